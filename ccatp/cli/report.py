@@ -53,7 +53,7 @@ def report(run_dir: Path, out: Path | None, figures: Path | None, json_output: b
     Map, errors, how the panels lie, where the time went, events. It takes runs that are over, go on, were killed or
     resumed, and says what is missing.
     """
-    from ccatp.report.writer import report_run
+    from ccatp.report.run_page import report_run
 
     path, data, warnings = report_run(run_dir, out, figures)
     warn(warnings)
@@ -69,8 +69,7 @@ def report(run_dir: Path, out: Path | None, figures: Path | None, json_output: b
 @_JSON
 def compare(run_a: Path, run_b: Path, out: Path | None, figures: Path | None, json_output: bool) -> int:
     """Put two runs beside each other: figures, configuration, time, errors, and which panels have moved."""
-    from ccatp.report.compare import compare_data, compare_lines
-    from ccatp.report.writer import COMPARISON, compare_runs
+    from ccatp.report.compare import COMPARISON, compare_data, compare_lines, compare_runs
 
     path = out or run_b / COMPARISON
     pair = compare_runs(run_a, run_b, path, figures)

@@ -35,7 +35,7 @@ from ccatp.links.topics import (
 )
 from ccatp.records.beacon_summary import BeaconSummary, Reached, beacon_facts
 from ccatp.records.recorder import Recorder
-from ccatp.report.views import recorded_schemas
+from ccatp.report.foxglove import recorded_schemas
 
 RECEIVED = tuple(topic.name for topic in TOPICS if topic.recorded or topic.message in (Timing, Heartbeat))
 FINISH_TIMEOUT_S = 5.0

@@ -23,9 +23,8 @@ from ccatp.links.topics import BY_NAME, Heartbeat, Message, schema_of
 from ccatp.mirror.mirror import build_mirror
 from ccatp.records.recorder import read_metadata
 from ccatp.records.recording_repair import TELEMETRY
-from ccatp.report.foxglove import plain_schema
+from ccatp.report.foxglove import VIEWS, ViewMessage, Views, plain_schema, view_schemas
 from ccatp.report.live import FoxgloveStream, LiveStream, PlotJugglerStream, check_host
-from ccatp.report.views import VIEWS, ViewMessage, Views, view_schemas
 
 # Topics that are streamed as they are; batches are streamed as their views.
 PASSED_ON = ("mission", "arrival", "rest", "treatment", "fix", "danger_event")

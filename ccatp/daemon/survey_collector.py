@@ -28,7 +28,7 @@ from ccatp.records.recorder import iter_messages, recordings
 from ccatp.records.store import StoredSurvey, read_survey
 from ccatp.records.store_rows import StoreError
 from ccatp.records.summary import RunFacts, SummaryBuilder, puck_targets
-from ccatp.report.views import Views
+from ccatp.report.foxglove import Views
 from ccatp.survey.planning.route import ORDERS
 
 # A panel's plane has three parameters; the fit says so too, this saves the attempt.

@@ -157,7 +157,7 @@ def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.Fi
         return by_hand
     # Nothing of it is needed while the robot moves.
     from ccatp.records.run_reader import RunReadError  # noqa: PLC0415
-    from ccatp.report.writer import report_run  # noqa: PLC0415
+    from ccatp.report.run_page import report_run  # noqa: PLC0415
 
     try:
         return str(report_run(run_dir).path)

@@ -7,7 +7,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from ccatp.core import FloatArray
-from ccatp.report.beacon_figures import (
+from ccatp.report.beacon_record import BeaconRecord, beacon_rows, pose_errors_m, pose_nees, readings_of, waypoint_rows
+from ccatp.report.figures import (
     beacon_error_figure,
     beacon_map_figure,
     consistency_figure,
@@ -16,7 +17,6 @@ from ccatp.report.beacon_figures import (
     target_curves,
     target_figure,
 )
-from ccatp.report.beacon_record import BeaconRecord, beacon_rows, pose_errors_m, pose_nees, readings_of, waypoint_rows
 from ccatp.report.html import Draw, events_of, page_figures, render
 from ccatp.report.record import COMPLETE, PointOutcome
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import sqrt
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,6 +32,30 @@ _COLUMNS = {"beacon_track": TRACK_COLUMNS, "beacon_truth": TRUTH_COLUMNS}
 BEACON_TOPICS_READ = frozenset((*_COLUMNS, "beacon_map", "beacon_arrival", "beacon_places", "mission"))
 
 
+def standing_beacons(cfg: RadioConfig, message: BeaconMapMessage) -> dict[str, BeaconEllipse]:
+    """The beacons of a map without the radio that is followed."""
+    moving = cfg.follow.target if cfg.follow.is_active else ""
+    return {name: ellipse for name, ellipse in message.beacons.items() if name != moving}
+
+
+def expected_rms_m(beacons: Mapping[str, BeaconEllipse]) -> float | None:
+    """Root of the mean square of a place's error that the filter expects, sqrt(mean(xx + yy)); None without beacons."""
+    if not beacons:
+        return None
+    total = sum(xx + yy for _, _, xx, _, yy in beacons.values())
+    return sqrt(max(total, 0.0) / len(beacons))
+
+
+def true_rms_m(beacons: Mapping[str, BeaconEllipse], places: Mapping[str, tuple[float, float]]) -> float | None:
+    """Root of the mean square distance of the beacons from their true places; None where none is known."""
+    squares = [
+        (x - places[name][0]) ** 2 + (y - places[name][1]) ** 2
+        for name, (x, y, *_) in beacons.items()
+        if name in places
+    ]
+    return sqrt(sum(squares) / len(squares)) if squares else None
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class BeaconRecord(RunFiles):
     """A mission among beacons.
@@ -51,12 +76,7 @@ class BeaconRecord(RunFiles):
     @property
     def beacons(self) -> dict[str, BeaconEllipse]:
         """Those that stand, as the newest map has them."""
-        return self.standing(self.maps[-1]) if self.maps else {}
-
-    def standing(self, message: BeaconMapMessage) -> dict[str, BeaconEllipse]:
-        """The beacons of a map without the radio that is followed."""
-        moving = self.cfg.follow.target if self.cfg.follow.is_active else ""
-        return {name: ellipse for name, ellipse in message.beacons.items() if name != moving}
+        return standing_beacons(self.cfg, self.maps[-1]) if self.maps else {}
 
     @property
     def settled_s(self) -> float:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,14 +10,15 @@ from scipy.special import chdtrc, chdtri
 
 from ccatp.core import FloatArray, PanelId
 from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront
-from ccatp.report.findings import KINDS, Findings
-from ccatp.report.html import MICRO, Draw, events_of, inline, page_figures, render
+from ccatp.report.figures import distribution_figure, errors_figure, time_figure
+from ccatp.report.findings import KINDS, Findings, findings_of
+from ccatp.report.html import MICRO, Draw, events_of, inline, page_figures, render, write_page, write_pictures
 from ccatp.report.mirror_map import change_figure, paths_figure, surface_figure
 from ccatp.report.plots import NARROW
-from ccatp.report.record import changed_keys
-from ccatp.report.run_figures import distribution_figure, errors_figure, time_figure
+from ccatp.report.record import changed_keys, read_record
 from ccatp.report.run_page import run_data, wavefront_data
 
+COMPARISON = "compare.html"
 _MODES = 3
 BAND = 0.99
 FALSE_ALARM = 0.01  # probability that noise alone makes any panel of the mirror look moved
@@ -125,6 +127,22 @@ def pair_of(a: Findings, b: Findings) -> RunPair:
     if not found.is_one_mirror or a.alignment is None or b.alignment is None:
         return found
     return found._replace(changes=panel_changes(a.alignment.panels, b.alignment.panels))
+
+
+def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = None) -> RunPair:
+    """Write two runs beside each other.
+
+    Args:
+        figures: a directory for the figures; none are written if not given.
+
+    Raises:
+        CcatpError: as ``report_run``.
+    """
+    pair = pair_of(findings_of(read_record(run_a)), findings_of(read_record(run_b)))
+    write_page(compare_page(pair), out)
+    if figures is not None:
+        write_pictures(compare_drawings(pair), figures)
+    return pair
 
 
 class ComparedValue(NamedTuple):

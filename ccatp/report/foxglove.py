@@ -7,18 +7,33 @@ Foxglove and Lichtblick read a channel's schema as a list of fields: the root an
 of a plain type, and arrays hold plain types or objects. They refuse a channel with references, alternatives or arrays
 of arrays. Therefore references are resolved, and other properties stand under ``patternProperties``, which validators
 use and viewers ignore.
+
+Topics for viewers, named ``view/...``, have at most a tenth of the frame rate. Constant ones (frames, panels) are
+latched: a late subscriber gets the last message.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from math import cos, hypot, sin
 from types import GenericAlias
-from typing import Any
+from typing import Any, NamedTuple, NotRequired, TypedDict
 
 import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ccatp.core import DeckPose, PanelId, PointId
-from ccatp.mirror.mirror import Mirror
+from ccatp.core import DeckPose, PanelId, PanelPose, PointId, wrap_pi
+from ccatp.links.topics import (
+    TOPICS,
+    EstimateMessage,
+    FixMessage,
+    LogMessage,
+    Message,
+    SensorLines,
+    TrackMessage,
+    TruthMessage,
+    schema_of,
+)
+from ccatp.mirror.mirror import Mirror, deck_poses
 
 LOOP = 1  # of LinePrimitive.type
 LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
@@ -86,12 +101,23 @@ CHORDS = 8
 
 def panel_scene(mirror: Mirror, timestamp: Any) -> Any:
     """Every panel's outline and label, and the rim, deck frame."""
-    panels = [_panel_entity(mirror, panel, timestamp) for panel in mirror.panels]
+    entities = []
+    for panel, own in mirror.panels.items():
+        name = f"{panel.row}-{panel.col}"
+        sides = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+        corners = np.array([(own.x_m + sx * own.half_x_m, own.y_m + sy * own.half_y_m) for sx, sy in sides])
+        ends = np.roll(corners, -1, axis=0)
+        edge = [
+            _on_surface(mirror, *(a + i / CHORDS * (b - a)).tolist())
+            for a, b in zip(corners, ends, strict=True)
+            for i in range(CHORDS)
+        ]
+        outline = LinePrimitive(LOOP, ORIGIN, EDGE_PIXELS, True, edge, GREY)
+        label = TextPrimitive(Pose(Vector(*own.origin), UPRIGHT), True, LABEL_M, False, DARK, name)
+        entities.append(SceneEntity(timestamp, DECK, f"panel {name}", False, lines=(outline,), texts=(label,)))
     rim = [_on_surface(mirror, float(x), float(y)) for x, y in mirror.rim.vertices]
-    outline = SceneEntity(
-        timestamp, DECK, "rim", False, lines=(LinePrimitive(LOOP, ORIGIN, RIM_PIXELS, True, rim, RED),)
-    )
-    return SceneUpdate((), (*panels, outline))
+    outline = LinePrimitive(LOOP, ORIGIN, RIM_PIXELS, True, rim, RED)
+    return SceneUpdate((), (*entities, SceneEntity(timestamp, DECK, "rim", False, lines=(outline,))))
 
 
 def point_scene(mirror: Mirror, panels: Iterable[PanelId], deviations_m: dict[PointId, float], timestamp: Any) -> Any:
@@ -102,12 +128,15 @@ def point_scene(mirror: Mirror, panels: Iterable[PanelId], deviations_m: dict[Po
     """
     entities = []
     for panel in panels:
-        measured = [point for point in mirror.point_ids(panel) if point in deviations_m]
-        spheres = tuple(_sphere(mirror, point, deviations_m[point]) for point in measured)
-        facts = tuple(KeyValuePair(f"point {p.point}", f"{1e6 * deviations_m[p]:.1f} um") for p in measured)
-        entities.append(
-            SceneEntity(timestamp, DECK, f"points {panel.row}-{panel.col}", False, metadata=facts, spheres=spheres)
-        )
+        spheres, facts = [], []
+        for point in mirror.point_ids(panel):
+            if point in deviations_m:
+                pose = Pose(_on_surface(mirror, *mirror.point_on_deck(point)), UPRIGHT)
+                colour = Color(*colour_of(deviations_m[point]), 1.0)
+                spheres.append(SpherePrimitive(pose, Vector(POINT_M, POINT_M, POINT_M), colour))
+                facts.append(KeyValuePair(f"point {point.point}", f"{1e6 * deviations_m[point]:.1f} um"))
+        name = f"points {panel.row}-{panel.col}"
+        entities.append(SceneEntity(timestamp, DECK, name, False, metadata=facts, spheres=spheres))
     return SceneUpdate((), entities)
 
 
@@ -119,40 +148,8 @@ def colour_of(deviation_m: float) -> tuple[float, float, float]:
     return r, g, b
 
 
-def _panel_entity(mirror: Mirror, panel: PanelId, timestamp: Any) -> Any:
-    own = mirror.panel(panel)
-    corners = [
-        (own.x_m + sx * own.half_x_m, own.y_m + sy * own.half_y_m) for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1))
-    ]
-    outline = LinePrimitive(LOOP, ORIGIN, EDGE_PIXELS, True, _edge(mirror, corners), GREY)
-    x, y, z = own.origin
-    label = TextPrimitive(Pose(Vector(x, y, z), UPRIGHT), True, LABEL_M, False, DARK, f"{panel.row}-{panel.col}")
-    return SceneEntity(timestamp, DECK, f"panel {panel.row}-{panel.col}", False, lines=(outline,), texts=(label,))
-
-
-def _edge(mirror: Mirror, corners: Sequence[tuple[float, float]]) -> list[Any]:
-    points = []
-    for (ax, ay), (bx, by) in zip(corners, [*corners[1:], corners[0]], strict=True):
-        for i in range(CHORDS):
-            share = i / CHORDS
-            points.append(_on_surface(mirror, ax + share * (bx - ax), ay + share * (by - ay)))
-    return points
-
-
 def _on_surface(mirror: Mirror, x_m: float, y_m: float) -> Any:
     return Vector(*(round(c, 5) for c in mirror.surface_point(x_m, y_m)))
-
-
-def _sphere(mirror: Mirror, point: PointId, deviation_m: float) -> Any:
-    x, y = mirror.point_on_deck(point)
-    return SpherePrimitive(
-        Pose(_on_surface(mirror, x, y), UPRIGHT), Vector(POINT_M, POINT_M, POINT_M), Color(*colour_of(deviation_m), 1.0)
-    )
-
-
-def robot_rotation(mirror: Mirror, pose: DeckPose) -> Any:
-    """The robot's orientation in the deck frame."""
-    return quaternion(mirror.robot_axes(pose))
 
 
 def quaternion(axes: tuple[Sequence[float], Sequence[float], Sequence[float]]) -> Any:
@@ -160,11 +157,10 @@ def quaternion(axes: tuple[Sequence[float], Sequence[float], Sequence[float]]) -
     return Quaternion(*Rotation.from_matrix(np.array(axes).T).as_quat().tolist())
 
 
-Schema = dict[str, Any]
 _PLAIN = ("boolean", "string", "number", "integer")
 
 
-def plain_schema(schema: Mapping[str, Any], title: str) -> Schema:
+def plain_schema(schema: Mapping[str, Any], title: str) -> dict[str, Any]:
     """A schema of ``msgspec.json.schema`` in the form for viewers."""
     return {**_resolved(schema, schema.get("$defs", {})), "title": title}
 
@@ -180,7 +176,7 @@ def _resolved(node: Any, definitions: Mapping[str, Any]) -> Any:
     return _split(found) if found.get("type") == "object" and "properties" in found else found
 
 
-def _split(schema: Schema) -> Schema:
+def _split(schema: dict[str, Any]) -> dict[str, Any]:
     plain = {name: value for name, value in schema["properties"].items() if _is_plain(value)}
     others = {f"^{name}$": value for name, value in schema["properties"].items() if name not in plain}
     return {**schema, "properties": plain, **({"patternProperties": others} if others else {})}
@@ -192,3 +188,248 @@ def _is_plain(schema: Mapping[str, Any]) -> bool:
         items = schema.get("items")
         return isinstance(items, Mapping) and items.get("type") != "array" and _is_plain(items)
     return kind in _PLAIN or (kind == "object" and "properties" in schema)
+
+
+WORLD, ROBOT = "world", "robot"
+WHEELS, INERTIAL = ("wheel_right_rad_s", "wheel_left_rad_s"), ("acceleration_m_s2", "yaw_rate_rad_s")
+EDGES = ("edge_front_left", "edge_front_right", "edge_rear_left", "edge_rear_right")
+EVERY_FRAMES = 10
+# All points are published again at this period, for viewers that start in the middle of a recording.
+POINTS_AGAIN_S = 60.0
+_KEPT = 1000
+
+
+class RobotView(msgspec.Struct, frozen=True):
+    """Scalars to plot, of every tenth frame: the estimate on the deck, and the frame's own values."""
+
+    t_s: float
+    seq: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    sigma_m: float
+
+
+class SensorView(TypedDict):
+    """Scalars to plot, of every tenth frame: the newest sample of each sensor; ages as the robot echoes them.
+
+    Values that a frame does not hold are left out, because viewers do not plot null.
+    """
+
+    t_s: float
+    seq: int
+    wheel_right_rad_s: NotRequired[float]
+    wheel_left_rad_s: NotRequired[float]
+    acceleration_m_s2: NotRequired[float]
+    yaw_rate_rad_s: NotRequired[float]
+    edge_front_left: NotRequired[int]
+    edge_front_right: NotRequired[int]
+    edge_rear_left: NotRequired[int]
+    edge_rear_right: NotRequired[int]
+    fan_left: float
+    fan_right: float
+    battery: float
+    drive_age_s: NotRequired[float]
+    permit_age_s: NotRequired[float]
+    held: bool
+
+
+class ErrorView(msgspec.Struct, frozen=True):
+    """Estimate against the simulated truth, every tenth frame (simulation only); along and across the true heading."""
+
+    t_s: float
+    seq: int
+    position_mm: float
+    along_mm: float
+    across_mm: float
+    heading_mrad: float
+
+
+class TopicView(NamedTuple):
+    """A row of the table of views; the last message of a latched one holds until the next."""
+
+    name: str
+    message: Any
+    schema_name: str
+    is_latched: bool = False
+
+
+class ViewMessage(NamedTuple):
+    """A message of a view: topic, robot time (s), JSON."""
+
+    topic: str
+    t_s: float
+    payload: bytes
+
+
+VIEWS = (
+    TopicView("view/frames", FrameTransform, "foxglove.FrameTransform", True),
+    TopicView("view/panels", SceneUpdate, "foxglove.SceneUpdate", True),
+    TopicView("view/points", SceneUpdate, "foxglove.SceneUpdate"),
+    TopicView("view/robot_frame", FrameTransform, "foxglove.FrameTransform"),
+    TopicView("view/pose", PoseInFrame, "foxglove.PoseInFrame"),
+    TopicView("view/true_pose", PoseInFrame, "foxglove.PoseInFrame"),
+    TopicView("view/log", Log, "foxglove.Log"),
+    TopicView("view/robot", RobotView, "ccatp.Robot"),
+    TopicView("view/sensors", SensorView, "ccatp.Sensors"),
+    TopicView("view/error", ErrorView, "ccatp.Error"),
+)
+_encode = msgspec.json.Encoder().encode
+
+
+class _Echo(msgspec.Struct):
+    age: float | None = None
+    permit_age: float | None = None
+    held: bool = False
+
+
+class _Line(msgspec.Struct):
+    """The published part of a sensors line; a line without it is skipped."""
+
+    seq: int
+    t: float
+    imu: list[tuple[float, float, float]]
+    enc: list[tuple[float, float, float]]
+    edge: list[tuple[float, int, int, int, int]]
+    fans: tuple[float, float]
+    soc: float
+    cmd: _Echo
+
+
+_line_decoder = msgspec.json.Decoder(_Line)
+
+
+def recorded_schemas() -> list[tuple[str, dict[str, Any]]]:
+    """Name and schema of every channel of a recording: the recorded topics, and the views of them."""
+    raw = [(t.name, plain_schema(schema_of(t.name), f"ccatp.{t.message.__name__}")) for t in TOPICS if t.recorded]
+    return [*raw, *view_schemas()]
+
+
+def view_schemas() -> list[tuple[str, dict[str, Any]]]:
+    """Name and schema of every view."""
+    return [(view.name, plain_schema(msgspec.json.schema(view.message), view.schema_name)) for view in VIEWS]
+
+
+class Views:
+    """Derives the views of one run."""
+
+    def __init__(self, mirror: Mirror, puck_height_m: float) -> None:
+        self._mirror, self._puck_height_m = mirror, puck_height_m
+        self._deviations_m: dict[PointId, float] = {}
+        # Of one frame either may arrive first; at most _KEPT wait for their counterpart.
+        self._estimates: dict[int, DeckPose] = {}
+        self._truths: dict[int, DeckPose] = {}
+        self._points_sent_s = 0.0
+        self._has_begun = False
+
+    def begin(self, t_s: float = 0.0) -> Iterator[ViewMessage]:
+        """The latched views: frame of the world and map of the panels."""
+        self._has_begun = True
+        mirror, now = self._mirror, time_of(t_s)
+        origin = Vector(*mirror.world_from_deck((0.0, 0.0, 0.0)))
+        x, y, z = (mirror.rotate_world_from_deck(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+        yield _shown("view/frames", t_s, FrameTransform(now, WORLD, DECK, origin, quaternion((x, y, z))))
+        yield _shown("view/panels", t_s, panel_scene(mirror, now))
+
+    def of(self, message: Message) -> Iterator[ViewMessage]:
+        """The views of one message."""
+        if not self._has_begun:
+            yield from self.begin(max(message.t_s, 0.0))
+        if isinstance(message, EstimateMessage):
+            pose = DeckPose(message.x_m, message.y_m, message.heading_rad)
+            yield from self._of_pose(message.seq, message.t_s, pose, message.sigma_m)
+        elif isinstance(message, TrackMessage):
+            yield from self._of_track(message)
+        elif isinstance(message, SensorLines):
+            yield from _of_lines(message.lines)
+        elif isinstance(message, TruthMessage):
+            yield from self._of_truth(message)
+        elif isinstance(message, FixMessage):
+            yield from self._of_fix(message)
+        elif isinstance(message, LogMessage):
+            level = LEVELS.get(message.level, 0)
+            log = Log(time_of(max(message.t_s, 0.0)), level, message.text, message.process)
+            yield _shown("view/log", message.t_s, log)
+
+    def all_points(self, t_s: float) -> Iterator[ViewMessage]:
+        """All measured points so far."""
+        panels = dict.fromkeys(point.panel for point in self._deviations_m)
+        if panels:
+            yield _shown("view/points", t_s, point_scene(self._mirror, panels, self._deviations_m, time_of(t_s)))
+
+    def _of_track(self, track: TrackMessage) -> Iterator[ViewMessage]:
+        rows = [row for row in track.rows if row[0] % EVERY_FRAMES == 0]
+        if not rows:
+            return
+        poses = [PanelPose(PanelId(row, col), x, y, heading) for _, _, row, col, x, y, heading, _ in rows]
+        for row, place in zip(rows, deck_poses(self._mirror, poses).tolist(), strict=True):
+            yield from self._of_pose(row[0], row[1], DeckPose(*place[:3]), row[7])
+
+    def _of_pose(self, seq: int, t_s: float, pose: DeckPose, sigma_m: float) -> Iterator[ViewMessage]:
+        if seq % EVERY_FRAMES == 0:
+            yield from self._compared(seq, t_s, self._estimates, pose)
+        now, shown = time_of(t_s), self._pose_of(pose)
+        yield _shown("view/pose", t_s, PoseInFrame(now, DECK, shown))
+        frame = FrameTransform(now, DECK, ROBOT, shown.position, shown.orientation)
+        yield _shown("view/robot_frame", t_s, frame)
+        yield _shown("view/robot", t_s, RobotView(t_s, seq, pose.x_m, pose.y_m, pose.heading_rad, sigma_m))
+
+    def _of_truth(self, truth: TruthMessage) -> Iterator[ViewMessage]:
+        for seq, t_s, x, y, heading, *_ in truth.rows:
+            if seq % EVERY_FRAMES:
+                continue
+            pose = DeckPose(x, y, heading)
+            yield _shown("view/true_pose", t_s, PoseInFrame(time_of(t_s), DECK, self._pose_of(pose)))
+            yield from self._compared(seq, t_s, self._truths, pose)
+
+    def _compared(self, seq: int, t_s: float, own: dict[int, DeckPose], pose: DeckPose) -> Iterator[ViewMessage]:
+        """The error of a frame when both its estimate and its truth have arrived."""
+        own[seq] = pose
+        if seq in self._estimates and seq in self._truths:
+            yield _shown("view/error", t_s, _error(seq, t_s, self._estimates.pop(seq), self._truths.pop(seq)))
+        elif len(own) > _KEPT:
+            del own[next(iter(own))]
+
+    def _of_fix(self, fix: FixMessage) -> Iterator[ViewMessage]:
+        if fix.point is None or not fix.is_fused:
+            return
+        point = PointId(*fix.point)
+        *_, self._deviations_m[point] = self._mirror.foot_of_puck(fix.position_m, self._puck_height_m)
+        if fix.t_s - self._points_sent_s >= POINTS_AGAIN_S:
+            self._points_sent_s = fix.t_s
+            yield from self.all_points(fix.t_s)
+            return
+        scene = point_scene(self._mirror, (point.panel,), self._deviations_m, time_of(fix.t_s))
+        yield _shown("view/points", fix.t_s, scene)
+
+    def _pose_of(self, pose: DeckPose) -> Any:
+        place = Vector(*self._mirror.surface_point(pose.x_m, pose.y_m))
+        return Pose(place, quaternion(self._mirror.robot_axes(pose)))
+
+
+def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[ViewMessage]:
+    for raw in lines[::EVERY_FRAMES]:
+        try:
+            line = _line_decoder.decode(raw)
+        except msgspec.MsgspecError:
+            continue
+        left, right = line.fans
+        view = {"t_s": line.t, "seq": line.seq, "fan_left": left, "fan_right": right, "battery": line.soc,
+                "held": line.cmd.held}  # fmt: skip
+        for names, samples in ((WHEELS, line.enc), (INERTIAL, line.imu), (EDGES, line.edge)):
+            if samples:
+                view |= zip(names, samples[-1][1:], strict=True)
+        ages = {"drive_age_s": line.cmd.age, "permit_age_s": line.cmd.permit_age}
+        view |= {name: age for name, age in ages.items() if age is not None}
+        yield _shown("view/sensors", line.t, view)
+
+
+def _error(seq: int, t_s: float, estimate: DeckPose, truth: DeckPose) -> ErrorView:
+    dx, dy = estimate.x_m - truth.x_m, estimate.y_m - truth.y_m
+    c, s = cos(truth.heading_rad), sin(truth.heading_rad)
+    turn = wrap_pi(estimate.heading_rad - truth.heading_rad)
+    return ErrorView(t_s, seq, 1e3 * hypot(dx, dy), 1e3 * (c * dx + s * dy), 1e3 * (c * dy - s * dx), 1e3 * turn)
+
+
+def _shown(topic: str, t_s: float, message: object) -> ViewMessage:
+    return ViewMessage(topic, max(t_s, 0.0), _encode(message))

@@ -1,15 +1,17 @@
-"""The page around the sections of a report: templates, numbers as text, figures in two layouts, lines of the log."""
+"""What all pages share: templates, numbers as text, figures in two layouts, files, lines of the log."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from ccatp.errors import CcatpError, ExitStatus
 from ccatp.records.state_log import LogLine
-from ccatp.report.plots import NARROW, WIDE, svg_of
+from ccatp.report.plots import NARROW, WIDE, PictureError, save_figure, svg_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,6 +29,7 @@ _GRAVE = re.compile(
 # The name of a point or an address is one token; a number may have a fraction.
 _TOKEN = re.compile(r"\d+(?:[-/:.]\d+){2,}|\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
+_DPI = 192.0  # of PNG files: two pixels for each of the page
 Draw = Callable[[float], "Figure"]
 
 
@@ -77,6 +80,45 @@ def clock_text(time_s: float) -> str:
     """``3091.4`` as ``51 min 31 s``."""
     minutes, seconds = divmod(round(time_s), 60)
     return f"{minutes} min {seconds:02d} s" if minutes else f"{seconds} s"
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+class ReportError(CcatpError):
+    """A report that cannot be written."""
+
+    exit_status = ExitStatus.USAGE
+
+
+def write_page(markup: str, path: Path) -> None:
+    """Write a page, complete or not at all.
+
+    Raises:
+        ReportError: it cannot be written.
+    """
+    new = path.with_name(path.name + ".new")
+    try:
+        new.write_text(markup, encoding="utf-8")
+        new.replace(path)
+    except OSError as error:
+        raise ReportError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def write_pictures(drawings: dict[str, Draw], folder: Path) -> None:
+    """Write figures as SVG, PNG and PDF.
+
+    Raises:
+        PictureError: one cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise PictureError(f"{folder}: cannot be made: {error.strerror or error}") from error
+    for name, draw in drawings.items():
+        picture = draw(WIDE)
+        for suffix in (".svg", ".png", ".pdf"):
+            save_figure(picture, folder / f"{name}{suffix}", _DPI)
 
 
 # -- lines of the log -------------------------------------------------------------------------------------------------

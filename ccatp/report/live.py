@@ -10,7 +10,7 @@ from typing import Any
 import zmq
 
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.report.views import ViewMessage
+from ccatp.report.foxglove import ViewMessage
 
 _NS = 1e9
 # Some seconds of a run at full speed; a slower viewer loses the newest messages.

@@ -5,16 +5,56 @@ Lengths of the data in mm, times in s, unless a name says otherwise; null is not
 
 from collections import Counter
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront
-from ccatp.report.findings import Findings, Grade, PointVerdict
-from ccatp.report.html import MICRO, Draw, events_of, page_figures, render
+from ccatp.report.beacon_page import beacon_data, beacon_drawings, beacon_page
+from ccatp.report.beacon_record import read_beacon_record
+from ccatp.report.figures import error_figure, time_figure
+from ccatp.report.findings import Findings, Grade, PointVerdict, findings_of
+from ccatp.report.html import MICRO, Draw, events_of, page_figures, render, write_page, write_pictures
 from ccatp.report.mirror_map import path_figure, surface_figure
-from ccatp.report.record import WITHIN_MM
-from ccatp.report.run_figures import error_figure, time_figure
+from ccatp.report.record import WITHIN_MM, is_beacon_run, read_record
 
+REPORT = "report.html"
 _FEW = 12  # panels of a table; more are folded
+
+
+class Report(NamedTuple):
+    """A report that was written."""
+
+    path: Path
+    data: dict[str, Any]
+    warnings: tuple[str, ...]
+
+
+def report_run(run_dir: Path, out: Path | None = None, figures: Path | None = None) -> Report:
+    """Write the report of a run.
+
+    Args:
+        out: the page; ``report.html`` in the run directory if not given.
+        figures: a directory for the figures as SVG, PNG and PDF; none are written if not given.
+
+    Raises:
+        RunReadError: no run there.
+        ConfigError: its configuration cannot be used.
+        ReportError: the page cannot be written.
+        PictureError: a figure cannot be written.
+    """
+    path = out or run_dir / REPORT
+    if is_beacon_run(run_dir):
+        record = read_beacon_record(run_dir)
+        markup, data, pictures = beacon_page(record), beacon_data(record), beacon_drawings(record)
+        warnings = record.warnings
+    else:
+        found = findings_of(read_record(run_dir))
+        markup, data, pictures = run_page(found), run_data(found), run_drawings(found)
+        warnings = found.record.warnings
+    write_page(markup, path)
+    if figures is not None:
+        write_pictures(pictures, figures)
+    return Report(path, data, warnings)
 
 
 def run_page(found: Findings) -> str:

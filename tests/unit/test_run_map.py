@@ -1,7 +1,6 @@
 """Tests of the map of a run: it renders, and shows what the run directory holds."""
 
 import json
-from collections.abc import Callable
 from math import hypot
 from pathlib import Path
 
@@ -12,12 +11,13 @@ from ccatp.config.load import dump_config, load_config
 from ccatp.core import DeckPose, Fix, PanelId, PointId
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.records.recorder import Recorder
+from ccatp.records.run_reader import RunReadError
 from ccatp.records.store import MissionStore
 from ccatp.records.store_rows import PlannedPoint
-from ccatp.report import mirror_map as run_map
 from ccatp.report.findings import arrival_error_m
-from ccatp.report.mirror_map import MapPoint, draw_from_run_dir, draw_run_map
-from ccatp.report.plots import PictureError
+from ccatp.report.mirror_map import MAP_WIDTH_PX, MapPoint, draw_from_run_dir, record_map, run_map
+from ccatp.report.plots import WIDE, PictureError, save_figure
+from ccatp.report.record import read_record
 
 PNG = b"\x89PNG\r\n\x1a\n"
 POINTS = [PointId(5, 5, n) for n in range(1, 10)]
@@ -46,37 +46,32 @@ def make_run(run_dir: Path, mirror: Mirror) -> None:
         store.record_skipped(POINTS[4], 2.0).result()
     for _ in range(2):
         recorder = Recorder(run_dir / "telemetry.mcap", [("truth", {}), ("track", {})], is_simulation=True)
-        for topic, shift in (("truth", 0.0), ("track", 9.0)):
-            rows = [[i, i / 100, shift + i / 100, 0.5] for i in range(3)]
-            recorder.write(topic, 1.0, json.dumps({"rows": rows}).encode())
+        truth = [[i, i / 100, i / 100, 0.5, 0.0, i / 100, 0.5, 0.0, 1.0, 0, 0] for i in range(3)]
+        track = [[i, i / 100, 5, 5, 0.0, 0.0, 0.0, 0.001] for i in range(3)]
+        for topic, rows in (("truth", truth), ("track", track)):
+            recorder.write(topic, 1.0, json.dumps({"seq": 2, "t_s": 1.0, "rows": rows}).encode())
         recorder.close()
     (run_dir / "summary.json").write_text('{"mission_time_s": 125.4}')
 
 
-def test_a_run_directory_becomes_a_png(tmp_path: Path, mirror: Mirror, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_directory_becomes_a_png(tmp_path: Path, mirror: Mirror) -> None:
     make_run(tmp_path, mirror)
-    shown: list[tuple[np.ndarray, list[MapPoint], str, str]] = []
-    draw: Callable[..., None] = draw_run_map
-
-    def spy(mirror: Mirror, path_xy: np.ndarray, points: list[MapPoint], out: Path, title: str, subtitle: str) -> None:
-        shown.append((path_xy, points, title, subtitle))
-        draw(mirror, path_xy, points, out, title, subtitle)
-
-    monkeypatch.setattr(run_map, "draw_run_map", spy)
     draw_from_run_dir(tmp_path, tmp_path / "map.png")
     content = (tmp_path / "map.png").read_bytes()
     assert content.startswith(PNG)
-    assert int.from_bytes(content[16:20], "big") == run_map.MAP_WIDTH_PX
-    ((path_xy, points, title, subtitle),) = shown
-    assert title == "fyst-m1: 4 of 9 points in 2 min 05 s"
-    assert "simulation, world thesis  ·  seed 1  ·  filter ekf" in subtitle
-    assert path_xy.shape == (8, 2)  # the true path, not the estimated, of both recordings, each with a row of NaN
-    np.testing.assert_array_equal(path_xy[:3], [[0.0, 0.5], [0.01, 0.5], [0.02, 0.5]])
-    assert np.isnan(path_xy[[3, 7]]).all()
+    assert int.from_bytes(content[16:20], "big") == MAP_WIDTH_PX
+    figure = record_map(read_record(tmp_path), WIDE)
+    axes = figure.axes[0]
+    assert figure.get_label() == "fyst-m1: 4 of 9 points in 2 min 05 s"
+    assert "simulation, world thesis  ·  seed 1  ·  filter ekf" in axes.get_title(loc="left")
+    path_m = np.asarray(axes.lines[0].get_xydata())
+    assert path_m.shape == (8, 2)  # the true path, not the estimated, of both recordings, each with a row of NaN
+    np.testing.assert_array_equal(path_m[:3], [[0.0, 0.5], [0.01, 0.5], [0.02, 0.5]])
+    assert np.isnan(path_m[[3, 7]]).all()
+    marks = {str(marks.get_label()): marks.get_offsets() for marks in axes.collections}
+    assert (len(marks["skipped"]), len(marks["not measured"])) == (1, 4)  # type: ignore[arg-type]
     # the slope of the mirror's middle panel makes 5 mm longer by less than 1 %
-    assert [p.error_mm for p in points[:4]] == pytest.approx([5.0] * 4, rel=0.01)
-    assert [p.is_skipped for p in points] == [False] * 4 + [True] + [False] * 4
-    assert [p.error_mm for p in points[4:]] == [None] * 5
+    assert np.asarray(axes.collections[-1].get_array()) == pytest.approx([5.0] * 4, rel=0.01)
 
 
 def test_a_run_that_was_killed_is_drawn_too(tmp_path: Path, mirror: Mirror) -> None:
@@ -91,7 +86,7 @@ def test_errors_far_out_and_no_points_at_all_are_drawn(tmp_path: Path, mirror: M
     far = [MapPoint(0.0, 0.0, 55.0), MapPoint(0.1, 0.1, 0.0)]
     for number, points in enumerate((far, [], [MapPoint(0.0, 0.0, 0.0)])):
         out = tmp_path / f"{number}.png"
-        draw_run_map(mirror, np.empty((0, 2)), points, out, "title")
+        save_figure(run_map(mirror, np.empty((0, 2)), points, WIDE, "title"), out)
         assert out.read_bytes().startswith(PNG)
 
 
@@ -106,7 +101,7 @@ def test_arrival_error_is_the_distance_of_foot_and_point(mirror: Mirror) -> None
 
 
 def test_what_cannot_be_drawn_is_said_in_one_line(tmp_path: Path, mirror: Mirror) -> None:
-    with pytest.raises(PictureError, match=r"no config\.toml there"):
+    with pytest.raises(RunReadError, match=r"no config\.toml there"):
         draw_from_run_dir(tmp_path, tmp_path / "map.png")
     make_run(tmp_path, mirror)
     with pytest.raises(PictureError, match="cannot be written"):

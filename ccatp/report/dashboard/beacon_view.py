@@ -6,7 +6,8 @@ from typing import Any
 
 from ccatp.beacons.mission import BeaconState
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.links.topics import BeaconArrival, BeaconEllipse, BeaconMapMessage, BeaconPlaces, BeaconTrack, BeaconTruth
+from ccatp.links.topics import BeaconArrival, BeaconMapMessage, BeaconPlaces, BeaconTrack
+from ccatp.report.beacon_record import expected_rms_m, standing_beacons, true_rms_m
 from ccatp.report.dashboard.view import MEASURED, PLANNED, RunStateView, TruthCompare
 
 CODES = ["normal operation", "near something", "operation aborted"]
@@ -30,6 +31,7 @@ def beacon_ground(cfg: RadioConfig, *, is_sim: bool, needs_token: bool) -> dict[
     width_m, depth_m = cfg.workspace.size_m
     is_following = cfg.follow.is_active
     goals = "seconds" if is_following else "waypoints"
+    last = ["target"] if is_following else ["clearance"] if cfg.avoidance.is_active else []
     return {
         "title": TITLES[cfg.system],
         "is_sim": is_sim,
@@ -45,7 +47,7 @@ def beacon_ground(cfg: RadioConfig, *, is_sim: bool, needs_token: bool) -> dict[
         "rate_hz": cfg.dashboard.rate_hz,
         "states": [str(state) for state in BeaconState],
         "codes": CODES,
-        "plots": _plots(cfg),
+        "plots": ["error", "map", "nis", *last],
         "hides": HIDDEN,
         "words": {
             "simulation-what": "robot, radios and motes are simulated",
@@ -59,16 +61,11 @@ def beacon_ground(cfg: RadioConfig, *, is_sim: bool, needs_token: bool) -> dict[
     }
 
 
-def _plots(cfg: RadioConfig) -> list[str]:
-    last = ["target"] if cfg.follow.is_active else ["clearance"] if cfg.avoidance.is_active else []
-    return ["error", "map", "nis", *last]
-
-
+# Rows of robot time (s) and: true error and three sigma of the position (mm), without the truth only the latter; true
+# error of the beacons and its expected standard deviation (both root mean square, mm); NIS and degrees of freedom of
+# the readings since the row before; distance to the target and the one to be kept (m); the smallest distance that a
+# distance sensor measures (m).
 SERIES = ("error", "map", "nis", "target", "clearance")
-"""Rows of robot time (s) and: true error and three sigma of the position (mm), without the truth only the latter; true
-error of the beacons and its expected standard deviation (both root mean square, mm); NIS and degrees of freedom of the
-readings since the row before; distance to the target and the one to be kept (m); smallest distance that a distance
-sensor measures (m)."""
 # The page draws these from more frequent messages.
 _DRAWN = frozenset(("robot", "trail", "waypoint"))
 
@@ -87,7 +84,6 @@ class BeaconView(RunStateView):
             BeaconMapMessage: self._take_map,
             BeaconPlaces: self._take_places,
             BeaconTrack: self._take_track,
-            BeaconTruth: self._take_truth,
         }
 
     def _take_arrival(self, arrival: BeaconArrival, _now_s: float) -> None:
@@ -110,9 +106,10 @@ class BeaconView(RunStateView):
         if message.nis_size > before.nis_size:
             nis = round(message.nis_sum - before.nis_sum, 3)
             self._series["nis"].add(t_s, nis, message.nis_size - before.nis_size)
-        if (sigma_m := expected_rms_m(self._static(message))) is not None:
-            error_m = true_rms_m(self._static(message), self._places)
-            self._series["map"].add(t_s, _mm(error_m), _mm(sigma_m))
+        if (sigma_m := expected_rms_m(standing_beacons(self._cfg, message))) is not None:
+            error_m = true_rms_m(standing_beacons(self._cfg, message), self._places)
+            error_mm = None if error_m is None else round(1e3 * error_m, 2)
+            self._series["map"].add(t_s, error_mm, round(1e3 * sigma_m, 2))
         if message.target is not None:
             distance_m = hypot(message.target[0] - message.pose[0], message.target[1] - message.pose[1])
             self._series["target"].add(t_s, round(distance_m, 3), self._cfg.follow.safe_distance_m)
@@ -124,21 +121,14 @@ class BeaconView(RunStateView):
             if TruthCompare.is_compared(seq):
                 self._take_estimate(seq, t_s, x_m, y_m, worst_sigma_m(xx, xy, yy))
 
-    def _take_truth(self, truth: BeaconTruth, _now_s: float) -> None:
-        self._add_errors(self._truth.truth(row[:4] for row in truth.rows))
-
-    def _static(self, message: BeaconMapMessage) -> dict[str, BeaconEllipse]:
-        target = self._cfg.follow.target if self._cfg.follow.is_active else ""
-        return {name: ellipse for name, ellipse in message.beacons.items() if name != target}
-
-    def _own_levels(self) -> dict[str, Any]:
-        return {"facts": self._facts()}
+    def _levels(self, now_s: float) -> dict[str, Any]:
+        return {**super()._levels(now_s), "facts": self._facts()}
 
     def _facts(self) -> list[tuple[str, str]]:
         message = self._map
         if message is None:
             return []
-        static = self._static(message)
+        static = standing_beacons(self._cfg, message)
         rows = [("beacons on the map", str(len(static)))]
         if (sigma_m := expected_rms_m(static)) is not None:
             rows.append(("error of the map, expected", f"{1e3 * sigma_m:.1f} mm"))
@@ -166,29 +156,7 @@ class BeaconView(RunStateView):
         return [*true, *shapes]
 
 
-def expected_rms_m(beacons: Mapping[str, BeaconEllipse]) -> float | None:
-    """Root of the mean square of a place's error that the filter expects, sqrt(mean(xx + yy)); None without beacons."""
-    if not beacons:
-        return None
-    total = sum(xx + yy for _, _, xx, _, yy in beacons.values())
-    return sqrt(max(total, 0.0) / len(beacons))
-
-
-def true_rms_m(beacons: Mapping[str, BeaconEllipse], places: Mapping[str, tuple[float, float]]) -> float | None:
-    """Root of the mean square distance of the beacons from their true places; None where none is known."""
-    squares = [
-        (x - places[name][0]) ** 2 + (y - places[name][1]) ** 2
-        for name, (x, y, *_) in beacons.items()
-        if name in places
-    ]
-    return sqrt(sum(squares) / len(squares)) if squares else None
-
-
 def worst_sigma_m(xx: float, xy: float, yy: float) -> float:
     """Standard deviation of a position in its worst direction."""
     middle, spread = 0.5 * (xx + yy), hypot(0.5 * (xx - yy), xy)
     return sqrt(max(middle + spread, 0.0))
-
-
-def _mm(value_m: float | None) -> float | None:
-    return None if value_m is None else round(1e3 * value_m, 2)

@@ -6,7 +6,7 @@ from typing import Any
 
 from ccatp.config.models import Config
 from ccatp.core import PanelId, PanelPose, PointId, Vector3
-from ccatp.links.topics import ArrivalMessage, DisplayState, FixMessage, MissionStatus, TrackMessage, TruthMessage
+from ccatp.links.topics import ArrivalMessage, DisplayState, FixMessage, MissionStatus, TrackMessage
 from ccatp.mirror.mirror import Mirror, deck_poses
 from ccatp.mirror.surface import ConvergenceError
 from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView, TruthCompare
@@ -14,6 +14,7 @@ from ccatp.survey.planning.route import ORDERS
 from ccatp.survey.state import MissionState
 
 CODES = ["normal operation", "near the mirror's edge", "operation aborted"]
+# Terms of the page, by the id of their element or for its own sentences.
 WORDS = {
     "simulation-what": "robot and laser system are simulated",
     "progress-head": "Survey",
@@ -23,7 +24,6 @@ WORDS = {
     "goal": "points",
     "reached": "measured",
 }
-"""Terms of the page, by the id of their element or for its own sentences."""
 
 
 def point_name(point: PointId) -> str:
@@ -65,9 +65,9 @@ def ground(mirror: Mirror, cfg: Config, *, is_sim: bool, needs_token: bool) -> d
     }
 
 
+# Rows of robot time (s) and: arrival error by the laser (mm); how far a fix moved the estimate (mm); NIS and degrees of
+# freedom; true error and three sigma of the position (mm), without the truth only the latter.
 SERIES = ("arrival", "jump", "nis", "error")
-"""Rows of robot time (s) and: arrival error by the laser (mm); how far a fix moved the estimate (mm); NIS and degrees
-of freedom; true error and three sigma of the position (mm), without the truth only the latter."""
 
 
 class SurveyView(RunStateView):
@@ -83,7 +83,6 @@ class SurveyView(RunStateView):
             ArrivalMessage: self._take_arrival,
             FixMessage: self._take_fix,
             TrackMessage: self._take_track,
-            TruthMessage: self._take_truth,
         }
 
     def begin_with(self, measured: Iterable[tuple[PointId, float, Vector3]], skipped: Iterable[PointId]) -> None:
@@ -145,9 +144,6 @@ class SurveyView(RunStateView):
         for row, (x_m, y_m) in zip(rows, poses[:, :2].tolist(), strict=True):
             self._trail.add(x_m, y_m)
             self._take_estimate(row[0], row[1], x_m, y_m, row[7])
-
-    def _take_truth(self, truth: TruthMessage, _now_s: float) -> None:
-        self._add_errors(self._truth.truth(row[:4] for row in truth.rows))
 
     def _next_point(self) -> str:
         # On the way to a stop that is not a point the mission has none; then it is the first planned one.

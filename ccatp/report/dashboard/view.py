@@ -1,6 +1,5 @@
 """The state that every page shows, made from the messages of the bus: links, mission, verdict, pose, messages, map."""
 
-from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from math import dist, hypot
 from typing import Any, NamedTuple
@@ -10,7 +9,18 @@ import msgspec
 from ccatp.core import Verdict, danger_text
 from ccatp.links.liveness import Liveness, kind_of
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import BY_NAME, DangerEvent, DisplayState, Heartbeat, LogMessage, Message, MissionStatus, Scene
+from ccatp.links.topics import (
+    BY_NAME,
+    BeaconTruth,
+    DangerEvent,
+    DisplayState,
+    Heartbeat,
+    LogMessage,
+    Message,
+    MissionStatus,
+    Scene,
+    TruthMessage,
+)
 
 LOOPS = ("main", "danger")
 NAMES = {"main": "main loop", "danger": "danger loop"}
@@ -38,15 +48,21 @@ class Loss(NamedTuple):
 
 
 class Links:
-    """Age of the last message of each process; ``now_s`` is the machine's monotonic clock, as are their time stamps."""
+    """Age of the last message of each process; ``now_s`` is the machine's monotonic clock, as are their time stamps.
+
+    Attributes:
+        picture_s: when main published its last display state; None while none is requested: its absence is no loss.
+        fix_s: when the last fix came.
+        restarts: of each process, as far as they were seen from here.
+    """
 
     def __init__(self, *, has_laser: bool = True) -> None:
         self._has_laser = has_laser
         self._liveness = Liveness()
         self._presences: dict[str, Heartbeat] = {}
         self._cut_s: dict[str, float] = {}
-        self._restarts: dict[str, int] = {}
-        self._picture_s: float | None = None
+        self.restarts = dict.fromkeys(LOOPS, 0)
+        self.picture_s: float | None = None
         self.fix_s: float | None = None
         self.is_over = False
 
@@ -54,10 +70,11 @@ class Links:
         """Take the heartbeat of a process."""
         name = presence.process
         before = self._presences.get(name)
-        if before is not None and before.pid != presence.pid:
-            self._restarts[name] = self._restarts.get(name, 0) + 1
-            self._picture_s = None if name == "main" else self._picture_s
-        if name in self._cut_s and (before is None or before.pid != presence.pid or presence.t_s > self._cut_s[name]):
+        is_new = before is None or before.pid != presence.pid
+        if before is not None and is_new:
+            self.restarts[name] += 1
+            self.picture_s = None if name == "main" else self.picture_s
+        if name in self._cut_s and (is_new or presence.t_s > self._cut_s[name]):
             del self._cut_s[name]
         self._presences[name] = presence
         self._liveness.update(presence)
@@ -65,23 +82,6 @@ class Links:
     def cut(self, name: str, now_s: float) -> None:
         """The connection to a process has ended."""
         self._cut_s.setdefault(name, now_s)
-
-    def picture(self, now_s: float) -> None:
-        """The main loop has published its display state."""
-        self._picture_s = now_s
-
-    def look_away(self) -> None:
-        """No display states are requested any more: their absence is not a loss."""
-        self._picture_s = None
-
-    def status(self, status: MissionStatus) -> None:
-        """Take the status of the mission."""
-        self.is_over = status.exit_status >= 0
-
-    @property
-    def restarts(self) -> dict[str, int]:
-        """Restarts of each process that were seen from here."""
-        return {name: self._restarts.get(name, 0) for name in LOOPS}
 
     def losses(self, now_s: float) -> list[Loss]:
         """Lost links, the gravest first; none when the mission is over."""
@@ -99,9 +99,22 @@ class Links:
 
     def shown(self, now_s: float) -> list[LinkState]:
         """All links."""
-        links = [self._loop(name, now_s) for name in LOOPS]
-        links.append(self._robot(now_s))
-        return [*links, self._laser(now_s)] if self._has_laser else links
+        links = []
+        for name in LOOPS:
+            presence, cut_s = self._presences.get(name), self._cut_s.get(name)
+            phase, since_s = ("no heartbeat yet", None) if presence is None else (presence.phase, presence.t_s)
+            if cut_s is not None:
+                phase, since_s = "gone", cut_s
+            is_well = presence is not None and self._loss(name, now_s) is None
+            links.append(LinkState(NAMES[name], phase, _age_s(since_s, now_s), is_well))
+        frame_s = self._frame_s()
+        is_well = frame_s is not None and self._robot_loss(now_s) is None and self._loss("main", now_s) is None
+        phase = "frames" if is_well else "no frame yet" if frame_s is None else "lost"
+        links.append(LinkState("robot", phase, _age_s(frame_s, now_s), is_well))
+        if self._has_laser:
+            phase = "no fix yet" if self.fix_s is None else "last fix"
+            links.append(LinkState("laser", phase, _age_s(self.fix_s, now_s), True))
+        return links
 
     def _loss(self, name: str, now_s: float) -> Loss | None:
         presence = self._presences.get(name)
@@ -110,52 +123,29 @@ class Links:
         if presence is None:
             return None
         age_s = now_s - presence.t_s
-        picture_age_s = 0.0 if name != "main" or self._picture_s is None else now_s - self._picture_s
+        picture_age_s = 0.0 if name != "main" or self.picture_s is None else now_s - self.picture_s
         if age_s > BY_NAME[f"heartbeat.{name}"].stale_after_s or picture_age_s > PICTURE_STALE_S:
             return Loss(f"the {NAMES[name]} has not reported", max(age_s, picture_age_s))
         return None
 
     def _robot_loss(self, now_s: float) -> Loss | None:
-        main = self._presences.get("main")
+        main, frame_s = self._presences.get("main"), self._frame_s()
         if main is None or self._loss("main", now_s) is not None:
             return None
-        age_s = self._frame_age_s(now_s)
+        age_s = 0.0 if frame_s is None else now_s - frame_s
         if main.phase == "rejoining":
-            return Loss("the robot has been away", age_s or 0.0)
-        if main.phase == "joined" and age_s is not None and age_s > STATUS_STALE_S:
+            return Loss("the robot has been away", age_s)
+        if main.phase == "joined" and age_s > STATUS_STALE_S:
             return Loss("the robot has sent no frame", age_s)
         return None
 
-    def _frame_age_s(self, now_s: float) -> float | None:
+    def _frame_s(self) -> float | None:
         main = self._presences.get("main")
-        if main is None or main.frame_age_s is None:
-            return None
-        return main.frame_age_s + now_s - main.t_s
-
-    def _loop(self, name: str, now_s: float) -> LinkState:
-        presence = self._presences.get(name)
-        if name in self._cut_s:
-            return LinkState(NAMES[name], "gone", _age_s(now_s - self._cut_s[name]), False)
-        if presence is None:
-            return LinkState(NAMES[name], "no heartbeat yet", None, False)
-        age_s = _age_s(now_s - presence.t_s)
-        return LinkState(NAMES[name], presence.phase, age_s, self._loss(name, now_s) is None)
-
-    def _robot(self, now_s: float) -> LinkState:
-        age_s = self._frame_age_s(now_s)
-        if age_s is None:
-            return LinkState("robot", "no frame yet", None, False)
-        is_lost = self._robot_loss(now_s) is not None or self._loss("main", now_s) is not None
-        return LinkState("robot", "lost" if is_lost else "frames", _age_s(age_s), not is_lost)
-
-    def _laser(self, now_s: float) -> LinkState:
-        if self.fix_s is None:
-            return LinkState("laser", "no fix yet", None, True)
-        return LinkState("laser", "last fix", _age_s(now_s - self.fix_s), True)
+        return None if main is None or main.frame_age_s is None else main.t_s - main.frame_age_s
 
 
-def _age_s(age_s: float) -> float:
-    return round(max(age_s, 0.0), 2)
+def _age_s(since_s: float | None, now_s: float) -> float | None:
+    return None if since_s is None else round(max(now_s - since_s, 0.0), 2)
 
 
 Row = tuple[Any, ...]
@@ -248,9 +238,8 @@ class TruthCompare:
     """Joins estimates with the simulated truth of the same frame; either may arrive first."""
 
     def __init__(self) -> None:
-        self._estimates: OrderedDict[int, tuple[float, float, float]] = OrderedDict()
-        self._truths: OrderedDict[int, tuple[float, float, float]] = OrderedDict()
-        self._second = -1
+        self._estimates: dict[int, tuple[float, float, float]] = {}
+        self._truths: dict[int, tuple[float, float, float]] = {}
         self._worst: Second | None = None
 
     @staticmethod
@@ -258,39 +247,34 @@ class TruthCompare:
         """Whether a frame is one of those that are compared."""
         return seq % EVERY == 0
 
-    def estimate(self, seq: int, x_m: float, y_m: float, sigma_m: float) -> list[Second]:
-        """Add the estimate after frame ``seq``, deck frame; returns the seconds that it completes."""
+    def estimate(self, seq: int, x_m: float, y_m: float, sigma_m: float) -> Second | None:
+        """Add the estimate after frame ``seq``, deck frame; returns the second that it completes."""
         return self._join(seq, self._estimates, (x_m, y_m, sigma_m))
 
-    def truth(self, rows: Iterable[tuple[int, float, float, float]]) -> list[Second]:
-        """Add rows of frame, time (s), true x and y (m); returns the seconds that they complete."""
-        done = []
-        for seq, t_s, x_m, y_m in rows:
-            if self.is_compared(seq):
-                done += self._join(seq, self._truths, (t_s, x_m, y_m))
-        return done
+    def truth(self, seq: int, t_s: float, x_m: float, y_m: float) -> Second | None:
+        """Add the true position in frame ``seq``; returns the second that it completes."""
+        return self._join(seq, self._truths, (t_s, x_m, y_m)) if self.is_compared(seq) else None
 
     def _join(
-        self, seq: int, own: OrderedDict[int, tuple[float, float, float]], value: tuple[float, float, float]
-    ) -> list[Second]:
+        self, seq: int, own: dict[int, tuple[float, float, float]], value: tuple[float, float, float]
+    ) -> Second | None:
         own[seq] = value
         if len(own) > WAITING:
-            own.popitem(last=False)
+            del own[next(iter(own))]
         if seq not in self._estimates or seq not in self._truths:
-            return []
+            return None
         x_m, y_m, sigma_m = self._estimates.pop(seq)
         t_s, true_x_m, true_y_m = self._truths.pop(seq)
-        here = Second(t_s, 1e3 * hypot(x_m - true_x_m, y_m - true_y_m), 3e3 * sigma_m)
-        if int(t_s) == self._second and self._worst is not None:
-            if here.error_mm > self._worst.error_mm:
-                self._worst = here
-            return []
-        done, self._second, self._worst = self._worst, int(t_s), here
-        return [] if done is None else [done]
+        here, before = Second(t_s, 1e3 * hypot(x_m - true_x_m, y_m - true_y_m), 3e3 * sigma_m), self._worst
+        if before is not None and int(t_s) == int(before.t_s):
+            self._worst = max(before, here, key=lambda second: second.error_mm)
+            return None
+        self._worst = here
+        return before
 
 
+# State of a point; arrived: the robot is at rest there.
 PLANNED, ARRIVED, MEASURED, SKIPPED = range(4)
-"""State of a point; arrived: the robot is at rest there."""
 MAX_PATH, MAX_SAMPLES, MAX_LINES = 12_000, 4_000, 200
 NO_LINE = msgspec.Raw(b"null")
 _line = msgspec.json.Decoder(Sensors)
@@ -330,6 +314,8 @@ class RunStateView:
             Verdict: self._take_verdict,
             DangerEvent: self._take_verdict,
             Scene: self._take_scene,
+            TruthMessage: self._take_truth,
+            BeaconTruth: self._take_truth,
             LogMessage: lambda log, _: self._lines.add(round(log.t_s, 2), log.level, log.text),
         }
 
@@ -341,10 +327,10 @@ class RunStateView:
 
     def _take_status(self, status: MissionStatus, now_s: float) -> None:
         self.status, self._status_s = status, now_s
-        self.links.status(status)
+        self.links.is_over = status.exit_status >= 0
 
     def _take_picture(self, picture: DisplayState, now_s: float) -> None:
-        self.links.picture(now_s)
+        self.links.picture_s = now_s
         self._picture = msgspec.structs.replace(picture, line=NO_LINE)
         try:
             self._sensors = _line.decode(picture.line)
@@ -362,39 +348,36 @@ class RunStateView:
 
     def look_away(self) -> None:
         """Display states are not requested any more; the old one is not shown."""
-        self.links.look_away()
-        self._picture = self._sensors = None
+        self.links.picture_s = self._picture = self._sensors = None
 
     def news(self, now_s: float) -> dict[str, Any]:
         """The levels, and the new rows of what grows."""
         self._ticks += 1
-        state = self._levels(now_s) | self._own_levels()
-        state["points"] = [[k, self._states[k], self._errors_mm[k]] for k in sorted(self._changed)]
-        self._changed.clear()
-        state["path"] = self._trail.take_new()
-        state["series"] = {name: new for name, series in self._series.items() if (new := series.take_new())}
-        state["log"] = self._lines.take_new()
+        state = self._levels(now_s) | {
+            "points": [[k, self._states[k], self._errors_mm[k]] for k in sorted(self._changed)],
+            "path": self._trail.take_new(),
+            "series": {name: new for name, series in self._series.items() if (new := series.take_new())},
+            "log": self._lines.take_new(),
+        }
         if self._is_scene_new:
             state["shapes"] = self._shapes()
+        self._changed.clear()
         self._is_scene_new = False
         return state
 
     def everything(self, now_s: float) -> dict[str, Any]:
         """The levels and all rows, for a new page; to be called after ``news``, so that no row is sent twice."""
-        state = self._levels(now_s) | self._own_levels()
-        state["points"] = [[k, s, self._errors_mm[k]] for k, s in enumerate(self._states) if s != PLANNED]
-        state["path"] = self._trail.rows
-        state["series"] = {name: series.rows for name, series in self._series.items()}
-        state["log"] = self._lines.rows
-        state["shapes"] = self._shapes()
-        return state
+        return self._levels(now_s) | {
+            "points": [[k, s, self._errors_mm[k]] for k, s in enumerate(self._states) if s != PLANNED],
+            "path": self._trail.rows,
+            "series": {name: series.rows for name, series in self._series.items()},
+            "log": self._lines.rows,
+            "shapes": self._shapes(),
+        }
 
     def status_data(self, now_s: float) -> dict[str, Any]:
         """The levels with the run's trouble, for ``/status``."""
         return {**self._levels(now_s), "trouble": self.links.trouble(now_s)}
-
-    def _own_levels(self) -> dict[str, Any]:
-        return {}
 
     def _mark(self, index: int, state: int) -> None:
         self._states[index] = state
@@ -402,13 +385,17 @@ class RunStateView:
 
     def _take_estimate(self, seq: int, t_s: float, x_m: float, y_m: float, sigma_m: float) -> None:
         if self._is_sim:
-            self._add_errors(self._truth.estimate(seq, x_m, y_m, sigma_m))
+            self._add_error(self._truth.estimate(seq, x_m, y_m, sigma_m))
         elif int(t_s) != self._sigma_second:
             self._sigma_second = int(t_s)
             self._series["error"].add(round(t_s, 2), None, round(3e3 * sigma_m, 3))
 
-    def _add_errors(self, seconds: Iterable[Second]) -> None:
-        for second in seconds:
+    def _take_truth(self, truth: TruthMessage | BeaconTruth, _now_s: float) -> None:
+        for seq, t_s, x_m, y_m, *_ in truth.rows:
+            self._add_error(self._truth.truth(seq, t_s, x_m, y_m))
+
+    def _add_error(self, second: Second | None) -> None:
+        if second is not None:
             self._series["error"].add(round(second.t_s, 2), round(second.error_mm, 3), round(second.three_sigma_mm, 3))
 
     def _next_point(self) -> str:

@@ -19,11 +19,10 @@ from ccatp.links.topics import (
     RobotShape,
     Scene,
 )
+from ccatp.report.beacon_record import expected_rms_m, true_rms_m
 from ccatp.report.dashboard.beacon_view import (
     BeaconView,
     beacon_ground,
-    expected_rms_m,
-    true_rms_m,
     waypoint_name,
     worst_sigma_m,
 )

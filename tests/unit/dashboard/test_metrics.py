@@ -8,7 +8,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from ccatp.config.load import load_config
 from ccatp.links.topics import DisplayState
 from ccatp.mirror.mirror import build_mirror
-from ccatp.report.dashboard.metrics import StateCollector
+from ccatp.report.dashboard.app import StateCollector
 from ccatp.report.dashboard.survey_view import SurveyView
 from ccatp.report.dashboard.view import NO_LINE, LinkState
 from ccatp.survey.state import MissionState

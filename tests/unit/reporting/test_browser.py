@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ccatp.report.writer import compare_runs, report_run
+from ccatp.report.compare import compare_runs
+from ccatp.report.run_page import report_run
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

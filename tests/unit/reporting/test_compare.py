@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from ccatp.cli import main
-from ccatp.report.compare import compare_lines, compare_page, compared_figures, pair_of
+from ccatp.report.compare import compare_lines, compare_page, compare_runs, compared_figures, pair_of
 from ccatp.report.findings import findings_of
 from ccatp.report.record import read_record
-from ccatp.report.writer import compare_runs
 from tests.unit.reporting.markup import Markup
 from tests.unit.reporting.recorded import record
 

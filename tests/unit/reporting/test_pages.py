@@ -13,10 +13,9 @@ from ccatp.cli import main
 from ccatp.records.state_log import LogLine
 from ccatp.report.compare import compare_page, pair_of
 from ccatp.report.findings import findings_of, outcome_of
-from ccatp.report.html import POLICY, clock_text, number_text
+from ccatp.report.html import POLICY, ReportError, clock_text, number_text
 from ccatp.report.record import read_record
-from ccatp.report.run_page import run_page
-from ccatp.report.writer import ReportError, report_run
+from ccatp.report.run_page import report_run, run_page
 from tests.unit.reporting.markup import Markup
 from tests.unit.reporting.recorded import record
 

@@ -8,6 +8,7 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.report.figures import distribution_figure, error_figure, time_figure
 from ccatp.report.findings import ErrorSeries, TimeBreakdown
 from ccatp.report.mirror_map import MapPoint, run_map
 from ccatp.report.plots import (
@@ -22,9 +23,7 @@ from ccatp.report.plots import (
     new_plot,
     save_figure,
     svg_of,
-    thinned,
 )
-from ccatp.report.run_figures import distribution_figure, error_figure, time_figure
 
 
 @pytest.fixture(scope="module")
@@ -32,25 +31,11 @@ def mirror() -> Mirror:
     return build_mirror(load_config().mirror)
 
 
-def test_a_thinned_line_stays_near() -> None:
-    t = np.linspace(0.0, 20.0, 5001)
-    line = np.column_stack([40.0 * t, 100.0 * np.sin(t)])
-    line[2500] = np.nan
-    short = thinned(line, 0.5)
-    assert len(short) < 400
-    assert np.isnan(short).any(axis=1).sum() == 1
-    assert (short[0] == line[0]).all()
-    assert (short[-1] == line[-1]).all()
-    good = short[~np.isnan(short).any(axis=1)]
-    # Sampled ten times finer than a pixel, so that linear interpolation is as good as the sine.
-    assert np.abs(np.interp(line[:, 0], good[:, 0], good[:, 1]) - line[:, 1])[~np.isnan(line[:, 0])].max() < 1.5
-    assert len(thinned(np.empty((0, 2)), 1.0)) == 0
-    assert len(thinned(np.full((2, 2), np.nan), 1.0)) == 0
-
-
-def test_a_robot_that_stands_adds_nothing() -> None:
-    standing = np.vstack([np.tile([[1.0, 1.0]], (1000, 1)), [[5.0, 1.0]], np.tile([[9.0, 1.0]], (1000, 1))])
-    assert thinned(standing, 0.5).tolist() == [[1.0, 1.0], [9.0, 1.0]]
+def test_a_long_path_is_drawn_with_few_points() -> None:
+    figure, axes = new_plot(WIDE, "path")
+    t = np.linspace(0.0, 20.0, 100_001)
+    axes.plot(40.0 * t, np.sin(t))
+    assert len(svg_of(figure)) < 30_000
 
 
 def test_an_envelope() -> None:

@@ -43,7 +43,7 @@ def test_whatever_goes_wrong_is_logged_and_no_more(run_dir: Path, monkeypatch: p
     def fail(run_dir: Path) -> None:
         raise ZeroDivisionError("of nothing")
 
-    monkeypatch.setattr("ccatp.report.writer.report_run", fail)
+    monkeypatch.setattr("ccatp.report.run_page.report_run", fail)
     log = open_log(run_dir / "log.jsonl", "supervisor")
     assert write_run_report(run_dir, ExitStatus.COMPLETE, log) == f"none; make it with: ccatp report {run_dir}"
     (line,) = (json.loads(text) for text in (run_dir / "log.jsonl").read_text().splitlines())

@@ -10,8 +10,16 @@ from ccatp.config.load import load_config
 from ccatp.core import PanelId, PointId
 from ccatp.links.topics import TOPICS
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.report.foxglove import colour_of, panel_scene, plain_schema, point_scene, time_of
-from ccatp.report.views import VIEWS, recorded_schemas, view_schemas
+from ccatp.report.foxglove import (
+    VIEWS,
+    colour_of,
+    panel_scene,
+    plain_schema,
+    point_scene,
+    recorded_schemas,
+    time_of,
+    view_schemas,
+)
 
 PLAIN = ("boolean", "string", "number", "integer")
 

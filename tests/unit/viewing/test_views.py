@@ -12,7 +12,7 @@ from ccatp.config.load import load_config
 from ccatp.core import PanelId, PanelPose, PointId
 from ccatp.links.topics import FixMessage, LogMessage, Message, SensorLines, TrackMessage, TruthMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.report.views import POINTS_AGAIN_S, ViewMessage, Views
+from ccatp.report.foxglove import POINTS_AGAIN_S, ViewMessage, Views
 
 PUCK_M = 0.05
 
