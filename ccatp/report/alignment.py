@@ -1,7 +1,4 @@
-"""The alignment of the panels as data, as CSV and as text for a terminal.
-
-Micrometres and microradians; moves and deviations > 0 towards the robot.
-"""
+"""Alignment of the panels as data, CSV and text: um, urad; moves and deviations > 0 towards the robot."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -147,11 +144,7 @@ _SHOWN = 12  # panels without a result that are named
 
 
 def table_lines(result: SurveyResult, comparison: Comparison | None, puck_height_sigma_m: float) -> Iterator[str]:
-    """One line a panel, then the mirror.
-
-    Args:
-        comparison: against the simulated truth, if there is one.
-    """
+    """One line a panel, then the mirror, and the comparison with the simulated truth, if there is one."""
     if result.panels:
         yield from _panels(result.panels)
         yield ""
@@ -222,11 +215,7 @@ def _microns(value: float) -> str:
 
 
 def head_lines(facts: dict[str, Any]) -> Iterator[str]:
-    """What was analysed.
-
-    Args:
-        facts: run_dir, mirror, world, seed, points (total, measured), as in the JSON result.
-    """
+    """What was analysed; ``facts`` as in the JSON result."""
     where = "real robot" if facts["world"] is None else f"simulation, world {facts['world']}, seed {facts['seed']}"
     points = facts["points"]
     yield f"{facts['run_dir']}: {facts['mirror']}, {where}"

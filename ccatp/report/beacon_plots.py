@@ -1,6 +1,6 @@
 """Pictures of beacon work: path loss, fixes by signal strength, the fuzzy speed, maps of motes, recorded runs.
 
-matplotlib takes a second to import, so that it is imported only where something is drawn.
+The suffix of a file tells its format (PNG, PDF, SVG); PictureError: it cannot be written.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,11 +38,7 @@ _REGION = 0.9
 
 
 def draw_path_loss(fit: PathLossFit, pairs: Sequence[LevelPair], name: str, out: Path) -> None:
-    """Levels over distance, the line, and where 95 % of new places are expected.
-
-    Raises:
-        PictureError: the file cannot be written.
-    """
+    """Levels over distance, the line, and where 95 % of new places are expected."""
     figure = new_figure(7.0, 4.4)
     axes = figure.subplots()
     distances, levels = np.array([pair[:2] for pair in pairs]).T
@@ -63,11 +59,7 @@ def draw_fixes(
     fixes: Sequence[LevelFix], truths: Sequence[tuple[float, float]], beacons_m: Mapping[str, tuple[float, float]],
     name: str, out: Path,
 ) -> None:  # fmt: skip
-    """A panel for each point (at most twelve): its 90 % region, the fix, and where it was.
-
-    Raises:
-        PictureError: the file cannot be written.
-    """
+    """A panel for each point (at most twelve): its 90 % region, the fix, and where it was."""
     shown = list(zip(fixes, truths, strict=True))[:12]
     columns = min(5, len(shown))
     rows = -(-len(shown) // columns)
@@ -92,12 +84,7 @@ def draw_fixes(
 
 
 def draw_fuzzy(cfg: FuzzyConfig, out: Path) -> None:
-    """The speed over distance and heading error, and the memberships of both.
-
-    Raises:
-        PictureError: the file cannot be written.
-        FuzzyGapError: the rules leave a gap.
-    """
+    """The speed over distance and heading error, and the memberships of both; FuzzyGapError: the rules leave a gap."""
     sugeno = Sugeno(cfg)
     figure = new_figure(10.0, 4.6)
     layout = figure.add_gridspec(2, 2, width_ratios=(1.5, 1.0))
@@ -153,30 +140,19 @@ _VISIBLE = 0.012  # of the width of the map: ellipses that are smaller are drawn
 
 
 class MapPicture(NamedTuple):
-    """What is drawn of one map.
-
-    Attributes:
-        names, positions_m, covariance_m2: the map; drawn in its first two coordinates.
-        true_m: where the motes are, shape (n, d), or None.
-        pairs: measured pairs, indices, shape (e, 2).
-    """
+    """What is drawn of one map, in its first two coordinates."""
 
     names: Sequence[str]
     positions_m: FloatArray
     covariance_m2: FloatArray
-    true_m: FloatArray | None
-    pairs: NDArray[np.intp]
+    true_m: FloatArray | None  # shape (n, d)
+    pairs: NDArray[np.intp]  # measured, indices, shape (e, 2)
     doubtful: Sequence[int]
     title: str
 
 
 class Traces(NamedTuple):
-    """Error after each update, over runs.
-
-    Attributes:
-        low_m, middle_m, high_m: 10, 50 and 90 %, shape (k,).
-        expected_m: what the filter expects, median, shape (k,).
-    """
+    """Error after each update, over runs: 10, 50 and 90 %, and what the filter expects (median), shape (k,)."""
 
     low_m: FloatArray
     middle_m: FloatArray
@@ -187,14 +163,7 @@ class Traces(NamedTuple):
 
 
 def draw_mote_map(picture: MapPicture, traces: Traces | None, out: Path) -> None:
-    """Draw a map, and beside it the errors where there are some.
-
-    Args:
-        out: the file; its suffix tells the format (PNG, PDF, SVG).
-
-    Raises:
-        PictureError: the file cannot be written.
-    """
+    """Draw a map, and beside it the errors where there are some."""
     figure = new_figure(11.0 if traces else 6.5, 6.5)
     panels = figure.subplots(1, 2 if traces else 1, squeeze=False)[0]
     draw_places(panels[0], picture)
@@ -282,14 +251,7 @@ _TRUTH, _PATH, _MAP, _RECKONED = "#8fa3b8", "#1d6fa5", "#d5703f", "#d9c9a8"
 
 
 def draw_slam(run: RecordedRun, track: EstimatedPath, judged: TrackEvaluation, out: Path, title: str) -> None:
-    """Draw a track, laid on the truth if there is one, into an image file.
-
-    Args:
-        out: the file; its suffix tells the format (PNG, PDF, SVG).
-
-    Raises:
-        PictureError: the file cannot be written.
-    """
+    """Draw a track, laid on the truth if there is one."""
     beacons = aligned_beacons(track, judged.alignment)
     path = judged.alignment.moved(track.poses[:, :2])
     centre, half = _frame(run, path, beacons)

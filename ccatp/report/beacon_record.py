@@ -58,11 +58,7 @@ def true_rms_m(beacons: Mapping[str, BeaconEllipse], places: Mapping[str, tuple[
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class BeaconRecord(RunFiles):
-    """A mission among beacons.
-
-    Attributes:
-        truth: in the same frames, NaN where there is none; None on a real robot.
-    """
+    """A mission among beacons; the truth is that of the same frames, NaN where there is none, None on a real robot."""
 
     version: str
     cfg: RadioConfig
@@ -85,11 +81,7 @@ class BeaconRecord(RunFiles):
 
 
 def read_beacon_record(run_dir: Path) -> BeaconRecord:
-    """Everything that a report shows of a mission among beacons.
-
-    Raises:
-        ConfigError: its configuration cannot be used.
-    """
+    """Everything that a report shows of a mission among beacons; ConfigError: its configuration cannot be used."""
     cfg = load_radio_config(run_dir / CONFIG)
     shipped = load_radio_config(None, {"system": cfg.system})
     missing: list[str] = []
@@ -151,26 +143,18 @@ def readings_of(record: BeaconRecord) -> list[Reading]:
 
 
 class WaypointRow(NamedTuple):
-    """A waypoint that was reached.
+    """A waypoint that was reached; None is not known without a truth."""
 
-    Attributes:
-        number: over all laps, from 1.
-        lap, waypoint: from 1.
-        true_off_m: of the true place; None without a truth.
-        error_m: distance of the estimated place from the true one.
-        sigmas: the same in standard deviations, root(e^T P^-1 e).
-    """
-
-    number: int
-    lap: int
-    waypoint: int
+    number: int  # over all laps, from 1
+    lap: int  # from 1
+    waypoint: int  # from 1
     t_s: float
     place_m: tuple[float, float]
     sigma_m: float
     estimate_off_m: float
-    true_off_m: float | None
-    error_m: float | None
-    sigmas: float | None
+    true_off_m: float | None  # of the true place
+    error_m: float | None  # distance of the estimated place from the true one
+    sigmas: float | None  # the same in standard deviations, root(e^T P^-1 e)
 
 
 def waypoint_rows(record: BeaconRecord) -> list[WaypointRow]:

@@ -25,20 +25,13 @@ FALSE_ALARM = 0.01  # probability that noise alone makes any panel of the mirror
 
 
 class PanelChange(NamedTuple):
-    """One panel, the later survey less the earlier one.
-
-    Attributes:
-        values: piston (m), tip, tilt (rad), shape (3,).
-        sigma: standard deviations of these, shape (3,).
-        chi2: of no change at all, three degrees of freedom.
-        has_moved: noise alone would hardly make it so.
-    """
+    """One panel, the later survey less the earlier one."""
 
     panel: PanelId
-    values: FloatArray
-    sigma: FloatArray
-    chi2: float
-    has_moved: bool
+    values: FloatArray  # piston (m), tip, tilt (rad), shape (3,)
+    sigma: FloatArray  # standard deviations of these
+    chi2: float  # of no change at all, three degrees of freedom
+    has_moved: bool  # noise alone would hardly make it so
 
 
 class Changes(NamedTuple):
@@ -59,8 +52,7 @@ class Changes(NamedTuple):
 def panel_changes(before: Sequence[PanelResult], after: Sequence[PanelResult]) -> Changes | None:
     """Compare two surveys of one mirror; None without a panel of both.
 
-    The error of the puck's height shifts all pistons of a survey alike and is in no covariance here: with another puck,
-    or another height, all pistons seem to have moved.
+    The error of the puck's height, which all pistons share, is in no covariance: with another puck all seem to move.
     """
     earlier = {panel.panel: panel for panel in before}
     pairs = [(earlier[panel.panel], panel) for panel in after if panel.panel in earlier]
@@ -130,14 +122,7 @@ def pair_of(a: Findings, b: Findings) -> RunPair:
 
 
 def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = None) -> RunPair:
-    """Write two runs beside each other.
-
-    Args:
-        figures: a directory for the figures; none are written if not given.
-
-    Raises:
-        CcatpError: as ``report_run``.
-    """
+    """Write two runs beside each other, and their figures if a directory is given; raises as ``report_run``."""
     pair = pair_of(findings_of(read_record(run_a)), findings_of(read_record(run_b)))
     write_page(compare_page(pair), out)
     if figures is not None:

@@ -57,10 +57,7 @@ _KIND_COLOURS = dict(
 
 
 def error_figure(series: ErrorSeries, width_px: float) -> "Figure":
-    """Localization error and three sigma over time, and how far each fix moved the estimate; mm, logarithmic.
-
-    Where no truth is known, three sigma and the fixes alone.
-    """
+    """Localization error, if known, three sigma, and how far each fix moved the estimate, over time; mm."""
     figure, axes = new_plot(width_px, "localization error over time")
     set_log_axis(axes, "y")
     low_mm, high_mm = _ends_mm(series)
@@ -102,11 +99,7 @@ def _draw_band(axes: "Axes", found: Envelope, colour: str, label: str, low: floa
 
 
 def time_figure(budgets: Sequence[tuple[str, TimeBreakdown]], budget_s: float, width_px: float) -> "Figure":
-    """Where the time went, as bars: what runs took, each above the least that its way takes.
-
-    Args:
-        budget_s: what a mission may take; marked where it is near.
-    """
+    """Where the time of runs went, each above the least that its way takes; marked is what a mission may take."""
     bars: list[tuple[str, dict[str, float]]] = []
     for name, found in budgets:
         bars += [(name, found.spent_s), *([("least", found.least_s)] if found.least_s is not None else [])]

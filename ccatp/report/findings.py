@@ -36,21 +36,14 @@ class Grade(StrEnum):
 
 
 class PointVerdict(NamedTuple):
-    """One measurement point.
-
-    Attributes:
-        place_m: deck x, y.
-        first_mm: distance at the first arrival, before any correction; None where it is not known.
-        left_mm: distance where it was measured, as the laser saw it; None without a fix.
-        why: why it was left out; empty where it was not, or no reason is recorded.
-    """
+    """One measurement point; None is not known."""
 
     point: PointId
-    place_m: tuple[float, float]
-    first_mm: float | None
-    left_mm: float | None
+    place_m: tuple[float, float]  # deck x, y
+    first_mm: float | None  # distance at the first arrival, before any correction
+    left_mm: float | None  # distance where it was measured, as the laser saw it
     grade: Grade
-    why: str
+    why: str  # why it was left out; may be empty
 
     @property
     def shown_mm(self) -> float | None:
@@ -87,10 +80,7 @@ def point_verdicts(record: RunRecord) -> list[PointVerdict]:
 
 
 def first_arrivals_mm(record: RunRecord) -> dict[PointId, float]:
-    """Distance from each point when the robot came to rest there first, mm.
-
-    From the simulated truth, as in ``summary.json``; on a real robot from the first fix there.
-    """
+    """Distance from each point at the first rest there, mm: from the truth, or from the first fix there."""
     found: dict[PointId, float] = {}
     for session in record.sessions:
         found = (_from_fixes if session.truth is None else _from_truth)(record, session) | found
@@ -137,21 +127,14 @@ def _reasons(record: RunRecord) -> dict[PointId, str]:
 
 
 class ErrorSeries(NamedTuple):
-    """Over the time of all sessions, one after the other.
+    """Over the time of all sessions, one after the other; of frames shape (k,), of fixes shape (n,)."""
 
-    Attributes:
-        t_s: robot time since the start of the first session, shape (k,).
-        sigma3_mm: three standard deviations of the estimated place, shape (k,).
-        error_mm: distance of the true place from the estimated one, shape (k,); NaN where the truth is not known.
-        fix_t_s, fix_mm, fix_fused: of fixes: how far each moved the estimate, or would have, and whether it was taken.
-    """
-
-    t_s: FloatArray
-    sigma3_mm: FloatArray
-    error_mm: FloatArray
+    t_s: FloatArray  # robot time since the start of the first session
+    sigma3_mm: FloatArray  # three standard deviations of the estimated place
+    error_mm: FloatArray  # distance of the true place from the estimated one; NaN where the truth is not known
     breaks_s: tuple[float, ...]
     fix_t_s: FloatArray
-    fix_mm: FloatArray
+    fix_mm: FloatArray  # how far each moved the estimate, or would have
     fix_fused: "np.ndarray[tuple[int, ...], np.dtype[np.bool_]]"
 
 
@@ -229,19 +212,12 @@ TimeSpan = tuple[str, float]  # a state of the mission, and for how long, s
 
 
 class TimeBreakdown(NamedTuple):
-    """Times of a run, s.
+    """Times of a run by kind, s."""
 
-    Attributes:
-        spent_s: by kind, in the order of ``KINDS``; kinds that did not occur are left out.
-        least_s: by kind, of the same way from rest to rest; None where the way is not known.
-        visits: how often the robot turned, drove, settled, measured, ...
-        is_exact: from the log, frame by frame; else sampled from the status.
-    """
-
-    spent_s: dict[str, float]
-    least_s: dict[str, float] | None
-    visits: dict[str, int]
-    is_exact: bool
+    spent_s: dict[str, float]  # in the order of KINDS; those that did not occur are left out
+    least_s: dict[str, float] | None  # of the same way from rest to rest; None where the way is not known
+    visits: dict[str, int]  # how often the robot turned, drove, settled, measured, ...
+    is_exact: bool  # from the log, frame by frame; else sampled from the status
     covers: str
 
     @property
@@ -261,10 +237,7 @@ class TimeBreakdown(NamedTuple):
 
 
 def time_budget(record: RunRecord) -> TimeBreakdown | None:
-    """The budget of a run; None where its states are not recorded.
-
-    A measurement that takes longer than its time was repeated, or waited for the laser: the rest is waiting.
-    """
+    """The budget of a run; None where its states are not recorded. A longer measurement than is due waited."""
     measuring_s = record.cfg.etalon.measuring_time_s
     exact = [spells_of(session) for session in record.sessions]
     spells = [
@@ -362,17 +335,13 @@ def least_times(record: RunRecord) -> tuple[dict[str, float] | None, str]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Findings:
-    """A run and what follows from it. What the run does not hold is None or empty.
-
-    Attributes:
-        errors: localization error over time, and ``figures`` of its distribution.
-    """
+    """A run and what follows from it. What the run does not hold is None or empty."""
 
     record: RunRecord
     outcome: PointOutcome
     points: list[PointVerdict]
-    errors: ErrorSeries | None
-    figures: ErrorFigures | None
+    errors: ErrorSeries | None  # over time
+    figures: ErrorFigures | None  # of their distribution
     budget: TimeBreakdown | None
     alignment: SurveyResult | None
     against: Comparison | None

@@ -121,11 +121,7 @@ def panel_scene(mirror: Mirror, timestamp: Any) -> Any:
 
 
 def point_scene(mirror: Mirror, panels: Iterable[PanelId], deviations_m: dict[PointId, float], timestamp: Any) -> Any:
-    """The measured points of some panels, an entity for each.
-
-    Args:
-        deviations_m: of each measured point from the ideal surface along the normal, m.
-    """
+    """The measured points of some panels, an entity for each; deviations from the surface along the normal, m."""
     entities = []
     for panel in panels:
         spheres, facts = [], []
@@ -211,10 +207,7 @@ class RobotView(msgspec.Struct, frozen=True):
 
 
 class SensorView(TypedDict):
-    """Scalars to plot, of every tenth frame: the newest sample of each sensor; ages as the robot echoes them.
-
-    Values that a frame does not hold are left out, because viewers do not plot null.
-    """
+    """Scalars to plot, of every tenth frame: the newest sample of each sensor; what is not known is left out."""
 
     t_s: float
     seq: int

@@ -92,11 +92,7 @@ class ReportError(CcatpError):
 
 
 def write_page(markup: str, path: Path) -> None:
-    """Write a page, complete or not at all.
-
-    Raises:
-        ReportError: it cannot be written.
-    """
+    """Write a page, complete or not at all; ReportError: it cannot be written."""
     new = path.with_name(path.name + ".new")
     try:
         new.write_text(markup, encoding="utf-8")
@@ -106,11 +102,7 @@ def write_page(markup: str, path: Path) -> None:
 
 
 def write_pictures(drawings: dict[str, Draw], folder: Path) -> None:
-    """Write figures as SVG, PNG and PDF.
-
-    Raises:
-        PictureError: one cannot be written.
-    """
+    """Write figures as SVG, PNG and PDF; PictureError: one cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -57,11 +57,7 @@ class LiveStream(ABC):
 
 
 def check_host(host: str, *, is_open: bool) -> None:
-    """Refuse to serve a network unless it is requested, because every client may watch without authentication.
-
-    Raises:
-        StreamError: the host is not this machine, and ``is_open`` is not given.
-    """
+    """StreamError: the host is not this machine, and ``is_open`` is not given; every client may watch."""
     try:
         is_local = ipaddress.ip_address(host).is_loopback
     except ValueError:

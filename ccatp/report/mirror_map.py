@@ -56,9 +56,7 @@ _USUAL_ERRORS_PERCENT, _USUAL_HEIGHTS_PERCENT = 98.0, 99.0
 def new_mirror_map(mirror: Mirror, width_px: float, title: str, subtitle: str | None = None) -> "tuple[Figure, Axes]":
     """The ground of a map: panels, their rows and columns, and the rim; both axes in metres, to the same scale.
 
-    Args:
-        width_px: of the figure; its height follows.
-        title: what it shows; written above the map if there is a subtitle, which may be empty.
+    The title is written above the map if there is a subtitle, which may be empty.
     """
     from matplotlib.collections import PatchCollection  # noqa: PLC0415 - takes a second
     from matplotlib.patches import Polygon, Rectangle  # noqa: PLC0415
@@ -122,33 +120,21 @@ def _add_bar(axes: "Axes", drawn: "ScalarMappable", label: str, width_px: float,
 
 @dataclass(frozen=True, slots=True)
 class MapPoint:
-    """A measurement point on the map.
-
-    Attributes:
-        x_m, y_m: deck frame.
-        error_mm: arrival error; None where the point was not measured.
-        is_skipped: given up, not merely still to come.
-        has_failed: measured too far from its place.
-        title: what a browser shows over it.
-    """
+    """A measurement point on the map, deck frame."""
 
     x_m: float
     y_m: float
-    error_mm: float | None = None
-    is_skipped: bool = False
-    has_failed: bool = False
-    title: str = ""
+    error_mm: float | None = None  # arrival error; None where the point was not measured
+    is_skipped: bool = False  # given up, not merely still to come
+    has_failed: bool = False  # measured too far from its place
+    title: str = ""  # what a browser shows over it
 
 
 def run_map(
     mirror: Mirror, path_m: FloatArray, points: Sequence[MapPoint], width_px: float, title: str,
     subtitle: str | None = None, path_label: str = "driven path", error_label: str = "arrival error, mm",
 ) -> "Figure":  # fmt: skip
-    """The driven path, and each point coloured by its arrival error.
-
-    Args:
-        path_m: deck frame, shape (n, 2); rows of NaN part it.
-    """
+    """The driven path (deck frame, shape (n, 2), parted by NaN), and each point coloured by its arrival error."""
     from matplotlib.colors import LinearSegmentedColormap  # noqa: PLC0415
 
     wide = is_wide(width_px)
@@ -222,9 +208,7 @@ def paths_figure(mirror: Mirror, records: Mapping[str, RunRecord], width_px: flo
 
 
 def draw_from_run_dir(run_dir: Path, out: Path) -> None:
-    """Draw the map of a run into a file, whose suffix tells the format (PNG, PDF, SVG).
-
-    The arrival error is the distance from the puck's foot, as the laser system measured it, to the measurement point.
+    """Draw the map of a run into a file, with the distances that the laser system measured.
 
     Raises:
         PictureError: the run holds no points, or the map cannot be drawn.
@@ -255,11 +239,7 @@ def record_map(record: RunRecord, width_px: float) -> "Figure":
 
 
 def draw_plan(mirror: Mirror, plan: SurveyPlan, out: Path) -> None:
-    """Draw the route of a planned survey, coloured by the time at which the robot is there, into a file.
-
-    Raises:
-        PictureError: the file cannot be written.
-    """
+    """Draw the route of a planned survey, coloured by the time at which the robot is there; PictureError as above."""
     from matplotlib.collections import LineCollection  # noqa: PLC0415
     from matplotlib.colors import LinearSegmentedColormap  # noqa: PLC0415
 
@@ -305,13 +285,9 @@ def surface_figure(
     mirror: Mirror, panels: Sequence[PanelResult], title: str, width_px: float,
     scaled_as: Sequence[PanelResult] | None = None, subtitle: str | None = None, *, with_moves: bool = False,
 ) -> "Figure":  # fmt: skip
-    """The deviation of the surface as fitted; dots show what was measured in the same colours.
+    """The deviation of the surface as fitted; dots, which vanish where the fit agrees, show what was measured.
 
-    A dot vanishes where the fit agrees with it; a cross is an outlier.
-
-    Args:
-        scaled_as: panels that the colours are to span; those shown if not given.
-        with_moves: write the move of each vertical adjuster, um, beside it.
+    The colours span the panels of ``scaled_as``; ``with_moves`` writes the move of each vertical adjuster, um.
     """
     wide = is_wide(width_px)
     figure, axes = new_mirror_map(mirror, width_px, title, subtitle)
@@ -386,11 +362,7 @@ def _write_moves(axes: "Axes", mirror: Mirror, panel: PanelResult) -> None:
 
 
 def draw_alignment(mirror: Mirror, result: SurveyResult, out: Path, title: str, subtitle: str = "") -> None:
-    """Draw ``surface_figure`` with the adjuster moves into a file, whose suffix tells the format (PNG, PDF, SVG).
-
-    Raises:
-        PictureError: the file cannot be written.
-    """
+    """Draw ``surface_figure`` with the adjuster moves into a file; PictureError as above."""
     if result.wavefront is not None:
         before, after = result.wavefront.before_m * _MICRO, result.wavefront.after_m * _MICRO
         title += f", half-wavefront error {before:.1f} um rms, {after:.1f} after the moves"

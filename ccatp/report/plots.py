@@ -66,11 +66,7 @@ def dress(*panels: "Axes", grid: Literal["major", "both"] = "major") -> None:
 
 
 def new_plot(width_px: float, title: str, heights_px: tuple[float, float] = (370.0, 320.0)) -> "tuple[Figure, Axes]":
-    """A figure of a page with one plot, its height for a screen or for a phone.
-
-    Args:
-        title: what it shows, for readers who cannot see it.
-    """
+    """A figure of a page with one plot, its height for a screen or for a phone; the title is its description."""
     height_px = heights_px[0] if is_wide(width_px) else heights_px[1]
     figure = new_figure(width_px / PX_PER_IN, height_px / PX_PER_IN, PX_PER_IN)
     figure.set_label(title)
@@ -124,14 +120,9 @@ def ellipse_outline(covariance: FloatArray, sigmas: float) -> FloatArray:
 
 
 def save_figure(figure: "Figure", path: Path, dpi: float | None = None) -> None:
-    """Write a figure; the same figure gives the same bytes on every day.
+    """Write a figure as PNG, PDF or SVG, by the suffix; the same figure gives the same bytes on every day.
 
-    Args:
-        path: its suffix tells the format (PNG, PDF, SVG).
-        dpi: pixels an inch, if not the figure's own.
-
-    Raises:
-        PictureError: the file cannot be written, or no such format is known.
+    ``dpi``: pixels an inch, if not the figure's own. PictureError: it cannot be written, or no such format is known.
     """
     undated: dict[str, dict[str, Any]] = {".png": {"Software": None}, ".pdf": {"CreationDate": None}}
     try:

@@ -33,21 +33,12 @@ TOPICS_READ = frozenset(("track", "truth", "arrival", "fix", "mission"))
 
 
 class EstimatedTrack(NamedTuple):
-    """Estimated poses after k frames, deck frame.
+    """Estimates after k frames, deck frame."""
 
-    Attributes:
-        seq: numbers of the frames, shape (k,).
-        t_s: robot time, shape (k,).
-        place_m: points on the surface, shape (k, 3).
-        heading_rad: shape (k,).
-        sigma_m: standard deviation of the place along any one direction, shape (k,).
-    """
-
-    seq: IntArray
-    t_s: FloatArray
-    place_m: FloatArray
-    heading_rad: FloatArray
-    sigma_m: FloatArray
+    seq: IntArray  # shape (k,)
+    t_s: FloatArray  # robot time, shape (k,)
+    place_m: FloatArray  # points on the surface, shape (k, 3)
+    sigma_m: FloatArray  # standard deviation of the place along any one direction, shape (k,)
 
 
 class TrueTrack(NamedTuple):
@@ -59,21 +50,16 @@ class TrueTrack(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedSession:
-    """One recording; a run that was resumed has several.
-
-    Attributes:
-        truth: None on a real robot.
-        changes: of the mission's state, from the log; empty where the log does not hold them in order.
-    """
+    """One recording; a run that was resumed has several."""
 
     name: str
     version: str
     track: EstimatedTrack
-    truth: TrueTrack | None
+    truth: TrueTrack | None  # None on a real robot
     arrivals: tuple[ArrivalMessage, ...]
     fixes: tuple[FixMessage, ...]
     statuses: tuple[MissionStatus, ...]
-    changes: tuple[StateChange, ...]
+    changes: tuple[StateChange, ...]  # from the log; empty where it does not hold them in order
 
     @property
     def span_s(self) -> float:
@@ -91,23 +77,16 @@ class PointOutcome(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RunFiles:
-    """What every run leaves behind, whatever its mission.
-
-    Attributes:
-        changed: keys with another value than the shipped one: value of the run, and shipped value.
-        summary: ``summary.json``; None where the run did not come to write one.
-        files: names and sizes in bytes.
-        missing: what a complete run would hold and this one does not, one line each.
-    """
+    """What every run leaves behind, whatever its mission."""
 
     name: str
     config_text: str
-    changed: Mapping[str, tuple[object, object]]
+    changed: Mapping[str, tuple[object, object]]  # keys with another value than the shipped one: both values
     is_simulation: bool | None
     summary: Mapping[str, Any] | None
     log: tuple[LogLine, ...]
-    files: Mapping[str, int]
-    missing: tuple[str, ...]
+    files: Mapping[str, int]  # sizes in bytes
+    missing: tuple[str, ...]  # what a complete run would hold and this one does not, one line each
     warnings: tuple[str, ...]
 
     @property
@@ -118,19 +97,14 @@ class RunFiles:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RunRecord(RunFiles):
-    """A survey.
-
-    Attributes:
-        points: of the mission database, by row, column and number; None where there is none.
-        injected: piston (m), tip and tilt (rad) of the simulated panels.
-    """
+    """A survey."""
 
     cfg: Config
     mirror: Mirror
     sessions: tuple[RecordedSession, ...]
-    points: tuple[StoredPoint, ...] | None
+    points: tuple[StoredPoint, ...] | None  # by row, column and number; None without a mission database
     measured: tuple[Measured, ...]
-    injected: Mapping[PanelId, Vector3] | None
+    injected: Mapping[PanelId, Vector3] | None  # piston (m), tip and tilt (rad) of the simulated panels
 
     @property
     def last_status(self) -> MissionStatus | None:
@@ -253,8 +227,7 @@ def read_recording(
 ) -> Recording | None:
     """Read a recording up to its end or its first damage; None if it cannot be read at all.
 
-    Args:
-        columns: of the topics that hold tables, whose messages become arrays of shape (k, columns).
+    Messages of topics in ``columns`` are tables and become arrays of shape (k, columns).
     """
     found: dict[str, list[Any]] = {topic: [] for topic in topics}
     damages, lost = list[str](), list[str]()
@@ -281,11 +254,7 @@ def read_recording(
 
 
 def joined(batches: Sequence[FloatArray], columns: int, needed: int) -> FloatArray:
-    """One table, the frames growing: a frame that was recorded twice counts once.
-
-    Args:
-        needed: so many first columns must be finite, otherwise the row is left out.
-    """
+    """One table, the frames growing, each once; rows whose first ``needed`` columns are not finite are left out."""
     rows = np.concatenate(batches) if batches else np.empty((0, columns))
     rows = rows[np.isfinite(rows[:, :needed]).all(axis=1)]
     _, first = np.unique(rows[:, 0], return_index=True)
@@ -328,7 +297,7 @@ def _session(
     return RecordedSession(
         name=name,
         version=found.version,
-        track=EstimatedTrack(track[:, 0].astype(np.int64), track[:, 1], deck[:, [0, 1, 3]], deck[:, 2], track[:, 7]),
+        track=EstimatedTrack(track[:, 0].astype(np.int64), track[:, 1], deck[:, [0, 1, 3]], track[:, 7]),
         truth=TrueTrack(truth[:, 0].astype(np.int64), truth[:, 5:8]) if messages["truth"] else None,
         arrivals=tuple(messages["arrival"]),
         fixes=tuple(messages["fix"]),

@@ -30,11 +30,7 @@ class Report(NamedTuple):
 
 
 def report_run(run_dir: Path, out: Path | None = None, figures: Path | None = None) -> Report:
-    """Write the report of a run.
-
-    Args:
-        out: the page; ``report.html`` in the run directory if not given.
-        figures: a directory for the figures as SVG, PNG and PDF; none are written if not given.
+    """Write the report of a run, by default into its directory, and its figures if a directory is given.
 
     Raises:
         RunReadError: no run there.

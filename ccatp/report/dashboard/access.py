@@ -29,10 +29,9 @@ class CommandRefusal(NamedTuple):
 
 
 def host_refusal(host: str | None, names: Collection[str]) -> str | None:
-    """Why a request with this header ``Host`` is not served, or ``None``.
+    """Why a request with this header ``Host`` is not served: no address, not ``localhost`` and no configured name.
 
-    A foreign name may resolve to this address, an address is always that of this machine: accepted are addresses,
-    ``localhost`` and the configured names.
+    A foreign name may resolve to this address; an address is always that of this machine.
     """
     matched = _HOST.fullmatch(host or "")
     if matched is None:
@@ -72,11 +71,7 @@ def _is_address(name: str) -> bool:
 
 
 def read_token(cfg: DashboardConfig) -> str | None:
-    """The token, without white space around it; ``None`` where none is configured.
-
-    Raises:
-        ConfigError: the file cannot be read, is open to others, or holds no token.
-    """
+    """The token, ``None`` where none is configured; ConfigError: it cannot be read, is open to others, or is none."""
     if not cfg.token_file:
         return None
     path = Path(cfg.token_file)

@@ -215,11 +215,7 @@ def build_app(
 ) -> ASGIApp:
     """The application.
 
-    Args:
-        ground: what does not change during a run, see ``survey_view.ground``.
-        host_names: names of the page besides localhost and addresses.
-        token: required with commands, unless ``None``.
-        note: writes a line to the log.
+    ``ground`` is what does not change during a run, see ``survey_view.ground``; ``token`` is required with commands.
     """
     static = StaticFiles(directory=STATIC)
     ground_json = msgspec.json.encode(ground)

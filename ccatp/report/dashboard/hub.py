@@ -31,10 +31,7 @@ MAX_MESSAGES = 2_000
 
 
 class BusReader:
-    """Subscriptions of the dashboard: rare topics always, the others on request.
-
-    No publisher waits for them: a run starts when its own processes have subscribed.
-    """
+    """Subscriptions of the dashboard: rare topics always, the others on request; no publisher waits for them."""
 
     def __init__(
         self,

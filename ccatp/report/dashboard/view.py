@@ -48,22 +48,17 @@ class Loss(NamedTuple):
 
 
 class Links:
-    """Age of the last message of each process; ``now_s`` is the machine's monotonic clock, as are their time stamps.
-
-    Attributes:
-        picture_s: when main published its last display state; None while none is requested: its absence is no loss.
-        fix_s: when the last fix came.
-        restarts: of each process, as far as they were seen from here.
-    """
+    """Age of the last message of each process; times are the machine's monotonic clock."""
 
     def __init__(self, *, has_laser: bool = True) -> None:
         self._has_laser = has_laser
         self._liveness = Liveness()
         self._presences: dict[str, Heartbeat] = {}
         self._cut_s: dict[str, float] = {}
-        self.restarts = dict.fromkeys(LOOPS, 0)
+        self.restarts = dict.fromkeys(LOOPS, 0)  # as far as they were seen from here
+        # Of the last display state; None while none is requested: its absence is no loss.
         self.picture_s: float | None = None
-        self.fix_s: float | None = None
+        self.fix_s: float | None = None  # of the last fix
         self.is_over = False
 
     def presence(self, presence: Heartbeat) -> None:
@@ -186,9 +181,9 @@ class Trail(Growing):
 
 
 class Lines:
-    """The last messages to the operator: of each kind the newest, and how many of that kind there were.
+    """The last messages to the operator, of each kind the newest.
 
-    A row is the robot's time (s), the level, the text, the number of messages of its kind, and the kind's number.
+    Rows: robot time (s), level, text, number of messages of its kind, number of the kind.
     """
 
     def __init__(self, limit: int) -> None:
@@ -281,17 +276,13 @@ _line = msgspec.json.Decoder(Sensors)
 
 
 class RunStateView:
-    """Keeps the state of a run up to date, and returns what is new; a subclass adds that of its kind of mission.
-
-    Attributes:
-        is_tracking: the path arrives as it is driven; otherwise it has only the stops.
-    """
+    """Keeps the state of a run up to date, and returns what is new; a subclass adds that of its kind of mission."""
 
     def __init__(self, *, points: int, is_sim: bool, series: Iterable[str], has_laser: bool = True) -> None:
         self._is_sim = is_sim
         self.links = Links(has_laser=has_laser)
         self.status: MissionStatus | None = None
-        self.is_tracking = False
+        self.is_tracking = False  # the path arrives as it is driven; otherwise it has only the stops
         self._status_s = self._verdict_s = float("-inf")
         self._picture: DisplayState | None = None
         self._sensors: Sensors | None = None
