@@ -59,12 +59,14 @@ POINT_COUNTS = {"planned": "total", "measured": "done", "skipped": "skipped"}
 class StateCollector(Collector):
     """Collects the state of a run as metrics of Prometheus at each request; ``ground`` is that of the page."""
 
-    def __init__(self, hub: StateBroadcaster, ground: Mapping[str, Any]) -> None:
-        self._hub, self._ground = hub, ground
+    def __init__(
+        self, state: Callable[[], Mapping[str, Any]], pages: Callable[[], int], ground: Mapping[str, Any]
+    ) -> None:
+        self._state, self._pages, self._ground = state, pages, ground
 
     def collect(self) -> Iterator[Metric]:
         """All metrics that have a value."""
-        return (metric for metric in self._all(self._hub.state()) if metric.samples)
+        return (metric for metric in self._all(self._state()) if metric.samples)
 
     def _all(self, state: Mapping[str, Any]) -> Iterator[Metric]:
         info = GaugeMetricFamily("ccatp_info", "What runs.", labels=("mirror", "simulation", "version"))
@@ -72,7 +74,7 @@ class StateCollector(Collector):
         yield info
         up = not state["trouble"]
         yield _gauge("up", "1 when both loops report and the robot sends frames.", [("", up)])
-        yield _gauge("dashboard_pages", "Open pages.", [("", self._hub.pages)])
+        yield _gauge("dashboard_pages", "Open pages.", [("", self._pages())])
         links = state["links"]
         yield _gauge("link_up", "1 when that end reports.", [(link.name, link.is_well) for link in links], "link")
         ages = [(link.name, link.age_s) for link in links]
@@ -220,7 +222,7 @@ def build_app(
     static = StaticFiles(directory=STATIC)
     ground_json = msgspec.json.encode(ground)
     registry = CollectorRegistry()
-    registry.register(StateCollector(hub, ground))
+    registry.register(StateCollector(hub.state, lambda: hub.pages, ground))
 
     async def page(request: Request) -> Response:
         return await static.get_response("index.html", request.scope)

@@ -41,19 +41,9 @@ ALL: dict[str, Any] = NOTHING | {
 }  # fmt: skip
 
 
-class Hub:
-    """A state, and open pages."""
-
-    def __init__(self, state: dict[str, Any], pages: int) -> None:
-        self._state, self.pages = state, pages
-
-    def state(self) -> dict[str, Any]:
-        return self._state
-
-
 def metrics_of(state: dict[str, Any], pages: int = 0, **ground: Any) -> dict[str, dict[tuple[str, ...], float]]:
     registry = CollectorRegistry()
-    registry.register(StateCollector(Hub(state, pages), GROUND | ground))
+    registry.register(StateCollector(lambda: state, lambda: pages, GROUND | ground))
     return parse(generate_latest(registry).decode())
 
 
