@@ -306,7 +306,8 @@ def _draw_paths(
 def _draw_beacons(axes: "Axes", run: RecordedRun, beacons: dict[str, BeaconFix]) -> None:
     surveyed = np.array([run.beacon_truth_m[name] for name in beacons if name in run.beacon_truth_m]).reshape(-1, 2)
     if surveyed.size:
-        axes.scatter(*surveyed.T, marker="x", s=46, linewidths=1.6, color=INK, zorder=6, label="surveyed beacon")
+        x, y = surveyed.T
+        axes.scatter(x, y, marker="x", s=46, linewidths=1.6, color=INK, zorder=6, label="surveyed beacon")
     for k, (name, fix) in enumerate(beacons.items()):
         label = "beacon, 3 sigma" if k == 0 else "_"
         axes.plot(fix.x_m, fix.y_m, "o", color=_MAP, markersize=4.5, zorder=7, label=label)

@@ -108,7 +108,7 @@ def _add_bar(axes: "Axes", drawn: "ScalarMappable", label: str, width_px: float,
         "location": "bottom", "aspect": 30,
     }  # fmt: skip
     bar = figure.colorbar(drawn, ax=axes, pad=0.01, **place, **look)  # type: ignore[union-attr]
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=8, color=QUIET, labelcolor=INK)
     bar.set_label(label, fontsize=8.5, color=INK)
     if bar.solids is not None:
@@ -135,7 +135,8 @@ def run_map(
     subtitle: str | None = None, path_label: str = "driven path", error_label: str = "arrival error, mm",
 ) -> "Figure":  # fmt: skip
     """The driven path (deck frame, shape (n, 2), parted by NaN), and each point coloured by its arrival error."""
-    from matplotlib.colors import LinearSegmentedColormap  # noqa: PLC0415
+    from matplotlib.cm import ScalarMappable  # noqa: PLC0415
+    from matplotlib.colors import LinearSegmentedColormap, Normalize  # noqa: PLC0415
 
     wide = is_wide(width_px)
     figure, axes = new_mirror_map(mirror, width_px, title, subtitle)
@@ -159,12 +160,14 @@ def run_map(
                     "linewidths": 0.6 if wide else 0.3, "zorder": 5}),
     )  # fmt: skip
     for some, look in looks:
-        if some or some is measured:
-            x, y = [point.x_m for point in some], [point.y_m for point in some]
-            dots = axes.scatter(x, y, **{"zorder": 4.5, **look})
-            if wide and some and some is not failed and all(point.title for point in some):
-                add_tooltips(dots, [point.title for point in some])
-    _add_bar(axes, dots, error_label, width_px, extend="max" if largest > top else "neither")
+        if not some:
+            continue
+        x, y = [point.x_m for point in some], [point.y_m for point in some]
+        dots = axes.scatter(x, y, **{"zorder": 4.5, **look})
+        if wide and some is not failed and all(point.title for point in some):
+            add_tooltips(dots, [point.title for point in some])
+    scale = ScalarMappable(Normalize(0.0, top), colours)
+    _add_bar(axes, scale, error_label, width_px, extend="max" if largest > top else "neither")
     add_legend(axes)
     return figure
 
@@ -298,8 +301,9 @@ def surface_figure(
     kept = [np.column_stack([p.deviations.deck_m, p.deviations.values_m * _MICRO])[p.is_kept] for p in panels]
     if kept:
         x, y, heights = np.concatenate(kept).T
+        colours: dict[str, Any] = {"c": heights, "cmap": drawn.cmap, "norm": drawn.norm}
         look: dict[str, Any] = {"edgecolors": QUIET, "linewidths": 0.3, "zorder": 5, "label": "measured point"}
-        axes.scatter(x, y, c=heights, cmap=drawn.cmap, norm=drawn.norm, s=size, **look)
+        axes.scatter(x, y, s=size, **colours, **look)
     outliers = [panel.deviations.deck_m[~panel.is_kept] for panel in panels if not panel.is_kept.all()]
     if outliers:
         x, y = np.concatenate(outliers).T
