@@ -25,8 +25,7 @@ from ccatp.errors import CcatpError, ExitStatus
 
 if TYPE_CHECKING:
     from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun
-    from ccatp.config.beacon_models import CricketConfig
-    from ccatp.config.recording_models import RecordingConfig, RecordingsConfig
+    from ccatp.config.beacon_models import CricketConfig, RecordingConfig, RecordingsConfig
 
 
 FORMATS = ("plaza", "mrclam", "labyrinth", "csv")

@@ -1,8 +1,6 @@
-"""Frozen configuration models of missions among beacons: goals, dangers, robot link, incidents.
+"""Frozen configuration models of robots among radio beacons and of recorded radio data.
 
-Frozen configuration models of ultrasonic motes that map themselves. Values live in ``configs/radio.toml``.
-
-Frozen configuration models of the robots among radio beacons. Values live in ``configs/radio.toml``.
+Values live in ``configs/radio.toml`` and ``configs/recordings.toml``.
 """
 
 from typing import Annotated, Literal
@@ -23,9 +21,19 @@ from ccatp.config.models import (
 
 # Frames come ten times a second: what is older than two of them is stale.
 SlowFreshness = Annotated[float, Field(gt=0.0, le=1.0)]
-RadioName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
-Place = Annotated[float, Field(ge=-1e3, le=1e3)]
-Laps = Annotated[int, Field(ge=1, le=1000)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+Length = Annotated[float, Field(ge=-1e3, le=1e3)]
+Coordinates = Annotated[tuple[Length, ...], Field(min_length=2, max_length=3)]
+Angle = Annotated[float, Field(ge=-6.2832, le=6.2832)]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Share = Annotated[float, Field(ge=0.0, lt=1.0)]
+Level = Annotated[float, Field(ge=-150.0, le=30.0)]  # dBm: from below any receiver's noise to a watt
+Decibel = Annotated[float, Field(ge=0.0, le=60.0)]
+Exponent = Annotated[float, Field(gt=0.5, le=8.0)]
+Celsius = Annotated[float, Field(ge=-60.0, le=80.0)]
+Many = Annotated[int, Field(ge=1, le=100_000)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+Membership = tuple[float, float, float, float]
 
 
 class BeaconRobotConfig(LinkConfig):
@@ -40,7 +48,7 @@ class BeaconRobotConfig(LinkConfig):
 class BeaconMissionConfig(Model):
     """What the robot is there for, and when that takes too long."""
 
-    laps: Laps  # how often all waypoints are visited
+    laps: Annotated[int, Field(ge=1, le=1000)]  # how often all waypoints are visited
     follow_s: Positive  # how long a target is followed
     time_limit_s: Positive  # a mission that takes longer is held for an operator
     verdict_timeout_s: SlowFreshness
@@ -68,7 +76,7 @@ class BeaconDangerConfig(Model):
 class ListenerConfig(Model):
     """How the robot hears ultrasonic motes."""
 
-    name: RadioName  # of the robot's own listener, in readings
+    name: Name  # of the robot's own listener, in readings
     pulses_per_frame: Annotated[int, Field(ge=1, le=20)]  # motes that send in one frame, one after the other
     mapping_rounds: Annotated[int, Field(ge=1, le=10_000)]  # in which motes report what they hear of each other
     gate_probability: Annotated[float, Field(gt=0.5, lt=1.0)]  # a range less likely than this is not used
@@ -88,7 +96,7 @@ class RadioLossConfig(Model):
     type: Literal["radio_loss"]
     at_s: NonNegative
     for_s: Positive
-    beacons: tuple[RadioName, ...]  # empty: all of them
+    beacons: tuple[Name, ...]  # empty: all of them
 
 
 class ObstacleIncidentConfig(Model):
@@ -97,8 +105,8 @@ class ObstacleIncidentConfig(Model):
     type: Literal["obstacle"]
     at_s: NonNegative
     for_s: Positive
-    x_m: Place
-    y_m: Place
+    x_m: Length
+    y_m: Length
     radius_m: Positive
 
 
@@ -112,14 +120,6 @@ class TargetApproachConfig(Model):
 
 
 IncidentConfig = Annotated[RadioLossConfig | ObstacleIncidentConfig | TargetApproachConfig, Field(discriminator="type")]
-
-MoteName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
-Coordinates = Annotated[tuple[Annotated[float, Field(ge=-1e3, le=1e3)], ...], Field(min_length=2, max_length=3)]
-Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
-Celsius = Annotated[float, Field(ge=-60.0, le=80.0)]
-Off = Annotated[float, Field(ge=0.0, le=3.1416)]
-Draws = Annotated[int, Field(ge=0, le=100_000)]
-Many = Annotated[int, Field(ge=1, le=100_000)]
 
 
 class MotePlaceConfig(Model):
@@ -157,7 +157,7 @@ class TransducerConfig(Model):
     """Where a mote hears another: reach against the angle off the axis."""
 
     is_omnidirectional: bool
-    off_axis_rad: Annotated[tuple[Off, ...], Field(min_length=2)]
+    off_axis_rad: Annotated[tuple[Annotated[float, Field(ge=0.0, le=3.1416)], ...], Field(min_length=2)]
     reach_m: Annotated[tuple[NonNegative, ...], Field(min_length=2)]
     nearest_m: NonNegative
 
@@ -166,7 +166,7 @@ class PhaseOneConfig(Model):
     """Trilateration."""
 
     max_dop: Positive
-    draws: Draws  # 0, or many
+    draws: Annotated[int, Field(ge=0, le=100_000)]  # 0, or many
 
 
 class PhaseTwoConfig(Model):
@@ -212,10 +212,10 @@ class CricketConfig(Model):
 
     dimension: Literal[2, 3]
     layout: Literal["networks", "motes", "random"]
-    anchors: dict[MoteName, Coordinates]
-    networks: dict[MoteName, MotePlaceConfig]
+    anchors: dict[Name, Coordinates]
+    networks: dict[Name, MotePlaceConfig]
     stand_m: Annotated[tuple[Coordinates, ...], Field(min_length=1)]
-    motes: dict[MoteName, MotePlaceConfig]
+    motes: dict[Name, MotePlaceConfig]
     random: RandomMotesConfig
     air: AirConfig
     ranging: RangingConfig
@@ -224,18 +224,6 @@ class CricketConfig(Model):
     phase2: PhaseTwoConfig
     batch: BatchConfig
     sim: MoteSimConfig
-
-
-Probability = Annotated[float, Field(ge=0.0, le=1.0)]
-Share = Annotated[float, Field(ge=0.0, lt=1.0)]
-Angle = Annotated[float, Field(ge=-6.2832, le=6.2832)]
-Length = Annotated[float, Field(ge=-1e3, le=1e3)]
-Level = Annotated[float, Field(ge=-150.0, le=30.0)]  # dBm: from below any receiver's noise to a watt
-Decibel = Annotated[float, Field(ge=0.0, le=60.0)]
-Exponent = Annotated[float, Field(gt=0.5, le=8.0)]
-Count = Annotated[int, Field(ge=1, le=1_000_000)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
-Membership = tuple[float, float, float, float]
 
 
 class RadioRunConfig(Model):
@@ -407,7 +395,7 @@ class SimRadioConfig(Model):
     beam_width_rad: Positive
     front_to_back_db: Decibel
     resolution_db: Decibel
-    loss_probability: Probability
+    loss_probability: Fraction
     obstacle_loss_db: Decibel
     sensitivity_dbm: Level
 
@@ -482,3 +470,86 @@ class RadioConfig(Model):
     dashboard: DashboardConfig
     sim: RadioSimConfig
     cricket: CricketConfig
+
+
+# -- recorded data ----------------------------------------------------------------------------------------------------
+
+
+class OdometryNoiseConfig(Model):
+    """Random walks of the odometry: standard deviations after a metre, a radian, a second."""
+
+    distance_per_sqrt_m: NonNegative
+    distance_per_sqrt_rad: NonNegative
+    turn_per_sqrt_m: NonNegative
+    turn_per_sqrt_rad: NonNegative
+    turn_per_sqrt_s: NonNegative
+    lateral_per_sqrt_m: NonNegative
+
+
+class RadioNoiseConfig(Model):
+    """Noise of the readings."""
+
+    range_sigma_m: Positive
+    range_sigma_per_m: NonNegative
+    bearing_sigma_rad: Positive
+    rssi_sigma_db: Positive
+    rssi_reference_dbm: Level
+    rssi_exponent: Exponent
+    freedom: Annotated[float, Field(ge=1.0)]  # of Student's t
+    correlation_s: NonNegative
+    gate_sigmas: Positive
+
+
+class PriorsConfig(Model):
+    """Standard deviations, before any reading, of what is calibrated on the way; 0: not estimated."""
+
+    distance_scale: NonNegative
+    turn_scale: NonNegative
+    turn_per_m: NonNegative
+    turn_bias_rad_s: NonNegative
+    delay_s: NonNegative
+    range_scale: NonNegative
+    range_offset_m: NonNegative
+    bearing_offset_rad: NonNegative
+    rssi_reference_db: NonNegative
+    rssi_exponent: NonNegative
+    beacon_offset_m: NonNegative
+    beacon_reference_db: NonNegative
+    pose_m: Positive
+    heading_rad: Positive
+
+
+class RecordingConfig(Model):
+    """One format."""
+
+    odometry: OdometryNoiseConfig
+    radio: RadioNoiseConfig
+    priors: PriorsConfig
+
+
+class SlamFilterConfig(Model):
+    """How the filter takes readings, of whatever format."""
+
+    knee_sigmas: Positive
+    learn_memory: NonNegative
+    learn_prior: Positive
+    doubt_pose_after: Annotated[int, Field(ge=1)]
+    doubt_beacon_after: Annotated[int, Field(ge=1)]
+    jump_m: Positive
+    jump_rad: Positive
+    transports: bool
+    wander_share: Annotated[float, Field(ge=0.0, lt=1.0)]
+    wander_length_m: Positive
+    rest_speed_m_s: NonNegative
+    rest_turn_rad_s: NonNegative
+    turn_bias_walk_rad_s_sqrt_s: NonNegative
+
+
+class RecordingsConfig(Model):
+    """All formats."""
+
+    plaza: RecordingConfig
+    mrclam: RecordingConfig
+    labyrinth: RecordingConfig
+    csv: RecordingConfig
+    filter: SlamFilterConfig

@@ -1,16 +1,17 @@
-"""What one value of the configuration demands of another, and values that look like another unit."""
+"""What one value of a configuration demands of another, and values that look like another unit."""
 
 import ipaddress
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import PurePath
 
 from pydantic import BaseModel
 
+from ccatp.config.beacon_models import CricketConfig, FuzzyConfig, RadioConfig
 from ccatp.config.messages import ConfigProblem, Key, choice_hint, slip_hint
 from ccatp.config.models import (
-    AlignConfig,
     Config,
     DashboardConfig,
     LimitsConfig,
@@ -24,6 +25,7 @@ from ccatp.config.models import (
 
 FILTERS = ("kf", "ekf", "ukf")
 ORDERS = ("thesis", "optimised", "calibration")
+FUZZY_INPUTS = ("distance_m", "heading_error_rad")
 
 MIN_COLLIMATORS = 4  # three unknowns and one length to spare, interface control document 2
 _LARGEST_LENGTH_M = 2.0  # no length outside the mirror's own files reaches it
@@ -36,19 +38,24 @@ _PITCH_AGREEMENT_MM = 0.1  # the fitted pitches of the telescope differ by up to
 _TCP_ENDPOINT = re.compile(r"tcp://[^\s/@;]+:(\d{1,5})")
 _LARGEST_PORT = 65535
 _CORNERS = ((1, 1, "front-left"), (1, -1, "front-right"), (-1, 1, "rear-left"), (-1, -1, "rear-right"))
+_ANCHORS = 2  # A is the origin, B shows the second axis
+_LEAST_DRAWS = 200
+_LEAST_NETWORK = 3  # motes of a stand that can trilaterate others in the plane
+
+Problems = Iterator[ConfigProblem]
 
 
 def check_config(cfg: Config) -> list[ConfigProblem]:
-    """Everything wrong with a configuration whose values are each in range."""
+    """Everything wrong with a survey's configuration whose values are each in range."""
     return [
-        *_check_names(cfg),
+        *_check_run(cfg),
         *_check_units(cfg),
         *_check_wheels(cfg.robot, cfg.limits),
         *_check_edge_sensors(cfg.robot),
         *_check_world(cfg.world, cfg.sim.robot),
-        *_check_light(cfg.align),
+        *_check_light(cfg),
         *_check_observatory(cfg.observatory),
-        *check_dashboard(cfg.dashboard),
+        *_check_dashboard(cfg.dashboard),
         *_check_stand_ins(cfg),
         *_check_standstill(cfg),
         *_check_panels(cfg.mirror.panels),
@@ -57,26 +64,42 @@ def check_config(cfg: Config) -> list[ConfigProblem]:
     ]
 
 
+def check_radio_config(cfg: RadioConfig, *, simulates: bool = True) -> list[ConfigProblem]:
+    """Everything wrong with a configuration among beacons whose values are each in range.
+
+    ``simulates`` says whether the field of motes is simulated; of measured ranges, layout and places have no say.
+    """
+    motes = cfg.cricket
+    return [
+        *_check_fuzzy(cfg.control.fuzzy),
+        *_check_follow(cfg),
+        *_check_room(cfg),
+        *([*_check_layout(motes), *_check_places(motes)] if simulates else []),
+        *_check_motes(motes),
+        *_check_dashboard(cfg.dashboard),
+    ]
+
+
 def is_file_name(name: str) -> bool:
     """Whether ``run.mirror`` or ``run.world`` is the path of a file instead of a name."""
     return name.endswith(".toml") or "/" in name
 
 
-def _check_names(cfg: Config) -> Iterator[ConfigProblem]:
-    if cfg.run.filter not in FILTERS:
-        yield ConfigProblem(
-            ("run", "filter"), f'= "{cfg.run.filter}" is no filter; {choice_hint(cfg.run.filter, FILTERS)}'
-        )
-    if cfg.run.order not in ORDERS:
-        yield ConfigProblem(
-            ("run", "order"), f'= "{cfg.run.order}" is no traversal order; {choice_hint(cfg.run.order, ORDERS)}'
-        )
+def _choice(key: Key, name: str, names: Iterable[str], kind: str) -> Problems:
+    if name not in (names := list(names)):
+        yield ConfigProblem(key, f'= "{name}" is no {kind}; {choice_hint(name, names)}')
+
+
+# -- surveys of mirrors -----------------------------------------------------------------------------------------------
+
+
+def _check_run(cfg: Config) -> Problems:
+    yield from _choice(("run", "filter"), cfg.run.filter, FILTERS, "filter")
+    yield from _choice(("run", "order"), cfg.run.order, ORDERS, "traversal order")
     if cfg.run.panels > (there := cfg.mirror.panels.count):
         what = f"= {cfg.run.panels}, but {cfg.mirror.name} has {there} panels; 0 takes all of them"
         yield ConfigProblem(("run", "panels"), what)
-    gains, sets = cfg.control.gains, cfg.control.gain_sets
-    if gains not in sets:
-        yield ConfigProblem(("control", "gains"), f'= "{gains}" is no set of gains; {choice_hint(gains, sets)}')
+    yield from _choice(("control", "gains"), cfg.control.gains, cfg.control.gain_sets, "set of gains")
     for section, named, found in (
         ("mirror", cfg.run.mirror, cfg.mirror.name),
         ("world", cfg.run.world, cfg.world.name),
@@ -86,7 +109,7 @@ def _check_names(cfg: Config) -> Iterator[ConfigProblem]:
             yield ConfigProblem((section, "name"), what, (("run", section),))
 
 
-def _check_units(cfg: Config) -> Iterator[ConfigProblem]:
+def _check_units(cfg: Config) -> Problems:
     """Lengths and angles that have no limit of their own, but that nobody can have meant."""
     for name in type(cfg).model_fields:
         if name != "mirror":
@@ -95,24 +118,24 @@ def _check_units(cfg: Config) -> Iterator[ConfigProblem]:
     yield from _slips(cfg.mirror.base, ("mirror", "base"))
 
 
-def _slips(value: object, key: Key) -> Iterator[ConfigProblem]:
+def _slips(value: object, key: Key) -> Problems:
+    items: Iterable[tuple[str | int, object]] = ()
     if isinstance(value, BaseModel):
-        for name in type(value).model_fields:
-            yield from _slips(getattr(value, name), (*key, name))
+        items = value
     elif isinstance(value, dict):
-        for name, item in value.items():
-            yield from _slips(item, (*key, name))
+        items = value.items()
     elif isinstance(value, tuple):
-        for index, item in enumerate(value):
-            yield from _slips(item, (*key, index))
+        items = enumerate(value)
     elif isinstance(value, float):
         name = next(part for part in reversed(key) if isinstance(part, str))
         largest = {"rad": _LARGEST_ANGLE_RAD, "m": _LARGEST_LENGTH_M}.get(name.rsplit("_", 1)[-1], math.inf)
         if abs(value) > largest:
             yield ConfigProblem(key, f"= {value:g} must be at most {largest:.4g}{slip_hint(key, value)}")
+    for part, item in items:
+        yield from _slips(item, (*key, part))
 
 
-def _check_wheels(robot: RobotConfig, limits: LimitsConfig) -> Iterator[ConfigProblem]:
+def _check_wheels(robot: RobotConfig, limits: LimitsConfig) -> Problems:
     """The wheels must be able to give the motion that the limits allow."""
     rim_m_s = robot.max_wheel_rad_s * robot.wheel_radius_m
     formula = "max_wheel_rad_s * wheel_radius_m"
@@ -127,7 +150,7 @@ def _check_wheels(robot: RobotConfig, limits: LimitsConfig) -> Iterator[ConfigPr
         yield ConfigProblem(("limits", "omega_max_rad_s"), what, (*wheels, ("robot", "wheel_base_m")))
 
 
-def _check_edge_sensors(robot: RobotConfig) -> Iterator[ConfigProblem]:
+def _check_edge_sensors(robot: RobotConfig) -> Problems:
     """Order front-left, front-right, rear-left, rear-right; x to the front, y to the left."""
     for index, ((x, y), (sign_x, sign_y, corner)) in enumerate(zip(robot.edge_sensors_m, _CORNERS, strict=True)):
         if x * sign_x <= 0.0 or y * sign_y <= 0.0:
@@ -138,7 +161,7 @@ def _check_edge_sensors(robot: RobotConfig) -> Iterator[ConfigProblem]:
             yield ConfigProblem(("robot", "edge_sensors_m", index), what)
 
 
-def _check_world(world: WorldConfig, sim: SimRobotConfig) -> Iterator[ConfigProblem]:
+def _check_world(world: WorldConfig, sim: SimRobotConfig) -> Problems:
     """Slip has a range; a delay is a number of frames, and what it delays must not be too old when it arrives."""
     if world.slip_min > world.slip_max:
         what = f"= {world.slip_min:g} is more than slip_max = {world.slip_max:g}"
@@ -155,7 +178,13 @@ def _check_world(world: WorldConfig, sim: SimRobotConfig) -> Iterator[ConfigProb
             yield ConfigProblem(("world", name), what, (("sim", "robot", "ttl_s"), ("sim", "robot", "frame_hz")))
 
 
-def _check_observatory(observatory: ObservatoryConfig) -> Iterator[ConfigProblem]:
+def _check_light(cfg: Config) -> Problems:
+    for name, light in cfg.align.light.items():
+        if not any(light.direction_world):
+            yield ConfigProblem(("align", "light", name, "direction_world"), "= [0, 0, 0] is no direction")
+
+
+def _check_observatory(observatory: ObservatoryConfig) -> Problems:
     """TCP only with a key and a list of clients."""
     root = "observatory"
     if not observatory.endpoint:
@@ -171,7 +200,7 @@ def _check_observatory(observatory: ObservatoryConfig) -> Iterator[ConfigProblem
             yield ConfigProblem((root, name), what, ((root, "endpoint"),))
 
 
-def check_dashboard(dashboard: DashboardConfig) -> Iterator[ConfigProblem]:
+def _check_dashboard(dashboard: DashboardConfig) -> Problems:
     """Whoever reaches the page may stop the robot, unless there is a token."""
     if not (is_loopback(dashboard.host) or dashboard.token_file):
         what = f'= "{dashboard.host}" is beyond this machine; name a file with a token in dashboard.token_file'
@@ -186,7 +215,7 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def _check_stand_ins(cfg: Config) -> Iterator[ConfigProblem]:
+def _check_stand_ins(cfg: Config) -> Problems:
     """Whoever reaches a stand-in may command it, unless there is a key."""
     if cfg.sim.open_to_network:
         return
@@ -199,7 +228,7 @@ def _check_stand_ins(cfg: Config) -> Iterator[ConfigProblem]:
         yield ConfigProblem(("sim", "etalon", "host"), what)
 
 
-def _check_standstill(cfg: Config) -> Iterator[ConfigProblem]:
+def _check_standstill(cfg: Config) -> Problems:
     """Nothing is measured before the robot has stood still for long enough."""
     time_s = cfg.control.settle_time_s + cfg.etalon.measuring_time_s
     if time_s < _LEAST_STANDSTILL_S:
@@ -210,7 +239,7 @@ def _check_standstill(cfg: Config) -> Iterator[ConfigProblem]:
         yield ConfigProblem(("etalon", "measuring_time_s"), what, (("control", "settle_time_s"),))
 
 
-def _check_panels(panels: PanelsConfig) -> Iterator[ConfigProblem]:
+def _check_panels(panels: PanelsConfig) -> Problems:
     root: Key = ("mirror", "panels")
     for name in ("size_x_mm", "size_y_mm", "pitch_x_mm", "pitch_y_mm"):
         value = getattr(panels, name)
@@ -226,23 +255,19 @@ def _check_panels(panels: PanelsConfig) -> Iterator[ConfigProblem]:
         if n > panels.cols or (panels.cols - n) % 2:
             what = f"= {n} panels cannot be centred on cols = {panels.cols}; both even or both odd, and not more"
             yield ConfigProblem((*rows, row), what, ((*root, "cols"),))
-    yield from _check_grid(panels, "x", root)
-    yield from _check_grid(panels, "y", root)
+    for axis in "xy":
+        size, pitch = getattr(panels, f"size_{axis}_mm"), getattr(panels, f"pitch_{axis}_mm")
+        size_key: Key = (*root, f"size_{axis}_mm")
+        if abs(pitch - size - panels.gap_mm) > _PITCH_AGREEMENT_MM:
+            what = f"= {pitch:g} must be size + gap = {size + panels.gap_mm:g}"
+            yield ConfigProblem((*root, f"pitch_{axis}_mm"), what, (size_key, (*root, "gap_mm")))
+        low, middle, high = getattr(panels, f"points_{axis}_mm")
+        if not -size / 2.0 < low < middle < high < size / 2.0:
+            what = f"= [{low:g}, {middle:g}, {high:g}] must ascend within the panel, {-size / 2.0:g} to {size / 2.0:g}"
+            yield ConfigProblem((*root, f"points_{axis}_mm"), what, (size_key,))
 
 
-def _check_grid(panels: PanelsConfig, axis: str, root: Key) -> Iterator[ConfigProblem]:
-    size, pitch = getattr(panels, f"size_{axis}_mm"), getattr(panels, f"pitch_{axis}_mm")
-    size_key: Key = (*root, f"size_{axis}_mm")
-    if abs(pitch - size - panels.gap_mm) > _PITCH_AGREEMENT_MM:
-        what = f"= {pitch:g} must be size + gap = {size + panels.gap_mm:g}"
-        yield ConfigProblem((*root, f"pitch_{axis}_mm"), what, (size_key, (*root, "gap_mm")))
-    low, middle, high = getattr(panels, f"points_{axis}_mm")
-    if not -size / 2.0 < low < middle < high < size / 2.0:
-        what = f"= [{low:g}, {middle:g}, {high:g}] must ascend within the panel, {-size / 2.0:g} to {size / 2.0:g}"
-        yield ConfigProblem((*root, f"points_{axis}_mm"), what, (size_key,))
-
-
-def _check_base(mirror: MirrorConfig) -> Iterator[ConfigProblem]:
+def _check_base(mirror: MirrorConfig) -> Problems:
     """The base must stand on a panel that exists."""
     base, panels, root = mirror.base, mirror.panels, ("mirror", "base")
     rows = len(panels.panels_per_row)
@@ -257,18 +282,11 @@ def _check_base(mirror: MirrorConfig) -> Iterator[ConfigProblem]:
     for axis in "xy":
         value, half = getattr(base, f"{axis}_mm"), getattr(panels, f"size_{axis}_mm") / 2.0
         if abs(value) >= half:
-            yield ConfigProblem(
-                (*root, f"{axis}_mm"), f"= {value:g} is off the panel, which reaches from {-half:g} to {half:g}"
-            )
+            what = f"= {value:g} is off the panel, which reaches from {-half:g} to {half:g}"
+            yield ConfigProblem((*root, f"{axis}_mm"), what)
 
 
-def _check_light(align: AlignConfig) -> Iterator[ConfigProblem]:
-    for name, light in align.light.items():
-        if not any(light.direction_world):
-            yield ConfigProblem(("align", "light", name, "direction_world"), "= [0, 0, 0] is no direction")
-
-
-def _check_collimators(mirror: MirrorConfig) -> Iterator[ConfigProblem]:
+def _check_collimators(mirror: MirrorConfig) -> Problems:
     channels, positions = mirror.collimators.channels, mirror.collimators.positions_world_mm
     root: Key = ("mirror", "collimators")
     if len(channels) < MIN_COLLIMATORS:
@@ -276,12 +294,104 @@ def _check_collimators(mirror: MirrorConfig) -> Iterator[ConfigProblem]:
     if len(set(channels)) != len(channels):
         yield ConfigProblem((*root, "channels"), f"= {list(channels)} names a channel twice")
     if len(channels) != len(positions):
-        yield ConfigProblem(
-            (*root, "positions_world_mm"),
-            f"has {len(positions)} positions for {len(channels)} channels",
-            ((*root, "channels"),),
-        )
+        what = f"has {len(positions)} positions for {len(channels)} channels"
+        yield ConfigProblem((*root, "positions_world_mm"), what, ((*root, "channels"),))
     for index, position in enumerate(positions):
         if math.hypot(*position) < _NEAREST_COLLIMATOR_MM:
             what = f"= {list(position)} is {math.hypot(*position):.3g} mm from the world's origin; looks like metres"
             yield ConfigProblem((*root, "positions_world_mm", index), what)
+
+
+# -- robots among radio beacons ---------------------------------------------------------------------------------------
+
+
+def _check_fuzzy(fuzzy: FuzzyConfig) -> Problems:
+    root = ("control", "fuzzy")
+    for name, given in fuzzy.inputs.items():
+        if name not in FUZZY_INPUTS:
+            yield ConfigProblem((*root, "inputs", name), f"is no input of the speed; {choice_hint(name, FUZZY_INPUTS)}")
+        for term, corners in given.terms.items():
+            if list(corners) != sorted(corners):
+                what = f"= {list(corners)} must rise: left foot, left shoulder, right shoulder, right foot"
+                yield ConfigProblem((*root, "inputs", name, "terms", term), what)
+    for index, rule in enumerate(fuzzy.rules):
+        key = (*root, "rules", index)
+        yield from _choice((*key, "then"), rule.then, fuzzy.outputs, "output")
+        for name, term in rule.when.items():
+            if name not in fuzzy.inputs:
+                yield ConfigProblem((*key, "when"), f'names "{name}", no input; {choice_hint(name, fuzzy.inputs)}')
+            else:
+                yield from _choice((*key, "when", name), term, fuzzy.inputs[name].terms, "term of it")
+
+
+def _check_follow(cfg: RadioConfig) -> Problems:
+    follow, avoidance = cfg.follow, cfg.avoidance
+    if follow.is_active and follow.target in cfg.sim.beacons:
+        what = f'= "{follow.target}" is also a static beacon of sim.beacons; give the radio that moves its own name'
+        yield ConfigProblem(("follow", "target"), what)
+    if follow.band_m >= follow.safe_distance_m:
+        what = f"= {follow.band_m:g} must be less than follow.safe_distance_m = {follow.safe_distance_m:g}"
+        yield ConfigProblem(("follow", "band_m"), what, (("follow", "safe_distance_m"),))
+    if avoidance.stop_m >= avoidance.influence_m:
+        what = f"= {avoidance.stop_m:g} must be less than avoidance.influence_m = {avoidance.influence_m:g}"
+        yield ConfigProblem(("avoidance", "stop_m"), what, (("avoidance", "influence_m"),))
+
+
+def _check_room(cfg: RadioConfig) -> Problems:
+    width_m, height_m = cfg.workspace.size_m
+    for index, (x_m, y_m) in enumerate(cfg.workspace.waypoints_m):
+        if not (0.0 <= x_m <= width_m and 0.0 <= y_m <= height_m):
+            what = f"= [{x_m:g}, {y_m:g}] lies outside the room of {width_m:g} by {height_m:g} m"
+            yield ConfigProblem(("workspace", "waypoints_m", index), what, (("workspace", "size_m"),))
+
+
+def _check_layout(cfg: CricketConfig) -> Problems:
+    if cfg.layout == "motes" and len(cfg.motes) < 2:
+        yield ConfigProblem(("cricket", "motes"), f"has {len(cfg.motes)}; a map needs two")
+    if cfg.layout != "networks":
+        return
+    found: tuple[tuple[bool, str, str], ...] = (
+        (cfg.dimension != 2, "dimension", '= 3 needs layout = "motes" or "random"; stands lie in a plane'),
+        (len(cfg.networks) < 2, "networks", f"has {len(cfg.networks)}; phase 1 goes from one network to the next"),
+        (len(cfg.anchors) != _ANCHORS, "anchors",
+         f"has {len(cfg.anchors)} motes, not {_ANCHORS}: the origin and the axis"),
+        (len(cfg.stand_m) < _LEAST_NETWORK, "stand_m",
+         f"has {len(cfg.stand_m)} motes; trilateration needs {_LEAST_NETWORK}"),
+    )  # fmt: skip
+    for is_wrong, name, what in found:
+        if is_wrong:
+            yield ConfigProblem(("cricket", name), what)
+
+
+def _check_places(cfg: CricketConfig) -> Problems:
+    def check(coordinates: Sequence[float], *key: str | int) -> Problems:
+        if len(coordinates) != cfg.dimension:
+            wanted = f"cricket.dimension = {cfg.dimension} asks for {cfg.dimension}"
+            yield ConfigProblem(("cricket", *key), f"has {len(coordinates)} coordinates, {wanted}")
+
+    if cfg.layout == "random":
+        yield from check(cfg.random.size_m, "random", "size_m")
+        return
+    if cfg.layout == "networks":
+        for number, place in enumerate(cfg.stand_m):
+            yield from check(place, "stand_m", number)
+        for name, place in cfg.anchors.items():
+            yield from check(place, "anchors", name)
+    for name, mote in (cfg.networks if cfg.layout == "networks" else cfg.motes).items():
+        yield from check(mote.place_m, cfg.layout, name, "place_m")
+        yield from check(mote.facing, cfg.layout, name, "facing")
+        if not any(mote.facing):
+            yield ConfigProblem(("cricket", cfg.layout, name, "facing"), "is no direction: all its parts are 0")
+
+
+def _check_motes(cfg: CricketConfig) -> Problems:
+    angles, reaches = cfg.transducer.off_axis_rad, cfg.transducer.reach_m
+    key = ("cricket", "transducer")
+    if len(angles) != len(reaches):
+        what = f"has {len(reaches)} values for {len(angles)} angles of off_axis_rad"
+        yield ConfigProblem((*key, "reach_m"), what, ((*key, "off_axis_rad"),))
+    if angles[0] != 0.0 or any(later <= before for before, later in pairwise(angles)):
+        yield ConfigProblem((*key, "off_axis_rad"), f"= {list(angles)} must begin with 0 and rise")
+    if 0 < cfg.phase1.draws < _LEAST_DRAWS:
+        what = f"= {cfg.phase1.draws} tell no covariance of dozens of coordinates; 0, or {_LEAST_DRAWS} at least"
+        yield ConfigProblem(("cricket", "phase1", "draws"), what)

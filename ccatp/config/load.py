@@ -1,13 +1,4 @@
-"""Reads the configuration: the default file, the user's, the command line, one mirror and one world.
-
-Where the values of a configuration come from: files and the command line, laid over each other.
-
-Reads the configuration of a robot among radio beacons: base file, the system's, the user's, command line.
-
-Reads what is assumed of recorded radio data: the shipped file, the user's, the command line.
-
-Changes single keys of a configuration file, with everything else in it, comments included, as it was.
-"""
+"""Reads configurations: the default file, the user's, the command line, laid over each other; edits single keys."""
 
 import difflib
 import json
@@ -15,18 +6,17 @@ import os
 import re
 import tempfile
 import tomllib
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import tomlkit
 from pydantic import BaseModel, ValidationError
 from tomlkit.exceptions import TOMLKitError
 
-from ccatp.config.beacon_checks import check_radio_config
-from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.checks import check_config, is_file_name
+from ccatp.config.beacon_models import RadioConfig, RecordingsConfig
+from ccatp.config.checks import check_config, check_radio_config, is_file_name
 from ccatp.config.messages import (
     ConfigProblem,
     Key,
@@ -39,20 +29,41 @@ from ccatp.config.messages import (
 )
 from ccatp.config.models import Config, MirrorConfig, WorldConfig
 from ccatp.config.package import configs_dir
-from ccatp.config.recording_models import RecordingsConfig
 from ccatp.errors import ConfigError
 
 Tree = dict[str, Any]
+Overrides = Mapping[str, object] | None
+M = TypeVar("M", bound=BaseModel)
+
+DEFAULT_FILE, BEACON_FILE, RECORDING_FILE = "ccatp.toml", "radio.toml", "recordings.toml"
+SYSTEMS = ("zigbee", "follow", "cricket")
+_RUN_FILE = "config.toml"  # of a run directory
+_RUN_HEAD = "# The exact configuration of one run; ccatp run --config FILE repeats it.\n\n"
+_SECTIONS: dict[str, tuple[str, type[BaseModel]]] = {
+    "mirror": ("mirrors", MirrorConfig),
+    "world": ("worlds", WorldConfig),
+}
+# A file that names its own beacons means these and no others; on the command line one may be moved.
+_WHOLE: tuple[Key, ...] = (
+    ("sim", "beacons"),
+    ("path_loss", "reference_dbm_of"),
+    ("cricket", "networks"),
+    ("cricket", "motes"),
+    ("cricket", "anchors"),
+)
+# In comments: a stand-in value, and what takes its place.
+UNVERIFIED, MEASURED = "UNVERIFIED", "measured by ccatp calibrate"
+
+
+class NotASurvey(ConfigError):
+    """A configuration of a mission among beacons where one of a survey is wanted."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConfigSource:
-    """One place that values come from.
+    """One place that values come from: a file, or the command line, which has no text.
 
-    Attributes:
-        name: file name as the user knows it, or ``command line``.
-        text: the file's text; empty for the command line.
-        root: the section of the configuration that ``tree`` is.
+    ``name`` is the file's as the user knows it; ``tree`` is the section ``root`` of the configuration.
     """
 
     name: str
@@ -102,7 +113,7 @@ def read_source(path: Path, root: Key = ()) -> ConfigSource:
 
 
 def nested(dotted: Mapping[str, object]) -> Tree:
-    """``{"run.seed": 2}`` as ``{"run": {"seed": 2}}``.
+    """``{"run.seed": 2}`` as ``{"run": {"seed": 2}}``; ``None`` values are left out.
 
     Raises:
         ConfigError: a key is given both as a value and as a section.
@@ -124,11 +135,7 @@ def nested(dotted: Mapping[str, object]) -> Tree:
 def merged(
     below: Mapping[str, Any], above: Mapping[str, Any], whole: Collection[Key] = (), at: tuple[str, ...] = ()
 ) -> Tree:
-    """``above`` laid over ``below``, section by section; arrays are replaced whole.
-
-    Args:
-        whole: sections that are lists by name: they are replaced whole, too.
-    """
+    """``above`` laid over ``below``, section by section; arrays and the sections ``whole`` are replaced as a whole."""
     tree = dict(below)
     for name, value in above.items():
         key = (*at, name)
@@ -137,84 +144,83 @@ def merged(
     return tree
 
 
-def source_of(key: Key, sources: Iterable[ConfigSource]) -> ConfigSource:
+def _layers(base: ConfigSource, file: Path | None, overrides: Overrides) -> list[ConfigSource]:
+    """Command line, the user's file, base: the strongest first."""
+    user = read_source(file) if file else ConfigSource("", "", {})
+    return [ConfigSource("command line", "", nested(overrides or {})), user, base]
+
+
+def _stacked(sources: Sequence[ConfigSource]) -> Tree:
+    tree: Tree = {}
+    for source in reversed(sources):
+        tree = merged(tree, source.tree)
+    return tree
+
+
+def _source_of(key: Key, sources: Iterable[ConfigSource]) -> ConfigSource:
     """The source that says most about a key; of equals the strongest, which stands first."""
     return max(sources, key=lambda source: source.depth(key))
 
 
-def fault_line(fault: ConfigProblem, sources: list[ConfigSource]) -> str:
+def _fault_line(fault: ConfigProblem, sources: list[ConfigSource]) -> str:
     """The line for the reader. Of keys that contradict each other it points to the one nearest to the user."""
-    held = [(sources.index(source_of(key, sources)), key) for key in (fault.key, *fault.related)]
+    held = [(sources.index(_source_of(key, sources)), key) for key in (fault.key, *fault.related)]
     strength, key = min(held, key=lambda pair: pair[0])
     return f"{sources[strength].place(key)}: {format_key(fault.key)} {fault.what}"
 
 
-DEFAULT_FILE = "ccatp.toml"
-_RUN_FILE = "config.toml"  # of a run directory
-_SECTIONS: dict[str, tuple[str, type[BaseModel]]] = {
-    "mirror": ("mirrors", MirrorConfig),
-    "world": ("worlds", WorldConfig),
-}
+def _validated(
+    model: type[M],
+    tree: Tree,
+    sources: list[ConfigSource],
+    check: Callable[[M], list[ConfigProblem]] = lambda _: [],
+) -> M:
+    try:
+        # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
+        cfg = model.model_validate_json(json.dumps(tree, default=str), strict=True)
+    except ValidationError as error:
+        faults = faults_of(error.errors(), model)
+    else:
+        faults = check(cfg)
+        if not faults:
+            return cfg
+    raise ConfigError(*(_fault_line(fault, sources) for fault in faults))
 
 
-class NotASurvey(ConfigError):
-    """A configuration of a mission among beacons where one of a survey is wanted."""
+# -- surveys of mirrors -----------------------------------------------------------------------------------------------
 
 
-def shipped_config_dir() -> Path:
-    """The folder of the configurations that come with ccatp."""
-    return configs_dir()
-
-
-def load_config(
-    file: Path | None = None, overrides: Mapping[str, object] | None = None, config_dir: Path | None = None
-) -> Config:
+def load_config(file: Path | None = None, overrides: Overrides = None, config_dir: Path | None = None) -> Config:
     """The whole configuration of a run.
 
     The user's file needs only the keys that differ from the default file. ``mirror`` and ``world`` come from the files
     that ``run.mirror`` and ``run.world`` name, a name or the path of a ``.toml`` file; a file with complete sections
     ``[mirror]`` and ``[world]``, as a run directory holds, is taken as it is, and single keys of these sections are
-    laid over the named file.
-
-    Args:
-        file: the user's configuration, or ``None``.
-        overrides: dotted keys, stronger than the file; ``None`` values are left out.
-        config_dir: folder with ``ccatp.toml``, ``mirrors/`` and ``worlds/``; the shipped one if ``None``.
+    laid over the named file. Dotted keys in ``overrides`` are stronger than the file; ``None`` values are left out.
+    ``config_dir`` (the shipped one by default) has ``ccatp.toml``, ``mirrors/`` and ``worlds/``.
 
     Raises:
         ConfigError: one line with file, line, key, what is wrong and what to do.
         NotASurvey: the file is of a mission among beacons.
     """
-    config_dir = config_dir or shipped_config_dir()
-    default = read_source(config_dir / DEFAULT_FILE)
-    user = read_source(file) if file else ConfigSource("", "", {})
-    _refuse_beacons(user, file)
-    command = ConfigSource("command line", "", nested(overrides or {}))
-    sources = [command, user, default]
-    tree: Tree = {}
-    for source in reversed(sources):
-        tree = merged(tree, source.tree)
+    config_dir = config_dir or configs_dir()
+    sources = _layers(read_source(config_dir / DEFAULT_FILE), file, overrides)
+    system = sources[1].tree.get("system")
+    if file is not None and system is not None:
+        use = f"ccatp report {file.parent}" if file.name == _RUN_FILE else "ccatp run or ccatp study with it"
+        what = f"{file}: is of a mission among beacons (system = {format_value(system)})"
+        raise NotASurvey(f"{what}, and this is for surveys of mirrors alone; use {use}")
+    tree = _stacked(sources)
     for section in _SECTIONS:
         named = _named_section(section, tree, sources, config_dir)
         tree[section] = merged(named.tree, _overlay(section, tree, sources))
         sources.append(named)
-    return _validated(tree, sources)
+    return _validated(Config, tree, sources, check_config)
 
 
-def _refuse_beacons(user: ConfigSource, file: Path | None) -> None:
-    if file is None or "system" not in user.tree:
-        return
-    name = f"{file}: is of a mission among beacons (system = {format_value(user.tree['system'])})"
-    if file.name == _RUN_FILE:
-        raise NotASurvey(f"{name}, and this is for surveys of mirrors alone; use ccatp report {file.parent}")
-    raise NotASurvey(f"{name}, and this is for surveys of mirrors alone; use ccatp run or ccatp study with it")
-
-
-def dump_config(cfg: Config) -> str:
-    """The complete configuration as TOML; ``load_config`` on it gives an equal one."""
-    return "# The exact configuration of one run; ccatp run --config FILE repeats it.\n\n" + format_toml(
-        cfg.model_dump()
-    )
+def dump_config(cfg: Config | RadioConfig) -> str:
+    """The complete configuration as TOML; the loader of its kind gives an equal one."""
+    return _RUN_HEAD + format_toml(cfg.model_dump())
 
 
 def json_schema() -> dict[str, Any]:
@@ -227,16 +233,24 @@ def json_schema() -> dict[str, Any]:
 
 def available(kind: str, config_dir: Path | None = None) -> list[str]:
     """Names of the shipped ``mirror`` or ``world`` files."""
-    folder = (config_dir or shipped_config_dir()) / _SECTIONS[kind][0]
+    folder = (config_dir or configs_dir()) / _SECTIONS[kind][0]
     return sorted(path.stem for path in folder.glob("*.toml"))
 
 
-def _is_complete(section: str, value: object) -> bool:
+def _get(tree: object, *key: str) -> object:
+    for part in key:
+        tree = tree.get(part) if isinstance(tree, Mapping) else None
+    return tree
+
+
+def _is_complete(section: str, user: ConfigSource) -> bool:
+    value = user.tree.get(section)
     return isinstance(value, Mapping) and set(_SECTIONS[section][1].model_fields) <= set(value)
 
 
-def _is_replaced(section: str, user: ConfigSource, command: ConfigSource) -> bool:
+def _is_replaced(section: str, sources: list[ConfigSource]) -> bool:
     """Whether the command line names another mirror or world than the one that the user's file holds in full."""
+    command, user = sources[:2]
     wanted = _get(command.tree, "run", section)
     return wanted is not None and wanted != _get(user.tree, "run", section)
 
@@ -244,37 +258,36 @@ def _is_replaced(section: str, user: ConfigSource, command: ConfigSource) -> boo
 def _overlay(section: str, tree: Tree, sources: list[ConfigSource]) -> Mapping[str, Any]:
     """What file and command line say about the section itself."""
     command, user = sources[:2]
-    if _is_complete(section, user.tree.get(section)) and _is_replaced(section, user, command):
-        overlay = command.tree.get(section, {})
-    else:
-        overlay = tree.get(section, {})
+    is_without_file = _is_complete(section, user) and _is_replaced(section, sources)
+    overlay = (command.tree if is_without_file else tree).get(section, {})
     if not isinstance(overlay, Mapping):
-        place = source_of((section,), sources).place((section,))
+        place = _source_of((section,), sources).place((section,))
         raise ConfigError(f"{place}: {section}: must be a section; name a {section} with run.{section}")
     return overlay
 
 
 def _named_section(section: str, tree: Tree, sources: list[ConfigSource], config_dir: Path) -> ConfigSource:
     """The file that ``run.mirror`` or ``run.world`` names; an empty source where the user's file holds all of it."""
-    command, user = sources[:2]
-    if _is_complete(section, user.tree.get(section)) and not _is_replaced(section, user, command):
+    if _is_complete(section, sources[1]) and not _is_replaced(section, sources):
         return ConfigSource("", "", {}, (section,))
     key: Key = ("run", section)
     name = _get(tree, "run", section)
-    source = source_of(key, sources)
+    source = _source_of(key, sources)
+    place = source.place(key)
     if not isinstance(tree["run"], Mapping):
-        raise ConfigError(f"{source.place(key)}: run = {format_value(tree['run'])} must be a section, not a value")
+        raise ConfigError(f"{place}: run = {format_value(tree['run'])} must be a section, not a value")
     if not isinstance(name, str) or not name:
-        raise ConfigError(f"{source.place(key)}: run.{section} = {format_value(name)} must be the name of a {section}")
+        raise ConfigError(f"{place}: run.{section} = {format_value(name)} must be the name of a {section}")
+    shown = f"{place}: run.{section} = {format_value(name)}"
     folder = config_dir / _SECTIONS[section][0]
     path = source.folder / name if is_file_name(name) else folder / f"{name}.toml"
     if not _is_file(path):
         hint = f"no file {path}" if is_file_name(name) else choice_hint(name, available(section, config_dir))
-        raise ConfigError(f"{source.place(key)}: run.{section} = {format_value(name)} is no {section}; {hint}")
+        raise ConfigError(f"{shown} is no {section}; {hint}")
     try:
         return read_source(path, (section,))
     except ConfigError as error:
-        raise ConfigError(f"{source.place(key)}: run.{section} = {format_value(name)}: {error}") from error
+        raise ConfigError(f"{shown}: {error}") from error
 
 
 def _is_file(path: Path) -> bool:
@@ -284,71 +297,35 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def _get(tree: object, *key: str) -> object:
-    for part in key:
-        tree = tree.get(part) if isinstance(tree, Mapping) else None
-    return tree
-
-
-def _validated(tree: Tree, sources: list[ConfigSource]) -> Config:
-    try:
-        # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
-        cfg = Config.model_validate_json(json.dumps(tree, default=str), strict=True)
-    except ValidationError as error:
-        faults = faults_of(error.errors())
-    else:
-        faults = check_config(cfg)
-        if not faults:
-            return cfg
-    raise ConfigError(*(fault_line(fault, sources) for fault in faults))
-
-
-BEACON_FILE = "radio.toml"
-SYSTEMS = ("zigbee", "follow", "cricket")
-# A file that names its own beacons means these and no others; on the command line one may be moved.
-_WHOLE: tuple[Key, ...] = (
-    ("sim", "beacons"),
-    ("path_loss", "reference_dbm_of"),
-    ("cricket", "networks"),
-    ("cricket", "motes"),
-    ("cricket", "anchors"),
-)
+# -- robots among radio beacons ---------------------------------------------------------------------------------------
 
 
 def load_radio_config(
-    file: Path | None = None,
-    overrides: Mapping[str, object] | None = None,
-    config_dir: Path | None = None,
-    *,
-    simulates: bool = True,
+    file: Path | None = None, overrides: Overrides = None, config_dir: Path | None = None, *, simulates: bool = True
 ) -> RadioConfig:
-    """The whole configuration of a robot among radio beacons.
+    """The whole configuration of a robot among radio beacons; arguments as in ``load_config``.
 
-    ``system`` of the user's file, else of the base file, says which of ``zigbee.toml``, ``follow.toml`` and
-    ``cricket.toml`` lies between the two.
-
-    Args:
-        file: the user's configuration, or ``None``.
-        overrides: dotted keys, stronger than the file; ``None`` values are left out.
-        config_dir: folder with ``radio.toml``; the shipped one if ``None``.
-        simulates: whether a field of motes is simulated, or its ranges were measured.
+    ``system`` of the user's file, else of the base file ``radio.toml``, says which of ``zigbee.toml``, ``follow.toml``
+    and ``cricket.toml`` lies between the two. ``simulates`` says whether a field of motes is simulated, or its ranges
+    were measured.
 
     Raises:
         ConfigError: one line with file, line, key, what is wrong and what to do.
     """
-    config_dir = config_dir or shipped_config_dir()
-    base = read_source(config_dir / BEACON_FILE)
-    user = read_source(file) if file else ConfigSource("", "", {})
+    config_dir = config_dir or configs_dir()
+    command, user, base = sources = _layers(read_source(config_dir / BEACON_FILE), file, overrides)
     if file is not None and _is_survey(user.tree):
         raise ConfigError(
             f"{file}: is the configuration of a survey of a mirror; give that of a robot among beacons, as cricket.toml"
         )
-    command = ConfigSource("command line", "", nested(overrides or {}))
-    system = read_source(config_dir / f"{_system([command, user, base])}.toml")
+    system = read_source(config_dir / f"{_system(sources)}.toml")
     tree: Tree = {}
     for source in (base, system, user):
         tree = merged(tree, source.tree, _WHOLE)
-    return _radio_loader_validated(merged(tree, command.tree), [command, user, system, base], simulates)
+    tree = merged(tree, command.tree)
+    return _validated(
+        RadioConfig, tree, [command, user, system, base], lambda cfg: check_radio_config(cfg, simulates=simulates)
+    )
 
 
 def is_radio_file(file: Path) -> bool:
@@ -367,13 +344,6 @@ def _is_survey(tree: Tree) -> bool:
     return "system" not in tree and bool({"mirror", "world"} & (named | set(tree)))
 
 
-def dump_radio_config(cfg: RadioConfig) -> str:
-    """The complete configuration as TOML; ``load_radio_config`` on it gives an equal one."""
-    return "# The exact configuration of one run; ccatp run --config FILE repeats it.\n\n" + format_toml(
-        cfg.model_dump()
-    )
-
-
 def _system(sources: list[ConfigSource]) -> str:
     for source in sources:
         if "system" in source.tree:
@@ -385,58 +355,24 @@ def _system(sources: list[ConfigSource]) -> str:
     raise ConfigError(f"{sources[-1].name}: system is missing; {choice_hint('', SYSTEMS)}")
 
 
-def _radio_loader_validated(tree: Tree, sources: list[ConfigSource], simulates: bool) -> RadioConfig:
-    try:
-        # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
-        cfg = RadioConfig.model_validate_json(json.dumps(tree, default=str), strict=True)
-    except ValidationError as error:
-        faults = faults_of(error.errors(), RadioConfig)
-    else:
-        faults = check_radio_config(cfg, simulates=simulates)
-        if not faults:
-            return cfg
-    raise ConfigError(*(fault_line(fault, sources) for fault in faults))
-
-
-RECORDING_FILE = "recordings.toml"
-
-
-def load_recordings_config(file: Path | None = None, overrides: Mapping[str, object] | None = None) -> RecordingsConfig:
-    """What is assumed of recordings, by format.
-
-    Args:
-        file: the user's configuration, or ``None``; it needs only its own differences.
-        overrides: dotted keys, stronger than the file, as in ``plaza.priors.range_scale``.
+def load_recordings_config(file: Path | None = None, overrides: Overrides = None) -> RecordingsConfig:
+    """What is assumed of recorded radio data, by format, as in ``plaza.priors.range_scale``.
 
     Raises:
         ConfigError: one line with file, line, key, what is wrong and what to do.
     """
-    base = read_source(shipped_config_dir() / RECORDING_FILE)
-    user = read_source(file) if file else ConfigSource("", "", {})
-    command = ConfigSource("command line", "", nested(overrides or {}))
-    tree: Tree = {}
-    for source in (base, user, command):
-        tree = merged(tree, source.tree)
-    try:
-        return RecordingsConfig.model_validate_json(json.dumps(tree, default=str), strict=True)
-    except ValidationError as error:
-        sources = [command, user, base]
-        faults = faults_of(error.errors(), RecordingsConfig)
-        raise ConfigError(*(fault_line(fault, sources) for fault in faults)) from error
+    sources = _layers(read_source(configs_dir() / RECORDING_FILE), file, overrides)
+    return _validated(RecordingsConfig, _stacked(sources), sources)
 
 
-# In comments: a stand-in value, and what takes its place.
-UNVERIFIED, MEASURED = "UNVERIFIED", "measured by ccatp calibrate"
+# -- changing a file --------------------------------------------------------------------------------------------------
 
 
 def with_values(text: str, values: Mapping[str, float], file: Path) -> str:
-    """The text with other values of some keys.
+    """The text with other values of some keys, ``section.key``; everything else, comments included, stays.
 
     A key that is there keeps its comment, but for the mark of values that nobody has measured; one that is not is
     added to its section.
-
-    Args:
-        values: by dotted key, ``section.key``.
 
     Raises:
         ConfigError: the text is not TOML, or a key stands where no key can be.
@@ -475,11 +411,9 @@ def write_in_place(file: Path, text: str) -> None:
         ConfigError: it cannot be written.
     """
     file = file.resolve()
+    name: str | None = None
     try:
         handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot be written: {error.strerror or error}") from error
-    try:
         with os.fdopen(handle, "w", encoding="utf-8") as out:
             out.write(text)
             out.flush()
@@ -492,5 +426,6 @@ def write_in_place(file: Path, text: str) -> None:
         finally:
             os.close(folder)
     except OSError as error:
-        Path(name).unlink(missing_ok=True)
+        if name is not None:
+            Path(name).unlink(missing_ok=True)
         raise ConfigError(f"{file}: cannot be written: {error.strerror or error}") from error

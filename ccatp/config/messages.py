@@ -1,13 +1,11 @@
-"""What is wrong with a configuration, in words: from pydantic's findings to one line with a hint.
-
-TOML as text: where a key stands in a file, and a writer whose output reads back equal.
-"""
+"""Keys, values and problems of a configuration as text: one line for each finding, TOML that reads back equal."""
 
 import difflib
 import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import takewhile
 from typing import Any, NamedTuple, get_args
 
 from pydantic import BaseModel
@@ -30,9 +28,16 @@ def find_line(text: str, key: Key) -> int | None:
 
     A key inside an inline table or an array is found at the line of its table or array.
     """
-    path = _names(key)
+    path = tuple(takewhile(lambda part: isinstance(part, str), key))
     best, best_line = 0, None
-    for number, full in _keys(text):
+    section: tuple[str, ...] = ()
+    for number, line in enumerate(text.splitlines(), start=1):
+        if header := _HEADER.match(line):
+            full = section = _parts(header["key"])
+        elif assignment := _ASSIGNMENT.match(line):
+            full = section + _parts(assignment["key"])
+        else:
+            continue
         if len(full) > best and full == path[: len(full)]:
             best, best_line = len(full), number
         elif path and full[: len(path)] == path and best < len(path):
@@ -40,29 +45,8 @@ def find_line(text: str, key: Key) -> int | None:
     return best_line
 
 
-def _keys(text: str) -> Iterator[tuple[int, tuple[str, ...]]]:
-    """Every header and assignment of a text: line number and full path."""
-    section: tuple[str, ...] = ()
-    for number, line in enumerate(text.splitlines(), start=1):
-        if header := _HEADER.match(line):
-            section = _parts(header["key"])
-            yield number, section
-        elif assignment := _ASSIGNMENT.match(line):
-            yield number, section + _parts(assignment["key"])
-
-
 def _parts(dotted: str) -> tuple[str, ...]:
     return tuple(part.strip("\"'") for part in _PART.findall(dotted))
-
-
-def _names(key: Key) -> tuple[str, ...]:
-    """The part of a key before the first index into an array."""
-    names: list[str] = []
-    for part in key:
-        if isinstance(part, int):
-            break
-        names.append(part)
-    return tuple(names)
 
 
 def format_key(key: Key) -> str:
@@ -99,17 +83,13 @@ def _section(data: Mapping[str, object], path: tuple[str, ...]) -> Iterator[str]
         yield ""
         yield f"[{'.'.join(_quoted(name) for name in path)}]"
     for name, value in plain.items():
-        yield f"{_quoted(name)} = {_folded(value)}"
+        text = format_value(value)
+        if len(text) > _WIDTH and isinstance(value, Sequence) and not isinstance(value, str):
+            text = "[\n" + "".join(f"  {format_value(item)},\n" for item in value) + "]"
+        yield f"{_quoted(name)} = {text}"
     for name, value in data.items():
         if isinstance(value, Mapping):
             yield from _section(value, (*path, name))
-
-
-def _folded(value: object) -> str:
-    text = format_value(value)
-    if len(text) <= _WIDTH or isinstance(value, str) or not isinstance(value, Sequence):
-        return text
-    return "[\n" + "".join(f"  {format_value(item)},\n" for item in value) + "]"
 
 
 def _quoted(name: str) -> str:
@@ -138,29 +118,19 @@ _BOUNDS = {
     "less_than_equal": ("le", "must be at most"),
 }
 _TYPES = {
-    "float_type": "must be a number",
-    "float_parsing": "must be a number",
-    "int_type": "must be a whole number",
-    "int_parsing": "must be a whole number",
-    "int_from_float": "must be a whole number",
+    **dict.fromkeys(("float_type", "float_parsing"), "must be a number"),
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "must be a whole number"),
     "string_type": "must be text in quotes",
-    "bool_type": "must be true or false",
-    "bool_parsing": "must be true or false",
+    **dict.fromkeys(("bool_type", "bool_parsing"), "must be true or false"),
     "finite_number": "must be a finite number",
     "tuple_type": "must be an array",
-    "model_type": "must be a section, not a value",
-    "model_attributes_type": "must be a section, not a value",
-    "dict_type": "must be a section, not a value",
+    **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "must be a section, not a value"),
 }
 _SHOWN = 60
 
 
 class ConfigProblem(NamedTuple):
-    """One thing wrong with a configuration.
-
-    Attributes:
-        related: keys that contradict ``key``, any of which the user may have meant to change.
-    """
+    """One thing wrong with a configuration; the user may have meant to change one of the ``related`` keys."""
 
     key: Key
     what: str

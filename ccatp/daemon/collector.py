@@ -11,7 +11,7 @@ import zmq
 
 import ccatp
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.load import dump_radio_config
+from ccatp.config.load import dump_config
 from ccatp.core import danger_text
 from ccatp.daemon.process import Endpoints
 from ccatp.errors import ExitStatus
@@ -214,7 +214,7 @@ class BeaconCollector(Collector):
 
     def __init__(self, access: RunAccess, cfg: RadioConfig) -> None:
         """Subscribe before anybody publishes."""
-        metadata = {"system": cfg.system, "seed": str(cfg.run.seed), "config": dump_radio_config(cfg)}
+        metadata = {"system": cfg.system, "seed": str(cfg.run.seed), "config": dump_config(cfg)}
         super().__init__(access, metadata)
         self._summary = BeaconSummary(beacon_facts(cfg, is_sim=access.is_sim))
         self._signal = ""

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import zmq
 
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.load import dump_config, dump_radio_config, is_radio_file, load_config, load_radio_config
+from ccatp.config.load import dump_config, is_radio_file, load_config, load_radio_config
 from ccatp.config.models import Config, ProcessesConfig
 from ccatp.daemon.child_processes import (
     ProcessEnd,
@@ -305,7 +305,7 @@ def run_beacons(options: RunOptions) -> int:
             cfg = cfg.model_copy(update={"dashboard": page.config})
         run_dir = new_run_dir(options, cfg.system, cfg.run.seed)
         stack.enter_context(owned(run_dir / RUN_LOCK, "--run-dir"))
-        (run_dir / "config.toml").write_text(dump_radio_config(cfg), encoding="utf-8")
+        (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         mission_type = beacon_type(cfg, is_sim=options.sim)
         return SupervisedRun(options, mission_type, run_dir, Endpoints(runtime_dir), sockets, page, started).run()

@@ -14,7 +14,7 @@ import numpy as np
 from ccatp.beacons.slam.batch_odometry import CALIBRATION, Reckoning
 from ccatp.beacons.slam.batch_smoother import place_by_distances
 from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun
-from ccatp.config.recording_models import RecordingConfig
+from ccatp.config.beacon_models import RecordingConfig
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus
 

@@ -10,7 +10,8 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Page, expect
 
-from ccatp.config.load import load_radio_config, shipped_config_dir
+from ccatp.config.load import load_radio_config
+from ccatp.config.package import configs_dir
 from tests.processes.test_beacon_runs import BeaconRunProcess
 from tests.processes.test_dashboard_run import WITH_PAGE, ask
 from tests.processes.test_page import CHROMIUM, PATIENCE_MS, aborts_in_two_steps, browser_page, fits_a_phone
@@ -20,7 +21,7 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the page 
 
 @pytest.fixture
 def run(tmp_path: Path, runtime_dir: Path) -> Iterator[BeaconRunProcess]:
-    config = ("--config", str(shipped_config_dir() / "zigbee.toml"))
+    config = ("--config", str(configs_dir() / "zigbee.toml"))
     started = BeaconRunProcess(
         tmp_path / "run", runtime_dir, *config, "--realtime", "--json", "--set", "mission.laps=50", *WITH_PAGE
     )

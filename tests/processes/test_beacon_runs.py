@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.config.load import load_radio_config, shipped_config_dir
+from ccatp.config.load import load_radio_config
+from ccatp.config.package import configs_dir
 from ccatp.records.recorder import iter_messages
 from ccatp.studies.mote_navigation import rehearse_beacons
 from tests.processes.conftest import Run
@@ -33,7 +34,7 @@ def begin(tmp_path: Path, runtime_dir: Path) -> Iterator[Begin]:
     runs: list[BeaconRunProcess] = []
 
     def start(system: str, *args: str) -> BeaconRunProcess:
-        config = ("--config", str(shipped_config_dir() / f"{system}.toml"))
+        config = ("--config", str(configs_dir() / f"{system}.toml"))
         runs.append(BeaconRunProcess(tmp_path / "run", runtime_dir, *config, *args))
         return runs[-1]
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.beacons.slam.recording import Steps, running_total
-from ccatp.config.recording_models import OdometryNoiseConfig
+from ccatp.config.beacon_models import OdometryNoiseConfig
 from ccatp.core import FloatArray
 
 # What odometry is calibrated by: d = (1 + distance_scale) d_o, w = (1 + turn_scale) w_o + turn_per_m d_o - bias t.

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from ccatp.beacons.slam.batch_odometry import CALIBRATION, Reckoning
 from ccatp.beacons.slam.recording import Readings, Steps
-from ccatp.config.recording_models import PriorsConfig, RecordingConfig
+from ccatp.config.beacon_models import PriorsConfig, RecordingConfig
 from ccatp.core import FloatArray, IntArray
 
 OF_READINGS = ("range_scale", "range_offset_m", "bearing_offset_rad", "rssi_reference_db", "rssi_exponent")

@@ -14,7 +14,7 @@ from ccatp.beacons.slam.batch_problem import BEACON, BEARING_OFFSET, SHARED, Bat
 from ccatp.beacons.slam.batch_solver import Descent, Factored, descend, t_weights
 from ccatp.beacons.slam.causal import beyond_priors
 from ccatp.beacons.slam.recording import BeaconFix, Calibrated, EstimatedPath, RecordedRun
-from ccatp.config.recording_models import RadioNoiseConfig, RecordingConfig
+from ccatp.config.beacon_models import RadioNoiseConfig, RecordingConfig
 from ccatp.core import FloatArray
 
 STARTS = 48  # directions, around the place of a range's reading, from which a beacon is sought

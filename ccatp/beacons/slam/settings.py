@@ -11,8 +11,7 @@ from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.reflector import ReflectorScan
 from ccatp.beacons.slam.signal_landmarks import MovingRadio, ShadowingMap
 from ccatp.beacons.slam.signal_slam import SignalSettings, SignalSlam
-from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.recording_models import RecordingConfig, SlamFilterConfig
+from ccatp.config.beacon_models import RadioConfig, RecordingConfig, SlamFilterConfig
 
 
 def slam_settings(cfg: RecordingConfig, how: SlamFilterConfig) -> SlamSettings:

@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.load import load_radio_config, shipped_config_dir
+from ccatp.config.load import load_radio_config
+from ccatp.config.package import configs_dir
 from ccatp.studies.mote_navigation import BeaconSilResult, BeaconSilWorld
 
 
 def beacon_config(system: str, **overrides: Any) -> RadioConfig:
     """The shipped configuration of a system; dots in keys are written as two underscores."""
     keys = {name.replace("__", "."): value for name, value in overrides.items()}
-    return load_radio_config(Path(shipped_config_dir() / f"{system}.toml"), keys)
+    return load_radio_config(Path(configs_dir() / f"{system}.toml"), keys)
 
 
 def play(stage: BeaconSilWorld, until_s: float = 1e9) -> BeaconSilWorld:

@@ -10,14 +10,13 @@ import pytest
 from ccatp.config.load import (
     available,
     dump_config,
-    dump_radio_config,
     is_radio_file,
     json_schema,
     load_config,
     load_radio_config,
-    shipped_config_dir,
 )
 from ccatp.config.models import Config
+from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
 
 
@@ -85,7 +84,7 @@ def test_single_keys_of_the_mirror_are_laid_over_the_named_one(tmp_path: Path) -
 
 
 def test_a_mirror_may_be_a_file_beside_the_configuration(tmp_path: Path) -> None:
-    shipped = shipped_config_dir() / "mirrors" / "fyst-m1.toml"
+    shipped = configs_dir() / "mirrors" / "fyst-m1.toml"
     write(tmp_path / "mine.toml", shipped.read_text(encoding="utf-8").replace('name = "fyst-m1"', 'name = "ours"'))
     cfg = load_config(write(tmp_path / "config.toml", '[run]\nmirror = "mine.toml"\n'))
     assert cfg.mirror.name == "ours"
@@ -93,7 +92,7 @@ def test_a_mirror_may_be_a_file_beside_the_configuration(tmp_path: Path) -> None
 
 
 def test_a_fault_in_a_mirror_file_is_found_there(tmp_path: Path) -> None:
-    shipped = (shipped_config_dir() / "mirrors" / "fyst-m1.toml").read_text(encoding="utf-8")
+    shipped = (configs_dir() / "mirrors" / "fyst-m1.toml").read_text(encoding="utf-8")
     mirror = write(tmp_path / "mine.toml", shipped.replace("count = 77", "count = 87"))
     line = next(n for n, text in enumerate(shipped.splitlines(), start=1) if text.startswith("count = 77"))
     with pytest.raises(ConfigError, match="panels_per_row adds up to 77") as caught:
@@ -108,7 +107,7 @@ def test_what_is_written_loads_back_equal(tmp_path: Path, mirror: str) -> None:
 
 
 def test_a_written_configuration_needs_no_mirror_file(tmp_path: Path) -> None:
-    shipped = shipped_config_dir() / "mirrors" / "fyst-m1.toml"
+    shipped = configs_dir() / "mirrors" / "fyst-m1.toml"
     mirror = write(tmp_path / "gone.toml", shipped.read_text(encoding="utf-8"))
     cfg = load_config(overrides={"run.mirror": str(mirror)})
     file = write(tmp_path / "config.toml", dump_config(cfg))
@@ -193,22 +192,22 @@ def test_the_schema_allows_what_the_loader_allows(tmp_path: Path) -> None:
 
 
 def test_the_default_file_says_unit_or_source_of_each_number() -> None:
-    text = (shipped_config_dir() / "ccatp.toml").read_text(encoding="utf-8")
+    text = (configs_dir() / "ccatp.toml").read_text(encoding="utf-8")
     assert tomllib.loads(text)["run"]["mirror"] == "fyst-m1"
     assert "UNVERIFIED" in text
 
 
 @pytest.mark.parametrize("system", ["zigbee", "follow"])
 def test_shipped_files_are_valid_and_name_their_system(system: str) -> None:
-    file = shipped_config_dir() / f"{system}.toml"
+    file = configs_dir() / f"{system}.toml"
     assert load_radio_config(file).system == system
     assert is_radio_file(file)
-    assert not is_radio_file(shipped_config_dir() / "ccatp.toml")
+    assert not is_radio_file(configs_dir() / "ccatp.toml")
 
 
 def test_dump_loads_back_equal(tmp_path: Path) -> None:
     cfg = load_radio_config(None, {"system": "follow", "run.seed": 7})
-    (tmp_path / "config.toml").write_text(dump_radio_config(cfg))
+    (tmp_path / "config.toml").write_text(dump_config(cfg))
     assert load_radio_config(tmp_path / "config.toml") == cfg
 
 
@@ -260,7 +259,7 @@ def problem(**keys: Any) -> str:
 
 def test_the_shipped_field_comes_back_from_a_run(tmp_path: Path) -> None:
     cfg = load_radio_config(None, {"system": "cricket"})
-    (tmp_path / "config.toml").write_text(dump_radio_config(cfg))
+    (tmp_path / "config.toml").write_text(dump_config(cfg))
     assert load_radio_config(tmp_path / "config.toml") == cfg
     assert len(cfg.cricket.networks) == 6
 

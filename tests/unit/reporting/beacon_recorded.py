@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.load import dump_radio_config, load_radio_config
+from ccatp.config.load import dump_config, load_radio_config
 from ccatp.links.topics import (
     BeaconArrival,
     BeaconMapMessage,
@@ -79,7 +79,7 @@ def record_beacons(run_dir: Path, cfg: RadioConfig | None = None, *, is_sim: boo
     """A run directory; without an end as after ``kill -9``."""
     cfg = cfg or beacon_config()
     run_dir.mkdir(exist_ok=True)
-    (run_dir / "config.toml").write_text(dump_radio_config(cfg))
+    (run_dir / "config.toml").write_text(dump_config(cfg))
     recorder = Recorder(
         run_dir / "telemetry.mcap",
         [(name, schema_of(name)) for name in TOPICS],

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ccatp.cli import main
-from ccatp.config.load import shipped_config_dir
+from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
 from ccatp.sim.fault_models import LINK_TYPES, TYPES, Intermittent
 from ccatp.sim.fault_plan import FaultPlan, check_pacing, parse_plan
@@ -16,7 +16,7 @@ LINK = "[[link]]\nat_s = 1.0\n"
 
 
 def test_the_example_loads() -> None:
-    plan = read_plan(shipped_config_dir() / "faults" / "example.toml", lockstep=False)
+    plan = read_plan(configs_dir() / "faults" / "example.toml", lockstep=False)
     assert [fault.type for fault in plan.faults] == ["stuck", "intermittent", "drop", "slip"]
     assert [fault.type for fault in plan.link] == ["fragment", "delay"]
     edge = plan.faults[1]

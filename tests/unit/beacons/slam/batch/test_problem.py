@@ -9,7 +9,7 @@ from ccatp.beacons.slam.batch_odometry import CALIBRATION, Reckoning, chained
 from ccatp.beacons.slam.batch_problem import BEACON, SHARED, BatchProblem, BatchState, repeats
 from ccatp.beacons.slam.batch_solver import Factored, t_cost, t_weights
 from ccatp.beacons.slam.recording import Readings, Steps, dead_reckoned
-from ccatp.config.recording_models import OdometryNoiseConfig, PriorsConfig, RadioNoiseConfig, RecordingConfig
+from ccatp.config.beacon_models import OdometryNoiseConfig, PriorsConfig, RadioNoiseConfig, RecordingConfig
 
 FloatArray = npt.NDArray[np.float64]
 DELAY = CALIBRATION.index("delay_s")

@@ -8,8 +8,8 @@ import pytest
 from ccatp.beacons.slam.batch_smoother import place_by_distances, smooth
 from ccatp.beacons.slam.evaluation import judge
 from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun, Steps
+from ccatp.config.beacon_models import RecordingConfig
 from ccatp.config.load import load_recordings_config
-from ccatp.config.recording_models import RecordingConfig
 from tests.unit.beacons.datasets.sets import BEACONS, changed, recorded, world
 
 SETTINGS = load_recordings_config().csv
