@@ -143,7 +143,7 @@ def warn(warnings: Iterable[str]) -> None:
         complain(f"warning: {warning}", 0)
 
 
-def tell(lines: Iterable[str]) -> None:
+def print_lines(lines: Iterable[str]) -> None:
     """Lines on standard output."""
     for line in lines:
         click.echo(line)
@@ -206,7 +206,7 @@ def parse_setting(text: str) -> tuple[str, object]:
 
 
 def _changes(ctx: click.Context) -> dict[str, object]:
-    """What this command line says of the configuration, by dotted key."""
+    """What this command line sets of the configuration, by dotted key."""
     changes: dict[str, object] = ctx.meta.setdefault("ccatp.changes", {})
     return changes
 
@@ -252,7 +252,7 @@ def figure_option(what: str) -> Callable[[Command], Command]:
 
 
 def settings_option(which: str) -> Callable[[Command], Command]:
-    """``--set KEY=VALUE`` as ``settings``, with what other options say; ``which`` tells what keys there are."""
+    """``--set KEY=VALUE`` as ``settings``, with what other options set; ``which`` names the keys."""
     return click.option(
         "--set", "settings", multiple=True, callback=_take_settings, metavar="KEY=VALUE",
         help=f"{which} May be repeated.",

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from ccatp.cli.common import PATH, NearestChoice, SuggestingGroup, complain, example, json_option, tell
+from ccatp.cli.common import PATH, NearestChoice, SuggestingGroup, complain, example, json_option, print_lines
 from ccatp.errors import ConfigError
 
 
@@ -94,7 +94,7 @@ def generate(folder: Path, name: str, is_client: bool, force: bool) -> None:
     folder = folder.absolute()
     files.make_key_dir(folder)
     public, secret = files.write_pair(folder, name, is_replacing=force)
-    tell([f"{public}  (public, for the peers)", f"{secret}  (secret, stays here)"])
+    print_lines([f"{public}  (public, for the peers)", f"{secret}  (secret, stays here)"])
     if is_client:
         key = files.read_public(public, "--dir").decode()
         click.echo(f'\nAdd to the list of clients at the daemon (or role = "clear"):\n\n[clients.{name}]')
@@ -103,7 +103,7 @@ def generate(folder: Path, name: str, is_client: bool, force: bool) -> None:
         return
     link = files.write_link_key(folder, name, is_replacing=force)
     clients = files.write_clients(folder, name)
-    tell([f"{link}  (secret, the same file at the robot)", f"{clients}  (clients that get in, none so far)"])
+    print_lines([f"{link}  (secret, the same file at the robot)", f"{clients}  (clients that get in, none so far)"])
     click.echo("\nAdd to the configuration, and clients to the list (ccatp keys generate --client, at theirs):\n")
     click.echo(f'[robot]\nkey_file = "{link}"\n\n[observatory]\nendpoint = "tcp://ADDRESS:7020"')
     click.echo(f'key_file = "{secret}"\nclients_file = "{clients}"')
@@ -126,7 +126,7 @@ def show_public(folder: Path, name: str | None, json_output: bool) -> None:
         click.echo(json.dumps(shown))
         return
     width = max(map(len, shown))
-    tell(f"{key:<{width}}  {value}" for key, value in shown.items())
+    print_lines(f"{key:<{width}}  {value}" for key, value in shown.items())
 
 
 SHELLS = ("bash", "zsh", "fish")

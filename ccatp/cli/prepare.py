@@ -20,7 +20,7 @@ from ccatp.cli.common import (
     figure_option,
     json_option,
     key_option,
-    tell,
+    print_lines,
 )
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 @figure_option("Draw the way")
 @JSON_OPTION
 def plan(config_file: Path | None, settings: Mapping[str, object], figure_file: Path | None, json_output: bool) -> int:
-    """Tell what a survey would do, without moving anything: order, way, least time, points out of reach.
+    """Show what a survey would do, without moving anything: order, way, least time, points out of reach.
 
     The exit status is 2 where points are out of reach: a run would be refused.
     """
@@ -58,7 +58,7 @@ def plan(config_file: Path | None, settings: Mapping[str, object], figure_file: 
         from ccatp.report.mirror_map import draw_plan
 
         draw_plan(geometry, found, figure_file)
-    tell([json.dumps(plan_data(cfg, found))] if json_output else plan_lines(cfg, found))
+    print_lines([json.dumps(plan_data(cfg, found))] if json_output else plan_lines(cfg, found))
     if found.out_of_reach:
         return complain(
             f"{len(found.out_of_reach)} points are out of reach with mission.leg_clearance_m = "
@@ -109,7 +109,7 @@ def _show(found: "Sequence[PreflightResult]") -> None:
     from ccatp.commissioning.preflight import lines
 
     if not sys.stdout.isatty():
-        tell(lines(found))
+        print_lines(lines(found))
         return
     from rich.console import Console
     from rich.table import Table
@@ -149,7 +149,7 @@ class DriveFailed(CcatpError):
 )
 @click.option("--from", "from_dir", type=PATH, help="Do not drive: take the drive of this run.")
 @click.option("--run-dir", type=PATH, help="Where to record the drive.")
-@click.option("--dry-run", is_flag=True, help="Drive and tell, but write nothing into the configuration.")
+@click.option("--dry-run", is_flag=True, help="Drive and report, but write nothing into the configuration.")
 @JSON_OPTION
 @RUNTIME_DIR_OPTION
 def calibrate(
@@ -191,7 +191,7 @@ def calibrate(
     found = estimate(on_mirror, drive, priors)
     table = rows(_replaced(config_file, cfg), found)
     if not json_output:
-        tell(lines(table, found))
+        print_lines(lines(table, found))
     check_usable(table)
     written, difference = _write(config_file, table, dry_run=dry_run)
     if json_output:

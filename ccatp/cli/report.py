@@ -19,8 +19,8 @@ from ccatp.cli.common import (
     figure_option,
     json_option,
     key_option,
+    print_lines,
     settings_option,
-    tell,
     warn,
     write_lines,
 )
@@ -76,7 +76,7 @@ def compare(run_a: Path, run_b: Path, out: Path | None, figures: Path | None, js
     for found in (pair.a, pair.b):
         warn(f"{found.record.name}: {warning}" for warning in found.record.warnings)
     data = {"report": str(path), **compare_data(pair)}
-    tell([json.dumps(data)] if json_output else [*compare_lines(pair), str(path)])
+    print_lines([json.dumps(data)] if json_output else [*compare_lines(pair), str(path)])
     return 0
 
 
@@ -114,7 +114,7 @@ ALIGN_KEYS = ("align.", "robot.puck_height_m", "mirror.")
 def align(
     run_dir: Path, settings: Mapping[str, object], csv_file: Path | None, figure_file: Path | None, json_output: bool
 ) -> int:
-    """Tell how the panels lie and how to turn their adjusters, from the fixes of a run."""
+    """Show how the panels lie and how to turn their adjusters, from the fixes of a run."""
     from ccatp.mirror.mirror import build_mirror
     from ccatp.mirror.mirror_alignment import compare, survey_result
     from ccatp.records.survey_reader import read_run
@@ -138,9 +138,9 @@ def align(
 
         draw_alignment(mirror, result, figure_file, f"{mirror.name}: {len(result.panels)} panels", str(run_dir))
     if json_output:
-        tell([json.dumps({**facts, **result_data(result, comparison), "warnings": warnings})])
+        print_lines([json.dumps({**facts, **result_data(result, comparison), "warnings": warnings})])
     else:
-        tell([*head_lines(facts), *table_lines(result, comparison, cfg.align.puck_height_sigma_m)])
+        print_lines([*head_lines(facts), *table_lines(result, comparison, cfg.align.puck_height_sigma_m)])
     return 0
 
 
@@ -209,7 +209,7 @@ def replay(run_dir: Path, settings: Mapping[str, object], smooth: bool, out: Pat
     lines = [*_head(result), *table_lines(result)]
     if is_as_it_was or may_differ:
         lines.append(f"the replay {'reproduces' if is_as_it_was else 'differs from'} the recorded estimates")
-    tell([json.dumps(result)] if json_output else lines)
+    print_lines([json.dumps(result)] if json_output else lines)
     if is_as_it_was or may_differ:
         return ExitStatus.COMPLETE
     why = "was the run made by another version, or on another CPU?"

@@ -37,7 +37,7 @@ def _finite(_ctx: click.Context, _param: click.Parameter, place: Place | None) -
 
 def _endpoint(_ctx: click.Context, _param: click.Parameter, endpoint: str | None) -> str | None:
     if endpoint is not None and not re.fullmatch(r"ipc://.+|tcp://[^\s/:]+:\d{1,5}", endpoint):
-        raise click.BadParameter(f"{endpoint!r} is no endpoint; give ipc://PATH, as ccatp sim robot tells it")
+        raise click.BadParameter(f"{endpoint!r} is no endpoint; give ipc://PATH, as ccatp sim robot prints it")
     return endpoint
 
 
@@ -97,7 +97,7 @@ def sim_etalon(
         raise click.UsageError("--puck and --truth exclude each other")
     if runtime_dir is not None:
         if puck_world_m is not None or truth is not None:
-            raise click.UsageError("--runtime-dir tells where the puck is: leave out --puck and --truth")
+            raise click.UsageError("--runtime-dir gives the place of the puck: leave out --puck and --truth")
         from ccatp.links.runtime_dir import runtime_dir_path
 
         truth = f"ipc://{runtime_dir_path(str(runtime_dir), {})}/puck"

@@ -16,7 +16,7 @@ from ccatp.cli.common import (
     WORLD_OPTIONS,
     example,
     key_option,
-    tell,
+    print_lines,
 )
 
 
@@ -93,7 +93,7 @@ def study(
         if runs or workers:
             click.echo(f"ccatp: study {name} is one analysis: --runs and --workers change nothing", err=True)
         result = _analysed(found, load_config(config_file, settings), out)
-    tell([json.dumps(result) if json_output else (out / "table.md").read_text(encoding="utf-8").rstrip()])
+    print_lines([json.dumps(result) if json_output else (out / "table.md").read_text(encoding="utf-8").rstrip()])
     return 0
 
 
@@ -139,5 +139,5 @@ def bench(
         result = run_bench(cfg, quick=quick, run_args=("--config", str(exact)), missions=not steps_only)
     if markdown is not None:
         markdown.write_text(page(result), encoding="utf-8")
-    tell([json.dumps(result)] if json_output else terminal_lines(result))
+    print_lines([json.dumps(result)] if json_output else terminal_lines(result))
     return 0

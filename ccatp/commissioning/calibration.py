@@ -1,11 +1,8 @@
 """Weighted least squares for wheel radii, wheel base and gyroscope bias over all segments of a drive together.
 
-Unknown are the parameters and the pose at every fix. Known are, each with its covariance: the fixes; where the wheels
-lead from each pose to the next, right but for the noise of the encoders and the slip of each motion; the change of
-heading that the gyroscope measured. How much slip varies from motion to motion is not known beforehand: it is chosen so
-that the residuals are as large as they should be (chi^2 = degrees of freedom), and widens all uncertainties with it.
-
-The result is written as values of the configuration, as lines of text and as JSON.
+Unknown are the parameters and the pose at every fix; known, each with its covariance, are the fixes, where the wheels
+lead from each pose to the next, and the change of heading that the gyroscope measured. How much slip varies from motion
+to motion is chosen so that chi^2 equals the degrees of freedom, and widens all uncertainties with it.
 """
 
 from dataclasses import dataclass
@@ -41,12 +38,9 @@ class CalibrationError(CcatpError):
 
 @dataclass(frozen=True, slots=True)
 class Priors:
-    """What is thought before the drive.
+    """What is thought before the drive: where the search begins, without weight, and standard deviations about 0.
 
-    Attributes:
-        radius_m, base_m: where the search begins; they have no weight.
-        gyro_scale_sigma: standard deviation of the gyroscope's scale error, about 0.
-        creep_sigma: of the downhill drift, part of the way, about 0.
+    Creep is the downhill drift, part of the way.
     """
 
     radius_m: float
@@ -60,7 +54,7 @@ class Calibration:
     """What a drive shows.
 
     Attributes:
-        covariance: of these three, shape (3, 3).
+        covariance: of radius, base and bias, shape (3, 3).
         slip_sigma: how much slip varies from motion to motion; 0 where nothing shows that it does.
         chi2, degrees: of all residuals, with ``slip_sigma`` as it is.
     """
@@ -89,9 +83,6 @@ class Calibration:
 
 def calibrate(mirror: Mirror, drive: RecordedDrive, priors: Priors) -> Calibration:
     """Estimate the parameters.
-
-    Args:
-        priors: what is thought before it.
 
     Raises:
         CalibrationError: too few segments, or no turns or ways among them.
@@ -152,9 +143,11 @@ class _Solution:
     degrees: int
 
 
+@dataclass(frozen=True, slots=True)
 class _Problem:
-    def __init__(self, mirror: Mirror, drive: RecordedDrive, priors: Priors) -> None:
-        self._mirror, self._drive, self._priors = mirror, drive, priors
+    mirror: Mirror
+    drive: RecordedDrive
+    priors: Priors
 
     def solve(self, x: FloatArray, slip_sigma: float) -> _Solution:
         for _ in range(_ROUNDS):
@@ -192,15 +185,15 @@ class _Problem:
         wheels = WheelParameters(*x[[RIGHT, LEFT, BASE, CREEP]].tolist())
         starts = x[PARAMETERS:].reshape(-1, 3)
         return [
-            carry(self._mirror, segment, start, wheels)
-            for segment, start in zip(self._drive.segments, starts[:-1], strict=True)
+            carry(self.mirror, segment, start, wheels)
+            for segment, start in zip(self.drive.segments, starts[:-1], strict=True)
         ]
 
     def _whitened(
         self, x: FloatArray, carried: list[DeadReckonedSegment], slip_sigma: float
     ) -> tuple[FloatArray, FloatArray]:
         """Whitened Jacobian and residuals: what is known minus what ``x`` makes of it."""
-        drive, size = self._drive, len(x)
+        drive, size = self.drive, len(x)
         rows, residuals = [], []
 
         def add(jacobian: FloatArray, residual: FloatArray, covariance: FloatArray) -> None:
@@ -221,7 +214,7 @@ class _Problem:
             jacobian[:, [RIGHT, LEFT, BASE, CREEP]] = -led.of_wheels
             add(jacobian, led.end - x[at + 3 : at + 6], _process_covariance(drive, segment, led, slip_sigma))
             add(*_gyro_row(drive, k, led, x))
-        for index, sigma in ((SCALE, self._priors.gyro_scale_sigma), (CREEP, self._priors.creep_sigma)):
+        for index, sigma in ((SCALE, self.priors.gyro_scale_sigma), (CREEP, self.priors.creep_sigma)):
             jacobian = np.zeros((1, size))
             jacobian[0, index] = 1.0
             add(jacobian, -x[[index]], np.array([[sigma**2]]))
@@ -285,11 +278,7 @@ SHOWN_SLIP = 1e-4
 
 
 class CalibrationRow(NamedTuple):
-    """One key of the configuration.
-
-    Attributes:
-        configured, found, sigma: in the unit of the key.
-    """
+    """One key of the configuration; values in the unit of the key."""
 
     key: str
     configured: float
@@ -357,10 +346,9 @@ def lines(table: tuple[CalibrationRow, ...], found: Calibration) -> list[str]:
 
 def as_json(table: tuple[CalibrationRow, ...], found: Calibration) -> dict[str, Any]:
     """For ``--json``."""
+    parameters = {row.key: {"configured": row.configured, "found": row.found, "sigma": row.sigma} for row in table}
     return {
-        "parameters": {
-            row.key: {"configured": row.configured, "found": row.found, "sigma": row.sigma} for row in table
-        },
+        "parameters": parameters,
         "covariance": found.covariance.tolist(),
         "radius_difference_m": [found.radius_difference_m, found.radius_difference_sigma_m],
         "gyroscope_scale": [found.gyro_scale, found.gyro_scale_sigma],

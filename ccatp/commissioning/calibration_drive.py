@@ -1,9 +1,6 @@
-"""A recorded calibration drive, cut into segments from fix to fix: what the wheels turned and the gyroscope summed up.
+"""A recorded calibration drive, cut into segments from fix to fix, and dead reckoning over a segment."""
 
-A segment is driven again by its wheels alone, for several sets of parameters at once.
-"""
-
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import sqrt
 from pathlib import Path
@@ -34,11 +31,7 @@ _MEDIAN_TO_SIGMA = 1.0 / (0.6745 * 2.0**0.5)
 
 @dataclass(frozen=True, slots=True)
 class FixedPlace:
-    """Where a fix saw the robot, deck frame.
-
-    Attributes:
-        covariance_m2: of both, shape (2, 2).
-    """
+    """Where a fix saw the robot, deck frame; covariance of shape (2, 2)."""
 
     x_m: float
     y_m: float
@@ -47,12 +40,9 @@ class FixedPlace:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """From one fix to the next.
+    """From one fix to the next: what each wheel turned, frame by frame, shape (n,), and the gyroscope summed up.
 
-    Attributes:
-        right_rad, left_rad: what each wheel turned, frame by frame, shape (n,).
-        motions: first and last (exclusive) frame of each motion; together all frames.
-        gyro_rad: sum of the gyroscope's rates times their periods.
+    ``motions`` are the first and last (exclusive) frame of each motion; together all frames.
     """
 
     right_rad: FloatArray
@@ -66,12 +56,9 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class RecordedDrive:
-    """A whole drive.
+    """A whole drive: k + 1 places and the k segments between them.
 
-    Attributes:
-        places: k + 1 fixes.
-        encoder_sigma_rad_s: noise of a rate sample; 0 of a counter.
-        quantum_rad: step of a counter; 0 where the rate itself is read.
+    The noise of a rate sample is 0 of a counter; the quantum of a counter is 0 where the rate itself is read.
     """
 
     places: tuple[FixedPlace, ...]
@@ -126,17 +113,14 @@ class DriveBuilder:
                 self._scatters.append(float(np.std([rate for _, rate in right], ddof=1)))
             self._periods.append((times[-1] - times[0]) / (len(times) - 1))
             self._samples = len(times)
-        for t_s, _, rate in sensors.imu:
-            self._feel(t_s, rate)
-
-    def _feel(self, t_s: float, rate_rad_s: float) -> None:
-        if self._gyro is not None:
-            period_s = t_s - self._gyro[0]
-            self._open.gyro_rad += rate_rad_s * period_s
-            self._open.gyro_s += period_s
-            self._open.gyro_samples += 1
-            self._gyro_steps.append(abs(rate_rad_s - self._gyro[1]))
-        self._gyro = t_s, rate_rad_s
+        for t_s, _, rate_rad_s in sensors.imu:
+            if self._gyro is not None:
+                period_s = t_s - self._gyro[0]
+                self._open.gyro_rad += rate_rad_s * period_s
+                self._open.gyro_s += period_s
+                self._open.gyro_samples += 1
+                self._gyro_steps.append(abs(rate_rad_s - self._gyro[1]))
+            self._gyro = t_s, rate_rad_s
 
     def fix(self, fix: Fix) -> None:
         """Take a fix of the robot at rest; a second one at the same place replaces the first."""
@@ -148,8 +132,9 @@ class DriveBuilder:
         right, left = np.array(done.right), np.array(done.left)
         motions = _motions(right, left, self._rest_rad())
         if not motions:
+            # A rest between two fixes at one place shows the gyroscope's bias like any other; no segment holds it.
             self._places[-1] = place
-            self._join(done)
+            self._open = replace(done, right=[], left=[])
             return
         self._places.append(place)
         duration_s = self._t_s - done.begun_s
@@ -160,11 +145,6 @@ class DriveBuilder:
             return REST_RAD
         noise_rad = median(self._scatters) * median(self._periods) * sqrt(self._samples)
         return max(REST_RAD, REST_SIGMAS * noise_rad)
-
-    def _join(self, rest: _Open) -> None:
-        """A rest between two fixes at one place shows the gyroscope's bias like any other; no segment holds it."""
-        self._open.gyro_rad, self._open.gyro_s = rest.gyro_rad, rest.gyro_s
-        self._open.gyro_samples, self._open.begun_s = rest.gyro_samples, rest.begun_s
 
     def _place(self, fix: Fix) -> FixedPlace:
         x, y, _ = self._mirror.foot_of_puck(fix.position_m, self._puck_height_m)
@@ -244,7 +224,7 @@ class DeadReckonedSegment(NamedTuple):
 
     Attributes:
         end: x, y (m), heading (rad), deck frame, shape (3,).
-        of_wheels: derivatives of ``end`` by the four of ``Wheels``, shape (3, 4).
+        of_wheels: derivatives of ``end`` by the four of ``WheelParameters``, shape (3, 4).
         of_start: by the pose at the start, shape (3, 3).
         of_slip: by the share of travel that right and left wheel gain in each motion, shape (3, 2 motions).
         turn_rad: the robot's own rotation; what is left of the change of heading the surface's curvature does.
@@ -257,66 +237,37 @@ class DeadReckonedSegment(NamedTuple):
     turn_rad: float
 
 
-def carry(mirror: Mirror, segment: Segment, start: FloatArray, wheels: WheelParameters) -> DeadReckonedSegment:
-    """Drive a segment again.
-
-    The model is that of the localizer (thesis eqs 2.11, 2.14 on the curved surface): with d = (r_R phi_R + r_L phi_L)/2
-    and turn = (r_R phi_R - r_L phi_L)/b the deck position moves by d h(psi + turn/2) + c |d| g, and the heading by
-    turn - fy (fxx dx + fxy dy) / ((1 + fx^2) W).
-
-    Args:
-        start: x, y (m), heading (rad), deck frame.
-    """
-    steps = np.array(wheels) * 1e-5
-    steps[3] = 1e-3
-    columns = 1 + len(wheels) + 1 + 2 * len(segment.motions)
-    right_m, left_m = np.full(columns, wheels.right_m), np.full(columns, wheels.left_m)
-    base_m, creep = np.full(columns, wheels.base_m), np.full(columns, wheels.creep)
-    for k, parameter in enumerate((right_m, left_m, base_m, creep)):
-        parameter[1 + k] += steps[k]
-    psi = np.full(columns, start[2])
-    psi[5] += _TURN_RAD
-    grips = [
-        (1 + len(wheels) + 1 + 2 * m + side, first, last)
-        for m, (first, last) in enumerate(segment.motions)
-        for side, (first, last) in ((0, (first, last)), (1, (first, last)))
-    ]
-    x, y, psi, turned = _drive(mirror, segment, start, psi, (right_m, left_m, base_m, creep), grips)
-    ends = np.array([x, y, psi])
-    end = ends[:, 0]
-    away = ends - end[:, None]
-    of_start = np.eye(3)
-    of_start[:, 2] = away[:, 5] / _TURN_RAD
-    return DeadReckonedSegment(end, away[:, 1:5] / steps, of_start, away[:, 6:] / _GRIP, turned)
-
-
+_STEPS = np.array((1e-5, 1e-5, 1e-5, 1e-3))  # relative, but for the creep
 _TURN_RAD, _GRIP = 1e-5, 1e-4
 
 
-def _drive(
-    mirror: Mirror,
-    segment: Segment,
-    start: FloatArray,
-    psi: FloatArray,
-    wheels: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    grips: list[tuple[int, int, int]],
-) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Step by step, one column for each set of parameters; the surface is that under the first column."""
-    right_m, left_m, base_m, creep = wheels
+def carry(mirror: Mirror, segment: Segment, start: FloatArray, wheels: WheelParameters) -> DeadReckonedSegment:
+    """Drive a segment again from x, y (m), heading (rad), deck frame.
+
+    The model is that of the localizer (thesis eqs 2.11, 2.14 on the curved surface): with d = (r_R phi_R + r_L phi_L)/2
+    and turn = (r_R phi_R - r_L phi_L)/b the deck position moves by d h(psi + turn/2) + c |d| g, and the heading by
+    turn - fy (fxx dx + fxy dy) / ((1 + fx^2) W). One column for each set of parameters: as given, each of the four
+    changed, the heading changed, and the grip of either wheel in each motion; the surface is that under the first.
+    """
+    steps = np.array((*wheels[:3], 1.0)) * _STEPS
+    columns = 6 + 2 * len(segment.motions)
+    parameters = np.tile(np.array(wheels)[:, None], columns)
+    parameters[:, 1:5] += np.diag(steps)
+    right_m, left_m, base_m, creep = parameters
+    x, y, psi = (np.full(columns, value) for value in start)
+    psi[5] += _TURN_RAD
     terrain = Terrain(mirror)
-    x, y = np.full(len(psi), start[0]), np.full(len(psi), start[1])
-    psi = psi.copy()
-    dx0 = dy0 = turned = 0.0
-    for first, last in segment.motions:
+    dx0 = dy0 = turned_rad = 0.0
+    for motion, (first, last) in enumerate(segment.motions):
+        grip_right, grip_left = np.ones(columns), np.ones(columns)
+        grip_right[6 + 2 * motion] += _GRIP
+        grip_left[7 + 2 * motion] += _GRIP
         for begin in range(first, last, STEP_FRAMES):
             end = min(begin + STEP_FRAMES, last)
             phi_r, phi_l = float(segment.right_rad[begin:end].sum()), float(segment.left_rad[begin:end].sum())
             if phi_r == phi_l == 0.0:  # a counter at rest
                 continue
-            right, left = right_m * phi_r, left_m * phi_l
-            for column, motion_first, motion_last in grips:
-                if motion_first <= begin < motion_last:
-                    (right if (column - 6) % 2 == 0 else left)[column] *= 1.0 + _GRIP
+            right, left = right_m * phi_r * grip_right, left_m * phi_l * grip_left
             d, turn = 0.5 * (right + left), (right - left) / base_m
             # In the middle of the step, by the duration of the last one.
             fx, fy, fxx, fxy, _, gx, gy = terrain.at(float(x[0]) + 0.5 * dx0, float(y[0]) + 0.5 * dy0)
@@ -331,8 +282,12 @@ def _drive(
             x, y = x + dx, y + dy
             psi = psi + turn - fy * (fxx * dx + fxy * dy) / (s2 * norm)
             dx0, dy0 = float(dx[0]), float(dy[0])
-            turned += float(turn[0])
-    return x, y, psi, turned
+            turned_rad += float(turn[0])
+    ends = np.array([x, y, psi])
+    away = ends - ends[:, :1]
+    of_start = np.eye(3)
+    of_start[:, 2] = away[:, 5] / _TURN_RAD
+    return DeadReckonedSegment(ends[:, 0], away[:, 1:5] / steps, of_start, away[:, 6:] / _GRIP, turned_rad)
 
 
 # A survey has hundreds of legs; what its first ones do not show the others hardly will, and time grows with the cube.

@@ -1,6 +1,6 @@
 """Checks before a mission: findings as a table, and the rules for the laser server and the robot at rest."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from itertools import pairwise
 from math import dist
@@ -27,11 +27,7 @@ class CheckOutcome(StrEnum):
 
 
 class PreflightResult(NamedTuple):
-    """One check.
-
-    Attributes:
-        todo: what to do; empty where all is well.
-    """
+    """One check; ``todo`` says what to do and is empty where all is well."""
 
     name: str
     outcome: CheckOutcome
@@ -99,14 +95,10 @@ def check_lasers(*, connected: bool, laser_ready: bool) -> PreflightResult:
 def check_air(air: Environment) -> PreflightResult:
     """Can the air be what the server takes it for? Lengths are corrected by it."""
     found = f"{air.temperature_c:.1f} degC, {air.pressure_hpa:.0f} hPa, {air.humidity_pct:.0f} %"
-    for value, (low, high) in (
-        (air.temperature_c, TEMPERATURE_C),
-        (air.pressure_hpa, PRESSURE_HPA),
-        (air.humidity_pct, HUMIDITY_PCT),
-    ):
-        if not low <= value <= high:
-            todo = "look at the weather station of the laser unit: lengths are corrected by it"
-            return failed("air", f"{found}: not the air of any telescope", todo)
+    limits = (air.temperature_c, TEMPERATURE_C), (air.pressure_hpa, PRESSURE_HPA), (air.humidity_pct, HUMIDITY_PCT)
+    if not all(low <= value <= high for value, (low, high) in limits):
+        todo = "check the weather station of the laser unit: lengths are corrected by it"
+        return failed("air", f"{found}: not the air of any telescope", todo)
     return passed("air", found)
 
 
@@ -134,7 +126,7 @@ ROBOT_NAMES = (
     "battery",
 )  # fmt: skip
 EDGES = ("front left", "front right", "rear left", "rear right")
-# The rates that a robot must have: half of what the interface allows, which the danger rules still bear.
+# The rates that a robot must have: half of what the interface allows, which the danger rules still tolerate.
 LEAST_HZ = {"imu": 20.0, "enc": 50.0, "edge": 200.0}
 CLOCK_TOLERANCE = 0.01
 STANDING_RAD_S = 0.02
@@ -142,12 +134,7 @@ BIAS_SIGMAS = 5.0
 
 
 class RobotReport(NamedTuple):
-    """What came from the robot.
-
-    Attributes:
-        frames: one after the other.
-        arrived_s: when each came, by our monotonic clock.
-    """
+    """What came from the robot: its hello, its frames in order, and when each arrived, by our monotonic clock."""
 
     hello: Hello
     frames: Sequence[Sensors]
@@ -157,11 +144,12 @@ class RobotReport(NamedTuple):
 def check_robot(cfg: Config, mirror: Mirror, report: RobotReport) -> list[PreflightResult]:
     """All checks of a robot that stands at base."""
     problems = robot_problems(cfg, mirror, report.hello)
-    geometry = (
-        failed("robot geometry", "; ".join(problems), "measure the robot and correct [robot], or run.mirror")
-        if problems
-        else passed("robot geometry", f"wheel radius {cfg.robot.wheel_radius_m:g} m, base {cfg.robot.wheel_base_m:g} m")
+    geometry = passed(
+        "robot geometry", f"wheel radius {cfg.robot.wheel_radius_m:g} m, base {cfg.robot.wheel_base_m:g} m"
     )
+    if problems:
+        todo = "measure the robot and correct [robot], or run.mirror"
+        geometry = failed("robot geometry", "; ".join(problems), todo)
     return [
         geometry,
         _frames(cfg, report),
@@ -184,14 +172,16 @@ def _frames(cfg: Config, report: RobotReport) -> PreflightResult:
     frames, nominal = report.frames, report.hello.frame_hz
     span_s = report.arrived_s[-1] - report.arrived_s[0]
     if span_s <= 0.0:
-        return failed("frames", "a single frame", "is something between us and the robot that holds frames back?")
+        return failed(
+            "frames", "a single frame", "check whether something between here and the robot holds frames back"
+        )
     rate, gap_s = (len(frames) - 1) / span_s, max(b - a for a, b in pairwise(report.arrived_s))
     missing = sum(b.seq - a.seq - 1 for a, b in pairwise(frames))
     found = f"{rate:.1f} a second of {nominal:g}, longest gap {1e3 * gap_s:.0f} ms, {missing} missing"
     if gap_s > cfg.robot.sensors_timeout_s or rate < 0.9 * nominal:
-        return failed("frames", found, "look at the network between here and the robot, and at the load of both")
+        return failed("frames", found, "check the network between here and the robot, and at the load of both")
     if gap_s > cfg.robot.lag_limit_s or missing:
-        return warned("frames", found, "the robot will pause now and then; look at the network and the load")
+        return warned("frames", found, "the robot will pause now and then; check the network and the load")
     return passed("frames", found)
 
 
@@ -210,7 +200,7 @@ def _clock(report: RobotReport) -> PreflightResult:
 def _faults(frames: Sequence[Sensors]) -> PreflightResult:
     reported = sorted({fault for frame in frames for fault in frame.faults})
     if reported:
-        return failed("faults", f"the robot reports {', '.join(reported)}", "see to it before anything moves")
+        return failed("faults", f"the robot reports {', '.join(reported)}", "correct it before anything moves")
     return passed("faults", "the robot reports none")
 
 
@@ -220,7 +210,7 @@ def _too_slow(kind: str, count: int, frames: Sequence[Sensors]) -> str:
 
 
 def _encoders(frames: Sequence[Sensors]) -> PreflightResult:
-    todo = "look at the encoders and their cables"
+    todo = "check the encoders and their cables"
     for index, side in ((1, "right"), (2, "left")):
         rates = [rate for frame in frames for row in frame.enc if (rate := row[index]) is not None]
         if slow := _too_slow("enc", len(rates), frames):
@@ -232,7 +222,7 @@ def _encoders(frames: Sequence[Sensors]) -> PreflightResult:
 
 def _inertial_unit(cfg: Config, frames: Sequence[Sensors]) -> PreflightResult:
     rows = [row for frame in frames for row in frame.imu]
-    todo = "look at the inertial unit and its cable"
+    todo = "check the inertial unit and its cable"
     if slow := _too_slow("imu", len(rows), frames):
         return failed("inertial unit", slow, todo)
     repeated = longest = 0
@@ -252,20 +242,14 @@ def _inertial_unit(cfg: Config, frames: Sequence[Sensors]) -> PreflightResult:
 def _edge_sensors(frames: Sequence[Sensors]) -> PreflightResult:
     rows = [row[1:] for frame in frames for row in frame.edge]
     if slow := _too_slow("edge", len(rows), frames):
-        return failed("edge sensors", slow, "look at the edge sensors and their cable")
-    off = [name for name, values in zip(EDGES, zip(*rows, strict=True), strict=True) if not any(values)]
-    if off:
+        return failed("edge sensors", slow, "check the edge sensors and their cable")
+    seen = dict(zip(EDGES, zip(*rows, strict=True), strict=True))
+    if off := [name for name, values in seen.items() if not any(values)]:
         todo = "set the robot down at base, on a panel with all four; clean the sensors"
         return failed("edge sensors", f"{' and '.join(off)} see no panel", todo)
-    if flickering := list(_flickering(rows)):
+    if flickering := [name for name, values in seen.items() if not all(values)]:
         return failed("edge sensors", f"{' and '.join(flickering)} see the panel on and off", "clean the sensors")
     return passed("edge sensors", "all four see the panel")
-
-
-def _flickering(rows: Sequence[Sequence[int]]) -> Iterator[str]:
-    for name, values in zip(EDGES, zip(*rows, strict=True), strict=True):
-        if not all(values):
-            yield name
 
 
 def _gravity(mirror: Mirror, frames: Sequence[Sensors]) -> PreflightResult:

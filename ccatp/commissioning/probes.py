@@ -160,11 +160,11 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
         link.close()
     if lost or not frames:
         why = lost[0] if lost else f"no sensors frame within {FIRST_FRAME_S:g} s"
-        return [failed(name, why, "look at the robot's own log"), *skipped(ROBOT_NAMES, "no frames")]
+        return [failed(name, why, "read the robot's own log"), *skipped(ROBOT_NAMES, "no frames")]
     hello = hellos[0]
     found = passed(name, f"{cfg.robot.host}:{cfg.robot.port}, {hello.protocol}, auth {hello.auth}")
     if hello.auth == "none" and not cfg.robot.host.startswith(_LOCAL):
-        todo = "anybody on that network can drive it: give it a key (ccatp keys generate, robot.key_file)"
+        todo = "everyone on that network can drive it: give it a key (ccatp keys generate, robot.key_file)"
         found = warned(name, found.found, todo)
     return [found, *check_robot(cfg, mirror, RobotReport(hello, frames, arrived_s))]
 
@@ -189,7 +189,7 @@ async def probe_laser(cfg: Config, mirror: Mirror) -> list[PreflightResult]:
             await asyncio.sleep(cfg.etalon.measuring_time_s)
             fix = await client.measure(0.0, mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m))
         except EtalonUnreachable as error:
-            return [*found, failed("laser fix", str(error), "the server went away; look at its log")]
+            return [*found, failed("laser fix", str(error), "the server ended; read its log")]
         except EtalonError as error:
             todo = "set the robot down at base, with a free view for the beams"
             return [*found, failed("laser fix", str(error), todo)]

@@ -65,7 +65,7 @@ class BeaconDangerConfig(Model):
     target_m: Positive  # no motion towards the target when it is nearer
     target_window_s: Positive  # its levels are averaged over this time
     target_level_sigma_db: Positive  # of the white noise of its level
-    radio_timeout_s: Positive  # hold when no static radio, or no mote, was heard for this long
+    radio_timeout_s: Positive  # hold when no static radio, or no mote, was received for this long
     position_sigma_m: Positive  # hold while the estimate's standard deviation is larger ...
     position_clear_m: Positive  # ... until it is smaller than this
     estimate_timeout_s: Positive  # hold without an estimate that is newer
@@ -74,11 +74,11 @@ class BeaconDangerConfig(Model):
 
 
 class ListenerConfig(Model):
-    """How the robot hears ultrasonic motes."""
+    """How the robot receives ultrasonic motes."""
 
     name: Name  # of the robot's own listener, in readings
     pulses_per_frame: Annotated[int, Field(ge=1, le=20)]  # motes that send in one frame, one after the other
-    mapping_rounds: Annotated[int, Field(ge=1, le=10_000)]  # in which motes report what they hear of each other
+    mapping_rounds: Annotated[int, Field(ge=1, le=10_000)]  # in which motes report what they receive of each other
     gate_probability: Annotated[float, Field(gt=0.5, lt=1.0)]  # a range less likely than this is not used
 
 
@@ -100,7 +100,7 @@ class RadioLossConfig(Model):
 
 
 class ObstacleIncidentConfig(Model):
-    """Somebody puts something in the way, and takes it away again."""
+    """Something is put in the way, and taken away again."""
 
     type: Literal["obstacle"]
     at_s: NonNegative
@@ -154,7 +154,7 @@ class RangingConfig(Model):
 
 
 class TransducerConfig(Model):
-    """Where a mote hears another: reach against the angle off the axis."""
+    """Where a mote receives another: reach against the angle off the axis."""
 
     is_omnidirectional: bool
     off_axis_rad: Annotated[tuple[Annotated[float, Field(ge=0.0, le=3.1416)], ...], Field(min_length=2)]

@@ -67,7 +67,7 @@ def check_config(cfg: Config) -> list[ConfigProblem]:
 def check_radio_config(cfg: RadioConfig, *, simulates: bool = True) -> list[ConfigProblem]:
     """Everything wrong with a configuration among beacons whose values are each in range.
 
-    ``simulates`` says whether the field of motes is simulated; of measured ranges, layout and places have no say.
+    ``simulates`` says whether the field of motes is simulated; layout and places do not matter for measured ranges.
     """
     motes = cfg.cricket
     return [
@@ -110,7 +110,7 @@ def _check_run(cfg: Config) -> Problems:
 
 
 def _check_units(cfg: Config) -> Problems:
-    """Lengths and angles that have no limit of their own, but that nobody can have meant."""
+    """Lengths and angles that have no limit of their own, but that cannot be meant."""
     for name in type(cfg).model_fields:
         if name != "mirror":
             yield from _slips(getattr(cfg, name), (name,))
@@ -219,7 +219,7 @@ def _check_stand_ins(cfg: Config) -> Problems:
     """Whoever reaches a stand-in may command it, unless there is a key."""
     if cfg.sim.open_to_network:
         return
-    hint = "set sim.open_to_network if anybody there may command it"
+    hint = "set sim.open_to_network if everyone there may command it"
     if not (is_loopback(cfg.sim.robot.host) or cfg.robot.key_file):
         what = f'= "{cfg.sim.robot.host}" is beyond this machine; name a key in robot.key_file, or {hint}'
         yield ConfigProblem(("sim", "robot", "host"), what)
@@ -393,5 +393,5 @@ def _check_motes(cfg: CricketConfig) -> Problems:
     if angles[0] != 0.0 or any(later <= before for before, later in pairwise(angles)):
         yield ConfigProblem((*key, "off_axis_rad"), f"= {list(angles)} must begin with 0 and rise")
     if 0 < cfg.phase1.draws < _LEAST_DRAWS:
-        what = f"= {cfg.phase1.draws} tell no covariance of dozens of coordinates; 0, or {_LEAST_DRAWS} at least"
+        what = f"= {cfg.phase1.draws} give no covariance of dozens of coordinates; 0, or {_LEAST_DRAWS} at least"
         yield ConfigProblem(("cricket", "phase1", "draws"), what)

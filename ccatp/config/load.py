@@ -92,7 +92,7 @@ class ConfigSource:
 
 
 def read_source(path: Path, root: Key = ()) -> ConfigSource:
-    """What a TOML file says, as the section ``root`` of a configuration.
+    """The content of a TOML file, as the section ``root`` of a configuration.
 
     Raises:
         ConfigError: there is no such file, or it is not TOML.
@@ -158,7 +158,7 @@ def _stacked(sources: Sequence[ConfigSource]) -> Tree:
 
 
 def _source_of(key: Key, sources: Iterable[ConfigSource]) -> ConfigSource:
-    """The source that says most about a key; of equals the strongest, which stands first."""
+    """The source that holds most of a key; of equals the strongest, which stands first."""
     return max(sources, key=lambda source: source.depth(key))
 
 
@@ -371,7 +371,7 @@ def load_recordings_config(file: Path | None = None, overrides: Overrides = None
 def with_values(text: str, values: Mapping[str, float], file: Path) -> str:
     """The text with other values of some keys, ``section.key``; everything else, comments included, stays.
 
-    A key that is there keeps its comment, but for the mark of values that nobody has measured; one that is not is
+    A key that is there keeps its comment, but for the mark of unmeasured values; one that is not is
     added to its section.
 
     Raises:
@@ -403,7 +403,7 @@ def difference(before: str, after: str, file: Path) -> str:
 
 
 def write_in_place(file: Path, text: str) -> None:
-    """Replace a file's contents at once: whoever reads it finds the old ones or the new ones, also after a power cut.
+    """Replace a file's contents at once: a reader finds the old ones or the new ones, also after a power cut.
 
     Its mode stays as it is; where it is a link, what it points to is replaced.
 

@@ -43,7 +43,7 @@ class RunConfig(ProcessesConfig):
 
 
 class LinkConfig(Model):
-    """The robot link: where the robot is, and when what it says is too old."""
+    """The robot link: where the robot is, and when its data are too old."""
 
     host: str
     port: Port

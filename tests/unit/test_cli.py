@@ -125,7 +125,7 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
         (["sim", "etalon", "--puck", "1", "2", "3", "--truth", "ipc://x"], "--puck and --truth exclude each other"),
         (["sim", "etalon", "--puck", "nan", "0", "0"], "each of X Y Z is a number of metres, at most 1000 from the"),
         (["sim", "etalon", "--puck", "0", "0", "-inf"], "each of X Y Z is a number of metres"),
-        (["sim", "etalon", "--truth", "foo"], "'foo' is no endpoint; give ipc://PATH, as ccatp sim robot tells it"),
+        (["sim", "etalon", "--truth", "foo"], "'foo' is no endpoint; give ipc://PATH, as ccatp sim robot prints it"),
         (["sim", "etalon", "--truth", "tcp://a"], "'tcp://a' is no endpoint"),
         (["sim", "etalon", "--truth", "ipc://x", "--runtime-dir", "x"], "leave out --puck and --truth"),
         (["run", "--sim", "--miror", "x"], "Did you mean one of: '--mirror'"),

@@ -1,4 +1,4 @@
-"""Children run the package of their parent."""
+"""Children run the package of their parent; errors are one line and have their exit status."""
 
 import os
 import subprocess
@@ -9,6 +9,7 @@ import pytest
 
 import ccatp
 from ccatp.config import package
+from ccatp.errors import CcatpError, ConfigError, DaemonUnreachableError, ExitStatus, RefusedError, RuntimeDirError
 
 
 @pytest.mark.parametrize("is_installed", [True, False])
@@ -32,3 +33,28 @@ def test_the_paths_of_the_parent_are_kept(monkeypatch: pytest.MonkeyPatch) -> No
     found = package.child_environment({"PYTHONPATH": "/one", "HOME": "/home"})
     assert found["PYTHONPATH"] == os.pathsep.join((str(package.ROOT.parent), "/one"))
     assert found["HOME"] == "/home"
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (CcatpError("x"), ExitStatus.HELD),
+        (ConfigError("x"), ExitStatus.USAGE),
+        (RuntimeDirError("x"), ExitStatus.USAGE),
+        (RefusedError("x"), ExitStatus.REFUSED),
+        (DaemonUnreachableError("x"), ExitStatus.UNREACHABLE),
+    ],
+)
+def test_each_error_has_its_exit_status(error: CcatpError, status: ExitStatus) -> None:
+    assert error.exit_status == status
+    assert str(error) == "x"
+
+
+def test_a_message_is_one_line() -> None:
+    assert str(CcatpError("two\n lines ")) == "two lines"
+
+
+def test_the_first_of_several_problems_is_the_message() -> None:
+    error = ConfigError("a: b", "c:\nd")
+    assert str(error) == "a: b (and 1 more: ccatp config check)"
+    assert error.problems == ["a: b", "c: d"]

@@ -214,7 +214,7 @@ def _lost(key: Key, ending: Ending, context: CheckContext) -> str:
         if seen is not None:
             return seen
         context.clear()
-    raise NotApplicable("the server or this machine is too slow to tell")
+    raise NotApplicable("the server or this machine is too slow for this check")
 
 
 def _end(pair: ControllerAndMonitor, key: Key, witness: Key, ending: Ending) -> Sequence[Frame]:

@@ -39,11 +39,11 @@ _RESET = b"\x01\0\0\0\0\0\0\0"  # linger on, for 0 s: close sends RST
 
 
 class CheckFailed(AssertionError):
-    """The server does not do what the interface control document promises; the text says what was seen instead."""
+    """The server does not do what the interface control document promises; the text is what was seen instead."""
 
 
 class NotApplicable(Exception):
-    """The server promises nothing here, or nothing that can be seen; the text says why."""
+    """The server promises nothing here, or nothing that can be seen; the text is the reason."""
 
 
 Run = Callable[["CheckContext"], str]
@@ -105,7 +105,7 @@ def parse(model: type[PartT], message: Message, where: str = "") -> PartT:
 
 
 class Timing(Part):
-    """Clock of the robot, as its hello tells it."""
+    """Clock of the robot, in its hello."""
 
     lockstep: bool
     frame_hz: Positive
@@ -170,7 +170,7 @@ class Frame(Part):
 
 
 def whole_samples(samples: object, size: int) -> list[list[float]]:
-    """The samples of a list that are so many numbers; of others ``frames-samples`` tells."""
+    """The samples of a list that are so many numbers; ``frames-samples`` reports the others."""
     whole = [one for one in samples if isinstance(one, list) and len(one) == size] if isinstance(samples, list) else []
     return [one for one in whole if all(isinstance(value, int | float) for value in one)]
 

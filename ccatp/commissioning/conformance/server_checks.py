@@ -218,7 +218,7 @@ def _take_over(context: CheckContext) -> str:
     if answer["type"] == "joined":
         early_s = pair.newest.t - silent_s
         require(early_s > SILENCE_S, f"taken over after a silence of {early_s:.2f} s")
-        raise NotApplicable("the server or this machine is too slow to tell")
+        raise NotApplicable("the server or this machine is too slow for this check")
     _send_bad_lines(pair, silent_s + TAKEN_S)
     try:
         # Not for long: now the holder is silent altogether.

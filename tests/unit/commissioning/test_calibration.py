@@ -13,7 +13,7 @@ from ccatp.cli import main
 from ccatp.commissioning.calibration import Calibration, CalibrationError, calibrate, check_usable, lines, rows
 from ccatp.commissioning.calibration_drive import RecordedDrive, WheelParameters, carry
 from ccatp.core import FloatArray
-from tests.unit.calibrating.driven import OTHER_ROBOT, CalibrationDrive, priors, record
+from tests.unit.commissioning.driven import OTHER_ROBOT, CalibrationDrive, priors, record
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,349 @@
+"""Tests of the commands ``completion``, ``plan`` and ``status``."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from ccatp.cli import main
+from ccatp.config.load import available, load_config
+from ccatp.config.package import child_environment
+from ccatp.daemon.terminal import clock, share_done, status_line, status_rows
+from ccatp.links.topics import MissionStatus
+from ccatp.mirror.mirror import build_mirror
+from ccatp.survey.composition import assemble, make_plan, plan_lines
+from tests.unit.serving import serving
+
+
+@pytest.mark.parametrize(
+    ("shell", "sign"),
+    [("bash", "complete -o nosort -F"), ("zsh", "#compdef ccatp"), ("fish", "complete --no-files --command ccatp")],
+)
+def test_each_shell_gets_its_script(shell: str, sign: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert sign in script
+    assert "_CCATP_COMPLETE" in script
+
+
+def test_another_shell_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", "bahs"]) == 2
+    assert "did you mean bash?" in capsys.readouterr().err
+
+
+def test_without_a_bash_its_script_is_there_all_the_same(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ccatp.cli.config.shutil.which", lambda _: None)
+    assert main(["completion", "bash"]) == 0
+    assert "_ccatp_completion" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def bash(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, dict[str, str]]:
+    """A bash, and an environment in which ``ccatp`` is this package."""
+    shell = shutil.which("bash")
+    if shell is None:
+        pytest.skip("no bash here")
+    folder = tmp_path_factory.mktemp("bin")
+    program = folder / "ccatp"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ccatp "$@"\n')
+    program.chmod(0o755)
+    environment = child_environment(os.environ)
+    return shell, {**environment, "PATH": f"{folder}:{environment['PATH']}"}
+
+
+# Each TAB is one start of the program: as few as show that every kind of word is completed.
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        (("ccatp", "re"), ("replay", "resume")),
+        (("ccatp", "run", "--mir"), ("--mirror",)),
+        (("ccatp", "run", "--mirror", "fyst"), ("fyst-m1", "fyst-m2")),
+        (("ccatp", "emergency", "f"), ("fire",)),
+    ],
+    ids=" ".join,
+)
+def test_bash_completes(words: tuple[str, ...], offered: tuple[str, ...], bash: tuple[str, dict[str, str]]) -> None:
+    shell, environment = bash
+    quoted = " ".join(f"'{word}'" for word in words)
+    script = f"""
+eval "$(ccatp completion bash)"
+COMP_WORDS=({quoted}); COMP_CWORD={len(words) - 1}
+_ccatp_completion ccatp
+printf '%s\\n' "${{COMPREPLY[@]}}"
+"""
+    done = subprocess.run(
+        [shell, "-c", script], env=environment, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert set(offered) <= set(done.stdout.split())
+    assert all(word.startswith(words[-1]) for word in done.stdout.split())
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_the_script_is_sound(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    program = shutil.which(shell)
+    if program is None:
+        pytest.skip(f"no {shell} here")
+    assert main(["completion", shell]) == 0
+    script = tmp_path / "script"
+    script.write_text(capsys.readouterr().out)
+    subprocess.run([program, "-n", str(script)], check=True, timeout=20)
+
+
+NAMES = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
+
+
+def planned(capsys: pytest.CaptureFixture[str], *args: str, status: int = 0) -> dict[str, Any]:
+    assert main(["plan", "--json", *args]) == status
+    result: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return result
+
+
+def test_every_shipped_world_is_named_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", "--help"]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert set(available("world")) <= set(re.split(r"[ ,]+", told))
+
+
+def test_one_panel_is_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", "--mirror", "fyst-m2", "--panels", "1"]) == 0
+    assert "fyst-m2: 9 points of 1 panel, order thesis\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("filter_name", ["kf", "ekf"])
+def test_the_plan_is_that_of_a_run(name: str, filter_name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    found = planned(capsys, "--mirror", name, "--panels", "3", "--filter", filter_name)
+    parts = assemble(load_config(overrides={"run.mirror": name, "run.panels": 3, "run.filter": filter_name}))
+    assert found["lower_bound_s"] == pytest.approx(parts.lower_bound_s, abs=1e-3)
+    assert found["length_m"] == pytest.approx(parts.route.remaining_m(0), abs=1e-3)
+    assert [(s["x_m"], s["y_m"]) for s in found["stops"]] == [
+        (round(stop.x_m, 4), round(stop.y_m, 4)) for stop in parts.route.stops
+    ]
+    assert [tuple(s["point"]) for s in found["stops"] if s["point"]] == [tuple(point) for point in parts.points]
+    assert found["points"] == {"total": 27, "reached": 27}
+    assert (found["mirror"], found["order"], found["out_of_reach"]) == (name, "thesis", [])
+
+
+def test_its_times_add_up(capsys: pytest.CaptureFixture[str]) -> None:
+    found = planned(capsys, "--panels", "2")
+    parts_s = [found[key] for key in ("driving_s", "turning_s", "measuring_s")]
+    assert sum(parts_s) == pytest.approx(found["lower_bound_s"], abs=2e-3)
+    assert found["measuring_s"] == pytest.approx(0.5 * sum(s["kind"] != "via" for s in found["stops"]))
+    # The clock at the last stop, and the measurement there.
+    assert found["stops"][-1]["t_s"] + 0.5 == pytest.approx(found["lower_bound_s"], abs=2e-3)
+    times_s = [stop["t_s"] for stop in found["stops"]]
+    assert times_s == sorted(times_s)
+    assert 0.0 < found["any_order_bound_s"] <= found["lower_bound_s"]
+    assert found["fits_budget"]
+
+
+def test_settings_act(capsys: pytest.CaptureFixture[str]) -> None:
+    usual = planned(capsys, "--panels", "4")
+    faster = planned(capsys, "--panels", "4", "--set", "limits.v_max_m_s=0.2")
+    other = planned(capsys, "--panels", "4", "--set", "run.order=optimised", "--set", "run.budget_s=60")
+    assert faster["driving_s"] < usual["driving_s"]
+    assert other["order"] == "optimised"
+    assert other["lower_bound_s"] < usual["lower_bound_s"]
+    assert not other["fits_budget"]
+
+
+def test_points_out_of_reach_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    args = ("--panels", "1", "--set", "mission.leg_clearance_m=0.12")
+    found = planned(capsys, *args, status=2)
+    # Points lie 115 mm from the rim at least; the first panel of M1 has it below and on its left.
+    lost = [tuple(point) for point in found["out_of_reach"]]
+    assert lost
+    assert all(point[:2] == (1, 2) for point in lost)
+    assert (1, 2, 5) not in lost
+    assert found["points"] == {"total": 9, "reached": 9 - len(lost)}
+    assert main(["plan", *args]) == 2
+    out, err = capsys.readouterr()
+    assert f"out of reach    {len(lost)} points: 1/2/" in out
+    assert err == (
+        f"ccatp: {len(lost)} points are out of reach with mission.leg_clearance_m = 0.12 and "
+        "turn_clearance_m = 0.005; a run would be refused\n"
+    )
+
+
+def test_many_points_out_of_reach_are_counted() -> None:
+    cfg = load_config(overrides={"run.panels": 2})
+    found = make_plan(cfg, build_mirror(cfg.mirror))
+    *_, line = plan_lines(cfg, replace(found, out_of_reach=found.points))
+    assert line.startswith("out of reach    18 points: 1/2/")
+    assert line.count("/") == 2 * 10
+    assert line.endswith(" ...")
+
+
+def test_the_text_tells_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    found = planned(capsys, "--panels", "10", "--mirror", "fyst-m2")
+    assert main(["plan", "--panels", "10", "--mirror", "fyst-m2"]) == 0
+    out = capsys.readouterr().out
+    assert "fyst-m2: 90 points of 10 panels, order thesis\n" in out
+    assert f"way             {found['length_m']:.1f} m, {len(found['stops'])} stops" in out
+    assert out.endswith("out of reach    none\n")
+    assert out.splitlines()[1].endswith(" ...")
+
+
+@pytest.mark.parametrize(("suffix", "magic"), [("png", b"\x89PNG"), ("svg", b"<svg")])
+def test_the_figure_is_drawn(suffix: str, magic: bytes, tmp_path: Path) -> None:
+    picture = tmp_path / f"plan.{suffix}"
+    args = ["--panels", "1", "--set", "mission.leg_clearance_m=0.12", "--figure", str(picture)]
+    assert main(["plan", *args]) == 2
+    assert picture.read_bytes().startswith(magic)
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["--mirror", "fyst-m3"], "fyst-m3"),
+        (["--panels", "-1"], "run.panels"),
+        (["--panels", "999"], "run.panels = 999, but fyst-m1 has 77 panels; 0 takes all of them"),
+        (["--set", "limits.v_max_m_s=1e-300"], "limits.v_max_m_s = 1e-300 must be at least 0.001"),
+        (["--set", "limits.alpha_max_rad_s2=1e-300"], "limits.alpha_max_rad_s2 = 1e-300 must be at least 0.001"),
+        (
+            ["--panels", "1", "--set", "mirror.surface.normalisation_radius_mm=1e-300"],
+            "mirror.surface.normalisation_radius_mm = 1e-300 must be at least 100",
+        ),
+        (["--figure", "nowhere/plan.png"], "--figure: no directory nowhere; make it first"),
+        (
+            ["--panels", "1", "--figure", "plan.tiff7"],
+            "--figure: plan.tiff7: no format by that name; the file may end in .png, .pdf, .svg",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(
+    args: list[str], message: str, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert main(["plan", *args]) == 2
+    out, err = capsys.readouterr()
+    assert len(err.splitlines()) == 1
+    assert message in err
+    assert out == ""
+
+
+NO_STATUS = MissionStatus(seq=-1, t_s=0.0, state="")
+
+STATUS = {
+    **msgspec.to_builtins(NO_STATUS),
+    "state": "driving", "point": "3-4-5", "done": 120, "skipped": 3, "total": 693, "elapsed_s": 754.0, "eta_s": 3700.0,
+    "lower_bound_s": 3000.0, "error_mm": 0.052,
+}  # fmt: skip
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="ccatp-") as path:  # short: unix sockets take no long one
+        yield Path(path)
+
+
+def test_the_table() -> None:
+    assert status_rows(STATUS) == [
+        ("state", "driving 3-4-5"),
+        ("points", f"120 of 693 measured, 3 skipped  [{'#' * 5}{'.' * 25}]"),
+        ("time", "12:34 elapsed, 1:01:40 to go, no path takes less than 50:00"),
+        ("arrival", "0.05 mm from the last point, as estimated"),
+        ("danger", "0 normal"),
+    ]
+    assert dict(status_rows({**STATUS, "error_mm": 0.0}))["arrival"] == "none yet"
+    held = {
+        **STATUS,
+        "state": "held",
+        "point": "",
+        "cause": "operator",
+        "code": 2,
+        "missed_deadlines": 4,
+        "worst_lateness_ms": 31.0,
+    }
+    held |= {"left_out": {"out of time": ["1-2-3", "1-2-4"]}, "exit_status": 4, "outcome": "stopped"}
+    found = dict(status_rows(held))
+    assert found["cause"] == "operator"
+    assert found["danger"] == "2 operation aborted"
+    assert found["late frames"] == "4, the latest by 31 ms"
+    assert found["left out: out of time"] == "1-2-3, 1-2-4"
+    assert found["over"] == "with exit status 4"
+    many = dict(status_rows({**STATUS, "left_out": {"operator": [f"1-2-{k}" for k in range(1, 94)]}}))
+    assert many["left out: operator"] == (
+        "93 points: 1-2-1, 1-2-2, 1-2-3, 1-2-4, 1-2-5, 1-2-6, 1-2-7, 1-2-8, 1-2-9, 1-2-10, ..."
+    )
+    assert found["outcome"] == "stopped"
+
+
+def test_one_line() -> None:
+    assert status_line(STATUS) == "18 %: 120 of 693 points, driving 3-4-5, 12:34 elapsed, 1:01:40 to go"
+    assert "held (operator)" in status_line({**STATUS, "state": "held", "point": "", "cause": "operator"})
+    assert share_done({}) == 0.0
+    assert [clock(s) for s in (-1.0, 0.4, 59.6, 3600.0)] == ["0:00", "0:00", "1:00", "1:00:00"]
+
+
+def test_the_command(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with serving(folder, "control", lambda _: {"ok": True, "status": STATUS}):
+        assert main(["status", "--runtime-dir", str(folder)]) == 0
+        assert capsys.readouterr().out.splitlines()[0] == "state    driving 3-4-5"
+        assert main(["status", "--runtime-dir", str(folder), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["status"] == STATUS
+
+
+@pytest.mark.parametrize("command", ["pause", "resume", "abort", "stop"])
+def test_commands_answer_with_the_same_table(folder: Path, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with serving(folder, "control", lambda _: {"ok": True, "status": STATUS}):
+        assert main(["status", "--runtime-dir", str(folder)]) == 0
+        table = capsys.readouterr().out
+        assert main([command, "--runtime-dir", str(folder)]) == 0
+    assert capsys.readouterr().out == table
+
+
+def answers(*found: dict[str, Any]) -> Any:
+    left = list(found)
+    return lambda _: {"ok": True, "status": {**STATUS, **(left.pop(0) if len(left) > 1 else left[0])}}
+
+
+def test_watching_tells_changes_until_the_end(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    course = answers({}, {}, {"done": 121}, {"done": 693, "state": "done", "exit_status": 0})
+    command = ["status", "--watch", "--every", "0.1", "--runtime-dir", str(folder)]
+    with serving(folder, "control", course) as asked:
+        assert main(command) == 0
+    assert len(asked) == 4
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3  # what did not change is not told again
+    assert lines[-1].startswith("100 %: 693 of 693 points, done")
+    with serving(folder, "control", answers({}, {"exit_status": 3})):
+        assert main([*command, "--json"]) == 0
+    assert [json.loads(line)["status"]["exit_status"] for line in capsys.readouterr().out.splitlines()] == [-1, 3]
+
+
+def test_watching_a_daemon_that_goes_ends_well(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = ["status", "--watch", "--runtime-dir", str(folder)]
+    assert main(command) == 5  # nobody was there
+    with serving(folder, "control", answers({})):
+        # The daemon goes between two looks.
+        monkeypatch.setattr("ccatp.cli.operate.time.sleep", lambda _: (folder / "control").unlink())
+        assert main(command) == 0
+    assert "driving" in capsys.readouterr().out
+
+
+def test_a_terminal_gets_a_table(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    with serving(folder, "control", answers({}, {"exit_status": 0})):
+        assert main(["status", "--watch", "--every", "0.1", "--runtime-dir", str(folder)]) == 0
+    assert "120 of 693 measured" in capsys.readouterr().out
