@@ -73,7 +73,7 @@ new-examples: $(VENV)/.installed-dev
 	$(PYTEST) tests/property tests/oracle --hypothesis-profile=explore
 
 sweep: $(VENV)/.installed-dev
-	$(BIN)/python -m tests.faults.whole_sweep build/sweep --workers $(WORKERS)
+	$(BIN)/python -m tests.faults.edge_sweep build/sweep --workers $(WORKERS)
 
 mutants: $(VENV)/.installed-dev
 	nice -n 19 $(BIN)/python -m tests.mutation $(TARGETS)

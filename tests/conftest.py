@@ -5,6 +5,7 @@ import inspect
 import os
 import signal
 import socket
+import tempfile
 from collections.abc import AsyncIterator, Iterator
 
 import psutil
@@ -44,6 +45,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         group = item.get_closest_marker("xdist_group")
         if group is not None and "@" not in item.nodeid:
             item._id = coerce_node_id(f"{item.nodeid}@{group.args[0]}")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_runtime_dir() -> Iterator[None]:
+    """A daemon or server that names no runtime directory shares it with this worker's tests only."""
+    with tempfile.TemporaryDirectory(prefix="ccatp-") as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CCATP_RUNTIME_DIR", folder)
+        yield
 
 
 @pytest.fixture(autouse=True)

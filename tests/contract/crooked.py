@@ -2,11 +2,15 @@
 
 import asyncio
 import json
+import time
 from collections.abc import AsyncIterator, Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager
+from types import SimpleNamespace
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
+from ccatp.commissioning.conformance import connections, runner, session_checks
 from ccatp.commissioning.conformance.runner import Conformance, Result
 from ccatp.config.models import Config
 from ccatp.dataloop import DataLoop, _Connection
@@ -78,6 +82,45 @@ class CrookedLoop(DataLoop):
 
     def _connection(self) -> _Connection:
         return Middle(self)
+
+
+class ServerClock:
+    """Time as the server gets it: what passes while its event loop waits for a processor does not count.
+
+    In lockstep nothing depends on the wall clock but the patience of the checks, which is for a silent server and not
+    for a busy machine.
+    """
+
+    STEP_S, MOST_S = 0.005, 0.02
+
+    def __init__(self) -> None:
+        self.now_s = time.monotonic()
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    async def run(self) -> None:
+        before_s = time.monotonic()
+        while True:
+            await asyncio.sleep(self.STEP_S)
+            now_s = time.monotonic()
+            self.now_s += min(now_s - before_s, self.MOST_S)
+            before_s = now_s
+
+
+@asynccontextmanager
+async def server_time() -> AsyncIterator[None]:
+    """Let the checks wait by the clock of the event loop that serves the robots."""
+    clock = ServerClock()
+    running = asyncio.create_task(clock.run())
+    seen = SimpleNamespace(monotonic=clock.monotonic, sleep=time.sleep)
+    try:
+        with ExitStack() as stack:
+            for module in (connections, runner, session_checks):
+                stack.enter_context(patch.object(module, "time", seen))
+            yield
+    finally:
+        running.cancel()
 
 
 HONEST = Crooked("honest", frozenset(), ())

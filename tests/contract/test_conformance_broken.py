@@ -4,6 +4,7 @@ import asyncio
 import json
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -19,7 +20,7 @@ from ccatp.links.robot_messages import BadLineCounter, Drive, LineBuffer
 from ccatp.links.robot_messages import Fans as FansMessage
 from ccatp.sim import sessions
 from ccatp.sim.rules import FanRules, MotionRules
-from tests.contract.crooked import Crooked, Message, Middle, failures
+from tests.contract.crooked import Crooked, Message, Middle, failures, server_time
 
 AT_ONCE = 8  # servers
 KEY = b"secret"
@@ -557,7 +558,8 @@ async def judge(config: Config, table: list[Crooked], *, lockstep: bool, key: by
         async with room:
             return await failures(config, crooked, lockstep=lockstep, key=key)
 
-    seen = await asyncio.gather(*map(one, table))
+    async with server_time() if lockstep else nullcontext():
+        seen = await asyncio.gather(*map(one, table))
     wrong = {c.name: (sorted(c.fails), s) for c, s in zip(table, seen, strict=True) if set(s) != c.fails}
     assert not wrong, json.dumps(wrong, indent=1)
 

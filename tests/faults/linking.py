@@ -17,9 +17,7 @@ from typing import Any
 
 import pytest
 
-from tests.faults import record
-from tests.faults.realtime import is_realtime_permitted
-from tests.faults.table import PATH, Row, Table, load_table
+from tests.faults.table import PATH, RECORD, Row, Table, is_realtime_permitted, keep_record, load_table
 
 ROWS, MEASURED = "fault_rows", "fault"
 COLLECTED = "fault_marks"
@@ -191,7 +189,7 @@ class Linking:
         self._judgement = judge(self.table, self._tests, kind)
         path = self._config.getoption("--fault-record")
         if path is not None or self.table_is_ours:
-            record.keep(path or self._config.rootpath / record.NAME, self._tests, is_full=kind is not None)
+            keep_record(path or self._config.rootpath / RECORD, self._tests, is_full=kind is not None)
         if self._judgement.problems:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 

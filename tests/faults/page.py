@@ -4,9 +4,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from tests.faults import record
-from tests.faults.record import Record
-from tests.faults.table import PATH, Row, Table, load_table
+from tests.faults.table import PATH, RECORD, Record, Row, Table, load_record, load_table
 
 ROOT = PATH.parents[2]
 PAGE = ROOT / "docs" / "fault_table.md"
@@ -87,7 +85,7 @@ def _listed(names: Iterable[str]) -> str:
 
 def main() -> int:
     """Write the page; what is missing in it goes to standard error."""
-    table, kept = load_table(), record.load(ROOT / record.NAME)
+    table, kept = load_table(), load_record(ROOT / RECORD)
     PAGE.write_text(page(table, kept), encoding="utf-8")
     shown = {row_id for entry in kept.values() for row_id in entry["rows"]}
     print(f"{PAGE.relative_to(ROOT)}: {len(table)} rows")

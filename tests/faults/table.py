@@ -1,13 +1,19 @@
-"""The fault table as data: one row per fault, read from ``table.toml``."""
+"""The fault table as data, one row per fault, and the record of what its tests showed and measured on this machine."""
 
+import functools
+import json
+import os
+import threading
 import tomllib
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ccatp.commissioning.conformance.runner import check_ids
+from ccatp.studies.bench import CPU_INFO, cpu_model, machine
 
 PATH = Path(__file__).with_name("table.toml")
 # Rows of each kind in the list that the project works from; a row may be added, none may be lost.
@@ -76,3 +82,77 @@ def load_table(path: Path = PATH) -> Table:
 def conformance_rows(table: Table) -> tuple[str, ...]:
     """Rows of which the robot itself keeps a part that ``ccatp conformance`` asks for."""
     return tuple(row_id for row_id, row in table.items() if row.conformance)
+
+
+@functools.cache
+def is_realtime_permitted() -> bool:
+    """Try it on a thread of its own, which ends with what it was given."""
+    outcome: list[bool] = []
+
+    def try_it() -> None:
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        except OSError:
+            outcome.append(False)
+        else:
+            outcome.append(True)
+
+    thread = threading.Thread(target=try_it)
+    thread.start()
+    thread.join()
+    return outcome == [True]
+
+
+# -- the record, kept from run to run ----------------------------------------------------------------------------------
+
+RECORD = ".faults.json"
+
+Record = dict[str, dict[str, Any]]
+
+
+class Shown(Protocol):
+    """What the record wants to know of a test."""
+
+    rows: tuple[str, ...]
+    is_slow: bool
+    values: dict[str, float]
+    passed: bool
+    failed: bool
+
+
+def load_record(path: Path) -> Record:
+    """Tests by name; empty where there is no record yet."""
+    if not path.exists():
+        return {}
+    loaded: Record = json.loads(path.read_text(encoding="utf-8"))
+    return loaded
+
+
+def keep_record(path: Path, tests: Mapping[str, Shown], *, is_full: bool) -> None:
+    """Merge a run into the record.
+
+    A test that passed replaces its entry, one that failed loses it, one that did not run keeps it. A full run has seen
+    every test there is, so that entries of others are dropped.
+    """
+    entries = {name: entry for name, entry in load_record(path).items() if not is_full or name in tests}
+    now = datetime.now(UTC).date().isoformat()
+    for name, test in tests.items():
+        if test.failed:
+            entries.pop(name, None)
+        elif test.passed:
+            entries[name] = {
+                "rows": list(test.rows),
+                "slow": test.is_slow,
+                "values": test.values,
+                "date": now,
+                "machine": machine_line(),
+                "realtime": is_realtime_permitted(),
+            }
+    path.write_text(json.dumps(entries, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def machine_line() -> str:
+    """Processor, cores, Python, and whether real-time scheduling was permitted."""
+    facts = machine()
+    scheduling = "with" if is_realtime_permitted() else "without"
+    return f"{cpu_model(CPU_INFO)}, {facts['cores']} cores, Python {facts['python']}, {scheduling} real-time scheduling"

@@ -7,26 +7,23 @@ from collections.abc import Callable
 from math import dist
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
-from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import Fix, PointId
-from ccatp.daemon.fix_service import FixRequest, FixService
-from ccatp.daemon.telemetry import SurveyTelemetry
+from ccatp.daemon.fix_service import FixRequest
 from ccatp.etalon_client import EtalonClient, EtalonError, EtalonTimeout, StaleLengths
 from ccatp.links import multiline
 from ccatp.localizer import build_localizer
-from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 from ccatp.records.store import MissionStore
 from ccatp.records.store_rows import PlannedPoint
 from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck
 from ccatp.survey.fix_gate import FixGate, FrameCheck, explain, signed_axes
-from ccatp.survey.mission import Mission
 from ccatp.survey.state import MissionState
 from tests.contract.test_etalon_client import (
     CHANNELS,
@@ -40,27 +37,37 @@ from tests.contract.test_etalon_client import (
     records,
     silence,
 )
-from tests.faults.campaign import single
-from tests.faults.laser import DeskRehearsal, Laser, Measured, failing, honest, moved, patient
-from tests.support.mission_story import FREE, Story
+from tests.faults.linking import Measured
+from tests.support.mission_story import FREE, Story, from_first_leg
+from tests.support.scenario import config_of, mirror_of
+from tests.support.sim_survey import (
+    Laser,
+    LaserRequest,
+    MeasuredSurvey,
+    failing,
+    fix_service,
+    honest,
+    moved,
+    patient,
+    short_survey,
+    single,
+)
 from tests.support.virtual_time import run_virtual
 
-Note = Callable[..., None]
 POINT = PointId(5, 5, 1)
 KIDNAP_S = 15.0
 
 
-def one_panel(**changes: Any) -> Config:
-    short: dict[str, Any] = {"run.world": "thesis", "mission.calibration_length_m": 0.0}
-    return load_config(overrides={"run.panels": 1, "run.seed": 3} | short | changes)
+def one_panel(**changes: object) -> Config:
+    return short_survey("thesis", **{"run__seed": 3, **changes})
 
 
-def is_point(number: int) -> Callable[[Measured], bool]:
+def is_point(number: int) -> Callable[[LaserRequest], bool]:
     return lambda m: m.point is not None and m.point.point == number
 
 
-def failing_where(is_meant: Callable[[Measured], bool]) -> Laser:
-    def laser(measured: Measured, fix: Fix) -> Fix:
+def failing_where(is_meant: Callable[[LaserRequest], bool]) -> Laser:
+    def laser(measured: LaserRequest, fix: Fix) -> Fix:
         return failing(measured, fix) if is_meant(measured) else fix
 
     return laser
@@ -71,15 +78,15 @@ def failing_where(is_meant: Callable[[Measured], bool]) -> Laser:
 
 @pytest.mark.fault("E1")
 def test_a_point_that_fails_is_skipped_flagged_and_measured_at_the_end(tmp_path: Path) -> None:
-    failures: list[Measured] = []
+    failures: list[LaserRequest] = []
 
-    def laser(measured: Measured, fix: Fix) -> Fix:
+    def laser(measured: LaserRequest, fix: Fix) -> Fix:
         if is_point(5)(measured) and not failures:
             failures.append(measured)
             return failing(measured, fix)
         return fix
 
-    run = DeskRehearsal(one_panel(), tmp_path, laser)
+    run = MeasuredSurvey(one_panel(), tmp_path, laser)
     result = run.run()
     assert result.outcome == "complete"
     assert result.summary["points"]["measured"] == 9
@@ -91,7 +98,7 @@ def test_a_point_that_fails_is_skipped_flagged_and_measured_at_the_end(tmp_path:
 
 @pytest.mark.fault("E1")
 def test_a_point_that_fails_twice_is_told_with_its_reason(tmp_path: Path) -> None:
-    run = DeskRehearsal(one_panel(), tmp_path, failing_where(is_point(5)))
+    run = MeasuredSurvey(one_panel(), tmp_path, failing_where(is_point(5)))
     result = run.run()
     assert result.outcome == "complete"
     assert (result.summary["points"]["measured"], result.summary["points"]["skipped"]) == (8, 1)
@@ -102,7 +109,7 @@ def test_a_point_that_fails_twice_is_told_with_its_reason(tmp_path: Path) -> Non
 
 @pytest.mark.fault("E1")
 def test_three_points_in_a_row_hold_the_mission(tmp_path: Path) -> None:
-    run = DeskRehearsal(one_panel(), tmp_path, failing_where(lambda m: m.point is not None and m.point.point < 7))
+    run = MeasuredSurvey(one_panel(), tmp_path, failing_where(lambda m: m.point is not None and m.point.point < 7))
     result = run.run()
     assert run.mission.is_faulted
     assert run.mission.state is MissionState.HELD
@@ -111,13 +118,12 @@ def test_three_points_in_a_row_hold_the_mission(tmp_path: Path) -> None:
 
 
 class Desk:
-    """The measuring desk with a real client and a real store, and a mission that asks for one point."""
+    """The fix service with a real client and a real store, and a mission that asks for one point."""
 
     def __init__(self, config: Config, client: EtalonClient, folder: Path) -> None:
         self.failed: list[str] = []
         self.done: list[PointId | None] = []
         self.over = asyncio.Event()
-        mirror = build_mirror(config.mirror)
         self.store = MissionStore.create(
             folder / "m.sqlite", mirror="x", seed=1, config_toml="", points=[PlannedPoint(POINT, 0.0, 0.0)]
         )
@@ -129,33 +135,22 @@ class Desk:
             fixed=self.done.append,
             not_fixed=lambda _point, cause: self.failed.append(cause),
         )
-        scrutiny = SimpleNamespace(
-            begin=lambda: None,
-            review=lambda *_, **__: SimpleNamespace(doubt="", refusal=""),
-            refusal_of=lambda *_: "",
-        )
-        localizer = SimpleNamespace(
-            fuse_fix=lambda _fix: 0.0, notices=[], pose=None, pose_covariance=np.eye(3), position_sigma_m=5e-6
-        )
-        self.desk = FixService(
-            config.mission,
-            client,
-            cast(FixGate, scrutiny),
-            cast(Any, localizer),
-            cast(Mission, mission),
+        self.service = fix_service(
+            config,
+            client.measure,
             patient(self.store),
-            cast(SurveyTelemetry, SimpleNamespace(publish_fix=lambda *_, **__: None, notify_operator=lambda *_: None)),
-            self.over.set,
-            lambda: config.etalon.measuring_time_s,
+            mission,
+            on_finished=self.over.set,
+            measuring_time_s=config.etalon.measuring_time_s,
         )
-        self.estimate = mirror.base_pose
+        self.estimate = mirror_of().base_pose
 
     async def measure(self) -> float:
         """Measure the point; the time it took."""
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
-        serving = loop.create_task(self.desk.run())
-        self.desk.begin(FixRequest(1, 1.0, POINT, EXPECTED, self.estimate))
+        serving = loop.create_task(self.service.run())
+        self.service.begin(FixRequest(1, 1.0, POINT, EXPECTED, self.estimate))
         await self.over.wait()
         took_s = loop.time() - begun_s
         serving.cancel()
@@ -170,7 +165,7 @@ def daemon_client(config: Config, port: int) -> EtalonClient:
 
 @pytest.mark.fault("E1", "E10")
 @pytest.mark.parametrize("action", [silence, flood, b"junk\r\n", lengths(channels=(1, 2)), lengths(server_error=4)])
-def test_a_point_takes_ten_seconds_at_most(action: Any, config: Config, tmp_path: Path, measured: Note) -> None:
+def test_a_point_takes_ten_seconds_at_most(action: Any, config: Config, tmp_path: Path, measured: Measured) -> None:
     async def story() -> tuple[float, list[str], int]:
         server = ScriptedServer()
         await server.start()
@@ -191,7 +186,7 @@ def test_a_point_takes_ten_seconds_at_most(action: Any, config: Config, tmp_path
 
 
 @pytest.mark.fault("E10")
-def test_a_beam_that_is_free_again_costs_a_retry(config: Config, tmp_path: Path, measured: Note) -> None:
+def test_a_beam_that_is_free_again_costs_a_retry(config: Config, tmp_path: Path, measured: Measured) -> None:
     async def story() -> tuple[float, list[PointId | None], dict[str, int]]:
         standin = EtalonSimulator(
             config.sim.etalon, CHANNELS, COLLIMATORS, FixedPuck(PUCK), np.random.default_rng(4), measuring_time_s=0.5
@@ -211,6 +206,16 @@ def test_a_beam_that_is_free_again_costs_a_retry(config: Config, tmp_path: Path,
     measured("E10", took_s)
     assert done == [POINT]
     assert counts["retries"] == 2
+
+
+def test_a_point_missed_by_more_than_the_tolerance_is_approached_again(tmp_path: Path) -> None:
+    # Set down 10 mrad askew, the four-state filter misses the first points by some 4 mm.
+    run = MeasuredSurvey(one_panel(run__seed=1, run__filter="kf", mission__correction_tolerance_m=0.003), tmp_path)
+    result = run.run()
+    assert result.outcome == "complete"
+    assert any("approaching it again" in line for line in run.said)
+    points = {"total": 9, "measured": 9, "first_arrival_within_10mm": 9, "skipped": 0}
+    assert result.summary["points"] == points
 
 
 # -- E2, E6, E7, E8: the server ---------------------------------------------------------------------------------------
@@ -237,7 +242,7 @@ async def test_lengths_of_the_last_place_are_no_fix_of_this_one() -> None:
 
 
 @pytest.mark.fault("E2")
-def test_random_delays_assign_no_reply_to_another_request(measured: Note) -> None:
+def test_random_delays_assign_no_reply_to_another_request(measured: Measured) -> None:
     """Every reply names its request by where it puts the puck; late ones come while later requests wait."""
 
     async def story() -> int:
@@ -273,7 +278,7 @@ def test_random_delays_assign_no_reply_to_another_request(measured: Note) -> Non
 @pytest.mark.fault("E6")
 @pytest.mark.parametrize("down_s", [0.5, 2.0, 4.4])
 def test_a_server_that_is_restarted_is_found_and_the_point_counts_once(
-    down_s: float, config: Config, tmp_path: Path, measured: Note
+    down_s: float, config: Config, tmp_path: Path, measured: Measured
 ) -> None:
     async def story() -> tuple[float, list[PointId | None], int]:
         server = ScriptedServer()
@@ -305,7 +310,7 @@ def test_a_server_that_is_restarted_is_found_and_the_point_counts_once(
 
 
 @pytest.mark.fault("E7")
-def test_mutilated_replies_are_bad_replies_and_nothing_else(measured: Note) -> None:
+def test_mutilated_replies_are_bad_replies_and_nothing_else(measured: Measured) -> None:
     rng = random.Random(7)
     good = [lengths(), b"isconnected_1\r\n", b"environmentdata_5.0_525.0_30.0\r\n", b"error_busy\r\n"]
     surprises = 0
@@ -330,7 +335,7 @@ def test_mutilated_replies_are_bad_replies_and_nothing_else(measured: Note) -> N
 
 
 @pytest.mark.fault("E8")
-async def test_a_reply_without_an_end_takes_no_memory(measured: Note) -> None:
+async def test_a_reply_without_an_end_takes_no_memory(measured: Measured) -> None:
     server = ScriptedServer()
     await server.start()
     async with client_of(server.port, retries=2) as client:
@@ -353,17 +358,17 @@ async def test_a_reply_without_an_end_takes_no_memory(measured: Note) -> None:
 
 @pytest.mark.fault("E3")
 @pytest.mark.parametrize("name", ["ekf", "kf"])
-def test_outliers_are_not_fused(name: str, tmp_path: Path, measured: Note) -> None:
+def test_outliers_are_not_fused(name: str, tmp_path: Path, measured: Measured) -> None:
     rng = np.random.default_rng(11)
 
-    def laser(m: Measured, fix: Fix) -> Fix:
+    def laser(m: LaserRequest, fix: Fix) -> Fix:
         if m.t_s < 1.0 or rng.random() > 0.3:
             return fix
         direction = rng.normal(size=3)
         offset = 10.0 ** rng.uniform(-3.0, 0.0) * direction / np.linalg.norm(direction)
         return moved(fix, tuple(offset))
 
-    run = DeskRehearsal(one_panel(**{"run.filter": name}), tmp_path, laser)
+    run = MeasuredSurvey(one_panel(run__filter=name), tmp_path, laser)
     run.run()
     outliers = [m for m in run.asked if m.offset_m > 0.0]
     fused = [m for m in outliers if m.is_fused and not m.nis <= 25.0]
@@ -375,17 +380,16 @@ def test_outliers_are_not_fused(name: str, tmp_path: Path, measured: Note) -> No
 @pytest.mark.fault("E3")
 @pytest.mark.parametrize(("height_m", "is_taken"), [(0.0045, True), (-0.0055, False)])
 def test_a_puck_off_the_surface_is_not_believed(height_m: float, is_taken: bool, tmp_path: Path) -> None:
-    cfg = one_panel()
-    mirror = build_mirror(cfg.mirror)
+    cfg, mirror = one_panel(), mirror_of()
 
-    def laser(m: Measured, fix: Fix) -> Fix:
+    def laser(m: LaserRequest, fix: Fix) -> Fix:
         if not is_point(5)(m):
             return fix
         x, y, _ = mirror.foot_of_puck(fix.position_m, cfg.robot.puck_height_m)
         normal = mirror.rotate_world_from_deck(mirror.surface.normal(x, y))
         return moved(fix, tuple(height_m * n for n in normal))  # type: ignore[arg-type]
 
-    run = DeskRehearsal(cfg, tmp_path, laser)
+    run = MeasuredSurvey(cfg, tmp_path, laser)
     result = run.run()
     assert result.summary["points"]["skipped"] == (0 if is_taken else 1)
     asked = [m for m in run.asked if is_point(5)(m)]
@@ -398,11 +402,11 @@ def test_a_puck_off_the_surface_is_not_believed(height_m: float, is_taken: bool,
 @pytest.mark.fault("E4")
 @pytest.mark.parametrize("way", [(0.03, 0.0, 0.0), (0.0, -0.06, 0.0), (0.1, 0.1, 0.2)])
 def test_a_robot_put_elsewhere_is_believed_after_three_fixes(
-    way: tuple[float, float, float], tmp_path: Path, measured: Note
+    way: tuple[float, float, float], tmp_path: Path, measured: Measured
 ) -> None:
     dx, dy, turn = way
     keys = f"at_s = {KIDNAP_S}\ndx_m = {dx}\ndy_m = {dy}\ndheading_rad = {turn}"
-    run = DeskRehearsal(one_panel(), tmp_path, honest, single(f'signal = "body"\ntype = "kidnap"\n{keys}'))
+    run = MeasuredSurvey(one_panel(), tmp_path, honest, single(f'signal = "body"\ntype = "kidnap"\n{keys}'))
     result = run.run()
     assert run.injected[0].samples > 0
     after = [m for m in run.asked if m.t_s > KIDNAP_S]
@@ -418,9 +422,8 @@ def test_a_robot_put_elsewhere_is_believed_after_three_fixes(
 
 @pytest.mark.fault("E5")
 @pytest.mark.parametrize("name", ["fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2"])
-def test_every_exchange_of_axes_and_units_is_refused_at_the_first_fix(name: str, measured: Note) -> None:
-    cfg = load_config(overrides={"run.mirror": name})
-    mirror = build_mirror(cfg.mirror)
+def test_every_exchange_of_axes_and_units_is_refused_at_the_first_fix(name: str, measured: Measured) -> None:
+    cfg, mirror = config_of(name), mirror_of(name)
     puck = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)
     true_m = {c: float(np.linalg.norm(p - puck)) for c, p in zip(mirror.channels, mirror.collimators_m, strict=True)}
     accepted, explained, lies = 0, 0, 0
@@ -461,7 +464,7 @@ def refusal(
 @pytest.mark.fault("E5")
 def test_what_the_first_place_hides_the_second_shows() -> None:
     """A robot in the plane of symmetry sees a mirrored axis only once it has moved."""
-    cfg = load_config().etalon
+    cfg = config_of().etalon
     check = FrameCheck(cfg)
     assert check.look((0.0, 2.0, 5.0), (0.0, 2.0, 5.001)) is None
     fault = check.look((-0.2, 2.0, 5.0), (0.2, 2.0, 5.0))
@@ -472,7 +475,7 @@ def test_what_the_first_place_hides_the_second_shows() -> None:
 
 @pytest.mark.fault("E5")
 def test_the_check_ends_with_three_places_that_span_a_plane() -> None:
-    check = FrameCheck(load_config().etalon)
+    check = FrameCheck(config_of().etalon)
     for place in ((1.0, 2.0, 5.0), (1.2, 2.0, 5.0), (1.0, 2.0, 5.0), (1.1, 2.0, 5.0)):
         assert check.look(place, place) is None
     assert not check.is_over  # all on a line
@@ -483,17 +486,17 @@ def test_the_check_ends_with_three_places_that_span_a_plane() -> None:
 
 def test_a_place_that_no_exchange_explains() -> None:
     assert explain((1.0, 2.0, 3.0), (1.0, 2.0, 3.4), 0.05) == ""
-    fault = FrameCheck(load_config().etalon).look((1.0, 2.0, 3.0), (1.0, 2.0, 3.4))
+    fault = FrameCheck(config_of().etalon).look((1.0, 2.0, 3.0), (1.0, 2.0, 3.4))
     assert fault is not None
     assert str(fault).startswith("no exchange of axes or units explains it")
 
 
 @pytest.mark.fault("E5")
 def test_a_mission_in_a_wrong_frame_does_not_begin(tmp_path: Path) -> None:
-    def turned(_m: Measured, fix: Fix) -> Fix:
+    def turned(_m: LaserRequest, fix: Fix) -> Fix:
         return moved(fix, (0.3, 0.0, 0.0))
 
-    run = DeskRehearsal(one_panel(), tmp_path, turned)
+    run = MeasuredSurvey(one_panel(), tmp_path, turned)
     run.run()
     assert run.mission.is_faulted
     assert run.mission.cause == (
@@ -508,11 +511,11 @@ def test_a_mission_in_a_wrong_frame_does_not_begin(tmp_path: Path) -> None:
 
 
 @pytest.mark.fault("E9")
-def test_nothing_counts_that_was_measured_while_the_robot_moved(config: Config, tmp_path: Path, measured: Note) -> None:
+def test_nothing_counts_that_was_measured_while_the_robot_moved(
+    config: Config, tmp_path: Path, measured: Measured
+) -> None:
     """Frames and replies race: the robot is pushed at random times, the server takes its time."""
-    first = config.mission.model_copy(update={"fix_at_start": False})
-    cfg = config.model_copy(update={"mission": first})
-    mirror = build_mirror(cfg.mirror)
+    cfg, mirror = from_first_leg(config), mirror_of()
     moving = bumps = counted = 0
 
     async def race(seed: int) -> None:
@@ -540,22 +543,8 @@ def test_nothing_counts_that_was_measured_while_the_robot_moved(config: Config, 
             fuse_fix=fuse, notices=[], pose=localizer.pose, pose_covariance=np.eye(3), position_sigma_m=5e-6
         )
         with MissionStore.create(folder / "m.sqlite", mirror="x", seed=1, config_toml="", points=points) as store:
-            desk = FixService(
-                cfg.mission.model_copy(update={"correction_tolerance_m": 1e3}),
-                cast(EtalonClient, SimpleNamespace(measure=measure)),
-                cast(
-                    FixGate,
-                    SimpleNamespace(begin=lambda: None, review=lambda *_, **__: SimpleNamespace(doubt="", refusal="")),
-                ),
-                cast(Any, stub),
-                story.mission,
-                patient(store),
-                cast(
-                    SurveyTelemetry, SimpleNamespace(publish_fix=lambda *_, **__: None, notify_operator=lambda *_: None)
-                ),
-                lambda: None,
-                lambda: 0.0,
-            )
+            far = cfg.model_copy(update={"mission": cfg.mission.model_copy(update={"correction_tolerance_m": 1e3})})
+            desk = fix_service(far, measure, patient(store), story.mission, localizer=stub)
             serving = loop.create_task(desk.run())
             done = 0
             for _ in range(6000):

@@ -23,8 +23,9 @@ from ccatp.links.robot_messages import PROTOCOL, BadLineLimit, Hello, LineBuffer
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.robot import Robot
 from ccatp.sim.sessions import RobotServer
-from tests.faults.link_rig import DEADLINE_S, Driver, robot_behind_proxy
 from tests.faults.linking import Measured
+from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S
+from tests.support.daemon import Driver, robot_behind_proxy
 
 FRAMES = 60
 KEY = b"secret"

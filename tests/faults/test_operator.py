@@ -4,11 +4,9 @@ import itertools
 import random
 import threading
 import time
-from collections.abc import Callable
 from math import ceil, inf, log
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import pytest
 import zmq
@@ -16,13 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EmergencyKind, EventCode, Severity, Verdict
 from ccatp.links.channels import format_ok
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.rpc import REPEAT_S, RequestFailed, request
-from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mirror.mirror import Mirror
 from ccatp.safety.emergency_latch import EmergencyLatch
 from ccatp.survey.behaviours import home_time_s
 from ccatp.survey.planning.search import path_time
@@ -30,18 +27,17 @@ from ccatp.survey.planning.way_home import plan_way_home
 from ccatp.survey.reactions import ReminderCall, UnattendedFaultTimer
 from ccatp.survey.state import MissionState
 from ccatp.survey.stops import MissionCommand
-from tests.faults.campaign import single
-from tests.faults.laser import FULL, DeskRehearsal
+from tests.faults.linking import Measured
 from tests.support.mission_story import DT, FREE, FRONT_OFF, Story, from_first_leg
+from tests.support.scenario import config_of, mirror_of
+from tests.support.sim_survey import FULL, MeasuredSurvey, short_survey, single
 
-Note = Callable[..., None]
 SURVEYING = (MissionState.TURNING, MissionState.DRIVING, MissionState.SETTLING, MissionState.MEASURING)
 TABLE_ROWS = [(kind, level, held) for kind in EmergencyKind for level in (False, True) for held in (False, True)]
 
 
-def one_panel(**changes: Any) -> Config:
-    short: dict[str, Any] = {"run.world": "thesis", "mission.calibration_length_m": 0.0}
-    return load_config(overrides={"run.panels": 1, "run.seed": 3} | short | changes)
+def one_panel(**changes: object) -> Config:
+    return short_survey("thesis", **{"run__seed": 3, **changes})
 
 
 @pytest.fixture(scope="module")
@@ -49,17 +45,12 @@ def config(config: Config) -> Config:
     return from_first_leg(config)
 
 
-@pytest.fixture(scope="module")
-def mirror(config: Config) -> Mirror:
-    return build_mirror(config.mirror)
-
-
 @pytest.fixture
 def story(config: Config, mirror: Mirror) -> Story:
     return Story(config, mirror)
 
 
-class Aborted(DeskRehearsal):
+class Aborted(MeasuredSurvey):
     """An emergency in a given state of the mission, and how long it took until the wheels were told to stand."""
 
     def __init__(self, cfg: Config, folder: Path, state: MissionState, kind: str, clear_after_s: float = inf) -> None:
@@ -94,7 +85,7 @@ class Aborted(DeskRehearsal):
 
 @pytest.mark.fault("O1")
 @pytest.mark.parametrize("state", [MissionState.DRIVING, MissionState.TURNING, MissionState.MEASURING])
-def test_a_fire_stops_the_wheels_and_leads_home(state: MissionState, tmp_path: Path, measured: Note) -> None:
+def test_a_fire_stops_the_wheels_and_leads_home(state: MissionState, tmp_path: Path, measured: Measured) -> None:
     run = Aborted(one_panel(), tmp_path, state, "fire")
     result = run.run()
     measured("O1", 1e3 * (run.zero_s - run.raised_s))
@@ -109,9 +100,9 @@ def test_a_fire_stops_the_wheels_and_leads_home(state: MissionState, tmp_path: P
 @pytest.mark.fault("O1")
 @pytest.mark.parametrize("state", [MissionState.DRIVING, MissionState.TURNING])
 def test_an_earthquake_presses_on_holds_and_leads_home_when_it_is_over(
-    state: MissionState, tmp_path: Path, measured: Note
+    state: MissionState, tmp_path: Path, measured: Measured
 ) -> None:
-    run = Aborted(one_panel(**{"run.mirror": "fyst-m2"}), tmp_path, state, "earthquake", clear_after_s=5.0)
+    run = Aborted(one_panel(run__mirror="fyst-m2"), tmp_path, state, "earthquake", clear_after_s=5.0)
     result = run.run()
     measured("O1", 1e3 * (run.zero_s - run.raised_s))
     assert run.zero_s - run.raised_s <= 0.1
@@ -229,11 +220,10 @@ def test_what_was_latched_before_the_start_is_waited_for_at_base(story: Story) -
 
 
 @pytest.mark.fault("O1")
-def test_the_way_home_is_planned_before_the_robot_misses_it(measured: Note) -> None:
+def test_the_way_home_is_planned_before_the_robot_misses_it(measured: Measured) -> None:
     longest_s = 0.0
     for name in ("fyst-m1", "fyst-m2"):
-        cfg = load_config(overrides={"run.mirror": name})
-        mirror = build_mirror(cfg.mirror)
+        cfg, mirror = config_of(name), mirror_of(name)
         for panel in list(mirror.panels)[::6]:
             x, y = mirror.point_on_deck(mirror.point_ids(panel)[0])
             tries = []
@@ -251,7 +241,7 @@ def test_the_way_home_is_planned_before_the_robot_misses_it(measured: Note) -> N
 @pytest.mark.fault("O2")
 @pytest.mark.parametrize("frames", [0, 1, 10, 40, 80])
 def test_an_abort_during_a_back_off_never_drives_forward_and_is_home_bound_soon(
-    frames: int, story: Story, measured: Note
+    frames: int, story: Story, measured: Measured
 ) -> None:
     story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
     story.frame(FRONT_OFF)
@@ -287,7 +277,7 @@ def test_repeated_aborts_change_nothing(config: Config, mirror: Mirror, again: l
 
 
 @pytest.mark.fault("O3")
-def test_an_abort_in_every_frame_is_one_abort(config: Config, mirror: Mirror, measured: Note) -> None:
+def test_an_abort_in_every_frame_is_one_abort(config: Config, mirror: Mirror, measured: Measured) -> None:
     once, always = drive(config, mirror, [60]), drive(config, mirror, list(range(60, 900)))
     measured("O3", sum(a != b for a, b in zip(once, always, strict=True)))
     assert drive(config, mirror, []) != once
@@ -349,7 +339,7 @@ class LossyRelay:
 
 
 @pytest.mark.fault("O4")
-def test_an_emergency_is_told_until_it_is_heard(measured: Note) -> None:
+def test_an_emergency_is_told_until_it_is_heard(measured: Measured) -> None:
     relay = LossyRelay(3)
     repeats = []
     for k in range(20):
@@ -367,7 +357,7 @@ def test_an_emergency_is_told_until_it_is_heard(measured: Note) -> None:
 
 
 @pytest.mark.fault("O4")
-def test_an_emergency_is_acknowledged_at_once(measured: Note) -> None:
+def test_an_emergency_is_acknowledged_at_once(measured: Measured) -> None:
     relay = LossyRelay(0)
     relay._is_lost = lambda: False  # type: ignore[method-assign]
     took_ms = []
@@ -397,7 +387,7 @@ def test_what_must_not_be_asked_twice_is_asked_once() -> None:
 @pytest.mark.fault("O7")
 @pytest.mark.parametrize(("kind", "level", "held"), TABLE_ROWS)
 def test_a_clear_is_refused_with_a_reason_while_the_cause_persists(
-    kind: EmergencyKind, level: bool, held: bool, measured: Note
+    kind: EmergencyKind, level: bool, held: bool, measured: Measured
 ) -> None:
     latch = EmergencyLatch()
     latch.raise_emergency(kind.value, "a")
@@ -417,7 +407,7 @@ def test_a_clear_is_refused_with_a_reason_while_the_cause_persists(
 @pytest.mark.fault("O8", "F6")
 @pytest.mark.parametrize("home_s", [30.0, 120.0, 400.0])
 def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
-    home_s: float, story: Story, config: Config, measured: Note
+    home_s: float, story: Story, config: Config, measured: Measured
 ) -> None:
     cfg = config.health
     story.until_state(MissionState.DRIVING)
@@ -475,8 +465,7 @@ def check_ways_home(step: int) -> tuple[int, int]:
     count = invalid = 0
     rng = random.Random(9)
     for name in ("thesis-m1", "thesis-m2"):
-        cfg = load_config(overrides={"run.mirror": name})
-        mirror = build_mirror(cfg.mirror)
+        cfg, mirror = config_of(name), mirror_of(name)
         base, least_m = mirror.base_pose, cfg.mission.leg_clearance_m - 1e-9
         points = [point for panel in mirror.panels for point in mirror.point_ids(panel)]
         for point in points[::step]:
@@ -496,7 +485,7 @@ def check_ways_home(step: int) -> tuple[int, int]:
 
 
 @pytest.mark.fault("O9")
-def test_the_way_home_stays_on_the_mirror_and_takes_no_longer_than_thought(measured: Note) -> None:
+def test_the_way_home_stays_on_the_mirror_and_takes_no_longer_than_thought(measured: Measured) -> None:
     count, invalid = check_ways_home(9)
     measured("O9", invalid)
     assert (count, invalid) == (87 + 78, 0)
@@ -504,7 +493,7 @@ def test_the_way_home_stays_on_the_mirror_and_takes_no_longer_than_thought(measu
 
 @pytest.mark.slow
 @pytest.mark.fault("O9")
-def test_the_way_home_from_every_point(measured: Note) -> None:
+def test_the_way_home_from_every_point(measured: Measured) -> None:
     count, invalid = check_ways_home(1)
     measured("O9", invalid)
     assert (count, invalid) == (1485, 0)
@@ -517,9 +506,9 @@ SLOW = 'signal = "body"\ntype = "slip"\nat_s = 20.0\nfor_s = 20.0\nfactor = 0.8'
 
 @pytest.mark.fault("O10")
 @pytest.mark.parametrize("budget_s", [45.0, 70.0])
-def test_what_does_not_fit_into_the_budget_is_left_out(budget_s: float, tmp_path: Path, measured: Note) -> None:
-    cfg = one_panel(**{"run.panels": 2, "run.budget_s": budget_s, "mission.holds_to_budget": True})
-    run = DeskRehearsal(cfg, tmp_path, plan=single(SLOW))
+def test_what_does_not_fit_into_the_budget_is_left_out(budget_s: float, tmp_path: Path, measured: Measured) -> None:
+    cfg = one_panel(run__panels=2, run__budget_s=budget_s, mission__holds_to_budget=True)
+    run = MeasuredSurvey(cfg, tmp_path, plan=single(SLOW))
     result = run.run()
     points = result.summary["points"]
     # The same share of an hour.
@@ -536,6 +525,6 @@ def test_a_budget_that_suffices_changes_nothing(tmp_path: Path) -> None:
     with_it, without = tmp_path / "with", tmp_path / "without"
     with_it.mkdir()
     without.mkdir()
-    held = DeskRehearsal(one_panel(**{"mission.holds_to_budget": True}), with_it).run()
-    assert held.summary == DeskRehearsal(one_panel(), without).run().summary
+    held = MeasuredSurvey(one_panel(mission__holds_to_budget=True), with_it).run()
+    assert held.summary == MeasuredSurvey(one_panel(), without).run().summary
     assert held.outcome == "complete"

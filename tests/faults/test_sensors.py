@@ -8,9 +8,8 @@ import pytest
 
 from ccatp.core import Severity
 from ccatp.survey.state import MissionState
-from tests.faults.campaign import Seen, Watched, short_survey, was_real, watched
-
-Measured = Callable[[str, float], None]
+from tests.faults.linking import Measured
+from tests.support.sim_survey import Seen, Watched, short_survey, was_real, watched
 
 # Of the first seconds of a short survey in the hard world with seed 1: see ``test_the_times_are_what_they_are_called``.
 DRIVING_S, BRAKING_S, TURNING_S, STANDING_S = 7.5, 8.9, 3.5, 9.6

@@ -20,18 +20,14 @@ import pytest
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.daemon import fix_service as measuring
-from ccatp.daemon.fix_service import FixRequest, FixService
+from ccatp.daemon.fix_service import FixRequest
 from ccatp.daemon.process import LogStream, open_log
-from ccatp.daemon.telemetry import SurveyTelemetry
-from ccatp.etalon_client import EtalonClient
-from ccatp.localizer import Localizer
 from ccatp.records.recorder import Recorder, iter_messages
 from ccatp.records.store import MissionStore
 from ccatp.records.store_rows import PlannedPoint, StoreError, StoreEvent
-from ccatp.survey.fix_gate import FixFinding, FixGate
-from ccatp.survey.mission import Mission
+from tests.faults.linking import Measured
+from tests.support.sim_survey import fix_service
 
-Measured = Callable[[str, float], None]
 POINTS = [PointId(row, col, n) for row in range(1, 10) for col in range(1, 9) for n in range(1, 10)][: 77 * 9]
 FIX = Fix(1.5, (1.0, 2.0, 3.0), (1e-12,) * 9, 1.7, (1, 2, 5, 8), 2e-6)
 POSE = DeckPose(0.1, 0.2, 0.3)
@@ -165,7 +161,7 @@ def test_nobody_waits_for_a_stalled_disk(tmp_path: Path, measured: Measured) -> 
 
 
 class Desk:
-    """A measuring desk on a real store; mission and laser system are only there to be asked."""
+    """The fix service on a real store; mission and laser system are only there to be asked."""
 
     def __init__(self, config: Config, store: MissionStore) -> None:
         self.faults, self.said, self.measured = list[str](), list[str](), list[PointId | None]()
@@ -183,23 +179,8 @@ class Desk:
             fault=self._fault,
             survey=SimpleNamespace(distance_m=lambda pose: 0.0),
         )
-        localizer = SimpleNamespace(
-            fuse_fix=lambda fix: 0.0, notices=[], pose=None, pose_covariance=None, position_sigma_m=5e-6
-        )
-        sure = SimpleNamespace(begin=lambda: None, review=lambda *_, **__: FixFinding())
-        teller = SimpleNamespace(
-            publish_fix=lambda *_, **__: None, notify_operator=lambda level, text: self.said.append(text)
-        )
-        self.desk = FixService(
-            config.mission,
-            cast(EtalonClient, SimpleNamespace(measure=measure)),
-            cast(FixGate, sure),
-            cast(Localizer, localizer),
-            cast(Mission, mission),
-            store,
-            cast(SurveyTelemetry, teller),
-            self.over.set,
-            lambda: 0.0,
+        self.service = fix_service(
+            config, measure, store, mission, on_finished=self.over.set, notify=lambda _, text: self.said.append(text)
         )
 
     def _fault(self, cause: str) -> None:
@@ -208,7 +189,7 @@ class Desk:
 
     def begin(self, point: PointId) -> None:
         self.over.clear()
-        self.desk.begin(FixRequest(1, 1.0, point, (0.0, 0.0, 0.0), POSE))
+        self.service.begin(FixRequest(1, 1.0, point, (0.0, 0.0, 0.0), POSE))
 
 
 @pytest.mark.fault("P14")
@@ -219,7 +200,7 @@ async def test_the_robot_is_held_where_the_disk_stalls_and_the_point_counts_once
     monkeypatch.setattr(measuring, "STALLED_DISK_S", 0.15)
     with make(tmp_path / "mission.sqlite", POINTS[:9]) as store:
         desk = Desk(config, store)
-        serving = asyncio.get_running_loop().create_task(desk.desk.run())
+        serving = asyncio.get_running_loop().create_task(desk.service.run())
         release = stall(store)
         desk.begin(POINTS[0])
         async with asyncio.timeout(20.0):
@@ -293,7 +274,7 @@ async def test_a_broken_disk_holds_the_robot_with_the_reason(tmp_path: Path, con
         broken = Broken(store._db, "SQLITE_IOERR_FSYNC")
         store._db = cast(sqlite3.Connection, broken)
         desk = Desk(config, store)
-        serving = asyncio.get_running_loop().create_task(desk.desk.run())
+        serving = asyncio.get_running_loop().create_task(desk.service.run())
         broken.is_armed = True
         for point in POINTS[:2]:
             desk.begin(point)

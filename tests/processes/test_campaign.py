@@ -1,11 +1,10 @@
 """Whole surveys of every mirror: what the project promises, three seeds each, at both noise levels."""
 
 import json
-from collections.abc import Callable
 
 import pytest
 
-from tests.processes.conftest import Run
+from tests.processes.conftest import Start
 
 MIRRORS = {"fyst-m1": 693, "fyst-m2": 621, "thesis-m1": 783, "thesis-m2": 702}
 # Part of the first arrivals that must be within 10 mm.
@@ -17,7 +16,7 @@ HOUR_S = 3600.0
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("world", WORLDS)
 @pytest.mark.parametrize("mirror", MIRRORS)
-def test_a_whole_mirror(start: Callable[..., Run], mirror: str, world: str, seed: int) -> None:
+def test_a_whole_mirror(start: Start, mirror: str, world: str, seed: int) -> None:
     run = start("--mirror", mirror, "--world", world, "--seed", str(seed))
     assert run.wait(timeout_s=900.0) == 0, run.stderr
     summary = run.summary

@@ -8,15 +8,14 @@ import random
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
-from tests.processes.conftest import FREE_PORTS, NO_CALIBRATION, Run
-from tests.processes.killing import first_after, log_of, robot_record, send
-from tests.processes.test_restarts import fixes, until_another
+from tests.faults.linking import Measured
+from tests.support.runs import NO_CALIBRATION, Run
 
 KILLS = int(os.environ.get("CCATP_KILLS", "40"))
 SEED = int(os.environ.get("CCATP_KILLS_SEED", "20"))
@@ -41,11 +40,11 @@ def campaign(rng: random.Random, run: Run, kills: int, figures: dict[str, Any]) 
         names = rng.choice(VICTIMS)
         is_hung = rng.random() < 0.2 and names == ("main",)
         try:
-            sent = {name: send(run, name, signal.SIGSTOP if is_hung else signal.SIGKILL) for name in names}
-        except (StopIteration, ProcessLookupError):
+            sent = {name: run.send(name, signal.SIGSTOP if is_hung else signal.SIGKILL) for name in names}
+        except (AssertionError, psutil.Error, ProcessLookupError):
             break
         for name, (pid, at_s) in sent.items():
-            until_another(run, name, pid)
+            run.child(name, not_pid=pid)
             figures["kills"] += 1
             if name == "main" and not is_hung:
                 figures["mains"].append(at_s)
@@ -55,13 +54,13 @@ def campaign(rng: random.Random, run: Run, kills: int, figures: dict[str, Any]) 
 def note_times(run: Run, figures: dict[str, Any]) -> None:
     """From each kill of main to the robot holding its wheels, and to the successor having joined."""
     for at_s in figures.pop("mains"):
-        figures["held_ms"].append(1e3 * first_after(run, at_s, "dataloop", "controller lost"))
-        figures["ready_s"].append(first_after(run, at_s, "main", "joined the robot"))
+        figures["held_ms"].append(1e3 * run.first_after(at_s, "dataloop", "controller lost"))
+        figures["ready_s"].append(run.first_after(at_s, "main", "joined the robot"))
 
 
 @pytest.mark.slow
 @pytest.mark.fault("P1", "P2", "P3", "P17", "F4")
-def test_random_kills(tmp_path: Path, runtime_dir: Path, measured: Callable[[str, float], None]) -> None:
+def test_random_kills(tmp_path: Path, runtime_dir: Path, measured: Measured) -> None:
     rng = random.Random(SEED)
     figures: dict[str, Any] = {"kills": 0, "held_ms": [], "ready_s": [], "lost": 0, "twice": 0, "remeasured": 0}
     figures |= {"fan_changes": 0, "missions": 0, "falls": 0, "oldest_ack_frames": 0}
@@ -70,15 +69,12 @@ def test_random_kills(tmp_path: Path, runtime_dir: Path, measured: Callable[[str
         paced = ("--realtime",) if mission % 2 else ()
         figures["mains"], figures["acknowledged"] = [], 0
         args = ("--panels", "1", "--seed", str(mission), "--world", "hard", *NO_CALIBRATION, *LIMIT, *paced)
-        run = Run(tmp_path / f"run{mission}", runtime_dir, *FREE_PORTS, *args)
-        try:
+        with Run(tmp_path / f"run{mission}", runtime_dir, *args) as run:
             campaign(rng, run, KILLS_PER_MISSION, figures)
             assert run.wait(300.0) == 0, run.stderr
-        finally:
-            run.end()
         note_times(run, figures)
-        points = Counter(fixes(run))
-        record = robot_record(run)
+        points = Counter(run.fixes)
+        record = run.robot_record
         figures["missions"] += 1
         figures["lost"] += max(figures["acknowledged"] - len(points), 0) + 9 - len(points)
         figures["twice"] += run.summary["points"]["measured"] - len(points)
@@ -86,7 +82,7 @@ def test_random_kills(tmp_path: Path, runtime_dir: Path, measured: Callable[[str
         figures["fan_changes"] += max(record["fan_changes"] - 1, 0)
         figures["falls"] += run.summary["danger"]["falls"]
         figures["oldest_ack_frames"] = max(figures["oldest_ack_frames"], record["oldest_ack_frames"])
-        assert not [entry for entry in log_of(run) if "never retrieved" in entry.get("text", "")]
+        assert not [entry for entry in run.log if "never retrieved" in entry.get("text", "")]
     told = {key: (max(value) if isinstance(value, list) else value) for key, value in figures.items() if value != []}
     print(told)
     assert (figures["lost"], figures["twice"], figures["falls"], figures["fan_changes"]) == (0, 0, 0, 0), told

@@ -1,18 +1,23 @@
-"""The page in a real browser, beside a real run. One story, because browser and run take seconds to begin."""
+"""The page in a real browser, beside a survey and a mission among beacons. One story each: starts take seconds."""
 
+import json
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from urllib.parse import urlsplit
 
-import psutil
 import pytest
 from playwright.sync_api import Page, Request, expect, sync_playwright
 
-from tests.processes.conftest import Run
-from tests.processes.test_dashboard_run import WITH_PAGE, page_port
+from ccatp.config.load import load_radio_config
+from ccatp.config.package import configs_dir
+from tests.processes.conftest import Start
+from tests.processes.test_beacon_runs import BeaconRun
+from tests.processes.test_observers import WITH_PAGE, ask, page_port
+from tests.support.runs import Run
 
 CHROMIUM = shutil.which("chromium")
 FLAGS = (
@@ -27,14 +32,15 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the page 
 
 
 @contextmanager
-def browser_page(requests: list[str]) -> Iterator[Page]:
-    """A browser's page that notes what it asks for."""
+def browser_page(requests: list[str], errors: list[str]) -> Iterator[Page]:
+    """A browser's page that notes what it asks for, and errors."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
         try:
             page = browser.new_page(viewport={"width": 1280, "height": 900})
             page.set_default_timeout(PATIENCE_MS)
             page.on("request", lambda request: requests.append(_url(request)))
+            page.on("pageerror", lambda error: errors.append(str(error)))
             yield page
         finally:
             browser.close()
@@ -44,22 +50,12 @@ def _url(request: Request) -> str:
     return request.url
 
 
-def killed_main(run: Run) -> float:
-    """Kill the main loop; returns when, s."""
-    for child in psutil.Process(run.process.pid).children():
-        if "ccatp.daemon.main_loop" in child.cmdline():
-            child.kill()
-            return time.monotonic()
-    raise AssertionError("no main loop")
-
-
-def test_an_operator_looks_and_aborts(start: Callable[..., Run]) -> None:
+def test_an_operator_looks_and_aborts(start: Start) -> None:
     run = start("--panels", "2", "--realtime", *WITH_PAGE)
-    run.until(lambda status: status["state"] in ("turning", "driving"))
+    run.until_state("turning", "driving")
     requests: list[str] = []
     errors: list[str] = []
-    with browser_page(requests) as page:
-        page.on("pageerror", lambda error: errors.append(str(error)))
+    with browser_page(requests, errors) as page:
         url = f"http://127.0.0.1:{page_port(run)}/"
         page.goto(url)
         sees_a_running_survey(page)
@@ -85,7 +81,11 @@ def sees_a_running_survey(page: Page) -> None:
     expect(page.locator("#map")).to_have_attribute("aria-label", re.compile(r"Map: robot at .* m, \d+ of 18 points"))
     expect(page.locator("#done")).to_have_text(re.compile("^[1-9]"))
     expect(page.locator("#plot-arrival")).to_have_attribute("aria-label", re.compile("latest arrival error 0"))
-    # The robot drives: the map is drawn, and not always the same.
+    sees_the_map_move(page)
+
+
+def sees_the_map_move(page: Page) -> None:
+    """The robot drives: the map is drawn, and not always the same."""
     drawn = "document.querySelector('#map').toDataURL()"
     first = page.evaluate(drawn)
     deadline_s = time.monotonic() + 1e-3 * PATIENCE_MS
@@ -126,7 +126,8 @@ def knows_keys(page: Page) -> None:
 
 def sees_a_dead_main_loop(page: Page, run: Run) -> None:
     for attempt in range(3):
-        killed_s = killed_main(run)
+        run.send("main")
+        killed_s = time.monotonic()
         page.wait_for_selector("#alarm:not([hidden])")
         took_s = time.monotonic() - killed_s
         expect(page.locator("#alarm")).to_contain_text("LINK LOST")
@@ -147,3 +148,59 @@ def aborts_in_two_steps(page: Page) -> None:
     page.wait_for_timeout(500)  # longer than a double click
     button.click()
     expect(page.locator("#answer")).to_have_text("abort: done")
+
+
+@pytest.mark.slow  # the page's own code is tried by test_page
+def test_an_operator_looks_aborts_and_stops_among_beacons(tmp_path: Path, runtime_dir: Path) -> None:
+    config = ("--config", str(configs_dir() / "zigbee.toml"))
+    options = ("--realtime", "--json", "--set", "mission.laps=50", *WITH_PAGE)
+    with BeaconRun(tmp_path / "run", runtime_dir, *config, *options) as run:
+        run.until(lambda status: status["done"] >= 1)
+        looks_aborts_and_stops(run)
+
+
+def looks_aborts_and_stops(run: Run) -> None:
+    port = load_radio_config(run.run_dir / "config.toml").dashboard.port
+    requests: list[str] = []
+    errors: list[str] = []
+    with browser_page(requests, errors) as page:
+        page.goto(f"http://127.0.0.1:{port}/")
+        sees_a_mission_among_beacons(page)
+        fits_a_phone(page)
+        status, _ = ask(port, "GET", "/healthz")
+        assert status == 200
+        aborts_in_two_steps(page)
+        expect(page.locator("#state")).to_contain_text("returning")
+        page.locator("#stop").click()
+        assert run.wait() == 4, run.stderr
+        expect(page.locator("#ended")).to_contain_text("The daemon has ended: stopped")
+        expect(page.locator("#ended")).to_contain_text(re.compile(r"\d+ of 200 waypoints reached"))
+    assert {urlsplit(asked).netloc for asked in requests} == {f"127.0.0.1:{port}"}, "asked elsewhere"
+    assert errors == []
+    assert json.loads(run.stdout)["outcome"] == "stopped"
+    assert f"report  {run.run_dir / 'report.html'}" in run.stderr
+    assert "Waypoints among ZigBee beacons" in (run.run_dir / "report.html").read_text()
+
+
+def sees_a_mission_among_beacons(page: Page) -> None:
+    expect(page.locator("#simulation")).to_contain_text("radios")
+    expect(page.locator("#title")).to_have_text("ZigBee beacons")
+    expect(page.locator("#total")).to_have_text("200")
+    expect(page.locator("#unit")).to_have_text("waypoints")
+    expect(page.locator("#state")).to_have_text("visiting")
+    expect(page.locator("#verdict")).to_contain_text("0 normal operation")
+    expect(page.locator("#links li[data-well=yes]")).to_have_count(3)
+    expect(page.locator("#edges")).to_be_hidden()
+    expect(page.locator("#pose-xy")).to_contain_text(" m")
+    expect(page.locator("#facts")).to_contain_text("beacons on the map4")
+    expect(page.locator("#map")).to_have_attribute(
+        "aria-label", re.compile(r"Map: robot at .* m, \d of 4 waypoints reached, \d+ other things")
+    )
+    expect(page.locator("#plot-error")).to_have_attribute(
+        "aria-label", re.compile("latest true error [0-9.]+, 3\u03c3"), timeout=PATIENCE_MS
+    )
+    expect(page.locator("#plot-map")).to_have_attribute(
+        "aria-label", re.compile("latest true error [0-9.]+, expected"), timeout=PATIENCE_MS
+    )
+    expect(page.locator("#plot-arrival")).to_be_hidden()
+    sees_the_map_move(page)

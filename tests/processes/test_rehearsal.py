@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-from collections.abc import Callable
 from datetime import datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
@@ -15,7 +14,7 @@ from ccatp.config.load import load_config
 from ccatp.records.recorder import iter_messages
 from ccatp.studies.sil_run import rehearse
 from tests.faults.linking import Measured
-from tests.processes.conftest import Run
+from tests.processes.conftest import Start
 
 # Read by every process of the run at its start: the wall clock is an hour early or an hour late, anew at each look.
 RESTLESS_CLOCK = """
@@ -38,14 +37,25 @@ datetime.datetime = Restless
 
 
 @pytest.mark.fault("S13")
+@pytest.mark.parametrize("calibrates", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_rehearsal_is_the_run_without_the_sockets(
-    start: Callable[..., Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, measured: Measured
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, measured: Measured, calibrates: bool
 ) -> None:
     (tmp_path / "clock").mkdir()
     (tmp_path / "clock" / "sitecustomize.py").write_text(RESTLESS_CLOCK)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "clock"), *sys.path]))
     run = start(
-        "--panels", "1", "--mirror", "thesis-m1", "--filter", "ekf", "--world", "hard", "--seed", "3", calibrates=True
+        "--panels",
+        "1",
+        "--mirror",
+        "thesis-m1",
+        "--filter",
+        "ekf",
+        "--world",
+        "hard",
+        "--seed",
+        "3",
+        calibrates=calibrates,
     )
     assert run.wait() == 0, run.stderr
     labels = [json.loads(line)["timestamp"] for line in (run.run_dir / "log.jsonl").read_text().splitlines()]

@@ -1,108 +1,104 @@
-"""A process may die, or hang, at any instant: the wheels are held, another one takes its place, the survey goes on."""
+"""A process may die, hang, or find what it left damaged: the wheels are held, the next one goes on with the survey."""
 
+import json
 import os
+import shutil
 import signal
-import sqlite3
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
 import pytest
 
-from tests.processes.conftest import NO_CALIBRATION, Run
-from tests.processes.killing import child, first_after, log_of, robot_record, send, wall_s
+from tests.faults.linking import Measured
+from tests.processes.conftest import Start
+from tests.support.runs import Run, wall_s
 
-Start = Callable[..., Run]
-Measured = Callable[[str, float], None]
-SOUND = {"true_edges": 0, "false_edges": 0, "falls": 0, "max_overrun_mm": 0.0}
-
-
-def fixes(run: Run) -> list[tuple[int, int, int]]:
-    """Points of all fixes that were ever committed, replaced ones, too."""
-    db = sqlite3.connect(run.run_dir / "mission.sqlite")
-    rows = db.execute("SELECT row, col, point FROM fixes ORDER BY id").fetchall()
-    db.close()
-    return rows
-
-
-def until_driving(run: Run, done: int) -> None:
-    run.until(lambda status: status["done"] >= done and status["state"] == "driving", timeout_s=60.0)
-
-
-def until_another(run: Run, name: str, pid: int) -> None:
-    deadline_s = time.monotonic() + 20.0
-    while time.monotonic() < deadline_s:
-        try:
-            if child(run, name).pid != pid:
-                return
-        except (StopIteration, psutil.NoSuchProcess):
-            pass
-        time.sleep(0.01)
-    raise AssertionError(f"no other {name} has come")
+# -- the loops --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.fault("P1", "P2", "P17")
 def test_main_and_danger_are_killed_and_the_survey_goes_on(start: Start, measured: Measured) -> None:
-    run = start("--panels", "1", *NO_CALIBRATION)
-    until_driving(run, 1)
-    _, main_s = send(run, "main")
+    run = start("--panels", "1")
+    run.until_state("driving", done=1)
+    _, main_s = run.send("main")
+    run.until(lambda status: status["done"] >= 2)
+    danger_pid, _ = run.send("danger")
+    run.child("danger", not_pid=danger_pid)
     run.until(lambda status: status["done"] >= 3)
-    danger_pid, _ = send(run, "danger")
-    until_another(run, "danger", danger_pid)
+    main_pid, _ = run.send("main")
+    run.send("danger")
+    run.child("main", not_pid=main_pid)
     run.until(lambda status: status["done"] >= 5)
-    main_pid, _ = send(run, "main")
-    send(run, "danger")
-    until_another(run, "main", main_pid)
-    assert run.wait() == 0, run.stderr
-    assert run.summary["points"]["measured"] == 9
+    assert run.ask("stop")["ok"]
+    assert run.wait() == 4, run.stderr
     assert run.summary["danger"]["falls"] == 0
-    assert len(fixes(run)) == len(set(fixes(run))) == 9  # none lost, none measured again, none counted twice
-    assert robot_record(run)["fan_changes"] <= 1
+    # None lost, none measured again, none counted twice.
+    assert len(run.fixes) == len(set(run.fixes)) == run.summary["points"]["measured"] == run.measured >= 5
+    assert run.robot_record["fan_changes"] <= 1
     assert "Traceback" not in run.stderr
-    measured("P1", 1e3 * first_after(run, main_s, "dataloop", "controller lost"))
+    measured("P1", 1e3 * run.first_after(main_s, "dataloop", "controller lost"))
 
 
 @pytest.mark.slow
 @pytest.mark.fault("E6")
 def test_the_laser_system_is_killed_and_the_survey_goes_on(start: Start) -> None:
-    run = start("--panels", "1", *NO_CALIBRATION)
-    until_driving(run, 1)
-    pid, _ = send(run, "etalon")
-    until_another(run, "etalon", pid)
+    run = start("--panels", "1")
+    run.until_state("driving", done=1)
+    pid, _ = run.send("etalon")
+    run.child("etalon", not_pid=pid)
     assert run.wait() == 0, run.stderr
     assert run.summary["points"] == {"total": 9, "measured": 9, "first_arrival_within_10mm": 9, "skipped": 0}
 
 
-@pytest.mark.fault("P6")
-def test_a_main_loop_that_is_stopped_and_goes_on_decides_nothing_by_old_frames(start: Start) -> None:
+@pytest.mark.fault("P6", "P23")
+def test_a_main_loop_that_is_stopped_and_goes_on_decides_nothing_by_old_frames(
+    start: Start, measured: Measured
+) -> None:
     run = start("--panels", "1", "--realtime")
-    until_driving(run, 0)
-    pid, _ = send(run, "main", signal.SIGSTOP)
+    run.until_state("driving")
+    pid, _ = run.send("main", signal.SIGSTOP)
     time.sleep(1.0)  # of frames that wait for it
     os.kill(pid, signal.SIGCONT)
     run.until(lambda status: status["done"] >= 1)
-    assert child(run, "main").pid == pid
-    assert run.ask("stop")["ok"]
-    assert run.wait() == 4
-    record = robot_record(run)
+    assert run.child("main").pid == pid
+    run.until_state("driving")
+    measured("P23", terminated(run))
+    record = run.robot_record
     # The oldest frame that moved the robot is one of the ordinary delay of a busy machine, and not of the second.
     assert record["oldest_ack_frames"] < 30
     assert run.summary["danger"]["falls"] == 0
-    withheld = [
-        entry for entry in log_of(run) if entry["logger"] == "danger" and entry["event"] == "verdict_changed"
-        and entry["cause"] == "estimate stale"
-    ]  # fmt: skip
-    assert withheld
+    changes = [e for e in run.log if e["logger"] == "danger" and e["event"] == "verdict_changed"]
+    assert "estimate stale" in [entry["cause"] for entry in changes]
+
+
+def terminated(run: Run) -> float:
+    """Terminate it; the time it took, s."""
+    run.process.terminate()
+    at_s = time.monotonic()
+    assert run.wait() == 130
+    return time.monotonic() - at_s
+
+
+@pytest.mark.slow
+@pytest.mark.fault("P23")
+@pytest.mark.parametrize("state", ["measuring", "held", "turning"])
+def test_terminated_in_each_state(start: Start, measured: Measured, state: str) -> None:
+    run = start("--panels", "1", "--realtime")
+    run.until_state("driving")
+    if state == "held":
+        assert run.ask("pause")["ok"]
+    run.until_state(state)
+    measured("P23", terminated(run))
 
 
 @pytest.mark.slow
 @pytest.mark.fault("P7")
 def test_a_main_loop_that_hangs_is_killed_and_another_one_goes_on(start: Start) -> None:
-    run = start("--panels", "1", *NO_CALIBRATION)
-    until_driving(run, 1)
-    pid, _ = send(run, "main", signal.SIGSTOP)
-    until_another(run, "main", pid)
+    run = start("--panels", "1")
+    run.until_state("driving", done=1)
+    pid, _ = run.send("main", signal.SIGSTOP)
+    run.child("main", not_pid=pid)
     assert run.wait() == 0, run.stderr
     assert "process main sent no heartbeat for 2 s and was killed: restarting it" in run.stderr
     assert run.summary["points"]["measured"] == 9
@@ -110,12 +106,12 @@ def test_a_main_loop_that_hangs_is_killed_and_another_one_goes_on(start: Start) 
 
 @pytest.mark.fault("P18")
 def test_a_main_loop_that_always_dies_ends_the_run_held(start: Start) -> None:
-    run = start("--panels", "1", "--set", "run.restart_limit=2", *NO_CALIBRATION)
-    until_driving(run, 0)
+    run = start("--panels", "1", "--set", "run.restart_limit=2")
+    run.until_state("driving")
     for _ in range(2):
-        pid, _ = send(run, "main")
-        until_another(run, "main", pid)
-    send(run, "main")
+        pid, _ = run.send("main")
+        run.child("main", not_pid=pid)
+    run.send("main")
     assert run.wait() == 4
     line = "process main was killed by SIGKILL, more than 2 times within 60 s: run ended, wheels held"
     assert run.stderr.count(line) == 1
@@ -125,18 +121,18 @@ def test_a_main_loop_that_always_dies_ends_the_run_held(start: Start) -> None:
 @pytest.mark.slow
 @pytest.mark.fault("P1")
 def test_an_abort_and_a_pause_survive(start: Start) -> None:
-    run = start("--panels", "4", *NO_CALIBRATION)
+    run = start("--panels", "4")
     run.until(lambda status: status["done"] >= 2)
     assert run.ask("pause")["ok"]
-    pid, _ = send(run, "main")
-    until_another(run, "main", pid)
+    pid, _ = run.send("main")
+    run.child("main", not_pid=pid)
     status = run.until(lambda status: status["seq"] >= 0)
     assert (status["state"], status["cause"]) == ("held", "operator")
     identity = "8c0e5f9e-6a1f-4b8e-9a51-0d5b2f4f2f10"
     assert run.ask("emergency", channel="emergency", kind="fire", id=identity)["latched"]
-    danger_pid, _ = send(run, "danger")
-    send(run, "main")
-    until_another(run, "danger", danger_pid)
+    danger_pid, _ = run.send("danger")
+    run.send("main")
+    run.child("danger", not_pid=danger_pid)
     assert run.wait() == 3, run.stderr
 
 
@@ -160,13 +156,13 @@ for_s = 1.0
 def test_a_link_that_is_open_and_dead_is_joined_again(start: Start, tmp_path: Path, measured: Measured) -> None:
     plan = tmp_path / "plan.toml"
     plan.write_text(HALF_OPEN)
-    run = start("--panels", "1", "--realtime", "--faults", str(plan))
+    run = start("--panels", "1", "--realtime", "--faults", str(plan), calibrates=True)
     assert run.wait(180.0) == 0, run.stderr
     assert run.stderr.count("robot link lost: no sensors frame for") == 2
     assert run.stderr.count("again") >= 2
     assert run.summary["points"]["measured"] == 9
     assert run.summary["danger"]["falls"] == 0
-    log = log_of(run)
+    log = run.log
     begun_s = next(
         wall_s(e) for e in log if e["event"] == "fault_begins" and (e["signal"], e["type"]) == ("link", "black_hole")
     )
@@ -175,34 +171,21 @@ def test_a_link_that_is_open_and_dead_is_joined_again(start: Start, tmp_path: Pa
     measured("L2", 1e3 * (noticed_s - begun_s))
 
 
-@pytest.fixture
-def begun(start: Start, tmp_path: Path) -> Iterator[Callable[..., Run]]:
-    """Starts runs in the run directory of another one."""
-    runs: list[Run] = []
-
-    def again(before: Run, *args: str) -> Run:
-        runs.append(Run(before.run_dir, before.runtime_dir, *args))
-        return runs[-1]
-
-    yield again
-    for run in runs:
-        run.end()
+# -- the whole run ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.fault("P4", "P5", "P17")
-def test_a_service_that_is_restarted_waits_for_an_operator(
-    start: Start, begun: Callable[..., Run], measured: Measured
-) -> None:
-    run = start("--panels", "1", *NO_CALIBRATION)
-    until_driving(run, 2)
+def test_a_service_that_is_restarted_waits_for_an_operator(start: Start, measured: Measured) -> None:
+    run = start("--panels", "1")
+    run.until_state("driving", done=1)
     orphans = psutil.Process(run.process.pid).children()
     run.process.kill()
     run.wait()
     _, alive = psutil.wait_procs(orphans, timeout=10.0)
     assert not alive
-    done = len(fixes(run))
+    done = len(run.fixes)
     again_s = time.monotonic()
-    again = begun(run, "--resume", "--start-held", "--panels", "1")
+    again = start("--resume", "--start-held", "--panels", "1", run_dir=run.run_dir)
     status = again.until(lambda status: status["seq"] >= 0)
     measured("P4", time.monotonic() - again_s)
     assert status["state"] == "held"
@@ -213,24 +196,50 @@ def test_a_service_that_is_restarted_waits_for_an_operator(
     time.sleep(0.3)
     assert again.ask("status")["status"]["done"] == done
     assert again.ask("resume")["ok"]
-    assert again.wait() == 0, again.stderr
-    assert len(fixes(again)) == len(set(fixes(again))) == 9
+    again.until(lambda status: status["done"] >= done + 1)
+    assert again.ask("stop")["ok"]
+    assert again.wait() == 4
+    assert len(again.fixes) == len(set(again.fixes)) == again.measured >= done + 1
     assert again.summary["danger"]["falls"] == 0
 
 
-@pytest.mark.fault("P23")
-@pytest.mark.parametrize(
-    "state", ["driving", *(pytest.param(state, marks=pytest.mark.slow) for state in ("measuring", "held", "turning"))]
-)
-def test_terminated_in_each_state(start: Start, measured: Measured, state: str) -> None:
-    run = start("--panels", "1", "--realtime")
-    until_driving(run, 0)
-    if state == "held":
-        assert run.ask("pause")["ok"]
-    run.until(lambda status: status["state"] == state)
-    run.process.terminate()
-    at_s = time.monotonic()
-    assert run.wait() == 130
-    took_s = time.monotonic() - at_s
-    assert took_s < 5.0
-    measured("P23", took_s)
+def flipped(path: Path) -> None:
+    """Flip a bit in every hundred bytes."""
+    data = bytearray(path.read_bytes())
+    data[::100] = bytes(byte ^ 0x10 for byte in data[::100])
+    path.write_bytes(data)
+
+
+@pytest.mark.fault("P13", "P16", "P17")
+def test_what_is_damaged_is_refused_what_was_measured_stays_and_the_rest_is_measured(start: Start) -> None:
+    run = start("--panels", "1")
+    run.until(lambda status: status["done"] >= 2)
+    run.ask("stop")
+    assert run.wait() == 4
+    before = run.summary
+    assert 2 <= before["points"]["measured"] == run.measured < 9
+    checkpoint, database = run.run_dir / "checkpoint", run.run_dir / "mission.sqlite"
+    for path, text in (
+        (checkpoint, "damaged, so nobody knows where the robot is; set it at base, remove this file and resume"),
+        (database, "damaged"),
+    ):
+        sound = path.with_name("sound")
+        shutil.copyfile(path, sound)
+        flipped(path)
+        refused = start("--resume", "--panels", "1", run_dir=run.run_dir)
+        assert refused.wait() == 2
+        assert f"{path}: {text}" in refused.stderr
+        assert "Traceback" not in refused.stderr
+        assert {key: refused.summary["points"][key] for key in ("total", "measured")} == {
+            key: before["points"][key] for key in ("total", "measured")
+        }
+        sound.replace(path)
+    # A summary that cannot be written changes nothing of the outcome.
+    (run.run_dir / "summary.json.new").mkdir()  # in its place nothing can be written
+    unchanged = json.dumps(run.summary)
+    again = start("--resume", "--panels", "1", run_dir=run.run_dir)
+    assert again.wait() == 0, again.stderr
+    assert "summary.json: cannot be written" in again.stderr
+    assert "Traceback" not in again.stderr
+    assert json.dumps(again.summary) == unchanged
+    assert again.measured == len(again.fixes) == len(set(again.fixes)) == 9

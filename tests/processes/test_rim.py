@@ -1,11 +1,253 @@
-"""A drive off the rim is stopped by the danger loop, on every side of every mirror, in lockstep and in real time."""
+"""A drive off the rim, by a controller that ignores verdicts, is stopped by the real danger loop.
 
+On every side of every mirror, in lockstep and in real time.
+"""
+
+import asyncio
+import contextlib
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import product
+from math import cos, hypot, sin
 from pathlib import Path
 
 import pytest
+import zmq
 
-from tests.processes.rim_drive import OUTWARD, RimCase, drive_off
+from ccatp.config.load import dump_config, load_config
+from ccatp.config.models import Config
+from ccatp.core import DeckPose, PanelId, Twist, twist_of, wheel_rates
+from ccatp.daemon.process import Endpoints
+from ccatp.links.bus import Publisher, Subscriber
+from ccatp.links.robot_link import RobotLink
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import DangerEvent, EstimateMessage, Heartbeat, TruthMessage
+from ccatp.mirror.mirror import Mirror, build_mirror
+
+START_M = 0.20  # of the robot's origin inside the rim: all sensors stand on the mirror, whatever the heading
+PATIENCE_S = 60.0
+
+
+@dataclass(frozen=True)
+class RimCase:
+    """One drive: which side of which mirror, how fast, at what angle to the outward normal."""
+
+    mirror: str
+    side: str
+    speed_m_s: float
+    angle_rad: float
+    is_realtime: bool
+    is_pose_right: bool = True
+
+
+@dataclass(frozen=True)
+class RimResult:
+    """What the truth says of a drive."""
+
+    has_fallen: bool
+    overrun_m: float
+    after_declaration_m: float
+    declared: bool
+
+
+OUTWARD = {"right": 0.0, "top": 1.5707963267948966, "left": 3.141592653589793, "bottom": -1.5707963267948966}
+
+
+def start_on(case: RimCase, mirror: Mirror) -> tuple[PanelId, float, float, float]:
+    """A place in front of the rim and the heading towards it: panel, x and y (m), heading, panel frame."""
+    outward = OUTWARD[case.side]
+    dx, dy = round(cos(outward)), round(sin(outward))
+    on_side = [p for p in mirror.panels if PanelId(p.row + dy, p.col + dx) not in mirror.panels]
+    middle = PanelId((mirror.rows + 1) // 2, (mirror.cols + 1) // 2)
+    panel = min(
+        on_side, key=lambda p: (abs(p.row - middle.row) if dx else abs(p.col - middle.col), -dx * p.col - dy * p.row)
+    )
+    body = mirror.panels[panel]
+    return panel, dx * (body.half_x_m - START_M), dy * (body.half_y_m - START_M), outward + case.angle_rad
+
+
+def configure(case: RimCase) -> Config:
+    """The default configuration with the base moved to the start of the drive."""
+    plain = build_mirror(load_config(None, {"run.mirror": case.mirror}).mirror)
+    panel, x, y, heading = start_on(case, plain)
+    cfg = load_config(None, {"run.mirror": case.mirror, "run.world": "thesis", "robot.port": 0, "sim.robot.port": 0})
+    base = cfg.mirror.base.model_copy(
+        update={"row": panel.row, "col": panel.col, "x_mm": 1e3 * x, "y_mm": 1e3 * y, "heading_rad": heading}
+    )
+    return cfg.model_copy(update={"mirror": cfg.mirror.model_copy(update={"base": base})})
+
+
+class RecklessMain:
+    """Stands in for the main loop: claims a pose, never listens to a verdict."""
+
+    def __init__(
+        self, case: RimCase, cfg: Config, context: zmq.Context[zmq.Socket[bytes]], endpoints: Endpoints
+    ) -> None:
+        self._case, self._cfg = case, cfg
+        self._publisher = Publisher(context, endpoints.of("main"))
+        self._mirror = build_mirror(cfg.mirror)
+        # A wrong pose: it believes itself in the middle of the mirror, with no rim and no seam anywhere near.
+        self._pose = self._mirror.base_pose if case.is_pose_right else DeckPose(0.05, 0.05, 0.3)
+        self._t_s = 0.0
+        self._wheels = wheel_rates(Twist(case.speed_m_s, 0.0), cfg.robot.wheel_radius_m, cfg.robot.wheel_base_m)
+        self.held_frames = self.frames = 0
+
+    def presence(self) -> None:
+        """Be seen by the danger loop."""
+        self._publisher.send("heartbeat.main", Heartbeat(seq=0, t_s=0.0, process="main", pid=0, phase="ready"))
+
+    def on_sensors(self, link: RobotLink, sensors: Sensors) -> None:
+        """Dead-reckon, claim the pose, drive on."""
+        robot = self._cfg.robot
+        if not self.frames:
+            link.send_fans(1, robot.fan_duty)
+        for sample in sensors.enc:
+            right, left = sample.right_rad_s, sample.left_rad_s
+            if right is None or left is None:
+                continue
+            twist = twist_of(right, left, robot.wheel_radius_m, robot.wheel_base_m)
+            dt = sample.t_s - self._t_s if self._t_s else 0.0
+            self._t_s = sample.t_s
+            x, y = self._mirror.body_offset(self._pose, twist.v_m_s * dt, 0.0)
+            if self._case.is_pose_right:
+                self._pose = DeckPose(x, y, self._pose.heading_rad + twist.omega_rad_s * dt)
+        self.frames += 1
+        is_moving = any(hypot(s.right_rad_s or 0.0, s.left_rad_s or 0.0) > 0.05 for s in sensors.enc)
+        self.held_frames = 0 if is_moving or self.frames < 50 else self.held_frames + 1
+        pose = self._pose
+        self._publisher.send(
+            "estimate",
+            EstimateMessage(
+                seq=sensors.seq,
+                t_s=sensors.t,
+                x_m=pose.x_m,
+                y_m=pose.y_m,
+                heading_rad=pose.heading_rad,
+                sigma_m=0.001,
+                state="driving",
+            ),
+        )
+        link.send_drive(sensors.seq, sensors.seq, *self._wheels)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._publisher.close()
+
+
+@contextlib.contextmanager
+def processes(cfg: Config, case: RimCase, run_dir: Path, endpoints: Endpoints) -> Iterator[Config]:
+    """The real DataLoop and the real danger loop; yields the configuration with the robot's port."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        cfg = cfg.model_copy(update={"robot": cfg.robot.model_copy(update={"port": listener.getsockname()[1]})})
+        (run_dir / "config.toml").write_text(dump_config(cfg))
+        common = ["--run-dir", str(run_dir), "--runtime-dir", str(endpoints.runtime_dir)]
+        common += ["--realtime"] if case.is_realtime else []
+        python = [sys.executable, "-m"]
+        fd = listener.fileno()
+        started = [
+            subprocess.Popen([*python, "ccatp.daemon.sim_robot", *common, "--listen-fd", str(fd)], pass_fds=(fd,)),
+            subprocess.Popen([*python, "ccatp.daemon.danger_loop", *common]),
+        ]
+        try:
+            yield cfg
+        finally:
+            for process in reversed(started):
+                process.terminate()
+            for process in started:
+                process.wait(10.0)
+
+
+async def drive_off(case: RimCase, run_dir: Path, runtime_dir: Path) -> RimResult:
+    """Run one case to the robot's standstill."""
+    endpoints = Endpoints(runtime_dir)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    subscriber = Subscriber(
+        context,
+        [endpoints.of("truth"), endpoints.of("danger")],
+        ["truth", "danger_event", "heartbeat.danger", "verdict"],
+    )
+    try:
+        with processes(configure(case), case, run_dir, endpoints) as cfg:
+            main = RecklessMain(case, cfg, context, endpoints)
+            lost = asyncio.Event()
+            link = RobotLink(
+                host=cfg.robot.host,
+                port=cfg.robot.port,
+                role="controller",
+                client="reckless",
+                key=None,
+                on_sensors=lambda sensors, _raw: main.on_sensors(link, sensors),
+                on_lost=lambda _reason: lost.set(),
+            )
+            try:
+                return await _watch(case, main, link, subscriber, context, endpoints)
+            finally:
+                link.close()
+                main.close()
+    finally:
+        subscriber.close()
+        context.destroy(linger=0)
+
+
+async def _watch(
+    case: RimCase,
+    main: RecklessMain,
+    link: RobotLink,
+    subscriber: Subscriber,
+    context: zmq.Context[zmq.Socket[bytes]],
+    endpoints: Endpoints,
+) -> RimResult:
+    deadline = time.monotonic() + PATIENCE_S
+    is_joined = False
+    while not is_joined:
+        assert time.monotonic() < deadline, "the danger loop never joined"
+        main.presence()
+        while (received := subscriber.receive()) is not None:
+            message = received[1]
+            is_joined = is_joined or (isinstance(message, Heartbeat) and message.phase == "joined")
+        await asyncio.sleep(0.02)
+    await link.connect(5.0)
+    rows: dict[int, tuple[float, int]] = {}
+    declared_at: int | None = None
+    is_over = False
+    while not is_over:
+        assert time.monotonic() < deadline, f"{case}: still moving"
+        await asyncio.sleep(0.005)
+        is_over = main.held_frames > 60
+        if is_over:
+            _flush(context, endpoints)
+            await asyncio.sleep(0.2)  # what is on its way when the robot stands must be heard too
+        while (received := subscriber.receive()) is not None:
+            message = received[1]
+            if isinstance(message, TruthMessage):
+                rows.update({row[0]: (row[8], row[9]) for row in message.rows})
+            elif isinstance(message, DangerEvent) and message.code == 1 and declared_at is None:
+                declared_at = message.seq
+    clearances = {seq: clearance for seq, (clearance, _) in rows.items()}
+    overrun = max(0.0, -min(clearances.values()))
+    at_declaration = max(0.0, -clearances.get(declared_at, 0.0)) if declared_at is not None else 0.0
+    return RimResult(
+        has_fallen=any(fallen for _, fallen in rows.values()),
+        overrun_m=overrun,
+        after_declaration_m=overrun - at_declaration,
+        declared=declared_at is not None,
+    )
+
+
+def _flush(context: zmq.Context[zmq.Socket[bytes]], endpoints: Endpoints) -> None:
+    with context.socket(zmq.REQ) as peer:
+        peer.setsockopt(zmq.LINGER, 0)
+        peer.connect(endpoints.of("puck"))
+        peer.send(b"flush")
+        assert peer.poll(5000), "the DataLoop does not answer"
+        peer.recv()
+
 
 MIRRORS = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
 SPEEDS = (0.02, 0.05, 0.1, 0.15)

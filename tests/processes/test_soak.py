@@ -2,14 +2,12 @@
 
 import os
 import time
-from collections.abc import Callable
 
 import numpy as np
-import psutil
 import pytest
 
 from tests.faults.linking import Measured
-from tests.processes.conftest import Run
+from tests.processes.conftest import Start
 
 MINUTES = float(os.environ.get("CCATP_SOAK_MINUTES", "3"))
 WARM_UP_S = 900.0  # at most: what is done for the first time brings its modules and its memory along
@@ -20,24 +18,13 @@ AN_HOUR_AND_MORE = ("--mirror", "thesis-m1", "--set", "etalon.measuring_time_s=2
 LOOPS = ("main", "danger")
 
 
-def loops_of(run: Run) -> dict[str, psutil.Process]:
-    """The two loops."""
-    found = {}
-    for child in psutil.Process(run.process.pid).children(recursive=True):
-        for name in LOOPS:
-            if any(part.endswith(f"processes.{name}_loop") for part in child.cmdline()):
-                found[name] = child
-    assert set(found) == set(LOOPS)
-    return found
-
-
 @pytest.mark.slow
 @pytest.mark.fault("P12")
-def test_nothing_grows(start: Callable[..., Run], measured: Measured) -> None:
+def test_nothing_grows(start: Start, measured: Measured) -> None:
     run = start("--realtime", "--world", "hard", "--filter", "ekf", *AN_HOUR_AND_MORE)
     run.until(lambda status: status["state"] == "driving")
     time.sleep(min(WARM_UP_S, 20.0 * MINUTES))  # a third of a short soak
-    loops = loops_of(run)
+    loops = {name: run.child(name) for name in LOOPS}
     begun_s = time.monotonic()
     rows: dict[str, list[tuple[float, float, int, int]]] = {name: [] for name in LOOPS}
     while time.monotonic() - begun_s < 60.0 * MINUTES:

@@ -91,7 +91,7 @@ def least_clearance(mirror: Mirror, start: DeckPose, stops: Sequence[Stop]) -> f
     return min(mirror.rim.segment_clearance_m(*a, *b) for a, b in pairwise(ends))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(mirror_names, order_names, st.integers(0, 120))
 def test_every_point_exactly_once(name: str, order: str, panels: int) -> None:
     _, mirror = load(name)
@@ -107,11 +107,12 @@ def check_route(cfg: Config, mirror: Mirror, stops: Sequence[Stop]) -> None:
     assert worst_sensor(cfg, mirror, drive(mirror, mirror.base_pose, stops)) >= cfg.mission.turn_clearance_m - SWEEP_M
 
 
+@pytest.mark.parametrize("panels", [16, pytest.param(0, marks=pytest.mark.slow, id="whole")])
 @pytest.mark.parametrize("order", SURVEYS)
 @pytest.mark.parametrize("name", NAMES)
-def test_whole_survey_stays_on_the_mirror(name: str, order: str) -> None:
+def test_a_survey_stays_on_the_mirror(name: str, order: str, panels: int) -> None:
     cfg, mirror = load(name)
-    points = ORDERS[order](mirror, 0)
+    points = ORDERS[order](mirror, panels)
     route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose)
     check_route(cfg, mirror, route.stops)
     measured = [stop for stop in route.stops if stop.kind is StopKind.MEASURE]
@@ -120,7 +121,7 @@ def test_whole_survey_stays_on_the_mirror(name: str, order: str) -> None:
     assert all(stop.kind is StopKind.VIA and stop.point is None for stop in route.stops if stop not in measured)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(mirror_names, order_names, st.integers(1, 90), st.integers(0, 2**32), st.floats(0.0, 1.0))
 def test_any_rest_of_a_survey_stays_on_the_mirror(name: str, order: str, panels: int, seed: int, part: float) -> None:
     cfg, mirror = load(name)
@@ -133,7 +134,7 @@ def test_any_rest_of_a_survey_stays_on_the_mirror(name: str, order: str, panels:
         check_route(cfg, mirror, route.stops)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(mirror_names, order_names, st.data())
 def test_back_to_a_route_from_anywhere_on_it(name: str, order: str, data: st.DataObject) -> None:
     """Off the route after any of its points, at any heading: the rest is driven safely, each point of it once."""
@@ -168,24 +169,26 @@ def check_way_home(cfg: Config, mirror: Mirror, start: DeckPose) -> None:
     assert worst_sensor(cfg, mirror, legs) >= cfg.mission.turn_clearance_m - SWEEP_M
 
 
+@pytest.mark.parametrize("panels", [1, 2, 8, pytest.param(0, marks=pytest.mark.slow, id="whole")])
 @pytest.mark.parametrize("order", SURVEYS)
 @pytest.mark.parametrize("name", NAMES)
-def test_home_from_the_end_of_a_survey(name: str, order: str) -> None:
-    """As it stands at the last stop, and at the last of the first few panels."""
+def test_home_from_the_end_of_a_survey(name: str, order: str, panels: int) -> None:
+    """As it stands at the last stop."""
     cfg, mirror = load(name)
-    for panels in (0, 1, 2, 8):
-        points = ORDERS[order](mirror, panels)
-        last = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose).stops[-2:]
-        course = atan2(last[1].y_m - last[0].y_m, last[1].x_m - last[0].x_m) + (pi if last[1].reverse else 0.0)
-        check_way_home(cfg, mirror, DeckPose(last[1].x_m, last[1].y_m, course))
+    points = ORDERS[order](mirror, panels)
+    last = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose).stops[-2:]
+    course = atan2(last[1].y_m - last[0].y_m, last[1].x_m - last[0].x_m) + (pi if last[1].reverse else 0.0)
+    check_way_home(cfg, mirror, DeckPose(last[1].x_m, last[1].y_m, course))
 
 
+@pytest.mark.parametrize(("inner", "rim"), [(96, 3), pytest.param(24, 1, marks=pytest.mark.slow, id="all")])
 @pytest.mark.parametrize("name", NAMES)
-def test_home_from_every_point(name: str) -> None:
+def test_home_from_points(name: str, inner: int, rim: int) -> None:
+    """From every so many of the points, and of those at the rim."""
     cfg, mirror = load(name)
     for k, point in enumerate(thesis_order(mirror)):
         x, y = mirror.point_on_deck(point)
-        if k % 24 == 0 or mirror.rim.signed_distance_m(x, y) < 0.134:
+        if k % inner == 0 or (k % rim == 0 and mirror.rim.signed_distance_m(x, y) < 0.134):
             check_way_home(cfg, mirror, DeckPose(x, y, radians(37.0 * k)))
 
 
@@ -200,7 +203,7 @@ def test_home_from_a_point_at_the_rim_without_a_sweep(name: str) -> None:
         assert worst_sensor(cfg, mirror, drive(mirror, start, stops)) >= cfg.mission.turn_clearance_m - SWEEP_M
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(mirror_names, st.floats(-4.0, 4.0), st.floats(-4.0, 4.0), st.floats(-7.0, 7.0))
 def test_home_from_anywhere(name: str, x: float, y: float, heading: float) -> None:
     cfg, mirror = load(name)
@@ -208,7 +211,7 @@ def test_home_from_anywhere(name: str, x: float, y: float, heading: float) -> No
         check_way_home(cfg, mirror, DeckPose(x, y, heading))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(mirror_names, st.integers(0, 1000), st.floats(0.0, 1.0), st.floats(1e-6, 0.13), st.floats(-7.0, 7.0))
 def test_home_from_the_rim(name: str, edge: int, along: float, depth: float, heading: float) -> None:
     cfg, mirror = load(name)
@@ -220,7 +223,7 @@ def test_home_from_the_rim(name: str, edge: int, along: float, depth: float, hea
         check_way_home(cfg, mirror, DeckPose(float(x), float(y), heading))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(mirror_names, order_names, st.integers(1, 6))
 def test_stops_on_the_way_cost_time_and_nothing_else(name: str, order: str, panels: int) -> None:
     cfg, mirror = load(name)

@@ -6,4 +6,7 @@
 * `mission_story`: the mission with an ideal robot on one panel and scripted verdicts (`FREE`, `FRONT_OFF`, `ABORT`).
 * `virtual_time`: `run_virtual(coroutine)` runs asyncio code, sockets included, on a clock on which nothing waits.
 * `runs`: real processes (`Run`), and `recorded_run()`: one two-panel run, recorded once per test session, to read from.
+* `sim_survey`: surveys in process: watched frame by frame with faults, measured by the daemon's own fix service with a
+  scripted laser (`MeasuredSurvey`, `fix_service`), restarted after a kill.
+* `daemon`: both loops of the daemon and their peers in one event loop; or the robot link alone, behind a proxy.
 """

@@ -95,6 +95,7 @@ class Run:
         module = f"ccatp.daemon.{MODULES.get(name, name)}"
         deadline_s = time.monotonic() + DEADLINE_S
         while time.monotonic() < deadline_s:
+            assert self.process.poll() is None, "the run has ended"
             for process in psutil.Process(self.process.pid).children():
                 try:
                     if process.pid != not_pid and module in process.cmdline():

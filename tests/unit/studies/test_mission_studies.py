@@ -38,7 +38,7 @@ from ccatp.studies.sil_models import SilTrace
 from ccatp.studies.thesis_replica import LIMIT_M, ThesisLocalizer, overrides_of, run_replica
 from ccatp.studies.thesis_study import PUBLISHED, cells, combine, draw, run_job
 from ccatp.survey.composition import SurveyParts, assemble
-from tests.faults.campaign import single
+from tests.support.sim_survey import single
 from tests.unit.studies.missions import SIGMA_M, mission, stops_of
 
 CAMPAIGNS = (filters_study.STUDY, time_study.STUDY, SENSITIVITY, ABLATION)

@@ -1,4 +1,7 @@
-"""Both loops of the daemon and their peers in one event loop, in real time: what happens can be seen from within."""
+"""The daemon in one event loop with its peers, in real time: what happens can be seen from within.
+
+`running_daemon` has both loops; `robot_behind_proxy` and `Driver` only the robot link.
+"""
 
 import asyncio
 import json
@@ -15,11 +18,14 @@ import zmq
 
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
+from ccatp.core import PanelPose
 from ccatp.daemon.danger_loop import DangerLoop
 from ccatp.daemon.main_loop import MainLoop, open_runner
 from ccatp.daemon.process import EitherArgs, Endpoints, ProcessArgs
 from ccatp.dataloop import DataLoop
 from ccatp.links.robot_link import RobotLink
+from ccatp.links.robot_messages import Sensors
+from ccatp.localizer import Localizer, build_localizer
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.etalon_server import EtalonSimulator, ZmqPuck
 from ccatp.sim.fault_proxy import FaultProxy
@@ -27,6 +33,8 @@ from ccatp.sim.ground_truth import GroundTruthPublisher
 from ccatp.sim.robot import TruthLog
 
 DEADLINE_S = 60.0
+LINK_DEADLINE_S = 30.0  # what never happens in a good run may take this long in a bad one
+SEED = 3
 SEND_DRIVE, SEND_PERMIT = RobotLink.send_drive, RobotLink.send_permit
 LATE_FRAMES = 16  # of 10 ms: data are too old after 150 ms
 
@@ -241,3 +249,75 @@ def _at(cfg: Config, robot_port: int, laser_port: int) -> Config:
 def tell(daemon: Daemon) -> str:
     """For a test that failed."""
     return json.dumps(daemon.log[-20:], default=str, indent=1)
+
+
+# -- the robot link alone ---------------------------------------------------------------------------------------------
+
+
+class Driver:
+    """Joins as the controller, localizes, and answers each frame by the same drive.
+
+    Args:
+        port: where the robot, or the proxy before it, listens.
+        key: of the robot link.
+
+    Attributes:
+        seqs: numbers of the frames that reached it.
+        lost: why the session ended.
+    """
+
+    def __init__(self, port: int, key: bytes | None = None) -> None:
+        cfg = load_config(overrides={"run.seed": SEED, "run.filter": "kf"})
+        self.localizer: Localizer = build_localizer(cfg, build_mirror(cfg.mirror))
+        self.seqs: list[int] = []
+        self.lost = ""
+        self.changed = asyncio.Event()
+        self.link = RobotLink(
+            host="127.0.0.1",
+            port=port,
+            role="controller",
+            client="test",
+            key=key,
+            on_sensors=self._on_sensors,
+            on_lost=self._on_lost,
+        )
+
+    def _on_sensors(self, frame: Sensors, _line: bytes) -> None:
+        self.seqs.append(frame.seq)
+        self.localizer.step(frame.t, frame.imu, frame.enc, frame.edge, frame.gravity)
+        self.link.send_drive(frame.seq + 1, frame.seq, 1.1, 1.0)
+        self.changed.set()
+
+    def _on_lost(self, reason: str) -> None:
+        self.lost = reason
+        self.changed.set()
+
+    @property
+    def pose(self) -> PanelPose:
+        return self.localizer.pose
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(LINK_DEADLINE_S):
+            while not condition():
+                self.changed.clear()
+                await self.changed.wait()
+
+    async def drive(self, frames: int) -> None:
+        """Until frame number ``frames`` came, or the session ended."""
+        await self.until(lambda: bool(self.lost or (self.seqs and self.seqs[-1] >= frames)))
+
+
+@asynccontextmanager
+async def robot_behind_proxy(*, lockstep: bool, key: bytes | None = None) -> AsyncIterator[tuple[DataLoop, FaultProxy]]:
+    """A running DataLoop with a proxy before it."""
+    cfg = load_config(overrides={"run.seed": SEED, "sim.robot.port": 0})
+    loop = DataLoop(cfg, lockstep, SEED, key)
+    port = await loop.start()
+    stop = asyncio.Event()
+    async with asyncio.TaskGroup() as tasks:
+        tasks.create_task(loop.run(stop))
+        try:
+            async with FaultProxy("127.0.0.1", port, seed=1) as proxy:
+                yield loop, proxy
+        finally:
+            stop.set()

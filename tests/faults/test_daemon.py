@@ -1,0 +1,291 @@
+"""Both loops of the daemon in one event loop: they end at once, a broken task ends them, no old frame drives."""
+
+import ast
+import asyncio
+import inspect
+import os
+import random
+import textwrap
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import pytest
+
+import ccatp
+from ccatp.daemon.danger_loop import DangerLoop
+from ccatp.daemon.main_loop import MainLoop
+from ccatp.errors import ExitStatus
+from tests.faults.linking import Measured
+from tests.support.daemon import Daemon, configuration, running_daemon, tell
+
+PACKAGE = Path(ccatp.__file__).parent
+
+# -- the end -----------------------------------------------------------------------------------------------------------
+
+TIMES = 4
+SLOW_TIMES = int(os.environ.get("CCATP_CANCELLATIONS", "200"))
+
+
+async def ended(seed: int) -> float:
+    """How long both loops take to end, s, at a random instant of joining, standing or driving."""
+    rng = random.Random(seed)
+    loop = asyncio.get_running_loop()
+    async with running_daemon(configuration()) as daemon:
+        await asyncio.sleep(rng.choice((rng.uniform(0.0, 0.05), rng.uniform(0.0, 0.4), rng.uniform(2.0, 3.0))))
+        for _ in range(rng.randrange(20)):
+            await asyncio.sleep(0)
+        begun_s = loop.time()
+        if rng.random() < 0.5:
+            daemon.stop.set()
+        else:
+            for task in daemon.loops:
+                task.cancel()
+        _, waiting = await asyncio.wait(daemon.loops, timeout=10.0)
+        assert not waiting
+        return loop.time() - begun_s
+
+
+@pytest.mark.fault("P10")
+async def test_whenever_they_are_told_to_end(measured: Measured) -> None:
+    for seed in range(TIMES):
+        measured("P10", await ended(seed))
+
+
+@pytest.mark.fault("P10")
+async def test_while_a_robot_that_took_the_connection_says_nothing(measured: Measured) -> None:
+    loop = asyncio.get_running_loop()
+    async with running_daemon(configuration()) as daemon:
+        for proxy in (daemon.to_main, daemon.to_danger):
+            proxy.stall("to_client")
+        await asyncio.sleep(1.0)
+        assert not daemon.sent
+        begun_s = loop.time()
+        daemon.stop.set()
+        _, waiting = await asyncio.wait(daemon.loops, timeout=10.0)
+        assert not waiting
+        measured("P10", loop.time() - begun_s)
+
+
+@pytest.mark.slow
+@pytest.mark.fault("P10")
+async def test_many_times(measured: Measured) -> None:
+    for seed in range(TIMES, TIMES + SLOW_TIMES):
+        measured("P10", await ended(seed))
+
+
+# -- a task that breaks ------------------------------------------------------------------------------------------------
+
+# Every task that the two loops serve, by the method that it runs.
+TASKS = (
+    "ccatp.daemon.main_loop.MainLoop._publish_levels",
+    "ccatp.daemon.main_loop.MainLoop._watch",
+    "ccatp.daemon.fix_service.FixService.run",
+    "ccatp.daemon.robot_session.ReconnectingRobotLink.serve",
+    "ccatp.links.rpc.Router.serve",
+    "ccatp.daemon.danger_loop.DangerLoop._publish_heartbeat",
+    "ccatp.daemon.danger_loop.DangerLoop._watch",
+    "ccatp.daemon.command_handlers.ObservatoryServer.serve",
+)
+
+
+class Broken(Exception):
+    """What nobody foresaw."""
+
+
+def names(error: BaseException) -> list[str]:
+    """The leaves of nested groups of exceptions."""
+    if isinstance(error, BaseExceptionGroup):
+        return [name for part in error.exceptions for name in names(part)]
+    return [type(error).__name__]
+
+
+async def breaks(*_: object, **__: object) -> None:
+    await asyncio.sleep(0.05)
+    raise Broken
+
+
+@pytest.mark.fault("P9")
+@pytest.mark.parametrize("task", TASKS)
+async def test_a_task_that_breaks_ends_its_loop_by_that_exception(task: str, measured: Measured) -> None:
+    unheard = list[dict[str, Any]]()
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: unheard.append(context))
+    found = list[str]()
+    with patch(task, breaks):
+        try:
+            async with running_daemon(configuration()) as daemon:
+                await asyncio.wait(daemon.loops, return_when=asyncio.FIRST_COMPLETED)
+        except BaseExceptionGroup as error:
+            found = names(error)
+    assert "Broken" in found
+    measured("P9", len(unheard))
+
+
+@pytest.mark.fault("P9")
+def test_the_tasks_are_those_that_the_loops_serve() -> None:
+    """The coroutines in the ``services`` of both loops, read from their source."""
+    found = set[str]()
+    for loop in (MainLoop, DangerLoop):
+        for node in ast.walk(ast.parse(textwrap.dedent(inspect.getsource(loop.run)))):
+            if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "services":
+                assert isinstance(node.value, ast.Tuple)
+                calls = [call.func for call in node.value.elts if isinstance(call, ast.Call)]
+                found |= {function.attr for function in calls if isinstance(function, ast.Attribute)}
+    assert {task.rsplit(".", 1)[1] for task in TASKS} == found
+
+
+# -- frames and drives that come late ----------------------------------------------------------------------------------
+
+LONG_S = 0.4  # longer than the robot's time-to-live, and than any age at which data still count
+
+
+def stale(daemon: Daemon, since_s: float, until_s: float) -> list[int]:
+    """Drives of before ``since_s`` that turned the wheels after ``until_s``."""
+    return [step.seq for step in daemon.executed if step.at_s > until_s and daemon.sent[step.seq] < since_s]
+
+
+async def moving_again(daemon: Daemon, since_s: float) -> None:
+    await daemon.until(lambda: bool(daemon.executed) and daemon.executed[-1].at_s > since_s)
+
+
+@pytest.mark.fault("L3", "P8")
+async def test_stalls_and_blocks(measured: Measured) -> None:
+    clock = asyncio.get_running_loop().time
+    async with running_daemon(configuration()) as daemon:
+        await daemon.until(lambda: daemon.is_driving)
+        assert daemon.robot.robot.t_s > 1.5  # gravity had to agree first
+        found: list[int] = []
+        tasks = len(asyncio.all_tasks())
+        both = daemon.to_main, daemon.to_danger
+        for proxies, direction in (
+            (both[:1], "to_client"),
+            (both[:1], "to_server"),
+            (both[1:], "to_client"),
+            (both[1:], "to_server"),
+            (both, "to_client"),
+        ):
+            await daemon.until(lambda: daemon.is_driving)
+            begun_s = clock()
+            for proxy in proxies:
+                proxy.stall(direction)  # type: ignore[arg-type]
+            await asyncio.sleep(LONG_S)
+            assert not daemon.is_driving, tell(daemon)  # held by the robot itself, or by zero drives
+            healed_s = clock()
+            for proxy in proxies:
+                proxy.heal()
+            await moving_again(daemon, healed_s)  # a pause that resumes by itself
+            found += stale(daemon, begun_s + LONG_S / 2, healed_s)
+        measured("L3", len(found) + len(daemon.late))
+        assert len(asyncio.all_tasks()) == tasks
+
+        slips, told = daemon.main.status().missed_deadlines, len(daemon.events("frame_late"))
+        await daemon.until(lambda: daemon.is_driving)
+        begun_s = clock()
+        time.sleep(0.12)  # noqa: ASYNC251 - this is what must not happen
+        await moving_again(daemon, clock() + 0.05)
+        status = daemon.main.status()
+        measured("P8", 0 if status.missed_deadlines > slips and len(daemon.events("frame_late")) > told else 1)
+        assert status.worst_lateness_ms >= 60.0
+        assert not stale(daemon, begun_s, begun_s + 0.2)
+
+
+@pytest.mark.fault("P8")
+async def test_planning_longer_than_a_frame_may_wait_pauses_nobody() -> None:
+    # On a slow or busy machine it takes longer than the limit: a pause for that would end in planning anew.
+    clock = asyncio.get_running_loop().time
+    async with running_daemon(configuration()) as daemon:
+        await daemon.until(lambda: daemon.is_driving)
+        mission = daemon.main._runner._mission  # type: ignore[attr-defined]
+        plan, planned = mission._travels._plan_rest, []
+
+        def plan_slowly(*args: object) -> object:
+            time.sleep(0.12)
+            planned.append(clock())
+            return plan(*args)
+
+        mission._travels._plan_rest = plan_slowly
+        assert mission.pause("a test") is None
+        await daemon.until(lambda: not daemon.is_driving)
+        assert mission.resume() is None
+        await daemon.until(lambda: bool(planned))
+        await moving_again(daemon, planned[0])
+        # The danger loop, here in the same event loop, is blocked as well: that may cost another plan.
+        assert len(planned) < 5
+        assert not stale(daemon, planned[0] - 0.12, planned[-1] + 0.2)
+
+
+# -- another mirror ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.fault("P21")
+async def test_a_robot_on_another_mirror_is_refused(measured: Measured) -> None:
+    told, real = configuration(**{"run.mirror": "fyst-m1"}), configuration(**{"run.mirror": "fyst-m2"})
+    async with running_daemon(told, real) as daemon:
+        duty = daemon.robot.robot.fans.duty
+        await daemon.until(daemon.main.over.is_set)
+        assert daemon.main.exit_status == ExitStatus.USAGE, tell(daemon)
+        (line,) = (entry["text"] for entry in daemon.log if "right mirror" in entry.get("text", ""))
+        assert "fyst-m1 has one of 24.7 deg there" in line
+        measured("P21", len(daemon.executed))
+        assert daemon.main.status().exit_status == 2
+        assert duty <= daemon.robot.robot.fans.duty
+
+
+# -- what the source must not contain ----------------------------------------------------------------------------------
+
+
+@pytest.mark.fault("P10")
+def test_nobody_uses_what_swallows_cancellations() -> None:
+    """``asyncio.wait_for`` may lose a cancellation that meets the end of what it waits for; ``timeout`` does not."""
+    found = [
+        f"{path.relative_to(PACKAGE)}:{node.lineno}"
+        for path in sorted(PACKAGE.rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if (isinstance(node, ast.Attribute) and node.attr == "wait_for" and ast.unparse(node.value) == "asyncio")
+        or (
+            isinstance(node, ast.ImportFrom) and node.module == "asyncio" and "wait_for" in {n.name for n in node.names}
+        )
+    ]
+    assert not found
+
+
+CALLS = {("time", "time"), ("time", "time_ns"), ("time", "localtime"), ("time", "gmtime"), ("datetime", "now"),
+         ("datetime", "today"), ("datetime", "utcnow"), ("date", "today")}  # fmt: skip
+# Labels: rows of the store, names of run directories and the observatory's feed say when they were made. The check
+# before a mission shows the clock itself.
+LABELS = {
+    "records/store.py",
+    "daemon/supervisor.py",
+    "daemon/run_dir.py",
+    "cli/prepare.py",
+    "daemon/ocs_agent.py",
+    "commissioning/probes.py",
+}
+
+
+def wall_clocks(tree: ast.AST) -> Iterator[int]:
+    """Lines that read the wall clock."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name | ast.Attribute):
+            owner = node.value.id if isinstance(node.value, ast.Name) else node.value.attr
+            if (owner, node.attr) in CALLS:
+                yield node.lineno
+        elif isinstance(node, ast.ImportFrom) and any((node.module, alias.name) in CALLS for alias in node.names):
+            yield node.lineno
+
+
+def test_the_search_finds_them() -> None:
+    text = "import time\ntime.time()\nfrom time import time_ns\ndatetime.datetime.now()\ntime.monotonic()\n"
+    assert sorted(wall_clocks(ast.parse(text))) == [2, 3, 4]
+
+
+@pytest.mark.fault("S13")
+def test_nothing_that_decides_reads_the_wall_clock() -> None:
+    found = {
+        str(path.relative_to(PACKAGE))
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if list(wall_clocks(ast.parse(path.read_text(encoding="utf-8"))))
+    }
+    assert found == LABELS

@@ -1,0 +1,261 @@
+"""The rim of all four mirrors, ways over the seams, and random faults: no fall, no false edge.
+
+One part of 96 is swept by the slow tests, which measure for the fault table. All of it, 4 million drives, takes
+five to nine hours of one core: ``make sweep``, which ``make test-slow`` ends with.
+"""
+
+import json
+import os
+import random
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from ccatp.sim.fault_models import Injected
+from ccatp.sim.fault_plan import FaultPlan
+from ccatp.studies.faults_study import FaultySilRun, random_plan
+from ccatp.studies.sil_models import SilResult
+from tests.faults import edge_sweep
+from tests.faults.edge_sweep import (
+    OVERRUN_M,
+    Tally,
+    rim_case,
+    rim_cases,
+    seam_case,
+    speed_of,
+    sweep,
+    turn_case,
+    turn_cases,
+)
+from tests.faults.linking import Measured
+from tests.support.scenario import config_of
+from tests.support.sim_survey import single
+
+# Random plans of faults that pass by; of such missions this share has to be completed.
+MISSIONS = int(os.environ.get("CCATP_FAULT_PLANS", "40"))
+LEAST_COMPLETE = 0.99
+FAULTS_PER_MISSION, LAST_S = 4, 80.0
+SHARD, SHARDS = 5, 96
+MIN_DRIVEN = 0.25
+PERMIT_S = 0.1  # S22, S24
+
+# Slower than this the way that tells a direction, 0.2 mm and more, takes longer than the bound in time.
+SLOW_M_S = 0.02
+
+
+def check(tally: Tally) -> None:
+    print(tally.line)
+    assert not tally.falls, "\n".join(tally.worst)
+    assert not tally.unseen, "\n".join(tally.worst)
+    assert tally.after_m <= OVERRUN_M, "\n".join(tally.worst)
+    assert not tally.false_edges, "\n".join(tally.worst)
+
+
+def check_rim(numbers: Iterable[int], measured: Measured) -> None:
+    """All drives count for falls and overrun; the time to the permit is that of those that are not slow."""
+    tally, late_s = Tally(), 0.0
+    count = 0
+    for number in numbers:
+        one = sweep(rim_case, [number])
+        tally.add(one)
+        count += 1
+        if speed_of(number) >= SLOW_M_S:
+            late_s = max(late_s, one.late_s)
+    check(tally)
+    assert tally.drives > count * MIN_DRIVEN
+    measured("S22", 1e3 * tally.after_m, "mm")
+    measured("S22", 1e3 * late_s, "ms")
+    measured("S22", tally.falls, "falls")
+
+
+def test_a_number_is_a_drive() -> None:
+    """Every place of every rim, heading and speed has its number, and the same number is the same drive."""
+    assert rim_cases() > 3_000_000
+    names = {rim_case(number)[0] for number in range(0, rim_cases(), 9973)}
+    assert len(names) == len(range(0, rim_cases(), 9973))
+    assert {name.split()[2] for name in names} == set(edge_sweep.MIRRORS)
+    assert rim_case(4)[1]() == rim_case(4)[1]()
+
+
+@pytest.mark.fault("S22")
+def test_a_sample_of_the_rim(measured: Measured) -> None:
+    rng = random.Random(20)
+    check_rim([rng.randrange(rim_cases()) for _ in range(160)], measured)
+
+
+@pytest.mark.fault("S24")
+def test_a_sample_of_turns_beside_the_rim(measured: Measured) -> None:
+    rng = random.Random(24)
+    tally = sweep(turn_case, [rng.randrange(turn_cases()) for _ in range(60)])
+    check(tally)
+    assert tally.drives > 60 * MIN_DRIVEN
+    assert tally.late_s <= PERMIT_S
+    measured("S24", 1e3 * tally.late_s)
+
+
+@pytest.mark.fault("S20", "S21")
+def test_a_sample_of_ways_and_stops_over_seams(measured: Measured) -> None:
+    rng = random.Random(21)
+    tally = sweep(seam_case, [rng.randrange(edge_sweep.SEAMS) for _ in range(24)])
+    check(tally)
+    assert tally.over_gap > 2
+    measured("S20", tally.false_edges / tally.transits)
+    measured("S21", float(tally.false_edges))
+
+
+@pytest.mark.slow
+@pytest.mark.fault("S22")
+@pytest.mark.parametrize("part", range(4))
+def test_the_rim(part: int, measured: Measured) -> None:
+    check_rim(range(SHARD + SHARDS * part, rim_cases(), 4 * SHARDS), measured)
+
+
+@pytest.mark.slow
+@pytest.mark.fault("S24")
+def test_turns_beside_the_rim(measured: Measured) -> None:
+    tally = sweep(turn_case, range(SHARD, turn_cases(), SHARDS))
+    check(tally)
+    measured("S24", 1e3 * tally.late_s)
+
+
+@pytest.mark.slow
+@pytest.mark.fault("S20", "S21")
+@pytest.mark.parametrize("part", range(2))
+def test_ways_and_stops_over_seams(part: int, measured: Measured) -> None:
+    # Neither mirrors nor kinds of crossing may fall out of step with the shards.
+    numbers = range(edge_sweep.SEAMS * part // 2, edge_sweep.SEAMS * (part + 1) // 2)
+    tally = sweep(seam_case, [k for k in numbers if k // 8 % SHARDS == SHARD % SHARDS])
+    check(tally)
+    measured("S20", tally.false_edges / tally.transits)
+    measured("S21", float(tally.false_edges))
+
+
+# -- the whole sweep --------------------------------------------------------------------------------------------------
+
+
+def few_drives(monkeypatch: pytest.MonkeyPatch, falls_at: int | None = None) -> None:
+    """Ten drives over a rim and five over seams, in blocks of four."""
+
+    def case(number: int) -> tuple[str, Callable[[], Tally]]:
+        return f"drive {number}", lambda: Tally(drives=1, falls=int(number == falls_at))
+
+    monkeypatch.setattr(edge_sweep, "BLOCK", 4)
+    monkeypatch.setattr(edge_sweep, "KINDS", {"rim": (case, lambda: 10), "seam": (case, lambda: 5)})
+
+
+def test_the_edge_sweep_is_every_drive_once() -> None:
+    swept: dict[str, list[range]] = {}
+    for kind, first in edge_sweep.blocks():
+        swept.setdefault(kind, []).append(range(first, first + edge_sweep.BLOCK))
+    for kind, count in (("rim", rim_cases()), ("turn", turn_cases()), ("seam", edge_sweep.SEAMS)):
+        firsts = sorted(part.start for part in swept[kind])
+        assert firsts == list(range(0, count, edge_sweep.BLOCK))
+
+
+def test_the_edge_sweep_goes_on_where_it_was_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few_drives(monkeypatch)
+    assert edge_sweep.main([str(tmp_path), "--workers", "1", "--blocks", "2"]) == 0
+    path = tmp_path / "blocks.jsonl"
+    path.write_text(path.read_text()[:-5])  # killed while it wrote
+    assert edge_sweep.main([str(tmp_path), "--workers", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "1 of 5 blocks are done, 4 to do" in said
+    assert "rim: 3 of 3 blocks, 10 drives" in said
+    assert "seam: 2 of 2 blocks, 5 drives" in said
+
+
+def test_the_edge_sweep_tells_who_fell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few_drives(monkeypatch, falls_at=3)
+    assert edge_sweep.main([str(tmp_path), "--workers", "1"]) == 1
+    assert "drive 3: 1 drives" in capsys.readouterr().out
+    assert edge_sweep.main([str(tmp_path), "--workers", "1"]) == 1  # nor is it forgotten
+    monkeypatch.setattr(edge_sweep, "build_id", lambda: "another")
+    few_drives(monkeypatch)
+    assert edge_sweep.main([str(tmp_path), "--workers", "1"]) == 0
+    builds = [json.loads(line)["build"] for line in (tmp_path / "blocks.jsonl").read_text().split("\n") if line]
+    assert builds[:5] != builds[5:] == ["another"] * 5
+
+
+# -- random faults -----------------------------------------------------------------------------------------------------
+
+
+def plan_of(seed: int) -> FaultPlan:
+    """Faults of a mission on one panel."""
+    return random_plan(seed, FAULTS_PER_MISSION, LAST_S)
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """What became of one mission."""
+
+    plan: FaultPlan
+    injected: tuple[Injected, ...]
+    result: SilResult
+
+    @property
+    def line(self) -> str:
+        """For people: faults, outcome, cause, falls, points."""
+        faults = ", ".join(f"{f.signal} {f.type} at {f.at_s:.1f}" for f in self.plan.faults)
+        points = self.result.summary["points"]
+        falls = self.result.summary["danger"]["falls"]
+        return f"{faults}: {self.result.outcome} ({self.result.cause}), {points['measured']} points, {falls} falls"
+
+
+def survey(seed: int, plan: FaultPlan) -> Ending:
+    """One panel in the hard world with the extended filter."""
+    cfg = config_of(run__world="hard", run__panels=1, run__seed=seed)
+    rehearsal = FaultySilRun(cfg, plan)
+    result = rehearsal.run()
+    return Ending(plan, rehearsal.injected, result)
+
+
+def test_plans_are_of_their_seed() -> None:
+    assert plan_of(3) == plan_of(3)
+    assert plan_of(3) != plan_of(4)
+
+
+@pytest.mark.parametrize("seed", [19, 45])
+def test_a_slip_in_the_calibration_drive_does_not_mislead_for_good(seed: int) -> None:
+    # The body slips in a turn; what the filter learns of it, wheel base and gyroscope, would be wrong ever after.
+    ending = survey(seed, plan_of(seed))
+    assert any(record.signal == "body" and record.changed for record in ending.injected)
+    assert ending.result.outcome == "complete", ending.line
+    assert ending.result.summary["points"]["measured"] == ending.result.summary["points"]["total"]
+
+
+def test_a_rim_on_the_map_of_a_robot_that_finds_itself_is_no_edge() -> None:
+    # An encoder at its rail turns the estimate by a radian: looks at the map show a rim, until the heading is found.
+    ending = survey(189, plan_of(189))
+    assert any(record.signal == "encoder_left" and record.changed for record in ending.injected)
+    assert (ending.result.outcome, ending.result.summary["points"]["measured"]) == ("complete", 9), ending.line
+
+
+@pytest.mark.slow
+def test_nobody_falls_and_what_passes_by_is_survived() -> None:
+    incomplete = []
+    for seed in range(MISSIONS):
+        ending = survey(seed, plan_of(seed))
+        assert ending.result.summary["danger"]["falls"] == 0, ending.line
+        assert ending.result.outcome in {"complete", "stopped", "aborted, at base"}, ending.line
+        time_s = ending.result.summary["mission_time_s"]
+        for record in ending.injected:
+            assert record.at_s is not None
+            # A second before the end a sensor of 20 Hz, too, has been read.
+            assert record.samples > 0 or record.at_s > time_s - 1.0, (record, ending.line)
+        if ending.result.outcome != "complete":
+            incomplete.append(ending.line)
+    assert len(incomplete) <= max(1, (1.0 - LEAST_COMPLETE) * MISSIONS), "\n".join(incomplete)
+
+
+@pytest.mark.slow
+def test_a_fault_long_after_the_mission_changes_nothing() -> None:
+    without = survey(5, single('signal = "imu_wz"\ntype = "off"\nat_s = 9000.0'))
+    with_one = survey(5, single('signal = "soc"\ntype = "stuck"\nat_s = 9000.0'))
+    assert without.result.summary == with_one.result.summary
+    assert without.injected[0].samples == 0

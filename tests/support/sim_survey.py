@@ -1,0 +1,397 @@
+"""Surveys in process, frame by frame: with faults, with a scripted laser system, with main loops that are killed."""
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import Future, wait
+from itertools import pairwise
+from math import hypot
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple, TypeVar, cast
+
+import numpy as np
+
+from ccatp.config.models import Config
+from ccatp.control.prediction import CommandPredictor
+from ccatp.core import DeckPose, Fix, PointId, Severity, Vector3, Verdict
+from ccatp.daemon.fix_service import FixRequest, FixService
+from ccatp.daemon.telemetry import SurveyTelemetry
+from ccatp.estimation.fixes import FixRefused, deck_foot
+from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
+from ccatp.links.robot_messages import Sensors
+from ccatp.localizer import Localizer
+from ccatp.mirror.multilateration import MultilaterationError
+from ccatp.records.store import MissionStore
+from ccatp.records.store_rows import PlannedPoint
+from ccatp.sim.fault_models import Injected
+from ccatp.sim.fault_plan import FaultPlan, parse_plan
+from ccatp.studies.faults_study import FaultySilRun
+from ccatp.studies.sil_models import SilResult
+from ccatp.studies.sil_run import SilRun
+from ccatp.survey.composition import assemble
+from ccatp.survey.fix_gate import FixGate, nis_of
+from ccatp.survey.heading_recovery import TakeoverState, doubted
+from ccatp.survey.mission import Mission
+from ccatp.survey.state import DRIVING, RETURNING, TURNING, MissionState
+from tests.support.scenario import one_panel
+from tests.support.virtual_time import VirtualLoop
+
+T = TypeVar("T")
+FULL = (1.0, 1.0)
+
+
+def single(fault: str) -> FaultPlan:
+    """A plan of one fault."""
+    return parse_plan("[[fault]]\n" + fault, "plan")
+
+
+def was_real(record: Injected) -> bool:
+    """The fault acted on something and changed it."""
+    return record.samples > 0 and record.changed > 0
+
+
+def short_survey(world: str = "hard", **overrides: object) -> Config:
+    """One panel without the calibration drive in a world."""
+    return one_panel(**{"run__world": world, **overrides})
+
+
+# -- watched frame by frame -------------------------------------------------------------------------------------------
+
+
+class Seen(NamedTuple):
+    """One frame of a watched mission: what the robot was told after it, and where it really was."""
+
+    t_s: float
+    verdict: Verdict
+    state: MissionState
+    cause: str
+    drive: tuple[float, float]
+    pose: DeckPose
+    estimate: tuple[float, float]
+
+    @property
+    def is_zero(self) -> bool:
+        return self.drive == (0.0, 0.0)
+
+
+class _Enough(Exception):
+    """Seen what was to be seen."""
+
+
+class Watched(FaultySilRun):
+    """Keeps what happened frame by frame; ends as soon as somebody has seen enough."""
+
+    def __init__(self, cfg: Config, plan: FaultPlan) -> None:
+        super().__init__(cfg, plan)
+        self.seen: list[Seen] = []
+        self.is_enough: Callable[[Seen], bool] = lambda _: False
+
+    def _serve(self, frame: Sensors, dt_s: float) -> None:
+        super()._serve(frame, dt_s)
+        deck = self.localizer.deck_pose
+        mission, plant = self.mission, self.robot.world.plant
+        now = Seen(
+            self.robot.t_s, self.monitor.verdict, mission.state, mission.cause, self._driven, plant.pose,
+            (deck.x_m, deck.y_m),
+        )  # fmt: skip
+        self.seen.append(now)
+        if self.is_enough(now):
+            raise _Enough
+
+    def watch(self, is_enough: Callable[[Seen], bool]) -> SilResult | None:
+        """Run until it is enough, or to the end: then its result."""
+        self.is_enough = is_enough
+        try:
+            return self.run()
+        except _Enough:
+            return None
+
+    def since(self, t_s: float) -> list[Seen]:
+        return [one for one in self.seen if one.t_s >= t_s - 1e-9]
+
+    def first(self, t_s: float, is_it: Callable[[Seen], bool]) -> Seen:
+        """The first frame from ``t_s`` on of which something is true."""
+        return next(one for one in self.since(t_s) if is_it(one))
+
+    def time_to_zero_s(self, t_s: float) -> float:
+        """From ``t_s`` to the first zero drive of the hold that follows."""
+        held = self.first(t_s, lambda one: one.verdict.severity >= Severity.PAUSE or one.verdict.code != 0)
+        return self.first(held.t_s, lambda one: one.is_zero).t_s - t_s
+
+    def way_m(self, t_s: float, until_s: float) -> float:
+        """True travel of the robot's centre."""
+        poses = [one.pose for one in self.since(t_s) if one.t_s <= until_s]
+        return sum(hypot(b.x_m - a.x_m, b.y_m - a.y_m) for a, b in pairwise(poses))
+
+
+def watched(fault: str, cfg: Config, is_enough: Callable[[Seen], bool]) -> Watched:
+    """A watched mission with faults, each as in ``single``, separated by empty lines."""
+    text = "\n".join("[[fault]]\n" + one for one in fault.strip().split("\n\n")) if fault else ""
+    rehearsal = Watched(cfg, parse_plan(text, "plan"))
+    rehearsal.watch(is_enough)
+    return rehearsal
+
+
+# -- measured as the main loop measures -------------------------------------------------------------------------------
+
+
+def patient(store: MissionStore) -> MissionStore:
+    """A store whose caller waits for the commit: virtual time must not pass while a disk turns."""
+
+    def waiting(record: Callable[..., "Future[T]"]) -> Callable[..., "Future[T]"]:
+        def recorded(*args: Any) -> "Future[T]":
+            commit = record(*args)
+            wait([commit])
+            return commit
+
+        return recorded
+
+    return cast(
+        MissionStore,
+        SimpleNamespace(record_fix=waiting(store.record_fix), record_skipped=waiting(store.record_skipped)),
+    )
+
+
+def fix_service(
+    cfg: Config,
+    measure: Callable[..., Any],
+    store: MissionStore,
+    mission: Any,
+    *,
+    localizer: Any = None,
+    gate: Any = None,
+    on_finished: Callable[[], None] = lambda: None,
+    publish_fix: Callable[..., None] = lambda *_, **__: None,
+    notify: Callable[[str, str], None] = lambda *_: None,
+    measuring_time_s: float = 0.0,
+) -> FixService:
+    """The main loop's fix service; what is not given is there only to be asked."""
+    localizer = localizer or SimpleNamespace(
+        fuse_fix=lambda _fix: 0.0, notices=[], pose=None, pose_covariance=np.eye(3), position_sigma_m=5e-6
+    )
+    gate = gate or SimpleNamespace(
+        begin=lambda: None,
+        review=lambda *_, **__: SimpleNamespace(doubt="", refusal=""),
+        refusal_of=lambda *_: "",
+    )
+    return FixService(
+        cfg.mission,
+        cast(EtalonClient, SimpleNamespace(measure=measure)),
+        cast(FixGate, gate),
+        cast(Localizer, localizer),
+        cast(Mission, mission),
+        store,
+        cast(SurveyTelemetry, SimpleNamespace(publish_fix=publish_fix, notify_operator=notify)),
+        on_finished,
+        lambda: measuring_time_s,
+    )
+
+
+class LaserRequest:
+    """One request to the laser system: what the robot knew, what it was told, what was wrong with that."""
+
+    def __init__(self, number: int, t_s: float, point: PointId | None) -> None:
+        self.number, self.t_s, self.point = number, t_s, point
+        self.offset_m = 0.0
+        self.nis = float("nan")
+        self.is_fused = False
+
+
+# Called with a request and the true fix; returns the fix that is given, or raises.
+Laser = Callable[[LaserRequest, Fix], Fix]
+
+
+def honest(_measured: LaserRequest, fix: Fix) -> Fix:
+    return fix
+
+
+def moved(fix: Fix, offset_m: Vector3) -> Fix:
+    x, y, z = (a + b for a, b in zip(fix.position_m, offset_m, strict=True))
+    return Fix(fix.t_s, (x, y, z), fix.covariance_m2, fix.dop, fix.channels, fix.residual_rms_m)
+
+
+class MeasuredSurvey(FaultySilRun):
+    """A survey that measures as the main loop does: fix service, fix gate, store.
+
+    Attributes:
+        asked: every request to the laser system.
+        said: lines for the operator.
+        fans: duties that were commanded, with their time.
+    """
+
+    def __init__(self, cfg: Config, folder: Path, laser: Laser = honest, plan: FaultPlan | None = None) -> None:
+        super().__init__(cfg, plan or parse_plan("", "no faults"))
+        self.asked: list[LaserRequest] = []
+        self.said: list[str] = []
+        self.fans: list[tuple[float, tuple[float, float]]] = []
+        self._scripted, self._folder = laser, folder
+
+    def run(self) -> Any:
+        points = [PlannedPoint(point, 0.0, 0.0) for point in self.parts.points]
+        path = self._folder / "mission.sqlite"
+        name = self.mirror.name
+        with (
+            asyncio.Runner(loop_factory=VirtualLoop) as runner,
+            MissionStore.create(path, mirror=name, seed=1, config_toml="", points=points) as store,
+        ):
+            self._runner, self.store = runner, store
+            self._over = asyncio.Event()
+            self.service = fix_service(
+                self.cfg,
+                self._ask,
+                patient(store),
+                self.mission,
+                localizer=self.localizer,
+                gate=FixGate(self.mirror, self.cfg),
+                on_finished=self._over.set,
+                publish_fix=self._note_fix,
+                notify=lambda level, text: self.said.append(f"{level}: {text}"),
+                measuring_time_s=0.5,
+            )
+            result = super().run()
+            self.stored = [(row.point, row.status) for row in store.points()]
+            self.all_fixes = store.fixes(history=True)
+            return result
+
+    def _serve(self, frame: Sensors, dt_s: float) -> None:
+        self.look(frame)
+        super()._serve(frame, dt_s)
+        if self.mission.wants_full_fans and not self.fans:
+            self.fans.append((frame.t, FULL))
+            self.robot.command_fans(2, *FULL)
+
+    def look(self, frame: Sensors) -> None:
+        """Before each frame; for tests to interfere."""
+
+    def _measure(self, frame: Sensors) -> None:
+        mission, pose = self.mission, self.localizer.deck_pose
+        expected = self.mirror.puck_world(pose, self.cfg.robot.puck_height_m)
+        request = FixRequest(mission.request, frame.t, mission.measuring_point, expected, pose)
+        self._request = request
+        self._runner.run(self._one(request))
+
+    async def _one(self, request: FixRequest) -> None:
+        self._over.clear()
+        serving = asyncio.get_running_loop().create_task(self.service.run())
+        self.service.begin(request)
+        over = asyncio.get_running_loop().create_task(self._over.wait())
+        await asyncio.wait([serving, over], return_when=asyncio.FIRST_COMPLETED)
+        if serving.done():
+            over.cancel()
+            serving.result()  # raises what ended it
+        serving.cancel()
+        await asyncio.wait([serving, over])
+
+    async def _ask(self, t_s: float, expected_m: Vector3) -> Fix:
+        measured = LaserRequest(len(self.asked), t_s, self._request.point)
+        self.asked.append(measured)
+        try:
+            true = self.laser.fix(t_s, self.localizer.deck_pose)
+        except MultilaterationError as error:
+            raise BadSolution(str(error), {}) from error
+        fix = self._scripted(measured, true)
+        measured.offset_m = float(np.linalg.norm(np.subtract(fix.position_m, true.position_m)))
+        distance_m = float(np.linalg.norm(np.subtract(fix.position_m, expected_m)))
+        if distance_m > self.cfg.etalon.max_distance_m:
+            raise BadSolution(f"{distance_m:.3f} m from the expected position", {})
+        try:
+            foot = deck_foot(self.mirror, fix, self.cfg.robot.puck_height_m)
+            measured.nis = nis_of(foot, self.localizer.deck_pose, self.localizer.pose_covariance)
+        except FixRefused:
+            measured.nis = float("inf")
+        return fix
+
+    def _note_fix(
+        self, _point: PointId | None, _fix: Fix, _jump_m: float, *, is_fused: bool, is_set_aside: bool
+    ) -> None:
+        del is_set_aside
+        self.asked[-1].is_fused = is_fused
+
+
+def failing(_measured: LaserRequest, _fix: Fix) -> Fix:
+    raise EtalonError("no reply")
+
+
+# -- main loops that are killed ----------------------------------------------------------------------------------------
+
+MOVING = (TURNING, DRIVING, RETURNING, MissionState.BACKING_OFF)
+RECORD_FRAMES = 10
+LONGEST_S = 900.0
+
+
+class RestartedSurvey(SilRun):
+    """A survey in which the main loop is killed at given frames, and another one knows what the first one kept.
+
+    Args:
+        cfg: the configuration.
+        kills: numbers of the frames after which main is gone.
+        silent_frames: for how long the robot is without a controller, each time.
+    """
+
+    def __init__(self, cfg: Config, kills: set[int], silent_frames: int = 150) -> None:
+        super().__init__(cfg, with_track=False)
+        self._kills, self._silent_frames = kills, silent_frames
+        self._records: list[tuple[DeckPose, tuple[float, float], tuple[float, float], MissionState]] = []
+        self.done: list[PointId] = []
+        self.states: list[MissionState] = []
+        self.heading_errors_rad: list[float] = []
+        self.first_moves_m: list[float] = []
+
+    def run(self) -> SilResult:
+        """As of a rehearsal, with whichever mission is the present one."""
+        robot = self.robot
+        robot.join_monitor()
+        robot.join_controller()
+        self._note_truth()
+        while robot.delivered is None:
+            robot.advance()
+            self._note_truth()
+        robot.command_fans(1, *self.cfg.robot.fan_duty)
+        first_s = robot.delivered.t
+        last_s = first_s - robot.frame_s
+        while not (self.mission.state is MissionState.DONE or self.mission.is_faulted or last_s - first_s > LONGEST_S):
+            frame = robot.delivered
+            self._serve(frame, frame.t - last_s)
+            last_s = frame.t
+            robot.advance()
+            self._note_truth()
+        return self._result(last_s - first_s)
+
+    def _serve(self, frame: Sensors, dt_s: float) -> None:
+        super()._serve(frame, dt_s)
+        if frame.seq % RECORD_FRAMES == 0:
+            localizer = self.localizer
+            sigmas = localizer.position_sigma_m, localizer.heading_sigma_rad
+            speeds = localizer.speed_m_s, localizer.rate_rad_s
+            self._records.append((localizer.deck_pose, sigmas, speeds, self.mission.state))
+        if frame.seq in self._kills:
+            self._die()
+
+    def _die(self) -> None:
+        robot = self.robot
+        self.states.append(self.mission.state)
+        self.done += self.mission.done
+        robot.lose_controller()
+        for _ in range(self._silent_frames):
+            robot.advance()
+            self._note_truth()
+        robot.join_controller()
+        self._take_over()
+
+    def _take_over(self) -> None:
+        cfg = self.cfg
+        pose, sigmas, speeds, state = self._records[-1]
+        limits = cfg.limits.a_max_m_s2, cfg.limits.alpha_max_rad_s2
+        sigma_m, sigma_rad = doubted(sigmas, speeds, limits, stood=state not in MOVING)
+        recovery = TakeoverState(pose, sigma_m, sigma_rad, abort_cause=self.mission.abort_cause)
+        parts = assemble(cfg, self.done, recovery)
+        truth = self.robot.world.plant
+        self.first_moves_m.append(hypot(truth.x_m - pose.x_m, truth.y_m - pose.y_m) / sigma_m)
+        self.heading_errors_rad.append((truth.heading_rad - pose.heading_rad) / sigma_rad)
+        self.localizer, self.mission, self.gate = parts.localizer, parts.mission, parts.gate
+        self.predictor = CommandPredictor(cfg.robot.wheel_lag_s, self.robot.frame_s)
+
+    @property
+    def measured(self) -> list[PointId]:
+        """All points measured, by whichever main loop, in their order."""
+        return self.done + self.mission.done
