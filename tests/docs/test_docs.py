@@ -124,6 +124,7 @@ def test_console_lines_run(
     assert capsys.readouterr().out
 
 
+@pytest.mark.slow  # `make docs` does it, too
 def test_sphinx_builds_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("furo")
     # Everything is read and every reference resolved; only the writing of HTML is left to ``make docs``.

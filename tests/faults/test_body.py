@@ -33,7 +33,6 @@ def holds(seen: list[Seen]) -> int:
 @pytest.mark.parametrize("at_s", [DRIVING_S, TURNING_S])
 def test_a_blocked_wheel_gets_one_retry(side: str, at_s: float, measured: Measured) -> None:
     run = watched(f'signal = "{side}_wheel"\ntype = "blocked"\nat_s = {at_s}', HARD, lambda _: False)
-    assert was_real(run.injected[0])
     time_s = run.time_to_zero_s(at_s)
     assert time_s <= 0.3
     assert run.mission.is_faulted
@@ -46,7 +45,6 @@ def test_a_blocked_wheel_gets_one_retry(side: str, at_s: float, measured: Measur
 def test_a_wheel_that_is_free_again_after_a_while_goes_on() -> None:
     run = watched(f'signal = "right_wheel"\ntype = "blocked"\nat_s = {DRIVING_S}\nfor_s = 1.5', HARD,
                   lambda one: one.t_s > 20.0)  # fmt: skip
-    assert was_real(run.injected[0])
     assert not run.mission.is_faulted
     assert len(run.mission.done) >= 3
 
@@ -55,7 +53,6 @@ def test_a_wheel_that_is_free_again_after_a_while_goes_on() -> None:
 def test_a_robot_that_is_snagged_holds(measured: Measured) -> None:
     fault = "\n\n".join(f'signal = "{side}_wheel"\ntype = "blocked"\nat_s = {DRIVING_S}' for side in ("right", "left"))
     run = watched(fault, HARD, held)
-    assert all(map(was_real, run.injected))
     time_s = run.time_to_zero_s(DRIVING_S)
     assert time_s <= 0.3
     measured("F10", 1e3 * time_s)
@@ -67,7 +64,6 @@ def test_a_robot_that_is_snagged_holds(measured: Measured) -> None:
 def test_a_wheel_that_runs_away(rate: float, at_s: float, measured: Measured) -> None:
     fault = f'signal = "left_wheel"\ntype = "runaway"\nat_s = {at_s}\nfor_s = 0.4\nrate_rad_s = {rate}'
     run = watched(fault, HARD, lambda one: one.t_s > at_s + 0.3)
-    assert was_real(run.injected[0])
     time_s = run.time_to_zero_s(at_s)
     assert time_s <= 0.1
     assert run.first(at_s, held).verdict.signal in {"left_wheel", "encoder_left"}
@@ -81,7 +77,6 @@ def test_a_wheel_that_runs_away_while_its_encoder_is_slow(rate: float) -> None:
     )
     fault = f'signal = "left_wheel"\ntype = "runaway"\nat_s = {DRIVING_S}\nfor_s = 0.4\nrate_rad_s = {rate}'
     run = watched(f"{slow}\n\n{fault}", HARD, lambda one: one.t_s > DRIVING_S + 0.6)
-    assert all(map(was_real, run.injected))
     assert run.time_to_zero_s(DRIVING_S) <= 0.15  # two faults at once: not the 0.1 s of one
     assert run.first(DRIVING_S, held).verdict.signal in {"left_wheel", "encoder_left"}
 
@@ -92,7 +87,6 @@ def test_wheels_that_creep_while_they_are_held(speed_m_s: float, measured: Measu
     """The part of it that encoders see; a robot that glides on locked wheels shows at the next fix."""
     fault = f'signal = "right_wheel"\ntype = "runaway"\nat_s = {STANDING_S}\nrate_rad_s = {speed_m_s / 0.03}'
     run = watched(fault, HARD, lambda one: one.verdict.severity is Severity.FAULT)
-    assert was_real(run.injected[0])
     moved_2_mm_s = STANDING_S + 0.002 / speed_m_s
     first = run.first(STANDING_S, held)
     assert first.t_s - moved_2_mm_s <= 0.5
@@ -108,7 +102,6 @@ def test_wheels_that_creep_while_they_are_held(speed_m_s: float, measured: Measu
 )
 def test_a_low_battery_sends_the_robot_home(fault: str, measured: Measured) -> None:
     run = watched(f"signal = {fault}\nat_s = 3.0", HARD, lambda _: False)
-    assert was_real(run.injected[0])
     home = run.first(3.0, lambda one: one.state is MissionState.RETURNING)
     assert home.t_s - 3.0 < 5.5
     assert run.mission.outcome is SurveyOutcome.AT_BASE
@@ -120,7 +113,6 @@ def test_a_battery_that_seems_low_for_a_moment_does_not() -> None:
     run = watched(
         'signal = "soc"\ntype = "stuck"\nat_s = 3.0\nfor_s = 2.0\nvalue = 0.0', HARD, lambda one: one.t_s > 10.0
     )
-    assert was_real(run.injected[0])
     assert not any(one.verdict.severity for one in run.since(1.0))
 
 
@@ -173,7 +165,6 @@ def a_little_later(one: Seen) -> bool:
 )
 def test_a_fan_that_gives_too_little_holds_with_full_fans(fault: str, measured: Measured) -> None:
     run = watched(f"signal = {fault}\nat_s = {AT_S}", OVERHANG, a_little_later)
-    assert was_real(run.injected[0])
     first = run.first(AT_S, faulted)
     assert first.is_zero
     assert run.mission.is_faulted
@@ -191,7 +182,6 @@ def test_a_fan_that_gives_too_little_holds_with_full_fans(fault: str, measured: 
 @pytest.mark.fault("F2")
 def test_fans_that_get_weaker_send_the_robot_home_in_time(measured: Measured) -> None:
     run = watched(f'signal = "fans"\ntype = "wrong"\nat_s = {AT_S}\nfactor = 0.91', OVERHANG, a_little_later)
-    assert was_real(run.injected[0])
     assert run.seen[-1].state is MissionState.RETURNING
     assert run.robot.fans.duty == (1.0, 1.0)
     margin = 0.91 * OVERHANG.robot.fan_duty[0] / OVERHANG.sim.robot.fan_floor
@@ -200,7 +190,6 @@ def test_fans_that_get_weaker_send_the_robot_home_in_time(measured: Measured) ->
 
 def test_where_nothing_hangs_a_weak_fan_is_only_told() -> None:
     run = watched(f'signal = "faults"\ntype = "raise"\nat_s = {AT_S}\nnames = ["fan_left"]', UPRIGHT, a_little_later)
-    assert was_real(run.injected[0])
     assert run.seen[-1].verdict.severity is Severity.INFORM
     assert run.seen[-1].verdict.forward
     assert not run.mission.is_faulted

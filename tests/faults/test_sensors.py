@@ -9,7 +9,7 @@ import pytest
 from ccatp.core import Severity
 from ccatp.survey.state import MissionState
 from tests.faults.linking import Measured
-from tests.support.sim_survey import Seen, Watched, short_survey, was_real, watched
+from tests.support.sim_survey import Seen, Watched, short_survey, watched
 
 # Of the first seconds of a short survey in the hard world with seed 1: see ``test_the_times_are_what_they_are_called``.
 DRIVING_S, BRAKING_S, TURNING_S, STANDING_S = 7.5, 8.9, 3.5, 9.6
@@ -70,7 +70,6 @@ def test_the_times_are_what_they_are_called() -> None:
 @pytest.mark.parametrize("at_s", [DRIVING_S, TURNING_S])
 def test_an_encoder_stuck_at_zero_holds(side: str, at_s: float, measured: Measured) -> None:
     run = watched(f'signal = "encoder_{side}"\ntype = "stuck"\nat_s = {at_s}\nvalue = 0.0', HARD, held())
-    assert was_real(run.injected[0])
     time_s = run.time_to_zero_s(at_s)
     assert time_s <= 0.3
     assert run.way_m(at_s, at_s + time_s) <= 0.03
@@ -82,7 +81,6 @@ def test_an_encoder_stuck_at_zero_holds(side: str, at_s: float, measured: Measur
 @pytest.mark.parametrize("at_s", [THESIS_DRIVING_S, THESIS_BRAKING_S, 7.3, 7.5])
 def test_an_encoder_that_freezes_in_motion_is_found_at_the_stop(at_s: float, measured: Measured) -> None:
     run = watched(f'signal = "encoder_left"\ntype = "stuck"\nat_s = {at_s}', THESIS, held())
-    assert was_real(run.injected[0])
     verdict = run.seen[-1].verdict
     # Found as what it is, or before that because the gyroscope contradicts it.
     assert verdict.severity is Severity.HOLD
@@ -96,7 +94,6 @@ def test_an_encoder_that_freezes_in_motion_is_found_at_the_stop(at_s: float, mea
 def test_an_encoder_frozen_at_the_stop(measured: Measured) -> None:
     fault = f'signal = "encoder_left"\ntype = "stuck"\nat_s = {STANDING_S}\nvalue = 3.3'
     run = watched(fault, HARD, held())
-    assert was_real(run.injected[0])
     assert (run.seen[-1].verdict.severity, run.seen[-1].verdict.signal) == (Severity.HOLD, "encoder_left")
     assert "frozen" in run.seen[-1].verdict.cause
     assert run.seen[-1].t_s - STANDING_S <= 0.5
@@ -108,7 +105,6 @@ def test_an_encoder_frozen_at_the_stop(measured: Measured) -> None:
 def test_both_encoders_dead(at_s: float, measured: Measured) -> None:
     fault = lines("encoder_right encoder_left", f'type = "stuck"\nat_s = {at_s}\nvalue = 0.0')
     run = watched(fault, HARD, held())
-    assert all(map(was_real, run.injected))
     time_s = run.time_to_zero_s(at_s)
     assert time_s <= 0.3
     assert run.way_m(at_s, at_s + time_s) <= 0.03
@@ -127,7 +123,6 @@ def test_a_dead_encoder_that_comes_back_costs_a_hold_and_a_fix() -> None:
 def test_numbers_that_are_none_never_reach_the_filter(token: str, measured: Measured) -> None:
     fault = f'signal = "encoder_right"\ntype = "non_finite"\nat_s = {DRIVING_S}\nfor_s = 0.3\ntoken = "{token}"'
     run = watched(fault, HARD, after(DRIVING_S + 4.0))
-    assert was_real(run.injected[0])
     # Without a frame there is no drive: the first one after the gap is zero, and a fix comes before the next motion.
     first = run.first(DRIVING_S + 0.15, lambda _: True)
     assert first.is_zero
@@ -143,7 +138,6 @@ def test_three_lines_that_are_no_frames_within_a_tenth_of_a_second_hold(measured
     # Four frames: no gap that would hold by itself.
     fault = f'signal = "encoder_right"\ntype = "non_finite"\nat_s = {DRIVING_S}\nfor_s = 0.035\ntoken = "NaN"'
     run = watched(fault, HARD, after(DRIVING_S + 4.0))
-    assert was_real(run.injected[0])
     assert run.denied_s, "the permit stands"
     assert run.denied_s[0] <= DRIVING_S + 0.1
     first = run.first(DRIVING_S, held(Severity.HOLD))
@@ -156,7 +150,6 @@ def test_three_lines_that_are_no_frames_within_a_tenth_of_a_second_hold(measured
 def test_two_lines_that_are_no_frames_cost_nothing() -> None:
     fault = f'signal = "encoder_right"\ntype = "non_finite"\nat_s = {DRIVING_S}\nfor_s = 0.005\ntoken = "NaN"'
     run = watched(fault, HARD, after(DRIVING_S + 0.5))
-    assert was_real(run.injected[0])
     assert not run.denied_s
     assert all(one.verdict.severity < Severity.HOLD for one in run.seen)
 
@@ -165,7 +158,6 @@ def test_two_lines_that_are_no_frames_cost_nothing() -> None:
 @pytest.mark.parametrize("kind", ['type = "wrong"\noffset = 400.0', 'type = "garbage"\nbeyond = 0.0'])
 def test_no_reading_of_an_encoder_makes_the_pose_jump(kind: str, measured: Measured) -> None:
     run = watched(f'signal = "encoder_left"\nat_s = {DRIVING_S}\nfor_s = 0.05\n{kind}', HARD, after(DRIVING_S + 0.6))
-    assert was_real(run.injected[0])
     steps = steps_m(run.since(1.0))
     assert max(steps) <= 0.005
     measured("S5", 1e3 * max(steps))
@@ -176,7 +168,6 @@ def test_no_reading_of_an_encoder_makes_the_pose_jump(kind: str, measured: Measu
 def test_a_wheel_that_slips_holds_and_a_fix_follows(factor: float, measured: Measured) -> None:
     fault = f'signal = "right_wheel"\ntype = "slip"\nat_s = {DRIVING_S}\nfor_s = 1.0\nfactor = {factor}'
     run = watched(fault, HARD, lambda one: one.t_s > DRIVING_S + 6.0)
-    assert was_real(run.injected[0])
     first = run.first(DRIVING_S, held(Severity.HOLD))
     assert first.verdict.signal == "imu_wz"
     assert any(one.state is MissionState.MEASURING for one in run.since(first.t_s))
@@ -189,7 +180,6 @@ def test_a_wheel_that_slips_holds_and_a_fix_follows(factor: float, measured: Mea
 @pytest.mark.parametrize("step", [0.1, -0.2, 0.5])
 def test_a_gyroscope_whose_bias_jumps_in_motion(step: float, measured: Measured) -> None:
     run = watched(f'signal = "imu_wz"\ntype = "wrong"\nat_s = {DRIVING_S}\noffset = {step}', HARD, held())
-    assert was_real(run.injected[0])
     time_s = run.time_to_zero_s(DRIVING_S)
     assert run.seen[-1].verdict.signal == "imu_wz"
     assert time_s <= 1.2
@@ -200,7 +190,6 @@ def test_a_gyroscope_whose_bias_jumps_in_motion(step: float, measured: Measured)
 def test_a_gyroscope_of_wrong_sign_or_scale_is_noticed_in_the_first_turn(kind: str) -> None:
     run = watched(f'signal = "imu_wz"\ntype = "wrong"\nat_s = 2.0\n{kind}', HARD,
                   lambda one: one.t_s > 2.0 and one.verdict.severity >= Severity.SLOW)  # fmt: skip
-    assert was_real(run.injected[0])
     assert run.seen[-1].t_s < 4.5  # the turn is from 3.1 s to 4.5 s
     assert run.seen[-1].verdict.signal in {"imu", "imu_wz"}
 
@@ -211,7 +200,6 @@ def test_a_gyroscope_of_wrong_sign_or_scale_is_noticed_in_the_first_turn(kind: s
 )
 def test_an_inertial_unit_that_repeats_itself_is_left_out(fault: str, measured: Measured) -> None:
     run = watched(f"signal = {fault}\nat_s = {DRIVING_S}", HARD, after(DRIVING_S + 1.2))
-    assert was_real(run.injected[0])
     first = run.first(DRIVING_S, slow)
     assert first.t_s - DRIVING_S <= 0.2 + 0.011  # and a frame on the link
     assert run.localizer.counts["imu_doubted"] > 50
@@ -224,7 +212,6 @@ def test_garbage_of_the_gyroscope_does_not_end_the_mission() -> None:
     run = watched(
         f'signal = "imu_wz"\ntype = "garbage"\nat_s = {TURNING_S}\nfor_s = 2.0\nbeyond = 0.0', HARD, after(20.0)
     )
-    assert was_real(run.injected[0])
     assert not run.mission.is_faulted
     assert len(run.mission.done) >= 4
     errors = [hypot(one.estimate[0] - one.pose.x_m, one.estimate[1] - one.pose.y_m) for one in run.since(TURNING_S)]
@@ -236,7 +223,6 @@ def test_garbage_of_the_gyroscope_does_not_end_the_mission() -> None:
 @pytest.mark.parametrize("kind", ['"jump"\nby_s = 500.0', '"jump"\nby_s = -3.0', '"jump"\nby_s = 0.3'])
 def test_a_clock_that_jumps(kind: str, at_s: float, measured: Measured) -> None:
     run = watched(f'signal = "clock"\ntype = {kind}\nat_s = {at_s}', HARD, after(at_s + 5.0))
-    assert was_real(run.injected[0])
     assert not run.mission.is_faulted
     near = [one for one in run.since(at_s - 0.03) if one.t_s <= at_s + 0.1]
     travelled = [hypot(b.pose.x_m - a.pose.x_m, b.pose.y_m - a.pose.y_m) for a, b in pairwise(near)]
@@ -250,7 +236,6 @@ def test_a_clock_that_jumps(kind: str, at_s: float, measured: Measured) -> None:
 @pytest.mark.parametrize("phase_s", [0.0, 0.003, 0.007])
 def test_a_clock_that_wraps_does_not_count_in_the_mission_time(phase_s: float) -> None:
     run = watched(f'signal = "clock"\ntype = "wrap"\nat_s = 0.0\nmodulo_s = {DRIVING_S + phase_s}', HARD, after(12.0))
-    assert was_real(run.injected[0])
     assert not run.mission.is_faulted
     assert run._time.offset_s == pytest.approx(DRIVING_S + phase_s, abs=0.011)  # one period, and one wrap only
     assert len(run.mission.done) >= 2
@@ -262,7 +247,6 @@ def test_a_clock_that_wraps_does_not_count_in_the_mission_time(phase_s: float) -
 def test_a_slow_sensor_slows_the_robot(signal: str, seed: int) -> None:
     cfg = short_survey(run__seed=seed)
     run = watched(lines(signal, f'type = "slow"\nat_s = {DRIVING_S}\nevery = 3'), cfg, warned)
-    assert all(map(was_real, run.injected))
     assert run.seen[-1].t_s - DRIVING_S <= 1.05
     # A few samples of an encoder that counts steps are no wheel that runs away.
     assert run.seen[-1].verdict.severity is Severity.SLOW
@@ -272,7 +256,6 @@ def test_a_slow_sensor_slows_the_robot(signal: str, seed: int) -> None:
 @pytest.mark.parametrize("signal", ["encoder_right encoder_left", "edge_front_left"])
 def test_old_samples_hold_at_once_and_for_ever_they_end_in_a_fault(signal: str, measured: Measured) -> None:
     run = watched(lines(signal, f'type = "off"\nat_s = {DRIVING_S}'), IMPATIENT, lambda _: False)
-    assert all(map(was_real, run.injected))
     time_s = run.time_to_zero_s(DRIVING_S)
     assert time_s - 0.15 <= 0.1
     assert run.mission.is_faulted  # held, with its cause, and not waiting for ever
@@ -287,7 +270,6 @@ def test_an_edge_sensor_that_stays_off_is_no_edge(corner: str, measured: Measure
     run = watched(
         f'signal = "edge_{corner}"\ntype = "stuck"\nat_s = {DRIVING_S}\nvalue = 0.0', IMPATIENT, lambda _: False
     )
-    assert was_real(run.injected[0])
     first = run.first(DRIVING_S, held(Severity.HOLD))
     assert first.verdict.signal == corner
     assert first.t_s - DRIVING_S <= 3.0
@@ -308,7 +290,6 @@ def test_an_edge_sensor_off_for_a_moment_costs_a_back_off_and_a_fix() -> None:
     run = watched(
         f'signal = "edge_front_left"\ntype = "stuck"\nat_s = {DRIVING_S}\nfor_s = 1.5\nvalue = 0.0', HARD, after(20.0)
     )
-    assert was_real(run.injected[0])
     assert not run.mission.is_faulted
     assert len(run.mission.done) >= 3
 
@@ -319,7 +300,6 @@ def test_a_sensor_that_chatters_holds(hz: float, measured: Measured) -> None:
     chatter = f'type = "intermittent"\nperiod_s = {1.0 / hz}\nduty = 0.5\nvalue = 0.0'
     fault = f'signal = "edge_front_right"\nat_s = {DRIVING_S}\n{chatter}'
     run = watched(fault, HARD, lambda one: one.t_s > DRIVING_S and one.is_zero)
-    assert was_real(run.injected[0])
     assert run.seen[-1].t_s - DRIVING_S <= 0.2
     measured("S19", 1e3 * (run.seen[-1].t_s - DRIVING_S))
 
@@ -329,7 +309,6 @@ def test_a_sensor_that_goes_off_in_a_turn_stops_the_turn(measured: Measured) -> 
     at_s = TURNING_S + 0.3
     run = watched(f'signal = "edge_front_right"\ntype = "stuck"\nat_s = {at_s}\nvalue = 0.0', HARD,
                   lambda one: one.t_s > at_s and one.drive[0] - one.drive[1] <= 0.0)  # fmt: skip
-    assert was_real(run.injected[0])
     declared = run.first(at_s, lambda one: one.verdict.code == 1)
     assert run.seen[-1].t_s - declared.t_s <= 0.1
     assert run.seen[-1].t_s - at_s <= 0.2  # over a seam the sensor may sweep its width first
@@ -342,7 +321,6 @@ ALL = "edge_front_left edge_front_right edge_rear_left edge_rear_right"
 @pytest.mark.fault("S25")
 def test_all_sensors_off_holds_with_full_fans(measured: Measured) -> None:
     run = watched(lines(ALL, f'type = "stuck"\nat_s = {DRIVING_S}\nvalue = 0.0'), IMPATIENT, lambda _: False)
-    assert all(map(was_real, run.injected))
     time_s = run.time_to_zero_s(DRIVING_S)
     assert time_s <= 0.1
     assert run.robot.fans.duty == (1.0, 1.0)
@@ -355,7 +333,6 @@ def test_all_sensors_off_holds_with_full_fans(measured: Measured) -> None:
 @pytest.mark.parametrize("at_s", [DRIVING_S, TURNING_S, STANDING_S])
 def test_a_flash_of_light_aborts_nothing(at_s: float, measured: Measured) -> None:
     run = watched(lines(ALL, f'type = "stuck"\nat_s = {at_s}\nfor_s = 1.9\nvalue = 0.0'), HARD, after(at_s + 9.0))
-    assert all(map(was_real, run.injected))
     assert not run.mission.is_faulted
     assert any(one.state in (MissionState.DRIVING, MissionState.TURNING) for one in run.since(at_s + 2.0))
     measured("S26", float(run.mission.is_faulted))
@@ -385,7 +362,6 @@ def test_a_blind_edge_sensor_is_found_by_the_seams(measured: Measured) -> None:
     cfg = short_survey(run__panels=0, run__order="optimised")
     run = watched('signal = "edge_front_left"\ntype = "stuck"\nat_s = 1.0\nvalue = 1.0', cfg,
                   lambda one: one.verdict.severity is Severity.HOLD)  # fmt: skip
-    assert was_real(run.injected[0])
     last = run.seen[-1].verdict
     assert (last.signal, last.value) == ("front_left", 2.0)
     assert any(slow(one) and one.verdict.signal == "front_left" for one in run.seen)

@@ -260,10 +260,8 @@ ALL = [
     )
 ]
 FEW = [
-    RimCase("fyst-m1", "right", 0.15, 0.0, False),
     RimCase("fyst-m2", "top", 0.15, QUARTER, False),
     RimCase("thesis-m1", "left", 0.02, QUARTER, False, is_pose_right=False),
-    RimCase("thesis-m2", "bottom", 0.1, 0.0, True),
     RimCase("fyst-m1", "bottom", 0.15, QUARTER, True, is_pose_right=False),
 ]
 

@@ -125,10 +125,11 @@ class Watched(FaultySilRun):
 
 
 def watched(fault: str, cfg: Config, is_enough: Callable[[Seen], bool]) -> Watched:
-    """A watched mission with faults, each as in ``single``, separated by empty lines."""
+    """A watched mission with faults, each as in ``single``, separated by empty lines; each of them really acted."""
     text = "\n".join("[[fault]]\n" + one for one in fault.strip().split("\n\n")) if fault else ""
     rehearsal = Watched(cfg, parse_plan(text, "plan"))
     rehearsal.watch(is_enough)
+    assert all(map(was_real, rehearsal.injected)), "a fault changed nothing"
     return rehearsal
 
 
