@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
-from ccatp.commissioning.conformance import connections, runner, session_checks
+from ccatp.commissioning.conformance import harness, server_checks
 from ccatp.commissioning.conformance.runner import Conformance, Result
 from ccatp.config.models import Config
 from ccatp.dataloop import DataLoop, _Connection
@@ -116,7 +116,7 @@ async def server_time() -> AsyncIterator[None]:
     seen = SimpleNamespace(monotonic=clock.monotonic, sleep=time.sleep)
     try:
         with ExitStack() as stack:
-            for module in (connections, runner, session_checks):
+            for module in (harness, server_checks):
                 stack.enter_context(patch.object(module, "time", seen))
             yield
     finally:

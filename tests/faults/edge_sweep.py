@@ -1,7 +1,7 @@
 """Drives over the rim, turns beside it and stops over seams, all round a mirror, on the simulated plant.
 
 The real danger rules judge frame by frame, with the estimate and the delays of a disturbed world. A case is a number:
-the same number is the same drive. `make sweep` runs all of them, five to nine hours of one core: each block is a line of
+the same number is the same drive. `make sweep` runs all of them, five to nine hours of one core: a block is a line of
 `blocks.jsonl`. A stopped sweep goes on there; what another build swept does not count.
 """
 
