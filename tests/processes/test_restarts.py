@@ -104,6 +104,7 @@ def test_a_main_loop_that_hangs_is_killed_and_another_one_goes_on(start: Start) 
     assert run.summary["points"]["measured"] == 9
 
 
+@pytest.mark.slow  # the policy itself: tests/unit/supervision/test_restarts
 @pytest.mark.fault("P18")
 def test_a_main_loop_that_always_dies_ends_the_run_held(start: Start) -> None:
     run = start("--panels", "1", "--set", "run.restart_limit=2")
