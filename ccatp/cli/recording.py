@@ -83,7 +83,7 @@ def _tell(facts: "RecordingFacts") -> None:
     click.echo(f"  {facts.messages} messages in {condition.chunks} chunks")
     rows = [("topic", "schema", "messages", "per s", "kB")]
     for name, topic in sorted((name, topic) for name, topic in facts.topics.items() if topic.messages):
-        length_s = topic.last_s - topic.first_s
+        length_s = (topic.end_s or 0.0) - (topic.start_s or 0.0)
         per_s = f"{(topic.messages - 1) / length_s:.2f}" if topic.messages > 1 and length_s > 0.0 else "-"
         rows.append((name, topic.schema, str(topic.messages), per_s, f"{topic.payload_bytes / 1e3:.1f}"))
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]

@@ -29,8 +29,7 @@ from ccatp.errors import CcatpError, ConfigError, ExitStatus
 if TYPE_CHECKING:
     from ccatp.config.models import Config
     from ccatp.mirror.mirror_alignment import SurveyResult
-    from ccatp.records.run_reader import Recording
-    from ccatp.records.survey_reader import Survey
+    from ccatp.records.run_reader import Recording, Survey
     from ccatp.studies.replay_report import ReplayEvaluation
 
 
@@ -117,7 +116,7 @@ def align(
     """Show how the panels lie and how to turn their adjusters, from the fixes of a run."""
     from ccatp.mirror.mirror import build_mirror
     from ccatp.mirror.mirror_alignment import compare, survey_result
-    from ccatp.records.survey_reader import read_run
+    from ccatp.records.run_reader import read_run
     from ccatp.report.alignment import csv_lines, head_lines, result_data, table_lines
 
     if idle := [key for key in settings if not key.startswith(ALIGN_KEYS)]:

@@ -34,7 +34,7 @@ from ccatp.commissioning.preflight import (
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
 from ccatp.config.package import child_environment
-from ccatp.daemon.child_processes import ENVIRONMENT, listen, simulator_addresses, with_addresses
+from ccatp.daemon.child_processes import ENVIRONMENT, listen, simulated_servers, with_addresses
 from ccatp.daemon.command_handlers import check_observatory
 from ccatp.daemon.process import SUPERVISOR_PID
 from ccatp.daemon.supervisor import PROCESSES
@@ -89,8 +89,9 @@ def _stand_ins(cfg: Config) -> Iterator[Config]:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ccatp-")))
         any_port = {part: getattr(cfg.sim, part).model_copy(update={"port": 0}) for part in ("robot", "etalon")}
         cfg = cfg.model_copy(update={"sim": cfg.sim.model_copy(update=any_port)})
-        places = simulator_addresses(cfg)
-        sockets = {p.name: stack.enter_context(listen(p.listens, *places[p.listens])) for p in processes}
+        sockets = {
+            name: stack.enter_context(listen(section, at.host, at.port)) for name, section, at in simulated_servers(cfg)
+        }
         cfg = with_addresses(cfg, sockets)
         (folder / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
         for process in processes:

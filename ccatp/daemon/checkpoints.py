@@ -1,10 +1,10 @@
-"""What a main loop saves for its successor, and its parts and database: new, resumed, or taken over."""
+"""Checkpoint of a main loop, and its parts and database: new, resumed, or taken over."""
 
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from ccatp.config.models import LimitsConfig
+from ccatp.config.models import Config, LimitsConfig
 from ccatp.core import DeckPose, PointId
 from ccatp.daemon.danger_loop import FILE as EMERGENCIES
 from ccatp.daemon.danger_loop import active_ids
@@ -13,8 +13,7 @@ from ccatp.errors import CcatpError, ExitStatus
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import build_mirror
 from ccatp.records.checkpoint import FILE, Checkpoint, CheckpointFile, read_checkpoint
-from ccatp.records.store import MissionStore
-from ccatp.records.store_rows import PlannedPoint, StoreError
+from ccatp.records.store import MissionStore, PlannedPoint, StoreError
 from ccatp.survey.composition import SurveyParts, assemble
 from ccatp.survey.heading_recovery import TakeoverState, doubted
 from ccatp.survey.mission import Mission
@@ -24,40 +23,38 @@ from ccatp.survey.state import HELD, IDLE, MEASURING, SETTLING, MissionState, Su
 # Frames between two records: ten a second.
 PERIOD_FRAMES = 10
 STANDING = (IDLE, SETTLING, MEASURING, HELD, MissionState.DONE)
-# Standing still is a matter of a second; a robot that was not at rest yet may still be on its way.
+# Below this a robot that is in a standing state is at rest.
 _STILL_M_S, _STILL_RAD_S = 0.002, 0.01
 
 
 class CheckpointWriter:
-    """Keeps the checkpoint up to date."""
+    """Keeps the checkpoint up to date; ``boot`` is the robot's."""
 
-    def __init__(self, run_dir: Path, localizer: Localizer, mission: Mission, *, is_patient: bool) -> None:
+    def __init__(self, run_dir: Path, localizer: Localizer, mission: Mission, is_patient: bool) -> None:
         before = read_checkpoint(run_dir / FILE)
-        self._count = 0 if before is None else before.count
+        self._count, self._last_fix = (0, "") if before is None else (before.count, before.last_fix)
         self._file = CheckpointFile(run_dir / FILE, is_patient=is_patient)
         self._localizer, self._mission = localizer, mission
         self._in_force = ("", "")
         self._left = 1
         self.boot = -1
-        self._last_fix = "" if before is None else before.last_fix
 
     def write_if_due(self, seq: int, t_s: float, elapsed_s: float) -> None:
-        """A frame was served; now and then it is written down."""
+        """Write in every tenth frame, and in each while the mission is held."""
         self._left -= 1
         if self._left <= 0 or self._mission.state is HELD:
             self.write(seq, t_s, elapsed_s)
 
     def write(self, seq: int, t_s: float, elapsed_s: float) -> None:
-        """Write down where the robot is and what is in force; the latter for good, if it changed."""
+        """Write the state of frame ``seq``; durably where abort or hold changed."""
         localizer, mission = self._localizer, self._mission
         self._left = PERIOD_FRAMES
         in_force = in_force_of(mission)
-        is_news, self._in_force = in_force != self._in_force, in_force
+        has_changed, self._in_force = in_force != self._in_force, in_force
         if mission.done:
             self._last_fix = "{}-{}-{}".format(*mission.done[-1])
-        pose = localizer.deck_pose
-        numbers = (pose.x_m, pose.y_m, pose.heading_rad, localizer.position_sigma_m, localizer.heading_sigma_rad)
-        if not all(map(math.isfinite, numbers)):
+        pose, sigma_m, sigma_rad = localizer.deck_pose, localizer.position_sigma_m, localizer.heading_sigma_rad
+        if not all(map(math.isfinite, (pose.x_m, pose.y_m, pose.heading_rad, sigma_m, sigma_rad))):
             return  # the last good one is a better guess
         self._count += 1
         record = Checkpoint(
@@ -68,8 +65,8 @@ class CheckpointWriter:
             x_m=pose.x_m,
             y_m=pose.y_m,
             heading_rad=pose.heading_rad,
-            sigma_m=numbers[3],
-            heading_sigma_rad=numbers[4],
+            sigma_m=sigma_m,
+            heading_sigma_rad=sigma_rad,
             speed_m_s=localizer.speed_m_s,
             rate_rad_s=localizer.rate_rad_s,
             state=str(mission.state),
@@ -78,17 +75,17 @@ class CheckpointWriter:
             elapsed_s=elapsed_s,
             last_fix=self._last_fix,
         )
-        self._file.write(record, is_durable=is_news)
+        self._file.write(record, is_durable=has_changed)
 
     def close(self) -> None:
-        """Write what waits."""
+        """Write the record that waits."""
         self._file.close()
 
 
 def in_force_of(mission: Mission) -> tuple[str, str]:
-    """Why the survey was given up, and why it waits for an operator; empty where it did or does not.
+    """Cause of an abort, and of a hold that needs an operator; empty without one.
 
-    One that was stopped on its way home goes home when it goes on. An earthquake is kept by the danger loop.
+    A survey that was stopped on its way home goes home when it is resumed. An earthquake is kept by the danger loop.
     """
     if mission.state is MissionState.DONE and mission.outcome is not SurveyOutcome.STOPPED:
         return "", ""
@@ -98,11 +95,9 @@ def in_force_of(mission: Mission) -> tuple[str, str]:
 def recovery_from(
     run_dir: Path, limits: LimitsConfig, skipped: tuple[PointId, ...] = (), held_cause: str = ""
 ) -> TakeoverState | None:
-    """What a run directory says of a survey that goes on; ``None`` where nobody wrote anything down.
+    """State of a survey that goes on, from its run directory; ``None`` without a checkpoint.
 
-    Args:
-        limits: how quickly a robot can have begun to move.
-        held_cause: why it begins held, if it does; a hold that is in force goes before.
+    The limits bound the motion since then. ``held_cause`` is a reason to begin held; a hold in force takes precedence.
 
     Raises:
         CheckpointError: it is damaged.
@@ -135,17 +130,24 @@ class StoreUnusable(CcatpError):
     exit_status = ExitStatus.USAGE
 
 
-def build_parts(args: ProcessArgs) -> tuple[SurveyParts, MissionStore]:
+def build_parts(cfg: Config, args: ProcessArgs) -> tuple[SurveyParts, MissionStore]:
     """All parts of the main loop and the mission's database."""
-    cfg = args.config
     mirror = build_mirror(cfg.mirror)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
     try:
-        store = _open_store(args, mirror.name, points)
+        store = _open_store(cfg, args, mirror.name, points)
     except StoreError as error:
         raise StoreUnusable(str(error)) from error
     done = store.measured_points()
-    recovery = _recovery(args, store, points, done)
+    recovery = None
+    if args.is_taking_over:
+        # A resumed run tries skipped points again; a main loop that takes over does not.
+        skipped = tuple(p.point for p in store.points() if p.status == "skipped") if args.is_restarted else ()
+        left = [point for point in points if point not in done and point not in skipped]
+        held_cause = _why_held(len(done), left) if args.is_held else ""
+        recovery = recovery_from(args.run_dir, cfg.limits, skipped, held_cause)
+        if recovery is not None and not args.is_restarted:
+            recovery = recovery._replace(elapsed_s=0.0)
     parts = assemble(cfg, done, recovery)
     if recovery is None and args.is_held:
         latched = [f"'ccatp clear {one}'" for one in active_ids(args.run_dir / EMERGENCIES)]
@@ -155,31 +157,16 @@ def build_parts(args: ProcessArgs) -> tuple[SurveyParts, MissionStore]:
     return parts, store
 
 
-def _recovery(
-    args: ProcessArgs, store: MissionStore, points: Sequence[PointId], done: set[PointId]
-) -> TakeoverState | None:
-    if not args.is_taking_over:
-        return None
-    # A run that is resumed tries again what was skipped; a main loop that takes over does not.
-    skipped = tuple(p.point for p in store.points() if p.status == "skipped") if args.is_restarted else ()
-    left = [point for point in points if point not in done and point not in skipped]
-    recovery = recovery_from(
-        args.run_dir, args.config.limits, skipped, _why_held(len(done), left) if args.is_held else ""
-    )
-    return recovery if recovery is None or args.is_restarted else recovery._replace(elapsed_s=0.0)
-
-
 def _why_held(done: int, left: Sequence[PointId]) -> str:
     goes_on = f"goes on with point {left[0].row}-{left[0].col}-{left[0].point}" if left else "ends it"
     measured = f"{done} points are measured and will be left out, {len(left)} are to do"
     return f"restarted: {measured}; 'ccatp resume' {goes_on}"
 
 
-def _open_store(args: ProcessArgs, mirror: str, points: Sequence[PointId]) -> MissionStore:
+def _open_store(cfg: Config, args: ProcessArgs, mirror: str, points: Sequence[PointId]) -> MissionStore:
     path = args.run_dir / "mission.sqlite"
     if args.is_resuming or (args.is_restarted and path.exists()):
         return MissionStore.open(path, mirror=mirror)
-    cfg = args.config
     grid = cfg.mirror.panels
     planned = []
     for point in points:

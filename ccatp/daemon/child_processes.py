@@ -1,6 +1,5 @@
 """The child processes of a run: start, supervision by pidfd and heartbeat, restart policy, stop, listening sockets."""
 
-import contextlib
 import os
 import socket
 import subprocess
@@ -8,27 +7,35 @@ import sys
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar, cast
 
-from ccatp.config.models import Config, ProcessesConfig
+from ccatp.config.beacon_models import RadioConfig, SimBeaconRobotConfig
+from ccatp.config.models import Config, ProcessesConfig, SimEtalonConfig, SimRobotConfig
 from ccatp.config.package import child_environment
 from ccatp.daemon.process import SUPERVISOR_PID
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import Heartbeat
 
-# It has said why, and would say so again.
+# The process has reported why, and a restart would end alike.
 FINAL = (ExitStatus.USAGE, ExitStatus.UNREACHABLE)
 # As POSIX and Linux number them; what kills processes here.
 _SIGNALS = {2: "SIGINT", 3: "SIGQUIT", 6: "SIGABRT", 7: "SIGBUS", 9: "SIGKILL", 11: "SIGSEGV", 15: "SIGTERM"}
-# A supervisor that was itself held up for longer than this between two looks has not listened meanwhile.
+# Of a longer time between two polls the supervisor was itself held up and received nothing.
 MAX_POLL_GAP_S = 0.2
+# The matrices are 4 x 4: threads of the linear algebra would only compete with the processes for the cores.
+ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+STOP_TIMEOUT_S = 4.0
+# The last process has this long, even where others have used up the time.
+LEAST_STOP_S = 1.0
+# A loop that was restarted joins within this.
+RECOVERY_S = 5.0
 
 
 class ProcessEnd(Enum):
-    """What becomes of the run."""
+    """Consequence of a process's death for the run."""
 
     RESTART = "restart"
     END = "end"  # with the status of the process
@@ -37,18 +44,14 @@ class ProcessEnd(Enum):
 
 
 class RestartDecision(NamedTuple):
-    """What becomes of the run, and a line for people."""
+    """Consequence for the run, and a line for the operator."""
 
     end: ProcessEnd
     text: str
 
 
 class RestartPolicy:
-    """Decides over the processes of one run.
-
-    Args:
-        limit: each may be restarted so many times ...
-    """
+    """Decides on the processes of one run; each may be restarted ``limit`` times within ``window_s``."""
 
     def __init__(self, limit: int, window_s: float) -> None:
         self._limit, self._window_s = limit, window_s
@@ -57,39 +60,30 @@ class RestartPolicy:
     def died(
         self, name: str, code: int, now_s: float, *, is_replaceable: bool = True, is_needed: bool = True, why: str = ""
     ) -> RestartDecision:
-        """A process has died.
-
-        Args:
-            code: exit status, or minus the number of the signal that killed it.
-        """
-        how = why or (f"was killed by {_signal(-code)}" if code < 0 else f"ended with status {code}")
+        """A process has died with exit status ``code``, or minus the number of the signal that killed it."""
+        how = why or (f"was killed by {_SIGNALS.get(-code, f'signal {-code}')}" if code < 0 else "")
+        what = f"process {name} {how or f'ended with status {code}'}"
         if code in FINAL:
-            if not is_needed:
-                return RestartDecision(ProcessEnd.WITHOUT, f"process {name} {how}: the survey goes on without it")
-            return RestartDecision(ProcessEnd.END, f"process {name} {how}")
+            if is_needed:
+                return RestartDecision(ProcessEnd.END, what)
+            return RestartDecision(ProcessEnd.WITHOUT, f"{what}: the survey goes on without it")
         if not is_replaceable:
-            return RestartDecision(ProcessEnd.HELD, f"process {name} {how}: run ended, wheels held")
+            return RestartDecision(ProcessEnd.HELD, f"{what}: run ended, wheels held")
         restarts_s = self._restarts_s[name]
         while restarts_s and now_s - restarts_s[0] > self._window_s:
             restarts_s.popleft()
         if len(restarts_s) >= self._limit:
-            often = f"more than {self._limit} times within {self._window_s:g} s"
-            if not is_needed:
-                return RestartDecision(
-                    ProcessEnd.WITHOUT, f"process {name} {how}, {often}: the survey goes on without it"
-                )
-            return RestartDecision(ProcessEnd.HELD, f"process {name} {how}, {often}: run ended, wheels held")
+            what += f", more than {self._limit} times within {self._window_s:g} s"
+            if is_needed:
+                return RestartDecision(ProcessEnd.HELD, f"{what}: run ended, wheels held")
+            return RestartDecision(ProcessEnd.WITHOUT, f"{what}: the survey goes on without it")
         restarts_s.append(now_s)
         meanwhile = "wheels held meanwhile" if is_needed else "the survey goes on"
-        return RestartDecision(ProcessEnd.RESTART, f"process {name} {how}: restarting it, {meanwhile}")
-
-
-def _signal(number: int) -> str:
-    return _SIGNALS.get(number, f"signal {number}")
+        return RestartDecision(ProcessEnd.RESTART, f"{what}: restarting it, {meanwhile}")
 
 
 class SilenceWatch:
-    """For how long a process has said nothing while somebody listened."""
+    """Time since the last heartbeat of a process, as far as the supervisor was able to receive."""
 
     def __init__(self, start_timeout_s: float, hang_timeout_s: float) -> None:
         self._limit_s, self._hang_timeout_s = start_timeout_s, hang_timeout_s
@@ -97,11 +91,11 @@ class SilenceWatch:
         self._polled_s: float | None = None
 
     def reset(self) -> None:
-        """It has said something."""
+        """A heartbeat was received."""
         self._limit_s, self._silent_s = self._hang_timeout_s, 0.0
 
     def is_hung(self, now_s: float) -> bool:
-        """Look once more. Time in which the listener itself stood still does not count."""
+        """Poll. Time in which the supervisor itself stood still does not count."""
         if self._polled_s is not None:
             self._silent_s += min(max(now_s - self._polled_s, 0.0), MAX_POLL_GAP_S)
         self._polled_s = now_s
@@ -109,18 +103,8 @@ class SilenceWatch:
 
     @property
     def text(self) -> str:
-        """What is said of one that hangs."""
+        """Message for a process that hangs."""
         return f"sent no heartbeat for {self._limit_s:g} s and was killed"
-
-
-# The matrices are 4 x 4: threads of the linear algebra would only fight the processes for the cores.
-ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-STOP_TIMEOUT_S = 4.0
-# Whoever comes last has this long, even where others have used up the time.
-LEAST_STOP_S = 1.0
-# A loop that was restarted joins within this.
-RECOVERY_S = 5.0
-Notify = Callable[[str, str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,10 +115,10 @@ class ProcessSpec:
         module: run with ``python -m``.
         is_simulator: runs with ``--sim`` only.
         listens: the configuration section with the host and port of its listening socket, bound by the supervisor.
-        is_replaceable: another one can take its place when it dies; the simulated robot has no other.
-        is_loop: it tells its heartbeat, and hangs when it does not.
+        is_replaceable: can be restarted when it dies; the simulated robot cannot.
+        is_loop: publishes a heartbeat, and hangs when it does not.
         is_needed: the survey does not go on without it.
-        hang_timeout_s: says nothing for this long before it hangs, where that is not ``run.hang_timeout_s``.
+        hang_timeout_s: where it is not ``run.hang_timeout_s``.
     """
 
     name: str
@@ -156,22 +140,26 @@ class _Child:
     watch: SilenceWatch | None
     why_killed: str = ""
 
+    def close(self) -> None:
+        if self.pidfd >= 0:
+            os.close(self.pidfd)
+            self.pidfd = -1
+
 
 class ProcessManager:
     """The processes of one run.
 
     Args:
-        cfg: when one hangs, and how often they are restarted.
-        command_of: command line of a process, and the file descriptors that it inherits; told whether it takes the
-            place of another one.
-        notify_operator: tells the operator (level, text).
+        cfg: time-outs and restart limits.
+        command_of: command line of a process (restarted or not), and the file descriptors that it inherits.
+        notify_operator: called with level and text.
     """
 
     def __init__(
         self,
         cfg: ProcessesConfig,
         command_of: Callable[[ProcessSpec, bool], tuple[list[str], tuple[int, ...]]],
-        notify_operator: Notify,
+        notify_operator: Callable[[str, str], None],
     ) -> None:
         self._cfg, self._command_of, self._notify_operator = cfg, command_of, notify_operator
         self._policy = RestartPolicy(cfg.restart_limit, cfg.restart_window_s)
@@ -202,56 +190,49 @@ class ProcessManager:
         )
         pidfd = os.pidfd_open(process.pid) if hasattr(os, "pidfd_open") else -1
         if spec.niceness:
-            _be_nice(process.pid, spec.niceness)
+            # From outside, so that it holds before the process has read its first module.
+            with suppress(OSError):  # it has ended already
+                niceness = os.getpriority(os.PRIO_PROCESS, 0) + spec.niceness
+                os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
         hang_timeout_s = spec.hang_timeout_s or self._cfg.hang_timeout_s
         watch = SilenceWatch(max(self._cfg.start_timeout_s, hang_timeout_s), hang_timeout_s) if spec.is_loop else None
         self._children[spec.name] = _Child(spec, process, pidfd, watch)
 
     def on_heartbeat(self, heartbeat: Heartbeat) -> None:
-        """A process has told its heartbeat; words of one that is dead do not count."""
+        """A heartbeat was received; that of a dead process does not count."""
         child = self._children.get(heartbeat.process)
         if child is not None and child.watch is not None and child.process.pid == heartbeat.pid:
             child.watch.reset()
 
     def poll(self, now_s: float) -> tuple[str, int, RestartDecision] | None:
-        """Bury the dead, kill who hangs, and start anew.
+        """Collect dead processes, kill hung ones, and restart.
 
         Returns:
             The process that ends the run, with its exit code, or ``None``.
         """
         for name, child in tuple(self._children.items()):
-            if child.process.poll() is None:
+            spec, code = child.spec, child.process.poll()
+            if code is None:
                 if child.watch is not None and not child.why_killed and child.watch.is_hung(now_s):
                     child.why_killed = child.watch.text
-                    child.process.kill()  # also one that is stopped dies of it, and is found dead at the next look
+                    child.process.kill()  # ends also a stopped process, which is found dead by the next poll
                 continue
-            code = child.process.returncode
-            spec = child.spec
+            replaceable, needed = spec.is_replaceable, spec.is_needed
             decision = self._policy.died(
-                name,
-                code,
-                now_s,
-                is_replaceable=spec.is_replaceable,
-                is_needed=spec.is_needed,
-                why=child.why_killed,
+                name, code, now_s, is_replaceable=replaceable, is_needed=needed, why=child.why_killed
             )
             if decision.end not in (ProcessEnd.RESTART, ProcessEnd.WITHOUT):
                 return name, code, decision
             self._notify_operator("warning", decision.text)
-            self._forget(child)
+            child.close()
             if decision.end is ProcessEnd.WITHOUT:
                 del self._children[name]
                 continue
             self.restarts += 1
-            if spec.is_needed:
+            if needed:
                 self._is_recovering_until_s = now_s + self._cfg.hang_timeout_s + RECOVERY_S
             self.start(spec, is_restarted=True)
         return None
-
-    def _forget(self, child: _Child) -> None:
-        if child.pidfd >= 0:
-            os.close(child.pidfd)
-            child.pidfd = -1
 
     def stop_all(self) -> None:
         """Ask each to end, the last one started first; a deadline for all of them together."""
@@ -271,26 +252,17 @@ class ProcessManager:
                 process.wait()
 
     def kill_all(self) -> None:
-        """End whoever is left."""
+        """Kill every process that is left."""
         for child in self._children.values():
             if child.process.poll() is None:
                 child.process.kill()
                 child.process.wait()
-            self._forget(child)
-
-
-def _be_nice(pid: int, niceness: int) -> None:
-    """From outside, so that it holds before the process has read its first module."""
-    with contextlib.suppress(OSError):  # it has ended already
-        os.setpriority(os.PRIO_PROCESS, pid, os.getpriority(os.PRIO_PROCESS, 0) + niceness)
+            child.close()
 
 
 @contextmanager
 def listen(section: str, host: str, port: int) -> Iterator[socket.socket]:
-    """A listening socket for a process that inherits it.
-
-    Args:
-        host, port: the address; port 0 takes any that is free.
+    """A listening socket for a process that inherits it; port 0 takes any free one.
 
     Raises:
         ConfigError: the port is taken.
@@ -308,28 +280,24 @@ def listen(section: str, host: str, port: int) -> Iterator[socket.socket]:
         yield listener
 
 
-def simulator_addresses(cfg: Config) -> dict[str, tuple[str, int]]:
-    """Where the stand-ins shall listen, (host, port) by the section of the configuration."""
-    robot, etalon = cfg.sim.robot, cfg.sim.etalon
-    return {"sim.robot": (robot.host, robot.port), "sim.etalon": (etalon.host, etalon.port)}
+C = TypeVar("C", bound=Config | RadioConfig)
+SimulatedServer = SimRobotConfig | SimEtalonConfig | SimBeaconRobotConfig
 
 
-def with_addresses(cfg: Config, sockets: Mapping[str, socket.socket]) -> Config:
-    """The configuration with the addresses at which the stand-ins really listen."""
+def simulated_servers(cfg: Config | RadioConfig) -> list[tuple[str, str, SimulatedServer]]:
+    """Process, section of the configuration and address of each simulated server."""
+    servers: list[tuple[str, str, SimulatedServer]] = [("dataloop", "sim.robot", cfg.sim.robot)]
+    return servers if isinstance(cfg, RadioConfig) else [*servers, ("etalon", "sim.etalon", cfg.sim.etalon)]
 
-    def at(process: str) -> dict[str, object]:
+
+def with_addresses(cfg: C, sockets: Mapping[str, socket.socket]) -> C:
+    """The configuration with the actual addresses of the simulated servers."""
+    changes: dict[str, object] = {}
+    sim: dict[str, object] = {}
+    for process, section, server in simulated_servers(cfg):
         host, port = sockets[process].getsockname()
-        return {"host": host, "port": port}
-
-    robot, etalon = at("dataloop"), at("etalon")
-    sim = {
-        "robot": cfg.sim.robot.model_copy(update=robot),
-        "etalon": cfg.sim.etalon.model_copy(update=etalon),
-    }
-    return cfg.model_copy(
-        update={
-            "robot": cfg.robot.model_copy(update=robot),
-            "etalon": cfg.etalon.model_copy(update=etalon),
-            "sim": cfg.sim.model_copy(update=sim),
-        }
-    )
+        at = {"host": host, "port": port}
+        name = section.removeprefix("sim.")
+        changes[name] = getattr(cfg, name).model_copy(update=at)
+        sim[name] = server.model_copy(update=at)
+    return cast(C, cfg.model_copy(update={**changes, "sim": cfg.sim.model_copy(update=sim)}))

@@ -7,6 +7,7 @@ import asyncio
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -15,7 +16,7 @@ import structlog
 import zmq.asyncio
 
 from ccatp.config.models import ObservatoryConfig
-from ccatp.daemon.mission_runner import CommandHandler
+from ccatp.daemon.mission_runner import OperableMission
 from ccatp.links.auth import AuthorizedClient, ClientsFile, KeyPair, Role, read_clients, read_pair
 from ccatp.links.channels import (
     BadRequest,
@@ -36,24 +37,21 @@ EFFECT_TIMEOUT_S = 5.0
 CAUSE = "operator"
 
 
+@dataclass(frozen=True, slots=True)
 class OperatorCommandHandler:
-    """Hands the commands of an operator to the mission.
+    """Applies the commands of an operator to the mission.
 
-    Args:
-        notify_operator: tells the log and the terminal (level, text).
+    Attributes:
+        notify_operator: writes to log and terminal (level, text).
+        settled: waits until the robot is at rest.
         on_change: called after a command changed the mission.
     """
 
-    def __init__(
-        self,
-        mission: CommandHandler,
-        notify_operator: Callable[[str, str], None],
-        status: Callable[[], MissionStatus],
-        settled: Callable[[], Awaitable[None]],
-        on_change: Callable[[], None],
-    ) -> None:
-        self._mission, self._notify_operator, self._status = mission, notify_operator, status
-        self._settled, self._on_change = settled, on_change
+    mission: OperableMission
+    notify_operator: Callable[[str, str], None]
+    status: Callable[[], MissionStatus]
+    settled: Callable[[], Awaitable[None]]
+    on_change: Callable[[], None]
 
     async def handle(self, frame: bytes) -> bytes:
         """The reply to one request."""
@@ -61,40 +59,39 @@ class OperatorCommandHandler:
             command = parse_operator(frame).cmd
         except BadRequest as error:
             return format_error(str(error))
-        if command is OperatorCommand.STATUS:
-            return format_ok(status=msgspec.to_builtins(self._status()))
-        refusal = self._apply(command)
-        if refusal is not None:
-            return format_error(refusal)
-        self._notify_operator("info", f"operator: {command}")
-        self._on_change()
+        if command is not OperatorCommand.STATUS:
+            refusal = self._apply(command)
+            if refusal is not None:
+                return format_error(refusal)
+            self.notify_operator("info", f"operator: {command}")
+            self.on_change()
         try:
             if command in (OperatorCommand.PAUSE, OperatorCommand.STOP):
                 async with asyncio.timeout(EFFECT_TIMEOUT_S):
-                    await self._settled()
+                    await self.settled()
         except TimeoutError:
             return format_error(f"{command}: accepted, but the robot is not at rest after {EFFECT_TIMEOUT_S:.0f} s")
-        return format_ok(status=msgspec.to_builtins(self._status()))
+        return format_ok(status=msgspec.to_builtins(self.status()))
 
     def _apply(self, command: OperatorCommand) -> str | None:
         if command is OperatorCommand.PAUSE:
-            return self._mission.pause(CAUSE)
+            return self.mission.pause(CAUSE)
         if command is OperatorCommand.RESUME:
-            return self._mission.resume()
+            return self.mission.resume()
         if command is OperatorCommand.ABORT:
-            return self._mission.abort(CAUSE)
-        return self._mission.stop()
+            return self.mission.abort(CAUSE)
+        return self.mission.stop()
 
 
 KEY_FILE, CLIENTS_FILE = "observatory.key_file", "observatory.clients_file"
-# Whoever reaches the unix socket has the daemon's own user: it might as well stop the daemon.
+# Access to the unix socket takes the daemon's own user, who might as well stop the daemon.
 LOCAL = AuthorizedClient("local", Role.CLEAR)
-# Somebody who asks over and over must not fill the log.
+# Repeated requests must not fill the log.
 LOGGED_LINES, LOGGED_PERIOD_S = 10, 60.0
 
 
 class EmergencyReceiver(EmergencyHandler, Protocol):
-    """What is asked and answer; ``ccatp.danger.DangerMonitor`` is one."""
+    """Danger rules that receive emergencies; ``ccatp.danger.DangerMonitor`` is one."""
 
     @property
     def at_base_or_held(self) -> bool:
@@ -102,16 +99,15 @@ class EmergencyReceiver(EmergencyHandler, Protocol):
 
 
 class EmergencyCommandHandler:
-    """Hands the requests of the observatory to the danger rules, and tells the log.
+    """Applies the requests of the observatory to the danger rules, and logs them.
 
-    Args:
-        age_s: age of the last frame, ``None`` before the first.
+    ``age_s`` returns the age of the last frame, ``None`` before the first.
     """
 
     def __init__(
         self, monitor: EmergencyReceiver, age_s: Callable[[], float | None], log: structlog.typing.FilteringBoundLogger
     ) -> None:
-        self._monitor, self._age_s, self._log = monitor, age_s, log
+        self._monitor, self._age_s, self.log = monitor, age_s, log
         self._accepted = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
         self._refused = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
 
@@ -127,24 +123,18 @@ class EmergencyCommandHandler:
         answer = parse_reply(reply)
         if not answer["ok"]:
             self.log_refusal(client.name, answer["error"])
-        elif "id" in answer:
-            left_out = self._accepted.take(time.monotonic())
-            if left_out is not None:
-                text = frame.decode("utf-8", "replace")
-                self._log.warning(
-                    "observatory_request", client=client.name, request=text, code=answer["code"], left_out=left_out
-                )
+        elif "id" in answer and (left_out := self._accepted.take(time.monotonic())) is not None:
+            text = frame.decode("utf-8", "replace")
+            self.log.warning(
+                "observatory_request", client=client.name, request=text, code=answer["code"], left_out=left_out
+            )
         return reply
 
     def log_refusal(self, client: str, why: str) -> None:
-        """Note that somebody was refused."""
+        """Log a refused request."""
         left_out = self._refused.take(time.monotonic())
         if left_out is not None:
-            self._log.warning("observatory_refused", client=client, why=why, left_out=left_out)
-
-    def log_event(self, text: str, **fields: object) -> None:
-        """A line for the log."""
-        self._log.info(text, **fields)
+            self.log.warning("observatory_refused", client=client, why=why, left_out=left_out)
 
 
 class ObservatoryServer:
@@ -160,11 +150,7 @@ class ObservatoryServer:
         self._clients = ClientsFile(Path(cfg.clients_file), CLIENTS_FILE)
 
     async def serve(self, context: zmq.asyncio.Context) -> None:
-        """Bind, and answer until cancelled; whatever fails ends all of it.
-
-        Raises:
-            RouterError: an endpoint cannot be bound.
-        """
+        """Bind, and answer until cancelled; raises ``RouterError`` where an endpoint cannot be bound."""
         async with AsyncExitStack() as stack:
             local = await stack.enter_async_context(Router(self._local_endpoint, self._handler.answer, context))
             work = [local.serve()]
@@ -173,15 +159,14 @@ class ObservatoryServer:
                 remote = CurveRouter(self._cfg.endpoint, self._answer_remote, context, self._keys)
                 work.append((await stack.enter_async_context(zap)).serve())
                 work.append((await stack.enter_async_context(remote)).serve())
-                self._handler.log_event(
-                    "observatory_channel", endpoint=remote.bound, clients=len(self._clients.clients)
-                )
+                clients = len(self._clients.clients)
+                self._handler.log.info("observatory_channel", endpoint=remote.bound, clients=clients)
             async with asyncio.TaskGroup() as tasks:
                 for coroutine in work:
                     tasks.create_task(coroutine)
 
     def _answer_remote(self, frame: bytes, user_id: str) -> bytes:
-        """Whoever is taken off the list loses their rights at once, connected or not."""
+        """A client that is taken off the list loses its rights at once, connected or not."""
         client = self._clients.clients.get(bytes.fromhex(user_id))
         if client is None:
             self._on_refused_client(f"key {user_id} is not on the list any more")

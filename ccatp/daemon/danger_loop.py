@@ -13,26 +13,18 @@ import uuid
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import structlog
 import zmq
 import zmq.asyncio
 
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.models import Config, LinkConfig, ObservatoryConfig
+from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon import realtime
 from ccatp.daemon.command_handlers import EmergencyCommandHandler, EmergencyReceiver, ObservatoryServer
-from ccatp.daemon.process import (
-    BeaconArgs,
-    ProcessArgs,
-    die_with_parent,
-    open_log,
-    parse_either,
-    run_process,
-    unless_stopped,
-)
+from ccatp.daemon.process import ProcessArgs, open_log, run_process, start_process, unless_stopped
 from ccatp.daemon.robot_session import LatenessStatistics, ReconnectingRobotLink
 from ccatp.daemon.subscribers import PERIOD_S, EstimateSubscriber, HeartbeatPublisher
 from ccatp.danger import DangerMonitor
@@ -56,7 +48,7 @@ class SafetyMonitor(EmergencyReceiver, Protocol):
 
     @property
     def counts(self) -> dict[str, object]:
-        """For the log, at the end."""
+        """Statistics for the log, at the end."""
 
     def reset(self) -> None:
         """The robot has booted."""
@@ -68,49 +60,22 @@ class SafetyMonitor(EmergencyReceiver, Protocol):
         """The verdict where a line of the robot was no frame, if that counts."""
 
 
-class SafetyMonitorConfig(NamedTuple):
-    """What the process hosts.
-
-    Attributes:
-        judge: the verdict on a frame, its line and main's newest estimate.
-    """
-
-    monitor: SafetyMonitor
-    judge: Judge
-    link: LinkConfig
-    observatory: ObservatoryConfig
-    realtime_priority: int
-    stale_after_s: float
-
-
-def build_safety_monitor(cfg: Config | RadioConfig) -> SafetyMonitorConfig:
-    """The rules that go with a configuration."""
+def build_safety_monitor(cfg: Config | RadioConfig) -> tuple[SafetyMonitor, Judge]:
+    """The rules that go with a configuration, and the verdict on a frame, its line and main's newest estimate."""
     if isinstance(cfg, RadioConfig):
-        return _beacon_monitor(cfg)
+        rules = BeaconSafetyRules(cfg)
+
+        def judge(sensors: Sensors, raw: bytes, estimate: EstimateMessage | None) -> Verdict:
+            try:
+                extras = decode_beacon_frame(raw)
+            except BadLine:
+                # Without its distances the way ahead is not known.
+                return rules.stale(sensors.seq, sensors.t)
+            return rules.step(sensors, extras, estimate)
+
+        return rules, judge
     monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)
-
-    def judge(sensors: Sensors, _raw: bytes, estimate: EstimateMessage | None) -> Verdict:
-        return monitor.step(sensors, estimate)
-
-    return SafetyMonitorConfig(
-        monitor, judge, cfg.robot, cfg.observatory, cfg.run.realtime_priority, cfg.danger.stale_after_s
-    )
-
-
-def _beacon_monitor(cfg: RadioConfig) -> SafetyMonitorConfig:
-    monitor = BeaconSafetyRules(cfg)
-
-    def judge(sensors: Sensors, raw: bytes, estimate: EstimateMessage | None) -> Verdict:
-        try:
-            extras = decode_beacon_frame(raw)
-        except BadLine:
-            # Without its distances nobody knows what is ahead.
-            return monitor.stale(sensors.seq, sensors.t)
-        return monitor.step(sensors, extras, estimate)
-
-    return SafetyMonitorConfig(
-        monitor, judge, cfg.robot, cfg.observatory, cfg.processes.realtime_priority, cfg.danger.stale_after_s
-    )
+    return monitor, lambda sensors, _raw, estimate: monitor.step(sensors, estimate)
 
 
 FILE = "emergencies.json"
@@ -119,7 +84,7 @@ RESERVE_BYTES = 65536
 
 
 def active_ids(path: Path) -> list[str]:
-    """The ids of the emergencies that a file holds, as far as it can be read."""
+    """The ids of the emergencies in a file, as far as it can be read."""
     try:
         return [str(e["id"]) for e in json.loads(path.read_text(encoding="utf-8"))["active"]]
     except (OSError, ValueError, KeyError, TypeError):
@@ -127,11 +92,9 @@ def active_ids(path: Path) -> list[str]:
 
 
 class PersistentEmergencyLatch(EmergencyLatch):
-    """A latch that is on the disk before anybody is told that it is latched.
+    """A latch that is on the disk before it is acknowledged.
 
-    Args:
-        path: the file; one that is there is read.
-        log: told when the file cannot be read or written; the latch holds all the same.
+    An existing file is read. Where the file cannot be read or written, this is logged, and the latch holds as before.
     """
 
     def __init__(self, path: Path, log: structlog.typing.FilteringBoundLogger) -> None:
@@ -148,7 +111,7 @@ class PersistentEmergencyLatch(EmergencyLatch):
         except FileNotFoundError:
             return
         except (OSError, ValueError, KeyError, TypeError) as error:
-            # What it held is not known: the survey is aborted rather than driven on.
+            # Its content is not known: the survey is aborted rather than continued.
             unknown = str(uuid.uuid4())
             advice = f"taken for an emergency; 'ccatp clear {unknown}' ends it"
             log.error("emergencies_unreadable", path=str(path), error=str(error), advice=advice)
@@ -158,7 +121,7 @@ class PersistentEmergencyLatch(EmergencyLatch):
             log.warning("emergencies_restored", active=sorted(self._active))
 
     def raise_emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
-        """As ``EmergencyLatch``, and on the disk."""
+        """See ``EmergencyLatch``; saved before it returns."""
         before = self.raised
         refusal = super().raise_emergency(kind, emergency_id, note)
         if self.raised != before:
@@ -166,7 +129,7 @@ class PersistentEmergencyLatch(EmergencyLatch):
         return refusal
 
     def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
-        """As ``EmergencyLatch``, and on the disk."""
+        """See ``EmergencyLatch``; saved before it returns."""
         before = len(self._active)
         refusal = super().clear(emergency_id, at_base_or_held)
         if len(self._active) != before:
@@ -205,16 +168,13 @@ WAIT_PERIOD_S = 0.02
 
 
 class DangerLoop:
-    """Wires the monitor to the robot link, the bus and the observatory channel.
+    """Connects the monitor to the robot link, the bus and the observatory channel."""
 
-    A process that is restarted finds the latch as it was.
-    """
-
-    def __init__(self, args: ProcessArgs | BeaconArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
-        self._cfg = cfg = build_safety_monitor(args.config)
-        self._endpoints, self._context = args.endpoints, context
+    def __init__(self, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+        self._cfg = cfg = args.config
+        self._context = context
         self.log = open_log(args.run_dir / "log.jsonl", "danger")
-        self.monitor = cfg.monitor
+        self.monitor, self._judge = build_safety_monitor(cfg)
         self.monitor.latch = PersistentEmergencyLatch(args.run_dir / FILE, self.log)
         self._publisher = Publisher(context, args.endpoints.of("danger"))
         self._heartbeat = HeartbeatPublisher(self._publisher, "danger")
@@ -228,10 +188,10 @@ class DangerLoop:
         self._permit_seq = 0
         self._t_s = 0.0
         self._is_stale = False
-        self._lateness = LatenessStatistics(cfg.link.slip_after_s)
+        self._lateness = LatenessStatistics(cfg.robot.slip_after_s)
         self._hello: Hello | None = None
         self.link = ReconnectingRobotLink(
-            cfg.link,
+            cfg.robot,
             role="monitor",
             client="danger",
             on_sensors=self.on_sensors,
@@ -256,7 +216,9 @@ class DangerLoop:
                 await self._wait_for_main(stop)
                 joins = self.link.join(is_patient=self._is_taking_over)
                 if await unless_stopped(stop, joins) and not self._is_lockstep:
-                    realtime.enter(self._cfg.realtime_priority, self.log)
+                    cfg = self._cfg
+                    processes = cfg.processes if isinstance(cfg, RadioConfig) else cfg.run
+                    realtime.enter(processes.realtime_priority, self.log)
                 waits = [tasks.create_task(stop.wait()), tasks.create_task(self.failed.wait())]
                 await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
                 for wait in waits:
@@ -275,7 +237,6 @@ class DangerLoop:
             has_received = has_received or self._estimates.has_received()
 
     def _on_joined(self, hello: Hello) -> None:
-        """A session begins; its first frame comes next."""
         before, self._hello, self._is_lockstep = self._hello, hello, hello.lockstep
         if before is not None and before.boot != hello.boot:
             self.monitor.reset()
@@ -283,7 +244,7 @@ class DangerLoop:
             self._seq = -1
         self._lateness.reset()
         self._heartbeat.phase, self._heartbeat.frame_s = "joined", time.monotonic()
-        self.log.info("robot_joined", port=self._cfg.link.port, lockstep=hello.lockstep, session=self.link.sessions)
+        self.log.info("robot_joined", port=self._cfg.robot.port, lockstep=hello.lockstep, session=self.link.sessions)
 
     def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
         """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
@@ -291,19 +252,19 @@ class DangerLoop:
         self._bad_lines = 0
         estimate = self._estimates.latest(sensors.seq, is_lockstep=self._is_lockstep)
         try:
-            verdict = self._cfg.judge(sensors, raw, estimate)
+            verdict = self._judge(sensors, raw, estimate)
         except Exception as error:
             # Without a verdict the robot's permit runs out: it holds by itself.
             self.log.exception("unhandled_exception", seq=self._seq)
             print(f"ccatp danger: internal error: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
             self.failed.set()
             return
-        if not self._is_lockstep and self._lateness.add(sensors.t, time.monotonic()) > self._cfg.stale_after_s:
-            verdict = self.monitor.stale(sensors.seq, sensors.t)  # it saw the past: no permit for the present
+        if not self._is_lockstep and self._lateness.add(sensors.t, time.monotonic()) > self._cfg.danger.stale_after_s:
+            verdict = self.monitor.stale(sensors.seq, sensors.t)  # a verdict on the past: no permit for the present
         self._publish_verdict(verdict, sensors.seq)
 
     def _on_bad_line(self) -> None:
-        """A line was no frame. In lockstep each stands for a frame's time, so that the run is repeatable."""
+        """A line was not a frame. In lockstep each stands for a frame's time, so that the run is repeatable."""
         self._bad_lines += 1
         hello = self._hello
         is_timed = hello is not None and hello.lockstep
@@ -313,14 +274,12 @@ class DangerLoop:
             self._publish_verdict(verdict, self._seq)
 
     def _publish_verdict(self, verdict: Verdict, ack: int) -> None:
-        if ack >= 0:  # the robot first: what it may do does not wait for anyone to read why
+        if ack >= 0:  # the robot first: the permit does not wait for the publication
             self._permit_seq += 1
             self.link.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
         self._publisher.send("verdict", verdict)
-        if (verdict.code, verdict.cause, verdict.severity) != self._published:
-            self._publish_event(verdict)
-
-    def _publish_event(self, verdict: Verdict) -> None:
+        if (verdict.code, verdict.cause, verdict.severity) == self._published:
+            return
         self._published = verdict.code, verdict.cause, verdict.severity
         fields: dict[str, Any] = {
             "code": int(verdict.code),
@@ -339,23 +298,20 @@ class DangerLoop:
             await asyncio.sleep(PERIOD_S)
 
     async def _watch(self) -> None:
-        """Where frames stop coming, withhold the permit aloud; make a connection anew that is open and silent."""
+        """Where frames stop coming, withhold the permit; drop a connection that is open and silent."""
         while True:
             await asyncio.sleep(WAIT_PERIOD_S)
             self._estimates.maintain()
             age_s = self._heartbeat.frame_age_s
             if self._heartbeat.phase != "joined" or self._is_lockstep or age_s is None:
                 continue
-            if age_s > self._cfg.stale_after_s:
-                self._declare_stale(age_s)
-            if age_s > self._cfg.link.silence_timeout_s:
+            if age_s > self._cfg.danger.stale_after_s:
+                if not self._is_stale:
+                    self._is_stale = True
+                    self.log.warning("sensors_stale", age_s=age_s)
+                self._publish_verdict(self.monitor.stale(self._seq, self._t_s), self._seq)
+            if age_s > self._cfg.robot.silence_timeout_s:
                 self.link.drop(f"no sensors frame for {age_s:.2f} s")
-
-    def _declare_stale(self, age_s: float) -> None:
-        if not self._is_stale:
-            self._is_stale = True
-            self.log.warning("sensors_stale", age_s=age_s)
-        self._publish_verdict(self.monitor.stale(self._seq, self._t_s), self._seq)
 
     def _on_lost(self, reason: str) -> None:
         self._heartbeat.phase = "rejoining"
@@ -370,13 +326,10 @@ class DangerLoop:
 
 def main() -> int:
     """Entry of ``python -m ccatp.daemon.danger_loop``."""
-    die_with_parent()
-    args = parse_either()
-    if not args.is_realtime:
-        realtime.leave_a_core(os.getppid())
+    args = start_process()
 
     async def serve(context: zmq.Context[zmq.Socket[bytes]], stop: asyncio.Event) -> int:
-        loop = DangerLoop(args.one, context)
+        loop = DangerLoop(args, context)
         try:
             await loop.run(stop)
         finally:

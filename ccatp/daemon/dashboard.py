@@ -10,8 +10,9 @@ import os
 import socket
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import structlog
 import zmq
@@ -19,22 +20,20 @@ import zmq
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import is_radio_file, load_config, load_radio_config
 from ccatp.config.models import Config, DashboardConfig
-from ccatp.daemon import realtime as spinning
 from ccatp.daemon.command_handlers import LOGGED_LINES, LOGGED_PERIOD_S
-from ccatp.daemon.process import RUN_DIR_FILE, Endpoints, die_with_parent, open_log, parse_either, stop_on_signals
+from ccatp.daemon.process import RUN_DIR_FILE, Endpoints, open_log, start_process, stop_on_signals
 from ccatp.daemon.subscribers import HeartbeatPublisher
 from ccatp.errors import ConfigError, DaemonUnreachableError
 from ccatp.links.bus import Publisher
 from ccatp.links.liveness import LogRateLimit
 from ccatp.links.runtime_dir import runtime_dir_path
-from ccatp.mirror.mirror import build_mirror
-from ccatp.records.recorder import read_metadata
-from ccatp.records.store import read_survey
-from ccatp.records.store_rows import StoreError
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.records.recorder import TELEMETRY, read_metadata
+from ccatp.records.store import StoreError, read_survey
 from ccatp.report.dashboard.access import read_token
 from ccatp.report.dashboard.app import CommandEndpoint, build_app, serve
 from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground
-from ccatp.report.dashboard.hub import BEACONS, SURVEY, BusReader, StateBroadcaster, Wants
+from ccatp.report.dashboard.hub import BEACONS, SURVEY, BusReader, StateBroadcaster
 from ccatp.report.dashboard.survey_view import SurveyView
 from ccatp.report.dashboard.survey_view import ground as survey_ground
 from ccatp.report.dashboard.view import RunStateView
@@ -46,11 +45,7 @@ ROOT = "dashboard."
 
 
 class Dashboard:
-    """The parts of a dashboard, put together.
-
-    Args:
-        run_dir: points that were measured before are read from its database.
-        is_sim: robot and laser system are simulated.
+    """A dashboard; points that were measured before are read from the database in ``run_dir``.
 
     Raises:
         ConfigError: the token cannot be read.
@@ -61,7 +56,14 @@ class Dashboard:
     ) -> None:
         self._cfg, self._endpoints = cfg, endpoints
         token = read_token(cfg.dashboard)
-        view, ground, wants = _view_of(cfg, run_dir, is_sim=is_sim, needs_token=token is not None)
+        view: RunStateView
+        if isinstance(cfg, RadioConfig):
+            view, wants = BeaconView(cfg, is_sim=is_sim), BEACONS
+            ground = beacon_ground(cfg, is_sim=is_sim, needs_token=token is not None)
+        else:
+            mirror = build_mirror(cfg.mirror)
+            view, wants = _survey_view(mirror, cfg, run_dir, is_sim=is_sim), SURVEY
+            ground = survey_ground(mirror, cfg, is_sim=is_sim, needs_token=token is not None)
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._reader = BusReader(self._context, endpoints.of, view, is_sim=is_sim, wants=wants)
         self._hub = StateBroadcaster(self._reader, view, cfg.dashboard.rate_hz)
@@ -106,44 +108,37 @@ class Dashboard:
         self._context.destroy(linger=0)
 
 
-async def run_dashboard(
-    cfg: Config | RadioConfig, run_dir: Path, endpoints: Endpoints, listener: socket.socket, *, is_sim: bool,
-    log: Logger, has_heartbeat: bool,
-) -> None:  # fmt: skip
-    """Serve a dashboard until SIGTERM or SIGINT; arguments as of ``Dashboard`` and its ``run``."""
-    stop = asyncio.Event()
-    stop_on_signals(stop)
-    _log_warnings(log)
-    dashboard = Dashboard(cfg, run_dir, endpoints, is_sim=is_sim, log=log)
-    try:
-        await dashboard.run(listener, stop, has_heartbeat=has_heartbeat)
-    finally:
-        dashboard.close()
-
-
-def _view_of(
-    cfg: Config | RadioConfig, run_dir: Path, *, is_sim: bool, needs_token: bool
-) -> tuple[RunStateView, dict[str, Any], Wants]:
-    if isinstance(cfg, RadioConfig):
-        ground = beacon_ground(cfg, is_sim=is_sim, needs_token=needs_token)
-        return BeaconView(cfg, is_sim=is_sim), ground, BEACONS
-    mirror = build_mirror(cfg.mirror)
+def _survey_view(mirror: Mirror, cfg: Config, run_dir: Path, *, is_sim: bool) -> SurveyView:
     view = SurveyView(mirror, cfg, is_sim=is_sim)
-    _load_points(view, run_dir, mirror.name)
-    return view, survey_ground(mirror, cfg, is_sim=is_sim, needs_token=needs_token), SURVEY
+    with suppress(StoreError):  # nothing has been measured yet
+        survey = read_survey(run_dir / "mission.sqlite", mirror.name)
+        measured = [(stored.point, stored.fix.t_s, stored.fix.position_m) for stored in survey.fixes]
+        view.begin_with(measured, [stored.point for stored in survey.points if stored.status == "skipped"])
+    return view
 
 
-def _load_points(view: SurveyView, run_dir: Path, mirror: str) -> None:
-    try:
-        survey = read_survey(run_dir / "mission.sqlite", mirror)
-    except StoreError:
-        return  # nothing has been measured yet
-    measured = [(stored.point, stored.fix.t_s, stored.fix.position_m) for stored in survey.fixes]
-    view.begin_with(measured, [stored.point for stored in survey.points if stored.status == "skipped"])
+def _run(make: Callable[[Logger], Dashboard], run_dir: Path, listener: socket.socket, *, has_heartbeat: bool) -> None:
+    """Serve a dashboard until SIGTERM or SIGINT."""
+
+    async def run() -> None:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+        log = open_log(run_dir / "log.jsonl", "dashboard")
+        for name in ("uvicorn.error", "asyncio"):
+            logger = logging.getLogger(name)
+            logger.handlers, logger.propagate = [_Handler(log)], False
+            logger.setLevel(logging.WARNING)
+        dashboard = make(log)
+        try:
+            await dashboard.run(listener, stop, has_heartbeat=has_heartbeat)
+        finally:
+            dashboard.close()
+
+    asyncio.run(run())
 
 
 def _rate_limited(log: Logger) -> Callable[[str, dict[str, object]], None]:
-    # Everybody who reaches the port can cause these lines.
+    # Every client of the port can cause these lines.
     budget = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
 
     def note(text: str, fields: dict[str, object]) -> None:
@@ -171,26 +166,14 @@ class _Handler(logging.Handler):
             )
 
 
-def _log_warnings(log: Logger) -> None:
-    for name in ("uvicorn.error", "asyncio"):
-        logger = logging.getLogger(name)
-        logger.handlers, logger.propagate = [_Handler(log)], False
-        logger.setLevel(logging.WARNING)
-
-
 def main() -> int:
     """Entry of ``python -m ccatp.daemon.dashboard``."""
-    die_with_parent()
-    args = parse_either().one
-    if not args.is_realtime:
-        spinning.leave_a_core(os.getppid())
-    log = open_log(args.run_dir / "log.jsonl", "dashboard")
-    listener = socket.socket(fileno=args.listen_fd)
-    asyncio.run(
-        run_dashboard(
-            args.config, args.run_dir, args.endpoints, listener, is_sim=args.is_sim, log=log, has_heartbeat=True
-        )
-    )
+    args = start_process()
+
+    def make(log: Logger) -> Dashboard:
+        return Dashboard(args.config, args.run_dir, args.endpoints, is_sim=args.is_sim, log=log)
+
+    _run(make, args.run_dir, socket.socket(fileno=args.listen_fd), has_heartbeat=True)
     return 0
 
 
@@ -207,18 +190,21 @@ def open_page_socket(cfg: DashboardConfig) -> PageSocket:
     """Listen at the configured address, or at another port if that one is in use; a survey runs without a page, too."""
     if not cfg.enabled:
         return PageSocket(None, cfg, "info", "")
+    level, before = "info", "dashboard: "
     try:
-        listener = _listen(cfg.host, cfg.port)
+        try:
+            listener = _listen(cfg.host, cfg.port)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+            level, before = "warning", f"dashboard: port {cfg.port} is in use, so it is at "
+            listener = _listen(cfg.host, 0)
     except OSError as error:
-        if error.errno != errno.EADDRINUSE:
-            return PageSocket(None, cfg, "warning", _without(cfg, error))
-    else:
-        return _listening(listener, cfg, "info", "dashboard: ")
-    try:
-        listener = _listen(cfg.host, 0)
-    except OSError as error:
-        return PageSocket(None, cfg, "warning", _without(cfg, error))
-    return _listening(listener, cfg, "warning", f"dashboard: port {cfg.port} is in use, so it is at ")
+        why = str(error.strerror).partition(" (while")[0]  # Python appends the address again
+        text = f"no dashboard: cannot listen on {cfg.host}:{cfg.port}: {why}; choose another dashboard.host"
+        return PageSocket(None, cfg, "warning", text)
+    port = listener.getsockname()[1]
+    return PageSocket(listener, cfg.model_copy(update={"port": port}), level, before + page_url(cfg.host, port))
 
 
 def page_url(host: str, port: int) -> str:
@@ -231,25 +217,11 @@ def _listen(host: str, port: int) -> socket.socket:
     return socket.create_server((host, port), family=family, backlog=BACKLOG)
 
 
-def _listening(listener: socket.socket, cfg: DashboardConfig, level: str, before: str) -> PageSocket:
-    port = listener.getsockname()[1]
-    return PageSocket(listener, cfg.model_copy(update={"port": port}), level, before + page_url(cfg.host, port))
-
-
-def _without(cfg: DashboardConfig, error: OSError) -> str:
-    why = str(error.strerror).partition(" (while")[0]  # Python appends the address again
-    return f"no dashboard: cannot listen on {cfg.host}:{cfg.port}: {why}; choose another dashboard.host"
-
-
 def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callable[[str], None]) -> int:
-    """Serve a dashboard beside a running daemon until SIGINT or SIGTERM.
-
-    Args:
-        runtime_dir: of the daemon, if not the default one.
-        settings: keys of ``dashboard`` that replace those of the run.
+    """Serve a dashboard beside a running daemon until SIGINT or SIGTERM; ``settings`` replace keys of ``dashboard``.
 
     Raises:
-        DaemonUnreachableError: no daemon runs there.
+        DaemonUnreachableError: no daemon runs in the runtime directory.
         ConfigError: a key outside ``dashboard``, a token that cannot be read, or no address to listen on.
     """
     for key in settings:
@@ -262,13 +234,14 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callab
     page = open_page_socket(cfg.dashboard)
     if page.socket is None:
         raise ConfigError(page.text)
-    is_sim = read_metadata(run_dir / "telemetry.mcap").get("simulation") == "true"
-    log = open_log(run_dir / "log.jsonl", "dashboard")
+    is_sim = read_metadata(run_dir / TELEMETRY).get("simulation") == "true"
+
+    def make(log: Logger) -> Dashboard:
+        return Dashboard(cfg, run_dir, Endpoints(folder), is_sim=is_sim, log=log)
+
     with page.socket:
         say(page.text)
-        asyncio.run(
-            run_dashboard(cfg, run_dir, Endpoints(folder), page.socket, is_sim=is_sim, log=log, has_heartbeat=False)
-        )
+        _run(make, run_dir, page.socket, has_heartbeat=False)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""One measurement at a time: laser system, localizer, store, mission."""
+"""One measurement at a time: laser system, fix gate, localizer, store, mission."""
 
 import asyncio
 from collections.abc import Callable
@@ -12,16 +12,15 @@ from ccatp.daemon.telemetry import SurveyTelemetry
 from ccatp.estimation.fixes import FixRefused
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
 from ccatp.localizer import Localizer
-from ccatp.records.store import MissionStore
-from ccatp.records.store_rows import AlreadyMeasuredError, StoreError
+from ccatp.records.store import AlreadyMeasuredError, MissionStore, StoreError
 from ccatp.survey.fix_gate import FixGate
 from ccatp.survey.mission import Mission
 from ccatp.survey.state import ApproachCounter
 
-# A commit takes milliseconds, on a busy disk a second. One that takes longer is told, and much longer holds the robot.
+# A commit takes milliseconds, on a busy disk a second. A longer one is reported, a much longer one holds the robot.
 SLOW_DISK_S = 2.0
 STALLED_DISK_S = 30.0
-# A fix that is doubted is measured again this often; who is doubted then is not believed.
+# A doubtful fix is measured again this often.
 REPEATS = 2
 
 
@@ -31,7 +30,7 @@ class FrameRefused(EtalonError):
 
 @dataclass(frozen=True, slots=True)
 class FixRequest:
-    """One measurement wanted: of a point, or (``None``) to find the robot again; ``number`` is the mission's."""
+    """One measurement: of a point, or (``None``) to localize the robot; ``number`` is the mission's."""
 
     number: int
     t_s: float
@@ -41,14 +40,15 @@ class FixRequest:
 
 
 class FixService:
-    """Takes the measurements that the mission orders.
+    """Takes the measurements that the mission requests; a point counts only when its fix is committed.
 
     Args:
-        cfg: how near the robot has to come, and how often it may try.
-        fix_gate: looks at a fix before the localizer gets it.
-        store: keeps it; a point counts only when it is committed.
-        on_finished: called after each measurement, good or bad.
-        between_s: how long to wait for new lengths before measuring again at the same place.
+        on_finished: called after each measurement, successful or not.
+        between_s: wait for new lengths before measuring again at the same place.
+
+    Attributes:
+        is_busy: from ``begin`` to the end of the measurement.
+        arrival_error_m: distance of the last fix from its point.
     """
 
     def __init__(
@@ -72,16 +72,16 @@ class FixService:
         self._wanted: FixRequest | None = None
         self._wakes = asyncio.Event()
         self.is_busy = False
-        self.arrival_error_m = 0.0  # distance of the last fix from its point
+        self.arrival_error_m = 0.0
 
     def begin(self, request: FixRequest) -> None:
-        """Take a measurement; ``is_busy`` until it is over. One that is under way is finished first, for nothing."""
+        """Take a measurement; one in progress is finished first, and dropped."""
         self.is_busy = True
         self._wanted = request
         self._wakes.set()
 
     async def run(self) -> None:
-        """Serve requests for ever."""
+        """Serve requests until cancelled."""
         while True:
             await self._wakes.wait()
             self._wakes.clear()
@@ -93,7 +93,7 @@ class FixService:
                 self._on_finished()
 
     def _is_wanted(self, request: FixRequest) -> bool:
-        """A pause or an edge in between means that the robot may have moved: the lengths are worth nothing then."""
+        """Not after a pause or an edge: the robot may have moved."""
         return self._mission.is_awaiting_fix and self._mission.request == request.number
 
     async def _serve(self, request: FixRequest) -> None:

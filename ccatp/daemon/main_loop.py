@@ -1,27 +1,17 @@
 """The main-loop process: serves a mission's frames between robot link, bus and operator channel."""
 
 import asyncio
-import os
 from contextlib import AbstractContextManager
 
 import zmq
 import zmq.asyncio
 
+from ccatp.config.beacon_models import RadioConfig
 from ccatp.daemon import realtime
 from ccatp.daemon.command_handlers import OperatorCommandHandler
-from ccatp.daemon.frame_service import FrameService
-from ccatp.daemon.mission_runner import MissionClock, RunnerConfig, RunnerContext, RunnerFactory
-from ccatp.daemon.process import (
-    BeaconArgs,
-    EitherArgs,
-    ProcessArgs,
-    die_with_parent,
-    open_log,
-    parse_either,
-    run_process,
-    unless_stopped,
-)
-from ccatp.daemon.robot_session import ControllerSession, ReconnectingRobotLink
+from ccatp.daemon.mission_runner import FrameService, MissionClock, RunnerConfig, RunnerContext, RunnerFactory
+from ccatp.daemon.process import ProcessArgs, open_log, run_process, start_process, unless_stopped
+from ccatp.daemon.robot_session import ControllerSession
 from ccatp.daemon.subscribers import PERIOD_S, HeartbeatPublisher, VerdictSubscriber
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.bus import Publisher
@@ -39,7 +29,7 @@ class MainLoop:
 
     def __init__(
         self,
-        args: ProcessArgs | BeaconArgs,
+        args: ProcessArgs,
         context: zmq.Context[zmq.Socket[bytes]],
         cfg: RunnerConfig,
         make_runner: RunnerFactory,
@@ -50,15 +40,14 @@ class MainLoop:
         self._heartbeat = HeartbeatPublisher(self._publisher, "main")
         danger = args.endpoints.of("danger")
         self._verdicts = VerdictSubscriber(context, danger, cfg.verdict_timeout_s, self._heartbeat.publish_if_due)
-        self._link = ReconnectingRobotLink(
+        self._session = ControllerSession(
             cfg.link,
-            role="controller",
-            client="main",
             on_sensors=self._on_sensors,
             on_lost=self._on_lost,
             on_joined=self._on_joined,
+            is_taking_over=self._is_taking_over,
+            frame_hz=cfg.frame_hz,
         )
-        self._session = ControllerSession(self._link, is_taking_over=self._is_taking_over, frame_hz=cfg.frame_hz)
         self._clock = MissionClock(cfg.clock_jump_s)
         self._runner = make_runner(
             RunnerContext(
@@ -74,7 +63,7 @@ class MainLoop:
         )
         self._telemetry = self._runner.telemetry
         self._frames = FrameService(
-            cfg.link, self._runner, self._session, self._clock, self._verdicts, self._heartbeat, on_error=self._fail
+            cfg.link, self._runner, self._session, self._clock, self._verdicts, self._heartbeat, self._fail
         )
         self._failure: Exception | None = None
         self.over = self._frames.over
@@ -83,14 +72,14 @@ class MainLoop:
     async def run(self, stop: asyncio.Event) -> None:
         """Join the robot when the danger loop has, then serve frames until the mission is over or ``stop`` is set."""
         handler = OperatorCommandHandler(
-            self._runner, self._telemetry.notify_operator, self.status, self.settled, self._answer_held_frame
+            self._runner.mission, self._telemetry.notify_operator, self.status, self.settled, self._answer_held_frame
         )
         shadow = zmq.asyncio.Context.shadow(self._context)
         async with (
             Router(self._endpoints.of("control"), handler.handle, shadow) as router,
             asyncio.TaskGroup() as tasks,
         ):
-            services = router.serve(), self._publish_levels(), self._runner.run(), self._link.serve(), self._watch()
+            services = router.serve(), self._publish_levels(), self._runner.run(), self._session.serve(), self._watch()
             served = [tasks.create_task(service) for service in services]
             try:
                 await self._join(stop)
@@ -106,7 +95,7 @@ class MainLoop:
             finally:
                 for task in served:
                     task.cancel()
-                self._link.close()
+                self._session.close()
                 await self._runner.close()
 
     # -- beginning and end ----------------------------------------------------------------------------------------
@@ -124,20 +113,18 @@ class MainLoop:
             if stop.is_set():
                 return
             await asyncio.sleep(WAIT_PERIOD_S)
-        is_joined = await unless_stopped(stop, self._link.join(is_patient=self._is_taking_over))
+        is_joined = await unless_stopped(stop, self._session.join(is_patient=self._is_taking_over))
         if is_joined and not self._session.is_lockstep:
             realtime.enter(self._cfg.realtime_priority, self._telemetry.log)
 
     def _on_joined(self, hello: Hello) -> None:
-        """A session begins; its first frame comes next."""
         try:
             self._runner.check_robot(hello)
         except ConfigError as error:
             self._fail(error)
             return
-        link = self._cfg.link
         has_booted = self._session.has_rebooted(hello)
-        text = self._session.begin(hello, f"{link.host}:{link.port}")
+        text = self._session.begin(hello)
         self._runner.begin_session(hello)
         self._frames.begin_session()
         self._telemetry.notify_operator("info", text)
@@ -155,11 +142,11 @@ class MainLoop:
         if self.over.is_set():
             return
         self._frames.end_session()
-        self._runner.interrupt(f"robot link lost: {reason}")
+        self._runner.mission.interrupt(f"robot link lost: {reason}")
         self._telemetry.notify_operator("warning", f"robot link lost: {reason}; reconnecting")
 
     def _fail(self, error: Exception) -> None:
-        """End this process, held; who starts it anew is the supervisor's business."""
+        """End this process, held; the supervisor restarts it."""
         self._failure = self._failure or error
         self.over.set()
 
@@ -169,7 +156,7 @@ class MainLoop:
         self.over.set()
 
     async def _await_shutdown(self, stop: asyncio.Event) -> None:
-        """Keep telling the end until the supervisor has heard it and stops us."""
+        """Repeat the end until the supervisor has received it and stops this process."""
         self._heartbeat.phase = "done"
         try:
             async with asyncio.timeout(SHUTDOWN_TIMEOUT_S):
@@ -185,7 +172,7 @@ class MainLoop:
         self._telemetry.publish_status(self.status())
 
     def _save_checkpoint(self) -> None:
-        if self._clock.has_begun:  # before its first frame the mission knows no more than its predecessor
+        if self._clock.has_begun:  # before its first frame the predecessor's checkpoint is better
             self._runner.save_checkpoint()
 
     def close(self) -> None:
@@ -201,12 +188,12 @@ class MainLoop:
             self._telemetry.flush_if_due()
             if self._heartbeat.phase != "starting":
                 self._telemetry.publish_status(self.status())
-            if self._runner.is_paused and not self._runner.is_busy:
-                self._frames.answer_held_frame()  # a frame now and then, so that an emergency is heard in a pause too
+            if self._runner.mission.is_paused and not self._runner.is_busy:
+                self._frames.answer_held_frame()  # a frame now and then, so that an emergency acts in a pause, too
             await asyncio.sleep(PERIOD_S)
 
     async def _watch(self) -> None:
-        """Hold where frames stop coming; make a connection anew that is open and silent."""
+        """Hold where frames stop coming; drop a connection that is open and silent."""
         robot, heartbeat = self._cfg.link, self._heartbeat
         while True:
             await asyncio.sleep(WAIT_PERIOD_S)
@@ -219,11 +206,11 @@ class MainLoop:
                 or age_s <= robot.sensors_timeout_s
             ):
                 continue
-            if self._runner.interrupt(f"no sensors frame for {age_s:.2f} s"):
-                self._telemetry.notify_operator("warning", self._runner.cause)
+            if self._runner.mission.interrupt(f"no sensors frame for {age_s:.2f} s"):
+                self._telemetry.notify_operator("warning", self._runner.mission.cause)
                 self._session.send_drive(self._clock.seq, 0.0, 0.0)
             if age_s > robot.silence_timeout_s:
-                self._link.drop(f"no sensors frame for {age_s:.2f} s")
+                self._session.drop(f"no sensors frame for {age_s:.2f} s")
 
     def _answer_held_frame(self) -> None:
         """Let lockstep time go on after a measurement or a pause."""
@@ -237,7 +224,7 @@ class MainLoop:
             await asyncio.sleep(WAIT_PERIOD_S)
 
     def status(self) -> MissionStatus:
-        """Where the mission stands."""
+        """Progress of the mission."""
         status, lateness = self._runner.status(), self._frames.lateness
         status.elapsed_s = round(self._clock.elapsed_s, 6)
         status.code = 0 if self._verdicts.verdict is None else int(self._verdicts.verdict.code)
@@ -247,34 +234,29 @@ class MainLoop:
         return status
 
 
-def open_runner(args: EitherArgs) -> tuple[RunnerConfig, AbstractContextManager[RunnerFactory]]:
-    """THE table of missions: which one the configuration is of, and what the process needs to host it.
+def open_runner(args: ProcessArgs) -> tuple[RunnerConfig, AbstractContextManager[RunnerFactory]]:
+    """THE table of missions: configuration and factory. Only the configured one is imported, to start sooner."""
+    cfg = args.config
+    if isinstance(cfg, RadioConfig):
+        from ccatp.daemon.beacon_runner import beacon_runner_config, open_beacons  # noqa: PLC0415
 
-    Only that one is imported: a main loop that was killed is back half a second sooner.
-    """
-    if args.survey is not None:
-        from ccatp.daemon.survey_runner import open_survey, survey_runner_config  # noqa: PLC0415
+        return beacon_runner_config(cfg), open_beacons(cfg, args)
+    from ccatp.daemon.survey_runner import open_survey, survey_runner_config  # noqa: PLC0415
 
-        return survey_runner_config(args.survey.config), open_survey(args.survey)
-    from ccatp.daemon.beacon_runner import beacon_runner_config, open_beacons  # noqa: PLC0415
-
-    return beacon_runner_config(args.one_of_beacons.config), open_beacons(args.one_of_beacons)
+    return survey_runner_config(cfg), open_survey(cfg, args)
 
 
 def main() -> int:
     """Entry of ``python -m ccatp.daemon.main_loop``."""
-    die_with_parent()
-    args = parse_either()
-    # The core is for the main thread alone.
-    core = None if args.is_realtime else realtime.leave_a_core(os.getppid())
+    args = start_process()
 
     async def serve(context: zmq.Context[zmq.Socket[bytes]], stop: asyncio.Event) -> int:
         cfg, opening = open_runner(args)
         loop: MainLoop | None = None
         try:
             with opening as make_runner:
-                loop = MainLoop(args.one, context, cfg, make_runner)
-                realtime.take_core(core)  # now that the threads of ZeroMQ and of the store have been started elsewhere
+                loop = MainLoop(args, context, cfg, make_runner)
+                realtime.take_core(args.free_core)  # the threads of ZeroMQ and the store have started elsewhere
                 await loop.run(stop)
         finally:
             if loop is not None:  # last, so that the last messages leave while the store commits

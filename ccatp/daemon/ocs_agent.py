@@ -23,7 +23,7 @@ from ccatp.links.topics import MissionStatus
 
 Answer = tuple[bool, str]
 PERIOD_S = 0.5
-# A survey that was started tells its status within this: processes, planning, joining.
+# A survey that was started publishes its status within this: processes, planning, joining.
 START_TIMEOUT_S = 60.0
 ENDINGS: Mapping[int, str] = {
     ExitStatus.COMPLETE: "the survey is complete",
@@ -55,13 +55,10 @@ class SurveyTask:
     log: Callable[[str], None]
 
     def survey(self, session: OcsSession, panels: int | None = None) -> Answer:
-        """Start a survey, or join the one that runs, and follow it to its end.
+        """Start a survey of the first ``panels`` (all where None), or join the one that runs, and follow it to its end.
 
-        When the session is told to stop, the survey is aborted, and the session ends with it: the robot is at base.
-
-        Args:
-            session: its ``data`` shows the status.
-            panels: survey only the first so many; all of the configuration where ``None``.
+        ``session.data`` shows the status. When the session is stopped, the survey is aborted: the robot is at base when
+        the session ends.
         """
         if self._status() is not None:
             self.log("a survey runs already; following it")
@@ -98,7 +95,7 @@ class SurveyTask:
         if code < 0:
             return False, "the survey is over"
         ending = ENDINGS.get(code, f"the survey ended with status {code}; see its log")
-        # Whoever stopped it wanted it aborted.
+        # A session that was stopped asked for the abort.
         return code == ExitStatus.COMPLETE or (is_aborted and code == ExitStatus.ABORTED), ending
 
     def ask(self, order: str, session: OcsSession | None = None) -> Answer:
@@ -112,11 +109,7 @@ class SurveyTask:
         return True, f"{order}: {status.state}"
 
     def monitor(self, session: OcsSession, publish: Callable[[dict[str, Any]], None], period_s: float) -> Answer:
-        """Publish the status again and again until the session is told to stop.
-
-        Args:
-            session: its ``data`` shows what was published last.
-        """
+        """Publish the status periodically until the session is stopped; ``session.data`` is what was published last."""
         while session.status in ("starting", "running"):
             status = self._status()
             now_s = time.time()
@@ -145,7 +138,7 @@ def shown(status: MissionStatus) -> dict[str, Any]:
 
 
 def feed_fields(status: MissionStatus) -> dict[str, Any]:
-    """What of the status goes into the feed: numbers and short texts, always the same fields."""
+    """Part of the status for the feed: numbers and short texts, always the same fields."""
     return {
         "state": status.state,
         "cause": status.cause,
@@ -163,6 +156,9 @@ def feed_fields(status: MissionStatus) -> dict[str, Any]:
 
 
 AGENT_CLASS = "CcatpAgent"
+# Names that OCS reads from the module of the entry point ``ocs.plugins``.
+package_name = "ccatp"
+agents = {AGENT_CLASS: {"module": "ccatp.daemon.ocs_agent", "entry_point": "main"}}
 FEED = "survey"
 ORDERS = ("status", "pause", "resume", "abort", "stop")
 # A pause is answered when the robot is at rest.
@@ -176,7 +172,7 @@ class OcsMissing(CcatpError):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
-    """The agent's own options; those of OCS come beside them."""
+    """Add the agent's own options to those of OCS."""
     own = parser.add_argument_group("Agent options")
     own.add_argument("--config", type=Path, help="configuration of the surveys")
     own.add_argument("--sim", action="store_true", help="simulate robot and laser system")
@@ -188,7 +184,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
 
 
 def survey_command(args: argparse.Namespace) -> list[str]:
-    """``ccatp run`` as the agent's options want it."""
+    """``ccatp run`` with the agent's options."""
     command = [sys.executable, "-m", "ccatp", "run"]
     command += [flag for flag, is_given in (("--sim", args.sim), ("--realtime", args.realtime)) if is_given]
     for option, value in (("--config", args.config), ("--mirror", args.mirror), ("--runtime-dir", args.runtime_dir)):
@@ -216,19 +212,15 @@ def main(args: Sequence[str] | None = None) -> None:
     if not parsed.sim and parsed.config is None:
         parser.error("name the robot's configuration with --config FILE, or add --sim")
     agent, runner = ocs_agent.init_site_agent(parsed)
-    desk = SurveyTask(OperatorClient(parsed.runtime_dir, TIMEOUT_S), survey_command(parsed), os.environ, agent.log.info)
-    register(agent, desk, ocs_agent.param, parsed.period)
+    surveys = SurveyTask(
+        OperatorClient(parsed.runtime_dir, TIMEOUT_S), survey_command(parsed), os.environ, agent.log.info
+    )
+    register(agent, surveys, ocs_agent.param, parsed.period)
     runner.run(agent, auto_reconnect=True)
 
 
-def register(agent: Any, desk: SurveyTask, param: Any, period_s: float) -> None:
-    """Tell the agent its processes, tasks and feed.
-
-    Args:
-        agent: an ``ocs.ocs_agent.OCSAgent``.
-        desk: what does the work, in threads of the agent.
-        param: ``ocs.ocs_agent.param``.
-    """
+def register(agent: Any, surveys: SurveyTask, param: Any, period_s: float) -> None:
+    """Register processes, tasks and feed at an ``OCSAgent``; ``param`` is ``ocs.ocs_agent.param``."""
 
     def stop(session: Any, params: Any) -> Answer:
         del params
@@ -241,7 +233,7 @@ def register(agent: Any, desk: SurveyTask, param: Any, period_s: float) -> None:
         **Process** - with ``panels`` only of the first so many. Stopping it aborts the survey: the robot drives to its
         base.
         """
-        return desk.survey(session, params["panels"])
+        return surveys.survey(session, params["panels"])
 
     def monitor(session: Any, params: Any) -> Answer:
         """Publish the state of the survey to the feed ``survey``, whether one runs or not.
@@ -249,7 +241,7 @@ def register(agent: Any, desk: SurveyTask, param: Any, period_s: float) -> None:
         **Process** - begins with the agent.
         """
         del params
-        return desk.monitor(session, lambda block: agent.publish_to_feed(FEED, block), period_s)
+        return surveys.monitor(session, lambda block: agent.publish_to_feed(FEED, block), period_s)
 
     panels = param("panels", default=None, type=int, check=lambda number: number >= 0)
     nothing = param("_")
@@ -257,16 +249,15 @@ def register(agent: Any, desk: SurveyTask, param: Any, period_s: float) -> None:
     agent.register_process("survey", panels(survey), stop, blocking=True)
     agent.register_process("monitor", nothing(monitor), stop, blocking=True, startup=True)
     for order in ORDERS:
-        agent.register_task(order, nothing(_task(desk, order)), blocking=True)
 
+        def task(session: Any, params: Any, order: str = order) -> Answer:
+            del params
+            return surveys.ask(order, session)
 
-def _task(desk: SurveyTask, order: str) -> Callable[[Any, Any], Answer]:
-    def task(session: Any, params: Any) -> Answer:
-        del params
-        return desk.ask(order, session)
-
-    task.__doc__ = f"Ask the daemon: {order}.\n\n**Task** - {order}(): the status afterwards is in the session's data."
-    return task
+        task.__doc__ = (
+            f"Ask the daemon: {order}.\n\n**Task** - {order}(): the session's data hold the status afterwards."
+        )
+        agent.register_task(order, nothing(task), blocking=True)
 
 
 if __name__ == "__main__":

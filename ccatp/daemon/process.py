@@ -1,4 +1,4 @@
-"""What every process does at its start: arguments, log file, end with its parent, signals.
+"""Common start of every process: arguments, log file, end with its parent, signals.
 
 Writing a log line never fails: what the disk does not take is dropped and counted.
 """
@@ -12,9 +12,9 @@ import signal
 import sys
 from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TextIO, TypeVar, cast
+from typing import Any, TextIO, cast
 
 import structlog
 import zmq
@@ -22,28 +22,28 @@ import zmq
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import is_radio_file, load_config, load_radio_config
 from ccatp.config.models import Config
+from ccatp.daemon import realtime
 from ccatp.errors import CcatpError
 
 
 class LogStream(io.TextIOBase):
     """Appends whole lines; several processes may share the file.
 
-    Args:
-        process: whose log it is, for the alarm on standard error when the first line is dropped.
+    When the first line is dropped, ``process`` reports it on standard error. Raises ``OSError`` where the file cannot
+    be made.
 
     Attributes:
         dropped: lines that are not in the file, or only in part.
     """
 
     def __init__(self, path: Path, process: str) -> None:
-        """Open the file; raises ``OSError`` where it cannot be made."""
         self._path, self._process = path, process
         self._file = path.open("ab", buffering=0)
         self._is_torn = False
         self.dropped = 0
 
     def write(self, text: str) -> int:
-        """Append; always takes all of it."""
+        """Append; never fails."""
         data = text.encode("utf-8", "backslashreplace")
         if self._is_torn:
             data = b"\n" + data
@@ -74,13 +74,13 @@ class LogStream(io.TextIOBase):
 
 PR_SET_PDEATHSIG = 1
 LEVELS = {"info": 20, "warning": 30, "error": 40}
-# The event of a line that the operator gets, too; the field ``text`` holds it.
+# The event of a line that is also shown to the operator; the field ``text`` holds it.
 OPERATOR_MESSAGE = "operator_message"
 # The copy of the fault plan in the run directory.
 FAULTS_FILE = "faults.toml"
 # In the runtime directory: the run directory of the run that goes on there, or of the last one.
 RUN_DIR_FILE = "run_dir"
-# In this variable the supervisor tells its children who it is.
+# Environment variable with the supervisor's process number, for its children.
 SUPERVISOR_PID = "CCATP_SUPERVISOR_PID"
 
 
@@ -95,23 +95,21 @@ class Endpoints:
         return f"ipc://{self.runtime_dir / name}"
 
 
-C = TypeVar("C", Config, RadioConfig)
-
-
-@dataclass(frozen=True)  # no slots: an alias with its type filled in notes that on the instance
-class ArgsOf(Generic[C]):
-    """What the supervisor tells a process.
+@dataclass(frozen=True, slots=True)
+class ProcessArgs:
+    """Arguments of a process.
 
     Attributes:
         config: the run's exact configuration, from its run directory.
         listen_fd: an inherited listening socket, or ``None``.
-        is_resuming: go on with a mission that stands in the run directory.
-        has_faults: a fault plan stands in the run directory; stand-ins only.
-        is_restarted: another process of this run has died, and this one takes its place.
-        is_sim: robot and laser system are stand-ins.
+        is_resuming: go on with the mission in the run directory.
+        has_faults: a fault plan is in the run directory; simulators only.
+        is_restarted: takes the place of a process of this run that died.
+        is_sim: robot and laser system are simulated.
+        free_core: the core that all processes but the main loop leave, or ``None``.
     """
 
-    config: C
+    config: Config | RadioConfig
     run_dir: Path
     endpoints: Endpoints
     listen_fd: int | None
@@ -121,80 +119,37 @@ class ArgsOf(Generic[C]):
     is_restarted: bool = False
     is_held: bool = False
     is_sim: bool = False
+    free_core: int | None = None
 
     @property
     def is_taking_over(self) -> bool:
-        """Somebody else has been at it before."""
+        """Continues the work of another process."""
         return self.is_resuming or self.is_restarted
 
 
-ProcessArgs = ArgsOf[Config]
-BeaconArgs = ArgsOf[RadioConfig]
-
-
-class EitherArgs(NamedTuple):
-    """What a process serves: the survey of a mirror or a mission among beacons; the other one is ``None``."""
-
-    survey: ProcessArgs | None
-    beacons: BeaconArgs | None
-
-    @property
-    def one_of_beacons(self) -> BeaconArgs:
-        """Of a mission among beacons, where there is no survey."""
-        return cast(BeaconArgs, self.beacons)
-
-    @property
-    def one(self) -> ProcessArgs | BeaconArgs:
-        """Whichever it is."""
-        return self.survey or self.one_of_beacons
-
-    @property
-    def is_realtime(self) -> bool:
-        """Stand-ins pace on the wall clock."""
-        return self.one.is_realtime
-
-
-def parse_either(argv: list[str] | None = None) -> EitherArgs:
-    """As ``parse_args``, for processes that serve missions among beacons, too."""
-    run_dir, rest = _split(_parse(argv))
-    path = run_dir / "config.toml"
-    if is_radio_file(path):
-        return EitherArgs(None, ArgsOf(load_radio_config(path), run_dir, **rest))
-    return EitherArgs(ArgsOf(load_config(path), run_dir, **rest), None)
+def start_process(argv: list[str] | None = None) -> ProcessArgs:
+    """Arguments of this process, which ends with the supervisor; its sockets can be used by its own user only."""
+    die_with_parent()
+    args = parse_args(argv)
+    return args if args.is_realtime else replace(args, free_core=realtime.leave_a_core(os.getppid()))
 
 
 def parse_args(argv: list[str] | None = None) -> ProcessArgs:
-    """Read the command line of a process and the configuration it names; sockets that it makes are its user's alone."""
-    run_dir, rest = _split(_parse(argv))
-    return ArgsOf(load_config(run_dir / "config.toml"), run_dir, **rest)
-
-
-def _parse(argv: list[str] | None) -> argparse.Namespace:
+    """Read the command line of a process and the configuration it names."""
     os.umask(os.umask(0o077) | 0o022)  # to connect to a socket takes the right to write to it
     parser = argparse.ArgumentParser()
     parser.add_argument("--run-dir", type=Path, required=True)
-    parser.add_argument("--runtime-dir", type=Path, required=True)
+    parser.add_argument("--runtime-dir", dest="endpoints", type=lambda text: Endpoints(Path(text)), required=True)
     parser.add_argument("--listen-fd", type=int)
-    parser.add_argument("--realtime", action="store_true")
-    parser.add_argument("--resume", action="store_true")
-    parser.add_argument("--faults", action="store_true")
-    parser.add_argument("--restarted", action="store_true")
-    parser.add_argument("--held", action="store_true")
-    parser.add_argument("--sim", action="store_true")
-    return parser.parse_args(argv)
-
-
-def _split(args: argparse.Namespace) -> tuple[Path, dict[str, Any]]:
-    return args.run_dir, {
-        "endpoints": Endpoints(args.runtime_dir),
-        "listen_fd": args.listen_fd,
-        "is_realtime": args.realtime,
-        "is_resuming": args.resume,
-        "has_faults": args.faults,
-        "is_restarted": args.restarted,
-        "is_held": args.held,
-        "is_sim": args.sim,
-    }
+    parser.add_argument("--realtime", dest="is_realtime", action="store_true")
+    parser.add_argument("--resume", dest="is_resuming", action="store_true")
+    parser.add_argument("--faults", dest="has_faults", action="store_true")
+    parser.add_argument("--restarted", dest="is_restarted", action="store_true")
+    parser.add_argument("--held", dest="is_held", action="store_true")
+    parser.add_argument("--sim", dest="is_sim", action="store_true")
+    args = parser.parse_args(argv)
+    path = args.run_dir / "config.toml"
+    return ProcessArgs(config=load_radio_config(path) if is_radio_file(path) else load_config(path), **vars(args))
 
 
 def die_with_parent() -> None:
@@ -229,7 +184,7 @@ def stop_on_signals(stop: asyncio.Event) -> None:
 
 
 async def unless_stopped(stop: asyncio.Event, work: Coroutine[Any, Any, None]) -> bool:
-    """Do some work, but leave it as soon as ``stop`` is set; whether it came to its end. Its errors are raised."""
+    """Run ``work`` until it ends or ``stop`` is set; returns whether it ended. Its errors are raised."""
     working, stopping = asyncio.ensure_future(work), asyncio.ensure_future(stop.wait())
     try:
         await asyncio.wait((working, stopping), return_when=asyncio.FIRST_COMPLETED)
@@ -247,8 +202,7 @@ async def run_process(
 ) -> int:
     """Run ``serve(context, stop)`` to its end; ``stop`` is set by SIGTERM and SIGINT.
 
-    Returns:
-        Its exit status, or that of the gravest error that ended it, which is printed.
+    Expected errors are printed. Returns the exit status, or the highest one of the errors.
     """
     stop = asyncio.Event()
     stop_on_signals(stop)
@@ -257,24 +211,16 @@ async def run_process(
     try:
         status = await serve(context, stop)
     except* CcatpError as group:
-        status = report(name, group)
+        for error in _leaves(group):
+            print(f"ccatp {name}: {error}", file=sys.stderr, flush=True)
+            status = max(status, int(error.exit_status))
     finally:
         context.destroy(linger=0)
     return status
 
 
-def report(process: str, group: BaseExceptionGroup[CcatpError]) -> int:
-    """Print the expected refusals of a task group, one line each; returns the exit status of the gravest."""
-    status = 0
-    for error in leaves(group):
-        print(f"ccatp {process}: {error}", file=sys.stderr, flush=True)
-        status = max(status, int(error.exit_status))
-    return status
-
-
-def leaves(group: BaseExceptionGroup[CcatpError]) -> list[CcatpError]:
-    """All errors of a group of groups."""
+def _leaves(group: BaseExceptionGroup[CcatpError]) -> list[CcatpError]:
     found: list[CcatpError] = []
     for error in group.exceptions:
-        found += leaves(error) if isinstance(error, BaseExceptionGroup) else [error]
+        found += _leaves(error) if isinstance(error, BaseExceptionGroup) else [error]
     return found

@@ -1,7 +1,7 @@
 """Real-time scheduling and locked memory, and the busy-polling event loop of lockstep.
 
 The bounds on reaction times hold under load only with real-time scheduling: a loop that shares its core waits for its
-turn, and a page that was swapped out waits for the disk. It is for robots that go by the wall clock.
+turn, and a page that was swapped out waits for the disk. It is for robots in real time.
 
 In lockstep a peer answers within microseconds and a frame passes five sockets between processes. Waking a sleeping
 process costs some 30 microseconds, and two processes that take turns on one core run at half speed: so the loop polls
@@ -33,10 +33,9 @@ WITHOUT = "reaction times hold while the machine has a core to spare; the robot'
 
 
 def enter(priority: int, log: structlog.typing.FilteringBoundLogger) -> None:
-    """Take real-time scheduling for this thread and libzmq's, and lock memory; one warning where that is not permitted.
+    """Schedule this thread and libzmq's with SCHED_FIFO, and lock memory; one warning where that is not permitted.
 
-    Args:
-        priority: of SCHED_FIFO; 0 leaves everything as it is.
+    A ``priority`` of 0 changes nothing.
     """
     if not priority:
         return
@@ -49,7 +48,7 @@ def enter(priority: int, log: structlog.typing.FilteringBoundLogger) -> None:
 
 
 def reserve_heap(size: int) -> None:
-    """Let the heap of the C library have ``size`` bytes in memory that are free; nothing where it is not glibc's."""
+    """Grow the heap of glibc by ``size`` free bytes in memory; no effect with another C library."""
     libc = ctypes.CDLL(None)
     if not hasattr(libc, "mallopt"):
         return
@@ -81,7 +80,7 @@ def _io_threads() -> list[int]:
 
 
 def _lock_memory() -> str:
-    """Lock what is used and what will be. With a limit, that would let an allocation fail some day: then not at all."""
+    """Lock present and future pages; not with a limit, because an allocation would fail some day."""
     if sys.platform != "linux":
         return f"mlockall: not on {sys.platform}"
     _, most = resource.getrlimit(resource.RLIMIT_MEMLOCK)
@@ -100,7 +99,7 @@ SPIN_S = 1e-3
 
 
 class SpinningSelector(selectors.EpollSelector):
-    """Polls for ``SPIN_S`` before it blocks, giving the core to whoever wants it."""
+    """Polls for ``SPIN_S`` before it blocks, and yields the core in between."""
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         """As ``EpollSelector.select``."""
@@ -122,10 +121,10 @@ def run(main: Coroutine[Any, Any, int], *, is_spinning: bool) -> int:
 
 
 def leave_a_core(supervisor_pid: int) -> int | None:
-    """Keep this thread, and those it starts, off one core; returns that core, or ``None`` where there is but one.
+    """Keep this thread, and those it starts, off one core; returns that core, or ``None`` where there is only one.
 
-    Which one follows from the number of the supervisor's process, so that all processes of a run leave the same and two
-    runs side by side not always so.
+    The core follows from the supervisor's process number: all processes of a run leave the same one, and two runs side
+    by side usually different ones.
     """
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     if len(cores) < 2:
@@ -136,6 +135,6 @@ def leave_a_core(supervisor_pid: int) -> int | None:
 
 
 def take_core(core: int | None) -> None:
-    """Run the calling thread alone on the core that the others left."""
+    """Run the calling thread on the core that the other processes left."""
     if core is not None:
         os.sched_setaffinity(0, {core})

@@ -1,8 +1,9 @@
-"""The controller's session at the robot: reconnecting link, numbered commands, command history, lateness of frames."""
+"""Sessions at the robot: reconnecting link, numbered commands, command history, lateness of frames."""
 
 import asyncio
 import random
 from collections.abc import Callable
+from math import inf
 
 from ccatp.config.models import LinkConfig, RobotConfig
 from ccatp.control.prediction import CommandPredictor
@@ -13,18 +14,16 @@ from ccatp.links.robot_messages import Hello, Role, Sensors
 from ccatp.safety.wheel_monitors import CommandSpan
 
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.05, 1.0
-# A robot that accepts a connection and does not answer is not there yet: rather ask anew.
+# After this time without an answer the connection is closed and another one is tried.
 ATTEMPT_S = 2.0
-# What will be refused the next time, too.
+# Refusals that will be repeated.
 FINAL = ("bad mac",)
+# The robot's clock and the host's drift apart by less than this share; a quartz is ten times better.
+MAX_DRIFT = 2e-4
 
 
 def delay_s(failures: int, share: float) -> float:
-    """How long to wait before the next attempt: twice as long each time, spread so that two clients do not collide.
-
-    Args:
-        share: random, 0 to 1.
-    """
+    """Wait before the next attempt, s: doubled each time, spread by the random ``share`` (0 to 1) of each client."""
     return max(FIRST_DELAY_S, min(LONGEST_DELAY_S, FIRST_DELAY_S * 2.0 ** min(failures, 10)) * (0.5 + 0.5 * share))
 
 
@@ -36,6 +35,9 @@ class ReconnectingRobotLink:
         on_lost: called with the reason when a session ends.
         on_joined: called with the robot's hello when a session begins, before its first frame.
         on_bad_line: called after each line that fails a check.
+
+    Attributes:
+        sessions: number of sessions so far.
     """
 
     def __init__(
@@ -55,7 +57,7 @@ class ReconnectingRobotLink:
         self._on_bad_line = on_bad_line
         self._lost = asyncio.Event()
         self._is_joined = False
-        # A robot that lets join and then says nothing is as far away as one that does not answer.
+        # A session without a valid frame counts as a failure.
         self._failures = 0
         self._deadline_s: float | None = None
         self.sessions = 0
@@ -81,7 +83,7 @@ class ReconnectingRobotLink:
             is_patient: try for as long as after a loss, because the robot may still hold a dead session's role.
 
         Raises:
-            UnreachableError: the robot is not there, or refuses.
+            UnreachableError: the robot does not answer, or refuses.
         """
         if is_patient:
             await self._join_again()
@@ -89,10 +91,10 @@ class ReconnectingRobotLink:
             await self.link.connect(self._cfg.connect_timeout_s)
 
     async def serve(self) -> None:
-        """Join again after each loss, for ever.
+        """Join again after each loss, until cancelled.
 
         Raises:
-            UnreachableError: the robot stayed away for ``reconnect_timeout_s``, or refuses for good.
+            UnreachableError: no session with frames for ``reconnect_timeout_s``, or a refusal that is final.
         """
         while True:
             await self._lost.wait()
@@ -136,41 +138,53 @@ class ReconnectingRobotLink:
         self._on_lost(reason)
 
     def drop(self, reason: str) -> None:
-        """The connection is open and dead: begin anew."""
+        """Close a connection that is open and silent; ``serve`` makes another one."""
         if self._is_joined:
             self.link.abort(reason)
 
     def close(self) -> None:
-        """End the session; nobody is told."""
+        """End the session; ``on_lost`` is not called."""
         self.link.close()
 
 
-class ControllerSession:
-    """Sends drives and fans, and knows what the session is like.
+class ControllerSession(ReconnectingRobotLink):
+    """The controller's role: numbers drives and fans, and keeps the state of the session.
 
     Args:
-        is_taking_over: somebody else sat here before.
+        is_taking_over: another process had the role before.
 
     Attributes:
-        on_drive: told of each drive that is sent: its number, and the rates of the right and the left wheel, rad/s.
+        on_drive: called with number and rates of the right and the left wheel, rad/s, of each drive that is sent.
         is_new_session: no frame of this session has been served yet.
     """
 
-    def __init__(self, link: ReconnectingRobotLink, *, is_taking_over: bool, frame_hz: float) -> None:
-        self._link, self._is_taking_over, self._frame_hz = link, is_taking_over, frame_hz
+    def __init__(
+        self,
+        cfg: LinkConfig,
+        *,
+        on_sensors: Callable[[Sensors, bytes], None],
+        on_lost: Callable[[str], None],
+        on_joined: Callable[[Hello], None],
+        is_taking_over: bool,
+        frame_hz: float,
+    ) -> None:
+        super().__init__(
+            cfg, role="controller", client="main", on_sensors=on_sensors, on_lost=on_lost, on_joined=on_joined
+        )
+        self._is_taking_over, self._frame_hz = is_taking_over, frame_hz
         self._hello: Hello | None = None
         self._drive_seq = self._fans_seq = 0
         self.on_drive: Callable[[int, float, float], None] = lambda _seq, _right, _left: None
         self.is_lockstep = self.is_new_session = False
 
-    def begin(self, hello: Hello, where: str) -> str:
-        """A session begins, at an address; what people say of it."""
+    def begin(self, hello: Hello) -> str:
+        """A session begins; returns a line for the operator."""
         before, self._hello, self.is_lockstep = self._hello, hello, hello.lockstep
         self.is_new_session = True
-        return f"joined the robot at {where}{'' if before is None else ' again'}"
+        return f"joined the robot at {self._cfg.host}:{self._cfg.port}{'' if before is None else ' again'}"
 
     def has_rebooted(self, hello: Hello) -> bool:
-        """Whether the robot has restarted since the last session; to be asked before ``begin``."""
+        """Whether the robot has restarted since the last session; valid before ``begin``."""
         return self._hello is not None and self._hello.boot != hello.boot
 
     @property
@@ -180,27 +194,26 @@ class ControllerSession:
 
     @property
     def may_lack_verdict(self) -> bool:
-        """Danger may have judged the first frame before this session began, and does so once: the next one will do."""
-        return self.is_new_session and (self._is_taking_over or self._link.sessions > 1)
+        """Danger judges each frame once, the first one of this session perhaps before the session began."""
+        return self.is_new_session and (self._is_taking_over or self.sessions > 1)
 
     def send_drive(self, ack: int, right: float, left: float, steer: float | None = None) -> None:
         """Send wheel rates, rad/s, and the steering angle, rad, where there is one, computed from frame ``ack``."""
         self._drive_seq += 1
         self.on_drive(self._drive_seq, right, left)
-        link = self._link.link
         if steer is None:
-            link.send_drive(self._drive_seq, max(ack, 0), right, left)
+            self.link.send_drive(self._drive_seq, max(ack, 0), right, left)
         else:
-            link.send_drive(self._drive_seq, max(ack, 0), right, left, steer)
+            self.link.send_drive(self._drive_seq, max(ack, 0), right, left, steer)
 
     def send_fans(self, duty: tuple[float, float]) -> None:
         """Send the fans' duties."""
         self._fans_seq += 1
-        self._link.link.send_fans(self._fans_seq, duty)
+        self.link.send_fans(self._fans_seq, duty)
 
 
 class CommandHistory:
-    """Hears of each drive that is sent."""
+    """Drives that were sent: predictor of the motion, and span of the set points for the danger loop."""
 
     def __init__(self, cfg: RobotConfig, frame_hz: float) -> None:
         self._cfg = cfg
@@ -209,7 +222,7 @@ class CommandHistory:
         self.begin(frame_hz)
 
     def begin(self, frame_hz: float) -> None:
-        """A session begins: nothing of the one before is on its way."""
+        """A session begins, without drives that are still to act."""
         self.predictor = CommandPredictor(self._cfg.wheel_lag_s, 1.0 / frame_hz)
 
     def add(self, seq: int, right: float, left: float) -> None:
@@ -220,20 +233,15 @@ class CommandHistory:
         self.predictor.sent(seq, twist.v_m_s, twist.omega_rad_s)
 
     def since_last_estimate(self) -> tuple[tuple[float, float, float, float], int]:
-        """Span of the set points since it was asked for last, rad/s, and the number of the newest drive."""
+        """Span of the set points since the last call, rad/s, and the number of the newest drive."""
         return self._span.take(*self._driven), self._newest
 
 
-# The robot's clock and the host's drift apart by less than this share; a quartz is ten times better.
-MAX_DRIFT = 2e-4
-_NEVER_S = float("inf")
-
-
 class LatenessStatistics:
-    """Measures the lag of each frame against the promptest one lately.
+    """Measures the lag of each frame against the promptest recent one.
 
     The difference of the host's clock to the robot's is least for a frame that was served at once. It may grow by the
-    drift of the clocks; whatever it is above that, the frame is late. What always takes the same time does not show.
+    drift of the clocks; the rest is the frame's lag. A constant delay does not show.
 
     Args:
         late_after_s: a frame served later than this misses its deadline.
@@ -246,20 +254,18 @@ class LatenessStatistics:
 
     def __init__(self, late_after_s: float) -> None:
         self._late_after_s = late_after_s
-        self._t_s, self._wall_s, self._least_s = _NEVER_S, 0.0, 0.0
+        self._t_s, self._wall_s, self._least_s = inf, 0.0, 0.0
         self.missed_deadlines = 0
         self.worst_s = 0.0
 
     def reset(self) -> None:
-        """Begin anew: another session, or another boot."""
-        self._t_s = _NEVER_S
+        """Restart: another session, or another boot."""
+        self._t_s = inf
 
     def add(self, t_s: float, wall_s: float) -> float:
-        """The lag of a frame, s.
+        """The lag of a frame, s, from the robot's time and the host's monotonic clock when the frame is served.
 
-        Args:
-            t_s: the robot's time of the frame; where it runs backwards, the clock was set and lags count anew.
-            wall_s: the host's monotonic clock when the frame is served.
+        Where the robot's time runs backwards, its clock was set and the measurement restarts.
         """
         offset_s = wall_s - t_s
         if t_s < self._t_s:

@@ -23,11 +23,7 @@ FINISHED = (ExitStatus.COMPLETE, ExitStatus.ABORTED)
 
 
 def find_resumable() -> Path | None:
-    """The directory of the run that did not finish, ``None`` where there is none with a mission in it.
-
-    Raises:
-        ConfigError: the note cannot be read.
-    """
+    """The directory of the run that did not finish, ``None`` where there is none with a mission in it."""
     try:
         text = FILE.read_text(encoding="utf-8").strip()
     except FileNotFoundError:
@@ -39,7 +35,7 @@ def find_resumable() -> Path | None:
 
 
 def finished_summary(run_dir: Path) -> dict[str, Any] | None:
-    """The summary of a mission of which every point is measured, ``None`` for any other."""
+    """The summary of a mission whose points are all measured, ``None`` for any other."""
     try:
         summary = json.loads((run_dir / "summary.json").read_text(encoding="utf-8"))
         points = summary["points"]
@@ -50,11 +46,7 @@ def finished_summary(run_dir: Path) -> dict[str, Any] | None:
 
 
 def mark_resumable(run_dir: Path) -> None:
-    """Note that a run has begun.
-
-    Raises:
-        ConfigError: the note cannot be written.
-    """
+    """Note that a run has begun; raises ``ConfigError`` where the note cannot be written."""
     try:
         FILE.parent.mkdir(parents=True, exist_ok=True)
         _write(FILE, f"{run_dir}\n".encode())
@@ -65,7 +57,7 @@ def mark_resumable(run_dir: Path) -> None:
 
 
 def clear_finished(status: int, run_dir: Path) -> None:
-    """Take the note away where the run has finished; emergencies that are in force then stay so in the next one.
+    """Remove the note where the run has finished; keep emergencies that are in force for the next one.
 
     Raises:
         ConfigError: they cannot be kept.
@@ -84,10 +76,10 @@ def clear_finished(status: int, run_dir: Path) -> None:
 
 
 def take_over_emergencies(run_dir: Path) -> bool:
-    """Give a new run the emergencies that were in force when the last one finished; whether there are any.
+    """Copy the emergencies that were in force when the last run finished; returns whether there are any.
 
     Raises:
-        ConfigError: they cannot be read, or not be written.
+        ConfigError: they cannot be read or written.
     """
     try:
         kept = LATCHED_FILE.read_bytes()
@@ -110,7 +102,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _emergencies(path: Path) -> bytes:
-    """The file of a latch as it is, empty where it holds nothing; one that is damaged holds something."""
+    """Content of a latch's file, empty without an active emergency; a damaged file counts as active."""
     try:
         found = path.read_bytes()
     except FileNotFoundError:
@@ -126,16 +118,16 @@ class RunOptions:
     """The command line of ``ccatp run``.
 
     Attributes:
-        sim: start the stand-ins of robot and laser system.
-        config_file: the user's configuration, or ``None`` for the default one.
+        sim: simulate robot and laser system.
         overrides: dotted keys given on the command line (``{"run.seed": 2}``), stronger than the file.
-        realtime: pace the stand-ins on the wall clock instead of in lockstep.
-        run_dir: where the run is written; ``None`` asks for ``default_run_dir``.
-        resume: carry on with the mission in ``run_dir``.
-        recover: carry on, held, with the run that did not finish, or else begin one that may be recovered.
+        realtime: pace the simulation on the wall clock instead of in lockstep.
+        run_dir: ``None`` for ``default_run_dir``.
+        resume: continue the mission in ``run_dir``.
+        held: begin held.
+        recover: continue, held, the run that did not finish, or begin one that can be recovered.
         json_output: the summary goes to standard output as JSON, and nothing else does.
-        runtime_dir: folder of the unix sockets given on the command line, or ``None``.
-        faults_file: plan of faults for the stand-ins, or ``None``; a copy goes into the run directory.
+        runtime_dir: folder of the unix sockets.
+        faults_file: plan of simulated faults; a copy goes into the run directory.
     """
 
     sim: bool
@@ -153,17 +145,12 @@ class RunOptions:
 
     @property
     def is_paced(self) -> bool:
-        """The robot's clock is that of the wall: there is time to sleep between frames."""
+        """The robot follows the wall clock: there is time to sleep between frames."""
         return self.realtime or not self.sim
 
 
 def default_run_dir(mirror: str, seed: int, now_utc: datetime, parent: Path = Path("runs")) -> Path:
-    """Where a run is written when nobody said: ``runs/<UTC time>-<mirror>-s<seed>``.
-
-    Args:
-        mirror: ``run.mirror``, a name or the path of a file.
-        seed: ``run.seed``.
-    """
+    """``runs/<UTC time>-<mirror>-s<seed>``; the mirror is a name or the path of a file."""
     return parent / f"{now_utc:%Y%m%dT%H%M%SZ}-{PurePath(mirror).stem}-s{seed}"
 
 
@@ -174,18 +161,14 @@ TRUTH_SOCKETS = ("truth", "puck")
 
 @contextmanager
 def owned(path: Path, option: str) -> Iterator[None]:
-    """Hold a lock, or say that another daemon does and which ``option`` names another place.
-
-    Raises:
-        RefusedError: it is held.
-    """
+    """Hold a lock; raises ``RefusedError``, which names the ``option`` for another place, where it is held."""
     refusal = f"another ccatp runs in {path.parent}; end it with 'ccatp stop', or give this one its own {option}"
     with locked(path, refusal):
         yield
 
 
 def own_runtime_dir(stack: ExitStack, runtime_dir: Path, *, is_sim: bool) -> None:
-    """Have a runtime directory for ourselves until the end, when our sockets go, too.
+    """Lock a runtime directory until the stack is closed, and remove the sockets then.
 
     Raises:
         RefusedError: another daemon has it, or a simulated robot that runs alone.
@@ -198,11 +181,7 @@ def own_runtime_dir(stack: ExitStack, runtime_dir: Path, *, is_sim: bool) -> Non
 
 
 def new_run_dir(options: RunOptions, name: str, seed: int) -> Path:
-    """The folder of a run that begins anew.
-
-    Raises:
-        ConfigError: it holds a mission already, or cannot be made.
-    """
+    """The directory of a new run; raises ``ConfigError`` where it holds a mission or cannot be made."""
     run_dir = options.run_dir or default_run_dir(name, seed, datetime.now(UTC))
     if (run_dir / "mission.sqlite").exists():
         raise ConfigError(f"--run-dir: {run_dir} holds a mission already; name another folder")
@@ -218,10 +197,10 @@ def _made(run_dir: Path) -> Path:
 
 
 def survey_run_dir(options: RunOptions, cfg: Config) -> Path:
-    """The folder of a survey that begins anew, or is resumed with the points that it was planned with.
+    """The directory of a survey that is new, or resumed with the points that it was planned with.
 
     Raises:
-        ConfigError: what is asked for does not fit what it holds, or it cannot be made.
+        ConfigError: options or configuration contradict its content, or it cannot be made.
     """
     run_dir = options.run_dir or default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC))
     has_mission = (run_dir / "mission.sqlite").exists()
@@ -231,21 +210,16 @@ def survey_run_dir(options: RunOptions, cfg: Config) -> Path:
         )
     if options.resume and not has_mission:
         raise ConfigError(f"--resume: no mission in {run_dir}; name the folder of the run with --run-dir")
-    if options.resume:
-        _check_resumed(run_dir, cfg)
-    return _made(run_dir)
-
-
-def _check_resumed(run_dir: Path, cfg: Config) -> None:
-    """A mission goes on with the points it was planned with."""
     path = run_dir / "config.toml"
-    if not path.exists():
-        return
-    before = load_config(path)
-    for name, was, wanted in (
-        ("run.mirror", before.mirror.name, cfg.mirror.name),
-        ("run.order", before.run.order, cfg.run.order),
-        ("run.panels", before.run.panels, cfg.run.panels),
-    ):
-        if was != wanted:
-            raise ConfigError(f"--resume: {name} was {was} in {run_dir} and is {wanted} now; resume with what it was")
+    if options.resume and path.exists():
+        before = load_config(path)
+        for name, was, wanted in (
+            ("run.mirror", before.mirror.name, cfg.mirror.name),
+            ("run.order", before.run.order, cfg.run.order),
+            ("run.panels", before.run.panels, cfg.run.panels),
+        ):
+            if was != wanted:
+                raise ConfigError(
+                    f"--resume: {name} was {was} in {run_dir} and is {wanted} now; resume with what it was"
+                )
+    return _made(run_dir)

@@ -12,10 +12,9 @@ SOCKET, WATCHDOG_USEC, WATCHDOG_PID = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDO
 
 
 class Notifier:
-    """Sends lines like ``READY=1`` to the service manager, or to nobody where none listens.
+    """Sends lines like ``READY=1`` to the service manager, if there is one.
 
-    Args:
-        address: its datagram socket: a path, or a name in the abstract namespace behind ``@``; empty for none.
+    ``address`` is its datagram socket: a path, or a name in the abstract namespace behind ``@``; empty for none.
     """
 
     def __init__(self, address: str) -> None:
@@ -23,7 +22,7 @@ class Notifier:
         self.has_listener = address.startswith(("@", "/"))
 
     def send(self, *lines: str) -> None:
-        """Send one datagram. A service manager that is gone or does not read holds nobody up."""
+        """Send one datagram, without waiting for a service manager that does not read."""
         if not self.has_listener:
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as peer:
@@ -33,7 +32,7 @@ class Notifier:
 
 
 def watchdog_period_s(environ: Mapping[str, str]) -> float | None:
-    """How often the service manager wants to hear ``WATCHDOG=1`` from this process; ``None`` where it does not."""
+    """Period in which the service manager expects ``WATCHDOG=1`` from this process; ``None`` where it does not."""
     text = environ.get(WATCHDOG_USEC, "")
     if environ.get(WATCHDOG_PID, str(os.getpid())) != str(os.getpid()) or not text.isdecimal() or int(text) == 0:
         return None
@@ -41,7 +40,7 @@ def watchdog_period_s(environ: Mapping[str, str]) -> float | None:
 
 
 def take_from(environ: MutableMapping[str, str]) -> tuple[Notifier, float | None]:
-    """Notifier and watchdog period, taken out of the environment: they are not the children's."""
+    """Notifier and watchdog period; their variables are removed, because the children must not use them."""
     notifier, period_s = Notifier(environ.get(SOCKET, "")), watchdog_period_s(environ)
     for name in (SOCKET, WATCHDOG_USEC, WATCHDOG_PID):
         environ.pop(name, None)
@@ -49,16 +48,12 @@ def take_from(environ: MutableMapping[str, str]) -> tuple[Notifier, float | None
 
 
 STATUS_PERIOD_S = 1.0
-# Strokes in a watchdog period, and the part of it after which silence of a loop withholds them.
+# Messages in a watchdog period, and the part of it after which silence of a loop withholds them.
 STROKES, STALE_SHARE = 4.0, 0.5
 
 
 class Service:
-    """Tells the service manager what the supervisor hears.
-
-    Args:
-        watchdog_s: its watchdog's period, ``None`` without one.
-    """
+    """Reports the state of the run to the service manager; ``watchdog_s`` is None without a watchdog."""
 
     def __init__(self, notifier: Notifier, watchdog_s: float | None) -> None:
         self._notifier, self._watchdog_s = notifier, watchdog_s
@@ -68,15 +63,11 @@ class Service:
         self._text = ""
 
     def on_heartbeat(self, heartbeat: Heartbeat) -> None:
-        """A loop is there."""
+        """A heartbeat was received."""
         self._liveness.update(heartbeat)
 
     def update(self, now_s: float, status: MissionStatus | None, *, is_recovering: bool = False) -> None:
-        """Tell what is due.
-
-        Args:
-            is_recovering: the supervisor has just started a process anew; the manager is not to end all of it.
-        """
+        """Send due messages; while ``is_recovering`` from a restart the watchdog is served in any case."""
         if not self._notifier.has_listener:
             return
         if not self._is_ready:

@@ -1,16 +1,15 @@
 """The process of the simulated MultiLine server."""
 
 import asyncio
-import os
 import socket
 import sys
 
 import numpy as np
 
+from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.core import Vector3
-from ccatp.daemon import realtime as spinning
-from ccatp.daemon.process import die_with_parent, parse_args, stop_on_signals
+from ccatp.daemon.process import start_process, stop_on_signals
 from ccatp.errors import ConfigError
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck, PuckSource, ZmqPuck
@@ -47,17 +46,17 @@ async def _serve(cfg: Config, truth: PuckSource, listener: socket.socket | None,
 
 def main() -> int:
     """Entry of ``python -m ccatp.daemon.sim_etalon``."""
-    die_with_parent()
-    args = parse_args()
-    if not args.is_realtime:
-        spinning.leave_a_core(os.getppid())
+    args = start_process()
+    cfg = args.config
+    if isinstance(cfg, RadioConfig):
+        raise TypeError("a mission among beacons has no laser system")
 
     async def run() -> None:
         stop = asyncio.Event()
         stop_on_signals(stop)
         truth = ZmqPuck(args.endpoints.of("puck"))
         try:
-            await _serve(args.config, truth, socket.socket(fileno=args.listen_fd), stop)
+            await _serve(cfg, truth, socket.socket(fileno=args.listen_fd), stop)
         finally:
             truth.close()
 
@@ -68,8 +67,7 @@ def main() -> int:
 def run_alone(cfg: Config, puck_world_m: Vector3 | None, truth: str | None) -> int:
     """The simulated server alone, for other controllers; ends on SIGINT or SIGTERM.
 
-    Args:
-        puck_world_m: a puck that stands still there, world frame; at base where neither this nor ``truth`` is given.
+    The puck stands still at ``puck_world_m`` (world frame), or follows ``truth``; at base where neither is given.
     """
 
     async def run() -> None:

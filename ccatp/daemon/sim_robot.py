@@ -15,7 +15,7 @@ import structlog
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.daemon import realtime
-from ccatp.daemon.process import FAULTS_FILE, Endpoints, die_with_parent, open_log, parse_either, stop_on_signals
+from ccatp.daemon.process import FAULTS_FILE, Endpoints, open_log, start_process, stop_on_signals
 from ccatp.dataloop import serve, serve_beacons
 from ccatp.errors import ConfigError
 from ccatp.links.robot_link import read_key
@@ -28,24 +28,21 @@ Serve = Callable[..., Coroutine[Any, Any, None]]
 
 def main() -> int:
     """Entry of ``python -m ccatp.daemon.sim_robot``."""
-    die_with_parent()
-    either = parse_either()
-    args = either.survey or either.one_of_beacons
+    args = start_process()
+    cfg = args.config
     serve_robot: Serve
-    if either.survey is None:
-        serve_robot = partial(serve_beacons, either.one_of_beacons.config)
+    if isinstance(cfg, RadioConfig):
+        serve_robot = partial(serve_beacons, cfg)
     else:
-        survey = either.survey
+        plan = args.run_dir / FAULTS_FILE
         serve_robot = partial(
             serve,
-            survey.config,
-            seed=survey.config.run.seed,
-            faults=read_plan(args.run_dir / FAULTS_FILE, lockstep=not args.is_realtime) if survey.has_faults else None,
+            cfg,
+            seed=cfg.run.seed,
+            faults=read_plan(plan, lockstep=not args.is_realtime) if args.has_faults else None,
             body_file=args.run_dir / FILE,
-            is_resuming=survey.is_resuming,
+            is_resuming=args.is_resuming,
         )
-    if not args.is_realtime:
-        realtime.leave_a_core(os.getppid())
 
     async def run() -> int:
         stop = asyncio.Event()
@@ -56,7 +53,7 @@ def main() -> int:
             listen_sock=socket.socket(fileno=args.listen_fd),
             truth_rep=args.endpoints.of("puck"),
             truth_pub=args.endpoints.of("truth"),
-            key=read_key(args.config.robot.key_file),
+            key=read_key(cfg.robot.key_file),
             log=open_log(args.run_dir / "log.jsonl", "dataloop"),
         )
         return 0

@@ -21,8 +21,7 @@ from ccatp.links.bus import Subscriber
 from ccatp.links.runtime_dir import runtime_dir_path
 from ccatp.links.topics import BY_NAME, Heartbeat, Message, schema_of
 from ccatp.mirror.mirror import build_mirror
-from ccatp.records.recorder import read_metadata
-from ccatp.records.recording_repair import TELEMETRY
+from ccatp.records.recorder import TELEMETRY, read_metadata
 from ccatp.report.foxglove import VIEWS, ViewMessage, Views, plain_schema, view_schemas
 from ccatp.report.live import FoxgloveStream, LiveStream, PlotJugglerStream, check_host
 
@@ -53,7 +52,7 @@ def streamed_schemas() -> list[tuple[str, dict[str, object]]]:
 
 
 class Streamer:
-    """Passes the messages of the runs of a runtime directory on to the streams."""
+    """Forwards the messages of the runs of a runtime directory to the streams."""
 
     def __init__(
         self,
@@ -70,7 +69,7 @@ class Streamer:
         self._pid = -1
 
     def step(self) -> None:
-        """Wait for ``PERIOD_MS`` at most, and pass on the messages that have arrived."""
+        """Wait for ``PERIOD_MS`` at most, and forward the messages that have arrived."""
         sockets = [self._heartbeats.socket, *([] if self._run is None else [self._run.socket])]
         poller = zmq.Poller()
         for socket in sockets:
@@ -143,7 +142,6 @@ def serve(
     """Stream until SIGINT or SIGTERM.
 
     Args:
-        runtime_dir: of the runs, if not the default one.
         plotjuggler_port, foxglove_port: 0 takes any free one, ``None`` serves none.
         is_open: the host may be an address of the network.
 
@@ -162,9 +160,13 @@ def serve(
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         stack.callback(context.term)
         streams: list[LiveStream] = []
-        for stream in _streams(context, host, plotjuggler_port, foxglove_port):
-            stack.callback(stream.close)
-            streams.append(stream)
+        if plotjuggler_port is not None:
+            streams.append(PlotJugglerStream(context, host, plotjuggler_port))
+            stack.callback(streams[-1].close)
+        if foxglove_port is not None:
+            streams.append(FoxgloveStream("ccatp", host, foxglove_port, streamed_schemas()))
+            stack.callback(streams[-1].close)
+        for stream in streams:
             say(f"serving at {stream.where}")
         streamer = Streamer(context, folder, streams, say)
         stack.callback(streamer.close)
@@ -175,14 +177,3 @@ def serve(
         while not is_over:
             streamer.step()
     return 0
-
-
-def _streams(
-    context: "zmq.Context[zmq.Socket[bytes]]", host: str, plotjuggler_port: int | None, foxglove_port: int | None
-) -> "list[LiveStream]":
-    found: list[LiveStream] = []
-    if plotjuggler_port is not None:
-        found.append(PlotJugglerStream(context, host, plotjuggler_port))
-    if foxglove_port is not None:
-        found.append(FoxgloveStream("ccatp", host, foxglove_port, streamed_schemas()))
-    return found

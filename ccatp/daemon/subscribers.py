@@ -1,4 +1,4 @@
-"""Heartbeats, and what each loop receives of the other one; in lockstep it waits for the message of its frame."""
+"""Heartbeats, verdicts for main and estimates for danger; in lockstep a loop waits for the message of its frame."""
 
 import os
 import time
@@ -10,22 +10,18 @@ from ccatp.core import Verdict
 from ccatp.links.bus import Publisher, Subscriber
 from ccatp.links.topics import EstimateMessage, Heartbeat, Message, last_estimate_before
 
-# In lockstep simulated time stands still while we wait; longer than this the other loop hangs.
+# In lockstep simulated time stands still while a loop waits; longer than this the other loop hangs.
 LOCKSTEP_WAIT_S = 10.0
-# How long to wait at a time: in between we are seen alive, and see whether the other one is gone.
+# Between slices the heartbeat is sent, and the connection to the other loop is checked.
 WAIT_SLICE_S = 0.02
-# Danger is at most a few frames ahead of main: a number far beyond ours is of the robot's last boot.
+# Danger is at most a few frames ahead of main: a number far beyond the present one is of the robot's last boot.
 MAX_FRAMES_AHEAD = 100
 
 
 def await_message(
     subscriber: Subscriber, is_it: Callable[[Message | Verdict], bool], on_wait: Callable[[], None]
 ) -> None:
-    """Receive messages until the one that lockstep waits for; not for ever, and not for a process that is gone.
-
-    Args:
-        is_it: takes each message; whether it was the one.
-    """
+    """Receive messages until ``is_it`` returns True for one, the other process is gone, or the time is up."""
     deadline = time.monotonic() + LOCKSTEP_WAIT_S
     while True:
         received = subscriber.receive(WAIT_SLICE_S)
@@ -39,11 +35,7 @@ def await_message(
 
 
 class VerdictSubscriber:
-    """Listens to the danger loop.
-
-    Args:
-        on_wait: called now and then while lockstep waits for a verdict.
-    """
+    """Receives the verdicts; ``on_wait`` is called now and then while lockstep waits for one."""
 
     def __init__(
         self,
@@ -58,7 +50,7 @@ class VerdictSubscriber:
         self.verdict: Verdict | None = None
 
     def is_danger_joined(self) -> bool:
-        """Whether it says that it has joined the robot; it repeats that."""
+        """Whether danger has reported that it joined the robot; it repeats that."""
         while (received := self._subscriber.receive()) is not None:
             message = received[1]
             if isinstance(message, Heartbeat) and message.phase == "joined":
@@ -66,20 +58,15 @@ class VerdictSubscriber:
         return False
 
     def maintain(self) -> None:
-        """Keep the connection up where nothing is heard for long."""
+        """Renew a connection that is silent for long."""
         self._subscriber.maintain()
 
     def reset(self) -> None:
-        """The robot's frames count anew: the verdict in force is of another time."""
+        """The robot's frames restarted: forget the verdict."""
         self.verdict = None
 
     def latest(self, seq: int, frame_s: float, *, is_lockstep: bool) -> Verdict | None:
-        """The verdict in force: in lockstep that of this very frame, else the newest that is fresh.
-
-        Args:
-            seq: the present frame.
-            is_lockstep: wait for the verdict on ``seq``.
-        """
+        """The verdict in force for frame ``seq``: in lockstep that of this frame, else the newest that is fresh."""
         newest = seq + MAX_FRAMES_AHEAD
 
         def take(message: Message | Verdict) -> bool:
@@ -107,11 +94,11 @@ class VerdictSubscriber:
 
 
 class EstimateSubscriber:
-    """Listens to main.
+    """Receives main's estimates.
 
     Args:
         on_wait: called now and then while lockstep waits for an estimate.
-        is_taking_over: of the frame that it meets, a process that takes over may have missed the estimate.
+        is_taking_over: the estimate for the first frame may have been missed.
     """
 
     def __init__(
@@ -127,31 +114,27 @@ class EstimateSubscriber:
         self.reset()
 
     def has_received(self) -> bool:
-        """Whether anything was heard of it."""
+        """Whether a message was received."""
         return self._subscriber.receive() is not None
 
     def maintain(self) -> None:
-        """Keep the connection up where nothing is heard for long."""
+        """Renew a connection that is silent for long."""
         self._subscriber.maintain()
 
     def reset(self) -> None:
-        """The robot's frames count anew: what was heard is of another time."""
+        """The robot's frames restarted: forget the estimate."""
         self._newest: EstimateMessage | None = None
         self._judged_frame = self._judged = self._first_seq = -1
 
     def latest(self, seq: int, *, is_lockstep: bool) -> EstimateMessage | None:
-        """The estimate to judge a frame with: in lockstep always the same one, else the newest.
+        """The estimate to judge frame ``seq`` with: in lockstep always the same one, else the newest.
 
         Where several waited, after a stall, the newest counts, but the drives of each have moved the wheels:
         ``commanded`` spans those of all that no frame was judged with.
-
-        Args:
-            seq: the frame.
-            is_lockstep: wait for the estimate that goes with ``seq``.
         """
 
         def take(message: Message | Verdict) -> bool:
-            # One of a frame that we have not seen is of the robot's last boot.
+            # An estimate for a frame far ahead is of the robot's last boot.
             if not isinstance(message, EstimateMessage) or message.seq > seq + MAX_FRAMES_AHEAD:
                 return False
             missed = self._newest if self._newest_seq > self._judged else None
@@ -183,7 +166,7 @@ PERIOD_S = 0.1
 
 
 class HeartbeatPublisher:
-    """Tells the heartbeat of one process.
+    """Publishes the heartbeat of one process.
 
     Attributes:
         phase: starting, ready, joined, rejoining (the robot is away), done.
@@ -198,11 +181,11 @@ class HeartbeatPublisher:
 
     @property
     def frame_age_s(self) -> float | None:
-        """Since the newest frame was served."""
+        """Time since the newest frame was served."""
         return None if self.frame_s is None else time.monotonic() - self.frame_s
 
     def publish(self) -> None:
-        """Tell it now."""
+        """Publish now."""
         self._published_s = now_s = time.monotonic()
         heartbeat = Heartbeat(
             seq=self._count,
@@ -216,6 +199,6 @@ class HeartbeatPublisher:
         self._count += 1
 
     def publish_if_due(self) -> None:
-        """Tell it if it has been a while."""
+        """Publish if it is due."""
         if time.monotonic() - self._published_s >= PERIOD_S:
             self.publish()

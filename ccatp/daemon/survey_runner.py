@@ -1,17 +1,19 @@
 """The survey of a mirror in the main-loop process: localizer, mission, gate, laser system, fans, store."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from ccatp.config.models import Config
+from ccatp.control.gate import Denial, DriveGate, FanGate
 from ccatp.control.motion_checks import as_standing
 from ccatp.core import Verdict
 from ccatp.daemon.checkpoints import CheckpointWriter, build_parts
 from ccatp.daemon.fix_service import FixRequest, FixService
-from ccatp.daemon.frame_service import FanController, GateLog
 from ccatp.daemon.mission_runner import (
+    EXIT_STATUS,
     STILL,
     DriveCommand,
+    MissionRunner,
     RunnerConfig,
     RunnerContext,
     RunnerFactory,
@@ -19,90 +21,74 @@ from ccatp.daemon.mission_runner import (
 )
 from ccatp.daemon.process import ProcessArgs
 from ccatp.daemon.robot_session import CommandHistory
-from ccatp.daemon.telemetry import SurveyTelemetry, TelemetryPublisher
+from ccatp.daemon.telemetry import SurveyTelemetry
 from ccatp.errors import DaemonUnreachableError, ExitStatus
 from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.links.robot_messages import Hello, Sensors
-from ccatp.links.topics import MissionStatus, is_estimate_due
+from ccatp.links.topics import MissionStatus, TreatmentKind, is_estimate_due
 from ccatp.records.store import MissionStore
 from ccatp.survey.behaviours import home_time_s
 from ccatp.survey.composition import SurveyParts
 from ccatp.survey.fix_gate import FixGate
+from ccatp.survey.mission import Mission
 from ccatp.survey.reactions import MirrorCheck, ReminderCall, UnattendedFaultTimer
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.state import MissionState, SurveyOutcome, by_reason
 from ccatp.survey.stops import HOLD_POSITION, MissionCommand
 
 
-class SurveyWatch:
-    """Tells states, reminds of faults, and sends a robot home that nobody comes for."""
-
-    def __init__(self, cfg: Config, parts: SurveyParts, telemetry: TelemetryPublisher) -> None:
-        """Nothing to look after."""
-        self._limits, self._base = cfg.limits, parts.mirror.base_pose
-        self._mission, self._localizer, self._telemetry = parts.mission, parts.localizer, telemetry
-        self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
-
-    def check_unattended_fault(self, sensors: Sensors) -> None:
-        """A fault that nobody looks after: an alarm now and then, and home before the battery is too low for it."""
-        mission, timer, pose = self._mission, self._fault_timer, self._localizer.deck_pose
-        knows_place = not (mission.is_lost or self._localizer.is_frozen)
-        home_s = home_time_s(self._base, self._limits, pose.x_m, pose.y_m) if knows_place else None
-        call = timer.watch(sensors.t, sensors.soc, home_s)
-        if call is ReminderCall.REMIND:
-            held_s = timer.held_s(sensors.t)
-            self._telemetry.notify_operator(
-                "error", f"held for {held_s:.0f} s, waiting for an operator: {mission.cause}"
-            )
-        elif call is ReminderCall.RETURN:
-            mission.abort(f"unattended fault: the battery ({sensors.soc:.0%}) lasts for little more than the way home")
-
-    def publish_state_change(self, before: MissionState, seq: int) -> None:
-        """The mission's state is another one than before, in frame ``seq``."""
-        mission, telemetry = self._mission, self._telemetry
-        if not mission.is_faulted:
-            self._fault_timer.over()
-        telemetry.log.debug("state_changed", seq=seq, before=before, after=mission.state, cause=mission.cause)
-        if mission.state in (MissionState.HELD, MissionState.BACKING_OFF) or before is MissionState.HELD:
-            telemetry.notify_operator("warning", state_text(mission.state, mission.cause))
-        if mission.state is MissionState.RETURNING and before is not MissionState.BACKING_OFF:
-            telemetry.notify_operator("warning", f"returning to base: {mission.cause}")
-
-
 def state_text(state: MissionState, cause: str) -> str:
-    """What is said of the state in which a mission is held, or of the one after that."""
+    """Text for the state in which a mission is held, or for the one after that."""
     if cause:
         return f"{state}: {cause}"
-    return (
-        f"{state}"
-        if state in (MissionState.HELD, MissionState.BACKING_OFF, MissionState.DONE)
-        else f"going on: {state}"
-    )
+    is_end = state in (MissionState.HELD, MissionState.BACKING_OFF, MissionState.DONE)
+    return f"{state}" if is_end else f"going on: {state}"
 
 
 GIVEN_UP = "the calibration drive is left out, as the robot was held elsewhere: slip and heading are learned on the way"
-EXIT_STATUS = {
-    SurveyOutcome.COMPLETE: ExitStatus.COMPLETE,
-    SurveyOutcome.AT_BASE: ExitStatus.ABORTED,
-    SurveyOutcome.STOPPED: ExitStatus.HELD,
-    SurveyOutcome.NONE: ExitStatus.INTERRUPTED,
-}
+FULL_FANS = (1.0, 1.0)
+DENIAL_REPEAT_S = 1.0
 
 
-class SurveyRunner:
-    """A survey as the main-loop process hosts it."""
+class GateLog:
+    """Reports denials of the gate, the same one at most once in ``DENIAL_REPEAT_S``."""
+
+    def __init__(self, gate: DriveGate, notify: Callable[[str, str], None]) -> None:
+        self._gate, self._notify = gate, notify
+        self._logged_s: dict[Denial, float] = {}
+
+    def update(self, t_s: float) -> None:
+        """Report a drive denied in the frame of robot time ``t_s``."""
+        denial = self._gate.denial
+        if denial is None:
+            return
+        logged_s = self._logged_s.get(denial)
+        # A clock that went back must not silence it.
+        if logged_s is not None and 0.0 <= t_s - logged_s < DENIAL_REPEAT_S:
+            return
+        self._logged_s[denial] = t_s
+        self._notify("warning", f"drive denied: {denial} ({self._gate.denied[denial]} so far)")
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of denials by the reason, without zeros."""
+        return {denial.name.lower(): count for denial, count in self._gate.denied.items() if count}
+
+
+class SurveyRunner(MissionRunner):
+    """A survey in the main-loop process."""
+
+    mission: Mission
+    telemetry: SurveyTelemetry
 
     def __init__(self, cfg: Config, context: RunnerContext, parts: SurveyParts, store: MissionStore) -> None:
+        super().__init__(parts.mission, SurveyTelemetry(context.publisher, context.log))
         self._cfg, self._context, self._parts, self._store = cfg, context, parts, store
         self._mirror, self._localizer, self._gate = parts.mirror, parts.localizer, parts.gate
-        self._mission = mission = parts.mission
         self._session, self._clock = context.session, context.clock
         self._clock.resume_at(parts.elapsed_s)
-        self._telemetry = telemetry = SurveyTelemetry(context.publisher, context.log)
-        self._gate_log = GateLog(self._gate, telemetry.notify_operator)
-        self._fans = FanController(
-            cfg.robot.fan_duty, self._session, mission, telemetry, has_floor=bool(parts.mirror.overhang)
-        )
+        self._gate_log = GateLog(self._gate, self.telemetry.notify_operator)
+        self._fan_gate, self._has_full_fans = FanGate(0.0), False
         self._commands = CommandHistory(cfg.robot, cfg.sim.robot.frame_hz)
         self._session.on_drive = self._commands.add
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
@@ -111,44 +97,26 @@ class SurveyRunner:
             self._etalon,
             FixGate(parts.mirror, cfg),
             parts.localizer,
-            mission,
+            self.mission,
             store,
-            telemetry,
+            self.telemetry,
             context.answer,
             # lockstep time stands still meanwhile
             lambda: 0.0 if self._session.is_lockstep else cfg.etalon.measuring_time_s,
         )
-        self._checkpoint = CheckpointWriter(context.run_dir, parts.localizer, mission, is_patient=context.is_patient)
-        self._watch = SurveyWatch(cfg, parts, telemetry)
+        self._checkpoint = CheckpointWriter(context.run_dir, parts.localizer, self.mission, context.is_patient)
+        self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
         self._recovery = parts.recovery
         self._is_odometry_off = False
         self._state = MissionState.IDLE
         self._motion: StateEstimate | None = None
         self._has_reported_calibration = False
-        self._sent_commands: tuple[tuple[float, float, float, float], int] | None = None
-        # An operator's commands are the mission's; so is what holds it.
-        self.pause, self.resume, self.abort, self.stop = mission.pause, mission.resume, mission.abort, mission.stop
-        self.interrupt, self.on_tracking_gap = mission.interrupt, mission.lose_sight
-
-    @property
-    def telemetry(self) -> SurveyTelemetry:
-        """Tells the others."""
-        return self._telemetry
-
-    @property
-    def cause(self) -> str:
-        """Why it is held."""
-        return self._mission.cause
-
-    @property
-    def is_paused(self) -> bool:
-        """Held until somebody resumes."""
-        return self._mission.is_paused
+        self._sent_commands: tuple[tuple[float, float, float, float] | None, int] = (None, -1)
 
     @property
     def is_busy(self) -> bool:
-        """A measurement is under way."""
+        """A measurement is in progress."""
         return self._fix_service.is_busy
 
     @property
@@ -161,8 +129,8 @@ class SurveyRunner:
         )
 
     def status(self) -> MissionStatus:
-        """Progress of the mission."""
-        mission = self._mission
+        """See ``MissionRunner``."""
+        mission = self.mission
         stop = mission.journey.current
         point = stop.point if stop is not None else None
         if mission.is_paused:
@@ -186,21 +154,17 @@ class SurveyRunner:
     # -- beside the frames ----------------------------------------------------------------------------------------
 
     async def connect(self) -> None:
-        """Connect to the laser system.
-
-        Raises:
-            UnreachableError: it does not answer.
-        """
+        """Connect to the laser system; raises ``UnreachableError`` where it does not answer."""
         try:
             await self._etalon.connect()
         except EtalonError as error:
             raise DaemonUnreachableError(str(error)) from error
 
     def _on_retry(self, error: EtalonError, tries_left: int) -> None:
-        self._telemetry.log.warning("etalon_retry", error=str(error), tries_left=tries_left)
+        self.telemetry.log.warning("etalon_retry", error=str(error), tries_left=tries_left)
 
     async def run(self) -> None:
-        """Take measurements, for ever."""
+        """Take measurements, until cancelled."""
         await self._fix_service.run()
 
     async def close(self) -> None:
@@ -209,44 +173,53 @@ class SurveyRunner:
         await self._etalon.close()
 
     def check_robot(self, hello: Hello) -> None:
-        """Refuse a robot whose own geometry contradicts the configuration."""
+        """See ``MissionRunner``."""
         self._parts.check_robot(hello)
 
     def begin_session(self, hello: Hello) -> None:
-        """A session begins."""
+        """See ``MissionRunner``."""
         self._commands.begin(hello.frame_hz)
         self._checkpoint.boot = hello.boot
-        self._fans.begin(hello.robot.fan_floor)
+        # The robot's own floor counts where the mirror overhangs.
+        self._fan_gate = FanGate(hello.robot.fan_floor if self._mirror.overhang else 0.0)
 
     def begin_drives(self) -> None:
-        """The fans, before the first drive."""
-        self._fans.send()
+        """Send the fans' duties, before the first drive."""
+        duty = FULL_FANS if self._has_full_fans else self._cfg.robot.fan_duty
+        refusal = self._fan_gate.refusal(*duty)
+        if refusal is None:
+            self._session.send_fans(duty)
+        else:
+            self.telemetry.notify_operator("error", refusal)
+            self.mission.fault(refusal)
+
+    def on_tracking_gap(self) -> None:
+        """See ``MissionRunner``."""
+        self.mission.lose_sight()
 
     def save_checkpoint(self) -> None:
-        """Write down what a successor needs."""
+        """See ``MissionRunner``."""
         self._checkpoint.write(self._clock.seq, self._clock.t_s, self._clock.elapsed_s)
 
-    def publish_state(self) -> None:
-        """Tell a state that is new, and end where that is the end."""
-        if self._mission.state is not self._state:
-            self._on_state_change()
-
     def log_statistics(self) -> None:
-        """What the gates refused."""
-        self._telemetry.log.info("gate_statistics", denied=self._gate_log.counts, fans_refused=self._fans.refused)
+        """Log how often the gates refused, by the reason."""
+        self.telemetry.log.info("gate_statistics", denied=self._gate_log.counts, fans_refused=self._fan_gate.refused)
 
     # -- the frame ------------------------------------------------------------------------------------------------
 
     def estimate(self, frame: TimedFrame) -> None:
-        """The frame's samples go to the localizer, or as much of them as is to be believed."""
-        sensors, mission, localizer = frame.sensors, self._mission, self._localizer
-        self._publish_beginning(sensors)
+        """Give the frame's samples to the localizer, as far as they can be trusted."""
+        sensors, mission, localizer = frame.sensors, self.mission, self._localizer
+        recovery, self._recovery = self._recovery, None
+        if recovery is not None:  # a replay has to know where the localizer of a loop that takes over begins
+            pose, sigmas = recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad)
+            values = (pose.x_m, pose.y_m, pose.heading_rad, *sigmas)
+            self.telemetry.publish_treatment(sensors.seq, sensors.t, "begun", values)
         is_odometry_off = mission.ignores_motion
         if is_odometry_off is not self._is_odometry_off:
             self._is_odometry_off = is_odometry_off
-            self._telemetry.publish_treatment(
-                sensors.seq, sensors.t, "odometry_off" if is_odometry_off else "odometry_on"
-            )
+            kind: TreatmentKind = "odometry_off" if is_odometry_off else "odometry_on"
+            self.telemetry.publish_treatment(sensors.seq, sensors.t, kind)
         imu, enc = ((), as_standing(sensors.enc)) if is_odometry_off else (sensors.imu, sensors.enc)
         localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
         if localizer.hold_requested:
@@ -254,14 +227,6 @@ class SurveyRunner:
             mission.recover(localizer.hold_cause, frame.t_s)
             localizer.clear_hold()
         self._motion = self._state_estimate(frame) if frame.dt_s > 0.0 else None
-
-    def _publish_beginning(self, sensors: Sensors) -> None:
-        """Where the localizer of a loop that takes over begins: who replays the run has to know."""
-        recovery, self._recovery = self._recovery, None
-        if recovery is not None:
-            pose, sigmas = recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad)
-            values = (pose.x_m, pose.y_m, pose.heading_rad, *sigmas)
-            self._telemetry.publish_treatment(sensors.seq, sensors.t, "begun", values)
 
     def _state_estimate(self, frame: TimedFrame) -> StateEstimate:
         localizer, echo = self._localizer, frame.sensors.cmd
@@ -276,8 +241,8 @@ class SurveyRunner:
         return self._localizer.position_sigma_m
 
     def plan(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
-        """What the mission wants, as far as the gate lets it through."""
-        mission, motion = self._mission, self._motion
+        """The mission's velocity, as far as the gate permits it."""
+        mission, motion = self.mission, self._motion
         if motion is None:
             raise RuntimeError("plan comes after estimate, and not for a stale frame")
         command = mission.step(motion, verdict) if self._is_on_mirror(frame.sensors) else HOLD_POSITION
@@ -290,17 +255,16 @@ class SurveyRunner:
         return DriveCommand(right, left)
 
     def hold(self, frame: TimedFrame) -> DriveCommand:
-        """The robot stands, and nothing is decided in this frame."""
+        """See ``MissionRunner``."""
         self._note_commands(frame)
         return STILL
 
     def _note_commands(self, frame: TimedFrame) -> None:
-        """What the wheels were told since the last estimate, where one is due."""
         is_due = frame.is_first or is_estimate_due(frame.sensors.seq)
-        self._sent_commands = self._commands.since_last_estimate() if is_due else None
+        self._sent_commands = self._commands.since_last_estimate() if is_due else (None, -1)
 
     def _is_on_mirror(self, sensors: Sensors) -> bool:
-        """Whether the robot may move, as far as gravity knows: it stands on the mirror of the configuration.
+        """Whether gravity permits motion: the robot stands on the mirror of the configuration.
 
         In lockstep the mission begins at once, and ends when gravity contradicts: nothing real can be harmed, and a run
         stays the same function of its seed.
@@ -311,37 +275,52 @@ class SurveyRunner:
         if check.hear(sensors.t, sensors.gravity, self._localizer.deck_pose):
             self._mirror_check = None
             if check.warning:
-                self._telemetry.notify_operator("warning", check.warning)
+                self.telemetry.notify_operator("warning", check.warning)
         if check.contradiction:
-            self._telemetry.notify_operator("error", check.contradiction)
+            self.telemetry.notify_operator("error", check.contradiction)
             self._context.finish(ExitStatus.USAGE)
             return False
         return self._mirror_check is None or self._session.is_lockstep
 
     def _apply_requests(self, sensors: Sensors) -> None:
-        """What the mission wants besides the drive, before that is sent."""
-        mission, health = self._mission, self._cfg.health
+        """Requests of the mission besides the drive, before that is sent."""
+        mission, health = self.mission, self._cfg.health
         if mission.doubts_pose:
             mission.doubts_pose = False
             doubt = health.doubt_position_m, health.doubt_heading_rad
             self._localizer.doubt(*doubt)
-            self._telemetry.publish_treatment(sensors.seq, sensors.t, "doubted", doubt)
+            self.telemetry.publish_treatment(sensors.seq, sensors.t, "doubted", doubt)
         if mission.wants_calibration and not self._has_reported_calibration:
             self._has_reported_calibration = True
-            self._telemetry.notify_operator("warning", GIVEN_UP)
-        if mission.wants_full_fans:
-            self._fans.set_full()  # pressed on first, held then
+            self.telemetry.notify_operator("warning", GIVEN_UP)
+        if mission.wants_full_fans and not self._has_full_fans:  # pressed on first, held then
+            self._has_full_fans = True
+            self.begin_drives()
         if mission.is_faulted:
-            self._watch.check_unattended_fault(sensors)
+            self._check_unattended_fault(sensors)
+
+    def _check_unattended_fault(self, sensors: Sensors) -> None:
+        """An alarm now and then, and the return to base before the battery is too low for it."""
+        mission, timer, pose = self.mission, self._fault_timer, self._localizer.deck_pose
+        knows_place = not (mission.is_lost or self._localizer.is_frozen)
+        home_s = home_time_s(self._mirror.base_pose, self._cfg.limits, pose.x_m, pose.y_m) if knows_place else None
+        call = timer.watch(sensors.t, sensors.soc, home_s)
+        if call is ReminderCall.REMIND:
+            held_s = timer.held_s(sensors.t)
+            self.telemetry.notify_operator(
+                "error", f"held for {held_s:.0f} s, waiting for an operator: {mission.cause}"
+            )
+        elif call is ReminderCall.RETURN:
+            mission.abort(f"unattended fault: the battery ({sensors.soc:.0%}) lasts for little more than the way home")
 
     def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
-        mission, seq = self._mission, self._clock.seq
+        mission, seq = self.mission, self._clock.seq
         if command.at_rest:
             self._localizer.rest()
-            self._telemetry.publish_rest(seq, motion.t_s)
+            self.telemetry.publish_rest(seq, motion.t_s)
         if command.arrived is not None:
             error_m = mission.survey.distance_m(motion.pose)
-            self._telemetry.publish_arrival(seq, motion.t_s, command.arrived, error_m)
+            self.telemetry.publish_arrival(seq, motion.t_s, command.arrived, error_m)
             self._store.record_arrival(command.arrived, motion.t_s, error_m)
         if command.measure:
             pose = self._localizer.deck_pose
@@ -351,27 +330,38 @@ class SurveyRunner:
             self._fix_service.begin(FixRequest(mission.request, t_s, mission.measuring_point, expected, pose))
 
     def publish(self, frame: TimedFrame) -> None:
-        """The estimate, the checkpoint, a state that is new."""
+        """See ``MissionRunner``."""
         seq, t_s = frame.sensors.seq, frame.sensors.t
-        self._telemetry.publish_frame(
-            seq, t_s, self._localizer, self._mission.state, frame.raw, self._sent_commands, is_first=frame.is_first
+        self.telemetry.publish_frame(
+            seq, t_s, self._localizer, self.mission.state, frame.raw, self._sent_commands, is_first=frame.is_first
         )
         self._checkpoint.write_if_due(seq, t_s, self._clock.elapsed_s)
         self.publish_state()
 
-    def _on_state_change(self) -> None:
-        mission = self._mission
-        before, self._state = self._state, mission.state
-        self._watch.publish_state_change(before, self._clock.seq)
+    def publish_state(self) -> None:
+        """See ``MissionRunner``."""
+        mission, telemetry, before = self.mission, self.telemetry, self._state
+        if mission.state is before:
+            return
+        self._state = mission.state
+        if not mission.is_faulted:
+            self._fault_timer.over()
+        telemetry.log.debug(
+            "state_changed", seq=self._clock.seq, before=before, after=mission.state, cause=mission.cause
+        )
+        if mission.state in (MissionState.HELD, MissionState.BACKING_OFF) or before is MissionState.HELD:
+            telemetry.notify_operator("warning", state_text(mission.state, mission.cause))
+        if mission.state is MissionState.RETURNING and before is not MissionState.BACKING_OFF:
+            telemetry.notify_operator("warning", f"returning to base: {mission.cause}")
         if mission.state is MissionState.DONE:
             self._context.finish(EXIT_STATUS[mission.outcome])
         elif mission.is_faulted and self._session.is_lockstep:
-            # Nobody can be waited for while simulated time runs at many times the wall clock.
+            # No operator can react while simulated time runs at many times the wall clock.
             self._context.finish(EXIT_STATUS[SurveyOutcome.STOPPED])
 
 
 def survey_runner_config(cfg: Config) -> RunnerConfig:
-    """What the process needs of the configuration of a survey."""
+    """Configuration of the process."""
     return RunnerConfig(
         cfg.robot,
         cfg.run.realtime_priority,
@@ -382,8 +372,8 @@ def survey_runner_config(cfg: Config) -> RunnerConfig:
 
 
 @contextmanager
-def open_survey(args: ProcessArgs) -> Iterator[RunnerFactory]:
-    """The parts and the database of a survey, new or taken over; what makes the mission of them."""
-    parts, store = build_parts(args)
+def open_survey(cfg: Config, args: ProcessArgs) -> Iterator[RunnerFactory]:
+    """Open the parts and the database of a survey, new or taken over; yields a factory of the mission."""
+    parts, store = build_parts(cfg, args)
     with store:
-        yield lambda context: SurveyRunner(args.config, context, parts, store)
+        yield lambda context: SurveyRunner(cfg, context, parts, store)

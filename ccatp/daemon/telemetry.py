@@ -1,8 +1,7 @@
-"""What the main loop publishes: lines, tracks and times in batches, status, messages, display state, survey events."""
+"""Publications of the main loop: lines, tracks and times in batches, status, messages, display state, survey events."""
 
 import time
-from collections.abc import Callable
-from typing import Generic, NamedTuple, TypeVar
+from dataclasses import asdict
 
 import msgspec
 import structlog
@@ -35,11 +34,16 @@ BATCH_WALL_S = 0.25
 
 
 class TelemetryPublisher:
-    """Publishes for the main loop; a mission adds its estimates by a class of its own."""
+    """Publishes for the main loop; a mission adds its estimates in a subclass.
+
+    Attributes:
+        seq, t_s: the newest frame.
+    """
 
     def __init__(self, publisher: Publisher, log: structlog.typing.FilteringBoundLogger) -> None:
         self._publisher, self.log = publisher, log
         self._lines: list[msgspec.Raw] = []
+        self._newest_line = msgspec.Raw(b"null")
         self._tick_us: list[float] = []
         self._flushed_wall_s = time.monotonic()
         self._frames_before = 0
@@ -47,17 +51,16 @@ class TelemetryPublisher:
         self.t_s = 0.0
 
     def continue_numbering(self) -> None:
-        """The robot's frames count anew: what is recorded counts on, as far as we know how many there were."""
+        """The robot's frames restarted: recorded numbers go on, as far as the number of frames is known."""
         self._frames_before += max(self.seq, 0)
 
     def stale_frame(self, seq: int, raw: bytes) -> None:
-        """Keep the line of a frame that is not newer than the last one: the mission has seen it."""
+        """Keep the line of a frame that is not newer than the last one, without an estimate."""
         self.seq = seq
-        self.add_line(raw)
+        self._add_line(msgspec.Raw(raw))
 
-    def add_line(self, raw: bytes) -> None:
-        """Keep a frame's line for the batch."""
-        self._lines.append(msgspec.Raw(raw))
+    def _add_line(self, line: msgspec.Raw) -> None:
+        self._lines.append(line)
         if len(self._lines) >= BATCH_FRAMES:
             self.flush()
 
@@ -66,7 +69,11 @@ class TelemetryPublisher:
         self._tick_us.append(microseconds)
 
     def take_estimates(self) -> tuple[str, Message] | None:
-        """The pending batch of estimates and its topic, which is empty then; ``None`` without any."""
+        """Topic and message of the pending estimates, which are then cleared; ``None`` without any."""
+        return None
+
+    def display_state(self) -> DisplayState | None:
+        """The newest values for a display; ``None`` before the first frame."""
         return None
 
     def flush_if_due(self) -> None:
@@ -88,8 +95,10 @@ class TelemetryPublisher:
         self._lines, self._tick_us = [], []
 
     def publish_status(self, message: MissionStatus) -> None:
-        """Publish the mission's status."""
+        """Publish the mission's status, and the display state if it is subscribed."""
         self._publisher.send("mission", message)
+        if self._publisher.has_subscriber("display_state") and (state := self.display_state()) is not None:
+            self._publisher.send("display_state", state)
 
     def notify_operator(self, level: str, text: str) -> None:
         """One line for the log file and for the operator's terminal."""
@@ -97,53 +106,12 @@ class TelemetryPublisher:
         self._publisher.send("log", LogMessage(seq=self.seq, t_s=self.t_s, level=level, process="main", text=text))
 
 
-class PoseSnapshot(NamedTuple):
-    """The pose as ``DisplayState`` tells it."""
-
-    x_m: float
-    y_m: float
-    heading_rad: float
-    covariance_m2: tuple[float, float, float]
-    heading_sigma_rad: float
-    nis: float
-    size: int
-
-
-Source = TypeVar("Source")
-
-
-class DisplayStatePublisher(Generic[Source]):
-    """Publishes ``DisplayState`` for the main loop."""
-
-    def __init__(self, publisher: Publisher, snapshot_of: Callable[[Source], PoseSnapshot]) -> None:
-        self._publisher, self._snapshot_of = publisher, snapshot_of
-        self._source: Source | None = None
-        self._line = b"null"
-
-    def update(self, source: Source, line: bytes) -> None:
-        """A frame was served: who knows the pose, and its line. Called in every frame, so it only notes them."""
-        self._source, self._line = source, line
-
-    def publish_if_subscribed(self, seq: int, t_s: float) -> None:
-        """Publish, if there are subscribers.
-
-        Args:
-            seq, t_s: the newest frame.
-        """
-        if self._source is None or not self._publisher.has_subscriber("display_state"):
-            return
-        snapshot = self._snapshot_of(self._source)
-        self._publisher.send(
-            "display_state", DisplayState(seq=seq, t_s=t_s, line=msgspec.Raw(self._line), **snapshot._asdict())
-        )
-
-
 class SurveyTelemetry(TelemetryPublisher):
     """Publishes for a survey."""
 
     def __init__(self, publisher: Publisher, log: structlog.typing.FilteringBoundLogger) -> None:
         super().__init__(publisher, log)
-        self._display = DisplayStatePublisher(publisher, localizer_pose)
+        self._localizer: Localizer | None = None
         self._track: list[tuple[int, float, int, int, float, float, float, float]] = []
 
     def publish_frame(
@@ -153,52 +121,65 @@ class SurveyTelemetry(TelemetryPublisher):
         localizer: Localizer,
         state: str,
         raw: bytes,
-        commands: tuple[tuple[float, float, float, float], int] | None = None,
+        commands: tuple[tuple[float, float, float, float] | None, int] = (None, -1),
         *,
         is_first: bool = False,
     ) -> None:
-        """Keep the estimate after frame ``seq`` and the frame's line for the batch; publish it where it is due.
+        """Keep the estimate after frame ``seq`` and the frame's line for the batch; publish the estimate where due.
 
         Args:
-            seq, t_s: the frame.
-            raw: the frame's line.
             commands: span of the set points since the last estimate, rad/s, and the number of the newest drive.
             is_first: of a session; it is always due, because the danger loop may wait for it.
         """
         self.seq, self.t_s = seq, t_s
-        self._display.update(localizer, raw)
-        pose, sigma = localizer.pose, localizer.position_sigma_m
+        self._localizer, self._newest_line = localizer, msgspec.Raw(raw)
+        pose, sigma_m = localizer.pose, localizer.position_sigma_m
         if is_first or is_estimate_due(seq):
             deck = localizer.deck_pose
-            x, y, heading = deck.x_m, deck.y_m, deck.heading_rad
-            commanded, drive_seq = commands if commands is not None else (None, -1)
-            message = EstimateMessage(
+            estimate = EstimateMessage(
                 seq=seq,
                 t_s=t_s,
-                x_m=x,
-                y_m=y,
-                heading_rad=heading,
-                sigma_m=sigma,
+                x_m=deck.x_m,
+                y_m=deck.y_m,
+                heading_rad=deck.heading_rad,
+                sigma_m=sigma_m,
                 state=state,
-                commanded=commanded,
-                drive_seq=drive_seq,
+                commanded=commands[0],
+                drive_seq=commands[1],
             )
-            self._publisher.send("estimate", message)
-        row, col = pose.panel
-        self._track.append((seq + self._frames_before, t_s, row, col, pose.x_m, pose.y_m, pose.heading_rad, sigma))
-        self.add_line(raw)
+            self._publisher.send("estimate", estimate)
+        number = seq + self._frames_before
+        self._track.append((number, t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, sigma_m))
+        self._add_line(self._newest_line)
 
     def take_estimates(self) -> tuple[str, Message] | None:
-        """The pending rows of the track."""
+        """See ``TelemetryPublisher``."""
         rows, self._track = self._track, []
         return ("track", TrackMessage(seq=self.seq, t_s=self.t_s, rows=rows)) if rows else None
 
+    def display_state(self) -> DisplayState | None:
+        """See ``TelemetryPublisher``; pose on the deck, and the filter's last update."""
+        if self._localizer is None:
+            return None
+        localizer = self._localizer
+        pose, covariance, innovation = localizer.deck_pose, localizer.pose_covariance, localizer.innovation
+        return DisplayState(
+            seq=self.seq,
+            t_s=self.t_s,
+            x_m=pose.x_m,
+            y_m=pose.y_m,
+            heading_rad=pose.heading_rad,
+            covariance_m2=(float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])),
+            heading_sigma_rad=localizer.heading_sigma_rad,
+            nis=innovation.nis if innovation is not None else 0.0,
+            size=innovation.size if innovation is not None else 0,
+            line=self._newest_line,
+        )
+
     def publish_arrival(self, seq: int, t_s: float, point: PointId, error_m: float) -> None:
         """The robot came to rest in frame ``seq``, at a point for the first time."""
-        message = ArrivalMessage(
-            seq=seq + self._frames_before, t_s=t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m
-        )
-        self._publisher.send("arrival", message)
+        number = seq + self._frames_before
+        self._publisher.send("arrival", ArrivalMessage(seq=number, t_s=t_s, point=(*point,), error_mm=1e3 * error_m))
 
     def publish_rest(self, seq: int, t_s: float) -> None:
         """The mission takes the robot to be at rest from frame ``seq`` on."""
@@ -211,41 +192,16 @@ class SurveyTelemetry(TelemetryPublisher):
     def publish_fix(
         self, point: PointId | None, fix: Fix, jump_m: float, *, is_fused: bool, is_set_aside: bool = False
     ) -> None:
-        """A fix was measured after the last frame; no point for one that only finds the robot.
+        """A fix was measured after the last frame; without a point it only localizes the robot.
 
-        Args:
-            is_set_aside: the localizer was not given it.
+        One that ``is_set_aside`` was not given to the localizer.
         """
         message = FixMessage(
             seq=self.seq,
-            t_s=fix.t_s,
-            point=(point.row, point.col, point.point) if point is not None else None,
+            point=None if point is None else (*point,),
             is_fused=is_fused,
-            position_m=fix.position_m,
-            covariance_m2=list(fix.covariance_m2),
-            dop=fix.dop,
-            residual_rms_m=fix.residual_rms_m,
-            channels=list(fix.channels),
             jump_mm=1e3 * jump_m,
             is_set_aside=is_set_aside,
+            **asdict(fix),
         )
         self._publisher.send("fix", message)
-
-    def publish_status(self, message: MissionStatus) -> None:
-        """Publish the mission's status, and a picture of all that is newest for whoever looks on."""
-        super().publish_status(message)
-        self._display.publish_if_subscribed(self.seq, self.t_s)
-
-
-def localizer_pose(localizer: Localizer) -> PoseSnapshot:
-    """The pose on the deck, and the filter's last update."""
-    pose, covariance, innovation = localizer.deck_pose, localizer.pose_covariance, localizer.innovation
-    return PoseSnapshot(
-        x_m=pose.x_m,
-        y_m=pose.y_m,
-        heading_rad=pose.heading_rad,
-        covariance_m2=(float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])),
-        heading_sigma_rad=localizer.heading_sigma_rad,
-        nis=innovation.nis if innovation is not None else 0.0,
-        size=innovation.size if innovation is not None else 0,
-    )

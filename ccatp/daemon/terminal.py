@@ -5,13 +5,13 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 import structlog
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.errors import ExitStatus
 from ccatp.links.liveness import RateLimitedLog
@@ -23,7 +23,7 @@ STYLES = {"info": "", "warning": "yellow", "error": "bold red"}
 
 
 class _BufferedConsole(Console):
-    """A terminal that may go away: the survey goes on without it."""
+    """A terminal that may be closed: the survey goes on without it."""
 
     def on_broken_pipe(self) -> None:
         self.quiet = True
@@ -36,19 +36,16 @@ class _BufferedConsole(Console):
 
 
 class RunView:
-    """Progress and messages on standard error; the summary on standard output.
+    """Progress and messages on standard error; the summary on standard output."""
 
-    Args:
-        goals: what there are so many of to be done.
-    """
+    goals = "points"
 
-    def __init__(self, title: str, *, is_sim: bool, run_dir: Path, goals: str = "points") -> None:
+    def __init__(self, title: str, *, is_sim: bool, run_dir: Path) -> None:
         self._console: Console = _BufferedConsole(stderr=True, highlight=False)
         self._is_terminal = self._console.is_terminal
         self._rate_limit = RateLimitedLog(LINES_OF_A_KIND, LINES_PERIOD_S)
         self._has_pose = False
         self._shown_tenths = 0
-        self._goals = goals
         self._console.print(f"{title}; writing {run_dir}", soft_wrap=True, markup=False)
         self._progress = Progress(
             TextColumn("{task.description}"),
@@ -58,25 +55,25 @@ class RunView:
             console=self._console,
             auto_refresh=False,
         )
-        self._task = self._progress.add_task("SIM" if is_sim else goals, total=None, state="starting")
+        self._task = self._progress.add_task("SIM" if is_sim else self.goals, total=None, state="starting")
 
-    def __enter__(self) -> "RunView":
+    def __enter__(self) -> Self:
         if self._is_terminal:
             self._progress.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._is_terminal:
             self._progress.stop()
 
     def show_message(self, level: str, text: str) -> None:
-        """One line for the operator; of those that come again and again a few. ``log.jsonl`` has them all."""
+        """One line for the operator, unless too many like it were shown; ``log.jsonl`` has them all."""
         shown = self._rate_limit.take(level, text, time.monotonic())
         if shown is not None:
             self._console.print(f"{level}: {shown}", style=STYLES[level], markup=False, soft_wrap=True)
 
     def pose(self, track: TrackMessage) -> None:
-        """The first pose shows that the robot is there."""
+        """Show the first pose."""
         if not self._has_pose and track.rows:
             self._has_pose = True
             _, t_s, row, col, x, y, heading, _ = track.rows[-1]
@@ -84,7 +81,7 @@ class RunView:
             self.show_message("info", f"first pose at {t_s:.2f} s: {where}")
 
     def status(self, status: MissionStatus) -> None:
-        """Points done, state, ETA, error."""
+        """Show points done, state, ETA, error."""
         text = self.text_of(status)
         if self._is_terminal:
             self._progress.update(self._task, completed=status.done, total=status.total, state=text)
@@ -94,17 +91,17 @@ class RunView:
         if tenths > self._shown_tenths:
             self._shown_tenths = tenths
             self._console.print(
-                f"{10 * tenths} %: {status.done} of {status.total} {self._goals}, {text}", soft_wrap=True
+                f"{10 * tenths} %: {status.done} of {status.total} {self.goals}, {text}", soft_wrap=True
             )
 
     def text_of(self, status: MissionStatus) -> str:
         """State, place, times, error."""
-        times = f"{_clock(status.elapsed_s)} elapsed, {_clock(status.eta_s)} to go"
+        times = f"{clock(status.elapsed_s)} elapsed, {clock(status.eta_s)} to go"
         arrival = f", arrival {status.error_mm:.2f} mm" if status.error_mm else ""
         return f"{_where(status.state, status.point)}, {times}{arrival}"
 
     def show_summary(self, summary: dict[str, Any], *, as_json: bool) -> None:
-        """The end: JSON alone on standard output, or a table."""
+        """Print JSON alone on standard output, or a table."""
         if as_json:
             json.dump(summary, sys.stdout, indent=1)
             sys.stdout.write("\n")
@@ -113,24 +110,30 @@ class RunView:
         sys.stdout.flush()
 
     def show_report(self, where: str) -> None:
-        """Where the report is, or why there is none; on standard error, so that JSON stays alone."""
+        """Show where the report is, or why there is none; on standard error, so that JSON stays alone."""
         self._console.print(f"report  {where}", soft_wrap=True, markup=False)
 
 
 def survey_title(cfg: Config, *, is_sim: bool) -> str:
-    """What runs, of a survey."""
+    """Headline of a survey."""
     what = "SIMULATION" if is_sim else "survey"
     world = f", world {cfg.world.name}, seed {cfg.run.seed}" if is_sim else ""
     return f"ccatp {what} of {cfg.mirror.name}{world}, filter {cfg.run.filter}"
 
 
 class BeaconRunView(RunView):
-    """The same of a mission among beacons."""
+    """View of a mission among beacons."""
+
+    def __init__(self, cfg: RadioConfig, *, is_sim: bool, run_dir: Path) -> None:
+        what, self.goals = ("follow a radio", "seconds") if cfg.follow.is_active else ("visit waypoints", "waypoints")
+        seed = f", seed {cfg.run.seed}" if is_sim else ""
+        title = f"ccatp {'SIMULATION' if is_sim else 'mission'} among beacons: {cfg.system}, {what}{seed}"
+        super().__init__(title, is_sim=is_sim, run_dir=run_dir)
 
     def text_of(self, status: MissionStatus) -> str:
-        """State, place, time, uncertainty."""
+        """State, place, time, uncertainty of the position."""
         cause = f" ({status.cause})" if status.cause else ""
-        where = f"{_where(status.state + cause, status.point)}, {_clock(status.elapsed_s)} elapsed"
+        where = f"{_where(status.state + cause, status.point)}, {clock(status.elapsed_s)} elapsed"
         return f"{where}, position known to {0.1 * status.error_mm:.1f} cm"
 
 
@@ -138,24 +141,15 @@ def _where(state: str, point: str) -> str:
     return f"{state} {point}" if point else state
 
 
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes}:{rest:02d}"
-
-
 def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.FilteringBoundLogger) -> str:
-    """Write the report of a run that has ended.
+    """Write the report of a run that has ended; returns where it is, or why there is none.
 
-    Args:
-        status: what it ended with; an interrupted run gets none, because somebody is waiting for the end.
-
-    Returns:
-        Where it is, or why there is none.
+    An interrupted run gets none, because the operator waits for the end.
     """
     by_hand = f"none; make it with: ccatp report {run_dir}"
     if status is ExitStatus.INTERRUPTED:
         return by_hand
-    # Nothing of it is needed while the robot moves.
+    # Imported late: not needed while the robot moves.
     from ccatp.records.run_reader import RunReadError  # noqa: PLC0415
     from ccatp.report.run_page import report_run  # noqa: PLC0415
 
@@ -164,7 +158,7 @@ def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.Fi
     except RunReadError as error:
         return f"none; {error}"
     except Exception as error:
-        # Whatever it is: the survey is done, and its record is on the disk.
+        # The survey is done, and its record is on the disk.
         log.error("report_failed", error=f"{type(error).__name__}: {error}")
         return by_hand
 
@@ -182,17 +176,13 @@ def clock(seconds: float) -> str:
 
 
 def share_done(status: Mapping[str, Any]) -> float:
-    """Points that are done with, 0 to 1."""
+    """Share of the points that are measured or skipped, 0 to 1."""
     total = int(status.get("total", 0))
     return (int(status.get("done", 0)) + int(status.get("skipped", 0))) / total if total else 0.0
 
 
 def status_rows(status: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Name and value of each line of the table.
-
-    Args:
-        status: the ``status`` of the operator channel's answer.
-    """
+    """Name and value of each line of the table, from the ``status`` of the operator channel's answer."""
     done, total, skipped = (int(status.get(key, 0)) for key in ("done", "total", "skipped"))
     state, point, cause = (str(status.get(key, "")) for key in ("state", "point", "cause"))
     rows = [("state", f"{state} {point}".strip())]
@@ -220,13 +210,12 @@ def status_rows(status: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _named(points: Sequence[str]) -> str:
-    """The first names, and of many how many there are."""
     names = ", ".join(points[:_SHOWN])
     return names if len(points) <= _SHOWN else f"{len(points)} points: {names}, ..."
 
 
 def status_line(status: Mapping[str, Any]) -> str:
-    """The same in one line."""
+    """The status in one line."""
     what = f"{status.get('state', '')} {status.get('point', '')}".strip()
     cause = f" ({status['cause']})" if status.get("cause") else ""
     times = f"{clock(float(status.get('elapsed_s', 0.0)))} elapsed, {clock(float(status.get('eta_s', 0.0)))} to go"

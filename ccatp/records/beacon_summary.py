@@ -17,12 +17,14 @@ from ccatp.links.beacon_messages import (
     pose_truth,
     table,
 )
+from ccatp.records.summary import rounded, wall_figures
 
 WITHIN_SIGMAS = 3.0
+_DISTRIBUTION = ("rmse", "mean", "p50", "p99", "max")
 
 
 class BeaconFacts(NamedTuple):
-    """What a run is of.
+    """Facts of a run that are known before it starts.
 
     Attributes:
         safe_distance_m: to be kept from the target; ``None`` without one.
@@ -39,7 +41,7 @@ class BeaconFacts(NamedTuple):
 
 
 def beacon_facts(cfg: RadioConfig, *, is_sim: bool) -> BeaconFacts:
-    """What the summary has to know of a run."""
+    """Facts of a configured run."""
     is_following = cfg.follow.is_active
     return BeaconFacts(
         system=cfg.system,
@@ -77,15 +79,15 @@ class BeaconSummary:
         self._ticks_us: list[float] = []
 
     def add_track(self, rows: Sequence[Sequence[float]]) -> None:
-        """Rows of the topic ``beacon_track``."""
+        """Add rows of the topic ``beacon_track``."""
         self._track += rows
 
     def add_truth(self, rows: Sequence[Sequence[float | None]]) -> None:
-        """Rows of the topic ``beacon_truth``."""
+        """Add rows of the topic ``beacon_truth``."""
         self._truth += rows
 
     def set_places(self, places: Mapping[str, tuple[float, float]]) -> None:
-        """Where radios and motes really are."""
+        """True places of radios and motes."""
         self._places = places
 
     def set_map(
@@ -99,7 +101,7 @@ class BeaconSummary:
         self._reached.append(reached)
 
     def add_danger(self, signal: str) -> None:
-        """The danger loop began to deny motion because of a signal."""
+        """The danger loop began to deny motion because of ``signal``."""
         self._events[signal] = self._events.get(signal, 0) + 1
 
     def add_ticks(self, tick_us: Sequence[float]) -> None:
@@ -111,7 +113,7 @@ class BeaconSummary:
         self._mission_time_s, self._outcome, self._cause = mission_time_s, outcome, cause
 
     def build(self, wall_s: float) -> dict[str, Any]:
-        """The summary; lengths in m, angles in rad, times in s. What needs the truth is null without it."""
+        """The summary; lengths in m, angles in rad, times in s. Values that need the truth are null without it."""
         facts = self._facts
         track = pose_track(table(self._track, TRACK_COLUMNS))
         truth = pose_truth(table(self._truth, TRUTH_COLUMNS))
@@ -131,33 +133,24 @@ class BeaconSummary:
             "outcome": self._outcome,
             "cause": self._cause,
             "waypoints": self._waypoints(truth if known else None),
-            "trajectory_rmse_m": _rounded(aligned_rms_m(track.place_m, true.place_m)) if known else None,
-            "position_error_m": _distribution(np.hypot(errors[:, 0], errors[:, 1])) if known else _no_distribution(),
-            "heading_rmse_rad": _rounded(np.sqrt(np.mean(errors[:, 2] ** 2))) if known else None,
-            "dead_reckoning_rmse_m": _rounded(rms_m(track.reckoned_m, true.place_m)) if known else None,
-            "path_length_m": _path_m(true.place_m) if known else None,
+            "trajectory_rmse_m": rounded(aligned_rms_m(track.place_m, true.place_m)) if known else None,
+            "position_error_m": _distribution(np.hypot(errors[:, 0], errors[:, 1]), known=known),
+            "heading_rmse_rad": rounded(np.sqrt(np.mean(errors[:, 2] ** 2))) if known else None,
+            "dead_reckoning_rmse_m": rounded(rms_m(track.reckoned_m, true.place_m)) if known else None,
+            "path_length_m": rounded(np.hypot(*np.diff(true.place_m, axis=0).T).sum()) if known else None,
             "beacons": self._beacon_figures(known=known),
             "target": self._target_figures(truth, known=known),
             "obstacles": _obstacle_figures(truth, known=known),
             "consistency": {
-                "pose_nees_mean": _rounded(np.mean(nees(errors, track.covariance))) if known else None,
-                "nis_mean": _rounded(self._score[0] / self._score[1]) if self._score[1] else None,
+                "pose_nees_mean": rounded(np.mean(nees(errors, track.covariance))) if known else None,
+                "nis_mean": rounded(self._score[0] / self._score[1]) if self._score[1] else None,
                 "readings": self._score[1],
                 "refused": self._score[2],
             },
             "danger": dict(sorted(self._events.items())),
-            "map": {name: _rounded(value) for name, value in sorted(self._notes.items())},
-            "mission_time_s": _rounded(self._mission_time_s, 3),
-            "wall": self._wall(wall_s),
-        }
-
-    def _wall(self, wall_s: float) -> dict[str, float | None]:
-        p50, p99 = np.percentile(self._ticks_us, (50, 99)) if self._ticks_us else (None, None)
-        return {
-            "time_s": _rounded(wall_s, 3),
-            "realtime_factor": _rounded(self._mission_time_s / wall_s, 2) if wall_s else None,
-            "tick_us_p50": _rounded(p50, 1),
-            "tick_us_p99": _rounded(p99, 1),
+            "map": {name: rounded(value) for name, value in sorted(self._notes.items())},
+            "mission_time_s": rounded(self._mission_time_s, 3),
+            "wall": wall_figures(self._mission_time_s, wall_s, self._ticks_us),
         }
 
     def _waypoints(self, truth: PoseTruth | None) -> dict[str, Any]:
@@ -179,10 +172,10 @@ class BeaconSummary:
         return {
             "count": len(self._places) if known else None,
             "mapped": len(found),
-            "rmse_m": _rounded(np.sqrt(np.mean(np.square(errors)))) if errors else None,
-            "max_m": _rounded(max(errors)) if errors else None,
-            "nees_mean": _rounded(np.mean(nees)) if nees else None,
-            "places_m": {name: [_rounded(place[0]), _rounded(place[1])] for name, place in sorted(found.items())},
+            "rmse_m": rounded(np.sqrt(np.mean(np.square(errors)))) if errors else None,
+            "max_m": rounded(max(errors)) if errors else None,
+            "nees_mean": rounded(np.mean(nees)) if nees else None,
+            "places_m": {name: [rounded(place[0]), rounded(place[1])] for name, place in sorted(found.items())},
         }
 
     def _target_figures(self, truth: PoseTruth, *, known: bool) -> dict[str, Any] | None:
@@ -194,28 +187,22 @@ class BeaconSummary:
         error_m = None
         place = self._beacons.get(self._facts.target)
         if known and place is not None:
-            error_m = _rounded(np.hypot(*(place[:2] - truth.target_m[-1])))
+            error_m = rounded(np.hypot(*(place[:2] - truth.target_m[-1])))
         return {
             "safe_distance_m": safe_m,
-            "distance_mean_m": _rounded(distances.mean()) if len(distances) else None,
-            "distance_min_m": _rounded(distances.min()) if len(distances) else None,
-            "distance_rms_off_m": _rounded(np.sqrt(np.mean((distances - safe_m) ** 2))) if len(distances) else None,
+            "distance_mean_m": rounded(distances.mean()) if len(distances) else None,
+            "distance_min_m": rounded(distances.min()) if len(distances) else None,
+            "distance_rms_off_m": rounded(np.sqrt(np.mean((distances - safe_m) ** 2))) if len(distances) else None,
             "final_error_m": error_m,
         }
 
 
-def _distribution(errors: FloatArray) -> dict[str, float | None]:
+def _distribution(errors: FloatArray, *, known: bool) -> dict[str, float | None]:
+    if not known:
+        return dict.fromkeys(_DISTRIBUTION)
     p50, p99 = np.percentile(errors, (50, 99))
-    figures = {"rmse": np.sqrt(np.mean(errors**2)), "mean": errors.mean(), "p50": p50, "p99": p99, "max": errors.max()}
-    return {name: _rounded(value) for name, value in figures.items()}
-
-
-def _no_distribution() -> dict[str, float | None]:
-    return dict.fromkeys(("rmse", "mean", "p50", "p99", "max"))
-
-
-def _path_m(places: FloatArray) -> float | None:
-    return _rounded(np.hypot(*np.diff(places, axis=0).T).sum())
+    figures = (np.sqrt(np.mean(errors**2)), errors.mean(), p50, p99, errors.max())
+    return {name: rounded(value) for name, value in zip(_DISTRIBUTION, figures, strict=True)}
 
 
 def _obstacle_figures(truth: PoseTruth, *, known: bool) -> dict[str, Any] | None:
@@ -223,15 +210,10 @@ def _obstacle_figures(truth: PoseTruth, *, known: bool) -> dict[str, Any] | None
     if known and not len(clearances):
         return None
     least_m = clearances.min() if known else None
-    return {"least_clearance_m": _rounded(least_m), "touched": None if least_m is None else bool(least_m <= 0.0)}
+    return {"least_clearance_m": rounded(least_m), "touched": None if least_m is None else bool(least_m <= 0.0)}
 
 
 def _sigmas(reached: Reached, true_m: FloatArray) -> float:
     x, y, xx, xy, yy = reached.estimate
     off = true_m - (x, y)
     return float(np.sqrt(off @ np.linalg.solve(np.array(((xx, xy), (xy, yy))), off)))
-
-
-def _rounded(value: Any, decimals: int = 6) -> float | None:
-    # None for what JSON has no number for; never a negative zero.
-    return None if value is None or not np.isfinite(value) else round(float(value), decimals) + 0.0

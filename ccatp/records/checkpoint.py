@@ -1,4 +1,4 @@
-"""The checkpoint beside the mission's database: where the robot is and what is in force, for a main loop to come.
+"""The checkpoint beside the mission's database: the robot's place and what is in force, for the next main loop.
 
 Two slots in one file, written in turn, each with a count and a checksum: whatever instant the writer dies at, one of
 them is whole. A pose is left to the kernel, which keeps it when the process dies; what an operator or the observatory
@@ -19,15 +19,19 @@ FILE = "checkpoint"
 _SLOT_BYTES = 4096
 _HEAD_BYTES = 8  # length and checksum
 _AT_BASE = "set it at base, remove this file and resume"
-_encoder = msgspec.json.Encoder()
+
+
+class CheckpointError(CcatpError):
+    """There is a checkpoint that cannot be read: the robot's place has to be set by hand."""
+
+    exit_status = ExitStatus.USAGE
 
 
 class Checkpoint(msgspec.Struct, kw_only=True):
-    """What one main loop leaves to the next.
+    """State that one main loop leaves to the next.
 
     Attributes:
         boot: the robot's boot; its clock counts from there.
-        seq, t_s: the frame.
         x_m, y_m, heading_rad: pose, deck frame.
         abort_cause: why the survey was given up, or empty.
         last_fix: the point whose fix was the last one stored, or empty.
@@ -51,14 +55,10 @@ class Checkpoint(msgspec.Struct, kw_only=True):
     last_fix: str
 
 
-_decoder = msgspec.json.Decoder(Checkpoint)
-
-
 class CheckpointFile:
     """Writes checkpoints.
 
     Args:
-        path: the file; made where there is none.
         is_patient: simulated time waits for the writer, so that a pose may be written at once and not by the thread.
 
     Attributes:
@@ -76,13 +76,9 @@ class CheckpointFile:
         self._thread.start()
 
     def write(self, record: Checkpoint, *, is_durable: bool = False) -> None:
-        """Take a record; it replaces one that waits. Returns at once.
-
-        Args:
-            record: the record; its count is one more than the last one's.
-        """
+        """Take a record, whose count is one more than the last one's; it replaces one that waits. Returns at once."""
         if self._is_patient and not is_durable:
-            self._put(record)
+            self._put(record, is_durable=False)
             return
         with self._wake:
             self._newest = record
@@ -90,7 +86,7 @@ class CheckpointFile:
             self._wake.notify()
 
     def close(self) -> None:
-        """Write what waits and close the file."""
+        """Write the record that waits and close the file."""
         with self._wake:
             self._is_closing = True
             self._wake.notify()
@@ -105,38 +101,25 @@ class CheckpointFile:
                 is_durable, self._is_durable = self._is_durable, False
             if record is None:
                 return
-            self._put(record)
-            if is_durable and not self.failure:
-                self._sync()
+            self._put(record, is_durable=is_durable)
 
-    def _put(self, record: Checkpoint) -> None:
-        body = _encoder.encode(record)
+    def _put(self, record: Checkpoint, *, is_durable: bool) -> None:
+        body = msgspec.json.encode(record)
         head = len(body).to_bytes(4, "little") + zlib.crc32(body).to_bytes(4, "little")
         try:
             os.pwrite(self._fd, head + body, record.count % 2 * _SLOT_BYTES)
-        except OSError as error:
-            self.failure = error.strerror or str(error)
-        else:
+            if is_durable:
+                os.fdatasync(self._fd)
             self.failure = ""
-
-    def _sync(self) -> None:
-        try:
-            os.fdatasync(self._fd)
         except OSError as error:
             self.failure = error.strerror or str(error)
-
-
-class CheckpointError(CcatpError):
-    """There is a checkpoint, and nobody can read it: where the robot is must be told anew."""
-
-    exit_status = ExitStatus.USAGE
 
 
 def read_checkpoint(path: Path) -> Checkpoint | None:
-    """The newest whole record of a file, ``None`` where nothing was written down.
+    """The newest whole record of a file, ``None`` where nothing was written.
 
     Raises:
-        CheckpointError: something was, and none of it is whole.
+        CheckpointError: something was written, and none of it is whole.
     """
     try:
         data = path.read_bytes()
@@ -146,7 +129,7 @@ def read_checkpoint(path: Path) -> Checkpoint | None:
         raise CheckpointError(f"{path}: {error.strerror or error}; {_AT_BASE}") from error
     records = [record for k in range(2) if (record := _slot(data[k * _SLOT_BYTES : (k + 1) * _SLOT_BYTES])) is not None]
     if data and not records:
-        raise CheckpointError(f"{path}: damaged, so nobody knows where the robot is; {_AT_BASE}")
+        raise CheckpointError(f"{path}: damaged, so the robot's place is not known; {_AT_BASE}")
     return max(records, key=lambda record: record.count, default=None)
 
 
@@ -156,6 +139,6 @@ def _slot(data: bytes) -> Checkpoint | None:
     if not body or len(body) != length or zlib.crc32(body) != crc:
         return None
     try:
-        return _decoder.decode(body)
+        return msgspec.json.decode(body, type=Checkpoint)
     except msgspec.MsgspecError:
         return None

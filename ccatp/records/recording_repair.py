@@ -1,18 +1,44 @@
-"""What a recording holds, and how one that was cut off or damaged is saved."""
+"""Content of a recording, and the repair of one that was cut off or damaged.
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from math import inf
+``scan`` yields every intact record. A chunk carries a checksum, so a damaged one is left out. Where the lengths are
+damaged, the next chunk is found by how it begins, and taken if its checksum is right.
+"""
+
+import mmap
+import struct
+from collections.abc import Iterator, Mapping, Sized
+from dataclasses import asdict, dataclass, field
+from io import SEEK_END, BytesIO
 from pathlib import Path
 from typing import Any
 
-from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.records.recorder import CHUNK_BYTES, Condition, is_being_written, recordings, scan, strict_faults
+from ccatp.records.recorder import CHUNK_BYTES, DAMAGE, TELEMETRY, error_text, is_being_written, recordings
 
-TELEMETRY = "telemetry.mcap"
+MAGIC = b"\x89MCAP0\r\n"
+NO_INDEX = "no index: it was not closed"
+_HEAD = struct.Struct("<BQ")
+# Times, size and checksum stand between a chunk's head and the name of its compression.
+_TO_COMPRESSION = _HEAD.size + 8 + 8 + 8 + 4
+_COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
+_LAST_OPCODE = max(opcode.value for opcode in Opcode)
+_READ: Mapping[int, Any] = {
+    Opcode.HEADER: Header,
+    Opcode.FOOTER: Footer,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.CHUNK: Chunk,
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.METADATA: Metadata,
+    Opcode.DATA_END: DataEnd,
+}
 _NS = 1e9
 _HOUR_S = 3600.0
 
@@ -24,27 +50,130 @@ class RecordingError(CcatpError):
 
 
 @dataclass(slots=True)
-class TopicFacts:
-    """What a recording holds of a topic.
+class Condition:
+    """Condition of a file, known when the scan has come to its end.
 
     Attributes:
-        payload_bytes: of all of them, before compression.
+        lost: beginning and end of each stretch of bytes that holds no intact record.
     """
+
+    size_bytes: int = 0
+    lost: list[tuple[int, int]] = field(default_factory=list)
+    is_complete: bool = False
+    chunks: int = 0
+
+    @property
+    def lost_bytes(self) -> int:
+        """Bytes in ``lost``."""
+        return sum(end - begin for begin, end in self.lost)
+
+    def lose(self, begin: int, end: int) -> None:
+        """Note a stretch; it is joined to an adjacent one before it."""
+        if self.lost and self.lost[-1][1] >= begin:
+            begin = self.lost.pop()[0]
+        if end > begin:
+            self.lost.append((begin, end))
+
+
+def scan(path: Path, condition: Condition) -> Iterator[McapRecord]:
+    """The intact records of a file, chunks broken up. Raises ``OSError`` where it cannot be read."""
+    condition.size_bytes = path.stat().st_size
+    if not condition.size_bytes:
+        return
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        size = len(data)
+        at = len(MAGIC) if data[: len(MAGIC)] == MAGIC else 0
+        has_footer = False
+        while at < size:
+            if has_footer and data[at:] == MAGIC:
+                condition.is_complete = not condition.lost
+                return
+            end = _end_of_record(data, at)
+            records = None if end is None else _parsed(data, at, end)
+            if end is None or records is None:
+                # A record that is whole but for its contents is followed by another; otherwise one has to be searched.
+                is_framed = end is not None and (data[end:] == MAGIC or _end_of_record(data, end) is not None)
+                after = end if is_framed and end is not None else _next_chunk(data, at + 1)
+                condition.lose(at, after)
+                at = after
+                continue
+            condition.chunks += data[at] == Opcode.CHUNK
+            has_footer = has_footer or data[at] == Opcode.FOOTER
+            yield from records
+            at = end
+
+
+def _end_of_record(data: mmap.mmap, at: int) -> int | None:
+    if at + _HEAD.size > len(data):
+        return None
+    opcode, length = _HEAD.unpack_from(data, at)
+    end = at + _HEAD.size + int(length)
+    return end if 0 < opcode <= _LAST_OPCODE and end <= len(data) else None
+
+
+def _parsed(data: mmap.mmap, at: int, end: int) -> list[McapRecord] | None:
+    """The records in a record: those of a chunk, itself, or none where it is of no interest; ``None`` if damaged."""
+    opcode, body = data[at], data[at + _HEAD.size : end]
+    stream = ReadDataStream(BytesIO(body))
+    try:
+        if opcode == Opcode.MESSAGE:
+            return [Message.read(stream, len(body))]
+        if opcode not in _READ:
+            return []
+        record: McapRecord = _READ[opcode].read(stream)
+        return breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+    except DAMAGE:
+        return None
+
+
+def _next_chunk(data: mmap.mmap, start: int) -> int:
+    """Where the next intact chunk begins; the end of the file where there is none."""
+    place = start + _TO_COMPRESSION
+    while True:
+        found = [at for name in _COMPRESSIONS if (at := data.find(name, place)) >= 0]
+        if not found:
+            return len(data)
+        at, place = min(found) - _TO_COMPRESSION, min(found) + 1
+        end = _end_of_record(data, at)
+        if end is not None and data[at] == Opcode.CHUNK and _parsed(data, at, end):
+            return at
+
+
+def strict_faults(path: Path) -> list[str]:
+    """Objections of the format's own reader, all checksums compared; raises ``OSError`` where it cannot be read."""
+    faults = []
+    with path.open("rb") as file:
+        try:
+            for _ in StreamReader(file, validate_crcs=True, record_size_limit=path.stat().st_size).records:
+                pass
+        except DAMAGE as error:
+            faults.append(f"read from the beginning: {error_text(error)}")
+        file.seek(-min(len(MAGIC), path.stat().st_size), SEEK_END)
+        if file.read() != MAGIC:
+            return [*faults, NO_INDEX]
+        file.seek(0)
+        try:
+            for _ in make_reader(file, validate_crcs=True).iter_messages():
+                pass
+        except DAMAGE as error:
+            faults.append(f"read by its index: {error_text(error)}")
+    return faults
+
+
+@dataclass(slots=True)
+class TopicFacts:
+    """Content of a topic; ``payload_bytes`` of all messages, before compression; times None without a message."""
 
     schema: str
     messages: int = 0
     payload_bytes: int = 0
-    first_s: float = inf
-    last_s: float = -inf
+    start_s: float | None = None
+    end_s: float | None = None
 
 
 @dataclass(slots=True)
 class RecordingFacts:
-    """What a recording holds.
-
-    Attributes:
-        faults: what the format's own strict reader says against it.
-    """
+    """Content of a recording; ``faults`` are the objections of the format's own strict reader."""
 
     path: Path
     condition: Condition
@@ -55,7 +184,7 @@ class RecordingFacts:
 
     @property
     def state(self) -> str:
-        """In what order it is, for a reader."""
+        """The condition, for a reader."""
         if not self.faults:
             return "complete, every checksum right"
         return "still being written, so without an index" if self.is_being_written else "cut off or damaged"
@@ -67,63 +196,52 @@ class RecordingFacts:
 
     @property
     def messages(self) -> int:
-        """Of all topics."""
+        """Messages of all topics."""
         return sum(topic.messages for topic in self.topics.values())
 
     @property
     def span_s(self) -> tuple[float, float] | None:
         """Times of the first and the last message."""
-        told = [topic for topic in self.topics.values() if topic.messages]
-        return (min(t.first_s for t in told), max(t.last_s for t in told)) if told else None
+        starts = [topic.start_s for topic in self.topics.values() if topic.start_s is not None]
+        ends = [topic.end_s for topic in self.topics.values() if topic.end_s is not None]
+        return (min(starts), max(ends)) if starts and ends else None
 
     @property
     def bytes_per_hour(self) -> float | None:
-        """Of the file, by its messages' times; ``None`` where they span no time."""
+        """Bytes of the file per hour of its messages' times; ``None`` where they span no time."""
         span = self.span_s
         if span is None or span[1] <= span[0]:
             return None
         return self.condition.size_bytes * _HOUR_S / (span[1] - span[0])
 
     def as_json(self) -> dict[str, Any]:
-        """For ``--json``."""
-        span, condition = self.span_s, self.condition
-        known = {name: dict(values) for name, values in self.metadata.items()}
-        for values in known.values():
-            values.pop("config", None)  # a file of its own beside the recording
+        """For ``--json``; without the configuration, a file of its own beside the recording."""
+        start_s, end_s = self.span_s or (None, None)
+        known = {
+            name: {key: value for key, value in values.items() if key != "config"}
+            for name, values in self.metadata.items()
+        }
         return {
             "file": str(self.path),
-            "complete": condition.is_complete,
+            "complete": self.condition.is_complete,
             "verified": not self.faults,
             "being_written": self.is_being_written,
             "faults": self.faults,
-            "size_bytes": condition.size_bytes,
-            "lost_bytes": condition.lost_bytes,
-            "lost": condition.lost,
-            "chunks": condition.chunks,
+            "size_bytes": self.condition.size_bytes,
+            "lost_bytes": self.condition.lost_bytes,
+            "lost": self.condition.lost,
+            "chunks": self.condition.chunks,
             "messages": self.messages,
-            "start_s": None if span is None else span[0],
-            "end_s": None if span is None else span[1],
+            "start_s": start_s,
+            "end_s": end_s,
             "bytes_per_hour": None if self.bytes_per_hour is None else round(self.bytes_per_hour),
             "metadata": known,
-            "topics": {
-                name: {
-                    "schema": topic.schema,
-                    "messages": topic.messages,
-                    "payload_bytes": topic.payload_bytes,
-                    "start_s": topic.first_s if topic.messages else None,
-                    "end_s": topic.last_s if topic.messages else None,
-                }
-                for name, topic in sorted(self.topics.items())
-            },
+            "topics": {name: asdict(topic) for name, topic in sorted(self.topics.items())},
         }
 
 
 def recording_files(path: Path) -> list[Path]:
-    """The file itself, or all recordings of a run directory, oldest first.
-
-    Raises:
-        RecordingError: there is none.
-    """
+    """The file itself, or all recordings of a run directory, oldest first; raises ``RecordingError`` without any."""
     if path.is_dir():
         found = recordings(path / TELEMETRY)
         if not found:
@@ -135,11 +253,7 @@ def recording_files(path: Path) -> list[Path]:
 
 
 def read_facts(path: Path) -> RecordingFacts:
-    """Look through a recording.
-
-    Raises:
-        RecordingError: it cannot be read, or is no recording.
-    """
+    """Read the content of a recording; raises ``RecordingError`` where it cannot be read or is no recording."""
     condition = Condition()
     facts = RecordingFacts(path, condition)
     schemas: dict[int, str] = {}
@@ -157,7 +271,8 @@ def read_facts(path: Path) -> RecordingFacts:
                 topic, t_s = channels[record.channel_id], record.log_time / _NS
                 topic.messages += 1
                 topic.payload_bytes += len(record.data)
-                topic.first_s, topic.last_s = min(topic.first_s, t_s), max(topic.last_s, t_s)
+                topic.start_s = t_s if topic.start_s is None else min(topic.start_s, t_s)
+                topic.end_s = t_s if topic.end_s is None else max(topic.end_s, t_s)
         facts.is_being_written = is_being_written(path)
         facts.faults = strict_faults(path)
     except OSError as error:
@@ -168,11 +283,7 @@ def read_facts(path: Path) -> RecordingFacts:
 
 @dataclass(frozen=True, slots=True)
 class Saved:
-    """A recording that was saved.
-
-    Attributes:
-        end_s: time of the latest, ``None`` where there is none.
-    """
+    """A recording that was saved; ``end_s`` is the latest message's time, ``None`` without a message."""
 
     path: Path
     messages: int
@@ -183,8 +294,7 @@ class Saved:
 def recover(path: Path, out: Path) -> Saved:
     """Write every intact message of a recording to a new one, in the same order, with an index.
 
-    Args:
-        path: the old file; it is left as it is.
+    The old file is left as it is.
 
     Raises:
         RecordingError: one cannot be read or written, or nothing in it is a recording.
@@ -232,15 +342,14 @@ def _rewrite(
         elif isinstance(record, Attachment):
             writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
         elif isinstance(record, Message) and record.channel_id in new_channels:
-            writer.add_message(
-                new_channels[record.channel_id], record.log_time, record.data, record.publish_time, record.sequence
-            )
+            channel = new_channels[record.channel_id]
+            writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
             count, end_ns = count + 1, max(end_ns, record.log_time)
     writer.finish()  # type: ignore[no-untyped-call]
     return count, end_ns / _NS if count else None
 
 
-def _check_is_recording(path: Path, channels: Mapping[Any, Any], condition: Condition) -> None:
+def _check_is_recording(path: Path, channels: Sized, condition: Condition) -> None:
     if not channels:
         what = "is empty" if not condition.size_bytes else "holds no intact channel of an MCAP recording"
         raise RecordingError(f"{path}: {what}; nothing can be shown or saved")

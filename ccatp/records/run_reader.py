@@ -1,4 +1,4 @@
-"""Reads a run directory for replay: each recording with its configuration, its events in order, and its poses."""
+"""Reads a run directory: recordings with configuration, ordered events and poses; and the survey of a run."""
 
 import tempfile
 from array import array
@@ -12,7 +12,7 @@ import numpy as np
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.core import Fix, FloatArray, IntArray, PanelId, PanelPose
+from ccatp.core import Fix, FloatArray, IntArray, PanelId, PanelPose, PointId, Vector3
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
@@ -21,6 +21,7 @@ from ccatp.links.topics import (
     ArrivalMessage,
     BadMessage,
     FixMessage,
+    Misalignment,
     Rest,
     SensorLines,
     TrackMessage,
@@ -29,18 +30,21 @@ from ccatp.links.topics import (
     decode_recorded,
 )
 from ccatp.mirror.mirror import Mirror, deck_poses
-from ccatp.records.recorder import iter_messages, read_metadata, recordings
+from ccatp.mirror.panel_alignment import Measured
+from ccatp.records.recorder import TELEMETRY, iter_messages, read_metadata, recordings
+from ccatp.records.store import StoreError, point_name, read_survey
+
+Injected = dict[PanelId, Vector3]
 
 
 @dataclass(frozen=True, slots=True)
 class Marked:
-    """A frame was taken, and what else was done to the localizer in it.
+    """A frame, and the treatment of the localizer in it.
 
     Attributes:
-        sensors: the frame.
-        begun: before the frame the localizer began anew, with these values of ``Treatment``.
-        is_odometry_off: whatever wheels and inertial unit say, the robot stands.
-        doubted: after the samples its pose was doubted by this much, m and rad.
+        begun: before the frame the localizer was reset, with these values of ``Treatment``.
+        is_odometry_off: whatever wheels and inertial unit report, the robot stands.
+        doubted: after the samples its uncertainty was increased by this much, m and rad.
     """
 
     sensors: Sensors
@@ -52,11 +56,7 @@ class Marked:
 
 @dataclass(frozen=True, slots=True)
 class Fixed:
-    """A fix was measured after the frame before it.
-
-    Attributes:
-        was_set_aside: the localizer never saw it: it was doubted, and measured again.
-    """
+    """A fix after the frame before it; one that ``was_set_aside`` was doubted and never given to the localizer."""
 
     fix: Fix
     was_fused: bool
@@ -85,7 +85,7 @@ Message = Sensors | Stood | FixGiven | Treatment
 
 
 def fix_given(message: FixMessage) -> FixGiven:
-    """The recorded fix as it was measured, and what became of it."""
+    """The recorded fix, and whether it was used."""
     fix = Fix(
         t_s=message.t_s,
         position_m=message.position_m,
@@ -101,11 +101,8 @@ def in_order(messages: Iterable[Message]) -> Iterator[Event]:
     """Frames, rests, treatments and fixes in the order in which the localizer met them.
 
     Frames are recorded in batches, rests and fixes at once and with the number of their frame: they come at any time
-    before the batch of the frame after it. A rest belongs into its frame, a fix behind it. What belongs behind a frame
-    beyond the end of the record is left out. A treatment belongs into its frame, too.
-
-    Args:
-        messages: in the order of recording; the numbers of the frames grow.
+    before the batch of the frame after it. A rest and a treatment belong into their frame, a fix behind it. Fixes
+    behind a frame beyond the end of the record are left out. ``messages`` are in the order of recording.
     """
     rests: set[int] = set()
     treatments: dict[tuple[int, str], tuple[float, ...]] = {}
@@ -170,7 +167,7 @@ class TraceBuilder:
         self._covariances = array("d")
 
     def add(self, seq: int, t_s: float, row: int, col: int, pose: tuple[float, float, float]) -> None:
-        """A pose (x, y, heading) in the frame of panel (row, col)."""
+        """Add a pose (x, y, heading) in the frame of panel (row, col)."""
         self._names.extend((seq, row, col))
         self._rows.extend((t_s, *pose))
 
@@ -198,9 +195,9 @@ def trace_of_truth(rows: Sequence[Sequence[float]] | FloatArray) -> Trace:
 
 
 _T = TypeVar("_T")
-TELEMETRY = "telemetry.mcap"
 CONFIG = "config.toml"
-# What a replay reads; the others of the topic table would only be decoded for nothing.
+STORE = "mission.sqlite"
+# Topics that a replay needs; the others of the topic table would be decoded for nothing.
 READ = frozenset(("sensors", "rest", "treatment", "fix", "track", "truth", "arrival"))
 
 
@@ -215,7 +212,7 @@ class Recording:
     """One recording of a run; a run that was resumed has several, each from the robot's start at base.
 
     Attributes:
-        warnings: what is wrong with it; complete when ``messages`` has come to its end.
+        warnings: defects; complete when ``messages`` has come to its end.
         arrivals: frames at which the robot stood at a point for the first time; complete likewise.
     """
 
@@ -225,22 +222,17 @@ class Recording:
     arrivals: list[int] = field(default_factory=list)
     _track: TraceBuilder = field(default_factory=TraceBuilder)
     _truth: list[tuple[float, ...]] = field(default_factory=list)
-    _lost: int = 0
 
     @property
     def is_simulation(self) -> bool:
-        """It was recorded of the stand-ins."""
+        """Robot and laser system were simulated."""
         return self.metadata.get("simulation") == "true"
 
     def config(self, overrides: Mapping[str, object]) -> Config:
-        """The configuration that was recorded with, and ``overrides`` on top.
-
-        Raises:
-            ConfigError: it cannot be used.
-        """
+        """The recorded configuration with ``overrides``; raises ``ConfigError`` where it cannot be used."""
         beside = self.path.with_name(CONFIG)
         kept = self.metadata.get("config")
-        if kept is None or (beside.is_file() and _text(beside) == kept):
+        if kept is None or (beside.is_file() and _readable(beside, _read_text) == kept):
             return load_config(beside, overrides)
         # A later session of a resumed run has written its own.
         with tempfile.TemporaryDirectory(prefix="ccatp-replay-") as folder:
@@ -249,8 +241,8 @@ class Recording:
             return load_config(file, overrides)
 
     def messages(self) -> Iterator[Message]:
-        """Frames, rests and fixes, in the order of recording; estimates and truth are put aside on the way."""
-        last, missing, t_s = -1, 0, 0.0
+        """Frames, rests and fixes in the order of recording; estimates and truth are collected on the way."""
+        last, missing, t_s, lost = -1, 0, 0.0, False
         damages: list[str] = []
         for topic, _, payload in iter_messages(self.path, damages.append):
             if topic not in READ:
@@ -258,7 +250,9 @@ class Recording:
             try:
                 found = self._take(decode_recorded(topic, payload))
             except (BadMessage, BadLine) as error:
-                self._lose(str(error))
+                if not lost:  # one line, however many there are
+                    self.warnings.append(f"{self.path}: what cannot be read is left out: {error}")
+                lost = True
                 continue
             for message in found:
                 if isinstance(message, Sensors):
@@ -288,14 +282,8 @@ class Recording:
             self.arrivals.append(message.seq)
         return []
 
-    def _lose(self, why: str) -> None:
-        """A message that cannot be read: one line says so, however many there are."""
-        self._lost += 1
-        if self._lost == 1:
-            self.warnings.append(f"{self.path}: what cannot be read is left out: {why}")
-
     def recorded(self, mirror: Mirror) -> Trace:
-        """What the run itself estimated."""
+        """The estimates of the run itself."""
         return self._track.build(mirror)
 
     def truth(self) -> Trace | None:
@@ -334,8 +322,8 @@ def _open(path: Path) -> Recording:
     return Recording(path, metadata)
 
 
-def _text(path: Path) -> str:
-    return _readable(path, lambda file: file.read_text(encoding="utf-8", errors="replace"))
+def _read_text(path: Path) -> str:
+    return path.read_text(encoding="utf-8", errors="replace")
 
 
 def _readable(path: Path, read: Callable[[Path], _T]) -> _T:
@@ -343,3 +331,78 @@ def _readable(path: Path, read: Callable[[Path], _T]) -> _T:
         return read(path)
     except OSError as error:
         raise RunReadError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+class Survey(NamedTuple):
+    """A run's survey.
+
+    Attributes:
+        injected: piston (m), tip and tilt (rad) of the simulated panels; None on a real robot or where not recorded.
+    """
+
+    cfg: Config
+    planned: tuple[PointId, ...]
+    measured: tuple[Measured, ...]
+    injected: Injected | None
+    is_simulation: bool | None
+    warnings: tuple[str, ...]
+
+
+def read_run(run_dir: Path, overrides: Mapping[str, object]) -> Survey:
+    """Read the survey of a run directory without changing it; ``overrides`` are dotted keys of the configuration.
+
+    Raises:
+        RunReadError: no such directory, or no run in it, or a database that cannot be read.
+        ConfigError: its configuration cannot be used.
+    """
+    if not run_dir.is_dir():
+        raise RunReadError(f"{run_dir}: no such directory; name the directory of a run")
+    if not (run_dir / CONFIG).is_file():
+        raise RunReadError(f"{run_dir}: no {CONFIG} there; name the directory of a run")
+    cfg = load_config(run_dir / CONFIG, overrides)
+    try:
+        stored = read_survey(run_dir / STORE, cfg.mirror.name)
+    except StoreError as error:
+        raise RunReadError(str(error)) from error
+    warnings = [
+        f"point {point_name(point)}: its stored fix is damaged and left out; measure it again"
+        for point in stored.damaged
+    ]
+    injected, is_simulation = read_truth(run_dir, warnings)
+    planned = tuple(row.point for row in stored.points)
+    measured = tuple(Measured(one.point, one.fix) for one in stored.fixes)
+    return Survey(cfg, planned, measured, injected, is_simulation, tuple(warnings))
+
+
+def read_truth(run_dir: Path, warnings: list[str]) -> tuple[Injected | None, bool | None]:
+    """The simulated misalignment of the panels, and whether they were simulated; defects are added to ``warnings``."""
+    found: list[Injected] = []
+    is_simulation: bool | None = None
+    for path in recordings(run_dir / TELEMETRY):
+        try:
+            is_simulation = read_metadata(path).get("simulation") == "true"
+            injected = _injected(path) if is_simulation else None
+        except OSError as error:
+            warnings.append(f"{path}: cannot be read: {error.strerror or error}; the truth is not compared")
+            continue
+        if injected is not None:
+            found.append(injected)
+    if any(one != found[0] for one in found):
+        warnings.append("the sessions of this run simulated differently misaligned panels; the truth is not compared")
+        return None, is_simulation
+    return (found[0] if found else None), is_simulation
+
+
+def _injected(path: Path) -> Injected | None:
+    for topic, _, payload in iter_messages(path):
+        if topic == "truth":  # before the misalignment: an older recording, which does not have it
+            return None
+        if topic == "misalignment":
+            try:
+                message = decode_recorded(topic, payload)
+            except BadMessage:
+                return None
+            if not isinstance(message, Misalignment):
+                return None
+            return {PanelId(row, col): (piston, tip, tilt) for row, col, piston, tip, tilt in message.panels}
+    return None

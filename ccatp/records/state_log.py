@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from ccatp.core import danger_text
 
-# Fields of every line; the others say more of what happened.
+# Fields of every line.
 _OWN = frozenset(("logger", "process", "event", "level", "timestamp", "wall", "seq", "t_s"))
 # Names of events and keys in logs of older versions.
 _OLD_EVENTS = {"run": "run_started", "end": "run_finished", "state": "state_changed", "verdict": "verdict_changed"}
@@ -29,7 +29,7 @@ class StateChange(NamedTuple):
 
 
 class LogLine(NamedTuple):
-    """A line of the log: wall time (ISO), robot time where it is known, level, process, text."""
+    """A line of the log; wall time in ISO format, robot time where it is known."""
 
     wall: str
     t_s: float | None
@@ -39,11 +39,7 @@ class LogLine(NamedTuple):
 
 
 class ReadLine(NamedTuple):
-    """A line of the log.
-
-    Attributes:
-        shown: what a reader is shown; None for what was said for debugging.
-    """
+    """A parsed line: text for a reader (None for debugging), change of state, and whether a session begins."""
 
     shown: LogLine | None
     change: StateChange | None
@@ -51,12 +47,7 @@ class ReadLine(NamedTuple):
 
 
 def read_log(path: Path, warnings: list[str]) -> Iterator[ReadLine]:
-    """The lines of a log, oldest first; a log that is not there has none.
-
-    Args:
-        path: the file; its last line may be torn, as after a ``kill -9``.
-        warnings: takes one line where something cannot be read.
-    """
+    """The lines of a log, oldest first; a missing log has none. Damage adds a line to ``warnings``."""
     bad = 0
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
@@ -105,7 +96,6 @@ def _change(fields: dict[str, Any]) -> StateChange | None:
 
 
 def _text(fields: dict[str, Any]) -> str:
-    """What happened, and what more the line says of it: names, values and units as a reader writes them."""
     event = str(fields["event"])
     if event == "verdict_changed":
         return _verdict(fields)
@@ -113,12 +103,12 @@ def _text(fields: dict[str, Any]) -> str:
         return str(fields.get("text", ""))
     if _EVENT_NAME.fullmatch(event):  # older logs have sentences
         event = event.replace("_", " ")
-    more = [f"{_named(key)} {_shown(value)}{_unit(key)}" for key, value in fields.items() if _says(key, value)]
+    more = [
+        f"{_named(key)} {_shown(value)}{_unit(key)}"
+        for key, value in fields.items()
+        if key not in _OWN and value not in ("", {}, [], None)
+    ]
     return f"{event}: {', '.join(more)}" if more else event
-
-
-def _says(key: str, value: object) -> bool:
-    return key not in _OWN and value not in ("", {}, [], None)
 
 
 def _verdict(fields: dict[str, Any]) -> str:
@@ -154,8 +144,8 @@ def _shown(value: object) -> str:
 def changes_of(lines: Iterable[ReadLine], sessions: int) -> list[tuple[StateChange, ...]]:
     """The changes of state in each session.
 
-    They are numbered by the robot's frames. Where these count anew within a session, because the robot booted, or where
-    the log does not hold as many sessions as there are recordings, their times are not known: then there are none.
+    They are numbered by the robot's frames. There are none where these restart within a session, because the robot
+    booted, or where the log does not hold as many sessions as there are recordings: their times are then not known.
     """
     parts: list[list[StateChange]] = []
     for line in lines:
@@ -165,8 +155,4 @@ def changes_of(lines: Iterable[ReadLine], sessions: int) -> list[tuple[StateChan
             parts[-1].append(line.change)
     if len(parts) != sessions:
         return [()] * sessions
-    return [tuple(part) if _is_in_order(part) else () for part in parts]
-
-
-def _is_in_order(part: list[StateChange]) -> bool:
-    return all(a.seq <= b.seq for a, b in pairwise(part))
+    return [tuple(part) if all(a.seq <= b.seq for a, b in pairwise(part)) else () for part in parts]

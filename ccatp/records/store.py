@@ -1,76 +1,166 @@
-"""The mission database: which points are planned, measured or skipped, with their fixes, arrivals and events.
+"""The mission database: which points are planned, measured or skipped, with their fixes and arrivals.
 
 SQLite with one connection, owned by a writer thread that commits with ``synchronous=FULL``. The journal is a rollback
-journal: the file alone is complete after each commit, and a curious reader from outside cannot meet the defect that
-write-ahead logs of SQLite 3.7.0 to 3.51.2 have with several connections. Room for a whole mission, the journal's
-included, is taken at the start: a disk that fills up later costs no measurement.
+journal: the file alone is complete after each commit, and a reader from outside cannot meet the defect that write-ahead
+logs of SQLite 3.7.0 to 3.51.2 have with several connections. Room for a whole mission, the journal's included, is taken
+at the start: a disk that fills up later costs no measurement.
 
-Reads a mission database without writing to it: of a run that goes on, was killed, or is an archive.
+Every fix carries a checksum over all its values, and so do the targets with the meta data: a flipped bit that leaves
+the file a valid database is found, and the point is measured again.
 """
 
 import hashlib
+import os
 import shutil
 import sqlite3
 import tempfile
 import threading
-import time
-from collections import deque
+import zlib
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from contextlib import closing, suppress
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from dataclasses import dataclass, field
+from math import isfinite
 from pathlib import Path
-from types import TracebackType
+from queue import SimpleQueue
 from typing import Any, NamedTuple, Self
 from urllib.parse import quote
 
 from ccatp.core import DeckPose, Fix, PointId
-from ccatp.records import store_rows as rows
-from ccatp.records.store_rows import PlannedPoint, StoredFix, StoredPoint, StoreError, StoreEvent, StoreRefusal
 
-RESERVE_BYTES = 2 * 1024 * 1024  # five times what 800 fixes and 2,000 events take
-EVENT_QUEUE = 1000
-BATCH = 256
+SCHEMA_VERSION = 1
+BUSY_TIMEOUT_S = 30.0  # an outside reader may hold its lock for this long
+RESERVE_BYTES = 2 * 1024 * 1024  # five times what 800 fixes and 2,000 arrivals take
+QUEUE_LIMIT = 1000
 
-FailureCallback = Callable[[StoreError], None]
+# Its text is compared with that in a file, comments included. Nothing is written to ``events``.
+_SCHEMA = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE fixes (
+  id INTEGER PRIMARY KEY, row INTEGER NOT NULL, col INTEGER NOT NULL, point INTEGER NOT NULL, t_s REAL NOT NULL,
+  x_m REAL NOT NULL, y_m REAL NOT NULL, z_m REAL NOT NULL, -- puck, world frame
+  cov_xx_m2 REAL NOT NULL, cov_xy_m2 REAL NOT NULL, cov_xz_m2 REAL NOT NULL,
+  cov_yx_m2 REAL NOT NULL, cov_yy_m2 REAL NOT NULL, cov_yz_m2 REAL NOT NULL,
+  cov_zx_m2 REAL NOT NULL, cov_zy_m2 REAL NOT NULL, cov_zz_m2 REAL NOT NULL,
+  dop REAL NOT NULL, residual_rms_m REAL NOT NULL, channels TEXT NOT NULL,
+  estimate_x_m REAL NOT NULL, estimate_y_m REAL NOT NULL, estimate_heading_rad REAL NOT NULL, -- deck frame
+  crc INTEGER NOT NULL);
+CREATE TABLE points (
+  row INTEGER NOT NULL, col INTEGER NOT NULL, point INTEGER NOT NULL,
+  x_m REAL NOT NULL, y_m REAL NOT NULL, -- target, panel frame
+  status TEXT NOT NULL DEFAULT 'planned' CHECK (status IN ('planned', 'measured', 'skipped')),
+  t_s REAL, fix_id INTEGER UNIQUE REFERENCES fixes (id),
+  CHECK ((status = 'measured') = (fix_id IS NOT NULL)), PRIMARY KEY (row, col, point)) WITHOUT ROWID;
+CREATE TABLE events (
+  id INTEGER PRIMARY KEY, t_s REAL, wall_utc TEXT NOT NULL, kind TEXT NOT NULL, code INTEGER NOT NULL,
+  cause TEXT NOT NULL, signal TEXT NOT NULL, value REAL, "limit" REAL, text TEXT NOT NULL);
+CREATE TABLE arrivals (
+  id INTEGER PRIMARY KEY, row INTEGER NOT NULL, col INTEGER NOT NULL, point INTEGER NOT NULL,
+  t_s REAL NOT NULL, estimated_error_m REAL NOT NULL);
+CREATE TABLE reserve (id INTEGER PRIMARY KEY, used INTEGER NOT NULL, filler BLOB NOT NULL);
+CREATE TABLE ballast (filler BLOB);
+"""
+_PAGE_FILLER = 3900  # bytes; one row fills a page
+_JOURNAL_PAGES = 48  # room kept in the journal; a commit of one fix touches about six pages
+_CRC_KEY = "crc"
+_INSERT_FIX = "INSERT INTO fixes VALUES (NULL,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)"
+_STATUS = "SELECT status FROM points WHERE row = ? AND col = ? AND point = ?"
+_SET_STATUS = "UPDATE points SET status = ?, t_s = ?, fix_id = ? WHERE row = ? AND col = ? AND point = ?"
+# SQLite's errors for a file whose last transaction was cut off: it must be rolled back before it can be read.
+_CUT_OFF = ("SQLITE_READONLY", "SQLITE_CANTOPEN")
 
 
-@dataclass(slots=True)
+class StoreError(Exception):
+    """The store cannot be used, or a write failed for good: nothing after it is acknowledged."""
+
+
+class StoreRefusal(StoreError):
+    """One request was refused; the store goes on."""
+
+
+class AlreadyMeasuredError(StoreRefusal):
+    """The point already has a committed fix."""
+
+
+class UnknownPointError(StoreRefusal):
+    """The point is not one of this mission's."""
+
+
+class PlannedPoint(NamedTuple):
+    """A point to be measured and its target in the tangent plane of its panel, panel frame."""
+
+    point: PointId
+    x_m: float
+    y_m: float
+
+
+class StoredPoint(NamedTuple):
+    """A row of ``points``; ``status`` is planned, measured or skipped, ``t_s`` the time of the latter two."""
+
+    point: PointId
+    x_m: float
+    y_m: float
+    status: str
+    t_s: float | None
+    fix_id: int | None
+
+
+class StoredFix(NamedTuple):
+    """A committed fix (world frame), and the estimated pose (deck) at that time."""
+
+    id: int
+    point: PointId
+    fix: Fix
+    estimate: DeckPose
+
+
+class StoredSurvey(NamedTuple):
+    """Content of a mission database; ``damaged`` are the points whose fix does not match its checksum."""
+
+    points: list[StoredPoint]
+    fixes: list[StoredFix]
+    damaged: list[PointId]
+
+
+def point_name(point: PointId) -> str:
+    """``row/column/number``."""
+    return "/".join(map(str, point))
+
+
+_Work = Callable[[sqlite3.Connection], Any]
+
+
+@dataclass(frozen=True, slots=True)
 class _Job:
-    work: Callable[[sqlite3.Connection], Any]
-    queued_s: float
-    future: "Future[Any] | None" = None  # None: nobody waits, may be dropped where there is no room
+    work: _Work
     point: PointId | None = None  # measured once committed
+    is_optional: bool = False  # gives way where there is no room
+    future: "Future[Any]" = field(default_factory=Future)
 
 
 class MissionStore:
     """The mission database of one run, owned by one process; made by ``create`` or ``open``.
 
-    Recording returns at once and may be done from an asyncio loop. ``points``, ``fixes``, ``events``, ``arrivals`` and
-    ``close`` wait for the writer thread.
+    Recording returns at once and may be done from an asyncio loop; each request is one transaction. ``points``,
+    ``fixes`` and ``close`` wait for the writer thread.
 
     Attributes:
-        meta: mirror, seed, config_sha256 and schema_version, as text.
-        damaged: points whose stored fix did not pass its checksum at ``open``; they are planned again.
+        damaged: points whose stored fix did not match its checksum at ``open``; they are planned again.
         failure: the error that ended all writing, if any.
-        events_dropped: events and arrivals that found the queue or the disk full.
+        arrivals_dropped: arrivals that found the queue or the disk full.
     """
 
-    def __init__(self, path: Path, db: sqlite3.Connection, on_failure: FailureCallback | None) -> None:
+    def __init__(self, path: Path, db: sqlite3.Connection) -> None:
         self.path = path
-        self.meta: dict[str, str] = dict(db.execute("SELECT key, value FROM meta"))
-        self.damaged = tuple(rows.replan_damaged(db))
+        self.damaged = tuple(_damaged_points(db))
+        for point in self.damaged:
+            db.execute(_SET_STATUS, ("planned", None, None, *point))
         self.failure: StoreError | None = None
-        self.events_dropped = 0
+        self.arrivals_dropped = 0
         self._db = db
-        self._on_failure = on_failure
-        self._measured = {p.point for p in rows.select_points(db) if p.status == "measured"}
-        self._jobs: deque[_Job] = deque()
-        self._batch: list[_Job] = []
-        self._waiting_events = 0
-        self._closing = False
-        self._wake = threading.Condition()
+        self._measured = {p.point for p in select_points(db) if p.status == "measured"}
+        self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
+        self._is_closed = False
         self._thread = threading.Thread(target=self._run, name="store", daemon=True)
         self._thread.start()
 
@@ -83,99 +173,113 @@ class MissionStore:
         seed: int,
         config_toml: str,
         points: Iterable[PlannedPoint],
-        on_failure: FailureCallback | None = None,
         reserve_bytes: int = RESERVE_BYTES,
     ) -> Self:
         """Make a new store with all points planned; the file appears complete or not at all.
 
         Args:
-            path: a file that does not exist.
             config_toml: the run's exact configuration; its SHA-256 is kept.
-            on_failure: called once, from the writer thread, when writing has ended for good.
 
         Raises:
             StoreError: the file exists, or cannot be made.
         """
-        digest = hashlib.sha256(config_toml.encode()).hexdigest()
-        rows.make_file(path, points, {"mirror": mirror, "seed": str(seed), "config_sha256": digest}, reserve_bytes)
-        return cls.open(path, mirror=mirror, on_failure=on_failure)
+        if path.exists():
+            raise StoreError(f"{path}: exists already; resume it or choose another run directory")
+        meta = [
+            ("mirror", mirror),
+            ("seed", str(seed)),
+            ("config_sha256", hashlib.sha256(config_toml.encode()).hexdigest()),
+            ("schema_version", str(SCHEMA_VERSION)),
+        ]
+        new = path.with_name(path.name + ".new")
+        try:
+            for leftover in (new, path):
+                leftover.with_name(leftover.name + "-journal").unlink(missing_ok=True)
+            new.unlink(missing_ok=True)
+            with closing(_connect(new)) as db:
+                # A half-made file is thrown away, so it needs no journal on the disk.
+                db.execute("PRAGMA journal_mode = MEMORY")
+                _fill(db, points, meta, reserve_bytes)
+            new.replace(path)
+            folder = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+        except (OSError, sqlite3.Error) as error:
+            raise StoreError(f"{path}: cannot be made: {error}") from error
+        return cls.open(path, mirror=mirror)
 
     @classmethod
-    def open(cls, path: Path, *, mirror: str, on_failure: FailureCallback | None = None) -> Self:
+    def open(cls, path: Path, *, mirror: str) -> Self:
         """Open the store of an earlier run to go on with it.
-
-        Args:
-            mirror: the mirror about to be surveyed; must be that of the file.
-            on_failure: as for ``create``.
 
         Raises:
             StoreError: no such file, not a mission store, another schema or mirror, or damaged.
         """
-        return cls(path, rows.open_file(path, mirror), on_failure)
+        if not path.is_file():
+            raise StoreError(f"{path}: no such file; nothing to resume")
+        db: sqlite3.Connection | None = None
+        try:
+            db = _connect(path)
+            _check_file(db, path, mirror)
+            # Touches so many pages that the journal keeps the room which later commits need.
+            db.execute("UPDATE reserve SET used = used + 1")
+        except (sqlite3.Error, UnicodeDecodeError, StoreError) as error:
+            if db is not None:
+                db.close()
+            if isinstance(error, StoreError):
+                raise
+            raise StoreError(f"{path}: damaged or not a mission store: {error}") from error
+        return cls(path, db)
 
-    def record_fix(self, point: PointId, fix: Fix, estimate: DeckPose, *, remeasure: bool = False) -> "Future[int]":
-        """Store a fix and make its point measured, in one transaction.
-
-        Args:
-            fix: the puck in the world frame, with covariance.
-            estimate: estimated deck pose at that time.
-            remeasure: replace the fix of a point that has one; the old row stays in the table.
+    def record_fix(self, point: PointId, fix: Fix, estimate: DeckPose) -> "Future[int]":
+        """Store a fix (world frame) and make its point measured, in one transaction.
 
         Returns:
             Resolves to the number of the fix after the commit (await it with ``asyncio.wrap_future``). Fails with
             ``AlreadyMeasuredError``, ``UnknownPointError``, ``StoreRefusal`` (not finite, or a covariance not of nine
             values) or, where nothing will be stored any more, another ``StoreError``.
         """
-        return self._submit(
-            lambda db: rows.insert_fix(db, point, rows.fix_values(point, fix, estimate), remeasure), point
-        )
+        return self._submit(lambda db: _insert_fix(db, point, fix, estimate), point)
 
     def record_skipped(self, point: PointId, t_s: float) -> "Future[None]":
         """Mark a point as skipped (it may still be measured later); resolves and fails like ``record_fix``."""
-        return self._submit(lambda db: rows.skip_point(db, point, t_s))
 
-    def record_event(self, event: StoreEvent) -> bool:
-        """Store an event without waiting; False where it was dropped because the queue is full or writing has ended."""
-        wall_utc = datetime.now(UTC).isoformat(timespec="milliseconds")
-        return self._post(lambda db: rows.insert_event(db, event, wall_utc))
+        def skip(db: sqlite3.Connection) -> None:
+            if _status(db, point) == "measured":
+                raise AlreadyMeasuredError(f"point {point_name(point)} has been measured; it cannot be skipped")
+            db.execute(_SET_STATUS, ("skipped", t_s, None, *point))
+
+        return self._submit(skip)
 
     def record_arrival(self, point: PointId, t_s: float, estimated_error_m: float) -> bool:
-        """Store that the robot came to rest at a point, without waiting; returns as ``record_event``."""
-        return self._post(lambda db: rows.insert_arrival(db, point, t_s, estimated_error_m))
+        """Store that the robot came to rest at a point; False where it was dropped: a full queue, or writing ended."""
+        if self._jobs.qsize() >= QUEUE_LIMIT or self._is_closed or self.failure is not None:
+            self.arrivals_dropped += 1
+            return False
+        row = (*point, t_s, estimated_error_m)
+        insert = "INSERT INTO arrivals VALUES (NULL, ?, ?, ?, ?, ?)"
+        self._jobs.put(_Job(lambda db: db.execute(insert, row), is_optional=True))
+        return True
 
     def measured_points(self) -> set[PointId]:
         """The points whose fix is committed."""
-        with self._wake:
-            return set(self._measured)
+        return set(self._measured)
 
     def points(self) -> list[StoredPoint]:
         """All points, by row, column and number."""
-        return list(self._submit(rows.select_points).result())
+        return list(self._submit(select_points).result())
 
-    def fixes(self, *, history: bool = False) -> list[StoredFix]:
-        """The fix of each measured point in the order of measuring; with ``history`` replaced ones too."""
-        return list(self._submit(lambda db: rows.select_fixes(db, history)).result())
-
-    def events(self) -> list[tuple[int, StoreEvent, str]]:
-        """All events: number, event, wall time (UTC, a label only)."""
-        return list(self._submit(rows.select_events).result())
-
-    def arrivals(self) -> list[tuple[PointId, float, float]]:
-        """All arrivals: point, time (s), estimated error (m)."""
-        return list(self._submit(rows.select_arrivals).result())
-
-    @property
-    def queue_age_s(self) -> float:
-        """How long the oldest request has waited for its commit, s; grows when the disk stalls."""
-        with self._wake:
-            oldest = self._batch[0] if self._batch else self._jobs[0] if self._jobs else None
-            return 0.0 if oldest is None else time.monotonic() - oldest.queued_s
+    def fixes(self) -> list[StoredFix]:
+        """The fix of each measured point in the order of measuring."""
+        return list(self._submit(select_fixes).result())
 
     def close(self, timeout_s: float = 10.0) -> None:
-        """Commit what is queued and close the file; again is harmless. Raises ``StoreError`` after the time-out."""
-        with self._wake:
-            self._closing = True
-            self._wake.notify()
+        """Commit what is queued and close the file; may be repeated. Raises ``StoreError`` after the time-out."""
+        if not self._is_closed:
+            self._is_closed = True
+            self._jobs.put(None)
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             raise StoreError(f"{self.path}: writer still busy after {timeout_s} s")
@@ -183,135 +287,72 @@ class MissionStore:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _submit(self, work: Callable[[sqlite3.Connection], Any], point: PointId | None = None) -> "Future[Any]":
-        future: Future[Any] = Future()
-        with self._wake:
-            refused = self.failure or (StoreError(f"{self.path}: is closed") if self._closing else None)
-            if refused is None:
-                self._jobs.append(_Job(work, time.monotonic(), future, point))
-                self._wake.notify()
-        if refused is not None:
-            future.set_exception(refused)
-        return future
-
-    def _post(self, work: Callable[[sqlite3.Connection], Any]) -> bool:
-        with self._wake:
-            if self._waiting_events >= EVENT_QUEUE or self._closing or self.failure is not None:
-                self.events_dropped += 1
-                return False
-            self._waiting_events += 1
-            self._jobs.append(_Job(work, time.monotonic()))
-            self._wake.notify()
-            return True
+    def _submit(self, work: _Work, point: PointId | None = None) -> "Future[Any]":
+        job = _Job(work, point)
+        if self._is_closed:
+            job.future.set_exception(self.failure or StoreError(f"{self.path}: is closed"))
+        else:
+            self._jobs.put(job)
+        return job.future
 
     def _run(self) -> None:
-        try:
-            while (batch := self._take_batch()) is not None:
-                self._write(batch)
-        except Exception as error:
-            self._end(f"{type(error).__name__}: {error}", [])
-            raise
-        finally:
-            with suppress(sqlite3.Error):
-                self._db.execute("PRAGMA journal_mode = DELETE")
-            self._db.close()
-
-    def _take_batch(self) -> list[_Job] | None:
-        with self._wake:
-            self._batch = []
-            self._wake.wait_for(lambda: self._jobs or self._closing)
-            if not self._jobs:
-                return None
-            jobs = [self._jobs.popleft() for _ in range(min(BATCH, len(self._jobs)))]
-            self._waiting_events -= sum(job.future is None for job in jobs)
+        while (job := self._jobs.get()) is not None:
             # A request cancelled before it began is left out; from here on it can no longer be cancelled.
-            self._batch = [job for job in jobs if job.future is None or job.future.set_running_or_notify_cancel()]
-            return self._batch
-
-    def _write(self, batch: list[_Job]) -> None:
-        try:
-            self._commit(batch)
-        except sqlite3.Error as error:
-            waited_for = [job for job in batch if job.future is not None]
-            if self._rolled_back() and error.sqlite_errorname == "SQLITE_FULL" and len(waited_for) < len(batch):
-                # Events give way to fixes, for which there may be room in what was taken at the start.
-                self.events_dropped += len(batch) - len(waited_for)
-                self._write(waited_for)
+            if not job.future.set_running_or_notify_cancel():
+                continue
+            try:
+                if self.failure is not None:
+                    raise self.failure
+                result = self._commit(job)
+            except StoreError as error:
+                self.arrivals_dropped += job.is_optional
+                job.future.set_exception(error)
             else:
-                # Final: after a failed fsync a repeated one may report a success that never reached the disk.
-                self._end(f"{error} ({error.sqlite_errorname})", batch)
-
-    def _commit(self, batch: list[_Job]) -> None:
-        done: list[tuple[_Job, Any]] = []
-        self._db.execute("BEGIN IMMEDIATE")
-        for job in batch:
-            done.append((job, self._one(job)))
-        self._db.execute("COMMIT")
-        with self._wake:
-            self._measured.update(j.point for j, r in done if j.point is not None and not isinstance(r, StoreError))
-        for job, result in done:
-            if job.future is None:
-                self.events_dropped += isinstance(result, StoreError)
-            elif isinstance(result, StoreError):
-                job.future.set_exception(result)
-            else:
+                if job.point is not None:
+                    self._measured.add(job.point)
                 job.future.set_result(result)
+        with suppress(sqlite3.Error):
+            self._db.execute("PRAGMA journal_mode = DELETE")
+        self._db.close()
 
-    def _one(self, job: _Job) -> Any:
-        # One request that the database does not take must not take the others of its batch with it.
-        self._db.execute("SAVEPOINT job")
+    def _commit(self, job: _Job) -> Any:
+        """Raises ``StoreRefusal`` where the store can go on, another ``StoreError`` where it cannot."""
         try:
-            result = job.work(self._db)
-        except (StoreRefusal, sqlite3.IntegrityError, sqlite3.ProgrammingError, TypeError, OverflowError) as error:
-            self._db.execute("ROLLBACK TO job")
-            result = error if isinstance(error, StoreRefusal) else StoreRefusal(f"{self.path}: not storable: {error}")
-        self._db.execute("RELEASE job")
+            self._db.execute("BEGIN IMMEDIATE")
+            try:
+                result = job.work(self._db)
+            except (StoreRefusal, sqlite3.IntegrityError, sqlite3.ProgrammingError, TypeError, OverflowError) as error:
+                self._db.execute("ROLLBACK")
+                if isinstance(error, StoreRefusal):
+                    raise
+                raise StoreRefusal(f"{self.path}: not storable: {error}") from error
+            self._db.execute("COMMIT")
+        except StoreRefusal:
+            raise
+        except Exception as error:
+            name = getattr(error, "sqlite_errorname", "")
+            reason = f"{error} ({name})" if name else f"{type(error).__name__}: {error}"
+            # Arrivals give way to fixes, for which there may be room in what was taken at the start.
+            if self._is_rolled_back() and job.is_optional and name == "SQLITE_FULL":
+                raise StoreRefusal(f"{self.path}: {reason}") from error
+            # Final: after a failed fsync a repeated one may report a success that never reached the disk.
+            self.failure = StoreError(f"{self.path}: cannot write any more: {reason}")
+            raise self.failure from error
         return result
 
-    def _rolled_back(self) -> bool:
+    def _is_rolled_back(self) -> bool:
         with suppress(sqlite3.Error):
             if self._db.in_transaction:
                 self._db.execute("ROLLBACK")
             return True
         return False
 
-    def _end(self, reason: str, batch: list[_Job]) -> None:
-        failure = StoreError(f"{self.path}: cannot write any more: {reason}")
-        with self._wake:
-            self.failure = failure
-            lost = [*(batch or self._batch), *self._jobs]
-            self._jobs.clear()
-        for job in lost:
-            if job.future is None:
-                self.events_dropped += 1
-            elif not job.future.done():
-                job.future.set_exception(failure)
-        if self._on_failure is not None:
-            self._on_failure(failure)
-
-
-_BUSY_TIMEOUT_S = 10.0
-# What SQLite says of a file whose last transaction was cut off: it cannot be read before it has been rolled back.
-_CUT_OFF = ("SQLITE_READONLY", "SQLITE_CANTOPEN")
-
-
-class StoredSurvey(NamedTuple):
-    """What a mission database holds.
-
-    Attributes:
-        damaged: points whose fix does not match its checksum.
-    """
-
-    points: list[StoredPoint]
-    fixes: list[StoredFix]
-    damaged: list[PointId]
-
 
 def read_survey(path: Path, mirror: str) -> StoredSurvey:
-    """Read a mission database; the file is not changed.
+    """Read a mission database without writing to it: of a run that goes on, was killed, or is an archive.
 
     Raises:
         StoreError: no such file, not a mission store, another schema or mirror, or damaged.
@@ -324,27 +365,137 @@ def read_survey(path: Path, mirror: str) -> StoredSurvey:
         except sqlite3.OperationalError as error:
             if not error.sqlite_errorname.startswith(_CUT_OFF):
                 raise
-            return _read_copy(path, mirror)
+        # SQLite may undo in a copy what was cut off.
+        with tempfile.TemporaryDirectory(prefix="ccatp-read-") as folder:
+            for file in (path, path.with_name(path.name + "-journal")):
+                if file.exists():
+                    shutil.copyfile(file, Path(folder) / file.name)
+            return _read(f"file:{quote(str(Path(folder) / path.name))}?mode=rw", path, mirror)
     except (sqlite3.Error, UnicodeDecodeError, OSError, ValueError, TypeError) as error:
         raise StoreError(f"{path}: damaged or not a mission store: {error}") from error
 
 
-def _read_copy(path: Path, mirror: str) -> StoredSurvey:
-    """Read a copy, in which SQLite may undo what was cut off."""
-    journal = path.with_name(path.name + "-journal")
-    with tempfile.TemporaryDirectory(prefix="ccatp-read-") as folder:
-        copy = Path(folder) / path.name
-        for file in (path, journal):
-            if file.exists():
-                shutil.copyfile(file, copy.with_name(file.name))
-        return _read(f"file:{quote(str(copy))}?mode=rw", path, mirror)
-
-
 def _read(uri: str, path: Path, mirror: str) -> StoredSurvey:
-    with closing(sqlite3.connect(uri, timeout=_BUSY_TIMEOUT_S, uri=True, isolation_level=None)) as db:
+    with closing(sqlite3.connect(uri, timeout=10.0, uri=True, isolation_level=None)) as db:
         db.execute("BEGIN")  # all of it at one instant, while a run goes on
-        rows.check_file(db, path, mirror)
-        damaged = rows.damaged_points(db)
-        bad = set(damaged)
-        fixes = [stored for stored in rows.select_fixes(db, history=False) if stored.point not in bad]
-        return StoredSurvey(rows.select_points(db), fixes, damaged)
+        _check_file(db, path, mirror)
+        damaged = _damaged_points(db)
+        fixes = [stored for stored in select_fixes(db) if stored.point not in damaged]
+        return StoredSurvey(select_points(db), fixes, damaged)
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    # The connection is handed to the writer thread once and never shared.
+    db = sqlite3.connect(path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False)
+    # A damaged text comes back damaged, and fails its checksum, instead of ending the program.
+    db.text_factory = lambda raw: raw.decode("utf-8", "surrogateescape")
+    try:
+        db.execute("PRAGMA synchronous = FULL")
+        db.execute("PRAGMA journal_mode = PERSIST")
+    except Exception:  # not a database; its message may even be no UTF-8
+        db.close()
+        raise
+    return db
+
+
+def _fill(
+    db: sqlite3.Connection, points: Iterable[PlannedPoint], meta: list[tuple[str, str]], reserve_bytes: int
+) -> None:
+    db.executescript(f"BEGIN; {_SCHEMA} COMMIT;")
+    db.execute("BEGIN")
+    rows = [(*p.point, float(p.x_m), float(p.y_m)) for p in points]
+    db.executemany("INSERT INTO points (row, col, point, x_m, y_m) VALUES (?, ?, ?, ?, ?)", rows)
+    db.executemany("INSERT INTO meta VALUES (?, ?)", meta)
+    db.execute("INSERT INTO meta VALUES (?, ?)", (_CRC_KEY, str(_plan_crc(db))))
+    filler = [(0, bytes(_PAGE_FILLER))] * (_JOURNAL_PAGES if reserve_bytes else 0)
+    db.executemany("INSERT INTO reserve (used, filler) VALUES (?, ?)", filler)
+    db.execute("INSERT INTO ballast VALUES (zeroblob(?))", (reserve_bytes,))
+    db.execute("COMMIT")
+    # Its pages were written once, so the disk has given them; now they are free inside the file.
+    db.execute("DROP TABLE ballast")
+
+
+def _check_file(db: sqlite3.Connection, path: Path, mirror: str) -> None:
+    """Raises ``StoreError``, or ``sqlite3.Error``, unless the file is a sound store of this schema and mirror."""
+    verdict = db.execute("PRAGMA integrity_check(1)").fetchone()[0]
+    if verdict != "ok":
+        raise StoreError(f"{path}: damaged: {verdict}")
+    pages, page_bytes = (db.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "page_size"))
+    if path.stat().st_size < pages * page_bytes:  # SQLite fills up a page that is cut off
+        raise StoreError(f"{path}: damaged: cut off at {path.stat().st_size} of {pages * page_bytes} bytes")
+    meta = dict(db.execute("SELECT key, value FROM meta"))
+    version = meta.get("schema_version")
+    if version != str(SCHEMA_VERSION):
+        raise StoreError(
+            f"{path}: schema version {version}, this program has {SCHEMA_VERSION}; use a new run directory"
+        )
+    with closing(sqlite3.connect(":memory:")) as expected:
+        expected.executescript(_SCHEMA)
+        if _tables(db) != _tables(expected):
+            raise StoreError(f"{path}: damaged: its tables are not those of schema version {SCHEMA_VERSION}")
+    if meta.get(_CRC_KEY) != str(_plan_crc(db)):
+        raise StoreError(f"{path}: damaged: meta data or targets do not match their checksum")
+    if meta.get("mirror") != mirror:
+        raise StoreError(f"{path}: is a survey of {meta.get('mirror')}, not of {mirror}; use a new run directory")
+
+
+def _tables(db: sqlite3.Connection) -> list[tuple[str, str]]:
+    # Ballast is gone in a sound file; where dropping it was cut short the file was never complete.
+    rows = db.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL AND name <> 'ballast' ORDER BY name")
+    return [(str(name), str(sql)) for name, sql in rows]
+
+
+def _damaged_points(db: sqlite3.Connection) -> list[PointId]:
+    """The points whose fix is missing or does not match its checksum."""
+    damaged = []
+    for key in db.execute("SELECT row, col, point, fix_id, t_s FROM points WHERE fix_id IS NOT NULL").fetchall():
+        fix = db.execute("SELECT * FROM fixes WHERE id = ?", (key[3],)).fetchone()
+        if fix is None or fix[1:5] != (*key[:3], key[4]) or fix[-1] != _crc(fix[1:-1]):
+            damaged.append(PointId(*key[:3]))
+    return damaged
+
+
+def _insert_fix(db: sqlite3.Connection, point: PointId, fix: Fix, estimate: DeckPose) -> int:
+    before = (fix.t_s, *fix.position_m, *fix.covariance_m2, fix.dop, fix.residual_rms_m)
+    after = (estimate.x_m, estimate.y_m, estimate.heading_rad)
+    if len(fix.covariance_m2) != 9 or not all(map(isfinite, (*before, *after))):
+        raise StoreRefusal(f"fix of {point_name(point)}: a value is not finite, or the covariance is not of 9 values")
+    channels = ",".join(str(int(channel)) for channel in fix.channels)
+    values = (*map(int, point), *map(float, before), channels, *map(float, after))
+    if _status(db, point) == "measured":
+        raise AlreadyMeasuredError(f"point {point_name(point)} has been measured; its fix is not replaced")
+    number = db.execute(_INSERT_FIX, (*values, _crc(values))).lastrowid
+    db.execute(_SET_STATUS, ("measured", float(fix.t_s), number, *point))
+    return int(number or 0)
+
+
+def select_points(db: sqlite3.Connection) -> list[StoredPoint]:
+    """All points, by row, column and number."""
+    return [StoredPoint(PointId(*r[:3]), *r[3:8]) for r in db.execute("SELECT * FROM points ORDER BY row, col, point")]
+
+
+def select_fixes(db: sqlite3.Connection) -> list[StoredFix]:
+    """The fix of each measured point in the order of measuring."""
+    fixes = []
+    for r in db.execute("SELECT * FROM fixes WHERE id IN (SELECT fix_id FROM points) ORDER BY id"):
+        channels = tuple(int(c) for c in r[19].split(",") if c)
+        fix = Fix(r[4], (r[5], r[6], r[7]), tuple(r[8:17]), r[17], channels, r[18])
+        fixes.append(StoredFix(r[0], PointId(*r[1:4]), fix, DeckPose(*r[20:23])))
+    return fixes
+
+
+def _status(db: sqlite3.Connection, point: PointId) -> str:
+    found = db.execute(_STATUS, tuple(point)).fetchone()
+    if found is None:
+        raise UnknownPointError(f"point {point_name(point)} is not one of this mission's points")
+    return str(found[0])
+
+
+def _crc(values: Iterable[Any]) -> int:
+    return zlib.crc32(repr(tuple(values)).encode())
+
+
+def _plan_crc(db: sqlite3.Connection) -> int:
+    meta = db.execute("SELECT key, value FROM meta WHERE key <> ? ORDER BY key", (_CRC_KEY,)).fetchall()
+    targets = db.execute("SELECT row, col, point, x_m, y_m FROM points ORDER BY row, col, point").fetchall()
+    return _crc([*meta, *targets])

@@ -1,7 +1,7 @@
 """The summary of a run: joins estimates with the simulated truth and builds ``summary.json``.
 
-Numbers are rounded to fixed decimals, and the result does not depend on how
-the rows were cut into batches: the same run gives the same file. What needs the truth is null on a real robot.
+Numbers are rounded to fixed decimals, and the result does not depend on how the rows were cut into batches: the same
+run gives the same file. Values that need the truth are null on a real robot.
 """
 
 from collections import deque
@@ -47,8 +47,7 @@ def puck_targets(mirror: Mirror, points: Iterable[PointId], puck_height_m: float
 def arrival_error_m(target: PuckTarget, place_m: FloatArray, normal: Vector3, puck_height_m: float) -> float:
     """Distance of the puck from its target in the tangent plane of the target's panel, m.
 
-    Args:
-        place_m: surface point under the robot, deck frame, shape (3,).
+    ``place_m`` is the surface point under the robot, deck frame, shape (3,).
     """
     offset, across = place_m + puck_height_m * np.array(normal) - target.position_m, np.array(target.normal)
     return float(np.linalg.norm(offset - (offset @ across) * across))
@@ -56,10 +55,10 @@ def arrival_error_m(target: PuckTarget, place_m: FloatArray, normal: Vector3, pu
 
 @dataclass(frozen=True, slots=True)
 class RunFacts:
-    """What is known of a run before it starts.
+    """Facts of a run that are known before it starts.
 
     Attributes:
-        mirror, world, filter, seed: as configured; ``world`` is None on a real robot.
+        world: None on a real robot.
         lower_bound_s: rest-to-rest time of the same path under the same limits, with the measuring.
     """
 
@@ -77,8 +76,8 @@ class RunFacts:
 class SummaryBuilder:
     """Collects a run and builds its summary.
 
-    Rows may come in batches of any size, and truth and track in any order against each other; joined rows are
-    forgotten but for their errors.
+    Rows may come in batches of any size, and truth and track in any order against each other; of joined rows only the
+    errors are kept.
 
     Args:
         targets: of every point, see ``puck_targets``.
@@ -92,7 +91,6 @@ class SummaryBuilder:
         self._measured = self._skipped = 0
         self._left_out: Mapping[str, Sequence[str]] = {}
         self._mission_time_s = 0.0
-        self._wall_s: float | None = None
         self._ticks_us: list[FloatArray] = []
         self._open_truth, self._open_track = np.empty((0, 8)), np.empty((0, 8))
         self._errors: list[FloatArray] = []  # rows: seq, distance (m), heading (rad)
@@ -111,9 +109,8 @@ class SummaryBuilder:
     def add_truth(self, rows: Sequence[Sequence[float]] | FloatArray) -> None:
         """Add true states, in the order of their frames.
 
-        Args:
-            rows: shape (n, 11): seq, t_s, x, y, heading (deck), X, Y, Z (surface point, deck, m), clearance of the
-                worst edge sensor to the rim (m, < 0 beyond it), fallen, mask of the sensors beyond the rim.
+        Columns: seq, t_s, x, y, heading (deck), X, Y, Z (surface point, deck, m), clearance of the worst edge sensor to
+        the rim (m, < 0 beyond it), fallen, mask of the sensors beyond the rim; shape (n, 11).
         """
         if not len(rows):
             return
@@ -132,18 +129,14 @@ class SummaryBuilder:
         self._settle(is_over=False)
 
     def add_track(self, rows: Sequence[Sequence[float]] | FloatArray) -> None:
-        """Add estimates of the same frames.
-
-        Args:
-            rows: shape (n, 8 or more): seq, t_s, x, y, heading (deck), X, Y, Z (surface point, deck, m), ...
-        """
+        """Add estimates of the same frames: the first eight columns of ``add_truth``."""
         if len(rows) and self._facts.has_truth:
             track = np.asarray(rows, dtype=np.float64)[:, :8]
             self._open_track = np.concatenate((self._open_track, track))[-HISTORY_ROWS:]
             self._join()
 
     def add_arrival(self, point: PointId, seq: int) -> None:
-        """The robot stood at a point at frame ``seq``, before any correction; only the first of a point counts."""
+        """The robot stood at a point at frame ``seq``, before any correction; only the first arrival counts."""
         if point not in self._arrivals:
             self._waiting_arrivals.setdefault(point, seq)
             self._settle(is_over=False)
@@ -173,24 +166,17 @@ class SummaryBuilder:
         """Misalignment of panels as fitted, and as simulated (None on a real robot)."""
         self._fits, self._injected = fits, injected
 
-    def set_wall(self, time_s: float) -> None:
-        """Wall time of the run."""
-        self._wall_s = time_s
-
     def precede(self, earlier: "SummaryBuilder") -> None:
-        """Take in a session of the same mission that ended before this one began: one summary tells of both.
+        """Include a session of the same mission that ended before this one began.
 
-        Points and those left out are as the later session says; the bound is that of the whole way, which the earlier
-        one began.
+        Points, measured and left out, are those of the later session; the bound is that of the whole path, which the
+        earlier one began.
         """
         earlier._settle(is_over=True)
         if earlier._facts.lower_bound_s > 0.0:
             self._facts = replace(self._facts, lower_bound_s=earlier._facts.lower_bound_s)
         self._mission_time_s += earlier._mission_time_s
-        self._arrivals = {
-            **earlier._arrivals,
-            **{k: v for k, v in self._arrivals.items() if k not in earlier._arrivals},
-        }
+        self._arrivals = earlier._arrivals | self._arrivals | earlier._arrivals  # the first arrival counts
         self._errors = [*earlier._errors, *self._errors]
         self._true_edges += earlier._true_edges
         self._false_edges += earlier._false_edges
@@ -202,14 +188,15 @@ class SummaryBuilder:
         """Arrivals and edges that wait for their frame's truth; those left at the end count as neither good nor bad."""
         return len(self._waiting_arrivals) + len(self._waiting_edges)
 
-    def build(self) -> dict[str, Any]:
-        """The summary, keys in the order of the command line contract."""
+    def build(self, wall_s: float | None = None) -> dict[str, Any]:
+        """The summary, keys in the order of the command line contract; ``wall_s`` is the wall time of the run."""
         self._settle(is_over=True)
         facts, has_truth = self._facts, self._facts.has_truth
         arrivals = np.array(list(self._arrivals.values()))
         errors = np.concatenate(self._errors) if self._errors else np.empty((0, 3))
         errors = errors[np.argsort(errors[:, 0], kind="stable")]
         distances = errors[:, 1]
+        ticks_us = np.concatenate(self._ticks_us) if self._ticks_us else np.empty(0)
         return {
             "mirror": facts.mirror,
             "world": facts.world,
@@ -225,20 +212,20 @@ class SummaryBuilder:
             "arrival_error_mm": _distribution(arrivals),
             "localization_error_mm": {
                 **_distribution(distances),
-                "within_10mm_fraction": _rounded(np.mean(distances <= WITHIN_M), 6) if len(distances) else None,
+                "within_10mm_fraction": rounded(np.mean(distances <= WITHIN_M), 6) if len(distances) else None,
             },
             "heading_error_mrad": {"rms": _rms(errors[:, 2], 1e3)},
-            "mission_time_s": _rounded(self._mission_time_s, 3),
-            "lower_bound_s": _rounded(facts.lower_bound_s, 3),
+            "mission_time_s": rounded(self._mission_time_s, 3),
+            "lower_bound_s": rounded(facts.lower_bound_s, 3),
             "within_budget": self._mission_time_s <= facts.budget_s,
             "danger": {
                 "true_edges": self._true_edges if has_truth else None,
                 "false_edges": self._false_edges if has_truth else None,
                 "falls": self._falls if has_truth else None,
-                "max_overrun_mm": _rounded(self._overrun_m * 1e3, 3) if has_truth else None,
+                "max_overrun_mm": rounded(self._overrun_m * 1e3, 3) if has_truth else None,
             },
             "panels": self._panels(),
-            "wall": self._wall(),
+            "wall": wall_figures(self._mission_time_s, wall_s, ticks_us),
         }
 
     def _panels(self) -> dict[str, Any]:
@@ -249,16 +236,6 @@ class SummaryBuilder:
             "count": len(self._fits),
             "piston_rms_um": _rms(table[:, 0], 1e6),
             "tilt_rms_urad": _rms(table[:, 1:].ravel(), 1e6),
-        }
-
-    def _wall(self) -> dict[str, Any]:
-        ticks = np.concatenate(self._ticks_us) if self._ticks_us else np.empty(0)
-        p50, p99 = np.percentile(ticks, (50, 99)) if len(ticks) else (None, None)
-        return {
-            "time_s": _rounded(self._wall_s, 3),
-            "realtime_factor": _rounded(self._mission_time_s / self._wall_s, 2) if self._wall_s else None,
-            "tick_us_p50": _rounded(p50, 1),
-            "tick_us_p99": _rounded(p99, 1),
         }
 
     def _join(self) -> None:
@@ -274,7 +251,9 @@ class SummaryBuilder:
     def _settle(self, *, is_over: bool) -> None:
         for point, seq in list(self._waiting_arrivals.items()):
             if seq <= self._newest_seq and len(found := self._truth(seq, seq)):
-                self._arrivals[point] = self._arrival_error_m(point, found[0])
+                place_m, normal = found[0][_SURFACE], self._normal_at(float(found[0][_X]), float(found[0][_Y]))
+                height_m = self._facts.puck_height_m
+                self._arrivals[point] = arrival_error_m(self._targets[point], place_m, normal, height_m)
                 del self._waiting_arrivals[point]
         for seq in list(self._waiting_edges):
             first, last = seq - EDGE_FRAMES, seq + EDGE_FRAMES
@@ -294,13 +273,9 @@ class SummaryBuilder:
                 found.append(batch[(batch[:, _SEQ] >= first) & (batch[:, _SEQ] <= last)])
         return np.concatenate(found) if found else np.empty((0, 11))
 
-    def _arrival_error_m(self, point: PointId, truth: FloatArray) -> float:
-        normal = self._normal_at(float(truth[_X]), float(truth[_Y]))
-        return arrival_error_m(self._targets[point], truth[_SURFACE], normal, self._facts.puck_height_m)
-
 
 def format_table(summary: Mapping[str, Any]) -> str:
-    """The summary as a short table for a terminal: one line a section, a dash for what is not known."""
+    """The summary as a short table for a terminal: one line a section, a dash for an unknown value."""
     single = [f"{key} {_text(value)}" for key, value in summary.items() if not isinstance(value, Mapping)]
     sections = [(name, section) for name, section in summary.items() if isinstance(section, Mapping)]
     lines = [("run", single), *((n, [f"{key} {_text(value)}" for key, value in s.items()]) for n, s in sections)]
@@ -320,13 +295,26 @@ def _distribution(errors_m: FloatArray) -> dict[str, float | None]:
         return dict.fromkeys(("mean", "p50", "p99", "max"))
     p50, p99 = np.percentile(errors_m, (50, 99))
     figures = {"mean": errors_m.mean(), "p50": p50, "p99": p99, "max": errors_m.max()}
-    return {name: _rounded(value * 1e3, 3) for name, value in figures.items()}
+    return {name: rounded(value * 1e3, 3) for name, value in figures.items()}
 
 
 def _rms(values: FloatArray, scale: float) -> float | None:
-    return _rounded(np.sqrt(np.mean(values**2)) * scale, 3) if len(values) else None
+    return rounded(np.sqrt(np.mean(values**2)) * scale, 3) if len(values) else None
 
 
-def _rounded(value: Any, decimals: int) -> float | None:
-    # None for what JSON has no number for; never a negative zero.
+def wall_figures(
+    mission_time_s: float, wall_s: float | None, ticks_us: Sequence[float] | FloatArray
+) -> dict[str, float | None]:
+    """Wall time of a run, and of the main loop's ticks."""
+    p50, p99 = np.percentile(ticks_us, (50, 99)) if len(ticks_us) else (None, None)
+    return {
+        "time_s": rounded(wall_s, 3),
+        "realtime_factor": rounded(mission_time_s / wall_s, 2) if wall_s else None,
+        "tick_us_p50": rounded(p50, 1),
+        "tick_us_p99": rounded(p99, 1),
+    }
+
+
+def rounded(value: Any, decimals: int = 6) -> float | None:
+    """The value, None where JSON has no number for it; never a negative zero."""
     return None if value is None or not np.isfinite(value) else round(float(value), decimals) + 0.0

@@ -23,8 +23,8 @@ from ccatp.links.beacon_messages import (
     truth_in,
 )
 from ccatp.links.topics import BeaconArrival, BeaconEllipse, BeaconMapMessage, MissionStatus
-from ccatp.records.recorder import recordings
-from ccatp.records.run_reader import CONFIG, TELEMETRY
+from ccatp.records.recorder import TELEMETRY, recordings
+from ccatp.records.run_reader import CONFIG
 from ccatp.records.state_log import read_log
 from ccatp.report.record import LOG, RunFiles, changed_keys, common_fields, joined, read_recording
 

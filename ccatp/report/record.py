@@ -19,12 +19,10 @@ from ccatp.links.topics import ArrivalMessage, BadMessage, FixMessage, MissionSt
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.mirror.surface import MirrorError
-from ccatp.records.recorder import damage_text, iter_messages, read_metadata, recordings
-from ccatp.records.run_reader import CONFIG, TELEMETRY, RunReadError
+from ccatp.records.recorder import TELEMETRY, damage_text, iter_messages, read_metadata, recordings
+from ccatp.records.run_reader import CONFIG, STORE, RunReadError, read_truth
 from ccatp.records.state_log import LogLine, ReadLine, StateChange, changes_of, read_log
-from ccatp.records.store import read_survey
-from ccatp.records.store_rows import StoredPoint, StoreError, point_name
-from ccatp.records.survey_reader import STORE, read_truth
+from ccatp.records.store import StoredPoint, StoreError, point_name, read_survey
 
 COMPLETE = "complete"
 WITHIN_MM = 10.0  # the thesis's requirement on arrivals

@@ -197,7 +197,7 @@ async def test_planning_longer_than_a_frame_may_wait_pauses_nobody() -> None:
     clock = asyncio.get_running_loop().time
     async with running_daemon(configuration()) as daemon:
         await daemon.until(lambda: daemon.is_driving)
-        mission = daemon.main._runner._mission  # type: ignore[attr-defined]
+        mission: Any = daemon.main._runner.mission
         plan, planned = mission._travels._plan_rest, []
 
         def plan_slowly(*args: object) -> object:

@@ -23,8 +23,7 @@ from ccatp.daemon import fix_service as measuring
 from ccatp.daemon.fix_service import FixRequest
 from ccatp.daemon.process import LogStream, open_log
 from ccatp.records.recorder import Recorder, iter_messages
-from ccatp.records.store import MissionStore
-from ccatp.records.store_rows import PlannedPoint, StoreError, StoreEvent
+from ccatp.records.store import MissionStore, PlannedPoint, StoreError
 from tests.faults.linking import Measured
 from tests.support.sim_survey import fix_service
 
@@ -33,11 +32,9 @@ FIX = Fix(1.5, (1.0, 2.0, 3.0), (1e-12,) * 9, 1.7, (1, 2, 5, 8), 2e-6)
 POSE = DeckPose(0.1, 0.2, 0.3)
 
 
-def make(
-    path: Path, points: list[PointId] = POINTS, on_failure: Callable[[StoreError], None] | None = None
-) -> MissionStore:
+def make(path: Path, points: list[PointId] = POINTS) -> MissionStore:
     plan = [PlannedPoint(p, 0.22, -0.25) for p in points]
-    return MissionStore.create(path, mirror="fyst-m1", seed=1, config_toml="", points=plan, on_failure=on_failure)
+    return MissionStore.create(path, mirror="fyst-m1", seed=1, config_toml="", points=plan)
 
 
 @pytest.fixture
@@ -67,10 +64,9 @@ def test_a_whole_mirror_is_measured_on_a_disk_that_gives_nothing_more(
         with pytest.raises(OSError, match="File too large"):  # the limit is real
             (tmp_path / "probe").write_bytes(bytes(2 * path.stat().st_size))
         for k, point in enumerate(POINTS):
-            store.record_event(StoreEvent(float(k), "mission", text="driving"))
             store.record_arrival(point, float(k), 0.001)
             store.record_fix(point, FIX, POSE).result(timeout=30.0)
-        assert store.events_dropped == 0
+        assert store.arrivals_dropped == 0
     with MissionStore.open(path, mirror="fyst-m1") as store:
         lost = set(POINTS) - {fix.point for fix in store.fixes()}
     measured("P13", len(lost))
@@ -148,13 +144,11 @@ def test_nobody_waits_for_a_stalled_disk(tmp_path: Path, measured: Measured) -> 
         for point in POINTS[:9]:  # what a pass of the control loop does at a stop, and more
             begun_s = time.thread_time()
             futures.append(store.record_fix(point, FIX, POSE))
-            assert all(store.record_event(StoreEvent(1.0, "mission")) for _ in range(50))
-            assert store.record_arrival(point, 1.0, 0.001)
+            assert all(store.record_arrival(point, 1.0, 0.001) for _ in range(50))
             longest_s = max(longest_s, time.thread_time() - begun_s)
         # All of it came back while the writer was stuck: it cannot have waited.
         assert not release.is_set()
         assert not any(future.done() for future in futures)
-        assert store.queue_age_s > 0.0
         measured("P14", 1e3 * longest_s)
         release.set()
         assert [future.result(timeout=30.0) for future in futures] == list(range(1, 10))
@@ -246,9 +240,8 @@ ERRORS = ("SQLITE_IOERR_FSYNC", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_DIR_FSYNC", 
 @pytest.mark.fault("P15")
 @pytest.mark.parametrize("name", ERRORS)
 def test_after_an_error_nothing_is_acknowledged(tmp_path: Path, name: str, measured: Measured) -> None:
-    failures: list[StoreError] = []
     path = tmp_path / "mission.sqlite"
-    with make(path, POINTS[:9], failures.append) as store:
+    with make(path, POINTS[:9]) as store:
         broken = Broken(store._db, name)
         store._db = cast(sqlite3.Connection, broken)
         assert store.record_fix(POINTS[0], FIX, POSE).result(timeout=10.0) == 1
@@ -258,10 +251,10 @@ def test_after_an_error_nothing_is_acknowledged(tmp_path: Path, name: str, measu
         commits = broken.commits
         late = [store.record_fix(point, FIX, POSE) for point in POINTS[2:9]]
         acknowledged = sum(future.exception(timeout=10.0) is None for future in late)
-        assert not store.record_event(StoreEvent(1.0, "x"))
+        assert not store.record_arrival(POINTS[0], 1.0, 0.0)
         assert broken.commits == commits  # it is not even tried
         assert store.measured_points() == {POINTS[0]}
-        assert failures == [store.failure]
+        assert store.failure is not None
     measured("P15", acknowledged)
     assert acknowledged == 0
     with MissionStore.open(path, mirror="fyst-m1") as store:

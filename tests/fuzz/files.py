@@ -4,7 +4,7 @@ import json
 import tempfile
 import tomllib
 from collections.abc import Hashable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,9 @@ from ccatp.config.load import dump_config, load_config
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.errors import ConfigError
 from ccatp.links.topics import TOPICS, FixMessage, Rest, SensorLines, TrackMessage, pack, schema_of
-from ccatp.records import store_rows
 from ccatp.records.recorder import Recorder, iter_messages
 from ccatp.records.run_reader import RunReadError, open_run
-from ccatp.records.store import MissionStore
-from ccatp.records.store_rows import PlannedPoint, StoreError
+from ccatp.records.store import MissionStore, PlannedPoint, StoreError
 from tests.fuzz.decoders import SENSORS
 from tests.fuzz.fuzzer import Target
 
@@ -115,10 +113,9 @@ def sound_store(folder: Path) -> bytes:
 
 def check_store(path: Path) -> int:
     """Open what is at ``path``: what is measured there is what was measured, and what is damaged is said to be."""
-    with closing(store_rows.open_file(path, "fyst-m1")) as db:
-        damaged = store_rows.replan_damaged(db)
-        measured = {p.point for p in store_rows.select_points(db) if p.status == "measured"}
-        fixes = {f.point: f.fix for f in store_rows.select_fixes(db, history=False)}
+    with MissionStore.open(path, mirror="fyst-m1") as db:
+        damaged, measured = db.damaged, db.measured_points()
+        fixes = {f.point: f.fix for f in db.fixes()}
     assert measured | set(damaged) == set(PANEL[:6])
     assert fixes == {p: a_fix(float(k)) for k, p in enumerate(PANEL[:6]) if p in measured}
     return len(damaged)

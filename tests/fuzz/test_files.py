@@ -11,7 +11,7 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.messages import format_toml
 from ccatp.errors import ConfigError
-from ccatp.records.store_rows import StoreError
+from ccatp.records.store import StoreError
 from tests.fuzz.files import (
     check_store,
     config_target,

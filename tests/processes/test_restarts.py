@@ -221,7 +221,7 @@ def test_what_is_damaged_is_refused_what_was_measured_stays_and_the_rest_is_meas
     assert 2 <= before["points"]["measured"] == run.measured < 9
     checkpoint, database = run.run_dir / "checkpoint", run.run_dir / "mission.sqlite"
     for path, text in (
-        (checkpoint, "damaged, so nobody knows where the robot is; set it at base, remove this file and resume"),
+        (checkpoint, "damaged, so the robot's place is not known; set it at base, remove this file and resume"),
         (database, "damaged"),
     ):
         sound = path.with_name("sound")

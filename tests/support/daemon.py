@@ -21,7 +21,7 @@ from ccatp.config.models import Config
 from ccatp.core import PanelPose
 from ccatp.daemon.danger_loop import DangerLoop
 from ccatp.daemon.main_loop import MainLoop, open_runner
-from ccatp.daemon.process import EitherArgs, Endpoints, ProcessArgs
+from ccatp.daemon.process import Endpoints, ProcessArgs
 from ccatp.dataloop import DataLoop
 from ccatp.links.robot_link import RobotLink
 from ccatp.links.robot_messages import Sensors
@@ -187,12 +187,10 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
         stop, robot_stop = asyncio.Event(), asyncio.Event()
         try:
             async with FaultProxy("127.0.0.1", port, seed=1) as one, FaultProxy("127.0.0.1", port, seed=2) as two:
-                main_args, danger_args = (
-                    ProcessArgs(_at(cfg, proxy.port, laser_port), run_dir, endpoints, None, True, False)
-                    for proxy in (one, two)
-                )
-                (run_dir / "config.toml").write_text(dump_config(main_args.config), encoding="utf-8")
-                runner_cfg, opening = open_runner(EitherArgs(main_args, None))
+                configs = [_at(cfg, proxy.port, laser_port) for proxy in (one, two)]
+                main_args, danger_args = (ProcessArgs(at, run_dir, endpoints, None, True, False) for at in configs)
+                (run_dir / "config.toml").write_text(dump_config(configs[0]), encoding="utf-8")
+                runner_cfg, opening = open_runner(main_args)
                 with opening as make_runner:
                     main = MainLoop(main_args, context, runner_cfg, make_runner)
                     danger = DangerLoop(danger_args, context)

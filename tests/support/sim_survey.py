@@ -21,8 +21,7 @@ from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
 from ccatp.links.robot_messages import Sensors
 from ccatp.localizer import Localizer
 from ccatp.mirror.multilateration import MultilaterationError
-from ccatp.records.store import MissionStore
-from ccatp.records.store_rows import PlannedPoint
+from ccatp.records.store import MissionStore, PlannedPoint
 from ccatp.sim.fault_models import Injected
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.studies.faults_study import FaultySilRun
@@ -251,7 +250,7 @@ class MeasuredSurvey(FaultySilRun):
             )
             result = super().run()
             self.stored = [(row.point, row.status) for row in store.points()]
-            self.all_fixes = store.fixes(history=True)
+            self.all_fixes = store.fixes()
             return result
 
     def _serve(self, frame: Sensors, dt_s: float) -> None:

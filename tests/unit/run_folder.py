@@ -12,8 +12,7 @@ from ccatp.links.topics import Misalignment, schema_of
 from ccatp.mirror.misalignment import PanelMisalignment
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.recorder import Recorder
-from ccatp.records.store import MissionStore
-from ccatp.records.store_rows import PlannedPoint
+from ccatp.records.store import MissionStore, PlannedPoint
 
 HERE = DeckPose(0.0, 0.0, 0.0)
 

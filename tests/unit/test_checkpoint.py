@@ -69,7 +69,7 @@ def test_a_sound_checksum_over_something_else_is_no_record(tmp_path: Path) -> No
     path = tmp_path / "checkpoint"
     path.write_bytes(len(body).to_bytes(4, "little") + zlib.crc32(body).to_bytes(4, "little") + body)
     with pytest.raises(
-        CheckpointError, match=r"checkpoint: damaged, so nobody knows where the robot is; set it at base"
+        CheckpointError, match=r"checkpoint: damaged, so the robot's place is not known; set it at base"
     ):
         read_checkpoint(path)
 

@@ -1,20 +1,41 @@
-"""Tests of the recorder: readable by the format's own reader, cut off anywhere, never in the mission's way."""
+"""Recordings: readable by the format's own reader, cut off anywhere, repaired, never in the mission's way."""
 
+import contextlib
 import json
 import os
 import random
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 from mcap.reader import make_reader
 
-from ccatp.records.recorder import Recorder, iter_messages, read_metadata, recordings
+from ccatp.cli import main
+from ccatp.links.runtime_dir import locked
+from ccatp.records.recorder import (
+    HELD_BACK_S,
+    RUN_LOCK,
+    Recorder,
+    damage_text,
+    iter_messages,
+    read_metadata,
+    recordings,
+)
+from ccatp.records.recording_repair import (
+    Condition,
+    RecordingError,
+    read_facts,
+    recording_files,
+    recover,
+    scan,
+    strict_faults,
+)
 
-SCHEMA: dict[str, Any] = {"type": "object", "properties": {"n": {"type": "integer"}}}
-TOPICS = [("track", SCHEMA), ("fix", SCHEMA)]
+SCHEMA: dict[str, Any] = {"type": "object", "title": "x.Track", "properties": {"n": {"type": "integer"}}}
+TOPICS: list[tuple[str, dict[str, Any]]] = [("track", SCHEMA), ("fix", {"type": "object"})]
 
 
 def payload(n: int, size: int = 0) -> bytes:
@@ -47,7 +68,8 @@ def test_messages_come_back_and_the_formats_own_reader_agrees(path: Path) -> Non
         assert official == [(m.topic, round(m.t_s * 1e9), m.payload) for m in found]
         summary = reader.get_summary()
         assert summary is not None
-        assert {s.name: json.loads(s.data) for s in summary.schemas.values()} == dict(TOPICS)
+        schemas = {s.name: json.loads(s.data) for s in summary.schemas.values()}
+        assert schemas == {"x.Track": SCHEMA, "fix": TOPICS[1][1]}
         assert {s.encoding for s in summary.schemas.values()} == {"jsonschema"}
         assert {(c.message_encoding, c.metadata["simulation"]) for c in summary.channels.values()} == {("json", "true")}
         # 501 messages of 450 bytes in chunks of 16 KiB
@@ -99,30 +121,6 @@ def test_slow_topics_reach_the_file_without_a_full_chunk(path: Path) -> None:
     # 0.5 s waits, 1.5 s takes it along, 1.6 s waits, a clock that went back (another boot) takes it along
     assert [m.t_s for m in iter_messages(path)] == [0.5, 1.5, 1.6, 0.1]
     slow.close()
-
-
-WRITER = """
-import sys
-from pathlib import Path
-from ccatp.records.recorder import Recorder
-recorder = Recorder(Path(sys.argv[1]), [("track", {})], is_simulation=True)
-n = 0
-while True:
-    recorder.write("track", n / 100, b'{"n":%d,"x":"%s"}' % (n, b"x" * 200))
-    n += 1
-    if n % 1000 == 0:
-        print(n, flush=True)
-"""
-
-
-def test_kill_9_costs_the_last_bit_only(path: Path) -> None:
-    with subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, text=True) as child:
-        assert child.stdout is not None
-        written = [int(child.stdout.readline()) for _ in range(5)][-1]
-        child.kill()
-    numbers = [json.loads(m.payload)["n"] for m in iter_messages(path)]
-    assert numbers == list(range(len(numbers)))
-    assert len(numbers) > written - 100  # a chunk of 16 KiB holds about 70 of these messages
 
 
 def test_messages_that_cannot_be_recorded_are_counted(path: Path) -> None:
@@ -205,3 +203,255 @@ def test_an_existing_recording_is_kept(path: Path) -> None:
     assert parts[-1] == path
     assert [next(iter_messages(p)).t_s for p in parts] == [float(n) for n in range(12)]
     assert recordings(path.with_name("none.mcap")) == []
+
+
+def numbers(path: Path) -> list[int]:
+    """By the format's own reader, in the order of the file."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        return [json.loads(m.data)["n"] for _, _, m in reader.iter_messages(log_time_order=False)]
+
+
+@pytest.fixture
+def recorded(path: Path) -> Path:
+    record(path, 600, 100, metadata={"mirror": "fyst-m1"}).close()
+    return path
+
+
+def test_facts_of_a_recording_in_order(recorded: Path) -> None:
+    facts = read_facts(recorded)
+    assert facts.condition.is_complete
+    assert facts.faults == []
+    assert facts.condition.lost == []
+    told = facts.as_json()
+    assert told["verified"]
+    assert told["messages"] == 600
+    assert (told["start_s"], told["end_s"]) == (0.0, 5.99)
+    assert told["metadata"] == {"ccatp": {"mirror": "fyst-m1", "simulation": "true"}}
+    assert told["topics"]["track"]["schema"] == "x.Track"
+    assert told["topics"]["fix"]["messages"] == 0
+    assert told["bytes_per_hour"] == pytest.approx(recorded.stat().st_size * 3600 / 5.99, abs=1)
+
+
+def test_a_recording_cut_off_anywhere_is_saved(recorded: Path, tmp_path: Path) -> None:
+    whole = recorded.read_bytes()
+    rng = random.Random(1)
+    for number, cut in enumerate(sorted(rng.randrange(20_000, len(whole)) for _ in range(25))):
+        recorded.write_bytes(whole[:cut])
+        there = [json.loads(m.payload)["n"] for m in iter_messages(recorded)]
+        saved = recover(recorded, tmp_path / f"{number}.mcap")
+        assert numbers(saved.path) == there
+        assert saved.messages == len(there)
+        assert not saved.condition.is_complete
+        assert strict_faults(saved.path) == []
+        assert strict_faults(recorded)
+
+
+def test_damage_in_the_middle_costs_its_chunk_alone(recorded: Path, tmp_path: Path) -> None:
+    whole = bytearray(recorded.read_bytes())
+    rng = random.Random(3)
+    lost = []
+    for number in range(40):
+        at = rng.randrange(20_000, len(whole) - 5000)
+        length = rng.choice((1, 1, 30))
+        recorded.write_bytes(bytes(whole[:at]) + rng.randbytes(length) + bytes(whole[at + length :]))
+        saved = recover(recorded, tmp_path / f"{number}.mcap")
+        found = numbers(saved.path)
+        assert found == sorted(set(found))
+        assert strict_faults(saved.path) == []
+        lost.append(600 - len(found))
+        facts = read_facts(recorded)
+        assert facts.messages == len(found)
+        assert not facts.faults or not facts.condition.is_complete or lost[-1] == 0
+    # a chunk holds some 70 messages; damage may lie in an index or across two chunks
+    assert max(lost) < 160
+    assert sum(lost) > 40
+
+
+def test_what_stands_before_the_file_is_passed_over(recorded: Path, tmp_path: Path) -> None:
+    recorded.write_bytes(random.Random(4).randbytes(5000) + recorded.read_bytes())
+    saved = recover(recorded, tmp_path / "out.mcap")
+    assert saved.messages == 600
+    assert saved.condition.lost[0][0] == 0
+
+
+def test_channels_of_a_lost_first_chunk_are_found_at_the_end(recorded: Path, tmp_path: Path) -> None:
+    whole = bytearray(recorded.read_bytes())
+    whole[400:440] = bytes(40)
+    recorded.write_bytes(bytes(whole))
+    saved = recover(recorded, tmp_path / "out.mcap")
+    assert 500 < saved.messages < 600
+
+
+def test_a_recording_that_was_saved_is_saved_again_alike(recorded: Path, tmp_path: Path) -> None:
+    first = recover(recorded, tmp_path / "a.mcap")
+    second = recover(first.path, tmp_path / "b.mcap")
+    assert second.condition.is_complete
+    assert list(iter_messages(second.path)) == list(iter_messages(recorded))
+
+
+def test_files_of_a_run_directory(recorded: Path, tmp_path: Path) -> None:
+    Recorder(recorded, [("track", SCHEMA)], is_simulation=True).close()
+    assert [p.name for p in recording_files(tmp_path)] == ["telemetry.1.mcap", "telemetry.mcap"]
+    assert recording_files(recorded) == [recorded]
+
+
+def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
+    empty, text = tmp_path / "empty.mcap", tmp_path / "text.mcap"
+    empty.touch()
+    text.write_text("x" * 10_000)
+    for file, what in ((empty, "is empty"), (text, "holds no intact channel")):
+        with pytest.raises(RecordingError, match=what):
+            read_facts(file)
+        with pytest.raises(RecordingError, match=what):
+            recover(file, tmp_path / "out.mcap")
+    with pytest.raises(RecordingError, match="no such file; name a recording"):
+        recording_files(tmp_path / "missing.mcap")
+    (tmp_path / "run").mkdir()
+    with pytest.raises(RecordingError, match=r"no telemetry\.mcap there"):
+        recording_files(tmp_path / "run")
+    with pytest.raises(RecordingError, match="cannot be read"):
+        read_facts(tmp_path / "run")
+    with pytest.raises(RecordingError, match="cannot be read"):
+        recover(tmp_path / "run", tmp_path / "out.mcap")
+
+
+def test_nothing_is_overwritten(recorded: Path, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="exists already; name another file with --out"):
+        recover(recorded, recorded)
+    with pytest.raises(RecordingError, match=r"cannot be written: No such file"):
+        recover(recorded, tmp_path / "missing" / "out.mcap")
+
+
+def test_a_disk_that_garbles_is_noticed(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ccatp.records.recording_repair.strict_faults", lambda _: ["crc"])
+    with pytest.raises(RecordingError, match=r"does not read back \(crc\)"):
+        recover(recorded, tmp_path / "out.mcap")
+
+
+def test_commands(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["recording", "info", str(tmp_path), "--json"]) == 0
+    (told,) = json.loads(capsys.readouterr().out)["recordings"]
+    assert told["complete"]
+    assert main(["recording", "info", str(recorded)]) == 0
+    text = capsys.readouterr().out
+    assert "complete, every checksum right" in text
+    assert "x.Track" in text
+    recorded.write_bytes(recorded.read_bytes()[:50_000])
+    assert main(["recording", "info", str(recorded)]) == 1
+    assert "save what is intact with: ccatp recording repair" in capsys.readouterr().out
+    assert main(["recording", "repair", str(tmp_path)]) == 0
+    assert "telemetry.recovered.mcap: " in capsys.readouterr().out
+    assert main(["recording", "repair", str(recorded), "--out", str(tmp_path / "b.mcap"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["was_complete"] is False
+    assert main(["recording", "repair", str(recorded)]) == 2
+    assert "exists already" in capsys.readouterr().err
+
+
+# Writes like a run, 200 messages a second with pauses, and notes outside the recording what it has written and when.
+WRITER = """
+import os, sys, time, random
+from pathlib import Path
+from ccatp.records.recorder import Recorder
+recorder = Recorder(Path(sys.argv[1]), [("track", {})], is_simulation=True)
+notes = os.open(sys.argv[2], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+rng, n = random.Random(int(sys.argv[3])), 0
+print("ready", flush=True)
+while True:
+    for _ in range(rng.choice((0, 1, 1, 1, 3, 20))):
+        recorder.write("track", time.monotonic(), b'{"n":%d,"x":"%s"}' % (n, rng.randbytes(60).hex().encode()))
+        os.write(notes, b"%d %.4f\\n" % (n, time.monotonic()))
+        n += 1
+    recorder.flush_if_due()
+    os.write(notes, b"tend %.4f\\n" % time.monotonic())
+    time.sleep(0.01)
+"""
+
+
+def test_killed_at_ten_random_moments_all_but_the_last_second_is_there(tmp_path: Path) -> None:
+    rng = random.Random(11)
+    with contextlib.ExitStack() as stack:
+        children = []
+        for k in range(10):
+            command = [sys.executable, "-c", WRITER, str(tmp_path / f"{k}.mcap"), str(tmp_path / f"{k}.txt"), str(k)]
+            children.append(stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE)))
+        for child in children:
+            assert child.stdout is not None
+            assert child.stdout.readline() == b"ready\n"
+        moments = sorted(rng.uniform(0.2, 3.0) for _ in children)
+        start = time.monotonic()
+        for child, moment in zip(children, moments, strict=True):
+            time.sleep(max(0.0, start + moment - time.monotonic()))
+            child.kill()
+    for k in range(10):
+        notes = [line.split() for line in (tmp_path / f"{k}.txt").read_text().splitlines()]
+        end_s = float(notes[-1][1])
+        owed = [int(n) for n, t_s in notes if n != "tend" and float(t_s) < end_s - 1.0]
+        saved = recover(tmp_path / f"{k}.mcap", tmp_path / f"{k}.saved.mcap")
+        found = numbers(saved.path)
+        assert found == list(range(len(found)))
+        assert found[: len(owed)] == owed
+        assert strict_faults(saved.path) == []
+
+
+def test_nothing_waits_longer_than_a_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 100.0
+    monkeypatch.setattr("ccatp.records.recorder.time.monotonic", lambda: now_s)
+    path = tmp_path / "telemetry.mcap"
+    made = Recorder(path, [("track", {})], is_simulation=True)
+    made.write("track", 0.5, b"{}")
+    made.flush_if_due()
+    assert list(iter_messages(path)) == []
+    now_s += HELD_BACK_S
+    made.flush_if_due()
+    assert len(list(iter_messages(path))) == 1
+    made.close()
+    made.flush_if_due()
+
+
+def test_a_full_disk_while_nothing_comes_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    made = Recorder(tmp_path / "a.mcap", [("track", {})], is_simulation=True, on_failure=told.append)
+    made.write("track", 0.5, b"{}")
+    monkeypatch.setattr("ccatp.records.recorder.HELD_BACK_S", 0.0)
+
+    def full(*_: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("ccatp.records.recorder.os.write", full)
+        made.flush_if_due()
+    assert not made.is_recording
+    assert "No space left" in told[0]
+
+
+def test_a_scan_of_an_empty_file_finds_nothing(tmp_path: Path) -> None:
+    (tmp_path / "a").touch()
+    assert list(scan(tmp_path / "a", Condition())) == []
+
+
+def test_a_recording_that_is_being_written_is_not_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    made = Recorder(
+        run_dir / "telemetry.mcap", [("track", SCHEMA), ("beacon_map", {})], is_simulation=True, metadata={}
+    )
+    for n in range(600):
+        made.write("track", n / 100, payload(n))
+    with locked(run_dir / RUN_LOCK, "taken"):
+        assert main(["recording", "info", str(run_dir)]) == 0
+        told = capsys.readouterr().out
+        assert "telemetry.mcap: still being written, so without an index\n" in told
+        assert "recording repair" not in told
+        assert "beacon_map" not in told
+        assert "  1 topic without messages\n" in told
+        assert damage_text(run_dir / "telemetry.mcap", "x").startswith("telemetry.mcap: still being written")
+    # Nobody writes it any more, and it has no end.
+    assert main(["recording", "info", str(run_dir)]) == 1
+    told = capsys.readouterr().out
+    assert "telemetry.mcap: cut off or damaged\n" in told
+    assert "  no index: it was not closed\n" in told
+    assert "RecordLengthLimitExceeded" not in told
+    assert "recording repair" in told
+    made.close()
+    assert main(["recording", "info", str(run_dir)]) == 0

@@ -12,8 +12,7 @@ from ccatp.core import DeckPose, Fix, PanelId, PointId
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.records.recorder import Recorder
 from ccatp.records.run_reader import RunReadError
-from ccatp.records.store import MissionStore
-from ccatp.records.store_rows import PlannedPoint
+from ccatp.records.store import MissionStore, PlannedPoint
 from ccatp.report.findings import arrival_error_m
 from ccatp.report.mirror_map import MAP_WIDTH_PX, MapPoint, draw_from_run_dir, record_map, run_map
 from ccatp.report.plots import WIDE, PictureError, save_figure

@@ -1,25 +1,24 @@
 """Tests of the mission database: what is acknowledged stays, what is damaged is noticed."""
 
-import asyncio
 import hashlib
 import random
 import sqlite3
 import subprocess
 import sys
 import threading
-from concurrent.futures import Future
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from ccatp.core import DeckPose, Fix, PointId
-from ccatp.records import store, store_rows
-from ccatp.records.store import MissionStore
-from ccatp.records.store_rows import (
+from ccatp.records import store
+from ccatp.records.store import (
     AlreadyMeasuredError,
+    MissionStore,
     PlannedPoint,
     StoreError,
-    StoreEvent,
     StoreRefusal,
     UnknownPointError,
 )
@@ -47,6 +46,7 @@ def path(tmp_path: Path) -> Path:
 def test_a_fix_comes_back_as_it_was(path: Path) -> None:
     with make(path) as db:
         assert db.record_fix(PANEL[4], a_fix(), POSE).result() == 1
+        assert db.record_arrival(PANEL[1], 3.5, 0.0004)
         assert db.measured_points() == {PANEL[4]}
     with MissionStore.open(path, mirror="fyst-m1") as db:
         (found,) = db.fixes()
@@ -56,47 +56,22 @@ def test_a_fix_comes_back_as_it_was(path: Path) -> None:
         assert rows[PANEL[4]].t_s == 1.5
         assert rows[PANEL[0]].status == "planned"
         assert (rows[PANEL[0]].x_m, rows[PANEL[0]].y_m) == (0.22, -0.25)
-        assert db.meta["seed"] == "1"
-        assert db.meta["config_sha256"] == hashlib.sha256(b"[run]\n").hexdigest()
         assert db.damaged == ()
+    assert select(path, "SELECT row, col, point, t_s, estimated_error_m FROM arrivals") == [(*PANEL[1], 3.5, 0.0004)]
+    meta = dict(select(path, "SELECT key, value FROM meta"))
+    assert (meta["seed"], meta["config_sha256"]) == ("1", hashlib.sha256(b"[run]\n").hexdigest())
 
 
-async def test_a_fix_can_be_awaited(path: Path) -> None:
-    with make(path) as db:
-        assert await asyncio.wrap_future(db.record_fix(PANEL[0], a_fix(), POSE)) == 1
-
-
-def test_events_and_arrivals_come_back(path: Path) -> None:
-    event = StoreEvent(2.5, "danger", 1, "rim ahead", "front_left", 0.004, 0.005, "text")
-    with make(path) as db:
-        assert db.record_event(event)
-        assert db.record_arrival(PANEL[1], 3.5, 0.0004)
-        ((number, found, wall_utc),) = db.events()
-        assert (number, found) == (1, event)
-        assert wall_utc.endswith("+00:00")
-        assert db.arrivals() == [(PANEL[1], 3.5, 0.0004)]
-
-
-def test_a_measured_point_is_not_measured_again_unless_told(path: Path) -> None:
-    with make(path) as db:
-        db.record_fix(PANEL[0], a_fix(1.0), POSE).result()
-        with pytest.raises(AlreadyMeasuredError, match="1/2/1 has been measured"):
-            db.record_fix(PANEL[0], a_fix(2.0), POSE).result()
-        assert [f.fix.t_s for f in db.fixes()] == [1.0]
-        db.record_fix(PANEL[0], a_fix(3.0), POSE, remeasure=True).result()
-        assert [f.fix.t_s for f in db.fixes()] == [3.0]
-        assert [f.fix.t_s for f in db.fixes(history=True)] == [1.0, 3.0]
-
-
-def test_two_fixes_of_one_point_in_one_batch_leave_one(path: Path) -> None:
+def test_a_measured_point_is_not_measured_again(path: Path) -> None:
     with make(path) as db:
         gate = hold(db)
-        first, second = db.record_fix(PANEL[0], a_fix(), POSE), db.record_fix(PANEL[0], a_fix(), POSE)
+        first, second = db.record_fix(PANEL[0], a_fix(1.0), POSE), db.record_fix(PANEL[0], a_fix(2.0), POSE)
         gate.set()
         assert first.result() == 1
-        with pytest.raises(AlreadyMeasuredError, match="not replaced"):
+        with pytest.raises(AlreadyMeasuredError, match="1/2/1 has been measured; its fix is not replaced"):
             second.result()
-        assert len(db.fixes(history=True)) == 1
+        assert [f.fix.t_s for f in db.fixes()] == [1.0]
+    assert select(path, "SELECT count(*) FROM fixes") == [(1,)]
 
 
 def test_a_skipped_point_may_be_measured_later_and_not_the_other_way_round(path: Path) -> None:
@@ -108,13 +83,13 @@ def test_a_skipped_point_may_be_measured_later_and_not_the_other_way_round(path:
             db.record_skipped(PANEL[0], 10.0).result()
 
 
-def test_a_refused_request_harms_no_other_of_its_batch(path: Path) -> None:
+def test_a_refused_request_harms_no_other(path: Path) -> None:
     with make(path) as db:
         gate = hold(db)
         unknown = db.record_fix(PointId(9, 9, 9), a_fix(), POSE)
         not_finite = db.record_fix(PANEL[1], a_fix(float("nan")), POSE)
         short = db.record_fix(PANEL[2], Fix(1.0, (0.0, 0.0, 0.0), (1.0,), 1.0, (1,), 0.0), POSE)
-        db.record_event(StoreEvent(1.0, None))  # type: ignore[arg-type]
+        db.record_arrival(PANEL[0], None, 0.0)  # type: ignore[arg-type]
         good = db.record_fix(PANEL[0], a_fix(), POSE)
         gate.set()
         with pytest.raises(UnknownPointError, match="9/9/9 is not one"):
@@ -124,9 +99,9 @@ def test_a_refused_request_harms_no_other_of_its_batch(path: Path) -> None:
         with pytest.raises(StoreRefusal, match="covariance is not of 9"):
             short.result()
         assert good.result() == 1
-        assert db.events() == []
-        assert db.events_dropped == 1
         assert db.failure is None
+    assert db.arrivals_dropped == 1
+    assert select(path, "SELECT * FROM arrivals") == []
 
 
 def test_a_request_the_database_cannot_hold_is_refused(path: Path) -> None:
@@ -145,15 +120,16 @@ def test_a_request_refused_half_way_leaves_nothing_behind(path: Path) -> None:
         assert db._submit(lambda c: c.execute("SELECT * FROM meta WHERE key = 'half'").fetchall()).result() == []
 
 
-def test_the_event_queue_is_bounded_and_counts_what_it_drops(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(store, "EVENT_QUEUE", 3)
+def test_the_queue_is_bounded_and_counts_the_arrivals_that_it_drops(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(store, "QUEUE_LIMIT", 3)
     with make(path) as db:
         gate = hold(db)
-        assert [db.record_event(StoreEvent(float(i), "x")) for i in range(5)] == [True, True, True, False, False]
-        assert db.queue_age_s > 0.0
+        assert [db.record_arrival(PANEL[0], float(i), 0.0) for i in range(5)] == [True, True, True, False, False]
         gate.set()
-        assert len(db.events()) == 3
-        assert db.events_dropped == 2
+    assert db.arrivals_dropped == 2
+    assert select(path, "SELECT count(*) FROM arrivals") == [(3,)]
 
 
 def test_a_cancelled_request_is_left_out(path: Path) -> None:
@@ -163,7 +139,6 @@ def test_a_cancelled_request_is_left_out(path: Path) -> None:
         assert late.cancel()
         gate.set()
         assert db.fixes() == []
-        assert db.queue_age_s < 5.0
         assert db.measured_points() == set()
 
 
@@ -178,7 +153,7 @@ def test_close_commits_what_is_queued_and_ends_the_store(path: Path) -> None:
     assert [p.name for p in path.parent.iterdir()] == ["mission.sqlite"]  # no journal is left behind
     with pytest.raises(StoreError, match="is closed"):
         db.record_fix(PANEL[1], a_fix(), POSE).result()
-    assert not db.record_event(StoreEvent(1.0, "x"))
+    assert not db.record_arrival(PANEL[0], 1.0, 0.0)
 
 
 def test_close_says_when_the_writer_does_not_end(path: Path) -> None:
@@ -261,43 +236,45 @@ def test_no_flipped_bit_and_no_truncation_changes_a_fix_unnoticed(path: Path) ->
     assert noticed > len(sound) // 1021  # all truncations and some of the flips (the others hit unused bytes)
 
 
-def test_events_give_way_to_fixes_when_the_disk_is_full(path: Path) -> None:
-    failures: list[StoreError] = []
+def test_arrivals_give_way_to_fixes_when_the_disk_is_full(path: Path) -> None:
     make(path, reserve_bytes=20_000).close()
-    with MissionStore.open(path, mirror="fyst-m1", on_failure=failures.append) as db:
-        gate = hold(db, lambda c: c.execute("PRAGMA max_page_count = 1"))  # SQLite's "disk full": no further page
-        for _ in range(200):
-            db.record_event(StoreEvent(1.0, "x", text="y" * 1000))
+    with MissionStore.open(path, mirror="fyst-m1") as db:
+        gate = hold(db)
+        refused = db._submit(lambda c: c.execute("PRAGMA max_page_count = 1"))  # "disk full": no further page
+        assert db.record_arrival(PANEL[0], "far too long" * 5000, 0.0)  # type: ignore[arg-type]
         fix = db.record_fix(PANEL[0], a_fix(), POSE)
         gate.set()
+        refused.result()
         assert fix.result() == 1
-        assert db.events_dropped >= 200
-        assert failures == []
+        assert db.failure is None
+    assert db.arrivals_dropped == 1
 
 
 def test_a_disk_without_room_ends_the_store_loudly(path: Path) -> None:
-    failures: list[StoreError] = []
     make(path).close()
-    with MissionStore.open(path, mirror="fyst-m1", on_failure=failures.append) as db:
-        gate = hold(db, lambda c: c.execute("PRAGMA max_page_count = 1"))
+    with MissionStore.open(path, mirror="fyst-m1") as db:
+        db._submit(lambda c: c.execute("PRAGMA max_page_count = 1")).result()
         big = Fix(1.0, (0.0, 0.0, 0.0), (0.0,) * 9, 1.0, tuple(range(5000)), 0.0)
-        first = db.record_fix(PANEL[0], big, POSE)
+        gate = hold(db)
+        first, queued = db.record_fix(PANEL[0], big, POSE), db.record_arrival(PANEL[0], 1.0, 0.0)
         gate.set()
         with pytest.raises(StoreError, match=r"cannot write any more: .*full.*SQLITE_FULL"):
             first.result()
         with pytest.raises(StoreError, match="cannot write any more"):  # final, though this one would fit
             db.record_fix(PANEL[1], a_fix(), POSE).result()
-        assert not db.record_event(StoreEvent(1.0, "x"))
+        assert not db.record_arrival(PANEL[0], 1.0, 0.0)
+        assert queued
         assert db.measured_points() == set()
-        assert failures == [db.failure]
+        assert not isinstance(db.failure, StoreRefusal)
+    assert db.arrivals_dropped == 2
+    assert db.record_skipped(PANEL[0], 1.0).exception() is db.failure
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_writer_that_dies_takes_its_requests_with_it(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_surprise_in_the_writer_ends_the_store(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def surprise(*_: object) -> int:
         raise RuntimeError("surprise")
 
-    monkeypatch.setattr(store_rows, "insert_fix", surprise)
+    monkeypatch.setattr(store, "_insert_fix", surprise)
     db = make(path)
     with pytest.raises(StoreError, match="RuntimeError: surprise"):
         db.record_fix(PANEL[0], a_fix(), POSE).result(timeout=5.0)
@@ -308,10 +285,10 @@ WRITER = """
 import sys
 from pathlib import Path
 from ccatp.core import DeckPose, Fix, PointId
-from ccatp.records.store import MissionStore, StoreEvent
+from ccatp.records.store import MissionStore
 db = MissionStore.open(Path(sys.argv[1]), mirror="fyst-m1")
 for point in sorted({p.point for p in db.points()} - db.measured_points()):
-    db.record_event(StoreEvent(1.0, "x"))
+    db.record_arrival(point, 1.0, 0.0)
     fix = Fix(float(point.row), (1.0, 2.0, 3.0), (0.0,) * 9, 1.0, (1, 2, 3, 4), 0.0)
     db.record_fix(point, fix, DeckPose(0.0, 0.0, 0.0)).result()
     print(*point, flush=True)
@@ -339,19 +316,22 @@ def test_what_was_acknowledged_survives_kill_9_at_any_instant(path: Path) -> Non
             assert {f.point for f in db.fixes()} == db.measured_points()
 
 
-def hold(db: MissionStore, then: object = None) -> threading.Event:
-    """Keep the writer thread busy until the event is set, so that what follows makes one batch."""
+def hold(db: MissionStore) -> threading.Event:
+    """Keep the writer thread busy until the event is set."""
     gate, began = threading.Event(), threading.Event()
 
-    def wait(connection: sqlite3.Connection) -> None:
+    def wait(_: sqlite3.Connection) -> None:
         began.set()
         gate.wait(10.0)
-        if callable(then):
-            then(connection)
 
-    _held: Future[None] = db._submit(wait)
+    db._submit(wait)
     assert began.wait(10.0)
     return gate
+
+
+def select(path: Path, query: str) -> list[tuple[Any, ...]]:
+    with closing(sqlite3.connect(path)) as db:
+        return db.execute(query).fetchall()
 
 
 def alter(path: Path, statement: str) -> None:

@@ -184,8 +184,7 @@ def test_a_whole_summary_has_the_keys_of_the_contract_in_their_order(builder: Su
     builder.set_mission(690, 3, 3600.0)
     builder.add_ticks([100.0, 110.0])
     builder.add_ticks(np.array([120.0]))
-    builder.set_wall(60.0)
-    built = builder.build()
+    built = builder.build(60.0)
     assert list(built) == [
         *("mirror", "world", "filter", "seed", "points", "arrival_error_mm", "localization_error_mm"),
         *("heading_error_mrad", "mission_time_s", "lower_bound_s", "within_budget", "danger", "panels", "wall"),

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from ccatp.config.models import LimitsConfig
 from ccatp.control.gate import Denial, DriveGate, FanGate, Purpose
 from ccatp.core import EventCode, Twist, Verdict, twist_of, wheel_rates
-from ccatp.daemon.frame_service import GateLog
+from ccatp.daemon.survey_runner import GateLog
 from ccatp.survey.state import PURPOSES, MissionState
 
 LIMITS = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=0.8, alpha_max_rad_s2=2.0)

@@ -22,8 +22,7 @@ from ccatp.links.topics import (
     schema_of,
 )
 from ccatp.records.recorder import Recorder
-from ccatp.records.store import MissionStore
-from ccatp.records.store_rows import PlannedPoint
+from ccatp.records.store import MissionStore, PlannedPoint
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.state import MissionState
 
@@ -150,7 +149,7 @@ class RecordingRun(SilRun):
             ),
         )  # fmt: skip
         if point is not None and point in self.mission.done:
-            self.store.record_fix(point, fix, before, remeasure=True).result()
+            self.store.record_fix(point, fix, before).result()
 
 
 def record(run_dir: Path, *, is_simulation: bool = True, only: int | None = None, **changes: object) -> Path:

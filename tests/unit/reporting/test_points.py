@@ -11,7 +11,7 @@ import pytest
 from ccatp.core import PointId, Vector3
 from ccatp.links.topics import FixMessage
 from ccatp.mirror.panel_alignment import Measured
-from ccatp.records.store_rows import StoredPoint
+from ccatp.records.store import StoredPoint
 from ccatp.report.findings import Grade, error_figures, error_series, first_arrivals_mm, point_verdicts
 from ccatp.report.record import RunRecord, changed_keys, read_record
 

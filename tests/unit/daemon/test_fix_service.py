@@ -1,4 +1,4 @@
-"""The measuring desk and a localizer that refuses."""
+"""The fix service and a localizer that refuses."""
 
 import asyncio
 from concurrent.futures import Future
@@ -15,8 +15,7 @@ from ccatp.daemon.telemetry import SurveyTelemetry
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.etalon_client import EtalonClient
 from ccatp.localizer import Localizer
-from ccatp.records.store import MissionStore
-from ccatp.records.store_rows import AlreadyMeasuredError
+from ccatp.records.store import AlreadyMeasuredError, MissionStore
 from ccatp.survey.fix_gate import FixFinding, FixGate
 from ccatp.survey.mission import Mission
 

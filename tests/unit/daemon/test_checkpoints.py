@@ -1,19 +1,24 @@
-"""The main loop's parts: which robot they accept, what a plan holds."""
+"""Parts, database and checkpoint of a main loop: new, resumed, taken over."""
 
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import structs
 
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, StopKind
-from ccatp.daemon.checkpoints import StoreUnusable, build_parts
+from ccatp.core import DeckPose, EventCode, StopKind
+from ccatp.daemon.checkpoints import StoreUnusable, build_parts, in_force_of
 from ccatp.daemon.process import Endpoints, ProcessArgs
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello, RobotData
+from ccatp.mirror.mirror import build_mirror
+from ccatp.records.store import MissionStore
 from ccatp.survey.composition import SurveyParts
+from ccatp.survey.state import MissionState
+from tests.support.mission_story import ABORT, FREE, Story, from_first_leg
 
 
 def args(config: Config, folder: Path) -> ProcessArgs:
@@ -21,9 +26,14 @@ def args(config: Config, folder: Path) -> ProcessArgs:
     return ProcessArgs(config, folder, Endpoints(folder), None, False, False)
 
 
+def build(of: ProcessArgs) -> tuple[SurveyParts, MissionStore]:
+    assert isinstance(of.config, Config)
+    return build_parts(of.config, of)
+
+
 @pytest.fixture
 def parts(tmp_path: Path) -> SurveyParts:
-    built, store = build_parts(args(load_config(None, {"run.panels": 1}), tmp_path))
+    built, store = build(args(load_config(None, {"run.panels": 1}), tmp_path))
     store.close()
     return built
 
@@ -79,9 +89,9 @@ def test_an_overhanging_mirror_needs_a_fan_floor(parts: SurveyParts, config: Con
 
 def test_a_store_that_exists_is_not_overwritten(tmp_path: Path) -> None:
     where = args(load_config(None, {"run.panels": 1}), tmp_path)
-    build_parts(where)[1].close()
+    build(where)[1].close()
     with pytest.raises(StoreUnusable, match=r"mission\.sqlite"):
-        build_parts(where)
+        build(where)
 
 
 def test_a_resumed_plan_leaves_out_what_is_measured(tmp_path: Path) -> None:
@@ -90,13 +100,55 @@ def test_a_resumed_plan_leaves_out_what_is_measured(tmp_path: Path) -> None:
     from ccatp.core import Fix
 
     where = args(load_config(None, {"run.panels": 1}), tmp_path)
-    built, store = build_parts(where)
+    built, store = build(where)
     first = next(stop.point for stop in built.route.stops if stop.point is not None)
     fix = Fix(1.0, (0.0, 0.0, 0.0), tuple(np.eye(3).ravel().tolist()), 1.0, (1, 2, 3, 4), 0.0)
     store.record_fix(first, fix, DeckPose(0.0, 0.0, 0.0)).result(5.0)
     store.close()
-    again, store = build_parts(replace(where, is_resuming=True))
+    again, store = build(replace(where, is_resuming=True))
     store.close()
     assert again.already_done == 1
     assert first not in {stop.point for stop in again.route.stops}
     assert again.total_points == 9
+
+
+QUAKE = structs.replace(
+    FREE, code=EventCode.ABORTED, cause="emergency: earthquake", forward=False, reverse=False, turn=False, raised=1,
+    is_shaking=True,
+)  # fmt: skip
+
+
+@pytest.fixture
+def driving(config: Config) -> Story:
+    cfg = from_first_leg(config)
+    story = Story(cfg, build_mirror(cfg.mirror))
+    story.until_state(MissionState.DRIVING)
+    return story
+
+
+def test_a_pause_and_an_abort(driving: Story) -> None:
+    mission = driving.mission
+    assert in_force_of(mission) == ("", "")
+    driving.frame(ABORT)
+    assert in_force_of(mission) == ("fire", "")
+    assert mission.pause("operator") is None
+    assert in_force_of(mission) == ("fire", "operator")
+
+
+@pytest.mark.fault("O1")
+def test_an_earthquake_is_kept_by_the_danger_loop(driving: Story) -> None:
+    """Who takes over is held by the next verdict, and goes home when it is over; nobody has to resume."""
+    driving.frame(QUAKE)
+    assert driving.mission.is_paused
+    assert in_force_of(driving.mission) == ("emergency: earthquake", "")
+
+
+def test_what_was_stopped_on_its_way_home_goes_home_when_it_goes_on(driving: Story) -> None:
+    assert driving.mission.abort("operator") is None
+    assert driving.mission.stop() is None
+    assert in_force_of(driving.mission) == ("operator", "")
+
+
+def test_what_is_at_base_has_nothing_in_force(driving: Story) -> None:
+    driving.until_state(MissionState.DONE, ABORT)
+    assert in_force_of(driving.mission) == ("", "")

@@ -1,4 +1,4 @@
-"""The latch of emergencies survives its process."""
+"""The emergency latch survives its process."""
 
 from io import StringIO
 from pathlib import Path

@@ -1,16 +1,20 @@
-"""What the main loop tells of frames and fixes, as a recording needs it."""
+"""Publications of the main loop: frames, fixes, display state."""
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import msgspec
 import structlog
+import zmq
 
+from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PanelId, PanelPose
 from ccatp.daemon.telemetry import BATCH_FRAMES, SurveyTelemetry
-from ccatp.links.bus import Publisher
-from ccatp.links.topics import FixMessage, Message, SensorLines, TrackMessage
-from ccatp.localizer import Localizer
+from ccatp.links.bus import Publisher, Subscriber
+from ccatp.links.topics import DisplayState, FixMessage, Message, MissionStatus, SensorLines, TrackMessage
+from ccatp.localizer import Localizer, build_localizer
+from ccatp.mirror.mirror import build_mirror
 
 
 class Listener:
@@ -66,3 +70,42 @@ def test_a_fix_belongs_behind_the_last_frame_whatever_it_was() -> None:
     (fix,) = listener.of("fix")
     assert isinstance(fix, FixMessage)
     assert (fix.seq, fix.is_fused) == (8, False)
+
+
+LINE = b'{"type":"sensors"}'
+STATUS = MissionStatus(seq=1, t_s=0.1, state="driving")
+
+
+def test_a_display_state_for_a_subscriber_only(config: Config, tmp_path: Path) -> None:
+    mirror = build_mirror(config.mirror)
+    localizer = build_localizer(config, mirror)
+    endpoint = f"ipc://{tmp_path}/main"
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    publisher = Publisher(context, endpoint)
+    painter = SurveyTelemetry(publisher, structlog.get_logger())
+    subscriber = Subscriber(context, [endpoint], ["display_state"], keeps_newest=True)
+    try:
+        while not publisher.has_subscriber("display_state"):
+            pass
+        painter.publish_status(STATUS)  # before the first frame
+        for seq in (2, 3):
+            painter.publish_frame(seq, 0.1 * seq, localizer, "driving", LINE)
+            painter.publish_status(STATUS)
+        received = subscriber.receive(5.0)
+        while received is not None and isinstance(received[1], DisplayState) and received[1].seq < 3:
+            received = subscriber.receive(5.0)
+        assert received is not None
+        picture = received[1]
+        assert isinstance(picture, DisplayState)
+        base = mirror.base_pose
+        assert (picture.x_m, picture.y_m) == (base.x_m, base.y_m)
+        assert bytes(picture.line) == LINE
+        assert picture.covariance_m2[0] > 0.0
+        subscriber.close()
+        while publisher.has_subscriber("display_state"):
+            pass
+        painter.publish_status(STATUS)  # without a subscriber nothing is put together
+    finally:
+        subscriber.close()
+        publisher.close()
+        context.destroy(linger=0)

@@ -1,4 +1,4 @@
-"""Tests of what the agent of the observatory control system does, with a daemon and a survey that tests play."""
+"""The agent of the observatory control system."""
 
 import argparse
 import sys
@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from ccatp.daemon import ocs_plugin
+from ccatp.daemon import ocs_agent
 from ccatp.daemon.ocs_agent import OcsMissing, SurveyTask, add_arguments, feed_fields, main, register, survey_command
 from ccatp.links.client import OperatorClient
 from ccatp.links.topics import MissionStatus
@@ -44,7 +44,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ccatp.daemon.ocs_agent.PERIOD_S", 0.01)
 
 
-def desk_of(folder: Path, program: str = "") -> SurveyTask:
+def surveys_of(folder: Path, program: str = "") -> SurveyTask:
     command = [sys.executable, "-c", program]
     return SurveyTask(OperatorClient(folder, 5.0), command, {}, lambda _: None)
 
@@ -60,7 +60,7 @@ def status(**fields: object) -> dict[str, Any]:
 )  # fmt: skip
 def test_a_survey_ends_as_its_process_does(code: int, success: bool, told: str, folder: Path) -> None:
     session = Session()
-    done, text = desk_of(folder, f"raise SystemExit({code})").survey(session)
+    done, text = surveys_of(folder, f"raise SystemExit({code})").survey(session)
     assert done is success
     assert told in text
     assert session.data["exit_status"] == code
@@ -68,12 +68,12 @@ def test_a_survey_ends_as_its_process_does(code: int, success: bool, told: str, 
 
 def test_the_number_of_panels_goes_to_the_survey(folder: Path) -> None:
     program = "import sys; raise SystemExit(0 if sys.argv[1:] == ['--panels', '3'] else 9)"
-    assert desk_of(folder, program).survey(Session(), 3) == (True, "the survey is complete")
+    assert surveys_of(folder, program).survey(Session(), 3) == (True, "the survey is complete")
 
 
 def test_a_survey_that_says_nothing_is_ended(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ccatp.daemon.ocs_agent.START_TIMEOUT_S", 0.2)
-    done, text = desk_of(folder, "import time; time.sleep(60)").survey(Session())
+    done, text = surveys_of(folder, "import time; time.sleep(60)").survey(Session())
     assert not done
     assert "said nothing within 0.2 s" in text
 
@@ -97,7 +97,7 @@ def test_a_survey_that_runs_already_is_followed_and_aborted_when_the_session_sto
 
         thread = threading.Thread(target=go_away)
         thread.start()
-        done, text = desk_of(folder, "raise SystemExit(9)").survey(session)
+        done, text = surveys_of(folder, "raise SystemExit(9)").survey(session)
         thread.join()
     assert "abort" in asked
     assert session.data["state"] == "driving"
@@ -106,15 +106,15 @@ def test_a_survey_that_runs_already_is_followed_and_aborted_when_the_session_sto
 
 def test_orders_and_refusals(folder: Path) -> None:
     session = Session()
-    desk = desk_of(folder)
-    done, text = desk.ask("status", session)
+    surveys = surveys_of(folder)
+    done, text = surveys.ask("status", session)
     assert not done
     assert "no daemon in" in text
     with serving(folder, "control", lambda request: status(state=request["cmd"])):
-        assert desk.ask("pause", session) == (True, "pause: pause")
+        assert surveys.ask("pause", session) == (True, "pause: pause")
         assert session.data["state"] == "pause"
     with serving(folder, "control", lambda _: {"ok": False, "error": "nothing is paused"}):
-        assert desk.ask("resume") == (False, "resume refused: nothing is paused")
+        assert surveys.ask("resume") == (False, "resume refused: nothing is paused")
 
 
 def test_the_monitor_publishes_until_it_is_stopped(folder: Path) -> None:
@@ -127,12 +127,12 @@ def test_the_monitor_publishes_until_it_is_stopped(folder: Path) -> None:
             session.status = "stopping"
 
     with serving(folder, "control", lambda _: status(done=5)):
-        assert desk_of(folder).monitor(session, publish, 0.01) == (True, "monitoring ended")
+        assert surveys_of(folder).monitor(session, publish, 0.01) == (True, "monitoring ended")
     assert [block["block_name"] for block in blocks] == ["daemon", "survey", "daemon", "survey"]
     assert blocks[0]["data"] == {"running": 1}
     assert blocks[1]["data"]["done"] == 5
     session.status, blocks[:] = "running", []
-    desk_of(folder / "none").monitor(session, publish, 0.01)
+    surveys_of(folder / "none").monitor(session, publish, 0.01)
     assert [block["data"] for block in blocks] == [{"running": 0}] * 3
 
 
@@ -164,7 +164,7 @@ class Agent:
 
 def test_what_the_agent_offers(folder: Path) -> None:
     agent = Agent()
-    register(agent, desk_of(folder, "raise SystemExit(0)"), lambda *_, **__: lambda function: function, 0.01)
+    register(agent, surveys_of(folder, "raise SystemExit(0)"), lambda *_, **__: lambda function: function, 0.01)
     assert set(agent.processes) == {"survey", "monitor"}
     assert set(agent.tasks) == {"status", "pause", "resume", "abort", "stop"}
     assert agent.feeds == ["survey"]
@@ -197,6 +197,6 @@ def test_without_the_extra_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_plugin_names_the_agent() -> None:
-    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
-    assert project["entry-points"]["ocs.plugins"] == {"ccatp": "ccatp.daemon.ocs_plugin"}
-    assert ocs_plugin.agents["CcatpAgent"] == {"module": "ccatp.daemon.ocs_agent", "entry_point": "main"}
+    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
+    assert project["entry-points"]["ocs.plugins"] == {"ccatp": "ccatp.daemon.ocs_agent"}
+    assert ocs_agent.agents["CcatpAgent"] == {"module": "ccatp.daemon.ocs_agent", "entry_point": "main"}

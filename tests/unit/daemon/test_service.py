@@ -1,4 +1,4 @@
-"""The daemon as a service: what systemd is told, and when; the unit file."""
+"""The daemon as a systemd service; real-time scheduling; the unit file."""
 
 import configparser
 import os
