@@ -1,4 +1,4 @@
-"""DataLoops that break the interface page in one place: a man in the middle, or other rules inside."""
+"""DataLoops that break the interface page in one place: messages changed on their way, or other rules inside."""
 
 import asyncio
 import json
@@ -14,6 +14,7 @@ from ccatp.commissioning.conformance import harness, server_checks
 from ccatp.commissioning.conformance.runner import Conformance, Result
 from ccatp.config.models import Config
 from ccatp.dataloop import DataLoop, _Connection
+from ccatp.sim.rules import FanRules, MotionRules
 
 Message = dict[str, Any]
 STOP_S = 10.0
@@ -40,7 +41,7 @@ class Crooked(NamedTuple):
 
 
 class Middle(_Connection):
-    """A connection with somebody in between.
+    """A connection whose messages are changed on their way.
 
     Attributes:
         owner: the DataLoop.
@@ -76,7 +77,7 @@ class Middle(_Connection):
 
 
 class CrookedLoop(DataLoop):
-    """A DataLoop whose connections have somebody in between."""
+    """A DataLoop whose messages are changed on their way."""
 
     crooked: Crooked
 
@@ -124,6 +125,50 @@ async def server_time() -> AsyncIterator[None]:
 
 
 HONEST = Crooked("honest", frozenset(), ())
+
+
+def of(kind: str, change: Callable[[Message, Middle], object]) -> Callable[[Message, Middle], Message]:
+    """Change messages of one type in place."""
+
+    def says(message: Message, middle: Middle) -> Message:
+        if message["type"] == kind:
+            change(message, middle)
+        return message
+
+    return says
+
+
+def put(kind: str, **values: Any) -> Callable[[Message, Middle], Message]:
+    """Other values in messages of one type."""
+    return of(kind, lambda message, _: message.update(values))
+
+
+def swap(old: bytes, new: bytes) -> Callable[[bytes, Middle], bytes]:
+    """Something else in what clients send."""
+    return lambda data, _: data.replace(old, new)
+
+
+def rules(**methods: Any) -> Callable[[DataLoop], None]:
+    """Other rules of motion."""
+    return lambda loop: setattr(
+        loop.robot.rules, "__class__", type("Other", (MotionRules,), {"__slots__": (), **methods})
+    )
+
+
+def fans(**methods: Any) -> Callable[[DataLoop], None]:
+    """Other rules of the fans."""
+    return lambda loop: setattr(loop.robot.fans, "__class__", type("Other", (FanRules,), {"__slots__": (), **methods}))
+
+
+def around(path: str, new: Callable[..., Any]) -> Callable[[DataLoop], None]:
+    """A method of the robot or its server, replaced by ``new(loop, method, *arguments)``."""
+
+    def twist(loop: DataLoop) -> None:
+        part, name = path.split(".")
+        method = getattr(getattr(loop, part), name)
+        setattr(getattr(loop, part), name, lambda *args, **kwargs: new(loop, method, *args, **kwargs))
+
+    return twist
 
 
 @asynccontextmanager

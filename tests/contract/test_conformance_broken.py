@@ -20,7 +20,7 @@ from ccatp.links.robot_messages import BadLineCounter, Drive, LineBuffer
 from ccatp.links.robot_messages import Fans as FansMessage
 from ccatp.sim import sessions
 from ccatp.sim.rules import FanRules, MotionRules
-from tests.contract.crooked import Crooked, Message, Middle, failures, server_time
+from tests.contract.crooked import Crooked, Message, Middle, around, failures, fans, of, put, rules, server_time, swap
 
 AT_ONCE = 8  # servers
 KEY = b"secret"
@@ -37,39 +37,6 @@ MOVES = tuple(name for name in IDS if name.startswith("move"))
 TIMED = ("no-permit", "no-drive", "ttl-drive", "ttl-permit", "ttl-noise", *(n for n in IDS if n.startswith("lost")))
 
 
-def of(kind: str, change: Callable[[Message, Middle], object]) -> Callable[[Message, Middle], Message]:
-    """Change messages of one type in place."""
-
-    def says(message: Message, middle: Middle) -> Message:
-        if message["type"] == kind:
-            change(message, middle)
-        return message
-
-    return says
-
-
-def put(kind: str, **values: Any) -> Callable[[Message, Middle], Message]:
-    """Other values in messages of one type."""
-    return of(kind, lambda message, _: message.update(values))
-
-
-def swap(old: bytes, new: bytes) -> Callable[[bytes, Middle], bytes]:
-    """Something else in what clients send."""
-    return lambda data, _: data.replace(old, new)
-
-
-def rules(**methods: Any) -> Callable[[DataLoop], None]:
-    """Other rules of motion."""
-    return lambda loop: setattr(
-        loop.robot.rules, "__class__", type("Other", (MotionRules,), {"__slots__": (), **methods})
-    )
-
-
-def fans(**methods: Any) -> Callable[[DataLoop], None]:
-    """Other rules of the fans."""
-    return lambda loop: setattr(loop.robot.fans, "__class__", type("Other", (FanRules,), {"__slots__": (), **methods}))
-
-
 # -- hello and join ---------------------------------------------------------------------------------------------------
 
 
@@ -83,38 +50,30 @@ def _boots(hello: Message, middle: Middle) -> None:
     hello["boot"] = middle.owner.server.counts["boots"]
 
 
-def _throw_out(loop: DataLoop) -> None:
-    join = loop.server.join
-
-    def crooked(session: Any, message: Any, now_s: float) -> None:
-        holder = loop.server._holders.get(getattr(message, "role", "controller"))
-        if holder is not None:
-            loop.server.drop(holder, "thrown out")
-        join(session, message, now_s)
-
-    loop.server.join = crooked  # type: ignore[method-assign]
+def _throw_out(loop: DataLoop, join: Any, session: Any, message: Any, now_s: float) -> None:
+    holder = loop.server._holders.get(getattr(message, "role", "controller"))
+    if holder is not None:
+        loop.server.drop(holder, "thrown out")
+    join(session, message, now_s)
 
 
-def _disturb(loop: DataLoop) -> None:
-    refuse = loop.server.refuse
-
-    def crooked(session: Any, reason: Any) -> None:
-        for holder in list(loop.server._holders.values()):
-            holder.wire.close()
-        refuse(session, reason)
-
-    loop.server.refuse = crooked  # type: ignore[method-assign]
+def _disturb(loop: DataLoop, refuse: Any, session: Any, reason: Any) -> None:
+    for holder in list(loop.server._holders.values()):
+        holder.wire.close()
+    refuse(session, reason)
 
 
-def _patient(loop: DataLoop, extra_s: float) -> None:
-    accept = loop.server.accept
-
-    def crooked(wire: Any, now_s: float) -> Any:
-        session = accept(wire, now_s)
-        session.joined_s += extra_s
+def _each_session(change: Callable[[Any], object]) -> Callable[[DataLoop], None]:
+    def accept(_: DataLoop, method: Any, wire: Any, now_s: float) -> Any:
+        session = method(wire, now_s)
+        change(session)
         return session
 
-    loop.server.accept = crooked  # type: ignore[method-assign]
+    return around("server.accept", accept)
+
+
+def _patient(extra_s: float) -> Callable[[DataLoop], None]:
+    return _each_session(lambda session: setattr(session, "joined_s", session.joined_s + extra_s))
 
 
 def _join_by_drive(data: bytes, middle: Middle) -> bytes:
@@ -160,12 +119,14 @@ SESSIONS = [
     Crooked("a join without client", frozenset({"join-client"}), JOIN,
             hears=swap(b'"controller"}', b'"controller","client":"x"}')),
     Crooked("joined by a drive", frozenset({"join-first"}), JOIN, hears=_join_by_drive),
-    Crooked("the last to come has the role", frozenset({"role-taken", "refused-harmless"}), JOIN, twist=_throw_out),
-    Crooked("a refusal closes the holders, too", frozenset({"role-taken", "refused-harmless"}), JOIN, twist=_disturb),
+    Crooked("the last to come has the role", frozenset({"role-taken", "refused-harmless"}), JOIN,
+            twist=around("server.join", _throw_out)),
+    Crooked("a refusal closes the holders, too", frozenset({"role-taken", "refused-harmless"}), JOIN,
+            twist=around("server.refuse", _disturb)),
     Crooked("waits for joins for ever", frozenset({"join-late"}), ("join-late", "join"),
-            twist=lambda loop: _patient(loop, 60.0)),
+            twist=_patient(60.0)),
     Crooked("waits for joins half a second", frozenset({"join-late", "join-in-time"}),
-            ("join-late", "join-in-time", "join"), twist=lambda loop: _patient(loop, -1.5)),
+            ("join-late", "join-in-time", "join"), twist=_patient(-1.5)),
 ]  # fmt: skip
 MACS = [
     Crooked("takes every mac", frozenset(MAC[1:]), MAC, hears=_mac(lambda *_: True)),
@@ -194,17 +155,12 @@ def _not_each_to_the_monitor(message: Message, middle: Middle) -> Message | None
     return None if is_left_out else message
 
 
-def _to_all(loop: DataLoop) -> None:
-    send = loop.server._send_frame
-
-    def crooked() -> None:
-        send()
-        if len(loop.server._holders) == 2:
-            for session in loop.server._sessions:
-                if session.role is None:
-                    session.wire.write(loop.robot.delivered_line)
-
-    loop.server._send_frame = crooked  # type: ignore[method-assign]
+def _to_all(loop: DataLoop, send: Any) -> None:
+    send()
+    if len(loop.server._holders) == 2:
+        for session in loop.server._sessions:
+            if session.role is None:
+                session.wire.write(loop.robot.delivered_line)
 
 
 def _key_twice(message: Message, _: Middle) -> Message | bytes:
@@ -235,7 +191,8 @@ STREAMS = [
     Crooked("ages below zero", frozenset({"frames-cmd"}), FRAMES,
             says=_each(lambda frame: frame["cmd"].update(age=frame["cmd"]["age"] - 0.02))),
     Crooked("a monitor that misses frames", frozenset({"frames-all"}), FRAMES, says=_not_each_to_the_monitor),
-    Crooked("frames for all who connect", frozenset({"frames-joined"}), FRAMES, twist=_to_all),
+    Crooked("frames for all who connect", frozenset({"frames-joined"}), FRAMES,
+            twist=around("server._send_frame", _to_all)),
     Crooked("an echo that jumps", frozenset({"echo"}), FRAMES,
             says=_each(lambda frame: frame["seq"] % 5 or frame["cmd"].update(seq=7))),
 ]  # fmt: skip
@@ -273,50 +230,23 @@ def _take_fans(is_taken: Callable[[int, int], bool]) -> Any:
 def _obey(kind: type[Drive] | type[FansMessage]) -> Callable[[DataLoop], None]:
     """Messages of one kind from whatever role."""
 
-    def twist(loop: DataLoop) -> None:
-        command = loop.server.command
+    def command(_: DataLoop, method: Any, session: Any, role: Any, message: Any, now_s: float) -> bool:
+        return bool(method(session, "controller" if isinstance(message, kind) else role, message, now_s))
 
-        def crooked(session: Any, role: Any, message: Any, now_s: float) -> bool:
-            return command(session, "controller" if isinstance(message, kind) else role, message, now_s)
-
-        loop.server.command = crooked  # type: ignore[method-assign]
-
-    return twist
+    return around("server.command", command)
 
 
-def _fans_off_when_lost(loop: DataLoop) -> None:
-    lose = loop.robot.lose_controller
+def _fans_off_when_lost(loop: DataLoop, lose: Any) -> None:
+    lose()
+    loop.robot.fans.duty = (0.0, 0.0)
 
-    def crooked() -> None:
-        lose()
+
+def _fans_off_when_denied(
+    loop: DataLoop, permit: Any, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None
+) -> Any:
+    if not (forward or reverse or turn):
         loop.robot.fans.duty = (0.0, 0.0)
-
-    loop.robot.lose_controller = crooked  # type: ignore[method-assign]
-
-
-def _fans_off_when_denied(loop: DataLoop) -> None:
-    permit = loop.robot.permit
-
-    def crooked(seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None) -> bool:
-        if not (forward or reverse or turn):
-            loop.robot.fans.duty = (0.0, 0.0)
-        return permit(seq, forward, reverse, turn, now_s)
-
-    loop.robot.permit = crooked  # type: ignore[method-assign]
-
-
-def _each_session(change: Callable[[Any], object]) -> Callable[[DataLoop], None]:
-    def twist(loop: DataLoop) -> None:
-        accept = loop.server.accept
-
-        def crooked(wire: Any, now_s: float) -> Any:
-            session = accept(wire, now_s)
-            change(session)
-            return session
-
-        loop.server.accept = crooked  # type: ignore[method-assign]
-
-    return twist
+    return permit(seq, forward, reverse, turn, now_s)
 
 
 def _no_buffer(data: bytes, middle: Middle) -> bytes:
@@ -324,7 +254,7 @@ def _no_buffer(data: bytes, middle: Middle) -> bytes:
     return data
 
 
-MENDED = {
+CORRECTED = {
     "no-json": swap(b'"wl":0.0\n', b'"wl":0.0}\n'),
     "key-twice": swap(b'"wr":0.0,"wr":0.0', b'"wr":0.0'),
     "nan": swap(b"NaN", b"0.0"),
@@ -347,9 +277,11 @@ COMMANDS = [
     Crooked("obeys drives of the monitor", frozenset({"role-drive"}), NEWEST, twist=_obey(Drive)),
     Crooked("obeys fans of the monitor", frozenset({"role-fans"}), NEWEST, twist=_obey(FansMessage)),
     Crooked("has no fans", frozenset({"fans"}), ("fans",), hears=swap(b'"fans"', b'"sails"')),
-    Crooked("stops fans at a lost session", frozenset({"fans-fin", "fans-rst"}), FANS, twist=_fans_off_when_lost),
-    Crooked("stops fans at a stop", frozenset({"fans-stop"}), FANS, twist=_fans_off_when_denied),
-    *(Crooked(f"takes {kind}", frozenset({kind}), tuple(BAD_DRIVES), hears=MENDED[kind]) for kind in BAD_DRIVES),
+    Crooked("stops fans at a lost session", frozenset({"fans-fin", "fans-rst"}), FANS,
+            twist=around("robot.lose_controller", _fans_off_when_lost)),
+    Crooked("stops fans at a stop", frozenset({"fans-stop"}), FANS,
+            twist=around("robot.permit", _fans_off_when_denied)),
+    *(Crooked(f"takes {kind}", frozenset({kind}), tuple(BAD_DRIVES), hears=CORRECTED[kind]) for kind in BAD_DRIVES),
     Crooked("refuses unknown keys", frozenset({"unknown-key"}), LINES, hears=swap(b'"colour":', b'"colour",')),
     Crooked("counts unknown types as bad", frozenset({"unknown-type"}), LINES, hears=swap(b'"dance","s', b'dance",s')),
     Crooked("closes after five bad lines", frozenset({"bad-lines-few"}), LINES,
@@ -375,37 +307,22 @@ FLOORS = [
 
 
 def _never_waits(flag: str) -> Callable[[DataLoop], None]:
-    def twist(loop: DataLoop) -> None:
-        command = loop.server.command
+    def command(loop: DataLoop, method: Any, *args: Any) -> Any:
+        setattr(loop.server, flag, True)
+        return method(*args)
 
-        def crooked(session: Any, role: Any, message: Any, now_s: float) -> bool:
-            setattr(loop.server, flag, True)
-            return command(session, role, message, now_s)
-
-        loop.server.command = crooked  # type: ignore[method-assign]
-
-    return twist
+    return around("server.command", command)
 
 
-def _any_ack(loop: DataLoop) -> None:
-    command = loop.server.command
-
-    def crooked(session: Any, role: Any, message: Any, now_s: float) -> bool:
-        if hasattr(message, "ack"):
-            message.ack = loop.robot.delivered_seq
-        return command(session, role, message, now_s)
-
-    loop.server.command = crooked  # type: ignore[method-assign]
+def _any_ack(loop: DataLoop, command: Any, session: Any, role: Any, message: Any, now_s: float) -> Any:
+    if hasattr(message, "ack"):
+        message.ack = loop.robot.delivered_seq
+    return command(session, role, message, now_s)
 
 
-def _two_steps(loop: DataLoop) -> None:
-    advance = loop.server._advance
-
-    def crooked(now_s: float) -> None:
-        advance(now_s)
-        advance(now_s)
-
-    loop.server._advance = crooked  # type: ignore[method-assign]
+def _two_steps(_: DataLoop, advance: Any, now_s: float) -> None:
+    advance(now_s)
+    advance(now_s)
 
 
 def _wall_ages(frame: Message, middle: Middle) -> None:
@@ -441,8 +358,9 @@ STEPS = [
             twist=_never_waits("_is_drive_acked")),
     Crooked("does not wait for permits", frozenset({"lockstep-permit"}), LOCKSTEP[:2],
             twist=_never_waits("_is_permit_acked")),
-    Crooked("takes any ack", frozenset({"lockstep-ack"}), LOCKSTEP, twist=_any_ack),
-    Crooked("takes two steps", frozenset({"lockstep-step"}), LOCKSTEP[3:4], twist=_two_steps),
+    Crooked("takes any ack", frozenset({"lockstep-ack"}), LOCKSTEP, twist=around("server.command", _any_ack)),
+    Crooked("takes two steps", frozenset({"lockstep-step"}), LOCKSTEP[3:4],
+            twist=around("server._advance", _two_steps)),
     Crooked("measures ages on the wall clock", frozenset({"lockstep-ages"}), LOCKSTEP, says=of("sensors", _wall_ages)),
     Crooked("drives forward without permit", frozenset({"move-forward"}), MOVES, twist=_allowing(forward=True)),
     Crooked("reverses without permit", frozenset({"move-reverse", "move-curve-back"}), MOVES,
@@ -499,15 +417,10 @@ def _noise_keeps_the_role(data: bytes, middle: Middle) -> bytes:
     return data
 
 
-def _soon_taken_over(loop: DataLoop) -> None:
-    command = loop.server.command
-
-    def crooked(session: Any, role: Any, message: Any, now_s: float) -> bool:
-        result = command(session, role, message, now_s)
-        session.received_s -= 3.0
-        return result
-
-    loop.server.command = crooked  # type: ignore[method-assign]
+def _soon_taken_over(_: DataLoop, command: Any, session: Any, *args: Any) -> Any:
+    result = command(session, *args)
+    session.received_s -= 3.0
+    return result
 
 
 def _fans_stop_with_wheels(loop: DataLoop) -> None:
@@ -529,7 +442,8 @@ def _forgets(method: str) -> Callable[[DataLoop], None]:
 LOST = {role: frozenset({f"lost-{role}-fin", f"lost-{role}-rst"}) for role in ("controller", "monitor")}
 REALTIME = [
     Crooked("keeps a role for bad lines", frozenset({"take-over"}), ("take-over",), hears=_noise_keeps_the_role),
-    Crooked("gives roles away too soon", frozenset({"take-over"}), ("take-over",), twist=_soon_taken_over),
+    Crooked("gives roles away too soon", frozenset({"take-over"}), ("take-over",),
+            twist=around("server.command", _soon_taken_over)),
     Crooked("ignores the age of drives", frozenset({"ttl-drive", "ttl-noise"}), TIMED, twist=_ageless("drive")),
     Crooked("ignores the age of permits", frozenset({"ttl-permit"}), TIMED, twist=_ageless("permit")),
     Crooked("needs one key only", frozenset({"no-permit", "ttl-permit"}) | LOST["monitor"], TIMED,
