@@ -258,7 +258,7 @@ def _simulated(
     cfg: "CricketConfig", method: str, seeds: range, out_file: Path | None, figure_file: Path | None
 ) -> dict[str, Any]:
     from ccatp.report.beacon_plots import draw_mote_map
-    from ccatp.studies.mote_sizes import campaign_data, pictured, run_campaign
+    from ccatp.studies.mote_runs import campaign_data, pictured, run_campaign
 
     campaign = run_campaign(cfg, method, seeds, _progress(len(seeds)))
     if out_file is not None:

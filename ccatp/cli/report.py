@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ccatp.config.models import Config
     from ccatp.mirror.mirror_alignment import SurveyResult
     from ccatp.records.run_reader import Recording, Survey
-    from ccatp.studies.replay_report import ReplayEvaluation
+    from ccatp.studies.replay import ReplayEvaluation
 
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -187,7 +187,7 @@ class ReplayError(CcatpError):
 def replay(run_dir: Path, settings: Mapping[str, object], smooth: bool, out: Path | None, json_output: bool) -> int:
     """Run an estimator again over the recorded samples of a run, as it was or with other settings."""
     from ccatp.records.run_reader import open_run
-    from ccatp.studies.replay_report import csv_lines, judge, table_lines
+    from ccatp.studies.replay import csv_lines, judge, table_lines
 
     recordings = open_run(run_dir)
     configs = [_config(recording, settings, smooth) for recording in recordings]
@@ -231,8 +231,8 @@ def _judged(recording: "Recording", cfg: "Config", smooth: bool) -> "ReplayEvalu
     from ccatp.mirror.mirror import build_mirror
     from ccatp.mirror.surface import MirrorError
     from ccatp.records.run_reader import in_order
+    from ccatp.studies.replay import ReplayEvaluation
     from ccatp.studies.replay import replay as play
-    from ccatp.studies.replay_report import ReplayEvaluation
 
     mirror = build_mirror(cfg.mirror)
     try:

@@ -24,10 +24,10 @@ class _StudyCommand(click.Command):
     """A command whose help lists the studies, from their table, when it is asked for."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        from ccatp.studies.registry import STUDIES
+        from ccatp.studies import STUDIES
 
         with formatter.section("Studies"):
-            formatter.write_dl([(name, entry.title) for name, entry in STUDIES.items()])
+            formatter.write_dl([(name, title) for name, (_, title) in STUDIES.items()])
         super().format_epilog(ctx, formatter)
 
 
@@ -68,13 +68,13 @@ def study(
     settings: Mapping[str, object], no_figures: bool, json_output: bool,
 ) -> int:  # fmt: skip
     """Run the study NAME: many missions or an analysis, with tables, figures and a machine-readable result."""
-    from ccatp.studies.engine import limit_threads
+    from ccatp.studies import limit_threads
 
     limit_threads()  # before numpy is imported
     from ccatp.config.load import load_config, load_radio_config
+    from ccatp.studies import find_study
     from ccatp.studies.campaign import WHOLE, CampaignError, Study, parse_choice, parse_shard
     from ccatp.studies.engine import CampaignOptions, run_campaign
-    from ccatp.studies.registry import find_study
 
     out = out or Path("studies") / name
     found = find_study(name)
@@ -99,7 +99,7 @@ def study(
 
 def _analysed(analysis: Callable[[Any, Path], dict[str, Any]], cfg: Any, out: Path) -> dict[str, Any]:
     from ccatp.studies.campaign import CampaignFailed
-    from ccatp.studies.job_store import make_out
+    from ccatp.studies.engine import make_out
 
     make_out(out)
     try:

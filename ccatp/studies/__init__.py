@@ -1,4 +1,64 @@
 """Monte Carlo campaigns, comparisons with published results and with peers, replay of recorded runs.
 
-``registry`` is the table of studies; ``campaign`` and ``engine`` run them.
+This file holds the table of studies. It imports nothing heavy, since the help of the command reads it.
 """
+
+import difflib
+import os
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from ccatp.config.models import Config
+    from ccatp.studies.campaign import Study
+
+Analysis: TypeAlias = "Callable[[Config, Path], dict[str, Any]]"
+"""A study without runs: a configuration and a directory, to what ``result.json`` holds."""
+
+# Name: module and name in it of a Study or an Analysis, one line for the help.
+STUDIES = {
+    "thesis": ("thesis_study:STUDY", "the thesis's own simulation again, under several readings"),
+    "filters": ("filters_study:STUDY", "filters in four worlds, over whole missions"),
+    "time": ("factor_studies:TIME", "order, speed and measuring time against the hour"),
+    "sensitivity": ("factor_studies:SENSITIVITY", "what each disturbance of a hard world costs"),
+    "ablation": ("factor_studies:ABLATION", "what each technique gives, one off at a time"),
+    "danger": ("danger_study:STUDY", "false edges and overrun of two edge rules"),
+    "faults": ("faults_study:STUDY", "whole missions with random faults: falls, completion"),
+    "cricket": ("cricket_study:STUDY", "self-mapping of motes: the published figures, better ways"),
+    "mote-sizes": ("cricket_study:run_sizes", "time of self-mapping against the number of motes"),
+    "mote-navigation": ("mote_navigation:STUDY", "a robot guided by motes that mapped themselves"),
+    "radio-signals": ("radio_studies:RADIO_SIGNALS", "levels and bearings of ZigBee radios, beside 2017"),
+    "radio-slam": ("radio_studies:RADIO_SLAM", "EKF-SLAM among ZigBee radios: rooms, slip, shadowing"),
+    "radio-cases": ("radio_studies:RADIO_CASES", "cases I to III of 2017 side by side with ours"),
+    "radio-follow": ("radio_studies:RADIO_FOLLOW", "a moving radio followed, beside 2018"),
+    "loops": ("loops:run", "Bode plots, margins and root loci of the controllers"),
+}
+
+
+def find_study(name: str) -> "Study | Analysis":
+    """The study of a name.
+
+    Raises:
+        CampaignError: there is none.
+    """
+    if name not in STUDIES:
+        from ccatp.studies.campaign import CampaignError  # noqa: PLC0415
+
+        near = difflib.get_close_matches(name, STUDIES, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(STUDIES)}"
+        raise CampaignError(f"no study {name!r}; {hint}")
+    module, _, attribute = STUDIES[name][0].partition(":")
+    found: Study | Analysis = getattr(import_module(f"ccatp.studies.{module}"), attribute)
+    return found
+
+
+def limit_threads() -> None:
+    """Ask for one thread of the linear algebra, here and in children; acts only before numpy is imported.
+
+    On matrices this small more threads cost time, and compete with the workers.
+    """
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")

@@ -1,4 +1,4 @@
-"""The benchmarks: every case of one table against its peers by turns on one clock, missions, and the result as text."""
+"""Benchmarks: every case of one table against its peers by turns on one clock, missions, and the result as text."""
 
 import gc
 import json
@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -24,8 +24,7 @@ from ccatp.studies.bench_cases import (
     Contender,
     FilterProblem,
     dense_slam,
-    filterpy_linear,
-    filterpy_unscented,
+    filterpy,
     linearised_problem,
     our_filter,
     our_position,
@@ -39,6 +38,7 @@ from ccatp.studies.bench_cases import (
     thesis_problem,
 )
 from ccatp.studies.engine import settle
+from ccatp.studies.results import markdown_table
 from ccatp.studies.sil_run import rehearse
 
 EQUAL_WITHIN = 1e-10  # every entry of mean and covariance, SI units
@@ -51,8 +51,8 @@ PACKAGES = ("ccatp", "numpy", "scipy", "filterpy", "stonesoup")
 CPU_INFO = Path("/proc/cpuinfo")
 
 Peers = Mapping[str, Callable[[FilterProblem], Contender]]
-LINEAR: Peers = {"eq. 2.13 in numpy": printed_filter, "filterpy": filterpy_linear, "Stone Soup": stonesoup}
-UNSCENTED: Peers = {"filterpy": filterpy_unscented, "Stone Soup": stonesoup}
+LINEAR: Peers = {"eq. 2.13 in numpy": printed_filter, "filterpy": filterpy, "Stone Soup": stonesoup}
+UNSCENTED: Peers = {"filterpy": filterpy, "Stone Soup": stonesoup}
 FILTER_CASES: tuple[tuple[str, Callable[[Config], FilterProblem], Peers], ...] = (
     *(("kf", lambda cfg, m=m: thesis_problem(cfg, m), LINEAR) for m in (2, 4, 22)),
     *(("ekf", lambda cfg, m=m: linearised_problem(cfg, m), LINEAR) for m in (4, 6, 23)),
@@ -67,18 +67,10 @@ class BenchError(CcatpError):
     """A benchmark that gives no figure: results differ, or a mission failed."""
 
 
-class Times(NamedTuple):
-    """Wall times of single steps, microseconds, one row for each round: shape (rounds, steps)."""
-
-    ours_us: FloatArray
-    peer_us: FloatArray | None
-
-
 def run_bench(cfg: Config, *, quick: bool, run_args: Sequence[str] = (), missions: bool = True) -> dict[str, Any]:
     """Run every benchmark.
 
     Args:
-        cfg: the robot's measures and noise, the mirror, and the mission that is timed.
         quick: a tenth of the repeats and a mission of one panel.
         run_args: what else ``ccatp run`` needs to work on the same configuration.
         missions: time missions as well as steps.
@@ -102,13 +94,14 @@ def step_cases(cfg: Config, rounds: int) -> Iterator[dict[str, Any]]:
         problem = problem_of(cfg)
         name = f"{filter_name} predict + update, n = {problem.mean.size}, m = {problem.variances.size}"
         for peer_name, peer_of in peers.items():
+            ours = our_filter(filter_name, problem)
             try:
                 peer = peer_of(problem)
             except ImportError:
                 note = f"{peer_name} is not installed: {INSTALL}"
-                yield {**step_case(name, our_filter(filter_name, problem), "", None, rounds), "note": note}
-                continue
-            yield step_case(name, our_filter(filter_name, problem), peer_name, peer, rounds)
+                yield {**step_case(name, ours, "", None, rounds), "note": note}
+            else:
+                yield step_case(name, ours, peer_name, peer, rounds)
     for beacons, has_peer in SLAM_CASES:
         slam = slam_problem(beacons)
         name = f"ekf-slam, {beacons} beacons, n = {slam.mean.size}"
@@ -138,20 +131,23 @@ def step_case(name: str, ours: Contender, peer_name: str, peer: Contender | None
                 "times of different computations cannot be compared"
             )
         found["largest_difference"] = difference
-    times = race(ours, peer, rounds)
-    p50, p99 = (float(value) for value in np.percentile(times.ours_us, (50, 99)))
+    times_us = [np.percentile(taken, (50, 99)).tolist() for taken in race(ours, peer, rounds)]
+    p50, p99 = times_us[0]
     found |= {"us_p50": p50, "us_p99": p99, "peer": None, "peer_us_p50": None, "peer_us_p99": None, "ratio": None}
-    if times.peer_us is not None:
-        peer_p50, peer_p99 = (float(value) for value in np.percentile(times.peer_us, (50, 99)))
+    if peer is not None:
+        peer_p50, peer_p99 = times_us[1]
         found |= {"peer": peer_name, "peer_us_p50": peer_p50, "peer_us_p99": peer_p99, "ratio": p50 / peer_p50}
     return found
 
 
-def race(ours: Contender, peer: Contender | None, rounds: int, steps: int = STEPS) -> Times:
+def race(ours: Contender, peer: Contender | None, rounds: int, steps: int = STEPS) -> FloatArray:
     """Time every step of both, a round of steps each by turns, who begins by turns as well.
 
     So a machine that slows down for a while slows both, and neither runs on caches that the other one has filled. A
     round begins with a reset; one round before them warms up.
+
+    Returns:
+        Wall times of single steps of ours and of the peer, if there is one, us, shape (1 or 2, rounds, steps).
     """
     both = [ours] if peer is None else [ours, peer]
     taken = np.zeros((len(both), rounds, steps))
@@ -172,7 +168,7 @@ def race(ours: Contender, peer: Contender | None, rounds: int, steps: int = STEP
     finally:
         if collecting:
             gc.enable()
-    return Times(taken[0], None if peer is None else taken[1])
+    return taken
 
 
 def largest_difference(ours: Contender, peer: Contender, steps: int = STEPS) -> float:
@@ -305,18 +301,15 @@ def markdown(result: Mapping[str, Any]) -> str:
     """The page ``docs/bench.md``."""
     steps = [case for case in result["cases"] if "times_real_time" not in case]
     missions = [case for case in result["cases"] if "times_real_time" in case]
-    lines = _table(_STEP_HEAD, [_step_row(case) for case in steps])
+    text = markdown_table(_STEP_HEAD, [_step_row(case) for case in steps])
     if missions:
         keys = ("times_real_time", "mission_time_s", "wall_s")
-        lines += [
-            "",
-            *_table(_MISSION_HEAD, [[case["name"], *(f"{case[key]:.1f}" for key in keys)] for case in missions]),
-        ]
+        rows = [[case["name"], *(f"{case[key]:.1f}" for key in keys)] for case in missions]
+        text += "\n" + markdown_table(_MISSION_HEAD, rows)
     notes = dict.fromkeys(case["note"] for case in result["cases"] if "note" in case)
     if notes:
-        lines += ["", *(f"* {note}" for note in notes)]
-    head = _PAGE.format(equal_within=result["equal_within"], machine=machine_line(result["machine"]))
-    return head + "\n".join(lines) + "\n"
+        text += "\n" + "".join(f"* {note}\n" for note in notes)
+    return _PAGE.format(equal_within=result["equal_within"], machine=machine_line(result["machine"])) + text
 
 
 def terminal_lines(result: Mapping[str, Any]) -> list[str]:
@@ -339,10 +332,6 @@ def machine_line(machine: Mapping[str, Any]) -> str:
     """The machine in one line."""
     packages = [f"{name} {machine[name]}" for name in PACKAGES[1:] if machine[name]]
     return ", ".join([machine["cpu"], f"{machine['cores']} cores", f"Python {machine['python']}", *packages])
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    return [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
 
 
 def _step_row(case: Mapping[str, Any]) -> list[str]:

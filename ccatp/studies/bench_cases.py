@@ -1,11 +1,10 @@
 """What is raced: problems drawn from a seed, this project's parts and their peers as contenders that solve them.
 
-filterpy and Stone Soup belong to the extra ``peers`` and are imported when a race is set up, models are built before
+filterpy and Stone Soup belong to the extra ``peers`` and are imported when a race is set up; models are built before
 the clock starts. What the peers compute has to be what this project computes: the race checks it.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from math import cos, hypot, sin, sqrt, tau
 from typing import Any, NamedTuple
 
@@ -14,32 +13,8 @@ from scipy.optimize import least_squares
 
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, FloatArray
-from ccatp.estimation.state_model import (
-    BA,
-    BG,
-    E0,
-    E1,
-    KG,
-    KL,
-    PL,
-    PR,
-    PSI,
-    SL,
-    SR,
-    STATES,
-    TX,
-    TY,
-    A,
-    C,
-    SensorRows,
-    SurveyMotion,
-    Terrain,
-    V,
-    W,
-    X,
-    Y,
-)  # fmt: skip
-from ccatp.filters import FILTERS, Observation, Transition
+from ccatp.estimation import state_model as sm
+from ccatp.filters import FILTERS
 from ccatp.filters.ekf_slam import Columns, EkfSlam, columns_of
 from ccatp.filters.unscented import ALPHA, BETA, KURTOSIS
 from ccatp.mirror.mirror import build_mirror
@@ -56,21 +31,17 @@ Result = tuple[FloatArray, FloatArray]
 
 
 class Contender(NamedTuple):
-    """Something that is timed.
-
-    Attributes:
-        reset: begin again; not timed.
-        step: work on reading number i; timed.
-        result: what it has come to.
-    """
+    """Something that is timed: begin again (not timed), work on reading number i (timed), the state after it."""
 
     reset: Callable[[], None]
     step: Callable[[int], object]
     result: Callable[[], Result]
 
 
-@dataclass(frozen=True, slots=True)
-class FilterProblem:
+# -- filters ----------------------------------------------------------------------------------------------------------
+
+
+class FilterProblem(NamedTuple):
     """Predict, and update with each reading.
 
     Attributes:
@@ -120,30 +91,31 @@ def linear_problem(
 
 def survey_problem(cfg: Config) -> FilterProblem:
     """The full-state localizer's problem with its own models: n = 19, both wheels' angles, rate and acceleration."""
-    rng = np.random.default_rng((SEED, STATES))
+    rng = np.random.default_rng((SEED, sm.STATES))
     robot, full = cfg.robot, cfg.localizer.full_state
-    mean, sigma = np.zeros(STATES), np.zeros(STATES)
-    mean[[X, Y, PSI, V, W]] = _SURVEY_START
-    sigma[[X, Y]], sigma[PSI] = cfg.localizer.start_position_sigma_m, cfg.localizer.start_heading_sigma_rad
-    sigma[[V, A, W]] = 0.01, 0.05, 0.02
-    sigma[BG], sigma[KG] = full.gyroscope_bias_sigma_rad_s, full.gyroscope_scale_sigma
-    sigma[BA], sigma[KL] = full.accelerometer_bias_sigma_m_s2, full.wheel_base_sigma
-    sigma[[SR, SL]], sigma[C], sigma[[E0, E1]] = full.slip_sigma, full.creep_sigma, full.edge_sigma_m
-    sigma[[PR, PL]], sigma[[TX, TY]] = sqrt(_ANGLE_RAD2), robot.puck_height_m * full.panel_tilt_sigma_rad
-    slope = Terrain(build_mirror(cfg.mirror)).at(float(mean[X]), float(mean[Y]))
-    motion = SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m).over(DT_S, slope)
+    mean, sigma = np.zeros(sm.STATES), np.zeros(sm.STATES)
+    mean[[sm.X, sm.Y, sm.PSI, sm.V, sm.W]] = _SURVEY_START
+    sigma[[sm.X, sm.Y]] = cfg.localizer.start_position_sigma_m
+    sigma[sm.PSI] = cfg.localizer.start_heading_sigma_rad
+    sigma[[sm.V, sm.A, sm.W]] = 0.01, 0.05, 0.02
+    sigma[sm.BG], sigma[sm.KG] = full.gyroscope_bias_sigma_rad_s, full.gyroscope_scale_sigma
+    sigma[sm.BA], sigma[sm.KL] = full.accelerometer_bias_sigma_m_s2, full.wheel_base_sigma
+    sigma[[sm.SR, sm.SL]], sigma[sm.C], sigma[[sm.E0, sm.E1]] = full.slip_sigma, full.creep_sigma, full.edge_sigma_m
+    sigma[[sm.PR, sm.PL]], sigma[[sm.TX, sm.TY]] = sqrt(_ANGLE_RAD2), robot.puck_height_m * full.panel_tilt_sigma_rad
+    slope = sm.Terrain(build_mirror(cfg.mirror)).at(float(mean[sm.X]), float(mean[sm.Y]))
+    motion = sm.SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m).over(DT_S, slope)
     slip = (full.slip_scatter_max * DT_S) ** 2
     impulses = np.array(
         (full.jerk_density_m2_s5 * DT_S, full.angular_acceleration_density_rad2_s3 * DT_S, slip, slip, slip)
     )
-    drift = np.zeros(STATES)
-    drift[[PR, PL]] = cfg.localizer.encoder_sigma_rad_s**2 * full.encoder_period_s * DT_S
+    drift = np.zeros(sm.STATES)
+    drift[[sm.PR, sm.PL]] = cfg.localizer.encoder_sigma_rad_s**2 * full.encoder_period_s * DT_S
     Q = motion.noise(mean, impulses, drift)
     gyroscope, accelerometer = cfg.localizer.gyroscope_sigma_rad_s**2, cfg.localizer.accelerometer_sigma_m_s2**2
-    sight = SensorRows().take((0.0, 0.0, _ANGLE_RAD2), (0.0, gyroscope), (0.0, accelerometer))
-    x, readings = mean + 0.5 * sigma * rng.normal(size=STATES), np.empty((STEPS, sight.R.size))
+    sight = sm.SensorRows().take((0.0, 0.0, _ANGLE_RAD2), (0.0, gyroscope), (0.0, accelerometer))
+    x, readings = mean + 0.5 * sigma * rng.normal(size=sm.STATES), np.empty((STEPS, sight.R.size))
     for i in range(STEPS):
-        x = motion.at(x)[0] + rng.multivariate_normal(np.zeros(STATES), Q, method="svd")
+        x = motion.at(x)[0] + rng.multivariate_normal(np.zeros(sm.STATES), Q, method="svd")
         readings[i] = sight.at(x)[0] + np.sqrt(sight.R) * rng.normal(size=sight.R.size)
     return FilterProblem(mean, np.diag(sigma**2), motion, sight, Q, sight.R, readings)
 
@@ -155,7 +127,7 @@ def linearised_problem(cfg: Config, rows: int) -> FilterProblem:
     """
     problem = survey_problem(cfg)
     F, sensors = problem.F.at(problem.mean)[1].copy(), problem.H.at(problem.mean)[1].copy()
-    fix, heading = np.eye(STATES)[[X, Y]], np.eye(STATES)[[PSI]]
+    fix, heading = np.eye(sm.STATES)[[sm.X, sm.Y]], np.eye(sm.STATES)[[sm.PSI]]
     H, variances = {
         4: (sensors, problem.variances),
         6: (np.vstack([sensors, fix]), np.append(problem.variances, [_POSITION_M2] * 2)),
@@ -169,24 +141,20 @@ def linearised_problem(cfg: Config, rows: int) -> FilterProblem:
 
 def our_filter(name: str, problem: FilterProblem) -> Contender:
     """A filter of ``FILTERS``."""
-    ours, (F, H, Q, R) = FILTERS[name](problem.mean, problem.covariance), _models(problem)
-    readings = list(problem.readings)
+    mean, covariance, F, H, Q, R, _ = problem
+    ours, readings = FILTERS[name](mean, covariance), list(problem.readings)
 
     def step(i: int) -> None:
         ours.predict(F, Q)
         ours.update(readings[i], H, R)
 
-    return Contender(lambda: ours.reset(problem.mean, problem.covariance), step, lambda: (ours.mean, ours.covariance))
-
-
-def _models(problem: FilterProblem) -> tuple[Any, Any, FloatArray, FloatArray]:
-    return problem.F, problem.H, problem.Q, problem.variances
+    return Contender(lambda: ours.reset(mean, covariance), step, lambda: (ours.mean, ours.covariance))
 
 
 def printed_filter(problem: FilterProblem) -> Contender:
     """Thesis eq. 2.13 with its inverse and its (I - W H) P in bare numpy, without a check."""
-    (F, H, Q, variances), identity = _models(problem), np.eye(problem.mean.size)
-    x, P, R = problem.mean, problem.covariance, np.diag(variances)
+    x, P, F, H, Q, variances, readings = problem
+    R, identity = np.diag(variances), np.eye(x.size)
 
     def reset() -> None:
         nonlocal x, P
@@ -197,56 +165,43 @@ def printed_filter(problem: FilterProblem) -> Contender:
         x = F @ x
         P = F @ P @ F.T + Q
         K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
-        x = x + K @ (problem.readings[i] - H @ x)
+        x = x + K @ (readings[i] - H @ x)
         P = (identity - K @ H) @ P
 
     return Contender(reset, step, lambda: (x, P))
 
 
-def filterpy_linear(problem: FilterProblem) -> Contender:
-    """``filterpy.kalman.KalmanFilter``."""
-    from filterpy.kalman import KalmanFilter  # noqa: PLC0415 - belongs to an extra
+def _sigma_points(problem: FilterProblem) -> dict[str, float]:
+    """The parameters of our sigma points, by the names that both peers give them."""
+    return {"alpha": ALPHA, "beta": BETA, "kappa": max(KURTOSIS - problem.mean.size, 0.0)}
 
-    peer = KalmanFilter(dim_x=problem.mean.size, dim_z=problem.variances.size)
-    peer.F, peer.H, peer.Q, variances = _models(problem)
-    peer.R = np.diag(variances)
-    columns = [reading[:, None] for reading in problem.readings]
+
+def filterpy(problem: FilterProblem) -> Contender:
+    """Filterpy's Kalman filter for matrices; its unscented one with the scaled points of Merwe for models."""
+    from filterpy.kalman import KalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter  # noqa: PLC0415 - an extra
+
+    mean, covariance, F, H, Q, variances, readings = problem
+    shape: tuple[int, ...] = (-1,)
+    if isinstance(F, np.ndarray):
+        peer, shape = KalmanFilter(dim_x=mean.size, dim_z=variances.size), (-1, 1)
+        peer.F, peer.H = F, H
+    else:
+        points = MerweScaledSigmaPoints(mean.size, **_sigma_points(problem))
+        peer = UnscentedKalmanFilter(
+            mean.size, variances.size, DT_S, points=points,
+            hx=lambda x: H.through(x[None])[0], fx=lambda x, _dt: F.through(x[None])[0],
+        )  # fmt: skip
+    peer.Q, peer.R = Q, np.diag(variances)
+    columns = [reading.reshape(shape) for reading in readings]
 
     def reset() -> None:
-        peer.x, peer.P = problem.mean[:, None].copy(), problem.covariance.copy()
+        peer.x, peer.P = mean.reshape(shape).copy(), covariance.copy()
 
     def step(i: int) -> None:
         peer.predict()
         peer.update(columns[i])
 
-    return Contender(reset, step, lambda: (peer.x[:, 0], peer.P))
-
-
-def sigma_points(problem: FilterProblem) -> dict[str, float]:
-    """The parameters of our sigma points, by the names that both peers give them."""
-    return {"alpha": ALPHA, "beta": BETA, "kappa": max(KURTOSIS - problem.mean.size, 0.0)}
-
-
-def filterpy_unscented(problem: FilterProblem) -> Contender:
-    """``filterpy.kalman.UnscentedKalmanFilter`` with the scaled points of Merwe."""
-    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter  # noqa: PLC0415 - belongs to an extra
-
-    n, (motion, sight, Q, variances) = problem.mean.size, _models(problem)
-    points = MerweScaledSigmaPoints(n, **sigma_points(problem))
-    peer = UnscentedKalmanFilter(
-        n, variances.size, DT_S, points=points,
-        hx=lambda x: sight.through(x[None])[0], fx=lambda x, _dt: motion.through(x[None])[0],
-    )  # fmt: skip
-    peer.Q, peer.R = Q, np.diag(variances)
-
-    def reset() -> None:
-        peer.x, peer.P = problem.mean.copy(), problem.covariance.copy()
-
-    def step(i: int) -> None:
-        peer.predict()
-        peer.update(problem.readings[i])
-
-    return Contender(reset, step, lambda: (peer.x, peer.P))
+    return Contender(reset, step, lambda: (peer.x.ravel(), peer.P))
 
 
 def stonesoup(problem: FilterProblem) -> Contender:
@@ -258,7 +213,7 @@ def stonesoup(problem: FilterProblem) -> Contender:
     from stonesoup.types.state import GaussianState  # noqa: PLC0415
 
     is_linear = isinstance(problem.F, np.ndarray)
-    kind, points = ("Kalman", {}) if is_linear else ("UnscentedKalman", sigma_points(problem))
+    kind, points = ("Kalman", {}) if is_linear else ("UnscentedKalman", _sigma_points(problem))
     transition, measurement = _stonesoup_linear(problem) if is_linear else _stonesoup_nonlinear(problem)
     predictor = getattr(predictors, kind + "Predictor")(transition, **points)
     updater = getattr(updaters, kind + "Updater")(measurement, **points)
@@ -303,7 +258,7 @@ def _stonesoup_nonlinear(problem: FilterProblem) -> tuple[Any, Any]:
 
     n = problem.mean.size
 
-    def mapped(model: Transition | Observation, state: Any) -> Any:
+    def mapped(model: Any, state: Any) -> Any:
         return StateVectors(model.through(np.asarray(state.state_vector, dtype=np.float64).T).T)
 
     class Motion(GaussianTransitionModel, TimeInvariantModel):  # type: ignore[misc] # Stone Soup has no types
@@ -332,8 +287,7 @@ _RANGE_SIGMA_M, _STEP_M, _TURN_RAD = 0.1, 0.05, 0.02
 _SLAM_NOISE = np.diag((1e-4, 1e-4, 1e-5))
 
 
-@dataclass(frozen=True, slots=True)
-class SlamProblem:
+class SlamProblem(NamedTuple):
     """Pose, range scale and offset, and beacons: mean (n,), covariance (n, n); a range a step, of each in turn."""
 
     mean: FloatArray

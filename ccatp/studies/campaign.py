@@ -1,16 +1,5 @@
-"""What a campaign is: cells of factors, crossed with seeds into jobs that can run anywhere in any order.
+"""What a campaign is: cells of factors, crossed with seeds into jobs that can run anywhere in any order."""
 
-The plan of a campaign: which cells, which seeds, whose share of the jobs.
-
-Which job next: one of each cell to begin with, then what takes longest first, so that no worker waits long.
-
-The spread of many non-negative numbers in little room: histograms that add up over jobs.
-
-A mission has half a million localization errors; a campaign pools hundreds of missions. Bins are 1/1000 of a decade
-wide, so a quantile is right to 0.12 %; count, mean, maximum and the share within the limit are exact.
-"""
-
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -19,21 +8,19 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 
 import ccatp
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
-from ccatp.core import FloatArray, IntArray
 from ccatp.errors import CcatpError, ExitStatus
 
 Factor = str | int | float | bool
 Factors = Mapping[str, Factor]
 Arrays = Mapping[str, NDArray[Any]]
 AnyConfig = Config | RadioConfig
+# Dotted keys, stronger than the configuration file, to a configuration.
 Load = Callable[[Mapping[str, object]], AnyConfig]
-"""Dotted keys, stronger than the configuration file, to a configuration."""
 
 
 class CampaignError(CcatpError):
@@ -62,11 +49,7 @@ class ClusterUnreachable(CampaignError):
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One combination of factors.
-
-    Attributes:
-        factors: as they stand in the cell of ``result.json``.
-    """
+    """One combination of factors, as they stand in ``result.json``, and the dotted keys that make it."""
 
     factors: Factors
     overrides: Mapping[str, object] = field(default_factory=dict)
@@ -74,58 +57,31 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """All that a worker is given. What comes of it is a function of these four and nothing else."""
+    """All that a worker is given: the outcome is a function of these four and nothing else.
+
+    Attributes:
+        cfg: a ``Config``, or a ``RadioConfig`` where the study's ``is_radio`` is set.
+    """
 
     study: str
     factors: Factors
     seed: int
-    whole: AnyConfig
-
-    @property
-    def cfg(self) -> Config:
-        """The configuration of a job on a mirror.
-
-        Raises:
-            TypeError: the job is one among radio beacons.
-        """
-        if not isinstance(self.whole, Config):
-            raise TypeError(f"job {self.key} has no mirror; take its radio configuration")
-        return self.whole
-
-    @property
-    def radio(self) -> RadioConfig:
-        """The configuration of a job among radio beacons.
-
-        Raises:
-            TypeError: the job is one on a mirror.
-        """
-        if not isinstance(self.whole, RadioConfig):
-            raise TypeError(f"job {self.key} is one on a mirror; take its mission's configuration")
-        return self.whole
-
-    @property
-    def cell(self) -> str:
-        """``world=hard,filter=ekf``."""
-        return ",".join(f"{name}={value}" for name, value in self.factors.items())
+    cfg: Any
 
     @property
     def key(self) -> str:
         """``world=hard,filter=ekf,seed=3``."""
-        return f"{self.cell},seed={self.seed}"
+        return ",".join(f"{name}={value}" for name, value in {**self.factors, "seed": self.seed}.items())
 
     @property
     def fingerprint(self) -> str:
         """Of everything that the outcome depends on, this program's version included."""
-        whole = [ccatp.__version__, self.study, dict(self.factors), self.seed, self.whole.model_dump(mode="json")]
+        whole = [ccatp.__version__, self.study, dict(self.factors), self.seed, self.cfg.model_dump(mode="json")]
         return sha256(dumps(whole, sort_keys=True).encode()).hexdigest()[:16]
 
 
 class JobOutcome(NamedTuple):
-    """What comes of a job, or of all jobs of a cell.
-
-    Attributes:
-        values: what JSON can say; numbers that are not finite become null.
-    """
+    """The outcome of a job, or of all jobs of a cell; numbers in ``values`` that are not finite become null."""
 
     values: Mapping[str, Any]
     arrays: Arrays = MappingProxyType({})
@@ -140,12 +96,7 @@ class CellResult(NamedTuple):
 
 
 class Column(NamedTuple):
-    """A column of ``table.md``.
-
-    Attributes:
-        heading: with unit.
-        spec: format of numbers; empty leaves the value as it is.
-    """
+    """A column of ``table.md``: heading with unit, dotted key of the value, format of numbers."""
 
     heading: str
     key: str
@@ -160,9 +111,9 @@ class Study:
         run_job: a function of a module, which workers import by its name; a pure function of the job.
         combine: factors of a cell and the outcomes of its jobs in the order of their seeds, to figures and arrays.
         columns: of ``table.md``.
-        defaults: dotted keys of the study's own: stronger than the configuration file, weaker than the command line.
+        defaults: dotted keys of the study: stronger than the configuration file, weaker than the command line.
         mirrors: cells are crossed with these; empty where the study chooses the mirror in its cells.
-        runs: seeds of each cell, unless told otherwise.
+        runs: seeds of each cell, by default.
         is_radio: its configurations are those of robots among radio beacons.
     """
 
@@ -177,17 +128,6 @@ class Study:
     mirrors: tuple[str, ...] = ("thesis-m1",)
     runs: int = 20
     is_radio: bool = False
-
-
-def plain(value: Any) -> Any:
-    """A value as JSON can say it: numpy's numbers as Python's, what is not finite as None."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(part) for key, part in value.items()}
-    if isinstance(value, np.ndarray | list | tuple):
-        return [plain(part) for part in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 class Shard(NamedTuple):
@@ -226,10 +166,7 @@ def parse_choice(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def cells_of(study: Study, mirrors: Sequence[str] = (), only: Mapping[str, Sequence[str]] | None = None) -> list[Cell]:
-    """The cells of a campaign.
-
-    Args:
-        only: levels to keep, by factor; all of the others.
+    """The cells of a campaign; ``only`` has the levels to keep, by factor.
 
     Raises:
         CampaignError: a factor or level that the study does not have.
@@ -244,28 +181,22 @@ def cells_of(study: Study, mirrors: Sequence[str] = (), only: Mapping[str, Seque
             for cell in cells
         ]
     for name, levels in (only or {}).items():
-        cells = _chosen(study.name, cells, name, levels)
+        there = list(dict.fromkeys(str(cell.factors[name]) for cell in cells if name in cell.factors))
+        if not there:
+            known = ", ".join(dict.fromkeys(factor for cell in cells for factor in cell.factors))
+            raise CampaignError(f"--only {name}: is no factor of study {study.name}; there are {known}")
+        for level in levels:
+            if level not in there:
+                known = ", ".join(there)
+                raise CampaignError(f"--only {name}={level}: study {study.name} has no such level; there are {known}")
+        cells = [cell for cell in cells if str(cell.factors.get(name)) in levels]
     return cells
-
-
-def _chosen(study: str, cells: Sequence[Cell], name: str, levels: Sequence[str]) -> list[Cell]:
-    there = list(dict.fromkeys(str(cell.factors[name]) for cell in cells if name in cell.factors))
-    if not there:
-        known = ", ".join(dict.fromkeys(factor for cell in cells for factor in cell.factors))
-        raise CampaignError(f"--only {name}: is no factor of study {study}; there are {known}")
-    for level in levels:
-        if level not in there:
-            raise CampaignError(f"--only {name}={level}: study {study} has no such level; there are {', '.join(there)}")
-    return [cell for cell in cells if str(cell.factors.get(name)) in levels]
 
 
 def jobs_of(
     study: Study, cells: Iterable[Cell], load: Load, settings: Mapping[str, object], runs: int
 ) -> list[list[Job]]:
-    """The jobs of each cell, seeds in their order.
-
-    Args:
-        runs: seeds of each cell, from ``run.seed`` on.
+    """The jobs of each cell, ``runs`` seeds from ``run.seed`` on in their order.
 
     Raises:
         CampaignError: a setting would overrule a factor, or there are no runs.
@@ -273,164 +204,18 @@ def jobs_of(
     """
     if runs < 1:
         raise CampaignError(f"--runs {runs}: must be at least 1")
-    return [_jobs_of_cell(study, cell, load, settings, runs) for cell in cells]
-
-
-def _jobs_of_cell(study: Study, cell: Cell, load: Load, settings: Mapping[str, object], runs: int) -> list[Job]:
-    if taken := sorted(set(settings) & set(cell.overrides)):
-        raise CampaignError(
-            f"{taken[0]} is set by study {study.name} itself; leave it out, or choose cells with --only"
-        )
-    cfg = load({**study.defaults, **settings, **cell.overrides})
-    seeds = range(cfg.run.seed, cfg.run.seed + runs)
-    return [Job(study.name, cell.factors, seed, with_seed(cfg, seed)) for seed in seeds]
+    plan = []
+    for cell in cells:
+        if taken := sorted(set(settings) & set(cell.overrides)):
+            raise CampaignError(
+                f"{taken[0]} is set by study {study.name} itself; leave it out, or choose cells with --only"
+            )
+        cfg = load({**study.defaults, **settings, **cell.overrides})
+        seeds = range(cfg.run.seed, cfg.run.seed + runs)
+        plan.append([Job(study.name, cell.factors, seed, with_seed(cfg, seed)) for seed in seeds])
+    return plan
 
 
 def with_seed(cfg: AnyConfig, seed: int) -> AnyConfig:
     """The same configuration with another seed."""
     return cfg.model_copy(update={"run": cfg.run.model_copy(update={"seed": seed})})
-
-
-class Schedule:
-    """The jobs that are still to be handed out.
-
-    Missions of one cell take about equally long, cells differ: a robot with the thesis's gains takes four times as
-    long. Handing out what is longest first keeps the end short, when some workers have nothing left to do (Graham
-    1969: at most a third longer than the best plan).
-
-    Args:
-        past_s: durations of finished jobs by cell, from earlier parts of the campaign.
-    """
-
-    def __init__(self, jobs: Iterable[Job], past_s: Mapping[str, Sequence[float]]) -> None:
-        self._queues: dict[str, deque[Job]] = {}
-        for job in jobs:
-            self._queues.setdefault(job.cell, deque()).append(job)
-        self._taken: dict[str, list[float]] = {cell: list(past_s.get(cell, ())) for cell in self._queues}
-        self._is_tried = {cell for cell, durations in self._taken.items() if durations}
-        self._left = {cell: len(queue) for cell, queue in self._queues.items()}
-        self.done_s = 0.0
-
-    def __bool__(self) -> bool:
-        """Whether a job is still to be handed out."""
-        return any(self._queues.values())
-
-    def take(self) -> Job:
-        """The next job.
-
-        Raises:
-            IndexError: all are handed out.
-        """
-        waiting = [cell for cell, queue in self._queues.items() if queue]
-        if not waiting:
-            raise IndexError("all jobs are handed out")
-        cell = next((c for c in waiting if c not in self._is_tried), None) or max(waiting, key=self._expected_s)
-        self._is_tried.add(cell)
-        return self._queues[cell].popleft()
-
-    def done(self, job: Job, took_s: float) -> None:
-        """A job has come back after so much time of its worker."""
-        self._taken[job.cell].append(took_s)
-        self._left[job.cell] -= 1
-        self.done_s += took_s
-
-    @property
-    def left_s(self) -> float:
-        """Time of workers that the jobs not yet back will take, as far as is known."""
-        return sum(count * self._expected_s(cell) for cell, count in self._left.items())
-
-    def _expected_s(self, cell: str) -> float:
-        taken = self._taken[cell] or [duration for durations in self._taken.values() for duration in durations]
-        return sum(taken) / len(taken) if taken else 0.0
-
-
-PER_DECADE = 1000
-LEAST = 1e-9  # anything smaller falls into the first bin
-
-
-@dataclass(frozen=True, slots=True)
-class Histogram:
-    """A histogram with logarithmic bins, empty ones left out.
-
-    Attributes:
-        bins: indices of the bins, ascending, shape (k,). Bin i ends at ``LEAST * 10**(i / PER_DECADE)``.
-        counts: in each of them, shape (k,).
-        largest: of the values; 0 where there are none.
-    """
-
-    bins: IntArray
-    counts: IntArray
-    total: float
-    largest: float
-    within: int
-
-    @classmethod
-    def of(cls, values: FloatArray, limit: float) -> "Histogram":
-        """The spread of values, shape (n,).
-
-        Raises:
-            ValueError: a value is negative or not finite.
-        """
-        if values.size and not (np.isfinite(values).all() and values.min() >= 0.0):
-            raise ValueError(f"values from {values.min()} to {values.max()}: must be finite and not negative")
-        places = np.ceil(PER_DECADE * np.log10(np.maximum(values, LEAST) / LEAST)).astype(np.int64)
-        bins, counts = np.unique(places, return_counts=True)
-        largest = float(values.max(initial=0.0))
-        return cls(bins, counts.astype(np.int64), float(values.sum()), largest, int(np.count_nonzero(values <= limit)))
-
-    @property
-    def count(self) -> int:
-        """How many values."""
-        return int(self.counts.sum())
-
-    @property
-    def mean(self) -> float:
-        """Their mean; NaN where there are none."""
-        return self.total / self.count if self.count else float("nan")
-
-    def quantile(self, share: float) -> float:
-        """The value that this share of the values does not exceed; NaN where there are none."""
-        if not self.count:
-            return float("nan")
-        ends = np.cumsum(self.counts)
-        rank = share * (self.count - 1)
-        place = int(np.searchsorted(ends, rank, side="right"))
-        value = self.edges[min(place, len(ends) - 1)] * 10.0 ** (-0.5 / PER_DECADE)  # the bin's middle
-        return min(float(value), self.largest)
-
-    @property
-    def edges(self) -> FloatArray:
-        """Upper ends of the bins, shape (k,)."""
-        return np.asarray(LEAST * 10.0 ** (self.bins / PER_DECADE), dtype=np.float64)
-
-    def exceedance(self) -> tuple[FloatArray, FloatArray]:
-        """Values and the share of all that is larger, shapes (k,), for a figure."""
-        return self.edges, 1.0 - np.cumsum(self.counts) / max(self.count, 1)
-
-    def to_arrays(self, name: str) -> dict[str, NDArray[np.generic]]:
-        """As arrays whose names begin with ``name``."""
-        figures = np.array([self.total, self.largest, float(self.within)])
-        return {f"{name}_bins": self.bins.astype(np.int32), f"{name}_counts": self.counts, f"{name}_figures": figures}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, NDArray[np.generic]], name: str) -> "Histogram":
-        """What ``to_arrays`` made."""
-        total, largest, within = arrays[f"{name}_figures"].astype(np.float64).tolist()
-        bins, counts = arrays[f"{name}_bins"].astype(np.int64), arrays[f"{name}_counts"].astype(np.int64)
-        return cls(bins, counts, total, largest, int(within))
-
-
-def pooled(spreads: Sequence[Histogram]) -> Histogram:
-    """All of them in one."""
-    places = np.concatenate([spread.bins for spread in spreads]) if spreads else np.empty(0, dtype=np.int64)
-    counts = np.concatenate([spread.counts for spread in spreads]) if spreads else np.empty(0, dtype=np.int64)
-    bins, where = np.unique(places, return_inverse=True)
-    sums = np.zeros(len(bins), dtype=np.int64)
-    np.add.at(sums, where, counts)
-    return Histogram(
-        bins,
-        sums,
-        sum(spread.total for spread in spreads),
-        max((spread.largest for spread in spreads), default=0.0),
-        sum(spread.within for spread in spreads),
-    )

@@ -12,8 +12,7 @@ from ccatp.estimation.fixes import deck_foot
 from ccatp.estimation.seams import EdgeScanner, SensorTransition
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
-from ccatp.studies.sil_models import SilResult
-from ccatp.studies.sil_run import SilRun
+from ccatp.studies.sil_run import SilResult, SilRun
 
 T, X, Y, HX, HY, LX, LY, FX, FY, RIGHT, LEFT, RIGHT_SCALE, LEFT_SCALE, ORDERED = range(14)
 """Columns of the way.
@@ -144,10 +143,7 @@ def passes_of(
         part = at - (frame - 1)
         row = way[frame - 1] + part * (way[frame] - way[frame - 1])
         ahead, left = sensors_m[transition.corner]
-        place = (
-            float(row[X] + ahead * row[HX] + left * row[LX]),
-            float(row[Y] + ahead * row[HY] + left * row[LY]),
-        )
+        place = (float(row[X] + ahead * row[HX] + left * row[LX]), float(row[Y] + ahead * row[HY] + left * row[LY]))
         seam = mirror.nearest_seam(*place)
         panel = mirror.panels[mirror.nearest_panel(*place)]
         if seam is None:

@@ -1,103 +1,28 @@
-"""The study `cricket`: figures 9 to 14 of Patil et al. again, and better ways beside them, at their cost.
+"""The studies `cricket` and `mote-sizes` of motes that map themselves.
 
-Figures of the study `cricket`, as PNG and PDF.
+`cricket`: figures 9 to 14 of Patil et al. again, and better ways beside them, at their cost. `mote-sizes`: what a batch
+map of sparse ranges costs, against the number of motes.
 """
 
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, bound_rms_m
+from ccatp.beacons.cricket.mote_map import map_motes
+from ccatp.beacons.cricket.range_network import MoteRange, RangeNetwork, build_network, components
+from ccatp.beacons.cricket.rigidity import find_fold_over, find_freedom, generic_state
 from ccatp.config.load import load_radio_config
-from ccatp.report.plots import INK, QUIET, dress, new_figure
+from ccatp.config.models import Config
+from ccatp.core import FloatArray
+from ccatp.filters.metrics import best_motion
+from ccatp.report.plots import QUIET
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
-from ccatp.studies.figures import LIMIT, colour, save
-from ccatp.studies.mote_runs import look_ahead, run_batch, run_filter, simulate_field
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
-_POOR = ("zigzag-printed", "zigzag-p0-99", "zigzag-pooled")
-_FULL = ("adjacent-printed", "all-printed", "all-p0-99", "all-pooled")
-_MAPS = (("zigzag-printed", "figures 9, 10: five pairs"), ("all-printed", "figure 13: fifteen pairs"))
-_CLOUD = 200  # runs shown as dots
-
-
-def draw_cricket(cells: Sequence[CellResult], out: Path) -> None:
-    """Traces (figures 11, 12, 14), clouds of maps (9, 10, 13), all ways beside each other."""
-    found = {str(cell.factors["case"]): cell for cell in cells}
-    for stem, names, title, goal_m in (
-        ("figure_11_12", _POOR, "Few measurements: five pairs in a zigzag", 0.15),
-        ("figure_14", _FULL, "Many measurements: nine adjacent pairs, or all fifteen", 0.005),
-    ):
-        shown = [name for name in names if name in found]
-        if shown:
-            _draw_traces(found, shown, title, goal_m, out / stem)
-    maps = [(name, title) for name, title in _MAPS if name in found]
-    if maps:
-        _draw_maps(found, maps, out / "figure_9_10_13")
-    _draw_ways(cells, out / "ways")
-
-
-def _draw_traces(found: Mapping[str, CellResult], names: Sequence[str], title: str, goal_m: float, stem: Path) -> None:
-    figure = new_figure(8.5, 5.2)
-    axes = figure.subplots()
-    for number, name in enumerate(names):
-        low, middle, high = found[name].arrays["trace_m"]
-        updates, shade = np.arange(len(middle)), colour(number)
-        axes.fill_between(updates, low, high, color=shade, alpha=0.13, linewidth=0)
-        axes.plot(updates, middle, color=shade, linewidth=1.7, label=name)
-        axes.plot(updates, found[name].arrays["expected_trace_m"], color=shade, linewidth=1.0, linestyle="--")
-    axes.axhline(goal_m, color=LIMIT, linewidth=0.9, linestyle=":", label=f"published: {1e3 * goal_m:g} mm")
-    axes.set_yscale("log")
-    axes.set(xlabel="updates", ylabel="root mean square error of a place, m")
-    axes.set_title(f"{title}\nmedian, 10 to 90 %; dashed: what the filter expects", color=INK)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, frameon=False, fontsize=8)
-    dress(axes)
-    save(figure, stem)
-
-
-def _draw_maps(found: Mapping[str, CellResult], maps: Sequence[tuple[str, str]], stem: Path) -> None:
-    figure = new_figure(4.6 * len(maps), 6.4)
-    panels = figure.subplots(1, len(maps), squeeze=False)[0]
-    for axes, (name, title) in zip(panels, maps, strict=True):
-        cell = found[name]
-        true, places = cell.arrays["true_m"], cell.arrays["positions_m"][:_CLOUD]
-        for mote in range(len(true)):
-            axes.plot(*places[:, mote].T, ".", color=colour(0), markersize=2.5, alpha=0.35)
-        axes.plot(*true.T, "o", color=colour(1), markersize=8, fillstyle="none", label="true")
-        axes.plot([], [], ".", color=colour(0), label=f"mapped, {len(places)} runs")
-        axes.set_title(title, color=INK)
-        axes.set(xlabel="x, m", ylabel="y, m", aspect="equal", xlim=(-1.2, 6.2), ylim=(-0.2, 9.2))
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2, frameon=False, fontsize=8)
-    dress(*panels)
-    save(figure, stem)
-
-
-def _draw_ways(cells: Sequence[CellResult], stem: Path) -> None:
-    figure = new_figure(8.5, 0.36 * len(cells) + 1.7)
-    axes = figure.subplots()
-    for row, cell in enumerate(cells):
-        _draw_way(axes, row, cell)
-    axes.set_yticks(range(len(cells)), [str(cell.factors["case"]) for cell in cells])
-    axes.set_ylim(len(cells) - 0.5, -0.5)
-    axes.set_xscale("log")
-    axes.set_xlabel("root mean square error of a place, m: median (dot), 10 to 90 % (bar), Cramér-Rao bound (line)")
-    dress(axes)
-    save(figure, stem)
-
-
-def _draw_way(axes: "Axes", row: int, cell: CellResult) -> None:
-    rms, bound_m = cell.values["rms_m"], cell.values["bound_m"]
-    shade = colour(0 if cell.values["method"] == "ekf" else 2)
-    axes.plot([rms["p10"], rms["p90"]], [row, row], color=shade, linewidth=4.0, alpha=0.35, solid_capstyle="butt")
-    axes.plot(rms["p50"], row, "o", color=shade, markersize=5)
-    if bound_m is not None:
-        axes.plot([bound_m, bound_m], [row - 0.3, row + 0.3], color=QUIET, linewidth=1.4)
-
+from ccatp.studies.mote_runs import look_ahead, percentiles, run_batch, run_filter, simulate_field
+from ccatp.studies.results import LIMIT, colour, plot, write_analysis
 
 UPDATES = 300  # of figures 11 and 12 as we read them
 SHOWN = 30  # updates within which figure 14 comes down
@@ -111,12 +36,7 @@ _LATE = {"cricket.sim.latency_s": 0.0003}  # 10 cm: a pulse that is detected a f
 
 
 class Case(NamedTuple):
-    """A row of the study.
-
-    Attributes:
-        method: ``ekf`` or ``batch``.
-        keys: of the configuration, over ``configs/cricket.toml``.
-    """
+    """A row of the study; ``method`` is ``ekf`` or ``batch``, ``keys`` stand over ``configs/cricket.toml``."""
 
     figure: str
     method: str
@@ -182,11 +102,10 @@ def run_job(job: Job) -> JobOutcome:
         "spent_s": spent_s,
         "nis": float(run.nis.mean()) if run.nis.size else None,
     }
-    errors = run.positions_m - run.true_m
     arrays = {
         "trace_m": run.trace_m,
         "expected_trace_m": run.expected_trace_m,
-        "errors_m": errors,
+        "errors_m": run.positions_m - run.true_m,
         "positions_m": run.positions_m,
         "true_m": run.true_m,
     }
@@ -195,46 +114,100 @@ def run_job(job: Job) -> JobOutcome:
 
 def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """Median and 10 to 90 % of a case, and its traces."""
-    case = CASES[str(factors["case"])]
-    rms = np.array([outcome.values["rms_m"] for outcome in outcomes])
+    case, runs = CASES[str(factors["case"])], [outcome.values for outcome in outcomes]
+    rms = np.array([run["rms_m"] for run in runs])
     traces = np.array([outcome.arrays["trace_m"] for outcome in outcomes])
-    laid = [outcome.values["phase1_rms_m"] for outcome in outcomes if outcome.values["phase1_rms_m"] is not None]
-    bounds = [outcome.values["bound_m"] for outcome in outcomes if outcome.values["bound_m"] is not None]
-    low, middle, high = np.percentile(rms, (10, 50, 90))
-    bound_m = bounds[0] if bounds else None
+    laid = [run["phase1_rms_m"] for run in runs if run["phase1_rms_m"] is not None]
+    bound_m = next((run["bound_m"] for run in runs if run["bound_m"] is not None), None)
     total = float(np.sqrt(np.mean(rms**2)))
+    shown_m = float(np.median(traces[:, SHOWN])) if traces.shape[1] > SHOWN else None
     values = {
         "figure": case.figure,
         "method": case.method,
-        "rms_m": {"p10": low, "p50": middle, "p90": high},
+        "rms_m": percentiles(rms.tolist()),
         "rms_of_all_m": total,
         "phase1_rms_m": float(np.median(laid)) if laid else None,
-        "rms_at_30_m": float(np.median(traces[:, SHOWN])) if traces.shape[1] > SHOWN else None,
+        "rms_at_30_m": shown_m,
         # The paper's error is of a coordinate, root(mean e^2) over all of them; ours of a place.
-        "coordinate_rms_at_30_m": float(np.median(traces[:, SHOWN]) / np.sqrt(2.0))
-        if traces.shape[1] > SHOWN
-        else None,
-        "expected_rms_m": float(np.median([outcome.values["expected_rms_m"] for outcome in outcomes])),
+        "coordinate_rms_at_30_m": None if shown_m is None else float(shown_m / np.sqrt(2.0)),
+        "expected_rms_m": float(np.median([run["expected_rms_m"] for run in runs])),
         "bound_m": bound_m,
         "ratio": None if bound_m is None else total / bound_m,
-        "rank_deficiency": max(outcome.values["rank_deficiency"] for outcome in outcomes),
-        "is_unique": all(outcome.values["is_unique"] for outcome in outcomes),
-        "spent_ms": 1e3 * float(np.median([outcome.values["spent_s"] for outcome in outcomes])),
+        "rank_deficiency": max(run["rank_deficiency"] for run in runs),
+        "is_unique": all(run["is_unique"] for run in runs),
+        "spent_ms": 1e3 * float(np.median([run["spent_s"] for run in runs])),
     }
-    expected = np.array([outcome.arrays["expected_trace_m"] for outcome in outcomes])
     arrays = {
         "rms_m": rms,
         "trace_m": np.percentile(traces, (10, 50, 90), axis=0),
-        "expected_trace_m": np.median(expected, axis=0),
+        "expected_trace_m": np.median([outcome.arrays["expected_trace_m"] for outcome in outcomes], axis=0),
         "positions_m": np.array([outcome.arrays["positions_m"] for outcome in outcomes]),
         "true_m": np.asarray(outcomes[0].arrays["true_m"]),
     }
     return JobOutcome(values, arrays)
 
 
+# -- figures ----------------------------------------------------------------------------------------------------------
+
+_CLOUD = 200  # runs shown as dots
+_FEW = ("zigzag-printed", "zigzag-p0-99", "zigzag-pooled")
+_MANY = ("adjacent-printed", "all-printed", "all-p0-99", "all-pooled")
+_TRACES = (
+    ("figure_11_12", _FEW, "Few measurements: five pairs in a zigzag", 0.15),
+    ("figure_14", _MANY, "Many measurements: nine adjacent pairs, or all fifteen", 0.005),
+)
+_MAPS = (("zigzag-printed", "figures 9, 10: five pairs"), ("all-printed", "figure 13: fifteen pairs"))
+
+
 def draw(cells: Sequence[CellResult], out: Path) -> None:
-    """Figures 9 to 14, and the ways beside each other."""
-    draw_cricket(cells, out)
+    """Traces (figures 11, 12, 14), clouds of maps (9, 10, 13), all ways beside each other."""
+    found = {str(cell.factors["case"]): cell for cell in cells}
+    for stem, names, title, goal_m in _TRACES:
+        if shown := [name for name in names if name in found]:
+            _draw_traces(found, shown, title, goal_m, out / stem)
+    if maps := [(name, title) for name, title in _MAPS if name in found]:
+        _draw_maps(found, maps, out / "figure_9_10_13")
+    _draw_ways(cells, out / "ways")
+
+
+def _draw_traces(found: Mapping[str, CellResult], names: Sequence[str], title: str, goal_m: float, stem: Path) -> None:
+    with plot(stem, 8.5, 5.2, legend=3) as (_, (axes,)):
+        for number, name in enumerate(names):
+            low, middle, high = found[name].arrays["trace_m"]
+            updates, shade = np.arange(len(middle)), colour(number)
+            axes.fill_between(updates, low, high, color=shade, alpha=0.13, linewidth=0)
+            axes.plot(updates, middle, color=shade, linewidth=1.7, label=name)
+            axes.plot(updates, found[name].arrays["expected_trace_m"], color=shade, linewidth=1.0, linestyle="--")
+        axes.axhline(goal_m, color=LIMIT, linewidth=0.9, linestyle=":", label=f"published: {1e3 * goal_m:g} mm")
+        axes.set(xlabel="updates", ylabel="root mean square error of a place, m", yscale="log")
+        axes.set_title(f"{title}\nmedian, 10 to 90 %; dashed: what the filter expects")
+
+
+def _draw_maps(found: Mapping[str, CellResult], maps: Sequence[tuple[str, str]], stem: Path) -> None:
+    with plot(stem, 4.6 * len(maps), 6.4, 1, len(maps), legend=2) as (_, panels):
+        for axes, (name, title) in zip(panels, maps, strict=True):
+            true, places = found[name].arrays["true_m"], found[name].arrays["positions_m"][:_CLOUD]
+            for mote in range(len(true)):
+                axes.plot(*places[:, mote].T, ".", color=colour(0), markersize=2.5, alpha=0.35)
+            axes.plot(*true.T, "o", color=colour(1), markersize=8, fillstyle="none", label="true")
+            axes.plot([], [], ".", color=colour(0), label=f"mapped, {len(places)} runs")
+            axes.set(xlabel="x, m", ylabel="y, m", aspect="equal", xlim=(-1.2, 6.2), ylim=(-0.2, 9.2), title=title)
+
+
+def _draw_ways(cells: Sequence[CellResult], stem: Path) -> None:
+    with plot(stem, 8.5, 0.36 * len(cells) + 1.7) as (_, (axes,)):
+        for row, cell in enumerate(cells):
+            rms, bound_m = cell.values["rms_m"], cell.values["bound_m"]
+            shade = colour(0 if cell.values["method"] == "ekf" else 2)
+            bar: dict[str, Any] = {"linewidth": 4.0, "alpha": 0.35, "solid_capstyle": "butt"}
+            axes.plot([rms["p10"], rms["p90"]], [row, row], color=shade, **bar)
+            axes.plot(rms["p50"], row, "o", color=shade, markersize=5)
+            if bound_m is not None:
+                axes.plot([bound_m, bound_m], [row - 0.3, row + 0.3], color=QUIET, linewidth=1.4)
+        axes.set_yticks(range(len(cells)), [str(cell.factors["case"]) for cell in cells])
+        axes.set_ylim(len(cells) - 0.5, -0.5)
+        axes.set_xscale("log")
+        axes.set_xlabel("root mean square error of a place, m: median (dot), 10 to 90 % (bar), Cramér-Rao bound (line)")
 
 
 STUDY = Study(
@@ -262,3 +235,78 @@ STUDY = Study(
     mirrors=(),
     runs=200,
 )
+
+# -- mote-sizes -------------------------------------------------------------------------------------------------------
+
+SIZES = (30, 60, 120, 250, 500, 1000)
+NEIGHBOURS = 13.0  # of a mote, on the average, beside those at the rim
+REACH_M, SIGMA_M = 5.5, 0.02 / 3.0
+_ROBUST = 4.0
+
+
+def run_sizes(cfg: Config, out: Path) -> dict[str, Any]:
+    """Map drawn fields of growing size, once each, and write ``result.json``, ``table.md`` and the figure.
+
+    Raises:
+        OSError: ``out`` cannot be written.
+    """
+    began_s = time.perf_counter()
+    out.mkdir(parents=True, exist_ok=True)
+    cells = [_sized_cell(size, cfg.run.seed) for size in SIZES]
+    result = write_analysis("mote-sizes", cells, {key: key for key in cells[0]}, out, began_s)
+    with plot(out / "mote_sizes", 6.5, 4.2, legend=2) as (_, (axes,)):
+        for number, (key, label) in enumerate((("map_s", "map"), ("outlook_s", "rank and folds, before"))):
+            motes, times_s = [cell["motes"] for cell in cells], [cell[key] for cell in cells]
+            axes.loglog(motes, times_s, "o-", color=colour(number), label=label)
+        axes.set(xlabel="motes", ylabel="time, s")
+        axes.set_title(f"Batch map of sparse ranges, {NEIGHBOURS:g} neighbours a mote")
+    return result
+
+
+def drawn_network(size: int, rng: np.random.Generator) -> tuple[RangeNetwork, FloatArray]:
+    """A square field with ranges between motes that are near each other: its largest connected part, and the truth."""
+    side_m = REACH_M * np.sqrt(np.pi * size / NEIGHBOURS)
+    places = rng.uniform(0.0, side_m, (size, 2))
+    distances = np.linalg.norm(places[:, None] - places[None], axis=2)
+    pairs = np.column_stack(np.nonzero(np.triu(distances < REACH_M, 1)))
+    labels = components(size, pairs)
+    pairs = pairs[labels[pairs[:, 0]] == np.bincount(labels).argmax()]
+    noise = rng.normal(0.0, SIGMA_M, len(pairs))
+    rows = [
+        MoteRange(f"M{i}", f"M{j}", float(distances[i, j] + error), SIGMA_M)
+        for (i, j), error in zip(pairs.tolist(), noise, strict=True)
+    ]
+    network = build_network(rows, 2)
+    return network, places[[int(name[1:]) for name in network.names]]
+
+
+def _sized_cell(size: int, seed: int) -> dict[str, Any]:
+    network, true_m = drawn_network(size, np.random.default_rng((seed, size)))
+    model = MapModel(network)
+    rng = np.random.default_rng(0)
+    began_s = time.perf_counter()
+    folds = find_fold_over(network, rng)
+    freedom = find_freedom(model, generic_state(model, rng))
+    looked_s = time.perf_counter()
+    found = map_motes(network, MapFitSettings(_ROBUST), mirrors=folds.mirrors)
+    mapped_s = time.perf_counter()
+    in_doubt = {mote for _, motes in folds.mirrors for mote in motes}
+    in_doubt |= {mote for fold in found.folds for mote in fold.motes}
+    sure = [mote for mote in range(network.count) if mote not in in_doubt]
+    of_all, of_sure = (
+        best_motion(places, true, mirrors=True).moved(places) - true
+        for places, true in ((found.positions_m, true_m), (found.positions_m[sure], true_m[sure]))
+    )
+    return {
+        "motes": network.count,
+        "ranges": len(network.ranges_m),
+        "runs": 1,
+        "outlook_s": looked_s - began_s,
+        "map_s": mapped_s - looked_s,
+        "error_median_m": float(np.median(np.linalg.norm(of_all, axis=1))),
+        "motes_in_doubt": len(in_doubt),
+        "rms_of_others_m": float(np.sqrt((of_sure**2).sum(axis=1).mean())),
+        "bound_m": bound_rms_m(model, true_m, sure, aligned=True),
+        "rank_deficiency": freedom.deficiency,
+        "cost_per_dof": found.variance_factor,
+    }

@@ -3,151 +3,277 @@
 A cell is a mirror (width of the gaps), a speed and a way of crossing: an angle to the seam's normal, or a quarter turn
 in place whose sensors move at that speed. Both rules judge the same transits; each stops its own drives to the rim.
 
-The figures of the study `danger`: false edges and overrun against speed and way of crossing.
+The robot drives on constant set points; its wheels slip, its sensors err and the panels' edges lie as the world says
+(creep and vibration are left out). The rules see what the danger loop sees: edge and encoder samples frame by frame,
+and an estimate of the pose every fifth frame.
 """
 
-from collections.abc import Sequence
-from math import radians, sqrt
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import cos, hypot, pi, radians, sin, sqrt
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ccatp.core import FloatArray
-from ccatp.mirror.mirror import build_mirror
-from ccatp.report.plots import dress, new_figure
+from ccatp.config.models import Config
+from ccatp.core import DeckPose, EdgeSample, EventCode, FloatArray, PanelId, WheelSample
+from ccatp.danger import DangerMonitor
+from ccatp.links.robot_messages import CommandEcho, Sensors
+from ccatp.links.topics import EstimateMessage, is_estimate_due
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.sim.plant import Plant
+from ccatp.sim.sensors import SensorSuite, named
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
-from ccatp.studies.danger_drives import RULES, EdgeErrors, drive_to_rim, transit
-from ccatp.studies.figures import colour, save
-
-_TITLES = {"thesis": "off for 0.1 s (thesis)", "shipped": "travel against the map (ours)"}
-
-_MARGIN_M_S = 0.02
-
-
-def draw_danger(
-    results: Sequence[CellResult], speeds_m_s: Sequence[float], crossings: Sequence[int | str], out: Path
-) -> None:
-    """Draw ``danger_false_edges_<mirror>`` and ``danger_overrun_<mirror>``, one panel per rule."""
-    for mirror in dict.fromkeys(str(result.factors["mirror"]) for result in results):
-        mine = {
-            (result.factors["speed_m_s"], result.factors["crossing"]): result
-            for result in results
-            if result.factors["mirror"] == mirror
-        }
-        _draw_false_edges(mirror, mine, speeds_m_s, crossings, out)
-        _draw_overrun(mirror, mine, speeds_m_s, crossings, out)
-
-
-def _draw_false_edges(
-    mirror: str, cells: dict[Any, CellResult], speeds: Sequence[float], crossings: Sequence[int | str], out: Path
-) -> None:
-    figure = new_figure(9.0, 3.8)
-    panels = figure.subplots(1, len(RULES), sharey=True)
-    for axes, rule in zip(panels, RULES, strict=True):
-        for k, way in enumerate(crossings):
-            known = [v for v in speeds if (v, way) in cells]
-            figures = [cells[v, way].values[rule] for v in known]
-            p = np.array([one["false_edge_probability"] for one in figures])
-            low = np.array([one["false_edge_low"] for one in figures])
-            high = np.array([one["false_edge_high"] for one in figures])
-            # Side by side, so that intervals at the same speed can be told apart.
-            at = np.array(known) + 0.0035 * (k - 0.5 * (len(crossings) - 1))
-            bars = np.maximum(np.vstack([p - low, high - p]), 0.0)
-            label = "turning in place" if isinstance(way, str) else f"{way}°"
-            axes.errorbar(at, p, bars, color=colour(k), marker="o", markersize=4, linewidth=1.2, capsize=2, label=label)
-        axes.set_title(_TITLES[rule], fontsize=10)
-        axes.set_xlabel("speed of the robot, in turns of the sensors, m/s", fontsize=9)
-        axes.set_xticks(list(speeds))
-        axes.set_xlim(min(speeds) - _MARGIN_M_S, max(speeds) + _MARGIN_M_S)
-        axes.set_ylim(-0.03, 1.03)
-    panels[0].set_ylabel("false edges per transit (95 %)", fontsize=9)
-    figure.legend(
-        *panels[0].get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=len(crossings),
-        frameon=False,
-        fontsize=8,
-    )
-    figure.suptitle(f"A seam taken for an edge, {mirror}", fontsize=11)
-    dress(*panels)
-    save(figure, out / f"danger_false_edges_{mirror}")
-
-
-def _draw_overrun(
-    mirror: str, cells: dict[Any, CellResult], speeds: Sequence[float], crossings: Sequence[int | str], out: Path
-) -> None:
-    angles = [way for way in crossings if not isinstance(way, str)]
-    figure = new_figure(9.0, 3.8)
-    panels = figure.subplots(1, len(RULES), sharey=True)
-    for axes, rule in zip(panels, RULES, strict=True):
-        for k, way in enumerate(angles):
-            known = [v for v in speeds if (v, way) in cells]
-            samples = [1e3 * cells[v, way].arrays[f"{rule}_overrun_m"] for v in known]
-            at = np.array(known) + 0.0045 * (k - 0.5 * (len(angles) - 1))
-            boxes = axes.boxplot(
-                samples, positions=at, widths=0.004, whis=(0, 100), manage_ticks=False, patch_artist=True
-            )
-            for box in boxes["boxes"]:
-                box.set(facecolor=colour(k), edgecolor=colour(k))
-            for part in (*boxes["whiskers"], *boxes["caps"]):
-                part.set_color(colour(k))
-            for line in boxes["medians"]:
-                line.set_color("white")
-            axes.plot([], [], "s", color=colour(k), label=f"{way}°")
-        axes.axhline(0.0, color="black", linewidth=0.8)
-        axes.set_title(_TITLES[rule], fontsize=10)
-        axes.set_xlabel("speed, m/s", fontsize=9)
-        axes.set_xticks(list(speeds))
-        axes.set_xlim(min(speeds) - _MARGIN_M_S, max(speeds) + _MARGIN_M_S)
-    panels[0].set_ylabel("furthest sensor beyond the rim, mm", fontsize=9)
-    figure.legend(
-        *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(angles), frameon=False, fontsize=8
-    )
-    figure.suptitle(f"Where a drive over the rim ends: quartiles and range, {mirror}", fontsize=11)
-    dress(*panels)
-    save(figure, out / f"danger_overrun_{mirror}")
-
+from ccatp.studies.results import colour, plot
 
 SPEEDS_M_S = (0.05, 0.10, 0.15, 0.20)
-CROSSINGS: tuple[int | str, ...] = (0, 15, 30, 45, 60, "turn")
 TURN = "turn"
+CROSSINGS: tuple[int | str, ...] = (0, 15, 30, 45, 60, TURN)
+RULES = ("thesis", "shipped")
+OFF_S = 0.1
+"""Threshold of the thesis's rule: a gap of 1 cm at 0.1 m/s."""
+_MARGIN_M = 0.01  # the first sensor begins this far before a seam, the last one ends this far behind it
+_APPROACH_M = 0.03  # the first sensor begins this far before the rim
+_BESIDE_M = 0.10  # drives to the rim meet it within this of a panel's middle
+_ASKEW_RAD = 0.05  # a turn in place begins within this of an axis
+_RUN_DOWN_S = 1.0  # a robot without set point has stopped after this: a dozen time constants
+_BLIND_M = 0.4  # an edge that was not seen by now is not going to be seen
 _DRIVES = 25  # of each kind in a job
-# What a good localizer gives the rules in a disturbed world.
-_ERRORS = EdgeErrors(position_m=1.5e-3, heading_rad=2e-3)
 _TRANSITS, _RIM = 3, 4  # streams of random numbers of a seed
 _Z_95 = 1.96  # quantiles of the normal distribution
 _RESAMPLES = 2000
 
 
-def cells() -> Sequence[Cell]:
-    """Speeds times ways of crossing; the engine crosses them with the mirrors."""
-    return [Cell({"speed_m_s": v_m_s, "crossing": way}) for v_m_s in SPEEDS_M_S for way in CROSSINGS]
+@dataclass(frozen=True, slots=True)
+class EdgeErrors:
+    """Standard deviations of the estimate that the rules get, drawn once per drive; in x and in y, and of heading.
+
+    ``position_m`` is also what the estimate reports of itself.
+    """
+
+    position_m: float
+    heading_rad: float
+
+
+def drive_frame(seq: int, t_s: float, enc: list[WheelSample], edge: list[EdgeSample]) -> Sensors:
+    """A sensors frame with what the rules read."""
+    return Sensors(seq, t_s, [], enc, edge, None, (0.0, 0.0), 1.0, CommandEcho(0, 0.0, 0.0, False), [])
+
+
+EdgeRule = Callable[[Sensors, EstimateMessage], bool]
+"""Judges frame by frame: whether there is an edge."""
+
+
+def off_time_rule(off_s: float) -> EdgeRule:
+    """The thesis's rule (3.4.1): an edge where a sensor has been off for the time that the gap takes at 0.1 m/s.
+
+    Once it is on again its time begins again.
+    """
+    since_s: list[float | None] = [None] * 4
+
+    def judge(frame: Sensors, estimate: EstimateMessage) -> bool:
+        del estimate  # the rule knows no map
+        found = False
+        for t_s, *values in frame.edge:
+            for k, value in enumerate(values):
+                begun_s = since_s[k]
+                if value == 1:
+                    since_s[k] = None
+                elif begun_s is None:
+                    since_s[k] = t_s
+                else:
+                    found = found or t_s - begun_s > off_s
+        return found
+
+    return judge
+
+
+def build_rule(name: str, mirror: Mirror, cfg: Config) -> EdgeRule:
+    """A rule by its name out of ``RULES``: the thesis's, or the daemon's, which compares the travel with the map.
+
+    Raises:
+        ValueError: no such rule.
+    """
+    if name == "thesis":
+        return off_time_rule(OFF_S)
+    if name == "shipped":
+        monitor = DangerMonitor(mirror, cfg.robot, cfg.danger)
+        return lambda frame, estimate: monitor.step(frame, estimate).code is EventCode.NEAR_EDGE
+    raise ValueError(f"no edge rule is called {name!r}: take one of {', '.join(RULES)}")
+
+
+class Rig:
+    """One robot on its way, with what it reads."""
+
+    def __init__(
+        self, mirror: Mirror, cfg: Config, start: DeckPose, errors: EdgeErrors, rng: np.random.Generator
+    ) -> None:
+        slip_rng, error_rng, sensors_rng = rng.spawn(3)
+        world, robot = cfg.world, cfg.robot
+        lag_s = cfg.sim.robot.wheel_lag_s
+        self.plant = plant = Plant(
+            mirror.surface, start, wheel_radius_m=robot.wheel_radius_m, wheel_base_m=robot.wheel_base_m,
+            wheel_lag_s=lag_s,
+        )  # fmt: skip
+        # There is no steering here, so both wheels slip alike: the angle at the edge counts, not the way there.
+        plant.right_scale = plant.left_scale = 1.0 - float(slip_rng.uniform(world.slip_min, world.slip_max))
+        panels = cfg.mirror.panels
+        self._sensors = SensorSuite(
+            mirror, cfg.sim.robot, world, robot.edge_sensors_m, sensors_rng, panels=panels, lag_s=lag_s
+        )
+        self._sensors.edges.place(plant)
+        dx, dy, turn = error_rng.standard_normal(3).tolist()
+        self._error = errors.position_m * dx, errors.position_m * dy, errors.heading_rad * turn
+        self._sigma_m = errors.position_m
+        self._frame_s = 1.0 / cfg.sim.robot.frame_hz
+        self._seq = 0
+        self._sensors.enter(0)
+        self._estimate = self._estimated()
+
+    def frame(self, right_rad_s: float, left_rad_s: float) -> tuple[Sensors, EstimateMessage]:
+        """Drive one frame on these set points; what is known at its end: the frame, and the estimate before it."""
+        estimate, sensors, plant = self._estimate, self._sensors, self.plant
+        t_s = self._seq * self._frame_s
+        plant.step(t_s, self._frame_s, right_rad_s, left_rad_s)
+        self._seq += 1
+        sensors.enter(self._seq)
+        edge = named(EdgeSample, sensors.read_edges(plant))
+        enc = named(WheelSample, sensors.read_encoders(plant))
+        if is_estimate_due(self._seq):
+            self._estimate = self._estimated()
+        return drive_frame(self._seq, self._seq * self._frame_s, enc, edge), estimate
+
+    @property
+    def places(self) -> list[tuple[float, float]]:
+        """Deck places of the edge sensors, m."""
+        return self._sensors.edges.places
+
+    def _estimated(self) -> EstimateMessage:
+        p, (dx, dy, turn) = self.plant, self._error
+        return EstimateMessage(
+            seq=self._seq, t_s=self._seq * self._frame_s, x_m=p.x_m + dx, y_m=p.y_m + dy,
+            heading_rad=p.heading_rad + turn, sigma_m=self._sigma_m, state="driving",
+        )  # fmt: skip
+
+    def at_speed(self, v_m_s: float, omega_rad_s: float, cfg: Config) -> tuple[float, float]:
+        """Set points (right, left) of a twist; the wheels have them from the beginning."""
+        r, half = cfg.robot.wheel_radius_m, 0.5 * cfg.robot.wheel_base_m
+        set_points = (v_m_s + omega_rad_s * half) / r, (v_m_s - omega_rad_s * half) / r
+        self.plant.right_rad_s, self.plant.left_rad_s = set_points
+        return set_points
+
+
+def transit(
+    mirror: Mirror, cfg: Config, v_m_s: float, angle_rad: float | None, errors: EdgeErrors, rng: np.random.Generator
+) -> tuple[bool, ...]:
+    """Cross a seam between two columns, or turn by a quarter beside it; whether each rule took it for an edge.
+
+    Args:
+        angle_rad: between the way and the seam's normal; None turns in place.
+
+    Returns:
+        A flag for each of ``RULES``.
+    """
+    place_rng, rig_rng = rng.spawn(2)
+    # Panels with neighbours all round their right seam: the rim is far from every way over it.
+    around = ((0, 1), (1, 0), (1, 1), (-1, 0), (-1, 1))
+    inner = [
+        panel
+        for panel in mirror.panels.values()
+        if all(PanelId(panel.id.row + r, panel.id.col + c) in mirror.panels for r, c in around)
+    ]
+    panel = inner[int(place_rng.integers(len(inner)))]
+    seam_m = panel.x_m + panel.half_x_m + 0.5 * mirror.gap_m
+    ahead, left = cfg.robot.edge_sensors_m[0]
+    if angle_rad is None:
+        reach_m = hypot(ahead, left)
+        start = DeckPose(
+            seam_m + place_rng.uniform(-reach_m, reach_m),
+            panel.y_m + place_rng.uniform(-1.0, 1.0) * (panel.half_y_m - reach_m - _MARGIN_M),
+            0.5 * pi * int(place_rng.integers(4)) + place_rng.uniform(-_ASKEW_RAD, _ASKEW_RAD),
+        )
+        omega_rad_s = v_m_s / reach_m * int(place_rng.choice((-1, 1)))
+        drive_s, v_m_s = 0.5 * pi / abs(omega_rad_s), 0.0
+    else:
+        reach_m, omega_rad_s = ahead * cos(angle_rad) + left * sin(angle_rad), 0.0
+        half_way_m = (reach_m + _MARGIN_M + 0.5 * mirror.gap_m) / cos(angle_rad)
+        heading_rad = angle_rad * int(place_rng.choice((-1, 1))) + pi * int(place_rng.integers(2))
+        beside_m = max(panel.half_y_m - reach_m - half_way_m * sin(angle_rad), 0.0)
+        middle_m = panel.y_m + place_rng.uniform(-beside_m, beside_m)
+        start = DeckPose(seam_m - half_way_m * cos(heading_rad), middle_m - half_way_m * sin(heading_rad), heading_rad)
+        drive_s = 2.0 * half_way_m / (v_m_s * (1.0 - cfg.world.slip_max))
+    rig = Rig(mirror, cfg, start, errors, rig_rng)
+    set_points = rig.at_speed(v_m_s, omega_rad_s, cfg)
+    rules = [build_rule(name, mirror, cfg) for name in RULES]
+    found = [False] * len(rules)
+    for _ in range(round(drive_s * cfg.sim.robot.frame_hz)):
+        seen = rig.frame(*set_points)
+        for k, rule in enumerate(rules):
+            found[k] = rule(*seen) or found[k]
+    return tuple(found)
+
+
+def drive_to_rim(
+    mirror: Mirror, cfg: Config, v_m_s: float, angle_rad: float, name: str, errors: EdgeErrors, rng: np.random.Generator
+) -> tuple[float, bool]:
+    """Drive over the rim until a rule sees an edge; the set points are zero one frame and the link's delays later.
+
+    Returns:
+        How far the furthest sensor went beyond the rim, m, and whether the robot fell.
+    """
+    place_rng, rig_rng = rng.spawn(2)
+    at_rim = [p for p in mirror.panels.values() if PanelId(p.id.row, p.id.col + 1) not in mirror.panels]
+    panel = at_rim[int(place_rng.integers(len(at_rim)))]
+    ahead, left = cfg.robot.edge_sensors_m[0]
+    heading_rad = angle_rad * int(place_rng.choice((-1, 1)))
+    before_m = ahead * cos(angle_rad) + left * sin(angle_rad) + _APPROACH_M
+    meets_m = panel.y_m + place_rng.uniform(-_BESIDE_M, _BESIDE_M)
+    start = DeckPose(
+        panel.x_m + panel.half_x_m - before_m, meets_m - _APPROACH_M * float(np.tan(heading_rad)), heading_rad
+    )
+    rig = Rig(mirror, cfg, start, errors, rig_rng)
+    set_points = rig.at_speed(v_m_s, 0.0, cfg)
+    rule, hz = build_rule(name, mirror, cfg), cfg.sim.robot.frame_hz
+    frames_left = round(_BLIND_M / v_m_s * hz)
+    late = round((cfg.world.sensors_delay_s + cfg.world.commands_delay_s) * hz)
+    is_seen = has_fallen = False
+    while frames_left > 0:
+        if is_seen:
+            late -= 1
+        seen = rig.frame(*(set_points if not is_seen or late >= 0 else (0.0, 0.0)))
+        frames_left -= 1
+        if not is_seen and rule(*seen):
+            is_seen, frames_left = True, round(_RUN_DOWN_S * hz)
+        has_fallen = has_fallen or mirror.rim.signed_distance_m(rig.plant.x_m, rig.plant.y_m) < 0.0
+    return max(-mirror.rim.signed_distance_m(x, y) for x, y in rig.places), has_fallen
+
+
+# What a good localizer gives the rules in a disturbed world.
+_ERRORS = EdgeErrors(position_m=1.5e-3, heading_rad=2e-3)
 
 
 def run_job(job: Job) -> JobOutcome:
     """So many transits, and as many drives to the rim for each rule."""
-    cfg, v_m_s, way = job.cfg, float(job.factors["speed_m_s"]), job.factors["crossing"]
+    cfg, v_m_s, way, seed = job.cfg, float(job.factors["speed_m_s"]), job.factors["crossing"], job.cfg.run.seed
     mirror = build_mirror(cfg.mirror)
     angle_rad = None if way == TURN else radians(float(way))
-    seed = cfg.run.seed
     found = [
         transit(mirror, cfg, v_m_s, angle_rad, _ERRORS, np.random.default_rng([seed, _TRANSITS, k]))
         for k in range(_DRIVES)
     ]
-    false_edges = np.sum(found, axis=0)
     values: dict[str, Any] = {"transits": len(found)}
     arrays: dict[str, FloatArray] = {}
-    for k, name in enumerate(RULES):
-        values[name] = {"false_edges": int(false_edges[k])}
+    for name, false_edges in zip(RULES, np.sum(found, axis=0), strict=True):
+        values[name] = {"false_edges": int(false_edges)}
         if angle_rad is not None:
             # The same draws for both rules: what differs is the rule.
             drives = [
                 drive_to_rim(mirror, cfg, v_m_s, angle_rad, name, _ERRORS, np.random.default_rng([seed, _RIM, k]))
                 for k in range(_DRIVES)
             ]
-            values[name]["falls"] = sum(drive.has_fallen for drive in drives)
-            arrays[f"{name}_overrun_m"] = np.array([drive.sensor_m for drive in drives])
+            values[name]["falls"] = sum(has_fallen for _, has_fallen in drives)
+            arrays[f"{name}_overrun_m"] = np.array([overrun_m for overrun_m, _ in drives])
     return JobOutcome(values, arrays)
 
 
@@ -169,9 +295,17 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
         key = f"{name}_overrun_m"
         kept = [outcome.arrays[key] for outcome in outcomes if key in outcome.arrays]
         if kept:
-            arrays[key] = np.concatenate(kept)
-            values[name] |= _overrun_figures(arrays[key])
-            values[name]["falls"] = sum(outcome.values[name]["falls"] for outcome in outcomes)
+            arrays[key] = overrun_m = np.concatenate(kept)
+            low, high = bootstrap(overrun_m, 0.95)
+            values[name] |= {
+                "overrun_mean_mm": 1e3 * float(np.mean(overrun_m)),
+                "overrun_p95_mm": 1e3 * float(np.quantile(overrun_m, 0.95)),
+                "overrun_p95_low_mm": 1e3 * low,
+                "overrun_p95_high_mm": 1e3 * high,
+                "overrun_max_mm": 1e3 * float(np.max(overrun_m)),
+                "drives": overrun_m.size,
+                "falls": sum(outcome.values[name]["falls"] for outcome in outcomes),
+            }
     return JobOutcome(values, arrays)
 
 
@@ -190,32 +324,77 @@ def wilson(hits: int, of: int) -> tuple[float, float]:
 
 
 def bootstrap(values: FloatArray, q: float) -> tuple[float, float]:
-    """95 % interval of a quantile by resampling with a fixed seed.
-
-    Args:
-        values: the sample, shape (k,).
-        q: the quantile, 0 to 1.
-    """
+    """95 % interval of the quantile ``q`` (0 to 1) of values (k,) by resampling with a fixed seed."""
     drawn = np.random.default_rng(0).choice(values, (_RESAMPLES, values.size))
     low, high = np.quantile(np.quantile(drawn, q, axis=1), (0.025, 0.975)).tolist()
     return low, high
 
 
-def _overrun_figures(overrun_m: FloatArray) -> dict[str, Any]:
-    low, high = bootstrap(overrun_m, 0.95)
-    return {
-        "overrun_mean_mm": 1e3 * float(np.mean(overrun_m)),
-        "overrun_p95_mm": 1e3 * float(np.quantile(overrun_m, 0.95)),
-        "overrun_p95_low_mm": 1e3 * low,
-        "overrun_p95_high_mm": 1e3 * high,
-        "overrun_max_mm": 1e3 * float(np.max(overrun_m)),
-        "drives": overrun_m.size,
-    }
+_Cells = Mapping[tuple[Any, Any], CellResult]
+_TITLES = {"thesis": "off for 0.1 s (thesis)", "shipped": "travel against the map (ours)"}
 
 
 def draw(results: Sequence[CellResult], out: Path) -> None:
-    """Figures ``danger_false_edges_<mirror>`` and ``danger_overrun_<mirror>``."""
-    draw_danger(results, SPEEDS_M_S, CROSSINGS, out)
+    """Figures ``danger_false_edges_<mirror>`` and ``danger_overrun_<mirror>``, one panel per rule."""
+    for mirror in dict.fromkeys(str(result.factors["mirror"]) for result in results):
+        cells = {
+            (result.factors["speed_m_s"], result.factors["crossing"]): result
+            for result in results
+            if result.factors["mirror"] == mirror
+        }
+        _draw_rules(
+            cells, CROSSINGS, _draw_false_edges, f"A seam taken for an edge, {mirror}",
+            ("speed of the robot, in turns of the sensors, m/s", "false edges per transit (95 %)"),
+            out / f"danger_false_edges_{mirror}",
+        )  # fmt: skip
+        _draw_rules(
+            cells, CROSSINGS[:-1], _draw_overrun, f"Where a drive over the rim ends: quartiles and range, {mirror}",
+            ("speed, m/s", "furthest sensor beyond the rim, mm"), out / f"danger_overrun_{mirror}",
+        )  # fmt: skip
+
+
+def _draw_rules(
+    cells: _Cells, ways: Sequence[int | str], draw_way: Callable[..., None], title: str, labels: tuple[str, str],
+    stem: Path,
+) -> None:  # fmt: skip
+    size = 9.0, 3.8
+    with plot(stem, *size, 1, len(RULES), title=title, legend=len(ways), sharey=True) as (_, panels):
+        for axes, rule in zip(panels, RULES, strict=True):
+            for k, way in enumerate(ways):
+                known = [v for v in SPEEDS_M_S if (v, way) in cells]
+                label = "turning in place" if way == TURN else f"{way}°"
+                # Side by side, so that what belongs to the same speed can be distinguished.
+                places = np.array(known) + 0.004 * (k - 0.5 * (len(ways) - 1))
+                draw_way(axes, rule, places, [cells[v, way] for v in known], colour(k), label)
+            axes.set_title(_TITLES[rule])
+            axes.set_xlabel(labels[0])
+            axes.set_xticks(list(SPEEDS_M_S))
+            axes.set_xlim(min(SPEEDS_M_S) - 0.02, max(SPEEDS_M_S) + 0.02)
+        panels[0].set_ylabel(labels[1])
+
+
+def _draw_false_edges(
+    axes: Any, rule: str, places: FloatArray, cells: Sequence[CellResult], shade: str, label: str
+) -> None:
+    names = ("false_edge_probability", "false_edge_low", "false_edge_high")
+    p, low, high = (np.array([cell.values[rule][name] for cell in cells]) for name in names)
+    bars = np.maximum(np.vstack([p - low, high - p]), 0.0)
+    axes.errorbar(places, p, bars, color=shade, marker="o", markersize=4, linewidth=1.2, capsize=2, label=label)
+    axes.set_ylim(-0.03, 1.03)
+
+
+def _draw_overrun(
+    axes: Any, rule: str, places: FloatArray, cells: Sequence[CellResult], shade: str, label: str
+) -> None:
+    samples = [1e3 * cell.arrays[f"{rule}_overrun_m"] for cell in cells]
+    look = {"color": shade}
+    axes.boxplot(
+        samples, positions=places, widths=0.004, whis=(0, 100), manage_ticks=False, patch_artist=True,
+        boxprops={"facecolor": shade, "edgecolor": shade}, whiskerprops=look, capprops=look,
+        medianprops={"color": "white"},
+    )  # fmt: skip
+    axes.plot([], [], "s", color=shade, label=label)
+    axes.axhline(0.0, color="black", linewidth=0.8)
 
 
 def _columns() -> list[Column]:
@@ -237,7 +416,7 @@ def _columns() -> list[Column]:
 STUDY = Study(
     name="danger",
     title="False edges and overrun of the thesis's edge rule and of the daemon's",
-    cells=cells,
+    cells=lambda: [Cell({"speed_m_s": v_m_s, "crossing": way}) for v_m_s in SPEEDS_M_S for way in CROSSINGS],
     run_job=run_job,
     combine=combine,
     columns=_columns(),

@@ -1,41 +1,39 @@
-"""Runs the jobs of a campaign wherever there is room, and puts their outcomes together.
+"""Runs the jobs of a campaign and puts their outcomes together.
 
 The outcome of a job does not depend on where or when it runs, and outcomes are combined in the order of the plan: the
 cells are the same whatever the number of workers.
-
-The collector of garbage, kept from what will never be garbage.
-
-One thread for the linear algebra: on matrices this small more of them cost time, and fight the workers.
-
-Where jobs run: in this process, in processes of this machine, or on a cluster.
 """
 
+import base64
+import fcntl
 import gc
+import io
+import json
 import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    wait,
-)
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import timedelta
 from multiprocessing import connection
 from pathlib import Path
 from threading import Thread
 from traceback import format_exception
-from typing import Any, NamedTuple
+from types import TracebackType
+from typing import Any, BinaryIO
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ccatp.errors import CcatpError
+from ccatp.studies import limit_threads
 from ccatp.studies.campaign import (
     WHOLE,
+    Arrays,
     CampaignError,
     CampaignFailed,
     CampaignInterrupted,
@@ -44,17 +42,20 @@ from ccatp.studies.campaign import (
     Job,
     JobOutcome,
     Load,
-    Schedule,
     Shard,
     Study,
     cells_of,
     jobs_of,
 )
-from ccatp.studies.job_store import CampaignView, JobStore, write_results
+from ccatp.studies.results import plain, write_results
+
+FAILURES = "failures.txt"
+CLUSTER_TIMEOUT_S = 5.0
+_MOST_FAILURES = 5  # one bad seed must not cost a night; what fails this often is wrong everywhere
 
 
 def settle() -> None:
-    """Collect what is garbage now, and look no more at what is not: modules and tables stay to the end.
+    """Collect garbage, and exempt what is left: modules and tables stay to the end.
 
     A mission makes tuples by the million and hardly a cycle; going through everything imported again and again for
     them costs it 3 % of its time.
@@ -63,86 +64,171 @@ def settle() -> None:
     gc.freeze()
 
 
-VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+# -- finished jobs ----------------------------------------------------------------------------------------------------
 
 
-def limit_threads() -> None:
-    """Ask for one thread, for this process and its children. Has an effect only before numpy is imported."""
-    for name in VARIABLES:
-        os.environ.setdefault(name, "1")
+def make_out(out: Path) -> None:
+    """Make a study's directory, before any work.
+
+    Raises:
+        CampaignError: it cannot be made.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CampaignError(f"--out: cannot make {out}: {error.strerror or error}; choose another --out") from error
 
 
-_CLUSTER_TIMEOUT_S = 5.0
+class JobStore:
+    """The finished jobs in a directory: one line each, safe on the disk before the next begins.
 
+    A campaign that is killed at any instant continues from its store. Each shard writes a file of its own, so that
+    shards may share a directory; all of them are read.
 
-class Timed(NamedTuple):
-    """What came of a job, and how long it took its worker."""
+    Args:
+        out: the campaign's directory; made if it is not there.
+        others: directories whose jobs are taken over.
 
-    outcome: JobOutcome
-    took_s: float
-
-
-class JobExecutor(NamedTuple):
-    """Where jobs are sent.
-
-    Attributes:
-        room: how many it can have at a time; on a cluster workers come and go.
+    Raises:
+        CampaignError: ``out`` cannot be made, another campaign writes here, a directory does not exist, or a line is
+            not a finished job.
     """
 
-    executor: Executor
-    room: Callable[[], int]
-
-
-class _SerialExecutor(Executor):
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
+    def __init__(self, out: Path, shard: Shard = WHOLE, others: Iterable[Path] = ()) -> None:
+        make_out(out)
+        name = "jobs.jsonl" if shard == WHOLE else f"jobs-{shard.number}of{shard.of}.jsonl"
+        self._done: dict[str, tuple[str, Path, JobOutcome, float]] = {}
+        self._file: BinaryIO = (out / name).open("a+b")
         try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:  # it belongs to whoever asks for the result, as in any executor
-            future.set_exception(error)
-        return future
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise CampaignError(
+                    f"{self._file.name}: another campaign writes there; wait for it or choose another --out"
+                ) from error
+            self._file.seek(0)
+            self._file.truncate(self._file.read().rfind(b"\n") + 1)  # what was being written at the last kill
+            for folder in (out, *others):
+                self._read_all(folder)
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> "JobStore":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._file.close()
+
+    def outcome(self, job: Job) -> JobOutcome | None:
+        """The outcome of a job; None where it is still to do.
+
+        Raises:
+            CampaignError: a job of the same name was done under other circumstances.
+        """
+        if job.key not in self._done:
+            return None
+        fingerprint, path, outcome, _ = self._done[job.key]
+        if fingerprint != job.fingerprint:
+            raise CampaignError(
+                f"{path}: job {job.key} was done with another configuration or version; "
+                "give the options of then, or another --out"
+            )
+        return outcome
+
+    def took_s(self, job: Job) -> float:
+        """Working time of a job; 0 where it is still to do."""
+        return self._done[job.key][3] if job.key in self._done else 0.0
+
+    def add(self, job: Job, outcome: JobOutcome, took_s: float = 0.0) -> None:
+        """Keep a finished job and its working time; returns when it is on the disk."""
+        stream = io.BytesIO()
+        np.savez_compressed(stream, allow_pickle=False, **outcome.arrays)
+        record = {
+            "key": job.key,
+            "fingerprint": job.fingerprint,
+            "took_s": round(took_s, 3),
+            "values": plain(outcome.values),
+            "arrays": base64.b64encode(stream.getvalue()).decode(),
+        }
+        line = json.dumps(record, allow_nan=False).encode() + b"\n"
+        self._file.write(line)
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._take(line, Path(self._file.name))
+
+    def _read_all(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise CampaignError(f"{folder}: is no directory; name one that a campaign wrote")
+        for path in sorted(folder.glob("jobs*.jsonl")):
+            lines = path.read_bytes().split(b"\n")
+            for number, line in enumerate(lines[:-1], start=1):  # what follows the last line end is torn
+                try:
+                    self._take(line, path)
+                except (ValueError, KeyError, TypeError) as error:
+                    raise CampaignError(f"{path}:{number}: is no finished job; remove the line") from error
+
+    def _take(self, line: bytes, path: Path) -> None:
+        record = json.loads(line)
+        with np.load(io.BytesIO(base64.b64decode(record["arrays"])), allow_pickle=False) as stored:
+            arrays: Arrays = dict(stored)
+        outcome = JobOutcome(record["values"], arrays)
+        self._done.setdefault(record["key"], (record["fingerprint"], path, outcome, float(record["took_s"])))
 
 
-def timed(run_job: Callable[[Job], JobOutcome], job: Job) -> Timed:
-    """Do a job."""
+# -- where jobs run ---------------------------------------------------------------------------------------------------
+
+
+def timed(run_job: Callable[[Job], JobOutcome], job: Job) -> tuple[JobOutcome, float]:
+    """Do a job; its outcome and working time, s."""
     settle()
     started_s = time.perf_counter()
     outcome = run_job(job)
-    return Timed(outcome, time.perf_counter() - started_s)
+    return outcome, time.perf_counter() - started_s
+
+
+Finished = Iterator[tuple[Job, "Future[tuple[JobOutcome, float]]"]]
 
 
 @contextmanager
-def place_of(workers: int | None, cluster: str | None, jobs: int) -> Iterator[JobExecutor]:
-    """Where to run so many jobs.
-
-    Args:
-        workers: processes; None takes one for each core. One is this process.
-        jobs: there are; more workers would idle.
-
-    Raises:
-        CampaignError: the cluster's client is not installed.
-        ClusterUnreachable: no scheduler answers.
-    """
-    count = min(workers or len(os.sched_getaffinity(0)), jobs)
+def _started(study: Study, jobs: Sequence[Job], workers: int | None, cluster: str | None) -> Iterator[Finished]:
+    """The jobs as they are finished: on the cluster, in this process (one worker), or in processes of this machine."""
+    count = min(workers or len(os.sched_getaffinity(0)), len(jobs))
     if cluster:
-        with _cluster(cluster) as place:
-            yield place
+        with _cluster(cluster) as executor:
+            yield _finished(executor, study, jobs)
     elif count == 1:
-        yield JobExecutor(_SerialExecutor(), lambda: 1)
+        yield _in_turn(study, jobs)
     else:
-        with _pool(count) as place:
-            yield place
+        with _pool(count) as executor:
+            yield _finished(executor, study, jobs)
+
+
+def _in_turn(study: Study, jobs: Sequence[Job]) -> Finished:
+    for job in jobs:
+        future: Future[tuple[JobOutcome, float]] = Future()
+        try:
+            future.set_result(timed(study.run_job, job))
+        except Exception as error:  # raised when the result is taken, as by any executor
+            future.set_exception(error)
+        yield job, future
+
+
+def _finished(executor: Executor, study: Study, jobs: Sequence[Job]) -> Finished:
+    sent = {executor.submit(timed, study.run_job, job): job for job in jobs}
+    for future in as_completed(list(sent)):
+        yield sent.pop(future), future  # outcomes are large: none is kept here
 
 
 @contextmanager
-def _pool(count: int) -> Iterator[JobExecutor]:
+def _pool(count: int) -> Iterator[Executor]:
     """Processes of this machine; on an error they are ended in the middle of their jobs."""
     limit_threads()
     before = set(multiprocessing.active_children())
     context = multiprocessing.get_context("spawn")  # a fork would inherit threads and locks in any state
     executor = ProcessPoolExecutor(count, mp_context=context, initializer=prepare_worker)
     try:
-        yield JobExecutor(executor, lambda: count + 1)  # one more waits, so that no worker does
+        yield executor
     except BaseException:
         executor.shutdown(wait=False, cancel_futures=True)
         for child in set(multiprocessing.active_children()) - before:
@@ -166,13 +252,13 @@ def _end_with(sentinel: int) -> None:
 
 
 @contextmanager
-def _cluster(address: str) -> Iterator[JobExecutor]:
+def _cluster(address: str) -> Iterator[Executor]:
     try:
         from distributed import Client  # noqa: PLC0415 - belongs to an extra
     except ImportError as error:
         raise CampaignError("--cluster needs distributed: install ccatp[cluster]") from error
     try:
-        client = Client(address, timeout=_CLUSTER_TIMEOUT_S, set_as_default=False)  # type: ignore[no-untyped-call]
+        client = Client(address, timeout=CLUSTER_TIMEOUT_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
         raise ClusterUnreachable(
             f"--cluster {address}: no scheduler answers there ({error}); start one, or correct the address"
@@ -180,14 +266,12 @@ def _cluster(address: str) -> Iterator[JobExecutor]:
     with client:
         executor = client.get_executor(pure=False)  # type: ignore[no-untyped-call]
         try:
-            yield JobExecutor(executor, lambda: 2 * max(1, sum(client.nthreads().values())))  # type: ignore[no-untyped-call]
+            yield executor
         finally:
             executor.shutdown(wait=False)
 
 
-# One bad seed must not cost a night; what fails this often is wrong everywhere.
-_MOST_FAILURES = 5
-FAILURES = "failures.txt"
+# -- campaigns --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,16 +328,21 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
     started_s = time.perf_counter()
     cells = cells_of(study, options.mirrors, options.only)
     plan = jobs_of(study, cells, load, options.settings, study.runs if options.runs is None else options.runs)
-    with JobStore(options.out, options.shard, options.others) as ledger:
-        jobs = [job for group in plan for job in group]
-        own = set(range(options.shard.number - 1, len(jobs), options.shard.of))
-        done = {job.key for job in jobs if ledger.outcome(job) is not None}
-        todo = [job for index, job in enumerate(jobs) if index in own and job.key not in done]
-        with CampaignView(study.name, len(todo), len(done), options.is_quiet) as view:
-            failures = _run_jobs(study, todo, ledger, view, options) if todo else []
-        found = [[ledger.outcome(job) for job in group] for group in plan]
-        work_s = sum(ledger.took_s(job) for job in jobs)
-    results = [_cell(study, group, outcomes) for group, outcomes in zip(plan, found, strict=True)]
+    jobs = [job for group in plan for job in group]
+    console = Console(stderr=True, highlight=False, quiet=options.is_quiet)
+    with JobStore(options.out, options.shard, options.others) as store:
+        done = {job.key for job in jobs if store.outcome(job) is not None}
+        todo = [job for job in jobs[options.shard.number - 1 :: options.shard.of] if job.key not in done]
+        todo.sort(key=lambda job: job.seed)  # one job of each cell first
+        _say(console, study, f"{len(todo)} jobs to do" + (f", {len(done)} done before" if done else ""))
+        failures = _run_jobs(study, todo, store, console, options) if todo else []
+        found = [[store.outcome(job) for job in group] for group in plan]
+        work_s = sum(store.took_s(job) for job in jobs)
+    results = []
+    for group, outcomes in zip(plan, found, strict=True):
+        there = [outcome for outcome in outcomes if outcome is not None]
+        values, arrays = study.combine(group[0].factors, there) if there else JobOutcome({})
+        results.append(CellResult(group[0].factors, {"runs": len(there), **values}, arrays))
     missing = sum(outcome is None for outcomes in found for outcome in outcomes)
     about: dict[str, Any] = {
         "wall_s": round(time.perf_counter() - started_s, 3),
@@ -267,54 +356,53 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
             f"{len(failures)} of {len(todo)} jobs failed, the first: {failures[0]}; see {options.out / FAILURES}; "
             "the results are those of the others: the same command tries again"
         )
-    view.end(missing, len(jobs), options.out)
+    if missing:
+        _say(
+            console, study,
+            f"{len(jobs) - missing} of {len(jobs)} jobs are done; the other shards, "
+            f"or the same command without --shard, do the {missing} that are missing",
+        )  # fmt: skip
+    else:
+        _say(console, study, f"all {len(jobs)} jobs are done; results are in {options.out}")
     return result
 
 
-def _cell(study: Study, jobs: Sequence[Job], outcomes: Sequence[JobOutcome | None]) -> CellResult:
-    there = [outcome for outcome in outcomes if outcome is not None]
-    values, arrays = study.combine(jobs[0].factors, there) if there else JobOutcome({})
-    return CellResult(jobs[0].factors, {"runs": len(there), **values}, arrays)
+def _say(console: Console, study: Study, text: str) -> None:
+    console.print(f"ccatp: study {study.name}: {text}", markup=False, soft_wrap=True)
 
 
 def _run_jobs(
-    study: Study, jobs: Sequence[Job], ledger: JobStore, view: CampaignView, options: CampaignOptions
+    study: Study, jobs: Sequence[Job], store: JobStore, console: Console, options: CampaignOptions
 ) -> list[str]:
-    """Do the jobs; what failed is told, a line each."""
-    schedule = Schedule(jobs, ledger.durations_s)
+    """Do the jobs; a line for each that failed. Shows a bar on a terminal, a line for each tenth elsewhere."""
     failures: list[str] = []
-    with place_of(options.workers, options.cluster, len(jobs)) as place:
-        under_way: dict[Future[Timed], Job] = {}
-        while schedule or under_way:
-            _hand_out(study, schedule, place, under_way)
-            for future in wait(under_way, return_when=FIRST_COMPLETED).done:
-                job = under_way.pop(future)
-                try:
-                    outcome, took_s = _result(future, options.out)
-                except CcatpError:
-                    raise
-                except Exception as error:  # whatever a mission dies of, the others go on
-                    failures.append(_noted(job, error, options.out))
-                    if len(failures) == _MOST_FAILURES:
-                        raise CampaignFailed(
-                            f"{_MOST_FAILURES} jobs failed, the last: {failures[-1]}; see {options.out / FAILURES}; "
-                            f"what is done is kept in {options.out}"
-                        ) from error
-                    continue
-                ledger.add(job, outcome, took_s)
-                schedule.done(job, took_s)
-                view.done(job.key, schedule.done_s, schedule.left_s)
+    began_s, total = time.monotonic(), len(jobs)
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    progress = Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal)
+    with _started(study, jobs, options.workers, options.cluster) as finished, progress:
+        task = progress.add_task(f"study {study.name}", total=total)
+        for count, (job, future) in enumerate(finished, start=1):
+            try:
+                outcome, took_s = _result(future, options.out)
+            except CcatpError:
+                raise
+            except Exception as error:  # whatever a mission dies of, the others go on
+                failures.append(_noted(job, error, options.out))
+                if len(failures) == _MOST_FAILURES:
+                    raise CampaignFailed(
+                        f"{_MOST_FAILURES} jobs failed, the last: {failures[-1]}; see {options.out / FAILURES}; "
+                        f"what is done is kept in {options.out}"
+                    ) from error
+            else:
+                store.add(job, outcome, took_s)
+            progress.update(task, completed=count)
+            if not console.is_terminal and 10 * count // total > 10 * (count - 1) // total:
+                left = timedelta(seconds=round((time.monotonic() - began_s) / count * (total - count)))
+                _say(console, study, f"{count} of {total} jobs ({100 * count // total} %), {left} left; last {job.key}")
     return failures
 
 
-def _hand_out(study: Study, schedule: Schedule, place: JobExecutor, under_way: dict[Future[Timed], Job]) -> None:
-    room = place.room()
-    while schedule and len(under_way) < room:
-        job = schedule.take()
-        under_way[place.executor.submit(timed, study.run_job, job)] = job
-
-
-def _result(future: Future[Timed], out: Path) -> Timed:
+def _result(future: "Future[tuple[JobOutcome, float]]", out: Path) -> tuple[JobOutcome, float]:
     try:
         return future.result()
     except BrokenExecutor as error:

@@ -1,11 +1,4 @@
-"""The study `faults`: whole missions without faults, and with random ones that pass by: falls, completion.
-
-The figure of the study `faults`: what faults that pass by cost in time.
-
-Random plans of faults that pass by: sensors, frames, clock, wheels, at random times of a mission.
-
-A rehearsal whose robot has a plan of faults: frames lost or garbled, a clock that jumps, wheels blocked.
-"""
+"""The study `faults`: whole missions without faults, and with random ones that pass by: falls, completion."""
 
 import random
 from collections.abc import Sequence
@@ -17,47 +10,27 @@ import numpy as np
 from ccatp.config.models import Config
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
-from ccatp.report.plots import dress, new_figure
 from ccatp.sim.fault_models import SENSOR_SIGNALS, Injected
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
-from ccatp.studies.figures import LIMIT, colour, save
 from ccatp.studies.mission_study import dangers, times
-from ccatp.studies.sil_models import SilResult
+from ccatp.studies.results import LIMIT, colour, plot
 from ccatp.studies.sil_run import SilRun, rehearse
 from ccatp.survey.composition import assemble
 
+LONGEST_S = 2.0
+FIRST_S = 3.0  # not before the sensors have sent anything
+NONE, RANDOM = "none", "random"
+FAULTS_PER_MISSION = 12
 _SPREAD = 0.3  # dots of a row lie beside each other
 
 
-def draw_faults(cells: Sequence[CellResult], out: Path) -> None:
-    """Figure ``faults``: every mission a dot, those that were not completed marked."""
-    figure = new_figure(7.0, 1.0 + 0.55 * len(cells))
-    axes = figure.add_subplot()
-    kinds = list(dict.fromkeys(cell.factors["faults"] for cell in cells))
-    for k, cell in enumerate(cells):
-        ratios, is_complete = cell.arrays["time_ratio"], cell.arrays["is_complete"].astype(bool)
-        rows = k + _SPREAD * np.linspace(-1.0, 1.0, len(ratios)) if len(ratios) > 1 else np.array([float(k)])
-        shade = colour(kinds.index(cell.factors["faults"]))
-        axes.plot(ratios[is_complete], rows[is_complete], ".", color=shade, markersize=5)
-        axes.plot(ratios[~is_complete], rows[~is_complete], "x", color=LIMIT, markersize=6)
-    axes.set_yticks(range(len(cells)), [f"{c.factors['mirror']}, faults: {c.factors['faults']}" for c in cells])
-    axes.invert_yaxis()
-    axes.set_xlabel("mission time over its bound; a cross: not completed")
-    dress(axes)
-    save(figure, out / "faults")
-
-
-LONGEST_S = 2.0
-FIRST_S = 3.0  # not before the sensors have said anything
-
-
 class NoFrames(RuntimeError):
-    """The robot fell silent for good, which no plan of passing faults does."""
+    """The robot sends no frame any more, which no plan of passing faults causes."""
 
 
 def random_plan(seed: int, count: int, last_s: float) -> FaultPlan:
-    """A function of its arguments alone.
+    """Random faults of sensors, frames, clock and wheels that pass by; a function of its arguments alone.
 
     Args:
         last_s: robot time by which all have begun; each lasts at most ``LONGEST_S``.
@@ -75,43 +48,37 @@ def random_plan(seed: int, count: int, last_s: float) -> FaultPlan:
 
 def _draw(rng: random.Random) -> tuple[str, str, str]:
     if rng.random() < 0.25:
-        return rng.choice(
-            [
-                ("frames", "drop", f"every = {rng.randint(1, 4)}"),
-                ("frames", "reorder", f"every = {rng.randint(2, 5)}"),
-                ("frames", "duplicate", "every = 2"),
-                ("clock", "jump", f"by_s = {rng.uniform(-0.5, 0.5):.3f}"),
-                ("body", "slip", f"factor = {rng.uniform(0.2, 1.0):.3f}"),
-                ("right_wheel", "blocked", ""),
-                ("left_wheel", "blocked", ""),
-                ("faults", "raise", 'names = ["imu", "edge"]'),
-            ]
-        )
-    signal = rng.choice(SENSOR_SIGNALS)
-    kind, keys = rng.choice(
-        [
-            ("off", ""),
-            ("stuck", ""),
-            ("garbage", f"beyond = {rng.choice((0.0, 0.3))}"),
-            ("wrong", f"factor = {rng.uniform(0.5, 1.5):.3f}"),
-            ("slow", f"every = {rng.randint(2, 20)}"),
-            ("delayed", f'by_s = {rng.uniform(0.02, 0.5):.3f}\nstamps = "{rng.choice(("old", "fresh"))}"'),
-            ("intermittent", f"period_s = {rng.uniform(0.01, 0.3):.3f}\nduty = 0.5"),
-            ("saturated", "low = -0.1\nhigh = 0.1" if not signal.startswith("edge") else "high = 0.0"),
-            ("non_finite", 'token = "NaN"'),
+        others = [
+            ("frames", "drop", f"every = {rng.randint(1, 4)}"),
+            ("frames", "reorder", f"every = {rng.randint(2, 5)}"),
+            ("frames", "duplicate", "every = 2"),
+            ("clock", "jump", f"by_s = {rng.uniform(-0.5, 0.5):.3f}"),
+            ("body", "slip", f"factor = {rng.uniform(0.2, 1.0):.3f}"),
+            ("right_wheel", "blocked", ""),
+            ("left_wheel", "blocked", ""),
+            ("faults", "raise", 'names = ["imu", "edge"]'),
         ]
-    )
-    return signal, kind, keys
+        return rng.choice(others)
+    signal = rng.choice(SENSOR_SIGNALS)
+    kinds = [
+        ("off", ""),
+        ("stuck", ""),
+        ("garbage", f"beyond = {rng.choice((0.0, 0.3))}"),
+        ("wrong", f"factor = {rng.uniform(0.5, 1.5):.3f}"),
+        ("slow", f"every = {rng.randint(2, 20)}"),
+        ("delayed", f'by_s = {rng.uniform(0.02, 0.5):.3f}\nstamps = "{rng.choice(("old", "fresh"))}"'),
+        ("intermittent", f"period_s = {rng.uniform(0.01, 0.3):.3f}\nduty = 0.5"),
+        ("saturated", "low = -0.1\nhigh = 0.1" if not signal.startswith("edge") else "high = 0.0"),
+        ("non_finite", 'token = "NaN"'),
+    ]
+    return signal, *rng.choice(kinds)
 
 
 _LOST_FRAMES = 500  # without a frame for so long a mission is over
 
 
 class FaultySilRun(SilRun):
-    """As the processes: a frame that nobody can take is passed over, and one that is not newer is answered with zeros.
-
-    Args:
-        with_track: keep true and estimated pose of every frame.
+    """As the processes: a frame that cannot be decoded is passed over, one that is not newer is answered with zeros.
 
     Attributes:
         denied_s: when lines that were no frames took the permit away.
@@ -125,7 +92,7 @@ class FaultySilRun(SilRun):
 
     @property
     def injected(self) -> tuple[Injected, ...]:
-        """What became of each fault of the plan."""
+        """The effect of each fault of the plan."""
         injector = self.robot.injector
         return () if injector is None else injector.injected
 
@@ -134,13 +101,13 @@ class FaultySilRun(SilRun):
         for _ in range(_LOST_FRAMES):
             if self.robot.delivered is not None:
                 return
-            self._hear_garbled()
+            self._receive_garbled()
             self.robot.advance()
             super()._note_truth()
         raise NoFrames(f"no frame arrives any more after {self.robot.t_s:.2f} s")
 
-    def _hear_garbled(self) -> None:
-        """As the danger loop on a line that no client may take."""
+    def _receive_garbled(self) -> None:
+        """As the danger loop on a line that is not a frame."""
         last = self.monitor.verdict
         if not self.robot.delivered_line or last.seq < 0:
             return
@@ -162,47 +129,32 @@ class FaultySilRun(SilRun):
         self.robot.drive(self._drive_seq, 0.0, 0.0)
 
 
-NONE, RANDOM = "none", "random"
-FAULTS_PER_MISSION = 12
-COLUMNS = (
-    Column("complete", "complete"),
-    Column("recoverable", "recoverable.runs"),
-    Column("of these complete", "recoverable.complete"),
-    Column("falls", "danger.falls"),
-    Column("false edges", "danger.false_edges"),
-    Column("largest overrun, mm", "danger.max_overrun_mm", ".1f"),
-    Column("frames below the fans' floor", "weak_frames"),
-    Column("points measured", "points.measured"),
-    Column("of", "points.total"),
-    Column("faults", "injected.planned"),
-    Column("that acted", "injected.acted"),
-    Column("mission, s", "mission_time_s", ".0f"),
-    Column("time / bound", "time_ratio", ".4f"),
-    Column("ended by", "ended"),
-)
-
-
-def cells() -> Sequence[Cell]:
-    """Without and with faults."""
-    return [Cell({"faults": kind}) for kind in (NONE, RANDOM)]
-
-
 def run_job(job: Job) -> JobOutcome:
     """One mission."""
+    about: dict[str, Any] = {"injected": {"planned": 0, "acted": 0}, "is_recoverable": True, "weak_frames": 0}
     if job.factors["faults"] == NONE:
-        about = {"injected": {"planned": 0, "acted": 0}, "is_recoverable": True, "weak_frames": 0}
-        return _outcome(job, rehearse(job.cfg), about)
-    parts = assemble(job.cfg)
-    plan = random_plan(job.seed, FAULTS_PER_MISSION, parts.lower_bound_s)
-    rehearsal = FaultySilRun(job.cfg, plan)
-    result = rehearsal.run()
-    about = {
-        # A fault that comes after the end, or between two readings of a slow sensor, does nothing.
-        "injected": {"planned": len(plan.faults), "acted": sum(record.samples > 0 for record in rehearsal.injected)},
-        "is_recoverable": is_recoverable(plan, parts.mirror),
-        "weak_frames": rehearsal.weak_frames,
+        found = rehearse(job.cfg)
+    else:
+        parts = assemble(job.cfg)
+        plan = random_plan(job.seed, FAULTS_PER_MISSION, parts.lower_bound_s)
+        faulty = FaultySilRun(job.cfg, plan)
+        found = faulty.run()
+        about = {
+            # A fault that comes after the end, or between two readings of a slow sensor, does nothing.
+            "injected": {"planned": len(plan.faults), "acted": sum(one.samples > 0 for one in faulty.injected)},
+            "is_recoverable": is_recoverable(plan, parts.mirror),
+            "weak_frames": faulty.weak_frames,
+        }
+    names = ("points", "danger", "mission_time_s", "lower_bound_s", "within_budget")
+    values: dict[str, Any] = {
+        "seed": job.seed,
+        "outcome": found.outcome,
+        "cause": found.cause,
+        **about,
+        **{name: found.summary[name] for name in names},
+        "states_s": found.states_s,
     }
-    return _outcome(job, result, about)
+    return JobOutcome(values)
 
 
 def is_recoverable(plan: FaultPlan, mirror: Mirror) -> bool:
@@ -210,52 +162,66 @@ def is_recoverable(plan: FaultPlan, mirror: Mirror) -> bool:
     return not (mirror.overhang and any(fault.signal == "fans" for fault in plan.faults))
 
 
-def _outcome(job: Job, rehearsal: SilResult, about: dict[str, Any]) -> JobOutcome:
-    summary = rehearsal.summary
-    values: dict[str, Any] = {
-        "seed": job.seed,
-        "outcome": rehearsal.outcome,
-        "cause": rehearsal.cause,
-        **about,
-        **{name: summary[name] for name in ("points", "danger", "mission_time_s", "lower_bound_s", "within_budget")},
-        "states_s": rehearsal.states_s,
-    }
-    return JobOutcome(values, {})
-
-
 def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """Sums over the missions; how those ended that were not completed."""
+    del factors
     values = [outcome.values for outcome in outcomes]
-    ended = [f"seed {v['seed']} {v['outcome']}: {v['cause']}" for v in values if v["outcome"] != "complete"]
-    recoverable = [v for v in values if v["is_recoverable"]]
+    is_complete = [v["outcome"] == "complete" for v in values]
+    recoverable = [v["outcome"] == "complete" for v in values if v["is_recoverable"]]
     figures: dict[str, Any] = {
-        "complete": _complete(values),
-        "recoverable": {"runs": len(recoverable), "complete": _complete(recoverable)},
-        "ended": ended,
-        "danger": dangers([v["danger"] for v in values]),
+        "complete": sum(is_complete),
+        "recoverable": {"runs": len(recoverable), "complete": sum(recoverable)},
+        "ended": [f"seed {v['seed']} {v['outcome']}: {v['cause']}" for v in values if v["outcome"] != "complete"],
+        "danger": dangers(values),
         "weak_frames": sum(v["weak_frames"] for v in values),
         **{of: {name: sum(v[of][name] for v in values) for name in values[0][of]} for of in ("points", "injected")},
         **times(values),
     }
     arrays = {
         "time_ratio": np.array([v["mission_time_s"] / v["lower_bound_s"] for v in values]),
-        "is_complete": np.array([float(v["outcome"] == "complete") for v in values]),
+        "is_complete": np.array(is_complete, dtype=np.float64),
     }
     return JobOutcome(figures, arrays)
 
 
-def _complete(values: Sequence[Any]) -> int:
-    return sum(v["outcome"] == "complete" for v in values)
+def draw(cells: Sequence[CellResult], out: Path) -> None:
+    """Figure ``faults``, the cost of faults in time: every mission a dot, those that were not completed marked."""
+    kinds = list(dict.fromkeys(cell.factors["faults"] for cell in cells))
+    with plot(out / "faults", 7.0, 1.0 + 0.55 * len(cells)) as (_, (axes,)):
+        for k, cell in enumerate(cells):
+            ratios, is_complete = cell.arrays["time_ratio"], cell.arrays["is_complete"].astype(bool)
+            rows = k + _SPREAD * np.linspace(-1.0, 1.0, len(ratios)) if len(ratios) > 1 else np.array([float(k)])
+            shade = colour(kinds.index(cell.factors["faults"]))
+            axes.plot(ratios[is_complete], rows[is_complete], ".", color=shade, markersize=5)
+            axes.plot(ratios[~is_complete], rows[~is_complete], "x", color=LIMIT, markersize=6)
+        axes.set_yticks(range(len(cells)), [f"{c.factors['mirror']}, faults: {c.factors['faults']}" for c in cells])
+        axes.invert_yaxis()
+        axes.set_xlabel("mission time over its bound; a cross: not completed")
 
 
 STUDY = Study(
     name="faults",
     title="Whole missions without faults, and with faults that pass by",
-    cells=cells,
+    cells=lambda: [Cell({"faults": kind}) for kind in (NONE, RANDOM)],
     run_job=run_job,
     combine=combine,
-    columns=COLUMNS,
-    draw=draw_faults,
+    columns=(
+        Column("complete", "complete"),
+        Column("recoverable", "recoverable.runs"),
+        Column("of these complete", "recoverable.complete"),
+        Column("falls", "danger.falls"),
+        Column("false edges", "danger.false_edges"),
+        Column("largest overrun, mm", "danger.max_overrun_mm", ".1f"),
+        Column("frames below the fans' floor", "weak_frames"),
+        Column("points measured", "points.measured"),
+        Column("of", "points.total"),
+        Column("faults", "injected.planned"),
+        Column("that acted", "injected.acted"),
+        Column("mission, s", "mission_time_s", ".0f"),
+        Column("time / bound", "time_ratio", ".4f"),
+        Column("ended by", "ended"),
+    ),
+    draw=draw,
     defaults={"run.filter": "ekf", "run.world": "hard"},
     mirrors=("thesis-m1", "thesis-m2", "fyst-m1", "fyst-m2"),
     runs=75,

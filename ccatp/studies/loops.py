@@ -4,16 +4,9 @@ The thesis judges its two loops on the plant 1/(T s + 1), from speed command to 
 speed command to position, which has an integrator more: 1/(s (T s + 1)). The study sets both side by side, without and
 with the delay of the link, and beside them every other set of gains of the configuration.
 
-The open loops of the controllers as transfer functions, their margins, frequency responses and root loci.
-
 Needs the extra ``tune`` (python-control), imported only when a system is built.
-
-The figures of the study `loops`, as PNG and PDF.
-
-Imports matplotlib, which takes a second, only when something is drawn.
 """
 
-import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -28,13 +21,12 @@ from scipy.optimize import brentq
 from ccatp.config.models import Config, ControlConfig, LimitsConfig, PidConfig
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.report.plots import INK, QUIET, dress, new_figure
-from ccatp.studies.figures import save
+from ccatp.report.plots import INK, QUIET
+from ccatp.studies.results import plot, write_analysis
 
 if TYPE_CHECKING:
     from control import TransferFunction
     from matplotlib.axes import Axes
-
 
 Coefficients = tuple[float, ...]
 """A polynomial in s, highest power first."""
@@ -99,7 +91,7 @@ def controller(gains: PidConfig, is_filtered: bool) -> tuple[Coefficients, Coeff
     denominator: Coefficients = (filter_s, 1.0, 0.0)
     if gains.ki == 0.0:  # else a pole and a zero at the origin would cancel
         numerator, denominator = numerator[:2], denominator[:2]
-    return _trimmed(numerator), _trimmed(denominator)
+    return tuple(np.trim_zeros(numerator, "f")) or (0.0,), tuple(np.trim_zeros(denominator, "f"))
 
 
 def steering(limits: LimitsConfig, control: ControlConfig) -> PidConfig:
@@ -175,9 +167,15 @@ def margins(loop: Loop) -> Margins:
     """Margins of the closed loop L/(1 + L), the delay exact, over the frequencies that a sampled controller has."""
     omega = np.geomspace(*OMEGA_RAD_S, GRID_POINTS)
     magnitude, phase = response(loop, omega)
-    at_gain = [_root(loop, _log_gain, a, b) for a, b in _changes(omega, np.sign(np.log(magnitude)))]
-    at_phase = [_root(loop, _half_turn, a, b) for a, b in _changes(omega, np.floor((phase + pi) / (2.0 * pi)))]
-    phases = [(_wrapped(float(response(loop, np.array([w]))[1][0]) + pi), w) for w in at_gain]
+
+    def crossings(of: Callable[[float, Loop], float], level: FloatArray) -> list[float]:
+        """Roots between the frequencies at which a level changes."""
+        at = np.flatnonzero(np.diff(level))
+        return [float(brentq(of, omega[i], omega[i + 1], args=(loop,))) for i in at]
+
+    at_gain = crossings(_log_gain, np.sign(np.log(magnitude)))
+    at_phase = crossings(_half_turn, np.floor((phase + pi) / (2.0 * pi)))
+    phases = [(-wrap_pi(-(float(response(loop, np.array([w]))[1][0]) + pi)), w) for w in at_gain]
     gains = [(-20.0 * _log_gain(w, loop) / np.log(10.0), w) for w in at_phase]
     phase_rad, gain_crossover = min(phases, key=lambda pair: abs(pair[0]), default=(inf, inf))
     gain_db, phase_crossover = min(gains, key=lambda pair: abs(pair[0]), default=(inf, inf))
@@ -237,24 +235,6 @@ def _half_turn(omega_rad_s: float, loop: Loop) -> float:
     return float(-value.imag / abs(value))
 
 
-def _changes(omega_rad_s: FloatArray, level: FloatArray) -> list[tuple[float, float]]:
-    at = np.flatnonzero(np.diff(level))
-    return [(float(omega_rad_s[i]), float(omega_rad_s[i + 1])) for i in at]
-
-
-def _root(loop: Loop, of: Callable[[float, Loop], float], low: float, high: float) -> float:
-    return float(brentq(of, low, high, args=(loop,)))
-
-
-def _wrapped(angle_rad: float) -> float:
-    return -wrap_pi(-angle_rad)
-
-
-def _trimmed(coefficients: Coefficients) -> Coefficients:
-    first = next((i for i, c in enumerate(coefficients) if c != 0.0), len(coefficients) - 1)
-    return coefficients[first:]
-
-
 _COLOURS = {"printed": "#d08c00", "true": "#123f6d"}
 _PLANTS = {"printed": "1/(Ts+1)", "true": "1/(s(Ts+1))"}
 _DASHES = ("-", "--", ":")  # by the order of the delays
@@ -263,53 +243,48 @@ _FACTORS = np.concatenate([[0.0], np.geomspace(1e-3, 1e3, 1200)])  # of the loop
 _WINDOW_CORNERS = 1.5  # the root locus shows this many times the servo's corner 1/T
 
 
-def draw_bode(loops: Sequence[Loop], margins: Sequence[Margins], out: Path) -> None:
-    """Draw magnitude and phase of the loops of one controller into ``bode_<gains>_<axis>.png`` and ``.pdf``."""
-    figure = new_figure(8.0, 6.4)
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    crossovers = [m.gain_crossover_rad_s for m in margins if np.isfinite(m.gain_crossover_rad_s)]
+def _draw_bode(loops: Sequence[Loop], found: Sequence[Margins], out: Path) -> None:
+    """Magnitude and phase of the loops of one controller."""
+    first, delays = loops[0], sorted({loop.delay_frames for loop in loops})
+    crossovers = [m.gain_crossover_rad_s for m in found if np.isfinite(m.gain_crossover_rad_s)]
     centre = np.log10(max(crossovers, default=1.0))
     omega = np.geomspace(10.0 ** (centre + _DECADES[0]), 10.0 ** (centre + _DECADES[1]), 600)
-    for loop, found in zip(loops, margins, strict=True):
-        magnitude, phase = response(loop, omega)
-        look = {"color": _COLOURS[loop.plant], "linestyle": _style(loops, loop), "linewidth": 1.6}
-        if loop.delay_frames == 0:  # a delay leaves the magnitude as it is
-            upper.semilogx(omega, 20.0 * np.log10(magnitude), **look)
-        lower.semilogx(omega, np.degrees(phase), label=_label(loop, found), **look)
-        if np.isfinite(found.gain_crossover_rad_s):
-            at = response(loop, np.geomspace(1e-4, found.gain_crossover_rad_s, 400))[1][-1]
-            lower.plot(found.gain_crossover_rad_s, degrees(at), "o", color=_COLOURS[loop.plant], markersize=4)
-    upper.axhline(0.0, color=QUIET, linewidth=0.8)
-    lower.axhline(-180.0, color=QUIET, linewidth=0.8)
-    lower.set_ylim(-290.0, 10.0)
-    lower.set_yticks(range(-270, 1, 45))
-    upper.set_ylabel("magnitude, dB")
-    lower.set_ylabel("phase, deg")
-    lower.set_xlabel("frequency, rad/s")
-    upper.set_title(f"Open loop, {loops[0].axis}, gains “{loops[0].gains}”, T = {loops[0].lag_s:g} s")
-    lower.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, frameon=False, fontsize=8)
-    dress(upper, lower, grid="both")
-    save(figure, out / f"bode_{loops[0].gains}_{loops[0].axis}")
+    stem = out / f"bode_{first.gains}_{first.axis}"
+    with plot(stem, 8.0, 6.4, 2, 1, grid="both", sharex=True) as (_, (upper, lower)):
+        for loop, margin in zip(loops, found, strict=True):
+            magnitude, phase = response(loop, omega)
+            style = _DASHES[delays.index(loop.delay_frames) % len(_DASHES)]
+            look = {"color": _COLOURS[loop.plant], "linestyle": style, "linewidth": 1.6}
+            if loop.delay_frames == 0:  # a delay leaves the magnitude as it is
+                upper.semilogx(omega, 20.0 * np.log10(magnitude), **look)
+            gain = f"{margin.gain_db:.0f} dB" if np.isfinite(margin.gain_db) else "∞"
+            margin_text = f"{degrees(margin.phase_rad):.0f}°, {gain}"
+            label = f"{_PLANTS[loop.plant]}, {loop.delay_frames} frames: {margin_text}"
+            lower.semilogx(omega, np.degrees(phase), label=label, **look)
+            if np.isfinite(margin.gain_crossover_rad_s):
+                at = response(loop, np.geomspace(1e-4, margin.gain_crossover_rad_s, 400))[1][-1]
+                lower.plot(margin.gain_crossover_rad_s, degrees(at), "o", color=_COLOURS[loop.plant], markersize=4)
+        upper.axhline(0.0, color=QUIET, linewidth=0.8)
+        lower.axhline(-180.0, color=QUIET, linewidth=0.8)
+        lower.set_ylim(-290.0, 10.0)
+        lower.set_yticks(range(-270, 1, 45))
+        upper.set_ylabel("magnitude, dB")
+        lower.set(xlabel="frequency, rad/s", ylabel="phase, deg")
+        upper.set_title(f"Open loop, {first.axis}, gains “{first.gains}”, T = {first.lag_s:g} s")
+        lower.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, frameon=False, fontsize=8)
 
 
-def draw_locus(loops: Sequence[Loop], out: Path) -> None:
-    """Draw the root loci, each plant without and with the longest delay: ``rlocus_<gains>_<axis>.png`` and ``.pdf``.
-
-    Raises:
-        LoopsError: python-control is not installed.
-    """
+def _draw_locus(loops: Sequence[Loop], out: Path) -> None:
+    """Root loci of one controller, each plant without and with the longest delay."""
+    first = loops[0]
     ends = {min(loop.delay_frames for loop in loops), max(loop.delay_frames for loop in loops)}
     shown = [loop for loop in loops if loop.delay_frames in ends]
-    figure = new_figure(3.6 * len(shown), 5.6)
-    panels = figure.subplots(1, len(shown), squeeze=False)[0]
-    for axes, loop in zip(panels, shown, strict=True):
-        _draw_poles(axes, loop)
-    panels[0].set_ylabel("imaginary part, 1/s")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
-    figure.suptitle(f"Root locus, {loops[0].axis}, gains “{loops[0].gains}”, T = {loops[0].lag_s:g} s")
-    dress(*panels, grid="both")
-    save(figure, out / f"rlocus_{loops[0].gains}_{loops[0].axis}")
+    title = f"Root locus, {first.axis}, gains “{first.gains}”, T = {first.lag_s:g} s"
+    stem, width = out / f"rlocus_{first.gains}_{first.axis}", 3.6 * len(shown)
+    with plot(stem, width, 5.6, 1, len(shown), title=title, legend=4, grid="both") as (_, panels):
+        for axes, loop in zip(panels, shown, strict=True):
+            _draw_poles(axes, loop)
+        panels[0].set_ylabel("imaginary part, 1/s")
 
 
 def _draw_poles(axes: "Axes", loop: Loop) -> None:
@@ -323,35 +298,26 @@ def _draw_poles(axes: "Axes", loop: Loop) -> None:
     axes.axvspan(0.0, 1e4, color="#d64545", alpha=0.06, linewidth=0, label="unstable")
     size = _WINDOW_CORNERS / loop.lag_s
     axes.set(xlim=(-size, 0.4 * size), ylim=(-size, size), xlabel="real part, 1/s", aspect="equal")
-    axes.set_title(f"{_PLANTS[loop.plant]}, {loop.delay_frames} frames of delay", fontsize=9)
+    axes.set_title(f"{_PLANTS[loop.plant]}, {loop.delay_frames} frames of delay")
 
 
-def _style(loops: Sequence[Loop], loop: Loop) -> str:
-    delays = sorted({other.delay_frames for other in loops})
-    return _DASHES[delays.index(loop.delay_frames) % len(_DASHES)]
-
-
-def _label(loop: Loop, found: Margins) -> str:
-    gain = f"{found.gain_db:.0f} dB" if np.isfinite(found.gain_db) else "∞"
-    return f"{_PLANTS[loop.plant]}, {loop.delay_frames} frames: {degrees(found.phase_rad):.0f}°, {gain}"
-
-
-HEADINGS = (
-    "gains", "axis", "plant", "T, s", "delay, frames", "gain margin, dB", "phase margin, deg", "crossover, rad/s",
-    "delay margin, s", "least distance from -1", "overshoot, %",
-)  # fmt: skip
-COLUMNS = (
-    "gains", "axis", "plant", "lag_s", "delay_frames", "gain_margin_db", "phase_margin_deg", "gain_crossover_rad_s",
-    "delay_margin_s", "modulus_margin", "overshoot_percent",
-)  # fmt: skip
+COLUMNS = {
+    "gains": "gains",
+    "axis": "axis",
+    "plant": "plant",
+    "lag_s": "T, s",
+    "delay_frames": "delay, frames",
+    "gain_margin_db": "gain margin, dB",
+    "phase_margin_deg": "phase margin, deg",
+    "gain_crossover_rad_s": "crossover, rad/s",
+    "delay_margin_s": "delay margin, s",
+    "modulus_margin": "least distance from -1",
+    "overshoot_percent": "overshoot, %",
+}
 
 
 def run(cfg: Config, out: Path) -> dict[str, Any]:
     """Analyse every loop of the configuration and write ``result.json``, ``result.npz``, ``table.md`` and the figures.
-
-    Args:
-        cfg: sets of gains, wheel lag, frame rate.
-        out: directory; made if it is not there.
 
     Returns:
         What ``result.json`` holds: ``{"study", "cells", "wall_s"}``. A cell is one loop with its margins; what does not
@@ -365,21 +331,15 @@ def run(cfg: Config, out: Path) -> dict[str, Any]:
     out.mkdir(parents=True, exist_ok=True)
     loops = list(loops_of(cfg))
     cells = [_cell(loop, margins(loop)) for loop in (*loops, *limit_of(cfg))]
-    for group in _grouped(loops):
-        draw_bode(group, [margins(loop) for loop in group], out)
-        draw_locus(group, out)
-    _write_arrays(loops, out / "result.npz")
-    (out / "table.md").write_text(table(cells), encoding="utf-8")
-    result = {"study": "loops", "cells": cells, "wall_s": time.perf_counter() - started_s}
-    (out / "result.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    return result
-
-
-def table(cells: Sequence[dict[str, Any]]) -> str:
-    """The cells as a Markdown table."""
-    lines = ["| " + " | ".join(HEADINGS) + " |", "|" + "---|" * len(HEADINGS)]
-    lines += ["| " + " | ".join(_text(cell[column]) for column in COLUMNS) + " |" for cell in cells]
-    return "\n".join(lines) + "\n"
+    for gains, axis in dict.fromkeys((loop.gains, loop.axis) for loop in loops):
+        group = [loop for loop in loops if (loop.gains, loop.axis) == (gains, axis)]
+        _draw_bode(group, [margins(loop) for loop in group], out)
+        _draw_locus(group, out)
+    omega = np.geomspace(*OMEGA_RAD_S, GRID_POINTS)
+    magnitude, phase = (np.array(part) for part in zip(*(response(loop, omega) for loop in loops), strict=True))
+    names = np.array([f"{loop.gains}/{loop.axis}/{loop.plant}/{loop.delay_frames}" for loop in loops])
+    np.savez_compressed(out / "result.npz", omega_rad_s=omega, loop=names, magnitude=magnitude, phase_rad=phase)
+    return write_analysis("loops", cells, COLUMNS, out, started_s)
 
 
 def _cell(loop: Loop, found: Margins) -> dict[str, Any]:
@@ -393,35 +353,8 @@ def _cell(loop: Loop, found: Margins) -> dict[str, Any]:
         "overshoot_percent": 100.0 * overshoot(loop),
     }
     return {
-        "gains": loop.gains,
-        "axis": loop.axis,
-        "plant": loop.plant,
-        "lag_s": loop.lag_s,
-        "delay_frames": loop.delay_frames,
+        **{name: getattr(loop, name) for name in ("gains", "axis", "plant", "lag_s", "delay_frames")},
         "runs": 1,
         "is_stable": found.is_stable,
         **{name: value if isfinite(value) else None for name, value in figures.items()},
     }
-
-
-def _grouped(loops: Sequence[Loop]) -> list[list[Loop]]:
-    """Loops that share a figure: one set of gains, one axis."""
-    groups: dict[tuple[str, str], list[Loop]] = {}
-    for loop in loops:
-        groups.setdefault((loop.gains, loop.axis), []).append(loop)
-    return list(groups.values())
-
-
-def _write_arrays(loops: Sequence[Loop], path: Path) -> None:
-    """Frequency responses: magnitude and phase (rad), one row for each cell without a limit, in their order."""
-    omega = np.geomspace(*OMEGA_RAD_S, GRID_POINTS)
-    responses = [response(loop, omega) for loop in loops]
-    names = [f"{loop.gains}/{loop.axis}/{loop.plant}/{loop.delay_frames}" for loop in loops]
-    magnitude, phase = (np.array(part) for part in zip(*responses, strict=True))
-    np.savez_compressed(path, omega_rad_s=omega, loop=np.array(names), magnitude=magnitude, phase_rad=phase)
-
-
-def _text(value: object) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,6 +1,6 @@
-"""The study `mote-navigation`: motes map themselves, then carry a robot along its route; error against map.
+"""The study `mote-navigation`: motes map themselves, then guide a robot along its route; error against map.
 
-A whole mission among beacons in one process: the daemon's own mission and danger rules against the sim.
+Each job is a whole mission among beacons in one process: the daemon's own mission and danger rules against the sim.
 """
 
 from collections.abc import Sequence
@@ -32,16 +32,16 @@ from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.records.beacon_summary import BeaconSummary, Reached, beacon_facts
-from ccatp.report.plots import INK, QUIET, dress, new_figure
+from ccatp.report.plots import QUIET
 from ccatp.safety.beacons import BeaconSafetyRules
 from ccatp.sim.beacon_robot import BeaconTruthLog, build_beacon_robot, motes_of
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
-from ccatp.studies.figures import LIMIT, colour, save
+from ccatp.studies.results import LIMIT, colour, plot
 
 
 @dataclass(slots=True)
 class BeaconSilResult:
-    """What a rehearsal leaves, one entry a frame where nothing else is said.
+    """The result of a mission, one entry a frame where nothing else is said.
 
     Attributes:
         summary: as ``summary.json``.
@@ -89,7 +89,7 @@ class BeaconSilWorld:
         line = self.robot.delivered_line.rstrip()
         sensors = decode_from_robot(line)
         if not isinstance(sensors, Sensors):
-            raise TypeError(f"a robot's frame is no frame: {line[:80]!r}")
+            raise TypeError(f"not a sensors frame: {line[:80]!r}")
         extras = decode_beacon_frame(line)
         verdict = self.danger.step(sensors, extras, self._estimate)
         before = len(self.mission.arrivals)
@@ -99,14 +99,11 @@ class BeaconSilWorld:
         for arrival in self.mission.arrivals[before:]:
             self._book.add_reached(Reached(sensors.seq, arrival.belief.ellipse))
         if not self.is_over:
-            self._drive(sensors.seq, verdict, drive)
-
-    def _drive(self, seq: int, verdict: Verdict, drive: SteeringCommand) -> None:
-        right, left, steer = wheel_rates(drive, self._cfg)
-        self.robot.permit(seq + 1, verdict.forward, verdict.reverse, verdict.turn)
-        self.robot.drive(seq + 1, right, left, None, steer)
-        self.robot.advance()
-        self._log.add()
+            right, left, steer = wheel_rates(drive, self._cfg)
+            self.robot.permit(sensors.seq + 1, verdict.forward, verdict.reverse, verdict.turn)
+            self.robot.drive(sensors.seq + 1, right, left, None, steer)
+            self.robot.advance()
+            self._log.add()
 
     def _note(self, sensors: Sensors, verdict: Verdict, drive: SteeringCommand) -> None:
         found, mission = self.found, self.mission
@@ -127,7 +124,7 @@ class BeaconSilWorld:
         found.speeds_m_s.append(drive.speed_m_s)
 
     def result(self) -> BeaconSilResult:
-        """What there is to say at the end."""
+        """The result at the end."""
         found, mission, book = self.found, self.mission, self._book
         batch = self._log.batch()
         found.truth = [] if batch is None else list(batch[1].rows)
@@ -144,10 +141,10 @@ class BeaconSilWorld:
 
 def rehearse_beacons(cfg: RadioConfig) -> BeaconSilResult:
     """A mission from its first frame to its end, in virtual time; a function of configuration and seed."""
-    stage = BeaconSilWorld(cfg)
-    while not stage.is_over:
-        stage.frame()
-    return stage.result()
+    world = BeaconSilWorld(cfg)
+    while not world.is_over:
+        world.frame()
+    return world.result()
 
 
 SECOND = 10  # frames; errors are compared once in so many
@@ -157,7 +154,7 @@ _BAND = 0.95
 
 def run_job(job: Job) -> JobOutcome:
     """One mission: its figures, and errors each second from the end of mapping on."""
-    found = rehearse_beacons(job.radio)
+    found = rehearse_beacons(job.cfg)
     summary = found.summary
     values = {
         "outcome": summary["outcome"],
@@ -228,25 +225,21 @@ def band(runs: int) -> tuple[float, float]:
 def draw(cells: Sequence[CellResult], out: Path) -> None:
     """Figure ``mote_navigation``: errors beside what is expected, and NEES in its band, over time."""
     cell = cells[0]
-    figure = new_figure(7.5, 5.6)
-    above, below = figure.subplots(2, 1, sharex=True)
     seconds = np.arange(len(cell.arrays["nees"]))
-    above.plot(seconds, 1e3 * cell.arrays["error_m"], color=colour(0), label="true error of the position")
-    above.plot(seconds, 1e3 * cell.arrays["sigma_m"], color=colour(1), linestyle="--", label="expected by the filter")
-    above.axhline(
-        1e3 * cell.values["map_m"], color=QUIET, linewidth=1.0, linestyle=":", label="true error of the map at the end"
-    )
-    above.set(ylabel="mm, root mean square", yscale="log")
-    above.set_title("A robot that navigates by motes which mapped themselves", color=INK)
-    above.legend(frameon=False, fontsize=8)
-    low, high = cell.values["band"]
-    below.axhspan(low, high, color=colour(2), alpha=0.15, linewidth=0, label="95 % band")
-    below.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":")
-    below.plot(seconds, cell.arrays["nees"], color=colour(0), linewidth=1.2, label="mean NEES of the pose")
-    below.set(xlabel="seconds since the map", ylabel="for each degree of freedom", ylim=(0.0, 2.5))
-    below.legend(frameon=False, fontsize=8, ncols=2)
-    dress(above, below)
-    save(figure, out / "mote_navigation")
+    true_mm, expected_mm = 1e3 * cell.arrays["error_m"], 1e3 * cell.arrays["sigma_m"]
+    with plot(out / "mote_navigation", 7.5, 5.6, 2, 1, sharex=True) as (_, (above, below)):
+        above.plot(seconds, true_mm, color=colour(0), label="true error of the position")
+        above.plot(seconds, expected_mm, color=colour(1), linestyle="--", label="expected by the filter")
+        look: dict[str, Any] = {"color": QUIET, "linewidth": 1.0, "linestyle": ":"}
+        above.axhline(1e3 * cell.values["map_m"], label="true error of the map at the end", **look)
+        above.set(ylabel="mm, root mean square", yscale="log")
+        above.set_title("A robot that navigates by motes which mapped themselves")
+        above.legend(frameon=False, fontsize=8)
+        below.axhspan(*cell.values["band"], color=colour(2), alpha=0.15, linewidth=0, label="95 % band")
+        below.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":")
+        below.plot(seconds, cell.arrays["nees"], color=colour(0), linewidth=1.2, label="mean NEES of the pose")
+        below.set(xlabel="seconds since the map", ylabel="for each degree of freedom", ylim=(0.0, 2.5))
+        below.legend(frameon=False, fontsize=8, ncols=2)
 
 
 def _root(values: Sequence[float]) -> float:

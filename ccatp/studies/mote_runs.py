@@ -1,11 +1,9 @@
-"""Self-mapping of one simulated field by filter or batch, and its error against the truth.
+"""Self-mapping of simulated fields of motes by filter or batch: one field, and many of one configuration."""
 
-One simulated field of motes: the truth, and all ranges that phases 1 and 2 are given.
-"""
-
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import cycle, islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,14 +25,17 @@ from ccatp.beacons.cricket.trilateration import FirstMap, map_as_possible, map_b
 from ccatp.config.beacon_models import CricketConfig
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import aligned_rms_m, best_motion, rms_m
+from ccatp.report.beacon_plots import MapPicture, Traces
 from ccatp.sim.motes import MoteField, MotePulse, true_motes
 
 _LAYOUT, _FIELD, _READINGS = 0, 1, 2  # streams of random numbers of one seed
+_GENERIC = 0  # seed of the random places of rank and fold-over: they must not depend on the run
+_LINED = 100  # motes up to which the measured pairs are drawn
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedField:
-    """What happened in one field.
+    """One simulated field of motes: the truth, and all ranges that phases 1 and 2 are given.
 
     Attributes:
         true_m: places of all motes, shape (n, d).
@@ -61,32 +62,29 @@ class SimulatedField:
 
 
 def simulate_field(cfg: CricketConfig, seed: int) -> SimulatedField:
-    """Draw the errors of one field and everything that its motes hear.
+    """Draw the errors of one field and everything that its motes receive.
 
     Raises:
-        MappingError: no pair of phase 2 hears each other.
+        MappingError: no pair of phase 2 can range.
     """
     motes = true_motes(cfg, np.random.default_rng((seed, _LAYOUT)))
     plan = network_plan(cfg) if cfg.layout == "networks" else loose_plan(cfg, motes.names)
     field = MoteField(cfg, motes, np.random.default_rng((seed, _FIELD)))
     rng = np.random.default_rng((seed, _READINGS))
-    first = tuple(_range(cfg, plan, heard) for heard in field.listen(plan.phase1_pairs, cfg.ranging.repeats, rng))
+
+    def reading(pulse: MotePulse) -> MoteRange:
+        names = plan.names[pulse.transmitter], plan.names[pulse.listener]
+        return pair_range(cfg, names, pulse.delays_s, pulse.temperature_c)
+
+    first = tuple(reading(pulse) for pulse in field.listen(plan.phase1_pairs, cfg.ranging.repeats, rng))
     pairs = [pair for pair in plan.phase2_pairs if field.receives(*pair)]
     if not pairs:
         raise MappingError("no pair of phase 2 hears each other; enlarge cricket.transducer or turn the motes")
     second = []
-    for heard in field.listen(list(islice(cycle(pairs), cfg.phase2.max_updates)), 1, rng):
-        reading = _range(cfg, plan, heard)
-        second.append((heard.transmitter, heard.listener, reading.range_m, reading.sigma_m))
+    for pulse in field.listen(list(islice(cycle(pairs), cfg.phase2.max_updates)), 1, rng):
+        found = reading(pulse)
+        second.append((pulse.transmitter, pulse.listener, found.range_m, found.sigma_m))
     return SimulatedField(plan, motes.positions_m, first, tuple(second))
-
-
-def _range(cfg: CricketConfig, plan: MotePlan, heard: MotePulse) -> MoteRange:
-    names = plan.names[heard.transmitter], plan.names[heard.listener]
-    return pair_range(cfg, names, heard.delays_s, heard.temperature_c)
-
-
-_GENERIC = 0  # seed of the random places of rank and fold-over: they must not depend on the run
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +98,7 @@ class MoteRun:
         trace_m: error after each update, phase 1 first; of the batch just both.
         is_aligned: whether the frame was free.
         doubtful: rows of motes whose mirror image fits as well, or that hang on too few ranges.
-        whole: the map with all motes of the stands, by name; the same motes where there are no others.
+        whole: names, positions and covariance of all motes of the stands; the same motes where there are no others.
     """
 
     names: tuple[str, ...]
@@ -118,20 +116,12 @@ class MoteRun:
     scale: float
     nis: FloatArray
     doubtful: tuple[int, ...]
-    whole: "NamedMap"
-
-
-class NamedMap(NamedTuple):
-    """Motes with names: what a beacon file holds."""
-
-    names: tuple[str, ...]
-    positions_m: FloatArray
-    covariance_m2: FloatArray
+    whole: tuple[tuple[str, ...], FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
 class MoteOutlook:
-    """What the ranges can tell, said before anything is estimated.
+    """What the ranges determine, known before anything is estimated.
 
     Attributes:
         bound_rms_m: Cramér-Rao bound at the true places; None where something stays free.
@@ -143,7 +133,7 @@ class MoteOutlook:
 
 
 def first_map(cfg: CricketConfig, field: SimulatedField, draws: int = 0) -> FirstMap:
-    """Phase 1; where its bias and covariance are of use, by so many draws.
+    """Phase 1; its bias and covariance, where they are needed, by so many draws.
 
     Raises:
         MappingError: a step that cannot be made.
@@ -164,15 +154,11 @@ def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
     motes = list(plan.heads or plan.mapped)
     if lost := [plan.names[mote] for mote in motes if mote in first.unplaced]:
         raise MappingError(f"phase 1 cannot place {lost[0]} (and {len(lost) - 1} more); the batch needs no such start")
-    d = plan.dimension
-    at = (np.array(motes)[:, None] * d + np.arange(d)).ravel()
     known, places = plan.surveyed_m[motes], first.positions_m[motes]
-    mean = places + first.bias_m[motes]
-    covariance = first.covariance_m2[np.ix_(at, at)]
+    mean, covariance = places + first.bias_m[motes], _block(first.covariance_m2, motes, plan.dimension)
     if cfg.phase2.prior == "printed":
-        covariance = printed_prior(
-            len(motes), d, np.flatnonzero(np.isfinite(known.ravel())).tolist(), cfg.phase2.printed_variance_m2
-        )
+        fixed = np.flatnonzero(np.isfinite(known.ravel())).tolist()
+        covariance = printed_prior(len(motes), plan.dimension, fixed, cfg.phase2.printed_variance_m2)
         mean = places
     mapper = MoteMapper(mean, covariance, mapper_settings(cfg), known)
     index = {mote: row for row, mote in enumerate(motes)}
@@ -181,8 +167,13 @@ def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
     aligned = bool(np.isnan(known).all())
     true_m = field.true_m[motes]
     trace = np.array([_error_m(found, true_m, aligned) for found in went.positions_m])
+    names = tuple(plan.names[mote] for mote in motes)
+    whole = plan.names, mapper.positions_m, mapper.covariance_m2
+    if plan.networks:
+        every = complete_stands(plan, first.positions_m, first.covariance_m2, mapper.positions_m, mapper.covariance_m2)
+        whole = tuple(plan.names[mote] for mote in every.motes), every.positions_m, every.covariance_m2
     return MoteRun(
-        names=tuple(plan.names[mote] for mote in motes),
+        names=names,
         positions_m=mapper.positions_m,
         covariance_m2=mapper.covariance_m2,
         true_m=true_m,
@@ -197,24 +188,15 @@ def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
         scale=mapper.scale,
         nis=went.nis,
         doubtful=(),
-        whole=_whole(field, first, mapper),
+        whole=whole,
     )
-
-
-def _whole(field: SimulatedField, first: FirstMap, mapper: MoteMapper) -> NamedMap:
-    plan = field.plan
-    if not plan.networks:
-        return NamedMap(plan.names, mapper.positions_m, mapper.covariance_m2)
-    whole = complete_stands(plan, first.positions_m, first.covariance_m2, mapper.positions_m, mapper.covariance_m2)
-    names = tuple(plan.names[mote] for mote in whole.motes)
-    return NamedMap(names, whole.positions_m, whole.covariance_m2)
 
 
 def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | None = None) -> MoteRun:
     """The batch over all ranges of both phases; its error after the best rigid motion.
 
     Args:
-        outlook: of the same graph, for the sets of motes that may fold.
+        outlook: of the same graph, for the sets of motes that may be mirrored.
 
     Raises:
         MappingError: the ranges make no map.
@@ -227,7 +209,7 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
         first = None
     found = map_motes(
         network,
-        batch_settings(cfg),
+        MapFitSettings(cfg.batch.robust_scale, cfg.batch.max_iterations),
         with_offset=cfg.batch.estimates_offset,
         with_scale=cfg.batch.estimates_scale,
         start_m=None if first is None else first.positions_m,
@@ -238,16 +220,18 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
     laid = None
     if first is not None and not set(motes) & set(first.unplaced):
         laid = aligned_rms_m(first.positions_m[motes], true_m, mirrors=not plan.anchors)
-    positions, covariance = _in_field(cfg, field, found)
-    d = plan.dimension
-    at = (np.array(motes)[:, None] * d + np.arange(d)).ravel()
-    error_m = aligned_rms_m(positions[motes], true_m, mirrors=not plan.bodies)
+    positions, covariance = _in_field(field, found)
+    positions, covariance = positions[motes], _block(covariance, motes, plan.dimension)
+    error_m = aligned_rms_m(positions, true_m, mirrors=not plan.bodies)
     expected_m = map_rms_m(found.covariance_m2, found.positions_m, motes, aligned=True)
     names = tuple(plan.names[mote] for mote in motes)
+    lost = {mote for fold in found.folds for mote in fold.motes}
+    if outlook is not None:
+        lost |= {mote for _, moved in outlook.folds.mirrors for mote in moved}
     return MoteRun(
         names=names,
-        positions_m=positions[motes],
-        covariance_m2=covariance[np.ix_(at, at)],
+        positions_m=positions,
+        covariance_m2=covariance,
         true_m=true_m,
         rms_m=error_m,
         phase1_rms_m=laid,
@@ -259,26 +243,20 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
         offset_m=found.offset_m,
         scale=found.scale,
         nis=np.zeros(0),
-        doubtful=_doubtful(found, outlook, motes),
-        whole=NamedMap(names, positions[motes], covariance[np.ix_(at, at)]),
+        doubtful=tuple(row for row, mote in enumerate(motes) if mote in lost),
+        whole=(names, positions, covariance),
     )
 
 
-def _doubtful(found: MoteMap, outlook: MoteOutlook | None, motes: list[int]) -> tuple[int, ...]:
-    sets = [fold.motes for fold in found.folds]
-    sets += [moved for _, moved in outlook.folds.mirrors] if outlook is not None else []
-    lost = {mote for moved in sets for mote in moved}
-    return tuple(row for row, mote in enumerate(motes) if mote in lost)
+def _block(covariance_m2: FloatArray, motes: list[int], dimension: int) -> FloatArray:
+    """The covariance of some motes."""
+    at = (np.array(motes)[:, None] * dimension + np.arange(dimension)).ravel()
+    return covariance_m2[np.ix_(at, at)]
 
 
 def batch_network(cfg: CricketConfig, field: SimulatedField) -> RangeNetwork:
     """The graph that the batch uses: ranges of phases 1 and 2 and shapes of the stands, as the configuration says."""
     return field.network(with_second=cfg.batch.uses_phase2, with_shapes=cfg.batch.uses_shapes)
-
-
-def batch_settings(cfg: CricketConfig) -> MapFitSettings:
-    """How the batch fits."""
-    return MapFitSettings(cfg.batch.robust_scale, cfg.batch.max_iterations)
 
 
 def look_ahead(cfg: CricketConfig, field: SimulatedField, method: str, updates: int | None = None) -> MoteOutlook:
@@ -308,7 +286,8 @@ def look_ahead(cfg: CricketConfig, field: SimulatedField, method: str, updates: 
     aligned = bool(np.isnan(known).all())
     if cfg.phase2.prior == "printed":
         return MoteOutlook(freedom, folds, bound_rms_m(model, field.true_m[motes], range(len(motes)), aligned=aligned))
-    whole = MapModel(_with_known(field, updates), **options)
+    both = replace(field, second=field.second[:updates]).network(with_second=True)
+    whole = MapModel(replace(both, bodies=(), known_m=known), **options)
     return MoteOutlook(freedom, folds, bound_rms_m(whole, field.true_m, motes, aligned=aligned))
 
 
@@ -328,22 +307,7 @@ def _part(field: SimulatedField, motes: list[int], known: FloatArray, updates: i
     )
 
 
-def _with_known(field: SimulatedField, updates: int | None) -> RangeNetwork:
-    cut = SimulatedField(field.plan, field.true_m, field.first, field.second[:updates])
-    whole = cut.network(with_second=True)
-    return RangeNetwork(
-        whole.names,
-        whole.dimension,
-        whole.first,
-        whole.second,
-        whole.ranges_m,
-        whole.sigmas_m,
-        (),
-        field.plan.surveyed_m,
-    )
-
-
-def _in_field(cfg: CricketConfig, field: SimulatedField, found: MoteMap) -> tuple[FloatArray, FloatArray]:
+def _in_field(field: SimulatedField, found: MoteMap) -> tuple[FloatArray, FloatArray]:
     """The map in the field's frame, as far as the operator knows it."""
     plan = field.plan
     if not plan.anchors:
@@ -362,3 +326,123 @@ def _in_field(cfg: CricketConfig, field: SimulatedField, found: MoteMap) -> tupl
 
 def _error_m(found_m: FloatArray, true_m: FloatArray, aligned: bool) -> float:
     return aligned_rms_m(found_m, true_m, mirrors=True) if aligned else rms_m(found_m, true_m)
+
+
+# -- many fields of one configuration ---------------------------------------------------------------------------------
+
+
+class MoteCampaign(NamedTuple):
+    """Runs of one configuration.
+
+    Attributes:
+        method: ``ekf`` or ``batch``.
+        outlook: of the first seed's graph, bounds at the median number of updates.
+    """
+
+    method: str
+    runs: tuple[MoteRun, ...]
+    outlook: MoteOutlook
+    field: SimulatedField
+
+
+def run_campaign(
+    cfg: CricketConfig, method: str, seeds: Sequence[int], on_done: Callable[[int], None] = lambda _: None
+) -> MoteCampaign:
+    """Map the motes once for each seed, by ``ekf`` or ``batch``.
+
+    Args:
+        on_done: receives the number of runs so far.
+
+    Raises:
+        MappingError: a field of which no map can be made.
+    """
+    field = simulate_field(cfg, seeds[0])
+    outlook = look_ahead(cfg, field, method)
+    runs = []
+    for done, seed in enumerate(seeds, start=1):
+        drawn = field if seed == seeds[0] else simulate_field(cfg, seed)
+        # Drawn layouts differ from seed to seed, and so do their folds.
+        known = outlook if cfg.layout != "random" or seed == seeds[0] else look_ahead(cfg, drawn, method)
+        runs.append(run_filter(cfg, drawn) if method == "ekf" else run_batch(cfg, drawn, known))
+        on_done(done)
+    if method == "ekf":
+        updates = int(np.median([run.iterations for run in runs]))
+        outlook = look_ahead(cfg, field, method, max(updates, 1))
+    return MoteCampaign(method, tuple(runs), outlook, field)
+
+
+def campaign_data(campaign: MoteCampaign) -> dict[str, Any]:
+    """What ``ccatp radio map --json`` prints."""
+    runs, outlook = campaign.runs, campaign.outlook
+    laid = [run.phase1_rms_m for run in runs if run.phase1_rms_m is not None]
+    return {
+        "rms_m": percentiles([run.rms_m for run in runs]),
+        "crlb_m": outlook.bound_rms_m,
+        "rank_deficiency": outlook.freedom.deficiency,
+        "fold_over_risk": not outlook.folds.is_unique,
+        "phase1_rms_m": float(np.median(laid)) if laid else None,
+        "iterations": int(np.median([run.iterations for run in runs])),
+        "method": campaign.method,
+        "seeds": len(runs),
+        "motes": len(runs[0].names),
+        "frame": "aligned" if runs[0].is_aligned else "surveyed",
+        "rms_of_all_m": float(np.sqrt(np.mean([run.rms_m**2 for run in runs]))),
+        "motes_in_doubt": int(np.median([len(run.doubtful) for run in runs])),
+        "rms_of_others_m": float(np.median([sure_rms_m(run) for run in runs])),
+        "expected_rms_m": float(np.median([run.expected_rms_m for run in runs])),
+        "offset_m": float(np.median([run.offset_m for run in runs])),
+        "scale": 1.0 + float(np.median([run.scale for run in runs])),
+        "free_directions": [*outlook.freedom.frame, *outlook.freedom.flexes, *outlook.freedom.calibration],
+        "warnings": list(outlook.folds.warnings),
+    }
+
+
+def sure_rms_m(run: MoteRun) -> float:
+    """Error of the motes that are not in doubt, in the frame of the run; not a number where there are too few."""
+    sure = [row for row in range(len(run.names)) if row not in run.doubtful]
+    found, true = run.positions_m[sure], run.true_m[sure]
+    if not run.is_aligned:
+        return rms_m(found, true)
+    return aligned_rms_m(found, true, mirrors=True) if len(sure) > true.shape[1] else float("nan")
+
+
+def percentiles(values: Sequence[float]) -> dict[str, float]:
+    """10, 50 and 90 %."""
+    return dict(zip(("p10", "p50", "p90"), np.percentile(values, (10, 50, 90)).tolist(), strict=True))
+
+
+def pictured(campaign: MoteCampaign, seed: int) -> tuple[MapPicture, Traces | None]:
+    """The map of the first run, and of the filter the errors against updates."""
+    run = campaign.runs[0]
+    title = f"{campaign.method}, {len(run.names)} motes, seed {seed}, error {1e3 * run.rms_m:.3g} mm"
+    positions_m, covariance_m2 = run.positions_m, run.covariance_m2
+    if run.is_aligned:  # its frame is its own: moved onto the truth, for the eye
+        motion = best_motion(run.positions_m, run.true_m, mirrors=True)
+        positions_m, covariance_m2 = motion.moved(positions_m), motion.turned_map(covariance_m2)
+    pairs = np.array(_pairs(campaign, run), dtype=np.intp).reshape(-1, 2)
+    picture = MapPicture(run.names, positions_m, covariance_m2, run.true_m, pairs, run.doubtful, title)
+    if campaign.method != "ekf":
+        return picture, None
+    # A run that ended early stays where it was.
+    longest = max(len(one.trace_m) for one in campaign.runs)
+    errors, expected = (
+        np.array([np.pad(trace, (0, longest - len(trace)), mode="edge") for trace in traces])
+        for traces in ([one.trace_m for one in campaign.runs], [one.expected_trace_m for one in campaign.runs])
+    )
+    low, middle, high = np.percentile(errors, (10, 50, 90), axis=0)
+    bound_m = campaign.outlook.bound_rms_m
+    return picture, Traces(low, middle, high, np.median(expected, axis=0), bound_m, len(campaign.runs))
+
+
+def _pairs(campaign: MoteCampaign, run: MoteRun) -> list[tuple[int, int]]:
+    """Pairs of motes of the map that ranged, in phase 2 for the filter, in phase 1 for the batch."""
+    field = campaign.field
+    if len(run.names) > _LINED:
+        return []
+    row = {name: number for number, name in enumerate(run.names)}
+    names = field.plan.names
+    if campaign.method == "ekf":
+        ends = {(names[i], names[j]) for i, j, _, _ in field.second}
+    else:
+        ends = {(reading.first, reading.second) for reading in field.first}
+    return sorted((row[a], row[b]) for a, b in ends if a in row and b in row)

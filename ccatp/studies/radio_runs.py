@@ -1,7 +1,4 @@
-"""One run of a robot among beacons against the simulated world, with the truth beside the estimates.
-
-One run among radio beacons as the outcome of a job, and the runs of a cell put together.
-"""
+"""One run of a robot among radio beacons, with the truth beside the estimates; the runs of a cell put together."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -30,7 +27,9 @@ class RadioRun:
         reckoned_errors: x_m and y_m of dead reckoning by the same odometry.
         beacon_errors_m: by name, from the first estimate on: distance of estimate and truth.
         beacon_nees: the same, with 2 degrees of freedom.
+        nis: of each reading, and its degrees of freedom.
         truth, estimates, targets, believed: paths of the vehicle and of the target, x_m and y_m.
+        places: by name at the end: mean, covariance and truth.
         joint_nees: at the end, of the pose and all static radios on the map, and its degrees of freedom.
     """
 
@@ -66,16 +65,12 @@ def run_radio(cfg: RadioConfig) -> RadioRun:
     truths = _true_places(world, cfg.follow.target)
     for name, estimate in navigator.slam.beacons.items():
         run.places[str(name)] = (estimate.mean, estimate.covariance, np.array(truths[str(name)]))
-    run.joint_nees = _joint_nees(world, navigator)
-    return run
-
-
-def _joint_nees(world: RadioWorld, navigator: RadioNavigator) -> tuple[float, int]:
-    """Of what is on the map: radios whose readings still wait are left out."""
+    # Radios whose readings still wait are not on the map.
     placed = [name for name in world.beacons_m if name in navigator.slam.engine]
     mean, covariance = navigator.slam.joint(placed)
     truth = np.concatenate([world.pose, *(world.beacons_m[name] for name in placed)])
-    return _nees(mean - truth, covariance), truth.size
+    run.joint_nees = _nees(mean - truth, covariance), truth.size
+    return run
 
 
 def _note(run: RadioRun, world: RadioWorld, navigator: RadioNavigator, target: str) -> None:
@@ -141,25 +136,27 @@ TARGET_COLUMNS = (
 
 def run_job(job: Job) -> JobOutcome:
     """One run."""
-    return outcome_of(job.radio, run_radio(job.radio))
+    return outcome_of(job.cfg, run_radio(job.cfg))
 
 
 def outcome_of(cfg: RadioConfig, run: RadioRun) -> JobOutcome:
     """Figures of a run, and its errors over time."""
     truth, estimates = np.array(run.truth), np.array(run.estimates)
     reckoned = truth + np.array(run.reckoned_errors)
-    turn, shift = rigid(estimates, truth)
-    names = [name for name in run.places if name != cfg.follow.target]
-    finals = {name: run.places[name] for name in names}
+    (turn, shift), (reckoned_turn, reckoned_shift) = rigid(estimates, truth), rigid(reckoned, truth)
+    finals = {name: place for name, place in run.places.items() if name != cfg.follow.target}
+    names = list(finals)
     values: dict[str, Any] = {
-        "beacons_m": {name: _length(mean - true) for name, (mean, _, true) in finals.items()},
-        "beacons_aligned_m": {name: _length(turn @ mean + shift - true) for name, (mean, _, true) in finals.items()},
+        "beacons_m": {name: float(np.hypot(*(mean - true))) for name, (mean, _, true) in finals.items()},
+        "beacons_aligned_m": {
+            name: float(np.hypot(*(turn @ mean + shift - true))) for name, (mean, _, true) in finals.items()
+        },
         "beacons_rmse_m": {name: _rms(np.array(run.beacon_errors_m[name])) for name in names},
         "beacons_hit": {name: run.beacon_nees[name][-1] < _HIT for name in names},
         "pose_m": _rms(estimates - truth),
         "pose_aligned_m": _rms(estimates @ turn.T + shift - truth),
         "reckoned_m": _rms(reckoned - truth),
-        "reckoned_aligned_m": _rms(_aligned(reckoned, truth) - truth),
+        "reckoned_aligned_m": _rms(reckoned @ reckoned_turn.T + reckoned_shift - truth),
         "heading_rad": _rms(np.array(run.pose_errors)[:, 2]),
         "nis": [sum(nis for nis, _ in run.nis), sum(size for _, size in run.nis)],
         "nees": list(run.joint_nees),
@@ -176,9 +173,12 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """The runs of a cell pooled: errors, coverage, consistency with the 95 % bands of their chi-squared sums."""
     del factors
     runs = [outcome.values for outcome in outcomes]
+
+    def mean(key: str) -> float:
+        return float(np.mean([run[key] for run in runs]))
+
     nis, rows = (float(sum(run["nis"][k] for run in runs)) for k in (0, 1))
     nees, states = (float(sum(run["nees"][k] for run in runs)) for k in (0, 1))
-    pose_m, reckoned_m = (float(np.mean([run[key] for run in runs])) for key in ("pose_m", "reckoned_m"))
     values: dict[str, Any] = {
         "beacons_m": _spread([e for run in runs for e in run["beacons_m"].values()]),
         "beacons_aligned_m": _spread([e for run in runs for e in run["beacons_aligned_m"].values()]),
@@ -187,12 +187,12 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
             name: float(np.mean([run["beacons_rmse_m"][name] for run in runs if name in run["beacons_rmse_m"]]))
             for name in runs[0]["beacons_rmse_m"]
         },
-        "pose_m": pose_m,
-        "reckoned_m": reckoned_m,
-        "pose_ratio": pose_m / reckoned_m,
-        "pose_aligned_m": float(np.mean([run["pose_aligned_m"] for run in runs])),
-        "reckoned_aligned_m": float(np.mean([run["reckoned_aligned_m"] for run in runs])),
-        "heading_rad": float(np.mean([run["heading_rad"] for run in runs])),
+        "pose_m": mean("pose_m"),
+        "reckoned_m": mean("reckoned_m"),
+        "pose_ratio": mean("pose_m") / mean("reckoned_m"),
+        "pose_aligned_m": mean("pose_aligned_m"),
+        "reckoned_aligned_m": mean("reckoned_aligned_m"),
+        "heading_rad": mean("heading_rad"),
         "nis": nis / max(rows, 1.0),
         "nis_band": _band(rows),
         "nees": nees / max(states, 1.0),
@@ -203,7 +203,7 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
         values |= {
             "target_m": _spread([run["target_m"] for run in runs]),
             "target_aligned_m": _spread([run["target_aligned_m"] for run in runs]),
-            "target_covered": float(np.mean([run["target_covered"] for run in runs])),
+            "target_covered": mean("target_covered"),
             "nearest_m": min(run["nearest_m"] for run in runs),
         }
     arrays = {name: np.stack([o.arrays[name] for o in outcomes if name in o.arrays]) for name in outcomes[0].arrays}
@@ -230,15 +230,6 @@ def _target_figures(cfg: RadioConfig, run: RadioRun, turn: FloatArray, shift: Fl
         "target_covered": float(np.mean(covered)),
         "nearest_m": min(run.distances_m),
     }
-
-
-def _aligned(points: FloatArray, onto: FloatArray) -> FloatArray:
-    turn, shift = rigid(points, onto)
-    return np.asarray(points @ turn.T + shift)
-
-
-def _length(vector: FloatArray) -> float:
-    return float(np.hypot(vector[0], vector[1]))
 
 
 def _rms(errors: FloatArray) -> float:

@@ -1,22 +1,20 @@
-"""The events of a run through a localizer.
-
-A filter that keeps what is done to it, so that a smoother can go back over it.
-"""
+"""Replay: the events of a recorded run through a localizer, judged against the truth or against the run itself."""
 
 from array import array
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ccatp.config.models import Config
 from ccatp.control.motion_checks import as_standing
 from ccatp.core import DeckPose, FloatArray, IntArray
 from ccatp.estimation.fixes import FixRefused
 from ccatp.filters.base import Filter, FilterError, Innovation, Observation, Transition
-from ccatp.filters.smoother import ROUNDING, Smoother
+from ccatp.filters.smoother import ROUNDING, Smoothed, Smoother
 from ccatp.localizer import FOUR_STATE, Localizer, build_doubting, build_localizer
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import MirrorError
@@ -26,43 +24,35 @@ from ccatp.records.run_reader import Event, Fixed, Marked, Trace, TraceBuilder
 REACH = 2000
 # Steps in one smoother: some 30 MB at 19 states, so that going back needs little more memory than the record itself.
 CHAPTER = 4096
+# Wheels that turn faster than this move the robot: ten times the noise of an encoder that gives rates.
+TURNING_RAD_S = 0.01
+REPRODUCED = 1e-9
+"""Largest difference, m and rad, with which a replay counts as the run again: rounding and nothing else."""
 
 
-class _Step(NamedTuple):
-    """x' = F x + ..., P' = F P F^T + Q: what a smoother needs of a transition."""
-
-    F: FloatArray
-    predicted: FloatArray
-    Q: FloatArray
-
-
-class _Past(NamedTuple):
-    """The state before a call, and the transition that the call was; None for an update."""
-
-    mean: FloatArray
-    covariance: FloatArray
-    step: _Step | None
+# -- a filter that can be smoothed ------------------------------------------------------------------------------------
 
 
 class _State(NamedTuple):
-    """A mean and its covariance: all that a smoother asks of a filter."""
+    """A mean and its covariance: all that a smoother reads of a filter."""
 
     mean: FloatArray
     covariance: FloatArray
 
 
-class SmoothedPoses(NamedTuple):
-    """The first three states, given everything recorded: means (k, 3) and covariances (k, 3, 3) of k states."""
+class _Past(NamedTuple):
+    """The state before a call, and F, predicted mean and Q of the transition that the call was; None for an update."""
 
-    means: FloatArray
-    covariances: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+    step: tuple[FloatArray, FloatArray, FloatArray] | None
 
 
 class RecordingFilter:
-    """Does what the filter in it does, and records every transition of the state.
+    """Does what the filter in it does, and records every transition of the state, so that a smoother can go back.
 
     A ``reset`` is one of three things. To a state that the filter has been in: it is taken back there, and what came
-    after is forgotten. From a state in which nothing was recorded yet: the beginning. Anything else is a transition of
+    after is removed. From a state in which nothing was recorded yet: the beginning. Anything else is a transition of
     its own (``transition_of_reset``).
 
     The record costs ``Smoother``'s memory, 9 kB a transition at 19 states.
@@ -91,7 +81,7 @@ class RecordingFilter:
         self._filter.predict(F, Q)
         self._look()
         noise = added_noise(covariance, self.transition, self.covariance, Q)
-        self._keep(_Past(mean, covariance, _Step(self.transition, self.mean, noise)))
+        self._keep(_Past(mean, covariance, (self.transition, self.mean, noise)))
 
     def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
         """As ``Filter.update``."""
@@ -103,18 +93,18 @@ class RecordingFilter:
 
     def reset(self, mean: FloatArray, covariance: FloatArray) -> None:
         """As ``Filter.reset``."""
-        before = _State(self.mean, self.covariance)
+        mean_before, covariance_before = self.mean, self.covariance
         is_beginning = not self.count and not self._past
         is_back = self._take_back(mean, covariance)
         self._filter.reset(mean, covariance)
         self._look()
         if is_beginning or is_back:
             return
-        F, Q = transition_of_reset(before.covariance, self.covariance)
-        self._keep(_Past(before.mean, before.covariance, _Step(F, self.mean, Q)))
+        F, Q = transition_of_reset(covariance_before, self.covariance)
+        self._keep(_Past(mean_before, covariance_before, (F, self.mean, Q)))
 
     def _take_back(self, mean: FloatArray, covariance: FloatArray) -> bool:
-        """Forget everything after the state with these arrays, where the filter has been in it."""
+        """Remove everything after the state with these arrays, where the filter has been in it."""
         if mean is self.mean and covariance is self.covariance:
             return True
         past = self._past
@@ -141,8 +131,8 @@ class RecordingFilter:
         self._chapters[-1].record(mean, covariance, *step)
         self._recorded += 1
 
-    def smooth(self) -> SmoothedPoses:
-        """The first three states after 0, 1, ... ``count`` transitions, given everything.
+    def smooth(self) -> Smoothed:
+        """The first three states after 0, 1, ... ``count`` transitions, given everything; (k, 3) and (k, 3, 3).
 
         Nothing can be taken back afterwards.
 
@@ -161,7 +151,7 @@ class RecordingFilter:
             last = first + len(chapter)
             means[first:last], covariances[first:last] = found.means[:-1, :3], found.covariances[:-1, :3, :3]
             end = _State(found.means[0], found.covariances[0])
-        return SmoothedPoses(means, covariances)
+        return Smoothed(means, covariances)
 
 
 def added_noise(P: FloatArray, F: FloatArray, predicted: FloatArray, Q: FloatArray) -> FloatArray:
@@ -183,7 +173,7 @@ def added_noise(P: FloatArray, F: FloatArray, predicted: FloatArray, Q: FloatArr
 def transition_of_reset(before: FloatArray, after: FloatArray) -> tuple[FloatArray, FloatArray]:
     """F and Q (n, n) of a reset, from the covariances (n, n) around it.
 
-    States whose variance changed are drawn anew (their rows of F are zero), the others keep what was known of them; a
+    States whose variance changed are drawn again (their rows of F are zero), the others keep what was known of them; a
     change of the mean alone shifts the state. That holds where the reset left the covariance of the others as it was
     and cut them from those that it drew; otherwise nothing before it says anything of what came after.
     """
@@ -198,13 +188,12 @@ def transition_of_reset(before: FloatArray, after: FloatArray) -> tuple[FloatArr
     return F, Q
 
 
-# Wheels that turn faster than this move the robot: ten times the noise of an encoder that gives rates.
-TURNING_RAD_S = 0.01
+# -- replay -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(slots=True)
 class Replayed:
-    """What a localizer made of a run.
+    """The estimates of a localizer for a run.
 
     Attributes:
         trace: its estimates, each before the fix that was taken there.
@@ -212,7 +201,7 @@ class Replayed:
         feet: of the fixes taken then: frame before them, deck x, y of the robot's origin as they show it, shape (f, 3).
         fixes: measured; of them ``set_aside`` were kept from the localizer in the run, and are here, and ``refused``
             were not taken by this localizer.
-        first_difference: the first fix of another fate than in the run: its time, and what the localizer said to it.
+        first_difference: the first fix of another fate than in the run: its time, and the localizer's reason.
     """
 
     trace: Trace
@@ -244,7 +233,7 @@ def replay(
     Args:
         events: see ``in_order``.
         smooth: go back over the run with the smoother afterwards.
-        on_frame: told the robot time of each frame, s.
+        on_frame: receives the robot time of each frame, s.
 
     Raises:
         ValueError: the filter has no smoother.
@@ -295,17 +284,14 @@ class _Player:
             counts=dict(self._localizer.counts),
         )
 
-    def _begin(self, values: tuple[float, ...]) -> None:
-        """A main loop that took over from another one began where the robot was seen last."""
-        if self._recording is not None and self._seq >= 0:
-            raise FilterError("the main loop was started anew within this recording, and no smoother goes across that")
-        x_m, y_m, heading_rad, *sigmas = values
-        pose = DeckPose(x_m, y_m, heading_rad)
-        self._localizer = build_doubting(self._cfg, self._mirror, pose, (sigmas[0], sigmas[1]), self._wrap)
-
     def _take_frame(self, event: Marked) -> None:
         if event.begun is not None:
-            self._begin(event.begun)
+            # A main loop that took over from another one began where the robot was seen last.
+            if self._recording is not None and self._seq >= 0:
+                raise FilterError("the main loop was restarted within this recording, and no smoother goes across that")
+            x_m, y_m, heading_rad, *sigmas = event.begun
+            pose = DeckPose(x_m, y_m, heading_rad)
+            self._localizer = build_doubting(self._cfg, self._mirror, pose, (sigmas[0], sigmas[1]), self._wrap)
         localizer, sensors = self._localizer, event.sensors
         imu, enc = ((), as_standing(sensors.enc)) if event.is_odometry_off else (sensors.imu, sensors.enc)
         localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
@@ -318,9 +304,9 @@ class _Player:
         self._seq = sensors.seq
         if any(abs(right or 0.0) > TURNING_RAD_S or abs(left or 0.0) > TURNING_RAD_S for _, right, left in sensors.enc):
             self._moving.append(sensors.seq)
-        pose = localizer.pose
-        row, col = pose.panel
-        self._builder.add(sensors.seq, sensors.t, row, col, (pose.x_m, pose.y_m, pose.heading_rad))
+        here = localizer.pose
+        row, col = here.panel
+        self._builder.add(sensors.seq, sensors.t, row, col, (here.x_m, here.y_m, here.heading_rad))
         self._builder.add_covariance(localizer.pose_covariance)
         if self._recording is not None:
             self._steps.append(self._recording.count)
@@ -353,3 +339,208 @@ class _Player:
         steps = np.array(self._steps, dtype=np.int64)
         corrections = means[steps] - np.array(self._states).reshape(-1, 3)
         return trace.moved_to(self._mirror, trace.pose + corrections, covariances[steps])
+
+
+# -- judgement --------------------------------------------------------------------------------------------------------
+
+
+class ReplayErrors(NamedTuple):
+    """Differences of an estimate from its reference in the frames that both have.
+
+    Attributes:
+        distance_m: along a straight line, shape (k,).
+        turn_rad: of the heading, in (-pi, pi], shape (k,).
+        is_moving: the wheels turn, shape (k,).
+        is_arrival: the robot has just come to rest at a point for the first time, shape (k,).
+        nees: normalised estimation error squared of x, y and heading; 3 in the mean where the covariance is right;
+            NaN where there is none; shape (k,).
+    """
+
+    distance_m: FloatArray
+    turn_rad: FloatArray
+    is_moving: NDArray[np.bool_]
+    is_arrival: NDArray[np.bool_]
+    nees: FloatArray
+
+
+def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: IntArray) -> ReplayErrors:
+    """Compare in the frames that both have.
+
+    Args:
+        arrivals: frames at whose end the robot stood at a point for the first time.
+    """
+    seqs, i, j = np.intersect1d(estimate.seq, reference.seq, return_indices=True)
+    offset = estimate.place[i] - reference.place[j]
+    turn = estimate.pose[i, 2] - reference.pose[j, 2]
+    turn = turn - 2.0 * np.pi * np.round(turn / (2.0 * np.pi))  # exactly zero for equal angles
+    nees = np.full(len(seqs), np.nan)
+    if estimate.covariance is not None:
+        error = np.column_stack([offset[:, :2], turn])
+        covariance = estimate.covariance[i]
+        is_usable = np.linalg.det(covariance) > 0.0
+        solved = np.linalg.solve(covariance[is_usable], error[is_usable][:, :, None])[:, :, 0]
+        nees[is_usable] = (error[is_usable] * solved).sum(axis=1)
+    distance = np.linalg.norm(offset, axis=1)
+    return ReplayErrors(distance, turn, np.isin(seqs, moving), np.isin(seqs, arrivals), nees)
+
+
+def fix_distances_m(estimate: Trace, feet: FloatArray, mirror: Mirror) -> FloatArray:
+    """How far each fix was from the estimate before it, m, shape (f,).
+
+    Args:
+        estimate: before each fix.
+        feet: frame before the fix, deck x, y of the robot's origin as the fix shows it, shape (f, 3).
+    """
+    x, y = feet[:, 1], feet[:, 2]
+    places = estimate.place[np.searchsorted(estimate.seq, feet[:, 0])]
+    distances: FloatArray = np.linalg.norm(places - np.column_stack([x, y, mirror.surface.heights_m(x, y)]), axis=1)
+    return distances
+
+
+def figures(errors: ReplayErrors) -> dict[str, Any]:
+    """The figures of a table: lengths in mm, angles in mrad; None where there is nothing to take them from."""
+    distance_mm = 1e3 * errors.distance_m
+    known = errors.nees[np.isfinite(errors.nees)]
+    return {
+        "position_error_mm": _distribution(distance_mm),
+        "moving_error_mm": {"rms": _rms(distance_mm[errors.is_moving])},
+        "arrival_error_mm": _rms_and_max(distance_mm[errors.is_arrival]),
+        "heading_error_mrad": {"rms": _rms(1e3 * errors.turn_rad)},
+        "nees_mean": float(known.mean()) if known.size else None,
+    }
+
+
+def difference(errors: ReplayErrors) -> dict[str, Any]:
+    """How far replayed estimates are from the recorded ones, and whether that is only rounding."""
+    distance, turn = errors.distance_m, np.abs(errors.turn_rad)
+    return {
+        "frames": int(distance.size),
+        "position_mm": _rms_and_max(1e3 * distance),
+        "heading_mrad": _rms_and_max(1e3 * turn),
+        "reproduced": bool(distance.size and max(distance.max(), turn.max()) <= REPRODUCED),
+    }
+
+
+def _distribution(values: FloatArray) -> dict[str, float | None]:
+    if not values.size:
+        return dict.fromkeys(("mean", "p50", "p99", "max"))
+    p50, p99 = np.percentile(values, (50, 99)).tolist()
+    return {"mean": float(values.mean()), "p50": p50, "p99": p99, "max": float(values.max())}
+
+
+def _rms(values: FloatArray) -> float | None:
+    return float(np.sqrt(np.mean(np.square(values)))) if values.size else None
+
+
+def _rms_and_max(values: FloatArray) -> dict[str, float | None]:
+    return {"rms": _rms(values), "max": float(values.max()) if values.size else None}
+
+
+class ReplayEvaluation(NamedTuple):
+    """One recording and its replay.
+
+    Attributes:
+        arrivals: frames at which the robot stood at a point for the first time.
+    """
+
+    replayed: Replayed
+    recorded: Trace
+    truth: Trace | None
+    arrivals: IntArray
+    mirror: Mirror
+
+
+def judge(parts: Sequence[ReplayEvaluation]) -> dict[str, Any]:
+    """Errors of recorded, replayed and smoothed estimates, and how far the replay is from the record.
+
+    Errors are those against the truth where every recording has one, else against the run's own estimates: then there
+    are none of the recorded ones. How far each fix was from the estimate before it is known without any truth.
+    """
+    truths = [part.truth for part in parts if part.truth is not None]
+    recorded = [part.recorded for part in parts]
+    replayed = [part.replayed.trace for part in parts]
+    smoothed = [part.replayed.smoothed for part in parts if part.replayed.smoothed is not None]
+    has_truth = len(truths) == len(parts)
+    references = truths if has_truth else recorded
+
+    def errors(estimates: Sequence[Trace], references: Sequence[Trace]) -> ReplayErrors:
+        each = [
+            errors_of(estimate, reference, part.replayed.moving, part.arrivals)
+            for part, estimate, reference in zip(parts, estimates, references, strict=True)
+        ]
+        return ReplayErrors(*(np.concatenate(column) for column in zip(*each, strict=True)))
+
+    def fix_distance_mm(estimates: Sequence[Trace]) -> dict[str, float | None]:
+        each = [
+            fix_distances_m(estimate, part.replayed.feet, part.mirror)
+            for part, estimate in zip(parts, estimates, strict=True)
+        ]
+        return _distribution(1e3 * np.concatenate(each))
+
+    return {
+        "reference": "truth" if has_truth else "recorded",
+        "recorded": {
+            **(figures(errors(recorded, truths)) if has_truth else {}),
+            "fix_distance_mm": fix_distance_mm(recorded),
+        },
+        "replayed": {**figures(errors(replayed, references)), "fix_distance_mm": fix_distance_mm(replayed)},
+        "smoothed": figures(errors(smoothed, references)) if len(smoothed) == len(parts) else None,
+        "difference": difference(errors(replayed, recorded)),
+    }
+
+
+# Section and key of a figure, and its name for a reader.
+_ROWS = (
+    ("position_error_mm", "mean", "position mean (mm)"),
+    ("position_error_mm", "p50", "position p50 (mm)"),
+    ("position_error_mm", "p99", "position p99 (mm)"),
+    ("position_error_mm", "max", "position max (mm)"),
+    ("moving_error_mm", "rms", "in motion rms (mm)"),
+    ("arrival_error_mm", "rms", "at arrivals rms (mm)"),
+    ("arrival_error_mm", "max", "at arrivals max (mm)"),
+    ("heading_error_mrad", "rms", "heading rms (mrad)"),
+)
+_FIX_ROWS = (("fix_distance_mm", "mean", "mean (mm)"), ("fix_distance_mm", "max", "max (mm)"))
+_POSE = ("x_m", "y_m", "heading_rad")
+
+
+def table_lines(result: Mapping[str, Any]) -> Iterator[str]:
+    """The result of ``judge`` as a table: a column for each estimate, a dash for what is not known."""
+    names = [name for name in ("recorded", "replayed", "smoothed") if result[name] is not None]
+    columns = [result[name] for name in names]
+    yield _line(f"error against {'the truth' if result['reference'] == 'truth' else 'the recorded estimate'}", names)
+    for section, key, name in _ROWS:
+        yield _line(f"  {name}", [_cell(column.get(section, {}).get(key)) for column in columns])
+    yield _line("  NEES mean (3 is right)", [_cell(column.get("nees_mean")) for column in columns])
+    yield _line("distance of the fixes", names)
+    for section, key, name in _FIX_ROWS:
+        yield _line(f"  {name}", [_cell(column.get(section, {}).get(key)) for column in columns])
+    found = result["difference"]
+    yield _line("replayed less recorded", ["rms", "max"])
+    for section, name in (("position_mm", "position (mm)"), ("heading_mrad", "heading (mrad)")):
+        yield _line(f"  {name}", [_cell(found[section]["rms"]), _cell(found[section]["max"])])
+
+
+def _line(name: str, cells: Sequence[str]) -> str:
+    return f"{name:<34}" + "".join(f"{cell:>12}" for cell in cells)
+
+
+def _cell(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4f}" if value == 0.0 or abs(value) >= 1e-3 else f"{value:.1e}"
+
+
+def csv_lines(parts: Sequence[ReplayEvaluation]) -> Iterator[str]:
+    """Poses of each frame, deck frame: replayed, smoothed, recorded and true; empty where there is none."""
+    others = [f"{name}_{key}" for name in ("smoothed", "recorded", "true") for key in _POSE]
+    yield ",".join(("part", "seq", "t_s", *_POSE, *others))
+    for number, part in enumerate(parts, 1):
+        trace = part.replayed.trace
+        poses_of = [
+            {} if other is None else dict(zip(other.seq.tolist(), other.pose.tolist(), strict=True))
+            for other in (part.replayed.smoothed, part.recorded, part.truth)
+        ]
+        for seq, t_s, pose in zip(trace.seq.tolist(), trace.t_s.tolist(), trace.pose.tolist(), strict=True):
+            found = [cell for poses in poses_of for cell in poses.get(seq, ("", "", ""))]
+            yield ",".join(str(cell) for cell in (number, seq, t_s, *pose, *found))

@@ -1,42 +1,262 @@
 """A whole mission in one process: the daemon's own localizer, danger rules, mission and gate against the sim.
 
-What the sockets carry is handed over directly; the order of events is that of lockstep, so that a rehearsal and a run
-of the daemon with the same configuration and seed go through the same states.
+What the sockets carry is handed over directly; the order of events is that of lockstep, so that a mission here and a
+run of the daemon with the same configuration and seed go through the same states.
 """
 
-from collections import defaultdict
+from collections import defaultdict, deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import hypot
+from typing import Any
 
 import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.control.motion_checks import as_standing
 from ccatp.control.prediction import CommandPredictor
-from ccatp.core import EventCode, Fix, PanelPose, twist_of
+from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelId, PanelPose, PointId, difference, twist_of
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.fixes import FixGated, FixRefused
+from ccatp.links import multiline
 from ccatp.links.robot_codec import set_point_on_wire
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.localizer import Localizer
-from ccatp.mirror.multilateration import MultilaterationError
+from ccatp.mirror.mirror import Mirror, deck_poses
+from ccatp.mirror.misalignment import PanelMisalignment, fit_panel
+from ccatp.mirror.multilateration import MultilaterationError, solve_fix
+from ccatp.mirror.surface import PanelFitError
+from ccatp.records.summary import RunFacts, SummaryBuilder, puck_targets
 from ccatp.safety.robot_clock import SteadyTime
 from ccatp.safety.wheel_monitors import CommandSpan
 from ccatp.sim.fault_plan import FaultPlan
+from ccatp.sim.laser import SEED_STREAM, EtalonModel, PuckTruth
 from ccatp.sim.robot import Robot
-from ccatp.studies.sil_models import SilLaser, SilResult, SilTrace
+from ccatp.sim.world import TruthRow
 from ccatp.survey.composition import SurveyParts, assemble
+from ccatp.survey.mission import Mission
 from ccatp.survey.route_follower import StateEstimate
-from ccatp.survey.state import DONE, MissionState, SurveyOutcome
+from ccatp.survey.state import DONE, ApproachCounter, MissionState, SurveyOutcome
 
 # A mission that takes this many times its bound hangs; the robot's own deadlines should have ended it long before.
 _ENDLESS = 6.0
+_BATCH = 1000  # frames that go to the summary at a time
+_RECENT = 64  # frames of truth at hand: more than any delay of the sensors
+_MIN_FIXES = 3
+
+
+@dataclass(slots=True)
+class StopRow:
+    """One measurement of a point, before its fix is fused.
+
+    Attributes:
+        approach: 1 at the first arrival.
+        error: true minus estimated pose: x, y (deck, m), heading (rad).
+        covariance: of the estimate of the three, shape (3, 3).
+        distance_m: true distance of the puck's foot from the point.
+        nis: normalised innovation squared of the fix (two degrees of freedom), NaN where it is not known.
+        fix_distance_m: the same distance as the fix shows it, after fusing.
+    """
+
+    t_s: float
+    point: tuple[int, int, int]
+    approach: int
+    error: tuple[float, float, float]
+    covariance: np.ndarray[Any, np.dtype[np.float64]]
+    distance_m: float
+    nis: float = float("nan")
+    fix_distance_m: float = float("nan")
+
+
+@dataclass(slots=True)
+class SilResult:
+    """The result of a mission.
+
+    Attributes:
+        summary: as in ``summary.json``.
+        corrections: moves after a fix that showed the robot too far from its point.
+        track: rows of t, true x, y, heading, estimated x, y, heading (deck), shape (k, 7), where it was asked for.
+    """
+
+    summary: dict[str, Any]
+    stops: list[StopRow]
+    corrections: int
+    counts: dict[str, int]
+    outcome: str
+    cause: str
+    states_s: dict[str, float]
+    track: np.ndarray[Any, np.dtype[np.float64]] | None = None
+    notices: list[str] = field(default_factory=list)
+
+    @property
+    def mission_time_s(self) -> float:
+        """Robot time from start to end."""
+        return float(self.summary["mission_time_s"])
+
+
+class SilTrace:
+    """Truth and estimate of every frame on their way to the summary, converted a thousand at a time.
+
+    Args:
+        with_track: keep true and estimated pose of every frame.
+    """
+
+    def __init__(self, parts: SurveyParts, *, with_track: bool) -> None:
+        cfg, mirror = parts.cfg, parts.mirror
+        facts = RunFacts(
+            mirror=cfg.mirror.name,
+            world=cfg.world.name,
+            filter=cfg.run.filter,
+            seed=cfg.run.seed,
+            total_points=parts.total_points,
+            lower_bound_s=parts.lower_bound_s,
+            budget_s=cfg.run.budget_s,
+            puck_height_m=cfg.robot.puck_height_m,
+            has_truth=True,
+        )
+        targets = puck_targets(mirror, parts.points, cfg.robot.puck_height_m)
+        self.builder = SummaryBuilder(facts, targets, mirror.surface.normal)
+        self._mirror, self._with_track = mirror, with_track
+        self._truth: list[TruthRow] = []
+        self._recent: deque[TruthRow] = deque(maxlen=_RECENT)
+        self._estimates: list[tuple[int, float, PanelPose]] = []
+        self._true_rows: list[FloatArray] = []
+        self._track_rows: list[FloatArray] = []
+
+    def note_truth(self, row: TruthRow) -> None:
+        """The truth at the newest frame."""
+        self._truth.append(row)
+        self._recent.append(row)
+
+    def note_estimate(self, seq: int, t_s: float, pose: PanelPose) -> None:
+        """The estimate after frame ``seq``."""
+        self._estimates.append((seq, t_s, pose))
+        if len(self._estimates) >= _BATCH:
+            self._flush()
+
+    def truth_at(self, seq: int) -> TruthRow:
+        """The truth at one of the newest frames."""
+        return next(row for row in self._recent if row[0] == seq)
+
+    def _flush(self) -> None:
+        if self._truth:
+            truth = np.array(self._truth, dtype=np.float64)
+            self._truth.clear()
+            self.builder.add_truth(truth)
+            if self._with_track:
+                self._true_rows.append(truth[:, :5])
+        if self._estimates:
+            seqs, times_s, poses = zip(*self._estimates, strict=True)
+            self._estimates.clear()
+            x, y, heading, z = deck_poses(self._mirror, poses).T
+            rows = np.column_stack([np.array(seqs, dtype=np.float64), times_s, x, y, heading, x, y, z])
+            self.builder.add_track(rows)
+            if self._with_track:
+                self._track_rows.append(rows[:, :5])
+
+    def summary(
+        self,
+        mission: Mission,
+        mission_time_s: float,
+        fits: Mapping[PanelId, tuple[float, float, float]],
+        misalignments: Mapping[PanelId, PanelMisalignment],
+    ) -> dict[str, Any]:
+        """The summary of the whole run; ``fits`` has piston (m), tip and tilt (rad) of panels as fitted."""
+        self._flush()
+        injected = {panel: (m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in misalignments.items()}
+        self.builder.set_mission(len(mission.done), len(mission.skipped), mission_time_s)
+        self.builder.set_panels(fits, injected)
+        return self.builder.build()
+
+    def track(self) -> FloatArray | None:
+        """Rows of t, true x, y, heading, estimated x, y, heading, shape (k, 7), after the summary; None without."""
+        if not self._track_rows:
+            return None
+        true, rows = np.concatenate(self._true_rows), np.concatenate(self._track_rows)
+        _, i, j = np.intersect1d(true[:, 0], rows[:, 0], return_indices=True)
+        return np.column_stack([true[i, 1:], rows[j, 2:]])
+
+
+class SilLaser:
+    """Measures the puck of a simulated robot and keeps the measurements.
+
+    Args:
+        cfg: its seed seeds the lengths' noise.
+
+    Attributes:
+        stops: measurements whose fix was fused, in their order.
+    """
+
+    def __init__(self, cfg: Config, mirror: Mirror, robot: Robot) -> None:
+        self._cfg, self._mirror, self._robot = cfg, mirror, robot
+        channels, collimators_m = mirror.channels, mirror.collimators_m
+        rng = np.random.default_rng([cfg.run.seed, SEED_STREAM])
+        self._etalon = EtalonModel(cfg.sim.etalon, channels, collimators_m, rng)
+        self._collimators_m = dict(zip(channels, collimators_m, strict=True))
+        self._approaches = ApproachCounter(cfg.mission.correction_tolerance_m, cfg.mission.max_approaches)
+        self._fixes: dict[PanelId, list[Fix]] = {}
+        self.stops: list[StopRow] = []
+
+    def fix(self, t_s: float, estimate: DeckPose) -> Fix:
+        """Measure now; the fix belongs to the frame of time ``t_s``.
+
+        Raises:
+            MultilaterationError: no solution, or one past a limit.
+        """
+        robot, channels = self._robot, self._mirror.channels
+        puck = PuckTruth(robot.t_s, robot.world.puck_world(), robot.world.moved_m())
+        data = multiline.ChannelData(self._etalon.records(channels, puck))
+        lengths_m, _ = multiline.valid_lengths(data, channels)
+        expected_m = self._mirror.puck_world(estimate, self._cfg.robot.puck_height_m)
+        return solve_fix(self._cfg.etalon, t_s, expected_m, lengths_m, self._collimators_m)
+
+    def stop_row(self, t_s: float, point: PointId, truth: TruthRow, localizer: Localizer) -> StopRow:
+        """The state in which a point is measured, before its fix."""
+        _, _, true_x_m, true_y_m, true_heading_rad, *_ = truth
+        deck = localizer.deck_pose
+        x_m, y_m = self._mirror.point_on_deck(point)
+        error = true_x_m - deck.x_m, true_y_m - deck.y_m, difference(true_heading_rad, deck.heading_rad)
+        covariance, distance_m = localizer.pose_covariance.copy(), hypot(true_x_m - x_m, true_y_m - y_m)
+        return StopRow(t_s, (point.row, point.col, point.point), 0, error, covariance, distance_m)
+
+    def is_too_far(self, row: StopRow, point: PointId, fix: Fix, distance_m: float, localizer: Localizer) -> bool:
+        """Keep a fix that was fused; whether the point has to be approached again.
+
+        Args:
+            row: the state before it.
+            distance_m: of the robot from the point, as the fix shows it.
+        """
+        row.fix_distance_m = distance_m
+        if localizer.innovation is not None and localizer.innovation.size == 2:
+            row.nis = localizer.innovation.nis
+        is_too_far = self._approaches.is_too_far(point, distance_m, localizer.position_sigma_m)
+        row.approach = self._approaches.count
+        self.stops.append(row)
+        if not is_too_far:
+            self._fixes.setdefault(point.panel, []).append(fix)
+        return is_too_far
+
+    def panel_fits(self) -> dict[PanelId, tuple[float, float, float]]:
+        """Piston (m), tip and tilt (rad) of every panel with enough fixes."""
+        fits = {}
+        for panel, fixes in sorted(self._fixes.items()):
+            if len(fixes) < _MIN_FIXES:
+                continue
+            points = np.array([fix.position_m for fix in fixes])
+            covariances = np.array([fix.covariance_m2 for fix in fixes]).reshape(-1, 3, 3)
+            try:
+                fit = fit_panel(self._mirror, panel, points, covariances, self._cfg.robot.puck_height_m)
+            except PanelFitError:
+                continue
+            fits[panel] = fit.piston_m, fit.tip_rad, fit.tilt_rad
+        return fits
 
 
 def rehearse(cfg: Config, *, with_track: bool = False) -> SilResult:
-    """Survey the mirror of a configuration in its world.
+    """Survey the mirror of a configuration in its world; ``run.seed`` seeds everything.
 
     Args:
-        cfg: the configuration; ``run.seed`` seeds everything.
         with_track: keep true and estimated pose of every frame.
     """
     return SilRun(cfg, with_track=with_track).run()
@@ -45,11 +265,11 @@ def rehearse(cfg: Config, *, with_track: bool = False) -> SilResult:
 class SilRun:
     """The processes' parts side by side.
 
-    A subclass may exchange parts before ``run``, or look on by overriding what happens in a frame.
+    A subclass may exchange parts before ``run``, or override what happens in a frame.
 
     Args:
         with_track: keep true and estimated pose of every frame.
-        faults: what shall go wrong with the robot; ``FaultyRehearsal`` can serve it.
+        faults: of the robot; ``FaultySilRun`` can serve them.
     """
 
     def __init__(self, cfg: Config, *, with_track: bool, faults: FaultPlan | None = None) -> None:
@@ -91,8 +311,8 @@ class SilRun:
         limit_s = _ENDLESS * self.parts.lower_bound_s + 600.0
         while mission.state is not DONE:
             frame = robot.delivered
-            is_news = frame.seq > self.monitor.verdict.seq
-            t_s = self._time.at(frame.seq, frame.t) if is_news else last_s
+            is_new = frame.seq > self.monitor.verdict.seq
+            t_s = self._time.at(frame.seq, frame.t) if is_new else last_s
             self._serve(frame, t_s - last_s)
             last_s = t_s
             if mission.is_faulted or t_s - first_s > limit_s:
@@ -105,7 +325,7 @@ class SilRun:
         robot = self.robot
         self.book.note_truth(robot.world.truth_row(robot.seq, robot.t_s))
 
-    # -- a frame, as in processes.main_loop and processes.danger_loop -------------------------------------------------
+    # -- a frame, as in daemon.frame_service and daemon.danger_loop ---------------------------------------------------
 
     def _serve(self, frame: Sensors, dt_s: float) -> None:
         localizer, mission, robot = self.localizer, self.mission, self.robot
@@ -115,8 +335,7 @@ class SilRun:
         if verdict.code is not self._code:
             self._code = verdict.code
             self.book.builder.add_verdict_event(seq, verdict.code)
-        is_deaf = mission.ignores_motion
-        imu, enc = ((), as_standing(frame.enc)) if is_deaf else (frame.imu, frame.enc)
+        imu, enc = ((), as_standing(frame.enc)) if mission.ignores_motion else (frame.imu, frame.enc)
         localizer.step(t_s, imu, enc, frame.edge, frame.gravity)
         if localizer.hold_requested:
             mission.recover(localizer.hold_cause, t_s + self._time.offset_s)
@@ -170,21 +389,14 @@ class SilRun:
     def _publish(self, seq: int, t_s: float, pose: PanelPose, state: MissionState) -> None:
         self.book.note_estimate(seq, t_s, pose)
         if is_estimate_due(seq):
-            deck, sigma_m = self.localizer.deck_pose, self.localizer.position_sigma_m
-            x_m, y_m, heading_rad = deck.x_m, deck.y_m, deck.heading_rad
+            deck = self.localizer.deck_pose
             self._published = EstimateMessage(
-                seq=seq,
-                t_s=t_s,
-                x_m=x_m,
-                y_m=y_m,
-                heading_rad=heading_rad,
-                sigma_m=sigma_m,
-                state=state,
-                commanded=self._span.take(*self._driven),
+                seq=seq, t_s=t_s, x_m=deck.x_m, y_m=deck.y_m, heading_rad=deck.heading_rad,
+                sigma_m=self.localizer.position_sigma_m, state=state, commanded=self._span.take(*self._driven),
                 drive_seq=self._drive_seq,
-            )
+            )  # fmt: skip
 
-    # -- a measurement, as in processes.measuring ---------------------------------------------------------------------
+    # -- a measurement, as in daemon.fix_service ----------------------------------------------------------------------
 
     def _measure(self, frame: Sensors) -> None:
         mission, localizer, laser = self.mission, self.localizer, self.laser

@@ -1,138 +1,177 @@
-"""The study `thesis`: its five runs of 36 waypoints under four readings of its text, beside its own figures.
+"""The study `thesis`: the thesis's simulation again, its five runs of 36 waypoints beside its own figures.
 
-The readings are the parameters of ``thesis_replica``; a cell with one of them off shows what that one does. The cells
-of the system ``ours`` are the same waypoints and the same noise with the daemon's own filter and control.
+Four panels, its filter, its control, and two readings of what it prints; a cell with one of them off shows its effect:
 
-The figures of the study `thesis`, each after one of the thesis's: 2.9 to 2.12, 3.10 and 3.11.
+* ``noise_is_variance``: eq. 2.17 calls sigma a variance; then a sensor's standard deviation is the root of what table
+  2.1 lists. The filter's R follows, as the thesis adjusts it.
+* ``period_error``: the filter's time step is 10 ms, the loop takes longer by this part of it. The true robot moves for
+  longer than the filter believes; control and rules keep the true time.
+
+Both are properties of that simulation. A daemon that reads the time stamps of the samples has no period error. As in
+thesis 2.1.5 the angle at a seam replaces the heading here, however sure the filter is of another. The cells of the
+system ``ours`` are the same waypoints and the same noise with the daemon's own filter and control.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 from math import sqrt
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ccatp.report.plots import INK, QUIET, dress, new_figure
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Histogram, Job, JobOutcome, Study, pooled
-from ccatp.studies.figures import LIMIT, colour, save
-from ccatp.studies.mission_study import of_spread, of_values
-from ccatp.studies.thesis_replica import LIMIT_M, NOISES, PANELS, POINTS, overrides_of, run_replica
+from ccatp.config.models import Config
+from ccatp.core import EdgeSample, EventCode, Fix, FloatArray, GravitySample, ImuSample, Verdict, WheelSample
+from ccatp.danger import DangerMonitor
+from ccatp.estimation.measurements import STATES, THETA
+from ccatp.estimation.seams import SensorTransition
+from ccatp.estimation.thesis_localizer import FourStateLocalizer
+from ccatp.filters import FILTERS
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import EstimateMessage
+from ccatp.report.plots import INK, QUIET
+from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
+from ccatp.studies.mission_study import Histogram, of_histogram, of_values, pooled
+from ccatp.studies.results import LIMIT, colour, plot
+from ccatp.studies.sil_run import SilResult, SilRun
+from ccatp.survey.composition import assemble
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+FRAME_HZ = 100.0
+POINTS, PANELS = 36, 4
+LIMIT_M = 0.010
+# Accelerometer m/s^2, gyroscope rad/s, encoder rad/s: thesis table 2.1.
+_TABLE = {"normal": (0.0059, 0.0087, 0.001), "twice": (0.0118, 0.0175, 0.002)}
+_WORLDS = {"normal": "thesis", "twice": "thesis-x2"}
+_SENSORS = ("accelerometer_sigma_m_s2", "gyroscope_sigma_rad_s", "encoder_sigma_rad_s")
+# A block of 2 x 2 panels of thesis-m1 with others all round it: no rim within reach of a robot that turns.
+_BLOCK = (3, 4)  # its rows and columns, of the parity of the mirror's first ones (table 3.1)
+_SIDE = 6
+_LAYOUT: dict[str, object] = {
+    "run.mirror": "thesis-m1",
+    "run.order": "thesis",
+    "mirror.panels.count": _SIDE * _SIDE,
+    "mirror.panels.cols": _SIDE,
+    "mirror.panels.panels_per_row": [_SIDE] * _SIDE,
+    "mirror.base.row": _BLOCK[0],
+    "mirror.base.col": _BLOCK[0],
+}
 
 
-_NUMBERS = {"normal": ("2.9", "2.10", "3.10"), "twice": ("2.11", "2.12", "3.11")}
-_LIMIT_MM = 10.0
-_BIN_MM = 1.0
-
-
-def draw_thesis(
-    results: Sequence[CellResult], published: Mapping[str, Mapping[str, Mapping[str, float]]], out: Path
-) -> None:
-    """Draw the figures of both noises.
-
-    * ``trajectory_<noise>``: true and estimated way of the first run, the thesis's system with both readings.
-    * ``localization_<noise>``: cumulative distribution of the localization error, every cell.
-    * ``waypoints_<noise>``: the waypoint errors of all runs, and their histogram.
+def overrides_of(
+    noise: str, *, noise_is_variance: bool, period_error: float, is_ours: bool = False
+) -> dict[str, object]:
+    """Dotted configuration keys of one set-up.
 
     Args:
-        published: the thesis's figures by noise and quantity.
+        noise: ``normal`` or ``twice``.
+        period_error: by which part of the filter's step the loop takes longer.
+        is_ours: the daemon's filter and control in the same set-up, all encoder samples included.
     """
-    for noise, numbers in _NUMBERS.items():
-        mine = [result for result in results if result.factors["noise"] == noise]
-        nearest = [r for r in mine if r.factors["noise_is_variance"] and r.factors["period_error"]][:1]
-        if mine:
-            title = f"{noise} noise, as fig. {numbers[1]}"
-            _draw_localization(mine, published[noise]["localization"], title, out / f"localization_{noise}")
-        for result in nearest:
-            _draw_trajectory(result, f"{noise} noise, as fig. {numbers[0]}", out / f"trajectory_{noise}")
-            title = f"{noise} noise, as fig. {numbers[2]}"
-            _draw_waypoints(result, published[noise]["waypoint"], title, out / f"waypoints_{noise}")
+    sigmas = [sqrt(value) if noise_is_variance else value for value in _TABLE[noise]]
+    keys: dict[str, object] = {**_LAYOUT, "run.world": _WORLDS[noise]}
+    for name, sigma in zip(_SENSORS, sigmas, strict=True):
+        keys[f"world.{name}"] = keys[f"localizer.{name}"] = sigma
+    if is_ours:
+        return keys | {"run.filter": "ekf", "control.gains": "shipped"}
+    frame_hz = FRAME_HZ / (1.0 + period_error)
+    return keys | {
+        "run.filter": "kf",
+        "control.gains": "thesis",
+        "mission.max_approaches": 1,  # the thesis corrects no stop
+        "sim.robot.frame_hz": frame_hz,
+        # Thesis 2.1.4: of each sensor only the sample with the latest time stamp is used, one per frame.
+        "sim.robot.imu_hz": frame_hz,
+        "sim.robot.encoder_hz": frame_hz,
+        "sim.robot.edge_hz": 10.0 * frame_hz,
+    }
 
 
-def _draw_trajectory(result: CellResult, title: str, stem: Path) -> None:
-    track = np.asarray(result.arrays["track"], dtype=np.float64)
-    figure = new_figure(6.4, 6.0)
-    axes = figure.subplots()
-    axes.plot(track[:, 1], track[:, 2], color=colour(0), linewidth=1.6, label="true")
-    axes.plot(track[:, 3], track[:, 4], color=colour(1), linewidth=0.9, linestyle="--", label="estimated")
-    axes.set_aspect("equal")
-    axes.set_xlabel("x, m")
-    axes.set_ylabel("y, m")
-    axes.set_title(f"Way of one run, {title}")
-    axes.legend(frameon=False, fontsize=8)
-    dress(axes)
-    save(figure, stem)
+class ThesisLocalizer(FourStateLocalizer):
+    """The four-state localizer, closer to the letter of the thesis.
 
+    Attributes:
+        period_factor: its clock is its own: a step of so many times 10 ms counts as 10 ms.
+    """
 
-def _draw_localization(results: Sequence[CellResult], published: Mapping[str, float], title: str, stem: Path) -> None:
-    figure = new_figure(7.2, 5.2)
-    axes = figure.subplots()
-    for k, result in enumerate(results):
-        values, beyond = Histogram.from_arrays(dict(result.arrays), "localization").exceedance()
-        is_ours = result.factors["system"] == "ours"
-        axes.semilogx(
-            1e3 * values,
-            1.0 - beyond,
-            color=colour(k),
-            linestyle=":" if is_ours else "-",
-            linewidth=1.5,
-            label=_reading(result.factors),
+    period_factor = 1.0
+
+    def step(
+        self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample], edges: Sequence[EdgeSample],
+        gravity: GravitySample | None = None,
+    ) -> None:  # fmt: skip
+        """Take one sensors frame; see ``FourStateLocalizer.step``."""
+        k = 1.0 / self.period_factor
+        super().step(
+            k * t_s,
+            [ImuSample(k * t, ax, wz) for t, ax, wz in imu],
+            [WheelSample(k * t, right, left) for t, right, left in encoders],
+            [EdgeSample(k * t, *values) for t, *values in edges],
+            gravity,
         )
-    axes.plot(
-        [_LIMIT_MM, published["max"]], [published["within_10mm_fraction"], 1.0], "x", color=INK, label="published"
-    )
-    axes.axvline(_LIMIT_MM, color=LIMIT, linewidth=0.9)
-    axes.set_xlim(0.01, 100.0)
-    axes.set_xlabel("distance between true and estimated position, mm")
-    axes.set_ylabel("share of all instants below")
-    axes.set_title(f"Localization error, {title}")
-    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
-    dress(axes)
-    save(figure, stem)
+
+    def fuse_fix(self, fix: Fix) -> float:
+        """Fuse a fix; see ``FourStateLocalizer.fuse_fix``."""
+        return super().fuse_fix(replace(fix, t_s=fix.t_s / self.period_factor))
+
+    def _use_crossings(self, transitions: Sequence[SensorTransition]) -> None:
+        """Thesis 2.1.5: the angle at the seam is the heading from now on."""
+        filter_ = self._filter
+        theta = float(filter_.mean[THETA])
+        seen = self._crossings.headings(transitions, self._odometer, self.pose, self.deck_pose, self.speed_m_s)
+        for innovation, variance in seen:
+            mean, covariance = filter_.mean.copy(), filter_.covariance.copy()
+            mean[THETA] = theta + innovation
+            covariance[THETA, :] = covariance[:, THETA] = 0.0
+            covariance[THETA, THETA] = variance
+            self.reset_filter(mean, covariance)
+            self.counts["crossings_used"] += 1
 
 
-def _draw_waypoints(result: CellResult, published: Mapping[str, float], title: str, stem: Path) -> None:
-    errors = 1e3 * np.asarray(result.arrays["waypoint_m"])
-    figure = new_figure(9.0, 3.6)
-    left, right = figure.subplots(1, 2, width_ratios=(2, 1), sharey=True)
-    left.plot(np.arange(1, errors.size + 1), errors, ".", color=colour(0), markersize=4)
-    right.hist(errors, bins=np.arange(0.0, max(errors.max(initial=0.0), _LIMIT_MM) + _BIN_MM, _BIN_MM),
-               orientation="horizontal", color=colour(0))  # fmt: skip
-    for axes in (left, right):
-        _mark(axes, published)
-    left.set_xlabel("waypoint, one run after the other")
-    left.set_ylabel("distance of the stop, mm")
-    right.set_xlabel("waypoints")
-    within = float(np.mean(errors < _LIMIT_MM)) if errors.size else float("nan")
-    figure.suptitle(
-        f"Waypoint error, {title}: {100.0 * within:.1f} % below 1 cm "
-        f"(published {100.0 * published['within_10mm_fraction']:.2f} %)",
-        fontsize=10,
-    )
-    right.legend(frameon=False, fontsize=7)
-    dress(left, right)
-    save(figure, stem)
+class _NoEdges(DangerMonitor):
+    """Permits everything: far from the rim an edge that a rule sees is a false one, and would end the run."""
+
+    def step(self, sensors: Sensors, estimate: EstimateMessage | None) -> Verdict:
+        del estimate
+        return Verdict(sensors.seq, sensors.t, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
 
 
-def _mark(axes: "Axes", published: Mapping[str, float]) -> None:
-    axes.axhline(_LIMIT_MM, color=LIMIT, linewidth=0.9, label="1 cm")
-    axes.axhline(published["mean"], color=QUIET, linewidth=0.9, linestyle="--", label="published mean")
-    axes.axhline(published["max"], color=QUIET, linewidth=0.9, linestyle=":", label="published largest")
+class _Replica(SilRun):
+    """A mission over the block's waypoints that may have the period error; ``run.panels`` counts the block's."""
+
+    def __init__(self, cfg: Config, period_error: float) -> None:
+        panels = cfg.run.panels
+        cfg = cfg.model_copy(update={"run": cfg.run.model_copy(update={"panels": 0})})
+        super().__init__(cfg, with_track=True)
+        block = [p.panel for p in self.parts.points if p.row in _BLOCK and p.col in _BLOCK]
+        kept = list(dict.fromkeys(block))[: panels or None]
+        outside = [p for p in self.parts.points if p.panel not in kept]
+        self.parts = parts = assemble(cfg, done=outside)
+        self.monitor = _NoEdges(self.mirror, cfg.robot, cfg.danger)
+        self.localizer, self.mission, self.gate = parts.localizer, parts.mission, parts.gate
+        if cfg.run.filter == "kf":
+            filter_ = FILTERS["kf"](np.zeros(STATES), np.eye(STATES))
+            start = self.mirror.base_panel_pose
+            localizer = ThesisLocalizer(filter_, self.mirror, cfg.robot, cfg.localizer, start)
+            localizer.period_factor = 1.0 + period_error
+            self.localizer = localizer
 
 
-def _reading(factors: Mapping[str, Any]) -> str:
-    who = "ekf, shipped control" if factors["system"] == "ours" else "kf, thesis's control"
-    noise = "variances" if factors["noise_is_variance"] else "standard deviations"
-    late = 100.0 * float(factors["period_error"])
-    return f"{who}: {noise}{f', period {late:.1f} % long' if late else ''}"
+def run_replica(cfg: Config, *, period_error: float) -> SilResult:
+    """One simulation run.
+
+    Args:
+        cfg: with the keys of ``overrides_of``.
+        period_error: by which part of the filter's step the loop takes longer.
+
+    Raises:
+        ValueError: a period error for a filter that reads time stamps.
+    """
+    if period_error and cfg.run.filter != "kf":
+        raise ValueError(f"the filter {cfg.run.filter!r} reads time stamps: only kf can have a period error")
+    return _Replica(cfg, period_error).run()
 
 
-SYSTEMS = ("thesis", "ours")
 # Thesis 2.3.2 (one run for each noise) and 3.5 (five runs each): share below 1 cm, mean, largest, mm.
 PUBLISHED: dict[str, dict[str, dict[str, float]]] = {
     "normal": {
@@ -144,12 +183,11 @@ PUBLISHED: dict[str, dict[str, dict[str, float]]] = {
         "waypoint": {"within_10mm_fraction": 0.8333, "mean": 7.1, "max": 42.9},
     },
 }
-QUANTITIES = ("localization", "waypoint")
 RUNS = {"localization": 1, "waypoint": 5}  # behind the published figures
 # The first is what brings this replica closest to the published figures. How long that loop took is not known: another
 # simulation of the same text came closest with the second.
 PERIOD_ERRORS = (0.008, 0.013)
-_TRACK_STEP = 2  # a fifth of a second between points of the drawn track
+_TRACK_STEP = 20  # frames, a fifth of a second, between points of the drawn track
 _SCATTERS = 2.0  # a published figure further away than this many standard deviations lies outside the spread
 
 
@@ -157,40 +195,51 @@ def cells() -> Sequence[Cell]:
     """Readings times noise for the thesis's system; for ours, which has no period error, noise and its reading."""
     nearest, other = PERIOD_ERRORS
     readings = [(True, nearest), (True, 0.0), (False, nearest), (False, 0.0), (True, other)]
-    found = [_cell("thesis", noise, *reading) for reading in readings for noise in NOISES]
-    return found + [_cell("ours", noise, is_variance, 0.0) for is_variance, noise in product((True, False), NOISES)]
-
-
-def _cell(system: str, noise: str, noise_is_variance: bool, period_error: float) -> Cell:
-    return Cell(
-        {"system": system, "noise": noise, "noise_is_variance": noise_is_variance, "period_error": period_error},
-        overrides_of(noise, noise_is_variance=noise_is_variance, period_error=period_error, is_ours=system == "ours"),
-    )
+    rows = [("thesis", noise, *reading) for reading in readings for noise in _TABLE]
+    rows += [("ours", noise, is_variance, 0.0) for is_variance, noise in product((True, False), _TABLE)]
+    return [
+        Cell(
+            {"system": system, "noise": noise, "noise_is_variance": is_variance, "period_error": error},
+            overrides_of(noise, noise_is_variance=is_variance, period_error=error, is_ours=system == "ours"),
+        )
+        for system, noise, is_variance, error in rows
+    ]
 
 
 def run_job(job: Job) -> JobOutcome:
-    """One simulation run."""
-    run = run_replica(job.cfg, period_error=float(job.factors["period_error"]))
+    """One simulation run, as the thesis measures it.
+
+    Arrays: ``waypoint_m``, distance of each stop from its waypoint, shape (9 panels,) if all were reached; ``track``:
+    t, true x, y, estimated x, y, shape (j, 5); histogram of the distance of true and estimated position, every frame
+    until the last stop.
+    """
+    found = run_replica(job.cfg, period_error=float(job.factors["period_error"]))
+    track = found.track if found.track is not None else np.empty((0, 7))
+    stops = [stop for stop in found.stops if stop.approach == 1]
+    # The way back to base is not part of the thesis's runs.
+    track = track[track[:, 0] <= (stops[-1].t_s if stops else 0.0)]
+    error_m = np.hypot(track[:, 1] - track[:, 4], track[:, 2] - track[:, 5])
+    waypoint_m = np.array([stop.distance_m for stop in stops])
     values = {
-        "outcome": run.outcome,
-        "cause": run.cause,
-        "waypoints": run.waypoint_m.size,
+        "outcome": found.outcome,
+        "cause": found.cause,
+        "waypoints": waypoint_m.size,
         "wanted": POINTS * (job.cfg.run.panels or PANELS) // PANELS,
-        "time_s": float(run.track[-1, 0]) if run.track.size else 0.0,
-        "localization": _of_run(run.localization_m),
-        "waypoint": _of_run(run.waypoint_m),
+        "time_s": float(track[::10][-1, 0]) if track.size else 0.0,
+        "localization": _of_run(error_m),
+        "waypoint": _of_run(waypoint_m),
     }
-    arrays: dict[str, NDArray[Any]] = {
-        "waypoint_m": run.waypoint_m,
-        "track": run.track[::_TRACK_STEP].astype(np.float32),
-        **Histogram.of(run.localization_m, LIMIT_M).to_arrays("localization"),
+    arrays: dict[str, Any] = {
+        "waypoint_m": waypoint_m,
+        "track": track[::_TRACK_STEP, [0, 1, 2, 4, 5]].astype(np.float32),
+        **Histogram.of(error_m, LIMIT_M).to_arrays("localization"),
     }
     return JobOutcome(values, arrays)
 
 
-def _of_run(errors_m: NDArray[np.float64]) -> dict[str, float]:
+def _of_run(errors_m: FloatArray) -> dict[str, float]:
     if not errors_m.size:
-        return {"within_10mm_fraction": float("nan"), "mean": float("nan"), "max": float("nan")}
+        return dict.fromkeys(("within_10mm_fraction", "mean", "max"), float("nan"))
     return {
         "within_10mm_fraction": float(np.mean(errors_m < LIMIT_M)),
         "mean": 1e3 * float(np.mean(errors_m)),
@@ -202,18 +251,17 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """Pooled figures, their scatter from run to run, and the published ones beside them."""
     values = [outcome.values for outcome in outcomes]
     waypoint_m = np.concatenate([outcome.arrays["waypoint_m"] for outcome in outcomes])
-    localization = pooled([Histogram.from_arrays(dict(outcome.arrays), "localization") for outcome in outcomes])
+    localization = pooled([Histogram.from_arrays(outcome.arrays, "localization") for outcome in outcomes])
     figures: dict[str, Any] = {
         "complete": sum(v["outcome"] == "complete" and v["waypoints"] == v["wanted"] for v in values),
         "causes": sorted({v["cause"] for v in values if v["cause"]}),
         "time_s": float(np.mean([v["time_s"] for v in values])),
-        "localization_error_mm": of_spread(localization),
+        "localization_error_mm": of_histogram(localization),
         "arrival_error_mm": of_values(waypoint_m),
     }
-    published = PUBLISHED[str(factors["noise"])]
-    for quantity in QUANTITIES:
-        figures[quantity] = _beside(published[quantity], [v[quantity] for v in values], RUNS[quantity])
-    arrays: dict[str, NDArray[Any]] = {
+    for quantity, published in PUBLISHED[str(factors["noise"])].items():
+        figures[quantity] = _beside(published, [v[quantity] for v in values], RUNS[quantity])
+    arrays: dict[str, Any] = {
         "waypoint_m": waypoint_m,
         "track": outcomes[0].arrays["track"],
         **localization.to_arrays("localization"),
@@ -234,13 +282,14 @@ def _beside(published: Mapping[str, float], runs: Sequence[Mapping[str, float]],
         spread = float(np.std(ours, ddof=1)) if ours.size > 1 else float("nan")
         scatter = spread * sqrt(1.0 / ours.size + 1.0 / published_runs)
         is_comparable = ours.size > 1 and (name != "max" or published_runs == 1)
-        away = (theirs - mean) / scatter if is_comparable and scatter > 0.0 else float("nan")
         found[name] = {
             "mean": mean,
             "run_to_run": spread,
             "least": float(np.min(ours)),
             "largest": float(np.max(ours)),
-            "published_minus_mean_in_scatters": away,
+            "published_minus_mean_in_scatters": (theirs - mean) / scatter
+            if is_comparable and scatter > 0.0
+            else float("nan"),
             "is_published_within": abs(theirs - mean) <= _SCATTERS * scatter if is_comparable else None,
         }
     verdicts = [found[name]["is_published_within"] for name in published]
@@ -249,14 +298,83 @@ def _beside(published: Mapping[str, float], runs: Sequence[Mapping[str, float]],
     return found
 
 
+# -- figures, each after one of the thesis's: 2.9 to 2.12, 3.10 and 3.11 ----------------------------------------------
+
+_NUMBERS = {"normal": ("2.9", "2.10", "3.10"), "twice": ("2.11", "2.12", "3.11")}
+_LIMIT_MM = 10.0
+_BIN_MM = 1.0
+
+
 def draw(results: Sequence[CellResult], out: Path) -> None:
-    """Figures like 2.9 to 2.12, 3.10 and 3.11 of the thesis."""
-    draw_thesis(results, PUBLISHED, out)
+    """Draw the figures of both noises.
+
+    * ``trajectory_<noise>``: true and estimated way of the first run, the thesis's system with both readings.
+    * ``localization_<noise>``: cumulative distribution of the localization error, every cell.
+    * ``waypoints_<noise>``: the waypoint errors of all runs, and their histogram.
+    """
+    for noise, numbers in _NUMBERS.items():
+        published = PUBLISHED[noise]
+        mine = [result for result in results if result.factors["noise"] == noise]
+        nearest = [r for r in mine if r.factors["noise_is_variance"] and r.factors["period_error"]][:1]
+        titles = [f"{noise} noise, as fig. {number}" for number in numbers]
+        if mine:
+            _draw_localization(mine, published["localization"], titles[1], out / f"localization_{noise}")
+        for result in nearest:
+            _draw_trajectory(result, titles[0], out / f"trajectory_{noise}")
+            _draw_waypoints(result, published["waypoint"], titles[2], out / f"waypoints_{noise}")
+
+
+def _draw_trajectory(result: CellResult, title: str, stem: Path) -> None:
+    track = result.arrays["track"]
+    with plot(stem, 6.4, 6.0, legend=2) as (_, (axes,)):
+        axes.plot(track[:, 1], track[:, 2], color=colour(0), linewidth=1.6, label="true")
+        axes.plot(track[:, 3], track[:, 4], color=colour(1), linewidth=0.9, linestyle="--", label="estimated")
+        axes.set(aspect="equal", xlabel="x, m", ylabel="y, m", title=f"Way of one run, {title}")
+
+
+def _draw_localization(results: Sequence[CellResult], published: Mapping[str, float], title: str, stem: Path) -> None:
+    with plot(stem, 7.2, 5.2, legend=2) as (_, (axes,)):
+        for k, result in enumerate(results):
+            values, beyond = Histogram.from_arrays(result.arrays, "localization").exceedance()
+            factors = result.factors
+            is_ours = factors["system"] == "ours"
+            who = "ekf, shipped control" if is_ours else "kf, thesis's control"
+            noise = "variances" if factors["noise_is_variance"] else "standard deviations"
+            late = 100.0 * float(factors["period_error"])
+            label = f"{who}: {noise}{f', period {late:.1f} % long' if late else ''}"
+            style = ":" if is_ours else "-"
+            axes.semilogx(1e3 * values, 1.0 - beyond, color=colour(k), linestyle=style, linewidth=1.5, label=label)
+        marks_mm, shares = [_LIMIT_MM, published["max"]], [published["within_10mm_fraction"], 1.0]
+        axes.plot(marks_mm, shares, "x", color=INK, label="published")
+        axes.axvline(_LIMIT_MM, color=LIMIT, linewidth=0.9)
+        axes.set_xlim(0.01, 100.0)
+        axes.set_xlabel("distance between true and estimated position, mm")
+        axes.set(ylabel="share of all instants below", title=f"Localization error, {title}")
+
+
+def _draw_waypoints(result: CellResult, published: Mapping[str, float], title: str, stem: Path) -> None:
+    errors = 1e3 * np.asarray(result.arrays["waypoint_m"])
+    within = float(np.mean(errors < _LIMIT_MM)) if errors.size else float("nan")
+    title = (
+        f"Waypoint error, {title}: {100.0 * within:.1f} % below 1 cm "
+        f"(published {100.0 * published['within_10mm_fraction']:.2f} %)"
+    )
+    with plot(stem, 9.0, 3.6, 1, 2, title=title, width_ratios=(2, 1), sharey=True) as (_, (left, right)):
+        left.plot(np.arange(1, errors.size + 1), errors, ".", color=colour(0), markersize=4)
+        bins = np.arange(0.0, max(errors.max(initial=0.0), _LIMIT_MM) + _BIN_MM, _BIN_MM)
+        right.hist(errors, bins=bins.tolist(), orientation="horizontal", color=colour(0))
+        for axes in (left, right):
+            axes.axhline(_LIMIT_MM, color=LIMIT, linewidth=0.9, label="1 cm")
+            axes.axhline(published["mean"], color=QUIET, linewidth=0.9, linestyle="--", label="published mean")
+            axes.axhline(published["max"], color=QUIET, linewidth=0.9, linestyle=":", label="published largest")
+        left.set(xlabel="waypoint, one run after the other", ylabel="distance of the stop, mm")
+        right.set_xlabel("waypoints")
+        right.legend(frameon=False, fontsize=7)
 
 
 def _columns() -> list[Column]:
     columns = [Column("complete", "complete")]
-    for quantity in QUANTITIES:
+    for quantity in RUNS:
         for name, heading, spec in (
             ("within_10mm_fraction", "< 1 cm", ".3f"),
             ("mean", "mean, mm", ".2f"),

@@ -26,7 +26,7 @@ from ccatp.core import DeckPose, EventCode, PanelId, Verdict
 from ccatp.danger import DangerMonitor
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety.edge_detector import EdgeLimits
-from ccatp.studies.danger_drives import EdgeErrors, Rig
+from ccatp.studies.danger_study import EdgeErrors, Rig
 from tests.support.scenario import config_of, mirror_of
 
 MIRRORS = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")

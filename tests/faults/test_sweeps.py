@@ -16,7 +16,7 @@ import pytest
 from ccatp.sim.fault_models import Injected
 from ccatp.sim.fault_plan import FaultPlan
 from ccatp.studies.faults_study import FaultySilRun, random_plan
-from ccatp.studies.sil_models import SilResult
+from ccatp.studies.sil_run import SilResult
 from tests.faults import edge_sweep
 from tests.faults.edge_sweep import (
     OVERRUN_M,

@@ -12,7 +12,7 @@ import pytest
 from ccatp.cli import main
 from ccatp.config.load import load_config
 from ccatp.records.run_reader import open_run
-from ccatp.studies import replay_report as comparison
+from ccatp.studies import replay as comparison
 from tests.processes.conftest import Start
 from tests.support.runs import RecordedRun, Run
 

@@ -21,8 +21,7 @@ from ccatp.links.robot_codec import set_point_on_wire
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.sim.robot import Robot
-from ccatp.studies.sil_models import SilLaser
-from ccatp.studies.sil_run import SilRun
+from ccatp.studies.sil_run import SilLaser, SilRun
 from ccatp.survey.state import BACKING_OFF, DONE, DRIVING, HELD, PURPOSES, RETURNING, TURNING
 
 FRESH_S = 0.15  # I10

@@ -25,8 +25,7 @@ from ccatp.records.store import MissionStore, PlannedPoint
 from ccatp.sim.fault_models import Injected
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.studies.faults_study import FaultySilRun
-from ccatp.studies.sil_models import SilResult
-from ccatp.studies.sil_run import SilRun
+from ccatp.studies.sil_run import SilResult, SilRun
 from ccatp.survey.composition import assemble
 from ccatp.survey.fix_gate import FixGate, nis_of
 from ccatp.survey.heading_recovery import TakeoverState, doubted

@@ -15,8 +15,7 @@ from ccatp.core import Fix, PanelId, PointId
 from ccatp.localizer import Localizer
 from ccatp.mirror.misalignment import PanelMisalignment
 from ccatp.mirror.panel_alignment import Measured
-from ccatp.studies.sil_models import SilLaser, StopRow
-from ccatp.studies.sil_run import SilRun
+from ccatp.studies.sil_run import SilLaser, SilRun, StopRow
 from tests.unit.aligning.conftest import NAMES, exact_fix, load, misaligned, survey
 from tests.unit.run_folder import make_run
 

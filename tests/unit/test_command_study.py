@@ -12,7 +12,7 @@ from tests.unit.studies import toy
 
 @pytest.fixture(autouse=True)
 def toy_study(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ccatp.studies.registry.find_study", lambda name: analysis if name == "one" else toy.STUDY)
+    monkeypatch.setattr("ccatp.studies.find_study", lambda name: analysis if name == "one" else toy.STUDY)
 
 
 def analysis(cfg: Any, out: Path) -> dict[str, Any]:

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from ccatp.records.summary import WITHIN_M
-from ccatp.studies.campaign import Histogram, JobOutcome
-from ccatp.studies.mission_study import COLUMN, STOP_COLUMNS
+from ccatp.studies.campaign import JobOutcome
+from ccatp.studies.mission_study import COLUMN, STOP_COLUMNS, Histogram
 
 SIGMA_M, SIGMA_RAD = 1e-3, 2e-3
 

@@ -9,7 +9,7 @@ from ccatp.beacons.cricket.range_network import MappingError
 from ccatp.config.load import load_radio_config
 from ccatp.config.models import Config
 from ccatp.links.beacon_messages import PoseTrack, PoseTruth, pose_track, pose_truth
-from ccatp.studies import mote_sizes
+from ccatp.studies import cricket_study
 from ccatp.studies.campaign import Cell, CellResult, Job, JobOutcome
 from ccatp.studies.cricket_study import CASES, STUDY, combine, draw, run_job
 from ccatp.studies.mote_navigation import STUDY as MoteNavigationSTUDY
@@ -86,8 +86,8 @@ def test_a_field_whose_motes_cannot_be_laid_out() -> None:
 
 
 def test_sizes(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mote_sizes, "SIZES", (30, 60))
-    found = mote_sizes.run(config, tmp_path)
+    monkeypatch.setattr(cricket_study, "SIZES", (30, 60))
+    found = cricket_study.run_sizes(config, tmp_path)
     assert [cell["ranges"] > cell["motes"] for cell in found["cells"]] == [True, True]
     assert (tmp_path / "mote_sizes.png").exists()
     assert len((tmp_path / "table.md").read_text().splitlines()) == 4

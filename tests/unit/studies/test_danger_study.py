@@ -12,17 +12,22 @@ from ccatp.core import EdgeSample
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.studies.campaign import CellResult, Job, JobOutcome
-from ccatp.studies.danger_drives import (
+from ccatp.studies.danger_study import (
     OFF_S,
     RULES,
+    STUDY,
     EdgeErrors,
-    OffTimeRule,
+    bootstrap,
     build_rule,
+    combine,
+    draw,
     drive_frame,
     drive_to_rim,
+    off_time_rule,
+    run_job,
     transit,
+    wilson,
 )
-from ccatp.studies.danger_study import bootstrap, cells, combine, draw, run_job, wilson
 
 ERRORS = EdgeErrors(1e-3, 2e-3)
 NOWHERE = EstimateMessage(seq=0, t_s=0.0, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-3, state="driving")
@@ -35,9 +40,9 @@ def loaded(mirror: str, world: str = "thesis") -> tuple[Config, Mirror]:
 
 def judged(pattern: str) -> bool:
     """The thesis's rule on the front-left sensor's values, one per millisecond."""
-    rule = OffTimeRule(OFF_S)
+    rule = off_time_rule(OFF_S)
     samples = [EdgeSample(1e-3 * k, int(value), 1, 1, 1) for k, value in enumerate(pattern)]
-    return any(rule.judge(drive_frame(k, s.t_s, [], [s]), NOWHERE) for k, s in enumerate(samples))
+    return any(rule(drive_frame(k, s.t_s, [], [s]), NOWHERE) for k, s in enumerate(samples))
 
 
 @pytest.mark.parametrize(
@@ -55,7 +60,7 @@ def test_the_thesis_counts_the_time_that_one_sensor_is_off(pattern: str, is_edge
 def test_an_unknown_rule_is_refused() -> None:
     cfg, mirror = loaded("thesis-m1")
     with pytest.raises(ValueError, match="no edge rule is called 'none': take one of thesis, shipped"):
-        build_rule("none", mirror, cfg, OFF_S)
+        build_rule("none", mirror, cfg)
 
 
 @pytest.mark.parametrize(
@@ -86,18 +91,18 @@ def test_a_turn_in_place_sweeps_over_the_gap() -> None:
 @pytest.mark.parametrize("v_m_s", [0.05, 0.10])
 def test_a_drive_ends_after_threshold_and_run_down(v_m_s: float) -> None:
     cfg, mirror = loaded("fyst-m1")
-    found = drive_to_rim(mirror, cfg, v_m_s, 0.0, "thesis", ERRORS, np.random.default_rng(2))
+    sensor_m, has_fallen = drive_to_rim(mirror, cfg, v_m_s, 0.0, "thesis", ERRORS, np.random.default_rng(2))
     expected_m = v_m_s * (OFF_S + cfg.sim.robot.wheel_lag_s)
     # The verdict waits for the end of its frame, at most 10 ms, and one sample; 5 % for the slope of the surface.
-    assert 0.95 * expected_m < found.sensor_m < expected_m + v_m_s * 0.012
-    assert not found.has_fallen
+    assert 0.95 * expected_m < sensor_m < expected_m + v_m_s * 0.012
+    assert not has_fallen
 
 
 def test_the_delay_of_the_link_lets_it_go_further() -> None:
     cfg, mirror = loaded("fyst-m1")
     late = cfg.model_copy(update={"world": cfg.world.model_copy(update={"commands_delay_s": 0.1})})
     near, far = (
-        drive_to_rim(mirror, one, 0.1, 0.0, "shipped", ERRORS, np.random.default_rng(3)).sensor_m for one in (cfg, late)
+        drive_to_rim(mirror, one, 0.1, 0.0, "shipped", ERRORS, np.random.default_rng(3))[0] for one in (cfg, late)
     )
     assert far - near == pytest.approx(0.01, abs=2e-4)  # 0.1 s at 0.1 m/s, on a surface that slopes by up to 10 %
 
@@ -105,7 +110,7 @@ def test_the_delay_of_the_link_lets_it_go_further() -> None:
 def test_blind_drives_fall() -> None:
     cfg, mirror = loaded("fyst-m1")
     late = cfg.model_copy(update={"world": cfg.world.model_copy(update={"commands_delay_s": 1.0})})
-    assert drive_to_rim(mirror, late, 0.2, 0.0, "thesis", ERRORS, np.random.default_rng(3)).has_fallen
+    assert drive_to_rim(mirror, late, 0.2, 0.0, "thesis", ERRORS, np.random.default_rng(3))[1]
 
 
 def test_wilson_is_that_of_the_tables() -> None:
@@ -158,7 +163,7 @@ def test_a_job_is_a_function_of_its_seed() -> None:
 
 def test_turns_have_no_overrun_and_every_cell_can_be_drawn(tmp_path: Path) -> None:
     results = []
-    for cell in cells():
+    for cell in STUDY.cells():
         made = outcome(1, [0.01, 0.02])
         pooled = combine(cell.factors, [JobOutcome(made.values) if cell.factors["crossing"] == "turn" else made])
         assert ("overrun_mean_mm" in pooled.values["thesis"]) is (cell.factors["crossing"] != "turn")

@@ -16,32 +16,45 @@ from ccatp.estimation.seams import HeadingFix
 from ccatp.filters import FILTERS
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.world import TruthRow
-from ccatp.studies import faults_study, filters_study, time_study
-from ccatp.studies.campaign import (
-    CampaignError,
-    CellResult,
-    Histogram,
-    Job,
-    JobOutcome,
-    Study,
-    cells_of,
-    jobs_of,
-    plain,
-)
+from ccatp.studies import STUDIES, faults_study, filters_study, find_study
+from ccatp.studies.campaign import CampaignError, CellResult, Job, JobOutcome, Study, cells_of, jobs_of
 from ccatp.studies.engine import CampaignOptions, run_campaign
-from ccatp.studies.factor_studies import ABLATION, GROUPS, SENSITIVITY, sensitivity_cells
+from ccatp.studies.factor_studies import ABLATION, GROUPS, SENSITIVITY, TIME, sensitivity_cells
 from ccatp.studies.faults_study import FIRST_S, LONGEST_S, is_recoverable, random_plan
-from ccatp.studies.job_store import table
-from ccatp.studies.mission_study import COLUMN, chi_square_figures, combine_missions, nees, run_mission
-from ccatp.studies.registry import STUDIES, find_study
-from ccatp.studies.sil_models import SilTrace
-from ccatp.studies.thesis_replica import LIMIT_M, ThesisLocalizer, overrides_of, run_replica
-from ccatp.studies.thesis_study import PUBLISHED, cells, combine, draw, run_job
+from ccatp.studies.mission_study import (
+    COLUMN,
+    LEAST,
+    Histogram,
+    chi_square_figures,
+    combine_missions,
+    nees,
+    pooled,
+    run_mission,
+)
+from ccatp.studies.results import plain, table
+from ccatp.studies.sil_run import SilTrace
+from ccatp.studies.thesis_study import (
+    LIMIT_M,
+    PUBLISHED,
+    ThesisLocalizer,
+    cells,
+    combine,
+    draw,
+    overrides_of,
+    run_job,
+    run_replica,
+)
 from ccatp.survey.composition import SurveyParts, assemble
 from tests.support.sim_survey import single
 from tests.unit.studies.missions import SIGMA_M, mission, stops_of
 
-CAMPAIGNS = (filters_study.STUDY, time_study.STUDY, SENSITIVITY, ABLATION)
+# Each with the stems of its figures.
+CAMPAIGNS = (
+    (filters_study.STUDY, {f"{kind}-thesis-m1" for kind in ("localization", "arrival", "bound", "consistency")}),
+    (TIME, {"time-thesis-m1"}),
+    (SENSITIVITY, {"sensitivity-thesis-m1"}),
+    (ABLATION, {"ablation-thesis-m1-thesis", "ablation-thesis-m1-hard"}),
+)
 
 
 def results_of(study: Study) -> list[CellResult]:
@@ -55,25 +68,14 @@ def results_of(study: Study) -> list[CellResult]:
     return found
 
 
-@pytest.mark.parametrize("study", CAMPAIGNS)
+@pytest.mark.parametrize("study", [study for study, _ in CAMPAIGNS], ids=lambda study: study.name)
 def test_every_cell_is_a_configuration_of_its_own(study: Study) -> None:
     plan = jobs_of(study, cells_of(study), lambda keys: load_config(None, keys), {}, 1)
     configurations = [group[0].cfg.model_dump_json() for group in plan]
     assert len(set(configurations)) == len(configurations) > 1
 
 
-@pytest.mark.parametrize(
-    ("study", "stems"),
-    [
-        (
-            filters_study.STUDY,
-            {"localization-thesis-m1", "arrival-thesis-m1", "bound-thesis-m1", "consistency-thesis-m1"},
-        ),
-        (time_study.STUDY, {"time-thesis-m1"}),
-        (SENSITIVITY, {"sensitivity-thesis-m1"}),
-        (ABLATION, {"ablation-thesis-m1-thesis", "ablation-thesis-m1-hard"}),
-    ],
-)
+@pytest.mark.parametrize(("study", "stems"), CAMPAIGNS)
 def test_figures_and_table_show_every_cell(study: Study, stems: set[str], tmp_path: Path) -> None:
     results = results_of(study)
     study.draw(results, tmp_path)
@@ -98,10 +100,10 @@ def test_stop_errors_stand_beside_the_bound_without_each_first_stop() -> None:
 
 
 def test_the_margin_is_that_of_the_slowest_mission() -> None:
-    values, _ = time_study.combine({}, [mission([0.001]), mission([0.001], mission_time_s=130.0)])
+    values, _ = TIME.combine({}, [mission([0.001]), mission([0.001], mission_time_s=130.0)])
     assert values["margin_s"] == 3600.0 - 130.0
     assert values["tour_ratio"] == pytest.approx(120.0 / 90.0, abs=1e-4)
-    held, _ = time_study.combine({}, [mission([0.001], outcome="held")])
+    held, _ = TIME.combine({}, [mission([0.001], outcome="held")])
     assert (held["margin_s"], held["tour_ratio"]) == (None, None)
 
 
@@ -121,18 +123,19 @@ def test_everything_that_is_disturbed_belongs_to_a_group() -> None:
     assert differing <= {key for group in GROUPS.values() for key in group}
 
 
-FACTORS: Mapping[str, Mapping[str, Any]] = {
-    "filters": {"world": ("thesis",), "filter": ("ekf",)},
-    "time": {"order": ("optimised",), "v_max_m_s": ("0.2",), "measuring_time_s": ("0.5",)},
-}
-
-
-@pytest.mark.parametrize("name", FACTORS)
-def test_a_real_job_has_every_figure(name: str, tmp_path: Path) -> None:
-    study = find_study(name)
-    settings = {"run.panels": 1, **({"run.filter": "ekf"} if name == "time" else {})}
-    options = CampaignOptions(tmp_path, runs=1, workers=1, only=FACTORS[name], settings=settings, is_quiet=True)
-    result = run_campaign(study, lambda keys: load_config(None, keys), options)  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("study", "only", "settings"),
+    [
+        (filters_study.STUDY, {"world": ("thesis",), "filter": ("ekf",)}, {}),
+        (TIME, {"order": ("optimised",), "v_max_m_s": ("0.2",), "measuring_time_s": ("0.5",)}, {"run.filter": "ekf"}),
+    ],
+)
+def test_a_real_job_has_every_figure(
+    study: Study, only: Mapping[str, Any], settings: Mapping[str, object], tmp_path: Path
+) -> None:
+    settings = {"run.panels": 1, **settings}
+    options = CampaignOptions(tmp_path, runs=1, workers=1, only=only, settings=settings, is_quiet=True)
+    result = run_campaign(study, lambda keys: load_config(None, keys), options)
     (cell,) = result["cells"]
     assert (cell["complete"], cell["points"]["measured"]) == (1, 9)
     assert cell["time_ratio"] > 1.0
@@ -158,9 +161,51 @@ def test_every_row_of_the_registry_leads_to_a_study() -> None:
         assert getattr(found, "name", name) == name
 
 
-def test_a_job_has_a_name_that_tells_it_apart() -> None:
-    job = Job("filters", {"world": "hard", "filter": "ekf"}, 3, load_config(None, {}))
-    assert (job.cell, job.key) == ("world=hard,filter=ekf", "world=hard,filter=ekf,seed=3")
+# -- the missions of a cell -------------------------------------------------------------------------------------------
+
+BIN = 0.0012  # half a bin, 1/2000 of a decade, is 0.115 %
+
+
+def errors(seed: int, count: int) -> np.ndarray:
+    return np.random.default_rng(seed).lognormal(-7.0, 1.0, count)
+
+
+def test_a_histogram_has_the_figures_of_its_values() -> None:
+    values = np.append(errors(1, 20_000), 0.01)  # one exactly at the limit
+    found = Histogram.of(values, 0.01)
+    for share in (0.01, 0.5, 0.99, 0.999):
+        # Beside the bin there is the step to the next number, which in the tail of so many is 1 % at most.
+        assert found.quantile(share) == pytest.approx(np.quantile(values, share), rel=BIN + 0.01)
+    assert Histogram.of(np.append(np.full(7, 0.0123), 1.0), 0.01).quantile(0.5) == pytest.approx(0.0123, rel=BIN)
+    assert Histogram.of(np.array([0.00100001]), 0.01).quantile(1.0) == 0.00100001  # not beyond the maximum
+    assert (found.count, found.largest) == (20_001, values.max())
+    assert found.mean == pytest.approx(values.mean(), rel=1e-12)  # the order of summing
+    assert found.within == np.count_nonzero(values <= 0.01)
+    assert Histogram.of(np.array([0.0, LEAST / 2.0]), 0.01).bins.tolist() == [0]
+    edges, share_beyond = found.exceedance()
+    assert (np.diff(edges) > 0.0).all()
+    assert (np.diff(share_beyond) < 0.0).all()
+    assert share_beyond[-1] == 0.0
+
+
+def test_histograms_are_pooled_and_stored() -> None:
+    parts = [errors(3, 500), errors(4, 30), np.empty(0)]
+    one, whole = pooled([Histogram.of(part, 0.01) for part in parts]), Histogram.of(np.concatenate(parts), 0.01)
+    again = Histogram.from_arrays(whole.to_arrays("x"), "x")
+    for found in (one, again):
+        assert np.array_equal(found.bins, whole.bins)
+        assert np.array_equal(found.counts, whole.counts)
+        assert (found.largest, found.within) == (whole.largest, whole.within)
+        assert found.total == pytest.approx(whole.total, rel=1e-12)  # the order of summing
+    empty = Histogram.of(np.empty(0), 0.01)
+    assert np.isnan([empty.quantile(0.5), empty.mean]).all()
+    assert empty.count == pooled([]).count == 0
+
+
+@pytest.mark.parametrize("value", [-1e-6, np.nan, np.inf])
+def test_errors_are_finite_and_not_negative(value: float) -> None:
+    with pytest.raises(ValueError, match="must be finite and not negative"):
+        Histogram.of(np.array([0.1, value]), 0.01)
 
 
 def test_every_error_of_every_run_counts_once() -> None:
@@ -244,6 +289,8 @@ def test_a_real_mission_says_the_same_as_its_summary() -> None:
     assert values["points"] == outcome.values["points"]
 
 
+# -- truth and estimate of a mission -----------------------------------------------------------------------------------
+
 FRAMES, DELAY = 2500, 3  # more than two batches; frames by which the estimates lag behind the truth
 
 
@@ -279,14 +326,14 @@ def test_late_estimates_meet_their_truth_across_batches(parts: SurveyParts) -> N
     assert summary["localization_error_mm"]["max"] == pytest.approx(1e-2 * (FRAMES - DELAY - 1), rel=0.02)  # slope
 
 
-def test_the_truth_of_a_late_frame_is_at_hand(parts: SurveyParts) -> None:
-    assert book_of(parts, with_track=False).truth_at(FRAMES - 1 - DELAY) == true_row(parts, FRAMES - 1 - DELAY)
-
-
-def test_no_track_where_none_was_asked_for(parts: SurveyParts) -> None:
+def test_a_late_frame_has_its_truth_and_there_is_no_track_unless_asked_for(parts: SurveyParts) -> None:
     book = book_of(parts, with_track=False)
+    assert book.truth_at(FRAMES - 1 - DELAY) == true_row(parts, FRAMES - 1 - DELAY)
     book.summary(parts.mission, 25.0, {}, {})
     assert book.track() is None
+
+
+# -- the study `thesis` -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("noise", "table"), [("normal", 0.0087), ("twice", 0.0175)])
@@ -417,6 +464,8 @@ def test_a_whole_run_reaches_all_waypoints() -> None:
     assert found.values["localization"]["mean"] < 1.0  # a quiet world: white noise of the table, no disturbance
 
 
+# -- the study `faults` -----------------------------------------------------------------------------------------------
+
 DANGER = {"true_edges": 0, "false_edges": 1, "falls": 0, "max_overrun_mm": 2.0}
 
 
@@ -492,7 +541,7 @@ def test_a_cell_says_who_was_not_completed_and_is_drawn(tmp_path: Path) -> None:
     assert first["recoverable"] == {"runs": 1, "complete": 1}
     assert (first["danger"]["false_edges"], first["weak_frames"]) == (2, 4)
     assert (first["injected"]["acted"], first["points"]["total"], first["time_ratio"]) == (22, 18, 1.1)
-    lines = table([plain({**cell.factors, **cell.values}) for cell in results], faults_study.COLUMNS).splitlines()
+    lines = table([plain({**cell.factors, **cell.values}) for cell in results], faults_study.STUDY.columns).splitlines()
     assert len(lines) == 2 + 8
     assert lines[3].startswith("| thesis-m1 | random | 2 | 1 |")
     assert "seed 2 stopped: held" in lines[3]

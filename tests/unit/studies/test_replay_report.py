@@ -9,16 +9,15 @@ from ccatp.config.load import load_config
 from ccatp.core import FloatArray
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.records.run_reader import Trace
-from ccatp.studies.replay import Replayed
-from ccatp.studies.replay_report import (
+from ccatp.studies.replay import (
     REPRODUCED,
+    Replayed,
     ReplayEvaluation,
     csv_lines,
     difference,
     errors_of,
     figures,
     fix_distances_m,
-    joined,
     judge,
     table_lines,
 )
@@ -121,11 +120,6 @@ def test_without_one_the_record_is_the_reference_and_not_judged(mirror: Mirror) 
     assert set(found["recorded"]) == {"fix_distance_mm"}
     assert found["replayed"]["position_error_mm"]["max"] == pytest.approx(2.0)
     assert judge([judged(mirror, has_truth=False, is_smoothed=False)])["smoothed"] is None
-
-
-def test_the_parts_of_a_resumed_run_are_joined(mirror: Mirror) -> None:
-    parts = [errors_of(trace([float(n)]), trace([0.0]), NONE, NONE) for n in (1, 3)]
-    assert joined(parts).distance_m.tolist() == [1.0, 3.0]
 
 
 def test_the_table_has_a_column_for_each_estimate(mirror: Mirror) -> None:

@@ -1,0 +1,196 @@
+"""Files of a study: ``result.json``, ``result.npz``, ``table.md`` and figures, all in one look."""
+
+import json
+import os
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from ccatp.report.plots import dress, new_figure, save_figure
+from ccatp.studies.campaign import CellResult, Column, Study
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LIMIT = "#c0392b"
+# Distinguishable with any colour vision, and in print by their lightness.
+CYCLE = ("#0b3c5d", "#d08c00", "#1d9a8a", "#b5478a", "#6b7785", "#7a3e00")
+
+
+# -- numbers and tables -----------------------------------------------------------------------------------------------
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON has it: numpy's numbers as Python's, what is not finite as None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(part) for key, part in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [plain(part) for part in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
+    """A Markdown table; floats with four digits, None as a dash."""
+    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    for row in rows:
+        texts = ("-" if v is None else f"{v:.4g}" if isinstance(v, float) else str(v) for v in row)
+        lines.append(f"| {' | '.join(texts)} |")
+    return "\n".join(lines) + "\n"
+
+
+def table(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> str:
+    """Cells as a Markdown table: their factors first, then the columns."""
+    names = list(rows[0]) if rows else ["runs"]
+    shown = [*(Column(name, name) for name in names[: names.index("runs") + 1]), *columns]
+    return markdown_table([column.heading for column in shown], ([_text(row, c) for c in shown] for row in rows))
+
+
+def _text(row: Mapping[str, Any], column: Column) -> str:
+    value: Any = row
+    for part in column.key.split("."):
+        value = value.get(part) if isinstance(value, Mapping) else None
+    if value is None or value == []:
+        return "-"
+    if isinstance(value, list):  # an interval, or remarks
+        return (" to " if column.spec else "; ").join(_number(part, column.spec) for part in value)
+    return _number(value, column.spec)
+
+
+def _number(value: Any, spec: str) -> str:
+    return format(value, spec) if isinstance(value, int | float) and spec else str(value)
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+def write_results(
+    study: Study, cells: Sequence[CellResult], out: Path, about: Mapping[str, Any], *, with_figures: bool
+) -> dict[str, Any]:
+    """Write all files of a campaign, cells without a run left out of table and figures.
+
+    Args:
+        about: what else ``result.json`` says of the campaign: its wall time, jobs that are missing.
+
+    Returns:
+        What ``result.json`` holds.
+    """
+    rows = [plain({**cell.factors, **cell.values}) for cell in cells]
+    result: dict[str, Any] = {"study": study.name, "cells": rows, **plain(about)}
+    there = [cell for cell in cells if cell.values["runs"]]
+    arrays = {f"{k}/{name}": array for k, cell in enumerate(cells) for name, array in cell.arrays.items()}
+    np.savez_compressed(out / "result.npz", allow_pickle=False, **arrays)
+    _write_whole(out / "table.md", f"# {study.title}\n\n" + table([row for row in rows if row["runs"]], study.columns))
+    _write_whole(out / "result.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
+    if with_figures and there:
+        study.draw(there, out)
+    return result
+
+
+def write_analysis(
+    name: str, cells: Sequence[Mapping[str, Any]], columns: Mapping[str, str], out: Path, started_s: float
+) -> dict[str, Any]:
+    """Write ``result.json`` and ``table.md`` of a study without runs, begun at ``started_s`` of ``perf_counter``.
+
+    Args:
+        columns: headings of the table, by key of a cell.
+    """
+    result = {"study": name, "cells": list(cells), "wall_s": time.perf_counter() - started_s}
+    rows = ([cell[key] for key in columns] for cell in cells)
+    _write_whole(out / "table.md", markdown_table(list(columns.values()), rows))
+    _write_whole(out / "result.json", json.dumps(result, indent=1) + "\n")
+    return result
+
+
+def _write_whole(path: Path, text: str) -> None:
+    """A reader sees the old file or the new one, never a part."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft.write_text(text, encoding="utf-8")
+    draft.replace(path)
+
+
+# -- figures ----------------------------------------------------------------------------------------------------------
+
+
+def colour(index: int) -> str:
+    """A colour of the cycle."""
+    return CYCLE[index % len(CYCLE)]
+
+
+@contextmanager
+def plot(
+    stem: Path, width_in: float, height_in: float, rows: int = 1, columns: int = 1,
+    *, title: str = "", legend: int = 0, grid: Literal["major", "both"] = "major", **shared: Any,
+) -> "Iterator[tuple[Figure, list[Axes]]]":  # fmt: skip
+    """A figure and its axes row by row to draw on, written as PNG and PDF at the end.
+
+    Args:
+        legend: columns of a legend of the first axes below the figure; 0 for none.
+        shared: see ``Figure.subplots``.
+
+    Raises:
+        PictureError: a file cannot be written.
+    """
+    figure = new_figure(width_in, height_in)
+    panels: list[Axes] = figure.subplots(rows, columns, squeeze=False, **shared).ravel().tolist()
+    yield figure, panels
+    if title:
+        figure.suptitle(title, fontsize=11)
+    if legend:
+        labelled = panels[0].get_legend_handles_labels()
+        figure.legend(*labelled, loc="outside lower center", ncols=legend, frameon=False, fontsize=8)
+    dress(*panels, grid=grid)
+    for suffix in (".png", ".pdf"):
+        save_figure(figure, stem.with_suffix(suffix))
+
+
+_RANGES = (
+    ("localization error, mm", "localization_error_mm"),
+    ("first arrival error, mm", "arrival_error_mm"),
+    ("time / bound of the path", "time_ratio"),
+)
+
+
+class FigureRow(NamedTuple):
+    """A line of ``draw_ranges``; that of a base is drawn through all others, which are compared with it."""
+
+    label: str
+    cell: CellResult
+    shade: int
+    is_base: bool
+
+
+def draw_ranges(rows: Sequence[FigureRow], title: str, stem: Path) -> None:
+    """Errors and time of missions, a cell a line: mean as a dot, 99th percentile as the end of a bar."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter  # noqa: PLC0415 - takes a second
+
+    title = f"{title}: mean (dot), 99th percentile (end of the bar)"
+    with plot(stem, 10.5, 0.27 * len(rows) + 1.6, 1, len(_RANGES), title=title, sharey=True) as (_, panels):
+        for axes, (label, key) in zip(panels, _RANGES, strict=True):
+            for place, row in enumerate(rows):
+                found = row.cell.values[key]
+                mean, tail = (found["mean"], found["p99"]) if isinstance(found, Mapping) else (found, None)
+                if mean is None:
+                    continue
+                shade = colour(row.shade)
+                if row.is_base:
+                    axes.axvline(mean, color=shade, linewidth=0.9, linestyle="--", alpha=0.7)
+                if tail is not None:
+                    axes.plot([mean, tail], [place] * 2, color=shade, linewidth=3.0, alpha=0.35, solid_capstyle="butt")
+                axes.plot(mean, place, "D" if row.is_base else "o", color=shade, markersize=5)
+            axes.set_xlabel(label)
+        panels[0].set_yticks(range(len(rows)), [row.label for row in rows])
+        panels[0].set_ylim(len(rows) - 0.5, -0.5)  # the first one on top
+        for axes in panels[:2]:
+            axes.set_xscale("log")
+            # 1, 2 and 5 in plain numbers: most cells lie within a decade or two.
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        panels[2].xaxis.set_major_locator(MaxNLocator(5))
