@@ -39,11 +39,7 @@ STUDIES = {
 
 
 def find_study(name: str) -> "Study | Analysis":
-    """The study of a name.
-
-    Raises:
-        CampaignError: there is none.
-    """
+    """The study of a name (raises CampaignError: there is none)."""
     if name not in STUDIES:
         from ccatp.studies.campaign import CampaignError  # noqa: PLC0415
 

@@ -117,11 +117,7 @@ def step_cases(cfg: Config, rounds: int) -> Iterator[dict[str, Any]]:
 
 
 def step_case(name: str, ours: Contender, peer_name: str, peer: Contender | None, rounds: int) -> dict[str, Any]:
-    """The figures of one race.
-
-    Raises:
-        BenchError: the results differ, so that times cannot be compared.
-    """
+    """The figures of one race (raises BenchError: the results differ, so that times cannot be compared)."""
     found: dict[str, Any] = {"name": name}
     if peer is not None:
         difference = largest_difference(ours, peer)
@@ -146,8 +142,7 @@ def race(ours: Contender, peer: Contender | None, rounds: int, steps: int = STEP
     So a machine that slows down for a while slows both, and neither runs on caches that the other one has filled. A
     round begins with a reset; one round before them warms up.
 
-    Returns:
-        Wall times of single steps of ours and of the peer, if there is one, us, shape (1 or 2, rounds, steps).
+    The result has the wall times of single steps of ours and of the peer, if any, us, shape (1 or 2, rounds, steps).
     """
     both = [ours] if peer is None else [ours, peer]
     taken = np.zeros((len(both), rounds, steps))

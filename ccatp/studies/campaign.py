@@ -141,11 +141,7 @@ WHOLE = Shard(1, 1)
 
 
 def parse_shard(text: str) -> Shard:
-    """``2/4`` as the second shard of four.
-
-    Raises:
-        CampaignError: it is not such a pair.
-    """
+    """``2/4`` as the second shard of four (raises CampaignError: it is not such a pair)."""
     number, slash, of = text.partition("/")
     if slash and number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of):
         return Shard(int(number), int(of))
@@ -153,11 +149,7 @@ def parse_shard(text: str) -> Shard:
 
 
 def parse_choice(text: str) -> tuple[str, tuple[str, ...]]:
-    """``world=hard,extreme`` as the factor and its levels.
-
-    Raises:
-        CampaignError: there is no factor or no level.
-    """
+    """``world=hard,extreme`` as the factor and its levels (raises CampaignError: there is no factor or no level)."""
     name, equals, levels = text.partition("=")
     chosen = tuple(level.strip() for level in levels.split(",") if level.strip())
     if not equals or not name.strip() or not chosen:

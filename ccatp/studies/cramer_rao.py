@@ -1,4 +1,4 @@
-"""The posterior Cramér-Rao bound of the position at the stops of a rehearsal, computed from the truth.
+"""The posterior Cramér-Rao bound of the position at the stops of a mission, computed from the truth.
 
 No estimator can have a smaller mean square error than the inverse of the Bayesian information, and for a Markov process
 the recursion of Tichavský, Muravchik and Nehorai (1998) carries that information from step to step. With Gaussian
@@ -17,20 +17,152 @@ What is approximated:
 * the ``_SLOTS`` panel edges and tilts met last are remembered; one that is met again later counts as unknown.
 """
 
+from array import array
 from collections import OrderedDict
 from collections.abc import Hashable
-from dataclasses import dataclass
 from math import exp, pi, sqrt
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
 from ccatp.config.models import Config, WorldConfig
-from ccatp.core import FloatArray, PointId
+from ccatp.core import Fix, FloatArray, PanelId, PointId
+from ccatp.estimation.fixes import deck_foot
+from ccatp.estimation.seams import EdgeScanner, SensorTransition
+from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.disturbances import LEG_PAUSE_S, LEVEL_SLOPE
-from ccatp.studies import cramer_rao_record as way
-from ccatp.studies.cramer_rao_record import SeamPass, StopFix, TrueRecord
+from ccatp.studies.sil_run import SilResult, SilRun
+
+# -- the record: true way, seams, fixes --------------------------------------------------------------------------------
+
+
+(
+    WAY_T, WAY_X, WAY_Y, WAY_HX, WAY_HY, WAY_LX, WAY_LY, WAY_FX, WAY_FY, WAY_RIGHT, WAY_LEFT, WAY_RIGHT_SCALE,
+    WAY_LEFT_SCALE, WAY_ORDERED,
+) = range(14)  # fmt: skip
+"""Columns of the true way.
+
+T: time, s. X, Y: robot origin, deck frame, m. HX, HY, LX, LY: deck components of the robot's x and y axes. FX, FY:
+slopes of the surface. RIGHT, LEFT: wheel angles since boot, rad. RIGHT_SCALE, LEFT_SCALE: travel of the body over
+travel of the nominal wheel in the frame that ends here. ORDERED: 1 where a set point of that frame was not zero.
+"""
+WAY_COLUMNS = 14
+
+
+class SeamPass(NamedTuple):
+    """An edge sensor changed its value over a panel's edge.
+
+    Attributes:
+        frame: index of the row that ends the frame in which it did.
+        axis: deck axis across the edge, 0 or 1.
+        edge: which edge: axis, panel, and whether it is the one on the high side.
+    """
+
+    frame: int
+    corner: int
+    interval_s: float
+    axis: int
+    edge: tuple[int, PanelId, bool]
+
+
+class StopFix(NamedTuple):
+    """A fix at rest.
+
+    Attributes:
+        point: where it was taken; None where it was not for a point.
+        covariance_m2: of the foot (x, y), deck frame, from the lengths alone, shape (2, 2).
+        error_m: true minus estimated position before the fix (x, y), m.
+    """
+
+    frame: int
+    point: PointId | None
+    panel: PanelId
+    covariance_m2: FloatArray
+    error_m: tuple[float, float]
+
+
+class TrueRecord(NamedTuple):
+    """The truth of one mission.
+
+    Attributes:
+        way: a row per frame from the boot on, columns ``WAY_...``, shape (k, 14).
+    """
+
+    way: FloatArray
+    passes: tuple[SeamPass, ...]
+    fixes: tuple[StopFix, ...]
+    base_m: float
+
+
+class RecordedSilRun(SilRun):
+    """A mission with its record; everything random stays as it is without."""
+
+    def __init__(self, cfg: Config, *, with_track: bool = False) -> None:
+        super().__init__(cfg, with_track=with_track)
+        self._way = array("d")
+        self._scanner = EdgeScanner()
+        self._transitions: list[SensorTransition] = []
+        self._fixes: list[StopFix] = []
+
+    def record(self) -> TrueRecord:
+        """The record so far."""
+        way = np.frombuffer(self._way, dtype=np.float64).reshape(-1, WAY_COLUMNS).copy()
+        return TrueRecord(way, self._passes(way), tuple(self._fixes), self.robot.world.wheels.base_m)
+
+    def _passes(self, way: FloatArray) -> tuple[SeamPass, ...]:
+        """The edges of the transitions, from the true way, its first row at t = 0; those over the rim left out."""
+        mirror = self.mirror
+        found = []
+        for transition in self._transitions:
+            at = transition.t_s / self.robot.frame_s
+            frame = min(int(np.ceil(at - 1e-9)), len(way) - 1)
+            part = at - (frame - 1)
+            row = way[frame - 1] + part * (way[frame] - way[frame - 1])
+            ahead, left = self.cfg.robot.edge_sensors_m[transition.corner]
+            x_m = float(row[WAY_X] + ahead * row[WAY_HX] + left * row[WAY_LX])
+            y_m = float(row[WAY_Y] + ahead * row[WAY_HY] + left * row[WAY_LY])
+            seam = mirror.nearest_seam(x_m, y_m)
+            if seam is None:
+                continue
+            panel = mirror.panels[mirror.nearest_panel(x_m, y_m)]
+            axis, beyond_m = (0, x_m - panel.x_m) if seam.axis == "x" else (1, y_m - panel.y_m)
+            edge = axis, panel.id, beyond_m > 0.0
+            found.append(SeamPass(frame, transition.corner, transition.interval_s, axis, edge))
+        return tuple(found)
+
+    def _note_truth(self) -> None:
+        super()._note_truth()
+        p = self.robot.world.plant
+        right_set, _, left_set, _ = p.servo
+        self._way.extend(
+            (
+                self.robot.t_s, p.x_m, p.y_m, p.hx, p.hy, p.lx, p.ly, p.fx, p.fy, p.right_angle_rad, p.left_angle_rad,
+                p.right_scale, p.left_scale, float(right_set != 0.0 or left_set != 0.0),
+            )
+        )  # fmt: skip
+
+    def _serve(self, frame: Sensors, dt_s: float) -> None:
+        self._transitions += self._scanner.scan(frame.edge)
+        super()._serve(frame, dt_s)
+
+    def _fuse(self, fix: Fix) -> None:
+        plant, deck = self.robot.world.plant, self.localizer.deck_pose
+        panel = self.mirror.nearest_panel(plant.x_m, plant.y_m)
+        covariance = deck_foot(self.mirror, fix, self.cfg.robot.puck_height_m).covariance_m2
+        error_m = plant.x_m - deck.x_m, plant.y_m - deck.y_m
+        row = len(self._way) // WAY_COLUMNS - 1
+        self._fixes.append(StopFix(row, self.mission.measuring_point, panel, covariance, error_m))
+        super()._fuse(fix)
+
+
+def rehearse_recorded(cfg: Config, *, with_track: bool = False) -> tuple[SilResult, TrueRecord]:
+    """Survey the mirror of a configuration in its world, and keep the record; see ``sil_run.rehearse``."""
+    run = RecordedSilRun(cfg, with_track=with_track)
+    return run.run(), run.record()
+
+
+# -- the bound ---------------------------------------------------------------------------------------------------------
 
 (X, Y, PSI, BG, KG, BA, SR, SL, UR, UL, RR, RL, KL, C, ER, ER0, EL, EL0, J, J0, JA, JA0) = range(22)
 """Order of the state.
@@ -44,8 +176,6 @@ _OWN = 22
 _SLOTS = 12  # edges of the seams around one panel, and the tilts of two
 _STATES = _OWN + _SLOTS
 _UNIFORM = 1.0 / 12.0  # variance of a uniform distribution over one interval
-_Row = TypeVar("_Row", SeamPass, StopFix)
-
 _STILL_M = 1e-7  # a frame in which no wheel moves further is a frame at rest
 
 
@@ -55,77 +185,18 @@ class StopBound(NamedTuple):
     Attributes:
         point: measured there, None where the fix was not for a point.
         covariance_m2: bound of the covariance of (x, y), shape (2, 2).
-        error_m: what the estimator's error was there, (x, y).
+        error_m: the estimator's error there, (x, y).
     """
 
     t_s: float
     point: PointId | None
     covariance_m2: FloatArray
-    heading_sigma_rad: float
     error_m: tuple[float, float]
-
-    @property
-    def rms_m(self) -> float:
-        """Bound of the root mean square distance between true and estimated position."""
-        return sqrt(float(np.trace(self.covariance_m2)))
-
-
-@dataclass(frozen=True, slots=True)
-class BoundSummary:
-    """All stops of a run.
-
-    Attributes:
-        rms_error_m: root mean square of the estimator's errors.
-        ratio: root mean square of the errors in units of their own bound: 1 for an efficient estimator, but for the
-            scatter of a single run.
-    """
-
-    stops: int
-    median_bound_m: float
-    rms_bound_m: float
-    rms_error_m: float
-    ratio: float
-
-
-def summarise(bounds: list[StopBound]) -> BoundSummary:
-    """Figures over the stops, the first left out: until the second fix only the start errors count.
-
-    Raises:
-        ValueError: fewer than two stops.
-    """
-    if len(bounds) < 2:
-        raise ValueError(f"{len(bounds)} stops have no bound to speak of: survey at least two points")
-    kept = bounds[1:]
-    bound = np.array([stop.rms_m for stop in kept])
-    error = np.array([stop.error_m for stop in kept])
-    squares = np.array([e @ np.linalg.solve(s.covariance_m2, e) for e, s in zip(error, kept, strict=True)])
-    return BoundSummary(
-        len(kept),
-        float(np.median(bound)),
-        float(np.sqrt(np.mean(bound**2))),
-        float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
-        float(np.sqrt(np.mean(squares) / 2.0)),
-    )
 
 
 def bounds_of(cfg: Config, mirror: Mirror, record: TrueRecord, *, with_accelerometer: bool = False) -> list[StopBound]:
-    """The bound at each fix of a run.
-
-    Args:
-        cfg: the world's statistics and the robot's geometry.
-    """
+    """The bound at each fix of a run."""
     return _Recursion(cfg, mirror, record, with_accelerometer).run()
-
-
-class _Wheels(NamedTuple):
-    """Travel of the body under its wheels per frame: right, left (m), forward (m), turn (rad), each shape (k,)."""
-
-    right: FloatArray
-    left: FloatArray
-    forward: FloatArray
-    turn: FloatArray
-    right_change: FloatArray
-    left_change: FloatArray
 
 
 class _Recursion:
@@ -135,7 +206,12 @@ class _Recursion:
         self._sensors = cfg.robot.edge_sensors_m
         self._radius_m, self._base_m = cfg.robot.wheel_radius_m, record.base_m
         self._frame_s = 1.0 / cfg.sim.robot.frame_hz
-        self._wheels = _wheels_of(record, self._radius_m)
+        rows = record.way
+        self._right_m, self._left_m = (
+            np.concatenate([np.zeros(1), np.diff(rows[:, angle])]) * self._radius_m * rows[:, scale]
+            for angle, scale in ((WAY_RIGHT, WAY_RIGHT_SCALE), (WAY_LEFT, WAY_LEFT_SCALE))
+        )
+        self._turn_rad = (self._right_m - self._left_m) / record.base_m
         self._downhill = _downhill_of(mirror, record.way)
         self._jitter_m = world.vibration_speed_m_s * self._frame_s / sqrt(2.0)
         self._jitter_rad = world.vibration_rate_rad_s * self._frame_s / sqrt(2.0)
@@ -146,10 +222,14 @@ class _Recursion:
         self._ordered_s = -np.inf
 
     def run(self) -> list[StopBound]:
-        record, wheels = self._record, self._wheels
-        passes = _by_frame(record.passes)
-        fixes = _by_frame(record.fixes)
-        still = (np.abs(wheels.right) < _STILL_M) & (np.abs(wheels.left) < _STILL_M)
+        record = self._record
+        passes: dict[int, list[SeamPass]] = {}
+        fixes: dict[int, list[StopFix]] = {}
+        for one in record.passes:
+            passes.setdefault(one.frame, []).append(one)
+        for fix in record.fixes:
+            fixes.setdefault(fix.frame, []).append(fix)
+        still = (np.abs(self._right_m) < _STILL_M) & (np.abs(self._left_m) < _STILL_M)
         resting = 0
         found: list[StopBound] = []
         for k in range(1, len(record.way)):
@@ -163,33 +243,36 @@ class _Recursion:
             for one in passes.get(k, ()):
                 self._cross(one)
             for fix in fixes.get(k, ()):
-                found.append(self._bound(fix))
+                t_s = float(record.way[fix.frame, WAY_T])
+                found.append(StopBound(t_s, fix.point, self._P[:2, :2].copy(), fix.error_m))
                 self._fix(fix)
         return found
 
     # -- motion -------------------------------------------------------------------------------------------------------
 
     def _redraw_if_ordered(self, k: int) -> None:
+        """The slips of a leg that begins."""
         row = self._record.way[k]
-        if not row[way.ORDERED]:
+        if not row[WAY_ORDERED]:
             return
-        begun_s = float(row[way.T]) - self._frame_s
+        begun_s = float(row[WAY_T]) - self._frame_s
         if begun_s - self._ordered_s >= LEG_PAUSE_S - 1e-6:
             variance = (self._world.slip_max - self._world.slip_min) ** 2 * _UNIFORM
             self._renew(SR, variance)
             self._renew(SL, variance)
-        self._ordered_s = float(row[way.T])
+        self._ordered_s = float(row[WAY_T])
 
     def _advance(self, k: int) -> None:
         """One frame in which the wheels turn, and what the inertial unit says at its end."""
         self._P = self._shift.dot(self._P).dot(self._shift.T)
         self._P.flat[:: _STATES + 1] += self._fresh
-        right, left, forward, turn, right_change, left_change = (float(values[k]) for values in self._wheels)
+        right, left, turn = float(self._right_m[k]), float(self._left_m[k]), float(self._turn_rad[k])
+        forward = 0.5 * (right + left)
         base_m, dt_s, radius_m = self._base_m, self._frame_s, self._radius_m
         _, _, _, hx, hy, lx, ly, *_ = self._record.way[k].tolist()
         gx, gy = self._downhill[k]
-        per_right = _per_parameter(right, radius_m, float(self._record.way[k, way.RIGHT_SCALE]))
-        per_left = _per_parameter(left, radius_m, float(self._record.way[k, way.LEFT_SCALE]))
+        per_right = _per_parameter(right, radius_m, float(self._record.way[k, WAY_RIGHT_SCALE]))
+        per_left = _per_parameter(left, radius_m, float(self._record.way[k, WAY_LEFT_SCALE]))
         # How forward way and turn depend on the parameters of each wheel, and the turn on the base.
         ahead, swing = np.zeros(_STATES), np.zeros(_STATES)
         for states, per, sign in ((_RIGHT_STATES, per_right, 1.0), (_LEFT_STATES, per_left, -1.0)):
@@ -211,7 +294,12 @@ class _Recursion:
         rate[J], rate[J0] = 1.0 / dt_s, -1.0 / dt_s
         rows, variances = [rate], [self._world.gyroscope_sigma_rad_s**2]
         if self._with_accelerometer:
-            rows.append(_acceleration_row(right_change, left_change, dt_s))
+            period_s = float(self._record.way[1, WAY_T] - self._record.way[0, WAY_T])
+            changes = (
+                (right - float(self._right_m[k - 1])) / period_s**2,
+                (left - float(self._left_m[k - 1])) / period_s**2,
+            )
+            rows.append(_acceleration_row(*changes))
             variances.append(self._world.accelerometer_sigma_m_s2**2)
         # The rate's row refers to the parameters, which the motion leaves as they are, so it may follow it.
         self._P = F.dot(self._P).dot(F.T)
@@ -220,8 +308,6 @@ class _Recursion:
 
     def _rest(self, frames: int) -> None:
         """Frames at rest, taken together: slip wanders on, the inertial unit shows its biases."""
-        if not frames:
-            return
         P, world, rest_s = self._P, self._world, frames * self._frame_s
         for state, sigma, time_s in _wanderers(world):
             keep = exp(-rest_s / time_s)
@@ -245,19 +331,15 @@ class _Recursion:
     def _cross(self, one: SeamPass) -> None:
         ahead, left = self._sensors[one.corner]
         row = self._record.way[one.frame]
-        hx, hy, lx, ly = row[way.HX : way.LY + 1].tolist()
+        hx, hy, lx, ly = row[WAY_HX : WAY_LY + 1].tolist()
         turned = ahead * (lx, ly)[one.axis] - left * (hx, hy)[one.axis]
-        moved_m = row[[way.X, way.Y]] - self._record.way[one.frame - 1][[way.X, way.Y]]
-        speed_m_s = (float(moved_m[one.axis]) + float(self._wheels.turn[one.frame]) * turned) / self._frame_s
+        moved_m = row[[WAY_X, WAY_Y]] - self._record.way[one.frame - 1][[WAY_X, WAY_Y]]
+        speed_m_s = (float(moved_m[one.axis]) + float(self._turn_rad[one.frame]) * turned) / self._frame_s
         H = np.zeros(_STATES)
         H[X + one.axis], H[PSI] = 1.0, turned
         H[self._slot(one.edge, self._world.panel_edge_sigma_m**2)] = -1.0
         jitter = (self._jitter_rad * turned) ** 2 + (self._jitter_m * (hx, hy)[one.axis]) ** 2
         self._update(H, (speed_m_s * one.interval_s) ** 2 * _UNIFORM + jitter)
-
-    def _bound(self, fix: StopFix) -> StopBound:
-        P, t_s = self._P, float(self._record.way[fix.frame, way.T])
-        return StopBound(t_s, fix.point, P[:2, :2].copy(), sqrt(float(P[PSI, PSI])), fix.error_m)
 
     def _fix(self, fix: StopFix) -> None:
         """Position of the puck's foot; the panel under it is tilted, and the puck stands above it."""
@@ -303,7 +385,7 @@ def _per_parameter(travel_m: float, radius_m: float, scale: float) -> FloatArray
     return np.array((-nominal_m, -nominal_m, travel_m, -m_per_rad, m_per_rad))
 
 
-def _acceleration_row(right_m_s2: float, left_m_s2: float, dt_s: float) -> FloatArray:
+def _acceleration_row(right_m_s2: float, left_m_s2: float) -> FloatArray:
     row = np.zeros(_STATES)
     row[[SR, UR, RR]] = -0.5 * right_m_s2, -0.5 * right_m_s2, 0.5 * right_m_s2
     row[[SL, UL, RL]] = -0.5 * left_m_s2, -0.5 * left_m_s2, 0.5 * left_m_s2
@@ -311,19 +393,10 @@ def _acceleration_row(right_m_s2: float, left_m_s2: float, dt_s: float) -> Float
     return row
 
 
-def _wheels_of(record: TrueRecord, radius_m: float) -> _Wheels:
-    rows, frame_s = record.way, float(record.way[1, way.T] - record.way[0, way.T])
-    zero = np.zeros(1)
-    right = np.concatenate([zero, np.diff(rows[:, way.RIGHT])]) * radius_m * rows[:, way.RIGHT_SCALE]
-    left = np.concatenate([zero, np.diff(rows[:, way.LEFT])]) * radius_m * rows[:, way.LEFT_SCALE]
-    changes = (np.concatenate([zero, np.diff(travel)]) / frame_s**2 for travel in (right, left))
-    return _Wheels(right, left, 0.5 * (right + left), (right - left) / record.base_m, *changes)
-
-
 def _downhill_of(mirror: Mirror, rows: FloatArray) -> FloatArray:
     """Deck components of the unit vector downhill at each row, shape (k, 2)."""
     gx, gy, gz = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
-    fx, fy = rows[:, way.FX], rows[:, way.FY]
+    fx, fy = rows[:, WAY_FX], rows[:, WAY_FY]
     along = (gz - fx * gx - fy * gy) / (1.0 + fx * fx + fy * fy)
     tangent = np.column_stack([gx + along * fx, gy + along * fy, gz - along])
     slope = np.sqrt(np.sum(tangent**2, axis=1))
@@ -385,10 +458,3 @@ def _start_of(world: WorldConfig) -> FloatArray:
     for state, sigma, _ in _wanderers(world):
         sigmas[state] = sigma
     return np.diag(sigmas**2)
-
-
-def _by_frame(rows: tuple[_Row, ...]) -> dict[int, list[_Row]]:
-    found: dict[int, list[_Row]] = {}
-    for row in rows:
-        found.setdefault(row.frame, []).append(row)
-    return found

@@ -68,11 +68,7 @@ def settle() -> None:
 
 
 def make_out(out: Path) -> None:
-    """Make a study's directory, before any work.
-
-    Raises:
-        CampaignError: it cannot be made.
-    """
+    """Make a study's directory, before any work (raises CampaignError: it cannot be made)."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

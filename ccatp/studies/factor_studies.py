@@ -126,11 +126,7 @@ TIME = Study(
 
 
 def _error_columns(tail: str, more: Sequence[Column], late: Sequence[Column] = ()) -> tuple[Column, ...]:
-    """Columns of missions with one thing changed, with more before and late ones after the stop error.
-
-    Args:
-        tail: format of the 99th percentile.
-    """
+    """Columns of missions with one thing changed, with more before and late ones after the stop error."""
     return (
         Column("complete", "complete"),
         Column("localization mean, mm", "localization_error_mm.mean", ".3f"),

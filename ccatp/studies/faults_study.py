@@ -32,8 +32,7 @@ class NoFrames(RuntimeError):
 def random_plan(seed: int, count: int, last_s: float) -> FaultPlan:
     """Random faults of sensors, frames, clock and wheels that pass by; a function of its arguments alone.
 
-    Args:
-        last_s: robot time by which all have begun; each lasts at most ``LONGEST_S``.
+    All have begun by robot time ``last_s``; each lasts at most ``LONGEST_S``.
     """
     rng = random.Random(f"plan {seed}")
     texts = []

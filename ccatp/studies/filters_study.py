@@ -10,8 +10,7 @@ from ccatp.core import FloatArray
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.plots import GRID, INK, QUIET
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
-from ccatp.studies.cramer_rao import bounds_of
-from ccatp.studies.cramer_rao_record import rehearse_recorded
+from ccatp.studies.cramer_rao import bounds_of, rehearse_recorded
 from ccatp.studies.mission_study import COLUMN, Histogram, combine_missions, first_arrivals, mission_outcome, nees
 from ccatp.studies.results import LIMIT, colour, plot
 from ccatp.studies.sil_run import rehearse

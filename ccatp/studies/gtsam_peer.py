@@ -33,11 +33,7 @@ class PeerError(CcatpError):
 
 
 class Peers(NamedTuple):
-    """What GTSAM made of a run.
-
-    Attributes:
-        isam2: each pose as it was estimated from readings up to it; the map at the end.
-    """
+    """The estimates of GTSAM; of iSAM2 each pose from readings up to it, and the map at the end."""
 
     isam2: EstimatedPath
     batch: EstimatedPath

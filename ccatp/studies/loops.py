@@ -69,10 +69,8 @@ class Loop:
 class Margins(NamedTuple):
     """What separates a loop from instability; ``inf`` where nothing does.
 
-    Attributes:
-        gain_db: the gain may grow by this before the loop becomes unstable; negative if it has to shrink.
-        phase_rad: least phase margin over all gain crossovers.
-        modulus: least distance of L(j w) from -1.
+    The gain may grow by ``gain_db`` before the loop becomes unstable, negative if it has to shrink; ``phase_rad`` is
+    the least over all gain crossovers, ``modulus`` the least distance of L(j w) from -1.
     """
 
     gain_db: float
@@ -148,11 +146,7 @@ def limit_of(cfg: Config) -> Iterator[Loop]:
 
 
 def system(loop: Loop) -> "TransferFunction":
-    """L(s) with the delay as a Pade approximant.
-
-    Raises:
-        LoopsError: python-control is not installed.
-    """
+    """L(s) with the delay as a Pade approximant (raises LoopsError: python-control is not installed)."""
     try:
         import control  # noqa: PLC0415 - takes seconds, and belongs to an extra
     except ImportError as error:
@@ -319,9 +313,7 @@ COLUMNS = {
 def run(cfg: Config, out: Path) -> dict[str, Any]:
     """Analyse every loop of the configuration and write ``result.json``, ``result.npz``, ``table.md`` and the figures.
 
-    Returns:
-        What ``result.json`` holds: ``{"study", "cells", "wall_s"}``. A cell is one loop with its margins; what does not
-        exist (a gain margin without a phase crossover) is None.
+    A cell is one loop with its margins; what does not exist (a gain margin without a phase crossover) is None.
 
     Raises:
         LoopsError: python-control is not installed.

@@ -54,11 +54,7 @@ class Histogram:
 
     @classmethod
     def of(cls, values: FloatArray, limit: float) -> "Histogram":
-        """The histogram of values, shape (n,).
-
-        Raises:
-            ValueError: a value is negative or not finite.
-        """
+        """The histogram of values, shape (n,) (raises ValueError: a value is negative or not finite)."""
         if values.size and not (np.isfinite(values).all() and values.min() >= 0.0):
             raise ValueError(f"values from {values.min()} to {values.max()}: must be finite and not negative")
         places = np.ceil(PER_DECADE * np.log10(np.maximum(values, LEAST) / LEAST)).astype(np.int64)
@@ -157,7 +153,6 @@ def mission_outcome(cfg: Config, found: SilResult) -> JobOutcome:
 
 
 def _stop_rows(mirror: Mirror, puck_height_m: float, stops: list[StopRow], track: FloatArray) -> FloatArray:
-    """The measurements, columns ``STOP_COLUMNS``."""
     points = [PointId(*stop.point) for stop in stops]
     targets = puck_targets(mirror, dict.fromkeys(points), puck_height_m)
     true = track[np.searchsorted(track[:, _T], [stop.t_s for stop in stops])][:, [_X, _Y]].reshape(-1, 2)

@@ -121,11 +121,7 @@ class MoteRun:
 
 @dataclass(frozen=True, slots=True)
 class MoteOutlook:
-    """What the ranges determine, known before anything is estimated.
-
-    Attributes:
-        bound_rms_m: Cramér-Rao bound at the true places; None where something stays free.
-    """
+    """What the ranges determine; the Cramér-Rao bound at the true places, None where something stays free."""
 
     freedom: Freedom
     folds: FoldOver
@@ -133,11 +129,7 @@ class MoteOutlook:
 
 
 def first_map(cfg: CricketConfig, field: SimulatedField, draws: int = 0) -> FirstMap:
-    """Phase 1; its bias and covariance, where they are needed, by so many draws.
-
-    Raises:
-        MappingError: a step that cannot be made.
-    """
+    """Phase 1, its bias and covariance by so many draws (raises MappingError: a step that cannot be made)."""
     network = field.network()
     if field.plan.networks:
         return map_by_plan(field.plan, network, cfg.phase1.max_dop, draws)
@@ -195,11 +187,8 @@ def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
 def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | None = None) -> MoteRun:
     """The batch over all ranges of both phases; its error after the best rigid motion.
 
-    Args:
-        outlook: of the same graph, for the sets of motes that may be mirrored.
-
-    Raises:
-        MappingError: the ranges make no map.
+    ``outlook`` of the same graph has the sets of motes that may be mirrored. Raises MappingError: the ranges make no
+    map.
     """
     plan = field.plan
     network = batch_network(cfg, field)
@@ -249,7 +238,6 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
 
 
 def _block(covariance_m2: FloatArray, motes: list[int], dimension: int) -> FloatArray:
-    """The covariance of some motes."""
     at = (np.array(motes)[:, None] * dimension + np.arange(dimension)).ravel()
     return covariance_m2[np.ix_(at, at)]
 
@@ -266,7 +254,6 @@ def look_ahead(cfg: CricketConfig, field: SimulatedField, method: str, updates: 
     phase 1 measured too, unless the printed prior throws that away.
 
     Args:
-        field: the ranges; their values are not looked at.
         method: ``ekf`` or ``batch``.
         updates: ranges of phase 2 that count; all if ``None``.
     """
@@ -332,12 +319,7 @@ def _error_m(found_m: FloatArray, true_m: FloatArray, aligned: bool) -> float:
 
 
 class MoteCampaign(NamedTuple):
-    """Runs of one configuration.
-
-    Attributes:
-        method: ``ekf`` or ``batch``.
-        outlook: of the first seed's graph, bounds at the median number of updates.
-    """
+    """Runs of one configuration; ``outlook`` is of the first seed's graph, bounds at the median number of updates."""
 
     method: str
     runs: tuple[MoteRun, ...]
@@ -348,14 +330,7 @@ class MoteCampaign(NamedTuple):
 def run_campaign(
     cfg: CricketConfig, method: str, seeds: Sequence[int], on_done: Callable[[int], None] = lambda _: None
 ) -> MoteCampaign:
-    """Map the motes once for each seed, by ``ekf`` or ``batch``.
-
-    Args:
-        on_done: receives the number of runs so far.
-
-    Raises:
-        MappingError: a field of which no map can be made.
-    """
+    """Map the motes once for each seed, by ``ekf`` or ``batch`` (raises MappingError: a field has no map)."""
     field = simulate_field(cfg, seeds[0])
     outlook = look_ahead(cfg, field, method)
     runs = []

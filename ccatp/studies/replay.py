@@ -134,10 +134,7 @@ class RecordingFilter:
     def smooth(self) -> Smoothed:
         """The first three states after 0, 1, ... ``count`` transitions, given everything; (k, 3) and (k, 3, 3).
 
-        Nothing can be taken back afterwards.
-
-        Raises:
-            FilterDiverged: a smoothed state is not finite.
+        Nothing can be taken back afterwards. Raises FilterDiverged where a smoothed state is not finite.
         """
         while self._past:
             self._settle()
@@ -158,10 +155,8 @@ def added_noise(P: FloatArray, F: FloatArray, predicted: FloatArray, Q: FloatArr
     """Q of ``P' = F P F^T + Q`` where F is a regression and the given Q only part of what the prediction added.
 
     Args:
-        P: covariance before a prediction, shape (n, n).
-        F: its transition, shape (n, n).
-        predicted: P' after it, shape (n, n).
-        Q: the noise that it was given, shape (n, n).
+        P, predicted: covariances before and after a prediction, shape (n, n).
+        F, Q: its transition and the noise that it was given, shape (n, n).
     """
     excess = predicted - F.dot(P).dot(F.T) - Q
     sigma = np.sqrt(np.maximum(predicted.diagonal(), 0.0))
@@ -197,7 +192,7 @@ class Replayed:
 
     Attributes:
         trace: its estimates, each before the fix that was taken there.
-        smoothed: what the whole record says of the same poses, where it was asked for.
+        smoothed: the same poses given the whole record, where asked for.
         feet: of the fixes taken then: frame before them, deck x, y of the robot's origin as they show it, shape (f, 3).
         fixes: measured; of them ``set_aside`` were kept from the localizer in the run, and are here, and ``refused``
             were not taken by this localizer.
@@ -364,11 +359,7 @@ class ReplayErrors(NamedTuple):
 
 
 def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: IntArray) -> ReplayErrors:
-    """Compare in the frames that both have.
-
-    Args:
-        arrivals: frames at whose end the robot stood at a point for the first time.
-    """
+    """Compare in the frames that both have; ``arrivals``: where the robot stood at a point for the first time."""
     seqs, i, j = np.intersect1d(estimate.seq, reference.seq, return_indices=True)
     offset = estimate.place[i] - reference.place[j]
     turn = estimate.pose[i, 2] - reference.pose[j, 2]
@@ -385,12 +376,7 @@ def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: Int
 
 
 def fix_distances_m(estimate: Trace, feet: FloatArray, mirror: Mirror) -> FloatArray:
-    """How far each fix was from the estimate before it, m, shape (f,).
-
-    Args:
-        estimate: before each fix.
-        feet: frame before the fix, deck x, y of the robot's origin as the fix shows it, shape (f, 3).
-    """
+    """How far each fix was from the estimate before it, m, shape (f,); ``feet`` as in ``Replayed``."""
     x, y = feet[:, 1], feet[:, 2]
     places = estimate.place[np.searchsorted(estimate.seq, feet[:, 0])]
     distances: FloatArray = np.linalg.norm(places - np.column_stack([x, y, mirror.surface.heights_m(x, y)]), axis=1)
@@ -437,11 +423,7 @@ def _rms_and_max(values: FloatArray) -> dict[str, float | None]:
 
 
 class ReplayEvaluation(NamedTuple):
-    """One recording and its replay.
-
-    Attributes:
-        arrivals: frames at which the robot stood at a point for the first time.
-    """
+    """One recording and its replay; ``arrivals``: frames at which the robot stood at a point for the first time."""
 
     replayed: Replayed
     recorded: Trace

@@ -96,11 +96,7 @@ class SilResult:
 
 
 class SilTrace:
-    """Truth and estimate of every frame on their way to the summary, converted a thousand at a time.
-
-    Args:
-        with_track: keep true and estimated pose of every frame.
-    """
+    """Truth and estimate of every frame on their way to the summary, converted a thousand at a time."""
 
     def __init__(self, parts: SurveyParts, *, with_track: bool) -> None:
         cfg, mirror = parts.cfg, parts.mirror
@@ -179,14 +175,7 @@ class SilTrace:
 
 
 class SilLaser:
-    """Measures the puck of a simulated robot and keeps the measurements.
-
-    Args:
-        cfg: its seed seeds the lengths' noise.
-
-    Attributes:
-        stops: measurements whose fix was fused, in their order.
-    """
+    """Measures the puck of a simulated robot; ``stops`` keeps the measurements whose fix was fused, in order."""
 
     def __init__(self, cfg: Config, mirror: Mirror, robot: Robot) -> None:
         self._cfg, self._mirror, self._robot = cfg, mirror, robot
@@ -199,11 +188,7 @@ class SilLaser:
         self.stops: list[StopRow] = []
 
     def fix(self, t_s: float, estimate: DeckPose) -> Fix:
-        """Measure now; the fix belongs to the frame of time ``t_s``.
-
-        Raises:
-            MultilaterationError: no solution, or one past a limit.
-        """
+        """Measure now, for the frame of time ``t_s`` (raises MultilaterationError: no solution, or past a limit)."""
         robot, channels = self._robot, self._mirror.channels
         puck = PuckTruth(robot.t_s, robot.world.puck_world(), robot.world.moved_m())
         data = multiline.ChannelData(self._etalon.records(channels, puck))
@@ -223,9 +208,7 @@ class SilLaser:
     def is_too_far(self, row: StopRow, point: PointId, fix: Fix, distance_m: float, localizer: Localizer) -> bool:
         """Keep a fix that was fused; whether the point has to be approached again.
 
-        Args:
-            row: the state before it.
-            distance_m: of the robot from the point, as the fix shows it.
+        ``row`` is the state before it, ``distance_m`` that of the robot from the point as the fix shows it.
         """
         row.fix_distance_m = distance_m
         if localizer.innovation is not None and localizer.innovation.size == 2:
@@ -254,11 +237,7 @@ class SilLaser:
 
 
 def rehearse(cfg: Config, *, with_track: bool = False) -> SilResult:
-    """Survey the mirror of a configuration in its world; ``run.seed`` seeds everything.
-
-    Args:
-        with_track: keep true and estimated pose of every frame.
-    """
+    """Survey the mirror of a configuration in its world; ``run.seed`` seeds everything. See ``SilRun``."""
     return SilRun(cfg, with_track=with_track).run()
 
 

@@ -174,9 +174,6 @@ def test_a_mission_in_lockstep(cfg: Config, monkeypatch: pytest.MonkeyPatch) -> 
     assert commands[0][8:10] == ["--config", "c.toml"]
     assert case["tick_us_p99"] == 200.0
     assert case["times_real_time"] == pytest.approx(30.0 / case["wall_s"])
-
-
-def test_a_mission_that_fails(cfg: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subprocess, "run", lambda c, **_: subprocess.CompletedProcess(c, 4, "", "first\nccatp: held\n"))
     with pytest.raises(BenchError, match="ended with status 4: ccatp: held"):
         bench.lockstep_case(cfg, 1)

@@ -11,7 +11,6 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.models import Config, PidConfig
 from ccatp.studies import loops
-from ccatp.studies import loops as loop_models
 from ccatp.studies.loops import Loop, LoopsError, margins, open_loop
 
 LAG_S, FRAME_S = 0.08, 0.01
@@ -59,7 +58,7 @@ def test_the_same_margins_as_python_control(pid: PidConfig, plant: str, frames: 
 
     one = loop(pid, plant, frames=frames)
     found = margins(one)
-    gain, phase_deg, _, at_phase, at_gain, _ = control.stability_margins(loop_models.system(one))
+    gain, phase_deg, _, at_phase, at_gain, _ = control.stability_margins(loops.system(one))
     assert degrees(found.phase_rad) == pytest.approx(phase_deg, abs=1e-3)  # what the Pade approximant leaves
     if found.gain_crossover_rad_s < inf:  # python-control has nan where there is none
         assert found.gain_crossover_rad_s == pytest.approx(at_gain, rel=1e-6)
@@ -80,7 +79,7 @@ def test_a_delay_costs_its_phase_and_no_more_than_the_delay_margin() -> None:
 def test_the_gain_margin_is_where_the_closed_loop_tips_over() -> None:
     late = loop(gains(8.0, 0.0, 0.5), "true", frames=4)
     factor = 10.0 ** (margins(late).gain_db / 20.0)
-    inner, outer = loop_models.root_locus(late, np.array([0.99 * factor, 1.01 * factor]))
+    inner, outer = loops.root_locus(late, np.array([0.99 * factor, 1.01 * factor]))
     assert inner.real.max() < 0.0 < outer.real.max()
 
 
@@ -89,39 +88,39 @@ def test_an_unstable_loop_says_so() -> None:
     assert not found.is_stable
     assert found.gain_db < 0.0
     assert found.phase_rad < 0.0
-    assert loop_models.overshoot(loop(gains(100.0, 0.0, 0.0), "true", frames=4)) == inf
+    assert loops.overshoot(loop(gains(100.0, 0.0, 0.0), "true", frames=4)) == inf
 
 
 def test_overshoot_of_a_second_order_loop() -> None:
     # K / (s (T s + 1)), damping zeta = 1 / (2 sqrt(K T)): overshoot exp(-pi zeta / sqrt(1 - zeta^2)).
     kp = 25.0
     zeta = 0.5 / sqrt(kp * LAG_S)
-    found = loop_models.overshoot(loop(gains(kp, 0.0, 0.0), "true"))
+    found = loops.overshoot(loop(gains(kp, 0.0, 0.0), "true"))
     assert found == pytest.approx(np.exp(-pi * zeta / sqrt(1.0 - zeta * zeta)), abs=1e-3)  # the grid of the step
 
 
 def test_the_phase_is_continuous_and_starts_at_the_integrators() -> None:
     omega = np.geomspace(1e-3, 300.0, 2000)
     for plant, start_deg in (("printed", -90.0), ("true", -180.0)):
-        phase = loop_models.response(loop(ANGULAR, plant), omega)[1]
+        phase = loops.response(loop(ANGULAR, plant), omega)[1]
         assert degrees(phase[0]) == pytest.approx(start_deg, abs=0.3)  # atan of the zeros at 1e-3 rad/s
         assert np.abs(np.diff(phase)).max() < 0.1
 
 
 def test_every_set_of_gains_is_analysed(cfg: Config) -> None:
-    found = {(one.gains, one.axis, one.plant) for one in loop_models.loops_of(cfg)}
+    found = {(one.gains, one.axis, one.plant) for one in loops.loops_of(cfg)}
     for name, gain_set in cfg.control.gain_sets.items():
         assert (name, "forward", "true") in found
         assert ((name, "angular", "printed") in found) == (not gain_set.shaped)
         assert ((name, "steering", "true") in found) == gain_set.shaped
-    assert {one.delay_frames for one in loop_models.loops_of(cfg)} == {0, 2, 4}
-    assert next(one.lag_s for one in loop_models.limit_of(cfg)) == 0.5 * cfg.robot.wheel_lag_s
+    assert {one.delay_frames for one in loops.loops_of(cfg)} == {0, 2, 4}
+    assert next(one.lag_s for one in loops.limit_of(cfg)) == 0.5 * cfg.robot.wheel_lag_s
 
 
 def test_steering_is_the_regulator_on_the_line(cfg: Config) -> None:
     from ccatp.control.tracker import LegView, line_rate
 
-    pid, v = loop_models.steering(cfg.limits, cfg.control), cfg.limits.v_max_m_s
+    pid, v = loops.steering(cfg.limits, cfg.control), cfg.limits.v_max_m_s
     weights = cfg.control.cross_track_gain_rad_m2, cfg.control.heading_weight_1_s2
     assert -line_rate(LegView(1.0, 0.0, 1.0, 1.0), v, *weights) == pytest.approx(pid.kp)
     assert -line_rate(LegView(1.0, 1.0, 0.0, 1.0), v, *weights) * v == pytest.approx(pid.ki)
@@ -150,4 +149,4 @@ def test_the_files(cfg: Config, tmp_path: Path) -> None:
 def test_without_python_control(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "control", None)
     with pytest.raises(LoopsError, match=r"install ccatp\[tune\]"):
-        loop_models.system(loop(FORWARD, "true"))
+        loops.system(loop(FORWARD, "true"))

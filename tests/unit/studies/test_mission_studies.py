@@ -1,7 +1,6 @@
 """The studies of whole missions: their cells, the figures of a cell, what they draw."""
 
 from collections.abc import Mapping
-from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +9,8 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.core import EdgeSample, Fix, ImuSample, WheelSample
-from ccatp.estimation.measurements import STATES
-from ccatp.estimation.seams import HeadingFix
-from ccatp.filters import FILTERS
 from ccatp.mirror.mirror import build_mirror
+from ccatp.records.summary import WITHIN_M
 from ccatp.sim.world import TruthRow
 from ccatp.studies import STUDIES, faults_study, filters_study, find_study
 from ccatp.studies.campaign import CampaignError, CellResult, Job, JobOutcome, Study, cells_of, jobs_of
@@ -24,6 +20,7 @@ from ccatp.studies.faults_study import FIRST_S, LONGEST_S, is_recoverable, rando
 from ccatp.studies.mission_study import (
     COLUMN,
     LEAST,
+    STOP_COLUMNS,
     Histogram,
     chi_square_figures,
     combine_missions,
@@ -33,20 +30,56 @@ from ccatp.studies.mission_study import (
 )
 from ccatp.studies.results import plain, table
 from ccatp.studies.sil_run import SilTrace
-from ccatp.studies.thesis_study import (
-    LIMIT_M,
-    PUBLISHED,
-    ThesisLocalizer,
-    cells,
-    combine,
-    draw,
-    overrides_of,
-    run_job,
-    run_replica,
-)
 from ccatp.survey.composition import SurveyParts, assemble
 from tests.support.sim_survey import single
-from tests.unit.studies.missions import SIGMA_M, mission, stops_of
+
+SIGMA_M, SIGMA_RAD = 1e-3, 2e-3
+
+
+def stops_of(errors_m: list[float], approaches: list[int] | None = None) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Stops at the points of one panel in turn, each this far off along x, in truth, in the estimate and at the fix."""
+    rows = np.zeros((len(errors_m), len(STOP_COLUMNS)))
+    approach = np.array(approaches or [1] * len(errors_m))
+    rows[:, COLUMN["t_s"]] = np.arange(len(errors_m))
+    rows[:, COLUMN["row"]] = rows[:, COLUMN["col"]] = 1
+    rows[:, COLUMN["point"]] = np.cumsum(approach == 1)
+    rows[:, COLUMN["approach"]] = approach
+    for name in ("error_x_m", "arrival_m", "distance_m", "fix_distance_m"):
+        rows[:, COLUMN[name]] = errors_m
+    rows[:, COLUMN["nis"]] = (np.array(errors_m) / SIGMA_M) ** 2
+    rows[:, [COLUMN["p_xx"], COLUMN["p_yy"]]] = SIGMA_M**2
+    rows[:, COLUMN["p_hh"]] = SIGMA_RAD**2
+    return rows
+
+
+def mission(errors_m: list[float], approaches: list[int] | None = None, **changes: Any) -> JobOutcome:
+    """A mission whose localization errors are those at its stops."""
+    values = {
+        "outcome": "complete",
+        "cause": "",
+        "points": {"total": 9, "measured": 9, "first_arrival_within_10mm": 9, "skipped": 0},
+        "heading_error_mrad": {"count": 2, "square_sum": 8.0},
+        "mission_time_s": 110.0,
+        "lower_bound_s": 100.0,
+        "within_budget": True,
+        "danger": {"true_edges": 0, "false_edges": 1, "falls": 0, "max_overrun_mm": 0.5},
+        "panels": {"count": 1, "piston_rms_um": 3.0, "tilt_rms_urad": None},
+        "corrections": sum(a > 1 for a in approaches or []),
+        "counts": {"fixes": 9},
+        "states_s": {"driving": 60.0, "turning": 50.0, "settling": 5.0, "measuring": 4.0},
+        "tour_bound_s": 90.0,
+        "budget_s": 3600.0,
+        **changes,
+    }
+    errors = np.array(errors_m)
+    arrays = {
+        **Histogram.of(errors, WITHIN_M).to_arrays("localization"),
+        **Histogram.of(errors[1:], WITHIN_M).to_arrays("localization_later"),
+        "stops": stops_of(errors_m, approaches),
+        "bounds": np.array([(k, 8e-6, 2e-6, e, 0.0) for k, e in enumerate(errors_m)]),
+    }
+    return JobOutcome(values, arrays)
+
 
 # Each with the stems of its figures.
 CAMPAIGNS = (
@@ -109,17 +142,13 @@ def test_the_margin_is_that_of_the_slowest_mission() -> None:
 
 def test_each_group_of_disturbances_is_added_and_taken_away() -> None:
     cells = {str(cell.factors["group"]): cell for cell in sensitivity_cells()}
-    hard = load_config(None, {"run.world": "hard"}).world
-    slip = load_config(None, cells["plus slip"].overrides).world
+    quiet, hard = (load_config(None, {"run.world": name}).world for name in ("thesis", "hard"))
+    slip, rest = (load_config(None, cells[name].overrides).world for name in ("plus slip", "minus slip"))
     assert (slip.slip_max, slip.creep_fraction) == (hard.slip_max, 0.0)
-    rest = load_config(None, cells["minus slip"].overrides).world
     assert (rest.slip_max, rest.creep_fraction) == (0.0, hard.creep_fraction)
-
-
-def test_everything_that_is_disturbed_belongs_to_a_group() -> None:
-    """With all groups added, the quiet world is the hard one but for its name."""
-    quiet, hard = (load_config(None, {"run.world": name}).world.model_dump() for name in ("thesis", "hard"))
-    differing = {key for key in quiet if quiet[key] != hard[key]} - {"name"}
+    # With all groups added, the quiet world is the hard one but for its name.
+    keys = set(type(quiet).model_fields) - {"name"}
+    differing = {key for key in keys if getattr(quiet, key) != getattr(hard, key)}
     assert differing <= {key for group in GROUPS.values() for key in group}
 
 
@@ -331,137 +360,6 @@ def test_a_late_frame_has_its_truth_and_there_is_no_track_unless_asked_for(parts
     assert book.truth_at(FRAMES - 1 - DELAY) == true_row(parts, FRAMES - 1 - DELAY)
     book.summary(parts.mission, 25.0, {}, {})
     assert book.track() is None
-
-
-# -- the study `thesis` -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("noise", "table"), [("normal", 0.0087), ("twice", 0.0175)])
-@pytest.mark.parametrize("noise_is_variance", [False, True])
-def test_the_table_is_read_as_sigma_or_as_variance(noise: str, table: float, noise_is_variance: bool) -> None:
-    keys = overrides_of(noise, noise_is_variance=noise_is_variance, period_error=0.0)
-    cfg = load_config(overrides=keys)
-    expected = table**0.5 if noise_is_variance else table
-    assert cfg.world.gyroscope_sigma_rad_s == pytest.approx(expected)
-    assert cfg.localizer.gyroscope_sigma_rad_s == cfg.world.gyroscope_sigma_rad_s  # R follows, thesis 2.3.1
-
-
-def test_a_long_period_keeps_one_sample_per_frame() -> None:
-    sim = load_config(overrides=overrides_of("normal", noise_is_variance=True, period_error=0.013)).sim.robot
-    assert sim.frame_hz == pytest.approx(100.0 / 1.013)
-    assert sim.frame_hz == sim.imu_hz == sim.encoder_hz
-
-
-def test_a_fixed_step_believes_in_a_shorter_way() -> None:
-    cfg = load_config(overrides=overrides_of("normal", noise_is_variance=False, period_error=0.013))
-    mirror = build_mirror(cfg.mirror)
-    start = mirror.base_panel_pose
-    filter_ = FILTERS["kf"](np.zeros(STATES), np.eye(STATES))
-    localizer = ThesisLocalizer(filter_, mirror, cfg.robot, cfg.localizer, start)
-    localizer.period_factor = 1.013
-    period_s, rate = 0.01 * 1.013, 0.1 / cfg.robot.wheel_radius_m
-    for k in range(101):
-        t_s = k * period_s
-        localizer.step(t_s, [ImuSample(t_s, 0.0, 0.0)], [WheelSample(t_s, rate, rate)], [EdgeSample(t_s, 1, 1, 1, 1)])
-    pose = localizer.pose
-    way_m = np.hypot(pose.x_m - start.x_m, pose.y_m - start.y_m)
-    # 100 steps of 10 ms at 0.1 m/s, less what the filter needs to find the speed.
-    assert way_m == pytest.approx(0.1, abs=1e-3)
-    # A fix carries the true time; the localizer's own would be earlier than its path by now.
-    x, y, z = mirror.puck_world(localizer.deck_pose, cfg.robot.puck_height_m)
-    t_s = 100 * period_s
-    localizer.fuse_fix(Fix(t_s, (x, y, z), (1e-10, 0, 0, 0, 1e-10, 0, 0, 0, 1e-10), 1.0, (1, 2, 3, 4), 0.0))
-    assert localizer.counts["fixes"] == 1
-
-
-def test_only_a_filter_with_a_fixed_step_can_have_a_period_error() -> None:
-    cfg = load_config(overrides=overrides_of("normal", noise_is_variance=False, period_error=0.0, is_ours=True))
-    with pytest.raises(ValueError, match="'ekf' reads time stamps: only kf can have a period error"):
-        run_replica(cfg, period_error=0.013)
-
-
-def test_the_cells_are_all_readings_of_both_systems() -> None:
-    factors = [cell.factors for cell in cells()]
-    assert len(factors) == 14
-    assert sum(f["system"] == "thesis" for f in factors) == 10
-    assert not any(f["period_error"] for f in factors if f["system"] == "ours")
-    for cell in cells():
-        load_config(overrides=cell.overrides)
-
-
-def outcome(fraction: float, mean: float) -> JobOutcome:
-    figures = {"within_10mm_fraction": fraction, "mean": mean, "max": 20.0}
-    values = {"outcome": "complete", "cause": "", "waypoints": 36, "wanted": 36, "time_s": 500.0}
-    localization = Histogram.of(np.linspace(0.0, 0.02, 100), LIMIT_M).to_arrays("localization")
-    track = np.tile(np.linspace(0.0, 1.0, 20, dtype=np.float32)[:, None], 5)
-    arrays: dict[str, np.ndarray] = {"waypoint_m": np.linspace(0.0, 0.02, 36), "track": track, **localization}
-    return JobOutcome({**values, "localization": figures, "waypoint": figures}, arrays)
-
-
-def test_a_published_figure_is_measured_in_scatters_of_a_run() -> None:
-    values, _ = combine({"noise": "normal"}, [outcome(0.9, 3.0), outcome(1.0, 4.0)])
-    found = values["localization"]["within_10mm_fraction"]
-    assert found["mean"] == pytest.approx(0.95)
-    assert found["run_to_run"] == pytest.approx(0.1 / 2.0**0.5)
-    # One run there, two here.
-    assert found["published_minus_mean_in_scatters"] == pytest.approx(0.0121 / (0.1 / 2.0**0.5 * 1.5**0.5))
-    assert found["is_published_within"] is True
-    assert values["waypoint"]["mean"]["is_published_within"] is False  # 6.4 mm, 3.5 and 0.7
-    assert values["waypoint"]["max"]["is_published_within"] is None  # the largest of five runs is no mean
-    assert values["localization"]["is_published_within"] is False  # share and mean are, the largest is not
-    assert values["complete"] == 2
-
-
-def test_runs_that_agree_leave_no_room_for_another_figure() -> None:
-    values, _ = combine({"noise": "normal"}, [outcome(1.0, 3.4), outcome(1.0, 3.4)])
-    assert values["localization"]["within_10mm_fraction"]["is_published_within"] is False
-    assert values["localization"]["mean"]["is_published_within"] is True
-
-
-def test_one_run_has_no_scatter() -> None:
-    values, _ = combine({"noise": "twice"}, [outcome(0.9, 3.0)])
-    assert values["localization"]["mean"]["is_published_within"] is None
-    assert values["localization"]["is_published_within"] is None
-
-
-def test_a_run_that_went_nowhere_counts_as_not_complete() -> None:
-    lost = outcome(nan, nan)
-    lost.values["waypoints"] = 3  # type: ignore[index]  # the test's own dict
-    assert combine({"noise": "normal"}, [lost, outcome(0.9, 3.0)]).values["complete"] == 1
-
-
-def test_every_figure_of_the_thesis_is_drawn(tmp_path: Path) -> None:
-    results = []
-    for cell in cells():
-        values, arrays = combine(cell.factors, [outcome(0.9, 3.0), outcome(1.0, 4.0)])
-        results.append(CellResult(cell.factors, values, arrays))
-    draw(results, tmp_path)
-    stems = ("trajectory", "localization", "waypoints")
-    assert {path.name for path in tmp_path.glob("*.png")} == {f"{s}_{noise}.png" for s in stems for noise in PUBLISHED}
-
-
-def test_a_seam_replaces_the_heading(monkeypatch: pytest.MonkeyPatch) -> None:
-    cfg = load_config(overrides=overrides_of("normal", noise_is_variance=False, period_error=0.0))
-    mirror = build_mirror(cfg.mirror)
-    filter_ = FILTERS["kf"](np.zeros(STATES), np.eye(STATES))
-    localizer = ThesisLocalizer(filter_, mirror, cfg.robot, cfg.localizer, mirror.base_panel_pose)
-    localizer.step(0.0, [ImuSample(0.0, 0.0, 0.0)], [WheelSample(0.0, 0.0, 0.0)], [EdgeSample(0.0, 1, 1, 1, 1)])
-    before_rad = localizer.pose.heading_rad
-    monkeypatch.setattr(localizer._crossings, "scan", lambda *_: ["a transition"])
-    monkeypatch.setattr(localizer._crossings, "headings", lambda *_: [HeadingFix(0.3, 1e-6)])
-    localizer.step(0.01, [ImuSample(0.01, 0.0, 0.0)], [WheelSample(0.01, 0.0, 0.0)], [EdgeSample(0.01, 1, 1, 1, 1)])
-    # Thirty sigmas of the start heading: the daemon's localizer would not believe it.
-    assert localizer.pose.heading_rad - before_rad == pytest.approx(0.3, abs=1e-3)
-    assert localizer.heading_sigma_rad == pytest.approx(1e-3)
-
-
-@pytest.mark.slow
-def test_a_whole_run_reaches_all_waypoints() -> None:
-    keys = overrides_of("normal", noise_is_variance=False, period_error=0.0)
-    cfg = load_config(overrides={**keys, "run.seed": 1})
-    found = run_job(Job("thesis", {"period_error": 0.0}, 1, cfg))
-    assert (found.values["outcome"], found.values["waypoints"]) == ("complete", 36)
-    assert found.values["localization"]["mean"] < 1.0  # a quiet world: white noise of the table, no disturbance
 
 
 # -- the study `faults` -----------------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """A run made of frames by hand, through the localizers."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from math import cos, sin
 
 import numpy as np
@@ -104,7 +104,10 @@ def test_a_replay_is_what_the_localizer_does(name: str, mirror: Mirror) -> None:
             if event.at_rest:
                 localizer.rest()
             wanted.append(mirror.deck_pose(localizer.pose))
-    found = replay(cfg, mirror, driving(mirror, cfg, late_frames=20))
+    times_s: list[float] = []
+    found = replay(cfg, mirror, driving(mirror, cfg, late_frames=20), on_frame=times_s.append)
+    assert times_s == [n * FRAME_S for n in range(1, 261)]
+    assert found.moving.tolist() == list(range(STILL_FRAMES + 1, 261))
     assert found.trace.seq.tolist() == list(range(1, 261))
     assert found.trace.t_s[-1] == 2.6
     # 1e-12 m: the trace goes by way of many poses at once, which drops a point on the surface by other arithmetic.
@@ -127,12 +130,6 @@ def test_a_late_fix_is_smoothed_as_if_it_had_come_in_time(name: str, mirror: Mir
     np.testing.assert_allclose(late.pose[:, :2], in_time.pose[:, :2], atol=5e-5)
     aside = in_time.pose[STILL_FRAMES, :2] - replay(cfg, mirror, driving(mirror, cfg, late_frames=0)).trace.pose[0, :2]
     assert np.linalg.norm(aside) > 5e-4  # the fix is seen from the beginning
-
-
-def test_it_tells_which_wheels_turned(mirror: Mirror) -> None:
-    cfg = config_for("ekf")
-    found = replay(cfg, mirror, driving(mirror, cfg, late_frames=0))
-    assert found.moving.tolist() == list(range(STILL_FRAMES + 1, 261))
 
 
 def test_a_fix_that_the_run_refused_and_the_replay_takes(mirror: Mirror) -> None:
@@ -163,13 +160,6 @@ def test_a_fix_that_the_run_took_and_the_replay_refuses(mirror: Mirror) -> None:
     assert "mm from the estimate" in found.first_difference[1]
 
 
-def test_progress_is_told_frame_by_frame(mirror: Mirror) -> None:
-    told: list[float] = []
-    cfg = config_for("kf")
-    replay(cfg, mirror, standing(mirror, cfg), on_frame=told.append)
-    assert told == [n * FRAME_S for n in range(1, 151)]
-
-
 def test_four_states_cannot_be_smoothed(mirror: Mirror) -> None:
     assert [has_smoother(config_for(name)) for name in ("kf", "ekf", "ukf")] == [False, True, True]
     with pytest.raises(ValueError, match="no smoother for filter kf"):
@@ -192,7 +182,7 @@ def fix(t_s: float) -> Fix:
     return Fix(t_s, (0.0, 0.0, 0.0), (1.0,) * 9, 1.0, (1, 2, 3), 0.0)
 
 
-def told(messages: list[Message]) -> list[str]:
+def names_of(messages: Sequence[Message]) -> list[str]:
     def name(event: Event) -> str:
         if isinstance(event, Marked):
             return f"{event.sensors.seq}{' rests' if event.at_rest else ''}"
@@ -201,40 +191,35 @@ def told(messages: list[Message]) -> list[str]:
     return [name(event) for event in in_order(messages)]
 
 
-def test_a_fix_comes_behind_its_frame_wherever_it_was_recorded() -> None:
-    given = FixGiven(1, fix(7.0), True)
-    wanted = ["0", "1", "fix 7", "2", "3"]
-    assert told([given, *map(events_frame, range(4))]) == wanted  # before the batch
-    assert told([events_frame(0), events_frame(1), given, events_frame(2), events_frame(3)]) == wanted  # between two
+FRAMES = [events_frame(seq) for seq in range(4)]
+GIVEN = FixGiven(1, fix(7.0), True)
 
 
-def test_a_rest_comes_in_its_frame_and_before_the_fix_there() -> None:
-    assert told([Stood(1), FixGiven(1, fix(7.0), True), *map(events_frame, range(3))]) == ["0", "1 rests", "fix 7", "2"]
-
-
-def test_fixes_keep_their_order() -> None:
-    messages: list[Message] = [
-        FixGiven(0, fix(1.0), False),
-        FixGiven(0, fix(2.0), True),
-        events_frame(0),
-        events_frame(1),
-    ]
-    assert told(messages) == ["0", "fix 1 refused", "fix 2", "1"]
-
-
-def test_at_the_end_only_what_belongs_to_a_frame_that_is_there() -> None:
-    messages: list[Message] = [
-        events_frame(0),
-        events_frame(1),
-        FixGiven(1, fix(1.0), True),
-        FixGiven(2, fix(2.0), True),
-        Stood(2),
-    ]
-    assert told(messages) == ["0", "1", "fix 1"]
-
-
-def test_where_frames_are_missing_a_fix_comes_before_the_next_one() -> None:
-    assert told([events_frame(0), FixGiven(3, fix(1.0), True), events_frame(7)]) == ["0", "fix 1", "7"]
+@pytest.mark.parametrize(
+    ("messages", "wanted"),
+    [
+        pytest.param([GIVEN, *FRAMES], ["0", "1", "fix 7", "2", "3"], id="before the batch of its frame"),
+        pytest.param([*FRAMES[:2], GIVEN, *FRAMES[2:]], ["0", "1", "fix 7", "2", "3"], id="between two batches"),
+        pytest.param([Stood(1), GIVEN, *FRAMES[:3]], ["0", "1 rests", "fix 7", "2"], id="a rest before the fix"),
+        pytest.param(
+            [FixGiven(0, fix(1.0), False), FixGiven(0, fix(2.0), True), *FRAMES[:2]],
+            ["0", "fix 1 refused", "fix 2", "1"],
+            id="fixes keep their order",
+        ),
+        pytest.param(
+            [*FRAMES[:2], FixGiven(1, fix(1.0), True), FixGiven(2, fix(2.0), True), Stood(2)],
+            ["0", "1", "fix 1"],
+            id="at the end only what belongs to a frame that is there",
+        ),
+        pytest.param(
+            [events_frame(0), FixGiven(3, fix(1.0), True), events_frame(7)],
+            ["0", "fix 1", "7"],
+            id="before the next frame where frames are missing",
+        ),
+    ],
+)
+def test_a_fix_comes_behind_its_frame(messages: Sequence[Message], wanted: list[str]) -> None:
+    assert names_of(messages) == wanted
 
 
 def test_a_recorded_fix_is_the_fix_again() -> None:
@@ -308,40 +293,26 @@ def test_it_filters_as_the_filter_in_it_and_smooths_as_the_smoother(name: str) -
     assert_same(found.covariances, covariances)
 
 
-def test_what_was_taken_back_is_forgotten() -> None:
+def test_what_was_taken_back_is_removed() -> None:
     filter_ = started("ekf")
     drive(filter_, READINGS[:5])
+    filter_.reset(filter_.mean, filter_.covariance)  # to the present state changes nothing
     kept = filter_.mean, filter_.covariance
     drive(filter_, READINGS[:4] + 3.0)  # not what was read, as it turns out
     filter_.reset(*kept)
     assert filter_.count == 5
-    drive(filter_, READINGS[5:])
-    means, covariances = by_hand("ekf")
-    found = filter_.smooth()
-    assert_same(found.means, means)
-    assert_same(found.covariances, covariances)
-
-
-def test_a_late_reading_between_prediction_and_update() -> None:
-    # As the journal does it: back to the state after a prediction, the late one first, then the others again.
-    filter_ = started("ekf")
-    drive(filter_, READINGS[:6])
+    drive(filter_, READINGS[5:6])
+    # A late reading between prediction and update: the late one first, then the others again.
     filter_.predict(F, Q)
     kept = filter_.mean, filter_.covariance
     drive(filter_, READINGS[7:9])
     filter_.reset(*kept)
     filter_.update(READINGS[6], H, R)
     drive(filter_, READINGS[7:])
-    means, _ = by_hand("ekf")
-    assert_same(filter_.smooth().means, means)
-
-
-def test_a_reset_to_the_present_state_changes_nothing() -> None:
-    filter_ = started("ekf")
-    drive(filter_, READINGS[:5])
-    filter_.reset(filter_.mean, filter_.covariance)
-    drive(filter_, READINGS[5:])
-    assert_same(filter_.smooth().means, by_hand("ekf")[0])
+    means, covariances = by_hand("ekf")
+    found = filter_.smooth()
+    assert_same(found.means, means)
+    assert_same(found.covariances, covariances)
 
 
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
@@ -390,22 +361,14 @@ def asymmetric_in_the_last_bit(P: FloatArray) -> FloatArray:
     return after
 
 
-def more_certain(P: FloatArray) -> FloatArray:
-    return 0.5 * P
-
-
-def inflated(P: FloatArray) -> FloatArray:
-    return P + np.diag([1.0, 0.0, 0.0, 0.0])
-
-
 @pytest.mark.parametrize(
     ("change", "diagonal_of_F", "variance"),
     [
         (np.copy, [1, 1, 1, 1], 0.0),
         (asymmetric_in_the_last_bit, [1, 1, 1, 1], 0.0),
         (redrawn, [1, 0, 1, 1], 7.0),
-        (more_certain, [0, 0, 0, 0], None),
-        (inflated, [0, 0, 0, 0], None),
+        (lambda P: 0.5 * P, [0, 0, 0, 0], None),
+        (lambda P: P + np.diag([1.0, 0.0, 0.0, 0.0]), [0, 0, 0, 0], None),
     ],
 )
 def test_what_a_reset_was(

@@ -50,19 +50,13 @@ def test_the_figures() -> None:
     assert found["nees_mean"] is None
 
 
-def test_the_height_counts_as_it_does_in_the_summary() -> None:
+def test_frames_that_both_have_are_compared_with_height_and_the_short_way_round() -> None:
     high = trace([0.003])._replace(height_m=np.array([0.004]))
     assert errors_of(high, trace([0.0]), NONE, NONE).distance_m == pytest.approx([0.005])
-
-
-def test_only_frames_that_both_have_are_compared() -> None:
-    errors = errors_of(trace([1.0, 2.0, 3.0], first=4), trace([0.0, 0.0, 1.0], first=3), NONE, NONE)
-    assert errors.distance_m.tolist() == [1.0, 1.0]
-
-
-def test_headings_are_compared_the_short_way() -> None:
-    errors = errors_of(trace([0.0], pi - 0.01), trace([0.0], -pi + 0.02), NONE, NONE)
-    assert errors.turn_rad == pytest.approx([-0.03])
+    shifted = errors_of(trace([1.0, 2.0, 3.0], first=4), trace([0.0, 0.0, 1.0], first=3), NONE, NONE)
+    assert shifted.distance_m.tolist() == [1.0, 1.0]
+    turned = errors_of(trace([0.0], pi - 0.01), trace([0.0], -pi + 0.02), NONE, NONE)
+    assert turned.turn_rad == pytest.approx([-0.03])
 
 
 def test_nees_takes_correlations_into_account() -> None:
@@ -82,10 +76,7 @@ def test_a_replay_reproduces_up_to_rounding(by_m: float, is_same: bool) -> None:
     assert found["position_mm"] == pytest.approx({"rms": 1e3 * by_m / sqrt(2.0), "max": 1e3 * by_m}, abs=1e-15)
     turned = difference(errors_of(trace([0.0], by_m), trace([0.0]), NONE, NONE))
     assert turned["reproduced"] is is_same
-
-
-def test_nothing_reproduces_nothing() -> None:
-    assert not difference(errors_of(trace([1.0]), trace([1.0], first=7), NONE, NONE))["reproduced"]
+    assert not difference(errors_of(trace([1.0]), trace([1.0], first=7), NONE, NONE))["reproduced"]  # no common frame
 
 
 def test_the_distance_of_a_fix_is_that_to_the_estimate_before_it(mirror: Mirror) -> None:
@@ -131,9 +122,6 @@ def test_the_table_has_a_column_for_each_estimate(mirror: Mirror) -> None:
     without = list(table_lines(judge([judged(mirror, has_truth=False, is_smoothed=False)])))
     assert without[0].split() == ["error", "against", "the", "recorded", "estimate", "recorded", "replayed"]
     assert without[1].split() == ["position", "mean", "(mm)", "-", "1.0000"]
-
-
-def test_small_numbers_are_shown_as_what_they_are(mirror: Mirror) -> None:
     part = judged(mirror, has_truth=True)._replace(recorded=trace([0.002, 0.002 + 3e-14]))
     assert list(table_lines(judge([part])))[-2].split()[-1] == "3.0e-11"
 
@@ -142,21 +130,5 @@ def test_the_rows_of_the_csv(mirror: Mirror) -> None:
     rows = [line.split(",") for line in csv_lines([judged(mirror, has_truth=False, first=3)])]
     assert rows[0][:6] == ["part", "seq", "t_s", "x_m", "y_m", "heading_rad"]
     assert rows[0][-3:] == ["true_x_m", "true_y_m", "true_heading_rad"]
-    assert rows[1] == [
-        "1",
-        "3",
-        "0.03",
-        "0.002",
-        "0.0",
-        "0.0",
-        "0.001",
-        "0.0",
-        "0.0",
-        "0.004",
-        "0.0",
-        "0.0",
-        "",
-        "",
-        "",
-    ]
+    assert ",".join(rows[1]) == "1,3,0.03,0.002,0.0,0.0,0.001,0.0,0.0,0.004,0.0,0.0,,,"
     assert len(rows) == 3
