@@ -7,7 +7,7 @@ import numpy as np
 
 from ccatp.core import FloatArray
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, Undetermined, point_text
-from ccatp.mirror.panel_alignment import AdjusterPlan, MirrorWavefront, PanelResult, mirror_wavefront
+from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront
 
 MICRO = 1e6
 _DECIMALS = 4
@@ -24,13 +24,22 @@ def result_data(result: SurveyResult, comparison: Comparison | None) -> dict[str
         ],
         **_wavefront(result.wavefront),
         "rms_after_bending_um": None if result.wavefront_bent is None else _um(result.wavefront_bent.after_m),
-        "truth": None if comparison is None else _comparison(comparison),
+        "truth": comparison
+        and {
+            "panels": comparison.panels,
+            "piston_rms_um": _um(comparison.piston_rms_m),
+            "tilt_rms_urad": _um(comparison.tilt_rms_rad),
+            "chi2": round(comparison.chi2, _DECIMALS),
+            "dof": comparison.dof,
+            "band_99": [round(comparison.low, _DECIMALS), round(comparison.high, _DECIMALS)],
+            "agrees": comparison.agrees,
+        },
     }
 
 
 def _panel(panel: PanelResult) -> dict[str, Any]:
     piston, tip, tilt = _list(panel.fit.values)
-    bending = panel.bending
+    bending, own = panel.bending, _wavefront(mirror_wavefront([panel.rigid.wavefront]))
     return {
         "row": panel.panel.row,
         "col": panel.panel.col,
@@ -50,7 +59,8 @@ def _panel(panel: PanelResult) -> dict[str, Any]:
         "bending_adjusters_um": None if bending is None else _list(bending.moves.values_m),
         "bending_adjusters_sigma_um": None if bending is None else _list(bending.moves.sigma_m),
         "cos_incidence": round(panel.cos_i, 6),
-        **_own_wavefront(panel.rigid),
+        "rms_before_um": own["rms_before_um"],
+        "rms_after_um": own["rms_after_um"],
         "deviations": list(_deviations(panel)),
     }
 
@@ -87,27 +97,10 @@ def _deviations(panel: PanelResult) -> Iterator[dict[str, Any]]:
         }
 
 
-def _own_wavefront(plan: AdjusterPlan) -> dict[str, float | None]:
-    found = _wavefront(mirror_wavefront([plan.wavefront]))
-    return {name: found[name] for name in ("rms_before_um", "rms_after_um")}
-
-
 def _wavefront(found: MirrorWavefront | None) -> dict[str, float | None]:
     if found is None:
         return dict.fromkeys(_WAVEFRONT)
     return {name: _um(value) for name, value in zip(_WAVEFRONT, found, strict=True)}
-
-
-def _comparison(found: Comparison) -> dict[str, Any]:
-    return {
-        "panels": found.panels,
-        "piston_rms_um": _um(found.piston_rms_m),
-        "tilt_rms_urad": _um(found.tilt_rms_rad),
-        "chi2": round(found.chi2, _DECIMALS),
-        "dof": found.dof,
-        "band_99": [round(found.low, _DECIMALS), round(found.high, _DECIMALS)],
-        "agrees": found.agrees,
-    }
 
 
 def csv_lines(result: SurveyResult) -> Iterator[str]:
@@ -139,7 +132,6 @@ def _um(value: float) -> float:
     return round(float(value) * MICRO, _DECIMALS) + 0.0
 
 
-_MICRO = 1e6
 _SHOWN = 12  # panels without a result that are named
 
 
@@ -159,7 +151,12 @@ def table_lines(result: SurveyResult, comparison: Comparison | None, puck_height
         yield f"  one point           {_microns(found.noise_m)} um of measurement noise"
         yield f"pistons share         {_microns(puck_height_sigma_m)} um, the uncertainty of the puck's height"
     if comparison is not None:
-        yield from _table_comparison(comparison)
+        tilt = f"tip and tilt {_microns(comparison.tilt_rms_rad)} urad rms"
+        yield f"against the truth     piston {_microns(comparison.piston_rms_m)} um rms, {tilt}"
+        verdict = "inside" if comparison.agrees else "OUTSIDE"
+        band = f"{verdict} its 99 % band of {comparison.low:.1f} to {comparison.high:.1f}"
+        chi2 = f"{comparison.chi2:.1f} for {comparison.dof} degrees of freedom"
+        yield f"  chi2 of {comparison.panels} panels{'':<2}{chi2}, {band}"
 
 
 def _panels(panels: Sequence[PanelResult]) -> Iterator[str]:
@@ -167,10 +164,11 @@ def _panels(panels: Sequence[PanelResult]) -> Iterator[str]:
     head = f"{'panel':<6}{'points':>7}{'piston um':>16}{'tip urad':>16}{'tilt urad':>16}{'chi2/dof':>12}  "
     yield head + "".join(f"{name:>8}" for name in names) + "   moves, um (> 0 towards the robot)"
     for panel in panels:
-        fit = "".join(f"{cell:>16}" for cell in _with_sigma(panel.fit.values, panel.fit.sigma))
+        pairs = zip(panel.fit.values, panel.fit.sigma, strict=True)
+        fit = "".join(f"{f'{MICRO * value:.1f} +- {MICRO * sigma:.1f}':>16}" for value, sigma in pairs)
         kept = int(panel.is_kept.sum())
         where = f"{panel.panel.row}/{panel.panel.col}"
-        moves = "".join(f"{_MICRO * move:>8.1f}" for move in panel.rigid.moves.values_m)
+        moves = "".join(f"{MICRO * move:>8.1f}" for move in panel.rigid.moves.values_m)
         line = f"{where:<6}{kept:>7}{fit}{panel.fit.chi2:>8.1f}/{panel.fit.dof:<3}  {moves}   {_notes(panel)}"
         yield line.rstrip()
 
@@ -180,14 +178,9 @@ def _notes(panel: PanelResult) -> str:
     if panel.outliers:
         notes.append("left out: " + " ".join(point_text(point) for point in panel.outliers))
     if panel.shape is not None and panel.shape.is_significant:
-        xx, xy, yy = (f"{_MICRO * value:.0f}" for value in panel.shape.values_1_m)
+        xx, xy, yy = (f"{MICRO * value:.0f}" for value in panel.shape.values_1_m)
         notes.append(f"bent: xx {xx}, xy {xy}, yy {yy} um/m^2")
     return "; ".join(notes)
-
-
-def _with_sigma(values: FloatArray, sigmas: FloatArray) -> list[str]:
-    pairs = zip(values, sigmas, strict=True)
-    return [f"{_MICRO * value:.1f} +- {_MICRO * sigma:.1f}" for value, sigma in pairs]
 
 
 def _undetermined(others: Sequence[Undetermined]) -> Iterator[str]:
@@ -202,16 +195,8 @@ def _undetermined(others: Sequence[Undetermined]) -> Iterator[str]:
         yield ""
 
 
-def _table_comparison(found: Comparison) -> Iterator[str]:
-    tilt = f"tip and tilt {_microns(found.tilt_rms_rad)} urad rms"
-    yield f"against the truth     piston {_microns(found.piston_rms_m)} um rms, {tilt}"
-    verdict = "inside" if found.agrees else "OUTSIDE"
-    band = f"{verdict} its 99 % band of {found.low:.1f} to {found.high:.1f}"
-    yield f"  chi2 of {found.panels} panels{'':<2}{found.chi2:.1f} for {found.dof} degrees of freedom, {band}"
-
-
 def _microns(value: float) -> str:
-    return f"{_MICRO * value:.2f}"
+    return f"{MICRO * value:.2f}"
 
 
 def head_lines(facts: dict[str, Any]) -> Iterator[str]:

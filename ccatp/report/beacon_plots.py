@@ -5,7 +5,7 @@ The suffix of a file tells its format (PNG, PDF, SVG); PictureError: it cannot b
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,19 +177,13 @@ def draw_places(axes: "Axes", picture: MapPicture) -> None:
     places = picture.positions_m[:, :2]
     for i, j in picture.pairs.tolist():
         axes.plot(*places[[i, j]].T, color=GRID, linewidth=0.8, zorder=1)
-    grown = _ellipses(axes, picture)
+    grown = _draw_ellipses(axes, picture)
     if picture.true_m is not None:
         axes.plot(*picture.true_m[:, :2].T, "o", color=TRUE, markersize=7, fillstyle="none", label="true", zorder=3)
     axes.plot(*places.T, "x", color=FOUND, markersize=6, label="mapped", zorder=4)
     if len(picture.doubtful):
-        axes.plot(
-            *places[list(picture.doubtful)].T,
-            "s",
-            color=DOUBT,
-            markersize=11,
-            fillstyle="none",
-            label="may be elsewhere",
-        )
+        doubtful = places[list(picture.doubtful)]
+        axes.plot(*doubtful.T, "s", color=DOUBT, markersize=11, fillstyle="none", label="may be elsewhere")
     if len(picture.names) <= _LABELLED:
         for name, place in zip(picture.names, places, strict=True):
             axes.annotate(name, place, textcoords="offset points", xytext=(6, 5), fontsize=7, color=QUIET)
@@ -207,13 +201,11 @@ def draw_traces(axes: "Axes", traces: Traces, label: str = "", shade: str = FOUN
     axes.fill_between(updates, traces.low_m, traces.high_m, color=shade, alpha=0.18, linewidth=0)
     axes.plot(updates, traces.middle_m, color=shade, linewidth=1.6, label=f"{label}error, median and 10 to 90 %")
     expected = np.arange(len(traces.expected_m))
-    axes.plot(
-        expected, traces.expected_m, color=shade, linewidth=1.0, linestyle="--", label=f"{label}expected by the filter"
-    )
+    dashed: dict[str, Any] = {"linewidth": 1.0, "linestyle": "--", "label": f"{label}expected by the filter"}
+    axes.plot(expected, traces.expected_m, color=shade, **dashed)
     if traces.bound_m is not None:
-        axes.axhline(
-            traces.bound_m, color=QUIET, linewidth=0.9, linestyle=":", label=f"{label}Cramér-Rao bound, all updates"
-        )
+        dotted: dict[str, Any] = {"linewidth": 0.9, "linestyle": ":", "label": f"{label}Cramér-Rao bound, all updates"}
+        axes.axhline(traces.bound_m, color=QUIET, **dotted)
     axes.set_yscale("log")
     axes.set(xlabel="updates", ylabel="root mean square error, m")
     axes.set_title(f"{traces.runs} runs", fontsize=10, color=INK)
@@ -221,25 +213,17 @@ def draw_traces(axes: "Axes", traces: Traces, label: str = "", shade: str = FOUN
     dress(axes)
 
 
-def _ellipses(axes: "Axes", picture: MapPicture) -> float:
-    """Draw them; by what factor, a power of ten, they are larger than they are."""
-    from matplotlib.patches import Ellipse  # noqa: PLC0415 - see above
-
-    d = picture.positions_m.shape[1]
-    places = picture.positions_m[:, :2]
+def _draw_ellipses(axes: "Axes", picture: MapPicture) -> float:
+    """By what factor, a power of ten, they are larger than they are."""
+    d, places = picture.positions_m.shape[1], picture.positions_m[:, :2]
     blocks = [picture.covariance_m2[row * d : row * d + 2, row * d : row * d + 2] for row in range(len(places))]
-    spread = [np.linalg.eigh(block) for block in blocks]
-    halves = [np.sqrt(_CHI2_90 * np.maximum(values, 0.0)) for values, _ in spread]
-    typical, width = float(np.median([half[1] for half in halves])), float(np.ptp(places, axis=0).max())
-    grown = 1.0
+    outlines = [ellipse_outline(block, _CHI2_90**0.5) for block in blocks]
+    typical = float(np.median([np.hypot(*outline.T).max() for outline in outlines]))
+    width, grown = float(np.ptp(places, axis=0).max()), 1.0
     while 0.0 < typical * grown < _VISIBLE * width and grown < 1e6:
         grown *= 10.0
-    for place, half, (_, vectors) in zip(places, halves, spread, strict=True):
-        angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
-        size = 2.0 * grown * half
-        axes.add_patch(
-            Ellipse(place, size[1], size[0], angle=angle, facecolor=FOUND, alpha=0.18, edgecolor=FOUND, zorder=2)
-        )
+    for place, outline in zip(places, outlines, strict=True):
+        axes.fill(*(place + grown * outline).T, facecolor=FOUND, alpha=0.18, edgecolor=FOUND, zorder=2)
     return grown
 
 

@@ -120,36 +120,32 @@ class EventStream:
     """The next payload for one page; a page that was too slow gets the whole state next."""
 
     def __init__(self) -> None:
-        self._payload = b""
-        self._is_full = asyncio.Event()
+        self._next: asyncio.Queue[bytes] = asyncio.Queue(maxsize=1)
         self._is_over = False
         self.needs_all = True
 
     @property
     def has_taken(self) -> bool:
         """Whether the last payload has been taken."""
-        return not self._is_full.is_set()
+        return self._next.empty()
 
     def offer(self, payload: bytes) -> None:
         """Set the next payload."""
-        self._payload = payload
-        self._is_full.set()
+        self._next.put_nowait(payload)
 
-    def end(self, payload: bytes | None = None) -> None:
+    def end(self, payload: bytes = b"") -> None:
         """End the stream after this payload, which replaces one that was not taken."""
         self._is_over = True
-        self.offer(self._payload if payload is None else payload)
+        if not self.has_taken:
+            untaken = self._next.get_nowait()
+            payload = payload or untaken
+        self.offer(payload)
 
     async def __aiter__(self) -> AsyncIterator[bytes]:
         """Payloads, until the end."""
-        while True:
-            await self._is_full.wait()
-            self._is_full.clear()
-            if self._payload:
-                yield self._payload
-            self._payload = b""
-            if self._is_over:
-                return
+        while not (self._is_over and self.has_taken):
+            if payload := await self._next.get():
+                yield payload
 
 
 class StateBroadcaster:

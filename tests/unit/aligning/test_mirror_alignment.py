@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ccatp.config.models import Config
+from ccatp.config.models import AlignConfig, Config
 from ccatp.core import PanelId, PointId, Vector3
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.mirror_alignment import compare, survey_result
+from ccatp.mirror.mirror_alignment import SurveyResult, compare, survey_result
 from ccatp.mirror.misalignment import PanelMisalignment
 from ccatp.mirror.panel_alignment import Measured, PanelResult
 from tests.unit.aligning.conftest import HEIGHT_M, Truth, exact_fix, load, misaligned, survey
@@ -93,15 +93,12 @@ def test_without_noise_a_panel_is_recovered(each: tuple[Config, Mirror]) -> None
         assert panel.probability > 0.99
 
 
-def test_an_outlier_is_left_out_with_a_warning() -> None:
-    measured = [exact_fix(M1, point, TRUTH) for point in M1.point_ids(PANEL)]
-    measured[3] = shifted(measured[3], 80e-6)
-    result = survey_result(M1, CFG.align, HEIGHT_M, measured, [PANEL])
-    (panel,) = result.panels
-    assert panel.outliers == (PointId(3, 7, 4),)
-    assert (panel.fit.dof, len(panel.deviations.points)) == (5, 9)
-    assert panel.fit.values == pytest.approx([TRUTH.piston_m, TRUTH.tip_rad, TRUTH.tilt_rad], abs=1e-8)
-    assert result.warnings == ("panel 3/7: left out as outliers: 3/7/4; measure them again",)
+def exact(panel: PanelId = PANEL) -> list[Measured]:
+    return [exact_fix(M1, point, TRUTH) for point in M1.point_ids(panel)]
+
+
+def result_of(measured: list[Measured], align: AlignConfig = CFG.align, height_m: float = HEIGHT_M) -> SurveyResult:
+    return survey_result(M1, align, height_m, measured, [PANEL])
 
 
 def shifted(one: Measured, shift_m: float) -> Measured:
@@ -111,46 +108,46 @@ def shifted(one: Measured, shift_m: float) -> Measured:
     return Measured(one.point, replace(one.fix, position_m=(x, y, z)))
 
 
+def test_an_outlier_is_left_out_with_a_warning() -> None:
+    measured = exact()
+    measured[3] = shifted(measured[3], 80e-6)
+    result = result_of(measured)
+    (panel,) = result.panels
+    assert panel.outliers == (PointId(3, 7, 4),)
+    assert (panel.fit.dof, len(panel.deviations.points)) == (5, 9)
+    assert panel.fit.values == pytest.approx([TRUTH.piston_m, TRUTH.tip_rad, TRUTH.tilt_rad], abs=1e-8)
+    assert result.warnings == ("panel 3/7: left out as outliers: 3/7/4; measure them again",)
+
+
 def test_contradictions_beyond_outliers_are_told() -> None:
     rng = np.random.default_rng(4)
-    measured = [shifted(exact_fix(M1, p, TRUTH), float(rng.normal()) * 60e-6) for p in M1.point_ids(PANEL)]
-    result = survey_result(M1, CFG.align, HEIGHT_M, measured, [PANEL])
+    measured = [shifted(one, float(rng.normal()) * 60e-6) for one in exact()]
+    result = result_of(measured)
     assert any("contradict each other by more than they are uncertain" in line for line in result.warnings)
     # A floor that says so makes them agree.
-    floor = CFG.align.model_copy(update={"point_floor_m": 60e-6})
-    result = survey_result(M1, floor, HEIGHT_M, measured, [PANEL])
+    result = result_of(measured, CFG.align.model_copy(update={"point_floor_m": 60e-6}))
     assert result.warnings == ()
     assert result.panels[0].fit.sigma[0] == pytest.approx(20e-6, rel=0.01)
 
 
 def test_a_wrong_puck_height_shifts_all_pistons_and_nothing_else() -> None:
-    panels = [PanelId(1, 5), PANEL, PanelId(9, 5)]
-    measured = [exact_fix(M1, point, TRUTH) for panel in panels for point in M1.point_ids(panel)]
-    result = survey_result(M1, CFG.align, HEIGHT_M - 10e-6, measured, panels)
-    for panel in result.panels:
+    measured = [one for panel in (PanelId(1, 5), PANEL, PanelId(9, 5)) for one in exact(panel)]
+    for panel in result_of(measured, height_m=HEIGHT_M - 10e-6).panels:
         assert panel.fit.values == pytest.approx([TRUTH.piston_m + 10e-6, TRUTH.tip_rad, TRUTH.tilt_rad], abs=2e-8)
 
 
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_too_few_points_determine_nothing(count: int) -> None:
-    measured = [exact_fix(M1, point, TRUTH) for point in M1.point_ids(PANEL)[:count]]
-    result = survey_result(M1, CFG.align, HEIGHT_M, measured, [PANEL])
-    assert result.panels == ()
-    assert result.wavefront is None
-    (one,) = result.undetermined
-    assert one == (PANEL, count, f"{count} of 3 points that it takes")
-
-
-def test_points_on_a_line_determine_nothing() -> None:
-    measured = [exact_fix(M1, point, TRUTH) for point in M1.point_ids(PANEL)[:3]]
-    result = survey_result(M1, CFG.align, HEIGHT_M, measured, [PANEL])
-    assert result.undetermined[0].why == "its points lie on one line"
+@pytest.mark.parametrize(
+    ("count", "why"),
+    [(n, f"{n} of 3 points that it takes") for n in range(3)] + [(3, "its points lie on one line")],
+)
+def test_too_few_points_determine_nothing(count: int, why: str) -> None:
+    result = result_of(exact()[:count])
+    assert (result.panels, result.wavefront) == ((), None)
+    assert result.undetermined == ((PANEL, count, why),)
 
 
 def test_three_points_determine_a_plane_without_shape_and_bending() -> None:
-    points = M1.point_ids(PANEL)
-    measured = [exact_fix(M1, points[k], TRUTH) for k in (0, 2, 7)]
-    result = survey_result(M1, CFG.align, HEIGHT_M, measured, [PANEL])
+    result = result_of([exact()[k] for k in (0, 2, 7)])
     (panel,) = result.panels
     assert (panel.fit.dof, panel.shape, panel.bending, panel.probability) == (0, None, None, 1.0)
     assert result.wavefront_bent is None
@@ -158,11 +155,10 @@ def test_three_points_determine_a_plane_without_shape_and_bending() -> None:
 
 
 def test_a_fix_that_is_none_does_not_stop_the_others() -> None:
-    good = [exact_fix(M1, point, TRUTH) for point in M1.point_ids(PANEL)]
-    far = [exact_fix(M1, point, TRUTH) for point in M1.point_ids(PanelId(2, 2))]
+    far = exact(PanelId(2, 2))
     far[0] = Measured(far[0].point, replace(far[0].fix, position_m=(1e3, 1e3, 1e3)))
-    exact = [exact_fix(M1, point, TRUTH, sigma_m=0.0) for point in M1.point_ids(PanelId(2, 3))]
-    result = survey_result(M1, CFG.align, HEIGHT_M, [*good, *far, *exact], [])
+    certain = [exact_fix(M1, point, TRUTH, sigma_m=0.0) for point in M1.point_ids(PanelId(2, 3))]
+    result = result_of([*exact(), *far, *certain])
     assert [panel.panel for panel in result.panels] == [PANEL]
     assert [one.panel for one in result.undetermined] == [(2, 2), (2, 3)]
     assert result.undetermined[0].why.startswith("a fix is far from the mirror: ")
@@ -170,9 +166,7 @@ def test_a_fix_that_is_none_does_not_stop_the_others() -> None:
 
 
 def test_a_mirror_without_light_is_told() -> None:
-    dark = CFG.align.model_copy(update={"light": {}})
-    measured = [exact_fix(M1, point, TRUTH) for point in M1.point_ids(PANEL)]
-    result = survey_result(M1, dark, HEIGHT_M, measured, [PANEL])
+    result = result_of(exact(), CFG.align.model_copy(update={"light": {}}))
     assert result.warnings == (
         "no light is configured for fyst-m1 (align.light): its angle of incidence is taken as 0",
     )
@@ -186,12 +180,11 @@ def test_stated_uncertainties_that_are_too_small_do_not_agree() -> None:
         Measured(one.point, replace(one.fix, covariance_m2=tuple(0.5 * c for c in one.fix.covariance_m2)))
         for one in survey(CFG, M1, truth, rng)
     ]
-    found = compare(survey_result(M1, CFG.align, HEIGHT_M, measured, []).panels, injected(truth))
+    found = compare(result_of(measured).panels, injected(truth))
     assert found is not None
     assert not found.agrees
     assert found.chi2 > found.high
 
 
 def test_nothing_known_of_the_truth_is_no_comparison() -> None:
-    measured = [exact_fix(M1, point, TRUTH) for point in M1.point_ids(PANEL)]
-    assert compare(survey_result(M1, CFG.align, HEIGHT_M, measured, []).panels, {}) is None
+    assert compare(result_of(exact()).panels, {}) is None

@@ -1,0 +1,400 @@
+"""One panel: deviations along the normal, least squares, adjuster moves, outliers and shapes, half-wavefront error."""
+
+from dataclasses import replace
+from itertools import combinations
+from math import atan, cos, sqrt
+
+import numpy as np
+import pytest
+
+from ccatp.core import DeckPose, Fix, PanelId, PointId
+from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
+from ccatp.mirror.panel_alignment import (
+    Measured,
+    Modes,
+    PanelWavefront,
+    adjustable,
+    adjuster_moves,
+    adjuster_places,
+    cos_incidence,
+    deviations_of,
+    explain,
+    fit_modes,
+    gram,
+    half_size_m,
+    mirror_wavefront,
+    panel_wavefront,
+    prices,
+    quadratic,
+    rigid,
+)
+from ccatp.mirror.surface import UnknownPanelError
+from tests.unit.aligning.conftest import GRID_M, HEIGHT_M, exact_fix, load, on_grid
+
+# -- deviations -------------------------------------------------------------------------------------------------------
+
+PANEL = PanelId(1, 2)
+SHIFTED = PanelMisalignment(30e-6, 0.0, 0.0)
+
+
+def test_the_surface_counts_where_the_puck_stood(m1: Mirror) -> None:
+    x, y = m1.point_on_deck(PointId(1, 2, 9))
+    puck = misaligned_puck_world(m1, PANEL, SHIFTED, DeckPose(x + 8e-3, y - 6e-3, 0.0), HEIGHT_M)
+    one = exact_fix(m1, PointId(1, 2, 9), SHIFTED)
+    found = deviations_of(m1, PANEL, [Measured(one.point, replace(one.fix, position_m=puck))], HEIGHT_M, 0.0)
+    # The mirror's slope against the panel's there is 3 mrad: the height of the point itself is off by some 20 um.
+    assert found.deck_m[0] == pytest.approx([x + 8e-3, y - 6e-3], abs=1e-6)
+    assert found.values_m[0] == pytest.approx(30e-6 * found.lever[0], rel=1e-6)
+
+
+def test_points_come_in_the_order_of_their_numbers(m1: Mirror) -> None:
+    measured = [exact_fix(m1, point, SHIFTED) for point in reversed(m1.point_ids(PANEL))]
+    found = deviations_of(m1, PANEL, measured, HEIGHT_M, 0.0)
+    assert found.points == m1.point_ids(PANEL)
+    assert found.places_m[0] == pytest.approx([-0.22, -0.25], abs=1e-6)
+
+
+def test_the_lever_is_the_cosine_between_the_normals(m1: Mirror) -> None:
+    found = deviations_of(m1, PANEL, [exact_fix(m1, p, SHIFTED) for p in m1.point_ids(PANEL)], HEIGHT_M, 0.0)
+    here, middle = (np.array(m1.surface.normal(*found.deck_m[k])) for k in (0, 4))
+    assert found.lever[0] == pytest.approx(float(here @ middle), abs=1e-12)
+    assert 3e-6 < 1.0 - found.lever[0] < 1e-5
+    assert found.lever[4] == pytest.approx(1.0, abs=1e-12)
+
+
+def test_the_variance_is_that_along_the_normal_and_the_floor(m1: Mirror) -> None:
+    one = exact_fix(m1, PointId(1, 2, 1), SHIFTED)
+    normal = np.array(m1.rotate_world_from_deck(m1.surface.normal(*m1.point_on_deck(one.point))))
+    covariance = 9e-12 * np.outer(normal, normal) + 1e-6 * (np.eye(3) - np.outer(normal, normal))
+    fix: Fix = replace(one.fix, covariance_m2=tuple(covariance.ravel().tolist()))
+    found = deviations_of(m1, PANEL, [Measured(one.point, fix)], HEIGHT_M, 4e-6)
+    assert found.sigmas_m[0] == pytest.approx(5e-6, rel=1e-6)
+
+
+def test_a_panel_that_does_not_exist_is_refused(m1: Mirror) -> None:
+    with pytest.raises(UnknownPanelError, match="no panel in row 1, column 9"):
+        deviations_of(m1, PanelId(1, 9), [exact_fix(m1, PointId(1, 2, 1), SHIFTED)], HEIGHT_M, 0.0)
+
+
+# -- least squares ----------------------------------------------------------------------------------------------------
+
+ALL: list[tuple[Modes, int]] = [(rigid, 3), (adjustable, 5), (quadratic, 6)]
+EVEN = np.full(9, 2e-6)
+
+
+@pytest.mark.parametrize(("modes", "count"), ALL)
+def test_each_coefficient_is_recovered_exactly(modes: Modes, count: int) -> None:
+    for k in range(count):
+        truth = np.zeros(count)
+        truth[k] = 1e-4
+        fit = fit_modes(modes(GRID_M), modes(GRID_M) @ truth, EVEN)
+        assert fit is not None
+        assert fit.values == pytest.approx(truth, abs=1e-9 * 1e-4)
+        assert fit.dof == 9 - count
+        assert fit.residuals_m == pytest.approx(np.zeros(9), abs=1e-15)
+
+
+def test_the_curvatures_are_second_derivatives() -> None:
+    x, y = GRID_M.T
+    fit = fit_modes(quadratic(GRID_M), 3e-4 * x * x + 5e-4 * x * y - 2e-4 * y * y, EVEN)
+    assert fit is not None
+    assert fit.values == pytest.approx([0.0, 0.0, 0.0, 6e-4, 5e-4, -4e-4], abs=1e-12)
+
+
+def test_sigmas_of_nine_equal_points() -> None:
+    fit = fit_modes(rigid(GRID_M), np.zeros(9), EVEN)
+    assert fit is not None
+    assert fit.sigma == pytest.approx([2e-6 / 3, 2e-6 / (0.25 * 6**0.5), 2e-6 / (0.22 * 6**0.5)], rel=1e-12)
+
+
+@pytest.mark.parametrize(("modes", "count"), ALL)
+def test_the_covariance_and_the_residuals_are_as_stated(modes: Modes, count: int) -> None:
+    rng = np.random.default_rng(5)
+    sigmas = np.array([1.0, 2.0, 1.5, 3.0, 1.0, 0.8, 2.5, 1.2, 2.0]) * 1e-6
+    truth = np.full(count, 1e-4)
+    distances, unexplained, chi2 = [], [], []
+    for _ in range(200):
+        fit = fit_modes(modes(GRID_M), modes(GRID_M) @ truth + rng.normal(size=9) * sigmas, sigmas)
+        assert fit is not None
+        error = fit.values - truth
+        distances.append(error @ np.linalg.solve(fit.covariance, error))
+        chi2.append(fit.chi2)
+        unexplained.append(fit.unexplained_m2)
+    # Sums of 200 chi-squares: variance 2 x 200 x count; four sigmas.
+    assert sum(distances) == pytest.approx(200 * count, abs=4.0 * (400 * count) ** 0.5)
+    assert sum(chi2) == pytest.approx(200 * (9 - count), abs=4.0 * (400 * (9 - count)) ** 0.5)
+    assert abs(np.mean(unexplained)) < 4.0 * np.std(unexplained) / 200**0.5
+    assert fit is not None
+    assert np.std(unexplained) < 3.0 * fit.residual_variance_m2
+
+
+def test_the_mean_square_over_a_panel() -> None:
+    a, b = 0.335, 0.375
+    found = gram(quadratic, (a, b))
+    # Means of 1, y^2, x^2, x^4/4, x^2 y^2, y^4/4 over a rectangle.
+    assert np.diag(found) == pytest.approx([1.0, b**2 / 3, a**2 / 3, a**4 / 20, a**2 * b**2 / 9, b**4 / 20], rel=1e-12)
+    assert found[0] == pytest.approx([1.0, 0.0, 0.0, a**2 / 6, 0.0, b**2 / 6], abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("modes", "places"),
+    [
+        (rigid, GRID_M[:3]),  # on a line
+        (rigid, GRID_M[:2]),
+        (rigid, np.zeros((4, 2))),
+        (quadratic, GRID_M[:6]),  # two rows: y^2 is not determined
+        (quadratic, GRID_M[:5]),
+        (adjustable, GRID_M[[0, 2, 6, 8]]),
+    ],
+)
+def test_too_little_determines_nothing(modes: Modes, places: np.ndarray) -> None:
+    assert fit_modes(modes(places), np.zeros(len(places)), np.full(len(places), 1e-6)) is None
+
+
+# -- adjuster moves ---------------------------------------------------------------------------------------------------
+
+MOVED = PanelId(3, 7)
+
+
+def test_the_adjusters_of_the_telescope_are_under_the_corner_points_and_the_centre(m1: Mirror) -> None:
+    names, places = adjuster_places(m1, MOVED)
+    assert names == ("V1", "V2", "V3", "V4", "V5")
+    # M1's deck runs against the mirror frame's x, in which the tables give V1 at (-220, -250).
+    assert places == pytest.approx(
+        np.array([[0.22, -0.25], [-0.22, -0.25], [0.22, 0.25], [-0.22, 0.25], [0.0, 0.0]]), abs=1e-9
+    )
+
+
+def test_a_panel_that_stands_out_is_moved_away_from_the_robot(m1: Mirror) -> None:
+    fit = fit_modes(rigid(GRID_M), np.full(9, 30e-6), EVEN)
+    assert fit is not None
+    moves = adjuster_moves(fit, rigid, adjuster_places(m1, MOVED)[1])
+    assert moves.values_m == pytest.approx(np.full(5, -30e-6), abs=1e-15)
+    # A corner: piston and both slopes at their lever arms.
+    corner = 2e-6 * (1 / 9 + 1 / 6 + 1 / 6) ** 0.5
+    assert moves.sigma_m == pytest.approx([corner] * 4 + [2e-6 / 3], rel=1e-6)
+
+
+@pytest.mark.parametrize(("modes", "count"), [(rigid, 3), (adjustable, 5)])
+def test_moves_are_minus_the_displacement_at_the_adjusters(modes: Modes, count: int, m1: Mirror) -> None:
+    truth = np.array([4e-5, -1e-4, 7e-5, 6e-4, -9e-4])[:count]
+    fit = fit_modes(modes(GRID_M), modes(GRID_M) @ truth, EVEN)
+    assert fit is not None
+    places = adjuster_places(m1, MOVED)[1]
+    moves = adjuster_moves(fit, modes, places)
+    assert modes(places) @ truth + moves.values_m == pytest.approx(np.zeros(5), abs=1e-14)
+    # Independent: five moves, interpolated by the same modes, cancel the displacement at the measured points.
+    moved = np.linalg.lstsq(modes(places), moves.values_m, rcond=None)[0]
+    assert modes(GRID_M) @ (truth + moved) == pytest.approx(np.zeros(9), abs=1e-14)
+
+
+def test_moves_are_as_uncertain_as_stated(m1: Mirror) -> None:
+    rng = np.random.default_rng(8)
+    places = adjuster_places(m1, MOVED)[1]
+    drawn, stated = [], np.zeros(5)
+    for _ in range(400):
+        fit = fit_modes(adjustable(GRID_M), rng.normal(size=9) * EVEN, EVEN)
+        assert fit is not None
+        moves = adjuster_moves(fit, adjustable, places)
+        drawn.append(moves.values_m)
+        stated = moves.sigma_m
+    # A standard deviation of 400 draws is known to 3.5 %; four sigmas.
+    assert np.std(drawn, axis=0) == pytest.approx(stated, rel=0.14)
+
+
+# -- outliers ---------------------------------------------------------------------------------------------------------
+
+SIGMA_M = 2e-6
+PRICE = prices(0.01, 693, 77)
+RIGID = rigid(GRID_M) @ np.array([5e-5, -1e-4, 8e-5])
+BENT = RIGID + quadratic(GRID_M)[:, 3:] @ np.array([1e-3, -4e-4, 7e-4])
+
+
+def noise(rng: np.random.Generator) -> np.ndarray:
+    return rng.normal(scale=SIGMA_M, size=9)
+
+
+def test_prices_are_what_noise_reaches_with_the_agreed_probability() -> None:
+    # A normal deviate beyond 4.3372 has a chance of 0.01 / 693.
+    assert PRICE.outlier == pytest.approx(4.3372**2, rel=1e-3)
+    assert PRICE.shape > prices(0.1, 693, 77).shape
+
+
+def test_noise_makes_neither_outliers_nor_shapes() -> None:
+    rng = np.random.default_rng(1)
+    found = [explain(on_grid(RIGID + noise(rng)), PRICE) for _ in range(800)]
+    # Ten mirrors' worth of panels: 0.1 alarms of either kind are expected.
+    assert sum(not one.is_kept.all() for one in found) <= 1
+    assert sum(one.has_shape for one in found) <= 1
+
+
+@pytest.mark.parametrize("shift_m", [25e-6, -60e-6, 2e-3])
+def test_an_outlier_is_found_wherever_it_is(shift_m: float) -> None:
+    rng = np.random.default_rng(2)
+    for k in range(9):
+        values = RIGID + noise(rng)
+        values[k] += shift_m
+        found = explain(on_grid(values), PRICE)
+        assert [int(i) for i in np.flatnonzero(~found.is_kept)] == [k]
+        assert not found.has_shape
+
+
+def test_two_outliers_are_found_wherever_they_are() -> None:
+    rng = np.random.default_rng(3)
+    for pair in combinations(range(9), 2):
+        values = RIGID + noise(rng)
+        values[list(pair)] += [90e-6, 150e-6]
+        assert np.flatnonzero(~explain(on_grid(values), PRICE).is_kept).tolist() == list(pair)
+
+
+def test_a_bent_panel_keeps_its_points() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(50):
+        found = explain(on_grid(BENT + noise(rng)), PRICE)
+        assert found.has_shape
+        assert found.is_kept.all()
+
+
+def test_an_outlier_on_a_bent_panel() -> None:
+    rng = np.random.default_rng(6)
+    for k in range(9):
+        values = BENT + noise(rng)
+        values[k] += 80e-6
+        found = explain(on_grid(values), PRICE)
+        assert found.has_shape
+        assert [int(i) for i in np.flatnonzero(~found.is_kept)] == [k]
+
+
+@pytest.mark.parametrize("count", [3, 4, 5])
+def test_few_points_accuse_nobody(count: int) -> None:
+    # With so few, leaving any one of several points out explains the contradiction as well.
+    some = GRID_M[[0, 2, 6, 8, 4]][:count]
+    values = np.zeros(count)
+    values[0] = 1e-3
+    found = explain(on_grid(values, places_m=some), PRICE)
+    assert found.is_kept.all()
+    assert not found.has_shape
+
+
+def test_scattered_points_are_no_outliers() -> None:
+    # Scatter far beyond the stated sigma: with a third of the points left out something would always fit.
+    rng = np.random.default_rng(7)
+    for _ in range(100):
+        found = explain(on_grid(RIGID + rng.normal(scale=60e-6, size=9)), PRICE)
+        assert np.count_nonzero(~found.is_kept) <= 2 - found.has_shape
+
+
+@pytest.mark.parametrize(("count", "is_found"), [(5, False), (6, True)])
+def test_six_points_are_enough_to_find_one(count: int, is_found: bool) -> None:
+    values = RIGID[[0, 2, 6, 8, 4, 1][:count]].copy()
+    values[0] += 1e-3
+    found = explain(on_grid(values, places_m=GRID_M[[0, 2, 6, 8, 4, 1][:count]]), PRICE)
+    assert found.is_kept.tolist() == [not is_found] + [True] * (count - 1)
+
+
+# -- half-wavefront error ---------------------------------------------------------------------------------------------
+
+MIDDLE = PanelId(5, 5)
+
+
+@pytest.mark.parametrize(("name", "angle_rad"), [("fyst-m1", atan(1 / 2)), ("fyst-m2", atan(1 / 3))])
+def test_light_meets_the_middle_of_the_mirrors_at_their_inclination(name: str, angle_rad: float) -> None:
+    cfg, mirror = load(name)
+    # The middle panel of M1 is 35 mm off the axis, where the mirror is curved with 26 m: 1.3 mrad.
+    found = cos_incidence(mirror, MIDDLE, cfg.align.light[name])
+    assert found == pytest.approx(cos(angle_rad), abs=1e-3)
+
+
+def test_light_on_m2_comes_from_m1() -> None:
+    # Independent: rays along world +z, reflected at the panels of M1 by the law of reflection, and traced to M2.
+    _, m1 = load("fyst-m1")
+    cfg, m2 = load("fyst-m2")
+    hit = 0
+    for body in m1.panels.values():
+        normal = np.array(m1.rotate_world_from_deck(body.axes[2]))
+        ray = np.array([0.0, 0.0, 1.0]) - 2.0 * normal[2] * normal
+        start = np.array(m2.deck_from_world(m1.world_from_deck(body.origin)))
+        way = np.array(m2.rotate_deck_from_world((float(ray[0]), float(ray[1]), float(ray[2]))))
+        x, y, _ = m2.surface.drop((float(start[0]), float(start[1]), float(start[2])), (way[0], way[1], way[2]))
+        panel = m2.panel_at(x, y)
+        if panel is None:
+            continue
+        hit += 1
+        body2 = m2.panel(panel)
+        # Within half a panel the angle changes by up to 0.35 m / 30 m and the slope's 12 mrad.
+        assert cos_incidence(m2, panel, cfg.align.light["fyst-m2"]) == pytest.approx(
+            -float(way @ np.array(body2.axes[2])), abs=0.012
+        )
+    assert hit > 60
+
+
+def test_unknown_light_meets_the_mirror_along_its_normal(m1: Mirror) -> None:
+    assert cos_incidence(m1, MIDDLE, None) == 1.0
+
+
+def test_a_panel_is_larger_than_its_projection(m1: Mirror) -> None:
+    body = m1.panel(PanelId(1, 5))
+    half_x, half_y = half_size_m(body)
+    low, high = (m1.surface_point(body.x_m, body.y_m + s * body.half_y_m) for s in (-1, 1))
+    assert 2 * half_y == pytest.approx(float(np.linalg.norm(np.subtract(high, low))), rel=1e-4)
+    assert half_x >= body.half_x_m
+
+
+def test_a_shifted_panel_has_its_shift_times_the_cosine(m1: Mirror) -> None:
+    fit = fit_modes(rigid(GRID_M), np.full(9, 20e-6), np.full(9, 1e-9))
+    assert fit is not None
+    body = m1.panel(MIDDLE)
+    found = mirror_wavefront([panel_wavefront(body, 0.9, fit, gram(rigid, half_size_m(body)), np.full(9, 1e-9))])
+    assert found is not None
+    assert found.before_m == pytest.approx(18e-6, rel=1e-6)
+    assert found.before_level_m < 1e-9
+    assert found.after_m < 1e-9
+    assert found.noise_m == pytest.approx(0.9e-9)
+
+
+def test_a_tilted_panel_has_the_mean_square_of_a_plane(m1: Mirror) -> None:
+    fit = fit_modes(rigid(GRID_M), rigid(GRID_M) @ np.array([0.0, 0.0, 1e-4]), np.full(9, 1e-9))
+    assert fit is not None
+    body = m1.panel(MIDDLE)
+    half = half_size_m(body)
+    own = panel_wavefront(body, 1.0, fit, gram(rigid, half), np.full(9, 1e-9))
+    assert sqrt(own.fitted_m2) == pytest.approx(1e-4 * half[0] / sqrt(3), rel=1e-9)
+    assert own.weight_m2 == pytest.approx(4.0 * half[0] * half[1])
+
+
+def test_a_panel_weighs_its_area_across_the_beam(m1: Mirror) -> None:
+    fit = fit_modes(rigid(GRID_M), np.zeros(9), np.full(9, 1e-9))
+    assert fit is not None
+    body = m1.panel(MIDDLE)
+    weights = [panel_wavefront(body, c, fit, np.eye(3), np.full(9, 1e-9)).weight_m2 for c in (1.0, 0.8)]
+    # 0.67 m x 0.75 m in the deck plane.
+    assert weights == pytest.approx([0.67 * 0.75, 0.8 * 0.67 * 0.75], rel=1e-3)
+
+
+def test_panels_count_with_their_area_across_the_beam() -> None:
+    one = PanelWavefront(3.0, 4e-12, 1e-12, 0.0, 1e-12, 2e-6)
+    two = PanelWavefront(1.0, 16e-12, 1e-12, 0.0, 1e-12, -4e-6)
+    found = mirror_wavefront([one, two])
+    assert found is not None
+    assert found.before_m == pytest.approx(sqrt(7e-12))
+    assert found.before_level_m == pytest.approx(sqrt(7e-12 - (0.5e-6) ** 2))
+    assert found.after_m == pytest.approx(1e-6)
+
+
+def test_what_is_unexplained_is_cut_off_over_the_mirror_not_panel_by_panel() -> None:
+    def with_unexplained(value: float) -> PanelWavefront:
+        return PanelWavefront(1.0, 0.0, 1e-12, value, 1e-12, 0.0)
+
+    balanced = mirror_wavefront([with_unexplained(3e-12), with_unexplained(-3e-12)])
+    less = mirror_wavefront([with_unexplained(-3e-12)])
+    more = mirror_wavefront([with_unexplained(3e-12)])
+    assert balanced is not None
+    assert less is not None
+    assert more is not None
+    assert balanced.after_m == less.after_m == pytest.approx(1e-6)
+    assert (more.after_m, more.before_m) == pytest.approx((2e-6, sqrt(3e-12)))
+
+
+def test_no_panels_have_no_error() -> None:
+    assert mirror_wavefront([]) is None
