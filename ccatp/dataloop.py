@@ -1,7 +1,7 @@
 """The simulated robots behind the robot link: sockets, the wall clock or lockstep, and the true state beside the link.
 
 The sockets of the robot link carry what a real robot would send and nothing else. The true state leaves by ZeroMQ: a
-REP socket with the requests of ``ccatp.sim.robot`` or ``ccatp.sim.beacon_robot``, and a PUB socket with rows.
+REP socket with the requests of ``ccatp.sim.rules.TruthLog`` and of the robot, and a PUB socket with rows.
 
 Known limitations: the battery stays full, and nothing fails without a fault plan (``ccatp.sim.fault_injector``).
 """
@@ -19,13 +19,12 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.core import DeckPose
 from ccatp.mirror.mirror import build_mirror
-from ccatp.sim.beacon_robot import BeaconTruthLog, build_beacon_robot, motes_of
-from ccatp.sim.fault_models import Injected
-from ccatp.sim.fault_plan import FaultPlan
+from ccatp.sim.beacon_robot import build_beacon_robot
+from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.sim.fault_proxy import FaultProxy, LinkFaults
 from ccatp.sim.ground_truth import GroundTruthPublisher, SimPoseFile
-from ccatp.sim.robot import Robot, TruthLog
-from ccatp.sim.rules import SimulatedRobot
+from ccatp.sim.robot import Robot
+from ccatp.sim.rules import SimulatedRobot, TruthLog
 from ccatp.sim.sessions import RobotServer, RobotSession
 
 HOUSEKEEPING_S = 0.25
@@ -37,14 +36,14 @@ class ServerLog(Protocol):
     """A structlog logger, or whatever has this method."""
 
     def info(self, event: str, **fields: object) -> object:
-        """Take one line, and what belongs to it."""
+        """Take one line and its fields."""
 
 
 class RobotLinkServer:
-    """The server of one simulated robot.
+    """The server of one simulated robot on ``address`` (port 0 = any free port).
 
-    It listens on ``address`` (port 0 = any free port) where no bound socket is given. In lockstep simulated time waits
-    for the clients; otherwise the wall clock paces it. Without a ``key`` there is no authentication.
+    In lockstep simulated time waits for the clients; otherwise the wall clock paces it. Without a ``key`` there is no
+    authentication.
     """
 
     def __init__(
@@ -61,12 +60,12 @@ class RobotLinkServer:
         self._boot = secrets.randbits(31)
         self._listener: asyncio.Server | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._connections: set[_Connection] = set()
+        self.connections: set[Connection] = set()
         self._failure: asyncio.Future[None]
         self.truth: GroundTruthPublisher | None = None
 
     async def start(self, sock: socket.socket | None = None) -> int:
-        """Boot and listen on the configured address (port 0 = any free port) or on a bound socket; return the port.
+        """Boot and listen on the configured address or on a bound socket; return the port.
 
         Raises:
             OSError: the address cannot be had.
@@ -84,12 +83,16 @@ class RobotLinkServer:
             on_frame=self.on_frame,
         )
         if sock is None:
-            self._listener = await loop.create_server(self._connection, *self._address)
+            self._listener = await loop.create_server(self.connect, *self._address)
         else:
-            self._listener = await loop.create_server(self._connection, sock=sock)
+            self._listener = await loop.create_server(self.connect, sock=sock)
         if not self._is_lockstep:
             self._timer = loop.call_at(self.server.next_frame_s, self._tick)
         return int(self._listener.sockets[0].getsockname()[1])
+
+    def connect(self) -> "Connection":
+        """The protocol of a new connection."""
+        return Connection(self)
 
     async def run(self, stop: asyncio.Event) -> None:
         """Serve until ``stop`` is set; ``start`` first unless it was called. An unforeseen error is raised here."""
@@ -113,7 +116,7 @@ class RobotLinkServer:
             self._timer.cancel()
         if self._listener is not None:
             self._listener.close()
-        for connection in tuple(self._connections):
+        for connection in tuple(self.connections):
             connection.close()
         self.on_close()
         if self._listener is not None:
@@ -132,19 +135,6 @@ class RobotLinkServer:
         """Publish the last true states."""
         if self.truth is not None:
             self.truth.flush()
-
-    def _connection(self) -> "_Connection":
-        return _Connection(self)
-
-    def opened(self, connection: "_Connection") -> RobotSession:
-        """A client connected."""
-        self._connections.add(connection)
-        return self.server.accept(connection, asyncio.get_running_loop().time())
-
-    def closed(self, connection: "_Connection", session: RobotSession) -> None:
-        """A client is gone."""
-        self._connections.discard(connection)
-        self.server.lost(session)
 
     def fail(self, error: Exception) -> None:
         """End ``run`` with an unforeseen error."""
@@ -165,7 +155,9 @@ class RobotLinkServer:
             self._log.info("robot_session", text=text)
 
 
-class _Connection(asyncio.Protocol):
+class Connection(asyncio.Protocol):
+    """One client of a ``RobotLinkServer``."""
+
     def __init__(self, owner: RobotLinkServer) -> None:
         self._owner = owner
         self._transport: asyncio.Transport | None = None
@@ -179,7 +171,8 @@ class _Connection(asyncio.Protocol):
         peer = self._transport.get_extra_info("socket")
         peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        self._session = self._owner.opened(self)
+        self._owner.connections.add(self)
+        self._session = self._owner.server.accept(self, self._clock())
 
     def data_received(self, data: bytes) -> None:
         if self._session is None:
@@ -196,7 +189,8 @@ class _Connection(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         if self._session is not None:
-            self._owner.closed(self, self._session)
+            self._owner.connections.discard(self)
+            self._owner.server.lost(self._session)
 
     def pause_writing(self) -> None:
         self._is_paused = True
@@ -205,10 +199,12 @@ class _Connection(asyncio.Protocol):
         self._is_paused = False
 
     def write(self, data: bytes) -> None:
+        """Send, unless the client does not read."""
         if not self._is_paused and self._transport is not None:
             self._transport.write(data)
 
     def close(self) -> None:
+        """Close when everything is sent."""
         if self._transport is not None:
             self._transport.close()
 
@@ -216,8 +212,8 @@ class _Connection(asyncio.Protocol):
 class DataLoop(RobotLinkServer):
     """The server of the survey robot, with a fault plan; each fault is logged when it begins and with what it did.
 
-    ``start`` is where the robot stands, if not at base. ``link_faults`` drive the proxy before the link by the robot's
-    clock.
+    The robot is at base where no ``start`` is given. ``link_faults`` drive the proxy before the link by the robot's
+    clock; ``body`` keeps its true pose between runs.
     """
 
     def __init__(
@@ -235,28 +231,24 @@ class DataLoop(RobotLinkServer):
         self.body: SimPoseFile | None = None
         self.link_faults: LinkFaults | None = None
 
-    def on_close(self) -> None:
-        """Publish the last true states; log what each fault did."""
-        super().on_close()
-        if self.robot.injector is not None:
-            for injected in self.robot.injector.injected:
-                self._log_fault("injected", injected)
-        if self.link_faults is not None:
-            self.link_faults.tick(self.robot.t_s)  # what happened since the last frame
-            for injected in self.link_faults.injected:
-                self._log_fault("injected", injected)
-
     def on_frame(self) -> None:
         """Keep the pose and the true state; faults begin and end."""
         if self.body is not None:
             self.body.keep(self.robot)
         super().on_frame()
-        if self.robot.injector is not None:
-            for what, injected in self.robot.injector.changes(self.robot.t_s):
-                self._log_fault(what, injected)
+        for faults in (self.robot.injector, self.link_faults):
+            if faults is not None:
+                for what, injected in faults.changes(self.robot.t_s):
+                    self._log_fault(what, injected)
+
+    def on_close(self) -> None:
+        """Publish the last true states; log what each fault did."""
+        super().on_close()
         if self.link_faults is not None:
-            for what, injected in self.link_faults.tick(self.robot.t_s):
-                self._log_fault(what, injected)
+            self.link_faults.changes(self.robot.t_s)  # what happened since the last frame
+        for faults in (self.robot.injector, self.link_faults):
+            for injected in () if faults is None else faults.injected:
+                self._log_fault("injected", injected)
 
     def _log_fault(self, what: str, injected: Injected) -> None:
         if self._log is not None:
@@ -280,10 +272,8 @@ async def serve(
 ) -> None:
     """Run a DataLoop until ``stop`` is set.
 
-    Args:
-        key: key of the robot link, ``None`` for no authentication.
-        faults: what shall go wrong with the robot and its link; for the link a proxy listens in the robot's place.
-        body_file: keeps the true pose of the robot between runs.
+    ``faults`` may be those of the robot and of its link; for the link a proxy listens in the robot's place.
+    ``body_file`` keeps the true pose of the robot between runs.
 
     Raises:
         OSError: the address cannot be had.
@@ -296,7 +286,12 @@ async def serve(
     try:
         async with AsyncExitStack() as stack:
             if faults is not None and faults.link:
-                listen_sock = await _put_proxy_before(data_loop, faults, cfg, listen_sock, stack)
+                behind = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+                at = cfg.sim.robot.host, cfg.sim.robot.port
+                before = listen_sock or stack.enter_context(socket.create_server(at))
+                proxy = FaultProxy(*behind.getsockname()[:2], seed=cfg.run.seed, listener=before)
+                await stack.enter_async_context(proxy)
+                data_loop.link_faults, listen_sock = LinkFaults(faults.link, proxy), behind
             truth = GroundTruthPublisher(TruthLog(data_loop.robot), truth_rep, truth_pub)
             await _serve(data_loop, truth, listen_sock, stop)
     finally:
@@ -318,8 +313,7 @@ async def serve_beacons(
     """The same with a robot among beacons."""
     robot = build_beacon_robot(cfg)
     server = RobotLinkServer(robot, (cfg.sim.robot.host, cfg.sim.robot.port), lockstep=lockstep, key=key, log=log)
-    truth = GroundTruthPublisher(BeaconTruthLog(robot, motes_of(cfg)), truth_rep, truth_pub)
-    await _serve(server, truth, listen_sock, stop)
+    await _serve(server, GroundTruthPublisher(TruthLog(robot), truth_rep, truth_pub), listen_sock, stop)
 
 
 async def _serve(
@@ -334,16 +328,3 @@ async def _serve(
             answering.cancel()
     finally:
         truth.close()
-
-
-async def _put_proxy_before(
-    data_loop: DataLoop, faults: FaultPlan, cfg: Config, listen_sock: socket.socket | None, stack: AsyncExitStack
-) -> socket.socket:
-    """Let a proxy listen where the robot was to; the socket on which the robot listens instead."""
-    behind = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
-    at = cfg.sim.robot
-    before = listen_sock or stack.enter_context(socket.create_server((at.host, at.port)))
-    proxy = FaultProxy(*behind.getsockname()[:2], seed=cfg.run.seed, listener=before)
-    await stack.enter_async_context(proxy)
-    data_loop.link_faults = LinkFaults(faults.link, proxy)
-    return behind

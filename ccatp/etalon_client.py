@@ -1,11 +1,7 @@
 """Client of the MultiLine server: lengths over TCP, multilaterated to the position of the puck.
 
-A connection that has failed a request in any way, or that has said something unasked, is closed: the next request
+A connection that has failed a request in any way, or that has sent something unasked, is closed: the next request
 makes another, so that a late reply can never answer it. A fix is a function of the replies and the arguments alone.
-
-One connection to a MultiLine server: a line asked for at a time, or the lines of its push stream.
-
-Why a measurement of the laser system gave no fix.
 """
 
 import asyncio
@@ -33,6 +29,7 @@ from ccatp.links.multiline import (
     Remark,
     Reply,
 )
+from ccatp.links.robot_messages import LineBuffer, LineTooLong
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 
 PushQueue = asyncio.Queue[bytes | None]  # lines of the push stream; None: the connection is gone
@@ -41,7 +38,7 @@ _STREAM_LINES = 64  # lines of the push stream kept for a slow reader; older one
 
 
 class EtalonLink(asyncio.Protocol):
-    """One connection.
+    """One connection: a line asked for at a time, or the lines of the push stream.
 
     Attributes:
         fault: why it must not be used again; empty while it may.
@@ -51,25 +48,26 @@ class EtalonLink(asyncio.Protocol):
         self.fault = ""
         self._unasked = False
         self._stream: PushQueue | None = None
-        self._lines = multiline.LineSplitter()
+        self._lines = LineBuffer(multiline.MAX_LINE_BYTES)
         self._waiting: asyncio.Future[bytes] | None = None
         self._transport: asyncio.Transport | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Called by asyncio."""
         self._transport = cast(asyncio.Transport, transport)  # a TCP connection has no other
 
     def data_received(self, data: bytes) -> None:
-        """Called by asyncio: deliver whole lines."""
-        self._lines.feed(data)
+        too_long: LineTooLong | None = None
         try:
-            while not self.fault and (line := self._lines.next_line()) is not None:
-                self._deliver(line)
-        except multiline.MultilineTooLong as error:
-            self._fail(error)
+            lines = self._lines.feed(data)
+        except LineTooLong as error:
+            lines, too_long = error.lines, error
+        for line in lines:
+            if not self.fault:
+                self._deliver(line.rstrip(b"\r"))
+        if too_long is not None:
+            self._fail(too_long)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Called by asyncio."""
         self._fail(ConnectionError(f"connection lost: {exc}" if exc else "server closed the connection"))
 
     def _deliver(self, line: bytes) -> None:
@@ -96,14 +94,9 @@ class EtalonLink(asyncio.Protocol):
         stream.put_nowait(line)
 
     @property
-    def is_clean(self) -> bool:
-        """Free of faults and leftovers: fit for the next request."""
-        return not self.fault and not self.has_leftovers
-
-    @property
     def has_leftovers(self) -> bool:
         """More came than was asked for, so no line can be trusted to answer what it seems to."""
-        return self._unasked or self._lines.pending
+        return self._unasked or self._lines.has_rest
 
     async def ask(self, request: MultilineRequest) -> bytes:
         """Send and wait for one line; the deadline is the caller's.
@@ -204,10 +197,15 @@ class Readiness(NamedTuple):
 
 
 class EtalonClient:
-    """Measures where the puck is.
+    """Measures where the puck is, with k >= 4 channels, each once, and their collimators in the world frame, (k, 3).
+
+    ``on_retry`` is called with each error after which it is tried again, and how many tries are left then.
 
     Attributes:
         counts: connects, requests, retries, drained (connections closed for unasked or left-over bytes).
+
+    Raises:
+        ValueError: channels and collimators do not fit, or are too few.
     """
 
     def __init__(
@@ -217,17 +215,6 @@ class EtalonClient:
         collimators_m: NDArray[np.float64],
         on_retry: Callable[[EtalonError, int], None] = lambda _error, _left: None,
     ) -> None:
-        """Set up without a connection.
-
-        Args:
-            cfg: address, deadlines, limits.
-            channels: channels to ask for, each once, length k >= 4.
-            collimators_m: where their beams start, world frame, shape (k, 3).
-            on_retry: told of each error after which it is tried again, and how many tries are left then.
-
-        Raises:
-            ValueError: channels and collimators do not fit, or are too few.
-        """
         if np.shape(collimators_m) != (len(set(channels)), 3) or len(set(channels)) < _NEEDED_CHANNELS:
             raise ValueError(f"channels {tuple(channels)}, collimators {np.shape(collimators_m)}: need (k, 3), k >= 4")
         self.counts: Counter[str] = Counter()
@@ -255,25 +242,18 @@ class EtalonClient:
             self._drop()
 
     async def isready(self) -> Readiness:
-        """Ask for lasers connected, lasers warm, and the air.
-
-        Raises:
-            EtalonError: see the subclasses.
-        """
+        """Ask for lasers connected, lasers warm, and the air; errors as of ``measure``."""
         async with self._turn:
             return await self._retry(self._ask_readiness)
 
     async def measure(self, t_s: float, expected_position_m: Vector3) -> Fix:
-        """Measure the puck of a robot that stands still.
+        """Measure the puck of a robot that stands still; ``t_s`` becomes the time of the fix.
 
-        Args:
-            t_s: robot time for which the position holds; it becomes the time of the fix, whenever the reply arrives.
-            expected_position_m: world frame; the solution starts here, and here decides which of two mirror images it
-                is where all collimators lie in one plane.
+        The solution starts at ``expected_position_m``, world frame, which also decides between two mirror images where
+        all collimators lie in one plane.
 
         Raises:
-            EtalonUnreachable, EtalonTimeout, EtalonBadReply, EtalonServerError, TooFewChannels, StaleLengths,
-                BadSolution: after the configured retries, the error of the last one.
+            EtalonError: after the configured retries, the error of the last one.
         """
         async with self._turn:
             return await self._retry(lambda: self._measure_once(t_s, expected_position_m))
@@ -335,7 +315,7 @@ class EtalonClient:
     async def _retry(self, attempt: Callable[[], Awaitable[_T]]) -> _T:
         """Try up to ``retries`` times more. What needs a new measurement waits for one, what needs a server for it.
 
-        A server that is not there, because it is started anew, is waited for: that costs time and no try.
+        A server that is not there, because it is restarted, is waited for: that costs time and no try.
         """
         left = self._cfg.retries
         clock = asyncio.get_running_loop().time
@@ -362,7 +342,7 @@ class EtalonClient:
             # Two turns of the event loop: what lies in the socket by now is delivered, and seen here.
             await asyncio.sleep(0)
             await asyncio.sleep(0)
-            if self._link.is_clean:
+            if not self._link.fault and not self._link.has_leftovers:
                 return self._link
             self.counts["drained"] += 1
             self._drop()
@@ -398,7 +378,7 @@ class EtalonClient:
         except TimeoutError:
             self._drop()
             raise self._timeout(request.command) from None
-        except (multiline.BadReply, multiline.MultilineTooLong) as error:
+        except (multiline.BadReply, LineTooLong) as error:
             self._drop()
             raise EtalonBadReply(f"{self._where}: {error}; is this a MultiLine server?") from None
         except ConnectionError as error:
@@ -410,10 +390,8 @@ class EtalonClient:
         return reply
 
     def _timeout(self, request: str) -> EtalonTimeout:
-        return EtalonTimeout(
-            f"{self._where}: no reply to {request} within {self._cfg.request_timeout_s} s; "
-            "restart its laser driver or raise [etalon] request_timeout_s"
-        )
+        hint = "restart its laser driver or raise [etalon] request_timeout_s"
+        return EtalonTimeout(f"{self._where}: no reply to {request} within {self._cfg.request_timeout_s} s; {hint}")
 
     def _refuse_remark(self, reply: Reply, request: str) -> None:
         if isinstance(reply, Remark) and reply.name == "error":
@@ -449,11 +427,7 @@ class EtalonClient:
         return fix
 
     def _refuse_old(self, lengths_m: dict[int, float], expected_m: Vector3) -> None:
-        """Lengths have noise: where all come once more, to the last digit, and the robot has moved, nobody measured.
-
-        Raises:
-            StaleLengths: they are.
-        """
+        """Lengths have noise: where all are the same to the last digit and the robot has moved, none was measured."""
         if self._last is None:
             return
         before_m, there_m = self._last

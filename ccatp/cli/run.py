@@ -67,7 +67,7 @@ def run(
     from ccatp.daemon.supervisor import run as run_to_the_end
 
     if faults_file is not None:
-        from ccatp.sim.ground_truth import read_plan
+        from ccatp.sim.fault_plan import read_plan
 
         read_plan(faults_file, lockstep=not realtime)  # mistakes are reported before anything is started
     options = RunOptions(

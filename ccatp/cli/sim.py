@@ -61,7 +61,7 @@ def sim_robot(
     """Run the simulated robot behind the robot link, for any controller."""
     from ccatp.config.load import is_radio_file, load_config, load_radio_config
     from ccatp.daemon.sim_robot import run_alone
-    from ccatp.sim.ground_truth import read_plan
+    from ccatp.sim.fault_plan import read_plan
 
     if config_file is not None and is_radio_file(config_file):
         from ccatp.daemon.sim_robot import run_beacons_alone

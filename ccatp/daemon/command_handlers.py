@@ -29,7 +29,7 @@ from ccatp.links.channels import (
     parse_reply,
 )
 from ccatp.links.liveness import LogRateLimit
-from ccatp.links.rpc import CurveRouter, Router, ZapHandler
+from ccatp.links.rpc import Router, ZapHandler
 from ccatp.links.topics import MissionStatus
 
 # A robot at 0.1 m/s is at rest within half a second; a command that took no effect by then has failed.
@@ -156,7 +156,7 @@ class ObservatoryServer:
             work = [local.serve()]
             if self._keys is not None:
                 zap = ZapHandler(context, lambda: self._clients.clients, self._on_refused_client)
-                remote = CurveRouter(self._cfg.endpoint, self._answer_remote, context, self._keys)
+                remote = Router(self._cfg.endpoint, self._answer_remote, context, self._keys)
                 work.append((await stack.enter_async_context(zap)).serve())
                 work.append((await stack.enter_async_context(remote)).serve())
                 clients = len(self._clients.clients)

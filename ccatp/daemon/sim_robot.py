@@ -20,8 +20,8 @@ from ccatp.dataloop import serve, serve_beacons
 from ccatp.errors import ConfigError
 from ccatp.links.robot_link import read_key
 from ccatp.links.runtime_dir import TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
-from ccatp.sim.fault_plan import FaultPlan
-from ccatp.sim.ground_truth import FILE, read_plan
+from ccatp.sim.fault_plan import FaultPlan, read_plan
+from ccatp.sim.ground_truth import FILE
 
 Serve = Callable[..., Coroutine[Any, Any, None]]
 

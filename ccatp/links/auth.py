@@ -16,7 +16,9 @@ import stat
 import struct
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -128,10 +130,7 @@ def _parse_client(name: str, table: Any) -> tuple[bytes, AuthorizedClient]:
 
 
 def read_pair(path: Path, what: str) -> KeyPair:
-    """The pair in a secret file.
-
-    Args:
-        what: the option or the key of the configuration that names the file, for the error.
+    """The pair in a secret file; ``what`` is the option or the key that names it, for the error.
 
     Raises:
         ConfigError: the file cannot be read, is open to others, or holds no pair.
@@ -155,9 +154,7 @@ def read_clients(path: Path, what: str) -> Clients:
     Raises:
         ConfigError: the file cannot be read, others may write it, it is malformed, or it lists no client.
     """
-    text = _read(
-        path, what, stat.S_IWGRP | stat.S_IWOTH, lambda file: file.read_text(encoding="utf-8", errors="replace")
-    )
+    text = _read(path, what, stat.S_IWGRP | stat.S_IWOTH, partial(Path.read_text, encoding="utf-8", errors="replace"))
     try:
         clients = parse_clients(text)
     except BadAccess as error:
@@ -179,20 +176,16 @@ class ClientsFile:
     @property
     def clients(self) -> Clients:
         """The clients listed now; none where the list cannot be read or is malformed, see ``trouble``."""
+        stamp: tuple[int, ...] | None = None
+        with suppress(OSError):
+            info = self._path.stat()
+            stamp = info.st_ino, info.st_size, info.st_mtime_ns, info.st_ctime_ns
         try:
-            stamp = self._read_stamp()
             if stamp is None or stamp != self._stamp:
                 self._clients, self._stamp, self.trouble = read_clients(self._path, self._what), stamp, ""
         except ConfigError as error:
             self._clients, self._stamp, self.trouble = {}, None, str(error)
         return self._clients
-
-    def _read_stamp(self) -> tuple[int, ...] | None:
-        try:
-            info = self._path.stat()
-        except OSError:
-            return None
-        return info.st_ino, info.st_size, info.st_mtime_ns, info.st_ctime_ns
 
 
 def _load(path: Path, what: str, forbidden: int, suffix: str) -> tuple[bytes, bytes | None]:

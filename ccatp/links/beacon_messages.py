@@ -1,6 +1,4 @@
-"""What a robot among beacons says beside the frame of every robot: steering, radios, distances, motes.
-
-Extra keys of ``sensors`` on the robot link; a client that does not know them ignores them. ``docs/robot_link.md``.
+"""Extra keys of ``sensors`` of a robot among beacons (``docs/robot_link.md``): steering, radios, distances, motes.
 
 The rows of the topics ``beacon_track`` and ``beacon_truth`` as arrays, and the error between them.
 """
@@ -31,7 +29,7 @@ class SteerSample(NamedTuple):
 
 
 class RadioSample(NamedTuple):
-    """A radio heard: which, how strong, from where (left of the heading; ``None`` without a direction)."""
+    """A radio received: which, how strong, from where (left of the heading; ``None`` without a direction)."""
 
     t_s: Time
     beacon: Name
@@ -102,7 +100,7 @@ def with_extras(line: bytes, extras: BeaconFrame) -> bytes:
 
 
 TRACK_COLUMNS, TRUTH_COLUMNS = 13, 8
-_COVARIANCE = [5, 6, 8, 6, 7, 9, 8, 9, 10]  # told as xx, xy, yy, xh, yh, hh
+_COVARIANCE = [5, 6, 8, 6, 7, 9, 8, 9, 10]  # stored as xx, xy, yy, xh, yh, hh
 
 
 class PoseTrack(NamedTuple):
@@ -157,7 +155,7 @@ class PoseTruth(NamedTuple):
 
 
 def table(rows: Sequence[Sequence[float | None]], columns: int) -> FloatArray:
-    """Rows as they are told, shape (k, columns); NaN for what is not known."""
+    """Rows as arrays, shape (k, columns); NaN for what is not known."""
     filled = [[np.nan if value is None else value for value in row] for row in rows]
     return np.array(filled, dtype=np.float64).reshape(-1, columns)
 

@@ -34,7 +34,7 @@ class Publisher:
         self._socket.send(pack(name, message), zmq.DONTWAIT)
 
     def has_subscriber(self, name: str) -> bool:
-        """Whether somebody's subscription to a topic has arrived; what is published before is lost to them."""
+        """Whether a subscription to a topic has arrived; what is published before is lost to it."""
         while True:
             try:
                 change = self._socket.recv(zmq.DONTWAIT)
@@ -49,13 +49,11 @@ class Publisher:
 
 
 class Subscriber:
-    """Receives topics from one or more publishers.
+    """Receives topics from one or more publishers, which may come up later.
 
-    Args:
-        endpoints: where to connect (a publisher may come up later).
-        is_watching: watch the connection, for ``is_cut``; of one publisher only.
-        is_uncounted: a publisher that waits for its subscribers does not count this one (``has_subscriber``).
-        keeps_newest: of messages that wait only the newest is kept, whatever its topic.
+    ``is_watching``: watch the connection, for ``is_cut``; of one publisher only. ``is_uncounted``: a publisher that
+    waits for its subscribers does not count this one (``has_subscriber``). ``keeps_newest``: of messages that wait only
+    the newest is kept, whatever its topic.
     """
 
     def __init__(
@@ -113,9 +111,9 @@ class Subscriber:
                 self.bad_messages += 1
 
     def maintain(self) -> None:
-        """To be called now and then where nothing is received for long: a publisher that is new learns what we want.
+        """Let a new publisher learn the subscriptions; to be called now and then where nothing is received for long.
 
-        The library tells it from the thread that owns the socket, and only when that calls.
+        The library sends them from the thread that owns the socket, and only when that calls.
         """
         self.socket.getsockopt(zmq.EVENTS)
 

@@ -49,7 +49,7 @@ class ClearRequest(_Request):
 
 
 class PingRequest(_Request):
-    """Is anybody there, and what is the code?"""
+    """Request of the event code."""
 
     cmd: Literal["ping"]
 
@@ -87,11 +87,7 @@ def parse_observatory(frame: bytes) -> ObservatoryRequest:
 
 
 def parse_operator(frame: bytes) -> OperatorRequest:
-    """The request in a frame of the operator channel.
-
-    Raises:
-        BadRequest: too long, not JSON, not an object, or not of the form.
-    """
+    """The request in a frame of the operator channel; errors as of ``parse_observatory``."""
     return _validated(_operator, _parse_object(frame))
 
 
@@ -142,14 +138,7 @@ class EmergencyHandler(Protocol):
 def answer_observatory(
     frame: bytes, handler: EmergencyHandler, *, at_base_or_held: bool, age_s: float | None, may_clear: bool = True
 ) -> bytes:
-    """Serve one request of the observatory channel.
-
-    Args:
-        age_s: age of the last verdict, s; ``None`` before the first.
-
-    Returns:
-        The reply.
-    """
+    """The reply to one request of the observatory channel; ``age_s`` of the last verdict, ``None`` before the first."""
     try:
         request = parse_observatory(frame)
     except BadRequest as error:
@@ -194,8 +183,7 @@ def _object_in(frame: bytes) -> dict[str, Any]:
 
 
 def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    value = dict(pairs)
-    if len(value) != len(pairs):
+    if len(value := dict(pairs)) != len(pairs):
         raise BadRequest("a key stands twice")
     return value
 

@@ -53,12 +53,7 @@ class Latched(msgspec.Struct, frozen=True):
 
 
 class Pong(msgspec.Struct, frozen=True):
-    """State of the danger loop.
-
-    Attributes:
-        code: event code: 0 normal, 1 near an edge, 2 aborted.
-        age_s: of its newest frame, ``None`` before the first.
-    """
+    """The event code (0 normal, 1 near an edge, 2 aborted) and the age of its frame, ``None`` before the first."""
 
     code: int
     age_s: float | None = None
@@ -77,10 +72,7 @@ class ObservatoryClient:
 
     @classmethod
     def connect(cls, endpoint: str, server_key: Path, key: Path, timeout_s: float = TIMEOUT_S) -> "ObservatoryClient":
-        """A daemon on another machine, at ``tcp://HOST:PORT``.
-
-        Args:
-            key: file with the client's own secret key, whose public half the daemon lists.
+        """A daemon on another machine, at ``tcp://HOST:PORT``, which lists the public half of the secret ``key``.
 
         Raises:
             ConfigError: a key file cannot be used.
@@ -91,8 +83,7 @@ class ObservatoryClient:
     def emergency(self, kind: EmergencyKind, note: str = "", emergency_id: str | None = None) -> Latched:
         """Report an emergency: the robot drives to its base. The request is repeated until it is answered.
 
-        Args:
-            emergency_id: a UUID, by default a new one; reporting the same one again has no effect.
+        ``emergency_id`` is a UUID, by default a new one; reporting the same one again has no effect.
         """
         payload = {"cmd": "emergency", "kind": kind, "id": emergency_id or str(uuid.uuid4()), "note": note}
         return _as(Latched, self.ask(payload))
@@ -111,11 +102,9 @@ class ObservatoryClient:
 
 
 class OperatorClient:
-    """The operator channel of a daemon on this machine.
+    """The operator channel of a daemon on this machine, by default in the default runtime directory.
 
-    Args:
-        runtime_dir: its runtime directory, if not the default one.
-        timeout_s: of an answer; a pause is answered when the robot is at rest.
+    A pause is answered when the robot is at rest.
     """
 
     def __init__(self, runtime_dir: Path | None = None, timeout_s: float = TIMEOUT_S) -> None:

@@ -9,23 +9,19 @@ STALE_AFTER_S = min(BY_NAME[f"heartbeat.{name}"].stale_after_s for name in LOOPS
 
 
 class Liveness:
-    """What the loops say of themselves, and how long ago.
-
-    Args:
-        stale_after_s: what is older than this does not count, neither a word of a loop nor a frame of the robot.
-    """
+    """The newest heartbeat of each loop; no heartbeat and no frame of the robot counts after ``stale_after_s``."""
 
     def __init__(self, stale_after_s: float = STALE_AFTER_S) -> None:
         self._stale_after_s = stale_after_s
         self._heartbeats: dict[str, Heartbeat] = {}
 
     def update(self, heartbeat: Heartbeat) -> None:
-        """A loop is there. Its words are dated by its own clock, which is the machine's: waiting in line ages them."""
+        """Take a heartbeat. Its time is that of the machine's clock: waiting in a queue ages it."""
         self._heartbeats[heartbeat.process] = heartbeat
 
     @property
     def has_joined(self) -> bool:
-        """Whether both loops have said that they joined the robot."""
+        """Whether both loops have joined the robot."""
         return all(name in self._heartbeats and self._heartbeats[name].phase in ("joined", "done") for name in LOOPS)
 
     def trouble(self, now_s: float) -> str:
@@ -81,11 +77,7 @@ class RateLimitedLog:
         self._budgets: dict[str, LogRateLimit] = {}
 
     def take(self, level: str, text: str, now_s: float) -> str | None:
-        """The line as it is told; ``None`` where it is left out. Errors are all told.
-
-        Args:
-            now_s: time of any clock that only goes forward.
-        """
+        """The line to print at a monotonic time; ``None`` where it is left out. Errors are never left out."""
         if level == "error":
             return text
         budget = self._budgets.setdefault(f"{level} {kind_of(text)}", LogRateLimit(self._lines, self._period_s))

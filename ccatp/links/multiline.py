@@ -27,10 +27,6 @@ class BadReply(ValueError):
     """A line that is no reply."""
 
 
-class MultilineTooLong(ValueError):
-    """A line longer than the cap; the connection that sent it is of no further use."""
-
-
 class Command(StrEnum):
     """The requests."""
 
@@ -116,7 +112,7 @@ class ChannelData:
 class Remark:
     """A reply kept as text: ``defanadata`` (the vendor's own analysis, within a stream) or ``error``.
 
-    ``error_<reason>`` is the stand-in's answer to a line that is no request: the grammar's source is silent there.
+    ``error_<reason>`` is how the simulated server answers a line that is no request: the grammar's source is silent.
     """
 
     name: str
@@ -132,45 +128,6 @@ class Notice(StrEnum):
 
 
 Reply = Connected | LaserReady | Environment | ChannelData | Remark | Notice
-
-
-class LineSplitter:
-    """Cuts a byte stream into lines, however it was chopped on its way.
-
-    Call ``feed``, then ``next_line`` until it gives ``None``. What was complete before an oversized line is still
-    delivered, so the result does not depend on how the stream was chopped.
-    """
-
-    def __init__(self, limit: int = MAX_LINE_BYTES) -> None:
-        self._limit = limit
-        self._buffer = bytearray()
-        self._scanned = 0
-
-    @property
-    def pending(self) -> bool:
-        """Bytes are left over."""
-        return bool(self._buffer)
-
-    def feed(self, data: bytes) -> None:
-        """Append received bytes."""
-        self._buffer += data
-
-    def next_line(self) -> bytes | None:
-        """The next whole line without its CR LF, or ``None``.
-
-        Raises:
-            LineTooLong: the line, finished or not, is longer than the limit in bytes.
-        """
-        end = self._buffer.find(b"\n", self._scanned)
-        self._scanned = len(self._buffer) if end < 0 else end
-        if self._scanned > self._limit:
-            raise MultilineTooLong(f"line of more than {self._limit} bytes")
-        if end < 0:
-            return None
-        line = bytes(self._buffer[:end])
-        del self._buffer[: end + 1]
-        self._scanned = 0
-        return line.rstrip(b"\r")
 
 
 def format_request(request: MultilineRequest) -> bytes:

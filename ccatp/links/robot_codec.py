@@ -1,7 +1,7 @@
 """Codec of the robot link (interface control document 1): JSON lines between the robot and its clients.
 
 Decoding is strict: numbers are finite and in range, no key stands twice, booleans are no numbers. Unknown keys are
-ignored, a message of an unknown type is told apart from a bad line. Nothing of a bad line is used.
+ignored, a message of an unknown type is no bad line. Nothing of a bad line is used.
 """
 
 import hashlib
@@ -74,11 +74,7 @@ def decode_from_robot(line: bytes) -> FromRobot | Unknown:
 
 
 def decode_from_client(line: bytes) -> FromClient | Unknown:
-    """The message in a line of a client (without its LF).
-
-    Raises:
-        BadLine: the line fails a check.
-    """
+    """The message in a line of a client (without its LF); errors as of ``decode_from_robot``."""
     try:
         message = _client_decoder.decode(line)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -173,11 +169,7 @@ def is_mac_right(key: bytes, nonce: str, join: Join) -> bool:
 
 
 def _check_samples(frame: Sensors) -> None:
-    """Ranges of the samples, which the types cannot say.
-
-    Raises:
-        BadLine: a sample out of range.
-    """
+    """Ranges of the samples, which the types cannot say."""
     rate, latest = MAX_RATE_RAD_S, MAX_TIME_S
     for t, ax, wz in frame.imu:
         limit = MAX_ACCELERATION_M_S2
@@ -197,11 +189,7 @@ def _check_samples(frame: Sensors) -> None:
 
 
 def _unknown_or_bad(line: bytes, reason: str, known: frozenset[str]) -> Unknown:
-    """What a line is that the fast decoder refused: a message of an unknown type, or bad.
-
-    Raises:
-        BadLine: it is bad.
-    """
+    """What a line is that the fast decoder refused: a message of an unknown type, or bad."""
     value = _check_keys(line)
     message_type = value.get("type") if isinstance(value, dict) else None
     if not isinstance(message_type, str):
@@ -212,11 +200,7 @@ def _unknown_or_bad(line: bytes, reason: str, known: frozenset[str]) -> Unknown:
 
 
 def _check_keys(line: bytes) -> Any:
-    """Read the whole line slowly: no key twice, every number finite, also where the fast decoder skips.
-
-    Raises:
-        BadLine: it is no such JSON.
-    """
+    """Read the whole line slowly: no key twice, every number finite, also where the fast decoder skips."""
     try:
         return json.loads(
             line.decode("utf-8"),

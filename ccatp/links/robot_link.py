@@ -68,8 +68,7 @@ _HINTS = {
 def read_key(key_file: str, *, must_be_private: bool = False) -> bytes | None:
     """Key of the robot link: the file's bytes without white space around them; ``None`` when no file is named.
 
-    Args:
-        must_be_private: refuse a file that others may read; the key of a stand-in is no secret.
+    ``must_be_private``: refuse a file that others may read; the key of a simulated robot is no secret.
 
     Raises:
         ConfigError: the file cannot be read, is empty, or is not private.
@@ -96,11 +95,9 @@ class RobotLink(asyncio.Protocol):
     caller. While the robot does not take what was sent, drives and permits are dropped and counted: a burst of old
     commands must never follow a stall.
 
-    Args:
-        on_sensors: called with each frame and its line (without LF), within the event loop's read.
-        on_lost: called once with the reason when a joined session ends, unless ``close`` ended it.
-        on_joined: called with the robot's hello when the session begins, before its first frame.
-        on_bad_line: called after each line of a joined session that fails a check.
+    ``on_sensors`` is called with each frame and its line (without LF), within the event loop's read; ``on_lost`` once
+    with the reason when a joined session ends, unless ``close`` ended it; ``on_joined`` with the robot's hello when the
+    session begins, before its first frame; ``on_bad_line`` after each line of a joined session that fails a check.
 
     Attributes:
         counts: bad_lines, unknown_types, unexpected, repeated_frames, unsent.
@@ -142,9 +139,9 @@ class RobotLink(asyncio.Protocol):
 
         Raises:
             RobotTimeout: it took longer.
-            RobotRefused: the robot said no.
+            RobotRefused: the robot refused.
             WrongProtocol: another protocol, or no robot at all.
-            RobotLinkError: nobody answers, or the connection ended.
+            RobotLinkError: no answer, or the connection ended.
         """
         loop = asyncio.get_running_loop()
         joining: asyncio.Future[Hello] = loop.create_future()
@@ -165,7 +162,6 @@ class RobotLink(asyncio.Protocol):
                 self.close()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Called by asyncio."""
         self._transport = cast(asyncio.Transport, transport)  # a TCP connection has no other
         self._transport.set_write_buffer_limits(high=MAX_UNSENT_BYTES)
         peer = self._transport.get_extra_info("socket")
@@ -176,14 +172,13 @@ class RobotLink(asyncio.Protocol):
                 peer.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
     def data_received(self, data: bytes) -> None:
-        """Called by asyncio: serve whole lines."""
         is_too_long = False
         try:
             lines = self._lines.feed(data)
         except LineTooLong as error:
             lines, is_too_long = error.lines, True
         if self._budget is not None and not self._budget.take(len(lines), asyncio.get_running_loop().time()):
-            self._end("a flood of lines from the robot")
+            self.abort("a flood of lines from the robot")
         for line in lines:
             if self._is_closing or self._why:
                 return
@@ -198,10 +193,9 @@ class RobotLink(asyncio.Protocol):
             else:
                 self._take(message)
         if is_too_long:
-            self._end("the robot sent a line over the limit")
+            self.abort("the robot sent a line over the limit")
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Called by asyncio."""
         why = self._why or (f"connection lost: {exc}" if exc else "the robot closed the connection")
         self._transport = None
         if self._joining is not None and not self._joining.done():
@@ -214,11 +208,9 @@ class RobotLink(asyncio.Protocol):
             self._on_lost(why)
 
     def pause_writing(self) -> None:
-        """Called by asyncio: the robot does not take what was sent."""
         self._is_paused = True
 
     def resume_writing(self) -> None:
-        """Called by asyncio."""
         self._is_paused = False
 
     def _take_frame(self, frame: Sensors, line: bytes) -> None:
@@ -253,35 +245,30 @@ class RobotLink(asyncio.Protocol):
             self.counts["unexpected"] += 1
 
     def _answer(self, hello: Hello, joining: "asyncio.Future[Hello]") -> None:
+        needs_key = hello.auth == AUTH_HMAC
         if hello.protocol != PROTOCOL:
             error = f"the robot at {self._where} speaks {hello.protocol}, this program {PROTOCOL}"
             joining.set_exception(WrongProtocol(error))
-            return
-        mac = ""
-        if hello.auth == AUTH_HMAC:
-            if self._key is None:
-                error = f"the robot at {self._where} asks for a key: name its file in robot.key_file"
-                joining.set_exception(RobotLinkError(error))
-                return
-            mac = join_mac(self._key, hello.nonce, self._role)
-        self._hello = hello
-        self.send_raw(encode(Join(role=self._role, client=self._client, mac=mac)))
+        elif needs_key and self._key is None:
+            error = f"the robot at {self._where} asks for a key: name its file in robot.key_file"
+            joining.set_exception(RobotLinkError(error))
+        else:
+            mac = join_mac(self._key, hello.nonce, self._role) if needs_key and self._key is not None else ""
+            self._hello = hello
+            self.send_raw(encode(Join(role=self._role, client=self._client, mac=mac)))
 
     def _count_bad(self) -> None:
         self.counts["bad_lines"] += 1
         if self._bad.add(asyncio.get_running_loop().time()):
-            self._end("too many bad lines from the robot")
+            self.abort("too many bad lines from the robot")
         elif self._is_joined:
             self._on_bad_line()
 
-    def _end(self, why: str) -> None:
+    def abort(self, why: str) -> None:
+        """Break the connection at once, whatever waits to be sent; ``on_lost`` is called with ``why``."""
         self._why = self._why or why
         if self._transport is not None:
             self._transport.abort()
-
-    def abort(self, why: str) -> None:
-        """Break the connection at once, whatever waits to be sent; ``on_lost`` is called with ``why``."""
-        self._end(why)
 
     def send_drive(self, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float, steer_rad: float | None = None) -> None:
         """Send wheel set points, and the steering angle of a robot that has one.

@@ -171,15 +171,17 @@ class LineTooLong(ValueError):
 class LineBuffer:
     """Cuts a byte stream into lines, however it was chopped on its way.
 
-    Args:
-        limit: most bytes of a line, its LF not counted. No more than this is ever kept between two calls.
+    ``limit``: most bytes of a line, its LF not counted. No more than this is ever kept between two calls.
     """
-
-    __slots__ = ("_limit", "_rest")
 
     def __init__(self, limit: int = MAX_LINE_BYTES) -> None:
         self._limit = limit
         self._rest = b""
+
+    @property
+    def has_rest(self) -> bool:
+        """Whether there is the beginning of a line."""
+        return bool(self._rest)
 
     def feed(self, data: bytes) -> list[bytes]:
         """Whole lines, without their LF, after ``data`` was appended.
@@ -203,8 +205,6 @@ class LineBuffer:
 class BadLineLimit:
     """So many lines at once, so many a second in the long run; more is a flood."""
 
-    __slots__ = ("_left", "_lines", "_rate_hz", "_then_s")
-
     def __init__(self, lines: float, rate_hz: float) -> None:
         self._lines = self._left = lines
         self._rate_hz = rate_hz
@@ -218,9 +218,7 @@ class BadLineLimit:
 
 
 class BadLineCounter:
-    """Counts bad lines and tells when there are too many of them in a window of time."""
-
-    __slots__ = ("_limit", "_times_s", "_window_s", "total")
+    """Counts bad lines, and whether there are too many of them in a window of time."""
 
     def __init__(self, limit: int = 20, window_s: float = 1.0) -> None:
         self._limit, self._window_s = limit, window_s

@@ -9,7 +9,6 @@ import contextlib
 import os
 import socket
 from collections.abc import Awaitable, Callable
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import zmq
@@ -22,7 +21,8 @@ from ccatp.errors import CcatpError, DaemonUnreachableError, ExitStatus
 from ccatp.links.auth import Clients, KeyPair
 from ccatp.links.channels import BadRequest, format_error, parse_reply
 
-Handler = Callable[[bytes], bytes | Awaitable[bytes]]
+Handler = Callable[..., bytes | Awaitable[bytes]]
+"""Takes the request, and on TCP the client's public key in hexadecimal; returns the reply or an awaitable of it."""
 
 # libzmq cuts off a peer whose frame is longer than this; what lies between it and the limit of a request is answered.
 MAX_FRAME_BYTES = 1 << 13
@@ -34,10 +34,13 @@ MAX_CONNECTIONS = 32
 BACKLOG = 16
 # A connection whose ZeroMQ handshake, with its key where one is required, takes longer is closed.
 HANDSHAKE_MS = 2000
+# A peer that is gone without closing its connection gives its place back.
+HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 5000, 15000
 # An emergency is sent again at this period: where every other message is lost, fourteen leave 1 in 10,000 unreported.
 REPEAT_S = 0.05
 BUSY = "too many requests are waiting for their answer"
 NOT_SINGLE = "a request is one frame"
+DOMAIN = "ccatp.observatory"
 
 
 class RouterError(CcatpError):
@@ -53,63 +56,60 @@ class RequestFailed(DaemonUnreachableError):
 class Router:
     """Serves single-frame requests of REQ and DEALER peers.
 
-    Use as an async context manager around ``serve``, which runs until it is cancelled. The handler gets the frame and
-    returns the reply, or an awaitable of a later reply; meanwhile others are served. An exception of the handler ends
-    ``serve``. The endpoint is ``ipc://`` or ``inproc://``; plain ``tcp://`` is refused because it has no keys.
+    Use as an async context manager around ``serve``; a ``RouterError`` where the endpoint may not or cannot be bound.
+    While a handler's later reply is awaited, others are served. An exception of the handler ends ``serve``. Without
+    ``keys`` the endpoint is ``ipc://`` or ``inproc://``; with them it is ``tcp://ADDRESS:PORT`` for CURVE clients that
+    a ``ZapHandler`` admits.
 
     Attributes:
+        bound: the endpoint as bound, with its port.
         refused: requests that never reached the handler.
         turned_away: connections beyond ``MAX_CONNECTIONS``.
     """
 
-    def __init__(self, endpoint: str, handler: Handler, context: zmq.asyncio.Context) -> None:
-        self._endpoint, self._handler, self._context = endpoint, handler, context
+    def __init__(
+        self, endpoint: str, handler: Handler, context: zmq.asyncio.Context, keys: KeyPair | None = None
+    ) -> None:
+        self._endpoint, self._handler, self._context, self._keys = endpoint, handler, context, keys
         self._socket: zmq.asyncio.Socket | None = None
         self._monitor: zmq.asyncio.Socket | None = None
-        self._bound = ""
+        self.bound = ""
         self._pending: set[asyncio.Task[None]] = set()
         self._connections: set[int] = set()
         self.refused = self.turned_away = 0
 
-    @property
-    def bound(self) -> str:
-        """The endpoint as bound, with its port."""
-        return self._bound
-
     async def __aenter__(self) -> Self:
-        """Bind; ``RouterError`` where the endpoint may not or cannot be bound."""
-        self._check_endpoint()
-        router = self._context.socket(zmq.ROUTER)
-        self._configure(router)
-        self._socket = router
-        self._monitor = router.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
-        try:
-            router.bind(self._endpoint)
-        except zmq.ZMQError as error:
-            self._close()
-            raise RouterError(f"{self._endpoint}: {error.strerror}") from error
-        self._bound = router.getsockopt_string(zmq.LAST_ENDPOINT)
-        return self
-
-    def _check_endpoint(self) -> None:
-        if not self._endpoint.startswith(("ipc://", "inproc://")):
+        if self._keys is None and not self._endpoint.startswith(("ipc://", "inproc://")):
             raise RouterError(f"{self._endpoint}: only ipc:// and inproc:// are served without keys")
-
-    def _configure(self, router: zmq.asyncio.Socket) -> None:
+        if self._keys is not None and not self._endpoint.startswith("tcp://"):
+            raise RouterError(f"{self._endpoint}: CURVE keys are for tcp://")
+        self._socket = router = self._context.socket(zmq.ROUTER)
         router.setsockopt(zmq.LINGER, 0)
         router.setsockopt(zmq.RCVHWM, HIGH_WATER_MARK)
         router.setsockopt(zmq.SNDHWM, HIGH_WATER_MARK)
         router.setsockopt(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
         router.setsockopt(zmq.BACKLOG, BACKLOG)
         router.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+        if self._keys is not None:
+            router.setsockopt(zmq.ZAP_DOMAIN, DOMAIN.encode())
+            router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
+            router.setsockopt(zmq.CURVE_SERVER, 1)
+            router.setsockopt(zmq.CURVE_PUBLICKEY, self._keys.public)
+            router.setsockopt(zmq.CURVE_SECRETKEY, self._keys.secret)
+            router.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
+            router.setsockopt(zmq.HEARTBEAT_TIMEOUT, HEARTBEAT_TIMEOUT_MS)
+            router.setsockopt(zmq.TCP_KEEPALIVE, 1)
+        self._monitor = router.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
+        try:
+            router.bind(self._endpoint)
+        except zmq.ZMQError as error:
+            await self.__aexit__()
+            raise RouterError(f"{self._endpoint}: {error.strerror}") from error
+        self.bound = router.getsockopt_string(zmq.LAST_ENDPOINT)
+        return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Close; undelivered replies are dropped."""
-        self._close()
-
-    def _close(self) -> None:
         if self._socket is not None and self._monitor is not None:
             self._socket.disable_monitor()
             self._monitor.close()
@@ -123,14 +123,16 @@ class Router:
         async with asyncio.TaskGroup() as later:
             later.create_task(self._limit_connections())
             while (router := self._socket) is not None:
-                frames, user_id = await self._receive(router)
-                envelope, payload = split_envelope(frames)
+                frames = await router.recv_multipart(copy=False)
+                envelope, payload = split_envelope([frame.bytes for frame in frames])
                 if payload is None:
                     await self._refuse(envelope, NOT_SINGLE)
                 elif len(self._pending) >= MAX_PENDING:
                     await self._refuse(envelope, BUSY)
                 else:
-                    answer = self._ask(payload, user_id)
+                    # Only its owner reaches a socket in the runtime directory: without keys there is no client id.
+                    client = () if self._keys is None else (str(frames[-1].get("User-Id")),)
+                    answer = self._handler(payload, *client)
                     if isinstance(answer, bytes):
                         await self._send(envelope, answer)
                     else:
@@ -140,14 +142,6 @@ class Router:
                 # Receiving never yields while requests are queued: other tasks run here.
                 await asyncio.sleep(0)
 
-    async def _receive(self, router: zmq.asyncio.Socket) -> tuple[list[bytes], str]:
-        """The frames of the next message, and the user id of its sender or an empty text."""
-        return await router.recv_multipart(), ""
-
-    def _ask(self, payload: bytes, user_id: str) -> bytes | Awaitable[bytes]:
-        del user_id  # only its owner reaches a socket in the runtime directory
-        return self._handler(payload)
-
     async def _limit_connections(self) -> None:
         while (monitor := self._monitor) is not None:
             event = parse_monitor_message(await monitor.recv_multipart())
@@ -155,7 +149,7 @@ class Router:
                 self._connections.discard(event["value"])
             elif len(self._connections) < MAX_CONNECTIONS:
                 self._connections.add(event["value"])
-            elif turn_away(event["value"], self._bound):
+            elif turn_away(event["value"], self.bound):
                 self.turned_away += 1
             await asyncio.sleep(0)
 
@@ -175,8 +169,7 @@ class Router:
 def turn_away(descriptor: int, endpoint: str) -> bool:
     """End a connection that libzmq has accepted at an endpoint, as if the peer had closed it; whether it was done.
 
-    Args:
-        descriptor: from the socket monitor. It may be closed or reused by now; another endpoint's is left alone.
+    ``descriptor`` is from the socket monitor. It may be closed or reused by now; another endpoint's is left alone.
     """
     with contextlib.suppress(OSError):  # closed, or not a socket
         own = os.dup(descriptor)  # cannot be reused before it is closed
@@ -219,9 +212,8 @@ def request(
 ) -> dict[str, Any]:
     """Send a request to a ``Router`` and wait for its reply.
 
-    Args:
-        curve: the keys for a ``tcp://`` endpoint.
-        repeats: send it every ``REPEAT_S`` until a reply arrives; only for idempotent requests.
+    ``curve`` holds the keys for a ``tcp://`` endpoint. ``repeats``: send it every ``REPEAT_S`` until a reply arrives;
+    only for idempotent requests.
 
     Raises:
         RequestFailed: no reply in time, an invalid endpoint, or a malformed reply.
@@ -245,10 +237,8 @@ def request(
             if peer.poll(max(1, round(period_s * 1000.0))):
                 break
         else:
-            hint = (
-                "is ccatp running?" if curve is None else "is ccatp running there, with this server key and you listed?"
-            )
-            raise RequestFailed(f"no answer from {endpoint} within {timeout_s:g} s: {hint}")
+            there = "" if curve is None else " there, with this server key and you listed"
+            raise RequestFailed(f"no answer from {endpoint} within {timeout_s:g} s: is ccatp running{there}?")
         *_, reply = peer.recv_multipart()
     try:
         return parse_reply(reply)
@@ -256,18 +246,12 @@ def request(
         raise RequestFailed(f"{endpoint}: {error}") from error
 
 
-DOMAIN = "ccatp.observatory"
-# A peer that is gone without closing its connection gives its place back.
-HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 5000, 15000
-
-NamedHandler = Callable[[bytes, str], bytes | Awaitable[bytes]]
-
-
 class ZapHandler(Authenticator):
     """Decides which CURVE keys are admitted (ZAP, ZeroMQ RFC 27); a context can have one handler.
 
-    Use as an async context manager around ``serve``, and enter it before the ``CurveRouter`` of the same context.
-    pyzmq's ``AsyncioAuthenticator`` is not used: its own task would hide an exception, and refuse everybody afterwards.
+    Use as an async context manager around ``serve``, and enter it before the ``Router`` of the same context; after it
+    no client is admitted. pyzmq's ``AsyncioAuthenticator`` is not used: its own task would hide an exception, and
+    refuse everybody afterwards.
     """
 
     def __init__(
@@ -278,12 +262,10 @@ class ZapHandler(Authenticator):
         self.configure_curve_callback(DOMAIN, credentials_provider=self)
 
     async def __aenter__(self) -> Self:
-        """Bind."""
         self.start()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Close: from here on no client is admitted."""
         self.stop()
 
     async def serve(self) -> None:
@@ -307,36 +289,3 @@ class ZapHandler(Authenticator):
     def curve_user_id(self, client_public_key: bytes) -> str:
         """The key in hexadecimal."""
         return client_public_key.hex()
-
-
-class CurveRouter(Router):
-    """A ``Router`` on ``tcp://ADDRESS:PORT`` for CURVE clients that a ``ZapHandler`` admits.
-
-    The handler is called with the request and the client's public key in hexadecimal.
-    """
-
-    def __init__(self, endpoint: str, handler: NamedHandler, context: zmq.asyncio.Context, keys: KeyPair) -> None:
-        super().__init__(endpoint, lambda _: b"", context)
-        self._named_handler, self._keys = handler, keys
-
-    def _check_endpoint(self) -> None:
-        if not self._endpoint.startswith("tcp://"):
-            raise RouterError(f"{self._endpoint}: CURVE keys are for tcp://")
-
-    def _configure(self, router: zmq.asyncio.Socket) -> None:
-        super()._configure(router)
-        router.setsockopt(zmq.ZAP_DOMAIN, DOMAIN.encode())
-        router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
-        router.setsockopt(zmq.CURVE_SERVER, 1)
-        router.setsockopt(zmq.CURVE_PUBLICKEY, self._keys.public)
-        router.setsockopt(zmq.CURVE_SECRETKEY, self._keys.secret)
-        router.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
-        router.setsockopt(zmq.HEARTBEAT_TIMEOUT, HEARTBEAT_TIMEOUT_MS)
-        router.setsockopt(zmq.TCP_KEEPALIVE, 1)
-
-    async def _receive(self, router: zmq.asyncio.Socket) -> tuple[list[bytes], str]:
-        frames = await router.recv_multipart(copy=False)
-        return [frame.bytes for frame in frames], str(frames[-1].get("User-Id"))
-
-    def _ask(self, payload: bytes, user_id: str) -> bytes | Awaitable[bytes]:
-        return self._named_handler(payload, user_id)

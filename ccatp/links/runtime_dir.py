@@ -12,9 +12,9 @@ from pathlib import Path
 from ccatp.errors import RefusedError, RuntimeDirError
 
 LOCK_FILE = "lock"
-# Held by whoever gives away the truth of a simulation there: a daemon's stand-in, or one alone.
+# Held by the simulated robot that publishes its truth there.
 TRUTH_LOCK_FILE = "truth.lock"
-# Who asks whether a lock is held has it for an instant.
+# A process that asks whether a lock is held has it for an instant.
 _SECOND_LOOK_S = 0.05
 
 # sockaddr_un.sun_path holds 108 bytes with its closing zero on Linux.
@@ -26,11 +26,8 @@ MAX_SOCKET_NAME_BYTES = 24
 def runtime_dir_path(configured: str, environ: Mapping[str, str]) -> Path:
     """The folder, which need not exist: the configured one, or the first that the environment offers.
 
-    ``run.runtime_dir``, else ``$CCATP_RUNTIME_DIR``, else ``$XDG_RUNTIME_DIR/ccatp``, else ``ccatp-<uid>`` in the
-    temporary directory.
-
-    Args:
-        configured: ``run.runtime_dir``; empty when nothing is configured.
+    ``configured`` (``run.runtime_dir``) unless empty, else ``$CCATP_RUNTIME_DIR``, else ``$XDG_RUNTIME_DIR/ccatp``,
+    else ``ccatp-<uid>`` in the temporary directory.
 
     Raises:
         RuntimeDirError: the path is too long for a unix socket in it.
@@ -57,7 +54,7 @@ def make_runtime_dir(configured: str, environ: Mapping[str, str]) -> Path:
     """The folder, made with mode 0700 when it is missing, and checked to be the caller's own.
 
     Raises:
-        RuntimeDirError: it cannot be made, is not a folder, belongs to somebody else or is writable for others.
+        RuntimeDirError: it cannot be made, is not a folder, belongs to another user or is writable for others.
     """
     path = runtime_dir_path(configured, environ)
     try:
@@ -87,7 +84,7 @@ def locked(path: Path, refusal: str) -> Iterator[None]:
     """Hold the lock of a file for as long as the block lasts; it ends with the process, whatever ends that.
 
     Raises:
-        RefusedError: somebody else does.
+        RefusedError: another process holds it.
     """
     with path.open("w") as file:
         if not _takes(file.fileno(), LOCK_EX):
@@ -98,16 +95,16 @@ def locked(path: Path, refusal: str) -> Iterator[None]:
 
 
 def is_deserted(runtime_dir: Path) -> bool:
-    """Whether a daemon was there and is gone: its lock is there and nobody holds it."""
+    """Whether a daemon was there and is gone: its lock is there and no process holds it."""
     try:
         with (runtime_dir / LOCK_FILE).open() as file:
             return _takes(file.fileno(), LOCK_SH)
     except OSError:
-        return False  # whose it is cannot be told
+        return False  # not readable: it may be held
 
 
 def is_held(path: Path) -> bool:
-    """Whether somebody holds the lock of a file; where it cannot be read, nobody."""
+    """Whether a process holds the lock of a file; false where it cannot be read."""
     try:
         with path.open() as file:
             return not _takes(file.fileno(), LOCK_SH)
@@ -116,7 +113,7 @@ def is_held(path: Path) -> bool:
 
 
 def remove_sockets(runtime_dir: Path, names: Iterable[str]) -> None:
-    """Remove sockets that nobody serves any more; what is no socket stays."""
+    """Remove sockets that no process serves any more; what is no socket stays."""
     for name in names:
         path = runtime_dir / name
         with suppress(OSError):

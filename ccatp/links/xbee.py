@@ -1,4 +1,4 @@
-"""XBee API frames: what a coordinator on the serial line says of the radios that it hears.
+"""XBee API frames: the levels of radios that a coordinator reports on the serial line.
 
 802.15.4 firmware, API mode: 0x7E, length (2 bytes), frame data, checksum (0xFF minus the sum of the data). Received
 packets (0x80, 0x81) carry the level as a byte of -dBm; the answer to a node discovery (0x88, "ND") carries it in DB,
@@ -18,11 +18,9 @@ _OK = 0
 
 
 class XbeeLevel(NamedTuple):
-    """One radio and how strongly it was heard.
+    """One radio (the text that it sends, or its NI) and its level.
 
-    Attributes:
-        node: identifier: the text that the radio sends, or its NI.
-        address: 64-bit serial number, or the 16-bit address where only that is known.
+    ``address``: 64-bit serial number, or the 16-bit address where only that is known.
     """
 
     node: str
@@ -34,10 +32,7 @@ class XbeeFrames:
     """Takes bytes as they come and gives the levels in whole frames.
 
     Bytes before a start, frames with a wrong checksum or an impossible length, and frames that tell no level are left
-    out; the former two are counted.
-
-    Args:
-        escaped: API mode 2, in which 0x7E, 0x7D, 0x11 and 0x13 inside a frame are escaped.
+    out; the former two are counted. ``escaped``: API mode 2, in which 0x7E, 0x7D, 0x11 and 0x13 are escaped.
     """
 
     def __init__(self, *, escaped: bool) -> None:
@@ -102,7 +97,7 @@ class XbeeFrames:
 
 
 def level_of(frame: bytes) -> XbeeLevel | None:
-    """The radio and level that the data of a frame tell; None where they tell none, or end too early."""
+    """The radio and level in the data of a frame; None where there is none, or they end too early."""
     kind = frame[0]
     if kind == _RECEIVED_16 and len(frame) >= 5:
         return XbeeLevel(_text(frame[5:]), int.from_bytes(frame[1:3], "big"), -float(frame[3]))

@@ -19,6 +19,7 @@ import asyncio
 import socket
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol, cast
 
 import msgspec
@@ -31,6 +32,7 @@ from ccatp.config.models import SimEtalonConfig
 from ccatp.core import Vector3
 from ccatp.links import multiline
 from ccatp.links.multiline import ChannelData, Command, Connected, LaserReady, MultilineRequest, Notice, Remark, Reply
+from ccatp.links.robot_messages import LineBuffer, LineTooLong
 from ccatp.sim.laser import EtalonModel, PuckTruth
 
 _MAX_REPLY_BYTES = 4096
@@ -51,15 +53,17 @@ class PuckSource(Protocol):
         """
 
 
+@dataclass(slots=True)
 class FixedPuck:
-    """A puck that stands still; attributes may be changed. ``step_s`` passes between two queries, for fresh noise."""
+    """A puck that stands still, world frame; attributes may be changed.
 
-    def __init__(self, position_m: Vector3, *, t_s: float = 0.0, moved_m: float = 0.0, step_s: float = 0.0) -> None:
-        """``position_m`` is in the world frame."""
-        self.position_m = position_m
-        self.t_s = t_s
-        self.moved_m = moved_m
-        self.step_s = step_s
+    ``step_s`` passes between two queries, for fresh noise.
+    """
+
+    position_m: Vector3
+    t_s: float = 0.0
+    moved_m: float = 0.0
+    step_s: float = 0.0
 
     async def puck(self) -> PuckTruth:
         """The puck where it was put."""
@@ -81,51 +85,30 @@ class ZmqPuck:
         self._endpoint = endpoint
         self._timeout_s = timeout_s
         self._context = zmq.asyncio.Context()
-        self._socket: zmq.asyncio.Socket | None = None
-        self._turn = asyncio.Lock()
 
     async def puck(self) -> PuckTruth:
-        """The puck now; after a failure the socket is replaced, as a REQ socket that lost its reply is stuck.
+        """The puck now, by a socket of its own: a REQ socket that lost its reply is stuck.
 
         Raises:
             TruthUnavailable: no reply in time, or one that is not of the form above.
         """
         try:
-            async with asyncio.timeout(self._timeout_s), self._turn:
-                return await self._ask()
+            async with asyncio.timeout(self._timeout_s):
+                with self._context.socket(zmq.REQ) as peer:
+                    peer.setsockopt(zmq.LINGER, 0)
+                    peer.setsockopt(zmq.MAXMSGSIZE, _MAX_REPLY_BYTES)
+                    peer.connect(self._endpoint)
+                    await peer.send(b"puck")
+                    # Strict JSON: it has no NaN, and numbers past the range of a float are refused.
+                    reply = msgspec.json.decode(await peer.recv(), type=_TruthReply)
         except TimeoutError:
             raise TruthUnavailable(f"no puck from {self._endpoint} within {self._timeout_s} s") from None
         except (zmq.ZMQError, msgspec.MsgspecError) as error:
             raise TruthUnavailable(f"no puck from {self._endpoint}: {error}") from None
-
-    async def _ask(self) -> PuckTruth:
-        try:
-            peer = self._socket or self._connect()
-            await peer.send(b"puck")
-            # Strict JSON: it has no NaN, and numbers past the range of a float are refused.
-            reply = msgspec.json.decode(await peer.recv(), type=_TruthReply)
-        except BaseException:
-            self.close_socket()
-            raise
         return PuckTruth(reply.t, reply.puck, reply.moved_m)
 
-    def _connect(self) -> zmq.asyncio.Socket:
-        peer = self._context.socket(zmq.REQ)
-        self._socket = peer
-        peer.setsockopt(zmq.LINGER, 0)
-        peer.setsockopt(zmq.MAXMSGSIZE, _MAX_REPLY_BYTES)
-        peer.connect(self._endpoint)
-        return peer
-
-    def close_socket(self) -> None:
-        """Forget the socket; the next request makes another."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
-
     def close(self) -> None:
-        """Release socket and context."""
-        self.close_socket()
+        """Release the context."""
         self._context.term()
 
 
@@ -136,7 +119,9 @@ _BUSY = Remark("error", "busy")
 
 
 class EtalonSimulator:
-    """The server.
+    """The server of k channels with collimators in the world frame, shape (k, 3).
+
+    ``moved_m`` of ``truth`` is meant over ``measuring_time_s``, in which a length is averaged.
 
     Attributes:
         model: lengths and flags; ``blocked``, ``flags`` and ``laser_ready`` may be changed at any time.
@@ -154,16 +139,6 @@ class EtalonSimulator:
         *,
         measuring_time_s: float,
     ) -> None:
-        """Set up without a socket.
-
-        Args:
-            cfg: noise and motion tolerance.
-            mirror_channels: installed channels, length k.
-            collimators_m: world frame, shape (k, 3).
-            truth: where the puck is; ``moved_m`` is meant over ``measuring_time_s``.
-            rng: one draw gives the key of all noise.
-            measuring_time_s: how long a length is averaged.
-        """
         self.model = EtalonModel(cfg, mirror_channels, collimators_m, rng)
         self.measuring_time_s = measuring_time_s
         self.connected = True
@@ -219,7 +194,7 @@ class EtalonSimulator:
             await _Session(self, writer).run(reader)
         except* asyncio.CancelledError:
             pass  # by close(); asyncio logs a connection's task that ends cancelled as an error
-        except* multiline.MultilineTooLong:
+        except* LineTooLong:
             self.counts["oversized_lines"] += 1
         except* (ConnectionError, TimeoutError):
             self.counts["lost_clients"] += 1
@@ -258,13 +233,19 @@ class _Session:
         self._push: asyncio.Task[None] | None = None
 
     async def run(self, reader: asyncio.StreamReader) -> None:
-        lines = multiline.LineSplitter()
+        buffer = LineBuffer(multiline.MAX_LINE_BYTES)
         async with asyncio.TaskGroup() as group:
             try:
                 while data := await reader.read(_READ_BYTES):
-                    lines.feed(data)
-                    while (line := lines.next_line()) is not None:
-                        await self._handle(line, group)
+                    too_long: LineTooLong | None = None
+                    try:
+                        lines = buffer.feed(data)
+                    except LineTooLong as error:
+                        lines, too_long = error.lines, error
+                    for line in lines:
+                        await self._handle(line.rstrip(b"\r"), group)
+                    if too_long is not None:
+                        raise too_long
             finally:
                 self._stop_stream()
         self._writer.close()

@@ -4,23 +4,255 @@ The faults of the link in a fault plan switch it by the robot's clock, and are r
 """
 
 import asyncio
+import contextlib
 import random
 import socket
 import struct
-from collections import Counter
-from collections.abc import Iterator
+from collections import Counter, deque
+from collections.abc import Callable
 from math import inf
-from typing import Literal, Self, cast
+from typing import Any, Literal, Self, cast
 
-from ccatp.sim.fault_models import Injected, LastingLinkFault, LinkFault, Reset
-from ccatp.sim.network_faults import FloodLines, NetworkFaults, Pipe
+from ccatp.sim.fault_plan import (
+    LINK_TYPES,
+    BlackHole,
+    Corrupt,
+    Delay,
+    Direction,
+    DuplicateLines,
+    Flood,
+    Fragment,
+    GarbageBytes,
+    Injected,
+    LastingLinkFault,
+    LinkFault,
+    ReorderLines,
+    Reset,
+    Slowloris,
+    Stall,
+)
 
-Direction = Literal["to_client", "to_server", "both"]
-OneWay = Literal["to_client", "to_server"]
+OneWay = Literal["to_client", "to_robot"]
+OneWayFaults = dict[type[LinkFault], Any]
+"""What is switched on in one direction, one of each type."""
 
-_BOTH: tuple[OneWay, OneWay] = ("to_client", "to_server")
+READ_BYTES = 65536
+# While nothing goes out, no more than this is taken in: then the sender feels it.
+MAX_WAITING_BYTES = 8 << 20
+_LF = b"\n"
+_GARBAGE_LINE_BYTES = 64
+_LINE_FAULTS: tuple[type[LinkFault], ...] = (ReorderLines, DuplicateLines, Corrupt, GarbageBytes, Flood)
+_BOTH: tuple[OneWay, OneWay] = ("to_client", "to_robot")
 _FLOOD_PERIOD_S = 0.005
 _RST_ON_CLOSE = struct.pack("ii", 1, 0)  # SO_LINGER: on, for 0 s
+
+
+class LineStage:
+    """Cuts a stream into lines where a fault acts on lines, and applies the faults."""
+
+    def __init__(self, faults: OneWayFaults, counts: "Counter[str]", rng: random.Random) -> None:
+        self._faults, self._counts, self._rng = faults, counts, rng
+        self._rest = self._withheld = b""
+        self._seen: Counter[type[LinkFault]] = Counter()
+        self._last = b""
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """What goes on when ``data`` came in, in pieces; between two of them a line ends."""
+        if self._faults.keys().isdisjoint(_LINE_FAULTS):
+            found, self._rest, self._withheld = self._rest + data + self._withheld, b"", b""
+            return [found]
+        *lines, self._rest = (self._rest + data).split(_LF)  # ``splitlines`` would cut at CR, too
+        return [piece for line in lines for piece in self._treat(line + _LF)]
+
+    def finish(self) -> bytes:
+        """What is left at the end of the stream."""
+        found, self._rest, self._withheld = self._rest + self._withheld, b"", b""
+        return found
+
+    def flood_line(self) -> bytes:
+        """One further line."""
+        if self._faults[Flood].lines == "copies" and self._last:
+            return self._last
+        return self._garbage(_GARBAGE_LINE_BYTES)
+
+    def _treat(self, line: bytes) -> list[bytes]:
+        self._last = line
+        found: list[bytes] = []
+        if self._is_hit(GarbageBytes):
+            found.append(self._garbage(self._faults[GarbageBytes].garbage_bytes))
+        if self._is_hit(Corrupt):
+            line = self._corrupt(line)
+        if self._withheld:
+            found += [line, self._withheld]
+            self._withheld = b""
+        elif self._is_hit(ReorderLines):
+            self._withheld = line
+            return found
+        else:
+            found.append(line)
+        if self._is_hit(DuplicateLines):
+            found.append(line)
+        return found
+
+    def _is_hit(self, kind: type[LinkFault]) -> bool:
+        """Whether this line is an n-th one; counts it then."""
+        fault = self._faults.get(kind)
+        if fault is None:
+            return False
+        self._seen[kind] += 1
+        if self._seen[kind] % fault.every:
+            return False
+        self._counts[fault.type] += 1
+        return True
+
+    def _garbage(self, count: int) -> bytes:
+        return self._rng.randbytes(count).replace(_LF, b"\x00") + _LF
+
+    def _corrupt(self, line: bytes) -> bytes:
+        """Another byte in one place of the line, which stays one line."""
+        if line == _LF:
+            return line
+        at = self._rng.randrange(len(line) - 1)
+        other = [byte for byte in range(256) if byte not in {line[at], _LF[0]}]
+        return line[:at] + bytes((self._rng.choice(other),)) + line[at + 1 :]
+
+
+class Pipe:
+    """One direction of a connection: reader, queue, writer, and the faults switched on in it.
+
+    ``may_write`` returns the part of a write that may go out; the rest is dropped.
+    """
+
+    def __init__(
+        self,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        faults: OneWayFaults,
+        counts: "Counter[str]",
+        rng: random.Random,
+        may_write: Callable[[bytes], bytes],
+    ) -> None:
+        self._reader, self._writer, self._faults, self._counts, self._rng = reader, writer, faults, counts, rng
+        self._may_write = may_write
+        self._stage = LineStage(faults, counts, rng)
+        self._waiting: deque[tuple[float, bytes]] = deque()
+        self._waiting_bytes = 0
+        self._due_s = 0.0
+        self._is_at_end = self._is_shut = False
+        self._changed = asyncio.Event()
+
+    def wake(self) -> None:
+        """The faults have changed."""
+        self._changed.set()
+
+    def put(self, data: bytes) -> None:
+        """Let something wait for its time to go out; what is over the limit is lost."""
+        if not data or self._is_shut or self._waiting_bytes + len(data) > 2 * MAX_WAITING_BYTES:
+            return
+        now_s, late_s = asyncio.get_running_loop().time(), 0.0
+        delay = self._faults.get(Delay)
+        if delay is not None:
+            late_s = delay.delay_s + (delay.jitter_s * self._rng.random() if delay.jitter_s else 0.0)
+        if late_s:
+            self._counts["delay"] += 1
+        self._due_s = max(self._due_s, now_s + late_s)
+        self._waiting.append((self._due_s, data))
+        self._waiting_bytes += len(data)
+        self.wake()
+
+    def shut(self) -> None:
+        """Send the end now; nothing goes out any more."""
+        self._is_shut = True
+        self._waiting.clear()
+        self._waiting_bytes = 0
+        self._send_end()
+        self.wake()
+
+    def flood(self, lines: int) -> None:
+        """Let further lines wait, after what waits already."""
+        self._counts["flood"] += lines
+        self.put(b"".join(self._stage.flood_line() for _ in range(lines)))
+
+    async def receive(self) -> None:
+        """Take in until the sender ends or is gone."""
+        while data := await self._read():
+            if BlackHole in self._faults:
+                self._counts["black_hole"] += len(data)
+                continue
+            for piece in self._stage.feed(data):
+                self.put(piece)
+            while self._waiting_bytes > MAX_WAITING_BYTES:
+                await self._change()
+        while BlackHole in self._faults and not self._writer.is_closing():
+            await self._change()
+        self.put(self._stage.finish())
+        self._is_at_end = True
+        self.wake()
+
+    async def send(self) -> None:
+        """Give out until the end."""
+        while (data := await self._next()) is not None:
+            await self._write(data)
+        if not self._is_shut:
+            self._send_end()
+
+    def _send_end(self) -> None:
+        if self._writer.can_write_eof() and not self._writer.is_closing():
+            with contextlib.suppress(OSError):  # the peer may be gone already
+                self._writer.write_eof()
+
+    async def _read(self) -> bytes:
+        try:
+            return await self._reader.read(READ_BYTES)
+        except ConnectionError:
+            return b""
+
+    async def _change(self) -> None:
+        self._changed.clear()
+        await self._changed.wait()
+
+    async def _next(self) -> bytes | None:
+        """What is due, all of it in one piece; ``None`` at the end."""
+        loop = asyncio.get_running_loop()
+        while True:
+            if Stall in self._faults or not self._waiting:
+                if self._is_at_end and not self._waiting:
+                    return None
+                if self._waiting:
+                    self._counts["stall"] += 1
+                await self._change()
+                continue
+            early_s = self._waiting[0][0] - loop.time()
+            if early_s <= 0.0:
+                break
+            await asyncio.sleep(early_s)
+        now_s, found = loop.time(), b""
+        while self._waiting and self._waiting[0][0] <= now_s:
+            found += self._waiting.popleft()[1]
+        self._waiting_bytes -= len(found)
+        self.wake()  # there is room again
+        return found
+
+    async def _write(self, data: bytes) -> None:
+        while data and not self._is_shut:
+            slow, fragment = self._faults.get(Slowloris), self._faults.get(Fragment)
+            size = len(data) if fragment is None else fragment.write_bytes
+            piece = data[: size if slow is None else 1]
+            part = self._may_write(piece)
+            try:
+                self._writer.write(part)
+                await self._writer.drain()
+            except ConnectionError:
+                return
+            if len(part) < len(piece):  # the rest never goes out: see ``FaultProxy.reset_after``
+                return
+            data = data[len(piece) :]
+            if slow is not None:
+                self._counts["slowloris"] += 1
+                await asyncio.sleep(1.0 / slow.bytes_per_s)
+            elif fragment is not None:
+                self._counts["fragment"] += 1
+                await asyncio.sleep(0)
 
 
 class _Connection:
@@ -35,18 +267,6 @@ class _Connection:
             if not writer.is_closing() and peer is not None:
                 peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RST_ON_CLOSE)
             writer.transport.abort()
-        self.wake()
-
-    def shut(self) -> None:
-        """FIN to both. What they still send is read and forgotten: a socket closed over unread bytes sends RST."""
-        for pipe in self.pipes.values():
-            pipe.shut()
-
-    def close(self) -> None:
-        for writer in (self.client, self.server):
-            writer.close()
-
-    def wake(self) -> None:
         for pipe in self.pipes.values():
             pipe.wake()
 
@@ -54,21 +274,18 @@ class _Connection:
 class FaultProxy:
     """A proxy for one server; an asynchronous context manager.
 
-    Every fault is switched on by the method of its name, for the connections that are and for those to come, and off by
-    ``heal``. ``reset`` and ``close`` act at once.
-
-    Args:
-        listener: a bound socket to listen on; any free port of 127.0.0.1 if not given.
+    A fault that lasts acts on the connections that are and on those to come, from ``begin`` to ``heal``; ``reset`` and
+    ``close`` act at once. ``listener`` is a bound socket; any free port of 127.0.0.1 if not given.
 
     Attributes:
-        counts: what was really done, by the names of the methods: lines hit, writes, bytes swallowed, connections
+        counts: what was really done, by the types of the faults: lines hit, writes, bytes swallowed, connections
             ended; ``connections`` taken, ``refused`` because the server could not be reached.
     """
 
     def __init__(self, host: str, port: int, *, seed: int, listener: socket.socket | None = None) -> None:
         self._address, self._own_listener = (host, port), listener
         self._rng = random.Random(seed)
-        self._faults: dict[OneWay, NetworkFaults] = {way: NetworkFaults() for way in _BOTH}
+        self._faults: dict[OneWay, OneWayFaults] = {way: {} for way in _BOTH}
         self._connections: set[_Connection] = set()
         self._handlers: set[asyncio.Task[None]] = set()
         self._flooding: asyncio.Task[None] | None = None
@@ -109,8 +326,6 @@ class FaultProxy:
             await self._server.wait_closed()
             self._server = None
 
-    # -- faults of an instant -------------------------------------------------------------------------------------
-
     def reset(self) -> None:
         """Break every connection by RST, on both sides."""
         self.counts["reset"] += len(self._connections)
@@ -122,74 +337,44 @@ class FaultProxy:
         self._reset_after_bytes = passed_bytes
 
     def close(self) -> None:
-        """End every connection by FIN, on both sides, after what is on its way out of the proxy."""
+        """End every connection by FIN, on both sides, after what is on its way out of the proxy.
+
+        What they still send is read and forgotten: a socket closed over unread bytes sends RST.
+        """
         self.counts["close"] += len(self._connections)
         for connection in tuple(self._connections):
-            connection.shut()
+            for pipe in connection.pipes.values():
+                pipe.shut()
 
-    # -- faults that last -----------------------------------------------------------------------------------------
+    def begin(self, name: str, direction: Direction = "both", **values: Any) -> None:
+        """Switch on a fault that lasts: a type of the fault plan and its keys."""
+        self.switch_on(LINK_TYPES[name].model_validate({"type": name, "direction": direction, **values}))
 
-    def black_hole(self, direction: Direction) -> None:
-        """What is sent disappears, and so does the end of the connection: a half-open connection."""
-        self._set(direction, is_black_hole=True)
-
-    def stall(self, direction: Direction) -> None:
-        """Pass nothing on; ``heal`` lets everything go in one burst."""
-        self._set(direction, is_stalled=True)
-
-    def delay(self, direction: Direction, delay_s: float, jitter_s: float = 0.0) -> None:
-        """Be late by ``delay_s`` and up to ``jitter_s`` more, drawn for each piece; the order stays."""
-        self._set(direction, delay_s=delay_s, jitter_s=jitter_s)
-
-    def reorder(self, direction: Direction, every: int) -> None:
-        """Pass every n-th line on after the one that follows it."""
-        self._set(direction, reorder_every=every)
-
-    def duplicate(self, direction: Direction, every: int) -> None:
-        """Pass every n-th line on twice."""
-        self._set(direction, duplicate_every=every)
-
-    def corrupt(self, direction: Direction, every: int) -> None:
-        """Change one byte of every n-th line."""
-        self._set(direction, corrupt_every=every)
-
-    def garbage(self, direction: Direction, garbage_bytes: int, every: int) -> None:
-        """Put a line of so many random bytes before every n-th line."""
-        self._set(direction, garbage_every=every, garbage_bytes=garbage_bytes)
-
-    def fragment(self, direction: Direction, write_bytes: int) -> None:
-        """Write so many bytes at a time."""
-        self._set(direction, write_bytes=write_bytes)
-
-    def slowloris(self, direction: Direction, bytes_per_s: float) -> None:
-        """Write single bytes at this rate."""
-        self._set(direction, bytes_per_s=bytes_per_s)
-
-    def flood(self, direction: Direction, rate_hz: float, lines: FloodLines) -> None:
-        """Add further lines at this rate: random bytes, or copies of the last line that passed."""
-        self._set(direction, flood_hz=rate_hz, flood_lines=lines)
-        if self._flooding is None or self._flooding.done():
+    def switch_on(self, fault: LinkFault) -> None:
+        """The same with the fault of a plan, whatever its type."""
+        if not isinstance(fault, LastingLinkFault):
+            (self.reset if isinstance(fault, Reset) else self.close)()
+            return
+        for way in _BOTH:
+            if fault.direction in {way, "both"}:
+                self._faults[way][type(fault)] = fault
+        self._wake()
+        if isinstance(fault, Flood) and (self._flooding is None or self._flooding.done()):
             self._flooding = asyncio.get_running_loop().create_task(self._flood())
 
-    def heal(self, direction: Direction = "both", fault: str | None = None) -> None:
-        """End every fault that lasts, or one, named as its method."""
-        sound = NetworkFaults()
-        for way in _ways(direction):
-            for name in _FIELDS[fault] if fault else [name for names in _FIELDS.values() for name in names]:
-                setattr(self._faults[way], name, getattr(sound, name))
-        self._wake()
-
-    # -- connections ----------------------------------------------------------------------------------------------
-
-    def _set(self, direction: Direction, **values: object) -> None:
-        for way in _ways(direction):
-            for name, value in values.items():
-                setattr(self._faults[way], name, value)
+    def heal(self, direction: Direction = "both", name: str | None = None) -> None:
+        """End every fault that lasts, or that of one type; what was stalled goes in one burst."""
+        for way in _BOTH:
+            if direction in {way, "both"}:
+                for kind in tuple(self._faults[way]):
+                    if name is None or kind is LINK_TYPES[name]:
+                        del self._faults[way][kind]
         self._wake()
 
     def _wake(self) -> None:
         for connection in self._connections:
-            connection.wake()
+            for pipe in connection.pipes.values():
+                pipe.wake()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = cast(asyncio.Task[None], asyncio.current_task())  # asyncio runs this as a task of its own
@@ -211,11 +396,11 @@ class FaultProxy:
         for writer in (client, server):
             writer.transport.set_write_buffer_limits(0)  # written means: given to the kernel
             writer.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        pipes = {
-            "to_server": self._pipe("to_server", reader, server),
+        pipes: dict[OneWay, Pipe] = {
+            "to_robot": self._pipe("to_robot", reader, server),
             "to_client": self._pipe("to_client", server_reader, client),
         }
-        connection = _Connection(client, server, {way: pipes[way] for way in _BOTH})
+        connection = _Connection(client, server, pipes)
         self._connections.add(connection)
         self.counts["connections"] += 1
         try:
@@ -225,10 +410,11 @@ class FaultProxy:
                     tasks.create_task(pipe.send())
         finally:
             self._connections.discard(connection)
-            connection.close()
+            client.close()
+            server.close()
 
     def _pipe(self, way: OneWay, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Pipe:
-        may_write = self._passing if way == "to_client" else _everything
+        may_write = self._passing if way == "to_client" else bytes
         return Pipe(reader, writer, self._faults[way], self.counts, random.Random(self._rng.random()), may_write)
 
     def _passing(self, data: bytes) -> bytes:
@@ -247,37 +433,18 @@ class FaultProxy:
         owed = dict.fromkeys(_BOTH, 0.0)
         clock = asyncio.get_running_loop().time
         before_s = clock()
-        while any(faults.flood_hz for faults in self._faults.values()):
+        while any(Flood in faults for faults in self._faults.values()):
             await asyncio.sleep(_FLOOD_PERIOD_S)
             now_s = clock()
             for way in _BOTH:
-                owed[way] += (now_s - before_s) * self._faults[way].flood_hz
+                flood = self._faults[way].get(Flood)
+                if flood is None:
+                    continue
+                owed[way] += (now_s - before_s) * flood.rate_hz
                 lines, owed[way] = int(owed[way]), owed[way] % 1.0
                 for connection in self._connections if lines else ():
                     connection.pipes[way].flood(lines)
             before_s = now_s
-
-
-_FIELDS: dict[str, tuple[str, ...]] = {
-    "black_hole": ("is_black_hole",),
-    "stall": ("is_stalled",),
-    "delay": ("delay_s", "jitter_s"),
-    "reorder": ("reorder_every",),
-    "duplicate": ("duplicate_every",),
-    "corrupt": ("corrupt_every",),
-    "garbage": ("garbage_every", "garbage_bytes"),
-    "fragment": ("write_bytes",),
-    "slowloris": ("bytes_per_s",),
-    "flood": ("flood_hz",),
-}
-
-
-def _ways(direction: Direction) -> Iterator[OneWay]:
-    return (way for way in _BOTH if direction in {way, "both"})
-
-
-def _everything(data: bytes) -> bytes:
-    return data
 
 
 class _Watched:
@@ -288,6 +455,17 @@ class _Watched:
         self.from_s: float | None = None
         self.until_s: float | None = None
         self.count_before = self.count = 0
+        # A reset after so many bytes: the proxy itself waits for the moment, to the byte.
+        self.is_armed = isinstance(fault, Reset) and fault.after_bytes is not None
+
+    @property
+    def is_lasting(self) -> bool:
+        return self.from_s is not None and self.until_s is None
+
+    @property
+    def end_s(self) -> float:
+        for_s = getattr(self.fault, "for_s", None)
+        return inf if self.from_s is None or for_s is None else self.from_s + for_s
 
     @property
     def injected(self) -> Injected:
@@ -300,35 +478,36 @@ class LinkFaults:
     def __init__(self, plan: tuple[LinkFault, ...], proxy: FaultProxy) -> None:
         self._proxy = proxy
         self._watched = [_Watched(fault) for fault in plan]
-        for fault in plan:
-            if fault.after_bytes is not None and _is_armed(fault):
-                proxy.reset_after(fault.after_bytes)
+        for one in self._watched:
+            if one.is_armed and one.fault.after_bytes is not None:
+                proxy.reset_after(one.fault.after_bytes)
 
     @property
     def injected(self) -> tuple[Injected, ...]:
         """The record of each fault, in the order of the plan."""
         for one in self._watched:
-            if one.from_s is not None and one.until_s is None:
+            if one.is_lasting:
                 self._count(one)
         return tuple(one.injected for one in self._watched)
 
-    def tick(self, t_s: float) -> list[tuple[str, Injected]]:
+    def changes(self, t_s: float) -> list[tuple[str, Injected]]:
         """Begin and end what is due at a robot time; what began (``begins``) and ended (``ended``)."""
         news = []
         for one in self._watched:
-            if one.from_s is None and self._is_due(one.fault, t_s):
+            fault = one.fault
+            if one.from_s is None and self._is_due(fault, t_s):
                 one.from_s = t_s
-                if not _is_armed(one.fault):
-                    one.count_before = self._proxy.counts[one.fault.type]
-                    begin(one.fault, self._proxy)
-                if not isinstance(one.fault, LastingLinkFault):
+                if not one.is_armed:
+                    one.count_before = self._proxy.counts[fault.type]
+                    self._proxy.switch_on(fault)
+                if not isinstance(fault, LastingLinkFault):
                     one.until_s = t_s
                 self._count(one)
                 news.append(("begins", one.injected))
-            elif one.from_s is not None and one.until_s is None and t_s >= one.from_s + _length_s(one.fault):
+            elif one.is_lasting and isinstance(fault, LastingLinkFault) and t_s >= one.end_s:
                 self._count(one)
                 one.until_s = t_s
-                end(one.fault, self._proxy)
+                self._proxy.heal(fault.direction, fault.type)
                 news.append(("ended", one.injected))
         return news
 
@@ -342,33 +521,3 @@ class LinkFaults:
 
     def _count(self, one: _Watched) -> None:
         one.count = self._proxy.counts[one.fault.type] - one.count_before
-
-
-def begin(fault: LinkFault, proxy: FaultProxy) -> None:
-    """Let the proxy do what a fault says: the method of its type takes the keys that the type has for itself."""
-    values = fault.model_dump(exclude=set(LastingLinkFault.model_fields))
-    start = getattr(proxy, fault.type)
-    if isinstance(fault, LastingLinkFault):
-        start(_way(fault), **values)
-    else:
-        start()
-
-
-def end(fault: LinkFault, proxy: FaultProxy) -> None:
-    """End it."""
-    proxy.heal(_way(fault), fault.type)
-
-
-def _is_armed(fault: LinkFault) -> bool:
-    """Whether the proxy itself waits for the moment, to the byte."""
-    return isinstance(fault, Reset) and fault.after_bytes is not None
-
-
-def _way(fault: LinkFault) -> Direction:
-    direction = fault.direction if isinstance(fault, LastingLinkFault) else "both"
-    return "to_server" if direction == "to_robot" else direction
-
-
-def _length_s(fault: LinkFault) -> float:
-    for_s = fault.for_s if isinstance(fault, LastingLinkFault) else None
-    return inf if for_s is None else for_s

@@ -1,44 +1,25 @@
-"""The true state of a simulation beside the robot link: published by ZeroMQ, and kept in a file; reads fault plans."""
+"""The true state of a simulation beside the robot link: published by ZeroMQ, and kept in a file."""
 
 import os
 import zlib
 from pathlib import Path
 from struct import Struct
-from typing import Protocol
 
 import zmq
 import zmq.asyncio
 
 from ccatp.core import DeckPose
-from ccatp.errors import ConfigError
 from ccatp.links.bus import Publisher
-from ccatp.links.topics import Message
-from ccatp.sim.fault_plan import FaultPlan, check_pacing, parse_plan
 from ccatp.sim.robot import Robot
+from ccatp.sim.rules import TruthLog
 
 MAX_REQUEST_BYTES = 4096
 
 
-class TruthSource(Protocol):
-    """The log of one simulated robot."""
-
-    def add(self) -> bool:
-        """Add the row of the newest frame; true when the batch should be taken."""
-
-    def batch(self) -> tuple[str, Message] | None:
-        """The pending rows as a topic and its message, or ``None`` without any."""
-
-    def preface(self) -> tuple[str, Message]:
-        """What a recorder needs before the first batch, likewise."""
-
-    def answer(self, request: bytes) -> bytes:
-        """The reply to a request."""
-
-
 class GroundTruthPublisher:
-    """Publishes the true state by ZeroMQ, and answers requests."""
+    """Publishes the true state by ZeroMQ at ``pub``, and answers requests at ``rep``, where they are given."""
 
-    def __init__(self, truth: TruthSource, rep: str | None, pub: str | None) -> None:
+    def __init__(self, truth: TruthLog, rep: str | None, pub: str | None) -> None:
         self._truth = truth
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._publisher = Publisher(self._context, pub) if pub else None
@@ -61,7 +42,7 @@ class GroundTruthPublisher:
             return
         if not self._has_sent_preface:  # before the first batch: a recorder of one has the other, however the run ends
             self._has_sent_preface = True
-            self._publisher.send(*self._truth.preface())
+            self._publisher.send(*self._truth.robot.truth_preface())
         self._publisher.send(*batch)
 
     async def serve(self) -> None:
@@ -120,23 +101,3 @@ class SimPoseFile:
         """Close the file."""
         if self._fd >= 0:
             os.close(self._fd)
-
-
-def read_plan(file: Path, *, lockstep: bool) -> FaultPlan:
-    """The plan in a file.
-
-    Args:
-        lockstep: simulated time waits for the clients; not every fault of the link makes sense then.
-
-    Raises:
-        ConfigError: one line per problem with file, line, key, what is wrong and what to do.
-    """
-    try:
-        text = file.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{file}: {(error.strerror or str(error)).lower()}; name a TOML file that exists") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{file}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
-    plan = parse_plan(text, str(file))
-    check_pacing(plan, str(file), lockstep=lockstep)
-    return plan

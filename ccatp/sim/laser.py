@@ -26,12 +26,7 @@ SEED_STREAM = 2
 
 
 class PuckTruth(NamedTuple):
-    """Where the puck truly is.
-
-    Attributes:
-        position_m: centre of the puck, world frame, shape (3,).
-        moved_m: the furthest it was from there within the last measuring time.
-    """
+    """Centre of the puck, world frame, and the furthest it was from there within the last measuring time."""
 
     t_s: float
     position_m: Vector3
@@ -39,11 +34,14 @@ class PuckTruth(NamedTuple):
 
 
 class EtalonModel:
-    """Channels that look at the puck from known collimators.
+    """Channels that look at the puck from known collimators, world frame, shape (k, 3); ``rng`` is drawn from once.
 
     Attributes:
-        flags: further error flags to raise, names out of ``wire.multiline.FLAGS`` by channel.
+        flags: further error flags to raise, names out of ``ccatp.links.multiline.FLAGS`` by channel.
         laser_ready: while false, each record carries ``laser_temp_error``.
+
+    Raises:
+        ValueError: channels and collimators do not fit.
     """
 
     def __init__(
@@ -53,25 +51,13 @@ class EtalonModel:
         collimators_m: NDArray[np.float64],
         rng: np.random.Generator,
     ) -> None:
-        """Set up the channels.
-
-        Args:
-            cfg: noise and motion tolerance.
-            channels: channel numbers, length k.
-            collimators_m: where their beams start, world frame, shape (k, 3).
-            rng: gives the key of all noise; one draw.
-
-        Raises:
-            ValueError: channels and collimators do not fit.
-        """
         if np.shape(collimators_m) != (len(channels), 3):
             raise ValueError(f"{len(channels)} channels, collimators of shape {np.shape(collimators_m)}")
         self._sigma_m = cfg.length_sigma_m
         self._sigma_per_m = cfg.length_sigma_per_m
         self._motion_tolerance_m = cfg.motion_tolerance_m
-        self._collimators: dict[int, list[float]] = dict(
-            zip(channels, np.asarray(collimators_m, dtype=np.float64).tolist(), strict=True)
-        )
+        rows: list[list[float]] = np.asarray(collimators_m, dtype=np.float64).tolist()
+        self._collimators = dict(zip(channels, rows, strict=True))
         self._key = int(rng.integers(2**63))
         self.blocked: set[int] = set()
         self.flags: dict[int, set[str]] = {}
@@ -90,20 +76,16 @@ class EtalonModel:
         that is not installed gives ``daq_error`` and the length 0, a blocked one ``beam_break`` and the length 0, a
         puck that moved further than the tolerance ``motion_tolerance_error``.
         """
-        common = self._common_flags(puck)
+        common = set()
+        if not puck.moved_m <= self._motion_tolerance_m:
+            common.add("motion_tolerance_error")
+        if not self.laser_ready:
+            common.add("laser_temp_error")
         return tuple(self._record(channel, puck, common) for channel in channels)
 
     def failed_records(self, channels: Sequence[int]) -> tuple[ChannelRecord, ...]:
         """One record of length 0 with ``daq_error`` per asked channel: nothing could be measured."""
         return tuple(self._format(channel, 0.0, {"daq_error"}) for channel in channels)
-
-    def _common_flags(self, puck: PuckTruth) -> set[str]:
-        flags = set()
-        if not puck.moved_m <= self._motion_tolerance_m:
-            flags.add("motion_tolerance_error")
-        if not self.laser_ready:
-            flags.add("laser_temp_error")
-        return flags
 
     def _record(self, channel: int, puck: PuckTruth, common: set[str]) -> ChannelRecord:
         collimator = self._collimators.get(channel)

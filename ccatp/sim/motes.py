@@ -32,11 +32,7 @@ class TrueMotes:
 
 
 def true_motes(cfg: CricketConfig, rng: np.random.Generator) -> TrueMotes:
-    """The motes of a configuration.
-
-    Args:
-        rng: draws the places of ``random``.
-    """
+    """The motes of a configuration; ``rng`` draws the places of ``random``."""
     if cfg.layout == "networks":
         return _stands(cfg)
     if cfg.layout == "motes":
@@ -69,11 +65,7 @@ _ABSOLUTE_ZERO_C = -273.15
 
 
 class MotePulse(NamedTuple):
-    """Readings of one pair.
-
-    Attributes:
-        delays_s: pulse after message, shape (k,); as many as were received.
-    """
+    """Readings of one pair: delays of pulse after message, shape (k,); as many as were received."""
 
     transmitter: int
     listener: int
@@ -82,11 +74,7 @@ class MotePulse(NamedTuple):
 
 
 class MoteField:
-    """Motes that range among themselves.
-
-    Args:
-        rng: draws the errors of the thermometers, once for each mote.
-    """
+    """Motes that range among themselves; ``rng`` draws the errors of the thermometers, once for each mote."""
 
     def __init__(self, cfg: CricketConfig, motes: TrueMotes, rng: np.random.Generator) -> None:
         self.motes = motes
@@ -94,7 +82,7 @@ class MoteField:
         true = cfg.sim
         self._temperatures_c = true.temperature_c + rng.normal(0.0, true.thermometer_sigma_c, len(motes.names))
         ratio = (true.temperature_c - _ABSOLUTE_ZERO_C) / (cfg.air.temperature_c - _ABSOLUTE_ZERO_C)
-        self._sound_m_s = cfg.air.sound_speed_m_s * sqrt(ratio)
+        self.sound_m_s = cfg.air.sound_speed_m_s * sqrt(ratio)
 
     def receives(self, transmitter: int, listener: int) -> bool:
         """Whether a mote is in the usable region of another, and the other in its own."""
@@ -123,20 +111,17 @@ class MoteField:
         is_echo = rng.random(repeats) < true.multipath_probability
         ways_m[is_echo] += rng.exponential(true.multipath_excess_m, int(is_echo.sum()))
         ways_m += rng.normal(0.0, true.sigma_m, repeats)
-        delays_s = np.maximum(ways_m / self._sound_m_s + true.latency_s, 0.0)
+        delays_s = np.maximum(ways_m / self.sound_m_s + true.latency_s, 0.0)
         if true.tick_s > 0.0:
             delays_s = np.round(delays_s / true.tick_s) * true.tick_s
         return np.asarray(delays_s[rng.random(repeats) >= true.loss_probability])
 
 
 def usable_reach(transducer: TransducerConfig, off_transmitter_rad: float, off_listener_rad: float) -> float:
-    """How far a pulse is received, m: reach(a) reach(b) / reach(0).
+    """How far a pulse is received, m: reach(a) reach(b) / reach(0), with angles a and b between axes and way.
 
-    Both transducers have the same directivity, and each takes its share of the reach on the axis.
-
-    Args:
-        transducer: the table of reaches; straight lines between its angles, nothing beyond.
-        off_listener_rad: angle b between the listener's axis and the way.
+    Both transducers have the same directivity, and each takes its share of the reach on the axis. Between the angles of
+    the table the reach is linear, beyond them 0.
     """
     on_axis_m = transducer.reach_m[0]
     if transducer.is_omnidirectional or on_axis_m <= 0.0:
@@ -157,21 +142,14 @@ _DIGITS = 9  # of a delay on the link: a nanosecond is a third of a micrometre
 
 
 class MoteListener:
-    """Receives frame by frame.
-
-    Args:
-        listener: who the robot is to the motes, and how many send in a frame.
-    """
+    """The listener on the robot, frame by frame; its configuration has its name and how many motes send in a frame."""
 
     def __init__(
         self, cfg: CricketConfig, listener: ListenerConfig, motes: TrueMotes, rng: np.random.Generator
     ) -> None:
         self._cfg, self._listener, self._motes, self._rng = cfg, listener, motes, rng
         self._field = MoteField(cfg, motes, rng)
-        true = cfg.sim
-        self._temperature_c = true.temperature_c + float(rng.normal(0.0, true.thermometer_sigma_c))
-        ratio = (true.temperature_c - _ABSOLUTE_ZERO_C) / (cfg.air.temperature_c - _ABSOLUTE_ZERO_C)
-        self._sound_m_s = cfg.air.sound_speed_m_s * sqrt(ratio)
+        self._temperature_c = cfg.sim.temperature_c + float(rng.normal(0.0, cfg.sim.thermometer_sigma_c))
         self._sent = 0
 
     def receive(self, time_s: float, pose: TruePose) -> list[MoteBurst]:
@@ -208,7 +186,7 @@ class MoteListener:
         if is_echo < true.multipath_probability:
             way_m += true.multipath_excess_m * float(echo_m)
         way_m += true.sigma_m * float(noise)
-        delay_s = max(way_m / self._sound_m_s + true.latency_s, 0.0)
+        delay_s = max(way_m / self._field.sound_m_s + true.latency_s, 0.0)
         if true.tick_s > 0.0:
             delay_s = round(delay_s / true.tick_s) * true.tick_s
         name = self._motes.names[sender]

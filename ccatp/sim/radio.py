@@ -1,9 +1,4 @@
-"""Parts of the true world of a robot among beacons.
-
-Commands and readings; scheduled events (radios fall silent, obstacles and the target appear); round obstacles; static
-shadowing; signal strengths (path loss, shadowing, obstacles, reflected rays, a reflector's pattern, loss); the moving
-radio.
-"""
+"""Parts of the true world of a robot among beacons: commands, readings, obstacles, radio signals, the moving radio."""
 
 from collections.abc import Iterable, Sequence
 from math import atan2, cos, hypot, inf, log10, pi, sin, sqrt, tau
@@ -12,25 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ccatp.config.beacon_models import (
-    IncidentConfig,
-    ObstacleIncidentConfig,
-    RadioLossConfig,
-    SimObstacleConfig,
-    SimRadioConfig,
-    SimTargetConfig,
-    TargetApproachConfig,
-)
+from ccatp.config.beacon_models import SimObstacleConfig, SimRadioConfig, SimTargetConfig
 from ccatp.core import bearing, wrap_pi
 
 
 class SimDriveCommand(NamedTuple):
-    """Set points until the next step.
-
-    Attributes:
-        steer_rad: steering angle to the left; of an Ackermann vehicle.
-        turn_rate_rad_s: turn rate to the left; of a differential drive.
-    """
+    """Set points until the next step; steering angle (Ackermann) or turn rate (differential drive) to the left."""
 
     speed_m_s: float
     steer_rad: float
@@ -79,7 +61,7 @@ class WorldFrame(NamedTuple):
     Attributes:
         packets: answers received at its end while the reflector turned once; empty in steps without a scan.
         sightings: the same of worlds that draw the result of a scan.
-        distances_m: of the distance sensors, in the order of the configuration; their range where they see nothing.
+        distances_m: of the distance sensors, in the order of the configuration; their range without an obstacle.
     """
 
     time_s: float
@@ -87,35 +69,6 @@ class WorldFrame(NamedTuple):
     packets: tuple[Packet, ...]
     sightings: tuple[TargetBearing, ...]
     distances_m: tuple[float, ...]
-
-
-class Incidents:
-    """Each lasts from ``at_s`` for ``for_s``."""
-
-    def __init__(self, plan: Sequence[IncidentConfig]) -> None:
-        self._losses = [one for one in plan if isinstance(one, RadioLossConfig)]
-        self._things = [one for one in plan if isinstance(one, ObstacleIncidentConfig)]
-        self._approaches = [one for one in plan if isinstance(one, TargetApproachConfig)]
-
-    def is_heard(self, radio: str, time_s: float) -> bool:
-        """Whether a radio sends."""
-        return not any(_lasts(one, time_s) and (not one.beacons or radio in one.beacons) for one in self._losses)
-
-    def obstacles(self, time_s: float) -> list[SimObstacleConfig]:
-        """What was put into the room besides."""
-        return [
-            SimObstacleConfig(x_m=one.x_m, y_m=one.y_m, radius_m=one.radius_m)
-            for one in self._things
-            if _lasts(one, time_s)
-        ]
-
-    def approach_m_s(self, time_s: float) -> float | None:
-        """How fast the target comes at the robot; None while it goes its own way."""
-        return next((one.speed_m_s for one in self._approaches if _lasts(one, time_s)), None)
-
-
-def _lasts(one: IncidentConfig, time_s: float) -> bool:
-    return one.at_s <= time_s < one.at_s + one.for_s
 
 
 Point = tuple[float, float]
@@ -191,11 +144,7 @@ _BEYOND_WALLS_M = 1.0  # things that reflect stand in the room and as far as thi
 
 
 class Ray(NamedTuple):
-    """One way of a signal to the receiver.
-
-    Attributes:
-        level_dbm: as an antenna without direction would receive it.
-    """
+    """One way of a signal to the receiver; ``level_dbm`` as an antenna without direction would receive it."""
 
     direction_rad: float
     level_dbm: float
@@ -211,10 +160,7 @@ class TrueRadio:
 
     The direct ray has P_ref - 10 eta log10(r), the shadowing of both places, and the loss of each obstacle in the
     line of sight. Each reflected ray comes by a place of its own, drawn once, with the path loss of the whole way and a
-    loss of its own.
-
-    Args:
-        reference_dbm: P_ref of the sender, at 1 m.
+    loss of its own. ``reference_dbm`` is P_ref of the sender, at 1 m.
     """
 
     def __init__(

@@ -4,12 +4,20 @@ The vehicle has Ackermann or differential drive, wheels that slip, a heading tha
 """
 
 from math import cos, sin
+from typing import TypeVar
 
 import numpy as np
 
-from ccatp.config.beacon_models import RadioConfig, SimVehicleConfig, VehicleConfig
+from ccatp.config.beacon_models import (
+    ObstacleIncidentConfig,
+    RadioConfig,
+    RadioLossConfig,
+    SimObstacleConfig,
+    SimVehicleConfig,
+    TargetApproachConfig,
+    VehicleConfig,
+)
 from ccatp.sim.radio import (
-    Incidents,
     MovingTarget,
     Packet,
     SimDriveCommand,
@@ -74,21 +82,17 @@ def _clamped(value: float, limit: float) -> float:
 
 
 Point = tuple[float, float]
+_Incident = TypeVar("_Incident", RadioLossConfig, ObstacleIncidentConfig, TargetApproachConfig)
 # Streams of random numbers of a seed: what one of them draws does not depend on the use of another.
 _START, _WHEELS, _TARGET, _DISTANCES, _PLACES, _NOISE = range(6)
 
 
 class RadioWorld:
-    """Vehicle, beacons, moving target, obstacles.
-
-    Args:
-        cfg: the configuration; ``sim`` holds the truth.
-    """
+    """Vehicle, beacons, moving target, obstacles, and scheduled incidents: lost radios, obstacles, the target comes."""
 
     def __init__(self, cfg: RadioConfig, seed: int | None = None) -> None:
         seed = cfg.run.seed if seed is None else seed
         self._cfg = cfg
-        self._incidents = Incidents(cfg.sim.incidents)
         self.obstacles = list(cfg.sim.obstacles)
         self._vehicle = TrueVehicle(cfg.vehicle, cfg.sim.vehicle, _true_start(cfg, seed), _stream(seed, _WHEELS))
         self._target = MovingTarget(cfg.sim.target, cfg.workspace.size_m, cfg.sim.obstacles, _stream(seed, _TARGET))
@@ -126,31 +130,40 @@ class RadioWorld:
         return clearance_m(self.pose, self.obstacles) - self._cfg.vehicle.radius_m
 
     def step(self, command: SimDriveCommand, interval_s: float, *, static: bool, target: bool) -> WorldFrame:
-        """Drive on, then listen."""
-        incidents = self._incidents
-        self.obstacles[:] = (*self._cfg.sim.obstacles, *incidents.obstacles(self.time_s))
+        """Drive on, then receive."""
+        obstacles = self._lasting(ObstacleIncidentConfig)
+        self.obstacles[:] = self._cfg.sim.obstacles
+        self.obstacles += [SimObstacleConfig(x_m=one.x_m, y_m=one.y_m, radius_m=one.radius_m) for one in obstacles]
         wheels = self._vehicle.step(command, interval_s)
-        approach_m_s = incidents.approach_m_s(self.time_s)
-        if approach_m_s is None:
-            self._target.step(interval_s)
+        approaches = self._lasting(TargetApproachConfig)
+        if approaches:
+            self._target.approach(self.pose[:2], approaches[0].speed_m_s * interval_s)
         else:
-            self._target.approach(self.pose[:2], approach_m_s * interval_s)
+            self._target.step(interval_s)
         self.time_s += interval_s
-        packets, sightings = self._heard(static=static, target=target)
-        return WorldFrame(self.time_s, wheels, packets, sightings, self._seen())
+        packets, sightings = self._receive(static=static, target=target)
+        return WorldFrame(self.time_s, wheels, packets, sightings, self._distances_m())
 
-    def _heard(self, *, static: bool, target: bool) -> tuple[tuple[Packet, ...], tuple[TargetBearing, ...]]:
+    def _lasting(self, kind: type[_Incident]) -> list[_Incident]:
+        """The incidents of a kind that last now."""
+        incidents = [one for one in self._cfg.sim.incidents if isinstance(one, kind)]
+        return [one for one in incidents if one.at_s <= self.time_s < one.at_s + one.for_s]
+
+    def _receive(self, *, static: bool, target: bool) -> tuple[tuple[Packet, ...], tuple[TargetBearing, ...]]:
         places = dict(self.beacons_m) if static else {}
         if target and self.target_m is not None:
             places[self._cfg.follow.target] = self.target_m
-        places = {name: place_m for name, place_m in places.items() if self._incidents.is_heard(name, self.time_s)}
+        losses = self._lasting(RadioLossConfig)
+        for name in tuple(places):
+            if any(not one.beacons or name in one.beacons for one in losses):
+                del places[name]
         if self._cfg.sim.radio.scan == "drawn":
             found = (self._radios[name].sight(self.pose, place_m) for name, place_m in places.items())
             return (), tuple(sighting for sighting in found if sighting is not None)
         scans = (self._radios[name].scan(self.pose, place_m) for name, place_m in places.items())
         return tuple(packet for packets in scans for packet in packets), ()
 
-    def _seen(self) -> tuple[float, ...]:
+    def _distances_m(self) -> tuple[float, ...]:
         cfg = self._cfg
         distances = []
         for direction_rad in cfg.avoidance.sensors_rad:

@@ -6,9 +6,14 @@ default: a set point reaches the wheels only through ``MotionRules.set_points``.
 
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Callable
 from math import isfinite
+from typing import Any, Literal
+
+import msgspec
 
 from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData
+from ccatp.links.topics import Message
 
 HELD = (0.0, 0.0)
 _EVERYTHING = (True, True, True)
@@ -20,27 +25,11 @@ class MotionRules:
     Wheels turn only while the newest drive is at most ``ttl_s`` old and, once a monitor has joined in this boot, the
     newest permit is at most ``ttl_s`` old and allows the direction: v = r (wr + wl)/2 > 0 needs ``forward``, < 0
     ``reverse``, wr != wl needs ``turn``. Sequence numbers count per kind and per session: a new session begins again.
-
-    Args:
-        max_wheel_rad_s: limit of a wheel; a faster drive is slowed down as a whole, so that its path stays the same.
+    A drive over ``max_wheel_rad_s`` is slowed down as a whole, so that its path stays the same.
 
     Attributes:
         is_held: the last ``set_points`` held the wheels.
     """
-
-    __slots__ = (
-        "_drive",
-        "_drive_s",
-        "_drive_seq",
-        "_is_steered",
-        "_max_wheel_rad_s",
-        "_permit",
-        "_permit_s",
-        "_permit_seq",
-        "_ttl_s",
-        "has_monitor_joined",
-        "is_held",
-    )
 
     def __init__(self, ttl_s: float, max_wheel_rad_s: float, boot_s: float = 0.0) -> None:
         self._ttl_s, self._max_wheel_rad_s = ttl_s, max_wheel_rad_s
@@ -52,11 +41,11 @@ class MotionRules:
         self.is_held = True
 
     def join_controller(self) -> None:
-        """A new session holds the controller's role: nothing of the one before is in force."""
+        """A new session has the controller's role: nothing of the one before is in force."""
         self._drive, self._drive_seq = None, -1
 
     def join_monitor(self) -> None:
-        """A new session holds the monitor's role; from now on its permit is needed."""
+        """A new session has the monitor's role; from now on its permit is needed."""
         self.has_monitor_joined = True
         self._permit, self._permit_seq = None, -1
 
@@ -71,8 +60,7 @@ class MotionRules:
     def drive(self, seq: int, right_rad_s: float, left_rad_s: float, now_s: float, *, is_steered: bool = False) -> bool:
         """Take a drive that arrived at ``now_s``; false for an old or equal ``seq`` and for numbers not finite.
 
-        Args:
-            is_steered: wheels beside these two make a turn of it.
+        ``is_steered``: wheels beside these two make a turn of it.
         """
         if seq <= self._drive_seq:
             return False
@@ -97,11 +85,8 @@ class MotionRules:
     def set_points(self, until_s: float) -> tuple[float, float]:
         """(right, left) wheel set points, rad/s, of a step to ``until_s``: drive and permit must last to its end."""
         drive = self._drive
-        if drive is None or not self._may_move(drive, until_s):
-            self.is_held = True
-            return HELD
-        self.is_held = False
-        return drive
+        self.is_held = drive is None or not self._may_move(drive, until_s)
+        return HELD if drive is None or self.is_held else drive
 
     def _may_move(self, drive: tuple[float, float], until_s: float) -> bool:
         # Times are multiples of the frame period: an age of exactly the time-to-live must not fail for its last bit.
@@ -129,19 +114,15 @@ class MotionRules:
 class FanRules:
     """Fan duties: in force until changed by a newer command, never by time or by a lost session.
 
-    Args:
-        floor: no duty below this is accepted (0 = no floor); the fans start there.
+    No duty below ``floor`` is accepted (0 = no floor); the fans start there.
 
     Attributes:
         duty: (left, right), 0 to 1.
         health: (left, right) share of the thrust that comes out, 1 = sound.
     """
 
-    __slots__ = ("_floor", "_seq", "duty", "health")
-
     def __init__(self, floor: float) -> None:
-        self._floor = floor
-        self._seq = -1
+        self._floor, self._seq = floor, -1
         self.duty = (floor, floor)
         self.health = (1.0, 1.0)
 
@@ -163,106 +144,29 @@ class FanRules:
         return 0.5 * (self.duty[0] * self.health[0] + self.duty[1] * self.health[1])
 
 
-class CommandDelay:
-    """The way of commands to the wheels: what arrives takes effect a whole number of frames later.
-
-    A command that arrives while frame n is the newest takes effect in the frame that follows n + delay. Its age counts
-    from its arrival, so the time-to-live covers the delay, too. Whether a command is newer than the one before is
-    decided when it arrives. Drives, permits and duties do not overtake their own kind; the kinds are independent.
-    """
-
-    __slots__ = ("_drives", "_duties", "_fans", "_frames", "_newest_drive", "_newest_duty", "_newest_permit",
-                 "_permits", "_rules")  # fmt: skip
-
-    def __init__(self, rules: MotionRules, fans: FanRules, frames: int) -> None:
-        self._rules, self._fans, self._frames = rules, fans, frames
-        # (frame in which it is due, what the rules or the fans take)
-        self._drives: deque[tuple[int, int, float, float, float]] = deque()
-        self._permits: deque[tuple[int, int, tuple[bool, bool, bool], float]] = deque()
-        self._duties: deque[tuple[int, int, float, float]] = deque()
-        self._newest_drive = self._newest_permit = self._newest_duty = -1
-
-    def drive(self, frame: int, seq: int, right_rad_s: float, left_rad_s: float, now_s: float) -> bool:
-        """Take a drive; false for an old or equal ``seq`` and for numbers not finite."""
-        if not self._frames:
-            return self._rules.drive(seq, right_rad_s, left_rad_s, now_s)
-        if seq <= self._newest_drive or not (isfinite(right_rad_s) and isfinite(left_rad_s)):
-            return False
-        self._newest_drive = seq
-        self._drives.append((frame + self._frames, seq, right_rad_s, left_rad_s, now_s))
-        return True
-
-    def permit(self, frame: int, seq: int, allowed: tuple[bool, bool, bool], now_s: float) -> bool:
-        """Take a permit (forward, reverse, turn); false for an old or equal ``seq``."""
-        if not self._frames:
-            return self._rules.permit(seq, *allowed, now_s)
-        if seq <= self._newest_permit:
-            return False
-        self._newest_permit = seq
-        self._permits.append((frame + self._frames, seq, allowed, now_s))
-        return True
-
-    def fans(self, frame: int, seq: int, left: float, right: float) -> bool:
-        """Take fan duties; false for an old or equal ``seq`` and for numbers not finite."""
-        if not self._frames:
-            return self._fans.command(seq, left, right)
-        if seq <= self._newest_duty or not (isfinite(left) and isfinite(right)):
-            return False
-        self._newest_duty = seq
-        self._duties.append((frame + self._frames, seq, left, right))
-        return True
-
-    def release(self, frame: int) -> None:
-        """Hand on what is due when the step after ``frame`` begins."""
-        drives, permits, duties = self._drives, self._permits, self._duties
-        while drives and drives[0][0] <= frame:
-            _, seq, right_rad_s, left_rad_s, now_s = drives.popleft()
-            self._rules.drive(seq, right_rad_s, left_rad_s, now_s)
-        while permits and permits[0][0] <= frame:
-            _, seq, (forward, reverse, turn), now_s = permits.popleft()
-            self._rules.permit(seq, forward, reverse, turn, now_s)
-        while duties and duties[0][0] <= frame:
-            _, seq, left, right = duties.popleft()
-            self._fans.command(seq, left, right)
-
-    def join_controller(self) -> None:
-        """A new session: drives of the one before are forgotten; its fan duties, already accepted, come into force."""
-        self.lose_controller()
-        for _, seq, left, right in self._duties:
-            self._fans.command(seq, left, right)
-        self._duties.clear()
-        self._newest_duty = -1
-
-    def join_monitor(self) -> None:
-        """A new session: permits of the one before are forgotten."""
-        self.lose_monitor()
-
-    def lose_controller(self) -> None:
-        """Drives on their way are forgotten; fan duties are not."""
-        self._drives.clear()
-        self._newest_drive = -1
-
-    def lose_monitor(self) -> None:
-        """Permits on their way are forgotten."""
-        self._permits.clear()
-        self._newest_permit = -1
-
-
 class SimulatedRobot(ABC):
-    """The robot's side of the link that every simulated robot has: roles, commands, and the newest frame.
+    """Roles, commands and the newest frame of a simulated robot.
+
+    A command that arrives while frame n is the newest takes effect in the frame that follows n + the delay of the
+    commands, in whole frames. Its age counts from its arrival, so the time-to-live covers the delay, too. Whether it is
+    newer than the one before is decided when it arrives.
 
     Attributes:
         seq, t_s: newest frame and its time on the robot's clock.
         reboots: power-ups since the start.
+        truth_requests: replies to requests for the true state, by the request.
     """
+
+    truth_rows = 100  # a batch of the log of the true state
 
     def __init__(
         self, limits: tuple[float, float, float], frame_s: float, frame_hz: float, commands_delay_frames: int = 0
     ) -> None:
         self._limits = limits
-        self.frame_s, self._frame_hz = frame_s, frame_hz
+        self.frame_s, self.frame_hz = frame_s, frame_hz
         self.commands_delay_frames = commands_delay_frames
         self.seq, self.t_s, self.reboots = 0, 0.0, 0
+        self.truth_requests: dict[str, Callable[[], dict[str, object]]] = {}
         self._boot(0.0)
 
     def _boot(self, boot_s: float) -> None:
@@ -270,7 +174,12 @@ class SimulatedRobot(ABC):
         ttl_s, max_wheel_rad_s, fan_floor = self._limits
         self.rules = MotionRules(ttl_s, max_wheel_rad_s, boot_s)
         self.fans = FanRules(fan_floor)
-        self._commands = CommandDelay(self.rules, self.fans, self.commands_delay_frames)
+        self._waiting: deque[tuple[int, str, int, Any]] = deque()  # frame in which it is due, kind, seq, values
+        self._newest = {"drive": -1, "permit": -1, "fans": -1}
+
+    def hello(self, *, boot: int, nonce: str, auth: Literal["none", "hmac-sha256"], lockstep: bool) -> Hello:
+        """The first message on a connection."""
+        return Hello(PROTOCOL, boot, nonce, auth, lockstep, self.frame_hz, self._limits[0], self.describe())
 
     @abstractmethod
     def describe(self) -> RobotData:
@@ -289,45 +198,61 @@ class SimulatedRobot(ABC):
     @property
     @abstractmethod
     def delivered_line(self) -> bytes:
-        """That frame as a line with its LF; empty while none has reached the clients."""
+        """That frame as a line with its LF; empty while none has reached the clients.
+
+        With faults it is whatever leaves the robot at this instant: nothing, a line that none may take, several lines.
+        """
 
     @abstractmethod
     def advance(self) -> None:
         """Drive one frame and read the sensors."""
 
-    def hello(self, *, boot: int, nonce: str, auth: str, lockstep: bool) -> Hello:
-        """The first message on a connection."""
-        return Hello(
-            protocol=PROTOCOL,
-            boot=boot,
-            nonce=nonce,
-            auth="hmac-sha256" if auth == "hmac-sha256" else "none",
-            lockstep=lockstep,
-            frame_hz=self._frame_hz,
-            ttl_s=self._limits[0],
-            robot=self.describe(),
-        )
+    @abstractmethod
+    def truth_row(self) -> tuple[Any, ...]:
+        """The true state at the newest frame, as in the rows of ``truth_message``."""
+
+    @abstractmethod
+    def truth_message(self, rows: list[Any]) -> tuple[str, Message]:
+        """Rows of the true state as a topic and its message."""
+
+    @abstractmethod
+    def truth_preface(self) -> tuple[str, Message]:
+        """What a recorder needs before the first rows, likewise."""
+
+    @property
+    def is_fallen(self) -> bool:
+        """Whether the robot fell; its row is published at once."""
+        return False
 
     def join_controller(self) -> None:
-        """A new session holds the controller's role."""
-        self._commands.join_controller()
+        """A new session has the controller's role; fan duties of the one before, already accepted, come into force."""
+        for _, kind, seq, values in self._waiting:
+            if kind == "fans":
+                self.fans.command(seq, *values)
+        self._forget("fans", "drive")
         self.rules.join_controller()
         self.fans.join_controller()
 
     def join_monitor(self) -> None:
-        """A new session holds the monitor's role; from now on its permit is needed."""
-        self._commands.join_monitor()
+        """A new session has the monitor's role; from now on its permit is needed."""
+        self._forget("permit")
         self.rules.join_monitor()
 
     def lose_controller(self) -> None:
-        """The controller's session has ended: hold."""
-        self._commands.lose_controller()
+        """The controller's session has ended: hold. Its fan duties stay."""
+        self._forget("drive")
         self.rules.lose_controller()
 
     def lose_monitor(self) -> None:
         """The monitor's session has ended: hold."""
-        self._commands.lose_monitor()
+        self._forget("permit")
         self.rules.lose_monitor()
+
+    def _forget(self, *kinds: str) -> None:
+        for kind in kinds:
+            self._newest[kind] = -1
+        if self._waiting:
+            self._waiting = deque(command for command in self._waiting if command[1] not in kinds)
 
     def drive(
         self,
@@ -343,13 +268,75 @@ class SimulatedRobot(ABC):
         ``steer_rad`` has no effect.
         """
         del steer_rad
-        return self._commands.drive(self.seq, seq, right_rad_s, left_rad_s, self.t_s if now_s is None else now_s)
+        return self._take("drive", seq, right_rad_s, left_rad_s, self.t_s if now_s is None else now_s)
 
     def permit(self, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None) -> bool:
         """Take a permit; false for an old or equal ``seq``. ``now_s`` as for ``drive``."""
-        allowed = forward, reverse, turn
-        return self._commands.permit(self.seq, seq, allowed, self.t_s if now_s is None else now_s)
+        return self._take("permit", seq, forward, reverse, turn, self.t_s if now_s is None else now_s)
 
     def command_fans(self, seq: int, left: float, right: float) -> bool:
         """Take fan duties; false for an old or equal ``seq`` and for numbers that are not finite."""
-        return self._commands.fans(self.seq, seq, left, right)
+        return self._take("fans", seq, left, right)
+
+    def _take(self, kind: str, seq: int, *values: Any) -> bool:
+        if not self.commands_delay_frames:
+            return self._apply(kind, seq, values)
+        if seq <= self._newest[kind] or not all(map(isfinite, values)):
+            return False
+        self._newest[kind] = seq
+        self._waiting.append((self.seq + self.commands_delay_frames, kind, seq, values))
+        return True
+
+    def _apply(self, kind: str, seq: int, values: Any) -> bool:
+        if kind == "drive":
+            return self.rules.drive(seq, *values)
+        if kind == "permit":
+            return self.rules.permit(seq, *values)
+        return self.fans.command(seq, *values)
+
+    def _release_commands(self) -> None:
+        """Apply what is due when the step after the newest frame begins."""
+        while self._waiting and self._waiting[0][0] <= self.seq:
+            _, kind, seq, values = self._waiting.popleft()
+            self._apply(kind, seq, values)
+
+
+class TruthLog:
+    """Collects a row of the true state per frame.
+
+    Requests are answered as JSON: those of the robot, and ``b"flush"``: ``{"rows": n}``, the number of rows taken so
+    far (the caller takes the pending ones first); anything else: ``{"error"}``.
+    """
+
+    def __init__(self, robot: SimulatedRobot) -> None:
+        self.robot = robot
+        self._rows: list[Any] = []
+        self._taken = 0
+        self._is_fallen = False
+        self.add()
+
+    def add(self) -> bool:
+        """Add the row of the newest frame; true when the batch should be taken: it is full, or the robot fell."""
+        robot = self.robot
+        self._rows.append(robot.truth_row())
+        has_fallen = robot.is_fallen is not self._is_fallen
+        self._is_fallen = robot.is_fallen
+        return has_fallen or len(self._rows) >= robot.truth_rows
+
+    def batch(self) -> tuple[str, Message] | None:
+        """The pending rows as a topic and its message, or ``None`` without any."""
+        rows, self._rows = self._rows, []
+        self._taken += len(rows)
+        return self.robot.truth_message(rows) if rows else None
+
+    def answer(self, request: bytes) -> bytes:
+        """The reply to a request."""
+        known = self.robot.truth_requests
+        name = request.decode("ascii", "replace")
+        if name == "flush":
+            reply: dict[str, object] = {"rows": self._taken}
+        elif name in known:
+            reply = known[name]()
+        else:
+            reply = {"error": f"unknown request; known {'are' if known else 'is'} {', '.join((*known, 'flush'))}"}
+        return msgspec.json.encode(reply)

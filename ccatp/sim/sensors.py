@@ -3,51 +3,57 @@
 Samples are plain tuples in the order of the robot link, rounded as a real sensor bus would. Every sensor draws from its
 own stream, so that its noise depends on the seed alone, not on the rates of the others.
 
-Encoders give either rates with white noise, or angles that are counted. An encoder that counts floors the wheel's angle
-to whole counts at each sample and reports the change since the sample before as a rate,
-``rate = counts (2 pi / counts_per_rev) hz``. The sum of rates times the sample period is the counted angle exactly, so
-nothing is rounded here. The place of the first count is drawn for each wheel.
+The panels' true edges are shifted along their normals, rigidly, as the panels were mounted. The shift acts on the edge
+sensors alone. The rim over which the robot falls stays the ideal one.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain, pairwise, repeat
-from math import exp, hypot, pi
+from math import exp, hypot, inf, pi
 from typing import TypeVar
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from ccatp.config.models import PanelsConfig, SimRobotConfig, WorldConfig
-from ccatp.core import DeckPose, EdgeSample, GravitySample, ImuSample, Vector3, WheelSample
+from ccatp.config.models import Config, PanelsConfig, WorldConfig
+from ccatp.core import DeckPose, EdgeSample, GravitySample, ImuSample, PanelId, Vector3, WheelSample
 from ccatp.links.robot_codec import encode_sensors
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.mirror.mirror import Mirror
-from ccatp.sim.disturbances import BLOCK, WHOLE, DriftingBias, NoiseStream
-from ccatp.sim.edge_sensors import EdgeSensors, EdgeTuple, PanelEdges
-from ccatp.sim.plant import Plant
+from ccatp.sim.plant import BLOCK, WHOLE, DriftingBias, Plant, noise_stream
 
 _SAME_RATIO = 1e-9  # rates this near to a whole ratio are meant to be one
 _BLOCK_FRAMES = 512  # instants are computed ahead for so many frames
+_PER_UNIT = 1e7  # resolution of rates in rad/s: far below every noise, short on the wire
 
 Instants = tuple[list[float], list[float], list[float]]
-_BOOT: Instants = ([0.0], [1.0], [1.0])
-_NONE: Instants = ([], [], [])
+WheelTuple = tuple[float, float, float]
+ImuTuple = tuple[float, float, float]
+GravityTuple = tuple[float, float, float, float]
+MIN_GAP_M = 2e-4
+
+# A sensor is sampled along the chord of its way within a frame; the arc departs from it by microns. A chord whose ends
+# lie on one panel lies on it, and one whose ends lie beyond one side of it lies beyond, but for rounding.
+_ROUNDING_M = 1e-9
+# Way of a sensor in the deck plane over that of the body; the curvature turns the body's axes by less than this.
+_CURVED = 1.01
+
+Rectangle = tuple[float, float, float, float]
+"""Low x, high x, low y, high y, m, deck plane."""
+EdgeTuple = tuple[float, int, int, int, int]
+_Body = tuple[float, float, float, float, float, float]
+_Line = tuple[int, float, float, float, float]
+_Row = TypeVar("_Row", ImuSample, WheelSample, EdgeSample)
 
 
 class SampleTimes:
     """Instants ``n / hz`` that fall into the frames ``((k-1)/frame_hz, k/frame_hz]``.
 
-    Args:
-        lag_s: time constant of the wheel servo, for ``decays``.
-
     Attributes:
         times_s: the instants of the frame entered last.
         fractions: the same, as fractions of the frame, in (0, 1].
-        decays: ``exp(-tau/lag)`` at the same instants, tau counted from the start of the frame.
+        decays: ``exp(-tau/lag_s)`` of the wheel servo at the same instants, tau counted from the start of the frame.
     """
-
-    __slots__ = ("_ahead", "_ahead_from", "_count", "_frame_hz", "_hz", "_lag_s", "decays", "fractions", "times_s")
 
     def __init__(self, hz: float, frame_hz: float, lag_s: float) -> None:
         self._hz, self._frame_hz, self._lag_s = hz, frame_hz, lag_s
@@ -63,33 +69,22 @@ class SampleTimes:
         """Go on to a frame; frame 0 is the single instant of boot."""
         at = frame - self._ahead_from
         if not 0 <= at < len(self._ahead):
-            self._look_ahead(frame)
-            at = 0
+            self._ahead, self._ahead_from, at = self._look_ahead(frame), frame, 0
         self.times_s, self.fractions, self.decays = self._ahead[at]
 
-    def _look_ahead(self, frame: int) -> None:
-        self._ahead_from = frame
+    def _look_ahead(self, frame: int) -> list[Instants]:
         if frame == 0:
-            self._ahead = [_BOOT]
-            return
+            return [([0.0], [1.0], [1.0])]
         frames = np.arange(frame - 1, frame + _BLOCK_FRAMES)
         lasts = np.floor(frames * (self._hz / self._frame_hz) + _SAME_RATIO).astype(np.int64)
         times_s = np.arange(lasts[0] + 1, lasts[-1] + 1) / self._hz
-        self._ahead = self._even(times_s) if self._count else self._uneven(times_s, lasts - lasts[0], frame)
-
-    def _even(self, times_s: NDArray[np.float64]) -> list[Instants]:
-        """The same number of instants in every frame, always at the same fractions of it."""
-        fractions = [(j + 1) / self._count for j in range(self._count)]
-        decays = self._decays(fractions)
-        return [(row, fractions, decays) for row in times_s.reshape(-1, self._count).tolist()]
-
-    def _uneven(self, times_s: NDArray[np.float64], starts: NDArray[np.int64], frame: int) -> list[Instants]:
+        if self._count:  # the same number of instants in every frame, always at the same fractions of it
+            fractions = [(j + 1) / self._count for j in range(self._count)]
+            decays = self._decays(fractions)
+            return [(row, fractions, decays) for row in times_s.reshape(-1, self._count).tolist()]
         found: list[Instants] = []
-        times = times_s.tolist()
-        for before, (start, end) in enumerate(pairwise(starts.tolist()), frame - 1):
-            if start == end:
-                found.append(_NONE)
-                continue
+        times, starts = times_s.tolist(), (lasts - lasts[0]).tolist()
+        for before, (start, end) in enumerate(pairwise(starts), frame - 1):
             row = times[start:end]
             fractions = [t * self._frame_hz - before for t in row]
             found.append((row, fractions, self._decays(fractions)))
@@ -99,16 +94,8 @@ class SampleTimes:
         return [exp(-f / (self._frame_hz * self._lag_s)) for f in fractions]
 
 
-WheelTuple = tuple[float, float, float]
-
-_PER_UNIT = 1e7  # resolution of rates in rad/s: far below every noise, short on the wire
-_BLOCK = 4096  # more than two wheels read in a frame
-
-
 class RateEncoders:
     """Wheel rates with white noise, right and left independent."""
-
-    __slots__ = ("_next", "_noise", "_rng", "_sigma", "_still")
 
     def __init__(self, sigma_rad_s: float, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -133,26 +120,24 @@ class RateEncoders:
         right, right_lag, left, left_lag = right * unit, right_lag * unit, left * unit, left_lag * unit
         found: list[WheelTuple] = []
         for t, e, a, b in zip(times_s, times.decays, right_noise, left_noise):  # noqa: B905 - of one length; bare it compiles to a plain loop
-            found.append(
-                (
-                    t,
-                    (right + right_lag * e + a + whole - whole) / unit,
-                    (left + left_lag * e + b + whole - whole) / unit,
-                )
-            )
+            right_rad_s = (right + right_lag * e + a + whole - whole) / unit
+            left_rad_s = (left + left_lag * e + b + whole - whole) / unit
+            found.append((t, right_rad_s, left_rad_s))
         return found
 
     def _draw(self) -> None:
-        fresh = self._sigma * self._rng.standard_normal(_BLOCK)
+        fresh = self._sigma * self._rng.standard_normal(BLOCK)  # more than two wheels read in a frame
         self._noise = self._noise[self._next :] + fresh.tolist()
         self._still = self._still[self._next :] + (np.floor(fresh + 0.5) / _PER_UNIT).tolist()
         self._next = 0
 
 
 class CountingEncoders:
-    """Rates that are differences of counted angles."""
+    """Rates that are differences of counted angles, ``rate = counts (2 pi / counts_per_rev) hz``.
 
-    __slots__ = ("_counts", "_frame_s", "_left_phase", "_per_rad", "_right_phase", "_unit")
+    The wheel's angle is floored to whole counts at each sample. The sum of rates times the sample period is the counted
+    angle exactly, so nothing is rounded here. The place of the first count is drawn for each wheel.
+    """
 
     def __init__(self, world: WorldConfig, hz: float, frame_s: float, rng: np.random.Generator) -> None:
         self._per_rad = world.encoder_counts_per_rev / (2.0 * pi)
@@ -185,28 +170,16 @@ class CountingEncoders:
         return found
 
 
-ImuTuple = tuple[float, float, float]
-
-
 class InertialUnit:
     """Reads ``ax + bias(t) + noise`` and ``wz (1 + scale) + bias(t) + noise``.
 
-    What is added does not depend on the motion, so it is made ahead in blocks.
+    What is added does not depend on the motion, so it is made ahead in blocks. Scale and biases are three draws,
+    whatever is switched off; ``bias_rng`` is the parent of their generators.
     """
-
-    __slots__ = ("_ax_bias", "_next_errors", "_noise", "_scale", "_sigmas", "_wz_bias")
 
     def __init__(
         self, world: WorldConfig, hz: float, noise_rng: np.random.Generator, bias_rng: np.random.Generator
     ) -> None:
-        """Draw scale and biases: three draws, whatever is switched off.
-
-        Args:
-            world: their standard deviations and walks, and the white noise.
-            hz: rate of the samples.
-            noise_rng: generator of the white noise.
-            bias_rng: parent of the generators of scale and biases.
-        """
         constants, ax_walk, wz_walk = bias_rng.spawn(3)
         scale, wz_bias, ax_bias = constants.standard_normal(3).tolist()
         self._scale = 1.0 + world.gyroscope_scale_sigma * scale
@@ -222,7 +195,7 @@ class InertialUnit:
         self._next_errors: Callable[[], list[float]] = chain.from_iterable(blocks).__next__
 
     def read(self, plant: Plant, times: SampleTimes) -> list[ImuTuple]:
-        """(t, ax, wz) of the frame."""
+        """(t, ax, wz) of the frame: acceleration of the forward speed and angular rate about the normal."""
         unit, whole = _PER_UNIT, WHOLE
         found: list[ImuTuple] = []
         for t, e in zip(times.times_s, times.decays):  # noqa: B905 - of one length; bare it compiles to a plain loop
@@ -241,85 +214,189 @@ class InertialUnit:
         return rows
 
 
-GravityTuple = tuple[float, float, float, float]
+def nominal_rectangles(mirror: Mirror) -> dict[PanelId, Rectangle]:
+    """The material of each panel as designed."""
+    return {
+        pid: (p.x_m - p.half_x_m, p.x_m + p.half_x_m, p.y_m - p.half_y_m, p.y_m + p.half_y_m)
+        for pid, p in mirror.panels.items()
+    }
 
 
-class SensorSuite:
-    """All sensors of the robot.
+def draw_rectangles(
+    mirror: Mirror, panels: PanelsConfig, sigma_m: float, rng: np.random.Generator
+) -> dict[PanelId, Rectangle]:
+    """The material of each panel as mounted: four draws per panel, in the order of ``mirror.panels``.
 
-    Call ``enter`` once per frame, after the plant's step, then read each sensor once.
+    An edge never shifts outwards by more than half the gap less half of ``MIN_GAP_M``: neighbours keep that much
+    between them, and every panel stays in its own cell, so that a cell and a rectangle tell what lies at a point.
+    """
+    x_out = max(0.0, 5e-4 * (panels.pitch_x_mm - panels.size_x_mm) - 0.5 * MIN_GAP_M)
+    y_out = max(0.0, 5e-4 * (panels.pitch_y_mm - panels.size_y_mm) - 0.5 * MIN_GAP_M)
+    found = {}
+    for pid, (x0, x1, y0, y1) in nominal_rectangles(mirror).items():
+        west, east, south, north = (sigma_m * rng.standard_normal(4)).tolist()
+        found[pid] = x0 - min(west, x_out), x1 + min(east, x_out), y0 - min(south, y_out), y1 + min(north, y_out)
+    return found
+
+
+class EdgeSensors:
+    """Whether there is panel material under each edge sensor; ``place`` before the first ``read``.
+
+    While every sensor is known to be further from the edges of its panel than the body has moved since, nothing is
+    looked up. ``offsets_m``: places of the sensors, robot frame, shape (4, 2). ``shifted``: the material of the panels,
+    if not as the mirror says.
     """
 
     def __init__(
         self,
         mirror: Mirror,
-        cfg: SimRobotConfig,
-        world: WorldConfig,
-        edge_sensors_m: Sequence[tuple[float, float]],
-        rng: np.random.Generator,
-        *,
-        panels: PanelsConfig,
-        lag_s: float,
+        offsets_m: Sequence[tuple[float, float]],
+        shifted: Mapping[PanelId, Rectangle] | None = None,
     ) -> None:
-        """Set up the streams.
+        self._mirror, self._shifted = mirror, shifted
+        m = _ROUNDING_M
+        material = nominal_rectangles(mirror) if shifted is None else shifted
+        self._inner = {pid: (x0 + m, x1 - m, y0 + m, y1 - m) for pid, (x0, x1, y0, y1) in material.items()}
+        # The inner rectangle on which each sensor was seen last.
+        self._under: list[Rectangle] = [(inf, -inf, inf, -inf)] * len(offsets_m)
+        self._offsets = [(float(x), float(y)) for x, y in offsets_m]
+        self._reach_m = _CURVED * max(hypot(x, y) for x, y in self._offsets)
+        self._values = (1, 1, 1, 1)
+        self._slack_m = 0.0
+        self._body: _Body = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
-        Args:
-            mirror: the panels and the direction of gravity.
-            cfg: rates and gravity noise.
-            world: errors of inertial unit, encoders and panel edges.
-            edge_sensors_m: places of the edge sensors, robot frame, shape (4, 2).
-            rng: parent of the sensors' generators.
-            panels: pitches of the panels.
-            lag_s: true time constant of the wheel servos.
+    @property
+    def places(self) -> list[tuple[float, float]]:
+        """Deck (x, y) of the sensors at the end of the last frame, m."""
+        x, y, hx, hy, lx, ly = self._body
+        return [(x + a * hx + b * lx, y + a * hy + b * ly) for a, b in self._offsets]
+
+    def place(self, plant: Plant) -> None:
+        """Put the sensors where the plant is."""
+        self._body = plant.x_m, plant.y_m, plant.hx, plant.hy, plant.lx, plant.ly
+        self._slack_m = 0.0
+        a, b, c, d = (int(self.is_on(x, y)) for x, y in self.places)
+        self._values = a, b, c, d
+
+    def is_on(self, x: float, y: float) -> bool:
+        """Whether there is material at a point of the deck plane."""
+        if self._shifted is None:
+            return self._mirror.is_on_panel(x, y)
+        panel = self._mirror.panel_at(x, y)
+        if panel is None:
+            return False
+        x0, x1, y0, y1 = self._shifted[panel]
+        return x0 <= x <= x1 and y0 <= y <= y1
+
+    def read(self, plant: Plant, times_s: Sequence[float], fractions: Sequence[float]) -> list[EdgeTuple]:
+        """Readings at the times of a frame, after the plant's step.
+
+        ``fractions``: the times as fractions of the frame, ascending to at most 1.
         """
+        if plant.is_moving:
+            before = self._body
+            self._body = plant.x_m, plant.y_m, plant.hx, plant.hy, plant.lx, plant.ly
+            way_m = _CURVED * (abs(plant.forward_m) + abs(plant.left_m)) + self._reach_m * abs(plant.turn_rad)
+            self._slack_m -= way_m
+            if self._slack_m <= 0.0:
+                changing = self._look(before)
+                if changing:
+                    return self._sample(changing, times_s, fractions)
+        a, b, c, d = self._values
+        return [(t, a, b, c, d) for t in times_s]
+
+    def _look(self, before: _Body) -> list[_Line]:
+        """Values and slack of a frame in which an edge may be near; the chords of sensors whose value may change."""
+        x0, y0, hx0, hy0, lx0, ly0 = before
+        x1, y1, hx1, hy1, lx1, ly1 = self._body
+        values, changing, slack_m = list(self._values), [], inf
+        for k, (a, b) in enumerate(self._offsets):
+            u, v = x0 + a * hx0 + b * lx0, y0 + a * hy0 + b * ly0
+            x, y = x1 + a * hx1 + b * lx1, y1 + a * hy1 + b * ly1
+            west, east, south, north = self._under[k]
+            if west <= u <= east and south <= v <= north and west <= x <= east and south <= y <= north:
+                values[k] = 1
+                slack_m = min(slack_m, x - west, east - x, y - south, north - y)
+                continue
+            slack_m = 0.0
+            if self._is_beside(k, u, v, x, y):
+                values[k] = 0
+            else:
+                changing.append((k, u, v, x, y))
+        self._values, self._slack_m = (values[0], values[1], values[2], values[3]), slack_m
+        return changing
+
+    def _is_beside(self, k: int, u: float, v: float, x: float, y: float) -> bool:
+        """Whether a sensor stays in the gap beside one side of a panel throughout its chord from (u, v) to (x, y)."""
+        panel = self._mirror.panel_at(x, y)
+        if panel is None:
+            return False
+        self._under[k] = west, east, south, north = self._inner[panel]
+        if self._mirror.panel_at(u, v) != panel:
+            return False
+        m = 2.0 * _ROUNDING_M  # from the inner rectangle to beyond the outer one
+        return max(x, u) < west - m or min(x, u) > east + m or max(y, v) < south - m or min(y, v) > north + m
+
+    def _sample(
+        self, changing: Sequence[_Line], times_s: Sequence[float], fractions: Sequence[float]
+    ) -> list[EdgeTuple]:
+        values = list(self._values)
+        found: list[EdgeTuple] = []
+        for t, f in zip(times_s, fractions, strict=True):
+            for k, x0, y0, x1, y1 in changing:
+                values[k] = int(self.is_on(x0 + f * (x1 - x0), y0 + f * (y1 - y0)))
+            found.append((t, values[0], values[1], values[2], values[3]))
+        for k, _, _, x1, y1 in changing:
+            values[k] = int(self.is_on(x1, y1))
+        self._values = values[0], values[1], values[2], values[3]
+        return found
+
+
+class SensorSuite:
+    """All sensors of the robot; ``rng`` is the parent of their generators, ``lag_s`` that of the true wheel servos."""
+
+    def __init__(self, cfg: Config, mirror: Mirror, rng: np.random.Generator, *, lag_s: float) -> None:
+        sim, world = cfg.sim.robot, cfg.world
         imu, encoders, gravity = rng.spawn(3)
         biases, counts, panel_edges = rng.spawn(3)
         self._mirror = mirror
-        self._gravity_noise = NoiseStream(gravity).one
+        self._gravity_noise = noise_stream(gravity)
         self._gravity_on_deck = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))  # the telescope points to the zenith
         self._gravity_pose: DeckPose | None = None
         self._gravity = (0.0, 0.0, 0.0)
-        self._gravity_sigma = cfg.gravity_sigma_rad
-        frame_hz = cfg.frame_hz
-        kept = {
-            hz: SampleTimes(hz, frame_hz, lag_s) for hz in (cfg.imu_hz, cfg.encoder_hz, cfg.edge_hz, cfg.gravity_hz)
-        }
-        self._times = tuple(kept.values())  # sensors of the same rate are read at the same instants
-        self._imu_times, self._encoder_times = kept[cfg.imu_hz], kept[cfg.encoder_hz]
-        self._edge_times, self._gravity_times = kept[cfg.edge_hz], kept[cfg.gravity_hz]
-        self._imu = InertialUnit(world, cfg.imu_hz, imu, biases)
+        self._gravity_sigma = sim.gravity_sigma_rad
+        rates_hz = sim.imu_hz, sim.encoder_hz, sim.edge_hz, sim.gravity_hz
+        times = {hz: SampleTimes(hz, sim.frame_hz, lag_s) for hz in rates_hz}
+        self._times = tuple(times.values())  # sensors of the same rate are read at the same instants
+        self._imu_times, self._encoder_times, self._edge_times, self._gravity_times = (times[hz] for hz in rates_hz)
+        self._imu = InertialUnit(world, sim.imu_hz, imu, biases)
         self._encoders: CountingEncoders | RateEncoders
         if world.encoder_counts_per_rev:
-            self._encoders = CountingEncoders(world, cfg.encoder_hz, 1.0 / frame_hz, counts)
+            self._encoders = CountingEncoders(world, sim.encoder_hz, 1.0 / sim.frame_hz, counts)
         else:
             self._encoders = RateEncoders(world.encoder_sigma_rad_s, encoders)
         shifted = None
         if world.panel_edge_sigma_m:
-            shifted = PanelEdges(mirror, panels, world.panel_edge_sigma_m, panel_edges)
-        self.edges = EdgeSensors(mirror, edge_sensors_m, shifted)
+            shifted = draw_rectangles(mirror, cfg.mirror.panels, world.panel_edge_sigma_m, panel_edges)
+        self.edges = EdgeSensors(mirror, cfg.robot.edge_sensors_m, shifted)
 
-    def enter(self, frame: int) -> None:
-        """Go on to the instants of a frame (counted from 1; frame 0 is the instant of boot)."""
+    def read(
+        self, frame: int, plant: Plant
+    ) -> tuple[list[EdgeTuple], list[ImuTuple], list[WheelTuple], GravityTuple | None]:
+        """Edge, inertial and encoder samples of a frame, and the newest reading of gravity within it.
+
+        Frames count from 1; frame 0 is the instant of boot. Once per frame, after the plant's step.
+        """
         for times in self._times:
             times.enter(frame)
+        return (
+            self.edges.read(plant, self._edge_times.times_s, self._edge_times.fractions),
+            self._imu.read(plant, self._imu_times),
+            self._encoders.read(plant, self._encoder_times),
+            self._read_gravity(plant) if self._gravity_times.times_s else None,
+        )
 
-    def read_imu(self, plant: Plant) -> list[ImuTuple]:
-        """(t, ax, wz) of the frame: acceleration of the forward speed and angular rate about the normal."""
-        return self._imu.read(plant, self._imu_times)
-
-    def read_encoders(self, plant: Plant) -> list[WheelTuple]:
-        """(t, right, left) wheel rates of the frame."""
-        return self._encoders.read(plant, self._encoder_times)
-
-    def read_edges(self, plant: Plant) -> list[EdgeTuple]:
-        """(t, front left, front right, rear left, rear right) of the frame."""
-        return self.edges.read(plant, self._edge_times.times_s, self._edge_times.fractions)
-
-    def read_gravity(self, plant: Plant) -> GravityTuple | None:
-        """(t, gx, gy, gz) where the sensor was read within the frame: the newest reading."""
-        times = self._gravity_times.times_s
-        if not times:
-            return None
+    def _read_gravity(self, plant: Plant) -> GravityTuple:
         pose = plant.pose
         if pose != self._gravity_pose:
             self._gravity_pose, self._gravity = pose, self._gravity_at(pose)
@@ -327,20 +404,13 @@ class SensorSuite:
         x, y, z = self._gravity
         x, y, z = x + sigma * noise(), y + sigma * noise(), z + sigma * noise()
         scale = unit / hypot(x, y, z)
-        return (
-            times[-1],
-            (x * scale + whole - whole) / unit,
-            (y * scale + whole - whole) / unit,
-            (z * scale + whole - whole) / unit,
-        )
+        gx, gy, gz = ((component * scale + whole - whole) / unit for component in (x, y, z))
+        return self._gravity_times.times_s[-1], gx, gy, gz
 
     def _gravity_at(self, pose: DeckPose) -> Vector3:
         gx, gy, gz = self._gravity_on_deck
         (hx, hy, hz), (lx, ly, lz), (nx, ny, nz) = self._mirror.robot_axes(pose)
         return hx * gx + hy * gy + hz * gz, lx * gx + ly * gy + lz * gz, nx * gx + ny * gy + nz * gz
-
-
-_Row = TypeVar("_Row", ImuSample, WheelSample, EdgeSample)
 
 
 class RobotFrame(msgspec.Struct, frozen=True, gc=False):
@@ -369,19 +439,9 @@ def as_line(frame: RobotFrame) -> bytes:
 
 def as_message(frame: RobotFrame) -> Sensors:
     """The message that a client decodes from the frame's line."""
-    gravity = frame.gravity
-    return Sensors(
-        frame.seq,
-        frame.t,
-        named(ImuSample, frame.imu),
-        named(WheelSample, frame.enc),
-        named(EdgeSample, frame.edge),
-        None if gravity is None else GravitySample(*gravity),
-        frame.fans,
-        frame.soc,
-        frame.cmd,
-        list(frame.faults),
-    )
+    seq, t_s, imu, encoders, edges, gravity, fans, soc, cmd, faults = msgspec.structs.astuple(frame)
+    read = named(ImuSample, imu), named(WheelSample, encoders), named(EdgeSample, edges)
+    return Sensors(seq, t_s, *read, None if gravity is None else GravitySample(*gravity), fans, soc, cmd, list(faults))
 
 
 def named(kind: type[_Row], rows: Iterable[tuple[object, ...]]) -> list[_Row]:

@@ -9,7 +9,7 @@ Choices the interface leaves open:
   ``bad join``, and so is silence for ``JOIN_TIMEOUT_S``. ``busy`` means too many connections.
 * A message that does not belong to the sender's role is a bad line. Messages of unknown type keep no role alive.
 * The silence after which a role may be taken over is measured on the robot's clock: in lockstep, where a client may
-  hold its answer back for as long as it likes, nobody is silent while simulated time stands still.
+  hold its answer back for as long as it likes, no client is silent while simulated time stands still.
 * Sequence numbers start again with each session.
 * In lockstep a delay of the sensors keeps its length: each answer to the newest frame delivered drives one frame, and
   delivers the next. What a client has is old by the delay, as it is on a wall clock. The frames before the first
@@ -65,11 +65,9 @@ class RobotSession:
     """One client.
 
     Attributes:
-        joined_s, received_s: when it came (wall clock) and when it last sent something valid (the robot's clock).
+        joined_s, received_s: when it connected (wall clock) and when it last sent something valid (the robot's clock).
         is_open: not closed by us.
     """
-
-    __slots__ = ("_bad", "_lines", "_server", "is_open", "joined_s", "nonce", "received_s", "role", "wire")
 
     def __init__(self, server: "RobotServer", wire: Wire, nonce: str, now_s: float) -> None:
         self._server, self.wire, self.nonce = server, wire, nonce
@@ -114,10 +112,8 @@ class RobotSession:
 class RobotServer:
     """The robot behind its link.
 
-    Args:
-        key: of the HMAC, or ``None`` for no authentication.
-        make_nonce: 32 fresh hex digits.
-        on_frame: called after each frame that was driven.
+    Without a ``key`` of the HMAC there is no authentication. ``make_nonce`` returns 32 fresh hex digits, ``note`` takes
+    lines of the log, ``on_frame`` is called after each frame that was driven.
 
     Attributes:
         counts: bad_lines, unknown_types, oversized_lines, refused, stale (drives, permits and fans not newer),
@@ -151,16 +147,11 @@ class RobotServer:
         self._is_stall_noted = False
         self._reboots = robot.reboots
 
-    # -- connections ----------------------------------------------------------------------------------------------
-
     def accept(self, wire: Wire, now_s: float) -> RobotSession:
         """A client connected."""
         session = RobotSession(self, wire, self._make_nonce(), now_s)
-        auth = AUTH_NONE if self._key is None else AUTH_HMAC
-        hello = self.robot.hello(
-            boot=self._boot + self._reboots, nonce=session.nonce, auth=auth, lockstep=self._is_lockstep
-        )
-        wire.write(encode(hello))
+        auth, boot = AUTH_NONE if self._key is None else AUTH_HMAC, self._boot + self._reboots
+        wire.write(encode(self.robot.hello(boot=boot, nonce=session.nonce, auth=auth, lockstep=self._is_lockstep)))
         self._sessions.add(session)
         if len(self._sessions) > MAX_SESSIONS:
             self.refuse(session, "busy")
@@ -206,8 +197,6 @@ class RobotServer:
             missing = "permit" if self._is_drive_acked else "drive"
             self._note(f"stall: frame {self.robot.delivered_seq} waits for its {missing}")
 
-    # -- roles ----------------------------------------------------------------------------------------------------
-
     def join(self, session: RobotSession, message: FromClient, now_s: float) -> None:
         """A session that has no role yet sent its first message."""
         # The round of `check_time` may come later than this message: the limit holds all the same.
@@ -230,19 +219,15 @@ class RobotServer:
         session.wire.write(encode(Joined(role=message.role, session=self._last_session)))
         self._note(f"{message.role} joined: {message.client}")
         self._frame_wall_s, self._is_stall_noted = now_s, False
-        self._begin(session, message.role)
-
-    def _begin(self, session: RobotSession, role: Role) -> None:
-        robot = self.robot
-        if role == "controller":
-            robot.join_controller()
+        if message.role == "controller":
+            self.robot.join_controller()
             if self._is_lockstep:
                 self._run_to_delivery()
                 self._send_frame()
         else:
-            robot.join_monitor()
+            self.robot.join_monitor()
             if self._is_lockstep and "controller" in self._holders:
-                session.wire.write(robot.delivered_line)
+                session.wire.write(self.robot.delivered_line)
 
     def _run_to_delivery(self) -> None:
         """No client can answer what is still on its way, or lost: the frames until one arrives run by themselves."""
@@ -263,8 +248,8 @@ class RobotServer:
         if role == "controller" and isinstance(message, Drive):
             taken = robot.drive(message.seq, message.wr, message.wl, robot_s, message.steer)
             self._is_drive_acked |= taken and message.ack == robot.delivered_seq
-            if taken and (message.wr or message.wl) and robot.delivered_seq - message.ack > self.oldest_ack_frames:
-                self.oldest_ack_frames = robot.delivered_seq - message.ack
+            if taken and (message.wr or message.wl):
+                self.oldest_ack_frames = max(self.oldest_ack_frames, robot.delivered_seq - message.ack)
         elif role == "monitor" and isinstance(message, Permit):
             taken = robot.permit(message.seq, message.forward, message.reverse, message.turn, robot_s)
             self._is_permit_acked |= taken and message.ack == robot.delivered_seq
@@ -280,8 +265,6 @@ class RobotServer:
         if self._is_lockstep and self._is_drive_acked and has_permit:
             self._advance(now_s)
         return True
-
-    # -- frames ---------------------------------------------------------------------------------------------------
 
     @property
     def next_frame_s(self) -> float:

@@ -1,9 +1,8 @@
 """The truth of one run: where the robot really is, how the panels really lie, and whether it fell."""
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from math import hypot, inf
-from typing import Protocol
 
 import numpy as np
 
@@ -12,8 +11,8 @@ from ccatp.core import DeckPose, PanelId, PanelPose, Vector3, wrap_pi
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.rim import NearOutline
-from ccatp.sim.disturbances import Creep, Vibration, WheelSlip, draw_wheels
-from ccatp.sim.plant import Disturbance, Plant
+from ccatp.sim.plant import Creep, Disturbance, Plant, Vibration, WheelSlip, draw_wheels
+from ccatp.sim.sensors import EdgeSensors
 
 # seq, t, x, y, psi, X, Y, Z (surface point, deck), clearance of the worst edge sensor, fallen, sensors beyond the rim
 TruthRow = tuple[int, float, float, float, float, float, float, float, float, int, int]
@@ -24,20 +23,16 @@ FAR_CLEARANCE_M = 1.0
 """Stands for the clearance while the robot's origin is more than ``NEAR_RIM_M`` from the rim."""
 
 
-class Sensing(Protocol):
-    """Has the places of the edge sensors."""
-
-    @property
-    def places(self) -> Sequence[tuple[float, float]]:
-        """Deck (x, y) of each now, m."""
-
-
 class World:
     """Robot on mirror.
+
+    ``rng`` is the parent of the generators; the draws of one kind do not depend on the others. ``pushes`` move the body
+    besides the disturbances of the configuration. The robot stands at ``start``; at base, with an error, by default.
 
     Attributes:
         grip: share of its travel that each wheel gives to the body, right and left, besides its slip; may be set
             before a step.
+        sensors: the edge sensors, for their clearance in the truth rows.
     """
 
     def __init__(
@@ -49,16 +44,6 @@ class World:
         pushes: Iterable[Disturbance] = (),
         start: DeckPose | None = None,
     ) -> None:
-        """Draw the start errors, the misalignments and what disturbs the robot.
-
-        Args:
-            cfg: robot, world and truth sections.
-            mirror: the mirror.
-            rng: parent of the generators; the draws of one kind do not depend on the others.
-            window_frames: length of the window of ``moved_m``, in frames.
-            pushes: what moves the body besides the disturbances of the configuration.
-            start: where the robot stands; at base, with an error, by default.
-        """
         start_rng, truth_rng = rng.spawn(2)
         wheels_rng, slip_rng, creep_rng, vibration_rng = rng.spawn(4)
         self.mirror = mirror
@@ -96,19 +81,15 @@ class World:
         self._overhang, self._rim = mirror.overhang, NearOutline(mirror.rim)
         # The origin's distance to the rim is known to be at least this; it shrinks with the distance driven.
         self._rim_bound_m = -inf
-        self._sensors: Sensing | None = None
+        self.sensors: EdgeSensors | None = None
         self._has_looked = False
         self._clearance_m, self._off_mask = FAR_CLEARANCE_M, 0
 
     def step(self, t_s: float, dt_s: float, right_rad_s: float, left_rad_s: float, thrust: float) -> None:
-        """Advance by one frame.
+        """Advance by one frame from ``t_s``, with the mean thrust of the fans, 0 to 1.
 
         The robot falls when its centre of mass (its origin) passes the rim, or on an overhanging mirror when the mean
         thrust was below the floor for ``fall_thrust_s``.
-
-        Args:
-            t_s: time at the start of the frame.
-            thrust: mean thrust of the fans during the frame, 0 to 1.
         """
         plant = self.plant
         if self.is_fallen:
@@ -116,8 +97,11 @@ class World:
             return
         if self._full_scales is not None:
             (plant.right_scale, plant.left_scale), self._full_scales = self._full_scales, None
-        if self._slip is not None:
-            self._let_slip(self._slip, t_s, dt_s, right_rad_s != 0.0 or left_rad_s != 0.0)
+        is_ordered = right_rad_s != 0.0 or left_rad_s != 0.0
+        if self._slip is not None and (is_ordered or plant.right_rad_s or plant.left_rad_s):
+            self._slip.step(t_s, dt_s, is_ordered)
+            plant.right_scale = self.wheels.right_scale * (1.0 - self._slip.right)
+            plant.left_scale = self.wheels.left_scale * (1.0 - self._slip.left)
         if self.grip != FULL_GRIP:
             right_grip, left_grip = self.grip
             self._full_scales = right_scale, left_scale = plant.right_scale, plant.left_scale
@@ -139,13 +123,6 @@ class World:
                 if self._rim_bound_m < 0.0:
                     self._fall()
 
-    def _let_slip(self, slip: WheelSlip, t_s: float, dt_s: float, is_ordered: bool) -> None:
-        plant = self.plant
-        if is_ordered or plant.right_rad_s or plant.left_rad_s:
-            slip.step(t_s, dt_s, is_ordered)
-            plant.right_scale = self.wheels.right_scale * (1.0 - slip.right)
-            plant.left_scale = self.wheels.left_scale * (1.0 - slip.left)
-
     def displace(self, dx_m: float, dy_m: float, dheading_rad: float) -> None:
         """Put the robot elsewhere: deck frame, relative to where it is. Beyond the rim it falls."""
         plant = self.plant
@@ -159,18 +136,13 @@ class World:
         self.is_fallen = True
         self.plant.stop_dead()
 
-    def watch(self, sensors: Sensing) -> None:
-        """Set the source of the edge sensors' places, for the truth rows."""
-        self._sensors = sensors
-
     def truth_row(self, seq: int, t_s: float) -> TruthRow:
         """The truth at a frame."""
         if not self._has_looked:
             self._look()
         p = self.plant
-        x, y = p.x_m, p.y_m
-        fallen = 1 if self.is_fallen else 0
-        return seq, t_s, x, y, wrap_pi(p.heading_rad), x, y, p.z_m, self._clearance_m, fallen, self._off_mask
+        x, y, heading_rad = p.x_m, p.y_m, wrap_pi(p.heading_rad)
+        return seq, t_s, x, y, heading_rad, x, y, p.z_m, self._clearance_m, int(self.is_fallen), self._off_mask
 
     def _look(self) -> None:
         """Clearance and mask of the sensors: only on request, and only near the rim."""
@@ -178,9 +150,9 @@ class World:
         self._clearance_m, self._off_mask = FAR_CLEARANCE_M, 0
         if self._rim_bound_m < NEAR_RIM_M:
             self._measure_rim()
-        if self._rim_bound_m < NEAR_RIM_M and self._sensors is not None:
+        if self._rim_bound_m < NEAR_RIM_M and self.sensors is not None:
             distance_m = self._rim.signed_distance_m
-            clearances_m = [distance_m(x, y) for x, y in self._sensors.places]
+            clearances_m = [distance_m(x, y) for x, y in self.sensors.places]
             self._clearance_m = min(FAR_CLEARANCE_M, *clearances_m)
             if self._clearance_m < 0.0:
                 self._off_mask = sum((clearance_m < 0.0) << k for k, clearance_m in enumerate(clearances_m))

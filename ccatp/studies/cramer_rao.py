@@ -31,7 +31,7 @@ from ccatp.estimation.fixes import deck_foot
 from ccatp.estimation.seams import EdgeScanner, SensorTransition
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
-from ccatp.sim.disturbances import LEG_PAUSE_S, LEVEL_SLOPE
+from ccatp.sim.plant import LEG_PAUSE_S, LEVEL_SLOPE
 from ccatp.studies.sil_run import SilResult, SilRun
 
 # -- the record: true way, seams, fixes --------------------------------------------------------------------------------

@@ -118,28 +118,23 @@ class Rig:
         )  # fmt: skip
         # There is no steering here, so both wheels slip alike: the angle at the edge counts, not the way there.
         plant.right_scale = plant.left_scale = 1.0 - float(slip_rng.uniform(world.slip_min, world.slip_max))
-        panels = cfg.mirror.panels
-        self._sensors = SensorSuite(
-            mirror, cfg.sim.robot, world, robot.edge_sensors_m, sensors_rng, panels=panels, lag_s=lag_s
-        )
+        self._sensors = SensorSuite(cfg, mirror, sensors_rng, lag_s=cfg.sim.robot.wheel_lag_s)
         self._sensors.edges.place(plant)
         dx, dy, turn = error_rng.standard_normal(3).tolist()
         self._error = errors.position_m * dx, errors.position_m * dy, errors.heading_rad * turn
         self._sigma_m = errors.position_m
         self._frame_s = 1.0 / cfg.sim.robot.frame_hz
         self._seq = 0
-        self._sensors.enter(0)
         self._estimate = self._estimated()
 
     def frame(self, right_rad_s: float, left_rad_s: float) -> tuple[Sensors, EstimateMessage]:
         """Drive one frame on these set points; what is known at its end: the frame, and the estimate before it."""
-        estimate, sensors, plant = self._estimate, self._sensors, self.plant
+        estimate, plant = self._estimate, self.plant
         t_s = self._seq * self._frame_s
         plant.step(t_s, self._frame_s, right_rad_s, left_rad_s)
         self._seq += 1
-        sensors.enter(self._seq)
-        edge = named(EdgeSample, sensors.read_edges(plant))
-        enc = named(WheelSample, sensors.read_encoders(plant))
+        edges, _, encoders, _ = self._sensors.read(self._seq, plant)
+        edge, enc = named(EdgeSample, edges), named(WheelSample, encoders)
         if is_estimate_due(self._seq):
             self._estimate = self._estimated()
         return drive_frame(self._seq, self._seq * self._frame_s, enc, edge), estimate

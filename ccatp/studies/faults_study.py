@@ -10,8 +10,7 @@ import numpy as np
 from ccatp.config.models import Config
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
-from ccatp.sim.fault_models import SENSOR_SIGNALS, Injected
-from ccatp.sim.fault_plan import FaultPlan, parse_plan
+from ccatp.sim.fault_plan import SENSOR_SIGNALS, FaultPlan, Injected, parse_plan
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.mission_study import dangers, times
 from ccatp.studies.results import LIMIT, colour, plot

@@ -34,7 +34,7 @@ from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.records.beacon_summary import BeaconSummary, Reached, beacon_facts
 from ccatp.report.plots import QUIET
 from ccatp.safety.beacons import BeaconSafetyRules
-from ccatp.sim.beacon_robot import BeaconTruthLog, build_beacon_robot, motes_of
+from ccatp.sim.beacon_robot import build_beacon_robot
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.results import LIMIT, colour, plot
 
@@ -71,8 +71,8 @@ class BeaconSilWorld:
         self._cfg = cfg
         self.robot = build_beacon_robot(cfg)
         self.mission, self.danger = BeaconMission(cfg), BeaconSafetyRules(cfg)
-        self.found = BeaconSilResult()
-        self._reader, self._log = MeasurementReader(cfg), BeaconTruthLog(self.robot, motes_of(cfg))
+        self.found = BeaconSilResult(truth=[self.robot.truth_row()])
+        self._reader = MeasurementReader(cfg)
         self._book = BeaconSummary(beacon_facts(cfg, is_sim=True))
         self._estimate: EstimateMessage | None = None
         self._signal = ""
@@ -103,7 +103,7 @@ class BeaconSilWorld:
             self.robot.permit(sensors.seq + 1, verdict.forward, verdict.reverse, verdict.turn)
             self.robot.drive(sensors.seq + 1, right, left, None, steer)
             self.robot.advance()
-            self._log.add()
+            self.found.truth.append(self.robot.truth_row())
 
     def _note(self, sensors: Sensors, verdict: Verdict, drive: SteeringCommand) -> None:
         found, mission = self.found, self.mission
@@ -126,13 +126,11 @@ class BeaconSilWorld:
     def result(self) -> BeaconSilResult:
         """The result at the end."""
         found, mission, book = self.found, self.mission, self._book
-        batch = self._log.batch()
-        found.truth = [] if batch is None else list(batch[1].rows)
         found.outcome, found.cause = str(mission.outcome), mission.cause
         score = mission.navigator.score
         book.add_track(found.track)
         book.add_truth(found.truth)
-        book.set_places(self._log.preface()[1].places)
+        book.set_places(self.robot.truth_preface()[1].places)
         book.set_map(mission.navigator.beacons, (score.nis_sum, score.nis_size, score.refused), mission.navigator.notes)
         book.set_mission(found.times_s[-1], found.outcome, found.cause)
         found.summary = book.build(0.0)

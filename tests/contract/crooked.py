@@ -13,7 +13,7 @@ from unittest.mock import patch
 from ccatp.commissioning.conformance import harness, server_checks
 from ccatp.commissioning.conformance.runner import Conformance, Result
 from ccatp.config.models import Config
-from ccatp.dataloop import DataLoop, _Connection
+from ccatp.dataloop import Connection, DataLoop
 from ccatp.sim.rules import FanRules, MotionRules
 
 Message = dict[str, Any]
@@ -40,7 +40,7 @@ class Crooked(NamedTuple):
     twist: Callable[[DataLoop], object] | None = None
 
 
-class Middle(_Connection):
+class Middle(Connection):
     """A connection whose messages are changed on their way.
 
     Attributes:
@@ -81,7 +81,7 @@ class CrookedLoop(DataLoop):
 
     crooked: Crooked
 
-    def _connection(self) -> _Connection:
+    def connect(self) -> Connection:
         return Middle(self)
 
 

@@ -386,22 +386,3 @@ async def test_an_answer_that_is_no_reply_is_an_error(endpoint: str) -> None:
     async with served(endpoint, lambda _: b"[]"):
         with pytest.raises(RequestFailed, match="not a JSON object"):
             await asyncio.to_thread(request, endpoint, b"x", DEADLINE_S)
-
-
-async def test_the_observatory_channel_on_a_socket(endpoint: str) -> None:
-    desk = Desk()
-
-    def handler(frame: bytes) -> bytes:
-        return answer_observatory(frame, desk, at_base_or_held=False, age_s=0.0)
-
-    async with served(endpoint, handler):
-        fire = format_request("emergency", kind="fire", id=ID, note="")
-        assert await asyncio.to_thread(request, endpoint, fire, DEADLINE_S) == {
-            "ok": True,
-            "id": ID,
-            "latched": True,
-            "code": 2,
-        }
-        too_long = await asyncio.to_thread(request, endpoint, b" " * 5000, DEADLINE_S)
-        assert too_long == {"ok": False, "error": "request of 5000 bytes; at most 4096"}
-    assert desk.latch.is_latched

@@ -98,7 +98,7 @@ def _mac(is_good: Callable[[Message, Middle], bool]) -> Callable[[bytes, Middle]
 
 def _mac_of_any(join: Message, middle: Middle) -> bool:
     nonces = middle.owner.__dict__.setdefault("nonces", [])
-    others = [connection for connection in middle.owner._connections if isinstance(connection, Middle)]
+    others = [connection for connection in middle.owner.connections if isinstance(connection, Middle)]
     nonces.extend(connection.hello["nonce"] for connection in others if connection.hello)
     return any(join.get("mac") == join_mac(KEY, nonce, join["role"]) for nonce in nonces)
 

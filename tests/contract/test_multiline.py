@@ -1,9 +1,7 @@
 """The MultiLine grammar to the byte, both directions."""
 
 import contextlib
-import itertools
 import math
-from collections.abc import Iterator
 
 import pytest
 from hypothesis import given
@@ -19,9 +17,7 @@ from ccatp.links.multiline import (
     Connected,
     Environment,
     LaserReady,
-    LineSplitter,
     MultilineRequest,
-    MultilineTooLong,
     Notice,
     Remark,
     Reply,
@@ -226,57 +222,3 @@ def test_a_channel_is_valid_when_present_unflagged_finite_and_positive() -> None
 def test_any_flag_that_is_not_zero_makes_a_length_invalid(flag: str, value: int) -> None:
     lengths_m, reasons = valid_lengths(ChannelData((FIRST._replace(**{flag: value}), SECOND)), (1, 2))
     assert (list(lengths_m), reasons) == ([2], {1: flag})
-
-
-def split(chunks: list[bytes], limit: int = 65536) -> list[bytes]:
-    splitter = LineSplitter(limit)
-    lines = []
-    for chunk in chunks:
-        splitter.feed(chunk)
-        while (line := splitter.next_line()) is not None:
-            lines.append(line)
-    return lines
-
-
-@given(st.lists(st.integers(0, 60), max_size=8))
-def test_lines_do_not_depend_on_how_the_stream_was_chopped(cuts: list[int]) -> None:
-    stream = b"isconnected\r\nlaserready\n\r\n\nlatestlengthvalid,1,2\r\nhalf a li"
-    edges = [0, *sorted(cuts), len(stream)]
-    chunks = [stream[a:b] for a, b in itertools.pairwise(edges)]
-    assert split(chunks) == [b"isconnected", b"laserready", b"", b"", b"latestlengthvalid,1,2"]
-
-
-def test_bytes_left_over_are_seen() -> None:
-    splitter = LineSplitter()
-    seen = [splitter.pending]
-    splitter.feed(b"a\r\nb")
-    assert splitter.next_line() == b"a"
-    seen.append(splitter.pending)
-    splitter.feed(b"\r\n")
-    assert splitter.next_line() == b"b"
-    seen.append(splitter.pending)
-    assert seen == [False, True, False]
-
-
-def split_one_by_one(stream: bytes, size: int) -> Iterator[bytes]:
-    splitter = LineSplitter(limit=64)
-    for at in range(0, len(stream), size):
-        splitter.feed(stream[at : at + size])
-        while (line := splitter.next_line()) is not None:
-            yield line
-
-
-@pytest.mark.parametrize("size", [1, 7, 64, 1000])
-def test_a_line_over_the_limit_is_refused_after_the_lines_before_it(size: int) -> None:
-    stream = b"ok\r\n" + b"x" * 65 + b"\r\nlater\r\n"
-    lines: list[bytes] = []
-    with pytest.raises(MultilineTooLong, match="line of more than 64 bytes"):
-        lines.extend(split_one_by_one(stream, size))
-    assert lines == [b"ok"]
-
-
-def test_a_line_of_the_limit_passes() -> None:
-    assert split([b"x" * 63 + b"\r\n"], limit=64) == [b"x" * 63]
-    assert split([b"x" * 65536 + b"\n"]) == [b"x" * 65536]
-    with pytest.raises(MultilineTooLong, match="65536"):
-        split([b"x" * 65537])

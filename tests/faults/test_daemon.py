@@ -59,7 +59,7 @@ async def test_while_a_robot_that_took_the_connection_says_nothing(measured: Mea
     loop = asyncio.get_running_loop()
     async with running_daemon(configuration()) as daemon:
         for proxy in (daemon.to_main, daemon.to_danger):
-            proxy.stall("to_client")
+            proxy.begin("stall", "to_client")
         await asyncio.sleep(1.0)
         assert not daemon.sent
         begun_s = loop.time()
@@ -161,15 +161,15 @@ async def test_stalls_and_blocks(measured: Measured) -> None:
         both = daemon.to_main, daemon.to_danger
         for proxies, direction in (
             (both[:1], "to_client"),
-            (both[:1], "to_server"),
+            (both[:1], "to_robot"),
             (both[1:], "to_client"),
-            (both[1:], "to_server"),
+            (both[1:], "to_robot"),
             (both, "to_client"),
         ):
             await daemon.until(lambda: daemon.is_driving)
             begun_s = clock()
             for proxy in proxies:
-                proxy.stall(direction)  # type: ignore[arg-type]
+                proxy.begin("stall", direction)  # type: ignore[arg-type]
             await asyncio.sleep(LONG_S)
             assert not daemon.is_driving, tell(daemon)  # held by the robot itself, or by zero drives
             healed_s = clock()

@@ -17,6 +17,7 @@ from ccatp.core import Fix, PointId
 from ccatp.daemon.fix_service import FixRequest
 from ccatp.etalon_client import EtalonClient, EtalonError, EtalonTimeout, StaleLengths
 from ccatp.links import multiline
+from ccatp.links.robot_messages import LineBuffer, LineTooLong
 from ccatp.localizer import build_localizer
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
@@ -318,14 +319,12 @@ def test_mutilated_replies_are_bad_replies_and_nothing_else(measured: Measured) 
         for _ in range(rng.randint(1, 6)):
             at = rng.randrange(len(line) + 1)
             line[at : at + rng.randint(0, 3)] = rng.randbytes(rng.randint(0, 3))
-        splitter = multiline.LineSplitter()
-        splitter.feed(bytes(line) + b"\n")
         try:
-            while (text := splitter.next_line()) is not None:
-                reply = multiline.parse_reply(text)
+            for text in LineBuffer(multiline.MAX_LINE_BYTES).feed(bytes(line) + b"\n"):
+                reply = multiline.parse_reply(text.rstrip(b"\r"))
                 if isinstance(reply, multiline.ChannelData):
                     multiline.valid_lengths(reply, CHANNELS)
-        except (multiline.BadReply, multiline.MultilineTooLong):
+        except (multiline.BadReply, LineTooLong):
             pass
         except Exception:
             surprises += 1

@@ -62,7 +62,7 @@ async def driven(disturb: Callable[..., None] = lambda proxy: None, frames: int 
 @pytest.mark.fault("S14")
 async def test_frames_that_come_twice_leave_the_pose_as_it_is(measured: Measured) -> None:
     _, clean = await driven()
-    twice, pose = await driven(lambda proxy: proxy.duplicate("both", 1))
+    twice, pose = await driven(lambda proxy: proxy.begin("duplicate", "both", every=1))
     assert twice.link.counts["repeated_frames"] >= FRAMES - 1
     assert twice.seqs == list(range(len(twice.seqs)))
     assert pose == clean
@@ -74,7 +74,7 @@ async def test_frames_out_of_order_never_reach_the_localizer() -> None:
     async with robot_behind_proxy(lockstep=False) as (_, proxy):
         driver = Driver(proxy.port)
         await driver.link.connect(DEADLINE_S)
-        proxy.reorder("to_client", 3)
+        proxy.begin("reorder", "to_client", every=3)
         await driver.drive(FRAMES)
         assert proxy.counts["reorder"] >= 5
         assert driver.link.counts["repeated_frames"] >= 5
@@ -88,7 +88,7 @@ async def test_a_damaged_line_costs_itself_alone(measured: Measured) -> None:
     async with robot_behind_proxy(lockstep=False) as (_, proxy):
         driver = Driver(proxy.port)
         await driver.link.connect(DEADLINE_S)
-        proxy.corrupt("to_client", 10)  # ten a second; more than twenty would end the session
+        proxy.begin("corrupt", "to_client", every=10)  # ten a second; more than twenty would end the session
         await driver.drive(2 * FRAMES)
         assert not driver.lost
         assert proxy.counts["corrupt"] >= 8
@@ -102,7 +102,7 @@ async def test_a_damaged_line_costs_itself_alone(measured: Measured) -> None:
 @pytest.mark.fault("L5")
 async def test_single_bytes_make_no_difference() -> None:
     _, clean = await driven(frames=10)
-    chopped, pose = await driven(lambda proxy: proxy.fragment("both", 1), frames=10)
+    chopped, pose = await driven(lambda proxy: proxy.begin("fragment", "both", write_bytes=1), frames=10)
     assert not chopped.link.counts
     assert pose == clean
 
@@ -372,7 +372,7 @@ async def test_commands_that_come_again_are_dropped() -> None:
     async with robot_behind_proxy(lockstep=True) as (loop, proxy):
         driver = Driver(proxy.port)
         await driver.link.connect(DEADLINE_S)
-        proxy.duplicate("to_server", 1)
+        proxy.begin("duplicate", "to_robot", every=1)
         await driver.drive(FRAMES)
         assert loop.server.counts["stale"] >= FRAMES - 5
         driver.link.close()

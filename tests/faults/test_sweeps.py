@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.sim.fault_models import Injected
-from ccatp.sim.fault_plan import FaultPlan
+from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.studies.faults_study import FaultySilRun, random_plan
 from ccatp.studies.sil_run import SilResult
 from tests.faults import edge_sweep

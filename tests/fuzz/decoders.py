@@ -71,7 +71,6 @@ def targets() -> list[Target]:
             (multiline.BadMultilineRequest,),
         ),
         Target("MultiLine, replies", _replies(), _reply, (multiline.BadReply,)),
-        Target("MultiLine, lines", [b"laserready_1\r\nmeasstarted\n"], _split, (multiline.MultilineTooLong,)),
         Target("observatory channel", _observatory(), _emergency, (channels.BadRequest,)),
         Target("operator channel", [b'{"cmd":"status"}', b'{"cmd":"abort"}'], _operator, (channels.BadRequest,)),
         Target("replies of both channels", [b'{"ok":true,"code":0}'], _channel_reply, (channels.BadRequest,)),
@@ -178,17 +177,6 @@ def _reply(line: bytes) -> Hashable:
         assert len(lengths_m) + len(reasons) == 32
         return len(reply.records), len(lengths_m), reply.server_error == 0
     return type(reply).__name__, reply if isinstance(reply, multiline.Notice) else ""
-
-
-def _split(data: bytes) -> Hashable:
-    limit = 100
-    splitter, lines = multiline.LineSplitter(limit), []
-    for at in range(0, len(data), 7):
-        splitter.feed(data[at : at + 7])
-        while (line := splitter.next_line()) is not None:
-            assert len(line) <= limit
-            lines.append(line)
-    return min(len(lines), 20), splitter.pending
 
 
 # -- channels ---------------------------------------------------------------------------------------------------------

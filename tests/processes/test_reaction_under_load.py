@@ -27,10 +27,9 @@ from ccatp.config.load import dump_config, load_config
 from ccatp.dataloop import DataLoop
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.etalon_server import EtalonSimulator, ZmqPuck
-from ccatp.sim.fault_proxy import FaultProxy
+from ccatp.sim.fault_proxy import FaultProxy, Pipe
 from ccatp.sim.ground_truth import GroundTruthPublisher
-from ccatp.sim.network_faults import Pipe
-from ccatp.sim.robot import TruthLog
+from ccatp.sim.rules import TruthLog
 from tests.faults.linking import Measured
 
 TIMES = int(os.environ.get("CCATP_REACTIONS", "3"))
@@ -190,11 +189,11 @@ async def survey(folder: Path, runtime_dir: Path) -> AsyncIterator[Survey]:
 
 
 def _tapped(wire: Wire, proxy: FaultProxy) -> Callable[[Pipe], Awaitable[bytes]]:
-    read, to_server = Pipe._read, proxy._faults["to_server"]
+    read, to_robot = Pipe._read, proxy._faults["to_robot"]
 
     async def tapped(pipe: Pipe) -> bytes:
         data = await read(pipe)
-        if pipe._faults is to_server:
+        if pipe._faults is to_robot:
             wire.heard(id(pipe), data)
         return data
 
@@ -237,7 +236,7 @@ FAULTS: dict[str, tuple[Callable[[Survey], None], float]] = {
     "kill all": (kill_all, 0.0),
     "stop main": (halt("main"), EVIDENCE_S),
     "stop danger": (halt("danger"), EVIDENCE_S),
-    "black hole": (lambda it: it.proxy.black_hole("both"), EVIDENCE_S),
+    "black hole": (lambda it: it.proxy.begin("black_hole", "both"), EVIDENCE_S),
 }
 
 

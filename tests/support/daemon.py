@@ -30,7 +30,7 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.etalon_server import EtalonSimulator, ZmqPuck
 from ccatp.sim.fault_proxy import FaultProxy
 from ccatp.sim.ground_truth import GroundTruthPublisher
-from ccatp.sim.robot import TruthLog
+from ccatp.sim.rules import TruthLog
 
 DEADLINE_S = 60.0
 LINK_DEADLINE_S = 30.0  # what never happens in a good run may take this long in a bad one

@@ -22,8 +22,7 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.localizer import Localizer
 from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.records.store import MissionStore, PlannedPoint
-from ccatp.sim.fault_models import Injected
-from ccatp.sim.fault_plan import FaultPlan, parse_plan
+from ccatp.sim.fault_plan import FaultPlan, Injected, parse_plan
 from ccatp.studies.faults_study import FaultySilRun
 from ccatp.studies.sil_run import SilResult, SilRun
 from ccatp.survey.composition import assemble

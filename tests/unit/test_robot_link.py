@@ -240,74 +240,67 @@ async def test_nobody_listens(free_port: int) -> None:
     assert seen.lost == []
 
 
-async def connect_error(script: Script, error: type[Exception], match: str, *, key: bytes | None = None) -> Exception:
-    async with robot(script, key=key) as (link, seen):
-        with pytest.raises(error, match=match) as caught:
-            await link.connect(0.3 if error is RobotTimeout else DEADLINE_S)
-        assert seen.lost == []
-        return caught.value
+def saying(text: bytes, *, hangs_up: bool = False) -> Script:
+    async def script(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(text)
+        await writer.drain()
+        if not hangs_up:
+            await reader.read()
+
+    return script
 
 
-async def say(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, text: bytes) -> None:
-    writer.write(text)
-    await writer.drain()
+def refusing(reason: str) -> Script:
+    return after_join(joined=b'{"type":"refused","reason":"%b"}\n' % reason.encode())
 
 
-@pytest.mark.parametrize("reason", ["role taken", "bad mac", "bad join", "busy", "full moon"])
-async def test_refused(reason: str) -> None:
-    refusal = b'{"type":"refused","reason":"%b"}\n' % reason.encode()
-    error = await connect_error(after_join(joined=refusal), RobotRefused, f"refused the role controller: {reason}")
-    assert isinstance(error, RobotRefused)
-    assert error.reason == reason
-
-
-async def test_refused_without_having_been_asked() -> None:
-    async def busy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await say(reader, writer, HELLO + b'{"type":"refused","reason":"busy"}\n')
-
-    await connect_error(busy, RobotRefused, "busy; too many connections")
-
-
-async def test_another_version() -> None:
-    script = after_join(hello=HELLO.replace(b"robot/1", b"robot/2"))
-    await connect_error(script, WrongProtocol, "speaks ccatp-robot/2, this program ccatp-robot/1")
-
-
-async def test_something_that_is_no_robot() -> None:
-    async def http(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await say(reader, writer, b"HTTP/1.1 400 Bad Request\r\nConnection: close\r\n\r\n")
-
-    await connect_error(http, WrongProtocol, "no robot answers")
-
-
-async def test_hung_up_on() -> None:
-    async def nothing(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        return
-
-    await connect_error(nothing, RobotLinkError, "did not let us join: the robot closed the connection")
+HTTP = b"HTTP/1.1 400 Bad Request\r\nConnection: close\r\n\r\n"
+NO_ANSWER = "no answer from the robot at .* within 0.3 s"
+JOINING_THAT_FAILS: dict[str, tuple[Script, type[RobotLinkError], str]] = {
+    "role taken": (refusing("role taken"), RobotRefused, "refused the role controller: role taken; another program"),
+    "bad mac": (refusing("bad mac"), RobotRefused, "refused the role controller: bad mac; check robot.key_file"),
+    "bad join": (refusing("bad join"), RobotRefused, "refused the role controller: bad join$"),
+    "another reason": (refusing("full moon"), RobotRefused, "refused the role controller: full moon$"),
+    "busy": (
+        saying(HELLO + b'{"type":"refused","reason":"busy"}\n', hangs_up=True),
+        RobotRefused,
+        "busy; too many connections",
+    ),
+    "another version": (
+        after_join(hello=HELLO.replace(b"robot/1", b"robot/2")),
+        WrongProtocol,
+        "speaks ccatp-robot/2, this program ccatp-robot/1",
+    ),
+    "no robot": (saying(HTTP, hangs_up=True), WrongProtocol, "no robot answers"),
+    "hung up": (saying(b"", hangs_up=True), RobotLinkError, "did not let us join: the robot closed the connection"),
+    "bad hello": (
+        saying(b'{"type":"hello","protocol":"ccatp-robot/1"}\n'),
+        RobotTimeout,
+        f"{NO_ANSWER}; .*what came: bad line: .*boot",
+    ),
+    "another role": (
+        saying(HELLO + JOINED.replace(b"controller", b"monitor")),
+        RobotTimeout,
+        f"{NO_ANSWER}; .*joined as monitor, not as controller",
+    ),
+    "silence": (saying(b""), RobotTimeout, NO_ANSWER),
+    "no key": (after_join(hello=HELLO_HMAC), RobotLinkError, "asks for a key: name its file"),
+}
 
 
 @pytest.mark.parametrize(
-    ("lines", "why"),
-    [
-        (b'{"type":"hello","protocol":"ccatp-robot/1"}\n', "what came: bad line: .*boot"),
-        (HELLO + b'{"type":"joined","role":"monitor","session":1}\n', "joined as monitor, not as controller"),
-    ],
+    "name",
+    [pytest.param(name, marks=[pytest.mark.fault("L6")] if name == "silence" else []) for name in JOINING_THAT_FAILS],
 )
-async def test_an_answer_that_is_none_is_told(lines: bytes, why: str) -> None:
-    async def odd(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        writer.write(lines)
-        await reader.read()
-
-    await connect_error(odd, RobotTimeout, f"no answer from the robot at .* within 0.3 s; .*{why}")
-
-
-@pytest.mark.fault("L6")
-async def test_silence() -> None:
-    async def silence(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await reader.read()
-
-    await connect_error(silence, RobotTimeout, "no answer from the robot at .* within 0.3 s")
+async def test_joining_that_fails(name: str) -> None:
+    script, error, match = JOINING_THAT_FAILS[name]
+    async with robot(script) as (link, seen):
+        with pytest.raises(error, match=match) as caught:
+            await link.connect(0.3 if error is RobotTimeout else DEADLINE_S)
+        assert type(caught.value) is error
+        assert seen.lost == []
+    if isinstance(caught.value, RobotRefused):
+        assert caught.value.reason in match
 
 
 async def test_frames_before_the_join_is_over_are_not_served() -> None:
@@ -315,11 +308,6 @@ async def test_frames_before_the_join_is_over_are_not_served() -> None:
         await link.connect(DEADLINE_S)
         await seen.until(lambda: seen.frames == [5])
     assert link.counts["unexpected"] == 1
-
-
-async def test_joined_for_another_role_does_not_count() -> None:
-    wrong = JOINED.replace(b"controller", b"monitor")
-    await connect_error(after_join(joined=wrong), RobotTimeout, "no answer")
 
 
 # -- the key ----------------------------------------------------------------------------------------------------------
@@ -338,10 +326,6 @@ async def test_the_key_is_used_where_the_robot_asks_for_it() -> None:
         await link.connect(DEADLINE_S)
     mac = join_mac(b"secret", NONCE, "controller")
     assert joins == [b'{"type":"join","role":"controller","client":"test","mac":"%b"}\n' % mac.encode()]
-
-
-async def test_a_robot_that_asks_for_a_key_we_do_not_have() -> None:
-    await connect_error(after_join(hello=HELLO_HMAC), RobotLinkError, "asks for a key: name its file")
 
 
 def test_read_key(tmp_path: Path) -> None:

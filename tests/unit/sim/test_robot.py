@@ -10,8 +10,10 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, PanelId
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import MAX_LINE_BYTES, Sensors
+from ccatp.links.topics import TruthMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.sim.robot import Robot, TruthLog
+from ccatp.sim.robot import Robot
+from ccatp.sim.rules import TruthLog
 from ccatp.sim.world import TruthRow
 
 
@@ -63,61 +65,6 @@ def test_a_frame_holds_the_samples_since_the_one_before(config: Config, mirror: 
     assert (sensors.cmd.seq, sensors.cmd.age, sensors.cmd.permit_age, sensors.cmd.held) == (7, 0.01, 0.07, False)
     # 5 sigma of the encoder's noise.
     assert sensors.enc[-1].right_rad_s == pytest.approx(robot.world.plant.right_rad_s, abs=0.005)
-
-
-def test_the_same_seed_gives_the_same_bytes(config: Config, mirror: Mirror) -> None:
-    lines = []
-    for seed in (1, 1, 2):
-        robot = boot(config, mirror, seed)
-        found = [robot.delivered_line]
-        for k in range(300):
-            drive(robot, 3.0, 3.0 - 0.01 * k, 1)
-            found.append(robot.delivered_line)
-        lines.append(b"".join(found))
-    assert lines[0] == lines[1]
-    assert lines[0] != lines[2]
-
-
-def test_rows_line_and_message_say_the_same(config: Config, mirror: Mirror) -> None:
-    robot = boot(config, mirror)
-    for k in range(60):
-        drive(robot, 3.0, 3.0 - 0.1 * k, 1)
-        rows, message = robot.delivered_rows, robot.delivered
-        assert rows is not None
-        assert message == frame(robot)
-        assert [type(sample).__name__ for sample in (message.imu[0], message.enc[0], message.edge[0])] == [
-            "ImuSample", "WheelSample", "EdgeSample",
-        ]  # fmt: skip
-        for name in rows.__struct_fields__:
-            value = getattr(rows, name)
-            assert (list(value) if name == "faults" else value) == getattr(message, name)
-
-
-def test_a_drive_ends_with_its_time_to_live(config: Config, mirror: Mirror) -> None:
-    robot = boot(config, mirror)
-    robot.rules.drive(1, 3.0, 3.0, 0.0)
-    held = []
-    for _ in range(60):
-        robot.advance()
-        held.append(frame(robot).cmd.held)
-    assert held == [False] * 25 + [True] * 35  # ttl_s = 0.25 at 100 Hz
-    # 25 frames at 0.09 m/s; first order in and out: v ttl in all, but for the rest after 4.4 time constants.
-    moved = np.hypot(
-        robot.world.plant.x_m - robot.world.start_pose.x_m, robot.world.plant.y_m - robot.world.start_pose.y_m
-    )
-    assert 0.018 < moved < 0.0226
-
-
-def test_hold_is_a_servo_at_zero_not_power_off(config: Config, mirror: Mirror) -> None:
-    robot = boot(config, mirror)
-    drive(robot, 3.0, 3.0, 100)
-    robot.rules.lose_controller()
-    rates = []
-    for _ in range(20):
-        robot.advance()
-        rates.append(robot.world.plant.right_rad_s)
-    expected = [3.0 * np.exp(-0.01 * (k + 1) / 0.08) for k in range(20)]
-    assert rates == pytest.approx(expected, abs=1e-4)  # the drive had come within 4e-6 of 3.0
 
 
 def test_puck_stands_on_the_misaligned_panel(config: Config, mirror: Mirror) -> None:
@@ -296,15 +243,18 @@ def test_truth_comes_in_batches(config: Config, mirror: Mirror) -> None:
         drive(robot, 3.0, 3.0, 1)
         if truth.add():
             full.append(k)
-            batch = truth.take()
+            batch = truth.batch()
             assert batch is not None
-            assert [row[0] for row in batch.rows] == list(range(robot.seq - 99, robot.seq + 1))
+            assert isinstance(batch[1], TruthMessage)
+            assert [row[0] for row in batch[1].rows] == list(range(robot.seq - 99, robot.seq + 1))
     assert full == [98, 198]
     assert truth.answer(b"flush") == b'{"rows":200}'
-    rest = truth.take()
-    assert rest is not None
+    batch = truth.batch()
+    assert batch is not None
+    rest = batch[1]
+    assert isinstance(rest, TruthMessage)
     assert (rest.seq, rest.rows[0][0], rest.rows[-1][0]) == (250, 200, 250)
-    assert truth.take() is None
+    assert truth.batch() is None
     assert truth.answer(b"flush") == b'{"rows":251}'
 
 
@@ -312,7 +262,7 @@ def test_a_fall_is_told_at_once(config: Config, mirror: Mirror) -> None:
     robot = boot(config, mirror)
     truth = TruthLog(robot)
     while not robot.world.is_fallen:
-        truth.take()
+        truth.batch()
         drive(robot, 3.0, 3.0, 1)
         assert truth.add() is robot.world.is_fallen
 
@@ -324,7 +274,7 @@ def test_answers(config: Config, mirror: Mirror) -> None:
     assert (puck["t"], puck["moved_m"], tuple(puck["puck"])) == (0.0, 0.0, robot.world.puck_world())
     told = json.loads(truth.answer(b"misalignment"))
     assert [PanelId(*row[:2]) for row in told["panels"]] == list(mirror.panels)
-    assert [list(row) for row in truth.misalignment().panels] == told["panels"]
+    assert [list(row) for row in robot.truth_preface()[1].panels] == told["panels"]
     assert told["start"][:2] == [robot.world.start_pose.x_m, robot.world.start_pose.y_m]
     assert "unknown request" in json.loads(truth.answer(b"x" * 1000))["error"]
 
@@ -393,23 +343,6 @@ def test_a_frame_is_delivered_when_the_clock_shows_its_time_and_the_delay(
     boot_frame = late[frames - 1][1] if frames else None
     assert [sensors is None for _, sensors in late[:frames]] == [True] * (frames - 1) + [False] * min(frames, 1)
     assert boot_frame is None or boot_frame.seq == 0
-
-
-@pytest.mark.parametrize("frames", [0, 1, 2])
-def test_commands_take_effect_after_their_delay(config: Config, mirror: Mirror, frames: int) -> None:
-    robot = boot(with_world(config, commands_delay_s=0.01 * frames), mirror)
-    rates, echoes = [], []
-    for k in range(20):
-        if k >= 5:
-            robot.drive(k, 3.0, 3.0)
-        robot.advance()
-        rates.append(robot.world.plant.right_rad_s)
-        assert robot.delivered is not None
-        echoes.append(robot.delivered.cmd)
-    assert [rate > 0.0 for rate in rates] == [False] * (5 + frames) + [True] * (15 - frames)
-    assert [echo.held for echo in echoes] == [rate == 0.0 for rate in rates]
-    assert [echo.seq for echo in echoes[5 + frames :]] == list(range(5, 20 - frames))
-    assert {echo.age for echo in echoes[5 + frames :]} == {0.01 * (frames + 1)}
 
 
 @pytest.mark.parametrize("world", ["hard", "extreme"])

@@ -1,4 +1,4 @@
-"""The robot's own rules, as stories in virtual time. Every test starts from "held"."""
+"""The robot's own rules, and commands that wait on their way, in virtual time. Every test starts from "held"."""
 
 import math
 
@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.sim.rules import HELD, FanRules, MotionRules
+from ccatp.sim.rules import HELD, FanRules, MotionRules, SimulatedRobot
 
 TTL_S, FASTEST = 0.25, 8.0
 
@@ -97,7 +97,7 @@ def test_only_newer_sequence_numbers_count() -> None:
     assert r.echo(0.26)[1] == pytest.approx(0.26)
 
 
-def test_a_new_session_starts_anew() -> None:
+def test_a_new_session_counts_again() -> None:
     r = rules()
     r.drive(1000, 3.0, 3.0, 0.0)
     r.lose_controller()
@@ -187,3 +187,110 @@ def test_wheels_turn_only_with_both_keys(events: list[tuple[object, ...]]) -> No
                 assert permit[1] or right + left <= 0
                 assert permit[2] or right + left >= 0
                 assert permit[3] or right == left
+
+
+DT_S = 0.01
+# A robot with nothing but roles and commands.
+Bare = type("Bare", (SimulatedRobot,), dict.fromkeys(SimulatedRobot.__abstractmethods__))
+
+
+class Rig:
+    def __init__(self, frames: int, ttl_s: float = 0.25) -> None:
+        self.robot: SimulatedRobot = Bare((ttl_s, 8.0, 0.0), DT_S, 1.0 / DT_S, frames)
+
+    def moves(self, frame: int) -> bool:
+        """Whether the wheels turn in the step after ``frame``."""
+        self.at(frame)._release_commands()
+        return self.robot.rules.set_points((frame + 1) * DT_S) != HELD
+
+    def at(self, frame: int) -> SimulatedRobot:
+        self.robot.seq, self.robot.t_s = frame, frame * DT_S
+        return self.robot
+
+
+@pytest.mark.parametrize("frames", [0, 1, 2, 5])
+def test_a_drive_takes_effect_to_the_frame(frames: int) -> None:
+    rig = Rig(frames)
+    for frame in range(10):
+        if frame == 3:
+            assert rig.at(frame).drive(7, 3.0, 3.0)
+        assert rig.moves(frame) is (frame >= 3 + frames)
+        # What is in force is echoed, and its age counts from its arrival.
+        seq, age_s, _, _ = rig.robot.rules.echo((frame + 1) * DT_S)
+        assert seq == (7 if frame >= 3 + frames else -1)
+        if seq == 7:
+            assert age_s == pytest.approx((frame - 2) * DT_S, abs=1e-12)
+
+
+@pytest.mark.parametrize("frames", [0, 2])
+def test_a_permit_takes_effect_to_the_frame(frames: int) -> None:
+    rig = Rig(frames)
+    rig.robot.join_monitor()
+    for frame in range(8):
+        rig.at(frame).drive(frame, 3.0, 3.0)
+        if frame in {2, 5}:
+            assert rig.robot.permit(frame, frame == 2, False, False)
+        assert rig.moves(frame) is (2 + frames <= frame < 5 + frames)
+
+
+@pytest.mark.parametrize("frames", [0, 3])
+def test_fans_follow_to_the_frame(frames: int) -> None:
+    rig = Rig(frames)
+    assert rig.at(1).command_fans(1, 0.5, 0.6)
+    for frame in range(1, 8):
+        rig.moves(frame)
+        assert rig.robot.fans.duty == ((0.5, 0.6) if frame >= 1 + frames else (0.0, 0.0))
+
+
+def test_the_time_to_live_covers_the_delay() -> None:
+    rig = Rig(2, ttl_s=0.05)
+    rig.at(0).drive(1, 3.0, 3.0)
+    assert [rig.moves(frame) for frame in range(8)] == [False, False, True, True, True, False, False, False]
+
+
+@pytest.mark.parametrize("frames", [0, 2])
+def test_only_what_is_newer_is_taken(frames: int) -> None:
+    robot = Rig(frames).robot
+    assert [robot.drive(seq, 1.0, 1.0) for seq in (5, 5, 4, 6)] == [True, False, False, True]
+    assert [robot.permit(seq, True, True, True) for seq in (5, 5, 4, 6)] == [True, False, False, True]
+    assert [robot.command_fans(seq, 0.5, 0.5) for seq in (5, 5, 4, 6)] == [True, False, False, True]
+
+
+@pytest.mark.parametrize("frames", [0, 2])
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_commands_that_are_not_finite_are_dropped(frames: int, bad: float) -> None:
+    robot = Rig(frames).robot
+    assert not robot.drive(1, bad, 1.0)
+    assert not robot.drive(1, 1.0, bad)
+    assert not robot.command_fans(1, bad, 0.5)
+    assert robot.drive(1, 1.0, 1.0)
+    assert robot.command_fans(1, 0.5, 0.5)
+
+
+def test_what_is_on_its_way_goes_with_its_session() -> None:
+    rig = Rig(2)
+    robot = rig.at(0)
+    robot.join_monitor()
+    robot.drive(10, 3.0, 3.0)
+    robot.permit(10, True, True, True)
+    robot.command_fans(10, 0.7, 0.7)
+    robot.lose_controller()
+    assert not any(rig.moves(frame) for frame in range(5))
+    assert robot.fans.duty == (0.7, 0.7)  # fans are not changed by a lost session
+    rig.at(5).join_controller()
+    robot.drive(0, 3.0, 3.0)  # the next one counts again
+    assert [rig.moves(frame) for frame in range(5, 8)] == [False, False, True]
+    robot.permit(11, False, False, False)
+    robot.lose_monitor()
+    robot.rules.permit(12, True, True, True, 0.07)
+    assert rig.moves(9)  # the denial never arrives
+
+
+def test_fans_of_the_session_before_do_not_outrank_the_next() -> None:
+    rig = Rig(2)
+    rig.robot.command_fans(5000, 0.7, 0.7)
+    rig.robot.join_controller()
+    assert rig.robot.fans.duty == (0.7, 0.7)  # accepted is accepted
+    assert rig.at(1).command_fans(0, 0.3, 0.3)
+    rig.moves(3)
+    assert rig.robot.fans.duty == (0.3, 0.3)

@@ -1,17 +1,29 @@
 """What the simulated sensors read."""
 
-from math import acos, cos, pi, sin
+from itertools import product
+from math import acos, cos, floor, pi, sin, sqrt
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from ccatp.config.models import Config, SimRobotConfig
-from ccatp.core import DeckPose
+from ccatp.config.load import load_config
+from ccatp.config.models import Config, WorldConfig
+from ccatp.core import DeckPose, PanelId
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.sim.disturbances import NoiseStream
-from ccatp.sim.edge_sensors import EdgeSensors
 from ccatp.sim.plant import Plant
-from ccatp.sim.sensors import SampleTimes, SensorSuite
+from ccatp.sim.sensors import (
+    MIN_GAP_M,
+    CountingEncoders,
+    EdgeSensors,
+    InertialUnit,
+    RateEncoders,
+    Rectangle,
+    SampleTimes,
+    SensorSuite,
+    draw_rectangles,
+    nominal_rectangles,
+)
 
 OFFSETS = ((0.09, 0.09), (0.09, -0.09), (-0.09, 0.09), (-0.09, -0.09))
 DT_S = 0.01
@@ -27,22 +39,9 @@ def plant_at(mirror: Mirror, start: DeckPose) -> Plant:
 
 
 def suite(config: Config, mirror: Mirror, **rates: float) -> SensorSuite:
-    cfg: SimRobotConfig = config.sim.robot.model_copy(update=rates)
-    rng = np.random.default_rng(1)
-    return SensorSuite(mirror, cfg, config.world, OFFSETS, rng, panels=config.mirror.panels, lag_s=cfg.wheel_lag_s)
-
-
-# -- noise and times --------------------------------------------------------------------------------------------------
-
-
-def test_a_noise_stream_is_the_same_however_it_is_taken() -> None:
-    whole = NoiseStream(np.random.default_rng(3)).take(20_000)
-    stream = NoiseStream(np.random.default_rng(3))
-    pieces: list[float] = []
-    while len(pieces) < 20_000:
-        pieces += stream.take(min(1 + len(pieces) % 977, 20_000 - len(pieces)))
-    assert pieces == whole
-    assert stream.take(0) == []
+    robot = config.sim.robot.model_copy(update=rates)
+    cfg = config.model_copy(update={"sim": config.sim.model_copy(update={"robot": robot})})
+    return SensorSuite(cfg, mirror, np.random.default_rng(1), lag_s=robot.wheel_lag_s)
 
 
 @pytest.mark.parametrize(
@@ -82,13 +81,11 @@ def test_readings_are_the_truth_plus_noise_of_the_world(config: Config, mirror: 
     for frame in range(1, 1501):
         side = 1.0 if frame % 100 < 50 else -1.0
         plant.step((frame - 1) * DT_S, DT_S, 3.0 * side, 2.0 * side)
-        sensors.enter(frame)
-        ((t, ax, wz),) = sensors.read_imu(plant)
+        _, ((t, ax, wz),), encoders, _ = sensors.read(frame, plant)
         assert t == frame / 100.0
         speed_rate = 0.03 * ((3.0 + 2.0) * side - plant.right_rad_s - plant.left_rad_s) / 2.0 / 0.08
         errors["ax"].append(ax - speed_rate)
         errors["wz"].append(wz - 0.03 * (plant.right_rad_s - plant.left_rad_s) / 0.15)
-        encoders = sensors.read_encoders(plant)
         assert len(encoders) == 10
         errors["enc"] += [encoders[-1][1] - plant.right_rad_s, encoders[-1][2] - plant.left_rad_s]
     world = config.world
@@ -107,8 +104,7 @@ def test_right_and_left_encoder_noise_are_independent(config: Config, mirror: Mi
     sensors, plant = suite(config, mirror), plant_at(mirror, DeckPose(0.0, 0.0, 0.0))
     rows = []
     for frame in range(1, 301):
-        sensors.enter(frame)
-        rows += [row[1:] for row in sensors.read_encoders(plant)]
+        rows += [row[1:] for row in sensors.read(frame, plant)[2]]
     assert abs(np.corrcoef(np.array(rows).T)[0, 1]) < 4.5 / np.sqrt(len(rows))
 
 
@@ -119,9 +115,8 @@ def test_noise_of_one_sensor_does_not_depend_on_the_rate_of_another(config: Conf
         sensors = suite(config, mirror, encoder_hz=encoder_hz)
         readings = []
         for frame in range(1, 50):
-            sensors.enter(frame)
-            sensors.read_encoders(plant)
-            readings.append((sensors.read_imu(plant), sensors.read_gravity(plant)))
+            _, imu, _, gravity = sensors.read(frame, plant)
+            readings.append((imu, gravity))
         found.append(readings)
     assert found[0] == found[1]
 
@@ -131,8 +126,7 @@ def test_gravity_comes_at_its_own_rate_within_its_noise(config: Config, mirror: 
     g = np.array(mirror.gravity_in_robot(plant.pose))
     angles, times = [], []
     for frame in range(1, 5001):
-        sensors.enter(frame)
-        if (reading := sensors.read_gravity(plant)) is not None:
+        if (reading := sensors.read(frame, plant)[3]) is not None:
             times.append(reading[0])
             assert np.linalg.norm(reading[1:]) == pytest.approx(1.0, abs=1e-6)  # rounded to 1e-7 each
             angles.append(acos(min(1.0, float(np.dot(reading[1:], g)))))
@@ -143,37 +137,6 @@ def test_gravity_comes_at_its_own_rate_within_its_noise(config: Config, mirror: 
 
 
 # -- edge sensors -----------------------------------------------------------------------------------------------------
-
-
-def test_edges_are_those_of_the_panels_at_every_millisecond(mirror: Mirror) -> None:
-    """Against the plain question asked at each sample, along drives and turns across seams and over the rim."""
-    rng = np.random.default_rng(5)
-    times = [0.001 * (k + 1) for k in range(10)]
-    fractions = [(k + 1) / 10.0 for k in range(10)]
-    off = 0
-    for _ in range(40):
-        centre = mirror.panels[list(mirror.panels)[int(rng.integers(len(mirror.panels)))]]
-        start = DeckPose(
-            centre.x_m + rng.uniform(-1, 1) * centre.half_x_m, centre.y_m + rng.uniform(-1, 1) * centre.half_y_m,
-            rng.uniform(-pi, pi),
-        )  # fmt: skip
-        plant, edges = plant_at(mirror, start), EdgeSensors(mirror, OFFSETS)
-        edges.place(plant)
-        right, left = rng.uniform(-7, 7, 2)
-        for k in range(150):
-            before = [mirror.body_offset(plant.pose, *o) for o in OFFSETS]
-            plant.step(k * DT_S, DT_S, right, left)
-            after = [mirror.body_offset(plant.pose, *o) for o in OFFSETS]
-            for (_, *values), f in zip(edges.read(plant, times, fractions), fractions, strict=True):
-                for value, (x0, y0), (x1, y1) in zip(values, before, after, strict=True):
-                    x, y = x0 + f * (x1 - x0), y0 + f * (y1 - y0)
-                    if value != mirror.is_on_panel(x, y):
-                        # Within a nanometre of a panel's edge rounding may decide.
-                        assert mirror.is_on_panel(x + 1e-9, y) != mirror.is_on_panel(x - 1e-9, y) or (
-                            mirror.is_on_panel(x, y + 1e-9) != mirror.is_on_panel(x, y - 1e-9)
-                        )
-                    off += 1 - value
-    assert off > 1000  # the drives did meet edges
 
 
 def test_a_sensor_that_stops_over_a_gap_stays_off(mirror: Mirror) -> None:
@@ -199,3 +162,269 @@ def test_places_follow_the_robot(mirror: Mirror) -> None:
         # The slope at this place shortens projections by less than 1 %.
         assert x == pytest.approx(0.1 + ox * cos(0.5) - oy * sin(0.5), abs=1e-3)
         assert y == pytest.approx(0.2 + ox * sin(0.5) + oy * cos(0.5), abs=1e-3)
+
+
+SIGMA_M = 2e-4
+
+
+@pytest.fixture(scope="module")
+def wide() -> Config:
+    """A mirror with gaps of 10 mm, where no shift is ever limited."""
+    return load_config(overrides={"run.mirror": "thesis-m1"})
+
+
+def edges_of(cfg: Config, mirror: Mirror, seed: int = 1, sigma_m: float = SIGMA_M) -> dict[PanelId, Rectangle]:
+    return draw_rectangles(mirror, cfg.mirror.panels, sigma_m, np.random.default_rng(seed))
+
+
+def shifts_of(cfg: Config, seed: int = 1) -> NDArray[np.float64]:
+    """Outward shifts, shape (panels, 4)."""
+    mirror = build_mirror(cfg.mirror)
+    found, nominal = edges_of(cfg, mirror, seed), nominal_rectangles(mirror)
+    return np.array([np.subtract(found[p], nominal[p]) * (-1, 1, -1, 1) for p in nominal])
+
+
+def test_edges_shift_by_their_sigma_each_for_itself(wide: Config) -> None:
+    shifts = np.concatenate([shifts_of(wide, seed) for seed in range(20)])
+    n = len(shifts)
+    assert shifts.std(axis=0) == pytest.approx([SIGMA_M] * 4, rel=4.5 / sqrt(2 * n))
+    assert np.abs(shifts.mean(axis=0)).max() < 4.5 * SIGMA_M / sqrt(n)
+    assert np.abs(np.corrcoef(shifts.T)[np.triu_indices(4, 1)]).max() < 4.5 / sqrt(n)
+
+
+def test_the_same_seed_gives_the_same_edges(wide: Config) -> None:
+    assert (shifts_of(wide, 1) == shifts_of(wide, 1)).all()
+    assert (shifts_of(wide, 1) != shifts_of(wide, 2)).all()
+
+
+@pytest.mark.parametrize("sigma_m", [SIGMA_M, 2e-3])
+def test_neighbours_keep_a_gap(config: Config, sigma_m: float) -> None:
+    mirror = build_mirror(config.mirror)
+    for seed in range(20):
+        found = edges_of(config, mirror, seed, sigma_m)
+        for pid, (_, x1, _, y1) in found.items():
+            if right := found.get(PanelId(pid.row, pid.col + 1)):
+                assert right[0] - x1 >= MIN_GAP_M - 1e-9  # rounding of metres
+            if above := found.get(PanelId(pid.row + 1, pid.col)):
+                assert above[2] - y1 >= MIN_GAP_M - 1e-9
+
+
+def test_material_is_inside_the_shifted_edges_and_nowhere_else(config: Config) -> None:
+    mirror = build_mirror(config.mirror)
+    rectangles = edges_of(config, mirror)
+    sensors = EdgeSensors(mirror, OFFSETS, rectangles)
+    for x0, x1, y0, y1 in rectangles.values():
+        x, y, d = (x0 + x1) / 2.0, (y0 + y1) / 2.0, 1e-9
+        for (px, py), (qx, qy) in zip(
+            ((x0 + d, y), (x1 - d, y), (x, y0 + d), (x, y1 - d)),
+            ((x0 - d, y), (x1 + d, y), (x, y0 - d), (x, y1 + d)),
+            strict=True,
+        ):
+            assert sensors.is_on(px, py)
+            assert not sensors.is_on(qx, qy)
+    assert not sensors.is_on(99.0, 0.0)
+
+
+@pytest.mark.parametrize("is_shifted", [True, False])
+@pytest.mark.parametrize("seed", range(2))
+def test_sensors_see_the_edges_at_every_millisecond(config: Config, seed: int, is_shifted: bool) -> None:
+    """Against the plain question asked at each sample, along drives and turns across seams and over the rim."""
+    mirror = build_mirror(config.mirror)
+    shifted = edges_of(config, mirror, seed) if is_shifted else None
+    rng = np.random.default_rng(seed)
+    fractions = [(k + 1) / 10.0 for k in range(10)]
+    times = [0.001 * (k + 1) for k in range(10)]
+    off = ideal = 0
+    for _ in range(25):
+        centre = mirror.panels[list(mirror.panels)[int(rng.integers(len(mirror.panels)))]]
+        dx, dy = rng.uniform(-1, 1, 2)
+        start = DeckPose(centre.x_m + dx * centre.half_x_m, centre.y_m + dy * centre.half_y_m, rng.uniform(-pi, pi))
+        plant = Plant(mirror.surface, start, wheel_radius_m=0.03, wheel_base_m=0.15, wheel_lag_s=0.08)
+        sensors = EdgeSensors(mirror, OFFSETS, shifted)
+        sensors.place(plant)
+        right, left = rng.uniform(-7, 7, 2)
+        for k in range(150):
+            before = [mirror.body_offset(plant.pose, *o) for o in OFFSETS]
+            plant.step(k * DT_S, DT_S, right, left)
+            after = [mirror.body_offset(plant.pose, *o) for o in OFFSETS]
+            for (_, *values), f in zip(sensors.read(plant, times, fractions), fractions, strict=True):
+                for value, (x0, y0), (x1, y1) in zip(values, before, after, strict=True):
+                    x, y = x0 + f * (x1 - x0), y0 + f * (y1 - y0)
+                    if value != sensors.is_on(x, y):
+                        # Within a nanometre of an edge rounding may decide.
+                        near = [sensors.is_on(x + a, y + b) for a, b in product((-1e-9, 1e-9), repeat=2)]
+                        assert len(set(near)) == 2
+                    off += 1 - value
+                    ideal += value != mirror.is_on_panel(x, y)
+    assert off > 100
+    assert bool(ideal > 10) is is_shifted
+
+
+COUNTS, HZ, FRAME_HZ, LAG_S = 1200, 1000.0, 100.0, 0.08
+QUANTUM_RAD = 2.0 * pi / COUNTS
+
+
+def world_of(config: Config, **values: float) -> WorldConfig:
+    return config.world.model_copy(update=values)
+
+
+def plant_on_deck(mirror: Mirror) -> Plant:
+    start = DeckPose(0.0, 0.0, 0.3)
+    return Plant(mirror.surface, start, wheel_radius_m=0.03, wheel_base_m=0.15, wheel_lag_s=LAG_S)
+
+
+def orders(frames: int) -> list[tuple[float, float]]:
+    """Drives forwards, backwards, turns and stops long enough for the wheels to rest."""
+    rng = np.random.default_rng(4)
+    found: list[tuple[float, float]] = []
+    while len(found) < frames:
+        right, left = rng.uniform(-6.0, 6.0, 2).tolist()
+        found += [(right, left)] * int(rng.integers(5, 60)) + [(0.0, 0.0)] * int(rng.choice([0, 250]))
+    return found[:frames]
+
+
+@pytest.mark.parametrize("hz", [1000.0, 333.0])
+def test_the_sum_of_the_rates_is_the_counted_angle(config: Config, mirror: Mirror, hz: float) -> None:
+    world = world_of(config, encoder_counts_per_rev=COUNTS)
+    plant, encoders = plant_on_deck(mirror), CountingEncoders(world, hz, DT_S, np.random.default_rng(2))
+    phases = np.random.default_rng(2).random(2)
+    times = SampleTimes(hz, FRAME_HZ, LAG_S)
+    sums, turned = np.zeros(2), 0.0
+    for frame, (right, left) in enumerate(orders(4000), start=1):
+        plant.step((frame - 1) * DT_S, DT_S, right, left)
+        times.enter(frame)
+        for _, *rates in encoders.read(plant, times):
+            counts = np.array(rates) / hz / QUANTUM_RAD
+            assert counts == pytest.approx(np.round(counts), abs=1e-9)  # whole counts but for rounding
+            sums += np.array(rates) / hz
+            turned += abs(rates[0]) / hz
+        if times.fractions and times.fractions[-1] == 1.0:
+            angles = np.array([plant.right_angle_rad, plant.left_angle_rad])
+            expected = np.floor(angles / QUANTUM_RAD + phases)
+            # A wheel that rests on the border of two counts may stand on either.
+            fraction = (angles / QUANTUM_RAD + phases) % 1.0
+            sure = (fraction > 1e-6) & (fraction < 1.0 - 1e-6)
+            assert (np.round(sums / QUANTUM_RAD)[sure] == expected[sure]).all()
+    assert turned > 10.0
+
+
+def test_the_counted_angle_is_that_of_the_wheel_at_every_sample(config: Config, mirror: Mirror) -> None:
+    """Against an integration of the servo's equation by many small steps."""
+    world = world_of(config, encoder_counts_per_rev=100_000)
+    plant, encoders = plant_on_deck(mirror), CountingEncoders(world, HZ, DT_S, np.random.default_rng(2))
+    times = SampleTimes(HZ, FRAME_HZ, LAG_S)
+    rate = angle = counted = 0.0
+    small = 1e-5
+    for frame in range(1, 21):
+        set_point = 5.0 if frame <= 10 else -2.0
+        plant.step((frame - 1) * DT_S, DT_S, set_point, 0.0)
+        times.enter(frame)
+        for _, right, left in encoders.read(plant, times):
+            assert left == 0.0
+            for _ in range(100):
+                middle = rate + 0.5 * small * (set_point - rate) / LAG_S
+                angle += small * middle
+                rate += small * (set_point - middle) / LAG_S
+            counted += right / HZ
+            assert counted == pytest.approx(angle, abs=2.0 * 2.0 * pi / 100_000)  # a count, and where the first began
+
+
+def test_the_place_of_the_first_count_is_uniform(config: Config, mirror: Mirror) -> None:
+    """A wheel that turns a third of a count passes one in a third of all robots."""
+    world = world_of(config, encoder_counts_per_rev=COUNTS)
+    plant, times = plant_on_deck(mirror), SampleTimes(HZ, FRAME_HZ, LAG_S)
+    plant.step(0.0, DT_S, 5.0, 5.0)
+    share = plant.right_angle_rad / QUANTUM_RAD
+    share -= floor(share)
+    times.enter(1)
+    passed = []
+    for seed in range(1500):
+        rows = CountingEncoders(world, HZ, DT_S, np.random.default_rng(seed)).read(plant, times)
+        passed.append(
+            round(sum(row[1] for row in rows) / HZ / QUANTUM_RAD) - floor(plant.right_angle_rad / QUANTUM_RAD)
+        )
+    assert set(passed) <= {0, 1}
+    assert np.mean(passed) == pytest.approx(share, abs=4.5 * 0.5 / sqrt(1500))
+
+
+def test_counting_adds_no_white_noise(config: Config, mirror: Mirror) -> None:
+    found = []
+    for sigma in (0.0, 0.5):
+        world = world_of(config, encoder_counts_per_rev=COUNTS, encoder_sigma_rad_s=sigma)
+        plant, encoders = plant_on_deck(mirror), CountingEncoders(world, HZ, DT_S, np.random.default_rng(2))
+        times = SampleTimes(HZ, FRAME_HZ, LAG_S)
+        plant.step(0.0, DT_S, 3.0, 2.0)
+        times.enter(1)
+        found.append(encoders.read(plant, times))
+    assert found[0] == found[1]
+
+
+def test_noise_at_rest_is_that_in_motion(config: Config, mirror: Mirror) -> None:
+    """The short way for wheels that stand takes the same numbers of the stream."""
+    still, moving = plant_on_deck(mirror), plant_on_deck(mirror)
+    moving.step(0.0, DT_S, 1e-12, 1e-12)  # so slow that nothing of it is left after rounding
+    times = SampleTimes(HZ, FRAME_HZ, LAG_S)
+    encoders = [RateEncoders(0.001, np.random.default_rng(2)) for _ in range(2)]
+    for frame in range(1, 700):  # more than two blocks of the stream
+        times.enter(frame)
+        at_rest, in_motion = (e.read(plant, times) for e, plant in zip(encoders, (still, moving), strict=True))
+        assert np.array(at_rest) == pytest.approx(np.array(in_motion), abs=1.5e-7)  # the last digit
+
+
+# -- inertial unit ----------------------------------------------------------------------------------------------------
+
+
+BIASES = {
+    "accelerometer_bias_sigma_m_s2": 0.3,
+    "accelerometer_bias_walk_m_s2_sqrt_s": 0.01,
+    "gyroscope_bias_sigma_rad_s": 0.0175,
+    "gyroscope_bias_walk_rad_s_sqrt_s": 0.003,
+    "gyroscope_scale_sigma": 0.01,
+}
+OFF = dict.fromkeys((*BIASES, "accelerometer_sigma_m_s2", "gyroscope_sigma_rad_s"), 0.0)
+
+
+def readings(config: Config, mirror: Mirror, seed: int, frames: int, **values: float) -> list[tuple[float, float]]:
+    """(ax, wz) of a robot that turns at 0.8 rad/s."""
+    noise, biases = np.random.default_rng(seed).spawn(2)
+    unit = InertialUnit(world_of(config, **{**OFF, **values}), 100.0, noise, biases)
+    plant, times = plant_on_deck(mirror), SampleTimes(100.0, FRAME_HZ, LAG_S)
+    plant.right_rad_s, plant.left_rad_s = 2.0, -2.0
+    plant.step(0.0, DT_S, 2.0, -2.0)
+    found = []
+    for frame in range(1, frames + 1):
+        times.enter(frame)
+        ((_, ax, wz),) = unit.read(plant, times)
+        found.append((ax, wz))
+    return found
+
+
+def test_biases_and_scale_have_their_sigmas(config: Config, mirror: Mirror) -> None:
+    error = 4.5 / sqrt(2 * 800)
+    biases = {key: BIASES[key] for key in ("accelerometer_bias_sigma_m_s2", "gyroscope_bias_sigma_rad_s")}
+    found = np.array([readings(config, mirror, seed, 1, **biases)[0] for seed in range(800)])
+    assert found.std(axis=0) == pytest.approx([0.3, 0.0175], rel=error)
+    assert found.mean(axis=0) == pytest.approx([0.0, 0.8], abs=4.5 * 0.3 / sqrt(800))
+    assert abs(np.corrcoef(found.T)[0, 1]) < 4.5 / sqrt(800)
+    scaled = np.array([readings(config, mirror, seed, 1, gyroscope_scale_sigma=0.01)[0] for seed in range(800)])
+    assert (scaled[:, 1] / 0.8).std() == pytest.approx(0.01, rel=error)
+    assert (scaled[:, 0] == 0.0).all()
+
+
+def test_biases_walk(config: Config, mirror: Mirror) -> None:
+    walks = {key: value for key, value in BIASES.items() if "walk" in key}
+    ends = np.array([readings(config, mirror, seed, 100, **walks)[-1] for seed in range(400)])
+    assert ends.std(axis=0) == pytest.approx([0.01, 0.003], rel=4.5 / sqrt(2 * 400))  # one second
+    assert ends.mean(axis=0) == pytest.approx([0.0, 0.8], abs=4.5 * 0.01 / sqrt(400))
+
+
+@pytest.mark.parametrize("key", [*BIASES, "accelerometer_sigma_m_s2", "gyroscope_sigma_rad_s"])
+def test_each_error_of_the_inertial_unit_is_switched_off_by_itself(config: Config, mirror: Mirror, key: str) -> None:
+    """Errors add up, but for the scale, which multiplies only the true rate: none changes the draws of another."""
+    every = {**BIASES, "accelerometer_sigma_m_s2": 0.0059, "gyroscope_sigma_rad_s": 0.0087}
+    whole = np.array(readings(config, mirror, 3, 30, **every))
+    without = np.array(readings(config, mirror, 3, 30, **{**every, key: 0.0}))
+    alone = np.array(readings(config, mirror, 3, 30, **{key: every[key]}))
+    nothing = np.array(readings(config, mirror, 3, 30))
+    assert whole - without == pytest.approx(alone - nothing, abs=3e-7)  # readings are rounded to 1e-7
+    assert np.abs(whole - without).max() > 1e-4

@@ -7,9 +7,7 @@ import pytest
 from ccatp.cli import main
 from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
-from ccatp.sim.fault_models import LINK_TYPES, TYPES, Intermittent
-from ccatp.sim.fault_plan import FaultPlan, check_pacing, parse_plan
-from ccatp.sim.ground_truth import read_plan
+from ccatp.sim.fault_plan import LINK_TYPES, TYPES, FaultPlan, Intermittent, check_pacing, parse_plan, read_plan
 
 FAULT = '[[fault]]\nsignal = "imu_wz"\nat_s = 1.0\n'
 LINK = "[[link]]\nat_s = 1.0\n"

@@ -10,9 +10,8 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.sim.fault_effects import make_sensor_fault
-from ccatp.sim.fault_models import SIGNALS, TYPES, Drift, Injected
-from ccatp.sim.fault_plan import FaultPlan, parse_plan
+from ccatp.sim.fault_injector import make_sensor_fault
+from ccatp.sim.fault_plan import SIGNALS, TYPES, Drift, FaultPlan, Injected, parse_plan
 from ccatp.sim.robot import Robot
 
 

@@ -12,9 +12,8 @@ from ccatp.config.models import Config
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import MAX_LINE_BYTES
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.sim.fault_effects import make_sensor_fault
-from ccatp.sim.fault_models import SENSOR_SIGNALS, TYPES
-from ccatp.sim.fault_plan import FaultPlan, parse_plan
+from ccatp.sim.fault_injector import make_sensor_fault
+from ccatp.sim.fault_plan import SENSOR_SIGNALS, TYPES, FaultPlan, parse_plan
 from ccatp.sim.robot import Robot
 
 PLACES = {

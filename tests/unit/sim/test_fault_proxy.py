@@ -1,14 +1,18 @@
-"""Every fault of the proxy, observed on both ends of loopback connections."""
+"""Faults of the proxy: of connections on both ends of loopback connections, of lines without sockets."""
 
 import asyncio
 import contextlib
+import random
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from typing import Any
 
 import pytest
 
-from ccatp.sim import network_faults as pipe
-from ccatp.sim.fault_proxy import FaultProxy
+from ccatp.sim import fault_proxy
+from ccatp.sim.fault_plan import LINK_TYPES
+from ccatp.sim.fault_proxy import FaultProxy, LineStage, OneWayFaults
 
 DEADLINE_S = 5.0  # what never happens in a good run may take this long in a bad one
 LINES = [b"line %d of some length\n" % k for k in range(40)]
@@ -169,7 +173,7 @@ async def test_close_ends_both_sides_in_order() -> None:
 async def test_close_over_bytes_on_their_way_is_no_reset() -> None:
     async with rig() as r:
         reader, writer = await r.connect()
-        r.proxy.stall("to_server")
+        r.proxy.begin("stall", "to_robot")
         writer.write(TEXT)
         await passes(lambda: r.proxy.counts["stall"] > 0)
         writer.write(TEXT)
@@ -185,7 +189,7 @@ async def test_close_over_bytes_on_their_way_is_no_reset() -> None:
 async def test_a_black_hole_one_way_swallows_data_and_the_end() -> None:
     async with rig() as r:
         reader, writer = await r.connect()
-        r.proxy.black_hole("to_server")
+        r.proxy.begin("black_hole", "to_robot")
         writer.write(TEXT)
         r.server.writers[0].write(b"still here\n")
         assert await read(reader, 11) == b"still here\n"  # the other way is open
@@ -195,7 +199,7 @@ async def test_a_black_hole_one_way_swallows_data_and_the_end() -> None:
         assert await read(reader, 10) == b"half-open\n"
         assert r.server.pieces == []
         assert r.server.ends == []
-        r.proxy.heal("to_server")
+        r.proxy.heal("to_robot")
         await r.server.until(lambda: r.server.ends == ["FIN"])  # now it knows
         assert r.server.pieces == []
 
@@ -203,7 +207,7 @@ async def test_a_black_hole_one_way_swallows_data_and_the_end() -> None:
 async def test_a_black_hole_both_ways_swallows_both_and_a_reset_ends_it() -> None:
     async with rig() as r:
         reader, writer = await r.connect()
-        r.proxy.black_hole("both")
+        r.proxy.begin("black_hole", "both")
         writer.write(TEXT)
         r.server.writers[0].write(TEXT)
         await passes(lambda: r.proxy.counts["black_hole"] == 2 * len(TEXT))
@@ -216,7 +220,7 @@ async def test_a_black_hole_both_ways_swallows_both_and_a_reset_ends_it() -> Non
 async def test_a_stall_ends_in_one_burst() -> None:
     async with rig() as r:
         reader, writer = await r.connect()
-        r.proxy.stall("to_server")
+        r.proxy.begin("stall", "to_robot")
         for line in LINES:
             writer.write(line)
             await writer.drain()
@@ -224,7 +228,7 @@ async def test_a_stall_ends_in_one_burst() -> None:
         r.server.writers[0].write(b"other way\n")
         assert await read(reader, 10) == b"other way\n"
         assert r.server.pieces == []
-        r.proxy.heal("to_server", "stall")
+        r.proxy.heal("to_robot", "stall")
         await r.server.until(lambda: r.server.text == TEXT)
         assert r.server.pieces == [TEXT]
         assert r.proxy.counts["stall"] >= 1
@@ -233,7 +237,7 @@ async def test_a_stall_ends_in_one_burst() -> None:
 async def test_a_delay_with_jitter_keeps_the_order_and_takes_its_time() -> None:
     async with rig() as r:
         _, writer = await r.connect()
-        r.proxy.delay("to_server", 0.05, 0.02)
+        r.proxy.begin("delay", "to_robot", delay_s=0.05, jitter_s=0.02)
         clock = asyncio.get_running_loop().time
         start_s = clock()
         for line in LINES:
@@ -246,51 +250,11 @@ async def test_a_delay_with_jitter_keeps_the_order_and_takes_its_time() -> None:
         assert r.proxy.counts["delay"] >= 1
 
 
-async def test_lines_are_reordered() -> None:
-    async with rig() as r:
-        _, writer = await r.connect()
-        r.proxy.reorder("to_server", every=4)
-        writer.write(TEXT)
-        await r.server.until(lambda: len(r.server.text) == len(TEXT))
-        lines = r.server.text.splitlines(keepends=True)
-        assert lines != LINES
-        assert sorted(lines) == sorted(LINES)
-        assert lines[:5] == [LINES[0], LINES[1], LINES[2], LINES[4], LINES[3]]
-        assert r.proxy.counts["reorder"] == 8
-
-
-async def test_a_withheld_line_is_not_lost_when_it_is_over() -> None:
-    async with rig() as r:
-        _, writer = await r.connect()
-        r.proxy.reorder("to_server", every=2)
-        writer.write(LINES[0] + LINES[1])
-        await r.server.until(lambda: r.server.text == LINES[0])
-        r.proxy.heal()
-        writer.write(LINES[2])
-        await r.server.until(lambda: r.server.text == LINES[0] + LINES[2] + LINES[1])
-        r.proxy.reorder("to_server", every=1)
-        writer.write(LINES[3])
-        writer.close()
-        await r.server.until(lambda: r.server.ends == ["FIN"])
-        assert r.server.text.endswith(LINES[3])
-
-
-async def test_lines_are_duplicated() -> None:
-    async with rig() as r:
-        _, writer = await r.connect()
-        r.proxy.duplicate("to_server", every=10)
-        writer.write(TEXT)
-        await r.server.until(lambda: len(r.server.text.splitlines()) == 44)
-        lines = r.server.text.splitlines(keepends=True)
-        assert lines[9] == lines[10] == LINES[9]
-        assert r.proxy.counts["duplicate"] == 4
-
-
 @pytest.mark.parametrize("size", [1, 7])
 async def test_fragments_are_the_same_bytes_in_many_writes(size: int) -> None:
     async with rig() as r:
         reader, _ = await r.connect()
-        r.proxy.fragment("to_client", size)
+        r.proxy.begin("fragment", "to_client", write_bytes=size)
         r.server.writers[0].write(TEXT)
         assert await read(reader, len(TEXT)) == TEXT
         assert r.proxy.counts["fragment"] == -(-len(TEXT) // size)
@@ -299,7 +263,7 @@ async def test_fragments_are_the_same_bytes_in_many_writes(size: int) -> None:
 async def test_a_flood_of_garbage_comes_between_whole_lines() -> None:
     async with rig() as r:
         reader, _ = await r.connect()
-        r.proxy.flood("to_client", 2000.0, "garbage")
+        r.proxy.begin("flood", "to_client", rate_hz=2000.0, lines="garbage")
         found: list[bytes] = []
         async with asyncio.timeout(DEADLINE_S):
             for line in LINES:
@@ -315,91 +279,24 @@ async def test_a_flood_of_garbage_comes_between_whole_lines() -> None:
         r.proxy.heal()
 
 
-async def test_a_flood_of_copies_looks_valid() -> None:
-    async with rig() as r:
-        reader, _ = await r.connect()
-        r.proxy.flood("to_client", 2000.0, "copies")
-        r.server.writers[0].write(LINES[7])
-        async with asyncio.timeout(DEADLINE_S):
-            while await reader.readline() != LINES[7]:
-                pass
-            assert {await reader.readline() for _ in range(50)} == {LINES[7]}
-
-
-async def test_slowloris_writes_single_bytes() -> None:
-    async with rig() as r:
-        _, writer = await r.connect()
-        r.proxy.slowloris("to_server", 1000.0)
-        writer.write(LINES[0])
-        await r.server.until(lambda: r.server.text == LINES[0])
-        assert len(r.server.pieces) > 5
-        assert r.proxy.counts["slowloris"] == len(LINES[0])
-
-
 async def test_slowloris_that_is_over_lets_the_rest_go() -> None:
     async with rig() as r:
         _, writer = await r.connect()
-        r.proxy.slowloris("to_server", 20.0)
+        r.proxy.begin("slowloris", "to_robot", bytes_per_s=20.0)
         writer.write(TEXT)
         await r.server.until(lambda: bool(r.server.pieces))
         r.proxy.heal()
         await r.server.until(lambda: r.server.text == TEXT)  # at 20 bytes a second it would take 48 s
 
 
-async def test_garbage_comes_as_lines_of_its_own() -> None:
-    async with rig() as r:
-        _, writer = await r.connect()
-        r.proxy.garbage("to_server", garbage_bytes=30, every=5)
-        writer.write(TEXT)
-        await r.server.until(lambda: len(r.server.text) == len(TEXT) + 8 * 31)
-        lines = r.server.text.split(b"\n")[:-1]
-        assert [line + b"\n" for line in lines if line + b"\n" in LINES] == LINES
-        assert [len(line) for line in lines if line + b"\n" not in LINES] == [30] * 8
-        assert r.proxy.counts["garbage"] == 8
-
-
-async def test_one_byte_of_a_line_is_corrupted() -> None:
-    texts = []
-    for seed in (1, 1, 2):
-        async with rig(seed) as r:
-            _, writer = await r.connect()
-            r.proxy.corrupt("to_server", every=8)
-            writer.write(TEXT)
-            await r.server.until(lambda: len(r.server.text) == len(TEXT))
-            lines = r.server.text.split(b"\n")[:-1]
-            wrong = [k for k, line in enumerate(lines) if line + b"\n" != LINES[k]]
-            assert wrong == [7, 15, 23, 31, 39]
-            assert all(sum(a != b for a, b in zip(lines[k] + b"\n", LINES[k], strict=True)) == 1 for k in wrong)
-            assert r.proxy.counts["corrupt"] == 5
-            texts.append(r.server.text)
-    assert texts[0] == texts[1]  # of the seed
-    assert texts[0] != texts[2]
-
-
-async def test_an_empty_line_cannot_be_corrupted() -> None:
-    async with rig() as r:
-        _, writer = await r.connect()
-        r.proxy.corrupt("to_server", every=1)
-        writer.write(b"\n\n")
-        await r.server.until(lambda: r.server.text == b"\n\n")
-
-
-async def test_lines_end_in_lf_alone() -> None:
-    async with rig() as r:
-        _, writer = await r.connect()
-        r.proxy.duplicate("to_server", every=1)
-        writer.write(b"a\rb\r\n")
-        await r.server.until(lambda: r.server.text == b"a\rb\r\na\rb\r\n")
-
-
 async def test_heal_ends_one_fault_in_one_direction() -> None:
     async with rig() as r:
         r.server.is_echo = True
         reader, writer = await r.connect()
-        r.proxy.duplicate("both", every=1)
-        r.proxy.garbage("to_server", garbage_bytes=3, every=1)
+        r.proxy.begin("duplicate", "both", every=1)
+        r.proxy.begin("garbage", "to_robot", garbage_bytes=3, every=1)
         r.proxy.heal("to_client", "duplicate")
-        r.proxy.heal("to_server", "garbage")
+        r.proxy.heal("to_robot", "garbage")
         writer.write(LINES[0])
         assert await read(reader, 2 * len(LINES[0])) == 2 * LINES[0]
         r.proxy.heal()
@@ -409,11 +306,11 @@ async def test_heal_ends_one_fault_in_one_direction() -> None:
 
 
 async def test_who_does_not_take_is_felt_by_who_sends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipe, "MAX_WAITING_BYTES", 1 << 16)
+    monkeypatch.setattr(fault_proxy, "MAX_WAITING_BYTES", 1 << 16)
     blocks = 64
     async with rig() as r:
         _, writer = await r.connect()
-        r.proxy.stall("to_server")
+        r.proxy.begin("stall", "to_robot")
 
         async def send() -> None:
             for _ in range(blocks):
@@ -426,3 +323,68 @@ async def test_who_does_not_take_is_felt_by_who_sends(monkeypatch: pytest.Monkey
         r.proxy.heal()
         await sending
         await r.server.until(lambda: sum(map(len, r.server.pieces)) == blocks << 18)
+
+
+def stage(seed: int = 1, **faults: dict[str, Any]) -> tuple[LineStage, OneWayFaults, Counter[str]]:
+    switched: OneWayFaults = {}
+    for name, keys in faults.items():
+        switched[LINK_TYPES[name]] = LINK_TYPES[name].model_validate({"type": name, "direction": "both", **keys})
+    counts: Counter[str] = Counter()
+    return LineStage(switched, counts, random.Random(seed)), switched, counts
+
+
+def out(line_stage: LineStage, *lines: bytes) -> list[bytes]:
+    return [piece for line in lines for piece in line_stage.feed(line)]
+
+
+def test_lines_are_reordered_and_none_is_lost() -> None:
+    line_stage, faults, counts = stage(reorder={"every": 4})
+    assert out(line_stage, *LINES[:6]) == [*LINES[:3], LINES[4], LINES[3], LINES[5]]
+    assert out(line_stage, *LINES[6:9]) == LINES[6:8]  # the last one is withheld
+    faults.clear()
+    assert out(line_stage, LINES[9]) == [LINES[9] + LINES[8]]
+    faults.update(stage(reorder={"every": 9})[1])
+    assert out(line_stage, LINES[10]) == []
+    assert line_stage.finish() == LINES[10]
+    assert counts == {"reorder": 3}
+
+
+def test_lines_are_duplicated_and_end_in_lf_alone() -> None:
+    line_stage, _, counts = stage(duplicate={"every": 2})
+    assert out(line_stage, b"a\rb\r\nc", b"\nd\n") == [b"a\rb\r\n", b"c\n", b"c\n", b"d\n"]
+    assert counts == {"duplicate": 1}
+
+
+def test_garbage_comes_as_lines_of_its_own() -> None:
+    line_stage, _, counts = stage(garbage={"garbage_bytes": 30, "every": 5})
+    found = out(line_stage, TEXT)
+    assert [line for line in found if line in LINES] == LINES
+    assert [len(line) for line in found if line not in LINES] == [31] * 8
+    assert all(line.count(b"\n") == 1 for line in found)
+    assert counts == {"garbage": 8}
+
+
+def test_one_byte_of_a_line_is_corrupted() -> None:
+    texts = []
+    for seed in (1, 1, 2):
+        line_stage, _, counts = stage(seed, corrupt={"every": 8})
+        found = out(line_stage, TEXT)
+        wrong = [k for k, line in enumerate(found) if line != LINES[k]]
+        assert wrong == [7, 15, 23, 31, 39]
+        assert all(sum(a != b for a, b in zip(found[k], LINES[k], strict=True)) == 1 for k in wrong)
+        assert all(line.endswith(b"\n") and line.count(b"\n") == 1 for line in found)
+        assert counts == {"corrupt": 5}
+        texts.append(found)
+    assert texts[0] == texts[1]  # of the seed
+    assert texts[0] != texts[2]
+    assert out(stage(corrupt={"every": 1})[0], b"\n\n") == [b"\n", b"\n"]  # an empty line stays
+
+
+def test_a_flood_is_of_garbage_or_of_copies() -> None:
+    line_stage, _, _ = stage(flood={"rate_hz": 1.0, "lines": "copies"})
+    assert len(line_stage.flood_line()) == 65  # nothing has passed that could be copied
+    out(line_stage, LINES[7])
+    assert line_stage.flood_line() == LINES[7]
+    line_stage, _, _ = stage(flood={"rate_hz": 1.0, "lines": "garbage"})
+    out(line_stage, LINES[7])
+    assert line_stage.flood_line() != LINES[7]

@@ -13,8 +13,7 @@ from ccatp.config.load import load_config
 from ccatp.dataloop import serve
 from ccatp.links.robot_link import RobotLink
 from ccatp.links.robot_messages import Sensors
-from ccatp.sim.fault_models import LINK_TYPES, LOCKSTEP_TYPES
-from ccatp.sim.fault_plan import parse_plan
+from ccatp.sim.fault_plan import LINK_TYPES, LOCKSTEP_TYPES, parse_plan
 
 DEADLINE_S = 20.0
 
