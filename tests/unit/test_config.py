@@ -169,25 +169,20 @@ def test_several_faults_are_all_listed_and_the_first_one_told(tmp_path: Path) ->
     ]
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none.toml: no such file or directory; name a TOML file that exists"):
-        load_config(tmp_path / "none.toml")
-
-
-def test_a_folder_is_no_file(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="is a directory; name a TOML file"):
-        load_config(tmp_path)
-
-
-def test_a_file_in_another_encoding_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "latin.toml").write_bytes('[run]\nmirror = "Mirör"'.encode("latin-1"))
-    with pytest.raises(ConfigError, match=r"is not UTF-8 text \(byte 19\)"):
-        load_config(tmp_path / "latin.toml")
-
-
-def test_an_unfinished_file_points_to_its_end(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"mine.toml:2: is not TOML: "):
-        load_config(write(tmp_path / "mine.toml", "[run]\nseed ="))
+@pytest.mark.parametrize(
+    ("name", "content", "what"),
+    [
+        ("none.toml", None, r"none.toml: no such file or directory; name a TOML file that exists"),
+        ("", None, "is a directory; name a TOML file"),
+        ("latin.toml", '[run]\nmirror = "Mirör"'.encode("latin-1"), r"is not UTF-8 text \(byte 19\)"),
+        ("mine.toml", b"[run]\nseed =", r"mine.toml:2: is not TOML: "),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, name: str, content: bytes | None, what: str) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(ConfigError, match=what):
+        load_config(tmp_path / name)
 
 
 def test_the_schema_allows_what_the_loader_allows(tmp_path: Path) -> None:
@@ -205,27 +200,31 @@ def test_the_default_file_says_unit_or_source_of_each_number() -> None:
     assert "UNVERIFIED" in text
 
 
-@pytest.mark.parametrize("system", ["zigbee", "follow"])
-def test_shipped_files_are_valid_and_name_their_system(system: str) -> None:
+@pytest.mark.parametrize("system", ["zigbee", "follow", "cricket"])
+def test_each_system_has_a_file_and_loads_back_equal(tmp_path: Path, system: str) -> None:
     file = configs_dir() / f"{system}.toml"
     assert load_radio_config(file).system == system
     assert is_radio_file(file)
     assert not is_radio_file(configs_dir() / "ccatp.toml")
+    cfg = load_radio_config(None, {"system": system, "run.seed": 7})
+    assert load_radio_config(write(tmp_path / "config.toml", dump_config(cfg))) == cfg
+    assert len(cfg.cricket.networks) == 6
 
 
-def test_dump_loads_back_equal(tmp_path: Path) -> None:
-    cfg = load_radio_config(None, {"system": "follow", "run.seed": 7})
-    (tmp_path / "config.toml").write_text(dump_config(cfg))
-    assert load_radio_config(tmp_path / "config.toml") == cfg
-
-
-def test_beacons_of_a_file_replace_all_and_one_of_the_command_line_is_moved(tmp_path: Path) -> None:
-    file = tmp_path / "mine.toml"
-    file.write_text('system = "zigbee"\n[sim.beacons]\nsole = { x_m = 1.0, y_m = 2.0, reference_dbm = -40.0 }\n')
-    assert list(load_radio_config(file).sim.beacons) == ["sole"]
+def test_what_a_file_lists_replaces_all_and_one_of_the_command_line_is_moved(tmp_path: Path) -> None:
+    beacons = "[sim.beacons]\nsole = { x_m = 1.0, y_m = 2.0, reference_dbm = -40.0 }\n"
+    assert list(load_radio_config(write(tmp_path / "mine.toml", f'system = "zigbee"\n{beacons}')).sim.beacons) == [
+        "sole"
+    ]
     moved = load_radio_config(None, {"sim.beacons.beacon2.x_m": 0.5}).sim.beacons
     assert len(moved) == 4
     assert (moved["beacon2"].x_m, moved["beacon2"].y_m) == (0.5, 3.0)
+    stands = "P = { place_m = [0.0, 0.0], facing = [1.0, 0.0] }\nQ = { place_m = [4.0, 0.0], facing = [-1.0, 0.0] }\n"
+    file = write(tmp_path / "hall.toml", f'system = "cricket"\n[cricket.networks]\n{stands}')
+    assert list(load_radio_config(file).cricket.networks) == ["P", "Q"]
+    file = write(tmp_path / "one.toml", f'system = "cricket"\n[cricket.networks]\n{stands.splitlines()[0]}\n')
+    with pytest.raises(ConfigError, match="networks has 1; phase 1 goes from one network to the next"):
+        load_radio_config(file)
 
 
 @pytest.mark.parametrize(
@@ -247,38 +246,15 @@ def test_beacons_of_a_file_replace_all_and_one_of_the_command_line_is_moved(tmp_
         ({"control.fuzzy.inputs.distance_m.terms.near": [1.0, 0.0, 2.0, 3.0]}, "must rise"),
     ],
 )
-def test_one_line_says_what_is_wrong(keys: dict[str, object], message: str) -> None:
+def test_a_mistake_among_beacons_is_one_line(keys: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_radio_config(None, keys)
 
 
-def test_a_base_file_without_a_system_is_told(tmp_path: Path) -> None:
-    (tmp_path / "radio.toml").write_text("[run]\nseed = 1\n")
+def test_a_base_file_without_a_system_is_refused(tmp_path: Path) -> None:
+    write(tmp_path / "radio.toml", "[run]\nseed = 1\n")
     with pytest.raises(ConfigError, match="system is missing"):
         load_radio_config(None, None, tmp_path)
-
-
-def problem(**keys: Any) -> str:
-    dotted = {f"cricket.{name.replace('__', '.')}": value for name, value in keys.items()}
-    with pytest.raises(ConfigError) as caught:
-        load_radio_config(None, {"system": "cricket", **dotted})
-    return str(caught.value)
-
-
-def test_the_shipped_field_comes_back_from_a_run(tmp_path: Path) -> None:
-    cfg = load_radio_config(None, {"system": "cricket"})
-    (tmp_path / "config.toml").write_text(dump_config(cfg))
-    assert load_radio_config(tmp_path / "config.toml") == cfg
-    assert len(cfg.cricket.networks) == 6
-
-
-def test_a_file_with_networks_of_its_own_has_no_others(tmp_path: Path) -> None:
-    path = tmp_path / "hall.toml"
-    path.write_text(
-        'system = "cricket"\n[cricket.networks]\nP = { place_m = [0.0, 0.0], facing = [1.0, 0.0] }\n'
-        "Q = { place_m = [4.0, 0.0], facing = [-1.0, 0.0] }\n"
-    )
-    assert list(load_radio_config(path).cricket.networks) == ["P", "Q"]
 
 
 @pytest.mark.parametrize(
@@ -290,25 +266,24 @@ def test_a_file_with_networks_of_its_own_has_no_others(tmp_path: Path) -> None:
         ({"stand_m": [[0.0, 0.0, 0.0]] * 3}, "cricket.stand_m[0] has 3 coordinates, cricket.dimension = 2 asks for 2"),
         ({"anchors": {"C": [0.0, 1.0]}}, "cricket.anchors has 3 motes, not 2: the origin and the axis"),
         ({"anchors": {"A": [0.0, 1.0, 2.0]}}, "cricket.anchors.A has 3 coordinates"),
-        ({"layout": "random", "random__size_m": [1.0, 2.0, 3.0]}, "cricket.random.size_m has 3 coordinates"),
-        ({"networks__N1__facing": [0.0, 0.0]}, "cricket.networks.N1.facing is no direction: all its parts are 0"),
-        ({"networks__N1__place_m": [0.0, 0.0, 1.0]}, "cricket.networks.N1.place_m has 3 coordinates"),
-        ({"transducer__reach_m": [1.0, 2.0]}, "cricket.transducer.reach_m has 2 values for 5 angles"),
-        ({"transducer__off_axis_rad": [0.1, 0.2, 0.3, 0.4, 0.5]}, "must begin with 0 and rise"),
-        ({"phase2__pairs": "few"}, "cricket.phase2.pairs = \"few\" must be 'zigzag', 'adjacent' or 'all'"),
+        ({"layout": "random", "random.size_m": [1.0, 2.0, 3.0]}, "cricket.random.size_m has 3 coordinates"),
+        ({"networks.N1.facing": [0.0, 0.0]}, "cricket.networks.N1.facing is no direction: all its parts are 0"),
+        ({"networks.N1.place_m": [0.0, 0.0, 1.0]}, "cricket.networks.N1.place_m has 3 coordinates"),
+        ({"transducer.reach_m": [1.0, 2.0]}, "cricket.transducer.reach_m has 2 values for 5 angles"),
+        ({"transducer.off_axis_rad": [0.1, 0.2, 0.3, 0.4, 0.5]}, "must begin with 0 and rise"),
+        (
+            {"phase1.draws": 3},
+            "cricket.phase1.draws = 3 give no covariance of dozens of coordinates; 0, or 200 at least",
+        ),
+        ({"phase2.pairs": "few"}, "cricket.phase2.pairs = \"few\" must be 'zigzag', 'adjacent' or 'all'"),
     ],
 )
-def test_what_is_wrong_is_one_line(keys: dict[str, Any], what: str) -> None:
-    found = problem(**keys)
-    assert what in found
-    assert "\n" not in found
-
-
-def test_a_field_of_one_stand(tmp_path: Path) -> None:
-    path = tmp_path / "one.toml"
-    path.write_text('system = "cricket"\n[cricket.networks]\nP = { place_m = [0.0, 0.0], facing = [1.0, 0.0] }\n')
-    with pytest.raises(ConfigError, match="networks has 1; phase 1 goes from one network to the next"):
-        load_radio_config(path)
+def test_a_mistake_about_motes_is_one_line(keys: dict[str, Any], what: str) -> None:
+    dotted = {f"cricket.{name}": value for name, value in keys.items()}
+    with pytest.raises(ConfigError) as caught:
+        load_radio_config(None, {"system": "cricket", **dotted})
+    assert what in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 FOLDER = Path(__file__).parents[1] / "configs"
