@@ -94,11 +94,7 @@ def decode_key(text: str | bytes) -> bytes:
 
 
 def parse_clients(text: str) -> Clients:
-    """The clients in the text of a list, which may be empty.
-
-    Raises:
-        BadAccess: not TOML, or not of the form above; no entry of such a list counts.
-    """
+    """The clients in the text of a list, which may be empty; ``BadAccess`` where any entry is not of the form above."""
     try:
         tree = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting

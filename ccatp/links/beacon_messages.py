@@ -81,11 +81,7 @@ _encoder = msgspec.json.Encoder()
 
 
 def decode_beacon_frame(line: bytes) -> BeaconFrame:
-    """The extra keys in a line that has passed as ``sensors``.
-
-    Raises:
-        BadLine: a value of theirs is of the wrong type or out of range.
-    """
+    """The extra keys in a line that has passed as ``sensors``; ``BadLine`` for a wrong type or range."""
     try:
         return _decoder.decode(line)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:

@@ -139,11 +139,7 @@ class OperatorClient:
     def wait(
         self, is_there: Callable[[MissionStatus], bool], timeout_s: float, period_s: float = PERIOD_S
     ) -> MissionStatus:
-        """Poll the status until a condition holds.
-
-        Raises:
-            StillWaiting: it does not hold in time; the daemon continues.
-        """
+        """Poll the status until a condition holds; ``StillWaiting`` where it does not in time."""
         deadline_s = time.monotonic() + timeout_s
         while not is_there(status := self.status()):
             left_s = deadline_s - time.monotonic()
@@ -177,11 +173,9 @@ def exchange(
     *,
     repeats: bool = False,
 ) -> dict[str, Any]:
-    """One request and its answer; ``curve`` and ``repeats`` as of ``ccatp.links.rpc.request``.
+    """One request and its answer, as by ``ccatp.links.rpc.request``; ``RefusedError`` where the daemon refuses.
 
-    Raises:
-        RequestFailed: no answer in time, or the answer to an emergency does not confirm that it is in force.
-        RefusedError: the daemon refuses, with its reason.
+    An answer to an emergency that does not confirm that it is in force is a ``RequestFailed``.
     """
     reply = request(endpoint, json.dumps(payload).encode(), timeout_s, curve, repeats=repeats)
     if reply.get("ok") is not True:

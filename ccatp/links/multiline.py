@@ -139,7 +139,7 @@ def parse_request(line: bytes) -> MultilineRequest:
     """Read one line of a client.
 
     Raises:
-        BadRequest: unknown name, arguments where none belong, or channels that are not 1 to 32, each once.
+        BadMultilineRequest: unknown name, arguments where none belong, or channels that are not 1 to 32, each once.
     """
     name, *arguments = line.decode("ascii", "replace").split(",")
     try:
@@ -171,11 +171,7 @@ def format_reply(reply: Reply) -> bytes:
 
 
 def parse_reply(line: bytes) -> Reply:
-    """Read one line of a server, without its CR LF.
-
-    Raises:
-        BadReply: anything that the grammar does not allow; the whole line is refused then.
-    """
+    """Read one line of a server, without its CR LF; ``BadReply`` for anything that the grammar does not allow."""
     text = line.decode("ascii", "replace")
     name, separator, payload = text.partition("_")
     try:

@@ -97,13 +97,12 @@ class DisplayState(Message):
 
 
 class RobotShape(msgspec.Struct, omit_defaults=True):
-    """One thing on the map, in the plane of the pose.
+    """One thing on the map, in the plane of the pose; it has the same ``id`` in the next message.
 
     Attributes:
-        id: the same thing has the same one in the next message.
         kind: how it looks: ``beacon``, ``obstacle``, ``target``, ``robot``, ``trail``; a display draws others plainly.
         covariance_m2: of x and y: xx, xy, yy; drawn as its ellipse.
-        outline_m: for what is neither: a line, closed where the first point comes again.
+        outline_m: a line, closed where the first point comes again.
     """
 
     id: str

@@ -46,19 +46,12 @@ class PuckSource(Protocol):
     """Source of the true position of the puck."""
 
     async def puck(self) -> PuckTruth:
-        """The puck now.
-
-        Raises:
-            TruthUnavailable: it cannot be had.
-        """
+        """The puck now; ``TruthUnavailable`` where it cannot be had."""
 
 
 @dataclass(slots=True)
 class FixedPuck:
-    """A puck that stands still, world frame; attributes may be changed.
-
-    ``step_s`` passes between two queries, for fresh noise.
-    """
+    """A puck that stands still, world frame; ``step_s`` passes between two queries, for fresh noise."""
 
     position_m: Vector3
     t_s: float = 0.0
@@ -87,11 +80,7 @@ class ZmqPuck:
         self._context = zmq.asyncio.Context()
 
     async def puck(self) -> PuckTruth:
-        """The puck now, by a socket of its own: a REQ socket that lost its reply is stuck.
-
-        Raises:
-            TruthUnavailable: no reply in time, or one that is not of the form above.
-        """
+        """The puck now, by a socket of its own: a REQ socket that lost its reply is stuck."""
         try:
             async with asyncio.timeout(self._timeout_s):
                 with self._context.socket(zmq.REQ) as peer:

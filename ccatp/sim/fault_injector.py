@@ -355,12 +355,7 @@ def _put(row: Row, columns: tuple[int, ...], values: tuple[Any, ...]) -> Row:
 
 
 class Outgoing(NamedTuple):
-    """What leaves the robot at one instant.
-
-    Attributes:
-        line: its bytes; none, one or several lines.
-        message: the newest frame in them that a client can take, if there is one.
-    """
+    """What leaves the robot at one instant: none, one or several lines, and the newest frame that a client can take."""
 
     line: bytes
     message: Sensors | None

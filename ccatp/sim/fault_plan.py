@@ -35,12 +35,7 @@ _AX_M_S2, _WZ_RAD_S, _WHEEL_RAD_S = 19.6, 34.9, 16.0
 
 
 class Signal(NamedTuple):
-    """Where a signal stands.
-
-    Attributes:
-        columns: places in a row, the time being place 0.
-        is_binary: it is 0 or 1.
-    """
+    """Where a signal stands: its rows, its places in a row (the time being place 0), its range."""
 
     rows: str
     columns: tuple[int, ...]
@@ -66,11 +61,7 @@ SENSOR_SIGNALS = tuple(SIGNALS)
 
 
 class InjectedFault(Model):
-    """A fault of the simulated robot.
-
-    Attributes:
-        at_s: when it begins: robot time since the first boot.
-    """
+    """A fault of the simulated robot; ``at_s`` is robot time since the first boot."""
 
     signal: str
     type: str
@@ -261,12 +252,7 @@ TYPES: dict[str, dict[str, type[InjectedFault]]] = {
 
 
 class LinkFault(Model):
-    """A fault of the link.
-
-    Attributes:
-        at_s: robot time at which it begins; or else
-        after_lines, after_bytes: it begins once so much has gone to the clients, counted over all connections.
-    """
+    """A fault of the link; it begins at a robot time, or once so much has gone to all clients."""
 
     type: str
     at_s: NonNegative | None = None
@@ -386,22 +372,14 @@ class Injected(NamedTuple):
 
 
 class FaultPlan(NamedTuple):
-    """What shall go wrong in a run.
-
-    Attributes:
-        faults: of the simulated robot, in the order of the file, which is that of their application.
-    """
+    """What shall go wrong in a run; the robot's faults in the order of the file, which is that of their application."""
 
     faults: tuple[InjectedFault, ...] = ()
     link: tuple[LinkFault, ...] = ()
 
 
 def parse_plan(text: str, name: str) -> FaultPlan:
-    """The plan in a text.
-
-    Raises:
-        ConfigError: one line per problem with file, line, key, what is wrong and what to do.
-    """
+    """The plan in a text; a ``ConfigError`` has a line per problem with file, line, key, what is wrong, what to do."""
     try:
         tree = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
@@ -433,11 +411,7 @@ def read_plan(file: Path, *, lockstep: bool) -> FaultPlan:
 
 
 def check_pacing(plan: FaultPlan, name: str, *, lockstep: bool) -> None:
-    """Refuse faults of the link that make no sense in lockstep.
-
-    Raises:
-        ConfigError: there is one.
-    """
+    """Refuse faults of the link that make no sense in lockstep, with a ``ConfigError``."""
     if not lockstep:
         return
     problems = [

@@ -19,12 +19,7 @@ from ccatp.sim.radio import TruePose
 
 @dataclass(frozen=True, slots=True)
 class TrueMotes:
-    """The motes as they are.
-
-    Attributes:
-        positions_m: shape (n, d).
-        facings: unit vectors, shape (n, d); zero where a mote is turned to its peer.
-    """
+    """Positions and unit vectors of facing, shape (n, d); a facing is zero where a mote is turned to its peer."""
 
     names: tuple[str, ...]
     positions_m: FloatArray

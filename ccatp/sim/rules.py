@@ -145,16 +145,11 @@ class FanRules:
 
 
 class SimulatedRobot(ABC):
-    """Roles, commands and the newest frame of a simulated robot.
+    """Roles, commands and the newest frame (``seq``, ``t_s`` on the robot's clock) of a simulated robot.
 
     A command that arrives while frame n is the newest takes effect in the frame that follows n + the delay of the
     commands, in whole frames. Its age counts from its arrival, so the time-to-live covers the delay, too. Whether it is
     newer than the one before is decided when it arrives.
-
-    Attributes:
-        seq, t_s: newest frame and its time on the robot's clock.
-        reboots: power-ups since the start.
-        truth_requests: replies to requests for the true state, by the request.
     """
 
     truth_rows = 100  # a batch of the log of the true state
@@ -166,7 +161,7 @@ class SimulatedRobot(ABC):
         self.frame_s, self.frame_hz = frame_s, frame_hz
         self.commands_delay_frames = commands_delay_frames
         self.seq, self.t_s, self.reboots = 0, 0.0, 0
-        self.truth_requests: dict[str, Callable[[], dict[str, object]]] = {}
+        self.truth_requests: dict[str, Callable[[], dict[str, object]]] = {}  # replies for the true state, by request
         self._boot(0.0)
 
     def _boot(self, boot_s: float) -> None:
