@@ -19,24 +19,8 @@ from ccatp.config.models import Config
 from ccatp.config.package import child_environment
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError
-from ccatp.studies.bench_cases import (
-    STEPS,
-    Contender,
-    FilterProblem,
-    dense_slam,
-    filterpy,
-    linearised_problem,
-    our_filter,
-    our_position,
-    our_slam,
-    printed_filter,
-    range_problem,
-    scipy_position,
-    slam_problem,
-    stonesoup,
-    survey_problem,
-    thesis_problem,
-)
+from ccatp.studies import bench_cases as cases
+from ccatp.studies.bench_cases import STEPS, Contender, FilterProblem
 from ccatp.studies.engine import settle
 from ccatp.studies.results import markdown_table
 from ccatp.studies.sil_run import rehearse
@@ -51,12 +35,12 @@ PACKAGES = ("ccatp", "numpy", "scipy", "filterpy", "stonesoup")
 CPU_INFO = Path("/proc/cpuinfo")
 
 Peers = Mapping[str, Callable[[FilterProblem], Contender]]
-LINEAR: Peers = {"eq. 2.13 in numpy": printed_filter, "filterpy": filterpy, "Stone Soup": stonesoup}
-UNSCENTED: Peers = {"filterpy": filterpy, "Stone Soup": stonesoup}
+LINEAR: Peers = {"eq. 2.13 in numpy": cases.printed_filter, "filterpy": cases.filterpy, "Stone Soup": cases.stonesoup}
+UNSCENTED: Peers = {"filterpy": cases.filterpy, "Stone Soup": cases.stonesoup}
 FILTER_CASES: tuple[tuple[str, Callable[[Config], FilterProblem], Peers], ...] = (
-    *(("kf", lambda cfg, m=m: thesis_problem(cfg, m), LINEAR) for m in (2, 4, 22)),
-    *(("ekf", lambda cfg, m=m: linearised_problem(cfg, m), LINEAR) for m in (4, 6, 23)),
-    ("ukf", survey_problem, UNSCENTED),
+    *(("kf", lambda cfg, m=m: cases.thesis_problem(cfg, m), LINEAR) for m in (2, 4, 22)),
+    *(("ekf", lambda cfg, m=m: cases.linearised_problem(cfg, m), LINEAR) for m in (4, 6, 23)),
+    ("ukf", cases.survey_problem, UNSCENTED),
 )
 """Filter, problem, peers. kf: inertial unit; and one sample of each wheel; and ten. ekf: models as matrices."""
 SLAM_CASES = (4, True), (50, True), (200, False)
@@ -94,7 +78,7 @@ def step_cases(cfg: Config, rounds: int) -> Iterator[dict[str, Any]]:
         problem = problem_of(cfg)
         name = f"{filter_name} predict + update, n = {problem.mean.size}, m = {problem.variances.size}"
         for peer_name, peer_of in peers.items():
-            ours = our_filter(filter_name, problem)
+            ours = cases.our_filter(filter_name, problem)
             try:
                 peer = peer_of(problem)
             except ImportError:
@@ -103,17 +87,19 @@ def step_cases(cfg: Config, rounds: int) -> Iterator[dict[str, Any]]:
             else:
                 yield step_case(name, ours, peer_name, peer, rounds)
     for beacons, has_peer in SLAM_CASES:
-        slam = slam_problem(beacons)
+        slam = cases.slam_problem(beacons)
         name = f"ekf-slam, {beacons} beacons, n = {slam.mean.size}"
         if has_peer:
             peer_name, most = "whole matrices in numpy", min(rounds, MOST_DENSE_ROUNDS)
-            yield step_case(name, our_slam(slam), peer_name, dense_slam(slam), most)
+            yield step_case(name, cases.our_slam(slam), peer_name, cases.dense_slam(slam), most)
         else:
             note = f"ekf-slam: whole matrices take n^3, too long to race against with {beacons} beacons"
-            yield {**step_case(name, our_slam(slam), "", None, rounds), "note": note}
-    ranges = range_problem(cfg)
+            yield {**step_case(name, cases.our_slam(slam), "", None, rounds), "note": note}
+    ranges = cases.range_problem(cfg)
     name = f"multilaterate, {ranges.anchors_m.shape[0]} lengths"
-    yield step_case(name, our_position(ranges), "scipy.optimize.least_squares", scipy_position(ranges), rounds)
+    yield step_case(
+        name, cases.our_position(ranges), "scipy.optimize.least_squares", cases.scipy_position(ranges), rounds
+    )
 
 
 def step_case(name: str, ours: Contender, peer_name: str, peer: Contender | None, rounds: int) -> dict[str, Any]:

@@ -173,14 +173,14 @@ def sensitivity_cells() -> Sequence[Cell]:
 def draw_sensitivity(cells: Sequence[CellResult], out: Path) -> None:
     """One figure for each mirror, the undisturbed and the fully disturbed world as lines."""
     worlds = list(dict.fromkeys(cell.factors["world"] for cell in cells))
-    for mirror in dict.fromkeys(str(cell.factors["mirror"]) for cell in cells):
-        rows = []
-        for cell in cells:
-            if cell.factors["mirror"] == mirror:
-                world, group = cell.factors["world"], str(cell.factors["group"])
-                label = f"world {world}" if group in _BASES else group
-                rows.append(FigureRow(label, cell, worlds.index(world), group in _BASES))
-        draw_ranges(rows, f"What each disturbance costs on {mirror}", out / f"sensitivity-{mirror}")
+    rows: dict[str, list[FigureRow]] = {}
+    for cell in cells:
+        world, group = cell.factors["world"], str(cell.factors["group"])
+        label = f"world {world}" if group in _BASES else group
+        row = FigureRow(label, cell, worlds.index(world), group in _BASES)
+        rows.setdefault(str(cell.factors["mirror"]), []).append(row)
+    for mirror, there in rows.items():
+        draw_ranges(there, f"What each disturbance costs on {mirror}", out / f"sensitivity-{mirror}")
 
 
 SENSITIVITY = Study(
@@ -233,14 +233,13 @@ WITHOUT: Mapping[str, Mapping[str, object]] = {
 
 def draw_ablation(results: Sequence[CellResult], out: Path) -> None:
     """Figures ``ablation-<mirror>-<world>``, the mission with everything as a line."""
-    for mirror, world in dict.fromkeys((str(c.factors["mirror"]), str(c.factors["world"])) for c in results):
-        rows = []
-        for cell in results:
-            if (cell.factors["mirror"], cell.factors["world"]) == (mirror, world):
-                name = str(cell.factors["without"])
-                label = "with all" if name == ALL_ON else f"without {name}"
-                rows.append(FigureRow(label, cell, WORLDS.index(world), name == ALL_ON))
-        draw_ranges(rows, f"Without a technique, world {world} on {mirror}", out / f"ablation-{mirror}-{world}")
+    rows: dict[tuple[str, str], list[FigureRow]] = {}
+    for cell in results:
+        mirror, world, name = (str(cell.factors[key]) for key in ("mirror", "world", "without"))
+        label = "with all" if name == ALL_ON else f"without {name}"
+        rows.setdefault((mirror, world), []).append(FigureRow(label, cell, WORLDS.index(world), name == ALL_ON))
+    for (mirror, world), there in rows.items():
+        draw_ranges(there, f"Without a technique, world {world} on {mirror}", out / f"ablation-{mirror}-{world}")
 
 
 ABLATION = Study(

@@ -100,7 +100,7 @@ def _draw_exceedance(
     columns = min(2, len(worlds))
     rows = -(-len(worlds) // columns)
     size = 4.4 * columns, 3.1 * rows + 0.5
-    with plot(stem, *size, rows, columns, title=title, legend=3, sharex=True, sharey=True) as (figure, panels):
+    with plot(stem, *size, rows, columns, sharex=True, sharey=True) as (figure, panels):
         lowest = 1.0
         for axes, world in zip(panels, worlds, strict=False):
             for cell in cells:
@@ -121,6 +121,9 @@ def _draw_exceedance(
         panels[0].text(_LIMIT_MM * 1.08, 0.9, "10 mm", color=LIMIT, fontsize=8, va="top")
         figure.supxlabel("error, mm", fontsize=9)
         figure.supylabel("share of all that is as large", fontsize=9)
+        figure.suptitle(title, fontsize=11, x=0.02, ha="left")
+        labelled = panels[0].get_legend_handles_labels()
+        figure.legend(*labelled, loc="outside upper right", ncols=len(filters), frameon=False, fontsize=9)
 
 
 def _draw_bound(cells: Sequence[CellResult], stem: Path) -> None:
