@@ -88,7 +88,7 @@ def read_beacon_record(run_dir: Path) -> BeaconRecord:
     warnings: list[str] = []
     log = list(read_log(run_dir / LOG, warnings))
     if not log:
-        missing.append(f"{LOG}: what the processes said")
+        missing.append(f"{LOG}: log of the processes")
     paths = recordings(run_dir / TELEMETRY)
     if not paths:
         missing.append(f"{TELEMETRY}: path, map and readings over time")

@@ -381,7 +381,7 @@ def outcome_of(record: RunRecord) -> PointOutcome:
     """How the run ended, from the last status; a run without an end goes on or was killed."""
     status = record.last_status
     if status is None:
-        return PointOutcome("no mission", "main never said where the mission stood", is_good=False)
+        return PointOutcome("no mission", "main published no status of the mission", is_good=False)
     if status.outcome:
         return PointOutcome(status.outcome, status.cause, is_good=status.outcome == COMPLETE)
     if status.exit_status >= 0:

@@ -64,7 +64,7 @@ def check_host(host: str, *, is_open: bool) -> None:
         is_local = host == "localhost"
     if not is_local and not is_open:
         raise StreamError(
-            f"--host {host}: anybody there could watch; say so with --open-to-network, or use ssh -L and 127.0.0.1"
+            f"--host {host}: any host there could watch; permit it with --open-to-network, or use ssh -L and 127.0.0.1"
         )
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 INK, QUIET, GRID, PAPER = "#1f2933", "#5f6c7b", "#e3e8ed", "#ffffff"
 PANEL, SEAM, PATH, BAD, GOOD = "#f1f4f7", "#c5ced8", "#8fa3b8", "#c93f3f", "#1d7a55"
-# Told apart by lightness as well, for those who do not see colours, and for printers.
+# They differ in lightness as well, for those who do not see colours, and for printers.
 SERIES = ("#123f6d", "#e0902f", "#1d8a99", "#a8577e", "#8a96a3", "#5b7f2b")
 SMALL_TO_LARGE = ("#123f6d", "#1d8a99", "#f0b429")
 BELOW_TO_ABOVE = ("#2f6aa5", "#a9cbe3", "#f7f7f5", "#f3c08c", "#c25a28")

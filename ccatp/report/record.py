@@ -132,7 +132,7 @@ def read_record(run_dir: Path) -> RunRecord:
     warnings: list[str] = []
     log = list(read_log(run_dir / LOG, warnings))
     if not log:
-        missing.append(f"{LOG}: what the processes said, and when the mission changed its state")
+        missing.append(f"{LOG}: log of the processes, and when the mission changed its state")
     sessions, is_simulation = _sessions(run_dir, mirror, log, missing, warnings)
     points, measured = _survey(run_dir, mirror, missing, warnings)
     injected, _ = read_truth(run_dir, warnings)

@@ -159,7 +159,7 @@ def test_a_network_is_served_only_when_told_to() -> None:
     check_host("localhost", is_open=False)
     check_host("0.0.0.0", is_open=True)
     for host in ("0.0.0.0", "192.0.2.1", "telescope"):
-        with pytest.raises(StreamError, match="anybody there could watch; say so with --open-to-network"):
+        with pytest.raises(StreamError, match="any host there could watch; permit it with --open-to-network"):
             check_host(host, is_open=False)
 
 

@@ -4,6 +4,7 @@ A page of another site that the operator has open must neither command the robot
 the browser states its origin) nor read its state (under a name of its own that resolves to this address).
 """
 
+import contextlib
 import hmac
 import ipaddress
 import re
@@ -37,7 +38,10 @@ def host_refusal(host: str | None, names: Collection[str]) -> str | None:
     if matched is None:
         return "the Host header is missing or no host"
     name = matched["name"].strip("[]").lower()
-    if name == "localhost" or name in {known.lower() for known in names} or _is_address(name):
+    if name == "localhost" or name in {known.lower() for known in names}:
+        return None
+    with contextlib.suppress(ValueError):
+        ipaddress.ip_address(name)
         return None
     return f"this is not {name}; ask by address, or add the name to dashboard.host_names"
 
@@ -60,14 +64,6 @@ def command_refusal(headers: Mapping[str, str], token: str | None) -> CommandRef
     if not hmac.compare_digest(given.strip().encode(), token.encode()):
         return CommandRefusal(401, "the token is not that of dashboard.token_file")
     return None
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
 
 
 def read_token(cfg: DashboardConfig) -> str | None:

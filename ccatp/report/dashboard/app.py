@@ -11,7 +11,7 @@ import socket
 from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator, Mapping
 from math import sqrt
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import msgspec
 import uvicorn
@@ -35,7 +35,7 @@ import ccatp
 from ccatp.config.models import DashboardConfig
 from ccatp.links.channels import BadRequest, OperatorCommand, format_request, parse_reply
 from ccatp.links.rpc import MAX_REPLY_BYTES
-from ccatp.report.dashboard.access import command_refusal, host_refusal
+from ccatp.report.dashboard.access import CommandRefusal, command_refusal, host_refusal
 from ccatp.report.dashboard.hub import StateBroadcaster
 
 Samples = Iterable[tuple[str, float | None]]
@@ -138,13 +138,6 @@ MAX_REQUEST_BYTES = 16_384
 Note = Callable[[str, dict[str, object]], None]
 
 
-class RouteResponse(NamedTuple):
-    """HTTP status of a command, and the refusal or an empty text."""
-
-    http_status: int
-    refusal: str
-
-
 class CommandEndpoint:
     """Passes commands of the page on to the operator channel; a command is answered when it took effect."""
 
@@ -153,20 +146,20 @@ class CommandEndpoint:
         self._endpoint, self._timeout_s = endpoint, timeout_s
         self._pending = 0
 
-    async def ask(self, command: OperatorCommand) -> RouteResponse:
-        """Send a command and wait for its answer; never raises for what the daemon does or does not."""
+    async def ask(self, command: OperatorCommand) -> CommandRefusal | None:
+        """Send a command and wait until it took effect, or return why it did not."""
         if self._pending >= MAX_COMMANDS:
-            return RouteResponse(503, f"{command}: {MAX_COMMANDS} commands wait for their answers already")
+            return CommandRefusal(503, f"{command}: {MAX_COMMANDS} commands wait for their answers already")
         self._pending += 1
         try:
             async with asyncio.timeout(self._timeout_s):
                 return await self._exchange(command)
         except TimeoutError:
-            return RouteResponse(504, f"{command}: no answer from the main loop within {self._timeout_s:g} s")
+            return CommandRefusal(504, f"{command}: no answer from the main loop within {self._timeout_s:g} s")
         finally:
             self._pending -= 1
 
-    async def _exchange(self, command: OperatorCommand) -> RouteResponse:
+    async def _exchange(self, command: OperatorCommand) -> CommandRefusal | None:
         with self._context.socket(zmq.DEALER) as peer:
             peer.setsockopt(zmq.LINGER, 0)
             peer.setsockopt(zmq.MAXMSGSIZE, MAX_REPLY_BYTES)
@@ -176,10 +169,10 @@ class CommandEndpoint:
         try:
             reply = parse_reply(frame)
         except BadRequest as error:
-            return RouteResponse(502, f"{command}: the main loop answered with {error}")
+            return CommandRefusal(502, f"{command}: the main loop answered with {error}")
         if reply["ok"]:
-            return RouteResponse(200, "")
-        return RouteResponse(409, f"{command}: {reply.get('error', 'refused')}")
+            return None
+        return CommandRefusal(409, f"{command}: {reply.get('error', 'refused')}")
 
 
 class HostCheckMiddleware:
@@ -250,9 +243,9 @@ def build_app(
                 note("page_request_refused", {**fields, "why": refused.message})
                 headers = {"www-authenticate": "Bearer"} if refused.http_status == 401 else {}
                 return _error(*refused, headers)
-            answer = await commands.ask(name)
-            note("page_command", {**fields, "refusal": answer.refusal})
-            return _error(*answer) if answer.refusal else _json({"status": "ok"})
+            refused = await commands.ask(name)
+            note("page_command", {**fields, "refusal": refused.message if refused else ""})
+            return _error(*refused) if refused else _json({"status": "ok"})
 
         return Route(f"/{name}", run, methods=["POST"])
 

@@ -277,7 +277,7 @@ def test_truth_and_laser_tell_the_same_of_arrivals(recorded: Path) -> None:
 def test_what_is_missing_is_told(without: Callable[..., Path]) -> None:
     found = read_record(without("telemetry.mcap", "mission.sqlite", "summary.json", "log.jsonl"))
     assert found.missing == (
-        "log.jsonl: what the processes said, and when the mission changed its state",
+        "log.jsonl: log of the processes, and when the mission changed its state",
         "telemetry.mcap: path, estimates, arrivals and fixes over time",
         "mission.sqlite: points, their fixes, and how the panels lie",
         "summary.json: the run goes on, or was killed before its end",
