@@ -22,8 +22,17 @@ from ccatp.links.runtime_dir import runtime_dir_path
 from ccatp.links.topics import BY_NAME, Heartbeat, Message, schema_of
 from ccatp.mirror.mirror import build_mirror
 from ccatp.records.recorder import TELEMETRY, read_metadata
-from ccatp.report.foxglove import VIEWS, ViewMessage, Views, plain_schema, view_schemas
-from ccatp.report.live import FoxgloveStream, LiveStream, PlotJugglerStream, check_host
+from ccatp.report.foxglove import (
+    VIEWS,
+    FoxgloveStream,
+    LiveStream,
+    PlotJugglerStream,
+    ViewMessage,
+    Views,
+    check_host,
+    plain_schema,
+    view_schemas,
+)
 
 # Topics that are streamed as they are; batches are streamed as their views.
 PASSED_ON = ("mission", "arrival", "rest", "treatment", "fix", "danger_event")

@@ -13,8 +13,7 @@ import zmq
 
 from ccatp.cli import main
 from ccatp.daemon.streaming import RUN, streamed_schemas
-from ccatp.report.foxglove import ViewMessage
-from ccatp.report.live import FoxgloveStream, LiveStream, PlotJugglerStream, StreamError, check_host
+from ccatp.report.foxglove import FoxgloveStream, LiveStream, PlotJugglerStream, StreamError, ViewMessage, check_host
 from tests.web_socket import WebSocket
 
 PANELS = ViewMessage("view/panels", 0.0, b'{"deletions":[],"entities":[]}')

@@ -8,7 +8,6 @@ import pytest
 
 from ccatp.cli import main
 from ccatp.records.run_reader import RunReadError
-from ccatp.report.beacon_page import beacon_data, beacon_drawings, beacon_page
 from ccatp.report.beacon_record import (
     beacon_rows,
     pose_errors_m,
@@ -23,7 +22,7 @@ from ccatp.report.figures import (
     map_error_figure,
 )
 from ccatp.report.plots import NARROW, PX_PER_IN, WIDE, ellipse_outline
-from ccatp.report.run_page import report_run
+from ccatp.report.run_page import beacon_data, beacon_drawings, beacon_page, report_run
 from tests.unit.reporting.beacon_recorded import FRAMES, OFF_M, SIGMA_M, beacon_config, record_beacons
 from tests.unit.reporting.markup import Markup
 
