@@ -1,13 +1,258 @@
-"""No input makes a decoder raise anything but what its protocol says. ``CCATP_FUZZ_INPUTS`` sets how many the slow
-tests try per decoder (1,000,000), ``CCATP_FUZZ_SEED`` which."""
+"""The decoders that read what others wrote, as targets of the fuzzer."""
 
+import json
+import math
 import os
-from collections.abc import Callable
+import random
+from collections.abc import Callable, Hashable
 
 import pytest
 
-from tests.fuzz.decoders import targets
+from ccatp.core import EventCode, Verdict
+from ccatp.errors import ConfigError
+from ccatp.links import channels, multiline, topics
+from ccatp.links import robot_codec as robot
+from ccatp.links.auth import BadAccess, parse_clients
+from ccatp.links.robot_messages import LineBuffer, LineTooLong, Sensors
+from ccatp.sim.fault_plan import parse_plan
 from tests.fuzz.fuzzer import Target, fuzz
+
+HELLO = (
+    b'{"type":"hello","protocol":"ccatp-robot/1","boot":7,"nonce":"0123456789abcdef0123456789abcdef","auth":"none",'
+    b'"frame_hz":100.0,"ttl_s":0.25,"lockstep":true,"robot":{"wheel_radius_m":0.03,"wheel_base_m":0.15,'
+    b'"max_wheel_rad_s":8.0,"edge_sensors_m":[[0.09,0.09],[0.09,-0.09],[-0.09,0.09],[-0.09,-0.09]],'
+    b'"puck_m":[0.0,0.0,0.05],"fan_floor":0.6}}'
+)
+SENSORS = (
+    b'{"type":"sensors","seq":12,"t":0.12,"imu":[[0.115,0.01,-0.002]],"enc":[[0.111,1.5,null],[0.112,1.5,-1.5]],'
+    b'"edge":[[0.111,1,1,1,1],[0.112,0,1,1,1]],"gravity":[0.11,0.1,-0.2,-0.97],"fans":[0.8,0.8],"soc":0.9,'
+    b'"cmd":{"seq":3,"age":0.01,"permit_age":0.01,"held":false},"faults":["imu"]}'
+)
+JOIN = b'{"type":"join","protocol":"ccatp-robot/1","role":"controller","client":"main","mac":"00ff"}'
+RECORD = "1,1234.5678,20,90,20.1,1013.2,45.0,0,0,0,0,0,0,0,0,0,0"
+PLAN = b"""[[fault]]
+signal = "imu_wz"
+type = "stuck"
+at_s = 40.0
+for_s = 0.5
+value = 0.1
+
+[[fault]]
+signal = "body"
+type = "kidnap"
+at_s = 1.0
+dx_m = 0.1
+dy_m = 0.0
+dheading_rad = 0.1
+
+[[link]]
+type = "delay"
+direction = "to_client"
+at_s = 110.0
+for_s = 2.0
+delay_s = 0.02
+jitter_s = 0.01
+"""
+CLIENTS = b"""[clients.site]
+public_key = "rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7"
+role = "raise"
+"""
+VERDICT = Verdict(7, 0.07, EventCode.NEAR_EDGE, "rim ahead", "front_left", 0.01, 0.0, False, True, False)
+_ID = "12345678-1234-5678-1234-567812345678"
+
+
+def targets() -> list[Target]:
+    """All decoders that work on bytes in memory."""
+    return [
+        Target("robot link, from the robot", _from_robot(), _robot, (robot.BadLine,)),
+        Target("robot link, from a client", _from_client(), _client, (robot.BadLine,)),
+        Target("robot link, lines", [SENSORS + b"\n" + HELLO + b"\n"], _lines, (LineTooLong,)),
+        Target(
+            "MultiLine, requests",
+            [b"isconnected", b"latestlengthvalid,1,2,32"],
+            _request,
+            (multiline.BadMultilineRequest,),
+        ),
+        Target("MultiLine, replies", _replies(), _reply, (multiline.BadReply,)),
+        Target("observatory channel", _observatory(), _emergency, (channels.BadRequest,)),
+        Target("operator channel", [b'{"cmd":"status"}', b'{"cmd":"abort"}'], _operator, (channels.BadRequest,)),
+        Target("replies of both channels", [b'{"ok":true,"code":0}'], _channel_reply, (channels.BadRequest,)),
+        Target("observatory's clients", [CLIENTS], _clients, (BadAccess,)),
+        Target("bus", _bus(), _topic, (topics.BadMessage,)),
+        Target("fault plan", [PLAN], _plan, (ConfigError,)),
+    ]
+
+
+# -- robot link -------------------------------------------------------------------------------------------------------
+
+
+def _from_robot() -> list[bytes]:
+    joined, refused = b'{"type":"joined","role":"monitor","session":3}', b'{"type":"refused","reason":"busy"}'
+    return [HELLO, SENSORS, joined, refused, b'{"type":"x"}']
+
+
+def _from_client() -> list[bytes]:
+    drive = robot.format_drive(3, 12, 1.25, -0.5)[:-1]
+    permit = robot.format_permit(4, 12, True, False, True)[:-1]
+    return [JOIN, drive, permit, b'{"type":"fans","seq":1,"duty":[0.8,0.8]}', b'{"type":"x","y":{"z":[1,2.5]}}']
+
+
+def _robot(line: bytes) -> Hashable:
+    message = robot.decode_from_robot(line)
+    assert_finite(message)
+    if isinstance(message, Sensors):
+        return len(message.imu), len(message.enc), len(message.edge), message.gravity is None, len(message.faults) > 0
+    return type(message).__name__
+
+
+def _client(line: bytes) -> Hashable:
+    message = robot.decode_from_client(line)
+    assert_finite(message)
+    return type(message).__name__
+
+
+def assert_finite(message: object) -> None:
+    """Nothing that is no number gets through, however deep."""
+    if isinstance(message, float):
+        assert math.isfinite(message)
+    elif isinstance(message, list | tuple):
+        for part in message:
+            assert_finite(part)
+    elif hasattr(message, "__struct_fields__"):
+        for name in message.__struct_fields__:
+            assert_finite(getattr(message, name))
+
+
+def _lines(data: bytes) -> Hashable:
+    """However the stream is chopped, the lines are the same; the second run is byte by byte in clumps."""
+    limit = 600
+    whole = _fed(LineBuffer(limit), [data])
+    rng = random.Random(len(data))
+    cuts = sorted(rng.randrange(len(data) + 1) for _ in range(5))
+    parts = [data[a:b] for a, b in zip([0, *cuts], [*cuts, len(data)], strict=True)]
+    assert _fed(LineBuffer(limit), parts) == whole
+    lines, is_too_long = whole
+    assert all(len(line) <= limit and b"\n" not in line for line in lines)
+    if is_too_long:
+        raise LineTooLong(limit, lines)
+    return min(len(lines), 20)
+
+
+def _fed(buffer: LineBuffer, parts: list[bytes]) -> tuple[list[bytes], bool]:
+    lines: list[bytes] = []
+    for part in parts:
+        try:
+            lines += buffer.feed(part)
+        except LineTooLong as error:
+            return [*lines, *error.lines], True
+    return lines, False
+
+
+# -- MultiLine --------------------------------------------------------------------------------------------------------
+
+
+def _replies() -> list[bytes]:
+    texts = [
+        "isconnected_1",
+        "laserready_0",
+        "environmentdata_20.5,1013.25,40.0",
+        f"channeldata_{RECORD}_{RECORD.replace('1,', '2,', 1)}_0",
+        "defanadata_x",
+        "error_unknown-request",
+        "measstarted",
+        "measurementfinished",
+    ]
+    return [text.encode() for text in texts]
+
+
+def _request(line: bytes) -> Hashable:
+    request = multiline.parse_request(line)
+    assert set(request.channels) <= set(multiline.CHANNEL_NUMBERS)
+    assert multiline.parse_request(multiline.format_request(request).strip()) == request
+    return request.command, len(request.channels)
+
+
+def _reply(line: bytes) -> Hashable:
+    reply = multiline.parse_reply(line)
+    if isinstance(reply, multiline.ChannelData):
+        lengths_m, reasons = multiline.valid_lengths(reply, range(1, 33))
+        assert all(math.isfinite(length) and length > 0.0 for length in lengths_m.values())
+        assert len(lengths_m) + len(reasons) == 32
+        return len(reply.records), len(lengths_m), reply.server_error == 0
+    return type(reply).__name__, reply if isinstance(reply, multiline.Notice) else ""
+
+
+# -- channels ---------------------------------------------------------------------------------------------------------
+
+
+def _observatory() -> list[bytes]:
+    return [
+        b'{"cmd":"ping"}',
+        json.dumps({"cmd": "emergency", "kind": "fire", "id": _ID, "note": "north wing"}).encode(),
+        json.dumps({"cmd": "clear", "id": _ID}).encode(),
+    ]
+
+
+class _Desk:
+    code = EventCode.NORMAL
+
+    def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
+        del kind, note
+        return None if emergency_id else "no id"
+
+    def holds(self, emergency_id: str) -> bool:
+        return emergency_id < "8"
+
+    def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
+        del emergency_id
+        return None if at_base_or_held else "no"
+
+
+def _emergency(frame: bytes) -> Hashable:
+    # Whatever comes is answered, with an answer that can be read.
+    answer = channels.answer_observatory(frame, _Desk(), at_base_or_held=True, age_s=0.1)
+    assert channels.parse_reply(answer)["ok"] in (True, False)
+    return type(channels.parse_observatory(frame)).__name__
+
+
+def _operator(frame: bytes) -> Hashable:
+    return channels.parse_operator(frame).cmd
+
+
+def _channel_reply(frame: bytes) -> Hashable:
+    reply = channels.parse_reply(frame)
+    return reply["ok"], min(len(reply), 5)
+
+
+def _clients(data: bytes) -> Hashable:
+    return tuple(sorted(client.role for client in parse_clients(data.decode("utf-8", "replace")).values()))
+
+
+# -- the rest ---------------------------------------------------------------------------------------------------------
+
+
+def _bus() -> list[bytes]:
+    presence = topics.Heartbeat(seq=1, t_s=0.5, process="main", pid=7, phase="ready")
+    estimate = topics.EstimateMessage(
+        seq=5, t_s=0.05, x_m=1.0, y_m=2.0, heading_rad=0.5, sigma_m=0.001, state="driving"
+    )
+    track = topics.TrackMessage(seq=1, t_s=0.1, rows=[(1, 0.1, 1, 2, 0.1, 0.2, 0.3, 0.001)])
+    return [
+        topics.pack("heartbeat.main", presence),
+        topics.pack("estimate", estimate),
+        topics.pack("track", track),
+        topics.pack("verdict", VERDICT),
+    ]
+
+
+def _topic(frame: bytes) -> Hashable:
+    return topics.unpack(frame)[0]
+
+
+def _plan(data: bytes) -> Hashable:
+    plan = parse_plan(data.decode("utf-8", "replace"), "plan.toml")
+    return tuple(sorted(type(f).__name__ for f in (*plan.faults, *plan.link)))
+
 
 FEW = 3000
 GRAMMAR = "MultiLine, replies"

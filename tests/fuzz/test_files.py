@@ -1,27 +1,196 @@
-"""Damaged files: refused in their own words, never misread. ``CCATP_FUZZ_INPUTS`` and ``CCATP_FUZZ_SEED`` as for the
-decoders; a file costs a hundred times as much as a line, so that the slow tests take a tenth of the inputs."""
+"""Files that are read back, as targets of the fuzzer: configuration, mission database, recording of a run."""
 
+import json
 import os
 import random
-from collections.abc import Callable, Iterable, Iterator
+import tempfile
+import tomllib
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 
-from ccatp.config.load import load_config
+from ccatp.config.load import dump_config, load_config
 from ccatp.config.messages import format_toml
+from ccatp.core import DeckPose, Fix, PointId
 from ccatp.errors import ConfigError
-from ccatp.records.store import StoreError
-from tests.fuzz.files import (
-    check_store,
-    config_target,
-    dumped_config,
-    recording_target,
-    scratch,
-    sound_store,
-    store_target,
-)
+from ccatp.links.topics import TOPICS, FixMessage, Rest, SensorLines, TrackMessage, pack, schema_of
+from ccatp.records.recorder import Recorder, iter_messages
+from ccatp.records.run_reader import RunReadError, open_run
+from ccatp.records.store import MissionStore, PlannedPoint, StoreError
 from tests.fuzz.fuzzer import Target, fuzz
+from tests.fuzz.test_decoders import SENSORS
+
+USER_FILE = b"""[run]
+mirror = "fyst-m1"
+seed = 3
+panels = 2
+
+[robot]
+wheel_radius_m = 0.03
+edge_sensors_m = [[0.09, 0.09], [0.09, -0.09], [-0.09, 0.09], [-0.09, -0.09]]
+fan_duty = [0.8, 0.8]
+
+[limits]
+v_max_m_s = 0.10
+
+[danger]
+map_margin_m = 0.010
+debounce_samples = 2
+
+[mission]
+fix_at_start = true
+backoff_m = 0.06
+"""
+PANEL = [PointId(1, 2, n) for n in range(1, 10)]
+
+
+@contextmanager
+def scratch() -> Iterator[Path]:
+    """A folder in memory where there is one: a million files would wear a disk."""
+    memory = Path("/dev/shm")
+    with tempfile.TemporaryDirectory(prefix="ccatp-fuzz-", dir=memory if memory.is_dir() else None) as folder:
+        yield Path(folder)
+
+
+# -- configuration ----------------------------------------------------------------------------------------------------
+
+
+def config_target(folder: Path) -> Target:
+    """A user's file: it is refused with file and line, or each of its values is in force as it stands there."""
+    file = folder / "user.toml"
+
+    def run(data: bytes) -> Hashable:
+        file.write_bytes(data)
+        try:
+            cfg = load_config(file)
+        except ConfigError as error:
+            for problem in error.problems:
+                assert problem.startswith(f"{file}"), problem
+                assert "\n" not in problem, problem
+            raise
+        assert_in_force(tomllib.loads(data.decode()), cfg.model_dump(), "")
+        return cfg.run.panels == 0
+
+    return Target("configuration", [USER_FILE, b"", b"[run]\nseed = 1\n"], run, (ConfigError,))
+
+
+def assert_in_force(said: Any, got: Any, where: str) -> None:
+    """Nothing that was said was left out or taken for something else."""
+    if isinstance(said, Mapping):
+        for key, value in said.items():
+            assert_in_force(value, got[key], f"{where}.{key}")
+    elif isinstance(said, list):
+        assert len(said) == len(got), where
+        for one, other in zip(said, got, strict=True):
+            assert_in_force(one, other, where)
+    else:
+        assert said == got, where
+        assert isinstance(said, bool) == isinstance(got, bool), where
+
+
+def dumped_config() -> dict[str, Any]:
+    """The whole default configuration as a tree."""
+    return tomllib.loads(dump_config(load_config()))
+
+
+# -- mission database -------------------------------------------------------------------------------------------------
+
+
+def a_fix(t_s: float = 1.5) -> Fix:
+    return Fix(t_s, (1.0, 2.0 + t_s, 3.0), tuple(i * 1e-12 for i in range(9)), 1.7, (1, 2, 5, 8), 2e-6)
+
+
+def sound_store(folder: Path) -> bytes:
+    """A database with six points measured, one skipped, two planned."""
+    path = folder / "sound.sqlite"
+    plan = [PlannedPoint(p, 0.22, -0.25) for p in PANEL]
+    with MissionStore.create(path, mirror="fyst-m1", seed=1, config_toml="[run]\n", points=plan, reserve_bytes=0) as db:
+        for k, point in enumerate(PANEL[:6]):
+            db.record_fix(point, a_fix(float(k)), DeckPose(0.1, 0.2, 0.3)).result()
+        db.record_skipped(PANEL[6], 9.0).result()
+    return path.read_bytes()
+
+
+def check_store(path: Path) -> int:
+    """Open what is at ``path``: what is measured there is what was measured, and what is damaged is said to be."""
+    with MissionStore.open(path, mirror="fyst-m1") as db:
+        damaged, measured = db.damaged, db.measured_points()
+        fixes = {f.point: f.fix for f in db.fixes()}
+    assert measured | set(damaged) == set(PANEL[:6])
+    assert fixes == {p: a_fix(float(k)) for k, p in enumerate(PANEL[:6]) if p in measured}
+    return len(damaged)
+
+
+def store_target(folder: Path) -> Target:
+    """A database: refused as a whole, or all of its fixes are right or named as damaged."""
+    sound = sound_store(folder)
+    path = folder / "mission.sqlite"
+
+    def run(data: bytes) -> Hashable:
+        path.with_name("mission.sqlite-journal").unlink(missing_ok=True)
+        path.write_bytes(data)
+        return check_store(path)
+
+    return Target("mission database", [sound], run, (StoreError,))
+
+
+# -- recording --------------------------------------------------------------------------------------------------------
+
+
+def sound_recording(folder: Path) -> bytes:
+    """A short recording of a run."""
+    path = folder / "sound.mcap"
+    topics = [(topic.name, schema_of(topic.name)) for topic in TOPICS if topic.recorded]
+    config = dump_config(load_config(None, {"run.panels": 1}))
+    recorder = Recorder(path, topics, is_simulation=True, metadata={"format": "1", "config": config})
+    fix = FixMessage(
+        seq=12,
+        t_s=0.12,
+        point=(1, 1, 1),
+        is_fused=True,
+        position_m=(1.0, 2.0, 3.0),
+        covariance_m2=[1e-12, 0.0, 0.0, 0.0, 1e-12, 0.0, 0.0, 0.0, 1e-12],
+        dop=1.0,
+        residual_rms_m=1e-6,
+        channels=[1, 2, 3, 4],
+        jump_mm=0.1,
+    )
+    lines = [json.loads(SENSORS) | {"seq": k, "t": 0.01 * k} for k in range(3)]
+    raw = [json.dumps(line).encode() for line in lines]
+    messages = {
+        "sensors": SensorLines(seq=12, t_s=0.12, lines=[msgspec.Raw(line) for line in raw]),
+        "rest": Rest(seq=12, t_s=0.12),
+        "fix": fix,
+        "track": TrackMessage(seq=12, t_s=0.12, rows=[(12, 0.12, 1, 1, 0.0, 0.0, 0.0, 0.001)]),
+    }
+    for name, message in messages.items():
+        recorder.write(name, 0.12, pack(name, message).split(b" ", 1)[1])
+    recorder.close()
+    return path.read_bytes()
+
+
+def recording_target(folder: Path) -> Target:
+    """A recording: what can be read of it is read, and no more is promised."""
+    sound = sound_recording(folder)
+    (folder / "run").mkdir()
+    (folder / "run" / "config.toml").write_text(dump_config(load_config()))
+    path = folder / "run" / "telemetry.mcap"
+
+    def run(data: bytes) -> Hashable:
+        path.write_bytes(data)
+        damages: list[str] = []
+        topics = tuple(message.topic for message in iter_messages(path, damages.append))
+        for recording in open_run(folder / "run"):
+            count = sum(1 for _ in recording.messages())
+            return topics, len(damages), min(count, 8), len(recording.warnings)
+        raise AssertionError("no recording")
+
+    return Target("recording", [sound], run, (RunReadError,))
+
 
 MANY = int(os.environ.get("CCATP_FUZZ_INPUTS", "1000000")) // 10
 SEED = int(os.environ.get("CCATP_FUZZ_SEED", "1"))
@@ -58,9 +227,8 @@ def test_many_damaged_files(make: Callable[[Path], Target], few: int, folder: Pa
 
 # -- P20: every key of the configuration, wrong in every way that can be told -----------------------------------------
 
+
 Key = tuple[str, ...]
-
-
 # What looks wrong and means the same: Python's True is 1.
 EQUIVALENT = ((("mirror", "frame", "reflecting_side_sign"), "reflecting_side_sign", True),)
 
