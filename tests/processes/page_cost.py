@@ -4,16 +4,13 @@ A simulated run on the wall clock, with no page, one and three open ones in turn
 of main's ticks the median and the 99th percentile. Pages are plain clients, as a browser has a machine of its own.
 """
 
-import re
 import socket
-import subprocess
 import sys
 import tempfile
 import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 import psutil
@@ -21,19 +18,11 @@ import zmq
 
 from ccatp.links.bus import Subscriber
 from ccatp.links.topics import Timing
+from tests.processes.test_observers import WITH_PAGE, open_page, page_port
+from tests.support.runs import NO_CALIBRATION, Run
 
-URL = re.compile(r"http://127\.0\.0\.1:(\d+)/")
-SETTINGS = ("sim.robot.port=0", "sim.etalon.port=0", "dashboard.port=0", "mission.calibration_length_m=0")
 PAGES = (0, 1, 3)
-BEGINNING_S, OPENING_S = 8.0, 1.5
-
-
-def open_page(port: int) -> socket.socket:
-    """A page that takes what it is told."""
-    page = socket.create_connection(("127.0.0.1", port))
-    page.sendall(b"GET /events HTTP/1.1\r\nhost: localhost\r\n\r\n")
-    threading.Thread(target=drain, args=(page,), daemon=True).start()
-    return page
+OPENING_S = 1.5
 
 
 def drain(page: socket.socket) -> None:
@@ -67,6 +56,7 @@ def look(port: int, dashboard: psutil.Process, subscriber: Subscriber, pages: in
     with ExitStack() as stack:
         for _ in range(pages):
             page = stack.enter_context(open_page(port))
+            threading.Thread(target=drain, args=(page,), daemon=True).start()
             stack.callback(page.shutdown, socket.SHUT_RDWR)
         time.sleep(OPENING_S)
         begun_s, before_s = time.monotonic(), busy_s(dashboard)
@@ -75,33 +65,18 @@ def look(port: int, dashboard: psutil.Process, subscriber: Subscriber, pages: in
     return [share, float(np.median(ticks)), float(np.percentile(ticks, 99))]
 
 
-def wait_for_page(lines: IO[str]) -> int:
-    """Its port, as the run tells it; what else it tells is thrown away."""
-    for line in lines:
-        if found := URL.search(line):
-            threading.Thread(target=lines.read, daemon=True).start()
-            return int(found[1])
-    raise SystemExit("the run has no dashboard")
-
-
 def main(seconds: float, rounds: int) -> None:
     """Measure, and print a line for each number of pages."""
     rows: dict[int, list[list[float]]] = {pages: [] for pages in PAGES}
     with tempfile.TemporaryDirectory(prefix="ccatp-") as folder, zmq.Context() as context:
-        command = [sys.executable, "-m", "ccatp", "run", "--sim", "--realtime", "--run-dir", f"{folder}/run"]
-        command += ["--runtime-dir", folder, *(word for setting in SETTINGS for word in ("--set", setting))]
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as run:
-            assert run.stderr is not None
-            port = wait_for_page(run.stderr)
-            time.sleep(BEGINNING_S)
-            children = psutil.Process(run.pid).children()
-            dashboard = next(child for child in children if "ccatp.daemon.dashboard" in child.cmdline())
-            subscriber = Subscriber(context, [f"ipc://{Path(folder) / 'main'}"], ["timing"])
+        sockets = Path(folder)
+        with Run(sockets / "run", sockets, "--realtime", *WITH_PAGE, *NO_CALIBRATION) as run:
+            run.until_state("driving")
+            subscriber = Subscriber(context, [f"ipc://{sockets / 'main'}"], ["timing"])
             for k in range(rounds):
                 for pages in PAGES if k % 2 == 0 else reversed(PAGES):
-                    rows[pages].append(look(port, dashboard, subscriber, pages, seconds))
+                    rows[pages].append(look(page_port(run), run.child("dashboard"), subscriber, pages, seconds))
             subscriber.close()
-            run.terminate()
     for pages, found in rows.items():
         share, p50, p99 = np.median(np.array(found), axis=0)
         print(f"{pages} pages: dashboard {share:.2f} % of a core, main's ticks p50 {p50:.0f} us, p99 {p99:.0f} us")
