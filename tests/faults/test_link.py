@@ -9,23 +9,19 @@ import time
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
 
 import numpy as np
 import pytest
 
-from ccatp.config.load import load_config
 from ccatp.core import PanelPose
 from ccatp.dataloop import DataLoop
 from ccatp.links.robot_codec import decode_from_robot, encode, encode_sensors
 from ccatp.links.robot_link import BACKLOG_S, FLOOD_FACTOR, RobotLink, RobotTimeout, WrongProtocol
 from ccatp.links.robot_messages import PROTOCOL, BadLineLimit, Hello, LineBuffer, RobotData, Sensors
-from ccatp.mirror.mirror import build_mirror
-from ccatp.sim.robot import Robot
-from ccatp.sim.sessions import RobotServer
 from tests.faults.linking import Measured
 from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S
 from tests.support.daemon import Driver, robot_behind_proxy
+from tests.support.scenario import ServedRobot, config_of, mirror_of
 
 FRAMES = 60
 KEY = b"secret"
@@ -35,6 +31,7 @@ HELLO = Hello(
                     edge_sensors_m=((0.09, 0.09), (0.09, -0.09), (-0.09, 0.09), (-0.09, -0.09)),
                     puck_m=(0.0, 0.0, 0.05), max_wheel_rad_s=8.0, fan_floor=0.0),
 )  # fmt: skip
+JOIN = b'{"type":"join","role":"controller","client":"test"}\n'
 JOINED = b'{"type":"joined","role":"controller","session":1}\n'
 
 
@@ -97,14 +94,6 @@ async def test_a_damaged_line_costs_itself_alone(measured: Measured) -> None:
         measured("S15", max(gaps))
         assert sum(gaps) <= proxy.counts["corrupt"]
         driver.link.close()
-
-
-@pytest.mark.fault("L5")
-async def test_single_bytes_make_no_difference() -> None:
-    _, clean = await driven(frames=10)
-    chopped, pose = await driven(lambda proxy: proxy.begin("fragment", "both", write_bytes=1), frames=10)
-    assert not chopped.link.counts
-    assert pose == clean
 
 
 @pytest.mark.fault("L5")
@@ -219,59 +208,26 @@ def test_what_piled_up_in_half_a_minute_is_no_flood() -> None:
     assert FLOOD_FACTOR == 3.0
 
 
-class Wire:
-    """The robot's side of a connection."""
-
-    def __init__(self) -> None:
-        self.sent, self.is_closed = b"", False
-
-    def write(self, data: bytes) -> None:
-        self.sent += data
-
-    def close(self) -> None:
-        self.is_closed = True
-
-
-@cache
-def joined_line(role: str) -> bytes:
-    return b'{"type":"join","role":"%s","client":"test"}\n' % role.encode()
-
-
-def server(*, key: bytes | None = None, lockstep: bool = False) -> RobotServer:
-    """The robot's end of the link without sockets, at second 0."""
-    cfg = load_config()
-    return RobotServer(
-        Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(1)),
-        lockstep=lockstep, boot=1, key=key, make_nonce=lambda: f"{random.getrandbits(128):032x}", now_s=0.0,
-        note=lambda _: None, on_frame=lambda: None,
-    )  # fmt: skip
-
-
 @pytest.mark.fault("L6")
 def test_a_client_that_trickles_is_closed_in_time_and_nobody_else_notices(measured: Measured) -> None:
-    robot = server()
-    driver, trickler = Wire(), Wire()
-    session = robot.accept(driver, 0.0)
-    session.receive(joined_line("controller"), 0.0)
-    slow = robot.accept(trickler, 0.0)
-    text, closed_s, frames = joined_line("monitor"), None, 0
+    served = ServedRobot(config_of(), mirror_of(), lockstep=False)
+    begun_s = served.now_s
+    driver, trickler = served.client(JOIN), served.client()
+    text, closed_s = JOIN.replace(b"controller", b"monitor"), None
     for k in range(1, 400):
-        now_s = 0.01 * k
-        while robot.next_frame_s <= now_s:
-            robot.tick(robot.next_frame_s)
-            frames += 1
-            session.receive(b'{"type":"drive","seq":%d,"ack":0,"wr":1.0,"wl":1.0}\n' % k, now_s)
-        if not trickler.is_closed and k % 100 == 0:
-            slow.receive(text[k // 100 : k // 100 + 1], now_s)  # a byte a second
+        served.run(0.01)
+        driver.drive(k, 0, 1.0, 1.0)
+        if not trickler.wire.is_closed and k % 100 == 0:
+            trickler.send(text[k // 100 : k // 100 + 1])  # a byte a second
         if k % 25 == 0:
-            robot.check_time(now_s)
-        if trickler.is_closed and closed_s is None:
-            closed_s = now_s
+            served.server.check_time(served.now_s)
+        if trickler.wire.is_closed and closed_s is None:
+            closed_s = served.now_s - begun_s
     assert closed_s is not None
     measured("L6", closed_s)
-    assert b"bad join" in trickler.sent
-    assert driver.sent.count(b'"type":"sensors"') == frames > 300
-    assert not robot.robot.rules.is_held
+    assert b"bad join" in trickler.wire.sent
+    assert driver.wire.sent.count(b'"type":"sensors"') == served.frames > 300
+    assert not served.robot.rules.is_held
 
 
 @pytest.mark.fault("L6")
@@ -309,19 +265,17 @@ def test_a_thousand_others_do_not_disturb_who_drives(measured: Measured) -> None
     costs_s: list[float] = []
 
     def drive(rogues: int) -> bytes:
-        robot, wire = server(lockstep=True), Wire()
-        session = robot.accept(wire, 0.0)
-        session.receive(joined_line("controller"), 0.0)
+        served = ServedRobot(config_of(), mirror_of())
+        client = served.client(JOIN)
         for k in range(100):
             begun = time.thread_time()
             for _ in range(rogues):
-                rogue = robot.accept(Wire(), 0.01 * k)
-                rogue.receive(random.choice((joined_line("controller"), b"\xff\n", b"GET / HTTP/1.1\r\n")), 0.01 * k)
-                robot.lost(rogue)
+                rogue = served.client(random.choice((JOIN, b"\xff\n", b"GET / HTTP/1.1\r\n")))
+                served.server.lost(rogue.session)
             costs_s.append(time.thread_time() - begun)
-            ack = robot.robot.delivered_seq
-            session.receive(b'{"type":"drive","seq":%d,"ack":%d,"wr":1.0,"wl":0.9}\n' % (k, ack), 0.01 * k)
-        return wire.sent.partition(b"\n")[2]
+            served.now_s += 0.01
+            client.drive(k, served.robot.delivered_seq, 1.0, 0.9)
+        return client.wire.sent.partition(b"\n")[2]
 
     alone, crowded = drive(0), drive(10)  # of 10 ms each: 1000 a second
     assert alone == crowded
@@ -413,7 +367,7 @@ async def test_no_other_version_is_joined(protocol: str, measured: Measured) -> 
 async def round_trips(count: int) -> list[float]:
     """Times from a frame to the next one in lockstep: our answer's way, the robot's step, the frame's way."""
     times_s: list[float] = []
-    cfg = load_config(overrides={"sim.robot.port": 0})
+    cfg = config_of(sim__robot__port=0)
     robot, stop = DataLoop(cfg, True, 1), asyncio.Event()
     port = await robot.start()
     async with asyncio.TaskGroup() as tasks:
