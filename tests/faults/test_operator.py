@@ -116,34 +116,23 @@ def test_an_earthquake_presses_on_holds_and_leads_home_when_it_is_over(
     assert [m.point for m in after] == [None]  # where it stands is not known any more, and only that is asked
 
 
+def emergency(raised: int, kind: str = "fire", *, code: EventCode = EventCode.ABORTED) -> Verdict:
+    is_shaking = kind == "earthquake"
+    verdict = replace(FREE, code=code, cause=f"emergency: {kind}", signal=f"emergency:{kind}", raised=raised)
+    free = not is_shaking or code is EventCode.NEAR_EDGE
+    return replace(verdict, is_shaking=is_shaking, forward=free, reverse=free, turn=free)
+
+
 @pytest.mark.fault("O1")
 def test_during_an_earthquake_nobody_resumes(story: Story) -> None:
-    quake = replace(
-        FREE,
-        code=EventCode.ABORTED,
-        cause="emergency: earthquake",
-        signal="emergency:earthquake",
-        forward=False,
-        reverse=False,
-        turn=False,
-        raised=1,
-        is_shaking=True,
-    )
     story.until_state(MissionState.DRIVING)
-    story.frame(quake)
+    story.frame(emergency(1, "earthquake"))
     assert story.mission.is_paused
     assert story.mission.resume() == "emergency: earthquake: nothing moves until that is cleared"
     assert story.mission.abort("operator") is None
     assert story.mission.state is MissionState.HELD
     story.until_state(MissionState.DONE)  # it is over
     assert story.mission.done == []
-
-
-def emergency(raised: int, kind: str = "fire", *, code: EventCode = EventCode.ABORTED) -> Verdict:
-    is_shaking = kind == "earthquake"
-    verdict = replace(FREE, code=code, cause=f"emergency: {kind}", signal=f"emergency:{kind}", raised=raised)
-    free = not is_shaking or code is EventCode.NEAR_EDGE
-    return replace(verdict, is_shaking=is_shaking, forward=free, reverse=free, turn=free)
 
 
 @pytest.mark.fault("O1", "O3")

@@ -9,16 +9,7 @@ from pydantic import ValidationError
 
 from tests.faults.linking import Seen, judge
 from tests.faults.page import page
-from tests.faults.table import (
-    PATH,
-    ROWS,
-    Row,
-    conformance_rows,
-    keep_record,
-    load_record,
-    load_table,
-    machine_line,
-)
+from tests.faults.table import PATH, ROWS, Row, conformance_rows, keep_record, load_record, load_table, machine_line
 
 ROOT = PATH.parents[2]
 TABLE = """

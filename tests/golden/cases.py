@@ -71,10 +71,7 @@ def _clear(frame: int) -> Action:
 
 def _surveys() -> list[Case]:
     return [
-        Case(
-            f"survey-{mirror}-{world}",
-            (_survey("--mirror", mirror, "--world", world, "--panels", "2"),),
-        )
+        Case(f"survey-{mirror}-{world}", (_survey("--mirror", mirror, "--world", world, "--panels", "2"),))
         for mirror in ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
         for world in ("thesis", "hard", "extreme")
     ]

@@ -126,16 +126,7 @@ def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
     def little_room() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
 
-    run = finished(
-        *STUDY,
-        "--runs",
-        "2",
-        "--workers",
-        "1",
-        "--out",
-        str(tmp_path),
-        preexec_fn=little_room,
-    )
+    run = finished(*STUDY, "--runs", "2", "--workers", "1", "--out", str(tmp_path), preexec_fn=little_room)
     assert run.returncode == 4
     assert run.stderr.splitlines()[-1].startswith(f"ccatp: {tmp_path}")
     assert "make room or choose another --out: what is done is kept" in run.stderr

@@ -168,9 +168,7 @@ def fix_service(
         fuse_fix=lambda _fix: 0.0, notices=[], pose=None, pose_covariance=np.eye(3), position_sigma_m=5e-6
     )
     gate = gate or SimpleNamespace(
-        begin=lambda: None,
-        review=lambda *_, **__: SimpleNamespace(doubt="", refusal=""),
-        refusal_of=lambda *_: "",
+        begin=lambda: None, review=lambda *_, **__: SimpleNamespace(doubt="", refusal=""), refusal_of=lambda *_: ""
     )
     return FixService(
         cfg.mission,
