@@ -6,11 +6,10 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, asynccontextmanager
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
-from ccatp.commissioning.conformance import harness, server_checks
 from ccatp.commissioning.conformance.runner import Conformance, Result
 from ccatp.config.models import Config
 from ccatp.dataloop import Connection, DataLoop
@@ -88,8 +87,7 @@ class CrookedLoop(DataLoop):
 class ServerClock:
     """Time as the server gets it: what passes while its event loop waits for a processor does not count.
 
-    In lockstep nothing depends on the wall clock but the patience of the checks, which is for a silent server and not
-    for a busy machine.
+    The patience of the checks is for a silent server and not for a busy machine.
     """
 
     STEP_S, MOST_S = 0.005, 0.02
@@ -110,14 +108,14 @@ class ServerClock:
 
 
 @asynccontextmanager
-async def server_time() -> AsyncIterator[None]:
-    """Let the checks wait by the clock of the event loop that serves the robots."""
+async def server_time(*modules: ModuleType) -> AsyncIterator[None]:
+    """Let the checks in these modules wait by the clock of the event loop that serves the robots."""
     clock = ServerClock()
     running = asyncio.create_task(clock.run())
     seen = SimpleNamespace(monotonic=clock.monotonic, sleep=time.sleep)
     try:
         with ExitStack() as stack:
-            for module in (harness, server_checks):
+            for module in modules:
                 stack.enter_context(patch.object(module, "time", seen))
             yield
     finally:

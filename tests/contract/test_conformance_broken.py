@@ -4,12 +4,11 @@ import asyncio
 import json
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
 from typing import Any
 
 import pytest
 
-from ccatp.commissioning.conformance import server_checks
+from ccatp.commissioning.conformance import harness, server_checks
 from ccatp.commissioning.conformance.command_checks import BAD_DRIVES
 from ccatp.commissioning.conformance.runner import check_ids
 from ccatp.config.load import load_config
@@ -472,7 +471,8 @@ async def judge(config: Config, table: list[Crooked], *, lockstep: bool, key: by
         async with room:
             return await failures(config, crooked, lockstep=lockstep, key=key)
 
-    async with server_time() if lockstep else nullcontext():
+    # Where time is measured, the robot's goes by the wall clock, unless in lockstep.
+    async with server_time(harness, *((server_checks,) if lockstep else ())):
         seen = await asyncio.gather(*map(one, table))
     wrong = {c.name: (sorted(c.fails), s) for c, s in zip(table, seen, strict=True) if set(s) != c.fails}
     assert not wrong, json.dumps(wrong, indent=1)
