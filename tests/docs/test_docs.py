@@ -13,6 +13,7 @@ from unittest.mock import patch
 
 import click
 import pytest
+from _pytest.mark.structures import ParameterSet
 
 from ccatp.cli import cli, main
 from ccatp.filters import FILTERS
@@ -104,14 +105,17 @@ def telescope(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def quick_lines() -> list[str]:
-    return sorted({
+def quick_lines() -> list[ParameterSet]:
+    """Of each command the line with the most options; the others are slow."""
+    lines = {
         line.split(" ", 1)[1]
         for path in SOURCES
         for body in blocks(path, "console")
         for line in (one.removeprefix("$ ") for one in body.splitlines() if one.startswith("$ ccatp "))
         if line.split()[1] in RUN
-    })  # fmt: skip
+    }
+    longest = {line.split()[0]: line for line in sorted(lines, key=len)}.values()
+    return [pytest.param(line, marks=() if line in longest else pytest.mark.slow) for line in sorted(lines)]
 
 
 @pytest.mark.parametrize("line", quick_lines())
