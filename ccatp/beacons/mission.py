@@ -158,7 +158,10 @@ class BeaconMission:
         self._severity = verdict.severity
         if verdict.is_shaking:
             self._raised = verdict.raised
-            self._stand_fast()
+            if not self._bar:
+                self._bar = EARTHQUAKE
+                self.abort_cause = self.abort_cause or EARTHQUAKE
+                self._hold(EARTHQUAKE, by_hand=self.state is HELD and self._is_by_hand)
         else:
             self._bar = ""
         if verdict.severity is Severity.FAULT:
@@ -176,13 +179,6 @@ class BeaconMission:
         if self.state is IDLE or (self.state is HELD and not self._is_by_hand):
             self._go_on()
         return self.state is not HELD
-
-    def _stand_fast(self) -> None:
-        if self._bar:
-            return
-        self._bar = EARTHQUAKE
-        self.abort_cause = self.abort_cause or EARTHQUAKE
-        self._hold(EARTHQUAKE, by_hand=self.state is HELD and self._is_by_hand)
 
     def _hold(self, cause: str, *, by_hand: bool) -> None:
         self.state, self.cause, self._is_by_hand = HELD, cause, by_hand
@@ -244,17 +240,14 @@ class BeaconMission:
             return self._return(t_s, interval_s, distances_m)
         pose, target = self.navigator.belief.pose, self.navigator.target(t_s)
         drive = self.pilot.drive(t_s, interval_s, pose, target, distances_m)
-        if self._is_following:
-            self._follow(interval_s)
-        else:
+        if not self._is_following:
             self._visit()
+        else:
+            self.state = FOLLOWING
+            self._followed_s += interval_s
+            if self._followed_s >= self._cfg.mission.follow_s:
+                self.finish(SurveyOutcome.COMPLETE)
         return HALT if self.outcome is not SurveyOutcome.NONE else drive
-
-    def _follow(self, interval_s: float) -> None:
-        self.state = FOLLOWING
-        self._followed_s += interval_s
-        if self._followed_s >= self._cfg.mission.follow_s:
-            self.finish(SurveyOutcome.COMPLETE)
 
     def _visit(self) -> None:
         self.state = VISITING

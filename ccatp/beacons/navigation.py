@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from ccatp.beacons.cricket.range_network import MoteRange, build_network, pair_range
+from ccatp.beacons.cricket.range_network import build_network, coordinates_of, pair_range
 from ccatp.beacons.cricket.self_mapping import MoteMapper, mapper_settings, network_plan, printed_prior
 from ccatp.beacons.cricket.trilateration import map_by_plan
 from ccatp.beacons.pilot import TargetSight
@@ -79,14 +79,14 @@ class SelfMap:
 
     def _lay_out(self) -> MoteMapper:
         cfg, plan = self._cfg, self._plan
-        rows: list[MoteRange] = []
+        rows = []
         for i, j in plan.phase1_pairs:
             pair = frozenset((i, j))
             temperature_c = float(np.mean(self._temperatures[pair]))
             rows.append(pair_range(cfg, (plan.names[i], plan.names[j]), self._delays[pair], temperature_c))
         laid = map_by_plan(plan, build_network(rows, plan.dimension, plan.names), cfg.phase1.max_dop, cfg.phase1.draws)
         motes, d = list(plan.heads), plan.dimension
-        at = (np.array(motes)[:, None] * d + np.arange(d)).ravel()
+        at = coordinates_of(motes, d)
         known, covariance = plan.surveyed_m[motes], laid.covariance_m2[np.ix_(at, at)]
         mean = (laid.positions_m + laid.bias_m)[motes]
         if cfg.phase2.prior == "printed":
@@ -94,7 +94,7 @@ class SelfMap:
             covariance = printed_prior(len(motes), d, fixed, cfg.phase2.printed_variance_m2)
         mapper = MoteMapper(mean, covariance, mapper_settings(cfg), known)
         self.notes = {"map_phase1_expected_m": mapper.expected_rms_m, "map_updates": 0.0}
-        self._note(mapper)
+        self.notes["map_expected_m"] = mapper.expected_rms_m
         return mapper
 
     def _refine(self, mapper: MoteMapper, pair: frozenset[int], burst: MoteBurst) -> None:
@@ -105,9 +105,6 @@ class SelfMap:
             reading = pair_range(self._cfg, (burst.sender, burst.listener), [delay_s], burst.temperature_c)
             mapper.observe(self._row_of[i], self._row_of[j], reading.range_m, reading.sigma_m)
             self.notes["map_updates"] += 1.0
-        self._note(mapper)
-
-    def _note(self, mapper: MoteMapper) -> None:
         self.notes["map_expected_m"] = mapper.expected_rms_m
 
 
@@ -377,15 +374,12 @@ class MoteNavigator(_DeadReckoning):
             elif self.is_mapping:
                 self._self_map.take(burst)
         if self.is_mapping and self._self_map.is_done and self._self_map.places is not None:
-            self._join(*self._self_map.places)
+            positions_m, covariance_m2 = self._self_map.places
+            none, size = np.empty(0, dtype=np.intp), positions_m.size  # nothing ties the map to the robot yet
+            state.augment("map", positions_m.ravel(), none, np.zeros((size, 0)), np.eye(size), covariance_m2)
+            start = state.block("map").start
+            self._place_of = {name: start + _PLACE * row for row, name in enumerate(self._self_map.names)}
             self._self_map.notes["map_time_s"] = measurements.t_s
-
-    def _join(self, positions_m: FloatArray, covariance_m2: FloatArray) -> None:
-        # One block; nothing ties it to the robot yet.
-        none, size = np.empty(0, dtype=np.intp), positions_m.size
-        self._filter.augment("map", positions_m.ravel(), none, np.zeros((size, 0)), np.eye(size), covariance_m2)
-        start = self._filter.block("map").start
-        self._place_of = {name: start + _PLACE * row for row, name in enumerate(self._self_map.names)}
 
     def _range(self, burst: MoteBurst) -> None:
         at = self._place_of.get(burst.sender)

@@ -1,7 +1,4 @@
-"""The batch map from ranges alone: starts, the robust fit, a look for folds, covariance.
-
-A map that floats freely, brought into a frame, its covariance with it.
-"""
+"""The batch map from ranges alone: starts, the robust fit, a look for folds, covariance; its frame."""
 
 from dataclasses import dataclass, replace
 
@@ -165,18 +162,15 @@ def _fits(
         is_repeated = network.count > FEW and abs(found.cost - before) <= _SAME * before < float("inf")
         if _is_sure(model, found) or is_repeated:
             break
-        if len(fits) == len(images) and _may_be_grown(network, settings):
+        # Growing is quick for a few motes, and the shapes of bodies say more.
+        may_be_grown = network.count <= FEW and not network.bodies and np.isfinite(settings.robust_scale)
+        if len(fits) == len(images) and may_be_grown:
             # Wrong ranges would lead all starts by least squares astray, one after the other.
             found, is_settled = searched(model, found, settings)
             fits.append(found)
             if _is_sure(model, found) or (is_settled and _is_sound(model, found)):
                 break
     return fits
-
-
-def _may_be_grown(network: RangeNetwork, settings: MapFitSettings) -> bool:
-    """Whether growing is quick, and tells more than the shapes of bodies do."""
-    return network.count <= FEW and not network.bodies and bool(np.isfinite(settings.robust_scale))
 
 
 def _is_sure(model: MapModel, fit: MapFit) -> bool:

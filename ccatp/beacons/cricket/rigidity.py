@@ -1,7 +1,4 @@
-"""What ranges can determine at all: rank of their derivatives, and the directions that stay free, by name.
-
-Whether ranges leave several maps that fit equally well: generic global rigidity, and who can fold over.
-"""
+"""What ranges can determine: free directions by name, and whether several maps fit equally well (global rigidity)."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -13,7 +10,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from ccatp.beacons.cricket.map_fit import MapModel, MapState
-from ccatp.beacons.cricket.range_network import IndexArray, RangeNetwork, components, graph_pairs, list_names
+from ccatp.beacons.cricket.range_network import (
+    IndexArray,
+    RangeNetwork,
+    components,
+    coordinates_of,
+    every_pair,
+    graph_pairs,
+    list_names,
+)
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import rigid_modes
 
@@ -156,28 +161,25 @@ def _flexes(
 ) -> tuple[str, ...]:
     count, d = points.shape
     base = list(parts[0])
-    at = (np.array(base)[:, None] * d + np.arange(d)).ravel()
+    at = coordinates_of(base, d)
     # Take from each direction the rigid motion that its base makes.
     rigid = rigid_modes(points)
     moves = moves - rigid @ np.linalg.lstsq(rigid[at], moves[at], rcond=1e-9)[0]
     U, singular, _ = np.linalg.svd(moves, full_matrices=False)
     rows = U[:, singular > 1e-7].T
     names, lines = network.names, Counter[str]()
-    for row in _echelon(rows, _steps_from(base, network), d):
+    pairs = graph_pairs(network)
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
+    steps = np.asarray(dijkstra(graph, directed=False, unweighted=True, indices=base, min_only=True))
+    for row in _echelon(rows, steps, d):
         speeds = np.linalg.norm(row.reshape(count, d), axis=1)
         moving = [names[mote] for mote in np.flatnonzero(speeds > _STILL * speeds.max())]
         lines[f"{list_names(moving)} against {list_names([names[mote] for mote in base])}"] += 1
     return tuple(line if times == 1 else f"{line} ({times} ways)" for line, times in lines.items())
 
 
-def _steps_from(base: Sequence[int], network: RangeNetwork) -> FloatArray:
-    pairs = graph_pairs(network)
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(network.count, network.count)).tocsr()
-    return np.asarray(dijkstra(graph, directed=False, unweighted=True, indices=list(base), min_only=True))
-
-
 def _echelon(rows: FloatArray, steps: FloatArray, d: int) -> list[FloatArray]:
-    order = (np.argsort(steps, kind="stable")[:, None] * d + np.arange(d)).ravel()
+    order = coordinates_of(np.argsort(steps, kind="stable"), d)
     left = [row.copy() for row in rows]
     found = []
     for at in order:
@@ -226,7 +228,9 @@ def find_fold_over(network: RangeNetwork, rng: np.random.Generator) -> FoldOver:
     if complete:
         return FoldOver(True, (), np.zeros((0, 2), dtype=np.intp), ())
     single, rank = _stress(pairs, rng.standard_normal((count, d)), rng)
-    single = _measured(network, single)
+    measured = set(map(tuple, network.pairs.tolist()))
+    rows = [pair for pair in single.tolist() if tuple(pair) in measured]
+    single = np.array(rows, dtype=np.intp).reshape(-1, 2)
     if count > d + 1 and rank == count - d - 1:
         return FoldOver(True, (), single, ())
     # The same motes may hang on many pairs, one of which is a mote they all turn about: once is enough.
@@ -239,14 +243,7 @@ def _all_pairs(network: RangeNetwork) -> IndexArray:
     known = np.flatnonzero(np.isfinite(network.known_m).all(axis=1))
     if known.size < 2:
         return pairs
-    upper = np.triu_indices(len(known), 1)
-    return np.unique(np.concatenate([pairs, np.column_stack([known[upper[0]], known[upper[1]]])]), axis=0)
-
-
-def _measured(network: RangeNetwork, pairs: IndexArray) -> IndexArray:
-    ends = np.sort(np.column_stack([network.first, network.second]), axis=1)
-    measured = set(map(tuple, ends.tolist()))
-    return np.array([pair for pair in pairs.tolist() if tuple(pair) in measured], dtype=np.intp).reshape(-1, 2)
+    return np.unique(np.concatenate([pairs, every_pair(known)]), axis=0)
 
 
 def _stress(pairs: IndexArray, points: FloatArray, rng: np.random.Generator) -> tuple[IndexArray, int]:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from ccatp.beacons.slam.batch_odometry import CALIBRATION, Reckoning
 from ccatp.beacons.slam.recording import Readings, Steps
-from ccatp.config.beacon_models import PriorsConfig, RecordingConfig
+from ccatp.config.beacon_models import RecordingConfig
 from ccatp.core import FloatArray, IntArray
 
 OF_READINGS = ("range_scale", "range_offset_m", "bearing_offset_rad", "rssi_reference_db", "rssi_exponent")
@@ -128,7 +128,10 @@ class BatchProblem:
         self.sizes: FloatArray = self.there.sum(axis=1).astype(np.float64)
         self._read = np.where(self.there, read, 0.0)
         self.repeats = repeats(readings, settings.radio.correlation_s)
-        sigmas = _prior_sigmas(settings.priors, used)
+        # Of the shared unknowns and the beacons, shape (10 + 4 b,): 0 fixes one, infinity says nothing of it.
+        beacons = np.zeros((len(used), BEACON))
+        beacons[used] = (np.inf, np.inf, self.priors.beacon_offset_m, self.priors.beacon_reference_db)
+        sigmas = np.concatenate([[getattr(self.priors, name) for name in SHARED], beacons.ravel()])
         self.free = sigmas > 0.0
         self.prior_information = np.where(self.free, 1.0 / np.where(self.free, sigmas, 1.0) ** 2, 0.0)
         self.prior_information[np.isinf(sigmas)] = 0.0
@@ -292,11 +295,3 @@ def repeats(readings: Readings, correlation_s: float) -> FloatArray:
         half = 0.5 * correlation_s
         counts[rows] = np.searchsorted(t, t + half, "right") - np.searchsorted(t, t - half, "left")
     return counts
-
-
-def _prior_sigmas(priors: PriorsConfig, used: npt.NDArray[np.bool_]) -> FloatArray:
-    """Of the shared unknowns and the beacons, shape (10 + 4 b,): 0 fixes one, infinity tells nothing of it."""
-    shared = [getattr(priors, name) for name in SHARED]
-    beacons = np.zeros((len(used), BEACON))
-    beacons[used] = (np.inf, np.inf, priors.beacon_offset_m, priors.beacon_reference_db)
-    return np.concatenate([shared, beacons.ravel()])

@@ -1,6 +1,5 @@
 """Beacons as blocks of the filter's state, the settings of the filter, and how it learns the noise of its sensors."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from math import exp
 
@@ -185,32 +184,19 @@ class MapEntry:
     on_trial: int = 0
 
 
-class BeaconMap:
+class BeaconMap(dict[BeaconId, MapEntry]):
     """The beacons' blocks of an ``EkfSlam``."""
 
     def __init__(self, engine: EkfSlam, shared: slice) -> None:
+        super().__init__()
         self._engine, self._shared = engine, shared
-        self._entries: dict[BeaconId, MapEntry] = {}
-
-    def __contains__(self, beacon: BeaconId) -> bool:
-        return beacon in self._entries
-
-    def __iter__(self) -> Iterator[BeaconId]:
-        return iter(self._entries)
-
-    def __getitem__(self, beacon: BeaconId) -> MapEntry:
-        return self._entries[beacon]
-
-    def get(self, beacon: BeaconId) -> MapEntry | None:
-        """A beacon; None where it is not on the map."""
-        return self._entries.get(beacon)
 
     def join(self, beacon: BeaconId, mean: FloatArray, covariance: FloatArray) -> MapEntry:
         """A beacon that is correlated with nothing yet: mean (b,), covariance (b, b)."""
         self._append(beacon, mean, covariance)
-        self._entries[beacon] = MapEntry(_NONE, mean.size)
+        self[beacon] = MapEntry(_NONE, mean.size)
         self.renumber()
-        return self._entries[beacon]
+        return self[beacon]
 
     def leave(self, beacon: BeaconId) -> None:
         """Forget a beacon.
@@ -221,13 +207,13 @@ class BeaconMap:
         self._engine.remove(beacon)
         if (WANDER, beacon) in self._engine:
             self._engine.remove((WANDER, beacon))
-        del self._entries[beacon]
+        del self[beacon]
         self.renumber()
 
     def renumber(self) -> None:
-        """Find the columns anew, after a block has gone."""
+        """Find the columns again, after a block has gone."""
         engine = self._engine
-        for beacon, entry in self._entries.items():
+        for beacon, entry in self.items():
             parts: list[slice] = [slice(0, POSE), self._shared, engine.block(beacon)]
             if (WANDER, beacon) in engine:
                 parts.append(engine.block((WANDER, beacon)))
@@ -236,7 +222,7 @@ class BeaconMap:
 
     def wander_to(self, beacon: BeaconId, model: GaussMarkovBias, way_m: float, time_s: float) -> None:
         """Bring a beacon's wandering error, in sigmas, to now: w <- phi w, variance <- phi^2 variance + 1 - phi^2."""
-        entry = self._entries[beacon]
+        entry = self[beacon]
         if entry.wander < 0:
             self._append((WANDER, beacon), np.zeros(1), np.eye(1))
             self.renumber()

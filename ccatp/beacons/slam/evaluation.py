@@ -1,9 +1,4 @@
-"""A track against the truth of its recording: the figures that ``ccatp radio slam`` tells.
-
-The result of ``ccatp radio slam``: as data for machines, as a table for people.
-
-Estimators side by side on the same recordings: rows of figures, as a Markdown table.
-"""
+"""A track against the truth of its recording; the results of ``ccatp radio slam`` and ``compare`` as data and text."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -64,13 +59,17 @@ def judge(track: EstimatedPath, run: RecordedRun) -> TrackEvaluation:
     headings = wrapped(track.poses[:, 2] + alignment.angle_rad - truth[:, 2])
     offsets = np.hypot(*(alignment.moved(places) - surveyed).T)
     measurable = known.any() or len(common) > 2  # two points always fit
+    is_one_frame = False  # the truth gave the first pose: else track and truth are of two frames
+    if run.truth is not None:
+        start_s, end_s = run.truth.times_s[0] - FIRST_POSE_S, run.truth.times_s[-1]
+        is_one_frame = bool(start_s <= run.steps.times_s[0] <= end_s)
     return TrackEvaluation(
         alignment=alignment,
         trajectory_rmse_m=rms(errors),
         heading_rmse_rad=rms(headings),
         beacon_rmse_m=rms(offsets) if measurable else None,
         beacon_errors_m=dict(zip(common, offsets.tolist(), strict=True)) if measurable else {},
-        nees=_nees(track, truth, known) if _begins_on_truth(run) else None,
+        nees=_nees(track, truth, known) if is_one_frame else None,
         nis=consistency(track.nis, track.nis_sizes),
         errors_m=errors,
     )
@@ -93,12 +92,6 @@ def aligned_beacons(track: EstimatedPath, alignment: RigidMotion) -> dict[str, B
         ((x, y),) = alignment.moved(np.array([(fix.x_m, fix.y_m)])).tolist()
         moved[name] = BeaconFix(x, y, alignment.turned(fix.covariance))
     return moved
-
-
-def _begins_on_truth(run: RecordedRun) -> bool:
-    if run.truth is None:
-        return False
-    return bool(run.truth.times_s[0] - FIRST_POSE_S <= run.steps.times_s[0] <= run.truth.times_s[-1])
 
 
 def _nees(track: EstimatedPath, truth: FloatArray, known: np.ndarray) -> Consistency | None:

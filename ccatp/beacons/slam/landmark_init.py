@@ -204,7 +204,9 @@ class _Problem(NamedTuple):
         b, W, stride = prior.mean.copy(), np.linalg.inv(prior.covariance), 0.5 * self.reach_m
         variances, A, cost = self.z, W, inf
         for k in range(ITERATIONS):
-            H, G, e, R = self._linear(b)
+            H, G, e, R = _stacked(
+                self.readings, self.z.tolist(), self.places, self.calibration, b.tolist(), self.row_of
+            )
             spread = H.dot(self.P).dot(H.T)
             variances, left_out = _weighed(e, spread.diagonal() + R, R, k)
             S = spread + np.diag(variances)
@@ -219,9 +221,6 @@ class _Problem(NamedTuple):
                 break
             b = b + step * min(1.0, stride / max(size, 1e-12))
         return Candidate(b, np.linalg.inv(A), cost, variances)
-
-    def _linear(self, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        return _stacked(self.readings, self.z.tolist(), self.places, self.calibration, b.tolist(), self.row_of)
 
 
 def _stacked(

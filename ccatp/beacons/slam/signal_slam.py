@@ -95,11 +95,15 @@ class SignalSlam:
     @property
     def beacons(self) -> dict[BeaconId, BeaconEstimate]:
         """The map: places alone, x_m and y_m."""
-        found = {
+        found: dict[BeaconId, BeaconEstimate] = {
             beacon: BeaconEstimate(guess.mean[:PLACE], guess.covariance[:PLACE, :PLACE])
             for beacon, guess in self.waiting.guesses.items()
         }
-        return found | {beacon: self._place(beacon) for beacon in self._names()}
+        for beacon in self.engine.blocks:
+            if isinstance(beacon, int | str):
+                start = self.engine.block(beacon).start
+                found[beacon] = BeaconEstimate(*self.waiting.conditioned(columns_of(range(start, start + PLACE))))
+        return found
 
     @property
     def calibration(self) -> dict[str, tuple[float, float]]:
@@ -186,13 +190,6 @@ class SignalSlam:
     def path_loss_of(self, beacon: BeaconId) -> PathLoss:
         """The calibration of a radio."""
         return self.settings.path_loss.get(beacon, self.settings.default)
-
-    def _names(self) -> list[BeaconId]:
-        return [block for block in self.engine.blocks if isinstance(block, int | str)]
-
-    def _place(self, beacon: BeaconId) -> BeaconEstimate:
-        start = self.engine.block(beacon).start
-        return BeaconEstimate(*self.waiting.conditioned(columns_of(range(start, start + PLACE))))
 
     def _is_moving(self, beacon: BeaconId) -> bool:
         return self.settings.moving is not None and beacon == self.settings.moving.beacon
