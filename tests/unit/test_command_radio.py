@@ -1,0 +1,362 @@
+"""The commands ``ccatp radio slam``, ``calibrate``, ``fix``, ``fuzzy``; survey commands given a run among beacons."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccatp.cli import main
+from ccatp.config.load import dump_config, load_config
+from ccatp.config.package import configs_dir
+from ccatp.filters import FilterDiverged
+from ccatp.links.topics import schema_of
+from ccatp.records.recorder import Recorder, iter_messages
+from tests.unit.beacons.datasets.sets import (
+    BEACONS,
+    csv_lines,
+    labyrinth_lines,
+    world,
+    write_lines,
+    write_mrclam,
+    write_plaza,
+)
+
+CONTRACT = {
+    "dataset", "filter", "trajectory_rmse_m", "heading_rmse_rad", "beacon_rmse_m", "beacons", "range_scale",
+    "range_offset_m", "nis_mean", "nees_mean", "updates", "update_us_p50", "warnings",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A minute of a simulated run."""
+    return write_lines(tmp_path_factory.mktemp("csv") / "mine.csv", csv_lines(world(seconds=60.0)))
+
+
+@pytest.mark.parametrize("filter_name", ["ekf-slam", "smoother"])
+def test_json_is_the_contracts(recording: Path, filter_name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["radio", "slam", str(recording), "--filter", filter_name, "--json"]) == 0
+    out, err = capsys.readouterr()
+    data = json.loads(out)
+    assert set(data) >= CONTRACT
+    assert data["dataset"] == "mine"
+    assert data["filter"] == filter_name
+    assert data["trajectory_rmse_m"] < 0.1
+    assert data["heading_rmse_rad"] < 0.1
+    assert data["beacon_rmse_m"] < 0.2
+    assert set(data["beacons"]) == set(BEACONS)
+    offsets = [np.hypot(*np.subtract(data["beacons"][name], place)) for name, place in BEACONS.items()]
+    assert np.sqrt(np.mean(np.square(offsets))) == pytest.approx(data["beacon_rmse_m"])
+    assert data["range_scale"] == pytest.approx(1.0, abs=0.1)
+    assert data["updates"] > 200
+    assert data["update_us_p50"] > 0.0
+    assert (data["nis_mean"] is None) == (filter_name == "smoother")
+    assert data["nees_mean"] > 0.0
+    assert all(warning in err for warning in data["warnings"])
+
+
+def test_what_is_not_known_is_null(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write_plaza(tmp_path, world(seconds=60.0), mat=False)
+    (tmp_path / "Field1_GT.txt").unlink()
+    (tmp_path / "Field1_TL.txt").unlink()
+    assert main(["radio", "slam", str(file), "--json", "--filter", "smoother"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["trajectory_rmse_m"] is data["heading_rmse_rad"] is data["beacon_rmse_m"] is data["nees_mean"] is None
+    assert len(data["beacons"]) == len(BEACONS)
+
+
+@pytest.mark.parametrize("filter_name", ["ekf-slam", "smoother"])
+def test_a_truth_of_one_row_is_no_trajectory(
+    tmp_path: Path, filter_name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = labyrinth_lines(world(seconds=30.0))
+    first = next(line for line in lines if line.startswith("gt2"))
+    file = write_lines(tmp_path / "lab.txt", [first, *(line for line in lines if not line.startswith("gt2"))])
+    assert main(["radio", "slam", str(file), "--json", "--filter", filter_name]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["trajectory_rmse_m"] is data["nees_mean"] is None
+    assert data["beacon_rmse_m"] < 0.5
+    assert "no reference trajectory: the truth has 1 row" in data["warnings"][-1] + data["warnings"][0]
+
+
+def test_the_table_names_what_was_found(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["radio", "slam", str(recording), "--filter", "smoother"]) == 0
+    out = capsys.readouterr().out
+    for word in ("mine (csv): 60 s", "smoother: ", "m rms, heading", "range_scale 1.0", "NEES"):
+        assert word in out
+    rows = [line.split() for line in out.splitlines()[-len(BEACONS) :]]
+    assert {row[0] for row in rows} == set(BEACONS)
+
+
+def test_settings_change_what_is_assumed(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    changes = ["--set", "csv.priors.range_scale=0.0"]
+    assert main(["radio", "slam", str(recording), "--json", "--filter", "smoother", *changes]) == 0
+    assert json.loads(capsys.readouterr().out)["range_scale"] is None
+
+
+def test_the_robot_is_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_mrclam(tmp_path, world(seconds=30.0), robot=3)
+    assert main(["radio", "slam", str(tmp_path), "--robot", "3", "--json", "--filter", "smoother"]) == 0
+    assert json.loads(capsys.readouterr().out)["dataset"].endswith("robot 3")
+
+
+@pytest.mark.parametrize("filter_name", ["ekf-slam", "smoother"])
+def test_the_picture(recording: Path, tmp_path: Path, filter_name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "map.png"
+    assert main(["radio", "slam", str(recording), "--filter", filter_name, "--figure", str(picture)]) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["missing"], "missing: no such file or folder"),
+        (["{csv}", "--robot", "1"], "a csv set has one vehicle: leave out --robot"),
+        (["{csv}", "--format", "labyrinth"], "mine.csv:2: 'event,time_s,...' is none of range2"),
+        (["{csv}", "--format", "lidar"], "'lidar' is not one of"),
+        (["{csv}", "--filter", "particle"], "'particle' is not one of"),
+        (["{csv}", "--figure", "{tmp}/no/map.png"], "--figure: no directory"),
+        (["{csv}", "--figure", "{tmp}/map.wrong"], "map.wrong: no format by that name"),
+        (["{csv}", "--set", "csv.radio.range_sigma_m=-1"], "csv.radio.range_sigma_m"),
+        (["{csv}", "--set", "csv.radio.nothing=1"], "csv.radio.nothing"),
+    ],
+)
+def test_a_fault_is_one_line_and_status_2(
+    recording: Path, tmp_path: Path, arguments: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    filled = [argument.format(csv=recording, tmp=tmp_path) for argument in arguments]
+    assert main(["radio", "slam", *filled, "--json"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert told in err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("error", [FilterDiverged("prediction is not finite"), np.linalg.LinAlgError("singular")])
+def test_an_estimator_that_finds_nothing(
+    recording: Path, error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def diverging(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("ccatp.beacons.slam.causal.filter_run", diverging)
+    assert main(["radio", "slam", str(recording)]) == 2
+    assert f"mine: ekf-slam finds no finite map for these data ({error})" in capsys.readouterr().err.splitlines()[-1]
+
+
+XBEE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "radio" / "xbee_rssi"
+needs_xbee = pytest.mark.skipif(not XBEE.is_dir(), reason="the XBee sheets are not beside the checkout")
+CORNERS = ("--beacon", "A=0,0", "--beacon", "B=0,4", "--beacon", "C=4,0")
+
+
+def said(capsys: pytest.CaptureFixture[str], *argv: object) -> tuple[int, str, str]:
+    status = main([str(part) for part in argv])
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def pairs(folder: Path) -> Path:
+    rows = [f"{d},{-45.0 - 25.0 * np.log10(d) + 0.5 * (-1) ** k:.4f}" for k, d in enumerate((0.5, 1, 2, 3, 4, 5))]
+    (folder / "pairs.csv").write_text("distance_m,rssi_dbm\n" + "\n".join(rows) + "\n")
+    return folder / "pairs.csv"
+
+
+def test_calibrate_prints_what_the_configuration_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = said(capsys, "radio", "calibrate", pairs(tmp_path))
+    assert (status, err) == (0, "")
+    assert "reference_dbm = -44." in out
+    found = json.loads(said(capsys, "radio", "calibrate", pairs(tmp_path), "--json")[1])
+    assert found["exponent"] == pytest.approx(2.5, abs=0.3)
+    assert found["places"] == 6
+    assert found["white_sigma_db"] is None
+
+
+def test_figures_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    assert said(capsys, "radio", "calibrate", pairs(tmp_path), "--figure", tmp_path / "a.png")[0] == 0
+    assert said(capsys, "radio", "fuzzy", "--figure", tmp_path / "b.png")[0] == 0
+    assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in ("a.png", "b.png"))
+    status, _, err = said(capsys, "radio", "fuzzy", "--figure", tmp_path / "none" / "b.png")
+    assert status == 2
+    assert "--figure: no directory" in err
+
+
+def test_fuzzy_tells_the_speed_at_a_point(capsys: pytest.CaptureFixture[str]) -> None:
+    found = json.loads(said(capsys, "radio", "fuzzy", "--at", 2.0, 0.0, "--at", 0.05, 2.0, "--json")[1])
+    assert [point["speed_m_s"] for point in found["points"]] == [0.15, 0.05]
+    gap = 'control.fuzzy.rules=[{when={distance_m="near"},then="slow"}]'
+    status, _, err = said(capsys, "radio", "fuzzy", "--set", gap)
+    assert status == 2
+    assert "no rule of the fuzzy controller fires" in err
+
+
+@pytest.mark.parametrize("at", [("nan", "0.5"), ("-3", "0.5"), ("1", "inf"), ("inf", "0")])
+def test_fuzzy_refuses_what_is_no_point(at: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = said(capsys, "radio", "fuzzy", "--at", *at)
+    assert (status, out) == (2, "")
+    assert "wants a distance >= 0 m and a finite angle" in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (("radio", "calibrate", "nowhere.csv"), "no such file"),
+        (("radio", "fix", "nowhere.csv"), "give the place of two beacons"),
+        (("radio", "fix", "nowhere.csv", "--beacon", "A"), "is not NAME=X,Y"),
+        (("radio", "fix", "nowhere.csv", *CORNERS), "no such file"),
+        (("radio", "fix", "nowhere.csv", "--beacon", "A=0,0", "--beacon", "B=0,0"), "which bounds no room"),
+    ],
+)
+def test_bad_input_is_one_line(argv: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = said(capsys, *argv)
+    assert status != 0
+    assert out == ""
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_what_is_no_text_is_told_what_calibrates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rnd.csv").write_bytes(b"\xff\xfe\x00\x81")
+    status, _, err = said(capsys, "radio", "calibrate", tmp_path / "rnd.csv")
+    assert status == 2
+    assert "is not text; give a CSV file or an .xlsx workbook with columns of levels" in err
+
+
+@pytest.mark.parametrize("level", ["nan", "-1e300"])
+def test_levels_that_are_none(tmp_path: Path, level: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "k.csv").write_text(f"distance_m,rssi_dbm\n1,-40\n2,{level}\n3,-60\n4,-62\n")
+    status, _, err = said(capsys, "radio", "calibrate", tmp_path / "k.csv")
+    assert status == 2
+    assert f"k.csv:3: {level.replace('e3', 'e+3')} in column 2 is no level" in err
+
+
+def test_compare_takes_the_format_that_its_hint_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "name it with --format" in said(capsys, "radio", "compare", tmp_path)[2]
+    status, _, err = said(capsys, "radio", "compare", tmp_path, "--format", "labyrinth")
+    assert status == 2
+    assert "holds no Labyrinth text" in err
+
+
+def test_map_tells_the_configuration_of_a_survey(capsys: pytest.CaptureFixture[str]) -> None:
+    file = Path(__file__).parents[2] / "configs" / "ccatp.toml"
+    status, _, err = said(capsys, "radio", "map", "--config", file)
+    assert status == 2
+    assert "ccatp.toml: is the configuration of a survey of a mirror" in err
+
+
+def places(folder: Path) -> Path:
+    rows = []
+    for x in (0.5, 1.5, 2.5, 3.5):
+        for y in (0.5, 1.5, 2.5, 3.5):
+            r = [np.hypot(x - bx, y - by) for bx, by in ((0, 0), (0, 4), (4, 0))]
+            rows.append(f"{x},{y}," + ",".join(f"{-45.0 - 25.0 * np.log10(d) + 0.1 * ((x + y) % 2):.3f}" for d in r))
+    (folder / "places.csv").write_text("x,y,RSSI A,RSSI B,RSSI C\n" + "\n".join(rows) + "\n")
+    return folder / "places.csv"
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ((), "give either --fingerprints or --path-loss"),
+        (("--room", "1,2"), "is not X0,Y0,X1,Y1"),
+        (("--room", "1,2,0,3"), "its second corner"),
+        (("--room", "0,0,1,inf"), "must be numbers within"),
+        (("--spacing", "0"), "must be above 0 and at most the room's longer side 6 m"),
+        (("--spacing", "nan"), "must be above 0"),
+        (("--spacing", "1e-4"), "more than 250000 points in a room of 6 by 6 m; give 0.012 m or more"),
+        (("--beacon", "A=1,1"), "A was given before"),
+        (("--beacon", "D=nan,0"), "--beacon D=nan,0: coordinates must be numbers"),
+        (("--beacon", "=1,0"), "--beacon =1,0: has no name"),
+        (("--exchange", "A,Z"), "is not two beacons of the data, which has A, B, C"),
+    ],
+)
+def test_fix_says_what_is_missing(
+    tmp_path: Path, more: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, _, err = said(capsys, "radio", "fix", places(tmp_path), *CORNERS, *more)
+    assert status == 2
+    assert message in err
+
+
+def test_fix_finds_places_and_exchanged_beacons(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = places(tmp_path)
+    found = json.loads(said(capsys, "radio", "fix", file, *CORNERS, "--fingerprints", file, "--json")[1])
+    assert found["leave_one_out"] is True
+    assert found["mean_error_m"] < 0.15
+    other = tmp_path / "other.csv"
+    other.write_text(file.read_text().replace("RSSI B,RSSI C", "RSSI C,RSSI B"))
+    status, out, err = said(capsys, "radio", "fix", other, *CORNERS, "--fingerprints", file)
+    assert status == 0
+    assert "beacons look exchanged: B is C, C is B" in err
+    exchanged = said(capsys, "radio", "fix", other, *CORNERS, "--fingerprints", file, "--exchange", "B,C", "--json")
+    assert json.loads(exchanged[1])["mean_error_m"] < 0.15
+    assert "mean error" in out
+
+
+@needs_xbee
+def test_xbee_scenario_1_is_fixed_within_its_limit(capsys: pytest.CaptureFixture[str]) -> None:
+    folder = XBEE / "Scenario1"
+    common = (*CORNERS, "--fingerprints", folder / "Database_Scenario1.xlsx", "--json")
+    tests = json.loads(said(capsys, "radio", "fix", folder / "Tests_Scenario1.xlsx", "--exchange", "B,C", *common)[1])
+    own = json.loads(said(capsys, "radio", "fix", folder / "Database_Scenario1.xlsx", *common)[1])
+    assert tests["mean_error_m"] <= 1.3
+    assert own["mean_error_m"] <= 1.3
+    inside = (tests["in_region"] + own["in_region"]) / (len(tests["points"]) + len(own["points"]))
+    assert 0.80 <= inside <= 0.95
+
+
+@needs_xbee
+def test_xbee_sheets_and_logs_agree(capsys: pytest.CaptureFixture[str]) -> None:
+    sheet = XBEE / "Scenario1" / "Pathloss_Scenario1.xlsx"
+    one = json.loads(said(capsys, "radio", "calibrate", sheet, "--json")[1])
+    logs = XBEE / "Scenario1" / "Pathloss" / "Zigbee"
+    other = json.loads(said(capsys, "radio", "calibrate", logs, "--points", sheet, "--json")[1])
+    assert other["readings"] == 900
+    assert other["exponent"] == pytest.approx(one["exponent"], abs=0.05)
+    assert other["shadowing_sigma_db"] > 5.0 * other["white_sigma_db"]
+
+
+@pytest.mark.parametrize("command", [["align"], ["plot"], ["replay"], ["calibrate", "--from"]])
+def test_a_run_among_beacons_is_named_as_such(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(configs_dir() / "zigbee.toml", tmp_path / "config.toml")
+    Recorder(tmp_path / "telemetry.mcap", [("truth", schema_of("truth"))], is_simulation=True).close()
+    assert main([*command, str(tmp_path)]) == 2
+    err = capsys.readouterr().err
+    assert f'{tmp_path}/config.toml: is of a mission among beacons (system = "zigbee")' in err
+    assert err.endswith(f"use ccatp report {tmp_path}\n")
+    assert err.count("\n") == 1
+
+
+def test_the_check_is_of_surveys(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "--sim", "--config", str(configs_dir() / "zigbee.toml")]) == 2
+    out, err = capsys.readouterr()
+    assert "is of a mission among beacons" in err
+    assert "surveys of mirrors alone; use ccatp run" in err
+    assert err.count("\n") == 1
+    assert not out
+
+
+def test_a_map_of_a_run_without_points(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "config.toml").write_text(dump_config(load_config()))
+    assert main(["plot", str(tmp_path)]) == 2
+    err = capsys.readouterr().err
+    assert f"{tmp_path}: no mission.sqlite there" in err
+    assert "resume" not in err
+
+
+def test_a_cut_recording_is_told_without_loose_ends(tmp_path: Path) -> None:
+    path = tmp_path / "telemetry.mcap"
+    recorder = Recorder(path, [("truth", schema_of("truth"))], is_simulation=True)
+    recorder.write("truth", 1.0, b'{"seq":0,"t_s":0.0,"rows":[]}')
+    recorder.close()
+    path.write_bytes(path.read_bytes()[:-60])
+    damages: list[str] = []
+    assert list(iter_messages(path, damages.append))
+    (damage,) = damages
+    assert "damaged or cut off before byte" in damage
+    assert damage == damage.rstrip(" :")
