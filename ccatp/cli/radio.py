@@ -50,15 +50,13 @@ def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) 
 
     from ccatp.beacons.slam.batch_smoother import smooth
     from ccatp.beacons.slam.causal import filter_run
-    from ccatp.beacons.slam.settings import slam_settings
     from ccatp.filters.base import FilterError
 
     cfg: RecordingConfig = getattr(assumed, run.kind)
     try:
         if filter_name == "smoother":
             return smooth(run, cfg, perf_counter)
-        first_sigmas = (cfg.priors.pose_m, cfg.priors.heading_rad)
-        return filter_run(run, slam_settings(cfg, assumed.filter), first_sigmas, perf_counter)
+        return filter_run(run, cfg, assumed.filter, perf_counter)
     except (FilterError, LinAlgError) as error:
         raise SlamCommandError(
             f"{run.name}: {filter_name} finds no finite map for these data ({str(error)[:80]}); look at its warnings"

@@ -6,19 +6,21 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ccatp.beacons.slam.beacon_map import RangeModel, RobustLoss, SlamSettings
-from ccatp.beacons.slam.motion import DifferentialDrive, DifferentialNoise, Increment
+from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.range_slam import BeaconSlam
 from ccatp.beacons.slam.recording import RangeReading, Reading
 from ccatp.core import wrap_pi
+from tests.support.slam_settings import odometry, settings, trust
 
-NOISE = DifferentialNoise(0.02, 0.0, 0.01, 0.02, 0.0, 0.0)
-PLAIN = RobustLoss(
-    1e3, 1e3, 0.0, 1.0, 10**9, 10**9, 0.3, 0.3, True
-)  # the textbook's filter: no gate, no knee, nothing learned
 BEACONS = {1: (4.0, 1.0), 2: (2.0, 6.0), 3: (-3.0, 4.0), 4: (-1.0, -2.0)}
 SIGMA_M, SIGMA_RAD, STEP_M, TURN_RAD = 0.1, 0.05, 0.1, 0.04
 P0 = np.diag((1e-4, 1e-4, 1e-4))
+# The textbook's filter: no gate, no knee, nothing learned.
+PLAIN = settings(
+    **trust(1e3, 1e3, 0.0, 1.0, 10**9, 10**9), **odometry(0.02, 0.0, 0.01, 0.02, 0.0, 0.0),
+    radio__range_sigma_m=SIGMA_M, radio__bearing_sigma_rad=SIGMA_RAD,
+)  # fmt: skip
+NOISE = PLAIN.cfg.odometry
 
 
 def drive(slam: BeaconSlam, seed: int, steps: int, *, bearings: bool) -> tuple[float, float, int]:
@@ -48,10 +50,9 @@ def drive(slam: BeaconSlam, seed: int, steps: int, *, bearings: bool) -> tuple[f
 
 
 def check_consistent(seeds: int, steps: int, *, bearings: bool) -> None:
-    settings = SlamSettings(DifferentialDrive(NOISE), PLAIN, RangeModel(SIGMA_M, 0.0, 0.0, 0.0), SIGMA_RAD)
     nees, nis, size = 0.0, 0.0, 0
     for seed in range(seeds):
-        slam = BeaconSlam(settings, (0.0, 0.0, 0.0), P0)
+        slam = BeaconSlam(*PLAIN, (0.0, 0.0, 0.0), P0)
         found = drive(slam, seed, steps, bearings=bearings)
         assert set(slam.beacons) == set(BEACONS)
         nees, nis, size = nees + found[0], nis + found[1], size + found[2]
@@ -67,10 +68,10 @@ def test_range_and_bearing_over_fifty_seeds() -> None:
 
 def test_a_filter_that_believes_too_much_is_found_out() -> None:
     """The band is narrow enough: a tenth less noise than there is falls out of it."""
-    settings = SlamSettings(DifferentialDrive(NOISE), PLAIN, RangeModel(0.9 * SIGMA_M, 0.0, 0.0, 0.0), 0.9 * SIGMA_RAD)
+    sure = PLAIN.but(radio__range_sigma_m=0.9 * SIGMA_M, radio__bearing_sigma_rad=0.9 * SIGMA_RAD)
     nis, size = 0.0, 0
     for seed in range(10):
-        found = drive(BeaconSlam(settings, (0.0, 0.0, 0.0), P0), seed, 60, bearings=True)
+        found = drive(BeaconSlam(*sure, (0.0, 0.0, 0.0), P0), seed, 60, bearings=True)
         nis, size = nis + found[1], size + found[2]
     assert nis > chi2.ppf(0.975, size)
 

@@ -9,7 +9,7 @@ from math import inf, pi, sqrt
 
 import numpy as np
 
-from ccatp.beacons.slam.beacon_map import HEADING, SlamSettings
+from ccatp.beacons.slam.beacon_map import HEADING
 from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.range_slam import BeaconInnovation, BeaconSlam
 from ccatp.beacons.slam.recording import (
@@ -22,6 +22,7 @@ from ccatp.beacons.slam.recording import (
     RssiReading,
     Steps,
 )
+from ccatp.config.recording_models import RecordingConfig, SlamFilterConfig
 from ccatp.core import FloatArray
 
 FAR = 3.0  # standard deviations of the prior beyond which a value is told
@@ -119,27 +120,24 @@ DOUBTFUL_SHARE = 0.3  # share of refused readings that is told
 
 
 def filter_run(
-    run: RecordedRun, settings: SlamSettings, first_sigmas: tuple[float, float], clock_s: Callable[[], float]
+    run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float]
 ) -> EstimatedPath:
-    """Run the filter over a recording; nothing of the truth is used but the first pose.
-
-    Args:
-        first_sigmas: of the first position, m, and the first heading, rad.
-    """
-    position, heading = first_sigmas
-    search = HeadingRelocalizer(BeaconSlam(settings, run.first_pose, np.diag((position**2, position**2, heading**2))))
+    """Run the filter over a recording; nothing of the truth is used but the first pose."""
+    position, heading = cfg.priors.pose_m, cfg.priors.heading_rad
+    first = np.diag((position**2, position**2, heading**2))
+    search = HeadingRelocalizer(BeaconSlam(cfg, how, run.first_pose, first))
     times = np.union1d(_spaced(run.steps.times_s), run.readings.times_s)
     increments, readings = _increments(run.steps, times), list(_readings(run))
     ends = np.searchsorted([reading.time_s for reading in readings], times, side="right").tolist()
     poses, covariances = np.empty((len(times), 3)), np.empty((len(times), 3, 3))
     book = _Book()
-    for k, (first, end) in enumerate(pairwise((0, *ends))):
+    for k, (begin, end) in enumerate(pairwise((0, *ends))):
         begin_s = clock_s()
         if k:
             search.predict(increments[k - 1])
         predicted_s = clock_s()
         book.predict_s.append(predicted_s - begin_s)
-        if now := readings[first:end]:
+        if now := readings[begin:end]:
             taken = search.observe(now)
             end_s = clock_s()
             book.observed(taken, len(now), end_s - begin_s, end_s - predicted_s)

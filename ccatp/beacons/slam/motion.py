@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from ccatp.config.recording_models import OdometryNoiseConfig, PriorsConfig, SlamFilterConfig
 from ccatp.core import FloatArray
 
 POSE = 3  # x_m, y_m, heading_rad: the first states of a vehicle
@@ -73,39 +74,6 @@ def estimated(priors: Mapping[str, float]) -> tuple[tuple[str, ...], tuple[float
     return tuple(kept), tuple(kept.values())
 
 
-@dataclass(frozen=True, slots=True)
-class DifferentialNoise:
-    """Noise of odometry by increments; all are random walks, so variances grow with the way and the time.
-
-    Attributes:
-        distance_per_sqrt_m: standard deviation of the distance after a metre, m / sqrt(m).
-        distance_per_sqrt_rad: of the distance after a radian of turning, m / sqrt(rad).
-        turn_per_sqrt_m: of the heading after a metre, rad / sqrt(m).
-        turn_per_sqrt_rad: of the heading after a radian, rad / sqrt(rad).
-        turn_per_sqrt_s: of the heading after a second, rad / sqrt(s) (a gyroscope's angle random walk).
-        lateral_per_sqrt_m: of the way sideways after a metre, m / sqrt(m).
-        turn_bias_sigma_rad_s: prior of a constant error of the turn rate; 0: not estimated.
-        turn_bias_walk_rad_s_sqrt_s: how it wanders, (rad/s) / sqrt(s).
-        turn_scale_sigma: prior of the relative error of turns; 0: not estimated.
-        distance_scale_sigma: prior of the relative error of distances; 0: not estimated.
-        rest_speed_m_s, rest_turn_rad_s: odometry slower than both comes from a vehicle at rest; used where a turn bias
-            is estimated; 0: never.
-    """
-
-    distance_per_sqrt_m: float
-    distance_per_sqrt_rad: float
-    turn_per_sqrt_m: float
-    turn_per_sqrt_rad: float
-    turn_per_sqrt_s: float
-    lateral_per_sqrt_m: float
-    turn_bias_sigma_rad_s: float = 0.0
-    turn_bias_walk_rad_s_sqrt_s: float = 0.0
-    turn_scale_sigma: float = 0.0
-    distance_scale_sigma: float = 0.0
-    rest_speed_m_s: float = 0.0
-    rest_turn_rad_s: float = 0.0
-
-
 class DifferentialDrive:
     """Odometry by increments: the chord of a circular arc (thesis eq. 2.14 as it is meant).
 
@@ -115,19 +83,17 @@ class DifferentialDrive:
         x <- x + c d cos(m) - l sin(m),  y <- y + c d sin(m) + l cos(m),  heading <- heading + w
 
     States behind the pose, each where its prior is not zero: turn_bias_rad_s (b), turn_scale (e_w), distance_scale
-    (e_d): positive where the odometry reads too much. At rest the turn is nothing but the bias: the heading stays.
+    (e_d): positive where the odometry reads too much. At rest, where the odometry is slower than ``rest_speed_m_s`` and
+    ``rest_turn_rad_s``, the turn is nothing but the bias: the heading stays. All noise is a random walk, so variances
+    grow with the way and the time.
     """
 
-    def __init__(self, noise: DifferentialNoise) -> None:
-        self.noise = noise
-        priors = {
-            "turn_bias_rad_s": noise.turn_bias_sigma_rad_s,
-            "turn_scale": noise.turn_scale_sigma,
-            "distance_scale": noise.distance_scale_sigma,
-        }
-        self.names, self.prior_sigmas = estimated(priors)
+    def __init__(self, noise: OdometryNoiseConfig, priors: PriorsConfig, how: SlamFilterConfig) -> None:
+        self._noise, self._how = noise, how
+        calibrated = ("turn_bias_rad_s", "turn_scale", "distance_scale")
+        self.names, self.prior_sigmas = estimated({name: getattr(priors, name) for name in calibrated})
         place = {name: POSE + i for i, name in enumerate(self.names)}
-        self._bias, self._turn_scale, self._way_scale = (place.get(name, -1) for name in priors)
+        self._bias, self._turn_scale, self._way_scale = (place.get(name, -1) for name in calibrated)
         size = POSE + len(self.names)
         self._F, self._Q = np.eye(size), np.zeros((size, size))
 
@@ -164,13 +130,11 @@ class DifferentialDrive:
         if self._bias < 0 or not self._rests(odometry):
             return None
         dt = odometry.interval_s
-        return self._bias, odometry.turn_rad / dt, self.noise.turn_per_sqrt_s**2 / dt
+        return self._bias, odometry.turn_rad / dt, self._noise.turn_per_sqrt_s**2 / dt
 
     def _rests(self, odometry: Increment) -> bool:
-        dt, noise = odometry.interval_s, self.noise
-        return (
-            abs(odometry.distance_m) < noise.rest_speed_m_s * dt and abs(odometry.turn_rad) < noise.rest_turn_rad_s * dt
-        )
+        dt, how = odometry.interval_s, self._how
+        return abs(odometry.distance_m) < how.rest_speed_m_s * dt and abs(odometry.turn_rad) < how.rest_turn_rad_s * dt
 
     def _turn(self, values: list[float], odometry: Increment) -> tuple[float, float, float]:
         scaled = 1.0 + values[self._turn_scale] if self._turn_scale >= 0 else 1.0
@@ -186,7 +150,7 @@ class DifferentialDrive:
         chord: float,
         turning: float,
     ) -> FloatArray:
-        noise, dt = self.noise, odometry.interval_s
+        noise, dt = self._noise, odometry.interval_s
         way, turned = hypot(odometry.distance_m, odometry.lateral_m), abs(odometry.turn_rad)
         var_way = noise.distance_per_sqrt_m**2 * way + noise.distance_per_sqrt_rad**2 * turned
         var_turn = noise.turn_per_sqrt_m**2 * way + noise.turn_per_sqrt_rad**2 * turned + noise.turn_per_sqrt_s**2 * dt
@@ -202,7 +166,7 @@ class DifferentialDrive:
         Q[1, 2] = Q[2, 1] = ty * var_turn
         Q[2, 2] = var_turn
         if self._bias >= 0:
-            Q[self._bias, self._bias] = noise.turn_bias_walk_rad_s_sqrt_s**2 * dt
+            Q[self._bias, self._bias] = self._how.turn_bias_walk_rad_s_sqrt_s**2 * dt
         return Q
 
 

@@ -13,12 +13,12 @@ from ccatp.beacons.slam.beacon_map import (
     HeadingTransport,
     MapEntry,
     NoiseLevel,
-    SlamSettings,
 )
 from ccatp.beacons.slam.landmark_init import LandmarkInitializer, derivatives
 from ccatp.beacons.slam.measurement_models import MeasurementModels, is_direction, kind_of, strength_of
-from ccatp.beacons.slam.motion import POSE, DeadReckoning, Increment, VehiclePose
+from ccatp.beacons.slam.motion import POSE, DeadReckoning, DifferentialDrive, Increment, VehiclePose, estimated
 from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
+from ccatp.config.recording_models import RecordingConfig, SlamFilterConfig
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.ekf_slam import BlockError, EkfSlam, RowUpdate
 
@@ -92,35 +92,35 @@ class BeaconSlam:
     """
 
     def __init__(
-        self,
-        settings: SlamSettings,
-        pose0: VehiclePose | Sequence[float],
-        P0: FloatArray,
+        self, cfg: RecordingConfig, how: SlamFilterConfig, pose0: VehiclePose | Sequence[float], P0: FloatArray,
         known: Mapping[BeaconId, BeaconEstimate] | None = None,
-    ) -> None:
-        self.settings = settings
-        self._motion, self._sensors, trust = settings.motion, MeasurementModels(settings), settings.trust
-        delay = (settings.delay_sigma_s,) if settings.delay_sigma_s > 0.0 else ()
-        own, shared = self._motion.prior_sigmas, (*self._sensors.prior_sigmas, *delay)
+    ) -> None:  # fmt: skip
+        self._how, radio = how, cfg.radio
+        self._motion = DifferentialDrive(cfg.odometry, cfg.priors, how)
+        self._sensors = MeasurementModels(radio, cfg.priors)
+        delay_names, delay_sigmas = estimated({DELAY: cfg.priors.delay_s})
+        own, shared = self._motion.prior_sigmas, (*self._sensors.prior_sigmas, *delay_sigmas)
         v, self._ranges = POSE + len(own), len(self._sensors.names)
         mean, P = np.zeros(v), np.zeros((v, v))
         mean[:POSE], P[:POSE, :POSE] = pose0, P0
         P[range(POSE, v), range(POSE, v)] = np.square(own)
         self.engine = EkfSlam(mean, P, np.zeros(len(shared)), np.diag(np.square(shared)))
         self._shared = slice(v, v + len(shared))
-        self._delay = v + len(shared) - 1 if delay else -1
+        self._delay = v + len(shared) - 1 if delay_names else -1
         self._shown = POSE + len(shared)  # of the columns of a row, those before the beacon
         self.prior_sigmas = (*own, *shared)
-        self._names: tuple[str, ...] = (*self._motion.names, *self._sensors.names, *((DELAY,) if delay else ()))
-        self._clock = DeadReckoning(is_delayed=bool(delay))
+        self._names = (*self._motion.names, *self._sensors.names, *delay_names)
+        self._wander = None
+        if radio.correlation_s > 0.0:
+            self._wander = GaussMarkovBias(how.wander_share, how.wander_length_m, radio.correlation_s)
+        self._clock = DeadReckoning(is_delayed=bool(delay_names))
         self._map = BeaconMap(self.engine, self._shared)
-        self._transport = HeadingTransport(self.engine) if trust.transports else None
-        self.levels = {
-            k: NoiseLevel(trust.learn_prior, trust.learn_memory) for k in ("range", "bearing", "rssi", "motion")
-        }
-        self._learns = trust.learn_memory > 0.0
+        self._transport = HeadingTransport(self.engine) if how.transports else None
+        kinds = ("range", "bearing", "rssi", "motion")
+        self.levels = {kind: NoiseLevel(how.learn_prior, how.learn_memory) for kind in kinds}
+        self._learns = how.learn_memory > 0.0
         self._fresh = AddedPoseNoise()
-        self._gate, self._knee = trust.gate_sigmas**2, trust.knee_sigmas
+        self._gate, self._knee = radio.gate_sigmas**2, how.knee_sigmas
         self._refused, self.jumps, self.unplaced = 0, 0, 0
         self.moved: list[tuple[BeaconId, float]] = []
         self._way_m = 0.0
@@ -180,11 +180,7 @@ class BeaconSlam:
             self._follow(corrected)
 
     def observe(self, readings: Iterable[Reading]) -> list[BeaconInnovation]:
-        """Take readings of any beacons, one after the other; those of new ones begin their place on the map.
-
-        Raises:
-            MeasurementError: the settings have no model of a reading.
-        """
+        """Take readings of any beacons, one after the other; those of new ones begin their place on the map."""
         self.learned = []
         for reading in readings:
             entry, before = self._map.get(reading.beacon), self.engine.mean.copy()
@@ -224,7 +220,7 @@ class BeaconSlam:
         self._map.leave(beacon)
 
     def _update(self, reading: Reading, entry: MapEntry) -> BeaconInnovation:
-        model = None if is_direction(reading) else self._sensors.wander(reading)
+        model = None if is_direction(reading) else self._wander
         if model is not None:
             self._map.wander_to(reading.beacon, model, self._way_m, reading.time_s)
         bearing = reading.bearing_rad
@@ -283,14 +279,13 @@ class BeaconSlam:
             return
         entry.refused += 1
         self._refused += 1
-        trust = self.settings.trust
-        if self._refused >= trust.doubt_pose_after:
+        if self._refused >= self._how.doubt_pose_after:
             self._refused = 0
             v = self.engine.vehicle_size
             jump = np.zeros(v)
-            jump[:POSE] = trust.jump_m, trust.jump_m, trust.jump_rad
+            jump[:POSE] = self._how.jump_m, self._how.jump_m, self._how.jump_rad
             self.engine.predict(self.engine.mean[:v].copy(), np.eye(v), np.diag(jump**2))
             self.jumps += 1
-        if entry.refused >= trust.doubt_beacon_after:
+        if entry.refused >= self._how.doubt_beacon_after:
             self._map.leave(reading.beacon)
             self.moved.append((reading.beacon, reading.time_s))

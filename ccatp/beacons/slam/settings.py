@@ -1,53 +1,14 @@
-"""From the configuration to the settings of the estimators."""
-
-from dataclasses import fields
+"""From the configuration of a robot among radios to its filter."""
 
 import numpy as np
 from scipy.special import chdtri
 
-from ccatp.beacons.slam.beacon_map import GaussMarkovBias, RangeModel, RobustLoss, RssiModel, SlamSettings
-from ccatp.beacons.slam.motion import DifferentialDrive, DifferentialNoise, SlippingVehicle, VehiclePose, WheelNoise
+from ccatp.beacons.slam.motion import SlippingVehicle, VehiclePose, WheelNoise
 from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.reflector import ReflectorScan
 from ccatp.beacons.slam.signal_landmarks import MovingRadio, ShadowingMap
 from ccatp.beacons.slam.signal_slam import SignalSettings, SignalSlam
-from ccatp.config.beacon_models import RadioConfig, RecordingConfig, SlamFilterConfig
-
-
-def slam_settings(cfg: RecordingConfig, how: SlamFilterConfig) -> SlamSettings:
-    """Of the filter: a format's instruments, and how readings are taken."""
-    priors, radio = cfg.priors, cfg.radio
-    noise = DifferentialNoise(
-        **cfg.odometry.model_dump(),
-        turn_bias_sigma_rad_s=priors.turn_bias_rad_s,
-        turn_bias_walk_rad_s_sqrt_s=how.turn_bias_walk_rad_s_sqrt_s,
-        turn_scale_sigma=priors.turn_scale,
-        distance_scale_sigma=priors.distance_scale,
-        rest_speed_m_s=how.rest_speed_m_s,
-        rest_turn_rad_s=how.rest_turn_rad_s,
-    )
-    wander = None
-    if radio.correlation_s > 0.0:
-        wander = GaussMarkovBias(how.wander_share, how.wander_length_m, radio.correlation_s)
-    trust = how.model_dump(include={field.name for field in fields(RobustLoss)})
-    reference_sigma_db = (priors.rssi_reference_db**2 + priors.beacon_reference_db**2) ** 0.5
-    return SlamSettings(
-        motion=DifferentialDrive(noise),
-        trust=RobustLoss(gate_sigmas=radio.gate_sigmas, **trust),
-        range=RangeModel(
-            radio.range_sigma_m, radio.range_sigma_per_m, priors.range_scale, priors.range_offset_m, wander
-        ),
-        bearing_sigma_rad=radio.bearing_sigma_rad,
-        rssi=RssiModel(
-            sigma_db=radio.rssi_sigma_db,
-            reference_dbm=radio.rssi_reference_dbm,
-            reference_sigma_db=reference_sigma_db,
-            exponent=radio.rssi_exponent,
-            exponent_sigma=priors.rssi_exponent,
-            wander=wander,
-        ),
-        delay_sigma_s=priors.delay_s,
-    )
+from ccatp.config.beacon_models import RadioConfig
 
 
 def new_slam(cfg: RadioConfig) -> SignalSlam:

@@ -11,16 +11,20 @@ import pytest
 from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.slam.causal import filter_run
 from ccatp.beacons.slam.evaluation import judge
-from ccatp.beacons.slam.motion import DifferentialDrive, DifferentialNoise, Increment
+from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun, ReferencePath
 from ccatp.beacons.slam.reflector import ReflectorScan, ScanResult
-from ccatp.beacons.slam.settings import slam_settings
 from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.sim.radio import Packet
+from tests.support.slam_settings import odometry, settings
 from tests.unit.beacons.datasets.sets import recorded, world
 
-NOISE = DifferentialNoise(0.05, 0.03, 0.01, 0.05, 0.002, 0.02, 0.02, 1e-4, 0.1, 0.1, 0.03, 0.03)
+CALIBRATED = settings(
+    **odometry(0.05, 0.03, 0.01, 0.05, 0.002, 0.02), priors__turn_bias_rad_s=0.02, priors__turn_scale=0.1,
+    priors__distance_scale=0.1, filter__turn_bias_walk_rad_s_sqrt_s=1e-4, filter__rest_speed_m_s=0.03,
+    filter__rest_turn_rad_s=0.03,
+)  # fmt: skip
 
 
 def jacobian(of: Callable[[FloatArray], FloatArray], x: FloatArray, step: float = 1e-6) -> FloatArray:
@@ -30,20 +34,20 @@ def jacobian(of: Callable[[FloatArray], FloatArray], x: FloatArray, step: float 
 @pytest.mark.parametrize("turn_rad", [0.0, 1e-4, 0.7, -2.0])
 @pytest.mark.parametrize("lateral_m", [0.0, 0.2])
 def test_jacobian_of_the_differential_drive(turn_rad: float, lateral_m: float) -> None:
-    drive, odometry = DifferentialDrive(NOISE), Increment(1.0, 0.5, 0.8, turn_rad, lateral_m)
+    drive, step = CALIBRATED.drive, Increment(1.0, 0.5, 0.8, turn_rad, lateral_m)
     x = np.array((1.0, -2.0, 2.5, 0.01, 0.05, -0.04))
-    F = drive.step(x, odometry).F.copy()
-    assert pytest.approx(jacobian(lambda y: drive.step(y, odometry).mean, x), abs=1e-8) == F
+    F = drive.step(x, step).F.copy()
+    assert pytest.approx(jacobian(lambda y: drive.step(y, step).mean, x), abs=1e-8) == F
 
 
 def test_an_arc_ends_where_a_circle_does() -> None:
-    drive = DifferentialDrive(DifferentialNoise(0.1, 0.0, 0.0, 0.1, 0.0, 0.0))
+    drive = settings(**odometry(0.1, 0.0, 0.0, 0.1, 0.0, 0.0)).drive
     end = drive.step(np.zeros(3), Increment(1.0, 1.0, pi, pi)).mean  # half a circle of radius 1
     assert end == pytest.approx((0.0, 2.0, pi), abs=1e-12)
 
 
 def test_noise_of_a_way_does_not_depend_on_how_often_it_is_told() -> None:
-    drive = DifferentialDrive(DifferentialNoise(0.05, 0.0, 0.02, 0.0, 0.01, 0.0))
+    drive = settings(**odometry(0.05, 0.0, 0.02, 0.0, 0.01, 0.0)).drive
 
     def told(steps: int) -> FloatArray:
         x, P = np.zeros(3), np.zeros((3, 3))
@@ -58,17 +62,17 @@ def test_noise_of_a_way_does_not_depend_on_how_often_it_is_told() -> None:
 
 
 def test_noise_is_the_spread_of_steps() -> None:
-    drive, rng = DifferentialDrive(DifferentialNoise(0.05, 0.02, 0.02, 0.05, 0.01, 0.04)), np.random.default_rng(3)
-    odometry = Increment(1.0, 1.0, 1.0, 0.6)
+    drive, rng = settings(**odometry(0.05, 0.02, 0.02, 0.05, 0.01, 0.04)).drive, np.random.default_rng(3)
+    step = Increment(1.0, 1.0, 1.0, 0.6)
     var_way, var_turn = 0.05**2 + 0.02**2 * 0.6, 0.02**2 + 0.05**2 * 0.6 + 0.01**2
     noise = np.sqrt((var_way, var_turn, 0.04**2)) * rng.normal(size=(20000, 3))
     x = np.array((0.0, 0.0, 0.4))
     ends = np.array([drive.step(x, Increment(1.0, 1.0, 1.0 + d, 0.6 + t, s)).mean.copy() for d, t, s in noise])
-    assert pytest.approx(np.cov(ends.T), abs=2e-4) == drive.step(x, odometry).Q  # a tenth of the variances
+    assert pytest.approx(np.cov(ends.T), abs=2e-4) == drive.step(x, step).Q  # a tenth of the variances
 
 
 def test_a_turn_at_rest_is_the_bias_and_turns_nothing() -> None:
-    drive = DifferentialDrive(NOISE)
+    drive = CALIBRATED.drive
     x = np.array((1.0, 2.0, 0.3, 0.0, 0.0, 0.0))
     still = Increment(0.1, 0.1, 0.0, -7e-4)
     assert drive.step(x, still).mean == pytest.approx(x)
@@ -78,7 +82,7 @@ def test_a_turn_at_rest_is_the_bias_and_turns_nothing() -> None:
 
 def track_of(run: RecordedRun) -> EstimatedPath:
     cfg = load_recordings_config(None, {})
-    return filter_run(run, slam_settings(cfg.csv, cfg.filter), (0.05, 0.05), perf_counter)
+    return filter_run(run, cfg.csv, cfg.filter, perf_counter)
 
 
 def test_sound_data_raise_no_doubt_and_parts_are_timed() -> None:

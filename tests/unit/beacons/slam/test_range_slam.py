@@ -12,20 +12,12 @@ import pytest
 from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.trajectory import bridged
 from ccatp.beacons.slam.batch_smoother import smooth
-from ccatp.beacons.slam.beacon_map import (
-    GaussMarkovBias,
-    HeadingTransport,
-    NoiseLevel,
-    RangeModel,
-    RobustLoss,
-    RssiModel,
-    SlamSettings,
-)
+from ccatp.beacons.slam.beacon_map import HeadingTransport, NoiseLevel
 from ccatp.beacons.slam.causal import filter_run
 from ccatp.beacons.slam.evaluation import judge, result_data
 from ccatp.beacons.slam.landmark_init import derivatives
-from ccatp.beacons.slam.measurement_models import MeasurementError, MeasurementModels, MeasurementRow
-from ccatp.beacons.slam.motion import DeadReckoning, DifferentialDrive, DifferentialNoise, Increment
+from ccatp.beacons.slam.measurement_models import MeasurementModels, MeasurementRow
+from ccatp.beacons.slam.motion import DeadReckoning, Increment
 from ccatp.beacons.slam.range_slam import AddedPoseNoise, BeaconSlam
 from ccatp.beacons.slam.recording import (
     BeaconEstimate,
@@ -37,15 +29,16 @@ from ccatp.beacons.slam.recording import (
     RssiReading,
     Steps,
 )
-from ccatp.beacons.slam.settings import slam_settings
 from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.ekf_slam import BlockError, EkfSlam
+from tests.support.slam_settings import Settings, odometry, settings, trust
 from tests.unit.beacons.datasets.sets import recorded, world
 
-TRUST = RobustLoss(6.0, 3.0, 100.0, 5.0, 3, 20, 0.3, 0.3, True)
-MOTION = DifferentialNoise(0.01, 0.0, 0.005, 0.005, 0.0, 0.0)
-SETTINGS = SlamSettings(DifferentialDrive(MOTION), TRUST, RangeModel(0.05, 0.0, 0.0, 0.0), 0.03)
+SETTINGS = settings(
+    **trust(6.0, 3.0, 100.0, 5.0, 3, 20), **odometry(0.01, 0.0, 0.005, 0.005, 0.0, 0.0), radio__range_sigma_m=0.05,
+    radio__bearing_sigma_rad=0.03,
+)  # fmt: skip
 BEACONS: dict[BeaconId, tuple[float, float]] = {"a": (4.0, 1.0), "b": (2.0, 6.0), "c": (-3.0, 4.0), "d": (-1.0, -2.0)}
 P0 = np.diag((1e-6, 1e-6, 1e-6))
 Sense = Callable[[float, "World", BeaconId], Reading]
@@ -97,8 +90,8 @@ def both(time_s: float, world: World, beacon: BeaconId) -> Reading:
     return RangeReading(time_s, beacon, range_m, bearing_rad)
 
 
-def start(settings: SlamSettings = SETTINGS, sense: Sense = both) -> World:
-    return World(BeaconSlam(settings, (0.0, 0.0, 0.0), P0), sense)
+def start(settings: Settings = SETTINGS, sense: Sense = both) -> World:
+    return World(BeaconSlam(*settings, (0.0, 0.0, 0.0), P0), sense)
 
 
 def test_range_and_bearing_join_at_once_and_any_may_be_missing() -> None:
@@ -149,9 +142,11 @@ def test_a_beacon_that_joins_late_is_correlated_with_the_way_there() -> None:
 
 
 def test_ranges_calibrate_themselves_and_the_gyroscope() -> None:
-    noise = replace(MOTION, turn_bias_sigma_rad_s=0.02, rest_speed_m_s=0.03, rest_turn_rad_s=0.03)
-    settings = replace(SETTINGS, motion=DifferentialDrive(noise), range=RangeModel(0.05, 0.0, 0.1, 0.2))
-    world = start(settings, lambda t, w, b: RangeReading(t, b, 1.07 * w.range_m(b) + 0.15 + 0.05 * w.rng.normal()))
+    changed = SETTINGS.but(
+        priors__turn_bias_rad_s=0.02, filter__rest_speed_m_s=0.03, filter__rest_turn_rad_s=0.03,
+        priors__range_scale=0.1, priors__range_offset_m=0.2,
+    )  # fmt: skip
+    world = start(changed, lambda t, w, b: RangeReading(t, b, 1.07 * w.range_m(b) + 0.15 + 0.05 * w.rng.normal()))
     world.bias_rad_s = 0.01
     for turn_rad in (0.05, -0.04, 0.05, -0.04):
         world.drive(150, turn_rad)
@@ -164,10 +159,8 @@ def test_ranges_calibrate_themselves_and_the_gyroscope() -> None:
 
 
 def test_rest_shows_the_bias_of_the_gyroscope_before_any_beacon() -> None:
-    noise = replace(
-        MOTION, turn_per_sqrt_s=0.002, turn_bias_sigma_rad_s=0.02, rest_speed_m_s=0.03, rest_turn_rad_s=0.03
-    )
-    world = start(replace(SETTINGS, motion=DifferentialDrive(noise)))
+    rest = {"filter__rest_speed_m_s": 0.03, "filter__rest_turn_rad_s": 0.03}
+    world = start(SETTINGS.but(odometry__turn_per_sqrt_s=0.002, priors__turn_bias_rad_s=0.02, **rest))
     world.beacons, world.bias_rad_s = {}, -0.007
     world.drive(100, turn_rad=0.0, way_m=0.0)
     assert world.slam.calibration["turn_bias_rad_s"][0] == pytest.approx(-0.007, abs=1e-4)
@@ -175,8 +168,7 @@ def test_rest_shows_the_bias_of_the_gyroscope_before_any_beacon() -> None:
 
 
 def test_scales_of_the_wheels_are_found() -> None:
-    noise = replace(MOTION, turn_scale_sigma=0.1, distance_scale_sigma=0.1)
-    world = start(replace(SETTINGS, motion=DifferentialDrive(noise)))
+    world = start(SETTINGS.but(priors__turn_scale=0.1, priors__distance_scale=0.1))
     world.told_m, world.told_rad = 1.08, 0.95
     world.drive(300)
     assert world.slam.calibration["distance_scale"][0] == pytest.approx(0.08, abs=0.02)
@@ -184,8 +176,8 @@ def test_scales_of_the_wheels_are_found() -> None:
 
 
 def test_the_delay_of_a_vehicle_that_follows_its_commands_late_is_found() -> None:
-    slam = BeaconSlam(replace(SETTINGS, delay_sigma_s=0.2), (0.0, 0.0, 0.0), P0)
-    world = World(BeaconSlam(SETTINGS, (0.0, 0.0, 0.0), P0), both)
+    slam = BeaconSlam(*SETTINGS.but(priors__delay_s=0.2), (0.0, 0.0, 0.0), P0)
+    world = World(BeaconSlam(*SETTINGS, (0.0, 0.0, 0.0), P0), both)
     turns = [0.1 if (k // 15) % 2 else -0.06 for k in range(400)]
     for k, turn_rad in enumerate(turns):
         slam.predict(Increment(0.1 * (k + 1), 0.1, 0.1, turn_rad))
@@ -206,8 +198,8 @@ def test_signal_strengths_with_levels_of_their_own(has_bearing: bool) -> None:
         rssi = levels[str(beacon)] - 20.0 * log10(world.range_m(beacon)) + 0.5 * world.rng.normal()
         return RssiReading(time_s, beacon, rssi, world.bearing_rad(beacon) if has_bearing else None)
 
-    settings = replace(SETTINGS, rssi=RssiModel(0.5, -38.0, 5.0, 2.0, 0.0))
-    world = start(settings, heard)
+    rssi = {"radio__rssi_sigma_db": 0.5, "radio__rssi_reference_dbm": -38.0, "radio__rssi_exponent": 2.0}
+    world = start(SETTINGS.but(**rssi, priors__rssi_reference_db=5.0), heard)
     for turn_rad in (
         0.05,
         -0.04,
@@ -236,10 +228,11 @@ def test_an_outlier_is_refused_and_long_readings_weigh_little() -> None:
         return RangeReading(time_s, beacon, world.range_m(beacon) + longer + 0.05 * world.rng.normal())
 
     errors = []
-    for trust in (TRUST, replace(TRUST, gate_sigmas=1e3, knee_sigmas=1e3, learn_memory=0.0)):
+    plain = SETTINGS.but(radio__gate_sigmas=1e3, filter__knee_sigmas=1e3, filter__learn_memory=0.0)
+    for changed in (SETTINGS, plain):
         largest = []
         for seed in range(1, 4):
-            world = World(BeaconSlam(replace(SETTINGS, trust=trust), (0.0, 0.0, 0.0), P0), round_a_corner, seed)
+            world = World(BeaconSlam(*changed, (0.0, 0.0, 0.0), P0), round_a_corner, seed)
             world.drive(450)
             assert set(world.slam.beacons) == set(BEACONS)
             largest.append(max(world.error_m(b) for b in world.slam.beacons))
@@ -272,7 +265,7 @@ def test_exchanged_beacons_show_in_the_nis_and_are_placed_anew() -> None:
 
 def test_known_beacons_stay_and_the_pose_is_found_among_them() -> None:
     known = {b: BeaconEstimate(np.array(place), np.diag((1e-4, 1e-4))) for b, place in BEACONS.items()}
-    world = World(BeaconSlam(SETTINGS, (0.3, -0.2, 0.1), np.diag((0.2, 0.2, 0.02)), known), ranges)
+    world = World(BeaconSlam(*SETTINGS, (0.3, -0.2, 0.1), np.diag((0.2, 0.2, 0.02)), known), ranges)
     world.drive(100)
     assert world.pose_error_m() < 0.06
     assert max(world.error_m(b) for b in BEACONS) < 0.03
@@ -305,9 +298,9 @@ def test_removal() -> None:
 def test_errors_that_stay_while_the_vehicle_does_are_not_averaged_away() -> None:
     """A vehicle that hardly moves hears the same wrong range again and again: it believes in it none the more."""
     sigmas = []
-    for wander in (None, GaussMarkovBias(0.8, 0.5, 60.0)):
-        settings = replace(SETTINGS, range=RangeModel(0.05, 0.0, 0.0, 0.0, wander))
-        world = start(replace(settings, trust=replace(TRUST, learn_memory=0.0)))
+    wander = {"filter__wander_share": 0.8, "filter__wander_length_m": 0.5}
+    for correlation_s in (0.0, 60.0):
+        world = start(SETTINGS.but(filter__learn_memory=0.0, radio__correlation_s=correlation_s, **wander))
         world.drive(200, turn_rad=0.0, way_m=0.0005)
         assert set(world.slam.beacons) == set(BEACONS)
         along = np.array(BEACONS["a"]) / hypot(*BEACONS["a"])
@@ -317,7 +310,7 @@ def test_errors_that_stay_while_the_vehicle_does_are_not_averaged_away() -> None
 
 
 def test_beacons_join_though_the_settings_promise_less_noise_than_there_is() -> None:
-    world = start(replace(SETTINGS, range=RangeModel(0.025, 0.0, 0.0, 0.0)), ranges)
+    world = start(SETTINGS.but(radio__range_sigma_m=0.025), ranges)
     world.drive(250)
     assert set(world.slam.beacons) == set(BEACONS)
     assert max(world.error_m(b) for b in BEACONS) < 0.2
@@ -355,15 +348,11 @@ def test_it_is_that_of_the_matrices() -> None:
     assert ours.seen(1.0, 2.0, 3.0) == 0.0
 
 
-TRUST_SIGHTINGS = RobustLoss(5.0, 3.0, 0.0, 1.0, 3, 20, 0.3, 0.3, True)
-MOTION_SIGHTINGS = DifferentialDrive(DifferentialNoise(0.05, 0.0, 0.01, 0.0, 0.0, 0.0))
-SETTINGS_SIGHTINGS = SlamSettings(
-    MOTION_SIGHTINGS,
-    TRUST_SIGHTINGS,
-    RangeModel(0.1, 0.02, 0.1, 0.3),
-    0.05,
-    RssiModel(2.0, -40.0, 3.0, 2.0, 0.3),
-)
+SIGHTINGS = settings(
+    radio__range_sigma_m=0.1, radio__range_sigma_per_m=0.02, radio__bearing_sigma_rad=0.05, radio__rssi_sigma_db=2.0,
+    priors__range_scale=0.1, priors__range_offset_m=0.3, priors__rssi_reference_db=3.0, priors__rssi_exponent=0.3,
+).cfg  # fmt: skip
+SENSORS = MeasurementModels(SIGHTINGS.radio, SIGHTINGS.priors)
 POSE, CALIBRATION, BEACON = [1.0, 2.0, 0.4], [0.06, -0.1], [4.0, 6.0, -37.0, 2.2]
 READINGS: dict[str, RangeReading | RssiReading] = {
     "range": RangeReading(0.0, 1, 5.0),
@@ -371,46 +360,45 @@ READINGS: dict[str, RangeReading | RssiReading] = {
 }
 
 
-def row_at(sensors: MeasurementModels, kind: str, x: FloatArray) -> MeasurementRow:
+def row_at(kind: str, x: FloatArray) -> MeasurementRow:
     pose, calibration, beacon = x[:3].tolist(), x[3:5].tolist(), x[5:].tolist()
     if kind == "bearing":
-        return sensors.bearing(pose, beacon)
-    return sensors.row(READINGS[kind], pose, calibration, beacon[:2] if kind == "range" else beacon)
+        return SENSORS.bearing(pose, beacon)
+    return SENSORS.row(READINGS[kind], pose, calibration, beacon[:2] if kind == "range" else beacon)
 
 
 @pytest.mark.parametrize("kind", ["range", "bearing", "rssi"])
 def test_jacobian_of_a_row(kind: str) -> None:
-    sensors, x = MeasurementModels(SETTINGS_SIGHTINGS), np.array((*POSE, *CALIBRATION, *BEACON))
+    x = np.array((*POSE, *CALIBRATION, *BEACON))
     if kind == "range":
         x = x[:7]
-    row = row_at(sensors, kind, x)
+    row = row_at(kind, x)
     differences = [
-        (row_at(sensors, kind, x + 1e-6 * e).expected - row_at(sensors, kind, x - 1e-6 * e).expected) / 2e-6
-        for e in np.eye(x.size)
+        (row_at(kind, x + 1e-6 * e).expected - row_at(kind, x - 1e-6 * e).expected) / 2e-6 for e in np.eye(x.size)
     ]
     assert [*row.pose, *row.calibration, *row.beacon] == pytest.approx(differences, abs=1e-7)
 
 
 def test_values_of_the_rows() -> None:
-    sensors, x = MeasurementModels(SETTINGS_SIGHTINGS), np.array((*POSE, *CALIBRATION, *BEACON))
-    assert row_at(sensors, "range", x).expected == pytest.approx(1.06 * 5.0 - 0.1)
-    assert row_at(sensors, "range", x).variance == pytest.approx(0.1**2 + (0.02 * 5.0) ** 2)
-    assert row_at(sensors, "rssi", x).expected == pytest.approx(-37.0 - 22.0 * log10(5.0))
-    assert row_at(sensors, "bearing", x).expected == pytest.approx(np.arctan2(4.0, 3.0) - 0.4)
+    x = np.array((*POSE, *CALIBRATION, *BEACON))
+    assert row_at("range", x).expected == pytest.approx(1.06 * 5.0 - 0.1)
+    assert row_at("range", x).variance == pytest.approx(0.1**2 + (0.02 * 5.0) ** 2)
+    assert row_at("rssi", x).expected == pytest.approx(-37.0 - 22.0 * log10(5.0))
+    assert row_at("bearing", x).expected == pytest.approx(np.arctan2(4.0, 3.0) - 0.4)
 
 
 @pytest.mark.parametrize("kind", ["range", "bearing"])
 def test_jacobian_through_the_delay(kind: str) -> None:
-    sensors, clock = MeasurementModels(SETTINGS_SIGHTINGS), DeadReckoning(is_delayed=True)
+    clock = DeadReckoning(is_delayed=True)
     clock.took(Increment(1.0, 0.5, 0.0, 0.0), np.array((0.7, 1.6, 0.0)), np.array((1.0, 2.0, 0.4)))
 
     def expected(x: FloatArray) -> MeasurementRow:
         at = clock.at(x[:3].tolist(), 1.1, float(x[5]))
-        return row_at(sensors, kind, np.array((*at.pose, *x[3:5], *BEACON[:2])))
+        return row_at(kind, np.array((*at.pose, *x[3:5], *BEACON[:2])))
 
     x = np.array((*POSE, *CALIBRATION, 0.15))
     at = clock.at(POSE, 1.1, 0.15)
-    found = derivatives(row_at(sensors, kind, np.array((*at.pose, *CALIBRATION, *BEACON[:2]))), at, delayed=True)
+    found = derivatives(row_at(kind, np.array((*at.pose, *CALIBRATION, *BEACON[:2]))), at, delayed=True)
     differences = [(expected(x + 1e-6 * e).expected - expected(x - 1e-6 * e).expected) / 2e-6 for e in np.eye(6)]
     assert found == pytest.approx(differences, abs=1e-6)
 
@@ -433,18 +421,6 @@ def test_a_pose_is_carried_no_further_than_a_step() -> None:
     assert clock.at([0.1, 0.0, 0.0], 9.0, 0.0).pose == pytest.approx([0.2, 0.0, 0.0])
 
 
-def test_a_sensor_that_nobody_described_is_refused() -> None:
-    sensors = MeasurementModels(SlamSettings(MOTION_SIGHTINGS, TRUST_SIGHTINGS))
-    with pytest.raises(MeasurementError, match=r"no range model: give SlamSettings\.range"):
-        sensors.row(RangeReading(0.0, 1, 1.0), POSE, [], [0.0, 0.0])
-    with pytest.raises(MeasurementError, match=r"no RSSI model: give SlamSettings\.rssi"):
-        sensors.row(RssiReading(0.0, 1, -50.0), POSE, [], [0.0, 0.0])
-    with pytest.raises(MeasurementError, match=r"no bearing model: give SlamSettings\.bearing"):
-        sensors.bearing(POSE, [0.0, 0.0])
-    assert sensors.names == ()
-    assert RangeReading(0.0, 1, 1.0, 0.2).bearing_rad == 0.2
-
-
 CONFIG = load_recordings_config(None, {})
 
 
@@ -460,7 +436,7 @@ def with_gap(begin_s: float, long_s: float, *, bearings: bool) -> RecordedRun:
 @pytest.mark.parametrize(("begin_s", "bearings"), [(40.0, False), (60.0, False), (80.0, False), (60.0, True)])
 def test_the_filter_finds_itself_again(begin_s: float, bearings: bool) -> None:
     run = with_gap(begin_s, 15.0, bearings=bearings)
-    found = judge(filter_run(run, slam_settings(CONFIG.csv, CONFIG.filter), (0.05, 0.05), perf_counter), run)
+    found = judge(filter_run(run, CONFIG.csv, CONFIG.filter, perf_counter), run)
     assert found.trajectory_rmse_m is not None
     assert found.trajectory_rmse_m < 0.5  # the vehicle drove 7 m unseen
     assert found.beacon_rmse_m is not None
@@ -549,7 +525,7 @@ def calibration_doubts_both(run: RecordedRun, **priors: float) -> list[Estimated
     wide = CONFIG.csv.priors.model_copy(update=priors)
     cfg = CONFIG.csv.model_copy(update={"priors": wide})
     return [
-        filter_run(run, slam_settings(cfg, CONFIG.filter), (0.05, 0.05), no_clock),
+        filter_run(run, cfg, CONFIG.filter, no_clock),
         smooth(run, cfg, no_clock),
     ]
 
@@ -567,7 +543,7 @@ def test_filter_and_smoother_mean_the_same_by_a_name() -> None:
 def test_a_calibration_that_no_reading_told_is_not_told() -> None:
     run = recorded(world(3, 30.0), bearings=False)
     few = replace(run, readings=run.readings.where(run.readings.times_s < 1.0))
-    track = filter_run(few, slam_settings(CONFIG.csv, CONFIG.filter), (0.05, 0.05), no_clock)
+    track = filter_run(few, CONFIG.csv, CONFIG.filter, no_clock)
     assert track.updates == 0
     data = result_data(few, "ekf-slam", track, judge(track, few))
     assert data["range_scale"] is None
