@@ -11,9 +11,10 @@ from ccatp.beacons.cricket.range_network import build_network, coordinates_of, p
 from ccatp.beacons.cricket.self_mapping import MoteMapper, mapper_settings, network_plan, printed_prior
 from ccatp.beacons.cricket.trilateration import map_by_plan
 from ccatp.beacons.pilot import TargetSight
-from ccatp.beacons.slam.motion import POSE, Increment, Odometry, Steering
+from ccatp.beacons.slam.motion import POSE, Increment, Odometry, SlippingVehicle, Steering
 from ccatp.beacons.slam.recording import RssiReading
-from ccatp.beacons.slam.settings import new_slam, scan_of, vehicle_of
+from ccatp.beacons.slam.reflector import ReflectorScan
+from ccatp.beacons.slam.signal_slam import SignalSlam
 from ccatp.config.beacon_models import CricketConfig, RadioConfig
 from ccatp.core import FloatArray, WheelSample
 from ccatp.filters.ekf_slam import EkfSlam, columns_of
@@ -234,7 +235,7 @@ class _DeadReckoning:
     """Where the robot would be by odometry alone, and how the readings agree with what was expected of them."""
 
     def __init__(self, cfg: RadioConfig) -> None:
-        self._cfg, self._motion = cfg, vehicle_of(cfg)
+        self._cfg, self._motion = cfg, SlippingVehicle(cfg.vehicle, cfg.odometry)
         self._reckoned = np.zeros(self._motion.size)
         self._reckoned[:POSE] = cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad
         self.score = Score(0.0, 0, 0)
@@ -252,8 +253,8 @@ class RadioNavigator(_DeadReckoning):
 
     def __init__(self, cfg: RadioConfig) -> None:
         super().__init__(cfg)
-        self._scan, self._target = scan_of(cfg), cfg.follow.target
-        self.slam = new_slam(cfg)
+        self._scan, self._target = ReflectorScan(cfg.scan), cfg.follow.target
+        self.slam = SignalSlam(cfg)
         self._heard_s: float | None = None
 
     @property

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 
 from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.reflector import ScanResult
-from ccatp.beacons.slam.settings import scan_of
+from ccatp.beacons.slam.reflector import ReflectorScan, ScanResult
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import wrap_pi
 from ccatp.report.plots import INK, QUIET
@@ -136,7 +135,7 @@ def _turns(cfg: RadioConfig, sender_m: tuple[float, float]) -> list[ScanResult]:
     radio = TrueRadio(
         "radio", cfg.path_loss.reference_dbm, cfg.sim.radio, cfg.workspace.size_m, (), cfg.scan.readings, places, noise
     )
-    scan = scan_of(cfg)
+    scan = ReflectorScan(cfg.scan)
     headings = np.random.default_rng([cfg.run.seed, 2]).uniform(-pi, pi, TURNS) / cfg.scan.readings
     found = []
     for offset_rad in headings.tolist():  # the robot never stands quite straight: steps and beacon are not in line

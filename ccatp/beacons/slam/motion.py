@@ -4,10 +4,11 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import cos, hypot, nan, sin
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from ccatp.config.beacon_models import OdometryConfig, VehicleConfig
 from ccatp.config.recording_models import OdometryNoiseConfig, PriorsConfig, SlamFilterConfig
 from ccatp.core import FloatArray
 
@@ -170,22 +171,6 @@ class DifferentialDrive:
         return Q
 
 
-@dataclass(frozen=True, slots=True)
-class WheelNoise:
-    """Noise of the odometry, of every interval anew, and priors of its constant errors.
-
-    Attributes:
-        turn_sigma: of the steering angle (rad), or of the turn rate (rad/s).
-        drift_sigma_rad_s: prior of a constant drift of the heading; 0: not estimated.
-        slip_sigma: prior of the share of the travel that is lost; 0: not estimated.
-    """
-
-    speed_sigma_m_s: float
-    turn_sigma: float
-    drift_sigma_rad_s: float
-    slip_sigma: float
-
-
 class SlippingVehicle:
     """A steered vehicle (Hevrdejs and Knoll 2017, eq. 3) or a differential drive, with slip s and drift b.
 
@@ -197,18 +182,18 @@ class SlippingVehicle:
     States behind the pose: heading_drift_rad_s (b) and slip (s), each where its prior is not zero. Wheels that read
     zero stand, and have no noise.
 
-    Args:
-        kind: ``ackermann`` takes ``Steering``, ``differential`` takes ``Increment``.
+    An ``ackermann`` vehicle takes ``Steering``, a ``differential`` one ``Increment``.
     """
 
-    def __init__(self, kind: Literal["ackermann", "differential"], wheelbase_m: float, noise: WheelNoise) -> None:
-        self._is_steered = kind == "ackermann"
-        self._wheelbase_m = wheelbase_m
-        self._noise = noise
+    def __init__(self, vehicle: VehicleConfig, noise: OdometryConfig) -> None:
+        self._is_steered = vehicle.kind == "ackermann"
+        self._wheelbase_m = vehicle.wheelbase_m
+        turn_sigma = noise.steer_sigma_rad if self._is_steered else noise.turn_rate_sigma_rad_s
+        self._sigmas = noise.speed_sigma_m_s, turn_sigma
         self.names, self.prior_sigmas = estimated(
-            {"heading_drift_rad_s": noise.drift_sigma_rad_s, "slip": noise.slip_sigma}
+            {"heading_drift_rad_s": noise.heading_drift_sigma_rad_s, "slip": noise.slip_sigma}
         )
-        self._drift = POSE if noise.drift_sigma_rad_s > 0.0 else None
+        self._drift = POSE if noise.heading_drift_sigma_rad_s > 0.0 else None
         self._slip = POSE + (self._drift is not None) if noise.slip_sigma > 0.0 else None
         self.size = POSE + len(self.names)
 
@@ -248,7 +233,7 @@ class SlippingVehicle:
         L[:POSE, 0] = T * (1.0 - slip) * c, T * (1.0 - slip) * s, turn_by_speed
         L[:POSE, 1] = -d * s * swing_by_reading, d * c * swing_by_reading, turn_by_reading
         stands = v == 0.0 and (self._is_steered or reading == 0.0)
-        L *= (0.0, 0.0) if stands else (self._noise.speed_sigma_m_s, self._noise.turn_sigma)
+        L *= (0.0, 0.0) if stands else self._sigmas
         return MotionStep(mean, F, L @ L.T)
 
     def _read(self, odometry: Odometry) -> tuple[float, float, float]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from math import atan2, cos, hypot, pi, sin, tau
 from typing import NamedTuple
 
+from ccatp.config.beacon_models import ScanConfig
 from ccatp.core import wrap_pi
 
 _APART_RAD = pi / 2.0  # strongest readings further apart than this are two directions, not one
@@ -27,26 +28,19 @@ class ScanResult(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ReflectorScan:
-    """How scans are taken and read.
+    """How scans are taken and read: 40 readings of one turn are steps of 9 degrees (Hevrdejs and Knoll 2017)."""
 
-    Attributes:
-        readings: of one turn; 40 are steps of 9 degrees (Hevrdejs and Knoll 2017).
-        loss_tolerance: a scan that lost a larger share of its packets gives no bearing.
-    """
-
-    readings: int
-    bearing_sigma_rad: float
-    loss_tolerance: float
+    cfg: ScanConfig
 
     @property
     def step_rad(self) -> float:
         """Between two readings."""
-        return tau / self.readings
+        return tau / self.cfg.readings
 
     @property
     def sigma_rad(self) -> float:
         """Of a bearing: noise, and a direction that may lie anywhere within a step (variance step^2 / 12)."""
-        return hypot(self.bearing_sigma_rad, self.step_rad / 12.0**0.5)
+        return hypot(self.cfg.bearing_sigma_rad, self.step_rad / 12.0**0.5)
 
     def results(self, packets: Iterable[tuple[str, float, float]]) -> list[ScanResult]:
         """One result for each radio, in the order of their first packets.
@@ -60,9 +54,9 @@ class ReflectorScan:
         return [self._result(beacon, readings) for beacon, readings in by_beacon.items()]
 
     def _result(self, beacon: str, readings: Sequence[tuple[float, float]]) -> ScanResult:
-        heard = len(readings) / self.readings
+        heard = len(readings) / self.cfg.readings
         bearing_rad = self._bearing(readings)
-        if bearing_rad is None or heard < 1.0 - self.loss_tolerance:
+        if bearing_rad is None or heard < 1.0 - self.cfg.loss_tolerance:
             levels = [level_dbm for _, level_dbm in readings]
             return ScanResult(beacon, max(levels), 1, None, self.sigma_rad, heard)
         levels = [z for direction, z in readings if abs(wrap_pi(direction - bearing_rad)) <= 1.01 * self.step_rad]

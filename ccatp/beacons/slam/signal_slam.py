@@ -1,15 +1,16 @@
 """EKF-SLAM by levels and bearings of radios: static shadowing on the map, one radio that moves."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from math import cos, hypot, sin, sqrt
 
 import numpy as np
+from scipy.special import chdtri
 
 from ccatp.beacons.slam.motion import POSE, Odometry, SlippingVehicle, VehiclePose
 from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.range_slam import BeaconInnovation
 from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, RssiReading
+from ccatp.beacons.slam.reflector import ReflectorScan
 from ccatp.beacons.slam.signal_landmarks import (
     PLACE,
     MovingRadio,
@@ -22,6 +23,7 @@ from ccatp.beacons.slam.signal_landmarks import (
     SignalRows,
     rows_of,
 )
+from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import FloatArray
 from ccatp.filters.ekf_slam import EkfSlam, Update, columns_of
 
@@ -29,32 +31,6 @@ _POSE_COLUMNS = columns_of(range(POSE))
 _ITERATIONS = 4
 _WIDE = 10.0  # spread of a radio before its first reading, in ranges of that reading
 _NEAREST_M = 0.02  # nearer than that a distance has no derivative worth the name
-
-
-@dataclass(frozen=True, slots=True)
-class SignalSettings:
-    """What ``SignalSlam`` is told.
-
-    Attributes:
-        path_loss: of each radio that has a calibration of its own; ``sigma_db`` is the white noise.
-        shadowing_sigma_db: standard deviation of static shadowing; 0: none.
-        shadowing: its map, for static radios; None: what there is of it counts as white noise.
-        moving: the radio that moves; None without one.
-        placed_share: a new static radio joins when its place is this sure, as a share of its range ...
-        waiting_scans: ... or when as many readings wait; each scan keeps three states until then.
-        gates: largest normalised innovation squared that is used, of one row and of two.
-    """
-
-    motion: SlippingVehicle
-    path_loss: Mapping[BeaconId, PathLoss]
-    default: PathLoss
-    bearing_sigma_rad: float
-    shadowing_sigma_db: float
-    shadowing: ShadowingMap | None
-    moving: MovingRadio | None
-    placed_share: float
-    waiting_scans: int
-    gates: tuple[float, float]
 
 
 class SignalSlam:
@@ -66,21 +42,38 @@ class SignalSlam:
     shadowing where there is any. Updates are iterated (Gauss-Newton on the posterior), because an error of 18 degrees
     is too large for one linearisation.
 
-    Args:
-        pose0: where the vehicle begins; it defines the frame of the map.
-        P0: covariance of that, shape (3, 3).
+    The vehicle begins at the believed start of the configuration, which defines the frame of the map.
     """
 
-    def __init__(self, settings: SignalSettings, pose0: VehiclePose | Sequence[float], P0: FloatArray) -> None:
-        self.settings = settings
-        sigmas = np.array(settings.motion.prior_sigmas)
-        v = POSE + sigmas.size
-        mean, P = np.zeros(v), np.zeros((v, v))
-        mean[:POSE], P[:POSE, :POSE] = pose0, P0
-        P[range(POSE, v), range(POSE, v)] = sigmas**2
-        self.engine = EkfSlam(mean, P)
+    def __init__(self, cfg: RadioConfig) -> None:
+        start, loss, estimator, room_m = cfg.start, cfg.path_loss, cfg.estimator, cfg.workspace.size_m
+        self._motion = SlippingVehicle(cfg.vehicle, cfg.odometry)
+        v = self._motion.size
+        mean, sigmas = np.zeros(v), np.zeros(v)
+        mean[:POSE] = start.x_m, start.y_m, start.heading_rad
+        sigmas[:POSE] = start.position_sigma_m, start.position_sigma_m, start.heading_sigma_rad
+        sigmas[POSE:] = self._motion.prior_sigmas
+        self.engine = EkfSlam(mean, np.diag(sigmas**2))
         self.learned: list[BeaconInnovation] = []
         self.waiting = SignalLandmarkInitializer(self.engine)
+        self._default = PathLoss(loss.reference_dbm, loss.exponent, loss.white_sigma_db)
+        self._path_loss = {
+            name: PathLoss(reference_dbm, loss.exponent, loss.white_sigma_db)
+            for name, reference_dbm in loss.reference_dbm_of.items()
+        }
+        # Static shadowing without a map of it counts as white noise.
+        sigma_db, length_m = loss.shadowing_sigma_db, loss.shadowing_length_m
+        self._sigma_db = sigma_db = sigma_db if estimator.shadowing != "none" else 0.0
+        self._shadowing: ShadowingMap | None = None
+        if estimator.shadowing == "map" and sigma_db > 0.0:
+            self._shadowing = ShadowingMap(room_m, estimator.shadowing_grid_m, sigma_db, length_m)
+        # In a room without a radio that moves, its name is never received.
+        speed_m_s, course_time_s = estimator.target_speed_sigma_m_s, estimator.target_course_time_s
+        self._moving = MovingRadio(cfg.follow.target, speed_m_s, course_time_s, sigma_db, length_m, room_m)
+        self._bearing_sigma_rad = ReflectorScan(cfg.scan).sigma_rad
+        self._placed_share, self._waiting_scans = estimator.placed_share, estimator.waiting_scans
+        # Largest normalised innovation squared that is used, of one row and of two.
+        self._gates = tuple(float(chdtri(rows, 1.0 - estimator.gate_probability)) for rows in (1, 2))
 
     @property
     def pose(self) -> VehiclePose:
@@ -109,18 +102,16 @@ class SignalSlam:
     def calibration(self) -> dict[str, tuple[float, float]]:
         """Mean and standard deviation of the vehicle's calibration states, by name."""
         mean, variances = self.engine.mean.tolist(), self.engine.covariance.diagonal().tolist()
-        names = self.settings.motion.names
-        return {name: (mean[POSE + i], sqrt(variances[POSE + i])) for i, name in enumerate(names)}
+        return {name: (mean[POSE + i], sqrt(variances[POSE + i])) for i, name in enumerate(self._motion.names)}
 
     def predict(self, odometry: Odometry) -> None:
         """Carry the vehicle and the moving radio on."""
         before = self.engine.mean[:PLACE].tolist()
-        step = self.settings.motion.step(self.engine.mean[: self.engine.vehicle_size], odometry)
+        step = self._motion.step(self.engine.mean[: self.engine.vehicle_size], odometry)
         self.engine.predict(step.mean, step.F, step.Q)
-        moving = self.settings.moving
-        if moving is not None and moving.beacon in self.engine:
+        if self._moving.beacon in self.engine:
             travel_m = hypot(step.mean[0] - before[0], step.mean[1] - before[1])
-            moving.predict(self.engine, odometry.interval_s, travel_m)
+            self._moving.predict(self.engine, odometry.interval_s, travel_m)
 
     def observe(self, readings: Iterable[RssiReading]) -> list[BeaconInnovation]:
         """Take readings of any radios, one after the other; new ones are placed when their readings suffice.
@@ -130,9 +121,9 @@ class SignalSlam:
         self.learned = []
         waiting = []
         for reading in readings:
-            is_known = reading.beacon in self.engine
-            if is_known or self._is_moving(reading.beacon):
-                found = self._update_moving(reading) if self._is_moving(reading.beacon) else self._update(reading)
+            is_known, is_moving = reading.beacon in self.engine, reading.beacon == self._moving.beacon
+            if is_known or is_moving:
+                found = self._update_moving(reading) if is_moving else self._update(reading)
                 if found is not None and is_known:
                     self.learned.append(
                         BeaconInnovation(reading.beacon, found.residual, found.nis, found.size, found.accepted)
@@ -141,17 +132,6 @@ class SignalSlam:
                 waiting.append(reading)
         self._wait(waiting)
         return self.learned
-
-    def remove(self, beacon: BeaconId) -> None:
-        """Forget a radio; one that is heard again begins anew.
-
-        Raises:
-            BlockError: it is not on the map.
-        """
-        if beacon in self.waiting.records:
-            self.waiting.drop(beacon)
-            return
-        self.engine.remove(beacon)
 
     def distance(self, beacon: BeaconId) -> tuple[float, float]:
         """Between the vehicle and a radio, m, and its standard deviation.
@@ -170,10 +150,9 @@ class SignalSlam:
     @property
     def moving_velocity_m_s(self) -> tuple[float, float]:
         """Of the radio that moves; 0 before it was heard."""
-        moving = self.settings.moving
-        if moving is None or moving.beacon not in self.engine:
+        if self._moving.beacon not in self.engine:
             return 0.0, 0.0
-        start = self.engine.block(moving.beacon).start + PLACE
+        start = self.engine.block(self._moving.beacon).start + PLACE
         vx, vy = self.engine.mean[start : start + PLACE].tolist()
         return vx, vy
 
@@ -189,18 +168,14 @@ class SignalSlam:
 
     def path_loss_of(self, beacon: BeaconId) -> PathLoss:
         """The calibration of a radio."""
-        return self.settings.path_loss.get(beacon, self.settings.default)
-
-    def _is_moving(self, beacon: BeaconId) -> bool:
-        return self.settings.moving is not None and beacon == self.settings.moving.beacon
+        return self._path_loss.get(str(beacon), self._default)
 
     def _prior(self, reading: RssiReading, bearing_rad: float, pose: Sequence[float]) -> SignalPrior:
-        settings = self.settings
         range_m = self.path_loss_of(reading.beacon).median_range_m(reading.rssi_dbm)
         way_rad = pose[2] + bearing_rad
         spread = [_WIDE * range_m] * PLACE
-        if settings.shadowing is not None:
-            spread += [1.0] * settings.shadowing.size
+        if self._shadowing is not None:
+            spread += [1.0] * self._shadowing.size
         mean = np.zeros(len(spread))
         mean[:PLACE] = pose[0] + range_m * cos(way_rad), pose[1] + range_m * sin(way_rad)
         return SignalPrior(mean, np.array(spread))
@@ -227,12 +202,12 @@ class SignalSlam:
             self.waiting.solve(left, self._rows_at)
 
     def _is_ready(self, beacon: BeaconId) -> bool:
-        if len(self.waiting.records[beacon]) >= self.settings.waiting_scans:
+        if len(self.waiting.records[beacon]) >= self._waiting_scans:
             return True
         guess, pose = self.waiting.guesses[beacon], self.engine.mean
         range_m = hypot(guess.mean[0] - pose[0], guess.mean[1] - pose[1])
         largest = float(np.linalg.eigvalsh(guess.covariance[:PLACE, :PLACE])[-1])
-        return largest < (self.settings.placed_share * range_m) ** 2
+        return largest < (self._placed_share * range_m) ** 2
 
     def _settle(self, beacon: BeaconId, prior: SignalPrior) -> None:
         none, size = np.empty(0, dtype=np.intp), prior.mean.size
@@ -248,21 +223,18 @@ class SignalSlam:
 
     def _update(self, reading: RssiReading) -> Update:
         radio, path_loss = self.engine.block(reading.beacon), self.path_loss_of(reading.beacon)
-        rows = rows_of([self._sight(reading, 0)], radio, path_loss, self.settings.bearing_sigma_rad)
-        gate = self.settings.gates[rows.variances.size - 1]
+        rows = rows_of([self._sight(reading, 0)], radio, path_loss, self._bearing_sigma_rad)
+        gate = self._gates[rows.variances.size - 1]
         return self.engine.update_iterated(rows.columns, rows.linearise, rows.variances, _ITERATIONS, gate)
 
     def _update_moving(self, reading: RssiReading) -> Update | None:
         """The radio that moves joins at its first bearing: it would be elsewhere later."""
-        settings, moving = self.settings, self.settings.moving
-        if moving is None:
-            return None
         if reading.beacon not in self.engine:
             if reading.bearing_rad is None:
                 return None
-            moving.join(self.engine, reading.bearing_rad)
+            self._moving.join(self.engine, reading.bearing_rad)
         path_loss = self.path_loss_of(reading.beacon)
-        return moving.update(self.engine, reading, path_loss, settings.bearing_sigma_rad, settings.gates)
+        return self._moving.update(self.engine, reading, path_loss, self._bearing_sigma_rad, self._gates)
 
     def _rows_at(self, records: list[SignalRecord], pose_at: Callable[[PoseKey], int], radio: slice) -> SignalRows:
         sights = []
@@ -270,11 +242,11 @@ class SignalSlam:
             place = self.engine.block(record.pose).start
             sights.append(self._sight(record.reading, place)._replace(pose=pose_at(record.pose)))
         path_loss = self.path_loss_of(records[0].reading.beacon)
-        return rows_of(sights, radio, path_loss, self.settings.bearing_sigma_rad)
+        return rows_of(sights, radio, path_loss, self._bearing_sigma_rad)
 
     def _sight(self, reading: RssiReading, pose: int) -> RadioModel:
         x_m, y_m = self.engine.mean[pose : pose + PLACE].tolist()
-        shadow, rest_db2 = np.empty(0), self.settings.shadowing_sigma_db**2
-        if self.settings.shadowing is not None:
-            shadow, rest_db2 = self.settings.shadowing.row(x_m, y_m)
+        shadow, rest_db2 = np.empty(0), self._sigma_db**2
+        if self._shadowing is not None:
+            shadow, rest_db2 = self._shadowing.row(x_m, y_m)
         return RadioModel(reading, pose, shadow, self.path_loss_of(reading.beacon).sigma_db ** 2 + rest_db2)

@@ -14,6 +14,7 @@ from ccatp.beacons.slam.evaluation import judge
 from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun, ReferencePath
 from ccatp.beacons.slam.reflector import ReflectorScan, ScanResult
+from ccatp.config.beacon_models import ScanConfig
 from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.sim.radio import Packet
@@ -186,7 +187,7 @@ def test_a_wild_step_of_the_odometry_is_told(steps: int) -> None:
     assert not any("faster than" in w for w in suspicions(run))
 
 
-SCAN = ReflectorScan(readings=40, bearing_sigma_rad=radians(18.0), loss_tolerance=0.5)
+SCAN = ReflectorScan(ScanConfig(readings=40, bearing_sigma_rad=radians(18.0), loss_tolerance=0.5))
 STEP = radians(9.0)
 
 

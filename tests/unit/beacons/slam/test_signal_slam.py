@@ -7,18 +7,16 @@ import pytest
 from scipy.stats import chi2
 
 from ccatp.beacons.slam.level_fix import HeardPlace, LevelLocator, Room, likeliest_names
-from ccatp.beacons.slam.motion import Increment, Odometry, SlippingVehicle, Steering, WheelNoise
+from ccatp.beacons.slam.motion import Increment, Odometry, SlippingVehicle, Steering
 from ccatp.beacons.slam.path_loss import LevelPair, PathLoss, PathLossError, PathLossFit, fit_path_loss
 from ccatp.beacons.slam.recording import RssiReading
-from ccatp.beacons.slam.settings import new_slam, vehicle_of
 from ccatp.beacons.slam.signal_landmarks import MovingRadio, RadioModel, ShadowingMap, rows_of
 from ccatp.beacons.slam.signal_slam import SignalSlam
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_radio_config
-from ccatp.filters.ekf_slam import BlockError, EkfSlam
+from ccatp.filters.ekf_slam import EkfSlam
 from ccatp.studies.radio_runs import run_radio
 
-NOISE = WheelNoise(0.01, 0.02, 0.01, 0.05)
 ODOMETRY: dict[str, Odometry] = {
     "ackermann": Steering(0.1, 0.1, 0.15, 0.3),
     "differential": Increment(0.1, 0.1, 0.015, 0.02),
@@ -29,9 +27,18 @@ def config(**keys: object) -> RadioConfig:
     return load_radio_config(None, {name.replace("__", "."): value for name, value in keys.items()})
 
 
+def vehicle(kind: str, **keys: object) -> SlippingVehicle:
+    noise: dict[str, object] = {
+        "odometry__speed_sigma_m_s": 0.01, "odometry__steer_sigma_rad": 0.02, "odometry__turn_rate_sigma_rad_s": 0.02,
+        "odometry__heading_drift_sigma_rad_s": 0.01, "odometry__slip_sigma": 0.05,
+    }  # fmt: skip
+    cfg = config(vehicle__kind=kind, vehicle__wheelbase_m=0.35, **(noise | keys))
+    return SlippingVehicle(cfg.vehicle, cfg.odometry)
+
+
 @pytest.mark.parametrize("kind", ["ackermann", "differential"])
 def test_motion_has_the_derivatives_of_its_mean(kind: str) -> None:
-    model = SlippingVehicle("ackermann" if kind == "ackermann" else "differential", 0.35, NOISE)
+    model = vehicle(kind)
     assert model.names == ("heading_drift_rad_s", "slip")
     x = np.array((1.0, 2.0, 0.7, 0.02, 0.06))
     F = model.step(x, ODOMETRY[kind]).F
@@ -43,7 +50,7 @@ def test_motion_has_the_derivatives_of_its_mean(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["ackermann", "differential"])
 def test_motion_noise_is_that_of_its_readings(kind: str) -> None:
-    model = SlippingVehicle("ackermann" if kind == "ackermann" else "differential", 0.35, NOISE)
+    model = vehicle(kind)
     x, rng = np.array((1.0, 2.0, 0.7, 0.02, 0.06)), np.random.default_rng(1)
     drawn = []
     for speed, turn in rng.standard_normal((4000, 2)).tolist():
@@ -57,22 +64,22 @@ def test_motion_noise_is_that_of_its_readings(kind: str) -> None:
 
 
 def test_the_front_axle_goes_where_its_wheel_points() -> None:
-    vehicle = SlippingVehicle("ackermann", 0.35, WheelNoise(0.01, 0.02, 0.0, 0.0))
-    end = vehicle.step(np.zeros(3), Steering(0.1, 0.1, 0.15, 0.4)).mean
+    plain = vehicle("ackermann", odometry__heading_drift_sigma_rad_s=0.0, odometry__slip_sigma=0.0)
+    end = plain.step(np.zeros(3), Steering(0.1, 0.1, 0.15, 0.4)).mean
     assert end == pytest.approx((0.015 * cos(0.4), 0.015 * sin(0.4), 0.015 * sin(0.4) / 0.35))
 
 
 def test_wheels_that_stand_have_no_noise() -> None:
-    step = SlippingVehicle("ackermann", 0.35, NOISE).step(np.zeros(5), Steering(0.1, 0.1, 0.0, 0.3))
+    step = vehicle("ackermann").step(np.zeros(5), Steering(0.1, 0.1, 0.0, 0.3))
     assert not step.Q.any()
 
 
 def test_a_vehicle_takes_the_odometry_of_its_kind() -> None:
     with pytest.raises(TypeError, match="takes speed and steering angle, not Increment"):
-        SlippingVehicle("ackermann", 0.35, NOISE).step(np.zeros(5), ODOMETRY["differential"])
+        vehicle("ackermann").step(np.zeros(5), ODOMETRY["differential"])
     with pytest.raises(TypeError, match="takes increments, not Steering"):
-        SlippingVehicle("differential", 0.35, NOISE).step(np.zeros(5), ODOMETRY["ackermann"])
-    assert vehicle_of(config()).names == ()
+        vehicle("differential").step(np.zeros(5), ODOMETRY["ackermann"])
+    assert SlippingVehicle(config().vehicle, config().odometry).names == ()
 
 
 def test_rows_have_the_derivatives_of_level_and_bearing() -> None:
@@ -150,7 +157,7 @@ def test_a_velocity_is_carried_into_the_place() -> None:
 
 
 def heard(slam_cfg: RadioConfig, scans: int) -> tuple[SignalSlam, float]:
-    slam = new_slam(slam_cfg)
+    slam = SignalSlam(slam_cfg)
     loss = slam.path_loss_of("b")
     for k in range(scans):
         for _ in range(10):
@@ -172,13 +179,10 @@ def test_a_new_radio_waits_and_is_on_the_map_all_the_same() -> None:
     assert not [b for b in slam.engine.blocks if not isinstance(b, str)]
 
 
-def test_a_radio_without_a_bearing_is_not_placed_and_removal_forgets() -> None:
-    slam = new_slam(config())
+def test_a_radio_without_a_bearing_is_not_placed() -> None:
+    slam = SignalSlam(config())
     slam.observe([RssiReading(0.0, "b", -40.0, None)])
     assert slam.beacons == {}
-    slam.remove("b")
-    with pytest.raises(BlockError, match="is not in the state"):
-        slam.remove("b")
 
 
 SHADOW = {"sim.radio.shadowing_sigma_db": 5.0, "path_loss.shadowing_sigma_db": 5.0, "estimator.shadowing": "map"}
