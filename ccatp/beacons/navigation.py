@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from ccatp.beacons.cricket.range_network import build_network, coordinates_of, pair_range
-from ccatp.beacons.cricket.self_mapping import MoteMapper, mapper_settings, network_plan, printed_prior
+from ccatp.beacons.cricket.self_mapping import MoteMapper, network_plan, printed_prior
 from ccatp.beacons.cricket.trilateration import map_by_plan
 from ccatp.beacons.pilot import TargetSight
 from ccatp.beacons.slam.motion import POSE, Increment, Odometry, SlippingVehicle, Steering
@@ -93,7 +93,7 @@ class SelfMap:
         if cfg.phase2.prior == "printed":
             fixed = np.flatnonzero(np.isfinite(known.ravel())).tolist()
             covariance = printed_prior(len(motes), d, fixed, cfg.phase2.printed_variance_m2)
-        mapper = MoteMapper(mean, covariance, mapper_settings(cfg), known)
+        mapper = MoteMapper(mean, covariance, cfg.phase2, known, cfg.batch)
         self.notes = {"map_phase1_expected_m": mapper.expected_rms_m, "map_updates": 0.0}
         self.notes["map_expected_m"] = mapper.expected_rms_m
         return mapper

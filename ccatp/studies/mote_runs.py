@@ -16,7 +16,6 @@ from ccatp.beacons.cricket.self_mapping import (
     MotePlan,
     complete_stands,
     loose_plan,
-    mapper_settings,
     network_plan,
     printed_prior,
     run_phase_two,
@@ -152,7 +151,7 @@ def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
         fixed = np.flatnonzero(np.isfinite(known.ravel())).tolist()
         covariance = printed_prior(len(motes), plan.dimension, fixed, cfg.phase2.printed_variance_m2)
         mean = places
-    mapper = MoteMapper(mean, covariance, mapper_settings(cfg), known)
+    mapper = MoteMapper(mean, covariance, cfg.phase2, known, cfg.batch)
     index = {mote: row for row, mote in enumerate(motes)}
     readings = [(index[i], index[j], range_m, sigma_m) for i, j, range_m, sigma_m in field.second]
     went = run_phase_two(mapper, readings, cfg.phase2.target_rms_m)

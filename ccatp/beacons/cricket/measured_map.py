@@ -21,7 +21,7 @@ from ccatp.beacons.cricket.range_network import (
     list_names,
 )
 from ccatp.beacons.cricket.rigidity import find_fold_over, find_freedom, generic_state
-from ccatp.beacons.cricket.self_mapping import MapperSettings, MoteMapper, run_phase_two
+from ccatp.beacons.cricket.self_mapping import MoteMapper, run_phase_two
 from ccatp.beacons.cricket.trilateration import map_as_possible
 from ccatp.beacons.cricket.unfolding import agreement_of
 from ccatp.config.beacon_models import CricketConfig
@@ -297,8 +297,7 @@ def _filter(cfg: CricketConfig, network: RangeNetwork) -> _Found:
         lost = list_names([network.names[mote] for mote in first.unplaced])
         raise MappingError(f"trilateration cannot place {lost}; take --method batch, which needs no such start")
     # The ranges have made the first map already: its shape is a start, and its covariance, taken wide, hardly counts.
-    settings = MapperSettings(cfg.phase2.linearisations, cfg.phase2.pools, cfg.phase2.gate_probability)
-    mapper = MoteMapper(first.positions_m, _WIDER * first.covariance_m2, settings)
+    mapper = MoteMapper(first.positions_m, _WIDER * first.covariance_m2, cfg.phase2)
     columns = (network.first, network.second, network.ranges_m, network.sigmas_m)
     rows = zip(*(column.tolist() for column in columns), strict=True)
     went = run_phase_two(mapper, rows, 0.0)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from ccatp.beacons.cricket.range_network import MappingError, RigidBody, coordinates_of
-from ccatp.config.beacon_models import CricketConfig
+from ccatp.config.beacon_models import BatchConfig, CricketConfig, PhaseTwoConfig
 from ccatp.core import FloatArray
 from ccatp.filters.ekf_slam import EkfSlam, Update
 from ccatp.filters.metrics import best_motion
@@ -21,35 +21,6 @@ _DIRECTION_M = 1e-9  # motes nearer than this have no direction between them
 
 
 _OFFSET_SIGMA_M, _SCALE_SIGMA = 0.5, 0.05  # priors of a common offset and scale, where they are estimated
-
-
-class MapperSettings(NamedTuple):
-    """How phase 2 goes.
-
-    Attributes:
-        linearisations: of each update; 1 is the EKF, more the iterated one.
-        pools: keep the prior and one mean range for each pair, and linearise all pairs at one place after each reading.
-        gate_probability: a range less likely than this is not used; 1 uses all.
-        offset_sigma_m: of a common offset of the ranges; 0 where there is none.
-        scale_sigma: of their common scale; 0 where there is none.
-    """
-
-    linearisations: int
-    pools: bool
-    gate_probability: float
-    offset_sigma_m: float = 0.0
-    scale_sigma: float = 0.0
-
-
-def mapper_settings(cfg: CricketConfig) -> MapperSettings:
-    """How phase 2 goes by the configuration."""
-    return MapperSettings(
-        cfg.phase2.linearisations,
-        cfg.phase2.pools,
-        cfg.phase2.gate_probability,
-        _OFFSET_SIGMA_M if cfg.batch.estimates_offset else 0.0,
-        _SCALE_SIGMA if cfg.batch.estimates_scale else 0.0,
-    )
 
 
 class MoteMapper:
@@ -69,18 +40,16 @@ class MoteMapper:
         positions_m: of the motes, shape (n, d).
         covariance_m2: shape (n d, n d).
         known_m: coordinates that are known, nan elsewhere, shape (n, d).
+        batch: what it estimates of offset and scale, the filter estimates, too.
 
     Raises:
         MappingError: shapes that do not fit, or a place that is missing.
     """
 
     def __init__(
-        self,
-        positions_m: FloatArray,
-        covariance_m2: FloatArray,
-        settings: MapperSettings,
-        known_m: FloatArray | None = None,
-    ) -> None:
+        self, positions_m: FloatArray, covariance_m2: FloatArray, how: PhaseTwoConfig,
+        known_m: FloatArray | None = None, batch: BatchConfig | None = None,
+    ) -> None:  # fmt: skip
         count, self._dimension = positions_m.shape
         if covariance_m2.shape != (positions_m.size, positions_m.size):
             raise MappingError(
@@ -91,10 +60,12 @@ class MoteMapper:
         mean, covariance = positions_m.ravel(), covariance_m2
         if known_m is not None:
             mean, covariance = conditioned(mean, covariance, known_m.ravel())
-        self._prior = mean.copy(), covariance.copy(), np.diag((settings.offset_sigma_m**2, settings.scale_sigma**2))
+        offset_sigma_m = _OFFSET_SIGMA_M if batch is not None and batch.estimates_offset else 0.0
+        scale_sigma = _SCALE_SIGMA if batch is not None and batch.estimates_scale else 0.0
+        self._prior = mean.copy(), covariance.copy(), np.diag((offset_sigma_m**2, scale_sigma**2))
         self._filter = self._at_prior()
-        self._settings = settings
-        self._gate = float(chdtri(1, 1.0 - settings.gate_probability))
+        self._how = how
+        self._gate = float(chdtri(1, 1.0 - how.gate_probability))
         self._count, self._size = count, positions_m.size
         self._pairs: dict[tuple[int, int], tuple[float, float]] = {}  # sum of z / sigma^2, sum of 1 / sigma^2
 
@@ -131,12 +102,12 @@ class MoteMapper:
         """
         rows = _Rows(self._dimension, self._count, [(first, second)], np.array([range_m]))
         R = np.array([sigma_m**2])
-        if self._settings.linearisations == 1:
+        if self._how.linearisations == 1:
             residual, H = rows(self._filter.mean)
             learned = self._filter.update(rows.columns, H, residual, R, self._gate)
         else:
-            learned = self._filter.update_iterated(rows.columns, rows, R, self._settings.linearisations, self._gate)
-        if not (learned.accepted and self._settings.pools):
+            learned = self._filter.update_iterated(rows.columns, rows, R, self._how.linearisations, self._gate)
+        if not (learned.accepted and self._how.pools):
             return learned
         pair = min(first, second), max(first, second)
         total, weight = self._pairs.get(pair, (0.0, 0.0))
@@ -153,7 +124,7 @@ class MoteMapper:
             curvature = rows.curvature(start, self._filter.covariance)
             R = np.diag(1.0 / weights) + curvature
             self._filter = self._at_prior()
-            self._filter.update_iterated(rows.columns, rows.starting_at(start), R, self._settings.linearisations)
+            self._filter.update_iterated(rows.columns, rows.starting_at(start), R, self._how.linearisations)
             if float((curvature.diagonal() * weights).max()) < _STRAIGHT:
                 break
 

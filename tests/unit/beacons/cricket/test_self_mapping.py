@@ -22,7 +22,6 @@ from ccatp.beacons.cricket.range_network import (
     sound_speed,
 )
 from ccatp.beacons.cricket.self_mapping import (
-    MapperSettings,
     MoteMapper,
     complete_stands,
     conditioned,
@@ -31,14 +30,15 @@ from ccatp.beacons.cricket.self_mapping import (
     printed_prior,
     run_phase_two,
 )
-from ccatp.config.beacon_models import AirConfig
+from ccatp.config.beacon_models import AirConfig, PhaseTwoConfig
 from ccatp.config.load import load_radio_config
 from ccatp.errors import ExitStatus
 from ccatp.sim.motes import true_motes
 from tests.unit.beacons.cricket.fields import ADJACENT, ALL, HEADS, SIGMA_M, ZIGZAG, FloatArray, Pairs, network_of
 
-POOLED = MapperSettings(linearisations=10, pools=True, gate_probability=1.0)
-PRINTED = MapperSettings(linearisations=1, pools=False, gate_probability=1.0)
+CRICKET = load_radio_config(None, {"system": "cricket"}).cricket
+POOLED = CRICKET.phase2.model_copy(update={"linearisations": 10, "pools": True, "gate_probability": 1.0})
+PRINTED = CRICKET.phase2.model_copy(update={"linearisations": 1, "pools": False, "gate_probability": 1.0})
 KNOWN = np.full((6, 2), np.nan)
 KNOWN[0], KNOWN[1, 1] = HEADS[0], HEADS[1, 1]
 
@@ -52,7 +52,7 @@ def readings(pairs: Pairs, times: int, rng: np.random.Generator | None) -> list[
     return found
 
 
-def mapper(start: FloatArray, settings: MapperSettings = POOLED, sigma_m: float = 0.2) -> MoteMapper:
+def mapper(start: FloatArray, settings: PhaseTwoConfig = POOLED, sigma_m: float = 0.2) -> MoteMapper:
     return MoteMapper(start, np.eye(12) * sigma_m**2, settings, KNOWN)
 
 
@@ -117,7 +117,7 @@ def test_phase_two_stops_at_the_target() -> None:
 
 
 def test_a_range_out_of_all_proportion_is_refused() -> None:
-    gated = POOLED._replace(gate_probability=0.9999)
+    gated = POOLED.model_copy(update={"gate_probability": 0.9999})
     one = mapper(HEADS, gated, sigma_m=0.05)
     learned = one.observe(0, 5, 12.0, SIGMA_M)
     assert not learned.accepted
@@ -126,8 +126,8 @@ def test_a_range_out_of_all_proportion_is_refused() -> None:
 
 
 def test_offset_and_scale_are_found_among_known_motes() -> None:
-    settings = POOLED._replace(offset_sigma_m=0.5, scale_sigma=0.05)
-    one = MoteMapper(HEADS, np.zeros((12, 12)), settings, HEADS)
+    both = CRICKET.batch.model_copy(update={"estimates_offset": True, "estimates_scale": True})
+    one = MoteMapper(HEADS, np.zeros((12, 12)), POOLED, HEADS, both)
     for i, j, range_m, sigma_m in readings(ALL, 1, None):
         one.observe(i, j, 1.02 * range_m + 0.1, sigma_m)
     assert one.offset_m == pytest.approx(0.1, abs=1e-3)
