@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 from ccatp.beacons.slam.motion import DifferentialDrive
+from ccatp.config.beacon_models import RecordingConfig, SlamFilterConfig
 from ccatp.config.load import load_recordings_config
-from ccatp.config.recording_models import RecordingConfig, SlamFilterConfig
 
 _NOTHING: dict[str, object] = {
     **{f"odometry__{axis}": 0.0 for axis in ("distance_per_sqrt_rad", "turn_per_sqrt_s", "lateral_per_sqrt_m")},

@@ -22,7 +22,7 @@ from ccatp.beacons.slam.recording import (
     RssiReading,
     Steps,
 )
-from ccatp.config.recording_models import RecordingConfig, SlamFilterConfig
+from ccatp.config.beacon_models import RecordingConfig, SlamFilterConfig
 from ccatp.core import FloatArray
 
 FAR = 3.0  # standard deviations of the prior beyond which a value is told

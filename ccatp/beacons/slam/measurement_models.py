@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from ccatp.beacons.slam.motion import estimated
 from ccatp.beacons.slam.recording import RangeReading, Reading, RssiReading
-from ccatp.config.recording_models import PriorsConfig, RadioNoiseConfig
+from ccatp.config.beacon_models import PriorsConfig, RadioNoiseConfig
 
 LEAST_RANGE_M = 1e-3  # nearer than that a range has no direction: derivatives are taken there
 _DB = 10.0 / log(10.0)

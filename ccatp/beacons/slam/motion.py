@@ -8,8 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.config.beacon_models import OdometryConfig, VehicleConfig
-from ccatp.config.recording_models import OdometryNoiseConfig, PriorsConfig, SlamFilterConfig
+from ccatp.config.beacon_models import (
+    OdometryConfig,
+    OdometryNoiseConfig,
+    PriorsConfig,
+    SlamFilterConfig,
+    VehicleConfig,
+)
 from ccatp.core import FloatArray
 
 POSE = 3  # x_m, y_m, heading_rad: the first states of a vehicle

@@ -18,7 +18,7 @@ from ccatp.beacons.slam.landmark_init import LandmarkInitializer, derivatives
 from ccatp.beacons.slam.measurement_models import MeasurementModels, is_direction, kind_of, strength_of
 from ccatp.beacons.slam.motion import POSE, DeadReckoning, DifferentialDrive, Increment, VehiclePose, estimated
 from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
-from ccatp.config.recording_models import RecordingConfig, SlamFilterConfig
+from ccatp.config.beacon_models import RecordingConfig, SlamFilterConfig
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.ekf_slam import BlockError, EkfSlam, RowUpdate
 

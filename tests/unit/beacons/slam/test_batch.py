@@ -13,8 +13,8 @@ from ccatp.beacons.slam.batch_smoother import place_by_distances, smooth
 from ccatp.beacons.slam.batch_solver import Factored, t_cost, t_weights
 from ccatp.beacons.slam.evaluation import judge
 from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun, Steps, dead_reckoned
-from ccatp.config.load import load_recordings_config
 from ccatp.config.beacon_models import OdometryNoiseConfig, PriorsConfig, RadioNoiseConfig, RecordingConfig
+from ccatp.config.load import load_recordings_config
 from tests.unit.beacons.datasets.sets import BEACONS, changed, recorded, world
 
 FloatArray = npt.NDArray[np.float64]
