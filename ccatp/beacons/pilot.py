@@ -25,7 +25,7 @@ _NEAREST_M = 0.02  # nearer than that a direction means nothing
 class FollowState(StrEnum):
     """What a follower is doing."""
 
-    LOST = "lost"  # not heard for too long, or never: stands
+    LOST = "lost"  # not received for too long, or never: stands
     APPROACHING = "approaching"
     HOLDING = "holding"  # within the band round the safe distance: stands
     BACKING = "backing"  # too near

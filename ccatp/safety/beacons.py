@@ -6,7 +6,7 @@ Every rule looks at what the robot itself senses; of main's estimate only its un
   of the course: no forward motion, code 1; likewise behind, and no reverse;
 * target: by the mean level of the radio that is followed, less one standard deviation of that mean, it is nearer than
   ``target_m``: no forward motion, code 1;
-* silence: neither a static radio nor a mote was heard for ``radio_timeout_s``: hold;
+* silence: no reading of a static radio or a mote for ``radio_timeout_s``: hold;
 * estimate: too old, or its standard deviation above ``position_sigma_m`` (until below ``position_clear_m``): hold;
 * a hold that lasts ``hold_limit_s`` is a fault;
 * an emergency: code 2, latched (``ccatp.safety.emergency_latch``); in an earthquake nothing is permitted.
@@ -97,7 +97,7 @@ class BeaconSafetyRules:
         self.reset()
 
     def reset(self) -> None:
-        """The robot has booted: its clock counts anew. Emergencies stay latched."""
+        """The robot has booted: its clock starts again. Emergencies stay latched."""
         self._heard_s: float | None = None
         self._levels: deque[tuple[float, float]] = deque()
         avoidance = self._avoidance
@@ -229,8 +229,8 @@ class BeaconSafetyRules:
         held_s = sensors.t - self._held_since_s
         is_fault = held_s > self._danger.hold_limit_s
         severity = Severity.FAULT if is_fault else Severity.HOLD
-        told = f"{cause} for {held_s:.0f} s" if is_fault else cause
-        return self._denied(sensors.seq, sensors.t, told, signal, value, limit, severity)
+        text = f"{cause} for {held_s:.0f} s" if is_fault else cause
+        return self._denied(sensors.seq, sensors.t, text, signal, value, limit, severity)
 
     def _denied(
         self, seq: int, t_s: float, cause: str, signal: str, value: float, limit: float, severity: Severity

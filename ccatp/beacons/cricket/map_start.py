@@ -115,7 +115,7 @@ def _crossing(
 _MISFIT = 6.0  # root mean square residual of a patch, in sigmas, beyond which it is folded or its ranges are wrong
 _QUICK, _SLOW = (1e3,), (1e-2, 1.0, 1e3)  # a patch is nearly complete: most unfold at once, the others in a few steps
 _GOOD = 1.7  # root mean square residual, in sigmas, of a patch that needs no slower try
-_ROUNDS = 4  # of weighing the relations anew
+_ROUNDS = 4  # of weighing the relations again
 _SHIFT, _ITERATIONS = 1e-3, 30  # of the inverse iteration: eigenvalues are at most 1, those wanted next to it
 _AGREE = 0.2  # distance of a relation from the turns found, beyond which it weighs less and less
 _PARTNERS = 24  # patches that one patch is compared with at most
@@ -136,7 +136,7 @@ class Patch(NamedTuple):
 def stitched(count: int, means: PairMeans, dimension: int) -> FloatArray:
     """Places of n motes, nan where no patch holds a mote, shape (n, d).
 
-    Each mote and its neighbours give a patch; two patches that share d + 1 motes tell how one is turned, or mirrored,
+    Each mote and its neighbours give a patch; two patches that share d + 1 motes show how one is turned, or mirrored,
     against the other. The turns of all patches are the leading eigenvectors of the matrix of these relations
     (eigenvector synchronization over O(d): Cucuringu, Lipman and Singer 2012), and their shifts a linear least-squares
     problem. No patch decides for the others, so that errors do not grow with the way from a first one.
@@ -292,7 +292,7 @@ _MAX_DOP = 60.0  # of a trilateration that is but a start
 
 
 def map_starts(network: RangeNetwork, given_m: FloatArray | None) -> Iterator[list[FloatArray]]:
-    """Places to begin, the most promising first; each with its mirror image, where bodies tell them apart.
+    """Places to begin, the most promising first; each with its mirror image, where bodies distinguish them.
 
     Args:
         given_m: what the caller has, shape (n, d), nan where nothing is known.

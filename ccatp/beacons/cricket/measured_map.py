@@ -99,8 +99,8 @@ def hidden_offset(found: MoteMap, network: RangeNetwork, settings: MapFitSetting
     agreement = agreement_of(shown, network.sigmas_m, dof)
     if found.agreement.is_denied:
         # An offset may have bent the map too far to be seen from there.
-        anew = map_motes(network, settings, with_offset=True)
-        cost, offset_m, agreement = anew.cost, anew.offset_m, anew.agreement
+        again = map_motes(network, settings, with_offset=True)
+        cost, offset_m, agreement = again.cost, again.offset_m, again.agreement
     # Where the ranges deny the map even so, any unknown more betters it, and means nothing.
     if without.cost - cost > _TELLING and not agreement.is_denied:
         yield (
@@ -336,7 +336,7 @@ def _truth(truth_m: Places, names: tuple[str, ...], dimension: int) -> FloatArra
 
 
 def report_lines(data: dict[str, Any]) -> Iterator[str]:
-    """What ``ccatp radio map`` prints without ``--json``: first what the ranges can tell, then what was found.
+    """What ``ccatp radio map`` prints without ``--json``: first what the ranges determine, then what was found.
 
     Args:
         data: as ``--json`` prints it.

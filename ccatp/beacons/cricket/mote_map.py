@@ -71,13 +71,13 @@ def map_motes(
     """The map that fits all ranges best.
 
     A fit goes down to the nearest minimum, and most of them are folded maps. So it begins with the map unfolded from
-    more dimensions (``unfolded``) or stitched from patches (``stitched``), and its mirror image where bodies tell them
-    apart; then places that contradict their ranges are mapped anew (``repaired``), and motes that could stand on the
-    other side are tried there (``unfold``).
+    more dimensions (``unfolded``) or stitched from patches (``stitched``), and its mirror image where bodies
+    distinguish them; then places that contradict their ranges are mapped again (``repaired``), and motes that could
+    stand on the other side are tried there (``unfold``).
 
     Args:
         start_m: one more place to begin, shape (n, d), nan where unknown.
-        finds_sigma: the sigmas are right up to a factor, which the residuals tell (``scaled``).
+        finds_sigma: the sigmas are right up to a factor, which follows from the residuals (``scaled``).
     """
     model = MapModel(network, with_offset=with_offset, with_scale=with_scale)
     if finds_sigma:

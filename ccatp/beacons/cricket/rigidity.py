@@ -32,7 +32,7 @@ class Freedom(NamedTuple):
 
     Attributes:
         frame: names of rigid motions of the whole map that are free.
-        untold: what of offset and scale cannot be told from the map.
+        untold: what of offset and scale cannot be separated from the map.
     """
 
     unknowns: int
@@ -49,7 +49,7 @@ class Freedom(NamedTuple):
 
     @property
     def calibration(self) -> tuple[str, ...]:
-        """A line for each that cannot be told."""
+        """A line for each of ``untold``."""
         return tuple(f"range {name}: the map takes it up" for name in self.untold)
 
 

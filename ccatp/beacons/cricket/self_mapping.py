@@ -336,7 +336,7 @@ def network_plan(cfg: CricketConfig) -> MotePlan:
 
 
 def loose_plan(cfg: CricketConfig, names: tuple[str, ...]) -> MotePlan:
-    """The plan of motes by themselves: every pair that is heard is measured and used."""
+    """The plan of motes by themselves: every pair in reach is measured and used."""
     count, d = len(names), cfg.dimension
     pairs = tuple((i, j) for i in range(count) for j in range(i + 1, count))
     nowhere = np.full((count, d), np.nan)

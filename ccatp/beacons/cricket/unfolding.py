@@ -172,7 +172,7 @@ def agreement_of(fit: MapFit, sigmas_m: FloatArray, dof: int) -> Agreement:
 
 
 _SUSPECT = 4.0  # residual in sigmas that makes both ends of a range suspects
-_LARGEST = 60  # motes of one place that is mapped anew
+_LARGEST = 60  # motes of one place that is mapped again
 _ROUNDS = 3
 
 

@@ -19,7 +19,7 @@ FITTING = 0.3  # of what they miss their own place by: then they fit another,
 EXCHANGED = 0.75  # or, if those of the other fit here as well as theirs there, are exchanged with it
 TELLING = 1.5  # times what the others miss, without which nothing is exchanged
 AGREEMENT = 0.5  # length of the mean vector of bearing errors that share a constant
-CLOSE = 0.9  # the same, of bearings that tell places
+CLOSE = 0.9  # the same, of bearings that give places
 PIECES = 4  # of the run, looked at one by one
 FEW = 20
 FITS = " fit "  # in a line that says whose place it is
@@ -76,8 +76,8 @@ def _bearings(seen: Readings, pose: FloatArray, placed: FloatArray) -> tuple[lis
     if abs(mean) <= AGREEMENT:
         return [], None
     off_rad = float(np.angle(mean))
-    told = [f"bearings read {off_rad:+.3f} rad off (against the truth)"] if abs(off_rad) > 0.05 else []
-    return told, off_rad if abs(mean) > CLOSE else None
+    lines = [f"bearings read {off_rad:+.3f} rad off (against the truth)"] if abs(off_rad) > 0.05 else []
+    return lines, off_rad if abs(mean) > CLOSE else None
 
 
 def _robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
@@ -249,8 +249,8 @@ def _odometry_against(truth: ReferencePath, steps: Steps) -> Iterator[str]:
     true_way = np.hypot(np.diff(truth.x_m[rows]), np.diff(truth.y_m[rows]))
     half_turn = np.minimum(0.5 * np.abs(np.diff(amount_at(steps, steps.turn_rad, t))), 1.0)
     chord = np.abs(way) * np.sinc(half_turn / np.pi)  # of the arc
-    told = np.diff(amount_at(steps, steps.guess_m2, t)) <= 0.0
-    true_way, chord = true_way[told], chord[told]
+    measured = np.diff(amount_at(steps, steps.guess_m2, t)) <= 0.0
+    true_way, chord = true_way[measured], chord[measured]
     if chord.sum() > 0.0:
         scale = float(true_way.sum() / chord.sum())
         if abs(scale - 1.0) > SCALE_WARNING:

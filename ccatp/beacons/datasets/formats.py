@@ -292,7 +292,7 @@ def read_labyrinth(path: Path) -> RecordedRun:
 
 
 def wheel_columns(truth: ReferencePath, steps: Steps, half_track_m: float) -> list[str]:
-    """What the truth says of the wheel columns, a line; nothing where it tells too little.
+    """What the truth says of the wheel columns, a line; nothing where it says too little.
 
     Args:
         steps: odometry with the columns read as left, right, half the track.

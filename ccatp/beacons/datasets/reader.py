@@ -100,7 +100,7 @@ def _format_of_folder(folder: Path) -> str | None:
 
 LONGEST_RUN_S = 1e8  # three years
 LONGEST_STEP_M = 1e3  # between two rows of odometry
-LARGEST_TURN_RAD = 1e4  # likewise; degrees for radians stay far below it, and are told elsewhere
+LARGEST_TURN_RAD = 1e4  # likewise; degrees for radians stay far below it, and are reported elsewhere
 LONGEST_RANGE_M = 1e6
 LARGEST_BEARING_RAD = 1e4
 LARGEST_LEVEL_DBM = 1e3

@@ -10,7 +10,7 @@ from ccatp.core import FloatArray
 BEFORE_S = 1.0  # over so long the speed before a gap is taken
 WINDOWS = 1000  # spans of the run by which speeds are compared with those before
 LOST_RAD = float(np.pi / np.sqrt(3.0))  # standard deviation of a heading that is anything: more cannot be unknown
-# Travel over which a course is told from positions: well above the centimetres of GNSS and camera references.
+# Travel over which a course is taken from positions: well above the centimetres of GNSS and camera references.
 CHORD_M = 0.2
 LONGEST_WAY_M = 1e6  # longer ways are no vehicle's; they are not cut into chords
 AGREEMENT = 0.8  # length of the mean vector of (course - heading) above which the two differ by a constant

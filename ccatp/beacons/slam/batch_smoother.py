@@ -31,7 +31,7 @@ LEAST_READINGS = 4  # of a beacon that joins without bearings
 # Between the places of a beacon's readings without bearings: from a single place it may lie anywhere on a circle.
 LEAST_WAY_M = 0.01
 SURE_SPREAD = 0.15  # largest standard deviation of a beacon that joins, over its distance
-SPACING_S = 0.5  # there is a pose at least that often, whether something was heard or not
+SPACING_S = 0.5  # there is a pose at least that often, with a reading or without
 ITERATIONS = 40
 WIDENINGS = 8
 WIDER = 1.05  # noise is widened where the residuals are larger than it by that factor
@@ -75,7 +75,7 @@ def place_by_bearings(
 def place_by_distances(poses: FloatArray, distance_m: FloatArray, variance: FloatArray) -> Placement:
     """Best of the minima of the robust cost of distances, sought from all around the nearest reading.
 
-    A straight path leaves two mirror images that cost the same; ``margin`` tells.
+    A straight path leaves two mirror images that cost the same: see ``margin``.
 
     Args:
         poses: of the readings, shape (m, 3).

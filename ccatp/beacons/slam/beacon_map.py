@@ -158,10 +158,10 @@ HEADING = 2
 class HeadingTransport:
     """After a correction, P <- M P M^T with M = I + d e^T, e the heading and d = J (new - old) of every place.
 
-    Nobody tells the heading of the whole map: a turn of everything about any point changes no reading. In the state it
-    is the direction (J p of each place p, 1 of the heading), J a quarter turn; derivatives are taken at the estimate,
-    so it changes with each correction, and a filter that leaves P as it was takes that change for knowledge. A
-    covariance of errors that turn with the heading does not have to change (the invariant EKF: Barrau and Bonnabel
+    A turn of everything about any point changes no reading, so the heading of the whole map is not observed. In the
+    state it is the direction (J p of each place p, 1 of the heading), J a quarter turn; derivatives are taken at the
+    estimate, so it changes with each correction, and a filter that leaves P as it was takes that change for knowledge.
+    A covariance of errors that turn with the heading does not have to change (the invariant EKF: Barrau and Bonnabel
     2015; Zhang et al. 2017); this is that covariance, said of errors of x and y.
     """
 

@@ -25,13 +25,13 @@ from ccatp.beacons.slam.recording import (
 from ccatp.config.beacon_models import RecordingConfig, SlamFilterConfig
 from ccatp.core import FloatArray
 
-FAR = 3.0  # standard deviations of the prior beyond which a value is told
-UNCHANGED = 0.999  # of the prior's standard deviation: what is left of it where no reading told anything
+FAR = 3.0  # standard deviations of the prior beyond which a value is reported
+UNCHANGED = 0.999  # of the prior's standard deviation: what is left of it without readings of it
 KEYS = {"odometry_delay_s": "delay_s"}  # keys under ``priors`` that are called otherwise than the quantity
 
 
 def learned(calibration: Mapping[str, Calibrated], priors: Mapping[str, float]) -> dict[str, Calibrated]:
-    """Those that the readings told something of; a prior is no result."""
+    """Those that the readings have determined in part; a prior is no result."""
     return {name: found for name, found in calibration.items() if found.sigma < UNCHANGED * priors[name]}
 
 
@@ -82,7 +82,7 @@ class HeadingRelocalizer:
         return learned
 
     def _split(self) -> None:
-        for beacon in list(self.best.waiting):  # what was heard of it before the gap belongs to another frame
+        for beacon in list(self.best.waiting):  # its readings before the gap belong to another frame
             self.best.remove(beacon)
         if not self.best.beacons:
             return
@@ -113,10 +113,10 @@ class HeadingRelocalizer:
 
 
 FINEST_S = 0.1  # steps of odometry shorter than that are put together
-# Mean square of normalised innovations, per degree of freedom, that is told: of learned noise it is one.
+# Mean square of normalised innovations, per degree of freedom, that is reported: of learned noise it is one.
 DOUBTFUL_NIS = 1.3
-DOUBTFUL_JUMPS = 0.003  # how often the pose has to be doubted, for each reading, that it is told
-DOUBTFUL_SHARE = 0.3  # share of refused readings that is told
+DOUBTFUL_JUMPS = 0.003  # how often the pose has to be doubted, for each reading, that it is reported
+DOUBTFUL_SHARE = 0.3  # share of refused readings that is reported
 
 
 def filter_run(

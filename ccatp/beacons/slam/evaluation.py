@@ -13,12 +13,12 @@ from ccatp.filters.metrics import Consistency, RigidMotion, best_motion, consist
 LONGEST_GAP_S = 0.5  # the truth is taken as known between two of its rows that lie no further apart,
 USUAL_GAPS = 3.0  # or no further than that many of its usual intervals
 
-FIRST_POSE_S = 1.0  # the truth's first row tells the first pose if it comes no later than that
+FIRST_POSE_S = 1.0  # the truth's first row is the first pose if it comes no later than that
 LEAST_KNOWN = 3  # instants with a truth: one always fits, and two but for their distance
 
 
 class TrackEvaluation(NamedTuple):
-    """Errors of a track; None where there is no truth to tell.
+    """Errors of a track; None where there is no truth.
 
     Attributes:
         nees: of the poses as they are, without alignment; positions alone if the truth has no headings; None where the
@@ -104,7 +104,7 @@ def _nees(track: EstimatedPath, truth: FloatArray, known: np.ndarray) -> Consist
     return consistency(squares, np.full(squares.size, float(size)))
 
 
-SCALES = ("range_scale", "distance_scale", "turn_scale")  # told as factors: 1.07 for ranges that read 7 % too long
+SCALES = ("range_scale", "distance_scale", "turn_scale")  # shown as factors: 1.07 for ranges that read 7 % too long
 
 
 def result_data(run: RecordedRun, filter_name: str, track: EstimatedPath, judged: TrackEvaluation) -> dict[str, Any]:
@@ -208,7 +208,7 @@ AVERAGED = ("trajectory_rmse_m", "heading_rmse_rad", "beacon_rmse_m", "update_us
 def row(
     run: RecordedRun, name: str, track: EstimatedPath, run_s: float | None, *, peer: bool = False
 ) -> dict[str, Any]:
-    """The figures of one estimator on one run; a peer tells no covariance."""
+    """The figures of one estimator on one run; a peer has no covariance."""
     data = result_data(run, name, track, judge(track, run))
     found = {key: data.get(key) for _, key, _ in COLUMNS}
     found["run_s"] = run_s

@@ -184,7 +184,7 @@ class _Problem(NamedTuple):
         return [ring[k] for k in range(STARTS) if costs[k] <= min(costs[k - 1], costs[(k + 1) % STARTS])]
 
     def mirrored(self, point: FloatArray) -> tuple[float, float]:
-        """The image of a point (2,) on the other side of the way, which ranges tell apart last."""
+        """The image of a point (2,) on the other side of the way, which ranges distinguish last."""
         places = np.array(self.places)
         middle = places.mean(axis=0)
         along = np.linalg.svd(places - middle)[2][0]

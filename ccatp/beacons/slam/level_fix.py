@@ -92,10 +92,10 @@ class LevelLocator:
         self._predicted = [self._predict(self.points_m, i) for i in range(len(self.names))]
 
     def fix(self, levels_dbm: Mapping[str, float]) -> LevelFix:
-        """The position of a receiver that hears these levels; beacons that it does not hear are left out.
+        """The position of a receiver of these levels; beacons without a level are left out.
 
         Raises:
-            ValueError: it hears none.
+            ValueError: there is no level.
         """
         if not any(name in levels_dbm for name in self.names):
             raise ValueError(f"none of the beacons {', '.join(self.names)} was heard; a fix needs one at least")
@@ -110,7 +110,7 @@ class LevelLocator:
         return LevelFix(mean, (off * weights[:, None]).T @ off, self.points_m, weights)
 
     def log_likelihood(self, place_m: Sequence[float], levels_dbm: Mapping[str, float]) -> float:
-        """Of levels heard at a known place."""
+        """Of levels at a known place."""
         at = np.asarray(place_m, dtype=np.float64)[None, :]
         return sum(
             float(_log_density(levels_dbm[name], *self._predict(at, i), self._fits[i].freedom)[0])

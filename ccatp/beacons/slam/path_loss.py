@@ -46,8 +46,8 @@ class PathLoss:
         return self.sigma_db * _NEPER_PER_DB / self.exponent
 
 
-LEAST_EXPONENT = 0.1  # free space has 2; levels that hardly fall tell no distance
-LEAST_PLACES = 3  # two unknowns and one to tell the spread
+LEAST_EXPONENT = 0.1  # free space has 2; levels that hardly fall give no distance
+LEAST_PLACES = 3  # two unknowns and one for the spread
 _PLAUSIBLE_EXPONENT = (1.0, 6.0)  # a corridor that guides waves has 1.2, a building with walls in the way up to 6
 _LOUDEST_DBM = -10.0  # 20 dBm sent are -20 dBm at 1 m in free space, at 2.4 GHz
 _EXACT_DB = 1e-6

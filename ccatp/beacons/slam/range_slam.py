@@ -84,11 +84,11 @@ class BeaconSlam:
     Attributes:
         engine: the state: vehicle | calibration | beacons, wandering errors and places where readings wait.
         learned: what the readings of the last ``observe`` did.
-        waiting: beacons that were heard and are not on the map yet, with the candidates for their places.
+        waiting: beacons with readings that are not on the map yet, with the candidates for their places.
         levels: what the noise of each sensor and of the motion is, relative to the settings, in variance.
         prior_sigmas: standard deviations of ``calibration`` before any reading, in its order.
         unplaced: directions alone, of beacons that were not on the map then: they are not used.
-        moved: beacons that had to be placed anew, each with the time_s of the reading that decided it.
+        moved: beacons that had to be placed again, each with the time_s of the reading that decided it.
     """
 
     def __init__(
@@ -208,10 +208,10 @@ class BeaconSlam:
         return found.nis
 
     def remove(self, beacon: BeaconId) -> None:
-        """Forget a beacon; one that is heard again begins anew.
+        """Forget a beacon; its next reading begins it again.
 
         Raises:
-            BlockError: nothing was heard of it.
+            BlockError: there was no reading of it.
         """
         if self._candidates.forget(beacon):
             return

@@ -32,7 +32,7 @@ class Steps(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """What was heard of beacons, one reading a row, in order of time.
+    """Readings of beacons, one a row, in order of time.
 
     Args:
         times_s: shape (m,), s, rising.

@@ -15,7 +15,7 @@ class ScanResult(NamedTuple):
     """Level and bearing of one radio after a turn of the reflector.
 
     Attributes:
-        bearing_rad: left of the heading; None where the scan does not tell.
+        bearing_rad: left of the heading; None where the scan has none.
     """
 
     beacon: str
