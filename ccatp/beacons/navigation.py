@@ -13,8 +13,7 @@ from ccatp.beacons.cricket.trilateration import map_by_plan
 from ccatp.beacons.pilot import TargetSight
 from ccatp.beacons.slam.motion import POSE, Increment, Odometry, SlippingVehicle, Steering
 from ccatp.beacons.slam.recording import RssiReading
-from ccatp.beacons.slam.reflector import ReflectorScan
-from ccatp.beacons.slam.signal_slam import SignalSlam
+from ccatp.beacons.slam.signal_slam import ReflectorScan, SignalSlam
 from ccatp.config.beacon_models import CricketConfig, RadioConfig
 from ccatp.core import FloatArray, WheelSample
 from ccatp.filters.ekf_slam import EkfSlam, columns_of

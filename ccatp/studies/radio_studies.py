@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.reflector import ReflectorScan, ScanResult
+from ccatp.beacons.slam.signal_slam import ReflectorScan, ScanResult
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import wrap_pi
 from ccatp.report.plots import INK, QUIET

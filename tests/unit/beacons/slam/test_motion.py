@@ -13,7 +13,7 @@ from ccatp.beacons.slam.causal import filter_run
 from ccatp.beacons.slam.evaluation import judge
 from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun, ReferencePath
-from ccatp.beacons.slam.reflector import ReflectorScan, ScanResult
+from ccatp.beacons.slam.signal_slam import ReflectorScan, ScanResult
 from ccatp.config.beacon_models import ScanConfig
 from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
