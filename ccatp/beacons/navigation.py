@@ -115,13 +115,12 @@ class BeaconMeasurements(NamedTuple):
     """A frame as a mission takes it.
 
     Attributes:
-        wheels: odometry since the last frame, without gaps; empty where nothing is known of it.
         packets: answers of radios: name, direction of the reflector left of the heading (rad), level (dBm).
         sightings: results of scans: radio, level (dBm), bearing left of the heading (rad; None where not known).
     """
 
     t_s: float
-    wheels: tuple[Odometry, ...]
+    wheels: tuple[Odometry, ...]  # odometry since the last frame, without gaps; empty where nothing is known of it
     packets: tuple[tuple[str, float, float], ...]
     sightings: tuple[tuple[str, float, float | None], ...]
     distances_m: tuple[float, ...]
@@ -193,15 +192,10 @@ Ellipse = tuple[float, float, float, float, float]
 
 
 class PoseBelief(NamedTuple):
-    """What is believed now.
+    """What is believed now."""
 
-    Attributes:
-        pose: x m, y m, heading rad (continuous).
-        covariance: of these, shape (3, 3).
-    """
-
-    pose: tuple[float, float, float]
-    covariance: FloatArray
+    pose: tuple[float, float, float]  # x m, y m, heading rad (continuous)
+    covariance: FloatArray  # of these, shape (3, 3)
 
     @property
     def ellipse(self) -> Ellipse:

@@ -102,14 +102,10 @@ class _Obstacle(NamedTuple):
 
 
 class FreeHeading(NamedTuple):
-    """What the obstacles leave of an aim.
-
-    Attributes:
-        speed_factor: 1 far from everything, 0 where nothing but standing is safe.
-    """
+    """What the obstacles leave of an aim."""
 
     aim: BearingToPoint
-    speed_factor: float
+    speed_factor: float  # 1 far from everything, 0 where nothing but standing is safe
     is_blocked: bool
 
 

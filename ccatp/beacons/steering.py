@@ -105,14 +105,10 @@ HALT = SteeringCommand(0.0, 0.0, 0.0)
 
 
 class BearingToPoint(NamedTuple):
-    """Where to go, seen from the vehicle.
-
-    Attributes:
-        error_rad: of the heading: positive when the aim lies to the left.
-    """
+    """Where to go, seen from the vehicle."""
 
     distance_m: float
-    error_rad: float
+    error_rad: float  # of the heading: positive when the aim lies to the left
 
 
 def aim_at(pose: PlanarPose, goal_m: Point) -> BearingToPoint:

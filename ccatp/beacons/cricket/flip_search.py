@@ -24,14 +24,10 @@ _HOPELESS = 20.0  # times the best cost: such a fit ends in a worse fold
 
 
 class Fold(NamedTuple):
-    """Motes whose mirror image fits almost as well.
-
-    Attributes:
-        cost_gap: by how much the cost of the whole map would rise.
-    """
+    """Motes whose mirror image fits almost as well."""
 
     motes: tuple[int, ...]
-    cost_gap: float
+    cost_gap: float  # by how much the cost of the whole map would rise
 
 
 class Unfolded(NamedTuple):
@@ -211,15 +207,10 @@ _LEAST = 1e-9  # a factor of sigmas that is not nought where the ranges are exac
 
 
 class ScaledFit(NamedTuple):
-    """A robust fit and the sigmas that its residuals have.
+    """A robust fit and the sigmas that its residuals have."""
 
-    Attributes:
-        factor: of the sigmas of the network that was asked about.
-        model: of the network with the sigmas so multiplied.
-    """
-
-    factor: float
-    model: MapModel
+    factor: float  # of the sigmas of the network that was asked about
+    model: MapModel  # of the network with the sigmas so multiplied
     fit: MapFit
 
 

@@ -17,15 +17,10 @@ from ccatp.filters.metrics import best_motion, rigid_modes
 
 @dataclass(frozen=True, slots=True)
 class MapState:
-    """A map.
+    """A map."""
 
-    Attributes:
-        positions_m: of all motes, shape (n, d).
-        rotations: of the bodies, world from body, shape (b, d, d).
-    """
-
-    positions_m: FloatArray
-    rotations: FloatArray
+    positions_m: FloatArray  # of all motes, shape (n, d)
+    rotations: FloatArray  # of the bodies, world from body, shape (b, d, d)
     offset_m: float = 0.0
     scale: float = 0.0
 
@@ -193,30 +188,22 @@ class MapFitSettings(NamedTuple):
 
     Attributes:
         robust_scale: Cauchy loss: residuals beyond this many sigmas weigh less and less; infinite for least squares.
-        tolerance_m: a step whose largest part is shorter ends the iteration.
     """
 
     robust_scale: float = float("inf")
     max_iterations: int = 200
-    tolerance_m: float = 1e-8
+    tolerance_m: float = 1e-8  # a step whose largest part is shorter ends the iteration
 
 
 class MapFit(NamedTuple):
-    """A fitted map.
-
-    Attributes:
-        cost: sum of the loss, c^2 log(1 + (r / (c sigma))^2), or (r / sigma)^2.
-        weights: what the loss left of each range, 0 to 1, shape (m,).
-        residuals_m: shape (m,).
-        is_at_rest: whether the steps had ended before ``max_iterations``.
-    """
+    """A fitted map."""
 
     state: MapState
-    cost: float
-    weights: FloatArray
-    residuals_m: FloatArray
+    cost: float  # sum of the loss, c^2 log(1 + (r / (c sigma))^2), or (r / sigma)^2
+    weights: FloatArray  # what the loss left of each range, 0 to 1, shape (m,)
+    residuals_m: FloatArray  # shape (m,)
     iterations: int
-    is_at_rest: bool
+    is_at_rest: bool  # whether the steps had ended before ``max_iterations``
 
 
 def fit_map(model: MapModel, start: MapState, settings: MapFitSettings) -> MapFit:

@@ -122,15 +122,10 @@ _PARTNERS = 24  # patches that one patch is compared with at most
 
 
 class Patch(NamedTuple):
-    """A map of a mote and its neighbours, in a frame of its own.
+    """A map of a mote and its neighbours, in a frame of its own."""
 
-    Attributes:
-        motes: their indices, shape (k,).
-        places_m: shape (k, d).
-    """
-
-    motes: IndexArray
-    places_m: FloatArray
+    motes: IndexArray  # their indices, shape (k,)
+    places_m: FloatArray  # shape (k, d)
 
 
 def stitched(count: int, means: PairMeans, dimension: int) -> FloatArray:

@@ -150,18 +150,13 @@ class MeasuredRanges(NamedTuple):
 
 
 class MeasuredMap(NamedTuple):
-    """A map of real motes.
-
-    Attributes:
-        true_m: shape (n, d), or None.
-        data: as ``ccatp radio map --json`` prints it.
-    """
+    """A map of real motes."""
 
     names: tuple[str, ...]
     positions_m: FloatArray
     covariance_m2: FloatArray
-    true_m: FloatArray | None
-    data: dict[str, Any]
+    true_m: FloatArray | None  # shape (n, d), or None
+    data: dict[str, Any]  # as ``ccatp radio map --json`` prints it
 
 
 class _Found(NamedTuple):

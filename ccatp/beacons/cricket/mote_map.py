@@ -27,29 +27,20 @@ _CORRECTIONS = 3  # times that the unfolding is repeated with ranges corrected b
 
 @dataclass(frozen=True, slots=True)
 class MoteMap:
-    """A map of motes.
-
-    Attributes:
-        positions_m: shape (n, d).
-        covariance_m2: of all coordinates, shape (n d, n d); of the aligned map where nothing pins the frame.
-        cost: of all ranges, in units of chi-squared.
-        residuals_m: measured less computed ranges, shape (m,).
-        sigma_m: median of the sigmas in the end.
-        free: directions that no range sees, the frame's included.
-    """
+    """A map of motes."""
 
     names: tuple[str, ...]
-    positions_m: FloatArray
-    covariance_m2: FloatArray
+    positions_m: FloatArray  # shape (n, d)
+    covariance_m2: FloatArray  # of all coordinates, shape (n d, n d); of the aligned map where nothing pins the frame
     offset_m: float
     scale: float
-    cost: float
+    cost: float  # of all ranges, in units of chi-squared
     dof: int
-    residuals_m: FloatArray
-    sigma_m: float
+    residuals_m: FloatArray  # measured less computed ranges, shape (m,)
+    sigma_m: float  # median of the sigmas in the end
     iterations: int
     agreement: Agreement
-    free: int
+    free: int  # directions that no range sees, the frame's included
     folds: tuple[Fold, ...]
 
     @property

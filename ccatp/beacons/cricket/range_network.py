@@ -94,15 +94,11 @@ class MoteUnderdetermined(MappingError):
 
 @dataclass(frozen=True, slots=True)
 class RigidBody:
-    """Motes whose places relative to each other are known: a network on its stand, tags on a trolley.
-
-    Attributes:
-        local_m: their places in the body's own frame, shape (k, d).
-    """
+    """Motes whose places relative to each other are known: a network on its stand, tags on a trolley."""
 
     name: str
     motes: tuple[int, ...]
-    local_m: FloatArray
+    local_m: FloatArray  # their places in the body's own frame, shape (k, d)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,21 +106,17 @@ class RangeNetwork:
     """A graph of ranges.
 
     Attributes:
-        dimension: d, 2 or 3.
         first, second: ends of each of the m ranges, indices of motes, shape (m,).
-        ranges_m: measured, shape (m,).
-        sigmas_m: standard deviations, shape (m,).
-        known_m: coordinates that are known, nan elsewhere, shape (n, d); none for motes of bodies.
     """
 
     names: tuple[str, ...]
-    dimension: int
+    dimension: int  # d, 2 or 3
     first: IndexArray
     second: IndexArray
-    ranges_m: FloatArray
-    sigmas_m: FloatArray
+    ranges_m: FloatArray  # measured, shape (m,)
+    sigmas_m: FloatArray  # standard deviations, shape (m,)
     bodies: tuple[RigidBody, ...]
-    known_m: FloatArray
+    known_m: FloatArray  # coordinates that are known, nan elsewhere, shape (n, d); none for motes of bodies
 
     @property
     def count(self) -> int:

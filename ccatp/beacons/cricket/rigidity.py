@@ -28,18 +28,13 @@ _AXES = ("x", "y", "z")
 
 
 class Freedom(NamedTuple):
-    """Directions of the unknowns that no range sees, to first order.
-
-    Attributes:
-        frame: names of rigid motions of the whole map that are free.
-        untold: what of offset and scale cannot be separated from the map.
-    """
+    """Directions of the unknowns that no range sees, to first order."""
 
     unknowns: int
     rank: int
-    frame: tuple[str, ...]
+    frame: tuple[str, ...]  # names of rigid motions of the whole map that are free
     flexes: tuple[str, ...]
-    untold: tuple[str, ...]
+    untold: tuple[str, ...]  # what of offset and scale cannot be separated from the map
     parts: tuple[tuple[int, ...], ...]
 
     @property
@@ -203,14 +198,12 @@ class FoldOver(NamedTuple):
     """What may fold.
 
     Attributes:
-        is_unique: whether almost all places give a map that is the only one, up to a rigid motion and the mirror.
         mirrors: (separator, motes): these motes may be mirrored across the line (plane) through the separator.
-        single_pairs: pairs whose range nothing else confirms, shape (k, 2): without it something moves.
     """
 
-    is_unique: bool
+    is_unique: bool  # whether almost all places give a map that is the only one, up to a rigid motion and the mirror
     mirrors: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
-    single_pairs: IndexArray
+    single_pairs: IndexArray  # pairs whose range nothing else confirms, shape (k, 2): without it something moves
     warnings: tuple[str, ...]
 
 

@@ -195,17 +195,11 @@ class _Rows:
 
 
 class PhaseTwo(NamedTuple):
-    """How phase 2 went.
+    """How phase 2 went."""
 
-    Attributes:
-        positions_m: after each update, the first before any, shape (k + 1, n, d).
-        expected_rms_m: likewise, shape (k + 1,).
-        nis: of each update, shape (k,).
-    """
-
-    positions_m: FloatArray
-    expected_rms_m: FloatArray
-    nis: FloatArray
+    positions_m: FloatArray  # after each update, the first before any, shape (k + 1, n, d)
+    expected_rms_m: FloatArray  # likewise, shape (k + 1,)
+    nis: FloatArray  # of each update, shape (k,)
     refused: int
     reached: bool
 
@@ -272,22 +266,18 @@ class MotePlan:
 
     Attributes:
         networks: indices of the motes of each stand, in the order of mapping; empty where there are none.
-        bodies: the stands, whose shapes are known.
         axes_m: where A stands and the direction towards B, shape (2, d): what takes the map's frame to the field's.
-        phase1_pairs: pairs that are measured in phase 1.
-        phase2_pairs: pairs that phase 2 goes through.
-        surveyed_m: coordinates that phase 2 takes as known, nan elsewhere, shape (n, d).
     """
 
     names: tuple[str, ...]
     dimension: int
     anchors: tuple[int, ...]
     networks: tuple[tuple[int, ...], ...]
-    bodies: tuple[RigidBody, ...]
+    bodies: tuple[RigidBody, ...]  # the stands, whose shapes are known
     axes_m: FloatArray
-    phase1_pairs: Pairs
-    phase2_pairs: Pairs
-    surveyed_m: FloatArray
+    phase1_pairs: Pairs  # pairs that are measured in phase 1
+    phase2_pairs: Pairs  # pairs that phase 2 goes through
+    surveyed_m: FloatArray  # coordinates that phase 2 takes as known, nan elsewhere, shape (n, d)
 
     @property
     def heads(self) -> tuple[int, ...]:
@@ -358,16 +348,11 @@ def head_pairs(count: int, programme: str) -> list[tuple[int, int]]:
 
 
 class CompletedMap(NamedTuple):
-    """All motes of all stands.
-
-    Attributes:
-        positions_m: shape (k, d).
-        covariance_m2: shape (k d, k d).
-    """
+    """All motes of all stands."""
 
     motes: tuple[int, ...]
-    positions_m: FloatArray
-    covariance_m2: FloatArray
+    positions_m: FloatArray  # shape (k, d)
+    covariance_m2: FloatArray  # shape (k d, k d)
 
 
 def complete_stands(

@@ -35,16 +35,12 @@ class MissingRange(MappingError):
 
 
 class TrilaterationStep(NamedTuple):
-    """How one mote was placed.
-
-    Attributes:
-        how: ``axes``, ``cosines``, ``seed`` or ``trilateration``.
-    """
+    """How one mote was placed."""
 
     mote: int
     references: tuple[int, ...]
     dop: float
-    how: str
+    how: str  # ``axes``, ``cosines``, ``seed`` or ``trilateration``
 
 
 class Sketch:
@@ -321,17 +317,11 @@ _CLIQUES = 4000  # first motes looked at; the best of them begins the map
 
 
 class FirstMap(NamedTuple):
-    """What phase 1 gives.
+    """What phase 1 gives."""
 
-    Attributes:
-        positions_m: nan for motes without a place, shape (n, d).
-        covariance_m2: of all coordinates, zero for motes without a place, shape (n d, n d).
-        bias_m: mean error of the places, as far as it is known, shape (n, d).
-    """
-
-    positions_m: FloatArray
-    covariance_m2: FloatArray
-    bias_m: FloatArray
+    positions_m: FloatArray  # nan for motes without a place, shape (n, d)
+    covariance_m2: FloatArray  # of all coordinates, zero for motes without a place, shape (n d, n d)
+    bias_m: FloatArray  # mean error of the places, as far as it is known, shape (n, d)
     steps: tuple[TrilaterationStep, ...]
     unplaced: tuple[int, ...]
 

@@ -130,13 +130,9 @@ _DENIED = 3.0  # chi-squared for each degree of freedom
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """How the ranges fit a map.
+    """How the ranges fit a map."""
 
-    Attributes:
-        outlying: ranges of which the loss left less than half.
-    """
-
-    outlying: tuple[int, ...]
+    outlying: tuple[int, ...]  # ranges of which the loss left less than half
     inlier_cost: float
     dof: int
 

@@ -154,16 +154,11 @@ class BeaconFileError(MappingError):
 
 
 class BeaconPositions(NamedTuple):
-    """Beacons with what is uncertain about them.
-
-    Attributes:
-        positions_m: shape (n, d).
-        covariance_m2: of all coordinates, shape (n d, n d).
-    """
+    """Beacons with what is uncertain about them."""
 
     names: tuple[str, ...]
-    positions_m: FloatArray
-    covariance_m2: FloatArray
+    positions_m: FloatArray  # shape (n, d)
+    covariance_m2: FloatArray  # of all coordinates, shape (n d, n d)
     frame: str
 
 

@@ -20,17 +20,11 @@ FINEST_S = 0.1
 
 
 class Increments(NamedTuple):
-    """Motion from one instant to the next, in the vehicle's frame at the first.
+    """Motion from one instant to the next, in the vehicle's frame at the first."""
 
-    Attributes:
-        motion: x_m, y_m, heading_rad, shape (n, 3).
-        by_calibration: derivatives by ``CALIBRATION``, shape (n, 3, 5).
-        covariance: shape (n, 3, 3).
-    """
-
-    motion: FloatArray
-    by_calibration: FloatArray
-    covariance: FloatArray
+    motion: FloatArray  # x_m, y_m, heading_rad, shape (n, 3)
+    by_calibration: FloatArray  # derivatives by ``CALIBRATION``, shape (n, 3, 5)
+    covariance: FloatArray  # shape (n, 3, 3)
 
 
 class Reckoning:

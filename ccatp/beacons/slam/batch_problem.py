@@ -21,38 +21,23 @@ DB = 10.0 / np.log(10.0)
 
 @dataclass(slots=True)
 class ArrowSystem:
-    """Normal equations: a matrix [[A, B], [B^T, C]], A of the chain of poses, and the right-hand side (a, c).
+    """Normal equations: a matrix [[A, B], [B^T, C]], A of the chain of poses, and the right-hand side (a, c)."""
 
-    Attributes:
-        diagonal: of A, shape (n, 3, 3).
-        below: blocks (k + 1, k) of A, shape (n - 1, 3, 3).
-        border: B by pose, shape (n, 3, m).
-        corner: C, shape (m, m).
-        pose_side: a, shape (n, 3).
-        shared_side: c, shape (m,).
-    """
-
-    diagonal: FloatArray
-    below: FloatArray
-    border: FloatArray
-    corner: FloatArray
-    pose_side: FloatArray
-    shared_side: FloatArray
+    diagonal: FloatArray  # of A, shape (n, 3, 3)
+    below: FloatArray  # blocks (k + 1, k) of A, shape (n - 1, 3, 3)
+    border: FloatArray  # B by pose, shape (n, 3, m)
+    corner: FloatArray  # C, shape (m, m)
+    pose_side: FloatArray  # a, shape (n, 3)
+    shared_side: FloatArray  # c, shape (m,)
 
 
 @dataclass(slots=True)
 class BatchState:
-    """What is estimated.
+    """What is estimated."""
 
-    Attributes:
-        poses: x_m, y_m, heading_rad at each instant, shape (n, 3).
-        shared: by ``SHARED``, shape (10,).
-        beacons: x_m, y_m, range_offset_m, reference_db by beacon, shape (b, 4).
-    """
-
-    poses: FloatArray
-    shared: FloatArray
-    beacons: FloatArray
+    poses: FloatArray  # x_m, y_m, heading_rad at each instant, shape (n, 3)
+    shared: FloatArray  # by ``SHARED``, shape (10,)
+    beacons: FloatArray  # x_m, y_m, range_offset_m, reference_db by beacon, shape (b, 4)
 
     def moved(self, poses: FloatArray, shared: FloatArray) -> "BatchState":
         """The state after a step, the shared part of it shape (10 + 4 b,)."""
@@ -66,26 +51,16 @@ class Residuals:
     """What remains at a state, and its derivatives.
 
     Readings are rows of (range, bearing, signal strength), zero where there is none.
-
-    Attributes:
-        local: motion by the poses, in the vehicle's frame before it, shape (n - 1, 3).
-        odometry: what remains of it, shape (n - 1, 3).
-        odometry_information: shape (n - 1, 3, 3).
-        by_calibration: of the odometry's motion, shape (n - 1, 3, 5).
-        readings: predicted less read, shape (m, 3).
-        information: of each, zero where there is no reading, shape (m, 3).
-        by_pose: shape (m, 3, 3).
-        by_rest: by ``OF_READINGS`` and the beacon, shape (m, 3, 5 + 4).
     """
 
-    local: FloatArray
-    odometry: FloatArray
-    odometry_information: FloatArray
-    by_calibration: FloatArray
-    readings: FloatArray
-    information: FloatArray
-    by_pose: FloatArray
-    by_rest: FloatArray
+    local: FloatArray  # motion by the poses, in the vehicle's frame before it, shape (n - 1, 3)
+    odometry: FloatArray  # what remains of it, shape (n - 1, 3)
+    odometry_information: FloatArray  # shape (n - 1, 3, 3)
+    by_calibration: FloatArray  # of the odometry's motion, shape (n - 1, 3, 5)
+    readings: FloatArray  # predicted less read, shape (m, 3)
+    information: FloatArray  # of each, zero where there is no reading, shape (m, 3)
+    by_pose: FloatArray  # shape (m, 3, 3)
+    by_rest: FloatArray  # by ``OF_READINGS`` and the beacon, shape (m, 3, 5 + 4)
 
     @property
     def chi2(self) -> FloatArray:

@@ -43,17 +43,12 @@ SHOWN_AS = {"delay_s": "odometry_delay_s"}
 
 
 class Placement(NamedTuple):
-    """A beacon's first place.
-
-    Attributes:
-        margin: by how much the next best place costs more (half a chi-squared); infinite if there is none.
-        spread: largest standard deviation over the distance of the nearest reading.
-    """
+    """A beacon's first place."""
 
     x_m: float
     y_m: float
-    margin: float
-    spread: float
+    margin: float  # by how much the next best place costs more (half a chi-squared); infinite if there is none
+    spread: float  # largest standard deviation over the distance of the nearest reading
 
 
 def place_by_bearings(
@@ -116,16 +111,11 @@ def place_by_distances(poses: FloatArray, distance_m: FloatArray, variance: Floa
 
 
 class Start(NamedTuple):
-    """Where the smoother begins.
-
-    Attributes:
-        used: which beacons have been placed, shape (b,).
-        doubtful: those whose mirror image fits nearly as well, shape (b,).
-    """
+    """Where the smoother begins."""
 
     state: BatchState
-    used: npt.NDArray[np.bool_]
-    doubtful: npt.NDArray[np.bool_]
+    used: npt.NDArray[np.bool_]  # which beacons have been placed, shape (b,)
+    doubtful: npt.NDArray[np.bool_]  # those whose mirror image fits nearly as well, shape (b,)
 
 
 def grown(run: RecordedRun, times_s: FloatArray, settings: RecordingConfig) -> Start:

@@ -53,16 +53,11 @@ class GaussMarkovBias:
     """An error of a beacon's readings that stays while the vehicle does: multipath, shadowing, a tilted camera.
 
     A Gauss-Markov process of each beacon by itself: correlation exp(-way / length_m - time / time_s).
-
-    Attributes:
-        share: of the variance of the noise; the rest is new with every reading.
-        length_m: way of the vehicle after which it is forgotten.
-        time_s: time after which it is forgotten.
     """
 
-    share: float
-    length_m: float
-    time_s: float
+    share: float  # of the variance of the noise; the rest is new with every reading
+    length_m: float  # way of the vehicle after which it is forgotten
+    time_s: float  # time after which it is forgotten
 
 
 _NONE = np.empty(0, dtype=np.intp)
@@ -81,22 +76,17 @@ class MapEntry:
     """A beacon on the map.
 
     Attributes:
-        columns: pose, calibration, beacon and its wandering error, shape (k,).
-        wander: column of the wandering error; -1: none.
         way_m, time_s: of the vehicle when the wandering error was last looked at.
-        fresh: variance of what is new in the wandering error, in sigmas squared.
-        refused: readings in a row that were not believed.
-        on_trial: readings that must still agree with the one it joined by; 0: it is believed in.
     """
 
-    columns: Columns
+    columns: Columns  # pose, calibration, beacon and its wandering error, shape (k,)
     size: int
-    wander: int = -1
+    wander: int = -1  # column of the wandering error; -1: none
     way_m: float = 0.0
     time_s: float = 0.0
-    fresh: float = 1.0
-    refused: int = 0
-    on_trial: int = 0
+    fresh: float = 1.0  # variance of what is new in the wandering error, in sigmas squared
+    refused: int = 0  # readings in a row that were not believed
+    on_trial: int = 0  # readings that must still agree with the one it joined by; 0: it is believed in
 
 
 class BeaconMap(dict[BeaconId, MapEntry]):

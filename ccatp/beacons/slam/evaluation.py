@@ -23,7 +23,6 @@ class TrackEvaluation(NamedTuple):
     Attributes:
         nees: of the poses as they are, without alignment; positions alone if the truth has no headings; None where the
             first pose was not the truth's of that time.
-        errors_m: of each aligned position, shape (n,); NaN where there is no truth.
     """
 
     alignment: RigidMotion
@@ -33,7 +32,7 @@ class TrackEvaluation(NamedTuple):
     beacon_errors_m: Mapping[str, float]
     nees: Consistency | None
     nis: Consistency | None
-    errors_m: FloatArray
+    errors_m: FloatArray  # of each aligned position, shape (n,); NaN where there is no truth
 
 
 def judge(track: EstimatedPath, run: RecordedRun) -> TrackEvaluation:

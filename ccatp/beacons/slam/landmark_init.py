@@ -44,30 +44,20 @@ TRIAL = 2  # readings that must agree with the one that a beacon joined by: a mi
 
 
 class ReadingRecord(NamedTuple):
-    """A reading that waits.
-
-    Attributes:
-        place: block of the state that holds the place (x_m, y_m) where it was taken.
-    """
+    """A reading that waits."""
 
     reading: Reading
-    place: BlockId
+    place: BlockId  # block of the state that holds the place (x_m, y_m) where it was taken
     distance_m: float
 
 
 class Candidate(NamedTuple):
-    """A place where a beacon may be.
+    """A place where a beacon may be."""
 
-    Attributes:
-        mean: states of the beacon, shape (b,).
-        covariance: shape (b, b).
-        variances: of the readings' noise, larger where they look too far off, shape (m,).
-    """
-
-    mean: FloatArray
-    covariance: FloatArray
+    mean: FloatArray  # states of the beacon, shape (b,)
+    covariance: FloatArray  # shape (b, b)
     cost: float
-    variances: FloatArray
+    variances: FloatArray  # of the readings' noise, larger where they look too far off, shape (m,)
 
 
 PriorAt = Callable[[float, float], BeaconEstimate]
@@ -288,7 +278,6 @@ class LandmarkInitializer:
     one.
 
     Attributes:
-        delay: column of the odometry's delay; -1: none.
         waiting: beacons that are not on the map, with their readings and the candidates for their places.
     """
 
@@ -298,7 +287,7 @@ class LandmarkInitializer:
     clock: DeadReckoning
     levels: dict[str, NoiseLevel]
     shared: slice
-    delay: int
+    delay: int  # column of the odometry's delay; -1: none
     waiting: dict[BeaconId, PendingLandmark] = field(default_factory=dict)
 
     def forget(self, beacon: BeaconId) -> bool:

@@ -46,19 +46,12 @@ class Room:
 
 @dataclass(frozen=True, slots=True)
 class LevelFix:
-    """A position.
+    """A position."""
 
-    Attributes:
-        position_m: mean of the posterior, shape (2,).
-        covariance_m2: of the posterior, shape (2, 2).
-        points_m: the grid, shape (n, 2).
-        weights: posterior of the grid points, shape (n,).
-    """
-
-    position_m: FloatArray
-    covariance_m2: FloatArray
-    points_m: FloatArray
-    weights: FloatArray
+    position_m: FloatArray  # mean of the posterior, shape (2,)
+    covariance_m2: FloatArray  # of the posterior, shape (2, 2)
+    points_m: FloatArray  # the grid, shape (n, 2)
+    weights: FloatArray  # posterior of the grid points, shape (n,)
 
     def region(self, probability: float) -> npt.NDArray[np.bool_]:
         """The grid points of the smallest region that holds a probability, as a mask of shape (n,)."""

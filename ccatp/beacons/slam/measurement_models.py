@@ -12,17 +12,11 @@ _DB = 10.0 / log(10.0)
 
 
 class MeasurementRow(NamedTuple):
-    """One scalar of a reading.
+    """One scalar of a reading."""
 
-    Attributes:
-        expected: h(x), in the reading's unit.
-        pose: dh by x_m, y_m and heading_rad of the vehicle.
-        calibration: dh by range_scale and range_offset_m, as far as they are estimated.
-    """
-
-    expected: float
-    pose: tuple[float, float, float]
-    calibration: tuple[float, ...]
+    expected: float  # h(x), in the reading's unit
+    pose: tuple[float, float, float]  # dh by x_m, y_m and heading_rad of the vehicle
+    calibration: tuple[float, ...]  # dh by range_scale and range_offset_m, as far as they are estimated
     beacon: tuple[float, ...]
     variance: float
 

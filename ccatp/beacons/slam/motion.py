@@ -31,19 +31,14 @@ class VehiclePose(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Increment:
-    """Odometry of an interval: what the wheels, or wheels and gyroscope, say was travelled.
-
-    Attributes:
-        lateral_m: to the left; zero for wheels that do not slip.
-        guess_m2: variance of x and of y at its end, because the odometry was silent and the way is guessed.
-    """
+    """Odometry of an interval: what the wheels, or wheels and gyroscope, say was travelled."""
 
     time_s: float
     interval_s: float
     distance_m: float
     turn_rad: float
-    lateral_m: float = 0.0
-    guess_m2: float = 0.0
+    lateral_m: float = 0.0  # to the left; zero for wheels that do not slip
+    guess_m2: float = 0.0  # variance of x and of y at its end, because the odometry was silent and the way is guessed
     guess_rad2: float = 0.0
 
 
@@ -61,17 +56,11 @@ Odometry = Increment | Steering
 
 
 class MotionStep(NamedTuple):
-    """A prediction of the vehicle's states.
+    """A prediction of the vehicle's states."""
 
-    Attributes:
-        mean: shape (v,).
-        F: d(mean)/d(states before), shape (v, v); work space, as Q: it holds until the next step.
-        Q: covariance of what the odometry does not say, shape (v, v).
-    """
-
-    mean: FloatArray
-    F: FloatArray
-    Q: FloatArray
+    mean: FloatArray  # shape (v,)
+    F: FloatArray  # d(mean)/d(states before), shape (v, v); work space, as Q: it holds until the next step
+    Q: FloatArray  # covariance of what the odometry does not say, shape (v, v)
 
 
 def estimated(priors: Mapping[str, float]) -> tuple[tuple[str, ...], tuple[float, ...]]:
@@ -256,16 +245,11 @@ SLIVER = 0.2  # part of an interval that is not worth a step of its own: the pos
 
 
 class CarriedOdometry(NamedTuple):
-    """The pose at a reading's time: pose(t) = pose - back_s (vx, vy, turn).
-
-    Attributes:
-        velocity: vx_m_s, vy_m_s in the frame of the map, turn_rad_s.
-        back_s: the time it was carried back by; negative: forwards.
-    """
+    """The pose at a reading's time: pose(t) = pose - back_s (vx, vy, turn)."""
 
     pose: list[float]
-    velocity: tuple[float, float, float]
-    back_s: float
+    velocity: tuple[float, float, float]  # vx_m_s, vy_m_s in the frame of the map, turn_rad_s
+    back_s: float  # the time it was carried back by; negative: forwards
 
     def by_heading(self) -> tuple[float, float]:
         """Derivatives of x and y by the heading of the state."""

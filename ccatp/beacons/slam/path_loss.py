@@ -15,16 +15,11 @@ _NEPER_PER_DB = log(10.0) / 10.0
 
 @dataclass(frozen=True, slots=True)
 class PathLoss:
-    """z = P_ref - 10 eta log10(r / 1 m) + n, n ~ N(0, sigma^2): Hevrdejs and Knoll 2017, eq. 4; Auth and Hovey, 2.9.
+    """z = P_ref - 10 eta log10(r / 1 m) + n, n ~ N(0, sigma^2): Hevrdejs and Knoll 2017, eq. 4; Auth and Hovey, 2.9."""
 
-    Attributes:
-        reference_dbm: P_ref, at 1 m.
-        sigma_db: sigma.
-    """
-
-    reference_dbm: float
+    reference_dbm: float  # P_ref, at 1 m
     exponent: float
-    sigma_db: float
+    sigma_db: float  # sigma
 
     def level_dbm(self, range_m: float) -> float:
         """Expected level at a distance.
@@ -59,40 +54,27 @@ class PathLossError(ValueError):
 
 
 class LevelPair(NamedTuple):
-    """One reading.
-
-    Attributes:
-        place: where; readings without a place belong to the place of their distance.
-    """
+    """One reading."""
 
     distance_m: float
     level_dbm: float
-    place: tuple[float, float] | None = None
+    place: tuple[float, float] | None = None  # where; readings without a place belong to the place of their distance
 
 
 @dataclass(frozen=True, slots=True)
 class PathLossFit:
-    """Path loss z = P_ref - 10 eta log10(r) with the confidence of its two parameters.
-
-    Attributes:
-        covariance: of both, shape (2, 2).
-        sigma_db: spread of the levels of places about the line, whatever makes it.
-        white_sigma_db: of repeated readings at one place; NaN where nothing was repeated.
-        shadowing_sigma_db: of what stays with a place, sigma without the white part; NaN likewise.
-        residuals_db: mean level minus line of each place, shape (places,).
-        distances_m: of the places, shape (places,).
-    """
+    """Path loss z = P_ref - 10 eta log10(r) with the confidence of its two parameters."""
 
     reference_dbm: float
     exponent: float
-    covariance: FloatArray
-    sigma_db: float
-    white_sigma_db: float
-    shadowing_sigma_db: float
+    covariance: FloatArray  # of both, shape (2, 2)
+    sigma_db: float  # spread of the levels of places about the line, whatever makes it
+    white_sigma_db: float  # of repeated readings at one place; NaN where nothing was repeated
+    shadowing_sigma_db: float  # of what stays with a place, sigma without the white part; NaN likewise
     places: int
     readings: int
-    residuals_db: FloatArray
-    distances_m: FloatArray
+    residuals_db: FloatArray  # mean level minus line of each place, shape (places,)
+    distances_m: FloatArray  # of the places, shape (places,)
 
     @property
     def path_loss(self) -> PathLoss:

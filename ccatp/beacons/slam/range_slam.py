@@ -55,22 +55,14 @@ DELAY = "odometry_delay_s"
 
 
 class BeaconInnovation(NamedTuple):
-    """What one reading did.
-
-    Attributes:
-        residual: z - h(x) of the bearing, if there is one, and of the range or the strength, shape (m,).
-        nis: nu^T S^-1 nu, with the larger noise where a reading was beyond the knee.
-        size: m; a reading whose bearing is refused has its range left out.
-        accepted: False where it was refused; the state is then as before, or has taken the bearing alone.
-        surprise: minus twice its log-likelihood, up to a constant: sum of nis + ln S.
-    """
+    """What one reading did."""
 
     beacon: BeaconId
-    residual: FloatArray
-    nis: float
-    size: int
-    accepted: bool
-    surprise: float = 0.0
+    residual: FloatArray  # z - h(x) of the bearing, if there is one, and of the range or the strength, shape (m,)
+    nis: float  # nu^T S^-1 nu, with the larger noise where a reading was beyond the knee
+    size: int  # m; a reading whose bearing is refused has its range left out
+    accepted: bool  # False where it was refused; the state is then as before, or has taken the bearing alone
+    surprise: float = 0.0  # minus twice its log-likelihood, up to a constant: sum of nis + ln S
 
 
 class BeaconSlam:

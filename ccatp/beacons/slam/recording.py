@@ -14,39 +14,26 @@ class Steps(NamedTuple):
     """Dead reckoning, one step a row: step k carries the vehicle from times_s[k] to times_s[k + 1].
 
     Args:
-        times_s: where steps begin and end, s, shape (n + 1,), rising.
-        distance_m: forward travel within a step, m, shape (n,).
-        turn_rad: turn within a step, counter-clockwise, rad, shape (n,).
-        lateral_m: travel to the left within a step, m, shape (n,); zeros for wheels that do not slip.
         guess_m2: variance of the end of a step, along and across, where the odometry was silent and the way is guessed,
             m^2, shape (n,); 0.0: none is.
-        guess_rad2: the same of its turn, rad^2.
     """
 
-    times_s: FloatArray
-    distance_m: FloatArray
-    turn_rad: FloatArray
-    lateral_m: FloatArray
+    times_s: FloatArray  # where steps begin and end, s, shape (n + 1,), rising
+    distance_m: FloatArray  # forward travel within a step, m, shape (n,)
+    turn_rad: FloatArray  # turn within a step, counter-clockwise, rad, shape (n,)
+    lateral_m: FloatArray  # travel to the left within a step, m, shape (n,); zeros for wheels that do not slip
     guess_m2: FloatArray | float = 0.0
-    guess_rad2: FloatArray | float = 0.0
+    guess_rad2: FloatArray | float = 0.0  # the same of its turn, rad^2
 
 
 class Readings(NamedTuple):
-    """Readings of beacons, one a row, in order of time.
+    """Readings of beacons, one a row, in order of time."""
 
-    Args:
-        times_s: shape (m,), s, rising.
-        beacon: index into ``RecordedRun.beacon_ids``, shape (m,).
-        range_m: shape (m,), m; NaN where none was measured.
-        bearing_rad: from the heading, counter-clockwise, rad, shape (m,); NaN where none was measured.
-        rssi_dbm: signal strength, dBm, shape (m,); NaN where none was measured.
-    """
-
-    times_s: FloatArray
-    beacon: IntArray
-    range_m: FloatArray
-    bearing_rad: FloatArray
-    rssi_dbm: FloatArray
+    times_s: FloatArray  # shape (m,), s, rising
+    beacon: IntArray  # index into ``RecordedRun.beacon_ids``, shape (m,)
+    range_m: FloatArray  # shape (m,), m; NaN where none was measured
+    bearing_rad: FloatArray  # from the heading, counter-clockwise, rad, shape (m,); NaN where none was measured
+    rssi_dbm: FloatArray  # signal strength, dBm, shape (m,); NaN where none was measured
 
     def where(self, rows: npt.NDArray[np.bool_] | IntArray) -> "Readings":
         """Some of the readings."""
@@ -56,19 +43,12 @@ class Readings(NamedTuple):
 
 
 class ReferencePath(NamedTuple):
-    """Where the vehicle was, world frame.
+    """Where the vehicle was, world frame."""
 
-    Args:
-        times_s: shape (k,), s, rising.
-        x_m: shape (k,), m.
-        y_m: shape (k,), m.
-        heading_rad: shape (k,), rad, continuous; NaN where the reference saw positions alone.
-    """
-
-    times_s: FloatArray
-    x_m: FloatArray
-    y_m: FloatArray
-    heading_rad: FloatArray
+    times_s: FloatArray  # shape (k,), s, rising
+    x_m: FloatArray  # shape (k,), m
+    y_m: FloatArray  # shape (k,), m
+    heading_rad: FloatArray  # shape (k,), rad, continuous; NaN where the reference saw positions alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,14 +56,13 @@ class RecordedRun:
     """One vehicle's run among beacons.
 
     Attributes:
-        kind: format that it was read from: plaza, mrclam, labyrinth or csv.
         beacon_truth_m: surveyed x, y by name, world frame, m; beacons that were not surveyed are missing.
         first_pose: x_m, y_m, heading_rad at the first odometry time, world frame: the one thing that an estimator may
             take from the truth; the origin if there is no truth.
     """
 
     name: str
-    kind: str
+    kind: str  # format that it was read from: plaza, mrclam, labyrinth or csv
     steps: Steps
     readings: Readings
     beacon_ids: tuple[str, ...]
@@ -112,15 +91,11 @@ def dead_reckoned(steps: Steps, first_pose: tuple[float, float, float]) -> Float
 
 
 class BeaconFix(NamedTuple):
-    """A beacon on the map.
-
-    Attributes:
-        covariance: of x_m, y_m, shape (2, 2).
-    """
+    """A beacon on the map."""
 
     x_m: float
     y_m: float
-    covariance: FloatArray
+    covariance: FloatArray  # of x_m, y_m, shape (2, 2)
 
 
 class Calibrated(NamedTuple):
@@ -134,31 +109,25 @@ class EstimatedPath(NamedTuple):
     """An estimate of a run.
 
     Attributes:
-        times_s: shape (n,), rising.
-        poses: x_m, y_m, heading_rad, shape (n, 3).
-        covariances: of the poses, shape (n, 3, 3).
-        refused: how many readings were refused, or weigh less than a tenth.
         nis: normalised innovations squared of the readings that were used, shape (u,); none from a smoother.
-        nis_sizes: their degrees of freedom, shape (u,).
         update_s: wall time of each reading, the prediction to it included, s; of a smoother its whole time shared among
             the readings.
-        predict_s: wall time of each prediction, s; none from a smoother.
         scalar_s: wall time of each scalar of a reading of a beacon on the map, s, without prediction; none from a
             smoother.
     """
 
-    times_s: FloatArray
-    poses: FloatArray
-    covariances: FloatArray
+    times_s: FloatArray  # shape (n,), rising
+    poses: FloatArray  # x_m, y_m, heading_rad, shape (n, 3)
+    covariances: FloatArray  # of the poses, shape (n, 3, 3)
     beacons: Mapping[str, BeaconFix]
     calibration: Mapping[str, Calibrated]
-    refused: int
+    refused: int  # how many readings were refused, or weigh less than a tenth
     updates: int
     warnings: tuple[str, ...]
     nis: FloatArray = np.empty(0)
-    nis_sizes: FloatArray = np.empty(0)
+    nis_sizes: FloatArray = np.empty(0)  # their degrees of freedom, shape (u,)
     update_s: FloatArray = np.empty(0)
-    predict_s: FloatArray = np.empty(0)
+    predict_s: FloatArray = np.empty(0)  # wall time of each prediction, s; none from a smoother
     scalar_s: FloatArray = np.empty(0)
 
 
@@ -167,17 +136,12 @@ BeaconId = int | str
 
 @dataclass(frozen=True, slots=True)
 class RangeReading:
-    """A range to a beacon as it was measured, scale error, offset and all, with a direction where that is known.
-
-    Attributes:
-        range_m: NaN where the direction alone was read.
-        bearing_rad: from the vehicle's heading, counter-clockwise.
-    """
+    """A range to a beacon as it was measured, scale error, offset and all, with a direction where that is known."""
 
     time_s: float
     beacon: BeaconId
-    range_m: float
-    bearing_rad: float | None = None
+    range_m: float  # NaN where the direction alone was read
+    bearing_rad: float | None = None  # from the vehicle's heading, counter-clockwise
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,12 +162,7 @@ Reading = RangeReading | RssiReading
 
 
 class BeaconEstimate(NamedTuple):
-    """A beacon on the map, or what is known of it before its readings.
+    """A beacon on the map, or what is known of it before its readings."""
 
-    Attributes:
-        mean: x_m, y_m and what else is estimated of it (reference_dbm, exponent, shadowing), shape (b,).
-        covariance: shape (b, b).
-    """
-
-    mean: FloatArray
-    covariance: FloatArray
+    mean: FloatArray  # x_m, y_m and what else is estimated of it (reference_dbm, exponent, shadowing), shape (b,)
+    covariance: FloatArray  # shape (b, b)

@@ -21,30 +21,20 @@ Linearise = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 
 class RadioModel(NamedTuple):
-    """One reading, and where its states stand.
-
-    Attributes:
-        shadow: derivatives of the level by the shadowing states, which end the radio's block, shape (k,).
-        level_variance: of the level, dB^2.
-    """
+    """One reading, and where its states stand."""
 
     reading: RssiReading
     pose: int
-    shadow: FloatArray
-    level_variance: float
+    shadow: FloatArray  # derivatives of the level by the shadowing states, which end the radio's block, shape (k,)
+    level_variance: float  # of the level, dB^2
 
 
 class SignalRows(NamedTuple):
-    """Rows of an update.
-
-    Attributes:
-        linearise: state (n,) to residuals (m,) and derivatives (m, k).
-        variances: of the noise, shape (m,).
-    """
+    """Rows of an update."""
 
     columns: Columns
-    linearise: Linearise
-    variances: FloatArray
+    linearise: Linearise  # state (n,) to residuals (m,) and derivatives (m, k)
+    variances: FloatArray  # of the noise, shape (m,)
 
 
 def rows_of(sights: Sequence[RadioModel], radio: slice, path_loss: PathLoss, bearing_sigma_rad: float) -> SignalRows:
@@ -116,21 +106,13 @@ class SignalPrior(NamedTuple):
 
 
 class _Share(NamedTuple):
-    """What one radio says of the poses, once it is eliminated: y = H c + noise of covariance S.
+    """What one radio says of the poses, once it is eliminated: y = H c + noise of covariance S."""
 
-    Attributes:
-        H: by the poses, shape (m, p).
-        y: shape (m,).
-        root: lower Cholesky factor of S, shape (m, m).
-        gain: of the radio, by y - H c, shape (b, m).
-        covariance: of the radio for known poses, shape (b, b).
-    """
-
-    H: FloatArray
-    y: FloatArray
-    root: FloatArray
-    gain: FloatArray
-    covariance: FloatArray
+    H: FloatArray  # by the poses, shape (m, p)
+    y: FloatArray  # shape (m,)
+    root: FloatArray  # lower Cholesky factor of S, shape (m, m)
+    gain: FloatArray  # of the radio, by y - H c, shape (b, m)
+    covariance: FloatArray  # of the radio for known poses, shape (b, b)
 
 
 # Records, where their poses begin in a state, where the radio stands in it, to the rows of an update.
@@ -288,20 +270,14 @@ class MovingRadio:
 
     (Singer 1970 with the velocity in place of the acceleration). Shadowing at both ends decorrelates with the ways of
     both: b <- c b with c = exp(-(d_vehicle + d_radio) / L), d_radio = sqrt(2) s t, and var(b) += sigma^2 (1 - c^2).
-
-    Attributes:
-        speed_sigma_m_s: s.
-        course_time_s: T.
-        shadowing_sigma_db: sigma; 0: no such state.
-        room_m: lengths of its walls; it never leaves the room.
     """
 
     beacon: BeaconId
-    speed_sigma_m_s: float
-    course_time_s: float
-    shadowing_sigma_db: float
+    speed_sigma_m_s: float  # s
+    course_time_s: float  # T
+    shadowing_sigma_db: float  # sigma; 0: no such state
     shadowing_length_m: float
-    room_m: tuple[float, float]
+    room_m: tuple[float, float]  # lengths of its walls; it never leaves the room
 
     def join(self, engine: EkfSlam, bearing_rad: float) -> None:
         """Begin in the direction of a first bearing, anywhere in the room; the reading itself is to follow.

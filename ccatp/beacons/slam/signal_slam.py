@@ -38,16 +38,12 @@ _APART_RAD = pi / 2.0  # strongest readings further apart than this are two dire
 
 
 class ScanResult(NamedTuple):
-    """Level and bearing of one radio after a turn of the reflector.
-
-    Attributes:
-        bearing_rad: left of the heading; None where the scan has none.
-    """
+    """Level and bearing of one radio after a turn of the reflector."""
 
     beacon: str
     rssi_dbm: float
     readings: int
-    bearing_rad: float | None
+    bearing_rad: float | None  # left of the heading; None where the scan has none
     bearing_sigma_rad: float
     heard: float
 
