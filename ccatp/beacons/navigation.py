@@ -17,7 +17,7 @@ from ccatp.beacons.slam.signal_slam import ReflectorScan, SignalSlam
 from ccatp.config.beacon_models import CricketConfig, RadioConfig
 from ccatp.core import FloatArray, WheelSample
 from ccatp.filters.ekf_slam import EkfSlam, columns_of
-from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioScan
+from ccatp.links.beacon_messages import BeaconFrame, MoteBurst
 from ccatp.links.robot_messages import Sensors
 
 
@@ -154,10 +154,18 @@ class MeasurementReader:
             self._read_to_s = sensors.t
         steering = {sample.t_s: sample.steer_rad for sample in extras.steer}
         wheels = [self._interval(sample, steering) for sample in sensors.enc]
+        packets: tuple[tuple[str, float, float], ...] = ()
+        if (scan := extras.scan) is not None:
+            packets = tuple(
+                (beacon, index * scan.step, level)
+                for beacon, levels in scan.levels.items()
+                for index, level in enumerate(levels)
+                if level is not None
+            )
         return BeaconMeasurements(
             sensors.t,
             tuple(one for one in wheels if one is not None),
-            _packets(extras.scan),
+            packets,
             tuple((one.beacon, one.rssi_dbm, one.bearing_rad) for one in extras.radio),
             tuple(extras.distances),
             tuple(extras.motes),
@@ -175,17 +183,6 @@ class MeasurementReader:
         speed_m_s = 0.5 * radius_m * (right + left)
         rate_rad_s = radius_m * (right - left) / self._cfg.vehicle.track_m
         return odometry_of(self._cfg, sample.t_s, interval_s, speed_m_s, self._steer_rad, rate_rad_s)
-
-
-def _packets(scan: RadioScan | None) -> tuple[tuple[str, float, float], ...]:
-    if scan is None:
-        return ()
-    return tuple(
-        (beacon, index * scan.step, level)
-        for beacon, levels in scan.levels.items()
-        for index, level in enumerate(levels)
-        if level is not None
-    )
 
 
 Ellipse = tuple[float, float, float, float, float]

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -216,7 +215,7 @@ def _exchanged(table: "PlaceTable", exchange: str | None) -> "PlaceTable":
         known = ", ".join(table.places[0].levels_dbm)
         raise CalibrateError(f"--exchange {exchange}: is not two beacons of the data, which has {known}")
     new = {pair[0]: pair[1], pair[1]: pair[0]}
-    return replace(table, places=tuple(heard.renamed(new) for heard in table.places))
+    return table._replace(places=tuple(heard.renamed(new) for heard in table.places))
 
 
 def _fits(

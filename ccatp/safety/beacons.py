@@ -78,10 +78,6 @@ class ObstacleBuffer:
                     found = distance_m
         return found
 
-    def behind_m(self, course_rad: float, within_rad: float) -> float:
-        """The same, opposite to the course."""
-        return self.nearest_m(course_rad + pi, within_rad)
-
 
 _NORMAL, _NEAR, _ABORTED = EventCode
 
@@ -244,7 +240,7 @@ class BeaconSafetyRules:
         if emergency is not None and not emergency.forward:
             return emergency
         ahead_m = self._echoes.nearest_m(self._steer_rad, danger.ahead_rad)
-        behind_m = self._echoes.behind_m(self._steer_rad, danger.ahead_rad)
+        behind_m = self._echoes.nearest_m(self._steer_rad + pi, danger.ahead_rad)
         target_m = self._nearest_target_m()
         forward, reverse = ahead_m >= danger.obstacle_m and target_m >= danger.target_m, behind_m >= danger.obstacle_m
         if ahead_m < danger.obstacle_m:

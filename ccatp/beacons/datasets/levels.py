@@ -5,8 +5,8 @@ import re
 import zipfile
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from ccatp.beacons.datasets.tables import RadioDataError, read_text
 from ccatp.beacons.slam.level_fix import HeardPlace
@@ -64,8 +64,7 @@ _LEVEL_OF = re.compile(r"(?:rssi|level)[\s_]+(?P<node>\S+)", re.IGNORECASE)
 _LARGEST = 1e5  # of metres as of dBm
 
 
-@dataclass(frozen=True, slots=True)
-class LevelTable:
+class LevelTable(NamedTuple):
     """Pairs of distance and level, and what was odd about them."""
 
     name: str
@@ -73,8 +72,7 @@ class LevelTable:
     warnings: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class PlaceTable:
+class PlaceTable(NamedTuple):
     """Places with levels, and what was odd about them: see ``LevelTable``."""
 
     name: str

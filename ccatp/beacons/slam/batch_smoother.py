@@ -298,6 +298,8 @@ def _track(
         beacons[run.beacon_ids[k]] = BeaconFix(x_m, y_m, covariance[place, place])
     calibration = _calibration(problem, state, np.sqrt(np.diag(covariance)))
     priors = {SHOWN_AS.get(name, name): getattr(problem.priors, name) for name in SHARED}
+    names = {"range": "range_sigma_m", "bearing": "bearing_sigma_rad", "rssi": "rssi_sigma_db"}
+    ratios = {what: getattr(problem.radio, name) / getattr(first_radio, name) for what, name in names.items()}
     return EstimatedPath(
         times_s=times_s,
         poses=state.poses,
@@ -310,7 +312,11 @@ def _track(
         warnings=(
             *_warnings(run, start, found.converged),
             *beyond_priors(calibration, priors, run.kind),
-            *_noisy(problem.radio, first_radio),
+            *(
+                f"{what} readings are {ratio:.1f} times as noisy as assumed: beacons exchanged or moved on the way?"
+                for what, ratio in ratios.items()
+                if ratio > NOISY
+            ),
         ),
     )
 
@@ -328,13 +334,6 @@ def _calibration(problem: BatchProblem, state: BatchState, sigmas: FloatArray) -
                 value, sigma = 1.0 / scale - 1.0, sigma / scale**2
             found[SHOWN_AS.get(name, name)] = Calibrated(value, sigma)
     return found
-
-
-def _noisy(radio: RadioNoiseConfig, first: RadioNoiseConfig) -> Iterator[str]:
-    for what, name in (("range", "range_sigma_m"), ("bearing", "bearing_sigma_rad"), ("rssi", "rssi_sigma_db")):
-        ratio = getattr(radio, name) / getattr(first, name)
-        if ratio > NOISY:
-            yield f"{what} readings are {ratio:.1f} times as noisy as assumed: beacons exchanged or moved on the way?"
 
 
 def _warnings(run: RecordedRun, start: Start, converged: bool) -> Iterator[str]:

@@ -116,7 +116,13 @@ class PendingLandmark:
 
     def look(self, engine: EkfSlam, row_of: RowOf, shared: slice, prior_at: PriorAt, reach_m: float) -> None:
         """Look for the beacon: sets ``candidates``."""
-        problem = _problem(engine, self.records, row_of, shared, reach_m)
+        readings = [record.reading for record in self.records]
+        z = np.array([strength_of(reading) for reading in readings])
+        blocks = [engine.block(record.place) for record in self.records]
+        columns = columns_of(*blocks, shared)
+        P = engine.covariance[np.ix_(columns, columns)]
+        places = [engine.mean[block].tolist() for block in blocks]
+        problem = _Problem(readings, z, places, engine.mean[shared].tolist(), P, row_of, reach_m)
         starts: list[BeaconEstimate] = []
         # The last distance may have gone round a corner: the usual one is tried, too.
         for radius_m in {reach_m, median([record.distance_m for record in self.records])}:
@@ -245,16 +251,6 @@ def _weighed(e: FloatArray, S: FloatArray, R: FloatArray, step: int) -> tuple[Fl
     limit = KNEE * max(1.0, MEDIAN_TO_SIGMA * float(np.median(sigmas)))
     is_out = sigmas > limit
     return R + np.where(is_out, OUT * e * e, 0.0), limit**2 * float(is_out.sum())
-
-
-def _problem(engine: EkfSlam, records: list[ReadingRecord], row_of: RowOf, shared: slice, reach_m: float) -> _Problem:
-    readings = [record.reading for record in records]
-    z = np.array([strength_of(r) for r in readings])
-    blocks = [engine.block(record.place) for record in records]
-    columns = columns_of(*blocks, shared)
-    P = engine.covariance[np.ix_(columns, columns)]
-    places = [engine.mean[block].tolist() for block in blocks]
-    return _Problem(readings, z, places, engine.mean[shared].tolist(), P, row_of, reach_m)
 
 
 def derivatives(row: MeasurementRow, at: CarriedOdometry, *, delayed: bool) -> list[float]:
