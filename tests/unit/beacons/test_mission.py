@@ -144,9 +144,9 @@ def test_echoes_stay_where_they_are_while_the_robot_moves() -> None:
     assert memory.nearest_m(0.0, 0.1) == pytest.approx(0.3)
     memory.roll(0.0, 0.0, pi)  # turned round: it is behind now
     assert memory.nearest_m(0.0, 0.1) == inf
-    assert memory.behind_m(0.0, 0.1) == pytest.approx(0.3)
+    assert memory.nearest_m(pi, 0.1) == pytest.approx(0.3)
     memory.see(20.5, (3.0, 3.0))
-    assert memory.behind_m(0.0, 0.1) == inf  # forgotten
+    assert memory.nearest_m(pi, 0.1) == inf  # forgotten
 
 
 def test_the_course_of_a_steered_vehicle_is_where_its_front_wheel_points() -> None:
