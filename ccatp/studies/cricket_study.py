@@ -117,7 +117,7 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     case, runs = CASES[str(factors["case"])], [outcome.values for outcome in outcomes]
     rms = np.array([run["rms_m"] for run in runs])
     traces = np.array([outcome.arrays["trace_m"] for outcome in outcomes])
-    laid = [run["phase1_rms_m"] for run in runs if run["phase1_rms_m"] is not None]
+    phase1_m = [run["phase1_rms_m"] for run in runs if run["phase1_rms_m"] is not None]
     bound_m = next((run["bound_m"] for run in runs if run["bound_m"] is not None), None)
     total = float(np.sqrt(np.mean(rms**2)))
     shown_m = float(np.median(traces[:, SHOWN])) if traces.shape[1] > SHOWN else None
@@ -126,7 +126,7 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
         "method": case.method,
         "rms_m": percentiles(rms.tolist()),
         "rms_of_all_m": total,
-        "phase1_rms_m": float(np.median(laid)) if laid else None,
+        "phase1_rms_m": float(np.median(phase1_m)) if phase1_m else None,
         "rms_at_30_m": shown_m,
         # The paper's error is of a coordinate, root(mean e^2) over all of them; ours of a place.
         "coordinate_rms_at_30_m": None if shown_m is None else float(shown_m / np.sqrt(2.0)),

@@ -73,7 +73,7 @@ class BeaconSilWorld:
         self.mission, self.danger = BeaconMission(cfg), BeaconSafetyRules(cfg)
         self.found = BeaconSilResult(truth=[self.robot.truth_row()])
         self._reader = MeasurementReader(cfg)
-        self._book = BeaconSummary(beacon_facts(cfg, is_sim=True))
+        self._summary = BeaconSummary(beacon_facts(cfg, is_sim=True))
         self._estimate: EstimateMessage | None = None
         self._signal = ""
         self.robot.join_controller()
@@ -97,7 +97,7 @@ class BeaconSilWorld:
         drive = HALT if self.mission.state is DONE else drive
         self._note(sensors, verdict, drive)
         for arrival in self.mission.arrivals[before:]:
-            self._book.add_reached(Reached(sensors.seq, arrival.belief.ellipse))
+            self._summary.add_reached(Reached(sensors.seq, arrival.belief.ellipse))
         if not self.is_over:
             right, left, steer = wheel_rates(drive, self._cfg)
             self.robot.permit(sensors.seq + 1, verdict.forward, verdict.reverse, verdict.turn)
@@ -108,7 +108,7 @@ class BeaconSilWorld:
     def _note(self, sensors: Sensors, verdict: Verdict, drive: SteeringCommand) -> None:
         found, mission = self.found, self.mission
         if verdict.signal and verdict.signal != self._signal:
-            self._book.add_danger(verdict.signal)
+            self._summary.add_danger(verdict.signal)
         self._signal = verdict.signal
         if is_estimate_due(sensors.seq):
             belief = mission.navigator.belief
@@ -125,15 +125,17 @@ class BeaconSilWorld:
 
     def result(self) -> BeaconSilResult:
         """The result at the end."""
-        found, mission, book = self.found, self.mission, self._book
+        found, mission, summary = self.found, self.mission, self._summary
         found.outcome, found.cause = str(mission.outcome), mission.cause
         score = mission.navigator.score
-        book.add_track(found.track)
-        book.add_truth(found.truth)
-        book.set_places(self.robot.truth_preface()[1].places)
-        book.set_map(mission.navigator.beacons, (score.nis_sum, score.nis_size, score.refused), mission.navigator.notes)
-        book.set_mission(found.times_s[-1], found.outcome, found.cause)
-        found.summary = book.build(0.0)
+        summary.add_track(found.track)
+        summary.add_truth(found.truth)
+        summary.set_places(self.robot.truth_preface()[1].places)
+        summary.set_map(
+            mission.navigator.beacons, (score.nis_sum, score.nis_size, score.refused), mission.navigator.notes
+        )
+        summary.set_mission(found.times_s[-1], found.outcome, found.cause)
+        found.summary = summary.build(0.0)
         return found
 
 

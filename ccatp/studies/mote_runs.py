@@ -78,7 +78,7 @@ def simulate_field(cfg: CricketConfig, seed: int) -> SimulatedField:
     first = tuple(reading(pulse) for pulse in field.listen(plan.phase1_pairs, cfg.ranging.repeats, rng))
     pairs = [pair for pair in plan.phase2_pairs if field.receives(*pair)]
     if not pairs:
-        raise MappingError("no pair of phase 2 hears each other; enlarge cricket.transducer or turn the motes")
+        raise MappingError("no pair of phase 2 receives each other; enlarge cricket.transducer or turn the motes")
     second = []
     for pulse in field.listen(list(islice(cycle(pairs), cfg.phase2.max_updates)), 1, rng):
         found = reading(pulse)
@@ -205,9 +205,9 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
     )
     motes = list(plan.mapped)
     true_m = field.true_m[motes]
-    laid = None
+    phase1_m = None
     if first is not None and not set(motes) & set(first.unplaced):
-        laid = aligned_rms_m(first.positions_m[motes], true_m, mirrors=not plan.anchors)
+        phase1_m = aligned_rms_m(first.positions_m[motes], true_m, mirrors=not plan.anchors)
     positions, covariance = _in_field(field, found)
     positions, covariance = positions[motes], _block(covariance, motes, plan.dimension)
     error_m = aligned_rms_m(positions, true_m, mirrors=not plan.bodies)
@@ -222,10 +222,10 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
         covariance_m2=covariance,
         true_m=true_m,
         rms_m=error_m,
-        phase1_rms_m=laid,
+        phase1_rms_m=phase1_m,
         expected_rms_m=expected_m,
         iterations=found.iterations,
-        trace_m=np.array([error_m if laid is None else laid, error_m]),
+        trace_m=np.array([error_m if phase1_m is None else phase1_m, error_m]),
         expected_trace_m=np.array([expected_m]),
         is_aligned=True,
         offset_m=found.offset_m,
@@ -348,13 +348,13 @@ def run_campaign(
 def campaign_data(campaign: MoteCampaign) -> dict[str, Any]:
     """What ``ccatp radio map --json`` prints."""
     runs, outlook = campaign.runs, campaign.outlook
-    laid = [run.phase1_rms_m for run in runs if run.phase1_rms_m is not None]
+    phase1_m = [run.phase1_rms_m for run in runs if run.phase1_rms_m is not None]
     return {
         "rms_m": percentiles([run.rms_m for run in runs]),
         "crlb_m": outlook.bound_rms_m,
         "rank_deficiency": outlook.freedom.deficiency,
         "fold_over_risk": not outlook.folds.is_unique,
-        "phase1_rms_m": float(np.median(laid)) if laid else None,
+        "phase1_rms_m": float(np.median(phase1_m)) if phase1_m else None,
         "iterations": int(np.median([run.iterations for run in runs])),
         "method": campaign.method,
         "seeds": len(runs),

@@ -261,7 +261,7 @@ class SilRun:
         self.monitor = DangerMonitor(self.mirror, cfg.robot, cfg.danger, cfg.health)
         self.predictor = CommandPredictor(cfg.robot.wheel_lag_s, self.robot.frame_s)
         self.laser = SilLaser(cfg, self.mirror, self.robot)
-        self.book = SilTrace(parts, with_track=with_track)
+        self.trace = SilTrace(parts, with_track=with_track)
         self.states_s: defaultdict[MissionState, float] = defaultdict(float)
         self.notices: list[str] = []
         self._published: EstimateMessage | None = None
@@ -302,7 +302,7 @@ class SilRun:
 
     def _note_truth(self) -> None:
         robot = self.robot
-        self.book.note_truth(robot.world.truth_row(robot.seq, robot.t_s))
+        self.trace.note_truth(robot.world.truth_row(robot.seq, robot.t_s))
 
     # -- a frame, as in daemon.frame_service and daemon.danger_loop ---------------------------------------------------
 
@@ -313,7 +313,7 @@ class SilRun:
         verdict = self.monitor.step(frame, self._published)
         if verdict.code is not self._code:
             self._code = verdict.code
-            self.book.builder.add_verdict_event(seq, verdict.code)
+            self.trace.builder.add_verdict_event(seq, verdict.code)
         imu, enc = ((), as_standing(frame.enc)) if mission.ignores_motion else (frame.imu, frame.enc)
         localizer.step(t_s, imu, enc, frame.edge, frame.gravity)
         if localizer.hold_requested:
@@ -331,7 +331,7 @@ class SilRun:
         if order.at_rest:
             localizer.rest()
             if order.arrived is not None:
-                self.book.builder.add_arrival(order.arrived, seq)
+                self.trace.builder.add_arrival(order.arrived, seq)
         state = mission.state
         if state is not self._state:
             self._note_state(state)
@@ -366,7 +366,7 @@ class SilRun:
         self._state, self._state_s = state, self.states_s[state]
 
     def _publish(self, seq: int, t_s: float, pose: PanelPose, state: MissionState) -> None:
-        self.book.note_estimate(seq, t_s, pose)
+        self.trace.note_estimate(seq, t_s, pose)
         if is_estimate_due(seq):
             deck = self.localizer.deck_pose
             self._published = EstimateMessage(
@@ -382,7 +382,7 @@ class SilRun:
         point = mission.measuring_point
         row = None
         if point is not None:
-            row = laser.stop_row(frame.t, point, self.book.truth_at(frame.seq), localizer)
+            row = laser.stop_row(frame.t, point, self.trace.truth_at(frame.seq), localizer)
         try:
             fix = laser.fix(frame.t, localizer.deck_pose)
             self._fuse(fix)
@@ -411,13 +411,13 @@ class SilRun:
         mission, misalignments = self.mission, self.robot.world.misalignments
         self._note_state(self._state)
         return SilResult(
-            summary=self.book.summary(mission, mission_time_s, self.laser.panel_fits(), misalignments),
+            summary=self.trace.summary(mission, mission_time_s, self.laser.panel_fits(), misalignments),
             stops=self.laser.stops,
             corrections=mission.corrections,
             counts=dict(self.localizer.counts),
             outcome=str(mission.outcome if mission.state is DONE else SurveyOutcome.STOPPED),
             cause=mission.cause,
             states_s={str(state): time_s for state, time_s in self.states_s.items()},
-            track=self.book.track(),
+            track=self.trace.track(),
             notices=self.notices,
         )

@@ -280,7 +280,7 @@ def test_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_fields_that_cannot_be_mapped(capsys: pytest.CaptureFixture[str]) -> None:
     deaf = ("--set", "cricket.transducer.reach_m=[1,1,1,1,1]")
-    assert "no pair of phase 2 hears each other" in refusal(capsys, "--method", "ekf", *deaf)
+    assert "no pair of phase 2 receives each other" in refusal(capsys, "--method", "ekf", *deaf)
     narrow = ("--set", "cricket.phase1.max_dop=5")
     assert "N2-1 from N1-1, N1-2, N1-3: dilution of precision" in refusal(capsys, "--method", "ekf", *narrow)
     apart = ("--set", "cricket.layout=random", "--set", "cricket.random.count=30", "--set", "cricket.random.reach_m=9")

@@ -1,4 +1,4 @@
-"""``ccatp study``: what reaches the campaigns, what the shell is told."""
+"""``ccatp study``: what reaches the campaigns, what the shell gets."""
 
 import json
 from pathlib import Path
@@ -25,12 +25,12 @@ def analysis(cfg: Any, out: Path) -> dict[str, Any]:
 def test_json_is_alone_on_standard_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert main(["study", "toy", "--runs", "2", "--workers", "1", "--seed", "5", "--out", str(out), "--json"]) == 0
-    told = capsys.readouterr()
-    result = json.loads(told.out)
+    shown = capsys.readouterr()
+    result = json.loads(shown.out)
     assert [cell["mean"] for cell in result["cells"]] == pytest.approx([0.05 * 5.5, 0.1 * 5.5])
     assert result["settings"] == {"run.seed": 5}
-    assert "ccatp: study toy: 4 jobs to do" in told.err
-    assert told.err.splitlines()[-1] == f"ccatp: study toy: all 4 jobs are done; results are in {out}"
+    assert "ccatp: study toy: 4 jobs to do" in shown.err
+    assert shown.err.splitlines()[-1] == f"ccatp: study toy: all 4 jobs are done; results are in {out}"
     assert (out / "figure.txt").exists()
 
 
@@ -50,8 +50,8 @@ def test_without_json_the_table_is_shown(
 def test_shards_report_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = ["study", "toy", "--workers", "1", "--out"]
     assert main([*args, str(tmp_path / "a"), "--shard", "1/2"]) == 0
-    told = capsys.readouterr().err
-    assert "3 of 6 jobs are done; the other shards, or the same command without --shard, do the 3 that are m" in told
+    shown = capsys.readouterr().err
+    assert "3 of 6 jobs are done; the other shards, or the same command without --shard, do the 3 that are m" in shown
     assert main([*args, str(tmp_path / "b"), "--from", str(tmp_path / "a")]) == 0
     assert "3 jobs to do, 3 done before" in capsys.readouterr().err
 
@@ -68,9 +68,9 @@ def test_another_configuration_is_refused_with_one_line(tmp_path: Path, capsys: 
 def test_an_analysis_takes_what_every_study_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = ["study", "one", "--out", str(tmp_path / "a"), "--set", "limits.v_max_m_s=0.05"]
     assert main([*args, "--runs", "3", "--panels", "1", "--json"]) == 0
-    told = capsys.readouterr()
-    assert json.loads(told.out)["study"] == "one"
-    assert told.err == "ccatp: study one is one analysis: --runs and --workers change nothing\n"
+    shown = capsys.readouterr()
+    assert json.loads(shown.out)["study"] == "one"
+    assert shown.err == "ccatp: study one is one analysis: --runs and --workers change nothing\n"
     assert main(args) == 0
     assert capsys.readouterr().out == "0.05\n"
 
@@ -111,6 +111,6 @@ def test_an_unknown_study_is_one_line(
 
 def test_help_lists_the_studies(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["study", "--help"]) == 0
-    told = capsys.readouterr().out
+    shown = capsys.readouterr().out
     for name in ("thesis", "filters", "time", "sensitivity", "ablation", "danger", "loops"):
-        assert f"  {name} " in told
+        assert f"  {name} " in shown

@@ -57,8 +57,8 @@ class RecordingRun(SilRun):
         self.log = (run_dir / "log.jsonl").open("a", encoding="utf-8")
         self.track: list[tuple[Any, ...]] = []
         self.truth: list[tuple[Any, ...]] = []
-        self.note_arrival = self.book.builder.add_arrival
-        self.book.builder.add_arrival = self.arrive  # type: ignore[method-assign]
+        self.note_arrival = self.trace.builder.add_arrival
+        self.trace.builder.add_arrival = self.arrive  # type: ignore[method-assign]
         self.seq, self.t_s, self.seen = 0, 0.0, MissionState.IDLE
 
     def leave(self) -> Path:
@@ -104,7 +104,7 @@ class RecordingRun(SilRun):
 
     def _note_truth(self) -> None:
         super()._note_truth()
-        self.truth.append(tuple(self.book.truth_at(self.robot.seq)))
+        self.truth.append(tuple(self.trace.truth_at(self.robot.seq)))
 
     def _publish(self, seq: int, t_s: float, pose: PanelPose, state: MissionState) -> None:
         super()._publish(seq, t_s, pose, state)

@@ -1,4 +1,4 @@
-"""The studies of self-mapping: published figures on few seeds, files, a field that hears too little, sizes."""
+"""The studies of self-mapping: published figures on few seeds, files, a field that receives too little, sizes."""
 
 from pathlib import Path
 

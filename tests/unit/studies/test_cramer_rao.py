@@ -160,8 +160,8 @@ def hard() -> tuple[Config, TrueRecord, Mapping[str, int]]:
     cfg = load_config(
         overrides={"run.mirror": "thesis-m1", "run.world": "hard", "run.filter": "ekf", "run.panels": 1, "run.seed": 3}
     )
-    rehearsal, record = rehearse_recorded(cfg)
-    return cfg, record, rehearsal.counts
+    found, record = rehearse_recorded(cfg)
+    return cfg, record, found.counts
 
 
 def test_a_record_holds_the_whole_run(hard: tuple[Config, TrueRecord, Mapping[str, int]]) -> None:

@@ -50,7 +50,7 @@ def judged(pattern: str) -> bool:
     [
         ("1" + "0" * 100, False),
         ("1" + "0" * 102, True),
-        ("1" + "0" * 90 + "1" + "0" * 90, False),  # back on in between: the time begins anew
+        ("1" + "0" * 90 + "1" + "0" * 90, False),  # back on in between: the time begins again
     ],
 )
 def test_the_thesis_counts_the_time_that_one_sensor_is_off(pattern: str, is_edge: bool) -> None:

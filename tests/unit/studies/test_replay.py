@@ -70,7 +70,7 @@ def test_the_smoother_knows_from_the_first_frame_on_what_the_fix_showed(name: st
     np.testing.assert_allclose(found.feet[0], (100, *wanted[0]), rtol=0.0, atol=1e-9)  # Newton's rest
     before, after = found.trace.pose[:100, :2], found.smoothed.pose[:, :2]
     assert np.linalg.norm(before - wanted[:100], axis=1).min() > 3e-3
-    # 0.1 mm: a start known to 2 mm and a fix known to 10 um, from a robot of which nobody says at first that it stands.
+    # 0.1 mm: a start known to 2 mm and a fix known to 10 um, from a robot that is not yet known to stand.
     np.testing.assert_allclose(after, wanted, atol=1e-4)
     assert found.smoothed.covariance is not None
     assert np.sqrt(found.smoothed.covariance[0, 0, 0]) < 1e-4
