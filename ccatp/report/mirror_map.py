@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil, cos, sin
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -276,12 +276,8 @@ def draw_plan(mirror: Mirror, plan: SurveyPlan, out: Path) -> None:
 # -- surface ----------------------------------------------------------------------------------------------------------
 
 
-class PanelCells(NamedTuple):
-    """Values in a grid of cells over a panel: edges along deck x and y, shape (c + 1,), values (m), shape (c, c)."""
-
-    x_m: FloatArray
-    y_m: FloatArray
-    values_m: FloatArray
+# Edges of the cells of a panel along deck x and y (m), shape (c + 1,), and their values (m), shape (c, c).
+PanelCells = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def surface_figure(
@@ -295,7 +291,7 @@ def surface_figure(
     wide = is_wide(width_px)
     figure, axes = new_mirror_map(mirror, width_px, title, subtitle)
     spanned = panels if scaled_as is None else scaled_as
-    cells = [PanelCells(*on_grid_m(mirror, panel, _CELLS_WIDE if wide else _CELLS_NARROW)) for panel in panels]
+    cells = [on_grid_m(mirror, panel, _CELLS_WIDE if wide else _CELLS_NARROW) for panel in panels]
     drawn = _draw_cells(axes, cells, [panel.deviations.values_m[panel.is_kept] for panel in spanned])
     size = 20.0 if wide else 4.0
     kept = [np.column_stack([p.deviations.deck_m, p.deviations.values_m * _MICRO])[p.is_kept] for p in panels]
@@ -327,8 +323,8 @@ def change_figure(
     for panel in after:
         if panel.panel in earlier:
             x, y, later = on_grid_m(mirror, panel, _CELLS_NARROW)
-            cells.append(PanelCells(x, y, later - on_grid_m(mirror, earlier[panel.panel], _CELLS_NARROW)[2]))
-    drawn = _draw_cells(axes, cells, [one.values_m.ravel() for one in cells])
+            cells.append((x, y, later - on_grid_m(mirror, earlier[panel.panel], _CELLS_NARROW)[2]))
+    drawn = _draw_cells(axes, cells, [values_m.ravel() for _, _, values_m in cells])
     _add_bar(axes, drawn, "change along the normal, µm (> 0 towards the robot)", width_px, extend="both")
     return figure
 

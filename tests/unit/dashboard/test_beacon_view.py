@@ -117,13 +117,6 @@ def test_the_error_against_the_truth_is_the_worst_of_each_second(view: BeaconVie
     assert view.news(0.0)["series"]["error"] == [(1.0, pytest.approx(10.0), pytest.approx(60.0))]
 
 
-def test_without_a_truth_three_sigma_alone() -> None:
-    view = BeaconView(config(), is_sim=False)
-    rows: Any = [(k, 0.1 * k, 1.0, 2.0, 0.0, 4e-4, 0.0, 1e-4, 0.0, 0.0, 1e-4, 1.0, 2.0) for k in (10, 20)]
-    view.receive(BeaconTrack(seq=20, t_s=2.0, rows=rows), 0.0)
-    assert view.news(0.0)["series"]["error"] == [(1.0, None, 60.0), (2.0, None, 60.0)]
-
-
 def test_the_scene_without_what_the_page_draws_itself(view: BeaconView) -> None:
     kinds = ("robot", "trail", "waypoint", "beacon", "obstacle")
     view.receive(BeaconPlaces(seq=0, t_s=0.0, places={"a": (0.0, 1.0)}), 0.0)
