@@ -20,7 +20,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put each test into one of the queues."""
     for item in items:
         if Path(__file__).parent in item.path.parents and item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group("processes-2" if item.path.stem in SECOND else "processes-1"))
+            # Who reads the recorded run waits for it: all of them in the queue that records it.
+            is_second = item.path.stem in SECOND or "recorded_run" in getattr(item, "fixturenames", ())
+            item.add_marker(pytest.mark.xdist_group("processes-2" if is_second else "processes-1"))
 
 
 @pytest.fixture
