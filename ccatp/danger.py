@@ -250,23 +250,25 @@ class DangerMonitor:
         if not verdict.cause or not is_kept or (holds and top.severity > Severity.PAUSE):
             shown = top.cause, top.signal, float(top.value), float(top.limit)
         return Verdict(
-            verdict.seq, verdict.t_s, verdict.code, *shown, forward, reverse, turn, verdict.off,
-            top.severity, any(finding.full_fans for finding in found),
-        )  # fmt: skip
+            *(verdict.seq, verdict.t_s, verdict.code, *shown, forward, reverse, turn, verdict.off),
+            severity=top.severity,
+            full_fans=any(finding.full_fans for finding in found),
+        )
 
     def stale(self, seq: int, t_s: float) -> Verdict:
         """The verdict when no sensors frame came for ``stale_after_s`` after frame ``seq``: nothing permitted."""
         limit_s = self._stale_after_s
-        return self._denied(seq, t_s, _missing("sensors", "no sensors frame", limit_s, limit_s))
+        return self.latch.told(self._denied(seq, t_s, _lacking("sensors", "no sensors frame", limit_s, limit_s)))
 
     def garbled(self, seq: int, t_s: float, at_s: float) -> Verdict | None:
         """A line after frame ``seq`` was no frame. The verdict where there were too many: nothing permitted."""
         if self._board is None or not self._garbled.add(at_s):
             return None
-        return self._denied(seq, t_s, self._board.garbled())
+        return self.latch.told(self._denied(seq, t_s, self._board.garbled()))
 
     def _denied(self, seq: int, t_s: float, finding: MonitorFinding) -> Verdict:
-        return self.latch.told(_verdict(seq, t_s, self.code, finding))
+        shown = finding.cause, finding.signal, finding.value, finding.limit
+        return _verdict(seq, t_s, self.code, shown, severity=finding.severity)
 
     def _is_fresh(self, estimate: EstimateMessage, t_s: float) -> bool:
         # Written so that a time that is not a number is not fresh.
@@ -277,24 +279,24 @@ class DangerMonitor:
     def _missing(self, t_s: float, estimate: EstimateMessage | None, is_known: bool) -> MonitorFinding | None:
         limit_s = self._stale_after_s
         if self._edge_t_s is None:
-            return _missing("edge", "no edge samples", limit_s, limit_s)
+            return _lacking("edge", "no edge samples", limit_s, limit_s)
         age_s = abs(t_s - self._edge_t_s)
         if not age_s <= limit_s:
-            return _missing("edge", "edge samples stale", age_s, limit_s)
+            return _lacking("edge", "edge samples stale", age_s, limit_s)
         silent_s = self._edges.track.silence_s(t_s)
         if silent_s > 0.0:
-            return _missing("enc", "encoder samples stale", silent_s, limit_s)
+            return _lacking("enc", "encoder samples stale", silent_s, limit_s)
         return None if is_known else self._estimate_missing(t_s, estimate)
 
     def _estimate_missing(self, t_s: float, estimate: EstimateMessage | None) -> MonitorFinding:
         # The values go out as JSON: an age that is not finite is no number there.
         limit_s = self._estimate_stale_after_s
         if estimate is None:
-            return _missing("estimate", "no estimate", limit_s, limit_s)
+            return _lacking("estimate", "no estimate", limit_s, limit_s)
         age_s = abs(t_s - estimate.t_s)
         if isfinite(age_s) and age_s > limit_s:
-            return _missing("estimate", "estimate stale", age_s, limit_s)
-        return _missing("estimate", "estimate not finite", limit_s, limit_s)
+            return _lacking("estimate", "estimate stale", age_s, limit_s)
+        return _lacking("estimate", "estimate not finite", limit_s, limit_s)
 
     # -- arbitration ----------------------------------------------------------------------------------------------
 
@@ -303,13 +305,12 @@ class DangerMonitor:
 
     def _arbitrate(self, seq: int, t_s: float, missing: MonitorFinding | None) -> Verdict:
         if self._edges.is_lifted:
-            lifted = _missing("edge", "lifted or fallen", 4.0, 3.0, Severity.NONE)
-            return _verdict(seq, t_s, EventCode.NEAR_EDGE, lifted, off=EVERYWHERE)
+            return _verdict(seq, t_s, EventCode.NEAR_EDGE, ("lifted or fallen", "edge", 4.0, 3.0), off=EVERYWHERE)
         declared = self._declared()
         if declared is not None or self._origin.direction:
             return self._edge_verdict(seq, t_s, declared, missing)
         if missing is not None:
-            return _verdict(seq, t_s, self.code, missing)
+            return self._denied(seq, t_s, missing)
         newest = self.latch.newest
         if newest is None:
             return Verdict(seq, t_s, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
@@ -334,22 +335,20 @@ class DangerMonitor:
         permits = (forward, reverse, turn)
         if missing is not None:
             cause, permits = f"{cause}; {missing.cause}", (False, False, False)
-        why = _missing(signal, cause, value, limit, Severity.NONE)
-        return _verdict(seq, t_s, EventCode.NEAR_EDGE, why, permits, off)
+        return _verdict(seq, t_s, EventCode.NEAR_EDGE, (cause, signal, value, limit), permits, off)
 
 
-def _missing(
-    signal: str, cause: str, value: float, limit: float, severity: Severity = Severity.PAUSE
-) -> MonitorFinding:
-    return MonitorFinding(severity, cause, signal, value, limit)
+def _lacking(signal: str, cause: str, value: float, limit: float) -> MonitorFinding:
+    return MonitorFinding(Severity.PAUSE, cause, signal, value, limit)
 
 
 def _verdict(
     seq: int,
     t_s: float,
     code: EventCode,
-    why: MonitorFinding,
+    shown: tuple[str, str, float, float],
     permits: tuple[bool, bool, bool] = (False, False, False),
     off: tuple[bool, bool, bool, bool] = (False, False, False, False),
+    severity: Severity = Severity.NONE,
 ) -> Verdict:
-    return Verdict(seq, t_s, code, why.cause, why.signal, why.value, why.limit, *permits, off, why.severity)
+    return Verdict(seq, t_s, code, *shown, *permits, off, severity)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from math import inf
 
 from ccatp.config.models import LinkConfig, RobotConfig
-from ccatp.control.prediction import CommandPredictor
+from ccatp.control.tracker import CommandPredictor
 from ccatp.core import twist_of
 from ccatp.errors import DaemonUnreachableError
 from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout, read_key

@@ -11,12 +11,11 @@ from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, GravitySample, Imu
 from ccatp.estimation.fixes import FixGated, check_fix, deck_foot
 from ccatp.estimation.localizer_base import LocalizerBase, PanelFrame
 from ccatp.estimation.measurements import NoiseFloor, ZeroVelocityDetector
-from ccatp.estimation.odometry import PosePredictor, Preintegrator
+from ccatp.estimation.odometry import PosePredictor, Preintegrator, WheelAngle
 from ccatp.estimation.sample_validation import LONGEST_GAP_S, MAX_FRAME_STEP_S
 from ccatp.estimation.seams import EdgeScanner
 from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import PSI, W
-from ccatp.estimation.wheel_angles import WheelAngle
 from ccatp.filters.base import Filter, FilterDiverged, Innovation
 from ccatp.mirror.mirror import Mirror
 

@@ -10,8 +10,15 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety.escalation import FindingLatch, MonitorFinding
-from ccatp.safety.power_monitors import BatteryMonitor, FanMonitor, OwnFaults
-from ccatp.safety.sensor_monitors import FlickerMonitor, LatencyMonitor, RateMonitor, SeamMonitor
+from ccatp.safety.sensor_monitors import (
+    BatteryMonitor,
+    FanMonitor,
+    FlickerMonitor,
+    LatencyMonitor,
+    OwnFaults,
+    RateMonitor,
+    SeamMonitor,
+)
 from ccatp.safety.wheel_monitors import LATE_S, GyroscopeBias, WheelMonitor, YawMonitor, imu_finding
 
 _STANDS_RAD_S = 0.02  # a wheel's mean over a frame below which it stands: 0.6 mm/s

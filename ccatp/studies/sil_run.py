@@ -14,7 +14,7 @@ import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.control.motion_checks import as_standing
-from ccatp.control.prediction import CommandPredictor
+from ccatp.control.tracker import CommandPredictor
 from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelId, PanelPose, PointId, difference, twist_of
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.fixes import FixGated, FixRefused

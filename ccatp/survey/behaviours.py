@@ -10,7 +10,6 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.escape import is_on_drive
 from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.search import leg_time, turn_time
-from ccatp.survey.retreat import RetreatStep
 from ccatp.survey.route_follower import RouteFollower, StateEstimate
 from ccatp.survey.state import (
     BACKING_OFF,
@@ -26,7 +25,7 @@ from ccatp.survey.state import (
     SurveyOutcome,
     SurveyState,
 )
-from ccatp.survey.stops import HOLD_POSITION, MissionCommand, ReturnToBase
+from ccatp.survey.stops import HOLD_POSITION, MissionCommand, RetreatStep, ReturnToBase
 
 # Points of a panel that are measured when not all can be: corners and centre, then three that determine a plane.
 LEVELS = (frozenset((1, 3, 5, 7, 9)), frozenset((1, 3, 8)))
@@ -123,7 +122,7 @@ class Behaviours:
         """The point being measured; ``None`` for a fix that only serves to find the robot again."""
         standing = self._standing
         stop = standing.survey.current
-        return None if standing.is_lost or stop is None else stop.point
+        return None if standing.needs_fix or stop is None else stop.point
 
     def step(self, motion: StateEstimate, verdict: Verdict | None) -> MissionCommand:
         """One frame."""
@@ -155,7 +154,7 @@ class Behaviours:
 
     def _travel(self, motion: StateEstimate) -> MissionCommand:
         standing = self._standing
-        if standing.is_lost:
+        if standing.needs_fix:
             return self._align(motion)
         if standing.is_review_due and self._is_out_of_time(motion):
             return HOLD_POSITION
@@ -275,7 +274,7 @@ class Behaviours:
             standing.go_on()
             return HOLD_POSITION
         twist = retreat.step(motion, verdict)
-        if retreat.step_at is RetreatStep.TURN_AWAY and standing.abort_cause is not None:
+        if retreat.step_at is RetreatStep.TURN_AWAY and standing.abort_cause:
             retreat.step_at = RetreatStep.OVER  # there is no route to turn to; the way home begins from here
         if retreat.step_at is RetreatStep.STUCK:
             standing.hold("stuck at the edge: no motion away from it is permitted, or none helps", by_hand=False)

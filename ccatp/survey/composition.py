@@ -15,11 +15,10 @@ from ccatp.localizer import FOUR_STATE, Localizer, build_doubting, build_localiz
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.survey.heading_recovery import TakeoverState
 from ccatp.survey.mission import Mission
-from ccatp.survey.planning.escape import plan_calibration
+from ccatp.survey.planning.escape import plan_calibration, plan_way_home
 from ccatp.survey.planning.route import ORDERS, Route, plan_rejoin, plan_route, with_prelude
 from ccatp.survey.planning.search import leg_lengths, leg_time, path_time, stop_times
 from ccatp.survey.planning.tour_bound import tour_bound
-from ccatp.survey.planning.way_home import plan_way_home
 from ccatp.survey.state import PlanHome, PlanPoints, PlanRest
 
 # The configuration may be calibrated, the robot's own figures are nominal: this much apart they describe two robots.

@@ -8,7 +8,6 @@ from statistics import median
 from ccatp.config.models import Config
 from ccatp.core import Corner, DeckPose, EventCode, Severity, Verdict
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.retreat import EdgeRetreat
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.state import (
     DRIVING,
@@ -22,6 +21,7 @@ from ccatp.survey.state import (
     MissionState,
     SurveyState,
 )
+from ccatp.survey.stops import EdgeRetreat
 
 NEAR_EDGE, ABORTED = EventCode.NEAR_EDGE, EventCode.ABORTED
 NONE, SLOW, HOLD, RETURN, FAULT = Severity.NONE, Severity.SLOW, Severity.HOLD, Severity.RETURN, Severity.FAULT
@@ -31,24 +31,8 @@ _HEARD_S = 0.2
 EARTHQUAKE = "emergency: earthquake"
 
 
-def abort(standing: SurveyState, cause: str) -> str | None:
-    """Return to base and end there; why that is refused, or ``None``."""
-    if standing.state is MissionState.DONE:
-        return "the mission is over"
-    is_news = standing.abort_cause is None
-    standing.abort_cause = standing.abort_cause or cause
-    if standing.bar:
-        return None  # home, but not before the robot may move
-    # An edge outranks an abort: the retreat and its fix come first.
-    if standing.state is MissionState.HELD or (
-        is_news and standing.state is not MissionState.BACKING_OFF and not standing.is_lost
-    ):
-        standing.go_on()
-    return None
-
-
 class Failsafe:
-    """Hears the verdict of each frame before anything moves."""
+    """Takes the verdict of each frame before anything moves."""
 
     def __init__(self, standing: SurveyState) -> None:
         self._standing = standing
@@ -81,8 +65,8 @@ class Failsafe:
             self._meet_edge(motion, verdict)
             return
         if verdict.code is ABORTED and self._is_news(verdict):
-            abort(standing, verdict.cause)
-        is_waiting = standing.state is HELD and (standing.is_held_by_hand or motion.t_s < standing.waits_until_s)
+            standing.abort(verdict.cause)
+        is_waiting = standing.state is HELD and (standing.awaits_operator or motion.t_s < standing.waits_until_s)
         if standing.state is IDLE or (standing.state is HELD and not is_waiting):
             standing.go_on()
 
@@ -91,9 +75,9 @@ class Failsafe:
         standing = self._standing
         if verdict is not None and verdict.severity < HOLD:
             self._has_looked = False
-        if self._was_lost and not standing.is_lost and verdict is not None and verdict.code is NEAR_EDGE:
+        if self._was_lost and not standing.needs_fix and verdict is not None and verdict.code is NEAR_EDGE:
             standing.stands_until_s = t_s + _HEARD_S
-        self._was_lost = standing.is_lost
+        self._was_lost = standing.needs_fix
 
     def _stay(self, motion: StateEstimate, verdict: Verdict | None) -> None:
         standing = self._standing
@@ -101,7 +85,7 @@ class Failsafe:
             standing.interrupt("no fresh verdict from the danger loop")
         elif verdict.code is NEAR_EDGE:
             self._meet_edge(motion, verdict)
-        elif not (standing.is_lost and standing.state in (SETTLING, MEASURING)):
+        elif not (standing.needs_fix and standing.state in (SETTLING, MEASURING)):
             # A robot that stands to be found needs no permission, and without a pose gets none before it is.
             standing.interrupt(verdict.cause)
 
@@ -132,7 +116,7 @@ class Failsafe:
         standing.bar = EARTHQUAKE
         standing.abort_cause = standing.abort_cause or EARTHQUAKE
         standing.lose()
-        standing.hold(EARTHQUAKE, by_hand=standing.state is MissionState.HELD and standing.is_held_by_hand)
+        standing.hold(EARTHQUAKE, by_hand=standing.is_held_by_hand)
 
     def _obey(self, verdict: Verdict) -> bool:
         standing, severity = self._standing, verdict.severity
@@ -150,19 +134,19 @@ class Failsafe:
         self._pace(is_slow=severity in (SLOW, RETURN))
         if severity is RETURN and verdict.code is not NEAR_EDGE and verdict.cause != self._finding:
             self._finding = verdict.cause
-            abort(standing, verdict.cause)
+            standing.abort(verdict.cause)
         return False
 
     def _looks(self, cause: str) -> bool:
         """A sensor that stays off may be over a seam or the rim where the pose is wrong: one fix, at rest, tells."""
         standing = self._standing
-        if standing.state is MissionState.DONE or (standing.state is HELD and standing.is_held_by_hand):
+        if standing.state is MissionState.DONE or standing.is_held_by_hand:
             return False
         if not self._has_looked:
             self._has_looked = True
             standing.await_recovery(cause)
             standing.go_on()
-        return standing.is_lost and standing.state in (SETTLING, MEASURING)
+        return standing.needs_fix and standing.state in (SETTLING, MEASURING)
 
     def _pace(self, *, is_slow: bool) -> None:
         """Drive at the reduced speed from now on, or at the usual one from the next leg on."""
@@ -176,7 +160,7 @@ class Failsafe:
     def _waits_at_edge(self, t_s: float, verdict: Verdict | None) -> bool:
         """After a retreat that led nowhere: whether to go on waiting until no sensor hangs over any more."""
         standing = self._standing
-        if standing.state is not HELD or standing.is_held_by_hand or standing.stuck_s is None:
+        if standing.state is not HELD or standing.awaits_operator or standing.stuck_s is None:
             standing.stuck_s = None
             return False
         if verdict is not None and verdict.code is not NEAR_EDGE:
@@ -193,9 +177,9 @@ class Failsafe:
             return
         if standing.ignores_motion:
             standing.go_on()  # where the edge is, is not known before a fix; standing still for it is safe anywhere
-        if standing.is_lost and standing.state in (SETTLING, MEASURING):
+        if standing.needs_fix and standing.state in (SETTLING, MEASURING):
             return  # it stands, and a rim on the map is a matter of the pose that is being found
-        if standing.state is MissionState.HELD and standing.is_held_by_hand:
+        if standing.is_held_by_hand:
             return
         if motion.t_s < standing.stands_until_s:
             return

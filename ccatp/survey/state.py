@@ -11,9 +11,8 @@ from ccatp.core import DeckPose, PointId, Severity, Stop
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.heading_recovery import HeadingRecovery
 from ccatp.survey.planning.route import Route
-from ccatp.survey.retreat import EdgeRetreat
 from ccatp.survey.route_follower import Corrector, RouteFollower, SpeedLimitedTracker, StateEstimate
-from ccatp.survey.stops import ReturnToBase, SettleAndMeasure
+from ccatp.survey.stops import EdgeRetreat, ReturnToBase, SettleAndMeasure
 
 
 class MissionState(StrEnum):
@@ -218,12 +217,15 @@ class SurveyState:
     """State, causes and parts of one survey.
 
     Attributes:
-        abort_cause: why the survey was given up, or ``None``.
+        done: points measured, in order.
+        skipped: points whose measurement failed.
+        abort_cause: why the survey was given up, or empty.
         bar: why nothing may move, an earthquake, or empty.
         is_shaking: there is an earthquake, though the robot may be leaving an edge first.
         is_faulted: an operator has to look after it.
         is_hold_deaf: held because wheels or inertial unit are not trusted.
-        is_lost: a fix comes before the next move: the pose is known to be wrong or (``is_at_start``) not confirmed yet.
+        doubts_pose: the localizer shall doubt its pose; to be set to false when it does.
+        needs_fix: a fix comes before the next move: the pose is wrong or (``is_at_start``) not confirmed yet.
         wants_calibration: the calibration drive was given up, too far from where it leads.
         wants_full_fans: the robot shall be pressed on with full fans.
         stuck_s: when a retreat led nowhere, robot time.
@@ -245,12 +247,12 @@ class SurveyState:
         self.state, self.outcome, self.cause = MissionState.IDLE, SurveyOutcome.NONE, ""
         self.done: list[PointId] = []
         self.skipped: list[PointId] = []
-        self.abort_cause: str | None = None
+        self.abort_cause = ""
         self.bar = ""
         self.is_latched = self.is_shaking = False
         self.severity = Severity.NONE
-        self.is_held_by_hand = self.is_faulted = self.is_hold_deaf = False
-        self.is_lost = self.is_at_start = cfg.mission.fix_at_start
+        self.awaits_operator = self.is_faulted = self.is_hold_deaf = False
+        self.needs_fix = self.is_at_start = cfg.mission.fix_at_start
         self.is_off_route = self.is_review_due = self.doubts_pose = self.wants_full_fans = False
         self.wants_calibration = False
         self.retreat: EdgeRetreat | None = None
@@ -278,13 +280,23 @@ class SurveyState:
     @property
     def purpose(self) -> Purpose:
         """What the last gate lets the robot move for: legs that show the heading may be part of the way home."""
-        if self.is_lost and self.abort_cause is not None and self.state in (MissionState.TURNING, MissionState.DRIVING):
+        if self.needs_fix and self.abort_cause and self.state in (MissionState.TURNING, MissionState.DRIVING):
             return Purpose.HOMEWARD
         return PURPOSES[self.state]
 
     @property
+    def is_held_by_hand(self) -> bool:
+        """Held until an operator resumes."""
+        return self.state is HELD and self.awaits_operator
+
+    @property
+    def is_lost(self) -> bool:
+        """The pose is known to be wrong, and is to be found again; at the start it is only to be confirmed."""
+        return self.needs_fix and not self.is_at_start
+
+    @property
     def is_awaiting_fix(self) -> bool:
-        """Whether the measurement asked for last is still wanted."""
+        """Whether the measurement asked for last, number ``request``, is still wanted."""
         return self.state is MissionState.MEASURING and self.stopover.is_asked
 
     def apply(self, event: MissionEvent) -> None:
@@ -293,7 +305,7 @@ class SurveyState:
 
     def lose(self) -> None:
         """The pose is known to be wrong: a fix comes before the next move."""
-        self.is_lost, self.is_at_start = True, False
+        self.needs_fix, self.is_at_start = True, False
 
     def interrupt_travel(self) -> None:
         """Drive the leg anew from where the robot is."""
@@ -312,7 +324,7 @@ class SurveyState:
         """Hold, until somebody resumes or until the cause is gone."""
         self.interrupt_parts()
         self.apply(MissionEvent.HOLD)
-        self.is_held_by_hand = by_hand
+        self.awaits_operator = by_hand
         self.is_hold_deaf = False
         self.cause = cause
 
@@ -327,13 +339,13 @@ class SurveyState:
         """Hold until an operator resumes, because something is wrong; where the pose is, a fix comes first then."""
         if self.state is MissionState.DONE:
             return
-        self.is_lost |= is_lost
+        self.needs_fix |= is_lost
         self.hold(cause, by_hand=True)
         self.is_faulted = True
 
     def await_recovery(self, cause: str, *, is_pose_doubted: bool = False) -> None:
         """Hold until the cause is gone, and then find out where the robot is before moving on."""
-        if self.state is MissionState.DONE or (self.state is HELD and self.is_held_by_hand):
+        if self.state is MissionState.DONE or self.is_held_by_hand:
             return
         self.lose()
         was_deaf = self.ignores_motion
@@ -343,7 +355,7 @@ class SurveyState:
 
     def recover(self, cause: str, t_s: float) -> None:
         """Hold, and go on with a fix; what comes again and again is a fault."""
-        if self.state is MissionState.DONE or (self.state is HELD and self.is_held_by_hand):
+        if self.state is MissionState.DONE or self.is_held_by_hand:
             return
         health = self.cfg.health
         self._recoveries_s = [since_s for since_s in self._recoveries_s if t_s - since_s <= health.retry_window_s]
@@ -357,6 +369,19 @@ class SurveyState:
             # A filter that is frozen cannot tell when the robot stands.
             self.waits_until_s = t_s + health.retry_after_s
 
+    def abort(self, cause: str) -> str | None:
+        """Return to base and end there; why that is refused, or ``None``."""
+        if self.state is MissionState.DONE:
+            return "the mission is over"
+        is_new = not self.abort_cause
+        self.abort_cause = self.abort_cause or cause
+        if self.bar:
+            return None  # home, but not before the robot may move
+        # An edge outranks an abort: the retreat and its fix come first.
+        if self.state is HELD or (is_new and self.state is not MissionState.BACKING_OFF and not self.needs_fix):
+            self.go_on()
+        return None
+
     def go_on(self) -> None:
         """To what is next: finding the robot, home, the next stop, or the end."""
         self.interrupt_parts()
@@ -364,9 +389,9 @@ class SurveyState:
         self.is_faulted = False
         # Wherever a hold left the robot: the route's next turn may not be safe there.
         self.is_off_route |= self.state is MissionState.HELD
-        if self.is_lost:
+        if self.needs_fix:
             self.apply(MissionEvent.FIND)
-        elif self.abort_cause is not None:
+        elif self.abort_cause:
             self.cause = self.abort_cause
             self.home = None  # planned anew from where the robot is now
             self.apply(MissionEvent.GO_HOME)

@@ -14,11 +14,10 @@ from scipy.stats import chi2
 
 from ccatp.config.models import LocalizerConfig
 from ccatp.core import FloatArray, PanelId, PanelPose
-from ccatp.estimation.odometry import PreintegratedMotion
+from ccatp.estimation.odometry import PreintegratedMotion, WheelAngle
 from ccatp.estimation.slip_prior import SlipPrior
 from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import BA, BG, KG, KL, PL, PR, PSI, SL, SR, STATES, A, C, V, W, X, Y
-from ccatp.estimation.wheel_angles import WheelAngle
 from ccatp.filters import FILTERS
 from ccatp.mirror.mirror import Mirror
 from tests.unit.estimation.drive import config, mirror

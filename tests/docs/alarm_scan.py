@@ -12,21 +12,21 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[2]
 # Position of the cause among the arguments, by the name that is called.
 CAUSES = {
-    "MonitorFinding": 1, "FixFinding": 1, "_missing": 1,
+    "MonitorFinding": 1, "FixFinding": 1, "_lacking": 1,
     "fault": 0, "hold": 0, "interrupt": 0, "abort": 0, "_ask_to_hold": 0, "recover": 0,
 }  # fmt: skip
 # What the mission makes of a cause, by the name that is called; a finding has its severity with it.
 REACTIONS = {
-    "_missing": "pause", "fault": "fault", "hold": "hold", "interrupt": "pause", "abort": "return",
+    "_lacking": "pause", "fault": "fault", "hold": "hold", "interrupt": "pause", "abort": "return",
     "_ask_to_hold": "hold", "recover": "hold",
 }  # fmt: skip
 # Causes that stand in tables or in verdicts: file, name, reaction.
 EDGES, CENTRE = ("ccatp/safety/edge_detector.py", "Cause"), ("ccatp/danger.py", "CENTRE")
-OWN = "ccatp/safety/power_monitors.py", "_OWN"
+OWN = "ccatp/safety/sensor_monitors.py", "_OWN"
 LITERAL = (
     ("ccatp/danger.py", "lifted or fallen", "hold"),
     ("ccatp/danger.py", "emergency: \u2026", "return"),
-    ("ccatp/safety/power_monitors.py", "the robot reports a fault that is not known here", "inform"),
+    ("ccatp/safety/sensor_monitors.py", "the robot reports a fault that is not known here", "inform"),
 )
 SOURCES = (
     "ccatp/danger.py", "ccatp/safety", "ccatp/survey", "ccatp/estimation", "ccatp/daemon",
@@ -72,13 +72,11 @@ def _in_file(path: Path) -> Iterator[Cause]:
     for function in _functions(tree):
         for call in _calls(function):
             name = _called(call)
-            if (function.name, name) == ("_missing", "MonitorFinding"):
-                continue  # makes a finding of what its callers give
             place = CAUSES.get(name, -1)
-            if 0 <= place < len(call.args) and "Severity.NONE" not in map(ast.unparse, call.args):
+            if 0 <= place < len(call.args):
                 at = _Place(call, function, tree)
                 reactions = {REACTIONS[name]} if name in REACTIONS else set(at.severities(call.args[0]))
-                if name == "_missing" and getattr(call.args[0], "value", "") == "enc":
+                if name == "_lacking" and getattr(call.args[0], "value", "") == "enc":
                     reactions = {"hold"}  # as ``DangerMonitor._own_findings`` has it
                 for text in at.texts(call.args[place]):
                     yield Cause(text, where, frozenset(reactions))
@@ -102,7 +100,6 @@ class _Place(NamedTuple):
     call: ast.Call
     function: ast.FunctionDef | ast.AsyncFunctionDef
     tree: ast.AST
-    seen: tuple[ast.AST, ...] = ()  # functions whose callers are being followed
 
     def texts(self, node: ast.expr) -> Iterator[str]:
         """The texts that an expression may be; nothing where nobody can tell from the source."""
@@ -150,13 +147,13 @@ class _Place(NamedTuple):
     def _from_callers(self, name: str) -> Iterator[str]:
         """The texts given for a parameter of the function, in its own file."""
         parameters = [argument.arg for argument in self.function.args.args if argument.arg != "self"]
-        if name not in parameters or self.function in self.seen:
+        if name not in parameters:
             return
         place = parameters.index(name)
         for function in _functions(self.tree):
             for call in _calls(function):
                 if _called(call) == self.function.name and place < len(call.args):
-                    yield from _Place(call, function, self.tree, (*self.seen, self.function)).texts(call.args[place])
+                    yield from _Place(call, function, self.tree).texts(call.args[place])
 
 
 def _given(statement: ast.AST, name: str) -> Iterator[ast.expr]:

@@ -22,8 +22,8 @@ from ccatp.links.rpc import REPEAT_S, RequestFailed, request
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety.emergency_latch import EmergencyLatch
 from ccatp.survey.behaviours import home_time_s
+from ccatp.survey.planning.escape import plan_way_home
 from ccatp.survey.planning.search import path_time
-from ccatp.survey.planning.way_home import plan_way_home
 from ccatp.survey.reactions import ReminderCall, UnattendedFaultTimer
 from ccatp.survey.state import MissionState
 from ccatp.survey.stops import MissionCommand

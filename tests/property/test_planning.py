@@ -15,9 +15,9 @@ from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Stop, StopKind
 from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.survey.planning.escape import plan_way_home
 from ccatp.survey.planning.route import ORDERS, plan_rejoin, plan_route, thesis_order
 from ccatp.survey.planning.search import path_time
-from ccatp.survey.planning.way_home import plan_way_home
 
 NAMES = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
 ROUNDING_M = 1e-8  # the rim's segment clearance is exact to 1 nm

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from ccatp.config.models import Config, PidConfig
 from ccatp.control.pid import Pid, Profile, ProfiledAxis, lag_feed_forward
-from ccatp.control.prediction import CommandPredictor
+from ccatp.control.tracker import CommandPredictor
 from ccatp.core import Predicted
 
 

@@ -11,8 +11,7 @@ from scipy.linalg import solve_continuous_are
 
 from ccatp.config.models import Config
 from ccatp.control.gate import Purpose
-from ccatp.control.prediction import CommandPredictor
-from ccatp.control.tracker import LegLine, LegPhase, LegTracker, LegView, line_rate
+from ccatp.control.tracker import CommandPredictor, LegLine, LegPhase, LegTracker, LegView, line_rate
 from ccatp.core import EventCode, Twist, Verdict, difference, twist_of
 from ccatp.survey.composition import build_gate
 from ccatp.survey.planning.search import bang_bang_time

@@ -9,8 +9,7 @@ import pytest
 from ccatp.core import DeckPose, Fix, FloatArray, PanelPose
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.estimation.full_state import FullStateLocalizer
-from ccatp.estimation.replay_buffer import ReplayBuffer, Step
-from ccatp.estimation.state_filter import SurveyFilter
+from ccatp.estimation.state_filter import ReplayBuffer, Step, SurveyFilter
 from ccatp.estimation.state_model import PSI, STATES, A, V, W
 from ccatp.filters import FILTERS, KalmanFilter
 from tests.unit.estimation.drive import (

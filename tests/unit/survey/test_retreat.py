@@ -15,8 +15,8 @@ from ccatp.safety.edge_detector import Cause
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.planning.escape import is_on_drive
 from ccatp.survey.reactions import PATIENCE_S, READINGS, MirrorCheck
-from ccatp.survey.retreat import EdgeRetreat, RetreatStep
 from ccatp.survey.route_follower import StateEstimate
+from ccatp.survey.stops import EdgeRetreat, RetreatStep
 
 CFG = load_config()
 FRAME_S = 0.01

@@ -12,6 +12,7 @@ from ccatp.config.models import LimitsConfig
 from ccatp.control.pid import Profile
 from ccatp.core import DeckPose, PointId, Stop, StopKind, bearing, difference
 from ccatp.mirror.mirror import build_mirror
+from ccatp.survey.planning.escape import plan_way_home
 from ccatp.survey.planning.legs import OutsideMirrorError, UnreachablePointError, heading_of_course
 from ccatp.survey.planning.route import optimised_order, plan_route, thesis_order
 from ccatp.survey.planning.search import (
@@ -25,7 +26,6 @@ from ccatp.survey.planning.search import (
     turn_time,
 )
 from ccatp.survey.planning.tour_bound import tour_bound
-from ccatp.survey.planning.way_home import plan_way_home
 
 FLAT = 1e-3  # the patch at the apex of M1 that these tests drive on is flat to 1 mm in a metre
 

@@ -12,6 +12,7 @@ from ccatp.config.load import load_config
 from ccatp.config.models import LimitsConfig
 from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind
 from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.survey.planning.escape import plan_way_home
 from ccatp.survey.planning.legs import (
     Grazing,
     LegPlace,
@@ -34,7 +35,6 @@ from ccatp.survey.planning.route import (
     thesis_order,
 )
 from ccatp.survey.planning.search import Search, SearchNode, Target, path_time
-from ccatp.survey.planning.way_home import plan_way_home
 
 STEPS_OF_THESIS_M1 = ((1, 2), (2, 3), (7, 8), (8, 9))  # rows of 7, 9, 11, ..., 11, 9, 7 panels
 
