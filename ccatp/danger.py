@@ -203,7 +203,8 @@ class DangerMonitor:
         found = []
         if missing is not None:
             # Without its wheels it is not known where the robot went meanwhile.
-            found.append(missing._replace(severity=Severity.HOLD) if missing.signal == "enc" else missing)
+            severity = Severity.HOLD if missing.signal == "enc" else Severity.PAUSE
+            found.append(missing._replace(severity=severity))
         if self._health is None:
             return found
         if self._edges.is_lifted:
@@ -339,7 +340,7 @@ class DangerMonitor:
 
 
 def _lacking(signal: str, cause: str, value: float, limit: float) -> MonitorFinding:
-    return MonitorFinding(Severity.PAUSE, cause, signal, value, limit)
+    return MonitorFinding(severity=Severity.PAUSE, cause=cause, signal=signal, value=value, limit=limit)
 
 
 def _verdict(
