@@ -230,9 +230,9 @@ class Explanation(NamedTuple):
 
 
 def prices(false_alarm: float, points: int, panels: int) -> Prices:
-    """What an explanation costs; ``false_alarm``.
+    """What an explanation costs.
 
-    Probability of an outlier by noise on the whole mirror, likewise of a shape.
+    ``false_alarm``: probability of an outlier by noise on the whole mirror, likewise of a shape.
     """
     return Prices(
         float(chdtri(1, false_alarm / max(points, 1))), float(chdtri(_CURVATURES, false_alarm / max(panels, 1)))

@@ -193,9 +193,9 @@ def _name(matrix: FloatArray) -> str:
 
 
 class FixFinding(NamedTuple):
-    """What was found: nothing where both are empty; ``refusal``.
+    """What was found: nothing where both are empty.
 
-    Why this laser system must not be used for this mission.
+    ``refusal``: why this laser system must not be used for this mission.
     """
 
     doubt: str = ""

@@ -44,7 +44,7 @@ class Story:
     @staticmethod
     def route(stops: tuple[Stop, ...]) -> Route:
         left = tuple(float(len(stops) - k) for k in range(len(stops) + 1))
-        return Route(stops, left, left)
+        return Route(stops, left)
 
     def plan_rest(self, _route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
         self.plans.append(start)

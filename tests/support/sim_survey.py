@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.control.prediction import CommandPredictor
+from ccatp.control.tracker import CommandPredictor
 from ccatp.core import DeckPose, Fix, PointId, Severity, Vector3, Verdict
 from ccatp.daemon.fix_service import FixRequest, FixService
 from ccatp.daemon.telemetry import SurveyTelemetry

@@ -22,6 +22,7 @@ from ccatp.daemon.terminal import clock, share_done, status_line, status_rows
 from ccatp.links.topics import MissionStatus
 from ccatp.mirror.mirror import build_mirror
 from ccatp.survey.composition import assemble, make_plan, plan_lines
+from ccatp.survey.planning.search import leg_lengths
 from tests.unit.serving import serving
 
 
@@ -127,7 +128,8 @@ def test_the_plan_is_that_of_a_run(name: str, filter_name: str, capsys: pytest.C
     found = planned(capsys, "--mirror", name, "--panels", "3", "--filter", filter_name)
     parts = assemble(load_config(overrides={"run.mirror": name, "run.panels": 3, "run.filter": filter_name}))
     assert found["lower_bound_s"] == pytest.approx(parts.lower_bound_s, abs=1e-3)
-    assert found["length_m"] == pytest.approx(parts.route.remaining_m(0), abs=1e-3)
+    length_m = sum(leg_lengths(parts.route.stops, parts.mirror.base_pose, parts.mirror))
+    assert found["length_m"] == pytest.approx(length_m, abs=1e-3)
     assert [(s["x_m"], s["y_m"]) for s in found["stops"]] == [
         (round(stop.x_m, 4), round(stop.y_m, 4)) for stop in parts.route.stops
     ]

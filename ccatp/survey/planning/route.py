@@ -20,26 +20,21 @@ from ccatp.survey.planning.legs import (
     course_of_heading,
     in_parts,
 )
-from ccatp.survey.planning.search import Search, SearchNode, Target, leg_lengths, path_time, stop_times
+from ccatp.survey.planning.search import Search, SearchNode, Target, path_time, stop_times
 
 _REPLANNED_POINTS = 4  # at least, before the old route is joined again
 
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """The stops of a survey, with the least time and the way from before stop k to the end, shape (stops + 1,)."""
+    """The stops of a survey, with the least time from before stop k to the end, s, shape (stops + 1,)."""
 
     stops: tuple[Stop, ...]
     times_s: tuple[float, ...]
-    lengths_m: tuple[float, ...]
 
     def remaining_s(self, index: int) -> float:
         """Least time that is left while stop ``index`` is being approached, s; 0 behind the last."""
         return self.times_s[min(index, len(self.stops))]
-
-    def remaining_m(self, index: int) -> float:
-        """Way that is left while stop ``index`` is being approached, m; 0 behind the last."""
-        return self.lengths_m[min(index, len(self.stops))]
 
 
 def plan_route(
@@ -80,7 +75,6 @@ def with_prelude(
     return Route(
         prelude + route.stops,
         tuple(t + route.times_s[0] for t in head.times_s[:-1]) + route.times_s,
-        tuple(t + route.lengths_m[0] for t in head.lengths_m[:-1]) + route.lengths_m,
     )
 
 
@@ -116,7 +110,6 @@ def plan_rejoin(
     return Route(
         head.stops + route.stops[rest:],
         tuple(t + route.times_s[rest] for t in head.times_s[:-1]) + route.times_s[rest:],
-        tuple(t + route.lengths_m[rest] for t in head.lengths_m[:-1]) + route.lengths_m[rest:],
     )
 
 
@@ -180,7 +173,7 @@ def _with_remains(
         time_s + (measuring_time_s if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) else 0.0)
         for stop, time_s in zip(stops, stop_times(stops, start, limits, mirror), strict=True)
     ]
-    return Route(stops, _sums_to_the_end(times), _sums_to_the_end(leg_lengths(stops, start, mirror)))
+    return Route(stops, _sums_to_the_end(times))
 
 
 def _sums_to_the_end(parts: list[float]) -> tuple[float, ...]:

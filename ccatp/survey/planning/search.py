@@ -77,11 +77,6 @@ def leg_lengths(stops: Sequence[Stop], start: DeckPose, mirror: Mirror) -> list[
     return [dist(a, b) for a, b in pairwise(points)]
 
 
-def path_length(stops: Sequence[Stop], start: DeckPose, mirror: Mirror) -> float:
-    """Length of a path on the surface, m."""
-    return sum(leg_lengths(stops, start, mirror))
-
-
 # What a stop costs beyond the bang-bang time of its legs: the servo's lag and settling.
 STOP_S = 0.15
 # Of two ways that cost the same take the one driven forward.
@@ -100,9 +95,9 @@ class Target(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchNode:
-    """The cheapest arrival at a place with this leg, facing the deck direction ``course_rad``; ``before``.
+    """The cheapest arrival at a place with this leg, facing the deck direction ``course_rad``.
 
-    None at the start.
+    ``before``: the arrival before, None at the start.
     """
 
     place: LegPlace

@@ -6,12 +6,19 @@ from math import cos, exp, hypot, pi, sin
 import numpy as np
 import pytest
 
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, PanelId, PanelPose, PointId, Stop, StopKind
+from ccatp.control.tracker import LegTracker
+from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Verdict
+from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.safety.edge_detector import Cause
+from ccatp.studies.sil_run import SilRun
+from ccatp.survey.planning.escape import is_on_drive
+from ccatp.survey.reactions import PATIENCE_S, READINGS, MirrorCheck
 from ccatp.survey.route_follower import Corrector, LegAim, StateEstimate, plan_aim
 from ccatp.survey.state import ApproachCounter
-from ccatp.survey.stops import SETTLE_LIMIT_S, SettleAndMeasure, StandstillDetector
+from ccatp.survey.stops import SETTLE_LIMIT_S, EdgeRetreat, RetreatStep, SettleAndMeasure, StandstillDetector
 
 DT, MEASURING_S = 0.01, 0.5
 POINT = PointId(5, 5, 1)
@@ -257,3 +264,229 @@ def test_what_counts_as_near_enough_is_so_in_truth(sigma_m: float) -> None:
     assert 0.2 < passed.mean() < 0.5
     assert (true_m[passed] > 3e-3).sum() <= 1e-4 * passed.sum()
     assert true_m[passed].max() < 3e-3 + sigma_m
+
+
+CFG = load_config()
+FRAME_S = 0.01
+PANEL = PanelId(1, 1)
+Pose = tuple[float, float, float]
+Four = tuple[bool, bool, bool, bool]
+
+
+def off_at(pose: Pose) -> Four:
+    """Beyond two rims that meet: what lies at x < 0 or y < 0."""
+    x, y, heading = pose
+    c, s = cos(heading), sin(heading)
+    a, b, rear_a, rear_b = (
+        x + c * ox - s * oy < 0.0 or y + s * ox + c * oy < 0.0 for ox, oy in CFG.robot.edge_sensors_m
+    )
+    return a, b, rear_a, rear_b
+
+
+def verdict_of(off: Four, *, may_turn: bool, cause: Cause = Cause.RIM) -> Verdict:
+    code = EventCode.NEAR_EDGE if any(off) else EventCode.NORMAL
+    is_free = not any(off)
+    forward, reverse = not (off[0] or off[1]), not (off[2] or off[3])
+    return Verdict(0, 0.0, code, cause, "", 0.0, 0.0, forward, reverse, may_turn or is_free, off)
+
+
+def deck_of(pose: PanelPose) -> DeckPose:
+    return DeckPose(pose.x_m, pose.y_m, pose.heading_rad)
+
+
+def retreated(
+    pose: Pose, *, may_turn: bool, blames: Four | None = None, cause: Cause = Cause.RIM
+) -> tuple[Pose, list[RetreatStep]]:
+    """Where a retreat ends that begins with the sensors that are off there, or ``blames``; wheels follow at once."""
+    tracker = LegTracker(CFG.control, CFG.limits, 0.0)
+    first = verdict_of(blames or off_at(pose), may_turn=False)
+    retreat = EdgeRetreat(CFG.mission, tracker, first, PanelPose(PANEL, *pose), 0.0)
+    seen, rate_rad_s = [retreat.step_at], 0.0
+    for k in range(1500):
+        if retreat.step_at in (RetreatStep.OVER, RetreatStep.STUCK):
+            break
+        motion = StateEstimate(k * FRAME_S, FRAME_S, PanelPose(PANEL, *pose), deck_of, 0.0, rate_rad_s)
+        twist = retreat.step(motion, verdict_of(off_at(pose), may_turn=may_turn, cause=cause))
+        rate_rad_s = twist.omega_rad_s
+        x, y, heading = pose
+        heading += twist.omega_rad_s * FRAME_S
+        pose = x + twist.v_m_s * FRAME_S * cos(heading), y + twist.v_m_s * FRAME_S * sin(heading), heading
+        if retreat.step_at is not seen[-1]:
+            seen.append(retreat.step_at)
+    return pose, seen
+
+
+@pytest.mark.parametrize("heading_rad", [0.0, 0.05, -0.05])
+@pytest.mark.parametrize("y_m", [1.0, 0.3])
+def test_one_that_met_the_edge_backwards_drives_off_it_and_does_not_turn(y_m: float, heading_rad: float) -> None:
+    start = (0.088, y_m, heading_rad)
+    assert any(off_at(start)[2:])
+    end, seen = retreated(start, may_turn=True)
+    assert seen == [RetreatStep.BACK, RetreatStep.OVER]
+    assert end[0] >= start[0] + 0.5 * CFG.mission.backoff_m * cos(heading_rad) - 1e-3
+    assert end[2] == pytest.approx(heading_rad, abs=1e-3)
+    assert not any(off_at(end))
+
+
+def test_a_turn_away_that_sweeps_a_corner_over_the_rim_is_undone() -> None:
+    # It looks along one rim; turned away to the right, to the side of that rim, its right rear comes over it.
+    start = (1.0, 0.1, 0.0)
+    front_left = (True, False, False, False)
+    end, seen = retreated(start, may_turn=True, blames=front_left)
+    assert seen == [RetreatStep.BACK, RetreatStep.TURN_AWAY, RetreatStep.UNTURN, RetreatStep.OVER]
+    assert not any(off_at(end))
+    turned = -end[2]
+    assert 0.0 < turned < CFG.mission.turn_away_rad
+
+
+def test_one_that_may_not_be_undone_ends_with_what_is_gained() -> None:
+    start = (1.0, 0.1, 0.0)
+    end, seen = retreated(start, may_turn=False, blames=(True, False, False, False))
+    assert seen == [RetreatStep.BACK, RetreatStep.TURN_AWAY, RetreatStep.UNTURN, RetreatStep.OVER]
+    assert start[0] - end[0] == pytest.approx(0.5 * CFG.mission.backoff_m, abs=2e-3)
+
+
+@pytest.mark.parametrize("cause", [Cause.NO_MAP, Cause.SEAM])
+def test_off_what_may_be_a_seam_it_stands(cause: Cause) -> None:
+    _, seen = retreated((1.0, 0.1, 0.0), may_turn=True, blames=(True, False, False, False), cause=cause)
+    assert seen == [RetreatStep.BACK, RetreatStep.TURN_AWAY, RetreatStep.OVER]
+
+
+@pytest.mark.parametrize(("off", "sense"), [((True, False, False, False), -1.0), ((False, True, False, False), 1.0)])
+def test_where_there_is_room_it_turns_to_the_side_that_stands(off: Four, sense: float) -> None:
+    end, seen = retreated((1.0, 1.0, 0.5 * pi), may_turn=True, blames=off)
+    assert seen == [RetreatStep.BACK, RetreatStep.TURN_AWAY, RetreatStep.OVER]
+    assert end[1] == pytest.approx(1.0 - 0.5 * CFG.mission.backoff_m, abs=2e-3)
+    assert end[2] - 0.5 * pi == pytest.approx(sense * CFG.mission.turn_away_rad, abs=0.05)
+
+
+MIRRORS = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
+SIGMA_RAD = 0.035  # of a reading, as shipped
+SEEDS = 40
+
+
+def mirror_of(name: str) -> Mirror:
+    return build_mirror(load_config(overrides={"run.mirror": name}).mirror)
+
+
+def noisy(direction: np.ndarray, rng: np.random.Generator) -> tuple[float, float, float, float]:
+    found = direction + SIGMA_RAD * rng.normal(size=3)
+    x, y, z = found / np.linalg.norm(found)
+    return 0.0, float(x), float(y), float(z)
+
+
+def tilted(mirror: Mirror, pose: DeckPose, by_deg: float, heading: float) -> np.ndarray:
+    """Gravity in the robot frame on a surface whose slope differs by so much, the robot turned anyhow."""
+    gx, gy, gz = mirror.gravity_in_robot(pose)
+    slope = np.arctan2(np.hypot(gx, gy), -gz) + np.radians(by_deg)
+    return np.array([np.sin(slope) * np.cos(heading), np.sin(slope) * np.sin(heading), -np.cos(slope)])
+
+
+def check(mirror: Mirror, direction: np.ndarray, seed: int) -> MirrorCheck:
+    """Frames of 100 Hz, a reading in every fifth, until it is known."""
+    rng = np.random.default_rng(seed)
+    found = MirrorCheck(mirror)
+    for k in range(1000):
+        if found.hear(0.01 * k, None if k % 5 else noisy(direction, rng), mirror.base_pose):
+            assert k == 5 * (READINGS - 1)
+            return found
+    raise AssertionError("it never came to an end")
+
+
+@pytest.mark.fault("P21")
+def test_no_other_mirror_passes(measured: object) -> None:
+    """Every mirror of the telescope taken for every other one whose slope at the base differs by more than 5 deg."""
+    begun = 0
+    mirrors = [mirror_of(name) for name in MIRRORS]
+    for configured in mirrors:
+        for real in mirrors:
+            direction = np.array(real.gravity_in_robot(real.base_pose))
+            is_same = configured.overhang == real.overhang
+            for seed in range(SEEDS):
+                contradiction = check(configured, direction, seed).contradiction
+                assert is_same == (not contradiction), (configured.name, real.name, contradiction)
+                begun += not is_same and not contradiction
+    assert callable(measured)
+    measured("P21", begun)
+
+
+@pytest.mark.fault("P21")
+@pytest.mark.parametrize("name", MIRRORS)
+def test_a_slope_that_differs_by_more_than_5_deg_never_passes(name: str) -> None:
+    mirror = mirror_of(name)
+    for by_deg in (-60, -20, -10, -7, -5.5, -5, 5, 5.5, 7, 10, 20, 60):
+        for seed in range(SEEDS):
+            direction = tilted(mirror, mirror.base_pose, by_deg, 0.4 * seed)
+            assert "is this the right mirror" in check(mirror, direction, seed).contradiction, by_deg
+    for by_deg in (-1.5, 0.0, 1.5):
+        for seed in range(SEEDS):
+            assert not check(mirror, tilted(mirror, mirror.base_pose, by_deg, 0.4 * seed), seed).contradiction, by_deg
+
+
+def test_a_few_readings_of_garbage_do_no_harm() -> None:
+    mirror = mirror_of("fyst-m1")
+    found = MirrorCheck(mirror)
+    good = (0.0, *mirror.gravity_in_robot(mirror.base_pose))
+    for k in range(READINGS):
+        is_over = found.hear(0.05 * k, (0.0, 0.0, 0.0, 1.0) if k % 3 == 0 else good, mirror.base_pose)
+    assert is_over
+    assert not found.contradiction
+
+
+def test_a_robot_without_the_sensor_is_waited_for_and_told() -> None:
+    found = MirrorCheck(mirror_of("fyst-m1"))
+    pose = mirror_of("fyst-m1").base_pose
+    assert not found.hear(10.0, None, pose)
+    assert not found.hear(10.0 + 0.99 * PATIENCE_S, None, pose)
+    assert found.hear(10.0 + PATIENCE_S, None, pose)
+    assert "tells no gravity" in found.warning
+    assert not found.contradiction
+
+
+def test_a_slow_sensor_is_judged_by_what_has_come() -> None:
+    found = MirrorCheck(mirror_of("fyst-m1"))
+    pose = mirror_of("fyst-m1").base_pose
+    found.hear(0.0, (0.0, *mirror_of("fyst-m2").gravity_in_robot(pose)), pose)
+    assert found.hear(PATIENCE_S, None, pose)
+    assert "104" in found.contradiction or "deg" in found.contradiction
+
+
+DRIVE = (
+    Stop(0.0, 0.1, StopKind.CALIBRATE, reverse=True),
+    Stop(0.0, 0.0, StopKind.CALIBRATE),
+    Stop(0.0, 0.1, StopKind.CALIBRATE),
+    Stop(0.5, 0.5, StopKind.MEASURE, PointId(1, 1, 1)),
+)
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [((0.0, 0.05), True), ((0.02, 0.11), True), ((0.0, -0.02), True), ((0.04, 0.05), False), ((0.0, 0.14), False)],
+)
+def test_near_its_line_the_drive_goes_on(place: tuple[float, float], expected: bool) -> None:
+    assert is_on_drive(DRIVE, *place) is expected
+    assert not is_on_drive(DRIVE[-1:], *place)
+
+
+class Paused(SilRun):
+    """An operator holds the robot for a moment."""
+
+    def __init__(self, cfg: Config, pause_s: float) -> None:
+        super().__init__(cfg, with_track=False)
+        self.pause_s = pause_s
+
+    def _serve(self, frame: Sensors, dt_s: float) -> None:
+        super()._serve(frame, dt_s)
+        if self.pause_s <= frame.t < self.pause_s + 0.005:
+            self.mission.pause("an operator")
+        elif self.pause_s + 1.0 <= frame.t < self.pause_s + 1.005:
+            self.mission.resume()
+
+
+@pytest.mark.parametrize("pause_s", [6.0, 9.5])
+def test_a_pause_leaves_nothing_out(pause_s: float) -> None:
+    cfg = load_config(overrides={"run.panels": 1, "run.filter": "ekf"})
+    result = Paused(cfg, pause_s).run()
+    assert result.outcome == "complete"
+    assert result.summary["mission_time_s"] > result.summary["lower_bound_s"] + 0.9
+    assert result.summary["arrival_error_mm"]["max"] < 0.2

@@ -1,10 +1,82 @@
-"""Unit tests of the abort latch."""
+"""Wheels that turn though they were told to stand, and those that run down after a stall of the link."""
 
 import pytest
 
-from ccatp.core import EmergencyKind
+from ccatp.config.load import load_config
+from ccatp.control.motion_checks import MotionSum
+from ccatp.core import EmergencyKind, danger_text
 from ccatp.safety.emergency_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, EmergencyLatch, is_at_base_or_held
+from ccatp.safety.wheel_monitors import WheelMonitor
 from ccatp.survey.state import MissionState
+
+FRAME_S = 0.01
+ROLLS_M_S = 0.0054  # just above what a standing wheel may show
+
+
+def first_found_s(late_until_s: float) -> float | None:
+    """When a wheel that rolls, told to stand from the beginning, is found; the link stalls until then."""
+    cfg = load_config()
+    monitor = WheelMonitor(cfg.health, cfg.robot)
+    over_s = cfg.health.stall_time_s
+    for k in range(1, 200):
+        t_s = k * FRAME_S
+        monitor.commands.push(t_s, (0.0, 0.0, 0.0, 0.0))
+        monitor.learn(t_s)
+        now = MotionSum(t_s, ROLLS_M_S * t_s, 0.0, 0.0)
+        lately = MotionSum(over_s, ROLLS_M_S * over_s, 0.0, 0.0)
+        monitor.step(
+            now, None, lately, is_free=True, is_held=False, is_late=t_s <= late_until_s, is_sparse=False, samples=()
+        )
+        if monitor.alarm.finding is not None:
+            return t_s
+    return None
+
+
+def test_a_wheel_that_rolls_on_is_found() -> None:
+    found_s = first_found_s(0.0)
+    assert found_s is not None
+    assert found_s < 0.5
+
+
+@pytest.mark.parametrize("stalled_s", [0.4, 0.9])
+def test_after_a_stall_of_the_link_a_wheel_has_time_to_run_down(stalled_s: float) -> None:
+    found_s = first_found_s(stalled_s)
+    assert found_s is not None
+    assert stalled_s + 0.55 < found_s < stalled_s + 0.7
+
+
+@pytest.mark.parametrize(("is_held", "expected_s"), [(True, 1.4), (False, None)])
+def test_where_main_is_silent_only_a_robot_that_holds_its_wheels_shall_stand(
+    is_held: bool, expected_s: float | None
+) -> None:
+    """A robot that is permitted one direction of motion, as after an edge, may well be told to go there."""
+    cfg = load_config()
+    monitor = WheelMonitor(cfg.health, cfg.robot)
+    over_s = cfg.health.stall_time_s
+    stands, rolls = MotionSum(over_s, 0.0, 0.0, 0.0), MotionSum(over_s, ROLLS_M_S * over_s, 0.0, 0.0)
+    rolled_m = 0.0
+    for k in range(1, 300):
+        t_s = k * FRAME_S
+        is_silent = t_s > 1.0
+        if not is_silent:
+            monitor.commands.push(t_s, (0.0, 0.0, 0.0, 0.0))
+            monitor.learn(t_s)
+        is_rolling = t_s > 1.11
+        rolled_m += ROLLS_M_S * FRAME_S * is_rolling
+        monitor.step(
+            MotionSum(t_s, rolled_m, 0.0, 0.0),
+            None,
+            rolls if is_rolling else stands,
+            is_free=not is_silent,
+            is_held=is_held and is_silent,
+            is_late=False,
+            is_sparse=False,
+            samples=(),
+        )
+        if monitor.alarm.finding is not None:
+            break
+    found_s = t_s if monitor.alarm.finding is not None else None
+    assert found_s == (None if expected_s is None else pytest.approx(expected_s, abs=0.05))
 
 
 @pytest.mark.parametrize("kind", list(EmergencyKind))
@@ -115,3 +187,19 @@ def test_the_states_are_those_of_the_mission() -> None:
     assert is_at_base_or_held("held")
     assert not is_at_base_or_held("driving")
     assert not is_at_base_or_held("")
+
+
+@pytest.mark.parametrize(
+    ("cause", "signal", "value", "limit", "text"),
+    [
+        ("no estimate", "estimate", 0.15, 0.15, "no estimate: limit 0.15 s"),
+        ("estimate stale", "estimate", 0.31, 0.15, "estimate stale: 0.31 s (limit 0.15 s)"),
+        ("edge samples stale", "edge", 0.2, 0.1, "edge samples stale: 0.2 s (limit 0.1 s)"),
+        ("lifted or fallen", "edge", 4.0, 3.0, "lifted or fallen (edge): 4 (limit 3)"),
+        ("the left wheel runs away", "left_wheel", 0.5, 0.1, "the left wheel runs away: 0.5 (limit 0.1)"),
+        ("emergency: fire", "emergency:fire", 1.0, 0.0, "emergency: fire"),
+        ("", "", 0.0, 0.0, ""),
+    ],
+)
+def test_what_where_how_much(cause: str, signal: str, value: float, limit: float, text: str) -> None:
+    assert danger_text(cause, signal, value, limit) == text
