@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccatp.core import EdgeSample, GravitySample, ImuSample, WheelSample
+from ccatp.links import multiline
 from ccatp.links.robot_codec import (
     BadLine,
     decode_from_client,
@@ -246,6 +247,10 @@ def _sensors_with(**changes: object) -> bytes:
         ({"edge": [[1.0, 1, 1, 1]]}, "length 5"),
         ({"imu": [[1.0, 0.0, 1e5]]}, "imu sample out of range"),
         ({"imu": [[2e9, 0.0, 0.0]]}, "imu sample out of range"),
+        ({"imu": [[1.0, 1e5, 0.0]]}, "imu sample out of range"),
+        ({"edge": [[1e9 + 1.0, 1, 1, 1, 1]]}, "edge sample out of range"),
+        ({"gravity": [2e9, 0.0, 0.6, -0.8]}, "gravity out of range"),
+        ({"gravity": [1.0, 0.0, 1.2, -1.6]}, "gravity out of range"),
         ({"imu": [[1.0, 0.0, 0.0, 0.0]]}, "length 3"),
         ({"enc": [[1.0, 2e4, 0.0]]}, "encoder sample out of range"),
         ({"enc": [[1.0, 0.0, -2e4]]}, "encoder sample out of range"),
@@ -264,6 +269,14 @@ def _sensors_with(**changes: object) -> bytes:
 def test_sensors_out_of_range_are_refused(changes: dict[str, object], reason: str) -> None:
     with pytest.raises(BadLine, match=reason):
         decode_from_robot(_sensors_with(**changes))
+
+
+@pytest.mark.parametrize("t_s", [0.0, 1e9])
+def test_the_first_and_the_last_time_are_in_range(t_s: float) -> None:
+    changes = {"imu": [[t_s, 1e4, -1e4]], "enc": [[t_s, 1e4, None]], "edge": [[t_s, 1, 0, 1, 0]]}
+    decoded = decode_from_robot(_sensors_with(**changes))
+    assert isinstance(decoded, Sensors)
+    assert decoded.imu[0].t_s == decoded.enc[0].t_s == decoded.edge[0].t_s == t_s
 
 
 def test_unknown_keys_are_ignored_and_unknown_types_told_apart() -> None:
@@ -360,6 +373,16 @@ def test_lines_do_not_depend_on_how_the_stream_is_chopped(lines: list[bytes], da
         found += buffer.feed(stream[:cut])
         stream = stream[cut:]
     assert found == lines
+
+
+@pytest.mark.parametrize(("buffer", "limit"), [(LineBuffer(), 8192), (LineBuffer(multiline.MAX_LINE_BYTES), 65536)])
+def test_the_limits_of_both_protocols(buffer: LineBuffer, limit: int) -> None:
+    assert buffer.feed(b"x" * limit + b"\ny") == [b"x" * limit]
+    assert buffer.has_rest
+    assert buffer.feed(b"\n") == [b"y"]
+    assert not buffer.has_rest
+    with pytest.raises(LineTooLong, match=f"line of more than {limit} bytes"):
+        buffer.feed(b"x" * (limit + 1))
 
 
 def test_a_line_at_the_limit_passes_and_one_over_it_does_not() -> None:
