@@ -231,24 +231,25 @@ class BeaconCollector(Collector):
         """See ``Collector``."""
         summary = self._summary
         if isinstance(message, BeaconTrack):
-            summary.add_track(message.rows)
+            summary.track += message.rows
         elif isinstance(message, BeaconTruth):
-            summary.add_truth(message.rows)
+            summary.truth += message.rows
         elif isinstance(message, BeaconPlaces):
-            summary.set_places(message.places)
+            summary.places = message.places
         elif isinstance(message, BeaconMapMessage):
-            score = message.nis_sum, message.nis_size, message.refused
-            summary.set_map(message.beacons, score, message.notes)
+            summary.beacons, summary.notes = message.beacons, message.notes
+            summary.score = message.nis_sum, message.nis_size, message.refused
         elif isinstance(message, BeaconArrival):
-            summary.add_reached(Reached(message.seq, message.estimate))
+            summary.reached.append(Reached(message.seq, message.estimate))
         elif isinstance(message, Timing):
-            summary.add_ticks(message.tick_us)
+            summary.ticks_us += message.tick_us
         elif isinstance(message, DangerEvent):
             if message.signal and message.signal != self._signal:
-                summary.add_danger(message.signal)
+                summary.events[message.signal] += 1
             self._signal = message.signal
         elif isinstance(message, MissionStatus):
-            summary.set_mission(message.elapsed_s, message.outcome, message.cause)
+            summary.mission_time_s, summary.outcome = message.elapsed_s, message.outcome
+            summary.cause = message.cause
 
     def summary(self, wall_s: float) -> dict[str, Any]:
         """See ``Collector``."""

@@ -80,7 +80,7 @@ class SurveyTask:
             status = self._status()
             if status is not None:
                 last = status
-                session.data = shown(status)
+                session.data = msgspec.to_builtins(status)
             elif child is None:  # it was there, and is gone
                 break
             elif last is None and time.monotonic() > deadline_s:
@@ -105,7 +105,7 @@ class SurveyTask:
         except CcatpError as error:
             return False, str(error)
         if session is not None:
-            session.data = shown(status)
+            session.data = msgspec.to_builtins(status)
         return True, f"{order}: {status.state}"
 
     def monitor(self, session: OcsSession, publish: Callable[[dict[str, Any]], None], period_s: float) -> Answer:
@@ -118,7 +118,7 @@ class SurveyTask:
                 publish({"timestamp": now_s, "block_name": "survey", "data": feed_fields(status)})
             session.data = {"timestamp": now_s, "running": status is not None}
             if status is not None:
-                session.data |= shown(status)
+                session.data |= msgspec.to_builtins(status)
             until_s = time.monotonic() + period_s
             while session.status in ("starting", "running") and time.monotonic() < until_s:
                 time.sleep(min(0.1, period_s))
@@ -129,12 +129,6 @@ class SurveyTask:
             return self.client.status()
         except DaemonUnreachableError:
             return None
-
-
-def shown(status: MissionStatus) -> dict[str, Any]:
-    """The whole status as a session shows it."""
-    found: dict[str, Any] = msgspec.to_builtins(status)
-    return found
 
 
 def feed_fields(status: MissionStatus) -> dict[str, Any]:

@@ -1,6 +1,8 @@
 """``summary.json`` of a mission among beacons: figures of merit against the truth where that is known."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,68 +63,45 @@ class Reached(NamedTuple):
     estimate: tuple[float, float, float, float, float]
 
 
+@dataclass(slots=True)
 class BeaconSummary:
-    """Collects a run."""
+    """Collects a run.
 
-    def __init__(self, facts: BeaconFacts) -> None:
-        self._facts = facts
-        self._track: list[Sequence[float]] = []
-        self._truth: list[Sequence[float | None]] = []
-        self._places: Mapping[str, tuple[float, float]] = {}
-        self._beacons: Mapping[str, Sequence[float]] = {}
-        self._reached: list[Reached] = []
-        self._score = (0.0, 0, 0)
-        self._notes: Mapping[str, float] = {}
-        self._events: dict[str, int] = {}
-        self._mission_time_s = 0.0
-        self._outcome, self._cause = "", ""
-        self._ticks_us: list[float] = []
+    Attributes:
+        track, truth: rows of the topics ``beacon_track`` and ``beacon_truth``.
+        places: true places of radios and motes.
+        beacons: ellipses of the newest map, by name.
+        score: of the newest map: sum of NIS, its degrees of freedom, readings refused.
+        events: how often the danger loop began to deny motion, by the signal.
+        mission_time_s: by the robot's clock.
+        ticks_us: wall times of main-loop ticks.
+    """
 
-    def add_track(self, rows: Sequence[Sequence[float]]) -> None:
-        """Add rows of the topic ``beacon_track``."""
-        self._track += rows
-
-    def add_truth(self, rows: Sequence[Sequence[float | None]]) -> None:
-        """Add rows of the topic ``beacon_truth``."""
-        self._truth += rows
-
-    def set_places(self, places: Mapping[str, tuple[float, float]]) -> None:
-        """True places of radios and motes."""
-        self._places = places
-
-    def set_map(
-        self, beacons: Mapping[str, Sequence[float]], score: tuple[float, int, int], notes: Mapping[str, float]
-    ) -> None:
-        """The newest map: ellipses by name; sum of NIS, its degrees of freedom, readings refused; notes."""
-        self._beacons, self._score, self._notes = beacons, score, notes
-
-    def add_reached(self, reached: Reached) -> None:
-        """A waypoint is reached."""
-        self._reached.append(reached)
-
-    def add_danger(self, signal: str) -> None:
-        """The danger loop began to deny motion because of ``signal``."""
-        self._events[signal] = self._events.get(signal, 0) + 1
-
-    def add_ticks(self, tick_us: Sequence[float]) -> None:
-        """Wall times of main-loop ticks, microseconds."""
-        self._ticks_us += tick_us
-
-    def set_mission(self, mission_time_s: float, outcome: str, cause: str) -> None:
-        """How long it took by the robot's clock, and how it ended."""
-        self._mission_time_s, self._outcome, self._cause = mission_time_s, outcome, cause
+    facts: BeaconFacts
+    track: list[Sequence[float]] = field(default_factory=list)
+    truth: list[Sequence[float | None]] = field(default_factory=list)
+    places: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    beacons: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    score: tuple[float, int, int] = (0.0, 0, 0)
+    notes: Mapping[str, float] = field(default_factory=dict)
+    reached: list[Reached] = field(default_factory=list)
+    events: Counter[str] = field(default_factory=Counter)
+    mission_time_s: float = 0.0
+    outcome: str = ""
+    cause: str = ""
+    ticks_us: list[float] = field(default_factory=list)
 
     def build(self, wall_s: float) -> dict[str, Any]:
         """The summary; lengths in m, angles in rad, times in s. Values that need the truth are null without it."""
-        facts = self._facts
-        track = pose_track(table(self._track, TRACK_COLUMNS))
-        truth = pose_truth(table(self._truth, TRUTH_COLUMNS))
+        facts = self.facts
+        track = pose_track(table(self.track, TRACK_COLUMNS))
+        truth = pose_truth(table(self.truth, TRUTH_COLUMNS))
         if len(track.seq):  # the last drive may have been driven, or not
             truth = truth.at(truth.seq <= track.seq[-1])
         _, i, j = np.intersect1d(track.seq, truth.seq, return_indices=True)
         track, true = track.at(i), truth.at(j)
         # A robot that stands until motes have mapped themselves navigates from then on.
-        is_navigating = track.t_s >= self._notes.get("map_time_s", 0.0)
+        is_navigating = track.t_s >= self.notes.get("map_time_s", 0.0)
         if is_navigating.any():
             track, true = track.at(is_navigating), true.at(is_navigating)
         known = facts.has_truth and len(true.seq) > 0
@@ -130,8 +109,8 @@ class BeaconSummary:
         return {
             "system": facts.system,
             "seed": facts.seed,
-            "outcome": self._outcome,
-            "cause": self._cause,
+            "outcome": self.outcome,
+            "cause": self.cause,
             "waypoints": self._waypoints(truth if known else None),
             "trajectory_rmse_m": rounded(aligned_rms_m(track.place_m, true.place_m)) if known else None,
             "position_error_m": _distribution(np.hypot(errors[:, 0], errors[:, 1]), known=known),
@@ -143,14 +122,14 @@ class BeaconSummary:
             "obstacles": _obstacle_figures(truth, known=known),
             "consistency": {
                 "pose_nees_mean": rounded(np.mean(nees(errors, track.covariance))) if known else None,
-                "nis_mean": rounded(self._score[0] / self._score[1]) if self._score[1] else None,
-                "readings": self._score[1],
-                "refused": self._score[2],
+                "nis_mean": rounded(self.score[0] / self.score[1]) if self.score[1] else None,
+                "readings": self.score[1],
+                "refused": self.score[2],
             },
-            "danger": dict(sorted(self._events.items())),
-            "map": {name: rounded(value) for name, value in sorted(self._notes.items())},
-            "mission_time_s": rounded(self._mission_time_s, 3),
-            "wall": wall_figures(self._mission_time_s, wall_s, self._ticks_us),
+            "danger": dict(sorted(self.events.items())),
+            "map": {name: rounded(value) for name, value in sorted(self.notes.items())},
+            "mission_time_s": rounded(self.mission_time_s, 3),
+            "wall": wall_figures(self.mission_time_s, wall_s, self.ticks_us),
         }
 
     def _waypoints(self, truth: PoseTruth | None) -> dict[str, Any]:
@@ -158,19 +137,19 @@ class BeaconSummary:
         within: int | None = None
         if truth is not None:
             places = dict(zip(truth.seq.astype(int).tolist(), truth.place_m, strict=True))
-            within = sum(_sigmas(one, places[one.seq]) <= WITHIN_SIGMAS for one in self._reached if one.seq in places)
-        return {"total": self._facts.waypoints, "reached": len(self._reached), "within_3_sigma": within}
+            within = sum(_sigmas(one, places[one.seq]) <= WITHIN_SIGMAS for one in self.reached if one.seq in places)
+        return {"total": self.facts.waypoints, "reached": len(self.reached), "within_3_sigma": within}
 
     def _beacon_figures(self, *, known: bool) -> dict[str, Any]:
-        found = {name: place for name, place in self._beacons.items() if name != self._facts.target}
+        found = {name: place for name, place in self.beacons.items() if name != self.facts.target}
         errors, nees = [], []
         for name, (x, y, xx, xy, yy) in sorted(found.items()) if known else ():
-            if name in self._places:
-                off = np.subtract((x, y), self._places[name])
+            if name in self.places:
+                off = np.subtract((x, y), self.places[name])
                 errors.append(float(np.hypot(*off)))
                 nees.append(float(off @ np.linalg.pinv(np.array(((xx, xy), (xy, yy)))) @ off))
         return {
-            "count": len(self._places) if known else None,
+            "count": len(self.places) if known else None,
             "mapped": len(found),
             "rmse_m": rounded(np.sqrt(np.mean(np.square(errors)))) if errors else None,
             "max_m": rounded(max(errors)) if errors else None,
@@ -179,13 +158,13 @@ class BeaconSummary:
         }
 
     def _target_figures(self, truth: PoseTruth, *, known: bool) -> dict[str, Any] | None:
-        safe_m = self._facts.safe_distance_m
+        safe_m = self.facts.safe_distance_m
         if safe_m is None:
             return None
-        late = truth.at((truth.t_s >= self._facts.settled_s) & np.isfinite(truth.target_m[:, 0]) & known)
+        late = truth.at((truth.t_s >= self.facts.settled_s) & np.isfinite(truth.target_m[:, 0]) & known)
         distances = np.hypot(*(late.place_m - late.target_m).T)
         error_m = None
-        place = self._beacons.get(self._facts.target)
+        place = self.beacons.get(self.facts.target)
         if known and place is not None:
             error_m = rounded(np.hypot(*(place[:2] - truth.target_m[-1])))
         return {

@@ -97,7 +97,7 @@ class BeaconSilWorld:
         drive = HALT if self.mission.state is DONE else drive
         self._note(sensors, verdict, drive)
         for arrival in self.mission.arrivals[before:]:
-            self._summary.add_reached(Reached(sensors.seq, arrival.belief.ellipse))
+            self._summary.reached.append(Reached(sensors.seq, arrival.belief.ellipse))
         if not self.is_over:
             right, left, steer = wheel_rates(drive, self._cfg)
             self.robot.permit(sensors.seq + 1, verdict.forward, verdict.reverse, verdict.turn)
@@ -108,7 +108,7 @@ class BeaconSilWorld:
     def _note(self, sensors: Sensors, verdict: Verdict, drive: SteeringCommand) -> None:
         found, mission = self.found, self.mission
         if verdict.signal and verdict.signal != self._signal:
-            self._summary.add_danger(verdict.signal)
+            self._summary.events[verdict.signal] += 1
         self._signal = verdict.signal
         if is_estimate_due(sensors.seq):
             belief = mission.navigator.belief
@@ -128,13 +128,10 @@ class BeaconSilWorld:
         found, mission, summary = self.found, self.mission, self._summary
         found.outcome, found.cause = str(mission.outcome), mission.cause
         score = mission.navigator.score
-        summary.add_track(found.track)
-        summary.add_truth(found.truth)
-        summary.set_places(self.robot.truth_preface()[1].places)
-        summary.set_map(
-            mission.navigator.beacons, (score.nis_sum, score.nis_size, score.refused), mission.navigator.notes
-        )
-        summary.set_mission(found.times_s[-1], found.outcome, found.cause)
+        summary.track, summary.truth = list(found.track), list(found.truth)
+        summary.places, summary.beacons = self.robot.truth_preface()[1].places, mission.navigator.beacons
+        summary.score, summary.notes = (score.nis_sum, score.nis_size, score.refused), mission.navigator.notes
+        summary.mission_time_s, summary.outcome, summary.cause = found.times_s[-1], found.outcome, found.cause
         found.summary = summary.build(0.0)
         return found
 

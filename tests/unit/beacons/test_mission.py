@@ -250,7 +250,8 @@ def test_a_mirror_robot_is_no_beacon_robot(cfg: RadioConfig) -> None:
 def test_a_summary_without_truth_holds_what_needs_none(cfg: RadioConfig) -> None:
     book = BeaconSummary(beacon_facts(cfg, is_sim=False))
     navigator = BeaconMission(cfg).navigator
-    book.set_map({"beacon1": (0.1, 0.2, 0.01, 0.0, 0.01)}, (2.0, 2, 0), navigator.notes)
+    book.beacons, book.score = {"beacon1": (0.1, 0.2, 0.01, 0.0, 0.01)}, (2.0, 2, 0)
+    book.notes = navigator.notes
     summary = book.build(1.0)
     assert summary["trajectory_rmse_m"] is None
     assert summary["position_error_m"]["max"] is None

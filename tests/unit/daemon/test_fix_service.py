@@ -38,33 +38,33 @@ class Refusing:
 
 
 async def measured_once(
-    config: Config, localizer: Refusing, mission: object, store: object, teller: object, point: PointId | None
+    config: Config, localizer: Refusing, mission: object, store: object, telemetry: object, point: PointId | None
 ) -> None:
-    """One request to a desk whose laser system always answers, until it is over."""
+    """One request to a service whose laser system always answers, until it is over."""
 
     async def measure(t_s: float, expected_m: Any) -> Fix:
         return FIX
 
     over = asyncio.Event()
-    desk = FixService(
+    service = FixService(
         config.mission,
         cast(EtalonClient, SimpleNamespace(measure=measure)),
         cast(FixGate, SimpleNamespace(begin=lambda: None, review=lambda *_, **__: FixFinding())),
         cast(Localizer, localizer),
         cast(Mission, mission),
         cast(MissionStore, store),
-        cast(SurveyTelemetry, teller),
+        cast(SurveyTelemetry, telemetry),
         over.set,
         lambda: 0.0,
     )
-    serving = asyncio.get_running_loop().create_task(desk.run())
-    desk.begin(FixRequest(1, 1.0, point, (0.0, 0.0, 0.0), DeckPose(0.0, 0.0, 0.0)))
+    serving = asyncio.get_running_loop().create_task(service.run())
+    service.begin(FixRequest(1, 1.0, point, (0.0, 0.0, 0.0), DeckPose(0.0, 0.0, 0.0)))
     async with asyncio.timeout(10.0):
         await over.wait()
     serving.cancel()
 
 
-async def told_fixes(config: Config, *refusals: Exception) -> list[tuple[bool, bool]]:
+async def published_fixes(config: Config, *refusals: Exception) -> list[tuple[bool, bool]]:
     told: list[tuple[bool, bool]] = []
 
     def fix(point: Any, fix: Fix, jump_m: float, *, is_fused: bool, is_set_aside: bool) -> None:
@@ -73,8 +73,8 @@ async def told_fixes(config: Config, *refusals: Exception) -> list[tuple[bool, b
     mission = SimpleNamespace(
         is_awaiting_fix=True, request=1, is_lost=True, fixed=lambda point: None, not_fixed=lambda point, cause: None
     )
-    teller = SimpleNamespace(publish_fix=fix, notify_operator=lambda level, text: None)
-    await measured_once(config, Refusing(*refusals), mission, SimpleNamespace(), teller, None)
+    telemetry = SimpleNamespace(publish_fix=fix, notify_operator=lambda level, text: None)
+    await measured_once(config, Refusing(*refusals), mission, SimpleNamespace(), telemetry, None)
     return told
 
 
@@ -85,10 +85,10 @@ async def told_fixes(config: Config, *refusals: Exception) -> list[tuple[bool, b
 async def test_every_fix_that_the_localizer_saw_is_told(
     refusals: list[Exception], told: list[bool], config: Config
 ) -> None:
-    assert await told_fixes(config, *refusals) == [(is_fused, False) for is_fused in told]
+    assert await published_fixes(config, *refusals) == [(is_fused, False) for is_fused in told]
 
 
-async def test_a_point_that_is_measured_already_is_done_and_nobody_has_to_be_waited_for(config: Config) -> None:
+async def test_a_point_that_is_measured_already_is_done_and_needs_no_operator(config: Config) -> None:
     point, done, said = PointId(1, 2, 4), list[PointId](), list[str]()
     mission = SimpleNamespace(
         is_awaiting_fix=True, request=1, is_lost=False, fixed=done.append, fault=said.append,
@@ -98,6 +98,8 @@ async def test_a_point_that_is_measured_already_is_done_and_nobody_has_to_be_wai
     refused.set_exception(AlreadyMeasuredError("point 1/2/4 has been measured; its fix is not replaced"))
     localizer = Refusing()
     localizer.pose = None  # type: ignore[attr-defined]
-    teller = SimpleNamespace(publish_fix=lambda *_, **__: None, notify_operator=lambda level, text: said.append(level))
-    await measured_once(config, localizer, mission, SimpleNamespace(record_fix=lambda *_: refused), teller, point)
+    telemetry = SimpleNamespace(
+        publish_fix=lambda *_, **__: None, notify_operator=lambda level, text: said.append(level)
+    )
+    await measured_once(config, localizer, mission, SimpleNamespace(record_fix=lambda *_: refused), telemetry, point)
     assert (done, said) == ([point], ["warning"])

@@ -5,6 +5,7 @@ import os
 import socket
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -69,51 +70,45 @@ def run_until_told(children: ProcessManager, said: list[str], lines: int) -> obj
     return None
 
 
-@pytest.mark.usefixtures("child")
-def test_it_is_restarted_and_then_done_without(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    monkeypatch.setenv("STATUS", "1")
+def children_of(config: Config, said: list[str]) -> ProcessManager:
     children = ProcessManager(config.run, lambda _spec, _is_restarted: ([], ()), lambda _level, text: said.append(text))
     children.start(SPEC)
-    assert run_until_told(children, said, config.run.restart_limit + 1) is None
-    assert said[0] == "process page ended with status 1: restarting it, the survey goes on"
-    assert said[-1].endswith("more than 3 times within 60 s: the survey goes on without it")
-    assert children.fds == []
+    return children
+
+
+@pytest.mark.usefixtures("child")
+@pytest.mark.parametrize(
+    ("status", "first", "last", "restarts"),
+    [
+        (1, "ended with status 1: restarting it, the survey goes on", "more than 3 times within 60 s", 3),
+        (2, "ended with status 2: the survey goes on without it", "the survey goes on without it", 0),  # final
+    ],
+)
+def test_a_process_that_is_not_needed(
+    config: Config, monkeypatch: pytest.MonkeyPatch, status: int, first: str, last: str, restarts: int
+) -> None:
+    said: list[str] = []
+    monkeypatch.setenv("STATUS", str(status))
+    children = children_of(config, said)
+    assert run_until_told(children, said, restarts + 1) is None
+    assert said[0] == f"process page {first}"
+    assert last in said[-1]
+    assert (children.restarts, children.fds) == (restarts, [])
     assert children.poll(time.monotonic()) is None
-    assert not children.is_recovering(time.monotonic())  # nobody waits for it
+    assert not children.is_recovering(time.monotonic())
     children.stop_all()
 
 
 @pytest.mark.usefixtures("child")
-def test_what_it_would_say_again_is_not_tried_again(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    monkeypatch.setenv("STATUS", "2")
-    children = ProcessManager(config.run, lambda _spec, _is_restarted: ([], ()), lambda _level, text: said.append(text))
-    children.start(SPEC)
-    assert run_until_told(children, said, 1) is None
-    assert said == ["process page ended with status 2: the survey goes on without it"]
-    assert children.restarts == 0
-
-
-@pytest.mark.usefixtures("child")
-def test_it_is_nicer_than_its_parent_from_the_start(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("STATUS", "0")
-    children = ProcessManager(config.run, lambda _spec, _is_restarted: ([], ()), lambda _level, _text: None)
-    children.start(SPEC)
-    (found,) = children._children.values()
-    own = os.getpriority(os.PRIO_PROCESS, 0)
-    assert os.getpriority(os.PRIO_PROCESS, found.process.pid) == min(own + 7, 19)
-    children.kill_all()
-
-
-@pytest.mark.usefixtures("child")
-def test_the_last_to_be_stopped_has_its_time(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_niceness_and_the_time_of_the_last_process(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     monkeypatch.setenv("STATUS", "0")
     monkeypatch.setattr("ccatp.daemon.child_processes.STOP_TIMEOUT_S", 0.0)  # others have used it up
     monkeypatch.setattr("ccatp.daemon.child_processes.LEAST_STOP_S", 30.0)
-    children = ProcessManager(config.run, lambda _spec, _is_restarted: ([], ()), lambda _level, text: said.append(text))
-    children.start(SPEC)
+    children = children_of(config, said)
+    (found,) = children._children.values()
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    assert os.getpriority(os.PRIO_PROCESS, found.process.pid) == min(own + 7, 19)
     children.stop_all()
     children.kill_all()
     assert said == []
@@ -133,21 +128,21 @@ def test_a_crash_loop_ends_and_rare_deaths_do_not() -> None:
     assert {seldom.died("main", -9, 21.0 * k).end for k in range(50)} == {ProcessEnd.RESTART}
 
 
-@pytest.mark.parametrize("code", [2, 5])
-def test_what_would_be_said_again_is_not_tried_again(code: int) -> None:
-    assert RestartPolicy(3, 60.0).died("main", code, 0.0).end is ProcessEnd.END
-
-
-def test_the_robot_itself_has_no_substitute() -> None:
-    decision = RestartPolicy(3, 60.0).died("dataloop", -11, 0.0, is_replaceable=False)
-    assert decision == (ProcessEnd.HELD, "process dataloop was killed by SIGSEGV: run ended, wheels held")
-
-
-def test_how_it_died_is_told() -> None:
-    policy = RestartPolicy(9, 60.0)
-    assert "ended with status 1:" in policy.died("main", 1, 0.0).text
-    assert "was killed by signal 40:" in policy.died("main", -40, 0.0).text
-    assert "hung:" in policy.died("main", -9, 0.0, why="hung").text
+@pytest.mark.parametrize(
+    ("code", "options", "end", "text"),
+    [
+        (2, {}, ProcessEnd.END, "ended with status 2"),  # would end alike
+        (5, {}, ProcessEnd.END, "ended with status 5"),
+        (-11, {"is_replaceable": False}, ProcessEnd.HELD, "was killed by SIGSEGV: run ended, wheels held"),
+        (1, {}, ProcessEnd.RESTART, "ended with status 1: restarting it, wheels held meanwhile"),
+        (-40, {}, ProcessEnd.RESTART, "was killed by signal 40: restarting it, wheels held meanwhile"),
+        (-9, {"why": "hung"}, ProcessEnd.RESTART, "hung: restarting it, wheels held meanwhile"),
+        (-9, {"is_needed": False}, ProcessEnd.RESTART, "was killed by SIGKILL: restarting it, the survey goes on"),
+        (2, {"is_needed": False}, ProcessEnd.WITHOUT, "ended with status 2: the survey goes on without it"),
+    ],
+)
+def test_the_decision_on_a_death(code: int, options: dict[str, Any], end: ProcessEnd, text: str) -> None:
+    assert RestartPolicy(3, 60.0).died("main", code, 0.0, **options) == (end, f"process main {text}")
 
 
 @pytest.mark.fault("P7")
@@ -172,15 +167,10 @@ def test_a_start_may_take_longer() -> None:
     assert watch.text == "sent no heartbeat for 1 s and was killed"
 
 
-def test_a_run_goes_on_without_what_it_does_not_need() -> None:
+def test_a_run_goes_on_without_a_page_that_dies_again() -> None:
     policy = RestartPolicy(1, 60.0)
-    again = policy.died("dashboard", -9, 0.0, is_needed=False)
-    assert again == (
-        ProcessEnd.RESTART,
-        "process dashboard was killed by SIGKILL: restarting it, the survey goes on",
-    )
-    assert policy.died("dashboard", -9, 1.0, is_needed=False).end is ProcessEnd.WITHOUT
-    assert policy.died("dashboard", 2, 99.0, is_needed=False).end is ProcessEnd.WITHOUT
+    ends = [policy.died("dashboard", -9, t_s, is_needed=False).end for t_s in (0.0, 1.0)]
+    assert ends == [ProcessEnd.RESTART, ProcessEnd.WITHOUT]
 
 
 def test_none_is_wanted(config: Config) -> None:

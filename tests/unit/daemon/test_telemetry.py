@@ -21,16 +21,16 @@ class Listener:
     """Takes what is published."""
 
     def __init__(self) -> None:
-        self.heard: list[tuple[str, Message]] = []
+        self.received: list[tuple[str, Message]] = []
 
     def send(self, name: str, message: Message) -> None:
-        self.heard.append((name, message))
+        self.received.append((name, message))
 
     def of(self, name: str) -> list[Any]:
-        return [message for topic, message in self.heard if topic == name]
+        return [message for topic, message in self.received if topic == name]
 
 
-def teller() -> tuple[SurveyTelemetry, Listener]:
+def survey_telemetry() -> tuple[SurveyTelemetry, Listener]:
     listener = Listener()
     return SurveyTelemetry(cast(Publisher, listener), structlog.get_logger()), listener
 
@@ -41,11 +41,11 @@ def localizer() -> Localizer:
 
 
 def test_a_frame_that_is_not_newer_is_recorded_without_an_estimate() -> None:
-    tells, listener = teller()
-    tells.publish_frame(7, 1.0, localizer(), "driving", b'{"seq":7}')
-    tells.stale_frame(8, b'{"seq":8}')
-    tells.publish_frame(9, 1.01, localizer(), "driving", b'{"seq":9}')
-    tells.flush()
+    telemetry, listener = survey_telemetry()
+    telemetry.publish_frame(7, 1.0, localizer(), "driving", b'{"seq":7}')
+    telemetry.stale_frame(8, b'{"seq":8}')
+    telemetry.publish_frame(9, 1.01, localizer(), "driving", b'{"seq":9}')
+    telemetry.flush()
     (lines,), (track,) = listener.of("sensors"), listener.of("track")
     assert isinstance(lines, SensorLines)
     assert isinstance(track, TrackMessage)
@@ -54,19 +54,19 @@ def test_a_frame_that_is_not_newer_is_recorded_without_an_estimate() -> None:
 
 
 def test_stale_frames_alone_are_no_batch_of_estimates() -> None:
-    tells, listener = teller()
+    telemetry, listener = survey_telemetry()
     for seq in range(BATCH_FRAMES):
-        tells.stale_frame(seq, b"{}")
+        telemetry.stale_frame(seq, b"{}")
     assert len(listener.of("sensors")) == 1
     assert not listener.of("track")
     assert not listener.of("timing")
 
 
 def test_a_fix_belongs_behind_the_last_frame_whatever_it_was() -> None:
-    tells, listener = teller()
-    tells.publish_frame(7, 1.0, localizer(), "measuring", b"{}")
-    tells.stale_frame(8, b"{}")
-    tells.publish_fix(None, Fix(1.0, (0.0, 0.0, 0.0), (0.0,) * 9, 1.0, (1,), 0.0), 0.0, is_fused=False)
+    telemetry, listener = survey_telemetry()
+    telemetry.publish_frame(7, 1.0, localizer(), "measuring", b"{}")
+    telemetry.stale_frame(8, b"{}")
+    telemetry.publish_fix(None, Fix(1.0, (0.0, 0.0, 0.0), (0.0,) * 9, 1.0, (1,), 0.0), 0.0, is_fused=False)
     (fix,) = listener.of("fix")
     assert isinstance(fix, FixMessage)
     assert (fix.seq, fix.is_fused) == (8, False)
@@ -82,29 +82,29 @@ def test_a_display_state_for_a_subscriber_only(config: Config, tmp_path: Path) -
     endpoint = f"ipc://{tmp_path}/main"
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     publisher = Publisher(context, endpoint)
-    painter = SurveyTelemetry(publisher, structlog.get_logger())
+    telemetry = SurveyTelemetry(publisher, structlog.get_logger())
     subscriber = Subscriber(context, [endpoint], ["display_state"], keeps_newest=True)
     try:
         while not publisher.has_subscriber("display_state"):
             pass
-        painter.publish_status(STATUS)  # before the first frame
+        telemetry.publish_status(STATUS)  # before the first frame
         for seq in (2, 3):
-            painter.publish_frame(seq, 0.1 * seq, localizer, "driving", LINE)
-            painter.publish_status(STATUS)
+            telemetry.publish_frame(seq, 0.1 * seq, localizer, "driving", LINE)
+            telemetry.publish_status(STATUS)
         received = subscriber.receive(5.0)
         while received is not None and isinstance(received[1], DisplayState) and received[1].seq < 3:
             received = subscriber.receive(5.0)
         assert received is not None
-        picture = received[1]
-        assert isinstance(picture, DisplayState)
+        state = received[1]
+        assert isinstance(state, DisplayState)
         base = mirror.base_pose
-        assert (picture.x_m, picture.y_m) == (base.x_m, base.y_m)
-        assert bytes(picture.line) == LINE
-        assert picture.covariance_m2[0] > 0.0
+        assert (state.x_m, state.y_m) == (base.x_m, base.y_m)
+        assert bytes(state.line) == LINE
+        assert state.covariance_m2[0] > 0.0
         subscriber.close()
         while publisher.has_subscriber("display_state"):
             pass
-        painter.publish_status(STATUS)  # without a subscriber nothing is put together
+        telemetry.publish_status(STATUS)  # without a subscriber nothing is put together
     finally:
         subscriber.close()
         publisher.close()
