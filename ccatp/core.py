@@ -117,7 +117,7 @@ class Severity(IntEnum):
     """How grave a finding is; of several the gravest counts."""
 
     NONE = 0
-    INFORM = 1  # is told, and nothing else
+    INFORM = 1  # is reported, and nothing else
     SLOW = 2  # go on at reduced speed
     PAUSE = 3  # hold the wheels, go on as soon as it is over
     HOLD = 4  # hold the wheels, go on when it is over and a fix was had

@@ -122,7 +122,7 @@ class ImuGate:
         self.reset()
 
     def reset(self) -> None:
-        """The clock began anew."""
+        """The clock was reset."""
         self._ax = self._wz = inf
         self._same_ax = self._same_wz = self._different = 0
         self._is_noisy = False

@@ -140,7 +140,7 @@ class BareAxis:
         self.duration_s = self.overtime_s = 0.0
 
     def begin(self, remaining: float) -> None:
-        """Start anew."""
+        """Start again."""
         self._pid.reset()
         self.duration_s = Profile.rest_to_rest(remaining, self._v_max, self._a_max).duration_s
 

@@ -63,7 +63,7 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
         self._panel = PanelFrame(mirror, start.panel)
         self._refused: list[FloatArray] = []
         self._fixed_m: FloatArray | None = None  # where the last fix that counted was
-        self._is_anew = False  # no fix has agreed since it began anew
+        self._is_anew = False  # no fix has agreed since it began again
         self._is_new_base = False
         self._turned = (0.0, 0.0)
         self._half_s = 0.0

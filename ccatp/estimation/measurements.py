@@ -248,7 +248,7 @@ class ZeroVelocityDetector:
         return self._count
 
     def take(self) -> ZeroVelocityReading:
-        """The means so far; collecting begins anew."""
+        """The means so far; collecting begins again."""
         n = max(self._count, 1)
         found = ZeroVelocityReading(
             self._count, self._rate / n, self._acceleration / n, self._gravity_count, atan2(self._gy, self._gx)

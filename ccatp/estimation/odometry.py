@@ -226,7 +226,7 @@ class Preintegrator:
         self._last = (ax, wz)
 
     def take(self) -> PreintegratedMotion:
-        """The block so far; gathering begins anew."""
+        """The block so far; gathering begins again."""
         n = self._samples
         rate = acceleration = None
         if n:
@@ -367,7 +367,7 @@ class WheelAngle:
         return self.is_counter
 
     def take_gap(self) -> float:
-        """What may be wrong with the angle for want of samples, rad; told once."""
+        """What may be wrong with the angle for want of samples, rad; reset by the call."""
         gap_rad, self._gap_rad = self._gap_rad, 0.0
         return gap_rad
 

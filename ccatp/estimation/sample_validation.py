@@ -13,7 +13,7 @@ WheelColumns = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
 MAX_FRAME_STEP_S = 0.1
 """A frame further than this from the last one is a jump of the robot's clock or a gap in the link."""
 LONGEST_GAP_S = 0.4
-"""After so long without a drive the robot stands, whatever it was told: its time-to-live and the wheels' run-down."""
+"""After so long without a drive the robot stands whatever the last one was: its time-to-live and the run-down."""
 BACKWARD_LIMIT = 5
 """This many backward time stamps in a row ask for a hold."""
 _ROUNDING_S = 1e-6

@@ -271,7 +271,7 @@ class SeamLines:
         self._edges: dict[int, tuple[str, float, PanelId]] = {}
 
     def forget(self) -> None:
-        """The pose was found anew: the offsets belong to another one."""
+        """The pose was found again: the offsets belong to another one."""
         self._edges.clear()
 
     def meet(self, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope) -> Edge | None:

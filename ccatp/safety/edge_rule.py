@@ -63,7 +63,7 @@ class EdgeRule:
         self.reset()
 
     def reset(self) -> None:
-        """Forget episodes, odometry and times: the robot's clock began anew."""
+        """Forget episodes, odometry and times: the robot's clock was reset."""
         self.track.reset()
         self.episodes: tuple[EdgeDetector | None, ...] = (None, None, None, None)
         self._odometry: Odometry | None = None
@@ -189,7 +189,7 @@ class EdgeRule:
             self.reset_episodes()
 
     def reset_episodes(self) -> None:
-        """Begin anew on the panels: the robot has been put back."""
+        """Begin again on the panels: the robot has been put back."""
         self.is_lifted = False
         self.episodes = (None, None, None, None)
 
@@ -237,7 +237,7 @@ class CentreClearanceCheck:
         self.reset()
 
     def reset(self) -> None:
-        """Forget: the robot's clock began anew."""
+        """Forget: the robot's clock was reset."""
         self.direction = 0
         self.clearance_m, self.limit_m = inf, 0.0
         self._look_at_s = -inf

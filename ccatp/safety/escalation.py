@@ -98,7 +98,7 @@ class SeverityEscalation:
         self._held: dict[str, deque[float]] = {}
 
     def reset(self) -> None:
-        """The robot's clock began anew; what came back before does not count."""
+        """The robot's clock was reset; what came back before does not count."""
         self._since_s.clear()
         self._held.clear()
 

@@ -28,7 +28,7 @@ class SteadyTime:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew: another boot of the robot."""
+        """Begin again: another boot of the robot."""
         self._seq, self._t_s = -1, 0.0
         self._period_s = 0.0
         self.offset_s = self._before_s = 0.0

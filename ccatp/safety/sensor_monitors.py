@@ -101,7 +101,7 @@ class RateMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """Learn anew."""
+        """Learn again."""
         self.finding: MonitorFinding | None = None
         self.are_encoders_sparse = False
         self._begin_s: float | None = None
@@ -150,7 +150,7 @@ class LatencyMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """Another session: drives are numbered anew."""
+        """Another session: drives are numbered from the start."""
         self.alarm.reset()
         self._sent: deque[tuple[int, float]] = deque(maxlen=64)
 
@@ -348,7 +348,7 @@ class BatteryMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """The clock began anew."""
+        """The clock was reset."""
         self._low, self._told = Since(), Since()
 
     def step(self, t_s: float, soc: float, is_told: bool, home_m: float) -> None:
@@ -376,7 +376,7 @@ class OwnFaults:
         self.alarms.clear()
 
     def step(self, t_s: float, faults: Sequence[str]) -> None:
-        """Take the names of a frame; unknown ones are told."""
+        """Take the names of a frame; unknown ones are reported."""
         for name in faults:
             if name in _FANS or name == "battery_low":
                 continue

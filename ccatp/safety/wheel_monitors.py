@@ -42,7 +42,7 @@ class Span(NamedTuple):
 
 
 class Commands:
-    """What the wheels were told lately."""
+    """Recent set points of the wheels."""
 
     def __init__(self, wheel_radius_m: float) -> None:
         self._radius_m = wheel_radius_m
@@ -147,7 +147,7 @@ class WheelMonitor:
         self.alarm.settle(t_s)
 
     def _told(self, t_s: float) -> Span | None:
-        """What the wheels were told lately; ``None`` where that is not known."""
+        """Recent set points of the wheels; ``None`` where they are not known."""
         lately = self._lately
         if lately is not None and t_s - lately.t_s <= _LATENCY_S:
             return lately
@@ -198,7 +198,7 @@ class WheelMonitor:
         return low >= limit or high <= -limit
 
     def _find_creep(self, now: MotionSum, moved: MotionSum, told: Span, samples: Sequence[WheelSample]) -> None:
-        """Told to stand, and it does not. While the link stalls the robot goes on as told last, and then runs down."""
+        """Motion against a set point of zero. While the link stalls the robot keeps its last command, then stops."""
         runs_down_s = _MEMORY_S + self._cfg.stall_time_s
         is_running_down = self._late_s is not None and now.t_s - self._late_s < runs_down_s
         if is_running_down or told[1:] != (0.0, 0.0, 0.0, 0.0):

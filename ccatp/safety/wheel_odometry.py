@@ -39,7 +39,7 @@ class WheelTrack:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything (the robot's clock began anew)."""
+        """Forget everything (the robot's clock was reset)."""
         self._frames: deque[Sequence[WheelSample]] = deque(maxlen=HISTORY_FRAMES)
         self._right = self._left = 0.0
         self._right_t_s = self._left_t_s = self._heard_t_s = -inf

@@ -36,7 +36,7 @@ class FixPlausibility:
         self._seen: list[Vector3] = []
 
     def begin(self) -> None:
-        """The robot stands anew: what was measured before says nothing about here."""
+        """The robot stands again: what was measured before says nothing about here."""
         self._seen.clear()
 
     def doubt(self, fix: Fix, pose: DeckPose, covariance: FloatArray) -> str:
@@ -214,7 +214,7 @@ class FixGate:
         self._is_first = True
 
     def begin(self) -> None:
-        """The robot stands anew."""
+        """The robot stands again."""
         self._judge.begin()
 
     def review(

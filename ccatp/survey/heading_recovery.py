@@ -43,7 +43,7 @@ class HeadingRecovery:
         self.journey: RouteFollower | None = None
 
     def doubt(self) -> None:
-        """The robot may have turned while nobody looked."""
+        """The robot may have turned while it was not observed."""
         self._legs_left, self.journey = _MOST_LEGS, None
 
     @property

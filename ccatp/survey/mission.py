@@ -81,7 +81,7 @@ class Mission(SurveyState):
         self._leave_stop(point, self.done)
 
     def again(self) -> None:
-        """The fix shows the robot too far from its point, which has to be approached anew from where it really is."""
+        """The fix shows the robot too far from its point, which has to be approached again from where it really is."""
         if not self.is_awaiting_fix:
             self.is_off_route = True
             return
@@ -140,7 +140,7 @@ class Mission(SurveyState):
                 self.survey.advance()
             self.is_off_route |= not is_here  # the way that was planned leads to it once more
             self._doubt_heading()
-            # So it does where the robot was pushed meanwhile and waits to be measured anew: there is no need any more.
+            # So it does where the robot was pushed meanwhile and waits to be measured again: there is no need any more.
             goes_on |= self.state in (SETTLING, MEASURING)
         if goes_on:
             self.go_on()
@@ -162,7 +162,7 @@ class Mission(SurveyState):
         self._reactions.know_emergency()
 
     def lose_sight(self) -> None:
-        """The robot may have moved while nobody looked: it does not drive on before a fix, and a sure heading."""
+        """The robot may have moved while it was not observed: it does not drive on before a fix, and a sure heading."""
         self.lose()
         self.aligner.doubt()
 

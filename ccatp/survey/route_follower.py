@@ -208,7 +208,7 @@ class RouteFollower:
         self._is_begun, self._aim = False, None
 
     def interrupt(self) -> None:
-        """The robot stopped on the way: the leg begins anew, from wherever it is then."""
+        """The robot stopped on the way: the leg begins again, from wherever it is then."""
         self._is_begun, self._aim = False, None
 
     def correct(self, panel: PanelId, aim: LegAim) -> None:

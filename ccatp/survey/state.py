@@ -308,11 +308,11 @@ class SurveyState:
         self.needs_fix, self.is_at_start = True, False
 
     def interrupt_travel(self) -> None:
-        """Drive the leg anew from where the robot is."""
+        """Drive the leg again from where the robot is."""
         (self.survey if self.home is None else self.home).interrupt()
 
     def interrupt_parts(self) -> None:
-        """Forget where in a leg, a stop or a docking the robot was: it begins anew from where it is."""
+        """Forget where in a leg, a stop or a docking the robot was: it begins again from where it is."""
         self.interrupt_travel()
         self.stopover.interrupt()
         self.missed.interrupt()
@@ -393,7 +393,7 @@ class SurveyState:
             self.apply(MissionEvent.FIND)
         elif self.abort_cause:
             self.cause = self.abort_cause
-            self.home = None  # planned anew from where the robot is now
+            self.home = None  # planned again from where the robot is now
             self.apply(MissionEvent.GO_HOME)
         elif self.survey.current is None and not self._has_more():
             self.outcome = SurveyOutcome.COMPLETE

@@ -71,7 +71,7 @@ class SettleAndMeasure:
         self.is_asked = False
 
     def interrupt(self) -> None:
-        """The robot moves, or may have moved: the stop begins anew."""
+        """The robot moves, or may have moved: the stop begins again."""
         self.is_asked = self._is_anew = False
         self._stillness.reset()
         self._rest_by_s = None
@@ -146,7 +146,7 @@ class ReturnToBase:
         return self.journey.current is None
 
     def interrupt(self) -> None:
-        """The robot stopped on the way: the leg begins anew."""
+        """The robot stopped on the way: the leg begins again."""
         self._is_docking = False
         self.journey.interrupt()
 

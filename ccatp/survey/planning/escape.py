@@ -176,7 +176,7 @@ def is_on_drive(stops: Sequence[Stop], x_m: float, y_m: float) -> bool:
     return hypot(x_m - ax - share * dx, y_m - ay - share * dy) <= _BESIDE_M
 
 
-# About one stop per panel: there the robot points itself at base anew.
+# About one stop per panel: there the robot points itself at base again.
 _LONGEST_LEG_M = 0.75
 
 
