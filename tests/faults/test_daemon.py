@@ -253,10 +253,9 @@ def test_nobody_uses_what_swallows_cancellations() -> None:
 
 CALLS = {("time", "time"), ("time", "time_ns"), ("time", "localtime"), ("time", "gmtime"), ("datetime", "now"),
          ("datetime", "today"), ("datetime", "utcnow"), ("date", "today")}  # fmt: skip
-# Labels: rows of the store, names of run directories and the observatory's feed say when they were made. The check
-# before a mission shows the clock itself.
+# Labels: names of run directories and the observatory's feed say when they were made. The check before a mission shows
+# the clock itself.
 LABELS = {
-    "records/store.py",
     "daemon/supervisor.py",
     "daemon/run_dir.py",
     "cli/prepare.py",
