@@ -1,7 +1,7 @@
 """The simulated robots behind the robot link: sockets, the wall clock or lockstep, and the true state beside the link.
 
 The sockets of the robot link carry what a real robot would send and nothing else. The true state leaves by ZeroMQ: a
-REP socket with the requests of ``ccatp.sim.rules.TruthLog`` and of the robot, and a PUB socket with rows.
+REP socket with the requests of ``GroundTruthPublisher`` and of the robot, and a PUB socket with rows.
 
 Known limitations: the battery stays full, and nothing fails without a fault plan (``ccatp.sim.fault_injector``).
 """
@@ -24,7 +24,7 @@ from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.sim.fault_proxy import FaultProxy, LinkFaults
 from ccatp.sim.ground_truth import GroundTruthPublisher, SimPoseFile
 from ccatp.sim.robot import Robot
-from ccatp.sim.rules import SimulatedRobot, TruthLog
+from ccatp.sim.rules import SimulatedRobot
 from ccatp.sim.sessions import RobotServer, RobotSession
 
 HOUSEKEEPING_S = 0.25
@@ -292,7 +292,7 @@ async def serve(
                 proxy = FaultProxy(*behind.getsockname()[:2], seed=cfg.run.seed, listener=before)
                 await stack.enter_async_context(proxy)
                 data_loop.link_faults, listen_sock = LinkFaults(faults.link, proxy), behind
-            truth = GroundTruthPublisher(TruthLog(data_loop.robot), truth_rep, truth_pub)
+            truth = GroundTruthPublisher(data_loop.robot, truth_rep, truth_pub)
             await _serve(data_loop, truth, listen_sock, stop)
     finally:
         if body is not None:
@@ -313,7 +313,7 @@ async def serve_beacons(
     """The same with a robot among beacons."""
     robot = build_beacon_robot(cfg)
     server = RobotLinkServer(robot, (cfg.sim.robot.host, cfg.sim.robot.port), lockstep=lockstep, key=key, log=log)
-    await _serve(server, GroundTruthPublisher(TruthLog(robot), truth_rep, truth_pub), listen_sock, stop)
+    await _serve(server, GroundTruthPublisher(robot, truth_rep, truth_pub), listen_sock, stop)
 
 
 async def _serve(

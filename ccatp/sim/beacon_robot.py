@@ -9,7 +9,7 @@ Choices the interface leaves open:
   the wheels.
 """
 
-from math import inf, isfinite, tau
+from math import inf, tau
 
 import numpy as np
 
@@ -43,7 +43,7 @@ class BeaconRobot(SimulatedRobot):
             self._listener = MoteListener(cfg.cricket, cfg.listener, motes, rng)
         limits = cfg.sim.robot.ttl_s, cfg.robot.max_wheel_rad_s, 0.0
         super().__init__(limits, cfg.run.step_s, 1.0 / cfg.run.step_s)
-        self._steer_rad = 0.0
+        self.is_steerable = cfg.vehicle.kind == "ackermann"
         self._line = b""
         self._read(None)
 
@@ -92,22 +92,6 @@ class BeaconRobot(SimulatedRobot):
                 places[name] = place[0], place[1]
         return "beacon_places", BeaconPlaces(seq=self.seq, t_s=self.t_s, places=places)
 
-    def drive(
-        self,
-        seq: int,
-        right_rad_s: float,
-        left_rad_s: float,
-        now_s: float | None = None,
-        steer_rad: float | None = None,
-    ) -> bool:
-        """Take a drive; a steering angle other than zero makes a turn of it."""
-        steer = 0.0 if steer_rad is None or self._cfg.vehicle.kind != "ackermann" else steer_rad
-        at_s = self.t_s if now_s is None else now_s
-        if not isfinite(steer) or not self.rules.drive(seq, right_rad_s, left_rad_s, at_s, is_steered=steer != 0.0):
-            return False
-        self._steer_rad = steer
-        return True
-
     def advance(self) -> None:
         self.seq += 1
         self.t_s = round(self.seq * self.frame_s, 9)
@@ -124,8 +108,8 @@ class BeaconRobot(SimulatedRobot):
     def _command(self, right_rad_s: float, left_rad_s: float) -> SimDriveCommand:
         radius_m, vehicle = self._cfg.robot.wheel_radius_m, self._cfg.vehicle
         speed_m_s = 0.5 * radius_m * (right_rad_s + left_rad_s)
-        if vehicle.kind == "ackermann":
-            return SimDriveCommand(speed_m_s, self._steer_rad, 0.0)
+        if self.is_steerable:
+            return SimDriveCommand(speed_m_s, self.rules.steer_rad, 0.0)
         return SimDriveCommand(speed_m_s, 0.0, radius_m * (right_rad_s - left_rad_s) / vehicle.track_m)
 
     def _read(self, frame: WorldFrame | None) -> None:
@@ -139,9 +123,8 @@ class BeaconRobot(SimulatedRobot):
             half_m_s = 0.5 * vehicle.track_m * frame.wheels.turn_rate_rad_s
             speed_m_s = frame.wheels.speed_m_s
             wheels = [(t_s, (speed_m_s + half_m_s) / radius_m, (speed_m_s - half_m_s) / radius_m)]
-            is_steered = vehicle.kind == "ackermann"
             extras = BeaconFrame(
-                steer=[SteerSample(t_s, frame.wheels.steer_rad)] if is_steered else [],
+                steer=[SteerSample(t_s, frame.wheels.steer_rad)] if self.is_steerable else [],
                 radio=[RadioSample(t_s, one.beacon, one.rssi_dbm, one.bearing_rad) for one in frame.sightings],
                 scan=_scan(t_s, frame.packets, self._cfg.scan.readings),
                 distances=list(frame.distances_m),

@@ -14,45 +14,20 @@ delivered: in lockstep no client can answer it, and simulated time must not wait
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from math import inf, sqrt
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
+from ccatp.core import Vector3
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
-from ccatp.sim.fault_plan import (
-    SIGNALS,
-    Blocked,
-    Delayed,
-    Drift,
-    Drop,
-    Duplicate,
-    FaultPlan,
-    Garbage,
-    Injected,
-    InjectedFault,
-    Intermittent,
-    Jump,
-    Kidnap,
-    NonFinite,
-    Off,
-    Raise,
-    Reboot,
-    Reorder,
-    Runaway,
-    Saturated,
-    Slip,
-    Slow,
-    Stuck,
-    Weak,
-    Wrap,
-    Wrong,
-)
-from ccatp.sim.plant import LEVEL_SLOPE, BodyStep, Downhill, Plant
+from ccatp.sim.fault_plan import SIGNALS, FaultPlan, Injected, InjectedFault
+from ccatp.sim.plant import LEVEL_SLOPE, BodyStep, Disturbance, Plant, downhill
 from ccatp.sim.rules import FanRules
 from ccatp.sim.sensors import RobotFrame, as_line
 from ccatp.sim.world import World
@@ -108,104 +83,94 @@ class InjectionRecord:
         return ""
 
 
-class _StepFault:
-    """Wheel rates, grip and fan thrust in one step of the world: right and left of each."""
-
-    def __init__(self, set_points_rad_s: tuple[float, float]) -> None:
-        self.rates_rad_s, self.grip, self.health = [*set_points_rad_s], [1.0, 1.0], [1.0, 1.0]
-
-
 class BodyFaults:
-    """All faults of the body."""
+    """All faults of the body; ``drifts`` disturb the plant."""
 
-    def __init__(self, faults: Iterable[InjectedFault], mirror: Mirror) -> None:
-        self.records = [InjectionRecord(fault) for fault in faults]
-        self.drifts = [_DriftFault(record, mirror) for record in self.records if isinstance(record.fault, Drift)]
-        self._has_weak_fan = any(isinstance(record.fault, Weak) for record in self.records)
+    def __init__(self, records: list[InjectionRecord], mirror: Mirror) -> None:
+        self._records = records
+        gravity = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
+        self.drifts: list[Disturbance] = [partial(_drift, one, gravity) for one in records if one.fault.type == "drift"]
+        self._has_weak_fan = any(one.fault.type == "weak" for one in records)
 
     def act(
         self, world: World, fans: FanRules, t_s: float, set_points_rad_s: tuple[float, float]
     ) -> tuple[float, float]:
         """Wheel rates (right, left) of the next step, rad/s; a kidnap moves the world's body, a slip takes its grip."""
-        step = _StepFault(set_points_rad_s)
-        for record in self.records:
+        rates, grip, health = [*set_points_rad_s], [1.0, 1.0], [1.0, 1.0]  # right, left
+        for record in self._records:
             fault = record.fault
-            if isinstance(fault, Kidnap):
+            if fault.type == "kidnap":
                 if fault.has_begun(t_s) and not record.samples:
                     world.displace(fault.dx_m, fault.dy_m, fault.dheading_rad)
                     record.add(t_s)
-            elif fault.is_active(t_s):
-                _act_on_step(record, step, world.plant, fans, t_s)
+            elif fault.type != "drift" and fault.is_active(t_s):
+                is_changed = False
+                for k in {"right": (0,), "left": (1,)}.get(fault.signal.partition("_")[0], (0, 1)):
+                    is_changed |= _act_on_side(fault, k, world.plant, fans, rates, grip, health)
+                record.add(t_s, is_changed=is_changed)
         if self._has_weak_fan:
-            right, left = step.health
-            fans.health = left, right  # the fans' own order
-        world.grip = step.grip[0], step.grip[1]
-        return step.rates_rad_s[0], step.rates_rad_s[1]
+            fans.health = health[1], health[0]  # the fans' own order
+        world.grip = grip[0], grip[1]
+        return rates[0], rates[1]
 
 
-def _act_on_step(record: InjectionRecord, step: _StepFault, plant: Plant, fans: FanRules, t_s: float) -> None:
-    """Let one lasting fault act on the wheels or fans that it names, or on both."""
-    fault, rates = record.fault, step.rates_rad_s
-    sides = {"right": (0,), "left": (1,)}.get(fault.signal.partition("_")[0], (0, 1))
-    match fault:
-        case Blocked():
-            is_turning = plant.block(right=0 in sides, left=1 in sides)
-            record.add(t_s, is_changed=is_turning or any(rates[k] for k in sides))
-            for k in sides:
-                rates[k] = 0.0
-        case Runaway():
-            record.add(t_s, is_changed=any(rates[k] != fault.rate_rad_s for k in sides))
-            for k in sides:
-                rates[k] = fault.rate_rad_s
-        case Slip():
-            record.add(t_s, is_changed=not plant.are_wheels_still or any(rates))
-            for k in sides:
-                step.grip[k] *= fault.factor
-        case Weak():
-            record.add(t_s, is_changed=any(fans.duty[1 - k] for k in sides))
-            for k in sides:
-                step.health[k] *= fault.share
+def _act_on_side(
+    fault: Any, k: int, plant: Plant, fans: FanRules, rates: list[float], grip: list[float], health: list[float]
+) -> bool:
+    """Let a lasting fault act on the right (0) or left (1) wheel or fan; whether that changes anything."""
+    match fault.type:
+        case "blocked":
+            is_changed = plant.block(right=k == 0, left=k == 1) or rates[k] != 0.0
+            rates[k] = 0.0
+        case "runaway":
+            is_changed = rates[k] != fault.rate_rad_s
+            rates[k] = fault.rate_rad_s
+        case "slip":
+            is_changed = not plant.are_wheels_still or any(rates)
+            grip[k] *= fault.factor
+        case _:  # weak
+            is_changed = fans.duty[1 - k] != 0.0
+            health[k] *= fault.share
+    return is_changed
 
 
-class _DriftFault:
+def _drift(
+    record: InjectionRecord,
+    gravity: Vector3,
+    plant: Plant,
+    t_s: float,
+    dt_s: float,
+    forward_m: float,
+    left_m: float,
+    turn_rad: float,
+) -> BodyStep:
     """A disturbance of the plant: downhill while the wheels are held at zero."""
-
-    def __init__(self, record: InjectionRecord, mirror: Mirror) -> None:
-        self._record, self._downhill = record, Downhill(mirror)
-
-    def displace(
-        self, plant: Plant, t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
-    ) -> BodyStep:
-        right_set, _, left_set, _ = plant.servo
-        fault: Drift = self._record.fault
-        if right_set or left_set or not fault.is_active(t_s):
-            return forward_m, left_m, turn_rad
-        ahead, aside, slope = self._downhill.of(plant)
-        is_level = slope < LEVEL_SLOPE
-        self._record.add(t_s, is_changed=not is_level)
-        if is_level:
-            return forward_m, left_m, turn_rad
-        glide_m = fault.speed_m_s * dt_s / slope
-        return forward_m + glide_m * ahead, left_m + glide_m * aside, turn_rad
+    right_set, _, left_set, _ = plant.servo
+    if right_set or left_set or not record.fault.is_active(t_s):
+        return forward_m, left_m, turn_rad
+    ahead, aside, slope = downhill(plant, gravity)
+    is_level = slope < LEVEL_SLOPE
+    record.add(t_s, is_changed=not is_level)
+    if is_level:
+        return forward_m, left_m, turn_rad
+    glide_m = record.fault.speed_m_s * dt_s / slope
+    return forward_m + glide_m * ahead, left_m + glide_m * aside, turn_rad
 
 
 class SensorFault:
     """A fault that changes readings; ``past`` holds the readings that it needs later, with their times."""
 
-    def __init__(self, fault: InjectedFault, rng: np.random.Generator) -> None:
-        if type(fault) not in EFFECTS:
-            raise TypeError(f"no effect on readings: {type(fault).__name__}")
-        self._effect = EFFECTS[type(fault)]
-        self.fault: Any = fault
-        self.signal, self.rng, self.count = SIGNALS[fault.signal], rng, 0
+    def __init__(self, record: InjectionRecord, rng: np.random.Generator) -> None:
+        self.record, self.fault = record, record.fault
+        if self.fault.type not in EFFECTS:
+            raise TypeError(f"no effect on readings: {self.fault.type}")
+        self._effect = EFFECTS[self.fault.type]
+        self.signal, self.rng, self.count = SIGNALS[self.fault.signal], rng, 0
         self.past: deque[tuple[float, Reading]] = deque()
-        self._needs_past = isinstance(fault, Stuck | Delayed)
-        self._delay_s = fault.by_s if isinstance(fault, Delayed) else 0.0
-        self._is_raw = not self.signal.is_binary or isinstance(fault, Garbage | NonFinite)
+        self._delay_s = self.fault.by_s if self.fault.type == "delayed" else 0.0
+        self._is_raw = not self.signal.is_binary or self.fault.type in {"garbage", "non_finite"}
         self._last: Reading | None = None
-        self._sees_from_s = fault.at_s - _MEMORY_S - self._delay_s
-        self.rows_name = self.signal.rows
-        self.record = InjectionRecord(fault)
+        self._sees_from_s = self.fault.at_s - _MEMORY_S - self._delay_s
 
     def apply(self, rows: list[Row], now_s: float) -> list[Row]:
         """The rows as they come out, in the frame of robot time ``now_s``."""
@@ -227,7 +192,7 @@ class SensorFault:
         if None in reading:
             return row
         if not self.fault.is_active(t_s):
-            if self._needs_past:
+            if self.fault.type in {"stuck", "delayed"}:
                 self.remember(t_s, reading)
             self._last = reading
             return row
@@ -250,13 +215,20 @@ class SensorFault:
         return None
 
 
-def _stuck(one: SensorFault, t_s: float, reading: Reading) -> Reading | None:
+def _put(row: Row, columns: tuple[int, ...], values: tuple[Any, ...]) -> Row:
+    found = list(row)
+    for column, value in zip(columns, values, strict=True):
+        found[column] = value
+    return tuple(found)
+
+
+def _stuck(one: SensorFault, t_s: float, reading: Reading) -> Reading:
     if one.fault.value is not None:
         return (one.fault.value,) * len(reading)
     return one.past[0][1] if one.past else one.remember(t_s, reading)
 
 
-def _garbage(one: SensorFault, t_s: float, reading: Reading) -> Reading | None:
+def _garbage(one: SensorFault, t_s: float, reading: Reading) -> Reading:
     rng, signal, count = one.rng, one.signal, len(reading)
     if rng.random() < one.fault.beyond:
         if signal.is_binary:
@@ -271,7 +243,7 @@ def _garbage(one: SensorFault, t_s: float, reading: Reading) -> Reading | None:
     return tuple(rng.uniform(signal.low, signal.high, count).tolist())
 
 
-def _wrong(one: SensorFault, t_s: float, reading: Reading) -> Reading | None:
+def _wrong(one: SensorFault, t_s: float, reading: Reading) -> Reading:
     fault = one.fault
     if fault.sign == -1:  # what is 0 or 1 is inverted
         reading = tuple(1.0 - x for x in reading) if one.signal.is_binary else tuple(-x for x in reading)
@@ -291,41 +263,36 @@ def _intermittent(one: SensorFault, t_s: float, reading: Reading) -> Reading | N
     return None if fault.value is None else (fault.value,) * len(reading)
 
 
-def _saturated(one: SensorFault, t_s: float, reading: Reading) -> Reading | None:
+def _saturated(one: SensorFault, t_s: float, reading: Reading) -> Reading:
     low = -inf if one.fault.low is None else one.fault.low
     high = inf if one.fault.high is None else one.fault.high
     return tuple(min(max(x, low), high) for x in reading)
 
 
 # What comes out in place of a reading; ``None``: no sample.
-EFFECTS: dict[type[InjectedFault], Callable[[SensorFault, float, Reading], Reading | None]] = {
-    Off: lambda one, t_s, reading: None,
-    Stuck: _stuck,
-    Garbage: _garbage,
-    Wrong: _wrong,
-    Slow: _slow,
-    Delayed: SensorFault.remember,  # the reading of ``by_s`` ago; before there is one, the oldest
-    Intermittent: _intermittent,
-    Saturated: _saturated,
-    NonFinite: lambda one, t_s, reading: (TOKENS[one.fault.token],) * len(reading),
+EFFECTS: dict[str, Callable[[SensorFault, float, Reading], Reading | None]] = {
+    "off": lambda one, t_s, reading: None,
+    "stuck": _stuck,
+    "garbage": _garbage,
+    "wrong": _wrong,
+    "slow": _slow,
+    "delayed": SensorFault.remember,  # the reading of ``by_s`` ago; before there is one, the oldest
+    "intermittent": _intermittent,
+    "saturated": _saturated,
+    "non_finite": lambda one, t_s, reading: (TOKENS[one.fault.token],) * len(reading),
 }
 
 
 class LateRows:
-    """Rows that arrive late under the times at which they were taken; they keep their order.
+    """Rows of a signal that arrive late, whole, under the times at which they were taken; they keep their order."""
 
-    The fault takes the whole row of its signal.
-    """
-
-    def __init__(self, fault: Delayed) -> None:
-        self._fault = fault
+    def __init__(self, record: InjectionRecord) -> None:
+        self.record, self.signal = record, SIGNALS[record.fault.signal]
         self._waiting: deque[Row] = deque()
-        self.rows_name = SIGNALS[fault.signal].rows
-        self.record = InjectionRecord(fault)
 
     def apply(self, rows: list[Row], now_s: float) -> list[Row]:
         """As ``SensorFault.apply``."""
-        waiting, fault = self._waiting, self._fault
+        waiting, fault = self._waiting, self.record.fault
         if not waiting and not fault.is_active(now_s):
             return rows
         for row in rows:
@@ -339,19 +306,13 @@ class LateRows:
         return [waiting.popleft() for _ in range(min(due, len(waiting)))]
 
 
-def make_sensor_fault(fault: InjectedFault, rng: np.random.Generator) -> SensorFault | LateRows:
+def make_sensor_fault(record: InjectionRecord, rng: np.random.Generator) -> SensorFault | LateRows:
     """A fault of a sensor's signal, ready to act."""
+    fault = record.fault
     # Fans and battery are reported in every frame and have no time of their own: late they are old readings.
-    if isinstance(fault, Delayed) and fault.stamps == "old" and fault.signal not in _ALWAYS:
-        return LateRows(fault)
-    return SensorFault(fault, rng)
-
-
-def _put(row: Row, columns: tuple[int, ...], values: tuple[Any, ...]) -> Row:
-    found = list(row)
-    for column, value in zip(columns, values, strict=True):
-        found[column] = value
-    return tuple(found)
+    if fault.type == "delayed" and fault.stamps == "old" and fault.signal not in _ALWAYS:
+        return LateRows(record)
+    return SensorFault(record, rng)
 
 
 class Outgoing(NamedTuple):
@@ -368,26 +329,21 @@ class Injector:
     """The faults of the robot in a plan at work."""
 
     def __init__(self, plan: FaultPlan, mirror: Mirror, rng: np.random.Generator) -> None:
-        faults = plan.faults
-        children = rng.spawn(len(faults)) if faults else []
+        self._records = records = [InjectionRecord(fault) for fault in plan.faults]
+        children = rng.spawn(len(records)) if records else []
         self._sensing = [
-            make_sensor_fault(fault, child)
-            for fault, child in zip(faults, children, strict=True)
-            if fault.signal in SIGNALS
+            make_sensor_fault(record, child)
+            for record, child in zip(records, children, strict=True)
+            if record.fault.signal in SIGNALS
         ]
-        self.body = BodyFaults((f for f in faults if f.signal in _BODY_SIGNALS), mirror)
-        own = [*(one.record for one in self._sensing), *self.body.records]
-        own += [InjectionRecord(f) for f in faults if f.signal not in SIGNALS and f.signal not in _BODY_SIGNALS]
-        self._records = [next(record for record in own if record.fault is fault) for fault in faults]
-        self._stamping, self._raising = self._of(Jump | Wrap), self._of(Raise)
-        self._delivery, self._reboots = self._of(Drop | Duplicate | Reorder), self._of(Reboot)
-        self._counts = [0] * len(self._delivery)
+        self.body = BodyFaults([one for one in records if one.fault.signal in _BODY_SIGNALS], mirror)
+        self._on = {
+            name: [one for one in records if one.fault.signal == name]
+            for name in ("clock", "faults", "frames", "robot")
+        }
         self._withheld = b""
         self._seq_0, self._boot_s = 0, 0.0
         self.outgoing = NOTHING
-
-    def _of(self, kinds: Any) -> list[InjectionRecord]:
-        return [record for record in self._records if isinstance(record.fault, kinds)]
 
     @property
     def injected(self) -> tuple[Injected, ...]:
@@ -402,7 +358,7 @@ class Injector:
 
     def is_rebooting(self, t_s: float) -> bool:
         """Whether the robot reboots now; true once for each reboot."""
-        due = [record for record in self._reboots if record.fault.has_begun(t_s) and not record.samples]
+        due = [record for record in self._on["robot"] if record.fault.has_begun(t_s) and not record.samples]
         for record in due:
             record.add(t_s)
         return bool(due)
@@ -424,34 +380,31 @@ class Injector:
             "soc": [(t_s, frame.soc)],
         }
         for one in self._sensing:
-            rows[one.rows_name] = one.apply(rows[one.rows_name], t_s)
-        stamped = {name: self._stamp_rows(t_s, rows[name]) for name in ("imu", "enc", "edge", "gravity")}
-        _, *fans = rows["fans"][-1]
+            rows[one.signal.rows] = one.apply(rows[one.signal.rows], t_s)
+        for name in ("imu", "enc", "edge", "gravity"):
+            rows[name] = [(self._stamp(t_s, row[0] - self._boot_s, is_frame=False), *row[1:]) for row in rows[name]]
+        _, left, right = rows["fans"][-1]
         return RobotFrame(
             frame.seq - self._seq_0,
             self._stamp(t_s, t_s - self._boot_s, is_frame=True),
-            stamped["imu"],
-            stamped["enc"],
-            stamped["edge"],
-            stamped["gravity"][-1] if stamped["gravity"] else None,
-            (fans[0], fans[1]),
+            rows["imu"],
+            rows["enc"],
+            rows["edge"],
+            rows["gravity"][-1] if rows["gravity"] else None,
+            (left, right),
             rows["soc"][-1][1],
             frame.cmd,
             self._raised(t_s),
         )
 
-    def _stamp_rows(self, t_s: float, rows: list[Row]) -> list[Row]:
-        """The rows under the times that are written, counted from the boot."""
-        return [(self._stamp(t_s, row[0] - self._boot_s, is_frame=False), *row[1:]) for row in rows]
-
     def _stamp(self, t_s: float, at_s: float, *, is_frame: bool) -> float:
-        """The time that is written for ``at_s`` at the time ``t_s`` of the plan."""
-        for record in self._stamping:
+        """The time that is written for ``at_s``, counted from the boot, at the time ``t_s`` of the plan."""
+        for record in self._on["clock"]:
             fault = record.fault
             if not fault.is_active(t_s):
                 continue
             before_s = at_s
-            at_s = at_s + fault.by_s if isinstance(fault, Jump) else at_s % fault.modulo_s
+            at_s = at_s + fault.by_s if fault.type == "jump" else at_s % fault.modulo_s
             if is_frame:
                 record.add(t_s, is_changed=at_s != before_s)
         return at_s
@@ -459,7 +412,7 @@ class Injector:
     def _raised(self, t_s: float) -> tuple[str, ...]:
         """The names that the frame reports, each once."""
         names: dict[str, None] = {}
-        for record in self._raising:
+        for record in self._on["faults"]:
             if record.fault.is_active(t_s):
                 record.add(t_s)
                 names.update(dict.fromkeys(record.fault.names))
@@ -475,16 +428,15 @@ class Injector:
             line = line.replace(mark, token)
         withheld, self._withheld = self._withheld, b""
         is_lost = is_late = False
-        for k, record in enumerate(self._delivery):
+        for record in self._on["frames"]:
             fault = record.fault
             if not fault.is_active(t_s):
                 continue
-            self._counts[k] += 1
-            is_hit = self._counts[k] % fault.every == 0
+            is_hit = (record.samples + 1) % fault.every == 0
             record.add(t_s, is_changed=is_hit)
-            if is_hit and isinstance(fault, Drop):
+            if is_hit and fault.type == "drop":
                 is_lost = True
-            elif is_hit and isinstance(fault, Duplicate):
+            elif is_hit and fault.type == "duplicate":
                 line += line
             elif is_hit:
                 is_late = not withheld

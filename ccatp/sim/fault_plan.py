@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import Field, ValidationError, create_model
 
 from ccatp.config.messages import choice_hint, faults_of, format_key, format_value, nearest
 from ccatp.config.models import Model, NonNegative, Positive
@@ -21,14 +21,6 @@ from ccatp.errors import ConfigError
 
 _SAME_TIME_S = 1e-9  # times of frames and samples are multiples of their periods to within rounding
 _SECTIONS = ("fault", "link")
-_Model = TypeVar("_Model", bound=BaseModel)
-
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
-EveryNth = Annotated[int, Field(ge=1, le=1_000_000)]
-EverySecondOrLess = Annotated[int, Field(ge=2, le=1_000_000)]
-Direction = Literal["to_client", "to_robot", "both"]
-ByteCount = Annotated[int, Field(ge=1, le=65536)]
-RaisedName = Literal["imu", "encoder_left", "encoder_right", "edge", "fan_left", "fan_right", "battery_low", "stall"]
 
 # Ranges of random readings: those of common parts (accelerometer 2 g, gyroscope 2000 deg/s), twice the wheels' limit.
 _AX_M_S2, _WZ_RAD_S, _WHEEL_RAD_S = 19.6, 34.9, 16.0
@@ -71,7 +63,7 @@ class InjectedFault(Model):
     def end_s(self) -> float:
         """When it ends; infinite without ``for_s``."""
         for_s = getattr(self, "for_s", None)
-        return float("inf") if for_s is None else self.at_s + for_s
+        return math.inf if for_s is None else self.at_s + for_s
 
     def is_active(self, t_s: float) -> bool:
         """Whether it acts at a time."""
@@ -88,169 +80,6 @@ class LastingFault(InjectedFault):
     for_s: Positive | None = None
 
 
-class Off(LastingFault):
-    """No samples."""
-
-
-class Stuck(LastingFault):
-    """Always the same reading: ``value``, or the last one before."""
-
-    value: float | None = None
-
-
-class Garbage(LastingFault):
-    """Random readings; the share ``beyond`` of them far beyond the signal's range, the others uniform within it."""
-
-    beyond: Share
-
-
-class Wrong(LastingFault):
-    """``sign * factor * reading + offset``."""
-
-    offset: float | None = None
-    factor: float | None = None
-    sign: Literal[1, -1] | None = None
-
-
-class Slow(LastingFault):
-    """Only every n-th sample."""
-
-    every: EverySecondOrLess
-
-
-class Delayed(LastingFault):
-    """Readings late by ``by_s``: under the sample's time (``fresh``), or arriving late under their own (``old``)."""
-
-    by_s: Positive
-    stamps: Literal["fresh", "old"]
-
-
-class Intermittent(LastingFault):
-    """Sound for the first ``duty`` of each period; then no samples, or the reading ``value``."""
-
-    period_s: Positive
-    duty: Share
-    value: float | None = None
-
-
-class Saturated(LastingFault):
-    """Clamped to ``low`` and ``high``."""
-
-    low: float | None = None
-    high: float | None = None
-
-
-class NonFinite(LastingFault):
-    """The number is replaced in the raw line by a token that is no number of JSON."""
-
-    token: Literal["NaN", "Infinity", "1e999"]
-
-
-class Blocked(LastingFault):
-    """The wheel stands still, whatever its servo wants."""
-
-
-class Runaway(LastingFault):
-    """The wheel turns at ``rate_rad_s``, whatever its set point."""
-
-    rate_rad_s: float
-
-
-class Slip(LastingFault):
-    """The body moves by ``factor`` of what the wheels give, of both or of one."""
-
-    factor: Annotated[float, Field(ge=0.0, le=2.0)]
-
-
-class Weak(LastingFault):
-    """The fan gives the share ``share`` of its thrust; its echo does not show it."""
-
-    share: Share
-
-
-class Kidnap(InjectedFault):
-    """The body is put elsewhere, relative to where it stands: deck frame."""
-
-    dx_m: float
-    dy_m: float
-    dheading_rad: float
-
-
-class Drift(LastingFault):
-    """The body glides downhill while the wheels are held at zero; level ground has no downhill."""
-
-    speed_m_s: Positive
-
-
-class Jump(LastingFault):
-    """All time stamps are off by ``by_s``, which may be negative."""
-
-    by_s: float
-
-
-class Wrap(LastingFault):
-    """All time stamps are counted modulo ``modulo_s``, as by a counter that overflows."""
-
-    modulo_s: Positive
-
-
-class Drop(LastingFault):
-    """Every n-th frame is lost."""
-
-    every: EveryNth
-
-
-class Duplicate(LastingFault):
-    """Every n-th frame is sent twice."""
-
-    every: EveryNth
-
-
-class Reorder(LastingFault):
-    """Every n-th frame is sent after the one that follows it."""
-
-    every: EverySecondOrLess
-
-
-class Raise(LastingFault):
-    """The robot itself reports ``names`` in its frames."""
-
-    names: Annotated[tuple[RaisedName, ...], Field(min_length=1)]
-
-
-class Reboot(InjectedFault):
-    """The robot reboots: boot number, clock, sequence numbers and fans; every session is lost."""
-
-
-_ON_SENSORS: dict[str, type[InjectedFault]] = {
-    "off": Off,
-    "stuck": Stuck,
-    "garbage": Garbage,
-    "wrong": Wrong,
-    "slow": Slow,
-    "delayed": Delayed,
-    "intermittent": Intermittent,
-    "saturated": Saturated,
-    "non_finite": NonFinite,
-}
-_ON_WHEELS: dict[str, type[InjectedFault]] = {"blocked": Blocked, "runaway": Runaway, "slip": Slip}
-_ON_FANS: dict[str, type[InjectedFault]] = {"weak": Weak}
-
-TYPES: dict[str, dict[str, type[InjectedFault]]] = {
-    **dict.fromkeys(SENSOR_SIGNALS, _ON_SENSORS),
-    "right_wheel": _ON_WHEELS,
-    "left_wheel": _ON_WHEELS,
-    "right_fan": _ON_FANS,
-    "left_fan": _ON_FANS,
-    "body": {"kidnap": Kidnap, "slip": Slip, "drift": Drift},
-    "clock": {"jump": Jump, "wrap": Wrap},
-    "frames": {"drop": Drop, "duplicate": Duplicate, "reorder": Reorder},
-    "faults": {"raise": Raise},
-    "robot": {"reboot": Reboot},
-}
-"""The types that each signal takes."""
-
-
 class LinkFault(Model):
     """A fault of the link; it begins at a robot time, or once so much has gone to all clients."""
 
@@ -260,6 +89,9 @@ class LinkFault(Model):
     after_bytes: Annotated[int, Field(ge=1)] | None = None
 
 
+Direction = Literal["to_client", "to_robot", "both"]
+
+
 class LastingLinkFault(LinkFault):
     """One that lasts for ``for_s`` of robot time, or until the end, in one direction or both."""
 
@@ -267,86 +99,105 @@ class LastingLinkFault(LinkFault):
     for_s: Positive | None = None
 
 
-class Reset(LinkFault):
-    """Every connection is broken by RST."""
+_Fault = TypeVar("_Fault", InjectedFault, LinkFault)
 
 
-class Close(LinkFault):
-    """Every connection is ended by FIN."""
+def _types(base: type[_Fault], table: Mapping[str, Mapping[str, Any]]) -> dict[str, type[_Fault]]:
+    """A model for each type of fault; its further keys are required, but for those with a default."""
+    models = {}
+    for name, keys in table.items():
+        fields: dict[str, Any] = {key: kind if isinstance(kind, tuple) else (kind, ...) for key, kind in keys.items()}
+        models[name] = create_model(name, __base__=base, **fields)
+    return models
 
 
-class BlackHole(LastingLinkFault):
-    """What is sent disappears, and so does the end of a connection: a half-open connection."""
+_Share = Annotated[float, Field(ge=0.0, le=1.0)]
+_Nth = Annotated[int, Field(ge=1, le=1_000_000)]
+_SecondOrLater = Annotated[int, Field(ge=2, le=1_000_000)]
+_ByteCount = Annotated[int, Field(ge=1, le=65536)]
+_NUMBER = (float | None, None)
+_RaisedName = Literal["imu", "encoder_left", "encoder_right", "edge", "fan_left", "fan_right", "battery_low", "stall"]
 
+_SLIP = {"factor": Annotated[float, Field(ge=0.0, le=2.0)]}
+_ON_SENSORS = _types(
+    LastingFault,
+    {
+        # No samples.
+        "off": {},
+        # Always the same reading: ``value``, or the last one before.
+        "stuck": {"value": _NUMBER},
+        # Random readings; the share ``beyond`` of them far beyond the signal's range, the others uniform within it.
+        "garbage": {"beyond": _Share},
+        # ``sign * factor * reading + offset``
+        "wrong": {"offset": _NUMBER, "factor": _NUMBER, "sign": (Literal[1, -1] | None, None)},
+        # Only every n-th sample.
+        "slow": {"every": _SecondOrLater},
+        # Late by ``by_s``: under the sample's time (``fresh``), or arriving late under their own (``old``).
+        "delayed": {"by_s": Positive, "stamps": Literal["fresh", "old"]},
+        # Sound for the first ``duty`` of each period; then no samples, or the reading ``value``.
+        "intermittent": {"period_s": Positive, "duty": _Share, "value": _NUMBER},
+        # Clamped to ``low`` and ``high``.
+        "saturated": {"low": _NUMBER, "high": _NUMBER},
+        # The number is replaced in the raw line by a token that is no number of JSON.
+        "non_finite": {"token": Literal["NaN", "Infinity", "1e999"]},
+    },
+)
+# The wheel stands still, or turns at ``rate_rad_s``, whatever its set point; slip: the body moves by ``factor`` of what
+# the wheels give, of both or of one.
+_ON_WHEELS = _types(LastingFault, {"blocked": {}, "runaway": {"rate_rad_s": float}, "slip": _SLIP})
+# The fan gives the share ``share`` of its thrust; its echo does not show it.
+_ON_FANS = _types(LastingFault, {"weak": {"share": _Share}})
 
-class Stall(LastingLinkFault):
-    """Nothing is passed on; at the end everything at once."""
-
-
-class Delay(LastingLinkFault):
-    """Everything comes ``delay_s`` late, and up to ``jitter_s`` more, drawn for each piece; the order stays."""
-
-    delay_s: NonNegative
-    jitter_s: NonNegative
-
-
-class ReorderLines(LastingLinkFault):
-    """Every n-th line is passed on after the one that follows it."""
-
-    every: Annotated[int, Field(ge=2)]
-
-
-class DuplicateLines(LastingLinkFault):
-    """Every n-th line is passed on twice."""
-
-    every: EveryNth
-
-
-class Fragment(LastingLinkFault):
-    """Passed on in writes of so many bytes."""
-
-    write_bytes: ByteCount
-
-
-class Flood(LastingLinkFault):
-    """Further lines at a rate: random ones, or copies of the last line that passed."""
-
-    rate_hz: Positive
-    lines: Literal["garbage", "copies"]
-
-
-class Slowloris(LastingLinkFault):
-    """Passed on byte by byte, at a rate."""
-
-    bytes_per_s: Positive
-
-
-class GarbageBytes(LastingLinkFault):
-    """A line of so many random bytes before every n-th line."""
-
-    garbage_bytes: ByteCount
-    every: EveryNth
-
-
-class Corrupt(LastingLinkFault):
-    """One byte of every n-th line is another one."""
-
-    every: EveryNth
-
+TYPES: dict[str, dict[str, type[InjectedFault]]] = {
+    **dict.fromkeys(SENSOR_SIGNALS, _ON_SENSORS),
+    **dict.fromkeys(("right_wheel", "left_wheel"), _ON_WHEELS),
+    **dict.fromkeys(("right_fan", "left_fan"), _ON_FANS),
+    # The body is put elsewhere, relative to where it stands, deck frame; or it glides downhill while the wheels are
+    # held at zero: level ground has no downhill.
+    "body": _types(InjectedFault, {"kidnap": {"dx_m": float, "dy_m": float, "dheading_rad": float}})
+    | _types(LastingFault, {"slip": _SLIP, "drift": {"speed_m_s": Positive}}),
+    # All time stamps are off by ``by_s``, which may be negative; or counted modulo ``modulo_s``, as by a counter that
+    # overflows.
+    "clock": _types(LastingFault, {"jump": {"by_s": float}, "wrap": {"modulo_s": Positive}}),
+    # Every n-th frame is lost, sent twice, or sent after the one that follows it.
+    "frames": _types(
+        LastingFault, {"drop": {"every": _Nth}, "duplicate": {"every": _Nth}, "reorder": {"every": _SecondOrLater}}
+    ),
+    # The robot itself reports ``names`` in its frames.
+    "faults": _types(LastingFault, {"raise": {"names": Annotated[tuple[_RaisedName, ...], Field(min_length=1)]}}),
+    # The robot reboots: boot number, clock, sequence numbers and fans; every session is lost.
+    "robot": _types(InjectedFault, {"reboot": {}}),
+}
+"""The types that each signal takes."""
 
 LINK_TYPES: dict[str, type[LinkFault]] = {
-    "reset": Reset,
-    "close": Close,
-    "black_hole": BlackHole,
-    "stall": Stall,
-    "delay": Delay,
-    "reorder": ReorderLines,
-    "duplicate": DuplicateLines,
-    "fragment": Fragment,
-    "flood": Flood,
-    "slowloris": Slowloris,
-    "garbage": GarbageBytes,
-    "corrupt": Corrupt,
+    # Every connection is broken by RST, or ended by FIN.
+    **_types(LinkFault, {"reset": {}, "close": {}}),
+    **_types(
+        LastingLinkFault,
+        {
+            # What is sent disappears, and so does the end of a connection: a half-open connection.
+            "black_hole": {},
+            # Nothing is passed on; at the end everything at once.
+            "stall": {},
+            # Everything comes ``delay_s`` late, and up to ``jitter_s`` more, drawn for each piece; the order stays.
+            "delay": {"delay_s": NonNegative, "jitter_s": NonNegative},
+            # Every n-th line is passed on after the one that follows it.
+            "reorder": {"every": Annotated[int, Field(ge=2)]},
+            # Every n-th line is passed on twice.
+            "duplicate": {"every": _Nth},
+            # Passed on in writes of so many bytes.
+            "fragment": {"write_bytes": _ByteCount},
+            # Further lines at a rate: random ones, or copies of the last line that passed.
+            "flood": {"rate_hz": Positive, "lines": Literal["garbage", "copies"]},
+            # Passed on byte by byte, at a rate.
+            "slowloris": {"bytes_per_s": Positive},
+            # A line of so many random bytes before every n-th line.
+            "garbage": {"garbage_bytes": _ByteCount, "every": _Nth},
+            # One byte of every n-th line is another one.
+            "corrupt": {"every": _Nth},
+        },
+    ),
 }
 
 LOCKSTEP_TYPES = ("reset", "close", "duplicate", "fragment", "garbage")
@@ -438,19 +289,18 @@ class _Entry:
     def fault(self) -> InjectedFault | None:
         types = self._choice("signal", TYPES)
         model = self._choice("type", types) if types is not None else None
-        fault = self._validated(model) if model is not None else None
-        if isinstance(fault, Wrong) and (fault.offset, fault.factor, fault.sign) == (None, None, None):
+        fault: Any = self._validated(model)
+        if model is _ON_SENSORS["wrong"] and fault and (fault.offset, fault.factor, fault.sign) == (None, None, None):
             self._complain("type", '= "wrong" needs an offset, a factor or a sign')
-        if isinstance(fault, Saturated):
+        if model is _ON_SENSORS["saturated"] and fault:
             low = -math.inf if fault.low is None else fault.low
             high = math.inf if fault.high is None else fault.high
             if not low < high or (low, high) == (-math.inf, math.inf):
                 self._complain("type", '= "saturated" needs low or high, and low below high')
-        return fault
+        return fault  # type: ignore[no-any-return]
 
     def link(self) -> LinkFault | None:
-        model = self._choice("type", LINK_TYPES)
-        fault = self._validated(model) if model is not None else None
+        fault: LinkFault | None = self._validated(self._choice("type", LINK_TYPES))
         if fault is not None and [fault.at_s, fault.after_lines, fault.after_bytes].count(None) != 2:
             self._complain("type", f"= {format_value(fault.type)} needs one of at_s, after_lines, after_bytes")
         return fault
@@ -468,7 +318,9 @@ class _Entry:
             return choices[value]
         return None
 
-    def _validated(self, model: type[_Model]) -> _Model | None:
+    def _validated(self, model: Any) -> Any:
+        if model is None:
+            return None
         try:
             # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
             return model.model_validate_json(json.dumps(self.row, default=str), strict=True)

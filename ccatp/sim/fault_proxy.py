@@ -13,35 +13,19 @@ from collections.abc import Callable
 from math import inf
 from typing import Any, Literal, Self, cast
 
-from ccatp.sim.fault_plan import (
-    LINK_TYPES,
-    BlackHole,
-    Corrupt,
-    Delay,
-    Direction,
-    DuplicateLines,
-    Flood,
-    Fragment,
-    GarbageBytes,
-    Injected,
-    LastingLinkFault,
-    LinkFault,
-    ReorderLines,
-    Reset,
-    Slowloris,
-    Stall,
-)
+from ccatp.sim.fault_plan import LINK_TYPES, Direction, Injected, LinkFault
 
 OneWay = Literal["to_client", "to_robot"]
-OneWayFaults = dict[type[LinkFault], Any]
-"""What is switched on in one direction, one of each type."""
+OneWayFaults = dict[str, Any]
+"""What is switched on in one direction, one fault of each type."""
 
 READ_BYTES = 65536
 # While nothing goes out, no more than this is taken in: then the sender feels it.
 MAX_WAITING_BYTES = 8 << 20
 _LF = b"\n"
 _GARBAGE_LINE_BYTES = 64
-_LINE_FAULTS: tuple[type[LinkFault], ...] = (ReorderLines, DuplicateLines, Corrupt, GarbageBytes, Flood)
+_LINE_FAULTS = ("reorder", "duplicate", "corrupt", "garbage", "flood")
+_AT_ONCE = ("reset", "close")
 _BOTH: tuple[OneWay, OneWay] = ("to_client", "to_robot")
 _FLOOD_PERIOD_S = 0.005
 _RST_ON_CLOSE = struct.pack("ii", 1, 0)  # SO_LINGER: on, for 0 s
@@ -53,7 +37,7 @@ class LineStage:
     def __init__(self, faults: OneWayFaults, counts: "Counter[str]", rng: random.Random) -> None:
         self._faults, self._counts, self._rng = faults, counts, rng
         self._rest = self._withheld = b""
-        self._seen: Counter[type[LinkFault]] = Counter()
+        self._seen: Counter[str] = Counter()
         self._last = b""
 
     def feed(self, data: bytes) -> list[bytes]:
@@ -71,30 +55,30 @@ class LineStage:
 
     def flood_line(self) -> bytes:
         """One further line."""
-        if self._faults[Flood].lines == "copies" and self._last:
+        if self._faults["flood"].lines == "copies" and self._last:
             return self._last
         return self._garbage(_GARBAGE_LINE_BYTES)
 
     def _treat(self, line: bytes) -> list[bytes]:
         self._last = line
         found: list[bytes] = []
-        if self._is_hit(GarbageBytes):
-            found.append(self._garbage(self._faults[GarbageBytes].garbage_bytes))
-        if self._is_hit(Corrupt):
+        if self._is_hit("garbage"):
+            found.append(self._garbage(self._faults["garbage"].garbage_bytes))
+        if self._is_hit("corrupt"):
             line = self._corrupt(line)
         if self._withheld:
             found += [line, self._withheld]
             self._withheld = b""
-        elif self._is_hit(ReorderLines):
+        elif self._is_hit("reorder"):
             self._withheld = line
             return found
         else:
             found.append(line)
-        if self._is_hit(DuplicateLines):
+        if self._is_hit("duplicate"):
             found.append(line)
         return found
 
-    def _is_hit(self, kind: type[LinkFault]) -> bool:
+    def _is_hit(self, kind: str) -> bool:
         """Whether this line is an n-th one; counts it then."""
         fault = self._faults.get(kind)
         if fault is None:
@@ -102,7 +86,7 @@ class LineStage:
         self._seen[kind] += 1
         if self._seen[kind] % fault.every:
             return False
-        self._counts[fault.type] += 1
+        self._counts[kind] += 1
         return True
 
     def _garbage(self, count: int) -> bytes:
@@ -150,7 +134,7 @@ class Pipe:
         if not data or self._is_shut or self._waiting_bytes + len(data) > 2 * MAX_WAITING_BYTES:
             return
         now_s, late_s = asyncio.get_running_loop().time(), 0.0
-        delay = self._faults.get(Delay)
+        delay = self._faults.get("delay")
         if delay is not None:
             late_s = delay.delay_s + (delay.jitter_s * self._rng.random() if delay.jitter_s else 0.0)
         if late_s:
@@ -168,6 +152,18 @@ class Pipe:
         self._send_end()
         self.wake()
 
+    def abort(self) -> None:
+        """End the connection to whom it sends, now."""
+        self._writer.transport.abort()
+
+    def reset(self) -> None:
+        """The same by RST."""
+        peer = self._writer.get_extra_info("socket")
+        if not self._writer.is_closing() and peer is not None:
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RST_ON_CLOSE)
+        self.abort()
+        self.wake()
+
     def flood(self, lines: int) -> None:
         """Let further lines wait, after what waits already."""
         self._counts["flood"] += lines
@@ -176,14 +172,14 @@ class Pipe:
     async def receive(self) -> None:
         """Take in until the sender ends or is gone."""
         while data := await self._read():
-            if BlackHole in self._faults:
+            if "black_hole" in self._faults:
                 self._counts["black_hole"] += len(data)
                 continue
             for piece in self._stage.feed(data):
                 self.put(piece)
             while self._waiting_bytes > MAX_WAITING_BYTES:
                 await self._change()
-        while BlackHole in self._faults and not self._writer.is_closing():
+        while "black_hole" in self._faults and not self._writer.is_closing():
             await self._change()
         self.put(self._stage.finish())
         self._is_at_end = True
@@ -215,7 +211,7 @@ class Pipe:
         """What is due, all of it in one piece; ``None`` at the end."""
         loop = asyncio.get_running_loop()
         while True:
-            if Stall in self._faults or not self._waiting:
+            if "stall" in self._faults or not self._waiting:
                 if self._is_at_end and not self._waiting:
                     return None
                 if self._waiting:
@@ -235,7 +231,7 @@ class Pipe:
 
     async def _write(self, data: bytes) -> None:
         while data and not self._is_shut:
-            slow, fragment = self._faults.get(Slowloris), self._faults.get(Fragment)
+            slow, fragment = self._faults.get("slowloris"), self._faults.get("fragment")
             size = len(data) if fragment is None else fragment.write_bytes
             piece = data[: size if slow is None else 1]
             part = self._may_write(piece)
@@ -255,22 +251,6 @@ class Pipe:
                 await asyncio.sleep(0)
 
 
-class _Connection:
-    """A client, its connection to the server, and the two pipes between them."""
-
-    def __init__(self, client: asyncio.StreamWriter, server: asyncio.StreamWriter, pipes: dict[OneWay, Pipe]) -> None:
-        self.client, self.server, self.pipes = client, server, pipes
-
-    def reset(self) -> None:
-        for writer in (self.client, self.server):
-            peer = writer.get_extra_info("socket")
-            if not writer.is_closing() and peer is not None:
-                peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RST_ON_CLOSE)
-            writer.transport.abort()
-        for pipe in self.pipes.values():
-            pipe.wake()
-
-
 class FaultProxy:
     """A proxy for one server; an asynchronous context manager.
 
@@ -286,7 +266,7 @@ class FaultProxy:
         self._address, self._own_listener = (host, port), listener
         self._rng = random.Random(seed)
         self._faults: dict[OneWay, OneWayFaults] = {way: {} for way in _BOTH}
-        self._connections: set[_Connection] = set()
+        self._connections: list[dict[OneWay, Pipe]] = []
         self._handlers: set[asyncio.Task[None]] = set()
         self._flooding: asyncio.Task[None] | None = None
         self._server: asyncio.Server | None = None
@@ -311,6 +291,9 @@ class FaultProxy:
         """How many there are."""
         return len(self._connections)
 
+    def _pipes(self) -> list[Pipe]:
+        return [pipe for pipes in self._connections for pipe in pipes.values()]
+
     async def stop(self) -> None:
         """End everything."""
         if self._server is not None:
@@ -318,9 +301,8 @@ class FaultProxy:
         tasks = [*self._handlers, *([self._flooding] if self._flooding else [])]
         for task in tasks:
             task.cancel()
-        for connection in tuple(self._connections):
-            connection.client.transport.abort()
-            connection.server.transport.abort()
+        for pipe in self._pipes():
+            pipe.abort()
         await asyncio.gather(*tasks, return_exceptions=True)
         if self._server is not None:
             await self._server.wait_closed()
@@ -329,8 +311,8 @@ class FaultProxy:
     def reset(self) -> None:
         """Break every connection by RST, on both sides."""
         self.counts["reset"] += len(self._connections)
-        for connection in tuple(self._connections):
-            connection.reset()
+        for pipe in self._pipes():
+            pipe.reset()
 
     def reset_after(self, passed_bytes: int) -> None:
         """The same as soon as exactly so many bytes have gone to the clients, counted over all connections."""
@@ -342,39 +324,36 @@ class FaultProxy:
         What they still send is read and forgotten: a socket closed over unread bytes sends RST.
         """
         self.counts["close"] += len(self._connections)
-        for connection in tuple(self._connections):
-            for pipe in connection.pipes.values():
-                pipe.shut()
+        for pipe in self._pipes():
+            pipe.shut()
 
     def begin(self, name: str, direction: Direction = "both", **values: Any) -> None:
         """Switch on a fault that lasts: a type of the fault plan and its keys."""
         self.switch_on(LINK_TYPES[name].model_validate({"type": name, "direction": direction, **values}))
 
-    def switch_on(self, fault: LinkFault) -> None:
+    def switch_on(self, fault: Any) -> None:
         """The same with the fault of a plan, whatever its type."""
-        if not isinstance(fault, LastingLinkFault):
-            (self.reset if isinstance(fault, Reset) else self.close)()
+        if fault.type in _AT_ONCE:
+            (self.reset if fault.type == "reset" else self.close)()
             return
         for way in _BOTH:
             if fault.direction in {way, "both"}:
-                self._faults[way][type(fault)] = fault
+                self._faults[way][fault.type] = fault
         self._wake()
-        if isinstance(fault, Flood) and (self._flooding is None or self._flooding.done()):
+        if fault.type == "flood" and (self._flooding is None or self._flooding.done()):
             self._flooding = asyncio.get_running_loop().create_task(self._flood())
 
     def heal(self, direction: Direction = "both", name: str | None = None) -> None:
         """End every fault that lasts, or that of one type; what was stalled goes in one burst."""
         for way in _BOTH:
             if direction in {way, "both"}:
-                for kind in tuple(self._faults[way]):
-                    if name is None or kind is LINK_TYPES[name]:
-                        del self._faults[way][kind]
+                for kind in [kind for kind in self._faults[way] if name in {None, kind}]:
+                    del self._faults[way][kind]
         self._wake()
 
     def _wake(self) -> None:
-        for connection in self._connections:
-            for pipe in connection.pipes.values():
-                pipe.wake()
+        for pipe in self._pipes():
+            pipe.wake()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = cast(asyncio.Task[None], asyncio.current_task())  # asyncio runs this as a task of its own
@@ -400,8 +379,7 @@ class FaultProxy:
             "to_robot": self._pipe("to_robot", reader, server),
             "to_client": self._pipe("to_client", server_reader, client),
         }
-        connection = _Connection(client, server, pipes)
-        self._connections.add(connection)
+        self._connections.append(pipes)
         self.counts["connections"] += 1
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -409,7 +387,7 @@ class FaultProxy:
                     tasks.create_task(pipe.receive())
                     tasks.create_task(pipe.send())
         finally:
-            self._connections.discard(connection)
+            self._connections.remove(pipes)
             client.close()
             server.close()
 
@@ -433,17 +411,17 @@ class FaultProxy:
         owed = dict.fromkeys(_BOTH, 0.0)
         clock = asyncio.get_running_loop().time
         before_s = clock()
-        while any(Flood in faults for faults in self._faults.values()):
+        while any("flood" in faults for faults in self._faults.values()):
             await asyncio.sleep(_FLOOD_PERIOD_S)
             now_s = clock()
             for way in _BOTH:
-                flood = self._faults[way].get(Flood)
+                flood = self._faults[way].get("flood")
                 if flood is None:
                     continue
                 owed[way] += (now_s - before_s) * flood.rate_hz
                 lines, owed[way] = int(owed[way]), owed[way] % 1.0
-                for connection in self._connections if lines else ():
-                    connection.pipes[way].flood(lines)
+                for pipes in self._connections if lines else ():
+                    pipes[way].flood(lines)
             before_s = now_s
 
 
@@ -451,21 +429,12 @@ class _Watched:
     """One fault of the plan and what became of it."""
 
     def __init__(self, fault: LinkFault) -> None:
-        self.fault = fault
+        self.fault: Any = fault
         self.from_s: float | None = None
         self.until_s: float | None = None
         self.count_before = self.count = 0
         # A reset after so many bytes: the proxy itself waits for the moment, to the byte.
-        self.is_armed = isinstance(fault, Reset) and fault.after_bytes is not None
-
-    @property
-    def is_lasting(self) -> bool:
-        return self.from_s is not None and self.until_s is None
-
-    @property
-    def end_s(self) -> float:
-        for_s = getattr(self.fault, "for_s", None)
-        return inf if self.from_s is None or for_s is None else self.from_s + for_s
+        self.is_armed = fault.type == "reset" and fault.after_bytes is not None
 
     @property
     def injected(self) -> Injected:
@@ -479,14 +448,14 @@ class LinkFaults:
         self._proxy = proxy
         self._watched = [_Watched(fault) for fault in plan]
         for one in self._watched:
-            if one.is_armed and one.fault.after_bytes is not None:
+            if one.is_armed:
                 proxy.reset_after(one.fault.after_bytes)
 
     @property
     def injected(self) -> tuple[Injected, ...]:
         """The record of each fault, in the order of the plan."""
         for one in self._watched:
-            if one.is_lasting:
+            if one.from_s is not None and one.until_s is None:
                 self._count(one)
         return tuple(one.injected for one in self._watched)
 
@@ -500,11 +469,11 @@ class LinkFaults:
                 if not one.is_armed:
                     one.count_before = self._proxy.counts[fault.type]
                     self._proxy.switch_on(fault)
-                if not isinstance(fault, LastingLinkFault):
+                if fault.type in _AT_ONCE:
                     one.until_s = t_s
                 self._count(one)
                 news.append(("begins", one.injected))
-            elif one.is_lasting and isinstance(fault, LastingLinkFault) and t_s >= one.end_s:
+            elif one.from_s is not None and one.until_s is None and t_s >= one.from_s + (fault.for_s or inf):
                 self._count(one)
                 one.until_s = t_s
                 self._proxy.heal(fault.direction, fault.type)
@@ -512,12 +481,11 @@ class LinkFaults:
         return news
 
     def _is_due(self, fault: LinkFault, t_s: float) -> bool:
-        proxy = self._proxy
         if fault.at_s is not None:
             return t_s >= fault.at_s
         if fault.after_lines is not None:
-            return proxy.passed_lines >= fault.after_lines
-        return fault.after_bytes is not None and proxy.passed_bytes >= fault.after_bytes
+            return self._proxy.passed_lines >= fault.after_lines
+        return fault.after_bytes is not None and self._proxy.passed_bytes >= fault.after_bytes
 
     def _count(self, one: _Watched) -> None:
         one.count = self._proxy.counts[one.fault.type] - one.count_before

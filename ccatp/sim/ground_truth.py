@@ -4,54 +4,77 @@ import os
 import zlib
 from pathlib import Path
 from struct import Struct
+from typing import Any
 
+import msgspec
 import zmq
 import zmq.asyncio
 
 from ccatp.core import DeckPose
 from ccatp.links.bus import Publisher
 from ccatp.sim.robot import Robot
-from ccatp.sim.rules import TruthLog
+from ccatp.sim.rules import SimulatedRobot
 
 MAX_REQUEST_BYTES = 4096
 
 
 class GroundTruthPublisher:
-    """Publishes the true state by ZeroMQ at ``pub``, and answers requests at ``rep``, where they are given."""
+    """Collects a row of the true state per frame, publishes it at ``pub`` and answers requests at ``rep``, where given.
 
-    def __init__(self, truth: TruthLog, rep: str | None, pub: str | None) -> None:
-        self._truth = truth
+    Requests are answered as JSON: those of the robot, and ``b"flush"``: ``{"rows": n}``, the number of rows published
+    so far, after the pending ones; anything else: ``{"error"}``.
+    """
+
+    def __init__(self, robot: SimulatedRobot, rep: str | None = None, pub: str | None = None) -> None:
+        self._robot = robot
+        self._rows: list[Any] = []
+        self._taken = 0
+        self._was_fallen = self._has_sent_preface = False
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._publisher = Publisher(self._context, pub) if pub else None
-        self._has_sent_preface = False
         self._rep = zmq.asyncio.Context.shadow(self._context).socket(zmq.REP) if rep else None
         if self._rep is not None and rep:
             self._rep.setsockopt(zmq.LINGER, 0)
             self._rep.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
             self._rep.bind(rep)
+        self.add()
 
     def add(self) -> None:
-        """Take the row of the newest frame."""
-        if self._truth.add():
+        """Take the row of the newest frame; a batch is published when it is full, or the robot fell."""
+        robot = self._robot
+        self._rows.append(robot.truth_row())
+        has_fallen, self._was_fallen = robot.is_fallen is not self._was_fallen, robot.is_fallen
+        if has_fallen or len(self._rows) >= robot.truth_rows:
             self.flush()
 
     def flush(self) -> None:
         """Publish the pending rows."""
-        batch = self._truth.batch()
-        if batch is None or self._publisher is None:
+        rows, self._rows = self._rows, []
+        self._taken += len(rows)
+        if not rows or self._publisher is None:
             return
         if not self._has_sent_preface:  # before the first batch: a recorder of one has the other, however the run ends
             self._has_sent_preface = True
-            self._publisher.send(*self._truth.robot.truth_preface())
-        self._publisher.send(*batch)
+            self._publisher.send(*self._robot.truth_preface())
+        self._publisher.send(*self._robot.truth_message(rows))
+
+    def answer(self, request: bytes) -> bytes:
+        """The reply to a request."""
+        known = self._robot.truth_requests
+        name = request.decode("ascii", "replace")
+        if name == "flush":
+            self.flush()
+            reply: dict[str, object] = {"rows": self._taken}
+        elif name in known:
+            reply = known[name]()
+        else:
+            reply = {"error": f"unknown request; known {'are' if known else 'is'} {', '.join((*known, 'flush'))}"}
+        return msgspec.json.encode(reply)
 
     async def serve(self) -> None:
         """Answer requests for ever."""
         while self._rep is not None:
-            request = await self._rep.recv()
-            if request == b"flush":
-                self.flush()
-            await self._rep.send(self._truth.answer(request))
+            await self._rep.send(self.answer(await self._rep.recv()))
 
     def close(self) -> None:
         """Release the sockets."""

@@ -21,12 +21,12 @@ Each kind of random number has its own stream, a function of the seed alone.
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from math import cos, exp, inf, sin, sqrt
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from ccatp.config.models import RobotConfig, WorldConfig
-from ccatp.core import DeckPose, FloatArray
+from ccatp.core import DeckPose, FloatArray, Vector3
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import Surface, SurfacePatch
 
@@ -46,13 +46,9 @@ BodyStep = tuple[float, float, float]
 """Displacement along robot x and y, m, and rotation about robot z, rad."""
 
 
-class Disturbance(Protocol):
-    """What pushes the body besides its wheels: creep, vibration."""
-
-    def displace(
-        self, plant: "Plant", t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
-    ) -> BodyStep:
-        """Body displacement of one step after this disturbance, from the one before it."""
+Disturbance = Callable[["Plant", float, float, float, float, float], BodyStep]
+"""What pushes the body besides its wheels: from the plant, time and length of the step (s), and the body's displacement
+before this disturbance, it gives the displacement after it."""
 
 
 class Plant:
@@ -113,7 +109,7 @@ class Plant:
         self.are_wheels_still = is_still = right == left == right_set_rad_s == left_set_rad_s == 0.0
         forward, sideways, turn = (0.0, 0.0, 0.0) if is_still else self._turn_wheels(dt_s)
         for disturbance in self._disturbances:
-            forward, sideways, turn = disturbance.displace(self, t_s, dt_s, forward, sideways, turn)
+            forward, sideways, turn = disturbance(self, t_s, dt_s, forward, sideways, turn)
         self.forward_m, self.left_m, self.turn_rad = forward, sideways, turn
         self.is_moving = is_moving = not forward == sideways == turn == 0.0
         if is_moving:
@@ -325,27 +321,21 @@ class WheelSlip:
         self.left = self._base[1] + self._walks[1].at(t_s)
 
 
-class Downhill:
-    """Where downhill is under the robot."""
-
-    def __init__(self, mirror: Mirror) -> None:
-        self._gravity = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
-
-    def of(self, plant: Plant) -> tuple[float, float, float]:
-        """Gravity's part in the tangent plane along robot x and y, and its length: the slope."""
-        gx, gy, gz = self._gravity
-        hx, hy, lx, ly, fx, fy = plant.hx, plant.hy, plant.lx, plant.ly, plant.fx, plant.fy
-        # Both axes are tangents of the surface, so their third component is the slope along them.
-        ahead = gx * hx + gy * hy + gz * (fx * hx + fy * hy)
-        aside = gx * lx + gy * ly + gz * (fx * lx + fy * ly)
-        return ahead, aside, sqrt(ahead * ahead + aside * aside)
+def downhill(plant: Plant, gravity: Vector3) -> tuple[float, float, float]:
+    """Part of ``gravity`` (deck frame) in the tangent plane along robot x and y, and its length: the slope."""
+    gx, gy, gz = gravity
+    hx, hy, lx, ly, fx, fy = plant.hx, plant.hy, plant.lx, plant.ly, plant.fx, plant.fy
+    # Both axes are tangents of the surface, so their third component is the slope along them.
+    ahead = gx * hx + gy * hy + gz * (fx * hx + fy * hy)
+    aside = gx * lx + gy * ly + gz * (fx * lx + fy * ly)
+    return ahead, aside, sqrt(ahead * ahead + aside * aside)
 
 
 class Creep:
     """The body glides downhill while it drives; ``rng`` is that of the walk of the creep."""
 
     def __init__(self, mirror: Mirror, world: WorldConfig, rng: np.random.Generator) -> None:
-        self._downhill = Downhill(mirror)
+        self._gravity = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
         self._fraction = world.creep_fraction
         self._walk = OrnsteinUhlenbeck(world.creep_walk_fraction, world.creep_walk_time_s, rng)
 
@@ -355,7 +345,7 @@ class Creep:
         """Add ``creep_fraction |v| (1 + walk) dt`` along the unit vector downhill."""
         if forward_m == 0.0:
             return forward_m, left_m, turn_rad
-        ahead, aside, slope = self._downhill.of(plant)
+        ahead, aside, slope = downhill(plant, self._gravity)
         if slope < LEVEL_SLOPE:
             return forward_m, left_m, turn_rad
         glide = self._fraction * abs(forward_m) * (1.0 + self._walk.at(t_s)) / slope

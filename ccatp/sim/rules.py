@@ -10,13 +10,12 @@ from collections.abc import Callable
 from math import isfinite
 from typing import Any, Literal
 
-import msgspec
-
-from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData
+from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData, Role
 from ccatp.links.topics import Message
 
 HELD = (0.0, 0.0)
 _EVERYTHING = (True, True, True)
+_MOTION: dict[Role, str] = {"controller": "drive", "monitor": "permit"}  # command of a role that moves the robot
 
 
 class MotionRules:
@@ -29,6 +28,7 @@ class MotionRules:
 
     Attributes:
         is_held: the last ``set_points`` held the wheels.
+        steer_rad: steering angle of the newest drive.
     """
 
     def __init__(self, ttl_s: float, max_wheel_rad_s: float, boot_s: float = 0.0) -> None:
@@ -37,32 +37,32 @@ class MotionRules:
         self._permit: tuple[bool, bool, bool] | None = None
         self._drive_seq = self._permit_seq = -1
         self._drive_s = self._permit_s = boot_s  # as old as the boot
-        self._is_steered = self.has_monitor_joined = False
+        self.steer_rad = 0.0
+        self.has_monitor_joined = False
         self.is_held = True
 
-    def join_controller(self) -> None:
-        """A new session has the controller's role: nothing of the one before is in force."""
-        self._drive, self._drive_seq = None, -1
+    def join(self, role: Role) -> None:
+        """A new session has a role: nothing of the one before is in force; from now on a monitor's permit is needed."""
+        self.lose(role)
+        if role == "controller":
+            self._drive_seq = -1
+        else:
+            self.has_monitor_joined = True
+            self._permit_seq = -1
 
-    def join_monitor(self) -> None:
-        """A new session has the monitor's role; from now on its permit is needed."""
-        self.has_monitor_joined = True
-        self._permit, self._permit_seq = None, -1
+    def lose(self, role: Role) -> None:
+        """The session of a role has ended: hold."""
+        if role == "controller":
+            self._drive = None
+        else:
+            self._permit = None
 
-    def lose_controller(self) -> None:
-        """The controller's session has ended: hold."""
-        self._drive = None
-
-    def lose_monitor(self) -> None:
-        """The monitor's session has ended: hold."""
-        self._permit = None
-
-    def drive(self, seq: int, right_rad_s: float, left_rad_s: float, now_s: float, *, is_steered: bool = False) -> bool:
+    def drive(self, seq: int, right_rad_s: float, left_rad_s: float, now_s: float, steer_rad: float = 0.0) -> bool:
         """Take a drive that arrived at ``now_s``; false for an old or equal ``seq`` and for numbers not finite.
 
-        ``is_steered``: wheels beside these two make a turn of it.
+        A steering angle other than zero makes a turn of it.
         """
-        if seq <= self._drive_seq:
+        if seq <= self._drive_seq or not isfinite(steer_rad):
             return False
         limit = self._max_wheel_rad_s
         if not (-limit <= right_rad_s <= limit and -limit <= left_rad_s <= limit):
@@ -71,7 +71,7 @@ class MotionRules:
             scale = limit / max(abs(right_rad_s), abs(left_rad_s))
             right_rad_s, left_rad_s = scale * right_rad_s, scale * left_rad_s
         self._drive = (float(right_rad_s), float(left_rad_s))  # one number of numpy's would slow down all that follows
-        self._drive_seq, self._drive_s, self._is_steered = seq, now_s, is_steered
+        self._drive_seq, self._drive_s, self.steer_rad = seq, now_s, steer_rad
         return True
 
     def permit(self, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float) -> bool:
@@ -102,7 +102,7 @@ class MotionRules:
             return True
         (right, left), (forward, reverse, turn) = drive, permit
         speed = right + left
-        turns = right != left or (self._is_steered and speed != 0.0)
+        turns = right != left or (self.steer_rad != 0.0 and speed != 0.0)
         return (forward or speed <= 0.0) and (reverse or speed >= 0.0) and (turn or not turns)
 
     def echo(self, now_s: float) -> tuple[int, float, float, bool]:
@@ -126,7 +126,7 @@ class FanRules:
         self.duty = (floor, floor)
         self.health = (1.0, 1.0)
 
-    def join_controller(self) -> None:
+    def join(self) -> None:
         """A new session counts from the start; the duties stay."""
         self._seq = -1
 
@@ -153,6 +153,7 @@ class SimulatedRobot(ABC):
     """
 
     truth_rows = 100  # a batch of the log of the true state
+    is_steerable = False
 
     def __init__(
         self, limits: tuple[float, float, float], frame_s: float, frame_hz: float, commands_delay_frames: int = 0
@@ -219,35 +220,26 @@ class SimulatedRobot(ABC):
         """Whether the robot fell; its row is published at once."""
         return False
 
-    def join_controller(self) -> None:
-        """A new session has the controller's role; fan duties of the one before, already accepted, come into force."""
-        for _, kind, seq, values in self._waiting:
-            if kind == "fans":
-                self.fans.command(seq, *values)
-        self._forget("fans", "drive")
-        self.rules.join_controller()
-        self.fans.join_controller()
+    def join(self, role: Role) -> None:
+        """A new session has a role; fan duties of the controller before, already accepted, come into force."""
+        if role == "controller":
+            for _, kind, seq, values in self._waiting:
+                if kind == "fans":
+                    self.fans.command(seq, *values)
+            self.fans.join()
+            self._forget("fans")
+        self._forget(_MOTION[role])
+        self.rules.join(role)
 
-    def join_monitor(self) -> None:
-        """A new session has the monitor's role; from now on its permit is needed."""
-        self._forget("permit")
-        self.rules.join_monitor()
+    def lose(self, role: Role) -> None:
+        """The session of a role has ended: hold. Fan duties stay."""
+        self._forget(_MOTION[role])
+        self.rules.lose(role)
 
-    def lose_controller(self) -> None:
-        """The controller's session has ended: hold. Its fan duties stay."""
-        self._forget("drive")
-        self.rules.lose_controller()
-
-    def lose_monitor(self) -> None:
-        """The monitor's session has ended: hold."""
-        self._forget("permit")
-        self.rules.lose_monitor()
-
-    def _forget(self, *kinds: str) -> None:
-        for kind in kinds:
-            self._newest[kind] = -1
+    def _forget(self, kind: str) -> None:
+        self._newest[kind] = -1
         if self._waiting:
-            self._waiting = deque(command for command in self._waiting if command[1] not in kinds)
+            self._waiting = deque(command for command in self._waiting if command[1] != kind)
 
     def drive(
         self,
@@ -262,8 +254,8 @@ class SimulatedRobot(ABC):
         ``now_s`` is the robot's clock at its arrival, by default the time of the newest frame. Without a steered wheel
         ``steer_rad`` has no effect.
         """
-        del steer_rad
-        return self._take("drive", seq, right_rad_s, left_rad_s, self.t_s if now_s is None else now_s)
+        steer = steer_rad if steer_rad is not None and self.is_steerable else 0.0
+        return self._take("drive", seq, right_rad_s, left_rad_s, self.t_s if now_s is None else now_s, steer)
 
     def permit(self, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None) -> bool:
         """Take a permit; false for an old or equal ``seq``. ``now_s`` as for ``drive``."""
@@ -294,44 +286,3 @@ class SimulatedRobot(ABC):
         while self._waiting and self._waiting[0][0] <= self.seq:
             _, kind, seq, values = self._waiting.popleft()
             self._apply(kind, seq, values)
-
-
-class TruthLog:
-    """Collects a row of the true state per frame.
-
-    Requests are answered as JSON: those of the robot, and ``b"flush"``: ``{"rows": n}``, the number of rows taken so
-    far (the caller takes the pending ones first); anything else: ``{"error"}``.
-    """
-
-    def __init__(self, robot: SimulatedRobot) -> None:
-        self.robot = robot
-        self._rows: list[Any] = []
-        self._taken = 0
-        self._is_fallen = False
-        self.add()
-
-    def add(self) -> bool:
-        """Add the row of the newest frame; true when the batch should be taken: it is full, or the robot fell."""
-        robot = self.robot
-        self._rows.append(robot.truth_row())
-        has_fallen = robot.is_fallen is not self._is_fallen
-        self._is_fallen = robot.is_fallen
-        return has_fallen or len(self._rows) >= robot.truth_rows
-
-    def batch(self) -> tuple[str, Message] | None:
-        """The pending rows as a topic and its message, or ``None`` without any."""
-        rows, self._rows = self._rows, []
-        self._taken += len(rows)
-        return self.robot.truth_message(rows) if rows else None
-
-    def answer(self, request: bytes) -> bytes:
-        """The reply to a request."""
-        known = self.robot.truth_requests
-        name = request.decode("ascii", "replace")
-        if name == "flush":
-            reply: dict[str, object] = {"rows": self._taken}
-        elif name in known:
-            reply = known[name]()
-        else:
-            reply = {"error": f"unknown request; known {'are' if known else 'is'} {', '.join((*known, 'flush'))}"}
-        return msgspec.json.encode(reply)

@@ -165,11 +165,10 @@ class RobotServer:
         if role is None or self._holders.get(role) is not session:
             return
         del self._holders[role]
+        self.robot.lose(role)
         if role == "controller":
-            self.robot.lose_controller()
             self._is_drive_acked = False
         else:
-            self.robot.lose_monitor()
             self._is_permit_acked = False
         self._note(f"{role} lost: wheels held")
 
@@ -219,15 +218,14 @@ class RobotServer:
         session.wire.write(encode(Joined(role=message.role, session=self._last_session)))
         self._note(f"{message.role} joined: {message.client}")
         self._frame_wall_s, self._is_stall_noted = now_s, False
+        self.robot.join(message.role)
+        if not self._is_lockstep:
+            return
         if message.role == "controller":
-            self.robot.join_controller()
-            if self._is_lockstep:
-                self._run_to_delivery()
-                self._send_frame()
-        else:
-            self.robot.join_monitor()
-            if self._is_lockstep and "controller" in self._holders:
-                session.wire.write(self.robot.delivered_line)
+            self._run_to_delivery()
+            self._send_frame()
+        elif "controller" in self._holders:
+            session.wire.write(self.robot.delivered_line)
 
     def _run_to_delivery(self) -> None:
         """No client can answer what is still on its way, or lost: the frames until one arrives run by themselves."""

@@ -58,9 +58,9 @@ class World:
         self._vibration = Vibration(world, 1.0 / sim.frame_hz, vibration_rng) if has_vibration else None
         disturbances: list[Disturbance] = []
         if world.creep_fraction > 0.0:
-            disturbances.append(Creep(mirror, world, creep_rng))
+            disturbances.append(Creep(mirror, world, creep_rng).displace)
         if self._vibration is not None:
-            disturbances.append(self._vibration)
+            disturbances.append(self._vibration.displace)
         self.plant = Plant(
             mirror.surface,
             self.start_pose,

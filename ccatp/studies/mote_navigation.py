@@ -76,8 +76,8 @@ class BeaconSilWorld:
         self._summary = BeaconSummary(beacon_facts(cfg, is_sim=True))
         self._estimate: EstimateMessage | None = None
         self._signal = ""
-        self.robot.join_controller()
-        self.robot.join_monitor()
+        self.robot.join("controller")
+        self.robot.join("monitor")
 
     @property
     def is_over(self) -> bool:

@@ -278,8 +278,8 @@ class SilRun:
     def run(self) -> SilResult:
         """From the first frame to the end of the mission."""
         robot, mission = self.robot, self.mission
-        robot.join_monitor()
-        robot.join_controller()
+        robot.join("monitor")
+        robot.join("controller")
         self._note_truth()
         while robot.delivered is None:
             robot.advance()

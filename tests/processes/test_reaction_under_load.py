@@ -29,7 +29,6 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.etalon_server import EtalonSimulator, ZmqPuck
 from ccatp.sim.fault_proxy import FaultProxy, Pipe
 from ccatp.sim.ground_truth import GroundTruthPublisher
-from ccatp.sim.rules import TruthLog
 from tests.faults.linking import Measured
 
 TIMES = int(os.environ.get("CCATP_REACTIONS", "3"))
@@ -159,7 +158,7 @@ async def survey(folder: Path, runtime_dir: Path) -> AsyncIterator[Survey]:
     async with AsyncExitStack() as stack:
         robot = DataLoop(cfg, False, 1)
         puck_at = f"ipc://{runtime_dir / 'puck'}"
-        robot.truth = outlet = GroundTruthPublisher(TruthLog(robot.robot), puck_at, None)
+        robot.truth = outlet = GroundTruthPublisher(robot.robot, puck_at)
         stack.callback(outlet.close)
         wire = Wire(robot)
         port = await robot.start()

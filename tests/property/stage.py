@@ -82,8 +82,8 @@ class Stage(SilRun):
         self._pending: tuple[int, int, Sensors] | None = None
         self._emergencies: dict[str, str] = {}
         self._journey: object = None
-        self.robot.join_monitor()
-        self.robot.join_controller()
+        self.robot.join("monitor")
+        self.robot.join("controller")
         while self.robot.delivered is None:
             self.robot.advance()
         self.command_fans(*cfg.robot.fan_duty)

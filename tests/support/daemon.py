@@ -30,7 +30,6 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.etalon_server import EtalonSimulator, ZmqPuck
 from ccatp.sim.fault_proxy import FaultProxy
 from ccatp.sim.ground_truth import GroundTruthPublisher
-from ccatp.sim.rules import TruthLog
 
 DEADLINE_S = 60.0
 LINK_DEADLINE_S = 30.0  # what never happens in a good run may take this long in a bad one
@@ -176,7 +175,7 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
         run_dir = Path(folder)
         endpoints = Endpoints(run_dir)
         robot = DataLoop(robot_cfg or cfg, False, cfg.run.seed)
-        robot.truth = outlet = GroundTruthPublisher(TruthLog(robot.robot), endpoints.of("puck"), endpoints.of("truth"))
+        robot.truth = outlet = GroundTruthPublisher(robot.robot, endpoints.of("puck"), endpoints.of("truth"))
         port = await robot.start()
         mirror = build_mirror(cfg.mirror)
         puck = ZmqPuck(endpoints.of("puck"))

@@ -336,8 +336,8 @@ class RestartedSurvey(SilRun):
     def run(self) -> SilResult:
         """As of a rehearsal, with whichever mission is the present one."""
         robot = self.robot
-        robot.join_monitor()
-        robot.join_controller()
+        robot.join("monitor")
+        robot.join("controller")
         self._note_truth()
         while robot.delivered is None:
             robot.advance()
@@ -367,11 +367,11 @@ class RestartedSurvey(SilRun):
         robot = self.robot
         self.states.append(self.mission.state)
         self.done += self.mission.done
-        robot.lose_controller()
+        robot.lose("controller")
         for _ in range(self._silent_frames):
             robot.advance()
             self._note_truth()
-        robot.join_controller()
+        robot.join("controller")
         self._take_over()
 
     def _take_over(self) -> None:

@@ -158,7 +158,7 @@ def test_the_course_of_a_steered_vehicle_is_where_its_front_wheel_points() -> No
 
 def test_wheels_steering_and_scans_are_read_from_the_link(cfg: RadioConfig) -> None:
     robot = BeaconRobot(cfg, RadioWorld(cfg))
-    robot.join_controller()
+    robot.join("controller")
     reader = MeasurementReader(cfg)
     reader.read(*frame_of(robot))
     robot.drive(1, 1.0, 1.0, None, 0.3)
@@ -184,8 +184,8 @@ def test_a_scan_on_the_link_keeps_its_directions() -> None:
 
 def test_steering_needs_the_permit_to_turn(cfg: RadioConfig) -> None:
     robot = BeaconRobot(cfg, RadioWorld(cfg))
-    robot.join_controller()
-    robot.join_monitor()
+    robot.join("controller")
+    robot.join("monitor")
     for seq, steer, turn, is_held in ((1, 0.2, True, False), (2, 0.2, False, True), (3, 0.0, False, False)):
         robot.permit(seq, True, True, turn)
         robot.drive(seq, 1.0, 1.0, None, steer)
@@ -195,7 +195,7 @@ def test_steering_needs_the_permit_to_turn(cfg: RadioConfig) -> None:
 
 def test_a_drive_outlives_its_time_to_live_by_nothing(cfg: RadioConfig) -> None:
     robot = BeaconRobot(cfg, RadioWorld(cfg))
-    robot.join_controller()
+    robot.join("controller")
     robot.drive(1, 1.0, 1.0)
     held = []
     for _ in range(4):

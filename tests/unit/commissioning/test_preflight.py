@@ -48,7 +48,7 @@ def stand(cfg: Config) -> tuple[Mirror, RobotReport]:
     """What a robot that nobody drives says for three seconds."""
     mirror = build_mirror(cfg.mirror)
     robot = Robot(cfg, mirror, np.random.default_rng(cfg.run.seed))
-    robot.join_monitor()
+    robot.join("monitor")
     frames: list[Sensors] = []
     while len(frames) < FRAMES:
         robot.advance()

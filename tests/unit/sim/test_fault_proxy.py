@@ -328,7 +328,7 @@ async def test_who_does_not_take_is_felt_by_who_sends(monkeypatch: pytest.Monkey
 def stage(seed: int = 1, **faults: dict[str, Any]) -> tuple[LineStage, OneWayFaults, Counter[str]]:
     switched: OneWayFaults = {}
     for name, keys in faults.items():
-        switched[LINK_TYPES[name]] = LINK_TYPES[name].model_validate({"type": name, "direction": "both", **keys})
+        switched[name] = LINK_TYPES[name].model_validate({"type": name, "direction": "both", **keys})
     counts: Counter[str] = Counter()
     return LineStage(switched, counts, random.Random(seed)), switched, counts
 

@@ -12,6 +12,7 @@ from ccatp.core import DeckPose
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.plant import (
     WHOLE,
+    BodyStep,
     Creep,
     Disturbance,
     DriftingBias,
@@ -166,19 +167,13 @@ def test_coasting_distance_is_speed_times_lag(mirror: Mirror) -> None:
 
 
 def test_disturbances_act_on_the_body_one_after_the_other(mirror: Mirror) -> None:
-    class Creep:
-        def displace(
-            self, plant: Plant, t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
-        ) -> tuple[float, float, float]:
-            return forward_m, left_m + 0.01 * dt_s, turn_rad
+    def creep(_p: Plant, _t: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float) -> BodyStep:
+        return forward_m, left_m + 0.01 * dt_s, turn_rad
 
-    class Slip:
-        def displace(
-            self, plant: Plant, t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
-        ) -> tuple[float, float, float]:
-            return 0.5 * forward_m, 2.0 * left_m, turn_rad
+    def slip(_p: Plant, _t: float, _dt: float, forward_m: float, left_m: float, turn_rad: float) -> BodyStep:
+        return 0.5 * forward_m, 2.0 * left_m, turn_rad
 
-    plant = plant_on(mirror, disturbances=(Creep(), Slip()))
+    plant = plant_on(mirror, disturbances=(creep, slip))
     start = np.array(mirror.surface.point(plant.x_m, plant.y_m))
     axes = mirror.robot_axes(plant.pose)
     drive(plant, 0.0, 0.0, 10)
@@ -370,7 +365,7 @@ def shaken(config: Config, mirror: Mirror, frames: int, **values: float) -> NDAr
     values = {"vibration_rate_rad_s": 0.02, "vibration_speed_m_s": 0.001, "vibration_acceleration_m_s2": 0.3, **values}
     vibration = Vibration(world_of(config, **values), DT_S, np.random.default_rng(1))
     vibration.is_thrusting = True
-    plant = plant_with(mirror, vibration)
+    plant = plant_with(mirror, vibration.displace)
     rows = []
     for k in range(frames):
         plant.step(k * DT_S, DT_S, 0.0, 0.0)
@@ -399,7 +394,7 @@ def test_vibration_has_its_sigmas_and_stays_where_it_is(config: Config, mirror: 
 def test_without_thrust_the_body_comes_back_and_rests(config: Config, mirror: Mirror) -> None:
     values = {"vibration_rate_rad_s": 0.02, "vibration_speed_m_s": 0.001, "vibration_acceleration_m_s2": 0.3}
     vibration = Vibration(world_of(config, **values), DT_S, np.random.default_rng(1))
-    plant = plant_with(mirror, vibration)
+    plant = plant_with(mirror, vibration.displace)
     for k in range(40):
         vibration.is_thrusting = 10 <= k < 30
         plant.step(k * DT_S, DT_S, 0.0, 0.0)

@@ -1,6 +1,8 @@
 """The whole simulated robot, frame by frame, in virtual time."""
 
 import json
+from contextlib import closing
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,10 +12,10 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, PanelId
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import MAX_LINE_BYTES, Sensors
-from ccatp.links.topics import TruthMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.sim import ground_truth
+from ccatp.sim.ground_truth import GroundTruthPublisher
 from ccatp.sim.robot import Robot
-from ccatp.sim.rules import TruthLog
 from ccatp.sim.world import TruthRow
 
 
@@ -235,48 +237,59 @@ def test_lines_stay_within_the_limit_and_readable(config: Config, mirror: Mirror
 # -- what the truth gives away ----------------------------------------------------------------------------------------
 
 
-def test_truth_comes_in_batches(config: Config, mirror: Mirror) -> None:
-    robot = boot(config, mirror)
-    truth = TruthLog(robot)
-    full = []
-    for k in range(250):
-        drive(robot, 3.0, 3.0, 1)
-        if truth.add():
-            full.append(k)
-            batch = truth.batch()
-            assert batch is not None
-            assert isinstance(batch[1], TruthMessage)
-            assert [row[0] for row in batch[1].rows] == list(range(robot.seq - 99, robot.seq + 1))
-    assert full == [98, 198]
-    assert truth.answer(b"flush") == b'{"rows":200}'
-    batch = truth.batch()
-    assert batch is not None
-    rest = batch[1]
-    assert isinstance(rest, TruthMessage)
-    assert (rest.seq, rest.rows[0][0], rest.rows[-1][0]) == (250, 200, 250)
-    assert truth.batch() is None
-    assert truth.answer(b"flush") == b'{"rows":251}'
+class Outbox:
+    """Keeps what is published."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[str, Any]] = []
+
+    def send(self, topic: str, message: Any) -> None:
+        self.sent.append((topic, message))
+
+    def close(self) -> None:
+        pass
 
 
-def test_a_fall_is_told_at_once(config: Config, mirror: Mirror) -> None:
+@pytest.fixture
+def outbox(monkeypatch: pytest.MonkeyPatch) -> Outbox:
+    found = Outbox()
+    monkeypatch.setattr(ground_truth, "Publisher", lambda _context, _endpoint: found)
+    return found
+
+
+def test_truth_comes_in_batches(config: Config, mirror: Mirror, outbox: Outbox) -> None:
     robot = boot(config, mirror)
-    truth = TruthLog(robot)
-    while not robot.world.is_fallen:
-        truth.batch()
-        drive(robot, 3.0, 3.0, 1)
-        assert truth.add() is robot.world.is_fallen
+    with closing(GroundTruthPublisher(robot, pub="inproc://truth")) as truth:
+        for _ in range(250):
+            drive(robot, 3.0, 3.0, 1)
+            truth.add()
+        assert [topic for topic, _ in outbox.sent] == ["misalignment", "truth", "truth"]
+        assert truth.answer(b"flush") == truth.answer(b"flush") == b'{"rows":251}'
+    batches = [message for topic, message in outbox.sent if topic == "truth"]
+    assert [batch.seq for batch in batches] == [99, 199, 250]
+    assert [row[0] for batch in batches for row in batch.rows] == list(range(251))
+
+
+def test_a_fall_is_told_at_once(config: Config, mirror: Mirror, outbox: Outbox) -> None:
+    robot = boot(config, mirror)
+    with closing(GroundTruthPublisher(robot, pub="inproc://truth")) as truth:
+        while not robot.world.is_fallen:
+            truth.flush()
+            outbox.sent.clear()
+            drive(robot, 3.0, 3.0, 1)
+            truth.add()
+            assert bool(outbox.sent) is robot.world.is_fallen
 
 
 def test_answers(config: Config, mirror: Mirror) -> None:
     robot = boot(config, mirror)
-    truth = TruthLog(robot)
-    puck = json.loads(truth.answer(b"puck"))
+    with closing(GroundTruthPublisher(robot)) as truth:
+        puck, told, unknown = (json.loads(truth.answer(name)) for name in (b"puck", b"misalignment", b"x" * 1000))
     assert (puck["t"], puck["moved_m"], tuple(puck["puck"])) == (0.0, 0.0, robot.world.puck_world())
-    told = json.loads(truth.answer(b"misalignment"))
     assert [PanelId(*row[:2]) for row in told["panels"]] == list(mirror.panels)
     assert [list(row) for row in robot.truth_preface()[1].panels] == told["panels"]
     assert told["start"][:2] == [robot.world.start_pose.x_m, robot.world.start_pose.y_m]
-    assert "unknown request" in json.loads(truth.answer(b"x" * 1000))["error"]
+    assert "unknown request" in unknown["error"]
 
 
 # -- disturbed worlds -------------------------------------------------------------------------------------------------
@@ -297,7 +310,7 @@ Row = tuple[object, ...]
 def survey(config: Config, mirror: Mirror, seed: int = 1, frames: int = 400) -> list[tuple[Row, Sensors | None]]:
     """Turn, drive, stop, again and again, with the fans on: the truth and what is delivered, frame by frame."""
     robot = boot(config, mirror, seed)
-    robot.join_controller()
+    robot.join("controller")
     robot.command_fans(0, 0.8, 0.8)
     rows: list[tuple[Row, Sensors | None]] = []
     for k in range(frames):
@@ -312,8 +325,8 @@ def survey(config: Config, mirror: Mirror, seed: int = 1, frames: int = 400) -> 
 def test_what_is_delivered_equals_its_line(mirror: Mirror, world: str) -> None:
     cfg = load_config(overrides={"run.world": world})
     robot = boot(cfg, mirror)
-    robot.join_controller()
-    robot.join_monitor()
+    robot.join("controller")
+    robot.join("monitor")
     seen = 0
     for k in range(600):
         robot.command_fans(k, 0.8, 0.7)
@@ -416,7 +429,7 @@ def test_hello_stays_nominal(hard: Config, mirror: Mirror) -> None:
 def test_the_body_moves_by_the_true_wheels(config: Config, hard: Config, mirror: Mirror, seed: int) -> None:
     errors = {key: getattr(hard.world, key) for key in ("slip_min", "slip_max")}
     robot = boot(with_world(config, wheel_radius_sigma=0.1, **errors), mirror, seed)  # larger than any slip
-    robot.join_controller()
+    robot.join("controller")
     world, plant = robot.world, robot.world.plant
     for k in range(100):
         before = plant.right_angle_rad, plant.left_angle_rad
@@ -435,7 +448,7 @@ def test_the_body_moves_by_the_true_wheels(config: Config, hard: Config, mirror:
 
 def test_wheels_slip_creep_and_shake_in_the_whole_robot(hard: Config, mirror: Mirror) -> None:
     robot = boot(hard, mirror)
-    robot.join_controller()
+    robot.join("controller")
     plant = robot.world.plant
     for k in range(100):
         robot.drive(k, 3.0, 3.0)

@@ -13,9 +13,9 @@ TTL_S, FASTEST = 0.25, 8.0
 
 def rules(*, monitor: bool = False) -> MotionRules:
     made = MotionRules(TTL_S, FASTEST)
-    made.join_controller()
+    made.join("controller")
     if monitor:
-        made.join_monitor()
+        made.join("monitor")
     return made
 
 
@@ -30,13 +30,13 @@ def test_one_key_is_enough_until_a_monitor_has_joined() -> None:
     r = rules()
     assert r.drive(1, 3.0, 2.0, 0.0)
     assert r.set_points(0.01) == (3.0, 2.0)
-    r.join_monitor()
+    r.join("monitor")
     assert r.set_points(0.01) == HELD
     assert r.permit(1, True, False, True, 0.0)
     assert r.set_points(0.01) == (3.0, 2.0)
-    r.lose_monitor()
+    r.lose("monitor")
     assert r.set_points(0.01) == HELD  # for the rest of this boot
-    r.join_monitor()
+    r.join("monitor")
     assert r.set_points(0.01) == HELD
 
 
@@ -100,9 +100,9 @@ def test_only_newer_sequence_numbers_count() -> None:
 def test_a_new_session_counts_again() -> None:
     r = rules()
     r.drive(1000, 3.0, 3.0, 0.0)
-    r.lose_controller()
+    r.lose("controller")
     assert r.set_points(0.01) == HELD
-    r.join_controller()
+    r.join("controller")
     assert r.set_points(0.01) == HELD
     assert r.drive(0, 1.0, 1.0, 0.01)
     assert r.set_points(0.02) == (1.0, 1.0)
@@ -133,7 +133,7 @@ def test_fans_keep_their_floor_and_their_duty() -> None:
     assert fans.duty == (0.6, 0.9)
     assert not fans.command(1, 1.0, 1.0)
     assert not fans.command(0, 1.0, 1.0)
-    fans.join_controller()
+    fans.join()
     assert fans.duty == (0.6, 0.9)
     assert fans.command(0, 2.0, 0.7)
     assert fans.duty == (1.0, 0.7)
@@ -144,7 +144,7 @@ def test_fans_keep_their_floor_and_their_duty() -> None:
 EVENTS = st.one_of(
     st.tuples(st.just("drive"), st.integers(0, 20), st.floats(-20, 20), st.floats(-20, 20)),
     st.tuples(st.just("permit"), st.integers(0, 20), st.booleans(), st.booleans(), st.booleans()),
-    st.sampled_from([("join_controller",), ("join_monitor",), ("lose_controller",), ("lose_monitor",)]),
+    st.tuples(st.sampled_from(["join", "lose"]), st.sampled_from(["controller", "monitor"])),
     st.tuples(st.just("wait"), st.floats(0.0, 0.3)),
 )
 
@@ -169,12 +169,12 @@ def test_wheels_turn_only_with_both_keys(events: list[tuple[object, ...]]) -> No
                 permit = (*args, now)  # type: ignore[assignment]
                 permit_seq = args[0]  # type: ignore[assignment]
         else:
-            getattr(r, str(name))()
-            if str(name).endswith("controller"):
-                drive, drive_seq = None, -1 if name == "join_controller" else drive_seq
+            getattr(r, str(name))(*args)
+            if args == ["controller"]:
+                drive, drive_seq = None, -1 if name == "join" else drive_seq
             else:
-                permit, permit_seq = None, -1 if name == "join_monitor" else permit_seq
-                needs_permit |= name == "join_monitor"
+                permit, permit_seq = None, -1 if name == "join" else permit_seq
+                needs_permit |= name == "join"
         right, left = r.set_points(now + 0.01)
         assert max(abs(right), abs(left)) <= FASTEST * (1 + 1e-12)
         if (right, left) != HELD:
@@ -225,7 +225,7 @@ def test_a_drive_takes_effect_to_the_frame(frames: int) -> None:
 @pytest.mark.parametrize("frames", [0, 2])
 def test_a_permit_takes_effect_to_the_frame(frames: int) -> None:
     rig = Rig(frames)
-    rig.robot.join_monitor()
+    rig.robot.join("monitor")
     for frame in range(8):
         rig.at(frame).drive(frame, 3.0, 3.0)
         if frame in {2, 5}:
@@ -270,18 +270,18 @@ def test_commands_that_are_not_finite_are_dropped(frames: int, bad: float) -> No
 def test_what_is_on_its_way_goes_with_its_session() -> None:
     rig = Rig(2)
     robot = rig.at(0)
-    robot.join_monitor()
+    robot.join("monitor")
     robot.drive(10, 3.0, 3.0)
     robot.permit(10, True, True, True)
     robot.command_fans(10, 0.7, 0.7)
-    robot.lose_controller()
+    robot.lose("controller")
     assert not any(rig.moves(frame) for frame in range(5))
     assert robot.fans.duty == (0.7, 0.7)  # fans are not changed by a lost session
-    rig.at(5).join_controller()
+    rig.at(5).join("controller")
     robot.drive(0, 3.0, 3.0)  # the next one counts again
     assert [rig.moves(frame) for frame in range(5, 8)] == [False, False, True]
     robot.permit(11, False, False, False)
-    robot.lose_monitor()
+    robot.lose("monitor")
     robot.rules.permit(12, True, True, True, 0.07)
     assert rig.moves(9)  # the denial never arrives
 
@@ -289,7 +289,7 @@ def test_what_is_on_its_way_goes_with_its_session() -> None:
 def test_fans_of_the_session_before_do_not_outrank_the_next() -> None:
     rig = Rig(2)
     rig.robot.command_fans(5000, 0.7, 0.7)
-    rig.robot.join_controller()
+    rig.robot.join("controller")
     assert rig.robot.fans.duty == (0.7, 0.7)  # accepted is accepted
     assert rig.at(1).command_fans(0, 0.3, 0.3)
     rig.moves(3)

@@ -12,7 +12,7 @@ from ccatp.config.models import Config
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import MAX_LINE_BYTES
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.sim.fault_injector import make_sensor_fault
+from ccatp.sim.fault_injector import InjectionRecord, make_sensor_fault
 from ccatp.sim.fault_plan import SENSOR_SIGNALS, TYPES, FaultPlan, parse_plan
 from ccatp.sim.robot import Robot
 
@@ -46,7 +46,7 @@ class Drive:
 
     def __init__(self, config: Config, mirror: Mirror, plan: FaultPlan | None, frames: int = FRAMES) -> None:
         self.robot = Robot(config, mirror, np.random.default_rng(1), plan)
-        self.robot.join_controller()
+        self.robot.join("controller")
         self.robot.command_fans(1, 0.25, 0.5)
         self.lines: list[bytes] = []
         self.delivered: list[bool] = []
@@ -295,7 +295,9 @@ def test_an_echo_without_a_new_reading_repeats_the_last(config: Config, mirror: 
 )
 def test_a_wrong_edge_sensor_knows_light_and_dark(keys: dict[str, object], expected: list[int]) -> None:
     (fault,) = plan_of("edge_rear_right", "wrong", **keys).faults
-    rows = make_sensor_fault(fault, np.random.default_rng(1)).apply([(0.3, 1, 1, 1, k) for k in (1, 0, 1)], 0.3)
+    rows = make_sensor_fault(InjectionRecord(fault), np.random.default_rng(1)).apply(
+        [(0.3, 1, 1, 1, k) for k in (1, 0, 1)], 0.3
+    )
     assert [row[4] for row in rows] == expected
 
 

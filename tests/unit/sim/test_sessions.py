@@ -402,8 +402,8 @@ def test_the_server_and_the_calls_give_the_same_frames(mirror: Mirror) -> None:
         monitor.permit(k, k, b"true" if k % 50 < 40 else b"false")
         controller.drive(k, k, 3.0, 2.5)
     robot = Robot(cfg, mirror, np.random.default_rng(1))
-    robot.join_monitor()
-    robot.join_controller()
+    robot.join("monitor")
+    robot.join("controller")
     while robot.delivered is None:
         robot.advance()
     lines = [robot.delivered_line]
