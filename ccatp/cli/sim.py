@@ -64,10 +64,8 @@ def sim_robot(
     from ccatp.sim.fault_plan import read_plan
 
     if config_file is not None and is_radio_file(config_file):
-        from ccatp.daemon.sim_robot import run_beacons_alone
-
         among_beacons = load_radio_config(config_file, settings)
-        return int(run_beacons_alone(among_beacons, lockstep=not realtime, runtime_dir=runtime_dir))
+        return int(run_alone(among_beacons, lockstep=not realtime, runtime_dir=runtime_dir))
     cfg = load_config(config_file, settings)
     plan = None if faults_file is None else read_plan(faults_file, lockstep=not realtime)
     return int(run_alone(cfg, lockstep=not realtime, faults=plan, runtime_dir=runtime_dir))

@@ -10,27 +10,24 @@ import os
 import sys
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import structlog
 import zmq
-import zmq.asyncio
 
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
-from ccatp.daemon import realtime
-from ccatp.daemon.command_handlers import EmergencyCommandHandler, EmergencyReceiver, ObservatoryServer
-from ccatp.daemon.process import ProcessArgs, open_log, run_process, start_process, unless_stopped
-from ccatp.daemon.robot_session import LatenessStatistics, ReconnectingRobotLink
-from ccatp.daemon.subscribers import PERIOD_S, EstimateSubscriber, HeartbeatPublisher
+from ccatp.daemon.command_handlers import ObservatoryServer
+from ccatp.daemon.process import ProcessArgs, run_process, start_process
+from ccatp.daemon.robot_loop import RobotLoop
+from ccatp.daemon.subscribers import EstimateSubscriber
 from ccatp.danger import DangerMonitor
 from ccatp.errors import ExitStatus
 from ccatp.links.beacon_messages import decode_beacon_frame
-from ccatp.links.bus import Publisher
 from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import DangerEvent, EstimateMessage
@@ -41,26 +38,7 @@ from ccatp.safety.emergency_latch import Emergency, EmergencyLatch
 Judge = Callable[[Sensors, bytes, EstimateMessage | None], Verdict]
 
 
-class SafetyMonitor(EmergencyReceiver, Protocol):
-    """The danger rules of a mission."""
-
-    latch: EmergencyLatch
-
-    @property
-    def counts(self) -> dict[str, object]:
-        """Statistics for the log, at the end."""
-
-    def reset(self) -> None:
-        """The robot has booted."""
-
-    def stale(self, seq: int, t_s: float) -> Verdict:
-        """The verdict when no frame came in time."""
-
-    def garbled(self, seq: int, t_s: float, at_s: float) -> Verdict | None:
-        """The verdict where a line of the robot was no frame, if that counts."""
-
-
-def build_safety_monitor(cfg: Config | RadioConfig) -> tuple[SafetyMonitor, Judge]:
+def build_safety_monitor(cfg: Config | RadioConfig) -> tuple[DangerMonitor | BeaconSafetyRules, Judge]:
     """The rules that go with a configuration, and the verdict on a frame, its line and main's newest estimate."""
     if isinstance(cfg, RadioConfig):
         rules = BeaconSafetyRules(cfg)
@@ -164,109 +142,86 @@ class PersistentEmergencyLatch(EmergencyLatch):
             os.posix_fallocate(file.fileno(), 0, RESERVE_BYTES)
 
 
-WAIT_PERIOD_S = 0.02
-
-
-class DangerLoop:
+class DangerLoop(RobotLoop):
     """Connects the monitor to the robot link, the bus and the observatory channel."""
 
     def __init__(self, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+        super().__init__("danger", "monitor", args, context)
         self._cfg = cfg = args.config
-        self._context = context
-        self.log = open_log(args.run_dir / "log.jsonl", "danger")
         self.monitor, self._judge = build_safety_monitor(cfg)
         self.monitor.latch = PersistentEmergencyLatch(args.run_dir / FILE, self.log)
-        self._publisher = Publisher(context, args.endpoints.of("danger"))
-        self._heartbeat = HeartbeatPublisher(self._publisher, "danger")
-        main, self._is_taking_over = args.endpoints.of("main"), args.is_taking_over
-        self._estimates = EstimateSubscriber(
-            context, main, self._heartbeat.publish_if_due, is_taking_over=self._is_taking_over
+        self.peer = self._estimates = EstimateSubscriber(
+            context, args.endpoints.of("main"), self.heartbeat.publish_if_due, is_taking_over=args.is_taking_over
         )
+        self._has_heard_main = False
         self._published = (EventCode.NORMAL, "", Severity.NONE)
-        self._seq = -1
-        self._bad_lines = 0
-        self._permit_seq = 0
-        self._t_s = 0.0
+        self._seq, self._t_s = -1, 0.0
+        self._bad_lines = self._permit_seq = 0
         self._is_stale = False
-        self._lateness = LatenessStatistics(cfg.robot.slip_after_s)
-        self._hello: Hello | None = None
-        self.link = ReconnectingRobotLink(
-            cfg.robot,
-            role="monitor",
-            client="danger",
-            on_sensors=self.on_sensors,
-            on_lost=self._on_lost,
-            on_joined=self._on_joined,
-            on_bad_line=self._on_bad_line,
+        self._observatory = ObservatoryServer(
+            args.endpoints.of("emergency"),
+            cfg.observatory,
+            self.monitor,
+            lambda: self.heartbeat.frame_age_s if self._seq >= 0 else None,
+            self.log,
         )
-        handler = EmergencyCommandHandler(
-            self.monitor, lambda: self._heartbeat.frame_age_s if self._seq >= 0 else None, self.log
-        )
-        self._observatory = ObservatoryServer(args.endpoints.of("emergency"), cfg.observatory, handler)
-        self.failed = asyncio.Event()
-        self._is_lockstep = False
 
-    async def run(self, stop: asyncio.Event) -> None:
-        """Join the robot, then judge frames until ``stop`` is set or the link is lost."""
-        shadow = zmq.asyncio.Context.shadow(self._context)
-        async with asyncio.TaskGroup() as tasks:
-            services = self._observatory.serve(shadow), self._publish_heartbeat(), self._watch(), self.link.serve()
-            served = [tasks.create_task(service) for service in services]
-            try:
-                await self._wait_for_main(stop)
-                joins = self.link.join(is_patient=self._is_taking_over)
-                if await unless_stopped(stop, joins) and not self._is_lockstep:
-                    cfg = self._cfg
-                    processes = cfg.processes if isinstance(cfg, RadioConfig) else cfg.run
-                    realtime.enter(processes.realtime_priority, self.log)
-                waits = [tasks.create_task(stop.wait()), tasks.create_task(self.failed.wait())]
-                await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-                for wait in waits:
-                    wait.cancel()
-            finally:
-                for task in served:
-                    task.cancel()
-                self.link.close()
+    def services(self) -> tuple[Coroutine[Any, Any, None], ...]:
+        return self._observatory.serve(self._shadow), self.publish_heartbeat(), self.watch(), self.session.serve()
+
+    def is_peer_ready(self) -> bool:
+        """Messages get through, both ways: the first ones must not be lost."""
+        self._has_heard_main = self._has_heard_main or self._estimates.has_received()
+        return self._has_heard_main and self.publisher.has_subscriber("verdict")
+
+    async def end(self, _stop: asyncio.Event) -> None:
         self.log.info("danger_statistics", **self.monitor.counts)
 
-    async def _wait_for_main(self, stop: asyncio.Event) -> None:
-        """Join the robot only when messages get through, both ways: the first ones must not be lost."""
-        has_received = False
-        while not stop.is_set() and not (has_received and self._publisher.has_subscriber("verdict")):
-            await asyncio.sleep(WAIT_PERIOD_S)
-            has_received = has_received or self._estimates.has_received()
-
-    def _on_joined(self, hello: Hello) -> None:
-        before, self._hello, self._is_lockstep = self._hello, hello, hello.lockstep
-        if before is not None and before.boot != hello.boot:
+    def on_joined(self, hello: Hello) -> None:
+        if self.session.has_rebooted:
             self.monitor.reset()
             self._estimates.reset()
             self._seq = -1
-        self._lateness.reset()
-        self._heartbeat.phase, self._heartbeat.frame_s = "joined", time.monotonic()
-        self.log.info("robot_joined", port=self._cfg.robot.port, lockstep=hello.lockstep, session=self.link.sessions)
+        self.begin_session()
+        port = self._robot_cfg.port
+        self.log.info("robot_joined", port=port, lockstep=hello.lockstep, session=self.session.count)
+
+    def on_lost(self, reason: str) -> None:
+        self.heartbeat.phase = "rejoining"
+        self.log.warning("robot_link_lost", reason=reason)
+        self._publish_verdict(self.monitor.stale(self._seq, self._t_s), -1)
+
+    def on_silence(self, age_s: float) -> None:
+        """Withhold the permit."""
+        if age_s <= self._cfg.danger.stale_after_s:
+            return
+        if not self._is_stale:
+            self._is_stale = True
+            self.log.warning("sensors_stale", age_s=age_s)
+        self._publish_verdict(self.monitor.stale(self._seq, self._t_s), self._seq)
 
     def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
         """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
-        self._seq, self._t_s, self._heartbeat.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
+        is_lockstep = self.session.is_lockstep
+        self._seq, self._t_s, self.heartbeat.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
         self._bad_lines = 0
-        estimate = self._estimates.latest(sensors.seq, is_lockstep=self._is_lockstep)
+        estimate = self._estimates.latest(sensors.seq, is_lockstep=is_lockstep)
         try:
             verdict = self._judge(sensors, raw, estimate)
         except Exception as error:
             # Without a verdict the robot's permit runs out: it holds by itself.
             self.log.exception("unhandled_exception", seq=self._seq)
             print(f"ccatp danger: internal error: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
-            self.failed.set()
+            self.over.set()
             return
-        if not self._is_lockstep and self._lateness.add(sensors.t, time.monotonic()) > self._cfg.danger.stale_after_s:
+        if not is_lockstep and self.lateness.add(sensors.t, time.monotonic()) > self._cfg.danger.stale_after_s:
             verdict = self.monitor.stale(sensors.seq, sensors.t)  # a verdict on the past: no permit for the present
         self._publish_verdict(verdict, sensors.seq)
 
-    def _on_bad_line(self) -> None:
-        """A line was not a frame. In lockstep each stands for a frame's time, so that the run is repeatable."""
+    def on_bad_line(self) -> None:
+        """In lockstep each stands for a frame's time, so that the run is repeatable."""
         self._bad_lines += 1
-        hello = self._hello
+        hello = self.session.hello
         is_timed = hello is not None and hello.lockstep
         at_s = self._t_s + self._bad_lines / hello.frame_hz if hello and is_timed else time.monotonic()
         verdict = self.monitor.garbled(self._seq, self._t_s, at_s)
@@ -276,8 +231,8 @@ class DangerLoop:
     def _publish_verdict(self, verdict: Verdict, ack: int) -> None:
         if ack >= 0:  # the robot first: the permit does not wait for the publication
             self._permit_seq += 1
-            self.link.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
-        self._publisher.send("verdict", verdict)
+            self.session.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
+        self.publisher.send("verdict", verdict)
         if (verdict.code, verdict.cause, verdict.severity) == self._published:
             return
         self._published = verdict.code, verdict.cause, verdict.severity
@@ -289,39 +244,8 @@ class DangerLoop:
             "limit": verdict.limit,
             "severity": int(verdict.severity),
         }
-        self._publisher.send("danger_event", DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, **fields))
+        self.publisher.send("danger_event", DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, **fields))
         self.log.info("verdict_changed", seq=verdict.seq, t_s=verdict.t_s, **fields)
-
-    async def _publish_heartbeat(self) -> None:
-        while True:
-            self._heartbeat.publish()
-            await asyncio.sleep(PERIOD_S)
-
-    async def _watch(self) -> None:
-        """Where frames stop coming, withhold the permit; drop a connection that is open and silent."""
-        while True:
-            await asyncio.sleep(WAIT_PERIOD_S)
-            self._estimates.maintain()
-            age_s = self._heartbeat.frame_age_s
-            if self._heartbeat.phase != "joined" or self._is_lockstep or age_s is None:
-                continue
-            if age_s > self._cfg.danger.stale_after_s:
-                if not self._is_stale:
-                    self._is_stale = True
-                    self.log.warning("sensors_stale", age_s=age_s)
-                self._publish_verdict(self.monitor.stale(self._seq, self._t_s), self._seq)
-            if age_s > self._cfg.robot.silence_timeout_s:
-                self.link.drop(f"no sensors frame for {age_s:.2f} s")
-
-    def _on_lost(self, reason: str) -> None:
-        self._heartbeat.phase = "rejoining"
-        self.log.warning("robot_link_lost", reason=reason)
-        self._publish_verdict(self.monitor.stale(self._seq, self._t_s), -1)
-
-    def close(self) -> None:
-        """Close the sockets."""
-        self._estimates.close()
-        self._publisher.close()
 
 
 def main() -> int:
@@ -329,14 +253,10 @@ def main() -> int:
     args = start_process()
 
     async def serve(context: zmq.Context[zmq.Socket[bytes]], stop: asyncio.Event) -> int:
-        loop = DangerLoop(args, context)
-        try:
-            await loop.run(stop)
-        finally:
-            loop.close()
+        await DangerLoop(args, context).run(stop)
         return 0 if stop.is_set() else int(ExitStatus.HELD)
 
-    return realtime.run(run_process("danger", serve), is_spinning=not args.is_realtime)
+    return run_process("danger", serve, is_spinning=not args.is_realtime)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import is_radio_file, load_config, load_radio_config
 from ccatp.config.models import Config, DashboardConfig
 from ccatp.daemon.command_handlers import LOGGED_LINES, LOGGED_PERIOD_S
-from ccatp.daemon.process import RUN_DIR_FILE, Endpoints, open_log, start_process, stop_on_signals
+from ccatp.daemon.process import RUN_DIR_FILE, Endpoints, open_log, run_until_stopped, start_process
 from ccatp.daemon.subscribers import HeartbeatPublisher
 from ccatp.errors import ConfigError, DaemonUnreachableError
 from ccatp.links.bus import Publisher
@@ -117,12 +117,10 @@ def _survey_view(mirror: Mirror, cfg: Config, run_dir: Path, *, is_sim: bool) ->
     return view
 
 
-def _run(make: Callable[[Logger], Dashboard], run_dir: Path, listener: socket.socket, *, has_heartbeat: bool) -> None:
+def _run(make: Callable[[Logger], Dashboard], run_dir: Path, listener: socket.socket, *, has_heartbeat: bool) -> int:
     """Serve a dashboard until SIGTERM or SIGINT."""
 
-    async def run() -> None:
-        stop = asyncio.Event()
-        stop_on_signals(stop)
+    async def run(stop: asyncio.Event) -> int:
         log = open_log(run_dir / "log.jsonl", "dashboard")
         for name in ("uvicorn.error", "asyncio"):
             logger = logging.getLogger(name)
@@ -133,8 +131,9 @@ def _run(make: Callable[[Logger], Dashboard], run_dir: Path, listener: socket.so
             await dashboard.run(listener, stop, has_heartbeat=has_heartbeat)
         finally:
             dashboard.close()
+        return 0
 
-    asyncio.run(run())
+    return run_until_stopped(run)
 
 
 def _rate_limited(log: Logger) -> Callable[[str, dict[str, object]], None]:
@@ -173,8 +172,7 @@ def main() -> int:
     def make(log: Logger) -> Dashboard:
         return Dashboard(args.config, args.run_dir, args.endpoints, is_sim=args.is_sim, log=log)
 
-    _run(make, args.run_dir, socket.socket(fileno=args.listen_fd), has_heartbeat=True)
-    return 0
+    return _run(make, args.run_dir, socket.socket(fileno=args.listen_fd), has_heartbeat=True)
 
 
 class PageSocket(NamedTuple):
@@ -241,8 +239,7 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callab
 
     with page.socket:
         say(page.text)
-        _run(make, run_dir, page.socket, has_heartbeat=False)
-    return 0
+        return _run(make, run_dir, page.socket, has_heartbeat=False)
 
 
 def _run_dir_of(runtime_dir: Path) -> Path:

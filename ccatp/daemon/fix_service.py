@@ -3,14 +3,15 @@
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from ccatp.config.models import MissionConfig
 from ccatp.core import DeckPose, Fix, PointId, Vector3
-from ccatp.daemon.telemetry import SurveyTelemetry
+from ccatp.daemon.telemetry import Telemetry
 from ccatp.estimation.fixes import FixRefused
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
+from ccatp.links.topics import FixMessage
 from ccatp.localizer import Localizer
 from ccatp.records.store import AlreadyMeasuredError, MissionStore, StoreError
 from ccatp.survey.fix_gate import FixGate
@@ -59,7 +60,7 @@ class FixService:
         localizer: Localizer,
         mission: Mission,
         store: MissionStore,
-        telemetry: SurveyTelemetry,
+        telemetry: Telemetry,
         on_finished: Callable[[], None],
         between_s: Callable[[], float],
     ) -> None:
@@ -67,7 +68,7 @@ class FixService:
         self._approaches = ApproachCounter(cfg.correction_tolerance_m, cfg.max_approaches)
         self._client, self._localizer, self._mission = client, localizer, mission
         self._store, self._telemetry, self._on_finished, self._between_s = store, telemetry, on_finished, between_s
-        self._fix_gate = fix_gate
+        self._fix_gate, self._notify = fix_gate, telemetry.notify_operator
         self._timeout_s = cfg.measure_timeout_s
         self._wanted: FixRequest | None = None
         self._wakes = asyncio.Event()
@@ -110,9 +111,7 @@ class FixService:
             await self._fail(request, str(error) or f"no fix within {self._timeout_s:g} s", error)
             return
         if not self._is_wanted(request):
-            self._telemetry.notify_operator(
-                "info", f"measurement of {_name(request.point)} discarded: the robot was interrupted"
-            )
+            self._notify("info", f"measurement of {_name(request.point)} discarded: the robot was interrupted")
         elif doubt:
             await self._fail(request, doubt, None)
         else:
@@ -136,19 +135,25 @@ class FixService:
                 jump_m = localizer.fuse_fix(fix)
             except FixRefused as refusal:
                 doubt = str(refusal)
-        self._telemetry.publish_fix(request.point, fix, jump_m, is_fused=not doubt, is_set_aside=is_set_aside)
+        message = FixMessage(
+            seq=self._telemetry.seq,
+            point=None if request.point is None else (*request.point,),
+            is_fused=not doubt,
+            jump_mm=1e3 * jump_m,
+            is_set_aside=is_set_aside,
+            **asdict(fix),
+        )
+        self._telemetry.send("fix", message)
         if finding.refusal:
             raise FrameRefused(finding.refusal)
         if doubt:
-            self._telemetry.notify_operator("info", f"the fix at {_name(request.point)} is doubted: {doubt}")
+            self._notify("info", f"the fix at {_name(request.point)} is doubted: {doubt}")
             return doubt
         for notice in localizer.notices:
-            self._telemetry.notify_operator("warning", notice)
+            self._notify("warning", notice)
         localizer.notices.clear()
         if jump_m > self._tolerance_m:
-            self._telemetry.notify_operator(
-                "warning", f"the fix at {_name(request.point)} moved the estimate by {1e3 * jump_m:.1f} mm"
-            )
+            self._notify("warning", f"the fix at {_name(request.point)} moved the estimate by {1e3 * jump_m:.1f} mm")
         return ""
 
     async def _fail(self, request: FixRequest, why: str, error: Exception | None) -> None:
@@ -156,11 +161,11 @@ class FixService:
             refusal = self._fix_gate.refusal_of(error.lengths_m, request.expected_m)
             error = FrameRefused(refusal) if refusal else error
         if isinstance(error, FrameRefused):
-            self._telemetry.notify_operator("error", str(error))
+            self._notify("error", str(error))
             if self._is_wanted(request):
                 self._mission.fault(str(error))
             return
-        self._telemetry.notify_operator("warning", f"measurement of {_name(request.point)} failed: {why}")
+        self._notify("warning", f"measurement of {_name(request.point)} failed: {why}")
         if self._is_wanted(request):
             await self._skip(request, why)
 
@@ -183,9 +188,7 @@ class FixService:
             try:
                 await self._await_commit(self._store.record_fix(request.point, fix, request.estimate), request.point)
             except AlreadyMeasuredError as error:
-                self._telemetry.notify_operator(
-                    "warning", str(error)
-                )  # nothing is lost, and nobody has to be waited for
+                self._notify("warning", str(error))  # nothing is lost, and nobody has to be waited for
             except StoreError as error:
                 self._mission.fault(f"the fix of {_name(request.point)} cannot be stored: {error}")
                 return
@@ -201,7 +204,7 @@ class FixService:
         try:
             await asyncio.wait([waiting], timeout=SLOW_DISK_S)
             if not waiting.done():
-                self._telemetry.notify_operator("warning", f"the disk is slow: {_name(point)} waits for its commit")
+                self._notify("warning", f"the disk is slow: {_name(point)} waits for its commit")
                 await asyncio.wait([waiting], timeout=STALLED_DISK_S - SLOW_DISK_S)
             if not waiting.done():
                 self._mission.fault(f"the disk stalls: {_name(point)} is not stored after {STALLED_DISK_S:g} s")
@@ -215,11 +218,9 @@ class FixService:
         is_too_far = self._approaches.is_too_far(point, self.arrival_error_m, self._localizer.position_sigma_m)
         what = f"{1e3 * self.arrival_error_m:.2f} mm from {_name(point)}"
         if is_too_far:
-            self._telemetry.notify_operator("info", f"{what}: approaching it again")
+            self._notify("info", f"{what}: approaching it again")
         elif self.arrival_error_m > self._tolerance_m:
-            self._telemetry.notify_operator(
-                "warning", f"{what} after {self._approaches.count} approaches: measured there all the same"
-            )
+            self._notify("warning", f"{what} after {self._approaches.count} approaches: measured there all the same")
         return is_too_far
 
 

@@ -1,147 +1,113 @@
 """The main-loop process: serves a mission's frames between robot link, bus and operator channel."""
 
 import asyncio
+import time
+from collections.abc import Callable, Coroutine
 from contextlib import AbstractContextManager
+from math import inf
+from typing import Any
 
+import msgspec
 import zmq
-import zmq.asyncio
 
 from ccatp.config.beacon_models import RadioConfig
+from ccatp.core import Verdict
 from ccatp.daemon import realtime
-from ccatp.daemon.command_handlers import OperatorCommandHandler
-from ccatp.daemon.mission_runner import FrameService, MissionClock, RunnerConfig, RunnerContext, RunnerFactory
-from ccatp.daemon.process import ProcessArgs, open_log, run_process, start_process, unless_stopped
-from ccatp.daemon.robot_session import ControllerSession
-from ccatp.daemon.subscribers import PERIOD_S, HeartbeatPublisher, VerdictSubscriber
-from ccatp.errors import ConfigError, ExitStatus
-from ccatp.links.bus import Publisher
+from ccatp.daemon.mission_runner import STILL, DriveCommand, MissionClock, MissionRunner, TimedFrame
+from ccatp.daemon.process import ProcessArgs, run_process, start_process
+from ccatp.daemon.robot_loop import WAIT_PERIOD_S, RobotLoop
+from ccatp.daemon.subscribers import VerdictSubscriber
+from ccatp.daemon.telemetry import BATCH_WALL_S
+from ccatp.errors import CcatpError, ConfigError, ExitStatus
+from ccatp.links.channels import BadRequest, OperatorCommand, format_error, format_ok, parse_operator
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.rpc import Router
 from ccatp.links.topics import MissionStatus
 
-WAIT_PERIOD_S = 0.02
 # After the end the last messages must reach the supervisor, which then ends this process.
 SHUTDOWN_TIMEOUT_S = 5.0
+# The place of a robot that moved is not known when the samples of more frames than this are missing.
+UNSEEN_S = 0.1
+# The frames that come while a path is planned for a robot that stands are late for a reason, and served within this.
+CATCH_UP_S = 0.5
+# A robot at 0.1 m/s is at rest within half a second; a command that took no effect by then has failed.
+EFFECT_TIMEOUT_S = 5.0
 
 
-class MainLoop:
-    """The process around its mission: links, clock, commands, beginning and end."""
+class UnhandledError(CcatpError):
+    """An unexpected error, with details in the log. The process is restarted."""
+
+    exit_status = ExitStatus.HELD
+
+
+class MainLoop(RobotLoop):
+    """The process around its mission: frames, clock, commands, beginning and end.
+
+    Attributes:
+        clock: of the frames.
+        frame_period_s: time between two frames of the present session.
+        exit_status: of the process.
+    """
 
     def __init__(
         self,
         args: ProcessArgs,
         context: zmq.Context[zmq.Socket[bytes]],
-        cfg: RunnerConfig,
-        make_runner: RunnerFactory,
+        make_runner: Callable[["MainLoop"], MissionRunner],
     ) -> None:
-        self._cfg, self._endpoints, self._context = cfg, args.endpoints, context
-        self._is_taking_over = args.is_taking_over
-        self._publisher = Publisher(context, args.endpoints.of("main"))
-        self._heartbeat = HeartbeatPublisher(self._publisher, "main")
-        danger = args.endpoints.of("danger")
-        self._verdicts = VerdictSubscriber(context, danger, cfg.verdict_timeout_s, self._heartbeat.publish_if_due)
-        self._session = ControllerSession(
-            cfg.link,
-            on_sensors=self._on_sensors,
-            on_lost=self._on_lost,
-            on_joined=self._on_joined,
-            is_taking_over=self._is_taking_over,
-            frame_hz=cfg.frame_hz,
-        )
-        self._clock = MissionClock(cfg.clock_jump_s)
-        self._runner = make_runner(
-            RunnerContext(
-                args.run_dir,
-                self._publisher,
-                open_log(args.run_dir / "log.jsonl", "main"),
-                self._session,
-                self._clock,
-                is_patient=not args.is_realtime,
-                finish=self._finish,
-                answer=self._answer_held_frame,
-            )
-        )
-        self._telemetry = self._runner.telemetry
-        self._frames = FrameService(
-            cfg.link, self._runner, self._session, self._clock, self._verdicts, self._heartbeat, self._fail
-        )
+        super().__init__("main", "controller", args, context)
+        cfg = args.config
+        danger, timeout_s = args.endpoints.of("danger"), cfg.mission.verdict_timeout_s
+        self.peer = self._verdicts = VerdictSubscriber(context, danger, timeout_s, self.heartbeat.publish_if_due)
+        self.clock = MissionClock(10.0 * cfg.run.step_s if isinstance(cfg, RadioConfig) else cfg.health.clock_jump_s)
+        self.frame_period_s = 0.0
+        self._is_new_session, self._drive_seq = False, 0
+        self._catches_up_until_s = -inf
+        self._was_at_rest = False
+        self._unanswered: int | None = None
         self._failure: Exception | None = None
-        self.over = self._frames.over
         self.exit_status = ExitStatus.INTERRUPTED
+        self._runner = make_runner(self)
+        self._telemetry = self._runner.telemetry
 
-    async def run(self, stop: asyncio.Event) -> None:
-        """Join the robot when the danger loop has, then serve frames until the mission is over or ``stop`` is set."""
-        handler = OperatorCommandHandler(
-            self._runner.mission, self._telemetry.notify_operator, self.status, self.settled, self._answer_held_frame
-        )
-        shadow = zmq.asyncio.Context.shadow(self._context)
-        async with (
-            Router(self._endpoints.of("control"), handler.handle, shadow) as router,
-            asyncio.TaskGroup() as tasks,
-        ):
-            services = router.serve(), self._publish_levels(), self._runner.run(), self._session.serve(), self._watch()
-            served = [tasks.create_task(service) for service in services]
-            try:
-                await self._join(stop)
-                waits = [tasks.create_task(stop.wait()), tasks.create_task(self.over.wait())]
-                await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-                self._hold_wheels()
-                if self._failure is not None:
-                    raise self._failure
-                if not stop.is_set():
-                    await self._await_shutdown(stop)
-                for wait in waits:
-                    wait.cancel()
-            finally:
-                for task in served:
-                    task.cancel()
-                self._session.close()
-                await self._runner.close()
+    def services(self) -> tuple[Coroutine[Any, Any, None], ...]:
+        return self._serve_operator(), self.publish_heartbeat(), self._runner.run(), self.session.serve(), self.watch()
 
     # -- beginning and end ----------------------------------------------------------------------------------------
 
-    async def _join(self, stop: asyncio.Event) -> None:
-        if not await unless_stopped(stop, self._runner.connect()):
-            return
-        self._heartbeat.phase = "ready"
-        publisher = self._publisher
-        while not (
-            publisher.has_subscriber("track")
-            and publisher.has_subscriber("estimate")
-            and self._verdicts.is_danger_joined()
-        ):
-            if stop.is_set():
-                return
-            await asyncio.sleep(WAIT_PERIOD_S)
-        is_joined = await unless_stopped(stop, self._session.join(is_patient=self._is_taking_over))
-        if is_joined and not self._session.is_lockstep:
-            realtime.enter(self._cfg.realtime_priority, self._telemetry.log)
+    async def connect(self) -> None:
+        await self._runner.connect()
+        self.heartbeat.phase = "ready"
 
-    def _on_joined(self, hello: Hello) -> None:
+    def is_peer_ready(self) -> bool:
+        has_subscriber = self.publisher.has_subscriber
+        return has_subscriber("track") and has_subscriber("estimate") and self._verdicts.is_danger_joined()
+
+    def on_joined(self, hello: Hello) -> None:
         try:
             self._runner.check_robot(hello)
         except ConfigError as error:
             self._fail(error)
             return
-        has_booted = self._session.has_rebooted(hello)
-        text = self._session.begin(hello)
+        self.frame_period_s, self._is_new_session = 1.0 / hello.frame_hz, True
         self._runner.begin_session(hello)
-        self._frames.begin_session()
-        self._telemetry.notify_operator("info", text)
-        if has_booted:
+        self.begin_session()
+        again = " again" if self.session.count > 1 else ""
+        robot = self._robot_cfg
+        self._telemetry.notify_operator("info", f"joined the robot at {robot.host}:{robot.port}{again}")
+        if self.session.has_rebooted:
             self._telemetry.notify_operator("warning", "the robot restarted: relocalizing before it moves")
             self._verdicts.reset()
             self._telemetry.continue_numbering()
-            self._clock.reset()
+            self.clock.reset()
             self._runner.on_tracking_gap()
 
-    def _on_sensors(self, sensors: Sensors, raw: bytes) -> None:
-        self._frames.on_sensors(sensors, raw)
-
-    def _on_lost(self, reason: str) -> None:
+    def on_lost(self, reason: str) -> None:
         if self.over.is_set():
             return
-        self._frames.end_session()
+        # The robot's motion since the last frame shows in the next one, if that comes soon.
+        self._was_at_rest = self._runner.is_at_rest
+        self.heartbeat.phase, self._unanswered = "rejoining", None
         self._runner.mission.interrupt(f"robot link lost: {reason}")
         self._telemetry.notify_operator("warning", f"robot link lost: {reason}; reconnecting")
 
@@ -150,100 +116,216 @@ class MainLoop:
         self._failure = self._failure or error
         self.over.set()
 
-    def _finish(self, status: ExitStatus) -> None:
+    def finish(self, status: ExitStatus) -> None:
+        """End the process with a status, once the last messages are out."""
         self.exit_status = status
-        self._heartbeat.phase = "done"
+        self.heartbeat.phase = "done"
         self.over.set()
 
-    async def _await_shutdown(self, stop: asyncio.Event) -> None:
-        """Repeat the end until the supervisor has received it and stops this process."""
-        self._heartbeat.phase = "done"
+    async def end(self, stop: asyncio.Event) -> None:
+        self.send_drive(self.clock.seq, STILL)
+        self._runner.log_statistics()
+        self._save_checkpoint()
+        self._telemetry.flush()
+        self._publish_status()
+        if self._failure is not None:
+            raise self._failure
+        if stop.is_set():
+            return
+        # The end is repeated until the supervisor has received it and stops this process.
+        self.heartbeat.phase = "done"
         try:
             async with asyncio.timeout(SHUTDOWN_TIMEOUT_S):
                 await stop.wait()
         except TimeoutError:
-            self._telemetry.log.warning("shutdown_not_acknowledged")
+            self.log.warning("shutdown_not_acknowledged")
 
-    def _hold_wheels(self) -> None:
-        self._session.send_drive(self._clock.seq, 0.0, 0.0)
-        self._runner.log_statistics()
-        self._save_checkpoint()
-        self._telemetry.flush()
-        self._telemetry.publish_status(self.status())
+    async def close(self) -> None:
+        await self._runner.close()
 
     def _save_checkpoint(self) -> None:
-        if self._clock.has_begun:  # before its first frame the predecessor's checkpoint is better
+        if self.clock.has_begun:  # before its first frame the predecessor's checkpoint is better
             self._runner.save_checkpoint()
-
-    def close(self) -> None:
-        """Close the sockets."""
-        self._verdicts.close()
-        self._publisher.close()
 
     # -- beside the frames ----------------------------------------------------------------------------------------
 
-    async def _publish_levels(self) -> None:
-        while True:
-            self._heartbeat.publish()
-            self._telemetry.flush_if_due()
-            if self._heartbeat.phase != "starting":
-                self._telemetry.publish_status(self.status())
-            if self._runner.mission.is_paused and not self._runner.is_busy:
-                self._frames.answer_held_frame()  # a frame now and then, so that an emergency acts in a pause, too
-            await asyncio.sleep(PERIOD_S)
+    def publish_levels(self) -> None:
+        self._telemetry.flush(BATCH_WALL_S)
+        if self.heartbeat.phase != "starting":
+            self._publish_status()
+        if self._runner.mission.is_paused and not self._runner.is_busy:
+            self._answer_held_frame()  # a frame now and then, so that an emergency acts in a pause, too
 
-    async def _watch(self) -> None:
-        """Hold where frames stop coming; drop a connection that is open and silent."""
-        robot, heartbeat = self._cfg.link, self._heartbeat
-        while True:
-            await asyncio.sleep(WAIT_PERIOD_S)
-            self._verdicts.maintain()
-            age_s = heartbeat.frame_age_s
-            if (
-                heartbeat.phase != "joined"
-                or self._session.is_lockstep
-                or age_s is None
-                or age_s <= robot.sensors_timeout_s
-            ):
-                continue
-            if self._runner.mission.interrupt(f"no sensors frame for {age_s:.2f} s"):
-                self._telemetry.notify_operator("warning", self._runner.mission.cause)
-                self._session.send_drive(self._clock.seq, 0.0, 0.0)
-            if age_s > robot.silence_timeout_s:
-                self._session.drop(f"no sensors frame for {age_s:.2f} s")
+    def on_silence(self, age_s: float) -> None:
+        if age_s <= self._robot_cfg.sensors_timeout_s:
+            return
+        if self._runner.mission.interrupt(f"no sensors frame for {age_s:.2f} s"):
+            self._telemetry.notify_operator("warning", self._runner.mission.cause)
+            self.send_drive(self.clock.seq, STILL)
 
-    def _answer_held_frame(self) -> None:
-        """Let lockstep time go on after a measurement or a pause."""
-        self._frames.answer_if_allowed()
-        self._save_checkpoint()
-        self._runner.publish_state()
-
-    async def settled(self) -> None:
-        """Wait until the robot is held at rest, or the mission is over."""
-        while not (self.over.is_set() or self._runner.is_at_rest):  # noqa: ASYNC110 - frames are worth no event each
-            await asyncio.sleep(WAIT_PERIOD_S)
+    def _publish_status(self) -> None:
+        self._telemetry.send("mission", self.status())
+        if self._telemetry.seq >= 0 and self.publisher.has_subscriber("display_state"):
+            self._telemetry.send("display_state", self._runner.display_state())
 
     def status(self) -> MissionStatus:
         """Progress of the mission."""
-        status, lateness = self._runner.status(), self._frames.lateness
-        status.elapsed_s = round(self._clock.elapsed_s, 6)
+        status, lateness = self._runner.status(), self.lateness
+        status.elapsed_s = round(self.clock.elapsed_s, 6)
         status.code = 0 if self._verdicts.verdict is None else int(self._verdicts.verdict.code)
         status.exit_status = int(self.exit_status) if self.over.is_set() else -1
         status.missed_deadlines = lateness.missed_deadlines
         status.worst_lateness_ms = round(1e3 * lateness.worst_s, 3)
         return status
 
+    # -- commands of operators --------------------------------------------------------------------------------------
 
-def open_runner(args: ProcessArgs) -> tuple[RunnerConfig, AbstractContextManager[RunnerFactory]]:
-    """THE table of missions: configuration and factory. Only the configured one is imported, to start sooner."""
+    async def _serve_operator(self) -> None:
+        async with Router(self._args.endpoints.of("control"), self._answer_operator, self._shadow) as router:
+            await router.serve()
+
+    async def _answer_operator(self, frame: bytes) -> bytes:
+        """A command is answered after it took effect or was refused."""
+        try:
+            command = parse_operator(frame).cmd
+        except BadRequest as error:
+            return format_error(str(error))
+        if command is not OperatorCommand.STATUS:
+            refusal = self._apply(command)
+            if refusal is not None:
+                return format_error(refusal)
+            self._telemetry.notify_operator("info", f"operator: {command}")
+            self.let_time_go_on()
+        if command in (OperatorCommand.PAUSE, OperatorCommand.STOP):
+            try:
+                async with asyncio.timeout(EFFECT_TIMEOUT_S):
+                    while not (self.over.is_set() or self._runner.is_at_rest):  # noqa: ASYNC110 - no event each frame
+                        await asyncio.sleep(WAIT_PERIOD_S)
+            except TimeoutError:
+                return format_error(f"{command}: accepted, but the robot is not at rest after {EFFECT_TIMEOUT_S:.0f} s")
+        return format_ok(status=msgspec.to_builtins(self.status()))
+
+    def _apply(self, command: OperatorCommand) -> str | None:
+        mission = self._runner.mission
+        if command is OperatorCommand.PAUSE:
+            return mission.pause("operator")
+        if command is OperatorCommand.RESUME:
+            return mission.resume()
+        if command is OperatorCommand.ABORT:
+            return mission.abort("operator")
+        return mission.stop()
+
+    # -- the frame ------------------------------------------------------------------------------------------------
+
+    def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
+        """Serve one sensors frame. An unexpected error ends the process, held, and not just the connection."""
+        if self.over.is_set():
+            return
+        try:
+            self._serve(sensors, raw)
+        except Exception as error:
+            self.log.exception("unhandled_exception", seq=self.clock.seq)
+            what = f"{type(error).__name__}: {error}"
+            self._telemetry.notify_operator("error", f"internal error, wheels held: {what}; see log.jsonl")
+            self._fail(UnhandledError(f"internal error: {what}"))
+
+    def _serve(self, sensors: Sensors, raw: bytes) -> None:
+        start = time.perf_counter()
+        clock, runner, session, seq = self.clock, self._runner, self.session, sensors.seq
+        steady_s, dt_s = clock.time_of(seq, sensors.t, self.frame_period_s)
+        frame = TimedFrame(sensors, raw, steady_s, dt_s, self._is_new_session)
+        if frame.is_first:
+            self._begin_drives(dt_s)
+        clock.advance(seq, steady_s)
+        self.heartbeat.frame_s = time.monotonic()
+        runner.estimate(frame)
+        if dt_s <= 0.0:  # counted by the localizer; a controller cannot go back in time
+            self._telemetry.add_line(seq, raw)
+            self._answer(seq, STILL)
+            return
+        waiting = time.perf_counter()
+        verdict = None
+        # Danger judges each frame once, the first one of this session perhaps before the session began.
+        if not (frame.is_first and (self._args.is_taking_over or session.count > 1)):
+            verdict = self._verdicts.latest(seq, self.frame_period_s, is_lockstep=session.is_lockstep)
+        decided = time.perf_counter()
+        self._answer(seq, self._decide(frame, verdict))
+        runner.publish(frame)
+        self._telemetry.add_tick(1e6 * (time.perf_counter() - decided + waiting - start))
+
+    def _begin_drives(self, dt_s: float) -> None:
+        """Before the first drive and not on joining, so that in lockstep the robot gets it in a certain frame."""
+        self._is_new_session = False
+        self._runner.begin_drives()
+        if self.clock.has_begun and dt_s > UNSEEN_S and not self._was_at_rest:
+            text = f"the robot moved and sent no frame for {dt_s:.2f} s: relocalizing"
+            self._telemetry.notify_operator("warning", text)
+            self._runner.on_tracking_gap()
+
+    def _decide(self, frame: TimedFrame, verdict: Verdict | None) -> DriveCommand:
+        """The drive that answers a frame. One that is too late moves nothing."""
+        runner, limit_s, begun_s = self._runner, self._robot_cfg.lag_limit_s, time.monotonic()
+        lag_s = 0.0 if self.session.is_lockstep else self.lateness.add(frame.sensors.t, begun_s)
+        if lag_s > limit_s:
+            if begun_s < self._catches_up_until_s:
+                return runner.hold(frame)
+            verdict = None
+            # Paused until frames are prompt again.
+            if runner.mission.interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):
+                lateness_ms, limit_ms = 1e3 * lag_s, 1e3 * limit_s
+                self.log.warning("frame_late", seq=self.clock.seq, lateness_ms=lateness_ms, limit_ms=limit_ms)
+        drive = runner.plan(frame, verdict, lag_s)
+        now_s = time.monotonic()
+        is_slow, is_still = now_s - begun_s > self.frame_period_s, drive == STILL
+        # A hold for the cost of planning would have to be planned away again, and so on for ever on a slow machine.
+        self._catches_up_until_s = now_s + CATCH_UP_S if is_slow and is_still else -inf
+        return drive
+
+    def send_drive(self, ack: int, drive: DriveCommand) -> None:
+        """Send the drive that was computed from frame ``ack``."""
+        self._drive_seq += 1
+        right, left, steer = drive
+        self._runner.on_drive(self._drive_seq, right, left)
+        steering = () if steer is None else (steer,)
+        self.session.link.send_drive(self._drive_seq, max(ack, 0), right, left, *steering)
+
+    def _may_answer(self) -> bool:
+        """In lockstep simulated time stands still while a peer is awaited, and all but still in a pause."""
+        if not self.session.is_lockstep:
+            return True
+        runner = self._runner
+        return not runner.is_busy and not (runner.mission.is_paused and runner.is_at_rest)
+
+    def _answer(self, seq: int, drive: DriveCommand) -> None:
+        if self._may_answer():
+            self.send_drive(seq, drive)
+        else:
+            self._unanswered = seq
+
+    def _answer_held_frame(self) -> None:
+        """Answer the frame that waits, standing."""
+        seq, self._unanswered = self._unanswered, None
+        if seq is not None:
+            self.send_drive(seq, STILL)
+
+    def let_time_go_on(self) -> None:
+        """Something changed between two frames, as after a measurement or a pause: lockstep time may go on."""
+        if self._may_answer():
+            self._answer_held_frame()
+        self._save_checkpoint()
+        self._runner.publish_state()
+
+
+def open_runner(args: ProcessArgs) -> AbstractContextManager[Callable[[MainLoop], MissionRunner]]:
+    """THE table of missions: opens the database, yields a factory. Only the configured one is imported, to be quick."""
     cfg = args.config
     if isinstance(cfg, RadioConfig):
-        from ccatp.daemon.beacon_runner import beacon_runner_config, open_beacons  # noqa: PLC0415
+        from ccatp.daemon.beacon_runner import open_beacons  # noqa: PLC0415
 
-        return beacon_runner_config(cfg), open_beacons(cfg, args)
-    from ccatp.daemon.survey_runner import open_survey, survey_runner_config  # noqa: PLC0415
+        return open_beacons(cfg, args)
+    from ccatp.daemon.survey_runner import open_survey  # noqa: PLC0415
 
-    return survey_runner_config(cfg), open_survey(cfg, args)
+    return open_survey(cfg, args)
 
 
 def main() -> int:
@@ -251,19 +333,13 @@ def main() -> int:
     args = start_process()
 
     async def serve(context: zmq.Context[zmq.Socket[bytes]], stop: asyncio.Event) -> int:
-        cfg, opening = open_runner(args)
-        loop: MainLoop | None = None
-        try:
-            with opening as make_runner:
-                loop = MainLoop(args, context, cfg, make_runner)
-                realtime.take_core(args.free_core)  # the threads of ZeroMQ and the store have started elsewhere
-                await loop.run(stop)
-        finally:
-            if loop is not None:  # last, so that the last messages leave while the store commits
-                loop.close()
+        with open_runner(args) as make_runner:
+            loop = MainLoop(args, context, make_runner)
+            realtime.take_core(args.free_core)  # the threads of ZeroMQ and the store have started elsewhere
+            await loop.run(stop)
         return int(loop.exit_status)
 
-    return realtime.run(run_process("main", serve), is_spinning=not args.is_realtime)
+    return run_process("main", serve, is_spinning=not args.is_realtime)
 
 
 if __name__ == "__main__":

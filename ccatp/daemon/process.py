@@ -1,4 +1,4 @@
-"""Common start of every process: arguments, log file, end with its parent, signals.
+"""Common frame of every process: arguments, log file, end with its parent, signals, errors.
 
 Writing a log line never fails: what the disk does not take is dropped and counted.
 """
@@ -10,7 +10,7 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,56 +21,9 @@ import zmq
 
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import is_radio_file, load_config, load_radio_config
-from ccatp.config.models import Config
+from ccatp.config.models import Config, ProcessesConfig
 from ccatp.daemon import realtime
 from ccatp.errors import CcatpError
-
-
-class LogStream(io.TextIOBase):
-    """Appends whole lines; several processes may share the file.
-
-    When the first line is dropped, ``process`` reports it on standard error. Raises ``OSError`` where the file cannot
-    be made.
-
-    Attributes:
-        dropped: lines that are not in the file, or only in part.
-    """
-
-    def __init__(self, path: Path, process: str) -> None:
-        self._path, self._process = path, process
-        self._file = path.open("ab", buffering=0)
-        self._is_torn = False
-        self.dropped = 0
-
-    def write(self, text: str) -> int:
-        """Append; never fails."""
-        data = text.encode("utf-8", "backslashreplace")
-        if self._is_torn:
-            data = b"\n" + data
-        try:
-            written = self._file.write(data)
-        except OSError as error:
-            self._drop(error.strerror or str(error))
-            return len(text)
-        if written != len(data):
-            self._is_torn = self._is_torn or bool(written)
-            self._drop("the disk took a part of a line")
-        else:
-            self._is_torn = False
-        return len(text)
-
-    def _drop(self, why: str) -> None:
-        self.dropped += 1
-        if self.dropped > 1:
-            return
-        with suppress(OSError):  # standard error may lie on the same disk
-            print(f"ccatp {self._process}: {self._path}: lines are dropped: {why}", file=sys.stderr, flush=True)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-        super().close()
-
 
 PR_SET_PDEATHSIG = 1
 LEVELS = {"info": 20, "warning": 30, "error": 40}
@@ -82,6 +35,16 @@ FAULTS_FILE = "faults.toml"
 RUN_DIR_FILE = "run_dir"
 # Environment variable with the supervisor's process number, for its children.
 SUPERVISOR_PID = "CCATP_SUPERVISOR_PID"
+
+# Flags of the command line of a process, and what they say.
+FLAGS = {
+    "--realtime": "is_realtime",
+    "--resume": "is_resuming",
+    "--faults": "has_faults",
+    "--restarted": "is_restarted",
+    "--held": "is_held",
+    "--sim": "is_sim",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +90,17 @@ class ProcessArgs:
         return self.is_resuming or self.is_restarted
 
 
+def processes_of(cfg: Config | RadioConfig) -> ProcessesConfig:
+    """Time-outs, restarts and priorities of the processes."""
+    return cfg.processes if isinstance(cfg, RadioConfig) else cfg.run
+
+
+def read_config(path: Path | None, settings: Mapping[str, object] | None = None) -> Config | RadioConfig:
+    """The configuration in a file, of a survey or of a mission among beacons, with dotted keys laid over it."""
+    is_radio = path is not None and is_radio_file(path)
+    return load_radio_config(path, settings) if is_radio else load_config(path, settings)
+
+
 def start_process(argv: list[str] | None = None) -> ProcessArgs:
     """Arguments of this process, which ends with the supervisor; its sockets can be used by its own user only."""
     die_with_parent()
@@ -141,15 +115,10 @@ def parse_args(argv: list[str] | None = None) -> ProcessArgs:
     parser.add_argument("--run-dir", type=Path, required=True)
     parser.add_argument("--runtime-dir", dest="endpoints", type=lambda text: Endpoints(Path(text)), required=True)
     parser.add_argument("--listen-fd", type=int)
-    parser.add_argument("--realtime", dest="is_realtime", action="store_true")
-    parser.add_argument("--resume", dest="is_resuming", action="store_true")
-    parser.add_argument("--faults", dest="has_faults", action="store_true")
-    parser.add_argument("--restarted", dest="is_restarted", action="store_true")
-    parser.add_argument("--held", dest="is_held", action="store_true")
-    parser.add_argument("--sim", dest="is_sim", action="store_true")
+    for flag, name in FLAGS.items():
+        parser.add_argument(flag, dest=name, action="store_true")
     args = parser.parse_args(argv)
-    path = args.run_dir / "config.toml"
-    return ProcessArgs(config=load_radio_config(path) if is_radio_file(path) else load_config(path), **vars(args))
+    return ProcessArgs(config=read_config(args.run_dir / "config.toml"), **vars(args))
 
 
 def die_with_parent() -> None:
@@ -176,14 +145,49 @@ def open_log(path: Path, process: str) -> structlog.typing.FilteringBoundLogger:
     return logger
 
 
-def stop_on_signals(stop: asyncio.Event) -> None:
-    """Let SIGTERM and SIGINT set ``stop``."""
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop.set)
+class LogStream(io.TextIOBase):
+    """Appends whole lines; several processes may share the file.
+
+    When the first line is dropped, ``process`` reports it on standard error. Raises ``OSError`` where the file cannot
+    be made.
+
+    Attributes:
+        dropped: lines that are not in the file, or only in part.
+    """
+
+    def __init__(self, path: Path, process: str) -> None:
+        self._path, self._process = path, process
+        self._file = path.open("ab", buffering=0)
+        self._is_torn = False
+        self.dropped = 0
+
+    def write(self, text: str) -> int:
+        """Append; never fails."""
+        data = text.encode("utf-8", "backslashreplace")
+        if self._is_torn:
+            data = b"\n" + data
+        try:
+            written = self._file.write(data)
+            why = "" if written == len(data) else "the disk took a part of a line"
+            # After a part of a line the next one begins with a line feed, also where in between nothing was written.
+            self._is_torn = written != len(data) and (self._is_torn or bool(written))
+        except OSError as error:
+            why = error.strerror or str(error)
+        if why:
+            self.dropped += 1
+            if self.dropped == 1:
+                with suppress(OSError):  # standard error may lie on the same disk
+                    text_of_loss = f"ccatp {self._process}: {self._path}: lines are dropped: {why}"
+                    print(text_of_loss, file=sys.stderr, flush=True)
+        return len(text)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+        super().close()
 
 
-async def unless_stopped(stop: asyncio.Event, work: Coroutine[Any, Any, None]) -> bool:
+async def unless_stopped(stop: asyncio.Event, work: Coroutine[Any, Any, object]) -> bool:
     """Run ``work`` until it ends or ``stop`` is set; returns whether it ended. Its errors are raised."""
     working, stopping = asyncio.ensure_future(work), asyncio.ensure_future(stop.wait())
     try:
@@ -197,26 +201,42 @@ async def unless_stopped(stop: asyncio.Event, work: Coroutine[Any, Any, None]) -
         await asyncio.gather(working, stopping, return_exceptions=True)
 
 
-async def run_process(
-    name: str, serve: Callable[["zmq.Context[zmq.Socket[bytes]]", asyncio.Event], Awaitable[int]]
+def run_until_stopped(serve: Callable[[asyncio.Event], Coroutine[Any, Any, int]], *, is_spinning: bool = False) -> int:
+    """Run ``serve(stop)`` in an event loop to its end; ``stop`` is set by SIGTERM and SIGINT."""
+
+    async def run() -> int:
+        stop = asyncio.Event()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            asyncio.get_running_loop().add_signal_handler(number, stop.set)
+        return await serve(stop)
+
+    factory = (lambda: asyncio.SelectorEventLoop(realtime.SpinningSelector())) if is_spinning else None
+    with asyncio.Runner(loop_factory=factory) as runner:
+        return runner.run(run())
+
+
+def run_process(
+    name: str, serve: Callable[["zmq.Context[zmq.Socket[bytes]]", asyncio.Event], Awaitable[int]], *, is_spinning: bool
 ) -> int:
-    """Run ``serve(context, stop)`` to its end; ``stop`` is set by SIGTERM and SIGINT.
+    """The same with a context of ZeroMQ, which is closed at the end.
 
     Expected errors are printed. Returns the exit status, or the highest one of the errors.
     """
-    stop = asyncio.Event()
-    stop_on_signals(stop)
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    status = 0
-    try:
-        status = await serve(context, stop)
-    except* CcatpError as group:
-        for error in _leaves(group):
-            print(f"ccatp {name}: {error}", file=sys.stderr, flush=True)
-            status = max(status, int(error.exit_status))
-    finally:
-        context.destroy(linger=0)
-    return status
+
+    async def run(stop: asyncio.Event) -> int:
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        status = 0
+        try:
+            status = await serve(context, stop)
+        except* CcatpError as group:
+            for error in _leaves(group):
+                print(f"ccatp {name}: {error}", file=sys.stderr, flush=True)
+                status = max(status, int(error.exit_status))
+        finally:
+            context.destroy(linger=0)
+        return status
+
+    return run_until_stopped(run, is_spinning=is_spinning)
 
 
 def _leaves(group: BaseExceptionGroup[CcatpError]) -> list[CcatpError]:

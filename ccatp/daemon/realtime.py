@@ -8,16 +8,13 @@ process costs some 30 microseconds, and two processes that take turns on one cor
 before it sleeps, and main has a core for itself.
 """
 
-import asyncio
 import ctypes
 import os
 import resource
 import selectors
 import sys
 import time
-from collections.abc import Coroutine
 from pathlib import Path
-from typing import Any
 
 import structlog
 
@@ -111,13 +108,6 @@ class SpinningSelector(selectors.EpollSelector):
                 return ready
             os.sched_yield()
         return super().select(timeout)
-
-
-def run(main: Coroutine[Any, Any, int], *, is_spinning: bool) -> int:
-    """``asyncio.run``, spinning or not."""
-    factory = (lambda: asyncio.SelectorEventLoop(SpinningSelector())) if is_spinning else None
-    with asyncio.Runner(loop_factory=factory) as runner:
-        return runner.run(main)
 
 
 def leave_a_core(supervisor_pid: int) -> int | None:

@@ -1,17 +1,14 @@
-"""Sessions at the robot: reconnecting link, numbered commands, command history, lateness of frames."""
+"""Sessions at the robot: a link that reconnects, and the lateness of its frames."""
 
 import asyncio
 import random
 from collections.abc import Callable
 from math import inf
 
-from ccatp.config.models import LinkConfig, RobotConfig
-from ccatp.control.tracker import CommandPredictor
-from ccatp.core import twist_of
+from ccatp.config.models import LinkConfig
 from ccatp.errors import DaemonUnreachableError
 from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout, read_key
 from ccatp.links.robot_messages import Hello, Role, Sensors
-from ccatp.safety.wheel_monitors import CommandSpan
 
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.05, 1.0
 # After this time without an answer the connection is closed and another one is tried.
@@ -27,8 +24,8 @@ def delay_s(failures: int, share: float) -> float:
     return max(FIRST_DELAY_S, min(LONGEST_DELAY_S, FIRST_DELAY_S * 2.0 ** min(failures, 10)) * (0.5 + 0.5 * share))
 
 
-class ReconnectingRobotLink:
-    """Keeps a role at the robot.
+class RobotSession:
+    """Keeps a role at the robot, in one session after the other.
 
     Args:
         on_sensors: called with each frame and its line; in lockstep a new session begins with the last frame again.
@@ -37,7 +34,9 @@ class ReconnectingRobotLink:
         on_bad_line: called after each line that fails a check.
 
     Attributes:
-        sessions: number of sessions so far.
+        count: number of sessions so far.
+        hello: of the newest session.
+        has_rebooted: the robot has restarted between the last session and this one.
     """
 
     def __init__(
@@ -51,17 +50,21 @@ class ReconnectingRobotLink:
         on_joined: Callable[[Hello], None],
         on_bad_line: Callable[[], None] = lambda: None,
     ) -> None:
-        self._cfg, self._role, self._client = cfg, role, client
-        self._key = read_key(cfg.key_file)
+        self._cfg, self._role, self._client, self._key = cfg, role, client, read_key(cfg.key_file)
         self._on_sensors, self._on_lost, self._on_joined = on_sensors, on_lost, on_joined
         self._on_bad_line = on_bad_line
         self._lost = asyncio.Event()
-        self._is_joined = False
+        self._is_joined = self.has_rebooted = False
         # A session without a valid frame counts as a failure.
-        self._failures = 0
+        self._failures = self.count = 0
         self._deadline_s: float | None = None
-        self.sessions = 0
+        self.hello: Hello | None = None
         self.link = self._make()
+
+    @property
+    def is_lockstep(self) -> bool:
+        """Simulated time waits for the answers; false before the first session."""
+        return self.hello is not None and self.hello.lockstep
 
     def _make(self) -> RobotLink:
         return RobotLink(
@@ -128,8 +131,10 @@ class ReconnectingRobotLink:
         self._on_sensors(frame, line)
 
     def _handle_join(self, hello: Hello) -> None:
+        self.has_rebooted = self.hello is not None and self.hello.boot != hello.boot
+        self.hello = hello
         self._is_joined = True
-        self.sessions += 1
+        self.count += 1
         self._on_joined(hello)
 
     def _handle_loss(self, reason: str) -> None:
@@ -145,96 +150,6 @@ class ReconnectingRobotLink:
     def close(self) -> None:
         """End the session; ``on_lost`` is not called."""
         self.link.close()
-
-
-class ControllerSession(ReconnectingRobotLink):
-    """The controller's role: numbers drives and fans, and keeps the state of the session.
-
-    Args:
-        is_taking_over: another process had the role before.
-
-    Attributes:
-        on_drive: called with number and rates of the right and the left wheel, rad/s, of each drive that is sent.
-        is_new_session: no frame of this session has been served yet.
-    """
-
-    def __init__(
-        self,
-        cfg: LinkConfig,
-        *,
-        on_sensors: Callable[[Sensors, bytes], None],
-        on_lost: Callable[[str], None],
-        on_joined: Callable[[Hello], None],
-        is_taking_over: bool,
-        frame_hz: float,
-    ) -> None:
-        super().__init__(
-            cfg, role="controller", client="main", on_sensors=on_sensors, on_lost=on_lost, on_joined=on_joined
-        )
-        self._is_taking_over, self._frame_hz = is_taking_over, frame_hz
-        self._hello: Hello | None = None
-        self._drive_seq = self._fans_seq = 0
-        self.on_drive: Callable[[int, float, float], None] = lambda _seq, _right, _left: None
-        self.is_lockstep = self.is_new_session = False
-
-    def begin(self, hello: Hello) -> str:
-        """A session begins; returns a line for the operator."""
-        before, self._hello, self.is_lockstep = self._hello, hello, hello.lockstep
-        self.is_new_session = True
-        return f"joined the robot at {self._cfg.host}:{self._cfg.port}{'' if before is None else ' again'}"
-
-    def has_rebooted(self, hello: Hello) -> bool:
-        """Whether the robot has restarted since the last session; valid before ``begin``."""
-        return self._hello is not None and self._hello.boot != hello.boot
-
-    @property
-    def frame_period_s(self) -> float:
-        """Time between two frames."""
-        return 1.0 / (self._hello.frame_hz if self._hello is not None else self._frame_hz)
-
-    @property
-    def may_lack_verdict(self) -> bool:
-        """Danger judges each frame once, the first one of this session perhaps before the session began."""
-        return self.is_new_session and (self._is_taking_over or self.sessions > 1)
-
-    def send_drive(self, ack: int, right: float, left: float, steer: float | None = None) -> None:
-        """Send wheel rates, rad/s, and the steering angle, rad, where there is one, computed from frame ``ack``."""
-        self._drive_seq += 1
-        self.on_drive(self._drive_seq, right, left)
-        if steer is None:
-            self.link.send_drive(self._drive_seq, max(ack, 0), right, left)
-        else:
-            self.link.send_drive(self._drive_seq, max(ack, 0), right, left, steer)
-
-    def send_fans(self, duty: tuple[float, float]) -> None:
-        """Send the fans' duties."""
-        self._fans_seq += 1
-        self.link.send_fans(self._fans_seq, duty)
-
-
-class CommandHistory:
-    """Drives that were sent: predictor of the motion, and span of the set points for the danger loop."""
-
-    def __init__(self, cfg: RobotConfig, frame_hz: float) -> None:
-        self._cfg = cfg
-        self._span = CommandSpan()
-        self._newest, self._driven = 0, (0.0, 0.0)
-        self.begin(frame_hz)
-
-    def begin(self, frame_hz: float) -> None:
-        """A session begins, without drives that are still to act."""
-        self.predictor = CommandPredictor(self._cfg.wheel_lag_s, 1.0 / frame_hz)
-
-    def add(self, seq: int, right: float, left: float) -> None:
-        """Drive ``seq``, wheel rates in rad/s, is sent."""
-        self._newest, self._driven = seq, (right, left)
-        self._span.add(right, left)
-        twist = twist_of(right, left, self._cfg.wheel_radius_m, self._cfg.wheel_base_m)
-        self.predictor.sent(seq, twist.v_m_s, twist.omega_rad_s)
-
-    def since_last_estimate(self) -> tuple[tuple[float, float, float, float], int]:
-        """Span of the set points since the last call, rad/s, and the number of the newest drive."""
-        return self._span.take(*self._driven), self._newest
 
 
 class LatenessStatistics:

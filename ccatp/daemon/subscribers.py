@@ -16,26 +16,51 @@ LOCKSTEP_WAIT_S = 10.0
 WAIT_SLICE_S = 0.02
 # Danger is at most a few frames ahead of main: a number far beyond the present one is of the robot's last boot.
 MAX_FRAMES_AHEAD = 100
+PERIOD_S = 0.1
 
 
-def await_message(
-    subscriber: Subscriber, is_it: Callable[[Message | Verdict], bool], on_wait: Callable[[], None]
-) -> None:
-    """Receive messages until ``is_it`` returns True for one, the other process is gone, or the time is up."""
-    deadline = time.monotonic() + LOCKSTEP_WAIT_S
-    while True:
-        received = subscriber.receive(WAIT_SLICE_S)
-        if received is not None:
-            if is_it(received[1]):
+class PeerSubscriber:
+    """Receives what the other loop publishes for each frame, and its heartbeats.
+
+    Args:
+        topics: of the messages.
+        on_wait: called now and then while lockstep waits.
+    """
+
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        topics: tuple[str, ...],
+        on_wait: Callable[[], None],
+    ) -> None:
+        self._subscriber = Subscriber(context, [endpoint], topics, is_watching=True)
+        self._on_wait = on_wait
+        # Renews a connection that is silent for long.
+        self.maintain = self._subscriber.maintain
+        self.close = self._subscriber.close
+
+    def take_new(self, take: Callable[[Message | Verdict], bool]) -> None:
+        """Give all messages that have arrived to ``take``."""
+        while (received := self._subscriber.receive()) is not None:
+            take(received[1])
+
+    def take_until(self, take: Callable[[Message | Verdict], bool]) -> None:
+        """The same until ``take`` returns True for one, the other process is gone, or the time is up."""
+        deadline = time.monotonic() + LOCKSTEP_WAIT_S
+        while True:
+            received = self._subscriber.receive(WAIT_SLICE_S)
+            if received is not None:
+                if take(received[1]):
+                    return
+            elif self._subscriber.is_cut or time.monotonic() > deadline:
                 return
-        elif subscriber.is_cut or time.monotonic() > deadline:
-            return
-        else:
-            on_wait()
+            else:
+                self._on_wait()
 
 
-class VerdictSubscriber:
-    """Receives the verdicts; ``on_wait`` is called now and then while lockstep waits for one."""
+class VerdictSubscriber(PeerSubscriber):
+    """Receives danger's verdicts; ``timeout_s``: an older one is not in force."""
 
     def __init__(
         self,
@@ -44,9 +69,8 @@ class VerdictSubscriber:
         timeout_s: float,
         on_wait: Callable[[], None] = lambda: None,
     ) -> None:
-        self._subscriber = Subscriber(context, [endpoint], ["verdict", "heartbeat.danger"], is_watching=True)
-        self._timeout_s, self._on_wait = timeout_s, on_wait
-        self._wall_s = 0.0
+        super().__init__(context, endpoint, ("verdict", "heartbeat.danger"), on_wait)
+        self._timeout_s, self._wall_s = timeout_s, 0.0
         self.verdict: Verdict | None = None
 
     def is_danger_joined(self) -> bool:
@@ -56,10 +80,6 @@ class VerdictSubscriber:
             if isinstance(message, Heartbeat) and message.phase == "joined":
                 return True
         return False
-
-    def maintain(self) -> None:
-        """Renew a connection that is silent for long."""
-        self._subscriber.maintain()
 
     def reset(self) -> None:
         """The robot's frames restarted: forget the verdict."""
@@ -76,10 +96,9 @@ class VerdictSubscriber:
             return False
 
         if not is_lockstep:
-            while (received := self._subscriber.receive()) is not None:
-                take(received[1])
+            self.take_new(take)
         elif self.verdict is None or self.verdict.seq < seq:
-            await_message(self._subscriber, take, self._on_wait)
+            self.take_until(take)
         verdict = self.verdict
         if verdict is None or (is_lockstep and verdict.seq < seq):
             return None
@@ -88,18 +107,9 @@ class VerdictSubscriber:
             age_s = max(age_s, time.monotonic() - self._wall_s)
         return verdict if age_s <= self._timeout_s else None
 
-    def close(self) -> None:
-        """Close the socket."""
-        self._subscriber.close()
 
-
-class EstimateSubscriber:
-    """Receives main's estimates.
-
-    Args:
-        on_wait: called now and then while lockstep waits for an estimate.
-        is_taking_over: the estimate for the first frame may have been missed.
-    """
+class EstimateSubscriber(PeerSubscriber):
+    """Receives main's estimates; ``is_taking_over``: the one for the first frame may have been missed."""
 
     def __init__(
         self,
@@ -109,17 +119,13 @@ class EstimateSubscriber:
         *,
         is_taking_over: bool = False,
     ) -> None:
-        self._subscriber = Subscriber(context, [endpoint], ["estimate", "heartbeat.main"], is_watching=True)
-        self._on_wait, self._is_taking_over = on_wait, is_taking_over
+        super().__init__(context, endpoint, ("estimate", "heartbeat.main"), on_wait)
+        self._is_taking_over = is_taking_over
         self.reset()
 
     def has_received(self) -> bool:
         """Whether a message was received."""
         return self._subscriber.receive() is not None
-
-    def maintain(self) -> None:
-        """Renew a connection that is silent for long."""
-        self._subscriber.maintain()
 
     def reset(self) -> None:
         """The robot's frames restarted: forget the estimate."""
@@ -145,10 +151,9 @@ class EstimateSubscriber:
             self._first_seq = seq + self._is_taking_over
         wanted = last_estimate_before(seq)
         if not is_lockstep:
-            while (received := self._subscriber.receive()) is not None:
-                take(received[1])
+            self.take_new(take)
         elif wanted >= self._first_seq and self._newest_seq < wanted:
-            await_message(self._subscriber, take, self._on_wait)
+            self.take_until(take)
         if seq > self._judged_frame:  # an older one is not judged
             self._judged_frame, self._judged = seq, self._newest_seq
         return self._newest
@@ -156,13 +161,6 @@ class EstimateSubscriber:
     @property
     def _newest_seq(self) -> int:
         return -1 if self._newest is None else self._newest.seq
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._subscriber.close()
-
-
-PERIOD_S = 0.1
 
 
 class HeartbeatPublisher:
@@ -174,7 +172,7 @@ class HeartbeatPublisher:
     """
 
     def __init__(self, publisher: Publisher, process: str) -> None:
-        self._publisher, self._topic, self._process = publisher, f"heartbeat.{process}", process
+        self._publisher, self._process = publisher, process
         self.phase = "starting"
         self.frame_s: float | None = None
         self._count, self._published_s = 0, 0.0
@@ -187,15 +185,11 @@ class HeartbeatPublisher:
     def publish(self) -> None:
         """Publish now."""
         self._published_s = now_s = time.monotonic()
+        age_s, pid = self.frame_age_s, os.getpid()
         heartbeat = Heartbeat(
-            seq=self._count,
-            t_s=now_s,
-            process=self._process,
-            pid=os.getpid(),
-            phase=self.phase,
-            frame_age_s=self.frame_age_s,
+            seq=self._count, t_s=now_s, process=self._process, pid=pid, phase=self.phase, frame_age_s=age_s
         )
-        self._publisher.send(self._topic, heartbeat)
+        self._publisher.send(f"heartbeat.{self._process}", heartbeat)
         self._count += 1
 
     def publish_if_due(self) -> None:

@@ -2,31 +2,34 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from ccatp.config.models import Config
 from ccatp.control.gate import Denial, DriveGate, FanGate
 from ccatp.control.motion_checks import as_standing
-from ccatp.core import Verdict
+from ccatp.control.tracker import CommandPredictor
+from ccatp.core import Verdict, twist_of
 from ccatp.daemon.checkpoints import CheckpointWriter, build_parts
 from ccatp.daemon.fix_service import FixRequest, FixService
-from ccatp.daemon.mission_runner import (
-    EXIT_STATUS,
-    STILL,
-    DriveCommand,
-    MissionRunner,
-    RunnerConfig,
-    RunnerContext,
-    RunnerFactory,
-    TimedFrame,
-)
+from ccatp.daemon.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionRunner, TimedFrame
 from ccatp.daemon.process import ProcessArgs
-from ccatp.daemon.robot_session import CommandHistory
-from ccatp.daemon.telemetry import SurveyTelemetry
+from ccatp.daemon.telemetry import Telemetry
 from ccatp.errors import DaemonUnreachableError, ExitStatus
 from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.links.robot_messages import Hello, Sensors
-from ccatp.links.topics import MissionStatus, TreatmentKind, is_estimate_due
+from ccatp.links.topics import (
+    ArrivalMessage,
+    DisplayState,
+    EstimateMessage,
+    MissionStatus,
+    Rest,
+    TrackMessage,
+    Treatment,
+    TreatmentKind,
+    is_estimate_due,
+)
 from ccatp.records.store import MissionStore
+from ccatp.safety.wheel_monitors import CommandSpan
 from ccatp.survey.behaviours import home_time_s
 from ccatp.survey.composition import SurveyParts
 from ccatp.survey.fix_gate import FixGate
@@ -35,6 +38,9 @@ from ccatp.survey.reactions import MirrorCheck, ReminderCall, UnattendedFaultTim
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.state import MissionState, SurveyOutcome, by_reason
 from ccatp.survey.stops import HOLD_POSITION, MissionCommand
+
+if TYPE_CHECKING:
+    from ccatp.daemon.main_loop import MainLoop
 
 
 def state_text(state: MissionState, cause: str) -> str:
@@ -79,18 +85,23 @@ class SurveyRunner(MissionRunner):
     """A survey in the main-loop process."""
 
     mission: Mission
-    telemetry: SurveyTelemetry
 
-    def __init__(self, cfg: Config, context: RunnerContext, parts: SurveyParts, store: MissionStore) -> None:
-        super().__init__(parts.mission, SurveyTelemetry(context.publisher, context.log))
-        self._cfg, self._context, self._parts, self._store = cfg, context, parts, store
+    def __init__(
+        self, cfg: Config, args: ProcessArgs, loop: "MainLoop", parts: SurveyParts, store: MissionStore
+    ) -> None:
+        super().__init__(parts.mission, Telemetry(loop.publisher, loop.log, "track", TrackMessage))
+        self._cfg, self._loop, self._clock, self._parts, self._store = cfg, loop, loop.clock, parts, store
         self._mirror, self._localizer, self._gate = parts.mirror, parts.localizer, parts.gate
-        self._session, self._clock = context.session, context.clock
-        self._clock.resume_at(parts.elapsed_s)
+        self._clock.before_s = parts.elapsed_s
         self._gate_log = GateLog(self._gate, self.telemetry.notify_operator)
-        self._fan_gate, self._has_full_fans = FanGate(0.0), False
-        self._commands = CommandHistory(cfg.robot, cfg.sim.robot.frame_hz)
-        self._session.on_drive = self._commands.add
+        self._fan_gate, self._has_full_fans, self._fans_seq = FanGate(0.0), False, 0
+        # The drives that were sent: prediction of the motion, and span of the set points for the danger loop.
+        self._predictor, self._span = (
+            CommandPredictor(cfg.robot.wheel_lag_s, 1.0 / cfg.sim.robot.frame_hz),
+            CommandSpan(),
+        )
+        self._newest_drive, self._driven = 0, (0.0, 0.0)
+        self._sent_commands: tuple[tuple[float, float, float, float] | None, int] = (None, -1)
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
         self._fix_service = FixService(
             cfg.mission,
@@ -100,11 +111,11 @@ class SurveyRunner(MissionRunner):
             self.mission,
             store,
             self.telemetry,
-            context.answer,
+            loop.let_time_go_on,
             # lockstep time stands still meanwhile
-            lambda: 0.0 if self._session.is_lockstep else cfg.etalon.measuring_time_s,
+            lambda: 0.0 if loop.session.is_lockstep else cfg.etalon.measuring_time_s,
         )
-        self._checkpoint = CheckpointWriter(context.run_dir, parts.localizer, self.mission, context.is_patient)
+        self._checkpoint = CheckpointWriter(args.run_dir, parts.localizer, self.mission, not args.is_realtime)
         self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
         self._recovery = parts.recovery
@@ -112,16 +123,13 @@ class SurveyRunner(MissionRunner):
         self._state = MissionState.IDLE
         self._motion: StateEstimate | None = None
         self._has_reported_calibration = False
-        self._sent_commands: tuple[tuple[float, float, float, float] | None, int] = (None, -1)
 
     @property
     def is_busy(self) -> bool:
-        """A measurement is in progress."""
         return self._fix_service.is_busy
 
     @property
     def is_at_rest(self) -> bool:
-        """The robot is at rest."""
         control = self._cfg.control
         return (
             abs(self._localizer.speed_m_s) <= control.settle_speed_m_s
@@ -129,7 +137,6 @@ class SurveyRunner(MissionRunner):
         )
 
     def status(self) -> MissionStatus:
-        """See ``MissionRunner``."""
         mission = self.mission
         stop = mission.journey.current
         point = stop.point if stop is not None else None
@@ -151,6 +158,23 @@ class SurveyRunner(MissionRunner):
             left_out=dict(by_reason(mission.left_out)),
         )
 
+    def display_state(self) -> DisplayState:
+        """Pose on the deck, and the filter's last update."""
+        localizer, telemetry = self._localizer, self.telemetry
+        pose, covariance, innovation = localizer.deck_pose, localizer.pose_covariance, localizer.innovation
+        return DisplayState(
+            seq=telemetry.seq,
+            t_s=telemetry.t_s,
+            x_m=pose.x_m,
+            y_m=pose.y_m,
+            heading_rad=pose.heading_rad,
+            covariance_m2=(float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])),
+            heading_sigma_rad=localizer.heading_sigma_rad,
+            nis=innovation.nis if innovation is not None else 0.0,
+            size=innovation.size if innovation is not None else 0,
+            line=telemetry.newest_line,
+        )
+
     # -- beside the frames ----------------------------------------------------------------------------------------
 
     async def connect(self) -> None:
@@ -164,21 +188,18 @@ class SurveyRunner(MissionRunner):
         self.telemetry.log.warning("etalon_retry", error=str(error), tries_left=tries_left)
 
     async def run(self) -> None:
-        """Take measurements, until cancelled."""
         await self._fix_service.run()
 
     async def close(self) -> None:
-        """Close the files and the laser system."""
         self._checkpoint.close()
         await self._etalon.close()
 
     def check_robot(self, hello: Hello) -> None:
-        """See ``MissionRunner``."""
         self._parts.check_robot(hello)
 
     def begin_session(self, hello: Hello) -> None:
-        """See ``MissionRunner``."""
-        self._commands.begin(hello.frame_hz)
+        # No drive of the last session is still to act.
+        self._predictor = CommandPredictor(self._cfg.robot.wheel_lag_s, 1.0 / hello.frame_hz)
         self._checkpoint.boot = hello.boot
         # The robot's own floor counts where the mirror overhangs.
         self._fan_gate = FanGate(hello.robot.fan_floor if self._mirror.overhang else 0.0)
@@ -188,17 +209,23 @@ class SurveyRunner(MissionRunner):
         duty = FULL_FANS if self._has_full_fans else self._cfg.robot.fan_duty
         refusal = self._fan_gate.refusal(*duty)
         if refusal is None:
-            self._session.send_fans(duty)
+            self._fans_seq += 1
+            self._loop.session.link.send_fans(self._fans_seq, duty)
         else:
             self.telemetry.notify_operator("error", refusal)
             self.mission.fault(refusal)
 
+    def on_drive(self, seq: int, right_rad_s: float, left_rad_s: float) -> None:
+        robot = self._cfg.robot
+        self._newest_drive, self._driven = seq, (right_rad_s, left_rad_s)
+        self._span.add(right_rad_s, left_rad_s)
+        twist = twist_of(right_rad_s, left_rad_s, robot.wheel_radius_m, robot.wheel_base_m)
+        self._predictor.sent(seq, twist.v_m_s, twist.omega_rad_s)
+
     def on_tracking_gap(self) -> None:
-        """See ``MissionRunner``."""
         self.mission.lose_sight()
 
     def save_checkpoint(self) -> None:
-        """See ``MissionRunner``."""
         self._checkpoint.write(self._clock.seq, self._clock.t_s, self._clock.elapsed_s)
 
     def log_statistics(self) -> None:
@@ -207,19 +234,20 @@ class SurveyRunner(MissionRunner):
 
     # -- the frame ------------------------------------------------------------------------------------------------
 
+    def _publish_treatment(self, sensors: Sensors, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:
+        self.telemetry.send("treatment", Treatment(seq=sensors.seq, t_s=sensors.t, kind=kind, values=values))
+
     def estimate(self, frame: TimedFrame) -> None:
         """Give the frame's samples to the localizer, as far as they can be trusted."""
         sensors, mission, localizer = frame.sensors, self.mission, self._localizer
         recovery, self._recovery = self._recovery, None
         if recovery is not None:  # a replay has to know where the localizer of a loop that takes over begins
             pose, sigmas = recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad)
-            values = (pose.x_m, pose.y_m, pose.heading_rad, *sigmas)
-            self.telemetry.publish_treatment(sensors.seq, sensors.t, "begun", values)
+            self._publish_treatment(sensors, "begun", (pose.x_m, pose.y_m, pose.heading_rad, *sigmas))
         is_odometry_off = mission.ignores_motion
         if is_odometry_off is not self._is_odometry_off:
             self._is_odometry_off = is_odometry_off
-            kind: TreatmentKind = "odometry_off" if is_odometry_off else "odometry_on"
-            self.telemetry.publish_treatment(sensors.seq, sensors.t, kind)
+            self._publish_treatment(sensors, "odometry_off" if is_odometry_off else "odometry_on")
         imu, enc = ((), as_standing(sensors.enc)) if is_odometry_off else (sensors.imu, sensors.enc)
         localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
         if localizer.hold_requested:
@@ -232,7 +260,7 @@ class SurveyRunner(MissionRunner):
         localizer, echo = self._localizer, frame.sensors.cmd
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         place = pose.x_m, pose.y_m, pose.heading_rad
-        ahead = self._commands.predictor.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
+        ahead = self._predictor.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
         return StateEstimate(
             frame.t_s, frame.dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, self._position_sigma_m
         )
@@ -255,13 +283,12 @@ class SurveyRunner(MissionRunner):
         return DriveCommand(right, left)
 
     def hold(self, frame: TimedFrame) -> DriveCommand:
-        """See ``MissionRunner``."""
         self._note_commands(frame)
         return STILL
 
     def _note_commands(self, frame: TimedFrame) -> None:
         is_due = frame.is_first or is_estimate_due(frame.sensors.seq)
-        self._sent_commands = self._commands.since_last_estimate() if is_due else (None, -1)
+        self._sent_commands = (self._span.take(*self._driven), self._newest_drive) if is_due else (None, -1)
 
     def _is_on_mirror(self, sensors: Sensors) -> bool:
         """Whether gravity permits motion: the robot stands on the mirror of the configuration.
@@ -278,9 +305,9 @@ class SurveyRunner(MissionRunner):
                 self.telemetry.notify_operator("warning", check.warning)
         if check.contradiction:
             self.telemetry.notify_operator("error", check.contradiction)
-            self._context.finish(ExitStatus.USAGE)
+            self._loop.finish(ExitStatus.USAGE)
             return False
-        return self._mirror_check is None or self._session.is_lockstep
+        return self._mirror_check is None or self._loop.session.is_lockstep
 
     def _apply_requests(self, sensors: Sensors) -> None:
         """Requests of the mission besides the drive, before that is sent."""
@@ -289,7 +316,7 @@ class SurveyRunner(MissionRunner):
             mission.doubts_pose = False
             doubt = health.doubt_position_m, health.doubt_heading_rad
             self._localizer.doubt(*doubt)
-            self.telemetry.publish_treatment(sensors.seq, sensors.t, "doubted", doubt)
+            self._publish_treatment(sensors, "doubted", doubt)
         if mission.wants_calibration and not self._has_reported_calibration:
             self._has_reported_calibration = True
             self.telemetry.notify_operator("warning", GIVEN_UP)
@@ -317,10 +344,12 @@ class SurveyRunner(MissionRunner):
         mission, seq = self.mission, self._clock.seq
         if command.at_rest:
             self._localizer.rest()
-            self.telemetry.publish_rest(seq, motion.t_s)
+            self.telemetry.send("rest", Rest(seq=seq, t_s=motion.t_s))
         if command.arrived is not None:
             error_m = mission.survey.distance_m(motion.pose)
-            self.telemetry.publish_arrival(seq, motion.t_s, command.arrived, error_m)
+            number, point = self.telemetry.number_of(seq), (*command.arrived,)
+            arrival = ArrivalMessage(seq=number, t_s=motion.t_s, point=point, error_mm=1e3 * error_m)
+            self.telemetry.send("arrival", arrival)
             self._store.record_arrival(command.arrived, motion.t_s, error_m)
         if command.measure:
             pose = self._localizer.deck_pose
@@ -330,16 +359,29 @@ class SurveyRunner(MissionRunner):
             self._fix_service.begin(FixRequest(mission.request, t_s, mission.measuring_point, expected, pose))
 
     def publish(self, frame: TimedFrame) -> None:
-        """See ``MissionRunner``."""
-        seq, t_s = frame.sensors.seq, frame.sensors.t
-        self.telemetry.publish_frame(
-            seq, t_s, self._localizer, self.mission.state, frame.raw, self._sent_commands, is_first=frame.is_first
-        )
+        seq, t_s, telemetry, localizer = frame.sensors.seq, frame.sensors.t, self.telemetry, self._localizer
+        pose, sigma_m = localizer.pose, localizer.position_sigma_m
+        # That of the first frame of a session is always due, because the danger loop may wait for it.
+        if frame.is_first or is_estimate_due(seq):
+            deck, (commanded, drive_seq) = localizer.deck_pose, self._sent_commands
+            estimate = EstimateMessage(
+                seq=seq,
+                t_s=t_s,
+                x_m=deck.x_m,
+                y_m=deck.y_m,
+                heading_rad=deck.heading_rad,
+                sigma_m=sigma_m,
+                state=self.mission.state,
+                commanded=commanded,
+                drive_seq=drive_seq,
+            )
+            telemetry.send("estimate", estimate)
+        row = telemetry.number_of(seq), t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, sigma_m
+        telemetry.add_frame(seq, t_s, frame.raw, row)
         self._checkpoint.write_if_due(seq, t_s, self._clock.elapsed_s)
         self.publish_state()
 
     def publish_state(self) -> None:
-        """See ``MissionRunner``."""
         mission, telemetry, before = self.mission, self.telemetry, self._state
         if mission.state is before:
             return
@@ -354,26 +396,15 @@ class SurveyRunner(MissionRunner):
         if mission.state is MissionState.RETURNING and before is not MissionState.BACKING_OFF:
             telemetry.notify_operator("warning", f"returning to base: {mission.cause}")
         if mission.state is MissionState.DONE:
-            self._context.finish(EXIT_STATUS[mission.outcome])
-        elif mission.is_faulted and self._session.is_lockstep:
+            self._loop.finish(EXIT_STATUS[mission.outcome])
+        elif mission.is_faulted and self._loop.session.is_lockstep:
             # No operator can react while simulated time runs at many times the wall clock.
-            self._context.finish(EXIT_STATUS[SurveyOutcome.STOPPED])
-
-
-def survey_runner_config(cfg: Config) -> RunnerConfig:
-    """Configuration of the process."""
-    return RunnerConfig(
-        cfg.robot,
-        cfg.run.realtime_priority,
-        cfg.mission.verdict_timeout_s,
-        cfg.health.clock_jump_s,
-        cfg.sim.robot.frame_hz,
-    )
+            self._loop.finish(EXIT_STATUS[SurveyOutcome.STOPPED])
 
 
 @contextmanager
-def open_survey(cfg: Config, args: ProcessArgs) -> Iterator[RunnerFactory]:
+def open_survey(cfg: Config, args: ProcessArgs) -> Iterator[Callable[["MainLoop"], SurveyRunner]]:
     """Open the parts and the database of a survey, new or taken over; yields a factory of the mission."""
     parts, store = build_parts(cfg, args)
     with store:
-        yield lambda context: SurveyRunner(cfg, context, parts, store)
+        yield lambda loop: SurveyRunner(cfg, args, loop, parts, store)

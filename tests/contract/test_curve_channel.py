@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import structlog
@@ -19,7 +19,8 @@ from zmq.utils.monitor import parse_monitor_message
 from ccatp.cli import main
 from ccatp.config.models import ObservatoryConfig
 from ccatp.core import EventCode
-from ccatp.daemon.command_handlers import EmergencyCommandHandler, ObservatoryServer
+from ccatp.daemon.command_handlers import ObservatoryServer
+from ccatp.danger import DangerMonitor
 from ccatp.errors import ConfigError
 from ccatp.links.auth import AuthorizedClient, KeyPair, Role, decode_key, read_pair, write_pair
 from ccatp.links.channels import format_ok, format_request, parse_reply
@@ -112,20 +113,21 @@ def site(tmp_path: Path) -> Site:
     return site
 
 
-def desk_of(site: Site) -> EmergencyCommandHandler:
+def desk_of(site: Site) -> ObservatoryServer:
     def keep(_logger: object, _method: str, event: Any) -> Any:
         site.logged.append(dict(event))
         raise structlog.DropEvent
 
     log: structlog.typing.FilteringBoundLogger = structlog.wrap_logger(None, processors=[keep])
-    return EmergencyCommandHandler(site.monitor, lambda: 0.01, log)
+    monitor = cast(DangerMonitor, site.monitor)
+    return ObservatoryServer(f"ipc://{site.folder}/emergency", site.config, monitor, lambda: 0.01, log)
 
 
 @asynccontextmanager
 async def served(site: Site) -> AsyncIterator[zmq.asyncio.Context]:
     """The observatory channel of a danger process."""
     context = zmq.asyncio.Context()
-    observatory = ObservatoryServer(f"ipc://{site.folder}/emergency", site.config, desk_of(site))
+    observatory = desk_of(site)
     try:
         async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
             task = tasks.create_task(observatory.serve(context))
@@ -309,14 +311,13 @@ async def test_a_handler_that_fails_takes_the_channel_with_it(site: Site, monkey
 
 
 def test_what_cannot_be_served(site: Site) -> None:
-    desk = desk_of(site)
     (site.folder / "clients.toml").write_text("")
     with pytest.raises(ConfigError, match=r"observatory\.clients_file: .*lists no client"):
-        ObservatoryServer("ipc://x", site.config, desk)
+        desk_of(site)
     site.enlist(weather="raise")
     (site.folder / "server.key_secret").chmod(0o644)
     with pytest.raises(ConfigError, match=r"observatory\.key_file: .*open to others"):
-        ObservatoryServer("ipc://x", site.config, desk)
+        desk_of(site)
 
 
 async def test_keys_are_for_tcp(site: Site) -> None:
@@ -466,5 +467,5 @@ async def test_refusals_do_not_fill_the_log(site: Site) -> None:
     desk = desk_of(site)
     for _ in range(1000):
         desk.answer(b"nonsense")
-        desk.log_refusal("unknown", "no")
+        desk._log_refusal("unknown", "no")
     assert len(site.logged) == 10

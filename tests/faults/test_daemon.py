@@ -80,13 +80,13 @@ async def test_many_times(measured: Measured) -> None:
 
 # Every task that the two loops serve, by the method that it runs.
 TASKS = (
-    "ccatp.daemon.main_loop.MainLoop._publish_levels",
-    "ccatp.daemon.main_loop.MainLoop._watch",
+    "ccatp.daemon.main_loop.MainLoop.publish_heartbeat",
+    "ccatp.daemon.main_loop.MainLoop.watch",
+    "ccatp.daemon.danger_loop.DangerLoop.publish_heartbeat",
+    "ccatp.daemon.danger_loop.DangerLoop.watch",
     "ccatp.daemon.fix_service.FixService.run",
-    "ccatp.daemon.robot_session.ReconnectingRobotLink.serve",
-    "ccatp.links.rpc.Router.serve",
-    "ccatp.daemon.danger_loop.DangerLoop._publish_heartbeat",
-    "ccatp.daemon.danger_loop.DangerLoop._watch",
+    "ccatp.daemon.robot_session.RobotSession.serve",
+    "ccatp.daemon.main_loop.MainLoop._serve_operator",
     "ccatp.daemon.command_handlers.ObservatoryServer.serve",
 )
 
@@ -128,8 +128,8 @@ def test_the_tasks_are_those_that_the_loops_serve() -> None:
     """The coroutines in the ``services`` of both loops, read from their source."""
     found = set[str]()
     for loop in (MainLoop, DangerLoop):
-        for node in ast.walk(ast.parse(textwrap.dedent(inspect.getsource(loop.run)))):
-            if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "services":
+        for node in ast.walk(ast.parse(textwrap.dedent(inspect.getsource(loop.services)))):
+            if isinstance(node, ast.Return):
                 assert isinstance(node.value, ast.Tuple)
                 calls = [call.func for call in node.value.elts if isinstance(call, ast.Call)]
                 found |= {function.attr for function in calls if isinstance(function, ast.Attribute)}

@@ -155,10 +155,7 @@ def _logging_to(entries: list[dict[str, Any]]) -> Iterator[None]:
         raise structlog.DropEvent
 
     logger = structlog.wrap_logger(None, processors=[structlog.processors.add_log_level, keep])
-    with (
-        patch("ccatp.daemon.main_loop.open_log", lambda _, name: logger.bind(logger=name)),
-        patch("ccatp.daemon.danger_loop.open_log", lambda _, name: logger.bind(logger=name)),
-    ):
+    with patch("ccatp.daemon.robot_loop.open_log", lambda _, name: logger.bind(logger=name)):
         yield
 
 
@@ -189,9 +186,8 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
                 configs = [_at(cfg, proxy.port, laser_port) for proxy in (one, two)]
                 main_args, danger_args = (ProcessArgs(at, run_dir, endpoints, None, True, False) for at in configs)
                 (run_dir / "config.toml").write_text(dump_config(configs[0]), encoding="utf-8")
-                runner_cfg, opening = open_runner(main_args)
-                with opening as make_runner:
-                    main = MainLoop(main_args, context, runner_cfg, make_runner)
+                with open_runner(main_args) as make_runner:
+                    main = MainLoop(main_args, context, make_runner)
                     danger = DangerLoop(danger_args, context)
                     daemon = Daemon(main, danger, robot, (one, two))
                     daemon.log = entries
@@ -214,8 +210,6 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
                                     for task in serving[1:]:
                                         task.cancel()
                     finally:
-                        main.close()
-                        danger.close()
                         listener.close(linger=0)
         finally:
             await laser.close()

@@ -15,10 +15,11 @@ from ccatp.config.models import Config
 from ccatp.control.tracker import CommandPredictor
 from ccatp.core import DeckPose, Fix, PointId, Severity, Vector3, Verdict
 from ccatp.daemon.fix_service import FixRequest, FixService
-from ccatp.daemon.telemetry import SurveyTelemetry
+from ccatp.daemon.telemetry import Telemetry
 from ccatp.estimation.fixes import FixRefused, deck_foot
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
 from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import FixMessage
 from ccatp.localizer import Localizer
 from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.records.store import MissionStore, PlannedPoint
@@ -159,7 +160,7 @@ def fix_service(
     localizer: Any = None,
     gate: Any = None,
     on_finished: Callable[[], None] = lambda: None,
-    publish_fix: Callable[..., None] = lambda *_, **__: None,
+    publish: Callable[[str, Any], None] = lambda *_: None,
     notify: Callable[[str, str], None] = lambda *_: None,
     measuring_time_s: float = 0.0,
 ) -> FixService:
@@ -177,7 +178,7 @@ def fix_service(
         cast(Localizer, localizer),
         cast(Mission, mission),
         store,
-        cast(SurveyTelemetry, SimpleNamespace(publish_fix=publish_fix, notify_operator=notify)),
+        cast(Telemetry, SimpleNamespace(send=publish, notify_operator=notify, seq=0)),
         on_finished,
         lambda: measuring_time_s,
     )
@@ -240,7 +241,7 @@ class MeasuredSurvey(FaultySilRun):
                 localizer=self.localizer,
                 gate=FixGate(self.mirror, self.cfg),
                 on_finished=self._over.set,
-                publish_fix=self._note_fix,
+                publish=self._note_fix,
                 notify=lambda level, text: self.said.append(f"{level}: {text}"),
                 measuring_time_s=0.5,
             )
@@ -297,11 +298,8 @@ class MeasuredSurvey(FaultySilRun):
             measured.nis = float("inf")
         return fix
 
-    def _note_fix(
-        self, _point: PointId | None, _fix: Fix, _jump_m: float, *, is_fused: bool, is_set_aside: bool
-    ) -> None:
-        del is_set_aside
-        self.asked[-1].is_fused = is_fused
+    def _note_fix(self, _topic: str, message: FixMessage) -> None:
+        self.asked[-1].is_fused = message.is_fused
 
 
 def failing(_measured: LaserRequest, _fix: Fix) -> Fix:

@@ -1,105 +1,74 @@
-"""The fix service and a localizer that refuses."""
+"""The fix service: a localizer that refuses, a point that is measured already."""
 
 import asyncio
 from concurrent.futures import Future
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PointId
-from ccatp.daemon.fix_service import FixRequest, FixService
-from ccatp.daemon.telemetry import SurveyTelemetry
+from ccatp.daemon.fix_service import FixRequest
 from ccatp.estimation.fixes import FixGated, FixRefused
-from ccatp.etalon_client import EtalonClient
-from ccatp.localizer import Localizer
-from ccatp.records.store import AlreadyMeasuredError, MissionStore
-from ccatp.survey.fix_gate import FixFinding, FixGate
-from ccatp.survey.mission import Mission
+from ccatp.links.topics import FixMessage
+from ccatp.records.store import AlreadyMeasuredError
+from tests.support.sim_survey import fix_service
 
-FIX = Fix(1.0, (0.0, 0.0, 0.0), (0.0,) * 9, 1.0, (1,), 0.0)
-
-
-class Refusing:
-    """A localizer that says the given things in turn and then takes the fix."""
-
-    def __init__(self, *refusals: Exception) -> None:
-        self.refusals = list(refusals)
-        self.notices: list[str] = []
-        self.pose_covariance = np.eye(3)
-        self.position_sigma_m = 5e-6
-
-    def fuse_fix(self, fix: Fix) -> float:
-        if self.refusals:
-            raise self.refusals.pop(0)
-        return 0.0
+POINT = PointId(1, 2, 4)
 
 
 async def measured_once(
-    config: Config, localizer: Refusing, mission: object, store: object, telemetry: object, point: PointId | None
-) -> None:
-    """One request to a service whose laser system always answers, until it is over."""
+    config: Config, refusals: list[Exception], store: Any, point: PointId | None, **mission: Any
+) -> tuple[list[FixMessage], list[str]]:
+    """One request, with a laser system that always answers: the fixes and the levels of messages that were told."""
+    told, levels, over = list[FixMessage](), list[str](), asyncio.Event()
 
-    async def measure(t_s: float, expected_m: Any) -> Fix:
-        return FIX
+    async def measure(_t_s: float, _expected_m: Any) -> Fix:
+        return Fix(1.0, (0.0, 0.0, 0.0), (0.0,) * 9, 1.0, (1,), 0.0)
 
-    over = asyncio.Event()
-    service = FixService(
-        config.mission,
-        cast(EtalonClient, SimpleNamespace(measure=measure)),
-        cast(FixGate, SimpleNamespace(begin=lambda: None, review=lambda *_, **__: FixFinding())),
-        cast(Localizer, localizer),
-        cast(Mission, mission),
-        cast(MissionStore, store),
-        cast(SurveyTelemetry, telemetry),
-        over.set,
-        lambda: 0.0,
+    def fuse_fix(_fix: Fix) -> float:
+        if refusals:
+            raise refusals.pop(0)
+        return 0.0
+
+    service = fix_service(
+        config,
+        measure,
+        store,
+        SimpleNamespace(is_awaiting_fix=True, request=1, is_lost=point is None, **mission),
+        localizer=SimpleNamespace(
+            fuse_fix=fuse_fix, notices=[], pose=None, pose_covariance=np.eye(3), position_sigma_m=5e-6
+        ),
+        on_finished=over.set,
+        publish=lambda _topic, message: told.append(message),
+        notify=lambda level, _text: levels.append(level),
     )
     serving = asyncio.get_running_loop().create_task(service.run())
     service.begin(FixRequest(1, 1.0, point, (0.0, 0.0, 0.0), DeckPose(0.0, 0.0, 0.0)))
     async with asyncio.timeout(10.0):
         await over.wait()
     serving.cancel()
-
-
-async def published_fixes(config: Config, *refusals: Exception) -> list[tuple[bool, bool]]:
-    told: list[tuple[bool, bool]] = []
-
-    def fix(point: Any, fix: Fix, jump_m: float, *, is_fused: bool, is_set_aside: bool) -> None:
-        told.append((is_fused, is_set_aside))
-
-    mission = SimpleNamespace(
-        is_awaiting_fix=True, request=1, is_lost=True, fixed=lambda point: None, not_fixed=lambda point, cause: None
-    )
-    telemetry = SimpleNamespace(publish_fix=fix, notify_operator=lambda level, text: None)
-    await measured_once(config, Refusing(*refusals), mission, SimpleNamespace(), telemetry, None)
-    return told
+    return told, levels
 
 
 @pytest.mark.parametrize(
-    ("refusals", "told"),
+    ("refusals", "are_fused"),
     [([], [True]), ([FixGated("far")], [False, True]), ([FixRefused("too old")] * 4, [False] * 3)],
 )
 async def test_every_fix_that_the_localizer_saw_is_told(
-    refusals: list[Exception], told: list[bool], config: Config
+    refusals: list[Exception], are_fused: list[bool], config: Config
 ) -> None:
-    assert await published_fixes(config, *refusals) == [(is_fused, False) for is_fused in told]
+    mission = {"fixed": lambda _point: None, "not_fixed": lambda _point, _cause: None}
+    told, _ = await measured_once(config, refusals.copy(), None, None, **mission)
+    assert [(fix.point, fix.is_fused, fix.is_set_aside) for fix in told] == [(None, one, False) for one in are_fused]
 
 
 async def test_a_point_that_is_measured_already_is_done_and_needs_no_operator(config: Config) -> None:
-    point, done, said = PointId(1, 2, 4), list[PointId](), list[str]()
-    mission = SimpleNamespace(
-        is_awaiting_fix=True, request=1, is_lost=False, fixed=done.append, fault=said.append,
-        survey=SimpleNamespace(distance_m=lambda pose: 0.0),
-    )  # fmt: skip
+    done, survey = list[PointId](), SimpleNamespace(distance_m=lambda _pose: 0.0)
     refused: Future[None] = Future()
     refused.set_exception(AlreadyMeasuredError("point 1/2/4 has been measured; its fix is not replaced"))
-    localizer = Refusing()
-    localizer.pose = None  # type: ignore[attr-defined]
-    telemetry = SimpleNamespace(
-        publish_fix=lambda *_, **__: None, notify_operator=lambda level, text: said.append(level)
-    )
-    await measured_once(config, localizer, mission, SimpleNamespace(record_fix=lambda *_: refused), telemetry, point)
-    assert (done, said) == ([point], ["warning"])
+    store = SimpleNamespace(record_fix=lambda *_: refused)
+    told, levels = await measured_once(config, [], store, POINT, fixed=done.append, survey=survey)
+    assert (done, levels, [fix.point for fix in told]) == ([POINT], ["warning"], [(1, 2, 4)])

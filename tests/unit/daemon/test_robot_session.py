@@ -13,7 +13,7 @@ from ccatp.daemon.robot_session import (
     LONGEST_DELAY_S,
     MAX_DRIFT,
     LatenessStatistics,
-    ReconnectingRobotLink,
+    RobotSession,
     delay_s,
 )
 from ccatp.dataloop import DataLoop
@@ -38,7 +38,7 @@ class Client:
         self.frames: list[int] = []
         self.losses: list[str] = []
         self.changed = asyncio.Event()
-        self.lasting = ReconnectingRobotLink(
+        self.lasting = RobotSession(
             cfg.robot,
             role="controller",
             client="test",

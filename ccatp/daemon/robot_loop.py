@@ -1,0 +1,139 @@
+"""What the main loop and the danger loop have in common: session at the robot, bus, and tasks that end together."""
+
+# ruff: noqa: B027 - empty methods are for loops without such a peer or duty
+
+import asyncio
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Coroutine
+from typing import Any
+
+import zmq
+import zmq.asyncio
+
+from ccatp.daemon import realtime
+from ccatp.daemon.process import ProcessArgs, open_log, processes_of, unless_stopped
+from ccatp.daemon.robot_session import LatenessStatistics, RobotSession
+from ccatp.daemon.subscribers import PERIOD_S, HeartbeatPublisher, PeerSubscriber
+from ccatp.links.bus import Publisher
+from ccatp.links.robot_messages import Hello, Role, Sensors
+
+WAIT_PERIOD_S = 0.02
+
+
+class RobotLoop(ABC):
+    """A loop at the robot, and the process around it.
+
+    Attributes:
+        peer: the messages of the other loop.
+        over: set when the loop ends by itself.
+    """
+
+    peer: PeerSubscriber
+
+    def __init__(self, name: str, role: Role, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+        self._args, self._robot_cfg = args, args.config.robot
+        self._shadow = zmq.asyncio.Context.shadow(context)
+        self.log = open_log(args.run_dir / "log.jsonl", name)
+        self.publisher = Publisher(context, args.endpoints.of(name))
+        self.heartbeat = HeartbeatPublisher(self.publisher, name)
+        self.lateness = LatenessStatistics(self._robot_cfg.slip_after_s)
+        self.session = RobotSession(
+            self._robot_cfg,
+            role=role,
+            client=name,
+            on_sensors=self.on_sensors,
+            on_lost=self.on_lost,
+            on_joined=self.on_joined,
+            on_bad_line=self.on_bad_line,
+        )
+        self.over = asyncio.Event()
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Join the robot together with the other loop, then serve frames until the end or until ``stop`` is set."""
+        async with asyncio.TaskGroup() as tasks:
+            served = [tasks.create_task(service) for service in self.services()]
+            try:
+                await self._join(stop)
+                await unless_stopped(stop, self.over.wait())
+                await self.end(stop)
+            finally:
+                for task in served:
+                    task.cancel()
+                self.session.close()
+                await self.close()
+
+    async def _join(self, stop: asyncio.Event) -> None:
+        if not await unless_stopped(stop, self.connect()):
+            return
+        while not self.is_peer_ready():
+            if stop.is_set():
+                return
+            await asyncio.sleep(WAIT_PERIOD_S)
+        joins = self.session.join(is_patient=self._args.is_taking_over)
+        if await unless_stopped(stop, joins) and not self.session.is_lockstep:
+            realtime.enter(processes_of(self._args.config).realtime_priority, self.log)
+
+    @abstractmethod
+    def services(self) -> tuple[Coroutine[Any, Any, None], ...]:
+        """What is served beside the frames."""
+
+    async def connect(self) -> None:
+        """Connect to peers other than the robot and the other loop."""
+
+    @abstractmethod
+    def is_peer_ready(self) -> bool:
+        """Messages reach the other loop, and it has got as far as this one has to wait for."""
+
+    @abstractmethod
+    async def end(self, stop: asyncio.Event) -> None:
+        """The last messages and lines of the log."""
+
+    async def close(self) -> None:
+        """Close the resources of ``connect``."""
+
+    @abstractmethod
+    def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
+        """Serve one frame."""
+
+    @abstractmethod
+    def on_joined(self, hello: Hello) -> None:
+        """A session begins; its first frame comes next."""
+
+    @abstractmethod
+    def on_lost(self, reason: str) -> None:
+        """The session is lost; the robot holds itself."""
+
+    def on_bad_line(self) -> None:
+        """A line was no frame."""
+
+    def publish_levels(self) -> None:
+        """Publish what is repeated beside the heartbeat."""
+
+    @abstractmethod
+    def on_silence(self, age_s: float) -> None:
+        """No frame came for so long, in real time; called all the time, also while frames are prompt."""
+
+    def begin_session(self) -> None:
+        """Frames are judged and counted from here on."""
+        self.lateness.reset()
+        self.heartbeat.phase, self.heartbeat.frame_s = "joined", time.monotonic()
+
+    async def publish_heartbeat(self) -> None:
+        """Publish periodically, until cancelled."""
+        while True:
+            self.heartbeat.publish()
+            self.publish_levels()
+            await asyncio.sleep(PERIOD_S)
+
+    async def watch(self) -> None:
+        """Act where frames stop coming, and drop a connection that is open and silent; until cancelled."""
+        while True:
+            await asyncio.sleep(WAIT_PERIOD_S)
+            self.peer.maintain()
+            age_s = self.heartbeat.frame_age_s
+            if self.heartbeat.phase != "joined" or self.session.is_lockstep or age_s is None:
+                continue
+            self.on_silence(age_s)
+            if age_s > self._robot_cfg.silence_timeout_s:
+                self.session.drop(f"no sensors frame for {age_s:.2f} s")
