@@ -56,16 +56,11 @@ class EtalonLink(asyncio.Protocol):
         self._transport = cast(asyncio.Transport, transport)  # a TCP connection has no other
 
     def data_received(self, data: bytes) -> None:
-        too_long: LineTooLong | None = None
-        try:
-            lines = self._lines.feed(data)
-        except LineTooLong as error:
-            lines, too_long = error.lines, error
-        for line in lines:
+        for line in self._lines.feed(data):
             if not self.fault:
                 self._deliver(line.rstrip(b"\r"))
-        if too_long is not None:
-            self._fail(too_long)
+        if self._lines.error is not None:
+            self._fail(self._lines.error)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._fail(ConnectionError(f"connection lost: {exc}" if exc else "server closed the connection"))

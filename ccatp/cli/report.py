@@ -242,7 +242,7 @@ def _judged(recording: "Recording", cfg: "Config", smooth: bool) -> "ReplayEvalu
     if not len(replayed.trace.seq):
         why = f" ({recording.warnings[-1]})" if recording.warnings else ""
         raise ReplayError(f"{recording.path}: no sensors frames in it{why}")
-    return ReplayEvaluation(replayed, recording.recorded(mirror), recording.truth(), recording.arrival_frames(), mirror)
+    return ReplayEvaluation(replayed, recording.recorded(mirror), recording.truth(), recording.arrivals, mirror)
 
 
 def _replay_facts(

@@ -130,7 +130,7 @@ def conformance(
     """
     from ccatp.commissioning.conformance.motion_checks import extent
     from ccatp.commissioning.conformance.runner import CHECKS, Conformance, as_json, check_ids, last_line, table_line
-    from ccatp.links.robot_link import read_key
+    from ccatp.links.auth import read_key
 
     host, _, port = server.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")

@@ -40,7 +40,8 @@ from ccatp.daemon.process import SUPERVISOR_PID
 from ccatp.daemon.supervisor import PROCESSES
 from ccatp.errors import CcatpError, ConfigError
 from ccatp.etalon_client import EtalonClient, EtalonError, EtalonUnreachable
-from ccatp.links.robot_link import RobotLink, RobotLinkError, read_key
+from ccatp.links.auth import read_key
+from ccatp.links.robot_link import RobotLink, RobotLinkError
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.runtime_dir import make_runtime_dir
 from ccatp.mirror.mirror import Mirror, build_mirror

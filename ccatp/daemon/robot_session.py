@@ -7,7 +7,8 @@ from math import inf
 
 from ccatp.config.models import LinkConfig
 from ccatp.errors import DaemonUnreachableError
-from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout, read_key
+from ccatp.links.auth import read_key
+from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout
 from ccatp.links.robot_messages import Hello, Role, Sensors
 
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.05, 1.0

@@ -16,7 +16,7 @@ from ccatp.config.models import Config
 from ccatp.daemon.process import FAULTS_FILE, Endpoints, open_log, processes_of, run_until_stopped, start_process
 from ccatp.dataloop import serve, serve_beacons
 from ccatp.errors import ConfigError
-from ccatp.links.robot_link import read_key
+from ccatp.links.auth import read_key
 from ccatp.links.runtime_dir import TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
 from ccatp.sim.fault_plan import FaultPlan, read_plan
 from ccatp.sim.ground_truth import FILE

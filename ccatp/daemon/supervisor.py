@@ -48,7 +48,7 @@ from ccatp.daemon.run_dir import (
 from ccatp.daemon.service import Service, take_from
 from ccatp.daemon.terminal import BeaconRunView, RunView, survey_title, write_run_report
 from ccatp.errors import ConfigError, ExitStatus
-from ccatp.links.robot_link import read_key
+from ccatp.links.auth import read_key
 from ccatp.links.runtime_dir import make_runtime_dir
 from ccatp.links.topics import Heartbeat
 from ccatp.records.recorder import RUN_LOCK

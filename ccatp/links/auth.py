@@ -212,6 +212,23 @@ def _read(path: Path, what: str, forbidden: int, read: Callable[[Path], _T]) -> 
         ) from error
 
 
+def read_key(key_file: str, *, must_be_private: bool = False) -> bytes | None:
+    """Key of the robot link: the file's bytes without white space around them; ``None`` when no file is named.
+
+    ``must_be_private``: refuse a file that others may read; the key of a simulated robot is no secret.
+
+    Raises:
+        ConfigError: the file cannot be read, is empty, or is not private.
+    """
+    if not key_file:
+        return None
+    forbidden = stat.S_IRWXG | stat.S_IRWXO if must_be_private else 0
+    key = _read(Path(key_file), "robot.key_file", forbidden, Path.read_bytes).strip()
+    if not key:
+        raise ConfigError(f"robot.key_file: {key_file} is empty")
+    return key
+
+
 def make_key_dir(path: Path) -> None:
     """Make a folder for keys with mode 0700, or check that it belongs to the caller and is closed to others.
 

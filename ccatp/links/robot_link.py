@@ -2,13 +2,11 @@
 
 import asyncio
 import socket
-import stat
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 from typing import cast
 
-from ccatp.errors import ConfigError, DaemonUnreachableError
+from ccatp.errors import DaemonUnreachableError
 from ccatp.links.robot_codec import BadLine, decode_from_robot, encode, format_drive, format_permit, join_mac
 from ccatp.links.robot_messages import (
     AUTH_HMAC,
@@ -20,7 +18,6 @@ from ccatp.links.robot_messages import (
     Join,
     Joined,
     LineBuffer,
-    LineTooLong,
     Refused,
     Role,
     Sensors,
@@ -63,29 +60,6 @@ _HINTS = {
     "bad mac": "; check robot.key_file",
     "busy": "; too many connections",
 }
-
-
-def read_key(key_file: str, *, must_be_private: bool = False) -> bytes | None:
-    """Key of the robot link: the file's bytes without white space around them; ``None`` when no file is named.
-
-    ``must_be_private``: refuse a file that others may read; the key of a simulated robot is no secret.
-
-    Raises:
-        ConfigError: the file cannot be read, is empty, or is not private.
-    """
-    if not key_file:
-        return None
-    try:
-        mode = Path(key_file).stat().st_mode
-        key = Path(key_file).read_bytes().strip()
-    except OSError as error:
-        raise ConfigError(f"robot.key_file: cannot read {key_file}: {error.strerror}") from error
-    if must_be_private and mode & (stat.S_IRWXG | stat.S_IRWXO):
-        mode = stat.S_IMODE(mode)
-        raise ConfigError(f"robot.key_file: {key_file} is open to others (mode {mode:04o}); chmod go= {key_file}")
-    if not key:
-        raise ConfigError(f"robot.key_file: {key_file} is empty")
-    return key
 
 
 class RobotLink(asyncio.Protocol):
@@ -172,11 +146,7 @@ class RobotLink(asyncio.Protocol):
                 peer.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
     def data_received(self, data: bytes) -> None:
-        is_too_long = False
-        try:
-            lines = self._lines.feed(data)
-        except LineTooLong as error:
-            lines, is_too_long = error.lines, True
+        lines = self._lines.feed(data)
         if self._budget is not None and not self._budget.take(len(lines), asyncio.get_running_loop().time()):
             self.abort("a flood of lines from the robot")
         for line in lines:
@@ -192,7 +162,7 @@ class RobotLink(asyncio.Protocol):
                 self._take_frame(message, line)
             else:
                 self._take(message)
-        if is_too_long:
+        if self._lines.error is not None:
             self.abort("the robot sent a line over the limit")
 
     def connection_lost(self, exc: Exception | None) -> None:

@@ -157,26 +157,22 @@ MAX_LINE_BYTES = 8192
 
 
 class LineTooLong(ValueError):
-    """A line over the limit; the session that sent it is of no further use.
-
-    Attributes:
-        lines: the whole lines that came before it, without their LF.
-    """
-
-    def __init__(self, limit: int, lines: list[bytes]) -> None:
-        super().__init__(f"line of more than {limit} bytes")
-        self.lines = lines
+    """A line over the limit; the session that sent it is of no further use."""
 
 
 class LineBuffer:
     """Cuts a byte stream into lines, however it was chopped on its way.
 
     ``limit``: most bytes of a line, its LF not counted. No more than this is ever kept between two calls.
+
+    Attributes:
+        error: set from the first line on, finished or not, that is over the limit.
     """
 
     def __init__(self, limit: int = MAX_LINE_BYTES) -> None:
         self._limit = limit
         self._rest = b""
+        self.error: LineTooLong | None = None
 
     @property
     def has_rest(self) -> bool:
@@ -184,11 +180,7 @@ class LineBuffer:
         return bool(self._rest)
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Whole lines, without their LF, after ``data`` was appended.
-
-        Raises:
-            LineTooLong: a line, finished or not, is over the limit; it carries the lines before it.
-        """
+        """Whole lines, without their LF, after ``data`` was appended; none from one over the limit on."""
         if self._rest:
             data = self._rest + data
         lines = data.split(b"\n")
@@ -198,7 +190,8 @@ class LineBuffer:
             for k, line in enumerate((*lines, self._rest)):
                 if len(line) > limit:
                     self._rest = b""
-                    raise LineTooLong(limit, lines[:k])
+                    self.error = LineTooLong(f"line of more than {limit} bytes")
+                    return lines[:k]
         return lines
 
 

@@ -5,7 +5,7 @@ packets (0x80, 0x81) carry the level as a byte of -dBm; the answer to a node dis
 with the serial number in SH and SL and the node identifier in NI (Hevrdejs and Knoll 2017, data packet).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 START = 0x7E
@@ -48,52 +48,43 @@ class XbeeFrames:
     def _frames(self) -> Iterator[bytes]:
         while (start := self._buffer.find(START)) >= 0:
             del self._buffer[:start]
-            body, used = self._unescaped()
+            body, ends = self._unescaped()
             if len(body) < 2:
                 return
             length = int.from_bytes(body[:2], "big")
             if not 1 <= length <= _LONGEST:
                 self._skip()
-                continue
-            if len(body) < length + 3:
+            elif len(body) < length + 3:
                 # In mode 2 a start inside a frame means that the rest of this one is lost.
-                if self._escaped and used < len(self._buffer):
-                    self._skip()
-                    continue
-                return
-            if sum(body[2 : length + 3]) & 0xFF != 0xFF:
+                if not self._escaped or self._buffer.find(START, 1) < 0:
+                    return
                 self._skip()
-                continue
-            yield bytes(body[2 : length + 2])
-            del self._buffer[: self._raw_length(length + 3)]
+            elif sum(body[2 : length + 3]) & 0xFF != 0xFF:
+                self._skip()
+            else:
+                yield bytes(body[2 : length + 2])
+                del self._buffer[: ends[length + 2]]
         self._buffer.clear()
 
     def _skip(self) -> None:
         self.bad += 1
         del self._buffer[0]
 
-    def _unescaped(self) -> tuple[bytearray, int]:
-        """What follows the start, as far as it belongs to this frame, and how many raw bytes that is."""
+    def _unescaped(self) -> tuple[bytearray, Sequence[int]]:
+        """What follows the start, as far as it belongs to this frame, and where each byte of it ends in the buffer."""
         if not self._escaped:
-            return self._buffer[1:], len(self._buffer)
-        body, flips = bytearray(), False
-        for index in range(1, len(self._buffer)):
-            byte = self._buffer[index]
+            return self._buffer[1:], range(2, len(self._buffer) + 1)
+        body, ends, flip = bytearray(), list[int](), 0
+        for index, byte in enumerate(self._buffer[1:], start=2):
             if byte == START:
-                return body, index
+                break
             if byte == ESCAPE:
-                flips = True
+                flip = _FLIP
                 continue
-            body.append(byte ^ _FLIP if flips else byte)
-            flips = False
-        return body, len(self._buffer)
-
-    def _raw_length(self, count: int) -> int:
-        """Raw bytes, the start included, that hold so many bytes of a frame."""
-        index = 1
-        for _ in range(count):
-            index += 2 if self._escaped and self._buffer[index] == ESCAPE else 1
-        return index
+            body.append(byte ^ flip)
+            ends.append(index)
+            flip = 0
+        return body, ends
 
 
 def level_of(frame: bytes) -> XbeeLevel | None:

@@ -19,7 +19,7 @@ from ccatp.links.beacon_messages import (
     pose_truth,
     table,
 )
-from ccatp.records.summary import rounded, wall_figures
+from ccatp.records.summary import distribution, rounded, wall_figures
 
 WITHIN_SIGMAS = 3.0
 _DISTRIBUTION = ("rmse", "mean", "p50", "p99", "max")
@@ -105,7 +105,7 @@ class BeaconSummary:
         if is_navigating.any():
             track, true = track.at(is_navigating), true.at(is_navigating)
         known = facts.has_truth and len(true.seq) > 0
-        errors = pose_errors(track, true)
+        errors = pose_errors(track, true) if known else np.empty((0, 3))
         return {
             "system": facts.system,
             "seed": facts.seed,
@@ -113,7 +113,7 @@ class BeaconSummary:
             "cause": self.cause,
             "waypoints": self._waypoints(truth if known else None),
             "trajectory_rmse_m": rounded(aligned_rms_m(track.place_m, true.place_m)) if known else None,
-            "position_error_m": _distribution(np.hypot(errors[:, 0], errors[:, 1]), known=known),
+            "position_error_m": distribution(np.hypot(errors[:, 0], errors[:, 1]), _DISTRIBUTION),
             "heading_rmse_rad": rounded(np.sqrt(np.mean(errors[:, 2] ** 2))) if known else None,
             "dead_reckoning_rmse_m": rounded(rms_m(track.reckoned_m, true.place_m)) if known else None,
             "path_length_m": rounded(np.hypot(*np.diff(true.place_m, axis=0).T).sum()) if known else None,
@@ -174,14 +174,6 @@ class BeaconSummary:
             "distance_rms_off_m": rounded(np.sqrt(np.mean((distances - safe_m) ** 2))) if len(distances) else None,
             "final_error_m": error_m,
         }
-
-
-def _distribution(errors: FloatArray, *, known: bool) -> dict[str, float | None]:
-    if not known:
-        return dict.fromkeys(_DISTRIBUTION)
-    p50, p99 = np.percentile(errors, (50, 99))
-    figures = (np.sqrt(np.mean(errors**2)), errors.mean(), p50, p99, errors.max())
-    return {name: rounded(value) for name, value in zip(_DISTRIBUTION, figures, strict=True)}
 
 
 def _obstacle_figures(truth: PoseTruth, *, known: bool) -> dict[str, Any] | None:

@@ -66,26 +66,10 @@ class Fixed:
 Event = Marked | Fixed
 
 
-class Stood(NamedTuple):
-    """The mission takes the robot to be at rest from frame ``seq`` on."""
-
-    seq: int
+Message = Sensors | Rest | FixMessage | Treatment
 
 
-class FixGiven(NamedTuple):
-    """A fix was measured after frame ``seq``; the others as in ``Fixed``."""
-
-    seq: int
-    fix: Fix
-    was_fused: bool
-    was_set_aside: bool = False
-
-
-Message = Sensors | Stood | FixGiven | Treatment
-
-
-def fix_given(message: FixMessage) -> FixGiven:
-    """The recorded fix, and whether it was used."""
+def _fixed(message: FixMessage) -> Fixed:
     fix = Fix(
         t_s=message.t_s,
         position_m=message.position_m,
@@ -94,7 +78,7 @@ def fix_given(message: FixMessage) -> FixGiven:
         channels=tuple(message.channels),
         residual_rms_m=message.residual_rms_m,
     )
-    return FixGiven(message.seq, fix, message.is_fused, message.is_set_aside)
+    return Fixed(fix, message.is_fused, message.is_set_aside)
 
 
 def in_order(messages: Iterable[Message]) -> Iterator[Event]:
@@ -107,18 +91,18 @@ def in_order(messages: Iterable[Message]) -> Iterator[Event]:
     rests: set[int] = set()
     treatments: dict[tuple[int, str], tuple[float, ...]] = {}
     is_odometry_off = False
-    fixes: deque[FixGiven] = deque()
+    fixes: deque[FixMessage] = deque()
     last = -1
     for message in messages:
-        if isinstance(message, Stood):
+        if isinstance(message, Rest):
             rests.add(message.seq)
-        elif isinstance(message, FixGiven):
+        elif isinstance(message, FixMessage):
             fixes.append(message)
         elif isinstance(message, Treatment):
             treatments[message.seq, message.kind] = message.values
         else:
             while fixes and fixes[0].seq < message.seq:
-                yield Fixed(*fixes.popleft()[1:])
+                yield _fixed(fixes.popleft())
             last = message.seq
             at_rest = last in rests
             rests.discard(last)
@@ -127,7 +111,7 @@ def in_order(messages: Iterable[Message]) -> Iterator[Event]:
                 is_odometry_off = (last, "odometry_off") in treatments
             yield Marked(message, at_rest, begun, is_odometry_off, treatments.pop((last, "doubted"), None))
     while fixes and fixes[0].seq <= last:
-        yield Fixed(*fixes.popleft()[1:])
+        yield _fixed(fixes.popleft())
 
 
 class Trace(NamedTuple):
@@ -267,12 +251,8 @@ class Recording:
         if isinstance(message, SensorLines):
             frames = [decode_from_robot(bytes(line)) for line in message.lines]
             return [frame for frame in frames if isinstance(frame, Sensors)]
-        if isinstance(message, Rest):
-            return [Stood(message.seq)]
-        if isinstance(message, Treatment):
+        if isinstance(message, Rest | Treatment | FixMessage):
             return [message]
-        if isinstance(message, FixMessage):
-            return [fix_given(message)]
         if isinstance(message, TrackMessage):
             for seq, t_s, row, col, x_m, y_m, heading_rad, _ in message.rows:
                 self._track.add(seq, t_s, row, col, (x_m, y_m, heading_rad))
@@ -288,11 +268,7 @@ class Recording:
 
     def truth(self) -> Trace | None:
         """The simulated truth, where there is one."""
-        return trace_of_truth(np.array(self._truth)) if self._truth else None
-
-    def arrival_frames(self) -> IntArray:
-        """``arrivals`` as an array."""
-        return np.array(self.arrivals, dtype=np.int64)
+        return trace_of_truth(self._truth) if self._truth else None
 
 
 def open_run(run_dir: Path) -> list[Recording]:

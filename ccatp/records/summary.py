@@ -25,6 +25,7 @@ HISTORY_ROWS = 60_000  # truth kept for arrivals and verdicts that come late: te
 # Columns that truth and track share, and those of the truth alone.
 _SEQ, _X, _Y, _PSI, _SURFACE = 0, 2, 3, 4, slice(5, 8)
 _CLEARANCE, _FALLEN = 8, 9
+_IN_MM = ("mean", "p50", "p99", "max")
 
 
 class PuckTarget(NamedTuple):
@@ -209,9 +210,9 @@ class SummaryBuilder:
                 "skipped": self._skipped,
                 **({"left_out": {why: list(names) for why, names in self._left_out.items()}} if self._left_out else {}),
             },
-            "arrival_error_mm": _distribution(arrivals),
+            "arrival_error_mm": distribution(arrivals, _IN_MM, scale=1e3, decimals=3),
             "localization_error_mm": {
-                **_distribution(distances),
+                **distribution(distances, _IN_MM, scale=1e3, decimals=3),
                 "within_10mm_fraction": rounded(np.mean(distances <= WITHIN_M), 6) if len(distances) else None,
             },
             "heading_error_mrad": {"rms": _rms(errors[:, 2], 1e3)},
@@ -289,13 +290,16 @@ def _text(value: Any) -> str:
     return "-" if value is None else "yes" if value is True else "no" if value is False else f"{value}"
 
 
-def _distribution(errors_m: FloatArray) -> dict[str, float | None]:
-    """Mean, median, 99th percentile and maximum in mm; null where there are none."""
+def distribution(
+    errors_m: FloatArray, names: Sequence[str], *, scale: float = 1.0, decimals: int = 6
+) -> dict[str, Any]:
+    """Figures of errors, shape (k,), by name: rmse, mean, p50, p99, max; null where there are none."""
     if not len(errors_m):
-        return dict.fromkeys(("mean", "p50", "p99", "max"))
+        return dict.fromkeys(names)
     p50, p99 = np.percentile(errors_m, (50, 99))
     figures = {"mean": errors_m.mean(), "p50": p50, "p99": p99, "max": errors_m.max()}
-    return {name: rounded(value * 1e3, 3) for name, value in figures.items()}
+    figures["rmse"] = np.sqrt(np.mean(errors_m**2))
+    return {name: rounded(figures[name] * scale, decimals) for name in names}
 
 
 def _rms(values: FloatArray, scale: float) -> float | None:

@@ -65,12 +65,6 @@ class FixedPuck:
         return truth
 
 
-class _TruthReply(msgspec.Struct):
-    t: float
-    puck: Vector3
-    moved_m: float
-
-
 class ZmqPuck:
     """From the simulated robot: request ``b"puck"``, reply ``{"t", "puck": [x, y, z], "moved_m"}``, SI, world."""
 
@@ -89,12 +83,11 @@ class ZmqPuck:
                     peer.connect(self._endpoint)
                     await peer.send(b"puck")
                     # Strict JSON: it has no NaN, and numbers past the range of a float are refused.
-                    reply = msgspec.json.decode(await peer.recv(), type=_TruthReply)
+                    return msgspec.json.decode(await peer.recv(), type=PuckTruth)
         except TimeoutError:
             raise TruthUnavailable(f"no puck from {self._endpoint} within {self._timeout_s} s") from None
         except (zmq.ZMQError, msgspec.MsgspecError) as error:
             raise TruthUnavailable(f"no puck from {self._endpoint}: {error}") from None
-        return PuckTruth(reply.t, reply.puck, reply.moved_m)
 
     def close(self) -> None:
         """Release the context."""
@@ -115,6 +108,7 @@ class EtalonSimulator:
     Attributes:
         model: lengths and flags; ``blocked``, ``flags`` and ``laser_ready`` may be changed at any time.
         connected: answer to ``isconnected``.
+        streaming: the session that has the push stream.
         counts: requests, bad_requests, oversized_lines, truth_failures, refused_clients, lost_clients.
     """
 
@@ -136,7 +130,7 @@ class EtalonSimulator:
         self._truth = truth
         self._server: asyncio.Server | None = None
         self._sessions: set[asyncio.Task[None]] = set()
-        self._streaming: _Session | None = None
+        self.streaming: _Session | None = None
         self._end: asyncio.Future[None] | None = None
 
     async def start(self, host: str, port: int, sock: socket.socket | None = None) -> int:
@@ -203,17 +197,6 @@ class EtalonSimulator:
             return ChannelData(self.model.failed_records(channels), server_error=1)
         return ChannelData(self.model.records(channels, puck))
 
-    def take_stream(self, session: "_Session") -> bool:
-        """Give the push stream to a session, unless another has it."""
-        if self._streaming is None:
-            self._streaming = session
-        return self._streaming is session
-
-    def release_stream(self, session: "_Session") -> None:
-        """Take the push stream back."""
-        if self._streaming is session:
-            self._streaming = None
-
 
 class _Session:
     def __init__(self, server: EtalonSimulator, writer: asyncio.StreamWriter) -> None:
@@ -226,15 +209,10 @@ class _Session:
         async with asyncio.TaskGroup() as group:
             try:
                 while data := await reader.read(_READ_BYTES):
-                    too_long: LineTooLong | None = None
-                    try:
-                        lines = buffer.feed(data)
-                    except LineTooLong as error:
-                        lines, too_long = error.lines, error
-                    for line in lines:
+                    for line in buffer.feed(data):
                         await self._handle(line.rstrip(b"\r"), group)
-                    if too_long is not None:
-                        raise too_long
+                    if buffer.error is not None:
+                        raise buffer.error
             finally:
                 self._stop_stream()
         self._writer.close()
@@ -271,7 +249,8 @@ class _Session:
             reply = LaserReady(server.model.laser_ready)
         elif command is Command.ENVIRONMENT_DATA:
             reply = server.model.environment
-        elif server.take_stream(self):
+        elif server.streaming is None:
+            server.streaming = self
             reply = Notice.STARTED
         return reply
 
@@ -285,7 +264,8 @@ class _Session:
         if self._push is not None:
             self._push.cancel()
             self._push = None
-        self._server.release_stream(self)
+        if self._server.streaming is self:
+            self._server.streaming = None
 
     async def _send(self, reply: Reply) -> None:
         self._writer.write(multiline.format_reply(reply))

@@ -6,8 +6,8 @@ second client, a repeated request or another order of channels never changes wha
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,7 +25,7 @@ SEED_STREAM = 2
 """The laser's stream of random numbers: with the run's seed it makes the seed of its generator."""
 
 
-class PuckTruth(NamedTuple):
+class PuckTruth(msgspec.Struct, frozen=True, rename={"t_s": "t", "position_m": "puck"}):
     """Centre of the puck, world frame, and the furthest it was from there within the last measuring time."""
 
     t_s: float

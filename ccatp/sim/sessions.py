@@ -33,7 +33,6 @@ from ccatp.links.robot_messages import (
     Join,
     Joined,
     LineBuffer,
-    LineTooLong,
     Permit,
     RefusalReason,
     Refused,
@@ -79,15 +78,10 @@ class RobotSession:
 
     def receive(self, data: bytes, now_s: float) -> None:
         """Take bytes as they come."""
-        is_too_long = False
-        try:
-            lines = self._lines.feed(data)
-        except LineTooLong as error:
-            lines, is_too_long = error.lines, True
-        for line in lines:
+        for line in self._lines.feed(data):
             if self.is_open:
                 self._take(line, now_s)
-        if is_too_long and self.is_open:
+        if self._lines.error is not None and self.is_open:
             self._server.counts["oversized_lines"] += 1
             self._server.drop(self, "line over the limit")
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ccatp.config.models import Config
 from ccatp.control.motion_checks import as_standing
@@ -358,7 +358,7 @@ class ReplayErrors(NamedTuple):
     nees: FloatArray
 
 
-def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: IntArray) -> ReplayErrors:
+def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: ArrayLike) -> ReplayErrors:
     """Compare in the frames that both have; ``arrivals``: where the robot stood at a point for the first time."""
     seqs, i, j = np.intersect1d(estimate.seq, reference.seq, return_indices=True)
     offset = estimate.place[i] - reference.place[j]
@@ -428,7 +428,7 @@ class ReplayEvaluation(NamedTuple):
     replayed: Replayed
     recorded: Trace
     truth: Trace | None
-    arrivals: IntArray
+    arrivals: ArrayLike
     mirror: Mirror
 
 

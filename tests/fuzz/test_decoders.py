@@ -134,17 +134,16 @@ def _lines(data: bytes) -> Hashable:
     lines, is_too_long = whole
     assert all(len(line) <= limit and b"\n" not in line for line in lines)
     if is_too_long:
-        raise LineTooLong(limit, lines)
+        raise LineTooLong
     return min(len(lines), 20)
 
 
 def _fed(buffer: LineBuffer, parts: list[bytes]) -> tuple[list[bytes], bool]:
     lines: list[bytes] = []
     for part in parts:
-        try:
-            lines += buffer.feed(part)
-        except LineTooLong as error:
-            return [*lines, *error.lines], True
+        lines += buffer.feed(part)
+        if buffer.error is not None:
+            return lines, True
     return lines, False
 
 

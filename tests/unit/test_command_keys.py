@@ -14,8 +14,7 @@ import zmq.auth
 from ccatp.cli import main
 from ccatp.config.load import dump_config, load_config
 from ccatp.errors import ConfigError
-from ccatp.links.auth import ClientsFile, read_clients, read_pair, read_public
-from ccatp.links.robot_link import read_key
+from ccatp.links.auth import ClientsFile, read_clients, read_key, read_pair, read_public
 
 # -- ``ccatp keys``: what is written, and what is never shown ---------------------------------------------------------
 

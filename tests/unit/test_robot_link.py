@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from ccatp.errors import ConfigError, ExitStatus
+from ccatp.links.auth import read_key
 from ccatp.links.robot_codec import encode_sensors, join_mac
-from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout, WrongProtocol, read_key
+from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout, WrongProtocol
 from ccatp.links.robot_messages import Sensors
 
 NONCE = "ab" * 16

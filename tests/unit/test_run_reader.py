@@ -33,7 +33,7 @@ from ccatp.links.topics import (
 from ccatp.mirror.mirror import build_mirror
 from ccatp.mirror.misalignment import PanelMisalignment
 from ccatp.records.recorder import Recorder
-from ccatp.records.run_reader import RunReadError, Stood, open_run, read_run
+from ccatp.records.run_reader import RunReadError, open_run, read_run
 from ccatp.records.store import read_survey
 from ccatp.studies import replay as player
 from tests.unit.aligning.conftest import exact_fix, load
@@ -87,7 +87,7 @@ def test_what_a_recording_holds(tmp_path: Path, config_text: str) -> None:
     )
     (recording,) = open_run(tmp_path)
     found = list(recording.messages())
-    assert isinstance(found[0], Stood)
+    assert isinstance(found[0], Rest)
     assert [message.seq for message in found] == [1, 0, 1]
     assert isinstance(found[2], Sensors)
     assert found[2].imu[0].t_s == 0.01
@@ -98,7 +98,7 @@ def test_what_a_recording_holds(tmp_path: Path, config_text: str) -> None:
     assert known is not None
     assert known.pose.tolist() == [[1.0, 2.0, 0.5]]
     assert known.height_m.tolist() == [3.0]
-    assert recording.arrival_frames().tolist() == [1]
+    assert recording.arrivals == [1]
     assert recording.is_simulation
     assert not recording.warnings
 

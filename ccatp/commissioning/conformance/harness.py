@@ -233,6 +233,8 @@ class RawConnection:
             data = b""
         self.is_ended = self.is_ended or not data
         self.lines.extend(self._buffer.feed(data))
+        if self._buffer.error is not None:
+            raise self._buffer.error
 
     def end(self, ending: Ending) -> None:
         """End with FIN and go on reading (closing would send RST while something is unread), or close with RST."""

@@ -1,5 +1,6 @@
 """The simulated laser metrology."""
 
+import msgspec
 import numpy as np
 import pytest
 from scipy import stats
@@ -32,7 +33,10 @@ def test_noise_is_normal_with_the_configured_sigma_per_channel() -> None:
     sigmas_m = 1e-6 + 2.5e-7 * lengths_m
     etalon = model()
     draws = np.array(
-        [[r.length_mm * 1e-3 for r in etalon.records(CHANNELS, PUCK._replace(t_s=0.01 * k))] for k in range(500)]
+        [
+            [r.length_mm * 1e-3 for r in etalon.records(CHANNELS, msgspec.structs.replace(PUCK, t_s=0.01 * k))]
+            for k in range(500)
+        ]
     )
     normalised = ((draws - lengths_m) / sigmas_m).ravel()
     # Kolmogorov-Smirnov of 2000 draws; the seed is fixed, so this is a check of the code and not of luck.
@@ -46,10 +50,12 @@ def test_noise_belongs_to_seed_time_and_channel_and_to_nothing_else() -> None:
     first = model()
     reference = first.records(CHANNELS, PUCK)
     other = model()
-    other.records(CHANNELS, PUCK._replace(t_s=3.0))
+    other.records(CHANNELS, msgspec.structs.replace(PUCK, t_s=3.0))
     assert other.records(CHANNELS[::-1], PUCK) == reference[::-1]
-    assert first.records(CHANNELS[2:], PUCK._replace(t_s=PUCK.t_s + 4e-7)) == reference[2:]  # less than half a us
-    assert first.records(CHANNELS, PUCK._replace(t_s=PUCK.t_s + 1e-6)) != reference
+    assert (
+        first.records(CHANNELS[2:], msgspec.structs.replace(PUCK, t_s=PUCK.t_s + 4e-7)) == reference[2:]
+    )  # less than half a us
+    assert first.records(CHANNELS, msgspec.structs.replace(PUCK, t_s=PUCK.t_s + 1e-6)) != reference
     assert model(seed=2).records(CHANNELS, PUCK) != reference
 
 
@@ -74,7 +80,7 @@ def test_a_blocked_channel_has_no_length_no_light_and_beam_break() -> None:
 
 @pytest.mark.parametrize(("moved_m", "raised"), [(0.0, False), (1e-4, False), (1.01e-4, True), (float("nan"), True)])
 def test_a_puck_that_moved_further_than_the_tolerance_is_flagged_on_every_channel(moved_m: float, raised: bool) -> None:
-    records = model().records(CHANNELS, PUCK._replace(moved_m=moved_m))
+    records = model().records(CHANNELS, msgspec.structs.replace(PUCK, moved_m=moved_m))
     assert [record.motion_tolerance_error for record in records] == [int(raised)] * 4
 
 

@@ -11,10 +11,10 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, GravitySample, ImuSample, WheelSample
 from ccatp.filters import FILTERS, Smoother
 from ccatp.links.robot_messages import CommandEcho, Sensors
-from ccatp.links.topics import FixMessage
+from ccatp.links.topics import FixMessage, Rest
 from ccatp.localizer import build_localizer
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.records.run_reader import Event, Fixed, FixGiven, Marked, Message, Stood, fix_given, in_order
+from ccatp.records.run_reader import Event, Fixed, Marked, Message, in_order
 from ccatp.studies import replay as recording_filter
 from ccatp.studies.replay import RecordingFilter, added_noise, has_smoother, replay, transition_of_reset
 
@@ -178,8 +178,15 @@ def events_frame(seq: int) -> Sensors:
     return Sensors(seq, 0.01 * seq, [], [], [], None, (0.0, 0.0), 1.0, echo, [])
 
 
-def fix(t_s: float) -> Fix:
-    return Fix(t_s, (0.0, 0.0, 0.0), (1.0,) * 9, 1.0, (1, 2, 3), 0.0)
+def given(seq: int, t_s: float, is_fused: bool) -> FixMessage:
+    return FixMessage(
+        seq=seq, t_s=t_s, point=None, is_fused=is_fused, position_m=(1.0, 2.0, 3.0), covariance_m2=[0.5] * 9, dop=1.25,
+        residual_rms_m=1e-6, channels=[1, 4], jump_mm=0.0,
+    )  # fmt: skip
+
+
+def stood(seq: int) -> Rest:
+    return Rest(seq=seq, t_s=0.0)
 
 
 def names_of(messages: Sequence[Message]) -> list[str]:
@@ -192,7 +199,7 @@ def names_of(messages: Sequence[Message]) -> list[str]:
 
 
 FRAMES = [events_frame(seq) for seq in range(4)]
-GIVEN = FixGiven(1, fix(7.0), True)
+GIVEN = given(1, 7.0, True)
 
 
 @pytest.mark.parametrize(
@@ -200,19 +207,19 @@ GIVEN = FixGiven(1, fix(7.0), True)
     [
         pytest.param([GIVEN, *FRAMES], ["0", "1", "fix 7", "2", "3"], id="before the batch of its frame"),
         pytest.param([*FRAMES[:2], GIVEN, *FRAMES[2:]], ["0", "1", "fix 7", "2", "3"], id="between two batches"),
-        pytest.param([Stood(1), GIVEN, *FRAMES[:3]], ["0", "1 rests", "fix 7", "2"], id="a rest before the fix"),
+        pytest.param([stood(1), GIVEN, *FRAMES[:3]], ["0", "1 rests", "fix 7", "2"], id="a rest before the fix"),
         pytest.param(
-            [FixGiven(0, fix(1.0), False), FixGiven(0, fix(2.0), True), *FRAMES[:2]],
+            [given(0, 1.0, False), given(0, 2.0, True), *FRAMES[:2]],
             ["0", "fix 1 refused", "fix 2", "1"],
             id="fixes keep their order",
         ),
         pytest.param(
-            [*FRAMES[:2], FixGiven(1, fix(1.0), True), FixGiven(2, fix(2.0), True), Stood(2)],
+            [*FRAMES[:2], given(1, 1.0, True), given(2, 2.0, True), stood(2)],
             ["0", "1", "fix 1"],
             id="at the end only what belongs to a frame that is there",
         ),
         pytest.param(
-            [events_frame(0), FixGiven(3, fix(1.0), True), events_frame(7)],
+            [events_frame(0), given(3, 1.0, True), events_frame(7)],
             ["0", "fix 1", "7"],
             id="before the next frame where frames are missing",
         ),
@@ -223,16 +230,11 @@ def test_a_fix_comes_behind_its_frame(messages: Sequence[Message], wanted: list[
 
 
 def test_a_recorded_fix_is_the_fix_again() -> None:
-    message = FixMessage(
-        seq=5, t_s=1.5, point=None, is_fused=False, position_m=(1.0, 2.0, 3.0), covariance_m2=[0.5] * 9, dop=1.25,
-        residual_rms_m=1e-6, channels=[1, 4], jump_mm=0.0,
-    )  # fmt: skip
-    assert fix_given(message) == FixGiven(5, Fix(1.5, (1.0, 2.0, 3.0), (0.5,) * 9, 1.25, (1, 4), 1e-6), False)
-    assert list(in_order([events_frame(5), fix_given(message)]))[1] == Fixed(fix_given(message).fix, False)
+    message = given(5, 1.5, False)
+    fix = Fix(1.5, (1.0, 2.0, 3.0), (0.5,) * 9, 1.25, (1, 4), 1e-6)
+    assert list(in_order([events_frame(5), message]))[1] == Fixed(fix, False)
     message.is_set_aside = True
-    assert list(in_order([events_frame(5), fix_given(message)]))[1] == Fixed(
-        fix_given(message).fix, False, was_set_aside=True
-    )
+    assert list(in_order([events_frame(5), message]))[1] == Fixed(fix, False, was_set_aside=True)
 
 
 N = 4
