@@ -18,7 +18,6 @@ from zmq.utils.monitor import parse_monitor_message
 
 from ccatp.cli import main
 from ccatp.config.models import ObservatoryConfig
-from ccatp.core import EventCode
 from ccatp.daemon.command_handlers import ObservatoryServer
 from ccatp.danger import DangerMonitor
 from ccatp.errors import ConfigError
@@ -33,7 +32,7 @@ from ccatp.links.rpc import (
     request,
     turn_away,
 )
-from ccatp.safety.emergency_latch import EmergencyLatch
+from tests.contract.test_channels import Desk
 
 DEADLINE_S = 20.0
 ID = "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"
@@ -46,33 +45,12 @@ LOCKED_OUT = (
 )
 
 
-class Monitor:
-    """A latch and a robot that is held."""
-
-    def __init__(self) -> None:
-        self.latch = EmergencyLatch()
-        self.at_base_or_held = True
-
-    @property
-    def code(self) -> EventCode:
-        return EventCode.ABORTED if self.latch.is_latched else EventCode.NORMAL
-
-    def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
-        return self.latch.raise_emergency(kind, emergency_id, note)
-
-    def holds(self, emergency_id: str) -> bool:
-        return self.latch.holds(emergency_id)
-
-    def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
-        return self.latch.clear(emergency_id, at_base_or_held)
-
-
 @dataclass
 class Site:
     """A folder with keys, and what is served from it."""
 
     folder: Path
-    monitor: Monitor
+    monitor: Desk
     logged: list[dict[str, Any]]
     endpoint: str = ""
 
@@ -107,7 +85,7 @@ class Site:
 
 @pytest.fixture
 def site(tmp_path: Path) -> Site:
-    site = Site(tmp_path, Monitor(), [])
+    site = Site(tmp_path, Desk(), [])
     site.pair("server")
     site.enlist(observatory="clear", weather="raise")
     return site

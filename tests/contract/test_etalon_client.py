@@ -317,15 +317,6 @@ async def test_a_server_that_restarts_is_found_again(server: ScriptedServer) -> 
         assert_at(await client.measure(3.0, EXPECTED), PUCK)
 
 
-async def test_connecting_is_tried_as_often_as_configured(server: ScriptedServer) -> None:
-    await server.stop()
-    async with client_of(server.port, retries=2) as client:
-        with pytest.raises(EtalonUnreachable, match="is it running"):
-            await client.connect()
-        assert client.counts["retries"] == 2
-    await server.start()
-
-
 @pytest.mark.parametrize(
     "action", [lengths(channels=(1, 2)), lengths(server_error=1), b"junk\r\n", hang_up, lengths((9.0, 9.0, 9.0))]
 )
@@ -456,26 +447,6 @@ async def test_a_stream_whose_connection_is_lost_reports_it_first(server: Script
         with pytest.raises(EtalonUnreachable, match="server closed the connection in the push stream"):
             await stream_past_the_end_of(server, client)
     await server.start()
-
-
-async def test_measurements_of_the_stand_in_scatter_as_the_fix_says() -> None:
-    sim = SimEtalonConfig(
-        host="127.0.0.1", port=0, length_sigma_m=1e-6, length_sigma_per_m=2.5e-7, motion_tolerance_m=1e-4
-    )
-    puck = FixedPuck(PUCK, step_s=0.5)
-    standin = EtalonSimulator(sim, CHANNELS, COLLIMATORS, puck, np.random.default_rng(4), measuring_time_s=0.5)
-    port = await standin.start("127.0.0.1", 0)
-    nees = 0.0
-    async with client_of(port) as client:
-        for _ in range(100):
-            fix = await client.measure(0.0, EXPECTED)
-            error = np.array(fix.position_m) - PUCK
-            nees += float(error @ np.linalg.solve(np.array(fix.covariance_m2).reshape(3, 3), error))
-        async with client.stream() as pushed:
-            assert len((await anext(pushed)).records) == 8
-    await standin.close()
-    # 300 degrees of freedom: 99.9 % band of chi-squared.
-    assert 223.0 < nees < 388.0
 
 
 @pytest.mark.fault("E9")

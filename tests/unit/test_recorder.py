@@ -25,12 +25,10 @@ from ccatp.records.recorder import (
     recordings,
 )
 from ccatp.records.recording_repair import (
-    Condition,
     RecordingError,
     read_facts,
     recording_files,
     recover,
-    scan,
     strict_faults,
 )
 
@@ -161,14 +159,6 @@ def test_a_full_disk_ends_recording_with_one_report(path: Path, monkeypatch: pyt
     assert len(found) > 50  # of the 50 kB that went through
 
 
-def test_a_system_that_writes_in_small_pieces_loses_nothing(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real_write = os.write
-    monkeypatch.setattr(os, "write", lambda handle, data: real_write(handle, data[:1000]))
-    record(path, 300).close()
-    monkeypatch.undo()
-    assert len(list(iter_messages(path, on_damage=pytest.fail))) == 300
-
-
 def test_a_full_disk_at_close_is_reported_and_does_not_raise(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reports: list[str] = []
     made = record(path, 3, on_failure=reports.append)
@@ -281,13 +271,6 @@ def test_channels_of_a_lost_first_chunk_are_found_at_the_end(recorded: Path, tmp
     recorded.write_bytes(bytes(whole))
     saved = recover(recorded, tmp_path / "out.mcap")
     assert 500 < saved.messages < 600
-
-
-def test_a_recording_that_was_saved_is_saved_again_alike(recorded: Path, tmp_path: Path) -> None:
-    first = recover(recorded, tmp_path / "a.mcap")
-    second = recover(first.path, tmp_path / "b.mcap")
-    assert second.condition.is_complete
-    assert list(iter_messages(second.path)) == list(iter_messages(recorded))
 
 
 def test_files_of_a_run_directory(recorded: Path, tmp_path: Path) -> None:
@@ -423,11 +406,6 @@ def test_a_full_disk_while_nothing_comes_is_reported(tmp_path: Path, monkeypatch
         made.flush_if_due()
     assert not made.is_recording
     assert "No space left" in told[0]
-
-
-def test_a_scan_of_an_empty_file_finds_nothing(tmp_path: Path) -> None:
-    (tmp_path / "a").touch()
-    assert list(scan(tmp_path / "a", Condition())) == []
 
 
 def test_a_recording_that_is_being_written_is_not_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

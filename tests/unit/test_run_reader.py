@@ -34,7 +34,6 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.mirror.misalignment import PanelMisalignment
 from ccatp.records.recorder import Recorder
 from ccatp.records.run_reader import RunReadError, open_run, read_run
-from ccatp.records.store import read_survey
 from ccatp.studies import replay as player
 from tests.unit.aligning.conftest import exact_fix, load
 from tests.unit.run_folder import make_run, record_truth
@@ -280,12 +279,6 @@ def test_a_run_is_read(survey_dir: Path) -> None:
     assert (found.is_simulation, found.warnings) == (True, ())
 
 
-def test_nothing_is_written(survey_dir: Path) -> None:
-    before = {path.name: path.read_bytes() for path in survey_dir.iterdir()}
-    read_run(survey_dir, {})
-    assert {path.name: path.read_bytes() for path in survey_dir.iterdir()} == before
-
-
 def test_overrides_act(survey_dir: Path) -> None:
     assert read_run(survey_dir, {"robot.puck_height_m": 0.06}).cfg.robot.puck_height_m == 0.06
     with pytest.raises(ConfigError, match="puck_height"):
@@ -378,11 +371,6 @@ def test_what_is_no_run_is_refused_in_one_line(spoil: Callable[[Path], None], me
     assert caught.value.exit_status == 2
 
 
-def test_a_survey_of_another_mirror_is_refused(survey_dir: Path) -> None:
-    with pytest.raises(Exception, match="is a survey of fyst-m1, not of fyst-m2"):
-        read_survey(survey_dir / "mission.sqlite", "fyst-m2")
-
-
 def test_a_real_robot_has_no_truth(survey_dir: Path) -> None:
     (survey_dir / "telemetry.mcap").unlink()
     record_truth(survey_dir, {PANEL: LIES}, is_simulation=False)
@@ -404,16 +392,6 @@ def test_a_recording_that_does_not_tell_the_truth_is_no_hindrance(topic: str, su
     recorder.close()
     found = read_run(survey_dir, {})
     assert (found.injected, found.is_simulation) == (None, True)
-
-
-def test_only_the_beginning_of_a_recording_is_searched(survey_dir: Path) -> None:
-    # One made before the truth of the panels was recorded may hold hours of other messages.
-    (survey_dir / "telemetry.mcap").unlink()
-    recorder = Recorder(survey_dir / "telemetry.mcap", [("truth", {}), ("misalignment", {})], is_simulation=True)
-    recorder.write("truth", 1.0, b'{"seq":0,"t_s":0.0,"rows":[]}')
-    recorder.write("misalignment", 2.0, b'{"seq":0,"t_s":0.0,"panels":[[3,7,1e-5,0.0,0.0]]}')
-    recorder.close()
-    assert read_run(survey_dir, {}).injected is None
 
 
 def test_a_resumed_run_has_the_truth_of_its_sessions_where_it_is_one(survey_dir: Path) -> None:

@@ -204,19 +204,6 @@ async def test_a_black_hole_one_way_swallows_data_and_the_end() -> None:
         assert r.server.pieces == []
 
 
-async def test_a_black_hole_both_ways_swallows_both_and_a_reset_ends_it() -> None:
-    async with rig() as r:
-        reader, writer = await r.connect()
-        r.proxy.begin("black_hole", "both")
-        writer.write(TEXT)
-        r.server.writers[0].write(TEXT)
-        await passes(lambda: r.proxy.counts["black_hole"] == 2 * len(TEXT))
-        assert r.server.pieces == []
-        r.proxy.reset()
-        assert await rest(reader) == (b"", "RST")
-        await passes(lambda: not r.proxy.connections)
-
-
 async def test_a_stall_ends_in_one_burst() -> None:
     async with rig() as r:
         reader, writer = await r.connect()
@@ -232,32 +219,6 @@ async def test_a_stall_ends_in_one_burst() -> None:
         await r.server.until(lambda: r.server.text == TEXT)
         assert r.server.pieces == [TEXT]
         assert r.proxy.counts["stall"] >= 1
-
-
-async def test_a_delay_with_jitter_keeps_the_order_and_takes_its_time() -> None:
-    async with rig() as r:
-        _, writer = await r.connect()
-        r.proxy.begin("delay", "to_robot", delay_s=0.05, jitter_s=0.02)
-        clock = asyncio.get_running_loop().time
-        start_s = clock()
-        for line in LINES:
-            writer.write(line)
-            await writer.drain()
-            await asyncio.sleep(0)
-        await r.server.until(lambda: bool(r.server.pieces))
-        assert clock() - start_s >= 0.05
-        await r.server.until(lambda: r.server.text == TEXT)
-        assert r.proxy.counts["delay"] >= 1
-
-
-@pytest.mark.parametrize("size", [1, 7])
-async def test_fragments_are_the_same_bytes_in_many_writes(size: int) -> None:
-    async with rig() as r:
-        reader, _ = await r.connect()
-        r.proxy.begin("fragment", "to_client", write_bytes=size)
-        r.server.writers[0].write(TEXT)
-        assert await read(reader, len(TEXT)) == TEXT
-        assert r.proxy.counts["fragment"] == -(-len(TEXT) // size)
 
 
 async def test_a_flood_of_garbage_comes_between_whole_lines() -> None:

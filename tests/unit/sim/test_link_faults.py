@@ -158,24 +158,6 @@ async def test_in_lockstep_each_fault_that_makes_sense_there(kind: str, trigger:
     assert record["samples"] > 0
 
 
-async def test_a_reset_after_so_many_bytes_is_exact_to_the_line() -> None:
-    client, _ = await drive('[[link]]\ntype = "reset"\nafter_bytes = 3000', reached(100), lockstep=True)
-    shorter, _ = await drive('[[link]]\ntype = "reset"\nafter_bytes = 2000', reached(100), lockstep=True)
-    assert client.frames == list(range(len(client.frames)))
-    assert 0 < len(shorter.frames) < len(client.frames)
-
-
-@pytest.mark.parametrize("direction", ["to_client", "to_robot", "both"])
-async def test_a_fault_goes_the_way_that_it_names(direction: str) -> None:
-    plan = plan_of("duplicate", "at_s = 0.2", {"direction": direction, "every": 1})
-    client, log = await drive(plan, reached(60), lockstep=True)
-    frames = 0 if direction == "to_robot" else 20
-    drives = 0 if direction == "to_client" else 20
-    assert client.link.counts["repeated_frames"] == pytest.approx(frames, abs=2)
-    (record,) = log.of("injected")
-    assert record["samples"] == pytest.approx(frames + drives, abs=4)
-
-
 async def test_a_fault_that_never_began_says_so() -> None:
     client, log = await drive('[[link]]\ntype = "reset"\nat_s = 99.0', reached(20), lockstep=True)
     assert not client.lost

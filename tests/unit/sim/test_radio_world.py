@@ -142,10 +142,6 @@ def test_shadowing_stays_and_decorrelates_exponentially() -> None:
     assert np.mean(elsewhere * values[:, 0]) / 25.0 == pytest.approx(np.exp(-1.0), abs=0.17)
 
 
-def test_no_shadowing_is_nothing() -> None:
-    assert ShadowingField(0.0, 1.0, np.random.default_rng(0)).at((0.0, 0.0), (1.0, 1.0)) == 0.0
-
-
 def test_obstacles_are_seen_between_and_along_rays() -> None:
     here = TruePose(0.0, 0.0, 0.0)
     assert count_between((0.0, 0.0), (2.0, 0.1), [BALL]) == 1

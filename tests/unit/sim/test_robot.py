@@ -195,12 +195,6 @@ def test_on_an_overhang_thrust_below_the_floor_lets_it_fall(overhang: Config) ->
     assert frame(robot).cmd.held
 
 
-def test_without_overhang_fans_do_not_matter(config: Config, mirror: Mirror) -> None:
-    robot = boot(config, mirror)
-    drive(robot, 0.0, 0.0, 50)
-    assert not robot.world.is_fallen
-
-
 # -- configuration ----------------------------------------------------------------------------------------------------
 
 
@@ -444,24 +438,6 @@ def test_the_body_moves_by_the_true_wheels(config: Config, hard: Config, mirror:
         assert plant.turn_rad == pytest.approx((right_m - left_m) / world.wheels.base_m, rel=1e-9)
     drawn = boot(with_world(config, wheel_radius_sigma=0.005), mirror, seed).world
     assert (drawn.plant.right_scale, drawn.plant.left_scale) == drawn.wheels[1:3] != (1.0, 1.0)
-
-
-def test_wheels_slip_creep_and_shake_in_the_whole_robot(hard: Config, mirror: Mirror) -> None:
-    robot = boot(hard, mirror)
-    robot.join("controller")
-    plant = robot.world.plant
-    for k in range(100):
-        robot.drive(k, 3.0, 3.0)
-        robot.advance()
-    slip = 1.0 - plant.right_scale / robot.world.wheels.right_scale
-    assert -0.015 < slip < 0.075  # 1 to 5 per cent, and a walk of half a per cent, 5 sigma
-    assert plant.left_m != 0.0
-    assert plant.shake_rate_rad_s == 0.0  # no fans
-    robot.command_fans(0, 0.8, 0.8)
-    for k in range(100, 103):
-        robot.drive(k, 3.0, 3.0)
-        robot.advance()
-    assert plant.shake_rate_rad_s != 0.0
 
 
 def test_counted_rates_fit_the_line(hard: Config, mirror: Mirror) -> None:

@@ -17,7 +17,6 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.fault_injector import InjectionRecord, make_sensor_fault
 from ccatp.sim.fault_plan import (
     LINK_TYPES,
-    SIGNALS,
     TYPES,
     FaultPlan,
     Injected,
@@ -183,10 +182,6 @@ def record(robot: Robot) -> Injected:
     return found
 
 
-def test_the_tables_are_complete() -> None:
-    assert {signal for signal, types in TYPES.items() if "stuck" in types} == set(SIGNALS)
-
-
 def test_an_effect_that_is_none_is_refused() -> None:
     (drift,) = plan_of(signal="body", type="drift", speed_m_s=0.1).faults
     with pytest.raises(TypeError, match="no effect on readings: drift"):
@@ -296,14 +291,6 @@ def test_edge_sensors_read_the_panels_of_the_new_place(config: Config, mirror: M
     assert drive(robot, 0.0, 0.0, 0.52)[-1]["edge"][-1][1:] == [0, 0, 1, 1]
 
 
-def test_who_is_put_beyond_the_rim_falls(config: Config, mirror: Mirror) -> None:
-    robot = boot(config, mirror, signal="body", type="kidnap", dx_m=9.0, dy_m=0.0, dheading_rad=0.0)
-    drive(robot, 0.0, 0.0, 0.5)
-    assert not robot.world.is_fallen
-    drive(robot, 0.0, 0.0, 0.6)
-    assert robot.world.is_fallen
-
-
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_weak_fan_echoes_its_duty_and_lets_the_robot_fall_from_an_overhang(side: str) -> None:
     cfg = load_config(overrides={"run.mirror": "fyst-m2"})
@@ -340,13 +327,6 @@ def test_a_clock_that_wraps(config: Config, mirror: Mirror) -> None:
     assert record(robot).changed == 26
 
 
-def test_a_time_before_the_boot_is_taken_by_nobody(config: Config, mirror: Mirror) -> None:
-    robot = boot(config, mirror, signal="clock", type="jump", by_s=-5.0)
-    frames = drive(robot, 1.0, 1.0, 0.6)
-    assert frames[-1]["t"] < 0.0
-    assert robot.delivered is None
-
-
 def test_frames_that_are_lost(config: Config, mirror: Mirror) -> None:
     robot = boot(config, mirror, signal="frames", type="drop", every=3, for_s=0.3)
     numbers = [frame["seq"] for frame in drive(robot, 1.0, 1.0, 1.0)]
@@ -368,11 +348,6 @@ def test_frames_out_of_order(config: Config, mirror: Mirror) -> None:
     assert sorted(numbers) == list(range(1, 71))
     assert numbers[51:60] == [52, 54, 53, 55, 56, 58, 57, 59, 60]
     assert record(robot).changed == 2
-
-
-def test_a_frame_withheld_last_comes_after_the_end(config: Config, mirror: Mirror) -> None:
-    robot = boot(config, mirror, signal="frames", type="reorder", every=2, for_s=0.02)
-    assert [frame["seq"] for frame in drive(robot, 1.0, 1.0, 0.55)][48:] == [49, 50, 52, 51, 53, 54, 55]
 
 
 def test_names_that_the_robot_raises(config: Config, mirror: Mirror) -> None:

@@ -28,7 +28,6 @@ PLACES = {
 }
 FROM, UNTIL = 20, 60  # frames: the fault acts from 0.2 s to 0.6 s
 FRAMES = 80
-OUT = 1e9  # beyond every range of the wire
 
 
 @pytest.fixture(scope="module")
@@ -221,13 +220,6 @@ def test_stuck_without_a_value_repeats_the_last_reading(config: Config, mirror: 
     assert last != 0.0
 
 
-def test_stuck_from_the_boot_repeats_the_first_reading(config: Config, mirror: Mirror, sound: Drive) -> None:
-    drive = Drive(config, mirror, parse_plan('[[fault]]\nsignal = "soc"\ntype = "stuck"\nat_s = 0.0', "plan"))
-    assert {reading for _, reading in drive.readings("soc", 1, FRAMES - 1)} == {1.0}
-    plan = parse_plan('[[fault]]\nsignal = "imu_ax"\ntype = "stuck"\nat_s = 0.0', "plan")
-    assert len({reading for _, reading in Drive(config, mirror, plan).readings("imu_ax", 1, FRAMES - 1)}) == 1
-
-
 def test_an_intermittent_edge_sensor_reads_a_value(config: Config, mirror: Mirror) -> None:
     drive = Drive(config, mirror, plan_of("edge_rear_left", "intermittent", period_s=0.02, duty=0.5, value=0.0))
     found = drive.readings("edge_rear_left")
@@ -250,12 +242,6 @@ def test_old_samples_arrive_late_under_their_own_times_and_in_order(
             assert row[0] <= number / 100.0 - 0.1 + 1e-9
     if signal != "gravity":  # a frame holds one reading of gravity, the newest
         assert drive.readings(signal, 1, FRAMES - 1) == sound.readings(signal, 1, FRAMES - 1)
-
-
-@pytest.mark.parametrize("signal", ["fans", "soc"])
-def test_what_has_no_time_of_its_own_is_late_as_an_old_reading(config: Config, mirror: Mirror, signal: str) -> None:
-    plans = [plan_of(signal, "delayed", by_s=0.1, stamps=stamps) for stamps in ("old", "fresh")]
-    assert Drive(config, mirror, plans[0]).lines == Drive(config, mirror, plans[1]).lines
 
 
 def test_the_echo_of_the_fans_is_late(config: Config, mirror: Mirror) -> None:

@@ -1,7 +1,7 @@
 """What the simulated sensors read."""
 
 from itertools import product
-from math import acos, cos, floor, pi, sin, sqrt
+from math import acos, floor, pi, sqrt
 
 import numpy as np
 import pytest
@@ -60,15 +60,6 @@ def test_every_instant_falls_into_exactly_one_frame(hz: float, frame_hz: float) 
         found += times.times_s
     assert found == [n / hz for n in range(1, len(found) + 1)]
     assert len(found) == int(300 / frame_hz * hz + 1e-9)
-
-
-def test_boot_is_a_single_instant() -> None:
-    times = SampleTimes(1000.0, 100.0, 0.08)
-    times.enter(0)
-    assert (times.times_s, times.decays) == ([0.0], [1.0])
-    times.enter(1)
-    assert times.times_s == [n / 1000.0 for n in range(1, 11)]
-    assert len(times.decays) == 10
 
 
 # -- inertial unit, encoders, gravity ---------------------------------------------------------------------------------
@@ -155,15 +146,6 @@ def test_a_sensor_that_stops_over_a_gap_stays_off(mirror: Mirror) -> None:
         assert [reading[3:] for reading in readings] == [(1, 1), (1, 1)]
 
 
-def test_places_follow_the_robot(mirror: Mirror) -> None:
-    plant, edges = plant_at(mirror, DeckPose(0.1, 0.2, 0.5)), EdgeSensors(mirror, OFFSETS)
-    edges.place(plant)
-    for (x, y), (ox, oy) in zip(edges.places, OFFSETS, strict=True):
-        # The slope at this place shortens projections by less than 1 %.
-        assert x == pytest.approx(0.1 + ox * cos(0.5) - oy * sin(0.5), abs=1e-3)
-        assert y == pytest.approx(0.2 + ox * sin(0.5) + oy * cos(0.5), abs=1e-3)
-
-
 SIGMA_M = 2e-4
 
 
@@ -190,11 +172,6 @@ def test_edges_shift_by_their_sigma_each_for_itself(wide: Config) -> None:
     assert shifts.std(axis=0) == pytest.approx([SIGMA_M] * 4, rel=4.5 / sqrt(2 * n))
     assert np.abs(shifts.mean(axis=0)).max() < 4.5 * SIGMA_M / sqrt(n)
     assert np.abs(np.corrcoef(shifts.T)[np.triu_indices(4, 1)]).max() < 4.5 / sqrt(n)
-
-
-def test_the_same_seed_gives_the_same_edges(wide: Config) -> None:
-    assert (shifts_of(wide, 1) == shifts_of(wide, 1)).all()
-    assert (shifts_of(wide, 1) != shifts_of(wide, 2)).all()
 
 
 @pytest.mark.parametrize("sigma_m", [SIGMA_M, 2e-3])
@@ -345,18 +322,6 @@ def test_the_place_of_the_first_count_is_uniform(config: Config, mirror: Mirror)
         )
     assert set(passed) <= {0, 1}
     assert np.mean(passed) == pytest.approx(share, abs=4.5 * 0.5 / sqrt(1500))
-
-
-def test_counting_adds_no_white_noise(config: Config, mirror: Mirror) -> None:
-    found = []
-    for sigma in (0.0, 0.5):
-        world = world_of(config, encoder_counts_per_rev=COUNTS, encoder_sigma_rad_s=sigma)
-        plant, encoders = plant_on_deck(mirror), CountingEncoders(world, HZ, DT_S, np.random.default_rng(2))
-        times = SampleTimes(HZ, FRAME_HZ, LAG_S)
-        plant.step(0.0, DT_S, 3.0, 2.0)
-        times.enter(1)
-        found.append(encoders.read(plant, times))
-    assert found[0] == found[1]
 
 
 def test_noise_at_rest_is_that_in_motion(config: Config, mirror: Mirror) -> None:
