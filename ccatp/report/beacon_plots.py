@@ -5,7 +5,7 @@ The suffix of a file tells its format (PNG, PDF, SVG); PictureError: it cannot b
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,24 +14,14 @@ from scipy.special import stdtrit
 from ccatp.beacons.slam.evaluation import TrackEvaluation, aligned_beacons, truth_at
 from ccatp.beacons.slam.level_fix import LevelFix
 from ccatp.beacons.slam.path_loss import LevelPair, PathLossFit
-from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun, dead_reckoned
+from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun, dead_reckoned
 from ccatp.beacons.steering import Sugeno
 from ccatp.config.beacon_models import FuzzyConfig
 from ccatp.core import FloatArray
-from ccatp.report.plots import (
-    GRID,
-    INK,
-    QUIET,
-    add_legend,
-    dress,
-    ellipse_outline,
-    new_figure,
-    save_figure,
-)
+from ccatp.report.plots import GRID, INK, QUIET, add_legend, dress, ellipse_outline, new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
 
 _BLUE, _GOLD, _GREEN, _RED = "#0b3c5d", "#d08c00", "#1d9a8a", "#c0392b"
 _REGION = 0.9
@@ -45,8 +35,10 @@ def draw_path_loss(fit: PathLossFit, pairs: Sequence[LevelPair], name: str, out:
     grid = np.geomspace(distances.min() / 1.2, distances.max() * 1.2, 200)
     mean, scale = fit.predicted(grid)
     half = scale * float(stdtrit(fit.freedom, 0.975))
+    reference, exponent = fit.half_widths(0.95)
+    line = f"{fit.reference_dbm:.1f} ± {reference:.1f} dBm at 1 m, exponent {fit.exponent:.2f} ± {exponent:.2f}, "
     axes.fill_between(grid, mean - half, mean + half, color=_BLUE, alpha=0.12, linewidth=0, label="95 % of new places")
-    axes.plot(grid, mean, color=_BLUE, linewidth=1.6, label=_formula(fit))
+    axes.plot(grid, mean, color=_BLUE, linewidth=1.6, label=f"{line}spread {fit.sigma_db:.1f} dB")
     axes.plot(distances, levels, "o", color=_GOLD, markersize=4, markeredgecolor="white", label="readings")
     axes.set(xscale="log", xlabel="distance, m", ylabel="level, dBm", title=name)
     axes.xaxis.set_major_formatter("{x:g}")
@@ -73,8 +65,7 @@ def draw_fixes(
         axes.plot(*np.array(list(beacons_m.values())).T, "^", color=QUIET, markersize=5, label="beacons")
         axes.plot(*truth, "x", color=_RED, markersize=6, markeredgewidth=1.6, label="truth")
         axes.plot(*fix.position_m, "o", color=_GOLD, markersize=5, markeredgecolor="white", label="fix")
-        error_m = float(np.hypot(*(fix.position_m - truth)))
-        axes.set_title(f"{index}: {error_m:.2f} m")
+        axes.set_title(f"{index}: {float(np.hypot(*(fix.position_m - truth))):.2f} m")
         axes.set_aspect("equal")
         dress(axes)
     handles, labels = panels[0].get_legend_handles_labels()
@@ -88,52 +79,43 @@ def draw_fuzzy(cfg: FuzzyConfig, out: Path) -> None:
     sugeno = Sugeno(cfg)
     figure = new_figure(10.0, 4.6)
     layout = figure.add_gridspec(2, 2, width_ratios=(1.5, 1.0))
-    spans = [_span(cfg, name) for name in sugeno.inputs]
-    x, y = (np.linspace(*span, 121) for span in spans)
-    speed = np.array([[sugeno.evaluate((a, b)) for a in x.tolist()] for b in y.tolist()])
     axes = figure.add_subplot(layout[:, 0])
-    in_degrees = [name.endswith("_rad") for name in sugeno.inputs]
-    shown_x, shown_y = (np.degrees(v) if is_angle else v for v, is_angle in zip((x, y), in_degrees, strict=True))
+    x, y = (np.linspace(*_span(cfg, name), 121) for name in sugeno.inputs)
+    speed = np.array([[sugeno.evaluate((a, b)) for a in x.tolist()] for b in y.tolist()])
+    (shown_x, x_label), (shown_y, y_label) = map(_in_degrees, sugeno.inputs, (x, y))
     drawn = axes.contourf(shown_x, shown_y, speed, levels=np.linspace(speed.min(), speed.max(), 25), cmap="viridis")
     lines = axes.contour(shown_x, shown_y, speed, levels=6, colors="white", linewidths=0.6)
     axes.clabel(lines, fmt="%.2f", fontsize=7)
-    axes.set(xlabel=_label(sugeno.inputs[0]), ylabel=_label(sugeno.inputs[1]), title="speed, m/s")
+    axes.set(xlabel=x_label, ylabel=y_label, title="speed, m/s")
     figure.colorbar(drawn, ax=axes, format="%.2f")
-    for row, (name, span) in enumerate(zip(sugeno.inputs, spans, strict=True)):
+    for row, name in enumerate(sugeno.inputs):
         panel = figure.add_subplot(layout[row, 1])
-        values = np.linspace(*span, 200)
+        values = np.linspace(*_span(cfg, name), 200)
+        shown, label = _in_degrees(name, values)
         grades = np.array([sugeno.memberships(row, value) for value in values.tolist()])
         for index, term in enumerate(cfg.inputs[name].terms):
-            colour = (_BLUE, _GOLD, _GREEN, _RED, QUIET)[index % 5]
-            panel.plot(np.degrees(values) if in_degrees[row] else values, grades[:, index], color=colour, label=term)
-        panel.set(xlabel=_label(name), ylim=(-0.03, 1.08))
+            panel.plot(shown, grades[:, index], color=(_BLUE, _GOLD, _GREEN, _RED, QUIET)[index % 5], label=term)
+        panel.set(xlabel=label, ylim=(-0.03, 1.08))
         panel.legend(frameon=False, fontsize=8, loc="center right")
         dress(panel)
     axes.tick_params(labelsize=8, color=QUIET, labelcolor=INK)
     save_figure(figure, out)
 
 
-def _formula(fit: PathLossFit) -> str:
-    reference, exponent = fit.half_widths(0.95)
-    return (
-        f"{fit.reference_dbm:.1f} ± {reference:.1f} dBm at 1 m, exponent {fit.exponent:.2f} ± {exponent:.2f}, "
-        f"spread {fit.sigma_db:.1f} dB"
-    )
-
-
 def _span(cfg: FuzzyConfig, name: str) -> tuple[float, float]:
     """From nought to a quarter beyond the last corner that is not far away on purpose."""
-    corners = [corner for term in cfg.inputs[name].terms.values() for corner in term]
-    top = 1.25 * max(term[1] for term in cfg.inputs[name].terms.values())
-    return max(0.0, min(corners)), top
+    terms = cfg.inputs[name].terms.values()
+    return max(0.0, min(corner for term in terms for corner in term)), 1.25 * max(term[1] for term in terms)
 
 
-def _label(name: str) -> str:
+def _in_degrees(name: str, values: FloatArray) -> tuple[FloatArray, str]:
+    """An input as it is shown, and its name with its unit."""
     words = name.replace("_", " ")
-    return words.removesuffix(" rad") + ", deg" if name.endswith("_rad") else words.removesuffix(" m") + ", m"
+    if name.endswith("_rad"):
+        return np.degrees(values), words.removesuffix(" rad") + ", deg"
+    return values, words.removesuffix(" m") + ", m"
 
 
-FOUND, TRUE, DOUBT = "#0b3c5d", "#d08c00", "#c0392b"
 _CHI2_90 = 4.605  # of two degrees of freedom: the ellipse that holds nine of ten
 _LABELLED = 40  # motes up to which each has its name beside it
 _VISIBLE = 0.012  # of the width of the map: ellipses that are smaller are drawn larger, and the title says so
@@ -166,56 +148,20 @@ def draw_mote_map(picture: MapPicture, traces: Traces | None, out: Path) -> None
     """Draw a map, and beside it the errors where there are some."""
     figure = new_figure(11.0 if traces else 6.5, 6.5)
     panels = figure.subplots(1, 2 if traces else 1, squeeze=False)[0]
-    draw_places(panels[0], picture)
+    _draw_places(panels[0], picture)
     if traces is not None:
-        draw_traces(panels[1], traces)
+        _draw_traces(panels[1], traces)
+    for axes, columns in zip(panels, (3, 2), strict=False):
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=columns, frameon=False, fontsize=8)
+    dress(*panels)
     save_figure(figure, out)
 
 
-def draw_places(axes: "Axes", picture: MapPicture) -> None:
+def _draw_places(axes: "Axes", picture: MapPicture) -> None:
     """Motes, truth, measured pairs and the ellipses that hold nine of ten."""
-    places = picture.positions_m[:, :2]
+    d, places = picture.positions_m.shape[1], picture.positions_m[:, :2]
     for i, j in picture.pairs.tolist():
         axes.plot(*places[[i, j]].T, color=GRID, linewidth=0.8, zorder=1)
-    grown = _draw_ellipses(axes, picture)
-    if picture.true_m is not None:
-        axes.plot(*picture.true_m[:, :2].T, "o", color=TRUE, markersize=7, fillstyle="none", label="true", zorder=3)
-    axes.plot(*places.T, "x", color=FOUND, markersize=6, label="mapped", zorder=4)
-    if len(picture.doubtful):
-        doubtful = places[list(picture.doubtful)]
-        axes.plot(*doubtful.T, "s", color=DOUBT, markersize=11, fillstyle="none", label="may be elsewhere")
-    if len(picture.names) <= _LABELLED:
-        for name, place in zip(picture.names, places, strict=True):
-            axes.annotate(name, place, textcoords="offset points", xytext=(6, 5), fontsize=7, color=QUIET)
-    larger = f", ellipses {grown:g} times larger" if grown > 1.0 else ", 90 % ellipses"
-    axes.set_title(picture.title + larger, fontsize=10, color=INK)
-    axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
-    axes.margins(0.1)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=3, frameon=False, fontsize=8)
-    dress(axes)
-
-
-def draw_traces(axes: "Axes", traces: Traces, label: str = "", shade: str = FOUND) -> None:
-    """Median and the band from 10 to 90 %, what the filter expects, the bound."""
-    updates = np.arange(len(traces.middle_m))
-    axes.fill_between(updates, traces.low_m, traces.high_m, color=shade, alpha=0.18, linewidth=0)
-    axes.plot(updates, traces.middle_m, color=shade, linewidth=1.6, label=f"{label}error, median and 10 to 90 %")
-    expected = np.arange(len(traces.expected_m))
-    dashed: dict[str, Any] = {"linewidth": 1.0, "linestyle": "--", "label": f"{label}expected by the filter"}
-    axes.plot(expected, traces.expected_m, color=shade, **dashed)
-    if traces.bound_m is not None:
-        dotted: dict[str, Any] = {"linewidth": 0.9, "linestyle": ":", "label": f"{label}Cramér-Rao bound, all updates"}
-        axes.axhline(traces.bound_m, color=QUIET, **dotted)
-    axes.set_yscale("log")
-    axes.set(xlabel="updates", ylabel="root mean square error, m")
-    axes.set_title(f"{traces.runs} runs", fontsize=10, color=INK)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2, frameon=False, fontsize=8)
-    dress(axes)
-
-
-def _draw_ellipses(axes: "Axes", picture: MapPicture) -> float:
-    """By what factor, a power of ten, they are larger than they are."""
-    d, places = picture.positions_m.shape[1], picture.positions_m[:, :2]
     blocks = [picture.covariance_m2[row * d : row * d + 2, row * d : row * d + 2] for row in range(len(places))]
     outlines = [ellipse_outline(block, _CHI2_90**0.5) for block in blocks]
     typical = float(np.median([np.hypot(*outline.T).max() for outline in outlines]))
@@ -223,12 +169,35 @@ def _draw_ellipses(axes: "Axes", picture: MapPicture) -> float:
     while 0.0 < typical * grown < _VISIBLE * width and grown < 1e6:
         grown *= 10.0
     for place, outline in zip(places, outlines, strict=True):
-        axes.fill(*(place + grown * outline).T, facecolor=FOUND, alpha=0.18, edgecolor=FOUND, zorder=2)
-    return grown
+        axes.fill(*(place + grown * outline).T, facecolor=_BLUE, alpha=0.18, edgecolor=_BLUE, zorder=2)
+    if picture.true_m is not None:
+        axes.plot(*picture.true_m[:, :2].T, "o", color=_GOLD, markersize=7, fillstyle="none", label="true", zorder=3)
+    axes.plot(*places.T, "x", color=_BLUE, markersize=6, label="mapped", zorder=4)
+    if len(picture.doubtful):
+        doubtful = places[list(picture.doubtful)]
+        axes.plot(*doubtful.T, "s", color=_RED, markersize=11, fillstyle="none", label="may be elsewhere")
+    if len(picture.names) <= _LABELLED:
+        for name, place in zip(picture.names, places, strict=True):
+            axes.annotate(name, place, textcoords="offset points", xytext=(6, 5), fontsize=7, color=QUIET)
+    larger = f", ellipses {grown:g} times larger" if grown > 1.0 else ", 90 % ellipses"
+    axes.set_title(picture.title + larger, fontsize=10, color=INK)
+    axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    axes.margins(0.1)
 
 
-WIDTH_PX = 1800
-DPI = 180
+def _draw_traces(axes: "Axes", traces: Traces) -> None:
+    """Median and the band from 10 to 90 %, what the filter expects, the bound."""
+    updates, expected = np.arange(len(traces.middle_m)), np.arange(len(traces.expected_m))
+    axes.fill_between(updates, traces.low_m, traces.high_m, color=_BLUE, alpha=0.18, linewidth=0)
+    axes.plot(updates, traces.middle_m, color=_BLUE, linewidth=1.6, label="error, median and 10 to 90 %")
+    axes.plot(expected, traces.expected_m, "--", color=_BLUE, linewidth=1.0, label="expected by the filter")
+    if traces.bound_m is not None:
+        axes.axhline(traces.bound_m, color=QUIET, linewidth=0.9, linestyle=":", label="Cramér-Rao bound, all updates")
+    axes.set(xlabel="updates", ylabel="root mean square error, m", yscale="log")
+    axes.set_title(f"{traces.runs} runs", fontsize=10, color=INK)
+
+
+WIDTH_PX, DPI = 1800, 180
 SIGMAS = 3.0  # of the ellipses
 POSE_ELLIPSES = 24  # along the path
 _TRUTH, _PATH, _MAP, _RECKONED = "#8fa3b8", "#1d6fa5", "#d5703f", "#d9c9a8"
@@ -236,39 +205,49 @@ _TRUTH, _PATH, _MAP, _RECKONED = "#8fa3b8", "#1d6fa5", "#d5703f", "#d9c9a8"
 
 def draw_slam(run: RecordedRun, track: EstimatedPath, judged: TrackEvaluation, out: Path, title: str) -> None:
     """Draw a track, laid on the truth if there is one."""
-    beacons = aligned_beacons(track, judged.alignment)
+    beacons = {
+        name: (np.array((fix.x_m, fix.y_m)), ellipse_outline(fix.covariance, SIGMAS))
+        for name, fix in aligned_beacons(track, judged.alignment).items()
+    }
+    surveyed = np.array([run.beacon_truth_m[name] for name in beacons if name in run.beacon_truth_m]).reshape(-1, 2)
     path = judged.alignment.moved(track.poses[:, :2])
-    centre, half = _frame(run, path, beacons)
-    width = WIDTH_PX / DPI
+    # What is shown: path and beacons, wherever dead reckoning went.
+    points = np.vstack([path, surveyed, *(place + outline for place, outline in beacons.values())])
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre, half = 0.5 * (low + high), 0.5 * (high - low) + 0.06 * float((high - low).max()) + 1e-3
+    half[0] = max(half[0], half[1] / 1.1)  # no picture is much taller than wide,
+    half[1] = max(half[1], half[0] * 0.35)  # nor a stripe
     known = bool(np.isfinite(judged.errors_m).any())
-    heights = [(width - 0.8) * float(half[1] / half[0]), *([1.1] if known else [])]
-    figure = new_figure(width, sum(heights) + 1.8, DPI)
+    heights = [(WIDTH_PX / DPI - 0.8) * float(half[1] / half[0]), *([1.1] if known else [])]
+    figure = new_figure(WIDTH_PX / DPI, sum(heights) + 1.8, DPI)
     figure.suptitle(title, x=0.02, ha="left", fontsize=14, color=INK)
     panels = figure.subplots(len(heights), height_ratios=heights, squeeze=False)[:, 0]
     axes = panels[0]
-    axes.set_title(_figures(judged), loc="left", color=QUIET)
+    rms = {
+        "path {:.3f} m rms after one rigid alignment": judged.trajectory_rmse_m,
+        "beacons {:.3f} m rms": judged.beacon_rmse_m,
+    }
+    told = [text.format(rms_m) for text, rms_m in rms.items() if rms_m is not None]
+    axes.set_title("  ·  ".join(told) or "no truth to compare with", loc="left", color=QUIET)
     _draw_paths(axes, run, track, judged, path)
-    _draw_beacons(axes, run, beacons)
+    if surveyed.size:
+        axes.scatter(*surveyed.T, marker="x", s=46, linewidths=1.6, color=INK, zorder=6, label="surveyed beacon")
+    for k, (name, (place, outline)) in enumerate(beacons.items()):
+        label = "beacon, 3 sigma" if k == 0 else "_"
+        axes.plot(*place, "o", color=_MAP, markersize=4.5, zorder=7, label=label)
+        axes.plot(*(place + outline).T, color=_MAP, linewidth=1.0, zorder=5)
+        axes.annotate(name, place, xytext=(6, 5), textcoords="offset points", fontsize=8, color=INK, zorder=8)
     axes.set(xlim=(centre[0] - half[0], centre[0] + half[0]), ylim=(centre[1] - half[1], centre[1] + half[1]))
     axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     dress(*panels)
     add_legend(axes)
     if known:
-        _draw_error(panels[1], track, judged)
+        sigma, t = np.sqrt(np.trace(track.covariances[:, :2, :2], axis1=1, axis2=2)), track.times_s - track.times_s[0]
+        panels[1].fill_between(t, 0.0, SIGMAS * sigma, color=GRID, linewidth=0.0, label="3 sigma")
+        panels[1].plot(t, judged.errors_m, color=_PATH, linewidth=0.8, label="error")
+        top = 1.15 * max(float(np.nanmax(judged.errors_m)), 1e-6)
+        panels[1].set(xlim=(0.0, t[-1]), ylim=(0.0, top), xlabel="time, s", ylabel="error, m")
     save_figure(figure, out)
-
-
-def _frame(run: RecordedRun, path: FloatArray, beacons: dict[str, BeaconFix]) -> tuple[FloatArray, FloatArray]:
-    """Centre and half size of what is shown: path and beacons, wherever dead reckoning went."""
-    places = [(fix.x_m, fix.y_m) for fix in beacons.values()]
-    places += [run.beacon_truth_m[name] for name in beacons if name in run.beacon_truth_m]
-    outlines = [np.array((fix.x_m, fix.y_m)) + ellipse_outline(fix.covariance, SIGMAS) for fix in beacons.values()]
-    points = np.vstack([path, np.array(places).reshape(-1, 2), *outlines])
-    low, high = points.min(axis=0), points.max(axis=0)
-    half = 0.5 * (high - low) + 0.06 * float((high - low).max()) + 1e-3
-    half[0] = max(half[0], half[1] / 1.1)  # no picture is much taller than wide,
-    half[1] = max(half[1], half[0] * 0.35)  # nor a stripe
-    return 0.5 * (low + high), half
 
 
 def _draw_paths(
@@ -285,36 +264,3 @@ def _draw_paths(
         outline = place + ellipse_outline(covariance, SIGMAS)
         label = "3 sigma of the path" if k == 0 else "_"
         axes.plot(*outline.T, color=_PATH, linewidth=0.7, alpha=0.6, zorder=4, label=label)
-
-
-def _draw_beacons(axes: "Axes", run: RecordedRun, beacons: dict[str, BeaconFix]) -> None:
-    surveyed = np.array([run.beacon_truth_m[name] for name in beacons if name in run.beacon_truth_m]).reshape(-1, 2)
-    if surveyed.size:
-        x, y = surveyed.T
-        axes.scatter(x, y, marker="x", s=46, linewidths=1.6, color=INK, zorder=6, label="surveyed beacon")
-    for k, (name, fix) in enumerate(beacons.items()):
-        label = "beacon, 3 sigma" if k == 0 else "_"
-        axes.plot(fix.x_m, fix.y_m, "o", color=_MAP, markersize=4.5, zorder=7, label=label)
-        outline = np.array((fix.x_m, fix.y_m)) + ellipse_outline(fix.covariance, SIGMAS)
-        axes.plot(*outline.T, color=_MAP, linewidth=1.0, zorder=5)
-        axes.annotate(
-            name, (fix.x_m, fix.y_m), xytext=(6, 5), textcoords="offset points", fontsize=8, color=INK, zorder=8
-        )
-
-
-def _draw_error(axes: "Axes", track: EstimatedPath, judged: TrackEvaluation) -> None:
-    sigma = np.sqrt(np.trace(track.covariances[:, :2, :2], axis1=1, axis2=2))
-    t = track.times_s - track.times_s[0]
-    axes.fill_between(t, 0.0, SIGMAS * sigma, color=GRID, linewidth=0.0, label="3 sigma")
-    axes.plot(t, judged.errors_m, color=_PATH, linewidth=0.8, label="error")
-    top = float(np.nanmax(judged.errors_m))
-    axes.set(xlim=(0.0, t[-1]), ylim=(0.0, 1.15 * max(top, 1e-6)), xlabel="time, s", ylabel="error, m")
-
-
-def _figures(judged: TrackEvaluation) -> str:
-    parts = []
-    if judged.trajectory_rmse_m is not None:
-        parts.append(f"path {judged.trajectory_rmse_m:.3f} m rms after one rigid alignment")
-    if judged.beacon_rmse_m is not None:
-        parts.append(f"beacons {judged.beacon_rmse_m:.3f} m rms")
-    return "  ·  ".join(parts) or "no truth to compare with"

@@ -50,6 +50,11 @@ class PointVerdict(NamedTuple):
         """The first distance that is known."""
         return self.left_mm if self.first_mm is None else self.first_mm
 
+    def __str__(self) -> str:
+        distances = {"first": self.first_mm, "measured at": self.left_mm}
+        known = [f", {name} {mm:.2f} mm" for name, mm in distances.items() if mm is not None]
+        return f"{'/'.join(map(str, self.point))}: {self.grade}{''.join(known)}"
+
 
 def arrival_error_m(mirror: Mirror, point: PointId, puck_m: Vector3, puck_height_m: float) -> float:
     """Distance on the surface from the foot of a measured puck (world frame) to its measurement point, m."""

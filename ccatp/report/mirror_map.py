@@ -4,45 +4,28 @@ All are drawn on one ground (panels, rim, base), deck frame, x to the right.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil, cos, sin
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection, PatchCollection, PolyCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon, Rectangle
 
 from ccatp.core import FloatArray, StopKind
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import SurveyResult
 from ccatp.mirror.panel_alignment import PanelResult, adjuster_places, on_grid_m
+from ccatp.report import plots
 from ccatp.report.findings import Grade, PointVerdict, point_verdicts
-from ccatp.report.plots import (
-    BAD,
-    BELOW_TO_ABOVE,
-    INK,
-    PANEL,
-    PAPER,
-    PATH,
-    PX_PER_IN,
-    QUIET,
-    SEAM,
-    SERIES,
-    SMALL_TO_LARGE,
-    PictureError,
-    add_legend,
-    add_tooltips,
-    is_wide,
-    new_figure,
-    save_figure,
-)
+from ccatp.report.plots import BAD, INK, PANEL, PAPER, PATH, PX_PER_IN, QUIET, SEAM, PictureError, add_legend, is_wide
 from ccatp.report.record import WITHIN_MM, RunRecord, read_record
 from ccatp.survey.composition import SurveyPlan
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.figure import Figure
 
 MAP_WIDTH_PX, MAP_DPI = 1600, 160
 ALIGN_WIDTH_PX, ALIGN_DPI = 2400, 200
@@ -51,22 +34,26 @@ _MICRO = 1e6
 _CELLS_WIDE, _CELLS_NARROW = 12, 6  # along each side of a panel
 # A single far point must not make all others look alike.
 _USUAL_ERRORS_PERCENT, _USUAL_HEIGHTS_PERCENT = 98.0, 99.0
+_ERROR_COLOURS, _TIME_COLOURS, _HEIGHT_COLOURS = (
+    LinearSegmentedColormap.from_list(name, colours)
+    for name, colours in (
+        ("arrival error", plots.SMALL_TO_LARGE),
+        ("time", plots.SMALL_TO_LARGE),
+        ("deviation", plots.BELOW_TO_ABOVE),
+    )
+)
 
 
-def new_mirror_map(mirror: Mirror, width_px: float, title: str, subtitle: str | None = None) -> "tuple[Figure, Axes]":
+def new_mirror_map(mirror: Mirror, width_px: float, title: str, subtitle: str | None = None) -> Axes:
     """The ground of a map: panels, their rows and columns, and the rim; both axes in metres, to the same scale.
 
     The title is written above the map if there is a subtitle, which may be empty.
     """
-    from matplotlib.collections import PatchCollection  # noqa: PLC0415 - takes a second
-    from matplotlib.patches import Polygon, Rectangle  # noqa: PLC0415
-
     low, high = mirror.rim.vertices.min(axis=0) - _MARGIN_M, mirror.rim.vertices.max(axis=0) + _MARGIN_M
-    wide = is_wide(width_px)
-    width = width_px / PX_PER_IN
+    wide, width = is_wide(width_px), width_px / PX_PER_IN
     beside, below = (1.6, 0.9) if wide else (0.1, 1.3)
     map_height = (width - beside) * float((high[1] - low[1]) / (high[0] - low[0]))
-    figure = new_figure(width, map_height + below + (0.0 if subtitle is None else 0.6), PX_PER_IN)
+    figure = plots.new_figure(width, map_height + below + (0.0 if subtitle is None else 0.6), PX_PER_IN)
     figure.set_label(title)
     axes = figure.subplots()
     panels = mirror.panels.values()
@@ -88,10 +75,10 @@ def new_mirror_map(mirror: Mirror, width_px: float, title: str, subtitle: str | 
     if subtitle is not None:
         figure.suptitle(title, x=0.02, ha="left", fontsize=14, color=INK, parse_math=False)
         axes.set_title(subtitle, loc="left", fontsize=9, color=QUIET, parse_math=False)
-    return figure, axes
+    return axes
 
 
-def _draw_base(axes: "Axes", mirror: Mirror, width_px: float) -> None:
+def _draw_base(axes: Axes, mirror: Mirror, width_px: float) -> None:
     """Where the robot starts, and its heading."""
     base = mirror.base_pose
     ahead = {"dx": 0.18 * cos(base.heading_rad), "dy": 0.18 * sin(base.heading_rad)}
@@ -101,94 +88,65 @@ def _draw_base(axes: "Axes", mirror: Mirror, width_px: float) -> None:
     axes.plot(base.x_m, base.y_m, "o", color=INK, markersize=size, zorder=6, linestyle="", label="base")
 
 
-def _add_bar(axes: "Axes", drawn: "ScalarMappable", label: str, width_px: float, **look: Any) -> None:
-    """What the colours mean, beside the map or on a phone below it."""
-    figure = axes.get_figure()
-    place: dict[str, Any] = {"location": "right", "shrink": 0.6, "aspect": 40} if is_wide(width_px) else {
-        "location": "bottom", "aspect": 30,
-    }  # fmt: skip
-    bar = figure.colorbar(drawn, ax=axes, pad=0.01, **place, **look)  # type: ignore[union-attr]
+def _finished(axes: Axes, drawn: ScalarMappable, label: str, width_px: float, extend: str = "neither") -> Figure:
+    """With the legend, and what the colours mean beside the map or on a phone below it."""
+    place: dict[str, Any] = {"location": "bottom", "aspect": 30}
+    if is_wide(width_px):
+        place = {"location": "right", "shrink": 0.6, "aspect": 40}
+    bar = axes.figure.colorbar(drawn, ax=axes, pad=0.01, extend=extend, **place)
     bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=8, color=QUIET, labelcolor=INK)
     bar.set_label(label, fontsize=8.5, color=INK)
     if bar.solids is not None:
         bar.solids.set_rasterized(True)
+    return add_legend(axes)
 
 
 # -- path and arrivals ------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class MapPoint:
-    """A measurement point on the map, deck frame."""
-
-    x_m: float
-    y_m: float
-    error_mm: float | None = None  # arrival error; None where the point was not measured
-    is_skipped: bool = False  # given up, not merely still to come
-    has_failed: bool = False  # measured too far from its place
-    title: str = ""  # what a browser shows over it
-
-
 def run_map(
-    mirror: Mirror, path_m: FloatArray, points: Sequence[MapPoint], width_px: float, title: str,
-    subtitle: str | None = None, path_label: str = "driven path", error_label: str = "arrival error, mm",
-) -> "Figure":  # fmt: skip
-    """The driven path (deck frame, shape (n, 2), parted by NaN), and each point coloured by its arrival error."""
-    from matplotlib.cm import ScalarMappable  # noqa: PLC0415
-    from matplotlib.colors import LinearSegmentedColormap, Normalize  # noqa: PLC0415
+    mirror: Mirror, path_m: FloatArray, verdicts: Sequence[PointVerdict], width_px: float, title: str,
+    subtitle: str | None = None, path_label: str = "driven path", *, is_first: bool = False,
+) -> Figure:  # fmt: skip
+    """The driven path (deck frame, shape (n, 2), parted by NaN), and each point coloured by its arrival error.
 
+    That is what the laser saw when the point was measured; with ``is_first`` the distance at the first arrival.
+    """
     wide = is_wide(width_px)
-    figure, axes = new_mirror_map(mirror, width_px, title, subtitle)
+    axes = new_mirror_map(mirror, width_px, title, subtitle)
     if len(path_m):
         axes.plot(*path_m.T, color=PATH, linewidth=0.9 if wide else 0.6, zorder=3, label=path_label)
     _draw_base(axes, mirror, width_px)
-    measured = [point for point in points if point.error_mm is not None]
-    errors = np.array([point.error_mm for point in measured], dtype=np.float64)
+    measured = [one for one in verdicts if one.left_mm is not None]
+    errors = np.array([one.shown_mm if is_first else one.left_mm for one in measured], dtype=np.float64)
     usual, largest = np.percentile(errors, (_USUAL_ERRORS_PERCENT, 100)) if len(errors) else (1.0, 1.0)
     top = min(WITHIN_MM, max(0.1, ceil(usual * 10) / 10))
     size = 34.0 if wide else 8.0
-    failed = [point for point in measured if point.has_failed]
-    skipped = [point for point in points if point.is_skipped and point.error_mm is None]
-    to_come = [point for point in points if not point.is_skipped and point.error_mm is None]
-    colours = LinearSegmentedColormap.from_list("arrival error", SMALL_TO_LARGE)
-    looks: tuple[tuple[Sequence[MapPoint], dict[str, Any]], ...] = (
-        (failed, {"facecolors": PAPER, "edgecolors": BAD, "s": 2.4 * size, "label": f"beyond {WITHIN_MM:.0f} mm"}),
-        (skipped, {"marker": "x", "color": BAD, "s": 0.9 * size, "linewidths": 1.4, "label": "skipped"}),
-        (to_come, {"facecolors": PAPER, "edgecolors": QUIET, "s": 0.7 * size, "label": "not measured"}),
-        (measured, {"c": errors, "cmap": colours, "vmin": 0.0, "vmax": top, "s": size, "edgecolors": PAPER,
-                    "linewidths": 0.6 if wide else 0.3, "zorder": 5}),
-    )  # fmt: skip
-    for some, look in looks:
-        if not some:
-            continue
-        x, y = [point.x_m for point in some], [point.y_m for point in some]
-        dots = axes.scatter(x, y, **{"zorder": 4.5, **look})
-        if wide and some is not failed and all(point.title for point in some):
-            add_tooltips(dots, [point.title for point in some])
-    scale = ScalarMappable(Normalize(0.0, top), colours)
-    _add_bar(axes, scale, error_label, width_px, extend="max" if largest > top else "neither")
-    add_legend(axes)
-    return figure
+    looks: list[tuple[str, dict[str, Any]]] = [
+        (Grade.FAIL, {"facecolors": PAPER, "edgecolors": BAD, "s": 2.4 * size, "label": f"beyond {WITHIN_MM:.0f} mm"}),
+        (Grade.SKIPPED, {"marker": "x", "color": BAD, "s": 0.9 * size, "linewidths": 1.4, "label": "skipped"}),
+        (Grade.OPEN, {"facecolors": PAPER, "edgecolors": QUIET, "s": 0.7 * size, "label": "not measured"}),
+        ("measured", {"c": errors, "cmap": _ERROR_COLOURS, "vmin": 0.0, "vmax": top, "s": size, "edgecolors": PAPER,
+                      "linewidths": 0.6 if wide else 0.3, "zorder": 5}),
+    ]  # fmt: skip
+    for grade, look in looks:
+        some = measured if grade == "measured" else [one for one in verdicts if one.grade == grade]
+        if some:
+            dots = axes.scatter(*np.array([one.place_m for one in some]).T, **{"zorder": 4.5, **look})
+            if wide and grade != Grade.FAIL:
+                plots.add_tooltips(dots, [str(one) for one in some])
+    scale = ScalarMappable(Normalize(0.0, top), _ERROR_COLOURS)
+    label = "distance at first arrival, mm" if is_first else "arrival error, mm"
+    return _finished(axes, scale, label, width_px, extend="max" if largest > top else "neither")
 
 
-def path_figure(record: RunRecord, verdicts: Sequence[PointVerdict], width_px: float) -> "Figure":
+def path_figure(record: RunRecord, verdicts: Sequence[PointVerdict], width_px: float) -> Figure:
     """The map of a report: the path, and the distance of each first arrival."""
-    points = []
-    for verdict in verdicts:
-        parts = [f"{'/'.join(map(str, verdict.point))}: {verdict.grade}"]
-        if verdict.first_mm is not None:
-            parts.append(f"first {verdict.first_mm:.2f} mm")
-        if verdict.left_mm is not None:
-            parts.append(f"measured at {verdict.left_mm:.2f} mm")
-        error_mm = None if verdict.left_mm is None else verdict.shown_mm
-        is_skipped, has_failed = verdict.grade is Grade.SKIPPED, verdict.grade is Grade.FAIL
-        points.append(MapPoint(*verdict.place_m, error_mm, is_skipped, has_failed, ", ".join(parts)))
     label = "true path" if record.has_truth else "estimated path"
     title = f"{record.mirror.name}: path and arrival errors"
-    error_label = "distance at first arrival, mm"
     path_m = driven_path_m(record)
-    return run_map(record.mirror, path_m, points, width_px, title, path_label=label, error_label=error_label)
+    return run_map(record.mirror, path_m, verdicts, width_px, title, path_label=label, is_first=True)
 
 
 def driven_path_m(record: RunRecord) -> FloatArray:
@@ -200,14 +158,13 @@ def driven_path_m(record: RunRecord) -> FloatArray:
     return np.concatenate(pieces)
 
 
-def paths_figure(mirror: Mirror, records: Mapping[str, RunRecord], width_px: float) -> "Figure":
+def paths_figure(mirror: Mirror, records: Mapping[str, RunRecord], width_px: float) -> Figure:
     """The mirror with the paths of two runs, the later one above the earlier one."""
-    figure, axes = new_mirror_map(mirror, width_px, f"{mirror.name}: both paths")
-    for (name, record), colour, width in zip(records.items(), SERIES, (2.2, 0.8), strict=False):
+    axes = new_mirror_map(mirror, width_px, f"{mirror.name}: both paths")
+    for (name, record), colour, width in zip(records.items(), plots.SERIES, (2.2, 0.8), strict=False):
         axes.plot(*driven_path_m(record).T, color=colour, linewidth=width, zorder=3, label=name)
     _draw_base(axes, mirror, width_px)
-    add_legend(axes)
-    return figure
+    return add_legend(axes)
 
 
 def draw_from_run_dir(run_dir: Path, out: Path) -> None:
@@ -222,15 +179,14 @@ def draw_from_run_dir(run_dir: Path, out: Path) -> None:
     if record.points is None:
         reason = "; ".join(record.warnings) or "no mission.sqlite there, so no points to draw; was the run started?"
         raise PictureError(f"{run_dir}: {reason}")
-    save_figure(record_map(record, MAP_WIDTH_PX * PX_PER_IN / MAP_DPI), out, MAP_DPI)
+    plots.save_figure(record_map(record, MAP_WIDTH_PX * PX_PER_IN / MAP_DPI), out, MAP_DPI)
 
 
-def record_map(record: RunRecord, width_px: float) -> "Figure":
+def record_map(record: RunRecord, width_px: float) -> Figure:
     """The map of a run with its result in the title."""
     cfg, verdicts = record.cfg, point_verdicts(record)
-    points = [MapPoint(*one.place_m, one.left_mm, one.grade is Grade.SKIPPED) for one in verdicts]
-    errors = [point.error_mm for point in points if point.error_mm is not None]
-    title = f"{record.mirror.name}: {len(errors)} of {len(points)} points"
+    errors = [one.left_mm for one in verdicts if one.left_mm is not None]
+    title = f"{record.mirror.name}: {len(errors)} of {len(verdicts)} points"
     # A run that was killed has no summary.
     time_s = (record.summary or {}).get("mission_time_s")
     if time_s is not None:
@@ -238,39 +194,34 @@ def record_map(record: RunRecord, width_px: float) -> "Figure":
     where = [f"simulation, world {cfg.world.name}"] if record.is_simulation else []
     figures = [f"arrival error: mean {np.mean(errors):.2f} mm, largest {max(errors):.2f} mm"] if errors else []
     subtitle = "  ·  ".join([*where, f"seed {cfg.run.seed}", f"filter {cfg.run.filter}", *figures])
-    return run_map(record.mirror, driven_path_m(record), points, width_px, title, subtitle)
+    return run_map(record.mirror, driven_path_m(record), verdicts, width_px, title, subtitle)
 
 
 def draw_plan(mirror: Mirror, plan: SurveyPlan, out: Path) -> None:
     """Draw the route of a planned survey, coloured by the time at which the robot is there; PictureError as above."""
-    from matplotlib.collections import LineCollection  # noqa: PLC0415
-    from matplotlib.colors import LinearSegmentedColormap  # noqa: PLC0415
-
     width_px = MAP_WIDTH_PX * PX_PER_IN / MAP_DPI
     title = f"{mirror.name}: {len(plan.points) - len(plan.out_of_reach)} of {len(plan.points)} points"
-    subtitle = f"{plan.length_m:.0f} m, {plan.least_s / 60.0:.1f} min at least"
-    figure, axes = new_mirror_map(mirror, width_px, title, subtitle)
+    axes = new_mirror_map(mirror, width_px, title, f"{plan.length_m:.0f} m, {plan.least_s / 60.0:.1f} min at least")
     base = mirror.base_pose
     route = [(base.x_m, base.y_m), *((stop.x_m, stop.y_m) for stop in plan.stops)]
-    colours = LinearSegmentedColormap.from_list("time", SMALL_TO_LARGE)
-    lines = LineCollection([np.array(leg) for leg in pairwise(route)], cmap=colours, linewidths=1.4, zorder=3)
+    lines = LineCollection([np.array(leg) for leg in pairwise(route)], cmap=_TIME_COLOURS, linewidths=1.4, zorder=3)
     lines.set_array(np.array(plan.times_s) / 60.0)
     axes.add_collection(lines)
     _draw_base(axes, mirror, width_px)
-    measured = [(stop.x_m, stop.y_m) for stop in plan.stops if stop.kind is StopKind.MEASURE]
-    on_the_way = [(stop.x_m, stop.y_m) for stop in plan.stops if stop.kind is StopKind.VIA]
+    stops = {kind: [(s.x_m, s.y_m) for s in plan.stops if s.kind is kind] for kind in StopKind}
     out_of_reach = [mirror.point_on_deck(point) for point in plan.out_of_reach]
     looks: tuple[tuple[list[tuple[float, float]], dict[str, Any]], ...] = (
-        (measured, {"s": 14, "color": INK, "label": "measured"}),
-        (on_the_way, {"s": 12, "marker": "s", "facecolors": PAPER, "edgecolors": QUIET, "label": "on the way"}),
+        (stops[StopKind.MEASURE], {"s": 14, "color": INK, "label": "measured"}),
+        (
+            stops[StopKind.VIA],
+            {"s": 12, "marker": "s", "facecolors": PAPER, "edgecolors": QUIET, "label": "on the way"},
+        ),
         (out_of_reach, {"s": 36, "marker": "x", "color": BAD, "label": "out of reach"}),
     )
     for places, look in looks:
         if places:
             axes.scatter(*zip(*places, strict=True), zorder=4, **look)
-    _add_bar(axes, lines, "time, min", width_px)
-    add_legend(axes)
-    save_figure(figure, out, MAP_DPI)
+    plots.save_figure(_finished(axes, lines, "time, min", width_px), out, MAP_DPI)
 
 
 # -- surface ----------------------------------------------------------------------------------------------------------
@@ -283,41 +234,40 @@ PanelCells = tuple[FloatArray, FloatArray, FloatArray]
 def surface_figure(
     mirror: Mirror, panels: Sequence[PanelResult], title: str, width_px: float,
     scaled_as: Sequence[PanelResult] | None = None, subtitle: str | None = None, *, with_moves: bool = False,
-) -> "Figure":  # fmt: skip
+) -> Figure:  # fmt: skip
     """The deviation of the surface as fitted; dots, which vanish where the fit agrees, show what was measured.
 
     The colours span the panels of ``scaled_as``; ``with_moves`` writes the move of each vertical adjuster, um.
     """
     wide = is_wide(width_px)
-    figure, axes = new_mirror_map(mirror, width_px, title, subtitle)
+    axes = new_mirror_map(mirror, width_px, title, subtitle)
     spanned = panels if scaled_as is None else scaled_as
     cells = [on_grid_m(mirror, panel, _CELLS_WIDE if wide else _CELLS_NARROW) for panel in panels]
     drawn = _draw_cells(axes, cells, [panel.deviations.values_m[panel.is_kept] for panel in spanned])
     size = 20.0 if wide else 4.0
-    kept = [np.column_stack([p.deviations.deck_m, p.deviations.values_m * _MICRO])[p.is_kept] for p in panels]
-    if kept:
-        x, y, heights = np.concatenate(kept).T
-        colours: dict[str, Any] = {"c": heights, "cmap": drawn.cmap, "norm": drawn.norm}
-        look: dict[str, Any] = {"edgecolors": QUIET, "linewidths": 0.3, "zorder": 5, "label": "measured point"}
-        axes.scatter(x, y, s=size, **colours, **look)
-    outliers = [panel.deviations.deck_m[~panel.is_kept] for panel in panels if not panel.is_kept.all()]
-    if outliers:
-        x, y = np.concatenate(outliers).T
+    rows = [np.column_stack([p.deviations.deck_m, p.deviations.values_m * _MICRO, p.is_kept]) for p in panels]
+    points = np.concatenate(rows or [np.empty((0, 4))])
+    kept, outliers = points[points[:, 3] > 0.0], points[points[:, 3] == 0.0]
+    look: dict[str, Any] = {"cmap": drawn.cmap, "norm": drawn.norm, "edgecolors": QUIET, "linewidths": 0.3}
+    if len(kept):
+        axes.scatter(*kept.T[:2], s=size, c=kept[:, 2], zorder=5, label="measured point", **look)
+    if len(outliers):
         look = {"linewidths": 1.4, "zorder": 6, "label": "outlier, left out"}
-        axes.scatter(x, y, marker="x", color=BAD, s=1.5 * size, **look)
-    if with_moves:
-        for panel in panels:
-            _write_moves(axes, mirror, panel)
-    _add_bar(axes, drawn, "deviation along the normal, µm (> 0 towards the robot)", width_px, extend="both")
-    add_legend(axes)
-    return figure
+        axes.scatter(*outliers.T[:2], marker="x", color=BAD, s=1.5 * size, **look)
+    small: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 5.5, "color": INK, "zorder": 6}
+    for panel in panels if with_moves else ():
+        names, adjusters = adjuster_places(mirror, panel.panel)
+        for name, place, move in zip(names, adjusters.tolist(), panel.rigid.moves.values_m, strict=True):
+            deck_x, deck_y, _ = mirror.panel(panel.panel).to_deck((*place, 0.0))
+            axes.text(deck_x, deck_y - 0.025, f"{name} {_MICRO * move:+.0f}", **small)
+    return _finished(axes, drawn, "deviation along the normal, µm (> 0 towards the robot)", width_px, extend="both")
 
 
 def change_figure(
     mirror: Mirror, before: Sequence[PanelResult], after: Sequence[PanelResult], width_px: float
-) -> "Figure":
+) -> Figure:
     """What the later survey shows less the earlier one."""
-    figure, axes = new_mirror_map(mirror, width_px, f"{mirror.name}: change of the surface")
+    axes = new_mirror_map(mirror, width_px, f"{mirror.name}: change of the surface")
     earlier = {panel.panel: panel for panel in before}
     cells = []
     for panel in after:
@@ -325,14 +275,10 @@ def change_figure(
             x, y, later = on_grid_m(mirror, panel, _CELLS_NARROW)
             cells.append((x, y, later - on_grid_m(mirror, earlier[panel.panel], _CELLS_NARROW)[2]))
     drawn = _draw_cells(axes, cells, [values_m.ravel() for _, _, values_m in cells])
-    _add_bar(axes, drawn, "change along the normal, µm (> 0 towards the robot)", width_px, extend="both")
-    return figure
+    return _finished(axes, drawn, "change along the normal, µm (> 0 towards the robot)", width_px, extend="both")
 
 
-def _draw_cells(axes: "Axes", cells: Sequence[PanelCells], spanned_m: Sequence[FloatArray]) -> "ScalarMappable":
-    from matplotlib.collections import PolyCollection  # noqa: PLC0415
-    from matplotlib.colors import LinearSegmentedColormap, Normalize  # noqa: PLC0415
-
+def _draw_cells(axes: Axes, cells: Sequence[PanelCells], spanned_m: Sequence[FloatArray]) -> ScalarMappable:
     usual = float(np.percentile(np.abs(np.concatenate(spanned_m)), _USUAL_HEIGHTS_PERCENT)) * _MICRO if spanned_m else 1
     top = max(1.0, float(ceil(usual)))
     corners, values = [np.empty((0, 4, 2))], [np.empty(0)]
@@ -341,24 +287,14 @@ def _draw_cells(axes: "Axes", cells: Sequence[PanelCells], spanned_m: Sequence[F
         around = ((left, low), (right, low), (right, high), (left, high))
         corners.append(np.stack([np.column_stack([a.ravel(), b.ravel()]) for a, b in around], axis=1))
         values.append(found.ravel() * _MICRO)
-    colours = LinearSegmentedColormap.from_list("deviation", BELOW_TO_ABOVE)
     drawn = PolyCollection(
-        list(np.concatenate(corners)), array=np.concatenate(values), cmap=colours, norm=Normalize(-top, top),
+        list(np.concatenate(corners)), array=np.concatenate(values), cmap=_HEIGHT_COLOURS, norm=Normalize(-top, top),
         edgecolors="none", antialiased=False, rasterized=True, zorder=2,
     )  # fmt: skip
     axes.add_collection(drawn)
     seams = [np.array([(x[0], y[0]), (x[-1], y[0]), (x[-1], y[-1]), (x[0], y[-1])]) for x, y, _ in cells]
     axes.add_collection(PolyCollection(seams, facecolors="none", edgecolors=QUIET, linewidths=0.6, zorder=3))
     return drawn
-
-
-def _write_moves(axes: "Axes", mirror: Mirror, panel: PanelResult) -> None:
-    body = mirror.panel(panel.panel)
-    small: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 5.5, "color": INK, "zorder": 6}
-    names, adjusters = adjuster_places(mirror, panel.panel)
-    for name, place, move in zip(names, adjusters.tolist(), panel.rigid.moves.values_m, strict=True):
-        deck_x, deck_y, _ = body.to_deck((*place, 0.0))
-        axes.text(deck_x, deck_y - 0.025, f"{name} {_MICRO * move:+.0f}", **small)
 
 
 def draw_alignment(mirror: Mirror, result: SurveyResult, out: Path, title: str, subtitle: str = "") -> None:
@@ -370,4 +306,4 @@ def draw_alignment(mirror: Mirror, result: SurveyResult, out: Path, title: str, 
     note = "  ·  ".join(filter(None, (subtitle, moves)))
     width_px = ALIGN_WIDTH_PX * PX_PER_IN / ALIGN_DPI
     figure = surface_figure(mirror, result.panels, title, width_px, subtitle=note, with_moves=True)
-    save_figure(figure, out, ALIGN_DPI)
+    plots.save_figure(figure, out, ALIGN_DPI)

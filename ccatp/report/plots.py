@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -65,14 +65,24 @@ def dress(*panels: "Axes", grid: Literal["major", "both"] = "major") -> None:
             side.set_color(GRID)
 
 
-def new_plot(width_px: float, title: str, heights_px: tuple[float, float] = (370.0, 320.0)) -> "tuple[Figure, Axes]":
-    """A figure of a page with one plot, its height for a screen or for a phone; the title is its description."""
+def new_plot(width_px: float, title: str, heights_px: tuple[float, float] = (370.0, 320.0), log: str = "") -> "Axes":
+    """A figure of a page with one plot, its height for a screen or for a phone; the title is its description.
+
+    ``log`` names a logarithmic axis, x or y; it has plain numbers at the decades.
+    """
+    from matplotlib.ticker import NullFormatter  # noqa: PLC0415
+
     height_px = heights_px[0] if is_wide(width_px) else heights_px[1]
     figure = new_figure(width_px / PX_PER_IN, height_px / PX_PER_IN, PX_PER_IN)
     figure.set_label(title)
     axes = figure.subplots()
     dress(axes)
-    return figure, axes
+    if log:
+        axes.set(**{f"{log}scale": "log"})
+        axis = axes.xaxis if log == "x" else axes.yaxis
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
+    return axes
 
 
 def is_wide(width_px: float) -> bool:
@@ -80,27 +90,17 @@ def is_wide(width_px: float) -> bool:
     return width_px > NARROW
 
 
-def set_log_axis(axes: "Axes", which: Literal["x", "y"]) -> None:
-    """A logarithmic axis with plain numbers at the decades."""
-    from matplotlib.ticker import NullFormatter  # noqa: PLC0415
-
-    axes.set(**{f"{which}scale": "log"})
-    axis = axes.xaxis if which == "x" else axes.yaxis
-    axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter(NullFormatter())
-
-
-def add_legend(axes: "Axes") -> None:
-    """The labels of what is drawn, below the plot."""
-    figure = axes.get_figure()
+def add_legend(axes: "Axes") -> "Figure":
+    """The labels of what is drawn, below the plot; returns its figure, which is complete with that."""
+    figure = cast("Figure", axes.get_figure())
     handles, labels = axes.get_legend_handles_labels()
-    if figure is None or not handles:
-        return
     columns = min(len(labels), 5) if is_wide(figure.bbox.width / figure.dpi * PX_PER_IN) else 2
-    figure.legend(
-        handles, labels, ncols=columns, frameon=False, fontsize=8, labelcolor=INK, columnspacing=1.2,
-        handlelength=1.6, borderpad=0.2, loc="outside lower left",
-    )  # fmt: skip
+    if handles:
+        figure.legend(
+            handles, labels, ncols=columns, frameon=False, fontsize=8, labelcolor=INK, columnspacing=1.2,
+            handlelength=1.6, borderpad=0.2, loc="outside lower left",
+        )  # fmt: skip
+    return figure
 
 
 def add_tooltips(artist: "Artist", titles: Sequence[str]) -> None:

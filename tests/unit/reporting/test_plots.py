@@ -15,8 +15,8 @@ from ccatp.records.recorder import Recorder
 from ccatp.records.run_reader import RunReadError
 from ccatp.records.store import MissionStore, PlannedPoint
 from ccatp.report.figures import distribution_figure, error_figure, time_figure
-from ccatp.report.findings import ErrorSeries, TimeBreakdown, arrival_error_m
-from ccatp.report.mirror_map import MAP_WIDTH_PX, MapPoint, draw_from_run_dir, record_map, run_map
+from ccatp.report.findings import ErrorSeries, Grade, PointVerdict, TimeBreakdown, arrival_error_m
+from ccatp.report.mirror_map import MAP_WIDTH_PX, draw_from_run_dir, record_map, run_map
 from ccatp.report.plots import (
     NARROW,
     SVG,
@@ -32,17 +32,12 @@ from ccatp.report.plots import (
 )
 from ccatp.report.record import read_record
 
+PNG = b"\x89PNG\r\n\x1a\n"
+
 
 @pytest.fixture(scope="module")
 def mirror() -> Mirror:
     return build_mirror(load_config().mirror)
-
-
-def test_a_long_path_is_drawn_with_few_points() -> None:
-    figure, axes = new_plot(WIDE, "path")
-    t = np.linspace(0.0, 20.0, 100_001)
-    axes.plot(40.0 * t, np.sin(t))
-    assert len(svg_of(figure)) < 30_000
 
 
 def test_an_envelope() -> None:
@@ -66,11 +61,14 @@ def test_marks_on_one_pixel_are_one() -> None:
 
 @pytest.mark.parametrize("width_px", [WIDE, NARROW])
 def test_svg_is_alone_small_and_has_tooltips(width_px: float) -> None:
-    figure, axes = new_plot(width_px, 'a "picture"')
+    axes = new_plot(width_px, 'a "picture"')
     (marks,) = axes.plot([0.0, 1.0], [2.0, 3.0], "o", label="1 < 2")
+    t = np.linspace(0.0, 1.0, 100_001)
+    axes.plot(t, np.sin(20.0 * t))
     add_tooltips(marks, ["a < b", "c|d"])
-    add_legend(axes)
+    figure = add_legend(axes)
     text = svg_of(figure)
+    assert len(text) < 40_000
     root = ET.fromstring(text)
     assert (root.tag, root.get("aria-label"), root.get("role")) == (f"{{{SVG}}}svg", 'a "picture"', "img")
     assert root.get("width") is None
@@ -85,36 +83,38 @@ def test_svg_is_alone_small_and_has_tooltips(width_px: float) -> None:
     assert not {"metadata", "style"} & {element.tag.partition("}")[2] for element in root.iter()}
     assert svg_of(figure) == text
     assert ET.fromstring(svg_of(figure, is_file=True)).get("width") is not None
-
-
-def test_ids_of_two_figures_differ() -> None:
-    ids = []
-    for title in ("one", "two"):
-        figure, axes = new_plot(WIDE, title)
-        axes.plot([0.0, 1.0], [2.0, 3.0], "o")
-        ids.append({element.get("id") for element in ET.fromstring(svg_of(figure)).iter()} - {None})
-    assert not ids[0] & ids[1]
+    other = new_plot(width_px, "another")
+    other.plot([0.0, 1.0], [2.0, 3.0], "o")
+    others = {element.get("id") for element in ET.fromstring(svg_of(add_legend(other))).iter()}
+    assert not others.intersection(ids)
 
 
 def test_files(tmp_path: Path) -> None:
-    figure, axes = new_plot(WIDE, "title")
+    axes = new_plot(WIDE, "title")
     axes.plot([0.0, 1.0], [2.0, 3.0])
-    for suffix, start in ((".png", b"\x89PNG"), (".pdf", b"%PDF"), (".svg", b"<svg ")):
+    for suffix, start in ((".png", PNG), (".pdf", b"%PDF"), (".svg", b"<svg ")):
         one, other = tmp_path / f"one{suffix}", tmp_path / f"other{suffix}"
-        save_figure(figure, one)
-        save_figure(figure, other)
+        save_figure(add_legend(axes), one)
+        save_figure(add_legend(axes), other)
         assert one.read_bytes().startswith(start)
         assert one.read_bytes() == other.read_bytes()
         with pytest.raises(PictureError, match=rf"no/a\{suffix}: cannot be written: No such file or directory"):
-            save_figure(figure, tmp_path / "no" / f"a{suffix}")
+            save_figure(add_legend(axes), tmp_path / "no" / f"a{suffix}")
+
+
+POINTS = [PointId(5, 5, n) for n in range(1, 10)]
+
+
+def verdict(place_m: tuple[float, float], left_mm: float | None, grade: Grade, number: int = 1) -> PointVerdict:
+    return PointVerdict(POINTS[number - 1], place_m, None, left_mm, grade, "")
 
 
 def test_a_map_of_a_run_shows_what_it_is_given(mirror: Mirror) -> None:
     points = [
-        MapPoint(0.0, 0.0, 1.0, title="5/5/1: pass"),
-        MapPoint(0.5, 0.0, 55.0, has_failed=True, title="5/5/2: fail"),
-        MapPoint(0.0, 0.5, is_skipped=True, title="5/5/3: skipped"),
-        MapPoint(0.5, 0.5, title="5/5/4: not measured"),
+        verdict((0.0, 0.0), 1.0, Grade.GOOD, 1),
+        verdict((0.5, 0.0), 55.0, Grade.FAIL, 2),
+        verdict((0.0, 0.5), None, Grade.SKIPPED, 3),
+        verdict((0.5, 0.5), None, Grade.OPEN, 4),
     ]
     path_m = np.array([(0.0, 0.0), (0.5, 0.0), (np.nan, np.nan), (1.0, 1.0), (2.0, 1.0)])
     figure = run_map(mirror, path_m, points, WIDE, "title")
@@ -129,9 +129,12 @@ def test_a_map_of_a_run_shows_what_it_is_given(mirror: Mirror) -> None:
     low, high = mirror.rim.vertices.min(axis=0), mirror.rim.vertices.max(axis=0)
     assert axes.get_xlim()[0] < low[0] < high[0] < axes.get_xlim()[1]
     shown = {title.text for title in ET.fromstring(svg_of(figure)).iter(f"{{{SVG}}}title")}
-    assert shown == {point.title for point in points}
+    told = ("pass, measured at 1.00 mm", "fail, measured at 55.00 mm", "skipped", "not measured")
+    assert shown == {f"5/5/{number}: {text}" for number, text in enumerate(told, 1)}
     phone = ET.fromstring(svg_of(run_map(mirror, path_m, points, NARROW, "title")))
     assert not list(phone.iter(f"{{{SVG}}}title"))
+    for some in ([], [verdict((0.0, 0.0), 0.0, Grade.GOOD)]):
+        assert len(run_map(mirror, np.empty((0, 2)), some, WIDE, "title").axes) == 2
 
 
 def series(error_mm: float) -> ErrorSeries:
@@ -178,8 +181,6 @@ def test_a_distribution() -> None:
 
 # -- map of a run directory -------------------------------------------------------------------------------------------
 
-PNG = b"\x89PNG\r\n\x1a\n"
-POINTS = [PointId(5, 5, n) for n in range(1, 10)]
 HEIGHT_M = 0.05
 
 
@@ -187,10 +188,12 @@ def fix_at(mirror: Mirror, x: float, y: float) -> Fix:
     return Fix(1.0, mirror.puck_world(DeckPose(x, y, 0.0), HEIGHT_M), (0.0,) * 9, 1.0, (1, 2, 3, 4), 0.0)
 
 
-def make_run(run_dir: Path, mirror: Mirror) -> None:
+@pytest.fixture
+def run_dir(tmp_path: Path, mirror: Mirror) -> Path:
     """Four points measured 3-4-5 mm off, one skipped, the others to come; a path in two recordings."""
-    cfg = load_config()
-    (run_dir / "config.toml").write_text(dump_config(cfg))
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    (run_dir / "config.toml").write_text(dump_config(load_config()))
     planned = [PlannedPoint(point, 0.0, 0.0) for point in POINTS]
     path = run_dir / "mission.sqlite"
     with MissionStore.create(path, mirror=mirror.name, seed=1, config_toml="", points=planned) as store:
@@ -206,15 +209,15 @@ def make_run(run_dir: Path, mirror: Mirror) -> None:
             recorder.write(topic, 1.0, json.dumps({"seq": 2, "t_s": 1.0, "rows": rows}).encode())
         recorder.close()
     (run_dir / "summary.json").write_text('{"mission_time_s": 125.4}')
+    return run_dir
 
 
-def test_a_run_directory_becomes_a_png(tmp_path: Path, mirror: Mirror) -> None:
-    make_run(tmp_path, mirror)
-    draw_from_run_dir(tmp_path, tmp_path / "map.png")
-    content = (tmp_path / "map.png").read_bytes()
-    assert content.startswith(PNG)
-    assert int.from_bytes(content[16:20], "big") == MAP_WIDTH_PX
-    figure = record_map(read_record(tmp_path), WIDE)
+def test_a_run_directory_becomes_a_picture(run_dir: Path) -> None:
+    out = run_dir / "map.png"
+    draw_from_run_dir(run_dir, out)
+    assert out.read_bytes().startswith(PNG)
+    assert int.from_bytes(out.read_bytes()[16:20], "big") == MAP_WIDTH_PX
+    figure = record_map(read_record(run_dir), WIDE)
     axes = figure.axes[0]
     assert figure.get_label() == "fyst-m1: 4 of 9 points in 2 min 05 s"
     assert "simulation, world thesis  ·  seed 1  ·  filter ekf" in axes.get_title(loc="left")
@@ -226,22 +229,10 @@ def test_a_run_directory_becomes_a_png(tmp_path: Path, mirror: Mirror) -> None:
     assert (len(marks["skipped"]), len(marks["not measured"])) == (1, 4)  # type: ignore[arg-type]
     # the slope of the mirror's middle panel makes 5 mm longer by less than 1 %
     assert np.asarray(axes.collections[-1].get_array()) == pytest.approx([5.0] * 4, rel=0.01)
-
-
-def test_a_run_that_was_killed_is_drawn_too(tmp_path: Path, mirror: Mirror) -> None:
-    make_run(tmp_path, mirror)
-    for name in ("summary.json", "telemetry.mcap", "telemetry.1.mcap"):
-        (tmp_path / name).unlink()
-    draw_from_run_dir(tmp_path, tmp_path / "map.svg")
-    assert "fyst-m1" in (tmp_path / "map.svg").read_text() or (tmp_path / "map.svg").stat().st_size > 10_000
-
-
-def test_errors_far_out_and_no_points_at_all_are_drawn(tmp_path: Path, mirror: Mirror) -> None:
-    far = [MapPoint(0.0, 0.0, 55.0), MapPoint(0.1, 0.1, 0.0)]
-    for number, points in enumerate((far, [], [MapPoint(0.0, 0.0, 0.0)])):
-        out = tmp_path / f"{number}.png"
-        save_figure(run_map(mirror, np.empty((0, 2)), points, WIDE, "title"), out)
-        assert out.read_bytes().startswith(PNG)
+    for name in ("summary.json", "telemetry.mcap", "telemetry.1.mcap"):  # as after kill -9
+        (run_dir / name).unlink()
+    draw_from_run_dir(run_dir, run_dir / "map.svg")
+    assert "fyst-m1: 4 of 9 points<" in (run_dir / "map.svg").read_text()
 
 
 def test_arrival_error_is_the_distance_of_foot_and_point(mirror: Mirror) -> None:
@@ -254,14 +245,12 @@ def test_arrival_error_is_the_distance_of_foot_and_point(mirror: Mirror) -> None
     assert moved == pytest.approx(hypot(2e-3, rise), abs=1e-9)
 
 
-def test_what_cannot_be_drawn_is_said_in_one_line(tmp_path: Path, mirror: Mirror) -> None:
+def test_what_cannot_be_drawn_is_said_in_one_line(tmp_path: Path, run_dir: Path) -> None:
     with pytest.raises(RunReadError, match=r"no config\.toml there"):
         draw_from_run_dir(tmp_path, tmp_path / "map.png")
-    make_run(tmp_path, mirror)
-    with pytest.raises(PictureError, match="cannot be written"):
-        draw_from_run_dir(tmp_path, tmp_path / "nowhere" / "map.png")
-    with pytest.raises(PictureError, match="cannot be written"):
-        draw_from_run_dir(tmp_path, tmp_path / "map.what")
-    (tmp_path / "mission.sqlite").unlink()
+    for out in (tmp_path / "nowhere" / "map.png", tmp_path / "map.what"):
+        with pytest.raises(PictureError, match="cannot be written"):
+            draw_from_run_dir(run_dir, out)
+    (run_dir / "mission.sqlite").unlink()
     with pytest.raises(PictureError, match=r"no mission\.sqlite there"):
-        draw_from_run_dir(tmp_path, tmp_path / "map.png")
+        draw_from_run_dir(run_dir, tmp_path / "map.png")
