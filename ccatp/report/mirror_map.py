@@ -250,10 +250,10 @@ def surface_figure(
     kept, outliers = points[points[:, 3] > 0.0], points[points[:, 3] == 0.0]
     look: dict[str, Any] = {"cmap": drawn.cmap, "norm": drawn.norm, "edgecolors": QUIET, "linewidths": 0.3}
     if len(kept):
-        axes.scatter(*kept.T[:2], s=size, c=kept[:, 2], zorder=5, label="measured point", **look)
+        axes.scatter(kept[:, 0], kept[:, 1], s=size, c=kept[:, 2], zorder=5, label="measured point", **look)
     if len(outliers):
         look = {"linewidths": 1.4, "zorder": 6, "label": "outlier, left out"}
-        axes.scatter(*outliers.T[:2], marker="x", color=BAD, s=1.5 * size, **look)
+        axes.scatter(outliers[:, 0], outliers[:, 1], marker="x", color=BAD, s=1.5 * size, **look)
     small: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 5.5, "color": INK, "zorder": 6}
     for panel in panels if with_moves else ():
         names, adjusters = adjuster_places(mirror, panel.panel)

@@ -38,12 +38,13 @@ from ccatp.links.rpc import MAX_REPLY_BYTES
 from ccatp.report.dashboard.access import CommandRefusal, command_refusal, host_refusal
 from ccatp.report.dashboard.hub import StateBroadcaster
 
-Samples = Iterable[tuple[str, float | None]]
+Samples = Iterable[tuple[tuple[str, ...], float | None]]
 # Name, help, part of the state, value; left out while that part is not known.
 GAUGES: tuple[tuple[str, str, str, Callable[[Any], float | None]], ...] = (
     ("elapsed_seconds", "Of the mission, by the robot's clock.", "mission", lambda m: m["elapsed_s"]),
     ("remaining_seconds", "Estimated time to the end of the mission.", "mission", lambda m: m["eta_s"]),
     ("frame_lag_seconds", "Lateness of the last late frame.", "mission", lambda m: 1e-3 * m["worst_lateness_ms"]),
+    ("late_frames", "Frames that were served late.", "mission", lambda m: m["missed_deadlines"]),
     ("event_code", "Event code: 0 normal, 1 near the edge, 2 aborted.", "verdict", lambda v: v["code"]),
     ("severity", "Severity of the cause, 0 none to 6 fault.", "verdict", lambda v: v["severity"]),
     ("battery_charge_ratio", "Charge of the robot's battery, 0 to 1.", "robot", lambda r: r["charge"]),
@@ -53,6 +54,7 @@ GAUGES: tuple[tuple[str, str, str, Callable[[Any], float | None]], ...] = (
     ("robot_faults", "Faults that the robot reports.", "robot", lambda r: len(r["faults"])),
     ("position_sigma_meters", "Root of the summed variances of x and y.", "pose", lambda p: _sigma_m(*p.covariance_m2)),
 )  # fmt: skip
+COUNTERS = {"late_frames", "process_restarts"}
 POINT_COUNTS = {"planned": "total", "measured": "done", "skipped": "skipped"}
 
 
@@ -66,47 +68,38 @@ class StateCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """All metrics that have a value."""
-        return (metric for metric in self._all(self._state()) if metric.samples)
+        for name, text, labels, samples in self._families(self._state()):
+            kind = CounterMetricFamily if name in COUNTERS else GaugeMetricFamily
+            family = kind(f"ccatp_{name}", text, labels=labels)
+            for of_labels, value in samples:
+                if value is not None:
+                    family.add_metric(of_labels, float(value))
+            if family.samples:
+                yield family
 
-    def _all(self, state: Mapping[str, Any]) -> Iterator[Metric]:
-        info = GaugeMetricFamily("ccatp_info", "What runs.", labels=("mirror", "simulation", "version"))
-        info.add_metric((str(self._ground["title"]), str(state["is_sim"]).lower(), ccatp.__version__), 1.0)
-        yield info
-        up = not state["trouble"]
-        yield _gauge("up", "1 when both loops report and the robot sends frames.", [("", up)])
-        yield _gauge("dashboard_pages", "Open pages.", [("", self._pages())])
-        links = state["links"]
-        yield _gauge("link_up", "1 when that end reports.", [(link.name, link.is_well) for link in links], "link")
-        ages = [(link.name, link.age_s) for link in links]
-        yield _gauge("link_age_seconds", "Since the last message of that end.", ages, "link")
-        restarts = CounterMetricFamily(
-            "ccatp_process_restarts", "Restarts of a process that the dashboard has seen.", labels=("process",)
-        )
-        for process, count in state["restarts"].items():
-            restarts.add_metric((process,), count)
-        yield restarts
+    def _families(self, state: Mapping[str, Any]) -> Iterator[tuple[str, str, tuple[str, ...], Samples]]:
+        """Name, help, labels and samples of each metric."""
+        links, mission, robot = state["links"], state["mission"], state["robot"]
+        what = (str(self._ground["title"]), str(state["is_sim"]).lower(), ccatp.__version__)
+        yield "info", "What runs.", ("mirror", "simulation", "version"), [(what, 1.0)]
+        yield "up", "1 when both loops report and the robot sends frames.", (), [((), not state["trouble"])]
+        yield "dashboard_pages", "Open pages.", (), [((), self._pages())]
+        yield "link_up", "1 when that end reports.", ("link",), [((link.name,), link.is_well) for link in links]
+        ages = [((link.name,), link.age_s) for link in links]
+        yield "link_age_seconds", "Since the last message of that end.", ("link",), ages
+        restarts = [((process,), count) for process, count in state["restarts"].items()]
+        yield "process_restarts", "Restarts of a process that the dashboard has seen.", ("process",), restarts
         for name, text, part, value_of in GAUGES:
             if state[part] is not None:
-                yield _gauge(name, text, [("", value_of(state[part]))])
-        if (mission := state["mission"]) is not None:
-            states = [(known, known == mission["state"]) for known in self._ground["states"]]
-            yield _gauge("mission_state", "1 for the state of the mission.", states, "state")
-            counts = [(name, mission[key]) for name, key in POINT_COUNTS.items()]
-            yield _gauge("points", "Measurement points, or waypoints.", counts, "state")
-            yield CounterMetricFamily(
-                "ccatp_late_frames", "Frames that were served late.", value=mission["missed_deadlines"]
-            )
-        if (robot := state["robot"]) is not None:
-            fans = zip(("left", "right"), robot["fans"], strict=True)
-            yield _gauge("fan_duty_ratio", "Duty of the fans, as the robot echoes it, 0 to 1.", fans, "side")
-
-
-def _gauge(name: str, text: str, samples: Samples, label: str = "") -> Metric:
-    gauge = GaugeMetricFamily(f"ccatp_{name}", text, labels=(label,) if label else ())
-    for value_of_label, value in samples:
-        if value is not None:
-            gauge.add_metric((value_of_label,) if label else (), float(value))
-    return gauge
+                yield name, text, (), [((), value_of(state[part]))]
+        if mission is not None:
+            states = [((known,), known == mission["state"]) for known in self._ground["states"]]
+            yield "mission_state", "1 for the state of the mission.", ("state",), states
+            counts = [((name,), mission[key]) for name, key in POINT_COUNTS.items()]
+            yield "points", "Measurement points, or waypoints.", ("state",), counts
+        if robot is not None:
+            fans = [((side,), duty) for side, duty in zip(("left", "right"), robot["fans"], strict=True)]
+            yield "fan_duty_ratio", "Duty of the fans, as the robot echoes it, 0 to 1.", ("side",), fans
 
 
 def _sigma_m(xx: float, _xy: float, yy: float) -> float:
@@ -153,26 +146,20 @@ class CommandEndpoint:
         self._pending += 1
         try:
             async with asyncio.timeout(self._timeout_s):
-                return await self._exchange(command)
+                with self._context.socket(zmq.DEALER) as peer:
+                    peer.setsockopt(zmq.LINGER, 0)
+                    peer.setsockopt(zmq.MAXMSGSIZE, MAX_REPLY_BYTES)
+                    peer.connect(self._endpoint)
+                    await peer.send_multipart([b"", format_request(command)])
+                    *_, frame = await peer.recv_multipart()
+            reply = parse_reply(frame)
         except TimeoutError:
             return CommandRefusal(504, f"{command}: no answer from the main loop within {self._timeout_s:g} s")
-        finally:
-            self._pending -= 1
-
-    async def _exchange(self, command: OperatorCommand) -> CommandRefusal | None:
-        with self._context.socket(zmq.DEALER) as peer:
-            peer.setsockopt(zmq.LINGER, 0)
-            peer.setsockopt(zmq.MAXMSGSIZE, MAX_REPLY_BYTES)
-            peer.connect(self._endpoint)
-            await peer.send_multipart([b"", format_request(command)])
-            *_, frame = await peer.recv_multipart()
-        try:
-            reply = parse_reply(frame)
         except BadRequest as error:
             return CommandRefusal(502, f"{command}: the main loop answered with {error}")
-        if reply["ok"]:
-            return None
-        return CommandRefusal(409, f"{command}: {reply.get('error', 'refused')}")
+        finally:
+            self._pending -= 1
+        return None if reply["ok"] else CommandRefusal(409, f"{command}: {reply.get('error', 'refused')}")
 
 
 class HostCheckMiddleware:

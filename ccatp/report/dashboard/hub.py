@@ -3,7 +3,7 @@
 import asyncio
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 
 import msgspec
@@ -42,48 +42,40 @@ class BusReader:
         is_sim: bool,
         wants: Wants = SURVEY,
     ) -> None:
-        self._context, self._endpoint_of, self._view, self._is_sim = context, endpoint_of, view, is_sim
-        self._wants = wants
-        always = {"main": (*_OF_MAIN, *wants.main), "danger": _OF_DANGER}
-        self._always = {
-            name: Subscriber(context, [endpoint_of(name)], topics, is_watching=True, is_uncounted=True)
-            for name, topics in always.items()
+        self._context, self._endpoint_of, self._view = context, endpoint_of, view
+        # The main loop makes a display state only for counted subscribers; a run counts those of the verdict.
+        uncounted, watched = {"is_uncounted": True}, {"is_uncounted": True, "is_watching": True}
+        newest = {"keeps_newest": True}
+        # By whether they are read: publisher, topics, how.
+        self._rows: dict[str, list[tuple[str, tuple[str, ...], dict[str, bool]]]] = {
+            "always": [("main", (*_OF_MAIN, *wants.main), watched), ("danger", _OF_DANGER, watched)],
+            "levels": [("main", ("display_state",), newest), ("danger", ("verdict",), newest | uncounted)],
+            "track": [("main", (wants.track,), uncounted)],
         }
+        if is_sim:
+            self._rows["track"].append(("truth", (wants.truth,), uncounted))
         if is_sim and wants.once:
-            self._always["truth"] = self._subscribe("truth", *wants.once)
-        self._levels: list[Subscriber] = []
-        self._tracks: list[Subscriber] = []
+            self._rows["always"].append(("truth", wants.once, uncounted))
+        self._open: dict[str, dict[str, Subscriber]] = {name: {} for name in self._rows}
+        self._read("always", True)
 
     def read_levels(self, wanted: bool) -> None:
         """Subscribe to display state and verdict, of which only the newest counts, or end that."""
-        if wanted and not self._levels:
-            self._levels = [
-                # The main loop makes a display state only for counted subscribers; a run counts those of the verdict.
-                Subscriber(self._context, [self._endpoint_of("main")], ["display_state"], keeps_newest=True),
-                Subscriber(
-                    self._context, [self._endpoint_of("danger")], ["verdict"], keeps_newest=True, is_uncounted=True
-                ),
-            ]
-        elif not wanted and self._levels:
-            _close(self._levels)
+        if self._open["levels"] and not wanted:
             self._view.look_away()
+        self._read("levels", wanted)
 
     def read_track(self, wanted: bool) -> None:
         """Subscribe to the path as it is driven and, in simulation, the truth, or end that."""
         self._view.is_tracking = wanted
-        if wanted and not self._tracks:
-            self._tracks = [self._subscribe("main", self._wants.track)]
-            if self._is_sim:
-                self._tracks.append(self._subscribe("truth", self._wants.truth))
-        elif not wanted and self._tracks:
-            _close(self._tracks)
+        self._read("track", wanted)
 
     def drain(self, now_s: float) -> None:
         """Pass the received messages on to the view."""
-        for name, subscriber in self._always.items():
+        for name, subscriber in self._open["always"].items():
             if subscriber.is_cut:
                 self._view.links.cut(name, now_s)
-        for subscriber in (*self._always.values(), *self._levels, *self._tracks):
+        for subscriber in (one for group in self._open.values() for one in group.values()):
             for _ in range(MAX_MESSAGES):
                 received = subscriber.receive()
                 if received is None:
@@ -92,19 +84,18 @@ class BusReader:
 
     def close(self) -> None:
         """Close the sockets."""
-        for subscribers in (self._levels, self._tracks):
-            _close(subscribers)
-        for subscriber in self._always.values():
-            subscriber.close()
+        for name in self._rows:
+            self._read(name, False)
 
-    def _subscribe(self, publisher: str, *topics: str) -> Subscriber:
-        return Subscriber(self._context, [self._endpoint_of(publisher)], topics, is_uncounted=True)
-
-
-def _close(subscribers: list[Subscriber]) -> None:
-    for subscriber in subscribers:
-        subscriber.close()
-    subscribers.clear()
+    def _read(self, name: str, wanted: bool) -> None:
+        opened = self._open[name]
+        if wanted and not opened:
+            for publisher, topics, how in self._rows[name]:
+                opened[publisher] = Subscriber(self._context, [self._endpoint_of(publisher)], topics, **how)
+        elif not wanted:
+            for subscriber in opened.values():
+                subscriber.close()
+            opened.clear()
 
 
 # Of reading the bus while no page is open.
@@ -206,7 +197,9 @@ class StateBroadcaster:
                 continue
             # Missed ticks are dropped: a page shows the present.
             due_s = max(due_s + self._period_s, time.monotonic())
-            await _sleep_until(due_s, stop)
+            with suppress(TimeoutError):
+                async with asyncio.timeout(max(due_s - time.monotonic(), 0.0)):
+                    await stop.wait()
         self._is_over = True
         self.tick(is_last=True)
 
@@ -244,14 +237,6 @@ class StateBroadcaster:
             await asyncio.wait(waits, timeout=IDLE_PERIOD_S, return_when=asyncio.FIRST_COMPLETED)
             for wait in waits:
                 wait.cancel()
-
-
-async def _sleep_until(due_s: float, stop: asyncio.Event) -> None:
-    try:
-        async with asyncio.timeout(max(due_s - time.monotonic(), 0.0)):
-            await stop.wait()
-    except TimeoutError:
-        return
 
 
 def _event(name: str, data: dict[str, Any]) -> bytes:

@@ -145,8 +145,8 @@ class SurveyView(RunStateView):
             self._trail.add(x_m, y_m)
             self._take_estimate(row[0], row[1], x_m, y_m, row[7])
 
-    def _next_point(self) -> str:
+    def _next_point(self, status: MissionStatus) -> str:
         # On the way to a stop that is not a point the mission has none; then it is the first planned one.
-        if self.status is None or self.status.point or self.status.outcome or PLANNED not in self._states:
-            return super()._next_point()
+        if status.point or status.outcome or PLANNED not in self._states:
+            return status.point
         return point_name(self.points[self._states.index(PLANNED)])

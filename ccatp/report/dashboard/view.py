@@ -80,10 +80,7 @@ class Links:
 
     def losses(self, now_s: float) -> list[Loss]:
         """Lost links, the gravest first; none when the mission is over."""
-        if self.is_over:
-            return []
-        losses = [self._loss(name, now_s) for name in LOOPS]
-        return [loss for loss in (*losses, self._robot_loss(now_s)) if loss is not None]
+        return [] if self.is_over else [loss for _, loss in self._ends(now_s) if loss is not None]
 
     def trouble(self, now_s: float) -> str:
         """Why the run is not well, also while it starts; empty when it is well."""
@@ -94,49 +91,41 @@ class Links:
 
     def shown(self, now_s: float) -> list[LinkState]:
         """All links."""
-        links = []
-        for name in LOOPS:
-            presence, cut_s = self._presences.get(name), self._cut_s.get(name)
-            phase, since_s = ("no heartbeat yet", None) if presence is None else (presence.phase, presence.t_s)
-            if cut_s is not None:
-                phase, since_s = "gone", cut_s
-            is_well = presence is not None and self._loss(name, now_s) is None
-            links.append(LinkState(NAMES[name], phase, _age_s(since_s, now_s), is_well))
-        frame_s = self._frame_s()
-        is_well = frame_s is not None and self._robot_loss(now_s) is None and self._loss("main", now_s) is None
-        phase = "frames" if is_well else "no frame yet" if frame_s is None else "lost"
-        links.append(LinkState("robot", phase, _age_s(frame_s, now_s), is_well))
+        return [link for link, _ in self._ends(now_s)]
+
+    def _ends(self, now_s: float) -> list[tuple[LinkState, Loss | None]]:
+        """Each link, and how it is lost."""
+        ends = [self._loop(name, now_s) for name in LOOPS]
+        ends.append(self._robot(now_s, is_main_lost=ends[0][1] is not None))
         if self._has_laser:
             phase = "no fix yet" if self.fix_s is None else "last fix"
-            links.append(LinkState("laser", phase, _age_s(self.fix_s, now_s), True))
-        return links
+            ends.append((LinkState("laser", phase, _age_s(self.fix_s, now_s), True), None))
+        return ends
 
-    def _loss(self, name: str, now_s: float) -> Loss | None:
-        presence = self._presences.get(name)
-        if name in self._cut_s:
-            return Loss(f"the {NAMES[name]} is gone", now_s - self._cut_s[name])
-        if presence is None:
-            return None
-        age_s = now_s - presence.t_s
-        picture_age_s = 0.0 if name != "main" or self.picture_s is None else now_s - self.picture_s
-        if age_s > BY_NAME[f"heartbeat.{name}"].stale_after_s or picture_age_s > PICTURE_STALE_S:
-            return Loss(f"the {NAMES[name]} has not reported", max(age_s, picture_age_s))
-        return None
+    def _loop(self, name: str, now_s: float) -> tuple[LinkState, Loss | None]:
+        presence, cut_s, what, loss = self._presences.get(name), self._cut_s.get(name), f"the {NAMES[name]}", None
+        phase, since_s = ("no heartbeat yet", None) if presence is None else (presence.phase, presence.t_s)
+        if cut_s is not None:
+            phase, since_s, loss = "gone", cut_s, Loss(f"{what} is gone", now_s - cut_s)
+        elif presence is not None:
+            age_s = now_s - presence.t_s
+            picture_age_s = 0.0 if name != "main" or self.picture_s is None else now_s - self.picture_s
+            if age_s > BY_NAME[f"heartbeat.{name}"].stale_after_s or picture_age_s > PICTURE_STALE_S:
+                loss = Loss(f"{what} has not reported", max(age_s, picture_age_s))
+        is_well = presence is not None and loss is None
+        return LinkState(NAMES[name], phase, _age_s(since_s, now_s), is_well), loss
 
-    def _robot_loss(self, now_s: float) -> Loss | None:
-        main, frame_s = self._presences.get("main"), self._frame_s()
-        if main is None or self._loss("main", now_s) is not None:
-            return None
+    def _robot(self, now_s: float, *, is_main_lost: bool) -> tuple[LinkState, Loss | None]:
+        main, loss = self._presences.get("main"), None
+        frame_s = None if main is None or main.frame_age_s is None else main.t_s - main.frame_age_s
         age_s = 0.0 if frame_s is None else now_s - frame_s
-        if main.phase == "rejoining":
-            return Loss("the robot has been away", age_s)
-        if main.phase == "joined" and age_s > STATUS_STALE_S:
-            return Loss("the robot has sent no frame", age_s)
-        return None
-
-    def _frame_s(self) -> float | None:
-        main = self._presences.get("main")
-        return None if main is None or main.frame_age_s is None else main.t_s - main.frame_age_s
+        if main is not None and not is_main_lost and main.phase == "rejoining":
+            loss = Loss("the robot has been away", age_s)
+        elif main is not None and not is_main_lost and main.phase == "joined" and age_s > STATUS_STALE_S:
+            loss = Loss("the robot has sent no frame", age_s)
+        is_well = frame_s is not None and loss is None and not is_main_lost
+        phase = "frames" if is_well else "no frame yet" if frame_s is None else "lost"
+        return LinkState("robot", phase, _age_s(frame_s, now_s), is_well), loss
 
 
 def _age_s(since_s: float | None, now_s: float) -> float | None:
@@ -233,8 +222,7 @@ class TruthCompare:
     """Joins estimates with the simulated truth of the same frame; either may arrive first."""
 
     def __init__(self) -> None:
-        self._estimates: dict[int, tuple[float, float, float]] = {}
-        self._truths: dict[int, tuple[float, float, float]] = {}
+        self._waiting: tuple[dict[int, tuple[float, ...]], dict[int, tuple[float, ...]]] = ({}, {})
         self._worst: Second | None = None
 
     @staticmethod
@@ -244,28 +232,24 @@ class TruthCompare:
 
     def estimate(self, seq: int, x_m: float, y_m: float, sigma_m: float) -> Second | None:
         """Add the estimate after frame ``seq``, deck frame; returns the second that it completes."""
-        return self._join(seq, self._estimates, (x_m, y_m, sigma_m))
+        return self._join(seq, 0, (x_m, y_m, sigma_m))
 
     def truth(self, seq: int, t_s: float, x_m: float, y_m: float) -> Second | None:
         """Add the true position in frame ``seq``; returns the second that it completes."""
-        return self._join(seq, self._truths, (t_s, x_m, y_m)) if self.is_compared(seq) else None
+        return self._join(seq, 1, (t_s, x_m, y_m)) if self.is_compared(seq) else None
 
-    def _join(
-        self, seq: int, own: dict[int, tuple[float, float, float]], value: tuple[float, float, float]
-    ) -> Second | None:
+    def _join(self, seq: int, side: int, value: tuple[float, ...]) -> Second | None:
+        own = self._waiting[side]
         own[seq] = value
         if len(own) > WAITING:
             del own[next(iter(own))]
-        if seq not in self._estimates or seq not in self._truths:
+        if not all(seq in waiting for waiting in self._waiting):
             return None
-        x_m, y_m, sigma_m = self._estimates.pop(seq)
-        t_s, true_x_m, true_y_m = self._truths.pop(seq)
+        (x_m, y_m, sigma_m), (t_s, true_x_m, true_y_m) = (waiting.pop(seq) for waiting in self._waiting)
         here, before = Second(t_s, 1e3 * hypot(x_m - true_x_m, y_m - true_y_m), 3e3 * sigma_m), self._worst
-        if before is not None and int(t_s) == int(before.t_s):
-            self._worst = max(before, here, key=lambda second: second.error_mm)
-            return None
-        self._worst = here
-        return before
+        is_same = before is not None and int(t_s) == int(before.t_s)
+        self._worst = max(before, here, key=lambda second: second.error_mm) if before and is_same else here
+        return None if is_same else before
 
 
 # State of a point; arrived: the robot is at rest there.
@@ -349,9 +333,8 @@ class RunStateView:
             "path": self._trail.take_new(),
             "series": {name: new for name, series in self._series.items() if (new := series.take_new())},
             "log": self._lines.take_new(),
+            **({"shapes": self._shapes()} if self._is_scene_new else {}),
         }
-        if self._is_scene_new:
-            state["shapes"] = self._shapes()
         self._changed.clear()
         self._is_scene_new = False
         return state
@@ -389,10 +372,27 @@ class RunStateView:
         if second is not None:
             self._series["error"].add(round(second.t_s, 2), round(second.error_mm, 3), round(second.three_sigma_mm, 3))
 
-    def _next_point(self) -> str:
-        return "" if self.status is None else self.status.point
+    def _next_point(self, status: MissionStatus) -> str:
+        return status.point
 
     def _levels(self, now_s: float) -> dict[str, Any]:
+        """What is replaced as a whole; pose, mission and verdict with the fields of their messages."""
+
+        def is_stale(since_s: float) -> bool:
+            return now_s - since_s > STATUS_STALE_S and not self.links.is_over
+
+        mission: dict[str, Any] | None = None
+        if (status := self.status) is not None:
+            mission = msgspec.to_builtins(status) | {
+                "is_stale": is_stale(self._status_s),
+                "next_point": self._next_point(status),
+                "not_to_be_measured": sum(map(len, status.left_out.values())),
+            }
+        verdict: dict[str, Any] | None = None
+        if (v := self._verdict) is not None:
+            verdict = msgspec.to_builtins(v) | {"text": danger_text(v.cause, v.signal, v.value, v.limit)}
+            if isinstance(v, Verdict):
+                verdict["is_stale"] = is_stale(self._verdict_s)
         return {
             "tick": self._ticks,
             "is_sim": self._is_sim,
@@ -400,30 +400,11 @@ class RunStateView:
             "losses": self.links.losses(now_s),
             "links": self.links.shown(now_s),
             "restarts": self.links.restarts,
-            "mission": self._mission(now_s),
+            "mission": mission,
             "pose": self._picture,
-            "verdict": self._shown_verdict(now_s),
+            "verdict": verdict,
             "robot": self._robot(),
         }
-
-    def _mission(self, now_s: float) -> dict[str, Any] | None:
-        if self.status is None:
-            return None
-        shown: dict[str, Any] = msgspec.to_builtins(self.status)
-        shown["is_stale"] = now_s - self._status_s > STATUS_STALE_S and not self.links.is_over
-        shown["next_point"] = self._next_point()
-        shown["not_to_be_measured"] = sum(map(len, self.status.left_out.values()))
-        return shown
-
-    def _shown_verdict(self, now_s: float) -> dict[str, Any] | None:
-        v = self._verdict
-        if v is None:
-            return None
-        shown: dict[str, Any] = msgspec.to_builtins(v)
-        shown["text"] = danger_text(v.cause, v.signal, v.value, v.limit)
-        if isinstance(v, Verdict):
-            shown["is_stale"] = now_s - self._verdict_s > STATUS_STALE_S and not self.links.is_over
-        return shown
 
     def _robot(self) -> dict[str, Any] | None:
         s = self._sensors
@@ -440,5 +421,4 @@ class RunStateView:
         }
 
     def _shapes(self) -> list[Any]:
-        shapes: list[Any] = msgspec.to_builtins(self._scene.shapes) if self._scene is not None else []
-        return shapes
+        return [] if self._scene is None else [*msgspec.to_builtins(self._scene.shapes)]
