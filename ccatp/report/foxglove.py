@@ -19,7 +19,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import cos, hypot, sin
 from types import GenericAlias
-from typing import Any, NamedTuple, NotRequired, TypedDict
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -28,17 +28,9 @@ from scipy.spatial.transform import Rotation
 
 from ccatp.core import DeckPose, PanelId, PanelPose, PointId, wrap_pi
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.links.topics import (
-    TOPICS,
-    EstimateMessage,
-    FixMessage,
-    LogMessage,
-    Message,
-    SensorLines,
-    TrackMessage,
-    TruthMessage,
-    schema_of,
-)
+from ccatp.links import topics
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import FixMessage, Message, TrackMessage, TruthMessage
 from ccatp.mirror.mirror import Mirror, deck_poses
 
 LOOP = 1  # of LinePrimitive.type
@@ -46,17 +38,19 @@ LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
 _NS = 1_000_000_000
 
 
-def _message(title: str, /, **fields: Any) -> Any:
-    return msgspec.defstruct(title, [(name, *_field(kind)) for name, kind in fields.items()], frozen=True)
+def _message(title: str, doc: str | None = None, /, **fields: Any) -> Any:
+    """A message type; a field is a type, an array of a type (written as a list of it), or one of these and its default.
+
+    ``doc`` is the description in its schema.
+    """
+    rows = []
+    for name, field in fields.items():
+        kind, *default = field if isinstance(field, tuple) else (field,)
+        rows.append((name, GenericAlias(list, tuple(kind)) if isinstance(kind, list) else kind, *default))
+    return msgspec.defstruct(title, rows, frozen=True, namespace={"__doc__": doc})
 
 
-def _field(kind: Any) -> tuple[Any, ...]:
-    if isinstance(kind, tuple):
-        return *_field(kind[0]), kind[1]
-    return (GenericAlias(list, tuple(kind)) if isinstance(kind, list) else kind,)
-
-
-# Lengths in m, colours 0 to 1. A field is a type, an array of a type, or one of these and its default.
+# Lengths in m, colours 0 to 1.
 Time = _message("Time", sec=int, nsec=int)
 Vector = _message("Vector3", x=float, y=float, z=float)
 Quaternion = _message("Quaternion", x=float, y=float, z=float, w=float)
@@ -107,23 +101,21 @@ CHORDS = 8
 
 def panel_scene(mirror: Mirror, timestamp: Any) -> Any:
     """Every panel's outline and label, and the rim, deck frame."""
+
+    def outline(places: Iterable[Sequence[float]], pixels: float, colour: Any) -> Any:
+        return LinePrimitive(LOOP, ORIGIN, pixels, True, [_on_surface(mirror, x, y) for x, y in places], colour)
+
     entities = []
     for panel, own in mirror.panels.items():
         name = f"{panel.row}-{panel.col}"
         sides = ((-1, -1), (1, -1), (1, 1), (-1, 1))
         corners = np.array([(own.x_m + sx * own.half_x_m, own.y_m + sy * own.half_y_m) for sx, sy in sides])
-        ends = np.roll(corners, -1, axis=0)
-        edge = [
-            _on_surface(mirror, *(a + i / CHORDS * (b - a)).tolist())
-            for a, b in zip(corners, ends, strict=True)
-            for i in range(CHORDS)
-        ]
-        outline = LinePrimitive(LOOP, ORIGIN, EDGE_PIXELS, True, edge, GREY)
+        ends = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+        edge = outline([(a + i / CHORDS * (b - a)).tolist() for a, b in ends for i in range(CHORDS)], EDGE_PIXELS, GREY)
         label = TextPrimitive(Pose(Vector(*own.origin), UPRIGHT), True, LABEL_M, False, DARK, name)
-        entities.append(SceneEntity(timestamp, DECK, f"panel {name}", False, lines=(outline,), texts=(label,)))
-    rim = [_on_surface(mirror, float(x), float(y)) for x, y in mirror.rim.vertices]
-    outline = LinePrimitive(LOOP, ORIGIN, RIM_PIXELS, True, rim, RED)
-    return SceneUpdate((), (*entities, SceneEntity(timestamp, DECK, "rim", False, lines=(outline,))))
+        entities.append(SceneEntity(timestamp, DECK, f"panel {name}", False, lines=(edge,), texts=(label,)))
+    rim = outline(mirror.rim.vertices.tolist(), RIM_PIXELS, RED)
+    return SceneUpdate((), (*entities, SceneEntity(timestamp, DECK, "rim", False, lines=(rim,))))
 
 
 def point_scene(mirror: Mirror, panels: Iterable[PanelId], deviations_m: dict[PointId, float], timestamp: Any) -> Any:
@@ -175,13 +167,12 @@ def _resolved(node: Any, definitions: Mapping[str, Any]) -> Any:
     if "$ref" in node:
         return _resolved(definitions[str(node["$ref"]).rpartition("/")[2]], definitions)
     found = {key: _resolved(value, definitions) for key, value in node.items() if key not in ("$defs", "title")}
-    return _split(found) if found.get("type") == "object" and "properties" in found else found
-
-
-def _split(schema: dict[str, Any]) -> dict[str, Any]:
-    plain = {name: value for name, value in schema["properties"].items() if _is_plain(value)}
-    others = {f"^{name}$": value for name, value in schema["properties"].items() if name not in plain}
-    return {**schema, "properties": plain, **({"patternProperties": others} if others else {})}
+    if found.get("type") == "object" and "properties" in found:
+        fields = found["properties"]
+        found["properties"] = {name: value for name, value in fields.items() if _is_plain(value)}
+        if others := {f"^{name}$": value for name, value in fields.items() if not _is_plain(value)}:
+            found["patternProperties"] = others
+    return found
 
 
 def _is_plain(schema: Mapping[str, Any]) -> bool:
@@ -201,47 +192,24 @@ POINTS_AGAIN_S = 60.0
 _KEPT = 1000
 
 
-class RobotView(msgspec.Struct, frozen=True):
-    """Scalars to plot, of every tenth frame: the estimate on the deck, and the frame's own values."""
-
-    t_s: float
-    seq: int
-    x_m: float
-    y_m: float
-    heading_rad: float
-    sigma_m: float
-
-
-class SensorView(TypedDict):
-    """Scalars to plot, of every tenth frame: the newest sample of each sensor; what is not known is left out."""
-
-    t_s: float
-    seq: int
-    wheel_right_rad_s: NotRequired[float]
-    wheel_left_rad_s: NotRequired[float]
-    acceleration_m_s2: NotRequired[float]
-    yaw_rate_rad_s: NotRequired[float]
-    edge_front_left: NotRequired[int]
-    edge_front_right: NotRequired[int]
-    edge_rear_left: NotRequired[int]
-    edge_rear_right: NotRequired[int]
-    fan_left: float
-    fan_right: float
-    battery: float
-    drive_age_s: NotRequired[float]
-    permit_age_s: NotRequired[float]
-    held: bool
-
-
-class ErrorView(msgspec.Struct, frozen=True):
-    """Estimate against the simulated truth, every tenth frame (simulation only); along and across the true heading."""
-
-    t_s: float
-    seq: int
-    position_mm: float
-    along_mm: float
-    across_mm: float
-    heading_mrad: float
+_NUMBER, _INT = (float | msgspec.UnsetType, msgspec.UNSET), (int | msgspec.UnsetType, msgspec.UNSET)
+RobotView = _message(
+    "Robot",
+    "Scalars to plot, of every tenth frame: the estimate on the deck, and the frame's own values.",
+    t_s=float, seq=int, x_m=float, y_m=float, heading_rad=float, sigma_m=float,
+)  # fmt: skip
+SensorView = _message(
+    "Sensors",
+    "Scalars to plot, of every tenth frame: the newest sample of each sensor; what is not known is left out.",
+    t_s=float, seq=int, fan_left=float, fan_right=float, battery=float, held=bool,
+    **dict.fromkeys((*WHEELS, *INERTIAL), _NUMBER), **dict.fromkeys(EDGES, _INT),
+    drive_age_s=_NUMBER, permit_age_s=_NUMBER,
+)  # fmt: skip
+ErrorView = _message(
+    "Error",
+    "Estimate against the simulated truth, every tenth frame (simulation only); along and across the true heading.",
+    t_s=float, seq=int, position_mm=float, along_mm=float, across_mm=float, heading_mrad=float,
+)  # fmt: skip
 
 
 class TopicView(NamedTuple):
@@ -276,31 +244,13 @@ VIEWS = (
 _encode = msgspec.json.Encoder().encode
 
 
-class _Echo(msgspec.Struct):
-    age: float | None = None
-    permit_age: float | None = None
-    held: bool = False
-
-
-class _Line(msgspec.Struct):
-    """The published part of a sensors line; a line without it is skipped."""
-
-    seq: int
-    t: float
-    imu: list[tuple[float, float, float]]
-    enc: list[tuple[float, float, float]]
-    edge: list[tuple[float, int, int, int, int]]
-    fans: tuple[float, float]
-    soc: float
-    cmd: _Echo
-
-
-_line_decoder = msgspec.json.Decoder(_Line)
+_sensors = msgspec.json.Decoder(Sensors)
 
 
 def recorded_schemas() -> list[tuple[str, dict[str, Any]]]:
     """Name and schema of every channel of a recording: the recorded topics, and the views of them."""
-    raw = [(t.name, plain_schema(schema_of(t.name), f"ccatp.{t.message.__name__}")) for t in TOPICS if t.recorded]
+    recorded = [topic for topic in topics.TOPICS if topic.recorded]
+    raw = [(one.name, plain_schema(topics.schema_of(one.name), f"ccatp.{one.message.__name__}")) for one in recorded]
     return [*raw, *view_schemas()]
 
 
@@ -334,18 +284,18 @@ class Views:
         """The views of one message."""
         if not self._has_begun:
             yield from self.begin(max(message.t_s, 0.0))
-        if isinstance(message, EstimateMessage):
+        if isinstance(message, topics.EstimateMessage):
             pose = DeckPose(message.x_m, message.y_m, message.heading_rad)
             yield from self._of_pose(message.seq, message.t_s, pose, message.sigma_m)
         elif isinstance(message, TrackMessage):
             yield from self._of_track(message)
-        elif isinstance(message, SensorLines):
+        elif isinstance(message, topics.SensorLines):
             yield from _of_lines(message.lines)
         elif isinstance(message, TruthMessage):
             yield from self._of_truth(message)
         elif isinstance(message, FixMessage):
             yield from self._of_fix(message)
-        elif isinstance(message, LogMessage):
+        elif isinstance(message, topics.LogMessage):
             level = LEVELS.get(message.level, 0)
             log = Log(time_of(max(message.t_s, 0.0)), level, message.text, message.process)
             yield _shown("view/log", message.t_s, log)
@@ -358,11 +308,10 @@ class Views:
 
     def _of_track(self, track: TrackMessage) -> Iterator[ViewMessage]:
         rows = [row for row in track.rows if row[0] % EVERY_FRAMES == 0]
-        if not rows:
-            return
-        poses = [PanelPose(PanelId(row, col), x, y, heading) for _, _, row, col, x, y, heading, _ in rows]
-        for row, place in zip(rows, deck_poses(self._mirror, poses).tolist(), strict=True):
-            yield from self._of_pose(row[0], row[1], DeckPose(*place[:3]), row[7])
+        if rows:
+            poses = [PanelPose(PanelId(row, col), x, y, heading) for _, _, row, col, x, y, heading, _ in rows]
+            for row, place in zip(rows, deck_poses(self._mirror, poses).tolist(), strict=True):
+                yield from self._of_pose(row[0], row[1], DeckPose(*place[:3]), row[7])
 
     def _of_pose(self, seq: int, t_s: float, pose: DeckPose, sigma_m: float) -> Iterator[ViewMessage]:
         if seq % EVERY_FRAMES == 0:
@@ -385,7 +334,12 @@ class Views:
         """The error of a frame when both its estimate and its truth have arrived."""
         own[seq] = pose
         if seq in self._estimates and seq in self._truths:
-            yield _shown("view/error", t_s, _error(seq, t_s, self._estimates.pop(seq), self._truths.pop(seq)))
+            estimate, truth = self._estimates.pop(seq), self._truths.pop(seq)
+            dx, dy = estimate.x_m - truth.x_m, estimate.y_m - truth.y_m
+            c, s = cos(truth.heading_rad), sin(truth.heading_rad)
+            off = (1e3 * hypot(dx, dy), 1e3 * (c * dx + s * dy), 1e3 * (c * dy - s * dx))
+            turn = wrap_pi(estimate.heading_rad - truth.heading_rad)
+            yield _shown("view/error", t_s, ErrorView(t_s, seq, *off, 1e3 * turn))
         elif len(own) > _KEPT:
             del own[next(iter(own))]
 
@@ -409,25 +363,16 @@ class Views:
 def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[ViewMessage]:
     for raw in lines[::EVERY_FRAMES]:
         try:
-            line = _line_decoder.decode(raw)
+            line = _sensors.decode(raw)
         except msgspec.MsgspecError:
             continue
-        left, right = line.fans
-        view = {"t_s": line.t, "seq": line.seq, "fan_left": left, "fan_right": right, "battery": line.soc,
-                "held": line.cmd.held}  # fmt: skip
-        for names, samples in ((WHEELS, line.enc), (INERTIAL, line.imu), (EDGES, line.edge)):
-            if samples:
-                view |= zip(names, samples[-1][1:], strict=True)
-        ages = {"drive_age_s": line.cmd.age, "permit_age_s": line.cmd.permit_age}
-        view |= {name: age for name, age in ages.items() if age is not None}
-        yield _shown("view/sensors", line.t, view)
-
-
-def _error(seq: int, t_s: float, estimate: DeckPose, truth: DeckPose) -> ErrorView:
-    dx, dy = estimate.x_m - truth.x_m, estimate.y_m - truth.y_m
-    c, s = cos(truth.heading_rad), sin(truth.heading_rad)
-    turn = wrap_pi(estimate.heading_rad - truth.heading_rad)
-    return ErrorView(t_s, seq, 1e3 * hypot(dx, dy), 1e3 * (c * dx + s * dy), 1e3 * (c * dy - s * dx), 1e3 * turn)
+        pairs = ((WHEELS, line.enc), (INERTIAL, line.imu), (EDGES, line.edge))
+        samples = [pair for names, found in pairs if found for pair in zip(names, found[-1][1:], strict=True)]
+        newest = {name: value for name, value in samples if value is not None}
+        yield _shown("view/sensors", line.t, SensorView(
+            t_s=line.t, seq=line.seq, **newest, fan_left=line.fans[0], fan_right=line.fans[1], battery=line.soc,
+            drive_age_s=line.cmd.age, permit_age_s=line.cmd.permit_age, held=line.cmd.held,
+        ))  # fmt: skip
 
 
 def _shown(topic: str, t_s: float, message: object) -> ViewMessage:
