@@ -6,16 +6,16 @@ import subprocess
 import sys
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple, TypeVar, cast
+from typing import TypeVar, cast
 
 from ccatp.config.beacon_models import RadioConfig, SimBeaconRobotConfig
 from ccatp.config.models import Config, ProcessesConfig, SimEtalonConfig, SimRobotConfig
 from ccatp.config.package import child_environment
-from ccatp.daemon.process import SUPERVISOR_PID
+from ccatp.daemon.process import SUPERVISOR_PID, listen_at
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import Heartbeat
 
@@ -32,79 +32,6 @@ STOP_TIMEOUT_S = 4.0
 LEAST_STOP_S = 1.0
 # A loop that was restarted joins within this.
 RECOVERY_S = 5.0
-
-
-class ProcessEnd(Enum):
-    """Consequence of a process's death for the run."""
-
-    RESTART = "restart"
-    END = "end"  # with the status of the process
-    HELD = "held"  # with status 4
-    WITHOUT = "without"  # it goes on without the process
-
-
-class RestartDecision(NamedTuple):
-    """Consequence for the run, and a line for the operator."""
-
-    end: ProcessEnd
-    text: str
-
-
-class RestartPolicy:
-    """Decides on the processes of one run; each may be restarted ``limit`` times within ``window_s``."""
-
-    def __init__(self, limit: int, window_s: float) -> None:
-        self._limit, self._window_s = limit, window_s
-        self._restarts_s: defaultdict[str, deque[float]] = defaultdict(deque)
-
-    def died(
-        self, name: str, code: int, now_s: float, *, is_replaceable: bool = True, is_needed: bool = True, why: str = ""
-    ) -> RestartDecision:
-        """A process has died with exit status ``code``, or minus the number of the signal that killed it."""
-        how = why or (f"was killed by {_SIGNALS.get(-code, f'signal {-code}')}" if code < 0 else "")
-        what = f"process {name} {how or f'ended with status {code}'}"
-        if code in FINAL:
-            if is_needed:
-                return RestartDecision(ProcessEnd.END, what)
-            return RestartDecision(ProcessEnd.WITHOUT, f"{what}: the survey goes on without it")
-        if not is_replaceable:
-            return RestartDecision(ProcessEnd.HELD, f"{what}: run ended, wheels held")
-        restarts_s = self._restarts_s[name]
-        while restarts_s and now_s - restarts_s[0] > self._window_s:
-            restarts_s.popleft()
-        if len(restarts_s) >= self._limit:
-            what += f", more than {self._limit} times within {self._window_s:g} s"
-            if is_needed:
-                return RestartDecision(ProcessEnd.HELD, f"{what}: run ended, wheels held")
-            return RestartDecision(ProcessEnd.WITHOUT, f"{what}: the survey goes on without it")
-        restarts_s.append(now_s)
-        meanwhile = "wheels held meanwhile" if is_needed else "the survey goes on"
-        return RestartDecision(ProcessEnd.RESTART, f"{what}: restarting it, {meanwhile}")
-
-
-class SilenceWatch:
-    """Time since the last heartbeat of a process, as far as the supervisor was able to receive."""
-
-    def __init__(self, start_timeout_s: float, hang_timeout_s: float) -> None:
-        self._limit_s, self._hang_timeout_s = start_timeout_s, hang_timeout_s
-        self._silent_s = 0.0
-        self._polled_s: float | None = None
-
-    def reset(self) -> None:
-        """A heartbeat was received."""
-        self._limit_s, self._silent_s = self._hang_timeout_s, 0.0
-
-    def is_hung(self, now_s: float) -> bool:
-        """Poll. Time in which the supervisor itself stood still does not count."""
-        if self._polled_s is not None:
-            self._silent_s += min(max(now_s - self._polled_s, 0.0), MAX_POLL_GAP_S)
-        self._polled_s = now_s
-        return self._silent_s > self._limit_s
-
-    @property
-    def text(self) -> str:
-        """Message for a process that hangs."""
-        return f"sent no heartbeat for {self._limit_s:g} s and was killed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +57,69 @@ class ProcessSpec:
     is_needed: bool = True
     niceness: int = 0
     hang_timeout_s: float | None = None
+
+
+class ProcessEnd(Enum):
+    """Consequence of a process's death for the run."""
+
+    RESTART = "restart"
+    END = "end"  # with the status of the process
+    HELD = "held"  # with status 4
+    WITHOUT = "without"  # it goes on without the process
+
+
+class RestartPolicy:
+    """Decides on the processes of one run; each may be restarted ``limit`` times within ``window_s``."""
+
+    def __init__(self, limit: int, window_s: float) -> None:
+        self._limit, self._window_s = limit, window_s
+        self._restarts_s: defaultdict[str, deque[float]] = defaultdict(deque)
+
+    def died(self, spec: ProcessSpec, code: int, now_s: float, why: str = "") -> tuple[ProcessEnd, str]:
+        """A process has died with exit status ``code``, or minus the number of the signal that killed it.
+
+        Returns the consequence for the run, and a line for the operator.
+        """
+        how = f"was killed by {_SIGNALS.get(-code, f'signal {-code}')}" if code < 0 else f"ended with status {code}"
+        what = f"process {spec.name} {why or how}"
+        is_final = code in FINAL
+        if not is_final and spec.is_replaceable:
+            restarts_s = self._restarts_s[spec.name]
+            while restarts_s and now_s - restarts_s[0] > self._window_s:
+                restarts_s.popleft()
+            if len(restarts_s) < self._limit:
+                restarts_s.append(now_s)
+                meanwhile = "wheels held meanwhile" if spec.is_needed else "the survey goes on"
+                return ProcessEnd.RESTART, f"{what}: restarting it, {meanwhile}"
+            what += f", more than {self._limit} times within {self._window_s:g} s"
+        if not spec.is_needed:
+            return ProcessEnd.WITHOUT, f"{what}: the survey goes on without it"
+        return (ProcessEnd.END, what) if is_final else (ProcessEnd.HELD, f"{what}: run ended, wheels held")
+
+
+class SilenceWatch:
+    """Time since the last heartbeat of a process, as far as the supervisor was able to receive."""
+
+    def __init__(self, start_timeout_s: float, hang_timeout_s: float) -> None:
+        self._limit_s, self._hang_timeout_s = start_timeout_s, hang_timeout_s
+        self._silent_s = 0.0
+        self._polled_s: float | None = None
+
+    def reset(self) -> None:
+        """A heartbeat was received."""
+        self._limit_s, self._silent_s = self._hang_timeout_s, 0.0
+
+    def is_hung(self, now_s: float) -> bool:
+        """Poll. Time in which the supervisor itself stood still does not count."""
+        if self._polled_s is not None:
+            self._silent_s += min(max(now_s - self._polled_s, 0.0), MAX_POLL_GAP_S)
+        self._polled_s = now_s
+        return self._silent_s > self._limit_s
+
+    @property
+    def text(self) -> str:
+        """Message for a process that hangs."""
+        return f"sent no heartbeat for {self._limit_s:g} s and was killed"
 
 
 @dataclass(slots=True)
@@ -204,11 +194,11 @@ class ProcessManager:
         if child is not None and child.watch is not None and child.process.pid == heartbeat.pid:
             child.watch.reset()
 
-    def poll(self, now_s: float) -> tuple[str, int, RestartDecision] | None:
+    def poll(self, now_s: float) -> tuple[str, int, ProcessEnd, str] | None:
         """Collect dead processes, kill hung ones, and restart.
 
         Returns:
-            The process that ends the run, with its exit code, or ``None``.
+            The process that ends the run, with its exit code, how, and a line for the operator; or ``None``.
         """
         for name, child in tuple(self._children.items()):
             spec, code = child.spec, child.process.poll()
@@ -217,19 +207,16 @@ class ProcessManager:
                     child.why_killed = child.watch.text
                     child.process.kill()  # ends also a stopped process, which is found dead by the next poll
                 continue
-            replaceable, needed = spec.is_replaceable, spec.is_needed
-            decision = self._policy.died(
-                name, code, now_s, is_replaceable=replaceable, is_needed=needed, why=child.why_killed
-            )
-            if decision.end not in (ProcessEnd.RESTART, ProcessEnd.WITHOUT):
-                return name, code, decision
-            self._notify_operator("warning", decision.text)
+            end, text = self._policy.died(spec, code, now_s, child.why_killed)
+            if end in (ProcessEnd.END, ProcessEnd.HELD):
+                return name, code, end, text
+            self._notify_operator("warning", text)
             child.close()
-            if decision.end is ProcessEnd.WITHOUT:
+            if end is ProcessEnd.WITHOUT:
                 del self._children[name]
                 continue
             self.restarts += 1
-            if needed:
+            if spec.is_needed:
                 self._is_recovering_until_s = now_s + self._cfg.hang_timeout_s + RECOVERY_S
             self.start(spec, is_restarted=True)
         return None
@@ -260,27 +247,21 @@ class ProcessManager:
             child.close()
 
 
-@contextmanager
-def listen(section: str, host: str, port: int) -> Iterator[socket.socket]:
+def listen(section: str, host: str, port: int) -> socket.socket:
     """A listening socket for a process that inherits it; port 0 takes any free one.
 
     Raises:
         ConfigError: the port is taken.
     """
-    with socket.socket() as listener:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listener.bind((host, port))
-        except OSError as error:
-            raise ConfigError(
-                f"{section}.port: cannot listen on {host}:{port}: {error.strerror}; "
-                f"stop who uses it, or choose another with --set {section}.port=0 (0 = any free port)"
-            ) from error
-        listener.listen(16)
-        yield listener
+    try:
+        return listen_at(host, port)
+    except OSError as error:
+        raise ConfigError(
+            f"{section}.port: cannot listen on {host}:{port}: {error.strerror}; "
+            f"stop who uses it, or choose another with --set {section}.port=0 (0 = any free port)"
+        ) from error
 
 
-C = TypeVar("C", bound=Config | RadioConfig)
 SimulatedServer = SimRobotConfig | SimEtalonConfig | SimBeaconRobotConfig
 
 
@@ -290,14 +271,16 @@ def simulated_servers(cfg: Config | RadioConfig) -> list[tuple[str, str, Simulat
     return servers if isinstance(cfg, RadioConfig) else [*servers, ("etalon", "sim.etalon", cfg.sim.etalon)]
 
 
+C = TypeVar("C", bound=Config | RadioConfig)
+
+
 def with_addresses(cfg: C, sockets: Mapping[str, socket.socket]) -> C:
     """The configuration with the actual addresses of the simulated servers."""
     changes: dict[str, object] = {}
     sim: dict[str, object] = {}
     for process, section, server in simulated_servers(cfg):
-        host, port = sockets[process].getsockname()
-        at = {"host": host, "port": port}
-        name = section.removeprefix("sim.")
+        host, port = sockets[process].getsockname()[:2]
+        at, name = {"host": host, "port": port}, section.removeprefix("sim.")
         changes[name] = getattr(cfg, name).model_copy(update=at)
         sim[name] = server.model_copy(update=at)
     return cast(C, cfg.model_copy(update={**changes, "sim": cfg.sim.model_copy(update=sim)}))

@@ -1,10 +1,9 @@
 """Receives a run's messages from start to end: recording, progress, mission status, summary."""
 
 import json
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, Self
 
 import msgspec
 import numpy as np
@@ -14,8 +13,9 @@ import ccatp
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
-from ccatp.core import FloatArray, PanelId, PanelPose, PointId, danger_text
+from ccatp.core import FloatArray, PanelId, PanelPose, PointId
 from ccatp.daemon.process import Endpoints
+from ccatp.daemon.terminal import RunView
 from ccatp.errors import ExitStatus
 from ccatp.links.bus import Subscriber
 from ccatp.links.topics import (
@@ -29,7 +29,6 @@ from ccatp.links.topics import (
     BeaconTruth,
     DangerEvent,
     Heartbeat,
-    LogMessage,
     Message,
     MissionStatus,
     Timing,
@@ -56,73 +55,69 @@ MIN_FIXES = 3
 SUMMARISED = {"mission", "track", "truth", "arrival", "danger_event"}
 
 
-class ProgressView(Protocol):
-    """Display of the progress."""
-
-    def show_message(self, level: str, text: str) -> None:
-        """One line for the operator."""
-
-    def pose(self, track: TrackMessage) -> None:
-        """A batch of estimates."""
-
-    def status(self, status: MissionStatus) -> None:
-        """Progress of the mission."""
-
-
-class RunAccess(NamedTuple):
-    """Access to a run for its collector."""
-
-    context: zmq.Context[zmq.Socket[bytes]]
-    endpoints: Endpoints
-    run_dir: Path
-    is_sim: bool
-    on_heartbeat: Callable[[Heartbeat], None]
-
-
-class Collector(ABC):
-    """Receives a run's messages; a subclass for each kind of mission builds the summary.
+class Collector:
+    """Receives a run's messages: records and shows them, and has the summary built from them.
 
     Attributes:
         status: progress of the mission, once main has published it.
-        remarks: warnings for the operator at the end.
     """
 
-    def __init__(self, access: RunAccess, metadata: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoints: Endpoints,
+        run_dir: Path,
+        cfg: Config | RadioConfig,
+        on_heartbeat: Callable[[Heartbeat], None],
+        *,
+        is_sim: bool,
+    ) -> None:
         """Subscribe before the first message is published."""
-        self._access = access
-        names = ("main", "danger", "dashboard", *(("truth",) if access.is_sim else ()))
-        self._subscriber = Subscriber(access.context, [access.endpoints.of(name) for name in names], RECEIVED)
+        self._context, self._endpoints, self._on_heartbeat, self._is_sim = context, endpoints, on_heartbeat, is_sim
+        names = ("main", "danger", "dashboard", *(("truth",) if is_sim else ()))
+        self._subscriber = Subscriber(context, [endpoints.of(name) for name in names], RECEIVED)
+        self._record: BeaconRecord | SurveyRecord
+        self._views: Views | None = None
+        if isinstance(cfg, RadioConfig):
+            what = {"system": cfg.system, "seed": str(cfg.run.seed)}
+            self._record = BeaconRecord(cfg, is_sim=is_sim)
+        else:
+            what = {"mirror": cfg.mirror.name, "seed": str(cfg.run.seed), "world": cfg.world.name}
+            self._record = SurveyRecord(cfg, run_dir, is_sim=is_sim)
+            self._views = Views(self._record.mirror, cfg.robot.puck_height_m)
+        software = {"format": str(RECORD_FORMAT), "ccatp": ccatp.__version__}
+        config = dump_config(cfg)  # a later session in the same directory may have another
         self._recorder = Recorder(
-            access.run_dir / TELEMETRY,
+            run_dir / TELEMETRY,
             recorded_schemas(),
-            is_simulation=access.is_sim,
-            metadata={"format": str(RECORD_FORMAT), "ccatp": ccatp.__version__, **metadata},
+            is_simulation=is_sim,
+            metadata={**software, **what, "config": config},
             on_failure=self._on_recorder_failure,
         )
-        self._view: ProgressView | None = None
+        self._view: RunView | None = None
         self._truth_rows = 0
-        self._records_views = True
         self.status: MissionStatus | None = None
-        self.remarks: list[str] = []
 
-    @abstractmethod
-    def take(self, message: Message) -> None:
-        """A message for the summary."""
-
-    def views_of(self, message: Message) -> Iterable[tuple[str, float, bytes]]:
-        """Topic, time and JSON of messages for viewers, recorded beside this one."""
-        del message
-        return ()
+    @property
+    def remarks(self) -> list[str]:
+        """Warnings for the operator at the end."""
+        return self._record.remarks
 
     def finish(self) -> None:
         """Request the last rows of the simulated truth, and wait for messages on their way."""
-        if self._access.is_sim:
-            self._collect_until_truth(int(self._request(b"flush").get("rows", 0)))
-        self.collect(1, None)
+        if self._is_sim:
+            rows = int(self._request(b"flush").get("rows", 0))
+            if isinstance(self._record, SurveyRecord):
+                self._record.set_injected(self._request(b"misalignment").get("panels", []))
+            for _ in range(int(FINISH_TIMEOUT_S * 100)):
+                if self._truth_rows >= rows:
+                    break
+                self.collect(10)
+        self.collect(1)
 
-    @abstractmethod
     def summary(self, wall_s: float) -> dict[str, Any]:
         """``summary.json``; call it when main has closed the mission's database."""
+        return self._record.summary(wall_s)
 
     def __enter__(self) -> Self:
         return self
@@ -148,57 +143,51 @@ class Collector(ABC):
             poller.register(waited_for, zmq.POLLIN)
         poller.poll(timeout_ms)
 
-    def collect(self, timeout_ms: int, view: ProgressView | None) -> None:
+    def collect(self, timeout_ms: int, view: RunView | None = None) -> None:
         """Take all messages that have arrived, waiting at most ``timeout_ms`` for the first."""
         self._view = view
         received = self._subscriber.receive_raw(timeout_ms / 1000.0)
         while received is not None:
             name, body, message = received
             if isinstance(message, Heartbeat):
-                self._access.on_heartbeat(message)
+                self._on_heartbeat(message)
             elif isinstance(message, Message):
-                self._take(name, body, message, view)
+                self._take(name, body, message)
             received = self._subscriber.receive_raw()
         self._recorder.flush_if_due()
 
-    def _take(self, name: str, body: bytes, message: Message, view: ProgressView | None) -> None:
+    def _take(self, name: str, body: bytes, message: Message) -> None:
         if name != "timing":
             self._recorder.write(name, max(message.t_s, 0.0), body)
             self._record_views(message)
         if isinstance(message, TruthMessage | BeaconTruth):
             self._truth_rows += len(message.rows)
-        if view is not None:
-            _show(message, view)
+        if self._view is not None:
+            self._view.show(message)
         if isinstance(message, MissionStatus):
             self.status = message
-        self.take(message)
+        self._record.take(message)
 
     def _record_views(self, message: Message) -> None:
         """A failure in the views must not end the run."""
-        if not self._records_views:
+        if self._views is None:
             return
         try:
-            for shown in self.views_of(message):
+            for shown in self._views.of(message):
                 self._recorder.write(*shown)
         except Exception as error:  # the raw topics hold all of it
-            self._records_views = False
+            self._views = None
             self._on_recorder_failure(f"views for Foxglove and PlotJuggler: {type(error).__name__}: {error}")
 
     def _on_recorder_failure(self, reason: str) -> None:
         if self._view is not None:
             self._view.show_message("error", f"{reason}; the survey goes on")
 
-    def _collect_until_truth(self, rows: int) -> None:
-        for _ in range(int(FINISH_TIMEOUT_S * 100)):
-            if self._truth_rows >= rows:
-                return
-            self.collect(10, None)
-
     def _request(self, request: bytes) -> dict[str, Any]:
         """Reply of the simulated truth; empty where it is gone, so that everything that it published has arrived."""
-        with self._access.context.socket(zmq.REQ) as peer:
+        with self._context.socket(zmq.REQ) as peer:
             peer.setsockopt(zmq.LINGER, 0)
-            peer.connect(self._access.endpoints.of("puck"))
+            peer.connect(self._endpoints.of("puck"))
             peer.send(request)
             if not peer.poll(int(REQUEST_TIMEOUT_S * 1000)):
                 return {}
@@ -206,29 +195,16 @@ class Collector(ABC):
             return reply
 
 
-def _show(message: Message, view: ProgressView) -> None:
-    if isinstance(message, TrackMessage):
-        view.pose(message)
-    elif isinstance(message, MissionStatus):
-        view.status(message)
-    elif isinstance(message, LogMessage):
-        view.show_message(message.level, message.text)
-    elif isinstance(message, DangerEvent) and message.code:
-        text = danger_text(message.cause, message.signal, message.value, message.limit)
-        view.show_message("warning", f"danger: code {message.code}, {text}, at {message.t_s:.2f} s")
+class BeaconRecord:
+    """Messages of a mission among beacons, for its summary."""
 
-
-class BeaconCollector(Collector):
-    """Collector of a mission among beacons."""
-
-    def __init__(self, access: RunAccess, cfg: RadioConfig) -> None:
-        metadata = {"system": cfg.system, "seed": str(cfg.run.seed), "config": dump_config(cfg)}
-        super().__init__(access, metadata)
-        self._summary = BeaconSummary(beacon_facts(cfg, is_sim=access.is_sim))
+    def __init__(self, cfg: RadioConfig, *, is_sim: bool) -> None:
+        self._summary = BeaconSummary(beacon_facts(cfg, is_sim=is_sim))
         self._signal = ""
+        self.remarks: list[str] = []
 
     def take(self, message: Message) -> None:
-        """See ``Collector``."""
+        """Take one message."""
         summary = self._summary
         if isinstance(message, BeaconTrack):
             summary.track += message.rows
@@ -252,7 +228,7 @@ class BeaconCollector(Collector):
             summary.cause = message.cause
 
     def summary(self, wall_s: float) -> dict[str, Any]:
-        """See ``Collector``."""
+        """The summary."""
         return self._summary.build(wall_s)
 
 
@@ -295,34 +271,27 @@ class _SurveySession:
             builder.set_mission(message.done, message.skipped, message.elapsed_s, message.left_out)
 
 
-class SurveyCollector(Collector):
-    """Collector of a survey."""
+class SurveyRecord:
+    """Messages of a survey, for its summary."""
 
-    def __init__(self, access: RunAccess, cfg: Config) -> None:
-        metadata = {
-            "mirror": cfg.mirror.name,
-            "seed": str(cfg.run.seed),
-            "world": cfg.world.name,
-            "config": dump_config(cfg),  # a later session in the same directory may have another
-        }
-        super().__init__(access, metadata)
-        self._cfg, self._run_dir = cfg, access.run_dir
-        self._mirror = build_mirror(cfg.mirror)
-        self._views = Views(self._mirror, cfg.robot.puck_height_m)
+    def __init__(self, cfg: Config, run_dir: Path, *, is_sim: bool) -> None:
+        self._cfg, self._run_dir, self._is_sim = cfg, run_dir, is_sim
+        self.mirror = build_mirror(cfg.mirror)
         self._session = _SurveySession(self._builder_for, self._on_deck)
         self._injected: PanelFits | None = None
+        self.remarks: list[str] = []
 
     def take(self, message: Message) -> None:
-        """See ``Collector``."""
+        """Take one message."""
         self._session.take(message)
 
-    def views_of(self, message: Message) -> Iterable[tuple[str, float, bytes]]:
-        """See ``Collector``."""
-        return self._views.of(message)
+    def set_injected(self, rows: list[list[float]]) -> None:
+        """How the simulated panels really lie, rows as of ``Misalignment``."""
+        self._injected = {PanelId(int(row), int(col)): (piston, tip, tilt) for row, col, piston, tip, tilt in rows}
 
     def _builder_for(self, status: MissionStatus) -> SummaryBuilder:
-        cfg, is_sim = self._cfg, self._access.is_sim
-        points = ORDERS[cfg.run.order](self._mirror, cfg.run.panels)
+        cfg, is_sim = self._cfg, self._is_sim
+        points = ORDERS[cfg.run.order](self.mirror, cfg.run.panels)
         facts = RunFacts(
             mirror=cfg.mirror.name,
             world=cfg.world.name if is_sim else None,
@@ -334,29 +303,18 @@ class SurveyCollector(Collector):
             puck_height_m=cfg.robot.puck_height_m,
             has_truth=is_sim,
         )
-        targets = puck_targets(self._mirror, points, cfg.robot.puck_height_m)
-        return SummaryBuilder(facts, targets, self._mirror.surface.normal)
+        targets = puck_targets(self.mirror, points, cfg.robot.puck_height_m)
+        return SummaryBuilder(facts, targets, self.mirror.surface.normal)
 
     def _on_deck(self, track: TrackMessage) -> FloatArray:
         """Rows of seq, t_s, x, y, heading (deck), X, Y, Z of the surface point, as the truth has them."""
         poses = [PanelPose(PanelId(row, col), x, y, heading) for _, _, row, col, x, y, heading, _ in track.rows]
-        x, y, heading, z = deck_poses(self._mirror, poses).T
+        x, y, heading, z = deck_poses(self.mirror, poses).T
         seq, t_s = np.array([row[:2] for row in track.rows]).T
         return np.column_stack([seq, t_s, x, y, heading, x, y, z])
 
-    def finish(self) -> None:
-        """See ``Collector``; the simulated misalignment is requested, too."""
-        if self._access.is_sim:
-            rows = int(self._request(b"flush").get("rows", 0))
-            self._injected = {
-                PanelId(int(row), int(col)): (piston, tip, tilt)
-                for row, col, piston, tip, tilt in self._request(b"misalignment").get("panels", [])
-            }
-            self._collect_until_truth(rows)
-        self.collect(1, None)
-
     def summary(self, wall_s: float) -> dict[str, Any]:
-        """See ``Collector``."""
+        """The summary, when main has closed the mission's database."""
         survey = self._stored()
         if self._session.builder is None:
             if survey is None and (before := _read(self._run_dir / "summary.json")):
@@ -383,7 +341,7 @@ class SurveyCollector(Collector):
         if not path.exists():  # main ended before it made one
             return None
         try:
-            return read_survey(path, self._mirror.name)  # it needs no room on the disk
+            return read_survey(path, self.mirror.name)  # it needs no room on the disk
         except StoreError as error:
             self.remarks.append(f"the summary is without panels: {error}")
             return None
@@ -397,7 +355,7 @@ class SurveyCollector(Collector):
             points = np.array([fix.position_m for fix in own])
             covariances = np.array([fix.covariance_m2 for fix in own]).reshape(-1, 3, 3)
             try:
-                fit = fit_panel(self._mirror, panel, points, covariances, self._cfg.robot.puck_height_m)
+                fit = fit_panel(self.mirror, panel, points, covariances, self._cfg.robot.puck_height_m)
             except PanelFitError:
                 continue  # fixes on one line: a survey that ended early
             fits[panel] = (fit.piston_m, fit.tip_rad, fit.tilt_rad)

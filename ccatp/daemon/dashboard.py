@@ -18,10 +18,17 @@ import structlog
 import zmq
 
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.load import is_radio_file, load_config, load_radio_config
 from ccatp.config.models import Config, DashboardConfig
 from ccatp.daemon.command_handlers import LOGGED_LINES, LOGGED_PERIOD_S
-from ccatp.daemon.process import RUN_DIR_FILE, Endpoints, open_log, run_until_stopped, start_process
+from ccatp.daemon.process import (
+    RUN_DIR_FILE,
+    Endpoints,
+    listen_at,
+    open_log,
+    read_config,
+    run_until_stopped,
+    start_process,
+)
 from ccatp.daemon.subscribers import HeartbeatPublisher
 from ccatp.errors import ConfigError, DaemonUnreachableError
 from ccatp.links.bus import Publisher
@@ -40,7 +47,6 @@ from ccatp.report.dashboard.view import RunStateView
 
 Logger = structlog.typing.FilteringBoundLogger
 HEARTBEAT_PERIOD_S = 0.5
-BACKLOG = 64
 ROOT = "dashboard."
 
 
@@ -191,15 +197,15 @@ def open_page_socket(cfg: DashboardConfig) -> PageSocket:
     level, before = "info", "dashboard: "
     try:
         try:
-            listener = _listen(cfg.host, cfg.port)
+            listener = listen_at(cfg.host, cfg.port)
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 raise
             level, before = "warning", f"dashboard: port {cfg.port} is in use, so it is at "
-            listener = _listen(cfg.host, 0)
+            listener = listen_at(cfg.host, 0)
     except OSError as error:
-        why = str(error.strerror).partition(" (while")[0]  # Python appends the address again
-        text = f"no dashboard: cannot listen on {cfg.host}:{cfg.port}: {why}; choose another dashboard.host"
+        where = f"{cfg.host}:{cfg.port}"
+        text = f"no dashboard: cannot listen on {where}: {error.strerror}; choose another dashboard.host"
         return PageSocket(None, cfg, "warning", text)
     port = listener.getsockname()[1]
     return PageSocket(listener, cfg.model_copy(update={"port": port}), level, before + page_url(cfg.host, port))
@@ -208,11 +214,6 @@ def open_page_socket(cfg: DashboardConfig) -> PageSocket:
 def page_url(host: str, port: int) -> str:
     """The page's address."""
     return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    return socket.create_server((host, port), family=family, backlog=BACKLOG)
 
 
 def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callable[[str], None]) -> int:
@@ -227,8 +228,7 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callab
             raise ConfigError(f"--set: {key} is no key of the page; the daemon runs with what it has, see {ROOT}*")
     folder = runtime_dir_path(str(runtime_dir or ""), os.environ)
     run_dir = _run_dir_of(folder)
-    path, wanted = run_dir / "config.toml", {**settings, f"{ROOT}enabled": True}
-    cfg = load_radio_config(path, wanted) if is_radio_file(path) else load_config(path, wanted)
+    cfg = read_config(run_dir / "config.toml", {**settings, f"{ROOT}enabled": True})
     page = open_page_socket(cfg.dashboard)
     if page.socket is None:
         raise ConfigError(page.text)

@@ -9,6 +9,7 @@ import ctypes
 import io
 import os
 import signal
+import socket
 import sys
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import suppress
@@ -26,6 +27,7 @@ from ccatp.daemon import realtime
 from ccatp.errors import CcatpError
 
 PR_SET_PDEATHSIG = 1
+BACKLOG = 64  # of listening sockets
 LEVELS = {"info": 20, "warning": 30, "error": 40}
 # The event of a line that is also shown to the operator; the field ``text`` holds it.
 OPERATOR_MESSAGE = "operator_message"
@@ -199,6 +201,16 @@ async def unless_stopped(stop: asyncio.Event, work: Coroutine[Any, Any, object])
         working.cancel()
         stopping.cancel()
         await asyncio.gather(working, stopping, return_exceptions=True)
+
+
+def listen_at(host: str, port: int) -> socket.socket:
+    """A listening socket; raises ``OSError`` whose ``strerror`` says why, without the address."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family, backlog=BACKLOG)
+    except OSError as error:
+        error.strerror = str(error.strerror).partition(" (while")[0]  # Python appends the address
+        raise
 
 
 def run_until_stopped(serve: Callable[[asyncio.Event], Coroutine[Any, Any, int]], *, is_spinning: bool = False) -> int:

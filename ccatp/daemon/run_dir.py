@@ -2,13 +2,14 @@
 
 import json
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
 from typing import Any
 
+from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.daemon.danger_loop import FILE as EMERGENCIES
@@ -64,9 +65,14 @@ def clear_finished(status: int, run_dir: Path) -> None:
     """
     if status not in FINISHED:
         return
-    kept = _emergencies(run_dir / EMERGENCIES)
+    emergencies = run_dir / EMERGENCIES
+    kept = emergencies.read_bytes() if emergencies.exists() else b""
     try:
-        if kept:
+        is_latched = bool(kept) and bool(json.loads(kept)["active"])
+    except (ValueError, KeyError, TypeError):
+        is_latched = True  # damaged
+    try:
+        if is_latched:
             _write(LATCHED_FILE, kept)
         else:
             LATCHED_FILE.unlink(missing_ok=True)
@@ -99,18 +105,6 @@ def _write(path: Path, data: bytes) -> None:
         file.flush()
         os.fsync(file.fileno())
     new.replace(path)
-
-
-def _emergencies(path: Path) -> bytes:
-    """Content of a latch's file, empty without an active emergency; a damaged file counts as active."""
-    try:
-        found = path.read_bytes()
-    except FileNotFoundError:
-        return b""
-    try:
-        return found if json.loads(found)["active"] else b""
-    except (ValueError, KeyError, TypeError):
-        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,12 +153,10 @@ SOCKETS = ("main", "danger", "control", "emergency", "dashboard")
 TRUTH_SOCKETS = ("truth", "puck")
 
 
-@contextmanager
-def owned(path: Path, option: str) -> Iterator[None]:
+def owned(path: Path, option: str) -> AbstractContextManager[None]:
     """Hold a lock; raises ``RefusedError``, which names the ``option`` for another place, where it is held."""
     refusal = f"another ccatp runs in {path.parent}; end it with 'ccatp stop', or give this one its own {option}"
-    with locked(path, refusal):
-        yield
+    return locked(path, refusal)
 
 
 def own_runtime_dir(stack: ExitStack, runtime_dir: Path, *, is_sim: bool) -> None:
@@ -180,46 +172,35 @@ def own_runtime_dir(stack: ExitStack, runtime_dir: Path, *, is_sim: bool) -> Non
     stack.callback(remove_sockets, runtime_dir, (*SOCKETS, *(TRUTH_SOCKETS if is_sim else ())))
 
 
-def new_run_dir(options: RunOptions, name: str, seed: int) -> Path:
-    """The directory of a new run; raises ``ConfigError`` where it holds a mission or cannot be made."""
-    run_dir = options.run_dir or default_run_dir(name, seed, datetime.now(UTC))
-    if (run_dir / "mission.sqlite").exists():
-        raise ConfigError(f"--run-dir: {run_dir} holds a mission already; name another folder")
-    return _made(run_dir)
-
-
-def _made(run_dir: Path) -> Path:
-    try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--run-dir: cannot make {run_dir}: {error.strerror}") from error
-    return run_dir.absolute()
-
-
-def survey_run_dir(options: RunOptions, cfg: Config) -> Path:
-    """The directory of a survey that is new, or resumed with the points that it was planned with.
+def make_run_dir(options: RunOptions, cfg: Config | RadioConfig) -> Path:
+    """The directory of a run that is new, or of a survey that is resumed with the points that it was planned with.
 
     Raises:
         ConfigError: options or configuration contradict its content, or it cannot be made.
     """
-    run_dir = options.run_dir or default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC))
+    is_survey = isinstance(cfg, Config)
+    name = cfg.run.mirror if isinstance(cfg, Config) else cfg.system
+    run_dir = options.run_dir or default_run_dir(name, cfg.run.seed, datetime.now(UTC))
     has_mission = (run_dir / "mission.sqlite").exists()
     if has_mission and not options.resume:
-        raise ConfigError(
-            f"--run-dir: {run_dir} holds a mission already; give --resume to go on with it, or another folder"
-        )
+        advice = "give --resume to go on with it, or another folder" if is_survey else "name another folder"
+        raise ConfigError(f"--run-dir: {run_dir} holds a mission already; {advice}")
     if options.resume and not has_mission:
         raise ConfigError(f"--resume: no mission in {run_dir}; name the folder of the run with --run-dir")
     path = run_dir / "config.toml"
-    if options.resume and path.exists():
+    if options.resume and path.exists() and isinstance(cfg, Config):
         before = load_config(path)
-        for name, was, wanted in (
+        for key, was, wanted in (
             ("run.mirror", before.mirror.name, cfg.mirror.name),
             ("run.order", before.run.order, cfg.run.order),
             ("run.panels", before.run.panels, cfg.run.panels),
         ):
             if was != wanted:
                 raise ConfigError(
-                    f"--resume: {name} was {was} in {run_dir} and is {wanted} now; resume with what it was"
+                    f"--resume: {key} was {was} in {run_dir} and is {wanted} now; resume with what it was"
                 )
-    return _made(run_dir)
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--run-dir: cannot make {run_dir}: {error.strerror}") from error
+    return run_dir.absolute()

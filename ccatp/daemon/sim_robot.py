@@ -13,7 +13,15 @@ import structlog
 
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
-from ccatp.daemon.process import FAULTS_FILE, Endpoints, open_log, processes_of, run_until_stopped, start_process
+from ccatp.daemon.process import (
+    FAULTS_FILE,
+    Endpoints,
+    listen_at,
+    open_log,
+    processes_of,
+    run_until_stopped,
+    start_process,
+)
 from ccatp.dataloop import serve, serve_beacons
 from ccatp.errors import ConfigError
 from ccatp.links.auth import read_key
@@ -70,7 +78,7 @@ def run_alone(
     with locked(folder / TRUTH_LOCK_FILE, refusal):
         at = cfg.sim.robot
         try:
-            listener = socket.create_server((at.host, at.port))
+            listener = listen_at(at.host, at.port)
         except OSError as error:
             raise ConfigError(
                 f"sim.robot.port: cannot listen on {at.host}:{at.port}: {error.strerror}; choose another with --port"

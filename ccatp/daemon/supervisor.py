@@ -17,36 +17,43 @@ from typing import Any
 import zmq
 
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.load import dump_config, is_radio_file, load_config, load_radio_config
+from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.daemon.child_processes import (
     ProcessEnd,
     ProcessManager,
     ProcessSpec,
-    RestartDecision,
     listen,
     simulated_servers,
     with_addresses,
 )
-from ccatp.daemon.collector import BeaconCollector, Collector, RunAccess, SurveyCollector
+from ccatp.daemon.collector import Collector
 from ccatp.daemon.command_handlers import check_observatory
 from ccatp.daemon.dashboard import PageSocket, open_page_socket
-from ccatp.daemon.process import FAULTS_FILE, LEVELS, OPERATOR_MESSAGE, RUN_DIR_FILE, Endpoints, open_log
+from ccatp.daemon.process import (
+    FAULTS_FILE,
+    LEVELS,
+    OPERATOR_MESSAGE,
+    RUN_DIR_FILE,
+    Endpoints,
+    open_log,
+    processes_of,
+    read_config,
+)
 from ccatp.daemon.run_dir import (
     RunOptions,
     clear_finished,
     default_run_dir,
     find_resumable,
     finished_summary,
+    make_run_dir,
     mark_resumable,
-    new_run_dir,
     own_runtime_dir,
     owned,
-    survey_run_dir,
     take_over_emergencies,
 )
 from ccatp.daemon.service import Service, take_from
-from ccatp.daemon.terminal import BeaconRunView, RunView, survey_title, write_run_report
+from ccatp.daemon.terminal import RunView, write_run_report
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.auth import read_key
 from ccatp.links.runtime_dir import make_runtime_dir
@@ -58,21 +65,18 @@ POLL_MS = 20
 # In lockstep the three that answer each other keep both cores of a small machine busy: recording takes what they leave.
 LOCKSTEP_NICENESS = 10
 
-
-# First, so that it is there for the end of the others. It gets the time they leave, so it may be silent for a minute.
-_DASHBOARD = ProcessSpec(
-    "dashboard",
-    "ccatp.daemon.dashboard",
-    listens="dashboard",
-    is_loop=True,
-    is_needed=False,
-    niceness=15,
-    hang_timeout_s=60.0,
-)
-
 # In the order of starting; stopping is in the reverse order, so that main holds the wheels first.
 PROCESSES: tuple[ProcessSpec, ...] = (
-    _DASHBOARD,
+    # First, so that it is there for the end of the others. It gets the time they leave: it may be silent for a minute.
+    ProcessSpec(
+        "dashboard",
+        "ccatp.daemon.dashboard",
+        listens="dashboard",
+        is_loop=True,
+        is_needed=False,
+        niceness=15,
+        hang_timeout_s=60.0,
+    ),
     ProcessSpec("dataloop", "ccatp.daemon.sim_robot", is_simulator=True, listens="sim.robot", is_replaceable=False),
     ProcessSpec("etalon", "ccatp.daemon.sim_etalon", is_simulator=True, listens="sim.etalon"),
     ProcessSpec("danger", "ccatp.daemon.danger_loop", is_loop=True),
@@ -80,11 +84,10 @@ PROCESSES: tuple[ProcessSpec, ...] = (
 )
 
 # Without laser system, because radio measures. A main loop that dies takes the map with it: held, and over.
-BEACON_PROCESSES: tuple[ProcessSpec, ...] = (
-    _DASHBOARD,
-    ProcessSpec("dataloop", "ccatp.daemon.sim_robot", is_simulator=True, listens="sim.robot", is_replaceable=False),
-    ProcessSpec("danger", "ccatp.daemon.danger_loop", is_loop=True),
-    ProcessSpec("main", "ccatp.daemon.main_loop", is_loop=True, is_replaceable=False),
+BEACON_PROCESSES = tuple(
+    replace(spec, is_replaceable=spec.is_replaceable and spec.name != "main")
+    for spec in PROCESSES
+    if spec.name != "etalon"
 )
 
 
@@ -108,38 +111,28 @@ class SupervisedRun:
     ) -> None:
         self._options, self._cfg, self._run_dir, self._endpoints = options, cfg, run_dir, endpoints
         self._sockets, self._page, self._started_s = sockets, page, started_s
-        self._view: RunView | None = None
-        processes = cfg.processes if isinstance(cfg, RadioConfig) else cfg.run
-        self._children = ProcessManager(processes, self._command_of, self._notify_operator)
+        self._children = ProcessManager(processes_of(cfg), self._command_of, self._notify_operator)
         self._is_interrupted = False
         self._service = Service(*take_from(os.environ))
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
+        self._view = RunView(cfg, is_sim=options.sim, run_dir=run_dir)
 
     def run(self) -> int:
         """Start, watch, collect, stop; returns the exit status."""
-        cfg, is_sim = self._cfg, self._options.sim
+        cfg, is_sim, view = self._cfg, self._options.sim, self._view
         what = {"system": cfg.system} if isinstance(cfg, RadioConfig) else {"mirror": cfg.mirror.name}
         self._log.info("run_started", **what, seed=cfg.run.seed, sim=is_sim)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         # A flag and no exception: a signal must neither be lost in a handler of exceptions nor end the shutdown.
         previous = {n: signal.signal(n, self._interrupt) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-        access = RunAccess(context, self._endpoints, self._run_dir, is_sim, self._on_heartbeat)
-        collector: Collector
-        view: RunView
-        if isinstance(cfg, RadioConfig):
-            collector = BeaconCollector(access, cfg)
-            view = BeaconRunView(cfg, is_sim=is_sim, run_dir=self._run_dir)
-        else:
-            collector = SurveyCollector(access, cfg)
-            view = RunView(survey_title(cfg, is_sim=is_sim), is_sim=is_sim, run_dir=self._run_dir)
-        self._view = view
         try:
+            collector = Collector(context, self._endpoints, self._run_dir, cfg, self._on_heartbeat, is_sim=is_sim)
             with collector, view:
-                status = self._watch(collector, view)
+                status = self._watch(collector)
                 self._service.stopping()
                 collector.finish()
                 self._children.stop_all()
-                collector.collect(1, None)
+                collector.collect(1)
                 summary = collector.summary(time.monotonic() - self._started_s)
         finally:
             for number, handler in previous.items():
@@ -165,15 +158,13 @@ class SupervisedRun:
         except OSError as error:
             with suppress(OSError):
                 new.unlink()
-            reason = error.strerror or str(error)
-            self._notify_operator(
-                "error", f"{path}: cannot be written: {reason}; what was measured is in mission.sqlite"
-            )
+            text = f"{path}: cannot be written: {error.strerror or error}; what was measured is in mission.sqlite"
+            self._notify_operator("error", text)
 
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
         self._is_interrupted = True
 
-    def _watch(self, collector: Collector, view: RunView) -> ExitStatus:
+    def _watch(self, collector: Collector) -> ExitStatus:
         if self._page.text:
             self._notify_operator(self._page.level, self._page.text)
         for process in BEACON_PROCESSES if isinstance(self._cfg, RadioConfig) else PROCESSES:
@@ -184,15 +175,20 @@ class SupervisedRun:
             os.nice(LOCKSTEP_NICENESS)
         while not self._is_interrupted:
             collector.wait(POLL_MS, self._children.fds)
-            collector.collect(0, view)
+            collector.collect(0, self._view)
             now_s = time.monotonic()
             self._service.update(now_s, collector.status, is_recovering=self._children.is_recovering(now_s))
             # A death comes first: the messages of the others are its consequence.
-            if (end := self._children.poll(now_s)) is not None:
-                return self._died(*end)
+            if (death := self._children.poll(now_s)) is not None:
+                name, code, end, text = death
+                self._log.error("process_died", name=name, code=code)
+                if end is ProcessEnd.END:
+                    return ExitStatus(code)  # it has reported why
+                self._notify_operator("error", f"{text}; see {self._run_dir / 'log.jsonl'}")
+                return ExitStatus.HELD
             if collector.is_over:
                 return collector.exit_status
-        view.show_message("warning", "interrupted: holding the wheels and saving")
+        self._view.show_message("warning", "interrupted: holding the wheels and saving")
         return ExitStatus.INTERRUPTED
 
     def _on_heartbeat(self, heartbeat: Heartbeat) -> None:
@@ -201,8 +197,7 @@ class SupervisedRun:
 
     def _notify_operator(self, level: str, text: str) -> None:
         self._log.log(LEVELS[level], OPERATOR_MESSAGE, text=text)
-        if self._view is not None:
-            self._view.show_message(level, text)
+        self._view.show_message(level, text)
 
     def _command_of(self, process: ProcessSpec, is_restarted: bool) -> tuple[list[str], tuple[int, ...]]:
         options = self._options
@@ -221,35 +216,9 @@ class SupervisedRun:
         fd = self._sockets[process.name].fileno()
         return [*arguments, "--listen-fd", str(fd)], (fd,)
 
-    def _died(self, name: str, code: int, decision: RestartDecision) -> ExitStatus:
-        self._log.error("process_died", name=name, code=code)
-        if decision.end is ProcessEnd.END:
-            return ExitStatus(code)  # it has reported why
-        self._notify_operator("error", f"{decision.text}; see {self._run_dir / 'log.jsonl'}")
-        return ExitStatus.HELD
-
 
 def run(options: RunOptions) -> int:
-    """Run what the configuration is of: a survey, or a mission among beacons; arguments as of ``run_survey``."""
-    if options.config_file is not None and is_radio_file(options.config_file):
-        return run_beacons(options)
-    return run_survey(options)
-
-
-def run_beacons(options: RunOptions) -> int:
-    """Run one mission among beacons to its end; arguments, status and errors as of ``run_survey``."""
-    if options.resume or options.recover:
-        flag = "--resume" if options.resume else "--resume-last"
-        raise ConfigError(
-            f"{flag}: a mission among beacons has nothing to go on with, its map is not kept; start a new one"
-        )
-    if options.faults_file is not None:
-        raise ConfigError("--faults: plans are for surveys; sim.incidents of the configuration holds those of beacons")
-    return _run(options, load_radio_config(options.config_file, dict(options.overrides)))
-
-
-def run_survey(options: RunOptions) -> int:
-    """Run one survey to its end.
+    """Run what the configuration is of, a survey or a mission among beacons, to its end.
 
     Returns:
         The exit status of ``cli.md``.
@@ -257,8 +226,21 @@ def run_survey(options: RunOptions) -> int:
     Raises:
         CcatpError: the run could not begin.
     """
-    if options.recover:
-        return _recover(options)
+    cfg = read_config(options.config_file, dict(options.overrides))
+    if isinstance(cfg, Config):
+        return _recover(options, cfg) if options.recover else _run(options, cfg)
+    if options.resume or options.recover:
+        flag = "--resume" if options.resume else "--resume-last"
+        raise ConfigError(
+            f"{flag}: a mission among beacons has nothing to go on with, its map is not kept; start a new one"
+        )
+    if options.faults_file is not None:
+        raise ConfigError("--faults: plans are for surveys; sim.incidents of the configuration holds those of beacons")
+    return _run(options, cfg)
+
+
+def run_survey(options: RunOptions) -> int:
+    """Run one survey to its end, and nothing else; status and errors as of ``run``."""
     return _run(options, load_config(options.config_file, dict(options.overrides)))
 
 
@@ -269,8 +251,7 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
     read_token(cfg.dashboard)
     started_s = time.monotonic()
     with ExitStack() as stack:
-        default_dir = cfg.processes.runtime_dir if isinstance(cfg, RadioConfig) else cfg.run.runtime_dir
-        runtime_dir = make_runtime_dir(str(options.runtime_dir or default_dir), os.environ)
+        runtime_dir = make_runtime_dir(str(options.runtime_dir or processes_of(cfg).runtime_dir), os.environ)
         own_runtime_dir(stack, runtime_dir, is_sim=options.sim)
         sockets: dict[str, socket.socket] = {}
         if options.sim:
@@ -281,10 +262,7 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
         if page.socket is not None:
             sockets["dashboard"] = stack.enter_context(page.socket)
             cfg = cfg.model_copy(update={"dashboard": page.config})
-        if isinstance(cfg, RadioConfig):
-            run_dir = new_run_dir(options, cfg.system, cfg.run.seed)
-        else:
-            run_dir = survey_run_dir(options, cfg)
+        run_dir = make_run_dir(options, cfg)
         stack.enter_context(owned(run_dir / RUN_LOCK, "--run-dir"))
         if options.resume and (done := finished_summary(run_dir)) is not None:
             # Nothing is left of the mission: its record stays as it is.
@@ -300,19 +278,16 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
         return SupervisedRun(options, cfg, run_dir, Endpoints(runtime_dir), sockets, page, started_s).run()
 
 
-def _recover(options: RunOptions) -> int:
+def _recover(options: RunOptions, cfg: Config) -> int:
     """Go on, held, with the run that did not finish; else begin a new one that may be recovered."""
-    options = replace(options, recover=False)
-    found = find_resumable()
-    if found is not None:
-        options = replace(options, run_dir=found, resume=True, held=True)
+    run_dir = find_resumable()
+    if run_dir is not None:
+        options = replace(options, run_dir=run_dir, resume=True, held=True)
     else:
-        cfg = load_config(options.config_file, dict(options.overrides))
         run_dir = default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC)).absolute()
         # An emergency latched when the last run ended stays latched: the robot waits at its base until it is cleared.
         options = replace(options, run_dir=run_dir, held=take_over_emergencies(run_dir))
         mark_resumable(run_dir)
-        found = run_dir
-    status = run_survey(options)
-    clear_finished(status, found)
+    status = _run(options, cfg)
+    clear_finished(status, run_dir)
     return status

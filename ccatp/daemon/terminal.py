@@ -13,9 +13,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
+from ccatp.core import danger_text
 from ccatp.errors import ExitStatus
 from ccatp.links.liveness import RateLimitedLog
-from ccatp.links.topics import MissionStatus, TrackMessage
+from ccatp.links.topics import DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
 from ccatp.records.summary import format_table
 
 LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
@@ -38,14 +39,14 @@ class _BufferedConsole(Console):
 class RunView:
     """Progress and messages on standard error; the summary on standard output."""
 
-    goals = "points"
-
-    def __init__(self, title: str, *, is_sim: bool, run_dir: Path) -> None:
+    def __init__(self, cfg: Config | RadioConfig, *, is_sim: bool, run_dir: Path) -> None:
+        self._is_survey = isinstance(cfg, Config)
         self._console: Console = _BufferedConsole(stderr=True, highlight=False)
         self._is_terminal = self._console.is_terminal
         self._rate_limit = RateLimitedLog(LINES_OF_A_KIND, LINES_PERIOD_S)
         self._has_pose = False
         self._shown_tenths = 0
+        title, self._goals = _title_and_goals(cfg, is_sim=is_sim)
         self._console.print(f"{title}; writing {run_dir}", soft_wrap=True, markup=False)
         self._progress = Progress(
             TextColumn("{task.description}"),
@@ -55,7 +56,7 @@ class RunView:
             console=self._console,
             auto_refresh=False,
         )
-        self._task = self._progress.add_task("SIM" if is_sim else self.goals, total=None, state="starting")
+        self._task = self._progress.add_task("SIM" if is_sim else self._goals, total=None, state="starting")
 
     def __enter__(self) -> Self:
         if self._is_terminal:
@@ -72,16 +73,22 @@ class RunView:
         if shown is not None:
             self._console.print(f"{level}: {shown}", style=STYLES[level], markup=False, soft_wrap=True)
 
-    def pose(self, track: TrackMessage) -> None:
-        """Show the first pose."""
-        if not self._has_pose and track.rows:
+    def show(self, message: Message) -> None:
+        """Show what an operator has to see of a message: progress, lines, the first pose, what danger says."""
+        if isinstance(message, TrackMessage) and not self._has_pose and message.rows:
             self._has_pose = True
-            _, t_s, row, col, x, y, heading, _ = track.rows[-1]
+            _, t_s, row, col, x, y, heading, _ = message.rows[-1]
             where = f"panel {row}-{col}, x {x:.4f} m, y {y:.4f} m, heading {heading:.4f} rad"
             self.show_message("info", f"first pose at {t_s:.2f} s: {where}")
+        elif isinstance(message, MissionStatus):
+            self._show_status(message)
+        elif isinstance(message, LogMessage):
+            self.show_message(message.level, message.text)
+        elif isinstance(message, DangerEvent) and message.code:
+            text = danger_text(message.cause, message.signal, message.value, message.limit)
+            self.show_message("warning", f"danger: code {message.code}, {text}, at {message.t_s:.2f} s")
 
-    def status(self, status: MissionStatus) -> None:
-        """Show points done, state, ETA, error."""
+    def _show_status(self, status: MissionStatus) -> None:
         text = self.text_of(status)
         if self._is_terminal:
             self._progress.update(self._task, completed=status.done, total=status.total, state=text)
@@ -90,15 +97,19 @@ class RunView:
         tenths = 10 * status.done // max(status.total, 1)
         if tenths > self._shown_tenths:
             self._shown_tenths = tenths
-            self._console.print(
-                f"{10 * tenths} %: {status.done} of {status.total} {self.goals}, {text}", soft_wrap=True
-            )
+            done = f"{10 * tenths} %: {status.done} of {status.total} {self._goals}"
+            self._console.print(f"{done}, {text}", soft_wrap=True)
 
     def text_of(self, status: MissionStatus) -> str:
-        """State, place, times, error."""
-        times = f"{clock(status.elapsed_s)} elapsed, {clock(status.eta_s)} to go"
-        arrival = f", arrival {status.error_mm:.2f} mm" if status.error_mm else ""
-        return f"{_where(status.state, status.point)}, {times}{arrival}"
+        """State, place, times, and the error on arrival or the uncertainty of the position."""
+        state, elapsed = status.state, f"{clock(status.elapsed_s)} elapsed"
+        if self._is_survey:
+            arrival = f", arrival {status.error_mm:.2f} mm" if status.error_mm else ""
+            rest = f"{clock(status.eta_s)} to go{arrival}"
+        else:
+            state += f" ({status.cause})" if status.cause else ""
+            rest = f"position known to {0.1 * status.error_mm:.1f} cm"
+        return f"{state} {status.point}".strip() + f", {elapsed}, {rest}"
 
     def show_summary(self, summary: dict[str, Any], *, as_json: bool) -> None:
         """Print JSON alone on standard output, or a table."""
@@ -114,31 +125,15 @@ class RunView:
         self._console.print(f"report  {where}", soft_wrap=True, markup=False)
 
 
-def survey_title(cfg: Config, *, is_sim: bool) -> str:
-    """Headline of a survey."""
-    what = "SIMULATION" if is_sim else "survey"
-    world = f", world {cfg.world.name}, seed {cfg.run.seed}" if is_sim else ""
-    return f"ccatp {what} of {cfg.mirror.name}{world}, filter {cfg.run.filter}"
-
-
-class BeaconRunView(RunView):
-    """View of a mission among beacons."""
-
-    def __init__(self, cfg: RadioConfig, *, is_sim: bool, run_dir: Path) -> None:
-        what, self.goals = ("follow a radio", "seconds") if cfg.follow.is_active else ("visit waypoints", "waypoints")
-        seed = f", seed {cfg.run.seed}" if is_sim else ""
-        title = f"ccatp {'SIMULATION' if is_sim else 'mission'} among beacons: {cfg.system}, {what}{seed}"
-        super().__init__(title, is_sim=is_sim, run_dir=run_dir)
-
-    def text_of(self, status: MissionStatus) -> str:
-        """State, place, time, uncertainty of the position."""
-        cause = f" ({status.cause})" if status.cause else ""
-        where = f"{_where(status.state + cause, status.point)}, {clock(status.elapsed_s)} elapsed"
-        return f"{where}, position known to {0.1 * status.error_mm:.1f} cm"
-
-
-def _where(state: str, point: str) -> str:
-    return f"{state} {point}" if point else state
+def _title_and_goals(cfg: Config | RadioConfig, *, is_sim: bool) -> tuple[str, str]:
+    """Headline of a run, and what is counted in it."""
+    if isinstance(cfg, Config):
+        world = f", world {cfg.world.name}, seed {cfg.run.seed}" if is_sim else ""
+        what = f"{'SIMULATION' if is_sim else 'survey'} of {cfg.mirror.name}{world}, filter {cfg.run.filter}"
+        return f"ccatp {what}", "points"
+    what, goals = ("follow a radio", "seconds") if cfg.follow.is_active else ("visit waypoints", "waypoints")
+    seed = f", seed {cfg.run.seed}" if is_sim else ""
+    return f"ccatp {'SIMULATION' if is_sim else 'mission'} among beacons: {cfg.system}, {what}{seed}", goals
 
 
 def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.FilteringBoundLogger) -> str:

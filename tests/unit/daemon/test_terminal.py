@@ -3,92 +3,99 @@
 import json
 from pathlib import Path
 
-import msgspec
 import pytest
+from msgspec.structs import replace
 
 from ccatp.config.load import load_radio_config
 from ccatp.daemon.process import open_log
 from ccatp.daemon.survey_runner import state_text
-from ccatp.daemon.terminal import BeaconRunView, RunView, survey_title, write_run_report
+from ccatp.daemon.terminal import RunView, write_run_report
 from ccatp.errors import ExitStatus
 from ccatp.links.liveness import RateLimitedLog, kind_of
-from ccatp.links.topics import MissionStatus
+from ccatp.links.topics import DangerEvent, LogMessage, MissionStatus, TrackMessage
 from ccatp.survey.state import MissionState
 from tests.unit.aligning.conftest import load
 from tests.unit.reporting.beacon_recorded import record_beacons
 from tests.unit.run_folder import make_run
 
-
-def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status = MissionStatus(seq=-1, t_s=0.0, state="driving", elapsed_s=61.0, eta_s=9.0, done=1, total=10)
-    view = RunView("x", is_sim=True, run_dir=tmp_path)
-    view.status(status)
-    assert capsys.readouterr().err.splitlines()[-1] == "10 %: 1 of 10 points, driving, 1:01 elapsed, 0:09 to go"
-    at_point = msgspec.structs.replace(status, point="1-2-3", error_mm=0.5)
-    assert view.text_of(at_point) == "driving 1-2-3, 1:01 elapsed, 0:09 to go, arrival 0.50 mm"
-    beacons = BeaconRunView(load_radio_config(None), is_sim=True, run_dir=tmp_path)
-    held = msgspec.structs.replace(status, cause="operator", state="held", error_mm=25.0)
-    assert beacons.text_of(held) == "held (operator), 1:01 elapsed, position known to 2.5 cm"
+CFG, _ = load("fyst-m1")
+STATUS = MissionStatus(seq=-1, t_s=0.0, state="driving", elapsed_s=61.0, eta_s=9.0, done=1, total=10)
 
 
-def test_the_first_line_is_one_line_however_long(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / ("a" * 100) / "[b]"
-    RunView("ccatp SIMULATION of fyst-m1", is_sim=True, run_dir=folder)
-    assert capsys.readouterr().err == f"ccatp SIMULATION of fyst-m1; writing {folder}\n"
-
-
-def test_a_mission_that_goes_on_says_so() -> None:
-    assert state_text(MissionState.HELD, "operator") == "held: operator"
-    assert state_text(MissionState.TURNING, "") == "going on: turning"
-    assert state_text(MissionState.RETURNING, "fire") == "returning: fire"
-    assert state_text(MissionState.HELD, "") == "held"
-
-
-CFG, M1 = load("fyst-m1")
-
-
-@pytest.fixture
-def run_dir(tmp_path: Path) -> Path:
-    return make_run(tmp_path / "run", CFG, [], [], {})
-
-
-def test_a_run_gets_its_report(run_dir: Path) -> None:
-    log = open_log(run_dir / "log.jsonl", "supervisor")
-    assert write_run_report(run_dir, ExitStatus.HELD, log) == str(run_dir / "report.html")
-    assert (run_dir / "report.html").read_text().startswith("<!DOCTYPE html>")
-
-
-def test_an_interrupted_run_does_not_wait_for_one(run_dir: Path) -> None:
-    log = open_log(run_dir / "log.jsonl", "supervisor")
-    assert write_run_report(run_dir, ExitStatus.INTERRUPTED, log) == f"none; make it with: ccatp report {run_dir}"
-    assert not (run_dir / "report.html").exists()
-
-
-def test_a_mission_among_beacons_gets_one(tmp_path: Path) -> None:
-    run_dir = record_beacons(tmp_path / "beacons")
-    log = open_log(run_dir / "log.jsonl", "supervisor")
-    assert write_run_report(run_dir, ExitStatus.COMPLETE, log) == str(run_dir / "report.html")
-    assert "Waypoints among ZigBee beacons" in (run_dir / "report.html").read_text()
-
-
-def test_whatever_goes_wrong_is_logged_and_no_more(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(run_dir: Path) -> None:
-        raise ZeroDivisionError("of nothing")
-
-    monkeypatch.setattr("ccatp.report.run_page.report_run", fail)
-    log = open_log(run_dir / "log.jsonl", "supervisor")
-    assert write_run_report(run_dir, ExitStatus.COMPLETE, log) == f"none; make it with: ccatp report {run_dir}"
-    (line,) = (json.loads(text) for text in (run_dir / "log.jsonl").read_text().splitlines())
-    assert (line["event"], line["level"], line["error"]) == ("report_failed", "error", "ZeroDivisionError: of nothing")
-
-
-def test_the_run_ends_by_naming_it_on_standard_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    view = RunView(survey_title(CFG, is_sim=True), is_sim=True, run_dir=tmp_path)
+def test_a_run_from_its_first_line_to_its_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / ("a" * 100) / "[b]"  # one line, however long, and no markup
+    view = RunView(CFG, is_sim=True, run_dir=folder)
+    event = DangerEvent(seq=1, t_s=2.0, code=0, cause="", signal="", value=0.0, limit=0.0, off=(False,) * 4)
+    row = (1, 0.01, 2, 3, 0.1, 0.2, 0.3, 1e-3)
+    for message in (
+        STATUS,
+        STATUS,  # only every tenth is told
+        TrackMessage(seq=1, t_s=0.0, rows=[row]),
+        TrackMessage(seq=1, t_s=0.0, rows=[row]),  # the first pose only
+        LogMessage(seq=1, t_s=0.0, level="error", process="main", text="held"),
+        event,  # all is well
+        replace(event, code=1, cause="edge", signal="edge_fl"),
+    ):
+        view.show(message)
     view.show_summary({"mirror": "fyst-m1"}, as_json=True)
     view.show_report(str(tmp_path / "report.html"))
     told = capsys.readouterr()
     assert json.loads(told.out) == {"mirror": "fyst-m1"}
-    assert told.err.splitlines()[-1] == f"report  {tmp_path / 'report.html'}"
+    first, *lines, danger, report = told.err.splitlines()
+    assert first == f"ccatp SIMULATION of fyst-m1, world thesis, seed 1, filter ekf; writing {folder}"
+    assert lines == [
+        "10 %: 1 of 10 points, driving, 1:01 elapsed, 0:09 to go",
+        "info: first pose at 0.01 s: panel 2-3, x 0.1000 m, y 0.2000 m, heading 0.3000 rad",
+        "error: held",
+    ]
+    assert danger.startswith("warning: danger: code 1, edge")
+    assert report == f"report  {tmp_path / 'report.html'}"
+
+
+def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    survey = RunView(CFG, is_sim=False, run_dir=tmp_path)
+    at_point = replace(STATUS, point="1-2-3", error_mm=0.5)
+    assert survey.text_of(at_point) == "driving 1-2-3, 1:01 elapsed, 0:09 to go, arrival 0.50 mm"
+    beacons = RunView(load_radio_config(None), is_sim=True, run_dir=tmp_path)
+    held = replace(STATUS, cause="operator", state="held", error_mm=25.0)
+    assert beacons.text_of(held) == "held (operator), 1:01 elapsed, position known to 2.5 cm"
+    titles = [line.partition(";")[0] for line in capsys.readouterr().err.splitlines()]
+    assert titles == [
+        "ccatp survey of fyst-m1, filter ekf",
+        "ccatp SIMULATION among beacons: zigbee, visit waypoints, seed 1",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("state", "cause", "text"),
+    [
+        (MissionState.HELD, "operator", "held: operator"),
+        (MissionState.TURNING, "", "going on: turning"),
+        (MissionState.RETURNING, "fire", "returning: fire"),
+        (MissionState.HELD, "", "held"),
+    ],
+)
+def test_a_mission_that_goes_on_says_so(state: MissionState, cause: str, text: str) -> None:
+    assert state_text(state, cause) == text
+
+
+def test_a_run_gets_its_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_dir = make_run(tmp_path / "run", CFG, [], [], {})
+    log, by_hand = open_log(run_dir / "log.jsonl", "supervisor"), f"none; make it with: ccatp report {run_dir}"
+    # The operator waits for the end of an interrupted one.
+    assert write_run_report(run_dir, ExitStatus.INTERRUPTED, log) == by_hand
+    assert not (run_dir / "report.html").exists()
+    for one, text in ((run_dir, "<!DOCTYPE html>"), (record_beacons(tmp_path / "beacons"), "among ZigBee beacons")):
+        assert write_run_report(one, ExitStatus.HELD, log) == str(one / "report.html")
+        assert text in (one / "report.html").read_text()
+
+    def fail(_run_dir: Path) -> None:
+        raise ZeroDivisionError("of nothing")
+
+    monkeypatch.setattr("ccatp.report.run_page.report_run", fail)
+    assert write_run_report(run_dir, ExitStatus.COMPLETE, log) == by_hand
+    (line,) = (json.loads(text) for text in (run_dir / "log.jsonl").read_text().splitlines())
+    assert (line["event"], line["level"], line["error"]) == ("report_failed", "error", "ZeroDivisionError: of nothing")
 
 
 @pytest.mark.parametrize(
@@ -100,7 +107,6 @@ def test_the_run_ends_by_naming_it_on_standard_error(tmp_path: Path, capsys: pyt
         ("measurement of 1-2-7 failed", "measurement of 1-2-8 failed", False),
         ("panel 1/2", "panel 1/3", False),
         ("robot at 127.0.0.1:7010", "robot at 127.0.0.2:7010", False),
-        ("held", "going on", False),
     ],
 )
 def test_kinds(one: str, other: str, is_same: bool) -> None:
