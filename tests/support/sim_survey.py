@@ -1,8 +1,10 @@
 """Surveys in process, frame by frame: with faults, with a scripted laser system, with main loops that are killed."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future, wait
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
 from itertools import pairwise
 from math import hypot
 from pathlib import Path
@@ -23,34 +25,28 @@ from ccatp.links.topics import FixMessage
 from ccatp.localizer import Localizer
 from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.records.store import MissionStore, PlannedPoint
-from ccatp.sim.fault_plan import FaultPlan, Injected, parse_plan
+from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.studies.faults_study import FaultySilRun
-from ccatp.studies.sil_run import SilResult, SilRun
+from ccatp.studies.sil_run import SilRun
 from ccatp.survey.composition import assemble
 from ccatp.survey.fix_gate import FixGate, nis_of
 from ccatp.survey.heading_recovery import TakeoverState, doubted
 from ccatp.survey.mission import Mission
 from ccatp.survey.state import DRIVING, RETURNING, TURNING, MissionState
-from tests.support.scenario import one_panel
 from tests.support.virtual_time import VirtualLoop
 
 T = TypeVar("T")
 FULL = (1.0, 1.0)
+NO_FAULTS = FaultPlan()
 
 
-def single(fault: str) -> FaultPlan:
-    """A plan of one fault."""
-    return parse_plan("[[fault]]\n" + fault, "plan")
-
-
-def was_real(record: Injected) -> bool:
-    """The fault acted on something and changed it."""
-    return record.samples > 0 and record.changed > 0
-
-
-def short_survey(world: str = "hard", **overrides: object) -> Config:
-    """One panel without the calibration drive in a world."""
-    return one_panel(**{"run__world": world, **overrides})
+def plan_of(*faults: str) -> FaultPlan:
+    """A plan; each fault as in `encoder_right stuck at_s=7.5 value=0.0`."""
+    rows = []
+    for fault in faults:
+        signal, kind, *keys = fault.split()
+        rows.append("\n".join(["[[fault]]", f'signal = "{signal}"', f'type = "{kind}"', *keys]))
+    return parse_plan("\n".join(rows), "plan")
 
 
 # -- watched frame by frame -------------------------------------------------------------------------------------------
@@ -62,7 +58,6 @@ class Seen(NamedTuple):
     t_s: float
     verdict: Verdict
     state: MissionState
-    cause: str
     drive: tuple[float, float]
     pose: DeckPose
     estimate: tuple[float, float]
@@ -79,30 +74,19 @@ class _Enough(Exception):
 class Watched(FaultySilRun):
     """Keeps what happened frame by frame; ends as soon as somebody has seen enough."""
 
-    def __init__(self, cfg: Config, plan: FaultPlan) -> None:
+    def __init__(self, cfg: Config, plan: FaultPlan, is_enough: Callable[[Seen], bool]) -> None:
         super().__init__(cfg, plan)
         self.seen: list[Seen] = []
-        self.is_enough: Callable[[Seen], bool] = lambda _: False
+        self._is_enough = is_enough
 
     def _serve(self, frame: Sensors, dt_s: float) -> None:
         super()._serve(frame, dt_s)
-        deck = self.localizer.deck_pose
-        mission, plant = self.mission, self.robot.world.plant
-        now = Seen(
-            self.robot.t_s, self.monitor.verdict, mission.state, mission.cause, self._driven, plant.pose,
-            (deck.x_m, deck.y_m),
-        )  # fmt: skip
+        deck, robot = self.localizer.deck_pose, self.robot
+        place = robot.world.plant.pose
+        now = Seen(robot.t_s, self.monitor.verdict, self.mission.state, self._driven, place, (deck.x_m, deck.y_m))
         self.seen.append(now)
-        if self.is_enough(now):
+        if self._is_enough(now):
             raise _Enough
-
-    def watch(self, is_enough: Callable[[Seen], bool]) -> SilResult | None:
-        """Run until it is enough, or to the end: then its result."""
-        self.is_enough = is_enough
-        try:
-            return self.run()
-        except _Enough:
-            return None
 
     def since(self, t_s: float) -> list[Seen]:
         return [one for one in self.seen if one.t_s >= t_s - 1e-9]
@@ -122,13 +106,13 @@ class Watched(FaultySilRun):
         return sum(hypot(b.x_m - a.x_m, b.y_m - a.y_m) for a, b in pairwise(poses))
 
 
-def watched(fault: str, cfg: Config, is_enough: Callable[[Seen], bool]) -> Watched:
-    """A watched mission with faults, each as in ``single``, separated by empty lines; each of them really acted."""
-    text = "\n".join("[[fault]]\n" + one for one in fault.strip().split("\n\n")) if fault else ""
-    rehearsal = Watched(cfg, parse_plan(text, "plan"))
-    rehearsal.watch(is_enough)
-    assert all(map(was_real, rehearsal.injected)), "a fault changed nothing"
-    return rehearsal
+def watched(cfg: Config, is_enough: Callable[[Seen], bool], *faults: str) -> Watched:
+    """A watched mission with faults as of ``plan_of``; each of them really acted."""
+    run = Watched(cfg, plan_of(*faults), is_enough)
+    with suppress(_Enough):
+        run.run()
+    assert all(record.samples and record.changed for record in run.injected), "a fault changed nothing"
+    return run
 
 
 # -- measured as the main loop measures -------------------------------------------------------------------------------
@@ -165,9 +149,6 @@ def fix_service(
     measuring_time_s: float = 0.0,
 ) -> FixService:
     """The main loop's fix service; what is not given is there only to be asked."""
-    localizer = localizer or SimpleNamespace(
-        fuse_fix=lambda _fix: 0.0, notices=[], pose=None, pose_covariance=np.eye(3), position_sigma_m=5e-6
-    )
     gate = gate or SimpleNamespace(
         begin=lambda: None, review=lambda *_, **__: SimpleNamespace(doubt="", refusal=""), refusal_of=lambda *_: ""
     )
@@ -175,7 +156,7 @@ def fix_service(
         cfg.mission,
         cast(EtalonClient, SimpleNamespace(measure=measure)),
         cast(FixGate, gate),
-        cast(Localizer, localizer),
+        cast(Localizer, localizer or sightless()),
         cast(Mission, mission),
         store,
         cast(Telemetry, SimpleNamespace(send=publish, notify_operator=notify, seq=0)),
@@ -184,22 +165,67 @@ def fix_service(
     )
 
 
+def sightless(**parts: Any) -> Any:
+    """A localizer that takes every fix and learns nothing of it."""
+    kept = {"notices": [], "pose": None, "pose_covariance": np.eye(3), "position_sigma_m": 5e-6}
+    return SimpleNamespace(**{"fuse_fix": lambda _fix: 0.0, **kept, **parts})
+
+
+@asynccontextmanager
+async def serving(service: FixService) -> AsyncIterator[None]:
+    """The service at work; what ends it is raised."""
+    async with asyncio.TaskGroup() as tasks:
+        task = tasks.create_task(service.run())
+        yield
+        task.cancel()
+
+
+class Desk:
+    """The fix service before a mission that asks for one point after the other.
+
+    Attributes:
+        done, failed: what the mission was told.
+        faults: for which it is held.
+        said: lines for the operator.
+    """
+
+    def __init__(
+        self, cfg: Config, measure: Callable[..., Any], store: MissionStore, measuring_time_s: float = 0.0
+    ) -> None:
+        self.done, self.failed, self.faults, self.said = list[Any](), list[str](), list[str](), list[str]()
+        self.over, self.faulted = asyncio.Event(), asyncio.Event()
+        mission = SimpleNamespace(
+            is_awaiting_fix=True, is_lost=True, request=1, survey=SimpleNamespace(distance_m=lambda _pose: 0.0),
+            fixed=self.done.append, not_fixed=lambda _point, cause: self.failed.append(cause), fault=self._fault,
+        )  # fmt: skip
+        self.service = fix_service(
+            cfg, measure, store, mission, on_finished=self.over.set, notify=lambda _, text: self.said.append(text),
+            measuring_time_s=measuring_time_s,
+        )  # fmt: skip
+
+    def _fault(self, cause: str) -> None:
+        self.faults.append(cause)
+        self.faulted.set()
+
+    def begin(self, point: PointId, expected_m: Vector3 = (0.0, 0.0, 0.0)) -> None:
+        """Ask for a point; ``over`` tells the end."""
+        self.over.clear()
+        self.service.begin(FixRequest(1, 1.0, point, expected_m, DeckPose(0.1, 0.2, 0.3)))
+
+
+@dataclass(slots=True)
 class LaserRequest:
     """One request to the laser system: what the robot knew, what it was told, what was wrong with that."""
 
-    def __init__(self, number: int, t_s: float, point: PointId | None) -> None:
-        self.number, self.t_s, self.point = number, t_s, point
-        self.offset_m = 0.0
-        self.nis = float("nan")
-        self.is_fused = False
+    t_s: float
+    point: PointId | None
+    offset_m: float = 0.0
+    nis: float = float("nan")
+    is_fused: bool = False
 
 
 # Called with a request and the true fix; returns the fix that is given, or raises.
 Laser = Callable[[LaserRequest, Fix], Fix]
-
-
-def honest(_measured: LaserRequest, fix: Fix) -> Fix:
-    return fix
 
 
 def moved(fix: Fix, offset_m: Vector3) -> Fix:
@@ -216,8 +242,10 @@ class MeasuredSurvey(FaultySilRun):
         fans: duties that were commanded, with their time.
     """
 
-    def __init__(self, cfg: Config, folder: Path, laser: Laser = honest, plan: FaultPlan | None = None) -> None:
-        super().__init__(cfg, plan or parse_plan("", "no faults"))
+    def __init__(
+        self, cfg: Config, folder: Path, laser: Laser = lambda _measured, fix: fix, plan: FaultPlan | None = None
+    ) -> None:
+        super().__init__(cfg, plan)
         self.asked: list[LaserRequest] = []
         self.said: list[str] = []
         self.fans: list[tuple[float, tuple[float, float]]] = []
@@ -226,13 +254,11 @@ class MeasuredSurvey(FaultySilRun):
     def run(self) -> Any:
         points = [PlannedPoint(point, 0.0, 0.0) for point in self.parts.points]
         path = self._folder / "mission.sqlite"
-        name = self.mirror.name
         with (
             asyncio.Runner(loop_factory=VirtualLoop) as runner,
-            MissionStore.create(path, mirror=name, seed=1, config_toml="", points=points) as store,
+            MissionStore.create(path, mirror=self.mirror.name, seed=1, config_toml="", points=points) as store,
         ):
-            self._runner, self.store = runner, store
-            self._over = asyncio.Event()
+            self._runner, self._over = runner, asyncio.Event()
             self.service = fix_service(
                 self.cfg,
                 self._ask,
@@ -269,18 +295,12 @@ class MeasuredSurvey(FaultySilRun):
 
     async def _one(self, request: FixRequest) -> None:
         self._over.clear()
-        serving = asyncio.get_running_loop().create_task(self.service.run())
-        self.service.begin(request)
-        over = asyncio.get_running_loop().create_task(self._over.wait())
-        await asyncio.wait([serving, over], return_when=asyncio.FIRST_COMPLETED)
-        if serving.done():
-            over.cancel()
-            serving.result()  # raises what ended it
-        serving.cancel()
-        await asyncio.wait([serving, over])
+        async with serving(self.service):
+            self.service.begin(request)
+            await self._over.wait()
 
     async def _ask(self, t_s: float, expected_m: Vector3) -> Fix:
-        measured = LaserRequest(len(self.asked), t_s, self._request.point)
+        measured = LaserRequest(t_s, self._request.point)
         self.asked.append(measured)
         try:
             true = self.laser.fix(t_s, self.localizer.deck_pose)
@@ -310,7 +330,6 @@ def failing(_measured: LaserRequest, _fix: Fix) -> Fix:
 
 MOVING = (TURNING, DRIVING, RETURNING, MissionState.BACKING_OFF)
 RECORD_FRAMES = 10
-LONGEST_S = 900.0
 
 
 class RestartedSurvey(SilRun):
@@ -331,61 +350,3 @@ class RestartedSurvey(SilRun):
         self.heading_errors_rad: list[float] = []
         self.first_moves_m: list[float] = []
 
-    def run(self) -> SilResult:
-        """As of a rehearsal, with whichever mission is the present one."""
-        robot = self.robot
-        robot.join("monitor")
-        robot.join("controller")
-        self._note_truth()
-        while robot.delivered is None:
-            robot.advance()
-            self._note_truth()
-        robot.command_fans(1, *self.cfg.robot.fan_duty)
-        first_s = robot.delivered.t
-        last_s = first_s - robot.frame_s
-        while not (self.mission.state is MissionState.DONE or self.mission.is_faulted or last_s - first_s > LONGEST_S):
-            frame = robot.delivered
-            self._serve(frame, frame.t - last_s)
-            last_s = frame.t
-            robot.advance()
-            self._note_truth()
-        return self._result(last_s - first_s)
-
-    def _serve(self, frame: Sensors, dt_s: float) -> None:
-        super()._serve(frame, dt_s)
-        if frame.seq % RECORD_FRAMES == 0:
-            localizer = self.localizer
-            sigmas = localizer.position_sigma_m, localizer.heading_sigma_rad
-            speeds = localizer.speed_m_s, localizer.rate_rad_s
-            self._records.append((localizer.deck_pose, sigmas, speeds, self.mission.state))
-        if frame.seq in self._kills:
-            self._die()
-
-    def _die(self) -> None:
-        robot = self.robot
-        self.states.append(self.mission.state)
-        self.done += self.mission.done
-        robot.lose("controller")
-        for _ in range(self._silent_frames):
-            robot.advance()
-            self._note_truth()
-        robot.join("controller")
-        self._take_over()
-
-    def _take_over(self) -> None:
-        cfg = self.cfg
-        pose, sigmas, speeds, state = self._records[-1]
-        limits = cfg.limits.a_max_m_s2, cfg.limits.alpha_max_rad_s2
-        sigma_m, sigma_rad = doubted(sigmas, speeds, limits, stood=state not in MOVING)
-        recovery = TakeoverState(pose, sigma_m, sigma_rad, abort_cause=self.mission.abort_cause)
-        parts = assemble(cfg, self.done, recovery)
-        truth = self.robot.world.plant
-        self.first_moves_m.append(hypot(truth.x_m - pose.x_m, truth.y_m - pose.y_m) / sigma_m)
-        self.heading_errors_rad.append((truth.heading_rad - pose.heading_rad) / sigma_rad)
-        self.localizer, self.mission, self.gate = parts.localizer, parts.mission, parts.gate
-        self.predictor = CommandPredictor(cfg.robot.wheel_lag_s, self.robot.frame_s)
-
-    @property
-    def measured(self) -> list[PointId]:
-        """All points measured, by whichever main loop, in their order."""
-        return self.done + self.mission.done

@@ -11,7 +11,7 @@ SOCKET_S = 0.002
 
 
 class VirtualSelector(selectors.DefaultSelector):
-    """Waits for sockets a moment, for anything else by moving the clock on."""
+    """Waits for sockets, if there are any, a moment, for anything else by moving the clock on."""
 
     now_s = 0.0
 
@@ -19,7 +19,8 @@ class VirtualSelector(selectors.DefaultSelector):
         found = super().select(0)
         if found or timeout == 0:
             return found
-        found = super().select(SOCKET_S if timeout is not None else None)
+        has_sockets = len(self.get_map()) > 1  # one is the loop's own
+        found = super().select((SOCKET_S if has_sockets else 0) if timeout is not None else None)
         if not found and timeout is not None:
             self.now_s += timeout
         return found

@@ -31,7 +31,7 @@ from ccatp.studies.mission_study import (
 from ccatp.studies.results import plain, table
 from ccatp.studies.sil_run import SilTrace
 from ccatp.survey.composition import SurveyParts, assemble
-from tests.support.sim_survey import single
+from tests.support.sim_survey import plan_of
 
 SIGMA_M, SIGMA_RAD = 1e-3, 2e-3
 
@@ -411,8 +411,8 @@ def test_a_real_job(faults: str) -> None:
 
 def test_fans_that_seem_to_fail_on_an_overhang_wait_for_an_operator() -> None:
     fans, other = (
-        single('signal = "fans"\ntype = "off"\nat_s = 5.0'),
-        single('signal = "soc"\ntype = "off"\nat_s = 5.0'),
+        plan_of("fans off at_s=5.0"),
+        plan_of("soc off at_s=5.0"),
     )
     upright, overhanging = (
         build_mirror(load_config(None, {"run.mirror": name}).mirror) for name in ("fyst-m1", "fyst-m2")
