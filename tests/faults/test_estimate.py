@@ -18,8 +18,8 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.state import MissionState
 from tests.faults.linking import Measured
-from tests.support.scenario import config_of
-from tests.support.sim_survey import MeasuredSurvey, RestartedSurvey, short_survey
+from tests.support.scenario import config_of, one_panel
+from tests.support.sim_survey import MeasuredSurvey, RestartedSurvey
 
 # -- a filter that breaks in mid-mission: held in the same frame, found again by one fix ------------------------------
 
@@ -95,7 +95,7 @@ class Broken(MeasuredSurvey):
 def test_a_broken_filter_freezes_holds_and_begins_again_with_a_fix(
     harm: Callable[[Any], None], tmp_path: Path, measured: Measured
 ) -> None:
-    run = type("Harmed", (Broken,), {"harm": staticmethod(harm)})(short_survey("thesis", run__seed=3), tmp_path)
+    run = type("Harmed", (Broken,), {"harm": staticmethod(harm)})(one_panel(run__seed=3), tmp_path)
     result = run.run()
     assert run.broken_at_s is not None
     assert run.held_at_s is not None
@@ -132,7 +132,7 @@ class Leaking(SilRun):
 def test_innovations_stay_within_their_band() -> None:
     found = list[float]()
     for seed in SEEDS:
-        rehearsal = Leaking(config_of(run__world="hard", run__panels=1, run__seed=seed), with_track=False)
+        rehearsal = Leaking(one_panel(run__world="hard", run__seed=seed), with_track=False)
         found += [stop.nis for stop in rehearsal.run().stops]
         assert rehearsal.largest_m_s2 > 0.1
     low, high = (chi2.ppf(share, 2 * len(found)) / len(found) for share in (0.025, 0.975))

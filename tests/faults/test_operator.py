@@ -29,15 +29,11 @@ from ccatp.survey.state import MissionState
 from ccatp.survey.stops import MissionCommand
 from tests.faults.linking import Measured
 from tests.support.mission_story import DT, FREE, FRONT_OFF, Story, from_first_leg
-from tests.support.scenario import config_of, mirror_of
-from tests.support.sim_survey import FULL, MeasuredSurvey, short_survey, single
+from tests.support.scenario import config_of, mirror_of, one_panel
+from tests.support.sim_survey import FULL, MeasuredSurvey, plan_of
 
 SURVEYING = (MissionState.TURNING, MissionState.DRIVING, MissionState.SETTLING, MissionState.MEASURING)
 TABLE_ROWS = [(kind, level, held) for kind in EmergencyKind for level in (False, True) for held in (False, True)]
-
-
-def one_panel(**changes: object) -> Config:
-    return short_survey("thesis", **{"run__seed": 3, **changes})
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +82,7 @@ class Aborted(MeasuredSurvey):
 @pytest.mark.fault("O1")
 @pytest.mark.parametrize("state", [MissionState.DRIVING, MissionState.TURNING, MissionState.MEASURING])
 def test_a_fire_stops_the_wheels_and_leads_home(state: MissionState, tmp_path: Path, measured: Measured) -> None:
-    run = Aborted(one_panel(), tmp_path, state, "fire")
+    run = Aborted(one_panel(run__seed=3), tmp_path, state, "fire")
     result = run.run()
     measured("O1", 1e3 * (run.zero_s - run.raised_s))
     assert run.zero_s - run.raised_s <= 0.1
@@ -102,7 +98,7 @@ def test_a_fire_stops_the_wheels_and_leads_home(state: MissionState, tmp_path: P
 def test_an_earthquake_presses_on_holds_and_leads_home_when_it_is_over(
     state: MissionState, tmp_path: Path, measured: Measured
 ) -> None:
-    run = Aborted(one_panel(run__mirror="fyst-m2"), tmp_path, state, "earthquake", clear_after_s=5.0)
+    run = Aborted(one_panel(run__seed=3, run__mirror="fyst-m2"), tmp_path, state, "earthquake", clear_after_s=5.0)
     result = run.run()
     measured("O1", 1e3 * (run.zero_s - run.raised_s))
     assert run.zero_s - run.raised_s <= 0.1
@@ -490,14 +486,14 @@ def test_the_way_home_from_every_point(measured: Measured) -> None:
 
 # -- O10: the budget --------------------------------------------------------------------------------------------------
 
-SLOW = 'signal = "body"\ntype = "slip"\nat_s = 20.0\nfor_s = 20.0\nfactor = 0.8'
+SLOW = "body slip at_s=20.0 for_s=20.0 factor=0.8"
 
 
 @pytest.mark.fault("O10")
 @pytest.mark.parametrize("budget_s", [45.0, 70.0])
 def test_what_does_not_fit_into_the_budget_is_left_out(budget_s: float, tmp_path: Path, measured: Measured) -> None:
-    cfg = one_panel(run__panels=2, run__budget_s=budget_s, mission__holds_to_budget=True)
-    run = MeasuredSurvey(cfg, tmp_path, plan=single(SLOW))
+    cfg = one_panel(run__seed=3, run__panels=2, run__budget_s=budget_s, mission__holds_to_budget=True)
+    run = MeasuredSurvey(cfg, tmp_path, plan=plan_of(SLOW))
     result = run.run()
     points = result.summary["points"]
     # The same share of an hour.
@@ -514,6 +510,6 @@ def test_a_budget_that_suffices_changes_nothing(tmp_path: Path) -> None:
     with_it, without = tmp_path / "with", tmp_path / "without"
     with_it.mkdir()
     without.mkdir()
-    held = MeasuredSurvey(one_panel(mission__holds_to_budget=True), with_it).run()
-    assert held.summary == MeasuredSurvey(one_panel(), without).run().summary
+    held = MeasuredSurvey(one_panel(run__seed=3, mission__holds_to_budget=True), with_it).run()
+    assert held.summary == MeasuredSurvey(one_panel(run__seed=3), without).run().summary
     assert held.outcome == "complete"

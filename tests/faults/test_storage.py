@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -20,12 +19,11 @@ import pytest
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.daemon import fix_service as measuring
-from ccatp.daemon.fix_service import FixRequest
 from ccatp.daemon.process import LogStream, open_log
 from ccatp.records.recorder import Recorder, iter_messages
 from ccatp.records.store import MissionStore, PlannedPoint, StoreError
 from tests.faults.linking import Measured
-from tests.support.sim_survey import fix_service
+from tests.support.sim_survey import Desk, serving
 
 POINTS = [PointId(row, col, n) for row in range(1, 10) for col in range(1, 9) for n in range(1, 10)][: 77 * 9]
 FIX = Fix(1.5, (1.0, 2.0, 3.0), (1e-12,) * 9, 1.7, (1, 2, 5, 8), 2e-6)
@@ -154,36 +152,8 @@ def test_nobody_waits_for_a_stalled_disk(tmp_path: Path, measured: Measured) -> 
         assert [future.result(timeout=30.0) for future in futures] == list(range(1, 10))
 
 
-class Desk:
-    """The fix service on a real store; mission and laser system are only there to be asked."""
-
-    def __init__(self, config: Config, store: MissionStore) -> None:
-        self.faults, self.said, self.measured = list[str](), list[str](), list[PointId | None]()
-        self.over = asyncio.Event()
-        self.faulted = asyncio.Event()
-
-        async def measure(t_s: float, expected_m: Any) -> Fix:
-            return FIX
-
-        mission = SimpleNamespace(
-            is_awaiting_fix=True,
-            request=1,
-            is_lost=True,
-            fixed=self.measured.append,
-            fault=self._fault,
-            survey=SimpleNamespace(distance_m=lambda pose: 0.0),
-        )
-        self.service = fix_service(
-            config, measure, store, mission, on_finished=self.over.set, notify=lambda _, text: self.said.append(text)
-        )
-
-    def _fault(self, cause: str) -> None:
-        self.faults.append(cause)
-        self.faulted.set()
-
-    def begin(self, point: PointId) -> None:
-        self.over.clear()
-        self.service.begin(FixRequest(1, 1.0, point, (0.0, 0.0, 0.0), POSE))
+async def a_fix(*_: object) -> Fix:
+    return FIX
 
 
 @pytest.mark.fault("P14")
@@ -193,22 +163,19 @@ async def test_the_robot_is_held_where_the_disk_stalls_and_the_point_counts_once
     monkeypatch.setattr(measuring, "SLOW_DISK_S", 0.05)
     monkeypatch.setattr(measuring, "STALLED_DISK_S", 0.15)
     with make(tmp_path / "mission.sqlite", POINTS[:9]) as store:
-        desk = Desk(config, store)
-        serving = asyncio.get_running_loop().create_task(desk.service.run())
-        release = stall(store)
-        desk.begin(POINTS[0])
-        async with asyncio.timeout(20.0):
+        desk = Desk(config, a_fix, store)
+        async with serving(desk.service), asyncio.timeout(20.0):
+            release = stall(store)
+            desk.begin(POINTS[0])
             await desk.faulted.wait()
-        assert any("the disk is slow: point 1-1-1" in text for text in desk.said)
-        assert "the disk stalls: point 1-1-1 is not stored" in desk.faults[0]
-        assert desk.measured == []
-        desk.over.clear()
-        release.set()
-        async with asyncio.timeout(20.0):
+            assert any("the disk is slow: point 1-1-1" in text for text in desk.said)
+            assert "the disk stalls: point 1-1-1 is not stored" in desk.faults[0]
+            assert desk.done == []
+            desk.over.clear()
+            release.set()
             await desk.over.wait()
-        assert desk.measured == [POINTS[0]]
+        assert desk.done == [POINTS[0]]
         assert store.measured_points() == {POINTS[0]}
-        serving.cancel()
 
 
 # -- P15: a disk that is broken ---------------------------------------------------------------------------------------
@@ -266,15 +233,13 @@ async def test_a_broken_disk_holds_the_robot_with_the_reason(tmp_path: Path, con
     with make(tmp_path / "mission.sqlite", POINTS[:9]) as store:
         broken = Broken(store._db, "SQLITE_IOERR_FSYNC")
         store._db = cast(sqlite3.Connection, broken)
-        desk = Desk(config, store)
-        serving = asyncio.get_running_loop().create_task(desk.service.run())
+        desk = Desk(config, a_fix, store)
         broken.is_armed = True
-        for point in POINTS[:2]:
-            desk.begin(point)
-            async with asyncio.timeout(20.0):
+        async with serving(desk.service), asyncio.timeout(20.0):
+            for point in POINTS[:2]:
+                desk.begin(point)
                 await desk.over.wait()
-        serving.cancel()
-    assert desk.measured == []
+    assert desk.done == []
     assert len(desk.faults) == 2
     assert "the fix of point 1-1-1 cannot be stored" in desk.faults[0]
     assert "SQLITE_IOERR_FSYNC" in desk.faults[1]

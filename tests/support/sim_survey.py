@@ -167,7 +167,7 @@ def fix_service(
 
 def sightless(**parts: Any) -> Any:
     """A localizer that takes every fix and learns nothing of it."""
-    kept = {"notices": [], "pose": None, "pose_covariance": np.eye(3), "position_sigma_m": 5e-6}
+    kept: dict[str, Any] = {"notices": [], "pose": None, "pose_covariance": np.eye(3), "position_sigma_m": 5e-6}
     return SimpleNamespace(**{"fuse_fix": lambda _fix: 0.0, **kept, **parts})
 
 
@@ -243,7 +243,7 @@ class MeasuredSurvey(FaultySilRun):
     """
 
     def __init__(
-        self, cfg: Config, folder: Path, laser: Laser = lambda _measured, fix: fix, plan: FaultPlan | None = None
+        self, cfg: Config, folder: Path, laser: Laser = lambda _measured, fix: fix, plan: FaultPlan = NO_FAULTS
     ) -> None:
         super().__init__(cfg, plan)
         self.asked: list[LaserRequest] = []
@@ -329,7 +329,7 @@ def failing(_measured: LaserRequest, _fix: Fix) -> Fix:
 # -- main loops that are killed ----------------------------------------------------------------------------------------
 
 MOVING = (TURNING, DRIVING, RETURNING, MissionState.BACKING_OFF)
-RECORD_FRAMES = 10
+RECORD_FRAMES, SILENT_FRAMES = 10, 150
 
 
 class RestartedSurvey(SilRun):
@@ -337,16 +337,51 @@ class RestartedSurvey(SilRun):
 
     Args:
         cfg: the configuration.
-        kills: numbers of the frames after which main is gone.
-        silent_frames: for how long the robot is without a controller, each time.
+        kills: numbers of the frames after which main is gone; each time there is no controller for 1.5 s.
     """
 
-    def __init__(self, cfg: Config, kills: set[int], silent_frames: int = 150) -> None:
+    def __init__(self, cfg: Config, kills: set[int]) -> None:
         super().__init__(cfg, with_track=False)
-        self._kills, self._silent_frames = kills, silent_frames
+        self._kills = kills
         self._records: list[tuple[DeckPose, tuple[float, float], tuple[float, float], MissionState]] = []
         self.done: list[PointId] = []
         self.states: list[MissionState] = []
-        self.heading_errors_rad: list[float] = []
         self.first_moves_m: list[float] = []
 
+    def _serve(self, frame: Sensors, dt_s: float) -> None:
+        super()._serve(frame, dt_s)
+        if frame.seq % RECORD_FRAMES == 0:
+            localizer = self.localizer
+            sigmas = localizer.position_sigma_m, localizer.heading_sigma_rad
+            speeds = localizer.speed_m_s, localizer.rate_rad_s
+            self._records.append((localizer.deck_pose, sigmas, speeds, self.mission.state))
+        if frame.seq in self._kills:
+            self._die()
+
+    def _die(self) -> None:
+        robot = self.robot
+        self.states.append(self.mission.state)
+        self.done += self.mission.done
+        robot.lose("controller")
+        for _ in range(SILENT_FRAMES):
+            robot.advance()
+            self._note_truth()
+        robot.join("controller")
+        self._take_over()
+
+    def _take_over(self) -> None:
+        cfg = self.cfg
+        pose, sigmas, speeds, state = self._records[-1]
+        limits = cfg.limits.a_max_m_s2, cfg.limits.alpha_max_rad_s2
+        sigma_m, sigma_rad = doubted(sigmas, speeds, limits, stood=state not in MOVING)
+        recovery = TakeoverState(pose, sigma_m, sigma_rad, abort_cause=self.mission.abort_cause)
+        parts = assemble(cfg, self.done, recovery)
+        truth = self.robot.world.plant
+        self.first_moves_m.append(hypot(truth.x_m - pose.x_m, truth.y_m - pose.y_m) / sigma_m)
+        self.localizer, self.mission, self.gate = parts.localizer, parts.mission, parts.gate
+        self.predictor = CommandPredictor(cfg.robot.wheel_lag_s, self.robot.frame_s)
+
+    @property
+    def measured(self) -> list[PointId]:
+        """All points measured, by whichever main loop, in their order."""
+        return self.done + self.mission.done
