@@ -6,8 +6,7 @@ makes another, so that a late reply can never answer it. A fix is a function of 
 
 import asyncio
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Awaitable, Callable, Sequence
 from math import dist
 from typing import NamedTuple, TypeVar, cast
 
@@ -25,20 +24,14 @@ from ccatp.links.multiline import (
     Environment,
     LaserReady,
     MultilineRequest,
-    Notice,
     Remark,
-    Reply,
 )
 from ccatp.links.robot_messages import LineBuffer, LineTooLong
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 
-PushQueue = asyncio.Queue[bytes | None]  # lines of the push stream; None: the connection is gone
-
-_STREAM_LINES = 64  # lines of the push stream kept for a slow reader; older ones are dropped
-
 
 class EtalonLink(asyncio.Protocol):
-    """One connection: a line asked for at a time, or the lines of the push stream.
+    """One connection: a line is asked for at a time.
 
     Attributes:
         fault: why it must not be used again; empty while it may.
@@ -47,7 +40,6 @@ class EtalonLink(asyncio.Protocol):
     def __init__(self) -> None:
         self.fault = ""
         self._unasked = False
-        self._stream: PushQueue | None = None
         self._lines = LineBuffer(multiline.MAX_LINE_BYTES)
         self._waiting: asyncio.Future[bytes] | None = None
         self._transport: asyncio.Transport | None = None
@@ -57,36 +49,24 @@ class EtalonLink(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         for line in self._lines.feed(data):
-            if not self.fault:
-                self._deliver(line.rstrip(b"\r"))
+            if self.fault:
+                break
+            if self._waiting is not None and not self._waiting.done():
+                self._waiting.set_result(line.rstrip(b"\r"))
+            else:
+                self._unasked = True
+                self._fail(ConnectionError("server sent a line unasked"))
         if self._lines.error is not None:
             self._fail(self._lines.error)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._fail(ConnectionError(f"connection lost: {exc}" if exc else "server closed the connection"))
 
-    def _deliver(self, line: bytes) -> None:
-        if self._stream is not None:
-            self._push(self._stream, line)
-        elif self._waiting is not None and not self._waiting.done():
-            self._waiting.set_result(line)
-        else:
-            self._unasked = True
-            self._fail(ConnectionError("server sent a line unasked"))
-
     def _fail(self, error: Exception) -> None:
         self.fault = self.fault or str(error)
         if self._waiting is not None and not self._waiting.done():
             self._waiting.set_exception(error)
-        if self._stream is not None:
-            self._push(self._stream, None)
         self.abort()
-
-    @staticmethod
-    def _push(stream: PushQueue, line: bytes | None) -> None:
-        if stream.full():
-            stream.get_nowait()
-        stream.put_nowait(line)
 
     @property
     def has_leftovers(self) -> bool:
@@ -100,24 +80,11 @@ class EtalonLink(asyncio.Protocol):
             ConnectionError: the connection is lost.
             LineTooLong: the reply never ends.
         """
-        self._waiting = asyncio.get_running_loop().create_future()
-        self.send(request)
-        return await self._waiting
-
-    def start_stream(self) -> PushQueue:
-        """From now on, lines go into the queue returned."""
-        self._stream = asyncio.Queue(_STREAM_LINES)
-        return self._stream
-
-    def send(self, request: MultilineRequest) -> None:
-        """Send without waiting for anything.
-
-        Raises:
-            ConnectionError: the connection is lost.
-        """
         if self._transport is None or self.fault:
             raise ConnectionError(self.fault or "not connected")
+        self._waiting = asyncio.get_running_loop().create_future()
         self._transport.write(multiline.format_request(request))
+        return await self._waiting
 
     def abort(self) -> None:
         """Close at once; the other end's bytes, sent or to come, are lost."""
@@ -145,20 +112,11 @@ class EtalonBadReply(EtalonError):
 
 
 class EtalonServerError(EtalonError):
-    """The server reports an error. ``code`` is its number, ``None`` where it refused the request in words."""
-
-    def __init__(self, message: str, code: int | None) -> None:
-        super().__init__(message)
-        self.code = code
+    """The server reports an error: its number, or that it refused the request, in words."""
 
 
 class TooFewChannels(EtalonError):
-    """Fewer than four valid lengths. ``reasons`` says by channel why it was dropped."""
-
-    def __init__(self, message: str, valid: tuple[int, ...], reasons: dict[int, str]) -> None:
-        super().__init__(message)
-        self.valid = valid
-        self.reasons = reasons
+    """Fewer than four valid lengths."""
 
 
 class StaleLengths(EtalonError):
@@ -179,7 +137,7 @@ class BadSolution(EtalonError):
 _NEEDED_CHANNELS = 4
 _MOVED_M = 0.005  # further apart than this two places have different lengths
 
-_ReplyT = TypeVar("_ReplyT", Connected, LaserReady, Environment, ChannelData, Notice)
+_ReplyT = TypeVar("_ReplyT", Connected, LaserReady, Environment, ChannelData)
 _T = TypeVar("_T")
 
 
@@ -253,60 +211,6 @@ class EtalonClient:
         async with self._turn:
             return await self._retry(lambda: self._measure_once(t_s, expected_position_m))
 
-    @asynccontextmanager
-    async def stream(self) -> AsyncIterator[AsyncIterator[ChannelData]]:
-        """The server's continuous mode: yields an iterator over pushed records, on a connection of its own.
-
-        No request is sent while it runs. On leaving, the measurement is stopped and the connection closed.
-
-        Raises:
-            EtalonError: no start, or (from the iterator) no line within the deadline of a request.
-        """
-        async with self._turn:
-            self._drop()
-            link = await self._usable_link()
-            queue = link.start_stream()
-            try:
-                await self._command(link, queue, Command.START_MEASUREMENT, Notice.STARTED)
-                try:
-                    yield self._pushed(queue)
-                except BaseException:
-                    # The server must not go on measuring; the first error is the one to report.
-                    with suppress(EtalonError):
-                        await self._command(link, queue, Command.STOP_MEASUREMENT, Notice.STOPPED)
-                    raise
-                await self._command(link, queue, Command.STOP_MEASUREMENT, Notice.STOPPED)
-            finally:
-                self._drop()
-
-    async def _pushed(self, queue: PushQueue) -> AsyncIterator[ChannelData]:
-        while (reply := await self._next_pushed(queue)) is not Notice.FINISHED:
-            if isinstance(reply, ChannelData):
-                yield reply
-
-    async def _command(self, link: EtalonLink, queue: PushQueue, command: Command, awaited: Notice) -> None:
-        """Start or stop the stream; records that were already on their way are passed over."""
-        try:
-            link.send(MultilineRequest(command))
-        except ConnectionError as error:
-            raise EtalonUnreachable(f"{self._where}: {error}; is it running?") from None
-        while (reply := await self._next_pushed(queue)) is not awaited:
-            self._refuse_remark(reply, command)
-
-    async def _next_pushed(self, queue: PushQueue) -> Reply:
-        try:
-            async with asyncio.timeout(self._cfg.request_timeout_s):
-                line = await queue.get()
-        except TimeoutError:
-            raise self._timeout("the push stream") from None
-        if line is None:
-            fault = self._link.fault if self._link else "closed"
-            raise EtalonUnreachable(f"{self._where}: {fault} in the push stream; is it running?")
-        try:
-            return multiline.parse_reply(line)
-        except multiline.BadReply as error:
-            raise EtalonBadReply(f"{self._where}: {error}; is this a MultiLine server?") from None
-
     async def _retry(self, attempt: Callable[[], Awaitable[_T]]) -> _T:
         """Try up to ``retries`` times more. What needs a new measurement waits for one, what needs a server for it.
 
@@ -367,12 +271,16 @@ class EtalonClient:
             reply = multiline.parse_reply(line)
             if link.has_leftovers:
                 raise multiline.BadReply("more than one line in reply to one request")
-            self._refuse_remark(reply, request.command)
+            if isinstance(reply, Remark) and reply.name == "error":
+                raise EtalonServerError(f"{self._where}: refused {request.command}: {reply.text!r}; see its log")
             if not isinstance(reply, expected):
                 raise multiline.BadReply(f"{type(reply).__name__} in reply to {request.command}")
         except TimeoutError:
             self._drop()
-            raise self._timeout(request.command) from None
+            raise EtalonTimeout(
+                f"{self._where}: no reply to {request.command} within {self._cfg.request_timeout_s} s; restart its "
+                "laser driver or raise [etalon] request_timeout_s"
+            ) from None
         except (multiline.BadReply, LineTooLong) as error:
             self._drop()
             raise EtalonBadReply(f"{self._where}: {error}; is this a MultiLine server?") from None
@@ -384,14 +292,6 @@ class EtalonClient:
             raise
         return reply
 
-    def _timeout(self, request: str) -> EtalonTimeout:
-        hint = "restart its laser driver or raise [etalon] request_timeout_s"
-        return EtalonTimeout(f"{self._where}: no reply to {request} within {self._cfg.request_timeout_s} s; {hint}")
-
-    def _refuse_remark(self, reply: Reply, request: str) -> None:
-        if isinstance(reply, Remark) and reply.name == "error":
-            raise EtalonServerError(f"{self._where}: refused {request}: {reply.text!r}; see its log", None)
-
     async def _ask_readiness(self) -> Readiness:
         connected = await self._ask(MultilineRequest(Command.IS_CONNECTED), Connected)
         laser_ready = await self._ask(MultilineRequest(Command.LASER_READY), LaserReady)
@@ -401,15 +301,13 @@ class EtalonClient:
     async def _measure_once(self, t_s: float, expected_m: Vector3) -> Fix:
         data = await self._ask(self._request, ChannelData)
         if data.server_error:
-            raise EtalonServerError(f"{self._where}: server error {data.server_error}; see its log", data.server_error)
+            raise EtalonServerError(f"{self._where}: server error {data.server_error}; see its log")
         lengths_m, reasons = multiline.valid_lengths(data, self._channels)
         valid = tuple(lengths_m)
         if len(valid) < _NEEDED_CHANNELS:
             dropped = ", ".join(f"{channel}: {reason}" for channel, reason in reasons.items())
             raise TooFewChannels(
-                f"{self._where}: {len(valid)} valid channels, {_NEEDED_CHANNELS} needed ({dropped}); clear the beams",
-                valid,
-                reasons,
+                f"{self._where}: {len(valid)} valid channels, {_NEEDED_CHANNELS} needed ({dropped}); clear the beams"
             )
         self._refuse_old(lengths_m, expected_m)
         try:

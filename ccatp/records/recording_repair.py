@@ -12,10 +12,9 @@ from io import SEEK_END, BytesIO
 from pathlib import Path
 from typing import Any
 
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, McapRecord, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
@@ -29,16 +28,6 @@ _HEAD = struct.Struct("<BQ")
 _TO_COMPRESSION = _HEAD.size + 8 + 8 + 8 + 4
 _COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
 _LAST_OPCODE = max(opcode.value for opcode in Opcode)
-_READ: Mapping[int, Any] = {
-    Opcode.HEADER: Header,
-    Opcode.FOOTER: Footer,
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.CHUNK: Chunk,
-    Opcode.ATTACHMENT: Attachment,
-    Opcode.METADATA: Metadata,
-    Opcode.DATA_END: DataEnd,
-}
 _NS = 1e9
 _HOUR_S = 3600.0
 
@@ -112,17 +101,12 @@ def _end_of_record(data: mmap.mmap, at: int) -> int | None:
 
 
 def _parsed(data: mmap.mmap, at: int, end: int) -> list[McapRecord] | None:
-    """The records in a record: those of a chunk, itself, or none where it is of no interest; ``None`` if damaged."""
-    opcode, body = data[at], data[at + _HEAD.size : end]
-    stream = ReadDataStream(BytesIO(body))
+    """The records in a record: those of a chunk, or itself; ``None`` if damaged."""
+    stream = BytesIO(data[at:end])
     try:
-        if opcode == Opcode.MESSAGE:
-            return [Message.read(stream, len(body))]
-        if opcode not in _READ:
-            return []
-        record: McapRecord = _READ[opcode].read(stream)
+        record = next(StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=None).records)
         return breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
-    except DAMAGE:
+    except (StopIteration, *DAMAGE):
         return None
 
 

@@ -182,21 +182,17 @@ async def test_four_channels_suffice_and_three_do_not(server: ScriptedServer) ->
         fix = await client.measure(0.0, EXPECTED)
         assert fix.channels == (1, 4, 6, 8)
         assert_at(fix, PUCK)
-        with pytest.raises(TooFewChannels, match=r"3 valid channels, 4 needed \(2: absent, 3: absent") as caught:
+        with pytest.raises(TooFewChannels, match=r"3 valid channels, 4 needed \(2: absent, 3: absent.*8: absent"):
             await client.measure(0.0, EXPECTED)
-        assert caught.value.valid == (1, 4, 6)
-        assert caught.value.reasons[8] == "absent"
 
 
 async def test_a_server_error_is_reported_with_its_code(server: ScriptedServer) -> None:
     server.script += [lengths(server_error=3), format_reply(Remark("error", "busy"))]
     async with client_of(server.port) as client:
-        with pytest.raises(EtalonServerError, match="server error 3; see its log") as caught:
+        with pytest.raises(EtalonServerError, match="server error 3; see its log"):
             await client.measure(0.0, EXPECTED)
-        assert caught.value.code == 3
-        with pytest.raises(EtalonServerError, match="refused latestlengthvalid: 'busy'") as caught:
+        with pytest.raises(EtalonServerError, match="refused latestlengthvalid: 'busy'"):
             await client.measure(0.0, EXPECTED)
-        assert caught.value.code is None
         assert_at(await client.measure(0.0, EXPECTED), PUCK)
 
 
@@ -370,83 +366,6 @@ async def test_two_measurements_at_a_time_take_turns(server: ScriptedServer) -> 
     assert_at(first, PUCK)
     assert_at(second, ELSEWHERE)
     assert server.connections == 1
-
-
-async def test_the_stream_starts_pushes_and_stops(server: ScriptedServer) -> None:
-    async def push(writer: asyncio.StreamWriter) -> None:
-        # In one piece: the first record must not count as unasked.
-        writer.write(b"measstarted\r\n" + lengths() + b"defanadata_1,2\r\n" + lengths(ELSEWHERE))
-
-    server.script += [lengths(), push, lengths() + b"measstopped\r\n"]
-    async with client_of(server.port) as client:
-        await client.measure(0.0, EXPECTED)
-        async with client.stream() as pushed:
-            assert [(await anext(pushed)).records for _ in range(2)] == [
-                tuple(records()),
-                tuple(records(ELSEWHERE)),
-            ]
-        assert server.asked[1:] == [b"startmeasnogui\r\n", b"stopmeasnogui\r\n"]
-        assert_at(await client.measure(1.0, EXPECTED), PUCK)
-        assert server.connections == 3  # the stream has one of its own
-
-
-async def test_the_stream_ends_when_the_server_has_finished(server: ScriptedServer) -> None:
-    server.script += [b"measstarted\r\n" + lengths() + b"measurementfinished\r\n", b"measstopped\r\n"]
-    async with client_of(server.port) as client, client.stream() as pushed:
-        assert [data.server_error async for data in pushed] == [0]
-
-
-async def test_a_slow_reader_of_the_stream_gets_the_newest_records(server: ScriptedServer) -> None:
-    server.script += [b"measstarted\r\n", b"measstopped\r\n"]
-    async with client_of(server.port) as client, client.stream() as pushed:
-        assert client._link is not None
-        for code in range(100):
-            client._link.data_received(format_reply(ChannelData((), code)))
-        assert [(await anext(pushed)).server_error for _ in range(64)] == list(range(36, 100))
-
-
-@pytest.mark.parametrize(
-    ("start", "error", "match"),
-    [
-        (b"error_busy\r\n", EtalonServerError, "refused startmeasnogui: 'busy'"),
-        (silence, EtalonTimeout, r"no reply to the push stream within 0\.05 s"),
-        (b"junk\r\n", EtalonBadReply, "bad reply 'junk'"),
-        (hang_up, EtalonUnreachable, "server closed the connection in the push stream"),
-        (flood, EtalonUnreachable, "line of more than 65536 bytes in the push stream"),
-    ],
-)
-async def test_a_stream_that_does_not_start_is_a_typed_error(
-    server: ScriptedServer, start: Action, error: type[EtalonError], match: str
-) -> None:
-    server.script.append(start)
-    async with client_of(server.port, request_timeout_s=0.05) as client:
-        with pytest.raises(error, match=match):
-            async with client.stream():
-                pass
-        assert_at(await client.measure(1.0, EXPECTED), PUCK)
-
-
-async def test_leaving_the_stream_by_an_error_still_stops_the_server(server: ScriptedServer) -> None:
-    server.script += [b"measstarted\r\n", b"measstopped\r\n"]
-    async with client_of(server.port) as client:
-        with pytest.raises(KeyError, match="mine"):
-            async with client.stream():
-                raise KeyError("mine")
-    assert server.asked[-1] == b"stopmeasnogui\r\n"
-
-
-async def stream_past_the_end_of(server: ScriptedServer, client: EtalonClient) -> None:
-    async with client.stream() as pushed:
-        await server.stop()
-        await anext(pushed)
-
-
-async def test_a_stream_whose_connection_is_lost_reports_it_first(server: ScriptedServer) -> None:
-    server.script += [b"measstarted\r\n"]
-    async with client_of(server.port, request_timeout_s=0.05) as client:
-        with pytest.raises(EtalonUnreachable, match="server closed the connection in the push stream"):
-            await stream_past_the_end_of(server, client)
-    await server.start()
 
 
 @pytest.mark.fault("E9")
