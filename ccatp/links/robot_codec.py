@@ -84,7 +84,25 @@ def decode_from_client(line: bytes) -> FromClient | Unknown:
     return message
 
 
-def encode(message: FromRobot | FromClient) -> bytes:
+class RobotFrame(RobotLinkMessage, tag="sensors"):
+    """A frame as it is encoded: the fields of ``Sensors`` in the same places, samples as plain tuples (finite, SI).
+
+    Making named tuples of twenty samples takes as long as reading them, so it waits until names are needed.
+    """
+
+    seq: int
+    t: float
+    imu: Sequence[tuple[float, float, float]]
+    enc: Sequence[tuple[float, float | None, float | None]]
+    edge: Sequence[tuple[float, int, int, int, int]]
+    gravity: tuple[float, float, float, float] | None
+    fans: tuple[float, float]
+    soc: float
+    cmd: CommandEcho
+    faults: Sequence[str]
+
+
+def encode(message: FromRobot | FromClient | RobotFrame) -> bytes:
     """The message as one line with its LF.
 
     Raises:
@@ -124,38 +142,6 @@ def format_permit(seq: int, ack: int, forward: bool, reverse: bool, turn: bool) 
         b"true" if reverse else b"false",
         b"true" if turn else b"false",
     )
-
-
-def encode_sensors(
-    seq: int,
-    t_s: float,
-    imu: Sequence[tuple[float, float, float]],
-    enc: Sequence[tuple[float, float | None, float | None]],
-    edge: Sequence[tuple[float, int, int, int, int]],
-    gravity: tuple[float, float, float, float] | None,
-    fans: tuple[float, float],
-    soc: float,
-    cmd: tuple[int, float, float, bool],
-    faults: Sequence[str],
-) -> bytes:
-    """A sensors frame as one line, from plain tuples in the order of the wire (finite numbers, SI units)."""
-    frame = _SensorsOut(seq, t_s, imu, enc, edge, gravity, fans, soc, CommandEcho(*cmd), faults)
-    return _encoder.encode(frame) + b"\n"
-
-
-class _SensorsOut(RobotLinkMessage, tag="sensors"):
-    """Sensors as they are encoded: plain tuples cost a tenth of named ones."""
-
-    seq: int
-    t: float
-    imu: Any
-    enc: Any
-    edge: Any
-    gravity: Any
-    fans: tuple[float, float]
-    soc: float
-    cmd: CommandEcho
-    faults: Any
 
 
 def join_mac(key: bytes, nonce: str, role: str) -> str:

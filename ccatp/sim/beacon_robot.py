@@ -15,8 +15,8 @@ import numpy as np
 
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.links.beacon_messages import BeaconFrame, RadioSample, RadioScan, SteerSample, with_extras
-from ccatp.links.robot_codec import encode_sensors
-from ccatp.links.robot_messages import RobotData, VehicleData
+from ccatp.links.robot_codec import RobotFrame, encode
+from ccatp.links.robot_messages import CommandEcho, RobotData, VehicleData
 from ccatp.links.topics import BeaconPlaces, BeaconTruth
 from ccatp.sim.motes import MoteListener, TrueMotes, true_motes
 from ccatp.sim.radio import Packet, SimDriveCommand, WorldFrame
@@ -115,7 +115,7 @@ class BeaconRobot(SimulatedRobot):
     def _read(self, frame: WorldFrame | None) -> None:
         t_s = self.t_s
         seq, age_s, permit_age_s, is_held = self.rules.echo(t_s)
-        cmd = seq, round(age_s, 6), round(permit_age_s, 6), is_held
+        cmd = CommandEcho(seq, round(age_s, 6), round(permit_age_s, 6), is_held)
         wheels: list[tuple[float, float, float]] = []
         extras = BeaconFrame()
         if frame is not None:
@@ -130,8 +130,8 @@ class BeaconRobot(SimulatedRobot):
                 distances=list(frame.distances_m),
                 motes=[] if self._listener is None else self._listener.receive(t_s, self.world.pose),
             )
-        line = encode_sensors(self.seq, t_s, (), wheels, (), None, (0.0, 0.0), 1.0, cmd, ())
-        self._line = with_extras(line, extras)
+        line = RobotFrame(self.seq, t_s, (), wheels, (), None, (0.0, 0.0), 1.0, cmd, ())
+        self._line = with_extras(encode(line), extras)
 
 
 def _scan(t_s: float, packets: tuple[Packet, ...], readings: int) -> RadioScan | None:

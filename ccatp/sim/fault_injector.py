@@ -23,13 +23,12 @@ import msgspec
 import numpy as np
 
 from ccatp.core import Vector3
-from ccatp.links.robot_codec import BadLine, decode_from_robot
+from ccatp.links.robot_codec import BadLine, RobotFrame, decode_from_robot, encode
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_plan import SIGNALS, FaultPlan, Injected, InjectedFault
 from ccatp.sim.plant import LEVEL_SLOPE, BodyStep, Disturbance, Plant, downhill
 from ccatp.sim.rules import FanRules
-from ccatp.sim.sensors import RobotFrame, as_line
 from ccatp.sim.world import World
 
 Reading = tuple[float, ...]
@@ -423,7 +422,7 @@ class Injector:
         self.outgoing = NOTHING if frame is None else self._send(t_s, frame)
 
     def _send(self, t_s: float, frame: RobotFrame) -> Outgoing:
-        line = as_line(frame)
+        line = encode(frame)
         for mark, token in _MARKS:
             line = line.replace(mark, token)
         withheld, self._withheld = self._withheld, b""

@@ -26,13 +26,14 @@ import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.core import DeckPose
+from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_messages import MAX_LINE_BYTES, CommandEcho, RobotData, Sensors
 from ccatp.links.topics import Misalignment, TruthMessage
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_injector import Injector
 from ccatp.sim.fault_plan import FaultPlan
 from ccatp.sim.rules import SimulatedRobot
-from ccatp.sim.sensors import RobotFrame, SensorSuite, as_line, as_message
+from ccatp.sim.sensors import SensorSuite, as_message
 from ccatp.sim.world import TruthRow, World
 
 # Worst case of a frame's line: fixed part, and bytes per sample of each list. Counted rates have all their digits.
@@ -171,7 +172,7 @@ class Robot(SimulatedRobot):
             return self.injector.outgoing.line
         frame = self.delivered_rows
         if not self._line and frame is not None:
-            self._line = as_line(frame)
+            self._line = encode(frame)
         return self._line
 
     def _read(self) -> None:

@@ -17,8 +17,8 @@ import numpy as np
 
 from ccatp.config.models import Config, PanelsConfig, WorldConfig
 from ccatp.core import DeckPose, EdgeSample, GravitySample, ImuSample, PanelId, Vector3, WheelSample
-from ccatp.links.robot_codec import encode_sensors
-from ccatp.links.robot_messages import CommandEcho, Sensors
+from ccatp.links.robot_codec import RobotFrame
+from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.plant import BLOCK, WHOLE, DriftingBias, Plant, noise_stream
 
@@ -411,30 +411,6 @@ class SensorSuite:
         gx, gy, gz = self._gravity_on_deck
         (hx, hy, hz), (lx, ly, lz), (nx, ny, nz) = self._mirror.robot_axes(pose)
         return hx * gx + hy * gy + hz * gz, lx * gx + ly * gy + lz * gz, nx * gx + ny * gy + nz * gz
-
-
-class RobotFrame(msgspec.Struct, frozen=True, gc=False):
-    """A frame as it was read: the fields of ``Sensors``, in the same places, with samples as plain tuples.
-
-    Making named tuples of twenty samples takes as long as reading them, so it waits until names are needed.
-    """
-
-    seq: int
-    t: float
-    imu: list[ImuTuple]
-    enc: list[WheelTuple]
-    edge: list[EdgeTuple]
-    gravity: GravityTuple | None
-    fans: tuple[float, float]
-    soc: float
-    cmd: CommandEcho
-    faults: tuple[str, ...]
-
-
-def as_line(frame: RobotFrame) -> bytes:
-    """The frame as a line with its LF."""
-    seq, t_s, imu, encoders, edges, gravity, fans, soc, cmd, faults = msgspec.structs.astuple(frame)
-    return encode_sensors(seq, t_s, imu, encoders, edges, gravity, fans, soc, msgspec.structs.astuple(cmd), faults)
 
 
 def as_message(frame: RobotFrame) -> Sensors:

@@ -11,10 +11,10 @@ from ccatp.core import EdgeSample, GravitySample, ImuSample, WheelSample
 from ccatp.links import multiline
 from ccatp.links.robot_codec import (
     BadLine,
+    RobotFrame,
     decode_from_client,
     decode_from_robot,
     encode,
-    encode_sensors,
     format_permit,
     is_mac_right,
     join_mac,
@@ -187,23 +187,25 @@ def test_golden_bytes_from_a_client(message: FromClient, line: bytes) -> None:
 
 def test_fast_encoders_give_the_golden_bytes() -> None:
     assert format_permit(7, 6, True, False, True) == PERMIT_LINE
-    line = encode_sensors(
-        8812,
-        88.12,
-        [(88.12, 0.01, -0.02)],
-        [(88.119, 3.3, 3.2), (88.12, 3.31, None)],
-        [(88.12, 1, 1, 0, 1)],
-        (88.12, 0.0, 0.6, -0.8),
-        (0.8, 0.75),
-        0.93,
-        (8810, 0.012, 0.008, False),
-        ["battery_low"],
+    line = encode(
+        RobotFrame(
+            8812,
+            88.12,
+            [(88.12, 0.01, -0.02)],
+            [(88.119, 3.3, 3.2), (88.12, 3.31, None)],
+            [(88.12, 1, 1, 0, 1)],
+            (88.12, 0.0, 0.6, -0.8),
+            (0.8, 0.75),
+            0.93,
+            CommandEcho(8810, 0.012, 0.008, False),
+            ["battery_low"],
+        )
     )
     assert line == SENSORS_LINE
 
 
 def test_lists_may_be_empty_and_gravity_null() -> None:
-    line = encode_sensors(0, 0.0, (), (), (), None, (0.0, 0.0), 1.0, (-1, 0.0, 0.0, True), ())
+    line = encode(RobotFrame(0, 0.0, (), (), (), None, (0.0, 0.0), 1.0, CommandEcho(-1, 0.0, 0.0, True), ()))
     decoded = decode_from_robot(line)
     assert isinstance(decoded, Sensors)
     assert (decoded.imu, decoded.enc, decoded.edge, decoded.gravity, decoded.cmd.seq) == ([], [], [], None, -1)

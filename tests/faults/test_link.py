@@ -15,9 +15,9 @@ import pytest
 
 from ccatp.core import PanelPose
 from ccatp.dataloop import DataLoop
-from ccatp.links.robot_codec import decode_from_robot, encode, encode_sensors
+from ccatp.links.robot_codec import RobotFrame, decode_from_robot, encode
 from ccatp.links.robot_link import BACKLOG_S, FLOOD_FACTOR, RobotLink, RobotTimeout, WrongProtocol
-from ccatp.links.robot_messages import PROTOCOL, BadLineLimit, Hello, LineBuffer, RobotData, Sensors
+from ccatp.links.robot_messages import PROTOCOL, BadLineLimit, CommandEcho, Hello, LineBuffer, RobotData, Sensors
 from tests.faults.linking import Measured
 from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S
 from tests.support.daemon import Driver, robot_behind_proxy
@@ -38,7 +38,8 @@ JOINED = b'{"type":"joined","role":"controller","session":1}\n'
 def frame(seq: int, samples: int = 10) -> bytes:
     t_s = seq / 100.0
     wheels = [(t_s + 1e-3 * k, 1.0 + 1e-9 * seq, 1.0) for k in range(samples)]
-    return encode_sensors(seq, t_s, [(t_s, 0.1, 0.2)], wheels, (), None, (0.8, 0.8), 1.0, (seq, 0.0, 0.0, False), ())
+    echo = CommandEcho(seq, 0.0, 0.0, False)
+    return encode(RobotFrame(seq, t_s, [(t_s, 0.1, 0.2)], wheels, (), None, (0.8, 0.8), 1.0, echo, ()))
 
 
 async def driven(disturb: Callable[..., None] = lambda proxy: None, frames: int = FRAMES) -> tuple[Driver, PanelPose]:

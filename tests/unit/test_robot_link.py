@@ -10,9 +10,9 @@ import pytest
 
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.auth import read_key
-from ccatp.links.robot_codec import encode_sensors, join_mac
+from ccatp.links.robot_codec import RobotFrame, encode, join_mac
 from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout, WrongProtocol
-from ccatp.links.robot_messages import Sensors
+from ccatp.links.robot_messages import CommandEcho, Sensors
 
 NONCE = "ab" * 16
 HELLO = (
@@ -29,7 +29,7 @@ Script = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
 
 def frame(seq: int) -> bytes:
-    return encode_sensors(seq, seq / 100.0, (), (), (), None, (0.0, 0.0), 1.0, (-1, 0.0, 0.0, True), ())
+    return encode(RobotFrame(seq, seq / 100.0, (), (), (), None, (0.0, 0.0), 1.0, CommandEcho(-1, 0.0, 0.0, True), ()))
 
 
 class Seen:

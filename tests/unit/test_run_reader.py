@@ -16,8 +16,8 @@ from ccatp.config.load import dump_config, load_config
 from ccatp.core import PanelId
 from ccatp.errors import ConfigError
 from ccatp.filters import FilterDiverged
-from ccatp.links.robot_codec import encode_sensors
-from ccatp.links.robot_messages import Sensors
+from ccatp.links.robot_codec import RobotFrame, encode
+from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import (
     RECORD_FORMAT,
     TOPICS,
@@ -41,8 +41,8 @@ from tests.unit.run_folder import make_run, record_truth
 
 def line_of(seq: int) -> bytes:
     t_s = 0.01 * seq
-    still = (-1, 0.0, 0.0, False)
-    return encode_sensors(seq, t_s, [(t_s, 0.0, 0.0)], [], [], None, (0.0, 0.0), 1.0, still, ()).strip()
+    still = CommandEcho(-1, 0.0, 0.0, False)
+    return encode(RobotFrame(seq, t_s, [(t_s, 0.0, 0.0)], [], [], None, (0.0, 0.0), 1.0, still, ())).strip()
 
 
 def batch(*seqs: int) -> SensorLines:
