@@ -21,11 +21,11 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config, DashboardConfig
 from ccatp.daemon.command_handlers import LOGGED_LINES, LOGGED_PERIOD_S
 from ccatp.daemon.process import (
-    RUN_DIR_FILE,
     Endpoints,
     listen_at,
     open_log,
     read_config,
+    run_dir_in,
     run_until_stopped,
     start_process,
 )
@@ -50,68 +50,69 @@ HEARTBEAT_PERIOD_S = 0.5
 ROOT = "dashboard."
 
 
-class Dashboard:
-    """A dashboard; points that were measured before are read from the database in ``run_dir``.
+async def serve_page(
+    cfg: Config | RadioConfig,
+    run_dir: Path,
+    endpoints: Endpoints,
+    listener: socket.socket,
+    stop: asyncio.Event,
+    log: Logger,
+    *,
+    is_sim: bool,
+    has_heartbeat: bool,
+) -> None:
+    """Serve a dashboard until ``stop`` is set and the open pages have got the last state.
+
+    Points that were measured before are read from the database in ``run_dir``.
 
     Raises:
         ConfigError: the token cannot be read.
     """
+    settings, token, is_over = cfg.dashboard, read_token(cfg.dashboard), asyncio.Event()
+    view: RunStateView
+    if isinstance(cfg, RadioConfig):
+        view, wants = BeaconView(cfg, is_sim=is_sim), BEACONS
+        ground = beacon_ground(cfg, is_sim=is_sim, needs_token=token is not None)
+    else:
+        mirror = build_mirror(cfg.mirror)
+        view, wants = _survey_view(mirror, cfg, run_dir, is_sim=is_sim), SURVEY
+        ground = survey_ground(mirror, cfg, is_sim=is_sim, needs_token=token is not None)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    reader = BusReader(context, endpoints.of, view, is_sim=is_sim, wants=wants)
+    hub = StateBroadcaster(reader, view, settings.rate_hz)
+    budget = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
 
-    def __init__(
-        self, cfg: Config | RadioConfig, run_dir: Path, endpoints: Endpoints, *, is_sim: bool, log: Logger
-    ) -> None:
-        self._cfg, self._endpoints = cfg, endpoints
-        token = read_token(cfg.dashboard)
-        view: RunStateView
-        if isinstance(cfg, RadioConfig):
-            view, wants = BeaconView(cfg, is_sim=is_sim), BEACONS
-            ground = beacon_ground(cfg, is_sim=is_sim, needs_token=token is not None)
-        else:
-            mirror = build_mirror(cfg.mirror)
-            view, wants = _survey_view(mirror, cfg, run_dir, is_sim=is_sim), SURVEY
-            ground = survey_ground(mirror, cfg, is_sim=is_sim, needs_token=token is not None)
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._reader = BusReader(self._context, endpoints.of, view, is_sim=is_sim, wants=wants)
-        self._hub = StateBroadcaster(self._reader, view, cfg.dashboard.rate_hz)
-        self._app = build_app(
-            self._hub,
-            CommandEndpoint(self._context, endpoints.of("control"), cfg.dashboard.command_timeout_s),
-            ground,
-            host_names=cfg.dashboard.host_names,
-            token=token,
-            note=_rate_limited(log),
-        )
+    def note(text: str, fields: dict[str, object]) -> None:
+        # Every client of the port can cause these lines.
+        left_out = budget.take(asyncio.get_running_loop().time())
+        if left_out is not None:
+            log.info(text, **fields, left_out=left_out)
 
-    async def run(self, listener: socket.socket, stop: asyncio.Event, *, has_heartbeat: bool) -> None:
-        """Serve until ``stop`` is set and the open pages have got the last state."""
-        is_over = asyncio.Event()
+    commands = CommandEndpoint(context, endpoints.of("control"), settings.command_timeout_s)
+    app = build_app(hub, commands, ground, host_names=settings.host_names, token=token, note=note)
 
-        async def broadcast() -> None:
-            await self._hub.run(stop)
-            is_over.set()
+    async def broadcast() -> None:
+        await hub.run(stop)
+        is_over.set()
 
+    try:
         async with asyncio.TaskGroup() as tasks:
-            heartbeat = tasks.create_task(self._send_heartbeats()) if has_heartbeat else None
+            heartbeat = tasks.create_task(_send_heartbeats(context, endpoints)) if has_heartbeat else None
             tasks.create_task(broadcast())
-            await serve(self._app, listener, self._cfg.dashboard, is_over)
+            await serve(app, listener, settings, is_over)
             if heartbeat is not None:
                 heartbeat.cancel()
+    finally:
+        reader.close()
+        context.destroy(linger=0)
 
-    async def _send_heartbeats(self) -> None:
-        publisher = Publisher(self._context, self._endpoints.of("dashboard"))
-        heartbeat = HeartbeatPublisher(publisher, "dashboard")
-        heartbeat.phase = "ready"
-        try:
-            while True:
-                heartbeat.publish()
-                await asyncio.sleep(HEARTBEAT_PERIOD_S)
-        finally:
-            publisher.close()
 
-    def close(self) -> None:
-        """Close the sockets."""
-        self._reader.close()
-        self._context.destroy(linger=0)
+async def _send_heartbeats(context: zmq.Context[zmq.Socket[bytes]], endpoints: Endpoints) -> None:
+    heartbeat = HeartbeatPublisher(Publisher(context, endpoints.of("dashboard")), "dashboard")
+    heartbeat.phase = "ready"
+    while True:
+        heartbeat.publish()
+        await asyncio.sleep(HEARTBEAT_PERIOD_S)
 
 
 def _survey_view(mirror: Mirror, cfg: Config, run_dir: Path, *, is_sim: bool) -> SurveyView:
@@ -123,35 +124,25 @@ def _survey_view(mirror: Mirror, cfg: Config, run_dir: Path, *, is_sim: bool) ->
     return view
 
 
-def _run(make: Callable[[Logger], Dashboard], run_dir: Path, listener: socket.socket, *, has_heartbeat: bool) -> int:
-    """Serve a dashboard until SIGTERM or SIGINT."""
-
+def _run(
+    cfg: Config | RadioConfig,
+    run_dir: Path,
+    endpoints: Endpoints,
+    listener: socket.socket,
+    *,
+    is_sim: bool,
+    has_heartbeat: bool,
+) -> int:
     async def run(stop: asyncio.Event) -> int:
         log = open_log(run_dir / "log.jsonl", "dashboard")
         for name in ("uvicorn.error", "asyncio"):
             logger = logging.getLogger(name)
             logger.handlers, logger.propagate = [_Handler(log)], False
             logger.setLevel(logging.WARNING)
-        dashboard = make(log)
-        try:
-            await dashboard.run(listener, stop, has_heartbeat=has_heartbeat)
-        finally:
-            dashboard.close()
+        await serve_page(cfg, run_dir, endpoints, listener, stop, log, is_sim=is_sim, has_heartbeat=has_heartbeat)
         return 0
 
     return run_until_stopped(run)
-
-
-def _rate_limited(log: Logger) -> Callable[[str, dict[str, object]], None]:
-    # Every client of the port can cause these lines.
-    budget = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
-
-    def note(text: str, fields: dict[str, object]) -> None:
-        left_out = budget.take(asyncio.get_running_loop().time())
-        if left_out is not None:
-            log.info(text, **fields, left_out=left_out)
-
-    return note
 
 
 class _Handler(logging.Handler):
@@ -174,11 +165,8 @@ class _Handler(logging.Handler):
 def main() -> int:
     """Entry of ``python -m ccatp.daemon.dashboard``."""
     args = start_process()
-
-    def make(log: Logger) -> Dashboard:
-        return Dashboard(args.config, args.run_dir, args.endpoints, is_sim=args.is_sim, log=log)
-
-    return _run(make, args.run_dir, socket.socket(fileno=args.listen_fd), has_heartbeat=True)
+    listener = socket.socket(fileno=args.listen_fd)
+    return _run(args.config, args.run_dir, args.endpoints, listener, is_sim=args.is_sim, has_heartbeat=True)
 
 
 class PageSocket(NamedTuple):
@@ -227,31 +215,19 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callab
         if not key.startswith(ROOT):
             raise ConfigError(f"--set: {key} is no key of the page; the daemon runs with what it has, see {ROOT}*")
     folder = runtime_dir_path(str(runtime_dir or ""), os.environ)
-    run_dir = _run_dir_of(folder)
+    run_dir = run_dir_in(folder)
+    if run_dir is None or not (folder / "control").exists():
+        raise DaemonUnreachableError(
+            f"no daemon in {folder}; start one with ccatp run, or name its folder with --runtime-dir"
+        )
     cfg = read_config(run_dir / "config.toml", {**settings, f"{ROOT}enabled": True})
     page = open_page_socket(cfg.dashboard)
     if page.socket is None:
         raise ConfigError(page.text)
     is_sim = read_metadata(run_dir / TELEMETRY).get("simulation") == "true"
-
-    def make(log: Logger) -> Dashboard:
-        return Dashboard(cfg, run_dir, Endpoints(folder), is_sim=is_sim, log=log)
-
     with page.socket:
         say(page.text)
-        return _run(make, run_dir, page.socket, has_heartbeat=False)
-
-
-def _run_dir_of(runtime_dir: Path) -> Path:
-    try:
-        run_dir = Path((runtime_dir / RUN_DIR_FILE).read_text(encoding="utf-8").strip())
-    except OSError:
-        run_dir = None
-    if run_dir is None or not (runtime_dir / "control").exists():
-        raise DaemonUnreachableError(
-            f"no daemon in {runtime_dir}; start one with ccatp run, or name its folder with --runtime-dir"
-        )
-    return run_dir
+        return _run(cfg, run_dir, Endpoints(folder), page.socket, is_sim=is_sim, has_heartbeat=False)
 
 
 if __name__ == "__main__":

@@ -60,6 +60,14 @@ class Endpoints:
         return f"ipc://{self.runtime_dir / name}"
 
 
+def run_dir_in(runtime_dir: Path) -> Path | None:
+    """The run directory of the run that goes on in a runtime directory, or of the last one."""
+    try:
+        return Path((runtime_dir / RUN_DIR_FILE).read_text(encoding="utf-8").strip())
+    except OSError:
+        return None
+
+
 @dataclass(frozen=True, slots=True)
 class ProcessArgs:
     """Arguments of a process.

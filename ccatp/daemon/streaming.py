@@ -15,7 +15,7 @@ import msgspec
 import zmq
 
 from ccatp.config.load import load_config
-from ccatp.daemon.process import RUN_DIR_FILE, Endpoints
+from ccatp.daemon.process import RUN_DIR_FILE, Endpoints, run_dir_in
 from ccatp.errors import ConfigError
 from ccatp.links.bus import Subscriber
 from ccatp.links.runtime_dir import runtime_dir_path
@@ -101,26 +101,25 @@ class Streamer:
     def _on_heartbeat(self, presence: Heartbeat) -> None:
         if presence.pid == self._pid or presence.phase != "joined":
             return
+        self._pid = presence.pid
         self._close_run()
+        run_dir = run_dir_in(self._runtime_dir)
         try:
-            run_dir = Path((self._runtime_dir / RUN_DIR_FILE).read_text(encoding="utf-8").strip())
+            if run_dir is None:
+                raise ConfigError(f"{self._runtime_dir / RUN_DIR_FILE}: cannot be read")
             cfg = load_config(run_dir / "config.toml")
-            is_simulation = read_metadata(run_dir / TELEMETRY).get("simulation") == "true"
+            is_sim = read_metadata(run_dir / TELEMETRY).get("simulation") == "true"
         except (OSError, ConfigError) as error:
             self._say(f"a run whose configuration cannot be read is not streamed: {error}")
             return
-        finally:
-            self._pid = presence.pid
         self._views = Views(build_mirror(cfg.mirror), cfg.robot.puck_height_m)
-        fact = RunFact(
-            cfg.mirror.name, cfg.world.name if is_simulation else "", is_simulation, cfg.run.seed, cfg.run.filter,
-            str(run_dir),
-        )  # fmt: skip
+        mirror, world, run = cfg.mirror.name, cfg.world.name if is_sim else "", cfg.run
+        fact = RunFact(mirror, world, is_sim, run.seed, run.filter, str(run_dir))
         self._send((ViewMessage(RUN, 0.0, json.dumps(msgspec.to_builtins(fact)).encode()), *self._views.begin()))
-        names = ("main", "danger", "truth") if is_simulation else ("main", "danger")
+        names = ("main", "danger", "truth") if is_sim else ("main", "danger")
         topics = dict.fromkeys((*PASSED_ON, *TURNED_INTO_VIEWS))
         self._run = Subscriber(self._context, [self._endpoints.of(name) for name in names], topics)
-        self._say(f"streaming {'SIMULATION of ' if is_simulation else ''}{cfg.mirror.name}, {run_dir}")
+        self._say(f"streaming {'SIMULATION of ' if is_sim else ''}{mirror}, {run_dir}")
 
     def _pass_on(self, name: str, body: bytes, message: Message) -> None:
         if name in PASSED_ON:

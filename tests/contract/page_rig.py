@@ -16,7 +16,7 @@ import zmq
 import zmq.asyncio
 
 from ccatp.config.models import Config
-from ccatp.daemon.dashboard import Dashboard
+from ccatp.daemon.dashboard import serve_page
 from ccatp.daemon.process import Endpoints
 from ccatp.links.bus import Publisher
 from ccatp.links.channels import format_ok
@@ -189,10 +189,11 @@ async def page_rig(cfg: Config, folder: Path, *, has_daemon: bool = True) -> Asy
     log, stop = _Log(), asyncio.Event()
     main, danger = (Publisher(context, endpoints.of(name)) for name in ("main", "danger"))
     rig = Rig(listener.getsockname()[1], main, danger, stop, log.lines)
-    dashboard = Dashboard(cfg, folder, endpoints, is_sim=True, log=cast(structlog.typing.FilteringBoundLogger, log))
+    logger = cast(structlog.typing.FilteringBoundLogger, log)
+    page = serve_page(cfg, folder, endpoints, listener, stop, logger, is_sim=True, has_heartbeat=True)
     try:
         async with asyncio.TaskGroup() as tasks:
-            served = tasks.create_task(dashboard.run(listener, stop, has_heartbeat=True))
+            served = tasks.create_task(page)
             if has_daemon:
                 async with Router(endpoints.of("control"), rig.handle, zmq.asyncio.Context.shadow(context)) as router:
                     answering = tasks.create_task(router.serve())
@@ -203,7 +204,6 @@ async def page_rig(cfg: Config, folder: Path, *, has_daemon: bool = True) -> Asy
             stop.set()
             await served
     finally:
-        dashboard.close()
         rig.main.close()
         rig.danger.close()
         context.destroy(linger=0)
