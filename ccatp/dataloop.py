@@ -67,8 +67,7 @@ class RobotLinkServer:
     async def start(self, sock: socket.socket | None = None) -> int:
         """Boot and listen on the configured address or on a bound socket; return the port.
 
-        Raises:
-            OSError: the address cannot be had.
+        ``OSError``: the address cannot be had.
         """
         loop = asyncio.get_running_loop()
         self._failure = loop.create_future()
@@ -273,11 +272,8 @@ async def serve(
     """Run a DataLoop until ``stop`` is set.
 
     ``faults`` may be those of the robot and of its link; for the link a proxy listens in the robot's place.
-    ``body_file`` keeps the true pose of the robot between runs.
-
-    Raises:
-        OSError: the address cannot be had.
-        zmq.ZMQError: an endpoint cannot be had.
+    ``body_file`` keeps the true pose of the robot between runs. ``OSError``: the address cannot be had;
+    ``zmq.ZMQError``: an endpoint cannot be had.
     """
     body = None if body_file is None else SimPoseFile(body_file)
     start = body.read() if body is not None and is_resuming else None

@@ -76,9 +76,7 @@ class EtalonLink(asyncio.Protocol):
     async def ask(self, request: MultilineRequest) -> bytes:
         """Send and wait for one line; the deadline is the caller's.
 
-        Raises:
-            ConnectionError: the connection is lost.
-            LineTooLong: the reply never ends.
+        ``ConnectionError``: the connection is lost; ``LineTooLong``: the reply never ends.
         """
         if self._transport is None or self.fault:
             raise ConnectionError(self.fault or "not connected")
@@ -157,8 +155,7 @@ class EtalonClient:
     Attributes:
         counts: connects, requests, retries, drained (connections closed for unasked or left-over bytes).
 
-    Raises:
-        ValueError: channels and collimators do not fit, or are too few.
+    ``ValueError``: channels and collimators do not fit, or are too few.
     """
 
     def __init__(
@@ -181,11 +178,7 @@ class EtalonClient:
         self._last: tuple[dict[int, float], Vector3] | None = None  # lengths of the last fix, and where it was expected
 
     async def connect(self) -> None:
-        """Connect, unless connected.
-
-        Raises:
-            EtalonUnreachable: not within the configured number of tries.
-        """
+        """Connect, unless connected; ``EtalonUnreachable``: not within the configured number of tries."""
         async with self._turn:
             await self._retry(self._usable_link)
 
@@ -203,10 +196,7 @@ class EtalonClient:
         """Measure the puck of a robot that stands still; ``t_s`` becomes the time of the fix.
 
         The solution starts at ``expected_position_m``, world frame, which also decides between two mirror images where
-        all collimators lie in one plane.
-
-        Raises:
-            EtalonError: after the configured retries, the error of the last one.
+        all collimators lie in one plane. ``EtalonError``: after the configured retries, the error of the last one.
         """
         async with self._turn:
             return await self._retry(lambda: self._measure_once(t_s, expected_position_m))

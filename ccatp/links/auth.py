@@ -78,11 +78,7 @@ class KeyPair(NamedTuple):
 
 
 def decode_key(text: str | bytes) -> bytes:
-    """The 32 bytes of a CURVE key of 40 characters (Z85, ZeroMQ RFC 32).
-
-    Raises:
-        BadAccess: the text is not a key.
-    """
+    """The 32 bytes of a CURVE key of 40 characters (Z85, ZeroMQ RFC 32); ``BadAccess``: the text is not a key."""
     try:
         if len(text) == KEY_CHARACTERS:
             return z85.decode(text)
@@ -128,8 +124,7 @@ def _parse_client(name: str, table: Any) -> tuple[bytes, AuthorizedClient]:
 def read_pair(path: Path, what: str) -> KeyPair:
     """The pair in a secret file; ``what`` is the option or the key that names it, for the error.
 
-    Raises:
-        ConfigError: the file cannot be read, is open to others, or holds no pair.
+    ``ConfigError``: the file cannot be read, is open to others, or holds no pair.
     """
     public, secret = _load(path, what, stat.S_IRWXG | stat.S_IRWXO, SECRET_SUFFIX)
     if secret is None:
@@ -147,8 +142,7 @@ def read_public(path: Path, what: str) -> bytes:
 def read_clients(path: Path, what: str) -> Clients:
     """The clients in a file.
 
-    Raises:
-        ConfigError: the file cannot be read, others may write it, it is malformed, or it lists no client.
+    ``ConfigError``: the file cannot be read, others may write it, it is malformed, or it lists no client.
     """
     text = _read(path, what, stat.S_IWGRP | stat.S_IWOTH, partial(Path.read_text, encoding="utf-8", errors="replace"))
     try:
@@ -215,10 +209,8 @@ def _read(path: Path, what: str, forbidden: int, read: Callable[[Path], _T]) -> 
 def read_key(key_file: str, *, must_be_private: bool = False) -> bytes | None:
     """Key of the robot link: the file's bytes without white space around them; ``None`` when no file is named.
 
-    ``must_be_private``: refuse a file that others may read; the key of a simulated robot is no secret.
-
-    Raises:
-        ConfigError: the file cannot be read, is empty, or is not private.
+    ``must_be_private``: refuse a file that others may read; the key of a simulated robot is no secret. ``ConfigError``:
+    the file cannot be read, is empty, or is not private.
     """
     if not key_file:
         return None
@@ -232,8 +224,7 @@ def read_key(key_file: str, *, must_be_private: bool = False) -> bytes | None:
 def make_key_dir(path: Path) -> None:
     """Make a folder for keys with mode 0700, or check that it belongs to the caller and is closed to others.
 
-    Raises:
-        ConfigError: it cannot be made or is open to others.
+    ``ConfigError``: it cannot be made or is open to others.
     """
     try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)

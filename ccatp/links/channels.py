@@ -80,8 +80,7 @@ _operator: TypeAdapter[OperatorRequest] = TypeAdapter(OperatorRequest)
 def parse_observatory(frame: bytes) -> ObservatoryRequest:
     """The request in a frame of the observatory channel.
 
-    Raises:
-        BadRequest: too long, not JSON, not an object, or not of the form.
+    ``BadRequest``: too long, not JSON, not an object, or not of the form.
     """
     return _validated(_observatory, _parse_object(frame))
 
@@ -107,11 +106,7 @@ def format_error(error: str, **fields: object) -> bytes:
 
 
 def parse_reply(frame: bytes) -> dict[str, Any]:
-    """The object in a reply.
-
-    Raises:
-        BadRequest: not a JSON object with a boolean ``ok``.
-    """
+    """The object in a reply; ``BadRequest``: not a JSON object with a boolean ``ok``."""
     reply = _object_in(frame)
     if not isinstance(reply.get("ok"), bool):
         raise BadRequest('a reply without "ok"')

@@ -74,8 +74,7 @@ class ObservatoryClient:
     def connect(cls, endpoint: str, server_key: Path, key: Path, timeout_s: float = TIMEOUT_S) -> "ObservatoryClient":
         """A daemon on another machine, at ``tcp://HOST:PORT``, which lists the public half of the secret ``key``.
 
-        Raises:
-            ConfigError: a key file cannot be used.
+        ``ConfigError``: a key file cannot be used.
         """
         pair = read_pair(key, "key")
         return cls(endpoint, CurveClient(read_public(server_key, "server_key"), pair.public, pair.secret), timeout_s)
@@ -208,8 +207,7 @@ MAX_BYTES = 1 << 20
 class HttpClient:
     """A dashboard at ``http://HOST:PORT``; ``token`` is that of ``dashboard.token_file``.
 
-    Raises:
-        ConfigError: the URL is not one of HTTP.
+    ``ConfigError``: the URL is not one of HTTP.
     """
 
     url: str

@@ -138,8 +138,7 @@ def format_request(request: MultilineRequest) -> bytes:
 def parse_request(line: bytes) -> MultilineRequest:
     """Read one line of a client.
 
-    Raises:
-        BadMultilineRequest: unknown name, arguments where none belong, or channels that are not 1 to 32, each once.
+    ``BadMultilineRequest``: unknown name, arguments where none belong, or channels that are not 1 to 32, each once.
     """
     name, *arguments = line.decode("ascii", "replace").split(",")
     try:

@@ -57,11 +57,7 @@ _encoder = msgspec.json.Encoder()
 
 
 def decode_from_robot(line: bytes) -> FromRobot | Unknown:
-    """The message in a line of the robot (without its LF).
-
-    Raises:
-        BadLine: the line fails a check.
-    """
+    """The message in a line of the robot (without its LF); ``BadLine``: the line fails a check."""
     try:
         message = _robot_decoder.decode(line)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -103,11 +99,7 @@ class RobotFrame(RobotLinkMessage, tag="sensors"):
 
 
 def encode(message: FromRobot | FromClient | RobotFrame) -> bytes:
-    """The message as one line with its LF.
-
-    Raises:
-        ValueError: a drive that is not finite (JSON has no such number).
-    """
+    """The message as one line with its LF; ``ValueError``: a drive that is not finite (JSON has no such number)."""
     if isinstance(message, Drive):
         return format_drive(message.seq, message.ack, message.wr, message.wl, message.steer)
     return _encoder.encode(message) + b"\n"
@@ -116,8 +108,7 @@ def encode(message: FromRobot | FromClient | RobotFrame) -> bytes:
 def format_drive(seq: int, ack: int, wr: float, wl: float, steer: float | None = None) -> bytes:
     """A drive as one line; the key ``steer`` only where there is an angle.
 
-    Raises:
-        ValueError: a set point that is not finite.
+    ``ValueError``: a set point that is not finite.
     """
     if not math.isfinite(wr) or not math.isfinite(wl):
         raise ValueError(f"drive set points must be finite: wr {wr}, wl {wl}")

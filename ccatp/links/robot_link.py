@@ -111,11 +111,8 @@ class RobotLink(asyncio.Protocol):
     async def connect(self, deadline_s: float) -> Hello:
         """Connect and join. A link is used once: for another session make another.
 
-        Raises:
-            RobotTimeout: it took longer.
-            RobotRefused: the robot refused.
-            WrongProtocol: another protocol, or no robot at all.
-            RobotLinkError: no answer, or the connection ended.
+        ``RobotTimeout``: it took longer; ``RobotRefused``: the robot refused; ``WrongProtocol``: another protocol, or
+        no robot at all; ``RobotLinkError``: no answer, or the connection ended.
         """
         loop = asyncio.get_running_loop()
         joining: asyncio.Future[Hello] = loop.create_future()
@@ -243,8 +240,7 @@ class RobotLink(asyncio.Protocol):
     def send_drive(self, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float, steer_rad: float | None = None) -> None:
         """Send wheel set points, and the steering angle of a robot that has one.
 
-        Raises:
-            ValueError: a set point that is not finite.
+        ``ValueError``: a set point that is not finite.
         """
         self._send_fresh(format_drive(seq, ack, wr_rad_s, wl_rad_s, steer_rad))
 

@@ -213,10 +213,7 @@ def request(
     """Send a request to a ``Router`` and wait for its reply.
 
     ``curve`` holds the keys for a ``tcp://`` endpoint. ``repeats``: send it every ``REPEAT_S`` until a reply arrives;
-    only for idempotent requests.
-
-    Raises:
-        RequestFailed: no reply in time, an invalid endpoint, or a malformed reply.
+    only for idempotent requests. ``RequestFailed``: no reply in time, an invalid endpoint, or a malformed reply.
     """
     with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
         peer.setsockopt(zmq.LINGER, 0)

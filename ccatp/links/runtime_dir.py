@@ -27,10 +27,7 @@ def runtime_dir_path(configured: str, environ: Mapping[str, str]) -> Path:
     """The folder, which need not exist: the configured one, or the first that the environment offers.
 
     ``configured`` (``run.runtime_dir``) unless empty, else ``$CCATP_RUNTIME_DIR``, else ``$XDG_RUNTIME_DIR/ccatp``,
-    else ``ccatp-<uid>`` in the temporary directory.
-
-    Raises:
-        RuntimeDirError: the path is too long for a unix socket in it.
+    else ``ccatp-<uid>`` in the temporary directory. ``RuntimeDirError``: the path is too long for a unix socket in it.
     """
     if configured:
         path = Path(configured).expanduser()
@@ -53,8 +50,7 @@ def runtime_dir_path(configured: str, environ: Mapping[str, str]) -> Path:
 def make_runtime_dir(configured: str, environ: Mapping[str, str]) -> Path:
     """The folder, made with mode 0700 when it is missing, and checked to be the caller's own.
 
-    Raises:
-        RuntimeDirError: it cannot be made, is not a folder, belongs to another user or is writable for others.
+    ``RuntimeDirError``: it cannot be made, is not a folder, belongs to another user or is writable for others.
     """
     path = runtime_dir_path(configured, environ)
     try:
@@ -83,8 +79,7 @@ def make_runtime_dir(configured: str, environ: Mapping[str, str]) -> Path:
 def locked(path: Path, refusal: str) -> Iterator[None]:
     """Hold the lock of a file for as long as the block lasts; it ends with the process, whatever ends that.
 
-    Raises:
-        RefusedError: another process holds it.
+    ``RefusedError``: another process holds it.
     """
     with path.open("w") as file:
         if not _takes(file.fileno(), LOCK_EX):

@@ -101,11 +101,7 @@ def level_of(frame: bytes) -> XbeeLevel | None:
 
 
 def xbee_frame(data: bytes, *, escaped: bool) -> bytes:
-    """A whole frame around its data.
-
-    Raises:
-        ValueError: the data are empty or longer than any frame.
-    """
+    """A whole frame around its data; ``ValueError``: the data are empty or longer than any frame."""
     if not 1 <= len(data) <= _LONGEST:
         raise ValueError(f"frame data of {len(data)} bytes; an XBee frame has 1 to {_LONGEST}")
     body = len(data).to_bytes(2, "big") + data + bytes([0xFF - (sum(data) & 0xFF)])

@@ -118,8 +118,7 @@ class CheckpointFile:
 def read_checkpoint(path: Path) -> Checkpoint | None:
     """The newest whole record of a file, ``None`` where nothing was written.
 
-    Raises:
-        CheckpointError: something was written, and none of it is whole.
+    ``CheckpointError``: something was written, and none of it is whole.
     """
     try:
         data = path.read_bytes()

@@ -210,8 +210,7 @@ def iter_messages(path: Path, on_damage: Callable[[str], None] | None = None) ->
         path: an MCAP file; it may end anywhere, as after a ``kill -9``.
         on_damage: called with the reason where the file ends early or is damaged; nothing behind that is read.
 
-    Raises:
-        OSError: the file cannot be read.
+    ``OSError``: the file cannot be read.
     """
     channels: dict[int, str] = {}
     for record in _iter_records(path, on_damage):

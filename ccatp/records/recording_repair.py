@@ -278,10 +278,7 @@ class Saved:
 def recover(path: Path, out: Path) -> Saved:
     """Write every intact message of a recording to a new one, in the same order, with an index.
 
-    The old file is left as it is.
-
-    Raises:
-        RecordingError: one cannot be read or written, or nothing in it is a recording.
+    The old file is left as it is. ``RecordingError``: one cannot be read or written, or nothing in it is a recording.
     """
     condition = Condition()
     try:

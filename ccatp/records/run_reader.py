@@ -274,8 +274,7 @@ class Recording:
 def open_run(run_dir: Path) -> list[Recording]:
     """The recordings of a run directory, oldest first.
 
-    Raises:
-        RunReadError: there is no such directory, it holds no recording or no configuration, or one of a newer format.
+    ``RunReadError``: there is no such directory, it holds no recording or no configuration, or one of a newer format.
     """
     if not run_dir.is_dir():
         raise RunReadError(f"{run_dir}: no such directory; name the directory of a run")
@@ -327,9 +326,8 @@ class Survey(NamedTuple):
 def read_run(run_dir: Path, overrides: Mapping[str, object]) -> Survey:
     """Read the survey of a run directory without changing it; ``overrides`` are dotted keys of the configuration.
 
-    Raises:
-        RunReadError: no such directory, or no run in it, or a database that cannot be read.
-        ConfigError: its configuration cannot be used.
+    ``RunReadError``: no such directory, or no run in it, or a database that cannot be read; ``ConfigError``: its
+    configuration cannot be used.
     """
     if not run_dir.is_dir():
         raise RunReadError(f"{run_dir}: no such directory; name the directory of a run")

@@ -180,8 +180,7 @@ class MissionStore:
         Args:
             config_toml: the run's exact configuration; its SHA-256 is kept.
 
-        Raises:
-            StoreError: the file exists, or cannot be made.
+        ``StoreError``: the file exists, or cannot be made.
         """
         if path.exists():
             raise StoreError(f"{path}: exists already; resume it or choose another run directory")
@@ -214,8 +213,7 @@ class MissionStore:
     def open(cls, path: Path, *, mirror: str) -> Self:
         """Open the store of an earlier run to go on with it.
 
-        Raises:
-            StoreError: no such file, not a mission store, another schema or mirror, or damaged.
+        ``StoreError``: no such file, not a mission store, another schema or mirror, or damaged.
         """
         if not path.is_file():
             raise StoreError(f"{path}: no such file; nothing to resume")
@@ -354,8 +352,7 @@ class MissionStore:
 def read_survey(path: Path, mirror: str) -> StoredSurvey:
     """Read a mission database without writing to it: of a run that goes on, was killed, or is an archive.
 
-    Raises:
-        StoreError: no such file, not a mission store, another schema or mirror, or damaged.
+    ``StoreError``: no such file, not a mission store, another schema or mirror, or damaged.
     """
     if not path.is_file():
         raise StoreError(f"{path}: no such file; name the directory of a run")

@@ -136,8 +136,7 @@ class EtalonSimulator:
     async def start(self, host: str, port: int, sock: socket.socket | None = None) -> int:
         """Listen on ``host:port`` (0 = any free port) or on the bound socket ``sock``; return the port.
 
-        Raises:
-            OSError: the address cannot be had.
+        ``OSError``: the address cannot be had.
         """
         self._end = asyncio.get_running_loop().create_future()
         if sock is None:

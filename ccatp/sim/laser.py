@@ -40,8 +40,7 @@ class EtalonModel:
         flags: further error flags to raise, names out of ``ccatp.links.multiline.FLAGS`` by channel.
         laser_ready: while false, each record carries ``laser_temp_error``.
 
-    Raises:
-        ValueError: channels and collimators do not fit.
+    ``ValueError``: channels and collimators do not fit.
     """
 
     def __init__(

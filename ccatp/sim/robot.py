@@ -43,10 +43,8 @@ _FRAME_BYTES, _IMU_BYTES, _ENCODER_BYTES, _COUNTER_BYTES, _EDGE_BYTES = 420, 48,
 class Robot(SimulatedRobot):
     """The robot from one boot to the next, at base where no ``start`` is given.
 
-    ``rng`` is the parent of every random draw.
-
-    Raises:
-        ValueError: the rates put more samples in a frame than a line may hold, or a frame outlasts the TTL.
+    ``rng`` is the parent of every random draw. ``ValueError``: the rates put more samples in a frame than a line may
+    hold, or a frame outlasts the TTL.
     """
 
     def __init__(
