@@ -1,7 +1,6 @@
 """The client's end of the robot link against a scripted robot."""
 
 import asyncio
-import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -139,16 +138,6 @@ async def test_join_frames_and_commands() -> None:
             ]
     assert seen.lost == []  # closed by us
     link.send_drive(9, 1, 0.0, 0.0)  # after the end nothing happens
-
-
-@pytest.mark.fault("L10")
-async def test_socket_options() -> None:
-    async with robot(after_join()) as (link, _):
-        await link.connect(DEADLINE_S)
-        assert link._transport is not None
-        peer = link._transport.get_extra_info("socket")
-        assert peer.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
-        assert peer.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
 
 
 async def test_a_drive_that_is_not_finite_is_not_sent() -> None:

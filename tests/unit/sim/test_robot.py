@@ -69,20 +69,6 @@ def test_a_frame_holds_the_samples_since_the_one_before(config: Config, mirror: 
     assert sensors.enc[-1].right_rad_s == pytest.approx(robot.world.plant.right_rad_s, abs=0.005)
 
 
-def test_puck_stands_on_the_misaligned_panel(config: Config, mirror: Mirror) -> None:
-    robot = boot(config, mirror)
-    world = robot.world
-    panel = mirror.nearest_panel(world.plant.x_m, world.plant.y_m)
-    nominal = np.array(mirror.puck_world(world.plant.pose, config.robot.puck_height_m))
-    offset = np.array(world.puck_world()) - nominal
-    n = np.array(mirror.rotate_world_from_deck(mirror.panels[panel].axes[2]))
-    pose = mirror.panel_pose(panel, world.plant.pose)
-    expected = world.misalignments[panel].displacement_m(pose.x_m, pose.y_m)
-    # Along the normal the displacement; sideways the tilt (some 100 urad) times the puck's height of 50 mm.
-    assert offset @ n == pytest.approx(expected, abs=1e-6)
-    assert np.linalg.norm(offset - (offset @ n) * n) < 3e-5
-
-
 def test_misalignment_and_start_have_the_configured_spread(config: Config, mirror: Mirror) -> None:
     starts, pistons, tips, tilts = [], [], [], []
     base = mirror.base_panel_pose
