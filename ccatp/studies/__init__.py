@@ -21,10 +21,10 @@ Analysis: TypeAlias = "Callable[[Config, Path], dict[str, Any]]"
 # Name: module and name in it of a Study or an Analysis, one line for the help.
 STUDIES = {
     "thesis": ("thesis_study:STUDY", "the thesis's own simulation again, under several readings"),
-    "filters": ("filters_study:STUDY", "filters in four worlds, over whole missions"),
-    "time": ("factor_studies:TIME", "order, speed and measuring time against the hour"),
-    "sensitivity": ("factor_studies:SENSITIVITY", "what each disturbance of a hard world costs"),
-    "ablation": ("factor_studies:ABLATION", "what each technique gives, one off at a time"),
+    "filters": ("survey_studies:FILTERS", "filters in four worlds, over whole missions"),
+    "time": ("survey_studies:TIME", "order, speed and measuring time against the hour"),
+    "sensitivity": ("survey_studies:SENSITIVITY", "what each disturbance of a hard world costs"),
+    "ablation": ("survey_studies:ABLATION", "what each technique gives, one off at a time"),
     "danger": ("danger_study:STUDY", "false edges and overrun of two edge rules"),
     "faults": ("faults_study:STUDY", "whole missions with random faults: falls, completion"),
     "cricket": ("cricket_study:STUDY", "self-mapping of motes: the published figures, better ways"),

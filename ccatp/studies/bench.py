@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,7 @@ from ccatp.config.models import Config
 from ccatp.config.package import child_environment
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError
-from ccatp.studies import bench_cases as cases
-from ccatp.studies.bench_cases import STEPS, Contender, FilterProblem
+from ccatp.studies.bench_cases import STEPS, Contender, races
 from ccatp.studies.engine import settle
 from ccatp.studies.results import markdown_table
 from ccatp.studies.sil_run import rehearse
@@ -29,22 +28,9 @@ EQUAL_WITHIN = 1e-10  # every entry of mean and covariance, SI units
 ROUNDS, QUICK_ROUNDS = 40, 4
 MOST_DENSE_ROUNDS = 10
 PANELS, QUICK_PANELS = 4, 1
-INSTALL = "pip install 'ccatp[peers]'"
 TIMEOUT_S = 900.0
 PACKAGES = ("ccatp", "numpy", "scipy", "filterpy", "stonesoup")
 CPU_INFO = Path("/proc/cpuinfo")
-
-Peers = Mapping[str, Callable[[FilterProblem], Contender]]
-LINEAR: Peers = {"eq. 2.13 in numpy": cases.printed_filter, "filterpy": cases.filterpy, "Stone Soup": cases.stonesoup}
-UNSCENTED: Peers = {"filterpy": cases.filterpy, "Stone Soup": cases.stonesoup}
-FILTER_CASES: tuple[tuple[str, Callable[[Config], FilterProblem], Peers], ...] = (
-    *(("kf", lambda cfg, m=m: cases.thesis_problem(cfg, m), LINEAR) for m in (2, 4, 22)),
-    *(("ekf", lambda cfg, m=m: cases.linearised_problem(cfg, m), LINEAR) for m in (4, 6, 23)),
-    ("ukf", cases.survey_problem, UNSCENTED),
-)
-"""Filter, problem, peers. kf: inertial unit; and one sample of each wheel; and ten. ekf: models as matrices."""
-SLAM_CASES = (4, True), (50, True), (200, False)
-"""Beacons, and whether whole matrices, which take n^3, are bearable."""
 
 
 class BenchError(CcatpError):
@@ -73,33 +59,17 @@ def run_bench(cfg: Config, *, quick: bool, run_args: Sequence[str] = (), mission
 
 
 def step_cases(cfg: Config, rounds: int) -> Iterator[dict[str, Any]]:
-    """Steps of filters, of range SLAM (a prediction and a scalar update) and of multilateration."""
-    for filter_name, problem_of, peers in FILTER_CASES:
-        problem = problem_of(cfg)
-        name = f"{filter_name} predict + update, n = {problem.mean.size}, m = {problem.variances.size}"
-        for peer_name, peer_of in peers.items():
-            ours = cases.our_filter(filter_name, problem)
+    """Every race, against each of its peers."""
+    for name, ours, peers, is_dense, note in races(cfg):
+        most = min(rounds, MOST_DENSE_ROUNDS) if is_dense else rounds
+        for peer_name, peer in peers.items():
             try:
-                peer = peer_of(problem)
+                yield step_case(name, ours, peer_name, peer, most)
             except ImportError:
-                note = f"{peer_name} is not installed: {INSTALL}"
-                yield {**step_case(name, ours, "", None, rounds), "note": note}
-            else:
-                yield step_case(name, ours, peer_name, peer, rounds)
-    for beacons, has_peer in SLAM_CASES:
-        slam = cases.slam_problem(beacons)
-        name = f"ekf-slam, {beacons} beacons, n = {slam.mean.size}"
-        if has_peer:
-            peer_name, most = "whole matrices in numpy", min(rounds, MOST_DENSE_ROUNDS)
-            yield step_case(name, cases.our_slam(slam), peer_name, cases.dense_slam(slam), most)
-        else:
-            note = f"ekf-slam: whole matrices take n^3, too long to race against with {beacons} beacons"
-            yield {**step_case(name, cases.our_slam(slam), "", None, rounds), "note": note}
-    ranges = cases.range_problem(cfg)
-    name = f"multilaterate, {ranges.anchors_m.shape[0]} lengths"
-    yield step_case(
-        name, cases.our_position(ranges), "scipy.optimize.least_squares", cases.scipy_position(ranges), rounds
-    )
+                why = f"{peer_name} is not installed: pip install 'ccatp[peers]'"
+                yield {**step_case(name, ours, "", None, rounds), "note": why}
+        if not peers:
+            yield {**step_case(name, ours, "", None, rounds), "note": note}
 
 
 def step_case(name: str, ours: Contender, peer_name: str, peer: Contender | None, rounds: int) -> dict[str, Any]:
@@ -126,7 +96,7 @@ def race(ours: Contender, peer: Contender | None, rounds: int, steps: int = STEP
     """Time every step of both, a round of steps each by turns, who begins by turns as well.
 
     So a machine that slows down for a while slows both, and neither runs on caches that the other one has filled. A
-    round begins with a reset; one round before them warms up.
+    round begins anew; one round before them warms up.
 
     The result has the wall times of single steps of ours and of the peer, if any, us, shape (1 or 2, rounds, steps).
     """
@@ -137,11 +107,11 @@ def race(ours: Contender, peer: Contender | None, rounds: int, steps: int = STEP
     try:
         for turn in range(-1, rounds):
             for which in range(len(both)) if turn % 2 else reversed(range(len(both))):
-                both[which].reset()
-                step = both[which].step
+                solution = both[which]()
+                next(solution)
                 for i in range(steps):
                     start_ns = time.perf_counter_ns()
-                    step(i)
+                    next(solution)
                     spent_ns = time.perf_counter_ns() - start_ns
                     if turn >= 0:
                         taken[which, turn, i] = 1e-3 * spent_ns
@@ -154,25 +124,21 @@ def race(ours: Contender, peer: Contender | None, rounds: int, steps: int = STEP
 
 def largest_difference(ours: Contender, peer: Contender, steps: int = STEPS) -> float:
     """Largest difference between any entries of the results of two contenders, after any of the steps; SI units."""
-    ours.reset()
-    peer.reset()
+    solutions = ours(), peer()
+    for solution in solutions:
+        next(solution)
     largest = 0.0
-    for i in range(steps):
-        ours.step(i)
-        peer.step(i)
-        for one, other in zip(ours.result(), peer.result(), strict=True):
-            largest = max(largest, float(np.abs(one - other).max()))
-            if not np.isfinite(other).all():
+    for _ in range(steps):
+        for one, other in zip(*map(next, solutions), strict=True):
+            found, expected = (np.asarray(result, dtype=np.float64).ravel() for result in (one, other))
+            largest = max(largest, float(np.abs(found - expected).max()))
+            if not np.isfinite(expected).all():
                 return float("nan")
     return largest
 
 
 def rehearsal_case(cfg: Config, panels: int) -> dict[str, Any]:
-    """The first ``panels`` panels in one process, without sockets and files.
-
-    Raises:
-        BenchError: the mission was not completed.
-    """
+    """The first panels in one process, without sockets and files (raises BenchError: it was not completed)."""
     part = cfg.model_copy(update={"run": cfg.run.model_copy(update={"panels": panels})})
     settle()
     started_s = time.perf_counter()
@@ -187,18 +153,15 @@ def rehearsal_case(cfg: Config, panels: int) -> dict[str, Any]:
 def lockstep_case(cfg: Config, panels: int, run_args: Sequence[str] = ()) -> dict[str, Any]:
     """The same by ``ccatp run --sim``: five processes, start and end included in the time.
 
-    Raises:
-        BenchError: the mission failed, or took longer than ``TIMEOUT_S``.
+    BenchError: the mission failed, or took longer than ``TIMEOUT_S``.
     """
     with tempfile.TemporaryDirectory(prefix="ccatp-bench-") as folder:
         command = [sys.executable, "-m", "ccatp", "run", "--sim", "--json", "--panels", str(panels), *run_args]
         command += ["--run-dir", f"{folder}/run", "--runtime-dir", f"{folder}/rt"]
-        environment = child_environment(os.environ)
+        options = {"capture_output": True, "text": True, "timeout": TIMEOUT_S, "env": child_environment(os.environ)}
         started_s = time.perf_counter()
         try:
-            done = subprocess.run(
-                command, capture_output=True, text=True, check=False, timeout=TIMEOUT_S, env=environment
-            )
+            done = subprocess.run(command, check=False, **options)
         except subprocess.TimeoutExpired as error:
             raise BenchError(f"the mission in lockstep was not over after {TIMEOUT_S:g} s") from error
         wall_s = time.perf_counter() - started_s
@@ -254,8 +217,6 @@ def _version(package: str) -> str | None:
         return None
 
 
-_STEP_HEAD = ("case", "ours p50, µs", "ours p99, µs", "peer", "peer p50, µs", "ratio", "difference")
-_MISSION_HEAD = ("case", "times real time", "simulated, s", "wall, s")
 _PAGE = """# Benchmarks
 
 Written by
@@ -280,17 +241,31 @@ Machine: {machine}
 
 def markdown(result: Mapping[str, Any]) -> str:
     """The page ``docs/bench.md``."""
-    steps = [case for case in result["cases"] if "times_real_time" not in case]
-    missions = [case for case in result["cases"] if "times_real_time" in case]
-    text = markdown_table(_STEP_HEAD, [_step_row(case) for case in steps])
+    steps, missions, notes = [], [], {}
+    for case in result["cases"]:
+        if "times_real_time" in case:
+            missions.append([case["name"], *(f"{case[key]:.1f}" for key in _MISSION_KEYS)])
+        else:
+            steps.append([case["name"], *(_cell(case.get(key), spec) for key, spec in _STEP_KEYS)])
+        if "note" in case:
+            notes[f"* {case['note']}\n"] = None
+    text = _PAGE.format(equal_within=result["equal_within"], machine=machine_line(result["machine"]))
+    head = ("case", "ours p50, µs", "ours p99, µs", "peer", "peer p50, µs", "ratio", "difference")
+    text += markdown_table(head, steps)
     if missions:
-        keys = ("times_real_time", "mission_time_s", "wall_s")
-        rows = [[case["name"], *(f"{case[key]:.1f}" for key in keys)] for case in missions]
-        text += "\n" + markdown_table(_MISSION_HEAD, rows)
-    notes = dict.fromkeys(case["note"] for case in result["cases"] if "note" in case)
-    if notes:
-        text += "\n" + "".join(f"* {note}\n" for note in notes)
-    return _PAGE.format(equal_within=result["equal_within"], machine=machine_line(result["machine"])) + text
+        text += "\n" + markdown_table(("case", "times real time", "simulated, s", "wall, s"), missions)
+    return text + ("\n" + "".join(notes) if notes else "")
+
+
+_MISSION_KEYS = ("times_real_time", "mission_time_s", "wall_s")
+_STEP_KEYS = (
+    ("us_p50", ".1f"), ("us_p99", ".1f"), ("peer", ""), ("peer_us_p50", ".1f"), ("ratio", ".3f"),
+    ("largest_difference", ".0e"),
+)  # fmt: skip
+
+
+def _cell(value: Any, spec: str) -> str:
+    return "-" if value is None else format(value, spec)
 
 
 def terminal_lines(result: Mapping[str, Any]) -> list[str]:
@@ -298,14 +273,15 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     lines = [machine_line(result["machine"])]
     for case in result["cases"]:
         if "times_real_time" in case:
-            lines.append(f"{case['name']:<52} {case['times_real_time']:8.1f} times real time")
+            figures = f"{case['times_real_time']:8.1f} times real time"
         elif case["peer"] is None:
-            lines.append(f"{case['name']:<52} {case['us_p50']:8.1f} us   {case['note']}")
+            figures = f"{case['us_p50']:8.1f} us   {case['note']}"
         else:
-            lines.append(
-                f"{case['name']:<52} {case['us_p50']:8.1f} us {case['peer']:>28} {case['peer_us_p50']:8.1f} us"
+            figures = (
+                f"{case['us_p50']:8.1f} us {case['peer']:>28} {case['peer_us_p50']:8.1f} us"
                 f"   ratio {case['ratio']:.3f}   difference {case['largest_difference']:.0e}"
             )
+        lines.append(f"{case['name']:<52} {figures}")
     return lines
 
 
@@ -313,11 +289,3 @@ def machine_line(machine: Mapping[str, Any]) -> str:
     """The machine in one line."""
     packages = [f"{name} {machine[name]}" for name in PACKAGES[1:] if machine[name]]
     return ", ".join([machine["cpu"], f"{machine['cores']} cores", f"Python {machine['python']}", *packages])
-
-
-def _step_row(case: Mapping[str, Any]) -> list[str]:
-    numbers = [case["name"], f"{case['us_p50']:.1f}", f"{case['us_p99']:.1f}"]
-    if case["peer"] is None:
-        return [*numbers, *["-"] * 4]
-    peer = [case["peer"], f"{case['peer_us_p50']:.1f}", f"{case['ratio']:.3f}", f"{case['largest_difference']:.0e}"]
-    return [*numbers, *peer]

@@ -4,7 +4,8 @@ filterpy and Stone Soup belong to the extra ``peers`` and are imported when a ra
 the clock starts. What the peers compute has to be what this project computes: the race checks it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from math import cos, hypot, sin, sqrt, tau
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, FloatArray
 from ccatp.estimation import state_model as sm
 from ccatp.filters import FILTERS
-from ccatp.filters.ekf_slam import Columns, EkfSlam, columns_of
+from ccatp.filters.ekf_slam import EkfSlam, columns_of
 from ccatp.filters.unscented import ALPHA, BETA, KURTOSIS
 from ccatp.mirror.mirror import build_mirror
 from ccatp.mirror.multilateration import multilaterate
@@ -26,16 +27,46 @@ MILDER = 1e4
 frame leaves unknown costs forms with an inverse and (I - W H) P half their digits: nothing could be compared."""
 _SURVEY_START = (0.3, -0.4, 0.5, 0.05, 0.1)  # on the mirror, under way and turning: X, Y, PSI, V, W
 _ANGLE_RAD2, _POSITION_M2, _HEADING_RAD2 = 1e-6, 1e-8, 1e-4  # variances of a wheel's angle, a fix, a heading
-Result = tuple[FloatArray, FloatArray]
-"""Mean (n,) and covariance (n, n)."""
+
+Solution = Iterator[tuple[Any, Any]]
+"""Set up by the first ``next``, which is not timed; each other one works on a reading: mean (n,), covariance (n, n)."""
+Contender = Callable[[], Solution]
+"""Begins again."""
+NOT_BEGUN = (), ()
 
 
-class Contender(NamedTuple):
-    """Something that is timed: begin again (not timed), work on reading number i (timed), the state after it."""
+class Race(NamedTuple):
+    """A case: ours against each peer; without peers, why. ``dense``: a peer that takes long, raced for few rounds."""
 
-    reset: Callable[[], None]
-    step: Callable[[int], object]
-    result: Callable[[], Result]
+    name: str
+    ours: Contender
+    peers: dict[str, Contender]
+    is_dense: bool = False
+    note: str = ""
+
+
+def races(cfg: Config) -> Iterator[Race]:
+    """Steps of filters, of range SLAM (a prediction and a scalar update) and of multilateration."""
+    # kf: inertial unit; and one sample of each wheel; and ten. ekf: models as matrices.
+    linear = [("kf", thesis_problem(cfg, m)) for m in (2, 4, 22)]
+    linear += [("ekf", linearised_problem(cfg, m)) for m in (4, 6, 23)]
+    for filter_name, problem in (*linear, ("ukf", survey_problem(cfg))):
+        name = f"{filter_name} predict + update, n = {problem.mean.size}, m = {problem.variances.size}"
+        peers = {"filterpy": partial(filterpy, problem), "Stone Soup": partial(stonesoup, problem)}
+        if filter_name != "ukf":
+            peers = {"eq. 2.13 in numpy": partial(printed_filter, problem), **peers}
+        yield Race(name, partial(our_filter, filter_name, problem), peers)
+    for beacons in (4, 50, 200):
+        slam = slam_problem(beacons)
+        name, ours = f"ekf-slam, {beacons} beacons, n = {slam.mean.size}", partial(our_slam, slam)
+        if beacons < 200:
+            yield Race(name, ours, {"whole matrices in numpy": partial(dense_slam, slam)}, is_dense=True)
+        else:
+            note = f"ekf-slam: whole matrices take n^3, too long to race against with {beacons} beacons"
+            yield Race(name, ours, {}, note=note)
+    ranges = range_problem(cfg)
+    peers = {"scipy.optimize.least_squares": partial(scipy_position, ranges)}
+    yield Race(f"multilaterate, {ranges.anchors_m.shape[0]} lengths", partial(our_position, ranges), peers)
 
 
 # -- filters ----------------------------------------------------------------------------------------------------------
@@ -139,36 +170,29 @@ def linearised_problem(cfg: Config, rows: int) -> FilterProblem:
     return linear_problem(problem.mean, problem.covariance, F, H, problem.Q, variances)
 
 
-def our_filter(name: str, problem: FilterProblem) -> Contender:
+def our_filter(name: str, problem: FilterProblem) -> Solution:
     """A filter of ``FILTERS``."""
-    mean, covariance, F, H, Q, R, _ = problem
-    ours, readings = FILTERS[name](mean, covariance), list(problem.readings)
-
-    def step(i: int) -> None:
+    mean, covariance, F, H, Q, R, readings = problem
+    ours = FILTERS[name](mean, covariance)
+    yield NOT_BEGUN
+    for z in readings:
         ours.predict(F, Q)
-        ours.update(readings[i], H, R)
+        ours.update(z, H, R)
+        yield ours.mean, ours.covariance
 
-    return Contender(lambda: ours.reset(mean, covariance), step, lambda: (ours.mean, ours.covariance))
 
-
-def printed_filter(problem: FilterProblem) -> Contender:
+def printed_filter(problem: FilterProblem) -> Solution:
     """Thesis eq. 2.13 with its inverse and its (I - W H) P in bare numpy, without a check."""
     x, P, F, H, Q, variances, readings = problem
     R, identity = np.diag(variances), np.eye(x.size)
-
-    def reset() -> None:
-        nonlocal x, P
-        x, P = problem.mean, problem.covariance
-
-    def step(i: int) -> None:
-        nonlocal x, P
+    yield NOT_BEGUN
+    for z in readings:
         x = F @ x
         P = F @ P @ F.T + Q
         K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
-        x = x + K @ (readings[i] - H @ x)
+        x = x + K @ (z - H @ x)
         P = (identity - K @ H) @ P
-
-    return Contender(reset, step, lambda: (x, P))
+        yield x, P
 
 
 def _sigma_points(problem: FilterProblem) -> dict[str, float]:
@@ -176,7 +200,7 @@ def _sigma_points(problem: FilterProblem) -> dict[str, float]:
     return {"alpha": ALPHA, "beta": BETA, "kappa": max(KURTOSIS - problem.mean.size, 0.0)}
 
 
-def filterpy(problem: FilterProblem) -> Contender:
+def filterpy(problem: FilterProblem) -> Solution:
     """Filterpy's Kalman filter for matrices; its unscented one with the scaled points of Merwe for models."""
     from filterpy.kalman import KalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter  # noqa: PLC0415 - an extra
 
@@ -191,20 +215,16 @@ def filterpy(problem: FilterProblem) -> Contender:
             mean.size, variances.size, DT_S, points=points,
             hx=lambda x: H.through(x[None])[0], fx=lambda x, _dt: F.through(x[None])[0],
         )  # fmt: skip
-    peer.Q, peer.R = Q, np.diag(variances)
+    peer.x, peer.P, peer.Q, peer.R = mean.reshape(shape).copy(), covariance.copy(), Q, np.diag(variances)
     columns = [reading.reshape(shape) for reading in readings]
-
-    def reset() -> None:
-        peer.x, peer.P = mean.reshape(shape).copy(), covariance.copy()
-
-    def step(i: int) -> None:
+    yield NOT_BEGUN
+    for column in columns:
         peer.predict()
-        peer.update(columns[i])
+        peer.update(column)
+        yield peer.x, peer.P
 
-    return Contender(reset, step, lambda: (peer.x.ravel(), peer.P))
 
-
-def stonesoup(problem: FilterProblem) -> Contender:
+def stonesoup(problem: FilterProblem) -> Solution:
     """Predictor and updater of Stone Soup: Kalman's for matrices, the unscented ones for models."""
     import stonesoup.predictor.kalman as predictors  # noqa: PLC0415 - belongs to an extra
     import stonesoup.updater.kalman as updaters  # noqa: PLC0415
@@ -214,31 +234,31 @@ def stonesoup(problem: FilterProblem) -> Contender:
 
     is_linear = isinstance(problem.F, np.ndarray)
     kind, points = ("Kalman", {}) if is_linear else ("UnscentedKalman", _sigma_points(problem))
-    transition, measurement = _stonesoup_linear(problem) if is_linear else _stonesoup_nonlinear(problem)
+    transition, measurement = _stonesoup_models(problem, is_linear=is_linear)
     predictor = getattr(predictors, kind + "Predictor")(transition, **points)
     updater = getattr(updaters, kind + "Updater")(measurement, **points)
     detections = [Detection(reading[:, None]) for reading in problem.readings]
-    state: Any = None
-
-    def reset() -> None:
-        nonlocal state
-        state = GaussianState(problem.mean[:, None].copy(), problem.covariance.copy())
-
-    def step(i: int) -> None:
-        nonlocal state
-        state = updater.update(SingleHypothesis(predictor.predict(state), detections[i]))
-
-    def result() -> Result:
-        return np.array(state.state_vector, dtype=np.float64)[:, 0], np.array(state.covar, dtype=np.float64)
-
-    return Contender(reset, step, result)
+    state: Any = GaussianState(problem.mean[:, None].copy(), problem.covariance.copy())
+    yield NOT_BEGUN
+    for detection in detections:
+        state = updater.update(SingleHypothesis(predictor.predict(state), detection))
+        yield state.state_vector, state.covar
 
 
-def _stonesoup_linear(problem: FilterProblem) -> tuple[Any, Any]:
-    from stonesoup.models.measurement.linear import LinearGaussian  # noqa: PLC0415 - belongs to an extra
+def _stonesoup_models(problem: FilterProblem, *, is_linear: bool) -> tuple[Any, Any]:
+    """The motion and the measurement."""
+    from stonesoup.models.base import TimeInvariantModel  # noqa: PLC0415 - belongs to an extra
+    from stonesoup.models.measurement.linear import LinearGaussian  # noqa: PLC0415
+    from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement  # noqa: PLC0415
     from stonesoup.models.transition.linear import LinearGaussianTimeInvariantTransitionModel  # noqa: PLC0415
+    from stonesoup.models.transition.nonlinear import GaussianTransitionModel  # noqa: PLC0415
+    from stonesoup.types.array import StateVectors  # noqa: PLC0415
 
     n = problem.mean.size
+    about = {"ndim_state": n, "mapping": tuple(range(n)), "noise_covar": np.diag(problem.variances)}
+
+    def mapped(model: Any, state: Any) -> Any:
+        return StateVectors(model.through(np.asarray(state.state_vector, dtype=np.float64).T).T)
 
     class Rows(LinearGaussian):  # type: ignore[misc] # Stone Soup has no types
         ndim_meas = problem.variances.size
@@ -246,22 +266,7 @@ def _stonesoup_linear(problem: FilterProblem) -> tuple[Any, Any]:
         def matrix(self, **_: object) -> Any:
             return problem.H
 
-    transition = LinearGaussianTimeInvariantTransitionModel(transition_matrix=problem.F, covariance_matrix=problem.Q)
-    return transition, Rows(ndim_state=n, mapping=tuple(range(n)), noise_covar=np.diag(problem.variances))
-
-
-def _stonesoup_nonlinear(problem: FilterProblem) -> tuple[Any, Any]:
-    from stonesoup.models.base import TimeInvariantModel  # noqa: PLC0415 - belongs to an extra
-    from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement  # noqa: PLC0415
-    from stonesoup.models.transition.nonlinear import GaussianTransitionModel  # noqa: PLC0415
-    from stonesoup.types.array import StateVectors  # noqa: PLC0415
-
-    n = problem.mean.size
-
-    def mapped(model: Any, state: Any) -> Any:
-        return StateVectors(model.through(np.asarray(state.state_vector, dtype=np.float64).T).T)
-
-    class Motion(GaussianTransitionModel, TimeInvariantModel):  # type: ignore[misc] # Stone Soup has no types
+    class Motion(GaussianTransitionModel, TimeInvariantModel):  # type: ignore[misc]
         ndim_state = n
 
         def covar(self, **_: object) -> FloatArray:
@@ -270,14 +275,16 @@ def _stonesoup_nonlinear(problem: FilterProblem) -> tuple[Any, Any]:
         def function(self, state: Any, noise: object = False, **_: object) -> Any:
             return mapped(problem.F, state)
 
-    class Sight(NonLinearGaussianMeasurement):  # type: ignore[misc] # Stone Soup has no types
+    class Sight(NonLinearGaussianMeasurement):  # type: ignore[misc]
         ndim_meas = problem.variances.size
 
         def function(self, state: Any, noise: object = False, **_: object) -> Any:
             return mapped(problem.H, state)
 
-    noise = np.diag(problem.variances)
-    return Motion(), Sight(ndim_state=n, mapping=tuple(range(n)), noise_covar=noise)
+    if not is_linear:
+        return Motion(), Sight(**about)
+    motion = LinearGaussianTimeInvariantTransitionModel(transition_matrix=problem.F, covariance_matrix=problem.Q)
+    return motion, Rows(**about)
 
 
 # -- range SLAM: a vehicle on an arc receives one beacon a step -------------------------------------------------------
@@ -293,11 +300,7 @@ class SlamProblem(NamedTuple):
     mean: FloatArray
     covariance: FloatArray
     ranges_m: FloatArray
-
-    @property
-    def beacons(self) -> int:
-        """How many there are."""
-        return (self.mean.size - _VEHICLE - _SHARED) // _BLOCK
+    touched: list[list[int]]  # states that a range to each beacon depends on
 
 
 def slam_problem(beacons: int) -> SlamProblem:
@@ -307,66 +310,51 @@ def slam_problem(beacons: int) -> SlamProblem:
     places = np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
     mean = np.concatenate([np.zeros(_VEHICLE + _SHARED), places.ravel()])
     sigmas = np.array((0.05, 0.05, 0.02, 0.05, 0.1, *[0.3] * (_BLOCK * beacons)))
+    first = _VEHICLE + _SHARED
+    touched = [[*range(first), at, at + 1] for at in range(first, mean.size, _BLOCK)]
     true, ranges = mean + sigmas * rng.normal(size=sigmas.size), np.empty(STEPS)
     for i in range(STEPS):
         true[:_VEHICLE] = _moved(true[:_VEHICLE])[0]
-        ranges[i] = _range(true[_touched(i % beacons)].tolist())[0] + _RANGE_SIGMA_M * rng.normal()
-    return SlamProblem(mean, np.diag(sigmas**2), ranges)
+        ranges[i] = _range(true[touched[i % beacons]].tolist())[0] + _RANGE_SIGMA_M * rng.normal()
+    return SlamProblem(mean, np.diag(sigmas**2), ranges, touched)
 
 
-def our_slam(problem: SlamProblem) -> Contender:
+def our_slam(problem: SlamProblem) -> Solution:
     """Blocks and sparse rows."""
-    ours: EkfSlam
+    x, P, ranges_m, touched = problem
     shared = slice(_VEHICLE, _VEHICLE + _SHARED)
-    columns: list[Columns] = [columns_of(_touched(beacon)) for beacon in range(problem.beacons)]
-
-    def reset() -> None:
-        nonlocal ours
-        x, P = problem.mean, problem.covariance
-        ours = EkfSlam(x[:_VEHICLE], P[:_VEHICLE, :_VEHICLE], x[shared], P[shared, shared])
-        for beacon in range(problem.beacons):
-            at, none = slice(_touched(beacon)[-2], _touched(beacon)[-1] + 1), np.empty(0, dtype=np.intp)
-            ours.augment(beacon, x[at], none, np.zeros((_BLOCK, 0)), np.eye(_BLOCK), P[at, at])
-
-    def step(i: int) -> None:
+    ours = EkfSlam(x[:_VEHICLE], P[:_VEHICLE, :_VEHICLE], x[shared], P[shared, shared])
+    for beacon, states in enumerate(touched):
+        at, none = slice(states[-2], states[-1] + 1), np.empty(0, dtype=np.intp)
+        ours.augment(beacon, x[at], none, np.zeros((_BLOCK, 0)), np.eye(_BLOCK), P[at, at])
+    columns = [columns_of(states) for states in touched]
+    yield NOT_BEGUN
+    for i in range(STEPS):
         new, F = _moved(ours.mean[:_VEHICLE])
         ours.predict(new, F, _SLAM_NOISE)
-        touched = columns[i % problem.beacons]
-        expected, h = _range(ours.mean.take(touched).tolist())
-        ours.update_row(touched, np.array(h), problem.ranges_m[i] - expected, _RANGE_SIGMA_M**2)
+        states = columns[i % len(columns)]
+        expected, h = _range(ours.mean.take(states).tolist())
+        ours.update_row(states, np.array(h), ranges_m[i] - expected, _RANGE_SIGMA_M**2)
+        yield ours.mean, ours.covariance
 
-    return Contender(reset, step, lambda: (ours.mean.copy(), ours.covariance.copy()))
 
-
-def dense_slam(problem: SlamProblem) -> Contender:
+def dense_slam(problem: SlamProblem) -> Solution:
     """The same by F P F^T + Q and (I - K H) P of the whole state, in bare numpy."""
-    x, P = problem.mean, problem.covariance
-    n = x.size
+    x, P, ranges_m, touched = problem
+    x, n = x.copy(), x.size
     identity, Q = np.eye(n), np.zeros((n, n))
     Q[:_VEHICLE, :_VEHICLE] = _SLAM_NOISE
-
-    def reset() -> None:
-        nonlocal x, P
-        x, P = problem.mean.copy(), problem.covariance
-
-    def step(i: int) -> None:
-        nonlocal x, P
+    yield NOT_BEGUN
+    for i in range(STEPS):
         F, H = np.eye(n), np.zeros(n)
         x[:_VEHICLE], F[:_VEHICLE, :_VEHICLE] = _moved(x[:_VEHICLE])
         P = F @ P @ F.T + Q
-        touched = _touched(i % problem.beacons)
-        expected, H[touched] = _range(x[touched].tolist())
+        states = touched[i % len(touched)]
+        expected, H[states] = _range(x[states].tolist())
         K = P @ H / (H @ P @ H + _RANGE_SIGMA_M**2)
-        x += K * (problem.ranges_m[i] - expected)
+        x += K * (ranges_m[i] - expected)
         P = (identity - np.outer(K, H)) @ P
-
-    return Contender(reset, step, lambda: (x, P))
-
-
-def _touched(beacon: int) -> list[int]:
-    """States that a range to a beacon depends on."""
-    at = _VEHICLE + _SHARED + _BLOCK * beacon
-    return [*range(_VEHICLE + _SHARED), at, at + 1]
+        yield x, P
 
 
 def _moved(pose: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -412,42 +400,35 @@ def range_problem(cfg: Config) -> RangeProblem:
     return RangeProblem(anchors, ranges, sigmas, pucks + 2e-3 * rng.normal(size=pucks.shape))
 
 
-def our_position(problem: RangeProblem) -> Contender:
+def our_position(problem: RangeProblem) -> Solution:
     """``multilaterate``."""
-    solution: Result = (np.zeros(3), np.eye(3))
-
-    def step(i: int) -> None:
-        nonlocal solution
-        found = multilaterate(problem.anchors_m, problem.ranges_m[i], problem.sigmas_m[i], problem.expected_m[i])
-        solution = found.position_m, found.covariance_m2
-
-    return Contender(lambda: None, step, lambda: solution)
+    anchors_m, *pucks = problem
+    yield NOT_BEGUN
+    for ranges, sigmas, expected_m in zip(*pucks, strict=True):
+        found = multilaterate(anchors_m, ranges, sigmas, expected_m)
+        yield found.position_m, found.covariance_m2
 
 
-def scipy_position(problem: RangeProblem) -> Contender:
+def scipy_position(problem: RangeProblem) -> Solution:
     """The same weighted least squares by SciPy's Levenberg-Marquardt, and the covariance out of its Jacobian."""
-    solution: Result = (np.zeros(3), np.eye(3))
+    anchors_m, *pucks = problem
     tolerance = sqrt(np.finfo(np.float64).eps)  # quadratic convergence squares it
 
-    def step(i: int) -> None:
-        nonlocal solution
-        ranges, sigmas = problem.ranges_m[i], problem.sigmas_m[i]
+    def residuals(x: FloatArray, ranges: FloatArray, sigmas: FloatArray) -> FloatArray:
+        offsets = x - anchors_m
+        seen: FloatArray = (np.sqrt((offsets * offsets).sum(axis=1)) - ranges) / sigmas
+        return seen
 
-        def residuals(x: FloatArray) -> FloatArray:
-            offsets = x - problem.anchors_m
-            seen: FloatArray = (np.sqrt((offsets * offsets).sum(axis=1)) - ranges) / sigmas
-            return seen
+    def jacobian(x: FloatArray, _: FloatArray, sigmas: FloatArray) -> FloatArray:
+        offsets = x - anchors_m
+        slopes: FloatArray = offsets / (np.sqrt((offsets * offsets).sum(axis=1)) * sigmas)[:, None]
+        return slopes
 
-        def jacobian(x: FloatArray) -> FloatArray:
-            offsets = x - problem.anchors_m
-            slopes: FloatArray = offsets / (np.sqrt((offsets * offsets).sum(axis=1)) * sigmas)[:, None]
-            return slopes
-
+    yield NOT_BEGUN
+    for ranges, sigmas, expected_m in zip(*pucks, strict=True):
         found = least_squares(
-            residuals, problem.expected_m[i], jac=jacobian, method="lm",
+            residuals, expected_m, jac=jacobian, method="lm", args=(ranges, sigmas),
             xtol=tolerance, ftol=tolerance, gtol=tolerance,
         )  # fmt: skip
         slopes = np.asarray(found.jac, dtype=np.float64)
-        solution = np.asarray(found.x), np.linalg.inv(slopes.T @ slopes).astype(np.float64)
-
-    return Contender(lambda: None, step, lambda: solution)
+        yield found.x, np.linalg.inv(slopes.T @ slopes)

@@ -180,18 +180,11 @@ _STILL_M = 1e-7  # a frame in which no wheel moves further is a frame at rest
 
 
 class StopBound(NamedTuple):
-    """The bound at one fix, before it is used.
-
-    Attributes:
-        point: measured there, None where the fix was not for a point.
-        covariance_m2: bound of the covariance of (x, y), shape (2, 2).
-        error_m: the estimator's error there, (x, y).
-    """
+    """The bound of the covariance of (x, y) at one fix, before it is used, shape (2, 2)."""
 
     t_s: float
-    point: PointId | None
+    fix: StopFix
     covariance_m2: FloatArray
-    error_m: tuple[float, float]
 
 
 def bounds_of(cfg: Config, mirror: Mirror, record: TrueRecord, *, with_accelerometer: bool = False) -> list[StopBound]:
@@ -203,7 +196,6 @@ class _Recursion:
     def __init__(self, cfg: Config, mirror: Mirror, record: TrueRecord, with_accelerometer: bool) -> None:
         world = cfg.world
         self._cfg, self._world, self._record, self._with_accelerometer = cfg, world, record, with_accelerometer
-        self._sensors = cfg.robot.edge_sensors_m
         self._radius_m, self._base_m = cfg.robot.wheel_radius_m, record.base_m
         self._frame_s = 1.0 / cfg.sim.robot.frame_hz
         rows = record.way
@@ -243,8 +235,7 @@ class _Recursion:
             for one in passes.get(k, ()):
                 self._cross(one)
             for fix in fixes.get(k, ()):
-                t_s = float(record.way[fix.frame, WAY_T])
-                found.append(StopBound(t_s, fix.point, self._P[:2, :2].copy(), fix.error_m))
+                found.append(StopBound(float(record.way[fix.frame, WAY_T]), fix, self._P[:2, :2].copy()))
                 self._fix(fix)
         return found
 
@@ -295,11 +286,15 @@ class _Recursion:
         rows, variances = [rate], [self._world.gyroscope_sigma_rad_s**2]
         if self._with_accelerometer:
             period_s = float(self._record.way[1, WAY_T] - self._record.way[0, WAY_T])
-            changes = (
-                (right - float(self._right_m[k - 1])) / period_s**2,
-                (left - float(self._left_m[k - 1])) / period_s**2,
-            )
-            rows.append(_acceleration_row(*changes))
+            push = np.zeros(_STATES)
+            for states, change_m in (
+                ([SR, UR, RR], right - float(self._right_m[k - 1])),
+                ([SL, UL, RL], left - float(self._left_m[k - 1])),
+            ):
+                half = 0.5 * (change_m / period_s**2)
+                push[states] = -half, -half, half
+            push[BA], push[JA], push[JA0] = 1.0, 1.0, -1.0
+            rows.append(push)
             variances.append(self._world.accelerometer_sigma_m_s2**2)
         # The rate's row refers to the parameters, which the motion leaves as they are, so it may follow it.
         self._P = F.dot(self._P).dot(F.T)
@@ -329,7 +324,7 @@ class _Recursion:
     # -- measurements -------------------------------------------------------------------------------------------------
 
     def _cross(self, one: SeamPass) -> None:
-        ahead, left = self._sensors[one.corner]
+        ahead, left = self._cfg.robot.edge_sensors_m[one.corner]
         row = self._record.way[one.frame]
         hx, hy, lx, ly = row[WAY_HX : WAY_LY + 1].tolist()
         turned = ahead * (lx, ly)[one.axis] - left * (hx, hy)[one.axis]
@@ -383,14 +378,6 @@ def _per_parameter(travel_m: float, radius_m: float, scale: float) -> FloatArray
     """Change of a wheel's travel per unit of its slips, its radius error, and the errors of its two angles."""
     nominal_m, m_per_rad = travel_m / scale, radius_m * scale
     return np.array((-nominal_m, -nominal_m, travel_m, -m_per_rad, m_per_rad))
-
-
-def _acceleration_row(right_m_s2: float, left_m_s2: float) -> FloatArray:
-    row = np.zeros(_STATES)
-    row[[SR, UR, RR]] = -0.5 * right_m_s2, -0.5 * right_m_s2, 0.5 * right_m_s2
-    row[[SL, UL, RL]] = -0.5 * left_m_s2, -0.5 * left_m_s2, 0.5 * left_m_s2
-    row[BA], row[JA], row[JA0] = 1.0, 1.0, -1.0
-    return row
 
 
 def _downhill_of(mirror: Mirror, rows: FloatArray) -> FloatArray:

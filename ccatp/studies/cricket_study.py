@@ -22,7 +22,7 @@ from ccatp.filters.metrics import best_motion
 from ccatp.report.plots import QUIET
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.mote_runs import look_ahead, percentiles, run_batch, run_filter, simulate_field
-from ccatp.studies.results import LIMIT, colour, plot, write_analysis
+from ccatp.studies.results import LIMIT, band, bar, colour, plot, write_analysis
 
 UPDATES = 300  # of figures 11 and 12 as we read them
 SHOWN = 30  # updates within which figure 14 comes down
@@ -32,6 +32,7 @@ _PLAIN = {
     "cricket.phase2.linearisations": 1,
     "cricket.phase2.gate_probability": 1.0 - 1e-15,
 }
+_PRINTED = {"cricket.phase2.prior": "printed"}
 _LATE = {"cricket.sim.latency_s": 0.0003}  # 10 cm: a pulse that is detected a few periods late
 
 
@@ -43,40 +44,30 @@ class Case(NamedTuple):
     keys: Mapping[str, object]
 
 
-def _filter(pairs: str, **keys: object) -> dict[str, object]:
-    return {
-        "cricket.phase2.pairs": pairs,
-        "cricket.phase2.max_updates": UPDATES,
-        "cricket.phase2.target_rms_m": _ENDLESS_M,
-        **keys,
-    }
+def _filter(figure: str, pairs: str, **keys: object) -> Case:
+    long = {"cricket.phase2.max_updates": UPDATES, "cricket.phase2.target_rms_m": _ENDLESS_M}
+    return Case(figure, "ekf", {"cricket.phase2.pairs": pairs, **long, **keys})
 
 
-def _batch(repeats: int, *, shapes: bool = True, second: bool = False) -> dict[str, object]:
-    return {
-        "cricket.ranging.repeats": repeats,
-        "cricket.batch.uses_shapes": shapes,
-        "cricket.batch.uses_phase2": second,
-        "cricket.phase2.max_updates": 15,
-    }
+def _batch(figure: str, repeats: int, *, shapes: bool = True, second: bool = False, **keys: object) -> Case:
+    uses = {"cricket.batch.uses_shapes": shapes, "cricket.batch.uses_phase2": second, "cricket.phase2.max_updates": 15}
+    return Case(figure, "batch", {"cricket.ranging.repeats": repeats, **uses, **keys})
 
 
 CASES = {
-    "zigzag-printed": Case("10 to 12", "ekf", {**_filter("zigzag"), **_PLAIN}),
-    "zigzag-p0-99": Case("eq. 25", "ekf", {**_filter("zigzag"), **_PLAIN, "cricket.phase2.prior": "printed"}),
-    "zigzag-pooled": Case("better", "ekf", _filter("zigzag")),
-    "adjacent-printed": Case("13, 14", "ekf", {**_filter("adjacent"), **_PLAIN}),
-    "all-printed": Case("13, 14", "ekf", {**_filter("all"), **_PLAIN}),
-    "all-p0-99": Case("eq. 25", "ekf", {**_filter("all"), **_PLAIN, "cricket.phase2.prior": "printed"}),
-    "all-pooled": Case("better", "ekf", _filter("all")),
-    "batch-45-once": Case("better", "batch", _batch(1)),
-    "batch-45": Case("better", "batch", _batch(60)),
-    "batch-45-no-shapes": Case("better", "batch", _batch(60, shapes=False)),
-    "batch-45-and-15": Case("better", "batch", _batch(60, second=True)),
-    "batch-late": Case("fault", "batch", {**_batch(60, second=True), **_LATE}),
-    "batch-late-offset": Case(
-        "better", "batch", {**_batch(60, second=True), **_LATE, "cricket.batch.estimates_offset": True}
-    ),
+    "zigzag-printed": _filter("10 to 12", "zigzag", **_PLAIN),
+    "zigzag-p0-99": _filter("eq. 25", "zigzag", **_PLAIN, **_PRINTED),
+    "zigzag-pooled": _filter("better", "zigzag"),
+    "adjacent-printed": _filter("13, 14", "adjacent", **_PLAIN),
+    "all-printed": _filter("13, 14", "all", **_PLAIN),
+    "all-p0-99": _filter("eq. 25", "all", **_PLAIN, **_PRINTED),
+    "all-pooled": _filter("better", "all"),
+    "batch-45-once": _batch("better", 1),
+    "batch-45": _batch("better", 60),
+    "batch-45-no-shapes": _batch("better", 60, shapes=False),
+    "batch-45-and-15": _batch("better", 60, second=True),
+    "batch-late": _batch("fault", 60, second=True, **_LATE),
+    "batch-late-offset": _batch("better", 60, second=True, **_LATE, **{"cricket.batch.estimates_offset": True}),
 }
 
 
@@ -171,12 +162,11 @@ def draw(cells: Sequence[CellResult], out: Path) -> None:
 
 
 def _draw_traces(found: Mapping[str, CellResult], names: Sequence[str], title: str, goal_m: float, stem: Path) -> None:
-    with plot(stem, 8.5, 5.2, legend=3) as (_, (axes,)):
+    with plot(stem, 8.5, 5.2, legend=3) as (axes,):
         for number, name in enumerate(names):
-            low, middle, high = found[name].arrays["trace_m"]
-            updates, shade = np.arange(len(middle)), colour(number)
-            axes.fill_between(updates, low, high, color=shade, alpha=0.13, linewidth=0)
-            axes.plot(updates, middle, color=shade, linewidth=1.7, label=name)
+            ends, shade = found[name].arrays["trace_m"], colour(number)
+            updates = np.arange(ends.shape[1])
+            band(axes, updates, ends, shade, label=name)
             axes.plot(updates, found[name].arrays["expected_trace_m"], color=shade, linewidth=1.0, linestyle="--")
         axes.axhline(goal_m, color=LIMIT, linewidth=0.9, linestyle=":", label=f"published: {1e3 * goal_m:g} mm")
         axes.set(xlabel="updates", ylabel="root mean square error of a place, m", yscale="log")
@@ -184,7 +174,7 @@ def _draw_traces(found: Mapping[str, CellResult], names: Sequence[str], title: s
 
 
 def _draw_maps(found: Mapping[str, CellResult], maps: Sequence[tuple[str, str]], stem: Path) -> None:
-    with plot(stem, 4.6 * len(maps), 6.4, 1, len(maps), legend=2) as (_, panels):
+    with plot(stem, 4.6 * len(maps), 6.4, 1, len(maps), legend=2) as panels:
         for axes, (name, title) in zip(panels, maps, strict=True):
             true, places = found[name].arrays["true_m"], found[name].arrays["positions_m"][:_CLOUD]
             for mote in range(len(true)):
@@ -195,19 +185,17 @@ def _draw_maps(found: Mapping[str, CellResult], maps: Sequence[tuple[str, str]],
 
 
 def _draw_ways(cells: Sequence[CellResult], stem: Path) -> None:
-    with plot(stem, 8.5, 0.36 * len(cells) + 1.7) as (_, (axes,)):
+    with plot(stem, 8.5, 0.36 * len(cells) + 1.7) as (axes,):
         for row, cell in enumerate(cells):
             rms, bound_m = cell.values["rms_m"], cell.values["bound_m"]
             shade = colour(0 if cell.values["method"] == "ekf" else 2)
-            bar: dict[str, Any] = {"linewidth": 4.0, "alpha": 0.35, "solid_capstyle": "butt"}
-            axes.plot([rms["p10"], rms["p90"]], [row, row], color=shade, **bar)
+            bar(axes, [rms["p10"], rms["p90"]], [row, row], shade)
             axes.plot(rms["p50"], row, "o", color=shade, markersize=5)
             if bound_m is not None:
                 axes.plot([bound_m, bound_m], [row - 0.3, row + 0.3], color=QUIET, linewidth=1.4)
         axes.set_yticks(range(len(cells)), [str(cell.factors["case"]) for cell in cells])
-        axes.set_ylim(len(cells) - 0.5, -0.5)
-        axes.set_xscale("log")
-        axes.set_xlabel("root mean square error of a place, m: median (dot), 10 to 90 % (bar), Cramér-Rao bound (line)")
+        label = "root mean square error of a place, m: median (dot), 10 to 90 % (bar), Cramér-Rao bound (line)"
+        axes.set(ylim=(len(cells) - 0.5, -0.5), xscale="log", xlabel=label)
 
 
 STUDY = Study(
@@ -245,16 +233,11 @@ _ROBUST = 4.0
 
 
 def run_sizes(cfg: Config, out: Path) -> dict[str, Any]:
-    """Map drawn fields of growing size, once each, and write ``result.json``, ``table.md`` and the figure.
-
-    Raises:
-        OSError: ``out`` cannot be written.
-    """
+    """Map drawn fields of growing size, once each, and write ``result.json``, ``table.md`` and the figure."""
     began_s = time.perf_counter()
-    out.mkdir(parents=True, exist_ok=True)
     cells = [_sized_cell(size, cfg.run.seed) for size in SIZES]
     result = write_analysis("mote-sizes", cells, {key: key for key in cells[0]}, out, began_s)
-    with plot(out / "mote_sizes", 6.5, 4.2, legend=2) as (_, (axes,)):
+    with plot(out / "mote_sizes", 6.5, 4.2, legend=2) as (axes,):
         for number, (key, label) in enumerate((("map_s", "map"), ("outlook_s", "rank and folds, before"))):
             motes, times_s = [cell["motes"] for cell in cells], [cell[key] for cell in cells]
             axes.loglog(motes, times_s, "o-", color=colour(number), label=label)

@@ -8,11 +8,10 @@ The robot drives on constant set points; its wheels slip, its sensors err and th
 and an estimate of the pose every fifth frame.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from math import cos, hypot, pi, radians, sin, sqrt
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -25,12 +24,15 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.plant import Plant
 from ccatp.sim.sensors import SensorSuite, named
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
-from ccatp.studies.results import colour, plot
+from ccatp.studies.results import colour, grouped, plot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 SPEEDS_M_S = (0.05, 0.10, 0.15, 0.20)
 TURN = "turn"
 CROSSINGS: tuple[int | str, ...] = (0, 15, 30, 45, 60, TURN)
-RULES = ("thesis", "shipped")
+RULES = {"thesis": "off for 0.1 s (thesis)", "shipped": "travel against the map (ours)"}
 OFF_S = 0.1
 """Threshold of the thesis's rule: a gap of 1 cm at 0.1 m/s."""
 _MARGIN_M = 0.01  # the first sensor begins this far before a seam, the last one ends this far behind it
@@ -45,12 +47,8 @@ _Z_95 = 1.96  # quantiles of the normal distribution
 _RESAMPLES = 2000
 
 
-@dataclass(frozen=True, slots=True)
-class EdgeErrors:
-    """Standard deviations of the estimate that the rules get, drawn once per drive; in x and in y, and of heading.
-
-    ``position_m`` is also what the estimate reports of itself.
-    """
+class EdgeErrors(NamedTuple):
+    """Standard deviations of the estimate that the rules get, drawn once per drive; it reports ``position_m``."""
 
     position_m: float
     heading_rad: float
@@ -90,11 +88,7 @@ def off_time_rule(off_s: float) -> EdgeRule:
 
 
 def build_rule(name: str, mirror: Mirror, cfg: Config) -> EdgeRule:
-    """A rule by its name out of ``RULES``: the thesis's, or the daemon's, which compares the travel with the map.
-
-    Raises:
-        ValueError: no such rule.
-    """
+    """A rule of ``RULES``: the thesis's, or the daemon's, which compares travel and map (ValueError: no such rule)."""
     if name == "thesis":
         return off_time_rule(OFF_S)
     if name == "shipped":
@@ -110,15 +104,12 @@ class Rig:
         self, mirror: Mirror, cfg: Config, start: DeckPose, errors: EdgeErrors, rng: np.random.Generator
     ) -> None:
         slip_rng, error_rng, sensors_rng = rng.spawn(3)
-        world, robot = cfg.world, cfg.robot
-        lag_s = cfg.sim.robot.wheel_lag_s
-        self.plant = plant = Plant(
-            mirror.surface, start, wheel_radius_m=robot.wheel_radius_m, wheel_base_m=robot.wheel_base_m,
-            wheel_lag_s=lag_s,
-        )  # fmt: skip
+        world, robot, lag_s = cfg.world, cfg.robot, cfg.sim.robot.wheel_lag_s
+        wheels = {"wheel_radius_m": robot.wheel_radius_m, "wheel_base_m": robot.wheel_base_m, "wheel_lag_s": lag_s}
+        self.plant = plant = Plant(mirror.surface, start, **wheels)
         # There is no steering here, so both wheels slip alike: the angle at the edge counts, not the way there.
         plant.right_scale = plant.left_scale = 1.0 - float(slip_rng.uniform(world.slip_min, world.slip_max))
-        self._sensors = SensorSuite(cfg, mirror, sensors_rng, lag_s=cfg.sim.robot.wheel_lag_s)
+        self._sensors = SensorSuite(cfg, mirror, sensors_rng, lag_s=lag_s)
         self._sensors.edges.place(plant)
         dx, dy, turn = error_rng.standard_normal(3).tolist()
         self._error = errors.position_m * dx, errors.position_m * dy, errors.heading_rad * turn
@@ -164,11 +155,7 @@ def transit(
 ) -> tuple[bool, ...]:
     """Cross a seam between two columns, or turn by a quarter beside it; whether each rule took it for an edge.
 
-    Args:
-        angle_rad: between the way and the seam's normal; None turns in place.
-
-    Returns:
-        A flag for each of ``RULES``.
+    ``angle_rad`` is that between the way and the seam's normal; None turns in place.
     """
     place_rng, rig_rng = rng.spawn(2)
     # Panels with neighbours all round their right seam: the rim is far from every way over it.
@@ -214,8 +201,7 @@ def drive_to_rim(
 ) -> tuple[float, bool]:
     """Drive over the rim until a rule sees an edge; the set points are zero one frame and the link's delays later.
 
-    Returns:
-        How far the furthest sensor went beyond the rim, m, and whether the robot fell.
+    How far the furthest sensor went beyond the rim, m, and whether the robot fell.
     """
     place_rng, rig_rng = rng.spawn(2)
     at_rim = [p for p in mirror.panels.values() if PanelId(p.id.row, p.id.col + 1) not in mirror.panels]
@@ -272,9 +258,8 @@ def run_job(job: Job) -> JobOutcome:
     return JobOutcome(values, arrays)
 
 
-def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
+def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """Probability of a false edge per transit with its interval, and the distribution of the overrun."""
-    del factors
     transits = sum(outcome.values["transits"] for outcome in outcomes)
     values: dict[str, Any] = {"transits": transits}
     arrays: dict[str, FloatArray] = {}
@@ -307,8 +292,7 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
 def wilson(hits: int, of: int) -> tuple[float, float]:
     """95 % interval of a probability after ``hits`` out of ``of`` (Wilson 1927); sensible for 0 hits, too.
 
-    Raises:
-        ValueError: no trials, or more hits than trials.
+    ValueError: no trials, or more hits than trials.
     """
     if not 0 <= hits <= of or of == 0:
         raise ValueError(f"{hits} hits out of {of} trials have no probability: count again")
@@ -325,51 +309,37 @@ def bootstrap(values: FloatArray, q: float) -> tuple[float, float]:
     return low, high
 
 
-_Cells = Mapping[tuple[Any, Any], CellResult]
-_TITLES = {"thesis": "off for 0.1 s (thesis)", "shipped": "travel against the map (ours)"}
-
-
 def draw(results: Sequence[CellResult], out: Path) -> None:
     """Figures ``danger_false_edges_<mirror>`` and ``danger_overrun_<mirror>``, one panel per rule."""
-    for mirror in dict.fromkeys(str(result.factors["mirror"]) for result in results):
-        cells = {
-            (result.factors["speed_m_s"], result.factors["crossing"]): result
-            for result in results
-            if result.factors["mirror"] == mirror
-        }
-        _draw_rules(
-            cells, CROSSINGS, _draw_false_edges, f"A seam taken for an edge, {mirror}",
-            ("speed of the robot, in turns of the sensors, m/s", "false edges per transit (95 %)"),
-            out / f"danger_false_edges_{mirror}",
-        )  # fmt: skip
-        _draw_rules(
-            cells, CROSSINGS[:-1], _draw_overrun, f"Where a drive over the rim ends: quartiles and range, {mirror}",
-            ("speed, m/s", "furthest sensor beyond the rim, mm"), out / f"danger_overrun_{mirror}",
-        )  # fmt: skip
+    for (mirror,), there in grouped(results, "mirror").items():
+        title, label = f"A seam taken for an edge, {mirror}", "false edges per transit (95 %)"
+        _draw_rules(there, CROSSINGS, _false_edges, (title, label), out / f"danger_false_edges_{mirror}")
+        title, label = f"Where a drive over the rim ends: quartiles and range, {mirror}", "furthest sensor over it, mm"
+        _draw_rules(there, CROSSINGS[:-1], _overruns, (title, label), out / f"danger_overrun_{mirror}")
+
+
+_DrawWay = Callable[["Axes", str, FloatArray, Sequence[CellResult], str, str], None]
 
 
 def _draw_rules(
-    cells: _Cells, ways: Sequence[int | str], draw_way: Callable[..., None], title: str, labels: tuple[str, str],
-    stem: Path,
-) -> None:  # fmt: skip
-    size = 9.0, 3.8
-    with plot(stem, *size, 1, len(RULES), title=title, legend=len(ways), sharey=True) as (_, panels):
-        for axes, rule in zip(panels, RULES, strict=True):
+    cells: Sequence[CellResult], ways: Sequence[int | str], draw_way: "_DrawWay", texts: tuple[str, str], stem: Path
+) -> None:
+    title, label = texts
+    with plot(stem, 9.0, 3.8, 1, len(RULES), title=title, legend=len(ways), sharey=True) as panels:
+        for axes, (rule, name) in zip(panels, RULES.items(), strict=True):
             for k, way in enumerate(ways):
-                known = [v for v in SPEEDS_M_S if (v, way) in cells]
-                label = "turning in place" if way == TURN else f"{way}°"
+                known = {cell.factors["speed_m_s"]: cell for cell in cells if cell.factors["crossing"] == way}
                 # Side by side, so that what belongs to the same speed can be distinguished.
-                places = np.array(known) + 0.004 * (k - 0.5 * (len(ways) - 1))
-                draw_way(axes, rule, places, [cells[v, way] for v in known], colour(k), label)
-            axes.set_title(_TITLES[rule])
-            axes.set_xlabel(labels[0])
-            axes.set_xticks(list(SPEEDS_M_S))
+                places = np.array([v for v in SPEEDS_M_S if v in known]) + 0.004 * (k - 0.5 * (len(ways) - 1))
+                shown = [known[v] for v in SPEEDS_M_S if v in known]
+                draw_way(axes, rule, places, shown, colour(k), "turning in place" if way == TURN else f"{way}°")
+            axes.set(title=name, xlabel="speed of the robot, in turns of the sensors, m/s", xticks=SPEEDS_M_S)
             axes.set_xlim(min(SPEEDS_M_S) - 0.02, max(SPEEDS_M_S) + 0.02)
-        panels[0].set_ylabel(labels[1])
+        panels[0].set_ylabel(label)
 
 
-def _draw_false_edges(
-    axes: Any, rule: str, places: FloatArray, cells: Sequence[CellResult], shade: str, label: str
+def _false_edges(
+    axes: "Axes", rule: str, places: FloatArray, cells: Sequence[CellResult], shade: str, label: str
 ) -> None:
     names = ("false_edge_probability", "false_edge_low", "false_edge_high")
     p, low, high = (np.array([cell.values[rule][name] for cell in cells]) for name in names)
@@ -378,11 +348,8 @@ def _draw_false_edges(
     axes.set_ylim(-0.03, 1.03)
 
 
-def _draw_overrun(
-    axes: Any, rule: str, places: FloatArray, cells: Sequence[CellResult], shade: str, label: str
-) -> None:
-    samples = [1e3 * cell.arrays[f"{rule}_overrun_m"] for cell in cells]
-    look = {"color": shade}
+def _overruns(axes: "Axes", rule: str, places: FloatArray, cells: Sequence[CellResult], shade: str, label: str) -> None:
+    samples, look = [1e3 * cell.arrays[f"{rule}_overrun_m"] for cell in cells], {"color": shade}
     axes.boxplot(
         samples, positions=places, widths=0.004, whis=(0, 100), manage_ticks=False, patch_artist=True,
         boxprops={"facecolor": shade, "edgecolor": shade}, whiskerprops=look, capprops=look,
@@ -392,29 +359,29 @@ def _draw_overrun(
     axes.axhline(0.0, color="black", linewidth=0.8)
 
 
-def _columns() -> list[Column]:
-    columns = [Column("transits", "transits")]
-    for name in RULES:
-        columns += [
-            Column(f"{name}: false edges", f"{name}.false_edges"),
-            Column("per transit", f"{name}.false_edge_probability", ".3f"),
-            Column("95 % low", f"{name}.false_edge_low", ".3f"),
-            Column("high", f"{name}.false_edge_high", ".3f"),
-            Column("overrun mean, mm", f"{name}.overrun_mean_mm", ".1f"),
-            Column("95 % of drives, mm", f"{name}.overrun_p95_mm", ".1f"),
-            Column("max, mm", f"{name}.overrun_max_mm", ".1f"),
-            Column("falls", f"{name}.falls"),
-        ]
-    return columns
-
-
 STUDY = Study(
     name="danger",
     title="False edges and overrun of the thesis's edge rule and of the daemon's",
     cells=lambda: [Cell({"speed_m_s": v_m_s, "crossing": way}) for v_m_s in SPEEDS_M_S for way in CROSSINGS],
     run_job=run_job,
     combine=combine,
-    columns=_columns(),
+    columns=(
+        Column("transits", "transits"),
+        *(
+            Column(heading, f"{name}.{key}", spec)
+            for name in RULES
+            for heading, key, spec in (
+                (f"{name}: false edges", "false_edges", ""),
+                ("per transit", "false_edge_probability", ".3f"),
+                ("95 % low", "false_edge_low", ".3f"),
+                ("high", "false_edge_high", ".3f"),
+                ("overrun mean, mm", "overrun_mean_mm", ".1f"),
+                ("95 % of drives, mm", "overrun_p95_mm", ".1f"),
+                ("max, mm", "overrun_max_mm", ".1f"),
+                ("falls", "falls", ""),
+            )
+        ),
+    ),
     draw=draw,
     defaults={"run.world": "hard"},
     mirrors=("fyst-m1", "thesis-m1"),

@@ -12,8 +12,8 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_plan import SENSOR_SIGNALS, FaultPlan, Injected, parse_plan
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
-from ccatp.studies.mission_study import dangers, times
-from ccatp.studies.results import LIMIT, colour, plot
+from ccatp.studies.mission_study import dangers, mission_columns, sums, times
+from ccatp.studies.results import LIMIT, colour, levels, plot
 from ccatp.studies.sil_run import SilRun, rehearse
 from ccatp.survey.composition import assemble
 
@@ -160,9 +160,8 @@ def is_recoverable(plan: FaultPlan, mirror: Mirror) -> bool:
     return not (mirror.overhang and any(fault.signal == "fans" for fault in plan.faults))
 
 
-def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
+def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """Sums over the missions; how those ended that were not completed."""
-    del factors
     values = [outcome.values for outcome in outcomes]
     is_complete = [v["outcome"] == "complete" for v in values]
     recoverable = [v["outcome"] == "complete" for v in values if v["is_recoverable"]]
@@ -172,7 +171,7 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
         "ended": [f"seed {v['seed']} {v['outcome']}: {v['cause']}" for v in values if v["outcome"] != "complete"],
         "danger": dangers(values),
         "weak_frames": sum(v["weak_frames"] for v in values),
-        **{of: {name: sum(v[of][name] for v in values) for name in values[0][of]} for of in ("points", "injected")},
+        **{of: sums(v[of] for v in values) for of in ("points", "injected")},
         **times(values),
     }
     arrays = {
@@ -184,8 +183,8 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
 
 def draw(cells: Sequence[CellResult], out: Path) -> None:
     """Figure ``faults``, the cost of faults in time: every mission a dot, those that were not completed marked."""
-    kinds = list(dict.fromkeys(cell.factors["faults"] for cell in cells))
-    with plot(out / "faults", 7.0, 1.0 + 0.55 * len(cells)) as (_, (axes,)):
+    kinds = levels(cells, "faults")
+    with plot(out / "faults", 7.0, 1.0 + 0.55 * len(cells)) as (axes,):
         for k, cell in enumerate(cells):
             ratios, is_complete = cell.arrays["time_ratio"], cell.arrays["is_complete"].astype(bool)
             rows = k + _SPREAD * np.linspace(-1.0, 1.0, len(ratios)) if len(ratios) > 1 else np.array([float(k)])
@@ -204,19 +203,16 @@ STUDY = Study(
     run_job=run_job,
     combine=combine,
     columns=(
-        Column("complete", "complete"),
+        *mission_columns("complete"),
         Column("recoverable", "recoverable.runs"),
         Column("of these complete", "recoverable.complete"),
-        Column("falls", "danger.falls"),
-        Column("false edges", "danger.false_edges"),
-        Column("largest overrun, mm", "danger.max_overrun_mm", ".1f"),
+        *mission_columns("danger: falls false_edges max_overrun_mm"),
         Column("frames below the fans' floor", "weak_frames"),
         Column("points measured", "points.measured"),
         Column("of", "points.total"),
         Column("faults", "injected.planned"),
         Column("that acted", "injected.acted"),
-        Column("mission, s", "mission_time_s", ".0f"),
-        Column("time / bound", "time_ratio", ".4f"),
+        *mission_columns("mission_time_s time_ratio"),
         Column("ended by", "ended"),
     ),
     draw=draw,

@@ -25,8 +25,9 @@ from ccatp.report.plots import INK, QUIET
 from ccatp.studies.results import plot, write_analysis
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from control import TransferFunction
-    from matplotlib.axes import Axes
 
 Coefficients = tuple[float, ...]
 """A polynomial in s, highest power first."""
@@ -145,12 +146,17 @@ def limit_of(cfg: Config) -> Iterator[Loop]:
                     yield open_loop(name, axis, pid, "printed", part * cfg.robot.wheel_lag_s, 0, 0.0)
 
 
-def system(loop: Loop) -> "TransferFunction":
-    """L(s) with the delay as a Pade approximant (raises LoopsError: python-control is not installed)."""
+def _control() -> "ModuleType":
     try:
         import control  # noqa: PLC0415 - takes seconds, and belongs to an extra
     except ImportError as error:
         raise LoopsError("the loops study needs python-control: install ccatp[tune]") from error
+    return control
+
+
+def system(loop: Loop) -> "TransferFunction":
+    """L(s) with the delay as a Pade approximant (raises LoopsError: python-control is not installed)."""
+    control = _control()
     rational = control.TransferFunction(loop.numerator, loop.denominator)
     if loop.delay_s == 0.0:
         return rational
@@ -180,28 +186,22 @@ def margins(loop: Loop) -> Margins:
 
 def is_stable(loop: Loop) -> bool:
     """Whether every pole of L/(1 + L) lies to the left of the axis (the delay as a Pade approximant)."""
-    whole = system(loop)
-    import control  # noqa: PLC0415 - see ``system``
-
-    return bool((control.feedback(whole, 1).poles().real < 0.0).all())
+    return bool((_control().feedback(system(loop), 1).poles().real < 0.0).all())
 
 
 def overshoot(loop: Loop) -> float:
     """Overshoot of the closed loop's unit step, as a fraction; ``inf`` where the loop is unstable."""
     if not is_stable(loop):
         return inf
-    import control  # noqa: PLC0415 - see ``system``
-
     # The peak comes within a few radians of the crossover; forty see a slowly decaying tail as well.
     time_s = np.linspace(0.0, 40.0 / margins(loop).gain_crossover_rad_s, 4001)
-    value = control.step_response(control.feedback(system(loop), 1), time_s).outputs
+    value = _control().step_response(_control().feedback(system(loop), 1), time_s).outputs
     return max(0.0, float(value.max()) - 1.0)
 
 
 def response(loop: Loop, omega_rad_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Magnitude and continuous phase (rad) of L(j omega), the delay exact; both shape (k,)."""
-    s = 1j * omega_rad_s
-    rational = np.polyval(loop.numerator, s) / np.polyval(loop.denominator, s)
+    rational = _rational(loop, 1j * omega_rad_s)
     phase = np.unwrap(np.angle(rational))
     # A loop with two integrators begins just above or just below -180 deg: bring it to the branch below zero.
     phase -= 2.0 * pi * np.ceil(phase[0] / (2.0 * pi) - 1e-9)
@@ -210,22 +210,22 @@ def response(loop: Loop, omega_rad_s: FloatArray) -> tuple[FloatArray, FloatArra
 
 def root_locus(loop: Loop, factors: FloatArray) -> NDArray[np.complex128]:
     """Closed-loop poles for the loop times each of ``factors`` (k,); shape (k, number of poles)."""
-    whole = system(loop)
-    import control  # noqa: PLC0415 - see ``system``
-
-    loci: NDArray[np.complex128] = control.root_locus_map(whole, gains=factors).loci
+    loci: NDArray[np.complex128] = _control().root_locus_map(system(loop), gains=factors).loci
     return loci
 
 
+def _rational(loop: Loop, s: Any) -> Any:
+    return np.polyval(loop.numerator, s) / np.polyval(loop.denominator, s)
+
+
 def _log_gain(omega_rad_s: float, loop: Loop) -> float:
-    s = 1j * omega_rad_s
-    return float(np.log(abs(np.polyval(loop.numerator, s) / np.polyval(loop.denominator, s))))
+    return float(np.log(abs(_rational(loop, 1j * omega_rad_s))))
 
 
 def _half_turn(omega_rad_s: float, loop: Loop) -> float:
     """Imaginary part of -L/|L|: zero, and changing its sign, where L is real."""
     s = 1j * omega_rad_s
-    value = np.polyval(loop.numerator, s) / np.polyval(loop.denominator, s) * np.exp(-s * loop.delay_s)
+    value = _rational(loop, s) * np.exp(-s * loop.delay_s)
     return float(-value.imag / abs(value))
 
 
@@ -244,7 +244,7 @@ def _draw_bode(loops: Sequence[Loop], found: Sequence[Margins], out: Path) -> No
     centre = np.log10(max(crossovers, default=1.0))
     omega = np.geomspace(10.0 ** (centre + _DECADES[0]), 10.0 ** (centre + _DECADES[1]), 600)
     stem = out / f"bode_{first.gains}_{first.axis}"
-    with plot(stem, 8.0, 6.4, 2, 1, grid="both", sharex=True) as (_, (upper, lower)):
+    with plot(stem, 8.0, 6.4, 2, 1, grid="both", sharex=True) as (upper, lower):
         for loop, margin in zip(loops, found, strict=True):
             magnitude, phase = response(loop, omega)
             style = _DASHES[delays.index(loop.delay_frames) % len(_DASHES)]
@@ -275,24 +275,21 @@ def _draw_locus(loops: Sequence[Loop], out: Path) -> None:
     shown = [loop for loop in loops if loop.delay_frames in ends]
     title = f"Root locus, {first.axis}, gains “{first.gains}”, T = {first.lag_s:g} s"
     stem, width = out / f"rlocus_{first.gains}_{first.axis}", 3.6 * len(shown)
-    with plot(stem, width, 5.6, 1, len(shown), title=title, legend=4, grid="both") as (_, panels):
+    with plot(stem, width, 5.6, 1, len(shown), title=title, legend=4, grid="both") as panels:
         for axes, loop in zip(panels, shown, strict=True):
-            _draw_poles(axes, loop)
+            loci, closed = root_locus(loop, _FACTORS), root_locus(loop, np.array([1.0]))[0]
+            zeros, poles, shade = np.roots(loop.numerator), np.roots(loop.denominator), _COLOURS[loop.plant]
+            axes.plot(loci.real, loci.imag, ".", color=shade, markersize=1.5)
+            axes.plot(poles.real, poles.imag, "x", color=INK, markersize=8, label="open-loop pole")
+            axes.plot(zeros.real, zeros.imag, "o", color=INK, markersize=8, fillstyle="none", label="open-loop zero")
+            axes.plot(
+                closed.real, closed.imag, "s", color=shade, markersize=5, label="closed-loop pole at the set gain"
+            )
+            axes.axvspan(0.0, 1e4, color="#d64545", alpha=0.06, linewidth=0, label="unstable")
+            size, title = _WINDOW_CORNERS / loop.lag_s, f"{_PLANTS[loop.plant]}, {loop.delay_frames} frames of delay"
+            ends = {"xlim": (-size, 0.4 * size), "ylim": (-size, size)}
+            axes.set(xlabel="real part, 1/s", aspect="equal", title=title, **ends)
         panels[0].set_ylabel("imaginary part, 1/s")
-
-
-def _draw_poles(axes: "Axes", loop: Loop) -> None:
-    loci = root_locus(loop, _FACTORS)
-    colour = _COLOURS[loop.plant]
-    axes.plot(loci.real, loci.imag, ".", color=colour, markersize=1.5)
-    zeros, poles, closed = np.roots(loop.numerator), np.roots(loop.denominator), root_locus(loop, np.array([1.0]))[0]
-    axes.plot(poles.real, poles.imag, "x", color=INK, markersize=8, label="open-loop pole")
-    axes.plot(zeros.real, zeros.imag, "o", color=INK, markersize=8, fillstyle="none", label="open-loop zero")
-    axes.plot(closed.real, closed.imag, "s", color=colour, markersize=5, label="closed-loop pole at the set gain")
-    axes.axvspan(0.0, 1e4, color="#d64545", alpha=0.06, linewidth=0, label="unstable")
-    size = _WINDOW_CORNERS / loop.lag_s
-    axes.set(xlim=(-size, 0.4 * size), ylim=(-size, size), xlabel="real part, 1/s", aspect="equal")
-    axes.set_title(f"{_PLANTS[loop.plant]}, {loop.delay_frames} frames of delay")
 
 
 COLUMNS = {
@@ -314,13 +311,9 @@ def run(cfg: Config, out: Path) -> dict[str, Any]:
     """Analyse every loop of the configuration and write ``result.json``, ``result.npz``, ``table.md`` and the figures.
 
     A cell is one loop with its margins; what does not exist (a gain margin without a phase crossover) is None.
-
-    Raises:
-        LoopsError: python-control is not installed.
-        OSError: ``out`` cannot be written.
+    LoopsError: python-control is not installed.
     """
     started_s = time.perf_counter()
-    out.mkdir(parents=True, exist_ok=True)
     loops = list(loops_of(cfg))
     cells = [_cell(loop, margins(loop)) for loop in (*loops, *limit_of(cfg))]
     for gains, axis in dict.fromkeys((loop.gains, loop.axis) for loop in loops):

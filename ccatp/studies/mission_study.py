@@ -6,7 +6,7 @@ in 95 % of the campaigns (Bar-Shalom, Li and Kirubarajan 2001, 5.4). The stops c
 of its own after its fix.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,8 +17,8 @@ from scipy.special import chdtri
 from ccatp.config.models import Config
 from ccatp.core import FloatArray, IntArray, PointId
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.records.summary import WITHIN_M, puck_targets
-from ccatp.studies.campaign import Arrays, Factors, Job, JobOutcome
+from ccatp.records.summary import WITHIN_M, arrival_error_m, puck_targets
+from ccatp.studies.campaign import Arrays, Column, Factors, Job, JobOutcome
 from ccatp.studies.sil_run import SilResult, StopRow, rehearse
 
 # Columns of the array ``stops``: one row for each measurement, in the order they were taken. Errors are true minus
@@ -31,6 +31,67 @@ COLUMN = {name: index for index, name in enumerate(STOP_COLUMNS)}
 PER_DECADE = 1000
 LEAST = 1e-9  # anything smaller falls into the first bin
 _T, _X, _Y, _HEADING, _EST_X, _EST_Y, _EST_HEADING = range(7)  # columns of a mission's track
+_PARTS = ("mean", "p50", "p99", "p99_9", "max")
+
+# Headings and formats of what a mission study may show, by the dotted key of the figure.
+_HEADINGS = {
+    "complete": ("complete", ""),
+    "causes": ("ended by", ""),
+    "localization_error_mm.mean": ("localization mean, mm", ".3f"),
+    "localization_error_mm.p99": ("p99", ".3f"),
+    "localization_error_mm.p99_9": ("p99.9", ".3f"),
+    "localization_error_mm.max": ("max", ".2f"),
+    "localization_error_mm.within_10mm_fraction": ("within 10 mm", ".4%"),
+    "localization_error_after_first_leg_mm.max": ("max after first leg", ".2f"),
+    "heading_error_mrad.rms": ("heading rms, mrad", ".3f"),
+    "arrival_error_mm.mean": ("arrival mean, mm", ".3f"),
+    "arrival_error_mm.p99": ("p99", ".3f"),
+    "arrival_error_mm.p99_9": ("p99.9", ".3f"),
+    "arrival_error_mm.max": ("max", ".2f"),
+    "arrival_error_mm.within_10mm_fraction": ("first arrivals within 10 mm", ".3%"),
+    "arrival_error_after_first_leg_mm.max": ("max after first leg", ".2f"),
+    "stop_error_mm.rms": ("stop error rms, mm", ".3f"),
+    "bound.error_rms_mm": ("stop error rms, mm", ".3f"),
+    "bound.rms_mm": ("bound rms, mm", ".3f"),
+    "bound.ratio": ("ratio", ".3f"),
+    "bound.with_accelerometer.rms_mm": ("bound with accelerometer", ".3f"),
+    "bound.with_accelerometer.ratio": ("ratio", ".3f"),
+    "nees.pose.mean": ("NEES pose (3)", ".2f"),
+    "nees.pose.band_95": ("95 % band", ".2f"),
+    "nees.position.mean": ("NEES position (2)", ".2f"),
+    "nis.mean": ("NIS of fixes (2)", ".2f"),
+    "corrections": ("corrections", ""),
+    "after_correction_mm.max": ("largest distance left, mm", ".2f"),
+    "mission_time_s": ("mission, s", ".0f"),
+    "lower_bound_s": ("bound of the path, s", ".0f"),
+    "time_ratio": ("time / bound", ".4f"),
+    "tour_bound_s": ("bound of any tour, s", ".0f"),
+    "tour_ratio": ("time / any tour", ".4f"),
+    "margin_s": ("margin to the budget, s", ".0f"),
+    "states_s.turning": ("turning, s", ".0f"),
+    "states_s.driving": ("driving, s", ".0f"),
+    "states_s.settling": ("settling, s", ".0f"),
+    "states_s.measuring": ("measuring, s", ".0f"),
+    "danger.falls": ("falls", ""),
+    "danger.false_edges": ("false edges", ""),
+    "danger.max_overrun_mm": ("largest overrun, mm", ".1f"),
+}
+
+
+def mission_columns(text: str) -> tuple[Column, ...]:
+    """Columns of figures of missions, a group a line: ``arrival_error_mm: mean p99=.2f``, or plain keys.
+
+    What follows an equals sign replaces the usual format.
+    """
+    columns = []
+    for line in text.strip().splitlines():
+        group, colon, names = line.strip().rpartition(":")
+        for name in names.split():
+            part, _, spec = name.partition("=")
+            key = f"{group}.{part}" if colon else part
+            heading, usual = _HEADINGS[key]
+            columns.append(Column(heading, key, spec or usual))
+    return tuple(columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,17 +139,14 @@ class Histogram:
             return float("nan")
         ends = np.cumsum(self.counts)
         place = int(np.searchsorted(ends, share * (self.count - 1), side="right"))
-        value = self.edges[min(place, len(ends) - 1)] * 10.0 ** (-0.5 / PER_DECADE)  # the bin's middle
+        edges, _ = self.exceedance()
+        value = edges[min(place, len(ends) - 1)] * 10.0 ** (-0.5 / PER_DECADE)  # the bin's middle
         return min(float(value), self.largest)
 
-    @property
-    def edges(self) -> FloatArray:
-        """Upper ends of the bins, shape (k,)."""
-        return np.asarray(LEAST * 10.0 ** (self.bins / PER_DECADE), dtype=np.float64)
-
     def exceedance(self) -> tuple[FloatArray, FloatArray]:
-        """Values and the share of all that is larger, shapes (k,), for a figure."""
-        return self.edges, 1.0 - np.cumsum(self.counts) / max(self.count, 1)
+        """Upper ends of the bins and the share of all that is larger, shapes (k,), for a figure."""
+        edges = np.asarray(LEAST * 10.0 ** (self.bins / PER_DECADE), dtype=np.float64)
+        return edges, 1.0 - np.cumsum(self.counts) / max(self.count, 1)
 
     def to_arrays(self, name: str) -> dict[str, NDArray[np.generic]]:
         """As arrays whose names begin with ``name``."""
@@ -123,7 +181,7 @@ def run_mission(job: Job) -> JobOutcome:
 
 def mission_outcome(cfg: Config, found: SilResult) -> JobOutcome:
     """What a campaign keeps of a mission that was run with its track."""
-    summary, mirror = found.summary, build_mirror(cfg.mirror)
+    mirror = build_mirror(cfg.mirror)
     track = found.track if found.track is not None else np.empty((0, 7))
     places = [
         np.column_stack([track[:, x], track[:, y], mirror.surface.heights_m(track[:, x], track[:, y])])
@@ -134,11 +192,14 @@ def mission_outcome(cfg: Config, found: SilResult) -> JobOutcome:
     turn = track[:, _EST_HEADING] - track[:, _HEADING]
     turns_rad = np.arctan2(np.sin(turn), np.cos(turn))
     first_s = found.stops[0].t_s if found.stops else np.inf
-    names = "points", "arrival_error_mm", "localization_error_mm", "mission_time_s", "lower_bound_s", "within_budget"
+    names = (
+        "points", "arrival_error_mm", "localization_error_mm", "mission_time_s", "lower_bound_s", "within_budget",
+        "danger", "panels",
+    )  # fmt: skip
     values: dict[str, Any] = {
         "outcome": found.outcome,
         "cause": found.cause,
-        **{name: summary[name] for name in (*names, "danger", "panels")},
+        **{name: found.summary[name] for name in names},
         "heading_error_mrad": {"count": len(turns_rad), "square_sum": float(turns_rad @ turns_rad) * 1e6},
         "corrections": found.corrections,
         "counts": found.counts,
@@ -158,13 +219,10 @@ def _stop_rows(mirror: Mirror, puck_height_m: float, stops: list[StopRow], track
     true = track[np.searchsorted(track[:, _T], [stop.t_s for stop in stops])][:, [_X, _Y]].reshape(-1, 2)
     rows = []
     for stop, point, (x_m, y_m) in zip(stops, points, true.tolist(), strict=True):
-        # How far the puck is from where it shall be, along the panel, as in a summary.
-        puck = np.array(mirror.surface_point(x_m, y_m)) + puck_height_m * np.array(mirror.surface.normal(x_m, y_m))
-        offset, across = puck - targets[point].position_m, np.array(targets[point].normal)
-        arrival_m = float(np.linalg.norm(offset - (offset @ across) * across))
+        place_m, normal = np.array(mirror.surface_point(x_m, y_m)), mirror.surface.normal(x_m, y_m)
         rows.append((
-            stop.t_s, *stop.point, stop.approach, *stop.error, *stop.covariance[np.triu_indices(3)],
-            stop.distance_m, stop.nis, stop.fix_distance_m, arrival_m,
+            stop.t_s, *stop.point, stop.approach, *stop.error, *stop.covariance[np.triu_indices(3)], stop.distance_m,
+            stop.nis, stop.fix_distance_m, arrival_error_m(targets[point], place_m, normal, puck_height_m),
         ))  # fmt: skip
     return np.array(rows, dtype=np.float64).reshape(-1, len(STOP_COLUMNS))
 
@@ -175,11 +233,7 @@ def _stop_rows(mirror: Mirror, puck_height_m: float, stops: list[StopRow], track
 def nees(rows: FloatArray, states: int) -> FloatArray:
     """Normalised estimation error squared, e' P^-1 e, of the first ``states`` of x, y, heading, shape (k,).
 
-    NaN where the covariance is not positive definite.
-
-    Args:
-        rows: stops, columns ``STOP_COLUMNS``.
-        states: 3 for the pose, 2 for the position.
+    NaN where the covariance is not positive definite. ``rows``: stops, columns ``STOP_COLUMNS``.
     """
     full = np.empty((len(rows), 3, 3))
     upper = np.triu_indices(3)
@@ -218,9 +272,8 @@ def chi_square_figures(values: FloatArray, freedom: int) -> dict[str, Any]:
     }
 
 
-def combine_missions(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
+def combine_missions(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """Figures of a cell from its missions, see ``mission_outcome``."""
-    del factors
     values = [outcome.values for outcome in outcomes]
     runs = [outcome.arrays["stops"] for outcome in outcomes]
     stops = np.concatenate(runs)
@@ -232,24 +285,17 @@ def combine_missions(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOut
     )
     turns = [v["heading_error_mrad"] for v in values]
     turn_count = sum(part["count"] for part in turns)
+    turn_square = sum(part["square_sum"] for part in turns) / turn_count if turn_count else None
     lasts = np.concatenate([_last_of_each(rows) for rows in runs])
-    panels = {
-        name: [v["panels"][name] for v in values if v["panels"][name] is not None]
-        for name in ("piston_rms_um", "tilt_rms_urad")
-    }
     figures: dict[str, Any] = {
         "complete": sum(v["outcome"] == "complete" for v in values),
         "causes": sorted({v["cause"] for v in values if v["cause"]}),
-        "points": {name: sum(v["points"][name] for v in values) for name in values[0]["points"]},
+        "points": sums(v["points"] for v in values),
         "arrival_error_mm": of_values(arrivals[:, COLUMN["arrival_m"]]),
         "arrival_error_after_first_leg_mm": of_values(later[:, COLUMN["arrival_m"]]),
         "localization_error_mm": of_histogram(everywhere),
         "localization_error_after_first_leg_mm": of_histogram(afterwards),
-        "heading_error_mrad": {
-            "rms": round(float(np.sqrt(sum(part["square_sum"] for part in turns) / turn_count)), 3)
-            if turn_count
-            else None
-        },
+        "heading_error_mrad": {"rms": None if turn_square is None else round(float(np.sqrt(turn_square)), 3)},
         "stop_error_mm": {**_stop_errors(arrivals), "after_first_leg": _stop_errors(later)},
         "nees": {
             name: chi_square_figures(nees(arrivals, states), states) for name, states in (("pose", 3), ("position", 2))
@@ -264,8 +310,8 @@ def combine_missions(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOut
         **times(values),
         "danger": dangers(values),
         "panels": {
-            name: round(float(np.sqrt(np.mean(np.square(known)))), 3) if known else None
-            for name, known in panels.items()
+            name: _root_mean_square([v["panels"][name] for v in values if v["panels"][name] is not None])
+            for name in ("piston_rms_um", "tilt_rms_urad")
         },
         "counts": {name: sum(v["counts"].get(name, 0) for v in values) for name in values[0]["counts"]},
     }
@@ -286,21 +332,22 @@ def first_arrivals(stops: FloatArray) -> FloatArray:
 def of_values(errors_m: FloatArray) -> dict[str, Any]:
     """Distribution of some errors, mm."""
     if not errors_m.size:
-        return dict.fromkeys(("mean", "p50", "p99", "p99_9", "max", "within_10mm_fraction"))
-    p50, p99, p99_9 = np.percentile(errors_m, (50.0, 99.0, 99.9))
-    figures = {"mean": errors_m.mean(), "p50": p50, "p99": p99, "p99_9": p99_9, "max": errors_m.max()}
-    within = round(float(np.mean(errors_m <= WITHIN_M)), 6)
-    return {**{name: _mm(value) for name, value in figures.items()}, "within_10mm_fraction": within}
+        return dict.fromkeys((*_PARTS, "within_10mm_fraction"))
+    quantiles = np.percentile(errors_m, (50.0, 99.0, 99.9))
+    return _distribution((errors_m.mean(), *quantiles, errors_m.max()), float(np.mean(errors_m <= WITHIN_M)))
 
 
 def of_histogram(errors_m: Histogram) -> dict[str, Any]:
     """The same of pooled errors."""
     if not errors_m.count:
         return of_values(np.empty(0))
-    quantiles = {name: errors_m.quantile(share) for name, share in (("p50", 0.5), ("p99", 0.99), ("p99_9", 0.999))}
-    figures = {"mean": errors_m.mean, **quantiles, "max": errors_m.largest}
-    within = round(errors_m.within / errors_m.count, 6)
-    return {**{name: _mm(value) for name, value in figures.items()}, "within_10mm_fraction": within}
+    quantiles = [errors_m.quantile(share) for share in (0.5, 0.99, 0.999)]
+    return _distribution((errors_m.mean, *quantiles, errors_m.largest), errors_m.within / errors_m.count)
+
+
+def _distribution(figures_m: Sequence[float], within: float) -> dict[str, float]:
+    named = {name: _mm(value) for name, value in zip(_PARTS, figures_m, strict=True)}
+    return {**named, "within_10mm_fraction": round(within, 6)}
 
 
 def _stop_errors(rows: FloatArray) -> dict[str, Any]:
@@ -330,16 +377,27 @@ def times(values: Sequence[Any]) -> dict[str, Any]:
     }
 
 
+def sums(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    """Sums of the same counts of several runs."""
+    first, *others = counts
+    return {name: sum((other[name] for other in others), start=number) for name, number in first.items()}
+
+
 def dangers(values: Sequence[Any]) -> dict[str, Any]:
     """Sums over the runs; the overrun is the largest."""
-    sums = {name: sum(v["danger"][name] for v in values) for name in ("true_edges", "false_edges", "falls")}
-    return {**sums, "max_overrun_mm": max(v["danger"]["max_overrun_mm"] for v in values)}
+    found = [v["danger"] for v in values]
+    counts = sums({name: danger[name] for name in ("true_edges", "false_edges", "falls")} for danger in found)
+    return {**counts, "max_overrun_mm": max(danger["max_overrun_mm"] for danger in found)}
 
 
 def _last_of_each(stops: FloatArray) -> FloatArray:
     names = stops[:, [COLUMN["row"], COLUMN["col"], COLUMN["point"]]]
     _, backwards = np.unique(names[::-1], axis=0, return_index=True)
     return stops[::-1][np.sort(backwards)]
+
+
+def _root_mean_square(values: Sequence[float]) -> float | None:
+    return round(float(np.sqrt(np.mean(np.square(values)))), 3) if values else None
 
 
 def _mm(value_m: Any) -> float:

@@ -41,12 +41,7 @@ from ccatp.studies.results import LIMIT, colour, plot
 
 @dataclass(slots=True)
 class BeaconSilResult:
-    """The result of a mission, one entry a frame where nothing else is said.
-
-    Attributes:
-        summary: as ``summary.json``.
-        track, truth: rows of ``beacon_track`` and ``beacon_truth``.
-    """
+    """A mission: ``summary`` as ``summary.json``, rows of ``beacon_track`` and ``beacon_truth``; one entry a frame."""
 
     summary: dict[str, Any] = field(default_factory=dict)
     states: list[str] = field(default_factory=list)
@@ -169,11 +164,7 @@ def run_job(job: Job) -> JobOutcome:
 
 
 def seconds_of(track: PoseTrack, truth: PoseTruth, begin_s: float) -> dict[str, FloatArray]:
-    """Errors of the pose, once a second.
-
-    Returns:
-        ``nees`` of the pose, ``error_m`` of the position, ``sigma_m``, root of the trace of its covariance.
-    """
+    """Once a second, NEES of the pose, error of the position, and ``sigma_m``, root of the trace of its covariance."""
     known = np.intersect1d(track.seq[track.t_s >= begin_s], truth.seq, return_indices=True)[0][::SECOND]
     track, truth = track.at(np.isin(track.seq, known)), truth.at(np.isin(truth.seq, known))
     errors, P = pose_errors(track, truth), track.covariance
@@ -184,9 +175,8 @@ def seconds_of(track: PoseTrack, truth: PoseTruth, begin_s: float) -> dict[str, 
     }
 
 
-def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
+def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """The missions together: NEES at each second over all of them, against the band of its chi-squared sum."""
-    del factors
     runs = [outcome.values for outcome in outcomes]
     length = min(len(outcome.arrays["nees"]) for outcome in outcomes)
     squares, errors, sigmas = (
@@ -224,11 +214,10 @@ def draw(cells: Sequence[CellResult], out: Path) -> None:
     cell = cells[0]
     seconds = np.arange(len(cell.arrays["nees"]))
     true_mm, expected_mm = 1e3 * cell.arrays["error_m"], 1e3 * cell.arrays["sigma_m"]
-    with plot(out / "mote_navigation", 7.5, 5.6, 2, 1, sharex=True) as (_, (above, below)):
+    with plot(out / "mote_navigation", 7.5, 5.6, 2, 1, sharex=True) as (above, below):
         above.plot(seconds, true_mm, color=colour(0), label="true error of the position")
         above.plot(seconds, expected_mm, color=colour(1), linestyle="--", label="expected by the filter")
-        look: dict[str, Any] = {"color": QUIET, "linewidth": 1.0, "linestyle": ":"}
-        above.axhline(1e3 * cell.values["map_m"], label="true error of the map at the end", **look)
+        above.axhline(1e3 * cell.values["map_m"], color=QUIET, linestyle=":", label="true error of the map at the end")
         above.set(ylabel="mm, root mean square", yscale="log")
         above.set_title("A robot that navigates by motes which mapped themselves")
         above.legend(frameon=False, fontsize=8)

@@ -14,23 +14,266 @@ radios with 5 dB of static shadowing and reflected rays, read through the turnin
 """
 
 from collections.abc import Sequence
-from math import atan2, degrees, pi
+from dataclasses import dataclass, field
+from functools import partial
+from math import atan2, degrees, inf, pi
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtri
 
+from ccatp.beacons.navigation import BeaconMeasurements, RadioNavigator, odometry_of
+from ccatp.beacons.pilot import BeaconPilot
 from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.signal_slam import ReflectorScan, ScanResult
+from ccatp.beacons.steering import HALT
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.core import wrap_pi
+from ccatp.core import FloatArray, wrap_pi
+from ccatp.filters.metrics import best_motion
 from ccatp.report.plots import INK, QUIET
-from ccatp.sim.radio import TruePose, TrueRadio
+from ccatp.sim.radio import SimDriveCommand, TruePose, TrueRadio
+from ccatp.sim.radio_world import RadioWorld
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
-from ccatp.studies.radio_runs import COLUMNS, TARGET_COLUMNS, combine, run_job
-from ccatp.studies.results import LIMIT, colour, plot
+from ccatp.studies.results import LIMIT, band, colour, grouped, plot
 
-_POINT_S = 1.0  # between the points of a curve: ten steps of 0.1 s
+RadioStudy = partial(Study, mirrors=(), is_radio=True)
+
+# -- a run with the truth beside the estimates -------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class RadioRun:
+    """What a run leaves, one entry a step where nothing else is said.
+
+    Attributes:
+        pose_errors: x_m, y_m and heading_rad, estimate minus truth.
+        reckoned_errors: x_m and y_m of dead reckoning by the same odometry.
+        beacon_errors_m: by name, from the first estimate on: distance of estimate and truth.
+        beacon_nees: the same, with 2 degrees of freedom.
+        nis: of each reading, and its degrees of freedom.
+        truth, estimates, targets, believed: paths of the vehicle and of the target, x_m and y_m.
+        places: by name at the end: mean and truth.
+        joint_nees: at the end, of the pose and all static radios on the map, and its degrees of freedom.
+        nearest_m, clearance_m: least distance from the target and from what stands in the room.
+    """
+
+    pose_errors: list[tuple[float, float, float]] = field(default_factory=list)
+    reckoned_errors: list[tuple[float, float]] = field(default_factory=list)
+    beacon_errors_m: dict[str, list[float]] = field(default_factory=dict)
+    beacon_nees: dict[str, list[float]] = field(default_factory=dict)
+    nis: list[tuple[float, int]] = field(default_factory=list)
+    truth: list[tuple[float, float]] = field(default_factory=list)
+    estimates: list[tuple[float, float]] = field(default_factory=list)
+    targets: list[tuple[float, float]] = field(default_factory=list)
+    believed: list[tuple[float, float]] = field(default_factory=list)
+    places: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    joint_nees: tuple[float, int] = (0.0, 0)
+    nearest_m: float = inf
+    clearance_m: float = inf
+
+
+def run_radio(cfg: RadioConfig) -> RadioRun:
+    """A whole run; a function of the configuration and its seed."""
+    world, navigator, pilot, run = RadioWorld(cfg), RadioNavigator(cfg), BeaconPilot(cfg), RadioRun()
+    drive, observation, slam = HALT, cfg.observation, navigator.slam
+    truths: dict[str, tuple[float, float]] = {}
+    for step in range(1, cfg.run.steps + 1):
+        static, target = step % observation.every_steps == 0, step % observation.target_every_steps == 0
+        frame = world.step(SimDriveCommand(*drive), cfg.run.step_s, static=static, target=target)
+        t_s, distances_m = frame.time_s, frame.distances_m
+        wheels = (odometry_of(cfg, t_s, *frame.wheels),)
+        navigator.take(BeaconMeasurements(t_s, wheels, frame.packets, frame.sightings, distances_m))
+        drive = pilot.drive(t_s, frame.wheels.interval_s, slam.pose, navigator.target(t_s), distances_m)
+        moving = {} if world.target_m is None else {cfg.follow.target: world.target_m}
+        truths = {**world.beacons_m, **moving}
+        _note(run, world, navigator, truths, cfg.follow.target)
+    for name, estimate in slam.beacons.items():
+        run.places[str(name)] = (estimate.mean, np.array(truths[str(name)]))
+    # Radios whose readings still wait are not on the map.
+    placed = [name for name in world.beacons_m if name in slam.engine]
+    mean, covariance = slam.joint(placed)
+    truth = np.concatenate([world.pose, *(world.beacons_m[name] for name in placed)])
+    run.joint_nees = _nees(mean - truth, covariance), truth.size
+    return run
+
+
+def _note(
+    run: RadioRun, world: RadioWorld, navigator: RadioNavigator, truths: dict[str, tuple[float, float]], target: str
+) -> None:
+    true, slam = world.pose, navigator.slam
+    pose, (reckoned_x_m, reckoned_y_m) = slam.pose, navigator.reckoned_m
+    run.pose_errors.append((pose.x_m - true.x_m, pose.y_m - true.y_m, wrap_pi(pose.heading_rad - true.heading_rad)))
+    run.reckoned_errors.append((reckoned_x_m - true.x_m, reckoned_y_m - true.y_m))
+    run.nis += [(learned.nis, learned.size) for learned in slam.learned]
+    run.clearance_m = min(run.clearance_m, world.clearance_m)
+    run.truth.append(true[:2])
+    run.estimates.append(pose[:2])
+    for name, estimate in slam.beacons.items():
+        off = estimate.mean - truths[str(name)]
+        run.beacon_errors_m.setdefault(str(name), []).append(float(np.hypot(*off)))
+        run.beacon_nees.setdefault(str(name), []).append(_nees(off, estimate.covariance))
+    if world.target_m is not None:
+        run.targets.append(world.target_m)
+        run.nearest_m = min(run.nearest_m, float(np.hypot(world.target_m[0] - true.x_m, world.target_m[1] - true.y_m)))
+        believed = slam.beacons.get(target)
+        run.believed.append((np.nan, np.nan) if believed is None else (believed.mean[0], believed.mean[1]))
+
+
+def _nees(error: FloatArray, covariance: FloatArray) -> float:
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+SETTLED_SHARE = 0.3  # of a run: errors over time are counted after it, when radios have been found
+_CURVE_EVERY = 10  # steps of 0.1 s between the points of a curve
+_POINT_S = 1.0
+_HIT = float(chdtri(2, 0.1))
+_BAND = 0.95
+
+COLUMNS = (
+    Column("beacons mean, m", "beacons_m.mean", ".3f"),
+    Column("median", "beacons_m.median", ".3f"),
+    Column("aligned mean, m", "beacons_aligned_m.mean", ".3f"),
+    Column("in 90 % ellipses", "beacons_covered", ".3f"),
+    Column("pose RMSE, m", "pose_m", ".3f"),
+    Column("dead reckoning, m", "reckoned_m", ".3f"),
+    Column("ratio", "pose_ratio", ".2f"),
+    Column("heading RMSE, rad", "heading_rad", ".3f"),
+    Column("NIS / rows", "nis", ".3f"),
+    Column("95 % band", "nis_band"),
+    Column("NEES / states", "nees", ".2f"),
+    Column("95 % band", "nees_band"),
+)
+_MEANS = ("pose_m", "reckoned_m", "pose_aligned_m", "reckoned_aligned_m", "heading_rad")
+
+
+def run_job(job: Job) -> JobOutcome:
+    """Figures of a run, and its errors over time."""
+    run, target = run_radio(job.cfg), job.cfg.follow.target
+    truth, estimates = np.array(run.truth), np.array(run.estimates)
+    reckoned = truth + np.array(run.reckoned_errors)
+    motion, reckoned_motion = best_motion(estimates, truth), best_motion(reckoned, truth)
+    finals = {name: place for name, place in run.places.items() if name != target}
+    values: dict[str, Any] = {
+        "beacons_m": {name: float(np.hypot(*(mean - true))) for name, (mean, true) in finals.items()},
+        "beacons_aligned_m": {
+            name: float(np.hypot(*(motion.moved(mean) - true))) for name, (mean, true) in finals.items()
+        },
+        "beacons_rmse_m": {name: _rms(np.array(run.beacon_errors_m[name])) for name in finals},
+        "beacons_hit": {name: run.beacon_nees[name][-1] < _HIT for name in finals},
+        "pose_m": _rms(estimates - truth),
+        "pose_aligned_m": _rms(motion.moved(estimates) - truth),
+        "reckoned_m": _rms(reckoned - truth),
+        "reckoned_aligned_m": _rms(reckoned_motion.moved(reckoned) - truth),
+        "heading_rad": _rms(np.array(run.pose_errors)[:, 2]),
+        "nis": [sum(nis for nis, _ in run.nis), sum(size for _, size in run.nis)],
+        "nees": list(run.joint_nees),
+        "collided": run.clearance_m < 0.0,
+    }
+    arrays = {"beacons_m": _curve([run.beacon_errors_m[name] for name in finals], len(truth))}
+    if run.targets:
+        first = round(SETTLED_SHARE * len(run.targets))
+        targets, believed = np.array(run.targets)[first:], np.array(run.believed)[first:]
+        known = np.isfinite(believed[:, 0])
+        covered = np.array(run.beacon_nees.get(target, [np.inf]))[-len(targets) :] < _HIT
+        values |= {
+            "target_m": _rms((believed - targets)[known]),
+            "target_aligned_m": _rms((motion.moved(believed) - targets)[known]),
+            "target_covered": float(np.mean(covered)),
+            "nearest_m": run.nearest_m,
+        }
+        arrays["target_m"] = _curve([run.beacon_errors_m.get(target, [])], len(truth))
+    return JobOutcome(values, arrays)
+
+
+def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
+    """The runs of a cell pooled: errors, coverage, consistency with the 95 % bands of their chi-squared sums."""
+    runs = [outcome.values for outcome in outcomes]
+    means = {key: float(np.mean([run[key] for run in runs])) for key in _MEANS}
+    nis, rows = (float(sum(run["nis"][k] for run in runs)) for k in (0, 1))
+    nees, states = (float(sum(run["nees"][k] for run in runs)) for k in (0, 1))
+    values: dict[str, Any] = {
+        "beacons_m": _spread([e for run in runs for e in run["beacons_m"].values()]),
+        "beacons_aligned_m": _spread([e for run in runs for e in run["beacons_aligned_m"].values()]),
+        "beacons_covered": float(np.mean([hit for run in runs for hit in run["beacons_hit"].values()])),
+        "beacon_rmse_m": {
+            name: float(np.mean([run["beacons_rmse_m"][name] for run in runs if name in run["beacons_rmse_m"]]))
+            for name in runs[0]["beacons_rmse_m"]
+        },
+        "pose_m": means["pose_m"],
+        "reckoned_m": means["reckoned_m"],
+        "pose_ratio": means["pose_m"] / means["reckoned_m"],
+        "pose_aligned_m": means["pose_aligned_m"],
+        "reckoned_aligned_m": means["reckoned_aligned_m"],
+        "heading_rad": means["heading_rad"],
+        "nis": nis / max(rows, 1.0),
+        "nis_band": _band(rows),
+        "nees": nees / max(states, 1.0),
+        "nees_band": _band(states),
+        "collisions": sum(run["collided"] for run in runs),
+    }
+    if "target_m" in runs[0]:
+        values |= {name: _spread([run[name] for run in runs]) for name in ("target_m", "target_aligned_m")}
+        values["target_covered"] = float(np.mean([run["target_covered"] for run in runs]))
+        values["nearest_m"] = min(run["nearest_m"] for run in runs)
+    arrays = {name: np.stack([o.arrays[name] for o in outcomes if name in o.arrays]) for name in outcomes[0].arrays}
+    return JobOutcome(values, arrays)
+
+
+def _rms(errors: FloatArray) -> float:
+    squares = errors**2 if errors.ndim == 1 else np.sum(errors**2, axis=1)
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _spread(values: Sequence[float]) -> dict[str, float]:
+    low, median, high = np.quantile(values, (0.1, 0.5, 0.9)).tolist()
+    return {"mean": float(np.mean(values)), "median": median, "p10": low, "p90": high}
+
+
+def _band(freedom: float) -> str:
+    """Where the mean of so many normalised squares lies with 95 % probability."""
+    if freedom < 1.0:
+        return "-"
+    low, high = (float(chdtri(freedom, share)) / freedom for share in (0.5 + 0.5 * _BAND, 0.5 - 0.5 * _BAND))
+    return f"{low:.3f} to {high:.3f}"
+
+
+def _curve(errors_m: Sequence[Sequence[float]], steps: int) -> FloatArray:
+    """Mean over series that end with the run, at every tenth of so many steps; NaN where none has begun."""
+    rows = np.full((len(errors_m), steps), np.nan)
+    for row, errors in zip(rows, errors_m, strict=True):
+        row[steps - len(errors) :] = errors
+    picked = rows[:, ::_CURVE_EVERY]
+    count = np.isfinite(picked).sum(axis=0)
+    return np.asarray(np.where(count > 0, np.nansum(picked, axis=0) / np.maximum(count, 1), np.nan))
+
+
+def _draw_errors(results: Sequence[CellResult], name: str, label: str, keys: Sequence[str], stem: Path) -> None:
+    """Median over the runs of an error over time, with 10 to 90 %; a panel for each level of the first key.
+
+    Args:
+        results: cells with the array ``name`` of shape (runs, points).
+        keys: factors that distinguish the cells; the first one makes the panels.
+    """
+    groups = grouped([result for result in results if name in result.arrays], keys[0])
+    if not groups:
+        return
+    with plot(stem, 5.2 * len(groups) + 0.5, 4.2, 1, len(groups), sharey=True) as panels:
+        for axes, ((group,), cells) in zip(panels, groups.items(), strict=True):
+            for index, result in enumerate(cells):
+                runs = result.arrays[name]
+                ends = np.full((3, runs.shape[1]), np.nan)
+                known = np.isfinite(runs).any(axis=0)  # some run has an estimate
+                ends[:, known] = np.nanquantile(runs[:, known], (0.1, 0.5, 0.9), axis=0)
+                names = (f"every {result.factors[k]}" if k == "every" else str(result.factors[k]) for k in keys[1:])
+                time_s = np.arange(runs.shape[1]) * _POINT_S
+                band(axes, time_s, ends, colour(index), "-" if index < 6 else "--", ", ".join(names))
+            axes.set(xlabel="time, s", title=f"{keys[0]}: {group}", ylim=(0.0, None))
+            axes.legend(frameon=False, fontsize=7)
+        panels[0].set_ylabel(label)
+
+
+# -- radio-signals ----------------------------------------------------------------------------------------------------
 
 # Slide "Initial Experimental Results": mean RSSI, and the range from it with P_ref = -33 dBm and an exponent of 2.
 RANGES_M = (0.5, 1.0, 2.0, 3.0)
@@ -55,21 +298,20 @@ def run_signals(job: Job) -> JobOutcome:
     at_m = CORNERS_M.get(place) or (ROBOT.x_m + float(place.removesuffix(" m")), ROBOT.y_m)
     results = _turns(cfg, at_m)
     dx_m, dy_m = at_m[0] - ROBOT.x_m, at_m[1] - ROBOT.y_m
-    true_rad = atan2(dy_m, dx_m) - ROBOT.heading_rad
-    loss = cfg.path_loss
-    model = PathLoss(loss.reference_dbm, loss.exponent, cfg.sim.radio.white_sigma_db)
+    true_rad, range_m = atan2(dy_m, dx_m) - ROBOT.heading_rad, float(np.hypot(dx_m, dy_m))
+    model = PathLoss(cfg.path_loss.reference_dbm, cfg.path_loss.exponent, cfg.sim.radio.white_sigma_db)
     level_dbm = float(np.mean([result.rssi_dbm for result in results]))
     errors = [wrap_pi(result.bearing_rad - true_rad) for result in results if result.bearing_rad is not None]
     values: dict[str, Any] = {
-        "range_m": float(np.hypot(dx_m, dy_m)),
+        "range_m": range_m,
         "level_dbm": level_dbm,
-        "model_dbm": model.level_dbm(float(np.hypot(dx_m, dy_m))),
+        "model_dbm": model.level_dbm(range_m),
         "estimate_m": model.median_range_m(level_dbm),
         "bearing_deg": degrees(true_rad) % 360.0,
         "bearing_errors_deg": [degrees(error) for error in errors],
         "without_bearing": len(results) - len(errors),
     }
-    return JobOutcome(values, {})
+    return JobOutcome(values)
 
 
 def combine_signals(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
@@ -77,18 +319,17 @@ def combine_signals(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutc
     place = str(factors["place"])
     runs = [outcome.values for outcome in outcomes]
     errors = np.array([error for run in runs for error in run["bearing_errors_deg"]])
-    ranges = np.array([run["estimate_m"] for run in runs])
-    printed: dict[str, float] = {}
+    ranges, levels_dbm = (np.array([run[key] for run in runs]) for key in ("estimate_m", "level_dbm"))
     if place in CORNERS_M:
-        printed["bearing_error_deg"] = PRINTED_DEG[place]
+        printed = {"bearing_error_deg": PRINTED_DEG[place]}
     else:
         index = _RANGE_NAMES.index(place)
         printed = {"level_dbm": PRINTED_DBM[index], "estimate_m": PRINTED_M[index]}
         printed["error_m"] = RANGES_M[index] - PRINTED_M[index]
     values: dict[str, Any] = {
         "range_m": runs[0]["range_m"],
-        "level_dbm": float(np.mean([run["level_dbm"] for run in runs])),
-        "level_sigma_db": float(np.std([run["level_dbm"] for run in runs])),
+        "level_dbm": float(np.mean(levels_dbm)),
+        "level_sigma_db": float(np.std(levels_dbm)),
         "model_dbm": runs[0]["model_dbm"],
         "estimate_m": float(np.mean(ranges)),
         "range_rms_m": float(np.sqrt(np.mean((ranges - runs[0]["range_m"]) ** 2))),
@@ -102,27 +343,24 @@ def combine_signals(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutc
 
 def draw_signals(results: Sequence[CellResult], out: Path) -> None:
     """Figure ``radio_signals``: level over range and error of the bearing by beacon: printed, model, ours."""
-    by_key = {(result.factors["condition"], result.factors["place"]): result.values for result in results}
-    at = np.arange(len(CORNERS_M))
-    with plot(out / "radio_signals", 10.0, 4.0, 1, 2) as (_, (left, right)):
-        for index, condition in enumerate(dict.fromkeys(result.factors["condition"] for result in results)):
-            rows = [by_key[condition, place] for place in _RANGE_NAMES if (condition, place) in by_key]
-            if len(rows) == len(RANGES_M):
-                ranges = np.array(RANGES_M)
+    at, ranges = np.arange(len(CORNERS_M)), np.array(RANGES_M)
+    mark: dict[str, Any] = {"color": LIMIT, "markersize": 8, "markeredgewidth": 2, "label": "2017"}
+    with plot(out / "radio_signals", 10.0, 4.0, 1, 2) as (left, right):
+        for index, ((condition,), cells) in enumerate(grouped(results, "condition").items()):
+            found = {cell.factors["place"]: cell.values for cell in cells}
+            if found.keys() >= set(_RANGE_NAMES):
+                rows = [found[place] for place in _RANGE_NAMES]
                 if index == 0:
-                    printed = [row["printed"]["level_dbm"] for row in rows]
                     left.plot(ranges, [row["model_dbm"] for row in rows], color=INK, linewidth=1.2, label="model")
-                    left.plot(ranges, printed, "x", color=LIMIT, markersize=8, markeredgewidth=2, label="2017")
-                levels, sigmas = ([row[key] for row in rows] for key in ("level_dbm", "level_sigma_db"))
+                    left.plot(ranges, PRINTED_DBM, "x", **mark)
+                levels_dbm, sigmas = ([row[key] for row in rows] for key in ("level_dbm", "level_sigma_db"))
                 look: dict[str, Any] = {"fmt": "o", "color": colour(index), "markersize": 4, "capsize": 2}
-                left.errorbar(ranges + 0.03 * (index - 1), levels, sigmas, label=f"ours: {condition}", **look)
-            rows = [by_key[condition, corner] for corner in CORNERS_M if (condition, corner) in by_key]
-            if len(rows) == len(CORNERS_M):
-                heights = [row["bearing_rms_deg"] for row in rows]
+                left.errorbar(ranges + 0.03 * (index - 1), levels_dbm, sigmas, label=f"ours: {condition}", **look)
+            if found.keys() >= CORNERS_M.keys():
+                heights = [found[place]["bearing_rms_deg"] for place in CORNERS_M]
                 right.bar(at + 0.2 * (index - 1), heights, 0.18, color=colour(index), label=f"ours, RMS: {condition}")
-            if index == 0:
-                printed = [row["printed"]["bearing_error_deg"] for row in rows]
-                right.plot(at[: len(rows)], printed, "x", color=LIMIT, markersize=8, markeredgewidth=2, label="2017")
+                if index == 0:
+                    right.plot(at, list(PRINTED_DEG.values()), "x", **mark)
         right.set_xticks(at, list(CORNERS_M))
         right.set(ylabel="error of the bearing, deg", title="bearing of the strongest reading")
         left.set(xlabel="range, m", ylabel="level, dBm", title="mean level of a scan")
@@ -145,7 +383,7 @@ def _turns(cfg: RadioConfig, sender_m: tuple[float, float]) -> list[ScanResult]:
     return found
 
 
-RADIO_SIGNALS = Study(
+RADIO_SIGNALS = RadioStudy(
     name="radio-signals",
     title="Levels and bearings of ZigBee radios",
     cells=lambda: [
@@ -172,10 +410,10 @@ RADIO_SIGNALS = Study(
     ),
     draw=draw_signals,
     defaults={"system": "zigbee"},
-    mirrors=(),
     runs=40,
-    is_radio=True,
 )
+
+# -- radio-cases ------------------------------------------------------------------------------------------------------
 
 # RMSE, RMSE of the heading, RMSE of the beacons 1 to 4: table of the slide "Discussion".
 CASES_PRINTED = {
@@ -188,11 +426,11 @@ PATHS: dict[str, list[list[float]]] = {
     "II": [[0.8, 0.8], [2.2, 2.2], [0.8, 2.2], [2.2, 0.8]],
     "III": [[2.2, 0.8], [1.5, 2.2], [0.8, 0.8]],
 }
+SHADOW: dict[str, object] = {"sim.radio.shadowing_sigma_db": 5.0, "path_loss.shadowing_sigma_db": 5.0}
 RADIO: dict[str, object] = {
+    **SHADOW,
     "sim.radio.scan": "reflector",
-    "sim.radio.shadowing_sigma_db": 5.0,
     "sim.radio.multipath_paths": 3,
-    "path_loss.shadowing_sigma_db": 5.0,
     "estimator.shadowing": "map",
 }
 NAMES = ("pose_m", "heading_rad", "beacon1", "beacon2", "beacon3", "beacon4")
@@ -208,7 +446,7 @@ def draw_cases(results: Sequence[CellResult], out: Path) -> None:
     """Figure ``radio_cases``: bars of the printed errors and of ours, for pose and beacons of each case."""
     shown = [name for name in NAMES if name != "heading_rad"]
     at = np.arange(len(shown))
-    with plot(out / "radio_cases", 3.4 * len(results) + 0.4, 3.8, 1, len(results), sharey=True) as (_, panels):
+    with plot(out / "radio_cases", 3.4 * len(results) + 0.4, 3.8, 1, len(results), sharey=True) as panels:
         for axes, result in zip(panels, results, strict=True):
             ours = [result.values["pose_m"], *(result.values["beacon_rmse_m"].get(n, np.nan) for n in shown[1:])]
             printed = [result.values["printed"][name] for name in shown]
@@ -220,34 +458,33 @@ def draw_cases(results: Sequence[CellResult], out: Path) -> None:
         panels[-1].legend(frameon=False, fontsize=8)
 
 
-def _columns() -> list[Column]:
-    columns = [
-        Column("2017: RMSE, m", "printed.pose_m", ".2f"),
-        Column("ours", "pose_m", ".3f"),
-        Column("2017: RMSE heading, rad", "printed.heading_rad", ".2f"),
-        Column("ours", "heading_rad", ".3f"),
-    ]
-    for name in NAMES[2:]:
-        columns += [
-            Column(f"2017: {name}, m", f"printed.{name}", ".2f"),
-            Column("ours", f"beacon_rmse_m.{name}", ".2f"),
-        ]
-    return columns + [column for column in COLUMNS if column.key not in {"pose_m", "heading_rad"}]
-
-
-RADIO_CASES = Study(
+RADIO_CASES = RadioStudy(
     name="radio-cases",
     title="Cases I to III of 2017",
     cells=lambda: [Cell({"case": case}, {**RADIO, "workspace.waypoints_m": path}) for case, path in PATHS.items()],
     run_job=run_job,
     combine=combine_cases,
-    columns=_columns(),
+    columns=(
+        Column("2017: RMSE, m", "printed.pose_m", ".2f"),
+        Column("ours", "pose_m", ".3f"),
+        Column("2017: RMSE heading, rad", "printed.heading_rad", ".2f"),
+        Column("ours", "heading_rad", ".3f"),
+        *(
+            column
+            for name in NAMES[2:]
+            for column in (
+                Column(f"2017: {name}, m", f"printed.{name}", ".2f"),
+                Column("ours", f"beacon_rmse_m.{name}", ".2f"),
+            )
+        ),
+        *(column for column in COLUMNS if column.key not in {"pose_m", "heading_rad"}),
+    ),
     draw=draw_cases,
     defaults={"system": "zigbee"},
-    mirrors=(),
     runs=50,
-    is_radio=True,
 )
+
+# -- radio-follow -----------------------------------------------------------------------------------------------------
 
 # Figures 3.2 to 3.5 of 2018, as its text sums them up.
 FOLLOW_PRINTED: dict[str, dict[str, str]] = {
@@ -255,11 +492,6 @@ FOLLOW_PRINTED: dict[str, dict[str, str]] = {
     "restrictive": {"target_m": "about 0.35", "beacons_m": "0.20 to 0.30"},
 }
 CASES = {"ideal": 1, "restrictive": 30}
-FOLLOW_SHADOW: dict[str, object] = {
-    "sim.radio.shadowing_sigma_db": 5.0,
-    "path_loss.shadowing_sigma_db": 5.0,
-    "estimator.shadowing": "map",
-}
 FOLLOW_CONDITIONS: dict[str, dict[str, object]] = {
     "as printed": {},
     "target stays": {"sim.target.speed_m_s": 0.0},
@@ -271,7 +503,7 @@ FOLLOW_CONDITIONS: dict[str, dict[str, object]] = {
         "path_loss.shadowing_length_m": 0.5,
         "estimator.shadowing": "map",
     },
-    "shadowing 5 dB": FOLLOW_SHADOW,
+    "shadowing 5 dB": {**SHADOW, "estimator.shadowing": "map"},
 }
 
 
@@ -290,7 +522,7 @@ def draw_follow(results: Sequence[CellResult], out: Path) -> None:
     _draw_errors(results, "beacons_m", "error of the beacons, m", keys, out / "radio_follow_beacons")
 
 
-RADIO_FOLLOW = Study(
+RADIO_FOLLOW = RadioStudy(
     name="radio-follow",
     title="A moving radio followed",
     cells=lambda: [
@@ -302,27 +534,31 @@ RADIO_FOLLOW = Study(
     combine=combine_follow,
     columns=(
         Column("2018: target, m", "printed.target_m"),
-        *TARGET_COLUMNS,
+        Column("target RMSE, m", "target_m.mean", ".3f"),
+        Column("median", "target_m.median", ".3f"),
+        Column("aligned, m", "target_aligned_m.mean", ".3f"),
+        Column("in 90 % ellipses", "target_covered", ".3f"),
+        Column("nearest to it, m", "nearest_m", ".2f"),
+        Column("runs with a collision", "collisions"),
         Column("2018: beacons, m", "printed.beacons_m"),
         *COLUMNS,
     ),
     draw=draw_follow,
     defaults={"system": "follow"},
-    mirrors=(),
     runs=50,
-    is_radio=True,
 )
+
+# -- radio-slam -------------------------------------------------------------------------------------------------------
 
 SLIP: dict[str, object] = {"sim.vehicle.slip": 0.05, "odometry.slip_sigma": 0.05}
 DRIFT: dict[str, object] = {"sim.vehicle.heading_drift_rad_s": 0.0087, "odometry.heading_drift_sigma_rad_s": 0.01}
-SLAM_SHADOW: dict[str, object] = {"sim.radio.shadowing_sigma_db": 5.0, "path_loss.shadowing_sigma_db": 5.0}
 SLAM_CONDITIONS: dict[str, dict[str, object]] = {
     "white": {},
     "slip 5 %": SLIP,
     "slip 5 %, drift 0.5 deg/s": {**SLIP, **DRIFT},
-    "shadowing 5 dB, mapped": {**SLAM_SHADOW, "estimator.shadowing": "map"},
-    "shadowing 5 dB, as white": {**SLAM_SHADOW, "estimator.shadowing": "white"},
-    "shadowing 5 dB, ignored": {**SLAM_SHADOW, "estimator.shadowing": "none"},
+    "shadowing 5 dB, mapped": {**SHADOW, "estimator.shadowing": "map"},
+    "shadowing 5 dB, as white": {**SHADOW, "estimator.shadowing": "white"},
+    "shadowing 5 dB, ignored": {**SHADOW, "estimator.shadowing": "none"},
 }
 EVERY = (30, 1)
 
@@ -363,36 +599,7 @@ def draw_slam(results: Sequence[CellResult], out: Path) -> None:
     _draw_errors(results, "beacons_m", "error of the beacons, m", ("room", "condition", "every"), out / "radio_slam")
 
 
-def _draw_errors(results: Sequence[CellResult], name: str, label: str, keys: Sequence[str], stem: Path) -> None:
-    """Median over the runs of an error over time, with 10 to 90 %; a panel for each level of the first key.
-
-    Args:
-        results: cells with the array ``name`` of shape (runs, points).
-        keys: factors that distinguish the cells; the first one makes the panels.
-    """
-    shown = [result for result in results if name in result.arrays]
-    if not shown:
-        return
-    groups = list(dict.fromkeys(result.factors[keys[0]] for result in shown))
-    with plot(stem, 5.2 * len(groups) + 0.5, 4.2, 1, len(groups), sharey=True) as (_, panels):
-        for axes, group in zip(panels, groups, strict=True):
-            cells = [result for result in shown if result.factors[keys[0]] == group]
-            for index, result in enumerate(cells):
-                runs = result.arrays[name]
-                low, median, high = np.full((3, runs.shape[1]), np.nan)
-                known = np.isfinite(runs).any(axis=0)  # some run has an estimate
-                low[known], median[known], high[known] = np.nanquantile(runs[:, known], (0.1, 0.5, 0.9), axis=0)
-                time_s = np.arange(median.size) * _POINT_S
-                names = (f"every {result.factors[k]}" if k == "every" else str(result.factors[k]) for k in keys[1:])
-                shade, style = colour(index), "-" if index < 6 else "--"
-                axes.plot(time_s, median, color=shade, linestyle=style, linewidth=1.4, label=", ".join(names))
-                axes.fill_between(time_s, low, high, color=shade, alpha=0.08, linewidth=0)
-            axes.set(xlabel="time, s", title=f"{keys[0]}: {group}", ylim=(0.0, None))
-            axes.legend(frameon=False, fontsize=7)
-        panels[0].set_ylabel(label)
-
-
-RADIO_SLAM = Study(
+RADIO_SLAM = RadioStudy(
     name="radio-slam",
     title="EKF-SLAM among ZigBee radios",
     cells=slam_cells,
@@ -401,7 +608,5 @@ RADIO_SLAM = Study(
     columns=COLUMNS,
     draw=draw_slam,
     defaults={"system": "zigbee"},
-    mirrors=(),
     runs=50,
-    is_radio=True,
 )

@@ -6,23 +6,20 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ccatp.report.plots import dress, new_figure, save_figure
+from ccatp.core import FloatArray
+from ccatp.report.plots import dress, new_figure, save_figure, set_log_axis
 from ccatp.studies.campaign import CellResult, Column, Study
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 LIMIT = "#c0392b"
 # Distinguishable with any colour vision, and in print by their lightness.
 CYCLE = ("#0b3c5d", "#d08c00", "#1d9a8a", "#b5478a", "#6b7785", "#7a3e00")
-
-
-# -- numbers and tables -----------------------------------------------------------------------------------------------
 
 
 def plain(value: Any) -> Any:
@@ -58,13 +55,9 @@ def _text(row: Mapping[str, Any], column: Column) -> str:
         value = value.get(part) if isinstance(value, Mapping) else None
     if value is None or value == []:
         return "-"
-    if isinstance(value, list):  # an interval, or remarks
-        return (" to " if column.spec else "; ").join(_number(part, column.spec) for part in value)
-    return _number(value, column.spec)
-
-
-def _number(value: Any, spec: str) -> str:
-    return format(value, spec) if isinstance(value, int | float) and spec else str(value)
+    parts = value if isinstance(value, list) else [value]  # an interval, or remarks
+    texts = (format(v, column.spec) if isinstance(v, int | float) and column.spec else str(v) for v in parts)
+    return (" to " if column.spec else "; ").join(texts)
 
 
 # -- files ------------------------------------------------------------------------------------------------------------
@@ -73,13 +66,9 @@ def _number(value: Any, spec: str) -> str:
 def write_results(
     study: Study, cells: Sequence[CellResult], out: Path, about: Mapping[str, Any], *, with_figures: bool
 ) -> dict[str, Any]:
-    """Write all files of a campaign, cells without a run left out of table and figures.
+    """Write all files of a campaign, cells without a run left out of table and figures; what ``result.json`` holds.
 
-    Args:
-        about: what else ``result.json`` says of the campaign: its wall time, jobs that are missing.
-
-    Returns:
-        What ``result.json`` holds.
+    ``about`` is what else ``result.json`` says of the campaign: its wall time, jobs that are missing.
     """
     rows = [plain({**cell.factors, **cell.values}) for cell in cells]
     result: dict[str, Any] = {"study": study.name, "cells": rows, **plain(about)}
@@ -98,8 +87,7 @@ def write_analysis(
 ) -> dict[str, Any]:
     """Write ``result.json`` and ``table.md`` of a study without runs, begun at ``started_s`` of ``perf_counter``.
 
-    Args:
-        columns: headings of the table, by key of a cell.
+    ``columns`` are the headings of the table, by key of a cell.
     """
     result = {"study": name, "cells": list(cells), "wall_s": time.perf_counter() - started_s}
     rows = ([cell[key] for key in columns] for cell in cells)
@@ -123,12 +111,25 @@ def colour(index: int) -> str:
     return CYCLE[index % len(CYCLE)]
 
 
+def grouped(cells: Iterable[CellResult], *factors: str) -> dict[tuple[Any, ...], list[CellResult]]:
+    """Cells by their levels of some factors, in the order in which these come."""
+    groups: dict[tuple[Any, ...], list[CellResult]] = {}
+    for cell in cells:
+        groups.setdefault(tuple(cell.factors[factor] for factor in factors), []).append(cell)
+    return groups
+
+
+def levels(cells: Iterable[CellResult], factor: str) -> list[Any]:
+    """What a factor is in some cells, in the order in which it comes."""
+    return list(dict.fromkeys(cell.factors[factor] for cell in cells))
+
+
 @contextmanager
 def plot(
     stem: Path, width_in: float, height_in: float, rows: int = 1, columns: int = 1,
     *, title: str = "", legend: int = 0, grid: Literal["major", "both"] = "major", **shared: Any,
-) -> "Iterator[tuple[Figure, list[Axes]]]":  # fmt: skip
-    """A figure and its axes row by row to draw on, written as PNG and PDF at the end.
+) -> "Iterator[list[Axes]]":  # fmt: skip
+    """The axes of a figure, row by row, to draw on, written as PNG and PDF at the end.
 
     Args:
         legend: columns of a legend of the first axes below the figure; 0 for none.
@@ -139,7 +140,7 @@ def plot(
     """
     figure = new_figure(width_in, height_in)
     panels: list[Axes] = figure.subplots(rows, columns, squeeze=False, **shared).ravel().tolist()
-    yield figure, panels
+    yield panels
     if title:
         figure.suptitle(title, fontsize=11)
     if legend:
@@ -150,6 +151,19 @@ def plot(
         save_figure(figure, stem.with_suffix(suffix))
 
 
+def bar(axes: "Axes", x: Sequence[float], y: Sequence[float], shade: str) -> None:
+    """A range between two ends, for a dot upon it."""
+    axes.plot(x, y, color=shade, linewidth=3.0, alpha=0.35, solid_capstyle="butt")
+
+
+def band(
+    axes: "Axes", x: FloatArray, ends: FloatArray, shade: str, style: Literal["-", "--"] = "-", label: str = ""
+) -> None:
+    """A line within its range: ``ends`` has low, middle and high at each x, shape (3, k)."""
+    axes.plot(x, ends[1], color=shade, linestyle=style, linewidth=1.5, label=label)
+    axes.fill_between(x, ends[0], ends[2], color=shade, alpha=0.1, linewidth=0)
+
+
 _RANGES = (
     ("localization error, mm", "localization_error_mm"),
     ("first arrival error, mm", "arrival_error_mm"),
@@ -157,40 +171,30 @@ _RANGES = (
 )
 
 
-class FigureRow(NamedTuple):
-    """A line of ``draw_ranges``; that of a base is drawn through all others, which are compared with it."""
+def draw_ranges(rows: Sequence[tuple[str, CellResult, int, bool]], title: str, stem: Path) -> None:
+    """Errors and time of missions, a cell a line: mean as a dot, 99th percentile as the end of a bar.
 
-    label: str
-    cell: CellResult
-    shade: int
-    is_base: bool
-
-
-def draw_ranges(rows: Sequence[FigureRow], title: str, stem: Path) -> None:
-    """Errors and time of missions, a cell a line: mean as a dot, 99th percentile as the end of a bar."""
-    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter  # noqa: PLC0415 - takes a second
+    ``rows``: label, cell, colour, and whether it is a base: its line is drawn through all others, to compare them with.
+    """
+    from matplotlib.ticker import LogLocator, MaxNLocator  # noqa: PLC0415 - takes a second
 
     title = f"{title}: mean (dot), 99th percentile (end of the bar)"
-    with plot(stem, 10.5, 0.27 * len(rows) + 1.6, 1, len(_RANGES), title=title, sharey=True) as (_, panels):
+    with plot(stem, 10.5, 0.27 * len(rows) + 1.6, 1, len(_RANGES), title=title, sharey=True) as panels:
         for axes, (label, key) in zip(panels, _RANGES, strict=True):
-            for place, row in enumerate(rows):
-                found = row.cell.values[key]
+            for place, (_, cell, index, is_base) in enumerate(rows):
+                found = cell.values[key]
                 mean, tail = (found["mean"], found["p99"]) if isinstance(found, Mapping) else (found, None)
                 if mean is None:
                     continue
-                shade = colour(row.shade)
-                if row.is_base:
-                    axes.axvline(mean, color=shade, linewidth=0.9, linestyle="--", alpha=0.7)
+                if is_base:
+                    axes.axvline(mean, color=colour(index), linewidth=0.9, linestyle="--", alpha=0.7)
                 if tail is not None:
-                    axes.plot([mean, tail], [place] * 2, color=shade, linewidth=3.0, alpha=0.35, solid_capstyle="butt")
-                axes.plot(mean, place, "D" if row.is_base else "o", color=shade, markersize=5)
+                    bar(axes, [mean, tail], [place] * 2, colour(index))
+                axes.plot(mean, place, "D" if is_base else "o", color=colour(index), markersize=5)
             axes.set_xlabel(label)
-        panels[0].set_yticks(range(len(rows)), [row.label for row in rows])
+        panels[0].set_yticks(range(len(rows)), [row[0] for row in rows])
         panels[0].set_ylim(len(rows) - 0.5, -0.5)  # the first one on top
         for axes in panels[:2]:
-            axes.set_xscale("log")
-            # 1, 2 and 5 in plain numbers: most cells lie within a decade or two.
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes.xaxis.set_major_formatter("{x:g}")
-            axes.xaxis.set_minor_formatter(NullFormatter())
+            set_log_axis(axes, "x")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))  # most cells lie within a decade or two
         panels[2].xaxis.set_major_locator(MaxNLocator(5))

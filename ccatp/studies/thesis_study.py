@@ -33,7 +33,7 @@ from ccatp.links.topics import EstimateMessage
 from ccatp.report.plots import INK, QUIET
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.mission_study import Histogram, of_histogram, of_values, pooled
-from ccatp.studies.results import LIMIT, colour, plot
+from ccatp.studies.results import LIMIT, colour, grouped, plot
 from ccatp.studies.sil_run import SilResult, SilRun
 from ccatp.survey.composition import assemble
 
@@ -158,15 +158,7 @@ class _Replica(SilRun):
 
 
 def run_replica(cfg: Config, *, period_error: float) -> SilResult:
-    """One simulation run.
-
-    Args:
-        cfg: with the keys of ``overrides_of``.
-        period_error: by which part of the filter's step the loop takes longer.
-
-    Raises:
-        ValueError: a period error for a filter that reads time stamps.
-    """
+    """One simulation run with the keys of ``overrides_of`` (ValueError: the filter reads time stamps, not a period)."""
     if period_error and cfg.run.filter != "kf":
         raise ValueError(f"the filter {cfg.run.filter!r} reads time stamps: only kf can have a period error")
     return _Replica(cfg, period_error).run()
@@ -306,43 +298,37 @@ _BIN_MM = 1.0
 
 
 def draw(results: Sequence[CellResult], out: Path) -> None:
-    """Draw the figures of both noises.
+    """The figures of both noises.
 
     * ``trajectory_<noise>``: true and estimated way of the first run, the thesis's system with both readings.
     * ``localization_<noise>``: cumulative distribution of the localization error, every cell.
     * ``waypoints_<noise>``: the waypoint errors of all runs, and their histogram.
     """
-    for noise, numbers in _NUMBERS.items():
-        published = PUBLISHED[noise]
-        mine = [result for result in results if result.factors["noise"] == noise]
-        nearest = [r for r in mine if r.factors["noise_is_variance"] and r.factors["period_error"]][:1]
-        titles = [f"{noise} noise, as fig. {number}" for number in numbers]
-        if mine:
-            _draw_localization(mine, published["localization"], titles[1], out / f"localization_{noise}")
-        for result in nearest:
+    for (noise,), mine in grouped(results, "noise").items():
+        published, titles = PUBLISHED[noise], [f"{noise} noise, as fig. {number}" for number in _NUMBERS[noise]]
+        _draw_localization(mine, published["localization"], titles[1], out / f"localization_{noise}")
+        for result in [r for r in mine if r.factors["noise_is_variance"] and r.factors["period_error"]][:1]:
             _draw_trajectory(result, titles[0], out / f"trajectory_{noise}")
             _draw_waypoints(result, published["waypoint"], titles[2], out / f"waypoints_{noise}")
 
 
 def _draw_trajectory(result: CellResult, title: str, stem: Path) -> None:
     track = result.arrays["track"]
-    with plot(stem, 6.4, 6.0, legend=2) as (_, (axes,)):
+    with plot(stem, 6.4, 6.0, legend=2) as (axes,):
         axes.plot(track[:, 1], track[:, 2], color=colour(0), linewidth=1.6, label="true")
         axes.plot(track[:, 3], track[:, 4], color=colour(1), linewidth=0.9, linestyle="--", label="estimated")
         axes.set(aspect="equal", xlabel="x, m", ylabel="y, m", title=f"Way of one run, {title}")
 
 
 def _draw_localization(results: Sequence[CellResult], published: Mapping[str, float], title: str, stem: Path) -> None:
-    with plot(stem, 7.2, 5.2, legend=2) as (_, (axes,)):
+    with plot(stem, 7.2, 5.2, legend=2) as (axes,):
         for k, result in enumerate(results):
             values, beyond = Histogram.from_arrays(result.arrays, "localization").exceedance()
             factors = result.factors
-            is_ours = factors["system"] == "ours"
-            who = "ekf, shipped control" if is_ours else "kf, thesis's control"
+            who, style = ("ekf, shipped control", ":") if factors["system"] == "ours" else ("kf, thesis's control", "-")
             noise = "variances" if factors["noise_is_variance"] else "standard deviations"
             late = 100.0 * float(factors["period_error"])
             label = f"{who}: {noise}{f', period {late:.1f} % long' if late else ''}"
-            style = ":" if is_ours else "-"
             axes.semilogx(1e3 * values, 1.0 - beyond, color=colour(k), linestyle=style, linewidth=1.5, label=label)
         marks_mm, shares = [_LIMIT_MM, published["max"]], [published["within_10mm_fraction"], 1.0]
         axes.plot(marks_mm, shares, "x", color=INK, label="published")
@@ -359,7 +345,7 @@ def _draw_waypoints(result: CellResult, published: Mapping[str, float], title: s
         f"Waypoint error, {title}: {100.0 * within:.1f} % below 1 cm "
         f"(published {100.0 * published['within_10mm_fraction']:.2f} %)"
     )
-    with plot(stem, 9.0, 3.6, 1, 2, title=title, width_ratios=(2, 1), sharey=True) as (_, (left, right)):
+    with plot(stem, 9.0, 3.6, 1, 2, title=title, width_ratios=(2, 1), sharey=True) as (left, right):
         left.plot(np.arange(1, errors.size + 1), errors, ".", color=colour(0), markersize=4)
         bins = np.arange(0.0, max(errors.max(initial=0.0), _LIMIT_MM) + _BIN_MM, _BIN_MM)
         right.hist(errors, bins=bins.tolist(), orientation="horizontal", color=colour(0))

@@ -3,8 +3,8 @@
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,62 +13,33 @@ from click.testing import CliRunner
 
 from ccatp.cli.study import bench as command
 from ccatp.config.load import load_config
-from ccatp.config.models import Config
 from ccatp.studies import bench, bench_cases
 from ccatp.studies.bench import BenchError, cpu_model, largest_difference, machine, race, step_case
-from ccatp.studies.bench_cases import (
-    Contender,
-    FilterProblem,
-    dense_slam,
-    our_filter,
-    our_slam,
-    printed_filter,
-    range_problem,
-    slam_problem,
-    thesis_problem,
-)
+from ccatp.studies.bench_cases import Contender, Race, dense_slam, our_slam, races, slam_problem
 
 STEPS = 10
+CFG = load_config()
+RACES = list(races(CFG))
 
 
-@pytest.fixture(scope="module")
-def cfg() -> Config:
-    return load_config()
+@pytest.mark.parametrize("one", [one for one in RACES if one.peers], ids=lambda one: one.name)
+def test_every_peer_computes_the_same(one: Race) -> None:
+    for peer in one.peers.values():
+        assert largest_difference(one.ours, peer, STEPS) < bench.EQUAL_WITHIN
+    assert all(len(list(contender())) == 1 + bench_cases.STEPS for contender in (one.ours, *one.peers.values()))
 
 
-@pytest.mark.parametrize(
-    ("filter_name", "problem_of", "peer_of"),
-    [
-        pytest.param(name, problem_of, peer_of, id=f"{name}-{k}-{peer}")
-        for k, (name, problem_of, peers) in enumerate(bench.FILTER_CASES)
-        for peer, peer_of in peers.items()
-    ],
-)
-def test_filters_equal_their_peers(
-    cfg: Config,
-    filter_name: str,
-    problem_of: Callable[[Config], FilterProblem],
-    peer_of: Callable[[FilterProblem], Contender],
-) -> None:
-    problem = problem_of(cfg)
-    assert problem.readings.shape == (bench_cases.STEPS, problem.variances.size)
-    assert largest_difference(our_filter(filter_name, problem), peer_of(problem), STEPS) < bench.EQUAL_WITHIN
-
-
-@pytest.mark.parametrize("beacons", [4, 20])
-def test_slam_by_blocks_equals_whole_matrices(beacons: int) -> None:
-    problem = slam_problem(beacons)
-    ours = our_slam(problem)
-    assert largest_difference(ours, dense_slam(problem), STEPS) < bench.EQUAL_WITHIN
-    mean, covariance = ours.result()
-    measured = slice(5, 7)
-    assert np.trace(covariance[measured, measured]) < 0.8 * np.trace(problem.covariance[measured, measured])
-    assert mean.size == 5 + 2 * beacons
+def test_slam_by_blocks_learns_of_each_beacon() -> None:
+    problem = slam_problem(20)
+    assert largest_difference(lambda: our_slam(problem), lambda: dense_slam(problem), STEPS) < bench.EQUAL_WITHIN
+    *_, (mean, covariance) = our_slam(problem)
+    assert np.trace(covariance[5:7, 5:7]) < 0.8 * np.trace(problem.covariance[5:7, 5:7])
+    assert mean.size == 5 + 2 * 20
 
 
 def fixed(value: float) -> Contender:
     """A contender whose result does not change."""
-    return Contender(lambda: None, lambda _: None, lambda: (np.full(2, value), np.eye(2)))
+    return lambda: iter([((), ()), *[(np.full(2, value), np.eye(2))] * bench_cases.STEPS])
 
 
 @pytest.mark.parametrize(("value", "difference"), [(1.0 + 2e-10, "2e-10"), (float("nan"), "nan")])
@@ -78,10 +49,10 @@ def test_a_peer_with_another_result_ends_the_run(value: float, difference: str) 
         step_case("case", fixed(1.0), "P", fixed(value), 1)
 
 
-def test_the_problems_are_a_function_of_the_seed(cfg: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_problems_are_a_function_of_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     def readings() -> list[Any]:
-        problems = [problem_of(cfg).readings for _, problem_of, _ in bench.FILTER_CASES]
-        return [*problems, range_problem(cfg).ranges_m, slam_problem(4).ranges_m]
+        found = [bench_cases.thesis_problem(CFG, 2).readings, bench_cases.survey_problem(CFG).readings]
+        return [*found, bench_cases.range_problem(CFG).ranges_m, slam_problem(4).ranges_m]
 
     first, again = readings(), readings()
     monkeypatch.setattr(bench_cases, "SEED", 2)
@@ -90,24 +61,24 @@ def test_the_problems_are_a_function_of_the_seed(cfg: Config, monkeypatch: pytes
         assert not np.array_equal(one, other)
 
 
-def test_a_race_times_every_step_of_both(cfg: Config) -> None:
-    problem = thesis_problem(cfg, 2)
-    times_us = race(our_filter("kf", problem), printed_filter(problem), 2, STEPS)
+def test_a_race_times_every_step_of_both() -> None:
+    times_us = race(RACES[0].ours, RACES[0].peers["eq. 2.13 in numpy"], 2, STEPS)
     assert times_us.shape == (2, 2, STEPS)
     assert times_us.min() > 0.0
-    assert race(our_filter("kf", problem), None, 1, STEPS).shape == (1, 1, STEPS)
+    assert race(RACES[0].ours, None, 1, STEPS).shape == (1, 1, STEPS)
 
 
-def test_a_missing_peer_leaves_ours_and_says_how_to_install_it(cfg: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_peer_leaves_ours_and_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     for package in ("filterpy.kalman", "stonesoup.predictor.kalman"):
         monkeypatch.setitem(sys.modules, package, None)
-    cases = [case for case in bench.step_cases(cfg, 1) if case["peer"] is None and "slam" not in case["name"]]
-    assert len(cases) == 2 * len(bench.FILTER_CASES)
-    assert all(case["us_p50"] > 0.0 and case["ratio"] is None for case in cases)
-    assert cases[0]["note"] == "filterpy is not installed: pip install 'ccatp[peers]'"
-    result = {"machine": machine(), "equal_within": 1e-10, "cases": cases}
-    assert "pip install 'ccatp[peers]'" in bench.markdown(result)
-    assert "pip install 'ccatp[peers]'" in bench.terminal_lines(result)[1]
+    monkeypatch.setattr(bench, "races", lambda _: RACES[:1])
+    result = {"machine": machine(), "equal_within": 1e-10, "cases": list(bench.step_cases(CFG, 1))}
+    printed, filterpy, stonesoup = result["cases"]
+    assert printed["ratio"] > 0.0
+    assert (filterpy["peer"], filterpy["ratio"], stonesoup["peer"]) == (None, None, None)
+    assert filterpy["note"] == "filterpy is not installed: pip install 'ccatp[peers]'"
+    assert bench.markdown(result).endswith("* Stone Soup is not installed: pip install 'ccatp[peers]'\n")
+    assert "pip install 'ccatp[peers]'" in bench.terminal_lines(result)[2]
 
 
 def test_the_command_and_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,70 +91,59 @@ def test_the_command_and_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert {"cpu", "cores", "python", "numpy"} <= result["machine"].keys()
     assert result["equal_within"] == 1e-10
     for case in result["cases"]:
-        assert {"name", "us_p50", "us_p99", "peer", "peer_us_p50", "ratio"} <= case.keys()
         if case["peer"] is None:
             assert case["name"].startswith("ekf-slam, 200")  # whole matrices of that size take too long
             assert case["us_p50"] > 0.0
             continue
+        assert case["us_p99"] >= case["us_p50"]
         assert case["ratio"] == pytest.approx(case["us_p50"] / case["peer_us_p50"])
         assert case["largest_difference"] <= 1e-10
-    peers = {case["peer"] for case in result["cases"]} - {None}
-    assert peers == {*bench.LINEAR, "scipy.optimize.least_squares", "whole matrices in numpy"}
+    names = {case["peer"] for case in result["cases"]} - {None}
+    assert names == {name for one in RACES for name in one.peers}
     table = [line for line in page.read_text().splitlines() if line.startswith("|")]
     assert len(table) == len(result["cases"]) + 2
     assert len({line.count("|") for line in table}) == 1
     assert len(bench.terminal_lines(result)) == len(result["cases"]) + 1
 
 
-class Rehearsed:
-    def __init__(self, measured: int) -> None:
-        self.mission_time_s = 20.0
-        self.summary = {"points": {"measured": measured, "total": 9}}
+def test_a_mission_in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    def measures(points: int) -> None:
+        found = SimpleNamespace(mission_time_s=20.0, summary={"points": {"measured": points, "total": 9}})
+        monkeypatch.setattr(bench, "rehearse", lambda part: found if part.run.panels == 1 else None)
 
-
-def test_a_mission_in_process(cfg: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[int] = []
-
-    def rehearse(part: Config) -> Rehearsed:
-        asked.append(part.run.panels)
-        return Rehearsed(9)
-
-    monkeypatch.setattr(bench, "rehearse", rehearse)
-    case = bench.rehearsal_case(cfg, 1)
-    assert asked == [1]
+    measures(9)
+    case = bench.rehearsal_case(CFG, 1)
     assert case["times_real_time"] == pytest.approx(20.0 / case["wall_s"])
     assert case["ratio"] == pytest.approx(1.0 / case["times_real_time"])
     assert case["peer_us_p50"] == pytest.approx(1e4)  # a frame of 100 Hz
     assert "1 panel |" in bench.markdown({"machine": machine(), "equal_within": 1e-10, "cases": [case]})
-    monkeypatch.setattr(bench, "rehearse", lambda _: Rehearsed(8))
+    measures(8)
     with pytest.raises(BenchError, match="measured 8 of 9 points"):
-        bench.rehearsal_case(cfg, 1)
+        bench.rehearsal_case(CFG, 1)
 
 
-def test_a_mission_in_lockstep(cfg: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mission_in_lockstep(monkeypatch: pytest.MonkeyPatch) -> None:
     wall = {"tick_us_p50": 100.0, "tick_us_p99": 200.0, "realtime_factor": 20.0}
     commands: list[list[str]] = []
 
-    def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
-        commands.append(command)
-        return subprocess.CompletedProcess(command, 0, json.dumps({"mission_time_s": 30.0, "wall": wall}), "")
+    def answers(status: int, out: str, err: str) -> None:
+        def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
+            commands.append(command)
+            if status < 0:
+                raise subprocess.TimeoutExpired(command, bench.TIMEOUT_S)
+            return subprocess.CompletedProcess(command, status, out, err)
 
-    monkeypatch.setattr(subprocess, "run", run)
-    case = bench.lockstep_case(cfg, 4, ("--config", "c.toml"))
-    assert commands[0][2:8] == ["ccatp", "run", "--sim", "--json", "--panels", "4"]
-    assert commands[0][8:10] == ["--config", "c.toml"]
+        monkeypatch.setattr(subprocess, "run", run)
+
+    answers(0, json.dumps({"mission_time_s": 30.0, "wall": wall}), "")
+    case = bench.lockstep_case(CFG, 4, ("--config", "c.toml"))
+    assert commands[0][2:10] == ["ccatp", "run", "--sim", "--json", "--panels", "4", "--config", "c.toml"]
     assert case["tick_us_p99"] == 200.0
     assert case["times_real_time"] == pytest.approx(30.0 / case["wall_s"])
-    monkeypatch.setattr(subprocess, "run", lambda c, **_: subprocess.CompletedProcess(c, 4, "", "first\nccatp: held\n"))
-    with pytest.raises(BenchError, match="ended with status 4: ccatp: held"):
-        bench.lockstep_case(cfg, 1)
-
-    def late(command: list[str], **_: Any) -> None:
-        raise subprocess.TimeoutExpired(command, bench.TIMEOUT_S)
-
-    monkeypatch.setattr(subprocess, "run", late)
-    with pytest.raises(BenchError, match="was not over after 900 s"):
-        bench.lockstep_case(cfg, 1)
+    for status, message in ((4, "ended with status 4: ccatp: held"), (-1, "was not over after 900 s")):
+        answers(status, "", "first\nccatp: held\n")
+        with pytest.raises(BenchError, match=message):
+            bench.lockstep_case(CFG, 1)
 
 
 def test_the_machine(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """The Cramér-Rao bound against what linear regression finds in simulated draws, and on a run of the real chain."""
 
-from collections.abc import Mapping
-
 import numpy as np
 import pytest
 
@@ -29,13 +27,8 @@ def config(**world: object) -> Config:
         "gyroscope_sigma_rad_s": 0.002, "gyroscope_bias_sigma_rad_s": 0.01, "encoder_sigma_rad_s": 0.0,
         "panel_edge_sigma_m": EDGE_SIGMA_M, **world,
     }  # fmt: skip
-    overrides = {f"world.{key}": value for key, value in values.items()}
-    return load_config(
-        overrides={
-            "run.mirror": "thesis-m1", "run.world": "thesis", "sim.robot.frame_hz": HZ, "sim.truth.tilt_sigma_rad": 0.0,
-            **overrides,
-        }
-    )  # fmt: skip
+    keys = {"run.mirror": "thesis-m1", "run.world": "thesis", "sim.robot.frame_hz": HZ, "sim.truth.tilt_sigma_rad": 0.0}
+    return load_config(overrides={**keys, **{f"world.{key}": value for key, value in values.items()}})
 
 
 def straight(cfg: Config, *, sensor_passes: bool = False) -> TrueRecord:
@@ -102,80 +95,60 @@ def drawn(cfg: Config, *, sensor_passes: bool) -> tuple[np.ndarray, np.ndarray]:
     return np.column_stack([x, y]), np.column_stack(measured)
 
 
-def last_rms_m(cfg: Config, *, with_accelerometer: bool = False) -> float:
-    """Bound of the root mean square distance at the end of the leg."""
-    bound = bounds_of(cfg, build_mirror(cfg.mirror), straight(cfg), with_accelerometer=with_accelerometer)[-1]
-    return float(np.sqrt(np.trace(bound.covariance_m2)))
-
-
-def residual_covariance(wanted: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """What is left of ``wanted`` after the best linear guess from ``measured``."""
-    known = np.column_stack([np.ones(len(measured)), measured])
-    rest = wanted - known @ np.linalg.lstsq(known, wanted, rcond=None)[0]
-    covariance: np.ndarray = rest.T @ rest / (len(measured) - known.shape[1])
-    return covariance
+def last_covariance(cfg: Config, *, sensor_passes: bool = False, with_accelerometer: bool = False) -> np.ndarray:
+    """Bound of the covariance at the end of the leg, m^2."""
+    record = straight(cfg, sensor_passes=sensor_passes)
+    return bounds_of(cfg, build_mirror(cfg.mirror), record, with_accelerometer=with_accelerometer)[-1].covariance_m2
 
 
 @pytest.mark.parametrize("sensor_passes", [False, True])
 def test_it_is_what_the_best_linear_estimate_leaves(sensor_passes: bool) -> None:
     cfg = config()
-    bound = bounds_of(cfg, build_mirror(cfg.mirror), straight(cfg, sensor_passes=sensor_passes))[-1]
-    found = residual_covariance(*drawn(cfg, sensor_passes=sensor_passes))
+    bound = last_covariance(cfg, sensor_passes=sensor_passes)
+    wanted, measured = drawn(cfg, sensor_passes=sensor_passes)
+    known = np.column_stack([np.ones(DRAWS), measured])
+    rest = wanted - known @ np.linalg.lstsq(known, wanted, rcond=None)[0]  # after the best linear guess
+    found = rest.T @ rest / (DRAWS - known.shape[1])
     # A variance out of 6000 draws is good to 1.8 %; the second order of the slip's difference adds as much.
-    assert np.diag(bound.covariance_m2) == pytest.approx(np.diag(found), rel=0.08)
-    expected, correlation = (c[0, 1] / np.sqrt(c[0, 0] * c[1, 1]) for c in (found, bound.covariance_m2))
+    assert np.diag(bound) == pytest.approx(np.diag(found), rel=0.08)
+    expected, correlation = (c[0, 1] / np.sqrt(c[0, 0] * c[1, 1]) for c in (found, bound))
     assert correlation == pytest.approx(expected, abs=0.05)  # 6000 draws: 0.013
 
 
 def test_the_scatter_of_slip_is_the_floor_of_a_leg() -> None:
     cfg = config(slip_walk_sigma=0.0, start_position_sigma_m=0.0, start_heading_sigma_rad=0.0)
-    bound = bounds_of(cfg, build_mirror(cfg.mirror), straight(cfg))[-1]
     expected_m = LEG_M / 0.97 * 0.02 / np.sqrt(12.0) / np.sqrt(2.0)
-    assert np.sqrt(bound.covariance_m2[0, 0]) == pytest.approx(expected_m, rel=1e-3)  # the model is linear along x
+    assert np.sqrt(last_covariance(cfg)[0, 0]) == pytest.approx(expected_m, rel=1e-3)  # the model is linear along x
 
 
-def test_less_noise_gives_a_lower_bound() -> None:
+def test_less_noise_and_the_accelerometer_give_a_lower_bound() -> None:
     changes = ({"gyroscope_sigma_rad_s": 0.001}, {"slip_max": 0.03}, {"slip_walk_sigma": 0.0})
-    assert all(last_rms_m(config(**change)) < last_rms_m(config()) for change in changes)
+    noisy = np.trace(last_covariance(config()))
+    assert all(np.trace(last_covariance(config(**change))) < noisy for change in changes)
+    cfg = config(accelerometer_bias_sigma_m_s2=0.1)
+    assert np.trace(last_covariance(cfg, with_accelerometer=True)) < np.trace(last_covariance(cfg))
 
 
 def test_a_counted_angle_costs_a_part_of_a_count() -> None:
     noiseless = {"slip_max": 0.02, "slip_walk_sigma": 0.0, "start_heading_sigma_rad": 0.0, "gyroscope_sigma_rad_s": 1.0}
     plain, counted = (
-        bounds_of(cfg, build_mirror(cfg.mirror), straight(cfg))[-1].covariance_m2[0, 0]
-        for cfg in (config(**noiseless), config(**noiseless, encoder_counts_per_rev=1200))
+        last_covariance(cfg)[0, 0] for cfg in (config(**noiseless), config(**noiseless, encoder_counts_per_rev=1200))
     )
     count_m = 0.97 * 2.0 * np.pi / 1200.0 * 0.03
     # Half a count's variance for the mean of two wheels, at the beginning of the leg and at its end.
     assert counted - plain == pytest.approx(count_m**2 / 12.0, rel=0.02)  # the gyroscope says a little
 
 
-def test_the_accelerometer_can_only_help() -> None:
-    cfg = config(accelerometer_bias_sigma_m_s2=0.1)
-    assert last_rms_m(cfg, with_accelerometer=True) < last_rms_m(cfg)
-
-
-@pytest.fixture(scope="module")
-def hard() -> tuple[Config, TrueRecord, Mapping[str, int]]:
-    cfg = load_config(
-        overrides={"run.mirror": "thesis-m1", "run.world": "hard", "run.filter": "ekf", "run.panels": 1, "run.seed": 3}
-    )
+def test_an_estimator_does_not_beat_the_bound() -> None:
+    keys = {"run.mirror": "thesis-m1", "run.world": "hard", "run.filter": "ekf", "run.panels": 1, "run.seed": 3}
+    cfg = load_config(overrides=keys)
     found, record = rehearse_recorded(cfg)
-    return cfg, record, found.counts
-
-
-def test_a_record_holds_the_whole_run(hard: tuple[Config, TrueRecord, Mapping[str, int]]) -> None:
-    _, record, counts = hard
     assert np.diff(record.way[:, cr.WAY_T]) == pytest.approx(0.01)
-    assert len(record.fixes) == counts["fixes"]
+    assert len(record.fixes) == found.counts["fixes"]
     assert record.passes  # the base lies on another panel
     assert len({one.edge for one in record.passes}) < len(record.passes)  # four sensors cross the same edge
-
-
-def test_an_estimator_does_not_beat_the_bound(hard: tuple[Config, TrueRecord, Mapping[str, int]]) -> None:
-    cfg, record, _ = hard
     bounds = bounds_of(cfg, build_mirror(cfg.mirror), record)[1:]  # until the second fix only the start errors count
-    errors = np.array([stop.error_m for stop in bounds])
+    errors = np.array([stop.fix.error_m for stop in bounds])
     squares = [e @ np.linalg.solve(stop.covariance_m2, e) for e, stop in zip(errors, bounds, strict=True)]
     median_m = np.median([np.sqrt(np.trace(stop.covariance_m2)) for stop in bounds])
     assert 0.5e-3 < median_m < 3e-3  # the scatter of slip on legs of 0.22 and 0.245 m

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 
 from ccatp.config.load import load_config
-from ccatp.config.models import Config
 from ccatp.mirror.mirror import build_mirror
 from ccatp.records.summary import WITHIN_M
 from ccatp.sim.world import TruthRow
-from ccatp.studies import STUDIES, faults_study, filters_study, find_study
+from ccatp.studies import STUDIES, faults_study, find_study
 from ccatp.studies.campaign import CampaignError, CellResult, Job, JobOutcome, Study, cells_of, jobs_of
 from ccatp.studies.engine import CampaignOptions, run_campaign
-from ccatp.studies.factor_studies import ABLATION, GROUPS, SENSITIVITY, TIME, sensitivity_cells
 from ccatp.studies.faults_study import FIRST_S, LONGEST_S, is_recoverable, random_plan
 from ccatp.studies.mission_study import (
     COLUMN,
@@ -30,7 +28,16 @@ from ccatp.studies.mission_study import (
 )
 from ccatp.studies.results import plain, table
 from ccatp.studies.sil_run import SilTrace
-from ccatp.survey.composition import SurveyParts, assemble
+from ccatp.studies.survey_studies import (
+    ABLATION,
+    FILTERS,
+    GROUPS,
+    SENSITIVITY,
+    TIME,
+    combine_filters,
+    sensitivity_cells,
+)
+from ccatp.survey.composition import assemble
 from tests.support.sim_survey import plan_of
 
 SIGMA_M, SIGMA_RAD = 1e-3, 2e-3
@@ -83,7 +90,7 @@ def mission(errors_m: list[float], approaches: list[int] | None = None, **change
 
 # Each with the stems of its figures.
 CAMPAIGNS = (
-    (filters_study.STUDY, {f"{kind}-thesis-m1" for kind in ("localization", "arrival", "bound", "consistency")}),
+    (FILTERS, {f"{kind}-thesis-m1" for kind in ("localization", "arrival", "bound", "consistency")}),
     (TIME, {"time-thesis-m1"}),
     (SENSITIVITY, {"sensitivity-thesis-m1"}),
     (ABLATION, {"ablation-thesis-m1-thesis", "ablation-thesis-m1-hard"}),
@@ -101,15 +108,11 @@ def results_of(study: Study) -> list[CellResult]:
     return found
 
 
-@pytest.mark.parametrize("study", [study for study, _ in CAMPAIGNS], ids=lambda study: study.name)
-def test_every_cell_is_a_configuration_of_its_own(study: Study) -> None:
+@pytest.mark.parametrize(("study", "stems"), CAMPAIGNS)
+def test_cells_are_configurations_of_their_own_and_all_shown(study: Study, stems: set[str], tmp_path: Path) -> None:
     plan = jobs_of(study, cells_of(study), lambda keys: load_config(None, keys), {}, 1)
     configurations = [group[0].cfg.model_dump_json() for group in plan]
     assert len(set(configurations)) == len(configurations) > 1
-
-
-@pytest.mark.parametrize(("study", "stems"), CAMPAIGNS)
-def test_figures_and_table_show_every_cell(study: Study, stems: set[str], tmp_path: Path) -> None:
     results = results_of(study)
     study.draw(results, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {f"{stem}.{kind}" for stem in stems for kind in ("png", "pdf")}
@@ -121,13 +124,13 @@ def test_figures_and_table_show_every_cell(study: Study, stems: set[str], tmp_pa
 
 
 def test_stop_errors_stand_beside_the_bound_without_each_first_stop() -> None:
-    values, arrays = filters_study.combine({}, [mission([0.1, 0.003]), mission([0.1, 0.004])])
+    values, arrays = combine_filters({}, [mission([0.1, 0.003]), mission([0.1, 0.004])])
     assert values["bound"]["rms_mm"] == pytest.approx(2.0 * 2.0**0.5, abs=1e-3)
     assert values["bound"]["error_rms_mm"] == pytest.approx(12.5**0.5, abs=1e-3)
     assert values["bound"]["ratio"] == pytest.approx((12.5 / 8.0) ** 0.5, abs=1e-3)
     assert values["bound"]["with_accelerometer"]["ratio"] == pytest.approx((12.5 / 2.0) ** 0.5, abs=1e-3)
     assert arrays["bounds"].shape == (2, 5)
-    alone, _ = filters_study.combine({}, [mission([0.1])])
+    alone, _ = combine_filters({}, [mission([0.1])])
     assert alone["bound"]["ratio"] is None
     assert alone["bound"]["error_rms_mm"] is None
 
@@ -155,7 +158,7 @@ def test_each_group_of_disturbances_is_added_and_taken_away() -> None:
 @pytest.mark.parametrize(
     ("study", "only", "settings"),
     [
-        (filters_study.STUDY, {"world": ("thesis",), "filter": ("ekf",)}, {}),
+        (FILTERS, {"world": ("thesis",), "filter": ("ekf",)}, {}),
         (TIME, {"order": ("optimised",), "v_max_m_s": ("0.2",), "measuring_time_s": ("0.5",)}, {"run.filter": "ekf"}),
     ],
 )
@@ -179,15 +182,10 @@ def test_a_real_job_has_every_figure(
         ("zzz", "there are thesis, filters, time, sensitivity, ablation, danger, faults, cricket, mote-sizes"),
     ],
 )
-def test_an_unknown_study_is_answered_with_the_nearest(name: str, hint: str) -> None:
+def test_every_name_leads_to_its_study_and_another_to_the_nearest(name: str, hint: str) -> None:
+    assert [getattr(find_study(known), "name", known) for known in STUDIES] == list(STUDIES)
     with pytest.raises(CampaignError, match=f"no study '{name}'; {hint}"):
         find_study(name)
-
-
-def test_every_row_of_the_registry_leads_to_a_study() -> None:
-    for name in STUDIES:
-        found = find_study(name)
-        assert getattr(found, "name", name) == name
 
 
 # -- the missions of a cell -------------------------------------------------------------------------------------------
@@ -215,6 +213,10 @@ def test_a_histogram_has_the_figures_of_its_values() -> None:
     assert (np.diff(edges) > 0.0).all()
     assert (np.diff(share_beyond) < 0.0).all()
     assert share_beyond[-1] == 0.0
+    with pytest.raises(ValueError, match="must be finite and not negative"):
+        Histogram.of(np.array([0.1, -1e-6]), 0.01)
+    with pytest.raises(ValueError, match="must be finite and not negative"):
+        Histogram.of(np.array([0.1, np.nan]), 0.01)
 
 
 def test_histograms_are_pooled_and_stored() -> None:
@@ -229,12 +231,6 @@ def test_histograms_are_pooled_and_stored() -> None:
     empty = Histogram.of(np.empty(0), 0.01)
     assert np.isnan([empty.quantile(0.5), empty.mean]).all()
     assert empty.count == pooled([]).count == 0
-
-
-@pytest.mark.parametrize("value", [-1e-6, np.nan, np.inf])
-def test_errors_are_finite_and_not_negative(value: float) -> None:
-    with pytest.raises(ValueError, match="must be finite and not negative"):
-        Histogram.of(np.array([0.1, value]), 0.01)
 
 
 def test_every_error_of_every_run_counts_once() -> None:
@@ -323,66 +319,33 @@ def test_a_real_mission_says_the_same_as_its_summary() -> None:
 FRAMES, DELAY = 2500, 3  # more than two batches; frames by which the estimates lag behind the truth
 
 
-@pytest.fixture(scope="module")
-def parts(config: Config) -> SurveyParts:
-    run = config.run.model_copy(update={"panels": 1})
-    return assemble(config.model_copy(update={"run": run}))
+def test_late_estimates_meet_their_truth_across_batches() -> None:
+    parts = assemble(load_config(None, {"run.panels": 1}))
+    base = parts.mirror.base_pose
 
+    def true_row(seq: int) -> TruthRow:
+        x_m, y_m = base.x_m + 1e-5 * seq, base.y_m
+        return seq, 0.01 * seq, x_m, y_m, 0.0, *parts.mirror.surface_point(x_m, y_m), 1.0, 0, 0
 
-def true_row(parts: SurveyParts, seq: int) -> TruthRow:
-    x_m, y_m = parts.mirror.base_pose.x_m + 1e-5 * seq, parts.mirror.base_pose.y_m
-    return seq, 0.01 * seq, x_m, y_m, 0.0, *parts.mirror.surface_point(x_m, y_m), 1.0, 0, 0
-
-
-def book_of(parts: SurveyParts, *, with_track: bool) -> SilTrace:
-    book = SilTrace(parts, with_track=with_track)
+    book, unasked = (SilTrace(parts, with_track=with_track) for with_track in (True, False))
     for seq in range(FRAMES):
-        book.note_truth(true_row(parts, seq))
+        book.note_truth(true_row(seq))
+        unasked.note_truth(true_row(seq))
         if seq >= DELAY:
             book.note_estimate(seq - DELAY, 0.01 * (seq - DELAY), parts.mirror.base_panel_pose)
-    return book
-
-
-def test_late_estimates_meet_their_truth_across_batches(parts: SurveyParts) -> None:
-    book = book_of(parts, with_track=True)
+    assert book.truth_at(FRAMES - 1 - DELAY) == true_row(FRAMES - 1 - DELAY)
     summary = book.summary(parts.mission, 25.0, {}, {})
+    unasked.summary(parts.mission, 25.0, {}, {})
     track = book.track()
     assert track is not None
+    assert unasked.track() is None
     assert track[:, 0] == pytest.approx(0.01 * np.arange(FRAMES - DELAY))
-    base = parts.mirror.base_pose
     assert track[:, 1] - track[:, 4] == pytest.approx(1e-5 * np.arange(FRAMES - DELAY), abs=1e-12)  # rounding
     assert track[:, 5] == pytest.approx(base.y_m, abs=1e-12)
     assert summary["localization_error_mm"]["max"] == pytest.approx(1e-2 * (FRAMES - DELAY - 1), rel=0.02)  # slope
 
 
-def test_a_late_frame_has_its_truth_and_there_is_no_track_unless_asked_for(parts: SurveyParts) -> None:
-    book = book_of(parts, with_track=False)
-    assert book.truth_at(FRAMES - 1 - DELAY) == true_row(parts, FRAMES - 1 - DELAY)
-    book.summary(parts.mission, 25.0, {}, {})
-    assert book.track() is None
-
-
 # -- the study `faults` -----------------------------------------------------------------------------------------------
-
-DANGER = {"true_edges": 0, "false_edges": 1, "falls": 0, "max_overrun_mm": 2.0}
-
-
-def faults_study_outcome(seed: int, how: str, **changes: Any) -> JobOutcome:
-    values = {
-        "seed": seed,
-        "outcome": how,
-        "cause": "" if how == "complete" else "held",
-        "injected": {"planned": 12, "acted": 11},
-        "is_recoverable": how == "complete",
-        "weak_frames": 0,
-        "points": {"measured": 9, "total": 9},
-        "danger": DANGER,
-        "mission_time_s": 110.0,
-        "lower_bound_s": 100.0,
-        "within_budget": True,
-        "states_s": {"driving": 60.0},
-    }
-    return JobOutcome(values | changes, {})
 
 
 def run(faults: str, seed: int = 5) -> Mapping[str, Any]:
@@ -409,17 +372,12 @@ def test_a_real_job(faults: str) -> None:
     assert planned / 2 <= values["injected"]["acted"] <= planned
 
 
-def test_fans_that_seem_to_fail_on_an_overhang_wait_for_an_operator() -> None:
-    fans, other = (
-        plan_of("fans off at_s=5.0"),
-        plan_of("soc off at_s=5.0"),
-    )
-    upright, overhanging = (
-        build_mirror(load_config(None, {"run.mirror": name}).mirror) for name in ("fyst-m1", "fyst-m2")
-    )
-    assert not is_recoverable(fans, overhanging)
-    assert is_recoverable(fans, upright)
-    assert is_recoverable(other, overhanging)
+@pytest.mark.parametrize(
+    ("signal", "mirror", "is_so"), [("fans", "fyst-m2", False), ("fans", "fyst-m1", True), ("soc", "fyst-m2", True)]
+)
+def test_fans_that_seem_to_fail_on_an_overhang_wait_for_an_operator(signal: str, mirror: str, is_so: bool) -> None:
+    plan = plan_of(f"{signal} off at_s=5.0")
+    assert is_recoverable(plan, build_mirror(load_config(None, {"run.mirror": mirror}).mirror)) is is_so
 
 
 def test_fans_below_their_floor_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -431,7 +389,13 @@ def test_fans_below_their_floor_are_counted(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_cell_says_who_was_not_completed_and_is_drawn(tmp_path: Path) -> None:
     results = []
     for cell in cells_of(faults_study.STUDY):
-        runs = [faults_study_outcome(1, "complete"), faults_study_outcome(2, "stopped", weak_frames=4)]
+        injected = {"planned": 12, "acted": 11}
+        runs = [
+            mission([0.001], seed=1, is_recoverable=True, weak_frames=0, injected=injected),
+            mission(
+                [0.001], seed=2, is_recoverable=False, weak_frames=4, injected=injected, outcome="stopped", cause="held"
+            ),
+        ]
         values, arrays = faults_study.STUDY.combine(cell.factors, runs)
         results.append(CellResult(cell.factors, {"runs": 2, **values}, arrays))
     first = results[0].values

@@ -15,7 +15,7 @@ from ccatp.beacons.slam.signal_slam import SignalSlam
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_radio_config
 from ccatp.filters.ekf_slam import EkfSlam
-from ccatp.studies.radio_runs import run_radio
+from ccatp.studies.radio_studies import run_radio
 
 ODOMETRY: dict[str, Odometry] = {
     "ackermann": Steering(0.1, 0.1, 0.15, 0.3),

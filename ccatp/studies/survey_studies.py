@@ -1,0 +1,432 @@
+"""The studies of whole missions over their factors.
+
+`filters`: which filter in which world, against the least possible error. `time`: what order of points, speed and
+measuring time do to the hour a mission may take. `sensitivity`: what each disturbance of the world `hard` costs, alone,
+and what its absence saves. `ablation`: what each technique of estimation and control gives, by switching it off alone.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ccatp.config.load import load_config
+from ccatp.core import FloatArray
+from ccatp.mirror.mirror import build_mirror
+from ccatp.report.plots import GRID, INK, QUIET
+from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
+from ccatp.studies.cramer_rao import bounds_of, rehearse_recorded
+from ccatp.studies.mission_study import (
+    COLUMN,
+    Histogram,
+    combine_missions,
+    first_arrivals,
+    mission_columns,
+    mission_outcome,
+    nees,
+    run_mission,
+)
+from ccatp.studies.results import LIMIT, bar, colour, draw_ranges, grouped, levels, plot
+from ccatp.survey.planning.route import ORDERS
+from ccatp.survey.planning.tour_bound import tour_bound
+
+# -- filters ----------------------------------------------------------------------------------------------------------
+
+_BOUND_EVERY = 4  # the bounds cost half a mission, and differ little from one run to the next
+_SHOWN_MM = (0.01, 300.0)
+_LIMIT_MM = 10.0
+_DASHES = ("-", "--", ":")  # curves that coincide stay visible
+
+
+def run_filter_mission(job: Job) -> JobOutcome:
+    """One mission; of every fourth seed also the bounds along its true way: without and with the accelerometer."""
+    if job.seed % _BOUND_EVERY != 1:
+        values, arrays = run_mission(job)
+        return JobOutcome(values, {**arrays, "bounds": np.empty((0, 5))})
+    found, record = rehearse_recorded(job.cfg, with_track=True)
+    values, arrays = mission_outcome(job.cfg, found)
+    mirror = build_mirror(job.cfg.mirror)
+    without, with_it = (bounds_of(job.cfg, mirror, record, with_accelerometer=flag) for flag in (False, True))
+    bounds = [
+        (stop.t_s, float(np.trace(stop.covariance_m2)), float(np.trace(more.covariance_m2)), *stop.fix.error_m)
+        for stop, more in zip(without, with_it, strict=True)
+        if stop.fix.point is not None
+    ]
+    return JobOutcome(values, {**arrays, "bounds": np.array(bounds, dtype=np.float64).reshape(-1, 5)})
+
+
+def combine_filters(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
+    """The missions pooled, and their stop errors beside the bound.
+
+    Array ``bounds``: rows of t (s), the least mean square distance without and with the accelerometer (m^2), error
+    x, y (m), shape (k, 5). ``rms_mm`` and ``p50_mm`` of a bound, ``error_rms_mm`` of the same fixes, and their
+    ``ratio``; the bound with ``with_accelerometer`` has its own.
+    """
+    values, arrays = combine_missions(factors, outcomes)
+    # At the first point of a run the start errors count: it says little about the filter.
+    bounds = np.concatenate([outcome.arrays["bounds"][1:] for outcome in outcomes])
+    error_rms_mm = _root_mean(np.sqrt(np.sum(bounds[:, 3:] ** 2, axis=1)) ** 2)
+    bound: dict[str, Any] = {
+        **_bound(bounds[:, 1], error_rms_mm),
+        "error_rms_mm": error_rms_mm,
+        "with_accelerometer": _bound(bounds[:, 2], error_rms_mm),
+    }
+    return JobOutcome({**values, "bound": bound}, {**arrays, "bounds": bounds})
+
+
+def _bound(squares_m2: FloatArray, error_rms_mm: float | None) -> dict[str, float | None]:
+    rms = _root_mean(squares_m2)
+    if rms is None or error_rms_mm is None:
+        return dict.fromkeys(("rms_mm", "p50_mm", "ratio"))
+    median = round(1e3 * float(np.sqrt(np.median(squares_m2))), 4)
+    return {"rms_mm": rms, "p50_mm": median, "ratio": round(error_rms_mm / rms, 4)}
+
+
+def _root_mean(squares_m2: FloatArray) -> float | None:
+    return round(1e3 * float(np.sqrt(squares_m2.mean())), 4) if squares_m2.size else None
+
+
+def draw_filters(cells: Sequence[CellResult], out: Path) -> None:
+    """Exceedance of localization and arrival errors, stop errors beside their bound, consistency."""
+    for (mirror,), there in grouped(cells, "mirror").items():
+        _draw_exceedance(there, _localization, f"Localization error on {mirror}", out / f"localization-{mirror}")
+        _draw_exceedance(there, _arrival, f"First arrival error on {mirror}", out / f"arrival-{mirror}")
+        _draw_bound(there, out / f"bound-{mirror}")
+        _draw_consistency(there, out / f"consistency-{mirror}")
+
+
+def _localization(cell: CellResult) -> tuple[FloatArray, FloatArray]:
+    return Histogram.from_arrays(cell.arrays, "localization").exceedance()
+
+
+def _arrival(cell: CellResult) -> tuple[FloatArray, FloatArray]:
+    values = np.sort(first_arrivals(cell.arrays["stops"][:, 1:])[:, COLUMN["arrival_m"]])
+    return values, 1.0 - np.arange(len(values)) / max(len(values), 1)  # this large or larger: shows the largest
+
+
+def _draw_exceedance(
+    cells: Sequence[CellResult], curve: Callable[[CellResult], tuple[FloatArray, FloatArray]], title: str, stem: Path
+) -> None:
+    worlds, filters = grouped(cells, "world"), levels(cells, "filter")
+    columns = min(2, len(worlds))
+    rows = -(-len(worlds) // columns)
+    size, lowest = (4.4 * columns, 3.1 * rows + 0.5), 1.0
+    with plot(stem, *size, rows, columns, title=title, legend=len(filters), sharex=True, sharey=True) as panels:
+        for axes, ((world,), there) in zip(panels, worlds.items(), strict=False):
+            for cell in there:
+                values, share = curve(cell)
+                is_seen = share > 0.0
+                lowest = min(lowest, float(share[is_seen].min(initial=1.0)))
+                index = filters.index(cell.factors["filter"])
+                look = {"color": colour(index), "linestyle": _DASHES[index % len(_DASHES)], "linewidth": 1.6}
+                axes.loglog(1e3 * values[is_seen], share[is_seen], label=str(cell.factors["filter"]), **look)
+            axes.axvline(_LIMIT_MM, color=LIMIT, linewidth=1.0, linestyle=":")
+            axes.set(xlim=_SHOWN_MM, title=f"world {world}", xlabel="error, mm", ylabel="share that is as large")
+        for axes in panels[len(worlds) :]:
+            axes.set_visible(False)
+        panels[0].set_ylim(max(lowest, 1e-6) * 0.8, 1.3)
+        panels[0].text(_LIMIT_MM * 1.08, 0.9, "10 mm", color=LIMIT, fontsize=8, va="top")
+
+
+def _draw_bound(cells: Sequence[CellResult], stem: Path) -> None:
+    """Rms error at the stops of each filter, and the bound of each world as a line under it."""
+    worlds, filters = levels(cells, "world"), levels(cells, "filter")
+    known = [cell for cell in cells if cell.values["bound"]["rms_mm"] is not None]
+    shown_mm = [cell.values["bound"][name] for cell in known for name in ("rms_mm", "error_rms_mm")] or [1.0]
+    with plot(stem, 6.4, 3.8, legend=len(filters) + 2) as (axes,):
+        for cell in known:
+            bound = cell.values["bound"]
+            at, shade = _place(cell, worlds, filters)
+            tight_mm, error_mm, bound_mm = bound["with_accelerometer"]["rms_mm"], bound["error_rms_mm"], bound["rms_mm"]
+            axes.plot([at - 0.09, at + 0.09], [bound_mm] * 2, color=INK, linewidth=1.5)
+            axes.plot([at - 0.09, at + 0.09], [tight_mm] * 2, color=INK, linewidth=1.0, linestyle=":")
+            axes.plot([at, at], [bound_mm, error_mm], color=GRID, linewidth=2.0, zorder=1)
+            axes.plot(at, error_mm, "o", color=shade, markersize=6)
+            axes.annotate(
+                f"{bound['ratio']:.3g}", (at, max(error_mm, bound_mm)), xytext=(0, 7), textcoords="offset points",
+                ha="center", fontsize=7, color=QUIET,
+            )  # fmt: skip
+        for index, name in enumerate(filters):
+            axes.plot([], [], "o", color=colour(index), label=name)
+        axes.plot([], [], color=INK, linewidth=1.5, label="posterior Cramér-Rao bound")
+        axes.plot([], [], color=INK, linewidth=1.0, linestyle=":", label="with the accelerometer")
+        ends = 10.0 ** np.floor(np.log10(min(shown_mm))), 10.0 ** np.ceil(np.log10(1.5 * max(shown_mm)))
+        axes.set(yscale="log", ylim=ends, ylabel="rms position error at the stops, mm")
+        axes.set_xticks(range(len(worlds)), worlds)
+        axes.set_title("Stop errors and the least possible; numbers: ratio")
+
+
+def _draw_consistency(cells: Sequence[CellResult], stem: Path) -> None:
+    """Normalised errors: the middle 90 % as a bar, the mean as a dot, what a consistent filter has as a line."""
+    worlds, filters = levels(cells, "world"), levels(cells, "filter")
+    shown: tuple[tuple[str, float, Callable[[FloatArray], FloatArray]], ...] = (
+        ("NEES of the pose", 3.0, lambda stops: nees(first_arrivals(stops), 3)),
+        ("NEES of the position", 2.0, lambda stops: nees(first_arrivals(stops), 2)),
+        ("NIS of the fixes", 2.0, lambda stops: stops[:, COLUMN["nis"]]),
+    )
+    with plot(stem, 9.6, 3.6, 1, len(shown), legend=len(filters), sharey=True) as panels:
+        for axes, (title, expected, of) in zip(panels, shown, strict=True):
+            for cell in cells:
+                at, shade = _place(cell, worlds, filters)
+                values = of(cell.arrays["stops"][:, 1:])
+                known = values[np.isfinite(values)]
+                if known.size:
+                    low, high = np.percentile(known, (5.0, 95.0))
+                    bar(axes, [at, at], [max(low, 1e-3), high], shade)
+                    axes.plot(at, known.mean(), "o", color=shade, markersize=5)
+            axes.axhline(expected, color=LIMIT, linewidth=1.0, linestyle=":")
+            axes.set(yscale="log", title=f"{title} (consistent: {expected:g})")
+            axes.set_xticks(range(len(worlds)), worlds)
+        for index, name in enumerate(filters):
+            panels[0].plot([], [], "o", color=colour(index), label=name)
+        panels[0].set_ylabel("mean (dot), 5 to 95 % (bar)")
+
+
+def _place(cell: CellResult, worlds: Sequence[str], filters: Sequence[str]) -> tuple[float, str]:
+    """Of a filter within its world: x and colour."""
+    index = filters.index(str(cell.factors["filter"]))
+    return worlds.index(str(cell.factors["world"])) + 0.22 * (index - 0.5 * (len(filters) - 1)), colour(index)
+
+
+FILTERS = Study(
+    name="filters",
+    title="Filters in four worlds",
+    cells=lambda: [
+        Cell({"world": world, "filter": name}, {"run.world": world, "run.filter": name})
+        for world in ("thesis", "thesis-x2", "hard", "extreme")
+        for name in ("kf", "ekf", "ukf")
+    ],
+    run_job=run_filter_mission,
+    combine=combine_filters,
+    columns=mission_columns("""
+        complete
+        localization_error_mm: mean p99 p99_9 max within_10mm_fraction
+        localization_error_after_first_leg_mm: max
+        heading_error_mrad: rms
+        arrival_error_mm: mean p99 p99_9 max within_10mm_fraction
+        arrival_error_after_first_leg_mm: max
+        bound: error_rms_mm rms_mm ratio with_accelerometer.rms_mm with_accelerometer.ratio
+        nees: pose.mean pose.band_95 position.mean
+        nis: mean
+        corrections
+        after_correction_mm: max
+        mission_time_s time_ratio
+        danger: falls false_edges
+    """),
+    draw=draw_filters,
+)
+
+# -- time -------------------------------------------------------------------------------------------------------------
+
+_PARTS = ("measuring", "driving", "turning", "settling")
+
+
+def run_timed_mission(job: Job) -> JobOutcome:
+    """One mission, and the least time of any tour through its points."""
+    values, arrays = run_mission(job)
+    cfg = job.cfg
+    mirror = build_mirror(cfg.mirror)
+    points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
+    bound_s = tour_bound(mirror, points, cfg.limits, cfg.etalon.measuring_time_s)
+    return JobOutcome({**values, "tour_bound_s": round(bound_s, 3), "budget_s": cfg.run.budget_s}, arrays)
+
+
+def combine_times(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
+    """The missions pooled, and the margin that the slowest leaves."""
+    values, arrays = combine_missions(factors, outcomes)
+    tour_s, budget_s = (float(outcomes[0].values[name]) for name in ("tour_bound_s", "budget_s"))
+    mean_s, slowest_s = values["mission_time_s"], values["mission_time_max_s"]
+    more = {
+        "tour_bound_s": tour_s,
+        "tour_ratio": None if mean_s is None else round(mean_s / tour_s, 5),
+        "budget_s": budget_s,
+        "margin_s": None if slowest_s is None else round(budget_s - slowest_s, 3),
+    }
+    return JobOutcome({**values, **more}, arrays)
+
+
+def draw_times(cells: Sequence[CellResult], out: Path) -> None:
+    """Where the time of a mission goes, its bounds and the budget: a bar for each cell, a figure for each mirror."""
+    known = [cell for cell in cells if cell.values["mission_time_s"] is not None]
+    for (mirror,), there in grouped(known, "mirror").items():
+        with plot(out / f"time-{mirror}", 8.4, 0.32 * len(there) + 1.9, legend=4) as (axes,):
+            for place, cell in enumerate(there):
+                left_s, states_s = 0.0, cell.values["states_s"]
+                rest_s = sum(time_s for state, time_s in states_s.items() if state not in _PARTS)
+                shown = [(part, states_s.get(part, 0.0), colour(k)) for k, part in enumerate(_PARTS)]
+                for part, width_s, shade in (*shown, ("rest", rest_s, QUIET)):
+                    axes.barh(place, width_s, left=left_s, height=0.66, color=shade, label=None if place else part)
+                    left_s += width_s
+                for bound_s, style, name in (
+                    (cell.values["lower_bound_s"], "-", "bound of the path"),
+                    (cell.values["tour_bound_s"], ":", "bound of any tour"),
+                ):
+                    ends, label = [place - 0.45, place + 0.45], None if place else name
+                    axes.plot([bound_s] * 2, ends, color=INK, linestyle=style, label=label)
+                axes.text(left_s, place, f"  {cell.values['time_ratio']:.3f}", va="center", fontsize=7, color=QUIET)
+            budget_s = there[0].values["budget_s"]
+            if max(cell.values["mission_time_s"] for cell in there) > 0.4 * budget_s:  # a few panels take no hour
+                axes.axvline(budget_s, color=LIMIT, linewidth=1.2, label="budget")
+            factors = [cell.factors for cell in there]
+            names = [f"{f['order']}, {f['v_max_m_s']:.2f} m/s, {f['measuring_time_s']:.1f} s" for f in factors]
+            axes.set_yticks(range(len(there)), names)
+            axes.invert_yaxis()
+            axes.margins(x=0.08)
+            axes.set_xlabel("time, s; number: in units of the path's bound")
+            axes.set_title(f"Where the time of a mission on {mirror} goes")
+
+
+TIME = Study(
+    name="time",
+    title="Order, speed and measuring time against the hour",
+    cells=lambda: [
+        Cell(
+            {"order": order, "v_max_m_s": v_m_s, "measuring_time_s": measuring_s},
+            {"run.order": order, "limits.v_max_m_s": v_m_s, "etalon.measuring_time_s": measuring_s},
+        )
+        for order in ("thesis", "optimised")
+        for v_m_s in (0.10, 0.15, 0.20)
+        for measuring_s in (0.5, 1.0)
+    ],
+    run_job=run_timed_mission,
+    combine=combine_times,
+    columns=mission_columns("""
+        complete mission_time_s lower_bound_s time_ratio tour_bound_s tour_ratio margin_s
+        states_s: turning driving settling measuring
+        corrections
+        localization_error_mm: mean
+        arrival_error_mm: mean max
+    """),
+    draw=draw_times,
+    runs=2,
+)
+
+# -- sensitivity ------------------------------------------------------------------------------------------------------
+
+# What belongs together, as keys of a world.
+GROUPS = {
+    "encoder counts": ("encoder_sigma_rad_s", "encoder_counts_per_rev"),
+    "gyroscope": ("gyroscope_bias_sigma_rad_s", "gyroscope_bias_walk_rad_s_sqrt_s", "gyroscope_scale_sigma"),
+    "accelerometer": ("accelerometer_bias_sigma_m_s2", "accelerometer_bias_walk_m_s2_sqrt_s"),
+    "slip": ("slip_min", "slip_max", "slip_walk_sigma", "slip_walk_time_s"),
+    "creep": ("creep_fraction", "creep_walk_fraction", "creep_walk_time_s"),
+    "vibration": ("vibration_rate_rad_s", "vibration_speed_m_s", "vibration_acceleration_m_s2"),
+    "wheels": ("wheel_radius_sigma", "wheel_base_sigma", "wheel_lag_spread"),
+    "delays": ("sensors_delay_s", "commands_delay_s"),
+    "panel edges": ("panel_edge_sigma_m",),
+}
+_BASES = ("none", "all")
+
+
+def sensitivity_cells() -> Sequence[Cell]:
+    """The quiet world, each group added to it; the hard world, each group taken from it."""
+    quiet, hard = (load_config(None, {"run.world": name}).world for name in ("thesis", "hard"))
+    found = []
+    for base, whole, sign, other in (("thesis", "none", "plus", hard), ("hard", "all", "minus", quiet)):
+        found.append(Cell({"world": base, "group": whole}, {"run.world": base}))
+        for group, keys in GROUPS.items():
+            values = {f"world.{key}": getattr(other, key) for key in keys}
+            found.append(Cell({"world": base, "group": f"{sign} {group}"}, {"run.world": base, **values}))
+    return found
+
+
+def draw_sensitivity(cells: Sequence[CellResult], out: Path) -> None:
+    """One figure for each mirror, the undisturbed and the fully disturbed world as lines."""
+    worlds = levels(cells, "world")
+    for (mirror,), there in grouped(cells, "mirror").items():
+        rows = []
+        for cell in there:
+            world, group = cell.factors["world"], str(cell.factors["group"])
+            is_base = group in _BASES
+            rows.append((f"world {world}" if is_base else group, cell, worlds.index(world), is_base))
+        draw_ranges(rows, f"What each disturbance costs on {mirror}", out / f"sensitivity-{mirror}")
+
+
+SENSITIVITY = Study(
+    name="sensitivity",
+    title="What each disturbance costs",
+    cells=sensitivity_cells,
+    run_job=run_mission,
+    combine=combine_missions,
+    columns=mission_columns("""
+        complete
+        localization_error_mm: mean p99 max
+        heading_error_mrad: rms
+        arrival_error_mm: mean p99 max
+        stop_error_mm: rms
+        nees: pose.mean
+        corrections mission_time_s time_ratio
+        danger: false_edges
+    """),
+    draw=draw_sensitivity,
+    defaults={"run.filter": "ekf"},
+    runs=5,
+)
+
+# -- ablation ---------------------------------------------------------------------------------------------------------
+
+WORLDS = ("thesis", "hard")
+ALL_ON = "nothing"
+_USE = "localizer.full_state.use"
+# What is off, and the keys that switch it off.
+WITHOUT: Mapping[str, Mapping[str, object]] = {
+    ALL_ON: {},
+    "zero-velocity updates": {f"{_USE}.zero_velocity": False},
+    "biases seen at rest": {f"{_USE}.rest_biases": False},
+    "seam crossings": {f"{_USE}.seams": False},
+    "states of edge offsets": {"localizer.full_state.edge_sigma_m": 1e-9},
+    "gravity heading": {f"{_USE}.gravity": False},
+    "accelerometer": {f"{_USE}.accelerometer": False},
+    "slip learned leg by leg": {f"{_USE}.slip_per_leg": False},
+    "slip that wanders": {"localizer.full_state.wander_fraction": 0.0},
+    "calibration drive": {"mission.calibration_length_m": 0.0},
+    "calibration drive, first fix": {"mission.calibration_length_m": 0.0, "mission.fix_at_start": False},
+    "delay prediction": {"control.predicts_delay": False},
+    "wheel lag in the control": {"robot.wheel_lag_s": 0.0},
+    "creep compensation": {"control.compensates_creep": False},
+    "slip share in the control": {"control.slip_limit": 0.0},
+    "settling on means": {"control.settle_mean_time_s": 1e-6},
+    "regulator on the line": {"control.cross_track_gain_rad_m2": 0.0},
+    "line tracking (thesis's PID)": {"control.gains": "thesis"},
+    "correction moves": {"mission.max_approaches": 1},
+    "thesis's order (optimised)": {"run.order": "optimised"},
+}
+
+
+def draw_ablation(cells: Sequence[CellResult], out: Path) -> None:
+    """Figures ``ablation-<mirror>-<world>``, the mission with everything as a line."""
+    for (mirror, world), there in grouped(cells, "mirror", "world").items():
+        rows = []
+        for cell in there:
+            name = str(cell.factors["without"])
+            label = "with all" if name == ALL_ON else f"without {name}"
+            rows.append((label, cell, WORLDS.index(world), name == ALL_ON))
+        draw_ranges(rows, f"Without a technique, world {world} on {mirror}", out / f"ablation-{mirror}-{world}")
+
+
+ABLATION = Study(
+    name="ablation",
+    title="What each technique gives: one switched off at a time",
+    cells=lambda: [
+        Cell({"world": world, "without": name}, {"run.world": world, **keys})
+        for world in WORLDS
+        for name, keys in WITHOUT.items()
+    ],
+    run_job=run_mission,
+    combine=combine_missions,
+    columns=mission_columns("""
+        complete
+        localization_error_mm: mean p99=.2f max
+        arrival_error_mm: mean p99=.2f max within_10mm_fraction=.2%
+        stop_error_mm: rms
+        heading_error_mrad: rms=.2f
+        nees: pose.mean
+        corrections mission_time_s time_ratio
+        danger: false_edges
+        causes
+    """),
+    draw=draw_ablation,
+    defaults={"run.filter": "ekf"},
+    runs=3,
+)
