@@ -13,7 +13,7 @@ import ccatp
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
-from ccatp.core import FloatArray, PanelId, PanelPose, PointId
+from ccatp.core import Fix, FloatArray, PanelId, PanelPose, PointId
 from ccatp.daemon.process import Endpoints
 from ccatp.daemon.terminal import RunView
 from ccatp.errors import ExitStatus
@@ -37,20 +37,17 @@ from ccatp.links.topics import (
     decode_recorded,
 )
 from ccatp.mirror.mirror import build_mirror, deck_poses
-from ccatp.mirror.misalignment import fit_panel
-from ccatp.mirror.surface import PanelFitError
+from ccatp.mirror.misalignment import fit_panels
 from ccatp.records.beacon_summary import BeaconSummary, Reached, beacon_facts
 from ccatp.records.recorder import TELEMETRY, Recorder, iter_messages, recordings
 from ccatp.records.store import StoredSurvey, StoreError, read_survey
-from ccatp.records.summary import PanelFits, RunFacts, SummaryBuilder, puck_targets
+from ccatp.records.summary import PanelFits, SummaryBuilder, survey_summary
 from ccatp.report.foxglove import Views, recorded_schemas
 from ccatp.survey.planning.route import ORDERS
 
 RECEIVED = tuple(topic.name for topic in TOPICS if topic.recorded or topic.message in (Timing, Heartbeat))
 FINISH_TIMEOUT_S = 5.0
 REQUEST_TIMEOUT_S = 1.0
-# A panel's plane has three parameters; the fit refuses fewer, too.
-MIN_FIXES = 3
 # Topics of a survey's summary; a recording holds twenty times as much.
 SUMMARISED = {"mission", "track", "truth", "arrival", "danger_event"}
 
@@ -292,19 +289,7 @@ class SurveyRecord:
     def _builder_for(self, status: MissionStatus) -> SummaryBuilder:
         cfg, is_sim = self._cfg, self._is_sim
         points = ORDERS[cfg.run.order](self.mirror, cfg.run.panels)
-        facts = RunFacts(
-            mirror=cfg.mirror.name,
-            world=cfg.world.name if is_sim else None,
-            filter=cfg.run.filter,
-            seed=cfg.run.seed,
-            total_points=status.total,
-            lower_bound_s=status.lower_bound_s,
-            budget_s=cfg.run.budget_s,
-            puck_height_m=cfg.robot.puck_height_m,
-            has_truth=is_sim,
-        )
-        targets = puck_targets(self.mirror, points, cfg.robot.puck_height_m)
-        return SummaryBuilder(facts, targets, self.mirror.surface.normal)
+        return survey_summary(cfg, self.mirror, points, status.total, status.lower_bound_s, is_sim=is_sim)
 
     def _on_deck(self, track: TrackMessage) -> FloatArray:
         """Rows of seq, t_s, x, y, heading (deck), X, Y, Z of the surface point, as the truth has them."""
@@ -347,19 +332,10 @@ class SurveyRecord:
             return None
 
     def _fits(self, survey: StoredSurvey) -> PanelFits:
-        fits = {}
-        for panel in sorted({stored.point.panel for stored in survey.fixes}):
-            own = [stored.fix for stored in survey.fixes if stored.point.panel == panel]
-            if len(own) < MIN_FIXES:
-                continue
-            points = np.array([fix.position_m for fix in own])
-            covariances = np.array([fix.covariance_m2 for fix in own]).reshape(-1, 3, 3)
-            try:
-                fit = fit_panel(self.mirror, panel, points, covariances, self._cfg.robot.puck_height_m)
-            except PanelFitError:
-                continue  # fixes on one line: a survey that ended early
-            fits[panel] = (fit.piston_m, fit.tip_rad, fit.tilt_rad)
-        return fits
+        fixes: dict[PanelId, list[Fix]] = {}
+        for stored in survey.fixes:
+            fixes.setdefault(stored.point.panel, []).append(stored.fix)
+        return fit_panels(self.mirror, fixes, self._cfg.robot.puck_height_m)
 
 
 def _read(path: Path) -> dict[str, Any]:

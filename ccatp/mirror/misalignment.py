@@ -5,12 +5,13 @@ the panel coordinates of the surface point. Angles are small (100 urad), so the 
 left out.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
 
-from ccatp.core import DeckPose, FloatArray, PanelId, Vector3
+from ccatp.core import DeckPose, Fix, FloatArray, PanelId, Vector3
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import PanelFitError
 
@@ -66,6 +67,24 @@ def misaligned_puck_world(
     scale = height_m / sqrt(mx * mx + my * my + mz * mz)
     ox, oy, oz = body.rotate_to_deck((scale * mx, scale * my, scale * mz + d))
     return mirror.world_from_deck((point[0] + ox, point[1] + oy, point[2] + oz))
+
+
+def fit_panels(
+    mirror: Mirror, fixes: Mapping[PanelId, Sequence[Fix]], puck_height_m: float
+) -> dict[PanelId, tuple[float, float, float]]:
+    """Piston (m), tip and tilt (rad) of every panel with enough fixes that span it."""
+    fits = {}
+    for panel, own in sorted(fixes.items()):
+        if len(own) < _PARAMETERS:
+            continue
+        points = np.array([fix.position_m for fix in own])
+        covariances = np.array([fix.covariance_m2 for fix in own]).reshape(-1, 3, 3)
+        try:
+            fit = fit_panel(mirror, panel, points, covariances, puck_height_m)
+        except PanelFitError:
+            continue  # fixes on one line: a survey that ended early
+        fits[panel] = (fit.piston_m, fit.tip_rad, fit.tilt_rad)
+    return fits
 
 
 def panel_deviations(mirror: Mirror, panel: PanelId, points_world: FloatArray, puck_height_m: float) -> FloatArray:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, FloatArray, PanelId, PointId, Vector3
 from ccatp.mirror.mirror import Mirror
 
@@ -72,6 +73,24 @@ class RunFacts:
     budget_s: float
     puck_height_m: float
     has_truth: bool
+
+
+def survey_summary(
+    cfg: Config, mirror: Mirror, points: Iterable[PointId], total: int, lower_bound_s: float, *, is_sim: bool
+) -> "SummaryBuilder":
+    """The summary of a survey that begins; ``total`` points are all of the mission, measured or not."""
+    facts = RunFacts(
+        mirror=cfg.mirror.name,
+        world=cfg.world.name if is_sim else None,
+        filter=cfg.run.filter,
+        seed=cfg.run.seed,
+        total_points=total,
+        lower_bound_s=lower_bound_s,
+        budget_s=cfg.run.budget_s,
+        puck_height_m=cfg.robot.puck_height_m,
+        has_truth=is_sim,
+    )
+    return SummaryBuilder(facts, puck_targets(mirror, points, cfg.robot.puck_height_m), mirror.surface.normal)
 
 
 class SummaryBuilder:

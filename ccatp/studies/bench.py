@@ -158,10 +158,12 @@ def lockstep_case(cfg: Config, panels: int, run_args: Sequence[str] = ()) -> dic
     with tempfile.TemporaryDirectory(prefix="ccatp-bench-") as folder:
         command = [sys.executable, "-m", "ccatp", "run", "--sim", "--json", "--panels", str(panels), *run_args]
         command += ["--run-dir", f"{folder}/run", "--runtime-dir", f"{folder}/rt"]
-        options = {"capture_output": True, "text": True, "timeout": TIMEOUT_S, "env": child_environment(os.environ)}
+        environment = child_environment(os.environ)
         started_s = time.perf_counter()
         try:
-            done = subprocess.run(command, check=False, **options)
+            done = subprocess.run(
+                command, capture_output=True, text=True, check=False, timeout=TIMEOUT_S, env=environment
+            )
         except subprocess.TimeoutExpired as error:
             raise BenchError(f"the mission in lockstep was not over after {TIMEOUT_S:g} s") from error
         wall_s = time.perf_counter() - started_s
@@ -241,7 +243,8 @@ Machine: {machine}
 
 def markdown(result: Mapping[str, Any]) -> str:
     """The page ``docs/bench.md``."""
-    steps, missions, notes = [], [], {}
+    steps, missions = [], []
+    notes: dict[str, None] = {}
     for case in result["cases"]:
         if "times_real_time" in case:
             missions.append([case["name"], *(f"{case[key]:.1f}" for key in _MISSION_KEYS)])

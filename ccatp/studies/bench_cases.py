@@ -52,6 +52,7 @@ def races(cfg: Config) -> Iterator[Race]:
     linear += [("ekf", linearised_problem(cfg, m)) for m in (4, 6, 23)]
     for filter_name, problem in (*linear, ("ukf", survey_problem(cfg))):
         name = f"{filter_name} predict + update, n = {problem.mean.size}, m = {problem.variances.size}"
+        peers: dict[str, Contender]
         peers = {"filterpy": partial(filterpy, problem), "Stone Soup": partial(stonesoup, problem)}
         if filter_name != "ukf":
             peers = {"eq. 2.13 in numpy": partial(printed_filter, problem), **peers}
@@ -332,9 +333,9 @@ def our_slam(problem: SlamProblem) -> Solution:
     for i in range(STEPS):
         new, F = _moved(ours.mean[:_VEHICLE])
         ours.predict(new, F, _SLAM_NOISE)
-        states = columns[i % len(columns)]
-        expected, h = _range(ours.mean.take(states).tolist())
-        ours.update_row(states, np.array(h), ranges_m[i] - expected, _RANGE_SIGMA_M**2)
+        seen = columns[i % len(columns)]
+        expected, h = _range(ours.mean.take(seen).tolist())
+        ours.update_row(seen, np.array(h), ranges_m[i] - expected, _RANGE_SIGMA_M**2)
         yield ours.mean, ours.covariance
 
 

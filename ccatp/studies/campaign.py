@@ -57,16 +57,12 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """All that a worker is given: the outcome is a function of these four and nothing else.
-
-    Attributes:
-        cfg: a ``Config``, or a ``RadioConfig`` where the study's ``is_radio`` is set.
-    """
+    """All that a worker is given: the outcome is a function of these four and nothing else."""
 
     study: str
     factors: Factors
     seed: int
-    cfg: Any
+    cfg: Any  # a Config, or a RadioConfig where the study's is_radio is set
 
     @property
     def key(self) -> str:
@@ -158,11 +154,7 @@ def parse_choice(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def cells_of(study: Study, mirrors: Sequence[str] = (), only: Mapping[str, Sequence[str]] | None = None) -> list[Cell]:
-    """The cells of a campaign; ``only`` has the levels to keep, by factor.
-
-    Raises:
-        CampaignError: a factor or level that the study does not have.
-    """
+    """The cells of a campaign; ``only``: levels to keep, by factor (raises CampaignError: the study has no such)."""
     if mirrors and not study.mirrors:
         raise CampaignError(f"study {study.name} chooses its mirrors itself; leave --mirror out")
     cells = list(study.cells())
@@ -190,9 +182,7 @@ def jobs_of(
 ) -> list[list[Job]]:
     """The jobs of each cell, ``runs`` seeds from ``run.seed`` on in their order.
 
-    Raises:
-        CampaignError: a setting would overrule a factor, or there are no runs.
-        ConfigError: a configuration cannot be used.
+    CampaignError: a setting would overrule a factor, or there are no runs. ConfigError: a configuration is of no use.
     """
     if runs < 1:
         raise CampaignError(f"--runs {runs}: must be at least 1")

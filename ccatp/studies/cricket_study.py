@@ -49,7 +49,9 @@ def _filter(figure: str, pairs: str, **keys: object) -> Case:
     return Case(figure, "ekf", {"cricket.phase2.pairs": pairs, **long, **keys})
 
 
-def _batch(figure: str, repeats: int, *, shapes: bool = True, second: bool = False, **keys: object) -> Case:
+def _batch(
+    figure: str, repeats: int, keys: Mapping[str, object] = {}, *, shapes: bool = True, second: bool = False
+) -> Case:
     uses = {"cricket.batch.uses_shapes": shapes, "cricket.batch.uses_phase2": second, "cricket.phase2.max_updates": 15}
     return Case(figure, "batch", {"cricket.ranging.repeats": repeats, **uses, **keys})
 
@@ -66,8 +68,8 @@ CASES = {
     "batch-45": _batch("better", 60),
     "batch-45-no-shapes": _batch("better", 60, shapes=False),
     "batch-45-and-15": _batch("better", 60, second=True),
-    "batch-late": _batch("fault", 60, second=True, **_LATE),
-    "batch-late-offset": _batch("better", 60, second=True, **_LATE, **{"cricket.batch.estimates_offset": True}),
+    "batch-late": _batch("fault", 60, _LATE, second=True),
+    "batch-late-offset": _batch("better", 60, {**_LATE, "cricket.batch.estimates_offset": True}, second=True),
 }
 
 

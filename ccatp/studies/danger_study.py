@@ -105,8 +105,9 @@ class Rig:
     ) -> None:
         slip_rng, error_rng, sensors_rng = rng.spawn(3)
         world, robot, lag_s = cfg.world, cfg.robot, cfg.sim.robot.wheel_lag_s
-        wheels = {"wheel_radius_m": robot.wheel_radius_m, "wheel_base_m": robot.wheel_base_m, "wheel_lag_s": lag_s}
-        self.plant = plant = Plant(mirror.surface, start, **wheels)
+        radius_m, base_m = robot.wheel_radius_m, robot.wheel_base_m
+        plant = Plant(mirror.surface, start, wheel_radius_m=radius_m, wheel_base_m=base_m, wheel_lag_s=lag_s)
+        self.plant = plant
         # There is no steering here, so both wheels slip alike: the angle at the edge counts, not the way there.
         plant.right_scale = plant.left_scale = 1.0 - float(slip_rng.uniform(world.slip_min, world.slip_max))
         self._sensors = SensorSuite(cfg, mirror, sensors_rng, lag_s=lag_s)

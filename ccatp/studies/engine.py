@@ -79,15 +79,10 @@ class JobStore:
     """The finished jobs in a directory: one line each, safe on the disk before the next begins.
 
     A campaign that is killed at any instant continues from its store. Each shard writes a file of its own, so that
-    shards may share a directory; all of them are read.
+    shards may share a directory; all of them are read, and those in ``others`` are taken over.
 
-    Args:
-        out: the campaign's directory; made if it is not there.
-        others: directories whose jobs are taken over.
-
-    Raises:
-        CampaignError: ``out`` cannot be made, another campaign writes here, a directory does not exist, or a line is
-            not a finished job.
+    CampaignError: ``out`` cannot be made, another campaign writes here, a directory does not exist, or a line is not a
+    finished job.
     """
 
     def __init__(self, out: Path, shard: Shard = WHOLE, others: Iterable[Path] = ()) -> None:
@@ -117,11 +112,7 @@ class JobStore:
         self._file.close()
 
     def outcome(self, job: Job) -> JobOutcome | None:
-        """The outcome of a job; None where it is still to do.
-
-        Raises:
-            CampaignError: a job of the same name was done under other circumstances.
-        """
+        """The outcome of a job, None where it is to do (raises CampaignError: done under other circumstances)."""
         if job.key not in self._done:
             return None
         fingerprint, path, outcome, _ = self._done[job.key]
@@ -272,21 +263,14 @@ def _cluster(address: str) -> Iterator[Executor]:
 
 @dataclass(frozen=True, slots=True)
 class CampaignOptions:
-    """How a campaign is run.
-
-    Attributes:
-        runs: seeds of each cell; None takes the study's.
-        workers: processes; None takes one for each core.
-        others: directories whose finished jobs are taken over.
-        mirrors, only: see ``cells_of``.
-    """
+    """How a campaign is run."""
 
     out: Path
-    runs: int | None = None
-    workers: int | None = None
+    runs: int | None = None  # seeds of each cell; else the study's
+    workers: int | None = None  # processes; else one for each core
     cluster: str | None = None
     shard: Shard = WHOLE
-    others: tuple[Path, ...] = ()
+    others: tuple[Path, ...] = ()  # directories whose finished jobs are taken over
     mirrors: tuple[str, ...] = ()
     only: Mapping[str, Sequence[str]] = field(default_factory=dict)
     settings: Mapping[str, object] = field(default_factory=dict)
@@ -295,17 +279,11 @@ class CampaignOptions:
 
 
 def run_campaign(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
-    """Do what is left of a campaign and write its results.
+    """Do what is left of a campaign and write its results; what ``result.json`` holds.
 
-    Returns:
-        What ``result.json`` holds. While jobs of other shards are missing it says how many, in ``missing``.
-
-    Raises:
-        CampaignError: the campaign cannot be run as asked.
-        CampaignFailed: jobs failed, a worker died, or the directory cannot be written; what is done is kept.
-        CampaignInterrupted: Ctrl-C; what is done is kept.
-        ClusterUnreachable: no scheduler answers.
-        ConfigError: a configuration cannot be used.
+    While jobs of other shards are missing it says how many, in ``missing``. Raises CampaignError (it cannot be run as
+    asked), CampaignFailed (jobs failed, a worker died, the directory cannot be written), CampaignInterrupted (Ctrl-C),
+    ClusterUnreachable, ConfigError; what is done is kept.
     """
     try:
         return _run(study, load, options)
@@ -352,14 +330,13 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
             f"{len(failures)} of {len(todo)} jobs failed, the first: {failures[0]}; see {options.out / FAILURES}; "
             "the results are those of the others: the same command tries again"
         )
+    text = f"all {len(jobs)} jobs are done; results are in {options.out}"
     if missing:
-        _say(
-            console, study,
+        text = (
             f"{len(jobs) - missing} of {len(jobs)} jobs are done; the other shards, "
-            f"or the same command without --shard, do the {missing} that are missing",
-        )  # fmt: skip
-    else:
-        _say(console, study, f"all {len(jobs)} jobs are done; results are in {options.out}")
+            f"or the same command without --shard, do the {missing} that are missing"
+        )
+    _say(console, study, text)
     return result
 
 
@@ -383,7 +360,9 @@ def _run_jobs(
             except CcatpError:
                 raise
             except Exception as error:  # whatever a mission dies of, the others go on
-                failures.append(_noted(job, error, options.out))
+                failures.append(f"{job.key}: {type(error).__name__}: {error}")
+                with (options.out / FAILURES).open("a", encoding="utf-8") as file:
+                    file.write(f"{job.key}\n{''.join(format_exception(error))}\n")
                 if len(failures) == _MOST_FAILURES:
                     raise CampaignFailed(
                         f"{_MOST_FAILURES} jobs failed, the last: {failures[-1]}; see {options.out / FAILURES}; "
@@ -401,19 +380,8 @@ def _run_jobs(
 def _result(future: "Future[tuple[JobOutcome, float]]", out: Path) -> tuple[JobOutcome, float]:
     try:
         return future.result()
-    except BrokenExecutor as error:
-        raise CampaignFailed(
-            f"a worker died, perhaps for want of memory; what is done is kept in {out}: "
-            "start again with the same options, or with fewer --workers"
-        ) from error
-    except CancelledError as error:
-        raise CampaignFailed(
-            f"the cluster has given up a job, perhaps its scheduler ended; what is done is kept in {out}: "
-            "start again with the same options"
-        ) from error
-
-
-def _noted(job: Job, error: BaseException, out: Path) -> str:
-    with (out / FAILURES).open("a", encoding="utf-8") as file:
-        file.write(f"{job.key}\n{''.join(format_exception(error))}\n")
-    return f"{job.key}: {type(error).__name__}: {error}"
+    except (BrokenExecutor, CancelledError) as error:
+        what, how = "a worker died, perhaps for want of memory", "the same options, or with fewer --workers"
+        if isinstance(error, CancelledError):
+            what, how = "the cluster has given up a job, perhaps its scheduler ended", "the same options"
+        raise CampaignFailed(f"{what}; what is done is kept in {out}: start again with {how}") from error

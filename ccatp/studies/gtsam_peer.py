@@ -40,11 +40,7 @@ class Peers(NamedTuple):
 
 
 def run_gtsam(run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], float]) -> Peers:
-    """Both estimates of a run.
-
-    Raises:
-        PeerError: gtsam is not installed, or its optimisation failed.
-    """
+    """Both estimates of a run (raises PeerError: gtsam is not installed, or its optimisation failed)."""
     try:
         import gtsam  # noqa: PLC0415 -- large, and belongs to an extra
     except ImportError as error:

@@ -25,8 +25,6 @@ from ccatp.report.plots import INK, QUIET
 from ccatp.studies.results import plot, write_analysis
 
 if TYPE_CHECKING:
-    from types import ModuleType
-
     from control import TransferFunction
 
 Coefficients = tuple[float, ...]
@@ -146,7 +144,7 @@ def limit_of(cfg: Config) -> Iterator[Loop]:
                     yield open_loop(name, axis, pid, "printed", part * cfg.robot.wheel_lag_s, 0, 0.0)
 
 
-def _control() -> "ModuleType":
+def _control() -> Any:
     try:
         import control  # noqa: PLC0415 - takes seconds, and belongs to an extra
     except ImportError as error:
@@ -287,8 +285,7 @@ def _draw_locus(loops: Sequence[Loop], out: Path) -> None:
             )
             axes.axvspan(0.0, 1e4, color="#d64545", alpha=0.06, linewidth=0, label="unstable")
             size, title = _WINDOW_CORNERS / loop.lag_s, f"{_PLANTS[loop.plant]}, {loop.delay_frames} frames of delay"
-            ends = {"xlim": (-size, 0.4 * size), "ylim": (-size, size)}
-            axes.set(xlabel="real part, 1/s", aspect="equal", title=title, **ends)
+            axes.set(xlim=(-size, 0.4 * size), ylim=(-size, size), xlabel="real part, 1/s", aspect="equal", title=title)
         panels[0].set_ylabel("imaginary part, 1/s")
 
 

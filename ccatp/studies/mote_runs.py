@@ -48,11 +48,7 @@ class SimulatedField:
     second: tuple[tuple[int, int, float, float], ...]
 
     def network(self, *, with_second: bool = False, with_shapes: bool = False) -> RangeNetwork:
-        """The graph of phase 1, with what phase 2 measured and the shapes of the stands where asked.
-
-        Raises:
-            MappingError: of these ranges no map can be made.
-        """
+        """The graph of phase 1, with phase 2 and the shapes of the stands where asked (raises MappingError: no map)."""
         names = self.plan.names
         rows = list(self.first)
         if with_second:
@@ -61,11 +57,7 @@ class SimulatedField:
 
 
 def simulate_field(cfg: CricketConfig, seed: int) -> SimulatedField:
-    """Draw the errors of one field and everything that its motes receive.
-
-    Raises:
-        MappingError: no pair of phase 2 can range.
-    """
+    """Draw the errors of one field and all that its motes receive (raises MappingError: no pair of phase 2 ranges)."""
     motes = true_motes(cfg, np.random.default_rng((seed, _LAYOUT)))
     plan = network_plan(cfg) if cfg.layout == "networks" else loose_plan(cfg, motes.names)
     field = MoteField(cfg, motes, np.random.default_rng((seed, _FIELD)))
@@ -138,8 +130,7 @@ def first_map(cfg: CricketConfig, field: SimulatedField, draws: int = 0) -> Firs
 def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
     """Phases 1 and 2: trilateration, then the filter over distances between the first motes of the stands.
 
-    Raises:
-        MappingError: phase 1 cannot place a mote.
+    MappingError: phase 1 cannot place a mote.
     """
     plan, first = field.plan, first_map(cfg, field, cfg.phase1.draws)
     motes = list(plan.heads or plan.mapped)
@@ -195,14 +186,10 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
         first = first_map(cfg, field)
     except MappingError:  # the batch needs no trilateration
         first = None
-    found = map_motes(
-        network,
-        MapFitSettings(cfg.batch.robust_scale, cfg.batch.max_iterations),
-        with_offset=cfg.batch.estimates_offset,
-        with_scale=cfg.batch.estimates_scale,
-        start_m=None if first is None else first.positions_m,
-        mirrors=() if outlook is None else outlook.folds.mirrors,
-    )
+    start_m = None if first is None else first.positions_m
+    mirrors = () if outlook is None else outlook.folds.mirrors
+    settings = MapFitSettings(cfg.batch.robust_scale, cfg.batch.max_iterations)
+    found = map_motes(network, settings, **_calibration(cfg), start_m=start_m, mirrors=mirrors)
     motes = list(plan.mapped)
     true_m = field.true_m[motes]
     phase1_m = None
@@ -236,6 +223,10 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
     )
 
 
+def _calibration(cfg: CricketConfig) -> Any:
+    return {"with_offset": cfg.batch.estimates_offset, "with_scale": cfg.batch.estimates_scale}
+
+
 def _block(covariance_m2: FloatArray, motes: list[int], dimension: int) -> FloatArray:
     at = (np.array(motes)[:, None] * dimension + np.arange(dimension)).ravel()
     return covariance_m2[np.ix_(at, at)]
@@ -247,18 +238,14 @@ def batch_network(cfg: CricketConfig, field: SimulatedField) -> RangeNetwork:
 
 
 def look_ahead(cfg: CricketConfig, field: SimulatedField, method: str, updates: int | None = None) -> MoteOutlook:
-    """Rank, folds and bound of what a method is given.
+    """Rank, folds and bound of what a method, ``ekf`` or ``batch``, is given, up to so many ranges of phase 2.
 
     For the filter, rank and folds are those of phase 2 alone, as the stands see each other; its bound takes in what
     phase 1 measured too, unless the printed prior throws that away.
-
-    Args:
-        method: ``ekf`` or ``batch``.
-        updates: ranges of phase 2 that count; all if ``None``.
     """
     plan = field.plan
     rng = np.random.default_rng(_GENERIC)
-    options = {"with_offset": cfg.batch.estimates_offset, "with_scale": cfg.batch.estimates_scale}
+    options = _calibration(cfg)
     if method == "batch":
         network = batch_network(cfg, field)
         model = MapModel(network, **options)

@@ -14,6 +14,7 @@ from ccatp.control.motion_checks import as_standing
 from ccatp.core import DeckPose, FloatArray, IntArray
 from ccatp.estimation.fixes import FixRefused
 from ccatp.filters.base import Filter, FilterError, Innovation, Observation, Transition
+from ccatp.filters.metrics import rms
 from ccatp.filters.smoother import ROUNDING, Smoothed, Smoother
 from ccatp.localizer import FOUR_STATE, Localizer, build_doubting, build_localizer
 from ccatp.mirror.mirror import Mirror
@@ -216,23 +217,14 @@ def has_smoother(cfg: Config) -> bool:
 
 
 def replay(
-    cfg: Config,
-    mirror: Mirror,
-    events: Iterable[Event],
-    *,
-    smooth: bool = False,
+    cfg: Config, mirror: Mirror, events: Iterable[Event], *, smooth: bool = False,
     on_frame: Callable[[float], None] | None = None,
-) -> Replayed:
+) -> Replayed:  # fmt: skip
     """Run the localizer of a configuration over the events of a run, from its start at base.
 
-    Args:
-        events: see ``in_order``.
-        smooth: go back over the run with the smoother afterwards.
-        on_frame: receives the robot time of each frame, s.
-
-    Raises:
-        ValueError: the filter has no smoother.
-        FilterError: the smoothed state is not finite, or the smoother would have to go across a restart.
+    ``smooth``: go back over the run with the smoother afterwards. ``on_frame`` gets the robot time of each frame, s.
+    ValueError: the filter has no smoother. FilterError: the smoothed state is not finite, or the smoother would have to
+    go across a restart.
     """
     if smooth and not has_smoother(cfg):
         raise ValueError(f"no smoother for filter {cfg.run.filter}: the pose is not in it")
@@ -389,9 +381,9 @@ def figures(errors: ReplayErrors) -> dict[str, Any]:
     known = errors.nees[np.isfinite(errors.nees)]
     return {
         "position_error_mm": _distribution(distance_mm),
-        "moving_error_mm": {"rms": _rms(distance_mm[errors.is_moving])},
+        "moving_error_mm": {"rms": rms(distance_mm[errors.is_moving])},
         "arrival_error_mm": _rms_and_max(distance_mm[errors.is_arrival]),
-        "heading_error_mrad": {"rms": _rms(1e3 * errors.turn_rad)},
+        "heading_error_mrad": {"rms": rms(1e3 * errors.turn_rad)},
         "nees_mean": float(known.mean()) if known.size else None,
     }
 
@@ -414,12 +406,8 @@ def _distribution(values: FloatArray) -> dict[str, float | None]:
     return {"mean": float(values.mean()), "p50": p50, "p99": p99, "max": float(values.max())}
 
 
-def _rms(values: FloatArray) -> float | None:
-    return float(np.sqrt(np.mean(np.square(values)))) if values.size else None
-
-
 def _rms_and_max(values: FloatArray) -> dict[str, float | None]:
-    return {"rms": _rms(values), "max": float(values.max()) if values.size else None}
+    return {"rms": rms(values), "max": float(values.max()) if values.size else None}
 
 
 class ReplayEvaluation(NamedTuple):

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ccatp.core import FloatArray
-from ccatp.report.plots import dress, new_figure, save_figure, set_log_axis
+from ccatp.report.plots import dress, new_figure, save_figure
 from ccatp.studies.campaign import CellResult, Column, Study
 
 if TYPE_CHECKING:
@@ -157,7 +158,7 @@ def bar(axes: "Axes", x: Sequence[float], y: Sequence[float], shade: str) -> Non
 
 
 def band(
-    axes: "Axes", x: FloatArray, ends: FloatArray, shade: str, style: Literal["-", "--"] = "-", label: str = ""
+    axes: "Axes", x: NDArray[Any], ends: FloatArray, shade: str, style: Literal["-", "--"] = "-", label: str = ""
 ) -> None:
     """A line within its range: ``ends`` has low, middle and high at each x, shape (3, k)."""
     axes.plot(x, ends[1], color=shade, linestyle=style, linewidth=1.5, label=label)
@@ -176,7 +177,7 @@ def draw_ranges(rows: Sequence[tuple[str, CellResult, int, bool]], title: str, s
 
     ``rows``: label, cell, colour, and whether it is a base: its line is drawn through all others, to compare them with.
     """
-    from matplotlib.ticker import LogLocator, MaxNLocator  # noqa: PLC0415 - takes a second
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter  # noqa: PLC0415 - takes a second
 
     title = f"{title}: mean (dot), 99th percentile (end of the bar)"
     with plot(stem, 10.5, 0.27 * len(rows) + 1.6, 1, len(_RANGES), title=title, sharey=True) as panels:
@@ -195,6 +196,8 @@ def draw_ranges(rows: Sequence[tuple[str, CellResult, int, bool]], title: str, s
         panels[0].set_yticks(range(len(rows)), [row[0] for row in rows])
         panels[0].set_ylim(len(rows) - 0.5, -0.5)  # the first one on top
         for axes in panels[:2]:
-            set_log_axis(axes, "x")
+            axes.set_xscale("log")
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))  # most cells lie within a decade or two
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter(NullFormatter())
         panels[2].xaxis.set_major_locator(MaxNLocator(5))

@@ -5,7 +5,6 @@ run of the daemon with the same configuration and seed go through the same state
 """
 
 from collections import defaultdict, deque
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import hypot
 from typing import Any
@@ -24,10 +23,9 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror, deck_poses
-from ccatp.mirror.misalignment import PanelMisalignment, fit_panel
+from ccatp.mirror.misalignment import fit_panels
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
-from ccatp.mirror.surface import PanelFitError
-from ccatp.records.summary import RunFacts, SummaryBuilder, puck_targets
+from ccatp.records.summary import PanelFits, survey_summary
 from ccatp.safety.robot_clock import SteadyTime
 from ccatp.safety.wheel_monitors import CommandSpan
 from ccatp.sim.fault_plan import FaultPlan
@@ -43,7 +41,6 @@ from ccatp.survey.state import DONE, ApproachCounter, MissionState, SurveyOutcom
 _ENDLESS = 6.0
 _BATCH = 1000  # frames that go to the summary at a time
 _RECENT = 64  # frames of truth at hand: more than any delay of the sensors
-_MIN_FIXES = 3
 
 
 @dataclass(slots=True)
@@ -63,7 +60,7 @@ class StopRow:
     point: tuple[int, int, int]
     approach: int
     error: tuple[float, float, float]
-    covariance: np.ndarray[Any, np.dtype[np.float64]]
+    covariance: FloatArray
     distance_m: float
     nis: float = float("nan")
     fix_distance_m: float = float("nan")
@@ -86,7 +83,7 @@ class SilResult:
     outcome: str
     cause: str
     states_s: dict[str, float]
-    track: np.ndarray[Any, np.dtype[np.float64]] | None = None
+    track: FloatArray | None = None
     notices: list[str] = field(default_factory=list)
 
     @property
@@ -100,19 +97,8 @@ class SilTrace:
 
     def __init__(self, parts: SurveyParts, *, with_track: bool) -> None:
         cfg, mirror = parts.cfg, parts.mirror
-        facts = RunFacts(
-            mirror=cfg.mirror.name,
-            world=cfg.world.name,
-            filter=cfg.run.filter,
-            seed=cfg.run.seed,
-            total_points=parts.total_points,
-            lower_bound_s=parts.lower_bound_s,
-            budget_s=cfg.run.budget_s,
-            puck_height_m=cfg.robot.puck_height_m,
-            has_truth=True,
-        )
-        targets = puck_targets(mirror, parts.points, cfg.robot.puck_height_m)
-        self.builder = SummaryBuilder(facts, targets, mirror.surface.normal)
+        counted = parts.total_points, parts.lower_bound_s
+        self.builder = survey_summary(cfg, mirror, parts.points, *counted, is_sim=True)
         self._mirror, self._with_track = mirror, with_track
         self._truth: list[TruthRow] = []
         self._recent: deque[TruthRow] = deque(maxlen=_RECENT)
@@ -151,16 +137,9 @@ class SilTrace:
             if self._with_track:
                 self._track_rows.append(rows[:, :5])
 
-    def summary(
-        self,
-        mission: Mission,
-        mission_time_s: float,
-        fits: Mapping[PanelId, tuple[float, float, float]],
-        misalignments: Mapping[PanelId, PanelMisalignment],
-    ) -> dict[str, Any]:
-        """The summary of the whole run; ``fits`` has piston (m), tip and tilt (rad) of panels as fitted."""
+    def summary(self, mission: Mission, mission_time_s: float, fits: PanelFits, injected: PanelFits) -> dict[str, Any]:
+        """The summary of the whole run; panels as fitted and as simulated."""
         self._flush()
-        injected = {panel: (m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in misalignments.items()}
         self.builder.set_mission(len(mission.done), len(mission.skipped), mission_time_s)
         self.builder.set_panels(fits, injected)
         return self.builder.build()
@@ -220,20 +199,9 @@ class SilLaser:
             self._fixes.setdefault(point.panel, []).append(fix)
         return is_too_far
 
-    def panel_fits(self) -> dict[PanelId, tuple[float, float, float]]:
-        """Piston (m), tip and tilt (rad) of every panel with enough fixes."""
-        fits = {}
-        for panel, fixes in sorted(self._fixes.items()):
-            if len(fixes) < _MIN_FIXES:
-                continue
-            points = np.array([fix.position_m for fix in fixes])
-            covariances = np.array([fix.covariance_m2 for fix in fixes]).reshape(-1, 3, 3)
-            try:
-                fit = fit_panel(self._mirror, panel, points, covariances, self._cfg.robot.puck_height_m)
-            except PanelFitError:
-                continue
-            fits[panel] = fit.piston_m, fit.tip_rad, fit.tilt_rad
-        return fits
+    def panel_fits(self) -> PanelFits:
+        """Of the fixes that count; see ``fit_panels``."""
+        return fit_panels(self._mirror, self._fixes, self._cfg.robot.puck_height_m)
 
 
 def rehearse(cfg: Config, *, with_track: bool = False) -> SilResult:
@@ -409,9 +377,10 @@ class SilRun:
 
     def _result(self, mission_time_s: float) -> SilResult:
         mission, misalignments = self.mission, self.robot.world.misalignments
+        injected = {panel: (m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in misalignments.items()}
         self._note_state(self._state)
         return SilResult(
-            summary=self.trace.summary(mission, mission_time_s, self.laser.panel_fits(), misalignments),
+            summary=self.trace.summary(mission, mission_time_s, self.laser.panel_fits(), injected),
             stops=self.laser.stops,
             corrections=mission.corrections,
             counts=dict(self.localizer.counts),

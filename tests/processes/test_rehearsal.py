@@ -44,19 +44,8 @@ def test_a_rehearsal_is_the_run_without_the_sockets(
     (tmp_path / "clock").mkdir()
     (tmp_path / "clock" / "sitecustomize.py").write_text(RESTLESS_CLOCK)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "clock"), *sys.path]))
-    run = start(
-        "--panels",
-        "1",
-        "--mirror",
-        "thesis-m1",
-        "--filter",
-        "ekf",
-        "--world",
-        "hard",
-        "--seed",
-        "3",
-        calibrates=calibrates,
-    )
+    args = "--panels 1 --mirror thesis-m1 --filter ekf --world hard --seed 3"
+    run = start(*args.split(), calibrates=calibrates)
     assert run.wait() == 0, run.stderr
     labels = [json.loads(line)["timestamp"] for line in (run.run_dir / "log.jsonl").read_text().splitlines()]
     instants = [datetime.fromisoformat(label) for label in labels]

@@ -1,9 +1,6 @@
 """What the daemon recorded, through `ccatp replay` and `ccatp align`."""
 
 import json
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -59,30 +56,27 @@ def test_its_panels_lie_as_they_were_simulated(recorded_run: RecordedRun, capsys
     assert result["truth"]["piston_rms_um"] == pytest.approx(recorded_run.summary["panels"]["piston_rms_um"], abs=2e-3)
 
 
-@pytest.mark.slow  # in process: tests/unit/studies/test_replay
-def test_another_filter_whose_fixes_were_doubted_is_reproduced(
-    start: Start, capsys: pytest.CaptureFixture[str]
-) -> None:
-    # Every other fix of a point is doubted: half of the chi-squared distribution with two degrees lies above 1.4.
-    doubting = ("--set", "etalon.doubt_nis=1.4")
-    run = stopped(start("--panels", "1", "--world", "thesis", "--filter", "kf", *doubting), points=4)
-    result = result_of(capsys, "replay", run.run_dir)
-    assert result["fixes"]["set_aside"] >= 1
-    assert result["fixes"]["first_difference"] is None
-    assert result["fixes"]["given"] >= 4
-    assert result["difference"]["reproduced"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "args", [("--filter", "ukf"), ("--filter", "ekf", "--world", "hard", "--realtime")], ids=["ukf", "realtime"]
+    ("args", "points"),
+    [
+        # Every other fix of a point is doubted: half of the chi-squared distribution with two degrees lies above 1.4.
+        pytest.param(
+            ("--filter", "kf", "--world", "thesis", "--set", "etalon.doubt_nis=1.4"), 4, id="doubted"
+        ),  # in process: tests/unit/studies/test_replay
+        pytest.param(("--filter", "ukf"), 2, id="ukf"),
+        # In real time frames go on while a fix is on its way, and batches end where the wall clock ends them.
+        pytest.param(("--filter", "ekf", "--world", "hard", "--realtime"), 2, id="realtime"),
+    ],
 )
-def test_other_runs_are_reproduced(start: Start, args: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
-    # In real time frames go on while a fix is on its way, and batches end where the wall clock ends them.
-    run = stopped(start("--panels", "1", *args), points=2)
-    result = result_of(capsys, "replay", run.run_dir)
+def test_other_runs_are_reproduced(
+    start: Start, args: tuple[str, ...], points: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = result_of(capsys, "replay", stopped(start("--panels", "1", *args), points).run_dir)
     assert result["difference"]["reproduced"]
-    assert result["fixes"]["given"] >= 2
+    assert result["fixes"]["given"] >= points
+    assert result["fixes"]["first_difference"] is None
+    assert (result["fixes"]["set_aside"] >= 1) is ("kf" in args)
 
 
 @pytest.mark.slow
@@ -103,13 +97,6 @@ def test_another_filter_gives_another_track(recorded_run: RecordedRun, capsys: p
     assert means[0] > 2.0 * means[1]
 
 
-def test_a_setting_changes_what_it_should(recorded_run: RecordedRun, capsys: pytest.CaptureFixture[str]) -> None:
-    result = result_of(capsys, "replay", recorded_run.run_dir, "--set", "localizer.full_state.fix_gate_nis=1e-6")
-    assert result["fixes"]["refused"] > 0
-    assert "mm from the estimate" in result["fixes"]["first_difference"]["said"]
-    assert result["settings"] == {"localizer.full_state.fix_gate_nis": 1e-6}
-
-
 @pytest.mark.parametrize("name", ["ekf", pytest.param("ukf", marks=pytest.mark.slow)])
 def test_the_smoother_is_clearly_better_between_the_stops(
     name: str, recorded_run: RecordedRun, capsys: pytest.CaptureFixture[str]
@@ -119,19 +106,6 @@ def test_the_smoother_is_clearly_better_between_the_stops(
     # Measured: a fifth to a quarter. Between two fixes of micrometres only what happens between them is left.
     assert moving["smoothed"] < 0.5 * moving["replayed"]
     assert result["smoothed"]["heading_error_mrad"]["rms"] < result["replayed"]["heading_error_mrad"]["rms"]
-
-
-def test_a_run_that_was_torn_off_is_replayed_to_its_end(recorded_run: RecordedRun, tmp_path: Path) -> None:
-    torn = tmp_path / "torn"
-    shutil.copytree(recorded_run.run_dir, torn)
-    telemetry = torn / "telemetry.mcap"
-    telemetry.write_bytes(telemetry.read_bytes()[: telemetry.stat().st_size // 3])
-    command = [sys.executable, "-m", "ccatp", "replay", str(torn)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0
-    assert "the replay reproduces the recorded estimates" in done.stdout
-    assert done.stderr.startswith(f"ccatp: warning: {telemetry}: damaged or cut off before byte")
-    assert done.stderr.count("\n") == 1
 
 
 def test_a_recording_that_is_not_reproduced_is_an_error(
@@ -145,22 +119,8 @@ def test_a_recording_that_is_not_reproduced_is_an_error(
     assert printed.err.startswith(f"ccatp: {run_dir}: the replay does not reproduce the recorded estimates: ")
     assert printed.err.count("\n") == 1
     # Another setting is asked to change something.
-    assert main(["replay", run_dir, "--set", "localizer.full_state.fix_gate_nis=60"]) == 0
+    assert main(["replay", run_dir, "--set", "localizer.full_state.fix_gate_nis=1e-6"]) == 0
     printed = capsys.readouterr()
+    assert "mm from the estimate" in printed.out
     assert printed.out.endswith("the replay differs from the recorded estimates\n")
     assert not printed.err
-
-
-def test_bad_inputs_are_one_line(recorded_run: RecordedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run_dir = recorded_run.run_dir
-    for args, message in (
-        ((tmp_path / "none",), "no such directory"),
-        ((tmp_path,), "no telemetry.mcap there"),
-        ((run_dir, "--filter", "ekff"), "did you mean ekf?"),
-        ((run_dir, "--set", "localizer.full_state.fix_gate=1"), "did you mean localizer.full_state.fix_gate_"),
-    ):
-        assert main(["replay", *map(str, args)]) == 2
-        printed = capsys.readouterr()
-        assert printed.out == ""
-        assert message in printed.err
-        assert printed.err.count("\n") == 1

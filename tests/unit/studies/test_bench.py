@@ -72,8 +72,8 @@ def test_a_missing_peer_leaves_ours_and_says_how_to_install_it(monkeypatch: pyte
     for package in ("filterpy.kalman", "stonesoup.predictor.kalman"):
         monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.setattr(bench, "races", lambda _: RACES[:1])
-    result = {"machine": machine(), "equal_within": 1e-10, "cases": list(bench.step_cases(CFG, 1))}
-    printed, filterpy, stonesoup = result["cases"]
+    printed, filterpy, stonesoup = cases = list(bench.step_cases(CFG, 1))
+    result = {"machine": machine(), "equal_within": 1e-10, "cases": cases}
     assert printed["ratio"] > 0.0
     assert (filterpy["peer"], filterpy["ratio"], stonesoup["peer"]) == (None, None, None)
     assert filterpy["note"] == "filterpy is not installed: pip install 'ccatp[peers]'"

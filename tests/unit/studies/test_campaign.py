@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,11 @@ from ccatp.studies.campaign import (
     CampaignError,
     CampaignFailed,
     CampaignInterrupted,
-    Cell,
     ClusterUnreachable,
     Column,
     Job,
     JobOutcome,
     Shard,
-    Study,
     cells_of,
     jobs_of,
     parse_choice,
@@ -27,106 +26,71 @@ from ccatp.studies.campaign import (
 )
 from ccatp.studies.engine import FAILURES, CampaignOptions, JobStore, run_campaign
 from ccatp.studies.results import plain, table
-from tests.unit.studies.toy import FAULTS, STUDY, combine, draw, load, run_job
+from tests.unit.studies.toy import FAULTS, SPEEDS_M_S, STUDY, load
 
-
-def a_study(mirrors: tuple[str, ...] = ("thesis-m1",)) -> Study:
-    return Study(
-        name="trial",
-        title="A trial",
-        cells=lambda: [Cell({"speed": v}, {"limits.v_max_m_s": v}) for v in (0.05, 0.1)],
-        run_job=run_job,
-        combine=combine,
-        columns=(),
-        draw=draw,
-        defaults={"run.filter": "ekf", "run.panels": 2},
-        mirrors=mirrors,
-        runs=3,
-    )
+TRIAL = replace(STUDY, name="trial", defaults={"run.filter": "ekf", "run.panels": 2}, mirrors=("thesis-m1",))
 
 
 # -- cells, jobs, shards ----------------------------------------------------------------------------------------------
 
 
 def test_cells_are_crossed_with_the_mirrors() -> None:
-    cells = cells_of(a_study(), ["fyst-m1", "fyst-m2"])
+    cells = cells_of(TRIAL, ["fyst-m1", "fyst-m2"])
     assert [dict(cell.factors) for cell in cells] == [
-        {"mirror": mirror, "speed": speed} for mirror in ("fyst-m1", "fyst-m2") for speed in (0.05, 0.1)
+        {"mirror": mirror, "speed_m_s": speed} for mirror in ("fyst-m1", "fyst-m2") for speed in SPEEDS_M_S
     ]
     assert cells[3].overrides == {"run.mirror": "fyst-m2", "limits.v_max_m_s": 0.1}
-    assert [cell.factors["speed"] for cell in cells_of(a_study(), only={"speed": ("0.1",)})] == [0.1]
-
-
-def test_a_study_may_choose_its_mirrors_itself() -> None:
-    assert [dict(cell.factors) for cell in cells_of(a_study(()))] == [{"speed": 0.05}, {"speed": 0.1}]
-    with pytest.raises(CampaignError, match="study trial chooses its mirrors itself; leave --mirror out"):
-        cells_of(a_study(()), ["fyst-m1"])
-
-
-@pytest.mark.parametrize(
-    ("only", "message"),
-    [
-        ({"sped": ("0.1",)}, "--only sped: is no factor of study trial; there are mirror, speed"),
-        ({"speed": ("0.3",)}, r"--only speed=0.3: study trial has no such level; there are 0.05, 0.1"),
-    ],
-)
-def test_a_choice_that_does_not_exist_is_refused(only: dict[str, tuple[str, ...]], message: str) -> None:
-    with pytest.raises(CampaignError, match=message):
-        cells_of(a_study(), only=only)
+    assert [cell.factors["speed_m_s"] for cell in cells_of(TRIAL, only={"speed_m_s": ("0.1",)})] == [0.1]
+    assert [dict(cell.factors) for cell in cells_of(STUDY)] == [{"speed_m_s": 0.05}, {"speed_m_s": 0.1}]
 
 
 def test_a_job_holds_all_that_it_depends_on() -> None:
-    plan = jobs_of(a_study(), cells_of(a_study()), load, {"run.panels": 1, "run.seed": 7}, 2)
+    plan = jobs_of(TRIAL, cells_of(TRIAL), load, {"run.panels": 1, "run.seed": 7}, 2)
     assert [[job.key for job in group] for group in plan] == [
-        [f"mirror=thesis-m1,speed={v},seed={seed}" for seed in (7, 8)] for v in (0.05, 0.1)
+        [f"mirror=thesis-m1,speed_m_s={v},seed={seed}" for seed in (7, 8)] for v in SPEEDS_M_S
     ]
     job = plan[1][1]
     assert (job.cfg.run.seed, job.cfg.run.filter, job.cfg.run.panels, job.cfg.limits.v_max_m_s) == (8, "ekf", 1, 0.1)
     assert job.cfg.mirror.name == "thesis-m1"
     again = pickle.loads(pickle.dumps(job))
     assert again == job
-    assert again.fingerprint == job.fingerprint
-
-
-def test_every_key_of_the_configuration_is_in_the_fingerprint() -> None:
-    job = Job("trial", {"speed": 0.1}, 1, load({}))
     others = [
-        Job("other", job.factors, 1, job.cfg),
-        Job("trial", {"speed": 0.2}, 1, job.cfg),
+        Job("other", job.factors, 8, job.cfg),
+        Job("trial", {"speed_m_s": 0.2}, 8, job.cfg),
         Job("trial", job.factors, 2, job.cfg),
-        Job("trial", job.factors, 1, load({"mission.backoff_m": 0.04})),
-        Job("trial", job.factors, 1, with_seed(job.cfg, 2)),
+        Job("trial", job.factors, 8, load({"mission.backoff_m": 0.04})),
+        Job("trial", job.factors, 8, with_seed(job.cfg, 2)),
     ]
+    assert again.fingerprint == job.fingerprint
     assert len({job.fingerprint, *(other.fingerprint for other in others)}) == 6
 
 
 @pytest.mark.parametrize(
-    ("settings", "runs", "message"),
+    ("refused", "message"),
     [
-        ({"limits.v_max_m_s": 0.2}, 1, r"limits\.v_max_m_s is set by study trial itself; leave it out, or"),
-        ({}, 0, "--runs 0: must be at least 1"),
+        (lambda: cells_of(STUDY, ["fyst-m1"]), "study toy chooses its mirrors itself; leave --mirror out"),
+        (lambda: cells_of(TRIAL, only={"sp": ("1",)}), "--only sp: is no factor of study trial; there are mirror, sp"),
+        (
+            lambda: cells_of(TRIAL, only={"speed_m_s": ("0.3",)}),
+            r"--only speed_m_s=0.3: study trial has no such level; there are 0.05, 0.1",
+        ),
+        (
+            lambda: jobs_of(TRIAL, cells_of(TRIAL), load, {"limits.v_max_m_s": 0.2}, 1),
+            r"limits\.v_max_m_s is set by study trial itself; leave it out, or",
+        ),
+        (lambda: jobs_of(TRIAL, cells_of(TRIAL), load, {}, 0), "--runs 0: must be at least 1"),
+        *(
+            (lambda text=text: parse_shard(text), f"--shard {text}: is not i/n with 1 <= i <= n")
+            for text in ("0/4", "5/4", "1", "a/b", "1/", "-1/4", "1/4/2")
+        ),
+        *((lambda text=text: parse_choice(text), "is not factor=level") for text in ("world", "=hard", "a=", "a=,")),
     ],
 )
-def test_what_cannot_be_planned_is_refused(settings: dict[str, object], runs: int, message: str) -> None:
+def test_what_cannot_be_planned_is_refused(refused: Any, message: str) -> None:
     with pytest.raises(CampaignError, match=message):
-        jobs_of(a_study(), cells_of(a_study()), load, settings, runs)
-
-
-def test_shards_and_choices_as_options() -> None:
+        refused()
     assert parse_shard("2/4") == Shard(2, 4)
     assert parse_choice("world=hard, extreme") == ("world", ("hard", "extreme"))
-
-
-@pytest.mark.parametrize("text", ["0/4", "5/4", "1", "a/b", "1/", "-1/4", "1/4/2"])
-def test_what_is_no_shard_is_refused(text: str) -> None:
-    with pytest.raises(CampaignError, match=f"--shard {text}: is not i/n with 1 <= i <= n"):
-        parse_shard(text)
-
-
-@pytest.mark.parametrize("text", ["world", "=hard", "world=", "world=,"])
-def test_what_is_no_choice_is_refused(text: str) -> None:
-    with pytest.raises(CampaignError, match="is not factor=level"):
-        parse_choice(text)
 
 
 # -- campaigns --------------------------------------------------------------------------------------------------------
@@ -151,12 +115,8 @@ def test_a_campaign_writes_all_its_files(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "result.json").read_text()) == result
     with np.load(tmp_path / "result.npz") as arrays:
         assert arrays["1/values"].tolist() == pytest.approx([0.1, 0.2, 0.3])
-    assert (tmp_path / "table.md").read_text().splitlines()[2:] == [
-        "| speed_m_s | runs | mean |",
-        "|---|---|---|",
-        "| 0.05 | 3 | 0.10 |",
-        "| 0.1 | 3 | 0.20 |",
-    ]
+    rows = "| speed_m_s | runs | mean |\n|---|---|---|\n| 0.05 | 3 | 0.10 |\n| 0.1 | 3 | 0.20 |\n"
+    assert (tmp_path / "table.md").read_text() == f"# A toy\n\n{rows}"
     assert (tmp_path / "figure.txt").read_text() == "2"
     seeds = [key.rpartition("=")[2] for key in jobs_done(tmp_path)]
     assert seeds == ["1", "1", "2", "2", "3", "3"]  # one job of each cell first
@@ -200,26 +160,36 @@ def test_one_failure_does_not_stop_the_others(tmp_path: Path, monkeypatch: pytes
     assert campaign(tmp_path)["cells"] == CELLS
 
 
-def test_failure_after_failure_ends_the_campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    keys = [f"speed_m_s={v},seed={seed}" for v in (0.05, 0.1) for seed in (1, 2, 3)]
-    monkeypatch.setenv(FAULTS, ";".join(f"{key}:raise" for key in keys))
-    with pytest.raises(CampaignFailed, match=r"5 jobs failed, the last: .*the wheel came off; see .*failures.txt"):
-        campaign(tmp_path)
+KEYS = [f"speed_m_s={v},seed={seed}" for v in SPEEDS_M_S for seed in (1, 2, 3)]
+
+
+@pytest.mark.parametrize(
+    ("faults", "workers", "error", "message", "done"),
+    [
+        pytest.param(
+            ";".join(f"{key}:raise" for key in KEYS), 1, CampaignFailed,
+            r"5 jobs failed, the last: .*the wheel came off; see .*failures.txt", [0], id="one after the other",
+        ),
+        pytest.param(
+            f"{KEYS[-1]}:interrupt", 1, CampaignInterrupted,
+            "interrupted; what is done is kept in .*: the same command goes on from there", [5], id="Ctrl-C",
+        ),
+        pytest.param(
+            f"{KEYS[-1]}:die", 2, CampaignFailed,
+            "a worker died, perhaps for want of memory; what is done is kept in", range(6), id="a worker dies",
+        ),
+    ],
+)  # fmt: skip
+def test_what_ends_a_campaign(
+    faults: str, workers: int, error: type[CampaignError], message: str, done: list[int], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setenv(FAULTS, faults)
+    with pytest.raises(error, match=message) as ended:
+        campaign(tmp_path, workers=workers)
+    assert ended.value.exit_status == (130 if error is CampaignInterrupted else 4)
+    assert len(jobs_done(tmp_path)) in done
     assert not (tmp_path / "result.json").exists()
-
-
-def test_an_interruption_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(FAULTS, "speed_m_s=0.1,seed=3:interrupt")
-    with pytest.raises(CampaignInterrupted, match=f"interrupted; what is done is kept in {tmp_path}: the same comm"):
-        campaign(tmp_path)
-    assert len(jobs_done(tmp_path)) == 5
-    assert CampaignInterrupted("").exit_status == 130
-
-
-def test_a_worker_that_dies_ends_the_campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(FAULTS, "speed_m_s=0.1,seed=3:die")
-    with pytest.raises(CampaignFailed, match=r"a worker died, perhaps for want of memory; what is done is kept in"):
-        campaign(tmp_path, workers=2)
 
 
 @pytest.mark.parametrize("out", ["file/out", "file"])
@@ -232,8 +202,9 @@ def test_a_directory_that_cannot_be_written_is_one_line(tmp_path: Path, out: str
 
 def test_a_cluster_that_does_not_answer_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ccatp.studies.engine.CLUSTER_TIMEOUT_S", 0.2)
-    with pytest.raises(ClusterUnreachable, match=r"--cluster tcp://127.0.0.1:9: no scheduler answers there"):
+    with pytest.raises(ClusterUnreachable, match=r"--cluster tcp://127.0.0.1:9: no scheduler answers there") as refused:
         campaign(tmp_path, cluster="tcp://127.0.0.1:9")
+    assert refused.value.exit_status == 5
 
 
 # -- the store --------------------------------------------------------------------------------------------------------
@@ -241,45 +212,24 @@ def test_a_cluster_that_does_not_answer_is_one_line(tmp_path: Path, monkeypatch:
 OUTCOME = JobOutcome({"value": 1.5, "lost": float("nan")}, {"values": np.arange(3.0)})
 
 
-@pytest.fixture(scope="module")
-def jobs() -> list[Job]:
-    return jobs_of(STUDY, cells_of(STUDY), load, {}, 3)[0]
-
-
-def test_a_finished_job_is_found_again(tmp_path: Path, jobs: list[Job]) -> None:
+@pytest.mark.parametrize("shard", [Shard(1, 1), Shard(1, 2)])
+def test_finished_jobs_are_found_again_and_a_torn_line_is_not(tmp_path: Path, shard: Shard) -> None:
+    one, other = jobs_of(STUDY, cells_of(STUDY), load, {}, 2)[0]
+    with JobStore(tmp_path / "new", shard) as store:
+        store.add(one, OUTCOME, 2.5)
+        store.add(other, OUTCOME)
+    (path,) = (tmp_path / "new").iterdir()
+    path.write_bytes(torn := path.read_bytes()[:-1])
     with JobStore(tmp_path / "new") as store:
-        store.add(jobs[0], OUTCOME, 2.5)
-    with JobStore(tmp_path / "new") as store:
-        found = store.outcome(jobs[0])
+        found = store.outcome(one)
         assert found is not None
         assert found.values == {"value": 1.5, "lost": None}
         assert found.arrays["values"].tolist() == [0.0, 1.0, 2.0]
-        assert store.outcome(jobs[1]) is None
-        assert (store.took_s(jobs[0]), store.took_s(jobs[1])) == (2.5, 0.0)
-
-
-def test_a_torn_last_line_is_cut_and_the_rest_kept(tmp_path: Path, jobs: list[Job]) -> None:
-    with JobStore(tmp_path) as store:
-        store.add(jobs[0], OUTCOME)
-        store.add(jobs[1], OUTCOME)
-    path = tmp_path / "jobs.jsonl"
-    path.write_bytes(path.read_bytes()[:-40])
-    with JobStore(tmp_path) as store:
-        assert store.outcome(jobs[0]) is not None
-        assert store.outcome(jobs[1]) is None
-        store.add(jobs[1], OUTCOME)
-    assert len(path.read_bytes().splitlines()) == 2
-
-
-def test_a_torn_last_line_of_another_shard_is_left_alone(tmp_path: Path, jobs: list[Job]) -> None:
-    with JobStore(tmp_path, Shard(1, 2)) as store:
-        store.add(jobs[0], OUTCOME)
-        store.add(jobs[1], OUTCOME)
-    path = tmp_path / "jobs-1of2.jsonl"
-    path.write_bytes(torn := path.read_bytes()[:-1])
-    with JobStore(tmp_path) as store:
-        assert (store.outcome(jobs[0]) is not None, store.outcome(jobs[1])) == (True, None)
-    assert path.read_bytes() == torn
+        assert store.outcome(other) is None
+        assert (store.took_s(one), store.took_s(other)) == (2.5, 0.0)
+        assert path.read_bytes() == (torn if shard.of == 2 else torn[: torn.rfind(b"\n") + 1])  # another's is left
+        store.add(other, OUTCOME)
+    assert len((tmp_path / "new" / "jobs.jsonl").read_bytes().splitlines()) == (1 if shard.of == 2 else 2)
 
 
 def test_what_cannot_be_read_or_locked_is_refused(tmp_path: Path) -> None:
@@ -304,17 +254,11 @@ def test_values_are_made_what_json_has() -> None:
 
 def test_a_table_has_the_factors_first() -> None:
     rows = [
-        {
-            "world": "hard",
-            "runs": 2,
-            "error": {"mean": 1.2345, "band": [0.5, 2.0]},
-            "ratio": None,
-            "causes": ["a", "b"],
-        },
-        {"world": "thesis", "runs": 1, "error": {"mean": 2, "band": None}, "ratio": 1.5, "causes": []},
+        {"world": "hard", "runs": 2, "e": {"mean": 1.2345, "band": [0.5, 2.0]}, "ratio": None, "causes": ["a", "b"]},
+        {"world": "thesis", "runs": 1, "e": {"mean": 2, "band": None}, "ratio": 1.5, "causes": []},
     ]
-    columns = [Column("mean, mm", "error.mean", ".2f"), Column("band", "error.band", ".1f"), Column("ratio", "ratio")]
-    assert table(rows, [*columns, Column("gone", "error.gone"), Column("by", "causes")]).splitlines() == [
+    columns = [Column("mean, mm", "e.mean", ".2f"), Column("band", "e.band", ".1f"), Column("ratio", "ratio")]
+    assert table(rows, [*columns, Column("gone", "e.gone"), Column("by", "causes")]).splitlines() == [
         "| world | runs | mean, mm | band | ratio | gone | by |",
         "|---|---|---|---|---|---|---|",
         "| hard | 2 | 1.23 | 0.5 to 2.0 | - | - | a; b |",

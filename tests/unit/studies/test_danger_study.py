@@ -46,10 +46,11 @@ def judged(pattern: str) -> bool:
 
 
 def test_the_thesis_counts_the_time_that_one_sensor_is_off() -> None:
+    cfg, mirror = loaded("thesis-m1")
     back_on = "1" + "0" * 90 + "1" + "0" * 90  # the time begins again
     assert [judged(pattern) for pattern in ("1" + "0" * 100, "1" + "0" * 102, back_on)] == [False, True, False]
     with pytest.raises(ValueError, match="no edge rule is called 'none': take one of thesis, shipped"):
-        build_rule("none", *reversed(loaded("thesis-m1")))
+        build_rule("none", mirror, cfg)
 
 
 @pytest.mark.parametrize(

@@ -5,15 +5,18 @@ import sys
 from math import atan, degrees, inf, pi, sqrt
 from pathlib import Path
 
+import control
 import numpy as np
 import pytest
 
 from ccatp.config.load import load_config
-from ccatp.config.models import Config, PidConfig
+from ccatp.config.models import PidConfig
+from ccatp.control.tracker import LegView, line_rate
 from ccatp.studies import loops
 from ccatp.studies.loops import Loop, LoopsError, margins, open_loop
 
 LAG_S, FRAME_S = 0.08, 0.01
+CFG = load_config()
 
 
 def gains(kp: float, ki: float, kd: float) -> PidConfig:
@@ -25,11 +28,6 @@ FORWARD, ANGULAR = gains(0.5, 0.5, 0.0), gains(0.1, 0.05, 0.01)
 
 def loop(pid: PidConfig, plant: str, lag_s: float = LAG_S, frames: int = 0) -> Loop:
     return open_loop("test", "forward", pid, plant, lag_s, frames, FRAME_S)
-
-
-@pytest.fixture(scope="module")
-def cfg() -> Config:
-    return load_config()
 
 
 def test_the_printed_margin_is_the_limit_of_no_lag() -> None:
@@ -54,8 +52,6 @@ def test_the_true_plant_has_the_integrator() -> None:
 @pytest.mark.parametrize("pid", [FORWARD, ANGULAR, gains(3.0, 0.0, 0.0), gains(8.0, 0.0, 0.5)])
 @pytest.mark.parametrize("frames", [0, 4])
 def test_the_same_margins_as_python_control(pid: PidConfig, plant: str, frames: int) -> None:
-    import control
-
     one = loop(pid, plant, frames=frames)
     found = margins(one)
     gain, phase_deg, _, at_phase, at_gain, _ = control.stability_margins(loops.system(one))
@@ -84,11 +80,14 @@ def test_the_gain_margin_is_where_the_closed_loop_tips_over() -> None:
 
 
 def test_an_unstable_loop_says_so() -> None:
-    found = margins(loop(gains(100.0, 0.0, 0.0), "true", frames=4))
-    assert not found.is_stable
-    assert found.gain_db < 0.0
-    assert found.phase_rad < 0.0
-    assert loops.overshoot(loop(gains(100.0, 0.0, 0.0), "true", frames=4)) == inf
+    one = loop(gains(100.0, 0.0, 0.0), "true", frames=4)
+    found = margins(one)
+    assert (found.is_stable, found.gain_db < 0.0, found.phase_rad < 0.0, loops.overshoot(one)) == (
+        False,
+        True,
+        True,
+        inf,
+    )
 
 
 def test_overshoot_of_a_second_order_loop() -> None:
@@ -107,42 +106,34 @@ def test_the_phase_is_continuous_and_starts_at_the_integrators() -> None:
         assert np.abs(np.diff(phase)).max() < 0.1
 
 
-def test_every_set_of_gains_is_analysed(cfg: Config) -> None:
-    found = {(one.gains, one.axis, one.plant) for one in loops.loops_of(cfg)}
-    for name, gain_set in cfg.control.gain_sets.items():
+def test_every_set_of_gains_is_analysed() -> None:
+    found = {(one.gains, one.axis, one.plant) for one in loops.loops_of(CFG)}
+    for name, gain_set in CFG.control.gain_sets.items():
         assert (name, "forward", "true") in found
         assert ((name, "angular", "printed") in found) == (not gain_set.shaped)
         assert ((name, "steering", "true") in found) == gain_set.shaped
-    assert {one.delay_frames for one in loops.loops_of(cfg)} == {0, 2, 4}
-    assert next(one.lag_s for one in loops.limit_of(cfg)) == 0.5 * cfg.robot.wheel_lag_s
+    assert {one.delay_frames for one in loops.loops_of(CFG)} == {0, 2, 4}
+    assert next(one.lag_s for one in loops.limit_of(CFG)) == 0.5 * CFG.robot.wheel_lag_s
 
 
-def test_steering_is_the_regulator_on_the_line(cfg: Config) -> None:
-    from ccatp.control.tracker import LegView, line_rate
-
-    pid, v = loops.steering(cfg.limits, cfg.control), cfg.limits.v_max_m_s
-    weights = cfg.control.cross_track_gain_rad_m2, cfg.control.heading_weight_1_s2
+def test_steering_is_the_regulator_on_the_line() -> None:
+    pid, v = loops.steering(CFG.limits, CFG.control), CFG.limits.v_max_m_s
+    weights = CFG.control.cross_track_gain_rad_m2, CFG.control.heading_weight_1_s2
     assert -line_rate(LegView(1.0, 0.0, 1.0, 1.0), v, *weights) == pytest.approx(pid.kp)
     assert -line_rate(LegView(1.0, 1.0, 0.0, 1.0), v, *weights) * v == pytest.approx(pid.ki)
 
 
-def test_the_files(cfg: Config, tmp_path: Path) -> None:
-    sets = {"thesis": cfg.control.gain_sets["thesis"]}
-    part = cfg.model_copy(update={"control": cfg.control.model_copy(update={"gain_sets": sets})})
-    out = tmp_path / "a" / "b"
-    result = loops.run(part, out)
-    assert json.loads((out / "result.json").read_text()) == result
+def test_the_files(tmp_path: Path) -> None:
+    sets = {"thesis": CFG.control.gain_sets["thesis"]}
+    part = CFG.model_copy(update={"control": CFG.control.model_copy(update={"gain_sets": sets})})
+    result = loops.run(part, tmp_path)
+    assert json.loads((tmp_path / "result.json").read_text()) == result
     assert result["study"] == "loops"
-    cells = result["cells"]
-    assert len(cells) == len((out / "table.md").read_text().splitlines()) - 2 == 22
-    assert cells[0]["gain_margin_db"] is None
-    assert {path.name for path in out.glob("*.p*")} == {
-        f"{kind}_thesis_{axis}.{suffix}"
-        for kind in ("bode", "rlocus")
-        for axis in ("forward", "angular")
-        for suffix in ("png", "pdf")
-    }
-    with np.load(out / "result.npz") as arrays:
+    assert len(result["cells"]) == len((tmp_path / "table.md").read_text().splitlines()) - 2 == 22
+    assert result["cells"][0]["gain_margin_db"] is None
+    names = {f"{kind}_thesis_{axis}.png" for kind in ("bode", "rlocus") for axis in ("forward", "angular")}
+    assert {path.name for path in tmp_path.glob("*.png")} == names
+    with np.load(tmp_path / "result.npz") as arrays:
         assert arrays["magnitude"].shape == (12, arrays["omega_rad_s"].size) == arrays["phase_rad"].shape
 
 

@@ -1,36 +1,49 @@
-"""A run made of frames by hand, through the localizers."""
+"""A run made of frames by hand, through the localizers; its smoother; figures against a reference, done by hand."""
 
 from collections.abc import Callable, Iterator, Sequence
-from math import cos, sin
+from math import cos, pi, sin, sqrt
 
 import numpy as np
 import pytest
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, GravitySample, ImuSample, WheelSample
+from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, ImuSample, WheelSample
 from ccatp.filters import FILTERS, Smoother
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import FixMessage, Rest
 from ccatp.localizer import build_localizer
-from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.records.run_reader import Event, Fixed, Marked, Message, in_order
+from ccatp.mirror.mirror import build_mirror
+from ccatp.records.run_reader import Event, Fixed, Marked, Message, Trace, in_order
 from ccatp.studies import replay as recording_filter
-from ccatp.studies.replay import RecordingFilter, added_noise, has_smoother, replay, transition_of_reset
+from ccatp.studies.replay import (
+    REPRODUCED,
+    RecordingFilter,
+    Replayed,
+    ReplayEvaluation,
+    added_noise,
+    csv_lines,
+    difference,
+    errors_of,
+    figures,
+    fix_distances_m,
+    has_smoother,
+    judge,
+    replay,
+    table_lines,
+    transition_of_reset,
+)
 
 FRAME_S = 0.01
 STILL_FRAMES = 60  # longer than a rest takes to be seen
 RATE_RAD_S = 1.0  # of both wheels: 30 mm/s
 FIX_SIGMA_M = 1e-5
+MIRROR = build_mirror(load_config().mirror)
+ECHO = CommandEcho(seq=-1, age=0.0, permit_age=0.0, held=False)
 
 
-def config_for(name: str) -> Config:
-    return load_config(None, {"run.filter": name})
-
-
-@pytest.fixture(scope="module")
-def mirror() -> Mirror:
-    return build_mirror(load_config().mirror)
+def config_for(name: str, **keys: object) -> Config:
+    return load_config(None, {"run.filter": name, **keys})
 
 
 def frame(number: int, rate_rad_s: float, *, at_rest: bool = False) -> Marked:
@@ -38,35 +51,43 @@ def frame(number: int, rate_rad_s: float, *, at_rest: bool = False) -> Marked:
     imu = [ImuSample(t_s, 0.0, 0.0)]
     encoders = [WheelSample(t_s - 0.001 * k, rate_rad_s, rate_rad_s) for k in range(9, -1, -1)]
     edges = [EdgeSample(t_s, 1, 1, 1, 1)]
-    echo = CommandEcho(seq=-1, age=0.0, permit_age=0.0, held=False)
-    gravity: GravitySample | None = None
-    return Marked(Sensors(number, t_s, imu, encoders, edges, gravity, (0.0, 0.0), 1.0, echo, []), at_rest)
+    return Marked(Sensors(number, t_s, imu, encoders, edges, None, (0.0, 0.0), 1.0, ECHO, []), at_rest)
 
 
-def fix_at(mirror: Mirror, cfg: Config, place: tuple[float, float], t_s: float) -> Fix:
-    puck = mirror.puck_world(DeckPose(*place, 0.0), cfg.robot.puck_height_m)
+def fix_at(cfg: Config, place: tuple[float, float], t_s: float) -> Fix:
+    puck = MIRROR.puck_world(DeckPose(*place, 0.0), cfg.robot.puck_height_m)
     return Fix(t_s, puck, tuple((FIX_SIGMA_M**2 * np.eye(3)).ravel().tolist()), 1.0, (1, 2, 3, 4), 0.0)
 
 
-def beside_base(mirror: Mirror, dx_m: float, dy_m: float) -> tuple[float, float]:
-    return mirror.base_pose.x_m + dx_m, mirror.base_pose.y_m + dy_m
+BESIDE = MIRROR.base_pose.x_m + 3e-3, MIRROR.base_pose.y_m - 1e-3
 
 
-def standing(mirror: Mirror, cfg: Config, *, was_fused: bool = True) -> Iterator[Event]:
-    """A robot that stands 3 mm and 1 mm beside base, as a fix shows."""
-    for n in range(1, 101):
+def standing(cfg: Config, **fate: bool) -> list[Event]:
+    """A robot that stands 3 mm and 1 mm beside base, as a fix shows; the fate of that in the run."""
+    seen = Fixed(fix_at(cfg, BESIDE, 1.0), **({"was_fused": True} | fate))
+    return [*(frame(n, 0.0) for n in range(1, 101)), seen, *(frame(n, 0.0) for n in range(101, 151))]
+
+
+def driving(cfg: Config, *, late_frames: int) -> Iterator[Event]:
+    """A robot that starts 1 mm to the left of base and drives 0.06 m; a fix of frame 160 is handed over later."""
+    base = MIRROR.base_pose
+    for n in range(1, STILL_FRAMES + 1):
         yield frame(n, 0.0)
-    yield Fixed(fix_at(mirror, cfg, beside_base(mirror, 3e-3, -1e-3), 1.0), was_fused)
-    for n in range(101, 151):
-        yield frame(n, 0.0)
+    for n in range(STILL_FRAMES + 1, 261):
+        yield frame(n, RATE_RAD_S, at_rest=n == 200)  # wrongly: what a localizer makes of that shows
+        if n == 160 + late_frames:
+            way_m = 0.001 * 1000 * FRAME_S * 100 * RATE_RAD_S * cfg.robot.wheel_radius_m
+            c, s = cos(base.heading_rad), sin(base.heading_rad)
+            place = base.x_m + way_m * c - 1e-3 * s, base.y_m + way_m * s + 1e-3 * c
+            yield Fixed(fix_at(cfg, place, 160 * FRAME_S), True)
 
 
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
-def test_the_smoother_knows_from_the_first_frame_on_what_the_fix_showed(name: str, mirror: Mirror) -> None:
+def test_the_smoother_knows_from_the_first_frame_on_what_the_fix_showed(name: str) -> None:
     cfg = config_for(name)
-    found = replay(cfg, mirror, standing(mirror, cfg), smooth=True)
+    found = replay(cfg, MIRROR, standing(cfg), smooth=True)
     assert found.smoothed is not None
-    wanted = np.tile(beside_base(mirror, 3e-3, -1e-3), (150, 1))
+    wanted = np.tile(BESIDE, (150, 1))
     np.testing.assert_allclose(found.feet[0], (100, *wanted[0]), rtol=0.0, atol=1e-9)  # Newton's rest
     before, after = found.trace.pose[:100, :2], found.smoothed.pose[:, :2]
     assert np.linalg.norm(before - wanted[:100], axis=1).min() > 3e-3
@@ -77,25 +98,11 @@ def test_the_smoother_knows_from_the_first_frame_on_what_the_fix_showed(name: st
     np.testing.assert_array_equal(found.smoothed.seq, found.trace.seq)
 
 
-def driving(mirror: Mirror, cfg: Config, *, late_frames: int) -> Iterator[Event]:
-    """A robot that starts 1 mm to the left of base and drives 0.06 m; a fix of frame 160 is handed over later."""
-    base = mirror.base_pose
-    for n in range(1, STILL_FRAMES + 1):
-        yield frame(n, 0.0)
-    for n in range(STILL_FRAMES + 1, 261):
-        yield frame(n, RATE_RAD_S, at_rest=n == 200)  # wrongly: what a localizer makes of that shows
-        if n == 160 + late_frames:
-            way_m = 0.001 * 1000 * FRAME_S * 100 * RATE_RAD_S * cfg.robot.wheel_radius_m
-            c, s = cos(base.heading_rad), sin(base.heading_rad)
-            place = base.x_m + way_m * c - 1e-3 * s, base.y_m + way_m * s + 1e-3 * c
-            yield Fixed(fix_at(mirror, cfg, place, 160 * FRAME_S), True)
-
-
 @pytest.mark.parametrize("name", ["kf", "ekf", "ukf"])
-def test_a_replay_is_what_the_localizer_does(name: str, mirror: Mirror) -> None:
+def test_a_replay_is_what_the_localizer_does(name: str) -> None:
     cfg = config_for(name)
-    localizer, wanted = build_localizer(cfg, mirror), []
-    for event in driving(mirror, cfg, late_frames=20):
+    localizer, wanted = build_localizer(cfg, MIRROR), []
+    for event in driving(cfg, late_frames=20):
         if isinstance(event, Fixed):
             localizer.fuse_fix(event.fix)
         else:
@@ -103,13 +110,12 @@ def test_a_replay_is_what_the_localizer_does(name: str, mirror: Mirror) -> None:
             localizer.step(s.t, s.imu, s.enc, s.edge, s.gravity)
             if event.at_rest:
                 localizer.rest()
-            wanted.append(mirror.deck_pose(localizer.pose))
+            wanted.append(MIRROR.deck_pose(localizer.pose))
     times_s: list[float] = []
-    found = replay(cfg, mirror, driving(mirror, cfg, late_frames=20), on_frame=times_s.append)
-    assert times_s == [n * FRAME_S for n in range(1, 261)]
+    found = replay(cfg, MIRROR, driving(cfg, late_frames=20), on_frame=times_s.append)
+    assert times_s == found.trace.t_s.tolist() == [n * FRAME_S for n in range(1, 261)]
     assert found.moving.tolist() == list(range(STILL_FRAMES + 1, 261))
     assert found.trace.seq.tolist() == list(range(1, 261))
-    assert found.trace.t_s[-1] == 2.6
     # 1e-12 m: the trace goes by way of many poses at once, which drops a point on the surface by other arithmetic.
     np.testing.assert_allclose(found.trace.pose, [(p.x_m, p.y_m, p.heading_rad) for p in wanted], rtol=0.0, atol=1e-12)
     assert found.trace.covariance is not None
@@ -120,62 +126,54 @@ def test_a_replay_is_what_the_localizer_does(name: str, mirror: Mirror) -> None:
 
 
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
-def test_a_late_fix_is_smoothed_as_if_it_had_come_in_time(name: str, mirror: Mirror) -> None:
+def test_a_late_fix_is_smoothed_as_if_it_had_come_in_time(name: str) -> None:
     cfg = config_for(name)
-    in_time, late = (replay(cfg, mirror, driving(mirror, cfg, late_frames=n), smooth=True).smoothed for n in (0, 60))
-    assert in_time is not None
-    assert late is not None
+    first, late = (replay(cfg, MIRROR, driving(cfg, late_frames=n), smooth=True) for n in (0, 60))
+    assert first.smoothed is not None
+    assert late.smoothed is not None
     # 50 um: the filters are linearised where they are, which a fix of 1 mm changes; a record of what was done twice
     # would be beside it by the whole millimetre.
-    np.testing.assert_allclose(late.pose[:, :2], in_time.pose[:, :2], atol=5e-5)
-    aside = in_time.pose[STILL_FRAMES, :2] - replay(cfg, mirror, driving(mirror, cfg, late_frames=0)).trace.pose[0, :2]
+    np.testing.assert_allclose(late.smoothed.pose[:, :2], first.smoothed.pose[:, :2], atol=5e-5)
+    aside = first.smoothed.pose[STILL_FRAMES, :2] - first.trace.pose[0, :2]
     assert np.linalg.norm(aside) > 5e-4  # the fix is seen from the beginning
 
 
-def test_a_fix_that_the_run_refused_and_the_replay_takes(mirror: Mirror) -> None:
-    cfg = config_for("ekf")
-    found = replay(cfg, mirror, standing(mirror, cfg, was_fused=False))
-    assert (found.refused, found.first_difference) == (0, (1.0, ""))
-    assert not found.feet.size  # it showed the place of nothing
-
-
 @pytest.mark.parametrize("name", ["kf", "ekf", "ukf"])
-def test_a_fix_that_was_set_aside_is_kept_from_the_localizer(name: str, mirror: Mirror) -> None:
+def test_a_fix_that_was_set_aside_is_kept_from_the_localizer(name: str) -> None:
     cfg = config_for(name)
-    events = list(standing(mirror, cfg, was_fused=False))
-    aside = [Fixed(e.fix, was_fused=False, was_set_aside=True) if isinstance(e, Fixed) else e for e in events]
-    found = replay(cfg, mirror, aside)
-    without = replay(cfg, mirror, [e for e in events if not isinstance(e, Fixed)])
+    found = replay(cfg, MIRROR, standing(cfg, was_fused=False, was_set_aside=True))
+    without = replay(cfg, MIRROR, [event for event in standing(cfg) if not isinstance(event, Fixed)])
+    taken = replay(cfg, MIRROR, standing(cfg, was_fused=False))
     assert (found.fixes, found.set_aside, found.refused, found.first_difference) == (1, 1, 0, None)
     np.testing.assert_array_equal(found.trace.pose, without.trace.pose)
-    assert np.abs(found.trace.pose - replay(cfg, mirror, events).trace.pose).max() > 1e-4
+    assert np.abs(found.trace.pose - taken.trace.pose).max() > 1e-4
+    assert (taken.refused, taken.first_difference) == (0, (1.0, ""))  # refused in the run, taken now
+    assert not taken.feet.size  # it showed the place of nothing
 
 
-def test_a_fix_that_the_run_took_and_the_replay_refuses(mirror: Mirror) -> None:
-    cfg = load_config(None, {"run.filter": "ekf", "localizer.full_state.fix_gate_nis": 1e-3})
-    found = replay(cfg, mirror, standing(mirror, cfg))
+def test_a_fix_that_the_run_took_and_the_replay_refuses() -> None:
+    cfg = config_for("ekf", **{"localizer.full_state.fix_gate_nis": 1e-3})
+    found = replay(cfg, MIRROR, standing(cfg))
     assert found.refused == 1
     assert found.first_difference is not None
     assert found.first_difference[0] == 1.0
     assert "mm from the estimate" in found.first_difference[1]
 
 
-def test_four_states_cannot_be_smoothed(mirror: Mirror) -> None:
+def test_four_states_cannot_be_smoothed_and_no_frames_can() -> None:
     assert [has_smoother(config_for(name)) for name in ("kf", "ekf", "ukf")] == [False, True, True]
     with pytest.raises(ValueError, match="no smoother for filter kf"):
-        replay(config_for("kf"), mirror, [], smooth=True)
-
-
-def test_no_frames_at_all(mirror: Mirror) -> None:
-    found = replay(config_for("ekf"), mirror, [], smooth=True)
+        replay(config_for("kf"), MIRROR, [], smooth=True)
+    found = replay(config_for("ekf"), MIRROR, [], smooth=True)
     assert found.smoothed is not None
-    assert not len(found.trace.seq)
-    assert not len(found.smoothed.seq)
+    assert len(found.trace.seq) == len(found.smoothed.seq) == 0
 
 
-def events_frame(seq: int) -> Sensors:
-    echo = CommandEcho(seq=-1, age=0.0, permit_age=0.0, held=False)
-    return Sensors(seq, 0.01 * seq, [], [], [], None, (0.0, 0.0), 1.0, echo, [])
+# -- the order of events ----------------------------------------------------------------------------------------------
+
+
+def bare(seq: int) -> Sensors:
+    return Sensors(seq, 0.01 * seq, [], [], [], None, (0.0, 0.0), 1.0, ECHO, [])
 
 
 def given(seq: int, t_s: float, is_fused: bool) -> FixMessage:
@@ -185,57 +183,45 @@ def given(seq: int, t_s: float, is_fused: bool) -> FixMessage:
     )  # fmt: skip
 
 
-def stood(seq: int) -> Rest:
-    return Rest(seq=seq, t_s=0.0)
+def name_of(event: Event) -> str:
+    if isinstance(event, Marked):
+        return f"{event.sensors.seq}{' rests' if event.at_rest else ''}"
+    return f"fix {event.fix.t_s:g}{'' if event.was_fused else ' refused'}"
 
 
-def names_of(messages: Sequence[Message]) -> list[str]:
-    def name(event: Event) -> str:
-        if isinstance(event, Marked):
-            return f"{event.sensors.seq}{' rests' if event.at_rest else ''}"
-        return f"fix {event.fix.t_s:g}{'' if event.was_fused else ' refused'}"
-
-    return [name(event) for event in in_order(messages)]
-
-
-FRAMES = [events_frame(seq) for seq in range(4)]
+FRAMES = [bare(seq) for seq in range(4)]
 GIVEN = given(1, 7.0, True)
+RESTS = [Rest(seq=seq, t_s=0.0) for seq in range(3)]
 
 
 @pytest.mark.parametrize(
     ("messages", "wanted"),
     [
-        pytest.param([GIVEN, *FRAMES], ["0", "1", "fix 7", "2", "3"], id="before the batch of its frame"),
-        pytest.param([*FRAMES[:2], GIVEN, *FRAMES[2:]], ["0", "1", "fix 7", "2", "3"], id="between two batches"),
-        pytest.param([stood(1), GIVEN, *FRAMES[:3]], ["0", "1 rests", "fix 7", "2"], id="a rest before the fix"),
+        pytest.param([GIVEN, *FRAMES], "0, 1, fix 7, 2, 3", id="before the batch of its frame"),
+        pytest.param([*FRAMES[:2], GIVEN, *FRAMES[2:]], "0, 1, fix 7, 2, 3", id="between two batches"),
+        pytest.param([RESTS[1], GIVEN, *FRAMES[:3]], "0, 1 rests, fix 7, 2", id="a rest before the fix"),
         pytest.param(
-            [given(0, 1.0, False), given(0, 2.0, True), *FRAMES[:2]],
-            ["0", "fix 1 refused", "fix 2", "1"],
-            id="fixes keep their order",
+            [given(0, 1.0, False), given(0, 2.0, True), *FRAMES[:2]], "0, fix 1 refused, fix 2, 1", id="in their order"
         ),
         pytest.param(
-            [*FRAMES[:2], given(1, 1.0, True), given(2, 2.0, True), stood(2)],
-            ["0", "1", "fix 1"],
-            id="at the end only what belongs to a frame that is there",
+            [*FRAMES[:2], given(1, 1.0, True), given(2, 2.0, True), RESTS[2]], "0, 1, fix 1", id="of a frame not there"
         ),
-        pytest.param(
-            [events_frame(0), given(3, 1.0, True), events_frame(7)],
-            ["0", "fix 1", "7"],
-            id="before the next frame where frames are missing",
-        ),
+        pytest.param([bare(0), given(3, 1.0, True), bare(7)], "0, fix 1, 7", id="where frames are missing"),
     ],
 )
-def test_a_fix_comes_behind_its_frame(messages: Sequence[Message], wanted: list[str]) -> None:
-    assert names_of(messages) == wanted
+def test_a_fix_comes_behind_its_frame(messages: Sequence[Message], wanted: str) -> None:
+    assert ", ".join(map(name_of, in_order(messages))) == wanted
 
 
 def test_a_recorded_fix_is_the_fix_again() -> None:
     message = given(5, 1.5, False)
     fix = Fix(1.5, (1.0, 2.0, 3.0), (0.5,) * 9, 1.25, (1, 4), 1e-6)
-    assert list(in_order([events_frame(5), message]))[1] == Fixed(fix, False)
+    assert list(in_order([bare(5), message]))[1] == Fixed(fix, False)
     message.is_set_aside = True
-    assert list(in_order([events_frame(5), message]))[1] == Fixed(fix, False, was_set_aside=True)
+    assert list(in_order([bare(5), message]))[1] == Fixed(fix, False, was_set_aside=True)
 
+
+# -- a filter that can be smoothed ------------------------------------------------------------------------------------
 
 N = 4
 F = np.eye(N) + np.diag([0.5, 0.2, 0.1], 1)
@@ -271,16 +257,19 @@ def by_hand(name: str) -> tuple[FloatArray, FloatArray]:
     return found.means[:, :3], found.covariances[:, :3, :3]
 
 
-@pytest.fixture(params=[(2000, 4096), (0, 4096), (3, 5)], ids=["all pending", "none pending", "chapters"])
-def sizes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    reach, chapter = request.param
-    monkeypatch.setattr(recording_filter, "REACH", reach)
-    monkeypatch.setattr(recording_filter, "CHAPTER", chapter)
+def assert_smoothed_as_by_hand(filter_: RecordingFilter, name: str) -> None:
+    found = filter_.smooth()
+    for one, wanted in zip((found.means, found.covariances), by_hand(name), strict=True):
+        assert_same(one, wanted)
 
 
-@pytest.mark.usefixtures("sizes")
+@pytest.mark.parametrize("sizes", [(2000, 4096), (0, 4096), (3, 5)], ids=["all pending", "none pending", "chapters"])
 @pytest.mark.parametrize("name", sorted(FILTERS))
-def test_it_filters_as_the_filter_in_it_and_smooths_as_the_smoother(name: str) -> None:
+def test_it_filters_as_the_filter_in_it_and_smooths_as_the_smoother(
+    name: str, sizes: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording_filter, "REACH", sizes[0])
+    monkeypatch.setattr(recording_filter, "CHAPTER", sizes[1])
     filter_, alone = started(name), FILTERS[name](np.ones(N), 2.0 * np.eye(N))
     for z in READINGS:
         filter_.predict(F, Q)
@@ -289,10 +278,7 @@ def test_it_filters_as_the_filter_in_it_and_smooths_as_the_smoother(name: str) -
         assert_same(filter_.mean, alone.mean)
         assert_same(filter_.covariance, alone.covariance)
     assert filter_.count == len(READINGS)
-    means, covariances = by_hand(name)
-    found = filter_.smooth()
-    assert_same(found.means, means)
-    assert_same(found.covariances, covariances)
+    assert_smoothed_as_by_hand(filter_, name)
 
 
 def test_what_was_taken_back_is_removed() -> None:
@@ -311,10 +297,7 @@ def test_what_was_taken_back_is_removed() -> None:
     filter_.reset(*kept)
     filter_.update(READINGS[6], H, R)
     drive(filter_, READINGS[7:])
-    means, covariances = by_hand("ekf")
-    found = filter_.smooth()
-    assert_same(found.means, means)
-    assert_same(found.covariances, covariances)
+    assert_smoothed_as_by_hand(filter_, "ekf")
 
 
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
@@ -345,20 +328,19 @@ def test_nothing_is_known_across_a_state_drawn_anew() -> None:
     assert_same(found.covariances[6], before[1])
 
 
-def some_covariance() -> FloatArray:
-    root = np.random.default_rng(1).normal(size=(N, N))
-    return np.asarray(root @ root.T + np.eye(N))
+ROOT = np.random.default_rng(1).normal(size=(N, N))
+P = np.asarray(ROOT @ ROOT.T + np.eye(N))
 
 
-def redrawn(P: FloatArray) -> FloatArray:
-    after = P.copy()
+def redrawn(before: FloatArray) -> FloatArray:
+    after = before.copy()
     after[1, :] = after[:, 1] = 0.0
     after[1, 1] = 7.0
     return after
 
 
-def asymmetric_in_the_last_bit(P: FloatArray) -> FloatArray:
-    after = P.copy()
+def asymmetric_in_the_last_bit(before: FloatArray) -> FloatArray:
+    after = before.copy()
     after[0, 1] = np.nextafter(after[0, 1], np.inf)
     return after
 
@@ -369,14 +351,13 @@ def asymmetric_in_the_last_bit(P: FloatArray) -> FloatArray:
         (np.copy, [1, 1, 1, 1], 0.0),
         (asymmetric_in_the_last_bit, [1, 1, 1, 1], 0.0),
         (redrawn, [1, 0, 1, 1], 7.0),
-        (lambda P: 0.5 * P, [0, 0, 0, 0], None),
-        (lambda P: P + np.diag([1.0, 0.0, 0.0, 0.0]), [0, 0, 0, 0], None),
+        (lambda before: 0.5 * before, [0, 0, 0, 0], None),
+        (lambda before: before + np.diag([1.0, 0.0, 0.0, 0.0]), [0, 0, 0, 0], None),
     ],
 )
 def test_what_a_reset_was(
     change: Callable[[FloatArray], FloatArray], diagonal_of_F: list[int], variance: float | None
 ) -> None:
-    P = some_covariance()
     after = change(P)
     transition, noise = transition_of_reset(P, after)
     np.testing.assert_array_equal(transition, np.diag(diagonal_of_F))
@@ -387,8 +368,104 @@ def test_what_a_reset_was(
 
 
 def test_noise_is_what_was_given_unless_the_prediction_added_more() -> None:
-    P = some_covariance()
     predicted = F @ P @ F.T + Q
     assert added_noise(P, F, predicted, Q) is Q
     more = np.diag([0.0, 0.0, 0.0, 1e-3])
     np.testing.assert_allclose(added_noise(P, F, predicted + more, Q), Q + more, atol=1e-12)  # rounding of 10
+
+
+# -- figures against a reference --------------------------------------------------------------------------------------
+
+
+def trace(x_m: list[float], heading_rad: float = 0.0, *, first: int = 0, covariance: FloatArray | None = None) -> Trace:
+    k = len(x_m)
+    seq = np.arange(first, first + k)
+    pose = np.column_stack([x_m, np.zeros(k), np.full(k, heading_rad)])
+    t_s = np.array(0.01 * seq, dtype=np.float64)
+    return Trace(seq, t_s, pose, np.zeros(k), None if covariance is None else np.tile(covariance, (k, 1, 1)))
+
+
+def test_the_figures() -> None:
+    found = figures(errors_of(trace([0.001, 0.002, 0.003, 0.004], 0.002), trace([0.0] * 4), np.array([1, 3]), [2, 9]))
+    assert found["position_error_mm"] == pytest.approx({"mean": 2.5, "p50": 2.5, "p99": 3.97, "max": 4.0})
+    assert found["moving_error_mm"]["rms"] == pytest.approx(sqrt(10.0))  # of 2 and 4
+    assert found["arrival_error_mm"] == pytest.approx({"rms": 3.0, "max": 3.0})
+    assert found["heading_error_mrad"]["rms"] == pytest.approx(2.0)
+    assert found["nees_mean"] is None
+
+
+NONE = np.empty(0, dtype=np.int64)
+
+
+def test_frames_that_both_have_are_compared_with_height_and_the_short_way_round() -> None:
+    high = trace([0.003])._replace(height_m=np.array([0.004]))
+    assert errors_of(high, trace([0.0]), NONE, NONE).distance_m == pytest.approx([0.005])
+    shifted = errors_of(trace([1.0, 2.0, 3.0], first=4), trace([0.0, 0.0, 1.0], first=3), NONE, NONE)
+    assert shifted.distance_m.tolist() == [1.0, 1.0]
+    turned = errors_of(trace([0.0], pi - 0.01), trace([0.0], -pi + 0.02), NONE, NONE)
+    assert turned.turn_rad == pytest.approx([-0.03])
+
+
+def test_nees_takes_correlations_into_account() -> None:
+    covariance = np.array([[4e-6, 0.0, 1e-6], [0.0, 1.0, 0.0], [1e-6, 0.0, 1e-6]])
+    errors = errors_of(trace([0.002], 0.001, covariance=covariance), trace([0.0]), NONE, NONE)
+    # The inverse of [[4, 1], [1, 1]] is [[1, -1], [-1, 4]] / 3: (2, 1) gives (4 - 4 + 4) / 3.
+    assert errors.nees == pytest.approx([4.0 / 3.0])
+    singular = errors_of(trace([0.002], covariance=np.zeros((3, 3))), trace([0.0]), NONE, NONE)
+    assert figures(singular)["nees_mean"] is None
+
+
+@pytest.mark.parametrize(("by_m", "is_same"), [(0.0, True), (0.9 * REPRODUCED, True), (1.1 * REPRODUCED, False)])
+def test_a_replay_reproduces_up_to_rounding(by_m: float, is_same: bool) -> None:
+    found = difference(errors_of(trace([by_m, 0.0]), trace([0.0, 0.0]), NONE, NONE))
+    assert (found["reproduced"], found["frames"]) == (is_same, 2)
+    assert found["position_mm"] == pytest.approx({"rms": 1e3 * by_m / sqrt(2.0), "max": 1e3 * by_m}, abs=1e-15)
+    assert difference(errors_of(trace([0.0], by_m), trace([0.0]), NONE, NONE))["reproduced"] is is_same
+    assert not difference(errors_of(trace([1.0]), trace([1.0], first=7), NONE, NONE))["reproduced"]  # no common frame
+
+
+def test_the_distance_of_a_fix_is_that_to_the_estimate_before_it() -> None:
+    heights = MIRROR.surface.heights_m(np.array([0.0, 0.1, 0.2]), np.zeros(3))
+    estimate = trace([0.0, 0.1, 0.2], first=5)._replace(height_m=heights)
+    found = fix_distances_m(estimate, np.array([[6.0, 0.1, 0.003], [7.0, 0.2, 0.0]]), MIRROR)
+    assert found == pytest.approx([0.003, 0.0], abs=2e-5)  # the surface falls by less than that over 3 mm
+
+
+def judged(*, has_truth: bool, is_smoothed: bool = True, first: int = 0) -> ReplayEvaluation:
+    smoothed = trace([0.001, 0.0], first=first) if is_smoothed else None
+    replayed = Replayed(trace([0.002, 0.002], first=first, covariance=np.eye(3)), np.array([first]), smoothed=smoothed)
+    truth = trace([0.0, 0.0], first=first) if has_truth else None
+    return ReplayEvaluation(replayed, trace([0.004, 0.002], first=first), truth, NONE, MIRROR)
+
+
+def test_all_are_judged_by_the_truth_where_every_recording_has_one() -> None:
+    found = judge([judged(has_truth=True), judged(has_truth=True)])
+    assert found["reference"] == "truth"
+    means = {name: found[name]["position_error_mm"]["mean"] for name in ("recorded", "replayed", "smoothed")}
+    assert means == pytest.approx({"recorded": 3.0, "replayed": 2.0, "smoothed": 0.5})
+    assert found["difference"]["position_mm"]["max"] == pytest.approx(2.0)
+    assert found["difference"]["frames"] == 4
+    found = judge([judged(has_truth=True), judged(has_truth=False)])
+    assert found["reference"] == "recorded"
+    assert set(found["recorded"]) == {"fix_distance_mm"}
+    assert found["replayed"]["position_error_mm"]["max"] == pytest.approx(2.0)
+    assert judge([judged(has_truth=False, is_smoothed=False)])["smoothed"] is None
+
+
+def test_the_table_has_a_column_for_each_estimate() -> None:
+    lines = [" ".join(line.split()) for line in table_lines(judge([judged(has_truth=True)]))]
+    assert lines[0] == "error against the truth recorded replayed smoothed"
+    assert lines[1] == "position mean (mm) 3.0000 2.0000 0.5000"
+    assert lines[-2] == "position (mm) 1.4142 2.0000"
+    assert "at arrivals rms (mm) - - -" in lines
+    lines = [" ".join(line.split()) for line in table_lines(judge([judged(has_truth=False, is_smoothed=False)]))]
+    assert lines[:2] == ["error against the recorded estimate recorded replayed", "position mean (mm) - 1.0000"]
+    part = judged(has_truth=True)._replace(recorded=trace([0.002, 0.002 + 3e-14]))
+    assert list(table_lines(judge([part])))[-2].split()[-1] == "3.0e-11"
+
+
+def test_the_rows_of_the_csv() -> None:
+    head, first, _ = csv_lines([judged(has_truth=False, first=3)])
+    assert head.split(",")[:6] == ["part", "seq", "t_s", "x_m", "y_m", "heading_rad"]
+    assert head.split(",")[-3:] == ["true_x_m", "true_y_m", "true_heading_rad"]
+    assert first == "1,3,0.03,0.002,0.0,0.0,0.001,0.0,0.0,0.004,0.0,0.0,,,"

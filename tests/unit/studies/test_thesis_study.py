@@ -39,23 +39,31 @@ def test_the_table_is_read_as_sigma_or_as_variance(noise: str, table: float, noi
     assert sim.frame_hz == sim.imu_hz == sim.encoder_hz  # one sample per frame
 
 
-def test_a_fixed_step_believes_in_a_shorter_way() -> None:
-    cfg = load_config(overrides=overrides_of("normal", noise_is_variance=False, period_error=0.013))
-    mirror = build_mirror(cfg.mirror)
-    start = mirror.base_panel_pose
+CFG = load_config(overrides=overrides_of("normal", noise_is_variance=False, period_error=0.0))
+MIRROR = build_mirror(CFG.mirror)
+
+
+def built() -> ThesisLocalizer:
     filter_ = FILTERS["kf"](np.zeros(STATES), np.eye(STATES))
-    localizer = ThesisLocalizer(filter_, mirror, cfg.robot, cfg.localizer, start)
+    return ThesisLocalizer(filter_, MIRROR, CFG.robot, CFG.localizer, MIRROR.base_panel_pose)
+
+
+def step(localizer: ThesisLocalizer, t_s: float, rate: float) -> None:
+    localizer.step(t_s, [ImuSample(t_s, 0.0, 0.0)], [WheelSample(t_s, rate, rate)], [EdgeSample(t_s, 1, 1, 1, 1)])
+
+
+def test_a_fixed_step_believes_in_a_shorter_way() -> None:
+    localizer, start = built(), MIRROR.base_panel_pose
     localizer.period_factor = 1.013
-    period_s, rate = 0.01 * 1.013, 0.1 / cfg.robot.wheel_radius_m
+    period_s, rate = 0.01 * 1.013, 0.1 / CFG.robot.wheel_radius_m
     for k in range(101):
-        t_s = k * period_s
-        localizer.step(t_s, [ImuSample(t_s, 0.0, 0.0)], [WheelSample(t_s, rate, rate)], [EdgeSample(t_s, 1, 1, 1, 1)])
+        step(localizer, k * period_s, rate)
     pose = localizer.pose
     way_m = np.hypot(pose.x_m - start.x_m, pose.y_m - start.y_m)
     # 100 steps of 10 ms at 0.1 m/s, less what the filter needs to find the speed.
     assert way_m == pytest.approx(0.1, abs=1e-3)
     # A fix carries the true time; the localizer's own would be earlier than its path by now.
-    x, y, z = mirror.puck_world(localizer.deck_pose, cfg.robot.puck_height_m)
+    x, y, z = MIRROR.puck_world(localizer.deck_pose, CFG.robot.puck_height_m)
     t_s = 100 * period_s
     localizer.fuse_fix(Fix(t_s, (x, y, z), (1e-10, 0, 0, 0, 1e-10, 0, 0, 0, 1e-10), 1.0, (1, 2, 3, 4), 0.0))
     assert localizer.counts["fixes"] == 1
@@ -122,15 +130,12 @@ def test_every_figure_of_the_thesis_is_drawn(tmp_path: Path) -> None:
 
 
 def test_a_seam_replaces_the_heading(monkeypatch: pytest.MonkeyPatch) -> None:
-    cfg = load_config(overrides=overrides_of("normal", noise_is_variance=False, period_error=0.0))
-    mirror = build_mirror(cfg.mirror)
-    filter_ = FILTERS["kf"](np.zeros(STATES), np.eye(STATES))
-    localizer = ThesisLocalizer(filter_, mirror, cfg.robot, cfg.localizer, mirror.base_panel_pose)
-    localizer.step(0.0, [ImuSample(0.0, 0.0, 0.0)], [WheelSample(0.0, 0.0, 0.0)], [EdgeSample(0.0, 1, 1, 1, 1)])
+    localizer = built()
+    step(localizer, 0.0, 0.0)
     before_rad = localizer.pose.heading_rad
     monkeypatch.setattr(localizer._crossings, "scan", lambda *_: ["a transition"])
     monkeypatch.setattr(localizer._crossings, "headings", lambda *_: [HeadingFix(0.3, 1e-6)])
-    localizer.step(0.01, [ImuSample(0.01, 0.0, 0.0)], [WheelSample(0.01, 0.0, 0.0)], [EdgeSample(0.01, 1, 1, 1, 1)])
+    step(localizer, 0.01, 0.0)
     # Thirty sigmas of the start heading: the daemon's localizer would not believe it.
     assert localizer.pose.heading_rad - before_rad == pytest.approx(0.3, abs=1e-3)
     assert localizer.heading_sigma_rad == pytest.approx(1e-3)
@@ -138,8 +143,6 @@ def test_a_seam_replaces_the_heading(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_a_whole_run_reaches_all_waypoints() -> None:
-    keys = overrides_of("normal", noise_is_variance=False, period_error=0.0)
-    cfg = load_config(overrides={**keys, "run.seed": 1})
-    found = run_job(Job("thesis", {"period_error": 0.0}, 1, cfg))
+    found = run_job(Job("thesis", {"period_error": 0.0}, CFG.run.seed, CFG))
     assert (found.values["outcome"], found.values["waypoints"]) == ("complete", 36)
     assert found.values["localization"]["mean"] < 1.0  # a quiet world: white noise of the table, no disturbance
