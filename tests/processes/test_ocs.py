@@ -23,79 +23,64 @@ CROSSBAR = os.environ.get("CCATP_CROSSBAR") or shutil.which("crossbar")
 REALM, ROOT, INSTANCE = "test_realm", "observatory", "ccatp"
 
 
-def _router(folder: Path, port: int) -> None:
+def configure(folder: Path, port: int) -> None:
+    """The files of a router at a port, and of a site with one agent; JSON is YAML."""
     allow = {"call": True, "register": True, "publish": True, "subscribe": True}
     role = {"name": "anonymous", "permissions": [{"uri": "", "match": "prefix", "allow": allow, "cache": True}]}
-    endpoint = {"type": "tcp", "interface": "127.0.0.1", "port": port}
-    paths = {
-        "ws": {"type": "websocket", "serializers": ["cbor", "msgpack", "json"]},
-        "call": {"type": "caller", "realm": REALM, "role": "anonymous"},
+    web = {
+        "type": "web",
+        "endpoint": {"type": "tcp", "interface": "127.0.0.1", "port": port},
+        "paths": {
+            "ws": {"type": "websocket", "serializers": ["cbor", "msgpack", "json"]},
+            "call": {"type": "caller", "realm": REALM, "role": "anonymous"},
+        },
     }
-    worker = {
-        "type": "router",
-        "realms": [{"name": REALM, "roles": [role]}],
-        "transports": [{"type": "web", "endpoint": endpoint, "paths": paths}],
-    }
-    (folder / "config.json").write_text(json.dumps({"version": 2, "controller": {}, "workers": [worker]}))
-
-
-def _sites(folder: Path, port: int) -> Path:
-    """JSON is YAML."""
+    worker = {"type": "router", "realms": [{"name": REALM, "roles": [role]}], "transports": [web]}
     hub = {
         "wamp_server": f"ws://127.0.0.1:{port}/ws", "wamp_http": f"http://127.0.0.1:{port}/call",
         "wamp_realm": REALM, "address_root": ROOT, "registry_address": f"{ROOT}.registry",
     }  # fmt: skip
     host = {"agent-instances": [{"agent-class": "CcatpAgent", "instance-id": INSTANCE, "arguments": []}]}
-    path = folder / "sites.yaml"
-    path.write_text(json.dumps({"hub": hub, "hosts": {"localhost": host}}))
-    return path
+    (folder / "cb").mkdir()
+    (folder / "cb" / "config.json").write_text(json.dumps({"version": 2, "controller": {}, "workers": [worker]}))
+    (folder / "sites.yaml").write_text(json.dumps({"hub": hub, "hosts": {"localhost": host}}))
 
 
-def _wait_for_port(port: int, process: "subprocess.Popen[bytes]", timeout_s: float = 60.0) -> None:
-    deadline_s = time.monotonic() + timeout_s
-    while time.monotonic() < deadline_s:
-        assert process.poll() is None, "the crossbar router ended early"
-        with socket.socket() as probe:
-            if probe.connect_ex(("127.0.0.1", port)) == 0:
-                return
-        time.sleep(0.1)
-    raise AssertionError(f"nobody listens on port {port}")
+@contextmanager
+def started(log: Path, command: list[str], environment: dict[str, str]) -> Iterator["subprocess.Popen[bytes]"]:
+    """A program whose output goes to a file; it is ended at the end."""
+    with log.open("wb") as file:
+        process = subprocess.Popen(command, stdout=file, stderr=file, cwd=log.parent, env=environment)
+        try:
+            yield process
+        finally:
+            process.terminate()
+            try:
+                process.wait(20.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 @contextmanager
 def network(crossbar: str, folder: Path, port: int, *arguments: str) -> Iterator[list[str]]:
     """A router at a free port and the agent with these options; yields the options of an OCS client."""
-    (folder / "cb").mkdir()
-    _router(folder / "cb", port)
-    sites = _sites(folder, port)
-    with (folder / "crossbar.log").open("wb") as log, (folder / "agent.log").open("wb") as agent_log:
-        environment = {**os.environ, "CROSSBAR_DISABLE_VERSION_CHECK": "1"}
-        environment.pop("PYTHONPATH", None)  # it has an environment of its own
-        router = subprocess.Popen(
-            [crossbar, "start", "--cbdir", str(folder / "cb")], stdout=log, stderr=log, env=environment
-        )
-        try:
-            _wait_for_port(port, router)
-            options = ["--site-file", str(sites), "--site-host", "localhost"]
-            agent = subprocess.Popen(
-                [sys.executable, "-m", "ccatp.daemon.ocs_agent", *options, "--instance-id", INSTANCE, *arguments],
-                stdout=agent_log, stderr=agent_log, cwd=folder, env=child_environment(os.environ),
-            )  # fmt: skip
-            try:
-                yield options
-            finally:
-                _end(agent)
-        finally:
-            _end(router)
+    configure(folder, port)
+    environment = {**os.environ, "CROSSBAR_DISABLE_VERSION_CHECK": "1"}
+    environment.pop("PYTHONPATH", None)  # it has an environment of its own
+    options = ["--site-file", str(folder / "sites.yaml"), "--site-host", "localhost"]
+    agent = [sys.executable, "-m", "ccatp.daemon.ocs_agent", *options, "--instance-id", INSTANCE, *arguments]
 
+    def listens() -> bool:
+        assert router.poll() is None, "the crossbar router ended early"
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", port)) == 0
 
-def _end(process: "subprocess.Popen[bytes]") -> None:
-    process.terminate()
-    try:
-        process.wait(20.0)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+    start = [crossbar, "start", "--cbdir", str(folder / "cb")]
+    with started(folder / "crossbar.log", start, environment) as router:
+        until(listens)
+        with started(folder / "agent.log", agent, child_environment(os.environ)):
+            yield options
 
 
 def until(look: Callable[[], Any], timeout_s: float = 90.0) -> Any:
@@ -174,13 +159,8 @@ def test_survey_status_abort_from_an_ocs_client(tmp_path: Path, runtime_dir: Pat
         assert fed["running"]
         block = published(client_options)
         assert block["data"]["total"][0] == 18
-        assert block["data"]["state"][0] in (
-            "held",
-            "turning",
-            "driving",
-            "settling",
-            "measuring",
-        )  # of the last second
+        of_the_last_second = "held", "turning", "driving", "settling", "measuring"
+        assert block["data"]["state"][0] in of_the_last_second
         assert client.abort().session["success"]
         ended = client.survey.wait(timeout=120)
         assert "aborted, the robot is at base" in str(ended.session["messages"])

@@ -63,17 +63,6 @@ def test_two_panels_after_a_calibration_drive(start: Start, mirror: str) -> None
     check_two_panels(run)
 
 
-@pytest.mark.slow  # in process and through the sockets: test_rehearsal
-def test_the_same_seed_gives_the_same_summary_and_another_does_not(start: Start) -> None:
-    summaries = []
-    for seed in (7, 7, 8):
-        run = start("--panels", "1", "--seed", str(seed))
-        assert run.wait() == 0, run.stderr
-        summaries.append({key: value for key, value in run.summary.items() if key != "wall"})
-    assert summaries[0] == summaries[1]
-    assert summaries[0] | {"seed": 8} != summaries[2]
-
-
 def test_four_processes_beside_the_supervisor_and_two_interrupts_end_as_one(start: Start) -> None:
     run = start("--panels", "9")
     run.until(lambda status: status["done"] >= 2)
@@ -97,17 +86,6 @@ def test_a_simulated_robot_that_dies_ends_the_run_with_a_line(start: Start) -> N
     assert "Traceback" not in run.stderr
     assert "process dataloop was killed by SIGKILL: run ended, wheels held" in run.stderr
     assert run.measured == run.summary["points"]["measured"]
-
-
-@pytest.mark.slow  # while it drives: test_a_lockstep_pause; in virtual time: tests/faults/test_operator
-@pytest.mark.parametrize("state", ["driving", "turning", "measuring"])
-def test_emergency_brings_the_robot_to_base(start: Start, state: str) -> None:
-    run = start("--panels", "1", "--realtime")
-    run.until_state(state, done=1)
-    assert run.ask("emergency", **FIRE) == {"ok": True, "id": FIRE["id"], "latched": True, "code": 2}
-    assert run.wait() == 3, run.stderr
-    assert run.measured == run.summary["points"]["measured"] >= 1
-    assert run.summary["danger"]["falls"] == 0
 
 
 @pytest.mark.slow
@@ -272,9 +250,9 @@ def test_a_survey_goes_on_through_injected_faults_which_the_log_names(start: Sta
     of_gyroscope = logged("imu_wz")
     assert [e["event"] for e in of_gyroscope] == ["fault_begins", "fault_ended", "fault_injected"]
     assert {(e["type"], e["logger"]) for e in of_gyroscope} == {("stuck", "dataloop")}
-    last = of_gyroscope[-1]
-    assert (last["at_s"], last["from_s"], last["until_s"], last["samples"]) == (6.0, 6.0, 6.49, 50)
-    assert last["changed"] > 0
+    last = {"at_s": 6.0, "from_s": 6.0, "until_s": 6.49, "samples": 50}
+    assert {key: of_gyroscope[-1][key] for key in last} == last
+    assert of_gyroscope[-1]["changed"] > 0
 
 
 # -- the command itself -----------------------------------------------------------------------------------------------

@@ -9,12 +9,13 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import msgspec
 import pytest
 
 from ccatp.daemon import ocs_agent
-from ccatp.daemon.ocs_agent import OcsMissing, SurveyTask, add_arguments, feed_fields, main, register, survey_command
+from ccatp.daemon.ocs_agent import OcsMissing, SurveyTask, add_arguments, main, register, survey_command
 from ccatp.links.client import OperatorClient
 from ccatp.links.topics import MissionStatus
 from tests.unit.serving import serving
@@ -54,21 +55,24 @@ def status(**fields: object) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("code", "success", "told"),
-    [(0, True, "complete"), (3, False, "at base"), (4, False, "not at base"), (5, False, "did not answer"),
-     (7, False, "status 7")],
-)  # fmt: skip
-def test_a_survey_ends_as_its_process_does(code: int, success: bool, told: str, folder: Path) -> None:
+    ("program", "panels", "code", "success", "told"),
+    [
+        ("0", None, 0, True, "complete"),
+        ("3", None, 3, False, "at base"),
+        ("4", None, 4, False, "not at base"),
+        ("5", None, 5, False, "did not answer"),
+        ("7", None, 7, False, "status 7"),
+        ("0 if sys.argv[1:] == ['--panels', '3'] else 9", 3, 0, True, "the survey is complete"),
+    ],
+)
+def test_a_survey_ends_as_its_process_does(
+    program: str, panels: int | None, code: int, success: bool, told: str, folder: Path
+) -> None:
     session = Session()
-    done, text = surveys_of(folder, f"raise SystemExit({code})").survey(session)
+    done, text = surveys_of(folder, f"import sys; raise SystemExit({program})").survey(session, panels)
     assert done is success
     assert told in text
     assert session.data["exit_status"] == code
-
-
-def test_the_number_of_panels_goes_to_the_survey(folder: Path) -> None:
-    program = "import sys; raise SystemExit(0 if sys.argv[1:] == ['--panels', '3'] else 9)"
-    assert surveys_of(folder, program).survey(Session(), 3) == (True, "the survey is complete")
 
 
 def test_a_survey_that_says_nothing_is_ended(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,57 +135,28 @@ def test_the_monitor_publishes_until_it_is_stopped(folder: Path) -> None:
     assert [block["block_name"] for block in blocks] == ["daemon", "survey", "daemon", "survey"]
     assert blocks[0]["data"] == {"running": 1}
     assert blocks[1]["data"]["done"] == 5
+    assert all(isinstance(value, int | float | str) for value in blocks[1]["data"].values())
     session.status, blocks[:] = "running", []
     surveys_of(folder / "none").monitor(session, publish, 0.01)
     assert [block["data"] for block in blocks] == [{"running": 0}] * 3
 
 
-def test_feed_fields_are_plain(folder: Path) -> None:
-    assert all(isinstance(value, (int, float, str)) for value in feed_fields(NO_STATUS).values())
-
-
-class Agent:
-    """Notes what is registered."""
-
-    def __init__(self) -> None:
-        self.processes: dict[str, Any] = {}
-        self.tasks: dict[str, Any] = {}
-        self.feeds: list[str] = []
-        self.published: list[Any] = []
-
-    def register_feed(self, name: str, **_: object) -> None:
-        self.feeds.append(name)
-
-    def register_process(self, name: str, start: Any, stop: Any, **_: object) -> None:
-        self.processes[name] = (start, stop)
-
-    def register_task(self, name: str, start: Any, **_: object) -> None:
-        self.tasks[name] = start
-
-    def publish_to_feed(self, name: str, block: Any) -> None:
-        self.published.append((name, block))
-
-
 def test_what_the_agent_offers(folder: Path) -> None:
-    agent = Agent()
+    agent, session = MagicMock(), Session()
     register(agent, surveys_of(folder, "raise SystemExit(0)"), lambda *_, **__: lambda function: function, 0.01)
-    assert set(agent.processes) == {"survey", "monitor"}
-    assert set(agent.tasks) == {"status", "pause", "resume", "abort", "stop"}
-    assert agent.feeds == ["survey"]
-    assert agent.processes["survey"][0](Session(), {"panels": None})[0]
-    session = Session()
-    assert agent.processes["monitor"][1](session, {})[0]
+    processes = {call.args[0]: call.args[1:] for call in agent.register_process.call_args_list}
+    tasks = {call.args[0]: call.args[1] for call in agent.register_task.call_args_list}
+    assert processes.keys() == {"survey", "monitor"}
+    assert tasks.keys() == {"status", "pause", "resume", "abort", "stop"}
+    assert [call.args[0] for call in agent.register_feed.call_args_list] == ["survey"]
+    assert processes["survey"][0](session, {"panels": None})[0]
+    assert not tasks["abort"](session, {})[0]
+    assert "**Task**" in tasks["abort"].__doc__
+    monitor, stop = processes["monitor"]
+    agent.publish_to_feed.side_effect = lambda *_: stop(session, {})
+    assert monitor(session, {})[0]
     assert session.status == "stopping"
-    assert not agent.tasks["abort"](Session(), {})[0]
-    assert "**Task**" in agent.tasks["abort"].__doc__
-    session.status = "running"
-    thread = threading.Thread(target=agent.processes["monitor"][0], args=(session, {}))
-    thread.start()
-    while not agent.published:
-        time.sleep(0.001)
-    session.status = "stopping"
-    thread.join()
-    assert agent.published[0][0] == "survey"
+    assert agent.publish_to_feed.call_args_list[0].args[0] == "survey"
 
 
 def test_the_command_of_a_survey() -> None:

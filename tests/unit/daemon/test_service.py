@@ -11,19 +11,18 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import structlog
+from structlog.testing import capture_logs
 
+from ccatp.config.load import load_config
 from ccatp.daemon import realtime
-from ccatp.daemon.service import Notifier, Service, take_from, watchdog_period_s
+from ccatp.daemon.service import Notifier, Service, take_from
 from ccatp.links.liveness import Liveness
 from ccatp.links.topics import Heartbeat, MissionStatus
 
-ROOT = Path(__file__).parents[3]
-UNIT = ROOT / "packaging" / "ccatp.service"
-
+UNIT = Path(__file__).parents[3] / "packaging" / "ccatp.service"
 NO_STATUS = MissionStatus(seq=-1, t_s=0.0, state="")
 
 
@@ -31,6 +30,7 @@ class Manager:
     """A service manager's end of the notification socket."""
 
     def __init__(self, address: str) -> None:
+        self.address = address
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self.socket.bind("\0" + address[1:] if address.startswith("@") else address)
         self.socket.setblocking(False)
@@ -45,10 +45,9 @@ class Manager:
 
 
 @pytest.fixture(params=["path", "abstract"])
-def manager(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Manager, str]]:
-    address = str(tmp_path / "notify") if request.param == "path" else f"@ccatp-test-{os.getpid()}"
-    manager = Manager(address)
-    yield manager, address
+def manager(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Manager]:
+    manager = Manager(str(tmp_path / "notify") if request.param == "path" else f"@ccatp-test-{os.getpid()}")
+    yield manager
     manager.socket.close()
 
 
@@ -56,10 +55,9 @@ def presence(name: str, t_s: float, phase: str = "joined", frame_age_s: float | 
     return Heartbeat(seq=0, t_s=t_s, process=name, pid=1, phase=phase, frame_age_s=frame_age_s)
 
 
-def test_lines_reach_the_service_manager(manager: tuple[Manager, str]) -> None:
-    ear, address = manager
-    Notifier(address).send("READY=1", "STATUS=well")
-    assert ear.heard() == ["READY=1\nSTATUS=well"]
+def both_alive(service: Service, t_s: float) -> None:
+    for name in ("main", "danger"):
+        service.on_heartbeat(presence(name, t_s))
 
 
 def test_a_service_manager_that_is_gone_or_deaf_holds_nobody_up(tmp_path: Path) -> None:
@@ -67,7 +65,7 @@ def test_a_service_manager_that_is_gone_or_deaf_holds_nobody_up(tmp_path: Path) 
     Notifier(str(tmp_path / "none")).send("READY=1")
     deaf = Manager(str(tmp_path / "notify"))
     for _ in range(10_000):  # more than its queue holds
-        Notifier(str(tmp_path / "notify")).send("WATCHDOG=1")
+        Notifier(deaf.address).send("WATCHDOG=1")
     assert 0 < len(deaf.heard()) < 10_000  # what its queue took is there, the rest was dropped without a wait
     deaf.socket.close()
 
@@ -85,13 +83,10 @@ def test_a_service_manager_that_is_gone_or_deaf_holds_nobody_up(tmp_path: Path) 
     ],
 )
 def test_the_watchdog_is_for_the_process_it_names(environ: dict[str, str], period_s: float | None) -> None:
-    assert watchdog_period_s(environ) == period_s
-
-
-def test_children_do_not_inherit_the_service_manager() -> None:
-    environ = {"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "2000000", "PATH": "/bin"}
-    notifier, period_s = take_from(environ)
-    assert (notifier.has_listener, period_s, environ) == (True, 2.0, {"PATH": "/bin"})
+    environ |= {"NOTIFY_SOCKET": "/x", "PATH": "/bin"}
+    notifier, found_s = take_from(environ)
+    assert (notifier.has_listener, found_s) == (True, period_s)
+    assert environ == {"PATH": "/bin"}  # children do not inherit the service manager
 
 
 # -- what is alive ----------------------------------------------------------------------------------------------------
@@ -99,13 +94,13 @@ def test_children_do_not_inherit_the_service_manager() -> None:
 
 def test_both_loops_must_have_joined() -> None:
     liveness = Liveness(1.0)
-    assert not liveness.has_joined
-    liveness.update(presence("main", 0.0))
-    assert not liveness.has_joined
-    liveness.update(presence("danger", 0.0, "starting"))
-    assert not liveness.has_joined
-    liveness.update(presence("danger", 0.0))
-    assert liveness.has_joined
+    for one, has_joined in (
+        (presence("main", 0.0), False),
+        (presence("danger", 0.0, "starting"), False),
+        (presence("danger", 0.0), True),
+    ):
+        liveness.update(one)
+        assert liveness.has_joined is has_joined
 
 
 @pytest.mark.parametrize(
@@ -122,76 +117,58 @@ def test_both_loops_must_have_joined() -> None:
 )
 def test_trouble(main: Heartbeat, danger: Heartbeat | None, trouble: str) -> None:
     liveness = Liveness(1.0)
-    liveness.update(main)
-    if danger is not None:
-        liveness.update(danger)
-    found = liveness.trouble(10.0)
-    assert re.fullmatch(trouble, found)
+    for one in (main, danger):
+        if one is not None:
+            liveness.update(one)
+    assert re.fullmatch(trouble, liveness.trouble(10.0))
 
 
-def test_a_service_from_its_start_to_its_end(manager: tuple[Manager, str]) -> None:
-    ear, address = manager
-    service = Service(Notifier(address), 2.0)
+def test_a_service_from_its_start_to_its_end(manager: Manager) -> None:
+    service = Service(Notifier(manager.address), 2.0)
     service.update(0.0, None)
     service.on_heartbeat(presence("main", 0.0))
     service.update(0.1, None)
-    assert ear.heard() == []  # danger has not joined
+    assert manager.heard() == []  # danger has not joined
     service.on_heartbeat(presence("danger", 0.1))
     service.update(0.2, None)
-    assert ear.heard() == ["READY=1"]
+    assert manager.heard() == ["READY=1"]
     for tick in range(3, 33):
-        now_s = 0.1 * tick
-        for name in ("main", "danger"):
-            service.on_heartbeat(presence(name, now_s))
-        service.update(now_s, NO_STATUS)
-    told = ear.heard()
+        both_alive(service, 0.1 * tick)
+        service.update(0.1 * tick, NO_STATUS)
+    told = manager.heard()
     assert told.count("WATCHDOG=1") == 6  # every half second
     assert [line for line in told if line.startswith("STATUS")] == ["STATUS=, 0 of 0 points"]
     service.on_heartbeat(presence("main", 6.0))  # danger was last heard of at 3.2 s
     service.update(6.0, NO_STATUS)
     service.update(6.6, NO_STATUS)
-    assert ear.heard() == ["STATUS=trouble: danger sent its last heartbeat 2.8 s ago"]
-    for name in ("main", "danger"):
-        service.on_heartbeat(presence(name, 6.7))
+    assert manager.heard() == ["STATUS=trouble: danger sent its last heartbeat 2.8 s ago"]
+    both_alive(service, 6.7)
     service.update(6.7, NO_STATUS)
-    assert ear.heard() == ["WATCHDOG=1", "STATUS=, 0 of 0 points"]
+    assert manager.heard() == ["WATCHDOG=1", "STATUS=, 0 of 0 points"]
     service.stopping()
-    assert ear.heard() == ["STOPPING=1\nSTATUS=holding the wheels and saving"]
+    assert manager.heard() == ["STOPPING=1\nSTATUS=holding the wheels and saving"]
 
 
-def test_silence_counts_well_before_a_short_watchdog_bites(manager: tuple[Manager, str]) -> None:
-    ear, address = manager
-    service = Service(Notifier(address), 0.4)
-    for name in ("main", "danger"):
-        service.on_heartbeat(presence(name, 0.0))
-    service.update(0.0, None)
-    service.update(0.19, None)
-    service.update(0.3, None)
-    assert ear.heard() == [
-        "READY=1", "WATCHDOG=1", "STATUS=joined the robot", "STATUS=trouble: main sent its last heartbeat 0.3 s ago"
-    ]  # fmt: skip
-
-
-def test_without_a_watchdog_none_is_stroked(manager: tuple[Manager, str]) -> None:
-    ear, address = manager
-    service = Service(Notifier(address), None)
-    for name in ("main", "danger"):
-        service.on_heartbeat(presence(name, 0.0))
-    service.update(0.0, None)
-    service.update(0.5, None)
-    assert ear.heard() == ["READY=1", "STATUS=joined the robot"]
+@pytest.mark.parametrize(
+    ("watchdog_s", "told"),
+    [
+        # Silence counts well before a short watchdog bites.
+        (
+            0.4,
+            ["WATCHDOG=1", "STATUS=joined the robot", "STATUS=trouble: main sent its last heartbeat 0.3 s ago"],
+        ),
+        (None, ["STATUS=joined the robot"]),
+    ],
+)
+def test_a_short_watchdog_and_none(manager: Manager, watchdog_s: float | None, told: list[str]) -> None:
+    service = Service(Notifier(manager.address), watchdog_s)
+    both_alive(service, 0.0)
+    for now_s in (0.0, 0.19, 0.3):
+        service.update(now_s, None)
+    assert manager.heard() == ["READY=1", *told]
 
 
 # -- real time --------------------------------------------------------------------------------------------------------
-
-
-def logger(lines: list[dict[str, Any]]) -> structlog.typing.FilteringBoundLogger:
-    def keep(_logger: object, method: str, event: Any) -> Any:
-        lines.append({"level": method, **event})
-        raise structlog.DropEvent
-
-    log: structlog.typing.FilteringBoundLogger = structlog.wrap_logger(None, processors=[keep])
-    return log
 
 
 def test_without_permission_there_is_one_warning_that_says_what_holds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -200,20 +177,14 @@ def test_without_permission_there_is_one_warning_that_says_what_holds(monkeypatc
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(resource, "setrlimit", refuse)
-    lines: list[dict[str, Any]] = []
-    realtime.enter(40, logger(lines))
+    with capture_logs() as lines:
+        realtime.enter(0, structlog.get_logger())  # changes nothing
+        realtime.enter(40, structlog.get_logger())
     (line,) = lines
-    assert line["level"] == "warning"
+    assert line["log_level"] == "warning"
     assert line["missing"][0] == "SCHED_FIFO 40: Operation not permitted; the unit grants it with LimitRTPRIO"
     assert "the unit grants it with LimitMEMLOCK=infinity" in line["missing"][1]
     assert "time-to-live" in line["without"]
-
-
-def test_priority_0_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "sched_setscheduler", lambda *_: pytest.fail("called"))
-    lines: list[dict[str, Any]] = []
-    realtime.enter(0, logger(lines))
-    assert lines == []
 
 
 REALTIME = """
@@ -274,68 +245,55 @@ def test_a_reserved_heap_grows_without_new_memory(reserve_bytes: int, least_kib:
 # -- the unit ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def unit(tmp_path: Path) -> Path:
-    """The unit with a program that exists here in the place of the installed one."""
+def analyze(tmp_path: Path, *args: str) -> "subprocess.CompletedProcess[str] | None":
+    """What systemd says of the unit, with a program that exists here in the place of the installed one."""
+    program = shutil.which("systemd-analyze")
+    if program is None:
+        return None
     path = tmp_path / UNIT.name
     path.write_text(UNIT.read_text().replace("/opt/ccatp/bin/ccatp", sys.executable))
-    return path
+    return subprocess.run([program, *args, str(path)], capture_output=True, text=True, timeout=60, check=False)
 
 
-def analyze(*args: str) -> subprocess.CompletedProcess[str]:
-    program = shutil.which("systemd-analyze")
-    assert program is not None
-    return subprocess.run([program, *args], capture_output=True, text=True, timeout=60, check=False)
+def settings() -> dict[str, str]:
+    """The settings of [Service]; of those that are repeated the last one."""
+    parser = configparser.ConfigParser(strict=False, interpolation=None, delimiters=("=",))
+    parser.optionxform = str  # type: ignore[assignment, method-assign]
+    parser.read(UNIT)
+    assert parser.sections() == ["Unit", "Service", "Install"]
+    return dict(parser["Service"])
 
 
-def settings() -> dict[str, list[str]]:
-    """The settings of [Service], each with all its values."""
-    found: dict[str, list[str]] = {}
-    section = ""
-    for line in UNIT.read_text().splitlines():
-        if line.startswith("["):
-            section = line
-        elif line and not line.startswith("#"):
-            key, equals, value = line.partition("=")
-            assert equals, line
-            assert section, line
-            if section == "[Service]":
-                found.setdefault(key, []).append(value)
-    return found
+def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
+    result = analyze(tmp_path, "verify")
+    if result is None:  # then at least it is a unit file, without unknown sections
+        assert settings()
+    else:
+        assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
 
 
-def test_systemd_has_nothing_to_say_about_the_unit(unit: Path) -> None:
-    if shutil.which("systemd-analyze") is None:  # then at least it is a unit file, without unknown sections
-        parser = configparser.ConfigParser(strict=False, interpolation=None)
-        parser.read(UNIT)
-        assert parser.sections() == ["Unit", "Service", "Install"]
-        return
-    result = analyze("verify", str(unit))
-    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
-
-
-def test_the_unit_exposes_little(unit: Path) -> None:
-    if shutil.which("systemd-analyze") is None:  # then at least the settings that weigh most
-        for key in ("NoNewPrivileges", "PrivateDevices", "PrivateUsers", "ProtectKernelModules", "RestrictNamespaces"):
-            assert settings()[key] == ["yes"]
-        assert settings()["CapabilityBoundingSet"] == [""]
-        return
+def test_the_unit_exposes_little(tmp_path: Path) -> None:
     # In tenths: 15 is an exposure of 1.5.
-    result = analyze("security", "--offline=true", "--no-pager", "--threshold=15", str(unit))
-    assert result.returncode == 0, result.stdout
+    result = analyze(tmp_path, "security", "--offline=true", "--no-pager", "--threshold=15")
+    if result is None:  # then at least the settings that weigh most
+        for key in ("NoNewPrivileges", "PrivateDevices", "PrivateUsers", "ProtectKernelModules", "RestrictNamespaces"):
+            assert settings()[key] == "yes"
+        assert settings()["CapabilityBoundingSet"] == ""
+    else:
+        assert result.returncode == 0, result.stdout
 
 
 def test_the_unit_grants_what_the_loops_ask_for() -> None:
+    wanted = {
+        "Type": "notify",
+        "LimitMEMLOCK": "infinity",
+        "RestrictRealtime": "no",
+        "RuntimeDirectoryMode": "0700",
+        "Restart": "on-failure",
+        "RestartPreventExitStatus": "1 2 4",
+    }
     found = settings()
-    assert found["Type"] == ["notify"]
-    assert found["LimitMEMLOCK"] == ["infinity"]
-    from ccatp.config.load import load_config
-
-    assert int(found["LimitRTPRIO"][0]) >= load_config().run.realtime_priority > 0
-    assert found["RestrictRealtime"] == ["no"]
-    assert found["RuntimeDirectoryMode"] == ["0700"]
-    assert "--runtime-dir /run/ccatp" in found["ExecStart"][0]
-    # What is restarted begins held.
-    assert "--resume-last" in found["ExecStart"][0]
-    assert found["Restart"] == ["on-failure"]
-    assert found["RestartPreventExitStatus"] == ["1 2 4"]
+    assert {key: found[key] for key in wanted} == wanted
+    assert int(found["LimitRTPRIO"]) >= load_config().run.realtime_priority > 0
+    assert "--runtime-dir /run/ccatp" in found["ExecStart"]
+    assert "--resume-last" in found["ExecStart"]  # what is restarted begins held
