@@ -17,15 +17,7 @@ from ccatp.config.models import EtalonConfig
 from ccatp.core import Fix, Vector3
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.links import multiline
-from ccatp.links.multiline import (
-    ChannelData,
-    Command,
-    Connected,
-    Environment,
-    LaserReady,
-    MultilineRequest,
-    Remark,
-)
+from ccatp.links.multiline import ChannelData, Command, Connected, Environment, LaserReady, MultilineRequest, Remark
 from ccatp.links.robot_messages import LineBuffer, LineTooLong
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 

@@ -21,10 +21,7 @@ def _run(cfg: Config, puck: ZmqPuck | FixedPuck, listener: socket.socket | None)
 
     async def run(stop: asyncio.Event) -> int:
         rng = np.random.default_rng([cfg.run.seed, SEED_STREAM])
-        measuring_time_s = cfg.etalon.measuring_time_s
-        server = EtalonSimulator(
-            at, mirror.channels, mirror.collimators_m, puck, rng, measuring_time_s=measuring_time_s
-        )
+        server = EtalonSimulator(at, mirror.channels, mirror.collimators_m, puck, rng)
         try:
             port = await server.start(at.host, at.port, listener)
         except OSError as error:

@@ -103,7 +103,7 @@ _BUSY = Remark("error", "busy")
 class EtalonSimulator:
     """The server of k channels with collimators in the world frame, shape (k, 3).
 
-    ``moved_m`` of ``truth`` is meant over ``measuring_time_s``, in which a length is averaged.
+    ``moved_m`` of ``truth`` is meant over the time in which a length is averaged.
 
     Attributes:
         model: lengths and flags; ``blocked``, ``flags`` and ``laser_ready`` may be changed at any time.
@@ -119,11 +119,8 @@ class EtalonSimulator:
         collimators_m: NDArray[np.float64],
         truth: PuckSource,
         rng: np.random.Generator,
-        *,
-        measuring_time_s: float,
     ) -> None:
         self.model = EtalonModel(cfg, mirror_channels, collimators_m, rng)
-        self.measuring_time_s = measuring_time_s
         self.connected = True
         self.push_hz = 5.0
         self.counts: Counter[str] = Counter()

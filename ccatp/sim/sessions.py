@@ -136,7 +136,7 @@ class RobotServer:
         self._sessions: set[RobotSession] = set()
         self._holders: dict[Role, RobotSession] = {}
         self._last_session = 0
-        self._is_drive_acked = self._is_permit_acked = False
+        self._acked: set[Role] = set()  # roles that have answered the newest frame
         self._frame_wall_s = now_s
         self._is_stall_noted = False
         self._reboots = robot.reboots
@@ -160,10 +160,7 @@ class RobotServer:
             return
         del self._holders[role]
         self.robot.lose(role)
-        if role == "controller":
-            self._is_drive_acked = False
-        else:
-            self._is_permit_acked = False
+        self._acked.discard(role)
         self._note(f"{role} lost: wheels held")
 
     def drop(self, session: RobotSession, why: str) -> None:
@@ -187,7 +184,7 @@ class RobotServer:
             return
         if now_s - self._frame_wall_s > STALL_S:
             self._is_stall_noted = True
-            missing = "permit" if self._is_drive_acked else "drive"
+            missing = "permit" if "controller" in self._acked else "drive"
             self._note(f"stall: frame {self.robot.delivered_seq} waits for its {missing}")
 
     def join(self, session: RobotSession, message: FromClient, now_s: float) -> None:
@@ -239,12 +236,10 @@ class RobotServer:
         robot = self.robot
         if role == "controller" and isinstance(message, Drive):
             taken = robot.drive(message.seq, message.wr, message.wl, robot_s, message.steer)
-            self._is_drive_acked |= taken and message.ack == robot.delivered_seq
             if taken and (message.wr or message.wl):
                 self.oldest_ack_frames = max(self.oldest_ack_frames, robot.delivered_seq - message.ack)
         elif role == "monitor" and isinstance(message, Permit):
             taken = robot.permit(message.seq, message.forward, message.reverse, message.turn, robot_s)
-            self._is_permit_acked |= taken and message.ack == robot.delivered_seq
         elif role == "controller" and isinstance(message, FansMessage):
             before = robot.fans.duty
             taken = robot.command_fans(message.seq, *message.duty)
@@ -253,8 +248,10 @@ class RobotServer:
             return False
         session.received_s = robot_s
         self.counts["stale"] += not taken
-        has_permit = self._is_permit_acked or not robot.rules.has_monitor_joined
-        if self._is_lockstep and self._is_drive_acked and has_permit:
+        if taken and not isinstance(message, FansMessage) and message.ack == robot.delivered_seq:
+            self._acked.add(role)
+        needed = {"controller", "monitor"} if robot.rules.has_monitor_joined else {"controller"}
+        if self._is_lockstep and needed <= self._acked:
             self._advance(now_s)
         return True
 
@@ -282,7 +279,7 @@ class RobotServer:
         return 0.0
 
     def _advance(self, now_s: float) -> None:
-        self._is_drive_acked = self._is_permit_acked = False
+        self._acked.clear()
         self._frame_wall_s, self._is_stall_noted = now_s, False
         self.robot.advance()
         self._on_frame()

@@ -23,15 +23,7 @@ from ccatp.danger import DangerMonitor
 from ccatp.errors import ConfigError
 from ccatp.links.auth import AuthorizedClient, KeyPair, Role, decode_key, read_pair, write_pair
 from ccatp.links.channels import format_ok, format_request, parse_reply
-from ccatp.links.rpc import (
-    MAX_CONNECTIONS,
-    CurveClient,
-    Router,
-    RouterError,
-    ZapHandler,
-    request,
-    turn_away,
-)
+from ccatp.links.rpc import MAX_CONNECTIONS, CurveClient, Router, RouterError, ZapHandler, request, turn_away
 from tests.contract.test_channels import Desk
 
 DEADLINE_S = 20.0

@@ -21,15 +21,7 @@ from ccatp.etalon_client import (
     Readiness,
     TooFewChannels,
 )
-from ccatp.links.multiline import (
-    ChannelData,
-    ChannelRecord,
-    Connected,
-    Environment,
-    LaserReady,
-    Remark,
-    format_reply,
-)
+from ccatp.links.multiline import ChannelData, ChannelRecord, Connected, Environment, LaserReady, Remark, format_reply
 
 CHANNELS = (1, 2, 3, 4, 5, 6, 7, 8)
 COLLIMATORS = np.array([[x, y, z] for x in (-4.0, 5.0) for y in (-5.0, 4.0) for z in (-3.0, 6.0)])

@@ -29,7 +29,7 @@ DEAD = b"0,0," + AIR + b",0,0,0,0,0,0,0,0,0,1"
 
 def standin(truth: PuckSource | None = None, cfg: SimEtalonConfig = QUIET, seed: int = 3) -> EtalonSimulator:
     puck = truth or FixedPuck((0.0, 0.0, 0.0))
-    return EtalonSimulator(cfg, CHANNELS, COLLIMATORS, puck, np.random.default_rng(seed), measuring_time_s=0.5)
+    return EtalonSimulator(cfg, CHANNELS, COLLIMATORS, puck, np.random.default_rng(seed))
 
 
 @asynccontextmanager

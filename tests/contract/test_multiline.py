@@ -1,6 +1,5 @@
 """The MultiLine grammar to the byte, both directions."""
 
-import contextlib
 import math
 
 import pytest
@@ -150,20 +149,6 @@ def test_a_line_that_is_no_request_is_refused_with_a_reason(line: bytes, reason:
 def test_a_line_that_is_no_reply_is_refused(line: bytes) -> None:
     with pytest.raises(BadReply, match=r"^bad reply '"):
         parse_reply(line)
-
-
-@given(st.binary(max_size=200))
-def test_any_bytes_give_a_message_or_the_typed_error(line: bytes) -> None:
-    with contextlib.suppress(BadReply):
-        parse_reply(line)
-    with contextlib.suppress(BadMultilineRequest):
-        parse_request(line)
-
-
-@given(st.integers(0, len(EXAMPLE) - 1), st.binary(min_size=0, max_size=3))
-def test_any_damage_to_a_reply_gives_a_message_or_the_typed_error(at: int, insert: bytes) -> None:
-    with contextlib.suppress(BadReply):
-        assert isinstance(parse_reply(EXAMPLE[:at] + insert + EXAMPLE[at + 1 :]), ChannelData | Remark)
 
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)

@@ -150,9 +150,7 @@ def test_a_point_takes_ten_seconds_at_most(action: Any, config: Config, tmp_path
 @pytest.mark.fault("E10")
 def test_a_beam_that_is_free_again_costs_a_retry(config: Config, tmp_path: Path, measured: Measured) -> None:
     async def story() -> tuple[float, list[PointId | None], int]:
-        standin = EtalonSimulator(
-            config.sim.etalon, CHANNELS, COLLIMATORS, FixedPuck(PUCK), np.random.default_rng(4), measuring_time_s=0.5
-        )
+        standin = EtalonSimulator(config.sim.etalon, CHANNELS, COLLIMATORS, FixedPuck(PUCK), np.random.default_rng(4))
         async with desk_of(config, await standin.start("127.0.0.1", 0), tmp_path) as (desk, client, _):
             standin.model.blocked.update(CHANNELS[3:])
             asyncio.get_running_loop().call_later(0.8, standin.model.blocked.clear)

@@ -164,8 +164,7 @@ async def survey(folder: Path, runtime_dir: Path) -> AsyncIterator[Survey]:
         port = await robot.start()
         puck = ZmqPuck(puck_at)
         stack.callback(puck.close)
-        laser = EtalonSimulator(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1),
-                              measuring_time_s=cfg.etalon.measuring_time_s)  # fmt: skip
+        laser = EtalonSimulator(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1))
         laser_port = await laser.start("127.0.0.1", 0)
         stack.push_async_callback(laser.close)
         proxy = await stack.enter_async_context(FaultProxy("127.0.0.1", port, seed=1))

@@ -24,13 +24,7 @@ from ccatp.records.recorder import (
     read_metadata,
     recordings,
 )
-from ccatp.records.recording_repair import (
-    RecordingError,
-    read_facts,
-    recording_files,
-    recover,
-    strict_faults,
-)
+from ccatp.records.recording_repair import RecordingError, read_facts, recording_files, recover, strict_faults
 
 SCHEMA: dict[str, Any] = {"type": "object", "title": "x.Track", "properties": {"n": {"type": "integer"}}}
 TOPICS: list[tuple[str, dict[str, Any]]] = [("track", SCHEMA), ("fix", {"type": "object"})]

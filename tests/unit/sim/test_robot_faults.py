@@ -15,15 +15,7 @@ from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.fault_injector import InjectionRecord, make_sensor_fault
-from ccatp.sim.fault_plan import (
-    LINK_TYPES,
-    TYPES,
-    FaultPlan,
-    Injected,
-    check_pacing,
-    parse_plan,
-    read_plan,
-)
+from ccatp.sim.fault_plan import LINK_TYPES, TYPES, FaultPlan, Injected, check_pacing, parse_plan, read_plan
 from ccatp.sim.robot import Robot
 
 FAULT = '[[fault]]\nsignal = "imu_wz"\nat_s = 1.0\n'
