@@ -146,9 +146,10 @@ def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.Fi
         return by_hand
     # Imported late: not needed while the robot moves.
     from ccatp.records.run_reader import RunReadError  # noqa: PLC0415
-    from ccatp.report.run_page import report_run  # noqa: PLC0415
 
     try:
+        from ccatp.report.run_page import report_run  # noqa: PLC0415
+
         return str(report_run(run_dir).path)
     except RunReadError as error:
         return f"none; {error}"

@@ -6,6 +6,7 @@ where it is a parameter the calls of that function in the same file. What varies
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -48,6 +49,7 @@ def files() -> Iterator[Path]:
         yield from sorted(path.rglob("*.py")) if path.is_dir() else [path]
 
 
+@cache
 def causes() -> dict[str, Cause]:
     """Every cause that the code can form."""
     found: dict[str, Cause] = {}

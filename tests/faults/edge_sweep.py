@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
-from math import acos, atan2, ceil, cos, hypot, pi, radians, sin
+from math import acos, atan2, ceil, cos, hypot, inf, pi, radians, sin
 from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
@@ -35,6 +35,8 @@ HEADINGS = range(0, 360, 5)
 SPEEDS_M_S = (0.005, 0.02, 0.05, 0.1, 0.15)
 TURNS_RAD_S = (-1.0, -0.2, 0.2, 1.0)
 ERRORS = EdgeErrors(position_m=1.5e-3, heading_rad=2e-3)
+Error = tuple[float, float, float]
+BLIND: Error = (inf, inf, inf)
 OVERRUN_M = 0.020  # invariant I5
 SLOWEST_COSINE = cos(radians(85.5))  # a way that is closer to the rim's direction than this does not lead over it
 RUN_UP_M = 0.004  # of the first sensor to the rim: the rules have a track before it goes off
@@ -53,7 +55,7 @@ class Place(NamedTuple):
 
 @dataclass(slots=True)
 class Tally:
-    """What became of the drives."""
+    """What became of the drives: numbers of them, and the worst of each length and time."""
 
     drives: int = 0
     impossible: int = 0  # the robot cannot stand anywhere on the way
@@ -62,23 +64,16 @@ class Tally:
     after_m: float = 0.0  # furthest way of a sensor after the declaration
     beyond_m: float = 0.0  # furthest sensor beyond the rim
     late_s: float = 0.0  # longest from the first sensor beyond the rim to the withheld permit
+    centre_m: float = -10.0  # furthest centre beyond the rim
     transits: int = 0
     over_gap: int = 0  # stops with a sensor over the gap
     false_edges: int = 0
     worst: list[str] = field(default_factory=list)
 
     def add(self, other: "Tally") -> None:
-        self.drives += other.drives
-        self.impossible += other.impossible
-        self.falls += other.falls
-        self.unseen += other.unseen
-        self.after_m = max(self.after_m, other.after_m)
-        self.beyond_m = max(self.beyond_m, other.beyond_m)
-        self.late_s = max(self.late_s, other.late_s)
-        self.transits += other.transits
-        self.over_gap += other.over_gap
-        self.false_edges += other.false_edges
-        self.worst += other.worst
+        for name, value in asdict(other).items():
+            is_worst_of_all = name.endswith(("_m", "_s"))
+            setattr(self, name, max(getattr(self, name), value) if is_worst_of_all else getattr(self, name) + value)
 
     @property
     def line(self) -> str:
@@ -131,22 +126,33 @@ def start_before(name: str, place: Place, heading_rad: float, sign: float) -> De
     return DeckPose(float(xs[k, 0]), float(ys[k, 0]), heading_rad)
 
 
-class _Drive:
-    """A robot that does what it is told until the danger rules forbid it."""
+class Drive:
+    """A robot that does what it is told until the danger rules forbid it.
 
-    def __init__(self, name: str, start: DeckPose, rng: np.random.Generator) -> None:
+    Args:
+        error: of the estimate, x and y (m) and heading (rad), in place of one that is drawn; ``BLIND``: there is none.
+    """
+
+    def __init__(self, name: str, start: DeckPose, rng: np.random.Generator, error: Error | None = None) -> None:
         self.cfg, self.mirror = world(name)
         self.rig = Rig(self.mirror, self.cfg, start, ERRORS, rng)
+        self._is_blind = error is BLIND
+        if error is not None:
+            self.rig._error = error
+            self.rig._estimate = self.rig._estimated()
         self.monitor = DangerMonitor(self.mirror, self.cfg.robot, self.cfg.danger)
         self.hz = self.cfg.sim.robot.frame_hz
         self.delay = round((self.cfg.world.sensors_delay_s + self.cfg.world.commands_delay_s) * self.hz)
         self.has_edge = False
 
     def frame(self, right: float, left: float) -> Verdict:
-        seen = self.rig.frame(right, left)
-        verdict = self.monitor.step(*seen)
+        frame, estimate = self.rig.frame(right, left)
+        verdict = self.monitor.step(frame, None if self._is_blind else estimate)
         self.has_edge |= verdict.code is EventCode.NEAR_EDGE
         return verdict
+
+    def has_gone_m(self, start: DeckPose) -> float:
+        return hypot(self.rig.plant.x_m - start.x_m, self.rig.plant.y_m - start.y_m)
 
     def beyond_m(self) -> list[float]:
         return [-self.mirror.rim.signed_distance_m(x, y) for x, y in self.rig.places]
@@ -154,15 +160,15 @@ class _Drive:
     @property
     def rolls_m(self) -> float:
         """What the wheels still travel without a set point."""
-        plant, robot = self.rig.plant, self.cfg.robot
-        return (
-            robot.wheel_radius_m * self.cfg.sim.robot.wheel_lag_s * max(abs(plant.right_rad_s), abs(plant.left_rad_s))
-        )
+        rate_rad_s = max(abs(self.rig.plant.right_rad_s), abs(self.rig.plant.left_rad_s))
+        return self.cfg.robot.wheel_radius_m * self.cfg.sim.robot.wheel_lag_s * rate_rad_s
 
 
-def run_off(name: str, start: DeckPose, v_m_s: float, omega_rad_s: float, rng: np.random.Generator) -> Tally:
-    """Drive, or turn, until an edge is declared, and on until the robot stands."""
-    drive = _Drive(name, start, rng)
+def run_off(
+    name: str, start: DeckPose, v_m_s: float, omega_rad_s: float, rng: np.random.Generator, error: Error | None = None
+) -> Tally:
+    """Drive, or turn, until an edge is declared and the robot stands; without an estimate only edges count."""
+    drive = Drive(name, start, rng, error)
     rig, hz = drive.rig, drive.hz
     set_points = rig.at_speed(v_m_s, omega_rad_s, drive.cfg)
     speed = max(abs(v_m_s), abs(omega_rad_s) * hypot(*drive.cfg.robot.edge_sensors_m[0]))
@@ -171,7 +177,7 @@ def run_off(name: str, start: DeckPose, v_m_s: float, omega_rad_s: float, rng: n
     off_frame = declared_frame = -1
     at_declaration = [0.0] * 4
     after_m = most_m = 0.0
-    has_fallen = False
+    centre_m = -10.0
     for k in range(frames + 300):
         if declared_frame >= 0:
             late -= 1
@@ -181,26 +187,27 @@ def run_off(name: str, start: DeckPose, v_m_s: float, omega_rad_s: float, rng: n
         beyond = drive.beyond_m() if is_off or drive.has_edge or declared_frame >= 0 else [0.0] * 4
         if off_frame < 0 and is_off and max(beyond) > 0.0:
             off_frame = k
-        if declared_frame < 0 and _is_barred(verdict, v_m_s):
+        if declared_frame < 0 and _is_barred(verdict, v_m_s, error is BLIND):
             declared_frame, at_declaration = k, [max(b, 0.0) for b in beyond]
         if declared_frame >= 0:
             after_m = max(after_m, *(now - then for now, then in zip(beyond, at_declaration, strict=True)))
         most_m = max(most_m, *beyond)
-        has_fallen = has_fallen or drive.mirror.rim.signed_distance_m(rig.plant.x_m, rig.plant.y_m) < 0.0
-        if has_fallen or (not is_driven and drive.rolls_m < REST_M) or (declared_frame < 0 and k >= frames):
+        centre_m = max(centre_m, -drive.mirror.rim.signed_distance_m(rig.plant.x_m, rig.plant.y_m))
+        if centre_m > 0.0 or (not is_driven and drive.rolls_m < REST_M) or (declared_frame < 0 and k >= frames):
             break
     is_unseen = declared_frame < 0 and most_m > 0.0
     late_s = max(declared_frame - off_frame, 0) / hz if declared_frame >= 0 and off_frame >= 0 else 0.0
-    return Tally(1, 0, int(has_fallen), int(is_unseen), after_m, most_m, late_s)
+    return Tally(1, 0, int(centre_m > 0.0), int(is_unseen), after_m, most_m, late_s, centre_m)
 
 
 def _on(rig: Rig) -> tuple[int, ...]:
     return rig._sensors.edges._values
 
 
-def _is_barred(verdict: Verdict, v_m_s: float) -> bool:
+def _is_barred(verdict: Verdict, v_m_s: float, only_edges: bool) -> bool:
     """Whether the motion is over: an edge, or its direction is not permitted any more."""
-    return verdict.code is EventCode.NEAR_EDGE or not (verdict.forward if v_m_s > 0.0 else verdict.reverse)
+    is_permitted = only_edges or (verdict.forward if v_m_s > 0.0 else verdict.reverse)
+    return verdict.code is EventCode.NEAR_EDGE or not is_permitted
 
 
 def rim_case(number: int) -> tuple[str, Callable[[], Tally]]:
@@ -295,18 +302,16 @@ def cross(name: str, v_m_s: float, angle_rad: float, stop_s: float, rng: np.rand
     """Carry the leading sensors over a seam, and stop with one of them over the gap where that is asked for."""
     _, mirror = world(name)
     start, course_sign = _start_at_seam(name, angle_rad, v_m_s, rng)
-    drive = _Drive(name, start, rng)
+    drive = Drive(name, start, rng)
     set_points = drive.rig.at_speed(course_sign * v_m_s, 0.0, drive.cfg)
     lag_m = v_m_s * drive.cfg.sim.robot.wheel_lag_s
     way_m = 0.02 + (lag_m + 0.5 * mirror.gap_m / cos(angle_rad)) + 0.01 / cos(angle_rad)
     stop_at_m = 0.02 + 0.5 * mirror.gap_m / cos(angle_rad)
     tally = Tally(transits=1)
     has_stopped = stop_s == 0.0
-    x0, y0 = start.x_m, start.y_m
     for _ in range(ceil((way_m + mirror.gap_m / cos(angle_rad) + 0.05) / v_m_s * 1.06 * drive.hz)):
         drive.frame(*set_points)
-        gone = hypot(drive.rig.plant.x_m - x0, drive.rig.plant.y_m - y0)
-        if not has_stopped and gone >= stop_at_m:
+        if not has_stopped and drive.has_gone_m(start) >= stop_at_m:
             has_stopped = True
             for _ in range(ceil((stop_s + 0.3) * drive.hz)):
                 drive.frame(0.0, 0.0)

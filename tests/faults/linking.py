@@ -11,13 +11,12 @@ the reports and, for tests that a run deselects, in the workers' last message.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.faults.table import PATH, RECORD, Row, Table, is_realtime_permitted, keep_record, load_table
+from tests.faults.table import PATH, RECORD, Row, Seen, Table, is_realtime_permitted, keep_record, load_table
 
 ROWS, MEASURED = "fault_rows", "fault"
 COLLECTED = "fault_marks"
@@ -28,42 +27,8 @@ SELECTIONS = ("keyword", "lf", "deselect", "ignore", "ignore_glob", "collectonly
 Measured = Callable[..., None]
 
 
-@dataclass(slots=True)
-class Seen:
-    """What is known of one test.
-
-    Attributes:
-        rows: that it is marked for.
-        of_robot: those of them of which it shows the robot's own part.
-        is_slow: whether ``make test`` leaves it out.
-        passed: whether it ran to its end and passed.
-        failed: whether any part of it failed.
-        values: what it measured, by row and unit.
-    """
-
-    rows: tuple[str, ...]
-    is_slow: bool
-    passed: bool = False
-    failed: bool = False
-    values: dict[str, float] = field(default_factory=dict)
-    of_robot: tuple[str, ...] = ()
-
-    @property
-    def is_shown(self) -> bool:
-        """Whether its rows count as shown by it."""
-        return self.passed and not self.failed
-
-
-@dataclass(slots=True)
-class Judgement:
-    """What is wrong between table and tests, and what is known to be missing."""
-
-    problems: list[str]
-    open_rows: list[str]
-
-
-def judge(table: Table, tests: dict[str, Seen], kind: str | None) -> Judgement:
-    """Hold a run against the table.
+def judge(table: Table, tests: dict[str, Seen], kind: str | None) -> tuple[list[str], list[str]]:
+    """What is wrong between table and tests, and the rows that are open.
 
     Args:
         table: the rows.
@@ -79,23 +44,21 @@ def judge(table: Table, tests: dict[str, Seen], kind: str | None) -> Judgement:
     problems += [f"{name} is marked, but for no row" for name, test in tests.items() if not test.rows]
     open_rows = []
     for row_id, row in table.items() if kind is not None else ():
-        marked = {name: test for name, test in tests.items() if row_id in test.rows}
-        problem = _missing(row_id, row, marked, kind or "")
+        problem = _missing(row_id, row, tests, kind or "")
         if row.open is not None:
             open_rows.append(f"{row_id} ({row.open}){'' if problem else '; tests show it by now'}")
         elif problem:
             problems.append(f"{row_id} ({row.fault}): {problem}")
-    return Judgement(problems, open_rows)
+    return problems, open_rows
 
 
-def _missing(row_id: str, row: Row, marked: dict[str, Seen], kind: str) -> str:
+def _missing(row_id: str, row: Row, tests: dict[str, Seen], kind: str) -> str:
     """What is missing for a row, on our side or on the robot's; empty if nothing is."""
-    ours = {name: test for name, test in marked.items() if row_id not in test.of_robot}
-    robots = {name: test for name, test in marked.items() if row_id in test.of_robot}
-    problem = _unshown(row.slow, ours, kind)
+    marked = {name: test for name, test in tests.items() if row_id in test.rows}
+    problem = _unshown(row.slow, {n: test for n, test in marked.items() if row_id not in test.of_robot}, kind)
     if problem or not row.conformance:
         return problem
-    problem = _unshown(False, robots, kind)
+    problem = _unshown(False, {n: test for n, test in marked.items() if row_id in test.of_robot}, kind)
     return f"of the robot's part {problem}" if problem else ""
 
 
@@ -108,7 +71,7 @@ def _unshown(needs_slow: bool, marked: dict[str, Seen], kind: str) -> str:
         return ""  # shown by the runs of the other kind
     if failed := sorted(name for name, test in marked.items() if test.failed):
         return f"{failed[0]} failed"
-    return "" if any(test.is_shown for test in of_kind.values()) else f"{min(of_kind)} did not pass"
+    return "" if any(test.passed for test in of_kind.values()) else f"{min(of_kind)} did not pass"
 
 
 def name_of(nodeid: str) -> str:
@@ -130,17 +93,14 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 class Linking:
-    """The plugin of one process: a worker, the controller, or both in one.
-
-    Args:
-        config: pytest's.
-    """
+    """The plugin of one process: a worker, the controller, or both in one."""
 
     def __init__(self, config: pytest.Config) -> None:
         self._config = config
-        self.table = load_table(config.getoption("--fault-table"))
+        path = config.getoption("--fault-table")
+        self.table, self._is_ours = load_table(path), path == PATH
         self._tests: dict[str, Seen] = {}
-        self._judgement = Judgement([], [])
+        self._problems, self._open_rows = list[str](), list[str]()
         self._is_worker = hasattr(config, "workeroutput")
 
     # -- where tests are collected and run ------------------------------------------------------------------------
@@ -186,17 +146,12 @@ class Linking:
         if self._is_worker or exitstatus not in {pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED}:
             return
         kind = None if session.shouldstop or session.shouldfail else self._kind()
-        self._judgement = judge(self.table, self._tests, kind)
+        self._problems, self._open_rows = judge(self.table, self._tests, kind)
         path = self._config.getoption("--fault-record")
-        if path is not None or self.table_is_ours:
+        if path is not None or self._is_ours:
             keep_record(path or self._config.rootpath / RECORD, self._tests, is_full=kind is not None)
-        if self._judgement.problems:
+        if self._problems:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
-
-    @property
-    def table_is_ours(self) -> bool:
-        """Whether it is the project's own table."""
-        return bool(self._config.getoption("--fault-table") == PATH)
 
     def _kind(self) -> str | None:
         option = self._config.option
@@ -207,13 +162,12 @@ class Linking:
 
     def pytest_terminal_summary(self, terminalreporter: Any) -> None:
         """Say what is missing."""
-        if self._judgement.open_rows:
-            rows = self._judgement.open_rows
+        if rows := self._open_rows:
             terminalreporter.write_sep("=", f"fault table: {len(rows)} rows open")
             terminalreporter.write_line(f"{len(rows)} rows open: " + ", ".join(rows))
-        if self._judgement.problems:
+        if self._problems:
             terminalreporter.write_sep("=", "fault table", red=True)
-            for problem in self._judgement.problems:
+            for problem in self._problems:
                 terminalreporter.write_line(problem)
 
 

@@ -3,12 +3,13 @@
 import functools
 import json
 import os
-import threading
 import tomllib
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -87,20 +88,8 @@ def conformance_rows(table: Table) -> tuple[str, ...]:
 @functools.cache
 def is_realtime_permitted() -> bool:
     """Try it on a thread of its own, which ends with what it was given."""
-    outcome: list[bool] = []
-
-    def try_it() -> None:
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-        except OSError:
-            outcome.append(False)
-        else:
-            outcome.append(True)
-
-    thread = threading.Thread(target=try_it)
-    thread.start()
-    thread.join()
-    return outcome == [True]
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(1)).exception() is None
 
 
 # -- the record, kept from run to run ----------------------------------------------------------------------------------
@@ -110,14 +99,24 @@ RECORD = ".faults.json"
 Record = dict[str, dict[str, Any]]
 
 
-class Shown(Protocol):
-    """What the record wants to know of a test."""
+@dataclass(slots=True)
+class Seen:
+    """What is known of one test.
+
+    Attributes:
+        rows: that it is marked for.
+        is_slow: whether ``make test`` leaves it out.
+        passed, failed: whether it ran to its end and passed; whether any part of it failed.
+        values: what it measured, by row and unit.
+        of_robot: those of its rows of which it shows the robot's own part.
+    """
 
     rows: tuple[str, ...]
     is_slow: bool
-    values: dict[str, float]
-    passed: bool
-    failed: bool
+    passed: bool = False
+    failed: bool = False
+    values: dict[str, float] = field(default_factory=dict)
+    of_robot: tuple[str, ...] = ()
 
 
 def load_record(path: Path) -> Record:
@@ -128,7 +127,7 @@ def load_record(path: Path) -> Record:
     return loaded
 
 
-def keep_record(path: Path, tests: Mapping[str, Shown], *, is_full: bool) -> None:
+def keep_record(path: Path, tests: Mapping[str, Seen], *, is_full: bool) -> None:
     """Merge a run into the record.
 
     A test that passed replaces its entry, one that failed loses it, one that did not run keeps it. A full run has seen
@@ -140,14 +139,8 @@ def keep_record(path: Path, tests: Mapping[str, Shown], *, is_full: bool) -> Non
         if test.failed:
             entries.pop(name, None)
         elif test.passed:
-            entries[name] = {
-                "rows": list(test.rows),
-                "slow": test.is_slow,
-                "values": test.values,
-                "date": now,
-                "machine": machine_line(),
-                "realtime": is_realtime_permitted(),
-            }
+            about = {"date": now, "machine": machine_line(), "realtime": is_realtime_permitted()}
+            entries[name] = {"rows": list(test.rows), "slow": test.is_slow, "values": test.values, **about}
     path.write_text(json.dumps(entries, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 

@@ -4,6 +4,8 @@ import itertools
 import random
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from math import ceil, inf, log
 from pathlib import Path
 from statistics import median
@@ -25,15 +27,15 @@ from ccatp.survey.behaviours import home_time_s
 from ccatp.survey.planning.escape import plan_way_home
 from ccatp.survey.planning.search import path_time
 from ccatp.survey.reactions import ReminderCall, UnattendedFaultTimer
-from ccatp.survey.state import MissionState
+from ccatp.survey.state import BACKING_OFF, DONE, DRIVING, HELD, RETURNING, TURNING, MissionState
 from ccatp.survey.stops import MissionCommand
 from tests.faults.linking import Measured
 from tests.support.mission_story import DT, FREE, FRONT_OFF, Story, from_first_leg
 from tests.support.scenario import config_of, mirror_of, one_panel
 from tests.support.sim_survey import FULL, MeasuredSurvey, plan_of
 
-SURVEYING = (MissionState.TURNING, MissionState.DRIVING, MissionState.SETTLING, MissionState.MEASURING)
 TABLE_ROWS = [(kind, level, held) for kind in EmergencyKind for level in (False, True) for held in (False, True)]
+NOBODY_RESUMES = "emergency: earthquake: nothing moves until that is cleared"
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +63,7 @@ class Aborted(MeasuredSurvey):
             assert self.monitor.emergency(self._kind, "e") is None
         if self.cleared_s == inf and frame.t - self.raised_s >= self._clear_after_s:
             self.cleared_s = frame.t
-            assert self.monitor.clear("e", at_base_or_held=self.mission.state is MissionState.HELD) is None
+            assert self.monitor.clear("e", at_base_or_held=self.mission.state is HELD) is None
 
     def _foresee(self, number: int, right: float, left: float) -> None:
         super()._foresee(number, right, left)
@@ -80,7 +82,7 @@ class Aborted(MeasuredSurvey):
 
 
 @pytest.mark.fault("O1")
-@pytest.mark.parametrize("state", [MissionState.DRIVING, MissionState.TURNING, MissionState.MEASURING])
+@pytest.mark.parametrize("state", [DRIVING, TURNING, MissionState.MEASURING])
 def test_a_fire_stops_the_wheels_and_leads_home(state: MissionState, tmp_path: Path, measured: Measured) -> None:
     run = Aborted(one_panel(run__seed=3), tmp_path, state, "fire")
     result = run.run()
@@ -94,7 +96,7 @@ def test_a_fire_stops_the_wheels_and_leads_home(state: MissionState, tmp_path: P
 
 
 @pytest.mark.fault("O1")
-@pytest.mark.parametrize("state", [MissionState.DRIVING, MissionState.TURNING])
+@pytest.mark.parametrize("state", [DRIVING, TURNING])
 def test_an_earthquake_presses_on_holds_and_leads_home_when_it_is_over(
     state: MissionState, tmp_path: Path, measured: Measured
 ) -> None:
@@ -119,61 +121,58 @@ def emergency(raised: int, kind: str = "fire", *, code: EventCode = EventCode.AB
     return replace(verdict, is_shaking=is_shaking, forward=free, reverse=free, turn=free)
 
 
+def frames(story: Story, *verdicts: Verdict, count: int = 1) -> MissionState:
+    """The state after these verdicts, ``count`` times."""
+    for verdict in verdicts * count:
+        story.frame(verdict)
+    return story.mission.state
+
+
 @pytest.mark.fault("O1")
 def test_during_an_earthquake_nobody_resumes(story: Story) -> None:
-    story.until_state(MissionState.DRIVING)
+    story.until_state(DRIVING)
     story.frame(emergency(1, "earthquake"))
     assert story.mission.is_paused
-    assert story.mission.resume() == "emergency: earthquake: nothing moves until that is cleared"
+    assert story.mission.resume() == NOBODY_RESUMES
     assert story.mission.abort("operator") is None
-    assert story.mission.state is MissionState.HELD
-    story.until_state(MissionState.DONE)  # it is over
+    assert story.mission.state is HELD
+    story.until_state(DONE)  # it is over
     assert story.mission.done == []
 
 
 @pytest.mark.fault("O1", "O3")
 def test_an_emergency_that_is_new_outranks_a_pause_and_its_level_does_not(story: Story) -> None:
-    story.until_state(MissionState.DRIVING)
-    story.frame(emergency(1))
-    assert str(story.mission.state) == MissionState.RETURNING
+    story.until_state(DRIVING)
+    assert frames(story, emergency(1)) is RETURNING
     assert story.mission.pause("operator") is None
-    for _ in range(50):
-        story.frame(emergency(1))  # the level
-        story.frame(emergency(1, "power"))  # one of two is cleared: what is left is the older one
-    assert str(story.mission.state) == MissionState.HELD
-    story.frame()  # all cleared
-    assert str(story.mission.state) == MissionState.HELD
-    story.frame(emergency(2))  # the same kind once more
-    assert str(story.mission.state) == MissionState.RETURNING
+    # The level; then one of two is cleared: what is left is the older one. Last all are cleared.
+    assert frames(story, emergency(1), emergency(1, "power"), count=50) is HELD
+    assert frames(story, FREE) is HELD
+    assert frames(story, emergency(2)) is RETURNING  # the same kind once more
 
 
 @pytest.mark.fault("O1", "O2")
 def test_an_earthquake_at_an_edge_presses_the_robot_on_and_nobody_resumes(story: Story) -> None:
-    story.until_state(MissionState.DRIVING)
-    at_edge = replace(
-        emergency(1, "earthquake", code=EventCode.NEAR_EDGE), off=(True, False, False, False), forward=False
-    )
-    story.frame(at_edge)
-    assert str(story.mission.state) == MissionState.BACKING_OFF
+    story.until_state(DRIVING)
+    shaking = emergency(1, "earthquake", code=EventCode.NEAR_EDGE)
+    assert frames(story, replace(shaking, off=(True, False, False, False), forward=False)) is BACKING_OFF
     assert story.mission.wants_full_fans
     assert story.mission.pause("operator") is None
-    assert story.mission.resume() == "emergency: earthquake: nothing moves until that is cleared"
-    story.frame(emergency(1, "earthquake"))
-    assert (story.mission.state, story.mission.cause) == (MissionState.HELD, "emergency: earthquake")
+    assert story.mission.resume() == NOBODY_RESUMES
+    assert frames(story, emergency(1, "earthquake")) is HELD
+    assert story.mission.cause == "emergency: earthquake"
 
 
 @pytest.mark.fault("O1")
 def test_what_breaks_in_an_earthquake_waits_for_an_operator_when_it_is_over(story: Story) -> None:
-    story.until_state(MissionState.DRIVING)
-    story.frame(emergency(1, "earthquake"))
-    broken = replace(emergency(1, "earthquake"), severity=Severity.FAULT, cause="a wheel runs away", signal="enc")
-    story.frame(broken)
+    story.until_state(DRIVING)
+    shaking = emergency(1, "earthquake")
+    frames(story, shaking, replace(shaking, severity=Severity.FAULT, cause="a wheel runs away", signal="enc"))
     assert story.mission.is_faulted
-    for _ in range(50):
-        story.frame()
-    assert (story.mission.state, story.mission.cause) == (MissionState.HELD, "a wheel runs away")
+    assert frames(story, FREE, count=50) is HELD
+    assert story.mission.cause == "a wheel runs away"
     assert story.mission.resume() is None
-    story.until_state(MissionState.DONE)
+    story.until_state(DONE)
     assert story.mission.done == []
 
 
@@ -183,25 +182,20 @@ def test_after_a_restart_with_nothing_latched_the_first_emergency_is_new(story: 
     story.mission.abort("operator")
     story.mission.pause("operator")
     story.mission.know_emergency()
-    story.frame()
-    assert str(story.mission.state) == MissionState.HELD
-    story.frame(emergency(1))
-    assert str(story.mission.state) == MissionState.RETURNING
+    assert frames(story, FREE) is HELD
+    assert frames(story, emergency(1)) is RETURNING
 
 
 @pytest.mark.fault("O1", "O7")
 def test_what_was_latched_before_the_start_is_waited_for_at_base(story: Story) -> None:
     story.mission.pause("restarted")
     story.mission.know_emergency()
-    for _ in range(50):
-        story.frame(emergency(4))
-    assert str(story.mission.state) == MissionState.HELD
+    assert frames(story, emergency(4), count=50) is HELD
     assert story.mission.resume() == "an emergency of before is latched: 'ccatp clear' it first"
     story.frame()
     assert story.mission.resume() is None
-    story.until_state(MissionState.DRIVING)
-    story.frame(emergency(5))
-    assert str(story.mission.state) == MissionState.RETURNING
+    story.until_state(DRIVING)
+    assert frames(story, emergency(5)) is RETURNING
 
 
 @pytest.mark.fault("O1")
@@ -224,23 +218,20 @@ def test_the_way_home_is_planned_before_the_robot_misses_it(measured: Measured) 
 
 
 @pytest.mark.fault("O2")
-@pytest.mark.parametrize("frames", [0, 1, 10, 40, 80])
+@pytest.mark.parametrize("count", [0, 1, 10, 40, 80])
 def test_an_abort_during_a_back_off_never_drives_forward_and_is_home_bound_soon(
-    frames: int, story: Story, measured: Measured
+    count: int, story: Story, measured: Measured
 ) -> None:
-    story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
-    story.frame(FRONT_OFF)
-    for _ in range(frames):
-        story.frame(FRONT_OFF)
+    story.until(lambda: story.mission.state is DRIVING and story.v > 0.09)
+    frames(story, FRONT_OFF, count=1 + count)
     story.mission.abort("fire")
     begun_s, first = story.t, len(story.orders)
-    for _ in range(20):
-        story.frame(FRONT_OFF)
-    story.until_state(MissionState.RETURNING)
+    frames(story, FRONT_OFF, count=20)
+    story.until_state(RETURNING)
     measured("O2", story.t - begun_s)
     assert story.t - begun_s <= 2.0
     assert all(order.twist.v_m_s <= 0.0 for order in story.orders[first:])
-    story.until_state(MissionState.DONE)
+    story.until_state(DONE)
     assert story.mission.done == []
 
 
@@ -285,54 +276,61 @@ def test_an_id_counts_once(events: list[tuple[str, str]]) -> None:
 # -- O4: lost messages ------------------------------------------------------------------------------------------------
 
 
-class LossyRelay:
-    """Carries requests to a desk that answers each, and loses half of all messages, both ways."""
+class Relay:
+    """Carries requests to a desk that answers each, and loses messages of both ways."""
 
-    def __init__(self, seed: int) -> None:
-        self._rng = random.Random(seed)
-        self.lost = 0
-        self.heard: list[tuple[bytes, float]] = []
-        self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.ROUTER)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self.endpoint = f"tcp://127.0.0.1:{self._socket.bind_to_random_port('tcp://127.0.0.1')}"
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
+    def __init__(self) -> None:
+        self.is_lost: Callable[[], bool] = lambda: False
+        self.heard: list[bytes] = []
+        self.stopping = threading.Event()
+        self.endpoint = ""
 
-    def _is_lost(self) -> bool:
-        is_lost = self._rng.random() < 0.5
-        self.lost += is_lost
-        return is_lost
+    def run(self, bound: threading.Event) -> None:
+        with zmq.Context() as context, context.socket(zmq.ROUTER) as socket:
+            socket.setsockopt(zmq.LINGER, 0)
+            self.endpoint = f"tcp://127.0.0.1:{socket.bind_to_random_port('tcp://127.0.0.1')}"
+            bound.set()
+            while not self.stopping.is_set():
+                if not socket.poll(5):
+                    continue
+                *envelope, payload = socket.recv_multipart()
+                if self.is_lost():
+                    continue
+                self.heard.append(payload)
+                if not self.is_lost():
+                    socket.send_multipart([*envelope, format_ok()])
 
-    def _run(self) -> None:
-        while not self._stopping.is_set():
-            if not self._socket.poll(5):
-                continue
-            *envelope, payload = self._socket.recv_multipart()
-            if self._is_lost():
-                continue
-            self.heard.append((payload, time.monotonic()))
-            if not self._is_lost():
-                self._socket.send_multipart([*envelope, format_ok()])
 
-    def close(self) -> None:
-        self._stopping.set()
-        self._thread.join()
-        self._socket.close()
-        self._context.term()
+@pytest.fixture
+def relay() -> Iterator[Relay]:
+    with relaying(Relay()) as found:
+        yield found
+
+
+@contextmanager
+def relaying(relay: Relay) -> Iterator[Relay]:
+    bound = threading.Event()
+    thread = threading.Thread(target=relay.run, args=(bound,))
+    thread.start()
+    assert bound.wait(10.0)
+    yield relay
+    relay.stopping.set()
+    thread.join()
 
 
 @pytest.mark.fault("O4")
-def test_an_emergency_is_told_until_it_is_heard(measured: Measured) -> None:
-    relay = LossyRelay(3)
-    repeats = []
-    for k in range(20):
-        payload = f"{k}".encode()
-        assert request(relay.endpoint, payload, 10.0, repeats=True)["ok"]
-        repeats.append(sum(heard == payload for heard, _ in relay.heard))
-    relay.close()
-    assert relay.lost > 20
+def test_an_emergency_is_told_until_it_is_heard(relay: Relay, measured: Measured) -> None:
+    rng, lost = random.Random(3), list[bool]()
+
+    def half_of_them() -> bool:
+        lost.append(rng.random() < 0.5)
+        return lost[-1]
+
+    relay.is_lost = half_of_them
+    for k in range(12):
+        assert request(relay.endpoint, b"%d" % k, 10.0, repeats=True)["ok"]
+    repeats = [relay.heard.count(b"%d" % k) for k in range(12)]
+    assert sum(lost) > 10
     assert min(repeats) >= 1
     assert max(repeats) > 1  # an answer was lost, and asked for again
     # After so many periods fewer than one in 10,000 have been lost each time.
@@ -342,28 +340,22 @@ def test_an_emergency_is_told_until_it_is_heard(measured: Measured) -> None:
 
 
 @pytest.mark.fault("O4")
-def test_an_emergency_is_acknowledged_at_once(measured: Measured) -> None:
-    relay = LossyRelay(0)
-    relay._is_lost = lambda: False  # type: ignore[method-assign]
+def test_an_emergency_is_acknowledged_at_once(relay: Relay, measured: Measured) -> None:
     took_ms = []
     for _ in range(9):
         begun_s = time.monotonic()
         assert request(relay.endpoint, b"fire", 5.0, repeats=True)["ok"]
         took_ms.append(1e3 * (time.monotonic() - begun_s))
-    relay.close()
     measured("O4", median(took_ms), "ms")  # of what the machine had to do besides, nothing is said
 
 
 @pytest.mark.fault("O4")
-def test_what_must_not_be_asked_twice_is_asked_once() -> None:
-    relay = LossyRelay(0)
-    relay._is_lost = lambda: False  # type: ignore[method-assign]
+def test_what_must_not_be_asked_twice_is_asked_once(relay: Relay) -> None:
     assert request(relay.endpoint, b"resume", 5.0)["ok"]
-    relay._is_lost = lambda: True  # type: ignore[method-assign]
+    relay.is_lost = lambda: True
     with pytest.raises(RequestFailed, match=r"no answer from .* within 0\.3 s"):
         request(relay.endpoint, b"resume", 0.3)
-    relay.close()
-    assert [payload for payload, _ in relay.heard] == [b"resume"]
+    assert relay.heard == [b"resume"]
 
 
 # -- O7: clear --------------------------------------------------------------------------------------------------------
@@ -395,7 +387,7 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
     home_s: float, story: Story, config: Config, measured: Measured
 ) -> None:
     cfg = config.health
-    story.until_state(MissionState.DRIVING)
+    story.until_state(DRIVING)
     story.mission.fault("leg overdue")
     vigil = UnattendedFaultTimer(config, falls=True)
     reminders: list[float] = []
@@ -412,7 +404,7 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
     at_dock = soc - home_s * drain
     measured("O8", (soc - cfg.battery_reserve) / (home_s * drain))
     measured("F6", 100.0 * at_dock)
-    assert story.mission.state is MissionState.RETURNING
+    assert story.mission.state is RETURNING
     assert at_dock >= cfg.battery_reserve
     assert (soc - cfg.battery_reserve) / (home_s * drain) >= 1.5
     assert len(reminders) >= 20
@@ -420,33 +412,38 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
 
 
 @pytest.mark.fault("O8")
-def test_who_does_not_know_where_it_is_stays_and_reminds(config: Config) -> None:
-    vigil = UnattendedFaultTimer(config, falls=True)
-    calls = [vigil.watch(float(t), 0.01, None) for t in range(200)]
-    assert [t for t, call in enumerate(calls) if call is not ReminderCall.NOTHING] == [60, 120, 180]
-    assert set(calls) == {ReminderCall.NOTHING, ReminderCall.REMIND}
-
-
-@pytest.mark.fault("O8")
-def test_a_return_is_tried_once_and_only_where_the_robot_would_fall(config: Config) -> None:
-    vigil = UnattendedFaultTimer(config, falls=True)
-    assert [vigil.watch(t, 0.1, 30.0) for t in (0.0, 1.0, 61.0)] == [
-        ReminderCall.RETURN,
-        ReminderCall.NOTHING,
-        ReminderCall.REMIND,
-    ]
+@pytest.mark.parametrize(
+    ("falls", "soc", "home_s", "times", "calls"),
+    [
+        # Who does not know where it is stays and reminds.
+        (True, 0.01, None, range(200), {60: ReminderCall.REMIND, 120: ReminderCall.REMIND, 180: ReminderCall.REMIND}),
+        # A return is tried once, and only where the robot would fall.
+        (True, 0.1, 30.0, (0, 1, 61), {0: ReminderCall.RETURN, 61: ReminderCall.REMIND}),
+        (False, 0.0, 30.0, range(50), {}),
+    ],
+)
+def test_reminders_and_one_return(
+    falls: bool, soc: float, home_s: float | None, times: range, calls: dict[int, ReminderCall], config: Config
+) -> None:
+    vigil = UnattendedFaultTimer(config, falls=falls)
+    found = {t: vigil.watch(float(t), soc, home_s) for t in times}
+    assert {t: call for t, call in found.items() if call is not ReminderCall.NOTHING} == calls
     vigil.over()
-    assert vigil.held_s(100.0) == 0.0
-    assert vigil.watch(100.0, 0.1, 30.0) is ReminderCall.NOTHING
-    safe = UnattendedFaultTimer(config, falls=False)
-    assert {safe.watch(float(t), 0.0, 30.0) for t in range(50)} == {ReminderCall.NOTHING}
+    assert vigil.held_s(300.0) == 0.0
+    assert vigil.watch(300.0, 0.1, home_s) is ReminderCall.NOTHING
 
 
 # -- O9: the way home -------------------------------------------------------------------------------------------------
 
 
-def check_ways_home(step: int) -> tuple[int, int]:
-    """Ways home from every ``step``-th point of both mirrors of the thesis: how many, and how many are not valid."""
+@pytest.mark.fault("O9")
+@pytest.mark.parametrize(
+    ("step", "expected"), [(9, 87 + 78), pytest.param(1, 1485, marks=pytest.mark.slow, id="every point")]
+)
+def test_the_way_home_stays_on_the_mirror_and_takes_no_longer_than_thought(
+    step: int, expected: int, measured: Measured
+) -> None:
+    """From every ``step``-th point of both mirrors of the thesis."""
     count = invalid = 0
     rng = random.Random(9)
     for name in ("thesis-m1", "thesis-m2"):
@@ -459,41 +456,24 @@ def check_ways_home(step: int) -> tuple[int, int]:
             start = DeckPose(x, y, rng.uniform(-3.14, 3.14))
             stops = plan_way_home(mirror, start, base, cfg.robot, cfg.limits, cfg.mission)
             ends = [(stop.x_m, stop.y_m) for stop in stops]
-            legs = list(zip([(x, y), *ends], ends, strict=False))
             # The first leg may begin nearer to the rim than legs keep to it, but leads away from it.
             own_m = min(least_m, mirror.rim.signed_distance_m(x, y) - 1e-9)
-            clear_m = [mirror.rim.segment_clearance_m(*a, *b) for a, b in legs]
+            clear_m = [mirror.rim.segment_clearance_m(*a, *b) for a, b in itertools.pairwise([(x, y), *ends])]
             is_valid = clear_m[0] >= own_m and all(c >= least_m for c in clear_m[1:])
             takes_s = path_time(stops, start, cfg.limits, mirror, 0.0)
             invalid += not (is_valid and takes_s <= home_time_s(base, cfg.limits, x, y))
-    return count, invalid
-
-
-@pytest.mark.fault("O9")
-def test_the_way_home_stays_on_the_mirror_and_takes_no_longer_than_thought(measured: Measured) -> None:
-    count, invalid = check_ways_home(9)
     measured("O9", invalid)
-    assert (count, invalid) == (87 + 78, 0)
-
-
-@pytest.mark.slow
-@pytest.mark.fault("O9")
-def test_the_way_home_from_every_point(measured: Measured) -> None:
-    count, invalid = check_ways_home(1)
-    measured("O9", invalid)
-    assert (count, invalid) == (1485, 0)
+    assert (count, invalid) == (expected, 0)
 
 
 # -- O10: the budget --------------------------------------------------------------------------------------------------
-
-SLOW = "body slip at_s=20.0 for_s=20.0 factor=0.8"
 
 
 @pytest.mark.fault("O10")
 @pytest.mark.parametrize("budget_s", [45.0, 70.0])
 def test_what_does_not_fit_into_the_budget_is_left_out(budget_s: float, tmp_path: Path, measured: Measured) -> None:
     cfg = one_panel(run__seed=3, run__panels=2, run__budget_s=budget_s, mission__holds_to_budget=True)
-    run = MeasuredSurvey(cfg, tmp_path, plan=plan_of(SLOW))
+    run = MeasuredSurvey(cfg, tmp_path, plan=plan_of("body slip at_s=20.0 for_s=20.0 factor=0.8"))
     result = run.run()
     points = result.summary["points"]
     # The same share of an hour.
@@ -507,9 +487,10 @@ def test_what_does_not_fit_into_the_budget_is_left_out(budget_s: float, tmp_path
 
 @pytest.mark.fault("O10")
 def test_a_budget_that_suffices_changes_nothing(tmp_path: Path) -> None:
-    with_it, without = tmp_path / "with", tmp_path / "without"
-    with_it.mkdir()
-    without.mkdir()
-    held = MeasuredSurvey(one_panel(run__seed=3, mission__holds_to_budget=True), with_it).run()
-    assert held.summary == MeasuredSurvey(one_panel(run__seed=3), without).run().summary
-    assert held.outcome == "complete"
+    found = []
+    for holds in (True, False):
+        folder = tmp_path / str(holds)
+        folder.mkdir()
+        found.append(MeasuredSurvey(one_panel(run__seed=3, mission__holds_to_budget=holds), folder).run())
+    assert found[0].summary == found[1].summary
+    assert found[0].outcome == "complete"

@@ -3,13 +3,14 @@
 import json
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
-from tests.faults.linking import Seen, judge
+from tests.faults.linking import judge
 from tests.faults.page import page
-from tests.faults.table import PATH, ROWS, Row, conformance_rows, keep_record, load_record, load_table, machine_line
+from tests.faults.table import PATH, ROWS, Row, Seen, keep_record, load_record, load_table, machine_line
 
 ROOT = PATH.parents[2]
 TABLE = """
@@ -48,9 +49,9 @@ def test_two(case):
 
 
 class Project:
-    """A project of one test file and a table; ``run`` gives what pytest printed, and the record."""
+    """A project of one test file and a table; ``run`` gives exit status and output, ``record`` is what it keeps."""
 
-    def __init__(self, pytester: pytest.Pytester, tests: str, table: str) -> None:
+    def __init__(self, pytester: pytest.Pytester, tests: str = SHOWN, table: str = TABLE) -> None:
         self._pytester, self.record = pytester, pytester.path / "record.json"
         pytester.makepyfile(test_it=tests)
         pytester.makeini(
@@ -60,27 +61,21 @@ class Project:
         (pytester.path / "table.toml").write_text(table)
 
     def run(self, *args: str, in_process: bool = True) -> tuple[int, str]:
-        """Exit status and output."""
         options = ["-p", "tests.faults.linking", "-p", "no:cacheprovider", "--fault-table=table.toml"]
         run = self._pytester.runpytest_inprocess if in_process else self._pytester.runpytest_subprocess
         result = run(*options, f"--fault-record={self.record}", *args)
         return int(result.ret), result.stdout.str()
 
 
-def project(pytester: pytest.Pytester, tests: str = SHOWN, table: str = TABLE) -> Project:
-    return Project(pytester, tests, table)
-
-
 def test_the_table_holds_every_row() -> None:
     table = load_table()
     assert list(table) == [f"{kind}{number}" for kind, count in ROWS.items() for number in range(1, count + 1)]
     assert len({row.fault for row in table.values()}) == len(table)
-    assert set(conformance_rows(table)) == {row_id for row_id, row in table.items() if row.hardware}
     assert Counter(row.severity for row in table.values())["fault"] >= 5
 
 
 def test_all_shown(pytester: pytest.Pytester) -> None:
-    it = project(pytester)
+    it = Project(pytester)
     status, said = it.run()
     assert (status, "fault table" in said) == (0, False), said
     kept = json.loads(it.record.read_text())["test_it.py::test_one"]
@@ -92,7 +87,7 @@ def test_all_shown_by_workers(pytester: pytest.Pytester, monkeypatch: pytest.Mon
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     slow = TABLE + '\n[A3]\nfault = "slow one"\ndetection = "how"\nreaction = "what"\nbound = "when"\n'
     slow += 'severity = "hold"\nslow = true\n'
-    it = project(pytester, SHOWN + '\n@pytest.mark.slow\n@pytest.mark.fault("A3", "A7")\ndef test_slow(): pass\n', slow)
+    it = Project(pytester, SHOWN + '\n@pytest.mark.slow\n@pytest.mark.fault("A3", "A7")\ndef test_slow(): pass\n', slow)
     status, said = it.run("-n1", "--dist=loadgroup", in_process=False)
     # The workers have told of the test that they did not run: its row is shown elsewhere, its mistake found.
     assert status == 1
@@ -122,7 +117,7 @@ def test_all_shown_by_workers(pytester: pytest.Pytester, monkeypatch: pytest.Mon
 )  # fmt: skip
 def test_what_differs_fails(pytester: pytest.Pytester, change: tuple[str, str], problem: str) -> None:
     assert change[0] in SHOWN
-    status, said = project(pytester, SHOWN.replace(*change)).run()
+    status, said = Project(pytester, SHOWN.replace(*change)).run()
     assert status == 1
     assert problem in said
     # A broken measurement fails its test, and with it its row.
@@ -131,7 +126,7 @@ def test_what_differs_fails(pytester: pytest.Pytester, change: tuple[str, str], 
 
 def test_a_teardown_that_fails_shows_nothing(pytester: pytest.Pytester) -> None:
     broken = "\n@pytest.fixture\ndef breaks():\n    yield\n    raise OSError\n"
-    it = project(
+    it = Project(
         pytester, SHOWN.replace("import pytest\n", "import pytest\n" + broken).replace("(case)", "(case, breaks)")
     )
     status, said = it.run()
@@ -141,11 +136,11 @@ def test_a_teardown_that_fails_shows_nothing(pytester: pytest.Pytester) -> None:
 
 
 def test_a_selection_stands_aside_but_for_wrong_marks(pytester: pytest.Pytester) -> None:
-    it = project(pytester)
+    it = Project(pytester)
     for args in (("-k", "one"), ("test_it.py::test_one",), ("--deselect", "test_it.py::test_two")):
         status, said = it.run(*args)
         assert (status, "fault table" in said) == (0, False), said
-    it = project(pytester, SHOWN.replace('fault("A2")', 'fault("B9")'))
+    it = Project(pytester, SHOWN.replace('fault("A2")', 'fault("B9")'))
     status, said = it.run("-k", "one")
     assert status == 1
     assert "B9, which is no row" in said
@@ -154,15 +149,15 @@ def test_a_selection_stands_aside_but_for_wrong_marks(pytester: pytest.Pytester)
 def test_slow_rows_are_shown_by_slow_runs(pytester: pytest.Pytester) -> None:
     slow_row = TABLE.replace("[A2]", "[A2]\nslow = true")
     slow_test = SHOWN.replace('fault("A2")', 'fault("A2")\n@pytest.mark.slow')
-    it = project(pytester, slow_test, slow_row)
+    it = Project(pytester, slow_test, slow_row)
     assert it.run()[0] == 0  # the test is there
     assert it.run("-m", "slow")[0] == 0
     # Both runs are in the record.
     assert len(json.loads(it.record.read_text())) == 3
-    status, said = project(pytester, SHOWN, slow_row).run()
+    status, said = Project(pytester, SHOWN, slow_row).run()
     assert status == 1
     assert "A2 (another): no slow test is marked for it" in said
-    it = project(pytester, slow_test.replace("    pass", "    raise OSError"), slow_row)
+    it = Project(pytester, slow_test.replace("    pass", "    raise OSError"), slow_row)
     assert it.run()[0] == 0
     status, said = it.run("-m", "slow")
     assert status == 1
@@ -171,13 +166,13 @@ def test_slow_rows_are_shown_by_slow_runs(pytester: pytest.Pytester) -> None:
 
 def test_open_rows_are_told_and_do_no_harm(pytester: pytest.Pytester) -> None:
     open_rows = TABLE.replace("[A1]", '[A1]\nopen = "not built"').replace("[A2]", '[A2]\nopen = "nor this"')
-    status, said = project(pytester, SHOWN.replace('fault("A2")', "slow"), open_rows).run()
+    status, said = Project(pytester, SHOWN.replace('fault("A2")', "slow"), open_rows).run()
     assert status == 0
     assert "2 rows open: A1 (not built); tests show it by now, A2 (nor this)" in said
 
 
 def test_a_run_that_was_stopped_is_not_judged(pytester: pytest.Pytester) -> None:
-    status, said = project(pytester, SHOWN.replace("measured(", "assert 0, (", 1)).run("-x")
+    status, said = Project(pytester, SHOWN.replace("measured(", "assert 0, (", 1)).run("-x")
     assert status == 1
     assert "no test is marked" not in said
     assert "A2" not in said
@@ -192,28 +187,35 @@ def test_without_real_time_other_limits_hold() -> None:
     assert row.limit("s", is_realtime=False) == ("at most", 3.0)
 
 
-def test_one_test_of_several_is_enough_and_a_failing_one_spoils_it() -> None:
-    table = {"A1": load_table()["S1"].model_copy(update={"open": None})}
-    passed = Seen(("A1",), is_slow=False, passed=True)
-    other = Seen(("A1",), is_slow=True)
-    assert judge(table, {"one": passed, "two": other}, "default").problems == []
-    other.failed = True
-    assert judge(table, {"one": passed, "two": other}, "default").problems == [f"A1 ({table['A1'].fault}): two failed"]
+def seen(row: str, state: str = "passed", **more: Any) -> Seen:
+    return Seen((row,), more.pop("is_slow", False), passed=state == "passed", failed=state == "failed", **more)
 
 
-def test_what_the_robot_keeps_by_itself_needs_a_test_of_its_own() -> None:
-    table = {"L1": load_table()["L1"].model_copy(update={"open": None})}
-    ours = Seen(("L1",), is_slow=False, passed=True)
-    robots = Seen(("L1",), is_slow=False, passed=True, of_robot=("L1",))
-    assert judge(table, {"ours": ours, "robots": robots}, "default").problems == []
-    (problem,) = judge(table, {"ours": ours}, "default").problems
-    assert "of the robot's part no test is marked for it" in problem
-    (problem,) = judge(table, {"robots": robots}, "default").problems
-    assert problem == f"L1 ({table['L1'].fault}): no test is marked for it"
-    robots.passed = False
-    (problem,) = judge(table, {"ours": ours, "robots": robots}, "default").problems
-    assert "of the robot's part robots did not pass" in problem
-    assert judge(table, {"ours": ours, "robots": robots}, "slow").problems == []
+UNSHOWN = seen("L1", "", of_robot=("L1",))
+
+
+@pytest.mark.parametrize(
+    ("row", "kind", "tests", "problem"),
+    [
+        # One test of several is enough, and a failing one spoils it.
+        ("S1", "default", {"one": seen("S1"), "two": seen("S1", "", is_slow=True)}, ""),
+        ("S1", "default", {"one": seen("S1"), "two": seen("S1", "failed", is_slow=True)}, "two failed"),
+        # What the robot keeps by itself needs a test of its own.
+        ("L1", "default", {"ours": seen("L1"), "robots": seen("L1", of_robot=("L1",))}, ""),
+        ("L1", "default", {"ours": seen("L1")}, "of the robot's part no test is marked for it"),
+        ("L1", "default", {"robots": seen("L1", of_robot=("L1",))}, "no test is marked for it"),
+        (
+            "L1",
+            "default",
+            {"o": seen("L1"), "r": UNSHOWN},
+            "of the robot's part r did not pass",
+        ),
+        ("L1", "slow", {"o": seen("L1"), "r": UNSHOWN}, ""),
+    ],
+)
+def test_what_shows_a_row(row: str, kind: str, tests: dict[str, Seen], problem: str) -> None:
+    table = {row: load_table()[row].model_copy(update={"open": None})}
+    assert judge(table, tests, kind) == ([f"{row} ({table[row].fault}): {problem}"] if problem else [], [])
 
 
 ROW = {"fault": "what", "detection": "how", "reaction": "then", "bound": "when", "severity": "hold"}

@@ -149,7 +149,7 @@ def aborts_in_two_steps(page: Page) -> None:
 def test_an_operator_looks_aborts_and_stops_among_beacons(tmp_path: Path, runtime_dir: Path) -> None:
     config = ("--config", str(configs_dir() / "zigbee.toml"))
     options = ("--realtime", "--json", "--set", "mission.laps=50", *WITH_PAGE)
-    with BeaconRun(tmp_path / "run", runtime_dir, *config, *options) as run:
+    with BeaconRun(tmp_path / "run", runtime_dir, *config, *options, has_report=True) as run:
         run.until(lambda status: status["done"] >= 1)
         port = load_radio_config(run.run_dir / "config.toml").dashboard.port
         with browser_page(port) as page:

@@ -32,15 +32,20 @@ RECORDED = ("--panels", "2", "--world", "hard", "--filter", "ekf", "--json", *NO
 
 
 class Run:
-    """One `ccatp run --sim`; at the end of a `with` it is ended, if it has not ended by itself."""
+    """One `ccatp run --sim`; at the end of a `with` it is ended, if it has not ended by itself.
+
+    Args:
+        has_report: it draws its report at its end, which takes seconds; otherwise it says that there is none.
+    """
 
     free_ports: tuple[str, ...] = FREE_PORTS
 
-    def __init__(self, run_dir: Path, runtime_dir: Path, *args: str) -> None:
+    def __init__(self, run_dir: Path, runtime_dir: Path, *args: str, has_report: bool = False) -> None:
         self.run_dir, self.runtime_dir = run_dir, runtime_dir
         command = [sys.executable, "-m", "ccatp", "run", "--sim", "--run-dir", str(run_dir)]
         command += ["--runtime-dir", str(runtime_dir), *self.free_ports, *args]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        env = os.environ | ({} if has_report else {"MPLBACKEND": "none"})
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env)
         self.stdout = self.stderr = ""
 
     def __enter__(self) -> Self:
@@ -195,7 +200,7 @@ def record_once(factory: pytest.TempPathFactory) -> RecordedRun:
             shutil.rmtree(folder / "run", ignore_errors=True)  # of an attempt that failed
             with (
                 tempfile.TemporaryDirectory(prefix="ccatp-") as sockets,
-                Run(folder / "run", Path(sockets), *RECORDED) as run,
+                Run(folder / "run", Path(sockets), *RECORDED, has_report=True) as run,
             ):
                 assert run.wait(300.0) == 0, run.stderr
             (folder / "stdout").write_text(run.stdout)

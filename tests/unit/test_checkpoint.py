@@ -36,7 +36,7 @@ def test_nothing_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.fault("P16")
-def test_every_flipped_bit_and_every_cut_leaves_a_whole_record_or_none(tmp_path: Path) -> None:
+def test_flipped_bits_and_cuts_leave_a_whole_record_or_none(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint"
     file = CheckpointFile(path, is_patient=True)
     written = {count: msgspec.to_builtins(record(count)) for count in (1, 2)}
@@ -44,12 +44,11 @@ def test_every_flipped_bit_and_every_cut_leaves_a_whole_record_or_none(tmp_path:
     file.write(record(2))
     file.close()
     whole = path.read_bytes()
-    for offset in range(len(whole)):
-        for flip in (0x01, 0x80):
-            path.write_bytes(whole[:offset] + bytes([whole[offset] ^ flip]) + whole[offset + 1 :])
-            found = read_checkpoint(path)
-            assert found is not None  # one slot is untouched
-            assert msgspec.to_builtins(found) == written[found.count]
+    for offset in (*range(8), *range(8, len(whole), 5)):  # length and checksum of a slot, and all over the records
+        path.write_bytes(whole[:offset] + bytes([whole[offset] ^ 1 << offset % 8]) + whole[offset + 1 :])
+        found = read_checkpoint(path)
+        assert found is not None  # one slot is untouched
+        assert msgspec.to_builtins(found) == written[found.count]
     whole_from = 8 + int.from_bytes(whole[:4], "little")  # length and checksum, and the record of an even count
     for length in range(1, len(whole), 7):
         path.write_bytes(whole[:length])
