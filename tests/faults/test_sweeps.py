@@ -262,8 +262,8 @@ def test_a_fault_long_after_the_mission_changes_nothing() -> None:
 
 # -- a robot that is not where it takes itself to be -------------------------------------------------------------------
 
-# The first panel lies at a corner. These meet the rim, some more than once; most others find themselves before.
-SEEDS = (0, 10, 22, 52, 62, 69)
+# The first panel lies at a corner. These meet the rim, two of them twice; most others find themselves before.
+SEEDS = (22, 62, 69)
 
 
 @pytest.mark.fault("S23")
