@@ -117,7 +117,7 @@ def align(
     from ccatp.mirror.mirror import build_mirror
     from ccatp.mirror.mirror_alignment import compare, survey_result
     from ccatp.records.run_reader import read_run
-    from ccatp.report.alignment import csv_lines, head_lines, result_data, table_lines
+    from ccatp.report.alignment import csv_lines, result_data, table_lines
 
     if idle := [key for key in settings if not key.startswith(ALIGN_KEYS)]:
         raise ConfigError(f"command line: {idle[0]}: has no effect on the alignment; what has: {', '.join(ALIGN_KEYS)}")
@@ -139,7 +139,7 @@ def align(
     if json_output:
         print_lines([json.dumps({**facts, **result_data(result, comparison), "warnings": warnings})])
     else:
-        print_lines([*head_lines(facts), *table_lines(result, comparison, cfg.align.puck_height_sigma_m)])
+        print_lines(table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m))
     return 0
 
 

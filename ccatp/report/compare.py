@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from ccatp.core import FloatArray, PanelId
-from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront
+from ccatp.mirror.panel_alignment import PanelResult, mirror_wavefront
 from ccatp.report.figures import distribution_figure, errors_figure, time_figure
 from ccatp.report.findings import KINDS, Findings, findings_of
 from ccatp.report.html import MICRO, Draw, events_of, inline, page_figures, render, write_page, write_pictures
@@ -49,13 +49,11 @@ class Changes(NamedTuple):
         return self.chi2 <= self.high and not any(panel.has_moved for panel in self.panels)
 
 
-def panel_changes(before: Sequence[PanelResult], after: Sequence[PanelResult]) -> Changes | None:
-    """Compare two surveys of one mirror; None without a panel of both.
+def panel_changes(pairs: Sequence[tuple[PanelResult, PanelResult]]) -> Changes | None:
+    """Compare the panels of two surveys of one mirror; None without any.
 
     The error of the puck's height, which all pistons share, is in no covariance: with another puck all seem to move.
     """
-    earlier = {panel.panel: panel for panel in before}
-    pairs = [(earlier[panel.panel], panel) for panel in after if panel.panel in earlier]
     if not pairs:
         return None
     changes = []
@@ -70,60 +68,33 @@ def panel_changes(before: Sequence[PanelResult], after: Sequence[PanelResult]) -
     return Changes(tuple(changes), sum(change.chi2 for change in changes), dof, low, high)
 
 
-class RunPair(NamedTuple):
-    """Two runs, called A and B as on the page, and what changed between them on one mirror."""
+class RunPair:
+    """Two runs, called A and B as on the page, and what changed between them on one mirror.
 
-    a: Findings
-    b: Findings
-    changes: Changes | None
+    ``panels``: those of each that could be fitted; ``wavefronts``: half-wavefront errors of the panels that both have,
+    None where there are none. Only of one mirror points and panels are compared, else ``warning`` says why not.
+    """
 
-    @property
-    def is_one_mirror(self) -> bool:
-        """Points and panels can be compared one by one."""
-        return self.a.record.mirror.name == self.b.record.mirror.name
-
-    @property
-    def named(self) -> tuple[tuple[str, Findings], tuple[str, Findings]]:
-        """Both, with their letters."""
-        return ("A", self.a), ("B", self.b)
-
-    @property
-    def warning(self) -> str:
-        """What keeps them from being compared, or nothing."""
-        if self.is_one_mirror:
-            return ""
-        mirrors = " and ".join(found.record.mirror.name for _, found in self.named)
-        return f"The runs are of different mirrors, {mirrors}: points and panels are not compared."
-
-    @property
-    def panels(self) -> tuple[dict[PanelId, PanelResult], dict[PanelId, PanelResult]]:
-        """Those of each that could be fitted."""
-        a, b = ({p.panel: p for p in (one.alignment.panels if one.alignment else ())} for _, one in self.named)
-        return a, b
-
-    @property
-    def wavefronts(self) -> tuple[MirrorWavefront | None, MirrorWavefront | None]:
-        """Half-wavefront errors over the panels that both have; None where there are none, or of different mirrors."""
-        a, b = self.panels
-        common = a.keys() & b.keys() if self.is_one_mirror else set()
-        first, second = (
+    def __init__(self, a: Findings, b: Findings) -> None:
+        self.a, self.b = a, b
+        self.named = (("A", a), ("B", b))
+        names = [found.record.mirror.name for found in (a, b)]
+        self.is_one_mirror = names[0] == names[1]
+        told = f"The runs are of different mirrors, {' and '.join(names)}: points and panels are not compared."
+        self.warning = "" if self.is_one_mirror else told
+        fitted = [() if found.alignment is None else found.alignment.panels for found in (a, b)]
+        self.panels = [{panel.panel: panel for panel in panels} for panels in fitted]
+        common = [panel for panel in self.panels[1] if panel in self.panels[0] and self.is_one_mirror]
+        self.changes = panel_changes([(self.panels[0][panel], self.panels[1][panel]) for panel in common])
+        self.wavefronts = [
             mirror_wavefront([panel.rigid.wavefront for panel in panels.values() if panel.panel in common])
-            for panels in (a, b)
-        )
-        return first, second
-
-
-def pair_of(a: Findings, b: Findings) -> RunPair:
-    """Put two runs beside each other."""
-    found = RunPair(a, b, None)
-    if not found.is_one_mirror or a.alignment is None or b.alignment is None:
-        return found
-    return found._replace(changes=panel_changes(a.alignment.panels, b.alignment.panels))
+            for panels in self.panels
+        ]
 
 
 def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = None) -> RunPair:
     """Write two runs beside each other, and their figures if a directory is given; raises as ``report_run``."""
-    pair = pair_of(findings_of(read_record(run_a)), findings_of(read_record(run_b)))
+    pair = RunPair(findings_of(read_record(run_a)), findings_of(read_record(run_b)))
     write_page(compare_page(pair), out)
     if figures is not None:
         write_pictures(compare_drawings(pair), figures)
@@ -137,14 +108,7 @@ class ComparedValue(NamedTuple):
     decimals: int
     a: float | None
     b: float | None
-    is_of_one: bool = True  # of the same mirror
-
-    @property
-    def change(self) -> float | None:
-        """B less A, as far as the decimals go."""
-        if self.a is None or self.b is None or not self.is_of_one:
-            return None
-        return round(self.b - self.a, self.decimals)
+    change: float | None  # B less A, as far as the decimals go
 
 
 # Path of a value in ``run_data``, its name, its decimals.
@@ -182,18 +146,17 @@ def compared_figures(pair: RunPair) -> list[ComparedValue]:
 
     Half-wavefront errors are of the panels that both have, and their names say so where these are not all.
     """
-    data = [run_data(found) for found in (pair.a, pair.b)]
+    data = [run_data(found) for _, found in pair.named]
     a, b = pair.panels
+    whole, over = [one["half_wavefront_um"] for one in data], ""
     if pair.is_one_mirror and a.keys() != b.keys():
+        whole = [wavefront_data(one) for one in pair.wavefronts]
         over = f", common panels ({len(a.keys() & b.keys())})"
-        wavefronts = [wavefront_data(one) for one in pair.wavefronts]
-        return [*_compared(_ROWS, data), *_compared(_WAVEFRONT_ROWS, wavefronts, over)]
-    whole = _compared(_WAVEFRONT_ROWS, [one["half_wavefront_um"] for one in data])
-    return [*_compared(_ROWS, data), *(one._replace(is_of_one=pair.is_one_mirror) for one in whole)]
+    return [*_compared(_ROWS, data), *_compared(_WAVEFRONT_ROWS, whole, over, is_of_one=pair.is_one_mirror)]
 
 
 def _compared(
-    rows: Sequence[_Row], data: Sequence[Mapping[str, Any] | None], suffix: str = ""
+    rows: Sequence[_Row], data: Sequence[Mapping[str, Any] | None], suffix: str = "", *, is_of_one: bool = True
 ) -> Iterator[ComparedValue]:
     for path, name, decimals in rows:
         values: list[float | None] = []
@@ -202,57 +165,37 @@ def _compared(
             for key in path.split("."):
                 value = None if value is None else value.get(key)
             values.append(None if value is None else (100.0 if name.endswith("%") else 1.0) * float(value))
+        a, b = values
         if values != [None, None]:
-            yield ComparedValue(name + suffix, decimals, a=values[0], b=values[1])
+            change = None if a is None or b is None or not is_of_one else round(b - a, decimals)
+            yield ComparedValue(name + suffix, decimals, a, b, change)
 
 
 def compare_page(pair: RunPair) -> str:
     """The comparison as one HTML file. A section that the runs hold nothing for is left out."""
-    figures = page_figures(compare_drawings(pair))
     mirror, (a, b) = pair.b.record.mirror, pair.panels
-    ours, others = (found.record.cfg.model_dump(mode="json") for found in (pair.a, pair.b))
+    ours, others = (found.record.cfg.model_dump(mode="json") for _, found in pair.named)
     earlier = {verdict.point: verdict for verdict in pair.a.points}
     fitted = [(name, panels) for name, panels in (("A", a), ("B", b)) if panels and pair.is_one_mirror]
     everything = [panel for _, panels in fitted for panel in panels.values()]
-    surfaces = [
-        (
-            name,
-            inline(surface_figure(mirror, [*panels.values()], f"{mirror.name}: surface of {name}", NARROW, everything)),
-        )
-        for name, panels in fitted
-    ]
-    moved = sorted({*a, *b}, key=lambda panel: (-_largest_move_m(b.get(panel)), panel)) if fitted else []
-    events = [(letter, events_of(found.record.log)) for letter, found in pair.named if found.record.log]
-    sections = (
-        ("figures", "Figures", True),
-        ("configuration", "Configuration", True),
-        ("map", "Paths", "paths" in figures),
-        ("time", "Time budget", "time" in figures),
-        ("errors", "Errors", figures.keys() & {"localization", "arrivals"}),
-        ("points", "Points", pair.is_one_mirror and pair.a.points and pair.b.points),
-        ("surface", "Surfaces", surfaces),
-        ("panels", "Panels, B less A", "change" in figures),
-        ("adjusters", "Adjuster moves", moved),
-        ("events", "Events", events),
-    )
+    surfaces = []
+    for name, panels in fitted:
+        title = f"{mirror.name}: surface of {name}"
+        surfaces.append((name, inline(surface_figure(mirror, [*panels.values()], title, NARROW, everything))))
+    largest_m = {panel: float(abs(found.rigid.moves.values_m).max()) for panel, found in b.items()}
+    moved = sorted({*a, *b}, key=lambda panel: (-largest_m.get(panel, 0.0), panel)) if fitted else []
     return render(
         "compare.html",
-        f"{pair.a.record.name} and {pair.b.record.name}",
-        sections,
         pair=pair,
-        figures=figures,
+        figures=page_figures(compare_drawings(pair)),
         compared=compared_figures(pair),
         changed=changed_keys(ours, others),
         points=[(earlier[verdict.point], verdict) for verdict in pair.b.points if verdict.point in earlier],
         surfaces=surfaces,
         adjusters=next(iter((b or a).values())).adjusters if moved else (),
         moves=[(panel, a.get(panel), b.get(panel)) for panel in moved],
-        events=events,
+        events=[(letter, events_of(found.record.log)) for letter, found in pair.named if found.record.log],
     )
-
-
-def _largest_move_m(panel: PanelResult | None) -> float:
-    return 0.0 if panel is None else float(abs(panel.rigid.moves.values_m).max())
 
 
 def compare_drawings(pair: RunPair) -> dict[str, Draw]:
@@ -260,7 +203,7 @@ def compare_drawings(pair: RunPair) -> dict[str, Draw]:
     found: dict[str, Draw] = {}
     budgets = [(name, one.budget) for name, one in pair.named if one.budget is not None]
     if budgets:
-        found["time"] = partial(time_figure, budgets, max(one.record.cfg.run.budget_s for one in (pair.a, pair.b)))
+        found["time"] = partial(time_figure, budgets, max(one.record.cfg.run.budget_s for _, one in pair.named))
     series = {name: one.errors for name, one in pair.named if one.errors is not None}
     if series:
         found["localization"] = partial(errors_figure, series)
@@ -277,38 +220,22 @@ def compare_drawings(pair: RunPair) -> dict[str, Draw]:
     return found
 
 
-def compare_lines(pair: RunPair) -> Iterator[str]:
+def compare_lines(pair: RunPair) -> list[str]:
     """A line for each figure that differs, then the panels that have moved."""
-    if pair.warning:
-        yield f"warning: {pair.warning}"
     rows = [one for one in compared_figures(pair) if one.change != 0.0]
     names = [one.name.replace("\u00b5", "u").replace("\u03c3", "sigma") for one in rows]
     width = max(map(len, names), default=0) + 2
-    yield f"{'':<{width}}{'A':>12}{'B':>12}{'B less A':>12}"
-    for name, one in zip(names, rows, strict=True):
-        cells = ("-" if value is None else f"{value:.{one.decimals}f}" for value in (one.a, one.b, one.change))
-        yield f"{name:<{width}}" + "".join(f"{cell:>12}" for cell in cells)
-    changes = pair.changes
-    if changes is None:
-        return
-    verdict = "the surveys agree" if changes.agree else "the surveys differ"
-    chi2 = f"chi2 of no change {changes.chi2:.1f} for {changes.dof} degrees of freedom"
-    yield f"{verdict}: {chi2}, {changes.high:.1f} at most by noise alone"
-    for panel in changes.panels:
-        if panel.has_moved:
-            piston, tip, tilt = (MICRO * value for value in panel.values)
-            where = f"panel {panel.panel.row}/{panel.panel.col} has moved"
-            yield f"{where}: piston {piston:+.1f} um, tip {tip:+.1f} urad, tilt {tilt:+.1f} urad"
+    return render("compare.txt", pair=pair, rows=[*zip(names, rows, strict=True)], width=width).splitlines()
 
 
 def compare_data(pair: RunPair) -> dict[str, Any]:
     """What ``ccatp compare --json`` prints."""
-    changes, (a, b) = pair.changes, pair.wavefronts
+    changes, (a, b) = pair.changes, map(wavefront_data, pair.wavefronts)
     return {
         "a": run_data(pair.a),
         "b": run_data(pair.b),
         "one_mirror": pair.is_one_mirror,
-        "half_wavefront_common_um": {"a": wavefront_data(a), "b": wavefront_data(b)},
+        "half_wavefront_common_um": {"a": a, "b": b},
         "panels": None if changes is None else [_panel(panel) for panel in changes.panels],
         "chi2": None if changes is None else round(changes.chi2, 4),
         "dof": None if changes is None else changes.dof,

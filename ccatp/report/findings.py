@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import pairwise
+from itertools import chain, pairwise
 from math import dist
 from typing import NamedTuple
 
@@ -87,32 +87,25 @@ def point_verdicts(record: RunRecord) -> list[PointVerdict]:
 def first_arrivals_mm(record: RunRecord) -> dict[PointId, float]:
     """Distance from each point at the first rest there, mm: from the truth, or from the first fix there."""
     found: dict[PointId, float] = {}
+    mirror, height_m = record.mirror, record.cfg.robot.puck_height_m
     for session in record.sessions:
-        found = (_from_fixes if session.truth is None else _from_truth)(record, session) | found
+        first: dict[PointId, float] = {}
+        truth = session.truth
+        if truth is None:
+            # The first fix of a point belongs to its first arrival: corrections follow it.
+            pucks = {PointId(*fix.point): fix.position_m for fix in reversed(session.fixes) if fix.point is not None}
+            first = {point: 1e3 * arrival_error_m(mirror, point, puck_m, height_m) for point, puck_m in pucks.items()}
+        elif len(truth.seq):
+            frames = {PointId(*arrival.point): arrival.seq for arrival in reversed(session.arrivals)}
+            targets = puck_targets(mirror, frames, height_m)
+            rows = zip(frames, np.searchsorted(truth.seq, [*frames.values()]).tolist(), frames.values(), strict=True)
+            for point, at, seq in rows:
+                if at < len(truth.seq) and truth.seq[at] == seq:
+                    place = truth.place_m[at]
+                    normal = mirror.surface.normal(float(place[0]), float(place[1]))
+                    first[point] = 1e3 * true_arrival_error_m(targets[point], place, normal, height_m)
+        found = first | found
     return found
-
-
-def _from_truth(record: RunRecord, session: RecordedSession) -> dict[PointId, float]:
-    truth, mirror, height_m = session.truth, record.mirror, record.cfg.robot.puck_height_m
-    if truth is None or not len(truth.seq):
-        return {}
-    first = {PointId(*arrival.point): arrival.seq for arrival in reversed(session.arrivals)}
-    targets = puck_targets(mirror, first, height_m)
-    found = {}
-    for point, seq in first.items():
-        at = int(np.searchsorted(truth.seq, seq))
-        if at < len(truth.seq) and truth.seq[at] == seq:
-            place = truth.place_m[at]
-            normal = mirror.surface.normal(float(place[0]), float(place[1]))
-            found[point] = 1e3 * true_arrival_error_m(targets[point], place, normal, height_m)
-    return found
-
-
-def _from_fixes(record: RunRecord, session: RecordedSession) -> dict[PointId, float]:
-    """The first fix of a point belongs to its first arrival: corrections follow it."""
-    height_m = record.cfg.robot.puck_height_m
-    first = {PointId(*fix.point): fix.position_m for fix in reversed(session.fixes) if fix.point is not None}
-    return {point: 1e3 * arrival_error_m(record.mirror, point, puck_m, height_m) for point, puck_m in first.items()}
 
 
 def _reasons(record: RunRecord) -> dict[PointId, str]:
@@ -159,13 +152,18 @@ def error_series(record: RunRecord) -> ErrorSeries | None:
     sessions = [session for session in record.sessions if len(session.track.seq)]
     if not sessions:
         return None
-    times, errors, breaks = list[FloatArray](), list[FloatArray](), list[float]()
+    times, all_errors, breaks = list[FloatArray](), list[FloatArray](), list[float]()
     fixes = list[tuple[float, float, bool]]()
     start_s = 0.0
     for session in sessions:
-        offset_s = start_s - float(session.track.t_s[0])
-        times.append(session.track.t_s + offset_s)
-        errors.append(_errors_mm(session))
+        track, truth = session.track, session.truth
+        offset_s = start_s - float(track.t_s[0])
+        times.append(track.t_s + offset_s)
+        errors = np.full(len(track.seq), np.nan)
+        if truth is not None:
+            _, i, j = np.intersect1d(track.seq, truth.seq, assume_unique=True, return_indices=True)
+            errors[i] = 1e3 * np.linalg.norm(track.place_m[i] - truth.place_m[j], axis=1)
+        all_errors.append(errors)
         fixes += [(fix.t_s + offset_s, fix.jump_mm, fix.is_fused) for fix in session.fixes]
         start_s += session.span_s
         breaks.append(start_s)
@@ -173,20 +171,12 @@ def error_series(record: RunRecord) -> ErrorSeries | None:
     return ErrorSeries(
         t_s=np.concatenate(times),
         sigma3_mm=1e3 * SIGMAS * np.concatenate([session.track.sigma_m for session in sessions]),
-        error_mm=np.concatenate(errors),
+        error_mm=np.concatenate(all_errors),
         breaks_s=tuple(breaks[:-1]),
         fix_t_s=table[:, 0],
         fix_mm=table[:, 1],
         fix_fused=table[:, 2] > 0.0,
     )
-
-
-def _errors_mm(session: RecordedSession) -> FloatArray:
-    errors = np.full(len(session.track.seq), np.nan)
-    if session.truth is not None:
-        _, i, j = np.intersect1d(session.track.seq, session.truth.seq, assume_unique=True, return_indices=True)
-        errors[i] = 1e3 * np.linalg.norm(session.track.place_m[i] - session.truth.place_m[j], axis=1)
-    return errors
 
 
 def error_figures(series: ErrorSeries) -> ErrorFigures | None:
@@ -250,10 +240,10 @@ def time_budget(record: RunRecord) -> TimeBreakdown | None:
         for session, found in zip(record.sessions, exact, strict=True)
     ]
     spent, visits = defaultdict[str, float](float), defaultdict[str, int](int)
-    for state, duration_s in (spell for found in spells for spell in found):
+    for state, duration_s in chain.from_iterable(spells):
         kind = _KIND_OF.get(state, "wait")
         visits[kind] += state != _NEVER_BEGUN
-        waited_s = duration_s - measuring_s if kind == "measure" and duration_s > measuring_s else 0.0
+        waited_s = max(duration_s - measuring_s, 0.0) if kind == "measure" else 0.0
         spent["wait"] += waited_s
         spent[kind] += measuring_s if waited_s else duration_s
     if not any(spells):
@@ -370,16 +360,9 @@ def findings_of(record: RunRecord) -> Findings:
         planned = {row.point.panel for row in record.points or ()}
         alignment = survey_result(record.mirror, cfg.align, cfg.robot.puck_height_m, record.measured, planned)
         against = compare(alignment.panels, record.injected) if record.injected else None
-    return Findings(
-        record=record,
-        outcome=outcome_of(record),
-        points=point_verdicts(record),
-        errors=errors,
-        figures=None if errors is None else error_figures(errors),
-        budget=time_budget(record),
-        alignment=alignment,
-        against=against,
-    )
+    figures = None if errors is None else error_figures(errors)
+    outcome, points, budget = outcome_of(record), point_verdicts(record), time_budget(record)
+    return Findings(record, outcome, points, errors, figures, budget, alignment, against)
 
 
 def outcome_of(record: RunRecord) -> PointOutcome:

@@ -43,10 +43,9 @@ def inline(figure: "Figure") -> Markup:
     return Markup(svg_of(figure))  # noqa: S704 - matplotlib and ElementTree escape every text in it
 
 
-def render(template: str, title: str, sections: Iterable[tuple[str, str, object]], **values: Any) -> str:
-    """The page as one HTML file that needs nothing from outside; ``sections``: anchor, heading, whether it is shown."""
-    shown = [(anchor, heading) for anchor, heading, is_shown in sections if is_shown]
-    return environment().get_template(template).render(title=title, sections=shown, **values)
+def render(template: str, **values: Any) -> str:
+    """The page as one HTML file that needs nothing from outside."""
+    return environment().get_template(template).render(values)
 
 
 @cache

@@ -122,7 +122,7 @@ def _members(enum: Any) -> list[Any]:
 
 def test_fields_have_foxgloves_names() -> None:
     for view in VIEWS:
-        kind = getattr(sdk, view.schema_name.removeprefix("foxglove."), None)
+        kind: Any = getattr(sdk, view.schema_name.removeprefix("foxglove."), None)
         for name in dict(view_schemas())[view.name]["properties"] if kind else ():
             with pytest.raises(TypeError) as refused:  # of the wrong type it is, but known
                 kind(**{name: object()})

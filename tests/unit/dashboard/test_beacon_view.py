@@ -20,12 +20,7 @@ from ccatp.links.topics import (
     Scene,
 )
 from ccatp.report.beacon_record import expected_rms_m, true_rms_m
-from ccatp.report.dashboard.beacon_view import (
-    BeaconView,
-    beacon_ground,
-    waypoint_name,
-    worst_sigma_m,
-)
+from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground, worst_sigma_m
 from ccatp.report.dashboard.view import MEASURED, PLANNED
 
 ELLIPSE = (0.8, 0.8, 4e-4, 0.0, 4e-4)
@@ -124,16 +119,12 @@ def test_the_scene_without_what_the_page_draws_itself(view: BeaconView) -> None:
     told = encoded(view.news(0.0))
     assert [shape["kind"] for shape in told["shapes"]] == ["true", "beacon", "obstacle"]
     assert told["shapes"][0]["y_m"] == 1.0
-
-
-def test_there_is_no_laser(view: BeaconView) -> None:
-    assert [link.name for link in view.news(0.0)["links"]] == ["main loop", "danger loop", "robot"]
+    assert [link["name"] for link in told["links"]] == ["main loop", "danger loop", "robot"]  # no laser
 
 
 def test_the_path_comes_with_the_map(view: BeaconView) -> None:
-    view.receive(told_map(), 0.0)
-    view.receive(told_map(1.5, pose=(0.801, 0.8, 0.0)), 0.0)  # nobody sees so little
-    view.receive(told_map(2.0, pose=(0.9, 0.8, 0.0)), 0.0)
+    for t_s, x_m in ((1.0, 0.8), (1.5, 0.801), (2.0, 0.9)):  # nobody sees a millimetre
+        view.receive(told_map(t_s, pose=(x_m, 0.8, 0.0)), 0.0)
     assert view.everything(0.0)["path"] == [(0.8, 0.8), (0.9, 0.8)]
 
 
@@ -152,15 +143,10 @@ def test_the_ground(system: str) -> None:
     assert told["rim"][2] == list(cfg.workspace.size_m)
     assert told["states"] == [str(state) for state in BeaconState]
     is_following = system == "follow"
-    assert len(told["points"]) == (0 if is_following else len(cfg.workspace.waypoints_m))
+    names = [] if is_following else [f"waypoint {k + 1}" for k in range(len(cfg.workspace.waypoints_m))]
+    assert [point[0] for point in told["points"]] == names
     assert ("target" in told["plots"]) is is_following
     assert told["words"]["unit"] == ("seconds" if is_following else "waypoints")
-
-
-def test_names_are_those_of_the_status() -> None:
-    assert waypoint_name(0) == "waypoint 1"
-    ground = beacon_ground(config(), is_sim=True, needs_token=False)
-    assert [point[0] for point in ground["points"]] == [waypoint_name(k) for k in range(4)]
 
 
 def test_a_page_beyond_this_machine_wants_a_token() -> None:

@@ -64,13 +64,11 @@ def picture(t_s: float = 1.5, nis: float = 2.0, line: bytes = LINE) -> DisplaySt
     )  # fmt: skip
 
 
-def fix_at(
-    mirror: Mirror, point: PointId | None, ahead_m: float, t_s: float = 2.0, *, is_fused: bool = True
-) -> FixMessage:
+def fix_at(mirror: Mirror, point: PointId | None, ahead_m: float, t_s: float = 2.0) -> FixMessage:
     x_m, y_m = mirror.point_on_deck(point or PointId(1, 2, 1))
     world = mirror.puck_world(DeckPose(x_m + ahead_m, y_m, 0.0), 0.05)
     return FixMessage(
-        seq=9, t_s=t_s, point=point, is_fused=is_fused, position_m=world, covariance_m2=[0.0] * 9, dop=1.0,
+        seq=9, t_s=t_s, point=point, is_fused=True, position_m=world, covariance_m2=[0.0] * 9, dop=1.0,
         residual_rms_m=1e-6, channels=[1, 2, 3, 4], jump_mm=0.7,
     )  # fmt: skip
 
@@ -80,82 +78,73 @@ def encoded(state: dict[str, Any]) -> dict[str, Any]:
     return told
 
 
-def test_before_anything_was_heard(view: SurveyView) -> None:
+def test_levels_are_there_each_time(view: SurveyView) -> None:
     state = encoded(view.news(0.0))
     assert state["mission"] is state["pose"] is state["verdict"] is state["robot"] is None
     assert state["points"] == state["path"] == state["log"] == []
     assert state["is_sim"] is True
-
-
-def test_levels_are_there_each_time(view: SurveyView) -> None:
     view.receive(mission(), 1.0)
     view.receive(picture(), 1.0)
     for _ in range(2):
         state = encoded(view.news(1.1))
-        assert state["mission"]["state"] == "driving"
-        assert state["mission"]["is_stale"] is False
-        assert state["pose"]["x_m"] == 1.0
+        assert (state["mission"]["state"], state["mission"]["is_stale"], state["pose"]["x_m"]) == (
+            "driving",
+            False,
+            1.0,
+        )
         assert state["robot"] == {
             "edges": [1, 0, 1, 1], "fans": [0.8, 0.7], "charge": 0.93, "drive_age_s": 0.012, "permit_age_s": 0.008,
             "is_held": False, "faults": ["stall"],
         }  # fmt: skip
+    assert view.news(2.1)["mission"]["is_stale"]
+    view.receive(picture(line=b"null"), 3.2)  # before the first frame
+    assert (view.news(3.2)["robot"], view.news(3.2)["pose"] is None) == (None, False)
+    view.look_away()
+    assert view.news(3.3)["pose"] is None
+    view.receive(mission(exit_status=0), 4.0)
+    assert (view.news(9.0)["is_over"], view.news(9.0)["mission"]["is_stale"]) == (True, False)
 
 
 def test_the_next_point_is_known_on_the_way_to_other_stops_too(view: SurveyView, mirror: Mirror) -> None:
-    view.receive(mission(point="1-2-9"), 1.0)
-    assert view.news(1.0)["mission"]["next_point"] == "1-2-9"
-    view.receive(mission(point=""), 1.1)
-    assert view.news(1.1)["mission"]["next_point"] == "1-2-7"
+    for status, point in ((mission(point="1-2-9"), "1-2-9"), (mission(point=""), "1-2-7")):
+        view.receive(status, 1.0)
+        assert view.news(1.0)["mission"]["next_point"] == point
     view.receive(fix_at(mirror, view.points[0], 0.0), 1.2)
     assert view.news(1.2)["mission"]["next_point"] == "1-2-8"
     view.receive(mission(point="", outcome="stopped"), 1.3)
     assert view.news(1.3)["mission"]["next_point"] == ""
 
 
-def test_a_status_gets_stale(view: SurveyView) -> None:
-    view.receive(mission(), 1.0)
-    assert not view.news(1.9)["mission"]["is_stale"]
-    assert view.news(2.1)["mission"]["is_stale"]
-    view.receive(mission(exit_status=0), 2.2)
-    assert not view.news(9.0)["mission"]["is_stale"]
-
-
-def test_a_point_from_arrival_to_measured(view: SurveyView, mirror: Mirror) -> None:
+def test_a_point_is_arrived_at_then_measured(view: SurveyView, mirror: Mirror) -> None:
     point = view.points[0]
-    view.receive(ArrivalMessage(seq=8, t_s=2.0, point=(point.row, point.col, point.point), error_mm=0.3), 2.0)
-    assert view.news(2.0)["points"] == [[0, ARRIVED, None]]
-    view.receive(fix_at(mirror, point, 0.004), 2.1)
-    state = view.news(2.1)
-    (index, how, error_mm), *none = state["points"]
-    assert (index, how, none) == (0, MEASURED, [])
+    arrival = ArrivalMessage(seq=9, t_s=1.0, point=(point.row, point.col, point.point), error_mm=0.3)
+    view.receive(arrival, 1.0)
+    assert view.news(1.0)["points"] == [[0, ARRIVED, None]]
+    view.receive(fix_at(mirror, point, 0.004), 2.0)
+    state = view.news(2.0)
     # The foot lies 4 mm ahead on the deck, and a little more along the slope.
-    assert error_mm == pytest.approx(4.0, abs=0.3)
-    assert state["series"]["arrival"] == [(2.0, error_mm)]
+    assert state["points"] == [[0, MEASURED, pytest.approx(4.0, abs=0.3)]]
+    assert state["series"]["arrival"] == [(2.0, state["points"][0][2])]
     assert state["series"]["jump"] == [(2.0, 0.7)]
-    view.receive(ArrivalMessage(seq=8, t_s=2.2, point=(point.row, point.col, point.point), error_mm=0.3), 2.2)
+    view.receive(arrival, 2.2)
     assert view.news(2.2)["points"] == []  # measured stays measured
 
 
-def test_a_fix_that_is_refused_measures_nothing(view: SurveyView, mirror: Mirror) -> None:
-    view.receive(fix_at(mirror, view.points[0], 0.0, is_fused=False), 2.0)
+@pytest.mark.parametrize(
+    ("is_point", "changes", "points", "series"),
+    [
+        pytest.param(True, {"is_fused": False}, [], set(), id="refused"),
+        pytest.param(False, {}, [], {"jump"}, id="finds the robot only"),
+        pytest.param(True, {"position_m": (1e3, 1e3, 1e3)}, [[0, MEASURED, None]], {"jump"}, id="far from the mirror"),
+    ],
+)
+def test_fixes_that_are_no_measurements(
+    view: SurveyView, mirror: Mirror, is_point: bool, changes: dict[str, Any], points: list[Any], series: set[str]
+) -> None:
+    fix = fix_at(mirror, view.points[0] if is_point else None, 0.0)
+    view.receive(msgspec.structs.replace(fix, **changes), 2.0)
     state = view.news(2.0)
-    assert state["points"] == []
-    assert state["series"] == {}
-
-
-def test_a_fix_without_a_point_finds_the_robot_only(view: SurveyView, mirror: Mirror) -> None:
-    view.receive(fix_at(mirror, None, 0.0), 2.0)
-    state = view.news(2.0)
-    assert state["points"] == []
-    assert set(state["series"]) == {"jump"}
-
-
-def test_a_fix_far_from_the_mirror_has_no_error(view: SurveyView, mirror: Mirror) -> None:
-    fix = msgspec.structs.replace(fix_at(mirror, view.points[0], 0.0), position_m=(1e3, 1e3, 1e3))
-    view.receive(fix, 2.0)
-    state = view.news(2.0)
-    assert state["points"] == [[0, MEASURED, None]]
-    assert "arrival" not in state["series"]
+    assert (state["points"], set(state["series"])) == (points, series)
 
 
 def test_points_left_out(view: SurveyView, mirror: Mirror) -> None:
@@ -167,52 +156,31 @@ def test_points_left_out(view: SurveyView, mirror: Mirror) -> None:
     assert news["mission"]["not_to_be_measured"] == 3
 
 
-def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(view: SurveyView, mirror: Mirror) -> None:
+def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(
+    view: SurveyView, mirror: Mirror, cfg: Config
+) -> None:
     view.is_tracking = True
     rows, truths = [], []
     for k in range(300):
         rows.append((k, 0.01 * k, 1, 2, -0.1 + 0.001 * k, 0.05, 0.0, 0.001))
         deck = mirror.deck_pose(PanelPose(PanelId(1, 2), rows[-1][4], 0.05, 0.0))
         truths.append((k, 0.01 * k, deck.x_m + 0.002, deck.y_m, 0.0, 0.0, 0.0, 0.0, 1.0, 0, 0))
-    view.receive(TrackMessage(seq=299, t_s=3.0, rows=rows), 3.0)
+    track = TrackMessage(seq=299, t_s=3.0, rows=rows)
+    view.receive(track, 3.0)
     view.receive(TruthMessage(seq=299, t_s=3.0, rows=truths), 3.0)
     state = encoded(view.news(3.0))
     path = np.array(state["path"])
     assert hypot(*(path[-1] - path[0])) == pytest.approx(0.28, abs=0.01)
-    assert [round(row[1], 3) for row in state["series"]["error"]] == [2.0, 2.0]
-    assert [row[2] for row in state["series"]["error"]] == [3.0, 3.0]
-
-
-def test_without_a_truth_sigma_alone_is_shown(mirror: Mirror, cfg: Config) -> None:
-    view = SurveyView(mirror, cfg, is_sim=False)
-    rows = [(k, 0.01 * k, 1, 2, 0.0, 0.0, 0.0, 0.002) for k in range(250)]
-    view.receive(TrackMessage(seq=249, t_s=2.5, rows=rows), 2.5)
-    assert view.news(2.5)["series"]["error"] == [(0.0, None, 6.0), (1.0, None, 6.0), (2.0, None, 6.0)]
-
-
-def test_stops_are_the_path_where_nobody_looked(view: SurveyView, mirror: Mirror) -> None:
-    for k in (0, 1):
-        view.receive(fix_at(mirror, view.points[k], 0.0, t_s=float(k)), float(k))
-    assert len(view.news(2.0)["path"]) == 2
-    view.is_tracking = True
-    view.receive(fix_at(mirror, view.points[2], 0.0), 3.0)
-    assert view.news(3.0)["path"] == []
+    assert [[round(value, 3) for value in row[1:]] for row in state["series"]["error"]] == [[2.0, 3.0], [2.0, 3.0]]
+    blind = SurveyView(mirror, cfg, is_sim=False)  # without a truth sigma alone is shown
+    blind.receive(track, 3.0)
+    assert blind.news(3.0)["series"]["error"] == [(0.0, None, 3.0), (1.0, None, 3.0), (2.0, None, 3.0)]
 
 
 def test_innovations_are_told_when_they_change(view: SurveyView) -> None:
-    view.receive(picture(1.0, nis=2.0), 1.0)
-    view.receive(picture(1.1, nis=2.0), 1.1)
-    view.receive(picture(1.2, nis=3.5), 1.2)
+    for t_s, nis in ((1.0, 2.0), (1.1, 2.0), (1.2, 3.5)):
+        view.receive(picture(t_s, nis=nis), t_s)
     assert view.news(1.2)["series"]["nis"] == [(1.0, 2.0, 2), (1.2, 3.5, 2)]
-
-
-def test_a_picture_before_the_first_frame(view: SurveyView) -> None:
-    view.receive(picture(line=b"null"), 1.0)
-    state = view.news(1.0)
-    assert state["robot"] is None
-    assert state["pose"] is not None
-    view.look_away()
-    assert view.news(1.1)["pose"] is None
 
 
 def test_the_verdict_and_its_cause(view: SurveyView) -> None:
@@ -226,9 +194,6 @@ def test_the_verdict_and_its_cause(view: SurveyView) -> None:
         "text": "edge (front left): 0.006 (limit 0.005)", "is_stale": False,
     }  # fmt: skip
     assert view.news(2.5)["verdict"]["is_stale"]
-
-
-def test_a_danger_event_is_a_line_as_well(view: SurveyView) -> None:
     event = DangerEvent(
         seq=4, t_s=1.25, code=2, cause="fire", signal="emergency:fire", value=1.0, limit=0.0, off=(False,) * 4,
         severity=5,
@@ -255,11 +220,14 @@ def test_other_things_on_the_map(view: SurveyView) -> None:
     assert len(view.everything(1.1)["shapes"]) == 2
 
 
-def test_everything_is_the_sum_of_the_news(view: SurveyView, mirror: Mirror) -> None:
+def test_everything_is_the_sum_of_the_news_and_stops_are_the_path_where_nobody_looked(
+    view: SurveyView, mirror: Mirror
+) -> None:
     points: dict[int, list[Any]] = {}
     path: list[Any] = []
     arrivals: list[Any] = []
     for k in range(6):
+        view.is_tracking = k == 5
         view.receive(fix_at(mirror, view.points[k], 0.001 * k, t_s=float(k)), float(k))
         news = view.news(float(k))
         points |= {row[0]: row for row in news["points"]}
@@ -268,6 +236,7 @@ def test_everything_is_the_sum_of_the_news(view: SurveyView, mirror: Mirror) -> 
     everything = view.everything(6.0)
     assert everything["points"] == list(points.values())
     assert everything["path"] == path
+    assert len(path) == 5
     assert everything["series"]["arrival"] == arrivals
 
 
@@ -283,9 +252,6 @@ def test_what_was_measured_before_is_there(view: SurveyView, mirror: Mirror) -> 
 
 def test_the_ground(mirror: Mirror, cfg: Config) -> None:
     told = encoded(ground(mirror, cfg, is_sim=True, needs_token=False))
-    assert len(told["panels"]) == 77
-    assert len(told["points"]) == 18
-    assert told["points"][0][0] == "1-2-7"
-    assert told["title"] == "fyst-m1"
-    assert told["is_sim"] is True
+    assert (told["title"], told["is_sim"]) == ("fyst-m1", True)
+    assert (len(told["panels"]), len(told["points"]), told["points"][0][0]) == (77, 18, "1-2-7")
     assert len(told["rim"]) > 4
