@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 from ccatp.config.models import Config, WorldConfig
 from ccatp.core import DeckPose
-from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mirror.mirror import Mirror
 from ccatp.sim.plant import (
     BodyStep,
     Creep,
@@ -26,11 +26,6 @@ from ccatp.sim.plant import (
 RADIUS_M, BASE_M, LAG_S = 0.03, 0.15, 0.08
 START = DeckPose(0.9, -1.4, 0.7)
 DT_S = 0.01
-
-
-@pytest.fixture(scope="module")
-def mirror(config: Config) -> Mirror:
-    return build_mirror(config.mirror)
 
 
 def plant_on(mirror: Mirror, start: DeckPose = START, disturbances: tuple[Disturbance, ...] = ()) -> Plant:

@@ -7,46 +7,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, PanelId
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import MAX_LINE_BYTES, Sensors
-from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mirror.mirror import Mirror
 from ccatp.sim import ground_truth
 from ccatp.sim.ground_truth import GroundTruthPublisher
 from ccatp.sim.robot import Robot
 from ccatp.sim.world import TruthRow
-
-
-@pytest.fixture(scope="module")
-def mirror(config: Config) -> Mirror:
-    return build_mirror(config.mirror)
+from tests.support.scenario import boot, config_of, drive, mirror_of, sensors_of
 
 
 @pytest.fixture(scope="module")
 def overhang() -> Config:
-    return load_config(overrides={"run.mirror": "fyst-m2"})
-
-
-def boot(config: Config, mirror: Mirror, seed: int = 1) -> Robot:
-    return Robot(config, mirror, np.random.default_rng(seed))
-
-
-def frame(robot: Robot) -> Sensors:
-    message = decode_from_robot(robot.delivered_line[:-1])
-    assert isinstance(message, Sensors)
-    return message
-
-
-def drive(robot: Robot, right: float, left: float, frames: int) -> None:
-    for _ in range(frames):
-        robot.rules.drive(robot.seq + 1, right, left, robot.t_s)
-        robot.advance()
+    return config_of("fyst-m2")
 
 
 def test_boot_is_frame_zero(config: Config, mirror: Mirror) -> None:
-    sensors = frame(boot(config, mirror))
+    sensors = sensors_of(boot(config, mirror))
     assert (sensors.seq, sensors.t, sensors.fans, sensors.faults) == (0, 0.0, (0.0, 0.0), [])
     assert [sample.t_s for sample in sensors.imu] == [0.0]
     assert [sample.t_s for sample in sensors.enc] == [0.0]
@@ -58,7 +37,7 @@ def test_boot_is_frame_zero(config: Config, mirror: Mirror) -> None:
 def test_a_frame_holds_the_samples_since_the_one_before(config: Config, mirror: Mirror) -> None:
     robot = boot(config, mirror)
     drive(robot, 3.0, 2.0, 7)
-    sensors = frame(robot)
+    sensors = sensors_of(robot)
     assert (sensors.seq, sensors.t) == (7, 0.07)
     assert [sample.t_s for sample in sensors.enc] == [n / 1000.0 for n in range(61, 71)]
     assert [sample.t_s for sample in sensors.edge] == [n / 1000.0 for n in range(61, 71)]
@@ -123,9 +102,9 @@ def test_it_falls_when_its_centre_passes_the_rim_and_never_moves_again(config: C
     assert -0.001 <= rim.signed_distance_m(x, y) <= 0.0  # within a frame of 0.9 mm
     assert all(rim.signed_distance_m(row[2], row[3]) >= 0.0 for row in rows[:first])
     assert {row[2:8] for row in rows[first:]} == {rows[first][2:8]}
-    assert frame(robot).cmd.held
+    assert sensors_of(robot).cmd.held
     # The truth is never on the link.
-    assert frame(robot).faults == []
+    assert sensors_of(robot).faults == []
 
 
 def test_the_distance_to_the_rim_is_never_missed_after_a_long_drive_inside(config: Config, mirror: Mirror) -> None:
@@ -163,8 +142,8 @@ def test_clearance_and_mask_of_the_truth_are_those_of_the_sensors(config: Config
 
 
 def test_on_an_overhang_thrust_below_the_floor_lets_it_fall(overhang: Config) -> None:
-    robot = boot(overhang, build_mirror(overhang.mirror))
-    assert frame(robot).fans == (0.6, 0.6)
+    robot = boot(overhang, mirror_of("fyst-m2"))
+    assert sensors_of(robot).fans == (0.6, 0.6)
     drive(robot, 0.0, 0.0, 100)
     robot.fans.command(1, 0.0, 0.0)
     drive(robot, 0.0, 0.0, 100)
@@ -178,7 +157,7 @@ def test_on_an_overhang_thrust_below_the_floor_lets_it_fall(overhang: Config) ->
     assert not robot.world.is_fallen
     drive(robot, 0.0, 0.0, 1)
     assert robot.world.is_fallen  # 0.2 s without a break
-    assert frame(robot).cmd.held
+    assert sensors_of(robot).cmd.held
 
 
 # -- configuration ----------------------------------------------------------------------------------------------------
@@ -211,7 +190,7 @@ def test_lines_stay_within_the_limit_and_readable(config: Config, mirror: Mirror
     for _ in range(200):
         drive(robot, 8.0, -8.0, 1)
         assert len(robot.delivered_line) <= MAX_LINE_BYTES
-        frame(robot)
+        sensors_of(robot)
 
 
 # -- what the truth gives away ----------------------------------------------------------------------------------------
@@ -277,7 +256,7 @@ def test_answers(config: Config, mirror: Mirror) -> None:
 
 @pytest.fixture(scope="module")
 def hard() -> Config:
-    return load_config(overrides={"run.world": "hard"})
+    return config_of(run__world="hard")
 
 
 def with_world(config: Config, **values: float) -> Config:
@@ -303,7 +282,7 @@ def survey(config: Config, mirror: Mirror, seed: int = 1, frames: int = 400) -> 
 
 @pytest.mark.parametrize("world", ["thesis", "hard", "extreme"])
 def test_what_is_delivered_equals_its_line(mirror: Mirror, world: str) -> None:
-    cfg = load_config(overrides={"run.world": world})
+    cfg = config_of(run__world=world)
     robot = boot(cfg, mirror)
     robot.join("controller")
     robot.join("monitor")
@@ -340,7 +319,7 @@ def test_a_frame_is_delivered_when_the_clock_shows_its_time_and_the_delay(
 
 @pytest.mark.parametrize("world", ["hard", "extreme"])
 def test_a_disturbed_world_is_a_function_of_its_seed(mirror: Mirror, world: str) -> None:
-    cfg = load_config(overrides={"run.world": world})
+    cfg = config_of(run__world=world)
     first, again, other = (survey(cfg, mirror, seed, 150) for seed in (1, 1, 2))
     assert first == again
     assert first != other

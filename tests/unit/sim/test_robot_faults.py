@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from ccatp.cli import main
-from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
-from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_injector import InjectionRecord, make_sensor_fault
 from ccatp.sim.fault_plan import LINK_TYPES, TYPES, FaultPlan, Injected, check_pacing, parse_plan, read_plan
 from ccatp.sim.robot import Robot
+from tests.support.scenario import config_of, fault_plan, mirror_of
 
 FAULT = '[[fault]]\nsignal = "imu_wz"\nat_s = 1.0\n'
 LINK = "[[link]]\nat_s = 1.0\n"
@@ -142,14 +142,8 @@ def test_the_commands_refuse_it_before_anything_starts(
     assert error.count("\n") == 1
 
 
-@pytest.fixture(scope="module")
-def mirror(config: Config) -> Mirror:
-    return build_mirror(config.mirror)
-
-
 def plan_of(**values: object) -> FaultPlan:
-    rows = {"at_s": 0.5, **values}
-    return parse_plan("[[fault]]\n" + "\n".join(f"{key} = {json.dumps(value)}" for key, value in rows.items()), "plan")
+    return fault_plan({"at_s": 0.5, **values})
 
 
 def boot(config: Config, mirror: Mirror, **values: object) -> Robot:
@@ -207,11 +201,10 @@ def test_a_runaway_wheel_turns_while_the_robot_holds(config: Config, mirror: Mir
 @pytest.mark.parametrize("world", ["thesis", "hard"])
 @pytest.mark.parametrize("signal", ["body", "right_wheel", "left_wheel"])
 def test_slip_takes_way_from_the_body_and_not_from_the_wheels(world: str, signal: str) -> None:
-    cfg = load_config(overrides={"run.world": world})
-    deck = build_mirror(cfg.mirror)
+    cfg = config_of(run__world=world)
     ways, angles, rates = [], [], []
     for faults in ({}, {"signal": signal, "type": "slip", "factor": 0.5, "for_s": 0.5}):
-        robot = boot(cfg, deck, **faults)
+        robot = boot(cfg, mirror_of(), **faults)
         frames = drive(robot, 3.0, 3.0, 0.98)
         ways.append(robot.world.plant.forward_m)
         rates.append(frames[-1]["imu"][-1][2])
@@ -285,15 +278,15 @@ def test_edge_sensors_read_the_panels_of_the_new_place(config: Config, mirror: M
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_weak_fan_echoes_its_duty_and_lets_the_robot_fall_from_an_overhang(side: str) -> None:
-    cfg = load_config(overrides={"run.mirror": "fyst-m2"})
-    robot = boot(cfg, build_mirror(cfg.mirror), signal=f"{side}_fan", type="weak", share=0.25, for_s=0.1)
+    cfg = config_of("fyst-m2")
+    robot = boot(cfg, mirror_of("fyst-m2"), signal=f"{side}_fan", type="weak", share=0.25, for_s=0.1)
     frames = drive(robot, 0.0, 0.0, 0.55)
     assert robot.fans.health == ((0.25, 1.0) if side == "left" else (1.0, 0.25))
     assert frames[-1]["fans"] == frames[0]["fans"]
     drive(robot, 0.0, 0.0, 0.7)
     assert robot.fans.health == (1.0, 1.0)
     assert not robot.world.is_fallen  # too short to fall
-    longer = boot(cfg, build_mirror(cfg.mirror), signal=f"{side}_fan", type="weak", share=0.25)
+    longer = boot(cfg, mirror_of("fyst-m2"), signal=f"{side}_fan", type="weak", share=0.25)
     drive(longer, 0.0, 0.0, 1.0)
     assert longer.world.is_fallen
     assert record(longer).changed >= 20
@@ -370,8 +363,8 @@ def test_a_reboot_counts_anew_forgets_and_leaves_the_body_where_it_is(config: Co
 
 
 def test_a_reboot_with_late_sensors_delivers_nothing_of_the_boot_before() -> None:
-    cfg = load_config(overrides={"run.world": "hard"})
-    robot = boot(cfg, build_mirror(cfg.mirror), signal="robot", type="reboot")
+    cfg = config_of(run__world="hard")
+    robot = boot(cfg, mirror_of(), signal="robot", type="reboot")
     assert robot.sensors_delay_frames > 0
     drive(robot, 1.0, 1.0, 0.5)
     first = drive(robot, 1.0, 1.0, 0.6)[0]

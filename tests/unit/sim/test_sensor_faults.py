@@ -11,10 +11,11 @@ import pytest
 from ccatp.config.models import Config
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import MAX_LINE_BYTES
-from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_injector import InjectionRecord, make_sensor_fault
 from ccatp.sim.fault_plan import SENSOR_SIGNALS, TYPES, FaultPlan, parse_plan
 from ccatp.sim.robot import Robot
+from tests.support.scenario import config_of, fault_plan, mirror_of
 
 PLACES = {
     "imu_ax": ("imu", 1),
@@ -30,14 +31,8 @@ FROM, UNTIL = 20, 60  # frames: the fault acts from 0.2 s to 0.6 s
 FRAMES = 80
 
 
-@pytest.fixture(scope="module")
-def mirror(config: Config) -> Mirror:
-    return build_mirror(config.mirror)
-
-
 def plan_of(signal: str, kind: str, **values: object) -> FaultPlan:
-    rows = {"signal": signal, "type": kind, "at_s": 0.2, "for_s": 0.4, **values}
-    return parse_plan("[[fault]]\n" + "\n".join(f"{key} = {json.dumps(value)}" for key, value in rows.items()), "plan")
+    return fault_plan({"signal": signal, "type": kind, "at_s": 0.2, "for_s": 0.4, **values})
 
 
 class Drive:
@@ -304,10 +299,8 @@ def test_garbage_within_the_range_is_taken_and_beyond_it_is_dropped_whole(config
 
 @pytest.mark.parametrize("world", ["thesis", "hard"])
 def test_a_run_with_an_empty_plan_is_the_run_without(world: str) -> None:
-    from ccatp.config.load import load_config
-
-    cfg = load_config(overrides={"run.world": world, "run.mirror": "fyst-m2"})
-    deck = build_mirror(cfg.mirror)
+    cfg = config_of("fyst-m2", run__world=world)
+    deck = mirror_of("fyst-m2")
     without, with_one = (Drive(cfg, deck, plan, 400) for plan in (None, FaultPlan()))
     assert with_one.lines == without.lines
     assert with_one.delivered == without.delivered

@@ -29,11 +29,6 @@ OFFSETS = ((0.09, 0.09), (0.09, -0.09), (-0.09, 0.09), (-0.09, -0.09))
 DT_S = 0.01
 
 
-@pytest.fixture(scope="module")
-def mirror(config: Config) -> Mirror:
-    return build_mirror(config.mirror)
-
-
 def plant_at(mirror: Mirror, start: DeckPose) -> Plant:
     return Plant(mirror.surface, start, wheel_radius_m=0.03, wheel_base_m=0.15, wheel_lag_s=0.08)
 

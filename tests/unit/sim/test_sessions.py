@@ -1,124 +1,38 @@
 """The robot's side of the link without sockets, in virtual time."""
 
-import json
 from collections.abc import Callable
-from typing import Any
 
-import numpy as np
 import pytest
 
-from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_plan import parse_plan
-from ccatp.sim.robot import Robot
-from ccatp.sim.sessions import MAX_LAG_S, MAX_SESSIONS, NO_DELIVERY_S, RobotServer, RobotSession
+from ccatp.sim.sessions import MAX_LAG_S, MAX_SESSIONS, NO_DELIVERY_S
+from tests.support.scenario import ServedRobot, boot, config_of, fault_plan
 
 JOIN = b'{"type":"join","role":"controller","client":"test"}\n'
 JOIN_MONITOR = b'{"type":"join","role":"monitor","client":"test"}\n'
 
 
-class FakeWire:
-    """Keeps what is sent."""
-
-    def __init__(self) -> None:
-        self.sent = b""
-        self.is_closed = False
-
-    def write(self, data: bytes) -> None:
-        assert not self.is_closed
-        self.sent += data
-
-    def close(self) -> None:
-        self.is_closed = True
-
-
-class Rig:
-    """A server, its clock and its clients."""
-
-    def __init__(self, config: Config, mirror: Mirror, *, lockstep: bool = True, plan: str = "") -> None:
-        self.now_s = 1000.0
-        self.notes: list[str] = []
-        self.frames = 0
-        faults = parse_plan(f"[[fault]]\n{plan}", "plan") if plan else None
-        self.robot = Robot(config, mirror, np.random.default_rng(1), faults)
-        self.server = RobotServer(
-            self.robot,
-            lockstep=lockstep,
-            boot=417,
-            key=None,
-            make_nonce=lambda: "0123456789abcdef" * 2,
-            now_s=self.now_s,
-            note=self.notes.append,
-            on_frame=self._count,
-        )
-
-    def _count(self) -> None:
-        self.frames += 1
-
-    def client(self, first: bytes = b"") -> "Client":
-        return Client(self, first)
-
-    def run(self, seconds: float) -> None:
-        """Let the wall clock go on."""
-        end = self.now_s + seconds
-        while self.server.next_frame_s <= end:
-            self.now_s = self.server.next_frame_s
-            self.server.tick(self.now_s)
-        self.now_s = end
-
-
-class Client:
-    """One end of a connection."""
-
-    def __init__(self, rig: Rig, first: bytes) -> None:
-        self.rig, self.wire = rig, FakeWire()
-        self.session: RobotSession = rig.server.accept(self.wire, rig.now_s)
-        if first:
-            self.send(first)
-
-    def send(self, data: bytes) -> None:
-        self.session.receive(data, self.rig.now_s)
-
-    def drive(self, seq: int, ack: int, right: float = 3.0, left: float = 3.0) -> None:
-        self.send(b'{"type":"drive","seq":%d,"ack":%d,"wr":%f,"wl":%f}\n' % (seq, ack, right, left))
-
-    def permit(self, seq: int, ack: int, allowed: bytes = b"true") -> None:
-        line = b'{"type":"permit","seq":%d,"ack":%d,"forward":%b,"reverse":%b,"turn":%b}\n'
-        self.send(line % (seq, ack, allowed, allowed, allowed))
-
-    @property
-    def messages(self) -> list[dict[str, Any]]:
-        """Everything received since the last look."""
-        lines, self.wire.sent = self.wire.sent.splitlines(), b""
-        return [json.loads(line) for line in lines]
-
-    @property
-    def kinds(self) -> list[str]:
-        return [m["type"] if m["type"] != "sensors" else str(m["seq"]) for m in self.messages]
+Rig = Callable[..., ServedRobot]
 
 
 @pytest.fixture
-def rig(config: Config, mirror: Mirror) -> Callable[..., Rig]:
-    return lambda **options: Rig(config, mirror, **options)
-
-
-@pytest.fixture(scope="module")
-def mirror(config: Config) -> Mirror:
-    return build_mirror(config.mirror)
+def rig(config: Config, mirror: Mirror) -> Rig:
+    return lambda **options: ServedRobot(config, mirror, **options)
 
 
 # -- joining ----------------------------------------------------------------------------------------------------------
 
 
-def test_garbage_before_the_join_is_dropped_and_the_join_still_counts(rig: Callable[..., Rig]) -> None:
+def test_garbage_before_the_join_is_dropped_and_the_join_still_counts(rig: Rig) -> None:
     r = rig(lockstep=False)
     client = r.client(b'garbage\n{"type":"wave"}\n' + JOIN)
     assert client.kinds == ["hello", "joined"]
     assert (r.server.counts["bad_lines"], r.server.counts["unknown_types"]) == (1, 1)
 
 
-def test_too_many_connections(rig: Callable[..., Rig]) -> None:
+def test_too_many_connections(rig: Rig) -> None:
     r = rig()
     clients = [r.client() for _ in range(MAX_SESSIONS)]
     assert r.client().messages[-1] == {"type": "refused", "reason": "busy"}
@@ -126,7 +40,7 @@ def test_too_many_connections(rig: Callable[..., Rig]) -> None:
     assert r.client(JOIN).kinds == ["hello", "joined", "0"]
 
 
-def test_in_lockstep_nobody_is_silent_while_simulated_time_stands_still(rig: Callable[..., Rig]) -> None:
+def test_in_lockstep_nobody_is_silent_while_simulated_time_stands_still(rig: Rig) -> None:
     r = rig()
     r.client(JOIN)
     r.now_s += 3600.0
@@ -136,7 +50,7 @@ def test_in_lockstep_nobody_is_silent_while_simulated_time_stands_still(rig: Cal
 # -- bad lines --------------------------------------------------------------------------------------------------------
 
 
-def test_bad_lines_are_counted_and_refresh_nothing(rig: Callable[..., Rig]) -> None:
+def test_bad_lines_are_counted_and_refresh_nothing(rig: Rig) -> None:
     r = rig(lockstep=False)
     client = r.client(JOIN)
     client.drive(1, 0)
@@ -153,7 +67,7 @@ def test_bad_lines_are_counted_and_refresh_nothing(rig: Callable[..., Rig]) -> N
 # -- lockstep ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_lost_monitor_stops_simulated_time_until_another_joins(rig: Callable[..., Rig]) -> None:
+def test_a_lost_monitor_stops_simulated_time_until_another_joins(rig: Rig) -> None:
     r = rig()
     controller, monitor = r.client(JOIN), r.client(JOIN_MONITOR)
     monitor.permit(0, 0)
@@ -175,7 +89,7 @@ def test_a_lost_monitor_stops_simulated_time_until_another_joins(rig: Callable[.
     assert not r.robot.rules.is_held
 
 
-def test_a_lost_controller_and_the_next_one(rig: Callable[..., Rig]) -> None:
+def test_a_lost_controller_and_the_next_one(rig: Rig) -> None:
     r = rig()
     controller, monitor = r.client(JOIN), r.client(JOIN_MONITOR)
     controller.drive(0, 0)
@@ -189,7 +103,7 @@ def test_a_lost_controller_and_the_next_one(rig: Callable[..., Rig]) -> None:
     assert r.robot.seq == 1  # the monitor's answer to frame 0 still stands
 
 
-def test_a_stall_is_noted_once_per_frame_and_waited_for(rig: Callable[..., Rig]) -> None:
+def test_a_stall_is_noted_once_per_frame_and_waited_for(rig: Rig) -> None:
     r = rig()
     monitor = r.client(JOIN_MONITOR)
     r.server.check_time(r.now_s + 100.0)
@@ -211,7 +125,7 @@ def test_a_stall_is_noted_once_per_frame_and_waited_for(rig: Callable[..., Rig])
 # -- realtime ---------------------------------------------------------------------------------------------------------
 
 
-def test_late_frames_are_made_up_for(rig: Callable[..., Rig]) -> None:
+def test_late_frames_are_made_up_for(rig: Rig) -> None:
     r = rig(lockstep=False)
     r.run(0.1)
     r.now_s += 0.1  # nobody called for ten periods
@@ -224,7 +138,7 @@ def test_late_frames_are_made_up_for(rig: Callable[..., Rig]) -> None:
     assert r.server.next_frame_s == pytest.approx(1000.0 + (r.robot.seq + 1) * 0.01, abs=1e-9)
 
 
-def test_a_drive_read_first_after_a_long_stop_lives_no_longer_than_any_other(rig: Callable[..., Rig]) -> None:
+def test_a_drive_read_first_after_a_long_stop_lives_no_longer_than_any_other(rig: Rig) -> None:
     r = rig(lockstep=False)
     controller = r.client(JOIN)
     r.run(0.1)
@@ -237,7 +151,7 @@ def test_a_drive_read_first_after_a_long_stop_lives_no_longer_than_any_other(rig
     assert r.server.counts["slips"] == 1
 
 
-def test_after_a_long_stop_the_clock_goes_on_where_it_stood(rig: Callable[..., Rig]) -> None:
+def test_after_a_long_stop_the_clock_goes_on_where_it_stood(rig: Rig) -> None:
     r = rig(lockstep=False)
     controller = r.client(JOIN)
     r.run(0.1)
@@ -259,7 +173,7 @@ def delayed(config: Config, sensors: int, commands: int) -> Config:
 
 @pytest.mark.parametrize(("sensors", "commands"), [(1, 0), (0, 1), (1, 1), (2, 2)])
 def test_lockstep_with_delays(config: Config, mirror: Mirror, sensors: int, commands: int) -> None:
-    r = Rig(delayed(config, sensors, commands), mirror)
+    r = ServedRobot(delayed(config, sensors, commands), mirror)
     monitor = r.client(JOIN_MONITOR)
     assert (monitor.kinds, r.robot.seq) == (["hello", "joined"], 0)
     controller = r.client(JOIN)
@@ -282,7 +196,7 @@ def test_lockstep_with_delays(config: Config, mirror: Mirror, sensors: int, comm
 
 
 def test_in_lockstep_the_newest_frame_delivered_is_to_be_acknowledged(config: Config, mirror: Mirror) -> None:
-    r = Rig(delayed(config, 2, 1), mirror)
+    r = ServedRobot(delayed(config, 2, 1), mirror)
     controller = r.client(JOIN)
     controller.drive(0, 2)  # the robot's own newest, which nobody can know
     assert r.robot.seq == 2
@@ -295,7 +209,7 @@ def test_in_lockstep_the_newest_frame_delivered_is_to_be_acknowledged(config: Co
 
 
 def test_delays_on_the_wall_clock(config: Config, mirror: Mirror) -> None:
-    r = Rig(delayed(config, 2, 1), mirror, lockstep=False)
+    r = ServedRobot(delayed(config, 2, 1), mirror, lockstep=False)
     controller = r.client(JOIN)
     r.run(0.0101)
     assert controller.kinds == ["hello", "joined"]  # frame 1 exists, frame 0 is on its way
@@ -313,14 +227,14 @@ def test_delays_on_the_wall_clock(config: Config, mirror: Mirror) -> None:
 
 
 def test_the_server_and_the_calls_give_the_same_frames(mirror: Mirror) -> None:
-    cfg = load_config(overrides={"run.world": "hard"})
-    r = Rig(cfg, mirror)
+    cfg = config_of(run__world="hard")
+    r = ServedRobot(cfg, mirror)
     monitor, controller = r.client(JOIN_MONITOR), r.client(JOIN)
     controller.send(b'{"type":"fans","seq":0,"duty":[0.8,0.8]}\n')
     for k in range(200):
         monitor.permit(k, k, b"true" if k % 50 < 40 else b"false")
         controller.drive(k, k, 3.0, 2.5)
-    robot = Robot(cfg, mirror, np.random.default_rng(1))
+    robot = boot(cfg, mirror)
     robot.join("monitor")
     robot.join("controller")
     while robot.delivered is None:
@@ -348,10 +262,8 @@ def test_the_server_and_the_calls_give_the_same_frames(mirror: Mirror) -> None:
         ('signal = "soc"\ntype = "stuck"\nvalue = 7.0', [1, 2, 3, 4, 5, 6, 7, 8, 9]),
     ],
 )
-def test_lockstep_goes_on_past_frames_that_nobody_can_answer(
-    rig: Callable[..., Rig], plan: str, expected: list[int]
-) -> None:
-    r = rig(plan=f"at_s = 0.05\nfor_s = 0.03\n{plan}")
+def test_lockstep_goes_on_past_frames_that_nobody_can_answer(rig: Rig, plan: str, expected: list[int]) -> None:
+    r = rig(plan=parse_plan(f"[[fault]]\nat_s = 0.05\nfor_s = 0.03\n{plan}", "plan"))
     controller, seen, answers = r.client(JOIN), list[str](), 0
     controller.messages.clear()
     while not seen or seen[-1] != "9":
@@ -364,8 +276,8 @@ def test_lockstep_goes_on_past_frames_that_nobody_can_answer(
         assert answers == 9 - 3  # three frames were not answered by anybody
 
 
-def test_a_robot_that_is_never_heard_again_ends_the_session(rig: Callable[..., Rig]) -> None:
-    r = rig(plan='signal = "frames"\ntype = "drop"\nat_s = 0.05\nevery = 1')
+def test_a_robot_that_is_never_heard_again_ends_the_session(rig: Rig) -> None:
+    r = rig(plan=fault_plan({"signal": "frames", "type": "drop", "at_s": 0.05, "every": 1}))
     controller = r.client(JOIN)
     for number in range(6):
         controller.drive(number, r.robot.delivered_seq)
@@ -376,8 +288,8 @@ def test_a_robot_that_is_never_heard_again_ends_the_session(rig: Callable[..., R
 
 
 @pytest.mark.parametrize("lockstep", [True, False])
-def test_a_reboot_ends_every_session_and_changes_the_boot(rig: Callable[..., Rig], lockstep: bool) -> None:
-    r = rig(plan='signal = "robot"\ntype = "reboot"\nat_s = 0.05', lockstep=lockstep)
+def test_a_reboot_ends_every_session_and_changes_the_boot(rig: Rig, lockstep: bool) -> None:
+    r = rig(plan=fault_plan({"signal": "robot", "type": "reboot", "at_s": 0.05}), lockstep=lockstep)
     controller, monitor, visitor = r.client(JOIN), r.client(JOIN_MONITOR), r.client()
     number = 0
     while not controller.wire.is_closed:
