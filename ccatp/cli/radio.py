@@ -1,7 +1,6 @@
 """The commands ``ccatp radio``: recorded runs through estimators, maps of motes from their ranges, signal levels."""
 
 import json
-import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -12,24 +11,30 @@ import click
 from ccatp.cli.common import (
     CONFIG_OPTION,
     JSON_OPTION,
+    PATH,
     OutputFile,
     SuggestingGroup,
     complain,
     example,
     figure_option,
     overrides,
+    print_lines,
     settings_option,
+    warn,
 )
 from ccatp.cli.radio_levels import calibrate, fix, fuzzy
 from ccatp.errors import CcatpError, ExitStatus
 
 if TYPE_CHECKING:
     from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun
-    from ccatp.config.beacon_models import CricketConfig, RecordingConfig, RecordingsConfig
+    from ccatp.config.beacon_models import CricketConfig, RecordingsConfig
 
-
-FORMATS = ("plaza", "mrclam", "labyrinth", "csv")
 FILTERS = ("ekf-slam", "smoother")
+FORMAT_OPTION = click.option(
+    "--format", "data_format", type=click.Choice(("plaza", "mrclam", "labyrinth", "csv")),
+    help="Format of the data; found out if not given.",
+)  # fmt: skip
+ASSUMED_OPTION = settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
 
 
 class SlamCommandError(CcatpError):
@@ -52,7 +57,7 @@ def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) 
     from ccatp.beacons.slam.causal import filter_run
     from ccatp.filters.base import FilterError
 
-    cfg: RecordingConfig = getattr(assumed, run.kind)
+    cfg = getattr(assumed, run.kind)
     try:
         if filter_name == "smoother":
             return smooth(run, cfg, perf_counter)
@@ -91,38 +96,35 @@ def compared(run: "RecordedRun", assumed: "RecordingsConfig", peers: bool) -> li
         "ccatp radio slam mine.csv --set csv.radio.range_sigma_m=0.3 --figure map.png",
     )
 )
-@click.argument("path", type=click.Path(path_type=Path))
-@click.option("--format", "data_format", type=click.Choice(FORMATS), help="Format of the data; found out if not given.")
+@click.argument("path", type=PATH)
+@FORMAT_OPTION
 @click.option("--robot", type=click.IntRange(min=1), metavar="N", help="Robot of an MRCLAM set; else the first there.")
 @click.option(
     "--filter", "filter_name", type=click.Choice(FILTERS), default=FILTERS[0], show_default=True,
     help="ekf-slam: at each instant from readings up to it; smoother: from all of them.",
 )  # fmt: skip
 @CONFIG_OPTION
-@settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
+@ASSUMED_OPTION
 @figure_option("Draw map and path")
 @click.option("--peers", is_flag=True, help="All our estimators and GTSAM's side by side; needs ccatp[peers].")
 @JSON_OPTION
 def slam(
     path: Path, data_format: str | None, robot: int | None, filter_name: str, config_file: Path | None,
     settings: Mapping[str, object], figure_file: Path | None, peers: bool, json_output: bool,
-) -> int:  # fmt: skip
+) -> None:  # fmt: skip
     """Map the beacons of a recorded run and find the vehicle's path on that map.
 
     PATH is a file or folder of the formats Plaza, MRCLAM, Labyrinth, or a CSV of events (docs/radio_data.md).
     """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
     from ccatp.beacons.datasets.reader import read_run
     from ccatp.beacons.slam.evaluation import judge, markdown, result_data, table_lines
     from ccatp.config.load import load_recordings_config
 
-    assumed = load_recordings_config(config_file, overrides(settings, {}))
+    assumed = load_recordings_config(config_file, settings)
     run = read_run(path, data_format, robot)
-    for warning in run.warnings:
-        complain(f"warning: {warning}", 0)
+    warn(run.warnings)
     track = estimate(run, assumed, filter_name)
-    for warning in track.warnings:
-        complain(f"warning: {warning}", 0)
+    warn(track.warnings)
     judged = judge(track, run)
     data: dict[str, Any] = result_data(run, filter_name, track, judged)
     if figure_file is not None:
@@ -133,10 +135,10 @@ def slam(
         data["peers"] = compared(run, assumed, peers=True)
     if json_output:
         click.echo(json.dumps(data, allow_nan=False))
-        return 0
-    for line in (*table_lines(run, data), *(("", *markdown(data["peers"])) if peers else ())):
-        click.echo(line)
-    return 0
+        return
+    print_lines(table_lines(run, data))
+    if peers:
+        print_lines(("", *markdown(data["peers"])))
 
 
 @click.command(
@@ -145,28 +147,23 @@ def slam(
         "ccatp radio compare recordings/Plaza2_.mat --peers",
     )
 )
-@click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option(
-    "--format", "data_format", type=click.Choice(FORMATS), help="Format of all the data; found out if not given."
-)
-@click.option(
-    "--robot", type=click.IntRange(min=1), metavar="N", help="Robot of an MRCLAM set; else all that are there."
-)
+@click.argument("paths", nargs=-1, required=True, type=PATH)
+@FORMAT_OPTION
+@click.option("--robot", type=click.IntRange(min=1), metavar="N", help="Robot of MRCLAM sets; else all there.")
 @click.option("--peers", is_flag=True, help="GTSAM (iSAM2, batch) on the same input as well; needs ccatp[peers].")
 @CONFIG_OPTION
-@settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
+@ASSUMED_OPTION
 @JSON_OPTION
 def compare(
     paths: Sequence[Path], data_format: str | None, robot: int | None, peers: bool, config_file: Path | None,
     settings: Mapping[str, object], json_output: bool,
-) -> int:  # fmt: skip
+) -> None:  # fmt: skip
     """Run all estimators over recorded runs: a table of their errors and times, side by side."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
     from ccatp.beacons.datasets.reader import read_run, robots_of
     from ccatp.beacons.slam.evaluation import markdown, with_means
     from ccatp.config.load import load_recordings_config
 
-    assumed = load_recordings_config(config_file, overrides(settings, {}))
+    assumed = load_recordings_config(config_file, settings)
     rows: list[dict[str, Any]] = []
     for path in paths:
         found: list[dict[str, Any]] = []
@@ -177,13 +174,8 @@ def compare(
         rows += with_means(found, f"{path.resolve().name}, mean")
     if json_output:
         click.echo(json.dumps({"rows": rows}, allow_nan=False))
-        return 0
-    for line in markdown(rows):
-        click.echo(line)
-    return 0
-
-
-METHODS = ("ekf", "batch")
+    else:
+        print_lines(markdown(rows))
 
 
 @click.command(
@@ -194,14 +186,16 @@ METHODS = ("ekf", "batch")
         "ccatp radio map --ranges ranges.csv --offset --out beacons.toml --json",
     ),
 )
-@click.option("--config", "config_file", type=click.Path(path_type=Path), help="Motes to simulate (TOML).")
+@click.option("--config", "config_file", type=PATH, help="Motes to simulate (TOML).")
+@click.option("--ranges", "ranges_file", type=PATH, help="Measured ranges (CSV) in place of simulated ones.")
+@click.option("--tags", "tags_file", type=PATH, help="Places of tags on their trolley (CSV).")
+@click.option("--truth", "truth_file", type=PATH, help="True places (CSV) to compare with.")
 @click.option(
-    "--ranges", "ranges_file", type=click.Path(path_type=Path), help="Measured ranges (CSV) in place of simulated ones."
-)
-@click.option("--tags", "tags_file", type=click.Path(path_type=Path), help="Places of tags on their trolley (CSV).")
-@click.option("--truth", "truth_file", type=click.Path(path_type=Path), help="True places (CSV) to compare with.")
-@click.option(
-    "--method", type=click.Choice(METHODS), default="batch", show_default=True, help="Filter, or all ranges at once."
+    "--method",
+    type=click.Choice(("ekf", "batch")),
+    default="batch",
+    show_default=True,
+    help="Filter, or all ranges at once.",
 )
 @click.option("--seeds", type=click.IntRange(min=1), default=1, show_default=True, metavar="N", help="Simulated runs.")
 @click.option("--seed", type=click.IntRange(min=0), metavar="N", help="Seed of the first run.")
@@ -218,13 +212,13 @@ def radio_map(
     config_file: Path | None, ranges_file: Path | None, tags_file: Path | None, truth_file: Path | None,
     method: str, seeds: int, seed: int | None, offset: bool, scale: bool, dimension: int | None,
     settings: Mapping[str, object], out_file: Path | None, figure_file: Path | None, json_output: bool,
-) -> int:  # fmt: skip
+) -> None:  # fmt: skip
     """Map beacons from the ranges between them."""
     if ranges_file is None and (tags_file is not None or truth_file is not None):
         raise click.UsageError("--tags and --truth go with --ranges; a simulation knows both")
     if ranges_file is not None and seeds > 1:
         raise click.UsageError("--seeds is for simulated ranges; --ranges has been measured once")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
+    from ccatp.beacons.cricket.measured_map import report_lines
     from ccatp.config.load import load_radio_config
 
     named: dict[str, object] = {
@@ -232,24 +226,15 @@ def radio_map(
         "cricket.dimension": dimension,
         "cricket.batch.estimates_offset": offset or None,
         "cricket.batch.estimates_scale": scale or None,
+        "system": "cricket" if config_file is None else None,
     }
-    if config_file is None:
-        named["system"] = "cricket"
     cfg = load_radio_config(config_file, overrides(settings, named), simulates=ranges_file is None)
     if ranges_file is None:
         data = _simulated(cfg.cricket, method, range(cfg.run.seed, cfg.run.seed + seeds), out_file, figure_file)
     else:
         data = _measured(cfg.cricket, method, (ranges_file, tags_file, truth_file), out_file, figure_file)
-    for warning in data["warnings"]:
-        complain(f"warning: {warning}", 0)
-    if json_output:
-        click.echo(json.dumps(data))
-    else:
-        from ccatp.beacons.cricket.measured_map import report_lines
-
-        for line in report_lines(data):
-            click.echo(line)
-    return 0
+    warn(data["warnings"])
+    print_lines([json.dumps(data)] if json_output else report_lines(data))
 
 
 def _simulated(
@@ -260,7 +245,7 @@ def _simulated(
 
     campaign = run_campaign(cfg, method, seeds, _progress(len(seeds)))
     if out_file is not None:
-        _write(out_file, *campaign.runs[0].whole, cfg.layout)
+        _write(out_file, campaign.runs[0].whole, cfg.layout)
     if figure_file is not None:
         draw_mote_map(*pictured(campaign, seeds[0]), figure_file)
     return campaign_data(campaign)
@@ -273,15 +258,14 @@ def _measured(
     import numpy as np
 
     from ccatp.beacons.cricket.measured_map import map_measured
-    from ccatp.beacons.datasets.range_csv import read_places, read_ranges
+    from ccatp.beacons.datasets.sheets import read_places, read_ranges
     from ccatp.report.beacon_plots import MapPicture, draw_mote_map
 
-    ranges_file, tags_file, truth_file = files
-    ranges = read_ranges(ranges_file, cfg.ranging.sigma_m)
-    tags_m, truth_m = (None if file is None else read_places(file) for file in (tags_file, truth_file))
+    ranges = read_ranges(files[0], cfg.ranging.sigma_m)
+    tags_m, truth_m = (None if file is None else read_places(file) for file in files[1:])
     found = map_measured(cfg, method, ranges, tags_m, truth_m)
     if out_file is not None:
-        _write(out_file, found.names, found.positions_m, found.covariance_m2, "measured")
+        _write(out_file, found[:3], "measured")
     if figure_file is not None:
         error = found.data["rms_m"]["p50"]
         title = f"{method}, {len(found.names)} motes" + (f", error {1e3 * error:.3g} mm" if error is not None else "")
@@ -291,13 +275,13 @@ def _measured(
     return found.data
 
 
-def _write(path: Path, names: tuple[str, ...], positions_m: Any, covariance_m2: Any, layout: str) -> None:
-    from ccatp.beacons.datasets.range_csv import write_beacons
+def _write(path: Path, found: tuple[Any, Any, Any], layout: str) -> None:
+    from ccatp.beacons.datasets.sheets import BeaconPositions, write_beacons
 
     frame = "field: as the anchors and surveyed places of the configuration say"
     if layout != "networks":
         frame = "own: first beacon at the origin, second on +x, third at y > 0; covariance of the aligned map"
-    write_beacons(path, names, positions_m, covariance_m2, frame)
+    write_beacons(path, BeaconPositions(*found, frame))
 
 
 def _progress(total: int) -> Callable[[int], None]:

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.beacons.cricket.range_network import MappingError
-from ccatp.beacons.datasets.range_csv import BeaconFileError, read_beacons, read_places, read_ranges, write_beacons
+from ccatp.beacons.datasets.sheets import read_beacons
 from ccatp.cli import main
 from tests.unit.beacons.cricket.fields import ALL, HEADS, FloatArray
 
@@ -51,17 +50,8 @@ def truth_file(path: Path) -> Path:
 
 
 def test_few_pairs_are_told_before_they_are_estimated(capsys: pytest.CaptureFixture[str]) -> None:
-    data = mapped(
-        capsys,
-        "--method",
-        "ekf",
-        "--seeds",
-        "3",
-        "--set",
-        "cricket.phase2.pairs=zigzag",
-        "--set",
-        "cricket.phase2.max_updates=40",
-    )
+    programme = ("--set", "cricket.phase2.pairs=zigzag", "--set", "cricket.phase2.max_updates=40")
+    data = mapped(capsys, "--method", "ekf", "--seeds", "3", *programme)
     assert data["rank_deficiency"] == 4
     assert data["fold_over_risk"] is True
     assert data["free_directions"][-1] == "N6-1 against N1-1, N2-1"
@@ -70,8 +60,11 @@ def test_few_pairs_are_told_before_they_are_estimated(capsys: pytest.CaptureFixt
     assert data["iterations"] == 40
 
 
-def test_all_pairs_reach_the_target(capsys: pytest.CaptureFixture[str]) -> None:
-    data = mapped(capsys, "--method", "ekf", "--seeds", "5")
+def test_all_pairs_reach_the_target(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, figure = tmp_path / "beacons.toml", tmp_path / "map.svg"
+    data = mapped(capsys, "--method", "ekf", "--seeds", "5", "--out", str(out), "--figure", str(figure))
+    assert len(read_beacons(out).names) == 18
+    assert figure.stat().st_size > 10_000
     assert (data["rank_deficiency"], data["fold_over_risk"]) == (0, False)
     assert data["rms_m"]["p50"] < 0.007
     assert data["phase1_rms_m"] > 0.05
@@ -93,13 +86,6 @@ def test_the_batch_and_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert beacons.positions_m[beacons.names.index("N6-1")] == pytest.approx([5.0, 8.0], abs=0.05)
     assert beacons.covariance_m2.shape == (36, 36)
     assert np.linalg.eigvalsh(beacons.covariance_m2)[0] > -1e-12
-
-
-def test_the_filters_file_holds_all_motes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out, figure = tmp_path / "beacons.toml", tmp_path / "map.svg"
-    mapped(capsys, "--method", "ekf", "--seeds", "2", "--out", str(out), "--figure", str(figure))
-    assert len(read_beacons(out).names) == 18
-    assert "updates" in figure.read_text() or figure.stat().st_size > 10_000
 
 
 def test_measured_ranges(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -146,32 +132,16 @@ def test_eight_surveyed_anchors(with_tags: bool, tmp_path: Path, capsys: pytest.
 
 
 @pytest.mark.parametrize(
-    ("text", "what"),
+    ("rows", "what"),
     [
-        ("first,second,range_m\nA,B,-1.0\n", ":2: range of -1 m is no distance"),
-        ("first,second,range_m\nA,B,nan\n", ":2: range of nan m is no distance"),
-        ("first,second,range_m\nA,B,0\n", ":2: range of 0 m is no distance"),
-        ("first,second,range_m\nA,B,inf\n", ":2: range of inf m is more than the 1e+06 m"),
-        ("first,second,range_m\nA,B,1e300\n", ":2: range of 1e+300 m is more than the 1e+06 m"),
-        ("first,second,range_m\nA,B,1.0,more\nB,C\n", ":3: range_m = '' is no number"),
-        ("", "ranges.csv: is empty; give a header"),
-        ("\n \n# nothing\n", "ranges.csv: is empty; give a header"),
-        ("first,second,range_m\nA,A,1.0\n", ":2: from A to itself"),
-        ("first,second,range_m\nA,B,far\n", ":2: range_m = 'far' is no number"),
-        ("first,second,range_m,sigma_m\nA,B,1.0,0\n", ":2: sigma of 0 m, must be 1e-06 to 1e+06 m"),
-        ("first,second,range_m,sigma_m\nA,B,1.0,1e-200\n", ":2: sigma of 1e-200 m, must be 1e-06 to 1e+06 m"),
-        ("first,second,range_m\nA,B,1e-300\n", ":2: range of 1e-300 m is no distance"),
-        ("first,second,range_m\nA,,1.0\n", ":2: second is empty"),
-        ("first,second,range_m\n", "has no ranges, only a header"),
-        ("session,pos,deg,anchor,tag,mean_m\n", "has no ranges, only a header"),
-        ("a,b,c\n1,2,3\n", ":1: columns a,b,c; wanted first,second,range_m"),
-        ("first,second,range_m\nA,B,1.0\nC,D,1.0\n", "the motes fall into 2 parts"),
-        ("first,second,range_m\nA,B,1.0\nB,C,1.0\nC,D,1.0\n", "3 pairs of 4 motes were measured, a map in 2"),
+        ("A,B,-1.0", ":2: range of -1 m is no distance"),
+        ("A,B,1.0\nC,D,1.0", "the motes fall into 2 parts"),
+        ("A,B,1.0\nB,C,1.0\nC,D,1.0", "3 pairs of 4 motes were measured, a map in 2"),
     ],
 )
-def test_ranges_that_make_no_map(text: str, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ranges_that_make_no_map(rows: str, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "ranges.csv"
-    path.write_text(text)
+    path.write_text(f"first,second,range_m\n{rows}\n")
     assert what in refusal(capsys, "--ranges", str(path))
 
 
@@ -216,120 +186,47 @@ def test_ranges_of_one_pair_that_disagree(tmp_path: Path, capsys: pytest.Capture
     assert not any("disagree" in warning for warning in sound["warnings"])
 
 
-def test_files_that_do_not_fit_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = ranges_file(tmp_path / "r.csv", ALL)
-    places = tmp_path / "p.csv"
-    places.write_text("name,x_m,y_m\nM0,0,0\n")
-    assert "--truth: no place of M1, M2, M3, M4, M5; there are M0" in refusal(
-        capsys, "--ranges", str(path), "--truth", str(places)
-    )
-    assert "--tags: these ranges are of no trolley" in refusal(capsys, "--ranges", str(path), "--tags", str(places))
-    places.write_text("name,x\nM0,0\n")
-    assert "p.csv:1: columns name,x; wanted name,x_m,y_m" in refusal(
-        capsys, "--ranges", str(path), "--truth", str(places)
-    )
-    session = tmp_path / "s.csv"
-    session.write_text(
-        "session,pos,deg,anchor,tag,mean_m\n"
-        + "".join(f"s,1,0,{a},{t},{3 + a + t}\n" for a in range(4) for t in range(3))
-    )
-    places.write_text("name,x_m,y_m\ntag0,0,0\n")
-    assert "--tags: no place of tag1; there are tag0" in refusal(
-        capsys, "--ranges", str(session), "--tags", str(places)
-    )
-    places.write_text("name,x_m,y_m\ntag0,0,0\ntag1,0.2,0\ntag2,0,0.2\n")
-    assert "the filter knows no trolleys" in refusal(
-        capsys, "--ranges", str(session), "--tags", str(places), "--method", "ekf"
-    )
+SESSION_ROWS = "session,pos,deg,anchor,tag,mean_m\n" + "".join(
+    f"s,1,0,{a},{t},{3 + a + t}\n" for a in range(4) for t in range(3)
+)
+IN_SPACE = "--set cricket.dimension=3 --set cricket.layout=random --set cricket.random.size_m=[1,1,1]"
+APART = "--set cricket.layout=random --set cricket.random.count=30 --set cricket.random.reach_m=9"
 
 
-def test_a_truth_of_too_few_coordinates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, truth = ranges_file(tmp_path / "r.csv", ALL), truth_file(tmp_path / "t.csv")
-    shown = refusal(
-        capsys,
-        "--ranges",
-        str(path),
-        "--truth",
-        str(truth),
-        "--set",
-        "cricket.dimension=3",
-        "--set",
-        "cricket.layout=random",
-        "--set",
-        "cricket.random.size_m=[1,1,1]",
-    )
-    assert "--truth: M0 has 2 coordinates, wanted 3" in shown
-
-
-def test_a_place_that_is_none(tmp_path: Path) -> None:
-    (tmp_path / "p.csv").write_text("name,x_m,y_m\nM0,0,0\nM1,nan,0\n")
-    with pytest.raises(MappingError, match=r"p\.csv:3: x_m = nan is no place within 1e\+06 m"):
-        read_places(tmp_path / "p.csv")
-
-
-def test_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "r.csv: no such file or directory; name a CSV file that exists" in refusal(
-        capsys, "--ranges", str(tmp_path / "r.csv")
-    )
-    assert "--seeds is for simulated ranges" in refusal(capsys, "--ranges", "r.csv", "--seeds", "2")
-    assert "--tags and --truth go with --ranges" in refusal(capsys, "--tags", "t.csv")
-    assert "--out: no directory" in refusal(capsys, "--out", str(tmp_path / "no" / "b.toml"))
-    (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00")
-    assert "is no CSV text" in refusal(capsys, "--ranges", str(tmp_path / "binary.csv"))
-
-
-def test_fields_that_cannot_be_mapped(capsys: pytest.CaptureFixture[str]) -> None:
-    deaf = ("--set", "cricket.transducer.reach_m=[1,1,1,1,1]")
-    assert "no pair of phase 2 receives each other" in refusal(capsys, "--method", "ekf", *deaf)
-    narrow = ("--set", "cricket.phase1.max_dop=5")
-    assert "N2-1 from N1-1, N1-2, N1-3: dilution of precision" in refusal(capsys, "--method", "ekf", *narrow)
-    apart = ("--set", "cricket.layout=random", "--set", "cricket.random.count=30", "--set", "cricket.random.reach_m=9")
-    assert "the motes fall into" in refusal(capsys, *apart)
-
-
-def test_a_figure_that_no_format_has(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = ranges_file(tmp_path / "r.csv", ALL)
-    assert "m.gifx: no format by that name" in refusal(
-        capsys, "--ranges", str(path), "--figure", str(tmp_path / "m.gifx")
-    )
-
-
-def test_beacon_files(tmp_path: Path) -> None:
-    path = tmp_path / "b.toml"
-    rng = np.random.default_rng(1)
-    places, root = rng.normal(size=(3, 3)), rng.normal(size=(9, 9))
-    write_beacons(path, ["N1-1", "b", "c"], places, root @ root.T, "here")
-    found = read_beacons(path)
-    assert found.names == ("N1-1", "b", "c")
-    assert (found.positions_m == places).all()
-    assert (found.covariance_m2 == root @ root.T).all()
-    assert found.frame == "here"
-    with pytest.raises(BeaconFileError, match="cannot be written"):
-        write_beacons(tmp_path / "no" / "b.toml", ["a"], places[:1], np.eye(3), "here")
-    with pytest.raises(BeaconFileError, match="cannot be read as a map of beacons"):
-        read_beacons(tmp_path / "none.toml")
-    path.write_text("x = 1\n")
-    with pytest.raises(BeaconFileError, match="is no map of beacons: 'beacons'"):
-        read_beacons(path)
-    path.write_text('frame = "x"\n[beacons.a]\nposition_m = [0.0, 0.0]\n[joint]\ncovariance_m2 = [[1.0]]\n')
-    with pytest.raises(BeaconFileError, match=r"covariance of shape \(1, 1\) for 2 coordinates"):
-        read_beacons(path)
-
-
-def test_ranges_of_both_forms(tmp_path: Path) -> None:
-    path = tmp_path / "r.csv"
-    path.write_text("\ufefffirst, second ,range_m,sigma_m\n A ,B,1.5,\nB,C,2.0,0.3\n")
-    found = read_ranges(path, 0.1)
-    assert [tuple(row) for row in found.readings] == [("A", "B", 1.5, 0.1), ("B", "C", 2.0, 0.3)]
-    path.write_text(
-        "session,pos,deg,anchor,tag,n,mean_m,median_m,std_m\n8_14,1,60,2,0,10,4.8,4.8,0.02\n8_14,1,60,2,1,10,4.5,4.5,0.02\n"
-    )
-    found = read_ranges(path, 0.1)
-    assert found.groups == {"1/60": ("1/60/tag0", "1/60/tag1")}
-    assert found.tags == {"1/60/tag0": "tag0", "1/60/tag1": "tag1"}
-    assert found.readings[0].first == "anchor2"
-    path.write_text("name,x_m,y_m,z_m\na,1,2,3\n")
-    assert read_places(path) == {"a": (1.0, 2.0, 3.0)}
+@pytest.mark.parametrize(
+    ("args", "places", "what"),
+    [
+        ("--ranges {ranges} --truth {places}", "M0,0,0", "--truth: no place of M1, M2, M3, M4, M5; there are M0"),
+        (f"--ranges {{ranges}} --truth {{truth}} {IN_SPACE}", "M0,0,0", "--truth: M0 has 2 coordinates, wanted 3"),
+        ("--ranges {ranges} --tags {places}", "M0,0,0", "--tags: these ranges are of no trolley"),
+        ("--ranges {session} --tags {places}", "tag0,0,0", "--tags: no place of tag1; there are tag0"),
+        (
+            "--ranges {session} --tags {places} --method ekf", "tag0,0,0\ntag1,0.2,0\ntag2,0,0.2",
+            "the filter knows no trolleys",
+        ),
+        ("--ranges {ranges} --figure m.gifx", "", "m.gifx: no format by that name"),
+        ("--ranges none.csv", "", "none.csv: no such file"),
+        ("--ranges r.csv --seeds 2", "", "--seeds is for simulated ranges"),
+        ("--tags t.csv", "", "--tags and --truth go with --ranges"),
+        ("--out {tmp}/no/b.toml", "", "--out: no directory"),
+        ("--dimension 3", "", 'cricket.dimension = 3 needs layout = "motes" or "random"'),
+        (
+            "--method ekf --set cricket.transducer.reach_m=[1,1,1,1,1]", "",
+            "no pair of phase 2 receives each other",
+        ),
+        ("--method ekf --set cricket.phase1.max_dop=5", "", "N2-1 from N1-1, N1-2, N1-3: dilution of precision"),
+        (APART, "", "the motes fall into"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_mapped_is_refused(
+    args: str, places: str, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = {name: tmp_path / f"{name}.csv" for name in ("ranges", "truth", "places", "session")}
+    ranges_file(files["ranges"], ALL)
+    truth_file(files["truth"])
+    files["places"].write_text(f"name,x_m,y_m\n{places}\n")
+    files["session"].write_text(SESSION_ROWS)
+    assert what in refusal(capsys, *args.format(**files, tmp=tmp_path).split())
 
 
 NOISE_M = 0.005
@@ -400,15 +297,6 @@ def test_ranges_in_space(args: tuple[str, ...], tell: Any) -> None:
     assert data["warnings"] == []
 
 
-def test_heights_that_are_all_the_same_are_not_missed(tell: Any) -> None:
-    assert tell(np.column_stack([FLAT, np.ones(8)]))["warnings"] == []
-
-
-def test_motes_of_a_simulated_field_have_its_dimension(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["radio", "map", "--dimension", "3"]) == 2
-    assert 'cricket.dimension = 3 needs layout = "motes" or "random"' in capsys.readouterr().err
-
-
 def test_no_scale_where_none_can_be_told(tell: Any) -> None:
     data = tell(FLAT, "--scale", scale=1.1)
     assert (data["scale"], data["expected_rms_m"], data["crlb_m"]) == (None, None, None)
@@ -423,8 +311,10 @@ def test_motes_in_a_line_with_noise(off_m: float, tell: Any) -> None:
     assert data["warnings"][-1].startswith("the motes lie in a line, or nearly")
 
 
-def test_a_thin_field_is_no_line(tell: Any) -> None:
-    places = np.column_stack([1.3 * np.arange(6), np.tile([0.0, 0.8], 3)])
+@pytest.mark.parametrize(
+    "places", [np.column_stack([FLAT, np.ones(8)]), np.column_stack([1.3 * np.arange(6), np.tile([0.0, 0.8], 3)])]
+)
+def test_equal_heights_and_a_thin_field_raise_no_doubt(places: FloatArray, tell: Any) -> None:
     data = tell(places)
     assert data["warnings"] == []
     assert data["expected_rms_m"] < 0.05
@@ -443,22 +333,3 @@ def test_unknown_scale_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[
     shown = capsys.readouterr().out
     assert "common offset of the ranges        unknown" in shown
     assert "common scale of the ranges         unknown" in shown
-
-
-def test_comments_in_a_file_of_ranges(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "r.csv"
-    path.write_text("# three motes\n\nfirst,second,range_m\n# hello\nA,B,1\n  # more, commas\nB,C,1\nA,C,1\n")
-    assert main(["radio", "map", "--json", "--ranges", str(path)]) == 0
-    assert json.loads(capsys.readouterr().out)["motes"] == 3
-    path.write_text("# three motes\nfirst,second,range_m\n# hello\nA,B,far\n")
-    assert main(["radio", "map", "--ranges", str(path)]) == 2
-    assert "r.csv:4: range_m = 'far' is no number" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("text", "what"), [("", "is empty"), ("name,x_m,y_m\n", "has no places, only a header")])
-def test_an_empty_file_of_places(text: str, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, truth = tmp_path / "r.csv", tmp_path / "t.csv"
-    path.write_text("first,second,range_m\nA,B,1\n")
-    truth.write_text(text)
-    assert main(["radio", "map", "--ranges", str(path), "--truth", str(truth)]) == 2
-    assert f"t.csv: {what}" in capsys.readouterr().err

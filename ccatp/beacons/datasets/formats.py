@@ -1,7 +1,6 @@
-"""The published sets of recorded radio data: Plaza (CMU), MRCLAM (UTIAS), Labyrinth (TU Chemnitz)."""
+"""Recorded runs: Plaza (CMU), MRCLAM (UTIAS), Labyrinth (TU Chemnitz), and a CSV of our own with an event a line."""
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,21 +9,65 @@ from ccatp.beacons.datasets.tables import (
     RadioDataError,
     Table,
     content_lines,
-    in_order,
+    is_number,
     listed,
-    names_of,
-    number,
+    needed_of,
     plural,
     read_table,
     read_text,
+    split_cells,
     tables_of,
-    with_unknown_ways,
+    tagged_row,
     within,
-    without_gaps_in_numbers,
 )
-from ccatp.beacons.datasets.trajectory import bridged, checked_heading, recorded_run, steps_of_speeds, turning_factor
+from ccatp.beacons.datasets.trajectory import bridged, checked_heading, pose_of_truth, steps_of_speeds, turning_factor
 from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
 from ccatp.core import FloatArray, IntArray
+
+NO_RANGE = "no range within the time of the odometry"
+
+
+def _run(
+    name: str, kind: str, steps: Steps, readings: Readings, beacon_ids: tuple[str, ...],
+    places_m: dict[str, tuple[float, float]], truth: ReferencePath | None, warnings: list[str],
+) -> RecordedRun:  # fmt: skip
+    first_pose = pose_of_truth(truth, steps, warnings)
+    return RecordedRun(name, kind, steps, readings, beacon_ids, places_m, truth, first_pose, tuple(warnings))
+
+
+def _truth(reference: Table | None, steps: Steps, warnings: list[str]) -> ReferencePath | None:
+    """The trajectory of rows of time, x, y and heading; of positions alone where headings are missing."""
+    if reference is None:
+        return None
+    t, x, y, *more = reference.values.T
+    heading = more[0] if more else np.full(len(t), np.nan)
+    known = np.isfinite(heading)
+    if known.any() and not known.all():
+        warnings.append(reference.note(~known, "of truth without heading (the first here): no heading is used"))
+    heading = np.unwrap(heading) if known.all() else np.full(len(t), np.nan)
+    return checked_heading(ReferencePath(t, x, y, heading), steps, warnings)
+
+
+def _readings(times_s: FloatArray, beacon: IntArray, range_m: FloatArray) -> Readings:
+    return Readings(times_s, beacon, range_m, np.full(len(times_s), np.nan), np.full(len(times_s), np.nan))
+
+
+def _names_of(ids: FloatArray) -> tuple[tuple[str, ...], IntArray]:
+    """Names of beacons and the index of each row into them, from a column of whole numbers."""
+    unique, index = np.unique(ids.astype(np.int64), return_inverse=True)
+    return tuple(str(i) for i in unique.tolist()), index.astype(np.int64)
+
+
+def _plain_or_gzipped(folder: Path, name: str) -> Path | None:
+    return next((file for file in (folder / name, folder / f"{name}.gz") if file.is_file()), None)
+
+
+def _needed(folder: Path, name: str, what: str) -> Path:
+    file = _plain_or_gzipped(folder, name)
+    if file is None:
+        raise RadioDataError(folder / name, f"no such file (nor gzipped): {what}")
+    return file
+
 
 PLAZA = {
     "DR": ("time [s]", "distance [m]", "turn [rad]"),
@@ -33,10 +76,6 @@ PLAZA = {
     "TL": ("beacon", "x [m]", "y [m]"),
 }
 PLAZA_NEEDED = ("DR", "TD")
-
-
-def _ranges(times_s: FloatArray, beacon: IntArray, range_m: FloatArray) -> Readings:
-    return Readings(times_s, beacon, range_m, np.full(len(times_s), np.nan), np.full(len(times_s), np.nan))
 
 
 def is_plaza(file: Path) -> bool:
@@ -57,27 +96,22 @@ def read_plaza(path: Path) -> RecordedRun:
     file = _plaza_file(path) if path.is_dir() else path
     tables = _mat_tables(file) if file.suffix == ".mat" else _text_tables(file)
     warnings: list[str] = []
-    odometry = in_order(with_unknown_ways(tables["DR"], warnings), warnings, 1)
-    ranges = in_order(tables["TD"], warnings)
-    reference = in_order(tables["GT"], warnings) if "GT" in tables else None
+    odometry = tables["DR"].with_unknown_ways(warnings).in_order(warnings, 1)
+    ranges = tables["TD"].in_order(warnings).values
+    reference = tables["GT"].in_order(warnings) if "GT" in tables else None
     steps = _plaza_steps(file, odometry, None if reference is None else float(reference.values[0, 0]))
-    heard = ranges.values[within(ranges.values[:, 0], steps.times_s, "range", warnings)]
-    if not len(heard):
-        raise RadioDataError(file, "no range within the time of the odometry")
-    beacon_ids, beacon = names_of(heard[:, 2])
-    truth = None if reference is None else _truth_with_heading(reference, steps, warnings)
-    surveyed = without_gaps_in_numbers(tables["TL"], warnings).values.tolist() if "TL" in tables else []
+    ranges = ranges[within(ranges[:, 0], steps.times_s, "range", warnings)]
+    if not len(ranges):
+        raise RadioDataError(file, NO_RANGE)
+    beacon_ids, beacon = _names_of(ranges[:, 2])
+    truth = _truth(reference, steps, warnings)
+    surveyed = tables["TL"].finite(warnings).values.tolist() if "TL" in tables else []
+    places_m = {str(int(i)): (x, y) for i, x, y in surveyed}
     name = file.name.split(".")[0]
     for kind in PLAZA:
         name = name.removesuffix(f"_{kind}")
-    places_m = {str(int(i)): (x, y) for i, x, y in surveyed}
-    readings = _ranges(heard[:, 0], beacon, heard[:, 3])
-    return recorded_run(name.rstrip("_"), "plaza", steps, readings, beacon_ids, places_m, truth, warnings)
-
-
-def _truth_with_heading(reference: Table, steps: Steps, warnings: list[str]) -> ReferencePath:
-    t, x, y, heading = reference.values.T
-    return checked_heading(ReferencePath(t, x, y, np.unwrap(heading)), steps, warnings)
+    readings = _readings(ranges[:, 0], beacon, ranges[:, 3])
+    return _run(name.rstrip("_"), "plaza", steps, readings, beacon_ids, places_m, truth, warnings)
 
 
 def _plaza_file(folder: Path) -> Path:
@@ -124,16 +158,11 @@ def _text_tables(file: Path) -> dict[str, Table]:
     tables: dict[str, Table] = {}
     for other, columns in PLAZA.items():
         name = file.name.replace(f"_{kind}.txt", f"_{other}.txt").removesuffix(".gz")
-        there = _plain_or_gzipped(file.parent, name)
-        if there is not None:
+        if other in PLAZA_NEEDED:
+            _needed(file.parent, name, f"it goes with {file.name}")
+        if there := _plain_or_gzipped(file.parent, name):
             tables[other] = read_table(there, columns)
-        elif other in PLAZA_NEEDED:
-            raise RadioDataError(file.with_name(name), f"no such file; it goes with {file.name}")
     return tables
-
-
-def _plain_or_gzipped(folder: Path, name: str) -> Path | None:
-    return next((file for file in (folder / name, folder / f"{name}.gz") if file.is_file()), None)
 
 
 def _plaza_steps(file: Path, odometry: Table, truth_start_s: float | None) -> Steps:
@@ -183,33 +212,25 @@ def read_mrclam(path: Path, robot: int | None) -> RecordedRun:
         raise RadioDataError(folder, f"has no odometry of robot {robot}; there are {listed([str(r) for r in there])}")
     warnings: list[str] = []
     odometry_file = _needed(folder, f"Robot{robot}_Odometry.dat", "the robot's odometry")
-    odometry = in_order(read_table(odometry_file, ODOMETRY), warnings)
+    odometry = read_table(odometry_file, ODOMETRY).in_order(warnings)
     odometry.check_steps("rows")
     t, speed, rate = odometry.values.T
     steps = steps_of_speeds(t, speed, rate, np.zeros(len(t)))
     seen_file = _needed(folder, f"Robot{robot}_Measurement.dat", "what the robot saw")
-    seen = in_order(read_table(seen_file, MEASUREMENT), warnings).values
+    seen = read_table(seen_file, MEASUREMENT).in_order(warnings).values
     seen = seen[within(seen[:, 0], steps.times_s, "reading", warnings)]
     subjects = _subjects(folder, seen[:, 1], warnings)
     kept = subjects > LAST_ROBOT_SUBJECT
     if not kept.any():
         raise RadioDataError(seen_file, "no reading of a landmark within the time of the odometry")
-    beacon_ids, beacon = names_of(subjects[kept])
+    beacon_ids, beacon = _names_of(subjects[kept])
     reference = _plain_or_gzipped(folder, f"Robot{robot}_Groundtruth.dat")
-    truth = None
-    if reference is not None:
-        truth = _truth_with_heading(in_order(read_table(reference, REFERENCE), warnings), steps, warnings)
+    rows = None if reference is None else read_table(reference, REFERENCE).in_order(warnings)
+    truth = _truth(rows, steps, warnings)
     places_m = _landmarks(folder, warnings)
-    readings = _ranges(seen[kept, 0], beacon, seen[kept, 2])._replace(bearing_rad=seen[kept, 3])
+    readings = _readings(seen[kept, 0], beacon, seen[kept, 2])._replace(bearing_rad=seen[kept, 3])
     name = f"{folder.resolve().name} robot {robot}"
-    return recorded_run(name, "mrclam", steps, readings, beacon_ids, places_m, truth, warnings)
-
-
-def _needed(folder: Path, name: str, what: str) -> Path:
-    file = _plain_or_gzipped(folder, name)
-    if file is None:
-        raise RadioDataError(folder / name, f"no such file (nor gzipped): {what}")
-    return file
+    return _run(name, "mrclam", steps, readings, beacon_ids, places_m, truth, warnings)
 
 
 def _subjects(folder: Path, barcodes: FloatArray, warnings: list[str]) -> FloatArray:
@@ -231,13 +252,13 @@ def _landmarks(folder: Path, warnings: list[str]) -> dict[str, tuple[float, floa
     if file is None:
         warnings.append("no Landmark_Groundtruth.dat: errors of the landmarks stay unknown")
         return {}
-    table = without_gaps_in_numbers(read_table(file, ("subject", "x [m]", "y [m]"), more=True), warnings)
+    table = read_table(file, ("subject", "x [m]", "y [m]"), more=True).finite(warnings)
     return {str(int(row[0])): (row[1], row[2]) for row in table.values.tolist()}
 
 
 TRACK_WARNING = 0.2
 # The readme calls the wheel columns right, left and the fourth the distance between the wheels; the numbers say left,
-# right, and half that distance (see ``wheel_columns``).
+# right, and half that distance (see ``_wheel_columns``).
 LABYRINTH = {
     "range2": ("time [s]", "range [m]", "sigma [m]", "anchor x [m]", "anchor y [m]", "anchor"),
     "odom2diff": (
@@ -262,7 +283,9 @@ def read_labyrinth(path: Path) -> RecordedRun:
     """
     file = _labyrinth_file(path) if path.is_dir() else path
     warnings: list[str] = []
-    tables = {kind: in_order(table, warnings) for kind, table in tables_of(file, _labyrinth_rows(file)).items()}
+    lines = content_lines(read_text(file))
+    rows = (tagged_row(file, line, content.split(), LABYRINTH, {}) for line, content in lines)
+    tables = {kind: table.in_order(warnings) for kind, table in tables_of(file, rows).items()}
     for kind in ("odom2diff", "range2"):
         if kind not in tables:
             raise RadioDataError(file, f"no line {kind} ({', '.join(LABYRINTH[kind])})")
@@ -270,33 +293,27 @@ def read_labyrinth(path: Path) -> RecordedRun:
     odometry.check_steps("lines odom2diff")
     t, left, right, side, half_track = odometry.values[:, :5].T
     if (half_track <= 0.0).any():
-        line = odometry.first_line(half_track <= 0.0)
+        line = int(odometry.lines[half_track <= 0.0][0])
         raise RadioDataError(file, "the distance between the wheels is not positive", line)
     steps = steps_of_speeds(t, 0.5 * (left + right), (right - left) / (2.0 * half_track), side)
     ranges = tables["range2"].values
     ranges = ranges[within(ranges[:, 0], steps.times_s, "range", warnings)]
     if not len(ranges):
-        raise RadioDataError(file, "no range within the time of the odometry")
-    beacon_ids, beacon = names_of(ranges[:, 5])
-    truth = None
-    if "gt2" in tables:
-        t, x, y = tables["gt2"].values.T
-        truth = checked_heading(ReferencePath(t, x, y, np.full(len(t), np.nan)), steps, warnings)
-        warnings += wheel_columns(truth, steps, float(np.median(half_track)))
+        raise RadioDataError(file, NO_RANGE)
+    beacon_ids, beacon = _names_of(ranges[:, 5])
+    truth = _truth(tables.get("gt2"), steps, warnings)
+    if truth is not None:
+        warnings += _wheel_columns(truth, steps, float(np.median(half_track)))
     places_m = {}
     for k, name in enumerate(beacon_ids):
         x_m, y_m = np.median(ranges[beacon == k, 3:5], axis=0).tolist()
         places_m[name] = (x_m, y_m)
-    readings = _ranges(ranges[:, 0], beacon, ranges[:, 1])
-    return recorded_run(file.name.split(".")[0], "labyrinth", steps, readings, beacon_ids, places_m, truth, warnings)
+    readings = _readings(ranges[:, 0], beacon, ranges[:, 1])
+    return _run(file.name.split(".")[0], "labyrinth", steps, readings, beacon_ids, places_m, truth, warnings)
 
 
-def wheel_columns(truth: ReferencePath, steps: Steps, half_track_m: float) -> list[str]:
-    """What the truth says of the wheel columns, a line; nothing where it says too little.
-
-    Args:
-        steps: odometry with the columns read as left, right, half the track.
-    """
+def _wheel_columns(truth: ReferencePath, steps: Steps, half_track_m: float) -> list[str]:
+    """What the truth says of the wheel columns, read as left, right, half the track; nothing where it says little."""
     factor = turning_factor(truth, steps)
     if factor is None:
         return []
@@ -316,13 +333,96 @@ def _labyrinth_file(folder: Path) -> Path:
     return files[0]
 
 
-def _labyrinth_rows(file: Path) -> Iterator[tuple[str, int, list[float]]]:
+# Columns after the event's name, as docs/radio_data.md lists them.
+EVENTS = {
+    "odom": ("time_s", "distance_m", "turn_rad", "(lateral_m)"),
+    "range": ("time_s", "beacon", "range_m"),
+    "bearing": ("time_s", "beacon", "bearing_rad"),
+    "rssi": ("time_s", "beacon", "rssi_dbm"),
+    "truth": ("time_s", "x_m", "y_m", "(heading_rad)"),
+    "beacon": ("beacon", "x_m", "y_m"),
+}
+HEARD = ("range", "bearing", "rssi")
+HEADER = "event"
+
+
+def is_events_csv(text: str) -> bool:
+    """Whether the text's first line, or the second below one of words, is an event or the header."""
+    lines = [split_cells(content) for _, content in content_lines(text[:4096])[:2]]
+    if lines and not any(is_number(cell) for cell in lines[0]):
+        return any(cells[0] in (*EVENTS, HEADER) for cells in lines)
+    return bool(lines) and lines[0][0] in EVENTS
+
+
+def read_events_csv(file: Path) -> RecordedRun:
+    """Read a run from a CSV of events (docs/radio_data.md), plain or gzipped.
+
+    Raises:
+        RadioDataError: a line is no event, or there is no odometry or no reading of a beacon.
+    """
+    if file.is_dir():
+        raise RadioDataError(file, "is a folder: name the CSV file in it")
+    numbers: dict[str, float] = {}
+    warnings: list[str] = []
+    rows: list[tuple[str, int, list[float]]] = []
     for line, content in content_lines(read_text(file)):
-        kind, *words = content.split()
-        if kind not in LABYRINTH:
-            raise RadioDataError(file, f"{kind!r} is none of {', '.join(LABYRINTH)}", line)
-        names = LABYRINTH[kind]
-        if len(words) != len(names):
-            wanted = ", ".join(names)
-            raise RadioDataError(file, f"{len(words)} values after {kind}, wanted {len(names)}: {wanted}", line)
-        yield kind, line, [number(file, line, word, name) for word, name in zip(words, names, strict=True)]
+        cells = split_cells(content)
+        is_head = not rows and cells[0] not in EVENTS and not any(is_number(cell) for cell in cells[1:])
+        if cells[0] != HEADER and not is_head:
+            rows.append(tagged_row(file, line, cells, EVENTS, numbers))
+    tables = tables_of(file, rows)
+    surveyed = tables.pop("beacon", None)
+    if "odom" in tables:
+        tables["odom"] = tables["odom"].with_unknown_ways(warnings)
+    needed = {kind: 1 if kind == "odom" else needed_of(columns) for kind, columns in EVENTS.items()}
+    tables = {kind: table.in_order(warnings, needed[kind]) for kind, table in tables.items()}
+    if "odom" not in tables:
+        raise RadioDataError(file, f"no event odom ({', '.join(EVENTS['odom'])})")
+    if not any(kind in tables for kind in HEARD):
+        raise RadioDataError(file, f"nothing heard of beacons: no event {', '.join(HEARD)}")
+    steps = _event_steps(tables["odom"])
+    names = tuple(numbers)
+    readings, heard_ids = _merged(tables, steps, names, warnings)
+    if not heard_ids:
+        raise RadioDataError(file, "nothing was heard of beacons within the time of the odometry")
+    truth = _truth(tables.get("truth"), steps, warnings)
+    places_m: dict[str, tuple[float, float]] = {}
+    if surveyed is not None:
+        for line, (index, x_m, y_m) in zip(surveyed.lines.tolist(), surveyed.values.tolist(), strict=True):
+            name = names[int(index)]
+            if places_m.setdefault(name, (x_m, y_m)) != (x_m, y_m):
+                raise RadioDataError(file, f"beacon {name} was surveyed at another place before", line)
+    return _run(file.name.split(".")[0], "csv", steps, readings, heard_ids, places_m, truth, warnings)
+
+
+def _event_steps(odometry: Table) -> Steps:
+    # Each row is the way since the row before; of the first row only its time counts.
+    t, distance, turn, lateral = odometry.values.T
+    odometry.check_steps("events odom")
+    if (np.diff(t) <= 0.0).any():
+        line = int(odometry.lines[1:][np.diff(t) <= 0.0][0])
+        raise RadioDataError(odometry.file, "two events odom at the same time say different things", line)
+    return bridged(Steps(t, distance[1:], turn[1:], lateral[1:]))
+
+
+def _merged(
+    tables: dict[str, Table], steps: Steps, names: tuple[str, ...], warnings: list[str]
+) -> tuple[Readings, tuple[str, ...]]:
+    """Readings, with range, bearing and strength of the same time and beacon in one row, and the beacons' names."""
+    merged: dict[tuple[float, float], list[float]] = {}
+    extra: list[tuple[float, float, list[float]]] = []
+    for place, kind in enumerate(HEARD):
+        if kind not in tables:
+            continue
+        values = tables[kind].values
+        for t, who, value in values[within(values[:, 0], steps.times_s, kind, warnings)].tolist():
+            row = merged.setdefault((t, who), [np.nan] * len(HEARD))
+            if np.isnan(row[place]):
+                row[place] = value
+            else:  # twice at the same time
+                extra.append((t, who, [value if k == place else np.nan for k in range(len(HEARD))]))
+    rows = sorted([(t, who, row) for (t, who), row in merged.items()] + extra, key=lambda item: item[:2])
+    heard, index = np.unique([int(who) for _, who, _ in rows], return_inverse=True)
+    data = np.array([row for _, _, row in rows]).reshape(-1, len(HEARD))
+    readings = Readings(np.array([t for t, _, _ in rows]), index.astype(np.int64), *data.T.copy())
+    return readings, tuple(names[int(who)] for who in heard)

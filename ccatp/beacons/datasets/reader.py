@@ -6,18 +6,19 @@ from pathlib import Path
 import numpy as np
 
 from ccatp.beacons.datasets.checks import suspicions
-from ccatp.beacons.datasets.events_csv import is_events_csv, read_events_csv
 from ccatp.beacons.datasets.formats import (
     ROBOT_FILE,
+    is_events_csv,
     is_labyrinth,
     is_plaza,
+    read_events_csv,
     read_labyrinth,
     read_mrclam,
     read_plaza,
     robots_in,
 )
 from ccatp.beacons.datasets.tables import RadioDataError, content_lines, plural, read_text
-from ccatp.beacons.slam.recording import Readings, RecordedRun
+from ccatp.beacons.slam.recording import RecordedRun
 from ccatp.core import FloatArray
 
 LEAST_TRUTH = 2  # rows: one fits any path
@@ -34,14 +35,12 @@ def read_run(path: Path, data_format: str | None, robot: int | None) -> Recorded
     Raises:
         RadioDataError: it cannot be read, or is not what it claims to be.
     """
-    if not path.exists():
-        raise RadioDataError(path, "no such file or folder")
-    data_format = data_format or found_format(path)
+    data_format = found_format(path, data_format)
     if robot is not None and data_format != "mrclam":
         raise RadioDataError(path, f"a {data_format} set has one vehicle: leave out --robot")
     with np.errstate(all="ignore"):  # numbers that overflow are refused below
         run = read_mrclam(path, robot) if data_format == "mrclam" else READERS[data_format](path)
-        run = bounded(run, path)
+        run = _bounded(run, path)
     if run.truth is not None and len(run.truth.times_s) < LEAST_TRUTH:
         warning = (
             f"no reference trajectory: the truth has {plural(len(run.truth.times_s), 'row')}, good for the first pose "
@@ -60,60 +59,54 @@ def robots_of(path: Path, data_format: str | None = None) -> list[int | None]:
     Raises:
         RadioDataError: there is no such set.
     """
-    if not path.exists():
-        raise RadioDataError(path, "no such file or folder")
-    return [*robots_in(path)] if path.is_dir() and (data_format or found_format(path)) == "mrclam" else [None]
+    return [*robots_in(path)] if found_format(path, data_format) == "mrclam" and path.is_dir() else [None]
 
 
-def found_format(path: Path) -> str:
-    """Which format a file or folder has, by its names and its first line.
+def found_format(path: Path, given: str | None = None) -> str:
+    """Which format a file or folder has: the one given, or else by its names and its first line.
 
     Raises:
-        RadioDataError: none that is known.
+        RadioDataError: it does not exist, is empty, or has none of the formats.
     """
-    found = _format_of_folder(path) if path.is_dir() else _format_of_file(path)
-    if found is None:
-        raise RadioDataError(path, f"none of the formats {', '.join(FORMATS)}; if it is one, name it with --format")
-    return found
-
-
-def _format_of_file(file: Path) -> str | None:
-    if is_plaza(file):
-        return "plaza"
-    if ROBOT_FILE.search(file.name):
+    if not path.exists():
+        raise RadioDataError(path, "no such file or folder")
+    if given is not None:
+        return given
+    is_folder = path.is_dir()
+    files = [file for file in sorted(path.iterdir()) if file.is_file()] if is_folder else [path]
+    if robots_in(path) if is_folder else ROBOT_FILE.search(path.name):
         return "mrclam"
-    text = read_text(file)
-    if not content_lines(text):
-        raise RadioDataError(file, "is empty: no line but comments; give a recording")
-    return "labyrinth" if is_labyrinth(text) else "csv" if is_events_csv(text) else None
-
-
-def _format_of_folder(folder: Path) -> str | None:
-    if robots_in(folder):
-        return "mrclam"
-    files = [file for file in sorted(folder.iterdir()) if file.is_file()]
     if any(is_plaza(file) for file in files):
         return "plaza"
-    texts = [file for file in files if ".txt" in file.suffixes]
-    return "labyrinth" if any(is_labyrinth(read_text(file)) for file in texts) else None
+    for file in files:
+        if is_folder and ".txt" not in file.suffixes:
+            continue
+        text = read_text(file)
+        if is_labyrinth(text):
+            return "labyrinth"
+        if not is_folder and not content_lines(text):
+            raise RadioDataError(path, "is empty: no line but comments; give a recording")
+        if not is_folder and is_events_csv(text):
+            return "csv"
+    raise RadioDataError(path, f"none of the formats {', '.join(FORMATS)}; if it is one, name it with --format")
 
 
 LONGEST_RUN_S = 1e8  # three years
 LONGEST_STEP_M = 1e3  # between two rows of odometry
 LARGEST_TURN_RAD = 1e4  # likewise; degrees for radians stay far below it, and are reported elsewhere
-LONGEST_RANGE_M = 1e6
-LARGEST_BEARING_RAD = 1e4
-LARGEST_LEVEL_DBM = 1e3
 FARTHEST_M = 1e8  # of coordinates; those of maps reach 1e7
+# Column of the readings, its name, the largest value and its unit.
+LIMITS = (
+    ("range_m", "range", 1e6, "m"),
+    ("bearing_rad", "bearing", 1e4, "rad"),
+    ("rssi_dbm", "signal strength", 1e3, "dBm"),
+)
 
 
-def bounded(run: RecordedRun, where: Path) -> RecordedRun:
+def _bounded(run: RecordedRun, where: Path) -> RecordedRun:
     """The run without readings and surveyed places that cannot be; each kind that was left out makes a warning.
 
     Odometry and truth are refused as a whole: without one of its steps a path leads elsewhere.
-
-    Raises:
-        RadioDataError: odometry or truth cannot be, or no reading is left.
     """
     steps, truth = run.steps, run.truth
     _refuse(where, "time of odometry", steps.times_s - steps.times_s[0], LONGEST_RUN_S, "s after its first row")
@@ -123,18 +116,30 @@ def bounded(run: RecordedRun, where: Path) -> RecordedRun:
     if truth is not None:
         for name, column in (("x", truth.x_m), ("y", truth.y_m)):
             _refuse(where, f"truth: {name}", column, FARTHEST_M, "m", truth.times_s)
-    warnings = list(run.warnings)
-    readings = _sensible(run.readings, warnings)
+    left_out: list[str] = []
+    readings = run.readings
+    for field, what, most, unit in LIMITS:
+        column = getattr(readings, field)
+        beyond = ~(np.abs(column) <= most) & ~np.isnan(column)
+        if beyond.any():
+            first = int(np.flatnonzero(beyond)[0])
+            left_out.append(
+                f"{plural(int(beyond.sum()), what)} beyond {most:g} {unit}, the first {column[first]:.3g} {unit} at "
+                f"{readings.times_s[first]:.6g} s, left out"
+            )
+            readings = readings._replace(**{field: np.where(beyond, np.nan, column)})
+    if left_out:
+        readings = readings.where(np.asarray(np.isfinite(np.column_stack(readings[2:])).any(axis=1)))
     if not len(readings.times_s):
-        raise RadioDataError(where, f"none of its readings can be ({'; '.join(warnings[len(run.warnings) :])})")
+        raise RadioDataError(where, f"none of its readings can be ({'; '.join(left_out)})")
     placed = {
         name: place_m
         for name, place_m in run.beacon_truth_m.items()
         if all(abs(axis_m) <= FARTHEST_M for axis_m in place_m)
     }
     if lost := [name for name in run.beacon_truth_m if name not in placed]:
-        warnings.append(f"surveyed place of {', '.join(lost)}: is no place within {FARTHEST_M:g} m, left out")
-    return replace(run, readings=readings, beacon_truth_m=placed, warnings=tuple(warnings))
+        left_out.append(f"surveyed place of {', '.join(lost)}: is no place within {FARTHEST_M:g} m, left out")
+    return replace(run, readings=readings, beacon_truth_m=placed, warnings=(*run.warnings, *left_out))
 
 
 def _refuse(
@@ -145,28 +150,3 @@ def _refuse(
         first = int(beyond[0])
         at = "" if times_s is None else f" at {times_s[first]:.6g} s"
         raise RadioDataError(where, f"{what} of {values[first]:.3g} {unit}{at} cannot be; at most {most:g} is taken")
-
-
-def _sensible(readings: Readings, warnings: list[str]) -> Readings:
-    columns = {}
-    for field, what, most, unit in (
-        ("range_m", "range", LONGEST_RANGE_M, "m"),
-        ("bearing_rad", "bearing", LARGEST_BEARING_RAD, "rad"),
-        ("rssi_dbm", "signal strength", LARGEST_LEVEL_DBM, "dBm"),
-    ):
-        column: FloatArray = getattr(readings, field)
-        beyond = ~(np.abs(column) <= most) & ~np.isnan(column)
-        if beyond.any():
-            first = int(np.flatnonzero(beyond)[0])
-            warnings.append(
-                f"{plural(int(beyond.sum()), what)} beyond {most:g} {unit}, the first {column[first]:.3g} {unit} at "
-                f"{readings.times_s[first]:.6g} s, left out"
-            )
-            columns[field] = np.where(beyond, np.nan, column)
-    if not columns:
-        return readings
-    cleaned = readings._replace(**columns)
-    known = np.asarray(
-        np.isfinite(np.column_stack([cleaned.range_m, cleaned.bearing_rad, cleaned.rssi_dbm])).any(axis=1)
-    )
-    return cleaned.where(known)

@@ -1,24 +1,23 @@
 """Tables of numbers in text files, plain or gzipped: faults carry file and line; order and completeness of rows."""
 
+import csv
 import gzip
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from ccatp.core import FloatArray
+from ccatp.core import FloatArray, IntArray
 from ccatp.errors import CcatpError, ExitStatus
+
+BoolArray = npt.NDArray[np.bool_]
 
 
 class RadioDataError(CcatpError):
-    """A recorded data set that cannot be used.
-
-    Args:
-        line: number of the line, from 1.
-    """
+    """A data set that cannot be used: the file, the number of the line from 1, what is wrong."""
 
     exit_status = ExitStatus.USAGE
 
@@ -32,25 +31,14 @@ GAP_S = 2.0  # pauses shorter than that are how recorders work,
 GAP_RATIO = 20.0  # and so are those of a few usual intervals
 
 
-class Table(NamedTuple):
-    """Rows of numbers, shape (n, columns), and the number of the line of each, from 1, shape (n,)."""
+def plural(count: int, what: str) -> str:
+    """``3 rows``, ``1 row``."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
-    file: Path
-    values: FloatArray
-    lines: npt.NDArray[np.int64]
 
-    def first_line(self, rows: npt.NDArray[np.bool_]) -> int:
-        """Number of the line of the first marked row (n,)."""
-        return int(self.lines[np.flatnonzero(rows)[0]])
-
-    def check_steps(self, what: str) -> None:
-        """Refuse odometry of fewer than three rows.
-
-        Raises:
-            RadioDataError: there are fewer.
-        """
-        if len(self.values) < 3:
-            raise RadioDataError(self.file, f"{len(self.values)} {what}: too few for a run")
+def listed(names: Sequence[str], most: int = 8) -> str:
+    """``6, 7, 8``, shortened where there are many."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def read_text(file: Path, wanted: str = "a data set of the formats plaza, mrclam, labyrinth or csv") -> str:
@@ -78,8 +66,15 @@ def content_lines(text: str) -> list[tuple[int, str]]:
     return [(number, line) for number, line in stripped if line and not line.startswith(COMMENTS)]
 
 
+def split_cells(content: str, delimiter: str | None = ",") -> list[str]:
+    """The cells of a line, quoted or not, stripped; between white space without a delimiter."""
+    if delimiter is None:
+        return content.split()
+    return [cell.strip() for cell in next(csv.reader([content], delimiter=delimiter, skipinitialspace=True))]
+
+
 def number(file: Path, line: int, text: str, what: str) -> float:
-    """A number, NaN and infinity included: ``in_order`` leaves those out with a warning.
+    """A number, NaN and infinity included: ``Table.in_order`` leaves those out with a warning.
 
     Raises:
         RadioDataError: it is none.
@@ -87,7 +82,7 @@ def number(file: Path, line: int, text: str, what: str) -> float:
     try:
         return float(text)
     except ValueError as error:
-        raise RadioDataError(file, f"{what} is {text!r}, not a number", line) from error
+        raise RadioDataError(file, f"{what} is {text[:40]!r}, not a number", line) from error
 
 
 def is_number(text: str) -> bool:
@@ -97,6 +92,67 @@ def is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+class Table(NamedTuple):
+    """Rows of numbers, shape (n, columns), and the number of the line of each, from 1, shape (n,)."""
+
+    file: Path
+    values: FloatArray
+    lines: IntArray
+
+    def note(self, rows: BoolArray, what: str) -> str:
+        """A warning of some rows (n,), with the line of the first."""
+        first = int(self.lines[np.flatnonzero(rows)[0]])
+        return f"{self.file.name}:{first}: {plural(int(rows.sum()), 'row')} {what}"
+
+    def finite(self, warnings: list[str], columns: int | None = None) -> "Table":
+        """Rows that are finite in the first ``columns``, all if not given; the others are left out with a warning."""
+        finite = np.asarray(np.isfinite(self.values[:, :columns]).all(axis=1))
+        if not finite.all():
+            warnings.append(self.note(~finite, "not finite (the first here), left out"))
+        return Table(self.file, self.values[finite], self.lines[finite])
+
+    def in_order(self, warnings: list[str], columns: int | None = None) -> "Table":
+        """Finite rows by time (column 0) without repetitions; warns of rows that were out of order or doubled.
+
+        Rows that are the same in every column are one; rows of the same time that differ all stay, in their order.
+        """
+        file, values, lines = self.finite(warnings, columns)
+        back = np.flatnonzero(np.diff(values[:, 0]) < 0.0)
+        if back.size:
+            warnings.append(
+                f"{file.name}:{int(lines[back[0] + 1])}: time goes back {plural(back.size, 'time')} (the first here, "
+                f"by {values[back[0], 0] - values[back[0] + 1, 0]:.6g} s); rows were sorted by time"
+            )
+            order = np.argsort(values[:, 0], kind="stable")
+            values, lines = values[order], lines[order]
+        keep = np.ones(len(values), dtype=bool)
+        for row in (np.flatnonzero(np.diff(values[:, 0]) == 0.0) + 1).tolist():
+            first = int(np.searchsorted(values[:, 0], values[row, 0]))
+            keep[row] = not any(np.array_equal(values[k], values[row], equal_nan=True) for k in range(first, row))
+        if not keep.all():
+            warnings.append(Table(file, values, lines).note(~keep, "doubled (the first here), left out"))
+        return Table(file, values[keep], lines[keep])
+
+    def with_unknown_ways(self, warnings: list[str]) -> "Table":
+        """Odometry by increments: rows with a time and no finite way keep the time, the way is NaN; with a warning."""
+        unknown = np.isfinite(self.values[:, 0]) & ~np.isfinite(self.values).all(axis=1)
+        if not unknown.any():
+            return self
+        warnings.append(self.note(unknown, "not finite (the first here): the way there is guessed by the speed before"))
+        values = self.values.copy()
+        values[unknown, 1:] = np.nan
+        return self._replace(values=values)
+
+    def check_steps(self, what: str) -> None:
+        """Refuse odometry of fewer than three rows.
+
+        Raises:
+            RadioDataError: there are fewer.
+        """
+        if len(self.values) < 3:
+            raise RadioDataError(self.file, f"{len(self.values)} {what}: too few for a run")
 
 
 def tables_of(file: Path, rows: Iterable[tuple[str, int, list[float]]]) -> dict[str, Table]:
@@ -132,74 +188,45 @@ def read_table(file: Path, names: tuple[str, ...], *, more: bool = False) -> Tab
     return tables_of(file, rows)[""]
 
 
-def plural(count: int, what: str) -> str:
-    """``3 rows``, ``1 row``."""
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+def tagged_row(
+    file: Path, line: int, words: Sequence[str], layout: Mapping[str, tuple[str, ...]], names: dict[str, float]
+) -> tuple[str, int, list[float]]:
+    """A line whose first word is its kind: kind, line, and the values of that kind's columns.
 
+    Args:
+        layout: columns by kind; those in parentheses may be missing. The column ``beacon`` is a name, all others are
+            numbers.
+        names: number of each name so far; new ones are added.
 
-def listed(names: Sequence[str], most: int = 8) -> str:
-    """``6, 7, 8``, shortened where there are many."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
-def without_gaps_in_numbers(table: Table, warnings: list[str], columns: int | None = None) -> Table:
-    """Rows that are finite in the first ``columns``, all if not given; the others are left out with a warning."""
-    finite = np.asarray(np.isfinite(table.values[:, :columns]).all(axis=1))
-    if not finite.all():
-        left_out = plural(int((~finite).sum()), "row")
-        line = table.first_line(~finite)
-        warnings.append(f"{table.file.name}:{line}: {left_out} not finite (the first here), left out")
-    return Table(table.file, table.values[finite], table.lines[finite])
-
-
-def in_order(table: Table, warnings: list[str], columns: int | None = None) -> Table:
-    """Finite rows by time (column 0) without repetitions; warns of rows that were out of order or doubled.
-
-    Rows that are the same in every column are one; rows of the same time that differ all stay, in their order.
+    Raises:
+        RadioDataError: the line is of no such kind, or its values are not the columns.
     """
-    table = without_gaps_in_numbers(table, warnings, columns)
-    values, lines = table.values, table.lines
-    back = np.flatnonzero(np.diff(values[:, 0]) < 0.0)
-    if back.size:
-        line = int(lines[back[0] + 1])
-        warnings.append(
-            f"{table.file.name}:{line}: time goes back {plural(back.size, 'time')} (the first here, by "
-            f"{values[back[0], 0] - values[back[0] + 1, 0]:.6g} s); rows were sorted by time"
-        )
-        order = np.argsort(values[:, 0], kind="stable")
-        values, lines = values[order], lines[order]
-    keep = np.ones(len(values), dtype=bool)
-    for row in (np.flatnonzero(np.diff(values[:, 0]) == 0.0) + 1).tolist():
-        first = int(np.searchsorted(values[:, 0], values[row, 0]))
-        keep[row] = not any(np.array_equal(values[k], values[row], equal_nan=True) for k in range(first, row))
-    if not keep.all():
-        doubled = plural(int((~keep).sum()), "row")
-        line = int(lines[np.flatnonzero(~keep)[0]])
-        warnings.append(f"{table.file.name}:{line}: {doubled} doubled (the first here), left out")
-    return Table(table.file, values[keep], lines[keep])
+    kind, *cells = words
+    if kind not in layout:
+        raise RadioDataError(file, f"{kind!r} is none of {', '.join(layout)}", line)
+    columns = layout[kind]
+    while len(cells) > 1 and not cells[-1]:
+        cells.pop()  # empty cells at the end, as spreadsheets write them
+    if not needed_of(columns) <= len(cells) <= len(columns):
+        raise RadioDataError(file, f"{len(cells)} values after {kind}, wanted {', '.join(columns)}", line)
+    values = []
+    for cell, column in zip(cells, columns, strict=False):
+        if column != "beacon":
+            values.append(number(file, line, cell, column.strip("()")))
+        elif cell:
+            values.append(names.setdefault(cell, float(len(names))))
+        else:
+            raise RadioDataError(file, f"{kind} has no name of a beacon", line)
+    missing = 0.0 if kind == "odom" else np.nan  # no travel sideways; heading unknown
+    return kind, line, values + [missing] * (len(columns) - len(values))
 
 
-def with_unknown_ways(table: Table, warnings: list[str]) -> Table:
-    """Odometry by increments: rows with a time and no finite way keep the time, the way is NaN; with a warning."""
-    unknown = np.isfinite(table.values[:, 0]) & ~np.isfinite(table.values).all(axis=1)
-    if not unknown.any():
-        return table
-    warnings.append(
-        f"{table.file.name}:{table.first_line(unknown)}: {plural(int(unknown.sum()), 'row')} not finite (the first "
-        "here): the way there is guessed by the speed before"
-    )
-    values = table.values.copy()
-    values[unknown, 1:] = np.nan
-    return Table(table.file, values, table.lines)
+def needed_of(columns: Sequence[str]) -> int:
+    """How many columns of a layout have to be there."""
+    return sum(not column.startswith("(") for column in columns)
 
 
-def names_of(ids: FloatArray) -> tuple[tuple[str, ...], npt.NDArray[np.int64]]:
-    """Names of beacons and the index of each row into them, from a column of whole numbers."""
-    unique, index = np.unique(ids.astype(np.int64), return_inverse=True)
-    return tuple(str(i) for i in unique.tolist()), index.astype(np.int64)
-
-
-def within(times_s: FloatArray, odometry_s: FloatArray, what: str, warnings: list[str]) -> npt.NDArray[np.bool_]:
+def within(times_s: FloatArray, odometry_s: FloatArray, what: str, warnings: list[str]) -> BoolArray:
     """Which of the times lie in the span of the odometry's; warns of the others."""
     inside = (times_s >= odometry_s[0]) & (times_s <= odometry_s[-1])
     if not inside.all():
@@ -207,7 +234,7 @@ def within(times_s: FloatArray, odometry_s: FloatArray, what: str, warnings: lis
     return np.asarray(inside)
 
 
-def long_pauses(times_s: FloatArray, least_s: float = GAP_S) -> npt.NDArray[np.int64]:
+def long_pauses(times_s: FloatArray, least_s: float = GAP_S) -> IntArray:
     """The rows after which nothing comes for longer than is usual."""
     pauses = np.diff(times_s)
     if not (pauses > 0.0).any():

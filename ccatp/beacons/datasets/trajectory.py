@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.beacons.datasets.tables import long_pauses
-from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps, dead_reckoned, running_total
+from ccatp.beacons.slam.recording import ReferencePath, Steps, dead_reckoned, running_total
 from ccatp.core import FloatArray
 
 BEFORE_S = 1.0  # over so long the speed before a gap is taken
@@ -198,12 +198,3 @@ def pose_of_truth(truth: ReferencePath | None, steps: Steps, warnings: list[str]
     p = np.interp(t, steps.times_s, path[:, 0]) + 1j * np.interp(t, steps.times_s, path[:, 1])
     q = truth.x_m[rows] + 1j * truth.y_m[rows]
     return (x, y, float(np.angle(np.vdot(p - p.mean(), q - q.mean()))))
-
-
-def recorded_run(
-    name: str, kind: str, steps: Steps, readings: Readings, beacon_ids: tuple[str, ...],
-    places_m: dict[str, tuple[float, float]], truth: ReferencePath | None, warnings: list[str],
-) -> RecordedRun:  # fmt: skip
-    """A run with the first pose of its truth."""
-    first_pose = pose_of_truth(truth, steps, warnings)
-    return RecordedRun(name, kind, steps, readings, beacon_ids, places_m, truth, first_pose, tuple(warnings))

@@ -1,23 +1,21 @@
-"""Each format gives back the run that was written, whatever liberties its files take."""
+"""Each format gives back the run that was written, whatever liberties its files take; a fault is one line."""
 
 import gzip
-import json
 import re
-import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from openpyxl import Workbook
+import scipy.io
 
-from ccatp.beacons.datasets.events_csv import EVENTS
-from ccatp.beacons.datasets.levels import read_levels, read_log, read_places, read_workbook
+from ccatp.beacons.datasets.formats import EVENTS
 from ccatp.beacons.datasets.reader import found_format, read_run
 from ccatp.beacons.datasets.tables import RadioDataError
 from ccatp.beacons.datasets.trajectory import LOST_RAD, bridged
 from ccatp.beacons.slam.recording import RecordedRun, Steps, dead_reckoned
-from ccatp.cli import main
 from ccatp.core import FloatArray
+from ccatp.errors import ExitStatus
 from tests.unit.beacons.datasets.sets import (
     BEACONS,
     World,
@@ -132,11 +130,6 @@ def test_labyrinth_plain_gzipped_and_as_folder(tmp_path: Path) -> None:
     assert read_run(packed, None, None).name == "part"
 
 
-def test_csv_merges_what_was_heard_at_once(tmp_path: Path) -> None:
-    run = read_run(write_lines(tmp_path / "mine.csv", csv_lines(W)), None, None)
-    check(run, W, bearings=True)
-
-
 def test_csv_of_signal_strengths_lateral_ways_and_names(tmp_path: Path) -> None:
     lines = [
         "odom,0,0,0", "odom,1,0.5,0.1,0.2", "odom,2,0.5,0.1", "odom,3,0.5,0.1,,",
@@ -188,6 +181,7 @@ def test_readings_beyond_the_odometry_are_left_out_and_told(tmp_path: Path) -> N
 def test_csv_with_a_head_of_words_or_quoted_cells(tmp_path: Path) -> None:
     lines = csv_lines(W)
     check(read_run(write_lines(tmp_path / "head.csv", ["time,x,y", *lines]), None, None), W, bearings=True)
+    check(read_run(write_lines(tmp_path / "mine.csv", lines), None, None), W, bearings=True)
     quoted = [line if line.startswith("#") else ",".join(f'"{cell}"' for cell in line.split(",")) for line in lines]
     check(read_run(write_lines(tmp_path / "quoted.csv", quoted), None, None), W, bearings=True)
 
@@ -202,144 +196,20 @@ def test_csv_with_a_truth_that_lacks_some_headings_is_told(tmp_path: Path) -> No
 
 DOCS = Path(__file__).parents[4] / "docs"
 EXAMPLE = DOCS / "radio_example.csv"
-PAGE = DOCS / "radio_data.md"
 
 
-def test_the_example_reads_without_a_warning() -> None:
+def test_the_example_and_its_page() -> None:
     run = read_run(EXAMPLE, None, None)
     assert run.warnings == ()
     assert run.beacon_ids == ("door", "window", "desk")
     assert run.first_pose == (1.0, 1.0, 0.0)
-
-
-@pytest.mark.parametrize("filter_name", ["ekf-slam", "smoother"])
-def test_the_example_is_solved(filter_name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["radio", "slam", str(EXAMPLE), "--filter", filter_name, "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
-    assert data["trajectory_rmse_m"] < 0.15
-    assert data["beacon_rmse_m"] < 0.3
-
-
-def test_the_page_lists_every_event_with_its_columns() -> None:
-    rows = re.findall(r"^\| `(\w+)` \| `([^`]*)`", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    text = (DOCS / "radio_data.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| `([^`]*)`", text, re.MULTILINE)
     assert dict(rows) == {
         event: ", ".join(columns).replace("(", "[").replace(")", "]") for event, columns in EVENTS.items()
     }
-
-
-def test_the_page_shows_lines_of_the_example() -> None:
-    text = PAGE.read_text(encoding="utf-8")
     shown = text.split("```text\n")[1].split("```")[0].splitlines()
-    lines = EXAMPLE.read_text(encoding="utf-8").splitlines()
-    assert all(line in lines for line in shown if line != "...")
-
-
-ROWS: list[list[str | float | None]] = [["Distance", None, "RSSI"], [0.5, None, -40], [1, None, -47]]
-
-
-def workbook(file: Path) -> Path:
-    book = Workbook()
-    sheet = book.active
-    assert sheet is not None
-    sheet.title = "Zigbee"
-    for row in ROWS:
-        sheet.append(row)
-    book.save(file)
-    return file
-
-
-def test_a_workbook_is_read_with_its_gaps(tmp_path: Path) -> None:
-    file = workbook(tmp_path / "a.xlsx")
-    assert read_workbook(file) == {"Zigbee": [["Distance", "", "RSSI"], ["0.5", "", "-40"], ["1", "", "-47"]]}
-    table = read_levels(file)
-    assert [pair[:2] for pair in table.pairs] == [(0.5, -40.0), (1.0, -47.0)]
-    assert table.name == "a.xlsx, sheet Zigbee"
-
-
-def test_what_is_no_workbook_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.xlsx").write_text("distance,rssi\n")
-    with pytest.raises(RadioDataError, match=r"is no \.xlsx workbook"):
-        read_workbook(tmp_path / "a.xlsx")
-    with pytest.raises(RadioDataError, match="no such file"):
-        read_workbook(tmp_path / "b.xlsx")
-    with zipfile.ZipFile(tmp_path / "c.xlsx", "w") as archive:
-        archive.writestr("other", "")
-    with pytest.raises(RadioDataError, match=r"is no \.xlsx workbook"):
-        read_workbook(tmp_path / "c.xlsx")
-    with zipfile.ZipFile(workbook(tmp_path / "d.xlsx"), "a") as archive:
-        archive.writestr("xl/theme/more.xml", '<!DOCTYPE a [<!ENTITY b "c">]><a/>')
-    with pytest.raises(RadioDataError, match="defines entities"):
-        read_workbook(tmp_path / "d.xlsx")
-    with pytest.raises(RadioDataError, match='has no sheet "BLE"; there are Zigbee'):
-        read_levels(workbook(tmp_path / "e.xlsx"), "BLE")
-
-
-@pytest.mark.parametrize("damage", range(0, 4000, 157))
-def test_a_damaged_workbook_is_read_or_refused_in_one_line(tmp_path: Path, damage: int) -> None:
-    data = bytearray(workbook(tmp_path / "a.xlsx").read_bytes())
-    data[damage % len(data)] ^= 0x55
-    (tmp_path / "a.xlsx").write_bytes(data)
-    said = "as it was"
-    try:
-        assert read_workbook(tmp_path / "a.xlsx")["Zigbee"][1][0] == "0.5"
-    except RadioDataError as error:
-        said = str(error)
-    assert "\n" not in said
-
-
-@pytest.mark.parametrize(
-    "text", ["distance_m,rssi_dbm\n1,-40\n2,-46\n", "# note\nd level\n1 -40\n2 -46\n", "range;dBm\n1;40\n2;46\n"]
-)
-def test_csv_in_its_usual_shapes(tmp_path: Path, text: str) -> None:
-    (tmp_path / "a.csv").write_text(text)
-    table = read_levels(tmp_path / "a.csv")
-    assert [pair[:2] for pair in table.pairs] == [(1.0, -40.0), (2.0, -46.0)]
-    assert bool(table.warnings) == ("-" not in text)
-
-
-def test_places_with_levels_by_node(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("Point,x,y,RSSI A,RSSI B\n1,0.5,1,56,60\n2,1,0,57,61\n")
-    table = read_places(tmp_path / "a.csv")
-    assert table.places[1].place_m == (1.0, 0.0)
-    assert table.places[0].levels_dbm == {"A": -56.0, "B": -60.0}
-    (tmp_path / "b.csv").write_text("x,y,level\n1,2,-40\n")
-    with pytest.raises(RadioDataError, match="has no column of levels by node"):
-        read_places(tmp_path / "b.csv")
-
-
-def test_a_folder_of_logs_with_their_distances(tmp_path: Path) -> None:
-    (tmp_path / "1.txt").write_text("Node A: -29\nNode A: -30\n\n")
-    (tmp_path / "2.txt").write_text("Node A: -35\n")
-    (tmp_path / "points.csv").write_text("distance_m,point\n0.1,1\n0.2,2\n0.3,3\n")
-    table = read_levels(tmp_path, None, tmp_path / "points.csv")
-    assert [pair[:2] for pair in table.pairs] == [(0.1, -29.0), (0.1, -30.0), (0.2, -35.0)]
-    assert table.warnings == ("1 logs are missing, the first 3.txt",)
-    with pytest.raises(RadioDataError, match="name the table of their distances with --points"):
-        read_levels(tmp_path)
-    (tmp_path / "none").mkdir()
-    with pytest.raises(RadioDataError, match="holds none of the logs"):
-        read_levels(tmp_path / "none", None, tmp_path / "points.csv")
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("a,b\n1,2\n", "has no column of distances"),
-        ("distance_m,b\n1,2\n", "has no column of levels"),
-        ("distance_m,rssi\n", "holds no rows below a head"),
-        ("distance_m,rssi\n1,loud\n", r":2: \"loud\" in column 2 is no number"),
-    ],
-)
-def test_tables_that_say_nothing_are_refused(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "a.csv").write_text(text)
-    with pytest.raises(RadioDataError, match=message):
-        read_levels(tmp_path / "a.csv")
-
-
-def test_a_log_line_of_another_kind_is_told_with_its_line(tmp_path: Path) -> None:
-    (tmp_path / "1.txt").write_text("Node A: -29\nNode A -30\n")
-    with pytest.raises(RadioDataError, match=r"1\.txt:2: .*is no line like"):
-        read_log(tmp_path / "1.txt")
+    assert {*shown} - {"..."} <= {*EXAMPLE.read_text(encoding="utf-8").splitlines()}
 
 
 def steps_of(distance_m: FloatArray, turn_rad: FloatArray, interval_s: float = 0.1) -> Steps:
@@ -394,3 +264,169 @@ def test_a_row_that_is_not_finite_keeps_its_time(tmp_path: Path, form: str) -> N
     assert run.steps.times_s.size == w.times_s.size
     assert run.steps.distance_m.sum() == pytest.approx(w.distance_m.sum(), abs=2e-3)
     assert any("1 row not finite (the first here): the way there is guessed" in line for line in run.warnings)
+
+
+W_SHORT = world(seconds=20.0)
+Make = Callable[[Path], Path]
+
+
+def _mat(**changes: object) -> Make:
+    def make(folder: Path) -> Path:
+        tables: dict[str, object] = {**plaza_tables(W_SHORT), **changes}
+        scipy.io.savemat(folder / "Field1.mat", {k: v for k, v in tables.items() if v is not None})
+        return folder / "Field1.mat"
+
+    return make
+
+
+def _changed(name: str, text: str | None, given: str = "") -> Make:
+    """A set of texts with one file that has another text, or none; the path to it, or to ``given``."""
+
+    def make(folder: Path) -> Path:
+        if name.startswith("Field1"):
+            write_plaza(folder, W_SHORT, mat=False)
+        else:
+            write_mrclam(folder, W_SHORT)
+        if text is None:
+            (folder / name).unlink()
+        else:
+            (folder / name).write_text(text, encoding="utf-8")
+        return folder / given
+
+    return make
+
+
+def _plaza_file(kind: str, text: str) -> Make:
+    return _changed(f"Field1_{kind}.txt", text, "Field1_DR.txt")
+
+
+def _two_sets(folder: Path) -> Path:
+    write_plaza(folder, W_SHORT, "Field1")
+    write_plaza(folder, W_SHORT, "Field2")
+    return folder
+
+
+def _text(*lines: str) -> Make:
+    return lambda folder: write_lines(folder / "data.txt", list(lines))
+
+
+def _bytes(name: str, data: bytes) -> Make:
+    def make(folder: Path) -> Path:
+        (folder / name).write_bytes(data)
+        return folder / name
+
+    return make
+
+
+def _two_labyrinths(folder: Path) -> Path:
+    for name in ("a.txt", "b.txt"):
+        write_lines(folder / name, labyrinth_lines(W_SHORT))
+    return folder
+
+
+def _folder(folder: Path) -> Path:
+    return folder
+
+
+def _with(line: str) -> Make:
+    return lambda folder: write_lines(folder / "mine.csv", [*csv_lines(W_SHORT), line])
+
+
+LAST = len(csv_lines(W_SHORT)) + 1
+CUT = gzip.compress("\n".join(labyrinth_lines(W_SHORT)).encode())[:2000]
+FAULTS: list[tuple[Make, str | None, str]] = [
+    (lambda folder: folder / "missing", None, r"missing: no such file or folder$"),
+    (_folder, None, r"none of the formats plaza, mrclam, labyrinth, csv"),
+    (_text("hello, world", "1 2 3"), None, r"data\.txt: none of the formats"),
+    (_bytes("data.bin", b"\xff\xfe\x00\x81"), None, r"data\.bin: is not text"),
+    (_bytes("part.txt.gz", CUT), None, r"part\.txt\.gz: cannot be read: .*end-of-stream"),
+    (_folder, "csv", r"is a folder: name the CSV file in it"),
+    (_folder, "plaza", r"holds no Plaza set: neither NAME\.mat nor NAME_DR\.txt"),
+    (_folder, "mrclam", r"holds no MRCLAM set: no file RobotN_Odometry\.dat"),
+    (_folder, "labyrinth", r"holds no Labyrinth text"),
+    (_two_labyrinths, None, r"holds 2 Labyrinth texts: name one"),
+    (_two_sets, None, r"holds 2 sets: name one, as in .*Field1\.mat"),
+    (_bytes("Field1.mat", b"no matrix at all"), None, r"Field1\.mat: is no MATLAB file that can be read"),
+    (_bytes("Field1.mat", b""), None, r"Field1\.mat: is no MATLAB file that can be read"),
+    (_mat(TD=None), None, r"Field1\.mat: has no variable TD \(time"),
+    (_mat(DR=np.ones((5, 2))), None, r"variable DR has shape \(5, 2\), wanted \(n, 3\): time"),
+    (_mat(TD="text"), None, r"variable TD does not hold numbers"),
+    (_mat(DR=np.ones((2, 3))), None, r"odometry rows: too few for a run"),
+    (_mat(TD=np.array([[1e6, 2.0, 6.0, 3.0]])), None, r"no range within the time of the odometry"),
+    (_changed("Field1_DR.txt", None, "Field1_TD.txt"), None, r"Field1_DR\.txt: no such file .*: it goes with Field1"),
+    (_changed("Field1_TD.txt", None, "Field1_DR.txt"), None, r"Field1_TD\.txt: no such file .*: it goes with"),
+    (_text("1 2 3"), "plaza", r"data\.txt: is no file of a Plaza set"),
+    (_plaza_file("TD", "1.0 2 6\n"), None, r"Field1_TD\.txt:1: 3 columns, wanted 4: time"),
+    (_plaza_file("TD", "# only a comment\n"), None, r"Field1_TD\.txt: no rows; wanted lines of time"),
+    (_plaza_file("TD", "1.0 2 6 3.0\n1.1 2 6 far\n"), None, r"Field1_TD\.txt:2: range \[m\] is 'far', not a number"),
+    (_changed("Robot1_Measurement.dat", None), None, r"Robot1_Measurement\.dat: no such file \(nor gzipped\)"),
+    (_changed("Barcodes.dat", None), None, r"Barcodes\.dat: no such file \(nor gzipped\): readings name barcodes"),
+    (_changed("Robot1_Odometry.dat", "1 0 0\n2 0 0\n"), None, r"Robot1_Odometry\.dat: 2 rows: too few for a run"),
+    (_changed("Robot1_Measurement.dat", "5.0 20 1 0\n"), None, r"no reading of a landmark within the time"),
+    (_text("range2 0.1 2 0.1 0 0 105", "gps 1 2"), None, r"data\.txt:2: 'gps' is none of range2, odom2diff, gt2"),
+    (_text("range2 0.1 2 0.1 0 0"), None, r"data\.txt:1: 5 values after range2, wanted time"),
+    (_text("range2 0.1 2 0.1 0 0 105"), None, r"data\.txt: no line odom2diff \(time"),
+    (_text(*[f"odom2diff {k} 0 0 0 0.1 0 0 0" for k in range(3)]), None, r"data\.txt: no line range2"),
+    (
+        _text("range2 9 2 0.1 0 0 105", *[f"odom2diff {k} 0 0 0 0.1 0 0 0" for k in range(3)]), None,
+        r"no range within the time of the odometry",
+    ),
+    (
+        _text("range2 0 2 0.1 0 0 105", *[f"odom2diff {k} 0 0 0 0.1 0 0 0" for k in range(2)]), None,
+        r"2 lines odom2diff: too few for a run",
+    ),
+    (
+        _text("range2 0 2 0.1 0 0 105", *[f"odom2diff {k} 0 0 0 {k - 1} 0 0 0" for k in range(3)]), None,
+        r"data\.txt:2: the distance between the wheels is not positive",
+    ),
+    (_text("", "# a comment"), None, r"data\.txt: is empty: no line but comments"),
+    (_with("lidar,1,2"), None, rf"mine\.csv:{LAST}: 'lidar' is none of odom, range"),
+    (_with("range,1,6"), None, rf"mine\.csv:{LAST}: 2 values after range, wanted time_s, beacon, range_m"),
+    (_with("range,soon,6,2"), None, rf"mine\.csv:{LAST}: time_s is 'soon', not a number"),
+    (_with("odom,3.0,7,7"), None, r"mine\.csv:\d+: two events odom at the same time say different things"),
+    (_text("range,1,6,2.0"), None, r"data\.txt: no event odom \(time_s, distance_m, turn_rad"),
+    (_text("odom,0,0,0", "odom,1,0,0"), None, r"nothing heard of beacons: no event range, bearing, rssi"),
+    (_text("odom,0,0,0", "odom,1,0,0", "range,0,a,1"), None, r"2 events odom: too few for a run"),
+    (
+        _text("odom,0,0,0", "odom,1,0,0", "odom,2,0,0", "range,9,a,1"), None,
+        r"nothing was heard of beacons within the time of the odometry",
+    ),
+    (_with("range,1,,3"), None, rf"mine\.csv:{LAST}: range has no name of a beacon"),
+    (_with("beacon,6,9,9"), None, rf"mine\.csv:{LAST}: beacon 6 was surveyed at another place before"),
+    (_with("odom,20.5,1e300,0"), None, r"a step forward of 1e\+300 m at 20\.5 s cannot be; at most 1000 is taken"),
+    (_with("odom,20.5,0,0,-1e300"), None, r"a step to the left of -1e\+300 m at 20\.5 s cannot be"),
+    (_with("odom,20.5,0,1e200"), None, r"a turn of 1e\+200 rad at 20\.5 s cannot be"),
+    (_with("odom,1e300,0,0"), None, r"time of odometry of 1e\+300 s after its first row cannot be"),
+    (_with("truth,20.5,1e200,0,0"), None, r"truth: x of 1e\+200 m at 20\.5 s cannot be"),
+    (
+        _text("odom,0,0,0", "odom,1,0,0", "odom,2,0,0", "range,1,a,1e200"), None,
+        r"none of its readings can be \(1 range beyond 1e\+06 m",
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "data_format", "told"), FAULTS, ids=[told for _, _, told in FAULTS])
+def test_a_fault_is_one_line(tmp_path: Path, make: Make, data_format: str | None, told: str) -> None:
+    with pytest.raises(RadioDataError, match=told) as caught:
+        read_run(make(tmp_path), data_format, None)
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_status == ExitStatus.USAGE
+
+
+def test_a_robot_that_is_not_there(tmp_path: Path) -> None:
+    write_mrclam(tmp_path, W_SHORT, robot=2)
+    with pytest.raises(RadioDataError, match=r"has no odometry of robot 1; there are 2$"):
+        read_run(tmp_path, None, 1)
+    with pytest.raises(RadioDataError, match=r"a plaza set has one vehicle: leave out --robot"):
+        read_run(write_plaza(tmp_path, W_SHORT), None, 1)
+
+
+def test_readings_that_cannot_be_are_left_out(tmp_path: Path) -> None:
+    lines = ["range,1.01,6,1e200", "rssi,1.02,6,-1e9", "bearing,1.03,6,inf", "range,1.04,7,2.5", "bearing,1.04,7,1e9"]
+    run = read_run(write_lines(tmp_path / "mine.csv", [*csv_lines(W_SHORT), *lines, "beacon,far,1e200,0"]), None, None)
+    assert len(run.readings.times_s) == len(W_SHORT.read_s) + 1
+    assert "far" not in run.beacon_truth_m
+    told = " ".join(run.warnings)
+    assert "1 range beyond 1e+06 m, the first 1e+200 m at 1.01 s" in told
+    for words in ("1 signal strength beyond", "1 bearing beyond", "surveyed place of far: is no place"):
+        assert words in told

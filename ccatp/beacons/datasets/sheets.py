@@ -1,0 +1,352 @@
+"""Sheets with a head that names the columns: signal levels by distance or place, ranges between motes, their places.
+
+CSV, sheets of a workbook, and folders of XBee logs ("Node A: -56"). Maps of beacons are written and read as TOML.
+"""
+
+import csv
+import re
+import tomllib
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.beacons.cricket.measured_map import MeasuredRanges
+from ccatp.beacons.cricket.range_network import MoteRange
+from ccatp.beacons.datasets.tables import RadioDataError, content_lines, number, read_text, split_cells
+from ccatp.beacons.slam.level_fix import HeardPlace
+from ccatp.beacons.slam.path_loss import LevelPair
+from ccatp.config.messages import format_toml
+from ccatp.core import FloatArray
+
+_LARGEST_PART = 50_000_000  # bytes: a table that people measured is smaller, a decompression bomb is not
+
+# What zipfile, zlib, the XML parser and openpyxl raise on damaged files.
+_DAMAGE = (
+    OSError, EOFError, LookupError, NotImplementedError, RuntimeError, SyntaxError, TypeError, ValueError,
+    zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+
+
+class Sheet(NamedTuple):
+    """The head of a sheet, and its other rows with the number of the line of each, from 1."""
+
+    path: Path
+    name: str
+    head: list[str]
+    rows: list[tuple[int, list[str]]]
+
+    def column(self, pattern: re.Pattern[str], what: str) -> int:
+        """The first column whose head matches.
+
+        Raises:
+            RadioDataError: none does.
+        """
+        found = next((i for i, cell in enumerate(self.head) if pattern.search(cell)), None)
+        if found is None:
+            raise RadioDataError(self.path, f"has no column of {what}; its columns are {', '.join(self.head)}", 1)
+        return found
+
+    def numbers(self, *columns: int) -> list[list[float]]:
+        """The numbers in some columns, a row each.
+
+        Raises:
+            RadioDataError: one is no number, or larger than any level or place.
+        """
+        found = []
+        for line, row in self.rows:
+            values = [number(self.path, line, row[column], f"column {column + 1}") for column in columns]
+            for column, value in zip(columns, values, strict=True):
+                if not abs(value) <= _LARGEST:
+                    what = f"{value:g} in column {column + 1} is no level and no place, m"
+                    raise RadioDataError(self.path, what, line)
+            found.append(values)
+        return found
+
+
+def read_sheet(path: Path, sheet: str | None = None) -> Sheet:
+    """A CSV file with commas, semicolons, tabs or white space, or a sheet of a workbook, the first if not named.
+
+    Raises:
+        RadioDataError: it cannot be read, or holds no rows below a head.
+    """
+    if path.suffix.lower() == ".xlsx":
+        sheets = read_workbook(path)
+        chosen = sheet or next(iter(sheets), "")
+        if chosen not in sheets:
+            raise RadioDataError(path, f'has no sheet "{chosen}"; there are {", ".join(sheets)}')
+        name = f"{path.name}, sheet {chosen}"
+        rows = [(line, row) for line, row in enumerate(sheets[chosen], 1) if any(cell.strip() for cell in row)]
+    else:
+        name = path.name
+        lines = content_lines(read_text(path, "a CSV file or an .xlsx workbook with columns of levels or ranges"))
+        delimiter = next((mark for mark in ",;\t" if lines and mark in lines[0][1]), None)
+        try:
+            rows = [(line, split_cells(content, delimiter)) for line, content in lines]
+        except csv.Error as error:
+            raise RadioDataError(path, f"is no CSV text: {error}") from error
+    if len(rows) < 2:
+        raise RadioDataError(path, "holds no rows below a head; the first row names the columns")
+    head = [cell.strip() for cell in rows[0][1]]
+    padding = [""] * len(head)
+    return Sheet(path, name, head, [(line, [cell.strip() for cell in row] + padding) for line, row in rows[1:]])
+
+
+def read_workbook(file: Path) -> dict[str, list[list[str]]]:
+    """Rows of cells by name of the sheet, in the workbook's order; empty cells are empty text.
+
+    Raises:
+        RadioDataError: it is missing or no workbook.
+    """
+    from openpyxl import load_workbook  # noqa: PLC0415 - the other formats do not wait for it
+
+    try:
+        with zipfile.ZipFile(file) as archive:
+            for part in archive.infolist():
+                if part.file_size > _LARGEST_PART:
+                    raise RadioDataError(
+                        file, f"{part.filename} in it has {part.file_size} bytes; save the sheet as CSV"
+                    )
+                if part.filename.endswith(".xml") and b"<!ENTITY" in archive.read(part):
+                    raise RadioDataError(file, f"{part.filename} in it defines entities, which no workbook does")
+        book = load_workbook(file, read_only=True, data_only=True)
+        try:
+            return {
+                sheet.title: [["" if cell is None else str(cell) for cell in row] for row in sheet.values]
+                for sheet in book.worksheets
+            }
+        finally:
+            book.close()
+    except FileNotFoundError as error:
+        raise RadioDataError(file, "no such file") from error
+    except _DAMAGE as error:
+        raise RadioDataError(
+            file, f"is no .xlsx workbook: {' '.join(str(error).split())}; save it again, or as CSV"
+        ) from error
+
+
+_LOG_LINE = re.compile(r"Node\s+(?P<node>\S+?)\s*:\s*(?P<level>[-+]?\d+(?:\.\d+)?)")
+_DISTANCE = re.compile(r"distance|range|^r$|^d$|_m$", re.IGNORECASE)
+_LEVEL = re.compile(r"rssi|level|dbm", re.IGNORECASE)
+_LEVEL_OF = re.compile(r"(?:rssi|level)[\s_]+(?P<node>\S+)", re.IGNORECASE)
+_POINT = re.compile("point", re.IGNORECASE)
+_DISTANCES = "distances, as distance_m"
+_LARGEST = 1e5  # of metres as of dBm
+
+Levels = tuple[str, tuple[LevelPair, ...], list[str]]
+LevelsByPlace = tuple[str, tuple[HeardPlace, ...], list[str]]
+
+
+def read_levels(path: Path, sheet: str | None = None, points: Path | None = None) -> Levels:
+    """Pairs of distance (m) and level (dBm) of a sheet, or XBee logs with a table of their ``points``.
+
+    Returns:
+        Name of the data, the pairs, and what was odd about them.
+
+    Raises:
+        RadioDataError: it cannot be read, or has no such columns.
+    """
+    if path.is_dir():
+        return _read_logs(path, sheet, points)
+    table = read_sheet(path, sheet)
+    numbers = table.numbers(table.column(_DISTANCE, _DISTANCES), table.column(_LEVEL, "levels, as rssi_dbm"))
+    levels, warnings = _signed([level for _, level in numbers])
+    return table.name, tuple(LevelPair(r_m, z) for (r_m, _), z in zip(numbers, levels, strict=True)), warnings
+
+
+def read_heard_places(path: Path, sheet: str | None = None) -> LevelsByPlace:
+    """Places and levels: columns ``x``, ``y`` (m) and ``RSSI A``, ``RSSI B``, ... (dBm); see ``read_levels``.
+
+    Raises:
+        RadioDataError: it cannot be read, or has no such columns.
+    """
+    table = read_sheet(path, sheet)
+    nodes = {match["node"]: i for i, cell in enumerate(table.head) if (match := _LEVEL_OF.fullmatch(cell))}
+    at = [table.column(re.compile(rf"^{axis}(_m)?$", re.IGNORECASE), f"places, as {axis}") for axis in "xy"]
+    if not nodes:
+        raise RadioDataError(path, 'has no column of levels by node; name one "RSSI A" for each node')
+    numbers = table.numbers(*at, *nodes.values())
+    levels, warnings = _signed([level for row in numbers for level in row[2:]])
+    rows = np.reshape(levels, (-1, len(nodes))).tolist()
+    places = zip(numbers, rows, strict=True)
+    heard = tuple(HeardPlace((place[0], place[1]), dict(zip(nodes, row, strict=True))) for place, row in places)
+    return table.name, heard, warnings
+
+
+def read_log(file: Path) -> dict[str, list[float]]:
+    """Levels by node of an XBee log with lines as ``Node A: -56``.
+
+    Raises:
+        RadioDataError: it cannot be read, or a line is none of these.
+    """
+    found: dict[str, list[float]] = {}
+    for line, content in content_lines(read_text(file)):
+        match = _LOG_LINE.fullmatch(content)
+        if match is None:
+            raise RadioDataError(file, f'"{content[:40]}" is no line like "Node A: -56"', line)
+        found.setdefault(match["node"], []).append(float(match["level"]))
+    return found
+
+
+def _read_logs(folder: Path, sheet: str | None, points: Path | None) -> Levels:
+    if points is None:
+        raise RadioDataError(folder, "is a folder of logs; name the table of their distances with --points")
+    table = read_sheet(points, sheet)
+    numbers = table.numbers(table.column(_POINT, "points"), table.column(_DISTANCE, _DISTANCES))
+    pairs, missing = [], []
+    for point, distance_m in numbers:
+        file = folder / f"{int(point)}.txt"
+        if file.is_file():
+            pairs += [LevelPair(distance_m, level) for levels in read_log(file).values() for level in levels]
+        else:
+            missing.append(file.name)
+    if not pairs:
+        raise RadioDataError(folder, f"holds none of the logs that {points.name} names, as {missing[0]}")
+    warnings = [f"{len(missing)} logs are missing, the first {missing[0]}"] if missing else []
+    return f"{folder.name}, distances of {table.name}", tuple(pairs), warnings
+
+
+def _signed(levels: list[float]) -> tuple[list[float], list[str]]:
+    if levels and min(levels) > 0.0:
+        return [-level for level in levels], ["all levels are positive: taken for dBm without their sign"]
+    return levels, []
+
+
+PLAIN = ("first", "second", "range_m")
+SESSION = ("session", "pos", "deg", "anchor", "tag", "mean_m")
+PLACES = ("name", "x_m", "y_m")
+LONGEST_M = 1e6
+SHORTEST_M = 1e-3  # no two motes are nearer
+FINEST_M = 1e-6  # no range is better
+
+
+def read_ranges(path: Path, sigma_m: float) -> MeasuredRanges:
+    """Ranges of a sheet.
+
+    Two forms are read. ``first,second,range_m`` with ``sigma_m`` where ranges differ in quality: one range a line.
+    ``session,pos,deg,anchor,tag,n,mean_m,...``: a trolley with tags among anchors, one line for the mean range of an
+    anchor to a tag while the trolley stood at a position with a heading; tags of one standstill move together.
+
+    Raises:
+        RadioDataError: it cannot be read, or a line is no range.
+    """
+    table = read_sheet(path)
+    is_session = set(SESSION) <= set(table.head)
+    if not is_session:
+        _check_columns(table, PLAIN, f"[,sigma_m], or {','.join(SESSION)}")
+    readings, groups, tags = [], dict[str, dict[str, None]](), dict[str, str]()
+    for line, cells in table.rows:
+        row = dict(zip(table.head, cells, strict=False))
+        sigma, length = sigma_m, "mean_m" if is_session else "range_m"
+        if is_session:
+            pose = f"{row['pos']}/{row['deg']}"
+            first, second = f"anchor{row['anchor']}", f"{pose}/tag{row['tag']}"
+            groups.setdefault(pose, {})[second] = None
+            tags[second] = f"tag{row['tag']}"
+        else:
+            first, second = (_name(path, line, key, row[key]) for key in PLAIN[:2])
+            if own := row.get("sigma_m"):
+                sigma = number(path, line, own, "sigma_m")
+        reading = MoteRange(first, second, number(path, line, row[length], length), sigma)
+        _check_range(path, line, reading)
+        readings.append(reading)
+    return MeasuredRanges(tuple(readings), {pose: tuple(motes) for pose, motes in groups.items()}, tags)
+
+
+def read_places(path: Path) -> dict[str, tuple[float, ...]]:
+    """Places of motes by name: a sheet with ``name,x_m,y_m`` and, in space, ``z_m``.
+
+    Raises:
+        RadioDataError: it cannot be read, or a line is no place.
+    """
+    table = read_sheet(path)
+    _check_columns(table, PLACES, "[,z_m]")
+    axes = [axis for axis in ("x_m", "y_m", "z_m") if axis in table.head]
+    found = {}
+    for line, cells in table.rows:
+        row = dict(zip(table.head, cells, strict=False))
+        place_m = tuple(number(path, line, row[axis], axis) for axis in axes)
+        for axis, value_m in zip(axes, place_m, strict=True):
+            if not abs(value_m) <= LONGEST_M:
+                raise RadioDataError(path, f"{axis} = {value_m:g} is no place within {LONGEST_M:g} m", line)
+        found[_name(path, line, "name", row["name"])] = place_m
+    return found
+
+
+def _check_columns(table: Sheet, wanted: Sequence[str], more: str) -> None:
+    if not set(wanted) <= set(table.head):
+        raise RadioDataError(table.path, f"columns {','.join(table.head)}; wanted {','.join(wanted)}{more}", 1)
+
+
+def _name(path: Path, line: int, key: str, text: str) -> str:
+    if not text:
+        raise RadioDataError(path, f"{key} is empty; every mote needs a name", line)
+    return text
+
+
+def _check_range(path: Path, line: int, reading: MoteRange) -> None:
+    problem = ""
+    if not SHORTEST_M <= reading.range_m <= LONGEST_M:
+        is_far = reading.range_m > LONGEST_M
+        what = f"is more than the {LONGEST_M:g} m that beacons reach" if is_far else "is no distance"
+        problem = f"range of {reading.range_m:g} m {what}; in metres, between two places"
+    elif not FINEST_M <= reading.sigma_m <= LONGEST_M:
+        problem = f"sigma of {reading.sigma_m:g} m, must be {FINEST_M:g} to {LONGEST_M:g} m"
+    elif reading.first == reading.second:
+        problem = f"from {reading.first} to itself; leave it out"
+    if problem:
+        raise RadioDataError(path, problem, line)
+
+
+_HEAD = "# Beacons, mapped by ccatp radio map: m, and the covariance of all coordinates in their order, m^2.\n\n"
+
+
+class BeaconPositions(NamedTuple):
+    """Beacons with what is uncertain about them."""
+
+    names: tuple[str, ...]
+    positions_m: FloatArray  # shape (n, d)
+    covariance_m2: FloatArray  # of all coordinates, shape (n d, n d)
+    frame: str
+
+
+def write_beacons(path: Path, found: BeaconPositions) -> None:
+    """Write a map.
+
+    Raises:
+        RadioDataError: the file cannot be written.
+    """
+    sigmas_m = np.sqrt(np.maximum(found.covariance_m2.diagonal(), 0.0)).reshape(found.positions_m.shape)
+    rows = zip(found.names, found.positions_m.tolist(), sigmas_m.tolist(), strict=True)
+    beacons = {name: {"position_m": place_m, "sigma_m": sigma_m} for name, place_m, sigma_m in rows}
+    tree = {"frame": found.frame, "dimension": found.positions_m.shape[1], "beacons": beacons}
+    joint = {"joint": {"covariance_m2": found.covariance_m2.tolist()}}
+    try:
+        path.write_text(_HEAD + format_toml(tree | joint), encoding="utf-8")
+    except OSError as error:
+        raise RadioDataError(path, f"cannot be written: {error.strerror or error}") from error
+
+
+def read_beacons(path: Path) -> BeaconPositions:
+    """Read a map that ``write_beacons`` wrote.
+
+    Raises:
+        RadioDataError: it cannot be read, or it is no such map.
+    """
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RadioDataError(path, f"cannot be read as a map of beacons: {error}") from error
+    try:
+        beacons: Mapping[str, Mapping[str, object]] = tree["beacons"]
+        positions = np.array([beacon["position_m"] for beacon in beacons.values()], dtype=np.float64)
+        covariance = np.array(tree["joint"]["covariance_m2"], dtype=np.float64)
+        frame = str(tree["frame"])
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise RadioDataError(path, f"is no map of beacons: {error}") from error
+    if positions.ndim != 2 or covariance.shape != (positions.size, positions.size):
+        raise RadioDataError(path, f"covariance of shape {covariance.shape} for {positions.size} coordinates")
+    return BeaconPositions(tuple(beacons), positions, covariance, frame)
