@@ -34,11 +34,9 @@ from ccatp.links.topics import (
     BeaconMapMessage,
     BeaconTrack,
     DisplayState,
-    EstimateMessage,
     MissionStatus,
     RobotShape,
     Scene,
-    is_estimate_due,
 )
 
 if TYPE_CHECKING:
@@ -130,7 +128,7 @@ class BeaconRunner(MissionRunner):
         if mission.state is DONE:
             self._publish_map(self.telemetry.seq, self.telemetry.t_s)
             self._loop.finish(EXIT_STATUS[mission.outcome])
-        elif mission.is_faulted and self._loop.session.is_lockstep:
+        elif mission.is_faulted and self._loop.is_lockstep:
             # No operator can react while simulated time runs at many times the wall clock.
             self._publish_map(self.telemetry.seq, self.telemetry.t_s)
             self._loop.finish(ExitStatus.HELD)
@@ -171,15 +169,9 @@ class BeaconRunner(MissionRunner):
     def publish(self, frame: TimedFrame) -> None:
         seq, t_s, mission, telemetry = frame.sensors.seq, frame.sensors.t, self.mission, self.telemetry
         belief = mission.navigator.belief
-        x_m, y_m, heading_rad = belief.pose
-        # That of the first frame of a session is always due, because the danger loop may wait for it.
-        if frame.is_first or is_estimate_due(seq):
-            sigma_m, state = belief.sigma_m, str(mission.state)
-            estimate = EstimateMessage(
-                seq=seq, t_s=t_s, x_m=x_m, y_m=y_m, heading_rad=heading_rad, sigma_m=sigma_m, state=state
-            )
-            telemetry.send("estimate", estimate)
-            self._trail.append((x_m, y_m))
+        if frame.is_estimate_due:
+            self.publish_estimate(frame, belief.pose, belief.sigma_m)
+            self._trail.append(belief.pose[:2])
         self._collect_echoes(belief.pose)
         if t_s >= self._map_due_s:
             self._map_due_s = t_s + self._cfg.mission.map_period_s

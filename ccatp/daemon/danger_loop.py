@@ -167,7 +167,7 @@ class DangerLoop(RobotLoop):
         )
 
     def services(self) -> tuple[Coroutine[Any, Any, None], ...]:
-        return self._observatory.serve(self._shadow), self.publish_heartbeat(), self.watch(), self.session.serve()
+        return self._observatory.serve(self._shadow), self.publish_heartbeat(), self.watch(), self.serve()
 
     def is_peer_ready(self) -> bool:
         """Messages get through, both ways: the first ones must not be lost."""
@@ -178,13 +178,13 @@ class DangerLoop(RobotLoop):
         self.log.info("danger_statistics", **self.monitor.counts)
 
     def on_joined(self, hello: Hello) -> None:
-        if self.session.has_rebooted:
+        if self.has_rebooted:
             self.monitor.reset()
             self._estimates.reset()
             self._seq = -1
         self.begin_session()
-        port = self._robot_cfg.port
-        self.log.info("robot_joined", port=port, lockstep=hello.lockstep, session=self.session.count)
+        port = self.robot_cfg.port
+        self.log.info("robot_joined", port=port, lockstep=hello.lockstep, session=self.sessions)
 
     def on_lost(self, reason: str) -> None:
         self.heartbeat.phase = "rejoining"
@@ -202,7 +202,7 @@ class DangerLoop(RobotLoop):
 
     def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
         """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
-        is_lockstep = self.session.is_lockstep
+        is_lockstep = self.is_lockstep
         self._seq, self._t_s, self.heartbeat.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
         self._bad_lines = 0
         estimate = self._estimates.latest(sensors.seq, is_lockstep=is_lockstep)
@@ -221,7 +221,7 @@ class DangerLoop(RobotLoop):
     def on_bad_line(self) -> None:
         """In lockstep each stands for a frame's time, so that the run is repeatable."""
         self._bad_lines += 1
-        hello = self.session.hello
+        hello = self.hello
         is_timed = hello is not None and hello.lockstep
         at_s = self._t_s + self._bad_lines / hello.frame_hz if hello and is_timed else time.monotonic()
         verdict = self.monitor.garbled(self._seq, self._t_s, at_s)
@@ -231,7 +231,7 @@ class DangerLoop(RobotLoop):
     def _publish_verdict(self, verdict: Verdict, ack: int) -> None:
         if ack >= 0:  # the robot first: the permit does not wait for the publication
             self._permit_seq += 1
-            self.session.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
+            self.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
         self.publisher.send("verdict", verdict)
         if (verdict.code, verdict.cause, verdict.severity) == self._published:
             return

@@ -71,7 +71,7 @@ class MainLoop(RobotLoop):
         self._telemetry = self._runner.telemetry
 
     def services(self) -> tuple[Coroutine[Any, Any, None], ...]:
-        return self._serve_operator(), self.publish_heartbeat(), self._runner.run(), self.session.serve(), self.watch()
+        return self._serve_operator(), self.publish_heartbeat(), self._runner.run(), self.serve(), self.watch()
 
     # -- beginning and end ----------------------------------------------------------------------------------------
 
@@ -92,10 +92,10 @@ class MainLoop(RobotLoop):
         self.frame_period_s, self._is_new_session = 1.0 / hello.frame_hz, True
         self._runner.begin_session(hello)
         self.begin_session()
-        again = " again" if self.session.count > 1 else ""
-        robot = self._robot_cfg
+        again = " again" if self.sessions > 1 else ""
+        robot = self.robot_cfg
         self._telemetry.notify_operator("info", f"joined the robot at {robot.host}:{robot.port}{again}")
-        if self.session.has_rebooted:
+        if self.has_rebooted:
             self._telemetry.notify_operator("warning", "the robot restarted: relocalizing before it moves")
             self._verdicts.reset()
             self._telemetry.continue_numbering()
@@ -157,7 +157,7 @@ class MainLoop(RobotLoop):
             self._answer_held_frame()  # a frame now and then, so that an emergency acts in a pause, too
 
     def on_silence(self, age_s: float) -> None:
-        if age_s <= self._robot_cfg.sensors_timeout_s:
+        if age_s <= self.robot_cfg.sensors_timeout_s:
             return
         if self._runner.mission.interrupt(f"no sensors frame for {age_s:.2f} s"):
             self._telemetry.notify_operator("warning", self._runner.mission.cause)
@@ -231,7 +231,7 @@ class MainLoop(RobotLoop):
 
     def _serve(self, sensors: Sensors, raw: bytes) -> None:
         start = time.perf_counter()
-        clock, runner, session, seq = self.clock, self._runner, self.session, sensors.seq
+        clock, runner, seq = self.clock, self._runner, sensors.seq
         steady_s, dt_s = clock.time_of(seq, sensors.t, self.frame_period_s)
         frame = TimedFrame(sensors, raw, steady_s, dt_s, self._is_new_session)
         if frame.is_first:
@@ -246,8 +246,8 @@ class MainLoop(RobotLoop):
         waiting = time.perf_counter()
         verdict = None
         # Danger judges each frame once, the first one of this session perhaps before the session began.
-        if not (frame.is_first and (self._args.is_taking_over or session.count > 1)):
-            verdict = self._verdicts.latest(seq, self.frame_period_s, is_lockstep=session.is_lockstep)
+        if not (frame.is_first and (self._args.is_taking_over or self.sessions > 1)):
+            verdict = self._verdicts.latest(seq, self.frame_period_s, is_lockstep=self.is_lockstep)
         decided = time.perf_counter()
         self._answer(seq, self._decide(frame, verdict))
         runner.publish(frame)
@@ -264,8 +264,8 @@ class MainLoop(RobotLoop):
 
     def _decide(self, frame: TimedFrame, verdict: Verdict | None) -> DriveCommand:
         """The drive that answers a frame. One that is too late moves nothing."""
-        runner, limit_s, begun_s = self._runner, self._robot_cfg.lag_limit_s, time.monotonic()
-        lag_s = 0.0 if self.session.is_lockstep else self.lateness.add(frame.sensors.t, begun_s)
+        runner, limit_s, begun_s = self._runner, self.robot_cfg.lag_limit_s, time.monotonic()
+        lag_s = 0.0 if self.is_lockstep else self.lateness.add(frame.sensors.t, begun_s)
         if lag_s > limit_s:
             if begun_s < self._catches_up_until_s:
                 return runner.hold(frame)
@@ -287,11 +287,11 @@ class MainLoop(RobotLoop):
         right, left, steer = drive
         self._runner.on_drive(self._drive_seq, right, left)
         steering = () if steer is None else (steer,)
-        self.session.link.send_drive(self._drive_seq, max(ack, 0), right, left, *steering)
+        self.link.send_drive(self._drive_seq, max(ack, 0), right, left, *steering)
 
     def _may_answer(self) -> bool:
         """In lockstep simulated time stands still while a peer is awaited, and all but still in a pause."""
-        if not self.session.is_lockstep:
+        if not self.is_lockstep:
             return True
         runner = self._runner
         return not runner.is_busy and not (runner.mission.is_paused and runner.is_at_rest)

@@ -14,7 +14,7 @@ from ccatp.core import Verdict
 from ccatp.daemon.telemetry import Telemetry
 from ccatp.errors import ExitStatus
 from ccatp.links.robot_messages import Hello, Sensors
-from ccatp.links.topics import DisplayState, MissionStatus
+from ccatp.links.topics import DisplayState, EstimateMessage, MissionStatus, is_estimate_due
 from ccatp.safety.robot_clock import SteadyTime
 from ccatp.survey.state import SurveyOutcome
 
@@ -95,6 +95,11 @@ class TimedFrame(NamedTuple):
     t_s: float
     dt_s: float
     is_first: bool
+
+    @property
+    def is_estimate_due(self) -> bool:
+        """That of the first frame of a session is always due, because the danger loop may wait for it."""
+        return self.is_first or is_estimate_due(self.sensors.seq)
 
 
 class DriveCommand(NamedTuple):
@@ -187,3 +192,26 @@ class MissionRunner(ABC):
     @abstractmethod
     def publish(self, frame: TimedFrame) -> None:
         """The drive is sent: publish the estimate, keep records."""
+
+    def publish_estimate(
+        self,
+        frame: TimedFrame,
+        pose: tuple[float, float, float],
+        sigma_m: float,
+        commanded: tuple[float, float, float, float] | None = None,
+        drive_seq: int = -1,
+    ) -> None:
+        """Publish the pose, m and rad, for the danger loop; the rest as of ``EstimateMessage``."""
+        seq, t_s, (x_m, y_m, heading_rad) = frame.sensors.seq, frame.sensors.t, pose
+        estimate = EstimateMessage(
+            seq=seq,
+            t_s=t_s,
+            x_m=x_m,
+            y_m=y_m,
+            heading_rad=heading_rad,
+            sigma_m=sigma_m,
+            state=str(self.mission.state),
+            commanded=commanded,
+            drive_seq=drive_seq,
+        )
+        self.telemetry.send("estimate", estimate)

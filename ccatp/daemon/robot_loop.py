@@ -1,10 +1,8 @@
 """What the main loop and the danger loop have in common: session at the robot, bus, and tasks that end together."""
 
-# ruff: noqa: B027 - empty methods are for loops without such a peer or duty
-
 import asyncio
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Coroutine
 from typing import Any
 
@@ -16,12 +14,12 @@ from ccatp.daemon.process import ProcessArgs, open_log, processes_of, unless_sto
 from ccatp.daemon.robot_session import LatenessStatistics, RobotSession
 from ccatp.daemon.subscribers import PERIOD_S, HeartbeatPublisher, PeerSubscriber
 from ccatp.links.bus import Publisher
-from ccatp.links.robot_messages import Hello, Role, Sensors
+from ccatp.links.robot_messages import Role
 
 WAIT_PERIOD_S = 0.02
 
 
-class RobotLoop(ABC):
+class RobotLoop(RobotSession):
     """A loop at the robot, and the process around it.
 
     Attributes:
@@ -32,21 +30,13 @@ class RobotLoop(ABC):
     peer: PeerSubscriber
 
     def __init__(self, name: str, role: Role, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
-        self._args, self._robot_cfg = args, args.config.robot
+        super().__init__(args.config.robot, role, name)
+        self._args = args
         self._shadow = zmq.asyncio.Context.shadow(context)
         self.log = open_log(args.run_dir / "log.jsonl", name)
         self.publisher = Publisher(context, args.endpoints.of(name))
         self.heartbeat = HeartbeatPublisher(self.publisher, name)
-        self.lateness = LatenessStatistics(self._robot_cfg.slip_after_s)
-        self.session = RobotSession(
-            self._robot_cfg,
-            role=role,
-            client=name,
-            on_sensors=self.on_sensors,
-            on_lost=self.on_lost,
-            on_joined=self.on_joined,
-            on_bad_line=self.on_bad_line,
-        )
+        self.lateness = LatenessStatistics(self.robot_cfg.slip_after_s)
         self.over = asyncio.Event()
 
     async def run(self, stop: asyncio.Event) -> None:
@@ -60,7 +50,7 @@ class RobotLoop(ABC):
             finally:
                 for task in served:
                     task.cancel()
-                self.session.close()
+                self.leave()
                 await self.close()
 
     async def _join(self, stop: asyncio.Event) -> None:
@@ -70,8 +60,8 @@ class RobotLoop(ABC):
             if stop.is_set():
                 return
             await asyncio.sleep(WAIT_PERIOD_S)
-        joins = self.session.join(is_patient=self._args.is_taking_over)
-        if await unless_stopped(stop, joins) and not self.session.is_lockstep:
+        joins = self.join(is_patient=self._args.is_taking_over)
+        if await unless_stopped(stop, joins) and not self.is_lockstep:
             realtime.enter(processes_of(self._args.config).realtime_priority, self.log)
 
     @abstractmethod
@@ -91,21 +81,6 @@ class RobotLoop(ABC):
 
     async def close(self) -> None:
         """Close the resources of ``connect``."""
-
-    @abstractmethod
-    def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
-        """Serve one frame."""
-
-    @abstractmethod
-    def on_joined(self, hello: Hello) -> None:
-        """A session begins; its first frame comes next."""
-
-    @abstractmethod
-    def on_lost(self, reason: str) -> None:
-        """The session is lost; the robot holds itself."""
-
-    def on_bad_line(self) -> None:
-        """A line was no frame."""
 
     def publish_levels(self) -> None:
         """Publish what is repeated beside the heartbeat."""
@@ -132,8 +107,8 @@ class RobotLoop(ABC):
             await asyncio.sleep(WAIT_PERIOD_S)
             self.peer.maintain()
             age_s = self.heartbeat.frame_age_s
-            if self.heartbeat.phase != "joined" or self.session.is_lockstep or age_s is None:
+            if self.heartbeat.phase != "joined" or self.is_lockstep or age_s is None:
                 continue
             self.on_silence(age_s)
-            if age_s > self._robot_cfg.silence_timeout_s:
-                self.session.drop(f"no sensors frame for {age_s:.2f} s")
+            if age_s > self.robot_cfg.silence_timeout_s:
+                self.drop(f"no sensors frame for {age_s:.2f} s")

@@ -2,7 +2,7 @@
 
 import asyncio
 import random
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from math import inf
 
 from ccatp.config.models import LinkConfig
@@ -25,42 +25,39 @@ def delay_s(failures: int, share: float) -> float:
     return max(FIRST_DELAY_S, min(LONGEST_DELAY_S, FIRST_DELAY_S * 2.0 ** min(failures, 10)) * (0.5 + 0.5 * share))
 
 
-class RobotSession:
-    """Keeps a role at the robot, in one session after the other.
-
-    Args:
-        on_sensors: called with each frame and its line; in lockstep a new session begins with the last frame again.
-        on_lost: called with the reason when a session ends.
-        on_joined: called with the robot's hello when a session begins, before its first frame.
-        on_bad_line: called after each line that fails a check.
+class RobotSession(ABC):
+    """Keeps a role at the robot, in one session after the other; a subclass handles what comes from it.
 
     Attributes:
-        count: number of sessions so far.
+        sessions: their number so far.
         hello: of the newest session.
         has_rebooted: the robot has restarted between the last session and this one.
     """
 
-    def __init__(
-        self,
-        cfg: LinkConfig,
-        *,
-        role: Role,
-        client: str,
-        on_sensors: Callable[[Sensors, bytes], None],
-        on_lost: Callable[[str], None],
-        on_joined: Callable[[Hello], None],
-        on_bad_line: Callable[[], None] = lambda: None,
-    ) -> None:
-        self._cfg, self._role, self._client, self._key = cfg, role, client, read_key(cfg.key_file)
-        self._on_sensors, self._on_lost, self._on_joined = on_sensors, on_lost, on_joined
-        self._on_bad_line = on_bad_line
+    def __init__(self, cfg: LinkConfig, role: Role, client: str) -> None:
+        self.robot_cfg, self._role, self._client, self._key = cfg, role, client, read_key(cfg.key_file)
         self._lost = asyncio.Event()
         self._is_joined = self.has_rebooted = False
         # A session without a valid frame counts as a failure.
-        self._failures = self.count = 0
+        self._failures = self.sessions = 0
         self._deadline_s: float | None = None
         self.hello: Hello | None = None
         self.link = self._make()
+
+    @abstractmethod
+    def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
+        """Serve one frame, which came as this line; in lockstep a session begins with the last frame again."""
+
+    @abstractmethod
+    def on_joined(self, hello: Hello) -> None:
+        """A session begins; its first frame comes next."""
+
+    @abstractmethod
+    def on_lost(self, reason: str) -> None:
+        """The session is lost; the robot holds itself."""
+
+    def on_bad_line(self) -> None:  # noqa: B027 - nothing has to be done
+        """A line failed a check."""
 
     @property
     def is_lockstep(self) -> bool:
@@ -69,15 +66,15 @@ class RobotSession:
 
     def _make(self) -> RobotLink:
         return RobotLink(
-            host=self._cfg.host,
-            port=self._cfg.port,
+            host=self.robot_cfg.host,
+            port=self.robot_cfg.port,
             role=self._role,
             client=self._client,
             key=self._key,
             on_sensors=self._handle_frame,
             on_lost=self._handle_loss,
             on_joined=self._handle_join,
-            on_bad_line=self._on_bad_line,
+            on_bad_line=self.on_bad_line,
         )
 
     async def join(self, *, is_patient: bool) -> None:
@@ -92,7 +89,7 @@ class RobotSession:
         if is_patient:
             await self._join_again()
         else:
-            await self.link.connect(self._cfg.connect_timeout_s)
+            await self.link.connect(self.robot_cfg.connect_timeout_s)
 
     async def serve(self) -> None:
         """Join again after each loss, until cancelled.
@@ -107,7 +104,7 @@ class RobotSession:
     async def _join_again(self) -> None:
         loop = asyncio.get_running_loop()
         if self._deadline_s is None:
-            self._deadline_s = loop.time() + self._cfg.reconnect_timeout_s
+            self._deadline_s = loop.time() + self.robot_cfg.reconnect_timeout_s
         elif self._failures:
             await asyncio.sleep(delay_s(self._failures, random.random()))
         self._failures += 1
@@ -125,30 +122,30 @@ class RobotSession:
                 return
             await asyncio.sleep(min(delay_s(self._failures - 1, random.random()), left_s))
             self._failures += 1
-        raise RobotTimeout(f"the robot did not come back within {self._cfg.reconnect_timeout_s:g} s: {why}")
+        raise RobotTimeout(f"the robot did not come back within {self.robot_cfg.reconnect_timeout_s:g} s: {why}")
 
     def _handle_frame(self, frame: Sensors, line: bytes) -> None:
         self._failures, self._deadline_s = 0, None
-        self._on_sensors(frame, line)
+        self.on_sensors(frame, line)
 
     def _handle_join(self, hello: Hello) -> None:
         self.has_rebooted = self.hello is not None and self.hello.boot != hello.boot
         self.hello = hello
         self._is_joined = True
-        self.count += 1
-        self._on_joined(hello)
+        self.sessions += 1
+        self.on_joined(hello)
 
     def _handle_loss(self, reason: str) -> None:
         self._is_joined = False
         self._lost.set()
-        self._on_lost(reason)
+        self.on_lost(reason)
 
     def drop(self, reason: str) -> None:
         """Close a connection that is open and silent; ``serve`` makes another one."""
         if self._is_joined:
             self.link.abort(reason)
 
-    def close(self) -> None:
+    def leave(self) -> None:
         """End the session; ``on_lost`` is not called."""
         self.link.close()
 

@@ -20,13 +20,11 @@ from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import (
     ArrivalMessage,
     DisplayState,
-    EstimateMessage,
     MissionStatus,
     Rest,
     TrackMessage,
     Treatment,
     TreatmentKind,
-    is_estimate_due,
 )
 from ccatp.records.store import MissionStore
 from ccatp.safety.wheel_monitors import CommandSpan
@@ -96,12 +94,9 @@ class SurveyRunner(MissionRunner):
         self._gate_log = GateLog(self._gate, self.telemetry.notify_operator)
         self._fan_gate, self._has_full_fans, self._fans_seq = FanGate(0.0), False, 0
         # The drives that were sent: prediction of the motion, and span of the set points for the danger loop.
-        self._predictor, self._span = (
-            CommandPredictor(cfg.robot.wheel_lag_s, 1.0 / cfg.sim.robot.frame_hz),
-            CommandSpan(),
-        )
-        self._newest_drive, self._driven = 0, (0.0, 0.0)
-        self._sent_commands: tuple[tuple[float, float, float, float] | None, int] = (None, -1)
+        self._predictor = CommandPredictor(cfg.robot.wheel_lag_s, 1.0 / cfg.sim.robot.frame_hz)
+        self._span, self._newest_drive, self._driven = CommandSpan(), 0, (0.0, 0.0)
+        self._sent_commands: tuple[tuple[float, float, float, float] | None, int] = None, -1
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
         self._fix_service = FixService(
             cfg.mission,
@@ -113,7 +108,7 @@ class SurveyRunner(MissionRunner):
             self.telemetry,
             loop.let_time_go_on,
             # lockstep time stands still meanwhile
-            lambda: 0.0 if loop.session.is_lockstep else cfg.etalon.measuring_time_s,
+            lambda: 0.0 if loop.is_lockstep else cfg.etalon.measuring_time_s,
         )
         self._checkpoint = CheckpointWriter(args.run_dir, parts.localizer, self.mission, not args.is_realtime)
         self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
@@ -210,7 +205,7 @@ class SurveyRunner(MissionRunner):
         refusal = self._fan_gate.refusal(*duty)
         if refusal is None:
             self._fans_seq += 1
-            self._loop.session.link.send_fans(self._fans_seq, duty)
+            self._loop.link.send_fans(self._fans_seq, duty)
         else:
             self.telemetry.notify_operator("error", refusal)
             self.mission.fault(refusal)
@@ -287,8 +282,8 @@ class SurveyRunner(MissionRunner):
         return STILL
 
     def _note_commands(self, frame: TimedFrame) -> None:
-        is_due = frame.is_first or is_estimate_due(frame.sensors.seq)
-        self._sent_commands = (self._span.take(*self._driven), self._newest_drive) if is_due else (None, -1)
+        if frame.is_estimate_due:
+            self._sent_commands = self._span.take(*self._driven), self._newest_drive
 
     def _is_on_mirror(self, sensors: Sensors) -> bool:
         """Whether gravity permits motion: the robot stands on the mirror of the configuration.
@@ -307,7 +302,7 @@ class SurveyRunner(MissionRunner):
             self.telemetry.notify_operator("error", check.contradiction)
             self._loop.finish(ExitStatus.USAGE)
             return False
-        return self._mirror_check is None or self._loop.session.is_lockstep
+        return self._mirror_check is None or self._loop.is_lockstep
 
     def _apply_requests(self, sensors: Sensors) -> None:
         """Requests of the mission besides the drive, before that is sent."""
@@ -361,21 +356,9 @@ class SurveyRunner(MissionRunner):
     def publish(self, frame: TimedFrame) -> None:
         seq, t_s, telemetry, localizer = frame.sensors.seq, frame.sensors.t, self.telemetry, self._localizer
         pose, sigma_m = localizer.pose, localizer.position_sigma_m
-        # That of the first frame of a session is always due, because the danger loop may wait for it.
-        if frame.is_first or is_estimate_due(seq):
-            deck, (commanded, drive_seq) = localizer.deck_pose, self._sent_commands
-            estimate = EstimateMessage(
-                seq=seq,
-                t_s=t_s,
-                x_m=deck.x_m,
-                y_m=deck.y_m,
-                heading_rad=deck.heading_rad,
-                sigma_m=sigma_m,
-                state=self.mission.state,
-                commanded=commanded,
-                drive_seq=drive_seq,
-            )
-            telemetry.send("estimate", estimate)
+        if frame.is_estimate_due:
+            deck = localizer.deck_pose
+            self.publish_estimate(frame, (deck.x_m, deck.y_m, deck.heading_rad), sigma_m, *self._sent_commands)
         row = telemetry.number_of(seq), t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, sigma_m
         telemetry.add_frame(seq, t_s, frame.raw, row)
         self._checkpoint.write_if_due(seq, t_s, self._clock.elapsed_s)
@@ -397,7 +380,7 @@ class SurveyRunner(MissionRunner):
             telemetry.notify_operator("warning", f"returning to base: {mission.cause}")
         if mission.state is MissionState.DONE:
             self._loop.finish(EXIT_STATUS[mission.outcome])
-        elif mission.is_faulted and self._loop.session.is_lockstep:
+        elif mission.is_faulted and self._loop.is_lockstep:
             # No operator can react while simulated time runs at many times the wall clock.
             self._loop.finish(EXIT_STATUS[SurveyOutcome.STOPPED])
 

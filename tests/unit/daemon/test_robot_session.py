@@ -30,24 +30,23 @@ def test_the_delay_grows_and_is_spread() -> None:
     assert delay_s(0, 0.0) == FIRST_DELAY_S
 
 
-class Client:
+class Client(RobotSession):
     """A controller that answers every frame with zeros."""
 
     def __init__(self, cfg: Config) -> None:
+        super().__init__(cfg.robot, "controller", "test")
         self.hellos: list[Hello] = []
         self.frames: list[int] = []
         self.losses: list[str] = []
         self.changed = asyncio.Event()
-        self.lasting = RobotSession(
-            cfg.robot,
-            role="controller",
-            client="test",
-            on_sensors=self._take,
-            on_lost=self.losses.append,
-            on_joined=self.hellos.append,
-        )
 
-    def _take(self, sensors: Sensors, _line: bytes) -> None:
+    def on_joined(self, hello: Hello) -> None:
+        self.hellos.append(hello)
+
+    def on_lost(self, reason: str) -> None:
+        self.losses.append(reason)
+
+    def on_sensors(self, sensors: Sensors, _line: bytes) -> None:
         self.frames.append(sensors.seq)
         self.changed.set()
 
@@ -73,8 +72,8 @@ async def with_robot(story: Callable[[Config, DataLoop], Coroutine[Any, Any, Non
 async def test_a_lost_session_is_followed_by_another_one_with_the_same_frame() -> None:
     async def story(cfg: Config, robot: DataLoop) -> None:
         client = Client(cfg)
-        await client.lasting.join(is_patient=False)
-        serving = asyncio.create_task(client.lasting.serve())
+        await client.join(is_patient=False)
+        serving = asyncio.create_task(client.serve())
         await client.until(lambda: len(client.frames) == 1)
         for session in range(1, 4):
             robot.server._drop_all("reset")
@@ -82,11 +81,11 @@ async def test_a_lost_session_is_followed_by_another_one_with_the_same_frame() -
         assert client.frames == [0, 0, 0, 0]  # nobody answered: time stood still
         assert len(client.losses) == 3
         assert len({hello.nonce for hello in client.hellos}) == 4
-        client.lasting.drop("silent")
+        client.drop("silent")
         await client.until(lambda: len(client.frames) == 5)
         assert client.losses[-1] == "silent"
         serving.cancel()
-        client.lasting.close()
+        client.leave()
         await asyncio.gather(serving, return_exceptions=True)
 
     await with_robot(story)
@@ -97,8 +96,8 @@ async def test_a_robot_that_stays_away_ends_it() -> None:
     async def story(cfg: Config, robot: DataLoop) -> None:
         quick = cfg.model_copy(update={"robot": cfg.robot.model_copy(update={"reconnect_timeout_s": 0.3})})
         client = Client(quick)
-        await client.lasting.join(is_patient=True)
-        serving = asyncio.create_task(client.lasting.serve())
+        await client.join(is_patient=True)
+        serving = asyncio.create_task(client.serve())
         await robot.close()
         with pytest.raises(RobotTimeout, match=r"did not come back within 0\.3 s: cannot reach the robot"):
             await serving
@@ -109,15 +108,15 @@ async def test_a_robot_that_stays_away_ends_it() -> None:
 async def test_a_role_that_is_taken_is_tried_again_by_who_takes_over_and_not_by_others() -> None:
     async def story(cfg: Config, robot: DataLoop) -> None:
         first, second = Client(cfg), Client(cfg)
-        await first.lasting.join(is_patient=False)
-        joining = asyncio.create_task(second.lasting.join(is_patient=True))
+        await first.join(is_patient=False)
+        joining = asyncio.create_task(second.join(is_patient=True))
         async with asyncio.timeout(20.0):
             while not robot.server.counts["refused"]:  # noqa: ASYNC110 - the server has no event for it
                 await asyncio.sleep(0.005)
-        first.lasting.close()
+        first.leave()
         await joining
         assert len(second.hellos) == 1
-        second.lasting.close()
+        second.leave()
 
     await with_robot(story)
 
@@ -138,13 +137,13 @@ async def test_a_robot_that_lets_join_and_gives_no_frame_stays_away() -> None:
     async with await asyncio.start_server(talk, "127.0.0.1", 0) as server:
         port = server.sockets[0].getsockname()[1]
         client = Client(load_config(overrides={"robot.port": port, "robot.reconnect_timeout_s": 1.0}))
-        await client.lasting.join(is_patient=False)
+        await client.join(is_patient=False)
         with pytest.raises(
             RobotTimeout, match=r"did not come back within 1 s: it accepts the session and sends no valid frame"
         ):
             async with asyncio.timeout(20.0):
-                await client.lasting.serve()
-        client.lasting.close()
+                await client.serve()
+        client.leave()
     assert 2 <= joins <= 10
     assert not client.frames
 
@@ -161,7 +160,8 @@ def serve(lag: LatenessStatistics, late_s: dict[int, float], frames: int = 100, 
 def test_late_frames_are_as_late_as_they_are_and_slips_are_counted(late_s: dict[int, float], slips: int) -> None:
     lag = LatenessStatistics(0.02)
     assert serve(lag, late_s) == pytest.approx([late_s.get(k, 0.0) for k in range(100)], abs=1e-4)
-    assert (lag.missed_deadlines, lag.worst_s) == (slips, pytest.approx(max(late_s.values(), default=0.0), abs=1e-4))
+    assert lag.missed_deadlines == slips
+    assert lag.worst_s == pytest.approx(max(late_s.values(), default=0.0), abs=1e-4)
 
 
 def test_a_first_frame_that_was_late_is_soon_no_measure() -> None:
