@@ -297,13 +297,6 @@ async def test_keys_are_for_tcp(site: Site) -> None:
             await router.__aenter__()
 
 
-async def test_an_address_in_use(site: Site, free_port: int) -> None:
-    with socket.create_server(("127.0.0.1", free_port)), zmq.asyncio.Context() as context:
-        router = Router(f"tcp://127.0.0.1:{free_port}", lambda *_: b"", context, site.pair("server"))
-        with pytest.raises(RouterError, match="Address already in use"):
-            await router.__aenter__()
-
-
 async def test_the_command_talks_to_a_daemon_elsewhere(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     keys = ["--server-key", f"{site.folder}/server.key", "--timeout", "10"]
     async with served(site):

@@ -291,14 +291,6 @@ async def test_truth_leaves_by_its_own_sockets(config: Config, tmp_path: Path) -
         await task
 
 
-async def test_a_port_in_use_is_an_error(config: Config) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        robot = config.sim.robot.model_copy(update={"port": taken.getsockname()[1]})
-        cfg = config.model_copy(update={"sim": config.sim.model_copy(update={"robot": robot})})
-        with pytest.raises(OSError, match="address already in use"):
-            await serve(cfg, lockstep=True, seed=1, stop=asyncio.Event())
-
-
 async def test_an_unforeseen_error_ends_the_loop_aloud(config: Config) -> None:
     for lockstep in (True, False):
         loop = DataLoop(on_port_0(config), lockstep, 1)

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ccatp.config.models import MirrorConfig
-from ccatp.core import DeckPose, PanelId, PointId
+from ccatp.core import PanelId, PointId
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.records import summary as summary_module
 from ccatp.records.summary import RunFacts, SummaryBuilder, format_table, puck_targets
@@ -130,15 +130,6 @@ def test_arrival_at_the_target_has_no_error_and_only_the_first_counts(builder: S
     built = builder.build()
     assert built["points"]["first_arrival_within_10mm"] == 1
     assert built["arrival_error_mm"]["max"] > 100.0
-
-
-def test_target_is_where_the_mirror_puts_the_puck(mirror: Mirror) -> None:
-    target = puck_targets(mirror, [POINT], HEIGHT_M)[POINT]
-    x, y = mirror.point_on_deck(POINT)
-    assert mirror.world_from_deck(target.position_m) == pytest.approx(
-        mirror.puck_world(DeckPose(x, y, 1.0), HEIGHT_M),
-        abs=1e-12,  # rounding
-    )
 
 
 def test_an_arrival_is_found_long_after_its_frame(

@@ -66,37 +66,12 @@ def test_each_of_the_ten_flags_can_be_raised_on_one_channel(flag: str) -> None:
     assert [record.errors for record in etalon.records(CHANNELS, PUCK)] == [(), (), (flag,), ()]
 
 
-def test_there_are_ten_flags() -> None:
-    assert len(FLAGS) == 10
-
-
 def test_a_blocked_channel_has_no_length_no_light_and_beam_break() -> None:
     etalon = model()
     etalon.blocked = {2}
     blocked = etalon.records(CHANNELS, PUCK)[1]
     assert blocked.errors == ("beam_break",)
     assert (blocked.length_mm, blocked.intensity_min, blocked.intensity_max) == (0.0, 0, 0)
-
-
-@pytest.mark.parametrize(("moved_m", "raised"), [(0.0, False), (1e-4, False), (1.01e-4, True), (float("nan"), True)])
-def test_a_puck_that_moved_further_than_the_tolerance_is_flagged_on_every_channel(moved_m: float, raised: bool) -> None:
-    records = model().records(CHANNELS, msgspec.structs.replace(PUCK, moved_m=moved_m))
-    assert [record.motion_tolerance_error for record in records] == [int(raised)] * 4
-
-
-def test_a_channel_that_is_not_installed_is_flagged() -> None:
-    (record,) = model().records((7,), PUCK)
-    assert (record.channel, record.length_mm, record.errors) == (7, 0.0, ("daq_error",))
-
-
-def test_cold_lasers_are_flagged() -> None:
-    etalon = model()
-    etalon.laser_ready = False
-    assert {record.errors for record in etalon.records(CHANNELS, PUCK)} == {("laser_temp_error",)}
-
-
-def test_failed_records_carry_daq_error() -> None:
-    assert [(r.channel, r.errors) for r in model().failed_records((1, 2))] == [(1, ("daq_error",)), (2, ("daq_error",))]
 
 
 def test_channels_and_collimators_must_fit() -> None:

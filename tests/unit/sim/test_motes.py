@@ -60,11 +60,6 @@ def test_echoes_are_longer_and_losses_are_missing() -> None:
     assert excess_m[echoes].mean() == pytest.approx(0.5, abs=0.08)
 
 
-def test_all_lost_is_no_reading() -> None:
-    motes = field(config(sim__loss_probability=1.0), [[0.0, 0.0], [5.0, 0.0]])
-    assert motes.listen([(0, 1)], 10, np.random.default_rng(2)) == []
-
-
 def test_thermometers_have_errors_of_their_own() -> None:
     motes = field(config(sim__thermometer_sigma_c=2.0), [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
     told = [one.temperature_c for one in motes.listen([(0, 1), (0, 2), (1, 2)], 1, np.random.default_rng(2))]

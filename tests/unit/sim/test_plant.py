@@ -20,7 +20,6 @@ from ccatp.sim.plant import (
     Vibration,
     WheelSlip,
     draw_wheels,
-    noise_stream,
 )
 
 RADIUS_M, BASE_M, LAG_S = 0.03, 0.15, 0.08
@@ -355,11 +354,6 @@ def test_without_thrust_the_body_comes_back_and_rests(config: Config, mirror: Mi
 
 
 SIGMA, TIME_S, DT_S = 0.3, 2.0, 0.01
-
-
-def test_the_stream_is_that_of_the_generator() -> None:
-    draw = noise_stream(np.random.default_rng(3))
-    assert [draw() for _ in range(5000)] == np.random.default_rng(3).standard_normal(5000).tolist()
 
 
 def test_the_first_value_is_one_of_the_stationary_distribution() -> None:

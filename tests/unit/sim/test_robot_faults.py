@@ -30,10 +30,6 @@ def test_the_example_loads() -> None:
     assert (edge.signal, edge.at_s, edge.end_s, edge.duty) == ("edge_front_left", 60.0, 60.3, 0.8)
 
 
-def test_nothing_goes_wrong_by_an_empty_plan() -> None:
-    assert parse_plan("", "plan") == FaultPlan()
-
-
 def test_the_page_names_every_signal_and_type() -> None:
     page = (Path(__file__).parents[3] / "docs" / "faults.md").read_text(encoding="utf-8")
     for signal, types in TYPES.items():

@@ -1,7 +1,7 @@
 """What the simulated sensors read."""
 
 from itertools import product
-from math import acos, floor, pi, sqrt
+from math import acos, pi, sqrt
 
 import numpy as np
 import pytest
@@ -84,14 +84,6 @@ def test_readings_are_the_truth_plus_noise_of_the_world(config: Config, mirror: 
         # 4.5 standard errors of a standard deviation and of a mean; the seed is fixed.
         assert found.std() == pytest.approx(sigma, rel=4.5 / np.sqrt(2.0 * len(found)))
         assert abs(found.mean()) < 4.5 * sigma / np.sqrt(len(found))
-
-
-def test_right_and_left_encoder_noise_are_independent(config: Config, mirror: Mirror) -> None:
-    sensors, plant = suite(config, mirror), plant_at(mirror, DeckPose(0.0, 0.0, 0.0))
-    rows = []
-    for frame in range(1, 301):
-        rows += [row[1:] for row in sensors.read(frame, plant)[2]]
-    assert abs(np.corrcoef(np.array(rows).T)[0, 1]) < 4.5 / np.sqrt(len(rows))
 
 
 def test_noise_of_one_sensor_does_not_depend_on_the_rate_of_another(config: Config, mirror: Mirror) -> None:
@@ -299,24 +291,6 @@ def test_the_counted_angle_is_that_of_the_wheel_at_every_sample(config: Config, 
                 rate += small * (set_point - middle) / LAG_S
             counted += right / HZ
             assert counted == pytest.approx(angle, abs=2.0 * 2.0 * pi / 100_000)  # a count, and where the first began
-
-
-def test_the_place_of_the_first_count_is_uniform(config: Config, mirror: Mirror) -> None:
-    """A wheel that turns a third of a count passes one in a third of all robots."""
-    world = world_of(config, encoder_counts_per_rev=COUNTS)
-    plant, times = plant_on_deck(mirror), SampleTimes(HZ, FRAME_HZ, LAG_S)
-    plant.step(0.0, DT_S, 5.0, 5.0)
-    share = plant.right_angle_rad / QUANTUM_RAD
-    share -= floor(share)
-    times.enter(1)
-    passed = []
-    for seed in range(1500):
-        rows = CountingEncoders(world, HZ, DT_S, np.random.default_rng(seed)).read(plant, times)
-        passed.append(
-            round(sum(row[1] for row in rows) / HZ / QUANTUM_RAD) - floor(plant.right_angle_rad / QUANTUM_RAD)
-        )
-    assert set(passed) <= {0, 1}
-    assert np.mean(passed) == pytest.approx(share, abs=4.5 * 0.5 / sqrt(1500))
 
 
 def test_noise_at_rest_is_that_in_motion(config: Config, mirror: Mirror) -> None:
