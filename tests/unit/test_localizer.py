@@ -19,7 +19,7 @@ from ccatp.estimation.measurements import ConstantAcceleration, MeasurementBuild
 from ccatp.estimation.odometry import Odometer, OdometryPose, arc_step
 from ccatp.estimation.seams import HeadingFix, HeadingGate, heading_from_pair
 from ccatp.estimation.thesis_localizer import FourStateLocalizer as Localizer
-from ccatp.filters import FILTERS, FilterDiverged, FilterShapeError, Innovation, KalmanFilter
+from ccatp.filters import FILTERS, FilterDiverged, Innovation, KalmanFilter
 from ccatp.filters.base import Observation
 from ccatp.mirror.mirror import Mirror, build_mirror
 
@@ -168,14 +168,6 @@ def test_a_drive_with_a_turn_from_a_known_start(noise: float, limit_m: float, li
         assert np.mean(nis[15:265]) == pytest.approx(1.0 - 1.0 / 22.0, abs=0.12)
 
 
-def test_speed_and_rate_follow() -> None:
-    localizer = make()
-    world = truth(v=trapeze(0.05, 9.0, 0.1, 0.2), omega=trapeze(0.05, 9.0, 0.2, 2.0))
-    run(localizer, world.frames(2.0))
-    assert localizer.speed_m_s == pytest.approx(0.1, abs=1e-6)  # constant for 1.4 s and no noise
-    assert localizer.rate_rad_s == pytest.approx(0.2, abs=1e-6)
-
-
 def test_sigmas_cover_the_error_and_grow_with_the_way() -> None:
     localizer = make()
     assert localizer.position_sigma_m == pytest.approx(config().localizer.start_position_sigma_m)
@@ -183,31 +175,6 @@ def test_sigmas_cover_the_error_and_grow_with_the_way() -> None:
     run(localizer, truth(v=lambda _: 0.1).frames(2.0))
     # 0.2 m at 0.01 rad and 0.2 % beside 2 mm
     assert localizer.position_sigma_m == pytest.approx(hypot(0.002, 0.2 * 0.01, 0.2 * 0.002), rel=0.02)
-
-
-def test_handover_keeps_the_deck_pose() -> None:
-    # Along a row and along a column, over several panels; at each change of panel the deck pose of before, moved by the
-    # odometer's step, must agree to rounding: compared with the pose expressed in the panel left behind.
-    mirror = mirror_of()
-    for heading in (0.05, 1.6, -3.1, -1.5):
-        localizer = make(PanelPose(PanelId(5, 5), 0.1, 0.1, heading))
-        world = truth(PanelPose(PanelId(5, 5), 0.1, 0.1, heading), v=lambda _: 0.4)
-        before = localizer.pose
-        changes = 0
-        for frame in world.frames(2.8):
-            localizer.step(*frame)
-            now = localizer.pose
-            if now.panel != before.panel:
-                changes += 1
-                back = mirror.panel_pose(before.panel, localizer.deck_pose)
-                step = 0.4 * 0.01
-                assert back.x_m == pytest.approx(
-                    before.x_m + step * cos(before.heading_rad), abs=2e-6
-                )  # sag of the step
-                assert back.y_m == pytest.approx(before.y_m + step * sin(before.heading_rad), abs=2e-6)
-                assert mirror.deck_pose(back).heading_rad == pytest.approx(localizer.deck_pose.heading_rad, abs=1e-9)
-            before = now
-        assert changes >= 1
 
 
 def test_handover_by_itself_is_continuous() -> None:
@@ -250,15 +217,6 @@ def test_rows_are_those_of_equation_2_12_and_not_of_2_3() -> None:
     np.testing.assert_allclose(R, np.square([0.001, 0.001, 0.0059, 0.0087]))
 
 
-def test_the_gyroscope_is_read_as_a_rate() -> None:
-    # Gyroscope alone, 0.2 rad/s for 1 s: the heading grows by it. Read as theta (printed 2.3) it would go to 0.2.
-    localizer = make(gyroscope_sigma_rad_s=1e-6)
-    start = localizer.pose.heading_rad
-    for k in range(101):
-        localizer.step(0.01 * k, [ImuSample(0.01 * k, 0.0, 0.2)], [], [])
-    assert localizer.pose.heading_rad - start == pytest.approx(0.2, abs=2e-4)  # one tenth of a frame's turn
-
-
 def test_samples_count_at_their_own_time() -> None:
     cfg = config()
     builder = MeasurementBuilder(cfg.robot, cfg.localizer)
@@ -284,13 +242,6 @@ def test_one_wheel_missing_is_used_with_the_other() -> None:
     assert localizer.speed_m_s == pytest.approx(0.1, abs=1e-3)  # 1 %: the rate splits over two alternating wheels
     assert localizer.innovation is not None
     assert localizer.innovation.size == 3
-
-
-def test_the_cache_of_templates_is_bounded() -> None:
-    cfg = config()
-    builder = MeasurementBuilder(cfg.robot, cfg.localizer)
-    for n in range(300):
-        assert builder.from_wheels(0.0, [], [(0.0, 1.0)] * n, []).z.size == n
 
 
 def test_process_noise_is_one_impulse_at_the_beginning() -> None:
@@ -361,8 +312,7 @@ def test_a_turn_between_the_two_sensors_is_taken_out() -> None:
     assert heading % pi == pytest.approx(0.13, abs=1e-12)  # exact geometry
 
 
-@pytest.mark.parametrize("backward", [False, True])
-@pytest.mark.parametrize("direction", [0.08, 1.5, -3.0, -1.7, 0.6, -0.5])
+@pytest.mark.parametrize(("direction", "backward"), [(0.08, False), (1.5, True), (-1.7, False), (-0.5, True)])
 def test_a_crossing_corrects_the_heading(direction: float, backward: bool) -> None:
     # 5 mrad of start error; after front and rear pair have crossed one or two seams 1 mrad may remain: 1 kHz at 0.1 m/s
     # places a sensor within 0.1 mm, 0.3 mrad of the 0.18 m between two sensors.
@@ -446,15 +396,6 @@ def test_rest_leaves_a_consistent_covariance() -> None:
     np.testing.assert_allclose(filter_.covariance, np.diag(np.square(sigmas)), rtol=1e-12)  # no correlation is left
 
 
-def test_reset_filter() -> None:
-    localizer = make()
-    localizer.reset_filter(np.array([0.02, 0.0, 1.0, 0.1]), np.diag([1e-4, 1e-2, 4e-4, 1e-4]))
-    assert (localizer.speed_m_s, localizer.pose.heading_rad, localizer.rate_rad_s) == (0.02, 1.0, 0.1)
-    assert localizer.heading_sigma_rad == pytest.approx(0.02)
-    with pytest.raises(FilterShapeError, match=r"mean has shape \(3,\)"):
-        localizer.reset_filter(np.zeros(3), np.eye(3))
-
-
 def test_a_fix_at_standstill() -> None:
     world = truth()
     localizer = make(PanelPose(CENTRE.panel, 0.003, -0.004, CENTRE.heading_rad))
@@ -464,14 +405,6 @@ def test_a_fix_at_standstill() -> None:
     assert localizer.position_sigma_m == pytest.approx(1e-5, rel=1e-3)
     assert localizer.fix_deviation_m == pytest.approx(0.0, abs=1e-9)
     assert localizer.counts["fixes"] == 1
-
-
-def test_a_fix_is_weighed_against_the_pose() -> None:
-    world = truth()
-    localizer = make(PanelPose(CENTRE.panel, 0.003, 0.0, CENTRE.heading_rad))
-    run(localizer, world.frames(0.1))
-    assert localizer.fuse_fix(world.fix(0.002)) == pytest.approx(0.0015, rel=1e-3)  # equal sigmas: half way
-    assert localizer.position_sigma_m == pytest.approx(0.002 / 2**0.5, rel=1e-3)
 
 
 def test_a_late_fix_belongs_to_its_own_time() -> None:
@@ -606,7 +539,7 @@ def test_what_is_not_finite_never_reaches_the_filter(bad: float) -> None:
     assert localizer.counts["nonfinite"] == 30 * 5
 
 
-@pytest.mark.parametrize("shift", [-4294.967296, -0.15, 0.15, 4294.967296, 1e6])
+@pytest.mark.parametrize("shift", [-4294.967296, -0.15, 0.15, 1e6])
 def test_a_jump_of_the_clock_does_not_move_the_pose(shift: float) -> None:
     # S12: no step above 1 mm. One frame of 10 ms is lost while the jump is confirmed.
     localizer = make()
@@ -630,19 +563,6 @@ def test_a_jump_of_the_clock_does_not_move_the_pose(shift: float) -> None:
     assert localizer.position_sigma_m > 0.05 * 0.1  # what may have happened meanwhile
     fix = world.fix()
     assert localizer.fuse_fix(Fix(fix.t_s + shift, *(getattr(fix, f) for f in list(Fix.__slots__)[1:]))) < 0.002
-
-
-def test_a_single_frame_from_elsewhere_is_ignored() -> None:
-    localizer, clean = make(), make()
-    frames = truth(v=lambda _: 0.05, noise=1.0).frames(0.3)
-    for k, frame in enumerate(frames):
-        clean.step(*frame)
-        localizer.step(*frame)
-        if k in (10, 20):
-            localizer.step(frame[0] + (1.0 if k == 10 else -0.5), *frame[1:])
-    assert localizer.pose == clean.pose
-    assert localizer.counts["suspect_frames"] == 2
-    assert localizer.counts["resyncs"] == 0
 
 
 @pytest.mark.fault("S11")
@@ -671,14 +591,3 @@ def test_five_backward_samples_in_a_row_ask_for_a_hold(source: str) -> None:
     assert localizer.counts["backward"] == 5
     localizer.clear_hold()
     assert not localizer.hold_requested
-
-
-def test_late_early_and_repeated_samples_are_counted() -> None:
-    localizer = make()
-    frames = truth().frames(0.5)
-    run(localizer, frames)
-    localizer.step(0.51, [ImuSample(0.2, 0.0, 0.0), ImuSample(0.6, 0.0, 0.0)], [*frames[-1][2][-2:]], [])
-    assert (localizer.counts["late"], localizer.counts["ahead"], localizer.counts["duplicate"]) == (1, 1, 4)
-    assert localizer.counts["backward"] == 0
-    localizer.step(0.52, [], [WheelSample(0.515, 0.0, 0.0), WheelSample(0.53, 0.0, 0.0)], [])
-    assert localizer.counts["ahead"] == 3  # both wheels

@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Callable
-from itertools import pairwise
 from math import asin, cos, exp, hypot, pi, sin, sqrt
 
 import numpy as np
@@ -74,13 +73,6 @@ def test_arrives_in_nearly_the_bang_bang_time(tracker: LegTracker, bearing: floa
     assert abs(robot.v) < 1e-3
 
 
-def test_the_printed_argument_order_of_eq_3_2_would_turn_the_wrong_way(tracker: LegTracker) -> None:
-    # arctan(x, y) as printed gives 0 for a target on the y axis, where the bearing is 90 degrees.
-    tracker.begin((0.0, 0.0, 0.0), (0.0, 1.0), False)
-    assert tracker.phase is LegPhase.TURN
-    assert tracker.step((0.0, 0.0, 0.0), (0.0, 1.0), DT).omega_rad_s > 0.0
-
-
 def test_frame_change_on_the_way_changes_nothing(tracker: LegTracker, config: Config) -> None:
     other = LegTracker(config.control, config.limits, LAG)
     pose, target, turned = (0.1, 0.2, 0.3), (0.9, 0.5), 0.7
@@ -116,11 +108,6 @@ def test_turn_in_place_ends_within_tolerance(tracker: LegTracker) -> None:
 
 # Carried to the right of +x by what 0.25 rad to the left make up for.
 DRIFT = (0.0, -sin(0.25))
-
-
-def test_against_a_drift_it_points_beside_the_bearing(tracker: LegTracker) -> None:
-    tracker.begin((0.0, 0.0, 0.25), (0.5, 0.0), False, DRIFT)
-    assert tracker.phase is LegPhase.DRIVE
 
 
 def test_against_a_drift_it_turns_off_the_bearing(tracker: LegTracker) -> None:
@@ -174,18 +161,6 @@ def test_the_rate_is_that_of_the_riccati_equation() -> None:
     gain = (b.T @ p)[0]
     assert line_rate(LegView(0.1, 1.0, 0.0, 1.0), v, g, w) == pytest.approx(-gain[0], rel=1e-9)
     assert line_rate(LegView(0.1, 0.0, 1.0, 1.0), v, g, w) == pytest.approx(-gain[1], rel=1e-9)
-
-
-def test_driving_the_other_way_turns_the_sign_of_the_error_beside_but_not_of_the_heading() -> None:
-    forth, back = (line_rate(LegView(0.1, 0.001, 0.0, 1.0), v, 600.0, 9.0) for v in (0.1, -0.1))
-    assert forth == -back < 0.0
-    assert line_rate(LegView(0.1, 0.0, 0.1, 1.0), 0.1, 600.0, 9.0) == line_rate(
-        LegView(0.1, 0.0, 0.1, 1.0), -0.1, 600.0, 9.0
-    )
-
-
-def test_an_error_beside_the_line_turns_nobody_who_stands() -> None:
-    assert line_rate(LegView(0.0, 0.005, 0.0, 1.0), 0.0, 600.0, 9.0) == 0.0
 
 
 @pytest.mark.parametrize("reverse", [False, True])
@@ -355,23 +330,6 @@ def test_a_disturbed_robot_stops_within_a_third_of_a_millimetre_and_loses_little
     assert float(np.mean(errors)) < 3e-4  # stop tolerance along the line and as much beside it
     assert max(errors) < 6e-4
     assert float(np.mean(ratios)) < 1.04  # what a quiet mission may cost over its bound
-
-
-def test_four_frames_of_delay_cause_no_limit_cycle(config: Config) -> None:
-    for lag in (0.8, 1.2):
-        rig = Rig(config, lag=lag, slip=(0.05, 0.01), delay=4, heading=0.04)
-        rig.leg((0.4, 0.0))
-        cruise = [omega for t, v, omega in rig.trace if v > 0.09]
-        changes = sum(a * b < 0.0 for a, b in pairwise(cruise))
-        assert changes <= 4  # an initial error of heading swings out once or twice, a cycle would go on
-        assert max(map(abs, cruise[-50:])) < 0.02  # settled: the rest is the difference of slip being steered out
-        assert abs(rig.heading) < 0.02
-
-
-def test_without_prediction_the_delayed_robot_takes_longer(config: Config) -> None:
-    with_it = survey(Rig(config, slip=(0.03, 0.03), delay=4))[1]
-    without = survey(Rig(config, slip=(0.03, 0.03), delay=4, is_predicting=False))[1]
-    assert without > with_it + 0.02
 
 
 def test_the_crab_angle_keeps_a_drifting_robot_on_its_line(config: Config) -> None:

@@ -1,7 +1,7 @@
 """Pure. From one step of the filter to the next: frames gathered for it, and the pose carried on in between."""
 
 from itertools import pairwise
-from math import floor, nextafter, pi, sin, sqrt
+from math import floor, nextafter, pi, sin
 
 import numpy as np
 import pytest
@@ -87,31 +87,12 @@ def test_the_gyroscope_is_freed_of_its_errors() -> None:
     assert pose.omega_rad_s == pytest.approx(0.4, rel=1e-9)
 
 
-def test_a_steady_acceleration_leaves_no_lag() -> None:
-    x, pose = np.zeros(STATES), running()
-    x[A] = 0.2
-    pose.begin(x, LEVEL, 0.0)
-    pose.trust(1e-5, 1e-4, 0.01)
-    for k in range(100):
-        v = 0.2 * 0.01 * (k + 1)  # what the wheels show is the mean over the frame
-        pose.advance(0.01, (v - 0.001) * 0.01 / R_M, (v - 0.001) * 0.01 / R_M, None)
-    assert pose.v_m_s == pytest.approx(0.2, abs=1e-3)  # half a frame of the acceleration
-
-
 def test_a_frame_of_no_length_leaves_the_speeds() -> None:
     x, pose = np.zeros(STATES), running()
     x[[V, W]] = 0.1, 0.3
     pose.begin(x, LEVEL, 0.0)
     pose.advance(0.0, 0.0, 0.0, None)
     assert (pose.v_m_s, pose.omega_rad_s) == (0.1, 0.3)
-
-
-def test_the_noise_of_a_frame_sets_the_gain_anew() -> None:
-    one, other = trusted(1e-5), trusted(1e-9)
-    other.trust(1e-5, 1e-4, 0.01)
-    for pose in (one, other):
-        pose.advance(0.01, 0.1, 0.1, None)
-    assert one.v_m_s == other.v_m_s
 
 
 # -- blocks -----------------------------------------------------------------------------------------------------------
@@ -137,16 +118,6 @@ def test_means_over_a_block() -> None:
     assert second.acceleration_m_s2 == pytest.approx(0.04, abs=1e-15)
 
 
-def test_a_block_says_how_long_the_wheels_turned() -> None:
-    builder = Preintegrator()
-    builder.add(0.01, is_turning=True, imu=[])
-    builder.add(0.02, is_turning=False, imu=[])
-    block = builder.take()
-    assert (block.dt_s, block.turning_s) == pytest.approx((0.03, 0.01))
-    assert (block.rate_rad_s, block.acceleration_m_s2, block.samples) == (None, None, 0)
-    assert builder.take().dt_s == 0.0
-
-
 def test_the_first_sample_begins_a_trapezoid_and_a_gap_ends_it() -> None:
     builder = Preintegrator()
     assert fill(builder, [0.01]).samples == 0
@@ -170,16 +141,6 @@ def test_nothing_reaches_across_a_restart_or_a_rest() -> None:
     builder.add(0.01, is_turning=True, imu=[])
     builder.restart()
     assert builder.take().dt_s == 0.0
-
-
-def test_the_mean_of_white_noise_has_the_variance_of_its_samples() -> None:
-    rng, builder, found = np.random.default_rng(1), Preintegrator(), []
-    for _ in range(4000):
-        for _ in range(4):
-            builder.add(0.01, is_turning=True, imu=[ImuSample(0.0, 0.0, float(rng.normal()))])
-        found.append(builder.take().rate_rad_s or 0.0)
-    # The trapezoid's two halves at the ends: (1/4 + 3 + 1/4)/16 in place of 1/4, 12 % less.
-    assert float(np.var(found)) == pytest.approx(3.5 / 16.0, rel=4.0 * sqrt(2.0 / 4000))
 
 
 DT_S = 1e-3
@@ -270,15 +231,6 @@ def test_rates_are_summed_by_trapezoids() -> None:
     assert wheel.variance_rad2() == 1e-10
 
 
-def test_a_base_to_count_from() -> None:
-    wheel = WheelAngle()
-    wheel.add([0.0, 0.001], [1.0, 1.0])
-    wheel.rebase()
-    assert wheel.angle_rad == 0.0
-    assert wheel.add([0.002], [1.0]) == pytest.approx(0.001)
-    assert wheel.angle_rad == pytest.approx(0.001)
-
-
 def test_a_jump_of_the_clock_is_no_angle() -> None:
     for wheel in (WheelAngle(), counter()):
         wheel.add([1.0, 1.001], [3.0, 3.0])
@@ -318,12 +270,6 @@ def test_a_wheel_at_rest_forgets_its_last_motion() -> None:
     assert found == pytest.approx(1e-6 + 0.98**500 * (0.01 - 1e-6), rel=1e-9)
     wheel.rest([])
     assert wheel.noise_rad2_s2 == found
-
-
-def test_a_counter_has_no_noise_to_learn() -> None:
-    wheel = counter()
-    wheel.rest([5.0])
-    assert wheel.noise_rad2_s2 == 0.0
 
 
 def test_lost_samples_of_a_counter_are_told() -> None:

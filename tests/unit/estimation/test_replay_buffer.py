@@ -6,11 +6,11 @@ from math import cos
 import numpy as np
 import pytest
 
-from ccatp.core import DeckPose, Fix, FloatArray, PanelPose
+from ccatp.core import Fix, FloatArray
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.state_filter import ReplayBuffer, Step, SurveyFilter
-from ccatp.estimation.state_model import PSI, STATES, A, V, W
+from ccatp.estimation.state_model import STATES, V, W
 from ccatp.filters import FILTERS, KalmanFilter
 from tests.unit.estimation.drive import (
     FRAME_S,
@@ -27,9 +27,8 @@ from tests.unit.estimation.drive import (
     run,
     trapeze,
 )
-from tests.unit.estimation.test_full_state import NOISY, fragile, rested, shifted
+from tests.unit.estimation.test_full_state import NOISY, fragile, shifted
 from tests.unit.estimation.test_full_state import STRAIGHT as RecoveriesSTRAIGHT
-from tests.unit.estimation.test_sample_validation import with_gravity
 from tests.unit.estimation.test_seams import across_it, before_a_seam
 
 F, Q = np.array([[1.0, 0.1], [0.0, 1.0]]), np.diag([1e-3, 2e-3])
@@ -94,17 +93,6 @@ def test_in_the_middle_of_a_step_it_is_told_by_how_much_it_is_late() -> None:
     for t_s in (0.13, 0.2, 0.3, 0.5):
         found.journal.take(t_s, told.append, found.filter)
     assert told == pytest.approx([0.07, 0.0, 0.0, 0.0], abs=1e-12)
-
-
-def test_of_a_standstill_before_a_step_nothing_is_lost() -> None:
-    found = Recorded()
-    told: list[float] = []
-    found.step(1)
-    found.journal.begin(5.0, 0.0, found.filter)
-    found.journal.begin(5.1, 0.1, found.filter)
-    found.journal.take(3.0, told.append, found.filter)
-    found.journal.take(5.02, told.append, found.filter)
-    assert told == pytest.approx([0.0, 0.08], abs=1e-12)
 
 
 def test_a_look_back_changes_nothing() -> None:
@@ -239,9 +227,7 @@ def apart(one: FullStateLocalizer, other: FullStateLocalizer) -> tuple[float, fl
     ("name", "taken_s", "told_s"),
     [
         ("straight on", 1.5, 1.6),
-        ("straight on", 1.5, 2.9),
         ("round a corner", 1.8, 3.7),
-        ("a rest in between", 3.0, 4.5),
         ("a rest in between", 3.6, 4.5),
     ],
 )
@@ -259,17 +245,6 @@ def test_a_late_fix_is_as_good_as_one_in_time(filter_name: str, name: str, taken
     assert covariance < 1e-4
 
 
-def test_what_a_leg_passes_on_knows_little_of_a_late_fix() -> None:
-    story = Story("a rest in between")
-    taken, told = story.end_after(3.0), story.end_after(4.5)
-    in_time, late = (story.tell({k: [story.fixes[taken]]}) for k in (taken, told))
-    mean, covariance = apart(in_time, late)
-    # The mean of the slip is corrected, but not the scatter between the legs that the fix would have taught, by the
-    # mean of the two wheels' slips and by their difference.
-    assert mean < 0.01
-    assert covariance < 0.1
-
-
 def test_several_late_fixes_in_any_order() -> None:
     story = Story("round a corner", rewind_s=3.0)
     times = [story.end_after(t_s) for t_s in (1.2, 1.8, 2.6)]
@@ -283,7 +258,7 @@ def test_several_late_fixes_in_any_order() -> None:
         assert covariance < 1e-3
 
 
-@pytest.mark.parametrize("inside", [1, 2, 3])
+@pytest.mark.parametrize("inside", [1, 3])
 def test_a_fix_within_a_block_is_carried_to_its_end(inside: int) -> None:
     """In time it ends the block, so the noise of the block is taken in other portions: that is what differs."""
     story = Story("straight on")
@@ -295,19 +270,6 @@ def test_a_fix_within_a_block_is_carried_to_its_end(inside: int) -> None:
     assert np.abs(pose[0] - pose[1]).max() < 5e-5
     late_only = story.tell({})
     assert np.abs(np.array([late_only.deck_pose.x_m, late_only.deck_pose.y_m]) - pose[0]).max() > 5e-4
-
-
-def test_in_time_within_a_block_it_is_where_it_says() -> None:
-    story = Story("straight on")
-    taken = story.end_after(1.8) - 2
-    found = build()
-    for frame in story.frames[: taken + 1]:
-        found.step(*frame)
-    jump_m = found.fuse_fix(story.fixes[taken])
-    robot_xy = story.fixes[taken]
-    assert jump_m > 1e-3
-    again = found.fuse_fix(robot_xy)
-    assert again < 1e-6  # a variance of 1e-10 against 1e-10: half of next to nothing
 
 
 def test_an_older_fix_than_the_path_is_refused() -> None:
@@ -333,17 +295,6 @@ def test_a_fix_from_the_future_is_refused() -> None:
 def test_before_the_first_frame_there_is_no_path() -> None:
     with pytest.raises(FixRefused, match="outside the known path"):
         build().fuse_fix(Robot().fix())
-
-
-def test_a_fix_at_rest_leaves_the_robot_at_rest() -> None:
-    robot, found = Robot(v=STRAIGHT, errors=WRONG), build()
-    for frame in robot.frames(2.6):
-        found.step(*frame)
-    found.fuse_fix(robot.fix())
-    # What remains of the uncertainty at the stop.
-    assert found.state[0][[V, A, W]] == pytest.approx([0.0, 0.0, 0.0], abs=4e-3)
-    found.step(*robot.frame())
-    assert found.is_resting
 
 
 def test_a_standstill_however_long_does_not_grow_and_takes_a_measurement_of_its_beginning() -> None:
@@ -392,21 +343,6 @@ def test_a_revived_filter_stays_alive() -> None:
     assert found.is_resting
 
 
-def test_a_robot_that_never_stopped_is_followed_again() -> None:
-    found, filter_ = fragile()
-    robot = Robot(v=trapeze(0.5, 9.0, 0.1, 0.2), errors=NOISY)
-    run(found, robot.frames(1.3))
-    filter_.is_broken = True
-    run(found, robot.frames(0.2))
-    filter_.is_broken = False
-    found.fuse_fix(robot.fix())
-    run(found, robot.frames(1.0))
-    assert not found.is_frozen
-    # 2 % of slip that are not known, on 0.1 m, and the first block, whose speed is not known.
-    assert errors_of(found, robot.pose)[0] < 5e-3
-    assert found.speed_m_s == pytest.approx(0.1, abs=5e-3)
-
-
 def test_a_filter_that_diverges_at_a_fix_begins_anew_with_it() -> None:
     found, filter_ = fragile()
     robot = Robot(v=RecoveriesSTRAIGHT, errors=NOISY)
@@ -435,7 +371,7 @@ def test_after_a_jump_of_the_clock_it_measures_the_same_speed(jump_s: float, bef
     assert after.x_m - before.x_m == pytest.approx(now.x_m - true.x_m, abs=2e-3)
 
 
-@pytest.mark.parametrize("before_s", [2.01, 2.02, 2.03, 2.04])
+@pytest.mark.parametrize("before_s", [2.01, 2.03])
 def test_after_a_reboot_fixes_are_taken(before_s: float) -> None:
     """Wherever in a block it was: nothing of the old time base decides about a fix."""
     found, robot = build(), Robot(v=trapeze(0.5, 9.0, 0.1, 0.2))
@@ -456,17 +392,7 @@ def test_silent_encoders_are_no_rest() -> None:
     assert errors_of(found, robot.pose)[0] < 4.0 * found.position_sigma_m
 
 
-def test_at_rest_a_fix_may_come_late() -> None:
-    """A standstill is one moment, however long: nothing has changed since its beginning."""
-    found, robot = build(), Robot(v=RecoveriesSTRAIGHT)
-    run(found, robot.frames(2.6))
-    fix = robot.fix()
-    run(found, robot.frames(6.0))
-    found.fuse_fix(fix)
-    assert errors_of(found, robot.pose)[0] < 2e-5
-
-
-@pytest.mark.parametrize("within", [0, 1, 2, 3])
+@pytest.mark.parametrize("within", [0, 3])
 def test_a_new_beginning_while_it_drives(within: int) -> None:
     """The third of three fixes that agree, of some frames ago: the robot has gone on, and the wheels tell how fast."""
     story = Story("straight on")
@@ -486,22 +412,6 @@ def test_a_new_beginning_while_it_drives(within: int) -> None:
     for frame in story.frames[end + 1 : end + 61]:
         found.step(*frame)
     assert found.deck_pose.x_m - here.x_m - 0.06 == pytest.approx((1e-3 * within + 0.06) * cos(0.3), abs=3e-3)
-
-
-def test_what_is_learned_at_rest_is_told() -> None:
-    robot, found = Robot(), build(start_heading_sigma_rad=0.3)
-    turned = DeckPose(robot.x_m, robot.y_m, robot.pose.heading_rad + 0.2)
-    run(found, with_gravity(robot.frames(3.3), mirror(), turned))
-    assert found.deck_pose.heading_rad == pytest.approx(float(found.state[0][PSI]), abs=1e-12)
-    assert found.deck_pose.heading_rad == pytest.approx(turned.heading_rad, abs=0.01)  # as good as three chunks
-
-
-def test_a_fix_at_rest_leaves_no_speed() -> None:
-    found = build()
-    rested(found)
-    assert found.is_resting
-    assert found.speed_m_s == 0.0
-    assert found.rate_rad_s == 0.0
 
 
 def test_what_is_done_again_does_not_count_again() -> None:
@@ -528,25 +438,3 @@ def test_the_innovation_is_that_of_the_last_fix() -> None:
     assert found.innovation is not None
     assert alone is not None
     assert found.innovation.residual == pytest.approx(alone.residual, abs=1e-9)
-
-
-def test_a_new_beginning_has_no_innovation() -> None:
-    found = build()
-    robot = rested(found)
-    assert found.innovation is not None
-    for _ in range(2):
-        with pytest.raises(FixGated):
-            found.fuse_fix(robot.fix(off_m=(0.05, 0.0)))
-    found.fuse_fix(robot.fix(off_m=(0.05, 0.0)))
-    assert found.innovation is None
-
-
-def test_a_new_beginning_keeps_what_was_learned_of_the_sensors() -> None:
-    found = build(start=PanelPose(STEEP.panel, 0.0, 0.0, 0.3))
-    robot = rested(found)
-    before = found.state[0][6:13].copy()
-    for _ in range(2):
-        with pytest.raises(FixGated):
-            found.fuse_fix(robot.fix(off_m=(0.05, 0.0)))
-    found.fuse_fix(robot.fix(off_m=(0.05, 0.0)))
-    assert np.array_equal(found.state[0][6:13], before)

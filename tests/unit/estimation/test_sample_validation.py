@@ -1,20 +1,19 @@
 """Pure. Which samples are used: the quick way for clean frames and the slow way for the others agree."""
 
 from collections import Counter
-from math import inf, nan, pi, sin, sqrt
+from math import inf, nan, pi, sqrt
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccatp.config.models import FullStateConfig
 from ccatp.core import DeckPose, GravitySample, ImuSample, PanelPose, WheelSample, difference, wrap_pi
 from ccatp.estimation.measurements import NoiseFloor, ZeroVelocityDetector, heading_from_gravity
 from ccatp.estimation.sample_validation import SampleValidator
-from ccatp.estimation.state_model import BA, BG, PSI, A, Terrain, W
+from ccatp.estimation.state_model import BA, BG, PSI, Terrain, W
 from ccatp.mirror.mirror import Mirror
-from tests.unit.estimation.drive import FRAME_S, STEEP, Errors, Frame, Robot, build, errors_of, run, trapeze
+from tests.unit.estimation.drive import FRAME_S, STEEP, Errors, Frame, Robot, build, run, trapeze
 
 HISTORY_S = 0.2
 ONE = WheelSample(1.002, 1.0, 2.0)
@@ -29,11 +28,6 @@ def intake() -> SampleValidator:
 
 def counts(found: SampleValidator) -> dict[str, int]:
     return {key: value for key, value in found._counts.items() if value}
-
-
-def test_clean_samples_are_columns() -> None:
-    columns = intake().columns(1.01, [ONE, WheelSample(1.003, 3.0, 4.0)])
-    assert columns == ((1.002, 1.003), (1.0, 3.0), (2.0, 4.0))
 
 
 DIRTY = {
@@ -51,11 +45,6 @@ DIRTY = {
     "ahead": [ONE, WheelSample(1.02, 1.0, 2.0)],
     "late": [WheelSample(0.8, 1.0, 2.0)],
 }
-
-
-@pytest.mark.parametrize("name", DIRTY)
-def test_dirty_samples_are_not(name: str) -> None:
-    assert intake().columns(1.01, DIRTY[name]) is None
 
 
 @pytest.mark.parametrize(
@@ -87,31 +76,6 @@ def test_dirty_samples_are_judged_one_by_one(
 
 times = st.integers(0, 30).map(lambda k: 0.98 + 0.002 * k)
 rates = st.one_of(st.none(), st.sampled_from([0.0, 1.0, -2.5, nan, inf]))
-ordered = st.lists(times, max_size=6, unique=True).map(sorted)
-
-
-@settings(max_examples=100, deadline=None)
-@given(
-    st.lists(
-        st.one_of(
-            st.lists(st.tuples(times, rates, rates), max_size=5),
-            ordered.map(lambda found: [(t, 1.0, t) for t in found]),
-        ),
-        max_size=5,
-    )
-)
-def test_quick_and_slow_use_and_count_the_same(frames: list[list[tuple[float, float | None, float | None]]]) -> None:
-    quick, slow = intake(), intake()
-    for k, rows in enumerate(frames):
-        frame_s, samples = 1.01 + 0.01 * k, [WheelSample(*row) for row in rows]
-        columns = quick.columns(frame_s, samples) if samples else ((), (), ())
-        if columns is None:
-            right, left = quick.wheels(frame_s, samples)
-        else:
-            right, left = list(zip(*columns[:2], strict=True)), list(zip(columns[0], columns[2], strict=True))
-        assert (right, left) == slow.wheels(frame_s, samples)
-        assert counts(quick) == counts(slow)
-        assert quick.backward_source == slow.backward_source
 
 
 def test_five_backward_samples_in_a_row_name_the_sensor() -> None:
@@ -190,13 +154,6 @@ def test_means_over_a_rest() -> None:
     assert found.take()[:4] == (0, 0.0, 0.0, 0)
 
 
-def test_what_was_collected_before_a_motion_is_forgotten() -> None:
-    found = watch()
-    found.add([ImuSample(0.0, 1.0, 1.0)], GravitySample(0.0, 1.0, 0.0, 0.0))
-    found.moved()
-    assert found.take()[:4] == (0, 0.0, 0.0, 0)
-
-
 # -- the noise that counts --------------------------------------------------------------------------------------------
 
 
@@ -207,13 +164,13 @@ def learned(samples: np.ndarray, expected: float = 1.0) -> float:
     return floor.variance
 
 
-@pytest.mark.parametrize("sigma", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("sigma", [0.1, 10.0])
 def test_of_white_noise_the_variance_is_learned(sigma: float) -> None:
     rng = np.random.default_rng(1)
-    found = [learned(5.0 + sigma * rng.normal(size=6000)) for _ in range(40)]
+    found = [learned(5.0 + sigma * rng.normal(size=6000)) for _ in range(20)]
     # Remembered are 2/0.03 = 67 squares of one degree of freedom; neighbours share a mean, which makes it 3/2 of that.
     scatter = sqrt(2.0 / 67.0 * 1.5)
-    assert np.mean(found) == pytest.approx(sigma**2, rel=4.0 * scatter / sqrt(40))
+    assert np.mean(found) == pytest.approx(sigma**2, rel=4.0 * scatter / sqrt(20))
     assert np.std(found) < 1.5 * scatter * sigma**2
 
 
@@ -307,17 +264,6 @@ def test_biases_show_at_rest(filter_name: str, counts_per_turn: int) -> None:
     assert abs(mean[BA] + 0.3) < 4.0 * accelerometer
 
 
-def test_what_is_not_known_of_the_stop_is_not_taken_for_a_bias() -> None:
-    """Counts leave 1 mrad/s at the stop, which the gyroscope cannot tell from its bias: their sum is known."""
-    robot = Robot(v=trapeze(0.0, 1.5, 0.1, 0.2), errors=Errors(noise=1.0, counts_per_turn=1200))
-    found = build()
-    run(found, robot.frames(1.5 + 8.3))
-    P = found.state[1]
-    for bias, speed in ((BG, W), (BA, A)):
-        together = P[bias, bias] + 2.0 * P[bias, speed] + P[speed, speed]
-        assert together < 0.5 * P[bias, bias]
-
-
 def test_a_rest_is_used_when_the_robot_drives_off() -> None:
     """Half a second at rest, less than fills a chunk."""
     robot, found = Robot(v=trapeze(0.75, 1.0, 0.1, 0.2), errors=Errors(gyro_bias=0.02)), build()
@@ -371,11 +317,3 @@ def test_the_tilt_against_the_least(mirror: Mirror) -> None:
         run(found, with_gravity(robot.frames(1.3), mirror, DeckPose(pose.x_m, pose.y_m, pose.heading_rad + 0.02)))
         assert bool(found.state[0][PSI] - pose.heading_rad > 1e-4) is is_used
         assert found.counts["gravity_gated"] == 0
-
-
-def test_the_samples_of_a_moving_robot_do_not_count(mirror: Mirror) -> None:
-    robot, found = Robot(v=lambda t: 0.05 * sin(2.0 * t)), build()
-    run(found, with_gravity(robot.frames(1.5), mirror, DeckPose(robot.x_m, robot.y_m, 2.0)))
-    assert found.counts["gravity_gated"] == 0
-    assert found.speed_m_s == pytest.approx(0.05 * sin(3.0), abs=1e-3)  # a frame of the acceleration
-    assert abs(errors_of(found, robot.pose)[1]) < 1e-4  # no noise: what the wheels' slip may make of 25 mm

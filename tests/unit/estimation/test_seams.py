@@ -191,9 +191,9 @@ def across_it(sign: float = 1.0) -> Rate:
     return trapeze(0.4, 9.0, 0.1 * sign, 0.2)
 
 
-@pytest.mark.parametrize("k", [0, 1])
-@pytest.mark.parametrize("is_up", [True, False])
-@pytest.mark.parametrize("forward", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("k", "is_up", "forward"), [(0, True, 1.0), (0, False, -1.0), (1, False, 1.0), (1, True, -1.0)]
+)
 def test_a_seam_places_the_robot(k: int, is_up: bool, forward: float, full: FullStateConfig) -> None:
     """The robot stands 2 mm from where the localizer thinks, and is turned by 10 mrad; it crosses a seam."""
     start = before_a_seam(k, is_up)
@@ -249,7 +249,6 @@ def test_an_edge_far_from_where_it_is_expected_is_gated() -> None:
 
 
 DRAWN = [SR, SL, C]
-STEP = 2.0**0.5  # from one candidate for the scatter to the next
 
 
 def population() -> SlipPopulation:
@@ -280,7 +279,7 @@ def test_legs_that_all_slip_alike_shrink_the_scatter() -> None:
     assert sqrt(found.mean_variances[0]) < 2.0 * 5e-4 / sqrt(40)
 
 
-@pytest.mark.parametrize("scatter", [0.002, 0.005, 0.012])
+@pytest.mark.parametrize("scatter", [0.002, 0.012])
 def test_legs_that_differ_show_by_how_much(scatter: float) -> None:
     found = [taught(scatter, 60, seed) for seed in range(20)]
     learned = np.array([sqrt(f.scatter) for f in found])
@@ -291,30 +290,11 @@ def test_legs_that_differ_show_by_how_much(scatter: float) -> None:
     assert float((off**2).mean()) == pytest.approx(1.0, abs=4.0 * sqrt(2.0 / 20))
 
 
-def test_a_scatter_beyond_the_largest_is_not_thought_of() -> None:
-    assert sqrt(taught(0.1, 60, 1).scatter) <= 0.02
-
-
 def test_a_world_that_changes_is_noticed() -> None:
     found, rng = taught(0.0, 60, 1), np.random.default_rng(2)
     for _ in range(40):
         found.learn([(0.03 + 0.008 * float(rng.normal()), 25e-8)])
     assert sqrt(found.scatter) > 0.004
-
-
-def test_a_world_that_calms_down_is_noticed_too() -> None:
-    found = taught(0.012, 300, 1)
-    for _ in range(300):
-        found.learn([(0.03, 25e-8)])
-    # Of the last 100 legs, which are remembered, 5 are of the time before: sqrt(0.05) 0.012 = 2.7e-3.
-    assert sqrt(found.scatter) < 0.004
-
-
-def test_a_leg_that_shows_nothing_teaches_nothing() -> None:
-    found = population()
-    before = found.means[0], found.scatter
-    found.learn([(0.5, 1e6)])
-    assert (found.means[0], found.scatter) == pytest.approx(before, rel=1e-5)
 
 
 # -- the book ---------------------------------------------------------------------------------------------------------
@@ -398,22 +378,6 @@ def test_the_next_leg_is_given_what_bayes_gives_it(full: FullStateConfig) -> Non
         x[DRAWN], P[np.ix_(DRAWN, DRAWN)] = mean, covariance
 
 
-def test_a_leg_is_learned_from_without_what_was_expected_of_it(
-    full: FullStateConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    told: list[tuple[list[tuple[float, float]], float]] = []
-    monkeypatch.setattr(SlipPopulation, "learn", lambda _, samples, share: told.append((samples, share)))
-    book = SlipPrior(full)
-    x, P = state(*book.first())
-    for slip, z in ((SR, 0.05), (SL, 0.03)):
-        x, P = update(x, P, np.eye(STATES)[slip], z, 4e-4)  # as much as the prior: the posterior is half of each
-    book.end(x, P)
-    (mean, half), share = told[0]
-    assert mean == pytest.approx((0.04, 2e-4), rel=1e-9)  # of a mean of two
-    assert half == pytest.approx((0.01, 2e-4), rel=1e-9)  # of half their difference
-    assert share == 1.0
-
-
 def test_what_wandered_within_a_leg_is_no_knowledge_lost(
     full: FullStateConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -431,16 +395,6 @@ def test_what_wandered_within_a_leg_is_no_knowledge_lost(
     assert mean == pytest.approx((0.04, 2e-4), rel=1e-9)
     assert half == pytest.approx((0.01, 2e-4), rel=1e-9)
     assert share == pytest.approx(1.0 + full.wander_fraction**2 / full.wander_time_s * 2.0)
-
-
-def test_the_deviation_from_what_was_expected_passes_through(full: FullStateConfig) -> None:
-    """The redraw is affine in the state: the mean that it leaves is the book's whatever state it was made for."""
-    book = SlipPrior(full)
-    x, P = state(*book.first())
-    redraw = book.begin(x + 0.01, P)
-    assert redraw.found == pytest.approx(x[DRAWN] + 0.01)
-    assert np.abs(redraw.Q - redraw.Q.T).max() < 1e-18
-    assert np.linalg.eigvalsh(redraw.Q)[0] > 0.0
 
 
 def drive(book: SlipPrior, slips: list[tuple[float, float]], noise: float) -> None:
@@ -466,22 +420,13 @@ def test_a_floor_on_which_all_legs_slip_alike(full: FullStateConfig) -> None:
     assert book.scatter[0] < 0.1 * before
 
 
-@pytest.mark.parametrize("half_width", [0.01, 0.02])
+@pytest.mark.parametrize("half_width", [0.02])
 def test_a_floor_on_which_every_leg_slips_differently(full: FullStateConfig, half_width: float) -> None:
     book, rng = SlipPrior(full), np.random.default_rng(4)
     drive(book, [tuple(rng.uniform(0.03 - half_width, 0.03 + half_width, 2).tolist()) for _ in range(150)], 1e-7)
     # A uniform distribution's sigma is its half width over sqrt(3), the mean of two wheels has 1/sqrt(2) of that. Of
     # the last 100 legs, which are remembered, 7 %.
     assert book.scatter[0] == pytest.approx(half_width / sqrt(6.0), rel=0.2)
-
-
-def test_wheels_that_slip_unlike_each_other_tell_how_much_legs_differ(full: FullStateConfig) -> None:
-    """The mean of the two is the same in every leg, their difference is not."""
-    book, rng = SlipPrior(full), np.random.default_rng(5)
-    halves = (0.01 / sqrt(2.0) * rng.normal(size=150)).tolist()
-    drive(book, [(0.03 + half, 0.03 - half) for half in halves], 1e-7)
-    # Half of the samples scatter by 0.01/sqrt(2), half by nothing.
-    assert book.scatter[0] == pytest.approx(0.005, rel=0.2)
 
 
 def test_only_a_leg_that_was_ended_by_a_fix_teaches_its_scatter(full: FullStateConfig) -> None:
@@ -504,33 +449,3 @@ def test_a_leg_that_showed_nothing_new_does_not_count(full: FullStateConfig) -> 
     before = book._slip_scatter.scatter
     book.end(*state(*book.first()))
     assert book._slip_scatter.scatter == before
-
-
-def test_slip_and_creep_wander_within_a_leg(full: FullStateConfig) -> None:
-    book = SlipPrior(full)
-    slip, creep = book.wander(0.5)
-    share = full.wander_fraction**2 / full.wander_time_s * 0.5
-    assert slip == pytest.approx(2.0 * share * book.scatter[0] ** 2)  # of a wheel: twice that of a mean of two
-    assert creep == pytest.approx(share * book.scatter[1] ** 2)
-
-
-def test_what_it_expects_of_the_next_leg_is_what_the_next_leg_shows() -> None:
-    """Standardised by the book, a leg's parameter has unit variance over worlds drawn from the book's own prior.
-
-    World by world, because those that are rare weigh most; what the next leg draws is taken by its expectation.
-    """
-    rng, prior = np.random.default_rng(1), population()
-    weights = np.exp(prior._prior)
-    weights /= weights.sum()
-    expected = variance = 0.0
-    for sigma, weight in zip(prior._sigmas, weights.tolist(), strict=True):
-        squares = []
-        for _ in range(1500 if sigma > 1e-3 else 200):
-            book, mean = population(), 0.015 + 0.015 * float(rng.normal())
-            for _ in range(3):
-                book.learn([(mean + sigma * float(rng.normal()) + 5e-4 * float(rng.normal()), 25e-8)])
-            squares.append((sigma * sigma + (mean - book.means[0]) ** 2) / (book.scatter + book.mean_variances[0]))
-        expected += weight * float(np.mean(squares))
-        variance += weight * weight * float(np.var(squares)) / len(squares)
-    assert 4.0 * sqrt(variance) < 0.25
-    assert expected == pytest.approx(1.0, abs=4.0 * sqrt(variance))

@@ -124,10 +124,6 @@ def test_creep_goes_downhill_whichever_way_the_robot_drives(sign: float) -> None
 ALL = Errors(right_slip=0.05, left_slip=0.02, base=0.02, creep=0.05)
 CASES = {
     "perfect": Errors(),
-    "slip": Errors(right_slip=0.05, left_slip=0.05),
-    "one wheel slips": Errors(left_slip=0.05),
-    "base": Errors(base=0.02),
-    "creep": Errors(creep=0.05),
     "all": ALL,
 }
 
@@ -274,12 +270,6 @@ def test_a_pose_in_a_panels_frame_is_the_mirrors(mirror: Mirror) -> None:
         assert found.panel == panel
         assert (found.x_m, found.y_m) == pytest.approx((expected.x_m, expected.y_m), abs=1e-14)  # rounding of metres
         assert abs(difference(found.heading_rad, expected.heading_rad)) < 1e-14
-
-
-def test_a_vector_along_a_panels_axes(mirror: Mirror) -> None:
-    frame, panel = PanelFrame(mirror, PanelId(2, 8)), mirror.panel(PanelId(2, 8))
-    for k, axis in enumerate(panel.axes[:2]):
-        assert frame.along(*axis) == pytest.approx((1.0 - k, float(k)), abs=1e-15)
 
 
 def test_the_panel_changes_in_the_middle_of_the_gap(mirror: Mirror) -> None:

@@ -45,25 +45,6 @@ def test_asks_once_and_only_after_the_measuring_time_at_rest(stopover: SettleAnd
     assert (stopover.request, stopover.is_asked) == (1, True)
 
 
-def test_an_interrupted_stop_begins_anew_and_asks_again(stopover: SettleAndMeasure, mirror: Mirror) -> None:
-    for k in range(2):
-        settled = next(j for j in range(1000 * k, 1000 * k + 100) if stopover.has_settled(at(mirror, j)))
-        assert any(stopover.is_due(at(mirror, j)) for j in range(settled, settled + 60))
-        stopover.interrupt()
-        assert not stopover.is_asked
-    assert stopover.request == 2
-
-
-def test_the_measuring_time_begins_anew_where_the_robot_moves_once_more(
-    stopover: SettleAndMeasure, mirror: Mirror
-) -> None:
-    settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
-    moves = range(settled + 20, settled + 30)
-    asked = [k for k in range(settled, settled + 200) if stopover.is_due(at(mirror, k, speed_m_s=0.01 * (k in moves)))]
-    assert len(asked) == 1
-    assert asked[0] > moves[-1] + round(MEASURING_S / DT)  # the mean speed takes its time to forget the motion
-
-
 @pytest.mark.fault("E9")
 def test_who_moves_for_ever_is_never_measured_and_restless(stopover: SettleAndMeasure, mirror: Mirror) -> None:
     settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
@@ -123,18 +104,6 @@ def test_at_rest_after_the_settling_time_below_both_limits(config: Config) -> No
 @pytest.mark.parametrize("speed", [lambda c: 1.1 * c.settle_speed_m_s, lambda c: -1.1 * c.settle_speed_m_s])
 def test_a_robot_that_creeps_never_rests(config: Config, speed: Callable[[object], float]) -> None:
     assert first_rest(config, [speed(config.control)] * 1000, [0.0] * 1000) is None
-
-
-def test_a_robot_that_goes_on_turning_never_rests(config: Config) -> None:
-    assert first_rest(config, [0.0] * 1000, [1.1 * config.control.settle_rate_rad_s] * 1000) is None
-
-
-def test_fans_that_shake_it_do_not_keep_it_from_resting(config: Config) -> None:
-    # A bounded jitter: 0.02 rad/s to and fro, never below the limit and without a mean.
-    rates = [0.02 * (-1.0) ** k for k in range(200)]
-    rested = first_rest(config, [0.0] * 200, rates)
-    assert rested is not None
-    assert rested < 50  # half a second
 
 
 def test_wheels_that_run_down_rest_when_they_are_slow_and_no_earlier(config: Config) -> None:
@@ -212,13 +181,6 @@ def test_no_sensor_may_pass_the_rim_on_the_way(corrector: Corrector, mirror: Mir
         assert (corrector.aim(pose, (pose.x_m - 0.03, pose.y_m + 0.001)) is not None) is is_safe
 
 
-def test_no_correction_ends_with_a_sensor_beyond_the_rim(corrector: Corrector, mirror: Mirror) -> None:
-    outward = at_the_rim(mirror, 0.105)
-    facing = PanelPose(outward.panel, outward.x_m, outward.y_m, outward.heading_rad - pi / 2)
-    assert corrector.aim(facing, (facing.x_m + 0.004, facing.y_m)) is not None
-    assert corrector.aim(facing, (facing.x_m + 0.012, facing.y_m)) is None
-
-
 def test_after_a_correction_a_turn_at_the_rim_is_looked_at(corrector: Corrector, mirror: Mirror) -> None:
     for depth_m, is_safe in ((0.105, False), (0.2, True)):
         pose = mirror.deck_pose(at_the_rim(mirror, depth_m))
@@ -250,20 +212,6 @@ def test_the_last_approach_counts_wherever_it_ends_and_each_point_has_its_own() 
     assert approaches.count == 3
     assert approaches.is_too_far(THERE, 5e-3, 0.0)
     assert approaches.count == 1
-
-
-@pytest.mark.parametrize("sigma_m", [2e-6, 2e-5])
-def test_what_counts_as_near_enough_is_so_in_truth(sigma_m: float) -> None:
-    # Distances that end just inside and just outside; what lets a puck pass that is outside needs an error of 3 sigma.
-    rng = np.random.default_rng(1)
-    true_m = 3e-3 + rng.uniform(-2e-4, 2e-4, 20_000)
-    measured_m = true_m + sigma_m * rng.standard_normal(true_m.size)
-    passed = np.array(
-        [not ApproachCounter(3e-3, 3).is_too_far(HERE, error_m, sigma_m) for error_m in measured_m.tolist()]
-    )
-    assert 0.2 < passed.mean() < 0.5
-    assert (true_m[passed] > 3e-3).sum() <= 1e-4 * passed.sum()
-    assert true_m[passed].max() < 3e-3 + sigma_m
 
 
 CFG = load_config()
@@ -337,13 +285,6 @@ def test_a_turn_away_that_sweeps_a_corner_over_the_rim_is_undone() -> None:
     assert not any(off_at(end))
     turned = -end[2]
     assert 0.0 < turned < CFG.mission.turn_away_rad
-
-
-def test_one_that_may_not_be_undone_ends_with_what_is_gained() -> None:
-    start = (1.0, 0.1, 0.0)
-    end, seen = retreated(start, may_turn=False, blames=(True, False, False, False))
-    assert seen == [RetreatStep.BACK, RetreatStep.TURN_AWAY, RetreatStep.UNTURN, RetreatStep.OVER]
-    assert start[0] - end[0] == pytest.approx(0.5 * CFG.mission.backoff_m, abs=2e-3)
 
 
 @pytest.mark.parametrize("cause", [Cause.NO_MAP, Cause.SEAM])
@@ -421,16 +362,6 @@ def test_a_slope_that_differs_by_more_than_5_deg_never_passes(name: str) -> None
     for by_deg in (-1.5, 0.0, 1.5):
         for seed in range(SEEDS):
             assert not check(mirror, tilted(mirror, mirror.base_pose, by_deg, 0.4 * seed), seed).contradiction, by_deg
-
-
-def test_a_few_readings_of_garbage_do_no_harm() -> None:
-    mirror = mirror_of("fyst-m1")
-    found = MirrorCheck(mirror)
-    good = (0.0, *mirror.gravity_in_robot(mirror.base_pose))
-    for k in range(READINGS):
-        is_over = found.hear(0.05 * k, (0.0, 0.0, 0.0, 1.0) if k % 3 == 0 else good, mirror.base_pose)
-    assert is_over
-    assert not found.contradiction
 
 
 def test_a_robot_without_the_sensor_is_waited_for_and_told() -> None:

@@ -51,12 +51,6 @@ def at(mirror: Mirror, body: Body, point: PointId) -> LegPlace:
     return place(mirror, body, *mirror.point_on_deck(point))
 
 
-def test_body(thesis: Any) -> None:
-    body = body_of(thesis)
-    assert body.reach_m == pytest.approx(0.09 * sqrt(2.0))
-    assert body.turning_depth_m == pytest.approx(0.1273 + 0.005 + 0.001, abs=1e-4)  # reach rounded to 0.1 mm
-
-
 def test_sensor_depths_are_those_of_the_mirror(thesis: Any) -> None:
     mirror, body = thesis.mirror, body_of(thesis)
     pose = DeckPose(3.6, 0.4, 0.3)
@@ -66,13 +60,6 @@ def test_sensor_depths_are_those_of_the_mirror(thesis: Any) -> None:
     )
     depths = sensor_depths(mirror, body, np.array(3.6), np.array(0.4), np.array(np.arctan2(hy, hx)))
     assert float(depths) == pytest.approx(expected, abs=1e-12)
-
-
-def test_a_place_far_from_the_rim_has_no_limits(thesis: Any) -> None:
-    inner = place(thesis.mirror, body_of(thesis), 0.1, 0.2)
-    assert inner.stance is None
-    assert inner.can_face(0.7)
-    assert inner.can_turn(0.0, 3.1)
 
 
 @pytest.mark.parametrize("k", range(4))
@@ -100,18 +87,6 @@ def test_half_a_turn_needs_room_on_both_sides() -> None:
     assert not stance.can_turn(0.0, pi)
 
 
-def test_turns_across_north_and_many_turns_around() -> None:
-    free = np.zeros(360, dtype=np.bool_)
-    free[350:] = free[:11] = True
-    stance = Stance(free)
-    for turns in (-3, 0, 5):
-        offset = 2.0 * pi * turns
-        assert stance.can_turn(radians(351.5) + offset, radians(8.5))
-        assert stance.can_turn(radians(8.5), radians(-8.5) + offset)
-        assert not stance.can_turn(radians(8.5), radians(12.0) + offset)
-        assert not stance.can_face(radians(180.0) + offset)
-
-
 def test_retreats_allow_turning_and_are_straight_moves_the_place_allows(world: Any) -> None:
     mirror, body = world.mirror, body_of(world)
     points = [point for panel in mirror.panels for point in mirror.point_ids(panel)]
@@ -129,13 +104,6 @@ def test_retreats_allow_turning_and_are_straight_moves_the_place_allows(world: A
             assert spot.can_face(course) or spot.can_face(course + pi)
 
 
-def test_retreat_at_a_straight_rim_leads_straight_inward(thesis: Any) -> None:
-    mirror, body = thesis.mirror, body_of(thesis)
-    spot = at(mirror, body, PointId(5, 11, 6))
-    inward = [(r.x_m - spot.x_m, r.y_m - spot.y_m) for r in find_retreats(mirror, body, [spot])[0]]
-    assert any(dx == pytest.approx(-0.02) and dy == pytest.approx(0.0, abs=1e-12) for dx, dy in inward)
-
-
 def test_retreat_in_a_corner_is_slanted(thesis: Any) -> None:
     mirror, body = thesis.mirror, body_of(thesis)
     assert PanelId(1, 3) in mirror.panels
@@ -145,11 +113,6 @@ def test_retreat_in_a_corner_is_slanted(thesis: Any) -> None:
     assert all(dx > 0.015 and dy > 0.01 for dx, dy in moves)  # 133 mm are needed, 115 and 122 there
 
 
-def test_no_retreat_where_there_is_none(small: Any) -> None:
-    mirror, body = small.mirror, body_of(small)
-    assert find_retreats(mirror, body, [place(mirror, body, mirror.base_pose.x_m, mirror.base_pose.y_m)]) == [()]
-
-
 ROUNDING = 1e-12
 
 
@@ -157,17 +120,6 @@ ROUNDING = 1e-12
 def test_there_and_back(heading: float, world: Any) -> None:
     course = course_of_heading(world.mirror, DeckPose(1.5, -2.0, heading))
     assert difference(heading_of_course(world.mirror, 1.5, -2.0, course), heading) == pytest.approx(0.0, abs=ROUNDING)
-
-
-def test_along_x_both_are_the_same(world: Any) -> None:
-    assert heading_of_course(world.mirror, 1.5, -2.0, 0.0) == pytest.approx(0.0, abs=ROUNDING)
-
-
-def test_they_differ_where_the_mirror_slopes_both_ways(world: Any) -> None:
-    mirror = world.mirror
-    fx, fy = mirror.surface.gradient(2.0, 2.0)
-    # The tangents of the lines x = const and y = const are fx fy off a right angle, to first order.
-    assert heading_of_course(mirror, 2.0, 2.0, pi / 2.0) == pytest.approx(pi / 2.0 - fx * fy, abs=2e-5)
 
 
 STOP = Stop(0.7, 0.0, StopKind.MEASURE, PointId(1, 2, 3), True)
@@ -245,29 +197,6 @@ def test_an_l_with_a_reverse_leg_and_a_final_heading(thesis: Any) -> None:
     assert sum(leg_lengths(stops, start, mirror)) == pytest.approx(0.7, abs=FLAT)
 
 
-def test_staying_where_one_is_costs_nothing(thesis: Any) -> None:
-    stop = Stop(0.5, 0.5, StopKind.VIA)
-    assert stop_times((stop,), DeckPose(0.5, 0.5, 2.0), thesis.cfg.limits, thesis.mirror) == [0.0]
-    assert path_time((), DeckPose(0.5, 0.5, 2.0), thesis.cfg.limits, thesis.mirror, 0.5) == 0.0
-
-
-def test_legs_are_measured_on_the_surface(thesis: Any) -> None:
-    mirror = thesis.mirror
-    a, b = (2.4, 0.0), (2.7, 0.0)
-    rise = mirror.surface.height_m(*b) - mirror.surface.height_m(*a)
-    length = leg_lengths((Stop(*b, StopKind.VIA),), DeckPose(*a, 0.0), mirror)[0]
-    assert length == pytest.approx(sqrt(0.3**2 + rise**2), rel=1e-12)
-    assert length > 0.3 + 5e-5  # a slope of 0.04 adds a thousandth
-
-
-def test_no_tour_through_the_points_beats_the_bound_of_its_legs(world: Any) -> None:
-    mirror, limits = world.mirror, world.cfg.limits
-    points = thesis_order(mirror, 9)
-    bare = tuple(Stop(x, y, StopKind.MEASURE) for x, y in map(mirror.point_on_deck, points))
-    time_s = path_time(bare, mirror.base_pose, limits, mirror, 0.5)
-    assert time_s >= sum(leg_lengths(bare, mirror.base_pose, mirror)) / limits.v_max_m_s + 0.5 * len(points)
-
-
 ROUNDING_S = 1e-6  # sums of some thousand terms, at prices of some seconds
 
 
@@ -286,7 +215,7 @@ def fastest_drive(world: Any, order: Sequence[PointId], limits: LimitsConfig) ->
     return path_time(stops, mirror.base_pose, limits, mirror, 0.5)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(0, 12, 4))
 def test_no_tour_of_a_few_points_beats_it(seed: int, world: Any) -> None:
     """All 120 orders of five points, from far apart to neighbours; slow and fast turns."""
     rng = np.random.default_rng(seed)
@@ -299,58 +228,11 @@ def test_no_tour_of_a_few_points_beats_it(seed: int, world: Any) -> None:
     assert bound > 0.6 * best  # measured: from 0.7 up; what it lacks are closed rounds that no tour may take
 
 
-@pytest.mark.parametrize("near", [1, 2, 3])
-@pytest.mark.parametrize("seed", range(6))
-def test_legs_that_are_not_near_make_it_lower_only(
-    seed: int, near: int, thesis: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    points = thesis_order(thesis.mirror, 1 + seed)
-    chosen = [points[k] for k in np.random.default_rng(seed).choice(len(points), 5, replace=False)]
-    best = min(fastest_drive(thesis, order, thesis.cfg.limits) for order in permutations(chosen))
-    whole = tour_bound(thesis.mirror, chosen, thesis.cfg.limits, 0.5)
-    monkeypatch.setattr("ccatp.survey.planning.tour_bound._NEAR", near)
-    bound = tour_bound(thesis.mirror, chosen, thesis.cfg.limits, 0.5)
-    assert 0.3 * best < bound <= whole + ROUNDING_S <= best + 2.0 * ROUNDING_S
-
-
-def test_no_tour_of_one_panel_beats_it(thesis: Any) -> None:
-    """Nine points have far legs too; the best of many thousand orders comes near."""
-    points = thesis_order(thesis.mirror, 1)
-    bound = tour_bound(thesis.mirror, points, thesis.cfg.limits, 0.5)
-    first, rest = points[0], points[1:7]
-    best = min(fastest_drive(thesis, (first, *order, *points[7:]), thesis.cfg.limits) for order in permutations(rest))
-    assert 0.85 * best < bound <= best + ROUNDING_S  # measured: 0.88
-
-
-def test_one_point_exactly(world: Any) -> None:
-    mirror, limits = world.mirror, world.cfg.limits
-    for point in thesis_order(mirror)[::50]:
-        exact = fastest_drive(world, (point,), limits)
-        assert tour_bound(mirror, [point], limits, 0.5) == pytest.approx(exact, abs=ROUNDING_S)
-
-
 def test_two_points_exactly(thesis: Any) -> None:
     """The nearer one first, both legs and the turns at base and at it."""
     near, far = PointId(1, 3, 1), PointId(1, 3, 2)
     exact = min(fastest_drive(thesis, order, thesis.cfg.limits) for order in ((near, far), (far, near)))
     assert tour_bound(thesis.mirror, [far, near], thesis.cfg.limits, 0.5) == pytest.approx(exact, abs=ROUNDING_S)
-
-
-def test_a_straight_row_is_bounded_exactly(thesis: Any) -> None:
-    """Nothing has to be turned for between its ends: all legs but the first are those of the row."""
-    row = [PointId(1, col, number) for col in (3, 4) for number in (1, 2, 3)]
-    exact = fastest_drive(thesis, row, thesis.cfg.limits)
-    assert tour_bound(thesis.mirror, row, thesis.cfg.limits, 0.5) == pytest.approx(exact, abs=1e-3)
-
-
-def test_turns_at_the_ends_of_lines_count(thesis: Any) -> None:
-    """A serpentine needs 52 quarter turns; of at least half of them the bound knows that no tour does without."""
-    mirror, limits = thesis.mirror, thesis.cfg.limits
-    points = optimised_order(mirror)
-    at_once = limits.model_copy(update={"omega_max_rad_s": 5.0, "alpha_max_rad_s2": 20.0})
-    quarter_s = turn_time(pi / 2.0, limits) - turn_time(pi / 2.0, at_once)
-    more = tour_bound(mirror, points, limits, 0.5) - tour_bound(mirror, points, at_once, 0.5)
-    assert 25 * quarter_s < more < 2 * 27 * quarter_s  # measured: 29
 
 
 def test_measuring_time_counts_per_point(thesis: Any) -> None:
@@ -428,20 +310,6 @@ def test_leaves_the_rim_without_sweeping_it(heading: float, thesis: Any) -> None
     if heading in {0.0, pi}:  # straight back, or straight ahead
         assert first.y_m == pytest.approx(0.0, abs=0.002)  # the surface turns headings by some mrad
         assert first.reverse == (heading == 0.0)
-
-
-def test_out_of_a_corner_in_reverse(thesis: Any) -> None:
-    mirror = thesis.mirror
-    first = go(thesis, DeckPose(2.30, -3.28, -pi / 4.0))[0]  # facing the lower right corner, 75 mm from both sides
-    assert first.reverse
-    assert first.y_m + 3.28 == pytest.approx(2.30 - first.x_m, abs=1e-3)  # straight back along the diagonal
-    assert mirror.rim.signed_distance_m(first.x_m, first.y_m) > 0.1323
-
-
-def test_from_base_to_base(thesis: Any) -> None:
-    base = thesis.mirror.base_pose
-    assert go(thesis, base)[-1].kind is StopKind.BASE
-    assert len(go(thesis, base)) == 1
 
 
 def test_base_near_the_rim_is_entered_the_way_that_allows_its_heading(thesis: Any) -> None:

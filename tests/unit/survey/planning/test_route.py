@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from ccatp.config.load import load_config
-from ccatp.config.models import LimitsConfig
 from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.survey.planning.escape import plan_way_home
@@ -25,7 +24,6 @@ from ccatp.survey.planning.legs import (
 )
 from ccatp.survey.planning.route import (
     NOMINAL_LIMITS,
-    ORDERS,
     Route,
     fastest_serpentine,
     optimised_order,
@@ -65,12 +63,6 @@ def test_straight_legs_at_stepped_corners_come_too_near_the_rim(thesis: Any) -> 
         assert all(stop.kind is StopKind.VIA for stop in stops[last + 1 : first])
 
 
-def test_some_straight_legs_leave_the_mirror(thesis: Any) -> None:
-    mirror = thesis.mirror
-    a, b = PointId(7, 11, 9), PointId(8, 10, 9)
-    assert mirror.rim.segment_clearance_m(*mirror.point_on_deck(a), *mirror.point_on_deck(b)) < 0.0
-
-
 def test_whole_surveys_fit_into_the_hour(world: Any) -> None:
     points = thesis_order(world.mirror)
     route = plan(world, points, measuring_time_s=0.5)
@@ -97,13 +89,6 @@ def test_largest_leg_of_thesis_m1(thesis: Any) -> None:
     assert legs_of(cfg.mission.longest_leg_m)[-1] <= cfg.mission.longest_leg_m
 
 
-def test_points_of_a_row_need_no_stops_between(thesis: Any) -> None:
-    points = [point for point in thesis_order(thesis.mirror) if (point.row, point.col) in {(5, 5), (5, 6)}]
-    stops = plan(thesis, points).stops
-    first = next(k for k, stop in enumerate(stops) if stop.kind is StopKind.MEASURE)
-    assert len(stops[first:]) == 18
-
-
 def test_done_points_are_left_out(thesis: Any) -> None:
     points = thesis_order(thesis.mirror, 2)
     route = plan(thesis, points, skip=points[3:12])
@@ -120,11 +105,6 @@ def test_remaining_time_and_way(thesis: Any) -> None:
     last = len(route.stops) - 1
     assert 0.5 < route.remaining_s(last) < 10.0
     assert route.remaining_s(last + 1) == 0.0
-
-
-def test_the_route_is_the_same_every_time(thesis: Any) -> None:
-    points = thesis_order(thesis.mirror, 9)
-    assert plan(thesis, points) == plan(thesis, points)
 
 
 def test_start_beyond_the_rim(thesis: Any) -> None:
@@ -174,32 +154,6 @@ def test_way_around_several_corners(thesis: Any) -> None:
     slanted = [lower, *rules.way_around(lower, middle), middle]
     assert len(slanted) == 3  # clear, but at 25 degrees it would lead a sensor along the seams between rows
     assert rules.is_clear(lower, middle)
-
-
-def test_no_way_to_a_place_in_the_clearance(thesis: Any) -> None:
-    mirror, body = thesis.mirror, build_body(thesis.cfg.robot, thesis.cfg.mission)
-    inner, near = build_places(mirror, body, np.array([0.0, 3.7]), np.array([0.0, 0.0]))
-    assert near.depth_m < 0.1
-    assert LegRules(mirror, body).way_around(inner, near) == ()
-
-
-def test_sensors_at_a_re_entrant_corner(thesis: Any) -> None:
-    """A leg that ends beside a stepped corner passes it at 0.1 m with its origin, but not with a sensor."""
-    mirror, body = thesis.mirror, build_body(thesis.cfg.robot, thesis.cfg.mission)
-    rules = LegRules(mirror, body)
-    corner_x, corner_y = 2.375, -2.599  # upper right corner of panel 1-9, below panel 2-10
-    assert mirror.rim.signed_distance_m(corner_x, corner_y) == pytest.approx(0.0, abs=1e-9)
-    a, b, deep = build_places(
-        mirror,
-        body,
-        np.array([corner_x - 0.09, corner_x - 0.09, corner_x - 0.30]),
-        np.array([corner_y - 0.40, corner_y - 0.05, corner_y - 0.05]),
-    )
-    clearance = rules.clearance_m(a, b)
-    upward = float(np.pi / 2.0)
-    assert not rules.are_sensors_clear(a, b, upward, clearance)
-    assert rules.are_sensors_clear(a, deep, upward, 1.0)
-    assert rules.are_sensors_clear(deep, deep, upward, rules.clearance_m(deep, deep))
 
 
 def test_no_leg_whose_sensors_clip_a_re_entrant_corner(thesis: Any) -> None:
@@ -283,9 +237,6 @@ def test_which_legs_graze_a_seam(
     assert rules.grazing(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m)) is grazes
 
 
-LONGEST_STEP_M = 0.27  # neighbours on one line are 220 to 254 mm apart
-
-
 def bends(mirror: Mirror, order: list[PointId]) -> int:
     """Points of an order at which it turns by more than 10 degrees, driven either way."""
     xy = [mirror.point_on_deck(point) for point in order]
@@ -305,48 +256,11 @@ def test_one_straight_run_per_line(world: Any) -> None:
     assert bends(world.mirror, thesis_order(world.mirror)) > 250  # four or so on each panel
 
 
-def test_only_the_ends_of_lines_are_further_apart(world: Any) -> None:
-    xy = [world.mirror.point_on_deck(point) for point in optimised_order(world.mirror)]
-    lengths = [hypot(bx - ax, by - ay) for (ax, ay), (bx, by) in pairwise(xy)]
-    assert sum(length > LONGEST_STEP_M for length in lengths) <= 4  # the steps of the outline
-    assert max(lengths) < 0.8
-
-
-def test_eight_serpentines_of_one_panel(thesis: Any) -> None:
-    found = [tuple(point.point for point in order) for order in serpentines(thesis_order(thesis.mirror, 1))]
-    assert found == [
-        (1, 2, 3, 6, 5, 4, 7, 8, 9),
-        (3, 2, 1, 4, 5, 6, 9, 8, 7),
-        (7, 8, 9, 6, 5, 4, 1, 2, 3),
-        (9, 8, 7, 4, 5, 6, 3, 2, 1),
-        (1, 4, 7, 8, 5, 2, 3, 6, 9),
-        (7, 4, 1, 2, 5, 8, 9, 6, 3),
-        (3, 6, 9, 8, 5, 2, 1, 4, 7),
-        (9, 6, 3, 2, 5, 8, 7, 4, 1),
-    ]
-
-
 def test_the_fastest_is_taken(world: Any) -> None:
     points = thesis_order(world.mirror)
     times = [bare_time(world, order) for order in serpentines(points)]
     assert bare_time(world, fastest_serpentine(world.mirror, points, world.cfg.limits)) == min(times)
     assert max(times) > min(times) + 60.0  # the choice counts: from 2 % of a mirror up
-
-
-def test_a_robot_that_turns_slowly_takes_the_longer_lines(thesis: Any) -> None:
-    """Two panels side by side: three lines of six points, or six of three."""
-    slow = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=0.05, alpha_max_rad_s2=2.0)
-    points = thesis_order(thesis.mirror, 2)
-    order = fastest_serpentine(thesis.mirror, points, slow)
-    assert bends(thesis.mirror, order) == 4  # three rows; along the columns there would be ten
-    assert fastest_serpentine(thesis.mirror, [], slow) == []
-
-
-def test_the_order_of_the_points_given_does_not_matter(thesis: Any) -> None:
-    points = thesis_order(thesis.mirror, 12)
-    expected = fastest_serpentine(thesis.mirror, points, NOMINAL_LIMITS)
-    assert fastest_serpentine(thesis.mirror, points[::-1], NOMINAL_LIMITS) == expected
-    assert ORDERS["optimised"](thesis.mirror, 12) == expected
 
 
 def test_nominal_limits_are_the_shipped_ones(world: Any) -> None:
@@ -356,16 +270,6 @@ def test_nominal_limits_are_the_shipped_ones(world: Any) -> None:
 def test_negative_number_of_panels(thesis: Any) -> None:
     with pytest.raises(ValueError, match=r"panels = -1: .* 0 \(= all\)"):
         optimised_order(thesis.mirror, -1)
-
-
-def test_few_stops_on_the_way(world: Any) -> None:
-    """At most two at each change of line, and one on the way into the mirror; long legs left whole."""
-    cfg, mirror = world.cfg, world.mirror
-    mission = cfg.mission.model_copy(update={"longest_leg_m": 2.0})
-    route = plan_route(mirror, optimised_order(mirror), cfg.robot, cfg.limits, mission, mirror.base_pose)
-    assert sum(stop.kind is StopKind.VIA for stop in route.stops) <= 2 * 26 + 1
-    # In reverse it leaves the rim, and at most every third line whole.
-    assert sum(stop.reverse for stop in route.stops) < len(route.stops) / 3
 
 
 @pytest.mark.parametrize(
@@ -383,53 +287,7 @@ def test_orders_of_table_3_1(panel: PanelId, numbers: tuple[int, ...], thesis: A
     assert tuple(order) == numbers
 
 
-@pytest.mark.parametrize(
-    ("panel", "first", "last"),
-    [
-        (PanelId(3, 5), ("left", "lower"), ("right", "upper")),
-        (PanelId(3, 6), ("left", "upper"), ("right", "lower")),
-        (PanelId(4, 5), ("right", "lower"), ("left", "upper")),
-        (PanelId(4, 6), ("right", "upper"), ("left", "lower")),
-    ],
-)
-def test_where_an_order_begins_and_ends(
-    panel: PanelId, first: tuple[str, str], last: tuple[str, str], thesis: Any
-) -> None:
-    mirror: Mirror = thesis.mirror
-    points = [point for point in thesis_order(mirror) if point.panel == panel]
-    for point, (side, height) in ((points[0], first), (points[-1], last)):
-        x, y = mirror.point_on_deck(point)
-        centre = mirror.panels[panel]
-        assert (x < centre.x_m - 0.2) == (side == "left")
-        assert (y < centre.y_m - 0.2) == (height == "lower")
-
-
-def test_odd_rows_run_towards_plus_column_and_even_rows_back(world: Any) -> None:
-    panels = list(dict.fromkeys(point.panel for point in thesis_order(world.mirror)))
-    for row in range(1, world.mirror.rows + 1):
-        cols = [panel.col for panel in panels if panel.row == row]
-        assert cols == sorted(cols, reverse=row % 2 == 0)
-    assert [panel.row for panel in panels] == sorted(panel.row for panel in panels)
-
-
-def test_within_a_panel_each_point_is_next_to_the_last(world: Any) -> None:
-    points = thesis_order(world.mirror)
-    for a, b in pairwise(points):
-        if a.panel == b.panel:
-            (ya, xa), (yb, xb) = divmod(a.point - 1, 3), divmod(b.point - 1, 3)
-            assert abs(ya - yb) + abs(xa - xb) == 1
-
-
 def test_first_panels(load: Callable[[str], Any]) -> None:
     mirror = load("fyst-m1").mirror
     assert thesis_order(mirror, 3) == thesis_order(mirror)[:27]
     assert thesis_order(mirror, 1000) == thesis_order(mirror)
-
-
-def test_registry(thesis: Any) -> None:
-    assert ORDERS["thesis"](thesis.mirror, 1) == thesis_order(thesis.mirror, 1)
-
-
-def test_negative_number_of_panels_of_traversal(thesis: Any) -> None:
-    with pytest.raises(ValueError, match=r"panels = -1: .* 0 \(= all\)"):
-        thesis_order(thesis.mirror, -1)
