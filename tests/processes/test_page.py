@@ -52,7 +52,7 @@ def browser_page(port: int) -> Iterator[Page]:
 
 
 def test_an_operator_looks_and_aborts(start: Start) -> None:
-    run = start("--panels", "2", "--realtime", *WITH_PAGE)
+    run = start("--panels", "9", *WITH_PAGE)
     run.until_state("turning", "driving")
     with browser_page(page_port(run)) as page:
         sees_a_running_survey(page)
@@ -68,12 +68,12 @@ def test_an_operator_looks_and_aborts(start: Start) -> None:
 
 def sees_a_running_survey(page: Page) -> None:
     expect(page.locator("#simulation")).to_be_visible()
-    expect(page.locator("#total")).to_have_text("18")
+    expect(page.locator("#total")).to_have_text("81")
     expect(page.locator("#state")).to_have_attribute("data-level", "good")
     expect(page.locator("#verdict")).to_contain_text("0 normal operation")
     expect(page.locator("#links li[data-well=yes]")).to_have_count(4)
     expect(page.locator("#pose-xy")).to_contain_text(" m")
-    expect(page.locator("#map")).to_have_attribute("aria-label", re.compile(r"Map: robot at .* m, \d+ of 18 points"))
+    expect(page.locator("#map")).to_have_attribute("aria-label", re.compile(r"Map: robot at .* m, \d+ of 81 points"))
     expect(page.locator("#done")).to_have_text(re.compile("^[1-9]"))
     expect(page.locator("#plot-arrival")).to_have_attribute("aria-label", re.compile("latest arrival error 0"))
     sees_the_map_move(page)

@@ -65,7 +65,7 @@ def test_two_panels_after_a_calibration_drive(start: Start, mirror: str) -> None
 
 def test_four_processes_beside_the_supervisor_and_two_interrupts_end_as_one(start: Start) -> None:
     run = start("--panels", "9")
-    run.until(lambda status: status["done"] >= 2)
+    run.until(lambda status: status["done"] >= 1)
     children = [" ".join(child.cmdline()) for child in psutil.Process(run.process.pid).children()]
     modules = {line.split("ccatp.daemon.")[1].split()[0] for line in children}
     assert modules == {"sim_robot", "sim_etalon", "danger_loop", "main_loop"}
@@ -75,11 +75,11 @@ def test_four_processes_beside_the_supervisor_and_two_interrupts_end_as_one(star
     assert "Traceback" not in run.stderr
     assert f"report  none; make it with: ccatp report {run.run_dir}" in run.stderr
     assert not (run.run_dir / "report.html").exists()
-    assert run.measured == run.summary["points"]["measured"] >= 2
+    assert run.measured == run.summary["points"]["measured"] >= 1
 
 
 def test_a_simulated_robot_that_dies_ends_the_run_with_a_line(start: Start) -> None:
-    run = start("--panels", "1", "--realtime")
+    run = start("--panels", "9")
     run.until_state("driving")
     run.send("dataloop")
     assert run.wait() == 4
@@ -126,9 +126,10 @@ def test_a_lockstep_pause_stops_simulated_time_but_no_emergency(start: Start) ->
 
 @pytest.mark.fault("P22")
 def test_a_run_directory_and_a_runtime_directory_belong_to_one_run(start: Start, tmp_path: Path) -> None:
-    first = start("--panels", "1", "--realtime")
+    first = start("--panels", "9")
     first.until_state("turning", "driving")
-    elsewhere = start("--resume", "--panels", "1", run_dir=first.run_dir, sockets=tmp_path.parent / "rt")
+    assert first.ask("pause")["ok"]
+    elsewhere = start("--resume", "--panels", "9", run_dir=first.run_dir, sockets=tmp_path.parent / "rt")
     assert elsewhere.wait() == 1
     assert "another ccatp runs in" in elsewhere.stderr
     second = start("--panels", "1")
