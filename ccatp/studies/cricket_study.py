@@ -19,10 +19,9 @@ from ccatp.config.load import load_radio_config
 from ccatp.config.models import Config
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import best_motion
-from ccatp.report.plots import QUIET
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.mote_runs import look_ahead, percentiles, run_batch, run_filter, simulate_field
-from ccatp.studies.results import LIMIT, band, bar, colour, plot, write_analysis
+from ccatp.studies.results import LIMIT, Measure, Range, Row, band, colour, draw_ranges, plot, write_analysis
 
 UPDATES = 300  # of figures 11 and 12 as we read them
 SHOWN = 30  # updates within which figure 14 comes down
@@ -160,7 +159,7 @@ def draw(cells: Sequence[CellResult], out: Path) -> None:
             _draw_traces(found, shown, title, goal_m, out / stem)
     if maps := [(name, title) for name, title in _MAPS if name in found]:
         _draw_maps(found, maps, out / "figure_9_10_13")
-    _draw_ways(cells, out / "ways")
+    draw_ranges([Row(str(cell.factors["case"]), cell) for cell in cells], WAYS, "All ways", out / "ways")
 
 
 def _draw_traces(found: Mapping[str, CellResult], names: Sequence[str], title: str, goal_m: float, stem: Path) -> None:
@@ -186,18 +185,17 @@ def _draw_maps(found: Mapping[str, CellResult], maps: Sequence[tuple[str, str]],
             axes.set(xlabel="x, m", ylabel="y, m", aspect="equal", xlim=(-1.2, 6.2), ylim=(-0.2, 9.2), title=title)
 
 
-def _draw_ways(cells: Sequence[CellResult], stem: Path) -> None:
-    with plot(stem, 8.5, 0.36 * len(cells) + 1.7) as (axes,):
-        for row, cell in enumerate(cells):
-            rms, bound_m = cell.values["rms_m"], cell.values["bound_m"]
-            shade = colour(0 if cell.values["method"] == "ekf" else 2)
-            bar(axes, [rms["p10"], rms["p90"]], [row, row], shade)
-            axes.plot(rms["p50"], row, "o", color=shade, markersize=5)
-            if bound_m is not None:
-                axes.plot([bound_m, bound_m], [row - 0.3, row + 0.3], color=QUIET, linewidth=1.4)
-        axes.set_yticks(range(len(cells)), [str(cell.factors["case"]) for cell in cells])
-        label = "root mean square error of a place, m: median (dot), 10 to 90 % (bar), Cramér-Rao bound (line)"
-        axes.set(ylim=(len(cells) - 0.5, -0.5), xscale="log", xlabel=label)
+def _rms(cell: CellResult) -> Range:
+    rms = cell.values["rms_m"]
+    return rms["p10"], rms["p50"], rms["p90"]
+
+
+WAYS = (
+    Measure(
+        "root mean square error of a place, m: median (dot), 10 to 90 % (bar), Cramér-Rao bound (mark)",
+        _rms, lambda cell: cell.values["bound_m"],
+    ),
+)  # fmt: skip
 
 
 STUDY = Study(

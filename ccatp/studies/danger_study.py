@@ -9,9 +9,10 @@ and an estimate of the pose every fifth frame.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from math import cos, hypot, pi, radians, sin, sqrt
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,10 +25,7 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.plant import Plant
 from ccatp.sim.sensors import SensorSuite, named
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
-from ccatp.studies.results import colour, grouped, plot
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from ccatp.studies.results import Measure, Range, draw_ranges, grouped, rows_by
 
 SPEEDS_M_S = (0.05, 0.10, 0.15, 0.20)
 TURN = "turn"
@@ -310,54 +308,26 @@ def bootstrap(values: FloatArray, q: float) -> tuple[float, float]:
     return low, high
 
 
+def _false_edges(rule: str, cell: CellResult) -> Range:
+    found = cell.values[rule]
+    return found["false_edge_low"], found["false_edge_probability"], found["false_edge_high"]
+
+
+def _overrun(rule: str, cell: CellResult) -> Range:
+    overrun_mm = 1e3 * cell.arrays[f"{rule}_overrun_m"]
+    return float(overrun_mm.min()), float(np.median(overrun_mm)), float(overrun_mm.max())
+
+
 def draw(results: Sequence[CellResult], out: Path) -> None:
     """Figures ``danger_false_edges_<mirror>`` and ``danger_overrun_<mirror>``, one panel per rule."""
     for (mirror,), there in grouped(results, "mirror").items():
-        title, label = f"A seam taken for an edge, {mirror}", "false edges per transit (95 %)"
-        _draw_rules(there, CROSSINGS, _false_edges, (title, label), out / f"danger_false_edges_{mirror}")
-        title, label = f"Where a drive over the rim ends: quartiles and range, {mirror}", "furthest sensor over it, mm"
-        _draw_rules(there, CROSSINGS[:-1], _overruns, (title, label), out / f"danger_overrun_{mirror}")
-
-
-_DrawWay = Callable[["Axes", str, FloatArray, Sequence[CellResult], str, str], None]
-
-
-def _draw_rules(
-    cells: Sequence[CellResult], ways: Sequence[int | str], draw_way: "_DrawWay", texts: tuple[str, str], stem: Path
-) -> None:
-    title, label = texts
-    with plot(stem, 9.0, 3.8, 1, len(RULES), title=title, legend=len(ways), sharey=True) as panels:
-        for axes, (rule, name) in zip(panels, RULES.items(), strict=True):
-            for k, way in enumerate(ways):
-                known = {cell.factors["speed_m_s"]: cell for cell in cells if cell.factors["crossing"] == way}
-                # Side by side, so that what belongs to the same speed can be distinguished.
-                places = np.array([v for v in SPEEDS_M_S if v in known]) + 0.004 * (k - 0.5 * (len(ways) - 1))
-                shown = [known[v] for v in SPEEDS_M_S if v in known]
-                draw_way(axes, rule, places, shown, colour(k), "turning in place" if way == TURN else f"{way}°")
-            axes.set(title=name, xlabel="speed of the robot, in turns of the sensors, m/s", xticks=SPEEDS_M_S)
-            axes.set_xlim(min(SPEEDS_M_S) - 0.02, max(SPEEDS_M_S) + 0.02)
-        panels[0].set_ylabel(label)
-
-
-def _false_edges(
-    axes: "Axes", rule: str, places: FloatArray, cells: Sequence[CellResult], shade: str, label: str
-) -> None:
-    names = ("false_edge_probability", "false_edge_low", "false_edge_high")
-    p, low, high = (np.array([cell.values[rule][name] for cell in cells]) for name in names)
-    bars = np.maximum(np.vstack([p - low, high - p]), 0.0)
-    axes.errorbar(places, p, bars, color=shade, marker="o", markersize=4, linewidth=1.2, capsize=2, label=label)
-    axes.set_ylim(-0.03, 1.03)
-
-
-def _overruns(axes: "Axes", rule: str, places: FloatArray, cells: Sequence[CellResult], shade: str, label: str) -> None:
-    samples, look = [1e3 * cell.arrays[f"{rule}_overrun_m"] for cell in cells], {"color": shade}
-    axes.boxplot(
-        samples, positions=places, widths=0.004, whis=(0, 100), manage_ticks=False, patch_artist=True,
-        boxprops={"facecolor": shade, "edgecolor": shade}, whiskerprops=look, capprops=look,
-        medianprops={"color": "white"},
-    )  # fmt: skip
-    axes.plot([], [], "s", color=shade, label=label)
-    axes.axhline(0.0, color="black", linewidth=0.8)
+        measures = [Measure(name, partial(_false_edges, rule), is_log=False) for rule, name in RULES.items()]
+        title, names = f"A seam taken for an edge on {mirror}: probability, 95 %", ("speed_m_s", "crossing")
+        draw_ranges(rows_by(there, *names), measures, title, out / f"danger_false_edges_{mirror}")
+        straight = [cell for cell in there if cell.factors["crossing"] != TURN]
+        measures = [Measure(name, partial(_overrun, rule), line=0.0, is_log=False) for rule, name in RULES.items()]
+        title = f"Furthest sensor beyond the rim, mm, on {mirror}: least, median, largest"
+        draw_ranges(rows_by(straight, *names), measures, title, out / f"danger_overrun_{mirror}")
 
 
 STUDY = Study(

@@ -31,11 +31,11 @@ from ccatp.beacons.steering import HALT
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.metrics import best_motion
-from ccatp.report.plots import INK, QUIET
+from ccatp.report.plots import INK
 from ccatp.sim.radio import SimDriveCommand, TruePose, TrueRadio
 from ccatp.sim.radio_world import RadioWorld
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
-from ccatp.studies.results import LIMIT, band, colour, grouped, plot
+from ccatp.studies.results import LIMIT, Measure, Range, Row, band, colour, draw_ranges, grouped, plot
 
 RadioStudy = partial(Study, mirrors=(), is_radio=True)
 
@@ -443,19 +443,24 @@ def combine_cases(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcom
 
 
 def draw_cases(results: Sequence[CellResult], out: Path) -> None:
-    """Figure ``radio_cases``: bars of the printed errors and of ours, for pose and beacons of each case."""
-    shown = [name for name in NAMES if name != "heading_rad"]
-    at = np.arange(len(shown))
-    with plot(out / "radio_cases", 3.4 * len(results) + 0.4, 3.8, 1, len(results), sharey=True) as panels:
-        for axes, result in zip(panels, results, strict=True):
-            ours = [result.values["pose_m"], *(result.values["beacon_rmse_m"].get(n, np.nan) for n in shown[1:])]
-            printed = [result.values["printed"][name] for name in shown]
-            axes.bar(at - 0.2, printed, 0.38, color=QUIET, label="2017, printed")
-            axes.bar(at + 0.2, ours, 0.38, color=colour(0), label="ours, mean of the runs")
-            axes.set_xticks(at, ["pose", *(name.replace("beacon", "b") for name in shown[1:])])
-            axes.set_title(f"case {result.factors['case']}")
-        panels[0].set_ylabel("RMSE, m")
-        panels[-1].legend(frameon=False, fontsize=8)
+    """Figure ``radio_cases``: the errors of pose and beacons of each case, ours (dot) and printed (mark)."""
+    measures = [
+        Measure(f"{name}, RMSE, m", partial(_case_error, name), partial(_printed_error, name), is_log=False)
+        for name in NAMES
+        if name != "heading_rad"
+    ]
+    rows = [Row(f"case {result.factors['case']}", result) for result in results]
+    draw_ranges(rows, measures, "Mean of the runs (dot), 2017 (mark)", out / "radio_cases")
+
+
+def _case_error(name: str, cell: CellResult) -> Range:
+    found = cell.values["pose_m"] if name == "pose_m" else cell.values["beacon_rmse_m"].get(name)
+    return None if found is None else (found, found, found)
+
+
+def _printed_error(name: str, cell: CellResult) -> float:
+    printed: float = cell.values["printed"][name]
+    return printed
 
 
 RADIO_CASES = RadioStudy(

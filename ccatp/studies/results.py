@@ -3,16 +3,16 @@
 import json
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ccatp.core import FloatArray
-from ccatp.report.plots import dress, new_figure, save_figure
+from ccatp.report.plots import INK, dress, new_figure, save_figure
 from ccatp.studies.campaign import CellResult, Column, Study
 
 if TYPE_CHECKING:
@@ -152,11 +152,6 @@ def plot(
         save_figure(figure, stem.with_suffix(suffix))
 
 
-def bar(axes: "Axes", x: Sequence[float], y: Sequence[float], shade: str) -> None:
-    """A range between two ends, for a dot upon it."""
-    axes.plot(x, y, color=shade, linewidth=3.0, alpha=0.35, solid_capstyle="butt")
-
-
 def band(
     axes: "Axes", x: NDArray[Any], ends: FloatArray, shade: str, style: Literal["-", "--"] = "-", label: str = ""
 ) -> None:
@@ -165,39 +160,69 @@ def band(
     axes.fill_between(x, ends[0], ends[2], color=shade, alpha=0.1, linewidth=0)
 
 
-_RANGES = (
-    ("localization error, mm", "localization_error_mm"),
-    ("first arrival error, mm", "arrival_error_mm"),
-    ("time / bound of the path", "time_ratio"),
-)
+Range = tuple[float, float, float] | None
+"""Low, middle and high; None where nothing is known."""
 
 
-def draw_ranges(rows: Sequence[tuple[str, CellResult, int, bool]], title: str, stem: Path) -> None:
-    """Errors and time of missions, a cell a line: mean as a dot, 99th percentile as the end of a bar.
+class Measure(NamedTuple):
+    """A panel of a figure of ranges.
 
-    ``rows``: label, cell, colour, and whether it is a base: its line is drawn through all others, to compare them with.
+    Attributes:
+        of: the range of a cell: its middle is a dot on a bar between the ends.
+        mark: a figure beside it, a bound or what was published; None for none.
+        line: where all should be, drawn through all cells.
     """
+
+    label: str
+    of: Callable[[CellResult], Range]
+    mark: Callable[[CellResult], float | None] = lambda _: None
+    line: float | None = None
+    is_log: bool = True
+
+
+class Row(NamedTuple):
+    """A line of a figure of ranges; those of a base are drawn through all others, which are compared with it."""
+
+    label: str
+    cell: CellResult
+    shade: int = 0
+    is_base: bool = False
+
+
+def rows_by(cells: Sequence[CellResult], factor: str, *others: str) -> list[Row]:
+    """A row for each cell, named by its factors, a colour for each level of the first one."""
+    known = levels(cells, factor)
+    return [
+        Row(", ".join(str(cell.factors[name]) for name in (factor, *others)), cell, known.index(cell.factors[factor]))
+        for cell in cells
+    ]
+
+
+def draw_ranges(rows: Sequence[Row], measures: Sequence[Measure], title: str, stem: Path) -> None:
+    """Figures of cells beside each other, a cell a line."""
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter  # noqa: PLC0415 - takes a second
 
-    title = f"{title}: mean (dot), 99th percentile (end of the bar)"
-    with plot(stem, 10.5, 0.27 * len(rows) + 1.6, 1, len(_RANGES), title=title, sharey=True) as panels:
-        for axes, (label, key) in zip(panels, _RANGES, strict=True):
-            for place, (_, cell, index, is_base) in enumerate(rows):
-                found = cell.values[key]
-                mean, tail = (found["mean"], found["p99"]) if isinstance(found, Mapping) else (found, None)
-                if mean is None:
+    with plot(stem, 10.5, 0.27 * len(rows) + 1.6, 1, len(measures), title=title, sharey=True) as panels:
+        for axes, (label, of, mark_of, line, is_log) in zip(panels, measures, strict=True):
+            for place, (_, cell, shade, is_base) in enumerate(rows):
+                found, mark = of(cell), mark_of(cell)
+                if found is None:
                     continue
+                low, middle, high = found
                 if is_base:
-                    axes.axvline(mean, color=colour(index), linewidth=0.9, linestyle="--", alpha=0.7)
-                if tail is not None:
-                    bar(axes, [mean, tail], [place] * 2, colour(index))
-                axes.plot(mean, place, "D" if is_base else "o", color=colour(index), markersize=5)
+                    axes.axvline(middle, color=colour(shade), linewidth=0.9, linestyle="--", alpha=0.7)
+                axes.plot([low, high], [place] * 2, color=colour(shade), linewidth=3.0, alpha=0.35)
+                axes.plot(middle, place, "D" if is_base else "o", color=colour(shade), markersize=5)
+                if mark is not None:
+                    axes.plot(mark, place, "|", color=INK, markersize=9, markeredgewidth=1.5)
+            if line is not None:
+                axes.axvline(line, color=LIMIT, linewidth=1.0, linestyle=":")
             axes.set_xlabel(label)
-        panels[0].set_yticks(range(len(rows)), [row[0] for row in rows])
+            axes.xaxis.set_major_locator(MaxNLocator(5))
+            if is_log:
+                axes.set_xscale("log")
+                axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))  # most lie within a decade or two
+                axes.xaxis.set_major_formatter("{x:g}")
+                axes.xaxis.set_minor_formatter(NullFormatter())
+        panels[0].set_yticks(range(len(rows)), [row.label for row in rows])
         panels[0].set_ylim(len(rows) - 0.5, -0.5)  # the first one on top
-        for axes in panels[:2]:
-            axes.set_xscale("log")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))  # most cells lie within a decade or two
-            axes.xaxis.set_major_formatter("{x:g}")
-            axes.xaxis.set_minor_formatter(NullFormatter())
-        panels[2].xaxis.set_major_locator(MaxNLocator(5))

@@ -14,7 +14,7 @@ import numpy as np
 from ccatp.config.load import load_config
 from ccatp.core import FloatArray
 from ccatp.mirror.mirror import build_mirror
-from ccatp.report.plots import GRID, INK, QUIET
+from ccatp.report.plots import INK, QUIET
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
 from ccatp.studies.cramer_rao import bounds_of, rehearse_recorded
 from ccatp.studies.mission_study import (
@@ -27,7 +27,7 @@ from ccatp.studies.mission_study import (
     nees,
     run_mission,
 )
-from ccatp.studies.results import LIMIT, bar, colour, draw_ranges, grouped, levels, plot
+from ccatp.studies.results import LIMIT, Measure, Range, Row, colour, draw_ranges, grouped, levels, plot, rows_by
 from ccatp.survey.planning.route import ORDERS
 from ccatp.survey.planning.tour_bound import tour_bound
 
@@ -92,8 +92,10 @@ def draw_filters(cells: Sequence[CellResult], out: Path) -> None:
     for (mirror,), there in grouped(cells, "mirror").items():
         _draw_exceedance(there, _localization, f"Localization error on {mirror}", out / f"localization-{mirror}")
         _draw_exceedance(there, _arrival, f"First arrival error on {mirror}", out / f"arrival-{mirror}")
-        _draw_bound(there, out / f"bound-{mirror}")
-        _draw_consistency(there, out / f"consistency-{mirror}")
+        rows = rows_by(there, "filter", "world")
+        draw_ranges(rows, BOUND, f"Stop errors and the least possible on {mirror}", out / f"bound-{mirror}")
+        title = f"Mean and 5 to 95 %; line: what a consistent filter has, on {mirror}"
+        draw_ranges(rows, CONSISTENCY, title, out / f"consistency-{mirror}")
 
 
 def _localization(cell: CellResult) -> tuple[FloatArray, FloatArray]:
@@ -129,64 +131,36 @@ def _draw_exceedance(
         panels[0].text(_LIMIT_MM * 1.08, 0.9, "10 mm", color=LIMIT, fontsize=8, va="top")
 
 
-def _draw_bound(cells: Sequence[CellResult], stem: Path) -> None:
-    """Rms error at the stops of each filter, and the bound of each world as a line under it."""
-    worlds, filters = levels(cells, "world"), levels(cells, "filter")
-    known = [cell for cell in cells if cell.values["bound"]["rms_mm"] is not None]
-    shown_mm = [cell.values["bound"][name] for cell in known for name in ("rms_mm", "error_rms_mm")] or [1.0]
-    with plot(stem, 6.4, 3.8, legend=len(filters) + 2) as (axes,):
-        for cell in known:
-            bound = cell.values["bound"]
-            at, shade = _place(cell, worlds, filters)
-            tight_mm, error_mm, bound_mm = bound["with_accelerometer"]["rms_mm"], bound["error_rms_mm"], bound["rms_mm"]
-            axes.plot([at - 0.09, at + 0.09], [bound_mm] * 2, color=INK, linewidth=1.5)
-            axes.plot([at - 0.09, at + 0.09], [tight_mm] * 2, color=INK, linewidth=1.0, linestyle=":")
-            axes.plot([at, at], [bound_mm, error_mm], color=GRID, linewidth=2.0, zorder=1)
-            axes.plot(at, error_mm, "o", color=shade, markersize=6)
-            axes.annotate(
-                f"{bound['ratio']:.3g}", (at, max(error_mm, bound_mm)), xytext=(0, 7), textcoords="offset points",
-                ha="center", fontsize=7, color=QUIET,
-            )  # fmt: skip
-        for index, name in enumerate(filters):
-            axes.plot([], [], "o", color=colour(index), label=name)
-        axes.plot([], [], color=INK, linewidth=1.5, label="posterior Cramér-Rao bound")
-        axes.plot([], [], color=INK, linewidth=1.0, linestyle=":", label="with the accelerometer")
-        ends = 10.0 ** np.floor(np.log10(min(shown_mm))), 10.0 ** np.ceil(np.log10(1.5 * max(shown_mm)))
-        axes.set(yscale="log", ylim=ends, ylabel="rms position error at the stops, mm")
-        axes.set_xticks(range(len(worlds)), worlds)
-        axes.set_title("Stop errors and the least possible; numbers: ratio")
+def _stop_error(cell: CellResult) -> Range:
+    bound = cell.values["bound"]
+    return None if bound["rms_mm"] is None else (bound["rms_mm"], bound["error_rms_mm"], bound["error_rms_mm"])
 
 
-def _draw_consistency(cells: Sequence[CellResult], stem: Path) -> None:
-    """Normalised errors: the middle 90 % as a bar, the mean as a dot, what a consistent filter has as a line."""
-    worlds, filters = levels(cells, "world"), levels(cells, "filter")
-    shown: tuple[tuple[str, float, Callable[[FloatArray], FloatArray]], ...] = (
-        ("NEES of the pose", 3.0, lambda stops: nees(first_arrivals(stops), 3)),
-        ("NEES of the position", 2.0, lambda stops: nees(first_arrivals(stops), 2)),
-        ("NIS of the fixes", 2.0, lambda stops: stops[:, COLUMN["nis"]]),
-    )
-    with plot(stem, 9.6, 3.6, 1, len(shown), legend=len(filters), sharey=True) as panels:
-        for axes, (title, expected, of) in zip(panels, shown, strict=True):
-            for cell in cells:
-                at, shade = _place(cell, worlds, filters)
-                values = of(cell.arrays["stops"][:, 1:])
-                known = values[np.isfinite(values)]
-                if known.size:
-                    low, high = np.percentile(known, (5.0, 95.0))
-                    bar(axes, [at, at], [max(low, 1e-3), high], shade)
-                    axes.plot(at, known.mean(), "o", color=shade, markersize=5)
-            axes.axhline(expected, color=LIMIT, linewidth=1.0, linestyle=":")
-            axes.set(yscale="log", title=f"{title} (consistent: {expected:g})")
-            axes.set_xticks(range(len(worlds)), worlds)
-        for index, name in enumerate(filters):
-            panels[0].plot([], [], "o", color=colour(index), label=name)
-        panels[0].set_ylabel("mean (dot), 5 to 95 % (bar)")
+def _spread(of: Callable[[FloatArray], FloatArray]) -> Callable[[CellResult], Range]:
+    """5 %, mean and 95 % of what is known of the stops of a cell."""
+
+    def range_of(cell: CellResult) -> Range:
+        values = of(cell.arrays["stops"][:, 1:])
+        known = values[np.isfinite(values)]
+        if not known.size:
+            return None
+        low, high = np.percentile(known, (5.0, 95.0)).tolist()
+        return max(low, 1e-3), float(known.mean()), high
+
+    return range_of
 
 
-def _place(cell: CellResult, worlds: Sequence[str], filters: Sequence[str]) -> tuple[float, str]:
-    """Of a filter within its world: x and colour."""
-    index = filters.index(str(cell.factors["filter"]))
-    return worlds.index(str(cell.factors["world"])) + 0.22 * (index - 0.5 * (len(filters) - 1)), colour(index)
+BOUND = (
+    Measure(
+        "rms position error at the stops (dot), posterior Cramér-Rao bound (end), with the accelerometer (mark), mm",
+        _stop_error, lambda cell: cell.values["bound"]["with_accelerometer"]["rms_mm"],
+    ),
+)  # fmt: skip
+CONSISTENCY = (
+    Measure("NEES of the pose", _spread(lambda stops: nees(first_arrivals(stops), 3)), line=3.0),
+    Measure("NEES of the position", _spread(lambda stops: nees(first_arrivals(stops), 2)), line=2.0),
+    Measure("NIS of the fixes", _spread(lambda stops: stops[:, COLUMN["nis"]]), line=2.0),
+)
 
 
 FILTERS = Study(
@@ -331,6 +305,27 @@ def sensitivity_cells() -> Sequence[Cell]:
     return found
 
 
+def _mean_to_p99(name: str) -> Callable[[CellResult], Range]:
+    def range_of(cell: CellResult) -> Range:
+        found = cell.values[name]
+        return None if found["mean"] is None else (found["mean"], found["mean"], found["p99"])
+
+    return range_of
+
+
+def _time_ratio(cell: CellResult) -> Range:
+    ratio = cell.values["time_ratio"]
+    return None if ratio is None else (ratio, ratio, ratio)
+
+
+MISSION = (
+    Measure("localization error, mm", _mean_to_p99("localization_error_mm")),
+    Measure("first arrival error, mm", _mean_to_p99("arrival_error_mm")),
+    Measure("time / bound of the path", _time_ratio, is_log=False),
+)
+_SHOWN = "mean (dot), 99th percentile (end of the bar)"
+
+
 def draw_sensitivity(cells: Sequence[CellResult], out: Path) -> None:
     """One figure for each mirror, the undisturbed and the fully disturbed world as lines."""
     worlds = levels(cells, "world")
@@ -339,8 +334,8 @@ def draw_sensitivity(cells: Sequence[CellResult], out: Path) -> None:
         for cell in there:
             world, group = cell.factors["world"], str(cell.factors["group"])
             is_base = group in _BASES
-            rows.append((f"world {world}" if is_base else group, cell, worlds.index(world), is_base))
-        draw_ranges(rows, f"What each disturbance costs on {mirror}", out / f"sensitivity-{mirror}")
+            rows.append(Row(f"world {world}" if is_base else group, cell, worlds.index(world), is_base))
+        draw_ranges(rows, MISSION, f"What each disturbance costs on {mirror}: {_SHOWN}", out / f"sensitivity-{mirror}")
 
 
 SENSITIVITY = Study(
@@ -401,8 +396,9 @@ def draw_ablation(cells: Sequence[CellResult], out: Path) -> None:
         for cell in there:
             name = str(cell.factors["without"])
             label = "with all" if name == ALL_ON else f"without {name}"
-            rows.append((label, cell, WORLDS.index(world), name == ALL_ON))
-        draw_ranges(rows, f"Without a technique, world {world} on {mirror}", out / f"ablation-{mirror}-{world}")
+            rows.append(Row(label, cell, WORLDS.index(world), name == ALL_ON))
+        title = f"Without a technique, world {world} on {mirror}: {_SHOWN}"
+        draw_ranges(rows, MISSION, title, out / f"ablation-{mirror}-{world}")
 
 
 ABLATION = Study(
