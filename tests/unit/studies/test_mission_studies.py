@@ -28,15 +28,7 @@ from ccatp.studies.mission_study import (
 )
 from ccatp.studies.results import plain, table
 from ccatp.studies.sil_run import SilTrace
-from ccatp.studies.survey_studies import (
-    ABLATION,
-    FILTERS,
-    GROUPS,
-    SENSITIVITY,
-    TIME,
-    combine_filters,
-    sensitivity_cells,
-)
+from ccatp.studies.survey_studies import ABLATION, FILTERS, GROUPS, SENSITIVITY, TIME, combine_filters
 from ccatp.survey.composition import assemble
 from tests.support.sim_survey import plan_of
 
@@ -61,21 +53,15 @@ def stops_of(errors_m: list[float], approaches: list[int] | None = None) -> np.n
 
 def mission(errors_m: list[float], approaches: list[int] | None = None, **changes: Any) -> JobOutcome:
     """A mission whose localization errors are those at its stops."""
-    values = {
-        "outcome": "complete",
-        "cause": "",
+    times = {"mission_time_s": 110.0, "lower_bound_s": 100.0, "tour_bound_s": 90.0, "budget_s": 3600.0}
+    counts = {"counts": {"fixes": 9}, "corrections": sum(a > 1 for a in approaches or [])}
+    values: dict[str, Any] = {"outcome": "complete", "cause": "", "within_budget": True, **times, **counts}
+    values |= {
         "points": {"total": 9, "measured": 9, "first_arrival_within_10mm": 9, "skipped": 0},
         "heading_error_mrad": {"count": 2, "square_sum": 8.0},
-        "mission_time_s": 110.0,
-        "lower_bound_s": 100.0,
-        "within_budget": True,
         "danger": {"true_edges": 0, "false_edges": 1, "falls": 0, "max_overrun_mm": 0.5},
         "panels": {"count": 1, "piston_rms_um": 3.0, "tilt_rms_urad": None},
-        "corrections": sum(a > 1 for a in approaches or []),
-        "counts": {"fixes": 9},
         "states_s": {"driving": 60.0, "turning": 50.0, "settling": 5.0, "measuring": 4.0},
-        "tour_bound_s": 90.0,
-        "budget_s": 3600.0,
         **changes,
     }
     errors = np.array(errors_m)
@@ -144,7 +130,7 @@ def test_the_margin_is_that_of_the_slowest_mission() -> None:
 
 
 def test_each_group_of_disturbances_is_added_and_taken_away() -> None:
-    cells = {str(cell.factors["group"]): cell for cell in sensitivity_cells()}
+    cells = {str(cell.factors["group"]): cell for cell in SENSITIVITY.cells()}
     quiet, hard = (load_config(None, {"run.world": name}).world for name in ("thesis", "hard"))
     slip, rest = (load_config(None, cells[name].overrides).world for name in ("plus slip", "minus slip"))
     assert (slip.slip_max, slip.creep_fraction) == (hard.slip_max, 0.0)
@@ -273,9 +259,7 @@ def test_times_are_those_of_complete_missions() -> None:
 
 def test_a_mission_that_reached_nothing_has_no_figures() -> None:
     values, _ = combine_missions({}, [mission([], outcome="held", cause="lost")])
-    assert values["arrival_error_mm"]["mean"] is None
-    assert values["time_ratio"] is None
-    assert values["nees"]["pose"]["band_95"] is None
+    assert values["arrival_error_mm"]["mean"] is values["time_ratio"] is values["nees"]["pose"]["band_95"] is None
     assert values["after_correction_mm"] == {"max": None, "true_max": None}
     assert values["stop_error_mm"] == {"rms": None, "p50": None, "after_first_leg": {"rms": None, "p50": None}}
     plain(values)
@@ -389,12 +373,11 @@ def test_fans_below_their_floor_are_counted(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_cell_says_who_was_not_completed_and_is_drawn(tmp_path: Path) -> None:
     results = []
     for cell in cells_of(faults_study.STUDY):
-        injected = {"planned": 12, "acted": 11}
+        injected = {"injected": {"planned": 12, "acted": 11}}
+        ended = {"is_recoverable": False, "weak_frames": 4, "outcome": "stopped", "cause": "held"}
         runs = [
-            mission([0.001], seed=1, is_recoverable=True, weak_frames=0, injected=injected),
-            mission(
-                [0.001], seed=2, is_recoverable=False, weak_frames=4, injected=injected, outcome="stopped", cause="held"
-            ),
+            mission([0.001], seed=1, is_recoverable=True, weak_frames=0, **injected),
+            mission([0.001], seed=2, **ended, **injected),
         ]
         values, arrays = faults_study.STUDY.combine(cell.factors, runs)
         results.append(CellResult(cell.factors, {"runs": 2, **values}, arrays))
