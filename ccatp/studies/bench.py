@@ -38,19 +38,11 @@ class BenchError(CcatpError):
 
 
 def run_bench(cfg: Config, *, quick: bool, run_args: Sequence[str] = (), missions: bool = True) -> dict[str, Any]:
-    """Run every benchmark.
+    """Run every benchmark, ``quick`` with a tenth of the repeats and a mission of one panel.
 
-    Args:
-        quick: a tenth of the repeats and a mission of one panel.
-        run_args: what else ``ccatp run`` needs to work on the same configuration.
-        missions: time missions as well as steps.
-
-    Returns:
-        ``{"machine", "cases"}``. A case holds name, us_p50, us_p99, peer, peer_us_p50 and ratio = ours / peer, None
-        without a peer; and how far the results differ, or how to install the peer.
-
-    Raises:
-        BenchError: a peer's result differs, or a mission failed.
+    ``run_args`` is what else ``ccatp run`` needs to work on the same configuration. A case holds name, us_p50, us_p99,
+    peer, peer_us_p50 and ratio = ours / peer, None without a peer; and how far the results differ, or how to install
+    the peer. BenchError: a peer's result differs, or a mission failed.
     """
     rounds, panels = (QUICK_ROUNDS, QUICK_PANELS) if quick else (ROUNDS, PANELS)
     # Missions first: they start in a process that has allocated little.

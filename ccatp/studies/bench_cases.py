@@ -74,23 +74,15 @@ def races(cfg: Config) -> Iterator[Race]:
 
 
 class FilterProblem(NamedTuple):
-    """Predict, and update with each reading.
+    """Predict, and update with each reading, from a prior."""
 
-    Attributes:
-        mean, covariance: prior, shapes (n,) and (n, n).
-        F, H: the models: matrices (n, n) and (m, n), or nonlinear ones.
-        Q: process noise of a step, shape (n, n).
-        variances: of the independent rows, shape (m,).
-        readings: shape (k, m).
-    """
-
-    mean: FloatArray
-    covariance: FloatArray
-    F: Any
-    H: Any
-    Q: FloatArray
-    variances: FloatArray
-    readings: FloatArray
+    mean: FloatArray  # shape (n,)
+    covariance: FloatArray  # shape (n, n)
+    F: Any  # matrix (n, n), or a nonlinear model
+    H: Any  # matrix (m, n), or a nonlinear model
+    Q: FloatArray  # process noise of a step, shape (n, n)
+    variances: FloatArray  # of the independent rows, shape (m,)
+    readings: FloatArray  # shape (k, m)
 
 
 def thesis_problem(cfg: Config, rows: int) -> FilterProblem:

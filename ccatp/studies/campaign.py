@@ -103,14 +103,8 @@ class Column(NamedTuple):
 class Study:
     """A campaign that has a name.
 
-    Attributes:
-        run_job: a function of a module, which workers import by its name; a pure function of the job.
-        combine: factors of a cell and the outcomes of its jobs in the order of their seeds, to figures and arrays.
-        columns: of ``table.md``.
-        defaults: dotted keys of the study: stronger than the configuration file, weaker than the command line.
-        mirrors: cells are crossed with these; empty where the study chooses the mirror in its cells.
-        runs: seeds of each cell, by default.
-        is_radio: its configurations are those of robots among radio beacons.
+    ``run_job`` is a pure function of the job, in a module, from which workers import it by its name. ``combine`` has
+    the factors of a cell and the outcomes of its jobs in the order of their seeds.
     """
 
     name: str
@@ -120,10 +114,11 @@ class Study:
     combine: Callable[[Factors, Sequence[JobOutcome]], JobOutcome]
     columns: Sequence[Column]
     draw: Callable[[Sequence[CellResult], Path], None]
+    # Dotted keys: stronger than the configuration file, weaker than the command line.
     defaults: Mapping[str, object] = field(default_factory=dict)
-    mirrors: tuple[str, ...] = ("thesis-m1",)
-    runs: int = 20
-    is_radio: bool = False
+    mirrors: tuple[str, ...] = ("thesis-m1",)  # crossed with the cells; empty where these choose the mirror
+    runs: int = 20  # seeds of each cell, by default
+    is_radio: bool = False  # its configurations are those of robots among radio beacons
 
 
 class Shard(NamedTuple):

@@ -51,43 +51,27 @@ WAY_COLUMNS = 14
 
 
 class SeamPass(NamedTuple):
-    """An edge sensor changed its value over a panel's edge.
+    """An edge sensor changed its value over a panel's edge."""
 
-    Attributes:
-        frame: index of the row that ends the frame in which it did.
-        axis: deck axis across the edge, 0 or 1.
-        edge: which edge: axis, panel, and whether it is the one on the high side.
-    """
-
-    frame: int
+    frame: int  # index of the row that ends the frame in which it did
     corner: int
     interval_s: float
-    axis: int
-    edge: tuple[int, PanelId, bool]
+    axis: int  # of the deck, across the edge: 0 or 1
+    edge: tuple[int, PanelId, bool]  # axis, panel, and whether it is the one on the high side
 
 
 class StopFix(NamedTuple):
-    """A fix at rest.
-
-    Attributes:
-        point: where it was taken; None where it was not for a point.
-        covariance_m2: of the foot (x, y), deck frame, from the lengths alone, shape (2, 2).
-        error_m: true minus estimated position before the fix (x, y), m.
-    """
+    """A fix at rest."""
 
     frame: int
-    point: PointId | None
+    point: PointId | None  # None where it was not for a point
     panel: PanelId
-    covariance_m2: FloatArray
-    error_m: tuple[float, float]
+    covariance_m2: FloatArray  # of the foot (x, y), deck frame, from the lengths alone, shape (2, 2)
+    error_m: tuple[float, float]  # true minus estimated position before the fix (x, y)
 
 
 class TrueRecord(NamedTuple):
-    """The truth of one mission.
-
-    Attributes:
-        way: a row per frame from the boot on, columns ``WAY_...``, shape (k, 14).
-    """
+    """The truth of one mission; ``way``: a row per frame from the boot on, columns ``WAY_...``, shape (k, 14)."""
 
     way: FloatArray
     passes: tuple[SeamPass, ...]

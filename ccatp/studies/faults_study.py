@@ -76,17 +76,12 @@ _LOST_FRAMES = 500  # without a frame for so long a mission is over
 
 
 class FaultySilRun(SilRun):
-    """As the processes: a frame that cannot be decoded is passed over, one that is not newer is answered with zeros.
-
-    Attributes:
-        denied_s: when lines that were no frames took the permit away.
-        weak_frames: frames on an overhang in which the fans gave less than their floor.
-    """
+    """As the processes: a frame that cannot be decoded is passed over, one that is not newer is answered with zeros."""
 
     def __init__(self, cfg: Config, plan: FaultPlan, *, with_track: bool = False) -> None:
         super().__init__(cfg, with_track=with_track, faults=plan)
-        self.denied_s: list[float] = []
-        self.weak_frames = 0
+        self.denied_s: list[float] = []  # when lines that were no frames took the permit away
+        self.weak_frames = 0  # on an overhang, in which the fans gave less than their floor
 
     @property
     def injected(self) -> tuple[Injected, ...]:

@@ -48,19 +48,16 @@ class LoopsError(CcatpError):
 class Loop:
     """One open loop L(s) = C(s) P(s) exp(-s tau).
 
-    Attributes:
-        axis: ``forward`` (distance, m), ``angular`` (turn in place, rad) or ``steering`` (heading on a leg, rad).
-        plant: ``printed``, 1/(T s + 1), or ``true``, 1/(s (T s + 1)): a speed command reaches the position by way of
-            an integrator, which the thesis leaves out.
-        delay_s: tau, the same in seconds.
+    Plant ``printed`` is 1/(T s + 1), ``true`` 1/(s (T s + 1)): a speed command reaches the position by way of an
+    integrator, which the thesis leaves out.
     """
 
     gains: str
-    axis: str
+    axis: str  # forward (distance, m), angular (turn in place, rad) or steering (heading on a leg, rad)
     plant: str
     lag_s: float
     delay_frames: int
-    delay_s: float
+    delay_s: float  # tau
     numerator: Coefficients
     denominator: Coefficients
 

@@ -100,17 +100,12 @@ class Histogram:
 
     A mission has half a million localization errors, a campaign hundreds of missions. Bins are 1/1000 of a decade
     wide, so a quantile is right to 0.12 %; count, mean, maximum and the share within the limit are exact.
-
-    Attributes:
-        bins: indices of the bins, ascending, shape (k,). Bin i ends at ``LEAST * 10**(i / PER_DECADE)``.
-        counts: in each of them, shape (k,).
-        largest: of the values; 0 where there are none.
     """
 
-    bins: IntArray
-    counts: IntArray
+    bins: IntArray  # indices, ascending, shape (k,); bin i ends at LEAST * 10**(i / PER_DECADE)
+    counts: IntArray  # in each of them, shape (k,)
     total: float
-    largest: float
+    largest: float  # 0 where there are none
     within: int
 
     @classmethod

@@ -34,18 +34,12 @@ _LINED = 100  # motes up to which the measured pairs are drawn
 
 @dataclass(frozen=True, slots=True)
 class SimulatedField:
-    """One simulated field of motes: the truth, and all ranges that phases 1 and 2 are given.
-
-    Attributes:
-        true_m: places of all motes, shape (n, d).
-        first: ranges of phase 1, repeated as configured.
-        second: single ranges in the order of phase 2, first, second, range_m, sigma_m.
-    """
+    """One simulated field of motes: the truth, and all ranges that phases 1 and 2 are given."""
 
     plan: MotePlan
-    true_m: FloatArray
-    first: tuple[MoteRange, ...]
-    second: tuple[tuple[int, int, float, float], ...]
+    true_m: FloatArray  # places of all motes, shape (n, d)
+    first: tuple[MoteRange, ...]  # of phase 1, repeated as configured
+    second: tuple[tuple[int, int, float, float], ...]  # in the order of phase 2: first, second, range_m, sigma_m
 
     def network(self, *, with_second: bool = False, with_shapes: bool = False) -> RangeNetwork:
         """The graph of phase 1, with phase 2 and the shapes of the stands where asked (raises MappingError: no map)."""
@@ -80,34 +74,24 @@ def simulate_field(cfg: CricketConfig, seed: int) -> SimulatedField:
 
 @dataclass(frozen=True, slots=True)
 class MoteRun:
-    """One self-mapping.
-
-    Attributes:
-        names, positions_m, covariance_m2, true_m: of the motes that were mapped; the truth in the same frame.
-        rms_m: error; after the best rigid motion where ``is_aligned``.
-        phase1_rms_m: the same of phase 1; None where it could not place all motes.
-        trace_m: error after each update, phase 1 first; of the batch just both.
-        is_aligned: whether the frame was free.
-        doubtful: rows of motes whose mirror image fits as well, or that hang on too few ranges.
-        whole: names, positions and covariance of all motes of the stands; the same motes where there are no others.
-    """
+    """One self-mapping: the motes that were mapped, and the truth in the same frame."""
 
     names: tuple[str, ...]
     positions_m: FloatArray
     covariance_m2: FloatArray
     true_m: FloatArray
-    rms_m: float
-    phase1_rms_m: float | None
+    rms_m: float  # error; after the best rigid motion where is_aligned
+    phase1_rms_m: float | None  # the same of phase 1; None where it could not place all motes
     expected_rms_m: float
     iterations: int
-    trace_m: FloatArray
+    trace_m: FloatArray  # error after each update, phase 1 first; of the batch just both
     expected_trace_m: FloatArray
-    is_aligned: bool
+    is_aligned: bool  # whether the frame was free
     offset_m: float
     scale: float
     nis: FloatArray
-    doubtful: tuple[int, ...]
-    whole: tuple[tuple[str, ...], FloatArray, FloatArray]
+    doubtful: tuple[int, ...]  # rows of motes whose mirror image fits as well, or that hang on too few ranges
+    whole: tuple[tuple[str, ...], FloatArray, FloatArray]  # of all motes of the stands, if there are others
 
 
 @dataclass(frozen=True, slots=True)

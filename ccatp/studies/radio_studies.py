@@ -44,33 +44,23 @@ RadioStudy = partial(Study, mirrors=(), is_radio=True)
 
 @dataclass(slots=True)
 class RadioRun:
-    """What a run leaves, one entry a step where nothing else is said.
+    """What a run leaves, one entry a step where nothing else is said; paths are x_m, y_m."""
 
-    Attributes:
-        pose_errors: x_m, y_m and heading_rad, estimate minus truth.
-        reckoned_errors: x_m and y_m of dead reckoning by the same odometry.
-        beacon_errors_m: by name, from the first estimate on: distance of estimate and truth.
-        beacon_nees: the same, with 2 degrees of freedom.
-        nis: of each reading, and its degrees of freedom.
-        truth, estimates, targets, believed: paths of the vehicle and of the target, x_m and y_m.
-        places: by name at the end: mean and truth.
-        joint_nees: at the end, of the pose and all static radios on the map, and its degrees of freedom.
-        nearest_m, clearance_m: least distance from the target and from what stands in the room.
-    """
-
+    # x_m, y_m and heading_rad, estimate minus truth; x_m, y_m of dead reckoning by the same odometry.
     pose_errors: list[tuple[float, float, float]] = field(default_factory=list)
     reckoned_errors: list[tuple[float, float]] = field(default_factory=list)
+    # By name, from the first estimate on: distance of estimate and truth, and NEES with 2 degrees of freedom.
     beacon_errors_m: dict[str, list[float]] = field(default_factory=dict)
     beacon_nees: dict[str, list[float]] = field(default_factory=dict)
-    nis: list[tuple[float, int]] = field(default_factory=list)
+    nis: list[tuple[float, int]] = field(default_factory=list)  # of each reading, and its degrees of freedom
     truth: list[tuple[float, float]] = field(default_factory=list)
     estimates: list[tuple[float, float]] = field(default_factory=list)
     targets: list[tuple[float, float]] = field(default_factory=list)
     believed: list[tuple[float, float]] = field(default_factory=list)
-    places: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    joint_nees: tuple[float, int] = (0.0, 0)
-    nearest_m: float = inf
-    clearance_m: float = inf
+    places: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)  # at the end: mean and truth
+    joint_nees: tuple[float, int] = (0.0, 0)  # at the end, of pose and static radios on the map; degrees of freedom
+    nearest_m: float = inf  # to the target
+    clearance_m: float = inf  # least, from what stands in the room
 
 
 def run_radio(cfg: RadioConfig) -> RadioRun:
@@ -249,12 +239,7 @@ def _curve(errors_m: Sequence[Sequence[float]], steps: int) -> FloatArray:
 
 
 def _draw_errors(results: Sequence[CellResult], name: str, label: str, keys: Sequence[str], stem: Path) -> None:
-    """Median over the runs of an error over time, with 10 to 90 %; a panel for each level of the first key.
-
-    Args:
-        results: cells with the array ``name`` of shape (runs, points).
-        keys: factors that distinguish the cells; the first one makes the panels.
-    """
+    """Median and 10 to 90 % over the runs of an array (runs, points); a panel for each level of the first key."""
     groups = grouped([result for result in results if name in result.arrays], keys[0])
     if not groups:
         return

@@ -155,9 +155,7 @@ class RecordingFilter:
 def added_noise(P: FloatArray, F: FloatArray, predicted: FloatArray, Q: FloatArray) -> FloatArray:
     """Q of ``P' = F P F^T + Q`` where F is a regression and the given Q only part of what the prediction added.
 
-    Args:
-        P, predicted: covariances before and after a prediction, shape (n, n).
-        F, Q: its transition and the noise that it was given, shape (n, n).
+    P and ``predicted``: covariances before and after; F and Q: transition and the noise given; all (n, n).
     """
     excess = predicted - F.dot(P).dot(F.T) - Q
     sigma = np.sqrt(np.maximum(predicted.diagonal(), 0.0))
@@ -189,15 +187,9 @@ def transition_of_reset(before: FloatArray, after: FloatArray) -> tuple[FloatArr
 
 @dataclass(slots=True)
 class Replayed:
-    """The estimates of a localizer for a run.
+    """The estimates of a localizer for a run, each before the fix that was taken there; the same poses smoothed.
 
-    Attributes:
-        trace: its estimates, each before the fix that was taken there.
-        smoothed: the same poses given the whole record, where asked for.
-        feet: of the fixes taken then: frame before them, deck x, y of the robot's origin as they show it, shape (f, 3).
-        fixes: measured; of them ``set_aside`` were kept from the localizer in the run, and are here, and ``refused``
-            were not taken by this localizer.
-        first_difference: the first fix of another fate than in the run: its time, and the localizer's reason.
+    ``feet`` of the fixes taken in the run: frame before them, deck x, y of the origin as they show it, shape (f, 3).
     """
 
     trace: Trace
@@ -205,9 +197,9 @@ class Replayed:
     smoothed: Trace | None = None
     feet: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     fixes: int = 0
-    refused: int = 0
-    set_aside: int = 0
-    first_difference: tuple[float, str] | None = None
+    refused: int = 0  # by this localizer
+    set_aside: int = 0  # kept from the localizer in the run, and here
+    first_difference: tuple[float, str] | None = None  # of the fates of a fix: its time, this localizer's reason
     counts: dict[str, int] = field(default_factory=dict)
 
 
@@ -332,22 +324,13 @@ class _Player:
 
 
 class ReplayErrors(NamedTuple):
-    """Differences of an estimate from its reference in the frames that both have.
+    """Differences of an estimate from its reference in the k frames that both have."""
 
-    Attributes:
-        distance_m: along a straight line, shape (k,).
-        turn_rad: of the heading, in (-pi, pi], shape (k,).
-        is_moving: the wheels turn, shape (k,).
-        is_arrival: the robot has just come to rest at a point for the first time, shape (k,).
-        nees: normalised estimation error squared of x, y and heading; 3 in the mean where the covariance is right;
-            NaN where there is none; shape (k,).
-    """
-
-    distance_m: FloatArray
-    turn_rad: FloatArray
-    is_moving: NDArray[np.bool_]
-    is_arrival: NDArray[np.bool_]
-    nees: FloatArray
+    distance_m: FloatArray  # along a straight line
+    turn_rad: FloatArray  # of the heading, in (-pi, pi]
+    is_moving: NDArray[np.bool_]  # the wheels turn
+    is_arrival: NDArray[np.bool_]  # the robot has just come to rest at a point for the first time
+    nees: FloatArray  # of x, y and heading: 3 in the mean where the covariance is right, NaN where there is none
 
 
 def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: ArrayLike) -> ReplayErrors:
@@ -459,32 +442,33 @@ def judge(parts: Sequence[ReplayEvaluation]) -> dict[str, Any]:
     }
 
 
-# Section and key of a figure, and its name for a reader.
+# Name of a figure for a reader, its section and key; a head without.
 _ROWS = (
-    ("position_error_mm", "mean", "position mean (mm)"),
-    ("position_error_mm", "p50", "position p50 (mm)"),
-    ("position_error_mm", "p99", "position p99 (mm)"),
-    ("position_error_mm", "max", "position max (mm)"),
-    ("moving_error_mm", "rms", "in motion rms (mm)"),
-    ("arrival_error_mm", "rms", "at arrivals rms (mm)"),
-    ("arrival_error_mm", "max", "at arrivals max (mm)"),
-    ("heading_error_mrad", "rms", "heading rms (mrad)"),
+    ("error against {}", "", ""),
+    ("  position mean (mm)", "position_error_mm", "mean"),
+    ("  position p50 (mm)", "position_error_mm", "p50"),
+    ("  position p99 (mm)", "position_error_mm", "p99"),
+    ("  position max (mm)", "position_error_mm", "max"),
+    ("  in motion rms (mm)", "moving_error_mm", "rms"),
+    ("  at arrivals rms (mm)", "arrival_error_mm", "rms"),
+    ("  at arrivals max (mm)", "arrival_error_mm", "max"),
+    ("  heading rms (mrad)", "heading_error_mrad", "rms"),
+    ("  NEES mean (3 is right)", "nees_mean", ""),
+    ("distance of the fixes", "", ""),
+    ("  mean (mm)", "fix_distance_mm", "mean"),
+    ("  max (mm)", "fix_distance_mm", "max"),
 )
-_FIX_ROWS = (("fix_distance_mm", "mean", "mean (mm)"), ("fix_distance_mm", "max", "max (mm)"))
 _POSE = ("x_m", "y_m", "heading_rad")
 
 
 def table_lines(result: Mapping[str, Any]) -> Iterator[str]:
     """The result of ``judge`` as a table: a column for each estimate, a dash for what is not known."""
     names = [name for name in ("recorded", "replayed", "smoothed") if result[name] is not None]
-    columns = [result[name] for name in names]
-    yield _line(f"error against {'the truth' if result['reference'] == 'truth' else 'the recorded estimate'}", names)
-    for section, key, name in _ROWS:
-        yield _line(f"  {name}", [_cell(column.get(section, {}).get(key)) for column in columns])
-    yield _line("  NEES mean (3 is right)", [_cell(column.get("nees_mean")) for column in columns])
-    yield _line("distance of the fixes", names)
-    for section, key, name in _FIX_ROWS:
-        yield _line(f"  {name}", [_cell(column.get(section, {}).get(key)) for column in columns])
+    reference = "the truth" if result["reference"] == "truth" else "the recorded estimate"
+    for name, section, key in _ROWS:
+        found = [result[column].get(section) for column in names]
+        cells = [value.get(key) if isinstance(value, Mapping) else value for value in found]
+        yield _line(name.format(reference), [_cell(value) for value in cells] if section else names)
     found = result["difference"]
     yield _line("replayed less recorded", ["rms", "max"])
     for section, name in (("position_mm", "position (mm)"), ("heading_mrad", "heading (mrad)")):

@@ -130,14 +130,9 @@ def plot(
     stem: Path, width_in: float, height_in: float, rows: int = 1, columns: int = 1,
     *, title: str = "", legend: int = 0, grid: Literal["major", "both"] = "major", **shared: Any,
 ) -> "Iterator[list[Axes]]":  # fmt: skip
-    """The axes of a figure, row by row, to draw on, written as PNG and PDF at the end.
+    """The axes of a figure, row by row, to draw on, written as PNG and PDF at the end (raises PictureError).
 
-    Args:
-        legend: columns of a legend of the first axes below the figure; 0 for none.
-        shared: see ``Figure.subplots``.
-
-    Raises:
-        PictureError: a file cannot be written.
+    ``legend``: columns of a legend of the first axes below the figure. ``shared``: see ``Figure.subplots``.
     """
     figure = new_figure(width_in, height_in)
     panels: list[Axes] = figure.subplots(rows, columns, squeeze=False, **shared).ravel().tolist()
@@ -165,18 +160,12 @@ Range = tuple[float, float, float] | None
 
 
 class Measure(NamedTuple):
-    """A panel of a figure of ranges.
-
-    Attributes:
-        of: the range of a cell: its middle is a dot on a bar between the ends.
-        mark: a figure beside it, a bound or what was published; None for none.
-        line: where all should be, drawn through all cells.
-    """
+    """A panel of a figure of ranges."""
 
     label: str
-    of: Callable[[CellResult], Range]
-    mark: Callable[[CellResult], float | None] = lambda _: None
-    line: float | None = None
+    of: Callable[[CellResult], Range]  # of a cell: its middle is a dot on a bar between the ends
+    mark: Callable[[CellResult], float | None] = lambda _: None  # beside it: a bound, or what was published
+    line: float | None = None  # where all should be
     is_log: bool = True
 
 

@@ -45,40 +45,28 @@ _RECENT = 64  # frames of truth at hand: more than any delay of the sensors
 
 @dataclass(slots=True)
 class StopRow:
-    """One measurement of a point, before its fix is fused.
-
-    Attributes:
-        approach: 1 at the first arrival.
-        error: true minus estimated pose: x, y (deck, m), heading (rad).
-        covariance: of the estimate of the three, shape (3, 3).
-        distance_m: true distance of the puck's foot from the point.
-        nis: normalised innovation squared of the fix (two degrees of freedom), NaN where it is not known.
-        fix_distance_m: the same distance as the fix shows it, after fusing.
-    """
+    """One measurement of a point, before its fix is fused."""
 
     t_s: float
     point: tuple[int, int, int]
-    approach: int
-    error: tuple[float, float, float]
-    covariance: FloatArray
-    distance_m: float
-    nis: float = float("nan")
-    fix_distance_m: float = float("nan")
+    approach: int  # 1 at the first arrival
+    error: tuple[float, float, float]  # true minus estimated pose: x, y (deck, m), heading (rad)
+    covariance: FloatArray  # of the estimate of the three, shape (3, 3)
+    distance_m: float  # true distance of the puck's foot from the point
+    nis: float = float("nan")  # of the fix, two degrees of freedom; NaN where it is not known
+    fix_distance_m: float = float("nan")  # the same distance as the fix shows it, after fusing
 
 
 @dataclass(slots=True)
 class SilResult:
-    """The result of a mission.
+    """The result of a mission; ``summary`` as in ``summary.json``.
 
-    Attributes:
-        summary: as in ``summary.json``.
-        corrections: moves after a fix that showed the robot too far from its point.
-        track: rows of t, true x, y, heading, estimated x, y, heading (deck), shape (k, 7), where it was asked for.
+    ``track``: rows of t, true x, y, heading, estimated x, y, heading (deck), shape (k, 7), where it was asked for.
     """
 
     summary: dict[str, Any]
     stops: list[StopRow]
-    corrections: int
+    corrections: int  # moves after a fix that showed the robot too far from its point
     counts: dict[str, int]
     outcome: str
     cause: str
@@ -210,13 +198,9 @@ def rehearse(cfg: Config, *, with_track: bool = False) -> SilResult:
 
 
 class SilRun:
-    """The processes' parts side by side.
+    """The processes' parts side by side; a subclass may exchange some before ``run``, or override a frame.
 
-    A subclass may exchange parts before ``run``, or override what happens in a frame.
-
-    Args:
-        with_track: keep true and estimated pose of every frame.
-        faults: of the robot; ``FaultySilRun`` can serve them.
+    ``with_track``: keep true and estimated pose of every frame. ``faults``: of the robot, for ``FaultySilRun``.
     """
 
     def __init__(self, cfg: Config, *, with_track: bool, faults: FaultPlan | None = None) -> None:

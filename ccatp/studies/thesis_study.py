@@ -12,7 +12,7 @@ thesis 2.1.5 the angle at a seam replaces the heading here, however sure the fil
 system ``ours`` are the same waypoints and the same noise with the daemon's own filter and control.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from math import sqrt
@@ -88,13 +88,9 @@ def overrides_of(
 
 
 class ThesisLocalizer(FourStateLocalizer):
-    """The four-state localizer, closer to the letter of the thesis.
+    """The four-state localizer, closer to the letter of the thesis."""
 
-    Attributes:
-        period_factor: its clock is its own: a step of so many times 10 ms counts as 10 ms.
-    """
-
-    period_factor = 1.0
+    period_factor = 1.0  # its clock is its own: a step of so many times 10 ms counts as 10 ms
 
     def step(
         self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample], edges: Sequence[EdgeSample],
@@ -201,9 +197,8 @@ def cells() -> Sequence[Cell]:
 def run_job(job: Job) -> JobOutcome:
     """One simulation run, as the thesis measures it.
 
-    Arrays: ``waypoint_m``, distance of each stop from its waypoint, shape (9 panels,) if all were reached; ``track``:
-    t, true x, y, estimated x, y, shape (j, 5); histogram of the distance of true and estimated position, every frame
-    until the last stop.
+    Arrays: ``waypoint_m``, distance of each stop from its waypoint; ``track``: t, true x, y, estimated x, y, shape
+    (j, 5); histogram of the distance of true and estimated position, every frame until the last stop.
     """
     found = run_replica(job.cfg, period_error=float(job.factors["period_error"]))
     track = found.track if found.track is not None else np.empty((0, 7))
@@ -298,12 +293,7 @@ _BIN_MM = 1.0
 
 
 def draw(results: Sequence[CellResult], out: Path) -> None:
-    """The figures of both noises.
-
-    * ``trajectory_<noise>``: true and estimated way of the first run, the thesis's system with both readings.
-    * ``localization_<noise>``: cumulative distribution of the localization error, every cell.
-    * ``waypoints_<noise>``: the waypoint errors of all runs, and their histogram.
-    """
+    """Of both noises: way of the first run, distribution of the localization error, waypoint errors of all runs."""
     for (noise,), mine in grouped(results, "noise").items():
         published, titles = PUBLISHED[noise], [f"{noise} noise, as fig. {number}" for number in _NUMBERS[noise]]
         _draw_localization(mine, published["localization"], titles[1], out / f"localization_{noise}")
@@ -358,21 +348,13 @@ def _draw_waypoints(result: CellResult, published: Mapping[str, float], title: s
         right.legend(frameon=False, fontsize=7)
 
 
-def _columns() -> list[Column]:
-    columns = [Column("complete", "complete")]
-    for quantity in RUNS:
-        for name, heading, spec in (
-            ("within_10mm_fraction", "< 1 cm", ".3f"),
-            ("mean", "mean, mm", ".2f"),
-            ("max", "max, mm", ".1f"),
-        ):
-            columns += [
-                Column(f"{quantity} {heading}", f"{quantity}.{name}.mean", spec),
-                Column("± run", f"{quantity}.{name}.run_to_run", spec),
-                Column("published", f"{quantity}.published.{name}", spec),
-            ]
-        columns.append(Column("within", f"{quantity}.is_published_within"))
-    return columns
+def _columns(quantity: str) -> Iterator[Column]:
+    shown = ("within_10mm_fraction", "< 1 cm", ".3f"), ("mean", "mean, mm", ".2f"), ("max", "max, mm", ".1f")
+    for name, heading, spec in shown:
+        yield Column(f"{quantity} {heading}", f"{quantity}.{name}.mean", spec)
+        yield Column("± run", f"{quantity}.{name}.run_to_run", spec)
+        yield Column("published", f"{quantity}.published.{name}", spec)
+    yield Column("within", f"{quantity}.is_published_within")
 
 
 STUDY = Study(
@@ -381,7 +363,7 @@ STUDY = Study(
     cells=cells,
     run_job=run_job,
     combine=combine,
-    columns=_columns(),
+    columns=(Column("complete", "complete"), *(column for quantity in RUNS for column in _columns(quantity))),
     draw=draw,
     mirrors=(),
     runs=5,
