@@ -373,8 +373,8 @@ def test_fans_below_their_floor_are_counted(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_cell_says_who_was_not_completed_and_is_drawn(tmp_path: Path) -> None:
     results = []
     for cell in cells_of(faults_study.STUDY):
-        injected = {"injected": {"planned": 12, "acted": 11}}
-        ended = {"is_recoverable": False, "weak_frames": 4, "outcome": "stopped", "cause": "held"}
+        injected: Any = {"injected": {"planned": 12, "acted": 11}}
+        ended: Any = {"is_recoverable": False, "weak_frames": 4, "outcome": "stopped", "cause": "held"}
         runs = [
             mission([0.001], seed=1, is_recoverable=True, weak_frames=0, **injected),
             mission([0.001], seed=2, **ended, **injected),
