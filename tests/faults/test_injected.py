@@ -23,6 +23,7 @@ HARD = one_panel(run__world="hard")
 IMPATIENT = one_panel(run__world="hard", health__hold_limit_s=5.0)
 THESIS = one_panel()
 PAUSE, HOLD = Severity.PAUSE, Severity.HOLD
+SIDES = ("right", "left")
 RUNAWAYS = {"left_wheel", "encoder_left"}
 ENCODERS = ("encoder_right", "encoder_left")
 EDGES = ("edge_front_left", "edge_front_right", "edge_rear_left", "edge_rear_right")
@@ -82,12 +83,15 @@ def test_the_times_are_what_they_are_called() -> None:
 # -- the wheels are told to stand --------------------------------------------------------------------------------------
 
 
+# Row of the fault table, faults, when, until when they are watched, limit in time, and what is expected.
+Stop = tuple[str, tuple[str, ...], float, Callable[[Seen], bool], float, dict[str, Any]]
+
+
 def stops() -> list[Any]:
-    """Rows of the fault table, faults, when, until when they are watched, limit in time, and what is expected."""
     never_far: dict[str, Any] = {"way_m": 0.03}
-    rows: list[tuple[str, tuple[str, ...], float, Callable[[Seen], bool], float, dict[str, Any]]] = []
+    rows: list[Stop] = []
     for at_s in (DRIVING_S, TURNING_S):
-        for side in ("right", "left"):
+        for side in SIDES:
             rows += [
                 ("S1", (f"encoder_{side} stuck value=0.0",), at_s, held(), 0.3, {**never_far, "severity": HOLD}),
                 ("F8", (f"{side}_wheel blocked",), at_s, to_its_end, 0.3, {"holds": (2, 3)}),
@@ -95,11 +99,10 @@ def stops() -> list[Any]:
         rows.append(("S3", each(ENCODERS, "stuck value=0.0"), at_s, held(), 0.3, never_far))
     both = each(("right_wheel", "left_wheel"), "blocked")
     rows.append(("F10", both, DRIVING_S, held(HOLD), 0.3, {}))
-    rows += [
-        ("F9", (f"left_wheel runaway for_s=0.4 rate_rad_s={rate}",), at_s, after(at_s + 0.31), 0.1,
-         {"signals": RUNAWAYS, "by": HOLD})
-        for rate in (8.0, -8.0) for at_s in (DRIVING_S, TURNING_S, STANDING_S)
-    ]  # fmt: skip
+    for at_s in (DRIVING_S, TURNING_S, STANDING_S):
+        for rate in (8.0, -8.0):
+            fault = f"left_wheel runaway for_s=0.4 rate_rad_s={rate}"
+            rows.append(("F9", (fault,), at_s, after(at_s + 0.31), 0.1, {"signals": RUNAWAYS, "by": HOLD}))
     rows += [
         ("S8", (f"imu_wz wrong offset={step}",), DRIVING_S, held(), 1.2, {"signals": {"imu_wz"}})
         for step in (0.1, -0.2, 0.5)
@@ -109,14 +112,12 @@ def stops() -> list[Any]:
         for signals in (ENCODERS, ("edge_front_left",))
     ]
     rows.append(("S25", each(EDGES, "stuck value=0.0"), DRIVING_S, to_its_end, 0.1, {"cause": "fallen"}))
-    return [pytest.param(*row, marks=pytest.mark.fault(row[0]), id=f"{row[0]} {row[1][0]} at {row[2]}") for row in rows]
+    return [pytest.param(row, marks=pytest.mark.fault(row[0]), id=f"{row[0]} {row[1][0]} at {row[2]}") for row in rows]
 
 
-@pytest.mark.parametrize(("row", "faults", "at_s", "until", "limit_s", "expected"), stops())
-def test_it_stops_in_time(
-    row: str, faults: tuple[str, ...], at_s: float, until: Callable[[Seen], bool], limit_s: float,
-    expected: dict[str, Any], measured: Measured,
-) -> None:  # fmt: skip
+@pytest.mark.parametrize("case", stops())
+def test_it_stops_in_time(case: Stop, measured: Measured) -> None:
+    row, faults, at_s, until, limit_s, expected = case
     run = watched(IMPATIENT if row in ("S16", "S25") else HARD, until, *each(faults, f"at_s={at_s}"))
     zero_s = run.time_to_zero_s(at_s)
     time_s = zero_s - expected.get("less_s", 0.0)
@@ -138,9 +139,9 @@ def test_it_stops_in_time(
 
 @pytest.mark.parametrize("rate", [8.0, -8.0])
 def test_a_wheel_that_runs_away_while_its_encoder_is_slow(rate: float) -> None:
-    faults = (*each(ENCODERS[::-1], f"slow at_s={DRIVING_S - 1.0} every=3"),
-              f"left_wheel runaway at_s={DRIVING_S} for_s=0.4 rate_rad_s={rate}")  # fmt: skip
-    run = watched(HARD, after(DRIVING_S + 0.61), *faults)
+    slow_ones = each(ENCODERS[::-1], f"slow at_s={DRIVING_S - 1.0} every=3")
+    fault = f"left_wheel runaway at_s={DRIVING_S} for_s=0.4 rate_rad_s={rate}"
+    run = watched(HARD, after(DRIVING_S + 0.61), *slow_ones, fault)
     assert run.time_to_zero_s(DRIVING_S) <= 0.15  # two faults at once: not the 0.1 s of one
     assert run.first(DRIVING_S, held(HOLD)).verdict.signal in RUNAWAYS
 
@@ -157,8 +158,8 @@ def test_a_sensor_that_chatters_holds(hz: float, measured: Measured) -> None:
 @pytest.mark.fault("S24")
 def test_a_sensor_that_goes_off_in_a_turn_stops_the_turn(measured: Measured) -> None:
     at_s = TURNING_S + 0.3
-    run = watched(HARD, lambda one: one.t_s > at_s and one.drive[0] - one.drive[1] <= 0.0,
-                  f"edge_front_right stuck at_s={at_s} value=0.0")  # fmt: skip
+    fault = f"edge_front_right stuck at_s={at_s} value=0.0"
+    run = watched(HARD, lambda one: one.t_s > at_s and one.drive[0] - one.drive[1] <= 0.0, fault)
     declared = run.first(at_s, lambda one: one.verdict.code == 1)
     assert run.seen[-1].t_s - declared.t_s <= 0.1
     assert run.seen[-1].t_s - at_s <= 0.2  # over a seam the sensor may sweep its width first
@@ -218,8 +219,8 @@ def test_wheels_that_creep_while_they_are_held(speed_m_s: float, measured: Measu
 
 @pytest.mark.parametrize("kind", ["sign=-1", "factor=0.5"])
 def test_a_gyroscope_of_wrong_sign_or_scale_is_noticed_in_the_first_turn(kind: str) -> None:
-    run = watched(HARD, lambda one: one.t_s > 2.0 and one.verdict.severity >= Severity.SLOW,
-                  f"imu_wz wrong at_s=2.0 {kind}")  # fmt: skip
+    fault = f"imu_wz wrong at_s=2.0 {kind}"
+    run = watched(HARD, lambda one: one.t_s > 2.0 and one.verdict.severity >= Severity.SLOW, fault)
     assert run.seen[-1].t_s < 4.5  # the turn is from 3.1 s to 4.5 s
     assert run.seen[-1].verdict.signal in {"imu", "imu_wz"}
 
@@ -392,7 +393,7 @@ def test_a_clock_that_wraps_does_not_count_in_the_mission_time(phase_s: float) -
         (f"edge_front_left stuck at_s={DRIVING_S} for_s=1.5 value=0.0", 20.0, 3),  # a back-off and a fix
         (f"imu_wz garbage at_s={TURNING_S} for_s=2.0 beyond=0.0", 20.0, 4),
     ],
-)  # fmt: skip
+)
 def test_what_is_over_soon_does_not_end_the_mission(fault: str, until_s: float, done: int) -> None:
     run = watched(HARD, after(until_s), fault)
     assert not run.mission.is_faulted
@@ -426,10 +427,8 @@ def with_fans(cfg: Any, fault: str) -> Watched:
 
 @pytest.mark.fault("F1", "F5")
 @pytest.mark.parametrize(
-    "fault",
-    ["fans stuck value=0.3", "fans wrong factor=0.7", 'faults raise names=["fan_left"]',
-     'faults raise names=["fan_right"]'],
-)  # fmt: skip
+    "fault", ["fans stuck value=0.3", "fans wrong factor=0.7", *(f'faults raise names=["fan_{s}"]' for s in SIDES)]
+)
 def test_a_fan_that_gives_too_little_holds_with_full_fans(fault: str, measured: Measured) -> None:
     run = with_fans(OVERHANG, fault)
     first = run.first(FANS_S, lambda one: one.verdict.severity is Severity.FAULT)

@@ -7,17 +7,18 @@ import statistics
 import threading
 import time
 import tracemalloc
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
 
-from ccatp.core import PanelPose
 from ccatp.dataloop import DataLoop
 from ccatp.links.robot_codec import RobotFrame, decode_from_robot, encode
 from ccatp.links.robot_link import BACKLOG_S, FLOOD_FACTOR, RobotLink, RobotTimeout, WrongProtocol
 from ccatp.links.robot_messages import PROTOCOL, BadLineLimit, CommandEcho, Hello, LineBuffer, RobotData, Sensors
+from ccatp.sim.fault_proxy import FaultProxy
 from tests.faults.linking import Measured
 from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S
 from tests.support.daemon import Driver, robot_behind_proxy
@@ -42,16 +43,19 @@ def frame(seq: int, samples: int = 10) -> bytes:
     return encode(RobotFrame(seq, t_s, [(t_s, 0.1, 0.2)], wheels, (), None, (0.8, 0.8), 1.0, echo, ()))
 
 
-async def driven(disturb: Callable[..., None] = lambda proxy: None, frames: int = FRAMES) -> tuple[Driver, PanelPose]:
-    """A drive in lockstep through a proxy that is told to misbehave."""
-    async with robot_behind_proxy(lockstep=True) as (_, proxy):
+@asynccontextmanager
+async def driving(*, lockstep: bool) -> AsyncIterator[tuple[DataLoop, FaultProxy, Driver]]:
+    """A robot, a proxy before it that may be told to misbehave, and who drives."""
+    async with robot_behind_proxy(lockstep=lockstep) as (loop, proxy):
         driver = Driver(proxy.port)
-        disturb(proxy)
         await driver.link.connect(DEADLINE_S)
-        await driver.drive(frames)
+        yield loop, proxy, driver
         driver.link.close()
-    assert not driver.lost
-    return driver, driver.pose
+
+
+def link_to(port: int, kind: type[RobotLink] = RobotLink, **hears: Any) -> RobotLink:
+    hears = {"on_sensors": lambda *_: None, "on_lost": lambda _: None} | hears
+    return kind(host="127.0.0.1", port=port, role="controller", client="test", key=None, **hears)
 
 
 # -- what TCP or a proxy may do to whole messages ---------------------------------------------------------------------
@@ -59,33 +63,34 @@ async def driven(disturb: Callable[..., None] = lambda proxy: None, frames: int 
 
 @pytest.mark.fault("S14")
 async def test_frames_that_come_twice_leave_the_pose_as_it_is(measured: Measured) -> None:
-    _, clean = await driven()
-    twice, pose = await driven(lambda proxy: proxy.begin("duplicate", "both", every=1))
+    drivers = []
+    for is_disturbed in (False, True):
+        async with driving(lockstep=True) as (_, proxy, driver):
+            if is_disturbed:
+                proxy.begin("duplicate", "both", every=1)
+            await driver.drive(FRAMES)
+        assert not driver.lost
+        drivers.append(driver)
+    clean, twice = drivers
     assert twice.link.counts["repeated_frames"] >= FRAMES - 1
     assert twice.seqs == list(range(len(twice.seqs)))
-    assert pose == clean
-    measured("S14", pose != clean)
+    measured("S14", twice.pose != clean.pose)
 
 
 @pytest.mark.fault("S14")
 async def test_frames_out_of_order_never_reach_the_localizer() -> None:
-    async with robot_behind_proxy(lockstep=False) as (_, proxy):
-        driver = Driver(proxy.port)
-        await driver.link.connect(DEADLINE_S)
+    async with driving(lockstep=False) as (_, proxy, driver):
         proxy.begin("reorder", "to_client", every=3)
         await driver.drive(FRAMES)
         assert proxy.counts["reorder"] >= 5
         assert driver.link.counts["repeated_frames"] >= 5
         assert driver.seqs == sorted(set(driver.seqs))
         assert driver.localizer.counts["stale_frames"] == 0
-        driver.link.close()
 
 
 @pytest.mark.fault("S15")
 async def test_a_damaged_line_costs_itself_alone(measured: Measured) -> None:
-    async with robot_behind_proxy(lockstep=False) as (_, proxy):
-        driver = Driver(proxy.port)
-        await driver.link.connect(DEADLINE_S)
+    async with driving(lockstep=False) as (_, proxy, driver):
         proxy.begin("corrupt", "to_client", every=10)  # ten a second; more than twenty would end the session
         await driver.drive(2 * FRAMES)
         assert not driver.lost
@@ -94,7 +99,6 @@ async def test_a_damaged_line_costs_itself_alone(measured: Measured) -> None:
         gaps = [b - a - 1 for a, b in zip(driver.seqs, driver.seqs[1:], strict=False)]
         measured("S15", max(gaps))
         assert sum(gaps) <= proxy.counts["corrupt"]
-        driver.link.close()
 
 
 @pytest.mark.fault("L5")
@@ -166,8 +170,7 @@ async def flooded(kind: type[RobotLink]) -> tuple[RobotLink, list[int], str]:
     seqs: list[int] = []
     over: asyncio.Future[str] = asyncio.get_running_loop().create_future()
     with flooding_robot() as port:
-        link = kind(host="127.0.0.1", port=port, role="controller", client="test", key=None,
-                    on_sensors=lambda sensors, _: seqs.append(sensors.seq), on_lost=over.set_result)  # fmt: skip
+        link = link_to(port, kind, on_sensors=lambda sensors, _: seqs.append(sensors.seq), on_lost=over.set_result)
         if isinstance(link, Timed):
             link.passes_s = []
         await link.connect(DEADLINE_S)
@@ -245,8 +248,7 @@ async def test_a_robot_that_trickles_is_given_up() -> None:
         over.set()
 
     listening = await asyncio.start_server(trickle, "127.0.0.1", 0)
-    link = RobotLink(host="127.0.0.1", port=listening.sockets[0].getsockname()[1], role="controller", client="test",
-                     key=None, on_sensors=lambda *_: None, on_lost=lambda _: None)  # fmt: skip
+    link = link_to(listening.sockets[0].getsockname()[1])
     try:
         with pytest.raises(RobotTimeout, match="no answer from the robot"):
             await link.connect(0.2)
@@ -324,13 +326,10 @@ async def test_a_recorded_session_opens_no_door(measured: Measured) -> None:
 
 @pytest.mark.fault("L9")
 async def test_commands_that_come_again_are_dropped() -> None:
-    async with robot_behind_proxy(lockstep=True) as (loop, proxy):
-        driver = Driver(proxy.port)
-        await driver.link.connect(DEADLINE_S)
+    async with driving(lockstep=True) as (loop, proxy, driver):
         proxy.begin("duplicate", "to_robot", every=1)
         await driver.drive(FRAMES)
         assert loop.server.counts["stale"] >= FRAMES - 5
-        driver.link.close()
 
 
 @pytest.mark.fault("L12")
@@ -349,8 +348,7 @@ async def test_no_other_version_is_joined(protocol: str, measured: Measured) -> 
         writer.close()
 
     listening = await asyncio.start_server(speak, "127.0.0.1", 0)
-    link = RobotLink(host="127.0.0.1", port=listening.sockets[0].getsockname()[1], role="controller", client="test",
-                     key=None, on_sensors=lambda *_: None, on_lost=lambda _: None)  # fmt: skip
+    link = link_to(listening.sockets[0].getsockname()[1])
     with pytest.raises(WrongProtocol, match="this program ccatp-robot/1"):
         await link.connect(DEADLINE_S)
     async with asyncio.timeout(DEADLINE_S):
@@ -381,8 +379,7 @@ async def round_trips(count: int) -> list[float]:
             if len(times_s) > count:
                 done.set()
 
-        link = RobotLink(host="127.0.0.1", port=port, role="controller", client="test", key=None,
-                         on_sensors=on_sensors, on_lost=lambda _: done.set())  # fmt: skip
+        link = link_to(port, on_sensors=on_sensors, on_lost=lambda _: done.set())
         await link.connect(DEADLINE_S)
         async with asyncio.timeout(DEADLINE_S):
             await done.wait()

@@ -9,14 +9,14 @@ import tempfile
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import numpy as np
 import structlog
 import zmq
 
-from ccatp.config.load import dump_config, load_config
+from ccatp.config.load import dump_config
 from ccatp.config.models import Config
 from ccatp.core import PanelPose
 from ccatp.daemon.danger_loop import DangerLoop
@@ -26,25 +26,24 @@ from ccatp.dataloop import DataLoop
 from ccatp.links.robot_link import RobotLink
 from ccatp.links.robot_messages import Sensors
 from ccatp.localizer import Localizer, build_localizer
-from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.etalon_server import EtalonSimulator, ZmqPuck
 from ccatp.sim.fault_proxy import FaultProxy
 from ccatp.sim.ground_truth import GroundTruthPublisher
+from ccatp.sim.rules import MotionRules
+from tests.support.scenario import config_of, mirror_of, one_panel
 
 DEADLINE_S = 60.0
 LINK_DEADLINE_S = 30.0  # what never happens in a good run may take this long in a bad one
 SEED = 3
-SEND_DRIVE, SEND_PERMIT = RobotLink.send_drive, RobotLink.send_permit
+SEND_DRIVE, SEND_PERMIT, SET_POINTS = RobotLink.send_drive, RobotLink.send_permit, MotionRules.set_points
 LATE_FRAMES = 16  # of 10 ms: data are too old after 150 ms
 
 
-class Executed:
+class Executed(NamedTuple):
     """One step in which the robot's wheels turned by a drive: its number, and when it was."""
 
-    __slots__ = ("at_s", "seq")
-
-    def __init__(self, seq: int, at_s: float) -> None:
-        self.seq, self.at_s = seq, at_s
+    seq: int
+    at_s: float
 
 
 class Daemon:
@@ -73,33 +72,35 @@ class Daemon:
         self.executed: list[Executed] = []
         self.loops: list[asyncio.Task[None]] = []
         self.stop = asyncio.Event()
-        self._watch_drives()
 
-    def _watch_drives(self) -> None:
-        rules, clock = self.robot.robot.rules, asyncio.get_running_loop().time
-        step = rules.set_points
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Functions in place of the methods of links and robot: bound methods would not get the link itself."""
+        clock = asyncio.get_running_loop().time
 
-        def set_points(until_s: float) -> tuple[float, float]:
-            found = step(until_s)
+        def send_drive(link: RobotLink, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float) -> None:
+            if wr_rad_s or wl_rad_s:
+                self.sent[seq] = clock()
+                self._note_late("drive", ack)
+            SEND_DRIVE(link, seq, ack, wr_rad_s, wl_rad_s)
+
+        def send_permit(link: RobotLink, seq: int, ack: int, *allowed: bool) -> None:
+            if any(allowed):
+                self._note_late("permit", ack)
+            SEND_PERMIT(link, seq, ack, *allowed)
+
+        def set_points(rules: MotionRules, until_s: float) -> tuple[float, float]:
+            found = SET_POINTS(rules, until_s)
             if any(found):
                 self.executed.append(Executed(rules._drive_seq, clock()))
             return found
 
-        watched = _Watched(rules, set_points)
-        self.robot.robot.rules = watched  # type: ignore[assignment]
-
-    def send_drive(self, link: RobotLink, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float) -> None:
-        """In place of the link's own method."""
-        if wr_rad_s or wl_rad_s:
-            self.sent[seq] = asyncio.get_running_loop().time()
-            self._note_late("drive", ack)
-        SEND_DRIVE(link, seq, ack, wr_rad_s, wl_rad_s)
-
-    def send_permit(self, link: RobotLink, seq: int, ack: int, allowed: tuple[bool, bool, bool]) -> None:
-        """In place of the link's own method."""
-        if any(allowed):
-            self._note_late("permit", ack)
-        SEND_PERMIT(link, seq, ack, *allowed)
+        with (
+            patch.object(RobotLink, "send_drive", send_drive),
+            patch.object(RobotLink, "send_permit", send_permit),
+            patch.object(MotionRules, "set_points", set_points),
+        ):
+            yield
 
     def _note_late(self, kind: str, ack: int) -> None:
         if self.robot.robot.seq - ack > LATE_FRAMES:
@@ -124,28 +125,10 @@ class Daemon:
         return [entry for entry in self.log if entry["event"] == event]
 
 
-class _Watched:
-    """The robot's rules, with one method looked at."""
-
-    def __init__(self, rules: object, set_points: Callable[[float], tuple[float, float]]) -> None:
-        object.__setattr__(self, "_rules", rules)
-        object.__setattr__(self, "set_points", set_points)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(object.__getattribute__(self, "_rules"), name)
-
-    def __setattr__(self, name: str, value: object) -> None:
-        setattr(object.__getattribute__(self, "_rules"), name, value)
-
-
-def configuration(**overrides: object) -> Config:
+def configuration(mirror: str = "fyst-m1") -> Config:
     """A survey of one panel, which begins to drive as soon as gravity is known."""
-    return load_config(
-        overrides={
-            "run.panels": 1, "run.filter": "kf", "run.seed": 5, "run.realtime_priority": 0, "sim.robot.port": 0,
-            "mission.calibration_length_m": 0, **overrides,
-        }
-    )  # fmt: skip
+    how = {"run__filter": "kf", "run__seed": 5, "run__realtime_priority": 0, "sim__robot__port": 0}
+    return one_panel(run__mirror=mirror, **how)
 
 
 @contextmanager
@@ -174,7 +157,7 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
         robot = DataLoop(robot_cfg or cfg, False, cfg.run.seed)
         robot.truth = outlet = GroundTruthPublisher(robot.robot, endpoints.of("puck"), endpoints.of("truth"))
         port = await robot.start()
-        mirror = build_mirror(cfg.mirror)
+        mirror = mirror_of(cfg.mirror.name)
         puck = ZmqPuck(endpoints.of("puck"))
         laser = EtalonSimulator(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1))
         laser_port = await laser.start("127.0.0.1", 0)
@@ -194,7 +177,7 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
                     listener.connect(endpoints.of("main"))
                     listener.subscribe("track")
                     try:
-                        with _seen_by(daemon):
+                        with daemon.watching():
                             async with asyncio.TaskGroup() as tasks:
                                 peers = robot.run(robot_stop), outlet.serve(), laser.serve()
                                 serving = [tasks.create_task(work) for work in peers]
@@ -215,20 +198,6 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
             puck.close()
             outlet.close()
             context.destroy(linger=0)
-
-
-@contextmanager
-def _seen_by(daemon: Daemon) -> Iterator[None]:
-    """Functions in place of the link's methods: bound methods would not get the link itself."""
-
-    def send_drive(link: RobotLink, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float) -> None:
-        daemon.send_drive(link, seq, ack, wr_rad_s, wl_rad_s)
-
-    def send_permit(link: RobotLink, seq: int, ack: int, forward: bool, reverse: bool, turn: bool) -> None:
-        daemon.send_permit(link, seq, ack, (forward, reverse, turn))
-
-    with patch.object(RobotLink, "send_drive", send_drive), patch.object(RobotLink, "send_permit", send_permit):
-        yield
 
 
 def _at(cfg: Config, robot_port: int, laser_port: int) -> Config:
@@ -257,20 +226,12 @@ class Driver:
     """
 
     def __init__(self, port: int, key: bytes | None = None) -> None:
-        cfg = load_config(overrides={"run.seed": SEED, "run.filter": "kf"})
-        self.localizer: Localizer = build_localizer(cfg, build_mirror(cfg.mirror))
+        self.localizer: Localizer = build_localizer(config_of(run__seed=SEED, run__filter="kf"), mirror_of())
         self.seqs: list[int] = []
         self.lost = ""
         self.changed = asyncio.Event()
-        self.link = RobotLink(
-            host="127.0.0.1",
-            port=port,
-            role="controller",
-            client="test",
-            key=key,
-            on_sensors=self._on_sensors,
-            on_lost=self._on_lost,
-        )
+        self.link = RobotLink(host="127.0.0.1", port=port, role="controller", client="test", key=key,
+                              on_sensors=self._on_sensors, on_lost=self._on_lost)  # fmt: skip
 
     def _on_sensors(self, frame: Sensors, _line: bytes) -> None:
         self.seqs.append(frame.seq)
@@ -300,8 +261,7 @@ class Driver:
 @asynccontextmanager
 async def robot_behind_proxy(*, lockstep: bool, key: bytes | None = None) -> AsyncIterator[tuple[DataLoop, FaultProxy]]:
     """A running DataLoop with a proxy before it."""
-    cfg = load_config(overrides={"run.seed": SEED, "sim.robot.port": 0})
-    loop = DataLoop(cfg, lockstep, SEED, key)
+    loop = DataLoop(config_of(run__seed=SEED, sim__robot__port=0), lockstep, SEED, key)
     port = await loop.start()
     stop = asyncio.Event()
     async with asyncio.TaskGroup() as tasks:
