@@ -216,7 +216,7 @@ class Recording:
         """The recorded configuration with ``overrides``; raises ``ConfigError`` where it cannot be used."""
         beside = self.path.with_name(CONFIG)
         kept = self.metadata.get("config")
-        if kept is None or (beside.is_file() and _readable(beside, _read_text) == kept):
+        if kept is None or (beside.is_file() and _readable(beside, Path.read_bytes).decode(errors="replace") == kept):
             return load_config(beside, overrides)
         # A later session of a resumed run has written its own.
         with tempfile.TemporaryDirectory(prefix="ccatp-replay-") as folder:
@@ -295,10 +295,6 @@ def _open(path: Path) -> Recording:
     if "config" not in metadata and not path.with_name(CONFIG).is_file():
         raise RunReadError(f"{path.parent}: no {CONFIG} there; name the directory of a run")
     return Recording(path, metadata)
-
-
-def _read_text(path: Path) -> str:
-    return path.read_text(encoding="utf-8", errors="replace")
 
 
 def _readable(path: Path, read: Callable[[Path], _T]) -> _T:

@@ -8,7 +8,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
@@ -328,7 +328,8 @@ class _Entry:
             for one in sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden"):
                 key = format_key(tuple(one["loc"]))
                 if one["type"] == "extra_forbidden":
-                    self._complain(key, _unknown(key, model.model_fields))
+                    near, known = nearest(key, list(model.model_fields)), ", ".join(model.model_fields)
+                    self._complain(key, f"is unknown; {f'did you mean {near}?' if near else f'known here: {known}'}")
                 else:
                     self._complain(key, faults_of([one])[0].what)
         return None
@@ -344,12 +345,6 @@ def _rows(tree: Mapping[str, Any], section: str, problems: list[str], name: str)
         return rows
     problems.append(f"{name}: {section} must be a list of tables; begin each with [[{section}]]")
     return []
-
-
-def _unknown(key: str, fields: Iterable[str]) -> str:
-    fields = list(fields)
-    near = nearest(key, fields)
-    return f"is unknown; did you mean {near}?" if near else f"is unknown; known here: {', '.join(fields)}"
 
 
 def _place(name: str, text: str, section: str, index: int, key: str) -> str:

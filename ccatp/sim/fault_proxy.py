@@ -260,13 +260,14 @@ class FaultProxy:
     Attributes:
         counts: what was really done, by the types of the faults: lines hit, writes, bytes swallowed, connections
             ended; ``connections`` taken, ``refused`` because the server could not be reached.
+        connections: the two pipes of each that there is now.
     """
 
     def __init__(self, host: str, port: int, *, seed: int, listener: socket.socket | None = None) -> None:
         self._address, self._own_listener = (host, port), listener
         self._rng = random.Random(seed)
         self._faults: dict[OneWay, OneWayFaults] = {way: {} for way in _BOTH}
-        self._connections: list[dict[OneWay, Pipe]] = []
+        self.connections: list[dict[OneWay, Pipe]] = []
         self._handlers: set[asyncio.Task[None]] = set()
         self._flooding: asyncio.Task[None] | None = None
         self._server: asyncio.Server | None = None
@@ -286,13 +287,8 @@ class FaultProxy:
     async def __aexit__(self, *_: object) -> None:
         await self.stop()
 
-    @property
-    def connections(self) -> int:
-        """How many there are."""
-        return len(self._connections)
-
     def _pipes(self) -> list[Pipe]:
-        return [pipe for pipes in self._connections for pipe in pipes.values()]
+        return [pipe for pipes in self.connections for pipe in pipes.values()]
 
     async def stop(self) -> None:
         """End everything."""
@@ -310,7 +306,7 @@ class FaultProxy:
 
     def reset(self) -> None:
         """Break every connection by RST, on both sides."""
-        self.counts["reset"] += len(self._connections)
+        self.counts["reset"] += len(self.connections)
         for pipe in self._pipes():
             pipe.reset()
 
@@ -323,7 +319,7 @@ class FaultProxy:
 
         What they still send is read and forgotten: a socket closed over unread bytes sends RST.
         """
-        self.counts["close"] += len(self._connections)
+        self.counts["close"] += len(self.connections)
         for pipe in self._pipes():
             pipe.shut()
 
@@ -379,7 +375,7 @@ class FaultProxy:
             "to_robot": self._pipe("to_robot", reader, server),
             "to_client": self._pipe("to_client", server_reader, client),
         }
-        self._connections.append(pipes)
+        self.connections.append(pipes)
         self.counts["connections"] += 1
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -387,7 +383,7 @@ class FaultProxy:
                     tasks.create_task(pipe.receive())
                     tasks.create_task(pipe.send())
         finally:
-            self._connections.remove(pipes)
+            self.connections.remove(pipes)
             client.close()
             server.close()
 
@@ -420,7 +416,7 @@ class FaultProxy:
                     continue
                 owed[way] += (now_s - before_s) * flood.rate_hz
                 lines, owed[way] = int(owed[way]), owed[way] % 1.0
-                for pipes in self._connections if lines else ():
+                for pipes in self.connections if lines else ():
                     pipes[way].flood(lines)
             before_s = now_s
 

@@ -163,10 +163,11 @@ class MoteListener:
         names = self._motes.names
         pairs = [(sender, other) for other in range(len(names)) if other != sender]
         found = self._field.listen(pairs, 1, self._rng)
-        return [
-            MoteBurst(time_s, names[sender], names[one.listener], round(one.temperature_c, 6), _rounded(one.delays_s))
-            for one in found
-        ]
+        bursts = []
+        for one in found:
+            delays_s = [round(delay_s, _DIGITS) for delay_s in one.delays_s.tolist()]
+            bursts.append(MoteBurst(time_s, names[sender], names[one.listener], round(one.temperature_c, 6), delays_s))
+        return bursts
 
     def _own(self, time_s: float, pose: TruePose, sender: int) -> list[MoteBurst]:
         """The robot's listener receives all round; the mote has its cone."""
@@ -193,7 +194,3 @@ class MoteListener:
         if not facing.any() or way_m <= 0.0:
             return 0.0
         return float(np.arccos(np.clip((facing[0] * dx + facing[1] * dy) / way_m, -1.0, 1.0)))
-
-
-def _rounded(delays_s: FloatArray) -> list[float]:
-    return [round(float(delay_s), _DIGITS) for delay_s in delays_s]

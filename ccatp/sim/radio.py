@@ -19,9 +19,6 @@ class SimDriveCommand(NamedTuple):
     turn_rate_rad_s: float
 
 
-HALT = SimDriveCommand(0.0, 0.0, 0.0)
-
-
 class TruePose(NamedTuple):
     """Pose in the room: x, y, and the heading from the x axis, counter-clockwise, not wrapped."""
 

@@ -9,7 +9,6 @@ from ccatp.config.beacon_models import RadioConfig, SimObstacleConfig
 from ccatp.config.load import load_radio_config
 from ccatp.core import wrap_pi
 from ccatp.sim.radio import (
-    HALT,
     MovingTarget,
     ShadowingField,
     SimDriveCommand,
@@ -193,7 +192,7 @@ def test_a_seed_repeats_itself_and_listening_does_not_change_the_rest() -> None:
 
 def test_reflector_worlds_give_packets_and_others_sightings() -> None:
     world = RadioWorld(config(sim__radio__scan="reflector"))
-    frame = world.step(HALT, 0.1, static=True, target=False)
+    frame = world.step(SimDriveCommand(0.0, 0.0, 0.0), 0.1, static=True, target=False)
     assert len(frame.packets) == 160
     assert frame.sightings == ()
     assert world.clearance_m == np.inf
