@@ -46,7 +46,7 @@ def build_localizer(
     return made
 
 
-def build_doubting(
+def build_with_uncertainty(
     cfg: Config,
     mirror: Mirror,
     pose: DeckPose,
@@ -55,5 +55,5 @@ def build_doubting(
 ) -> Localizer:
     """The localizer for ``run.filter`` at a deck ``pose`` seen last, with sigmas of place (m) and heading (rad)."""
     start = {"start_position_sigma_m": sigmas[0], "start_heading_sigma_rad": sigmas[1]}
-    doubting = cfg.model_copy(update={"localizer": cfg.localizer.model_copy(update=start)})
-    return build_localizer(doubting, mirror, wrap, mirror.panel_pose(mirror.nearest_panel(pose.x_m, pose.y_m), pose))
+    uncertain = cfg.model_copy(update={"localizer": cfg.localizer.model_copy(update=start)})
+    return build_localizer(uncertain, mirror, wrap, mirror.panel_pose(mirror.nearest_panel(pose.x_m, pose.y_m), pose))

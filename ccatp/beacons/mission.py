@@ -83,14 +83,14 @@ class BeaconMission:
         self.cause = self.abort_cause = ""
         self.is_faulted = False
         self._is_by_hand = False
-        self._bar = ""
+        self._interlock = ""
         self._raised = 0
         self._severity = Severity.NONE
 
     @property
     def is_paused(self) -> bool:
         """Held until somebody resumes, or says that an earthquake is over."""
-        return self.state is HELD and (self._is_by_hand or bool(self._bar))
+        return self.state is HELD and (self._is_by_hand or bool(self._interlock))
 
     # -- commands: each returns why it was refused, or None -------------------------------------------------------
 
@@ -105,11 +105,11 @@ class BeaconMission:
         """Go on after a hold; what holds the robot must be gone."""
         if self.state is not HELD:
             return f"the mission is not held but {self.state}"
-        if self._bar:
-            return f"{self._bar}: nothing moves until that is cleared"
+        if self._interlock:
+            return f"{self._interlock}: nothing moves until that is cleared"
         if self._severity >= Severity.HOLD:
             return f"the cause persists: {self.cause}"
-        self._go_on()
+        self._proceed()
         return None
 
     def abort(self, cause: str) -> str | None:
@@ -117,8 +117,8 @@ class BeaconMission:
         if self.state is DONE:
             return "the mission is over"
         self.abort_cause = self.abort_cause or cause
-        if not self._bar:
-            self._go_on()
+        if not self._interlock:
+            self._proceed()
             self.cause = self.abort_cause
         return None
 
@@ -158,12 +158,12 @@ class BeaconMission:
         self._severity = verdict.severity
         if verdict.is_shaking:
             self._raised = verdict.raised
-            if not self._bar:
-                self._bar = EARTHQUAKE
+            if not self._interlock:
+                self._interlock = EARTHQUAKE
                 self.abort_cause = self.abort_cause or EARTHQUAKE
                 self._hold(EARTHQUAKE, by_hand=self.state is HELD and self._is_by_hand)
         else:
-            self._bar = ""
+            self._interlock = ""
         if verdict.severity is Severity.FAULT:
             self.fault(verdict.cause)
             return False
@@ -177,13 +177,13 @@ class BeaconMission:
             self._raised = verdict.raised  # the level is repeated; what counts is that it is new
             self.abort(verdict.cause)
         if self.state is IDLE or (self.state is HELD and not self._is_by_hand):
-            self._go_on()
+            self._proceed()
         return self.state is not HELD
 
     def _hold(self, cause: str, *, by_hand: bool) -> None:
         self.state, self.cause, self._is_by_hand = HELD, cause, by_hand
 
-    def _go_on(self) -> None:
+    def _proceed(self) -> None:
         self.state, self.cause = IDLE, self.abort_cause
         self._is_by_hand = self.is_faulted = False
 

@@ -41,7 +41,7 @@ def _ask(folder: Path | None, command: str, timeout_s: float) -> dict[str, Any]:
     return OperatorClient(folder, timeout_s).ask(command)
 
 
-def _tell(reply: Mapping[str, Any], json_output: bool) -> None:
+def _print_reply(reply: Mapping[str, Any], json_output: bool) -> None:
     """A daemon's answer on standard output; of the operator channel's, where the mission stands."""
     if json_output:
         click.echo(json.dumps(reply))
@@ -71,7 +71,7 @@ def _operator_command(name: str, help_text: str) -> click.Command:
     @click.command(name, help=help_text, epilog=example(f"ccatp {name}"))
     @DAEMON_OPTIONS
     def command(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
-        _tell(_ask(configured_folder(config_file, runtime_dir), name, timeout_s), json_output)
+        _print_reply(_ask(configured_folder(config_file, runtime_dir), name, timeout_s), json_output)
 
     return command
 
@@ -112,7 +112,7 @@ def emergency(kind: str, note: str, emergency_id: uuid.UUID | None, json_output:
         "id": str(emergency_id or uuid.uuid4()),
         "note": note,
     }
-    _tell(_ask_observatory(payload, **where), json_output)
+    _print_reply(_ask_observatory(payload, **where), json_output)
 
 
 @click.command(epilog=example("ccatp clear 6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"))
@@ -123,7 +123,7 @@ def clear(emergency_id: uuid.UUID, json_output: bool, **where: Any) -> None:
 
     ID is what ccatp emergency printed. The robot must be at base or held; over TCP, our key needs the role clear.
     """
-    _tell(_ask_observatory({"cmd": "clear", "id": str(emergency_id)}, **where), json_output)
+    _print_reply(_ask_observatory({"cmd": "clear", "id": str(emergency_id)}, **where), json_output)
 
 
 def _ask_observatory(
@@ -170,7 +170,7 @@ def status(
     """Show what the running daemon is doing."""
     folder = configured_folder(config_file, runtime_dir)
     if not watch:
-        _tell(_ask(folder, "status", timeout_s), json_output)
+        _print_reply(_ask(folder, "status", timeout_s), json_output)
         return
     answers = _answers(folder, timeout_s, period_s)
     if json_output:

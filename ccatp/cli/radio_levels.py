@@ -131,7 +131,7 @@ def fix(
     except PathLossError as error:
         raise RadioDataError(source, str(error)) from error
     if not leave_out:
-        warnings += _names_doubt(locators[0], places)
+        warnings += _doubtful_names(locators[0], places)
         locators *= len(places)
     warn(warnings)
     found = [locator.fix(heard.levels_dbm) for locator, heard in zip(locators, places, strict=True)]
@@ -205,7 +205,7 @@ def _exchanged(places: "tuple[HeardPlace, ...]", exchange: str) -> "tuple[HeardP
     return tuple(heard.renamed({pair[0]: pair[1], pair[1]: pair[0]}) for heard in places)
 
 
-def _names_doubt(locator: "LevelLocator", places: "Sequence[HeardPlace]") -> list[str]:
+def _doubtful_names(locator: "LevelLocator", places: "Sequence[HeardPlace]") -> list[str]:
     from ccatp.beacons.slam.level_fix import likeliest_names
 
     names, gain = likeliest_names(locator, places)

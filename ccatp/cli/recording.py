@@ -37,7 +37,7 @@ def info(path: Path, json_output: bool) -> int:
         click.echo(json.dumps({"recordings": [facts.as_json() for facts in found]}))
     else:
         for facts in found:
-            _tell(facts)
+            _print_facts(facts)
     return int(not all(facts.is_in_order for facts in found))
 
 
@@ -68,7 +68,7 @@ def repair(path: Path, out: Path | None, json_output: bool) -> int:
     return 0
 
 
-def _tell(facts: "RecordingFacts") -> None:
+def _print_facts(facts: "RecordingFacts") -> None:
     condition, span = facts.condition, facts.span_s
     click.echo(f"{facts.path}: {facts.state}")
     for begin, end in () if facts.is_in_order else condition.lost:

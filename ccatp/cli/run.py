@@ -130,5 +130,5 @@ def stream(
         port if plotjuggler else None,
         foxglove_port,
         is_open=open_to_network,
-        say=lambda text: click.echo(f"ccatp stream: {text}", err=True),
+        report=lambda text: click.echo(f"ccatp stream: {text}", err=True),
     )

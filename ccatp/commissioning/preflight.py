@@ -254,7 +254,7 @@ def _edge_sensors(frames: Sequence[Sensors]) -> PreflightResult:
 
 def _gravity(mirror: Mirror, frames: Sequence[Sensors]) -> PreflightResult:
     check = MirrorCheck(mirror)
-    is_known = any(check.hear(frame.t, frame.gravity, mirror.base_pose) for frame in frames)
+    is_known = any(check.update(frame.t, frame.gravity, mirror.base_pose) for frame in frames)
     if check.contradiction:
         return failed(
             "gravity", check.contradiction, "set run.mirror to where the robot stands, or set it down at base"

@@ -153,7 +153,7 @@ def build_parts(cfg: Config, args: ProcessArgs) -> tuple[SurveyParts, MissionSto
         latched = [f"'ccatp clear {one}'" for one in active_ids(args.run_dir / EMERGENCIES)]
         before = f"the last run ended with an emergency that is not cleared: {', '.join(latched)}; " if latched else ""
         parts.mission.pause(before + _why_held(len(done), points))
-        parts.mission.know_emergency()
+        parts.mission.skip_present_emergency()
     return parts, store
 
 

@@ -204,7 +204,7 @@ def page_url(host: str, port: int) -> str:
     return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
 
 
-def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callable[[str], None]) -> int:
+def attach(runtime_dir: Path | None, settings: Mapping[str, object], report: Callable[[str], None]) -> int:
     """Serve a dashboard beside a running daemon until SIGINT or SIGTERM; ``settings`` replace keys of ``dashboard``.
 
     Raises:
@@ -226,7 +226,7 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callab
         raise ConfigError(page.text)
     is_sim = read_metadata(run_dir / TELEMETRY).get("simulation") == "true"
     with page.socket:
-        say(page.text)
+        report(page.text)
         return _run(cfg, run_dir, Endpoints(folder), page.socket, is_sim=is_sim, has_heartbeat=False)
 
 

@@ -181,7 +181,7 @@ class FixService:
     async def _store_fix(self, request: FixRequest, fix: Fix) -> None:
         """The localizer has taken the fix: store it where the robot is near enough to the point."""
         if request.point is not None:
-            self.arrival_error_m = self._mission.survey.distance_m(self._localizer.pose)
+            self.arrival_error_m = self._mission.survey_route.distance_m(self._localizer.pose)
             if self._is_too_far(request.point):
                 self._mission.again()
                 return

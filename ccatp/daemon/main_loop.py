@@ -195,7 +195,7 @@ class MainLoop(RobotLoop):
             if refusal is not None:
                 return format_error(refusal)
             self._telemetry.notify_operator("info", f"operator: {command}")
-            self.let_time_go_on()
+            self.release_time()
         if command in (OperatorCommand.PAUSE, OperatorCommand.STOP):
             try:
                 async with asyncio.timeout(EFFECT_TIMEOUT_S):
@@ -308,7 +308,7 @@ class MainLoop(RobotLoop):
         if seq is not None:
             self.send_drive(seq, STILL)
 
-    def let_time_go_on(self) -> None:
+    def release_time(self) -> None:
         """Something changed between two frames, as after a measurement or a pause: lockstep time may go on."""
         if self._may_answer():
             self._answer_held_frame()

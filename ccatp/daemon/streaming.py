@@ -68,9 +68,9 @@ class Streamer:
         context: zmq.Context[zmq.Socket[bytes]],
         runtime_dir: Path,
         streams: Sequence[LiveStream],
-        say: Callable[[str], None],
+        report: Callable[[str], None],
     ) -> None:
-        self._context, self._streams, self._say = context, streams, say
+        self._context, self._streams, self._report = context, streams, report
         self._runtime_dir, self._endpoints = runtime_dir, Endpoints(runtime_dir)
         self._heartbeats = Subscriber(context, [self._endpoints.of("main")], ["heartbeat.main"])
         self._run: Subscriber | None = None
@@ -110,7 +110,7 @@ class Streamer:
             cfg = load_config(run_dir / "config.toml")
             is_sim = read_metadata(run_dir / TELEMETRY).get("simulation") == "true"
         except (OSError, ConfigError) as error:
-            self._say(f"a run whose configuration cannot be read is not streamed: {error}")
+            self._report(f"a run whose configuration cannot be read is not streamed: {error}")
             return
         self._views = Views(build_mirror(cfg.mirror), cfg.robot.puck_height_m)
         mirror, world, run = cfg.mirror.name, cfg.world.name if is_sim else "", cfg.run
@@ -119,7 +119,7 @@ class Streamer:
         names = ("main", "danger", "truth") if is_sim else ("main", "danger")
         topics = dict.fromkeys((*PASSED_ON, *TURNED_INTO_VIEWS))
         self._run = Subscriber(self._context, [self._endpoints.of(name) for name in names], topics)
-        self._say(f"streaming {'SIMULATION of ' if is_sim else ''}{mirror}, {run_dir}")
+        self._report(f"streaming {'SIMULATION of ' if is_sim else ''}{mirror}, {run_dir}")
 
     def _pass_on(self, name: str, body: bytes, message: Message) -> None:
         if name in PASSED_ON:
@@ -145,7 +145,7 @@ def serve(
     foxglove_port: int | None,
     *,
     is_open: bool,
-    say: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> int:
     """Stream until SIGINT or SIGTERM.
 
@@ -175,13 +175,13 @@ def serve(
             streams.append(FoxgloveStream("ccatp", host, foxglove_port, streamed_schemas()))
             stack.callback(streams[-1].close)
         for stream in streams:
-            say(f"serving at {stream.where}")
-        streamer = Streamer(context, folder, streams, say)
+            report(f"serving at {stream.where}")
+        streamer = Streamer(context, folder, streams, report)
         stack.callback(streamer.close)
         for number in (signal.SIGINT, signal.SIGTERM):
             stack.callback(signal.signal, number, signal.signal(number, end))
         os.nice(NICENESS)
-        say(f"waiting for a run in {folder}")
+        report(f"waiting for a run in {folder}")
         while not is_over:
             streamer.step()
     return 0

@@ -32,7 +32,7 @@ from ccatp.survey.behaviours import home_time_s
 from ccatp.survey.composition import SurveyParts
 from ccatp.survey.fix_gate import FixGate
 from ccatp.survey.mission import Mission
-from ccatp.survey.reactions import MirrorCheck, ReminderCall, UnattendedFaultTimer
+from ccatp.survey.reactions import FaultAction, MirrorCheck, UnattendedFaultTimer
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.state import MissionState, SurveyOutcome, by_reason
 from ccatp.survey.stops import HOLD_POSITION, MissionCommand
@@ -106,7 +106,7 @@ class SurveyRunner(MissionRunner):
             self.mission,
             store,
             self.telemetry,
-            loop.let_time_go_on,
+            loop.release_time,
             # lockstep time stands still meanwhile
             lambda: 0.0 if loop.is_lockstep else cfg.etalon.measuring_time_s,
         )
@@ -133,10 +133,10 @@ class SurveyRunner(MissionRunner):
 
     def status(self) -> MissionStatus:
         mission = self.mission
-        stop = mission.journey.current
+        stop = mission.follower.current
         point = stop.point if stop is not None else None
         if mission.is_paused:
-            point = mission.survey.next_point
+            point = mission.survey_route.next_point
         return MissionStatus(
             seq=self._clock.seq,
             t_s=self._clock.t_s,
@@ -218,7 +218,7 @@ class SurveyRunner(MissionRunner):
         self._predictor.sent(seq, twist.v_m_s, twist.omega_rad_s)
 
     def on_tracking_gap(self) -> None:
-        self.mission.lose_sight()
+        self.mission.on_tracking_gap()
 
     def save_checkpoint(self) -> None:
         self._checkpoint.write(self._clock.seq, self._clock.t_s, self._clock.elapsed_s)
@@ -239,7 +239,7 @@ class SurveyRunner(MissionRunner):
         if recovery is not None:  # a replay has to know where the localizer of a loop that takes over begins
             pose, sigmas = recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad)
             self._publish_treatment(sensors, "begun", (pose.x_m, pose.y_m, pose.heading_rad, *sigmas))
-        is_odometry_off = mission.ignores_motion
+        is_odometry_off = mission.rejects_odometry
         if is_odometry_off is not self._is_odometry_off:
             self._is_odometry_off = is_odometry_off
             self._publish_treatment(sensors, "odometry_off" if is_odometry_off else "odometry_on")
@@ -294,7 +294,7 @@ class SurveyRunner(MissionRunner):
         check = self._mirror_check
         if check is None:
             return True
-        if check.hear(sensors.t, sensors.gravity, self._localizer.deck_pose):
+        if check.update(sensors.t, sensors.gravity, self._localizer.deck_pose):
             self._mirror_check = None
             if check.warning:
                 self.telemetry.notify_operator("warning", check.warning)
@@ -307,10 +307,10 @@ class SurveyRunner(MissionRunner):
     def _apply_requests(self, sensors: Sensors) -> None:
         """Requests of the mission besides the drive, before that is sent."""
         mission, health = self.mission, self._cfg.health
-        if mission.doubts_pose:
-            mission.doubts_pose = False
+        if mission.inflates_covariance:
+            mission.inflates_covariance = False
             doubt = health.doubt_position_m, health.doubt_heading_rad
-            self._localizer.doubt(*doubt)
+            self._localizer.inflate_covariance(*doubt)
             self._publish_treatment(sensors, "doubted", doubt)
         if mission.wants_calibration and not self._has_reported_calibration:
             self._has_reported_calibration = True
@@ -324,15 +324,15 @@ class SurveyRunner(MissionRunner):
     def _check_unattended_fault(self, sensors: Sensors) -> None:
         """An alarm now and then, and the return to base before the battery is too low for it."""
         mission, timer, pose = self.mission, self._fault_timer, self._localizer.deck_pose
-        knows_place = not (mission.is_lost or self._localizer.is_frozen)
-        home_s = home_time_s(self._mirror.base_pose, self._cfg.limits, pose.x_m, pose.y_m) if knows_place else None
-        call = timer.watch(sensors.t, sensors.soc, home_s)
-        if call is ReminderCall.REMIND:
+        is_localized = not (mission.is_lost or self._localizer.is_frozen)
+        home_s = home_time_s(self._mirror.base_pose, self._cfg.limits, pose.x_m, pose.y_m) if is_localized else None
+        action = timer.watch(sensors.t, sensors.soc, home_s)
+        if action is FaultAction.REMIND:
             held_s = timer.held_s(sensors.t)
             self.telemetry.notify_operator(
                 "error", f"held for {held_s:.0f} s, waiting for an operator: {mission.cause}"
             )
-        elif call is ReminderCall.RETURN:
+        elif action is FaultAction.RETURN:
             mission.abort(f"unattended fault: the battery ({sensors.soc:.0%}) lasts for little more than the way home")
 
     def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
@@ -341,7 +341,7 @@ class SurveyRunner(MissionRunner):
             self._localizer.rest()
             self.telemetry.send("rest", Rest(seq=seq, t_s=motion.t_s))
         if command.arrived is not None:
-            error_m = mission.survey.distance_m(motion.pose)
+            error_m = mission.survey_route.distance_m(motion.pose)
             number, point = self.telemetry.number_of(seq), (*command.arrived,)
             arrival = ArrivalMessage(seq=number, t_s=motion.t_s, point=point, error_mm=1e3 * error_m)
             self.telemetry.send("arrival", arrival)

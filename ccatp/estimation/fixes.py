@@ -116,7 +116,7 @@ def fix_row(z: FloatArray, mean: FloatArray, slope: Slope, late_s: float) -> tup
     return residual + way * np.array((hx, hy)), H
 
 
-def begun_anew(
+def relocated(
     mean: FloatArray,
     covariance: FloatArray,
     residual: FloatArray,

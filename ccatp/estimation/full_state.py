@@ -63,12 +63,12 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
         self._panel = PanelFrame(mirror, start.panel)
         self._refused: list[FloatArray] = []
         self._fixed_m: FloatArray | None = None  # where the last fix that counted was
-        self._is_anew = False  # no fix has agreed since it began again
+        self._is_relocated = False  # no fix has agreed since it began again
         self._is_new_base = False
         self._turned = (0.0, 0.0)
         self._half_s = 0.0
         self._frame_s = _NOMINAL_FRAME_S
-        self._carry_on(0.0)
+        self._predict_pose(0.0)
 
     # -- what it knows ------------------------------------------------------------------------------------------------
 
@@ -152,7 +152,7 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
         limit = self._full.rest_rate_rad_s * (dt_s or _NOMINAL_FRAME_S)
         is_still = -limit <= right <= limit and -limit <= left <= limit
         if is_still and self._rest.is_resting:
-            self._stay(t_s, dt_s, taken, gravity)
+            self._hold_position(t_s, dt_s, taken, gravity)
             self._edges.scan(edges)
         else:
             self._go(t_s, dt_s, taken.imu, edges, is_still=is_still)
@@ -177,7 +177,7 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
         )
         return rates
 
-    def _stay(self, t_s: float, dt_s: float, taken: _Moved, gravity: GravitySample | None) -> None:
+    def _hold_position(self, t_s: float, dt_s: float, taken: _Moved, gravity: GravitySample | None) -> None:
         imu = taken.imu
         for wheel, found in zip((self._right, self._left), taken.rates_rad_s, strict=True):
             wheel.rest(found)
@@ -199,7 +199,7 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
             is_start = rest.is_resting
             rest.moved()
             if is_start:
-                self._carry_on(0.0)
+                self._predict_pose(0.0)
         self._frame_s = dt_s or _NOMINAL_FRAME_S
         right, left = self._turned
         self._block.add(dt_s, is_turning=bool(right or left), imu=imu)
@@ -214,7 +214,7 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
             if is_stop:
                 self._estimate.stop((self._right.angle_rad, self._left.angle_rad))
                 self._rebase()
-            self._carry_on(self._half_s)
+            self._predict_pose(self._half_s)
         self._panel.hand_over(self._running.x_m, self._running.y_m)
 
     def _rebase(self) -> None:
@@ -230,7 +230,7 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
         if abs(v) > self._v_limit_m_s or abs(w) > self._omega_limit_rad_s:
             raise FilterDiverged(f"{v:.3g} m/s and {w:.3g} rad/s are more than the wheels can do")
 
-    def _carry_on(self, half_s: float) -> None:
+    def _predict_pose(self, half_s: float) -> None:
         self._slope = self._estimate.slope()
         self._running.begin(self._estimate.mean, self._slope, half_s)
         if self._rest.is_resting:
@@ -248,7 +248,7 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
         if reading.samples:
             variances = self._gyro.variance, self._accelerometer.variance
             self._estimate.calibrate(reading, rested_s, variances)
-        self._carry_on(0.0)
+        self._predict_pose(0.0)
 
     # -- fixes --------------------------------------------------------------------------------------------------------
 
@@ -273,7 +273,7 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
             self.is_frozen = False
         self.counts["fixes"] += 1
         self.fix_deviation_m = foot.deviation_m
-        self._carry_on(0.0)
+        self._predict_pose(0.0)
         now = self._running
         self._panel.hand_over(now.x_m, now.y_m)
         return sqrt((now.x_m - before[0]) ** 2 + (now.y_m - before[1]) ** 2)
@@ -287,14 +287,14 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
             self._refuse(t_s, z, variance)
             return
         self._refused.clear()
-        self._fixed_m, self._is_anew = z, False
+        self._fixed_m, self._is_relocated = z, False
         self.counts["late_fixes"] += estimate.fix(t_s, z, variance) > 0
         estimate.end_leg()
 
     def _relocate(self, t_s: float, z: FloatArray, variance: FloatArray, *, is_lost: bool) -> None:
         turn_rad = self._turn_to(z, self._estimate.fix_residual(t_s, z))
-        self._estimate.relocate(t_s, z, variance, is_lost=is_lost, turn_rad=turn_rad, again=self._is_anew)
-        self._is_anew = True
+        self._estimate.relocate(t_s, z, variance, is_lost=is_lost, turn_rad=turn_rad, again=self._is_relocated)
+        self._is_relocated = True
         self._fixed_m = z
         self._block.restart()
         self._rebase()
@@ -322,7 +322,7 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
             f"{_CONSISTENT} fixes in a row say that the pose is {distance_mm:.1f} mm wrong: it begins anew"
         )
 
-    def doubt(self, way_m: float, turn_rad: float) -> None:
+    def inflate_covariance(self, way_m: float, turn_rad: float) -> None:
         """The pose may be wrong by this much, because what it was made of was: the pose stays, its certainty goes."""
         if self.is_frozen:
             return
@@ -331,8 +331,8 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
         self._left.restart()
         if self._block.dt_s > 0.0:
             self._take_block(self._clock.t_s)
-        self._estimate.lose(way_m, turn_rad)
-        self._carry_on(self._half_s)
+        self._estimate.inflate_covariance(way_m, turn_rad)
+        self._predict_pose(self._half_s)
         self._estimate.journal.restart()
         self._block.restart()
 
@@ -354,7 +354,7 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
                 self._take_block(last_s)
             # A gap without frames, if it is one and no jump of the clock, ends with the robot's own time-to-live.
             lost_s = min(max(t_s - last_s, MAX_FRAME_STEP_S), LONGEST_GAP_S)
-            self._estimate.lose(self._running.v_m_s * lost_s, self._running.omega_rad_s * lost_s)
-            self._carry_on(0.0)
+            self._estimate.inflate_covariance(self._running.v_m_s * lost_s, self._running.omega_rad_s * lost_s)
+            self._predict_pose(0.0)
         self._estimate.journal.restart()
         self._block.restart()

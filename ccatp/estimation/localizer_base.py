@@ -75,13 +75,13 @@ class LocalizerBase(ABC, Generic[Taken]):
         elif kind is not FrameKind.NEXT:
             self.counts[f"{kind.value}_frames"] += 1
             if self._clock.stale_run >= BACKWARD_LIMIT:
-                self._ask_to_hold("time stamps of the frames run backward")
+                self._request_hold("time stamps of the frames run backward")
             return
         if self._guard is not None:
             imu = self._believed(imu, encoders, dt_s)
         taken = self._take(t_s, imu, encoders)
         if self._intake.backward_source:
-            self._ask_to_hold(f"time stamps of the {self._intake.backward_source} run backward")
+            self._request_hold(f"time stamps of the {self._intake.backward_source} run backward")
             self._intake.backward_source = ""
         if self.is_frozen:
             return
@@ -103,9 +103,9 @@ class LocalizerBase(ABC, Generic[Taken]):
     def _freeze(self, error: FilterDiverged) -> None:
         self.is_frozen = True
         self.counts["diverged"] += 1
-        self._ask_to_hold(f"filter: {error}")
+        self._request_hold(f"filter: {error}")
 
-    def _ask_to_hold(self, cause: str) -> None:
+    def _request_hold(self, cause: str) -> None:
         self.hold_cause = self.hold_cause or cause
 
     @abstractmethod

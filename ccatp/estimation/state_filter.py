@@ -8,7 +8,7 @@ import numpy as np
 
 from ccatp.config.models import LocalizerConfig, RobotConfig
 from ccatp.core import DeckPose, FloatArray, PanelId, difference
-from ccatp.estimation.fixes import begun_anew, fix_row
+from ccatp.estimation.fixes import fix_row, relocated
 from ccatp.estimation.measurements import ZeroVelocityReading, heading_from_gravity
 from ccatp.estimation.odometry import PreintegratedMotion, WheelAngle
 from ccatp.estimation.seams import Edge, SeamLines, SensorTransition
@@ -348,7 +348,7 @@ class SurveyFilter:
         turn_rad: float = 0.0,
         again: bool = False,
     ) -> None:
-        """Begin again from a position (2,) measured at ``t_s``, and its covariance (2, 2); see ``begun_anew``.
+        """Begin again from a position (2,) measured at ``t_s``, and its covariance (2, 2); see ``relocated``.
 
         The heading is doubted by ``turn_rad``, and never by less than a set angle. ``again``: what was learned of the
         sensors and of slip since the last time was misleading, and is forgotten, too. Raises ``FilterDiverged``: not
@@ -357,7 +357,7 @@ class SurveyFilter:
         residual = self.fix_residual(t_s, z)
         mean, P = self._filter.mean, self._filter.covariance
         heading_rad2 = max(self._full.relocated_heading_sigma_rad, turn_rad) ** 2
-        x, P = begun_anew(mean, P, residual, variance, self._tilt_sigma_m**2, heading_rad2, is_lost=is_lost)
+        x, P = relocated(mean, P, residual, variance, self._tilt_sigma_m**2, heading_rad2, is_lost=is_lost)
         self.journal.restart()
         self._seams.forget()
         self._legs.forget_leg()
@@ -372,7 +372,7 @@ class SurveyFilter:
         self._filter.reset(x, P)
         self._panel = self._panel_below()
 
-    def lose(self, way_m: float, turn_rad: float) -> None:
+    def inflate_covariance(self, way_m: float, turn_rad: float) -> None:
         """The robot may have gone this far, and turned, without anyone looking."""
         Q = np.zeros((STATES, STATES))
         Q[X, X] = Q[Y, Y] = way_m * way_m

@@ -238,7 +238,7 @@ class FourStateLocalizer(LocalizerBase[Stack]):
         variances = (speed**2, cfg.reset_acceleration_sigma_m_s2**2, variance_rad2, rate**2)
         self.reset_filter(np.array([0.0, 0.0, heading_rad, 0.0]), np.diag(variances))
 
-    def doubt(self, way_m: float, turn_rad: float) -> None:
+    def inflate_covariance(self, way_m: float, turn_rad: float) -> None:
         """The pose may be wrong by this much, because what it was made of was: the pose stays, its certainty goes."""
         if self.is_frozen:
             return

@@ -308,7 +308,7 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
         done = {job.key for job in jobs if store.outcome(job) is not None}
         todo = [job for job in jobs[options.shard.number - 1 :: options.shard.of] if job.key not in done]
         todo.sort(key=lambda job: job.seed)  # one job of each cell first
-        _say(console, study, f"{len(todo)} jobs to do" + (f", {len(done)} done before" if done else ""))
+        _print(console, study, f"{len(todo)} jobs to do" + (f", {len(done)} done before" if done else ""))
         failures = _run_jobs(study, todo, store, console, options) if todo else []
         found = [[store.outcome(job) for job in group] for group in plan]
         work_s = sum(store.took_s(job) for job in jobs)
@@ -336,11 +336,11 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
             f"{len(jobs) - missing} of {len(jobs)} jobs are done; the other shards, "
             f"or the same command without --shard, do the {missing} that are missing"
         )
-    _say(console, study, text)
+    _print(console, study, text)
     return result
 
 
-def _say(console: Console, study: Study, text: str) -> None:
+def _print(console: Console, study: Study, text: str) -> None:
     console.print(f"ccatp: study {study.name}: {text}", markup=False, soft_wrap=True)
 
 
@@ -373,7 +373,9 @@ def _run_jobs(
             progress.update(task, completed=count)
             if not console.is_terminal and 10 * count // total > 10 * (count - 1) // total:
                 left = timedelta(seconds=round((time.monotonic() - began_s) / count * (total - count)))
-                _say(console, study, f"{count} of {total} jobs ({100 * count // total} %), {left} left; last {job.key}")
+                _print(
+                    console, study, f"{count} of {total} jobs ({100 * count // total} %), {left} left; last {job.key}"
+                )
     return failures
 
 

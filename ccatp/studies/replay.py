@@ -16,7 +16,7 @@ from ccatp.estimation.fixes import FixRefused
 from ccatp.filters.base import Filter, FilterError, Innovation, Observation, Transition
 from ccatp.filters.metrics import rms
 from ccatp.filters.smoother import ROUNDING, Smoothed, Smoother
-from ccatp.localizer import FOUR_STATE, Localizer, build_doubting, build_localizer
+from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import MirrorError
 from ccatp.records.run_reader import Event, Fixed, Marked, Trace, TraceBuilder
@@ -270,14 +270,14 @@ class _Player:
                 raise FilterError("the main loop was restarted within this recording, and no smoother goes across that")
             x_m, y_m, heading_rad, *sigmas = event.begun
             pose = DeckPose(x_m, y_m, heading_rad)
-            self._localizer = build_doubting(self._cfg, self._mirror, pose, (sigmas[0], sigmas[1]), self._wrap)
+            self._localizer = build_with_uncertainty(self._cfg, self._mirror, pose, (sigmas[0], sigmas[1]), self._wrap)
         localizer, sensors = self._localizer, event.sensors
         imu, enc = ((), as_standing(sensors.enc)) if event.is_odometry_off else (sensors.imu, sensors.enc)
         localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
         if localizer.hold_requested:
             localizer.clear_hold()
         if event.doubted is not None:
-            localizer.doubt(*event.doubted)
+            localizer.inflate_covariance(*event.doubted)
         if event.at_rest:
             localizer.rest()
         self._seq = sensors.seq

@@ -266,16 +266,16 @@ class SilRun:
         if verdict.code is not self._code:
             self._code = verdict.code
             self.trace.builder.add_verdict_event(seq, verdict.code)
-        imu, enc = ((), as_standing(frame.enc)) if mission.ignores_motion else (frame.imu, frame.enc)
+        imu, enc = ((), as_standing(frame.enc)) if mission.rejects_odometry else (frame.imu, frame.enc)
         localizer.step(t_s, imu, enc, frame.edge, frame.gravity)
         if localizer.hold_requested:
             mission.recover(localizer.hold_cause, t_s + self._time.offset_s)
             localizer.clear_hold()
         motion = self._motion(frame, dt_s)
         order = mission.step(motion, verdict)
-        if mission.doubts_pose:
-            mission.doubts_pose = False
-            localizer.doubt(self.cfg.health.doubt_position_m, self.cfg.health.doubt_heading_rad)
+        if mission.inflates_covariance:
+            mission.inflates_covariance = False
+            localizer.inflate_covariance(self.cfg.health.doubt_position_m, self.cfg.health.doubt_heading_rad)
         if mission.wants_full_fans and not self._has_full_fans:
             self._has_full_fans = True
             robot.command_fans(2, 1.0, 1.0)
@@ -344,7 +344,7 @@ class SilRun:
         self.notices += localizer.notices
         localizer.notices.clear()
         if point is not None and row is not None:
-            distance_m = mission.survey.distance_m(localizer.pose)
+            distance_m = mission.survey_route.distance_m(localizer.pose)
             if laser.is_too_far(row, point, fix, distance_m, localizer):
                 mission.again()
                 return

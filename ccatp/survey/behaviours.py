@@ -108,26 +108,26 @@ class Behaviours:
 
     def __init__(
         self,
-        standing: SurveyState,
+        survey: SurveyState,
         budget: TimeBudget | None,
         plan_home: PlanHome,
         plan_rest: PlanRest,
         plan_points: PlanPoints | None,
     ) -> None:
-        self._standing, self._budget = standing, budget
+        self._survey, self._budget = survey, budget
         self._plan_home, self._plan_rest, self._plan_points = plan_home, plan_rest, plan_points
 
     @property
     def measuring_point(self) -> PointId | None:
         """The point being measured; ``None`` for a fix that only serves to find the robot again."""
-        standing = self._standing
-        stop = standing.survey.current
-        return None if standing.needs_fix or stop is None else stop.point
+        survey = self._survey
+        stop = survey.survey_route.current
+        return None if survey.needs_fix or stop is None else stop.point
 
     def step(self, motion: StateEstimate, verdict: Verdict | None) -> MissionCommand:
         """One frame."""
-        state = self._standing.state
-        if motion.t_s < self._standing.stands_until_s:
+        state = self._survey.state
+        if motion.t_s < self._survey.stands_until_s:
             return HOLD_POSITION
         if state is DRIVING or state is TURNING:
             return self._travel(motion)
@@ -144,158 +144,158 @@ class Behaviours:
     # -- legs -----------------------------------------------------------------------------------------------------
 
     def _is_overdue(self, motion: StateEstimate) -> bool:
-        journey = self._standing.journey
-        stop = journey.current
-        if stop is None or not journey.is_overdue(motion.t_s):
+        follower = self._survey.follower
+        stop = follower.current
+        if stop is None or not follower.is_overdue(motion.t_s):
             return False
         where = f"({stop.x_m:.3f}, {stop.y_m:.3f}) m"
-        self._standing.fault(f"the leg to {where} is overdue: is a wheel blocked or slipping?")
+        self._survey.fault(f"the leg to {where} is overdue: is a wheel blocked or slipping?")
         return True
 
     def _travel(self, motion: StateEstimate) -> MissionCommand:
-        standing = self._standing
-        if standing.needs_fix:
+        survey = self._survey
+        if survey.needs_fix:
             return self._align(motion)
-        if standing.is_review_due and self._is_out_of_time(motion):
+        if survey.is_review_due and self._is_out_of_time(motion):
             return HOLD_POSITION
-        survey = standing.survey
-        stop = survey.current
-        if stop is not None and not standing.missed.follows_route(motion, stop, survey):
-            standing.is_off_route = True
-        if standing.is_off_route:
+        follower = survey.survey_route
+        stop = follower.current
+        if stop is not None and not survey.missed.follows_route(motion, stop, follower):
+            survey.is_off_route = True
+        if survey.is_off_route:
             return self._find_route(motion)
         if stop is None:
-            standing.go_on()
+            survey.proceed()
             return HOLD_POSITION
-        order = self._follow(survey, motion, stop)
+        order = self._follow(follower, motion, stop)
         if order is not None:
             return order
         if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) or self._is_vague(motion, stop):
-            standing.apply(MissionEvent.ARRIVED)
+            survey.apply(MissionEvent.ARRIVED)
             return self._settle(motion)
-        survey.advance()
-        standing.go_on()
+        follower.advance()
+        survey.proceed()
         return self._travel(motion)
 
-    def _follow(self, journey: RouteFollower, motion: StateEstimate, stop: Stop) -> MissionCommand | None:
-        standing = self._standing
-        twist = journey.follow(motion, stop)
+    def _follow(self, follower: RouteFollower, motion: StateEstimate, stop: Stop) -> MissionCommand | None:
+        survey = self._survey
+        twist = follower.follow(motion, stop)
         if self._is_overdue(motion):
             return HOLD_POSITION
-        phase = standing.tracker.phase
+        phase = survey.tracker.phase
         if phase is DONE:
             return None
-        if (phase is DRIVE) is not (standing.state is DRIVING):
-            standing.apply(MissionEvent.TURNED if phase is DRIVE else MissionEvent.REALIGN)
+        if (phase is DRIVE) is not (survey.state is DRIVING):
+            survey.apply(MissionEvent.TURNED if phase is DRIVE else MissionEvent.REALIGN)
         return MissionCommand(twist)
 
     def _align(self, motion: StateEstimate) -> MissionCommand:
-        aligner = self._standing.aligner
-        leg = aligner.leg(motion.deck)
+        heading_recovery = self._survey.heading_recovery
+        leg = heading_recovery.leg(motion.deck)
         stop = None if leg is None else leg.current
         order = None if leg is None or stop is None else self._follow(leg, motion, stop)
         if order is not None:
             return order
-        aligner.interrupt()
-        self._standing.apply(MissionEvent.ARRIVED)
+        heading_recovery.interrupt()
+        self._survey.apply(MissionEvent.ARRIVED)
         return self._settle(motion)
 
     def _is_vague(self, motion: StateEstimate, stop: Stop) -> bool:
         """Whether to measure at a via point: they lie near the rim, and the next turn needs the room the route left."""
-        return stop.kind is StopKind.VIA and motion.sigma_of() > self._standing.cfg.mission.via_sigma_m
+        return stop.kind is StopKind.VIA and motion.sigma_of() > self._survey.cfg.mission.via_sigma_m
 
     def _find_route(self, motion: StateEstimate) -> MissionCommand:
-        standing, stop = self._standing, self._standing.survey.current
+        survey, stop = self._survey, self._survey.survey_route.current
         deck = motion.deck
         if stop is not None and stop.kind is StopKind.CALIBRATE:
-            if is_on_drive(standing.survey.stops, deck.x_m, deck.y_m):
-                standing.is_off_route = False  # what was measured of the drive is not lost, and the rest of it follows
+            if is_on_drive(survey.survey_route.stops, deck.x_m, deck.y_m):
+                survey.is_off_route = False  # what was measured of the drive is not lost, and the rest of it follows
                 return HOLD_POSITION
-            standing.wants_calibration = True
-        due = standing.leftovers.chunk
+            survey.wants_calibration = True
+        due = survey.retries.chunk
         try:
             if due and self._plan_points is not None:
-                standing.route = self._plan_points(deck, due)
+                survey.route = self._plan_points(deck, due)
             else:
-                standing.route = self._plan_rest(standing.route, deck, {*standing.done, *standing.skipped})
+                survey.route = self._plan_rest(survey.route, deck, {*survey.done, *survey.skipped})
         except PlanError as error:
-            standing.fault(f"no way on: {error}")
+            survey.fault(f"no way on: {error}")
             return HOLD_POSITION
-        standing.is_off_route = False
-        standing.survey = standing.journey_along(standing.route.stops)
+        survey.is_off_route = False
+        survey.survey_route = survey.follow_stops(survey.route.stops)
         return HOLD_POSITION
 
     def _is_out_of_time(self, motion: StateEstimate) -> bool:
-        standing, budget = self._standing, self._budget
-        standing.is_review_due = False
+        survey, budget = self._survey, self._budget
+        survey.is_review_due = False
         if budget is None:
             return False
-        stops = standing.survey.stops[standing.survey.index :]
-        left = standing.leftovers.due or [stop.point for stop in stops if stop.point is not None]
+        stops = survey.survey_route.stops[survey.survey_route.index :]
+        left = survey.retries.due or [stop.point for stop in stops if stop.point is not None]
         going_on = budget.review(motion.t_s, motion.deck, left)
         if going_on is None:
-            standing.abort_cause = standing.abort_cause or f"the time budget of {budget.budget_s:g} s is used up"
-            standing.go_on()
+            survey.abort_cause = survey.abort_cause or f"the time budget of {budget.budget_s:g} s is used up"
+            survey.proceed()
             return True
         if going_on is not left:
-            standing.leftovers.thin_out(left, going_on, "no time for it")
-            standing.is_off_route = True
+            survey.retries.drop_low_priority(left, going_on, "no time for it")
+            survey.is_off_route = True
         return False
 
     # -- standing -------------------------------------------------------------------------------------------------
 
     def _settle(self, motion: StateEstimate) -> MissionCommand:
-        standing = self._standing
-        if standing.stopover.has_settled(motion):
-            standing.apply(MissionEvent.SETTLED)
+        survey = self._survey
+        if survey.settling.has_settled(motion):
+            survey.apply(MissionEvent.SETTLED)
             return MissionCommand(
-                HOLD_POSITION.twist, at_rest=True, arrived=standing.stopover.arrival_at(self.measuring_point)
+                HOLD_POSITION.twist, at_rest=True, arrived=survey.settling.arrival_at(self.measuring_point)
             )
         self._check_rest(motion)
         return HOLD_POSITION
 
     def _stand(self, motion: StateEstimate) -> MissionCommand:
-        if self._standing.stopover.is_due(motion):
+        if self._survey.settling.is_due(motion):
             return MissionCommand(HOLD_POSITION.twist, measure=True)
         self._check_rest(motion)
         return HOLD_POSITION
 
     def _check_rest(self, motion: StateEstimate) -> None:
-        if self._standing.stopover.is_restless(motion.t_s):
+        if self._survey.settling.is_settle_overdue(motion.t_s):
             speeds = f"{motion.speed_m_s:.4f} m/s, {motion.rate_rad_s:.4f} rad/s"
-            self._standing.fault(f"the robot does not come to rest: {speeds}")
+            self._survey.fault(f"the robot does not come to rest: {speeds}")
 
     # -- edge and home --------------------------------------------------------------------------------------------
 
     def _back_off(self, motion: StateEstimate, verdict: Verdict) -> MissionCommand:
-        standing = self._standing
-        retreat = standing.retreat
+        survey = self._survey
+        retreat = survey.retreat
         if retreat is None:
-            standing.go_on()
+            survey.proceed()
             return HOLD_POSITION
         twist = retreat.step(motion, verdict)
-        if retreat.step_at is RetreatStep.TURN_AWAY and standing.abort_cause:
+        if retreat.step_at is RetreatStep.TURN_AWAY and survey.abort_cause:
             retreat.step_at = RetreatStep.OVER  # there is no route to turn to; the way home begins from here
         if retreat.step_at is RetreatStep.STUCK:
-            standing.hold("stuck at the edge: no motion away from it is permitted, or none helps", by_hand=False)
-            standing.stuck_s = motion.t_s
+            survey.hold("stuck at the edge: no motion away from it is permitted, or none helps", by_hand=False)
+            survey.stuck_s = motion.t_s
             return HOLD_POSITION
         if retreat.step_at is RetreatStep.OVER:
-            standing.apply(MissionEvent.FIND)
+            survey.apply(MissionEvent.FIND)
             return HOLD_POSITION
         return MissionCommand(twist)
 
     def _return(self, motion: StateEstimate) -> MissionCommand:
-        standing = self._standing
-        if standing.home is None:
+        survey = self._survey
+        if survey.home is None:
             try:
-                standing.home = ReturnToBase(standing.journey_along(self._plan_home(motion.deck)), standing.tracker)
+                survey.home = ReturnToBase(survey.follow_stops(self._plan_home(motion.deck)), survey.tracker)
             except PlanError as error:
-                standing.fault(f"no way home: {error}")
+                survey.fault(f"no way home: {error}")
             return HOLD_POSITION
-        if standing.home.is_at_base:
-            standing.outcome = SurveyOutcome.AT_BASE
-            standing.apply(MissionEvent.FINISHED)
+        if survey.home.is_at_base:
+            survey.outcome = SurveyOutcome.AT_BASE
+            survey.apply(MissionEvent.FINISHED)
             return MissionCommand(HOLD_POSITION.twist, at_rest=True)
-        twist = standing.home.step(motion, standing.stopover.is_quiet(motion))
+        twist = survey.home.step(motion, survey.settling.is_quiet(motion))
         return HOLD_POSITION if self._is_overdue(motion) else MissionCommand(twist)

@@ -11,7 +11,7 @@ from ccatp.control.gate import DriveGate
 from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
-from ccatp.localizer import FOUR_STATE, Localizer, build_doubting, build_localizer
+from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.survey.heading_recovery import TakeoverState
 from ccatp.survey.mission import Mission
@@ -145,7 +145,7 @@ def robot_problems(cfg: Config, mirror: Mirror, hello: Hello) -> list[str]:
 def _build_localizer(cfg: Config, mirror: Mirror, recovery: TakeoverState | None) -> Localizer:
     if recovery is None:
         return build_localizer(cfg, mirror)
-    return build_doubting(cfg, mirror, recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad))
+    return build_with_uncertainty(cfg, mirror, recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad))
 
 
 def _rest_planner(cfg: Config, mirror: Mirror) -> PlanRest:

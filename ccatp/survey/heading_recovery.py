@@ -32,19 +32,19 @@ class HeadingRecovery:
         robot: RobotConfig,
         cfg: MissionConfig,
         heading_sigma_of: Callable[[], float],
-        make_journey: Callable[[Sequence[Stop]], RouteFollower],
+        follow_stops: Callable[[Sequence[Stop]], RouteFollower],
     ) -> None:
         self._mirror, self._limit_rad, self._wanted_m = mirror, cfg.heading_doubt_rad, cfg.alignment_leg_m
         # Whatever the heading, no sensor leaves the mirror.
         self._clearance_m = max(build_body(robot, cfg).turning_depth_m, cfg.leg_clearance_m)
-        self._sigma_of, self._make_journey = heading_sigma_of, make_journey
+        self._sigma_of, self._follow_stops = heading_sigma_of, follow_stops
         self._legs_left = 0
         self._was_reverse = True
-        self.journey: RouteFollower | None = None
+        self.follower: RouteFollower | None = None
 
     def doubt(self) -> None:
         """The robot may have turned while it was not observed."""
-        self._legs_left, self.journey = _MOST_LEGS, None
+        self._legs_left, self.follower = _MOST_LEGS, None
 
     @property
     def is_needed(self) -> bool:
@@ -60,15 +60,15 @@ class HeadingRecovery:
 
     def leg(self, deck: DeckPose) -> RouteFollower | None:
         """The leg being driven, or a new one from a pose; ``None`` where there is no room for any."""
-        if self.journey is None:
+        if self.follower is None:
             stop = self._plan(deck)
             self._legs_left = 0 if stop is None else self._legs_left - 1
-            self.journey = None if stop is None else self._make_journey([stop])
-        return self.journey
+            self.follower = None if stop is None else self._follow_stops([stop])
+        return self.follower
 
     def interrupt(self) -> None:
         """The leg is over, or the robot stopped on it: the next one begins where it is then."""
-        self.journey = None
+        self.follower = None
 
     def _plan(self, deck: DeckPose) -> Stop | None:
         """Back where the last one came from; where there is less room than wanted, whichever way has more."""

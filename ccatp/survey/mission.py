@@ -48,8 +48,8 @@ class Mission(SurveyState):
         if cfg.mission.holds_to_budget:
             self._budget = TimeBudget(cfg.run.budget_s, mirror, cfg.limits, cfg.etalon.measuring_time_s)
         self._is_steered_bare = not (cfg.control.predicts_delay and cfg.control.compensates_creep)
-        self._reactions = Failsafe(self)
-        self._travels = Behaviours(self, self._budget, plan_home, plan_rest, plan_points)
+        self._failsafe = Failsafe(self)
+        self._behaviours = Behaviours(self, self._budget, plan_home, plan_rest, plan_points)
         self._failures = 0
 
     def step(self, motion: StateEstimate, verdict: Verdict | None) -> MissionCommand:
@@ -59,8 +59,8 @@ class Mission(SurveyState):
             motion = motion.with_only(ahead=control.predicts_delay, creep=control.compensates_creep)
         if self._budget is not None:
             self._budget.begin(motion.t_s)
-        self._reactions.react(motion, verdict)
-        return self._travels.step(motion, verdict)
+        self._failsafe.react(motion, verdict)
+        return self._behaviours.step(motion, verdict)
 
     # -- measurements ---------------------------------------------------------------------------------------------
 
@@ -70,7 +70,7 @@ class Mission(SurveyState):
         if point is None and not self.needs_fix:
             self._leave_pointless()
             return
-        if point is None and self.aligner.wants_leg:
+        if point is None and self.heading_recovery.wants_leg:
             self.interrupt_parts()
             self.apply(MissionEvent.GO_ON)
             return
@@ -85,7 +85,7 @@ class Mission(SurveyState):
         if not self.is_awaiting_fix:
             self.is_off_route = True
             return
-        self.go_on()
+        self.proceed()
         self.missed.miss()
 
     def not_fixed(self, point: PointId | None, cause: str) -> None:
@@ -97,12 +97,12 @@ class Mission(SurveyState):
         self._failures += 1
         if point is None:
             if self._failures < limit:
-                self.stopover.repeat()  # it may not have stood quite still, and cannot do without
+                self.settling.repeat()  # it may not have stood quite still, and cannot do without
                 return
             self._failures = 0
             self.fault(f"the robot cannot be found again: {cause}")
             return
-        self.leftovers.failed(point, cause)
+        self.retries.failed(point, cause)
         if self._failures < limit:
             self._leave_stop(point, self.skipped)
             return
@@ -111,21 +111,21 @@ class Mission(SurveyState):
         self._leave_stop(point, self.skipped)
 
     def _leave_pointless(self) -> None:
-        stop = self.survey.current
+        stop = self.survey_route.current
         if self.is_awaiting_fix and stop is not None and stop.kind in (StopKind.CALIBRATE, StopKind.VIA):
-            self.survey.advance()
+            self.survey_route.advance()
             self._doubt_heading()
-            self.go_on()
+            self.proceed()
 
     def _doubt_heading(self) -> None:
         """Where the fix showed that the pose was wrong, the heading is found before the robot drives on."""
-        if self.aligner.is_needed and not self.is_at_start:
-            self.aligner.doubt()
+        if self.heading_recovery.is_needed and not self.is_at_start:
+            self.heading_recovery.doubt()
             self.needs_fix = True
 
     def _leave_stop(self, point: PointId | None, record: list[PointId]) -> None:
         goes_on = self.is_awaiting_fix
-        stop = self.survey.current
+        stop = self.survey_route.current
         # A pause may come while the fix is being committed, and a new way to the point: it counts all the same.
         is_here = stop is not None and stop.point == point
         if point is not None and (is_here or point not in record):
@@ -133,38 +133,38 @@ class Mission(SurveyState):
                 self.skipped.remove(point)
             record.append(point)
             if record is self.done:
-                self.leftovers.measured(point)
+                self.retries.measured(point)
             self.is_review_due = self._budget is not None
             self.backoffs = 0
             if is_here:
-                self.survey.advance()
+                self.survey_route.advance()
             self.is_off_route |= not is_here  # the way that was planned leads to it once more
             self._doubt_heading()
             # So it does where the robot was pushed meanwhile and waits to be measured again: there is no need any more.
             goes_on |= self.state in (SETTLING, MEASURING)
         if goes_on:
-            self.go_on()
+            self.proceed()
 
     # -- beginnings in mid-survey ---------------------------------------------------------------------------------
 
     def take_over(self, recovery: TakeoverState) -> None:
         """Go on with what another process began; before the first frame. The robot is found before it moves."""
-        self.lose_sight()
+        self.on_tracking_gap()
         self.skipped += recovery.skipped
         self.abort_cause = recovery.abort_cause
         if recovery.held_cause:
             self.hold(recovery.held_cause, by_hand=True)
         if recovery.abort_cause:
-            self.know_emergency()
+            self.skip_present_emergency()
 
-    def know_emergency(self) -> None:
+    def skip_present_emergency(self) -> None:
         """An emergency that is latched when the first verdict comes is no news."""
-        self._reactions.know_emergency()
+        self._failsafe.skip_present_emergency()
 
-    def lose_sight(self) -> None:
+    def on_tracking_gap(self) -> None:
         """The robot may have moved while it was not observed: it does not drive on before a fix, and a sure heading."""
-        self.lose()
-        self.aligner.doubt()
+        self.invalidate_pose()
+        self.heading_recovery.doubt()
 
     # -- commands: each returns why it was refused, or None -------------------------------------------------------
 
@@ -179,13 +179,13 @@ class Mission(SurveyState):
         """Go on after a hold. What holds the robot must be gone."""
         if self.state is not MissionState.HELD:
             return f"the mission is not held but {self.state}"
-        if self.bar or self.is_shaking:
-            return f"{self.bar or EARTHQUAKE}: nothing moves until that is cleared"
+        if self.interlock or self.is_shaking:
+            return f"{self.interlock or EARTHQUAKE}: nothing moves until that is cleared"
         if self.is_latched and not self.abort_cause:
             return "an emergency of before is latched: 'ccatp clear' it first"
         if self.severity >= Severity.HOLD and self.severity is not Severity.RETURN:
             return f"the cause persists: {self.cause}"
-        self.go_on()
+        self.proceed()
         return None
 
     def stop(self) -> str | None:
@@ -201,7 +201,7 @@ class Mission(SurveyState):
     @property
     def left_out(self) -> dict[PointId, str]:
         """Points that are skipped, or that will not be measured any more, and why."""
-        out = dict(self.leftovers.causes)
+        out = dict(self.retries.causes)
         if self.state is MissionState.DONE:
             why, over = self.cause or str(self.outcome), {*self.done, *out}
             out |= {point: why for point in self._points if point not in over}
@@ -210,24 +210,24 @@ class Mission(SurveyState):
     @property
     def is_paused(self) -> bool:
         """Held until an operator resumes, or reports that an earthquake is over."""
-        return self.state is MissionState.HELD and (self.awaits_operator or bool(self.bar))
+        return self.state is MissionState.HELD and (self.awaits_operator or bool(self.interlock))
 
     @property
     def request(self) -> int:
         """Number of the measurement that was asked for last."""
-        return self.stopover.request
+        return self.settling.request
 
     @property
     def measuring_point(self) -> PointId | None:
         """The point being measured; ``None`` for a fix that only serves to find the robot again."""
-        return self._travels.measuring_point
+        return self._behaviours.measuring_point
 
     @property
     def eta_s(self) -> float:
         """Least time that the rest of the survey takes, s; nothing is left of one that was given up or is over."""
         if self.abort_cause or self.state is MissionState.DONE:
             return 0.0
-        return self.route.remaining_s(self.survey.index)
+        return self.route.remaining_s(self.survey_route.index)
 
     @property
     def corrections(self) -> int:

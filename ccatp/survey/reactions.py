@@ -27,185 +27,183 @@ NEAR_EDGE, ABORTED = EventCode.NEAR_EDGE, EventCode.ABORTED
 NONE, SLOW, HOLD, RETURN, FAULT = Severity.NONE, Severity.SLOW, Severity.HOLD, Severity.RETURN, Severity.FAULT
 _CORNERS = frozenset(Corner)
 # So long after a fix found the robot the danger loop has heard where it is: a pose in five frames, and a verdict.
-_HEARD_S = 0.2
+_NOTICED_S = 0.2
 EARTHQUAKE = "emergency: earthquake"
 
 
 class Failsafe:
     """Takes the verdict of each frame before anything moves."""
 
-    def __init__(self, standing: SurveyState) -> None:
-        self._standing = standing
+    def __init__(self, survey: SurveyState) -> None:
+        self._survey = survey
         self._finding = ""
-        self._raised: int | None = 0
+        self._emergency_epoch: int | None = 0
         self._was_lost = self._has_looked = False
 
-    def know_emergency(self) -> None:
+    def skip_present_emergency(self) -> None:
         """Whatever is latched when the first verdict comes was acted on before."""
-        self._raised = None
+        self._emergency_epoch = None
 
     def react(self, motion: StateEstimate, verdict: Verdict | None) -> None:
         """Do what the verdict in force demands (``None``: none fresh enough)."""
-        standing = self._standing
-        if verdict is not None and self._raised is None:
-            self._raised = verdict.raised
-        self._await_news(motion.t_s, verdict)
-        if verdict is not None and self._heed_earthquake(verdict):
+        survey = self._survey
+        if verdict is not None and self._emergency_epoch is None:
+            self._emergency_epoch = verdict.raised
+        self._wait_for_verdict(motion.t_s, verdict)
+        if verdict is not None and self._on_earthquake(verdict):
             return
-        if verdict is not None and (verdict.severity is not NONE or standing.severity is not NONE):
-            standing.severity = verdict.severity
-            if self._obey(verdict):
+        if verdict is not None and (verdict.severity is not NONE or survey.severity is not NONE):
+            survey.severity = verdict.severity
+            if self._apply_severity(verdict):
                 return
-        if standing.stuck_s is not None and self._waits_at_edge(motion.t_s, verdict):
+        if survey.stuck_s is not None and self._waits_at_edge(motion.t_s, verdict):
             return
         if verdict is None or not (verdict.forward and verdict.reverse and verdict.turn):
-            self._stay(motion, verdict)
+            self._hold_position(motion, verdict)
             return
         if verdict.code is NEAR_EDGE:
-            self._meet_edge(motion, verdict)
+            self._on_edge(motion, verdict)
             return
-        if verdict.code is ABORTED and self._is_news(verdict):
-            standing.abort(verdict.cause)
-        is_waiting = standing.state is HELD and (standing.awaits_operator or motion.t_s < standing.waits_until_s)
-        if standing.state is IDLE or (standing.state is HELD and not is_waiting):
-            standing.go_on()
+        if verdict.code is ABORTED and self._is_new_emergency(verdict):
+            survey.abort(verdict.cause)
+        is_waiting = survey.state is HELD and (survey.awaits_operator or motion.t_s < survey.waits_until_s)
+        if survey.state is IDLE or (survey.state is HELD and not is_waiting):
+            survey.proceed()
 
-    def _await_news(self, t_s: float, verdict: Verdict | None) -> None:
+    def _wait_for_verdict(self, t_s: float, verdict: Verdict | None) -> None:
         """Found at an edge, the robot stands until the danger loop knows where: what it met may have been a seam."""
-        standing = self._standing
+        survey = self._survey
         if verdict is not None and verdict.severity < HOLD:
             self._has_looked = False
-        if self._was_lost and not standing.needs_fix and verdict is not None and verdict.code is NEAR_EDGE:
-            standing.stands_until_s = t_s + _HEARD_S
-        self._was_lost = standing.needs_fix
+        if self._was_lost and not survey.needs_fix and verdict is not None and verdict.code is NEAR_EDGE:
+            survey.stands_until_s = t_s + _NOTICED_S
+        self._was_lost = survey.needs_fix
 
-    def _stay(self, motion: StateEstimate, verdict: Verdict | None) -> None:
-        standing = self._standing
+    def _hold_position(self, motion: StateEstimate, verdict: Verdict | None) -> None:
+        survey = self._survey
         if verdict is None:
-            standing.interrupt("no fresh verdict from the danger loop")
+            survey.interrupt("no fresh verdict from the danger loop")
         elif verdict.code is NEAR_EDGE:
-            self._meet_edge(motion, verdict)
-        elif not (standing.needs_fix and standing.state in (SETTLING, MEASURING)):
+            self._on_edge(motion, verdict)
+        elif not (survey.needs_fix and survey.state in (SETTLING, MEASURING)):
             # A robot that stands to be found needs no permission, and without a pose gets none before it is.
-            standing.interrupt(verdict.cause)
+            survey.interrupt(verdict.cause)
 
-    def _is_news(self, verdict: Verdict) -> bool:
+    def _is_new_emergency(self, verdict: Verdict) -> bool:
         """Whether another emergency was raised since the last look: the level is repeated in each verdict."""
-        is_news, self._raised = verdict.raised != self._raised, verdict.raised
-        return is_news
+        is_new, self._emergency_epoch = verdict.raised != self._emergency_epoch, verdict.raised
+        return is_new
 
-    def _heed_earthquake(self, verdict: Verdict) -> bool:
+    def _on_earthquake(self, verdict: Verdict) -> bool:
         """Nothing moves while the ground shakes, unless away from an edge; whether that is all for this frame."""
-        standing = self._standing
-        standing.is_latched, standing.is_shaking = verdict.raised > 0, verdict.is_shaking
+        survey = self._survey
+        survey.is_latched, survey.is_shaking = verdict.raised > 0, verdict.is_shaking
         if not verdict.is_shaking:
-            standing.bar = ""
+            survey.interlock = ""
             return False
-        standing.wants_full_fans = True
+        survey.wants_full_fans = True
         if verdict.code is NEAR_EDGE:
             return False
-        self._raised = verdict.raised
-        self._stand_fast()
+        self._emergency_epoch = verdict.raised
+        self._hold_for_earthquake()
         return verdict.severity is not FAULT  # which an operator has to look after, too
 
-    def _stand_fast(self) -> None:
+    def _hold_for_earthquake(self) -> None:
         """Held, and home when it is over; a pose from before is not to be trusted then."""
-        standing = self._standing
-        if standing.bar or standing.state is MissionState.DONE:
+        survey = self._survey
+        if survey.interlock or survey.state is MissionState.DONE:
             return
-        standing.bar = EARTHQUAKE
-        standing.abort_cause = standing.abort_cause or EARTHQUAKE
-        standing.lose()
-        standing.hold(EARTHQUAKE, by_hand=standing.is_held_by_hand)
+        survey.interlock = EARTHQUAKE
+        survey.abort_cause = survey.abort_cause or EARTHQUAKE
+        survey.invalidate_pose()
+        survey.hold(EARTHQUAKE, by_hand=survey.is_held_by_hand)
 
-    def _obey(self, verdict: Verdict) -> bool:
-        standing, severity = self._standing, verdict.severity
-        standing.wants_full_fans |= verdict.full_fans
+    def _apply_severity(self, verdict: Verdict) -> bool:
+        survey, severity = self._survey, verdict.severity
+        survey.wants_full_fans |= verdict.full_fans
         is_denied = not (verdict.forward or verdict.reverse or verdict.turn)
         if severity is FAULT:
-            if not (standing.state is HELD and standing.is_faulted):
-                standing.fault(verdict.cause, is_lost=True)
+            if not (survey.state is HELD and survey.is_faulted):
+                survey.fault(verdict.cause, is_lost=True)
             return True
-        if is_denied and severity is HOLD and verdict.signal in _CORNERS and self._looks(verdict.cause):
+        if is_denied and severity is HOLD and verdict.signal in _CORNERS and self._relocalizes_once(verdict.cause):
             return True
         if is_denied and severity >= HOLD:
-            standing.await_recovery(verdict.cause, is_pose_doubted=verdict.signal not in _CORNERS)
+            survey.await_recovery(verdict.cause, is_pose_doubted=verdict.signal not in _CORNERS)
             return True
         self._pace(is_slow=severity in (SLOW, RETURN))
         if severity is RETURN and verdict.code is not NEAR_EDGE and verdict.cause != self._finding:
             self._finding = verdict.cause
-            standing.abort(verdict.cause)
+            survey.abort(verdict.cause)
         return False
 
-    def _looks(self, cause: str) -> bool:
+    def _relocalizes_once(self, cause: str) -> bool:
         """A sensor that stays off may be over a seam or the rim where the pose is wrong: one fix, at rest, tells."""
-        standing = self._standing
-        if standing.state is MissionState.DONE or standing.is_held_by_hand:
+        survey = self._survey
+        if survey.state is MissionState.DONE or survey.is_held_by_hand:
             return False
         if not self._has_looked:
             self._has_looked = True
-            standing.await_recovery(cause)
-            standing.go_on()
-        return standing.needs_fix and standing.state in (SETTLING, MEASURING)
+            survey.await_recovery(cause)
+            survey.proceed()
+        return survey.needs_fix and survey.state in (SETTLING, MEASURING)
 
     def _pace(self, *, is_slow: bool) -> None:
         """Drive at the reduced speed from now on, or at the usual one from the next leg on."""
-        standing = self._standing
-        if is_slow is standing.tracker.is_slow:
+        survey = self._survey
+        if is_slow is survey.tracker.is_slow:
             return
-        standing.tracker.is_slow = is_slow
-        if is_slow and standing.state in (DRIVING, TURNING, RETURNING):
-            standing.interrupt_travel()
+        survey.tracker.is_slow = is_slow
+        if is_slow and survey.state in (DRIVING, TURNING, RETURNING):
+            survey.interrupt_leg()
 
     def _waits_at_edge(self, t_s: float, verdict: Verdict | None) -> bool:
         """After a retreat that led nowhere: whether to go on waiting until no sensor hangs over any more."""
-        standing = self._standing
-        if standing.state is not HELD or standing.awaits_operator or standing.stuck_s is None:
-            standing.stuck_s = None
+        survey = self._survey
+        if survey.state is not HELD or survey.awaits_operator or survey.stuck_s is None:
+            survey.stuck_s = None
             return False
         if verdict is not None and verdict.code is not NEAR_EDGE:
-            standing.stuck_s = None
+            survey.stuck_s = None
             return False
-        if t_s - standing.stuck_s > standing.cfg.health.hold_limit_s:
-            standing.stuck_s = None
-            standing.fault(standing.cause)
+        if t_s - survey.stuck_s > survey.cfg.health.hold_limit_s:
+            survey.stuck_s = None
+            survey.fault(survey.cause)
         return True
 
-    def _meet_edge(self, motion: StateEstimate, verdict: Verdict) -> None:
-        standing = self._standing
-        if standing.state in (MissionState.BACKING_OFF, MissionState.DONE):
+    def _on_edge(self, motion: StateEstimate, verdict: Verdict) -> None:
+        survey = self._survey
+        if survey.state in (MissionState.BACKING_OFF, MissionState.DONE):
             return
-        if standing.ignores_motion:
-            standing.go_on()  # where the edge is, is not known before a fix; standing still for it is safe anywhere
-        if standing.needs_fix and standing.state in (SETTLING, MEASURING):
+        if survey.rejects_odometry:
+            survey.proceed()  # where the edge is, is not known before a fix; standing still for it is safe anywhere
+        if survey.needs_fix and survey.state in (SETTLING, MEASURING):
             return  # it stands, and a rim on the map is a matter of the pose that is being found
-        if standing.is_held_by_hand:
+        if survey.is_held_by_hand:
             return
-        if motion.t_s < standing.stands_until_s:
+        if motion.t_s < survey.stands_until_s:
             return
-        mission = standing.cfg.mission
-        standing.backoffs += 1
-        if standing.backoffs > mission.max_backoffs_per_stop:
-            standing.backoffs = 0
-            standing.fault(
-                f"at the edge again after {mission.max_backoffs_per_stop} back-offs: is an edge sensor dirty?"
-            )
+        mission = survey.cfg.mission
+        survey.backoffs += 1
+        if survey.backoffs > mission.max_backoffs_per_stop:
+            survey.backoffs = 0
+            survey.fault(f"at the edge again after {mission.max_backoffs_per_stop} back-offs: is an edge sensor dirty?")
             return
         # Back at an edge right after a fix of the place: then it is the heading that is wrong.
-        standing.doubts_pose |= standing.backoffs > 1
-        standing.cause = verdict.cause
-        standing.interrupt_parts()
+        survey.inflates_covariance |= survey.backoffs > 1
+        survey.cause = verdict.cause
+        survey.interrupt_parts()
         # An edge that the route did not foresee means that the pose is wrong: it is found again before moving on.
-        standing.lose()
-        standing.apply(MissionEvent.EDGE)
-        standing.retreat = EdgeRetreat(mission, standing.tracker, verdict, motion.pose, motion.rate_rad_s)
+        survey.invalidate_pose()
+        survey.apply(MissionEvent.EDGE)
+        survey.retreat = EdgeRetreat(mission, survey.tracker, verdict, motion.pose, motion.rate_rad_s)
 
 
 _EARLY = 1.05  # from the decision to the first turn of a wheel some charge goes, too
 
 
-class ReminderCall(StrEnum):
-    """What the vigil asks for."""
+class FaultAction(StrEnum):
+    """What the timer asks for."""
 
     NOTHING = ""
     REMIND = "remind"
@@ -232,7 +230,7 @@ class UnattendedFaultTimer:
         """There is no fault any more."""
         self._since_s = None
 
-    def watch(self, t_s: float, soc: float, home_s: float | None) -> ReminderCall:
+    def watch(self, t_s: float, soc: float, home_s: float | None) -> FaultAction:
         """One frame of a fault; state of charge 0 to 1.
 
         ``home_s`` is None where the robot does not know where it is.
@@ -242,11 +240,11 @@ class UnattendedFaultTimer:
         # Once: a return that failed may have failed for the reason of the fault.
         if self._falls and not self._has_returned and home_s is not None and self.is_low(soc, home_s):
             self._has_returned = True
-            return ReminderCall.RETURN
+            return FaultAction.RETURN
         if t_s < self._remind_at_s:
-            return ReminderCall.NOTHING
+            return FaultAction.NOTHING
         self._remind_at_s = t_s + self._alarm_period_s
-        return ReminderCall.REMIND
+        return FaultAction.REMIND
 
     def is_low(self, soc: float, home_s: float) -> bool:
         """Whether the charge above the reserve is less than the way home may take."""
@@ -274,7 +272,7 @@ class MirrorCheck:
         self._first_s: float | None = None
         self.contradiction = self.warning = ""
 
-    def hear(self, t_s: float, gravity: Sequence[float] | None, pose: DeckPose) -> bool:
+    def update(self, t_s: float, gravity: Sequence[float] | None, pose: DeckPose) -> bool:
         """Take a frame and gravity's direction in the robot frame, where it was read.
 
         True once the check is complete.

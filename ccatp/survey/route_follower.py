@@ -113,7 +113,7 @@ class Corrector:
         is_safe = self._is_clear(self._mirror.deck_pose(turned), 0.0) and self._is_clear(end, 0.0)
         return aim if is_safe else None
 
-    def can_go_on(self, pose: DeckPose, stop: Stop) -> bool:
+    def can_proceed(self, pose: DeckPose, stop: Stop) -> bool:
         """Whether the turn towards ``stop`` from where a correction ended keeps every sensor on the mirror."""
         bearing = atan2(stop.y_m - pose.y_m, stop.x_m - pose.x_m) + (pi if stop.reverse else 0.0)
         return self._is_clear(pose, difference(bearing, course_of_heading(self._mirror, pose)))

@@ -157,7 +157,7 @@ class RetryQueue:
             self.due = [point for point in reversed(self.causes) if point not in self._tried_again]
             self._tried_again.update(self.due)
 
-    def thin_out(self, points: Sequence[PointId], wanted: Sequence[PointId], cause: str) -> None:
+    def drop_low_priority(self, points: Sequence[PointId], wanted: Sequence[PointId], cause: str) -> None:
         """Of these points only the wanted ones are due; there is no time for the others."""
         self.due = list(wanted)
         dropped = set(points).difference(wanted)
@@ -187,22 +187,22 @@ class MissedPoint:
         """The robot stopped, or goes on: wherever it is, it is not where it missed the point."""
         self._is_missed = False
 
-    def follows_route(self, motion: StateEstimate, stop: Stop, journey: RouteFollower) -> bool:
+    def follows_route(self, motion: StateEstimate, stop: Stop, follower: RouteFollower) -> bool:
         """Whether the leg to ``stop`` may be driven as planned, or as the correction that begins here."""
         if self._is_missed:
             self._is_missed = False
-            return self._correct(motion, stop, journey)
+            return self._correct(motion, stop, follower)
         if self._corrected is None or self._corrected is stop:
             return True
         self._corrected = None
-        return self._corrector.can_go_on(motion.deck, stop)
+        return self._corrector.can_proceed(motion.deck, stop)
 
-    def _correct(self, motion: StateEstimate, stop: Stop, journey: RouteFollower) -> bool:
+    def _correct(self, motion: StateEstimate, stop: Stop, follower: RouteFollower) -> bool:
         panel = motion.pose.panel
-        aim = self._corrector.aim(motion.pose, journey.target_in(panel, stop))
+        aim = self._corrector.aim(motion.pose, follower.target_in(panel, stop))
         if aim is None:
             return False
-        journey.correct(panel, aim)
+        follower.correct(panel, aim)
         self._corrected = stop
         self.corrections += 1
         return True
@@ -220,11 +220,11 @@ class SurveyState:
         done: points measured, in order.
         skipped: points whose measurement failed.
         abort_cause: why the survey was given up, or empty.
-        bar: why nothing may move, an earthquake, or empty.
+        interlock: why nothing may move, an earthquake, or empty.
         is_shaking: there is an earthquake, though the robot may be leaving an edge first.
         is_faulted: an operator has to look after it.
-        is_hold_deaf: held because wheels or inertial unit are not trusted.
-        doubts_pose: the localizer shall doubt its pose; to be set to false when it does.
+        is_odometry_rejected: held because wheels or inertial unit are not trusted.
+        inflates_covariance: the localizer shall widen its covariance; to be set to false when it does.
         needs_fix: a fix comes before the next move: the pose is wrong or (``is_at_start``) not confirmed yet.
         wants_calibration: the calibration drive was given up, too far from where it leads.
         wants_full_fans: the robot shall be pressed on with full fans.
@@ -238,22 +238,22 @@ class SurveyState:
     ) -> None:
         self.cfg, self.mirror, self.route, self._has_planner = cfg, mirror, route, has_planner
         self.tracker = SpeedLimitedTracker(cfg.control, cfg.limits, cfg.health, cfg.robot.wheel_lag_s)
-        self.survey = self.journey_along(route.stops)
+        self.survey_route = self.follow_stops(route.stops)
         self.home: ReturnToBase | None = None
-        self.stopover = SettleAndMeasure(cfg.control, cfg.etalon.measuring_time_s)
+        self.settling = SettleAndMeasure(cfg.control, cfg.etalon.measuring_time_s)
         self.missed = MissedPoint(Corrector(mirror, cfg.robot, cfg.mission))
-        self.aligner = HeadingRecovery(mirror, cfg.robot, cfg.mission, heading_sigma_of, self.journey_along)
-        self.leftovers = RetryQueue()
+        self.heading_recovery = HeadingRecovery(mirror, cfg.robot, cfg.mission, heading_sigma_of, self.follow_stops)
+        self.retries = RetryQueue()
         self.state, self.outcome, self.cause = MissionState.IDLE, SurveyOutcome.NONE, ""
         self.done: list[PointId] = []
         self.skipped: list[PointId] = []
         self.abort_cause = ""
-        self.bar = ""
+        self.interlock = ""
         self.is_latched = self.is_shaking = False
         self.severity = Severity.NONE
-        self.awaits_operator = self.is_faulted = self.is_hold_deaf = False
+        self.awaits_operator = self.is_faulted = self.is_odometry_rejected = False
         self.needs_fix = self.is_at_start = cfg.mission.fix_at_start
-        self.is_off_route = self.is_review_due = self.doubts_pose = self.wants_full_fans = False
+        self.is_off_route = self.is_review_due = self.inflates_covariance = self.wants_full_fans = False
         self.wants_calibration = False
         self.retreat: EdgeRetreat | None = None
         self.stuck_s: float | None = None
@@ -261,21 +261,21 @@ class SurveyState:
         self.waits_until_s = self.stands_until_s = -inf
         self._recoveries_s: list[float] = []
 
-    def journey_along(self, stops: Sequence[Stop]) -> RouteFollower:
+    def follow_stops(self, stops: Sequence[Stop]) -> RouteFollower:
         """A journey along stops."""
         return RouteFollower(self.mirror, self.tracker, self.cfg.control.leg_timeout_factor, stops)
 
     @property
-    def journey(self) -> RouteFollower:
+    def follower(self) -> RouteFollower:
         """The journey being made: the survey, the way home, or a leg that shows the heading."""
-        if self.aligner.journey is not None:
-            return self.aligner.journey
-        return self.survey if self.home is None else self.home.journey
+        if self.heading_recovery.follower is not None:
+            return self.heading_recovery.follower
+        return self.survey_route if self.home is None else self.home.follower
 
     @property
-    def ignores_motion(self) -> bool:
+    def rejects_odometry(self) -> bool:
         """Held because wheels or inertial unit are not to be believed: whatever they say, the robot stands."""
-        return self.state is HELD and self.is_hold_deaf
+        return self.state is HELD and self.is_odometry_rejected
 
     @property
     def purpose(self) -> Purpose:
@@ -297,26 +297,26 @@ class SurveyState:
     @property
     def is_awaiting_fix(self) -> bool:
         """Whether the measurement asked for last, number ``request``, is still wanted."""
-        return self.state is MissionState.MEASURING and self.stopover.is_asked
+        return self.state is MissionState.MEASURING and self.settling.is_requested
 
     def apply(self, event: MissionEvent) -> None:
         """Something happened: the table says what state that makes."""
         self.state = next_state(self.state, event)
 
-    def lose(self) -> None:
+    def invalidate_pose(self) -> None:
         """The pose is known to be wrong: a fix comes before the next move."""
         self.needs_fix, self.is_at_start = True, False
 
-    def interrupt_travel(self) -> None:
+    def interrupt_leg(self) -> None:
         """Drive the leg again from where the robot is."""
-        (self.survey if self.home is None else self.home).interrupt()
+        (self.survey_route if self.home is None else self.home).interrupt()
 
     def interrupt_parts(self) -> None:
         """Forget where in a leg, a stop or a docking the robot was: it begins again from where it is."""
-        self.interrupt_travel()
-        self.stopover.interrupt()
+        self.interrupt_leg()
+        self.settling.interrupt()
         self.missed.interrupt()
-        self.aligner.interrupt()
+        self.heading_recovery.interrupt()
 
     # -- holding and going on -------------------------------------------------------------------------------------
 
@@ -325,7 +325,7 @@ class SurveyState:
         self.interrupt_parts()
         self.apply(MissionEvent.HOLD)
         self.awaits_operator = by_hand
-        self.is_hold_deaf = False
+        self.is_odometry_rejected = False
         self.cause = cause
 
     def interrupt(self, cause: str) -> bool:
@@ -347,11 +347,11 @@ class SurveyState:
         """Hold until the cause is gone, and then find out where the robot is before moving on."""
         if self.state is MissionState.DONE or self.is_held_by_hand:
             return
-        self.lose()
-        was_deaf = self.ignores_motion
+        self.invalidate_pose()
+        was_rejected = self.rejects_odometry
         if not self.interrupt(cause):
             self.cause = cause
-        self.is_hold_deaf = was_deaf or is_pose_doubted
+        self.is_odometry_rejected = was_rejected or is_pose_doubted
 
     def recover(self, cause: str, t_s: float) -> None:
         """Hold, and go on with a fix; what comes again and again is a fault."""
@@ -375,17 +375,17 @@ class SurveyState:
             return "the mission is over"
         is_new = not self.abort_cause
         self.abort_cause = self.abort_cause or cause
-        if self.bar:
+        if self.interlock:
             return None  # home, but not before the robot may move
         # An edge outranks an abort: the retreat and its fix come first.
         if self.state is HELD or (is_new and self.state is not MissionState.BACKING_OFF and not self.needs_fix):
-            self.go_on()
+            self.proceed()
         return None
 
-    def go_on(self) -> None:
+    def proceed(self) -> None:
         """To what is next: finding the robot, home, the next stop, or the end."""
         self.interrupt_parts()
-        self.doubts_pose |= self.ignores_motion
+        self.inflates_covariance |= self.rejects_odometry
         self.is_faulted = False
         # Wherever a hold left the robot: the route's next turn may not be safe there.
         self.is_off_route |= self.state is MissionState.HELD
@@ -395,7 +395,7 @@ class SurveyState:
             self.cause = self.abort_cause
             self.home = None  # planned again from where the robot is now
             self.apply(MissionEvent.GO_HOME)
-        elif self.survey.current is None and not self._has_more():
+        elif self.survey_route.current is None and not self._has_more():
             self.outcome = SurveyOutcome.COMPLETE
             self.apply(MissionEvent.FINISHED)
         else:
@@ -406,9 +406,9 @@ class SurveyState:
         """Whether points are due away from the planned route: those that failed once, or a thinned rest."""
         if not self._has_planner:
             return False
-        self.leftovers.begin_second_round()
-        self.is_off_route |= bool(self.leftovers.due)
-        return bool(self.leftovers.due)
+        self.retries.begin_second_round()
+        self.is_off_route |= bool(self.retries.due)
+        return bool(self.retries.due)
 
 
 # A puck is within the tolerance when it is so by more than the fix may be wrong (guard band, ISO 14253-1); but a laser

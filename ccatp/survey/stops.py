@@ -68,11 +68,11 @@ class SettleAndMeasure:
         self._arrived_at: PointId | None = None
         self._is_anew = False
         self.request = 0
-        self.is_asked = False
+        self.is_requested = False
 
     def interrupt(self) -> None:
         """The robot moves, or may have moved: the stop begins again."""
-        self.is_asked = self._is_anew = False
+        self.is_requested = self._is_anew = False
         self._stillness.reset()
         self._rest_by_s = None
 
@@ -93,7 +93,7 @@ class SettleAndMeasure:
         self._measure_at_s = t_s + self._measuring_time_s - TIME_EPSILON_S
         self._rest_by_s = t_s + SETTLE_LIMIT_S
 
-    def is_restless(self, t_s: float) -> bool:
+    def is_settle_overdue(self, t_s: float) -> bool:
         """Whether coming to rest, or standing still for a measurement, takes far longer than it should."""
         return self._rest_by_s is not None and t_s > self._rest_by_s
 
@@ -106,7 +106,7 @@ class SettleAndMeasure:
 
     def repeat(self) -> None:
         """The measurement failed: it is asked for once more, after another measuring time."""
-        self.is_asked, self._is_anew = False, True
+        self.is_requested, self._is_anew = False, True
 
     def is_due(self, motion: StateEstimate) -> bool:
         """Take a frame of the measuring time; whether to ask for the measurement now. True once at each stop.
@@ -118,14 +118,14 @@ class SettleAndMeasure:
             self._is_anew = False
             self._begin(t_s)
         if not self.is_quiet(motion):
-            if self.is_asked:
-                self.is_asked = False
+            if self.is_requested:
+                self.is_requested = False
                 self._begin(t_s)
             self._measure_at_s = t_s + self._measuring_time_s - TIME_EPSILON_S
-        if self.is_asked or t_s < self._measure_at_s:
+        if self.is_requested or t_s < self._measure_at_s:
             return False
         self._rest_by_s = None
-        self.is_asked = True
+        self.is_requested = True
         self.request += 1
         return True
 
@@ -134,34 +134,34 @@ STILL = Twist(0.0, 0.0)
 
 
 class ReturnToBase:
-    """Drives a route whose last stop is base; ``journey`` is exhausted once the robot stands there."""
+    """Drives a route whose last stop is base; ``follower`` is exhausted once the robot stands there."""
 
-    def __init__(self, journey: RouteFollower, tracker: LegTracker) -> None:
-        self.journey, self._tracker = journey, tracker
+    def __init__(self, follower: RouteFollower, tracker: LegTracker) -> None:
+        self.follower, self._tracker = follower, tracker
         self._is_docking = False
 
     @property
     def is_at_base(self) -> bool:
         """Whether the robot stands at base, turned as it should be."""
-        return self.journey.current is None
+        return self.follower.current is None
 
     def interrupt(self) -> None:
         """The robot stopped on the way: the leg begins again."""
         self._is_docking = False
-        self.journey.interrupt()
+        self.follower.interrupt()
 
     def step(self, motion: StateEstimate, is_quiet: bool) -> Twist:
         """One frame of the way home; ``is_quiet``: the robot has been at rest for the settling time."""
-        stop = self.journey.current
+        stop = self.follower.current
         if stop is None:
             return STILL
         if self._is_docking:
             return self._dock(motion, stop, is_quiet)
-        twist = self.journey.follow(motion, stop)
+        twist = self.follower.follow(motion, stop)
         if self._tracker.phase is not LegPhase.DONE:
             return twist
         if stop.kind is not StopKind.BASE:
-            self.journey.advance()
+            self.follower.advance()
             return STILL
         self._is_docking = True
         if stop.heading_rad is not None:
@@ -173,7 +173,7 @@ class ReturnToBase:
             remaining = difference(stop.heading_rad, motion.deck.heading_rad + motion.lead_rad)
             return self._tracker.step_turn(remaining, motion.dt_s, motion.steered.omega_rad_s)
         if is_quiet:
-            self.journey.advance()
+            self.follower.advance()
         return STILL
 
 

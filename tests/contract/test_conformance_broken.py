@@ -226,7 +226,7 @@ def _take_fans(is_taken: Callable[[int, int], bool]) -> Any:
     return fans(command=command)
 
 
-def _obey(kind: type[Drive] | type[FansMessage]) -> Callable[[DataLoop], None]:
+def _apply_severity(kind: type[Drive] | type[FansMessage]) -> Callable[[DataLoop], None]:
     """Messages of one kind from whatever role."""
 
     def command(_: DataLoop, method: Any, session: Any, role: Any, message: Any, now_s: float) -> bool:
@@ -273,8 +273,8 @@ COMMANDS = [
             twist=_take_permit(lambda seq, last: seq == last)),
     Crooked("obeys old fans", frozenset({"newest-fans"}), NEWEST, twist=_take_fans(lambda seq, last: seq < last)),
     Crooked("obeys fans twice", frozenset({"newest-fans"}), NEWEST, twist=_take_fans(lambda seq, last: seq == last)),
-    Crooked("obeys drives of the monitor", frozenset({"role-drive"}), NEWEST, twist=_obey(Drive)),
-    Crooked("obeys fans of the monitor", frozenset({"role-fans"}), NEWEST, twist=_obey(FansMessage)),
+    Crooked("obeys drives of the monitor", frozenset({"role-drive"}), NEWEST, twist=_apply_severity(Drive)),
+    Crooked("obeys fans of the monitor", frozenset({"role-fans"}), NEWEST, twist=_apply_severity(FansMessage)),
     Crooked("has no fans", frozenset({"fans"}), ("fans",), hears=swap(b'"fans"', b'"sails"')),
     Crooked("stops fans at a lost session", frozenset({"fans-fin", "fans-rst"}), FANS,
             twist=around("robot.lose_controller", _fans_off_when_lost)),

@@ -199,14 +199,14 @@ async def test_planning_longer_than_a_frame_may_wait_pauses_nobody() -> None:
     async with running_daemon(configuration()) as daemon:
         await daemon.until(lambda: daemon.is_driving)
         mission: Any = daemon.main._runner.mission
-        plan, planned = mission._travels._plan_rest, []
+        plan, planned = mission._behaviours._plan_rest, []
 
         def plan_slowly(*args: object) -> object:
             time.sleep(0.12)
             planned.append(clock())
             return plan(*args)
 
-        mission._travels._plan_rest = plan_slowly
+        mission._behaviours._plan_rest = plan_slowly
         assert mission.pause("a test") is None
         await daemon.until(lambda: not daemon.is_driving)
         assert mission.resume() is None

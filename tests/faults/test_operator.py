@@ -26,7 +26,7 @@ from ccatp.safety.emergency_latch import EmergencyLatch
 from ccatp.survey.behaviours import home_time_s
 from ccatp.survey.planning.escape import plan_way_home
 from ccatp.survey.planning.search import path_time
-from ccatp.survey.reactions import ReminderCall, UnattendedFaultTimer
+from ccatp.survey.reactions import FaultAction, UnattendedFaultTimer
 from ccatp.survey.state import BACKING_OFF, DONE, DRIVING, HELD, RETURNING, TURNING, MissionState
 from ccatp.survey.stops import MissionCommand
 from tests.faults.linking import Measured
@@ -181,7 +181,7 @@ def test_after_a_restart_with_nothing_latched_the_first_emergency_is_new(story: 
     """It was on its way home by the operator's abort, and paused, when its predecessor died."""
     story.mission.abort("operator")
     story.mission.pause("operator")
-    story.mission.know_emergency()
+    story.mission.skip_present_emergency()
     assert frames(story, FREE) is HELD
     assert frames(story, emergency(1)) is RETURNING
 
@@ -189,7 +189,7 @@ def test_after_a_restart_with_nothing_latched_the_first_emergency_is_new(story: 
 @pytest.mark.fault("O1", "O7")
 def test_what_was_latched_before_the_start_is_waited_for_at_base(story: Story) -> None:
     story.mission.pause("restarted")
-    story.mission.know_emergency()
+    story.mission.skip_present_emergency()
     assert frames(story, emergency(4), count=50) is HELD
     assert story.mission.resume() == "an emergency of before is latched: 'ccatp clear' it first"
     story.frame()
@@ -397,9 +397,9 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
         soc -= 50.0 * DT * drain
         t_s = 50.0 * story.t
         call = vigil.watch(t_s, soc, home_s)
-        if call is ReminderCall.REMIND:
+        if call is FaultAction.REMIND:
             reminders.append(t_s)
-        elif call is ReminderCall.RETURN:
+        elif call is FaultAction.RETURN:
             story.mission.abort("nobody came")
     at_dock = soc - home_s * drain
     measured("O8", (soc - cfg.battery_reserve) / (home_s * drain))
@@ -416,21 +416,21 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
     ("falls", "soc", "home_s", "times", "calls"),
     [
         # Who does not know where it is stays and reminds.
-        (True, 0.01, None, range(200), {60: ReminderCall.REMIND, 120: ReminderCall.REMIND, 180: ReminderCall.REMIND}),
+        (True, 0.01, None, range(200), {60: FaultAction.REMIND, 120: FaultAction.REMIND, 180: FaultAction.REMIND}),
         # A return is tried once, and only where the robot would fall.
-        (True, 0.1, 30.0, (0, 1, 61), {0: ReminderCall.RETURN, 61: ReminderCall.REMIND}),
+        (True, 0.1, 30.0, (0, 1, 61), {0: FaultAction.RETURN, 61: FaultAction.REMIND}),
         (False, 0.0, 30.0, range(50), {}),
     ],
 )
 def test_reminders_and_one_return(
-    falls: bool, soc: float, home_s: float | None, times: range, calls: dict[int, ReminderCall], config: Config
+    falls: bool, soc: float, home_s: float | None, times: range, calls: dict[int, FaultAction], config: Config
 ) -> None:
     vigil = UnattendedFaultTimer(config, falls=falls)
     found = {t: vigil.watch(float(t), soc, home_s) for t in times}
-    assert {t: call for t, call in found.items() if call is not ReminderCall.NOTHING} == calls
+    assert {t: call for t, call in found.items() if call is not FaultAction.NOTHING} == calls
     vigil.over()
     assert vigil.held_s(300.0) == 0.0
-    assert vigil.watch(300.0, 0.1, home_s) is ReminderCall.NOTHING
+    assert vigil.watch(300.0, 0.1, home_s) is FaultAction.NOTHING
 
 
 # -- O9: the way home -------------------------------------------------------------------------------------------------

@@ -81,7 +81,7 @@ class Stage(SilRun):
         self._at_edge: dict[int, tuple[float, float, float]] = {}
         self._pending: tuple[int, int, Sensors] | None = None
         self._emergencies: dict[str, str] = {}
-        self._journey: object = None
+        self._follower: object = None
         self.robot.join("monitor")
         self.robot.join("controller")
         while self.robot.delivered is None:
@@ -280,9 +280,9 @@ class Stage(SilRun):
         assert mission.done == self.acknowledged, "I8"
         assert len(set(mission.done)) == len(mission.done), "I8"
         assert not set(mission.done) & set(mission.skipped), "I8"
-        if mission.journey is not self._journey:
-            self._journey = mission.journey
-            for x, y in _goals(mission.journey.stops):
+        if mission.follower is not self._follower:
+            self._follower = mission.follower
+            for x, y in _goals(mission.follower.stops):
                 assert self.mirror.rim.signed_distance_m(x, y) >= MARGIN_M, "I7"
 
     def look_at_hold(self) -> None:

@@ -37,7 +37,7 @@ class Survey(RuleBasedStateMachine):
         self.stage.advance(WARM_UP_FRAMES)
 
     @rule(n=frames)
-    def go_on(self, n: int) -> None:
+    def proceed(self, n: int) -> None:
         self.stage.advance(n)
 
     @rule(n=st.integers(100, 400))

@@ -130,20 +130,20 @@ def filter_run(
     increments, readings = _increments(run.steps, times), list(_readings(run))
     ends = np.searchsorted([reading.time_s for reading in readings], times, side="right").tolist()
     poses, covariances = np.empty((len(times), 3)), np.empty((len(times), 3, 3))
-    book = _Book()
+    statistics = _Statistics()
     for k, (begin, end) in enumerate(pairwise((0, *ends))):
         begin_s = clock_s()
         if k:
             search.predict(increments[k - 1])
         predicted_s = clock_s()
-        book.predict_s.append(predicted_s - begin_s)
+        statistics.predict_s.append(predicted_s - begin_s)
         if now := readings[begin:end]:
             taken = search.observe(now)
             end_s = clock_s()
-            book.observed(taken, len(now), end_s - begin_s, end_s - predicted_s)
+            statistics.observed(taken, len(now), end_s - begin_s, end_s - predicted_s)
         poses[k], covariances[k] = search.best.pose, search.best.pose_covariance
     slam = search.best
-    nis, sizes = np.array(book.nis), np.array(book.sizes, dtype=np.float64)
+    nis, sizes = np.array(statistics.nis), np.array(statistics.sizes, dtype=np.float64)
     priors = dict(zip(slam.calibration, slam.prior_sigmas, strict=True))
     calibration = learned({name: Calibrated(*found) for name, found in slam.calibration.items()}, priors)
     return EstimatedPath(
@@ -156,21 +156,21 @@ def filter_run(
         calibration=calibration,
         nis=nis,
         nis_sizes=sizes,
-        refused=book.refused,
-        update_s=np.array(book.update_s),
-        predict_s=np.array(book.predict_s[1:]),
-        scalar_s=np.array(book.scalar_s),
-        updates=len(book.nis),
+        refused=statistics.refused,
+        update_s=np.array(statistics.update_s),
+        predict_s=np.array(statistics.predict_s[1:]),
+        scalar_s=np.array(statistics.scalar_s),
+        updates=len(statistics.nis),
         warnings=(
             *_unplaced(run, slam),
             *beyond_priors(calibration, priors, run.kind),
-            *_doubts(slam, nis, sizes, book.refused),
+            *_warnings(slam, nis, sizes, statistics.refused),
         ),
     )
 
 
 @dataclass(slots=True)
-class _Book:
+class _Statistics:
     nis: list[float] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
     refused: int = 0
@@ -190,7 +190,7 @@ class _Book:
         self.sizes += [one.size for one in accepted]
 
 
-def _doubts(slam: BeaconSlam, nis: FloatArray, sizes: FloatArray, refused: int) -> Iterator[str]:
+def _warnings(slam: BeaconSlam, nis: FloatArray, sizes: FloatArray, refused: int) -> Iterator[str]:
     for beacon in dict.fromkeys(beacon for beacon, _ in slam.moved):
         times = ", ".join(f"{time_s:.1f}" for name, time_s in slam.moved if name == beacon)
         yield f"beacon {beacon} was placed anew at {times} s: was it moved, or exchanged for another?"

@@ -321,7 +321,7 @@ class RunStateView:
     def _take_scene(self, scene: Scene, _now_s: float) -> None:
         self._scene, self._is_scene_new = scene, True
 
-    def look_away(self) -> None:
+    def discard_history(self) -> None:
         """Display states are not requested any more; the old one is not shown."""
         self.links.picture_s = self._picture = self._sensors = None
 

@@ -70,5 +70,5 @@ async def test_a_point_that_is_measured_already_is_done_and_needs_no_operator(co
     refused: Future[None] = Future()
     refused.set_exception(AlreadyMeasuredError("point 1/2/4 has been measured; its fix is not replaced"))
     store = SimpleNamespace(record_fix=lambda *_: refused)
-    told, levels = await measured_once(config, [], store, POINT, fixed=done.append, survey=survey)
+    told, levels = await measured_once(config, [], store, POINT, fixed=done.append, survey_route=survey)
     assert (done, levels, [fix.point for fix in told]) == ([POINT], ["warning"], [(1, 2, 4)])

@@ -99,7 +99,7 @@ def test_levels_are_there_each_time(view: SurveyView) -> None:
     assert view.news(2.1)["mission"]["is_stale"]
     view.receive(picture(line=b"null"), 3.2)  # before the first frame
     assert (view.news(3.2)["robot"], view.news(3.2)["pose"] is None) == (None, False)
-    view.look_away()
+    view.discard_history()
     assert view.news(3.3)["pose"] is None
     view.receive(mission(exit_status=0), 4.0)
     assert (view.news(9.0)["is_over"], view.news(9.0)["mission"]["is_stale"]) == (True, False)

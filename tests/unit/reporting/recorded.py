@@ -130,7 +130,7 @@ class RecordingRun(SilRun):
 
     def arrive(self, point: PointId, seq: int) -> None:
         self.note_arrival(point, seq)
-        error_mm = 1e3 * self.mission.survey.distance_m(self.localizer.pose)
+        error_mm = 1e3 * self.mission.survey_route.distance_m(self.localizer.pose)
         self.write("arrival", ArrivalMessage(seq=seq, t_s=self.t_s, point=(*point,), error_mm=error_mm))
 
     def _fuse(self, fix: Fix) -> None:

@@ -30,7 +30,7 @@ def mirror(config: Config) -> Mirror:
 
 
 @pytest.fixture
-def stopover(config: Config) -> SettleAndMeasure:
+def settling(config: Config) -> SettleAndMeasure:
     return SettleAndMeasure(config.control, MEASURING_S)
 
 
@@ -38,49 +38,49 @@ def at(mirror: Mirror, frame: int, speed_m_s: float = 0.0) -> StateEstimate:
     return StateEstimate(frame * DT, DT, PanelPose(PanelId(5, 5), 0.0, 0.0, 0.0), mirror.deck_pose, speed_m_s, 0.0)
 
 
-def test_asks_once_and_only_after_the_measuring_time_at_rest(stopover: SettleAndMeasure, mirror: Mirror) -> None:
-    settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
-    asked = [k for k in range(settled, settled + 200) if stopover.is_due(at(mirror, k))]
+def test_asks_once_and_only_after_the_measuring_time_at_rest(settling: SettleAndMeasure, mirror: Mirror) -> None:
+    settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))
+    asked = [k for k in range(settled, settled + 200) if settling.is_due(at(mirror, k))]
     assert asked == [settled + round(MEASURING_S / DT)]
-    assert (stopover.request, stopover.is_asked) == (1, True)
+    assert (settling.request, settling.is_requested) == (1, True)
 
 
 @pytest.mark.fault("E9")
-def test_who_moves_for_ever_is_never_measured_and_restless(stopover: SettleAndMeasure, mirror: Mirror) -> None:
-    settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
+def test_who_moves_for_ever_is_never_measured_and_restless(settling: SettleAndMeasure, mirror: Mirror) -> None:
+    settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))
     frames = range(settled + 1, settled + 2000)
-    assert [k for k in frames if stopover.is_due(at(mirror, k, speed_m_s=0.01))] == []
+    assert [k for k in frames if settling.is_due(at(mirror, k, speed_m_s=0.01))] == []
     limit = settled + round(SETTLE_LIMIT_S / DT)
-    assert not stopover.is_restless((limit - 1) * DT)
-    assert stopover.is_restless((limit + 1) * DT)
+    assert not settling.is_settle_overdue((limit - 1) * DT)
+    assert settling.is_settle_overdue((limit + 1) * DT)
 
 
 @pytest.mark.fault("E9")
-def test_a_measurement_during_which_the_robot_moves_is_not_wanted(stopover: SettleAndMeasure, mirror: Mirror) -> None:
-    settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
-    asked = next(k for k in range(settled, settled + 200) if stopover.is_due(at(mirror, k)))
-    assert not stopover.is_due(at(mirror, asked + 1))
-    assert stopover.is_asked
-    stopover.is_due(at(mirror, asked + 2, speed_m_s=0.01))
-    assert not stopover.is_asked
-    again = next(k for k in range(asked + 3, asked + 400) if stopover.is_due(at(mirror, k)))
+def test_a_measurement_during_which_the_robot_moves_is_not_wanted(settling: SettleAndMeasure, mirror: Mirror) -> None:
+    settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))
+    asked = next(k for k in range(settled, settled + 200) if settling.is_due(at(mirror, k)))
+    assert not settling.is_due(at(mirror, asked + 1))
+    assert settling.is_requested
+    settling.is_due(at(mirror, asked + 2, speed_m_s=0.01))
+    assert not settling.is_requested
+    again = next(k for k in range(asked + 3, asked + 400) if settling.is_due(at(mirror, k)))
     assert again > asked + 2 + round(MEASURING_S / DT)
-    assert stopover.request == 2
+    assert settling.request == 2
 
 
-def test_who_never_rests_is_restless_after_the_limit(stopover: SettleAndMeasure, mirror: Mirror) -> None:
+def test_who_never_rests_is_restless_after_the_limit(settling: SettleAndMeasure, mirror: Mirror) -> None:
     frames = round(SETTLE_LIMIT_S / DT)
     for k in range(frames):
-        assert not stopover.has_settled(at(mirror, k, speed_m_s=0.01))
-    assert not stopover.is_restless((frames - 1) * DT)
-    assert stopover.is_restless((frames + 1) * DT)
+        assert not settling.has_settled(at(mirror, k, speed_m_s=0.01))
+    assert not settling.is_settle_overdue((frames - 1) * DT)
+    assert settling.is_settle_overdue((frames + 1) * DT)
 
 
-def test_a_point_is_arrived_at_once(stopover: SettleAndMeasure) -> None:
-    assert stopover.arrival_at(POINT) == POINT
-    assert stopover.arrival_at(None) is None  # a fix that finds the robot again is no arrival
-    assert stopover.arrival_at(POINT) is None
-    assert stopover.arrival_at(POINT._replace(point=2)) == POINT._replace(point=2)
+def test_a_point_is_arrived_at_once(settling: SettleAndMeasure) -> None:
+    assert settling.arrival_at(POINT) == POINT
+    assert settling.arrival_at(None) is None  # a fix that finds the robot again is no arrival
+    assert settling.arrival_at(POINT) is None
+    assert settling.arrival_at(POINT._replace(point=2)) == POINT._replace(point=2)
 
 
 DT_SETTLING = 0.01
@@ -184,9 +184,9 @@ def test_no_sensor_may_pass_the_rim_on_the_way(corrector: Corrector, mirror: Mir
 def test_after_a_correction_a_turn_at_the_rim_is_looked_at(corrector: Corrector, mirror: Mirror) -> None:
     for depth_m, is_safe in ((0.105, False), (0.2, True)):
         pose = mirror.deck_pose(at_the_rim(mirror, depth_m))
-        assert corrector.can_go_on(pose, Stop(pose.x_m, pose.y_m + 0.2, StopKind.MEASURE))
-        assert corrector.can_go_on(pose, Stop(pose.x_m - 0.2, pose.y_m, StopKind.MEASURE)) is is_safe
-        assert corrector.can_go_on(pose, Stop(pose.x_m, pose.y_m - 0.2, StopKind.MEASURE, reverse=True))
+        assert corrector.can_proceed(pose, Stop(pose.x_m, pose.y_m + 0.2, StopKind.MEASURE))
+        assert corrector.can_proceed(pose, Stop(pose.x_m - 0.2, pose.y_m, StopKind.MEASURE)) is is_safe
+        assert corrector.can_proceed(pose, Stop(pose.x_m, pose.y_m - 0.2, StopKind.MEASURE, reverse=True))
 
 
 HERE, THERE = PointId(1, 2, 3), PointId(1, 2, 4)
@@ -328,7 +328,7 @@ def check(mirror: Mirror, direction: np.ndarray, seed: int) -> MirrorCheck:
     rng = np.random.default_rng(seed)
     found = MirrorCheck(mirror)
     for k in range(1000):
-        if found.hear(0.01 * k, None if k % 5 else noisy(direction, rng), mirror.base_pose):
+        if found.update(0.01 * k, None if k % 5 else noisy(direction, rng), mirror.base_pose):
             assert k == 5 * (READINGS - 1)
             return found
     raise AssertionError("it never came to an end")
@@ -367,9 +367,9 @@ def test_a_slope_that_differs_by_more_than_5_deg_never_passes(name: str) -> None
 def test_a_robot_without_the_sensor_is_waited_for_and_told() -> None:
     found = MirrorCheck(mirror_of("fyst-m1"))
     pose = mirror_of("fyst-m1").base_pose
-    assert not found.hear(10.0, None, pose)
-    assert not found.hear(10.0 + 0.99 * PATIENCE_S, None, pose)
-    assert found.hear(10.0 + PATIENCE_S, None, pose)
+    assert not found.update(10.0, None, pose)
+    assert not found.update(10.0 + 0.99 * PATIENCE_S, None, pose)
+    assert found.update(10.0 + PATIENCE_S, None, pose)
     assert "tells no gravity" in found.warning
     assert not found.contradiction
 
@@ -377,8 +377,8 @@ def test_a_robot_without_the_sensor_is_waited_for_and_told() -> None:
 def test_a_slow_sensor_is_judged_by_what_has_come() -> None:
     found = MirrorCheck(mirror_of("fyst-m1"))
     pose = mirror_of("fyst-m1").base_pose
-    found.hear(0.0, (0.0, *mirror_of("fyst-m2").gravity_in_robot(pose)), pose)
-    assert found.hear(PATIENCE_S, None, pose)
+    found.update(0.0, (0.0, *mirror_of("fyst-m2").gravity_in_robot(pose)), pose)
+    assert found.update(PATIENCE_S, None, pose)
     assert "104" in found.contradiction or "deg" in found.contradiction
 
 

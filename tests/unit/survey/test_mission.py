@@ -375,7 +375,7 @@ def speeds_until_rest(story: Story) -> list[float]:
 
 
 def distance_m(story: Story) -> float:
-    return story.mission.survey.distance_m(story.motion().pose)
+    return story.mission.survey_route.distance_m(story.motion().pose)
 
 
 @pytest.mark.parametrize("ahead_m", [0.02, -0.02])
@@ -417,7 +417,7 @@ def test_a_miss_that_a_pause_overtakes_ends_in_a_new_route(story: Story) -> None
 
 
 def test_after_a_correction_an_unsafe_turn_is_planned_anew(story: Story, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Corrector, "can_go_on", lambda *_: False)
+    monkeypatch.setattr(Corrector, "can_proceed", lambda *_: False)
     miss(story, 0.02, 0.0)
     story.auto_fix = True
     story.until_state(MissionState.DONE)
