@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from math import cos, hypot, pi, radians, sin, sqrt
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +33,8 @@ CROSSINGS: tuple[int | str, ...] = (0, 15, 30, 45, 60, TURN)
 RULES = {"thesis": "off for 0.1 s (thesis)", "shipped": "travel against the map (ours)"}
 OFF_S = 0.1
 """Threshold of the thesis's rule: a gap of 1 cm at 0.1 m/s."""
+# What a good localizer gives the rules in a disturbed world: standard deviations, drawn once per drive.
+POSITION_SIGMA_M, HEADING_SIGMA_RAD = 1.5e-3, 2e-3
 _MARGIN_M = 0.01  # the first sensor begins this far before a seam, the last one ends this far behind it
 _APPROACH_M = 0.03  # the first sensor begins this far before the rim
 _BESIDE_M = 0.10  # drives to the rim meet it within this of a panel's middle
@@ -43,13 +45,6 @@ _DRIVES = 25  # of each kind in a job
 _TRANSITS, _RIM = 3, 4  # streams of random numbers of a seed
 _Z_95 = 1.96  # quantiles of the normal distribution
 _RESAMPLES = 2000
-
-
-class EdgeErrors(NamedTuple):
-    """Standard deviations of the estimate that the rules get, drawn once per drive; it reports ``position_m``."""
-
-    position_m: float
-    heading_rad: float
 
 
 def drive_frame(seq: int, t_s: float, enc: list[WheelSample], edge: list[EdgeSample]) -> Sensors:
@@ -98,9 +93,7 @@ def build_rule(name: str, mirror: Mirror, cfg: Config) -> EdgeRule:
 class Rig:
     """One robot on its way, with what it reads."""
 
-    def __init__(
-        self, mirror: Mirror, cfg: Config, start: DeckPose, errors: EdgeErrors, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, mirror: Mirror, cfg: Config, start: DeckPose, rng: np.random.Generator) -> None:
         slip_rng, error_rng, sensors_rng = rng.spawn(3)
         world, robot, lag_s = cfg.world, cfg.robot, cfg.sim.robot.wheel_lag_s
         radius_m, base_m = robot.wheel_radius_m, robot.wheel_base_m
@@ -111,8 +104,7 @@ class Rig:
         self._sensors = SensorSuite(cfg, mirror, sensors_rng, lag_s=lag_s)
         self._sensors.edges.place(plant)
         dx, dy, turn = error_rng.standard_normal(3).tolist()
-        self._error = errors.position_m * dx, errors.position_m * dy, errors.heading_rad * turn
-        self._sigma_m = errors.position_m
+        self._error = POSITION_SIGMA_M * dx, POSITION_SIGMA_M * dy, HEADING_SIGMA_RAD * turn
         self._frame_s = 1.0 / cfg.sim.robot.frame_hz
         self._seq = 0
         self._estimate = self._estimated()
@@ -138,7 +130,7 @@ class Rig:
         p, (dx, dy, turn) = self.plant, self._error
         return EstimateMessage(
             seq=self._seq, t_s=self._seq * self._frame_s, x_m=p.x_m + dx, y_m=p.y_m + dy,
-            heading_rad=p.heading_rad + turn, sigma_m=self._sigma_m, state="driving",
+            heading_rad=p.heading_rad + turn, sigma_m=POSITION_SIGMA_M, state="driving",
         )  # fmt: skip
 
     def at_speed(self, v_m_s: float, omega_rad_s: float, cfg: Config) -> tuple[float, float]:
@@ -150,7 +142,7 @@ class Rig:
 
 
 def transit(
-    mirror: Mirror, cfg: Config, v_m_s: float, angle_rad: float | None, errors: EdgeErrors, rng: np.random.Generator
+    mirror: Mirror, cfg: Config, v_m_s: float, angle_rad: float | None, rng: np.random.Generator
 ) -> tuple[bool, ...]:
     """Cross a seam between two columns, or turn by a quarter beside it; whether each rule took it for an edge.
 
@@ -184,7 +176,7 @@ def transit(
         middle_m = panel.y_m + place_rng.uniform(-beside_m, beside_m)
         start = DeckPose(seam_m - half_way_m * cos(heading_rad), middle_m - half_way_m * sin(heading_rad), heading_rad)
         drive_s = 2.0 * half_way_m / (v_m_s * (1.0 - cfg.world.slip_max))
-    rig = Rig(mirror, cfg, start, errors, rig_rng)
+    rig = Rig(mirror, cfg, start, rig_rng)
     set_points = rig.at_speed(v_m_s, omega_rad_s, cfg)
     rules = [build_rule(name, mirror, cfg) for name in RULES]
     found = [False] * len(rules)
@@ -196,7 +188,7 @@ def transit(
 
 
 def drive_to_rim(
-    mirror: Mirror, cfg: Config, v_m_s: float, angle_rad: float, name: str, errors: EdgeErrors, rng: np.random.Generator
+    mirror: Mirror, cfg: Config, v_m_s: float, angle_rad: float, name: str, rng: np.random.Generator
 ) -> tuple[float, bool]:
     """Drive over the rim until a rule sees an edge; the set points are zero one frame and the link's delays later.
 
@@ -212,7 +204,7 @@ def drive_to_rim(
     start = DeckPose(
         panel.x_m + panel.half_x_m - before_m, meets_m - _APPROACH_M * float(np.tan(heading_rad)), heading_rad
     )
-    rig = Rig(mirror, cfg, start, errors, rig_rng)
+    rig = Rig(mirror, cfg, start, rig_rng)
     set_points = rig.at_speed(v_m_s, 0.0, cfg)
     rule, hz = build_rule(name, mirror, cfg), cfg.sim.robot.frame_hz
     frames_left = round(_BLIND_M / v_m_s * hz)
@@ -229,18 +221,13 @@ def drive_to_rim(
     return max(-mirror.rim.signed_distance_m(x, y) for x, y in rig.places), has_fallen
 
 
-# What a good localizer gives the rules in a disturbed world.
-_ERRORS = EdgeErrors(position_m=1.5e-3, heading_rad=2e-3)
-
-
 def run_job(job: Job) -> JobOutcome:
     """So many transits, and as many drives to the rim for each rule."""
     cfg, v_m_s, way, seed = job.cfg, float(job.factors["speed_m_s"]), job.factors["crossing"], job.cfg.run.seed
     mirror = build_mirror(cfg.mirror)
     angle_rad = None if way == TURN else radians(float(way))
     found = [
-        transit(mirror, cfg, v_m_s, angle_rad, _ERRORS, np.random.default_rng([seed, _TRANSITS, k]))
-        for k in range(_DRIVES)
+        transit(mirror, cfg, v_m_s, angle_rad, np.random.default_rng([seed, _TRANSITS, k])) for k in range(_DRIVES)
     ]
     values: dict[str, Any] = {"transits": len(found)}
     arrays: dict[str, FloatArray] = {}
@@ -249,7 +236,7 @@ def run_job(job: Job) -> JobOutcome:
         if angle_rad is not None:
             # The same draws for both rules: what differs is the rule.
             drives = [
-                drive_to_rim(mirror, cfg, v_m_s, angle_rad, name, _ERRORS, np.random.default_rng([seed, _RIM, k]))
+                drive_to_rim(mirror, cfg, v_m_s, angle_rad, name, np.random.default_rng([seed, _RIM, k]))
                 for k in range(_DRIVES)
             ]
             values[name]["falls"] = sum(has_fallen for _, has_fallen in drives)

@@ -275,7 +275,6 @@ class CampaignOptions:
     only: Mapping[str, Sequence[str]] = field(default_factory=dict)
     settings: Mapping[str, object] = field(default_factory=dict)
     with_figures: bool = True
-    is_quiet: bool = False
 
 
 def run_campaign(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
@@ -303,7 +302,7 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
     cells = cells_of(study, options.mirrors, options.only)
     plan = jobs_of(study, cells, load, options.settings, study.runs if options.runs is None else options.runs)
     jobs = [job for group in plan for job in group]
-    console = Console(stderr=True, highlight=False, quiet=options.is_quiet)
+    console = Console(stderr=True, highlight=False)
     with JobStore(options.out, options.shard, options.others) as store:
         done = {job.key for job in jobs if store.outcome(job) is not None}
         todo = [job for job in jobs[options.shard.number - 1 :: options.shard.of] if job.key not in done]

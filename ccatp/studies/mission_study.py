@@ -106,17 +106,17 @@ class Histogram:
     counts: IntArray  # in each of them, shape (k,)
     total: float
     largest: float  # 0 where there are none
-    within: int
+    within: int  # the thesis's requirement
 
     @classmethod
-    def of(cls, values: FloatArray, limit: float) -> "Histogram":
+    def of(cls, values: FloatArray) -> "Histogram":
         """The histogram of values, shape (n,) (raises ValueError: a value is negative or not finite)."""
         if values.size and not (np.isfinite(values).all() and values.min() >= 0.0):
             raise ValueError(f"values from {values.min()} to {values.max()}: must be finite and not negative")
         places = np.ceil(PER_DECADE * np.log10(np.maximum(values, LEAST) / LEAST)).astype(np.int64)
         bins, counts = np.unique(places, return_counts=True)
-        largest = float(values.max(initial=0.0))
-        return cls(bins, counts.astype(np.int64), float(values.sum()), largest, int(np.count_nonzero(values <= limit)))
+        largest, within = float(values.max(initial=0.0)), int(np.count_nonzero(values <= WITHIN_M))
+        return cls(bins, counts.astype(np.int64), float(values.sum()), largest, within)
 
     @property
     def count(self) -> int:
@@ -201,8 +201,8 @@ def mission_outcome(cfg: Config, found: SilResult) -> JobOutcome:
         "states_s": found.states_s,
     }
     arrays = {
-        **Histogram.of(errors_m, WITHIN_M).to_arrays("localization"),
-        **Histogram.of(errors_m[track[:, _T] > first_s], WITHIN_M).to_arrays("localization_later"),
+        **Histogram.of(errors_m).to_arrays("localization"),
+        **Histogram.of(errors_m[track[:, _T] > first_s]).to_arrays("localization_later"),
         "stops": _stop_rows(mirror, cfg.robot.puck_height_m, found.stops, track),
     }
     return JobOutcome(values, arrays)

@@ -9,7 +9,14 @@ import numpy as np
 
 from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, bound_rms_m, map_rms_m
 from ccatp.beacons.cricket.mote_map import MoteMap, map_motes, pinned_map, plain_frame
-from ccatp.beacons.cricket.range_network import MappingError, MoteRange, RangeNetwork, build_network, pair_range
+from ccatp.beacons.cricket.range_network import (
+    MappingError,
+    MoteRange,
+    RangeNetwork,
+    build_network,
+    coordinates_of,
+    pair_range,
+)
 from ccatp.beacons.cricket.rigidity import FoldOver, Freedom, find_fold_over, find_freedom, generic_state
 from ccatp.beacons.cricket.self_mapping import (
     MoteMapper,
@@ -212,7 +219,7 @@ def _calibration(cfg: CricketConfig) -> Any:
 
 
 def _block(covariance_m2: FloatArray, motes: list[int], dimension: int) -> FloatArray:
-    at = (np.array(motes)[:, None] * dimension + np.arange(dimension)).ravel()
+    at = coordinates_of(motes, dimension)
     return covariance_m2[np.ix_(at, at)]
 
 

@@ -134,7 +134,7 @@ COLUMNS = (
     Column("NEES / states", "nees", ".2f"),
     Column("95 % band", "nees_band"),
 )
-_MEANS = ("pose_m", "reckoned_m", "pose_aligned_m", "reckoned_aligned_m", "heading_rad")
+_MEANS = ("pose_m", "reckoned_m", "pose_aligned_m", "reckoned_aligned_m", "heading_rad", "target_covered")
 
 
 def run_job(job: Job) -> JobOutcome:
@@ -179,7 +179,8 @@ def run_job(job: Job) -> JobOutcome:
 def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """The runs of a cell pooled: errors, coverage, consistency with the 95 % bands of their chi-squared sums."""
     runs = [outcome.values for outcome in outcomes]
-    means = {key: float(np.mean([run[key] for run in runs])) for key in _MEANS}
+    shared = [key for key in _MEANS if key in runs[0]]
+    means = {key: float(np.mean([run[key] for run in runs])) for key in shared}
     nis, rows = (float(sum(run["nis"][k] for run in runs)) for k in (0, 1))
     nees, states = (float(sum(run["nees"][k] for run in runs)) for k in (0, 1))
     values: dict[str, Any] = {
@@ -190,12 +191,8 @@ def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
             name: float(np.mean([run["beacons_rmse_m"][name] for run in runs if name in run["beacons_rmse_m"]]))
             for name in runs[0]["beacons_rmse_m"]
         },
-        "pose_m": means["pose_m"],
-        "reckoned_m": means["reckoned_m"],
+        **means,
         "pose_ratio": means["pose_m"] / means["reckoned_m"],
-        "pose_aligned_m": means["pose_aligned_m"],
-        "reckoned_aligned_m": means["reckoned_aligned_m"],
-        "heading_rad": means["heading_rad"],
         "nis": nis / max(rows, 1.0),
         "nis_band": _band(rows),
         "nees": nees / max(states, 1.0),
@@ -204,7 +201,6 @@ def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     }
     if "target_m" in runs[0]:
         values |= {name: _spread([run[name] for run in runs]) for name in ("target_m", "target_aligned_m")}
-        values["target_covered"] = float(np.mean([run["target_covered"] for run in runs]))
         values["nearest_m"] = min(run["nearest_m"] for run in runs)
     arrays = {name: np.stack([o.arrays[name] for o in outcomes if name in o.arrays]) for name in outcomes[0].arrays}
     return JobOutcome(values, arrays)
@@ -294,7 +290,6 @@ def run_signals(job: Job) -> JobOutcome:
         "estimate_m": model.median_range_m(level_dbm),
         "bearing_deg": degrees(true_rad) % 360.0,
         "bearing_errors_deg": [degrees(error) for error in errors],
-        "without_bearing": len(results) - len(errors),
     }
     return JobOutcome(values)
 

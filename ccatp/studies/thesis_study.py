@@ -30,6 +30,7 @@ from ccatp.estimation.thesis_localizer import FourStateLocalizer
 from ccatp.filters import FILTERS
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
+from ccatp.records.summary import WITHIN_M
 from ccatp.report.plots import INK, QUIET
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.mission_study import Histogram, of_histogram, of_values, pooled
@@ -39,7 +40,6 @@ from ccatp.survey.composition import assemble
 
 FRAME_HZ = 100.0
 POINTS, PANELS = 36, 4
-LIMIT_M = 0.010
 # Accelerometer m/s^2, gyroscope rad/s, encoder rad/s: thesis table 2.1.
 _TABLE = {"normal": (0.0059, 0.0087, 0.001), "twice": (0.0118, 0.0175, 0.002)}
 _WORLDS = {"normal": "thesis", "twice": "thesis-x2"}
@@ -219,7 +219,7 @@ def run_job(job: Job) -> JobOutcome:
     arrays: dict[str, Any] = {
         "waypoint_m": waypoint_m,
         "track": track[::_TRACK_STEP, [0, 1, 2, 4, 5]].astype(np.float32),
-        **Histogram.of(error_m, LIMIT_M).to_arrays("localization"),
+        **Histogram.of(error_m).to_arrays("localization"),
     }
     return JobOutcome(values, arrays)
 
@@ -228,7 +228,7 @@ def _of_run(errors_m: FloatArray) -> dict[str, float]:
     if not errors_m.size:
         return dict.fromkeys(("within_10mm_fraction", "mean", "max"), float("nan"))
     return {
-        "within_10mm_fraction": float(np.mean(errors_m < LIMIT_M)),
+        "within_10mm_fraction": float(np.mean(errors_m < WITHIN_M)),
         "mean": 1e3 * float(np.mean(errors_m)),
         "max": 1e3 * float(np.max(errors_m)),
     }
@@ -288,7 +288,7 @@ def _beside(published: Mapping[str, float], runs: Sequence[Mapping[str, float]],
 # -- figures, each after one of the thesis's: 2.9 to 2.12, 3.10 and 3.11 ----------------------------------------------
 
 _NUMBERS = {"normal": ("2.9", "2.10", "3.10"), "twice": ("2.11", "2.12", "3.11")}
-_LIMIT_MM = 10.0
+_LIMIT_MM = 1e3 * WITHIN_M
 _BIN_MM = 1.0
 
 

@@ -26,7 +26,7 @@ from ccatp.core import DeckPose, EventCode, PanelId, Verdict
 from ccatp.danger import DangerMonitor
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety.edge_detector import EdgeLimits
-from ccatp.studies.danger_study import EdgeErrors, Rig
+from ccatp.studies.danger_study import Rig
 from tests.support.scenario import config_of, mirror_of
 
 MIRRORS = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
@@ -34,7 +34,6 @@ SPACING_M = 0.01
 HEADINGS = range(0, 360, 5)
 SPEEDS_M_S = (0.005, 0.02, 0.05, 0.1, 0.15)
 TURNS_RAD_S = (-1.0, -0.2, 0.2, 1.0)
-ERRORS = EdgeErrors(position_m=1.5e-3, heading_rad=2e-3)
 Error = tuple[float, float, float]
 BLIND: Error = (inf, inf, inf)
 OVERRUN_M = 0.020  # invariant I5
@@ -135,7 +134,7 @@ class Drive:
 
     def __init__(self, name: str, start: DeckPose, rng: np.random.Generator, error: Error | None = None) -> None:
         self.cfg, self.mirror = world(name)
-        self.rig = Rig(self.mirror, self.cfg, start, ERRORS, rng)
+        self.rig = Rig(self.mirror, self.cfg, start, rng)
         self._is_blind = error is BLIND
         if error is not None:
             self.rig._error = error

@@ -102,7 +102,7 @@ CELLS = [
 
 
 def campaign(out: Path, **options: Any) -> dict[str, Any]:
-    return run_campaign(STUDY, load, CampaignOptions(out, **{"workers": 1, "is_quiet": True, **options}))
+    return run_campaign(STUDY, load, CampaignOptions(out, **{"workers": 1, **options}))
 
 
 def jobs_done(out: Path) -> list[str]:

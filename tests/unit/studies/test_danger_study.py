@@ -16,7 +16,6 @@ from ccatp.studies.danger_study import (
     OFF_S,
     RULES,
     STUDY,
-    EdgeErrors,
     bootstrap,
     build_rule,
     combine,
@@ -29,7 +28,6 @@ from ccatp.studies.danger_study import (
     wilson,
 )
 
-ERRORS = EdgeErrors(1e-3, 2e-3)
 NOWHERE = EstimateMessage(seq=0, t_s=0.0, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-3, state="driving")
 
 
@@ -66,13 +64,13 @@ def test_a_seam_is_an_edge_for_a_rule_that_counts_time(
     mirror_name: str, v_m_s: float, angle_deg: float, expected: tuple[bool, bool]
 ) -> None:
     cfg, mirror = loaded(mirror_name, "hard")
-    found = transit(mirror, cfg, v_m_s, radians(angle_deg), ERRORS, np.random.default_rng(1))
+    found = transit(mirror, cfg, v_m_s, radians(angle_deg), np.random.default_rng(1))
     assert found == expected
 
 
 def test_a_turn_in_place_sweeps_over_the_gap() -> None:
     cfg, mirror = loaded("thesis-m1", "hard")
-    found = [transit(mirror, cfg, 0.05, None, ERRORS, np.random.default_rng(seed)) for seed in range(6)]
+    found = [transit(mirror, cfg, 0.05, None, np.random.default_rng(seed)) for seed in range(6)]
     thesis, ours = np.sum(found, axis=0)
     assert thesis > 0
     assert ours == 0
@@ -81,7 +79,7 @@ def test_a_turn_in_place_sweeps_over_the_gap() -> None:
 @pytest.mark.parametrize("v_m_s", [0.05, 0.10])
 def test_a_drive_ends_after_threshold_and_run_down(v_m_s: float) -> None:
     cfg, mirror = loaded("fyst-m1")
-    sensor_m, has_fallen = drive_to_rim(mirror, cfg, v_m_s, 0.0, "thesis", ERRORS, np.random.default_rng(2))
+    sensor_m, has_fallen = drive_to_rim(mirror, cfg, v_m_s, 0.0, "thesis", np.random.default_rng(2))
     expected_m = v_m_s * (OFF_S + cfg.sim.robot.wheel_lag_s)
     # The verdict waits for the end of its frame, at most 10 ms, and one sample; 5 % for the slope of the surface.
     assert 0.95 * expected_m < sensor_m < expected_m + v_m_s * 0.012
@@ -94,10 +92,8 @@ def test_the_delay_of_the_link_lets_it_go_further() -> None:
         cfg.model_copy(update={"world": cfg.world.model_copy(update={"commands_delay_s": delay_s})})
         for delay_s in (0.1, 1.0)
     )
-    near, far = (
-        drive_to_rim(mirror, one, 0.1, 0.0, "shipped", ERRORS, np.random.default_rng(3))[0] for one in (cfg, late)
-    )
-    assert drive_to_rim(mirror, blind, 0.2, 0.0, "thesis", ERRORS, np.random.default_rng(3))[1]  # it fell
+    near, far = (drive_to_rim(mirror, one, 0.1, 0.0, "shipped", np.random.default_rng(3))[0] for one in (cfg, late))
+    assert drive_to_rim(mirror, blind, 0.2, 0.0, "thesis", np.random.default_rng(3))[1]  # it fell
     assert far - near == pytest.approx(0.01, abs=2e-4)  # 0.1 s at 0.1 m/s, on a surface that slopes by up to 10 %
 
 

@@ -9,7 +9,6 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.mirror.mirror import build_mirror
-from ccatp.records.summary import WITHIN_M
 from ccatp.sim.world import TruthRow
 from ccatp.studies import STUDIES, faults_study, find_study
 from ccatp.studies.campaign import CampaignError, CellResult, Job, JobOutcome, Study, cells_of, jobs_of
@@ -66,8 +65,8 @@ def mission(errors_m: list[float], approaches: list[int] | None = None, **change
     }
     errors = np.array(errors_m)
     arrays = {
-        **Histogram.of(errors, WITHIN_M).to_arrays("localization"),
-        **Histogram.of(errors[1:], WITHIN_M).to_arrays("localization_later"),
+        **Histogram.of(errors).to_arrays("localization"),
+        **Histogram.of(errors[1:]).to_arrays("localization_later"),
         "stops": stops_of(errors_m, approaches),
         "bounds": np.array([(k, 8e-6, 2e-6, e, 0.0) for k, e in enumerate(errors_m)]),
     }
@@ -152,7 +151,7 @@ def test_a_real_job_has_every_figure(
     study: Study, only: Mapping[str, Any], settings: Mapping[str, object], tmp_path: Path
 ) -> None:
     settings = {"run.panels": 1, **settings}
-    options = CampaignOptions(tmp_path, runs=1, workers=1, only=only, settings=settings, is_quiet=True)
+    options = CampaignOptions(tmp_path, runs=1, workers=1, only=only, settings=settings)
     result = run_campaign(study, lambda keys: load_config(None, keys), options)
     (cell,) = result["cells"]
     assert (cell["complete"], cell["points"]["measured"]) == (1, 9)
@@ -185,36 +184,36 @@ def errors(seed: int, count: int) -> np.ndarray:
 
 def test_a_histogram_has_the_figures_of_its_values() -> None:
     values = np.append(errors(1, 20_000), 0.01)  # one exactly at the limit
-    found = Histogram.of(values, 0.01)
+    found = Histogram.of(values)
     for share in (0.01, 0.5, 0.99, 0.999):
         # Beside the bin there is the step to the next number, which in the tail of so many is 1 % at most.
         assert found.quantile(share) == pytest.approx(np.quantile(values, share), rel=BIN + 0.01)
-    assert Histogram.of(np.append(np.full(7, 0.0123), 1.0), 0.01).quantile(0.5) == pytest.approx(0.0123, rel=BIN)
-    assert Histogram.of(np.array([0.00100001]), 0.01).quantile(1.0) == 0.00100001  # not beyond the maximum
+    assert Histogram.of(np.append(np.full(7, 0.0123), 1.0)).quantile(0.5) == pytest.approx(0.0123, rel=BIN)
+    assert Histogram.of(np.array([0.00100001])).quantile(1.0) == 0.00100001  # not beyond the maximum
     assert (found.count, found.largest) == (20_001, values.max())
     assert found.mean == pytest.approx(values.mean(), rel=1e-12)  # the order of summing
     assert found.within == np.count_nonzero(values <= 0.01)
-    assert Histogram.of(np.array([0.0, LEAST / 2.0]), 0.01).bins.tolist() == [0]
+    assert Histogram.of(np.array([0.0, LEAST / 2.0])).bins.tolist() == [0]
     edges, share_beyond = found.exceedance()
     assert (np.diff(edges) > 0.0).all()
     assert (np.diff(share_beyond) < 0.0).all()
     assert share_beyond[-1] == 0.0
     with pytest.raises(ValueError, match="must be finite and not negative"):
-        Histogram.of(np.array([0.1, -1e-6]), 0.01)
+        Histogram.of(np.array([0.1, -1e-6]))
     with pytest.raises(ValueError, match="must be finite and not negative"):
-        Histogram.of(np.array([0.1, np.nan]), 0.01)
+        Histogram.of(np.array([0.1, np.nan]))
 
 
 def test_histograms_are_pooled_and_stored() -> None:
     parts = [errors(3, 500), errors(4, 30), np.empty(0)]
-    one, whole = pooled([Histogram.of(part, 0.01) for part in parts]), Histogram.of(np.concatenate(parts), 0.01)
+    one, whole = pooled([Histogram.of(part) for part in parts]), Histogram.of(np.concatenate(parts))
     again = Histogram.from_arrays(whole.to_arrays("x"), "x")
     for found in (one, again):
         assert np.array_equal(found.bins, whole.bins)
         assert np.array_equal(found.counts, whole.counts)
         assert (found.largest, found.within) == (whole.largest, whole.within)
         assert found.total == pytest.approx(whole.total, rel=1e-12)  # the order of summing
-    empty = Histogram.of(np.empty(0), 0.01)
+    empty = Histogram.of(np.empty(0))
     assert np.isnan([empty.quantile(0.5), empty.mean]).all()
     assert empty.count == pooled([]).count == 0
 

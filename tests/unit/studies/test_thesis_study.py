@@ -15,7 +15,6 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.studies.campaign import CellResult, Job, JobOutcome
 from ccatp.studies.mission_study import Histogram
 from ccatp.studies.thesis_study import (
-    LIMIT_M,
     PUBLISHED,
     ThesisLocalizer,
     cells,
@@ -87,7 +86,7 @@ def test_the_cells_are_all_readings_of_both_systems() -> None:
 def outcome(fraction: float, mean: float) -> JobOutcome:
     figures = {"within_10mm_fraction": fraction, "mean": mean, "max": 20.0}
     values = {"outcome": "complete", "cause": "", "waypoints": 36, "wanted": 36, "time_s": 500.0}
-    localization = Histogram.of(np.linspace(0.0, 0.02, 100), LIMIT_M).to_arrays("localization")
+    localization = Histogram.of(np.linspace(0.0, 0.02, 100)).to_arrays("localization")
     track = np.tile(np.linspace(0.0, 1.0, 20, dtype=np.float32)[:, None], 5)
     arrays: dict[str, np.ndarray] = {"waypoint_m": np.linspace(0.0, 0.02, 36), "track": track, **localization}
     return JobOutcome({**values, "localization": figures, "waypoint": figures}, arrays)
