@@ -35,7 +35,7 @@ from ccatp.report.plots import INK, QUIET
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.mission_study import Histogram, of_histogram, of_values, pooled
 from ccatp.studies.results import LIMIT, colour, grouped, plot
-from ccatp.studies.sil_run import SilResult, SilRun
+from ccatp.studies.sil_run import SilRun
 from ccatp.survey.composition import assemble
 
 FRAME_HZ = 100.0
@@ -136,6 +136,8 @@ class _Replica(SilRun):
     """A mission over the block's waypoints that may have the period error; ``run.panels`` counts the block's."""
 
     def __init__(self, cfg: Config, period_error: float) -> None:
+        if period_error and cfg.run.filter != "kf":
+            raise ValueError(f"the filter {cfg.run.filter!r} reads time stamps: only kf can have a period error")
         panels = cfg.run.panels
         cfg = cfg.model_copy(update={"run": cfg.run.model_copy(update={"panels": 0})})
         super().__init__(cfg, with_track=True)
@@ -151,13 +153,6 @@ class _Replica(SilRun):
             localizer = ThesisLocalizer(filter_, self.mirror, cfg.robot, cfg.localizer, start)
             localizer.period_factor = 1.0 + period_error
             self.localizer = localizer
-
-
-def run_replica(cfg: Config, *, period_error: float) -> SilResult:
-    """One simulation run with the keys of ``overrides_of`` (ValueError: the filter reads time stamps, not a period)."""
-    if period_error and cfg.run.filter != "kf":
-        raise ValueError(f"the filter {cfg.run.filter!r} reads time stamps: only kf can have a period error")
-    return _Replica(cfg, period_error).run()
 
 
 # Thesis 2.3.2 (one run for each noise) and 3.5 (five runs each): share below 1 cm, mean, largest, mm.
@@ -195,12 +190,12 @@ def cells() -> Sequence[Cell]:
 
 
 def run_job(job: Job) -> JobOutcome:
-    """One simulation run, as the thesis measures it.
+    """One simulation run, as the thesis measures it (ValueError: a period error of a filter that reads time stamps).
 
     Arrays: ``waypoint_m``, distance of each stop from its waypoint; ``track``: t, true x, y, estimated x, y, shape
     (j, 5); histogram of the distance of true and estimated position, every frame until the last stop.
     """
-    found = run_replica(job.cfg, period_error=float(job.factors["period_error"]))
+    found = _Replica(job.cfg, float(job.factors["period_error"])).run()
     track = found.track if found.track is not None else np.empty((0, 7))
     stops = [stop for stop in found.stops if stop.approach == 1]
     # The way back to base is not part of the thesis's runs.

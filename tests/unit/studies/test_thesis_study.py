@@ -22,7 +22,6 @@ from ccatp.studies.thesis_study import (
     draw,
     overrides_of,
     run_job,
-    run_replica,
 )
 
 
@@ -71,7 +70,7 @@ def test_a_fixed_step_believes_in_a_shorter_way() -> None:
 def test_only_a_filter_with_a_fixed_step_can_have_a_period_error() -> None:
     cfg = load_config(overrides=overrides_of("normal", noise_is_variance=False, period_error=0.0, is_ours=True))
     with pytest.raises(ValueError, match="'ekf' reads time stamps: only kf can have a period error"):
-        run_replica(cfg, period_error=0.013)
+        run_job(Job("thesis", {"period_error": 0.013}, 1, cfg))
 
 
 def test_the_cells_are_all_readings_of_both_systems() -> None:
