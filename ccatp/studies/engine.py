@@ -22,7 +22,6 @@ from multiprocessing import connection
 from pathlib import Path
 from threading import Thread
 from traceback import format_exception
-from types import TracebackType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -75,41 +74,39 @@ def make_out(out: Path) -> None:
         raise CampaignError(f"--out: cannot make {out}: {error.strerror or error}; choose another --out") from error
 
 
+@contextmanager
+def open_store(out: Path, shard: Shard = WHOLE, others: Iterable[Path] = ()) -> "Iterator[JobStore]":
+    """The finished jobs in a directory, which is made if it is not there.
+
+    Each shard writes a file of its own, so that shards may share a directory; all of them are read, and those in
+    ``others`` are taken over. CampaignError: ``out`` cannot be made, another campaign writes here, a directory does not
+    exist, or a line is not a finished job.
+    """
+    make_out(out)
+    path = out / ("jobs.jsonl" if shard == WHOLE else f"jobs-{shard.number}of{shard.of}.jsonl")
+    with path.open("a+b") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            why = "another campaign writes there; wait for it or choose another --out"
+            raise CampaignError(f"{path}: {why}") from error
+        file.seek(0)
+        file.truncate(file.read().rfind(b"\n") + 1)  # what was being written at the last kill
+        store = JobStore(file, path)
+        for folder in (out, *others):
+            store.read_all(folder)
+        yield store
+
+
 class JobStore:
-    """The finished jobs in a directory: one line each, safe on the disk before the next begins.
+    """Finished jobs: one line each, safe on the disk before the next begins.
 
-    A campaign that is killed at any instant continues from its store. Each shard writes a file of its own, so that
-    shards may share a directory; all of them are read, and those in ``others`` are taken over.
-
-    CampaignError: ``out`` cannot be made, another campaign writes here, a directory does not exist, or a line is not a
-    finished job.
+    A campaign that is killed at any instant continues from its store.
     """
 
-    def __init__(self, out: Path, shard: Shard = WHOLE, others: Iterable[Path] = ()) -> None:
-        make_out(out)
-        name = "jobs.jsonl" if shard == WHOLE else f"jobs-{shard.number}of{shard.of}.jsonl"
+    def __init__(self, file: BinaryIO, path: Path) -> None:
+        self._file, self._path = file, path
         self._done: dict[str, tuple[str, Path, JobOutcome, float]] = {}
-        self._file: BinaryIO = (out / name).open("a+b")
-        try:
-            try:
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                raise CampaignError(
-                    f"{self._file.name}: another campaign writes there; wait for it or choose another --out"
-                ) from error
-            self._file.seek(0)
-            self._file.truncate(self._file.read().rfind(b"\n") + 1)  # what was being written at the last kill
-            for folder in (out, *others):
-                self._read_all(folder)
-        except BaseException:
-            self._file.close()
-            raise
-
-    def __enter__(self) -> "JobStore":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._file.close()
 
     def outcome(self, job: Job) -> JobOutcome | None:
         """The outcome of a job, None where it is to do (raises CampaignError: done under other circumstances)."""
@@ -142,9 +139,10 @@ class JobStore:
         self._file.write(line)
         self._file.flush()
         os.fsync(self._file.fileno())
-        self._take(line, Path(self._file.name))
+        self._take(line, self._path)
 
-    def _read_all(self, folder: Path) -> None:
+    def read_all(self, folder: Path) -> None:
+        """The jobs of all shards in a directory."""
         if not folder.is_dir():
             raise CampaignError(f"{folder}: is no directory; name one that a campaign wrote")
         for path in sorted(folder.glob("jobs*.jsonl")):
@@ -303,7 +301,7 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
     plan = jobs_of(study, cells, load, options.settings, study.runs if options.runs is None else options.runs)
     jobs = [job for group in plan for job in group]
     console = Console(stderr=True, highlight=False)
-    with JobStore(options.out, options.shard, options.others) as store:
+    with open_store(options.out, options.shard, options.others) as store:
         done = {job.key for job in jobs if store.outcome(job) is not None}
         todo = [job for job in jobs[options.shard.number - 1 :: options.shard.of] if job.key not in done]
         todo.sort(key=lambda job: job.seed)  # one job of each cell first

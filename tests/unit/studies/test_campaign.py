@@ -24,7 +24,7 @@ from ccatp.studies.campaign import (
     parse_shard,
     with_seed,
 )
-from ccatp.studies.engine import FAILURES, CampaignOptions, JobStore, run_campaign
+from ccatp.studies.engine import FAILURES, CampaignOptions, open_store, run_campaign
 from ccatp.studies.results import plain, table
 from tests.unit.studies.toy import FAULTS, SPEEDS_M_S, STUDY, load
 
@@ -215,12 +215,12 @@ OUTCOME = JobOutcome({"value": 1.5, "lost": float("nan")}, {"values": np.arange(
 @pytest.mark.parametrize("shard", [Shard(1, 1), Shard(1, 2)])
 def test_finished_jobs_are_found_again_and_a_torn_line_is_not(tmp_path: Path, shard: Shard) -> None:
     one, other = jobs_of(STUDY, cells_of(STUDY), load, {}, 2)[0]
-    with JobStore(tmp_path / "new", shard) as store:
+    with open_store(tmp_path / "new", shard) as store:
         store.add(one, OUTCOME, 2.5)
         store.add(other, OUTCOME)
     (path,) = (tmp_path / "new").iterdir()
     path.write_bytes(torn := path.read_bytes()[:-1])
-    with JobStore(tmp_path / "new") as store:
+    with open_store(tmp_path / "new") as store:
         found = store.outcome(one)
         assert found is not None
         assert found.values == {"value": 1.5, "lost": None}
@@ -233,15 +233,17 @@ def test_finished_jobs_are_found_again_and_a_torn_line_is_not(tmp_path: Path, sh
 
 
 def test_what_cannot_be_read_or_locked_is_refused(tmp_path: Path) -> None:
-    with JobStore(tmp_path), pytest.raises(CampaignError, match="another campaign writes there; wait for it or choose"):
-        JobStore(tmp_path)
-    with JobStore(tmp_path, Shard(1, 2)), JobStore(tmp_path, Shard(2, 2)):
+    def assert_refused(message: str, others: tuple[Path, ...] = ()) -> None:
+        with pytest.raises(CampaignError, match=message), open_store(tmp_path, others=others):
+            pass
+
+    with open_store(tmp_path):
+        assert_refused("another campaign writes there; wait for it or choose")
+    with open_store(tmp_path, Shard(1, 2)), open_store(tmp_path, Shard(2, 2)):
         pass
-    with pytest.raises(CampaignError, match=r"nowhere: is no directory; name one that a campaign wrote"):
-        JobStore(tmp_path, others=[tmp_path / "nowhere"])
+    assert_refused(r"nowhere: is no directory; name one that a campaign wrote", (tmp_path / "nowhere",))
     (tmp_path / "jobs.jsonl").write_text('{"key": "a"}\n')
-    with pytest.raises(CampaignError, match=r"jobs.jsonl:1: is no finished job; remove the line"):
-        JobStore(tmp_path)
+    assert_refused(r"jobs.jsonl:1: is no finished job; remove the line")
 
 
 # -- results ----------------------------------------------------------------------------------------------------------
