@@ -17,7 +17,6 @@ from ccatp.core import Fix, PointId
 from ccatp.daemon.fix_service import FixRequest
 from ccatp.etalon_client import EtalonClient, EtalonError, EtalonTimeout, StaleLengths
 from ccatp.links import multiline
-from ccatp.links.robot_messages import LineBuffer
 from ccatp.localizer import build_localizer
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
@@ -173,7 +172,7 @@ def test_a_point_missed_by_more_than_the_tolerance_is_approached_again(tmp_path:
     assert result.summary["points"] == points
 
 
-# -- E2, E6, E7, E8: the server ---------------------------------------------------------------------------------------
+# -- E2, E6, E8: the server ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.fault("E2")
@@ -256,29 +255,6 @@ def test_a_server_that_is_restarted_is_found_and_the_point_counts_once(
     measured("E6", fixes - 1, "twice")
     assert (done, fixes) == ([POINT], 1)
     assert late_s <= 5.0
-
-
-@pytest.mark.fault("E7")
-def test_mutilated_replies_are_bad_replies_and_nothing_else(measured: Measured) -> None:
-    rng = random.Random(7)
-    good = [lengths(), b"isconnected_1\r\n", b"environmentdata_5.0_525.0_30.0\r\n", b"error_busy\r\n"]
-    surprises = 0
-    for _ in range(10_000):
-        line = bytearray(rng.choice(good))
-        for _ in range(rng.randint(1, 6)):
-            at = rng.randrange(len(line) + 1)
-            line[at : at + rng.randint(0, 3)] = rng.randbytes(rng.randint(0, 3))
-        try:
-            for text in LineBuffer(multiline.MAX_LINE_BYTES).feed(bytes(line) + b"\n"):
-                reply = multiline.parse_reply(text.rstrip(b"\r"))
-                if isinstance(reply, multiline.ChannelData):
-                    multiline.valid_lengths(reply, CHANNELS)
-        except multiline.BadReply:
-            pass
-        except Exception:
-            surprises += 1
-    measured("E7", surprises)
-    assert surprises == 0
 
 
 @pytest.mark.fault("E8")

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from ccatp.dataloop import DataLoop
-from ccatp.links.robot_codec import RobotFrame, decode_from_robot, encode
+from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_link import BACKLOG_S, FLOOD_FACTOR, RobotLink, RobotTimeout, WrongProtocol
-from ccatp.links.robot_messages import PROTOCOL, BadLineLimit, CommandEcho, Hello, LineBuffer, RobotData, Sensors
+from ccatp.links.robot_messages import PROTOCOL, BadLineLimit, CommandEcho, Hello, RobotData, Sensors
 from ccatp.sim.fault_proxy import FaultProxy
 from tests.faults.linking import Measured
 from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S
@@ -99,28 +99,6 @@ async def test_a_damaged_line_costs_itself_alone(measured: Measured) -> None:
         gaps = [b - a - 1 for a, b in zip(driver.seqs, driver.seqs[1:], strict=False)]
         measured("S15", max(gaps))
         assert sum(gaps) <= proxy.counts["corrupt"]
-
-
-@pytest.mark.fault("L5")
-def test_wherever_the_stream_is_cut_the_messages_are_the_same(measured: Measured) -> None:
-    lines = [frame(k) for k in range(10_000)]
-    stream, rng = b"".join(lines), random.Random(5)
-    at, buffer, found = 0, LineBuffer(), 0
-    while at < len(stream):
-        size = rng.choice((1, 2, 3, 50, 700, 3000))
-        for line in buffer.feed(stream[at : at + size]):
-            assert line == lines[found][:-1]
-            found += 1
-        at += size
-    assert found == len(lines)
-    three = b"".join(lines[:3])
-    expected = [decode_from_robot(line[:-1]) for line in lines[:3]]
-    differences = 0
-    for cut in range(len(three) + 1):
-        buffer = LineBuffer()
-        seen = [decode_from_robot(line) for part in (three[:cut], three[cut:]) for line in buffer.feed(part)]
-        differences += seen != expected
-    measured("L5", differences)
 
 
 # -- floods and trickles ----------------------------------------------------------------------------------------------
