@@ -4,7 +4,7 @@ import asyncio
 import json
 import socket
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +14,8 @@ import msgspec
 import structlog
 import zmq
 import zmq.asyncio
+from structlog.testing import LogCapture
+from structlog.typing import FilteringBoundLogger
 
 from ccatp.config.models import Config
 from ccatp.daemon.dashboard import serve_page
@@ -42,22 +44,16 @@ class Reply:
 
 @dataclass
 class Rig:
-    """What a test has in hand.
+    """What a test has in hand: publishers of the played daemon, what ends the dashboard and what it logged.
 
-    Attributes:
-        port: of the page.
-        main, danger: publishers of the played daemon.
-        stop: ends the dashboard.
-        lines: what it logged.
-        asked: requests that came over the operator channel.
-        answer: what answers them.
+    ``asked``: requests that came over the operator channel; ``answer``: what answers them.
     """
 
     port: int
     main: Publisher
     danger: Publisher
     stop: asyncio.Event
-    lines: list[dict[str, Any]]
+    lines: Sequence[Mapping[str, Any]]
     asked: list[dict[str, Any]] = field(default_factory=list)
     answer: Handler | None = None
     _seq: int = 0
@@ -84,10 +80,12 @@ class Rig:
         writer.write(("\r\n".join(lines) + "\r\n\r\n").encode())
         try:
             async with asyncio.timeout(DEADLINE_S):
-                return _parsed(await reader.read())
+                head, _, body = (await reader.read()).partition(b"\r\n\r\n")
         finally:
             writer.close()
             await writer.wait_closed()
+        first, *rest = head.decode("latin-1").split("\r\n")
+        return Reply(int(first.split()[1]), {k.lower(): v for k, _, v in (line.partition(": ") for line in rest)}, body)
 
     async def until(self, path: str, is_there: Callable[[Reply], bool]) -> Reply:
         """Ask until the answer is as wanted; the played daemon lives meanwhile."""
@@ -140,55 +138,29 @@ class Page:
 
 
 def mission(**fields: Any) -> MissionStatus:
-    """A mission that drives."""
-    known: dict[str, Any] = {
-        "seq": 1, "t_s": 1.0, "state": "driving", "cause": "", "done": 3, "skipped": 0, "total": 9, "point": "1-2-7",
-        "elapsed_s": 5.0, "eta_s": 90.0, "error_mm": 0.0, "code": 0, "outcome": "", "lower_bound_s": 95.0,
-        "exit_status": -1,
-    }  # fmt: skip
-    return MissionStatus(**(known | fields))
+    return MissionStatus(**({"seq": 1, "t_s": 1.0, "state": "driving", "done": 3, "total": 9} | fields))
 
 
 def picture(seq: int) -> DisplayState:
-    """A pose."""
     return DisplayState(
         seq=seq, t_s=0.1 * seq, x_m=1.0, y_m=-2.0, heading_rad=0.5, covariance_m2=(1e-6, 0.0, 1e-6),
         heading_sigma_rad=0.01, nis=2.0, size=2, line=msgspec.Raw(b"null"),
     )  # fmt: skip
 
 
-def _parsed(raw: bytes) -> Reply:
-    head, _, body = raw.partition(b"\r\n\r\n")
-    first, *lines = head.decode("latin-1").split("\r\n")
-    headers = {name.lower(): value for name, _, value in (line.partition(": ") for line in lines)}
-    return Reply(int(first.split()[1]), headers, body)
-
-
-class _Log:
-    """Stands for the logger: what would be written."""
-
-    def __init__(self) -> None:
-        self.lines: list[dict[str, Any]] = []
-
-    def info(self, text: str, **fields: Any) -> None:
-        self.lines.append({"text": text, **fields})
-
-
 @asynccontextmanager
 async def page_rig(cfg: Config, folder: Path, *, has_daemon: bool = True) -> AsyncIterator[Rig]:
-    """The dashboard with this configuration; its runtime and run directory are ``folder``.
+    """The dashboard with this configuration at a free port; ``has_daemon``: somebody answers the operator channel.
 
-    Args:
-        cfg: configuration; the port is chosen here.
-        folder: a short path, empty.
-        has_daemon: somebody answers the operator channel.
+    ``folder`` is its runtime and run directory, a short path, empty.
     """
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     endpoints = Endpoints(folder)
     listener = socket.create_server(("127.0.0.1", 0))
-    log, stop = _Log(), asyncio.Event()
+    capture, stop = LogCapture(), asyncio.Event()
+    log = cast(FilteringBoundLogger, structlog.wrap_logger(None, processors=[capture]))
     main, danger = (Publisher(context, endpoints.of(name)) for name in ("main", "danger"))
-    rig = Rig(listener.getsockname()[1], main, danger, stop, log.lines)
+    rig = Rig(listener.getsockname()[1], main, danger, stop, capture.entries)
     logger = cast(structlog.typing.FilteringBoundLogger, log)
     page = serve_page(cfg, folder, endpoints, listener, stop, logger, is_sim=True, has_heartbeat=True)
     try:

@@ -14,7 +14,6 @@ from ccatp.links.topics import (
     BeaconPlaces,
     BeaconTrack,
     BeaconTruth,
-    DangerEvent,
     Message,
     MissionStatus,
     schema_of,
@@ -26,7 +25,7 @@ SIGMA_M, OFF_M = 0.02, 0.03  # of the estimate; the truth lies so far to the rig
 ELLIPSE = (SIGMA_M**2, 0.0, SIGMA_M**2)
 PLACES = {"beacon1": (0.0, 0.0), "beacon2": (3.0, 3.0)}
 TOPICS = (
-    "beacon_track", "beacon_truth", "beacon_map", "beacon_arrival", "beacon_places", "mission", "danger_event"
+    "beacon_track", "beacon_truth", "beacon_map", "beacon_arrival", "beacon_places", "mission"
 )  # fmt: skip
 
 
@@ -69,10 +68,7 @@ def truth_row(frame: int, *, has_target: bool = False) -> tuple[float | None, ..
 
 
 def status(outcome: str = "complete") -> MissionStatus:
-    return MissionStatus(
-        seq=60, t_s=6.0, state="done", cause="", done=1, skipped=0, total=4, point="", elapsed_s=6.0, eta_s=0.0,
-        error_mm=20.0, code=0, outcome=outcome, lower_bound_s=0.0, exit_status=0,
-    )  # fmt: skip
+    return MissionStatus(seq=60, t_s=6.0, state="done", done=1, total=4, elapsed_s=6.0, outcome=outcome, exit_status=0)
 
 
 def record_beacons(run_dir: Path, cfg: RadioConfig | None = None, *, is_sim: bool = True, ends: bool = True) -> Path:
@@ -104,11 +100,6 @@ def record_beacons(run_dir: Path, cfg: RadioConfig | None = None, *, is_sim: boo
             seq=10, t_s=1.0, waypoint=0, lap=0, place=cfg.workspace.waypoints_m[0], estimate=(*place(10), *ELLIPSE)
         )
         write("beacon_arrival", arrived)
-    event = DangerEvent(
-        seq=7, t_s=0.7, code=1, cause="near <something>", signal="obstacle", value=0.2, limit=0.3,
-        off=(False, False, False, False),
-    )  # fmt: skip
-    write("danger_event", event)
     write("mission", status() if ends else msgspec.structs.replace(status(), state="visiting", outcome=""))
     recorder.close()
     (run_dir / "log.jsonl").write_text(

@@ -32,11 +32,8 @@ BATCH = 100
 class RecordingRun(SilRun):
     """A mission in process that leaves a run directory behind.
 
-    Args:
-        cfg: its configuration.
-        run_dir: where it writes.
-        is_simulation: what the recording says of itself; without a simulation no truth is recorded.
-        only: points measured before it is told to abort; None for a whole mission.
+    ``is_simulation``: what the recording says of itself; without a simulation no truth is recorded. ``only``: points
+    measured before it is told to abort; None for a whole mission.
     """
 
     def __init__(self, cfg: Config, run_dir: Path, *, is_simulation: bool = True, only: int | None = None) -> None:
@@ -89,8 +86,7 @@ class RecordingRun(SilRun):
         mission = self.mission
         message = MissionStatus(
             seq=self.seq, t_s=self.t_s, state=str(mission.state), cause=mission.cause, done=len(mission.done),
-            skipped=len(mission.skipped), total=self.parts.total_points, point="", elapsed_s=self.t_s, eta_s=0.0,
-            error_mm=0.0, code=0, outcome=outcome, lower_bound_s=self.parts.lower_bound_s, exit_status=exit_status,
+            total=self.parts.total_points, elapsed_s=self.t_s, outcome=outcome, exit_status=exit_status,
         )  # fmt: skip
         self.write("mission", message)
 

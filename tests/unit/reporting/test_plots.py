@@ -1,21 +1,19 @@
 """Figures: what is drawn, shorter series, SVG for a page, files, the map of a run."""
 
-import json
+import re
 import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from math import hypot
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ccatp.config.load import dump_config, load_config
-from ccatp.core import DeckPose, Fix, PanelId, PointId
-from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.records.recorder import Recorder
+from ccatp.core import DeckPose, PanelId, PointId
+from ccatp.mirror.mirror import Mirror
 from ccatp.records.run_reader import RunReadError
-from ccatp.records.store import MissionStore, PlannedPoint
 from ccatp.report.figures import distribution_figure, error_figure, time_figure
-from ccatp.report.findings import ErrorSeries, Grade, PointVerdict, TimeBreakdown, arrival_error_m
+from ccatp.report.findings import ErrorSeries, Grade, PointVerdict, TimeBreakdown, arrival_error_m, point_verdicts
 from ccatp.report.mirror_map import MAP_WIDTH_PX, draw_from_run_dir, record_map, run_map
 from ccatp.report.plots import (
     NARROW,
@@ -31,13 +29,14 @@ from ccatp.report.plots import (
     svg_of,
 )
 from ccatp.report.record import read_record
+from tests.support.scenario import mirror_of
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @pytest.fixture(scope="module")
 def mirror() -> Mirror:
-    return build_mirror(load_config().mirror)
+    return mirror_of()
 
 
 def test_an_envelope() -> None:
@@ -102,11 +101,8 @@ def test_files(tmp_path: Path) -> None:
             save_figure(add_legend(axes), tmp_path / "no" / f"a{suffix}")
 
 
-POINTS = [PointId(5, 5, n) for n in range(1, 10)]
-
-
 def verdict(place_m: tuple[float, float], left_mm: float | None, grade: Grade, number: int = 1) -> PointVerdict:
-    return PointVerdict(POINTS[number - 1], place_m, None, left_mm, grade, "")
+    return PointVerdict(PointId(5, 5, number), place_m, None, left_mm, grade, "")
 
 
 def test_a_map_of_a_run_shows_what_it_is_given(mirror: Mirror) -> None:
@@ -184,73 +180,38 @@ def test_a_distribution() -> None:
 HEIGHT_M = 0.05
 
 
-def fix_at(mirror: Mirror, x: float, y: float) -> Fix:
-    return Fix(1.0, mirror.puck_world(DeckPose(x, y, 0.0), HEIGHT_M), (0.0,) * 9, 1.0, (1, 2, 3, 4), 0.0)
-
-
-@pytest.fixture
-def run_dir(tmp_path: Path, mirror: Mirror) -> Path:
-    """Four points measured 3-4-5 mm off, one skipped, the others to come; a path in two recordings."""
-    run_dir = tmp_path / "run"
-    run_dir.mkdir()
-    (run_dir / "config.toml").write_text(dump_config(load_config()))
-    planned = [PlannedPoint(point, 0.0, 0.0) for point in POINTS]
-    path = run_dir / "mission.sqlite"
-    with MissionStore.create(path, mirror=mirror.name, seed=1, config_toml="", points=planned) as store:
-        for point in POINTS[:4]:
-            x, y = mirror.point_on_deck(point)
-            store.record_fix(point, fix_at(mirror, x + 3e-3, y + 4e-3), DeckPose(x, y, 0.0)).result()
-        store.record_skipped(POINTS[4], 2.0).result()
-    for _ in range(2):
-        recorder = Recorder(run_dir / "telemetry.mcap", [("truth", {}), ("track", {})], is_simulation=True)
-        truth = [[i, i / 100, i / 100, 0.5, 0.0, i / 100, 0.5, 0.0, 1.0, 0, 0] for i in range(3)]
-        track = [[i, i / 100, 5, 5, 0.0, 0.0, 0.0, 0.001] for i in range(3)]
-        for topic, rows in (("truth", truth), ("track", track)):
-            recorder.write(topic, 1.0, json.dumps({"seq": 2, "t_s": 1.0, "rows": rows}).encode())
-        recorder.close()
-    (run_dir / "summary.json").write_text('{"mission_time_s": 125.4}')
-    return run_dir
-
-
 def test_a_run_directory_becomes_a_picture(run_dir: Path) -> None:
-    out = run_dir / "map.png"
-    draw_from_run_dir(run_dir, out)
-    assert out.read_bytes().startswith(PNG)
-    assert int.from_bytes(out.read_bytes()[16:20], "big") == MAP_WIDTH_PX
-    figure = record_map(read_record(run_dir), WIDE)
+    found = read_record(run_dir)
+    figure = record_map(found, WIDE)
     axes = figure.axes[0]
-    assert figure.get_label() == "fyst-m1: 4 of 9 points in 2 min 05 s"
-    assert "simulation, world thesis  ·  seed 1  ·  filter ekf" in axes.get_title(loc="left")
-    path_m = np.asarray(axes.lines[0].get_xydata())
-    assert path_m.shape == (8, 2)  # the true path, not the estimated, of both recordings, each with a row of NaN
-    np.testing.assert_array_equal(path_m[:3], [[0.0, 0.5], [0.01, 0.5], [0.02, 0.5]])
-    assert np.isnan(path_m[[3, 7]]).all()
-    marks = {str(marks.get_label()): marks.get_offsets() for marks in axes.collections}
-    assert (len(marks["skipped"]), len(marks["not measured"])) == (1, 4)  # type: ignore[arg-type]
-    # the slope of the mirror's middle panel makes 5 mm longer by less than 1 %
-    assert np.asarray(axes.collections[-1].get_array()) == pytest.approx([5.0] * 4, rel=0.01)
-    for name in ("summary.json", "telemetry.mcap", "telemetry.1.mcap"):  # as after kill -9
+    assert re.fullmatch(r"fyst-m1: 9 of 9 points in \d min \d\d s", str(figure.get_label()))
+    assert "simulation, world hard  ·  seed 1  ·  filter ekf  ·  arrival error: mean" in axes.get_title(loc="left")
+    path_m, truth = np.asarray(axes.lines[0].get_xydata()), found.sessions[0].truth
+    assert truth is not None  # which is drawn, not the estimate
+    np.testing.assert_array_equal(path_m, [*truth.place_m[:, :2], [np.nan, np.nan]])
+    assert axes.collections[-1].get_array().tolist() == [one.left_mm for one in point_verdicts(found)]  # type: ignore[union-attr]
+    for name in ("summary.json", "telemetry.mcap"):  # as after kill -9
         (run_dir / name).unlink()
-    draw_from_run_dir(run_dir, run_dir / "map.svg")
-    assert "fyst-m1: 4 of 9 points<" in (run_dir / "map.svg").read_text()
+    draw_from_run_dir(run_dir, run_dir / "map.png")
+    picture = (run_dir / "map.png").read_bytes()
+    assert (picture[:8], int.from_bytes(picture[16:20], "big")) == (PNG, MAP_WIDTH_PX)
 
 
 def test_arrival_error_is_the_distance_of_foot_and_point(mirror: Mirror) -> None:
     point = mirror.point_ids(PanelId(2, 3))[7]
     x, y = mirror.point_on_deck(point)
+    here, off = (mirror.puck_world(DeckPose(x + ahead, y, 0.0), HEIGHT_M) for ahead in (0.0, 2e-3))
     # foot_of_puck converges to 1e-10 m
-    assert arrival_error_m(mirror, point, fix_at(mirror, x, y).position_m, HEIGHT_M) == pytest.approx(0.0, abs=1e-9)
+    assert arrival_error_m(mirror, point, here, HEIGHT_M) == pytest.approx(0.0, abs=1e-9)
     rise = mirror.surface.height_m(x + 2e-3, y) - mirror.surface.height_m(x, y)
-    moved = arrival_error_m(mirror, point, fix_at(mirror, x + 2e-3, y).position_m, HEIGHT_M)
-    assert moved == pytest.approx(hypot(2e-3, rise), abs=1e-9)
+    assert arrival_error_m(mirror, point, off, HEIGHT_M) == pytest.approx(hypot(2e-3, rise), abs=1e-9)
 
 
-def test_what_cannot_be_drawn_is_said_in_one_line(tmp_path: Path, run_dir: Path) -> None:
+def test_what_cannot_be_drawn_is_said_in_one_line(tmp_path: Path, without: Callable[..., Path], run_dir: Path) -> None:
     with pytest.raises(RunReadError, match=r"no config\.toml there"):
         draw_from_run_dir(tmp_path, tmp_path / "map.png")
     for out in (tmp_path / "nowhere" / "map.png", tmp_path / "map.what"):
         with pytest.raises(PictureError, match="cannot be written"):
             draw_from_run_dir(run_dir, out)
-    (run_dir / "mission.sqlite").unlink()
     with pytest.raises(PictureError, match=r"no mission\.sqlite there"):
-        draw_from_run_dir(run_dir, tmp_path / "map.png")
+        draw_from_run_dir(without("mission.sqlite"), tmp_path / "map.png")

@@ -1,0 +1,331 @@
+"""The state of the pages of surveys and of missions among beacons, from messages in virtual time."""
+
+import json
+from math import hypot
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from ccatp.beacons.mission import BeaconState
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.load import load_radio_config
+from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Severity, Verdict
+from ccatp.errors import ConfigError
+from ccatp.links.topics import (
+    ArrivalMessage,
+    BeaconArrival,
+    BeaconMapMessage,
+    BeaconPlaces,
+    BeaconTrack,
+    BeaconTruth,
+    DangerEvent,
+    DisplayState,
+    FixMessage,
+    LogMessage,
+    MissionStatus,
+    RobotShape,
+    Scene,
+    TrackMessage,
+    TruthMessage,
+)
+from ccatp.report.beacon_record import expected_rms_m, true_rms_m
+from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground, worst_sigma_m
+from ccatp.report.dashboard.survey_view import SurveyView, ground
+from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView
+from tests.support.scenario import config_of, mirror_of
+
+LINE = (
+    b'{"type":"sensors","seq":5,"t":1.5,"imu":[],"enc":[],"edge":[[1.4,1,1,1,1],[1.5,1,0,1,1]],"gravity":null,'
+    b'"fans":[0.8,0.7],"soc":0.93,"cmd":{"seq":4,"age":0.012,"permit_age":0.008,"held":false},"faults":["stall"]}'
+)
+CFG, MIRROR = config_of(run__panels=2), mirror_of()
+
+
+@pytest.fixture
+def view() -> SurveyView:
+    return SurveyView(MIRROR, CFG, is_sim=True)
+
+
+def mission(**fields: Any) -> MissionStatus:
+    return MissionStatus(**({"seq": 1, "t_s": 1.0, "state": "driving", "total": 18} | fields))
+
+
+def picture(t_s: float = 1.5, nis: float = 2.0, line: bytes = LINE) -> DisplayState:
+    return DisplayState(
+        seq=5, t_s=t_s, x_m=1.0, y_m=-2.0, heading_rad=0.5, covariance_m2=(1e-6, 0.0, 4e-6), heading_sigma_rad=0.01,
+        nis=nis, size=2, line=msgspec.Raw(line),
+    )  # fmt: skip
+
+
+def fix_at(point: PointId | None, ahead_m: float, t_s: float = 2.0) -> FixMessage:
+    x_m, y_m = MIRROR.point_on_deck(point or PointId(1, 2, 1))
+    world = MIRROR.puck_world(DeckPose(x_m + ahead_m, y_m, 0.0), 0.05)
+    return FixMessage(
+        seq=9, t_s=t_s, point=point, is_fused=True, position_m=world, covariance_m2=[0.0] * 9, dop=1.0,
+        residual_rms_m=1e-6, channels=[1, 2, 3, 4], jump_mm=0.7,
+    )  # fmt: skip
+
+
+def told(view: RunStateView, *messages: Any, now_s: float = 1.0) -> dict[str, Any]:
+    """What is new after these messages, as a page gets it."""
+    for message in messages:
+        view.receive(message, now_s)
+    state: dict[str, Any] = json.loads(msgspec.json.encode(view.news(now_s)))
+    return state
+
+
+def test_levels_are_there_each_time(view: SurveyView) -> None:
+    state = told(view)
+    assert state["mission"] is state["pose"] is state["verdict"] is state["robot"] is None
+    assert state["points"] == state["path"] == state["log"] == []
+    assert state["is_sim"] is True
+    told(view, mission(), picture())
+    for now_s in (1.1, 1.9):
+        state = told(view, now_s=now_s)
+        assert (state["mission"]["state"], state["pose"]["x_m"]) == ("driving", 1.0)
+        assert state["mission"]["is_stale"] is False
+        assert state["robot"] == {
+            "edges": [1, 0, 1, 1], "fans": [0.8, 0.7], "charge": 0.93, "drive_age_s": 0.012, "permit_age_s": 0.008,
+            "is_held": False, "faults": ["stall"],
+        }  # fmt: skip
+    assert told(view, now_s=2.1)["mission"]["is_stale"]
+    state = told(view, picture(line=b"null"))  # before the first frame
+    assert (state["robot"], state["pose"] is None) == (None, False)
+    view.discard_history()
+    assert told(view)["pose"] is None
+    told(view, mission(exit_status=0))
+    assert (told(view, now_s=9.0)["is_over"], told(view, now_s=9.0)["mission"]["is_stale"]) == (True, False)
+
+
+def test_the_next_point_is_known_on_the_way_to_other_stops_too(view: SurveyView) -> None:
+    for message, point in (
+        (mission(point="1-2-9"), "1-2-9"),
+        (mission(), "1-2-7"),
+        (fix_at(view.points[0], 0.0), "1-2-8"),
+        (mission(outcome="stopped"), ""),
+    ):
+        assert told(view, message)["mission"]["next_point"] == point
+
+
+def test_a_point_from_arrival_to_measured(view: SurveyView) -> None:
+    point = view.points[0]
+    arrived = ArrivalMessage(seq=8, t_s=2.0, point=(point.row, point.col, point.point), error_mm=0.3)
+    assert told(view, arrived)["points"] == [[0, ARRIVED, None]]
+    state = told(view, fix_at(point, 0.004))
+    # The foot lies 4 mm ahead on the deck, and a little more along the slope.
+    assert state["points"] == [[0, MEASURED, pytest.approx(4.0, abs=0.3)]]
+    assert state["series"] == {"arrival": [[2.0, state["points"][0][2]]], "jump": [[2.0, 0.7]]}
+    assert told(view, arrived)["points"] == []  # measured stays measured
+
+
+@pytest.mark.parametrize(
+    ("is_point", "changes", "points", "series"),
+    [
+        pytest.param(True, {"is_fused": False}, [], set(), id="refused"),
+        pytest.param(False, {}, [], {"jump"}, id="finds the robot only"),
+        pytest.param(True, {"position_m": (1e3, 1e3, 1e3)}, [[0, MEASURED, None]], {"jump"}, id="far from the mirror"),
+    ],
+)
+def test_fixes_that_are_no_measurements(
+    view: SurveyView, is_point: bool, changes: dict[str, Any], points: list[Any], series: set[str]
+) -> None:
+    fix = fix_at(view.points[0] if is_point else None, 0.0)
+    state = told(view, msgspec.structs.replace(fix, **changes))
+    assert (state["points"], set(state["series"])) == (points, series)
+
+
+def test_points_left_out(view: SurveyView) -> None:
+    names = [f"{p.row}-{p.col}-{p.point}" for p in view.points[:2]]
+    news = told(view, fix_at(view.points[1], 0.0), mission(left_out={"no fix": names, "other": ["99-9-9"]}))
+    assert [row[:2] for row in news["points"]] == [[0, SKIPPED], [1, MEASURED]]
+    assert news["mission"]["not_to_be_measured"] == 3
+
+
+def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(view: SurveyView) -> None:
+    view.is_tracking = True
+    rows, truths = [], []
+    for k in range(300):
+        rows.append((k, 0.01 * k, 1, 2, -0.1 + 0.001 * k, 0.05, 0.0, 0.001))
+        deck = MIRROR.deck_pose(PanelPose(PanelId(1, 2), rows[-1][4], 0.05, 0.0))
+        truths.append((k, 0.01 * k, deck.x_m + 0.002, deck.y_m, 0.0, 0.0, 0.0, 0.0, 1.0, 0, 0))
+    track = TrackMessage(seq=299, t_s=3.0, rows=rows)
+    state = told(view, track, TruthMessage(seq=299, t_s=3.0, rows=truths))
+    path = np.array(state["path"])
+    assert hypot(*(path[-1] - path[0])) == pytest.approx(0.28, abs=0.01)
+    assert [[round(value, 3) for value in row[1:]] for row in state["series"]["error"]] == [[2.0, 3.0], [2.0, 3.0]]
+    blind = SurveyView(MIRROR, CFG, is_sim=False)  # without a truth sigma alone is shown
+    assert told(blind, track)["series"]["error"] == [[0.0, None, 3.0], [1.0, None, 3.0], [2.0, None, 3.0]]
+
+
+def test_innovations_are_told_when_they_change(view: SurveyView) -> None:
+    state = told(view, *(picture(t_s, nis) for t_s, nis in ((1.0, 2.0), (1.1, 2.0), (1.2, 3.5))))
+    assert state["series"]["nis"] == [[1.0, 2.0, 2], [1.2, 3.5, 2]]
+
+
+def test_the_verdict_and_its_cause(view: SurveyView) -> None:
+    verdict = Verdict(
+        seq=4, t_s=1.0, code=EventCode.NEAR_EDGE, cause="edge", signal="front_left", value=0.006, limit=0.005,
+        forward=False, reverse=True, turn=False, off=(True, False, False, False), severity=Severity.NONE,
+    )  # fmt: skip
+    more = {"text": "edge (front left): 0.006 (limit 0.005)", "is_stale": False}
+    assert told(view, verdict)["verdict"] == json.loads(msgspec.json.encode(verdict)) | more
+    assert told(view, now_s=2.5)["verdict"]["is_stale"]
+    event = DangerEvent(
+        seq=4, t_s=1.25, code=2, cause="fire", signal="emergency:fire", value=1.0, limit=0.0, off=(False,) * 4,
+        severity=5,
+    )  # fmt: skip
+    state = told(view, event)
+    assert (state["verdict"]["code"], "forward" in state["verdict"]) == (2, False)
+    assert state["log"] == [[1.25, "warning", "danger: fire", 1, 1]]
+    line = LogMessage(seq=5, t_s=2.0, level="info", process="main", text="joined")
+    assert told(view, line)["log"] == [[2.0, "info", "joined", 1, 2]]
+
+
+def test_other_things_on_the_map(view: SurveyView) -> None:
+    assert "shapes" not in told(view)
+    beacon = RobotShape(id="b1", kind="beacon", x_m=1.0, y_m=2.0, covariance_m2=(0.1, 0.0, 0.1), label="b1")
+    wall = RobotShape(id="w", kind="obstacle", x_m=0.0, y_m=0.0, outline_m=[(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)])
+    shapes = told(view, Scene(seq=1, t_s=1.0, shapes=[beacon, wall]))["shapes"]
+    place = {"x_m": 1.0, "y_m": 2.0, "covariance_m2": [0.1, 0.0, 0.1]}
+    assert shapes[0] == {"id": "b1", "kind": "beacon", "label": "b1"} | place
+    assert shapes[1]["outline_m"] == [[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
+    assert "shapes" not in told(view)  # nothing new
+    assert len(view.everything(1.1)["shapes"]) == 2
+
+
+def test_everything_is_the_sum_of_the_news_and_stops_are_the_path_where_nobody_looked(view: SurveyView) -> None:
+    points, path, arrivals = {}, list[Any](), list[Any]()
+    for k in range(6):
+        view.is_tracking = k == 5
+        news = told(view, fix_at(view.points[k], 0.001 * k, t_s=float(k)))
+        points |= {row[0]: row for row in news["points"]}
+        path += news["path"]
+        arrivals += news["series"]["arrival"]
+    everything = json.loads(msgspec.json.encode(view.everything(6.0)))
+    assert (everything["points"], everything["path"]) == (list(points.values()), path)
+    assert len(path) == 5
+    assert everything["series"]["arrival"] == arrivals
+
+
+def test_what_was_measured_before_is_there(view: SurveyView) -> None:
+    fixes = [fix_at(view.points[k], 0.001, t_s=10.0 - k) for k in range(3)]
+    measured = [(view.points[k], fix.t_s, fix.position_m) for k, fix in enumerate(fixes)]
+    elsewhere = (PointId(5, 5, 5), 1.0, fixes[0].position_m)
+    view.begin_with([*measured, elsewhere], [view.points[4], PointId(5, 5, 6)])
+    everything = view.everything(0.0)
+    assert [row[:2] for row in everything["points"]] == [[0, MEASURED], [1, MEASURED], [2, MEASURED], [4, SKIPPED]]
+    assert [row[0] for row in everything["series"]["arrival"]] == [8.0, 9.0, 10.0]
+
+
+def test_the_ground_of_a_survey() -> None:
+    found = json.loads(msgspec.json.encode(ground(MIRROR, CFG, is_sim=True, needs_token=False)))
+    assert (found["title"], found["is_sim"]) == ("fyst-m1", True)
+    assert (len(found["panels"]), len(found["points"]), found["points"][0][0]) == (77, 18, "1-2-7")
+    assert len(found["rim"]) > 4
+
+
+# -- missions among beacons -------------------------------------------------------------------------------------------
+
+ELLIPSE = (0.8, 0.8, 4e-4, 0.0, 4e-4)
+
+
+def radio(system: str = "zigbee", **keys: object) -> RadioConfig:
+    return load_radio_config(None, {"system": system, **keys})
+
+
+@pytest.fixture
+def room() -> BeaconView:
+    return BeaconView(radio(), is_sim=True)
+
+
+def told_map(t_s: float = 1.0, **fields: Any) -> BeaconMapMessage:
+    known: dict[str, Any] = {
+        "seq": 10, "t_s": t_s, "system": "zigbee", "pose": (0.8, 0.8, 0.0), "pose_ellipse": ELLIPSE,
+        "beacons": {"a": (0.3, 0.0, 0.03, 0.0, 0.01), "b": (3.0, 0.4, 0.02, 0.0, 0.02)}, "target": None,
+        "obstacles": [], "waypoints": [(0.8, 0.8), (2.2, 0.8)], "next_waypoint": 1, "distances": [1.5, 0.7],
+        "nis_sum": 0.0, "nis_size": 0, "refused": 0, "notes": {},
+    }  # fmt: skip
+    return BeaconMapMessage(**(known | fields))
+
+
+def test_waypoints_are_done_one_after_the_other_and_anew_in_the_next_lap(room: BeaconView) -> None:
+    first, second, again = (
+        BeaconArrival(seq=1, t_s=1.0, waypoint=waypoint, lap=lap, place=(0.8, 0.8), estimate=ELLIPSE)
+        for waypoint, lap in ((0, 0), (1, 0), (0, 1))
+    )
+    assert told(room, first, second)["points"] == [[0, MEASURED, None], [1, MEASURED, None]]
+    assert told(room)["points"] == []
+    assert told(room, again)["points"] == [[0, MEASURED, None], *([k, PLANNED, None] for k in (1, 2, 3))]
+    assert room.everything(0.0)["points"] == [[0, MEASURED, None]]
+
+
+def test_the_map_against_what_is_expected_and_what_is_true(room: BeaconView) -> None:
+    places = BeaconPlaces(seq=0, t_s=0.0, places={"a": (0.0, 0.0), "b": (3.0, 0.0)})
+    series = told(room, places, told_map(), told_map(1.5, nis_sum=6.0, nis_size=4, refused=2))["series"]
+    # Root mean squares of 0.3 and 0.4 m, and of variances of 0.04 for each place, in mm.
+    assert series["map"] == [[1.5, pytest.approx(353.55), pytest.approx(200.0)]]
+    assert (series["nis"], series["clearance"]) == ([[1.5, 6.0, 4]], [[1.5, 0.7]])
+    assert told(room, told_map(2.0, nis_sum=7.0, nis_size=6, refused=2))["series"]["nis"] == [[2.0, 1.0, 2]]
+    assert "nis" not in told(room, told_map(2.5))["series"]  # of another main loop: it begins anew
+
+
+def test_facts(room: BeaconView) -> None:
+    assert told(room)["facts"] == []
+    assert dict(told(room, told_map(nis_sum=6.0, nis_size=4, refused=2))["facts"]) == {
+        "beacons on the map": "2", "error of the map, expected": "200.0 mm", "readings used, refused": "4, 2",
+        "mean NIS": "1.50", "to the waypoint": "1.40 m", "lap": "1 of 2",
+    }  # fmt: skip
+
+
+def test_a_target_is_followed() -> None:
+    target = (1.8, 0.8, 0.01, 0.0, 0.01)
+    known: dict[str, Any] = {"target": target, "beacons": {"target": target}, "waypoints": [], "next_waypoint": -1}
+    state = told(BeaconView(radio("follow"), is_sim=True), *(told_map(t_s, **known) for t_s in (1.0, 1.5)))
+    assert state["series"]["target"] == [[1.5, 1.0, 0.6]]
+    assert "map" not in state["series"]  # the one that moves is none of the map
+    assert dict(state["facts"])["distance to the target"] == "1.00 m"
+
+
+def test_the_error_against_the_truth_is_the_worst_of_each_second(room: BeaconView) -> None:
+    rows: Any = [(k, 0.1 * k, 1.0, 2.0, 0.0, 4e-4, 0.0, 1e-4, 0.0, 0.0, 1e-4, 1.0, 2.0) for k in (10, 15, 20)]
+    true: Any = [(k, 0.1 * k, 1.0, 2.01, 0.0, None, None, None) for k in (10, 15, 20)]
+    state = told(room, BeaconTrack(seq=20, t_s=2.0, rows=rows), BeaconTruth(seq=20, t_s=2.0, rows=true))
+    assert state["series"]["error"] == [[1.0, pytest.approx(10.0), pytest.approx(60.0)]]
+
+
+def test_the_scene_without_what_the_page_draws_itself(room: BeaconView) -> None:
+    kinds = ("robot", "trail", "waypoint", "beacon", "obstacle")
+    scene = Scene(seq=1, t_s=1.0, shapes=[RobotShape(kind, kind, 1.0, 1.0) for kind in kinds])
+    state = told(room, BeaconPlaces(seq=0, t_s=0.0, places={"a": (0.0, 1.0)}), scene)
+    assert [shape["kind"] for shape in state["shapes"]] == ["true", "beacon", "obstacle"]
+    assert state["shapes"][0]["y_m"] == 1.0
+    assert [link["name"] for link in state["links"]] == ["main loop", "danger loop", "robot"]  # no laser
+
+
+def test_the_path_comes_with_the_map(room: BeaconView) -> None:
+    told(room, *(told_map(t_s, pose=(x_m, 0.8, 0.0)) for t_s, x_m in ((1.0, 0.8), (1.5, 0.801), (2.0, 0.9))))
+    assert room.everything(0.0)["path"] == [(0.8, 0.8), (0.9, 0.8)]  # nobody sees a millimetre
+
+
+def test_figures() -> None:
+    assert (expected_rms_m({}), true_rms_m({"a": ELLIPSE}, {})) == (None, None)
+    assert [worst_sigma_m(1.0, 0.0, 4.0), worst_sigma_m(2.0, 1.0, 2.0)] == pytest.approx([2.0, 3.0**0.5])
+
+
+@pytest.mark.parametrize("system", ["zigbee", "follow", "cricket"])
+def test_the_ground_of_a_room(system: str) -> None:
+    cfg, is_following = radio(system), system == "follow"
+    found = json.loads(msgspec.json.encode(beacon_ground(cfg, is_sim=True, needs_token=True)))
+    assert (found["needs_token"], found["rim"][2]) == (True, list(cfg.workspace.size_m))
+    assert found["states"] == [str(state) for state in BeaconState]
+    names = [] if is_following else [f"waypoint {k + 1}" for k in range(len(cfg.workspace.waypoints_m))]
+    assert [point[0] for point in found["points"]] == names
+    assert ("target" in found["plots"]) is is_following
+    assert found["words"]["unit"] == ("seconds" if is_following else "waypoints")
+
+
+def test_a_page_beyond_this_machine_wants_a_token() -> None:
+    with pytest.raises(ConfigError, match=r"dashboard\.host = \"0\.0\.0\.0\" is beyond this machine"):
+        radio(**{"dashboard.host": "0.0.0.0"})
