@@ -23,10 +23,8 @@ from ccatp.links.beacon_messages import (
     truth_in,
 )
 from ccatp.links.topics import BeaconArrival, BeaconEllipse, BeaconMapMessage, MissionStatus
-from ccatp.records.recorder import TELEMETRY, recordings
 from ccatp.records.run_reader import CONFIG
-from ccatp.records.state_log import read_log
-from ccatp.report.record import LOG, RunFiles, changed_keys, common_fields, joined, read_recording
+from ccatp.report.record import RunFiles, RunFolder, changed_keys, joined, simulation_in
 
 _COLUMNS = {"beacon_track": TRACK_COLUMNS, "beacon_truth": TRUTH_COLUMNS}
 BEACON_TOPICS_READ = frozenset((*_COLUMNS, "beacon_map", "beacon_arrival", "beacon_places", "mission"))
@@ -84,19 +82,13 @@ def read_beacon_record(run_dir: Path) -> BeaconRecord:
     """Everything that a report shows of a mission among beacons; ConfigError: its configuration cannot be used."""
     cfg = load_radio_config(run_dir / CONFIG)
     shipped = load_radio_config(None, {"system": cfg.system})
-    missing: list[str] = []
-    warnings: list[str] = []
-    log = list(read_log(run_dir / LOG, warnings))
-    if not log:
-        missing.append(f"{LOG}: log of the processes")
-    paths = recordings(run_dir / TELEMETRY)
-    if not paths:
-        missing.append(f"{TELEMETRY}: path, map and readings over time")
-    parts = [part for path in paths if (part := read_recording(path, BEACON_TOPICS_READ, _COLUMNS, warnings))]
+    folder = RunFolder(run_dir, "log of the processes")
+    recorded = folder.recordings(BEACON_TOPICS_READ, _COLUMNS, "path, map and readings over time")
+    parts = [part for part in recorded if part is not None]
     found = {topic: [one for part in parts for one in part.messages[topic]] for topic in BEACON_TOPICS_READ}
-    is_simulation = next((part.is_simulation for part in reversed(parts) if part.is_simulation is not None), None)
+    is_simulation = simulation_in(parts)
     if is_simulation and not found["beacon_truth"]:
-        missing.append("the simulated truth: errors are not known")
+        folder.missing.append("the simulated truth: errors are not known")
     track, truth = (joined(found[topic], count, needed=5) for topic, count in _COLUMNS.items())
     return BeaconRecord(
         cfg=cfg,
@@ -109,7 +101,7 @@ def read_beacon_record(run_dir: Path) -> BeaconRecord:
         arrivals=tuple(found["beacon_arrival"]),
         statuses=tuple(found["mission"]),
         places=found["beacon_places"][-1].places if found["beacon_places"] else {},
-        **common_fields(run_dir, log, missing, warnings),
+        **folder.fields(),
     )
 
 

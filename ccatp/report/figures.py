@@ -11,16 +11,8 @@ from matplotlib.patches import Circle, Rectangle
 
 from ccatp.core import FloatArray
 from ccatp.links.topics import BeaconEllipse
-from ccatp.report import plots
-from ccatp.report.beacon_record import (
-    BeaconRecord,
-    expected_rms_m,
-    pose_errors_m,
-    pose_nees,
-    readings_of,
-    standing_beacons,
-    true_rms_m,
-)
+from ccatp.report import beacon_record, plots
+from ccatp.report.beacon_record import BeaconRecord
 from ccatp.report.findings import KINDS, ErrorSeries, TimeBreakdown
 from ccatp.report.plots import BAD, INK, PX_PER_IN, QUIET, SERIES, add_legend, ellipse_outline, envelope, is_wide
 from ccatp.report.record import WITHIN_MM
@@ -153,7 +145,7 @@ class Curve(NamedTuple):
 
 def beacon_error_figure(record: BeaconRecord, width_px: float) -> Figure:
     """Error of the position, its three sigma, and the error of dead reckoning alone; mm, logarithmic."""
-    track, errors = record.track, pose_errors_m(record)
+    track, errors = record.track, beacon_record.pose_errors_m(record)
     curves = [Curve("3 \u03c3 of the estimate", track.t_s, SIGMAS * 1e3 * track.sigma_m, SERIES[1], "--")]
     if errors is not None and record.truth is not None:
         off = np.hypot(*(track.reckoned_m - record.truth.place_m).T)
@@ -164,13 +156,16 @@ def beacon_error_figure(record: BeaconRecord, width_px: float) -> Figure:
 
 def standing_maps(record: BeaconRecord) -> list[tuple[float, dict[str, BeaconEllipse]]]:
     """Robot time (s) and beacons of each map that holds any."""
-    return [(one.t_s, beacons) for one in record.maps if (beacons := standing_beacons(record.cfg, one))]
+    return [(one.t_s, beacons) for one in record.maps if (beacons := beacon_record.standing_beacons(record.cfg, one))]
 
 
 def map_error_figure(record: BeaconRecord, width_px: float) -> Figure:
     """Root of the mean square error of the beacons, expected and true, against time."""
     maps = standing_maps(record)
-    rows = [(t_s, expected_rms_m(beacons), true_rms_m(beacons, record.places)) for t_s, beacons in maps]
+    rows = [
+        (t_s, beacon_record.expected_rms_m(beacons), beacon_record.true_rms_m(beacons, record.places))
+        for t_s, beacons in maps
+    ]
     t_s, expected, true = np.array(rows, dtype=np.float64).T
     curves = [Curve("expected", t_s, 1e3 * expected, SERIES[1], "--")]
     if np.isfinite(true).any():
@@ -180,7 +175,7 @@ def map_error_figure(record: BeaconRecord, width_px: float) -> Figure:
 
 def consistency_figure(record: BeaconRecord, width_px: float) -> Figure:
     """NIS of the readings and NEES of the pose, each by its degrees of freedom: 1 is expected."""
-    readings, nees = readings_of(record), pose_nees(record)
+    readings, nees = beacon_record.readings_of(record), beacon_record.pose_nees(record)
     axes = plots.new_plot(width_px, "consistency over time", _HEIGHTS_PX)
     axes.axhline(1.0, color=QUIET, linewidth=1.0, linestyle="--")
     if readings:

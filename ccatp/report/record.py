@@ -21,7 +21,7 @@ from ccatp.mirror.panel_alignment import Measured
 from ccatp.mirror.surface import MirrorError
 from ccatp.records.recorder import TELEMETRY, damage_text, iter_messages, read_metadata, recordings
 from ccatp.records.run_reader import CONFIG, STORE, RunReadError, read_truth
-from ccatp.records.state_log import LogLine, ReadLine, StateChange, changes_of, read_log
+from ccatp.records.state_log import LogLine, StateChange, changes_of, read_log
 from ccatp.records.store import StoredPoint, StoreError, point_name, read_survey
 
 COMPLETE = "complete"
@@ -128,26 +128,34 @@ def read_record(run_dir: Path) -> RunRecord:
         raise RunReadError(f"{run_dir}: a mission among beacons; this is for surveys, ccatp report takes both")
     cfg = load_config(run_dir / CONFIG)
     mirror = build_mirror(cfg.mirror)
-    missing: list[str] = []
-    warnings: list[str] = []
-    log = list(read_log(run_dir / LOG, warnings))
-    if not log:
-        missing.append(f"{LOG}: log of the processes, and when the mission changed its state")
-    sessions, is_simulation = _sessions(run_dir, mirror, log, missing, warnings)
-    points, measured = _survey(run_dir, mirror, missing, warnings)
-    injected, _ = read_truth(run_dir, warnings)
+    folder = RunFolder(run_dir, "log of the processes, and when the mission changed its state")
+    found = folder.recordings(TOPICS_READ, _COLUMNS, "path, estimates, arrivals and fixes over time")
+    all_changes = changes_of(folder.log, len(found))
+    sessions = [
+        _session(one, mirror, changes, folder.warnings)
+        for one, changes in zip(found, all_changes, strict=True)
+        if one is not None
+    ]
+    is_simulation = simulation_in(found)
+    if found and folder.log and not all(session.changes for session in sessions):
+        why = "the time budget is taken from the status, which is coarser"
+        folder.missing.append(f"the frames of each change of state: {why}")
+    if is_simulation and not any(session.truth for session in sessions):
+        folder.missing.append("the simulated truth: errors are those that the laser saw")
+    points, measured = _survey(folder, mirror)
+    injected, _ = read_truth(run_dir, folder.warnings)
     # Mirror and world have names of their own.
     ours, shipped = (one.model_dump(mode="json", exclude={"mirror", "world"}) for one in (cfg, load_config()))
     return RunRecord(
         cfg=cfg,
         mirror=mirror,
-        sessions=sessions,
+        sessions=tuple(sessions),
         points=points,
         measured=measured,
         injected=injected,
         is_simulation=is_simulation,
         changed=changed_keys(ours, shipped),
-        **common_fields(run_dir, log, missing, warnings),
+        **folder.fields(),
     )
 
 
@@ -179,76 +187,96 @@ def changed_keys(
     return found
 
 
-def common_fields(run_dir: Path, log: Iterable[ReadLine], missing: list[str], warnings: list[str]) -> dict[str, Any]:
-    """Fields of ``RunFiles`` that are read in the same way for every mission; completes ``missing``."""
-    return {
-        "name": run_dir.resolve().name,
-        "config_text": (run_dir / CONFIG).read_text(encoding="utf-8", errors="replace"),
-        "summary": _read_summary(run_dir / SUMMARY, missing, warnings),
-        "log": tuple(line.shown for line in log if line.shown is not None),
-        # The report is no part of the run: it is the same when it is made again.
-        "files": {
-            path.name: path.stat().st_size
-            for path in sorted(run_dir.iterdir())
-            if path.is_file() and not path.name.startswith(".") and path.suffix != ".html"
-        },
-        "missing": tuple(missing),
-        "warnings": tuple(warnings),
-    }
-
-
-def _read_summary(path: Path, missing: list[str], warnings: list[str]) -> Mapping[str, Any] | None:
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        missing.append(f"{path.name}: the run goes on, or was killed before its end")
-        return None
-    except (OSError, ValueError) as error:
-        warnings.append(f"{path.name}: cannot be read: {error}")
-        return None
-    if not isinstance(found, dict):
-        warnings.append(f"{path.name}: is no summary")
-        return None
-    return found
-
-
 class Recording(NamedTuple):
     """The messages of a recording by topic, what made it, and whether that was a simulation (None if not known)."""
 
+    name: str
     messages: dict[str, list[Any]]
     version: str
     is_simulation: bool | None
 
 
-def read_recording(
-    path: Path, topics: Iterable[str], columns: Mapping[str, int], warnings: list[str]
-) -> Recording | None:
-    """Read a recording up to its end or its first damage; None if it cannot be read at all.
+def simulation_in(found: Iterable[Recording | None]) -> bool | None:
+    """Whether the last recording that tells it was made by a simulation."""
+    known = [one.is_simulation for one in found if one is not None and one.is_simulation is not None]
+    return known[-1] if known else None
 
-    Messages of topics in ``columns`` are tables and become arrays of shape (k, columns).
-    """
-    found: dict[str, list[Any]] = {topic: [] for topic in topics}
-    damages, lost = list[str](), list[str]()
-    try:
-        metadata = read_metadata(path)
-        for topic, _, payload in iter_messages(path, damages.append):
-            if topic not in found:
-                continue
-            try:
-                message: Any = decode_recorded(topic, payload)
-                if topic in columns:
-                    message = np.array(message.rows, dtype=np.float64).reshape(-1, columns[topic])
-                found[topic].append(message)
-            except (BadMessage, ValueError) as error:
-                lost.append(str(error))
-    except OSError as error:
-        warnings.append(f"{path.name}: cannot be read: {error.strerror or error}")
-        return None
-    warnings += [damage_text(path, damage) for damage in damages]
-    if lost:
-        warnings.append(f"{path.name}: {len(lost)} messages cannot be read and are left out: {lost[0]}")
-    is_simulation = {"true": True, "false": False}.get(metadata.get("simulation", ""))
-    return Recording(found, metadata.get("ccatp", "unknown"), is_simulation)
+
+class RunFolder:
+    """Reads what is the same for every mission; collects what is missing and what cannot be read."""
+
+    def __init__(self, run_dir: Path, log_holds: str) -> None:
+        self.run_dir = run_dir
+        self.missing: list[str] = []
+        self.warnings: list[str] = []
+        self.log = [*read_log(run_dir / LOG, self.warnings)]
+        if not self.log:
+            self.missing.append(f"{LOG}: {log_holds}")
+
+    def fields(self) -> dict[str, Any]:
+        """Those of ``RunFiles``; to be called when everything else has been read."""
+        return {
+            "name": self.run_dir.resolve().name,
+            "config_text": (self.run_dir / CONFIG).read_text(encoding="utf-8", errors="replace"),
+            "summary": self._summary(self.run_dir / SUMMARY),
+            "log": tuple(line.shown for line in self.log if line.shown is not None),
+            # The report is no part of the run: it is the same when it is made again.
+            "files": {
+                path.name: path.stat().st_size
+                for path in sorted(self.run_dir.iterdir())
+                if path.is_file() and not path.name.startswith(".") and path.suffix != ".html"
+            },
+            "missing": tuple(self.missing),
+            "warnings": tuple(self.warnings),
+        }
+
+    def _summary(self, path: Path) -> Mapping[str, Any] | None:
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            self.missing.append(f"{path.name}: the run goes on, or was killed before its end")
+            return None
+        except (OSError, ValueError) as error:
+            self.warnings.append(f"{path.name}: cannot be read: {error}")
+            return None
+        if not isinstance(found, dict):
+            self.warnings.append(f"{path.name}: is no summary")
+            return None
+        return found
+
+    def recordings(self, topics: Iterable[str], columns: Mapping[str, int], holds: str) -> list[Recording | None]:
+        """All recordings, each up to its end or its first damage; None in place of one that cannot be read at all.
+
+        Messages of topics in ``columns`` are tables and become arrays of shape (k, columns).
+        """
+        paths = recordings(self.run_dir / TELEMETRY)
+        if not paths:
+            self.missing.append(f"{TELEMETRY}: {holds}")
+        return [self._recording(path, topics, columns) for path in paths]
+
+    def _recording(self, path: Path, topics: Iterable[str], columns: Mapping[str, int]) -> Recording | None:
+        found: dict[str, list[Any]] = {topic: [] for topic in topics}
+        damages, lost = list[str](), list[str]()
+        try:
+            metadata = read_metadata(path)
+            for topic, _, payload in iter_messages(path, damages.append):
+                if topic not in found:
+                    continue
+                try:
+                    message: Any = decode_recorded(topic, payload)
+                    if topic in columns:
+                        message = np.array(message.rows, dtype=np.float64).reshape(-1, columns[topic])
+                    found[topic].append(message)
+                except (BadMessage, ValueError) as error:
+                    lost.append(str(error))
+        except OSError as error:
+            self.warnings.append(f"{path.name}: cannot be read: {error.strerror or error}")
+            return None
+        self.warnings += [damage_text(path, damage) for damage in damages]
+        if lost:
+            self.warnings.append(f"{path.name}: {len(lost)} messages cannot be read and are left out: {lost[0]}")
+        is_simulation = {"true": True, "false": False}.get(metadata.get("simulation", ""))
+        return Recording(path.name, found, metadata.get("ccatp", "unknown"), is_simulation)
 
 
 def joined(batches: Sequence[FloatArray], columns: int, needed: int) -> FloatArray:
@@ -262,38 +290,16 @@ def joined(batches: Sequence[FloatArray], columns: int, needed: int) -> FloatArr
 _COLUMNS = {"track": 8, "truth": 11}
 
 
-def _sessions(
-    run_dir: Path, mirror: Mirror, log: list[ReadLine], missing: list[str], warnings: list[str]
-) -> tuple[tuple[RecordedSession, ...], bool | None]:
-    paths = recordings(run_dir / TELEMETRY)
-    if not paths:
-        missing.append(f"{TELEMETRY}: path, estimates, arrivals and fixes over time")
-        return (), None
-    sessions, is_simulation = [], None
-    for path, changes in zip(paths, changes_of(log, len(paths)), strict=True):
-        found = read_recording(path, TOPICS_READ, _COLUMNS, warnings)
-        if found is not None:
-            is_simulation = is_simulation if found.is_simulation is None else found.is_simulation
-            sessions.append(_session(path.name, found, mirror, changes, warnings))
-    if log and not all(session.changes for session in sessions):
-        missing.append("the frames of each change of state: the time budget is taken from the status, which is coarser")
-    if is_simulation and not any(session.truth for session in sessions):
-        missing.append("the simulated truth: errors are those that the laser saw")
-    return tuple(sessions), is_simulation
-
-
-def _session(
-    name: str, found: Recording, mirror: Mirror, changes: Sequence[StateChange], warnings: list[str]
-) -> RecordedSession:
+def _session(found: Recording, mirror: Mirror, changes: Sequence[StateChange], warnings: list[str]) -> RecordedSession:
     messages = found.messages
     track, truth = (joined(messages[topic], count, count) for topic, count in _COLUMNS.items())
     try:
         deck = deck_rows(mirror, track[:, 2:4].astype(np.int64), track[:, 4:7])
     except MirrorError as error:
-        warnings.append(f"{name}: its estimates are not of this mirror and are left out: {error}")
+        warnings.append(f"{found.name}: its estimates are not of this mirror and are left out: {error}")
         track, deck = track[:0], np.empty((0, 4))
     return RecordedSession(
-        name=name,
+        name=found.name,
         version=found.version,
         track=EstimatedTrack(track[:, 0].astype(np.int64), track[:, 1], deck[:, [0, 1, 3]], track[:, 7]),
         truth=TrueTrack(truth[:, 0].astype(np.int64), truth[:, 5:8]) if messages["truth"] else None,
@@ -304,18 +310,17 @@ def _session(
     )
 
 
-def _survey(
-    run_dir: Path, mirror: Mirror, missing: list[str], warnings: list[str]
-) -> tuple[tuple[StoredPoint, ...] | None, tuple[Measured, ...]]:
-    if not (run_dir / STORE).is_file():
-        missing.append(f"{STORE}: points, their fixes, and how the panels lie")
+def _survey(folder: RunFolder, mirror: Mirror) -> tuple[tuple[StoredPoint, ...] | None, tuple[Measured, ...]]:
+    path = folder.run_dir / STORE
+    if not path.is_file():
+        folder.missing.append(f"{STORE}: points, their fixes, and how the panels lie")
         return None, ()
     try:
-        stored = read_survey(run_dir / STORE, mirror.name)
+        stored = read_survey(path, mirror.name)
     except StoreError as error:
-        warnings.append(str(error).replace(f"{run_dir}/", ""))
+        folder.warnings.append(str(error).replace(f"{folder.run_dir}/", ""))
         return None, ()
-    warnings += [
+    folder.warnings += [
         f"point {point_name(point)}: its stored fix is damaged and left out; measure it again"
         for point in stored.damaged
     ]

@@ -12,16 +12,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront
-from ccatp.report import figures
-from ccatp.report.beacon_record import (
-    BeaconRecord,
-    beacon_rows,
-    pose_errors_m,
-    pose_nees,
-    read_beacon_record,
-    readings_of,
-    waypoint_rows,
-)
+from ccatp.report import beacon_record, figures
+from ccatp.report.beacon_record import BeaconRecord
 from ccatp.report.findings import Findings, Grade, findings_of
 from ccatp.report.html import MICRO, Draw, events_of, page_figures, render, write_page, write_pictures
 from ccatp.report.mirror_map import path_figure, surface_figure
@@ -50,7 +42,7 @@ def report_run(run_dir: Path, out: Path | None = None, figures_dir: Path | None 
     """
     path = out or run_dir / REPORT
     if is_beacon_run(run_dir):
-        record = read_beacon_record(run_dir)
+        record = beacon_record.read_beacon_record(run_dir)
         markup, data, pictures = beacon_page(record), beacon_data(record), beacon_drawings(record)
         warnings = record.warnings
     else:
@@ -180,7 +172,7 @@ def beacon_drawings(record: BeaconRecord) -> dict[str, Draw]:
     drawings = {
         "map": (figures.beacon_map_figure, has_track),
         "localization": (figures.beacon_error_figure, has_track),
-        "consistency": (figures.consistency_figure, readings_of(record) or record.truth is not None),
+        "consistency": (figures.consistency_figure, beacon_record.readings_of(record) or record.truth is not None),
         "beacons": (figures.map_error_figure, len(figures.standing_maps(record)) > 1),
         "target": (figures.target_figure, figures.target_curves(record)),
     }
@@ -222,11 +214,15 @@ def beacon_data(record: BeaconRecord) -> dict[str, Any]:
 
 def _beacon_findings(record: BeaconRecord) -> dict[str, Any]:
     """How it ended; beacons and waypoints; of the frames that count and have a truth: errors and NEES; mean NIS."""
-    errors, nees, readings = pose_errors_m(record), pose_nees(record), readings_of(record)
+    errors, nees, readings = (
+        beacon_record.pose_errors_m(record),
+        beacon_record.pose_nees(record),
+        beacon_record.readings_of(record),
+    )
     found: dict[str, Any] = {
         "outcome": outcome_of(record),
-        "beacons": beacon_rows(record),
-        "waypoints": waypoint_rows(record),
+        "beacons": beacon_record.beacon_rows(record),
+        "waypoints": beacon_record.waypoint_rows(record),
         "errors": None,
         "pose_nees": None,
         "nis": None,

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequenc
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import structlog
@@ -138,7 +138,8 @@ class Page:
 
 
 def mission(**fields: Any) -> MissionStatus:
-    return MissionStatus(**({"seq": 1, "t_s": 1.0, "state": "driving", "done": 3, "total": 9} | fields))
+    known: dict[str, Any] = {"seq": 1, "t_s": 1.0, "state": "driving", "done": 3, "total": 9}
+    return MissionStatus(**(known | fields))
 
 
 def picture(seq: int) -> DisplayState:
@@ -158,11 +159,10 @@ async def page_rig(cfg: Config, folder: Path, *, has_daemon: bool = True) -> Asy
     endpoints = Endpoints(folder)
     listener = socket.create_server(("127.0.0.1", 0))
     capture, stop = LogCapture(), asyncio.Event()
-    log = cast(FilteringBoundLogger, structlog.wrap_logger(None, processors=[capture]))
+    log: FilteringBoundLogger = structlog.wrap_logger(None, processors=[capture])
     main, danger = (Publisher(context, endpoints.of(name)) for name in ("main", "danger"))
     rig = Rig(listener.getsockname()[1], main, danger, stop, capture.entries)
-    logger = cast(structlog.typing.FilteringBoundLogger, log)
-    page = serve_page(cfg, folder, endpoints, listener, stop, logger, is_sim=True, has_heartbeat=True)
+    page = serve_page(cfg, folder, endpoints, listener, stop, log, is_sim=True, has_heartbeat=True)
     try:
         async with asyncio.TaskGroup() as tasks:
             served = tasks.create_task(page)

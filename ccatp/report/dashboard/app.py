@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import logging
 import socket
-from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from math import sqrt
 from pathlib import Path
 from typing import Any, ClassVar
@@ -211,7 +211,7 @@ def build_app(
         return Response(ground_json, media_type="application/json")
 
     async def events(_request: Request) -> Response:
-        return StreamingResponse(_payloads(hub), media_type="text/event-stream", headers={"x-accel-buffering": "no"})
+        return StreamingResponse(hub.events(), media_type="text/event-stream", headers={"x-accel-buffering": "no"})
 
     async def status(_request: Request) -> Response:
         return _json({"status": "ok", **await hub.whole_state()})
@@ -247,12 +247,6 @@ def build_app(
         middleware=[Middleware(HostCheckMiddleware, names=host_names)],
         exception_handlers={HTTPException: _http_error},
     )
-
-
-async def _payloads(hub: StateBroadcaster) -> AsyncIterator[bytes]:
-    with hub.open() as stream:
-        async for payload in stream:
-            yield payload
 
 
 async def _http_error(request: Request, error: Exception) -> Response:

@@ -1,7 +1,7 @@
 """The page of a mission among beacons: waypoints, the map of the beacons, errors against the simulated truth."""
 
 from collections.abc import Mapping
-from math import hypot, sqrt
+from math import dist, hypot, sqrt
 from typing import Any
 
 from ccatp.beacons.mission import BeaconState
@@ -106,12 +106,13 @@ class BeaconView(RunStateView):
         if message.nis_size > before.nis_size:
             nis = round(message.nis_sum - before.nis_sum, 3)
             self._series["nis"].add(t_s, nis, message.nis_size - before.nis_size)
-        if (sigma_m := expected_rms_m(standing_beacons(self._cfg, message))) is not None:
-            error_m = true_rms_m(standing_beacons(self._cfg, message), self._places)
+        static = standing_beacons(self._cfg, message)
+        if (sigma_m := expected_rms_m(static)) is not None:
+            error_m = true_rms_m(static, self._places)
             error_mm = None if error_m is None else round(1e3 * error_m, 2)
             self._series["map"].add(t_s, error_mm, round(1e3 * sigma_m, 2))
         if message.target is not None:
-            distance_m = hypot(message.target[0] - message.pose[0], message.target[1] - message.pose[1])
+            distance_m = dist(message.target[:2], message.pose[:2])
             self._series["target"].add(t_s, round(distance_m, 3), self._cfg.follow.safe_distance_m)
         if message.distances:
             self._series["clearance"].add(t_s, round(min(message.distances), 3))
@@ -122,31 +123,29 @@ class BeaconView(RunStateView):
                 self._take_estimate(seq, t_s, x_m, y_m, worst_sigma_m(xx, xy, yy))
 
     def _levels(self, now_s: float) -> dict[str, Any]:
-        return {**super()._levels(now_s), "facts": self._facts()}
+        facts = {} if self._map is None else self._facts(self._map)
+        return {**super()._levels(now_s), "facts": [(name, text) for name, text in facts.items() if text]}
 
-    def _facts(self) -> list[tuple[str, str]]:
-        message = self._map
-        if message is None:
-            return []
-        static = standing_beacons(self._cfg, message)
-        rows = [("beacons on the map", str(len(static)))]
-        if (sigma_m := expected_rms_m(static)) is not None:
-            rows.append(("error of the map, expected", f"{1e3 * sigma_m:.1f} mm"))
-        if (error_m := true_rms_m(static, self._places)) is not None:
-            rows.append(("error of the map, true", f"{1e3 * error_m:.1f} mm"))
-        if message.nis_size:
-            rows.append(("readings used, refused", f"{message.nis_size}, {message.refused}"))
-            rows.append(("mean NIS", f"{message.nis_sum / message.nis_size:.2f}"))
+    def _facts(self, message: BeaconMapMessage) -> dict[str, str | None]:
+        """Texts by their names; None is not known."""
+        static, size = standing_beacons(self._cfg, message), message.nis_size
+        errors_m = expected_rms_m(static), true_rms_m(static, self._places)
+        expected, true = (None if error_m is None else f"{1e3 * error_m:.1f} mm" for error_m in errors_m)
+        facts = {
+            "beacons on the map": str(len(static)),
+            "error of the map, expected": expected,
+            "error of the map, true": true,
+            "readings used, refused": f"{size}, {message.refused}" if size else None,
+            "mean NIS": f"{message.nis_sum / size:.2f}" if size else None,
+        }
         if message.target is not None:
-            distance_m = hypot(message.target[0] - message.pose[0], message.target[1] - message.pose[1])
-            rows.append(("distance to the target", f"{distance_m:.2f} m"))
-            rows.append(("to be kept", f"{self._cfg.follow.safe_distance_m:.2f} m"))
+            facts["distance to the target"] = f"{dist(message.target[:2], message.pose[:2]):.2f} m"
+            facts["to be kept"] = f"{self._cfg.follow.safe_distance_m:.2f} m"
         elif message.waypoints and message.next_waypoint >= 0:
-            x_m, y_m = message.waypoints[message.next_waypoint]
-            rows.append(("to the waypoint", f"{hypot(x_m - message.pose[0], y_m - message.pose[1]):.2f} m"))
+            facts["to the waypoint"] = f"{dist(message.waypoints[message.next_waypoint], message.pose[:2]):.2f} m"
         if self._cfg.mission.laps > 1 and message.waypoints:
-            rows.append(("lap", f"{self._lap + 1} of {self._cfg.mission.laps}"))
-        return rows
+            facts["lap"] = f"{self._lap + 1} of {self._cfg.mission.laps}"
+        return facts
 
     def _shapes(self) -> list[Any]:
         shapes = [shape for shape in super()._shapes() if shape["kind"] not in _DRAWN]

@@ -2,8 +2,8 @@
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import msgspec
@@ -107,44 +107,13 @@ PICTURE_WAIT_S, PICTURE_POLL_S = 0.3, 0.02
 _encoder = msgspec.json.Encoder()
 
 
-class EventStream:
-    """The next payload for one page; a page that was too slow gets the whole state next."""
-
-    def __init__(self) -> None:
-        self._next: asyncio.Queue[bytes] = asyncio.Queue(maxsize=1)
-        self._is_over = False
-        self.needs_all = True
-
-    @property
-    def has_taken(self) -> bool:
-        """Whether the last payload has been taken."""
-        return self._next.empty()
-
-    def offer(self, payload: bytes) -> None:
-        """Set the next payload."""
-        self._next.put_nowait(payload)
-
-    def end(self, payload: bytes = b"") -> None:
-        """End the stream after this payload, which replaces one that was not taken."""
-        self._is_over = True
-        if not self.has_taken:
-            untaken = self._next.get_nowait()
-            payload = payload or untaken
-        self.offer(payload)
-
-    async def __aiter__(self) -> AsyncIterator[bytes]:
-        """Payloads, until the end."""
-        while not (self._is_over and self.has_taken):
-            if payload := await self._next.get():
-                yield payload
-
-
 class StateBroadcaster:
     """Sends the state to the open pages at a fixed rate, and idles while none is open."""
 
     def __init__(self, reader: BusReader, view: RunStateView, rate_hz: float) -> None:
         self._reader, self._view, self._period_s = reader, view, 1.0 / rate_hz
-        self._streams: set[EventStream] = set()
+        # The next payload of each open page, and whether that must be the whole state: it is new, or was too slow.
+        self._pages: dict[asyncio.Queue[bytes], bool] = {}
         self._wake = asyncio.Event()
         self._requested_s = float("-inf")
         self._is_over = False
@@ -152,21 +121,19 @@ class StateBroadcaster:
     @property
     def pages(self) -> int:
         """Number of open pages."""
-        return len(self._streams)
+        return len(self._pages)
 
-    @contextmanager
-    def open(self) -> Iterator[EventStream]:
-        """Register a page."""
-        stream = EventStream()
-        if self._is_over:
-            stream.end()
-        self._streams.add(stream)
+    async def events(self) -> AsyncIterator[bytes]:
+        """The events for one page, until the end."""
+        page: asyncio.Queue[bytes] = asyncio.Queue(maxsize=1)
+        self._pages[page] = True
         self._subscribe()
         self._wake.set()
         try:
-            yield stream
+            while not (self._is_over and page.empty()):
+                yield await page.get()
         finally:
-            self._streams.discard(stream)
+            del self._pages[page]
             self._subscribe()
 
     def state(self) -> dict[str, Any]:
@@ -191,7 +158,7 @@ class StateBroadcaster:
         due_s = time.monotonic()
         while not stop.is_set():
             self.tick()
-            if not self._streams:
+            if not self._pages:
                 await self._rest(stop)
                 due_s = time.monotonic()
                 continue
@@ -208,24 +175,22 @@ class StateBroadcaster:
         now_s = time.monotonic()
         self._reader.drain(now_s)
         news = self._view.news(now_s)
-        streams = [stream for stream in self._streams if is_last or stream.has_taken]
-        if not streams:
+        pages = [page for page in self._pages if is_last or page.empty()]
+        if not pages:
             return
-        for stream in self._streams.difference(streams):
-            stream.needs_all = True
+        self._pages |= dict.fromkeys(self._pages.keys() - pages, True)
         everything = b""
-        if is_last or any(stream.needs_all for stream in streams):
+        if is_last or any(self._pages[page] for page in pages):
             everything = _event("end" if is_last else "all", self._view.everything(now_s))
         payload = _event("news", news)
-        for stream in streams:
-            if is_last:
-                stream.end(everything)
-            else:
-                stream.offer(everything if stream.needs_all else payload)
-                stream.needs_all = False
+        for page in pages:
+            if not page.empty():
+                page.get_nowait()  # the end replaces what was not taken
+            page.put_nowait(everything if is_last or self._pages[page] else payload)
+            self._pages[page] = False
 
     def _subscribe(self) -> None:
-        has_pages = bool(self._streams)
+        has_pages = bool(self._pages)
         self._reader.read_track(has_pages)
         self._reader.read_levels(has_pages or time.monotonic() - self._requested_s < LEVELS_S)
 

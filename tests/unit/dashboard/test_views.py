@@ -49,7 +49,8 @@ def view() -> SurveyView:
 
 
 def mission(**fields: Any) -> MissionStatus:
-    return MissionStatus(**({"seq": 1, "t_s": 1.0, "state": "driving", "total": 18} | fields))
+    known: dict[str, Any] = {"seq": 1, "t_s": 1.0, "state": "driving", "total": 18}
+    return MissionStatus(**(known | fields))
 
 
 def picture(t_s: float = 1.5, nis: float = 2.0, line: bytes = LINE) -> DisplayState:
@@ -196,7 +197,7 @@ def test_other_things_on_the_map(view: SurveyView) -> None:
 
 
 def test_everything_is_the_sum_of_the_news_and_stops_are_the_path_where_nobody_looked(view: SurveyView) -> None:
-    points, path, arrivals = {}, list[Any](), list[Any]()
+    points, path, arrivals = dict[int, Any](), list[Any](), list[Any]()
     for k in range(6):
         view.is_tracking = k == 5
         news = told(view, fix_at(view.points[k], 0.001 * k, t_s=float(k)))
