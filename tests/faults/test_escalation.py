@@ -147,6 +147,12 @@ class Waiting:
     def receive(self) -> tuple[str, EstimateMessage] | None:
         return ("estimate", self.messages.popleft()) if self.messages else None
 
+    def maintain(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
 
 @pytest.mark.fault("P8")
 @pytest.mark.parametrize("seed", range(3))
