@@ -305,11 +305,7 @@ def track_row(seq: int, t_s: float, navigator: Navigator) -> TrackRow:
 
 
 def check_beacon_robot(cfg: RadioConfig, hello: Hello) -> None:
-    """Refuse a robot whose own geometry contradicts the configuration.
-
-    Raises:
-        ConfigError: it is another robot.
-    """
+    """Refuse a robot whose own geometry contradicts the configuration. Raises ConfigError: it is another robot."""
     own, vehicle = hello.robot, hello.robot.vehicle
     if vehicle is None:
         raise ConfigError("robot: it says nothing of its vehicle: this is no robot for missions among beacons")

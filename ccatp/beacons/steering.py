@@ -46,11 +46,7 @@ class Sugeno:
         self._check_gaps()
 
     def evaluate(self, values: Sequence[float]) -> float:
-        """The output.
-
-        Raises:
-            FuzzyGapError: no rule fires.
-        """
+        """The output. Raises FuzzyGapError: no rule fires."""
         grades = [self.memberships(index, value) for index, value in enumerate(values)]
         total = weighted = 0.0
         for conditions, output in self._rules:

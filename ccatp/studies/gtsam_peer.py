@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.slam.batch_odometry import CALIBRATION, Reckoning
+from ccatp.beacons.slam.batch_problem import CALIBRATION, Reckoning
 from ccatp.beacons.slam.batch_smoother import place_by_distances
 from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun
 from ccatp.config.beacon_models import RecordingConfig
@@ -58,7 +58,7 @@ class _Session:
         self._gtsam, self._run, self._settings = gtsam, run, settings
         self._times = np.union1d(run.readings.times_s, run.steps.times_s[:1])
         reckoning = Reckoning(run.steps, self._times, delayed=False)
-        self._increments = reckoning.increments(np.zeros(len(CALIBRATION)), settings.odometry)
+        self._motion, _, self._covariances = reckoning.increments(np.zeros(len(CALIBRATION)), settings.odometry)
         self._at = np.searchsorted(self._times, run.readings.times_s)
         self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._placed: set[int] = set()
@@ -80,8 +80,8 @@ class _Session:
             if k == 0:
                 graph.add(gtsam.PriorFactorPose2(self._x(0), pose, prior))
             else:
-                step = gtsam.Pose2(*self._increments.motion[k - 1])
-                noise = gtsam.noiseModel.Gaussian.Covariance(self._increments.covariance[k - 1])
+                step = gtsam.Pose2(*self._motion[k - 1])
+                noise = gtsam.noiseModel.Gaussian.Covariance(self._covariances[k - 1])
                 graph.add(gtsam.BetweenFactorPose2(self._x(k - 1), self._x(k), step, noise))
                 pose = pose.compose(step)
             values.insert(self._x(k), pose)

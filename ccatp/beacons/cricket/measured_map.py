@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc
 
-from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, bound_rms_m, fit_map, map_rms_m
+from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, MapState, bound_rms_m, fit_map, map_rms_m
 from ccatp.beacons.cricket.mote_map import MoteMap, map_motes, plain_frame
 from ccatp.beacons.cricket.range_network import (
     MappingError,
@@ -93,14 +93,14 @@ def hidden_offset(found: MoteMap, network: RangeNetwork, settings: MapFitSetting
     dof = len(network.ranges_m) - model.size
     if dof <= 0:
         return
-    state = model.state(found.positions_m, 0.0, found.scale)
+    state = model.state(found.positions_m, 0.0, found.fit.state.scale)
     without, shown = fit_map(MapModel(network), state, settings), fit_map(model, state, settings)
     cost, offset_m = shown.cost, shown.state.offset_m
     agreement = agreement_of(shown, network.sigmas_m, dof)
     if found.agreement.is_denied:
         # An offset may have bent the map too far to be seen from there.
         again = map_motes(network, settings, with_offset=True)
-        cost, offset_m, agreement = again.cost, again.offset_m, again.agreement
+        cost, offset_m, agreement = again.fit.cost, again.fit.state.offset_m, again.agreement
     # Where the ranges deny the map even so, any unknown more betters it, and means nothing.
     if without.cost - cost > _TELLING and not agreement.is_denied:
         yield (
@@ -160,11 +160,9 @@ class MeasuredMap(NamedTuple):
 
 
 class _Found(NamedTuple):
-    positions_m: FloatArray
+    state: MapState
     covariance_m2: FloatArray
     network: RangeNetwork
-    offset_m: float
-    scale: float
     iterations: int
     is_trusted: bool
     warnings: tuple[str, ...]
@@ -193,11 +191,13 @@ def map_measured(
     motes = [row for row, name in enumerate(network.names) if name not in file.tags]
     names = tuple(network.names[mote] for mote in motes)
     true_m = None if truth_m is None else _truth(truth_m, names, network.dimension)
-    places, covariance = _framed(found, motes, true_m)
+    places, at = found.state.positions_m[motes], coordinates_of(motes, network.dimension)
+    motion = plain_frame(places) if true_m is None else best_motion(places, true_m, mirrors=True)
+    places, covariance = motion.moved(places), motion.turned_map(found.covariance_m2[np.ix_(at, at)])
     at_found = MapModel(found.network, with_offset=model.with_offset, with_scale=model.with_scale)
     error_m = None if true_m is None else aligned_rms_m(places, true_m, mirrors=True)
-    expected_m = map_rms_m(found.covariance_m2, found.positions_m, motes, aligned=True)
-    bound_m = bound_rms_m(at_found, found.positions_m, motes, aligned=True)
+    expected_m = map_rms_m(found.covariance_m2, found.state.positions_m, motes, aligned=True)
+    bound_m = bound_rms_m(at_found, found.state.positions_m, motes, aligned=True)
     warnings = [
         word
         for option, given in (("--tags", tags_m), ("--truth", truth_m))
@@ -226,8 +226,8 @@ def map_measured(
         "motes": len(motes),
         "frame": "aligned",
         "expected_rms_m": expected_m if is_known else None,
-        "offset_m": None if "offset" in freedom.untold else found.offset_m,
-        "scale": None if "scale" in freedom.untold else 1.0 + found.scale,
+        "offset_m": None if "offset" in freedom.untold else found.state.offset_m,
+        "scale": None if "scale" in freedom.untold else 1.0 + found.state.scale,
         "free_directions": [*freedom.frame, *freedom.flexes, *freedom.calibration],
         "warnings": warnings,
     }
@@ -277,11 +277,9 @@ def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Any) -> _Found:
     warnings += doubts(found, network, factor)
     is_denied = found.agreement.is_denied
     # Of a map that its ranges deny, at least what they miss it by.
-    inflation = float(((found.residuals_m / scaled.sigmas_m) ** 2).sum()) / found.dof if is_denied else 1.0
-    return _Found(
-        found.positions_m, inflation * found.covariance_m2, scaled, found.offset_m, found.scale, found.iterations,
-        not is_denied, tuple(warnings),
-    )  # fmt: skip
+    inflation = float(((found.fit.residuals_m / scaled.sigmas_m) ** 2).sum()) / found.dof if is_denied else 1.0
+    covariance = inflation * found.covariance_m2
+    return _Found(found.fit.state, covariance, scaled, found.iterations, not is_denied, tuple(warnings))
 
 
 def _filter(cfg: CricketConfig, network: RangeNetwork) -> _Found:
@@ -297,7 +295,8 @@ def _filter(cfg: CricketConfig, network: RangeNetwork) -> _Found:
     rows = zip(*(column.tolist() for column in columns), strict=True)
     went = run_phase_two(mapper, rows, 0.0)
     warnings = (f"{went.refused} of {len(went.nis)} ranges were refused by the gate",) if went.refused else ()
-    return _Found(mapper.positions_m, mapper.covariance_m2, network, 0.0, 0.0, len(went.nis), True, warnings)
+    state = MapState(mapper.positions_m, np.zeros((0, network.dimension, network.dimension)))
+    return _Found(state, mapper.covariance_m2, network, len(went.nis), True, warnings)
 
 
 def _phase1_error_m(
@@ -312,14 +311,6 @@ def _phase1_error_m(
     if set(first.unplaced) & set(motes):
         return None
     return aligned_rms_m(first.positions_m[motes], true_m, mirrors=True)
-
-
-def _framed(found: _Found, motes: list[int], true_m: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    d = found.positions_m.shape[1]
-    places = found.positions_m[motes]
-    at = coordinates_of(motes, d)
-    motion = plain_frame(places) if true_m is None else best_motion(places, true_m, mirrors=True)
-    return motion.moved(places), motion.turned_map(found.covariance_m2[np.ix_(at, at)])
 
 
 def _truth(truth_m: Places, names: tuple[str, ...], dimension: int) -> FloatArray:

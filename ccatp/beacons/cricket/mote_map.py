@@ -29,14 +29,9 @@ _CORRECTIONS = 3  # times that the unfolding is repeated with ranges corrected b
 class MoteMap:
     """A map of motes."""
 
-    names: tuple[str, ...]
-    positions_m: FloatArray  # shape (n, d)
+    fit: MapFit
     covariance_m2: FloatArray  # of all coordinates, shape (n d, n d); of the aligned map where nothing pins the frame
-    offset_m: float
-    scale: float
-    cost: float  # of all ranges, in units of chi-squared
     dof: int
-    residuals_m: FloatArray  # measured less computed ranges, shape (m,)
     sigma_m: float  # median of the sigmas in the end
     iterations: int
     agreement: Agreement
@@ -44,9 +39,14 @@ class MoteMap:
     folds: tuple[Fold, ...]
 
     @property
+    def positions_m(self) -> FloatArray:
+        """Shape (n, d)."""
+        return self.fit.state.positions_m
+
+    @property
     def variance_factor(self) -> float:
         """Cost by degree of freedom: 1 where the sigmas are right."""
-        return self.cost / self.dof if self.dof > 0 else 1.0
+        return self.fit.cost / self.dof if self.dof > 0 else 1.0
 
 
 def map_motes(
@@ -120,14 +120,9 @@ def _unfolded_map(
     covariance, free = position_covariance(model, fit)
     dof = len(network.ranges_m) - (model.size - free)
     return MoteMap(
-        names=network.names,
-        positions_m=fit.state.positions_m,
+        fit=fit,
         covariance_m2=covariance,
-        offset_m=fit.state.offset_m,
-        scale=fit.state.scale,
-        cost=fit.cost,
         dof=dof,
-        residuals_m=fit.residuals_m,
         sigma_m=float(np.median(network.sigmas_m)),
         iterations=steps,
         agreement=agreement_of(fit, network.sigmas_m, dof),

@@ -265,11 +265,7 @@ class PairMeans:
         return None if row is None else self.values(row)
 
     def row(self, first: int, second: int) -> int:
-        """Which of the pairs these two are, in either order.
-
-        Raises:
-            MappingError: they have no range.
-        """
+        """Which of the pairs these two are, in either order. Raises MappingError: they have no range."""
         row = self._index.get((min(first, second), max(first, second)))
         if row is None:
             raise MappingError(f"no range between motes {first} and {second}")

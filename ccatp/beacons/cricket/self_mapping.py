@@ -95,11 +95,7 @@ class MoteMapper:
         return float(np.sqrt(np.trace(self._filter.covariance[: self._size, : self._size]) / self._count))
 
     def observe(self, first: int, second: int, range_m: float, sigma_m: float) -> Update:
-        """Condition the map on one distance.
-
-        Raises:
-            MappingError: the motes stand in one place.
-        """
+        """Condition the map on one distance. Raises MappingError: the motes stand in one place."""
         rows = _Rows(self._dimension, self._count, [(first, second)], np.array([range_m]))
         R = np.array([sigma_m**2])
         if self._how.linearisations == 1:

@@ -75,11 +75,7 @@ class Sketch:
         self._seen_m[list(motes)] = places_m
 
     def set_axes(self, origin: int, axis: int) -> None:
-        """Origin and second axis: A (0, 0), B (0, d_AB); in the plane alone.
-
-        Raises:
-            MissingRange: A and B have none.
-        """
+        """Origin and second axis: A (0, 0), B (0, d_AB); in the plane alone. Raises MissingRange: A and B have none."""
         range_m, sigma_m = self._range(origin, axis)
         self.positions_m[origin] = self._seen_m[origin] = 0.0
         self.positions_m[axis] = self._seen_m[axis] = (0.0, range_m)

@@ -40,11 +40,7 @@ class Sheet(NamedTuple):
     rows: list[tuple[int, list[str]]]
 
     def column(self, pattern: re.Pattern[str], what: str) -> int:
-        """The first column whose head matches.
-
-        Raises:
-            RadioDataError: none does.
-        """
+        """The first column whose head matches. Raises RadioDataError: none does."""
         found = next((i for i, cell in enumerate(self.head) if pattern.search(cell)), None)
         if found is None:
             raise RadioDataError(self.path, f"has no column of {what}; its columns are {', '.join(self.head)}", 1)
@@ -314,11 +310,7 @@ class BeaconPositions(NamedTuple):
 
 
 def write_beacons(path: Path, found: BeaconPositions) -> None:
-    """Write a map.
-
-    Raises:
-        RadioDataError: the file cannot be written.
-    """
+    """Write a map. Raises RadioDataError: the file cannot be written."""
     sigmas_m = np.sqrt(np.maximum(found.covariance_m2.diagonal(), 0.0)).reshape(found.positions_m.shape)
     rows = zip(found.names, found.positions_m.tolist(), sigmas_m.tolist(), strict=True)
     beacons = {name: {"position_m": place_m, "sigma_m": sigma_m} for name, place_m, sigma_m in rows}
@@ -331,11 +323,7 @@ def write_beacons(path: Path, found: BeaconPositions) -> None:
 
 
 def read_beacons(path: Path) -> BeaconPositions:
-    """Read a map that ``write_beacons`` wrote.
-
-    Raises:
-        RadioDataError: it cannot be read, or it is no such map.
-    """
+    """Read a map that ``write_beacons`` wrote. Raises RadioDataError: it cannot be read, or it is no such map."""
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

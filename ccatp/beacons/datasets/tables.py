@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from ccatp.beacons.slam.recording import BoolArray
 from ccatp.core import FloatArray, IntArray
 from ccatp.errors import CcatpError, ExitStatus
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 class RadioDataError(CcatpError):
@@ -146,11 +144,7 @@ class Table(NamedTuple):
         return self._replace(values=values)
 
     def check_steps(self, what: str) -> None:
-        """Refuse odometry of fewer than three rows.
-
-        Raises:
-            RadioDataError: there are fewer.
-        """
+        """Refuse odometry of fewer than three rows. Raises RadioDataError: there are fewer."""
         if len(self.values) < 3:
             raise RadioDataError(self.file, f"{len(self.values)} {what}: too few for a run")
 

@@ -1,21 +1,157 @@
 """The smoother of recorded runs: path, beacons and calibration that fit all odometry and all readings best.
 
-It starts from ever longer beginnings of the run, which beacons join as they can be placed.
+Levenberg-Marquardt with noise by Student's t; Cholesky of the arrow-shaped system. It starts from ever longer
+beginnings of the run, which beacons join as they can be placed.
 """
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular
 
-from ccatp.beacons.slam.batch_odometry import CALIBRATION, Reckoning, carried_on, chained
-from ccatp.beacons.slam.batch_problem import BEACON, BEARING_OFFSET, SHARED, BatchProblem, BatchState
-from ccatp.beacons.slam.batch_solver import Descent, Factored, descend, t_weights
+from ccatp.beacons.slam.batch_problem import (
+    BEACON,
+    BEARING_OFFSET,
+    CALIBRATION,
+    SHARED,
+    ArrowSystem,
+    BatchProblem,
+    BatchState,
+    Reckoning,
+    carried_on,
+    chained,
+)
 from ccatp.beacons.slam.causal import beyond_priors
-from ccatp.beacons.slam.recording import BeaconFix, Calibrated, EstimatedPath, RecordedRun
+from ccatp.beacons.slam.recording import BeaconFix, BoolArray, Calibrated, EstimatedPath, RecordedRun
 from ccatp.config.beacon_models import RadioNoiseConfig, RecordingConfig
-from ccatp.core import FloatArray
+from ccatp.core import FloatArray, IntArray
+
+BLOCK = 3  # x_m, y_m, heading_rad
+BAND = 2 * BLOCK - 1
+LEAST_DAMPING = 1e-9
+MOST_DAMPING = 1e9
+CONVERGED = 1e-5  # relative gain below which a cost has converged
+
+
+class Factored:
+    """Cholesky factors of an arrow system: A by bands, then the Schur complement S = C - B^T A^-1 B.
+
+    Args:
+        damping: the diagonal is multiplied by 1 + damping (Levenberg and Marquardt).
+
+    Raises:
+        LinAlgError: not positive definite.
+    """
+
+    def __init__(self, system: ArrowSystem, damping: float = 0.0) -> None:
+        self.system = system
+        n, m = len(system.diagonal), len(system.corner)
+        band = _banded(system, damping)
+        self._factor = cholesky_banded(band, lower=True, check_finite=False)
+        right = np.concatenate([system.border.reshape(n * BLOCK, m), system.pose_side.reshape(-1, 1)], axis=1)
+        solved = np.asarray(cho_solve_banded((self._factor, True), right, check_finite=False))
+        self._border_solved, self._pose_solved = solved[:, :m], solved[:, m]
+        corner = system.corner + damping * np.diag(np.diag(system.corner))
+        S = corner - system.border.reshape(n * BLOCK, m).T @ self._border_solved
+        self._schur = cho_factor(0.5 * (S + S.T), lower=True, check_finite=False)
+
+    def solution(self) -> tuple[FloatArray, FloatArray]:
+        """Unknowns of the poses (n, 3) and the shared ones (m,)."""
+        system = self.system
+        n, m = len(system.diagonal), len(system.corner)
+        side = system.shared_side - system.border.reshape(n * BLOCK, m).T @ self._pose_solved
+        shared = cho_solve(self._schur, side, check_finite=False)
+        return (self._pose_solved - self._border_solved @ shared).reshape(n, BLOCK), shared
+
+    def shared_covariance(self) -> FloatArray:
+        """Inverse's block of the shared unknowns, shape (m, m)."""
+        return np.asarray(cho_solve(self._schur, np.eye(len(self.system.corner)), check_finite=False))
+
+    def pose_covariances(self) -> FloatArray:
+        """Inverse's diagonal block of each pose, shape (n, 3, 3): (A^-1)_kk + W_k W_k^T, W = A^-1 B chol(S)^-T."""
+        n, m = len(self.system.diagonal), len(self.system.corner)
+        root = np.tril(self._schur[0])
+        W = solve_triangular(root, self._border_solved.T, lower=True, check_finite=False).T.reshape(n, BLOCK, m)
+        return np.asarray(_diagonal_of_inverse(self.system) + W @ W.transpose(0, 2, 1))
+
+
+def _banded(system: ArrowSystem, damping: float) -> FloatArray:
+    n = len(system.diagonal)
+    band = np.zeros((BAND + 1, n, BLOCK))
+    for column in range(BLOCK):
+        for row in range(column, BLOCK):
+            band[row - column, :, column] = system.diagonal[:, row, column]
+        band[0, :, column] *= 1.0 + damping
+        for row in range(BLOCK):
+            band[BLOCK + row - column, :-1, column] = system.below[:, row, column]
+    return band.reshape(BAND + 1, n * BLOCK)
+
+
+def _diagonal_of_inverse(system: ArrowSystem) -> FloatArray:
+    A, below = system.diagonal, system.below
+    n = len(A)
+    left, right = A.copy(), A.copy()
+    for k in range(1, n):
+        left[k] -= below[k - 1] @ np.linalg.solve(left[k - 1], below[k - 1].T)
+    for k in range(n - 2, -1, -1):
+        right[k] -= below[k].T @ np.linalg.solve(right[k + 1], below[k])
+    return np.asarray(np.linalg.inv(left + right - A))
+
+
+def t_weights(chi2: FloatArray, sizes: FloatArray, freedom: float, softness: FloatArray | float = 1.0) -> FloatArray:
+    """Weight of each reading: (nu + p) / (nu + chi2 / softness), the M-estimator of Student's t with p components.
+
+    A softness above one forgives large residuals: it is how a start far off is not mistaken for outliers.
+    """
+    weights: FloatArray = (freedom + sizes) / (freedom + chi2 / softness)
+    return weights
+
+
+def t_cost(chi2: FloatArray, sizes: FloatArray, freedom: float, softness: FloatArray | float = 1.0) -> float:
+    """Negative log likelihood of Student's t without its constants, with the weights above as its gradient's."""
+    return float((0.5 * (freedom + sizes) * softness * np.log1p(chi2 / (freedom * softness))).sum())
+
+
+def descend(
+    problem: BatchProblem,
+    state: BatchState,
+    most: int,
+    softness: FloatArray | float = 1.0,
+    enough: float = CONVERGED,
+) -> tuple[BatchState, bool]:
+    """Minimise the negative log posterior, with the softness of each reading's law (m,); whether that converged."""
+    damping = 1e-6
+
+    def cost_of(tried: BatchState) -> float:
+        r = problem.residuals(tried)
+        readings = t_cost(r.chi2, problem.sizes, problem.radio.freedom, softness)
+        steps = np.einsum("ki,kij,kj->k", r.odometry, r.odometry_information, r.odometry)
+        return problem.prior_cost(tried) + 0.5 * float(steps.sum()) + readings
+
+    residuals, cost = problem.residuals(state), cost_of(state)
+    for _ in range(most):
+        weights = t_weights(residuals.chi2, problem.sizes, problem.radio.freedom, softness)
+        system = problem.normal_equations(state, weights)
+        while (tried := _step(problem, state, system, damping)) is None or cost_of(tried) > cost:
+            damping = max(damping, LEAST_DAMPING) * 10.0
+            if damping > MOST_DAMPING:
+                return state, True
+        gain, state = cost - cost_of(tried), tried
+        residuals, cost = problem.residuals(state), cost - gain
+        damping = max(damping * 0.1, LEAST_DAMPING)
+        if gain <= enough * max(abs(cost), 1.0):
+            return state, True
+    return state, False
+
+
+def _step(problem: BatchProblem, state: BatchState, system: ArrowSystem, damping: float) -> BatchState | None:
+    try:
+        poses, shared = Factored(system, damping).solution()
+    except LinAlgError:
+        return None  # not positive definite
+    return state.moved(poses, problem.spread(shared))
+
 
 STARTS = 48  # directions, around the place of a range's reading, from which a beacon is sought
 PLACING_ITERATIONS = 20
@@ -49,22 +185,6 @@ class Placement(NamedTuple):
     y_m: float
     margin: float  # by how much the next best place costs more (half a chi-squared); infinite if there is none
     spread: float  # largest standard deviation over the distance of the nearest reading
-
-
-def place_by_bearings(
-    poses: FloatArray, distance_m: FloatArray, bearing_rad: FloatArray, shared: FloatArray
-) -> tuple[float, float]:
-    """Median of the places that distances with bearings point at.
-
-    Args:
-        poses: of the readings, shape (m, 3).
-        distance_m: to one beacon, shape (m,).
-        bearing_rad: of the same readings, shape (m,).
-        shared: calibration by ``problem.SHARED``.
-    """
-    way = poses[:, 2] + bearing_rad - shared[BEARING_OFFSET]
-    x, y = poses[:, 0] + distance_m * np.cos(way), poses[:, 1] + distance_m * np.sin(way)
-    return float(np.median(x)), float(np.median(y))
 
 
 def place_by_distances(poses: FloatArray, distance_m: FloatArray, variance: FloatArray) -> Placement:
@@ -114,8 +234,8 @@ class Start(NamedTuple):
     """Where the smoother begins."""
 
     state: BatchState
-    used: npt.NDArray[np.bool_]  # which beacons have been placed, shape (b,)
-    doubtful: npt.NDArray[np.bool_]  # those whose mirror image fits nearly as well, shape (b,)
+    used: BoolArray  # which beacons have been placed, shape (b,)
+    doubtful: BoolArray  # those whose mirror image fits nearly as well, shape (b,)
 
 
 def grown(run: RecordedRun, times_s: FloatArray, settings: RecordingConfig) -> Start:
@@ -133,7 +253,7 @@ def grown(run: RecordedRun, times_s: FloatArray, settings: RecordingConfig) -> S
     while known < n:
         n_now = min(n, max(FIRST, int(known * GROWTH) + 1))
         now = readings.where(at < n_now)
-        motion = whole.increments(state.shared[: len(CALIBRATION)], settings.odometry).motion[known - 1 : n_now - 1]
+        motion = whole.increments(state.shared[: len(CALIBRATION)], settings.odometry)[0][known - 1 : n_now - 1]
         state = BatchState(
             np.concatenate([state.poses[:-1], chained(state.poses[-1], motion)]), state.shared, state.beacons
         )
@@ -159,15 +279,15 @@ def _settled(problem: BatchProblem, state: BatchState, known: int) -> BatchState
             softness[new] = max(1.0, float(np.median(chi2[counted] / problem.sizes[counted])))
             if softness[new].max(initial=1.0) < 4.0:
                 continue
-        state = descend(problem, state, GROWING_ITERATIONS, softness, enough=ROUGHLY).state
+        state, _ = descend(problem, state, GROWING_ITERATIONS, softness, enough=ROUGHLY)
     return state
 
 
 def _join(
     problem: BatchProblem,
     state: BatchState,
-    used: npt.NDArray[np.bool_],
-    doubtful: npt.NDArray[np.bool_],
+    used: BoolArray,
+    doubtful: BoolArray,
     *,
     last: bool,
 ) -> bool:
@@ -181,7 +301,9 @@ def _join(
             if not used[beacon]:
                 poses, bearing = state.poses[problem.at[pointed]], readings.bearing_rad[pointed]
                 distance, _ = problem.distances(state, pointed)
-                state.beacons[beacon, :2] = place_by_bearings(poses, distance, bearing, state.shared)
+                way = poses[:, 2] + bearing - state.shared[BEARING_OFFSET]
+                pointed_at = poses[:, 0] + distance * np.cos(way), poses[:, 1] + distance * np.sin(way)
+                state.beacons[beacon, :2] = np.median(pointed_at[0]), np.median(pointed_at[1])
                 used[beacon] = changed = True
             continue
         # one that is surely placed is looked at again at the end, by all readings
@@ -213,25 +335,50 @@ def smooth(run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], fl
     begin_s, first_radio = clock_s(), settings.radio
     heard_s = np.union1d(run.readings.times_s, run.steps.times_s[:1])
     start = grown(run, heard_s, settings)
-    times_s = instants(run)
+    steps_s = run.steps.times_s  # there is a pose at each reading, and at an odometry step now and then between them
+    _, first = np.unique(np.floor((steps_s - steps_s[0]) / SPACING_S), return_index=True)
+    times_s = np.union1d(run.readings.times_s, steps_s[first])
     problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used)
     filled = _filled(problem, _anchored(start.state, run.first_pose), np.searchsorted(times_s, heard_s))
-    found = descend(problem, filled, ITERATIONS)
+    state, converged = descend(problem, filled, ITERATIONS)
     for _ in range(WIDENINGS):
-        radio = _widened(problem, found.state)
+        radio = _widened(problem, state)
         if radio == problem.radio:
             break
         settings = settings.model_copy(update={"radio": radio})
         problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used)
-        found = descend(problem, found.state, ITERATIONS)
-    return _track(run, problem, times_s, found, start, first_radio, clock_s() - begin_s)
-
-
-def instants(run: RecordedRun) -> FloatArray:
-    """Times of the poses: of all readings, and of an odometry step now and then between them, s."""
-    steps_s = run.steps.times_s
-    _, first = np.unique(np.floor((steps_s - steps_s[0]) / SPACING_S), return_index=True)
-    return np.union1d(run.readings.times_s, steps_s[first])
+        state, converged = descend(problem, state, ITERATIONS)
+    took_s = clock_s() - begin_s
+    weights = t_weights(problem.residuals(state).chi2, problem.sizes, problem.radio.freedom)
+    factored = Factored(problem.normal_equations(state, weights))
+    size = problem.free.size
+    covariance = np.zeros((size, size))
+    covariance[np.ix_(problem.free, problem.free)] = factored.shared_covariance()
+    counted = problem.sizes > 0
+    updates = int(counted.sum())
+    beacons = {}
+    for k in np.flatnonzero(start.used).tolist():
+        place = slice(len(SHARED) + BEACON * k, len(SHARED) + BEACON * k + 2)
+        x_m, y_m = state.beacons[k, :2].tolist()
+        beacons[run.beacon_ids[k]] = BeaconFix(x_m, y_m, covariance[place, place])
+    calibration = _calibration(problem, state, np.sqrt(np.diag(covariance)))
+    priors = {SHOWN_AS.get(name, name): getattr(problem.priors, name) for name in SHARED}
+    warnings = [*_warnings(run, start, converged), *beyond_priors(calibration, priors, run.kind)]
+    for what, name in (("range", "range_sigma_m"), ("bearing", "bearing_sigma_rad"), ("rssi", "rssi_sigma_db")):
+        if (ratio := getattr(problem.radio, name) / getattr(first_radio, name)) > NOISY:
+            much = f"{ratio:.1f} times as noisy as assumed"
+            warnings.append(f"{what} readings are {much}: beacons exchanged or moved on the way?")
+    return EstimatedPath(
+        times_s=times_s,
+        poses=state.poses,
+        covariances=factored.pose_covariances(),
+        beacons=beacons,
+        calibration=calibration,
+        refused=int((weights[counted] < LITTLE).sum()),
+        update_s=np.array([took_s / max(updates, 1)]),
+        updates=updates,
+        warnings=tuple(warnings),
+    )
 
 
 def _anchored(state: BatchState, first_pose: tuple[float, float, float]) -> BatchState:
@@ -248,8 +395,8 @@ def _anchored(state: BatchState, first_pose: tuple[float, float, float]) -> Batc
     return BatchState(poses, state.shared, np.column_stack([moved(state.beacons), state.beacons[:, 2:]]))
 
 
-def _filled(problem: BatchProblem, state: BatchState, known: npt.NDArray[np.int64]) -> BatchState:
-    motion = problem.reckoning.increments(state.shared[: len(CALIBRATION)], problem.odometry).motion
+def _filled(problem: BatchProblem, state: BatchState, known: IntArray) -> BatchState:
+    motion = problem.reckoning.increments(state.shared[: len(CALIBRATION)], problem.odometry)[0]
     poses = np.empty((len(motion) + 1, 3))
     poses[known] = state.poses
     is_known = np.zeros(len(poses), dtype=bool)
@@ -277,48 +424,6 @@ def _widened(problem: BatchProblem, state: BatchState) -> RadioNoiseConfig:
         "rssi_sigma_db": radio.rssi_sigma_db * by_rssi,
     }
     return radio.model_copy(update=wider)
-
-
-def _track(
-    run: RecordedRun, problem: BatchProblem, times_s: FloatArray, found: Descent, start: Start,
-    first_radio: RadioNoiseConfig, took_s: float,
-) -> EstimatedPath:  # fmt: skip
-    state = found.state
-    weights = t_weights(problem.residuals(state).chi2, problem.sizes, problem.radio.freedom)
-    factored = Factored(problem.normal_equations(state, weights))
-    size = problem.free.size
-    covariance = np.zeros((size, size))
-    covariance[np.ix_(problem.free, problem.free)] = factored.shared_covariance()
-    counted = problem.sizes > 0
-    updates = int(counted.sum())
-    beacons = {}
-    for k in np.flatnonzero(start.used).tolist():
-        place = slice(len(SHARED) + BEACON * k, len(SHARED) + BEACON * k + 2)
-        x_m, y_m = state.beacons[k, :2].tolist()
-        beacons[run.beacon_ids[k]] = BeaconFix(x_m, y_m, covariance[place, place])
-    calibration = _calibration(problem, state, np.sqrt(np.diag(covariance)))
-    priors = {SHOWN_AS.get(name, name): getattr(problem.priors, name) for name in SHARED}
-    names = {"range": "range_sigma_m", "bearing": "bearing_sigma_rad", "rssi": "rssi_sigma_db"}
-    ratios = {what: getattr(problem.radio, name) / getattr(first_radio, name) for what, name in names.items()}
-    return EstimatedPath(
-        times_s=times_s,
-        poses=state.poses,
-        covariances=factored.pose_covariances(),
-        beacons=beacons,
-        calibration=calibration,
-        refused=int((weights[counted] < LITTLE).sum()),
-        update_s=np.array([took_s / max(updates, 1)]),
-        updates=updates,
-        warnings=(
-            *_warnings(run, start, found.converged),
-            *beyond_priors(calibration, priors, run.kind),
-            *(
-                f"{what} readings are {ratio:.1f} times as noisy as assumed: beacons exchanged or moved on the way?"
-                for what, ratio in ratios.items()
-                if ratio > NOISY
-            ),
-        ),
-    )
 
 
 def _calibration(problem: BatchProblem, state: BatchState, sigmas: FloatArray) -> dict[str, Calibrated]:

@@ -9,7 +9,7 @@ from scipy.linalg.blas import daxpy, dger
 from ccatp.beacons.slam.motion import POSE
 from ccatp.beacons.slam.recording import BeaconId
 from ccatp.core import FloatArray
-from ccatp.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
+from ccatp.filters.ekf_slam import Columns, EkfSlam, columns_of
 
 
 class NoiseLevel:
@@ -61,14 +61,7 @@ class GaussMarkovBias:
 
 
 _NONE = np.empty(0, dtype=np.intp)
-
-
 WANDER = "wander"  # first part of the name of a block that holds a wandering error
-
-
-def is_place(block: BlockId) -> bool:
-    """Whether a block of the state begins with x_m and y_m."""
-    return not (isinstance(block, tuple) and block[0] == WANDER)
 
 
 @dataclass(slots=True)
@@ -104,11 +97,7 @@ class BeaconMap(dict[BeaconId, MapEntry]):
         return self[beacon]
 
     def leave(self, beacon: BeaconId) -> None:
-        """Forget a beacon.
-
-        Raises:
-            BlockError: it is not on the map.
-        """
+        """Forget a beacon. Raises BlockError: it is not on the map."""
         self._engine.remove(beacon)
         if (WANDER, beacon) in self._engine:
             self._engine.remove((WANDER, beacon))
@@ -191,7 +180,9 @@ class HeadingTransport:
     def _look(self, P: FloatArray) -> None:
         engine = self._engine
         self._seen = P
-        x = np.array([0, *(engine.block(block).start for block in engine.blocks if is_place(block))])
+        # All blocks but those of wandering errors begin with x_m and y_m.
+        places = [block for block in engine.blocks if not (isinstance(block, tuple) and block[0] == WANDER)]
+        x = np.array([0, *(engine.block(block).start for block in places)])
         self._partner, self._sign = np.zeros(engine.size, dtype=np.intp), np.zeros(engine.size)
         self._partner[x], self._sign[x] = x + 1, 1.0  # of the old less the new
         self._partner[x + 1], self._sign[x + 1] = x, -1.0

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
 from itertools import pairwise
 from math import inf, pi, sqrt
 
@@ -28,11 +27,6 @@ from ccatp.core import FloatArray
 FAR = 3.0  # standard deviations of the prior beyond which a value is reported
 UNCHANGED = 0.999  # of the prior's standard deviation: what is left of it without readings of it
 KEYS = {"odometry_delay_s": "delay_s"}  # keys under ``priors`` that are called otherwise than the quantity
-
-
-def learned(calibration: Mapping[str, Calibrated], priors: Mapping[str, float]) -> dict[str, Calibrated]:
-    """Those that the readings have determined in part; a prior is no result."""
-    return {name: found for name, found in calibration.items() if found.sigma < UNCHANGED * priors[name]}
 
 
 def beyond_priors(calibration: Mapping[str, Calibrated], priors: Mapping[str, float], kind: str) -> Iterator[str]:
@@ -130,67 +124,54 @@ def filter_run(
     increments, readings = _increments(run.steps, times), list(_readings(run))
     ends = np.searchsorted([reading.time_s for reading in readings], times, side="right").tolist()
     poses, covariances = np.empty((len(times), 3)), np.empty((len(times), 3, 3))
-    statistics = _Statistics()
+    predict_s, update_s, scalar_s = list[float](), list[float](), list[float]()
+    accepted: list[BeaconInnovation] = []
+    refused = 0
     for k, (begin, end) in enumerate(pairwise((0, *ends))):
         begin_s = clock_s()
         if k:
             search.predict(increments[k - 1])
         predicted_s = clock_s()
-        statistics.predict_s.append(predicted_s - begin_s)
+        predict_s.append(predicted_s - begin_s)
         if now := readings[begin:end]:
             taken = search.observe(now)
             end_s = clock_s()
-            statistics.observed(taken, len(now), end_s - begin_s, end_s - predicted_s)
+            update_s += [(end_s - begin_s) / len(now)] * len(now)
+            if len(taken) == len(now):  # nothing that waits or joins: updates alone
+                scalars = sum(one.size for one in taken)
+                scalar_s += [(end_s - predicted_s) / scalars] * scalars
+            used = [one for one in taken if one.accepted]
+            refused += len(taken) - len(used)
+            accepted += used
         poses[k], covariances[k] = search.best.pose, search.best.pose_covariance
     slam = search.best
-    nis, sizes = np.array(statistics.nis), np.array(statistics.sizes, dtype=np.float64)
+    nis, sizes = np.array([one.nis for one in accepted]), np.array([float(one.size) for one in accepted])
     priors = dict(zip(slam.calibration, slam.prior_sigmas, strict=True))
-    calibration = learned({name: Calibrated(*found) for name, found in slam.calibration.items()}, priors)
+    # Those that the readings have determined in part; a prior is no result.
+    calibration = {
+        name: Calibrated(*found) for name, found in slam.calibration.items() if found[1] < UNCHANGED * priors[name]
+    }
+    beacons = slam.beacons.items()
     return EstimatedPath(
         times_s=times,
         poses=poses,
         covariances=covariances,
-        beacons={
-            str(b): BeaconFix(float(e.mean[0]), float(e.mean[1]), e.covariance[:2, :2]) for b, e in slam.beacons.items()
-        },
+        beacons={str(b): BeaconFix(float(e.mean[0]), float(e.mean[1]), e.covariance[:2, :2]) for b, e in beacons},
         calibration=calibration,
         nis=nis,
         nis_sizes=sizes,
-        refused=statistics.refused,
-        update_s=np.array(statistics.update_s),
-        predict_s=np.array(statistics.predict_s[1:]),
-        scalar_s=np.array(statistics.scalar_s),
-        updates=len(statistics.nis),
+        refused=refused,
+        update_s=np.array(update_s),
+        predict_s=np.array(predict_s[1:]),
+        scalar_s=np.array(scalar_s),
+        updates=len(accepted),
         warnings=(
-            *_unplaced(run, slam),
-            *beyond_priors(calibration, priors, run.kind),
-            *_warnings(slam, nis, sizes, statistics.refused),
+            *_unplaced(run, slam), *beyond_priors(calibration, priors, run.kind), *_doubts(slam, nis, sizes, refused)
         ),
-    )
+    )  # fmt: skip
 
 
-@dataclass(slots=True)
-class _Statistics:
-    nis: list[float] = field(default_factory=list)
-    sizes: list[int] = field(default_factory=list)
-    refused: int = 0
-    predict_s: list[float] = field(default_factory=list)
-    update_s: list[float] = field(default_factory=list)
-    scalar_s: list[float] = field(default_factory=list)
-
-    def observed(self, learned: Sequence[BeaconInnovation], count: int, whole_s: float, update_s: float) -> None:
-        """``count`` readings of a moment were put into the filter."""
-        self.update_s += [whole_s / count] * count
-        if len(learned) == count:  # nothing that waits or joins: updates alone
-            scalars = sum(one.size for one in learned)
-            self.scalar_s += [update_s / scalars] * scalars
-        accepted = [one for one in learned if one.accepted]
-        self.refused += len(learned) - len(accepted)
-        self.nis += [one.nis for one in accepted]
-        self.sizes += [one.size for one in accepted]
-
-
-def _warnings(slam: BeaconSlam, nis: FloatArray, sizes: FloatArray, refused: int) -> Iterator[str]:
+def _doubts(slam: BeaconSlam, nis: FloatArray, sizes: FloatArray, refused: int) -> Iterator[str]:
     for beacon in dict.fromkeys(beacon for beacon, _ in slam.moved):
         times = ", ".join(f"{time_s:.1f}" for name, time_s in slam.moved if name == beacon)
         yield f"beacon {beacon} was placed anew at {times} s: was it moved, or exchanged for another?"

@@ -1,4 +1,4 @@
-"""How beacons join the map: at once by range and bearing; without a bearing their readings wait until they suffice."""
+"""Readings of a beacon without a bearing wait until they suffice to place it; derivatives at a reading's time."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -8,11 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.slam.beacon_map import BeaconMap, NoiseLevel
-from ccatp.beacons.slam.measurement_models import MeasurementModels, MeasurementRow, kind_of, strength_of
-from ccatp.beacons.slam.motion import POSE, CarriedOdometry, DeadReckoning
+from ccatp.beacons.slam.measurement_models import MeasurementRow, strength_of
+from ccatp.beacons.slam.motion import CarriedOdometry
 from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
-from ccatp.core import FloatArray, wrap_pi
+from ccatp.core import FloatArray
 from ccatp.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
 
 RowOf = Callable[[Reading, list[float], list[float], list[float]], MeasurementRow]
@@ -200,7 +199,7 @@ class _Problem(NamedTuple):
         b, W, stride = prior.mean.copy(), np.linalg.inv(prior.covariance), 0.5 * self.reach_m
         variances, A, cost = self.z, W, inf
         for k in range(ITERATIONS):
-            H, G, e, R = _stacked(
+            H, G, e, R = stacked_rows(
                 self.readings, self.z.tolist(), self.places, self.calibration, b.tolist(), self.row_of
             )
             spread = H.dot(self.P).dot(H.T)
@@ -219,7 +218,7 @@ class _Problem(NamedTuple):
         return Candidate(b, np.linalg.inv(A), cost, variances)
 
 
-def _stacked(
+def stacked_rows(
     readings: Sequence[Reading], z: Sequence[float], places: Sequence[list[float]], calibration: list[float],
     beacon: list[float], row_of: RowOf,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
@@ -264,123 +263,3 @@ def derivatives(row: MeasurementRow, at: CarriedOdometry, *, delayed: bool) -> l
     if delayed:  # the heading turns at ``turn``, too
         found.append(-hx * vx - hy * vy - turn * (turned + by_heading))
     return found
-
-
-@dataclass(slots=True)
-class LandmarkInitializer:
-    """With a bearing a beacon joins at once, where range and bearing say; without one its readings wait.
-
-    One that joined at once is on trial: if one of its next ``TRIAL`` readings is refused, it begins again with that
-    one.
-
-    Attributes:
-        waiting: beacons that are not on the map, with their readings and the candidates for their places.
-    """
-
-    engine: EkfSlam
-    sensors: MeasurementModels
-    beacons: BeaconMap
-    clock: DeadReckoning
-    levels: dict[str, NoiseLevel]
-    shared: slice
-    delay: int  # column of the odometry's delay; -1: none
-    waiting: dict[BeaconId, PendingLandmark] = field(default_factory=dict)
-
-    def forget(self, beacon: BeaconId) -> bool:
-        """Forget what waits of a beacon; False if nothing does."""
-        waiting = self.waiting.pop(beacon, None)
-        if waiting is None:
-            return False
-        waiting.drop(self.engine)
-        self.beacons.renumber()
-        return True
-
-    def carried(self, x: FloatArray, reading: Reading) -> CarriedOdometry:
-        """The pose of a state x (n,) at a reading's time."""
-        delay_s = float(x[self.delay]) if self.delay >= 0 else 0.0
-        return self.clock.at(x[:POSE].tolist(), reading.time_s, delay_s)
-
-    def add(self, reading: Reading) -> None:
-        """A reading of a beacon that is not on the map."""
-        reach_m = self.sensors.distance_m(reading)
-        at = self.carried(self.engine.mean, reading)
-        if reading.bearing_rad is not None:
-            way = at.pose[2] + reading.bearing_rad
-            x_m, y_m = at.pose[0] + reach_m * cos(way), at.pose[1] + reach_m * sin(way)
-            entry = self.beacons.join(reading.beacon, *self._prior(reading, reach_m, x_m, y_m))
-            entry.on_trial = TRIAL
-            self._settle(reading, reading.bearing_rad)
-            return
-        waiting = self.waiting.setdefault(reading.beacon, PendingLandmark(reading.beacon))
-        is_kept = waiting.take(self.engine, reading, np.array(at.pose[:2]), self._by_state(at), reach_m)
-        if is_kept and len(waiting.records) >= LEAST:
-
-            def prior_at(x_m: float, y_m: float) -> BeaconEstimate:
-                return self._prior(reading, reach_m, x_m, y_m)
-
-            waiting.look(self.engine, self._row_of, self.shared, prior_at, reach_m)
-            self._join_waiting(reading, waiting, reach_m)
-        self.beacons.renumber()
-
-    def _join_waiting(self, reading: Reading, waiting: PendingLandmark, reach_m: float) -> None:
-        """Condition the beacon, the places of its readings, the calibration and all else on them, iterated."""
-        engine, shared, found = self.engine, self.shared, waiting.found(self.engine)
-        if found is None:
-            return
-        prior = self._prior(reading, reach_m, *found.mean[:2].tolist())
-        prior.mean[:2] = found.mean[:2]
-        self.beacons.join(reading.beacon, *prior)
-        block = engine.block(reading.beacon)
-        places = [engine.block(record.place) for record in waiting.records]
-        readings = [record.reading for record in waiting.records]
-        z = [strength_of(one) for one in readings]
-
-        def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-            at = [x[place].tolist() for place in places]
-            H, G, residual, _ = _stacked(readings, z, at, x[shared].tolist(), x[block].tolist(), self._row_of)
-            return residual, np.hstack([H, G])
-
-        engine.update_iterated(columns_of(*places, shared, block), linearise, found.variances, LINEARISATIONS)
-        waiting.drop(engine)
-        del self.waiting[reading.beacon]
-
-    def _settle(self, reading: Reading, bearing_rad: float) -> None:
-        # Condition a beacon that has just joined at range and bearing on them.
-        engine, shared = self.engine, self.shared
-        block = engine.block(reading.beacon)
-
-        def rows_at(x: FloatArray) -> tuple[CarriedOdometry, MeasurementRow, MeasurementRow]:
-            at, beacon = self.carried(x, reading), x[block].tolist()
-            row = self._row_of(reading, at.pose, x[shared].tolist(), beacon)
-            return at, row, self.sensors.bearing(at.pose, beacon)
-
-        def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-            at, *rows = rows_at(x)
-            residual = strength_of(reading) - rows[0].expected, wrap_pi(bearing_rad - rows[1].expected)
-            H = [[*derivatives(row, at, delayed=self.delay >= 0), *row.beacon] for row in rows]
-            return np.array(residual), np.array(H)
-
-        _, row, bearing = rows_at(engine.mean)
-        R = np.array((row.variance, bearing.variance * self.levels["bearing"].factor))
-        engine.update_iterated(columns_of(slice(0, POSE), shared, block), linearise, R, LINEARISATIONS)
-
-    def _row_of(
-        self, reading: Reading, pose: list[float], calibration: list[float], beacon: list[float]
-    ) -> MeasurementRow:
-        row = self.sensors.row(reading, pose, calibration[: len(self.sensors.names)], beacon)
-        return row._replace(variance=row.variance * self.levels[kind_of(reading)].factor)
-
-    def _prior(self, reading: Reading, reach_m: float, x_m: float, y_m: float) -> BeaconEstimate:
-        extra = self.sensors.extra_prior(reading)
-        sigmas = (FLAT * reach_m, FLAT * reach_m, *(sigma for _, sigma in extra))
-        return BeaconEstimate(np.array((x_m, y_m, *(mean for mean, _ in extra))), np.diag(np.square(sigmas)))
-
-    def _by_state(self, at: CarriedOdometry) -> tuple[Columns, FloatArray]:
-        """Columns (k,) of the state that a carried place depends on, and its derivatives, shape (2, k)."""
-        (x_heading, y_heading), by = at.by_heading(), at.by_delay()
-        columns, J = [0, 1, 2], [[1.0, 0.0, x_heading], [0.0, 1.0, y_heading]]
-        if self.delay >= 0:
-            columns.append(self.delay)
-            J[0].append(by[0])
-            J[1].append(by[1])
-        return columns_of(columns), np.array(J)

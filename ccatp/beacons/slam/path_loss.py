@@ -22,11 +22,7 @@ class PathLoss:
     sigma_db: float  # sigma
 
     def level_dbm(self, range_m: float) -> float:
-        """Expected level at a distance.
-
-        Raises:
-            ValueError: the distance is not positive.
-        """
+        """Expected level at a distance. Raises ValueError: the distance is not positive."""
         if range_m <= 0.0:
             raise ValueError(f"range of {range_m} m has no level; it must be positive")
         return self.reference_dbm - 10.0 * self.exponent * log10(range_m)

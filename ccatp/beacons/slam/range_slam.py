@@ -1,7 +1,7 @@
 """EKF-SLAM over readings: a vehicle among beacons places them on a map while it finds itself on it."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from math import log, sqrt
+from math import cos, log, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -14,13 +14,29 @@ from ccatp.beacons.slam.beacon_map import (
     MapEntry,
     NoiseLevel,
 )
-from ccatp.beacons.slam.landmark_init import LandmarkInitializer, derivatives
-from ccatp.beacons.slam.measurement_models import MeasurementModels, is_direction, kind_of, strength_of
-from ccatp.beacons.slam.motion import POSE, DeadReckoning, DifferentialDrive, Increment, VehiclePose, estimated
+from ccatp.beacons.slam.landmark_init import (
+    FLAT,
+    LEAST,
+    LINEARISATIONS,
+    TRIAL,
+    PendingLandmark,
+    derivatives,
+    stacked_rows,
+)
+from ccatp.beacons.slam.measurement_models import MeasurementModels, MeasurementRow, is_direction, kind_of, strength_of
+from ccatp.beacons.slam.motion import (
+    POSE,
+    CarriedOdometry,
+    DeadReckoning,
+    DifferentialDrive,
+    Increment,
+    VehiclePose,
+    estimated,
+)
 from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
 from ccatp.config.beacon_models import RecordingConfig, SlamFilterConfig
 from ccatp.core import FloatArray, wrap_pi
-from ccatp.filters.ekf_slam import BlockError, EkfSlam, RowUpdate
+from ccatp.filters.ekf_slam import BlockError, EkfSlam, RowUpdate, columns_of
 
 
 class AddedPoseNoise:
@@ -116,10 +132,7 @@ class BeaconSlam:
         self._refused, self.jumps, self.unplaced = 0, 0, 0
         self.moved: list[tuple[BeaconId, float]] = []
         self._way_m = 0.0
-        self._candidates = LandmarkInitializer(
-            self.engine, self._sensors, self._map, self._clock, self.levels, self._shared, self._delay
-        )
-        self.waiting = self._candidates.waiting
+        self.waiting: dict[BeaconId, PendingLandmark] = {}
         self.learned: list[BeaconInnovation] = []
         for beacon, estimate in (known or {}).items():
             self._map.join(beacon, estimate.mean, estimate.covariance)
@@ -179,12 +192,12 @@ class BeaconSlam:
             if entry is None and is_direction(reading):
                 self.unplaced += 1  # it may lie anywhere along it
             elif entry is None:
-                self._candidates.add(reading)
+                self._begin(reading)
             else:
                 self.learned.append(self._update(reading, entry))
                 if entry.on_trial and reading.beacon not in self._map and not is_direction(reading):
                     before = self.engine.mean.copy()
-                    self._candidates.add(reading)
+                    self._begin(reading)
             self._follow(before)
         return self.learned
 
@@ -200,16 +213,106 @@ class BeaconSlam:
         return found.nis
 
     def remove(self, beacon: BeaconId) -> None:
-        """Forget a beacon; its next reading begins it again.
-
-        Raises:
-            BlockError: there was no reading of it.
-        """
-        if self._candidates.forget(beacon):
-            return
-        if beacon not in self._map:
+        """Forget a beacon; its next reading begins it again. Raises BlockError: there was no reading of it."""
+        if (waiting := self.waiting.pop(beacon, None)) is not None:
+            waiting.drop(self.engine)
+            self._map.renumber()
+        elif beacon in self._map:
+            self._map.leave(beacon)
+        else:
             raise BlockError(beacon, "is not on the map")
-        self._map.leave(beacon)
+
+    def _begin(self, reading: Reading) -> None:
+        """With a bearing a beacon joins at once, where range and bearing say; without one its readings wait.
+
+        One that joined at once is on trial: if one of its next ``TRIAL`` readings is refused, it begins again with that
+        one.
+        """
+        reach_m = self._sensors.distance_m(reading)
+        at = self._carried(self.engine.mean, reading)
+        if reading.bearing_rad is not None:
+            way = at.pose[2] + reading.bearing_rad
+            x_m, y_m = at.pose[0] + reach_m * cos(way), at.pose[1] + reach_m * sin(way)
+            entry = self._map.join(reading.beacon, *self._prior(reading, reach_m, x_m, y_m))
+            entry.on_trial = TRIAL
+            self._settle(reading, reading.bearing_rad)
+            return
+        # Columns (k,) of the state that the carried place depends on, and its derivatives, shape (2, k).
+        (x_heading, y_heading), by = at.by_heading(), at.by_delay()
+        columns, J = [0, 1, 2], [[1.0, 0.0, x_heading], [0.0, 1.0, y_heading]]
+        if self._delay >= 0:
+            columns.append(self._delay)
+            J[0].append(by[0])
+            J[1].append(by[1])
+        waiting = self.waiting.setdefault(reading.beacon, PendingLandmark(reading.beacon))
+        by_state = columns_of(columns), np.array(J)
+        is_kept = waiting.take(self.engine, reading, np.array(at.pose[:2]), by_state, reach_m)
+        if is_kept and len(waiting.records) >= LEAST:
+
+            def prior_at(x_m: float, y_m: float) -> BeaconEstimate:
+                return self._prior(reading, reach_m, x_m, y_m)
+
+            waiting.look(self.engine, self._row_of, self._shared, prior_at, reach_m)
+            self._join_waiting(reading, waiting, reach_m)
+        self._map.renumber()
+
+    def _join_waiting(self, reading: Reading, waiting: PendingLandmark, reach_m: float) -> None:
+        """Condition the beacon, the places of its readings, the calibration and all else on them, iterated."""
+        engine, shared, found = self.engine, self._shared, waiting.found(self.engine)
+        if found is None:
+            return
+        prior = self._prior(reading, reach_m, *found.mean[:2].tolist())
+        prior.mean[:2] = found.mean[:2]
+        self._map.join(reading.beacon, *prior)
+        block = engine.block(reading.beacon)
+        places = [engine.block(record.place) for record in waiting.records]
+        readings = [record.reading for record in waiting.records]
+        z = [strength_of(one) for one in readings]
+
+        def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+            at = [x[place].tolist() for place in places]
+            H, G, residual, _ = stacked_rows(readings, z, at, x[shared].tolist(), x[block].tolist(), self._row_of)
+            return residual, np.hstack([H, G])
+
+        engine.update_iterated(columns_of(*places, shared, block), linearise, found.variances, LINEARISATIONS)
+        waiting.drop(engine)
+        del self.waiting[reading.beacon]
+
+    def _settle(self, reading: Reading, bearing_rad: float) -> None:
+        # Condition a beacon that has just joined at range and bearing on them.
+        engine, shared = self.engine, self._shared
+        block = engine.block(reading.beacon)
+
+        def rows_at(x: FloatArray) -> tuple[CarriedOdometry, MeasurementRow, MeasurementRow]:
+            at, beacon = self._carried(x, reading), x[block].tolist()
+            row = self._row_of(reading, at.pose, x[shared].tolist(), beacon)
+            return at, row, self._sensors.bearing(at.pose, beacon)
+
+        def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+            at, *rows = rows_at(x)
+            residual = strength_of(reading) - rows[0].expected, wrap_pi(bearing_rad - rows[1].expected)
+            H = [[*derivatives(row, at, delayed=self._delay >= 0), *row.beacon] for row in rows]
+            return np.array(residual), np.array(H)
+
+        _, row, bearing = rows_at(engine.mean)
+        R = np.array((row.variance, bearing.variance * self.levels["bearing"].factor))
+        engine.update_iterated(columns_of(slice(0, POSE), shared, block), linearise, R, LINEARISATIONS)
+
+    def _carried(self, x: FloatArray, reading: Reading) -> CarriedOdometry:
+        """The pose of a state x (n,) at a reading's time."""
+        delay_s = float(x[self._delay]) if self._delay >= 0 else 0.0
+        return self._clock.at(x[:POSE].tolist(), reading.time_s, delay_s)
+
+    def _row_of(
+        self, reading: Reading, pose: list[float], calibration: list[float], beacon: list[float]
+    ) -> MeasurementRow:
+        row = self._sensors.row(reading, pose, calibration[: self._ranges], beacon)
+        return row._replace(variance=row.variance * self.levels[kind_of(reading)].factor)
+
+    def _prior(self, reading: Reading, reach_m: float, x_m: float, y_m: float) -> BeaconEstimate:
+        extra = self._sensors.extra_prior(reading)
+        sigmas = (FLAT * reach_m, FLAT * reach_m, *(sigma for _, sigma in extra))
+        return BeaconEstimate(np.array((x_m, y_m, *(mean for mean, _ in extra))), np.diag(np.square(sigmas)))
 
     def _update(self, reading: Reading, entry: MapEntry) -> BeaconInnovation:
         model = None if is_direction(reading) else self._wander

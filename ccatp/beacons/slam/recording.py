@@ -9,6 +9,8 @@ import numpy.typing as npt
 
 from ccatp.core import FloatArray, IntArray
 
+BoolArray = npt.NDArray[np.bool_]
+
 
 class Steps(NamedTuple):
     """Dead reckoning, one step a row: step k carries the vehicle from times_s[k] to times_s[k + 1].
@@ -35,7 +37,7 @@ class Readings(NamedTuple):
     bearing_rad: FloatArray  # from the heading, counter-clockwise, rad, shape (m,); NaN where none was measured
     rssi_dbm: FloatArray  # signal strength, dBm, shape (m,); NaN where none was measured
 
-    def where(self, rows: npt.NDArray[np.bool_] | IntArray) -> "Readings":
+    def where(self, rows: BoolArray | IntArray) -> "Readings":
         """Some of the readings."""
         return Readings(
             self.times_s[rows], self.beacon[rows], self.range_m[rows], self.bearing_rad[rows], self.rssi_dbm[rows]

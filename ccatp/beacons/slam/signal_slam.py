@@ -198,11 +198,7 @@ class SignalSlam:
         return self.learned
 
     def distance(self, beacon: BeaconId) -> tuple[float, float]:
-        """Between the vehicle and a radio, m, and its standard deviation.
-
-        Raises:
-            BlockError: it is not on the map.
-        """
+        """Between the vehicle and a radio, m, and its standard deviation. Raises BlockError: it is not on the map."""
         start = self.engine.block(beacon).start
         columns = columns_of(range(PLACE), range(start, start + PLACE))
         mean, covariance = self.waiting.conditioned(columns)

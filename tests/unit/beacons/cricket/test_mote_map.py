@@ -62,7 +62,7 @@ def test_the_best_map_is_found_from_nothing(repeats: int) -> None:
         network = stands(np.random.default_rng(seed), repeats)
         model = MapModel(network)
         best = fit_map(model, model.state(STANDS), ROBUST)
-        assert map_motes(network, ROBUST).cost <= best.cost * (1.0 + 1e-6)
+        assert map_motes(network, ROBUST).fit.cost <= best.cost * (1.0 + 1e-6)
 
 
 @pytest.mark.slow
@@ -73,9 +73,9 @@ def test_without_shapes_it_is_found_mostly() -> None:
         network = replace(stands(np.random.default_rng(seed), 1), bodies=())
         model = MapModel(network)
         best = fit_map(model, model.state(STANDS), ROBUST)
-        fit = map_motes(network, ROBUST)
-        found += fit.cost <= best.cost * (1.0 + 1e-6)
-        assert fit.cost <= best.cost * (1.0 + 1e-6) or fit.variance_factor > 2.0  # at least it shows
+        mapped = map_motes(network, ROBUST)
+        found += mapped.fit.cost <= best.cost * (1.0 + 1e-6)
+        assert mapped.fit.cost <= best.cost * (1.0 + 1e-6) or mapped.variance_factor > 2.0  # at least it shows
     assert found >= 3
 
 
@@ -89,7 +89,7 @@ def test_a_common_offset() -> None:
     heads = [(3 * i, 3 * j) for i, j in ALL]  # ranges of other lengths than those between neighbours
     network = network_of(STANDS, FORTY_FIVE + heads, rng, sigma_m=1e-3, bodies=BODIES, offset_m=0.12)
     without, found = map_motes(network, ROBUST), map_motes(network, ROBUST, with_offset=True)
-    assert found.offset_m == pytest.approx(0.12, abs=0.005)
+    assert found.fit.state.offset_m == pytest.approx(0.12, abs=0.005)
     assert aligned_rms_m(found.positions_m, STANDS) < 0.2 * aligned_rms_m(without.positions_m, STANDS)
 
 

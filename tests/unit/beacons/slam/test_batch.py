@@ -7,10 +7,17 @@ import numpy.typing as npt
 import pytest
 from scipy.linalg import LinAlgError
 
-from ccatp.beacons.slam.batch_odometry import CALIBRATION, Reckoning, chained
-from ccatp.beacons.slam.batch_problem import BEACON, SHARED, BatchProblem, BatchState, repeats
-from ccatp.beacons.slam.batch_smoother import place_by_distances, smooth
-from ccatp.beacons.slam.batch_solver import Factored, t_cost, t_weights
+from ccatp.beacons.slam.batch_problem import (
+    BEACON,
+    CALIBRATION,
+    SHARED,
+    BatchProblem,
+    BatchState,
+    Reckoning,
+    chained,
+    repeats,
+)
+from ccatp.beacons.slam.batch_smoother import Factored, place_by_distances, smooth, t_cost, t_weights
 from ccatp.beacons.slam.evaluation import judge
 from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun, Steps, dead_reckoned
 from ccatp.config.beacon_models import OdometryNoiseConfig, PriorsConfig, RadioNoiseConfig, RecordingConfig
@@ -134,9 +141,9 @@ def test_increments_by_the_delay() -> None:
     s = Steps(t, 0.02 * v, 0.02 * w, 0.02 * 0.1 * v)
     reckoning = Reckoning(s, np.array([1.0, 2.5, 6.0]))
     calibration = np.array([0.05, -0.03, 0.02, 0.01, 0.3])
-    found = reckoning.increments(calibration, ODOMETRY).by_calibration[:, :, DELAY]
+    found = reckoning.increments(calibration, ODOMETRY)[1][:, :, DELAY]
     h = np.array([0.0, 0.0, 0.0, 0.0, 0.04])
-    up, down = (reckoning.increments(calibration + sign * h, ODOMETRY).motion for sign in (1.0, -1.0))
+    up, down = (reckoning.increments(calibration + sign * h, ODOMETRY)[0] for sign in (1.0, -1.0))
     assert found == pytest.approx((up - down) / 0.08, rel=0.02, abs=2e-3)
 
 
@@ -205,7 +212,7 @@ def test_what_has_no_prior_is_not_estimated() -> None:
 def test_increments_put_together_are_dead_reckoning() -> None:
     s = steps()
     t = np.array([0.0, 1.0, 1.01, 2.7, s.times_s[-1]])
-    motion = Reckoning(s, t).increments(np.zeros(len(CALIBRATION)), ODOMETRY).motion
+    motion = Reckoning(s, t).increments(np.zeros(len(CALIBRATION)), ODOMETRY)[0]
     path = dead_reckoned(s, (1.0, 2.0, 0.5))
     assert chained(np.array([1.0, 2.0, 0.5]), motion)[-1] == pytest.approx(path[-1], abs=2e-3)  # cut chords
 
@@ -215,7 +222,7 @@ def test_the_noise_of_an_increment_is_that_of_its_steps() -> None:
     rng = np.random.default_rng(2)
     s = steps(n=25)
     ends = s.times_s[[0, -1]]
-    found = Reckoning(s, ends).increments(np.zeros(len(CALIBRATION)), ODOMETRY).covariance[0]
+    found = Reckoning(s, ends).increments(np.zeros(len(CALIBRATION)), ODOMETRY)[2][0]
     dt = np.diff(s.times_s)
     way, turned = np.hypot(s.distance_m, s.lateral_m), np.abs(s.turn_rad)
     sigma_way = np.sqrt(0.02**2 * way + 0.01**2 * turned)
