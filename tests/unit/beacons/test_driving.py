@@ -45,13 +45,6 @@ def test_steering_is_proportional_and_limited() -> None:
     assert driver.drive(BearingToPoint(1.0, -2.0), 0.1).steer_rad == -cfg.vehicle.steer_max_rad
 
 
-def test_aim_is_seen_from_the_heading() -> None:
-    aim = aim_at((1.0, 1.0, pi / 2), (1.0, 3.0))
-    assert aim.distance_m == pytest.approx(2.0)
-    assert aim.error_rad == pytest.approx(0.0)
-    assert aim_at((0.0, 0.0, 0.0), (0.0, 1.0)).error_rad == pytest.approx(pi / 2)
-
-
 def test_waypoints_begin_again_only_where_they_loop() -> None:
     once = WaypointList([(0.0, 0.0)], 0.1, loops=False)
     assert once.visit((0.0, 0.0, 0.0)) is None
@@ -96,12 +89,6 @@ def test_uncertainty_of_the_target_keeps_the_robot_away() -> None:
         states.append(pilot.follower.state)
     approaching, backing = FollowState.APPROACHING, FollowState.BACKING
     assert states == [approaching, approaching, backing, backing]
-
-
-def test_who_knows_nothing_of_the_target_goes_there_all_the_same() -> None:
-    pilot = BeaconPilot(config(follow__is_active=True))
-    pilot.drive(0.0, 0.1, (0.0, 0.0, 0.0), TargetSight((2.5, 0.0), 3.0, 0.0), ())
-    assert pilot.follower.state is FollowState.APPROACHING
 
 
 @pytest.mark.parametrize("target", [None, TargetSight((3.0, 0.0), 0.0, 11.0)])
@@ -171,11 +158,6 @@ FULL: list[dict[str, object]] = [
     {"when": {"a": "high", "b": "low"}, "then": "fast"},
     {"when": {"a": "high", "b": "high"}, "then": "slow"},
 ]
-
-
-def test_one_rule_alone_gives_its_output() -> None:
-    assert Sugeno(two_terms(FULL)).evaluate((0.0, 0.5)) == 1.0
-    assert Sugeno(two_terms(FULL)).evaluate((1.0, 0.0)) == 3.0
 
 
 def test_output_is_the_mean_weighted_by_products() -> None:

@@ -22,14 +22,12 @@ from ccatp.beacons.cricket.rigidity import find_fold_over
 from ccatp.beacons.cricket.unfolding import agreement_of, classical_scaling, completed, repaired, unfolded
 from ccatp.filters.metrics import aligned_rms_m, best_motion
 from tests.unit.beacons.cricket.fields import (
-    ADJACENT,
     ALL,
     FORTY_FIVE,
     HEADS,
     SIGMA_M,
     STAND,
     STANDS,
-    ZIGZAG,
     FloatArray,
     near_pairs,
     network_of,
@@ -47,7 +45,7 @@ def stands(rng: np.random.Generator, repeats: int) -> RangeNetwork:
 def test_the_papers_own_ranges(repeats: int, limit_m: float) -> None:
     """The best map is as good as published ranges allow; that it is found from nothing is the next test."""
     rng, errors = np.random.default_rng(1), []
-    for _ in range(100):
+    for _ in range(50):
         model = MapModel(stands(rng, repeats))
         errors.append(aligned_rms_m(fit_map(model, model.state(STANDS), ROBUST).state.positions_m, STANDS))
     assert np.median(errors) < limit_m
@@ -79,11 +77,6 @@ def test_without_shapes_it_is_found_mostly() -> None:
     assert found >= 3
 
 
-def test_shapes_tell_the_map_from_its_mirror_image() -> None:
-    found = map_motes(stands(np.random.default_rng(2), 60), ROBUST)
-    assert aligned_rms_m(found.positions_m, STANDS, mirrors=False) < 0.02
-
-
 def test_a_common_offset() -> None:
     rng = np.random.default_rng(3)
     heads = [(3 * i, 3 * j) for i, j in ALL]  # ranges of other lengths than those between neighbours
@@ -91,14 +84,6 @@ def test_a_common_offset() -> None:
     without, found = map_motes(network, ROBUST), map_motes(network, ROBUST, with_offset=True)
     assert found.fit.state.offset_m == pytest.approx(0.12, abs=0.005)
     assert aligned_rms_m(found.positions_m, STANDS) < 0.2 * aligned_rms_m(without.positions_m, STANDS)
-
-
-def test_sigmas_that_are_guesses_are_found() -> None:
-    network = network_of(HEADS, ALL * 6, np.random.default_rng(4))
-    network.sigmas_m[:] = 1.0
-    found = map_motes(network, ROBUST, finds_sigma=True)
-    assert found.sigma_m == pytest.approx(SIGMA_M, rel=0.2)  # 90 ranges: 10 %
-    assert aligned_rms_m(found.positions_m, HEADS, mirrors=True) < 0.01
 
 
 def test_known_motes_give_frame_and_side() -> None:
@@ -148,11 +133,6 @@ def test_the_bound_in_closed_form() -> None:
     assert bound_rms_m(model, places, [0], aligned=False) == pytest.approx(wanted)
 
 
-def test_no_bound_where_something_is_free() -> None:
-    assert bound_rms_m(MapModel(network_of(HEADS, ZIGZAG)), HEADS, range(6), aligned=True) is None
-    assert bound_rms_m(MapModel(network_of(HEADS, ADJACENT)), HEADS, range(6), aligned=True) is not None
-
-
 def test_a_pinned_map_has_the_errors_of_its_frame() -> None:
     known = np.full((6, 2), np.nan)
     known[0], known[1, 1] = HEADS[0], HEADS[1, 1]
@@ -194,10 +174,6 @@ def test_a_frame_of_the_maps_own(dimension: int) -> None:
 PLAIN = MapFitSettings()
 
 
-def field_3d(rng: np.random.Generator) -> FloatArray:
-    return np.asarray(rng.uniform(-2.0, 2.0, (9, 3)))
-
-
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_derivatives_of_everything(dimension: int) -> None:
     rng = np.random.default_rng(1)
@@ -222,29 +198,6 @@ def test_derivatives_of_everything(dimension: int) -> None:
         step[column] = h
         slope = (model.residuals(model.moved(state, -step)) - model.residuals(model.moved(state, step))) / (2.0 * h)
         assert J[:, column] == pytest.approx(slope, abs=1e-7)
-
-
-def test_a_state_is_as_known_and_rigid() -> None:
-    local = np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
-    known = np.full((6, 2), np.nan)
-    known[0] = (3.0, 4.0)
-    network = network_of(HEADS, ALL, bodies=[RigidBody("a", (3, 4, 5), local)], known_m=known)
-    model = MapModel(network)
-    state = model.moved(model.state(HEADS), np.full(model.size, 0.3))
-    assert state.positions_m[0].tolist() == [3.0, 4.0]
-    for a, b in ((0, 1), (0, 2), (1, 2)):
-        length = np.linalg.norm(state.positions_m[3 + a] - state.positions_m[3 + b])
-        assert length == pytest.approx(np.linalg.norm(local[a] - local[b]))
-    assert np.linalg.det(state.rotations[0]) == pytest.approx(1.0)
-
-
-def test_exact_ranges_give_the_exact_map_in_space() -> None:
-    rng = np.random.default_rng(2)
-    places = field_3d(rng)
-    model = MapModel(network_of(places, near_pairs(places, 9.0)))
-    fit = fit_map(model, model.state(places + rng.normal(0.0, 0.2, places.shape)), PLAIN)
-    assert fit.is_at_rest
-    assert aligned_rms_m(fit.state.positions_m, places) < 1e-7
 
 
 def test_offset_and_scale_with_known_places() -> None:
@@ -304,18 +257,6 @@ def test_the_covariance_is_that_of_many_runs() -> None:
     # 400 runs: a variance is known to 7 %
     assert sample.diagonal() == pytest.approx(covariance.diagonal(), rel=0.3)
     assert np.trace(sample) == pytest.approx(np.trace(covariance), rel=0.08)
-
-
-def test_known_places_pin_the_covariance() -> None:
-    known = np.full((6, 2), np.nan)
-    known[0], known[1, 1] = HEADS[0], HEADS[1, 1]
-    model = MapModel(network_of(HEADS, ALL, known_m=known))
-    fit = fit_map(model, model.state(HEADS), PLAIN)
-    covariance, free = position_covariance(model, fit)
-    assert free == 0
-    assert covariance[:2, :2] == pytest.approx(np.zeros((2, 2)))
-    # across the field the frame's error shows: 7 m from N1, where N2's y of 5 m away holds it
-    assert np.sqrt(covariance[11, 11]) > SIGMA_M / 2.0
 
 
 ALL_HEAR = 1e3
@@ -383,12 +324,6 @@ def test_a_tenth_of_the_ranges_may_be_wrong(finds_sigma: bool) -> None:
     assert found.sigma_m == pytest.approx(SIGMA_M, rel=0.5)
 
 
-def test_the_same_ranges_give_the_same_map() -> None:
-    network, _, _ = wrong(3, 7, 2)
-    first, again = map_motes(network, ROBUST), map_motes(network, ROBUST)
-    assert (first.positions_m == again.positions_m).all()
-
-
 @pytest.mark.parametrize("given", [0.2, 1.0, 5.0])
 def test_the_scale_of_sound_residuals(given: float) -> None:
     """Whatever the sigmas were taken for; 8 sets of 45 ranges tell it to a few hundredths on the average."""
@@ -443,21 +378,9 @@ def drawn(count: int, dimension: int, neighbours: float, seed: int) -> tuple[Flo
     return places, near_pairs(places, 1.0)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_classical_scaling_of_all_distances_is_exact(dimension: int) -> None:
-    places = np.random.default_rng(1).normal(size=(8, dimension))
-    table = np.linalg.norm(places[:, None] - places[None], axis=2)
-    assert aligned_rms_m(classical_scaling(table, dimension), places, mirrors=True) < 1e-9
-
-
-def test_missing_distances_go_the_shortest_way() -> None:
-    table = completed(3, np.array([[0, 1], [1, 2]]), np.array([1.0, 2.0]))
-    assert table[0, 2] == pytest.approx(3.0)
-
-
 def test_unfolding_finds_maps_that_plain_descent_folds() -> None:
     ends = []
-    for seed in range(12):
+    for seed in range(5):
         places, pairs = drawn(30, 3, 16.0, seed)
         if components(30, np.array(pairs)).max() > 0:
             continue
@@ -468,12 +391,6 @@ def test_unfolding_finds_maps_that_plain_descent_folds() -> None:
         ends.append([fit_map(model, model.state(first), MapFitSettings()).cost < 1e-6 for first in (plain, start)])
     plain_found, found = np.sum(ends, axis=0)
     assert found > plain_found
-
-
-def test_places_may_be_drawn_instead() -> None:
-    means = PairMeans(network_of(HEADS, ALL))
-    places = unfolded(6, means.pairs, means.ranges_m, means.sigmas_m, 2, rng=np.random.default_rng(1))
-    assert aligned_rms_m(places, HEADS, mirrors=True) < 1e-3
 
 
 @pytest.mark.parametrize(("dimension", "neighbours"), [(2, 13.0), (3, 26.0)])

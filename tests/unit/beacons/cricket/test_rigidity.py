@@ -69,12 +69,6 @@ def test_a_scale_is_taken_for_the_size_of_the_map() -> None:
     assert freedom(ALL, known, with_scale=True).deficiency == 0
 
 
-def test_a_ladder_has_nothing_to_spare_for_an_offset() -> None:
-    found = freedom(ADJACENT, with_offset=True)
-    assert found.deficiency == 1
-    assert found.calibration == ("range offset: the map takes it up",)
-
-
 def test_shapes_of_stands_hold_what_ranges_do_not() -> None:
     local = np.array([[0.0, 0.0], [0.5, 0.0], [0.2, 0.4]])
     places = np.concatenate([local, local + np.array([5.0, 1.0])])
@@ -110,12 +104,6 @@ def test_motes_on_a_ceiling_move_across_it_unseen() -> None:
 
 def is_unique(places: FloatArray, pairs: Pairs) -> bool:
     return find_fold_over(network_of(places, pairs), np.random.default_rng(0)).is_unique
-
-
-def test_the_fields_programmes() -> None:
-    assert is_unique(HEADS, ALL)
-    assert not is_unique(HEADS, ADJACENT)
-    assert not is_unique(HEADS, ZIGZAG)
 
 
 def test_nine_pairs_fold_at_every_pair_between() -> None:

@@ -14,7 +14,6 @@ from ccatp.beacons.slam.batch_problem import (
     BatchProblem,
     BatchState,
     Reckoning,
-    chained,
     repeats,
 )
 from ccatp.beacons.slam.batch_smoother import Factored, place_by_distances, smooth, t_cost, t_weights
@@ -27,24 +26,13 @@ from tests.unit.beacons.datasets.sets import BEACONS, changed, recorded, world
 FloatArray = npt.NDArray[np.float64]
 DELAY = CALIBRATION.index("delay_s")
 ODOMETRY = OdometryNoiseConfig(
-    distance_per_sqrt_m=0.02,
-    distance_per_sqrt_rad=0.01,
-    turn_per_sqrt_m=0.02,
-    turn_per_sqrt_rad=0.05,
-    turn_per_sqrt_s=0.01,
-    lateral_per_sqrt_m=0.015,
-)
+    distance_per_sqrt_m=0.02, distance_per_sqrt_rad=0.01, turn_per_sqrt_m=0.02, turn_per_sqrt_rad=0.05,
+    turn_per_sqrt_s=0.01, lateral_per_sqrt_m=0.015,
+)  # fmt: skip
 RADIO = RadioNoiseConfig(
-    range_sigma_m=0.1,
-    range_sigma_per_m=0.02,
-    bearing_sigma_rad=0.03,
-    rssi_sigma_db=3.0,
-    rssi_reference_dbm=-40.0,
-    rssi_exponent=2.2,
-    freedom=5.0,
-    correlation_s=0.0,
-    gate_sigmas=5.0,
-)
+    range_sigma_m=0.1, range_sigma_per_m=0.02, bearing_sigma_rad=0.03, rssi_sigma_db=3.0, rssi_reference_dbm=-40.0,
+    rssi_exponent=2.2, freedom=5.0, correlation_s=0.0, gate_sigmas=5.0,
+)  # fmt: skip
 NO_PRIORS = PriorsConfig(**dict.fromkeys(PriorsConfig.model_fields, 0.0) | {"pose_m": 0.05, "heading_rad": 0.03})
 PRIORS = PriorsConfig(
     distance_scale=0.1, turn_scale=0.1, turn_per_m=0.05, turn_bias_rad_s=0.02, delay_s=0.2, range_scale=0.1,
@@ -209,14 +197,6 @@ def test_what_has_no_prior_is_not_estimated() -> None:
     assert fixed.residuals(state).information[1::2].sum() == 0.0  # readings of the other one count nothing
 
 
-def test_increments_put_together_are_dead_reckoning() -> None:
-    s = steps()
-    t = np.array([0.0, 1.0, 1.01, 2.7, s.times_s[-1]])
-    motion = Reckoning(s, t).increments(np.zeros(len(CALIBRATION)), ODOMETRY)[0]
-    path = dead_reckoned(s, (1.0, 2.0, 0.5))
-    assert chained(np.array([1.0, 2.0, 0.5]), motion)[-1] == pytest.approx(path[-1], abs=2e-3)  # cut chords
-
-
 def test_the_noise_of_an_increment_is_that_of_its_steps() -> None:
     """Against many noisy runs of the same steps."""
     rng = np.random.default_rng(2)
@@ -322,16 +302,8 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
     for seed in range(10):
         run = run_of(100 + seed, bearings=True, seconds=60.0)
         # priors that the simulation draws from: what is exact must be known as exact
-        tight = with_priors(
-            distance_scale=0.0,
-            turn_scale=0.0,
-            turn_per_m=0.0,
-            turn_bias_rad_s=0.0,
-            range_scale=0.0,
-            range_offset_m=0.0,
-            pose_m=1e-3,
-            heading_rad=1e-3,
-        ).priors
+        exact = ("distance_scale", "turn_scale", "turn_per_m", "turn_bias_rad_s", "range_scale", "range_offset_m")
+        tight = with_priors(**dict.fromkeys(exact, 0.0), pose_m=1e-3, heading_rad=1e-3).priors
         gaussian = SETTINGS.radio.model_copy(update={"freedom": 1e6, "range_sigma_per_m": 0.0})
         track = smooth(run, SETTINGS.model_copy(update={"radio": gaussian, "priors": tight}), no_clock)
         judged = judge(track, run)
@@ -414,20 +386,11 @@ def test_a_straight_path_leaves_the_side_in_doubt() -> None:
     assert "beacon 7 may lie at its mirror image" in " ".join(track.warnings)
 
 
-def test_a_beacon_with_too_few_readings_is_told() -> None:
-    run = run_of(10, bearings=False)
-    keep = (run.readings.beacon != 2) | (np.arange(len(run.readings.times_s)) < 8)
-    track = smooth(replace(run, readings=run.readings.where(keep)), SETTINGS, no_clock)
-    assert "beacon 8 could not be placed: too few readings of it, or all from one place" in track.warnings
-    assert set(track.beacons) == {"6", "7", "9"}
-
-
-@pytest.mark.parametrize("range_m", [0.0, 3.0])
-def test_a_robot_that_stands_places_no_beacon(range_m: float) -> None:
+def test_a_robot_that_stands_places_no_beacon() -> None:
     w = world(10, 20.0)
     n = w.distance_m.size
     stood = changed(
-        w, poses=np.zeros((n + 1, 3)), distance_m=np.zeros(n), turn_rad=np.zeros(n), range_m=0.0 * w.range_m + range_m
+        w, poses=np.zeros((n + 1, 3)), distance_m=np.zeros(n), turn_rad=np.zeros(n), range_m=0.0 * w.range_m + 3.0
     )
     track = smooth(recorded(stood, bearings=False), SETTINGS, no_clock)
     assert track.beacons == {}

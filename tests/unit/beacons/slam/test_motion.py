@@ -8,12 +8,11 @@ from time import perf_counter
 import numpy as np
 import pytest
 
-from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.slam.causal import filter_run
 from ccatp.beacons.slam.evaluation import judge
 from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun, ReferencePath
-from ccatp.beacons.slam.signal_slam import ReflectorScan, ScanResult
+from ccatp.beacons.slam.signal_slam import ReflectorScan
 from ccatp.config.beacon_models import ScanConfig
 from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
@@ -97,13 +96,6 @@ def test_sound_data_raise_no_doubt_and_parts_are_timed() -> None:
     assert 0.0 < np.median(track.scalar_s) < np.median(track.update_s)
 
 
-def test_readings_of_another_time_are_told() -> None:
-    run = recorded(world(seconds=120.0))
-    late = run.readings.times_s + 4.0
-    shifted = replace(run, readings=run.readings._replace(times_s=late).where(late < run.steps.times_s[-1]))
-    assert any("innovations are" in w or "had to be doubted" in w for w in track_of(shifted).warnings)
-
-
 def test_beacons_that_are_misread_half_the_time_are_told() -> None:
     run = recorded(world(seconds=120.0))
     beacon = run.readings.beacon.copy()
@@ -175,18 +167,6 @@ def test_beacons_that_are_exchanged_on_the_way_are_told() -> None:
         assert any(w.startswith(f"beacon {name} was placed anew at ") and "exchanged" in w for w in told)
 
 
-@pytest.mark.parametrize("steps", [1, 3])
-def test_a_wild_step_of_the_odometry_is_told(steps: int) -> None:
-    run = replace(recorded(world()), truth=None)
-    distance = run.steps.distance_m.copy()
-    distance[100 : 100 + steps] = 1e6
-    told = suspicions(replace(run, steps=run.steps._replace(distance_m=distance)))
-    assert any(
-        f"{steps} step{'s' * (steps > 1)} faster than 50 m/s, the first of 1e+06 m at 10.000 s" in w for w in told
-    )
-    assert not any("faster than" in w for w in suspicions(run))
-
-
 SCAN = ReflectorScan(ScanConfig(readings=40, bearing_sigma_rad=radians(18.0), loss_tolerance=0.5))
 STEP = radians(9.0)
 
@@ -197,49 +177,29 @@ def turn(levels: dict[int, float], lost: set[int] | None = None, floor_dbm: floa
     ]
 
 
-def read(packets: list[Packet]) -> ScanResult:
-    (result,) = SCAN.results(packets)
-    return result
-
-
-def bearing(packets: list[Packet]) -> float:
-    found = read(packets).bearing_rad
-    assert found is not None
-    return found
-
-
-def test_bearing_is_that_of_the_strongest() -> None:
-    assert bearing(turn({7: -40.0, 8: -45.0, 30: -41.0})) == pytest.approx(7 * STEP)
-
-
-def test_neighbours_that_tie_give_their_middle_across_the_cut_too() -> None:
-    assert bearing(turn({7: -40.0, 8: -40.0})) == pytest.approx(7.5 * STEP)
-    assert abs(bearing(turn({20: -40.0, 21: -40.0, 19: -40.0}))) == pytest.approx(pi)
-
-
-def test_ties_that_lie_apart_give_no_bearing_but_a_level() -> None:
-    for levels in ({0: -40.0, 20: -40.0}, {0: -40.0, 12: -40.0}):
-        result = read(turn(levels))
-        assert result.bearing_rad is None
-        assert result.rssi_dbm == -40.0
-
-
-def test_level_is_the_mean_next_to_the_bearing() -> None:
-    result = read(turn({7: -40.0, 6: -42.0, 8: -44.0}))
-    assert result.rssi_dbm == pytest.approx(-42.0)
-    assert result.readings == 3
-
-
-def test_lost_packets_are_borne_up_to_the_tolerance() -> None:
-    some = read(turn({7: -40.0}, lost=set(range(20, 39))))
-    assert some.bearing_rad is not None
-    assert some.heard == pytest.approx(21 / 40)
-    most = read(turn({7: -40.0}, lost=set(range(10, 31))))
-    assert most.bearing_rad is None
-
-
-def test_variance_of_steps_is_in_the_bearing() -> None:
-    assert SCAN.sigma_rad**2 == pytest.approx(radians(18.0) ** 2 + STEP**2 / 12.0)
+@pytest.mark.parametrize(
+    ("packets", "bearing_steps", "level_dbm", "readings"),
+    [
+        (turn({7: -40.0, 8: -45.0, 30: -41.0}), 7.0, (-40.0 - 45.0 - 70.0) / 3.0, 3),  # of the strongest
+        (turn({7: -40.0, 6: -42.0, 8: -44.0}), 7.0, -42.0, 3),  # the level is the mean next to the bearing
+        (turn({7: -40.0, 8: -40.0}), 7.5, -40.0, 2),  # neighbours that tie give their middle
+        (turn({20: -40.0, 21: -40.0, 19: -40.0}), 20.0, -40.0, 3),  # across the cut, too
+        (turn({0: -40.0, 20: -40.0}), None, -40.0, 1),  # ties that lie apart give a level alone
+        (turn({0: -40.0, 12: -40.0}), None, -40.0, 1),
+        (turn({7: -40.0}, lost=set(range(20, 39))), 7.0, -60.0, 3),  # lost packets are borne up to the tolerance
+        (turn({7: -40.0}, lost=set(range(10, 31))), None, -40.0, 1),
+    ],
+)
+def test_bearing_and_level_of_a_scan(
+    packets: list[Packet], bearing_steps: float | None, level_dbm: float, readings: int
+) -> None:
+    (found,) = SCAN.results(packets)
+    assert (found.bearing_rad is None) == (bearing_steps is None)
+    assert wrap_pi((found.bearing_rad or 0.0) - STEP * (bearing_steps or 0.0)) == pytest.approx(0.0, abs=1e-9)
+    assert found.rssi_dbm == pytest.approx(level_dbm)
+    assert found.readings == readings
+    assert found.heard == pytest.approx(len(packets) / 40)
+    assert found.bearing_sigma_rad**2 == pytest.approx(radians(18.0) ** 2 + STEP**2 / 12.0)
 
 
 def test_radios_are_kept_apart_by_their_identifier() -> None:

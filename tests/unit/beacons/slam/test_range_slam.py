@@ -158,23 +158,6 @@ def test_ranges_calibrate_themselves_and_the_gyroscope() -> None:
     assert found["turn_bias_rad_s"][1] < 0.002
 
 
-def test_rest_shows_the_bias_of_the_gyroscope_before_any_beacon() -> None:
-    rest = {"filter__rest_speed_m_s": 0.03, "filter__rest_turn_rad_s": 0.03}
-    world = start(SETTINGS.but(odometry__turn_per_sqrt_s=0.002, priors__turn_bias_rad_s=0.02, **rest))
-    world.beacons, world.bias_rad_s = {}, -0.007
-    world.drive(100, turn_rad=0.0, way_m=0.0)
-    assert world.slam.calibration["turn_bias_rad_s"][0] == pytest.approx(-0.007, abs=1e-4)
-    assert world.slam.pose.heading_rad == 0.0
-
-
-def test_scales_of_the_wheels_are_found() -> None:
-    world = start(SETTINGS.but(priors__turn_scale=0.1, priors__distance_scale=0.1))
-    world.told_m, world.told_rad = 1.08, 0.95
-    world.drive(300)
-    assert world.slam.calibration["distance_scale"][0] == pytest.approx(0.08, abs=0.02)
-    assert world.slam.calibration["turn_scale"][0] == pytest.approx(-0.05, abs=0.02)
-
-
 def test_the_delay_of_a_vehicle_that_follows_its_commands_late_is_found() -> None:
     slam = BeaconSlam(*SETTINGS.but(priors__delay_s=0.2), (0.0, 0.0, 0.0), P0)
     world = World(BeaconSlam(*SETTINGS, (0.0, 0.0, 0.0), P0), both)
@@ -379,14 +362,6 @@ def test_jacobian_of_a_row(kind: str) -> None:
     assert [*row.pose, *row.calibration, *row.beacon] == pytest.approx(differences, abs=1e-7)
 
 
-def test_values_of_the_rows() -> None:
-    x = np.array((*POSE, *CALIBRATION, *BEACON))
-    assert row_at("range", x).expected == pytest.approx(1.06 * 5.0 - 0.1)
-    assert row_at("range", x).variance == pytest.approx(0.1**2 + (0.02 * 5.0) ** 2)
-    assert row_at("rssi", x).expected == pytest.approx(-37.0 - 22.0 * log10(5.0))
-    assert row_at("bearing", x).expected == pytest.approx(np.arctan2(4.0, 3.0) - 0.4)
-
-
 @pytest.mark.parametrize("kind", ["range", "bearing"])
 def test_jacobian_through_the_delay(kind: str) -> None:
     clock = DeadReckoning(is_delayed=True)
@@ -443,15 +418,6 @@ def test_the_filter_finds_itself_again(begin_s: float, bearings: bool) -> None:
     assert found.beacon_rmse_m < 0.4
     assert found.nees is not None
     assert found.nees.mean < 4.0
-
-
-def test_the_smoother_joins_both_ends() -> None:
-    run = with_gap(60.0, 15.0, bearings=False)
-    found = judge(smooth(run, CONFIG.csv, perf_counter), run)
-    assert found.trajectory_rmse_m is not None
-    assert found.trajectory_rmse_m < 0.3
-    assert found.beacon_rmse_m is not None
-    assert found.beacon_rmse_m < 0.3
 
 
 def test_a_guessed_way_is_told_and_no_scale_of_the_odometry() -> None:
