@@ -12,7 +12,7 @@ import pytest
 from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.trajectory import bridged
 from ccatp.beacons.slam.batch_smoother import smooth
-from ccatp.beacons.slam.beacon_map import HeadingTransport, NoiseLevel
+from ccatp.beacons.slam.beacon_map import NoiseLevel
 from ccatp.beacons.slam.causal import filter_run
 from ccatp.beacons.slam.evaluation import judge, result_data
 from ccatp.beacons.slam.landmark_init import derivatives
@@ -31,7 +31,7 @@ from ccatp.beacons.slam.recording import (
 )
 from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
-from ccatp.filters.ekf_slam import BlockError, EkfSlam
+from ccatp.filters.ekf_slam import BlockError
 from tests.support.slam_settings import Settings, odometry, settings, trust
 from tests.unit.beacons.datasets.sets import recorded, world
 
@@ -175,7 +175,7 @@ def test_the_delay_of_a_vehicle_that_follows_its_commands_late_is_found() -> Non
 
 @pytest.mark.parametrize("has_bearing", [True, False])
 def test_signal_strengths_with_levels_of_their_own(has_bearing: bool) -> None:
-    levels = {"a": -43.0, "b": -34.0, "c": -39.0, "d": -36.0}
+    levels = {"a": -43.0, "b": -34.0}
 
     def heard(time_s: float, world: World, beacon: BeaconId) -> Reading:
         rssi = levels[str(beacon)] - 20.0 * log10(world.range_m(beacon)) + 0.5 * world.rng.normal()
@@ -183,12 +183,9 @@ def test_signal_strengths_with_levels_of_their_own(has_bearing: bool) -> None:
 
     rssi = {"radio__rssi_sigma_db": 0.5, "radio__rssi_reference_dbm": -38.0, "radio__rssi_exponent": 2.0}
     world = start(SETTINGS.but(**rssi, priors__rssi_reference_db=5.0), heard)
-    for turn_rad in (
-        0.05,
-        -0.04,
-        0.03,
-        -0.05,
-    ):  # on one circle, levels of a point and of its inverse differ by a constant
+    world.beacons = {beacon: BEACONS[beacon] for beacon in levels}
+    # On one circle, levels of a point and of its inverse differ by a constant.
+    for turn_rad in (0.05, -0.04, 0.03, -0.05):
         world.drive(100, turn_rad)
     for beacon, level_dbm in levels.items():
         found = world.slam.beacons[beacon]
@@ -216,7 +213,7 @@ def test_an_outlier_is_refused_and_long_readings_weigh_little() -> None:
         largest = []
         for seed in range(1, 4):
             world = World(BeaconSlam(*changed, (0.0, 0.0, 0.0), P0), round_a_corner, seed)
-            world.drive(450)
+            world.drive(300)
             assert set(world.slam.beacons) == set(BEACONS)
             largest.append(max(world.error_m(b) for b in world.slam.beacons))
         errors.append(median(largest))  # the first run takes a beacon for its mirror image when long ranges are learned
@@ -408,7 +405,7 @@ def with_gap(begin_s: float, long_s: float, *, bearings: bool) -> RecordedRun:
     return replace(run, steps=bridged(steps))
 
 
-@pytest.mark.parametrize(("begin_s", "bearings"), [(40.0, False), (60.0, False), (80.0, False), (60.0, True)])
+@pytest.mark.parametrize(("begin_s", "bearings"), [(40.0, False), (80.0, False), (60.0, True)])
 def test_the_filter_finds_itself_again(begin_s: float, bearings: bool) -> None:
     run = with_gap(begin_s, 15.0, bearings=bearings)
     found = judge(filter_run(run, CONFIG.csv, CONFIG.filter, perf_counter), run)
@@ -427,79 +424,21 @@ def test_a_guessed_way_is_told_and_no_scale_of_the_odometry() -> None:
     assert np.isfinite(with_gap(60.0, 15.0, bearings=False).steps.distance_m).all()
 
 
-QUARTER = np.array(((0.0, -1.0), (1.0, 0.0)))
-
-
-def a_map(heading_variance: float) -> EkfSlam:
-    """A pose at the origin, two places and a wandering error; nothing is unknown but the turn of everything."""
-    x = np.array((0.0, 0.0, 0.3, 2.0, 1.0, -1.0, 3.0, 0.1))
-    turn = np.array((0.0, 0.0, 1.0, *(QUARTER @ x[3:5]), *(QUARTER @ x[5:7]), 0.0))
-    P = heading_variance * np.outer(turn, turn)
-    engine = EkfSlam(x[:3], P[:3, :3])
-    none = np.empty(0, dtype=np.intp)
-    for name, part in (("a", slice(3, 5)), ("b", slice(5, 7)), (("wander", "a"), slice(7, 8))):
-        size = part.stop - part.start
-        engine.augment(name, x[part], none, np.zeros((size, 0)), np.eye(size), np.eye(size))
-    engine.covariance[:] = P
-    return engine
-
-
-def test_a_turn_of_everything_stays_as_unknown_as_it_was() -> None:
-    engine = a_map(0.04)
-    transport, before = HeadingTransport(engine), engine.mean.copy()
-    moved: FloatArray = np.array((0.3, -0.2, 0.1, 0.5, 0.1, -0.4, 0.2, 0.7))
-    engine.mean += moved
-    transport.follow(before.copy())
-    x = engine.mean
-    pairs = (x[:2] - before[:2], QUARTER @ (x[3:5] - before[3:5]), QUARTER @ (x[5:7] - before[5:7]))
-    turn = np.array(
-        (*(QUARTER @ pairs[0]), 1.0, *(QUARTER @ before[3:5] + pairs[1]), *(QUARTER @ before[5:7] + pairs[2]), 0.0)
-    )
-    assert engine.covariance == pytest.approx(0.04 * np.outer(turn, turn), abs=1e-15)
-    assert np.array_equal(engine.covariance, engine.covariance.T)
-    bearing = np.zeros(8)  # by pose, heading and the place a, at the new estimate
-    dx, dy = x[3:5] - x[:2]
-    q = dx * dx + dy * dy
-    bearing[:5] = dy / q, -dx / q, -1.0, -dy / q, dx / q
-    assert bearing @ engine.covariance @ bearing == pytest.approx(0.0, abs=1e-15)  # no reading tells the turn
-
-
-def test_what_joined_since_is_left_alone_and_what_left_stops_it() -> None:
-    engine = a_map(0.04)
-    transport, before = HeadingTransport(engine), engine.mean.copy()
-    engine.augment("c", np.array((1.0, 1.0)), np.arange(2), np.eye(2))
-    engine.mean[3] += 0.5
-    transport.follow(before.copy())
-    row = engine.covariance[2]
-    assert row[8:10] == pytest.approx(engine.covariance[2, :2])
-    assert row[4] == pytest.approx(0.04 * (2.0 + 0.5))
-    engine.remove("a")
-    engine.remove("b")
-    whole = engine.covariance.copy()
-    engine.mean[0] += 1.0
-    transport.follow(before.copy())
-    assert np.array_equal(engine.covariance, whole)
-
-
 def no_clock() -> float:
     """Time stands still."""
     return 0.0
 
 
-def calibration_doubts_both(run: RecordedRun, **priors: float) -> list[EstimatedPath]:
+def by_both(run: RecordedRun, **priors: float) -> list[EstimatedPath]:
     """The run by filter and smoother, with other priors."""
-    wide = CONFIG.csv.priors.model_copy(update=priors)
-    cfg = CONFIG.csv.model_copy(update={"priors": wide})
-    return [
-        filter_run(run, cfg, CONFIG.filter, no_clock),
-        smooth(run, cfg, no_clock),
-    ]
+    cfg = CONFIG.csv.model_copy(update={"priors": CONFIG.csv.priors.model_copy(update=priors)})
+    return [filter_run(run, cfg, CONFIG.filter, no_clock), smooth(run, cfg, no_clock)]
 
 
 def test_filter_and_smoother_mean_the_same_by_a_name() -> None:
     run = recorded(world(3, 120.0))
     more = run.steps._replace(distance_m=1.1 * run.steps.distance_m, turn_rad=0.92 * run.steps.turn_rad)
-    tracks = calibration_doubts_both(replace(run, steps=more), distance_scale=0.2, turn_scale=0.2, delay_s=0.2)
+    tracks = by_both(replace(run, steps=more), distance_scale=0.2, turn_scale=0.2, delay_s=0.2)
     for track in tracks:
         assert track.calibration["distance_scale"].value == pytest.approx(0.1, abs=0.03)
         assert track.calibration["turn_scale"].value == pytest.approx(-0.08, abs=0.03)
@@ -517,15 +456,13 @@ def test_a_calibration_that_no_reading_told_is_not_told() -> None:
     assert not {"range_scale", "range_offset_m"} & {*data["calibration"]}
 
 
-@pytest.mark.parametrize("filter_name", ["ekf-slam", "smoother"])
-def test_a_value_that_its_prior_excludes_is_told_with_the_key(filter_name: str) -> None:
+def test_a_value_that_its_prior_excludes_is_told_with_the_key() -> None:
     run = recorded(world(3, 60.0))
     long = replace(run, truth=None, readings=run.readings._replace(range_m=1.4 * run.readings.range_m))
-    track = calibration_doubts_both(long)[filter_name == "smoother"]
-    told = [w for w in track.warnings if w.startswith("range_scale comes out as")]
-    assert len(told) == 1
-    assert "widen csv.priors.range_scale (now 0.05)" in told[0]
-    assert not any("comes out as" in w for w in calibration_doubts_both(run)[filter_name == "smoother"].warnings)
+    for track, sound in zip(by_both(long), by_both(run), strict=True):
+        (told,) = [w for w in track.warnings if w.startswith("range_scale comes out as")]
+        assert "widen csv.priors.range_scale (now 0.05)" in told
+        assert not any("comes out as" in w for w in sound.warnings)
 
 
 def test_names_that_mean_nothing_show_in_the_noise_of_the_smoother() -> None:
