@@ -14,12 +14,12 @@ ROOT = Path(__file__).parents[2]
 # Position of the cause among the arguments, by the name that is called.
 CAUSES = {
     "MonitorFinding": 1, "FixFinding": 1, "_lacking": 1,
-    "fault": 0, "hold": 0, "interrupt": 0, "abort": 0, "_ask_to_hold": 0, "recover": 0,
+    "fault": 0, "hold": 0, "interrupt": 0, "abort": 0, "_request_hold": 0, "recover": 0,
 }  # fmt: skip
 # What the mission makes of a cause, by the name that is called; a finding has its severity with it.
 REACTIONS = {
     "_lacking": "pause", "fault": "fault", "hold": "hold", "interrupt": "pause", "abort": "return",
-    "_ask_to_hold": "hold", "recover": "hold",
+    "_request_hold": "hold", "recover": "hold",
 }  # fmt: skip
 # Causes that stand in tables or in verdicts: file, name, reaction.
 EDGES, CENTRE = ("ccatp/safety/edge_detector.py", "Cause"), ("ccatp/danger.py", "CENTRE")

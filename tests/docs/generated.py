@@ -7,7 +7,7 @@ them with what the code says now.
 import inspect
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import click
@@ -16,7 +16,7 @@ from ccatp.cli import cli
 from ccatp.core import EventCode, Severity
 from ccatp.daemon.supervisor import PROCESSES
 from ccatp.links.topics import TOPICS
-from tests.docs.alarm_scan import ROOT, Cause, causes
+from tests.docs.alarm_scan import ROOT, causes
 
 DOCS = ROOT / "docs"
 MARKED = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- made -->)", re.DOTALL)
@@ -32,69 +32,58 @@ REACTIONS = {
 }
 
 
+def table(head: str, rows: Iterable[Iterable[object]]) -> str:
+    """A table of Markdown; ``head`` is its first line."""
+    lines = [f"| {' | '.join(map(str, row))} |" for row in rows]
+    return "\n".join([head, "|" + "---|" * (head.count("|") - 1), *lines])
+
+
 def alarms() -> str:
     """Every cause with what it means."""
-    known = causes()
+    known, rank = causes(), list(REACTIONS)
     catalogue = tomllib.loads((DOCS / "alarms.toml").read_text(encoding="utf-8"))["group"]
-    return "\n".join(part for group in catalogue for part in _group(group, known))
-
-
-def _group(group: Mapping[str, object], known: Mapping[str, Cause]) -> Iterator[str]:
-    rows = group["alarms"]
-    assert isinstance(rows, Mapping)
-    yield f"## {group['title']}\n"
-    if group["about"]:
-        yield f"{group['about']}\n"
-    yield "| it says | what happens | what it means | what to do |\n|---|---|---|---|"
-    for text, row in rows.items():
-        reactions = known[text].reactions if text in known else frozenset[str]()
-        what = ", or ".join(_reaction(name) for name in sorted(reactions, key=_rank))
-        yield f"| {text} | {what} | {row['means']} | {row['do']} |"
-    yield ""
-
-
-def _rank(name: str) -> int:
-    return list(REACTIONS).index(name)
-
-
-def _reaction(name: str) -> str:
-    return REACTIONS[name]
+    parts = []
+    for group in catalogue:
+        rows = []
+        for text, row in group["alarms"].items():
+            reactions = sorted(known[text].reactions, key=rank.index) if text in known else []
+            rows.append((text, ", or ".join(REACTIONS[name] for name in reactions), row["means"], row["do"]))
+        about = [f"{group['about']}\n"] if group["about"] else []
+        what = "| it says | what happens | what it means | what to do |"
+        parts += [f"## {group['title']}\n", *about, table(what, rows), ""]
+    return "\n".join(parts)
 
 
 def severities() -> str:
     """The severities, least first."""
-    rows = [
-        f"| {int(severity)} | `{severity.name.lower()}` | {REACTIONS[severity.name.lower()]} |" for severity in Severity
-    ]
-    return "\n".join(["| | severity | what happens |", "|---|---|---|", *rows])
+    names = [(severity, severity.name.lower()) for severity in Severity]
+    return table("| | severity | what happens |", [(int(one), f"`{name}`", REACTIONS[name]) for one, name in names])
 
 
 def topics() -> str:
     """The topic table."""
-    lines = ["| topic | from | rate, Hz | stale after, s | recorded | message |", "|---|---|---|---|---|---|"]
+    rows = []
     for topic in TOPICS:
         rate = f"{topic.rate_hz:g}" if topic.rate_hz else "event"
         stale = f"{topic.stale_after_s:g}" if topic.stale_after_s else "\u2013"
-        recorded = "yes" if topic.recorded else "no"
         summary = (topic.message.__doc__ or "").strip().splitlines()[0]
-        lines.append(f"| `{topic.name}` | {topic.publisher} | {rate} | {stale} | {recorded} | {summary} |")
-    return "\n".join(lines)
+        rows.append((f"`{topic.name}`", topic.publisher, rate, stale, "yes" if topic.recorded else "no", summary))
+    return table("| topic | from | rate, Hz | stale after, s | recorded | message |", rows)
 
 
 def processes() -> str:
     """The process table."""
-    lines = ["| process | module | runs | when it dies |", "|---|---|---|---|"]
+    rows = []
     for process in PROCESSES:
         runs = "with `--sim`" if process.is_simulator else "always"
         dies = "restarted" if process.is_replaceable else "the run ends, held"
-        lines.append(f"| {process.name} | `{process.module}` | {runs} | {dies} |")
-    return "\n".join(lines)
+        rows.append((process.name, f"`{process.module}`", runs, dies))
+    return table("| process | module | runs | when it dies |", rows)
 
 
 def codes() -> str:
     """The event codes."""
-    rows = [f"| {int(code)} | {code.name.lower().replace('_', ' ')} |" for code in EventCode]
-    return "\n".join(["| code | |", "|---|---|", *rows])
+    return table("| code | |", [(int(code), code.name.lower().replace("_", " ")) for code in EventCode])
 
 
 def commands() -> str:

@@ -64,7 +64,7 @@ def run_dir(tmp_path: Path) -> Path:
     return make_run(tmp_path / "run", CFG, planned, measured, truth)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES[::3], *(pytest.param(name, marks=pytest.mark.slow) for name in NAMES[1:3])])
 def test_a_survey_recovers_what_was_simulated(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cfg = load_config(overrides={"run.mirror": name, "run.panels": 1, "mission.calibration_length_m": 0.0})
     found = aligned(capsys, surveyed(tmp_path / "run", cfg))
