@@ -76,9 +76,8 @@ def test_a_turn_in_place_sweeps_over_the_gap() -> None:
     assert ours == 0
 
 
-@pytest.mark.parametrize("v_m_s", [0.05, 0.10])
-def test_a_drive_ends_after_threshold_and_run_down(v_m_s: float) -> None:
-    cfg, mirror = loaded("fyst-m1")
+def test_a_drive_ends_after_threshold_and_run_down() -> None:
+    (cfg, mirror), v_m_s = loaded("fyst-m1"), 0.10
     sensor_m, has_fallen = drive_to_rim(mirror, cfg, v_m_s, 0.0, "thesis", np.random.default_rng(2))
     expected_m = v_m_s * (OFF_S + cfg.sim.robot.wheel_lag_s)
     # The verdict waits for the end of its frame, at most 10 ms, and one sample; 5 % for the slope of the surface.

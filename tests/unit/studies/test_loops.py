@@ -30,14 +30,6 @@ def loop(pid: PidConfig, plant: str, lag_s: float = LAG_S, frames: int = 0) -> L
     return open_loop("test", "forward", pid, plant, lag_s, frames, FRAME_S)
 
 
-def test_the_printed_margin_is_the_limit_of_no_lag() -> None:
-    # T = 0: |0.5 + 0.5/(jw)| = 1 at w = 1/sqrt(3), phase -90 + 30 deg.
-    found = margins(loop(FORWARD, "printed", lag_s=1e-6))
-    assert degrees(found.phase_rad) == pytest.approx(120.0, abs=1e-3)  # T w = 6e-7 rad is left
-    assert found.gain_crossover_rad_s == pytest.approx(1.0 / sqrt(3.0), rel=1e-6)
-    assert found.gain_db == inf
-
-
 def test_the_true_plant_has_the_integrator() -> None:
     # |L| = 1: w^4 (1 + T^2 w^2) = 0.25 (w^2 + 1); phase -180 + atan(w) - atan(T w).
     found = margins(loop(FORWARD, "true"))
