@@ -15,11 +15,9 @@ from ccatp.config.models import Config
 Key = tuple[str | int, ...]
 
 _HEADER = re.compile(r"\s*\[\[?\s*(?P<key>[^\[\]]+?)\s*\]\]?\s*(#.*)?$")
-_ASSIGNMENT = re.compile(
-    r"\s*(?P<key>(?:[A-Za-z0-9_-]+|\"[^\"]*\"|'[^']*')(?:\s*\.\s*(?:[A-Za-z0-9_-]+|\"[^\"]*\"|'[^']*'))*)\s*="
-)
-_PART = re.compile(r"[A-Za-z0-9_-]+|\"[^\"]*\"|'[^']*'")
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
+_PART = re.compile(rf"{_BARE.pattern}|\"[^\"]*\"|'[^']*'")
+_ASSIGNMENT = re.compile(rf"\s*(?P<key>(?:{_PART.pattern})(?:\s*\.\s*(?:{_PART.pattern}))*)\s*=")
 _WIDTH = 100
 
 
