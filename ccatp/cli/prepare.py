@@ -88,7 +88,7 @@ def check(
     """
     if not sim and config_file is None:
         raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
-    from ccatp.commissioning.preflight import as_json, failed, has_failed
+    from ccatp.commissioning.preflight import as_json, failed, has_failed, named
     from ccatp.commissioning.probes import probe_all
     from ccatp.config.load import NotASurvey, load_config
 
@@ -97,7 +97,8 @@ def check(
     except NotASurvey:
         raise
     except ConfigError as error:
-        found = [failed("configuration", str(error), "correct it; ccatp config check FILE lists all that is wrong")]
+        todo = "correct it; ccatp config check FILE lists all that is wrong"
+        found = named(configuration=failed(str(error), todo))
     if json_output:
         click.echo(json.dumps(as_json(found)))
     else:
@@ -181,14 +182,12 @@ def calibrate(
         )  # fmt: skip
         if status := run_survey(options):
             raise DriveFailed(status, from_dir)
-    from ccatp.commissioning.calibration import Priors, as_json, check_usable, lines, rows
+    from ccatp.commissioning.calibration import as_json, check_usable, lines, rows
     from ccatp.commissioning.calibration import calibrate as estimate
     from ccatp.commissioning.calibration_drive import read_drive
 
     drive, on_mirror, cfg = read_drive(from_dir)
-    full = cfg.localizer.full_state
-    priors = Priors(cfg.robot.wheel_radius_m, cfg.robot.wheel_base_m, full.gyroscope_scale_sigma, full.creep_sigma)
-    found = estimate(on_mirror, drive, priors)
+    found = estimate(on_mirror, drive, cfg)
     table = rows(_replaced(config_file, cfg), found)
     if not json_output:
         print_lines(lines(table, found))

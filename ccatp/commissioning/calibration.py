@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ccatp.commissioning.calibration_drive import DeadReckonedSegment, RecordedDrive, Segment, WheelParameters, carry
-from ccatp.config.models import Config
+from ccatp.config.models import Config, FullStateConfig, RobotConfig
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.mirror.mirror import Mirror
@@ -36,22 +36,16 @@ class CalibrationError(CcatpError):
     exit_status = ExitStatus.USAGE
 
 
-@dataclass(frozen=True, slots=True)
-class Priors:
-    """What is thought before the drive: where the search begins, without weight, and standard deviations about 0.
+class Estimate(NamedTuple):
+    """A value and its standard deviation."""
 
-    Creep is the downhill drift, part of the way.
-    """
-
-    radius_m: float
-    base_m: float
-    gyro_scale_sigma: float
-    creep_sigma: float
+    value: float
+    sigma: float
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What a drive shows.
+    """What a drive shows: radius and base in m, bias in rad/s, the difference of the radii (right less left) in m.
 
     Attributes:
         covariance: of radius, base and bias, shape (3, 3).
@@ -59,37 +53,31 @@ class Calibration:
         chi2, degrees: of all residuals, with ``slip_sigma`` as it is.
     """
 
-    radius_m: float
-    base_m: float
-    bias_rad_s: float
+    radius: Estimate
+    base: Estimate
+    bias: Estimate
     covariance: FloatArray
-    radius_difference_m: float
-    radius_difference_sigma_m: float
-    gyro_scale: float
-    gyro_scale_sigma: float
-    creep: float
-    creep_sigma: float
+    radius_difference: Estimate
+    gyro_scale: Estimate
+    creep: Estimate
     slip_sigma: float
     chi2: float
     degrees: int
     segments: int
 
-    @property
-    def sigmas(self) -> tuple[float, float, float]:
-        """Standard deviations of radius (m), base (m) and bias (rad/s)."""
-        radius, base, bias = (sqrt(variance) for variance in np.diag(self.covariance))
-        return radius, base, bias
 
-
-def calibrate(mirror: Mirror, drive: RecordedDrive, priors: Priors) -> Calibration:
+def calibrate(mirror: Mirror, drive: RecordedDrive, cfg: Config) -> Calibration:
     """Estimate the parameters.
+
+    The search begins at the configured radius and base, which have no weight; scale of the gyroscope and downhill drift
+    (creep, part of the way) have the configured standard deviations about 0.
 
     Raises:
         CalibrationError: too few segments, or no turns or ways among them.
     """
-    _check(drive, priors)
-    problem = _Problem(mirror, drive, priors)
-    x = _first_guess(mirror, drive, priors)
+    _check(drive, cfg.robot)
+    problem = _Problem(mirror, drive, cfg.localizer.full_state)
+    x = _first_guess(mirror, drive, cfg.robot)
     slip = 0.0
     # The scatter of slip moves the solution, and the solution the scatter: twice is enough.
     for _ in range(2):
@@ -104,31 +92,23 @@ def calibrate(mirror: Mirror, drive: RecordedDrive, priors: Priors) -> Calibrati
     pick[1, BASE] = pick[2, BIAS] = pick[3, RIGHT] = 1.0
     pick[3, LEFT] = -1.0
     values, covariance = pick @ x, pick @ P @ pick.T
+    radius, base, bias, difference = (Estimate(float(v), sqrt(covariance[k, k])) for k, v in enumerate(values))
+    gyro_scale, creep = (Estimate(float(x[k]), sqrt(P[k, k])) for k in (SCALE, CREEP))
     return Calibration(
-        radius_m=float(values[0]),
-        base_m=float(values[1]),
-        bias_rad_s=float(values[2]),
-        covariance=covariance[:3, :3],
-        radius_difference_m=float(values[3]),
-        radius_difference_sigma_m=sqrt(covariance[3, 3]),
-        gyro_scale=float(x[SCALE]),
-        gyro_scale_sigma=sqrt(P[SCALE, SCALE]),
-        creep=float(x[CREEP]),
-        creep_sigma=sqrt(P[CREEP, CREEP]),
-        slip_sigma=slip,
-        chi2=solution.chi2,
-        degrees=solution.degrees,
-        segments=len(drive.segments),
-    )
+        radius, base, bias, covariance[:3, :3], difference, gyro_scale, creep, slip,
+        solution.chi2, solution.degrees, len(drive.segments),
+    )  # fmt: skip
 
 
-def _check(drive: RecordedDrive, priors: Priors) -> None:
+def _check(drive: RecordedDrive, robot: RobotConfig) -> None:
     if len(drive.segments) < MIN_SEGMENTS:
         raise CalibrationError(
             f"the drive has {len(drive.segments)} legs with a fix at each end, {MIN_SEGMENTS} are needed; drive again"
         )
-    turns = [priors.radius_m / priors.base_m * abs(float((s.right_rad - s.left_rad).sum())) for s in drive.segments]
-    ways = [0.5 * priors.radius_m * abs(float((s.right_rad + s.left_rad).sum())) for s in drive.segments]
+    turns = [
+        robot.wheel_radius_m / robot.wheel_base_m * abs(float((s.right_rad - s.left_rad).sum())) for s in drive.segments
+    ]
+    ways = [0.5 * robot.wheel_radius_m * abs(float((s.right_rad + s.left_rad).sum())) for s in drive.segments]
     if max(turns) < MIN_TURN_RAD:
         raise CalibrationError("the drive has no turn by more than a radian: it does not show the wheel base")
     if max(ways) < MIN_WAY_M:
@@ -147,7 +127,7 @@ class _Solution:
 class _Problem:
     mirror: Mirror
     drive: RecordedDrive
-    priors: Priors
+    priors: FullStateConfig
 
     def solve(self, x: FloatArray, slip_sigma: float) -> _Solution:
         for _ in range(_ROUNDS):
@@ -214,16 +194,16 @@ class _Problem:
             jacobian[:, [RIGHT, LEFT, BASE, CREEP]] = -led.of_wheels
             add(jacobian, led.end - x[at + 3 : at + 6], _process_covariance(drive, segment, led, slip_sigma))
             add(*_gyro_row(drive, k, led, x))
-        for index, sigma in ((SCALE, self.priors.gyro_scale_sigma), (CREEP, self.priors.creep_sigma)):
+        for index, sigma in ((SCALE, self.priors.gyroscope_scale_sigma), (CREEP, self.priors.creep_sigma)):
             jacobian = np.zeros((1, size))
             jacobian[0, index] = 1.0
             add(jacobian, -x[[index]], np.array([[sigma**2]]))
         return np.vstack(rows), np.concatenate(residuals)
 
 
-def _first_guess(mirror: Mirror, drive: RecordedDrive, priors: Priors) -> FloatArray:
+def _first_guess(mirror: Mirror, drive: RecordedDrive, robot: RobotConfig) -> FloatArray:
     """Poses from the fixes, headings from the wheels, the first one so that the first way lies along it."""
-    wheels = WheelParameters(priors.radius_m, priors.radius_m, priors.base_m, 0.0)
+    wheels = WheelParameters(robot.wheel_radius_m, robot.wheel_radius_m, robot.wheel_base_m, 0.0)
     poses = np.zeros((len(drive.places), 3))
     poses[:, :2] = [(place.x_m, place.y_m) for place in drive.places]
     went = carry(mirror, drive.segments[0], poses[0], wheels).end[:2] - poses[0, :2]
@@ -231,8 +211,7 @@ def _first_guess(mirror: Mirror, drive: RecordedDrive, priors: Priors) -> FloatA
     poses[0, 2] = np.arctan2(seen[1], seen[0]) - np.arctan2(went[1], went[0])
     for k, segment in enumerate(drive.segments):
         poses[k + 1, 2] = carry(mirror, segment, poses[k], wheels).end[2]
-    parameters = [priors.radius_m, priors.radius_m, priors.base_m, 0.0, 0.0, 0.0]
-    return np.concatenate((parameters, poses.ravel()))
+    return np.concatenate((wheels, [0.0, 0.0], poses.ravel()))
 
 
 def _process_covariance(
@@ -293,11 +272,10 @@ class CalibrationRow(NamedTuple):
 
 def rows(cfg: Config, found: Calibration) -> tuple[CalibrationRow, CalibrationRow, CalibrationRow]:
     """What is configured and what the drive shows."""
-    radius, base, bias = found.sigmas
     return (
-        CalibrationRow("robot.wheel_radius_m", cfg.robot.wheel_radius_m, found.radius_m, radius),
-        CalibrationRow("robot.wheel_base_m", cfg.robot.wheel_base_m, found.base_m, base),
-        CalibrationRow("localizer.gyroscope_bias_rad_s", cfg.localizer.gyroscope_bias_rad_s, found.bias_rad_s, bias),
+        CalibrationRow("robot.wheel_radius_m", cfg.robot.wheel_radius_m, *found.radius),
+        CalibrationRow("robot.wheel_base_m", cfg.robot.wheel_base_m, *found.base),
+        CalibrationRow("localizer.gyroscope_bias_rad_s", cfg.localizer.gyroscope_bias_rad_s, *found.bias),
     )
 
 
@@ -331,14 +309,13 @@ def lines(table: tuple[CalibrationRow, ...], found: Calibration) -> list[str]:
         "  ".join([one[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(one[1:], widths[1:], strict=True))])
         for one in shown
     ]
-    difference, sigma = 1e3 * found.radius_difference_m, 1e3 * found.radius_difference_sigma_m
-    scale, scale_sigma = 100.0 * found.gyro_scale, 100.0 * found.gyro_scale_sigma
+    difference, scale, creep = found.radius_difference, found.gyro_scale, found.creep
     slip = f", slip varies by {100.0 * found.slip_sigma:.2g} % from motion to motion"
     return [
         *text,
-        f"right wheel larger than left by {difference:.4f} +- {sigma:.4f} mm; "
-        f"gyroscope reads {scale:+.2f} +- {scale_sigma:.2f} % too much; "
-        f"downhill drift {100.0 * found.creep:.2f} +- {100.0 * found.creep_sigma:.2f} % of the way",
+        f"right wheel larger than left by {1e3 * difference.value:.4f} +- {1e3 * difference.sigma:.4f} mm; "
+        f"gyroscope reads {100.0 * scale.value:+.2f} +- {100.0 * scale.sigma:.2f} % too much; "
+        f"downhill drift {100.0 * creep.value:.2f} +- {100.0 * creep.sigma:.2f} % of the way",
         f"{found.segments} legs, chi2 {found.chi2:.1f} at {found.degrees} degrees of freedom"
         f"{slip if found.slip_sigma > SHOWN_SLIP else ''}",
     ]
@@ -350,9 +327,9 @@ def as_json(table: tuple[CalibrationRow, ...], found: Calibration) -> dict[str, 
     return {
         "parameters": parameters,
         "covariance": found.covariance.tolist(),
-        "radius_difference_m": [found.radius_difference_m, found.radius_difference_sigma_m],
-        "gyroscope_scale": [found.gyro_scale, found.gyro_scale_sigma],
-        "creep": [found.creep, found.creep_sigma],
+        "radius_difference_m": found.radius_difference,
+        "gyroscope_scale": found.gyro_scale,
+        "creep": found.creep,
         "slip_sigma": found.slip_sigma,
         "chi2": found.chi2,
         "degrees": found.degrees,

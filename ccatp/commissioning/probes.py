@@ -6,7 +6,6 @@ import logging
 import os
 import resource
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -19,7 +18,7 @@ import structlog
 
 from ccatp.commissioning.preflight import (
     LASER_NAMES,
-    ROBOT_NAMES,
+    ROBOT_CHECKS,
     PreflightResult,
     RobotReport,
     check_air,
@@ -27,16 +26,15 @@ from ccatp.commissioning.preflight import (
     check_lasers,
     check_robot,
     failed,
+    named,
     passed,
     skipped,
     warned,
 )
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
-from ccatp.config.package import child_environment
-from ccatp.daemon.child_processes import ENVIRONMENT, listen, simulated_servers, with_addresses
+from ccatp.daemon.child_processes import ProcessManager, ProcessSpec, listen, simulated_servers, with_addresses
 from ccatp.daemon.command_handlers import check_observatory
-from ccatp.daemon.process import SUPERVISOR_PID
 from ccatp.daemon.supervisor import PROCESSES
 from ccatp.errors import CcatpError, ConfigError
 from ccatp.etalon_client import EtalonClient, EtalonError, EtalonUnreachable
@@ -52,7 +50,6 @@ FIRST_FRAME_S = 2.0
 FREE_BYTES = 2_000_000_000
 WRITES, SLOW_WRITE_S = 20, 0.1
 _TIME_ERROR = 5
-STOP_TIMEOUT_S = 5.0
 _LOCAL = ("127.", "localhost", "::1")
 
 
@@ -66,8 +63,11 @@ def probe_all(
     """
     mirror = build_mirror(cfg.mirror)
     where = config_file or "the default one"
-    found = [passed("configuration", f"{where}: mirror {mirror.name}, {len(mirror.panels)} panels")]
-    found += [*probe_machine(cfg, runs_dir, runtime_dir, os.environ), probe_keys(cfg, sim=sim), _observatory(cfg)]
+    found = [
+        *named(configuration=passed(f"{where}: mirror {mirror.name}, {len(mirror.panels)} panels")),
+        *probe_machine(cfg, runs_dir, runtime_dir, os.environ),
+        *named(robot_key=probe_key(cfg, sim=sim), observatory_keys=_observatory(cfg)),
+    ]
 
     async def probe() -> list[PreflightResult]:
         robot, laser = await asyncio.gather(probe_robot(cfg, mirror), probe_laser(cfg, mirror))
@@ -85,7 +85,6 @@ def probe_all(
 @contextmanager
 def _stand_ins(cfg: Config) -> Iterator[Config]:
     """Start the stand-ins, on any free ports and by the wall clock; yields the configuration with their addresses."""
-    processes = [process for process in PROCESSES if process.is_simulator]
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ccatp-")))
         any_port = {part: getattr(cfg.sim, part).model_copy(update={"port": 0}) for part in ("robot", "etalon")}
@@ -95,27 +94,19 @@ def _stand_ins(cfg: Config) -> Iterator[Config]:
         }
         cfg = with_addresses(cfg, sockets)
         (folder / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
-        for process in processes:
+
+        def command_of(process: ProcessSpec, _is_restarted: bool) -> tuple[list[str], tuple[int, ...]]:
             fd = sockets[process.name].fileno()
-            command = [sys.executable, "-m", process.module, "--run-dir", str(folder), "--runtime-dir", str(folder)]
-            child = subprocess.Popen(
-                [*command, "--realtime", "--listen-fd", str(fd)],
-                stdin=subprocess.DEVNULL,
-                stdout=sys.stderr,
-                pass_fds=(fd,),
-                env={**child_environment(os.environ), **ENVIRONMENT, SUPERVISOR_PID: str(os.getpid())},
-            )
-            stack.callback(_end, child)
+            where = ["--run-dir", str(folder), "--runtime-dir", str(folder)]
+            return [*where, "--realtime", "--listen-fd", str(fd)], (fd,)
+
+        children = ProcessManager(cfg.run, command_of, lambda _level, _text: None)
+        stack.callback(children.kill_all)
+        stack.callback(children.stop_all)
+        for process in PROCESSES:
+            if process.is_simulator:
+                children.start(process)
         yield cfg
-
-
-def _end(child: "subprocess.Popen[bytes]") -> None:
-    child.terminate()
-    try:
-        child.wait(STOP_TIMEOUT_S)
-    except subprocess.TimeoutExpired:
-        child.kill()
-        child.wait()
 
 
 async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -> list[PreflightResult]:
@@ -139,11 +130,13 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
         has_changed.set()
         is_lost.set()
 
-    name = "robot link"
+    def without(finding: PreflightResult, why: str) -> list[PreflightResult]:
+        return [*named(robot_link=finding), *skipped(ROBOT_CHECKS, why)]
+
     try:
         key = read_key(cfg.robot.key_file)
     except CcatpError as error:
-        return [failed(name, str(error), "see ccatp keys"), *skipped(ROBOT_NAMES, "no robot link")]
+        return without(failed(str(error), "see ccatp keys"), "no robot link")
     link = RobotLink(
         host=cfg.robot.host, port=cfg.robot.port, role="monitor", client="check", key=key,
         on_sensors=take, on_lost=lose, on_joined=hellos.append,
@@ -157,45 +150,45 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
                 await is_lost.wait()
     except RobotLinkError as error:
         todo = "switch the robot on; check [robot] host, port and key_file; end what else drives it"
-        return [failed(name, str(error), todo), *skipped(ROBOT_NAMES, "no robot link")]
+        return without(failed(str(error), todo), "no robot link")
     finally:
         link.close()
     if lost or not frames:
         why = lost[0] if lost else f"no sensors frame within {FIRST_FRAME_S:g} s"
-        return [failed(name, why, "read the robot's own log"), *skipped(ROBOT_NAMES, "no frames")]
+        return without(failed(why, "read the robot's own log"), "no frames")
     hello = hellos[0]
-    found = passed(name, f"{cfg.robot.host}:{cfg.robot.port}, {hello.protocol}, auth {hello.auth}")
+    found = passed(f"{cfg.robot.host}:{cfg.robot.port}, {hello.protocol}, auth {hello.auth}")
     if hello.auth == "none" and not cfg.robot.host.startswith(_LOCAL):
         todo = "everyone on that network can drive it: give it a key (ccatp keys generate, robot.key_file)"
-        found = warned(name, found.found, todo)
-    return [found, *check_robot(cfg, mirror, RobotReport(hello, frames, arrived_s))]
+        found = warned(found.found, todo)
+    return [*named(robot_link=found), *check_robot(RobotReport(cfg, mirror, hello, frames, arrived_s))]
 
 
 async def probe_laser(cfg: Config, mirror: Mirror) -> list[PreflightResult]:
     """Request state and a fix of the puck from the MultiLine server."""
     quick = cfg.etalon.model_copy(update={"reconnect_for_s": 0.0})
     client = EtalonClient(quick, mirror.channels, mirror.collimators_m)
-    name = "laser server"
     try:
         try:
             readiness = await client.isready()
         except EtalonError as error:
             todo = "start the MultiLine server; check [etalon] host and port"
-            return [failed(name, str(error), todo), *skipped(LASER_NAMES, "no laser server")]
-        found = [
-            passed(name, f"{cfg.etalon.host}:{cfg.etalon.port}"),
-            check_lasers(connected=readiness.connected, laser_ready=readiness.laser_ready),
-            check_air(readiness.environment),
-        ]
+            return [*named(laser_server=failed(str(error), todo)), *skipped(LASER_NAMES, "no laser server")]
         try:
             await asyncio.sleep(cfg.etalon.measuring_time_s)
             fix = await client.measure(0.0, mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m))
         except EtalonUnreachable as error:
-            return [*found, failed("laser fix", str(error), "the server ended; read its log")]
+            at_base = failed(str(error), "the server ended; read its log")
         except EtalonError as error:
-            todo = "set the robot down at base, with a free view for the beams"
-            return [*found, failed("laser fix", str(error), todo)]
-        return [*found, check_fix(cfg, mirror, fix)]
+            at_base = failed(str(error), "set the robot down at base, with a free view for the beams")
+        else:
+            at_base = check_fix(cfg, mirror, fix)
+        return named(
+            laser_server=passed(f"{cfg.etalon.host}:{cfg.etalon.port}"),
+            lasers=check_lasers(connected=readiness.connected, laser_ready=readiness.laser_ready),
+            air=check_air(readiness.environment),
+            laser_fix=at_base,
+        )
     finally:
         await client.close()
 
@@ -204,71 +197,69 @@ def probe_machine(
     cfg: Config, runs_dir: Path, runtime_dir: Path | None, environ: Mapping[str, str]
 ) -> list[PreflightResult]:
     """Clock, disk, runtime directory, real time."""
-    return [_clock(), *_disk(runs_dir), _runtime_dir(cfg, runtime_dir, environ), _real_time(cfg)]
+    return [
+        *named(machine_clock=_clock()),
+        *_disk(runs_dir),
+        *named(runtime_directory=_runtime_dir(cfg, runtime_dir, environ), real_time=_real_time(cfg)),
+    ]
 
 
-def probe_keys(cfg: Config, *, sim: bool) -> PreflightResult:
+def probe_key(cfg: Config, *, sim: bool) -> PreflightResult:
     """The key of the robot link; those of the observatory channel are judged where it is served."""
     try:
         key = read_key(cfg.robot.key_file, must_be_private=not sim)
     except CcatpError as error:
-        return failed("robot key", str(error), "make one with ccatp keys generate, and give the robot the same")
-    return passed("robot key", f"{cfg.robot.key_file}" if key else "none configured")
+        return failed(str(error), "make one with ccatp keys generate, and give the robot the same")
+    return passed(cfg.robot.key_file if key else "none configured")
 
 
 def _observatory(cfg: Config) -> PreflightResult:
-    name = "observatory keys"
     try:
         keys = check_observatory(cfg.observatory)
     except ConfigError as error:
-        return failed(name, str(error), "make them with ccatp keys generate")
+        return failed(str(error), "make them with ccatp keys generate")
     if keys is None:
-        return passed(name, "served at the unix socket alone")
-    return passed(name, f"{cfg.observatory.endpoint}, listed in {cfg.observatory.clients_file}")
+        return passed("served at the unix socket alone")
+    return passed(f"{cfg.observatory.endpoint}, listed in {cfg.observatory.clients_file}")
 
 
 def _clock() -> PreflightResult:
     """Whether the machine's time is synchronised: logs and recordings are compared by it."""
-    name, year = "machine clock", time.gmtime().tm_year
     found = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
-    if year < 2025:
-        return failed(name, found, "set the clock; is its battery empty?")
+    if time.gmtime().tm_year < 2025:
+        return failed(found, "set the clock; is its battery empty?")
     if sys.platform != "linux":
-        return passed(name, found)
+        return passed(found)
     # struct timex is 208 bytes long; with its first field, the modes, zero the state is only read.
     state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(256))
     if state in (-1, _TIME_ERROR):
-        return warned(name, f"{found}, not synchronised", "logs may not fit those of others: start chrony or timesyncd")
-    return passed(name, f"{found}, synchronised")
+        return warned(f"{found}, not synchronised", "logs may not fit those of others: start chrony or timesyncd")
+    return passed(f"{found}, synchronised")
 
 
-def _disk(runs_dir: Path) -> Iterator[PreflightResult]:
+def _disk(runs_dir: Path) -> list[PreflightResult]:
     """Free room and speed where runs are written; ``runs_dir`` itself is made by the first run."""
     place = runs_dir.absolute()
     if place.exists() and not place.is_dir():
-        yield failed("disk", f"{place} is no directory", "name another with --runs-dir")
-        return
+        return named(disk=failed(f"{place} is no directory", "name another with --runs-dir"))
     if not place.is_dir():
         place = place.parent
     if not place.is_dir():
-        yield failed("disk", f"no directory {place} to make {runs_dir.name} in", "make it, or mount the disk it is on")
-        return
+        found = f"no directory {place} to make {runs_dir.name} in"
+        return named(disk=failed(found, "make it, or mount the disk it is on"))
     free = shutil.disk_usage(place).free
-    found = f"{free / 1e9:.1f} GB free in {place}"
+    space = passed(f"{free / 1e9:.1f} GB free in {place}")
     if free < FREE_BYTES:
-        yield failed("disk space", found, f"make room: {FREE_BYTES / 1e9:.0f} GB are a day of recordings")
-    else:
-        yield passed("disk space", found)
+        space = failed(space.found, f"make room: {FREE_BYTES / 1e9:.0f} GB are a day of recordings")
     try:
         slowest_s = _slowest_write_s(place)
     except OSError as error:
-        yield failed("disk writes", f"{place}: {error.strerror}", "let the daemon's user write there, or use --run-dir")
-        return
-    found = f"the slowest of {WRITES} took {1e3 * slowest_s:.1f} ms"
-    if slowest_s > SLOW_WRITE_S:
-        yield warned("disk writes", found, "a point counts when it is on the disk: use a faster one")
+        writes = failed(f"{place}: {error.strerror}", "let the daemon's user write there, or use --run-dir")
     else:
-        yield passed("disk writes", found)
+        writes = passed(f"the slowest of {WRITES} took {1e3 * slowest_s:.1f} ms")
+        if slowest_s > SLOW_WRITE_S:
+            writes = warned(writes.found, "a point counts when it is on the disk: use a faster one")
+    return named(disk_space=space, disk_writes=writes)
 
 
 def _slowest_write_s(folder: Path) -> float:
@@ -284,25 +275,24 @@ def _slowest_write_s(folder: Path) -> float:
 
 
 def _runtime_dir(cfg: Config, runtime_dir: Path | None, environ: Mapping[str, str]) -> PreflightResult:
-    name = "runtime directory"
     try:
         folder = make_runtime_dir(str(runtime_dir or cfg.run.runtime_dir), environ)
     except CcatpError as error:
-        return failed(name, str(error), "choose another with --runtime-dir")
+        return failed(str(error), "choose another with --runtime-dir")
     try:
         with (folder / "lock").open("a") as file:
             flock(file, LOCK_EX | LOCK_NB)
     except OSError:
-        return failed(name, f"a daemon runs in {folder}", "see it with ccatp status; end it with ccatp stop")
-    return passed(name, str(folder))
+        return failed(f"a daemon runs in {folder}", "see it with ccatp status; end it with ccatp stop")
+    return passed(str(folder))
 
 
 def _real_time(cfg: Config) -> PreflightResult:
-    name, priority = "real time", cfg.run.realtime_priority
+    priority = cfg.run.realtime_priority
     if not priority:
-        return passed(name, "not requested (run.realtime_priority = 0)")
+        return passed("not requested (run.realtime_priority = 0)")
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0] if hasattr(resource, "RLIMIT_RTPRIO") else 0
     if os.geteuid() == 0 or limit in (-1, resource.RLIM_INFINITY) or limit >= priority:
-        return passed(name, f"priority {priority} is permitted")
+        return passed(f"priority {priority} is permitted")
     todo = "reaction times hold only while a core is idle: the unit grants it with LimitRTPRIO"
-    return warned(name, f"priority {priority} is not permitted to this user", todo)
+    return warned(f"priority {priority} is not permitted to this user", todo)

@@ -6,10 +6,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from ccatp.commissioning.calibration import Priors
 from ccatp.commissioning.calibration_drive import DriveBuilder, RecordedDrive
 from ccatp.config.load import dump_config, load_config
-from ccatp.config.models import Config
 from ccatp.core import Fix, FloatArray
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_messages import Sensors
@@ -63,11 +61,6 @@ class CalibrationDrive(SilRun):
         return np.array((radius_m, wheels.base_m, self.robot._sensors._imu._wz_bias._value))
 
 
-def priors(cfg: Config) -> Priors:
-    full = cfg.localizer.full_state
-    return Priors(cfg.robot.wheel_radius_m, cfg.robot.wheel_base_m, full.gyroscope_scale_sigma, full.creep_sigma)
-
-
 def record(run_dir: Path, driven: CalibrationDrive) -> Path:
     """A run directory of the drive."""
     run_dir.mkdir(exist_ok=True)
@@ -90,6 +83,3 @@ def record(run_dir: Path, driven: CalibrationDrive) -> Path:
         recorder.write("sensors", batch.t_s, pack("sensors", batch).partition(b" ")[2])
     recorder.close()
     return run_dir
-
-
-__all__ = ["OTHER_ROBOT", "CalibrationDrive", "priors", "record"]
