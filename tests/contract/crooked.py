@@ -6,6 +6,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, asynccontextmanager
+from functools import partial
 from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -17,6 +18,7 @@ from ccatp.sim.rules import FanRules, MotionRules
 
 Message = dict[str, Any]
 STOP_S = 10.0
+STEP_S, MOST_S = 0.005, 0.02  # of the clock of the servers
 
 
 class Crooked(NamedTuple):
@@ -24,7 +26,7 @@ class Crooked(NamedTuple):
 
     Attributes:
         name: what is wrong with it.
-        fails: the checks that have to find it; all others of ``runs`` have to pass.
+        fails: the checks that have to find it, parted by blanks; all others of ``runs`` have to pass.
         runs: the checks that run.
         says: changes a message of the robot; returns it, bytes of its own, or nothing.
         hears: changes what a client sent, as it came.
@@ -32,8 +34,8 @@ class Crooked(NamedTuple):
     """
 
     name: str
-    fails: frozenset[str]
-    runs: tuple[str, ...]
+    fails: str = ""
+    runs: tuple[str, ...] = ()
     says: Callable[[Message, "Middle"], Message | bytes | None] | None = None
     hears: Callable[[bytes, "Middle"], bytes] | None = None
     twist: Callable[[DataLoop], object] | None = None
@@ -84,35 +86,26 @@ class CrookedLoop(DataLoop):
         return Middle(self)
 
 
-class ServerClock:
-    """Time as the server gets it: what passes while its event loop waits for a processor does not count.
-
-    The patience of the checks is for a silent server and not for a busy machine.
-    """
-
-    STEP_S, MOST_S = 0.005, 0.02
-
-    def __init__(self) -> None:
-        self.now_s = time.monotonic()
-
-    def monotonic(self) -> float:
-        return self.now_s
-
-    async def run(self) -> None:
-        before_s = time.monotonic()
-        while True:
-            await asyncio.sleep(self.STEP_S)
-            now_s = time.monotonic()
-            self.now_s += min(now_s - before_s, self.MOST_S)
-            before_s = now_s
-
-
 @asynccontextmanager
 async def server_time(*modules: ModuleType) -> AsyncIterator[None]:
-    """Let the checks in these modules wait by the clock of the event loop that serves the robots."""
-    clock = ServerClock()
-    running = asyncio.create_task(clock.run())
-    seen = SimpleNamespace(monotonic=clock.monotonic, sleep=time.sleep)
+    """Let the checks in these modules wait by the clock of the event loop that serves the robots.
+
+    What passes while that loop waits for a processor does not count: the patience of the checks is for a silent server
+    and not for a busy machine.
+    """
+    now_s = time.monotonic()
+
+    async def run() -> None:
+        nonlocal now_s
+        before_s = time.monotonic()
+        while True:
+            await asyncio.sleep(STEP_S)
+            seen_s = time.monotonic()
+            now_s += min(seen_s - before_s, MOST_S)
+            before_s = seen_s
+
+    running = asyncio.create_task(run())
+    seen = SimpleNamespace(monotonic=lambda: now_s, sleep=time.sleep)
     try:
         with ExitStack() as stack:
             for module in modules:
@@ -122,7 +115,7 @@ async def server_time(*modules: ModuleType) -> AsyncIterator[None]:
         running.cancel()
 
 
-HONEST = Crooked("honest", frozenset(), ())
+HONEST = Crooked("honest")
 
 
 def of(kind: str, change: Callable[[Message, Middle], object]) -> Callable[[Message, Middle], Message]:
@@ -146,16 +139,15 @@ def swap(old: bytes, new: bytes) -> Callable[[bytes, Middle], bytes]:
     return lambda data, _: data.replace(old, new)
 
 
-def rules(**methods: Any) -> Callable[[DataLoop], None]:
-    """Other rules of motion."""
-    return lambda loop: setattr(
-        loop.robot.rules, "__class__", type("Other", (MotionRules,), {"__slots__": (), **methods})
-    )
+def _other(part: str, base: type, **methods: Any) -> Callable[[DataLoop], None]:
+    def twist(loop: DataLoop) -> None:
+        getattr(loop.robot, part).__class__ = type("Other", (base,), {"__slots__": (), **methods})
+
+    return twist
 
 
-def fans(**methods: Any) -> Callable[[DataLoop], None]:
-    """Other rules of the fans."""
-    return lambda loop: setattr(loop.robot.fans, "__class__", type("Other", (FanRules,), {"__slots__": (), **methods}))
+rules = partial(_other, "rules", MotionRules)  # other rules of motion, by method
+fans = partial(_other, "fans", FanRules)
 
 
 def around(path: str, new: Callable[..., Any]) -> Callable[[DataLoop], None]:
@@ -208,9 +200,3 @@ async def checked(
 
         with ThreadPoolExecutor(1) as own:  # the common one has too few threads for servers side by side
             return await asyncio.get_running_loop().run_in_executor(own, run)
-
-
-async def failures(config: Config, crooked: Crooked, *, lockstep: bool, key: bytes | None = None) -> dict[str, str]:
-    """What failed, and by what was seen."""
-    results = await checked(config, crooked.runs, lockstep=lockstep, timeout_s=1.0, key=key, crooked=crooked)
-    return {result.check_id: result.detail for result in results if result.outcome == "fail"}

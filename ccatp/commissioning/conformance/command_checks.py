@@ -25,13 +25,13 @@ from ccatp.commissioning.conformance.harness import (
     NotApplicable,
     Pair,
     require,
-    steady_pair,
+    steady,
 )
 from ccatp.links.robot_codec import format_drive
 from ccatp.links.robot_messages import MAX_LINE_BYTES
 
 CHECKS = CheckList()
-check = CHECKS.add
+check, check_steady = CHECKS.add, CHECKS.using(steady)
 AFTER_TTL_S = 0.3  # watched beyond the time-to-live
 SHORT_S = 0.12  # wall time in which a message on loopback or a local network has arrived, below every useful ttl_s
 NOISE_S = 0.08  # between bad lines: fewer than 20 a second
@@ -61,29 +61,27 @@ def _always_held(key: Key, context: CheckContext) -> str:
     return f"held in {len(late)} frames with no {key}"
 
 
-def _ttl(key: Key, context: CheckContext) -> str:
-    pair = steady_pair(context)
+def _ttl(key: Key, pair: ControllerAndMonitor) -> str:
     pair.withhold(key)
-    frames = pair.run(context.facts.ttl_s + AFTER_TTL_S)
-    return check_ttl(frames, key, context.facts.ttl_s, context.facts.frame_s)
+    frames = pair.run(pair.facts.ttl_s + AFTER_TTL_S)
+    return check_ttl(frames, key, pair.facts.ttl_s, pair.facts.frame_s)
 
 
 check("no-permit", "once a monitor has joined, wheels are held without its permit", "real time")(
     partial(_always_held, "permit")
 )
 check("no-drive", "wheels are held without a drive", "real time")(partial(_always_held, "drive"))
-check("ttl-drive", "a drive is in force for ttl_s", "real time")(partial(_ttl, "drive"))
-check("ttl-permit", "a permit is in force for ttl_s", "real time")(partial(_ttl, "permit"))
+check_steady("ttl-drive", "a drive is in force for ttl_s", "real time")(partial(_ttl, "drive"))
+check_steady("ttl-permit", "a permit is in force for ttl_s", "real time")(partial(_ttl, "permit"))
 
 
-@check("ttl-noise", "a bad line never refreshes a time-out", "real time")
-def _noise_is_no_drive(context: CheckContext) -> str:
-    pair = steady_pair(context)
-    facts = context.facts
+@check_steady("ttl-noise", "a bad line never refreshes a time-out", "real time")
+def _noise_is_no_drive(pair: ControllerAndMonitor) -> str:
+    facts = pair.facts
     pair.rates = None
     first, begin_s = len(pair.frames), pair.newest.t
     while pair.newest.t < begin_s + facts.ttl_s + AFTER_TTL_S:
-        seq, ack = context.next_seq(), pair.newest.seq
+        seq, ack = pair.context.next_seq(), pair.newest.seq
         pair.controller.send(b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":"0"}\n' % (seq, ack))
         pair.run(NOISE_S)
     return check_ttl(pair.frames[first:], "drive", facts.ttl_s, facts.frame_s)
@@ -108,11 +106,10 @@ def check_ttl(frames: Sequence[Frame], key: Key, ttl_s: float, frame_s: float) -
     return f"held at a {key} age of {held_s:.3f} s, ttl_s {ttl_s:g}"
 
 
-@check("newest-drive", "a drive with an older or equal seq is dropped")
-def _newest_drive(context: CheckContext) -> str:
-    pair = steady_pair(context)
-    is_lockstep = context.facts.lockstep
-    newest = context.next_seq()
+@check_steady("newest-drive", "a drive with an older or equal seq is dropped")
+def _newest_drive(pair: ControllerAndMonitor) -> str:
+    is_lockstep = pair.facts.lockstep
+    newest = pair.context.next_seq()
     old = newest - 1
     pair.rates = None
     first = len(pair.frames)
@@ -122,7 +119,7 @@ def _newest_drive(context: CheckContext) -> str:
     pair.drive(old)
     _pause_and_settle(pair)
     check_newest(pair.frames[first:], newest, old)
-    again, first = context.next_seq(), len(pair.frames)
+    again, first = pair.context.next_seq(), len(pair.frames)
     pair.rates = None
     pair.drive(again)
     if is_lockstep:
@@ -135,7 +132,7 @@ def _newest_drive(context: CheckContext) -> str:
     pair.pause(SHORT_S)
     pair.answer_again()
     _pause_and_settle(pair)
-    check_once(pair.frames[first:], again, context.facts.frame_s)
+    check_once(pair.frames[first:], again, pair.facts.frame_s)
     return f"drive {old} after {newest} and a second {again} dropped"
 
 
@@ -166,21 +163,20 @@ def check_once(frames: Sequence[Frame], seq: int, frame_s: float) -> None:
     require(spread_s <= 0.5 * frame_s, f"a second drive {seq} came into force {1e3 * spread_s:.0f} ms after the first")
 
 
-@check("newest-permit", "a permit with an older or equal seq is dropped")
-def _newest_permit(context: CheckContext) -> str:
-    pair = steady_pair(context)
-    newest = context.next_seq()
+@check_steady("newest-permit", "a permit with an older or equal seq is dropped")
+def _newest_permit(pair: ControllerAndMonitor) -> str:
+    newest = pair.context.next_seq()
     pair.allowed = None
     pair.permit(newest)
-    if context.facts.lockstep:
+    if pair.facts.lockstep:
         in_force = _answered_frame(pair)
     else:
         pair.run(SHORT_S)
         in_force = pair.expect(lambda frame: frame.cmd.permit_age > 0.0, "permits do not age")
     # The age shows which permit is in force.
-    latest_s = in_force.arrival_s("permit") + 0.5 * context.facts.frame_s
+    latest_s = in_force.arrival_s("permit") + 0.5 * pair.facts.frame_s
     for seq in (newest - 1, newest):
-        if context.facts.lockstep:
+        if pair.facts.lockstep:
             pair.drive()
         pair.permit(seq)
         is_dropped = all(frame.arrival_s("permit") <= latest_s for frame in pair.pause(SHORT_S))
@@ -190,14 +186,13 @@ def _newest_permit(context: CheckContext) -> str:
     return f"permit {newest - 1} after {newest} and a second {newest} dropped"
 
 
-@check("role-drive", "drives are the controller's")
-def _wrong_role(context: CheckContext) -> str:
-    pair = steady_pair(context)
+@check_steady("role-drive", "drives are the controller's")
+def _wrong_role(pair: ControllerAndMonitor) -> str:
     seq = pair.newest.cmd.seq + AHEAD  # once obeyed it stays the newest for a while
     pair.monitor.send(b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":0.0}\n' % (seq, pair.newest.seq))
-    pair.find(lambda frame: frame.cmd.seq == seq, 10 * context.facts.frame_s)
+    pair.find(lambda frame: frame.cmd.seq == seq, 10 * pair.facts.frame_s)
     require(pair.newest.cmd.seq != seq, f"drive {seq} of the monitor came into force")
-    context.last_seq = max(context.last_seq, seq)
+    pair.context.last_seq = max(pair.context.last_seq, seq)
     pair.settle()
     return "a drive of the monitor does nothing"
 
@@ -209,7 +204,8 @@ def _lost(key: Key, ending: Ending, context: CheckContext) -> str:
     """The session that sends one of the two ends, and the other sends a last message right behind."""
     witness: Key = "permit" if key == "drive" else "drive"
     for _ in range(ATTEMPTS):
-        frames = _end(steady_pair(context), key, witness, ending)
+        with steady(context) as (pair,):
+            frames = _end(pair, key, witness, ending)
         seen = check_lost(frames, witness, context.facts.ttl_s, context.facts.frame_s)
         if seen is not None:
             return seen
@@ -253,14 +249,12 @@ def check_lost(frames: Sequence[Frame], witness: Key, ttl_s: float, frame_s: flo
     return f"held {max(0.0, 1e3 * (first.t - arrival_s)):.0f} ms after the end of the session"
 
 
-def _add_lost(role: str, key: Key) -> None:
-    for ending in ENDINGS:
-        promise = f"the {role}'s lost session holds the wheels within 50 ms"
-        check(f"lost-{role}-{ending.lower()}", promise, "real time")(partial(_lost, key, ending))
-
-
-_add_lost("controller", "drive")
-_add_lost("monitor", "permit")
+LOST: tuple[tuple[str, Key], ...] = (("controller", "drive"), ("monitor", "permit"))
+for _role, _key in LOST:
+    for _ending in ENDINGS:
+        check(
+            f"lost-{_role}-{_ending.lower()}", f"the {_role}'s lost session holds the wheels within 50 ms", "real time"
+        )(partial(_lost, _key, _ending))
 
 # -- fans -------------------------------------------------------------------------------------------------------------
 
@@ -284,6 +278,9 @@ def _changed_fans(context: CheckContext) -> Iterator[tuple[ControllerAndMonitor,
             pair.expect(lambda frame: frame.has_fans((left, right)), "")
 
 
+check_fans = CHECKS.using(_changed_fans)
+
+
 def other_duty(duty: Pair, lowest: float) -> Pair:
     """Duties that differ from these, and are allowed; ``NotApplicable`` where there are none."""
     if lowest > 1.0 - FAN_STEP:
@@ -301,69 +298,63 @@ def _shown(duty: Sequence[float]) -> str:
     return f"[{duty[0]:.3g}, {duty[1]:.3g}]"
 
 
-@check("fans", "duties stay in force until changed")
-def _fans_obeyed(context: CheckContext) -> str:
-    with _changed_fans(context) as (pair, duty):
-        pair.settle()
-        _check_unchanged(pair.settle(), duty, "by themselves")
-        return f"fans at {_shown(duty)}"
+@check_fans("fans", "duties stay in force until changed")
+def _fans_obeyed(pair: ControllerAndMonitor, duty: Pair) -> str:
+    pair.settle()
+    _check_unchanged(pair.settle(), duty, "by themselves")
+    return f"fans at {_shown(duty)}"
 
 
-@check("newest-fans", "a fans command with an older or equal seq is dropped")
-def _newest_fans(context: CheckContext) -> str:
-    with _changed_fans(context) as (pair, duty):
-        last = pair.fans(duty)
-        pair.settle()
-        other = other_duty(duty, context.facts.robot.fan_floor)
-        for seq in (last - 1, last):
-            pair.fans(other, seq)
-            _check_unchanged([*pair.settle(), *pair.run_frames(2)], duty, f"by command {seq} after {last}")
-        return f"commands {last - 1} and {last} after {last} dropped"
+@check_fans("newest-fans", "a fans command with an older or equal seq is dropped")
+def _newest_fans(pair: ControllerAndMonitor, duty: Pair) -> str:
+    last = pair.fans(duty)
+    pair.settle()
+    other = other_duty(duty, pair.facts.robot.fan_floor)
+    for seq in (last - 1, last):
+        pair.fans(other, seq)
+        _check_unchanged([*pair.settle(), *pair.run_frames(2)], duty, f"by command {seq} after {last}")
+    return f"commands {last - 1} and {last} after {last} dropped"
 
 
-@check("role-fans", "fans are the controller's")
-def _fans_of_the_monitor(context: CheckContext) -> str:
-    with _changed_fans(context) as (pair, duty):
-        left, right = other_duty(duty, context.facts.robot.fan_floor)
-        pair.monitor.send(b'{"type":"fans","seq":%d,"duty":[%.3f,%.3f]}\n' % (context.next_seq(), left, right))
-        _check_unchanged([*pair.run_frames(10), *pair.settle()], duty, "by a command of the monitor")
-        return "a command of the monitor does nothing"
+@check_fans("role-fans", "fans are the controller's")
+def _fans_of_the_monitor(pair: ControllerAndMonitor, duty: Pair) -> str:
+    left, right = other_duty(duty, pair.facts.robot.fan_floor)
+    pair.monitor.send(b'{"type":"fans","seq":%d,"duty":[%.3f,%.3f]}\n' % (pair.context.next_seq(), left, right))
+    _check_unchanged([*pair.run_frames(10), *pair.settle()], duty, "by a command of the monitor")
+    return "a command of the monitor does nothing"
 
 
-@check("fans-ttl", "fans are never changed by a time-out", "real time")
-def _fans_after_time_out(context: CheckContext) -> str:
-    silence_s = context.facts.ttl_s + AFTER_TTL_S
-    with _changed_fans(context) as (pair, duty):
-        pair.rates = pair.allowed = None
-        _check_unchanged(pair.run(silence_s), duty, "by a time-out")
-        return f"{_shown(duty)} over {silence_s:.2f} s without drive and permit"
+@check_fans("fans-ttl", "fans are never changed by a time-out", "real time")
+def _fans_after_time_out(pair: ControllerAndMonitor, duty: Pair) -> str:
+    silence_s = pair.facts.ttl_s + AFTER_TTL_S
+    pair.rates = pair.allowed = None
+    _check_unchanged(pair.run(silence_s), duty, "by a time-out")
+    return f"{_shown(duty)} over {silence_s:.2f} s without drive and permit"
 
 
-@check("fans-stop", "fans are never changed by a stop")
-def _fans_after_stop(context: CheckContext) -> str:
-    with _changed_fans(context) as (pair, duty):
-        pair.allowed = NOTHING
-        _check_unchanged(pair.run_frames(10), duty, "by a permit that allows nothing")
-        return f"{_shown(duty)} while nothing is allowed"
+@check_fans("fans-stop", "fans are never changed by a stop")
+def _fans_after_stop(pair: ControllerAndMonitor, duty: Pair) -> str:
+    pair.allowed = NOTHING
+    _check_unchanged(pair.run_frames(10), duty, "by a permit that allows nothing")
+    return f"{_shown(duty)} while nothing is allowed"
 
 
-def _fans_after_lost(ending: Ending, context: CheckContext) -> str:
+def _fans_after_lost(ending: Ending, pair: ControllerAndMonitor, duty: Pair) -> str:
     """Both sessions end, one after the other, and join again."""
-    with _changed_fans(context) as (pair, duty):
-        pair.controller.end(ending)
-        if not context.facts.lockstep:  # there the monitor sees no frame without the controller
-            pair.rates = None
-            _check_unchanged(pair.run_frames(10), duty, f"by a lost controller ({ending})")
-        pair.monitor.end(ending)
-        pair.rejoin()
-        first = len(pair.frames)
-        pair.steady()
-        _check_unchanged(pair.frames[first:], duty, f"by lost sessions ({ending})")
-        return f"{_shown(duty)} after {ending}"
+    pair.controller.end(ending)
+    if not pair.facts.lockstep:  # there the monitor sees no frame without the controller
+        pair.rates = None
+        _check_unchanged(pair.run_frames(10), duty, f"by a lost controller ({ending})")
+    pair.monitor.end(ending)
+    pair.rejoin()
+    first = len(pair.frames)
+    pair.steady()
+    _check_unchanged(pair.frames[first:], duty, f"by lost sessions ({ending})")
+    return f"{_shown(duty)} after {ending}"
 
 
-check("fans-fin", "fans are never changed by a lost session")(partial(_fans_after_lost, "FIN"))
-check("fans-rst", "fans are never changed by a lost session")(partial(_fans_after_lost, "RST"))
+check_fans("fans-fin", "fans are never changed by a lost session")(partial(_fans_after_lost, "FIN"))
+check_fans("fans-rst", "fans are never changed by a lost session")(partial(_fans_after_lost, "RST"))
 
 
 @check("fan-floor", "a duty below fan_floor is clamped to it, without a fault")
@@ -399,10 +390,9 @@ BAD_DRIVES: dict[str, tuple[str, bytes]] = {
 }  # fmt: skip
 
 
-def _dropped(template: bytes, context: CheckContext) -> str:
+def _dropped(template: bytes, pair: ControllerAndMonitor) -> str:
     """A bad drive with the higher number in front of a good one: only if it is dropped does the good one count."""
-    pair = steady_pair(context)
-    good = context.next_seq()
+    good = pair.context.next_seq()
     bad = good + 1
     pair.drive(good, before=template % (bad, pair.newest.seq))
     frame = pair.echoed(good, bad, otherwise="the good drive behind it was not obeyed")
@@ -412,26 +402,26 @@ def _dropped(template: bytes, context: CheckContext) -> str:
 
 
 for _check_id, (_promise, _template) in BAD_DRIVES.items():
-    check(_check_id, _promise)(partial(_dropped, _template))
+    check_steady(_check_id, _promise)(partial(_dropped, _template))
 
 
-@check("unknown-key", "unknown keys are ignored")
-def _unknown_key(context: CheckContext) -> str:
+@check_steady("unknown-key", "unknown keys are ignored")
+def _unknown_key(pair: ControllerAndMonitor) -> str:
     line = b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":0.0,"colour":"red","more":{"x":[1,2,null]}}\n'
-    _check_obeyed(context, lambda seq, ack: line % (seq, ack), "a drive with unknown keys was not obeyed")
+    _check_obeyed(pair, lambda seq, ack: line % (seq, ack), "a drive with unknown keys was not obeyed")
     return "a drive with unknown keys is obeyed"
 
 
-@check("unknown-type", "an unknown type is ignored, and no bad line")
-def _unknown_type(context: CheckContext) -> str:
+@check_steady("unknown-type", "an unknown type is ignored, and no bad line")
+def _unknown_type(pair: ControllerAndMonitor) -> str:
     # More lines at once than bad ones are allowed in a second.
-    _check_tolerated(context, b'{"type":"dance","seq":7,"partner":null}\n' * STRANGERS)
+    _check_tolerated(pair, b'{"type":"dance","seq":7,"partner":null}\n' * STRANGERS)
     return f"{STRANGERS} lines of an unknown type, the session goes on"
 
 
-@check("bad-lines-few", "20 bad lines in a second do not close the session")
-def _few_bad_lines(context: CheckContext) -> str:
-    _check_tolerated(context, b"garbage\n" * TOLERATED)
+@check_steady("bad-lines-few", "20 bad lines in a second do not close the session")
+def _few_bad_lines(pair: ControllerAndMonitor) -> str:
+    _check_tolerated(pair, b"garbage\n" * TOLERATED)
     return f"{TOLERATED} bad lines at once, the session goes on"
 
 
@@ -443,13 +433,13 @@ def _many_bad_lines(context: CheckContext) -> str:
     return f"{TOLERATED + 1} bad lines at once close the session"
 
 
-@check("line-longest", "a line holds up to 8192 bytes")
-def _longest_line(context: CheckContext) -> str:
+@check_steady("line-longest", "a line holds up to 8192 bytes")
+def _longest_line(pair: ControllerAndMonitor) -> str:
     def line(seq: int, ack: int) -> bytes:
         head = format_drive(seq, ack, 0.0, 0.0)[:-2] + b',"note":"'
         return head + b"x" * (MAX_LINE_BYTES - len(head) - 3) + b'"}\n'
 
-    _check_obeyed(context, line, f"a drive of {MAX_LINE_BYTES} bytes was not obeyed")
+    _check_obeyed(pair, line, f"a drive of {MAX_LINE_BYTES} bytes was not obeyed")
     return f"a drive of {MAX_LINE_BYTES} bytes is obeyed"
 
 
@@ -470,21 +460,20 @@ def _single_bytes(context: CheckContext) -> str:
         time.sleep(BYTE_S)
     require(context.answer(connection)["type"] == "joined", "a join in single bytes is refused")
     context.clear()
-    pair = steady_pair(context)
-    seq = context.next_seq()
-    for byte in format_drive(seq, pair.newest.seq, 0.0, 0.0):
-        pair.controller.send(bytes((byte,)))
-        pair.pause(BYTE_S)
-    pair.mark_driven()
-    pair.echoed(seq, otherwise="a drive in single bytes was not obeyed")
+    with steady(context) as (pair,):
+        seq = context.next_seq()
+        for byte in format_drive(seq, pair.newest.seq, 0.0, 0.0):
+            pair.controller.send(bytes((byte,)))
+            pair.pause(BYTE_S)
+        pair.mark_driven()
+        pair.echoed(seq, otherwise="a drive in single bytes was not obeyed")
     return "join and drive obeyed"
 
 
-@check("many-lines", "one object a line, however many come at once")
-def _many_lines(context: CheckContext) -> str:
-    pair = steady_pair(context)
-    before, first = pair.newest.seq - 1, context.next_seq()
-    last = context.last_seq = first + CROWD - 1
+@check_steady("many-lines", "one object a line, however many come at once")
+def _many_lines(pair: ControllerAndMonitor) -> str:
+    before, first = pair.newest.seq - 1, pair.context.next_seq()
+    last = pair.context.last_seq = first + CROWD - 1
     # Only the last answers the newest frame: where time waits for that, it waits for all of them.
     crowd = b"".join(format_drive(seq, before, 0.0, 0.0) for seq in range(first, last))
     pair.drive(last, before=crowd)
@@ -492,29 +481,26 @@ def _many_lines(context: CheckContext) -> str:
     return f"the last of {CROWD} drives obeyed"
 
 
-@check("glued-lines", "one object a line, however TCP glues them")
-def _glued_lines(context: CheckContext) -> str:
-    pair = steady_pair(context)
+@check_steady("glued-lines", "one object a line, however TCP glues them")
+def _glued_lines(pair: ControllerAndMonitor) -> str:
     left, right = pair.newest.fans
-    seq = context.next_seq()
-    fans = b'{"type":"fans","seq":%d,"duty":[%.6f,%.6f]}\n' % (context.next_seq(), left, right)
+    seq = pair.context.next_seq()
+    fans = b'{"type":"fans","seq":%d,"duty":[%.6f,%.6f]}\n' % (pair.context.next_seq(), left, right)
     pair.drive(seq, before=b'{"type":"dance"}\n' + fans)
     pair.echoed(seq, otherwise="a drive behind two other lines was not obeyed")
     return "a drive behind two other lines is obeyed"
 
 
-def _check_obeyed(context: CheckContext, line: Callable[[int, int], bytes], otherwise: str) -> None:
+def _check_obeyed(pair: ControllerAndMonitor, line: Callable[[int, int], bytes], otherwise: str) -> None:
     """Send a drive as it is, and answer frames until it is echoed."""
-    pair = steady_pair(context)
-    seq = context.next_seq()
+    seq = pair.context.next_seq()
     pair.controller.send(line(seq, pair.newest.seq))
     pair.mark_driven()
     pair.echoed(seq, otherwise=otherwise)
 
 
-def _check_tolerated(context: CheckContext, lines: bytes) -> None:
+def _check_tolerated(pair: ControllerAndMonitor, lines: bytes) -> None:
     """Send lines that change nothing, and go on."""
-    pair = steady_pair(context)
     pair.controller.send(lines)
     pair.run_frames(5)
     pair.settle()

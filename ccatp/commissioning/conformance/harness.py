@@ -8,8 +8,8 @@ import select
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -47,6 +47,8 @@ class NotApplicable(Exception):
 
 
 Run = Callable[["CheckContext"], str]
+FixtureRun = Callable[..., str]
+Fixture = Callable[["CheckContext"], AbstractContextManager[tuple[Any, ...]]]
 
 
 class Check(NamedTuple):
@@ -69,6 +71,22 @@ class CheckList(list[Check]):
             return run
 
         return append
+
+    def using(self, fixture: Fixture) -> Callable[..., Callable[[FixtureRun], FixtureRun]]:
+        """A decorator as ``add``, for functions that take what a fixture gives them."""
+
+        def add(check_id: str, promise: str, *needs: Need) -> Callable[[FixtureRun], FixtureRun]:
+            def append(run: FixtureRun) -> FixtureRun:
+                @self.add(check_id, promise, *needs)
+                def _(context: CheckContext) -> str:
+                    with fixture(context) as given:
+                        return run(*given)
+
+                return run
+
+            return append
+
+        return add
 
 
 def require(is_kept: bool, seen: str) -> None:
@@ -546,8 +564,9 @@ class ControllerAndMonitor:
         return len(self.frames) > before
 
 
-def steady_pair(context: CheckContext) -> ControllerAndMonitor:
+@contextmanager
+def steady(context: CheckContext) -> Iterator[tuple[ControllerAndMonitor]]:
     """Both sessions joined, with drive and permit in force."""
     pair = ControllerAndMonitor(context)
     pair.steady()
-    return pair
+    yield (pair,)

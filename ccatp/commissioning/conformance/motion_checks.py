@@ -18,12 +18,12 @@ from ccatp.commissioning.conformance.harness import (
     NotApplicable,
     Pair,
     require,
-    steady_pair,
+    steady,
     whole_samples,
 )
 
 CHECKS = CheckList()
-check = CHECKS.add
+check_steady = CHECKS.using(steady)
 WAIT_S = 0.3  # wall time in which a frame would have come
 BEYOND_TTL_S = 0.2
 RATE_RAD_S = 0.5
@@ -36,27 +36,24 @@ SHARE = 0.3  # of the set point: above it turns, below it stands
 # -- lockstep ---------------------------------------------------------------------------------------------------------
 
 
-@check("lockstep-drive", "time waits for a drive with ack = k", "lockstep")
-def _waits_for_drive(context: CheckContext) -> str:
-    pair = steady_pair(context)
+@check_steady("lockstep-drive", "time waits for a drive with ack = k", "lockstep")
+def _waits_for_drive(pair: ControllerAndMonitor) -> str:
     pair.permit()
     require(not pair.pause(WAIT_S), "a frame without a drive for the one before")
     pair.next_frame("no frame on drive and permit")
     return "no frame on a permit alone, one on permit and drive"
 
 
-@check("lockstep-permit", "once a monitor has joined, time waits for a permit with ack = k", "lockstep")
-def _waits_for_permit(context: CheckContext) -> str:
-    pair = steady_pair(context)
+@check_steady("lockstep-permit", "once a monitor has joined, time waits for a permit with ack = k", "lockstep")
+def _waits_for_permit(pair: ControllerAndMonitor) -> str:
     pair.drive()
     require(not pair.pause(WAIT_S), "a frame without a permit for the one before")
     pair.next_frame("no frame on permit and drive")
     return "no frame on a drive alone, one on drive and permit"
 
 
-@check("lockstep-ack", "only answers to frame k advance the clock", "lockstep")
-def _waits_for_this_frame(context: CheckContext) -> str:
-    pair = steady_pair(context)
+@check_steady("lockstep-ack", "only answers to frame k advance the clock", "lockstep")
+def _waits_for_this_frame(pair: ControllerAndMonitor) -> str:
     pair.run_frames(2)
     before = pair.newest.seq - 1
     pair.drive(ack=before)
@@ -66,9 +63,8 @@ def _waits_for_this_frame(context: CheckContext) -> str:
     return "no frame on answers to an older one"
 
 
-@check("lockstep-step", "the clock advances to k+1", "lockstep")
-def _one_step(context: CheckContext) -> str:
-    pair = steady_pair(context)
+@check_steady("lockstep-step", "the clock advances to k+1", "lockstep")
+def _one_step(pair: ControllerAndMonitor) -> str:
     before_s = pair.newest.t
     require(not pair.pause(WAIT_S), "a second frame on one drive and one permit")
     pair.drive()
@@ -76,21 +72,22 @@ def _one_step(context: CheckContext) -> str:
     frames = pair.pause(WAIT_S)
     require(len(frames) == 1, f"{len(frames)} frames on one drive and one permit")
     step_s = frames[0].t - before_s
-    require(abs(step_s - context.facts.frame_s) < 0.5 * context.facts.frame_s, f"a step of {step_s:.4f} s")
+    require(abs(step_s - pair.facts.frame_s) < 0.5 * pair.facts.frame_s, f"a step of {step_s:.4f} s")
     return f"one frame on one drive and one permit, {1e3 * step_s:.3g} ms on"
 
 
-@check("lockstep-ages", "ages are measured on the simulated clock; a client may hold its answer back", "lockstep")
-def _time_stands_still(context: CheckContext) -> str:
-    pair = steady_pair(context)
+@check_steady(
+    "lockstep-ages", "ages are measured on the simulated clock; a client may hold its answer back", "lockstep"
+)
+def _time_stands_still(pair: ControllerAndMonitor) -> str:
     before = pair.newest.cmd
-    wait_s = context.facts.ttl_s + BEYOND_TTL_S
+    wait_s = pair.facts.ttl_s + BEYOND_TTL_S
     require(not pair.pause(wait_s), "frames while the answer is held back")
     after = pair.next_frame("no frame on an answer that was held back").cmd
     ages = f"{after.age:.3f} and {after.permit_age:.3f} s"
     require(not after.held, f"held after {wait_s:.2f} s of waiting, ages {ages}")
     grown_s = max(after.age - before.age, after.permit_age - before.permit_age)
-    require(grown_s < context.facts.frame_s * 1.5, f"ages grew by {grown_s:.3f} s while time stood still")
+    require(grown_s < pair.facts.frame_s * 1.5, f"ages grew by {grown_s:.3f} s while time stood still")
     return f"{wait_s:.2f} s of waiting, the ages {ages}"
 
 
@@ -132,62 +129,62 @@ DIRECTIONS: tuple[tuple[str, str, Pair, Allowed, Allowed], ...] = (
 )  # fmt: skip
 
 
-def _direction(shares: Pair, allowed: Allowed, denied: Allowed, context: CheckContext) -> str:
-    """A drive that is denied, then the same allowed."""
-    rate_rad_s = _rate(context.facts)
-    rates = rate_rad_s * shares[0], rate_rad_s * shares[1]
-    with _at_rest(context) as pair:
-        pair.allowed = denied
-        pair.settle()
-        pair.rates = rates
-        pair.settle()
-        frames = pair.run(DENIED_S)
-        is_held = all(frame.cmd.held for frame in frames)
-        require(is_held, f"{rates[0]:g}, {rates[1]:g} rad/s not held although {_named(denied)} is allowed")
-        require(_is_still(frames, rate_rad_s), f"wheels turn although only {_named(denied)} is allowed")
-        pair.rates = STILL
-        pair.settle()
-        seen = _move(pair, rates, allowed)
-        return f"held when denied; allowed, the wheels turn at {seen[0]:.2f}, {seen[1]:.2f} rad/s"
-
-
-for _check_id, _promise, _shares, _allowed, _denied in DIRECTIONS:
-    check(_check_id, _promise, "motion")(partial(_direction, _shares, _allowed, _denied))
-
-
-@check("wheels-ttl", "wheels stop when the drive is older than ttl_s", "motion", "real time")
-def _stops_after_ttl(context: CheckContext) -> str:
-    with _at_rest(context) as pair:
-        rate_rad_s = _rate(context.facts)
-        _move(pair, (rate_rad_s, rate_rad_s), ALL)
-        pair.rates = None
-        pair.run(context.facts.ttl_s)
-        return _stopped(pair, "of the last drive's time-to-live")
-
-
-@check("wheels-lost", "wheels stop when the controller's session is lost", "motion", "real time")
-def _stops_when_lost(context: CheckContext) -> str:
-    with _at_rest(context) as pair:
-        rate_rad_s = _rate(context.facts)
-        _move(pair, (-rate_rad_s, -rate_rad_s), ALL)
-        pair.rates = None
-        pair.controller.end("FIN")
-        return _stopped(pair, "of the controller's session")
-
-
 @contextmanager
-def _at_rest(context: CheckContext) -> Iterator[ControllerAndMonitor]:
+def _at_rest(context: CheckContext) -> Iterator[tuple[ControllerAndMonitor]]:
     """Both sessions, with the wheels at rest before and after, whatever happens."""
     pair = ControllerAndMonitor(context)
     try:
         pair.steady()
         pair.expect(lambda _: _is_still(pair.frames[-WINDOW:], _rate(pair.facts)), "wheels turn at a drive of zero")
-        yield pair
+        yield (pair,)
     finally:
         pair.rates = STILL
         with suppress(CheckFailed):
             if not pair.controller.is_ended:
                 pair.steady()
+
+
+check_at_rest = CHECKS.using(_at_rest)
+
+
+def _direction(shares: Pair, allowed: Allowed, denied: Allowed, pair: ControllerAndMonitor) -> str:
+    """A drive that is denied, then the same allowed."""
+    rate_rad_s = _rate(pair.facts)
+    rates = rate_rad_s * shares[0], rate_rad_s * shares[1]
+    pair.allowed = denied
+    pair.settle()
+    pair.rates = rates
+    pair.settle()
+    frames = pair.run(DENIED_S)
+    is_held = all(frame.cmd.held for frame in frames)
+    require(is_held, f"{rates[0]:g}, {rates[1]:g} rad/s not held although {_named(denied)} is allowed")
+    require(_is_still(frames, rate_rad_s), f"wheels turn although only {_named(denied)} is allowed")
+    pair.rates = STILL
+    pair.settle()
+    seen = _move(pair, rates, allowed)
+    return f"held when denied; allowed, the wheels turn at {seen[0]:.2f}, {seen[1]:.2f} rad/s"
+
+
+for _check_id, _promise, _shares, _allowed, _denied in DIRECTIONS:
+    check_at_rest(_check_id, _promise, "motion")(partial(_direction, _shares, _allowed, _denied))
+
+
+@check_at_rest("wheels-ttl", "wheels stop when the drive is older than ttl_s", "motion", "real time")
+def _stops_after_ttl(pair: ControllerAndMonitor) -> str:
+    rate_rad_s = _rate(pair.facts)
+    _move(pair, (rate_rad_s, rate_rad_s), ALL)
+    pair.rates = None
+    pair.run(pair.facts.ttl_s)
+    return _stopped(pair, "of the last drive's time-to-live")
+
+
+@check_at_rest("wheels-lost", "wheels stop when the controller's session is lost", "motion", "real time")
+def _stops_when_lost(pair: ControllerAndMonitor) -> str:
+    rate_rad_s = _rate(pair.facts)
+    _move(pair, (-rate_rad_s, -rate_rad_s), ALL)
+    pair.rates = None
+    pair.controller.end("FIN")
+    return _stopped(pair, "of the controller's session")
 
 
 def _move(pair: ControllerAndMonitor, rates: Pair, allowed: Allowed) -> Pair:

@@ -3,7 +3,8 @@
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from statistics import median
 from typing import Annotated, Any, Literal, NoReturn
@@ -28,14 +29,14 @@ from ccatp.commissioning.conformance.harness import (
     parse,
     require,
     shorten,
-    steady_pair,
+    steady,
     whole_samples,
 )
 from ccatp.links.robot_codec import encode, join_mac
 from ccatp.links.robot_messages import MAX_LINE_BYTES, PROTOCOL, Drive, Role
 
 CHECKS = CheckList()
-check = CHECKS.add
+check, check_steady = CHECKS.add, CHECKS.using(steady)
 CONNECTIONS = 8
 JOIN_S = 2.0
 IN_TIME_S, LATE_S = 1.0, 2.1  # after the hello
@@ -179,20 +180,19 @@ def _role_taken(context: CheckContext) -> str:
     return seen
 
 
-@check("refused-harmless", "a refused client never disturbs the holder")
-def _refused_is_harmless(context: CheckContext) -> str:
-    pair = steady_pair(context)
-    facts = context.facts
+@check_steady("refused-harmless", "a refused client never disturbs the holder")
+def _refused_is_harmless(pair: ControllerAndMonitor) -> str:
+    facts = pair.facts
     first = len(pair.frames)
     refused = 0
     for role in ROLES:
         for line in (None, b'{"type":"join","role":"king","client":"conformance"}\n'):
-            connection, hello = context.greet()
+            connection, hello = pair.context.greet()
             pair.run_frames(2)
             if not facts.lockstep:
                 pair.rates = pair.allowed = None  # what was sent has to last
-            connection.send(context.join_line(hello, role) if line is None else line)
-            require(context.is_closed(connection), "a refused client's connection stays open")
+            connection.send(pair.context.join_line(hello, role) if line is None else line)
+            require(pair.context.is_closed(connection), "a refused client's connection stays open")
             refused += 1
             pair.run_frames(3)
             pair.rates, pair.allowed = STILL, ALL
@@ -207,13 +207,14 @@ def _refused_is_harmless(context: CheckContext) -> str:
     return f"{refused} refused, {len(pair.frames) - first} frames of the holders go on"
 
 
-@check("take-over", "a role may be taken over after 5 s without a valid line of its holder, not before", "real time")
-def _take_over(context: CheckContext) -> str:
-    pair = steady_pair(context)
+@check_steady(
+    "take-over", "a role may be taken over after 5 s without a valid line of its holder, not before", "real time"
+)
+def _take_over(pair: ControllerAndMonitor) -> str:
     pair.rates = None
     silent_s = pair.newest.t
     _send_bad_lines(pair, silent_s + STILL_HELD_S)
-    _, answer = context.request("controller")
+    _, answer = pair.context.request("controller")
     pair.pause(0.0)
     if answer["type"] == "joined":
         early_s = pair.newest.t - silent_s
@@ -222,7 +223,7 @@ def _take_over(context: CheckContext) -> str:
     _send_bad_lines(pair, silent_s + TAKEN_S)
     try:
         # Not for long: now the holder is silent altogether.
-        context.join("controller", retry_s=0.2 * SILENCE_S)
+        pair.context.join("controller", retry_s=0.2 * SILENCE_S)
     except CheckFailed as failed:
         late_s = pair.newest.t - silent_s
         raise CheckFailed(f"{failed} after {late_s:.2f} s without a valid line of its holder") from None
@@ -306,26 +307,26 @@ class _FaultsPart(Part):
     faults: list[FaultName]
 
 
-def _record(context: CheckContext) -> ControllerAndMonitor:
+@contextmanager
+def _recorded(context: CheckContext) -> Iterator[tuple[ControllerAndMonitor]]:
     pair = ControllerAndMonitor(context)
     pair.run_frames(FRAMES)
     require(len(pair.messages[0]) > 2, "fewer than three frames for the controller")
-    return pair
+    yield (pair,)
 
 
-def _recorded(check_id: str, promise: str) -> Callable[[Callable[[Frames], str]], Callable[[Frames], str]]:
-    """Decorator: a check of the frames that the controller received."""
-
-    def append(judge: Callable[[Frames], str]) -> Callable[[Frames], str]:
-        check(check_id, promise)(lambda context: judge(_record(context).messages[0]))
-        return judge
-
-    return append
+@contextmanager
+def _received(context: CheckContext) -> Iterator[tuple[Frames]]:
+    with _recorded(context) as (pair,):
+        yield (pair.messages[0],)
 
 
-@check("frames-lines", "one JSON object a line, finite numbers, no key twice, at most 8192 bytes")
-def _lines(context: CheckContext) -> str:
-    raw = _record(context).raw
+check_recorded, check_frames = CHECKS.using(_recorded), CHECKS.using(_received)
+
+
+@check_recorded("frames-lines", "one JSON object a line, finite numbers, no key twice, at most 8192 bytes")
+def _lines(pair: ControllerAndMonitor) -> str:
+    raw = pair.raw
     for line in raw:
         fault = line_fault(line, MAX_LINE_BYTES)
         require(fault is None, str(fault))
@@ -357,7 +358,7 @@ def line_fault(line: bytes, limit_bytes: int) -> str | None:
     return None if isinstance(value, dict) else f"no object: {shorten(line)}"
 
 
-@_recorded("frames-seq", "seq of the frames increases")
+@check_frames("frames-seq", "seq of the frames increases")
 def _seq(frames: Frames) -> str:
     numbers = [frame["seq"] for frame in frames]
     for before, after in pairwise(numbers):
@@ -365,9 +366,9 @@ def _seq(frames: Frames) -> str:
     return f"{numbers[0]} to {numbers[-1]} in {len(frames)} frames"
 
 
-@check("frames-clock", "t is a monotonic clock in seconds; frames come at frame_hz")
-def _clock(context: CheckContext) -> str:
-    return check_clock(_record(context).messages[0], context.facts.frame_hz)
+@check_recorded("frames-clock", "t is a monotonic clock in seconds; frames come at frame_hz")
+def _clock(pair: ControllerAndMonitor) -> str:
+    return check_clock(pair.messages[0], pair.facts.frame_hz)
 
 
 def check_clock(frames: Frames, frame_hz: float) -> str:
@@ -383,14 +384,14 @@ def check_clock(frames: Frames, frame_hz: float) -> str:
     return seen
 
 
-@_recorded("frames-samples", "imu, enc and edge are lists of samples, each with its time")
+@check_frames("frames-samples", "imu, enc and edge are lists of samples, each with its time")
 def _shapes(frames: Frames) -> str:
     for frame in frames:
         parse(_SamplesPart, frame)
     return ", ".join(f"{sum(len(frame[name]) for frame in frames)} {name}" for name in MOST_HZ) + " samples"
 
 
-@_recorded("frames-times", "a list holds the samples since the last frame, oldest first")
+@check_frames("frames-times", "a list holds the samples since the last frame, oldest first")
 def _times(frames: Frames) -> str:
     for name in MOST_HZ:
         latest_s = -math.inf
@@ -403,7 +404,7 @@ def _times(frames: Frames) -> str:
     return f"in order and within their frames, {len(frames) - 1} frames"
 
 
-@_recorded("frames-rates", "IMU up to 100 Hz, encoders and edge sensors up to 1000 Hz")
+@check_frames("frames-rates", "IMU up to 100 Hz, encoders and edge sensors up to 1000 Hz")
 def _rates(frames: Frames) -> str:
     span_s = frames[-1]["t"] - frames[0]["t"]
     seen = []
@@ -418,7 +419,7 @@ def _samples(frame: Message, name: str) -> list[list[float]]:
     return whole_samples(frame.get(name), 5 if name == "edge" else 3)
 
 
-@_recorded("frames-edge", "edge values are 0 or 1")
+@check_frames("frames-edge", "edge values are 0 or 1")
 def check_edges(frames: Frames) -> str:
     """Values of the edge sensors."""
     samples = [sample for frame in frames for sample in _samples(frame, "edge")]
@@ -429,7 +430,7 @@ def check_edges(frames: Frames) -> str:
     return f"{len(samples)} samples of 0 and 1, the last {samples[-1][1:]}"
 
 
-@_recorded("frames-gravity", "gravity is null, or a time and a unit vector")
+@check_frames("frames-gravity", "gravity is null, or a time and a unit vector")
 def check_gravity(frames: Frames) -> str:
     """Gravity: null, or a time and a unit vector."""
     found = [gravity for frame in frames if (gravity := parse(_GravityPart, frame).gravity) is not None]
@@ -439,19 +440,19 @@ def check_gravity(frames: Frames) -> str:
     return f"{len(found)} unit vectors in {len(frames)} frames"
 
 
-@_recorded("frames-state", "fans and soc are within 0 and 1")
+@check_frames("frames-state", "fans and soc are within 0 and 1")
 def _state(frames: Frames) -> str:
     states = [parse(_StatePart, frame) for frame in frames]
     return f"fans {states[-1].fans}, charge {states[-1].soc:g}"
 
 
-@_recorded("frames-faults", "faults holds names out of the page's list")
+@check_frames("frames-faults", "faults holds names out of the page's list")
 def _faults(frames: Frames) -> str:
     seen = {name for frame in frames for name in parse(_FaultsPart, frame).faults}
     return f"faults: {', '.join(sorted(seen)) or 'none'}"
 
 
-@_recorded("frames-cmd", "cmd holds seq, age, permit_age and held")
+@check_frames("frames-cmd", "cmd holds seq, age, permit_age and held")
 def _command(frames: Frames) -> str:
     for frame in frames:
         for name in ("age", "permit_age"):
@@ -459,9 +460,9 @@ def _command(frames: Frames) -> str:
     return f"the last {frames[-1]['cmd']}"
 
 
-@check("frames-all", "every frame goes to every joined session")
-def _to_both(context: CheckContext) -> str:
-    return check_both(*_record(context).messages)
+@check_recorded("frames-all", "every frame goes to every joined session")
+def _to_both(pair: ControllerAndMonitor) -> str:
+    return check_both(*pair.messages)
 
 
 def check_both(of_controller: Frames, of_monitor: Frames) -> str:
@@ -476,21 +477,19 @@ def check_both(of_controller: Frames, of_monitor: Frames) -> str:
     return f"{len(one)} frames, the same for both"
 
 
-@check("frames-joined", "frames go to joined sessions only")
-def _before_join(context: CheckContext) -> str:
-    onlooker, _ = context.greet()
-    pair = steady_pair(context)
+@check_steady("frames-joined", "frames go to joined sessions only")
+def _before_join(pair: ControllerAndMonitor) -> str:
+    onlooker, _ = pair.context.greet()
     pair.run_frames(10)
     require(not any(b'"sensors"' in line for line in onlooker.lines), "sensors frames before the join")
     return f"none in {len(pair.frames)} frames"
 
 
-@check("echo", "cmd echoes the newest drive in force and its age")
-def _echo(context: CheckContext) -> str:
-    pair = steady_pair(context)
+@check_steady("echo", "cmd echoes the newest drive in force and its age")
+def _echo(pair: ControllerAndMonitor) -> str:
     frames = [*pair.run_frames(20), *pair.settle()]
     for before, after in pairwise(frames):
         require(after.cmd.seq >= before.cmd.seq, f"cmd.seq {after.cmd.seq} after {before.cmd.seq}")
     ages_s = [frame.cmd.age for frame in frames[-10:]]
-    require(max(ages_s) < context.facts.ttl_s, f"cmd.age {max(ages_s):.3f} s with a new drive for each frame")
+    require(max(ages_s) < pair.facts.ttl_s, f"cmd.age {max(ages_s):.3f} s with a new drive for each frame")
     return f"drive {pair.newest.cmd.seq} in force, age {ages_s[-1]:.3f} s"
