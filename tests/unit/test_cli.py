@@ -111,6 +111,10 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
     assert importlib.metadata.version("click")  # the only package that help and version need
 
 
+# What takes a name; none that no file may have.
+NAMING = (["report"], ["replay"], ["map"], ["run", "--sim", "--mirror"], ["run", "--sim", "--world"])
+
+
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
@@ -118,10 +122,7 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
         (["sim", "robto"], "ccatp: no command 'robto'; did you mean robot?; see ccatp sim --help\n"),
         (["sim", "zzz"], "ccatp: no command 'zzz'; there are etalon, robot; see ccatp sim --help\n"),
         (["run"], "ccatp: name the robot's configuration with --config FILE, or add --sim; see ccatp run --help\n"),
-        (
-            ["run", "--sim", "--resume"],
-            "ccatp: --resume needs a run directory; name it with --run-dir; see ccatp run --help\n",
-        ),
+        (["run", "--sim", "--resume"], "--resume needs a run directory; name it with --run-dir; see ccatp run"),
         (["sim", "etalon", "--puck", "1", "2", "3", "--truth", "ipc://x"], "--puck and --truth exclude each other"),
         (["sim", "etalon", "--puck", "nan", "0", "0"], "each of X Y Z is a number of metres, at most 1000 from the"),
         (["sim", "etalon", "--puck", "0", "0", "-inf"], "each of X Y Z is a number of metres"),
@@ -138,23 +139,20 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
         (["recording", "recover", "x"], "the command 'recover' is now called 'repair'"),
         (["map", "x"], "the command 'map' is now called 'plot'"),
         (["run", "--sim", "--seed", "one"], "'one' is not a valid integer"),
-        (
-            ["run", "--config", "telescope.toml", "--faults", "plan.toml"],
-            "--faults needs --sim: faults are for the simulated robot, never for a real one",
-        ),
-        (
-            ["run", "--sim", "--faults", "none.toml"],
-            "ccatp: none.toml: no such file or directory; name a TOML file that",
-        ),
-        (
-            ["sim", "robot", "--faults", "none.toml"],
-            "ccatp: none.toml: no such file or directory; name a TOML file that",
-        ),
+        (["run", "--config", "a.toml", "--faults", "plan.toml"], "--faults needs --sim: faults are for the simulated"),
+        (["run", "--sim", "--faults", "none.toml"], "ccatp: none.toml: no such file or directory; name a TOML file"),
+        (["sim", "robot", "--faults", "none.toml"], "ccatp: none.toml: no such file or directory; name a TOML file"),
         (["emergency", "fier"], "'fier' is none of fire, earthquake, power, weather, operator; did you mean fire?"),
         (
             ["config", "check", "none.toml"],
             "ccatp: none.toml: no such file or directory; name a TOML file that exists\n",
         ),
+        (["conformance", "7010"], "'7010' is not HOST:PORT, as in 127.0.0.1:7010"),
+        (["conformance", "host:70100"], "'host:70100' is not HOST:PORT"),
+        (["conformance", "127.0.0.1:7010", "--only", "ttl-drve"], "no check 'ttl-drve'; did you mean ttl-drive?"),
+        (["conformance", "127.0.0.1:7010", "--only", "zzz"], "no check 'zzz'; there are hello,"),
+        (["completion", "bahs"], "did you mean bash?"),
+        *(([*command, 300 * "x"], "ccatp: ") for command in NAMING),
     ],
 )
 def test_misuse_is_one_line_and_exit_2(argv: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -166,8 +164,13 @@ def test_misuse_is_one_line_and_exit_2(argv: list[str], message: str, capsys: py
     assert not out
 
 
-@pytest.mark.parametrize("time_s", ["0", "-1", "nan", "inf", "1e300", "soon"])
-@pytest.mark.parametrize("command", [["status"], ["pause"], ["emergency", "fire"], ["conformance", "127.0.0.1:7010"]])
+@pytest.mark.parametrize(
+    ("command", "time_s"),
+    [
+        *((["status"], time_s) for time_s in ("0", "-1", "nan", "inf", "1e300", "soon")),
+        *((command, "0") for command in (["pause"], ["emergency", "fire"], ["conformance", "127.0.0.1:7010"])),
+    ],
+)
 def test_a_time_to_wait_is_finite_and_more_than_none(
     command: list[str], time_s: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -182,7 +185,7 @@ def test_no_command_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert "Usage: ccatp" in capsys.readouterr().err
 
 
-def test_run_hands_over_what_was_asked_for(stub: Stub, tmp_path: Path) -> None:
+def test_run_hands_over_what_was_asked_for_and_nothing_else(stub: Stub, tmp_path: Path) -> None:
     calls = stub("ccatp.daemon.supervisor", "run", 3)
     argv = "run --sim --mirror fyst-m2 --world thesis-x2 --filter kf --panels 4 --seed 2 --realtime --json"
     more = ["--run-dir", str(tmp_path), "--runtime-dir", "/run/x", "--set", "limits.v_max_m_s=0.05"]
@@ -191,24 +194,11 @@ def test_run_hands_over_what_was_asked_for(stub: Stub, tmp_path: Path) -> None:
         "run.mirror": "fyst-m2", "run.world": "thesis-x2", "run.seed": 2, "run.panels": 4, "run.filter": "kf",
         "limits.v_max_m_s": 0.05,
     }  # fmt: skip
-    assert calls == [
-        (
-            RunOptions(
-                sim=True,
-                overrides=overrides,
-                realtime=True,
-                run_dir=tmp_path,
-                json_output=True,
-                runtime_dir=Path("/run/x"),
-            ),
-        )
-    ]
-
-
-def test_run_says_nothing_of_what_was_not_asked_for(stub: Stub) -> None:
-    calls = stub("ccatp.daemon.supervisor", "run", 0)
-    assert main(["run", "--config", "mine.toml"]) == 0
-    assert calls == [(RunOptions(sim=False, config_file=Path("mine.toml")),)]
+    asked = RunOptions(
+        sim=True, overrides=overrides, realtime=True, run_dir=tmp_path, json_output=True, runtime_dir=Path("/run/x")
+    )
+    assert main(["run", "--config", "mine.toml"]) == 3
+    assert calls == [(asked,), (RunOptions(sim=False, config_file=Path("mine.toml")),)]
 
 
 def test_a_resumed_run_takes_the_configuration_of_its_directory(stub: Stub) -> None:
@@ -244,27 +234,27 @@ def test_the_operator_commands_ask_the_daemon(
     assert capsys.readouterr().out == "state        driving\npoints.done  3\neta_s        -\n"
 
 
-def test_status_as_json_is_the_answer_and_nothing_else(
-    router: Router, daemon_dir: Path, capsys: pytest.CaptureFixture[str]
+def test_an_answer_may_be_shown_as_json_or_be_empty(
+    router: Router, daemon_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     reply = {"ok": True, "state": "driving", "error_mm": 0.25}
     router(reply)
-    assert main(["status", "--json", "--runtime-dir", str(daemon_dir)]) == 0
-    assert json.loads(capsys.readouterr().out) == reply
-
-
-def test_an_answer_without_content_is_ok(router: Router, daemon_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    calls = router({"ok": True})
+    (tmp_path / "mine.toml").write_text(f'[run]\nruntime_dir = "{daemon_dir}"\n')
+    for where in (["--runtime-dir", str(daemon_dir)], ["--config", str(tmp_path / "mine.toml")]):
+        assert main(["status", "--json", *where]) == 0
+        assert json.loads(capsys.readouterr().out) == reply
+    router({"ok": True})
     assert main(["pause"]) == 0
-    assert calls[0][0] == f"ipc://{daemon_dir}/control"
     assert capsys.readouterr().out == "ok\n"
 
 
-def test_an_emergency_goes_to_the_danger_process(router: Router, daemon_dir: Path) -> None:
-    calls = router({"ok": True, "id": EMERGENCY_ID, "latched": True, "code": 2})
+def test_an_emergency_goes_to_the_danger_process_with_an_id_of_its_own(router: Router, daemon_dir: Path) -> None:
+    calls = router({"ok": True, "id": "the same", "latched": True, "code": 2})
     assert main(["emergency", "fire", "--note", "smoke", "--id", EMERGENCY_ID]) == 0
     payload = {"cmd": "emergency", "kind": "fire", "id": EMERGENCY_ID, "note": "smoke"}
     assert calls == [(f"ipc://{daemon_dir}/emergency", payload)]
+    assert main(["emergency", "power"]) == main(["emergency", "power"]) == 0
+    assert len({asked["id"] for _, asked in calls}) == 3
 
 
 @pytest.mark.parametrize(
@@ -288,28 +278,6 @@ def test_an_emergency_that_is_not_in_force_is_no_success(
     assert said.err.count("\n") == 1
 
 
-def test_each_emergency_has_its_own_id(router: Router, daemon_dir: Path) -> None:
-    calls = router({"ok": True, "id": "the same", "latched": True, "code": 2})
-    assert main(["emergency", "power"]) == main(["emergency", "power"]) == 0
-    assert calls[0][0] == f"ipc://{daemon_dir}/emergency"
-    assert calls[0][1]["id"] != calls[1][1]["id"]
-
-
-def test_the_runtime_directory_may_come_from_the_configuration(
-    router: Router, daemon_dir: Path, tmp_path: Path
-) -> None:
-    calls = router({"ok": True})
-    (tmp_path / "mine.toml").write_text(f'[run]\nruntime_dir = "{daemon_dir}"\n')
-    assert main(["status", "--config", str(tmp_path / "mine.toml")]) == 0
-    assert calls[0][0] == f"ipc://{daemon_dir}/control"
-
-
-def test_no_daemon_is_one_line_and_exit_5(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["status", "--runtime-dir", str(tmp_path)]) == 5
-    expected = f"ccatp: no daemon in {tmp_path}; start one with ccatp run, or name its folder with --runtime-dir\n"
-    assert capsys.readouterr().err == expected
-
-
 def test_a_silent_daemon_is_one_line_and_exit_5(daemon_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (daemon_dir / "control").unlink()
     with socket.socket(socket.AF_UNIX) as silent:
@@ -328,38 +296,24 @@ def test_a_refusal_tells_the_reason(router: Router, daemon_dir: Path, capsys: py
 def test_the_robot_alone_gets_its_address(stub: Stub) -> None:
     calls = stub("ccatp.daemon.sim_robot", "run_alone", 0)
     argv = "sim robot --host 0.0.0.0 --port 0 --mirror fyst-m2 --seed 4 --lockstep --set sim.open_to_network=true"
-    assert main(argv.split()) == 0
-    cfg, options = calls[0]
+    assert main(argv.split()) == main(["sim", "robot"]) == 0
+    (cfg, options), (_, usual) = calls
     assert isinstance(cfg, Config)
     assert (cfg.sim.robot.host, cfg.sim.robot.port, cfg.mirror.name, cfg.run.seed) == ("0.0.0.0", 0, "fyst-m2", 4)
     assert options == {"lockstep": True, "faults": None, "runtime_dir": None}
-
-
-def test_the_robot_alone_is_paced_unless_told_otherwise(stub: Stub) -> None:
-    calls = stub("ccatp.daemon.sim_robot", "run_alone", 0)
-    assert main(["sim", "robot"]) == 0
-    assert calls[0][1] == {"lockstep": False, "faults": None, "runtime_dir": None}
+    assert usual == {"lockstep": False, "faults": None, "runtime_dir": None}  # paced unless told otherwise
 
 
 def test_two_robots_alone_want_two_places(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with locked(tmp_path / TRUTH_LOCK_FILE, ""):
         tmp_path.chmod(0o700)
-        for command in (
-            ["sim", "robot", "--port", "0"],
-            ["sim", "robot", "--config", str(configs_dir() / "zigbee.toml")],
-        ):
-            assert main([*command, "--runtime-dir", str(tmp_path)]) == 1
+        for option in (["--port", "0"], ["--config", str(configs_dir() / "zigbee.toml")]):
+            assert main(["sim", "robot", *option, "--runtime-dir", str(tmp_path)]) == 1
             err = capsys.readouterr().err
             assert err.startswith(f"ccatp: another simulated robot uses {tmp_path}; end it, or give this")
             assert err.count("\n") == 1
         assert main(["run", "--sim", "--runtime-dir", str(tmp_path)]) == 1
         assert f"a simulated robot runs alone in {tmp_path}" in capsys.readouterr().err
-
-
-def test_the_laser_system_follows_the_robot_of_a_place(stub: Stub, tmp_path: Path) -> None:
-    calls = stub("ccatp.daemon.sim_etalon", "run_alone", 0)
-    assert main(["sim", "etalon", "--runtime-dir", str(tmp_path)]) == 0
-    assert calls[0][2] == f"ipc://{tmp_path}/puck"
 
 
 def test_a_daemon_that_is_gone_is_told_at_once(
@@ -370,17 +324,19 @@ def test_a_daemon_that_is_gone_is_told_at_once(
         assert main(["status"]) == 0
     capsys.readouterr()
     assert main(["status"]) == 5
-    assert capsys.readouterr().err.startswith(f"ccatp: no daemon in {daemon_dir}; start one")
+    expected = f"ccatp: no daemon in {daemon_dir}; start one with ccatp run, or name its folder with --runtime-dir\n"
+    assert capsys.readouterr().err == expected
     assert len(calls) == 1
 
 
-def test_the_laser_system_alone_gets_its_puck(stub: Stub) -> None:
+def test_the_laser_system_alone_gets_its_puck(stub: Stub, tmp_path: Path) -> None:
     calls = stub("ccatp.daemon.sim_etalon", "run_alone", 0)
     argv = "sim etalon --port 2002 --puck 0.1 -0.5 3.4 --set etalon.retries=1"
-    assert main(argv.split()) == 0
-    cfg, puck, truth = calls[0]
+    assert main(argv.split()) == main(["sim", "etalon", "--runtime-dir", str(tmp_path)]) == 0
+    (cfg, *where), (_, *of_robot) = calls
     assert (cfg.sim.etalon.port, cfg.etalon.retries) == (2002, 1)
-    assert (puck, truth) == ((0.1, -0.5, 3.4), None)
+    assert where == [(0.1, -0.5, 3.4), None]
+    assert of_robot == [None, f"ipc://{tmp_path}/puck"]
 
 
 def test_a_good_configuration_is_called_ok(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -402,16 +358,6 @@ def test_config_check_lists_every_problem(tmp_path: Path, capsys: pytest.Capture
     ]
 
 
-def test_a_map_of_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["plot", str(tmp_path)]) == 2
-    assert "no config.toml there" in capsys.readouterr().err
-
-
-def test_the_schema_is_json(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["config", "schema"]) == 0
-    assert json.loads(capsys.readouterr().out)["title"] == "ccatp configuration"
-
-
 @pytest.mark.parametrize(
     ("text", "setting"),
     [
@@ -431,16 +377,6 @@ def test_settings_are_toml_or_text(text: str, setting: tuple[str, object]) -> No
 def test_a_setting_needs_key_and_value(text: str) -> None:
     with pytest.raises(ValueError, match=r"is not KEY=VALUE, as in run\.seed=2"):
         parse_setting(text)
-
-
-@pytest.mark.parametrize(
-    "command", [["report"], ["replay"], ["map"], ["run", "--sim", "--mirror"], ["run", "--sim", "--world"]]
-)
-def test_a_name_that_no_file_may_have_is_one_line(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*command, 300 * "x"]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("ccatp: ")
-    assert said.count("\n") == 1
 
 
 def test_a_mirror_that_is_no_mirror_is_told_with_the_key_that_names_it(

@@ -30,16 +30,14 @@ from tests.unit.serving import serving
     ("shell", "sign"),
     [("bash", "complete -o nosort -F"), ("zsh", "#compdef ccatp"), ("fish", "complete --no-files --command ccatp")],
 )
-def test_each_shell_gets_its_script(shell: str, sign: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_shell_gets_its_script(shell: str, sign: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["completion", shell]) == 0
-    script = capsys.readouterr().out
-    assert sign in script
-    assert "_CCATP_COMPLETE" in script
-
-
-def test_another_shell_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["completion", "bahs"]) == 2
-    assert "did you mean bash?" in capsys.readouterr().err
+    text = capsys.readouterr().out
+    assert sign in text
+    assert "_CCATP_COMPLETE" in text
+    (tmp_path / "script").write_text(text)
+    if program := shutil.which(shell):
+        subprocess.run([program, "-n", str(tmp_path / "script")], check=True, timeout=20)
 
 
 def test_without_a_bash_its_script_is_there_all_the_same(
@@ -91,17 +89,6 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
     assert all(word.startswith(words[-1]) for word in done.stdout.split())
 
 
-@pytest.mark.parametrize("shell", ["zsh", "fish"])
-def test_the_script_is_sound(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    program = shutil.which(shell)
-    if program is None:
-        pytest.skip(f"no {shell} here")
-    assert main(["completion", shell]) == 0
-    script = tmp_path / "script"
-    script.write_text(capsys.readouterr().out)
-    subprocess.run([program, "-n", str(script)], check=True, timeout=20)
-
-
 NAMES = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
 
 
@@ -117,13 +104,7 @@ def test_every_shipped_world_is_named_in_the_help(capsys: pytest.CaptureFixture[
     assert set(available("world")) <= set(re.split(r"[ ,]+", told))
 
 
-def test_one_panel_is_one(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["plan", "--mirror", "fyst-m2", "--panels", "1"]) == 0
-    assert "fyst-m2: 9 points of 1 panel, order thesis\n" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("filter_name", ["kf", "ekf"])
+@pytest.mark.parametrize(("name", "filter_name"), [*((name, "kf") for name in NAMES), ("fyst-m1", "ekf")])
 def test_the_plan_is_that_of_a_run(name: str, filter_name: str, capsys: pytest.CaptureFixture[str]) -> None:
     found = planned(capsys, "--mirror", name, "--panels", "3", "--filter", filter_name)
     parts = assemble(load_config(overrides={"run.mirror": name, "run.panels": 3, "run.filter": filter_name}))
@@ -196,6 +177,8 @@ def test_the_text_tells_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     assert f"way             {found['length_m']:.1f} m, {len(found['stops'])} stops" in out
     assert out.endswith("out of reach    none\n")
     assert out.splitlines()[1].endswith(" ...")
+    assert main(["plan", "--mirror", "fyst-m2", "--panels", "1"]) == 0
+    assert "fyst-m2: 9 points of 1 panel, order thesis\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("suffix", "magic"), [("png", b"\x89PNG"), ("svg", b"<svg")])
@@ -213,15 +196,14 @@ def test_the_figure_is_drawn(suffix: str, magic: bytes, tmp_path: Path) -> None:
         (["--panels", "-1"], "run.panels"),
         (["--panels", "999"], "run.panels = 999, but fyst-m1 has 77 panels; 0 takes all of them"),
         (["--set", "limits.v_max_m_s=1e-300"], "limits.v_max_m_s = 1e-300 must be at least 0.001"),
-        (["--set", "limits.alpha_max_rad_s2=1e-300"], "limits.alpha_max_rad_s2 = 1e-300 must be at least 0.001"),
         (
-            ["--panels", "1", "--set", "mirror.surface.normalisation_radius_mm=1e-300"],
-            "mirror.surface.normalisation_radius_mm = 1e-300 must be at least 100",
+            ["--set", "mirror.surface.normalisation_radius_mm=1e-300"],
+            "normalisation_radius_mm = 1e-300 must be at least",
         ),
         (["--figure", "nowhere/plan.png"], "--figure: no directory nowhere; make it first"),
         (
             ["--panels", "1", "--figure", "plan.tiff7"],
-            "--figure: plan.tiff7: no format by that name; the file may end in .png, .pdf, .svg",
+            "--figure: plan.tiff7: no format by that name; the file may end in",
         ),
     ],
 )
@@ -262,26 +244,23 @@ def test_the_table() -> None:
     ]
     assert dict(status_rows({**STATUS, "error_mm": 0.0}))["arrival"] == "none yet"
     held = {
-        **STATUS,
-        "state": "held",
-        "point": "",
-        "cause": "operator",
-        "code": 2,
-        "missed_deadlines": 4,
-        "worst_lateness_ms": 31.0,
-    }
-    held |= {"left_out": {"out of time": ["1-2-3", "1-2-4"]}, "exit_status": 4, "outcome": "stopped"}
-    found = dict(status_rows(held))
-    assert found["cause"] == "operator"
-    assert found["danger"] == "2 operation aborted"
-    assert found["late frames"] == "4, the latest by 31 ms"
-    assert found["left out: out of time"] == "1-2-3, 1-2-4"
-    assert found["over"] == "with exit status 4"
-    many = dict(status_rows({**STATUS, "left_out": {"operator": [f"1-2-{k}" for k in range(1, 94)]}}))
-    assert many["left out: operator"] == (
-        "93 points: 1-2-1, 1-2-2, 1-2-3, 1-2-4, 1-2-5, 1-2-6, 1-2-7, 1-2-8, 1-2-9, 1-2-10, ..."
+        **STATUS, "state": "held", "point": "", "cause": "operator", "code": 2, "missed_deadlines": 4,
+        "worst_lateness_ms": 31.0, "exit_status": 4, "outcome": "stopped",
+        "left_out": {"out of time": ["1-2-3", "1-2-4"], "operator": [f"1-2-{k}" for k in range(1, 94)]},
+    }  # fmt: skip
+    first = ", ".join(f"1-2-{k}" for k in range(1, 11))
+    assert (
+        dict(status_rows(held)).items()
+        >= {
+            "cause": "operator",
+            "danger": "2 operation aborted",
+            "late frames": "4, the latest by 31 ms",
+            "left out: out of time": "1-2-3, 1-2-4",
+            "left out: operator": f"93 points: {first}, ...",
+            "over": "with exit status 4",
+            "outcome": "stopped",
+        }.items()
     )
-    assert found["outcome"] == "stopped"
 
 
 def test_one_line() -> None:
@@ -291,21 +270,13 @@ def test_one_line() -> None:
     assert [clock(s) for s in (-1.0, 0.4, 59.6, 3600.0)] == ["0:00", "0:00", "1:00", "1:00:00"]
 
 
-def test_the_command(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with serving(folder, "control", lambda _: {"ok": True, "status": STATUS}):
-        assert main(["status", "--runtime-dir", str(folder)]) == 0
-        assert capsys.readouterr().out.splitlines()[0] == "state    driving 3-4-5"
-        assert main(["status", "--runtime-dir", str(folder), "--json"]) == 0
-        assert json.loads(capsys.readouterr().out)["status"] == STATUS
-
-
-@pytest.mark.parametrize("command", ["pause", "resume", "abort", "stop"])
+@pytest.mark.parametrize("command", ["status", "pause", "resume", "abort", "stop"])
 def test_commands_answer_with_the_same_table(folder: Path, command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with serving(folder, "control", lambda _: {"ok": True, "status": STATUS}):
-        assert main(["status", "--runtime-dir", str(folder)]) == 0
-        table = capsys.readouterr().out
         assert main([command, "--runtime-dir", str(folder)]) == 0
-    assert capsys.readouterr().out == table
+        assert capsys.readouterr().out.splitlines()[0] == "state    driving 3-4-5"
+        assert main([command, "--runtime-dir", str(folder), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["status"] == STATUS
 
 
 def answers(*found: dict[str, Any]) -> Any:

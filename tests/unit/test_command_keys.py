@@ -61,13 +61,11 @@ def test_the_keys_of_a_daemon(folder: Path, capsys: pytest.CaptureFixture[str]) 
 
 def test_what_is_printed_is_a_configuration_without_secrets(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert generate(folder) == 0
-    text = capsys.readouterr().out.split("at theirs):\n\n")[1]
-    (folder / "mine.toml").write_text(text)
+    (folder / "mine.toml").write_text(capsys.readouterr().out.split("at theirs):\n\n")[1])
     cfg = load_config(folder / "mine.toml")
     assert cfg.observatory.key_file == str(folder / "ccatp.key_secret")
     dumped = dump_config(cfg)
-    for file in folder.glob("*_secret"):
-        assert file.name in dumped
+    assert all(file.name in dumped for file in folder.glob("*_secret"))
     assert read_pair(folder / "ccatp.key_secret", "x").secret.decode() not in dumped
     assert (folder / "ccatp-robot.key_secret").read_text().strip() not in dumped
 
@@ -105,8 +103,7 @@ def test_one_of_the_files_is_enough_to_refuse_all(folder: Path) -> None:
     folder.mkdir(mode=0o700)
     (folder / "ccatp-robot.key_secret").write_text("mine")
     assert generate(folder) == 2
-    assert [path.name for path in folder.iterdir()] == ["ccatp-robot.key_secret"]
-    assert (folder / "ccatp-robot.key_secret").read_text() == "mine"
+    assert {path.name: path.read_text() for path in folder.iterdir()} == {"ccatp-robot.key_secret": "mine"}
 
 
 @pytest.mark.parametrize("name", ["", "a b", "../a", "a.b", "-a", "x" * 64])
@@ -160,29 +157,26 @@ def test_show_public_shows_public_keys(folder: Path, capsys: pytest.CaptureFixtu
 
 def test_secret_files_that_are_refused(folder: Path) -> None:
     assert generate(folder) == 0
-    secret, public = folder / "ccatp.key_secret", folder / "ccatp.key"
-    with pytest.raises(ConfigError, match=r"--key: cannot read .*none: No such file or directory; make keys with"):
-        read_pair(folder / "none", "--key")
-    public.chmod(0o600)
-    with pytest.raises(ConfigError, match=r"--key: .* holds no secret key; name the file that ends in \.key_secret"):
-        read_pair(public, "--key")
-    secret.chmod(0o640)
-    with pytest.raises(ConfigError, match=r"is open to others \(mode 0640\); chmod go= "):
-        read_pair(secret, "--key")
+    secret, public, broken = folder / "ccatp.key_secret", folder / "ccatp.key", folder / "broken"
     text = secret.read_text()
-    broken = folder / "broken"
+    other_key = text.replace(read_public(public, "x").decode(), zmq.curve_keypair()[0].decode())
     broken.touch(mode=0o600)
     with pytest.raises(ConfigError, match=r"holds no public key; name the file that ends in \.key"):
         read_public(broken, "--server-key")
-    broken.write_text(text.replace('secret-key = "', 'secret-key = "x'))
-    with pytest.raises(ConfigError, match=r"a key has 40 characters of Z85, this one 41$"):
-        read_pair(broken, "--key")
-    broken.write_text(text.replace(read_public(public, "x").decode(), zmq.curve_keypair()[0].decode()))
-    with pytest.raises(ConfigError, match="public and secret key are no pair"):
-        read_pair(broken, "--key")
-    broken.write_bytes(b"x" * 300_000)
-    with pytest.raises(ConfigError, match="is longer than 262144 bytes"):
-        read_pair(broken, "--key")
+    with pytest.raises(ConfigError, match=r"--key: cannot read .*none: No such file or directory; make keys with"):
+        read_pair(folder / "none", "--key")
+    for content, message in (
+        (public.read_text(), r"--key: .* holds no secret key; name the file that ends in \.key_secret"),
+        (text.replace('secret-key = "', 'secret-key = "x'), r"a key has 40 characters of Z85, this one 41$"),
+        (other_key, "public and secret key are no pair"),
+        ("x" * 300_000, "is longer than 262144 bytes"),
+    ):
+        broken.write_text(content)
+        with pytest.raises(ConfigError, match=message):
+            read_pair(broken, "--key")
+    secret.chmod(0o640)
+    with pytest.raises(ConfigError, match=r"is open to others \(mode 0640\); chmod go= "):
+        read_pair(secret, "--key")
 
 
 def test_the_list_is_read_anew_and_a_bad_one_names_nobody(folder: Path) -> None:
