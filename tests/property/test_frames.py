@@ -1,27 +1,17 @@
 """Pure but for reading the shipped mirrors. Round trips between world, mirror, deck, panel and robot frames."""
 
-import tomllib
-from functools import cache
-from pathlib import Path
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.config.models import MirrorConfig
 from ccatp.core import DeckPose, PanelId, PanelPose, Vector3, difference
-from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mirror.mirror import Mirror
+from tests.support.scenario import mirror_of
 
-FOLDER = Path(__file__).parents[2] / "configs" / "mirrors"
 TOLERANCE = 1e-9  # m and rad: a thousandth of the laser's micrometre
 
 
-@cache
-def load(name: str) -> Mirror:
-    return build_mirror(MirrorConfig.model_validate(tomllib.loads((FOLDER / f"{name}.toml").read_text())))
-
-
-mirrors = st.sampled_from(("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")).map(load)
+mirrors = st.sampled_from(("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")).map(mirror_of)
 coordinates = st.floats(-3.5, 3.5)
 points = st.tuples(st.floats(-10.0, 10.0), st.floats(-10.0, 10.0), st.floats(-10.0, 10.0))
 headings = st.floats(-3.2, 3.2)
