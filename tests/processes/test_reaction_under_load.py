@@ -19,17 +19,14 @@ from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 from unittest.mock import patch
 
-import numpy as np
 import psutil
 import pytest
 
 from ccatp.config.load import dump_config, load_config
 from ccatp.dataloop import DataLoop
-from ccatp.mirror.mirror import build_mirror
-from ccatp.sim.etalon_server import EtalonSimulator, ZmqPuck
 from ccatp.sim.fault_proxy import FaultProxy, Pipe
-from ccatp.sim.ground_truth import GroundTruthPublisher
 from tests.faults.linking import Measured
+from tests.support.daemon import stand_ins
 
 TIMES = int(os.environ.get("CCATP_REACTIONS", "3"))
 IN_A_SURVEY = 10  # faults that one daemon has to bear, at most ...
@@ -153,27 +150,15 @@ async def survey(folder: Path, runtime_dir: Path) -> AsyncIterator[Survey]:
     """A survey that begins at base; the daemon is ended at the end."""
     settings = {"sim.robot.port": 0, "run.mirror": "fyst-m2", "run.filter": "kf", "run.panels": 20,
                 "run.restart_limit": IN_A_SURVEY, "mission.calibration_length_m": 0}  # fmt: skip
-    cfg = load_config(overrides=settings)
-    mirror, stop = build_mirror(cfg.mirror), asyncio.Event()
     async with AsyncExitStack() as stack:
-        robot = DataLoop(cfg, False, 1)
-        puck_at = f"ipc://{runtime_dir / 'puck'}"
-        robot.truth = outlet = GroundTruthPublisher(robot.robot, puck_at)
-        stack.callback(outlet.close)
+        peers = stand_ins(load_config(overrides=settings), runtime_dir, 1)
+        robot, port, laser_port = await stack.enter_async_context(peers)
         wire = Wire(robot)
-        port = await robot.start()
-        puck = ZmqPuck(puck_at)
-        stack.callback(puck.close)
-        laser = EtalonSimulator(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1))
-        laser_port = await laser.start("127.0.0.1", 0)
-        stack.push_async_callback(laser.close)
         proxy = await stack.enter_async_context(FaultProxy("127.0.0.1", port, seed=1))
         stack.enter_context(patch.object(Pipe, "_read", _tapped(wire, proxy)))
         at = load_config(overrides={**settings, "robot.port": proxy.port, "etalon.port": laser_port})
         (folder / "config.toml").write_text(dump_config(at), encoding="utf-8")
         said = stack.enter_context((folder / "said").open("w"))
-        tasks = await stack.enter_async_context(asyncio.TaskGroup())
-        serving = [tasks.create_task(work) for work in (robot.run(stop), outlet.serve(), laser.serve())]
         command = [sys.executable, "-m", "ccatp", "run", "--config", str(folder / "config.toml")]
         command += ["--run-dir", str(folder / "run"), "--runtime-dir", str(runtime_dir)]
         daemon = subprocess.Popen(command, stdout=said, stderr=said, text=True)  # noqa: ASYNC220 - takes milliseconds
@@ -181,9 +166,6 @@ async def survey(folder: Path, runtime_dir: Path) -> AsyncIterator[Survey]:
             yield Survey(wire, proxy, daemon, folder / "said")
         finally:
             await asyncio.to_thread(end, daemon)
-            stop.set()
-            for task in serving[1:]:
-                task.cancel()
 
 
 def _tapped(wire: Wire, proxy: FaultProxy) -> Callable[[Pipe], Awaitable[bytes]]:
@@ -212,12 +194,8 @@ def end(daemon: subprocess.Popen[str]) -> None:
         daemon.wait()
 
 
-def kill(name: str) -> Callable[[Survey], None]:
-    return lambda it: os.kill(it.pid_of(name), signal.SIGKILL)
-
-
-def halt(name: str) -> Callable[[Survey], None]:
-    return lambda it: os.kill(it.pid_of(name), signal.SIGSTOP)
+def sends(name: str, number: signal.Signals) -> Callable[[Survey], None]:
+    return lambda it: os.kill(it.pid_of(name), number)
 
 
 def kill_all(it: Survey) -> None:
@@ -229,11 +207,11 @@ def kill_all(it: Survey) -> None:
 
 # What is done, and after how long there is the first evidence of it: a session that ends is seen at once.
 FAULTS: dict[str, tuple[Callable[[Survey], None], float]] = {
-    "kill main": (kill("main"), 0.0),
-    "kill danger": (kill("danger"), 0.0),
+    "kill main": (sends("main", signal.SIGKILL), 0.0),
+    "kill danger": (sends("danger", signal.SIGKILL), 0.0),
     "kill all": (kill_all, 0.0),
-    "stop main": (halt("main"), EVIDENCE_S),
-    "stop danger": (halt("danger"), EVIDENCE_S),
+    "stop main": (sends("main", signal.SIGSTOP), EVIDENCE_S),
+    "stop danger": (sends("danger", signal.SIGSTOP), EVIDENCE_S),
     "black hole": (lambda it: it.proxy.begin("black_hole", "both"), EVIDENCE_S),
 }
 

@@ -7,7 +7,7 @@ import asyncio
 import json
 import tempfile
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -143,61 +143,67 @@ def _logging_to(entries: list[dict[str, Any]]) -> Iterator[None]:
 
 
 @asynccontextmanager
+async def stand_ins(
+    cfg: Config, folder: Path, seed: int, robot_cfg: Config | None = None
+) -> AsyncIterator[tuple[DataLoop, int, int]]:
+    """Robot (of another configuration, where that is given) and laser system in real time, and their ports.
+
+    The true state of the robot is at the sockets ``puck`` and ``truth`` in a folder.
+    """
+    endpoints, mirror, stop = Endpoints(folder), mirror_of(cfg.mirror.name), asyncio.Event()
+    async with AsyncExitStack() as stack:
+        robot = DataLoop(robot_cfg or cfg, False, seed)
+        robot.truth = outlet = GroundTruthPublisher(robot.robot, endpoints.of("puck"), endpoints.of("truth"))
+        stack.callback(outlet.close)
+        puck = ZmqPuck(endpoints.of("puck"))
+        stack.callback(puck.close)
+        laser = EtalonSimulator(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1))
+        stack.push_async_callback(laser.close)
+        robot_port, laser_port = await robot.start(), await laser.start("127.0.0.1", 0)
+        async with asyncio.TaskGroup() as tasks:
+            serving = [tasks.create_task(work) for work in (robot.run(stop), outlet.serve(), laser.serve())]
+            try:
+                yield robot, robot_port, laser_port
+            finally:
+                stop.set()
+                for task in serving[1:]:
+                    task.cancel()
+
+
+@asynccontextmanager
 async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncIterator[Daemon]:
     """A survey under way, from its beginning; it is stopped at the end.
 
     Args:
         cfg: the daemon's configuration.
-        robot_cfg: that of the stand-ins, if it is another one.
+        robot_cfg: that of the robot, if it is another one.
     """
     entries: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory(prefix="ccatp-") as folder, _logging_to(entries):
-        run_dir = Path(folder)
-        endpoints = Endpoints(run_dir)
-        robot = DataLoop(robot_cfg or cfg, False, cfg.run.seed)
-        robot.truth = outlet = GroundTruthPublisher(robot.robot, endpoints.of("puck"), endpoints.of("truth"))
-        port = await robot.start()
-        mirror = mirror_of(cfg.mirror.name)
-        puck = ZmqPuck(endpoints.of("puck"))
-        laser = EtalonSimulator(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1))
-        laser_port = await laser.start("127.0.0.1", 0)
+    stop = asyncio.Event()
+    async with AsyncExitStack() as stack:
+        run_dir = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ccatp-")))
+        stack.enter_context(_logging_to(entries))
+        robot, port, laser_port = await stack.enter_async_context(stand_ins(cfg, run_dir, cfg.run.seed, robot_cfg))
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        stop, robot_stop = asyncio.Event(), asyncio.Event()
-        try:
-            async with FaultProxy("127.0.0.1", port, seed=1) as one, FaultProxy("127.0.0.1", port, seed=2) as two:
-                configs = [_at(cfg, proxy.port, laser_port) for proxy in (one, two)]
-                main_args, danger_args = (ProcessArgs(at, run_dir, endpoints, None, True, False) for at in configs)
-                (run_dir / "config.toml").write_text(dump_config(configs[0]), encoding="utf-8")
-                with open_runner(main_args) as make_runner:
-                    main = MainLoop(main_args, context, make_runner)
-                    danger = DangerLoop(danger_args, context)
-                    daemon = Daemon(main, danger, robot, (one, two))
-                    daemon.log = entries
-                    listener = context.socket(zmq.SUB)
-                    listener.connect(endpoints.of("main"))
-                    listener.subscribe("track")
-                    try:
-                        with daemon.watching():
-                            async with asyncio.TaskGroup() as tasks:
-                                peers = robot.run(robot_stop), outlet.serve(), laser.serve()
-                                serving = [tasks.create_task(work) for work in peers]
-                                daemon.loops = [tasks.create_task(work) for work in (main.run(stop), danger.run(stop))]
-                                daemon.stop = stop
-                                try:
-                                    yield daemon
-                                finally:
-                                    stop.set()
-                                    await asyncio.wait(daemon.loops)
-                                    robot_stop.set()
-                                    for task in serving[1:]:
-                                        task.cancel()
-                    finally:
-                        listener.close(linger=0)
-        finally:
-            await laser.close()
-            puck.close()
-            outlet.close()
-            context.destroy(linger=0)
+        stack.callback(context.destroy, linger=0)
+        proxies = [await stack.enter_async_context(FaultProxy("127.0.0.1", port, seed=seed)) for seed in (1, 2)]
+        configs, endpoints = [_at(cfg, proxy.port, laser_port) for proxy in proxies], Endpoints(run_dir)
+        main_args, danger_args = (ProcessArgs(at, run_dir, endpoints, None, True, False) for at in configs)
+        (run_dir / "config.toml").write_text(dump_config(configs[0]), encoding="utf-8")
+        main = MainLoop(main_args, context, stack.enter_context(open_runner(main_args)))
+        daemon = Daemon(main, DangerLoop(danger_args, context), robot, (proxies[0], proxies[1]))
+        daemon.log, daemon.stop = entries, stop
+        recorder = context.socket(zmq.SUB)
+        recorder.connect(endpoints.of("main"))
+        recorder.subscribe("track")
+        stack.enter_context(daemon.watching())
+        async with asyncio.TaskGroup() as tasks:
+            daemon.loops = [tasks.create_task(loop.run(stop)) for loop in (daemon.main, daemon.danger)]
+            try:
+                yield daemon
+            finally:
+                stop.set()
+                await asyncio.wait(daemon.loops)
 
 
 def _at(cfg: Config, robot_port: int, laser_port: int) -> Config:
