@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 
@@ -32,18 +32,20 @@ ENDINGS: Mapping[int, str] = {
     ExitStatus.UNREACHABLE: "the robot or the laser system did not answer",
     ExitStatus.INTERRUPTED: "interrupted, the wheels are held",
 }
-
-
-class OcsSession(Protocol):
-    """The part of an OCS session that is used."""
-
-    status: str
-    data: dict[str, Any]
+# The feed always has the same fields, numbers and short texts: their names there and in the status.
+UNCHANGED = "state", "cause", "point", "done", "skipped", "total", "elapsed_s", "eta_s"
+FEED_FIELDS = {
+    **{name: name for name in UNCHANGED},
+    "arrival_error_mm": "error_mm",
+    "danger_code": "code",
+    "late_frames": "missed_deadlines",
+    "exit_status": "exit_status",
+}
 
 
 @dataclass(slots=True)
 class SurveyTask:
-    """Starts, follows and ends surveys.
+    """Starts, follows and ends surveys; a session is one of OCS, with ``status`` and ``data``.
 
     Attributes:
         command: of a survey, ``ccatp run ...``.
@@ -54,7 +56,7 @@ class SurveyTask:
     environment: Mapping[str, str]
     log: Callable[[str], None]
 
-    def survey(self, session: OcsSession, panels: int | None = None) -> Answer:
+    def survey(self, session: Any, panels: int | None = None) -> Answer:
         """Start a survey of the first ``panels`` (all where None), or join the one that runs, and follow it to its end.
 
         ``session.data`` shows the status. When the session is stopped, the survey is aborted: the robot is at base when
@@ -74,7 +76,7 @@ class SurveyTask:
         )
         return self._follow(session, child)
 
-    def _follow(self, session: OcsSession, child: "subprocess.Popen[bytes] | None") -> Answer:
+    def _follow(self, session: Any, child: "subprocess.Popen[bytes] | None") -> Answer:
         deadline_s, is_aborted, last = time.monotonic() + START_TIMEOUT_S, False, None
         while child is None or child.poll() is None:
             status = self._status()
@@ -98,7 +100,7 @@ class SurveyTask:
         # A session that was stopped asked for the abort.
         return code == ExitStatus.COMPLETE or (is_aborted and code == ExitStatus.ABORTED), ending
 
-    def ask(self, order: str, session: OcsSession | None = None) -> Answer:
+    def ask(self, order: str, session: Any | None = None) -> Answer:
         """One order to the daemon: status, pause, resume, abort, stop."""
         try:
             status: MissionStatus = getattr(self.client, order)()
@@ -108,14 +110,15 @@ class SurveyTask:
             session.data = msgspec.to_builtins(status)
         return True, f"{order}: {status.state}"
 
-    def monitor(self, session: OcsSession, publish: Callable[[dict[str, Any]], None], period_s: float) -> Answer:
+    def monitor(self, session: Any, publish: Callable[[dict[str, Any]], None], period_s: float) -> Answer:
         """Publish the status periodically until the session is stopped; ``session.data`` is what was published last."""
         while session.status in ("starting", "running"):
             status = self._status()
             now_s = time.time()
             publish({"timestamp": now_s, "block_name": "daemon", "data": {"running": int(status is not None)}})
             if status is not None:
-                publish({"timestamp": now_s, "block_name": "survey", "data": feed_fields(status)})
+                data = {field: getattr(status, name) for field, name in FEED_FIELDS.items()}
+                publish({"timestamp": now_s, "block_name": "survey", "data": data})
             session.data = {"timestamp": now_s, "running": status is not None}
             if status is not None:
                 session.data |= msgspec.to_builtins(status)
@@ -129,24 +132,6 @@ class SurveyTask:
             return self.client.status()
         except DaemonUnreachableError:
             return None
-
-
-def feed_fields(status: MissionStatus) -> dict[str, Any]:
-    """Part of the status for the feed: numbers and short texts, always the same fields."""
-    return {
-        "state": status.state,
-        "cause": status.cause,
-        "point": status.point,
-        "done": status.done,
-        "skipped": status.skipped,
-        "total": status.total,
-        "elapsed_s": status.elapsed_s,
-        "eta_s": status.eta_s,
-        "arrival_error_mm": status.error_mm,
-        "danger_code": status.code,
-        "late_frames": status.missed_deadlines,
-        "exit_status": status.exit_status,
-    }
 
 
 AGENT_CLASS = "CcatpAgent"

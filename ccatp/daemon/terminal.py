@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+import msgspec
 import structlog
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
@@ -171,38 +172,38 @@ def clock(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-def share_done(status: Mapping[str, Any]) -> float:
+def _read(status: Mapping[str, Any]) -> MissionStatus:
+    """The ``status`` of the operator channel's answer."""
+    return msgspec.convert({"seq": -1, "t_s": 0.0, "state": "", **status}, MissionStatus, strict=False)
+
+
+def share_done(status: MissionStatus) -> float:
     """Share of the points that are measured or skipped, 0 to 1."""
-    total = int(status.get("total", 0))
-    return (int(status.get("done", 0)) + int(status.get("skipped", 0))) / total if total else 0.0
+    return (status.done + status.skipped) / status.total if status.total else 0.0
 
 
-def status_rows(status: Mapping[str, Any]) -> list[tuple[str, str]]:
+def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Name and value of each line of the table, from the ``status`` of the operator channel's answer."""
-    done, total, skipped = (int(status.get(key, 0)) for key in ("done", "total", "skipped"))
-    state, point, cause = (str(status.get(key, "")) for key in ("state", "point", "cause"))
-    rows = [("state", f"{state} {point}".strip())]
-    if cause:
-        rows.append(("cause", cause))
-    if outcome := str(status.get("outcome", "")):
-        rows.append(("outcome", outcome))
+    status = _read(answered)
     filled = round(BAR * share_done(status))
-    skips = f", {skipped} skipped" if skipped else ""
-    rows.append(("points", f"{done} of {total} measured{skips}  [{'#' * filled}{'.' * (BAR - filled)}]"))
-    elapsed_s, eta_s = float(status.get("elapsed_s", 0.0)), float(status.get("eta_s", 0.0))
-    bound_s = float(status.get("lower_bound_s", 0.0))
-    rows.append(("time", f"{clock(elapsed_s)} elapsed, {clock(eta_s)} to go, no path takes less than {clock(bound_s)}"))
-    error_mm = float(status.get("error_mm", 0.0))  # exactly zero before the first arrival
-    rows.append(("arrival", f"{error_mm:.2f} mm from the last point, as estimated" if error_mm else "none yet"))
-    code = int(status.get("code", 0))
-    rows.append(("danger", f"{code} {CODES.get(code, '')}".strip()))
-    if missed := int(status.get("missed_deadlines", 0)):
-        worst_ms = float(status.get("worst_lateness_ms", 0.0))
-        rows.append(("late frames", f"{missed}, the latest by {worst_ms:.0f} ms"))
-    rows += [(f"left out: {why}", _named(points)) for why, points in dict(status.get("left_out", {})).items()]
-    if (exit_status := int(status.get("exit_status", -1))) >= 0:
-        rows.append(("over", f"with exit status {exit_status}"))
-    return rows
+    skips = f", {status.skipped} skipped" if status.skipped else ""
+    bound = f"no path takes less than {clock(status.lower_bound_s)}"
+    # The error is exactly zero before the first arrival.
+    arrival = f"{status.error_mm:.2f} mm from the last point, as estimated" if status.error_mm else "none yet"
+    late = f"{status.missed_deadlines}, the latest by {status.worst_lateness_ms:.0f} ms"
+    rows = [
+        ("state", f"{status.state} {status.point}".strip()),
+        ("cause", status.cause),
+        ("outcome", status.outcome),
+        ("points", f"{status.done} of {status.total} measured{skips}  [{'#' * filled}{'.' * (BAR - filled)}]"),
+        ("time", f"{clock(status.elapsed_s)} elapsed, {clock(status.eta_s)} to go, {bound}"),
+        ("arrival", arrival),
+        ("danger", f"{status.code} {CODES.get(status.code, '')}".strip()),
+        ("late frames", late if status.missed_deadlines else ""),
+        *((f"left out: {why}", _named(points)) for why, points in status.left_out.items()),
+        ("over", f"with exit status {status.exit_status}" if status.exit_status >= 0 else ""),
+    ]
+    return [(name, value) for name, value in rows if value]
 
 
 def _named(points: Sequence[str]) -> str:
@@ -210,10 +211,10 @@ def _named(points: Sequence[str]) -> str:
     return names if len(points) <= _SHOWN else f"{len(points)} points: {names}, ..."
 
 
-def status_line(status: Mapping[str, Any]) -> str:
+def status_line(answered: Mapping[str, Any]) -> str:
     """The status in one line."""
-    what = f"{status.get('state', '')} {status.get('point', '')}".strip()
-    cause = f" ({status['cause']})" if status.get("cause") else ""
-    times = f"{clock(float(status.get('elapsed_s', 0.0)))} elapsed, {clock(float(status.get('eta_s', 0.0)))} to go"
-    points = f"{status.get('done', 0)} of {status.get('total', 0)} points"
-    return f"{100.0 * share_done(status):.0f} %: {points}, {what}{cause}, {times}"
+    status = _read(answered)
+    what = f"{status.state} {status.point}".strip()
+    cause = f" ({status.cause})" if status.cause else ""
+    times = f"{clock(status.elapsed_s)} elapsed, {clock(status.eta_s)} to go"
+    return f"{100.0 * share_done(status):.0f} %: {status.done} of {status.total} points, {what}{cause}, {times}"

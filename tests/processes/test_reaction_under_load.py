@@ -81,13 +81,14 @@ class Wire:
         self._zeros_s: dict[int, list[float]] = {}
         self._last_go_s: dict[int, float] = {}
         self._sent_s = 0.0
-        on_frame = robot.on_frame
+        assert robot.truth is not None
+        add = robot.truth.add
 
         def watch() -> None:
-            on_frame()
+            add()
             self._step()
 
-        robot.on_frame = watch  # type: ignore[method-assign]
+        robot.truth.add = watch  # type: ignore[method-assign]
 
     def _step(self) -> None:
         now_s, rules = time.monotonic(), self._robot.rules
