@@ -81,9 +81,3 @@ def test_silence_of_all_radios_ends_held(begin: Begin, tmp_path: Path) -> None:
     assert run.wait() == 4, run.stderr
     assert "no radio is heard" in run.stderr
     assert run.summary["danger"] == {"radio": 1}
-
-
-def test_what_a_mission_among_beacons_has_not_is_refused(begin: Begin) -> None:
-    run = begin("zigbee", "--resume")
-    assert run.wait() == 2
-    assert "its map is not kept" in run.stderr

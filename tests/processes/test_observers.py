@@ -221,26 +221,6 @@ def test_a_port_in_use_stops_no_survey_and_the_summary_is_the_same(start: Start)
     assert {**run.summary, "wall": None} == {**rehearsed, "wall": None}
 
 
-def test_a_token_that_cannot_be_read_is_reported_before_anything_begins(start: Start, tmp_path: Path) -> None:
-    run = start("--panels", "1", *WITH_PAGE, "--set", f"dashboard.token_file={tmp_path / 'none'}")
-    assert run.wait() == 2
-    assert "dashboard.token_file: cannot read" in run.stderr
-    assert not run.run_dir.exists()
-
-
-@pytest.mark.slow
-def test_the_dashboard_dies_over_and_over_and_the_survey_goes_on_without_it(start: Start) -> None:
-    run = start("--panels", "1", "--realtime", *WITH_PAGE)
-    run.until_state("driving")
-    pid = 0
-    for _ in range(4):
-        victim = run.child("dashboard", not_pid=pid)
-        pid = victim.pid
-        victim.kill()
-    assert run.wait(120.0) == 0, run.stderr
-    assert "more than 3 times within 60 s: the survey goes on without it" in run.stderr
-
-
 def test_the_simulated_servers_are_ready(runtime_dir: Path, tmp_path: Path) -> None:
     status, found = check("--sim", "--mirror", "fyst-m2", "--runtime-dir", runtime_dir, "--runs-dir", tmp_path)
     wrong = {name for name, one in found.items() if one["outcome"] not in ("pass", "warn")}

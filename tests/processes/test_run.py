@@ -160,16 +160,6 @@ def test_bad_peers_leave_the_survey_undisturbed_and_an_abort_leads_to_base(start
     assert run.summary["danger"] == SOUND
 
 
-def test_a_port_in_use_is_one_line_and_status_2(start: Start) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        run = start("--set", f"sim.robot.port={taken.getsockname()[1]}")
-        assert run.wait() == 2
-    assert run.stderr.count("\n") == 1
-    assert "sim.robot.port" in run.stderr
-
-
 @pytest.mark.slow
 def test_a_robot_set_down_wrongly_meets_the_rim_finds_itself_and_measures_everything(start: Start) -> None:
     # Seed 8 sets the robot down 0.1 m beside base, with a sensor almost over the rim.

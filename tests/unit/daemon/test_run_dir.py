@@ -57,23 +57,33 @@ def test_the_tables_name_real_modules_and_main_stops_first() -> None:
         assert processes[-1].name == "main"  # stopping is in the reverse order
 
 
-def test_what_is_refused_before_anything_is_made(tmp_path: Path) -> None:
-    folders = {"runtime_dir": tmp_path / "rt", "run_dir": tmp_path / "run"}
-    observatory = {
-        "observatory.endpoint": "tcp://127.0.0.1:0",
-        "observatory.key_file": "k",
-        "observatory.clients_file": "none.toml",
-    }
-    with pytest.raises(ConfigError, match=r"observatory\.clients_file: cannot read none\.toml: No such file"):
-        run(options(overrides=observatory, **folders))
+OBSERVATORY = {"endpoint": "tcp://127.0.0.1:0", "key_file": "k", "clients_file": "none.toml"}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "why"),
+    [
+        (
+            {f"observatory.{name}": value for name, value in OBSERVATORY.items()},
+            r"observatory\.clients_file: cannot read none\.toml: No such file",
+        ),
+        ({"dashboard.token_file": "none"}, r"dashboard\.token_file: cannot read"),
+        ({"robot.key_file": "none"}, r"robot\.key_file: cannot read none: No such file"),
+    ],
+)
+def test_what_is_refused_before_anything_is_made(tmp_path: Path, overrides: dict[str, object], why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        run(options(overrides=overrides, runtime_dir=tmp_path / "rt", run_dir=tmp_path / "run"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_port_in_use(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(
-            ConfigError,
-            match=rf"sim\.robot\.port: cannot listen on 127\.0\.0\.1:{port}: Address already in use; .*--set",
-        ):
-            run(options(overrides={"sim.robot.port": port}, **folders))
+        wanted = options(overrides={"sim.robot.port": port}, runtime_dir=tmp_path / "rt", run_dir=tmp_path / "run")
+        why = rf"sim\.robot\.port: cannot listen on 127\.0\.0\.1:{port}: Address already in use; .*--set"
+        with pytest.raises(ConfigError, match=why):
+            run(wanted)
     assert not (tmp_path / "run").exists()
 
 
