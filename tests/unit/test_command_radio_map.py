@@ -158,13 +158,6 @@ def test_two_motes_are_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "no triangle of motes" in refusal(capsys, "--ranges", str(path), "--method", "ekf")
 
 
-def test_a_triangle_is_not_in_doubt_of_its_mirror_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for method in ("batch", "ekf"):
-        data = measured(tmp_path / "r.csv", "A,B,1\nB,C,1\nA,C,1\n", capsys, "--method", method)
-        assert (data["warnings"], data["fold_over_risk"]) == ([], False)
-        assert data["crlb_m"] < 0.01
-
-
 @pytest.mark.parametrize("rows", ["A,B,1\nB,C,1\nA,C,2\n", "A,B,1\nB,C,1\nA,C,2\nA,D,3\nB,D,2\nC,D,1\n"])
 def test_motes_in_a_line(rows: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "r.csv"
@@ -290,9 +283,8 @@ def test_ranges_in_space_mapped_in_the_plane(tell: Any, tmp_path: Path) -> None:
     assert np.sqrt(read_beacons(out).covariance_m2.diagonal().max()) > 0.1  # metres off, and it shows
 
 
-@pytest.mark.parametrize("args", [("--dimension", "3"), ("--set", "cricket.dimension=3")])
-def test_ranges_in_space(args: tuple[str, ...], tell: Any) -> None:
-    data = tell(DEEP, *args)
+def test_ranges_in_space(tell: Any) -> None:
+    data = tell(DEEP, "--dimension", "3")
     assert data["rms_m"]["p50"] < 0.01
     assert data["warnings"] == []
 
@@ -303,9 +295,8 @@ def test_no_scale_where_none_can_be_told(tell: Any) -> None:
     assert data["warnings"][-1].startswith("no scale can be told from these ranges")
 
 
-@pytest.mark.parametrize("off_m", [0.0, 0.01])
-def test_motes_in_a_line_with_noise(off_m: float, tell: Any) -> None:
-    off = np.random.default_rng(2).normal(0.0, 1.0, 6) * off_m
+def test_motes_in_a_line_with_noise(tell: Any) -> None:
+    off = np.random.default_rng(2).normal(0.0, 0.01, 6)
     data = tell(np.column_stack([1.3 * np.arange(6), off]))
     assert (data["expected_rms_m"], data["crlb_m"]) == (None, None)
     assert data["warnings"][-1].startswith("the motes lie in a line, or nearly")

@@ -6,7 +6,16 @@ import pytest
 from numpy.random import default_rng
 
 from ccatp.beacons.pilot import BackOff, BeaconPilot, FollowState, PilotState, TargetSight
-from ccatp.beacons.steering import HALT, BearingToPoint, FuzzyGapError, Sugeno, WaypointList, WaypointSteering, aim_at
+from ccatp.beacons.steering import (
+    HALT,
+    BearingToPoint,
+    FuzzyGapError,
+    Point,
+    Sugeno,
+    WaypointList,
+    WaypointSteering,
+    aim_at,
+)
 from ccatp.config.beacon_models import FuzzyConfig, RadioConfig
 from ccatp.config.load import load_radio_config
 from ccatp.sim.radio import SimDriveCommand, TruePose, clearance_m, seen_m
@@ -160,16 +169,17 @@ FULL: list[dict[str, object]] = [
 ]
 
 
-def test_output_is_the_mean_weighted_by_products() -> None:
-    # weights 0.75, 0.25 * 0.6, 0.25 * 0.4
-    expected = (0.75 * 1.0 + 0.15 * 3.0 + 0.10 * 1.0) / 1.0
-    assert Sugeno(two_terms(FULL)).evaluate((0.25, 0.4)) == pytest.approx(expected)
-
-
-def test_beyond_the_last_shoulder_an_input_counts_as_there() -> None:
-    sugeno = Sugeno(two_terms(FULL))
-    assert sugeno.evaluate((50.0, -50.0)) == 3.0
-    assert sugeno.memberships(0, 50.0) == [0.0, 1.0]
+@pytest.mark.parametrize(
+    ("values", "output"),
+    [
+        ((0.0, 0.5), 1.0),  # one rule alone
+        ((1.0, 0.0), 3.0),
+        ((0.25, 0.4), 0.75 * 1.0 + 0.15 * 3.0 + 0.10 * 1.0),  # weights 0.75, 0.25 * 0.6, 0.25 * 0.4
+        ((50.0, -50.0), 3.0),  # beyond its last shoulder an input counts as there
+    ],
+)
+def test_output_is_the_mean_weighted_by_products(values: tuple[float, float], output: float) -> None:
+    assert Sugeno(two_terms(FULL)).evaluate(values) == pytest.approx(output)
 
 
 def test_rules_with_a_gap_are_refused() -> None:
@@ -204,34 +214,34 @@ def test_it_goes_straight_away_where_nothing_stands(kind: str) -> None:
     assert retreat.drive(POSE, (1.0, 1.5), STILL, ()).speed_m_s == 0.05
 
 
-def test_where_the_target_goes_counts() -> None:
-    beside = (1.5, 2.0)
-    assert BackOff(retreat_config()).drive(POSE, beside, (0.08, 0.0), ()).speed_m_s < 0.0
-    assert BackOff(retreat_config()).drive(POSE, beside, (-0.08, 0.0), ()).speed_m_s > 0.0
+WALL = [(1.1, 1.5 + 0.1 * k) for k in range(-6, 7)]  # 0.4 m behind
+RING = [(1.5 + 0.36 * x, 1.5 + 0.36 * y) for x, y in ((1, 0), (0.7, 0.7), (0, 1), (-0.7, 0.7), (-1, 0))]
+RING += [(1.5 - 0.25, 1.5 - 0.25), (1.5, 1.14), (1.75, 1.25)]
 
 
-def test_what_stands_behind_is_not_touched_and_what_is_too_near_is_left() -> None:
-    cfg = retreat_config()
-    wall = [(1.1, 1.5 + 0.1 * k) for k in range(-6, 7)]  # 0.4 m behind
-    drive = BackOff(cfg).drive(POSE, (2.0, 1.2), STILL, wall)
-    assert drive.speed_m_s > 0.0  # past the target
-    touching = BackOff(cfg).drive(POSE, (1.9, 1.5), STILL, [(1.2, 1.5)])  # nearer than stop_m already
-    assert touching.speed_m_s >= 0.0
-
-
-def test_it_stands_where_no_way_is_free_and_at_the_wall_of_the_room() -> None:
-    ring = [(1.5 + 0.36 * x, 1.5 + 0.36 * y) for x, y in ((1, 0), (0.7, 0.7), (0, 1), (-0.7, 0.7), (-1, 0))]
-    ring += [(1.5 - 0.25, 1.5 - 0.25), (1.5, 1.14), (1.75, 1.25)]
-    assert BackOff(retreat_config()).drive(POSE, (2.1, 1.5), STILL, ring) == HALT
-    assert BackOff(retreat_config()).drive((0.0, 1.5, 0.0), (0.7, 1.5), STILL, ()).speed_m_s >= 0.0
+@pytest.mark.parametrize(
+    ("pose", "threat", "velocity", "obstacles", "signs"),
+    [
+        (POSE, (1.5, 2.0), (0.08, 0.0), [], {-1}),  # where the target goes counts
+        (POSE, (1.5, 2.0), (-0.08, 0.0), [], {1}),
+        (POSE, (2.0, 1.2), STILL, WALL, {1}),  # past the target, not into the wall
+        (POSE, (1.9, 1.5), STILL, [(1.2, 1.5)], {0, 1}),  # nearer than stop_m already
+        (POSE, (2.1, 1.5), STILL, RING, {0}),  # no way is free
+        ((0.0, 1.5, 0.0), (0.7, 1.5), STILL, [], {0, 1}),  # at the wall of the room
+    ],
+)
+def test_ways_to_back_off(
+    pose: tuple[float, float, float], threat: Point, velocity: Point, obstacles: list[Point], signs: set[int]
+) -> None:
+    speed_m_s = BackOff(retreat_config()).drive(pose, threat, velocity, obstacles).speed_m_s
+    assert (speed_m_s > 0.0) - (speed_m_s < 0.0) in signs
 
 
 @pytest.mark.parametrize("kind", ["ackermann", "differential"])
 def test_a_robot_between_an_obstacle_and_a_target_that_comes_gets_out(kind: str) -> None:
     """Backing off straight alone, it stood at the obstacle until the target was 0.23 m away."""
-    quiet = {f"sim.vehicle.{name}": 0.0 for name in ("speed_sigma_m_s", "steer_sigma_rad", "turn_rate_sigma_rad_s")}
-    cfg = retreat_config(vehicle__kind=kind, **quiet)
-    robot = TrueVehicle(cfg.vehicle, cfg.sim.vehicle, TruePose(2.15, 1.5, 0.4), default_rng(0))
+    cfg = retreat_config(vehicle__kind=kind, **QUIET)
+    robot = vehicle(cfg, (2.15, 1.5, 0.4))
     pilot, distances, clearances = BeaconPilot(cfg), [], []
     x, y = 2.75, 1.8
     for step in range(400):

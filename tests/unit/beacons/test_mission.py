@@ -1,7 +1,9 @@
 """An operator's commands to a mission among beacons, and what it does without verdicts."""
 
+import sqlite3
 from math import inf, pi, radians
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +27,7 @@ from ccatp.core import EventCode, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
 from ccatp.links.robot_codec import BadLine, decode_from_robot
-from ccatp.links.robot_messages import Hello, Sensors
+from ccatp.links.robot_messages import Sensors
 from ccatp.records.beacon_summary import BeaconSummary, beacon_facts
 from ccatp.safety.beacons import BeaconSafetyRules, ObstacleBuffer
 from ccatp.sim.beacon_robot import BeaconRobot
@@ -58,39 +60,31 @@ def test_abort_goes_to_the_start_also_out_of_a_pause(stage: BeaconSilWorld) -> N
     assert play(stage).result().outcome == "aborted, at base"
 
 
-def test_stop_ends_it_where_it_is(stage: BeaconSilWorld) -> None:
+def test_stop_ends_it_where_it_is_and_then_it_takes_no_commands(stage: BeaconSilWorld) -> None:
     assert stage.mission.stop() is None
     stage.frame()
     assert stage.mission.state is DONE
     assert stage.result().outcome == "stopped"
-
-
-def test_what_is_over_takes_no_commands(stage: BeaconSilWorld) -> None:
-    stage.mission.stop()
     over = "the mission is over"
     assert [stage.mission.pause(""), stage.mission.abort(""), stage.mission.stop()] == [over, over, over]
 
 
-def test_resume_is_refused_while_the_cause_is_there(stage: BeaconSilWorld) -> None:
-    assert stage.mission.resume() == "the mission is not held but visiting"
-    assert not stage.mission.react(DENIED)
-    assert stage.mission.state is HELD
-    assert stage.mission.resume() == "the cause persists: no radio"
-    assert stage.mission.react(FREE)
-
-
-def test_without_a_verdict_nothing_moves(stage: BeaconSilWorld) -> None:
-    assert not stage.mission.react(None)
-    assert stage.mission.cause == "no fresh verdict from the danger loop"
-    assert stage.mission.react(FREE)
-
-
-def test_a_fault_waits_for_an_operator(stage: BeaconSilWorld) -> None:
-    stage.mission.fault("lost")
-    assert stage.mission.is_faulted
-    assert not stage.mission.react(FREE)
-    assert stage.mission.resume() is None
-    assert stage.mission.react(FREE)
+def test_what_holds_the_robot_says_when_it_goes_on(stage: BeaconSilWorld) -> None:
+    mission = stage.mission
+    assert mission.resume() == "the mission is not held but visiting"
+    assert not mission.react(DENIED)
+    assert mission.state is HELD
+    assert mission.resume() == "the cause persists: no radio"
+    assert mission.react(FREE)
+    stage.frame()
+    assert not mission.react(None)
+    assert mission.cause == "no fresh verdict from the danger loop"
+    assert mission.react(FREE)
+    mission.fault("lost")
+    assert mission.is_faulted
+    assert not mission.react(FREE)  # a fault waits for an operator
+    assert mission.resume() is None
+    assert mission.react(FREE)
 
 
 NO_FORWARD = Verdict(0, 0.0, EventCode.NEAR_EDGE, "", "", 0.0, 0.0, False, True, True)
@@ -229,22 +223,24 @@ def test_no_frame_means_no_permit(cfg: RadioConfig) -> None:
     assert (verdict.forward, verdict.reverse, verdict.turn) == (False, False, False)
 
 
-def test_another_robot_is_refused(cfg: RadioConfig) -> None:
+@pytest.mark.parametrize(
+    ("system", "keys", "what"),
+    [
+        (
+            "zigbee", {"vehicle__wheelbase_m": 0.5, "vehicle__kind": "differential"},
+            r"vehicle\.wheelbase_m is 0\.5 here and 0\.35 there.*kind is differential",
+        ),
+        ("follow", {}, "the distance sensors look elsewhere"),
+        ("mirror", {}, "says nothing of its vehicle"),
+    ],
+)  # fmt: skip
+def test_another_robot_is_refused(system: str, keys: dict[str, Any], what: str, cfg: RadioConfig) -> None:
     hello = BeaconRobot(cfg, RadioWorld(cfg)).hello(boot=1, nonce="0" * 32, auth="none", lockstep=True)
     check_beacon_robot(cfg, hello)
-    other = beacon_config("zigbee", vehicle__wheelbase_m=0.5, vehicle__kind="differential")
-    with pytest.raises(ConfigError, match=r"vehicle.wheelbase_m is 0.5 here and 0.35 there.*kind is differential"):
-        check_beacon_robot(other, hello)
-    with pytest.raises(ConfigError, match="the distance sensors look elsewhere"):
-        check_beacon_robot(beacon_config("follow"), hello)
-
-
-def test_a_mirror_robot_is_no_beacon_robot(cfg: RadioConfig) -> None:
-    hello = BeaconRobot(cfg, RadioWorld(cfg)).hello(boot=1, nonce="0" * 32, auth="none", lockstep=True)
-    hello.robot.vehicle = None
-    assert isinstance(hello, Hello)
-    with pytest.raises(ConfigError, match="says nothing of its vehicle"):
-        check_beacon_robot(cfg, hello)
+    if system == "mirror":
+        hello.robot.vehicle = None
+    with pytest.raises(ConfigError, match=what):
+        check_beacon_robot(cfg if system == "mirror" else beacon_config(system, **keys), hello)
 
 
 def test_a_summary_without_truth_holds_what_needs_none(cfg: RadioConfig) -> None:
@@ -261,8 +257,6 @@ def test_a_summary_without_truth_holds_what_needs_none(cfg: RadioConfig) -> None
 
 
 def test_the_store_keeps_what_was_reached(cfg: RadioConfig, tmp_path: Path) -> None:
-    import sqlite3
-
     path = tmp_path / "mission.sqlite"
     store = BeaconStore(path, {"system": "zigbee"}, cfg.workspace.waypoints_m, 2)
     store.record_arrival(3.5, 5, WaypointArrival(1, 1, (2.2, 0.8), PoseBelief((2.1, 0.8, 0.0), np.eye(3))))
@@ -306,12 +300,22 @@ def test_silence_of_all_radios_holds_the_robot_until_they_are_heard_again() -> N
     assert found.summary["danger"] == {"radio": 1}
 
 
-def test_silence_that_lasts_needs_an_operator() -> None:
-    silence = {**SILENCE, "for_s": 1e4}
-    stage = play(BeaconSilWorld(beacon_config("zigbee", sim__incidents=[silence])))
+@pytest.mark.parametrize(
+    ("keys", "cause"),
+    [
+        ({"sim__incidents": [{**SILENCE, "for_s": 1e4}]}, "no radio is heard for 30 s"),
+        (
+            {"mission__time_limit_s": 60.0, "sim__incidents": [{**THING, "for_s": 1e4}]},
+            "the mission takes longer than mission.time_limit_s",
+        ),
+    ],
+)
+def test_what_lasts_needs_an_operator(keys: dict[str, Any], cause: str) -> None:
+    stage = play(BeaconSilWorld(beacon_config("zigbee", mission__laps=1, **keys)))
     assert stage.mission.is_faulted
-    assert stage.mission.cause.startswith("no radio is heard for 30 s")
-    assert stage.found.verdicts[-1].severity is Severity.FAULT
+    assert stage.mission.cause.startswith(cause)
+    assert (stage.found.verdicts[-1].severity is Severity.FAULT) == ("radio" in cause)
+    assert not (stage.result().summary["obstacles"] or {}).get("touched")
 
 
 def test_one_radio_less_is_no_silence() -> None:
@@ -329,15 +333,6 @@ def test_a_thing_in_the_way_is_not_run_into_without_avoidance() -> None:
     assert {verdict.signal for verdict in near} == {"obstacle"}
     assert min(row[7] for row in found.truth if row[7] is not None) > 0.0
     assert found.outcome == "complete"  # once it is taken away
-
-
-def test_a_thing_that_stays_ends_at_the_time_limit() -> None:
-    thing = {**THING, "for_s": 1e4}
-    cfg = beacon_config("zigbee", mission__laps=1, mission__time_limit_s=60.0, sim__incidents=[thing])
-    stage = play(BeaconSilWorld(cfg))
-    assert stage.mission.is_faulted
-    assert "mission.time_limit_s" in stage.mission.cause
-    assert not stage.result().summary["obstacles"]["touched"]
 
 
 def test_the_robot_backs_off_from_a_target_that_comes() -> None:

@@ -49,15 +49,6 @@ def test_one_mote_that_hangs_on_one_range() -> None:
     assert found.parts == ((0, 1, 2, 3, 4), (0, 5))
 
 
-def test_a_known_coordinate_leaves_the_rest_of_the_frame() -> None:
-    known = NOWHERE.copy()
-    known[0, 1] = known[1, 1] = 1.0
-    assert freedom(ALL, known).frame == ("translation along x",)
-    known = NOWHERE.copy()
-    known[2] = (0.0, 4.5)
-    assert freedom(ALL, known).frame == ("rotation",)
-
-
 def test_a_scale_is_taken_for_the_size_of_the_map() -> None:
     found = freedom(ALL, with_scale=True)
     assert found.deficiency == 1
@@ -127,21 +118,6 @@ def test_what_may_fold_does_fold_and_fits_as_well() -> None:
     fit = fit_map(model, model.state(folded), MapFitSettings())
     assert np.abs(fit.residuals_m).max() < 1e-9
     assert np.abs(fit.state.positions_m - HEADS).max() > 1.0
-
-
-@pytest.mark.parametrize(
-    ("count", "pairs", "unique"),
-    [
-        (4, list(combinations(range(4), 2)), True),  # complete
-        (4, [(0, 1), (1, 2), (2, 3), (0, 3), (0, 2)], False),  # two triangles on one side
-        (5, [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)], True),  # a wheel
-        (6, [(i, j) for i in range(3) for j in range(3, 6)], False),  # K33: rigid, 3-connected, no range to spare
-        (7, [(i, j) for i in range(3) for j in range(3, 7)], True),  # K34
-        (6, [(0, 1), (1, 2), (0, 2), (3, 4), (4, 5), (3, 5), (0, 3), (1, 4), (2, 5)], False),  # prism
-    ],
-)
-def test_graphs_of_the_plane(count: int, pairs: Pairs, unique: bool) -> None:
-    assert is_unique(np.random.default_rng(1).normal(size=(count, 2)), pairs) == unique
 
 
 def test_a_prism_names_the_ranges_that_nothing_confirms() -> None:

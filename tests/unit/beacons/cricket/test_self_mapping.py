@@ -64,16 +64,6 @@ def test_the_filter_ends_where_the_batch_does() -> None:
     assert filtered.positions_m == pytest.approx(batch.state.positions_m, abs=1e-5)  # of the wide prior
 
 
-def test_the_order_of_pairs_does_not_matter() -> None:
-    rng = np.random.default_rng(2)
-    rows = readings(ADJACENT, 3, rng)
-    one, other = mapper(HEADS + 0.05), mapper(HEADS + 0.05)
-    run_phase_two(one, rows, 0.0)
-    run_phase_two(other, [rows[at] for at in rng.permutation(len(rows))], 0.0)
-    assert one.positions_m == pytest.approx(other.positions_m, abs=1e-6)
-    assert one.covariance_m2 == pytest.approx(other.covariance_m2, rel=1e-4, abs=1e-12)
-
-
 def test_repeats_of_few_pairs_teach_their_lengths_alone() -> None:
     """Five pairs see five of nine directions; a filter that linearises each anew believes in all nine."""
     rng = np.random.default_rng(3)

@@ -16,7 +16,7 @@ from ccatp.beacons.slam.batch_problem import (
     Reckoning,
     repeats,
 )
-from ccatp.beacons.slam.batch_smoother import Factored, place_by_distances, smooth, t_cost, t_weights
+from ccatp.beacons.slam.batch_smoother import Factored, smooth, t_cost, t_weights
 from ccatp.beacons.slam.evaluation import judge
 from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun, Steps, dead_reckoned
 from ccatp.config.beacon_models import OdometryNoiseConfig, PriorsConfig, RadioNoiseConfig, RecordingConfig
@@ -396,16 +396,3 @@ def test_a_robot_that_stands_places_no_beacon() -> None:
     assert track.beacons == {}
     assert np.isfinite(track.covariances).all()
     assert sum("or all from one place" in warning for warning in track.warnings) == len(BEACONS)
-
-
-def test_mirror_images_of_a_straight_path_cost_the_same() -> None:
-    x = np.linspace(0.0, 4.0, 30)
-    poses = np.column_stack([x, np.zeros(30), np.zeros(30)])
-    distance = np.hypot(x - 2.5, 3.0)
-    found = place_by_distances(poses, distance, np.full(30, 0.01))
-    assert (found.x_m, abs(found.y_m)) == pytest.approx((2.5, 3.0), abs=0.01)
-    assert found.margin == pytest.approx(0.0, abs=0.1)
-    poses[:, 1] = np.linspace(0.0, 2.0, 30) ** 2
-    bent = place_by_distances(poses, np.hypot(x - 2.5, poses[:, 1] - 3.0), np.full(30, 0.01))
-    assert (bent.x_m, bent.y_m) == pytest.approx((2.5, 3.0), abs=0.01)
-    assert bent.margin > 8.0

@@ -63,16 +63,6 @@ def test_noise_of_a_way_does_not_depend_on_how_often_it_is_told() -> None:
     assert told(40)[2, 2] == pytest.approx(0.02**2 * 2.0 + 0.01**2 * 4.0)
 
 
-def test_noise_is_the_spread_of_steps() -> None:
-    drive, rng = settings(**odometry(0.05, 0.02, 0.02, 0.05, 0.01, 0.04)).drive, np.random.default_rng(3)
-    step = Increment(1.0, 1.0, 1.0, 0.6)
-    var_way, var_turn = 0.05**2 + 0.02**2 * 0.6, 0.02**2 + 0.05**2 * 0.6 + 0.01**2
-    noise = np.sqrt((var_way, var_turn, 0.04**2)) * rng.normal(size=(20000, 3))
-    x = np.array((0.0, 0.0, 0.4))
-    ends = np.array([drive.step(x, Increment(1.0, 1.0, 1.0 + d, 0.6 + t, s)).mean.copy() for d, t, s in noise])
-    assert pytest.approx(np.cov(ends.T), abs=2e-4) == drive.step(x, step).Q  # a tenth of the variances
-
-
 def test_a_turn_at_rest_is_the_bias_and_turns_nothing() -> None:
     drive = CALIBRATED.drive
     x = np.array((1.0, 2.0, 0.3, 0.0, 0.0, 0.0))

@@ -107,16 +107,6 @@ def test_range_and_bearing_join_at_once_and_any_may_be_missing() -> None:
     assert max(world.error_m(b) for b in BEACONS) < 0.1
 
 
-def test_the_first_covariance_is_that_of_range_and_bearing() -> None:
-    world = start(sense=lambda t, w, b: RangeReading(t, b, w.range_m(b), w.bearing_rad(b)))
-    world.drive(1, turn_rad=0.0)
-    range_m, angle = world.range_m("a"), world.bearing_rad("a")
-    turn = np.array(((cos(angle), -sin(angle)), (sin(angle), cos(angle))))
-    expected = turn @ np.diag((0.05**2, (0.03 * range_m) ** 2)) @ turn.T
-    # what the pose leaves unknown is a hundredth of it
-    assert world.slam.beacons["a"].covariance == pytest.approx(expected, abs=0.03 * expected.max())
-
-
 def test_ranges_on_a_straight_way_leave_two_places_and_a_turn_decides() -> None:
     world = start(sense=ranges)
     world.beacons = {"a": BEACONS["a"]}
