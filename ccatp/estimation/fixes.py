@@ -51,6 +51,13 @@ def check_fix(fix: Fix, oldest_s: float, newest_s: float) -> None:
         raise FixRefused(f"fix of {fix.t_s:.3f} s is outside the known path, {oldest_s:.3f} s to {newest_s:.3f} s")
 
 
+def _foot(mirror: Mirror, fix: Fix, puck_height_m: float) -> tuple[float, float, float]:
+    try:
+        return mirror.foot_of_puck(fix.position_m, puck_height_m)
+    except MirrorError as error:
+        raise FixRefused(f"fix at {fix.position_m} m has no foot on the mirror: {error}") from error
+
+
 def foot_of_fix(mirror: Mirror, fix: Fix, puck_height_m: float, panel: PanelId) -> Foot:
     """Foot of the puck on the surface, in the frame of ``panel``.
 
@@ -58,10 +65,7 @@ def foot_of_fix(mirror: Mirror, fix: Fix, puck_height_m: float, panel: PanelId) 
     the part along the surface counts: half its trace without the normal's share. Raises ``FixRefused`` far from the
     mirror, or where the covariance has no positive part along the surface.
     """
-    try:
-        x, y, deviation = mirror.foot_of_puck(fix.position_m, puck_height_m)
-    except MirrorError as error:
-        raise FixRefused(f"fix at {fix.position_m} m has no foot on the mirror: {error}") from error
+    x, y, deviation = _foot(mirror, fix, puck_height_m)
     normal = np.array(mirror.rotate_world_from_deck(mirror.surface.normal(x, y)))
     covariance = np.array(fix.covariance_m2, dtype=np.float64).reshape(3, 3)
     variance = 0.5 * float(np.trace(covariance) - normal @ covariance @ normal)
@@ -77,10 +81,7 @@ def deck_foot(mirror: Mirror, fix: Fix, puck_height_m: float) -> DeckFoot:
     An error along the normal leaves the foot where it is, so the fix's covariance is projected along the normal on the
     deck plane: ``J = [[1, 0, -nx/nz], [0, 1, -ny/nz]]``, ``J R^T C R J^T``. Raises ``FixRefused`` as ``foot_of_fix``.
     """
-    try:
-        x, y, deviation = mirror.foot_of_puck(fix.position_m, puck_height_m)
-    except MirrorError as error:
-        raise FixRefused(f"fix at {fix.position_m} m has no foot on the mirror: {error}") from error
+    x, y, deviation = _foot(mirror, fix, puck_height_m)
     fx, fy = mirror.surface.gradient(x, y)
     # The normal is along (-fx, -fy, 1).
     J = np.array([[1.0, 0.0, fx], [0.0, 1.0, fy]])

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from math import hypot, isfinite, sqrt
-from typing import NamedTuple
 
 import numpy as np
 
@@ -27,9 +26,8 @@ _NOMINAL_FRAME_S = 0.01
 _SHORTEST_LEG_M, _LARGEST_DOUBT_RAD = 0.02, 0.5  # of a heading, from where a leg ended instead
 
 
-class _Moved(NamedTuple):
-    imu: Sequence[ImuSample]
-    rates_rad_s: tuple[Sequence[float], Sequence[float]]
+# The usable samples of the inertial unit, and the rates of the right and of the left wheel.
+_Moved = tuple[Sequence[ImuSample], tuple[Sequence[float], Sequence[float]]]
 
 
 class FullStateLocalizer(LocalizerBase[_Moved]):
@@ -114,8 +112,8 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
     @property
     def creep(self) -> tuple[float, float]:
         """Estimated downhill drift per metre of travel, in the plane of ``pose``."""
-        now, slope = self._running, self._slope
-        return self._panel.along(now.creep_x, now.creep_y, slope[0] * now.creep_x + slope[1] * now.creep_y)
+        x, y, slope = self._running.creep_x, self._running.creep_y, self._slope
+        return self._panel.at.rotate_from_deck((x, y, slope[0] * x + slope[1] * y))[:2]
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
@@ -138,12 +136,16 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
     # -- frames -------------------------------------------------------------------------------------------------------
 
     def _take(self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]) -> _Moved:
-        usable = self._intake.imu(t_s, imu) if imu else imu
-        rates = self._take_wheels(t_s, encoders)
+        usable = self._intake.imu(t_s, imu)
+        right, left = self._intake.wheels(t_s, encoders)
+        self._turned = self._right.add(*right), self._left.add(*left)
         if self._is_new_base:
             self._is_new_base = False
-            self._leave_out_turn()
-        return _Moved(usable, rates)
+            # What the wheels did in the frame that begins a new time base lies in the gap before it, for the filter.
+            self._right.angle_rad -= self._turned[0]
+            self._left.angle_rad -= self._turned[1]
+            self._turned = (0.0, 0.0)
+        return usable, (right[1], left[1])
 
     def _use(
         self, t_s: float, dt_s: float, taken: _Moved, edges: Sequence[EdgeSample], gravity: GravitySample | None
@@ -155,32 +157,12 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
             self._hold_position(t_s, dt_s, taken, gravity)
             self._edges.scan(edges)
         else:
-            self._go(t_s, dt_s, taken.imu, edges, is_still=is_still)
-
-    def _leave_out_turn(self) -> None:
-        """What the wheels did in the frame that begins a new time base lies in the gap before it, for the filter."""
-        self._right.angle_rad -= self._turned[0]
-        self._left.angle_rad -= self._turned[1]
-        self._turned = (0.0, 0.0)
-
-    def _take_wheels(self, t_s: float, encoders: Sequence[WheelSample]) -> tuple[Sequence[float], Sequence[float]]:
-        columns = self._intake.columns(t_s, encoders) if encoders else ((), (), ())
-        if columns is not None:
-            times, right, left = columns
-            self._turned = self._right.add(times, right), self._left.add(times, left)
-            return right, left
-        one, other = self._intake.wheels(t_s, encoders)
-        rates = [rate for _, rate in one], [rate for _, rate in other]
-        self._turned = (
-            self._right.add([t for t, _ in one], rates[0]),
-            self._left.add([t for t, _ in other], rates[1]),
-        )
-        return rates
+            self._go(t_s, dt_s, taken[0], edges, is_still=is_still)
 
     def _hold_position(self, t_s: float, dt_s: float, taken: _Moved, gravity: GravitySample | None) -> None:
-        imu = taken.imu
-        for wheel, found in zip((self._right, self._left), taken.rates_rad_s, strict=True):
-            wheel.rest(found)
+        imu, rates = taken
+        self._right.rest(rates[0])
+        self._left.rest(rates[1])
         self._rebase()  # what adds up meanwhile is noise
         self._rested_s += dt_s
         self._block.stand(imu)

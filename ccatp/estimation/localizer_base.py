@@ -78,7 +78,12 @@ class LocalizerBase(ABC, Generic[Taken]):
                 self._request_hold("time stamps of the frames run backward")
             return
         if self._guard is not None:
-            imu = self._believed(imu, encoders, dt_s)
+            gate, means = self._guard
+            means.take(encoders, dt_s)
+            believed = gate.admit(imu, means.yaw_rad_s) if imu else imu
+            if len(believed) != len(imu):
+                self.counts["imu_doubted"] += len(imu)
+            imu = believed
         taken = self._take(t_s, imu, encoders)
         if self._intake.backward_source:
             self._request_hold(f"time stamps of the {self._intake.backward_source} run backward")
@@ -89,16 +94,6 @@ class LocalizerBase(ABC, Generic[Taken]):
             self._use(t_s, dt_s, taken, edges, gravity)
         except FilterDiverged as error:
             self._freeze(error)
-
-    def _believed(self, imu: Sequence[ImuSample], encoders: Sequence[WheelSample], dt_s: float) -> Sequence[ImuSample]:
-        if self._guard is None:
-            return imu
-        gate, means = self._guard
-        means.take(encoders, dt_s)
-        believed = gate.admit(imu, means.yaw_rad_s) if imu else imu
-        if len(believed) != len(imu):
-            self.counts["imu_doubted"] += len(imu)
-        return believed
 
     def _freeze(self, error: FilterDiverged) -> None:
         self.is_frozen = True
@@ -130,37 +125,24 @@ class PanelFrame:
 
     def __init__(self, mirror: Mirror, panel: PanelId) -> None:
         self._mirror = mirror
-        self.enter(panel)
-
-    def enter(self, panel: PanelId) -> None:
-        """Give poses in the frame of ``panel`` from now on."""
-        found = self._mirror.panel(panel)
-        self.panel = panel
-        self._origin = found.origin
-        (self._ax, self._ay, self._az), (self._bx, self._by, self._bz) = found.axes[:2]
-        self._cx, self._cy = found.x_m, found.y_m
-        self._near_x, self._near_y = _NEAR_BORDER * found.half_x_m, _NEAR_BORDER * found.half_y_m
+        self.at = mirror.panel(panel)
 
     def hand_over(self, x: float, y: float) -> None:
         """The robot is at this deck point."""
-        if abs(x - self._cx) > self._near_x or abs(y - self._cy) > self._near_y:
+        at = self.at
+        if abs(x - at.x_m) > _NEAR_BORDER * at.half_x_m or abs(y - at.y_m) > _NEAR_BORDER * at.half_y_m:
             panel = self._mirror.panel_at(x, y)
-            if panel is not None and panel != self.panel:
-                self.enter(panel)
+            if panel is not None:
+                self.at = self._mirror.panel(panel)
 
     def pose(self, deck: tuple[float, float, float], height_m: float, slope: Slope) -> PanelPose:
         """A deck pose (x, y, heading) on a surface of this height and slope, as ``Mirror.panel_pose``."""
         x, y, psi = deck
-        ox, oy, oz = self._origin
-        px, py, pz = x - ox, y - oy, height_m - oz
         fx, fy = slope[0], slope[1]
         s2 = 1.0 + fx * fx
         s, norm = sqrt(s2), sqrt(s2 + fy * fy)
         c, d = cos(psi), sin(psi)
         hx, hy = c / s - d * fx * fy / (norm * s), d * s / norm
-        along, across = self.along(hx, hy, fx * hx + fy * hy)
-        return PanelPose(self.panel, *self.along(px, py, pz), atan2(across, along))
-
-    def along(self, dx: float, dy: float, dz: float) -> tuple[float, float]:
-        """Components of a deck vector along the panel's axes."""
-        return self._ax * dx + self._ay * dy + self._az * dz, self._bx * dx + self._by * dy + self._bz * dz
+        along, across, _ = self.at.rotate_from_deck((hx, hy, fx * hx + fy * hy))
+        panel_x, panel_y, _ = self.at.from_deck((x, y, height_m))
+        return PanelPose(self.at.id, panel_x, panel_y, atan2(across, along))

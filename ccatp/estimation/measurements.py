@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.config.models import LocalizerConfig, RobotConfig
-from ccatp.core import FloatArray, GravitySample, ImuSample, WheelSample
+from ccatp.core import FloatArray, GravitySample, ImuSample
 from ccatp.estimation.state_model import Slope
 
 V, A, THETA, OMEGA = range(4)
@@ -17,9 +17,6 @@ The thesis prints m^2/s as the unit of the acceleration; m/s^2 is meant.
 """
 STATES = 4
 _CACHE_LIMIT = 256
-
-WheelReading = tuple[float, float]
-"""(time s, wheel rate rad/s) of one wheel."""
 
 
 class Stack(NamedTuple):
@@ -55,50 +52,36 @@ class MeasurementBuilder:
         self._var_wz = cfg.gyroscope_sigma_rad_s**2
         self._bias_wz = cfg.gyroscope_bias_rad_s
         self._var_wheel = cfg.encoder_sigma_rad_s**2
-        self._cache: dict[tuple[int, int, int], Stack] = {}
+        self._stacks: dict[tuple[int, int, int], Stack] = {}
 
-    def from_pairs(self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]) -> Stack:
-        """Stack of a frame in which every encoder sample holds both wheels, finite.
-
-        Imu (t, ax, wz), encoders (t, right, left).
+    def stack(
+        self,
+        t_s: float,
+        imu: Sequence[ImuSample],
+        right: tuple[Sequence[float], Sequence[float]],
+        left: tuple[Sequence[float], Sequence[float]],
+    ) -> Stack:
+        """Stack of a frame with any number of samples; of each wheel the times (s) and the rates (rad/s).
 
         The arrays are work space: they hold until the next call.
         """
-        k = len(encoders)
-        stack = self._template(k, k, len(imu))
+        stack = self._of_size(len(right[0]), len(left[0]), len(imu))
         z, H, _ = stack
-        if k:
-            samples = np.array(encoders, dtype=np.float64)
-            samples[:, 0] -= t_s
-            samples[:, 0] *= self._per_radius
-            H[:k, A] = H[k : 2 * k, A] = samples[:, 0]
-            z[:k] = samples[:, 1]
-            z[k : 2 * k] = samples[:, 2]
-        _fill_imu(z, 2 * k, imu, self._bias_wz)
-        return stack
-
-    def from_wheels(
-        self, t_s: float, imu: Sequence[ImuSample], right: Sequence[WheelReading], left: Sequence[WheelReading]
-    ) -> Stack:
-        """Stack of a frame with any number of samples of each wheel; see ``from_pairs``."""
-        stack = self._template(len(right), len(left), len(imu))
-        z, H, _ = stack
-        for i, (t, rate) in enumerate((*right, *left)):
+        wheels, n = len(right[0]) + len(left[0]), len(imu)
+        for i, (t, rate) in enumerate(zip((*right[0], *left[0]), (*right[1], *left[1]), strict=True)):
             H[i, A] = (t - t_s) * self._per_radius
             z[i] = rate
-        _fill_imu(z, len(right) + len(left), imu, self._bias_wz)
+        for i, (_, ax, wz) in enumerate(imu, wheels):
+            z[i] = ax
+            z[i + n] = wz - self._bias_wz
         return stack
 
-    def _template(self, right: int, left: int, imu: int) -> Stack:
-        key = (right, left, imu)
-        found = self._cache.get(key)
-        if found is None:
-            if len(self._cache) >= _CACHE_LIMIT:
-                self._cache.clear()
-            found = self._cache[key] = self._new(right, left, imu)
-        return found
-
-    def _new(self, right: int, left: int, imu: int) -> Stack:
+    def _of_size(self, right: int, left: int, imu: int) -> Stack:
+        found = self._stacks.get((right, left, imu))
+        if found is not None:
+            return found
+        if len(self._stacks) >= _CACHE_LIMIT:
+            self._stacks.clear()
         wheels = right + left
         m = wheels + 2 * imu
         H = np.zeros((m, STATES))
@@ -111,14 +94,8 @@ class MeasurementBuilder:
         R[:wheels] = self._var_wheel
         R[wheels : wheels + imu] = self._var_ax
         R[wheels + imu :] = self._var_wz
-        return Stack(np.zeros(m), H, R)
-
-
-def _fill_imu(z: FloatArray, start: int, imu: Sequence[ImuSample], bias_rad_s: float) -> None:
-    n = len(imu)
-    for i, (_, ax, wz) in enumerate(imu, start):
-        z[i] = ax
-        z[i + n] = wz - bias_rad_s
+        found = self._stacks[right, left, imu] = Stack(np.zeros(m), H, R)
+        return found
 
 
 class ConstantAcceleration:
@@ -200,7 +177,7 @@ class ZeroVelocityDetector:
     """Counts frames without wheel motion and collects the inertial unit's samples at rest.
 
     A servo that coasts to its set point passes every threshold long before it stands. Only after ``rest_after_s``
-    without motion, several of its time constants, the robot counts as resting.
+    without motion, several of its time constants, the robot counts as resting. ``count``: samples collected.
     """
 
     def __init__(self, rest_after_s: float, gyro: NoiseFloor, accelerometer: NoiseFloor) -> None:
@@ -211,7 +188,7 @@ class ZeroVelocityDetector:
         self._clear()
 
     def _clear(self) -> None:
-        self._count = self._gravity_count = 0
+        self.count = self._gravity_count = 0
         self._rate = self._acceleration = self._gx = self._gy = 0.0
 
     def moved(self) -> None:
@@ -232,7 +209,7 @@ class ZeroVelocityDetector:
     def add(self, imu: Sequence[ImuSample], gravity: GravitySample | None) -> None:
         """Take a frame's samples at rest."""
         for _, ax, wz in imu:
-            self._count += 1
+            self.count += 1
             self._rate += wz
             self._acceleration += ax
             self._gyro.add(wz)
@@ -242,16 +219,11 @@ class ZeroVelocityDetector:
             self._gx += gravity[1]
             self._gy += gravity[2]
 
-    @property
-    def count(self) -> int:
-        """Samples collected."""
-        return self._count
-
     def take(self) -> ZeroVelocityReading:
         """The means so far; collecting begins again."""
-        n = max(self._count, 1)
+        n = max(self.count, 1)
         found = ZeroVelocityReading(
-            self._count, self._rate / n, self._acceleration / n, self._gravity_count, atan2(self._gy, self._gx)
+            self.count, self._rate / n, self._acceleration / n, self._gravity_count, atan2(self._gy, self._gx)
         )
         self._clear()
         return found

@@ -81,19 +81,16 @@ class Odometer:
         later = None
         for entry in reversed(self._path):
             if entry[0] <= t_s:
-                return entry[1] if later is None else _between(entry, later, t_s)
+                if later is None:
+                    return entry[1]
+                part = (t_s - entry[0]) / (later[0] - entry[0])
+                return OdometryPose(*(p + part * (q - p) for p, q in zip(entry[1], later[1], strict=True)))
             later = entry
         return later[1] if later is not None else self.place
 
 
 def _is_still(a: OdometryPose, b: OdometryPose) -> bool:
     return hypot(b.x_m - a.x_m, b.y_m - a.y_m) < _STILL_M and abs(b.heading_rad - a.heading_rad) < _STILL_RAD
-
-
-def _between(early: tuple[float, OdometryPose], late: tuple[float, OdometryPose], t_s: float) -> OdometryPose:
-    (t0, a), (t1, b) = early, late
-    part = (t_s - t0) / (t1 - t0)
-    return OdometryPose(*(p + part * (q - p) for p, q in zip(a, b, strict=True)))
 
 
 class PosePredictor:
@@ -260,21 +257,6 @@ class WheelAngle:
     ``noise_rad2_s2``: variance of a rate sample at rest, None until it was seen at rest.
     """
 
-    __slots__ = (
-        "_gap_rad",
-        "_mean_rate",
-        "_period_s",
-        "_rate",
-        "_seen",
-        "_t_s",
-        "_zeros",
-        "angle_rad",
-        "is_counter",
-        "is_fresh",
-        "noise_rad2_s2",
-        "quantum_rad",
-    )
-
     def __init__(self) -> None:
         self.angle_rad = 0.0
         self.is_fresh = False
@@ -306,7 +288,7 @@ class WheelAngle:
             self._t_s, self._rate = times_s[0], rates_rad_s[0]
         is_counter = self.is_counter or self._is_counting(rates_rad_s)
         elapsed_s = times_s[-1] - self._t_s
-        if self._is_known and elapsed_s < (len(times_s) + _EVEN) * self._period_s:
+        if self._seen >= _ENOUGH and elapsed_s < (len(times_s) + _EVEN) * self._period_s:
             # None is missing, and the periods are as even as the clock: their sum says it all.
             total = sum(rates_rad_s)
             turned = elapsed_s / len(times_s) * (total if is_counter else total + 0.5 * (self._rate - rates_rad_s[-1]))
@@ -317,11 +299,6 @@ class WheelAngle:
         self._t_s, self._rate = times_s[-1], rates_rad_s[-1]
         self.angle_rad += turned
         return turned
-
-    @property
-    def _is_known(self) -> bool:
-        """The period has been seen often enough, and with a counter what a count is."""
-        return self._seen >= _ENOUGH
 
     def _integrated(self, times_s: Sequence[float], rates_rad_s: Sequence[float]) -> float:
         turned, t0, before = 0.0, self._t_s, self._rate

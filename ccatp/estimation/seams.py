@@ -53,21 +53,13 @@ class EdgeScanner:
             if not last < t < inf:
                 continue
             if sample[1:] != values:
-                if values:
-                    found.extend(_transitions(last, values, sample))
+                for corner, (old, new) in enumerate(zip(values, sample[1:], strict=bool(values))):
+                    if old != new:
+                        found.append(SensorTransition(0.5 * (last + t), t - last, corner, bool(new)))
                 values = sample[1:]
             last = t
         self._t_s, self._values = last, values
         return found
-
-
-def _transitions(last_s: float, values: tuple[int, ...], sample: EdgeSample) -> list[SensorTransition]:
-    t = sample[0]
-    return [
-        SensorTransition(0.5 * (last_s + t), t - last_s, corner, bool(new))
-        for corner, (old, new) in enumerate(zip(values, sample[1:], strict=True))
-        if old != new
-    ]
 
 
 def heading_from_pair(
@@ -229,8 +221,6 @@ class HeadingGate:
         return abs(deviation_rad) <= self._gate_sigma * sqrt(variance_rad2)
 
 
-# An edge is taken for a seam where the sensor is expected within this part of a panel's size from one; whatever else it
-# can be (the rim, the next seam) is at least ten times further.
 _TIMING_FLOOR_M2 = 1e-10  # (10 um)^2: the sensor's own repeatability, UNVERIFIED
 
 
@@ -244,14 +234,6 @@ class Edge(NamedTuple):
     position_m: float
     offset: int
     is_new: bool
-
-
-class PanelEdgeLine(NamedTuple):
-    """One sensor over one edge: ``sensor - edge - offset = 0`` along one axis; H is the row (1, n) of the model."""
-
-    residual_m: float
-    H: FloatArray
-    variance_m2: float
 
 
 class SeamLines:
@@ -289,8 +271,13 @@ class SeamLines:
         self._edges[state] = edge
         return Edge(k, edge_m, state, is_new)
 
-    def line(self, edge: Edge, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope) -> PanelEdgeLine:
-        """What a transition over ``edge`` says about the state; arguments as in ``meet``."""
+    def line(
+        self, edge: Edge, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope
+    ) -> tuple[float, FloatArray, float]:
+        """What a transition over ``edge`` says about the state; arguments as in ``meet``.
+
+        ``sensor - edge - offset = 0`` along one axis: residual, m, the row (1, n) of the model, and variance, m^2.
+        """
         place, speeds, (forward, left, lever) = self._sensor(transition, t_s, x, slope, edge.k)
         late_s = t_s - transition.t_s
         v = float(x[V]) - float(x[A]) * late_s
@@ -303,7 +290,7 @@ class SeamLines:
         row[W] = -late_s * row[PSI]
         row[edge.offset] = -1.0
         variance = (speeds[edge.k] * transition.interval_s) ** 2 * _UNIFORM + _TIMING_FLOOR_M2
-        return PanelEdgeLine(edge.position_m + float(x[edge.offset]) - place[edge.k], H, variance)
+        return edge.position_m + float(x[edge.offset]) - place[edge.k], H, variance
 
     def _sensor(
         self, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope, k: int = 0

@@ -100,12 +100,9 @@ class Redraw(NamedTuple):
 class _Parameter:
     """One parameter: leg by leg it is m + d, the mean m unknown with variance v, d drawn anew with variance scatter."""
 
-    __slots__ = ("beta", "mean", "prior", "variance")
-
     def __init__(self, mean: float, sigma: float) -> None:
         self.mean, self.variance = mean, sigma * sigma
         self.prior = (mean, sigma * sigma)
-        self.beta = 1.0
 
     def pass_on(self, found: float, known: float, old_scatter: float, scatter: float) -> tuple[float, float]:
         """From a leg's posterior (mean ``found``, variance ``known``) to the next leg's prior.
@@ -119,7 +116,6 @@ class _Parameter:
         own = self.variance * (1.0 - beta)
         self.mean += beta * (found - self.mean)
         self.variance = own + beta * beta * known
-        self.beta = beta
         self.prior = (self.mean, self.variance + scatter)
         return beta, own + scatter
 

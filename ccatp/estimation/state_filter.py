@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from math import sqrt
 
 import numpy as np
@@ -47,7 +48,7 @@ _STOP_ROWS = np.eye(STATES)[[V, A, W]]
 _DRAWN = [SR, SL, C]
 _WHERE_DRAWN = np.ix_(_DRAWN, _DRAWN)
 
-Step = Callable[[], None]
+Step = Callable[[], object]
 LateStep = Callable[[float], None]
 """A step that belongs to a moment before the state's: gets by how much, s."""
 _SAME_TIME_S = 1e-6
@@ -78,10 +79,7 @@ class SurveyFilter:
         self._legs = SlipPrior(self._full)
         self._tilt_sigma_m = robot.puck_height_m * cfg.full_state.panel_tilt_sigma_rad
         self._gravity_deck = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
-        self._start(start)
-
-    def _start(self, pose: DeckPose) -> None:
-        self._filter.reset(*self._first(pose))
+        self._filter.reset(*self._first(start))
         self._panel = self._panel_below()
 
     def _first(self, pose: DeckPose) -> tuple[FloatArray, FloatArray]:
@@ -207,11 +205,8 @@ class SurveyFilter:
         shift = np.zeros(STATES)
         shift[PR], shift[PL] = -angles[0], -angles[1]
         if full.use.zero_velocity:
-            self._do(lambda: self._update(np.zeros(3), _STOP_ROWS, R))
+            self._do(lambda: self._filter.update(np.zeros(3), _STOP_ROWS, R))
         self._do(lambda: self._filter.predict(Affine.shift(shift), np.zeros((STATES, STATES))))
-
-    def _update(self, z: FloatArray, H: FloatArray, R: FloatArray) -> None:
-        self._filter.update(z, H, R)
 
     def calibrate(self, reading: ZeroVelocityReading, rested_s: float, imu_variances: tuple[float, float]) -> None:
         """Biases from the inertial unit's means over a rest of ``rested_s``, heading from gravity."""
@@ -226,7 +221,7 @@ class SurveyFilter:
             H[0, BG] = H[0, W] = H[1, BA] = H[1, A] = 1.0
             z = np.array((reading.rate_rad_s, reading.acceleration_m_s2))
             R = np.array((imu_variances[0] / n, imu_variances[1] / n))
-            self._do(lambda: self._update(z, H, R))
+            self._do(lambda: self._filter.update(z, H, R))
         if reading.gravity_count and full.use.gravity:
             self._do(lambda: self._feel_gravity(reading.bearing_rad, reading.gravity_count))
 
@@ -244,7 +239,7 @@ class SurveyFilter:
             return
         H = np.zeros((1, STATES))
         H[0, PSI] = 1.0
-        self._update(np.array([float(mean[PSI]) + residual]), H, np.array([variance]))
+        self._filter.update(np.array([float(mean[PSI]) + residual]), H, np.array([variance]))
 
     def _tilt(self, fx: float, fy: float) -> float:
         """Sine of the angle between the surface and the horizontal."""
@@ -287,7 +282,7 @@ class SurveyFilter:
         is_used = residual * residual <= self._full.line_gate**2 * spread
         self._count("crossings_used" if is_used else "crossings_gated")
         if is_used:
-            self._update(H.dot(mean) + residual, H, np.array([variance]))
+            self._filter.update(H.dot(mean) + residual, H, np.array([variance]))
 
     def _renew(self, states: list[int], sigma: float) -> None:
         """States are given to other edges or panels: nothing known of them, nothing correlated."""
@@ -380,20 +375,16 @@ class SurveyFilter:
         self._filter.predict(np.eye(STATES), Q)
 
 
+@dataclass(slots=True, eq=False)
 class _Entry:
     """The state before some steps, the time to which they bring it, and how long the robot may have moved in them."""
 
-    __slots__ = ("covariance", "dt_s", "kept_s", "mean", "steps", "t_s")
-
-    def __init__(self, t_s: float, dt_s: float, mean: FloatArray, covariance: FloatArray) -> None:
-        self.t_s, self.dt_s, self.mean, self.covariance = t_s, dt_s, mean, covariance
-        self.steps: list[Step] = []
-        self.kept_s = t_s  # the steps are those since then
-
-    def settle(self, t_s: float, mean: FloatArray, covariance: FloatArray) -> None:
-        """The robot has stood since the entry's end: the present state is as good as the one before the steps."""
-        self.kept_s, self.mean, self.covariance = t_s, mean, covariance
-        self.steps.clear()
+    t_s: float
+    dt_s: float
+    mean: FloatArray
+    covariance: FloatArray
+    kept_s: float  # the steps are those since then
+    steps: list[Step] = field(default_factory=list)
 
 
 class ReplayBuffer:
@@ -421,20 +412,18 @@ class ReplayBuffer:
         if dt_s == 0.0 and entries and entries[-1].dt_s == 0.0:
             entries[-1].t_s = t_s  # a standstill, however long, is one entry
             if entries[-1].kept_s < t_s - self._reach_s:
-                self._settle(t_s, filter_)
+                # Forget how the state of a long standstill came about: nothing grows however long the robot stands,
+                # and the present state is as good as the one before the steps.
+                while len(entries) > 2:
+                    entries.popleft()
+                for entry in entries:
+                    entry.kept_s, entry.mean, entry.covariance = t_s, filter_.mean, filter_.covariance
+                    entry.steps.clear()
             return
-        entries.append(_Entry(t_s, dt_s, filter_.mean, filter_.covariance))
+        entries.append(_Entry(t_s, dt_s, filter_.mean, filter_.covariance, t_s))
         # Two entries at least: a standstill may outlast the reach, and its beginning is where its fix belongs.
         while len(entries) > 2 and entries[1].t_s < t_s - self._reach_s:
             entries.popleft()
-
-    def _settle(self, t_s: float, filter_: Filter) -> None:
-        """Forget how the state of a long standstill came about: nothing grows however long the robot stands."""
-        entries = self._entries
-        while len(entries) > 2:
-            entries.popleft()
-        for entry in entries:
-            entry.settle(t_s, filter_.mean, filter_.covariance)
 
     def add(self, step: Step) -> None:
         """Keep a step of the present entry."""

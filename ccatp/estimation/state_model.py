@@ -298,7 +298,11 @@ class SensorRows:
         rows = self._rows
         H = self._H.get(rows)
         if H is None:
-            H = self._H[rows] = _pattern(rows)
+            H = self._H[rows] = np.zeros((len(rows), STATES))
+            H[np.arange(len(rows)), rows] = 1.0
+            for state, bias in ((W, BG), (A, BA)):
+                if state in rows:
+                    H[rows.index(state), bias] = 1.0
         h: FloatArray = x.take(rows)
         if rows[0] == W:
             w = float(x[W])
@@ -318,14 +322,3 @@ class SensorRows:
         if rows[-1] == A:
             h[:, -1] += points[:, BA]
         return h
-
-
-def _pattern(rows: tuple[int, ...]) -> FloatArray:
-    H = np.zeros((len(rows), STATES))
-    for k, state in enumerate(rows):
-        H[k, state] = 1.0
-        if state == W:
-            H[k, BG] = 1.0
-        elif state == A:
-            H[k, BA] = 1.0
-    return H

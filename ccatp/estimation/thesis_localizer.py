@@ -111,7 +111,7 @@ class FourStateLocalizer(LocalizerBase[Stack]):
         return 0.0, 0.0
 
     def _take(self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]) -> Stack:
-        return self._intake.stack(self._builder, t_s, imu, encoders)
+        return self._builder.stack(t_s, self._intake.imu(t_s, imu), *self._intake.wheels(t_s, encoders))
 
     def _use(
         self,

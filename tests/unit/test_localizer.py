@@ -207,9 +207,8 @@ def test_handover_by_itself_is_continuous() -> None:
 
 def test_rows_are_those_of_equation_2_12_and_not_of_2_3() -> None:
     cfg = config()
-    z, H, R = MeasurementBuilder(cfg.robot, cfg.localizer).from_pairs(
-        1.0, [ImuSample(1.0, 0.1, 0.2)], [WheelSample(1.0, 3.0, 4.0)]
-    )
+    builder = MeasurementBuilder(cfg.robot, cfg.localizer)
+    z, H, R = builder.stack(1.0, [ImuSample(1.0, 0.1, 0.2)], ([1.0], [3.0]), ([1.0], [4.0]))
     per_r, turn = 1.0 / 0.03, 0.15 / 0.06
     np.testing.assert_allclose(z, [3.0, 4.0, 0.1, 0.2])
     expected = np.array([[per_r, 0, 0, turn], [per_r, 0, 0, -turn], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -222,15 +221,9 @@ def test_samples_count_at_their_own_time() -> None:
     builder = MeasurementBuilder(cfg.robot, cfg.localizer)
     times = [0.991, 0.994, 1.0]
     speed = {t: 0.05 + 0.2 * (t - 1.0) for t in times}  # v = 0.05, a = 0.2 at t = 1
-    encoders = [WheelSample(t, speed[t] / 0.03, speed[t] / 0.03) for t in times]
-    z, H, _ = builder.from_pairs(1.0, [], encoders)
+    wheel = times, [speed[t] / 0.03 for t in times]
+    z, H, _ = builder.stack(1.0, [], wheel, wheel)
     np.testing.assert_allclose(H @ np.array([0.05, 0.2, 0.0, 0.0]), z, rtol=1e-12)  # the model is exact here
-    right, left = [(s.t_s, s[1]) for s in encoders], [(s.t_s, s[2]) for s in encoders]
-    singly = builder.from_wheels(
-        1.0, [], [(t, float(w or 0.0)) for t, w in right], [(t, float(w or 0.0)) for t, w in left]
-    )
-    np.testing.assert_allclose(singly.H, H, rtol=1e-14)  # two orders of the same products
-    np.testing.assert_allclose(singly.z, z)
 
 
 def test_one_wheel_missing_is_used_with_the_other() -> None:

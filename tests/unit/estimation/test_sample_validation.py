@@ -1,11 +1,10 @@
-"""Pure. Which samples are used: the quick way for clean frames and the slow way for the others agree."""
+"""Pure. Which samples are used; the noise learned at rest, and what a rest shows."""
 
 from collections import Counter
 from math import inf, nan, pi, sqrt
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 
 from ccatp.config.models import FullStateConfig
 from ccatp.core import DeckPose, GravitySample, ImuSample, PanelPose, WheelSample, difference, wrap_pi
@@ -22,7 +21,7 @@ ONE = WheelSample(1.002, 1.0, 2.0)
 def intake() -> SampleValidator:
     """One that has used samples up to 1.001 s."""
     found = SampleValidator(HISTORY_S, Counter())
-    assert found.columns(1.001, [WheelSample(1.0, 0.0, 0.0), WheelSample(1.001, 0.0, 0.0)]) is not None
+    found.wheels(1.001, [WheelSample(1.0, 0.0, 0.0), WheelSample(1.001, 0.0, 0.0)])
     return found
 
 
@@ -30,52 +29,39 @@ def counts(found: SampleValidator) -> dict[str, int]:
     return {key: value for key, value in found._counts.items() if value}
 
 
-DIRTY = {
-    "a wheel without a sample": [WheelSample(1.002, None, 2.0)],
-    "the other": [ONE, WheelSample(1.003, 2.0, None)],
-    "a rate that is no number": [WheelSample(1.002, nan, 2.0)],
-    "an infinite rate": [WheelSample(1.002, 1.0, inf)],
-    "two that cancel": [WheelSample(1.002, inf, -inf)],
-    "a time that is no number": [ONE, WheelSample(nan, 1.0, 2.0), WheelSample(1.004, 1.0, 2.0)],
-    "the same at the end": [ONE, WheelSample(nan, 1.0, 2.0)],
-    "twice": [ONE, ONE],
-    "used before": [WheelSample(1.001, 1.0, 2.0), ONE],
-    "backward": [WheelSample(1.003, 1.0, 2.0), ONE],
-    "older than all": [WheelSample(1.0005, 1.0, 2.0)],
-    "ahead": [ONE, WheelSample(1.02, 1.0, 2.0)],
-    "late": [WheelSample(0.8, 1.0, 2.0)],
-}
-
-
 @pytest.mark.parametrize(
-    ("name", "right", "left", "refused"),
+    ("samples", "right", "left", "refused"),  # each wheel counts for itself
     [
-        ("a wheel without a sample", [], [1.002], {}),
-        ("the other", [1.002, 1.003], [1.002], {}),
-        ("a rate that is no number", [], [], {"nonfinite": 1}),
-        ("an infinite rate", [], [], {"nonfinite": 1}),
-        ("two that cancel", [], [], {"nonfinite": 1}),
-        ("a time that is no number", [1.002, 1.004], [1.002, 1.004], {"nonfinite": 1}),
-        ("twice", [1.002], [1.002], {"duplicate": 2}),
-        ("used before", [1.002], [1.002], {"duplicate": 2}),
-        ("backward", [1.003], [1.003], {"backward": 2}),
-        ("older than all", [], [], {"backward": 2}),
-        ("ahead", [1.002], [1.002], {"ahead": 2}),
-        ("late", [], [], {"late": 2}),
+        ([ONE, WheelSample(1.003, 3.0, 4.0)], [1.002, 1.003], [1.002, 1.003], {}),
+        ([WheelSample(1.002, None, 2.0)], [], [1.002], {}),
+        ([ONE, WheelSample(1.003, 2.0, None)], [1.002, 1.003], [1.002], {}),
+        ([WheelSample(1.002, nan, 2.0)], [], [], {"nonfinite": 1}),
+        ([WheelSample(1.002, 1.0, inf)], [], [], {"nonfinite": 1}),
+        ([WheelSample(1.002, inf, -inf)], [], [], {"nonfinite": 1}),
+        (
+            [ONE, WheelSample(nan, 1.0, 2.0), WheelSample(1.004, 1.0, 2.0)],
+            [1.002, 1.004],
+            [1.002, 1.004],
+            {"nonfinite": 1},
+        ),
+        ([WheelSample(1.002, 8.0, 2.0), WheelSample(1.003, 1.0, -8.0)], [1.003], [1.002], {"too_fast": 2}),
+        ([ONE, ONE], [1.002], [1.002], {"duplicate": 2}),
+        ([WheelSample(1.001, 1.0, 2.0), ONE], [1.002], [1.002], {"duplicate": 2}),
+        ([WheelSample(1.003, 1.0, 2.0), ONE], [1.003], [1.003], {"backward": 2}),
+        ([WheelSample(1.0005, 1.0, 2.0)], [], [], {"backward": 2}),
+        ([ONE, WheelSample(1.02, 1.0, 2.0)], [1.002], [1.002], {"ahead": 2}),
+        ([WheelSample(0.8, 1.0, 2.0)], [], [], {"late": 2}),
     ],
 )
-def test_dirty_samples_are_judged_one_by_one(
-    name: str, right: list[float], left: list[float], refused: dict[str, int]
+def test_wheel_samples_are_judged_one_by_one(
+    samples: list[WheelSample], right: list[float], left: list[float], refused: dict[str, int]
 ) -> None:
     found = intake()
-    one, other = found.wheels(1.01, DIRTY[name])
-    assert [t for t, _ in one] == right
-    assert [t for t, _ in other] == left
-    assert counts(found) == refused  # each wheel counts for itself
-
-
-times = st.integers(0, 30).map(lambda k: 0.98 + 0.002 * k)
-rates = st.one_of(st.none(), st.sampled_from([0.0, 1.0, -2.5, nan, inf]))
+    found.largest_rate_rad_s = 7.0
+    (right_times, right_rates), (left_times, left_rates) = found.wheels(1.01, samples)
+    assert (right_times, left_times) == (right, left)
+    assert (len(right_rates), len(left_rates)) == (len(right), len(left))
+    assert counts(found) == refused
 
 
 def test_five_backward_samples_in_a_row_name_the_sensor() -> None:
@@ -116,7 +102,7 @@ def test_unusable_samples_of_the_inertial_unit(reason: str) -> None:
 def test_a_jump_of_the_clock_forgets_all_times() -> None:
     found = intake()
     found.restart()
-    assert found.columns(0.01, [WheelSample(0.005, 1.0, 2.0)]) is not None
+    assert found.wheels(0.01, [WheelSample(0.005, 1.0, 2.0)]) == (([0.005], [1.0]), ([0.005], [2.0]))
 
 
 WINDOW = 15  # samples in a mean of the noise floor

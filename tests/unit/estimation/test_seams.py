@@ -104,7 +104,7 @@ def test_the_truth_has_no_residual(meeting: Meeting) -> None:
     line = seams.line(edge, meeting.transition, meeting.late_s, meeting.state, meeting.slope())
     # The way since the transition bends by v w late^2/2 = 8e-7 m, and the slopes change by f'' v late = 1.6e-5: of a
     # lever of 0.13 m and slopes of 0.05 that is 1e-7 m.
-    assert abs(line.residual_m) < 1e-6
+    assert abs(line[0]) < 1e-6
 
 
 @settings(max_examples=100, deadline=None)
@@ -117,12 +117,12 @@ def test_its_row_is_the_derivative(meeting: Meeting, a: float, offset: float) ->
     assert edge is not None
 
     def residual(state: FloatArray) -> float:
-        return seams.line(edge, meeting.transition, meeting.late_s, state, meeting.slope()).residual_m
+        return seams.line(edge, meeting.transition, meeting.late_s, state, meeting.slope())[0]
 
     line = seams.line(edge, meeting.transition, meeting.late_s, x, meeting.slope())
     numeric = [(residual(x - step * row) - residual(x + step * row)) / (2.0 * step) for row in np.eye(STATES)]
     # Rounding of metres over the step; that V depends on A bends by late^3 = 1e-6 and less.
-    np.testing.assert_allclose(line.H[0], numeric, atol=2e-9)
+    np.testing.assert_allclose(line[1][0], numeric, atol=2e-9)
 
 
 def test_the_variance_is_that_of_the_timing_and_of_the_sensor(seams: SeamLines) -> None:
@@ -132,7 +132,7 @@ def test_the_variance_is_that_of_the_timing_and_of_the_sensor(seams: SeamLines) 
         edge = meeting.meet(seams)
         assert edge is not None
         line = seams.line(edge, transition, 0.0, meeting.state, meeting.slope())
-        assert line.variance_m2 == pytest.approx((v * interval_s) ** 2 / 12.0 + 1e-10, rel=0.01)  # the slope: 0.1 %
+        assert line[2] == pytest.approx((v * interval_s) ** 2 / 12.0 + 1e-10, rel=0.01)  # the slope: 0.1 %
 
 
 def test_the_sensors_share_the_edge_and_its_offset(seams: SeamLines) -> None:

@@ -277,7 +277,7 @@ def test_the_panel_changes_in_the_middle_of_the_gap(mirror: Mirror) -> None:
     frame, middle = PanelFrame(mirror, here.id), 0.5 * (here.x_m + there.x_m)
     for x, panel in ((here.x_m, here), (middle - 1e-6, here), (middle + 1e-6, there), (middle - 1e-6, here)):
         frame.hand_over(x, here.y_m)
-        assert frame.panel == panel.id
+        assert frame.at.id == panel.id
         assert frame.pose(
             (panel.x_m, panel.y_m, 0.0), panel.origin[2], Terrain(mirror).at(panel.x_m, panel.y_m)
         ).x_m == (pytest.approx(0.0, abs=1e-15))
@@ -287,10 +287,10 @@ def test_the_panel_changes_along_y_and_far_away(mirror: Mirror) -> None:
     frame = PanelFrame(mirror, PanelId(4, 4))
     for wanted in (PanelId(5, 4), PanelId(2, 6)):
         frame.hand_over(mirror.panel(wanted).x_m, mirror.panel(wanted).y_m)
-        assert frame.panel == wanted
+        assert frame.at.id == wanted
 
 
 def test_beside_the_mirror_the_last_panel_stays(mirror: Mirror) -> None:
     frame = PanelFrame(mirror, PanelId(5, 1))
     frame.hand_over(mirror.panel(PanelId(5, 1)).x_m - 1.0, 0.0)
-    assert frame.panel == PanelId(5, 1)
+    assert frame.at.id == PanelId(5, 1)
