@@ -1,7 +1,7 @@
 """One quantity brought to zero: along a profile with feed-forward, or by the thesis's PID (eq. 3.4, in seconds)."""
 
 from math import copysign, exp, sqrt
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from ccatp.config.models import ControlConfig, PidConfig
 
@@ -110,27 +110,6 @@ def clamped(value: float, limit: float) -> float:
 FEEDBACK_SHARE = 0.25
 
 
-class ControlAxis(Protocol):
-    """Brings one remaining quantity (a distance in m or an angle in rad) to zero."""
-
-    def begin(self, remaining: float) -> None:
-        """Start a motion over ``remaining`` from rest to rest."""
-
-    def is_over(self, remaining: float, tolerance: float, speed: float | None) -> bool:
-        """Whether the motion has come to its end within ``tolerance``."""
-
-    @property
-    def duration_s(self) -> float:
-        """Bang-bang time of the motion begun last."""
-
-    @property
-    def overtime_s(self) -> float:
-        """Time spent after the plan's end."""
-
-    def step(self, remaining: float, dt_s: float, speed: float | None) -> float:
-        """Speed wanted for the next ``dt_s``, given what remains and, where it is known, the speed now."""
-
-
 class BareAxis:
     """PID of the remaining quantity, thesis eqs 3.1 to 3.4; ``a_max`` only serves the bang-bang time."""
 
@@ -164,6 +143,7 @@ class ProfiledAxis:
     wheels travel further than the body: it acts in proportion to the planned speed and is gone at the end, where an
     ordinary integral would still have to unwind. Kp e is bounded; where a plan ends further off than that brings home
     in time, a second motion follows. The derivative is the speed's own estimate, never a difference of poses.
+    ``duration_s``: bang-bang time of the motion begun last.
     """
 
     def __init__(self, gains: PidConfig, cfg: ControlConfig, v_max: float, a_max: float, lag_s: float) -> None:
@@ -178,14 +158,9 @@ class ProfiledAxis:
     def begin(self, remaining: float) -> None:
         """Plan the motion over ``remaining``."""
         self._profile = Profile.rest_to_rest(remaining, self._v_max, self._a_max)
-        self._duration_s = self._profile.duration_s
+        self.duration_s = self._profile.duration_s
         self._t_s = self._slip = 0.0
         self._planned = self._profile.at(0.0)
-
-    @property
-    def duration_s(self) -> float:
-        """Bang-bang time of the motion begun last."""
-        return self._duration_s
 
     @property
     def planned_speed(self) -> float:
@@ -195,11 +170,11 @@ class ProfiledAxis:
     @property
     def overtime_s(self) -> float:
         """Time spent after the plan's end, s; negative before."""
-        return self._t_s - self._duration_s
+        return self._t_s - self.duration_s
 
     def is_over(self, remaining: float, tolerance: float, speed: float | None) -> bool:
         """Whether the plan is out and what is left when the wheels have run down is within ``tolerance``."""
-        if self._t_s < self._duration_s:
+        if self._t_s < self.duration_s:
             return False
         coast = 0.0 if speed is None else speed * self._lag_s
         return abs(remaining - coast) <= tolerance

@@ -3,10 +3,10 @@
 from collections import deque
 from enum import StrEnum
 from math import asin, atan2, cos, exp, hypot, pi, sin, sqrt
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from ccatp.config.models import ControlConfig, LimitsConfig
-from ccatp.control.pid import BareAxis, ControlAxis, Pid, ProfiledAxis, clamped
+from ccatp.control.pid import BareAxis, Pid, ProfiledAxis, clamped
 from ccatp.core import Predicted, Twist, wrap_pi
 
 # Drift per metre beyond which an estimate is nonsense: a robot carried off that fast has lost its wheels' grip.
@@ -118,18 +118,6 @@ class LegPhase(StrEnum):
 TURN, DRIVE, DONE = LegPhase
 
 
-class Speeds(Protocol):
-    """Speeds of the robot's origin: a ``Twist``, or a state that has them."""
-
-    @property
-    def v_m_s(self) -> float:
-        """Forward speed."""
-
-    @property
-    def omega_rad_s(self) -> float:
-        """Angular rate."""
-
-
 class LegTracker:
     """Drives one leg: turn in place to the bearing of the target, then move to it, forward or in reverse.
 
@@ -144,8 +132,8 @@ class LegTracker:
         self._position_tolerance_m = gains.position_tolerance_m
         self._heading_tolerance_rad = gains.heading_tolerance_rad
         self._straight_rad = max(control.straight_tolerance_rad, gains.heading_tolerance_rad)
-        self._forward: ControlAxis
-        self._angular: ControlAxis
+        self._forward: BareAxis | ProfiledAxis
+        self._angular: BareAxis | ProfiledAxis
         v, a, omega, alpha = limits.v_max_m_s, limits.a_max_m_s2, limits.omega_max_rad_s, limits.alpha_max_rad_s2
         self._along = ProfiledAxis(gains.forward, control, v, a, wheel_lag_s)
         if gains.shaped:
@@ -201,7 +189,7 @@ class LegTracker:
         pose: tuple[float, float, float],
         target: tuple[float, float],
         dt_s: float,
-        speeds: Speeds | None = None,
+        speeds: Twist | Predicted | None = None,
         creep: tuple[float, float] = NO_CREEP,
     ) -> Twist:
         """Twist for the next ``dt_s``; ``pose`` is that at which it will take effect."""
@@ -255,7 +243,7 @@ class LegTracker:
         pose: tuple[float, float, float],
         target: tuple[float, float],
         dt_s: float,
-        speeds: Speeds | None,
+        speeds: Twist | Predicted | None,
         creep: tuple[float, float],
     ) -> Twist:
         control, axis = self._control, self._along

@@ -8,18 +8,16 @@ from typing import Any
 
 from ccatp.config.models import Config
 from ccatp.control.gate import DriveGate
-from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind
+from ccatp.core import PanelId, PointId, Stop, StopKind
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
 from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.survey.heading_recovery import TakeoverState
 from ccatp.survey.mission import Mission
-from ccatp.survey.planning.escape import plan_calibration, plan_way_home
-from ccatp.survey.planning.route import ORDERS, Route, plan_rejoin, plan_route, with_prelude
+from ccatp.survey.planning.route import ORDERS, Route, RoutePlanner
 from ccatp.survey.planning.search import leg_lengths, leg_time, path_time, stop_times
 from ccatp.survey.planning.tour_bound import tour_bound
-from ccatp.survey.state import PlanHome, PlanPoints, PlanRest
 
 # The configuration may be calibrated, the robot's own figures are nominal: this much apart they describe two robots.
 RADIUS_TOLERANCE = 0.05
@@ -62,11 +60,15 @@ def assemble(cfg: Config, done: Collection[PointId] = (), recovery: TakeoverStat
     mirror = build_mirror(cfg.mirror)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
     route = plan_survey(cfg, mirror, points, done, calibrates=recovery is None)
-    localizer = _build_localizer(cfg, mirror, recovery)
+    if recovery is None:
+        localizer = build_localizer(cfg, mirror)
+    else:
+        sigmas = recovery.position_sigma_m, recovery.heading_sigma_rad
+        localizer = build_with_uncertainty(cfg, mirror, recovery.pose, sigmas)
     # No drive shows the four states their heading: the fix does not reach it.
     heading_sigma_of = float if cfg.run.filter in FOUR_STATE else lambda: localizer.heading_sigma_rad
-    planners = _home_planner(cfg, mirror), _rest_planner(cfg, mirror), _points_planner(cfg, mirror)
-    mission = Mission(cfg, mirror, route, *planners, heading_sigma_of)
+    planner = RoutePlanner(mirror, cfg)
+    mission = Mission(cfg, mirror, route, planner.home, planner.rejoin, planner.route, heading_sigma_of)
     if recovery is not None:
         mission.take_over(recovery)
     return SurveyParts(
@@ -98,12 +100,10 @@ def plan_survey(
     ``out_of_reach`` takes the points that cannot be reached; without it they raise ``PlanError``, as does a base that
     is not on the mirror.
     """
-    limits, start, measuring_s = cfg.limits, mirror.base_pose, cfg.etalon.measuring_time_s
-    route = plan_route(mirror, points, cfg.robot, limits, cfg.mission, start, done, measuring_s, out_of_reach)
-    if not calibrates or cfg.run.filter in FOUR_STATE:  # they have no states that the drive could calibrate
-        return route
-    drive = plan_calibration(mirror, cfg.robot, cfg.mission, start)
-    return with_prelude(mirror, route, drive, limits, start, measuring_s)
+    planner = RoutePlanner(mirror, cfg)
+    route = planner.route(mirror.base_pose, points, done, out_of_reach)
+    # The four states have none that the drive could calibrate.
+    return planner.with_calibration(route) if calibrates and cfg.run.filter not in FOUR_STATE else route
 
 
 def build_gate(cfg: Config) -> DriveGate:
@@ -140,35 +140,6 @@ def robot_problems(cfg: Config, mirror: Mirror, hello: Hello) -> list[str]:
     if mirror.overhang and own.fan_floor <= 0.0:
         problems.append("the mirror overhangs and the robot has no fan floor")
     return problems
-
-
-def _build_localizer(cfg: Config, mirror: Mirror, recovery: TakeoverState | None) -> Localizer:
-    if recovery is None:
-        return build_localizer(cfg, mirror)
-    return build_with_uncertainty(cfg, mirror, recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad))
-
-
-def _rest_planner(cfg: Config, mirror: Mirror) -> PlanRest:
-    def plan(route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
-        measuring_s = cfg.etalon.measuring_time_s
-        return plan_rejoin(mirror, route, cfg.robot, cfg.limits, cfg.mission, start, skip, measuring_s)
-
-    return plan
-
-
-def _points_planner(cfg: Config, mirror: Mirror) -> PlanPoints:
-    def plan(start: DeckPose, points: Sequence[PointId]) -> Route:
-        measuring_s = cfg.etalon.measuring_time_s
-        return plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, start, (), measuring_s)
-
-    return plan
-
-
-def _home_planner(cfg: Config, mirror: Mirror) -> PlanHome:
-    def plan(start: DeckPose) -> tuple[Stop, ...]:
-        return plan_way_home(mirror, start, mirror.base_pose, cfg.robot, cfg.limits, cfg.mission)
-
-    return plan
 
 
 _SHOWN = 10

@@ -56,7 +56,10 @@ class Mission(SurveyState):
         """One frame: react to the verdict in force (``None``: none fresh enough), then do what the state says."""
         if self._is_steered_bare:
             control = self.cfg.control
-            motion = motion.with_only(ahead=control.predicts_delay, creep=control.compensates_creep)
+            motion = motion._replace(
+                creep=motion.creep if control.compensates_creep else (0.0, 0.0),
+                ahead=motion.ahead if control.predicts_delay else None,
+            )
         if self._budget is not None:
             self._budget.begin(motion.t_s)
         self._failsafe.react(motion, verdict)

@@ -165,20 +165,6 @@ class StateEstimate(NamedTuple):
         """The pose in the deck frame."""
         return self.deck_of(self.pose)
 
-    def with_only(self, *, ahead: bool, creep: bool) -> "StateEstimate":
-        """The same without what steering is not to use: the prediction, the drift."""
-        return StateEstimate(
-            self.t_s,
-            self.dt_s,
-            self.pose,
-            self.deck_of,
-            self.speed_m_s,
-            self.rate_rad_s,
-            self.creep if creep else (0.0, 0.0),
-            self.ahead if ahead else None,
-            self.sigma_of,
-        )
-
 
 class RouteFollower:
     """Keeps the current stop (``None`` when all are exhausted) and drives the leg to it.

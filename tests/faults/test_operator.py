@@ -24,7 +24,7 @@ from ccatp.links.rpc import REPEAT_S, RequestFailed, request
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety.emergency_latch import EmergencyLatch
 from ccatp.survey.behaviours import home_time_s
-from ccatp.survey.planning.escape import plan_way_home
+from ccatp.survey.planning.route import RoutePlanner
 from ccatp.survey.planning.search import path_time
 from ccatp.survey.reactions import FaultAction, UnattendedFaultTimer
 from ccatp.survey.state import BACKING_OFF, DONE, DRIVING, HELD, RETURNING, TURNING, MissionState
@@ -208,7 +208,7 @@ def test_the_way_home_is_planned_before_the_robot_misses_it(measured: Measured) 
             tries = []
             for _ in range(2):
                 begun_s = time.process_time()
-                plan_way_home(mirror, DeckPose(x, y, 1.0), mirror.base_pose, cfg.robot, cfg.limits, cfg.mission)
+                RoutePlanner(mirror, cfg).home(DeckPose(x, y, 1.0))
                 tries.append(time.process_time() - begun_s)
             longest_s = max(longest_s, min(tries))
     assert longest_s <= 0.2
@@ -454,7 +454,7 @@ def test_the_way_home_stays_on_the_mirror_and_takes_no_longer_than_thought(
             count += 1
             x, y = mirror.point_on_deck(point)
             start = DeckPose(x, y, rng.uniform(-3.14, 3.14))
-            stops = plan_way_home(mirror, start, base, cfg.robot, cfg.limits, cfg.mission)
+            stops = RoutePlanner(mirror, cfg).home(start, base)
             ends = [(stop.x_m, stop.y_m) for stop in stops]
             # The first leg may begin nearer to the rim than legs keep to it, but leads away from it.
             own_m = min(least_m, mirror.rim.signed_distance_m(x, y) - 1e-9)

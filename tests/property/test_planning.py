@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Stop, StopKind
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.planning.escape import plan_way_home
-from ccatp.survey.planning.route import ORDERS, plan_rejoin, plan_route, thesis_order
+from ccatp.survey.planning.route import ORDERS, RoutePlanner, thesis_order
 from ccatp.survey.planning.search import path_time
 from tests.support.scenario import config_of, mirror_of
 
@@ -112,7 +111,7 @@ def check_route(cfg: Config, mirror: Mirror, stops: Sequence[Stop]) -> None:
 def test_a_survey_stays_on_the_mirror(name: str, order: str, panels: int) -> None:
     cfg, mirror = load(name)
     points = ORDERS[order](mirror, panels)
-    route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose)
+    route = RoutePlanner(mirror, cfg).route(mirror.base_pose, points)
     check_route(cfg, mirror, route.stops)
     measured = [stop for stop in route.stops if stop.kind is StopKind.MEASURE]
     assert [stop.point for stop in measured] == points
@@ -127,7 +126,7 @@ def test_any_rest_of_a_survey_stays_on_the_mirror(name: str, order: str, panels:
     points = ORDERS[order](mirror, panels)
     is_done = np.random.default_rng(seed).random(len(points)) < part
     skip = {point for point, done in zip(points, is_done, strict=True) if done}
-    route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose, skip=skip)
+    route = RoutePlanner(mirror, cfg).route(mirror.base_pose, points, skip)
     assert [stop.point for stop in route.stops if stop.point] == [point for point in points if point not in skip]
     if route.stops:
         check_route(cfg, mirror, route.stops)
@@ -139,12 +138,12 @@ def test_back_to_a_route_from_anywhere_on_it(name: str, order: str, data: st.Dat
     """Off the route after any of its points, at any heading: the rest is driven safely, each point of it once."""
     cfg, mirror = load(name)
     points = ORDERS[order](mirror, 20)
-    route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose)
+    route = RoutePlanner(mirror, cfg).route(mirror.base_pose, points)
     done = data.draw(st.integers(0, len(points) - 1))
     # Well inside: how it leaves the rim is the way home's affair.
     inner = [xy for xy in map(mirror.point_on_deck, points) if mirror.rim.signed_distance_m(*xy) > 0.2]
     start = DeckPose(*data.draw(st.sampled_from(inner)), data.draw(st.floats(-7.0, 7.0)))
-    back = plan_rejoin(mirror, route, cfg.robot, cfg.limits, cfg.mission, start, set(points[:done]))
+    back = RoutePlanner(mirror, cfg).rejoin(route, start, set(points[:done]))
     assert [stop.point for stop in back.stops if stop.point] == points[done:]
     assert least_clearance(mirror, start, back.stops) >= cfg.mission.leg_clearance_m - ROUNDING_M
     assert worst_sensor(cfg, mirror, drive(mirror, start, back.stops)) >= cfg.mission.turn_clearance_m - SWEEP_M
@@ -153,7 +152,7 @@ def test_back_to_a_route_from_anywhere_on_it(name: str, order: str, data: st.Dat
 def check_way_home(cfg: Config, mirror: Mirror, start: DeckPose) -> None:
     """Every leg clear and every turn safe, but for the first move away from the rim, which only leads inward."""
     base = mirror.base_pose
-    stops = plan_way_home(mirror, start, base, cfg.robot, cfg.limits, cfg.mission)
+    stops = RoutePlanner(mirror, cfg).home(start, base)
     assert stops[-1] == Stop(base.x_m, base.y_m, StopKind.BASE, None, stops[-1].reverse, base.heading_rad)
     assert all(stop.kind is StopKind.VIA and stop.heading_rad is None for stop in stops[:-1])
     legs = drive(mirror, start, stops)
@@ -175,7 +174,7 @@ def test_home_from_the_end_of_a_survey(name: str, order: str, panels: int) -> No
     """As it stands at the last stop."""
     cfg, mirror = load(name)
     points = ORDERS[order](mirror, panels)
-    last = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose).stops[-2:]
+    last = RoutePlanner(mirror, cfg).route(mirror.base_pose, points).stops[-2:]
     course = atan2(last[1].y_m - last[0].y_m, last[1].x_m - last[0].x_m) + (pi if last[1].reverse else 0.0)
     check_way_home(cfg, mirror, DeckPose(last[1].x_m, last[1].y_m, course))
 
@@ -199,7 +198,7 @@ def test_home_from_a_point_at_the_rim_without_a_sweep(name: str, step: int) -> N
     near = [xy for xy in map(mirror.point_on_deck, thesis_order(mirror)) if mirror.rim.signed_distance_m(*xy) < 0.1323]
     for k, (x, y) in list(enumerate(near))[::step]:
         start = DeckPose(x, y, radians(90.0 * k + (4.0, -4.0)[k // 4 % 2]))  # all four directions, on both sides
-        stops = plan_way_home(mirror, start, mirror.base_pose, cfg.robot, cfg.limits, cfg.mission)
+        stops = RoutePlanner(mirror, cfg).home(start)
         assert worst_sensor(cfg, mirror, drive(mirror, start, stops)) >= cfg.mission.turn_clearance_m - SWEEP_M
 
 
@@ -228,7 +227,7 @@ def test_home_from_the_rim(name: str, edge: int, along: float, depth: float, hea
 def test_stops_on_the_way_cost_time_and_nothing_else(name: str, order: str, panels: int) -> None:
     cfg, mirror = load(name)
     points = ORDERS[order](mirror, panels)
-    route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose, measuring_time_s=0.5)
+    route = RoutePlanner(mirror, cfg).route(mirror.base_pose, points)
     time_s = path_time(route.stops, mirror.base_pose, cfg.limits, mirror, 0.5)
     assert route.remaining_s(0) == pytest.approx(time_s, abs=1e-6)  # two sums of some hundred terms
     assert all(a > b for a, b in pairwise(route.times_s))

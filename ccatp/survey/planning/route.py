@@ -2,16 +2,17 @@
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import accumulate, chain
+from itertools import accumulate, chain, groupby
 
 import numpy as np
 
-from ccatp.config.models import LimitsConfig, MissionConfig, RobotConfig
-from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind
+from ccatp.config.models import Config, LimitsConfig
+from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind, difference
 from ccatp.mirror.layout import POINTS_PER_ROW
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.planning.escape import find_escape, find_retreats
+from ccatp.survey.planning.escape import find_escape, find_retreats, plan_calibration
 from ccatp.survey.planning.legs import (
+    LegPlace,
     LegRules,
     OutsideMirrorError,
     UnreachablePointError,
@@ -20,9 +21,10 @@ from ccatp.survey.planning.legs import (
     course_of_heading,
     in_parts,
 )
-from ccatp.survey.planning.search import Search, SearchNode, Target, path_time, stop_times
+from ccatp.survey.planning.search import Search, SearchNode, Target, path_time, stop_times, turn_time
 
 _REPLANNED_POINTS = 4  # at least, before the old route is joined again
+_LONGEST_LEG_HOME_M = 0.75  # about one stop per panel: there the robot points itself at base again
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,151 +39,155 @@ class Route:
         return self.times_s[min(index, len(self.stops))]
 
 
-def plan_route(
-    mirror: Mirror,
-    points: Sequence[PointId],
-    robot: RobotConfig,
-    limits: LimitsConfig,
-    mission: MissionConfig,
-    start: DeckPose,
-    skip: Collection[PointId] = (),
-    measuring_time_s: float = 0.0,
-    out_of_reach: list[PointId] | None = None,
-) -> Route:
-    """The fastest drivable sequence of stops through the points from a deck pose.
+class RoutePlanner:
+    """Plans the ways of a survey on a mirror.
 
     The robot turns in place and moves straight, forward or in reverse. On every leg its origin keeps
     ``leg_clearance_m`` from the rim and all its edge sensors ``turn_clearance_m``, during turns too; where the thesis's
-    straight way does not, stops are put in between. ``measuring_time_s`` counts for the remaining time only.
-
-    Raises ``OutsideMirrorError`` (start); ``UnreachableError`` for a point, unless ``out_of_reach`` takes it.
+    straight way does not, stops are put in between.
     """
-    left = set(points).difference(skip)
-    wanted = [point for point in points if point in left]
-    stops = _stops(mirror, wanted, robot, limits, mission, start, out_of_reach)
-    return _with_remains(mirror, stops, limits, start, measuring_time_s)
 
+    def __init__(self, mirror: Mirror, cfg: Config) -> None:
+        self._mirror, self._limits, self._mission = mirror, cfg.limits, cfg.mission
+        self._measuring_s = cfg.etalon.measuring_time_s
+        self._body = build_body(cfg.robot, cfg.mission)
+        self._search = Search(LegRules(mirror, self._body), cfg.limits)
 
-def with_prelude(
-    mirror: Mirror,
-    route: Route,
-    prelude: tuple[Stop, ...],
-    limits: LimitsConfig,
-    start: DeckPose,
-    measuring_time_s: float = 0.0,
-) -> Route:
-    """A route with stops before it that lead from its start back to its start."""
-    head = _with_remains(mirror, prelude, limits, start, measuring_time_s)
-    return Route(
-        prelude + route.stops,
-        tuple(t + route.times_s[0] for t in head.times_s[:-1]) + route.times_s,
-    )
+    def route(
+        self,
+        start: DeckPose,
+        points: Sequence[PointId],
+        skip: Collection[PointId] = (),
+        out_of_reach: list[PointId] | None = None,
+    ) -> Route:
+        """The fastest drivable sequence of stops through the points from a deck pose.
 
+        Raises ``OutsideMirrorError`` (start); ``UnreachableError`` for a point, unless ``out_of_reach`` takes it.
+        """
+        left = set(points).difference(skip)
+        wanted = [point for point in points if point in left]
+        return self._timed(self._stops(wanted, start, out_of_reach), start)
 
-def plan_rejoin(
-    mirror: Mirror,
-    route: Route,
-    robot: RobotConfig,
-    limits: LimitsConfig,
-    mission: MissionConfig,
-    start: DeckPose,
-    skip: Collection[PointId],
-    measuring_time_s: float = 0.0,
-) -> Route:
-    """The way from a deck pose back to a route: its next points planned again, the rest as it was.
+    def rejoin(self, route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
+        """The way from a deck pose back to a route: its next points planned again, the rest as it was.
 
-    Raises as ``plan_route``.
-
-    Planning a whole mirror again takes longer than the robot's frames may wait. The new part ends at a point where the
-    robot can turn freely, so that it does not matter how it arrives there.
-    """
-    body = build_body(robot, mission)
-    left = [k for k, stop in enumerate(route.stops) if stop.point is not None and stop.point not in skip]
-    free = (
-        n
-        for n, k in enumerate(left)
-        if n >= _REPLANNED_POINTS
-        and mirror.rim.signed_distance_m(route.stops[k].x_m, route.stops[k].y_m) >= body.turning_depth_m
-    )
-    count = next(free, len(left) - 1) + 1
-    points = [point for k in left[:count] if (point := route.stops[k].point) is not None]
-    head = plan_route(mirror, points, robot, limits, mission, start, (), measuring_time_s)
-    rest = left[count - 1] + 1 if left else len(route.stops)
-    return Route(
-        head.stops + route.stops[rest:],
-        tuple(t + route.times_s[rest] for t in head.times_s[:-1]) + route.times_s[rest:],
-    )
-
-
-def _stops(
-    mirror: Mirror,
-    points: list[PointId],
-    robot: RobotConfig,
-    limits: LimitsConfig,
-    mission: MissionConfig,
-    start: DeckPose,
-    out_of_reach: list[PointId] | None,
-) -> tuple[Stop, ...]:
-    body = build_body(robot, mission)
-    xy = np.array([(start.x_m, start.y_m), *(mirror.point_on_deck(point) for point in points)])
-    places = build_places(mirror, body, xy[:, 0], xy[:, 1])
-    if not places[0].depth_m > 0.0:
-        raise OutsideMirrorError(
-            f"start ({start.x_m:.3f}, {start.y_m:.3f}) m is {-places[0].depth_m:.3f} m beyond the rim of {mirror.name}"
+        Raises as ``route``. Planning a whole mirror again takes longer than the robot's frames may wait. The new part
+        ends at a point where the robot can turn freely, so that it does not matter how it arrives there.
+        """
+        left = [k for k, stop in enumerate(route.stops) if stop.point is not None and stop.point not in skip]
+        free = (
+            n
+            for n, k in enumerate(left)
+            if n >= _REPLANNED_POINTS
+            and self._mirror.rim.signed_distance_m(route.stops[k].x_m, route.stops[k].y_m) >= self._body.turning_depth_m
         )
-    search = Search(LegRules(mirror, body), limits)
-    retreats = find_retreats(mirror, body, places)
-    first = SearchNode(places[0], course_of_heading(mirror, start), 0.0)
-    if places[0].stance is not None:  # too near the rim to turn: away from it first, as on the way home
-        first, retreats[0] = find_escape(mirror, body, first, limits), ()
-    arrivals, before = [first], 0
-    for k, point in enumerate(points, start=1):
-        found = search.advance(arrivals, retreats[before], Target(places[k], retreats[k]))
-        if found:
-            arrivals, before = found, k
-        elif out_of_reach is not None:
-            out_of_reach.append(point)
-        else:
+        count = next(free, len(left) - 1) + 1
+        points = [point for k in left[:count] if (point := route.stops[k].point) is not None]
+        return _followed(self.route(start, points), route, left[count - 1] + 1 if left else len(route.stops))
+
+    def with_calibration(self, route: Route) -> Route:
+        """A route from base with the calibration drive before it."""
+        base = self._mirror.base_pose
+        return _followed(self._timed(plan_calibration(self._mirror, self._body, self._mission, base), base), route, 0)
+
+    def home(self, start: DeckPose, base: DeckPose | None = None) -> tuple[Stop, ...]:
+        """Stops from a deck pose anywhere on the mirror to base; the last is base itself, with its heading.
+
+        Near the rim the first stop leads straight away from it, forward or in reverse, to where the robot can turn.
+        From there on legs and turns keep the clearances of a survey. Raises ``OutsideMirrorError`` (start), and
+        ``UnreachableError`` if base lies where the clearances allow no way.
+        """
+        mirror, body, mission = self._mirror, self._body, self._mission
+        base = base or mirror.base_pose
+        here, goal = build_places(mirror, body, np.array([start.x_m, base.x_m]), np.array([start.y_m, base.y_m]))
+        if not here.depth_m > 0.0:
+            raise OutsideMirrorError(
+                f"no way home from ({start.x_m:.3f}, {start.y_m:.3f}) m: {-here.depth_m:.3f} m beyond the rim of "
+                f"{mirror.name}"
+            )
+        target = Target(goal, find_retreats(mirror, body, [goal])[0])
+        arrivals = self._search.advance([self._first(here, start)], (), target)
+        if not arrivals:
             raise UnreachablePointError(
-                f"mission: no safe way to point {point.row}-{point.col}-{point.point} of {mirror.name}, "
-                f"{places[k].depth_m:.3f} m from the rim, with leg_clearance_m = {mission.leg_clearance_m} and "
+                f"no safe way to base at ({base.x_m:.3f}, {base.y_m:.3f}) m, {goal.depth_m:.3f} m from the rim of "
+                f"{mirror.name}, with leg_clearance_m = {mission.leg_clearance_m} and "
                 f"turn_clearance_m = {mission.turn_clearance_m}"
             )
-    point_of = dict(zip(places[1:], points, strict=True))
-    best = min(arrivals, key=lambda arrival: arrival.cost_s)
-    ends = [
-        Stop(
-            arrival.place.x_m,
-            arrival.place.y_m,
-            StopKind.MEASURE if arrival.place in point_of else StopKind.VIA,
-            point_of.get(arrival.place),
-            arrival.reverse,
-        )
-        for arrival in best.path()
-    ]
-    begins = [(start.x_m, start.y_m), *((stop.x_m, stop.y_m) for stop in ends)]
-    # A heading that is off by 10 mrad misses by a centimetre after a metre: long legs are looked after on the way.
-    return tuple(
-        part for begin, end in zip(begins, ends, strict=False) for part in in_parts(*begin, end, mission.longest_leg_m)
-    )
+        course = course_of_heading(mirror, base)
+
+        def rank(arrival: SearchNode) -> tuple[bool, float]:
+            """One from which the turn to the final course is safe, if there is; then the cheapest, with that turn."""
+            turned_s = turn_time(difference(course, arrival.course_rad), self._limits)
+            return not arrival.place.can_turn(arrival.course_rad, course), arrival.cost_s + turned_s
+
+        path = min(arrivals, key=rank).path()
+        ends = [Stop(a.place.x_m, a.place.y_m, StopKind.VIA, None, a.reverse) for a in path[:-1]]
+        ends.append(Stop(base.x_m, base.y_m, StopKind.BASE, None, path[-1].reverse, base.heading_rad))
+        return _in_parts((here.x_m, here.y_m), ends, _LONGEST_LEG_HOME_M)
+
+    def _first(self, place: LegPlace, start: DeckPose) -> SearchNode:
+        """Where the robot stands; too near the rim to turn, where its first move away from it ends."""
+        first = SearchNode(place, course_of_heading(self._mirror, start), 0.0)
+        return first if place.stance is None else find_escape(self._mirror, self._body, first, self._limits)
+
+    def _stops(self, points: list[PointId], start: DeckPose, out_of_reach: list[PointId] | None) -> tuple[Stop, ...]:
+        mirror, body, mission = self._mirror, self._body, self._mission
+        xy = np.array([(start.x_m, start.y_m), *(mirror.point_on_deck(point) for point in points)])
+        places = build_places(mirror, body, xy[:, 0], xy[:, 1])
+        if not places[0].depth_m > 0.0:
+            raise OutsideMirrorError(
+                f"start ({start.x_m:.3f}, {start.y_m:.3f}) m is {-places[0].depth_m:.3f} m beyond the rim of "
+                f"{mirror.name}"
+            )
+        retreats = find_retreats(mirror, body, places)
+        if places[0].stance is not None:
+            retreats[0] = ()  # away from the rim first, as on the way home
+        arrivals, before = [self._first(places[0], start)], 0
+        for k, point in enumerate(points, start=1):
+            found = self._search.advance(arrivals, retreats[before], Target(places[k], retreats[k]))
+            if found:
+                arrivals, before = found, k
+            elif out_of_reach is not None:
+                out_of_reach.append(point)
+            else:
+                raise UnreachablePointError(
+                    f"mission: no safe way to point {point.row}-{point.col}-{point.point} of {mirror.name}, "
+                    f"{places[k].depth_m:.3f} m from the rim, with leg_clearance_m = {mission.leg_clearance_m} and "
+                    f"turn_clearance_m = {mission.turn_clearance_m}"
+                )
+        point_of = dict(zip(places[1:], points, strict=True))
+        best = min(arrivals, key=lambda arrival: arrival.cost_s)
+        ends = [
+            Stop(
+                arrival.place.x_m,
+                arrival.place.y_m,
+                StopKind.MEASURE if arrival.place in point_of else StopKind.VIA,
+                point_of.get(arrival.place),
+                arrival.reverse,
+            )
+            for arrival in best.path()
+        ]
+        # A heading that is off by 10 mrad misses by a centimetre after a metre: long legs are looked after on the way.
+        return _in_parts((start.x_m, start.y_m), ends, mission.longest_leg_m)
+
+    def _timed(self, stops: tuple[Stop, ...], start: DeckPose) -> Route:
+        times = [
+            time_s + (self._measuring_s if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) else 0.0)
+            for stop, time_s in zip(stops, stop_times(stops, start, self._limits, self._mirror), strict=True)
+        ]
+        return Route(stops, tuple(accumulate(reversed(times), initial=0.0))[::-1])
 
 
-def _with_remains(
-    mirror: Mirror, stops: tuple[Stop, ...], limits: LimitsConfig, start: DeckPose, measuring_time_s: float
-) -> Route:
-    times = [
-        time_s + (measuring_time_s if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) else 0.0)
-        for stop, time_s in zip(stops, stop_times(stops, start, limits, mirror), strict=True)
-    ]
-    return Route(stops, _sums_to_the_end(times))
+def _followed(head: Route, route: Route, index: int) -> Route:
+    """``head``, and then ``route`` from stop ``index`` on."""
+    rest_s = route.times_s[index]
+    times_s = tuple(t + rest_s for t in head.times_s[:-1]) + route.times_s[index:]
+    return Route(head.stops + route.stops[index:], times_s)
 
 
-def _sums_to_the_end(parts: list[float]) -> tuple[float, ...]:
-    return tuple(accumulate(reversed(parts), initial=0.0))[::-1]
-
-
-# Line and place within the line, both counted over the whole grid of panels.
-_Split = Callable[[PointId], tuple[int, int]]
+def _in_parts(start: tuple[float, float], ends: list[Stop], longest_m: float) -> tuple[Stop, ...]:
+    begins = [start, *((stop.x_m, stop.y_m) for stop in ends)]
+    return tuple(part for begin, end in zip(begins, ends, strict=False) for part in in_parts(*begin, end, longest_m))
 
 
 def fastest_serpentine(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig) -> list[PointId]:
@@ -196,18 +202,13 @@ def fastest_serpentine(mirror: Mirror, points: Sequence[PointId], limits: Limits
 def serpentines(points: Sequence[PointId]) -> Iterator[list[PointId]]:
     """All eight serpentines: along the rows, along the columns; each from any of its corners."""
     for split in (_on_row, _on_column):
-        lines = _lines(points, split)
+        # Line and place within the line, both counted over the whole grid of panels.
+        by_line = groupby(sorted(points, key=split), key=lambda point: split(point)[0])
+        lines = [list(line) for _, line in by_line]
         for stacked in (lines, lines[::-1]):
             for odd in (0, 1):
                 turned = (line[::-1] if k % 2 != odd else line for k, line in enumerate(stacked))
                 yield list(chain.from_iterable(turned))
-
-
-def _lines(points: Sequence[PointId], split: _Split) -> list[list[PointId]]:
-    lines: dict[int, list[PointId]] = {}
-    for point in sorted(points, key=split):
-        lines.setdefault(split(point)[0], []).append(point)
-    return list(lines.values())
 
 
 def _on_row(point: PointId) -> tuple[int, int]:

@@ -102,12 +102,9 @@ def _choices(legs_s: FloatArray, headings: FloatArray, base_heading_rad: float, 
         angles = np.where(legs_s[k, near] > 0.0, headings[k, near], np.nan)
         turns_s = np.nan_to_num(_turn_times(angles[:, None] - angles, limits), nan=0.0)
         parts.append(_of_point(k, near, legs_s[k, near] / 2.0, turns_s, _least_far(legs_s[k], is_near[k], k) / 2.0))
-    return _Choices(
-        np.concatenate([part.place for part in parts]),
-        np.concatenate([part.near for part in parts]),
-        np.concatenate([part.is_end for part in parts]),
-        np.concatenate([part.cost_s for part in parts]),
-    )
+    place, near_places, is_end, cost_s = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    possible = np.isfinite(cost_s)
+    return _Choices(place[possible], near_places[possible], is_end[possible], cost_s[possible])
 
 
 def _near(legs_s: FloatArray) -> NDArray[np.bool_]:
@@ -131,7 +128,7 @@ def _of_base(legs_s: FloatArray, turns_s: FloatArray, is_near: NDArray[np.bool_]
     costs = np.r_[(legs_s / 2.0 + np.where(legs_s > 0.0, turns_s, 0.0))[near], _least_far(legs_s, is_near, 0)[0] / 2.0]
     joined = np.full((len(costs), 2), _NONE)
     joined[:-1, 0] = near
-    return _finite(_Choices(np.zeros(len(costs), dtype=np.int64), joined, np.zeros(len(costs), dtype=np.bool_), costs))
+    return _Choices(np.zeros(len(costs), dtype=np.int64), joined, np.zeros(len(costs), dtype=np.bool_), costs)
 
 
 def _of_point(place: int, near: IntArray, halves_s: FloatArray, turns_s: FloatArray, far_s: FloatArray) -> _Choices:
@@ -143,13 +140,7 @@ def _of_point(place: int, near: IntArray, halves_s: FloatArray, turns_s: FloatAr
     pairs_s = halves_s[first] + halves_s[second] + turns_s[first, second]
     costs = np.r_[pairs_s, halves_s + far_s[0], far_s[0] + far_s[1], halves_s, far_s[0]]
     is_end = np.arange(len(costs)) >= len(costs) - len(near) - 1
-    return _finite(_Choices(np.full(len(costs), place), joined, is_end, costs))
-
-
-def _finite(choices: _Choices) -> _Choices:
-    possible = np.isfinite(choices.cost_s)
-    place, near, is_end, cost_s = choices
-    return _Choices(place[possible], near[possible], is_end[possible], cost_s[possible])
+    return _Choices(np.full(len(costs), place), joined, is_end, costs)
 
 
 def _priced(choices: _Choices) -> float:

@@ -12,7 +12,7 @@ from ccatp.config.models import LimitsConfig
 from ccatp.control.pid import Profile
 from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind, bearing, difference
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.survey.planning.escape import find_retreats, plan_way_home
+from ccatp.survey.planning.escape import find_retreats
 from ccatp.survey.planning.legs import (
     Body,
     LegPlace,
@@ -26,7 +26,7 @@ from ccatp.survey.planning.legs import (
     in_parts,
     sensor_depths,
 )
-from ccatp.survey.planning.route import optimised_order, plan_route, thesis_order
+from ccatp.survey.planning.route import RoutePlanner, optimised_order, thesis_order
 from ccatp.survey.planning.search import (
     STRAIGHT_RAD,
     bang_bang_time,
@@ -258,8 +258,7 @@ def test_whole_mirrors(world: Any) -> None:
     cfg, mirror = world.cfg, world.mirror
     orders = (thesis_order(mirror), optimised_order(mirror))
     thesis_s, optimised_s = (
-        plan_route(mirror, order, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose, (), 0.5).remaining_s(0)
-        for order in orders
+        RoutePlanner(mirror, cfg).route(mirror.base_pose, order).remaining_s(0) for order in orders
     )
     bound_s = tour_bound(mirror, orders[0], cfg.limits, 0.5)
     assert bound_s < optimised_s < 1.06 * bound_s  # measured: 1.037 to 1.050
@@ -274,8 +273,7 @@ def test_whole_mirrors(world: Any) -> None:
 
 
 def go(world: Any, start: DeckPose, base: DeckPose | None = None) -> tuple[Stop, ...]:
-    cfg = world.cfg
-    return plan_way_home(world.mirror, start, base or world.mirror.base_pose, cfg.robot, cfg.limits, cfg.mission)
+    return RoutePlanner(world.mirror, world.cfg).home(start, base)
 
 
 def test_ends_at_base_with_its_heading(world: Any) -> None:

@@ -11,7 +11,6 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.survey.planning.escape import plan_way_home
 from ccatp.survey.planning.legs import (
     Grazing,
     LegPlace,
@@ -25,10 +24,10 @@ from ccatp.survey.planning.legs import (
 from ccatp.survey.planning.route import (
     NOMINAL_LIMITS,
     Route,
+    RoutePlanner,
     fastest_serpentine,
     optimised_order,
     panel_order,
-    plan_route,
     serpentines,
     thesis_order,
 )
@@ -38,8 +37,12 @@ STEPS_OF_THESIS_M1 = ((1, 2), (2, 3), (7, 8), (8, 9))  # rows of 7, 9, 11, ..., 
 
 
 def plan(world: Any, points: list[PointId], **options: Any) -> Route:
-    cfg = world.cfg
-    return plan_route(world.mirror, points, cfg.robot, cfg.limits, cfg.mission, world.mirror.base_pose, **options)
+    return RoutePlanner(world.mirror, world.cfg).route(world.mirror.base_pose, points, **options)
+
+
+def with_clearances(world: Any, **clearances: float) -> RoutePlanner:
+    mission = world.cfg.mission.model_copy(update=clearances)
+    return RoutePlanner(world.mirror, world.cfg.model_copy(update={"mission": mission}))
 
 
 def bare(world: Any, points: list[PointId]) -> tuple[Stop, ...]:
@@ -65,7 +68,7 @@ def test_straight_legs_at_stepped_corners_come_too_near_the_rim(thesis: Any) -> 
 
 def test_whole_surveys_fit_into_the_hour(world: Any) -> None:
     points = thesis_order(world.mirror)
-    route = plan(world, points, measuring_time_s=0.5)
+    route = plan(world, points)
     straight_s = path_time(bare(world, points), world.mirror.base_pose, world.cfg.limits, world.mirror, 0.5)
     settled_s = route.remaining_s(0) + 0.15 * len(route.stops)  # the servo's lag and settling, each stop
     assert settled_s < world.cfg.run.budget_s
@@ -77,8 +80,7 @@ def test_largest_leg_of_thesis_m1(thesis: Any) -> None:
     points, cfg = thesis_order(thesis.mirror), thesis.cfg
 
     def legs_of(longest_m: float) -> list[float]:
-        mission = cfg.mission.model_copy(update={"longest_leg_m": longest_m})
-        route = plan_route(thesis.mirror, points, cfg.robot, cfg.limits, mission, thesis.mirror.base_pose)
+        route = with_clearances(thesis, longest_leg_m=longest_m).route(thesis.mirror.base_pose, points)
         ends = [(stop.x_m, stop.y_m) for stop in route.stops]
         return sorted(hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(ends))
 
@@ -99,7 +101,7 @@ def test_done_points_are_left_out(thesis: Any) -> None:
 
 def test_remaining_time_and_way(thesis: Any) -> None:
     points = thesis_order(thesis.mirror, 1)
-    route = plan(thesis, points, measuring_time_s=0.5)
+    route = plan(thesis, points)
     base, cfg, mirror = thesis.mirror.base_pose, thesis.cfg, thesis.mirror
     assert route.remaining_s(0) == pytest.approx(path_time(route.stops, base, cfg.limits, mirror, 0.5), rel=1e-12)
     last = len(route.stops) - 1
@@ -108,36 +110,32 @@ def test_remaining_time_and_way(thesis: Any) -> None:
 
 
 def test_start_beyond_the_rim(thesis: Any) -> None:
-    cfg = thesis.cfg
     with pytest.raises(OutsideMirrorError, match=r"start \(9\.000, 0\.000\) m is 5\.\d+ m beyond the rim of thesis-m1"):
-        plan_route(thesis.mirror, [], cfg.robot, cfg.limits, cfg.mission, DeckPose(9.0, 0.0, 0.0))
+        RoutePlanner(thesis.mirror, thesis.cfg).route(DeckPose(9.0, 0.0, 0.0), [])
 
 
 def test_points_out_of_reach_may_be_left_out(thesis: Any) -> None:
-    cfg, mirror = thesis.cfg, thesis.mirror
-    mission = cfg.mission.model_copy(update={"leg_clearance_m": 0.13})
+    mirror, planner = thesis.mirror, with_clearances(thesis, leg_clearance_m=0.13)
     points = thesis_order(mirror, 1)
     lost: list[PointId] = []
     x, y = mirror.point_on_deck(PointId(1, 3, 5))
     start = DeckPose(x, y, 0.0)
-    route = plan_route(mirror, points, cfg.robot, cfg.limits, mission, start, (), 0.0, lost)
+    route = planner.route(start, points, (), lost)
     # The panel in the lower left corner: a point is 115 mm from either side of it that is a rim.
     assert sorted(point.point for point in lost) == [1, 2, 3, 4, 7]
     reached = [stop.point for stop in route.stops if stop.point is not None]
     assert reached == [point for point in points if point not in lost]
     # The way is that of a survey of the others alone.
-    assert route == plan_route(mirror, reached, cfg.robot, cfg.limits, mission, start)
+    assert route == planner.route(start, reached)
 
 
 @pytest.mark.parametrize("clearances", [{"leg_clearance_m": 0.13}, {"turn_clearance_m": 0.04}])
 def test_points_too_near_the_rim(clearances: dict[str, float], thesis: Any) -> None:
-    cfg = thesis.cfg
-    mission = cfg.mission.model_copy(update=clearances)
     points = thesis_order(thesis.mirror, 1)
     with pytest.raises(
         UnreachablePointError, match=r"no safe way to point 1-3-1 of thesis-m1, 0\.115 m from the rim"
     ) as e:
-        plan_route(thesis.mirror, points, cfg.robot, cfg.limits, mission, thesis.mirror.base_pose)
+        with_clearances(thesis, **clearances).route(thesis.mirror.base_pose, points)
     assert isinstance(e.value, PlanError)
     for name, value in clearances.items():
         assert f"{name} = {value}" in str(e.value)
@@ -192,16 +190,17 @@ def test_no_way_off_the_route_leads_along_a_seam(name: str, slanted: int) -> Non
     """Home from anywhere, or to a point at the other end of the mirror: straight there, a slanted way would."""
     cfg = load_config(overrides={"run.mirror": name})
     mirror = build_mirror(cfg.mirror)
-    rules, points = LegRules(mirror, build_body(cfg.robot, cfg.mission)), thesis_order(mirror)
+    planner, points = RoutePlanner(mirror, cfg), thesis_order(mirror)
+    rules = LegRules(mirror, build_body(cfg.robot, cfg.mission))
     rng, straight, found = np.random.default_rng(1), 0, []
     for k in range(60):
         x, y = next(p for p in rng.uniform(-3.0, 3.0, (99, 2)).tolist() if mirror.rim.signed_distance_m(*p) > 0.2)
         start = DeckPose(x, y, float(rng.uniform(-np.pi, np.pi)))
         if k % 2:
-            stops = plan_way_home(mirror, start, mirror.base_pose, cfg.robot, cfg.limits, cfg.mission)
+            stops = planner.home(start)
         else:
             point = points[int(rng.integers(len(points)))]
-            stops = plan_route(mirror, [point], cfg.robot, cfg.limits, cfg.mission, start).stops
+            stops = planner.route(start, [point]).stops
         places = [LegPlace(x, y, 1.0), *(LegPlace(stop.x_m, stop.y_m, 1.0) for stop in stops)]
         for (a, b), stop in zip(pairwise(places), stops, strict=True):
             if (b.x_m, b.y_m) != (a.x_m, a.y_m):
