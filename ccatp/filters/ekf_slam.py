@@ -124,7 +124,9 @@ class EkfSlam:
         """Advance the vehicle: its new mean (v,), F = d(new)/d(old) (v, v), and Q (v, v)."""
         v = self.vehicle_size
         if vehicle_mean.shape != (v,) or F.shape != (v, v) or Q.shape != (v, v):
-            raise _misfit(v, vehicle_mean, F, Q)
+            for name, array, wanted in (("vehicle_mean", vehicle_mean, (v,)), ("F", F, (v, v)), ("Q", Q, (v, v))):
+                if array.shape != wanted:
+                    raise FilterShapeError(name, array.shape, str(wanted))
         rows = F.dot(self._rows)
         corner = rows[:, :v].dot(F.T)
         corner += Q
@@ -290,12 +292,6 @@ def columns_of(*parts: slice | Sequence[int]) -> Columns:
     for part in parts:
         numbers += range(part.start, part.stop) if isinstance(part, slice) else part
     return np.array(numbers, dtype=np.intp)
-
-
-def _misfit(v: int, vehicle_mean: FloatArray, F: FloatArray, Q: FloatArray) -> FilterShapeError:
-    wanted = (("vehicle_mean", vehicle_mean, (v,)), ("F", F, (v, v)), ("Q", Q, (v, v)))
-    name, array, shape = next(each for each in wanted if each[1].shape != each[2])
-    return FilterShapeError(name, array.shape, str(shape))
 
 
 def _checked_rows(columns: Columns, H: FloatArray, residual: FloatArray, R: FloatArray) -> FloatArray:

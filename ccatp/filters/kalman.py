@@ -200,7 +200,7 @@ class KalmanFilter:
         dtrsm(*rows.solve)
         nis: float = ddot(*rows.squares)
         if not nis < HUGE:
-            raise _not_finite(residual, nis)
+            raise FilterDiverged(f"update is not finite: NIS {nis:.3g}, residuals {residual}")
         dsyrk(*rows.reduce)
         self._flat[-1] = 0.0
         self._mean = self._covariance = None
@@ -241,7 +241,7 @@ class KalmanFilter:
         dtrsm(1.0, C, U, 0, 0, 1, 0, 1)  # (L C^-1)^T above the negative change of x
         minus_x, nis = self._minus_x + self._U_row, corner * corner
         if not nis + ddot(minus_x, minus_x) < HUGE:
-            raise _not_finite(residual, nis)
+            raise FilterDiverged(f"update is not finite: NIS {nis:.3g}, residuals {residual}")
         self._U_row[...] = 0.0
         dsyrk(1.0, U, 0.0, self._M, 1, 0, 1)
         self._minus_x[...], self._flat[-1] = minus_x, 0.0
@@ -312,7 +312,3 @@ def noise_root(R: FloatArray) -> FloatArray:
     if info != 0:
         raise FilterDiverged("R is not positive definite")
     return factor
-
-
-def _not_finite(residual: list[float], nis: float) -> FilterDiverged:
-    return FilterDiverged(f"update is not finite: NIS {nis:.3g}, residuals {residual}")

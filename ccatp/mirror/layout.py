@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 from ccatp.config.models import PanelsConfig
 from ccatp.core import PanelId, Vector3
-from ccatp.mirror.surface import Axes, LayoutError, Surface
+from ccatp.mirror.surface import Axes, LayoutError
 
 GAP_AGREEMENT_MM = 0.1  # the fitted pitches of the telescope exceed size + gap by up to 0.012 mm
 
@@ -124,7 +124,7 @@ POINTS_PER_ROW = 3
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A panel and its frame (thesis fig. 2.2): centre and half sizes in the deck plane, m.
+    """A panel and its frame (thesis fig. 2.2), the tangent frame at its centre: it and half sizes in the deck plane, m.
 
     ``origin``: surface point at the centre, deck frame, m; ``axes``: the panel's x, y, z as unit vectors in the deck
     frame.
@@ -160,9 +160,3 @@ class Panel:
         vx, vy, vz = v
         (ax, ay, az), (bx, by, bz), (cx, cy, cz) = self.axes
         return ax * vx + bx * vy + cx * vz, ay * vx + by * vy + cy * vz, az * vx + bz * vy + cz * vz
-
-
-def build_panel(surface: Surface, panel: PanelId, centre: tuple[float, float], half: tuple[float, float]) -> Panel:
-    """Panel whose frame is the tangent frame of the surface at ``centre``; both arguments in the deck plane, m."""
-    x, y = centre
-    return Panel(panel, x, y, half[0], half[1], surface.point(x, y), surface.axes(x, y))

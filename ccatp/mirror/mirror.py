@@ -1,7 +1,6 @@
 """The mirror as the robot meets it: surface, frames, panels, rim and poses."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import groupby
 from math import atan2, cos, pi, sin
 from typing import Literal
@@ -11,12 +10,11 @@ from numpy.typing import NDArray
 
 from ccatp.config.models import BaseConfig, CollimatorsConfig, FrameConfig, MirrorConfig
 from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose, PointId, Vector3, wrap_pi
-from ccatp.mirror.layout import POINTS_PER_PANEL, POINTS_PER_ROW, Panel, PanelGrid, Seam, build_panel
+from ccatp.mirror.layout import POINTS_PER_PANEL, POINTS_PER_ROW, Panel, PanelGrid
 from ccatp.mirror.rim import build_rim
 from ccatp.mirror.surface import Axes, LayoutError, Surface, UnknownPanelError, build_surface
 
 
-@dataclass(frozen=True, slots=True)
 class MirrorFrames:
     """Where a mirror stands in the world.
 
@@ -24,10 +22,11 @@ class MirrorFrames:
     frame turned by pi about its y axis where ``drive_side`` is -1, and the mirror frame itself where it is +1.
     """
 
-    origin_m: Vector3
-    c: float
-    s: float
-    drive_side: int
+    def __init__(self, cfg: FrameConfig) -> None:
+        x, y, z = cfg.origin_world_mm
+        self.origin_m = x * 1e-3, y * 1e-3, z * 1e-3
+        self.c, self.s = cos(cfg.rotation_about_x_rad), sin(cfg.rotation_about_x_rad)
+        self.drive_side: int = cfg.reflecting_side_sign
 
     def deck_from_mirror(self, p: Vector3) -> Vector3:
         """Deck coordinates of a point given in the mirror frame, m. Its own inverse."""
@@ -67,17 +66,10 @@ class MirrorFrames:
         return self.deck_from_mirror((x, self.c * y + self.s * z, self.c * z - self.s * y))
 
 
-def build_frames(cfg: FrameConfig) -> MirrorFrames:
-    """Frames of a mirror from its configuration (mm and rad)."""
-    x, y, z = cfg.origin_world_mm
-    angle = cfg.rotation_about_x_rad
-    return MirrorFrames((x * 1e-3, y * 1e-3, z * 1e-3), cos(angle), sin(angle), cfg.reflecting_side_sign)
-
-
 _MIN_CHANNELS = 4
 
 
-class Mirror:
+class Mirror(MirrorFrames):
     """A telescope mirror: geometry only, without state. Points are in metres.
 
     ``surface`` is in the deck frame, ``rim`` in the deck plane, ``collimators_m`` (k, 3) of the laser ``channels`` in
@@ -85,15 +77,17 @@ class Mirror:
     """
 
     def __init__(self, cfg: MirrorConfig) -> None:
+        super().__init__(cfg.frame)
         self.name, self.overhang = cfg.name, cfg.overhang
-        self.drive_side: int = cfg.frame.reflecting_side_sign
         self.gap_m = cfg.panels.gap_mm * 1e-3
         self.surface = build_surface(cfg.surface, self.drive_side)
         self.grid = PanelGrid(cfg.panels)
         self.rows, self.cols = self.grid.rows, self.grid.cols
         half = self.grid.half_x_m, self.grid.half_y_m
         self.panels: dict[PanelId, Panel] = {
-            pid: build_panel(self.surface, pid, self.grid.centre(pid), half) for pid in self.grid.ids
+            pid: Panel(pid, x, y, *half, self.surface.point(x, y), self.surface.axes(x, y))
+            for pid in self.grid.ids
+            for x, y in (self.grid.centre(pid),)
         }
         self.rim = build_rim(self.grid)
         self._points_x = tuple(x * 1e-3 for x in cfg.panels.points_x_mm)
@@ -104,14 +98,9 @@ class Mirror:
             for name, (x, y) in cfg.panels.adjusters_mm.items()
         }
         self.channels, self.collimators_m = _collimators(cfg.collimators)
-        self.frames = build_frames(cfg.frame)
-        self.deck_from_mirror, self.mirror_from_deck = self.frames.deck_from_mirror, self.frames.mirror_from_deck
-        self.mirror_from_world, self.world_from_mirror = self.frames.mirror_from_world, self.frames.world_from_mirror
-        self.deck_from_world, self.world_from_deck = self.frames.deck_from_world, self.frames.world_from_deck
-        self.rotate_world_from_deck = self.frames.rotate_world_from_deck
-        self.rotate_deck_from_world = self.frames.rotate_deck_from_world
         self.panel_at, self.is_on_panel = self.grid.panel_at, self.grid.is_on_panel
-        self.nearest_panel = self.grid.nearest_panel
+        self.nearest_panel, self.nearest_seam = self.grid.nearest_panel, self.grid.nearest_seam
+        self.surface_point = self.surface.point
         self.base_panel_pose = _base(cfg.base, self.panels)
         self.base_pose = self.deck_pose(self.base_panel_pose)
 
@@ -121,14 +110,6 @@ class Mirror:
             return self.panels[panel]
         except KeyError:
             raise UnknownPanelError(f"{self.name} has no panel in row {panel[0]}, column {panel[1]}") from None
-
-    def nearest_seam(self, x: float, y: float) -> Seam | None:
-        """Nearest interior seam of the cell nearest to the deck point; None on a mirror of one panel."""
-        return self.grid.nearest_seam(x, y)
-
-    def surface_point(self, x: float, y: float) -> Vector3:
-        """Surface point over the deck point (x, y), deck frame, m."""
-        return self.surface.point(x, y)
 
     def point_on_deck(self, pid: PointId) -> tuple[float, float]:
         """Deck (x, y) of a measurement point, m; raises ``UnknownPanelError``, also for a number outside 1 to 9.

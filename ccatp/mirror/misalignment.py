@@ -92,7 +92,11 @@ def panel_deviations(mirror: Mirror, panel: PanelId, points_world: FloatArray, p
 
     Raises ``UnknownPanelError``, and ``ConvergenceError`` far from the mirror.
     """
-    return np.array([_deviation(mirror, panel, p, puck_height_m) for p in _as_points(points_world)]).reshape(-1, 3)
+    body, rows = mirror.panel(panel), []
+    for world_x, world_y, world_z in points_world.tolist():
+        x, y, deviation = mirror.foot_of_puck((world_x, world_y, world_z), puck_height_m)
+        rows.append((*body.from_deck(mirror.surface.point(x, y))[:2], deviation))
+    return np.array(rows).reshape(-1, 3)
 
 
 def fit_panel(
@@ -127,26 +131,12 @@ def fit_panel(
         )
     lever = normals @ np.array(body.axes[2])
     design = lever[:, None] * np.column_stack([np.ones(len(rows)), rows[:, 1], rows[:, 0]])
-    return _weighted_fit(design, rows[:, 2], np.sqrt(variances))
-
-
-def _weighted_fit(design: FloatArray, deviations: FloatArray, sigmas: FloatArray) -> PanelFit:
-    whitened = design / sigmas[:, None]
+    sigmas = np.sqrt(variances)
+    whitened, target = design / sigmas[:, None], rows[:, 2] / sigmas
     q, r = np.linalg.qr(whitened)
-    target = deviations / sigmas
-    solution = np.linalg.solve(r, q.T @ target)
-    spread = np.linalg.norm(np.linalg.solve(r, np.eye(_PARAMETERS)), axis=1)
+    piston, tip, tilt = solution = np.linalg.solve(r, q.T @ target)
+    sigma = np.linalg.norm(np.linalg.solve(r, np.eye(_PARAMETERS)), axis=1)
     residual = target - whitened @ solution
-    piston, tip, tilt = (float(v) for v in solution)
-    sigma = float(spread[0]), float(spread[1]), float(spread[2])
-    return PanelFit(piston, tip, tilt, sigma, float(residual @ residual), len(design) - _PARAMETERS)
-
-
-def _deviation(mirror: Mirror, panel: PanelId, world: Vector3, puck_height_m: float) -> Vector3:
-    x, y, deviation = mirror.foot_of_puck(world, puck_height_m)
-    x_p, y_p, _ = mirror.panel(panel).from_deck(mirror.surface.point(x, y))
-    return x_p, y_p, deviation
-
-
-def _as_points(points_world: FloatArray) -> list[Vector3]:
-    return [(float(x), float(y), float(z)) for x, y, z in points_world]
+    of_each = float(sigma[0]), float(sigma[1]), float(sigma[2])
+    chi2, dof = float(residual @ residual), len(design) - _PARAMETERS
+    return PanelFit(float(piston), float(tip), float(tilt), of_each, chi2, dof)

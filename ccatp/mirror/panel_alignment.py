@@ -430,23 +430,23 @@ def panel_result(
 
     bent = fit_modes(lever * adjustable(places), values, sigmas)
     full = fit_modes(lever * quadratic(places), values, sigmas)
+    shape = None
+    if full is not None:
+        gain = fit.chi2 - full.chi2
+        chance = float(chdtrc(_CURVATURES, max(gain, 0.0)))
+        values_1_m, sigma_1_m = full.values[SHAPE], full.sigma[SHAPE]
+        shape = PanelShape(values_1_m, sigma_1_m, gain, chance, full.chi2, full.dof, explanation.has_shape)
     return PanelResult(
         panel=panel,
         deviations=deviations,
         is_kept=kept,
         cos_i=cos_i,
         fit=fit,
-        shape=None if full is None else _shape(fit, full, is_significant=explanation.has_shape),
+        shape=shape,
         adjusters=names,
         rigid=plan(fit, rigid),
         bending=None if bent is None else plan(bent, adjustable),
     )
-
-
-def _shape(fit: ModeFit, full: ModeFit, *, is_significant: bool) -> PanelShape:
-    gain = fit.chi2 - full.chi2
-    chance = float(chdtrc(3, max(gain, 0.0)))
-    return PanelShape(full.values[SHAPE], full.sigma[SHAPE], gain, chance, full.chi2, full.dof, is_significant)
 
 
 def displacement_m(panel: PanelResult, places_m: FloatArray) -> FloatArray:

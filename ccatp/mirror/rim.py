@@ -148,7 +148,17 @@ class Rim(Outline):
         beyond = self._largest_excess_m(x0, y0, x1, y1)
         if beyond > _CLEARANCE_TOLERANCE_M:
             return -beyond
-        return min(_segment_distance((x0, y0), (x1, y1), c, d) for c, d in self._edges)
+        a, b = (x0, y0), (x1, y1)
+        # Segments that do not cross are nearest to each other at one of their ends.
+        return min(
+            min(
+                to_segment_m(a, c, d),
+                to_segment_m(b, c, d),
+                to_segment_m(c, a, b),
+                to_segment_m(d, a, b),
+            )
+            for c, d in self._edges
+        )
 
     def _largest_excess_m(self, x0: float, y0: float, x1: float, y1: float) -> float:
         """Largest distance of a point of the segment from the mirror; 0 when the whole segment lies on it.
@@ -207,12 +217,8 @@ def _maximal_boxes(slabs: Sequence[Span]) -> tuple[Box, ...]:
     return tuple(boxes)
 
 
-def _segment_distance(a: Point, b: Point, c: Point, d: Point) -> float:
-    """Distance between the segments ab and cd that do not cross: least of the four end-to-segment distances."""
-    return min(_point_distance(a, c, d), _point_distance(b, c, d), _point_distance(c, a, b), _point_distance(d, a, b))
-
-
-def _point_distance(p: Point, a: Point, b: Point) -> float:
+def to_segment_m(p: Point, a: Point, b: Point) -> float:
+    """Distance of a point from the segment ab."""
     ux, uy = b[0] - a[0], b[1] - a[1]
     wx, wy = p[0] - a[0], p[1] - a[1]
     length2 = ux * ux + uy * uy

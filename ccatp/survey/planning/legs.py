@@ -16,6 +16,7 @@ from ccatp.config.models import MissionConfig, RobotConfig
 from ccatp.core import BoolArray, DeckPose, FloatArray, PanelId, Stop, StopKind, bearing, difference
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.rim import to_segment_m
 
 _BINS = 360
 _BIN_RAD = tau / _BINS
@@ -282,7 +283,8 @@ class LegRules:
         return places
 
     def _corner_distance_m(self, a: LegPlace, b: LegPlace) -> float:
-        return min((_segment_distance(corner, a, b) for corner in self._corners), default=inf)
+        ends = (a.x_m, a.y_m), (b.x_m, b.y_m)
+        return min((to_segment_m(corner, *ends) for corner in self._corners), default=inf)
 
 
 def _seam_lines(mirror: Mirror) -> tuple[list[float], list[float]]:
@@ -316,14 +318,6 @@ def _reentrant_corners(mirror: Mirror, body: Body) -> tuple[list[tuple[float, fl
         if depth >= body.turning_depth_m:
             nodes.append(LegPlace(x, y, depth))
     return corners, nodes
-
-
-def _segment_distance(p: tuple[float, float], a: LegPlace, b: LegPlace) -> float:
-    ux, uy = b.x_m - a.x_m, b.y_m - a.y_m
-    wx, wy = p[0] - a.x_m, p[1] - a.y_m
-    length2 = ux * ux + uy * uy
-    t = 0.0 if length2 == 0.0 else min(max((wx * ux + wy * uy) / length2, 0.0), 1.0)
-    return hypot(wx - t * ux, wy - t * uy)
 
 
 def heading_of_course(mirror: Mirror, x: float, y: float, course_rad: float) -> float:
