@@ -195,7 +195,7 @@ class Desk:
         self.done, self.failed, self.faults, self.said = list[Any](), list[str](), list[str](), list[str]()
         self.over, self.faulted = asyncio.Event(), asyncio.Event()
         mission = SimpleNamespace(
-            is_awaiting_fix=True, is_lost=True, request=1, survey=SimpleNamespace(distance_m=lambda _pose: 0.0),
+            is_awaiting_fix=True, is_lost=True, request=1, survey_route=SimpleNamespace(distance_m=lambda _pose: 0.0),
             fixed=self.done.append, not_fixed=lambda _point, cause: self.failed.append(cause), fault=self._fault,
         )  # fmt: skip
         self.service = fix_service(
