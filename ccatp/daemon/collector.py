@@ -36,12 +36,12 @@ from ccatp.links.topics import (
     TruthMessage,
     decode_recorded,
 )
-from ccatp.mirror.mirror import build_mirror, deck_poses
+from ccatp.mirror.mirror import Mirror, build_mirror, deck_poses
 from ccatp.mirror.misalignment import fit_panels
 from ccatp.records.beacon_summary import BeaconSummary, Reached, beacon_facts
 from ccatp.records.recorder import TELEMETRY, Recorder, iter_messages, recordings
 from ccatp.records.store import StoredSurvey, StoreError, read_survey
-from ccatp.records.summary import PanelFits, SummaryBuilder, survey_summary
+from ccatp.records.summary import PanelFits, survey_summary
 from ccatp.report.foxglove import Views, recorded_schemas
 from ccatp.survey.planning.route import ORDERS
 
@@ -230,28 +230,15 @@ class BeaconRecord:
 
 
 class _SurveySession:
-    """Messages of one session of a survey; its summary can be built after the first status of the mission."""
+    """Messages of one session of a survey."""
 
-    def __init__(
-        self, builder_for: Callable[[MissionStatus], SummaryBuilder], on_deck: Callable[[TrackMessage], FloatArray]
-    ) -> None:
-        self._builder_for, self._on_deck = builder_for, on_deck
-        self._early: list[Message] = []
-        self._code = 0
-        self.builder: SummaryBuilder | None = None
+    def __init__(self, cfg: Config, mirror: Mirror, *, is_sim: bool) -> None:
+        self._mirror, self._code, self.has_status = mirror, 0, False
+        points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
+        self.builder = survey_summary(cfg, mirror, points, 0, 0.0, is_sim=is_sim)
 
     def take(self, message: Message) -> None:
-        if self.builder is None:
-            self._early.append(message)
-            if isinstance(message, MissionStatus):
-                self.builder = self._builder_for(message)
-                for early in self._early:
-                    self._add(self.builder, early)
-                self._early.clear()
-        else:
-            self._add(self.builder, message)
-
-    def _add(self, builder: SummaryBuilder, message: Message) -> None:
+        builder = self.builder
         if isinstance(message, TruthMessage):
             builder.add_truth(message.rows)
         elif isinstance(message, TrackMessage):
@@ -265,7 +252,17 @@ class _SurveySession:
                 builder.add_verdict_event(message.seq, message.code)
             self._code = message.code
         elif isinstance(message, MissionStatus):
+            if not self.has_status:  # a main loop that takes over plans what is left
+                self.has_status = True
+                builder.set_plan(message.total, message.lower_bound_s)
             builder.set_mission(message.done, message.skipped, message.elapsed_s, message.left_out)
+
+    def _on_deck(self, track: TrackMessage) -> FloatArray:
+        """Rows of seq, t_s, x, y, heading (deck), X, Y, Z of the surface point, as the truth has them."""
+        poses = [PanelPose(PanelId(row, col), x, y, heading) for _, _, row, col, x, y, heading, _ in track.rows]
+        x, y, heading, z = deck_poses(self._mirror, poses).T
+        seq, t_s = np.array([row[:2] for row in track.rows]).T
+        return np.column_stack([seq, t_s, x, y, heading, x, y, z])
 
 
 class SurveyRecord:
@@ -274,34 +271,19 @@ class SurveyRecord:
     def __init__(self, cfg: Config, run_dir: Path, *, is_sim: bool) -> None:
         self._cfg, self._run_dir, self._is_sim = cfg, run_dir, is_sim
         self.mirror = build_mirror(cfg.mirror)
-        self._session = _SurveySession(self._builder_for, self._on_deck)
+        self._session = _SurveySession(cfg, self.mirror, is_sim=is_sim)
+        self.take = self._session.take
         self._injected: PanelFits | None = None
         self.remarks: list[str] = []
-
-    def take(self, message: Message) -> None:
-        """Take one message."""
-        self._session.take(message)
 
     def set_injected(self, rows: list[list[float]]) -> None:
         """How the simulated panels really lie, rows as of ``Misalignment``."""
         self._injected = {PanelId(int(row), int(col)): (piston, tip, tilt) for row, col, piston, tip, tilt in rows}
 
-    def _builder_for(self, status: MissionStatus) -> SummaryBuilder:
-        cfg, is_sim = self._cfg, self._is_sim
-        points = ORDERS[cfg.run.order](self.mirror, cfg.run.panels)
-        return survey_summary(cfg, self.mirror, points, status.total, status.lower_bound_s, is_sim=is_sim)
-
-    def _on_deck(self, track: TrackMessage) -> FloatArray:
-        """Rows of seq, t_s, x, y, heading (deck), X, Y, Z of the surface point, as the truth has them."""
-        poses = [PanelPose(PanelId(row, col), x, y, heading) for _, _, row, col, x, y, heading, _ in track.rows]
-        x, y, heading, z = deck_poses(self.mirror, poses).T
-        seq, t_s = np.array([row[:2] for row in track.rows]).T
-        return np.column_stack([seq, t_s, x, y, heading, x, y, z])
-
     def summary(self, wall_s: float) -> dict[str, Any]:
         """The summary, when main has closed the mission's database."""
         survey = self._stored()
-        if self._session.builder is None:
+        if not self._session.has_status:
             if survey is None and (before := _read(self._run_dir / "summary.json")):
                 return before  # nothing is known, and that must not replace an earlier summary
             # Main ended before its first status: the mission's database holds the counts.
@@ -309,15 +291,13 @@ class SurveyRecord:
             done, skipped = standings.count("measured"), standings.count("skipped")
             self.take(MissionStatus(seq=-1, t_s=0.0, state="", total=len(standings), done=done, skipped=skipped))
         builder = self._session.builder
-        if builder is None:
-            raise RuntimeError("a status begins the summary")
         builder.set_panels({} if survey is None else self._fits(survey), self._injected)
         for path in reversed(recordings(self._run_dir / TELEMETRY)[:-1]):
-            earlier = _SurveySession(self._builder_for, self._on_deck)
+            earlier = _SurveySession(self._cfg, self.mirror, is_sim=self._is_sim)
             for topic, _, payload in iter_messages(path):
                 if topic in SUMMARISED and isinstance(message := decode_recorded(topic, payload), Message):
                     earlier.take(message)
-            if earlier.builder is not None:
+            if earlier.has_status:
                 builder.precede(earlier.builder)
         return builder.build(wall_s)
 

@@ -171,6 +171,10 @@ class SummaryBuilder:
         """Add wall times of main-loop ticks, microseconds."""
         self._ticks_us.append(np.array(tick_us, dtype=np.float64, ndmin=1))
 
+    def set_plan(self, total_points: int, lower_bound_s: float) -> None:
+        """All points of the mission, measured or not, and the bound of the path, as planned."""
+        self._facts = replace(self._facts, total_points=total_points, lower_bound_s=lower_bound_s)
+
     def set_mission(
         self,
         measured: int,
