@@ -85,22 +85,14 @@ def run_job(job: Job) -> JobOutcome:
         outlook = look_ahead(cfg, field, case.method)
         bound_m, deficiency, is_unique = outlook.bound_rms_m, outlook.freedom.deficiency, outlook.folds.is_unique
     values = {
-        "rms_m": run.rms_m,
-        "phase1_rms_m": run.phase1_rms_m,
-        "expected_rms_m": run.expected_rms_m,
+        **{name: getattr(run, name) for name in ("rms_m", "phase1_rms_m", "expected_rms_m")},
         "bound_m": bound_m,
         "rank_deficiency": deficiency,
         "is_unique": is_unique,
         "spent_s": spent_s,
         "nis": float(run.nis.mean()) if run.nis.size else None,
     }
-    arrays = {
-        "trace_m": run.trace_m,
-        "expected_trace_m": run.expected_trace_m,
-        "errors_m": run.positions_m - run.true_m,
-        "positions_m": run.positions_m,
-        "true_m": run.true_m,
-    }
+    arrays = {name: getattr(run, name) for name in ("trace_m", "expected_trace_m", "positions_m", "true_m")}
     return JobOutcome(values, arrays)
 
 

@@ -7,6 +7,7 @@ its own path.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,6 +57,7 @@ def run_gtsam(run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[],
 class _Session:
     def __init__(self, gtsam: Any, run: RecordedRun, settings: RecordingConfig) -> None:
         self._gtsam, self._run, self._settings = gtsam, run, settings
+        self._x, self._l = partial(gtsam.symbol, "x"), partial(gtsam.symbol, "l")
         self._times = np.union1d(run.readings.times_s, run.steps.times_s[:1])
         reckoning = Reckoning(run.steps, self._times, delayed=False)
         self._motion, _, self._covariances = reckoning.increments(np.zeros(len(CALIBRATION)), settings.odometry)
@@ -64,7 +66,6 @@ class _Session:
         self._placed: set[int] = set()
         self._waiting: dict[int, list[int]] = {}
         self._path = np.empty((len(self._times), 3))
-        self._final: Any = None
 
     def solve(self, clock_s: Callable[[], float]) -> Peers:
         gtsam, run = self._gtsam, self._run
@@ -91,20 +92,18 @@ class _Session:
             self._graph.push_back(graph)
             self._values.insert(values)
             isam.update(graph, values)
-            estimate = isam.calculateEstimatePose2(self._x(k))
-            pose = estimate
+            pose = isam.calculateEstimatePose2(self._x(k))
             self._path[k] = pose.x(), pose.y(), pose.theta()
             took += [(clock_s() - begin_s) / max(len(rows_at[k]), 1)] * len(rows_at[k])
-        self._final = isam.calculateEstimate()
-        path = self._unwrapped(self._path)
-        isam2 = self._track(path, self._beacons(self._final), np.array(took))
+        final = isam.calculateEstimate()
+        isam2 = self._track(self._path, final, np.array(took))
         begin_s = clock_s()
-        best = gtsam.LevenbergMarquardtOptimizer(self._graph, self._final).optimize()
+        best = gtsam.LevenbergMarquardtOptimizer(self._graph, final).optimize()
         # its time is that of a start, which iSAM2 gives, and of the descent
         spent = clock_s() - begin_s
         poses = np.array([(q.x(), q.y(), q.theta()) for q in map(best.atPose2, map(self._x, range(len(self._times))))])
         share = np.array([spent / max(len(self._at), 1)])
-        return Peers(isam2, self._track(self._unwrapped(poses), self._beacons(best), share))
+        return Peers(isam2, self._track(poses, best, share))
 
     def _read(self, row: int, graph: Any, values: Any) -> None:
         """A reading: a factor if its beacon is placed; else it waits until the beacon can be."""
@@ -158,26 +157,14 @@ class _Session:
         variance: FloatArray = radio.range_sigma_m**2 + (radio.range_sigma_per_m * range_m) ** 2
         return variance
 
-    def _x(self, k: int) -> Any:
-        return self._gtsam.symbol("x", k)
-
-    def _l(self, beacon: int) -> Any:
-        return self._gtsam.symbol("l", beacon)
-
-    def _beacons(self, values: Any) -> dict[str, BeaconFix]:
-        found = {}
+    def _track(self, path: FloatArray, values: Any, update_s: FloatArray) -> EstimatedPath:
+        beacons = {}
         for beacon in sorted(self._placed):
             x, y = values.atPoint2(self._l(beacon)).tolist()
-            found[self._run.beacon_ids[beacon]] = BeaconFix(x, y, UNKNOWN)
-        return found
-
-    def _unwrapped(self, path: FloatArray) -> FloatArray:
-        return np.column_stack([path[:, :2], np.unwrap(path[:, 2])])
-
-    def _track(self, path: FloatArray, beacons: dict[str, BeaconFix], update_s: FloatArray) -> EstimatedPath:
+            beacons[self._run.beacon_ids[beacon]] = BeaconFix(x, y, UNKNOWN)
         return EstimatedPath(
             times_s=self._times,
-            poses=path,
+            poses=np.column_stack([path[:, :2], np.unwrap(path[:, 2])]),
             covariances=np.broadcast_to(np.eye(3), (len(path), 3, 3)),
             beacons=beacons,
             calibration={},
