@@ -11,16 +11,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
-# Position of the cause among the arguments, by the name that is called.
+# By the name that is called: position of the cause among the arguments, and what the mission makes of it; a finding
+# has its severity with it.
 CAUSES = {
-    "MonitorFinding": 1, "FixFinding": 1, "_lacking": 1,
-    "fault": 0, "hold": 0, "interrupt": 0, "abort": 0, "_request_hold": 0, "recover": 0,
-}  # fmt: skip
-# What the mission makes of a cause, by the name that is called; a finding has its severity with it.
-REACTIONS = {
-    "_lacking": "pause", "fault": "fault", "hold": "hold", "interrupt": "pause", "abort": "return",
-    "_request_hold": "hold", "recover": "hold",
-}  # fmt: skip
+    "MonitorFinding": (1, ""),
+    "FixFinding": (1, ""),
+    "_lacking": (1, "pause"),
+    "fault": (0, "fault"),
+    "hold": (0, "hold"),
+    "interrupt": (0, "pause"),
+    "abort": (0, "return"),
+    "_request_hold": (0, "hold"),
+    "recover": (0, "hold"),
+}
 # Causes that stand in tables or in verdicts: file, name, reaction.
 EDGES, CENTRE = ("ccatp/safety/edge_detector.py", "Cause"), ("ccatp/danger.py", "CENTRE")
 OWN = "ccatp/safety/sensor_monitors.py", "_OWN"
@@ -29,9 +32,7 @@ LITERAL = (
     ("ccatp/danger.py", "emergency: \u2026", "return"),
     ("ccatp/safety/sensor_monitors.py", "the robot reports a fault that is not known here", "inform"),
 )
-SOURCES = (
-    "ccatp/danger.py", "ccatp/safety", "ccatp/survey", "ccatp/estimation", "ccatp/daemon",
-)  # fmt: skip
+SOURCES = ("ccatp/danger.py", "ccatp/safety", "ccatp/survey", "ccatp/estimation", "ccatp/daemon")
 VARIES = "\u2026"
 
 
@@ -74,10 +75,10 @@ def _in_file(path: Path) -> Iterator[Cause]:
     for function in _functions(tree):
         for call in _calls(function):
             name = _called(call)
-            place = CAUSES.get(name, -1)
+            place, reaction = CAUSES.get(name, (-1, ""))
             if 0 <= place < len(call.args):
                 at = _Place(call, function, tree)
-                reactions = {REACTIONS[name]} if name in REACTIONS else set(at.severities(call.args[0]))
+                reactions = {reaction} if reaction else set(at.severities(call.args[0]))
                 if name == "_lacking" and getattr(call.args[0], "value", "") == "enc":
                     reactions = {"hold"}  # as ``DangerMonitor._own_findings`` has it
                 for text in at.texts(call.args[place]):
