@@ -11,6 +11,7 @@ import json
 import random
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from math import acos, atan2, ceil, cos, hypot, inf, pi, radians, sin
@@ -182,7 +183,7 @@ def run_off(
             late -= 1
         is_driven = declared_frame < 0 or late >= 0
         verdict = drive.frame(*(set_points if is_driven else (0.0, 0.0)))
-        is_off = not all(_on(rig))
+        is_off = not all(rig._sensors.edges._values)
         beyond = drive.beyond_m() if is_off or drive.has_edge or declared_frame >= 0 else [0.0] * 4
         if off_frame < 0 and is_off and max(beyond) > 0.0:
             off_frame = k
@@ -197,10 +198,6 @@ def run_off(
     is_unseen = declared_frame < 0 and most_m > 0.0
     late_s = max(declared_frame - off_frame, 0) / hz if declared_frame >= 0 and off_frame >= 0 else 0.0
     return Tally(1, 0, int(centre_m > 0.0), int(is_unseen), after_m, most_m, late_s, centre_m)
-
-
-def _on(rig: Rig) -> tuple[int, ...]:
-    return rig._sensors.edges._values
 
 
 def _is_barred(verdict: Verdict, v_m_s: float, only_edges: bool) -> bool:
@@ -314,7 +311,7 @@ def cross(name: str, v_m_s: float, angle_rad: float, stop_s: float, rng: np.rand
             has_stopped = True
             for _ in range(ceil((stop_s + 0.3) * drive.hz)):
                 drive.frame(0.0, 0.0)
-            tally.over_gap = int(not all(_on(drive.rig)))
+            tally.over_gap = int(not all(drive.rig._sensors.edges._values))
     tally.false_edges = int(drive.has_edge)
     return tally
 
@@ -349,14 +346,17 @@ def _start_at_seam(name: str, angle_rad: float, v_m_s: float, rng: np.random.Gen
 # -- running ----------------------------------------------------------------------------------------------------------
 
 
-def sweep(case: Callable[[int], tuple[str, Callable[[], Tally]]], numbers: Iterable[int]) -> Tally:
+Case = Callable[[int], tuple[str, Callable[[], Tally]]]
+
+
+def sweep(case: Case, numbers: Iterable[int]) -> Tally:
     """Run cases by number; the names of those that went wrong are kept."""
     tally = Tally()
     for number in numbers:
         text, run = case(number)
         one = run()
         tally.add(one)
-        if one.falls or one.unseen or one.false_edges or one.after_m > OVERRUN_M:
+        if not is_good(one):
             tally.worst.append(f"{text}: {one.line}")
     return tally
 
@@ -365,7 +365,7 @@ def sweep(case: Callable[[int], tuple[str, Callable[[], Tally]]], numbers: Itera
 
 BLOCK = 4000  # drives: some seconds
 SEAMS = 300_000  # no false edge in as many says one in 100,000 at most, with 95 %
-KINDS: dict[str, tuple[Callable[[int], tuple[str, Callable[[], Tally]]], Callable[[], int]]] = {
+KINDS: dict[str, tuple[Case, Callable[[], int]]] = {
     "rim": (rim_case, rim_cases),
     "turn": (turn_case, turn_cases),
     "seam": (seam_case, lambda: SEAMS),
@@ -397,12 +397,9 @@ def run_block(block: Block) -> tuple[Block, Tally]:
 
 
 def run_all(todo: list[Block], workers: int) -> Iterator[tuple[Block, Tally]]:
-    """Blocks as they are done."""
-    if workers == 1:
-        yield from map(run_block, todo)
-        return
-    with get_context("spawn").Pool(workers) as pool:
-        yield from pool.imap_unordered(run_block, todo)
+    """Blocks as they are done; one worker is this process."""
+    with get_context("spawn").Pool(workers) if workers > 1 else nullcontext() as pool:
+        yield from map(run_block, todo) if pool is None else pool.imap_unordered(run_block, todo)
 
 
 def is_good(tally: Tally) -> bool:
