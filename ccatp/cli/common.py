@@ -298,9 +298,8 @@ def overrides(settings: Mapping[str, object], named: Mapping[str, object]) -> di
 def configured_folder(config_file: Path | None, runtime_dir: Path | None) -> Path | None:
     """The runtime directory that command line or configuration names."""
     if runtime_dir is None and config_file is not None:
-        from ccatp.config.load import is_radio_file, load_config, load_radio_config
+        from ccatp.daemon.process import processes_of, read_config
 
-        among_beacons = is_radio_file(config_file)
-        processes = load_radio_config(config_file).processes if among_beacons else load_config(config_file).run
-        return Path(processes.runtime_dir) if processes.runtime_dir else None
+        configured = processes_of(read_config(config_file)).runtime_dir
+        return Path(configured) if configured else None
     return runtime_dir

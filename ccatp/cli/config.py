@@ -24,20 +24,20 @@ def config() -> None:
 @click.argument("file", type=PATH)
 def config_check(file: Path) -> int:
     """Check a configuration; each problem is one line with file, line and key."""
-    from ccatp.config.load import is_radio_file, load_config, load_radio_config
+    from ccatp.config.models import Config
+    from ccatp.daemon.process import read_config
 
     try:
-        if is_radio_file(file):
-            beacons = load_radio_config(file)
-            click.echo(f"{file}: ok: system {beacons.system}, seed {beacons.run.seed}")
-            return 0
-        cfg = load_config(file)
+        cfg = read_config(file)
     except ConfigError as error:
         for problem in error.problems:
             complain(problem, error.exit_status)
         return error.exit_status
-    shown = f"mirror {cfg.mirror.name}, {cfg.mirror.panels.count} panels, world {cfg.world.name}, seed {cfg.run.seed}"
-    click.echo(f"{file}: ok: {shown}")
+    if isinstance(cfg, Config):
+        shown = f"mirror {cfg.mirror.name}, {cfg.mirror.panels.count} panels, world {cfg.world.name}"
+    else:
+        shown = f"system {cfg.system}"
+    click.echo(f"{file}: ok: {shown}, seed {cfg.run.seed}")
     return 0
 
 

@@ -106,12 +106,7 @@ def emergency(kind: str, note: str, emergency_id: uuid.UUID | None, json_output:
 
     KIND is fire, earthquake, power, weather or operator.
     """
-    payload: dict[str, object] = {
-        "cmd": "emergency",
-        "kind": kind,
-        "id": str(emergency_id or uuid.uuid4()),
-        "note": note,
-    }
+    payload = {"cmd": "emergency", "kind": kind, "id": str(emergency_id or uuid.uuid4()), "note": note}
     _print_reply(_ask_observatory(payload, **where), json_output)
 
 
@@ -127,7 +122,7 @@ def clear(emergency_id: uuid.UUID, json_output: bool, **where: Any) -> None:
 
 
 def _ask_observatory(
-    payload: dict[str, object], *, endpoint: str | None, server_key: Path | None, key_file: Path | None,
+    payload: Mapping[str, str], *, endpoint: str | None, server_key: Path | None, key_file: Path | None,
     config_file: Path | None, runtime_dir: Path | None, timeout_s: float,
 ) -> dict[str, Any]:  # fmt: skip
     """One request to the observatory channel of a daemon here, or by TCP of one elsewhere."""

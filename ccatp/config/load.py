@@ -212,9 +212,7 @@ def load_config(file: Path | None = None, overrides: Overrides = None, config_di
         raise NotASurvey(f"{what}, and this is for surveys of mirrors alone; use {use}")
     tree = _stacked(sources)
     for section in _SECTIONS:
-        named = _named_section(section, tree, sources, config_dir)
-        tree[section] = merged(named.tree, _overlay(section, tree, sources))
-        sources.append(named)
+        _add_section(section, tree, sources, config_dir)
     return _validated(Config, tree, sources, check_config)
 
 
@@ -237,45 +235,37 @@ def available(kind: str, config_dir: Path | None = None) -> list[str]:
     return sorted(path.stem for path in folder.glob("*.toml"))
 
 
-def _get(tree: object, *key: str) -> object:
-    for part in key:
-        tree = tree.get(part) if isinstance(tree, Mapping) else None
-    return tree
+def _add_section(section: str, tree: Tree, sources: list[ConfigSource], config_dir: Path) -> None:
+    """Put mirror or world into the tree: the file that ``run`` names, and over it what file and command line say.
 
-
-def _is_complete(section: str, user: ConfigSource) -> bool:
-    value = user.tree.get(section)
-    return isinstance(value, Mapping) and set(_SECTIONS[section][1].model_fields) <= set(value)
-
-
-def _is_replaced(section: str, sources: list[ConfigSource]) -> bool:
-    """Whether the command line names another mirror or world than the one that the user's file holds in full."""
+    Where the user's file holds all of it, this is taken, unless the command line names another one.
+    """
     command, user = sources[:2]
-    wanted = _get(command.tree, "run", section)
-    return wanted is not None and wanted != _get(user.tree, "run", section)
-
-
-def _overlay(section: str, tree: Tree, sources: list[ConfigSource]) -> Mapping[str, Any]:
-    """What file and command line say about the section itself."""
-    command, user = sources[:2]
-    is_without_file = _is_complete(section, user) and _is_replaced(section, sources)
-    overlay = (command.tree if is_without_file else tree).get(section, {})
+    held = user.tree.get(section)
+    is_complete = isinstance(held, Mapping) and set(_SECTIONS[section][1].model_fields) <= set(held)
+    runs = [source.tree.get("run") for source in (command, user)]
+    wanted, before = (run.get(section) if isinstance(run, Mapping) else None for run in runs)
+    is_replaced = wanted is not None and wanted != before
+    if is_complete and not is_replaced:
+        named = ConfigSource("", "", {}, (section,))
+    else:
+        named = _read_named(section, tree["run"], sources, config_dir)
+    overlay = (command.tree if is_complete and is_replaced else tree).get(section, {})
     if not isinstance(overlay, Mapping):
         place = _source_of((section,), sources).place((section,))
         raise ConfigError(f"{place}: {section}: must be a section; name a {section} with run.{section}")
-    return overlay
+    tree[section] = merged(named.tree, overlay)
+    sources.append(named)
 
 
-def _named_section(section: str, tree: Tree, sources: list[ConfigSource], config_dir: Path) -> ConfigSource:
-    """The file that ``run.mirror`` or ``run.world`` names; an empty source where the user's file holds all of it."""
-    if _is_complete(section, sources[1]) and not _is_replaced(section, sources):
-        return ConfigSource("", "", {}, (section,))
+def _read_named(section: str, run: object, sources: list[ConfigSource], config_dir: Path) -> ConfigSource:
+    """The file that ``run.mirror`` or ``run.world`` names."""
     key: Key = ("run", section)
-    name = _get(tree, "run", section)
     source = _source_of(key, sources)
     place = source.place(key)
-    if not isinstance(tree["run"], Mapping):
-        raise ConfigError(f"{place}: run = {format_value(tree['run'])} must be a section, not a value")
+    if not isinstance(run, Mapping):
+        raise ConfigError(f"{place}: run = {format_value(run)} must be a section, not a value")
+    name = run.get(section)
     if not isinstance(name, str) or not name:
         raise ConfigError(f"{place}: run.{section} = {format_value(name)} must be the name of a {section}")
     shown = f"{place}: run.{section} = {format_value(name)}"
@@ -314,7 +304,9 @@ def load_radio_config(
     """
     config_dir = config_dir or configs_dir()
     command, user, base = sources = _layers(read_source(config_dir / BEACON_FILE), file, overrides)
-    if file is not None and _is_survey(user.tree):
+    run = user.tree.get("run")
+    named = set(user.tree) | (set(run) if isinstance(run, Mapping) else set())
+    if "system" not in user.tree and {"mirror", "world"} & named:  # which only surveys have
         raise ConfigError(
             f"{file}: is the configuration of a survey of a mirror; give that of a robot among beacons, as cricket.toml"
         )
@@ -337,17 +329,9 @@ def is_radio_file(file: Path) -> bool:
     return "system" in read_source(file).tree
 
 
-def _is_survey(tree: Tree) -> bool:
-    """Whether a file without a system names a mirror or a world, which only surveys have."""
-    run = tree.get("run")
-    named = set(run) if isinstance(run, Mapping) else set()
-    return "system" not in tree and bool({"mirror", "world"} & (named | set(tree)))
-
-
 def _system(sources: list[ConfigSource]) -> str:
     for source in sources:
-        if "system" in source.tree:
-            name = source.tree["system"]
+        if (name := source.tree.get("system")) is not None:
             if name not in SYSTEMS:
                 hint = choice_hint(str(name), SYSTEMS)
                 raise ConfigError(f"{source.place(('system',))}: system = {format_value(name)} is no system; {hint}")

@@ -79,24 +79,14 @@ class _HelloRobot(Part):
 
 @check("hello", "on accept the robot says hello: protocol, boot, nonce, auth, lockstep, frame_hz, ttl_s")
 def _hello(context: CheckContext) -> str:
-    return check_fields(context.greet()[1])
-
-
-@check("hello-robot", "hello.robot describes wheels, edge sensors in their order, puck, limit and fan floor")
-def _hello_robot(context: CheckContext) -> str:
-    return check_robot(context.greet()[1])
-
-
-def check_fields(hello: Message) -> str:
-    """Fields of the hello beside ``robot``, with their types and ranges."""
-    found = parse(_HelloPart, hello)
+    found = parse(_HelloPart, context.greet()[1])
     require(found.protocol == PROTOCOL, f"protocol = {found.protocol!r}")
     return f"{found.protocol}, auth {found.auth}, {found.frame_hz:g} Hz, ttl {found.ttl_s:g} s"
 
 
-def check_robot(hello: Message) -> str:
-    """Fields of ``robot`` with their shapes, and the order of the edge sensors."""
-    robot = parse(_HelloRobot, hello).robot
+@check("hello-robot", "hello.robot describes wheels, edge sensors in their order, puck, limit and fan floor")
+def _hello_robot(context: CheckContext) -> str:
+    robot = parse(_HelloRobot, context.greet()[1]).robot
     front_left, front_right, rear_left, rear_right = edges = robot.edge_sensors_m
     fore = min(front_left[0], front_right[0]) > max(rear_left[0], rear_right[0])
     aside = min(front_left[1], rear_left[1]) > max(front_right[1], rear_right[1])
