@@ -1,7 +1,6 @@
 """The commands ``ccatp sim robot``, ``ccatp sim etalon`` and ``ccatp conformance``."""
 
 import json
-import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -128,7 +127,7 @@ def conformance(
 
     Wheels turn slowly and for a moment, unless --no-motion. In the end the robot is held, its fans as they were.
     """
-    from ccatp.commissioning.conformance.motion_checks import extent
+    from ccatp.commissioning.conformance.motion_checks import notice
     from ccatp.commissioning.conformance.runner import CHECKS, Conformance, as_json, check_ids, last_line, table_line
     from ccatp.links.auth import read_key
 
@@ -145,13 +144,7 @@ def conformance(
     checks = Conformance((host, int(port)), key, timeout_s)
     moving = [check for check in CHECKS if "motion" in check.needs and (not only or check.check_id in only)]
     if moving and not no_motion and checks.facts is not None:
-        most = extent(checks.facts)
-        complain(
-            f"wheels will turn in {len(moving)} checks, each at most {most.rate_rad_s:g} rad/s "
-            f"({1e3 * most.speed_m_s:.0f} mm/s) for {most.time_s:.2f} s: {1e3 * most.way_m:.0f} mm, "
-            f"{math.degrees(most.turn_rad):.0f} degrees; --no-motion leaves them out",
-            0,
-        )
+        complain(notice(checks.facts, len(moving)), 0)
     results = checks.run(
         motion=not no_motion,
         only=only,

@@ -1,9 +1,9 @@
 """Checks of lockstep, and the checks in which wheels turn: slowly, and for a moment."""
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
-from typing import NamedTuple
 
 from ccatp.commissioning.conformance.harness import (
     ALL,
@@ -94,23 +94,16 @@ def _time_stands_still(pair: ControllerAndMonitor) -> str:
 # -- motion -----------------------------------------------------------------------------------------------------------
 
 
-class Extent(NamedTuple):
-    """The most that one check may move the robot: wheel rate, speed, time, way and angle."""
-
-    rate_rad_s: float
-    speed_m_s: float
-    time_s: float
-    way_m: float
-    turn_rad: float
-
-
-def extent(facts: Facts) -> Extent:
-    """The most that each check of this file moves the robot."""
-    rate_rad_s = _rate(facts)
-    time_s = MOVE_S + facts.ttl_s
+def notice(facts: Facts, checks: int) -> str:
+    """The most that each of so many checks moves the robot, for its operator."""
+    rate_rad_s, time_s = _rate(facts), MOVE_S + facts.ttl_s
     speed_m_s = rate_rad_s * facts.robot.wheel_radius_m
     turn_rad = 2.0 * speed_m_s / facts.robot.wheel_base_m * time_s
-    return Extent(rate_rad_s, speed_m_s, time_s, speed_m_s * time_s, turn_rad)
+    return (
+        f"wheels will turn in {checks} checks, each at most {rate_rad_s:g} rad/s ({1e3 * speed_m_s:.0f} mm/s) for "
+        f"{time_s:.2f} s: {1e3 * speed_m_s * time_s:.0f} mm, {math.degrees(turn_rad):.0f} degrees; "
+        "--no-motion leaves them out"
+    )
 
 
 def _rate(facts: Facts) -> float:
