@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -120,14 +121,7 @@ class Gathered(NamedTuple):
 
     text: str
     lines: tuple[LogLine, ...]
-
-    @property
-    def rank(self) -> int:
-        """0 errors, 1 what no reader may miss, 2 warnings, 3 the rest."""
-        first = self.lines[0]
-        if first.level in ("error", "critical"):
-            return 0
-        return 1 if _GRAVE.search(first.text) else 3 if first.level in _CALM else 2
+    rank: int  # 0 errors, 1 what no reader may miss, 2 warnings, 3 the rest
 
 
 class Events(NamedTuple):
@@ -148,18 +142,22 @@ def events_of(lines: Sequence[LogLine]) -> Events:
 
 
 def gathered(lines: Iterable[LogLine]) -> list[Gathered]:
-    """Lines by process, level and text but for its numbers, in the order of their first."""
+    """Lines by process, level and text but for its numbers, in the order of their first.
+
+    The common text has each number that varies as the span of its values: the worst of them is one of its ends.
+    """
     kinds: dict[tuple[str, ...], list[LogLine]] = {}
     for line in lines:
         kinds.setdefault((line.process, line.level, *_TOKEN.split(line.text)), []).append(line)
-    return [Gathered(_common(alike), tuple(alike)) for alike in kinds.values()]
-
-
-def _common(lines: Sequence[LogLine]) -> str:
-    """The text, each number that varies as the span of its values: the worst of them is one of its ends."""
-    columns = zip(*(_TOKEN.findall(line.text) for line in lines), strict=True)
-    spans = iter([_span(values) for values in columns])
-    return _TOKEN.sub(lambda _: next(spans), lines[0].text)
+    found = []
+    for alike in kinds.values():
+        first = alike[0]
+        columns = zip(*(_TOKEN.findall(line.text) for line in alike), strict=True)
+        parts = zip_longest(_TOKEN.split(first.text), map(_span, columns), fillvalue="")
+        text = "".join(chain.from_iterable(parts))
+        rank = 0 if first.level in ("error", "critical") else 3 if first.level in _CALM else 2
+        found.append(Gathered(text, tuple(alike), 1 if rank and _GRAVE.search(first.text) else rank))
+    return found
 
 
 def _span(values: Sequence[str]) -> str:

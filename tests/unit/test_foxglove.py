@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ccatp.config.load import load_config
 from ccatp.core import PanelId, PanelPose, PointId
 from ccatp.links.topics import TOPICS, FixMessage, LogMessage, Message, SensorLines, TrackMessage, TruthMessage
-from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.report.foxglove import (
     POINTS_AGAIN_S,
     VIEWS,
@@ -26,13 +24,10 @@ from ccatp.report.foxglove import (
     time_of,
     view_schemas,
 )
+from tests.support.scenario import mirror_of
 
+MIRROR = mirror_of()
 PLAIN = ("boolean", "string", "number", "integer")
-
-
-@pytest.fixture(scope="module")
-def mirror() -> Mirror:
-    return build_mirror(load_config().mirror)
 
 
 def read_like_a_viewer(schema: dict[str, Any], where: str) -> None:
@@ -75,23 +70,12 @@ def test_a_nested_type_stands_in_its_place() -> None:
 
 
 SDK_TYPES: dict[str, Any] = {
-    "timestamp": sdk.Timestamp,
-    "lifetime": sdk.Duration,
-    "pose": sdk.Pose,
-    "position": sdk.Vector3,
-    "orientation": sdk.Quaternion,
-    "rotation": sdk.Quaternion,
-    "translation": sdk.Vector3,
-    "size": sdk.Vector3,
-    "color": sdk.Color,
-    "points": sdk.Point3,
-    "entities": sdk.SceneEntity,
-    "lines": sdk.LinePrimitive,
-    "spheres": sdk.SpherePrimitive,
-    "texts": sdk.TextPrimitive,
-    "metadata": sdk.KeyValuePair,
+    "timestamp": sdk.Timestamp, "lifetime": sdk.Duration, "pose": sdk.Pose, "position": sdk.Vector3,
+    "orientation": sdk.Quaternion, "rotation": sdk.Quaternion, "translation": sdk.Vector3, "size": sdk.Vector3,
+    "color": sdk.Color, "points": sdk.Point3, "entities": sdk.SceneEntity, "lines": sdk.LinePrimitive,
+    "spheres": sdk.SpherePrimitive, "texts": sdk.TextPrimitive, "metadata": sdk.KeyValuePair,
     "deletions": sdk.SceneEntityDeletion,
-}
+}  # fmt: skip
 NUMBERED = {"LinePrimitive": sdk.LinePrimitiveLineType, "Log": sdk.LogLevel}
 
 
@@ -105,7 +89,8 @@ def as_sdk(kind: Any, fields: dict[str, Any]) -> Any:
             return [as_sdk(SDK_TYPES[name], one) for one in found]
         if name in ("type", "level"):
             # an enumeration of theirs compares equal to its number
-            return next(e for e in _members(NUMBERED[kind.__name__]) if e == found)
+            members = (getattr(NUMBERED[kind.__name__], one) for one in dir(NUMBERED[kind.__name__]))
+            return next(one for one in members if isinstance(one, NUMBERED[kind.__name__]) and one == found)
         return found
 
     return kind(**{name: value(name, found) for name, found in fields.items()})
@@ -114,10 +99,6 @@ def as_sdk(kind: Any, fields: dict[str, Any]) -> Any:
 def builtins(message: msgspec.Struct) -> dict[str, Any]:
     found: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(message))
     return found
-
-
-def _members(enum: Any) -> list[Any]:
-    return [member for name in dir(enum) if isinstance(member := getattr(enum, name), enum)]
 
 
 def test_fields_have_foxgloves_names() -> None:
@@ -129,8 +110,8 @@ def test_fields_have_foxgloves_names() -> None:
             assert "unexpected keyword" not in str(refused.value), name
 
 
-def test_the_sdk_takes_the_scene_as_it_is(mirror: Mirror) -> None:
-    scene = builtins(panel_scene(mirror, time_of(1.5)))
+def test_the_sdk_takes_the_scene_as_it_is() -> None:
+    scene = builtins(panel_scene(MIRROR, time_of(1.5)))
     as_sdk(sdk.SceneUpdate, scene)
     assert scene["entities"][0]["timestamp"] == {"sec": 1, "nsec": 500_000_000}
     assert len(scene["entities"]) == 78  # 77 panels and the rim
@@ -138,15 +119,15 @@ def test_the_sdk_takes_the_scene_as_it_is(mirror: Mirror) -> None:
         as_sdk(sdk.SceneUpdate, {**scene, "entitys": []})
 
 
-def test_measured_points_carry_their_deviation(mirror: Mirror) -> None:
+def test_measured_points_carry_their_deviation() -> None:
     points = {PointId(4, 4, 5): 1e-4, PointId(4, 4, 6): -3e-4, PointId(5, 5, 1): 0.0}
-    scene = builtins(point_scene(mirror, [PanelId(4, 4)], points, time_of(0.0)))
+    scene = builtins(point_scene(MIRROR, [PanelId(4, 4)], points, time_of(0.0)))
     as_sdk(sdk.SceneUpdate, scene)
     (entity,) = scene["entities"]
     assert [fact["value"] for fact in entity["metadata"]] == ["100.0 um", "-300.0 um"]
-    x, y = mirror.point_on_deck(PointId(4, 4, 5))
+    x, y = MIRROR.point_on_deck(PointId(4, 4, 5))
     at = entity["spheres"][0]["pose"]["position"]
-    assert (at["x"], at["y"], at["z"]) == pytest.approx(mirror.surface_point(x, y), abs=1e-5)  # rounded
+    assert (at["x"], at["y"], at["z"]) == pytest.approx(MIRROR.surface_point(x, y), abs=1e-5)  # rounded
 
 
 def test_colours_run_from_blue_to_red() -> None:
@@ -164,8 +145,8 @@ PUCK_M = 0.05
 
 
 @pytest.fixture
-def views(mirror: Mirror) -> Views:
-    made = Views(mirror, PUCK_M)
+def views() -> Views:
+    made = Views(MIRROR, PUCK_M)
     assert [shown.topic for shown in made.begin()] == ["view/frames", "view/panels"]
     return made
 
@@ -182,35 +163,35 @@ def track(*rows: tuple[int, float, int, int, float, float, float, float]) -> Tra
     return TrackMessage(seq=rows[-1][0], t_s=rows[-1][1], rows=list(rows))
 
 
-def test_every_tenth_pose_is_shown_on_the_deck(views: Views, mirror: Mirror) -> None:
+def test_every_tenth_pose_is_shown_on_the_deck(views: Views) -> None:
     found = shown(views, track(*((seq, seq / 100, 3, 4, 0.1, -0.2, 0.5, 0.001) for seq in range(95, 115))))
     robots = found["view/robot"]
     assert [r["seq"] for r in robots] == [100, 110]
-    pose = mirror.deck_pose(PanelPose(PanelId(3, 4), 0.1, -0.2, 0.5))
+    pose = MIRROR.deck_pose(PanelPose(PanelId(3, 4), 0.1, -0.2, 0.5))
     assert [robots[0][k] for k in ("x_m", "y_m", "heading_rad")] == pytest.approx(
         [pose.x_m, pose.y_m, pose.heading_rad]
     )
     assert robots[0]["sigma_m"] == 0.001
     shown_pose = found["view/pose"][0]["pose"]
     where = [shown_pose["position"][k] for k in "xyz"]
-    assert where == pytest.approx(mirror.surface_point(pose.x_m, pose.y_m))
+    assert where == pytest.approx(MIRROR.surface_point(pose.x_m, pose.y_m))
     turn = Rotation.from_quat([shown_pose["orientation"][k] for k in "xyzw"])
-    assert pytest.approx(np.array(mirror.robot_axes(pose))) == turn.as_matrix().T
+    assert pytest.approx(np.array(MIRROR.robot_axes(pose))) == turn.as_matrix().T
     frame = found["view/robot_frame"][0]
     assert (frame["parent_frame_id"], frame["child_frame_id"]) == ("deck", "robot")
     assert frame["translation"] == shown_pose["position"]
 
 
-def test_the_deck_stands_in_the_world(mirror: Mirror) -> None:
-    frame = json.loads(next(iter(Views(mirror, PUCK_M).begin())).payload)
+def test_the_deck_stands_in_the_world() -> None:
+    frame = json.loads(next(iter(Views(MIRROR, PUCK_M).begin())).payload)
     turn = Rotation.from_quat([frame["rotation"][k] for k in "xyzw"])
     shift = np.array([frame["translation"][k] for k in "xyz"])
-    assert turn.apply([0.3, -0.4, 0.5]) + shift == pytest.approx(mirror.world_from_deck((0.3, -0.4, 0.5)))
+    assert turn.apply([0.3, -0.4, 0.5]) + shift == pytest.approx(MIRROR.world_from_deck((0.3, -0.4, 0.5)))
 
 
 @pytest.mark.parametrize("truth_first", [True, False])
-def test_the_error_is_that_of_the_same_frame(views: Views, mirror: Mirror, truth_first: bool) -> None:
-    pose = mirror.deck_pose(PanelPose(PanelId(3, 4), 0.0, 0.0, 0.0))
+def test_the_error_is_that_of_the_same_frame(views: Views, truth_first: bool) -> None:
+    pose = MIRROR.deck_pose(PanelPose(PanelId(3, 4), 0.0, 0.0, 0.0))
     row = (100, 1.0, pose.x_m, pose.y_m, pose.heading_rad, 0.0, 0.0, 0.0, 0.1, 0, 0)
     truth = TruthMessage(seq=100, t_s=1.0, rows=[row])
     estimate = track((100, 1.0, 3, 4, 0.003, 0.004, 0.01, 0.001))
@@ -239,34 +220,34 @@ def test_sensors_hold_what_the_frame_holds(views: Views) -> None:
     assert shown(views, broken) == {}
 
 
-def fix(mirror: Mirror, point: PointId, t_s: float, lift_m: float) -> FixMessage:
-    x, y = mirror.point_on_deck(point)
-    normal = mirror.surface.normal(x, y)
-    on_deck = [a + (PUCK_M + lift_m) * n for a, n in zip(mirror.surface_point(x, y), normal, strict=True)]
+def fix(point: PointId, t_s: float, lift_m: float) -> FixMessage:
+    x, y = MIRROR.point_on_deck(point)
+    normal = MIRROR.surface.normal(x, y)
+    on_deck = [a + (PUCK_M + lift_m) * n for a, n in zip(MIRROR.surface_point(x, y), normal, strict=True)]
     return FixMessage(
         seq=1, t_s=t_s, point=(point.row, point.col, point.point), is_fused=True,
-        position_m=mirror.world_from_deck((on_deck[0], on_deck[1], on_deck[2])),
+        position_m=MIRROR.world_from_deck((on_deck[0], on_deck[1], on_deck[2])),
         covariance_m2=[0.0] * 9, dop=1.0, residual_rms_m=0.0, channels=[1], jump_mm=0.0,
     )  # fmt: skip
 
 
-def test_a_fix_colours_its_point_and_all_points_come_again(views: Views, mirror: Mirror) -> None:
-    (first,) = shown(views, fix(mirror, PointId(2, 3, 5), 1.0, 1e-4))["view/points"]
+def test_a_fix_colours_its_point_and_all_points_come_again(views: Views) -> None:
+    (first,) = shown(views, fix(PointId(2, 3, 5), 1.0, 1e-4))["view/points"]
     (entity,) = first["entities"]
     assert entity["id"] == "points 2-3"
     assert entity["metadata"] == [{"key": "point 5", "value": "100.0 um"}]
-    (second,) = shown(views, fix(mirror, PointId(2, 4, 5), 2.0, 0.0))["view/points"]
+    (second,) = shown(views, fix(PointId(2, 4, 5), 2.0, 0.0))["view/points"]
     assert [e["id"] for e in second["entities"]] == ["points 2-4"]
-    (third,) = shown(views, fix(mirror, PointId(2, 5, 5), POINTS_AGAIN_S + 1.0, 0.0))["view/points"]
+    (third,) = shown(views, fix(PointId(2, 5, 5), POINTS_AGAIN_S + 1.0, 0.0))["view/points"]
     assert [e["id"] for e in third["entities"]] == ["points 2-3", "points 2-4", "points 2-5"]
-    refused = fix(mirror, PointId(2, 3, 5), 3.0, 0.0)
+    refused = fix(PointId(2, 3, 5), 3.0, 0.0)
     refused.is_fused = False
     assert shown(views, refused) == {}
 
 
-def test_a_run_begins_with_its_first_message_and_lines_become_a_log(mirror: Mirror) -> None:
+def test_a_run_begins_with_its_first_message_and_lines_become_a_log() -> None:
     message = LogMessage(seq=1, t_s=2.25, level="warning", process="main", text="held")
-    found = shown(Views(mirror, PUCK_M), message)
+    found = shown(Views(MIRROR, PUCK_M), message)
     assert list(found) == ["view/frames", "view/panels", "view/log"]
     (log,) = found["view/log"]
     assert log["timestamp"] == {"sec": 2, "nsec": 250_000_000}

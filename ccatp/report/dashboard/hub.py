@@ -62,7 +62,7 @@ class BusReader:
     def read_levels(self, wanted: bool) -> None:
         """Subscribe to display state and verdict, of which only the newest counts, or end that."""
         if self._open["levels"] and not wanted:
-            self._view.discard_history()
+            self._view.discard_picture()
         self._read("levels", wanted)
 
     def read_track(self, wanted: bool) -> None:

@@ -7,20 +7,10 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ccatp.core import Verdict, danger_text
+from ccatp.links import topics
 from ccatp.links.liveness import Liveness, kind_of
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import (
-    BY_NAME,
-    BeaconTruth,
-    DangerEvent,
-    DisplayState,
-    Heartbeat,
-    LogMessage,
-    Message,
-    MissionStatus,
-    Scene,
-    TruthMessage,
-)
+from ccatp.links.topics import BY_NAME, BeaconTruth, Heartbeat, MissionStatus, TruthMessage
 
 LOOPS = ("main", "danger")
 NAMES = {"main": "main loop", "danger": "danger loop"}
@@ -268,10 +258,10 @@ class RunStateView:
         self.status: MissionStatus | None = None
         self.is_tracking = False  # the path arrives as it is driven; otherwise it has only the stops
         self._status_s = self._verdict_s = float("-inf")
-        self._picture: DisplayState | None = None
+        self._picture: topics.DisplayState | None = None
         self._sensors: Sensors | None = None
-        self._verdict: Verdict | DangerEvent | None = None
-        self._scene: Scene | None = None
+        self._verdict: Verdict | topics.DangerEvent | None = None
+        self._scene: topics.Scene | None = None
         self._is_scene_new = False
         self._trail = Trail(MAX_PATH)
         self._series = {name: Growing(MAX_SAMPLES) for name in series}
@@ -285,16 +275,16 @@ class RunStateView:
         self._handlers: dict[type, Callable[[Any, float], None]] = {
             Heartbeat: lambda heartbeat, _: self.links.presence(heartbeat),
             MissionStatus: self._take_status,
-            DisplayState: self._take_picture,
+            topics.DisplayState: self._take_picture,
             Verdict: self._take_verdict,
-            DangerEvent: self._take_verdict,
-            Scene: self._take_scene,
+            topics.DangerEvent: self._take_verdict,
+            topics.Scene: self._take_scene,
             TruthMessage: self._take_truth,
             BeaconTruth: self._take_truth,
-            LogMessage: lambda log, _: self._lines.add(round(log.t_s, 2), log.level, log.text),
+            topics.LogMessage: lambda log, _: self._lines.add(round(log.t_s, 2), log.level, log.text),
         }
 
-    def receive(self, message: Message | Verdict, now_s: float) -> None:
+    def receive(self, message: topics.Message | Verdict, now_s: float) -> None:
         """Take a message of the bus; one that the page does not show is ignored."""
         handler = self._handlers.get(type(message))
         if handler is not None:
@@ -304,7 +294,7 @@ class RunStateView:
         self.status, self._status_s = status, now_s
         self.links.is_over = status.exit_status >= 0
 
-    def _take_picture(self, picture: DisplayState, now_s: float) -> None:
+    def _take_picture(self, picture: topics.DisplayState, now_s: float) -> None:
         self.links.picture_s = now_s
         self._picture = msgspec.structs.replace(picture, line=NO_LINE)
         try:
@@ -312,16 +302,16 @@ class RunStateView:
         except msgspec.MsgspecError:
             self._sensors = None  # no frame yet
 
-    def _take_verdict(self, verdict: Verdict | DangerEvent, now_s: float) -> None:
+    def _take_verdict(self, verdict: Verdict | topics.DangerEvent, now_s: float) -> None:
         self._verdict, self._verdict_s = verdict, now_s
-        if isinstance(verdict, DangerEvent) and verdict.cause:
+        if isinstance(verdict, topics.DangerEvent) and verdict.cause:
             text = danger_text(verdict.cause, verdict.signal, verdict.value, verdict.limit)
             self._lines.add(round(verdict.t_s, 2), "warning", f"danger: {text}")
 
-    def _take_scene(self, scene: Scene, _now_s: float) -> None:
+    def _take_scene(self, scene: topics.Scene, _now_s: float) -> None:
         self._scene, self._is_scene_new = scene, True
 
-    def discard_history(self) -> None:
+    def discard_picture(self) -> None:
         """Display states are not requested any more; the old one is not shown."""
         self.links.picture_s = self._picture = self._sensors = None
 

@@ -94,7 +94,7 @@ def test_levels_are_there_each_time(view: SurveyView) -> None:
     assert told(view, now_s=2.1)["mission"]["is_stale"]
     state = told(view, picture(line=b"null"))  # before the first frame
     assert (state["robot"], state["pose"] is None) == (None, False)
-    view.discard_history()
+    view.discard_picture()
     assert told(view)["pose"] is None
     told(view, mission(exit_status=0))
     assert (told(view, now_s=9.0)["is_over"], told(view, now_s=9.0)["mission"]["is_stale"]) == (True, False)
