@@ -366,9 +366,10 @@ def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[ViewMessage]:
             line = _sensors.decode(raw)
         except msgspec.MsgspecError:
             continue
+        if any(None in sample for sample in (*line.enc, *line.imu)):
+            continue  # a sensor that gave no value
         pairs = ((WHEELS, line.enc), (INERTIAL, line.imu), (EDGES, line.edge))
-        samples = [pair for names, found in pairs if found for pair in zip(names, found[-1][1:], strict=True)]
-        newest = {name: value for name, value in samples if value is not None}
+        newest = {name: v for names, found in pairs if found for name, v in zip(names, found[-1][1:], strict=True)}
         yield _shown("view/sensors", line.t, SensorView(
             t_s=line.t, seq=line.seq, **newest, fan_left=line.fans[0], fan_right=line.fans[1], battery=line.soc,
             drive_age_s=line.cmd.age, permit_age_s=line.cmd.permit_age, held=line.cmd.held,

@@ -205,19 +205,20 @@ def test_the_error_is_that_of_the_same_frame(views: Views, truth_first: bool) ->
 
 def test_sensors_hold_what_the_frame_holds(views: Views) -> None:
     line = {
-        "type": "sensors", "seq": 7, "t": 0.07, "imu": [], "enc": [[0.06, 1.0, 2.0], [0.07, 3.0, None]],
+        "type": "sensors", "seq": 7, "t": 0.07, "imu": [], "enc": [[0.06, 1.0, 2.0], [0.07, 3.0, 4.0]],
         "edge": [[0.07, 1, 0, 1, 1]], "gravity": None, "fans": [0.8, 0.7], "soc": 0.5,
         "cmd": {"seq": 6, "age": 0.01, "permit_age": 0.02, "held": True}, "faults": [],
     }  # fmt: skip
     lines = [msgspec.Raw(json.dumps(line).encode()), msgspec.Raw(b'{"type":"sensors"}')]
     (view,) = shown(views, SensorLines(seq=7, t_s=0.07, lines=lines))["view/sensors"]
     assert view == {
-        "t_s": 0.07, "seq": 7, "wheel_right_rad_s": 3.0, "edge_front_left": 1,
+        "t_s": 0.07, "seq": 7, "wheel_right_rad_s": 3.0, "wheel_left_rad_s": 4.0, "edge_front_left": 1,
         "edge_front_right": 0, "edge_rear_left": 1, "edge_rear_right": 1, "fan_left": 0.8, "fan_right": 0.7,
         "battery": 0.5, "drive_age_s": 0.01, "permit_age_s": 0.02, "held": True,
     }  # fmt: skip
-    broken = SensorLines(seq=8, t_s=0.08, lines=[msgspec.Raw(b'{"type":"sensors"}')])
-    assert shown(views, broken) == {}
+    silent = json.dumps(line | {"enc": [[0.07, 3.0, None]]}).encode()
+    for broken in (b'{"type":"sensors"}', silent):
+        assert shown(views, SensorLines(seq=8, t_s=0.08, lines=[msgspec.Raw(broken)])) == {}
 
 
 def fix(point: PointId, t_s: float, lift_m: float) -> FixMessage:
