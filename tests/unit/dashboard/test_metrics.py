@@ -5,11 +5,8 @@ from typing import Any
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 
-from ccatp.config.load import load_config
 from ccatp.links.topics import DisplayState
-from ccatp.mirror.mirror import build_mirror
 from ccatp.report.dashboard.app import StateCollector
-from ccatp.report.dashboard.survey_view import SurveyView
 from ccatp.report.dashboard.view import NO_LINE, LinkState
 from ccatp.survey.state import MissionState
 from tests.unit.dashboard.prometheus import parse
@@ -21,10 +18,7 @@ NOTHING: dict[str, Any] = {
 }  # fmt: skip
 ALL: dict[str, Any] = NOTHING | {
     "trouble": "",
-    "links": [
-        LinkState("main loop", "joined", 0.05, True),
-        LinkState("robot", "no frame yet", None, False),
-    ],
+    "links": [LinkState("main loop", "joined", 0.05, True), LinkState("robot", "no frame yet", None, False)],
     "mission": {
         "state": "driving", "total": 693, "done": 12, "skipped": 1, "elapsed_s": 61.5, "eta_s": 3000.0,
         "missed_deadlines": 2, "worst_lateness_ms": 21.0,
@@ -84,9 +78,3 @@ def test_unknown_values_are_left_out() -> None:
 def test_a_name_is_escaped() -> None:
     title = 'a"b\\c\nd'
     assert next(iter(metrics_of(NOTHING, title=title)["ccatp_info"]))[0] == title
-
-
-def test_the_state_of_a_real_view() -> None:
-    cfg = load_config(None, {"run.panels": 1})
-    view = SurveyView(build_mirror(cfg.mirror), cfg, is_sim=True)
-    assert metrics_of(view.status_data(1.0))["ccatp_up"] == {(): 0.0}

@@ -29,7 +29,6 @@ from ccatp.report.findings import (
 )
 from ccatp.report.record import TOPICS_READ, RecordedSession, RunRecord, changed_keys, read_record
 from ccatp.survey.composition import assemble
-from tests.unit.reporting.recorded import record as record_run
 
 
 @pytest.fixture(scope="module")
@@ -209,16 +208,6 @@ def test_a_recording_torn_in_its_first_bytes(run_dir: Path) -> None:
     found = findings_of(read_record(run_dir))
     assert (found.errors, found.budget, found.outcome.text) == (None, None, "no mission")
     assert found.alignment is not None  # the fixes are in the database
-
-
-def test_a_real_robot_has_no_truth(tmp_path: Path) -> None:
-    found = findings_of(read_record(record_run(tmp_path / "real", is_simulation=False, only=3)))
-    record = found.record
-    assert (record.is_simulation, record.has_truth, record.injected, record.missing) == (False, False, None, ())
-    assert found.errors is not None
-    assert np.isnan(found.errors.error_mm).all()
-    assert (found.figures, found.against) == (None, None)
-    assert sum(verdict.first_mm is not None for verdict in found.points) >= 3  # as the laser saw them
 
 
 def test_what_is_missing_is_told(without: Callable[..., Path]) -> None:

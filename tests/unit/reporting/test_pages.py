@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 from markupsafe import escape
 
@@ -39,15 +40,22 @@ def test_the_page_of_a_whole_run(recorded: Path) -> None:
     assert run_page(findings_of(read_record(recorded))) == page
 
 
-def test_a_real_robot_is_called_one(tmp_path: Path) -> None:
-    found = run_page(findings_of(read_record(record(tmp_path / "real", is_simulation=False, only=4))))
-    assert Markup(found).anchors == ALL
-    assert "SIMULATION" not in found
+def test_a_real_robot_is_called_one_and_has_no_truth(tmp_path: Path) -> None:
+    found = findings_of(read_record(record(tmp_path / "real", is_simulation=False, only=4)))
+    told = found.record
+    assert (told.is_simulation, told.has_truth, told.injected, told.missing) == (False, False, None, ())
+    assert found.errors is not None
+    assert np.isnan(found.errors.error_mm).all()
+    assert (found.figures, found.against) == (None, None)
+    assert sum(verdict.first_mm is not None for verdict in found.points) >= 4  # as the laser saw them
+    page = run_page(found)
+    assert Markup(page).anchors == ALL
+    assert "SIMULATION" not in page
     for text in (
         "real robot", "The true pose is not known", "aborted, at base", "the observatory wants the robot home",
         "the planned way to the last measured point",
     ):  # fmt: skip
-        assert text in found
+        assert text in page
 
 
 @pytest.mark.parametrize(
