@@ -9,10 +9,11 @@ import logging
 import os
 import socket
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import structlog
 import zmq
@@ -124,22 +125,14 @@ def _survey_view(mirror: Mirror, cfg: Config, run_dir: Path, *, is_sim: bool) ->
     return view
 
 
-def _run(
-    cfg: Config | RadioConfig,
-    run_dir: Path,
-    endpoints: Endpoints,
-    listener: socket.socket,
-    *,
-    is_sim: bool,
-    has_heartbeat: bool,
-) -> int:
+def _run(run_dir: Path, serve_until: Callable[[asyncio.Event, Logger], Coroutine[Any, Any, None]]) -> int:
     async def run(stop: asyncio.Event) -> int:
         log = open_log(run_dir / "log.jsonl", "dashboard")
         for name in ("uvicorn.error", "asyncio"):
             logger = logging.getLogger(name)
             logger.handlers, logger.propagate = [_Handler(log)], False
             logger.setLevel(logging.WARNING)
-        await serve_page(cfg, run_dir, endpoints, listener, stop, log, is_sim=is_sim, has_heartbeat=has_heartbeat)
+        await serve_until(stop, log)
         return 0
 
     return run_until_stopped(run)
@@ -166,7 +159,8 @@ def main() -> int:
     """Entry of ``python -m ccatp.daemon.dashboard``."""
     args = start_process()
     listener = socket.socket(fileno=args.listen_fd)
-    return _run(args.config, args.run_dir, args.endpoints, listener, is_sim=args.is_sim, has_heartbeat=True)
+    places = args.run_dir, args.endpoints, listener
+    return _run(args.run_dir, partial(serve_page, args.config, *places, is_sim=args.is_sim, has_heartbeat=True))
 
 
 class PageSocket(NamedTuple):
@@ -227,7 +221,8 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], report: Cal
     is_sim = read_metadata(run_dir / TELEMETRY).get("simulation") == "true"
     with page.socket:
         report(page.text)
-        return _run(cfg, run_dir, Endpoints(folder), page.socket, is_sim=is_sim, has_heartbeat=False)
+        places = run_dir, Endpoints(folder), page.socket
+        return _run(run_dir, partial(serve_page, cfg, *places, is_sim=is_sim, has_heartbeat=False))
 
 
 if __name__ == "__main__":
