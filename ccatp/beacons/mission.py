@@ -27,7 +27,6 @@ class BeaconState(StrEnum):
 
 
 IDLE, MAPPING, VISITING, FOLLOWING, RETURNING, HELD, DONE = BeaconState
-MOVING = (VISITING, FOLLOWING, RETURNING)
 
 # Nothing moves while the ground shakes.
 EARTHQUAKE = "emergency: earthquake"
@@ -273,22 +272,17 @@ class BeaconMission:
         return drive
 
 
-class WheelRates(NamedTuple):
-    """What goes to the robot: wheel rates, rad/s, and the angle of the steered wheel, rad, ``None`` without one."""
+def wheel_rates(drive: SteeringCommand, cfg: RadioConfig) -> tuple[float, float, float | None]:
+    """Rates of the right and the left wheel, rad/s, and the angle of the steered wheel, rad, ``None`` without one.
 
-    right_rad_s: float
-    left_rad_s: float
-    steer_rad: float | None
-
-
-def wheel_rates(drive: SteeringCommand, cfg: RadioConfig) -> WheelRates:
-    """The rates whose mean is v / r and whose difference is omega b / r (b the track); steered wheels turn alike."""
+    Their mean is v / r, their difference omega b / r with the track b; steered wheels turn alike.
+    """
     radius_m, vehicle = cfg.robot.wheel_radius_m, cfg.vehicle
     rate_rad_s = drive.speed_m_s / radius_m
     if vehicle.kind == "ackermann":
-        return WheelRates(rate_rad_s, rate_rad_s, drive.steer_rad)
+        return rate_rad_s, rate_rad_s, drive.steer_rad
     half_rad_s = 0.5 * vehicle.track_m * drive.turn_rate_rad_s / radius_m
-    return WheelRates(rate_rad_s + half_rad_s, rate_rad_s - half_rad_s, None)
+    return rate_rad_s + half_rad_s, rate_rad_s - half_rad_s, None
 
 
 # The configuration may be calibrated, the robot's own figures are nominal: this much apart they describe two robots.

@@ -12,10 +12,8 @@ from ccatp.beacons.cricket.mote_map import MoteMap, map_motes, plain_frame
 from ccatp.beacons.cricket.range_network import (
     MappingError,
     MoteRange,
-    MoteUnderdetermined,
     RangeNetwork,
     RigidBody,
-    UnknownMote,
     build_network,
     coordinates_of,
     list_names,
@@ -244,7 +242,7 @@ def _network(cfg: CricketConfig, file: MeasuredRanges, tags_m: Places | None) ->
     bodies = []
     for pose, motes in file.groups.items():
         if unknown := [file.tags[mote] for mote in motes if file.tags[mote] not in tags_m]:
-            raise UnknownMote(f"--tags: no place of {unknown[0]}; there are {list_names(list(tags_m))}")
+            raise MappingError(f"--tags: no place of {unknown[0]}; there are {list_names(list(tags_m))}")
         local = np.array([tags_m[file.tags[mote]][: cfg.dimension] for mote in motes], dtype=np.float64)
         bodies.append(RigidBody(pose, tuple(index[mote] for mote in motes), local))
     return build_network(file.readings, cfg.dimension, names, bodies)
@@ -255,7 +253,7 @@ def _check_enough(model: MapModel, network: RangeNetwork) -> None:
     wanted = model.size - d * (d + 1) // 2
     measured = len(np.unique(network.pairs, axis=0))
     if network.count > 2 and measured < min(wanted, network.count):
-        raise MoteUnderdetermined(
+        raise MappingError(
             f"{measured} pairs of {network.count} motes were measured, a map in {d} dimensions has {wanted} unknowns; "
             "measure more pairs"
         )
@@ -315,7 +313,7 @@ def _phase1_error_m(
 
 def _truth(truth_m: Places, names: tuple[str, ...], dimension: int) -> FloatArray:
     if lost := [name for name in names if name not in truth_m]:
-        raise UnknownMote(f"--truth: no place of {list_names(lost)}; there are {list_names(list(truth_m))}")
+        raise MappingError(f"--truth: no place of {list_names(lost)}; there are {list_names(list(truth_m))}")
     if short := [name for name in names if len(truth_m[name]) < dimension]:
         raise MappingError(f"--truth: {short[0]} has {len(truth_m[short[0]])} coordinates, wanted {dimension}")
     return np.array([truth_m[name][:dimension] for name in names], dtype=np.float64)

@@ -76,22 +76,6 @@ class MappingError(CcatpError):
     exit_status = ExitStatus.USAGE
 
 
-class UnknownMote(MappingError):
-    """A range names a mote that is none."""
-
-
-class BadRange(MappingError):
-    """A range that no two motes can have."""
-
-
-class Disconnected(MappingError):
-    """No chain of ranges leads from some motes to the others."""
-
-
-class MoteUnderdetermined(MappingError):
-    """Fewer ranges than anything could be determined from."""
-
-
 @dataclass(frozen=True, slots=True)
 class RigidBody:
     """Motes whose places relative to each other are known: a network on its stand, tags on a trolley."""
@@ -149,10 +133,8 @@ def build_network(
         known_m: known coordinates, nan elsewhere, shape (n, d).
 
     Raises:
-        UnknownMote: a range names a mote that is not among ``names``.
-        BadRange: negative or not finite, without a positive sigma, or from a mote to itself.
-        MoteUnderdetermined: there is none, or there are fewer than two motes.
-        Disconnected: the motes fall apart.
+        MappingError: a range names a mote that is not among ``names``, is from a mote to itself, negative or not
+            finite, or has no positive sigma; there are no ranges, fewer than two motes, or the motes fall apart.
     """
     rows = list(readings)
     if names is None:
@@ -161,9 +143,7 @@ def build_network(
     for row in rows:
         _check_row(row, index)
     if len(names) < 2 or not rows:
-        raise MoteUnderdetermined(
-            f"{len(rows)} ranges among {len(names)} motes; a map needs two motes and a range at least"
-        )
+        raise MappingError(f"{len(rows)} ranges among {len(names)} motes; a map needs two motes and a range at least")
     network = RangeNetwork(
         names=tuple(names),
         dimension=dimension,
@@ -211,15 +191,15 @@ def list_names(names: Sequence[str]) -> str:
 def _check_row(row: MoteRange, index: dict[str, int]) -> None:
     for name in (row.first, row.second):
         if name not in index:
-            raise UnknownMote(
+            raise MappingError(
                 f"range {row.first} to {row.second}: no mote {name!r}; there are {list_names(list(index))}"
             )
     if row.first == row.second:
-        raise BadRange(f"range {row.first} to {row.second}: from a mote to itself; leave it out")
+        raise MappingError(f"range {row.first} to {row.second}: from a mote to itself; leave it out")
     if not 0.0 <= row.range_m < float("inf"):
-        raise BadRange(f"range {row.first} to {row.second}: {row.range_m:g} m is no distance")
+        raise MappingError(f"range {row.first} to {row.second}: {row.range_m:g} m is no distance")
     if not 0.0 < row.sigma_m < float("inf"):
-        raise BadRange(f"range {row.first} to {row.second}: sigma of {row.sigma_m:g} m, must be positive")
+        raise MappingError(f"range {row.first} to {row.second}: sigma of {row.sigma_m:g} m, must be positive")
 
 
 def _check_connected(network: RangeNetwork) -> None:
@@ -231,7 +211,7 @@ def _check_connected(network: RangeNetwork) -> None:
     if len(sizes) == 1:
         return
     lost = [network.names[mote] for mote in np.flatnonzero(labels == sizes.argmin())]
-    raise Disconnected(
+    raise MappingError(
         f"the motes fall into {len(sizes)} parts with no range between them: {list_names(lost)} on one side; "
         "measure a range across, or map the parts one by one"
     )

@@ -30,10 +30,6 @@ class DegenerateStep(MappingError):
     """A step of phase 1 whose geometry does not determine a mote well enough."""
 
 
-class MissingRange(MappingError):
-    """A step of phase 1 lacks a range."""
-
-
 class TrilaterationStep(NamedTuple):
     """How one mote was placed."""
 
@@ -75,7 +71,7 @@ class Sketch:
         self._seen_m[list(motes)] = places_m
 
     def set_axes(self, origin: int, axis: int) -> None:
-        """Origin and second axis: A (0, 0), B (0, d_AB); in the plane alone. Raises MissingRange: A and B have none."""
+        """Origin and second axis: A (0, 0), B (0, d_AB); in the plane alone. Raises MappingError: A and B have none."""
         range_m, sigma_m = self._range(origin, axis)
         self.positions_m[origin] = self._seen_m[origin] = 0.0
         self.positions_m[axis] = self._seen_m[axis] = (0.0, range_m)
@@ -89,7 +85,7 @@ class Sketch:
         y = (d_A^2 + d_AB^2 - d_B^2) / (2 d_AB), x = sqrt(d_A^2 - y^2)
 
         Raises:
-            MissingRange: a range to A or B is missing.
+            MappingError: a range to A or B is missing.
             DegenerateStep: the mote is on the axis, or nearly.
         """
         (a, sigma_a), (b, sigma_b), (c, _) = (
@@ -128,7 +124,7 @@ class Sketch:
         """A mote by trilateration from motes that have places, with the solver of the laser system.
 
         Raises:
-            MissingRange: a range to a reference is missing.
+            MappingError: a range to a reference is missing.
             DegenerateStep: the references lie on a line with the mote, or nearly.
         """
         ranges = [self._range(reference, mote) for reference in references]
@@ -181,7 +177,7 @@ class Sketch:
     def _range(self, first: int, second: int) -> tuple[float, float]:
         found = self._means.between(first, second)
         if found is None:
-            raise MissingRange(
+            raise MappingError(
                 f"no range between {self._names[first]} and {self._names[second]}: phase 1 cannot place "
                 f"{self._names[second]}; move it into reach"
             )
@@ -330,7 +326,7 @@ def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: in
     covariance is by derivatives.
 
     Raises:
-        MissingRange, DegenerateStep: a step that cannot be made; the message names its motes.
+        MappingError: a step that cannot be made; the message names its motes.
     """
     means = PairMeans(network)
     sketch = Sketch(plan.names, means, plan.dimension, max_dop)

@@ -5,15 +5,11 @@ import pytest
 
 from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
 from ccatp.beacons.cricket.range_network import (
-    BadRange,
-    Disconnected,
     MappingError,
     MoteRange,
-    MoteUnderdetermined,
     PairMeans,
     RigidBody,
     TdoaError,
-    UnknownMote,
     build_network,
     graph_pairs,
     range_from_delay,
@@ -188,19 +184,19 @@ def row(first: str, second: str, range_m: float = 1.0, sigma_m: float = 0.01) ->
 
 
 A_TO_B = "range A to B: "
-REFUSALS: list[tuple[list[MoteRange], type[Exception], str]] = [
-    ([row("A", "X")], UnknownMote, "range A to X: no mote 'X'; there are A, B"),
-    ([row("A", "B", -0.1)], BadRange, f"{A_TO_B}-0.1 m is no distance"),
-    ([row("A", "B", float("nan"))], BadRange, f"{A_TO_B}nan m is no distance"),
-    ([row("A", "B", 1.0, 0.0)], BadRange, f"{A_TO_B}sigma of 0 m, must be positive"),
-    ([row("A", "A")], BadRange, "from a mote to itself"),
-    ([], MoteUnderdetermined, "0 ranges among 2 motes"),
+REFUSALS: list[tuple[list[MoteRange], str]] = [
+    ([row("A", "X")], "range A to X: no mote 'X'; there are A, B"),
+    ([row("A", "B", -0.1)], f"{A_TO_B}-0.1 m is no distance"),
+    ([row("A", "B", float("nan"))], f"{A_TO_B}nan m is no distance"),
+    ([row("A", "B", 1.0, 0.0)], f"{A_TO_B}sigma of 0 m, must be positive"),
+    ([row("A", "A")], "from a mote to itself"),
+    ([], "0 ranges among 2 motes"),
 ]
 
 
-@pytest.mark.parametrize(("rows", "error", "what"), REFUSALS, ids=[what for _, _, what in REFUSALS])
-def test_ranges_of_no_network(rows: list[MoteRange], error: type[Exception], what: str) -> None:
-    with pytest.raises(error, match=what):
+@pytest.mark.parametrize(("rows", "what"), REFUSALS, ids=[what for _, what in REFUSALS])
+def test_ranges_of_no_network(rows: list[MoteRange], what: str) -> None:
+    with pytest.raises(MappingError, match=what):
         build_network(rows, 2, ["A", "B"])
 
 
@@ -229,7 +225,7 @@ def test_parts_that_hang_on_known_places_are_no_error() -> None:
     rows = [row("a", "c"), row("b", "c"), row("d", "f")]
     assert build_network(rows, 2, list("abcdef"), (), known).count == 6
     known[3] = np.nan
-    with pytest.raises(Disconnected, match="into 2 parts with no range between them: d, f on one side"):
+    with pytest.raises(MappingError, match="into 2 parts with no range between them: d, f on one side"):
         build_network(rows, 2, list("abcdef"), (), known)
 
 

@@ -7,12 +7,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from ccatp.beacons.cricket.range_network import MoteRange, PairMeans, RangeNetwork, build_network
+from ccatp.beacons.cricket.range_network import MappingError, MoteRange, PairMeans, RangeNetwork, build_network
 from ccatp.beacons.cricket.self_mapping import MotePlan, conditioned, network_plan
 from ccatp.beacons.cricket.trilateration import (
     DegenerateStep,
     FirstMap,
-    MissingRange,
     Sketch,
     map_as_possible,
     map_by_plan,
@@ -97,7 +96,7 @@ def test_a_missing_range_names_both_motes() -> None:
     network = network_of(np.array([A, B, [1.0, 1.0]]), [(0, 1), (0, 2)])
     sketch = Sketch(network.names, PairMeans(network), 2, 60.0)
     sketch.set_axes(0, 1)
-    with pytest.raises(MissingRange, match="no range between M1 and M2"):
+    with pytest.raises(MappingError, match="no range between M1 and M2"):
         sketch.add_by_cosines(2, 0, 1)
 
 
