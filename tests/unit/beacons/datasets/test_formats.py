@@ -10,7 +10,7 @@ import pytest
 import scipy.io
 
 from ccatp.beacons.datasets.formats import EVENTS
-from ccatp.beacons.datasets.reader import found_format, read_run
+from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.datasets.tables import RadioDataError
 from ccatp.beacons.datasets.trajectory import LOST_RAD, bridged
 from ccatp.beacons.slam.recording import RecordedRun, Steps, dead_reckoned
@@ -30,6 +30,7 @@ from tests.unit.beacons.datasets.sets import (
 )
 
 W = world()
+MRCLAM_TRUTH = ("mrclam", "Robot1_Groundtruth.dat", "Landmark_Groundtruth.dat")
 
 
 def check(run: RecordedRun, w: World, bearings: bool, headings: bool = True) -> None:
@@ -54,37 +55,60 @@ def check(run: RecordedRun, w: World, bearings: bool, headings: bool = True) -> 
     assert run.truth.x_m == pytest.approx(w.poses[:, 0], abs=1e-6)
 
 
-def test_plaza_as_matlab_file_as_texts_and_as_folder(tmp_path: Path) -> None:
-    mat = write_plaza(tmp_path, W)
-    check(read_run(mat, None, None), W, bearings=False)
-    (tmp_path / "texts").mkdir()
-    texts = write_plaza(tmp_path / "texts", W, mat=False)
-    check(read_run(texts, None, None), W, bearings=False)
-    check(read_run(texts.with_name("Field1_TD.txt"), None, None), W, bearings=False)
-    check(read_run(tmp_path / "texts", None, None), W, bearings=False)
-    run = read_run(tmp_path, None, None)
-    assert (run.name, run.kind) == ("Field1", "plaza")
+def _texts(folder: Path) -> Path:
+    return write_plaza(folder, W, mat=False).with_name("Field1_TD.txt")
 
 
-def test_plaza_texts_without_truth_begin_at_the_origin(tmp_path: Path) -> None:
-    file = write_plaza(tmp_path, W, mat=False)
-    (tmp_path / "Field1_GT.txt").unlink()
-    (tmp_path / "Field1_TL.txt").unlink()
-    run = read_run(file, None, None)
-    assert run.truth is None
-    assert run.first_pose == (0.0, 0.0, 0.0)
-    assert dict(run.beacon_truth_m) == {}
+def _packed(folder: Path) -> Path:
+    (folder / "part.txt.gz").write_bytes(gzip.compress("\n".join(labyrinth_lines(W)).encode()))
+    return folder
+
+
+def _quoted(folder: Path) -> Path:
+    lines = (line if line.startswith("#") else '"' + line.replace(",", '","') + '"' for line in csv_lines(W))
+    return write_lines(folder / "mine.csv", [*lines])
+
+
+# What writes the run, its name, whether it has bearings, and whether the first heading is the truth's or that which the
+# first two metres of positions tell.
+WAYS: dict[str, tuple[Callable[[Path], Path], str, bool, bool]] = {
+    "plaza": (lambda folder: write_plaza(folder, W), "Field1", False, True),
+    "plaza in a folder": (lambda folder: write_plaza(folder, W).parent, "Field1", False, True),
+    "plaza texts": (_texts, "Field1", False, True),
+    "plaza texts in a folder": (lambda folder: _texts(folder).parent, "Field1", False, True),
+    "mrclam": (lambda folder: write_mrclam(folder, W), "run robot 1", True, True),
+    "mrclam packed": (lambda folder: write_mrclam(folder, W, packed=True), "run robot 1", True, True),
+    "mrclam file": (lambda folder: write_mrclam(folder, W) / "Robot1_Measurement.dat", "run robot 1", True, True),
+    "labyrinth": (lambda folder: write_lines(folder / "a_0.txt", labyrinth_lines(W)), "a_0", False, False),
+    "labyrinth packed": (_packed, "part", False, False),
+    "csv": (lambda folder: write_lines(folder / "mine.csv", csv_lines(W)), "mine", True, True),
+    "csv with a head": (lambda folder: write_lines(folder / "b.txt", ["t,x,y", *csv_lines(W)]), "b", True, True),
+    "csv quoted": (_quoted, "mine", True, True),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_run_comes_back(way: str, tmp_path: Path) -> None:
+    make, name, bearings, headings = WAYS[way]
+    folder = tmp_path / "run"
+    folder.mkdir()
+    run = read_run(make(folder), None, None)
+    check(run, W, bearings, headings)
+    assert (run.name, run.kind) == (name, way.split(maxsplit=1)[0])
+    assert run.first_pose[2] == pytest.approx(W.poses[0, 2], abs=0.02)
+
+
+@pytest.mark.parametrize(("form", "truth", "survey"), [("plaza", "Field1_GT.txt", "Field1_TL.txt"), MRCLAM_TRUTH])
+def test_without_truth_a_run_begins_at_the_origin(form: str, truth: str, survey: str, tmp_path: Path) -> None:
+    folder = write_plaza(tmp_path, W, mat=False).parent if form == "plaza" else write_mrclam(tmp_path, W)
+    (folder / truth).unlink()
+    (folder / survey).unlink()
+    run = read_run(folder, None, None)
+    assert (run.truth, run.first_pose, dict(run.beacon_truth_m)) == (None, (0.0, 0.0, 0.0), {})
     assert len(run.steps.times_s) == len(run.steps.distance_m) + 1
-    assert any("no reference trajectory" in warning for warning in run.warnings)
-
-
-@pytest.mark.parametrize("packed", [False, True], ids=["plain", "gzipped"])
-def test_mrclam_plain_and_gzipped(tmp_path: Path, packed: bool) -> None:
-    folder = write_mrclam(tmp_path, W, packed=packed)
-    check(read_run(folder, None, None), W, bearings=True)
-    check(read_run(folder, "mrclam", 1), W, bearings=True)
-    file = next(folder.glob("Robot1_Measurement.dat*"))
-    check(read_run(file, None, None), W, bearings=True)
+    told = " | ".join(run.warnings)
+    assert "no reference trajectory" in told
+    assert ("no Landmark_Groundtruth.dat" in told) == (form == "mrclam")
 
 
 def test_mrclam_takes_the_robot_asked_for_and_leaves_out_robots_and_strangers(tmp_path: Path) -> None:
@@ -99,15 +123,6 @@ def test_mrclam_takes_the_robot_asked_for_and_leaves_out_robots_and_strangers(tm
     assert read_run(tmp_path, None, None).readings.range_m == pytest.approx(W.range_m + 1.0, abs=1e-8)
 
 
-def test_mrclam_without_truth_still_reads(tmp_path: Path) -> None:
-    write_mrclam(tmp_path, W)
-    (tmp_path / "Robot1_Groundtruth.dat").unlink()
-    (tmp_path / "Landmark_Groundtruth.dat").unlink()
-    run = read_run(tmp_path, None, None)
-    assert run.truth is None
-    assert any("no Landmark_Groundtruth.dat" in warning for warning in run.warnings)
-
-
 def test_mrclam_velocities_hold_until_the_next_row(tmp_path: Path) -> None:
     write_mrclam(tmp_path, W)
     rows = ["0.0 1.0 0.0", "2.0 1.0 0.0", "2.0 3.0 0.5", "4.0 0.0 0.0"]  # two rows of one time: the last one holds
@@ -116,18 +131,6 @@ def test_mrclam_velocities_hold_until_the_next_row(tmp_path: Path) -> None:
     assert run.steps.times_s.tolist() == [0.0, 2.0, 4.0]
     assert run.steps.distance_m.tolist() == [2.0, 6.0]
     assert run.steps.turn_rad.tolist() == [0.0, 1.0]
-
-
-def test_labyrinth_plain_gzipped_and_as_folder(tmp_path: Path) -> None:
-    file = write_lines(tmp_path / "labyrinth_0_60s.txt", labyrinth_lines(W))
-    run = read_run(file, None, None)
-    check(run, W, bearings=False, headings=False)
-    assert run.first_pose[2] == pytest.approx(W.poses[0, 2], abs=0.02)  # told by the first two metres of positions
-    packed = tmp_path / "packed"
-    packed.mkdir()
-    (packed / "part.txt.gz").write_bytes(gzip.compress(file.read_bytes()))
-    check(read_run(packed, None, None), W, bearings=False, headings=False)
-    assert read_run(packed, None, None).name == "part"
 
 
 def test_csv_of_signal_strengths_lateral_ways_and_names(tmp_path: Path) -> None:
@@ -142,14 +145,6 @@ def test_csv_of_signal_strengths_lateral_ways_and_names(tmp_path: Path) -> None:
     assert run.steps.lateral_m.tolist() == [0.2, 0.0, 0.0]
     assert run.truth is not None
     assert np.isnan(run.truth.heading_rad).all()
-
-
-def test_the_format_is_found_by_name_or_first_line(tmp_path: Path) -> None:
-    write_mrclam(tmp_path, W)
-    assert found_format(tmp_path) == "mrclam"
-    assert found_format(tmp_path / "Robot1_Odometry.dat") == "mrclam"
-    assert found_format(write_lines(tmp_path / "a.txt", labyrinth_lines(W))) == "labyrinth"
-    assert found_format(write_lines(tmp_path / "b.txt", csv_lines(W))) == "csv"
 
 
 def test_rows_out_of_order_doubled_or_not_finite_are_mended_and_told(tmp_path: Path) -> None:
@@ -176,14 +171,6 @@ def test_readings_beyond_the_odometry_are_left_out_and_told(tmp_path: Path) -> N
     run = read_run(tmp_path, None, None)
     assert len(run.readings.times_s) == len(W.read_s)
     assert any("1 range before the first or after the last odometry" in warning for warning in run.warnings)
-
-
-def test_csv_with_a_head_of_words_or_quoted_cells(tmp_path: Path) -> None:
-    lines = csv_lines(W)
-    check(read_run(write_lines(tmp_path / "head.csv", ["time,x,y", *lines]), None, None), W, bearings=True)
-    check(read_run(write_lines(tmp_path / "mine.csv", lines), None, None), W, bearings=True)
-    quoted = [line if line.startswith("#") else ",".join(f'"{cell}"' for cell in line.split(",")) for line in lines]
-    check(read_run(write_lines(tmp_path / "quoted.csv", quoted), None, None), W, bearings=True)
 
 
 def test_csv_with_a_truth_that_lacks_some_headings_is_told(tmp_path: Path) -> None:
