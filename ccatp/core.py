@@ -201,6 +201,11 @@ class Stop:
     reverse: bool = False
     heading_rad: float | None = None
 
+    @property
+    def is_measured(self) -> bool:
+        """The robot stands there for a measurement."""
+        return self.kind in (StopKind.MEASURE, StopKind.CALIBRATE)
+
 
 class EmergencyKind(StrEnum):
     """Causes of an abort (interface control document 3)."""

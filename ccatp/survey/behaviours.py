@@ -13,6 +13,7 @@ from ccatp.survey.planning.search import leg_time, turn_time
 from ccatp.survey.route_follower import RouteFollower, StateEstimate
 from ccatp.survey.state import (
     BACKING_OFF,
+    CHUNK,
     DRIVING,
     MEASURING,
     RETURNING,
@@ -170,7 +171,7 @@ class Behaviours:
         order = self._follow(follower, motion, stop)
         if order is not None:
             return order
-        if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) or self._is_vague(motion, stop):
+        if stop.is_measured or self._is_vague(motion, stop):
             survey.apply(MissionEvent.ARRIVED)
             return self._settle(motion)
         follower.advance()
@@ -212,7 +213,7 @@ class Behaviours:
                 survey.is_off_route = False  # what was measured of the drive is not lost, and the rest of it follows
                 return HOLD_POSITION
             survey.wants_calibration = True
-        due = survey.retries.chunk
+        due = survey.retries.due[:CHUNK]
         try:
             if due and self._plan_points is not None:
                 survey.route = self._plan_points(deck, due)

@@ -8,7 +8,7 @@ from typing import Any
 
 from ccatp.config.models import Config
 from ccatp.control.gate import DriveGate
-from ccatp.core import PanelId, PointId, Stop, StopKind
+from ccatp.core import PointId, Stop, StopKind
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
 from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
@@ -179,7 +179,7 @@ def make_plan(cfg: Config, mirror: Mirror) -> SurveyPlan:
     stops = plan_survey(cfg, mirror, points, (), out_of_reach).stops
     legs_s = [leg_time(length, cfg.limits) for length in leg_lengths(stops, mirror.base_pose, mirror)]
     times_s = stop_times(stops, mirror.base_pose, cfg.limits, mirror)
-    rests_s = [cfg.etalon.measuring_time_s * _is_measured(stop) for stop in stops]
+    rests_s = [cfg.etalon.measuring_time_s * stop.is_measured for stop in stops]
     clock_s, arrivals_s = 0.0, []
     for time_s, rest_s in zip(times_s, rests_s, strict=True):
         arrivals_s.append(clock_s + time_s)
@@ -196,10 +196,6 @@ def make_plan(cfg: Config, mirror: Mirror) -> SurveyPlan:
         measuring_s=sum(rests_s),
         any_order_s=tour_bound(mirror, reached, cfg.limits, cfg.etalon.measuring_time_s),
     )
-
-
-def _is_measured(stop: Stop) -> bool:
-    return stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE)
 
 
 def plan_data(cfg: Config, plan: SurveyPlan) -> dict[str, Any]:
@@ -242,7 +238,8 @@ def plan_lines(cfg: Config, plan: SurveyPlan) -> Iterator[str]:
     count = len(set(panels))
     of = f"{count} panel{'' if count == 1 else 's'}"
     yield f"{cfg.mirror.name}: {len(plan.points)} points of {of}, order {cfg.run.order}"
-    yield f"first panels    {_names(panels)}"
+    first = " ".join(f"{panel.row}/{panel.col}" for panel in panels[:9])
+    yield f"first panels    {first}{' ...' if len(panels) > 9 else ''}"
     yield f"way             {plan.length_m:.1f} m, {len(plan.stops)} stops, {vias} of them only on the way"
     yield (
         f"least time      {_clock(plan.least_s)}: {plan.driving_s:.0f} s driving, {plan.turning_s:.0f} s turning, "
@@ -256,11 +253,6 @@ def plan_lines(cfg: Config, plan: SurveyPlan) -> Iterator[str]:
     lost = " ".join("/".join(map(str, point)) for point in plan.out_of_reach[:_SHOWN])
     more = " ..." if len(plan.out_of_reach) > _SHOWN else ""
     yield f"out of reach    {f'{len(plan.out_of_reach)} points: {lost}{more}' if lost else 'none'}"
-
-
-def _names(panels: list[PanelId]) -> str:
-    shown = " ".join(f"{panel.row}/{panel.col}" for panel in panels[:9])
-    return shown + (" ..." if len(panels) > 9 else "")
 
 
 def _clock(time_s: float) -> str:

@@ -66,29 +66,15 @@ _SURVEYING = _ANYWHERE | {
 # (state, event) -> state. An edge outranks an abort: while backing off GO_HOME changes nothing. DONE is final.
 TRANSITIONS = MappingProxyType(
     {
-        MissionState.IDLE: _ANYWHERE
-        | {
-            MissionEvent.GO_ON: MissionState.TURNING,
-            MissionEvent.GO_HOME: MissionState.RETURNING,
-            MissionEvent.EDGE: MissionState.BACKING_OFF,
-            MissionEvent.FIND: MissionState.SETTLING,
-        },
-        MissionState.TURNING: _SURVEYING
-        | {MissionEvent.TURNED: MissionState.DRIVING, MissionEvent.ARRIVED: MissionState.SETTLING},
-        MissionState.DRIVING: _SURVEYING
-        | {MissionEvent.REALIGN: MissionState.TURNING, MissionEvent.ARRIVED: MissionState.SETTLING},
-        MissionState.SETTLING: _SURVEYING | {MissionEvent.SETTLED: MissionState.MEASURING},
-        MissionState.MEASURING: _SURVEYING,
-        MissionState.BACKING_OFF: _ANYWHERE | {MissionEvent.FIND: MissionState.SETTLING},
-        MissionState.RETURNING: _ANYWHERE | {MissionEvent.EDGE: MissionState.BACKING_OFF},
-        MissionState.HELD: _ANYWHERE
-        | {
-            MissionEvent.GO_ON: MissionState.TURNING,
-            MissionEvent.GO_HOME: MissionState.RETURNING,
-            MissionEvent.EDGE: MissionState.BACKING_OFF,
-            MissionEvent.FIND: MissionState.SETTLING,
-        },
-        MissionState.DONE: {},
+        IDLE: _SURVEYING | {MissionEvent.FIND: SETTLING},
+        TURNING: _SURVEYING | {MissionEvent.TURNED: DRIVING, MissionEvent.ARRIVED: SETTLING},
+        DRIVING: _SURVEYING | {MissionEvent.REALIGN: TURNING, MissionEvent.ARRIVED: SETTLING},
+        SETTLING: _SURVEYING | {MissionEvent.SETTLED: MEASURING},
+        MEASURING: _SURVEYING,
+        BACKING_OFF: _ANYWHERE | {MissionEvent.FIND: SETTLING},
+        RETURNING: _ANYWHERE | {MissionEvent.EDGE: BACKING_OFF},
+        HELD: _SURVEYING | {MissionEvent.FIND: SETTLING},
+        DONE: {},
     }
 )
 
@@ -163,11 +149,6 @@ class RetryQueue:
         dropped = set(points).difference(wanted)
         self.causes |= {point: cause for point in points if point in dropped}
         self._tried_again |= dropped
-
-    @property
-    def chunk(self) -> list[PointId]:
-        """The points to be planned next."""
-        return self.due[:CHUNK]
 
 
 class MissedPoint:

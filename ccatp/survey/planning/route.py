@@ -172,7 +172,7 @@ class RoutePlanner:
 
     def _timed(self, stops: tuple[Stop, ...], start: DeckPose) -> Route:
         times = [
-            time_s + (self._measuring_s if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) else 0.0)
+            time_s + (self._measuring_s if stop.is_measured else 0.0)
             for stop, time_s in zip(stops, stop_times(stops, start, self._limits, self._mirror), strict=True)
         ]
         return Route(stops, tuple(accumulate(reversed(times), initial=0.0))[::-1])

@@ -7,7 +7,7 @@ from math import dist, hypot, pi, sqrt
 from typing import NamedTuple
 
 from ccatp.config.models import LimitsConfig
-from ccatp.core import DeckPose, Stop, StopKind, bearing, difference
+from ccatp.core import DeckPose, Stop, bearing, difference
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.legs import LegPlace, LegRules, heading_of_course
 
@@ -66,7 +66,7 @@ def path_time(
     stops: Sequence[Stop], start: DeckPose, limits: LimitsConfig, mirror: Mirror, measuring_time_s: float
 ) -> float:
     """Least time to drive a path from a deck pose, rest to rest, and to measure at its measurement points, s."""
-    measurements = sum(stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) for stop in stops)
+    measurements = sum(stop.is_measured for stop in stops)
     return sum(stop_times(stops, start, limits, mirror)) + measurements * measuring_time_s
 
 

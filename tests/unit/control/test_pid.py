@@ -194,14 +194,6 @@ def test_an_echo_younger_than_a_frame_acts_for_the_rest_of_it(predictor: Command
     assert predictor.ahead(POSE, 0.05, 0.3, 6, 0.4 * DT_PREDICTION, False).v_m_s < fresh.v_m_s
 
 
-def test_a_lost_echo_or_command_is_passed_over(predictor: CommandPredictor) -> None:
-    predictor.ahead(POSE, 0.0, 0.0, 2, DT_PREDICTION, False)
-    # 3 and 4 never came: what counts is that 5 is in force.
-    assert predictor.ahead(POSE, 0.05, 0.0, 5, DT_PREDICTION, False).v_m_s == pytest.approx(
-        0.06 - 0.01 * exp(-DT_PREDICTION / LAG_PREDICTION)
-    )
-
-
 def test_nothing_in_force_means_that_all_is_on_the_way() -> None:
     predictor = CommandPredictor(LAG_PREDICTION, DT_PREDICTION)
     predictor.sent(1, 0.1, 0.0)

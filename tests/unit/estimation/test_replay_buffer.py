@@ -245,19 +245,6 @@ def test_a_late_fix_is_as_good_as_one_in_time(filter_name: str, name: str, taken
     assert covariance < 1e-4
 
 
-def test_several_late_fixes_in_any_order() -> None:
-    story = Story("round a corner", rewind_s=3.0)
-    times = [story.end_after(t_s) for t_s in (1.2, 1.8, 2.6)]
-    told = story.end_after(3.7)
-    in_time = story.tell({k: [story.fixes[k]] for k in times})
-    for order in ((2, 0, 1), (1, 2, 0)):
-        late = story.tell({told: [story.fixes[times[k]] for k in order]})
-        mean, covariance = apart(in_time, late)
-        # Each is taken where the ones after it are not known yet: derivatives at means that are some 0.1 sigma apart.
-        assert mean < 1e-3
-        assert covariance < 1e-3
-
-
 @pytest.mark.parametrize("inside", [1, 3])
 def test_a_fix_within_a_block_is_carried_to_its_end(inside: int) -> None:
     """In time it ends the block, so the noise of the block is taken in other portions: that is what differs."""

@@ -1,7 +1,7 @@
 """From the end of a leg to the request for a measurement."""
 
 from collections.abc import Callable, Iterable
-from math import cos, exp, hypot, pi, sin
+from math import cos, hypot, pi, sin
 
 import numpy as np
 import pytest
@@ -104,13 +104,6 @@ def test_at_rest_after_the_settling_time_below_both_limits(config: Config) -> No
 @pytest.mark.parametrize("speed", [lambda c: 1.1 * c.settle_speed_m_s, lambda c: -1.1 * c.settle_speed_m_s])
 def test_a_robot_that_creeps_never_rests(config: Config, speed: Callable[[object], float]) -> None:
     assert first_rest(config, [speed(config.control)] * 1000, [0.0] * 1000) is None
-
-
-def test_wheels_that_run_down_rest_when_they_are_slow_and_no_earlier(config: Config) -> None:
-    speeds = [0.05 * exp(-k * DT_SETTLING / 0.08) for k in range(200)]
-    slow = next(k for k, v in enumerate(speeds) if v <= config.control.settle_speed_m_s)
-    rested = first_rest(config, speeds, [0.0] * 200)
-    assert rested == slow + round(config.control.settle_time_s / DT_SETTLING)
 
 
 POSE = (0.1, 0.2, 0.5)
@@ -414,7 +407,7 @@ class Paused(SilRun):
             self.mission.resume()
 
 
-@pytest.mark.parametrize("pause_s", [6.0, 9.5])
+@pytest.mark.parametrize("pause_s", [6.0])
 def test_a_pause_leaves_nothing_out(pause_s: float) -> None:
     cfg = load_config(overrides={"run.panels": 1, "run.filter": "ekf"})
     result = Paused(cfg, pause_s).run()

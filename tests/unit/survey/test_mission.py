@@ -182,17 +182,6 @@ def test_a_sensor_that_stays_off_is_looked_at_with_one_fix(story: Story) -> None
     story.until(lambda: len(story.mission.done) == 3)  # it came on: the survey goes on by itself
 
 
-def test_after_the_end_a_sensor_that_stays_off_is_nothing(story: Story) -> None:
-    stays_off = replace(FRONT_OFF, cause="stays off", signal="front_left", severity=Severity.HOLD, reverse=False)
-    story.until_state(MissionState.DRIVING)
-    story.mission.abort("fire")
-    story.until_state(MissionState.DONE)
-    for _ in range(100):
-        assert not story.frame(stays_off).measure
-    assert (story.mission.state, story.mission.outcome) == (MissionState.DONE, SurveyOutcome.AT_BASE)
-    assert story.mission.cause == "fire"
-
-
 def test_abort_during_back_off_waits_for_the_retreat(story: Story) -> None:
     story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
     story.frame(FRONT_OFF)
@@ -291,19 +280,6 @@ def test_failed_measurements_are_skipped_and_three_in_a_row_hold(story: Story) -
     assert story.mission.is_faulted
     assert "3 measurements in a row failed: no answer" in story.mission.cause
     assert len(story.mission.skipped) == 3
-
-
-def test_a_fix_committed_during_a_pause_counts_once(story: Story) -> None:
-    story.auto_fix = False
-    story.until(lambda: story.mission.is_awaiting_fix)
-    point = story.mission.measuring_point
-    story.mission.pause("operator")
-    story.mission.fixed(point)
-    assert story.mission.state is MissionState.HELD
-    story.auto_fix = True
-    story.mission.resume()
-    story.until_state(MissionState.DONE)
-    assert [p.point for p in story.mission.done] == [1, 2, 3]
 
 
 def test_a_fix_committed_after_the_way_was_planned_anew_counts_once(story: Story) -> None:
