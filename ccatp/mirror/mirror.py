@@ -164,13 +164,6 @@ class Mirror(MirrorFrames):
         x, y, z = self.surface.point(p.x_m, p.y_m)
         return x + a * hx + b * lx + c * nx, y + a * hy + b * ly + c * ny, z + a * hz + b * lz + c * nz
 
-    def robot_from_deck(self, p: DeckPose, v: Vector3) -> Vector3:
-        """Coordinates in the frame of a robot at ``p`` of a point given in the deck frame, m."""
-        x, y, z = self.surface.point(p.x_m, p.y_m)
-        h, left, n = self.robot_axes(p)
-        d = (v[0] - x, v[1] - y, v[2] - z)
-        return _dot(h, d), _dot(left, d), _dot(n, d)
-
     def body_axes(self, p: DeckPose) -> tuple[float, float, float, float]:
         """Deck-plane components (hx, hy, lx, ly) of the robot's x axis h and y axis l.
 

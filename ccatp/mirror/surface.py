@@ -81,10 +81,6 @@ class Surface:
             fy = fy * x + q1
         return fx, fy
 
-    def hessian(self, x: float, y: float) -> tuple[float, float, float]:
-        """Second derivatives (fxx, fxy, fyy), 1/m."""
-        return self.jet(x, y)[3:]
-
     def jet(self, x: float, y: float) -> Jet:
         """All of (f, fx, fy, fxx, fxy, fyy) in one pass."""
         f = fx = fy = half_fxx = fxy = half_fyy = 0.0
@@ -145,16 +141,6 @@ class Surface:
         w = sqrt(s2 + fy * fy)
         ws = w * s
         return (1.0 / s, 0.0, fx / s), (-fx * fy / ws, s / w, fy / ws), (-fx / w, -fy / w, 1.0 / w)
-
-    def transport_rad(self, x: float, y: float, dx: float, dy: float) -> float:
-        """Change of the deck heading of a robot that drives (dx, dy) without turning about its own normal, rad.
-
-        ``dpsi = -fy (fxx dx + fxy dy) / ((1 + fx^2) W)``: a straight line on the surface (a geodesic) turns against
-        the tangents of the lines y = const. For steps that are short against the radius of curvature.
-        """
-        _, fx, fy, fxx, fxy, _ = self.jet(x, y)
-        s2 = 1.0 + fx * fx
-        return -fy * (fxx * dx + fxy * dy) / (s2 * sqrt(s2 + fy * fy))
 
     def drop(self, start: Vector3, direction: Vector3) -> Vector3:
         """Point where the line ``start + s direction`` meets the surface near s = 0, deck frame, m.

@@ -20,6 +20,7 @@ from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import BA, BG, KG, KL, PL, PR, PSI, SL, SR, STATES, A, C, V, W, X, Y
 from ccatp.filters import FILTERS
 from ccatp.mirror.mirror import Mirror
+from tests.support.scenario import transport_rad
 from tests.unit.estimation.drive import config, mirror
 
 SEEDS, STEPS, DT_S = 50, 50, 0.04
@@ -57,7 +58,7 @@ def moved(m: Mirror, x: FloatArray) -> FloatArray:
     dx = d * (cos(middle) * e1x + sin(middle) * e2x) + x[C] * abs(d) * g[0]
     dy = d * sin(middle) * e2y + x[C] * abs(d) * g[1]
     out[X], out[Y] = x[X] + dx, x[Y] + dy
-    out[PSI] = x[PSI] + turn + m.surface.transport_rad(float(x[X]), float(x[Y]), float(dx), float(dy))
+    out[PSI] = x[PSI] + turn + transport_rad(m, float(x[X]), float(x[Y]), float(dx), float(dy))
     side = turn * (1.0 + x[KL]) * 0.5 * robot.wheel_base_m
     out[PR] = x[PR] + (d + side) / (robot.wheel_radius_m * (1.0 - x[SR]))
     out[PL] = x[PL] + (d - side) / (robot.wheel_radius_m * (1.0 - x[SL]))

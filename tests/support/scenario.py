@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from functools import cache
+from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,17 @@ def config_of(mirror: str = "fyst-m1", **overrides: object) -> Config:
 def mirror_of(name: str = "fyst-m1") -> Mirror:
     """A shipped mirror; one object for all tests."""
     return build_mirror(config_of(name).mirror)
+
+
+def transport_rad(mirror: Mirror, x: float, y: float, dx: float, dy: float) -> float:
+    """Change of the deck heading, rad, of a robot that drives (dx, dy) without turning about its own normal.
+
+    ``dpsi = -fy (fxx dx + fxy dy) / ((1 + fx^2) W)``: a straight line on the surface (a geodesic) turns against the
+    tangents of the lines y = const. For steps that are short against the radius of curvature.
+    """
+    _, fx, fy, fxx, fxy, _ = mirror.surface.jet(x, y)
+    s2 = 1.0 + fx * fx
+    return -fy * (fxx * dx + fxy * dy) / (s2 * sqrt(s2 + fy * fy))
 
 
 def one_panel(**overrides: object) -> Config:

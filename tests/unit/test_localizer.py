@@ -22,6 +22,7 @@ from ccatp.estimation.thesis_localizer import FourStateLocalizer as Localizer
 from ccatp.filters import FILTERS, FilterDiverged, Innovation, KalmanFilter
 from ccatp.filters.base import Observation
 from ccatp.mirror.mirror import Mirror, build_mirror
+from tests.support.scenario import transport_rad
 
 Rate = Callable[[float], float]
 Frame = tuple[float, list[ImuSample], list[WheelSample], list[EdgeSample]]
@@ -75,7 +76,7 @@ class Truth:
         v, omega = self.v(self.t_s + 0.5 * DT_S), self.omega(self.t_s + 0.5 * DT_S)
         hx, hy, _, _ = self.mirror.body_axes(DeckPose(p.x_m, p.y_m, p.heading_rad + 0.5 * omega * DT_S))
         dx, dy = v * DT_S * hx, v * DT_S * hy
-        turn = omega * DT_S + self.mirror.surface.transport_rad(p.x_m, p.y_m, dx, dy)
+        turn = omega * DT_S + transport_rad(self.mirror, p.x_m, p.y_m, dx, dy)
         self.pose = DeckPose(p.x_m + dx, p.y_m + dy, p.heading_rad + turn)
         self.ticks += 1
 

@@ -59,8 +59,10 @@ def test_puck_stands_on_the_normal(mirror: Mirror) -> None:
     foot = np.array(mirror.world_from_deck(mirror.surface_point(POSE.x_m, POSE.y_m)))
     puck = np.array(mirror.puck_world(POSE, 0.05))
     assert np.linalg.norm(puck - foot) == pytest.approx(0.05, abs=1e-12)
-    robot = mirror.robot_from_deck(POSE, mirror.deck_from_world(mirror.puck_world(POSE, 0.05)))
-    assert robot == pytest.approx((0.0, 0.0, 0.05), abs=1e-12)
+    offset = np.subtract(
+        mirror.deck_from_world(mirror.puck_world(POSE, 0.05)), mirror.surface_point(POSE.x_m, POSE.y_m)
+    )
+    assert np.array(mirror.robot_axes(POSE)) @ offset == pytest.approx((0.0, 0.0, 0.05), abs=1e-12)
 
 
 def test_foot_of_a_puck_that_is_too_high(mirror: Mirror) -> None:
