@@ -9,7 +9,7 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +27,9 @@ OPENING_S = 1.5
 
 def drain(page: socket.socket) -> None:
     """Take everything until the end."""
-    try:
+    with suppress(OSError):
         while page.recv(65_536):
             pass
-    except OSError:
-        return
 
 
 def ticks_us(subscriber: Subscriber, seconds: float) -> np.ndarray:

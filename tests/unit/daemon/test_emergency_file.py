@@ -55,14 +55,15 @@ def test_a_file_that_cannot_be_read_counts_as_an_emergency(tmp_path: Path, log: 
     assert not PersistentEmergencyLatch(tmp_path / FILE, log).is_latched
 
 
+def no_room(*_: int) -> None:
+    raise OSError(28, "No space left on device")
+
+
 def test_a_disk_that_refuses_does_not_keep_an_emergency_from_being_latched(
     tmp_path: Path, log: Log, told: StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(_: int) -> None:
-        raise OSError(5, "Input/output error")
-
     latch = PersistentEmergencyLatch(tmp_path / FILE, log)
-    monkeypatch.setattr("os.fsync", refuse)
+    monkeypatch.setattr("os.fsync", no_room)
     assert latch.raise_emergency("fire", "a") is None
     assert latch.is_latched
     assert "emergencies_not_saved" in told.getvalue()
@@ -71,10 +72,6 @@ def test_a_disk_that_refuses_does_not_keep_an_emergency_from_being_latched(
 @pytest.mark.fault("P13")
 def test_an_emergency_is_kept_on_a_full_disk(tmp_path: Path, log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     """The room for it was taken before; a full disk gives no more."""
-
-    def no_room(_fd: int, _offset: int, _length: int) -> None:
-        raise OSError(28, "No space left on device")
-
     latch = PersistentEmergencyLatch(tmp_path / FILE, log)
     assert (tmp_path / f"{FILE}.new").stat().st_size == RESERVE_BYTES
     monkeypatch.setattr("os.posix_fallocate", no_room)
