@@ -9,7 +9,9 @@ Known limitations: the battery stays full, and nothing fails without a fault pla
 import asyncio
 import secrets
 import socket
+from collections.abc import Callable
 from contextlib import AsyncExitStack
+from functools import partial
 from pathlib import Path
 from typing import Protocol, cast
 
@@ -20,6 +22,7 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.beacon_robot import build_beacon_robot
+from ccatp.sim.fault_injector import Injector
 from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.sim.fault_proxy import FaultProxy, LinkFaults
 from ccatp.sim.ground_truth import GroundTruthPublisher, SimPoseFile
@@ -44,6 +47,10 @@ class RobotLinkServer:
 
     In lockstep simulated time waits for the clients; otherwise the wall clock paces it. Without a ``key`` there is no
     authentication.
+
+    Attributes:
+        each_frame: called after each frame, before ``truth`` takes it.
+        faults: at work; each fault is logged when it begins and ends, and with what it did.
     """
 
     def __init__(
@@ -63,6 +70,8 @@ class RobotLinkServer:
         self.connections: set[Connection] = set()
         self._failure: asyncio.Future[None]
         self.truth: GroundTruthPublisher | None = None
+        self.each_frame: list[Callable[[], None]] = []
+        self.faults: list[Injector | LinkFaults] = []
 
     async def start(self, sock: socket.socket | None = None) -> int:
         """Boot and listen on the configured address or on a bound socket; return the port.
@@ -79,7 +88,7 @@ class RobotLinkServer:
             make_nonce=lambda: secrets.token_hex(16),
             now_s=loop.time(),
             note=self._note,
-            on_frame=self.on_frame,
+            on_frame=self._on_frame,
         )
         if sock is None:
             self._listener = await loop.create_server(self.connect, *self._address)
@@ -117,7 +126,7 @@ class RobotLinkServer:
             self._listener.close()
         for connection in tuple(self.connections):
             connection.close()
-        self.on_close()
+        self._finish()
         if self._listener is not None:
             if self._log is not None:
                 counts = {"fan_changes": self.server.fan_changes, "oldest_ack_frames": self.server.oldest_ack_frames}
@@ -125,15 +134,28 @@ class RobotLinkServer:
             await self._listener.wait_closed()
             self._listener = None
 
-    def on_frame(self) -> None:
-        """Record the true state after a frame."""
+    def _on_frame(self) -> None:
+        for call in self.each_frame:
+            call()
         if self.truth is not None:
             self.truth.add()
+        for faults in self.faults:
+            for what, injected in faults.changes(self._served.t_s):
+                self._log_fault(what, injected)
 
-    def on_close(self) -> None:
-        """Publish the last true states."""
+    def _finish(self) -> None:
+        """Publish the last true states; log what each fault did."""
         if self.truth is not None:
             self.truth.flush()
+        for faults in self.faults:
+            if isinstance(faults, LinkFaults):
+                faults.changes(self._served.t_s)  # what happened since the last frame
+            for injected in faults.injected:
+                self._log_fault("injected", injected)
+
+    def _log_fault(self, what: str, injected: Injected) -> None:
+        if self._log is not None:
+            self._log.info(f"fault_{what}", **injected._asdict())
 
     def fail(self, error: Exception) -> None:
         """End ``run`` with an unforeseen error."""
@@ -209,11 +231,7 @@ class Connection(asyncio.Protocol):
 
 
 class DataLoop(RobotLinkServer):
-    """The server of the survey robot, with a fault plan; each fault is logged when it begins and with what it did.
-
-    The robot is at base where no ``start`` is given. ``link_faults`` drive the proxy before the link by the robot's
-    clock; ``body`` keeps its true pose between runs.
-    """
+    """The server of the survey robot, with a fault plan; the robot is at base where no ``start`` is given."""
 
     def __init__(
         self,
@@ -227,31 +245,8 @@ class DataLoop(RobotLinkServer):
     ) -> None:
         self.robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(seed), faults, start)
         super().__init__(self.robot, (cfg.sim.robot.host, cfg.sim.robot.port), lockstep=lockstep, key=key, log=log)
-        self.body: SimPoseFile | None = None
-        self.link_faults: LinkFaults | None = None
-
-    def on_frame(self) -> None:
-        """Keep the pose and the true state; faults begin and end."""
-        if self.body is not None:
-            self.body.keep(self.robot)
-        super().on_frame()
-        for faults in (self.robot.injector, self.link_faults):
-            if faults is not None:
-                for what, injected in faults.changes(self.robot.t_s):
-                    self._log_fault(what, injected)
-
-    def on_close(self) -> None:
-        """Publish the last true states; log what each fault did."""
-        super().on_close()
-        if self.link_faults is not None:
-            self.link_faults.changes(self.robot.t_s)  # what happened since the last frame
-        for faults in (self.robot.injector, self.link_faults):
-            for injected in () if faults is None else faults.injected:
-                self._log_fault("injected", injected)
-
-    def _log_fault(self, what: str, injected: Injected) -> None:
-        if self._log is not None:
-            self._log.info(f"fault_{what}", **injected._asdict())
+        if self.robot.injector is not None:
+            self.faults.append(self.robot.injector)
 
 
 async def serve(
@@ -278,7 +273,8 @@ async def serve(
     body = None if body_file is None else SimPoseFile(body_file)
     start = body.read() if body is not None and is_resuming else None
     data_loop = DataLoop(cfg, lockstep, seed, key, log, faults, start)
-    data_loop.body = body
+    if body is not None:
+        data_loop.each_frame.append(partial(body.keep, data_loop.robot))
     try:
         async with AsyncExitStack() as stack:
             if faults is not None and faults.link:
@@ -287,7 +283,8 @@ async def serve(
                 before = listen_sock or stack.enter_context(socket.create_server(at))
                 proxy = FaultProxy(*behind.getsockname()[:2], seed=cfg.run.seed, listener=before)
                 await stack.enter_async_context(proxy)
-                data_loop.link_faults, listen_sock = LinkFaults(faults.link, proxy), behind
+                data_loop.faults.append(LinkFaults(faults.link, proxy))
+                listen_sock = behind
             truth = GroundTruthPublisher(data_loop.robot, truth_rep, truth_pub)
             await _serve(data_loop, truth, listen_sock, stop)
     finally:

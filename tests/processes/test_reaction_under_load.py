@@ -81,14 +81,7 @@ class Wire:
         self._zeros_s: dict[int, list[float]] = {}
         self._last_go_s: dict[int, float] = {}
         self._sent_s = 0.0
-        assert robot.truth is not None
-        add = robot.truth.add
-
-        def watch() -> None:
-            add()
-            self._step()
-
-        robot.truth.add = watch  # type: ignore[method-assign]
+        robot.each_frame.append(self._step)
 
     def _step(self) -> None:
         now_s, rules = time.monotonic(), self._robot.rules
