@@ -594,6 +594,17 @@ def test_an_emergency_is_code_2_with_motion_permitted(on_panel: Story) -> None:
     assert on_panel.run(1).code is EventCode.NORMAL
 
 
+def test_nothing_moves_while_the_ground_shakes(on_panel: Story) -> None:
+    on_panel.monitor.emergency("earthquake", "a")
+    on_panel.monitor.emergency("fire", "b")
+    verdict = on_panel.run(1)
+    assert (verdict.code, verdict.cause) == (EventCode.ABORTED, "emergency: earthquake")
+    assert permits(verdict) == NO_PERMIT
+    assert on_panel.monitor.clear("a", at_base_or_held=True) is None
+    verdict = on_panel.run(1)
+    assert (verdict.cause, permits(verdict)) == ("emergency: fire", ANY_PERMIT)
+
+
 def test_an_edge_outranks_an_abort(at_rim: Story) -> None:
     at_rim.monitor.emergency("fire", "a")
     verdict = at_rim.run(2, v=0.1, off=FRONT)
