@@ -121,7 +121,8 @@ def largest_difference(ours: Contender, peer: Contender, steps: int = STEPS) -> 
         next(solution)
     largest = 0.0
     for _ in range(steps):
-        for one, other in zip(*map(next, solutions), strict=True):
+        results = [next(solution)() for solution in solutions]
+        for one, other in zip(*results, strict=True):
             found, expected = (np.asarray(result, dtype=np.float64).ravel() for result in (one, other))
             largest = max(largest, float(np.abs(found - expected).max()))
             if not np.isfinite(expected).all():
