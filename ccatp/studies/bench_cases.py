@@ -462,5 +462,5 @@ def scipy_position(problem: RangeProblem) -> Solution:
             xtol=tolerance, ftol=tolerance, gtol=tolerance,
         )  # fmt: skip
         slopes = np.asarray(found.jac, dtype=np.float64)
-        position_m, covariance_m2 = found.x, np.linalg.inv(slopes.T @ slopes)
+        position_m, covariance_m2 = found.x, np.asarray(np.linalg.inv(slopes.T @ slopes), dtype=np.float64)
         yield state
