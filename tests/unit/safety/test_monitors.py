@@ -4,7 +4,7 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.control.motion_checks import MotionSum
-from ccatp.core import EmergencyKind, danger_text
+from ccatp.core import EmergencyKind
 from ccatp.safety.emergency_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, EmergencyLatch, is_at_base_or_held
 from ccatp.safety.wheel_monitors import WheelMonitor
 from ccatp.survey.state import MissionState
@@ -187,19 +187,3 @@ def test_the_states_are_those_of_the_mission() -> None:
     assert is_at_base_or_held("held")
     assert not is_at_base_or_held("driving")
     assert not is_at_base_or_held("")
-
-
-@pytest.mark.parametrize(
-    ("cause", "signal", "value", "limit", "text"),
-    [
-        ("no estimate", "estimate", 0.15, 0.15, "no estimate: limit 0.15 s"),
-        ("estimate stale", "estimate", 0.31, 0.15, "estimate stale: 0.31 s (limit 0.15 s)"),
-        ("edge samples stale", "edge", 0.2, 0.1, "edge samples stale: 0.2 s (limit 0.1 s)"),
-        ("lifted or fallen", "edge", 4.0, 3.0, "lifted or fallen (edge): 4 (limit 3)"),
-        ("the left wheel runs away", "left_wheel", 0.5, 0.1, "the left wheel runs away: 0.5 (limit 0.1)"),
-        ("emergency: fire", "emergency:fire", 1.0, 0.0, "emergency: fire"),
-        ("", "", 0.0, 0.0, ""),
-    ],
-)
-def test_what_where_how_much(cause: str, signal: str, value: float, limit: float, text: str) -> None:
-    assert danger_text(cause, signal, value, limit) == text
