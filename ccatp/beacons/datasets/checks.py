@@ -17,7 +17,7 @@ STRANGER_M = 0.3  # readings of a beacon are strange if half of them miss its pl
 STRANGER_RATIO = 5.0  # and by that many times what the others miss
 FITTING = 0.3  # of what they miss their own place by: then they fit another,
 EXCHANGED = 0.75  # or, if those of the other fit here as well as theirs there, are exchanged with it
-TELLING = 1.5  # times what the others miss, without which nothing is exchanged
+EXCHANGE_FACTOR = 1.5  # times what the others miss, without which nothing is exchanged
 AGREEMENT = 0.5  # length of the mean vector of bearing errors that share a constant
 CLOSE = 0.9  # the same, of bearings that give places
 PIECES = 4  # of the run, looked at one by one
@@ -140,7 +140,7 @@ def _unlike(names: tuple[str, ...], miss: FloatArray, pointed: FloatArray) -> di
     own, usual = _own_and_usual(pointed)
     gain = pointed / own[:, None]
     mutual = np.maximum(gain, gain.T)  # the worse of both directions
-    mutual[~(np.minimum.outer(own, own) > TELLING * usual)] = np.nan
+    mutual[~(np.minimum.outer(own, own) > EXCHANGE_FACTOR * usual)] = np.nan
     lines: dict[str, tuple[int, ...]] = {}
     paired: set[int] = set()
     for k, other in zip(*np.unravel_index(np.argsort(mutual, axis=None), mutual.shape), strict=True):

@@ -18,7 +18,7 @@ LARGEST_SIDESLIP_RAD = 0.3  # a constant difference below it is the vehicle's ow
 PIECE_S = 10.0  # long enough for a turn or two, short enough for odometry
 PIECE_POINTS = 40
 LEAST_PIECES = 4
-TELLING = 0.5  # a turning factor is believed if it halves the misfit of a straight path
+MISFIT_RATIO = 0.5  # a turning factor is believed if it halves the misfit of a straight path
 FIRST_WAY_M = 2.0  # way whose shape gives the first heading if the reference has positions alone
 
 
@@ -163,7 +163,7 @@ def turning_factor(truth: ReferencePath, steps: Steps) -> float | None:
     fine = best * np.linspace(0.9, 1.1, 41)
     fine_misfits = np.array([misfit(float(factor)) for factor in fine])
     moved = float(np.median(np.abs(true).max(axis=1)))
-    if moved < CHORD_M or fine_misfits.min() > TELLING * misfit(0.0):
+    if moved < CHORD_M or fine_misfits.min() > MISFIT_RATIO * misfit(0.0):
         return None
     return float(fine[int(np.argmin(fine_misfits))])
 
