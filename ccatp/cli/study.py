@@ -114,30 +114,31 @@ PAGE = "docs/bench.md"
 
 @click.command(epilog=example("ccatp bench --quick", "ccatp bench --json", "ccatp bench --markdown"))
 @WORLD_OPTIONS
-@click.option("--quick", is_flag=True, help="A tenth of the repeats, a mission of one panel.")
+@click.option("--quick", is_flag=True, help="A tenth of the repeats, missions of one panel.")
 @click.option("--steps-only", is_flag=True, help="No missions.")
+@click.option("--frames-only", is_flag=True, help="Missions only.")
 @click.option(
     "--markdown", type=click.Path(path_type=Path, dir_okay=False), is_flag=False, flag_value=PAGE, metavar="[FILE]",
-    help=f"Write the table to FILE; {PAGE} if not named.",
+    help=f"Write the tables to FILE, below them what stood there by hand; {PAGE} if not named.",
 )  # fmt: skip
 @JSON_OPTION
 def bench(
-    config_file: Path | None, settings: Mapping[str, object], quick: bool, steps_only: bool, markdown: Path | None,
-    json_output: bool,
+    config_file: Path | None, settings: Mapping[str, object], quick: bool, steps_only: bool, frames_only: bool,
+    markdown: Path | None, json_output: bool,
 ) -> int:  # fmt: skip
     """Time this project's parts against peers that compute the same, by turns in one run."""
     import tempfile
 
     from ccatp.config.load import dump_config, load_config
-    from ccatp.studies.bench import markdown as page
-    from ccatp.studies.bench import run_bench, terminal_lines
+    from ccatp.studies.bench import run_bench, terminal_lines, write_page
 
     cfg = load_config(config_file, settings)
     with tempfile.TemporaryDirectory(prefix="ccatp-bench-") as folder:
         exact = Path(folder) / "config.toml"
         exact.write_text(dump_config(cfg), encoding="utf-8")
-        result = run_bench(cfg, quick=quick, run_args=("--config", str(exact)), missions=not steps_only)
+        run_args = ("--config", str(exact))
+        result = run_bench(cfg, quick=quick, run_args=run_args, frames=not steps_only, steps=not frames_only)
     if markdown is not None:
-        markdown.write_text(page(result), encoding="utf-8")
+        write_page(markdown, result)
     print_lines([json.dumps(result)] if json_output else terminal_lines(result))
     return 0

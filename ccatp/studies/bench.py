@@ -1,12 +1,8 @@
 """Benchmarks: every case of one table against its peers by turns on one clock, missions, and the result as text."""
 
 import gc
-import json
 import os
 import platform
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
@@ -16,38 +12,31 @@ from typing import Any
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.config.package import child_environment
 from ccatp.core import FloatArray
-from ccatp.errors import CcatpError
 from ccatp.studies.bench_cases import STEPS, Contender, races
-from ccatp.studies.engine import settle
+from ccatp.studies.bench_frame import HEAD, BenchError, frame_cases, markdown_rows, terminal_line
 from ccatp.studies.results import markdown_table
-from ccatp.studies.sil_run import rehearse
 
 EQUAL_WITHIN = 1e-10  # every entry of mean and covariance, SI units
 ROUNDS, QUICK_ROUNDS = 40, 4
 MOST_DENSE_ROUNDS = 10
-PANELS, QUICK_PANELS = 4, 1
-TIMEOUT_S = 900.0
 PACKAGES = ("ccatp", "numpy", "scipy", "filterpy", "stonesoup")
 CPU_INFO = Path("/proc/cpuinfo")
 
 
-class BenchError(CcatpError):
-    """A benchmark that gives no figure: results differ, or a mission failed."""
-
-
-def run_bench(cfg: Config, *, quick: bool, run_args: Sequence[str] = (), missions: bool = True) -> dict[str, Any]:
-    """Run every benchmark, ``quick`` with a tenth of the repeats and a mission of one panel.
+def run_bench(
+    cfg: Config, *, quick: bool, run_args: Sequence[str] = (), frames: bool = True, steps: bool = True
+) -> dict[str, Any]:
+    """Run every benchmark, ``quick`` with a tenth of the repeats and missions of one panel.
 
     ``run_args`` is what else ``ccatp run`` needs to work on the same configuration. A case holds name, us_p50, us_p99,
     peer, peer_us_p50 and ratio = ours / peer, None without a peer; and how far the results differ, or how to install
     the peer. BenchError: a peer's result differs, or a mission failed.
     """
-    rounds, panels = (QUICK_ROUNDS, QUICK_PANELS) if quick else (ROUNDS, PANELS)
     # Missions first: they start in a process that has allocated little.
-    last = [rehearsal_case(cfg, panels), lockstep_case(cfg, panels, run_args)] if missions else []
-    return {"machine": machine(), "equal_within": EQUAL_WITHIN, "cases": [*step_cases(cfg, rounds), *last]}
+    of_frames = frame_cases(cfg, run_args, quick=quick) if frames else []
+    of_steps = step_cases(cfg, QUICK_ROUNDS if quick else ROUNDS) if steps else ()
+    return {"machine": machine(), "equal_within": EQUAL_WITHIN, "cases": [*of_steps, *of_frames]}
 
 
 def step_cases(cfg: Config, rounds: int) -> Iterator[dict[str, Any]]:
@@ -130,56 +119,6 @@ def largest_difference(ours: Contender, peer: Contender, steps: int = STEPS) -> 
     return largest
 
 
-def rehearsal_case(cfg: Config, panels: int) -> dict[str, Any]:
-    """The first panels in one process, without sockets and files (raises BenchError: it was not completed)."""
-    part = cfg.model_copy(update={"run": cfg.run.model_copy(update={"panels": panels})})
-    settle()
-    started_s = time.perf_counter()
-    done = rehearse(part)
-    wall_s = time.perf_counter() - started_s
-    points = done.summary["points"]
-    if points["measured"] != points["total"]:
-        raise BenchError(f"the mission in process measured {points['measured']} of {points['total']} points")
-    return _mission_case("in process", cfg, panels, done.mission_time_s, wall_s)
-
-
-def lockstep_case(cfg: Config, panels: int, run_args: Sequence[str] = ()) -> dict[str, Any]:
-    """The same by ``ccatp run --sim``: five processes, start and end included in the time.
-
-    BenchError: the mission failed, or took longer than ``TIMEOUT_S``.
-    """
-    with tempfile.TemporaryDirectory(prefix="ccatp-bench-") as folder:
-        command = [sys.executable, "-m", "ccatp", "run", "--sim", "--json", "--panels", str(panels), *run_args]
-        command += ["--run-dir", f"{folder}/run", "--runtime-dir", f"{folder}/rt"]
-        environment = child_environment(os.environ)
-        started_s = time.perf_counter()
-        try:
-            done = subprocess.run(
-                command, capture_output=True, text=True, check=False, timeout=TIMEOUT_S, env=environment
-            )
-        except subprocess.TimeoutExpired as error:
-            raise BenchError(f"the mission in lockstep was not over after {TIMEOUT_S:g} s") from error
-        wall_s = time.perf_counter() - started_s
-    if done.returncode != 0:
-        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise BenchError(f"the mission in lockstep ended with status {done.returncode}: {last}")
-    summary = json.loads(done.stdout)
-    found = _mission_case("in lockstep", cfg, panels, summary["mission_time_s"], wall_s)
-    return found | {name: summary["wall"][name] for name in ("tick_us_p50", "tick_us_p99", "realtime_factor")}
-
-
-def _mission_case(how: str, cfg: Config, panels: int, mission_time_s: float, wall_s: float) -> dict[str, Any]:
-    """One mission is one sample: its mean time for a frame of simulated time, and no p99."""
-    frame_us = 1e6 / cfg.sim.robot.frame_hz
-    us = frame_us * wall_s / mission_time_s
-    return {
-        "name": f"mission {how}, {cfg.mirror.name}, {cfg.run.filter}, {panels} panel{'s' if panels > 1 else ''}",
-        "us_p50": us, "us_p99": None, "peer": "the wall clock", "peer_us_p50": frame_us, "peer_us_p99": None,
-        "ratio": us / frame_us, "times_real_time": mission_time_s / wall_s, "mission_time_s": mission_time_s,
-        "wall_s": wall_s,
-    }  # fmt: skip
-
-
 def machine(cpu_info: Path = CPU_INFO) -> dict[str, object]:
     """Processor, usable cores, Python, build and versions of what takes part, threads of the linear algebra."""
     try:
@@ -212,6 +151,8 @@ def _version(package: str) -> str | None:
         return None
 
 
+BY_HAND = "<!-- by hand -->\n"
+
 _PAGE = """# Benchmarks
 
 Written by
@@ -220,40 +161,61 @@ Written by
 OPENBLAS_NUM_THREADS=1 ccatp bench --markdown
 ```
 
-on a machine that does nothing else. A filter step is a prediction and an update, called from Python. Ours and the peer
-take turns in rounds of fifty steps, and who begins by turns as well.
-Ratio = ours / peer: below 1 ours is faster.
+on a machine that does nothing else. Ratio = ours / peer: below 1 ours is faster.
+
+Machine: {machine}
+"""
+_FRAMES = """
+## A frame
+
+The peer of a frame is the calibrator, `python -m ccatp.studies.calibrator`: two plain asyncio processes that exchange
+the same lines over loopback TCP, with the standard library's json, and do nothing else. It runs before each of our
+runs, under the same load: the ratio compares versions and machines. Medians and spread over the rounds. A lockstep
+frame is timed between two moments of a run, after its start and before its end, recording included; a process's CPU
+time is user and system time together.
+
+"""
+_STEPS = """
+## A step
+
+A filter step is a prediction and an update, called from Python. Ours and the peer take turns in rounds of fifty steps,
+and who begins by turns as well.
 
 All compute the same: *difference* is the largest one between any entry of the two means and covariances after any of
 the steps, in its own SI unit, and more than {equal_within:g} ends the run. n = 4 is the thesis's filter, its readings a
 hundred times less exact than they are: as they are, forms with an inverse and (I - W H) P lose up to half their digits.
 n = 19 is the full state, its models as matrices; the unscented filters evaluate the models themselves.
 
-Machine: {machine}
-
 """
 
 
+def write_page(path: Path, result: Mapping[str, Any]) -> None:
+    """Write the page; what follows ``BY_HAND`` in an existing one stays."""
+    before = path.read_text(encoding="utf-8") if path.exists() else ""
+    _, mark, by_hand = before.partition(BY_HAND)
+    path.write_text(markdown(result) + (f"\n{mark}{by_hand}" if mark else ""), encoding="utf-8")
+
+
 def markdown(result: Mapping[str, Any]) -> str:
-    """The page ``docs/bench.md``."""
-    steps, missions = [], []
+    """The tables of ``docs/bench.md``, with what they are."""
+    steps, frames = [], []
     notes: dict[str, None] = {}
     for case in result["cases"]:
-        if "times_real_time" in case:
-            missions.append([case["name"], *(f"{case[key]:.1f}" for key in _MISSION_KEYS)])
+        if "us_spread" in case:
+            frames.append(case)
         else:
             steps.append([case["name"], *(_cell(case.get(key), spec) for key, spec in _STEP_KEYS)])
         if "note" in case:
             notes[f"* {case['note']}\n"] = None
-    text = _PAGE.format(equal_within=result["equal_within"], machine=machine_line(result["machine"]))
-    head = ("case", "ours p50, µs", "ours p99, µs", "peer", "peer p50, µs", "ratio", "difference")
-    text += markdown_table(head, steps)
-    if missions:
-        text += "\n" + markdown_table(("case", "times real time", "simulated, s", "wall, s"), missions)
+    text = _PAGE.format(machine=machine_line(result["machine"]))
+    if frames:
+        text += _FRAMES + markdown_table(HEAD, markdown_rows(frames))
+    if steps:
+        head = ("case", "ours p50, µs", "ours p99, µs", "peer", "peer p50, µs", "ratio", "difference")
+        text += _STEPS.format(equal_within=result["equal_within"]) + markdown_table(head, steps)
     return text + ("\n" + "".join(notes) if notes else "")
 
 
-_MISSION_KEYS = ("times_real_time", "mission_time_s", "wall_s")
 _STEP_KEYS = (
     ("us_p50", ".1f"), ("us_p99", ".1f"), ("peer", ""), ("peer_us_p50", ".1f"), ("ratio", ".3f"),
     ("largest_difference", ".0e"),
@@ -268,9 +230,10 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     """One line for the machine and one for each case."""
     lines = [machine_line(result["machine"])]
     for case in result["cases"]:
-        if "times_real_time" in case:
-            figures = f"{case['times_real_time']:8.1f} times real time"
-        elif case["peer"] is None:
+        if "us_spread" in case:
+            lines.append(terminal_line(case))
+            continue
+        if case["peer"] is None:
             figures = f"{case['us_p50']:8.1f} us   {case['note']}"
         else:
             figures = (

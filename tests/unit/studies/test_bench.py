@@ -1,10 +1,8 @@
 """The benchmarks: equality with the peers, the same problems each time, the format. No times are asserted."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,8 +12,9 @@ from click.testing import CliRunner
 from ccatp.cli.study import bench as command
 from ccatp.config.load import load_config
 from ccatp.studies import bench, bench_cases
-from ccatp.studies.bench import BenchError, cpu_model, largest_difference, machine, race, step_case
+from ccatp.studies.bench import cpu_model, largest_difference, machine, race, step_case
 from ccatp.studies.bench_cases import Contender, Race, races, slam_problem
+from ccatp.studies.bench_frame import BenchError
 
 STEPS = 10
 CFG = load_config()
@@ -97,46 +96,10 @@ def test_the_command_and_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert len(table) == len(result["cases"]) + 2
     assert len({line.count("|") for line in table}) == 1
     assert len(bench.terminal_lines(result)) == len(result["cases"]) + 1
-
-
-def test_a_mission_in_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    def measures(points: int) -> None:
-        found = SimpleNamespace(mission_time_s=20.0, summary={"points": {"measured": points, "total": 9}})
-        monkeypatch.setattr(bench, "rehearse", lambda part: found if part.run.panels == 1 else None)
-
-    measures(9)
-    case = bench.rehearsal_case(CFG, 1)
-    assert case["times_real_time"] == pytest.approx(20.0 / case["wall_s"])
-    assert case["ratio"] == pytest.approx(1.0 / case["times_real_time"])
-    assert case["peer_us_p50"] == pytest.approx(1e4)  # a frame of 100 Hz
-    assert "1 panel |" in bench.markdown({"machine": machine(), "equal_within": 1e-10, "cases": [case]})
-    measures(8)
-    with pytest.raises(BenchError, match="measured 8 of 9 points"):
-        bench.rehearsal_case(CFG, 1)
-
-
-def test_a_mission_in_lockstep(monkeypatch: pytest.MonkeyPatch) -> None:
-    wall = {"tick_us_p50": 100.0, "tick_us_p99": 200.0, "realtime_factor": 20.0}
-    commands: list[list[str]] = []
-
-    def answers(status: int, out: str, err: str) -> None:
-        def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
-            commands.append(command)
-            if status < 0:
-                raise subprocess.TimeoutExpired(command, bench.TIMEOUT_S)
-            return subprocess.CompletedProcess(command, status, out, err)
-
-        monkeypatch.setattr(subprocess, "run", run)
-
-    answers(0, json.dumps({"mission_time_s": 30.0, "wall": wall}), "")
-    case = bench.lockstep_case(CFG, 4, ("--config", "c.toml"))
-    assert commands[0][2:10] == ["ccatp", "run", "--sim", "--json", "--panels", "4", "--config", "c.toml"]
-    assert case["tick_us_p99"] == 200.0
-    assert case["times_real_time"] == pytest.approx(30.0 / case["wall_s"])
-    for status, message in ((4, "ended with status 4: ccatp: held"), (-1, "was not over after 900 s")):
-        answers(status, "", "first\nccatp: held\n")
-        with pytest.raises(BenchError, match=message):
-            bench.lockstep_case(CFG, 1)
+    written = page.read_text()
+    page.write_text(f"old\n{bench.BY_HAND}kept\n")
+    bench.write_page(page, result)
+    assert page.read_text() == f"{written}\n{bench.BY_HAND}kept\n"
 
 
 def test_the_machine(tmp_path: Path) -> None:
