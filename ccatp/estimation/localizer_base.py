@@ -1,35 +1,153 @@
-"""What every localizer does with a frame: order of time, holds, divergence, the panel under the robot."""
+"""What every localizer does with a frame: order of time, which samples are used, holds, divergence."""
 
 from abc import ABC, abstractmethod
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
-from math import atan2, cos, sin, sqrt
-from typing import Generic, TypeVar
+from math import hypot, inf, isfinite
+from operator import lt
 
 from ccatp.control.motion_checks import ImuGate, WheelMeans
-from ccatp.core import EdgeSample, GravitySample, ImuSample, PanelId, PanelPose, WheelSample
-from ccatp.estimation.sample_validation import BACKWARD_LIMIT, FrameKind, FrameTimeCheck, SampleValidator
-from ccatp.estimation.state_model import Slope
+from ccatp.core import EdgeSample, GravitySample, ImuSample, WheelSample
 from ccatp.filters.base import FilterDiverged
-from ccatp.mirror.mirror import Mirror
 
-Taken = TypeVar("Taken")
+WheelReadings = tuple[Sequence[float], Sequence[float]]
+"""Times (s) and rates (rad/s) of one wheel."""
+MAX_FRAME_STEP_S = 0.1
+"""A frame further than this from the last one is a jump of the robot's clock or a gap in the link."""
+LONGEST_GAP_S = 0.4
+"""After so long without a drive the robot stands whatever the last one was: its time-to-live and the run-down."""
+BACKWARD_LIMIT = 5
+"""This many backward time stamps in a row ask for a hold."""
+_ROUNDING_S = 1e-6
+_READABLE = 1e9  # rad/s or m/s^2: far beyond what any sensor shows; squares and products of it stay finite
 
 
-class LocalizerBase(ABC, Generic[Taken]):
+class SampleSource:
+    """The time stamps of one sensor: each is used once, in increasing order."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.backward_run = 0
+        self.newest_s = -inf
+        self.used: deque[Sequence[float]] = deque()
+
+    def use(self, times_s: Sequence[float], oldest_s: float) -> None:
+        """Samples of these times, newer than any before and increasing, are used; older ones are forgotten."""
+        self.newest_s, self.backward_run = times_s[-1], 0
+        used = self.used
+        used.append(times_s)
+        while used[0][-1] < oldest_s:
+            used.popleft()
+
+
+class SampleValidator:
+    """Picks the usable IMU and encoder samples of a frame and counts the others by reason in ``counts``.
+
+    The reasons: ahead, late (older than ``history_s``), duplicate, backward, nonfinite (or larger than any sensor can
+    show), too_fast. ``backward_source`` names a sensor that has sent ``BACKWARD_LIMIT`` backward time stamps in a row,
+    until it is emptied.
+    """
+
+    def __init__(self, history_s: float, counts: dict[str, int]) -> None:
+        self._history_s = history_s
+        self._counts = counts
+        self.backward_source = ""
+        self.largest_rate_rad_s = 0.5 * _READABLE
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget every time stamp: the robot's clock has jumped."""
+        self._imu = SampleSource("imu")
+        self._right, self._left = SampleSource("right encoder"), SampleSource("left encoder")
+
+    def wheels(self, frame_s: float, encoders: Sequence[WheelSample]) -> tuple[WheelReadings, WheelReadings]:
+        """The usable readings of the right and of the left wheel."""
+        if not encoders:
+            return ((), ()), ((), ())
+        times, right, left = zip(*encoders)  # noqa: B905 - of one length; checking that takes longer
+        newest_right_s, newest_left_s = self._right.newest_s, self._left.newest_s
+        first_s, oldest_s, largest = times[0], frame_s - self._history_s, self.largest_rate_rad_s
+        if (
+            newest_right_s < first_s > newest_left_s
+            and oldest_s <= first_s
+            and times[-1] <= frame_s + _ROUNDING_S
+            and all(map(lt, times, times[1:]))
+            and None not in right
+            and None not in left
+            # No less than each rate; not true of what is not a number.
+            and hypot(*right) <= largest >= hypot(*left)
+        ):
+            self._right.use(times, oldest_s)
+            self._left.use(times, oldest_s)
+            return (times, right), (times, left)
+        return self._judged_wheels(frame_s, encoders)
+
+    def _judged_wheels(self, frame_s: float, encoders: Sequence[WheelSample]) -> tuple[WheelReadings, WheelReadings]:
+        """Each sample judged by itself."""
+        right: tuple[list[float], list[float]] = [], []
+        left: tuple[list[float], list[float]] = [], []
+        largest = self.largest_rate_rad_s
+        for sample_s, right_rad_s, left_rad_s in encoders:
+            if not (isfinite(sample_s) and hypot(right_rad_s or 0.0, left_rad_s or 0.0) < _READABLE):
+                self._counts["nonfinite"] += 1
+                continue
+            for source, rate, (times, rates) in ((self._right, right_rad_s, right), (self._left, left_rad_s, left)):
+                if rate is None:
+                    continue
+                if not -largest <= rate <= largest:
+                    self._counts["too_fast"] += 1
+                elif self._is_usable(source, sample_s, frame_s):
+                    times.append(sample_s)
+                    rates.append(rate)
+        return right, left
+
+    def imu(self, frame_s: float, samples: Sequence[ImuSample]) -> Sequence[ImuSample]:
+        """The usable IMU samples."""
+        kept: list[ImuSample] = []
+        for sample in samples:
+            sample_s, ax, wz = sample
+            if not (isfinite(sample_s) and hypot(ax, wz) < _READABLE):
+                self._counts["nonfinite"] += 1
+            elif self._is_usable(self._imu, sample_s, frame_s):
+                kept.append(sample)
+        return kept
+
+    def _is_usable(self, source: SampleSource, sample_s: float, frame_s: float) -> bool:
+        oldest_s = frame_s - self._history_s
+        if sample_s > frame_s + _ROUNDING_S:
+            reason = "ahead"
+        elif sample_s < oldest_s:
+            reason = "late"
+        elif sample_s > source.newest_s:
+            source.use((sample_s,), oldest_s)
+            return True
+        elif any(sample_s in times_s for times_s in source.used):
+            reason = "duplicate"
+        else:
+            reason = "backward"
+            source.backward_run += 1
+        self._counts[reason] += 1
+        if source.backward_run >= BACKWARD_LIMIT:
+            self.backward_source = source.name
+        return False
+
+
+class LocalizerBase(ABC):
     """Admits frames in order of time, and asks to hold when time or the filter go wrong.
 
-    ``hold_cause`` stays until ``clear_hold``; ``is_frozen``: the filter has diverged, and the pose stands still until
-    the next fix; ``notices`` for the operator are removed by their reader. Samples older than ``history_s`` are
-    refused.
+    ``t_s``: robot time to which the pose belongs, that of the last frame used; -inf before the first. ``hold_cause``
+    stays until ``clear_hold``; ``is_frozen``: the filter has diverged, and the pose stands still until the next fix;
+    ``notices`` for the operator are removed by their reader. Samples older than ``history_s`` are refused.
     """
 
     def __init__(self, history_s: float) -> None:
+        self.t_s = -inf
         self.counts: dict[str, int] = Counter()
         self.hold_cause = ""
         self.is_frozen = False
         self.notices: list[str] = []
-        self._clock = FrameTimeCheck()
+        self._stale_run = 0
+        self._suspect_s: float | None = None
         self._intake = SampleValidator(history_s, self.counts)
         self._guard: tuple[ImuGate, WheelMeans] | None = None
 
@@ -37,11 +155,6 @@ class LocalizerBase(ABC, Generic[Taken]):
         """From now on leave out inertial samples that the gate does not believe, and wheels faster than any is."""
         self._guard = gate, means
         self._intake.largest_rate_rad_s = largest_rate_rad_s
-
-    @property
-    def t_s(self) -> float:
-        """Robot time to which the pose belongs: that of the last frame used; -inf before the first."""
-        return self._clock.t_s
 
     @property
     def hold_requested(self) -> bool:
@@ -66,17 +179,17 @@ class LocalizerBase(ABC, Generic[Taken]):
         a frame that is not newer than the last one changes nothing. ``gravity``: its direction in the robot frame,
         where it was read.
         """
-        last_s, kind = self._clock.t_s, self._clock.admit(t_s)
-        dt_s = t_s - last_s if kind is FrameKind.NEXT else 0.0
-        if kind is FrameKind.RESYNC:
+        last_s = self.t_s
+        dt_s = t_s - last_s
+        is_next = 0.0 < dt_s <= MAX_FRAME_STEP_S
+        if not (is_next or self._is_new_time_base(t_s)):
+            return
+        self.t_s, self._stale_run, self._suspect_s = t_s, 0, None
+        if not is_next:
+            dt_s = 0.0
             if self._guard is not None:
                 self._guard[0].reset()
             self._resync(t_s, last_s)
-        elif kind is not FrameKind.NEXT:
-            self.counts[f"{kind.value}_frames"] += 1
-            if self._clock.stale_run >= BACKWARD_LIMIT:
-                self._request_hold("time stamps of the frames run backward")
-            return
         if self._guard is not None:
             gate, means = self._guard
             means.take(encoders, dt_s)
@@ -84,16 +197,33 @@ class LocalizerBase(ABC, Generic[Taken]):
             if len(believed) != len(imu):
                 self.counts["imu_doubted"] += len(imu)
             imu = believed
-        taken = self._take(t_s, imu, encoders)
-        if self._intake.backward_source:
-            self._request_hold(f"time stamps of the {self._intake.backward_source} run backward")
-            self._intake.backward_source = ""
-        if self.is_frozen:
-            return
+        intake = self._intake
+        imu, (right, left) = intake.imu(t_s, imu), intake.wheels(t_s, encoders)
+        if intake.backward_source:
+            self._request_hold(f"time stamps of the {intake.backward_source} run backward")
+            intake.backward_source = ""
         try:
-            self._use(t_s, dt_s, taken, edges, gravity)
+            self._use(t_s, dt_s, imu, right, left, edges, gravity)
         except FilterDiverged as error:
             self._freeze(error)
+
+    def _is_new_time_base(self, t_s: float) -> bool:
+        """Whether a frame that does not continue the last one is used all the same; if not, it is counted.
+
+        A single frame from elsewhere (replayed, corrupted) changes nothing; the second one in a row that continues it
+        shows that the robot's clock itself has jumped.
+        """
+        if not isfinite(t_s) or -MAX_FRAME_STEP_S <= t_s - self.t_s <= 0.0:
+            self._stale_run += 1
+            self.counts["stale_frames"] += 1
+        else:
+            suspect_s, self._suspect_s = self._suspect_s, t_s
+            if self.t_s == -inf or (suspect_s is not None and 0.0 < t_s - suspect_s <= MAX_FRAME_STEP_S):
+                return True
+            self.counts["suspect_frames"] += 1
+        if self._stale_run >= BACKWARD_LIMIT:
+            self._request_hold("time stamps of the frames run backward")
+        return False
 
     def _freeze(self, error: FilterDiverged) -> None:
         self.is_frozen = True
@@ -108,41 +238,17 @@ class LocalizerBase(ABC, Generic[Taken]):
         """Go on in a new time base that begins at ``t_s``; ``last_s`` is the end of the old one, -inf at the start."""
 
     @abstractmethod
-    def _take(self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]) -> Taken: ...
-
-    @abstractmethod
     def _use(
-        self, t_s: float, dt_s: float, taken: Taken, edges: Sequence[EdgeSample], gravity: GravitySample | None
+        self,
+        t_s: float,
+        dt_s: float,
+        imu: Sequence[ImuSample],
+        right: WheelReadings,
+        left: WheelReadings,
+        edges: Sequence[EdgeSample],
+        gravity: GravitySample | None,
     ) -> None:
-        """Bring the filter to ``t_s``, ``dt_s`` after the last frame (0 in a new time base). May diverge."""
+        """Bring the filter to ``t_s``, ``dt_s`` after the last frame (0 in a new time base). May diverge.
 
-
-_NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up
-
-
-class PanelFrame:
-    """The panel under the robot, and poses in its frame."""
-
-    def __init__(self, mirror: Mirror, panel: PanelId) -> None:
-        self._mirror = mirror
-        self.at = mirror.panel(panel)
-
-    def hand_over(self, x: float, y: float) -> None:
-        """The robot is at this deck point."""
-        at = self.at
-        if abs(x - at.x_m) > _NEAR_BORDER * at.half_x_m or abs(y - at.y_m) > _NEAR_BORDER * at.half_y_m:
-            panel = self._mirror.panel_at(x, y)
-            if panel is not None:
-                self.at = self._mirror.panel(panel)
-
-    def pose(self, deck: tuple[float, float, float], height_m: float, slope: Slope) -> PanelPose:
-        """A deck pose (x, y, heading) on a surface of this height and slope, as ``Mirror.panel_pose``."""
-        x, y, psi = deck
-        fx, fy = slope[0], slope[1]
-        s2 = 1.0 + fx * fx
-        s, norm = sqrt(s2), sqrt(s2 + fy * fy)
-        c, d = cos(psi), sin(psi)
-        hx, hy = c / s - d * fx * fy / (norm * s), d * s / norm
-        along, across, _ = self.at.rotate_from_deck((hx, hy, fx * hx + fy * hy))
-        panel_x, panel_y, _ = self.at.from_deck((x, y, height_m))
-        return PanelPose(self.at.id, panel_x, panel_y, atan2(across, along))
+        A frozen filter stays as it is.
+        """

@@ -206,7 +206,7 @@ class Preintegrator:
         self._last = (imu[-1][1], imu[-1][2]) if imu else None
         self._before = None
 
-    def add(self, dt_s: float, *, is_turning: bool, imu: Sequence[ImuSample]) -> None:
+    def add(self, dt_s: float, imu: Sequence[ImuSample], *, is_turning: bool) -> None:
         """Take a frame of length ``dt_s``; of the inertial unit its last sample."""
         self.dt_s += dt_s
         if is_turning:
@@ -286,7 +286,12 @@ class WheelAngle:
             return 0.0
         if self._t_s == -inf:
             self._t_s, self._rate = times_s[0], rates_rad_s[0]
-        is_counter = self.is_counter or self._is_counting(rates_rad_s)
+        is_counter = self.is_counter
+        if not is_counter:
+            if 0.0 in rates_rad_s:
+                is_counter = self._is_counting(rates_rad_s)
+            else:
+                self._zeros = 0
         elapsed_s = times_s[-1] - self._t_s
         if self._seen >= _ENOUGH and elapsed_s < (len(times_s) + _EVEN) * self._period_s:
             # None is missing, and the periods are as even as the clock: their sum says it all.

@@ -15,16 +15,14 @@ from ccatp.core import (
     ImuSample,
     PanelId,
     PanelPose,
-    WheelSample,
     difference,
     rotate,
     wrap_pi,
 )
 from ccatp.estimation.fixes import PositionSigma, check_fix, foot_of_fix
-from ccatp.estimation.localizer_base import LocalizerBase
+from ccatp.estimation.localizer_base import MAX_FRAME_STEP_S, LocalizerBase, WheelReadings
 from ccatp.estimation.measurements import OMEGA, STATES, THETA, ConstantAcceleration, MeasurementBuilder, Stack, V
 from ccatp.estimation.odometry import Odometer, arc_step
-from ccatp.estimation.sample_validation import MAX_FRAME_STEP_S
 from ccatp.estimation.seams import CrossingDetector, HeadingFix, HeadingGate, SensorTransition
 from ccatp.filters.base import Filter, FilterDiverged, Innovation
 from ccatp.mirror.mirror import Mirror
@@ -34,7 +32,7 @@ _IMPOSSIBLE = 2.0  # an estimate of this many times the wheels' largest rate is 
 _SELECT_HEADING = np.eye(STATES)[THETA : THETA + 1]
 
 
-class FourStateLocalizer(LocalizerBase[Stack]):
+class FourStateLocalizer(LocalizerBase):
     """Estimates the pose (x, y, theta)_p (thesis 2.1, fig. 2.5).
 
     Each frame: the filter predicts over the time since the last frame and is updated with every usable sample at its
@@ -110,18 +108,19 @@ class FourStateLocalizer(LocalizerBase[Stack]):
         """Estimated drift per metre of travel: none in this model."""
         return 0.0, 0.0
 
-    def _take(self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]) -> Stack:
-        return self._builder.stack(t_s, self._intake.imu(t_s, imu), *self._intake.wheels(t_s, encoders))
-
     def _use(
         self,
         t_s: float,
         dt_s: float,
-        taken: Stack,
+        imu: Sequence[ImuSample],
+        right: WheelReadings,
+        left: WheelReadings,
         edges: Sequence[EdgeSample],
         gravity: GravitySample | None,  # the thesis does without
     ) -> None:
-        self._advance(t_s, dt_s, taken)
+        if self.is_frozen:
+            return
+        self._advance(t_s, dt_s, self._builder.stack(t_s, imu, right, left))
         transitions = self._crossings.scan(t_s, self.speed_m_s, self.rate_rad_s, edges)
         if transitions:
             self._use_crossings(transitions)
@@ -155,7 +154,7 @@ class FourStateLocalizer(LocalizerBase[Stack]):
         Position and fix are weighted by their variances. Raises ``FixRefused``: not finite, too old, from the future,
         or far from the mirror; the pose is unchanged.
         """
-        check_fix(fix, self._odometer.oldest_s, self._clock.t_s + MAX_FRAME_STEP_S)
+        check_fix(fix, self._odometer.oldest_s, self.t_s + MAX_FRAME_STEP_S)
         foot = foot_of_fix(self._mirror, fix, self._puck_height_m, self._panel)
         self.fix_deviation_m = foot.deviation_m
         then, here = self._odometer.at(fix.t_s), self._odometer.place

@@ -10,7 +10,7 @@ import pytest
 from ccatp.core import DeckPose, Fix, FloatArray, GravitySample, PanelId, PanelPose
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.estimation.full_state import FullStateLocalizer
-from ccatp.estimation.sample_validation import MAX_FRAME_STEP_S
+from ccatp.estimation.localizer_base import MAX_FRAME_STEP_S
 from ccatp.estimation.state_model import BG, PSI, SL, SR, STATES, TX, A, V, W, X, Y
 from ccatp.filters import FILTERS, Filter, FilterDiverged
 from tests.unit.estimation.drive import (

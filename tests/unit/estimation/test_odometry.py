@@ -101,7 +101,7 @@ def test_a_frame_of_no_length_leaves_the_speeds() -> None:
 def fill(builder: Preintegrator, times: list[float], rate: float = 1.0, jerk: float = 1.0) -> PreintegratedMotion:
     """Frames of 10 ms that end at ``times``; the angular rate is ``rate t^1``, the acceleration ``jerk t``."""
     for t in times:
-        builder.add(0.01, is_turning=True, imu=[ImuSample(t - 0.005, 9.0, 9.0), ImuSample(t, jerk * t, rate * t)])
+        builder.add(0.01, [ImuSample(t - 0.005, 9.0, 9.0), ImuSample(t, jerk * t, rate * t)], is_turning=True)
     return builder.take()
 
 
@@ -122,7 +122,7 @@ def test_the_first_sample_begins_a_trapezoid_and_a_gap_ends_it() -> None:
     builder = Preintegrator()
     assert fill(builder, [0.01]).samples == 0
     assert fill(builder, [0.02]).rate_rad_s == pytest.approx(0.015, abs=1e-15)
-    builder.add(0.01, is_turning=True, imu=[])
+    builder.add(0.01, [], is_turning=True)
     block = fill(builder, [0.04, 0.05])
     assert block.samples == 1
     assert block.rate_rad_s == pytest.approx(0.045, abs=1e-15)
@@ -138,7 +138,7 @@ def test_nothing_reaches_across_a_restart_or_a_rest() -> None:
         assert block.rate_rad_s == pytest.approx(5.015, abs=1e-12)
         assert block.acceleration_m_s2 == block.rate_rad_s  # none of before is averaged in
     builder = Preintegrator()
-    builder.add(0.01, is_turning=True, imu=[])
+    builder.add(0.01, [], is_turning=True)
     builder.restart()
     assert builder.take().dt_s == 0.0
 

@@ -8,8 +8,8 @@ import pytest
 
 from ccatp.config.models import FullStateConfig
 from ccatp.core import DeckPose, GravitySample, ImuSample, PanelPose, WheelSample, difference, wrap_pi
+from ccatp.estimation.localizer_base import SampleValidator
 from ccatp.estimation.measurements import NoiseFloor, ZeroVelocityDetector, heading_from_gravity
-from ccatp.estimation.sample_validation import SampleValidator
 from ccatp.estimation.state_model import BA, BG, PSI, Terrain, W
 from ccatp.mirror.mirror import Mirror
 from tests.unit.estimation.drive import FRAME_S, STEEP, Errors, Frame, Robot, build, run, trapeze
@@ -59,7 +59,7 @@ def test_wheel_samples_are_judged_one_by_one(
     found = intake()
     found.largest_rate_rad_s = 7.0
     (right_times, right_rates), (left_times, left_rates) = found.wheels(1.01, samples)
-    assert (right_times, left_times) == (right, left)
+    assert (list(right_times), list(left_times)) == (right, left)
     assert (len(right_rates), len(left_rates)) == (len(right), len(left))
     assert counts(found) == refused
 
@@ -102,7 +102,7 @@ def test_unusable_samples_of_the_inertial_unit(reason: str) -> None:
 def test_a_jump_of_the_clock_forgets_all_times() -> None:
     found = intake()
     found.restart()
-    assert found.wheels(0.01, [WheelSample(0.005, 1.0, 2.0)]) == (([0.005], [1.0]), ([0.005], [2.0]))
+    assert found.wheels(0.01, [WheelSample(0.005, 1.0, 2.0)]) == (((0.005,), (1.0,)), ((0.005,), (2.0,)))
 
 
 WINDOW = 15  # samples in a mean of the noise floor

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccatp.core import DeckPose, FloatArray, PanelId, difference
-from ccatp.estimation.localizer_base import PanelFrame
+from ccatp.estimation.full_state import PanelFrame
 from ccatp.estimation.seams import axes_on
 from ccatp.estimation.state_model import (
     BA,
