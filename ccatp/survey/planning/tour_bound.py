@@ -57,19 +57,14 @@ def tour_bound(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig, 
     """
     if not points:
         return 0.0
-    legs_s, headings = _legs(mirror, points, limits)
-    choices = _choices(legs_s, headings, mirror.base_pose.heading_rad, limits)
+    choices = _choices(mirror, points, limits)
     return _priced(choices) + len(points) * measuring_time_s
 
 
-def _legs(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig) -> tuple[FloatArray, FloatArray]:
-    """Times of all legs, s, and the headings at their first places, rad; base is place 0, both of shape (n, n)."""
-    base = mirror.base_pose
-    xy = np.array([(base.x_m, base.y_m), *(mirror.point_on_deck(point) for point in points)])
-    surface = np.array([mirror.surface_point(x, y) for x, y in xy.tolist()])
-    lengths_m = np.linalg.norm(surface[:, None] - surface, axis=2)
-    headings = np.stack([_headings(mirror, x, y, xy) for x, y in xy.tolist()])
-    return _bang_bang_times(lengths_m, limits.v_max_m_s, limits.a_max_m_s2), headings
+def _leg_times(surface: FloatArray, place: int, limits: LimitsConfig) -> FloatArray:
+    """Times of the legs from a place to all, s; ``surface``: all places, m, shape (n, 3)."""
+    lengths_m = np.linalg.norm(surface[place] - surface, axis=1)
+    return _bang_bang_times(lengths_m, limits.v_max_m_s, limits.a_max_m_s2)
 
 
 def _headings(mirror: Mirror, x: float, y: float, xy: FloatArray) -> FloatArray:
@@ -93,39 +88,49 @@ def _turn_times(angles_rad: FloatArray, limits: LimitsConfig) -> FloatArray:
     return np.where(least <= STRAIGHT_RAD, 0.0, times)
 
 
-def _choices(legs_s: FloatArray, headings: FloatArray, base_heading_rad: float, limits: LimitsConfig) -> _Choices:
-    is_near = _near(legs_s)
-    parts = [_of_base(legs_s[0], _turn_times(headings[0] - base_heading_rad, limits), is_near[0])]
-    for k in range(1, len(legs_s)):
-        near = np.flatnonzero(is_near[k])
-        # A leg of no length has no direction.
-        angles = np.where(legs_s[k, near] > 0.0, headings[k, near], np.nan)
-        turns_s = np.nan_to_num(_turn_times(angles[:, None] - angles, limits), nan=0.0)
-        parts.append(_of_point(k, near, legs_s[k, near] / 2.0, turns_s, _least_far(legs_s[k], is_near[k], k) / 2.0))
+def _choices(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig) -> _Choices:
+    """Place by place, because a table of all legs would take gigabytes for thousands of points; base is place 0."""
+    base = mirror.base_pose
+    xy = np.array([(base.x_m, base.y_m), *(mirror.point_on_deck(point) for point in points)])
+    surface = np.array([mirror.surface_point(x, y) for x, y in xy.tolist()])
+    parts = []
+    for k, near in enumerate(_near(surface, limits)):
+        legs_s = _leg_times(surface, k, limits)
+        near_s, far_s = legs_s[near], _least_far(legs_s, near, k)
+        headings = _headings(mirror, *xy[k].tolist(), xy[near])
+        if k == 0:
+            turns_s = np.where(near_s > 0.0, _turn_times(headings - base.heading_rad, limits), 0.0)
+            parts.append(_of_base(near, near_s / 2.0 + turns_s, far_s[0] / 2.0))
+        else:
+            # A leg of no length has no direction.
+            angles = np.where(near_s > 0.0, headings, np.nan)
+            turns_s = np.nan_to_num(_turn_times(angles[:, None] - angles, limits), nan=0.0)
+            parts.append(_of_point(k, near, near_s / 2.0, turns_s, far_s / 2.0))
     place, near_places, is_end, cost_s = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     possible = np.isfinite(cost_s)
     return _Choices(place[possible], near_places[possible], is_end[possible], cost_s[possible])
 
 
-def _near(legs_s: FloatArray) -> NDArray[np.bool_]:
-    """Whether one of two places is among the nearest of the other, shape (n, n)."""
-    count = min(_NEAR, len(legs_s) - 1)
-    others = legs_s + np.diag(np.full(len(legs_s), np.inf))
-    near = np.zeros(legs_s.shape, dtype=np.bool_)
-    np.put_along_axis(near, np.argsort(others, axis=1, kind="stable")[:, :count], True, axis=1)
-    return near | near.T
+def _near(surface: FloatArray, limits: LimitsConfig) -> list[IntArray]:
+    """For each place those that are among its nearest, or it among theirs, ascending."""
+    near: list[set[int]] = [set() for _ in surface]
+    for k in range(len(surface)):
+        legs_s = _leg_times(surface, k, limits)
+        legs_s[k] = np.inf
+        for other in np.argsort(legs_s, kind="stable")[: min(_NEAR, len(surface) - 1)].tolist():
+            near[k].add(other)
+            near[other].add(k)
+    return [np.array(sorted(others), dtype=np.int64) for others in near]
 
 
-def _least_far(legs_s: FloatArray, is_near: NDArray[np.bool_], own: int) -> FloatArray:
+def _least_far(legs_s: FloatArray, near: IntArray, own: int) -> FloatArray:
     """The two shortest legs that are not near; infinite where there is none, s."""
-    is_far = ~is_near
-    is_far[own] = False
-    return np.sort(np.r_[legs_s[is_far], np.inf, np.inf])[:2]
+    far_s = np.delete(legs_s, np.r_[near, own])
+    return np.partition(np.r_[far_s, np.inf, np.inf], 1)[:2]
 
 
-def _of_base(legs_s: FloatArray, turns_s: FloatArray, is_near: NDArray[np.bool_]) -> _Choices:
-    near = np.flatnonzero(is_near)
-    costs = np.r_[(legs_s / 2.0 + np.where(legs_s > 0.0, turns_s, 0.0))[near], _least_far(legs_s, is_near, 0)[0] / 2.0]
+def _of_base(near: IntArray, near_s: FloatArray, far_s: float) -> _Choices:
+    costs = np.r_[near_s, far_s]
     joined = np.full((len(costs), 2), _NONE)
     joined[:-1, 0] = near
     return _Choices(np.zeros(len(costs), dtype=np.int64), joined, np.zeros(len(costs), dtype=np.bool_), costs)
