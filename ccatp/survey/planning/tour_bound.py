@@ -94,10 +94,10 @@ def _choices(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig) ->
     xy = np.array([(base.x_m, base.y_m), *(mirror.point_on_deck(point) for point in points)])
     surface = np.array([mirror.surface_point(x, y) for x, y in xy.tolist()])
     parts = []
-    for k, near in enumerate(_near(surface, limits)):
+    for k, ((x, y), near) in enumerate(zip(xy.tolist(), _near(surface, limits), strict=True)):
         legs_s = _leg_times(surface, k, limits)
         near_s, far_s = legs_s[near], _least_far(legs_s, near, k)
-        headings = _headings(mirror, *xy[k].tolist(), xy[near])
+        headings = _headings(mirror, x, y, xy[near])
         if k == 0:
             turns_s = np.where(near_s > 0.0, _turn_times(headings - base.heading_rad, limits), 0.0)
             parts.append(_of_base(near, near_s / 2.0 + turns_s, far_s[0] / 2.0))
