@@ -23,6 +23,7 @@ from ccatp.links.topics import MissionStatus
 from ccatp.mirror.mirror import build_mirror
 from ccatp.survey.composition import assemble, make_plan, plan_lines
 from ccatp.survey.planning.search import leg_lengths
+from tests.support.command import answered, refused
 from tests.unit.serving import serving
 
 
@@ -92,10 +93,8 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
 NAMES = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
 
 
-def planned(capsys: pytest.CaptureFixture[str], *args: str, status: int = 0) -> dict[str, Any]:
-    assert main(["plan", "--json", *args]) == status
-    result: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return result
+def planned(capsys: pytest.CaptureFixture[str], *args: str, status: int = 0) -> Any:
+    return answered(capsys, "plan", *args, status=status)
 
 
 def test_every_shipped_world_is_named_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
@@ -212,11 +211,7 @@ def test_what_cannot_be_is_refused_in_one_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
-    assert main(["plan", *args]) == 2
-    out, err = capsys.readouterr()
-    assert len(err.splitlines()) == 1
-    assert message in err
-    assert out == ""
+    assert message in refused(capsys, "plan", *args)
 
 
 NO_STATUS = MissionStatus(seq=-1, t_s=0.0, state="")

@@ -1,7 +1,6 @@
 """The command ``ccatp align``: on surveys in process on all mirrors, its JSON, its files, its refusals."""
 
 import csv
-import json
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from ccatp.localizer import Localizer
 from ccatp.mirror.misalignment import PanelMisalignment
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.studies.sil_run import SilLaser, SilRun, StopRow
+from tests.support.command import answered
 from tests.unit.aligning.conftest import NAMES, exact_fix, load, misaligned, survey
 from tests.unit.run_folder import make_run
 
@@ -45,10 +45,8 @@ def surveyed(run_dir: Path, cfg: Config) -> Path:
     return make_run(run_dir, cfg, run.parts.points, desk.kept, run.robot.world.misalignments)
 
 
-def aligned(capsys: pytest.CaptureFixture[str], run_dir: Path, *args: str) -> dict[str, Any]:
-    assert main(["align", str(run_dir), "--json", *args]) == 0
-    result: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return result
+def aligned(capsys: pytest.CaptureFixture[str], run_dir: Path, *args: str) -> Any:
+    return answered(capsys, "align", run_dir, *args)
 
 
 @pytest.fixture

@@ -157,9 +157,11 @@ def test_several_faults_are_all_listed_and_the_first_one_told(tmp_path: Path) ->
         ("", None, "is a directory; name a TOML file"),
         ("latin.toml", '[run]\nmirror = "Mirör"'.encode("latin-1"), r"is not UTF-8 text \(byte 19\)"),
         ("mine.toml", b"[run]\nseed =", r"mine.toml:2: is not TOML: "),
+        ("mine.toml", b'[run]\nmirror = "bad.toml"\n', r"mine.toml:2: run.mirror.*is not TOML"),
     ],
 )
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, name: str, content: bytes | None, what: str) -> None:
+    (tmp_path / "bad.toml").write_text("no toml")
     if content is not None:
         (tmp_path / name).write_bytes(content)
     with pytest.raises(ConfigError, match=what):

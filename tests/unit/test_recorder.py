@@ -1,12 +1,8 @@
 """Recordings: readable by the format's own reader, cut off anywhere, repaired, never in the mission's way."""
 
-import contextlib
 import json
 import os
 import random
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -89,6 +85,7 @@ def test_a_file_cut_off_anywhere_gives_what_was_whole(path: Path) -> None:
         assert found == everything[: len(found)]
         assert len(damage) == 1
         assert "damaged or cut off before byte" in damage[0]
+        assert damage[0] == damage[0].rstrip(" :")
         read_metadata(path)
         counts.append(len(found))
     assert counts == sorted(counts)
@@ -330,54 +327,6 @@ def test_commands(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert json.loads(capsys.readouterr().out)["was_complete"] is False
     assert main(["recording", "repair", str(recorded)]) == 2
     assert "exists already" in capsys.readouterr().err
-
-
-# Writes like a run, 200 messages a second with pauses, and notes outside the recording what it has written and when.
-WRITER = """
-import os, sys, time, random
-from pathlib import Path
-from ccatp.records.recorder import Recorder
-recorder = Recorder(Path(sys.argv[1]), [("track", {})], is_simulation=True)
-notes = os.open(sys.argv[2], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-rng, n = random.Random(int(sys.argv[3])), 0
-print("ready", flush=True)
-while True:
-    for _ in range(rng.choice((0, 1, 1, 1, 3, 20))):
-        recorder.write("track", time.monotonic(), b'{"n":%d,"x":"%s"}' % (n, rng.randbytes(60).hex().encode()))
-        os.write(notes, b"%d %.4f\\n" % (n, time.monotonic()))
-        n += 1
-    recorder.flush_if_due()
-    os.write(notes, b"tend %.4f\\n" % time.monotonic())
-    time.sleep(0.01)
-"""
-
-CHILDREN = 6
-
-
-def test_killed_at_random_moments_all_but_the_last_second_is_there(tmp_path: Path) -> None:
-    rng = random.Random(11)
-    with contextlib.ExitStack() as stack:
-        children = []
-        for k in range(CHILDREN):
-            command = [sys.executable, "-c", WRITER, str(tmp_path / f"{k}.mcap"), str(tmp_path / f"{k}.txt"), str(k)]
-            children.append(stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE)))
-        for child in children:
-            assert child.stdout is not None
-            assert child.stdout.readline() == b"ready\n"
-        moments = sorted(rng.uniform(0.2, 2.0) for _ in children)
-        start = time.monotonic()
-        for child, moment in zip(children, moments, strict=True):
-            time.sleep(max(0.0, start + moment - time.monotonic()))
-            child.kill()
-    for k in range(CHILDREN):
-        notes = [line.split() for line in (tmp_path / f"{k}.txt").read_text().splitlines()]
-        end_s = float(notes[-1][1])
-        owed = [int(n) for n, t_s in notes if n != "tend" and float(t_s) < end_s - 1.0]
-        saved = recover(tmp_path / f"{k}.mcap", tmp_path / f"{k}.saved.mcap")
-        found = numbers(saved.path)
-        assert found == list(range(len(found)))
-        assert found[: len(owed)] == owed
-        assert strict_faults(saved.path) == []
 
 
 def test_nothing_waits_longer_than_a_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
