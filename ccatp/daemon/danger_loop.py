@@ -256,7 +256,7 @@ def main() -> int:
         await DangerLoop(args, context).run(stop)
         return 0 if stop.is_set() else int(ExitStatus.HELD)
 
-    return run_process("danger", serve, is_spinning=not args.is_realtime)
+    return run_process("danger", serve)
 
 
 if __name__ == "__main__":

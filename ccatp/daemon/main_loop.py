@@ -12,7 +12,6 @@ import zmq
 
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import Verdict
-from ccatp.daemon import realtime
 from ccatp.daemon.mission_runner import STILL, DriveCommand, MissionClock, MissionRunner, TimedFrame
 from ccatp.daemon.process import ProcessArgs, run_process, start_process
 from ccatp.daemon.robot_loop import WAIT_PERIOD_S, RobotLoop
@@ -335,11 +334,10 @@ def main() -> int:
     async def serve(context: zmq.Context[zmq.Socket[bytes]], stop: asyncio.Event) -> int:
         with open_runner(args) as make_runner:
             loop = MainLoop(args, context, make_runner)
-            realtime.take_core(args.free_core)  # the threads of ZeroMQ and the store have started elsewhere
             await loop.run(stop)
         return int(loop.exit_status)
 
-    return run_process("main", serve, is_spinning=not args.is_realtime)
+    return run_process("main", serve)
 
 
 if __name__ == "__main__":

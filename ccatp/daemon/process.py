@@ -13,7 +13,7 @@ import socket
 import sys
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO, cast
 
@@ -23,7 +23,6 @@ import zmq
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import is_radio_file, load_config, load_radio_config
 from ccatp.config.models import Config, ProcessesConfig
-from ccatp.daemon import realtime
 from ccatp.errors import CcatpError
 
 PR_SET_PDEATHSIG = 1
@@ -79,7 +78,6 @@ class ProcessArgs:
         has_faults: a fault plan is in the run directory; simulators only.
         is_restarted: takes the place of a process of this run that died.
         is_sim: robot and laser system are simulated.
-        free_core: the core that all processes but the main loop leave, or ``None``.
     """
 
     config: Config | RadioConfig
@@ -92,7 +90,6 @@ class ProcessArgs:
     is_restarted: bool = False
     is_held: bool = False
     is_sim: bool = False
-    free_core: int | None = None
 
     @property
     def is_taking_over(self) -> bool:
@@ -114,8 +111,7 @@ def read_config(path: Path | None, settings: Mapping[str, object] | None = None)
 def start_process(argv: list[str] | None = None) -> ProcessArgs:
     """Arguments of this process, which ends with the supervisor; its sockets can be used by its own user only."""
     die_with_parent()
-    args = parse_args(argv)
-    return args if args.is_realtime else replace(args, free_core=realtime.leave_a_core(os.getppid()))
+    return parse_args(argv)
 
 
 def parse_args(argv: list[str] | None = None) -> ProcessArgs:
@@ -221,7 +217,7 @@ def listen_at(host: str, port: int) -> socket.socket:
         raise
 
 
-def run_until_stopped(serve: Callable[[asyncio.Event], Coroutine[Any, Any, int]], *, is_spinning: bool = False) -> int:
+def run_until_stopped(serve: Callable[[asyncio.Event], Coroutine[Any, Any, int]]) -> int:
     """Run ``serve(stop)`` in an event loop to its end; ``stop`` is set by SIGTERM and SIGINT."""
 
     async def run() -> int:
@@ -230,14 +226,10 @@ def run_until_stopped(serve: Callable[[asyncio.Event], Coroutine[Any, Any, int]]
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
         return await serve(stop)
 
-    factory = (lambda: asyncio.SelectorEventLoop(realtime.SpinningSelector())) if is_spinning else None
-    with asyncio.Runner(loop_factory=factory) as runner:
-        return runner.run(run())
+    return asyncio.run(run())
 
 
-def run_process(
-    name: str, serve: Callable[["zmq.Context[zmq.Socket[bytes]]", asyncio.Event], Awaitable[int]], *, is_spinning: bool
-) -> int:
+def run_process(name: str, serve: Callable[["zmq.Context[zmq.Socket[bytes]]", asyncio.Event], Awaitable[int]]) -> int:
     """The same with a context of ZeroMQ, which is closed at the end.
 
     Expected errors are printed. Returns the exit status, or the highest one of the errors.
@@ -256,7 +248,7 @@ def run_process(
             context.destroy(linger=0)
         return status
 
-    return run_until_stopped(run, is_spinning=is_spinning)
+    return run_until_stopped(run)
 
 
 def _leaves(group: BaseExceptionGroup[CcatpError]) -> list[CcatpError]:

@@ -1,19 +1,13 @@
-"""Real-time scheduling and locked memory, and the busy-polling event loop of lockstep.
+"""Real-time scheduling and locked memory.
 
 The bounds on reaction times hold under load only with real-time scheduling: a loop that shares its core waits for its
 turn, and a page that was swapped out waits for the disk. It is for robots in real time.
-
-In lockstep a peer answers within microseconds and a frame passes five sockets between processes. Waking a sleeping
-process costs some 30 microseconds, and two processes that take turns on one core run at half speed: so the loop polls
-before it sleeps, and main has a core for itself.
 """
 
 import ctypes
 import os
 import resource
-import selectors
 import sys
-import time
 from pathlib import Path
 
 import structlog
@@ -89,42 +83,3 @@ def _lock_memory() -> str:
     if libc.mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT):
         return f"mlockall: {os.strerror(ctypes.get_errno())}"
     return ""
-
-
-# Longer than a frame takes, so that a run in progress never sleeps; a run that waits for something else soon does.
-SPIN_S = 1e-3
-
-
-class SpinningSelector(selectors.EpollSelector):
-    """Polls for ``SPIN_S`` before it blocks, and yields the core in between."""
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """As ``EpollSelector.select``."""
-        if timeout is not None and timeout <= 0.0:
-            return super().select(timeout)
-        deadline = time.perf_counter() + (SPIN_S if timeout is None else min(SPIN_S, timeout))
-        while time.perf_counter() < deadline:
-            if ready := super().select(0.0):
-                return ready
-            os.sched_yield()
-        return super().select(timeout)
-
-
-def leave_a_core(supervisor_pid: int) -> int | None:
-    """Keep this thread, and those it starts, off one core; returns that core, or ``None`` where there is only one.
-
-    The core follows from the supervisor's process number: all processes of a run leave the same one, and two runs side
-    by side usually different ones.
-    """
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    if len(cores) < 2:
-        return None
-    core = cores[supervisor_pid % len(cores)]
-    os.sched_setaffinity(0, set(cores) - {core})
-    return core
-
-
-def take_core(core: int | None) -> None:
-    """Run the calling thread on the core that the other processes left."""
-    if core is not None:
-        os.sched_setaffinity(0, {core})

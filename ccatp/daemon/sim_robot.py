@@ -57,7 +57,7 @@ def main() -> int:
         )
         return 0
 
-    return run_until_stopped(run, is_spinning=lockstep)
+    return run_until_stopped(run)
 
 
 def run_alone(

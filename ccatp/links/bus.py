@@ -1,6 +1,5 @@
 """State shared between the processes over ZeroMQ PUB and SUB: single frames of the topic table."""
 
-import os
 import time
 from collections.abc import Iterable
 
@@ -15,8 +14,6 @@ MAX_MESSAGE_BYTES = 1 << 20
 HIGH_WATER_MARK = 50_000
 # A subscriber comes up before its publisher; it should not miss the first messages for long.
 RECONNECT_MS = 10
-# Waking a sleeping thread costs more than the wait for a verdict: spin for a while, politely.
-SPIN_S = 5e-4
 
 
 class Publisher:
@@ -91,18 +88,13 @@ class Subscriber:
 
     def receive_raw(self, timeout_s: float = 0.0) -> tuple[str, bytes, Message | Verdict] | None:
         """As ``receive``, with the JSON text in the middle."""
-        deadline: float | None = None
-        spin_until = 0.0
+        deadline_s = time.monotonic() + timeout_s
         while True:
             try:
                 frame = self.socket.recv(zmq.DONTWAIT)
             except zmq.Again:
-                now = time.monotonic()
-                if deadline is None:
-                    deadline, spin_until = now + timeout_s, now + min(SPIN_S, timeout_s)
-                if now < spin_until:
-                    os.sched_yield()
-                elif now >= deadline or not self.socket.poll(max(1, int((deadline - now) * 1000))):
+                left_s = deadline_s - time.monotonic()
+                if left_s <= 0.0 or not self.socket.poll(max(1, int(left_s * 1000))):
                     return None
                 continue
             try:
