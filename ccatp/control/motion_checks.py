@@ -138,6 +138,7 @@ class ImuGate:
             if ax == self._ax or wz == self._wz or not self._is_noisy:
                 self._compare(ax, wz, yaw_rad_s)
             off, jump, largest = wz - yaw_rad_s, wz - self._wz, self._largest
+            # The first reading is not a repetition.
             self._same_ax = self._same_ax + 1 if ax == self._ax else 0
             self._same_wz = self._same_wz + 1 if wz == self._wz else 0
             self._ax, self._wz = ax, wz
@@ -145,7 +146,7 @@ class ImuGate:
                 self._blame(t_s, "the gyroscope's rate is impossible", off, limit)
             elif not -self._acceleration <= ax <= self._acceleration:
                 self._blame(t_s, "the acceleration is impossible", ax, self._acceleration)
-            elif self._is_repeating():
+            elif self._is_noisy and max(self._same_ax, self._same_wz) >= self._identical - 1:
                 repeats = max(self._same_ax, self._same_wz) + 1
                 self._blame(t_s, "the inertial unit repeats itself", repeats, self._identical)
             if -self._quarantine_s < t_s - self._bad_s < self._quarantine_s:
@@ -160,10 +161,6 @@ class ImuGate:
             self._is_noisy = self._is_noisy or self._different >= self._identical
         else:
             self._different = 0
-
-    def _is_repeating(self) -> bool:
-        # The first reading is not a repetition.
-        return self._is_noisy and max(self._same_ax, self._same_wz) >= self._identical - 1
 
     def _blame(self, t_s: float, cause: str, value: float, limit: float) -> None:
         self._bad_s = t_s

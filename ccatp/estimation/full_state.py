@@ -191,7 +191,7 @@ class FullStateLocalizer(LocalizerBase):
             self._estimate.begin_leg()
             rest.moved()
             self._predict_pose(0.0)
-        elif not is_still:
+        elif rest.still_s and not is_still:
             rest.moved()
         self._frame_s = frame_s
         block = self._block

@@ -177,13 +177,14 @@ class ZeroVelocityDetector:
     """Counts frames without wheel motion and collects the inertial unit's samples at rest.
 
     A servo that coasts to its set point passes every threshold long before it stands. Only after ``rest_after_s``
-    without motion, several of its time constants, the robot counts as resting. ``count``: samples collected.
+    without motion, several of its time constants, the robot counts as resting. ``count``: samples collected;
+    ``still_s``: time without motion.
     """
 
     def __init__(self, rest_after_s: float, gyro: NoiseFloor, accelerometer: NoiseFloor) -> None:
         self._rest_after_s = rest_after_s
         self._gyro, self._accelerometer = gyro, accelerometer
-        self._still_s = 0.0
+        self.still_s = 0.0
         self.is_resting = False
         self._clear()
 
@@ -193,13 +194,13 @@ class ZeroVelocityDetector:
 
     def moved(self) -> None:
         """The wheels turned."""
-        self._still_s, self.is_resting = 0.0, False
+        self.still_s, self.is_resting = 0.0, False
         self._clear()
 
     def stood(self, dt_s: float) -> bool:
         """The wheels stood for a frame; true when rest begins with it."""
-        self._still_s += dt_s
-        if self.is_resting or self._still_s < self._rest_after_s:
+        self.still_s += dt_s
+        if self.is_resting or self.still_s < self._rest_after_s:
             return False
         self.is_resting = True
         self._gyro.restart()

@@ -138,23 +138,28 @@ class SurveyFilter:
         Predict, then update with wheel angles, angular rate and acceleration, where they were read.
         """
         dt_s = block.dt_s
-        if dt_s > 0.0:
-            scatter = self._legs.wander(block.turning_s)
-            encoders = self.encoder_walk(right) * dt_s
-            self._do(lambda: self._predict(dt_s, scatter, encoders))
-        counts = None
+        slip, creep = self._legs.wander(block.turning_s) if dt_s > 0.0 else (0.0, 0.0)
+        encoders = self.encoder_walk(right) * dt_s
+        counts = rate = acceleration = None
         if right.is_fresh or left.is_fresh:
             gap_rad = right.take_gap() + left.take_gap()
             variance = max(right.variance_rad2(), left.variance_rad2()) + gap_rad * gap_rad
             counts = right.angle_rad, left.angle_rad, variance
-        rate = acceleration = None
         if block.rate_rad_s is not None:
             rate = block.rate_rad_s, imu_variances[0] / block.samples
         if block.acceleration_m_s2 is not None and self._full.use.accelerometer:
             # Set points jump, and the acceleration with them, anywhere between two samples.
             jump = self._full.acceleration_jump_m_s2**2
             acceleration = block.acceleration_m_s2, imu_variances[1] / block.samples + jump
-        self._do(lambda: self._sense(counts, rate, acceleration))
+
+        def step() -> None:
+            if dt_s > 0.0:
+                self._predict(dt_s, slip, creep, encoders)
+            rows = self._rows.take(counts, rate, acceleration)
+            if rows.z.size:
+                self._filter.update(rows.z, rows, rows.R)
+
+        self._do(step)
         self._enter()
 
     def _enter(self) -> None:
@@ -167,10 +172,9 @@ class SurveyFilter:
         mean = self._filter.mean
         return self._mirror.nearest_panel(float(mean[X]), float(mean[Y]))
 
-    def _predict(self, dt_s: float, scatter: tuple[float, float], encoders: float) -> None:
+    def _predict(self, dt_s: float, slip: float, creep: float, encoders: float) -> None:
         full, mean = self._full, self._filter.mean
         motion = self._motion.over(dt_s, self._terrain.at(float(mean[X]), float(mean[Y])))
-        slip, creep = scatter
         jerk, twist = full.jerk_density_m2_s5 * dt_s, full.angular_acceleration_density_rad2_s3 * dt_s
         impulses = np.array((jerk, twist, slip, slip, creep))
         drift = self._drift  # work space, of which the model keeps nothing
@@ -184,16 +188,6 @@ class SurveyFilter:
         found = wheel.noise_rad2_s2
         variance = self._cfg.encoder_sigma_rad_s**2 if found is None else found
         return variance * self._full.encoder_period_s
-
-    def _sense(
-        self,
-        counts: tuple[float, float, float] | None,
-        rate: tuple[float, float] | None,
-        acceleration: tuple[float, float] | None,
-    ) -> None:
-        rows = self._rows.take(counts, rate, acceleration)
-        if rows.z.size:
-            self._filter.update(rows.z, rows, rows.R)
 
     # -- rest and legs ------------------------------------------------------------------------------------------------
 
