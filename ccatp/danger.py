@@ -26,17 +26,31 @@ from ccatp.core import Corner, EdgeSample, EmergencyKind, EventCode, Severity, V
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror
+from ccatp.safety.conditions import (
+    ALL_OFF,
+    CENTRE_NEAR_RIM,
+    EDGE_SENSOR_STAYS_OFF,
+    EDGE_STALE,
+    EMERGENCY,
+    ENCODERS_STALE,
+    ESTIMATE_NOT_FINITE,
+    ESTIMATE_STALE,
+    LIFTED,
+    NO_EDGE_SAMPLES,
+    NO_ESTIMATE,
+    NO_FRAME,
+    MonitorFinding,
+)
 from ccatp.safety.edge_detector import EdgeDetector, EdgeMap, EdgePhase
 from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 from ccatp.safety.emergency_latch import HEARD_AFTER_FRAMES, EmergencyLatch, is_at_base_or_held
-from ccatp.safety.escalation import MonitorFinding, SeverityEscalation, denies, gravest
+from ccatp.safety.escalation import SeverityEscalation, denies, gravest
 from ccatp.safety.monitor import HealthMonitor
 from ccatp.safety.robot_clock import SteadyTime
 from ccatp.safety.sensor_monitors import FramingErrorRate
 
 CORNERS = tuple(Corner)
 CLOCK_JUMP_S = 0.1
-CENTRE = "the robot's centre is close to the rim on the map"
 EVERYWHERE = (True, True, True, True)
 _NORMAL = EventCode.NORMAL  # a member looked up on its class in every frame costs more than the verdict made of it
 
@@ -200,22 +214,15 @@ class DangerMonitor:
         return self._map.has_edge_near(self._map.place(pose, self._sensors_m[sensor]), slack_m)
 
     def _own_findings(self, missing: MonitorFinding | None) -> list[MonitorFinding]:
-        found = []
-        if missing is not None:
-            # Without its wheels it is not known where the robot went meanwhile.
-            severity = Severity.HOLD if missing.signal == "enc" else Severity.PAUSE
-            found.append(missing._replace(severity=severity))
+        found = [] if missing is None else [missing]
         if self._health is None:
             return found
         if self._edges.is_lifted:
-            limit_s = self._health.lifted_limit_s
-            cause = "all edge sensors off: lifted or fallen"
-            found.append(MonitorFinding(Severity.HOLD, cause, "edge", 4.0, 3.0, full_fans=True, patience_s=limit_s))
+            found.append(LIFTED.found("edge", 4.0, 3.0))
         for i, episode in enumerate(self._edges.episodes):
             if episode is not None and self._stays_off(i, episode):
-                cause = "an edge sensor stays off though it was moved back and the others are on"
                 limit_m = self._health.stuck_off_m
-                found.append(MonitorFinding(Severity.HOLD, cause, CORNERS[i].value, episode.retreat_m, limit_m))
+                found.append(EDGE_SENSOR_STAYS_OFF.found(CORNERS[i].value, episode.retreat_m, limit_m))
         return found
 
     def _stays_off(self, sensor: int, episode: EdgeDetector) -> bool:
@@ -253,13 +260,13 @@ class DangerMonitor:
         return Verdict(
             *(verdict.seq, verdict.t_s, verdict.code, *shown, forward, reverse, turn, verdict.off),
             severity=top.severity,
-            full_fans=any(finding.full_fans for finding in found),
+            full_fans=any(finding.condition.full_fans for finding in found),
         )
 
     def stale(self, seq: int, t_s: float) -> Verdict:
         """The verdict when no sensors frame came for ``stale_after_s`` after frame ``seq``: nothing permitted."""
         limit_s = self._stale_after_s
-        return self.latch.told(self._denied(seq, t_s, _lacking("sensors", "no sensors frame", limit_s, limit_s)))
+        return self.latch.told(self._denied(seq, t_s, NO_FRAME.found("sensors", limit_s, limit_s)))
 
     def garbled(self, seq: int, t_s: float, at_s: float) -> Verdict | None:
         """A line after frame ``seq`` was no frame. The verdict where there were too many: nothing permitted."""
@@ -280,24 +287,25 @@ class DangerMonitor:
     def _missing(self, t_s: float, estimate: EstimateMessage | None, is_known: bool) -> MonitorFinding | None:
         limit_s = self._stale_after_s
         if self._edge_t_s is None:
-            return _lacking("edge", "no edge samples", limit_s, limit_s)
+            return NO_EDGE_SAMPLES.found("edge", limit_s, limit_s)
         age_s = abs(t_s - self._edge_t_s)
         if not age_s <= limit_s:
-            return _lacking("edge", "edge samples stale", age_s, limit_s)
+            return EDGE_STALE.found("edge", age_s, limit_s)
         silent_s = self._edges.track.silence_s(t_s)
         if silent_s > 0.0:
-            return _lacking("enc", "encoder samples stale", silent_s, limit_s)
+            # Without its wheels it is not known where the robot went meanwhile.
+            return ENCODERS_STALE.found("enc", silent_s, limit_s)
         return None if is_known else self._estimate_missing(t_s, estimate)
 
     def _estimate_missing(self, t_s: float, estimate: EstimateMessage | None) -> MonitorFinding:
         # The values go out as JSON: an age that is not finite is no number there.
         limit_s = self._estimate_stale_after_s
         if estimate is None:
-            return _lacking("estimate", "no estimate", limit_s, limit_s)
+            return NO_ESTIMATE.found("estimate", limit_s, limit_s)
         age_s = abs(t_s - estimate.t_s)
         if isfinite(age_s) and age_s > limit_s:
-            return _lacking("estimate", "estimate stale", age_s, limit_s)
-        return _lacking("estimate", "estimate not finite", limit_s, limit_s)
+            return ESTIMATE_STALE.found("estimate", age_s, limit_s)
+        return ESTIMATE_NOT_FINITE.found("estimate", limit_s, limit_s)
 
     # -- arbitration ----------------------------------------------------------------------------------------------
 
@@ -306,7 +314,7 @@ class DangerMonitor:
 
     def _arbitrate(self, seq: int, t_s: float, missing: MonitorFinding | None) -> Verdict:
         if self._edges.is_lifted:
-            return _verdict(seq, t_s, EventCode.NEAR_EDGE, ("lifted or fallen", "edge", 4.0, 3.0), off=EVERYWHERE)
+            return _verdict(seq, t_s, EventCode.NEAR_EDGE, (ALL_OFF.message, "edge", 4.0, 3.0), off=EVERYWHERE)
         declared = self._declared()
         if declared is not None or self._origin.direction:
             return self._edge_verdict(seq, t_s, declared, missing)
@@ -317,7 +325,7 @@ class DangerMonitor:
             return Verdict(seq, t_s, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
         # Whoever drives while the ground shakes slips; the others are fled from.
         kind, may_move = (EmergencyKind.EARTHQUAKE, False) if self.latch.is_shaking else (newest.kind, True)
-        cause, signal = f"emergency: {kind}", f"emergency:{kind}"
+        cause, signal = EMERGENCY.message.format(kind=kind), f"emergency:{kind}"
         return Verdict(seq, t_s, EventCode.ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move)
 
     def _edge_verdict(
@@ -331,16 +339,12 @@ class DangerMonitor:
             value, limit = declared.value_m, declared.limit_m
         else:
             off, turn = (barred > 0, barred > 0, barred < 0, barred < 0), False
-            cause, signal, value, limit = CENTRE, "estimate", origin.clearance_m, origin.limit_m
+            cause, signal, value, limit = CENTRE_NEAR_RIM.message, "estimate", origin.clearance_m, origin.limit_m
         forward, reverse = barred <= 0 and not (off[0] or off[1]), barred >= 0 and not (off[2] or off[3])
         permits = (forward, reverse, turn)
         if missing is not None:
             cause, permits = f"{cause}; {missing.cause}", (False, False, False)
         return _verdict(seq, t_s, EventCode.NEAR_EDGE, (cause, signal, value, limit), permits, off)
-
-
-def _lacking(signal: str, cause: str, value: float, limit: float) -> MonitorFinding:
-    return MonitorFinding(severity=Severity.PAUSE, cause=cause, signal=signal, value=value, limit=limit)
 
 
 def _verdict(

@@ -24,6 +24,17 @@ from ccatp.core import EmergencyKind, EventCode, Severity, Verdict, wrap_pi
 from ccatp.links.beacon_messages import BeaconFrame
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
+from ccatp.safety.conditions import (
+    EMERGENCY,
+    NO_FRAME,
+    NO_FRESH_ESTIMATE,
+    OBSTACLE_AHEAD,
+    OBSTACLE_BEHIND,
+    POSITION_UNCERTAIN,
+    RADIO_SILENT,
+    TARGET_NEAR,
+    MonitorFinding,
+)
 from ccatp.safety.emergency_latch import HEARD_AFTER_FRAMES, EmergencyLatch, is_at_base_or_held
 
 
@@ -147,7 +158,7 @@ class BeaconSafetyRules:
             self._state, self._state_seq = estimate.state, estimate.seq
         hold = self._hold(sensors.t, estimate)
         if hold is not None:
-            verdict = self._held(sensors, *hold)
+            verdict = self._held(sensors, hold)
         else:
             self._held_since_s = None
             verdict = self._near(sensors)
@@ -159,8 +170,7 @@ class BeaconSafetyRules:
     def stale(self, seq: int, t_s: float) -> Verdict:
         """The verdict when no frame came for ``stale_after_s``: nothing permitted."""
         limit_s = self._danger.stale_after_s
-        denied = self._denied(seq, t_s, "no sensors frame", "sensors", limit_s, limit_s, Severity.PAUSE)
-        return self.latch.told(denied)
+        return self.latch.told(self._denied(seq, t_s, NO_FRAME.found("sensors", limit_s, limit_s)))
 
     def garbled(self, seq: int, t_s: float, _at_s: float) -> Verdict | None:
         """A line of the robot was no frame: nothing permitted until the next one."""
@@ -203,36 +213,34 @@ class BeaconSafetyRules:
         if self._rolled_to_s is None:
             self._rolled_to_s = sensors.t
 
-    def _hold(self, t_s: float, estimate: EstimateMessage | None) -> tuple[str, str, float, float] | None:
+    def _hold(self, t_s: float, estimate: EstimateMessage | None) -> MonitorFinding | None:
         danger = self._danger
         heard_s = t_s if self._heard_s is None else self._heard_s
         if t_s - heard_s > danger.radio_timeout_s:
-            return "no radio is heard", "radio", t_s - heard_s, danger.radio_timeout_s
+            return RADIO_SILENT.found("radio", t_s - heard_s, danger.radio_timeout_s)
         age_s = inf if estimate is None else t_s - estimate.t_s
         if estimate is None or not age_s <= danger.estimate_timeout_s:
             limit_s = danger.estimate_timeout_s
             is_beginning = estimate is None and t_s <= limit_s
-            return None if is_beginning else ("no fresh estimate", "estimate", min(age_s, 1e9), limit_s)
+            return None if is_beginning else NO_FRESH_ESTIMATE.found("estimate", min(age_s, 1e9), limit_s)
         limit_m = danger.position_clear_m if self._is_vague else danger.position_sigma_m
         self._is_vague = not (isfinite(estimate.sigma_m) and estimate.sigma_m <= limit_m)
         if self._is_vague:
-            return "the position is too uncertain", "position", min(estimate.sigma_m, 1e9), limit_m
+            return POSITION_UNCERTAIN.found("position", min(estimate.sigma_m, 1e9), limit_m)
         return None
 
-    def _held(self, sensors: Sensors, cause: str, signal: str, value: float, limit: float) -> Verdict:
+    def _held(self, sensors: Sensors, hold: MonitorFinding) -> Verdict:
         if self._held_since_s is None:
             self._held_since_s = sensors.t
         held_s = sensors.t - self._held_since_s
-        is_fault = held_s > self._danger.hold_limit_s
-        severity = Severity.FAULT if is_fault else Severity.HOLD
-        text = f"{cause} for {held_s:.0f} s" if is_fault else cause
-        return self._denied(sensors.seq, sensors.t, text, signal, value, limit, severity)
+        if held_s > self._danger.hold_limit_s:
+            hold = hold._replace(severity=Severity.FAULT, cause=f"{hold.cause} for {held_s:.0f} s")
+        return self._denied(sensors.seq, sensors.t, hold)
 
-    def _denied(
-        self, seq: int, t_s: float, cause: str, signal: str, value: float, limit: float, severity: Severity
-    ) -> Verdict:
+    def _denied(self, seq: int, t_s: float, found: MonitorFinding) -> Verdict:
         code = _ABORTED if self.latch.is_latched else _NORMAL
-        return Verdict(seq, t_s, code, cause, signal, value, limit, False, False, False, severity=severity)
+        shown = found.cause, found.signal, found.value, found.limit
+        return Verdict(seq, t_s, code, *shown, False, False, False, severity=found.severity)
 
     def _near(self, sensors: Sensors) -> Verdict:
         seq, t_s, danger = sensors.seq, sensors.t, self._danger
@@ -244,11 +252,11 @@ class BeaconSafetyRules:
         target_m = self._nearest_target_m()
         forward, reverse = ahead_m >= danger.obstacle_m and target_m >= danger.target_m, behind_m >= danger.obstacle_m
         if ahead_m < danger.obstacle_m:
-            found = "an obstacle ahead", "obstacle", ahead_m, danger.obstacle_m
+            found = OBSTACLE_AHEAD.message, "obstacle", ahead_m, danger.obstacle_m
         elif target_m < danger.target_m:
-            found = "the target is too near", "target", target_m, danger.target_m
+            found = TARGET_NEAR.message, "target", target_m, danger.target_m
         elif behind_m < danger.obstacle_m:
-            found = "an obstacle behind", "obstacle", behind_m, danger.obstacle_m
+            found = OBSTACLE_BEHIND.message, "obstacle", behind_m, danger.obstacle_m
         else:
             return emergency or Verdict(seq, t_s, _NORMAL, "", "", 0.0, 0.0, True, True, True)
         return Verdict(seq, t_s, _NEAR, *found, forward, reverse, True)
@@ -270,5 +278,5 @@ class BeaconSafetyRules:
             return None
         # Whoever drives while the ground shakes slips; the others are fled from.
         kind, may_move = (EmergencyKind.EARTHQUAKE, False) if self.latch.is_shaking else (newest.kind, True)
-        cause, signal = f"emergency: {kind}", f"emergency:{kind}"
+        cause, signal = EMERGENCY.message.format(kind=kind), f"emergency:{kind}"
         return Verdict(seq, t_s, _ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move)

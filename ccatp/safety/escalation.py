@@ -3,27 +3,10 @@
 from collections import deque
 from collections.abc import Iterable
 from math import inf
-from typing import NamedTuple
 
 from ccatp.config.models import HealthConfig
 from ccatp.core import Severity
-
-
-class MonitorFinding(NamedTuple):
-    """Something is wrong; ``value`` is in the unit of ``limit``.
-
-    ``retries``: how often it may come again before it is a fault; ``patience_s``: a hold that lasts longer is a fault;
-    ``None``: as the configuration says.
-    """
-
-    severity: Severity
-    cause: str
-    signal: str
-    value: float
-    limit: float
-    full_fans: bool = False
-    retries: int | None = None
-    patience_s: float | None = None
+from ccatp.safety.conditions import PRECEDENCE, MonitorFinding
 
 
 class FindingLatch:
@@ -75,8 +58,8 @@ _DENYING = (Severity.PAUSE, Severity.HOLD, Severity.FAULT)
 
 
 def gravest(findings: Iterable[MonitorFinding]) -> MonitorFinding | None:
-    """The finding that wins: the gravest, of equal ones the first."""
-    return max(findings, key=lambda finding: finding.severity, default=None)
+    """The finding that wins: the gravest, of equal ones that of the first row."""
+    return max(findings, key=lambda finding: (finding.severity, PRECEDENCE[finding.condition]), default=None)
 
 
 def denies(findings: Iterable[MonitorFinding]) -> bool:
@@ -88,7 +71,7 @@ class SeverityEscalation:
     """Raises the severity of what lasts or comes back.
 
     A pause that lasts for longer than ``pause_limit_s`` is a hold, so that a fix is taken before going on; a hold that
-    lasts for longer than its patience is a fault, because it does not pass by itself; a hold for the same signal that
+    lasts for longer than its limit is a fault, because it does not pass by itself; a hold for the same signal that
     comes more than ``retries`` times again within ``retry_window_s`` is one, too.
     """
 
@@ -119,11 +102,9 @@ class SeverityEscalation:
             finding = finding._replace(severity=Severity.HOLD)
         if finding.severity is not Severity.HOLD:
             return finding
-        patience_s = cfg.hold_limit_s if finding.patience_s is None else finding.patience_s
+        patience_s = cfg.lifted_limit_s if finding.condition.limit == "health.lifted_limit_s" else cfg.hold_limit_s
         if lasted_s >= patience_s:
-            return finding._replace(
-                severity=Severity.FAULT, cause=f"{finding.cause}, for {patience_s:g} s", retries=None
-            )
+            return finding._replace(severity=Severity.FAULT, cause=f"{finding.cause}, for {patience_s:g} s")
         return self._count(t_s, finding, is_new=lasted_s == 0.0)
 
     def _count(self, t_s: float, finding: MonitorFinding, *, is_new: bool) -> MonitorFinding:
@@ -132,7 +113,7 @@ class SeverityEscalation:
             held.popleft()
         if is_new:
             held.append(t_s)
-        retries = cfg.retries if finding.retries is None else finding.retries
+        retries = cfg.retries if finding.condition.retries is None else finding.condition.retries
         if len(held) <= retries + 1:
             return finding
         return finding._replace(severity=Severity.FAULT, cause=f"{finding.cause}, again after {retries} retries")

@@ -5,11 +5,12 @@ from math import hypot
 
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
 from ccatp.control.motion_checks import ImuGate, MotionSum, SlidingWindow, WheelMeans
-from ccatp.core import EdgeSample, ImuSample, Severity, WheelSample
+from ccatp.core import EdgeSample, ImuSample, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror
-from ccatp.safety.escalation import FindingLatch, MonitorFinding
+from ccatp.safety.conditions import CLOCK_JUMPED, FRAMES_LOST, LINES_GARBLED, MonitorFinding
+from ccatp.safety.escalation import FindingLatch
 from ccatp.safety.sensor_monitors import (
     BatteryMonitor,
     FanMonitor,
@@ -54,7 +55,6 @@ class HealthMonitor:
         self.flicker = FlickerMonitor(cfg, is_explained)
         self._clock, self._gap = FindingLatch(cfg.imu_quarantine_s), FindingLatch(cfg.imu_quarantine_s)
         self._garbled = FindingLatch(cfg.retry_after_s)
-        # Of findings that are equally grave the first one counts.
         self._alarms = (
             *(self._wheels.alarm, self._yaw.alarm, self._fans.alarm, self._latency.alarm),
             *(self._clock, self._gap, self._garbled, self.flicker.chatter, self.flicker.flash),
@@ -84,16 +84,14 @@ class HealthMonitor:
 
     def jumped(self, t_s: float, by_s: float) -> None:
         """The robot's clock has jumped before the frame at ``t_s``."""
-        limit_s = self._cfg.clock_jump_s
-        self._clock.see(t_s, MonitorFinding(Severity.PAUSE, "the robot's clock has jumped", "clock", by_s, limit_s))
+        self._clock.see(t_s, CLOCK_JUMPED.found("clock", by_s, self._cfg.clock_jump_s))
         self._gate.reset()
         self.findings = self._found()
 
     def garbled(self) -> MonitorFinding:
         """Too many lines that are no frames came since the last frame; what is found stays until frames come again."""
-        cfg = self._cfg
-        cause, lines = "lines of the robot were no frames", float(cfg.garbled_lines)
-        finding = MonitorFinding(Severity.HOLD, cause, "lines", lines, lines)
+        lines = float(self._cfg.garbled_lines)
+        finding = LINES_GARBLED.found("lines", lines, lines)
         self._garbled.see(self._t_s or 0.0, finding)
         self.findings = self._found()
         return finding
@@ -113,8 +111,7 @@ class HealthMonitor:
         self._t_s = t_s
         is_gap = dt_s > self._cfg.gap_s
         if is_gap:
-            cause = "frames were lost: nobody saw where the robot went"
-            self._gap.see(t_s, MonitorFinding(Severity.HOLD, cause, "frames", dt_s, self._cfg.gap_s))
+            self._gap.see(t_s, FRAMES_LOST.found("frames", dt_s, self._cfg.gap_s))
         imu = frame.imu
         self._means.take(wheels, dt_s)
         self._sums = self._added(imu, dt_s)

@@ -5,9 +5,31 @@ from collections.abc import Callable, Sequence
 from math import hypot, inf
 
 from ccatp.config.models import HealthConfig, RobotConfig
-from ccatp.core import Corner, DeckPose, EdgeSample, PanelId, Severity
+from ccatp.core import Corner, DeckPose, EdgeSample, PanelId
 from ccatp.mirror.mirror import Mirror
-from ccatp.safety.escalation import FindingLatch, MonitorFinding, Since
+from ccatp.safety.conditions import (
+    BATTERY_LOW,
+    BATTERY_REPORTED,
+    DRIVES_LATE,
+    DRIVES_TOO_LATE,
+    EDGE_REPORTED,
+    EDGE_SENSOR_BLIND,
+    EDGE_SENSOR_CHATTERS,
+    EDGE_SENSOR_FLASHES,
+    EDGE_SENSOR_STAYS_DARK,
+    ENCODER_REPORTED,
+    FAN_REPORTED,
+    FAN_REPORTED_ON_THE_FLAT,
+    FAN_TOO_LITTLE,
+    FAN_WEAK,
+    IMU_REPORTED,
+    SAMPLES_TOO_FEW,
+    SEAM_MISSED,
+    STALL_REPORTED,
+    UNKNOWN_REPORTED,
+    MonitorFinding,
+)
+from ccatp.safety.escalation import FindingLatch, Since
 
 _CORNERS = tuple(corner.value for corner in Corner)
 # Slower than this nothing crosses an edge; vibration moves a sensor by less in a frame.
@@ -55,14 +77,11 @@ class FlickerMonitor:
             while changes and changes[0] < since_s:
                 changes.popleft()
             if len(changes) > self._cfg.chatter_transitions and not self._is_explained(i):
-                self.chatter.see(t_s, self._chattering(i, len(changes)))
+                limit = self._cfg.chatter_transitions
+                self.chatter.see(t_s, EDGE_SENSOR_CHATTERS.found(_CORNERS[i], len(changes), limit))
         self._judge_flashes(t_s)
         self.chatter.settle(t_s)
         self.flash.settle(t_s)
-
-    def _chattering(self, i: int, count: int) -> MonitorFinding:
-        limit = self._cfg.chatter_transitions
-        return MonitorFinding(Severity.HOLD, "an edge sensor chatters", _CORNERS[i], count, limit)
 
     def _change(self, t_s: float, state: tuple[int, ...], *, is_still: bool) -> None:
         for i, (before, now) in enumerate(zip(self._last, state, strict=True)):
@@ -81,11 +100,10 @@ class FlickerMonitor:
             return
         longest_s = max(t_s - (self._flashing_s[i] or t_s) for i in off)
         limit_s = self._cfg.pause_limit_s
-        severity = Severity.PAUSE if longest_s < limit_s - _CLEAR_S else Severity.SLOW
-        cause = "an edge sensor went off though nothing moved"
-        self.flash.see(t_s, MonitorFinding(severity, cause, _CORNERS[off[0]], len(off), 0.0))
-        if severity is Severity.SLOW and self.flash.finding is not None:
-            self.flash.finding = self.flash.finding._replace(severity=Severity.SLOW)
+        condition = EDGE_SENSOR_FLASHES if longest_s < limit_s - _CLEAR_S else EDGE_SENSOR_STAYS_DARK
+        self.flash.see(t_s, condition.found(_CORNERS[off[0]], len(off), 0.0))
+        if condition is EDGE_SENSOR_STAYS_DARK and self.flash.finding is not None:
+            self.flash.finding = self.flash.finding._replace(condition=condition, severity=condition.severity)
 
 
 _SOURCES = ("imu", "enc", "edge")
@@ -138,7 +156,7 @@ class RateMonitor:
             self.finding = None
             return
         name = _SOURCES[shares.index(least)]
-        self.finding = MonitorFinding(Severity.SLOW, "a sensor gives too few samples", name, least, limit)
+        self.finding = SAMPLES_TOO_FEW.found(name, least, limit)
 
 
 class LatencyMonitor:
@@ -167,11 +185,9 @@ class LatencyMonitor:
             # The second one is not in force yet.
             latency_s, cfg = t_s - sent[1][1], self._cfg
             if latency_s > cfg.latency_pause_s:
-                cause = "drives reach the wheels too late"
-                self.alarm.see(t_s, MonitorFinding(Severity.PAUSE, cause, "latency", latency_s, cfg.latency_pause_s))
+                self.alarm.see(t_s, DRIVES_TOO_LATE.found("latency", latency_s, cfg.latency_pause_s))
             elif latency_s > cfg.latency_slow_s:
-                cause = "drives reach the wheels late"
-                self.alarm.see(t_s, MonitorFinding(Severity.SLOW, cause, "latency", latency_s, cfg.latency_slow_s))
+                self.alarm.see(t_s, DRIVES_LATE.found("latency", latency_s, cfg.latency_slow_s))
         self.alarm.settle(t_s)
 
 
@@ -255,8 +271,7 @@ class SeamMonitor:
         limit = self._cfg.seams_failed
         if missed >= limit and self._pose is not None:
             # The pose may be wrong instead: the hold brings a fix, and one more seam shows which.
-            cause = "an edge sensor sees no seams: blind"
-            self._blind.see(self._pose[0], MonitorFinding(Severity.HOLD, cause, _CORNERS[i], missed, limit, retries=0))
+            self._blind.see(self._pose[0], EDGE_SENSOR_BLIND.found(_CORNERS[i], missed, limit))
 
     @property
     def finding(self) -> MonitorFinding | None:
@@ -267,7 +282,7 @@ class SeamMonitor:
         if most < limit:
             return None
         corner = _CORNERS[self.missed.index(most)]
-        return MonitorFinding(Severity.SLOW, "an edge sensor did not see a seam", corner, most, limit)
+        return SEAM_MISSED.found(corner, most, limit)
 
 
 # A fan command is in force two delays of the link after it was sent, at the latest.
@@ -275,13 +290,13 @@ _FIRST_COMMAND_S = 1.0
 # The way home goes along rows and columns of panels.
 _DETOUR = 1.6
 _OWN = {
-    "imu": (Severity.SLOW, "the robot reports a fault of its inertial unit"),
-    "encoder_left": (Severity.HOLD, "the robot reports a fault of its left encoder"),
-    "encoder_right": (Severity.HOLD, "the robot reports a fault of its right encoder"),
-    "edge": (Severity.HOLD, "the robot reports a fault of its edge sensors"),
-    "stall": (Severity.HOLD, "the robot reports that a wheel is blocked"),
+    "imu": IMU_REPORTED,
+    "encoder_left": ENCODER_REPORTED,
+    "encoder_right": ENCODER_REPORTED,
+    "edge": EDGE_REPORTED,
+    "stall": STALL_REPORTED,
 }
-_FANS = ("fan_left", "fan_right")
+_FANS, _SIDES = ("fan_left", "fan_right"), ("left", "right")
 
 
 class FanMonitor:
@@ -317,23 +332,18 @@ class FanMonitor:
         lasts_s = self._low.lasts(t_s, is_low and is_due)
         if lasts_s >= self._cfg.fan_time_s - 1e-6 and self._overhang:
             k = 0 if fans[0] / left < fans[1] / right else 1
-            cause = f"the {('left', 'right')[k]} fan gives too little"
-            self._see(t_s, cause, _FANS[k], fans[k], self._least[k])
+            self.alarm.see(t_s, FAN_TOO_LITTLE.found(_FANS[k], fans[k], self._least[k], side=_SIDES[k]))
         elif self._overhang:
             is_weak = fans[0] < self._enough[0] or fans[1] < self._enough[1]
             if self._weak.lasts(t_s, is_weak and is_due) >= self._cfg.fan_time_s - 1e-6:
                 k = 0 if fans[0] - self._enough[0] < fans[1] - self._enough[1] else 1
-                cause = f"the {('left', 'right')[k]} fan gets weak"
-                finding = MonitorFinding(Severity.RETURN, cause, _FANS[k], fans[k], self._enough[k], full_fans=True)
+                finding = FAN_WEAK.found(_FANS[k], fans[k], self._enough[k], side=_SIDES[k])
                 self.alarm.see(t_s, finding)
         for name in faults:
             if name in _FANS:
-                self._see(t_s, f"the robot reports a fault of its {name[4:]} fan", name, 1.0, 0.0)
+                reported = FAN_REPORTED if self._overhang else FAN_REPORTED_ON_THE_FLAT
+                self.alarm.see(t_s, reported.found(name, 1.0, 0.0, side=name[4:]))
         self.alarm.settle(t_s)
-
-    def _see(self, t_s: float, cause: str, signal: str, value: float, limit: float) -> None:
-        severity = Severity.FAULT if self._overhang else Severity.INFORM
-        self.alarm.see(t_s, MonitorFinding(severity, cause, signal, value, limit, full_fans=self._overhang))
 
 
 class BatteryMonitor:
@@ -357,11 +367,9 @@ class BatteryMonitor:
         least = cfg.battery_reserve
         least += cfg.battery_margin * _DETOUR * home_m / cfg.slow_speed_m_s / cfg.battery_life_s
         if self._low.lasts(t_s, soc < least) >= cfg.battery_time_s:
-            self.finding = MonitorFinding(
-                Severity.RETURN, "the battery has to last for the way home", "soc", soc, least
-            )
+            self.finding = BATTERY_LOW.found("soc", soc, least)
         if self._told.lasts(t_s, is_told) >= cfg.battery_time_s:
-            self.finding = MonitorFinding(Severity.RETURN, "the robot reports a low battery", "battery_low", soc, least)
+            self.finding = BATTERY_REPORTED.found("battery_low", soc, least)
 
 
 class OwnFaults:
@@ -380,10 +388,8 @@ class OwnFaults:
         for name in faults:
             if name in _FANS or name == "battery_low":
                 continue
-            severity, cause = _OWN.get(name, (Severity.INFORM, "the robot reports a fault that is not known here"))
-            self.alarms.setdefault(name, FindingLatch(self._clear_s)).see(
-                t_s, MonitorFinding(severity, cause, name, 1.0, 0.0)
-            )
+            finding = _OWN.get(name, UNKNOWN_REPORTED).found(name, 1.0, 0.0, side=name.removeprefix("encoder_"))
+            self.alarms.setdefault(name, FindingLatch(self._clear_s)).see(t_s, finding)
         for name, alarm in list(self.alarms.items()):
             alarm.settle(t_s)
             if alarm.finding is None:

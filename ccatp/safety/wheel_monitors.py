@@ -6,10 +6,22 @@ from typing import NamedTuple
 
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.control.motion_checks import ImuGate, MotionSum
-from ccatp.core import Severity, WheelSample
-from ccatp.safety.escalation import FindingLatch, MonitorFinding, Since
+from ccatp.core import WheelSample
+from ccatp.safety.conditions import (
+    ENCODER_BROKEN,
+    ENCODER_COUNTS_NOTHING,
+    IMU_LEFT_OUT,
+    WHEEL_BLOCKED,
+    WHEEL_CREEPS,
+    WHEEL_CREEPS_ON,
+    WHEEL_DOES_NOT_STOP,
+    WHEEL_RUNS_AWAY,
+    WHEELS_STAND,
+    YAW_DISAGREES,
+    MonitorFinding,
+)
+from ccatp.safety.escalation import FindingLatch, Since
 
-HOLD, FAULT = Severity.HOLD, Severity.FAULT
 # A servo of 0.1 s and a link of 40 ms have forgotten a command after this long, to within 2 %.
 _MEMORY_S = 0.4
 # What is commanded is known in steps of five frames, and reaches the wheels two delays of the link later.
@@ -18,7 +30,6 @@ LATE_S = 0.1
 """A drive that has been in force for longer was followed by others that have not arrived: the link stalls."""
 # Wheels and gyroscope that differ by more than this within a stall's time do not show the same motion.
 _SAME_TURN_RAD = 0.05
-_STALL_RETRIES = 1
 # A few samples of an encoder that counts steps are hardly a speed: with fewer than usual a wheel has to be
 # faster than it may be by so many times, or for longer.
 _VAGUE = 2.5
@@ -166,10 +177,9 @@ class WheelMonitor:
         k = 0 if above[0] >= above[1] else 1
         side = _SIDES[k]
         if broken := _what_is_broken(samples, k):
-            finding = MonitorFinding(HOLD, f"the {side} encoder {broken}", f"encoder_{side}", worst, limit)
+            self.alarm.see(t_s, ENCODER_BROKEN.found(f"encoder_{side}", worst, limit, side=side, what=broken))
         else:
-            finding = MonitorFinding(HOLD, f"the {side} wheel runs away", f"{side}_wheel", worst, limit)
-        self.alarm.see(t_s, finding)
+            self.alarm.see(t_s, WHEEL_RUNS_AWAY.found(f"{side}_wheel", worst, limit, side=side))
 
     def _find_stall(self, t_s: float, moved: MotionSum) -> None:
         told, cfg = self._stall, self._cfg
@@ -184,14 +194,14 @@ class WheelMonitor:
             return
         disagreement = abs((moved.right_m - moved.left_m) / self._base_m - moved.turned_rad)
         speed = min(abs(rate) for rate, is_still in ((right, stands[0]), (left, stands[1])) if is_still)
+        side = "right" if stands[0] else "left"
         if all(stands):
-            what, signal = "both wheels stand, or no encoder counts", "encoders"
+            finding = WHEELS_STAND.found("encoders", speed, cfg.stall_speed_m_s)
+        elif disagreement > _SAME_TURN_RAD:
+            finding = ENCODER_COUNTS_NOTHING.found(f"encoder_{side}", speed, cfg.stall_speed_m_s, side=side)
         else:
-            side = "right" if stands[0] else "left"
-            is_encoder = disagreement > _SAME_TURN_RAD
-            what = f"the {side} encoder counts nothing" if is_encoder else f"the {side} wheel is blocked"
-            signal = f"encoder_{side}" if is_encoder else f"{side}_wheel"
-        self.alarm.see(t_s, MonitorFinding(HOLD, what, signal, speed, cfg.stall_speed_m_s, retries=_STALL_RETRIES))
+            finding = WHEEL_BLOCKED.found(f"{side}_wheel", speed, cfg.stall_speed_m_s, side=side)
+        self.alarm.see(t_s, finding)
 
     def _is_told(self, low: float, high: float) -> bool:
         limit = self._cfg.stall_command_m_s
@@ -219,16 +229,13 @@ class WheelMonitor:
                 continue
             if broken:
                 self._stood = now  # what it says it went, it did not
-                finding = MonitorFinding(
-                    HOLD, f"the {side} encoder {broken}", f"encoder_{side}", speed_m_s, cfg.stop_speed_m_s
-                )
+                limit_m_s = cfg.stop_speed_m_s
+                finding = ENCODER_BROKEN.found(f"encoder_{side}", speed_m_s, limit_m_s, side=side, what=broken)
             elif creeps:
-                severity = FAULT if lasts_s >= _CREEP_FAULT_S else HOLD
-                cause = f"the {side} wheel turns while it is held"
-                finding = MonitorFinding(severity, cause, f"{side}_wheel", crept_m, cfg.creep_m, full_fans=True)
+                condition = WHEEL_CREEPS_ON if lasts_s >= _CREEP_FAULT_S else WHEEL_CREEPS
+                finding = condition.found(f"{side}_wheel", crept_m, cfg.creep_m, side=side)
             else:
-                cause = f"the {side} wheel turns though it shall stand"
-                finding = MonitorFinding(HOLD, cause, f"{side}_wheel", speed_m_s, cfg.stop_speed_m_s)
+                finding = WHEEL_DOES_NOT_STOP.found(f"{side}_wheel", speed_m_s, cfg.stop_speed_m_s, side=side)
             self.alarm.see(t_s, finding)
 
 
@@ -309,12 +316,11 @@ class YawMonitor:
         difference = by_gyroscope - by_wheels
         limit = cfg.yaw_limit_rad + cfg.yaw_share * max(abs(by_wheels), abs(by_gyroscope))
         if not -limit <= difference <= limit:
-            cause = "gyroscope and wheels disagree about the turn: a wheel slips, or the gyroscope is off"
-            self.alarm.see(t_s, MonitorFinding(Severity.HOLD, cause, "imu_wz", difference, limit))
+            self.alarm.see(t_s, YAW_DISAGREES.found("imu_wz", difference, limit))
 
 
 def imu_finding(gate: ImuGate) -> MonitorFinding | None:
     """What the gate has against the inertial unit: it is left out, and the robot goes slowly by its wheels."""
     if not gate.cause:
         return None
-    return MonitorFinding(Severity.SLOW, f"{gate.cause}: left out", "imu", gate.value, gate.limit)
+    return IMU_LEFT_OUT.found("imu", gate.value, gate.limit, what=gate.cause)

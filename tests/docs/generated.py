@@ -6,7 +6,6 @@ them with what the code says now.
 
 import inspect
 import re
-import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
@@ -16,8 +15,10 @@ from ccatp.cli import cli
 from ccatp.core import EventCode, Severity
 from ccatp.daemon.supervisor import PROCESSES
 from ccatp.links.topics import TOPICS
-from tests.docs.alarm_scan import ROOT, causes
+from ccatp.safety.conditions import DANGER, Clear, Condition, Group, Motion
+from ccatp.survey.conditions import SURVEY
 
+ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 MARKED = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- made -->)", re.DOTALL)
 REACTIONS = {
@@ -28,7 +29,33 @@ REACTIONS = {
     "hold": "hold: wheels held, a fix, then on by itself",
     "return": "home",
     "fault": "fault: held until an operator resumes",
-    "back off": "back off",
+}
+ABOUT = {
+    Group.EDGES: (
+        "The robot stops, backs off along the way it came, has itself measured, and goes on: no operator is "
+        "needed unless it comes again at the same place. Code 1."
+    ),
+    Group.DATA: (
+        "Nothing moves on data older than 0.15 s. The wheels are held; the survey goes on by itself as soon "
+        "as data are fresh. What lasts for more than `health.pause_limit_s` is followed by a fix, for more "
+        "than `health.hold_limit_s` it is a fault."
+    ),
+    Group.SENSORS: (
+        "A sensor that is not to be believed is left out where the others suffice, and holds the robot where "
+        "they do not."
+    ),
+    Group.WHEELS: (
+        "The wheels are held. What passes by itself is followed by a fix; what comes back more than "
+        "`health.retries` times is a fault."
+    ),
+    Group.FANS: (
+        "On an overhanging mirror the fans carry the robot: these lead home or hold, with all that the fans "
+        "can give. Elsewhere they are only reported."
+    ),
+    Group.SURVEY: "Held until an operator decides: resume, abort, or stop.",
+    Group.BEACONS: "Missions of robots among radio beacons (`system` in the configuration).",
+    Group.STORAGE: "A fix counts once it is on the disk; the survey does not go on without.",
+    Group.OBSERVATORY: "Code 2, latched: it stays until it is cleared by its id (`ccatp clear ID`), across restarts.",
 }
 
 
@@ -39,19 +66,40 @@ def table(head: str, rows: Iterable[Iterable[object]]) -> str:
 
 
 def alarms() -> str:
-    """Every cause with what it means."""
-    known, rank = causes(), list(REACTIONS)
-    catalogue = tomllib.loads((DOCS / "alarms.toml").read_text(encoding="utf-8"))["group"]
+    """Every condition: what happens, and what to do."""
+    what = "| it says | what happens | it may still move | ends | limit | what it means | what to do |"
     parts = []
-    for group in catalogue:
-        rows = []
-        for text, row in group["alarms"].items():
-            reactions = sorted(known[text].reactions, key=rank.index) if text in known else []
-            rows.append((text, ", or ".join(REACTIONS[name] for name in reactions), row["means"], row["do"]))
-        about = [f"{group['about']}\n"] if group["about"] else []
-        what = "| it says | what happens | what it means | what to do |"
-        parts += [f"## {group['title']}\n", *about, table(what, rows), ""]
+    for group in Group:
+        rows = [_alarm(row) for row in (*DANGER, *SURVEY) if row.group is group]
+        parts += [f"## {group}\n", *([f"{ABOUT[group]}\n"] if group in ABOUT else []), table(what, rows), ""]
     return "\n".join(parts)
+
+
+def shown(message: str) -> str:
+    """A message with an ellipsis for what varies."""
+    return re.sub(r"\{[^{}]*\}", "\u2026", message)
+
+
+def _alarm(row: Condition) -> tuple[str, ...]:
+    limit = f"`{row.limit}`: {row.escalates_to.name.lower()}" if row.limit else ""
+    retries = "" if row.retries is None else f"; at the {('first', 'second')[row.retries]} return: fault"
+    return (
+        shown(row.message),
+        _reaction(row),
+        row.motion.value,
+        row.clear.value,
+        limit + retries,
+        row.meaning,
+        row.advice,
+    )
+
+
+def _reaction(row: Condition) -> str:
+    if row.severity is not Severity.NONE:
+        return REACTIONS[row.severity.name.lower()]
+    if row.motion is Motion.RETREAT:
+        return "back off" if row.clear is Clear.AFTER_FIX else "no motion towards it"
+    return "home" if row.motion is Motion.RETURN else "wheels held"
 
 
 def severities() -> str:

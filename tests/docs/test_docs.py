@@ -6,7 +6,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from unittest.mock import patch
@@ -17,8 +16,8 @@ from _pytest.mark.structures import ParameterSet
 
 from ccatp.cli import cli, main
 from ccatp.filters import FILTERS
-from tests.docs.alarm_scan import ROOT, causes
-from tests.docs.generated import DOCS, MADE, MARKED, REACTIONS, pages
+from ccatp.survey.conditions import SURVEY
+from tests.docs.generated import DOCS, MADE, MARKED, ROOT, pages, shown
 from tests.unit.reporting.recorded import record
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -33,25 +32,20 @@ def blocks(path: Path, *languages: str) -> list[str]:
     return [body for language, body in FENCE.findall(path.read_text(encoding="utf-8")) if language in languages]
 
 
-def test_every_cause_has_its_line_and_no_other() -> None:
-    groups = tomllib.loads((DOCS / "alarms.toml").read_text(encoding="utf-8"))["group"]
-    described = [text for group in groups for text in group["alarms"]]
-    assert len(described) == len(set(described))
-    known = causes()
-    assert set(known) - set(described) == set(), "say in docs/alarms.toml what these mean, then make docs"
-    assert set(described) - set(known) == set(), "docs/alarms.toml describes what the code does not say any more"
-    assert all(cause.reactions and cause.reactions <= set(REACTIONS) for cause in known.values())
+def texts(pattern: str, where: str) -> set[str]:
+    """Texts in packages of the source, with an ellipsis for what varies."""
+    paths = [path for path in sorted((ROOT / "ccatp").glob(f"{where}/**/*.py")) if path.name != "conditions.py"]
+    sources = (path.read_text(encoding="utf-8") for path in paths)
+    return {shown(text) for source in sources for text in re.findall(pattern + r'f?"([^"\n]*)"', source)}
 
 
-def test_the_scan_follows_names_branches_and_callers() -> None:
-    found = {text: cause.reactions for text, cause in causes().items()}
-    assert found["drives reach the wheels late"] == {"slow"}  # an assignment in its own branch
-    assert found["drives reach the wheels too late"] == {"pause"}
-    assert found["the \u2026 wheel is blocked"] == {"hold"}  # either branch of a choice
-    assert found["the \u2026 fan gives too little"] == {"fault", "inform"}  # a parameter of another method
-    assert found["the robot reports a fault of its inertial unit"] == {"slow"}  # a table
-    assert found["encoder samples stale"] == {"hold"}
-    assert 'Severity.HOLD if missing.signal == "enc"' in (ROOT / "ccatp/danger.py").read_text(encoding="utf-8")
+def test_what_the_survey_holds_the_robot_for_has_its_row_and_no_row_is_without_use() -> None:
+    rows = [shown(row.message) for row in SURVEY]
+    assert len(rows) == len(set(rows))
+    calls = r"\b(?:fault|hold|interrupt|abort|recover|_request_hold)\(\s*"
+    held = {text for package in ("survey", "estimation", "daemon", "beacons") for text in texts(calls, package)}
+    assert held <= set(rows), "a row for these in ccatp/survey/conditions.py, then make docs"
+    assert set(rows) <= texts("", "*"), "nobody says this any more"
 
 
 def test_what_is_made_from_the_code_is_current() -> None:

@@ -16,7 +16,8 @@ from ccatp.daemon.subscribers import EstimateSubscriber
 from ccatp.danger import DangerMonitor
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.mirror.mirror import build_mirror
-from ccatp.safety.escalation import MonitorFinding, SeverityEscalation, denies, gravest
+from ccatp.safety.conditions import DANGER, MonitorFinding
+from ccatp.safety.escalation import SeverityEscalation, denies, gravest
 from ccatp.safety.wheel_monitors import CommandSpan
 from ccatp.sim.robot import Robot
 
@@ -25,7 +26,9 @@ DENYING = {Severity.PAUSE, Severity.HOLD, Severity.FAULT}
 
 
 def finding(severity: Severity, signal: str = "x") -> MonitorFinding:
-    return MonitorFinding(severity, str(severity), signal, 1.0, 0.0)
+    """Of the first condition of that severity that has the configured limits."""
+    rows = [row for row in DANGER if row.severity is severity and row.retries is None]
+    return rows[0].found(signal, 1.0, 0.0)
 
 
 FINDINGS = st.lists(st.builds(finding, st.sampled_from(list(Severity)[1:]), st.sampled_from(["a", "b", "c"])))

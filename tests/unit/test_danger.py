@@ -9,10 +9,11 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import Corner, EdgeSample, EventCode, Verdict, WheelSample
-from ccatp.danger import CENTRE, DangerMonitor
+from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.safety.conditions import CENTRE_NEAR_RIM
 from ccatp.safety.edge_detector import Cause, EdgeMap
 from ccatp.safety.wheel_odometry import KNOTS_KEPT, Odometry, WheelTrack, pose_at
 
@@ -439,7 +440,7 @@ def test_the_centre_may_not_drive_at_the_rim(at_rim: Story) -> None:
     at_rim.pose = (x + 0.045, y, 0.0)  # 46 mm from the rim, and the sensors see nothing
     assert at_rim.frame(0.1).code is EventCode.NORMAL
     verdict = at_rim.run(3, v=0.1)
-    assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.NEAR_EDGE, CENTRE, "estimate")
+    assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.NEAR_EDGE, CENTRE_NEAR_RIM.message, "estimate")
     assert permits(verdict) == (False, True, False)
     assert verdict.off == (True, True, False, False)
     assert verdict.value < verdict.limit == pytest.approx(0.0453, abs=1e-9)  # m; half the lead and three sigma
@@ -456,7 +457,7 @@ def test_the_centre_may_leave_the_rim_in_either_direction(at_rim: Story) -> None
     assert verdict.off == (False, False, True, True)
     at_rim.has_estimate = False
     verdict = at_rim.run(20)
-    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, f"{CENTRE}; no estimate")
+    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, f"{CENTRE_NEAR_RIM.message}; no estimate")
     assert permits(verdict) == NO_PERMIT
 
 

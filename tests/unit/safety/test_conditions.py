@@ -1,0 +1,307 @@
+"""Each condition of the danger loop in scripted frames: it is found, lasts, is over; which of two wins."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import combinations
+from math import nan
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ccatp.core import EdgeSample, EventCode, ImuSample, Severity, Verdict, WheelSample
+from ccatp.danger import DangerMonitor
+from ccatp.links.robot_messages import CommandEcho, Sensors
+from ccatp.links.topics import EstimateMessage
+from ccatp.safety import conditions as rows
+from ccatp.safety.conditions import DANGER, Condition, Group, Motion
+from ccatp.safety.escalation import gravest
+from ccatp.survey.conditions import SURVEY
+from tests.support.scenario import config_of, mirror_of
+
+FRAME_S, SAMPLE_S = 0.01, 0.001
+BEGIN_S = 3.0  # until then the robot is sound: rates, noise and set points are learned
+LIMIT_S = 6.0  # instead of the configured ``hold_limit_s``
+
+
+@dataclass
+class Frame:
+    """What a frame says, and main with it; a fault changes some of it."""
+
+    seq: int
+    t_s: float
+    number: int  # of frames since the fault began
+    rates: tuple[float, float] = (0.0, 0.0)  # of the wheels, right and left, rad/s
+    commanded: tuple[float, float, float, float] | None = (0.0, 0.0, 0.0, 0.0)
+    noise: float = 1e-3
+    wz_rad_s: float = 0.0
+    imu_noise: float = 1e-4
+    imu: int = 10
+    enc: int = 10
+    edge: int = 10
+    off: tuple[int, ...] = ()
+    fans: tuple[float, float] = (1.0, 1.0)
+    soc: float = 1.0
+    echoed: int = -2
+    faults: tuple[str, ...] = ()
+    x_m: float = 0.0
+    sigma_m: float = 1e-4
+    estimate_s: float | None = 0.0  # age
+    is_dropped: bool = False
+
+
+Change = Callable[[Frame], dict[str, Any]]
+
+
+@dataclass
+class Scripted:
+    """A robot on the middle of a panel, and the monitor that judges it."""
+
+    mirror: str = "fyst-m1"
+    seq: int = 0
+    offset_s: float = 0.0
+    verdicts: list[Verdict] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        cfg, mirror = config_of(self.mirror, health__hold_limit_s=LIMIT_S), mirror_of(self.mirror)
+        self.monitor = DangerMonitor(mirror, cfg.robot, cfg.danger, cfg.health)
+        self.radius_m, self.base_m = cfg.robot.wheel_radius_m, cfg.robot.wheel_base_m
+        self.panel = min(mirror.panels.values(), key=lambda panel: panel.x_m**2 + panel.y_m**2)
+
+    def run(self, until_s: float, change: Change = lambda _: {}, steady: Change = lambda _: {}) -> list[Verdict]:
+        """Frames until then; returns their verdicts."""
+        seen: list[Verdict] = []
+        begin = self.seq
+        while self.seq * FRAME_S < until_s:
+            self.seq += 1
+            frame = Frame(self.seq, self.seq * FRAME_S, self.seq - begin)
+            for name, value in {**steady(frame), **change(frame)}.items():
+                setattr(frame, name, value)
+            if not frame.is_dropped:
+                seen.append(self.monitor.step(self._sensors(frame), self._estimate(frame)))
+        return seen
+
+    def _sensors(self, frame: Frame) -> Sensors:
+        t_s = frame.t_s + self.offset_s
+        first_s = t_s - FRAME_S
+        (right, left), jitter = frame.rates, [(-1.0) ** k * (1.0 + 1e-3 * (7 * frame.seq + k)) for k in range(1, 11)]
+        states = [int(k not in frame.off) for k in range(4)]
+        return Sensors(
+            frame.seq,
+            t_s,
+            [
+                ImuSample(first_s + k * SAMPLE_S, frame.imu_noise * z, frame.wz_rad_s + frame.imu_noise * z)
+                for k, z in list(enumerate(jitter, 1))[: frame.imu]
+            ],
+            [
+                WheelSample(first_s + k * SAMPLE_S, right + frame.noise * z, left + frame.noise * z)
+                for k, z in list(enumerate(jitter, 1))[: frame.enc]
+            ],
+            [EdgeSample(first_s + k * SAMPLE_S, *states) for k in range(1, 11)][: frame.edge],
+            None,
+            frame.fans,
+            frame.soc,
+            CommandEcho(frame.seq if frame.echoed == -2 else frame.echoed, 0.0, 0.0, False),
+            list(frame.faults),
+        )
+
+    def _estimate(self, frame: Frame) -> EstimateMessage | None:
+        if frame.estimate_s is None:
+            return None
+        return EstimateMessage(
+            seq=frame.seq - 1 - round(frame.estimate_s / FRAME_S), t_s=frame.t_s + self.offset_s - frame.estimate_s,
+            x_m=self.panel.x_m + frame.x_m, y_m=self.panel.y_m, heading_rad=0.0, sigma_m=frame.sigma_m,
+            state="driving", commanded=frame.commanded, drive_seq=frame.seq - 1,
+        )  # fmt: skip
+
+
+SPEED_RAD_S = 3.0
+SPEED = (SPEED_RAD_S, SPEED_RAD_S)
+TURN_RAD_S = 0.55  # of a body with one wheel at that speed and the other at rest, about
+
+
+def drives(frame: Frame) -> dict[str, Any]:
+    """Straight on at one speed, with the set points of it."""
+    return {"rates": SPEED, "commanded": (SPEED_RAD_S,) * 4} if frame.t_s > 0.5 else {}
+
+
+def stands(_: Frame) -> dict[str, Any]:
+    return {}
+
+
+def passes_panels(frame: Frame) -> dict[str, Any]:
+    """By the estimate the robot goes to and fro over a seam."""
+    return {"x_m": 0.3 - abs((0.5 * frame.number * FRAME_S) % 1.2 - 0.6)}
+
+
+def always(**fields: Any) -> Change:
+    return lambda _: fields
+
+
+@dataclass
+class Row:
+    """How a condition is brought about.
+
+    ``clears_s``: so long after the fault everything is permitted again; ``None`` where it is not. ``lasts``: it stays
+    as long as the fault does, and its time limit comes.
+    """
+
+    condition: Condition
+    change: Change
+    steady: Change = stands
+    cause: str = ""
+    signal: str = ""
+    clears_s: float | None = 4.0
+    lasts: bool = True
+    mirror: str = "fyst-m1"
+
+
+ROWS = [
+    Row(rows.ENCODER_BROKEN, always(rates=(SPEED_RAD_S, 0.0), noise=0.0), cause="the right encoder is frozen"),
+    Row(rows.WHEEL_RUNS_AWAY, always(rates=(0.0, 8.0)), cause="the left wheel runs away", lasts=False),
+    Row(rows.WHEELS_STAND, always(rates=(0.0, 0.0)), drives, signal="encoders", lasts=False),
+    Row(rows.ENCODER_COUNTS_NOTHING, always(rates=(0.0, SPEED_RAD_S)), drives, signal="encoder_right", lasts=False),
+    Row(
+        *(rows.WHEEL_BLOCKED, lambda _: {"rates": (SPEED_RAD_S, 0.0), "wz_rad_s": TURN_RAD_S}, drives),
+        signal="left_wheel", lasts=False,
+    ),
+    Row(rows.WHEEL_CREEPS, always(rates=(0.1, 0.0)), cause="the right wheel turns while it is held", lasts=False),
+    Row(rows.WHEEL_CREEPS_ON, always(rates=(0.1, 0.0)), cause="the right wheel turns while it is held"),
+    Row(rows.WHEEL_DOES_NOT_STOP, always(rates=(0.0, 0.5)), signal="left_wheel", lasts=False),
+    Row(rows.YAW_DISAGREES, always(wz_rad_s=0.4), drives, signal="imu_wz"),
+    Row(rows.FAN_TOO_LITTLE, always(fans=(0.1, 1.0)), cause="the left fan gives too little", mirror="fyst-m2"),
+    Row(rows.FAN_WEAK, always(fans=(1.0, 0.7)), cause="the right fan gets weak", mirror="fyst-m2"),
+    Row(rows.FAN_REPORTED, always(faults=("fan_left",)), cause="a fault of its left fan", mirror="fyst-m2"),
+    Row(rows.FAN_REPORTED_ON_THE_FLAT, always(faults=("fan_right",)), signal="fan_right", ),
+    Row(rows.DRIVES_TOO_LATE, lambda frame: {"echoed": frame.seq - 25}),
+    Row(rows.DRIVES_LATE, lambda frame: {"echoed": frame.seq - 15}),
+    Row(rows.CLOCK_JUMPED, lambda frame: {"t_s": frame.t_s + 1.0}, lasts=False),
+    Row(rows.FRAMES_LOST, lambda frame: {"is_dropped": frame.number < 30}, lasts=False),
+    Row(
+        rows.EDGE_SENSOR_CHATTERS, lambda frame: {"off": (1,) if frame.number % 2 else ()}, signal="front_right",
+    ),
+    Row(rows.EDGE_SENSOR_FLASHES, always(off=(2,)), signal="rear_left", lasts=False),
+    Row(rows.EDGE_SENSOR_STAYS_DARK, always(off=(2,)), signal="rear_left", lasts=False),
+    Row(rows.IMU_LEFT_OUT, always(wz_rad_s=9.0), cause="the gyroscope's rate is impossible: left out"),
+    Row(rows.SAMPLES_TOO_FEW, always(imu=5), signal="imu"),
+    Row(rows.BATTERY_LOW, always(soc=0.01), signal="soc", clears_s=None),
+    Row(rows.BATTERY_REPORTED, always(faults=("battery_low",)), signal="battery_low", clears_s=None),
+    Row(rows.EDGE_SENSOR_BLIND, passes_panels, signal="front_left", lasts=False, clears_s=None),
+    Row(rows.SEAM_MISSED, passes_panels, signal="front_left", lasts=False, clears_s=None),
+    Row(rows.ENCODER_REPORTED, always(faults=("encoder_left",)), cause="the robot reports a fault of its left encoder"),
+    Row(rows.EDGE_REPORTED, always(faults=("edge",))),
+    Row(rows.STALL_REPORTED, always(faults=("stall",))),
+    Row(rows.IMU_REPORTED, always(faults=("imu",))),
+    Row(rows.UNKNOWN_REPORTED, always(faults=("mood",)), signal="mood"),
+    Row(rows.EDGE_STALE, always(edge=0), signal="edge"),
+    Row(rows.ENCODERS_STALE, always(enc=0), signal="enc"),
+    Row(rows.NO_ESTIMATE, always(estimate_s=None), signal="estimate"),
+    Row(rows.ESTIMATE_STALE, always(estimate_s=0.5), signal="estimate"),
+    Row(rows.ESTIMATE_NOT_FINITE, always(sigma_m=nan), signal="estimate"),
+    Row(rows.LIFTED, always(off=(0, 1, 2, 3)), signal="edge"),
+]  # fmt: skip
+NAMES = [row.condition.name for row in ROWS]
+
+
+def is_found(verdict: Verdict, row: Row) -> bool:
+    pattern = re.sub(r"\\{\w+\\}", ".+", re.escape(row.condition.message))
+    is_it = re.match(pattern, verdict.cause) is not None and row.cause in verdict.cause
+    return is_it and (not row.signal or verdict.signal == row.signal) and verdict.severity >= row.condition.severity
+
+
+END_S = BEGIN_S + 1.25 * LIMIT_S
+
+
+@pytest.mark.parametrize("row", ROWS, ids=NAMES)
+def test_it_is_found_lasts_and_is_over(row: Row) -> None:
+    condition, scripted = row.condition, Scripted(row.mirror)
+    before = scripted.run(BEGIN_S, steady=row.steady)
+    assert all(verdict.severity is Severity.NONE and verdict.forward for verdict in before[1:])
+    seen = scripted.run(END_S, row.change, row.steady)
+    found = [verdict for verdict in seen if is_found(verdict, row)]
+    own = [verdict for verdict in found if verdict.severity is condition.severity]
+    assert own[0].full_fans is condition.full_fans
+    may_move = condition.motion is not Motion.NONE
+    assert own[0].forward is own[0].reverse is own[0].turn is may_move
+    if row.lasts:
+        assert found == seen[-len(found) :]
+        since_s = next(verdict.t_s for verdict in seen if verdict.signal == found[0].signal)
+        graver = {
+            verdict.severity: verdict.t_s - since_s for verdict in found[::-1] if verdict.severity != own[0].severity
+        }
+        assert graver == times_s(condition)
+    after = scripted.run(END_S + (row.clears_s or 4.0), steady=row.steady)
+    assert (after[-1].severity is Severity.NONE) is (row.clears_s is not None)
+    assert after[-1].forward or row.clears_s is None
+
+
+def times_s(condition: Condition) -> Any:
+    """When the condition becomes graver, after its signal was found first."""
+    times = {Severity.HOLD: 2.0} if condition.severity is Severity.PAUSE else {}
+    if condition.escalates_to is not Severity.NONE:
+        times[Severity.FAULT] = 3.0 if condition is rows.LIFTED else LIMIT_S
+    return pytest.approx(times, abs=0.025)  # two frames: the monitors look at every second one
+
+
+def test_no_edge_sample_from_the_beginning() -> None:
+    seen = Scripted().run(1.0, always(edge=0))
+    assert {(verdict.cause, verdict.severity) for verdict in seen} == {("no edge samples", Severity.PAUSE)}
+
+
+def test_no_frame_and_lines_that_are_none() -> None:
+    scripted = Scripted()
+    scripted.run(1.0)
+    verdict = scripted.monitor.stale(100, 1.0)
+    assert (verdict.cause, verdict.severity, verdict.forward) == (rows.NO_FRAME.message, Severity.PAUSE, False)
+    found = [scripted.monitor.garbled(100, 1.0, 1.0 + 0.01 * k) for k in range(3)]
+    assert found[:2] == [None, None]
+    assert found[2] is not None
+    assert (found[2].cause, found[2].severity) == (rows.LINES_GARBLED.message, Severity.HOLD)
+    assert {verdict.cause for verdict in scripted.run(2.5)} == {rows.LINES_GARBLED.message}
+    assert scripted.run(4.0)[-1].severity is Severity.NONE
+
+
+def test_a_sensor_that_stays_off_is_left_behind_with_the_edge() -> None:
+    scripted = Scripted()
+    scripted.run(BEGIN_S)
+
+    def there_and_back(frame: Frame) -> dict[str, Any]:
+        rate = SPEED_RAD_S if frame.number < 20 else -SPEED_RAD_S if frame.number < 90 else 0.0
+        return {"off": (0,), "rates": (rate, rate), "commanded": (-SPEED_RAD_S, SPEED_RAD_S) * 2}
+
+    seen = scripted.run(BEGIN_S + 1.5, there_and_back)
+    causes = list(dict.fromkeys(verdict.cause for verdict in seen if verdict.code is EventCode.NEAR_EDGE))
+    assert causes == [rows.NO_SEAM.message, rows.EDGE_SENSOR_STAYS_OFF.message]
+    assert (seen[-1].severity, seen[-1].signal) == (Severity.HOLD, "front_left")
+
+
+ROOT = Path(__file__).parents[3]
+ELSEWHERE = {
+    "tests/unit/test_danger.py": (
+        *(rows.RIM_AHEAD, rows.BEYOND_SEAM, rows.NO_SEAM, rows.OFF_WITHOUT_WHEELS, rows.CENTRE_NEAR_RIM),
+        *(rows.ALL_OFF, rows.EARTHQUAKE, rows.EMERGENCY),
+    ),
+    "tests/unit/beacons/test_mission.py": tuple(row for row in DANGER if row.group is Group.BEACONS),
+}
+
+
+def test_every_row_is_brought_about_here_or_in_the_named_tests() -> None:
+    here = [row.condition for row in ROWS]
+    source = Path(__file__).read_text(encoding="utf-8")
+    alone = [row for row in DANGER if f"{row.name.upper()}.message" in source]
+    alone += [row for row in DANGER if f'"{row.message}"' in source]
+    elsewhere = [row for path in ELSEWHERE for row in ELSEWHERE[path]]
+    assert set(DANGER) == {*here, *alone, *elsewhere}
+
+
+def test_names_are_unique() -> None:
+    names = [row.name for row in (*DANGER, *SURVEY)]
+    assert len(names) == len(set(names))
+
+
+def test_of_two_the_graver_wins_and_of_equal_ones_the_first_row() -> None:
+    for first, second in combinations(DANGER, 2):
+        found = first.found("a", 1.0, 0.0), second.found("b", 1.0, 0.0)
+        winner = found[0] if first.severity >= second.severity else found[1]
+        assert gravest(found) is gravest(found[::-1]) is winner, f"{first.name} and {second.name}"
