@@ -24,14 +24,13 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 import zmq
-from scipy.spatial.transform import Rotation
 
 from ccatp.core import DeckPose, PanelId, PanelPose, PointId, wrap_pi
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.links import topics
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import FixMessage, Message, TrackMessage, TruthMessage
-from ccatp.mirror.mirror import Mirror, deck_poses
+from ccatp.mirror.mirror import Mirror
 
 LOOP = 1  # of LinePrimitive.type
 LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
@@ -148,7 +147,17 @@ def _on_surface(mirror: Mirror, x_m: float, y_m: float) -> Any:
 
 def quaternion(axes: tuple[Sequence[float], Sequence[float], Sequence[float]]) -> Any:
     """The rotation that takes x, y, z to three right-handed unit vectors."""
-    return Quaternion(*Rotation.from_matrix(np.array(axes).T).as_quat().tolist())
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes
+    # Each row is the quaternion times four of its components; the row of the largest component has the least rounding.
+    rows = (
+        (1.0 + xx - yy - zz, xy + yx, zx + xz, yz - zy),
+        (xy + yx, 1.0 - xx + yy - zz, yz + zy, zx - xz),
+        (zx + xz, yz + zy, 1.0 - xx - yy + zz, xy - yx),
+        (yz - zy, zx - xz, xy - yx, 1.0 + xx + yy + zz),
+    )
+    row = rows[max(range(4), key=lambda i: rows[i][i])]
+    length = hypot(*row)
+    return Quaternion(*(c / length for c in row))
 
 
 _PLAIN = ("boolean", "string", "number", "integer")
@@ -307,11 +316,10 @@ class Views:
             yield _shown("view/points", t_s, point_scene(self._mirror, panels, self._deviations_m, time_of(t_s)))
 
     def _of_track(self, track: TrackMessage) -> Iterator[ViewMessage]:
-        rows = [row for row in track.rows if row[0] % EVERY_FRAMES == 0]
-        if rows:
-            poses = [PanelPose(PanelId(row, col), x, y, heading) for _, _, row, col, x, y, heading, _ in rows]
-            for row, place in zip(rows, deck_poses(self._mirror, poses).tolist(), strict=True):
-                yield from self._of_pose(row[0], row[1], DeckPose(*place[:3]), row[7])
+        for seq, t_s, row, col, x, y, heading, sigma_m in track.rows:
+            if seq % EVERY_FRAMES == 0:
+                pose = self._mirror.deck_pose(PanelPose(PanelId(row, col), x, y, heading))
+                yield from self._of_pose(seq, t_s, pose, sigma_m)
 
     def _of_pose(self, seq: int, t_s: float, pose: DeckPose, sigma_m: float) -> Iterator[ViewMessage]:
         if seq % EVERY_FRAMES == 0:
