@@ -7,8 +7,7 @@ import numpy as np
 from ccatp.config.models import Config
 from ccatp.control.motion_checks import ImuGate, WheelMeans, largest_rate_rad_s
 from ccatp.core import DeckPose, PanelPose
-from ccatp.estimation import measurements
-from ccatp.estimation import state_model as survey_model
+from ccatp.estimation import state_model, thesis_localizer
 from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.thesis_localizer import FourStateLocalizer
 from ccatp.filters import FILTERS, Filter
@@ -34,14 +33,12 @@ def build_localizer(
     """
     name = cfg.run.filter
     start = mirror.base_panel_pose if start is None else start
+    is_thesis = name in FOUR_STATE
     # The localizer re-initialises its filter at once; what counts is its size.
-    made: Localizer
-    if name in FOUR_STATE:
-        n = measurements.STATES
-        made = FourStateLocalizer(wrap(FILTERS[name](np.zeros(n), np.eye(n))), mirror, cfg.robot, cfg.localizer, start)
-    else:
-        n = survey_model.STATES
-        made = FullStateLocalizer(wrap(FILTERS[name](np.zeros(n), np.eye(n))), mirror, cfg.robot, cfg.localizer, start)
+    n = thesis_localizer.STATES if is_thesis else state_model.STATES
+    filter_ = wrap(FILTERS[name](np.zeros(n), np.eye(n)))
+    kind: type[Localizer] = FourStateLocalizer if is_thesis else FullStateLocalizer
+    made = kind(filter_, mirror, cfg.robot, cfg.localizer, start)
     made.guard(ImuGate(cfg.health), WheelMeans(cfg.robot), largest_rate_rad_s(cfg.robot))
     return made
 

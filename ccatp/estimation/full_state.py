@@ -9,8 +9,8 @@ from ccatp.config.models import LocalizerConfig, RobotConfig
 from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, GravitySample, ImuSample, PanelId, PanelPose, wrap_pi
 from ccatp.estimation.fixes import FixGated, check_fix, deck_foot
 from ccatp.estimation.localizer_base import LONGEST_GAP_S, MAX_FRAME_STEP_S, LocalizerBase, WheelReadings
-from ccatp.estimation.measurements import NoiseFloor, ZeroVelocityDetector
 from ccatp.estimation.odometry import PosePredictor, Preintegrator, WheelAngle
+from ccatp.estimation.rest import NoiseFloor, ZeroVelocityDetector
 from ccatp.estimation.seams import EdgeScanner
 from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import PSI, Slope, W
@@ -49,9 +49,12 @@ class PanelFrame:
         s, norm = sqrt(s2), sqrt(s2 + fy * fy)
         c, d = cos(psi), sin(psi)
         hx, hy = c / s - d * fx * fy / (norm * s), d * s / norm
-        along, across, _ = self.at.rotate_from_deck((hx, hy, fx * hx + fy * hy))
-        panel_x, panel_y, _ = self.at.from_deck((x, y, height_m))
-        return PanelPose(self.at.id, panel_x, panel_y, atan2(across, along))
+        at = self.at
+        (ax, ay, az), (bx, by, bz), _ = at.axes
+        ox, oy, oz = at.origin
+        hz, dx, dy, dz = fx * hx + fy * hy, x - ox, y - oy, height_m - oz
+        heading = atan2(bx * hx + by * hy + bz * hz, ax * hx + ay * hy + az * hz)
+        return PanelPose(at.id, ax * dx + ay * dy + az * dz, bx * dx + by * dy + bz * dz, heading)
 
 
 class FullStateLocalizer(LocalizerBase):

@@ -10,8 +10,8 @@ import numpy as np
 from ccatp.config.models import LocalizerConfig, RobotConfig
 from ccatp.core import DeckPose, FloatArray, PanelId, difference
 from ccatp.estimation.fixes import fix_row, relocated
-from ccatp.estimation.measurements import ZeroVelocityReading, heading_from_gravity
 from ccatp.estimation.odometry import PreintegratedMotion, WheelAngle
+from ccatp.estimation.rest import ZeroVelocityReading, heading_from_gravity
 from ccatp.estimation.seams import Edge, SeamLines, SensorTransition
 from ccatp.estimation.slip_prior import Redraw, SlipPrior
 from ccatp.estimation.state_model import (

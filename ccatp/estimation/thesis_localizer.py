@@ -1,7 +1,8 @@
-"""The localizer of thesis chapter 2: four states in a filter, the pose integrated in a panel frame beside it."""
+"""The localizer of thesis chapter 2: four states in a filter (eqs 2.4 to 2.12), the pose integrated beside it."""
 
 from collections.abc import Sequence
 from math import hypot, isfinite, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,11 +22,128 @@ from ccatp.core import (
 )
 from ccatp.estimation.fixes import PositionSigma, check_fix, foot_of_fix
 from ccatp.estimation.localizer_base import MAX_FRAME_STEP_S, LocalizerBase, WheelReadings
-from ccatp.estimation.measurements import OMEGA, STATES, THETA, ConstantAcceleration, MeasurementBuilder, Stack, V
 from ccatp.estimation.odometry import Odometer, arc_step
 from ccatp.estimation.seams import CrossingDetector, HeadingFix, HeadingGate, SensorTransition
 from ccatp.filters.base import Filter, FilterDiverged, Innovation
 from ccatp.mirror.mirror import Mirror
+
+V, A, THETA, OMEGA = range(4)
+"""Order of the state q of thesis eq. 2.1: speed m/s, acceleration m/s^2, heading rad, rate rad/s.
+
+The thesis prints m^2/s as the unit of the acceleration; m/s^2 is meant.
+"""
+STATES = 4
+_CACHE_LIMIT = 256
+
+
+class Stack(NamedTuple):
+    """z = H q + noise with independent rows: z (m,), H (m, 4), variances R (m,)."""
+
+    z: FloatArray
+    H: FloatArray
+    R: FloatArray
+
+
+class MeasurementBuilder:
+    """Builds z, H, R of a frame: rows in the order right wheel, left wheel, acceleration, rate (oldest first in each).
+
+    The full model (thesis eq. 2.12) is::
+
+        a_x     = a
+        omega_R = (v + omega L / 2) / r
+        omega_L = (v - omega L / 2) / r
+        omega_z = omega
+
+    Eq. 2.3 and 2.4 print theta_z with a row that picks theta; a gyroscope measures a rate, so omega_z of 2.12 holds.
+
+    A sample taken at t_i belongs to the state q(t_i), not to q(t) at the frame's time t. Within a frame acceleration
+    and rate are taken as constant, so q(t_i) = F(t_i - t) q(t) with F of eq. 2.11 and a row h becomes h F(t_i - t). The
+    approximation: all process noise of the interval enters at its beginning. ``cfg`` has standard deviations of single
+    samples (thesis eq. 2.17 calls sigma a variance; its table 2.1 lists standard deviations).
+    """
+
+    def __init__(self, robot: RobotConfig, cfg: LocalizerConfig) -> None:
+        self._per_radius = 1.0 / robot.wheel_radius_m
+        self._turn = 0.5 * robot.wheel_base_m / robot.wheel_radius_m
+        self._var_ax = cfg.accelerometer_sigma_m_s2**2
+        self._var_wz = cfg.gyroscope_sigma_rad_s**2
+        self._bias_wz = cfg.gyroscope_bias_rad_s
+        self._var_wheel = cfg.encoder_sigma_rad_s**2
+        self._stacks: dict[tuple[int, int, int], Stack] = {}
+
+    def stack(
+        self,
+        t_s: float,
+        imu: Sequence[ImuSample],
+        right: tuple[Sequence[float], Sequence[float]],
+        left: tuple[Sequence[float], Sequence[float]],
+    ) -> Stack:
+        """Stack of a frame with any number of samples; of each wheel the times (s) and the rates (rad/s).
+
+        The arrays are work space: they hold until the next call.
+        """
+        stack = self._of_size(len(right[0]), len(left[0]), len(imu))
+        z, H, _ = stack
+        wheels, n = len(right[0]) + len(left[0]), len(imu)
+        for i, (t, rate) in enumerate(zip((*right[0], *left[0]), (*right[1], *left[1]), strict=True)):
+            H[i, A] = (t - t_s) * self._per_radius
+            z[i] = rate
+        for i, (_, ax, wz) in enumerate(imu, wheels):
+            z[i] = ax
+            z[i + n] = wz - self._bias_wz
+        return stack
+
+    def _of_size(self, right: int, left: int, imu: int) -> Stack:
+        found = self._stacks.get((right, left, imu))
+        if found is not None:
+            return found
+        if len(self._stacks) >= _CACHE_LIMIT:
+            self._stacks.clear()
+        wheels = right + left
+        m = wheels + 2 * imu
+        H = np.zeros((m, STATES))
+        H[:wheels, V] = self._per_radius
+        H[:right, OMEGA] = self._turn
+        H[right:wheels, OMEGA] = -self._turn
+        H[wheels : wheels + imu, A] = 1.0
+        H[wheels + imu :, OMEGA] = 1.0
+        R = np.empty(m)
+        R[:wheels] = self._var_wheel
+        R[wheels : wheels + imu] = self._var_ax
+        R[wheels + imu :] = self._var_wz
+        found = self._stacks[right, left, imu] = Stack(np.zeros(m), H, R)
+        return found
+
+
+class ConstantAcceleration:
+    """The process model: F of thesis eq. 2.11 and its noise, white jerk and white angular acceleration.
+
+    The noise of an interval enters as one impulse at its beginning, so that within the interval acceleration and rate
+    are constant, as ``MeasurementBuilder`` takes them: an impulse of variance q dt in the rate of change, carried by F
+    to the end, gives q dt [[dt^2, dt], [dt, 1]] for (v, a) and for (theta, omega). The heading then moves by omega dt
+    with the rate measured *during* the interval, the midpoint rule. Noise spread over the interval
+    (q [[dt^3/3, dt^2/2], [dt^2/2, dt]]) would contradict those rows: the heading would lag by half a frame in a turn,
+    and its variance would grow by q dt^3/12 per frame however well the rate is measured. The thesis gives no Q; the
+    densities are in (m/s^3)^2 s and (rad/s^2)^2 s.
+    """
+
+    def __init__(self, cfg: LocalizerConfig) -> None:
+        self._jerk = cfg.jerk_density_m2_s5
+        self._alpha = cfg.angular_acceleration_density_rad2_s3
+        self._F = np.eye(STATES)
+        self._Q = np.zeros((STATES, STATES))
+
+    def over(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
+        """F and Q (4, 4) over dt_s; work space that holds until the next call."""
+        F, Q = self._F, self._Q
+        F[V, A] = F[THETA, OMEGA] = dt_s
+        for i, density in ((V, self._jerk), (THETA, self._alpha)):
+            impulse = density * dt_s
+            Q[i + 1, i + 1] = impulse
+            Q[i, i + 1] = Q[i + 1, i] = impulse * dt_s
+            Q[i, i] = impulse * dt_s * dt_s
+        return F, Q
+
 
 _NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up
 _IMPOSSIBLE = 2.0  # an estimate of this many times the wheels' largest rate is no estimate

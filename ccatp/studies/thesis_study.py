@@ -24,9 +24,8 @@ import numpy as np
 from ccatp.config.models import Config
 from ccatp.core import EdgeSample, EventCode, Fix, FloatArray, GravitySample, ImuSample, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
-from ccatp.estimation.measurements import STATES, THETA
 from ccatp.estimation.seams import SensorTransition
-from ccatp.estimation.thesis_localizer import FourStateLocalizer
+from ccatp.estimation.thesis_localizer import STATES, THETA, FourStateLocalizer
 from ccatp.filters import FILTERS
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage

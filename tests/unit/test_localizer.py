@@ -15,9 +15,9 @@ from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, ImuSample, PanelId, PanelPose, WheelSample, difference
 from ccatp.estimation.fixes import FixRefused, PositionSigma
-from ccatp.estimation.measurements import ConstantAcceleration, MeasurementBuilder
 from ccatp.estimation.odometry import Odometer, OdometryPose, arc_step
 from ccatp.estimation.seams import HeadingFix, HeadingGate, heading_from_pair
+from ccatp.estimation.thesis_localizer import ConstantAcceleration, MeasurementBuilder
 from ccatp.estimation.thesis_localizer import FourStateLocalizer as Localizer
 from ccatp.filters import FILTERS, FilterDiverged, Innovation, KalmanFilter
 from ccatp.filters.base import Observation

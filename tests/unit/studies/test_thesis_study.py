@@ -8,8 +8,8 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.core import EdgeSample, Fix, ImuSample, WheelSample
-from ccatp.estimation.measurements import STATES
 from ccatp.estimation.seams import HeadingFix
+from ccatp.estimation.thesis_localizer import STATES
 from ccatp.filters import FILTERS
 from ccatp.mirror.mirror import build_mirror
 from ccatp.studies.campaign import CellResult, Job, JobOutcome
