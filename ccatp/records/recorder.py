@@ -12,10 +12,12 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, NamedTuple
 
+from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
+from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.writer import Writer
 from zstandard import ZstdError
@@ -39,6 +41,7 @@ DAMAGE = (
     MemoryError,
     EOFError,
 )
+_COPIED_BYTES = 1 << 20  # at a time
 _METADATA = "ccatp"
 _SIMULATION = "simulation"
 _MAX_T_S = 1e9  # thirty years of uptime: anything beyond is not a time since boot
@@ -81,6 +84,33 @@ class _RawFile:
         os.close(self._handle)
 
 
+class _ChunkIndexes:
+    """The records of the chunks that end the file, until then on the disk: those of a day take hundreds of megabytes.
+
+    The MCAP writer keeps a list of them, adds to it and iterates over it once.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._file = TemporaryFile(dir=folder)  # noqa: SIM115 - open as long as the recording
+
+    def append(self, index: ChunkIndex) -> None:
+        builder = RecordBuilder()
+        index.write(builder)
+        self._file.write(builder.end())  # type: ignore[no-untyped-call]
+
+    def __iter__(self) -> Iterator["_ChunkIndexes"]:
+        yield self
+
+    def write(self, builder: RecordBuilder) -> None:
+        """Write all of them, as each would write itself."""
+        self._file.seek(0)
+        while part := self._file.read(_COPIED_BYTES):
+            builder.write(part)
+
+    def close(self) -> None:
+        self._file.close()
+
+
 class Recorder:
     """Writes messages of a fixed set of topics to one MCAP file.
 
@@ -115,6 +145,7 @@ class Recorder:
         self._waiting_since_s: float | None = None
         self._sequence = 0
         self._file: _RawFile | None = None
+        self._chunk_indexes: _ChunkIndexes | None = None
         mark = str(is_simulation).lower()
         try:
             if path.exists():
@@ -122,6 +153,8 @@ class Recorder:
                 path.rename(path.with_name(f"{path.stem}.{number}{path.suffix}"))
             self._file = _RawFile(path)
             self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)  # type: ignore[arg-type]
+            self._chunk_indexes = _ChunkIndexes(path.parent)
+            vars(self._writer)["_Writer__chunk_indices"] = self._chunk_indexes
             self._writer.start(library="ccatp")
             self._writer.add_metadata(_METADATA, {**(metadata or {}), _SIMULATION: mark})
             for name, schema in topics:
@@ -183,10 +216,11 @@ class Recorder:
             self._on_failure(f"{self.path}: recording ended: {error}")
 
     def _close_file(self) -> None:
-        if self._file is not None:
-            with suppress(OSError):
-                self._file.close()
-            self._file = None
+        for file in (self._file, self._chunk_indexes):
+            if file is not None:
+                with suppress(OSError):
+                    file.close()
+        self._file = self._chunk_indexes = None
 
 
 def recordings(path: Path) -> list[Path]:

@@ -3,16 +3,20 @@
 import json
 import os
 import random
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from ccatp.cli import main
 from ccatp.links.runtime_dir import locked
 from ccatp.records.recorder import (
+    CHUNK_BYTES,
+    FLUSH_AFTER_S,
     HELD_BACK_S,
     RUN_LOCK,
     Recorder,
@@ -63,6 +67,34 @@ def test_messages_come_back_and_the_formats_own_reader_agrees(path: Path) -> Non
         assert {(c.message_encoding, c.metadata["simulation"]) for c in summary.channels.values()} == {("json", "true")}
         # 501 messages of 450 bytes in chunks of 16 KiB
         assert len(summary.chunk_indexes) > 10
+
+
+def test_a_recording_is_that_of_the_formats_own_writer_in_bounded_memory(path: Path) -> None:
+    tracemalloc.start()
+    made = Recorder(path, TOPICS, is_simulation=True)
+    sizes = []
+    for n in range(1200):
+        made.write("track", n * FLUSH_AFTER_S, b"{}")  # a chunk each
+        if n % 400 == 399:
+            sizes.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    made.close()
+    assert sizes[2] - sizes[1] < 4000  # a chunk's index alone takes hundreds of bytes
+    with path.with_name("own.mcap").open("wb") as own:
+        writer = Writer(own, chunk_size=CHUNK_BYTES)
+        writer.start(library="ccatp")
+        writer.add_metadata("ccatp", {"simulation": "true"})
+        for name, schema in TOPICS:
+            data = json.dumps(schema, separators=(",", ":")).encode()
+            number = writer.register_schema(str(schema.get("title", name)), "jsonschema", data)
+            writer.register_channel(name, "json", number, {"simulation": "true"})
+        for n in range(1200):
+            time_ns = round(n * FLUSH_AFTER_S * 1e9)
+            writer.add_message(1, time_ns, b"{}", time_ns, n + 1)
+            if n:
+                writer.flush()  # type: ignore[no-untyped-call]
+        writer.finish()  # type: ignore[no-untyped-call]
+    assert path.read_bytes() == Path(own.name).read_bytes()
 
 
 @pytest.mark.parametrize(("is_simulation", "mark"), [(True, "true"), (False, "false")])
