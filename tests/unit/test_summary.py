@@ -15,7 +15,7 @@ from ccatp.config.models import MirrorConfig
 from ccatp.core import PanelId, PointId
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.records import summary as summary_module
-from ccatp.records.summary import RunFacts, SummaryBuilder, format_table, puck_targets
+from ccatp.records.summary import RunFacts, RunningStatistics, SummaryBuilder, format_table, puck_targets
 
 HEIGHT_M = 0.05
 POINT = PointId(5, 5, 3)
@@ -92,6 +92,31 @@ def test_batches_of_any_size_and_order_give_the_same_summary(mirror: Mirror) -> 
         results.append(json.dumps(made.build()))
     assert len(set(results)) == 1
     assert json.loads(results[0])["localization_error_mm"]["mean"] > 1.0
+
+
+def test_statistics_of_a_long_run_take_bounded_memory() -> None:
+    keys = np.arange(10_000)
+    values = np.random.default_rng(1).gamma(2.0, size=len(keys))
+    names = "mean", "p50", "p99", "max"
+    found = []
+    for size in (1, 7, 10_000):
+        statistics = RunningStatistics(3000)
+        for batch in np.split(keys, range(size, len(keys), size)):
+            statistics.add(batch, values[batch])
+        assert statistics.sample.tolist() == values[::4].tolist()  # 10,000 / 4 < 3000 < 10,000 / 2
+        found.append(statistics.figures(names, scale=1.0, decimals=9))
+    assert found[0] == found[1] == found[2]
+    expected = [values.mean(), *np.percentile(values[::4], (50, 99)), values.max()]
+    assert list(found[0].values()) == pytest.approx(expected, abs=1e-9)  # of the rounding
+    short, whole = RunningStatistics(3000), RunningStatistics(3000)
+    short.add(keys[:100], values[:100])
+    short.include(statistics)
+    assert whole.figures(("max",), scale=1.0, decimals=9) == {"max": None}
+    assert short.sample.tolist() == values[:100:4].tolist() + values[::4].tolist()
+    whole.include(short)
+    assert whole.count == 10_100
+    assert whole.figures(names, scale=1.0, decimals=9) == short.figures(names, scale=1.0, decimals=9)
+    assert whole.figures(("max",), scale=1.0, decimals=9) == {"max": found[0]["max"]}
 
 
 def test_heading_error_is_wrapped(builder: SummaryBuilder, mirror: Mirror) -> None:
