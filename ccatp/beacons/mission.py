@@ -4,6 +4,9 @@ from enum import StrEnum
 from math import isfinite
 from typing import NamedTuple
 
+import msgspec
+from msgspec.structs import replace
+
 from ccatp.beacons.navigation import BeaconMeasurements, MoteNavigator, Navigator, PoseBelief, RadioNavigator
 from ccatp.beacons.pilot import BeaconPilot
 from ccatp.beacons.steering import HALT, SteeringCommand
@@ -11,7 +14,7 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import EventCode, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
-from ccatp.survey.state import SurveyOutcome
+from ccatp.survey.state import Abort, Fault, Interrupted, Pause, Resume, SurveyInput, SurveyOutcome
 
 
 class BeaconState(StrEnum):
@@ -62,6 +65,113 @@ class WaypointArrival(NamedTuple):
     belief: PoseBelief
 
 
+class BeaconMissionState(msgspec.Struct, frozen=True):
+    """What the mission is at, and why.
+
+    Attributes:
+        interlock: why nothing may move, an earthquake, or empty.
+        raised: the newest emergency acted on.
+        severity: of the newest verdict.
+    """
+
+    mode: BeaconState = IDLE
+    outcome: SurveyOutcome = SurveyOutcome.NONE
+    cause: str = ""
+    abort_cause: str = ""
+    is_by_hand: bool = False
+    is_faulted: bool = False
+    interlock: str = ""
+    raised: int = 0
+    severity: Severity = Severity.NONE
+
+    @property
+    def is_paused(self) -> bool:
+        """Held until somebody resumes, or says that an earthquake is over."""
+        return self.mode is HELD and (self.is_by_hand or bool(self.interlock))
+
+    def held(self, cause: str, *, by_hand: bool) -> "BeaconMissionState":
+        """Held until somebody resumes, or until the cause is gone."""
+        return replace(self, mode=HELD, cause=cause, is_by_hand=by_hand)
+
+    def proceeding(self) -> "BeaconMissionState":
+        """Not held any more."""
+        return replace(self, mode=IDLE, cause=self.abort_cause, is_by_hand=False, is_faulted=False)
+
+    def aborted(self, cause: str) -> "BeaconMissionState":
+        """On the way to where the robot started, as soon as it may move."""
+        s = replace(self, abort_cause=self.abort_cause or cause)
+        return s if s.interlock or s.mode is DONE else s.proceeding()
+
+    def faulted(self, cause: str) -> "BeaconMissionState":
+        """Held until an operator resumes, because something is wrong."""
+        if self.mode is DONE or self.is_faulted:
+            return self
+        return replace(self.held(cause, by_hand=True), is_faulted=True)
+
+    def interrupted(self, cause: str) -> "BeaconMissionState":
+        """Held until frames and verdicts are fresh again."""
+        return self if self.mode in (IDLE, HELD, DONE) else self.held(cause, by_hand=False)
+
+    def handle(self, event: SurveyInput) -> "tuple[BeaconMissionState, str | None]":
+        """The state after an event between two frames, and why it was refused, or ``None``."""
+        if isinstance(event, Fault):
+            return self.faulted(event.cause), None
+        if isinstance(event, Interrupted):
+            return self.interrupted(event.cause), None
+        if isinstance(event, Resume):
+            refusal = self._resume_refusal()
+            return (self.proceeding(), None) if refusal is None else (self, refusal)
+        if self.mode is DONE:
+            return self, "the mission is over"
+        if isinstance(event, Pause):
+            return self.held(event.cause, by_hand=True), None
+        if isinstance(event, Abort):
+            return self.aborted(event.cause), None
+        return replace(self, mode=DONE, outcome=SurveyOutcome.STOPPED), None
+
+    def _resume_refusal(self) -> str | None:
+        if self.mode is not HELD:
+            return f"the mission is not held but {self.mode}"
+        if self.interlock:
+            return f"{self.interlock}: nothing moves until that is cleared"
+        if self.severity >= Severity.HOLD:
+            return f"the cause persists: {self.cause}"
+        return None
+
+    def _with_levels(self, verdict: Verdict) -> "BeaconMissionState":
+        """What the verdict says that is remembered; an earthquake holds, and home when it is over."""
+        s = self if self.severity is verdict.severity else replace(self, severity=verdict.severity)
+        if not verdict.is_shaking:
+            return replace(s, interlock="") if s.interlock else s
+        s = replace(s, raised=verdict.raised)
+        if s.interlock:
+            return s
+        s = replace(s, interlock=EARTHQUAKE, abort_cause=s.abort_cause or EARTHQUAKE)
+        return s.held(EARTHQUAKE, by_hand=s.mode is HELD and s.is_by_hand)
+
+    def react(self, verdict: Verdict | None) -> "tuple[BeaconMissionState, bool]":
+        """Do what a verdict demands; whether the robot may go about its business."""
+        if self.mode is DONE:
+            return self, False
+        if verdict is None:
+            return self.interrupted("no fresh verdict from the danger loop"), False
+        s = self._with_levels(verdict)
+        if verdict.severity is Severity.FAULT:
+            return s.faulted(verdict.cause), False
+        if verdict.is_shaking:
+            return s, False
+        if not (verdict.forward or verdict.reverse or verdict.turn):
+            if s.mode is HELD and not s.is_by_hand:
+                return replace(s, cause=verdict.cause), False
+            return s.interrupted(verdict.cause), False
+        if verdict.code is EventCode.ABORTED and verdict.raised != s.raised:
+            # The level is repeated; what counts is that it is new.
+            s = replace(s, raised=verdict.raised).aborted(verdict.cause)
+        if s.mode is IDLE or (s.mode is HELD and not s.is_by_hand):
+            s = s.proceeding()
+        return s, s.mode is not HELD
+
+
 class BeaconMission:
     """Maps and visits waypoints, or follows a radio, and returns to its start when it is given up.
 
@@ -77,114 +187,19 @@ class BeaconMission:
         self._begun_s: float | None = None
         self._followed_s = 0.0
         self._is_following = cfg.follow.is_active
-        self.state: BeaconState = IDLE
-        self.outcome = SurveyOutcome.NONE
-        self.cause = self.abort_cause = ""
-        self.is_faulted = False
-        self._is_by_hand = False
-        self._interlock = ""
-        self._raised = 0
-        self._severity = Severity.NONE
+        self.state = BeaconMissionState()
 
-    @property
-    def is_paused(self) -> bool:
-        """Held until somebody resumes, or says that an earthquake is over."""
-        return self.state is HELD and (self._is_by_hand or bool(self._interlock))
+    def handle(self, event: SurveyInput) -> str | None:
+        """An event between two frames; why it was refused, or ``None``."""
+        self.state, refusal = self.state.handle(event)
+        return refusal
 
-    # -- commands: each returns why it was refused, or None -------------------------------------------------------
+    def _finish(self, outcome: SurveyOutcome) -> None:
+        self.state = replace(self.state, mode=DONE, outcome=outcome)
 
-    def pause(self, cause: str) -> str | None:
-        """Hold until ``resume``."""
-        if self.state is DONE:
-            return "the mission is over"
-        self._hold(cause, by_hand=True)
-        return None
-
-    def resume(self) -> str | None:
-        """Go on after a hold; what holds the robot must be gone."""
-        if self.state is not HELD:
-            return f"the mission is not held but {self.state}"
-        if self._interlock:
-            return f"{self._interlock}: nothing moves until that is cleared"
-        if self._severity >= Severity.HOLD:
-            return f"the cause persists: {self.cause}"
-        self._proceed()
-        return None
-
-    def abort(self, cause: str) -> str | None:
-        """Return to where the robot started, and end there."""
-        if self.state is DONE:
-            return "the mission is over"
-        self.abort_cause = self.abort_cause or cause
-        if not self._interlock:
-            self._proceed()
-            self.cause = self.abort_cause
-        return None
-
-    def stop(self) -> str | None:
-        """Hold the wheels and end here."""
-        if self.state is DONE:
-            return "the mission is over"
-        self.finish(SurveyOutcome.STOPPED)
-        return None
-
-    def fault(self, cause: str) -> None:
-        """Hold until an operator resumes, because something is wrong."""
-        if self.state is not DONE and not self.is_faulted:
-            self._hold(cause, by_hand=True)
-            self.is_faulted = True
-
-    def interrupt(self, cause: str) -> bool:
-        """Hold until frames and verdicts are fresh again; returns whether that was news."""
-        if self.state in (IDLE, HELD, DONE):
-            return False
-        self._hold(cause, by_hand=False)
-        return True
-
-    def finish(self, outcome: SurveyOutcome) -> None:
-        """The mission is over."""
-        self.state, self.outcome = DONE, outcome
-
-    # -- verdicts -------------------------------------------------------------------------------------------------
-
-    def react(self, verdict: Verdict | None) -> bool:
-        """Do what a verdict demands; whether the robot may go about its business."""
-        if self.state is DONE:
-            return False
-        if verdict is None:
-            self.interrupt("no fresh verdict from the danger loop")
-            return False
-        self._severity = verdict.severity
-        if verdict.is_shaking:
-            self._raised = verdict.raised
-            if not self._interlock:
-                self._interlock = EARTHQUAKE
-                self.abort_cause = self.abort_cause or EARTHQUAKE
-                self._hold(EARTHQUAKE, by_hand=self.state is HELD and self._is_by_hand)
-        else:
-            self._interlock = ""
-        if verdict.severity is Severity.FAULT:
-            self.fault(verdict.cause)
-            return False
-        if verdict.is_shaking:
-            return False
-        if not (verdict.forward or verdict.reverse or verdict.turn):
-            if not self.interrupt(verdict.cause) and self.state is HELD and not self._is_by_hand:
-                self.cause = verdict.cause
-            return False
-        if verdict.code is EventCode.ABORTED and verdict.raised != self._raised:
-            self._raised = verdict.raised  # the level is repeated; what counts is that it is new
-            self.abort(verdict.cause)
-        if self.state is IDLE or (self.state is HELD and not self._is_by_hand):
-            self._proceed()
-        return self.state is not HELD
-
-    def _hold(self, cause: str, *, by_hand: bool) -> None:
-        self.state, self.cause, self._is_by_hand = HELD, cause, by_hand
-
-    def _proceed(self) -> None:
-        self.state, self.cause = IDLE, self.abort_cause
-        self._is_by_hand = self.is_faulted = False
+    def _enter(self, mode: BeaconState) -> None:
+        if self.state.mode is not mode:
+            self.state = replace(self.state, mode=mode)
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
@@ -215,50 +230,52 @@ class BeaconMission:
         t_s = measurements.t_s
         if self._begun_s is None:
             self._begun_s = t_s
-        if not self.react(verdict) or verdict is None:
+        self.state, goes_on = self.state.react(verdict)
+        if not goes_on or verdict is None:
             return HALT
-        if t_s - self._begun_s > self._cfg.mission.time_limit_s and self.state is not IDLE and not self.abort_cause:
-            self.fault(f"the mission takes longer than mission.time_limit_s = {self._cfg.mission.time_limit_s:g}")
+        limit_s = self._cfg.mission.time_limit_s
+        if t_s - self._begun_s > limit_s and self.state.mode is not IDLE and not self.state.abort_cause:
+            self.state = self.state.faulted(f"the mission takes longer than mission.time_limit_s = {limit_s:g}")
             return HALT
         drive = self._wanted(measurements, interval_s)
         return permitted(drive, verdict, self._cfg.avoidance.back_speed_m_s)
 
     def _wanted(self, measurements: BeaconMeasurements, interval_s: float) -> SteeringCommand:
-        if self.state is HELD:
+        if self.state.mode is HELD:
             return HALT
         if self.navigator.is_mapping:
-            if self.abort_cause:
-                self.finish(SurveyOutcome.AT_BASE)  # it never left
+            if self.state.abort_cause:
+                self._finish(SurveyOutcome.AT_BASE)  # it never left
             else:
-                self.state = MAPPING
+                self._enter(MAPPING)
             return HALT
         t_s, avoidance = measurements.t_s, self._cfg.avoidance
         # Sensors without a reading in this frame count as seeing nothing: what they saw before is remembered.
         distances_m = measurements.distances_m or (avoidance.range_max_m,) * len(avoidance.sensors_rad)
-        if self.abort_cause:
+        if self.state.abort_cause:
             return self._return(t_s, interval_s, distances_m)
         pose, target = self.navigator.belief.pose, self.navigator.target(t_s)
         drive = self.pilot.drive(t_s, interval_s, pose, target, distances_m)
         if not self._is_following:
             self._visit()
         else:
-            self.state = FOLLOWING
+            self._enter(FOLLOWING)
             self._followed_s += interval_s
             if self._followed_s >= self._cfg.mission.follow_s:
-                self.finish(SurveyOutcome.COMPLETE)
-        return HALT if self.outcome is not SurveyOutcome.NONE else drive
+                self._finish(SurveyOutcome.COMPLETE)
+        return HALT if self.state.outcome is not SurveyOutcome.NONE else drive
 
     def _visit(self) -> None:
-        self.state = VISITING
+        self._enter(VISITING)
         waypoints = self._cfg.workspace.waypoints_m
         while len(self.arrivals) < min(self.pilot.waypoints.reached, self.total):
             lap, waypoint = divmod(len(self.arrivals), len(waypoints))
             self.arrivals.append(WaypointArrival(waypoint, lap, waypoints[waypoint], self.navigator.belief))
         if len(self.arrivals) >= self.total:
-            self.finish(SurveyOutcome.COMPLETE)
+            self._finish(SurveyOutcome.COMPLETE)
 
     def _return(self, t_s: float, interval_s: float, distances_m: tuple[float, ...]) -> SteeringCommand:
-        self.state = RETURNING
+        self._enter(RETURNING)
         if self._homing is None:
             cfg = self._cfg
             home = {"waypoints_m": ((cfg.start.x_m, cfg.start.y_m),), "loops": False}
@@ -267,7 +284,7 @@ class BeaconMission:
             self._homing = BeaconPilot(cfg.model_copy(update={"workspace": workspace, "follow": follow}))
         drive = self._homing.drive(t_s, interval_s, self.navigator.belief.pose, None, distances_m)
         if self._homing.waypoints.current_m is None:
-            self.finish(SurveyOutcome.AT_BASE)
+            self._finish(SurveyOutcome.AT_BASE)
             return HALT
         return drive
 

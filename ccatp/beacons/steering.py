@@ -6,7 +6,7 @@ from math import cos, hypot, pi
 from typing import NamedTuple
 
 from ccatp.config.beacon_models import FuzzyConfig, RadioControlConfig, VehicleConfig
-from ccatp.control.pid import Pid
+from ccatp.control.pid import Pid, PidState
 from ccatp.core import bearing, wrap_pi
 
 _Trapezoid = tuple[float, float, float, float]
@@ -131,11 +131,11 @@ class WaypointSteering:
         self._control = control
         self._vehicle = vehicle
         self._fuzzy = Sugeno(control.fuzzy)
-        self._pi = Pid(control.pi, vehicle.speed_max_m_s)
+        self._pi, self._pi_memory = Pid(control.pi, vehicle.speed_max_m_s), PidState()
 
     def reset(self) -> None:
         """Forget the integral: a new aim, or a stop."""
-        self._pi.reset()
+        self._pi_memory = PidState()
 
     def drive(self, aim: BearingToPoint, interval_s: float) -> SteeringCommand:
         """Set points for the next interval, s."""
@@ -170,7 +170,8 @@ class WaypointSteering:
         if self._control.speed_mode == "constant":
             return min(self._control.constant_speed_m_s, limit_m_s)
         if self._control.speed_mode == "pi":
-            return max(0.0, self._pi.step(aim.distance_m, interval_s)) * max(0.0, cos(aim.error_rad))
+            self._pi_memory, speed_m_s = self._pi.step(self._pi_memory, aim.distance_m, interval_s)
+            return max(0.0, speed_m_s) * max(0.0, cos(aim.error_rad))
         values = {"distance_m": aim.distance_m, "heading_error_rad": abs(aim.error_rad)}
         wanted_m_s = self._fuzzy.evaluate([values[name] for name in self._fuzzy.inputs])
         return max(0.0, min(wanted_m_s, limit_m_s))

@@ -6,6 +6,14 @@ from typing import NamedTuple
 from ccatp.config.models import ControlConfig, PidConfig
 
 
+class PidState(NamedTuple):
+    """Memory of a PID between two steps."""
+
+    integral: float = 0.0
+    derivative: float = 0.0
+    last_error: float | None = None
+
+
 class Pid:
     """C(s) = Kp + Ki/s + Kd s/(Tf s + 1), thesis eq. 3.4 with a filtered derivative.
 
@@ -19,32 +27,25 @@ class Pid:
         self._filter_s = gains.derivative_filter_s
         self._integral_limit = gains.integral_limit
         self._output_limit = output_limit
-        self.reset()
 
-    def reset(self) -> None:
-        """Forget the integral and the past error."""
-        self._integral = 0.0
-        self._derivative = 0.0
-        self._last_error: float | None = None
-
-    def step(self, error: float, dt_s: float) -> float:
-        """The output within its limit, ``dt_s`` > 0 after the last step."""
+    def step(self, memory: PidState, error: float, dt_s: float) -> tuple[PidState, float]:
+        """The next memory, and the output within its limit, ``dt_s`` > 0 after the last step."""
         if dt_s <= 0.0:
             raise ValueError(f"dt of a control step must be positive, got {dt_s} s")
-        if self._kd and self._last_error is not None:
-            slope = (error - self._last_error) / dt_s
+        integral, derivative, last_error = memory
+        if self._kd and last_error is not None:
+            slope = (error - last_error) / dt_s
             keep = exp(-dt_s / self._filter_s) if self._filter_s > 0.0 else 0.0
-            self._derivative = keep * self._derivative + (1.0 - keep) * slope
-        self._last_error = error
-        grown = self._integral + self._ki * error * dt_s
+            derivative = keep * derivative + (1.0 - keep) * slope
+        grown = integral + self._ki * error * dt_s
         grown = max(-self._integral_limit, min(self._integral_limit, grown))
-        free = self._kp * error + self._kd * self._derivative
+        free = self._kp * error + self._kd * derivative
         output = free + grown
         limit = self._output_limit
         # Integrating further into a saturated output would only have to be undone later.
-        if abs(output) <= limit or abs(free + grown) < abs(free + self._integral):
-            self._integral = grown
-        return max(-limit, min(limit, free + self._integral))
+        if abs(output) <= limit or abs(free + grown) < abs(free + integral):
+            integral = grown
+        return PidState(integral, derivative, error), max(-limit, min(limit, free + integral))
 
 
 class Profile(NamedTuple):
@@ -110,26 +111,46 @@ def clamped(value: float, limit: float) -> float:
 FEEDBACK_SHARE = 0.25
 
 
+class AxisState(NamedTuple):
+    """Progress of a motion.
+
+    ``planned``: position and speed of the plan now; ``slip``: the share by which the wheels travel further than the
+    body; ``duration_s``: bang-bang time of the motion.
+    """
+
+    duration_s: float
+    profile: Profile
+    t_s: float = 0.0
+    planned: tuple[float, float] = (0.0, 0.0)
+    slip: float = 0.0
+    pid: PidState = PidState()
+
+    @property
+    def is_overtime(self) -> bool:
+        """The plan is out."""
+        return self.t_s - self.duration_s >= 0.0
+
+
 class BareAxis:
     """PID of the remaining quantity, thesis eqs 3.1 to 3.4; ``a_max`` only serves the bang-bang time."""
 
     def __init__(self, gains: PidConfig, v_max: float, a_max: float) -> None:
         self._pid = Pid(gains, v_max)
         self._v_max, self._a_max = v_max, a_max
-        self.duration_s = self.overtime_s = 0.0
 
-    def begin(self, remaining: float) -> None:
-        """Start again."""
-        self._pid.reset()
-        self.duration_s = Profile.rest_to_rest(remaining, self._v_max, self._a_max).duration_s
+    def begin(self, remaining: float) -> AxisState:
+        """Start; such a motion has no plan, and is overtime at once."""
+        profile = Profile.rest_to_rest(remaining, self._v_max, self._a_max)
+        return AxisState(profile.duration_s, profile, t_s=profile.duration_s)
 
-    def is_over(self, remaining: float, tolerance: float, _speed: float | None) -> bool:
+    def is_over(self, _motion: AxisState, remaining: float, tolerance: float, _speed: float | None) -> bool:
         """Whether it is within tolerance, however fast."""
         return abs(remaining) <= tolerance
 
-    def step(self, remaining: float, dt_s: float, _speed: float | None) -> float:
+    def step(self, motion: AxisState, remaining: float, dt_s: float, _speed: float | None) -> tuple[AxisState, float]:
         """The PID's output."""
-        return self._pid.step(remaining, dt_s)
+        pid, output = self._pid.step(motion.pid, remaining, dt_s)
+        return motion._replace(pid=pid), output
 
 
 class ProfiledAxis:
@@ -143,7 +164,6 @@ class ProfiledAxis:
     wheels travel further than the body: it acts in proportion to the planned speed and is gone at the end, where an
     ordinary integral would still have to unwind. Kp e is bounded; where a plan ends further off than that brings home
     in time, a second motion follows. The derivative is the speed's own estimate, never a difference of poses.
-    ``duration_s``: bang-bang time of the motion begun last.
     """
 
     def __init__(self, gains: PidConfig, cfg: ControlConfig, v_max: float, a_max: float, lag_s: float) -> None:
@@ -153,46 +173,34 @@ class ProfiledAxis:
         self._slip_limit = cfg.slip_limit
         self._feedback_limit = FEEDBACK_SHARE * v_max
         self._stop_time_s = cfg.stop_time_s
-        self.begin(0.0)
 
-    def begin(self, remaining: float) -> None:
+    def begin(self, remaining: float) -> AxisState:
         """Plan the motion over ``remaining``."""
-        self._profile = Profile.rest_to_rest(remaining, self._v_max, self._a_max)
-        self.duration_s = self._profile.duration_s
-        self._t_s = self._slip = 0.0
-        self._planned = self._profile.at(0.0)
+        profile = Profile.rest_to_rest(remaining, self._v_max, self._a_max)
+        return AxisState(profile.duration_s, profile)
 
-    @property
-    def planned_speed(self) -> float:
-        """Speed that the plan has now."""
-        return self._planned[1]
-
-    @property
-    def overtime_s(self) -> float:
-        """Time spent after the plan's end, s; negative before."""
-        return self._t_s - self.duration_s
-
-    def is_over(self, remaining: float, tolerance: float, speed: float | None) -> bool:
+    def is_over(self, motion: AxisState, remaining: float, tolerance: float, speed: float | None) -> bool:
         """Whether the plan is out and what is left when the wheels have run down is within ``tolerance``."""
-        if self._t_s < self.duration_s:
+        if motion.t_s < motion.duration_s:
             return False
         coast = 0.0 if speed is None else speed * self._lag_s
         return abs(remaining - coast) <= tolerance
 
-    def renew_if_far(self, remaining: float) -> None:
-        """Plan another motion where the last one ended further off than feedback can bring it in time."""
-        if self.overtime_s >= 0.0 and abs(remaining) > 0.5 * self._feedback_limit * self._stop_time_s:
-            self.begin(remaining)
+    def renewed_if_far(self, motion: AxisState, remaining: float) -> AxisState:
+        """Another motion where the last one ended further off than feedback can bring it in time."""
+        if motion.is_overtime and abs(remaining) > 0.5 * self._feedback_limit * self._stop_time_s:
+            return self.begin(remaining)
+        return motion
 
-    def step(self, remaining: float, dt_s: float, speed: float | None) -> float:
-        """Set point for the next ``dt_s``, in the unit of the quantity per s."""
-        profile = self._profile
-        position, now = self._planned
-        self._t_s += dt_s
-        self._planned = profile.at(self._t_s)
+    def step(self, motion: AxisState, remaining: float, dt_s: float, speed: float | None) -> tuple[AxisState, float]:
+        """The motion ``dt_s`` later, and its set point until then, in the unit of the quantity per s."""
+        duration_s, profile, t_s, (position, now), slip, pid = motion
+        t_s += dt_s
+        planned = profile.at(t_s)
         error = remaining - (profile.distance - position)
         feedback = clamped(self._kp * error, self._feedback_limit)
-        self._slip = slip = clamped(self._slip + self._slip_gain * feedback * now * dt_s, self._slip_limit)
+        slip = clamped(slip + self._slip_gain * feedback * now * dt_s, self._slip_limit)
         if speed is not None:
             feedback += self._kd * (now - speed)
-        return (1.0 + slip) * lag_feed_forward(now, self._planned[1], dt_s, self._lag_s) + feedback
+        set_point = (1.0 + slip) * lag_feed_forward(now, planned[1], dt_s, self._lag_s) + feedback
+        return AxisState(duration_s, profile, t_s, planned, slip, pid), set_point

@@ -5,8 +5,8 @@ from enum import StrEnum
 from math import asin, atan2, cos, exp, hypot, pi, sin, sqrt
 from typing import NamedTuple
 
-from ccatp.config.models import ControlConfig, LimitsConfig
-from ccatp.control.pid import BareAxis, Pid, ProfiledAxis, clamped
+from ccatp.config.models import ControlConfig, GainsConfig, LimitsConfig
+from ccatp.control.pid import AxisState, BareAxis, Pid, PidState, ProfiledAxis, clamped
 from ccatp.core import Predicted, Twist, wrap_pi
 
 # Drift per metre beyond which an estimate is nonsense: a robot carried off that fast has lost its wheels' grip.
@@ -26,56 +26,58 @@ class LegView(NamedTuple):
     gain: float
 
 
-class LegLine:
+class LegLine(NamedTuple):
     """The straight line through the stop along which a leg is driven, held by its course alone.
 
     So it passes through the stop wherever an update moves that. A stop whose coordinates change is one seen in another
-    frame: from afar the line is laid again from the robot to the stop; nearer than ``lookahead_m`` it keeps its angle
-    to the robot, because the bearing of a near stop is noise.
+    frame: from afar the line is laid again from the robot to the stop; nearer than the look-ahead it keeps its angle to
+    the robot, because the bearing of a near stop is noise.
     """
 
-    __slots__ = ("_cos", "_course_rad", "_lookahead_m", "_off_rad", "_reverse", "_sin", "_target")
+    target: tuple[float, float]
+    course_rad: float
+    cos: float
+    sin: float
+    off_rad: float = 0.0
 
-    def __init__(self, lookahead_m: float) -> None:
-        self._lookahead_m = lookahead_m
-        self._target = (0.0, 0.0)
-        self._off_rad = 0.0
-        self._reverse = False
-        self._lay(0.0)
+    @classmethod
+    def lay(cls, target: tuple[float, float], course_rad: float) -> "LegLine":
+        """The line through a stop with a course."""
+        return cls(target, course_rad, cos(course_rad), sin(course_rad))
 
-    def begin(self, pose: tuple[float, float, float], target: tuple[float, float], reverse: bool) -> None:
-        """Lay the line from the robot to the stop."""
-        self._reverse, self._target = reverse, target
-        self._lay(atan2(target[1] - pose[1], target[0] - pose[0]))
-        self._off_rad = 0.0
+    @classmethod
+    def through(cls, pose: tuple[float, float, float], target: tuple[float, float]) -> "LegLine":
+        """The line from the robot at (x, y, heading) to the stop."""
+        return cls.lay(target, atan2(target[1] - pose[1], target[0] - pose[0]))
 
     def look(
-        self, pose: tuple[float, float, float], target: tuple[float, float], creep: tuple[float, float]
-    ) -> LegView:
-        """Where the robot at ``pose`` = (x, y, heading) stands.
+        self,
+        pose: tuple[float, float, float],
+        target: tuple[float, float],
+        creep: tuple[float, float],
+        reverse: bool,
+        lookahead_m: float,
+    ) -> "tuple[LegLine, LegView]":
+        """Where the robot at ``pose`` = (x, y, heading) stands, and the line as it is from now on.
 
         The body moves along its axis m and drifts by c per metre: (m + c) lies along the line when the part of m across
         it cancels that of c, ``sin(crab) = -c_across``; progress is ``cos(crab) + c_along``.
         """
         x, y, heading = pose
-        motion = heading + pi if self._reverse else heading
+        motion = heading + pi if reverse else heading
         dx, dy = target[0] - x, target[1] - y
-        if target != self._target:
-            self._move_to(target, motion, dx, dy, crab(self._course_rad, creep))
-        c, s = self._cos, self._sin
+        line = self
+        if target != self.target:
+            is_far = dx * dx + dy * dy > lookahead_m * lookahead_m
+            angle = crab(self.course_rad, creep)
+            line = LegLine.lay(target, atan2(dy, dx) if is_far else wrap_pi(motion - angle - self.off_rad))
+        _, course_rad, c, s, _ = line
         creep_x, creep_y = creep
         angle = -asin(clamped(c * creep_y - s * creep_x, CREEP_LIMIT))
-        self._off_rad = off = wrap_pi(motion - self._course_rad - angle)
+        off = wrap_pi(motion - course_rad - angle)
         along = clamped(c * creep_x + s * creep_y, CREEP_LIMIT)
-        return LegView(c * dx + s * dy, s * dx - c * dy, off, cos(angle) + along)
-
-    def _move_to(self, target: tuple[float, float], motion: float, dx: float, dy: float, angle: float) -> None:
-        self._target = target
-        is_far = dx * dx + dy * dy > self._lookahead_m * self._lookahead_m
-        self._lay(atan2(dy, dx) if is_far else wrap_pi(motion - angle - self._off_rad))
-
-    def _lay(self, course_rad: float) -> None:
-        self._course_rad, self._cos, self._sin = course_rad, cos(course_rad), sin(course_rad)
+        view = LegView(c * dx + s * dy, s * dx - c * dy, off, cos(angle) + along)
+        return LegLine(target, course_rad, c, s, off), view
 
 
 def crab(course_rad: float, creep: tuple[float, float]) -> float:
@@ -118,36 +120,59 @@ class LegPhase(StrEnum):
 TURN, DRIVE, DONE = LegPhase
 
 
+class LegMotion(NamedTuple):
+    """Progress of a leg or of a turn in place, as ``LegTracker`` makes it.
+
+    ``axis``: the turn or the way along the line, by ``phase``; ``aim``: stop and heading for which a turn began.
+    """
+
+    phase: LegPhase
+    is_slow: bool
+    reverse: bool
+    axis: AxisState
+    line: LegLine | None = None
+    aim: tuple[tuple[float, float], float] = ((0.0, 0.0), 0.0)
+    steering: PidState = PidState()
+
+    @property
+    def planned_s(self) -> float:
+        """Bang-bang time of the motion."""
+        return self.axis.duration_s
+
+
+class _Pace:
+    """Controllers for one set of speed limits."""
+
+    def __init__(self, gains: GainsConfig, control: ControlConfig, limits: LimitsConfig, wheel_lag_s: float) -> None:
+        v, a, omega, alpha = limits.v_max_m_s, limits.a_max_m_s2, limits.omega_max_rad_s, limits.alpha_max_rad_s2
+        self.along = ProfiledAxis(gains.forward, control, v, a, wheel_lag_s)
+        self.forward: BareAxis | ProfiledAxis = self.along
+        self.angular: BareAxis | ProfiledAxis = ProfiledAxis(gains.angular, control, omega, alpha, wheel_lag_s)
+        if not gains.shaped:
+            self.forward, self.angular = BareAxis(gains.forward, v, a), BareAxis(gains.angular, omega, alpha)
+        self.steering = Pid(gains.angular, omega)
+        self.omega_max = omega
+
+
 class LegTracker:
     """Drives one leg: turn in place to the bearing of the target, then move to it, forward or in reverse.
 
     Pose, target and creep (drift per metre of travel) are in one plane, usually the panel frame, which may change from
     step to step. A shaped set of gains drives along the line from where the drive begins; the thesis's heads for the
-    stop.
+    stop. The tracker keeps nothing: each step takes the motion and returns the next one. ``slow_limits``: of motions
+    that begin with ``is_slow``.
     """
 
-    def __init__(self, control: ControlConfig, limits: LimitsConfig, wheel_lag_s: float) -> None:
+    def __init__(
+        self, control: ControlConfig, limits: LimitsConfig, wheel_lag_s: float, slow_limits: LimitsConfig | None = None
+    ) -> None:
         gains = control.gain_sets[control.gains]
         self._control, self._shaped = control, gains.shaped
         self._position_tolerance_m = gains.position_tolerance_m
         self._heading_tolerance_rad = gains.heading_tolerance_rad
         self._straight_rad = max(control.straight_tolerance_rad, gains.heading_tolerance_rad)
-        self._forward: BareAxis | ProfiledAxis
-        self._angular: BareAxis | ProfiledAxis
-        v, a, omega, alpha = limits.v_max_m_s, limits.a_max_m_s2, limits.omega_max_rad_s, limits.alpha_max_rad_s2
-        self._along = ProfiledAxis(gains.forward, control, v, a, wheel_lag_s)
-        if gains.shaped:
-            self._forward = self._along
-            self._angular = ProfiledAxis(gains.angular, control, omega, alpha, wheel_lag_s)
-        else:
-            self._forward, self._angular = BareAxis(gains.forward, v, a), BareAxis(gains.angular, omega, alpha)
-        self._steering = Pid(gains.angular, omega)
-        self._line = LegLine(control.lookahead_m)
         self._steering_damping = gains.angular.kd
-        self._omega_max = omega
-        self._reverse = False
-        self._aim = (0.0, 0.0), 0.0  # stop and heading of the turn under way
-        self.phase = DONE
+        self._paces = tuple(_Pace(gains, control, one, wheel_lag_s) for one in (limits, slow_limits or limits))
 
     def begin(
         self,
@@ -155,80 +180,90 @@ class LegTracker:
         target: tuple[float, float],
         reverse: bool,
         creep: tuple[float, float] = NO_CREEP,
-    ) -> None:
+        *,
+        is_slow: bool = False,
+    ) -> LegMotion:
         """Start a leg from ``pose`` = (x, y, heading)."""
-        self._reverse = reverse
         if hypot(target[0] - pose[0], target[1] - pose[1]) <= self._position_tolerance_m:
-            self.phase = DONE  # it is there, and the bearing of a stop so near is noise
-            return
-        angle = self._bearing_error(pose, target, creep)
+            # It is there, and the bearing of a stop so near is noise.
+            return LegMotion(DONE, is_slow, reverse, self._paces[is_slow].forward.begin(0.0))
+        angle = self._bearing_error(pose, target, creep, reverse)
         if abs(angle) > self._straight_rad:
-            self._begin_alignment(pose, target, angle)
-        else:
-            self._begin_drive(pose, target)
+            return self._begin_alignment(pose, target, angle, reverse, is_slow)
+        return self._begin_drive(pose, target, reverse, is_slow)
 
-    def begin_turn(self, angle_rad: float) -> None:
+    def begin_turn(self, angle_rad: float, *, is_slow: bool = False) -> LegMotion:
         """Start a turn in place by ``angle_rad`` (use with ``step_turn``)."""
-        self.phase = TURN
-        self._angular.begin(angle_rad)
+        return LegMotion(TURN, is_slow, False, self._paces[is_slow].angular.begin(angle_rad))
 
-    @property
-    def planned_s(self) -> float:
-        """Bang-bang time of the motion begun last."""
-        return self._angular.duration_s if self.phase is TURN else self._forward.duration_s
-
-    def step_turn(self, remaining_rad: float, dt_s: float, rate_rad_s: float | None = None) -> Twist:
+    def step_turn(
+        self, motion: LegMotion, remaining_rad: float, dt_s: float, rate_rad_s: float | None = None
+    ) -> tuple[LegMotion, Twist]:
         """One step of a turn in place; ``phase`` becomes DONE when it is over."""
-        if self._angular.is_over(remaining_rad, self._heading_tolerance_rad, rate_rad_s):
-            self.phase = DONE
-            return STILL
-        return Twist(0.0, self._angular.step(remaining_rad, dt_s, rate_rad_s))
+        angular = self._paces[motion.is_slow].angular
+        if angular.is_over(motion.axis, remaining_rad, self._heading_tolerance_rad, rate_rad_s):
+            return motion._replace(phase=DONE), STILL
+        axis, rate = angular.step(motion.axis, remaining_rad, dt_s, rate_rad_s)
+        return motion._replace(axis=axis), Twist(0.0, rate)
 
     def step(
         self,
+        motion: LegMotion,
         pose: tuple[float, float, float],
         target: tuple[float, float],
         dt_s: float,
         speeds: Twist | Predicted | None = None,
         creep: tuple[float, float] = NO_CREEP,
-    ) -> Twist:
-        """Twist for the next ``dt_s``; ``pose`` is that at which it will take effect."""
-        if self.phase is TURN:
-            angle = self._bearing_error(pose, target, creep)
-            rate = None if speeds is None else speeds.omega_rad_s
-            if self._angular.overtime_s >= 0.0 and self._has_run_away(pose, target, angle):
-                self.phase = DONE
-                return STILL
-            if not self._angular.is_over(angle, self._heading_tolerance_rad, rate):
-                return Twist(0.0, self._angular.step(angle, dt_s, rate))
-            self._begin_drive(pose, target)
-        if self.phase is DONE:
-            return STILL
-        return self._drive(pose, target, dt_s, speeds, creep) if self._shaped else self._head_on(pose, target, dt_s)
+    ) -> tuple[LegMotion, Twist]:
+        """The next motion, and the twist for ``dt_s``; ``pose`` is that at which it will take effect."""
+        if motion.phase is TURN:
+            angle = self._bearing_error(pose, target, creep, motion.reverse)
+            rate_rad_s = None if speeds is None else speeds.omega_rad_s
+            if motion.axis.is_overtime:
+                motion, has_run_away = self._look_at_bearing(motion, pose, target, angle)
+                if has_run_away:
+                    return motion._replace(phase=DONE), STILL
+            angular = self._paces[motion.is_slow].angular
+            if not angular.is_over(motion.axis, angle, self._heading_tolerance_rad, rate_rad_s):
+                axis, rate = angular.step(motion.axis, angle, dt_s, rate_rad_s)
+                return motion._replace(axis=axis), Twist(0.0, rate)
+            motion = self._begin_drive(pose, target, motion.reverse, motion.is_slow)
+        if motion.phase is DONE:
+            return motion, STILL
+        if self._shaped:
+            return self._drive(motion, pose, target, dt_s, speeds, creep)
+        return self._head_on(motion, pose, target, dt_s)
 
-    def _begin_alignment(self, pose: tuple[float, float, float], target: tuple[float, float], angle_rad: float) -> None:
-        self.phase = TURN
-        self._aim = target, pose[2] + angle_rad
-        self._angular.begin(angle_rad)
+    def _begin_alignment(
+        self,
+        pose: tuple[float, float, float],
+        target: tuple[float, float],
+        angle_rad: float,
+        reverse: bool,
+        is_slow: bool,
+    ) -> LegMotion:
+        axis = self._paces[is_slow].angular.begin(angle_rad)
+        return LegMotion(TURN, is_slow, reverse, axis, aim=(target, pose[2] + angle_rad))
 
-    def _has_run_away(self, pose: tuple[float, float, float], target: tuple[float, float], angle_rad: float) -> bool:
+    def _look_at_bearing(
+        self, motion: LegMotion, pose: tuple[float, float, float], target: tuple[float, float], angle_rad: float
+    ) -> tuple[LegMotion, bool]:
         """Whether a stop that is all but reached lies on another bearing than the turn began for (same frame)."""
         if hypot(target[0] - pose[0], target[1] - pose[1]) > ALL_BUT_THERE_M:
-            return False
-        aimed_at, heading_rad = self._aim
+            return motion, False
+        aimed_at, heading_rad = motion.aim
         if target != aimed_at:
-            self._aim = target, pose[2] + angle_rad
-            return False
-        return abs(wrap_pi(pose[2] + angle_rad - heading_rad)) > REALIGN_RAD
+            return motion._replace(aim=(target, pose[2] + angle_rad)), False
+        return motion, abs(wrap_pi(pose[2] + angle_rad - heading_rad)) > REALIGN_RAD
 
-    def _begin_drive(self, pose: tuple[float, float, float], target: tuple[float, float]) -> None:
-        self.phase = DRIVE
-        self._line.begin(pose, target, self._reverse)
-        self._forward.begin(hypot(target[0] - pose[0], target[1] - pose[1]))
-        self._steering.reset()
+    def _begin_drive(
+        self, pose: tuple[float, float, float], target: tuple[float, float], reverse: bool, is_slow: bool
+    ) -> LegMotion:
+        axis = self._paces[is_slow].forward.begin(hypot(target[0] - pose[0], target[1] - pose[1]))
+        return LegMotion(DRIVE, is_slow, reverse, axis, LegLine.through(pose, target))
 
     def _bearing_error(
-        self, pose: tuple[float, float, float], target: tuple[float, float], creep: tuple[float, float]
+        self, pose: tuple[float, float, float], target: tuple[float, float], creep: tuple[float, float], reverse: bool
     ) -> float:
         """Thesis eq. 3.2, e = beta - theta with beta = atan2(dy, dx); printed there with the arguments exchanged.
 
@@ -236,51 +271,57 @@ class LegTracker:
         """
         beta = atan2(target[1] - pose[1], target[0] - pose[0])
         beta += crab(beta, creep) if self._shaped else 0.0
-        return wrap_pi(beta - pose[2] - (pi if self._reverse else 0.0))
+        return wrap_pi(beta - pose[2] - (pi if reverse else 0.0))
 
     def _drive(
         self,
+        motion: LegMotion,
         pose: tuple[float, float, float],
         target: tuple[float, float],
         dt_s: float,
         speeds: Twist | Predicted | None,
         creep: tuple[float, float],
-    ) -> Twist:
-        control, axis = self._control, self._along
-        sight = self._line.look(pose, target, creep)
-        sign = -1.0 if self._reverse else 1.0
-        ahead_m, gain = sight.ahead_m, sight.gain
+    ) -> tuple[LegMotion, Twist]:
+        control, pace = self._control, self._paces[motion.is_slow]
+        _, is_slow, reverse, axis, line, aim, steering = motion
+        line, view = (line or LegLine.through(pose, target)).look(pose, target, creep, reverse, control.lookahead_m)
+        sign = -1.0 if reverse else 1.0
+        ahead_m, gain = view.ahead_m, view.gain
         speed = None if speeds is None else sign * speeds.v_m_s * gain
-        if axis.overtime_s >= 0.0:
-            axis.renew_if_far(ahead_m)
-            if axis.is_over(ahead_m, control.stop_tolerance_m, speed) or axis.overtime_s >= control.stop_time_s:
-                self.phase = DONE
-                return STILL
-        planned = axis.planned_speed
-        wanted = axis.step(ahead_m, dt_s, speed) / gain
-        rate = line_rate(sight, planned, control.cross_track_gain_rad_m2, control.heading_weight_1_s2)
+        if axis.is_overtime:
+            axis = pace.along.renewed_if_far(axis, ahead_m)
+            is_late = axis.t_s - axis.duration_s >= control.stop_time_s
+            if pace.along.is_over(axis, ahead_m, control.stop_tolerance_m, speed) or is_late:
+                return motion._replace(phase=DONE), STILL
+        planned = axis.planned[1]
+        axis, wanted = pace.along.step(axis, ahead_m, dt_s, speed)
+        wanted /= gain
+        rate = line_rate(view, planned, control.cross_track_gain_rad_m2, control.heading_weight_1_s2)
         if speeds is not None:
             rate += self._steering_damping * (rate - speeds.omega_rad_s)
-        return Twist(sign * wanted, clamped(rate, self._omega_max))
+        next_motion = LegMotion(DRIVE, is_slow, reverse, axis, line, aim, steering)
+        return next_motion, Twist(sign * wanted, clamped(rate, pace.omega_max))
 
-    def _head_on(self, pose: tuple[float, float, float], target: tuple[float, float], dt_s: float) -> Twist:
+    def _head_on(
+        self, motion: LegMotion, pose: tuple[float, float, float], target: tuple[float, float], dt_s: float
+    ) -> tuple[LegMotion, Twist]:
         """The thesis's drive: one PID on the distance, one on the bearing, eqs 3.1 to 3.4."""
         x, y, heading = pose
         dx, dy = target[0] - x, target[1] - y
         c, s = cos(heading), sin(heading)
         ahead, left = c * dx + s * dy, c * dy - s * dx
-        if self._reverse:
+        if motion.reverse:
             ahead, left = -ahead, -left
         remaining = hypot(ahead, left)
-        if self._forward.is_over(remaining, self._position_tolerance_m, None):
-            self.phase = DONE
-            return STILL
+        pace = self._paces[motion.is_slow]
+        if pace.forward.is_over(motion.axis, remaining, self._position_tolerance_m, None):
+            return motion._replace(phase=DONE), STILL
         error = atan2(left, ahead)
         if abs(error) > REALIGN_RAD:
-            self._begin_alignment(pose, target, error)
-            return STILL
-        speed = self._forward.step(remaining, dt_s, None)
-        return Twist(-speed if self._reverse else speed, self._steering.step(error, dt_s))
+            return self._begin_alignment(pose, target, error, motion.reverse, motion.is_slow), STILL
+        axis, speed = pace.forward.step(motion.axis, remaining, dt_s, None)
+        steering, rate = pace.steering.step(motion.steering, error, dt_s)
+        return motion._replace(axis=axis, steering=steering), Twist(-speed if motion.reverse else speed, rate)
 
 
 Pose = tuple[float, float, float]

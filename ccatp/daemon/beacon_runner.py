@@ -38,6 +38,7 @@ from ccatp.links.topics import (
     RobotShape,
     Scene,
 )
+from ccatp.survey.state import Fault
 
 if TYPE_CHECKING:
     from ccatp.daemon.main_loop import MainLoop
@@ -74,18 +75,18 @@ class BeaconRunner(MissionRunner):
         return abs(self._speed_m_s) <= self._cfg.mission.settle_speed_m_s
 
     def status(self) -> MissionStatus:
-        mission = self.mission
+        mission, state = self.mission, self.mission.state
         at = mission.next_waypoint
         return MissionStatus(
             seq=self._clock.seq,
             t_s=self._clock.t_s,
-            state=str(mission.state),
-            cause=mission.cause,
+            state=str(state.mode),
+            cause=state.cause,
             done=mission.done,
             total=mission.total,
             point=f"waypoint {at + 1}" if at >= 0 else "",
             error_mm=1e3 * mission.navigator.belief.sigma_m,
-            outcome=str(mission.outcome),
+            outcome=str(state.outcome),
         )
 
     def display_state(self) -> DisplayState:
@@ -113,22 +114,23 @@ class BeaconRunner(MissionRunner):
     def on_tracking_gap(self) -> None:
         """A fault: the robot's place is not known, and its map depends on that."""
         self._reader.forget()
-        self.mission.fault("no frames while the robot moved: put it at its start and start a new mission")
+        self.mission.handle(Fault("no frames while the robot moved: put it at its start and start a new mission"))
 
     def publish_state(self) -> None:
-        mission, before, was_faulted = self.mission, self._state, self._was_faulted
-        if mission.state is before and mission.is_faulted is was_faulted:
+        state, before, was_faulted = self.mission.state, self._state, self._was_faulted
+        mode = state.mode
+        if mode is before and state.is_faulted is was_faulted:
             return
-        self._state, self._was_faulted = mission.state, mission.is_faulted
-        self.telemetry.log.debug("state_changed", seq=self._clock.seq, before=before, after=mission.state)
-        if HELD in (mission.state, before) or mission.state is RETURNING:
-            text = f"{mission.state}: {mission.cause}" if mission.cause else f"{mission.state}"
+        self._state, self._was_faulted = mode, state.is_faulted
+        self.telemetry.log.debug("state_changed", seq=self._clock.seq, before=before, after=mode)
+        if HELD in (mode, before) or mode is RETURNING:
+            text = f"{mode}: {state.cause}" if state.cause else f"{mode}"
             self.telemetry.notify_operator("warning", text)
             self._store.record_event(self._clock.t_s, "warning", text)
-        if mission.state is DONE:
+        if mode is DONE:
             self._publish_map(self.telemetry.seq, self.telemetry.t_s)
-            self._loop.finish(EXIT_STATUS[mission.outcome])
-        elif mission.is_faulted and self._loop.is_lockstep:
+            self._loop.finish(EXIT_STATUS[state.outcome])
+        elif state.is_faulted and self._loop.is_lockstep:
             # No operator can react while simulated time runs at many times the wall clock.
             self._publish_map(self.telemetry.seq, self.telemetry.t_s)
             self._loop.finish(ExitStatus.HELD)
@@ -157,7 +159,7 @@ class BeaconRunner(MissionRunner):
         if self._measurements is None:
             raise RuntimeError("plan comes after estimate")
         drive = mission.step(self._measurements, self._loop.frame_period_s, verdict)
-        if mission.state is DONE:
+        if mission.state.mode is DONE:
             drive = HALT
         self._speed_m_s = drive.speed_m_s
         return DriveCommand(*wheel_rates(drive, self._cfg))

@@ -16,9 +16,19 @@ from ccatp.records.checkpoint import FILE, Checkpoint, CheckpointFile, read_chec
 from ccatp.records.store import MissionStore, PlannedPoint, StoreError
 from ccatp.survey.composition import SurveyParts, assemble
 from ccatp.survey.heading_recovery import TakeoverState, doubted
-from ccatp.survey.mission import Mission
 from ccatp.survey.planning.route import ORDERS
-from ccatp.survey.state import HELD, IDLE, MEASURING, SETTLING, MissionState, SurveyOutcome
+from ccatp.survey.state import (
+    HELD,
+    IDLE,
+    MEASURING,
+    SETTLING,
+    EmergencyKnown,
+    MissionState,
+    Pause,
+    SurveyOutcome,
+    SurveyState,
+)
+from ccatp.survey.statechart import Mission
 
 # Frames between two records: ten a second.
 PERIOD_FRAMES = 10
@@ -42,17 +52,17 @@ class CheckpointWriter:
     def write_if_due(self, seq: int, t_s: float, elapsed_s: float) -> None:
         """Write in every tenth frame, and in each while the mission is held."""
         self._left -= 1
-        if self._left <= 0 or self._mission.state is HELD:
+        if self._left <= 0 or self._mission.state.mode is HELD:
             self.write(seq, t_s, elapsed_s)
 
     def write(self, seq: int, t_s: float, elapsed_s: float) -> None:
         """Write the state of frame ``seq``; durably where abort or hold changed."""
-        localizer, mission = self._localizer, self._mission
+        localizer, state = self._localizer, self._mission.state
         self._left = PERIOD_FRAMES
-        in_force = in_force_of(mission)
+        in_force = in_force_of(state)
         has_changed, self._in_force = in_force != self._in_force, in_force
-        if mission.done:
-            self._last_fix = "{}-{}-{}".format(*mission.done[-1])
+        if state.done:
+            self._last_fix = "{}-{}-{}".format(*state.done[-1])
         pose, sigma_m, sigma_rad = localizer.deck_pose, localizer.position_sigma_m, localizer.heading_sigma_rad
         if not all(map(math.isfinite, (pose.x_m, pose.y_m, pose.heading_rad, sigma_m, sigma_rad))):
             return  # the last good one is a better guess
@@ -69,7 +79,7 @@ class CheckpointWriter:
             heading_sigma_rad=sigma_rad,
             speed_m_s=localizer.speed_m_s,
             rate_rad_s=localizer.rate_rad_s,
-            state=str(mission.state),
+            state=str(state.mode),
             abort_cause=in_force[0],
             held_cause=in_force[1],
             elapsed_s=elapsed_s,
@@ -82,14 +92,14 @@ class CheckpointWriter:
         self._file.close()
 
 
-def in_force_of(mission: Mission) -> tuple[str, str]:
+def in_force_of(state: SurveyState) -> tuple[str, str]:
     """Cause of an abort, and of a hold that needs an operator; empty without one.
 
     A survey that was stopped on its way home goes home when it is resumed. An earthquake is kept by the danger loop.
     """
-    if mission.state is MissionState.DONE and mission.outcome is not SurveyOutcome.STOPPED:
+    if state.mode is MissionState.DONE and state.outcome is not SurveyOutcome.STOPPED:
         return "", ""
-    return mission.abort_cause, mission.cause if mission.is_held_by_hand else ""
+    return state.abort_cause, state.cause if state.is_held_by_hand else ""
 
 
 def recovery_from(
@@ -152,8 +162,8 @@ def build_parts(cfg: Config, args: ProcessArgs) -> tuple[SurveyParts, MissionSto
     if recovery is None and args.is_held:
         latched = [f"'ccatp clear {one}'" for one in active_ids(args.run_dir / EMERGENCIES)]
         before = f"the last run ended with an emergency that is not cleared: {', '.join(latched)}; " if latched else ""
-        parts.mission.pause(before + _why_held(len(done), points))
-        parts.mission.skip_present_emergency()
+        parts.mission.handle(Pause(before + _why_held(len(done), points)))
+        parts.mission.handle(EmergencyKnown())
     return parts, store
 
 

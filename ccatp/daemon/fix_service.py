@@ -14,9 +14,9 @@ from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
 from ccatp.links.topics import FixMessage
 from ccatp.localizer import Localizer
 from ccatp.records.store import AlreadyMeasuredError, MissionStore, StoreError
-from ccatp.survey.fix_gate import FixGate
-from ccatp.survey.mission import Mission
-from ccatp.survey.state import ApproachCounter
+from ccatp.survey.fix_gate import ApproachCounter, FixGate
+from ccatp.survey.state import Fault, FixFailed, FixStored, PointMissed
+from ccatp.survey.statechart import Mission
 
 # A commit takes milliseconds, on a busy disk a second. A longer one is reported, a much longer one holds the robot.
 SLOW_DISK_S = 2.0
@@ -46,6 +46,7 @@ class FixService:
     Args:
         on_finished: called after each measurement, successful or not.
         between_s: wait for new lengths before measuring again at the same place.
+        heading_sigma_of: returns the standard deviation of the heading, rad.
 
     Attributes:
         is_busy: from ``begin`` to the end of the measurement.
@@ -63,12 +64,13 @@ class FixService:
         telemetry: Telemetry,
         on_finished: Callable[[], None],
         between_s: Callable[[], float],
+        heading_sigma_of: Callable[[], float] = float,
     ) -> None:
         self._tolerance_m = cfg.arrival_tolerance_m
         self._approaches = ApproachCounter(cfg.correction_tolerance_m, cfg.max_approaches)
         self._client, self._localizer, self._mission = client, localizer, mission
         self._store, self._telemetry, self._on_finished, self._between_s = store, telemetry, on_finished, between_s
-        self._fix_gate, self._notify = fix_gate, telemetry.notify_operator
+        self._fix_gate, self._notify, self._heading_sigma_of = fix_gate, telemetry.notify_operator, heading_sigma_of
         self._timeout_s = cfg.measure_timeout_s
         self._wanted: FixRequest | None = None
         self._wakes = asyncio.Event()
@@ -95,7 +97,8 @@ class FixService:
 
     def _is_wanted(self, request: FixRequest) -> bool:
         """Not after a pause or an edge: the robot may have moved."""
-        return self._mission.is_awaiting_fix and self._mission.request == request.number
+        state = self._mission.state
+        return state.is_awaiting_fix and state.request == request.number
 
     async def _serve(self, request: FixRequest) -> None:
         """Measure, again where the fix is doubted, all within the time that a point may take."""
@@ -126,7 +129,7 @@ class FixService:
         """Hand a fix to the localizer, unless it is doubted; why it is, or empty."""
         localizer = self._localizer
         finding = self._fix_gate.review(
-            fix, request.expected_m, request.estimate, localizer.pose_covariance, is_lost=self._mission.is_lost
+            fix, request.expected_m, request.estimate, localizer.pose_covariance, is_lost=self._mission.state.is_lost
         )
         doubt, jump_m = finding.doubt or finding.refusal, 0.0
         is_set_aside = bool(doubt)
@@ -163,7 +166,7 @@ class FixService:
         if isinstance(error, FrameRefused):
             self._notify("error", str(error))
             if self._is_wanted(request):
-                self._mission.fault(str(error))
+                self._mission.handle(Fault(str(error)))
             return
         self._notify("warning", f"measurement of {_name(request.point)} failed: {why}")
         if self._is_wanted(request):
@@ -174,25 +177,26 @@ class FixService:
             try:
                 await self._await_commit(self._store.record_skipped(request.point, request.t_s), request.point)
             except StoreError as error:
-                self._mission.fault(f"that {_name(request.point)} is skipped cannot be stored: {error}")
+                self._mission.handle(Fault(f"that {_name(request.point)} is skipped cannot be stored: {error}"))
                 return
-        self._mission.not_fixed(request.point, cause)
+        self._mission.handle(FixFailed(request.point, cause, self._heading_sigma_of()))
 
     async def _store_fix(self, request: FixRequest, fix: Fix) -> None:
         """The localizer has taken the fix: store it where the robot is near enough to the point."""
         if request.point is not None:
-            self.arrival_error_m = self._mission.survey_route.distance_m(self._localizer.pose)
+            mission = self._mission
+            self.arrival_error_m = mission.survey.follower.distance_m(mission.state.stop, self._localizer.pose)
             if self._is_too_far(request.point):
-                self._mission.again()
+                mission.handle(PointMissed())
                 return
             try:
                 await self._await_commit(self._store.record_fix(request.point, fix, request.estimate), request.point)
             except AlreadyMeasuredError as error:
                 self._notify("warning", str(error))  # nothing is lost, and nobody has to be waited for
             except StoreError as error:
-                self._mission.fault(f"the fix of {_name(request.point)} cannot be stored: {error}")
+                mission.handle(Fault(f"the fix of {_name(request.point)} cannot be stored: {error}"))
                 return
-        self._mission.fixed(request.point)
+        self._mission.handle(FixStored(request.point, self._heading_sigma_of()))
 
     async def _await_commit(self, commit: "Future[Any]", point: PointId) -> None:
         """Wait for a commit. On a disk that stalls the robot stands here, and after a while is held for an operator.
@@ -207,7 +211,7 @@ class FixService:
                 self._notify("warning", f"the disk is slow: {_name(point)} waits for its commit")
                 await asyncio.wait([waiting], timeout=STALLED_DISK_S - SLOW_DISK_S)
             if not waiting.done():
-                self._mission.fault(f"the disk stalls: {_name(point)} is not stored after {STALLED_DISK_S:g} s")
+                self._mission.handle(Fault(f"the disk stalls: {_name(point)} is not stored after {STALLED_DISK_S:g} s"))
                 self._on_finished()
             await waiting
         finally:

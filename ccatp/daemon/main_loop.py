@@ -22,6 +22,7 @@ from ccatp.links.channels import BadRequest, OperatorCommand, format_error, form
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.rpc import Router
 from ccatp.links.topics import MissionStatus
+from ccatp.survey.state import Abort, Interrupted, Pause, Resume, StopHere
 
 # After the end the last messages must reach the supervisor, which then ends this process.
 SHUTDOWN_TIMEOUT_S = 5.0
@@ -107,7 +108,7 @@ class MainLoop(RobotLoop):
         # The robot's motion since the last frame shows in the next one, if that comes soon.
         self._was_at_rest = self._runner.is_at_rest
         self.heartbeat.phase, self._unanswered = "rejoining", None
-        self._runner.mission.interrupt(f"robot link lost: {reason}")
+        self._runner.mission.handle(Interrupted(f"robot link lost: {reason}"))
         self._telemetry.notify_operator("warning", f"robot link lost: {reason}; reconnecting")
 
     def _fail(self, error: Exception) -> None:
@@ -152,15 +153,22 @@ class MainLoop(RobotLoop):
         self._telemetry.flush(BATCH_WALL_S)
         if self.heartbeat.phase != "starting":
             self._publish_status()
-        if self._runner.mission.is_paused and not self._runner.is_busy:
+        if self._runner.mission.state.is_paused and not self._runner.is_busy:
             self._answer_held_frame()  # a frame now and then, so that an emergency acts in a pause, too
 
     def on_silence(self, age_s: float) -> None:
         if age_s <= self.robot_cfg.sensors_timeout_s:
             return
-        if self._runner.mission.interrupt(f"no sensors frame for {age_s:.2f} s"):
-            self._telemetry.notify_operator("warning", self._runner.mission.cause)
+        if self._interrupt(f"no sensors frame for {age_s:.2f} s"):
+            self._telemetry.notify_operator("warning", self._runner.mission.state.cause)
             self.send_drive(self.clock.seq, STILL)
+
+    def _interrupt(self, cause: str) -> bool:
+        """Hold the mission until frames are fresh; whether it was not held before."""
+        mission = self._runner.mission
+        before = mission.state
+        mission.handle(Interrupted(cause))
+        return mission.state is not before
 
     def _publish_status(self) -> None:
         self._telemetry.send("mission", self.status())
@@ -205,14 +213,12 @@ class MainLoop(RobotLoop):
         return format_ok(status=msgspec.to_builtins(self.status()))
 
     def _apply(self, command: OperatorCommand) -> str | None:
-        mission = self._runner.mission
-        if command is OperatorCommand.PAUSE:
-            return mission.pause("operator")
-        if command is OperatorCommand.RESUME:
-            return mission.resume()
-        if command is OperatorCommand.ABORT:
-            return mission.abort("operator")
-        return mission.stop()
+        events: dict[OperatorCommand, Pause | Resume | Abort] = {
+            OperatorCommand.PAUSE: Pause("operator"),
+            OperatorCommand.RESUME: Resume(),
+            OperatorCommand.ABORT: Abort("operator"),
+        }
+        return self._runner.mission.handle(events.get(command, StopHere()))
 
     # -- the frame ------------------------------------------------------------------------------------------------
 
@@ -270,7 +276,7 @@ class MainLoop(RobotLoop):
                 return runner.hold(frame)
             verdict = None
             # Paused until frames are prompt again.
-            if runner.mission.interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):
+            if self._interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):
                 lateness_ms, limit_ms = 1e3 * lag_s, 1e3 * limit_s
                 self.log.warning("frame_late", seq=self.clock.seq, lateness_ms=lateness_ms, limit_ms=limit_ms)
         drive = runner.plan(frame, verdict, lag_s)
@@ -293,7 +299,7 @@ class MainLoop(RobotLoop):
         if not self.is_lockstep:
             return True
         runner = self._runner
-        return not runner.is_busy and not (runner.mission.is_paused and runner.is_at_rest)
+        return not runner.is_busy and not (runner.mission.state.is_paused and runner.is_at_rest)
 
     def _answer(self, seq: int, drive: DriveCommand) -> None:
         if self._may_answer():

@@ -20,7 +20,7 @@ from ccatp.survey.state import SurveyOutcome
 
 if TYPE_CHECKING:  # each main loop imports its own
     from ccatp.beacons.mission import BeaconMission
-    from ccatp.survey.mission import Mission
+    from ccatp.survey.statechart import Mission
 
 EXIT_STATUS = {
     SurveyOutcome.COMPLETE: ExitStatus.COMPLETE,
@@ -210,7 +210,7 @@ class MissionRunner(ABC):
             y_m=y_m,
             heading_rad=heading_rad,
             sigma_m=sigma_m,
-            state=str(self.mission.state),
+            state=str(self.mission.state.mode),
             commanded=commanded,
             drive_seq=drive_seq,
         )

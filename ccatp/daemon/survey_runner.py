@@ -28,14 +28,22 @@ from ccatp.links.topics import (
 )
 from ccatp.records.store import MissionStore
 from ccatp.safety.wheel_monitors import CommandSpan
-from ccatp.survey.behaviours import home_time_s
+from ccatp.survey.behaviours import HOLD_POSITION, MissionCommand
+from ccatp.survey.budget import home_time_s
 from ccatp.survey.composition import SurveyParts
 from ccatp.survey.fix_gate import FixGate
-from ccatp.survey.mission import Mission
 from ccatp.survey.reactions import FaultAction, MirrorCheck, UnattendedFaultTimer
 from ccatp.survey.route_follower import StateEstimate
-from ccatp.survey.state import MissionState, SurveyOutcome, by_reason
-from ccatp.survey.stops import HOLD_POSITION, MissionCommand
+from ccatp.survey.state import (
+    Abort,
+    EstimateDiverged,
+    Fault,
+    MissionState,
+    SurveyOutcome,
+    TrackingGap,
+    by_reason,
+)
+from ccatp.survey.statechart import Mission
 
 if TYPE_CHECKING:
     from ccatp.daemon.main_loop import MainLoop
@@ -109,6 +117,7 @@ class SurveyRunner(MissionRunner):
             loop.release_time,
             # lockstep time stands still meanwhile
             lambda: 0.0 if loop.is_lockstep else cfg.etalon.measuring_time_s,
+            parts.heading_sigma_rad,
         )
         self._checkpoint = CheckpointWriter(args.run_dir, parts.localizer, self.mission, not args.is_realtime)
         self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
@@ -132,25 +141,24 @@ class SurveyRunner(MissionRunner):
         )
 
     def status(self) -> MissionStatus:
-        mission = self.mission
-        stop = mission.follower.current
-        point = stop.point if stop is not None else None
-        if mission.is_paused:
-            point = mission.survey_route.next_point
+        state, survey = self.mission.state, self.mission.survey
+        point = state.measuring_point
+        if state.is_paused:
+            point = state.next_point
         return MissionStatus(
             seq=self._clock.seq,
             t_s=self._clock.t_s,
-            state=str(mission.state),
-            cause=mission.cause,
-            done=len(mission.done) + self._parts.already_done,
-            skipped=len(mission.skipped),
+            state=str(state.mode),
+            cause=state.cause,
+            done=len(state.done) + self._parts.already_done,
+            skipped=len(state.skipped),
             total=self._parts.total_points,
             point=f"{point.row}-{point.col}-{point.point}" if point is not None else "",
-            eta_s=round(mission.eta_s, 3),
+            eta_s=round(state.eta_s, 3),
             error_mm=1e3 * self._fix_service.arrival_error_m,
-            outcome=str(mission.outcome),
+            outcome=str(state.outcome),
             lower_bound_s=self._parts.lower_bound_s,
-            left_out=dict(by_reason(mission.left_out)),
+            left_out=by_reason(survey.left_out(state)),
         )
 
     def display_state(self) -> DisplayState:
@@ -208,7 +216,7 @@ class SurveyRunner(MissionRunner):
             self._loop.link.send_fans(self._fans_seq, duty)
         else:
             self.telemetry.notify_operator("error", refusal)
-            self.mission.fault(refusal)
+            self.mission.handle(Fault(refusal))
 
     def on_drive(self, seq: int, right_rad_s: float, left_rad_s: float) -> None:
         robot = self._cfg.robot
@@ -218,7 +226,7 @@ class SurveyRunner(MissionRunner):
         self._predictor.sent(seq, twist.v_m_s, twist.omega_rad_s)
 
     def on_tracking_gap(self) -> None:
-        self.mission.on_tracking_gap()
+        self.mission.handle(TrackingGap())
 
     def save_checkpoint(self) -> None:
         self._checkpoint.write(self._clock.seq, self._clock.t_s, self._clock.elapsed_s)
@@ -239,7 +247,7 @@ class SurveyRunner(MissionRunner):
         if recovery is not None:  # a replay has to know where the localizer of a loop that takes over begins
             pose, sigmas = recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad)
             self._publish_treatment(sensors, "begun", (pose.x_m, pose.y_m, pose.heading_rad, *sigmas))
-        is_odometry_off = mission.rejects_odometry
+        is_odometry_off = mission.state.rejects_odometry
         if is_odometry_off is not self._is_odometry_off:
             self._is_odometry_off = is_odometry_off
             self._publish_treatment(sensors, "odometry_off" if is_odometry_off else "odometry_on")
@@ -247,7 +255,7 @@ class SurveyRunner(MissionRunner):
         localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
         if localizer.hold_requested:
             # A filter that diverged is frozen until it has a fix.
-            mission.recover(localizer.hold_cause, frame.t_s)
+            mission.handle(EstimateDiverged(localizer.hold_cause, frame.t_s))
             localizer.clear_hold()
         self._motion = self._state_estimate(frame) if frame.dt_s > 0.0 else None
 
@@ -257,7 +265,9 @@ class SurveyRunner(MissionRunner):
         place = pose.x_m, pose.y_m, pose.heading_rad
         ahead = self._predictor.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
         return StateEstimate(
-            frame.t_s, frame.dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, self._position_sigma_m
+            *(frame.t_s, frame.dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead),
+            sigma_of=self._position_sigma_m,
+            heading_sigma_of=self._parts.heading_sigma_rad,
         )
 
     def _position_sigma_m(self) -> float:
@@ -269,8 +279,9 @@ class SurveyRunner(MissionRunner):
         if motion is None:
             raise RuntimeError("plan comes after estimate, and not for a stale frame")
         command = mission.step(motion, verdict) if self._is_on_mirror(frame.sensors) else HOLD_POSITION
-        self._apply_requests(frame.sensors)
-        right, left = self._gate.pass_through(command.twist, verdict, motion.dt_s, motion.t_s, lag_s, mission.purpose)
+        self._apply_requests(frame.sensors, command)
+        purpose = mission.state.purpose
+        right, left = self._gate.pass_through(command.twist, verdict, motion.dt_s, motion.t_s, lag_s, purpose)
         self._gate_log.update(motion.t_s)
         if command.at_rest or command.measure:
             self._execute(command, motion)
@@ -304,36 +315,36 @@ class SurveyRunner(MissionRunner):
             return False
         return self._mirror_check is None or self._loop.is_lockstep
 
-    def _apply_requests(self, sensors: Sensors) -> None:
+    def _apply_requests(self, sensors: Sensors, command: MissionCommand) -> None:
         """Requests of the mission besides the drive, before that is sent."""
-        mission, health = self.mission, self._cfg.health
-        if mission.inflates_covariance:
-            mission.inflates_covariance = False
+        state, health = self.mission.state, self._cfg.health
+        if command.inflates_covariance:
             doubt = health.doubt_position_m, health.doubt_heading_rad
             self._localizer.inflate_covariance(*doubt)
             self._publish_treatment(sensors, "doubted", doubt)
-        if mission.wants_calibration and not self._has_reported_calibration:
+        if state.wants_calibration and not self._has_reported_calibration:
             self._has_reported_calibration = True
             self.telemetry.notify_operator("warning", GIVEN_UP)
-        if mission.wants_full_fans and not self._has_full_fans:  # pressed on first, held then
+        if state.full_fans and not self._has_full_fans:  # pressed on first, held then
             self._has_full_fans = True
             self.begin_drives()
-        if mission.is_faulted:
+        if state.is_faulted:
             self._check_unattended_fault(sensors)
 
     def _check_unattended_fault(self, sensors: Sensors) -> None:
         """An alarm now and then, and the return to base before the battery is too low for it."""
         mission, timer, pose = self.mission, self._fault_timer, self._localizer.deck_pose
-        is_localized = not (mission.is_lost or self._localizer.is_frozen)
+        is_localized = not (mission.state.is_lost or self._localizer.is_frozen)
         home_s = home_time_s(self._mirror.base_pose, self._cfg.limits, pose.x_m, pose.y_m) if is_localized else None
         action = timer.watch(sensors.t, sensors.soc, home_s)
         if action is FaultAction.REMIND:
             held_s = timer.held_s(sensors.t)
             self.telemetry.notify_operator(
-                "error", f"held for {held_s:.0f} s, waiting for an operator: {mission.cause}"
+                "error", f"held for {held_s:.0f} s, waiting for an operator: {mission.state.cause}"
             )
         elif action is FaultAction.RETURN:
-            mission.abort(f"unattended fault: the battery ({sensors.soc:.0%}) lasts for little more than the way home")
+            cause = f"unattended fault: the battery ({sensors.soc:.0%}) lasts for little more than the way home"
+            mission.handle(Abort(cause))
 
     def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
         mission, seq = self.mission, self._clock.seq
@@ -341,7 +352,7 @@ class SurveyRunner(MissionRunner):
             self._localizer.rest()
             self.telemetry.send("rest", Rest(seq=seq, t_s=motion.t_s))
         if command.arrived is not None:
-            error_m = mission.survey_route.distance_m(motion.pose)
+            error_m = mission.survey.follower.distance_m(mission.state.stop, motion.pose)
             number, point = self.telemetry.number_of(seq), (*command.arrived,)
             arrival = ArrivalMessage(seq=number, t_s=motion.t_s, point=point, error_mm=1e3 * error_m)
             self.telemetry.send("arrival", arrival)
@@ -351,7 +362,9 @@ class SurveyRunner(MissionRunner):
             expected = self._mirror.puck_world(pose, self._cfg.robot.puck_height_m)
             # The localizer dates a fix by the robot's own clock.
             t_s = motion.t_s - self._clock.offset_s
-            self._fix_service.begin(FixRequest(mission.request, t_s, mission.measuring_point, expected, pose))
+            self._fix_service.begin(
+                FixRequest(mission.state.request, t_s, mission.state.measuring_point, expected, pose)
+            )
 
     def publish(self, frame: TimedFrame) -> None:
         seq, t_s, telemetry, localizer = frame.sensors.seq, frame.sensors.t, self.telemetry, self._localizer
@@ -365,22 +378,21 @@ class SurveyRunner(MissionRunner):
         self.publish_state()
 
     def publish_state(self) -> None:
-        mission, telemetry, before = self.mission, self.telemetry, self._state
-        if mission.state is before:
+        state, telemetry, before = self.mission.state, self.telemetry, self._state
+        mode = state.mode
+        if mode is before:
             return
-        self._state = mission.state
-        if not mission.is_faulted:
+        self._state = mode
+        if not state.is_faulted:
             self._fault_timer.over()
-        telemetry.log.debug(
-            "state_changed", seq=self._clock.seq, before=before, after=mission.state, cause=mission.cause
-        )
-        if mission.state in (MissionState.HELD, MissionState.BACKING_OFF) or before is MissionState.HELD:
-            telemetry.notify_operator("warning", state_text(mission.state, mission.cause))
-        if mission.state is MissionState.RETURNING and before is not MissionState.BACKING_OFF:
-            telemetry.notify_operator("warning", f"returning to base: {mission.cause}")
-        if mission.state is MissionState.DONE:
-            self._loop.finish(EXIT_STATUS[mission.outcome])
-        elif mission.is_faulted and self._loop.is_lockstep:
+        telemetry.log.debug("state_changed", seq=self._clock.seq, before=before, after=mode, cause=state.cause)
+        if mode in (MissionState.HELD, MissionState.BACKING_OFF) or before is MissionState.HELD:
+            telemetry.notify_operator("warning", state_text(mode, state.cause))
+        if mode is MissionState.RETURNING and before is not MissionState.BACKING_OFF:
+            telemetry.notify_operator("warning", f"returning to base: {state.cause}")
+        if mode is MissionState.DONE:
+            self._loop.finish(EXIT_STATUS[state.outcome])
+        elif state.is_faulted and self._loop.is_lockstep:
             # No operator can react while simulated time runs at many times the wall clock.
             self._loop.finish(EXIT_STATUS[SurveyOutcome.STOPPED])
 

@@ -136,7 +136,7 @@ class RecordedSilRun(SilRun):
         covariance = deck_foot(self.mirror, fix, self.cfg.robot.puck_height_m).covariance_m2
         error_m = plant.x_m - deck.x_m, plant.y_m - deck.y_m
         row = len(self._way) // WAY_COLUMNS - 1
-        self._fixes.append(StopFix(row, self.mission.measuring_point, panel, covariance, error_m))
+        self._fixes.append(StopFix(row, self.mission.state.measuring_point, panel, covariance, error_m))
         super()._fuse(fix)
 
 

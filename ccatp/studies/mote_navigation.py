@@ -77,7 +77,7 @@ class BeaconSilWorld:
     @property
     def is_over(self) -> bool:
         """The mission has ended, or would wait for an operator: that ends it in lockstep."""
-        return self.mission.state is DONE or self.mission.is_faulted
+        return self.mission.state.mode is DONE or self.mission.state.is_faulted
 
     def frame(self) -> None:
         """The newest frame: judged, decided, and driven on from unless that was the end."""
@@ -89,7 +89,7 @@ class BeaconSilWorld:
         verdict = self.danger.step(sensors, extras, self._estimate)
         before = len(self.mission.arrivals)
         drive = self.mission.step(self._reader.read(sensors, extras), self.robot.frame_s, verdict)
-        drive = HALT if self.mission.state is DONE else drive
+        drive = HALT if self.mission.state.mode is DONE else drive
         self._note(sensors, verdict, drive)
         for arrival in self.mission.arrivals[before:]:
             self._summary.reached.append(Reached(sensors.seq, arrival.belief.ellipse))
@@ -110,10 +110,10 @@ class BeaconSilWorld:
             x_m, y_m, heading_rad = belief.pose
             self._estimate = EstimateMessage(
                 seq=sensors.seq, t_s=sensors.t, x_m=x_m, y_m=y_m, heading_rad=heading_rad, sigma_m=belief.sigma_m,
-                state=str(mission.state),
+                state=str(mission.state.mode),
             )  # fmt: skip
         found.track.append(track_row(sensors.seq, sensors.t, mission.navigator))
-        found.states.append(str(mission.state))
+        found.states.append(str(mission.state.mode))
         found.verdicts.append(verdict)
         found.times_s.append(sensors.t)
         found.speeds_m_s.append(drive.speed_m_s)
@@ -121,7 +121,7 @@ class BeaconSilWorld:
     def result(self) -> BeaconSilResult:
         """The result at the end."""
         found, mission, summary = self.found, self.mission, self._summary
-        found.outcome, found.cause = str(mission.outcome), mission.cause
+        found.outcome, found.cause = str(mission.state.outcome), mission.state.cause
         score = mission.navigator.score
         summary.track, summary.truth = list(found.track), list(found.truth)
         summary.places, summary.beacons = self.robot.truth_preface()[1].places, mission.navigator.beacons

@@ -33,9 +33,18 @@ from ccatp.sim.laser import SEED_STREAM, EtalonModel, PuckTruth
 from ccatp.sim.robot import Robot
 from ccatp.sim.world import TruthRow
 from ccatp.survey.composition import SurveyParts, assemble
-from ccatp.survey.mission import Mission
+from ccatp.survey.fix_gate import ApproachCounter
 from ccatp.survey.route_follower import StateEstimate
-from ccatp.survey.state import DONE, ApproachCounter, MissionState, SurveyOutcome
+from ccatp.survey.state import (
+    DONE,
+    EstimateDiverged,
+    FixFailed,
+    FixStored,
+    MissionState,
+    PointMissed,
+    SurveyOutcome,
+    SurveyState,
+)
 
 # A mission that takes this many times its bound hangs; the robot's own deadlines should have ended it long before.
 _ENDLESS = 6.0
@@ -125,10 +134,12 @@ class SilTrace:
             if self._with_track:
                 self._track_rows.append(rows[:, :5])
 
-    def summary(self, mission: Mission, mission_time_s: float, fits: PanelFits, injected: PanelFits) -> dict[str, Any]:
+    def summary(
+        self, state: SurveyState, mission_time_s: float, fits: PanelFits, injected: PanelFits
+    ) -> dict[str, Any]:
         """The summary of the whole run; panels as fitted and as simulated."""
         self._flush()
-        self.builder.set_mission(len(mission.done), len(mission.skipped), mission_time_s)
+        self.builder.set_mission(len(state.done), len(state.skipped), mission_time_s)
         self.builder.set_panels(fits, injected)
         return self.builder.build()
 
@@ -240,13 +251,13 @@ class SilRun:
         first_s = t_s = self._time.at(robot.delivered.seq, robot.delivered.t)
         last_s = first_s - robot.frame_s
         limit_s = _ENDLESS * self.parts.lower_bound_s + 600.0
-        while self.mission.state is not DONE:  # a subclass may exchange it
+        while self.mission.state.mode is not DONE:  # a subclass may exchange it
             frame = robot.delivered
             is_new = frame.seq > self.monitor.verdict.seq
             t_s = self._time.at(frame.seq, frame.t) if is_new else last_s
             self._serve(frame, t_s - last_s)
             last_s = t_s
-            if self.mission.is_faulted or t_s - first_s > limit_s:
+            if self.mission.state.is_faulted or t_s - first_s > limit_s:
                 break
             robot.advance()
             self._note_truth()
@@ -266,25 +277,24 @@ class SilRun:
         if verdict.code is not self._code:
             self._code = verdict.code
             self.trace.builder.add_verdict_event(seq, verdict.code)
-        imu, enc = ((), as_standing(frame.enc)) if mission.rejects_odometry else (frame.imu, frame.enc)
+        imu, enc = ((), as_standing(frame.enc)) if mission.state.rejects_odometry else (frame.imu, frame.enc)
         localizer.step(t_s, imu, enc, frame.edge, frame.gravity)
         if localizer.hold_requested:
-            mission.recover(localizer.hold_cause, t_s + self._time.offset_s)
+            mission.handle(EstimateDiverged(localizer.hold_cause, t_s + self._time.offset_s))
             localizer.clear_hold()
         motion = self._motion(frame, dt_s)
         order = mission.step(motion, verdict)
-        if mission.inflates_covariance:
-            mission.inflates_covariance = False
+        if order.inflates_covariance:
             localizer.inflate_covariance(self.cfg.health.doubt_position_m, self.cfg.health.doubt_heading_rad)
-        if mission.wants_full_fans and not self._has_full_fans:
+        if mission.state.full_fans and not self._has_full_fans:
             self._has_full_fans = True
             robot.command_fans(2, 1.0, 1.0)
-        right, left = self.gate.pass_through(order.twist, verdict, dt_s, t_s, 0.0, mission.purpose)
+        right, left = self.gate.pass_through(order.twist, verdict, dt_s, t_s, 0.0, mission.state.purpose)
         if order.at_rest:
             localizer.rest()
             if order.arrived is not None:
                 self.trace.builder.add_arrival(order.arrived, seq)
-        state = mission.state
+        state = mission.state.mode
         if state is not self._state:
             self._note_state(state)
         self._state_s += dt_s
@@ -303,7 +313,16 @@ class SilRun:
         here = pose.x_m, pose.y_m, pose.heading_rad
         ahead = self.predictor.ahead(here, v, omega, echo.seq, echo.age, echo.held, creep)
         return StateEstimate(
-            frame.t + self._time.offset_s, dt_s, pose, self.mirror.deck_pose, v, omega, creep, ahead, self._sigma_of
+            frame.t + self._time.offset_s,
+            dt_s,
+            pose,
+            self.mirror.deck_pose,
+            v,
+            omega,
+            creep,
+            ahead,
+            self._sigma_of,
+            self.parts.heading_sigma_rad,
         )
 
     def _foresee(self, number: int, right: float, left: float) -> None:
@@ -331,7 +350,7 @@ class SilRun:
 
     def _measure(self, frame: Sensors) -> None:
         mission, localizer, laser = self.mission, self.localizer, self.laser
-        point = mission.measuring_point
+        point = mission.state.measuring_point
         row = None
         if point is not None:
             row = laser.stop_row(frame.t, point, self.trace.truth_at(frame.seq), localizer)
@@ -339,16 +358,16 @@ class SilRun:
             fix = laser.fix(frame.t, localizer.deck_pose)
             self._fuse(fix)
         except (MultilaterationError, FixRefused) as error:
-            mission.not_fixed(point, str(error))
+            mission.handle(FixFailed(point, str(error), self.parts.heading_sigma_rad()))
             return
         self.notices += localizer.notices
         localizer.notices.clear()
         if point is not None and row is not None:
-            distance_m = mission.survey_route.distance_m(localizer.pose)
+            distance_m = mission.survey.follower.distance_m(mission.state.stop, localizer.pose)
             if laser.is_too_far(row, point, fix, distance_m, localizer):
-                mission.again()
+                mission.handle(PointMissed())
                 return
-        mission.fixed(point)
+        mission.handle(FixStored(point, self.parts.heading_sigma_rad()))
 
     def _fuse(self, fix: Fix) -> None:
         """A fix that contradicts the estimate is measured again until it is accepted or refused for good."""
@@ -360,16 +379,16 @@ class SilRun:
             return
 
     def _result(self, mission_time_s: float) -> SilResult:
-        mission, misalignments = self.mission, self.robot.world.misalignments
+        state, misalignments = self.mission.state, self.robot.world.misalignments
         injected = {panel: (m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in misalignments.items()}
         self._note_state(self._state)
         return SilResult(
-            summary=self.trace.summary(mission, mission_time_s, self.laser.panel_fits(), injected),
+            summary=self.trace.summary(state, mission_time_s, self.laser.panel_fits(), injected),
             stops=self.laser.stops,
-            corrections=mission.corrections,
+            corrections=state.corrections,
             counts=dict(self.localizer.counts),
-            outcome=str(mission.outcome if mission.state is DONE else SurveyOutcome.STOPPED),
-            cause=mission.cause,
+            outcome=str(state.outcome if state.mode is DONE else SurveyOutcome.STOPPED),
+            cause=state.cause,
             states_s={str(state): time_s for state, time_s in self.states_s.items()},
             track=self.trace.track(),
             notices=self.notices,

@@ -1,302 +1,284 @@
-"""What the robot does in each state of a survey, and the time budget of the mission."""
+"""Behaviours of a survey: standing until a measurement, backing off an edge, driving home. Frozen values.
 
-from collections.abc import Callable, Sequence
-from math import hypot, pi
+``update`` takes a frame and returns what the behaviour is then.
+"""
 
-from ccatp.config.models import LimitsConfig
-from ccatp.control.tracker import DONE, DRIVE
-from ccatp.core import DeckPose, PointId, Stop, StopKind, Verdict
-from ccatp.mirror.mirror import Mirror
-from ccatp.survey.planning.escape import is_on_drive
-from ccatp.survey.planning.legs import PlanError
-from ccatp.survey.planning.search import leg_time, turn_time
-from ccatp.survey.route_follower import RouteFollower, StateEstimate
-from ccatp.survey.state import (
-    BACKING_OFF,
-    CHUNK,
-    DRIVING,
-    MEASURING,
-    RETURNING,
-    SETTLING,
-    TURNING,
-    MissionEvent,
-    PlanHome,
-    PlanPoints,
-    PlanRest,
-    SurveyOutcome,
-    SurveyState,
-)
-from ccatp.survey.stops import HOLD_POSITION, MissionCommand, RetreatStep, ReturnToBase
+from enum import StrEnum
+from math import copysign, hypot
+from typing import NamedTuple
 
-# Points of a panel that are measured when not all can be: corners and centre, then three that determine a plane.
-LEVELS = (frozenset((1, 3, 5, 7, 9)), frozenset((1, 3, 8)))
-_TURN_RAD = 0.5 * pi  # taken before every leg
-_DETOUR = 1.5  # the way home around the rim's steps against the straight line
-_DOCKING_S = 15.0  # escape from the rim, turns on the way, the turn at base
-_FIRST_S = 60.0  # planned motion before the pace is known
-_LARGEST_PACE = 5.0
+import msgspec
+
+from ccatp.config.models import ControlConfig, MissionConfig
+from ccatp.control.tracker import LegMotion, LegPhase, LegTracker
+from ccatp.core import EventCode, PanelPose, PointId, Stop, StopKind, Twist, Verdict, difference
+from ccatp.safety.edge_detector import Cause
+from ccatp.survey.route_follower import Leg, LegFollower, StateEstimate
+
+# Sums of frame periods are not exact: half a nanosecond must not cost a frame.
+TIME_EPSILON_S = 5e-10
+# Wheels stop within half a second: a robot that is not at rest after this long creeps, or its sensors say so.
+SETTLE_LIMIT_S = 10.0
+STILL = Twist(0.0, 0.0)
 
 
-def home_time_s(base: DeckPose, limits: LimitsConfig, x_m: float, y_m: float) -> float:
-    """An upper estimate of the way to ``base`` from a place on the deck, s; no way is planned for it."""
-    length_m = _DETOUR * hypot(x_m - base.x_m, y_m - base.y_m)
-    stops = 1 + int(length_m)
-    return leg_time(length_m, limits) + stops * turn_time(_TURN_RAD, limits) + _DOCKING_S
+class MissionCommand(msgspec.Struct, frozen=True):
+    """What the mission wants of the present frame.
 
-
-class TimeBudget:
-    """Compares what is left to do with what is left of ``budget_s``, first frame until home or complete."""
-
-    def __init__(self, budget_s: float, mirror: Mirror, limits: LimitsConfig, measuring_time_s: float) -> None:
-        self.budget_s = budget_s
-        self._limits, self._measuring_s = limits, measuring_time_s
-        self._place_of: Callable[[PointId], tuple[float, float]] = mirror.point_on_deck
-        self._base = mirror.base_pose
-        self._begun_s: float | None = None
-        self._planned_s = 0.0
-        self._next_s = 0.0
-
-    def begin(self, t_s: float) -> None:
-        """The first frame's time; again is harmless."""
-        if self._begun_s is None:
-            self._begun_s = t_s
-
-    def _home_s(self, point: PointId) -> float:
-        return home_time_s(self._base, self._limits, *self._place_of(point))
-
-    def tour_s(self, x_m: float, y_m: float, points: Sequence[PointId]) -> float:
-        """An estimate of the time to drive to the points in their order and to measure them."""
-        total_s = 0.0
-        turn_s = turn_time(_TURN_RAD, self._limits)
-        for point in points:
-            px, py = self._place_of(point)
-            total_s += leg_time(hypot(px - x_m, py - y_m), self._limits) + turn_s + self._measuring_s
-            x_m, y_m = px, py
-        return total_s
-
-    def review(self, t_s: float, pose: DeckPose, left: Sequence[PointId]) -> Sequence[PointId] | None:
-        """After a point: those of the ``left`` ones, in order, to go on with (``left`` itself: all).
-
-        None to go home now.
-        """
-        elapsed_s = t_s - (self._begun_s if self._begun_s is not None else t_s)
-        self._planned_s += self._next_s
-        self._next_s = self.tour_s(pose.x_m, pose.y_m, left[:1])
-        late = elapsed_s / self._planned_s if self._planned_s > _FIRST_S else 1.0
-        pace = min(max(late, 1.0), _LARGEST_PACE)
-        left_s = self.budget_s - elapsed_s
-        x, y = pose.x_m, pose.y_m
-        if not left or pace * self.tour_s(x, y, left) <= left_s:
-            return left
-        if pace * (self._next_s + self._home_s(left[0])) > left_s:
-            return None
-        thinned: Sequence[PointId] = left
-        for level in LEVELS:
-            thinned = [point for point in left if point.point in level]
-            if not thinned:
-                return None
-            if pace * (self.tour_s(x, y, thinned) + self._home_s(thinned[-1])) <= left_s:
-                break
-        return left if len(thinned) == len(left) else thinned
-
-
-class Behaviours:
-    """One frame of whatever the state says.
-
-    ``plan_rest`` gives the way back to a route from a pose, without the points that are done with; ``plan_points`` a
-    route through points from a pose, if there is such a planner.
+    Attributes:
+        twist: the velocity wanted until the next frame.
+        at_rest: the robot has come to rest in this frame.
+        arrived: the measurement point at which it did so for the first time; corrections are no arrivals.
+        measure: have the laser system measure now (of a point, or after a back-off to find itself again).
+        inflates_covariance: the localizer shall widen its covariance.
     """
 
-    def __init__(
-        self,
-        survey: SurveyState,
-        budget: TimeBudget | None,
-        plan_home: PlanHome,
-        plan_rest: PlanRest,
-        plan_points: PlanPoints | None,
-    ) -> None:
-        self._survey, self._budget = survey, budget
-        self._plan_home, self._plan_rest, self._plan_points = plan_home, plan_rest, plan_points
+    twist: Twist
+    at_rest: bool = False
+    arrived: PointId | None = None
+    measure: bool = False
+    inflates_covariance: bool = False
+
+
+HOLD_POSITION = MissionCommand(STILL)
+
+
+class Standstill(NamedTuple):
+    """At rest: both speeds, or both of their running means, have been below the limits for the settling time.
+
+    Fans shake the body with a mean of zero; wheels that run down, or that creep, move the mean as well.
+    """
+
+    is_rest: bool = False
+    since_s: float | None = None
+    mean_speed_m_s: float | None = None
+    mean_rate_rad_s: float = 0.0
+
+    def update(self, cfg: ControlConfig, motion: StateEstimate) -> "Standstill":
+        """Take the speeds of a frame."""
+        t_s, dt_s, speed_m_s, rate_rad_s = motion.t_s, motion.dt_s, motion.speed_m_s, motion.rate_rad_s
+        _, since_s, mean_m_s, mean_rad_s = self
+        if mean_m_s is None:
+            mean_m_s, mean_rad_s = speed_m_s, rate_rad_s
+        share = dt_s / (cfg.settle_mean_time_s + dt_s)
+        mean_m_s += share * (speed_m_s - mean_m_s)
+        mean_rad_s += share * (rate_rad_s - mean_rad_s)
+        v, omega = cfg.settle_speed_m_s, cfg.settle_rate_rad_s
+        is_slow = abs(speed_m_s) <= v and abs(rate_rad_s) <= omega
+        if not (is_slow or (abs(mean_m_s) <= v and abs(mean_rad_s) <= omega)):
+            return Standstill(False, None, mean_m_s, mean_rad_s)
+        if since_s is None:
+            since_s = t_s
+        return Standstill(t_s - since_s >= cfg.settle_time_s - TIME_EPSILON_S, since_s, mean_m_s, mean_rad_s)
+
+
+class Settling(NamedTuple):
+    """From the end of a leg to the request for a measurement, after standing for the measuring time.
+
+    ``rest_by_s``: coming to rest, or standing still for the measurement, takes no longer; ``measure_at_s``: the
+    measuring time is over; ``is_requested``: the measurement is asked for and wanted; ``is_repeated``: it failed, and
+    is asked for once more after another measuring time.
+    """
+
+    standstill: Standstill = Standstill()
+    rest_by_s: float | None = None
+    measure_at_s: float = 0.0
+    is_requested: bool = False
+    is_repeated: bool = False
+
+    def settle(self, cfg: ControlConfig, measuring_time_s: float, motion: StateEstimate) -> "Settling":
+        """One frame of coming to rest; over when ``standstill.is_rest``, and the measuring time begins."""
+        standstill = self.standstill.update(cfg, motion)
+        rest_by_s = motion.t_s + SETTLE_LIMIT_S if self.rest_by_s is None else self.rest_by_s
+        settling = self._replace(standstill=standstill, rest_by_s=rest_by_s)
+        return settling._timed(motion.t_s, measuring_time_s) if standstill.is_rest else settling
+
+    def measure(self, cfg: ControlConfig, measuring_time_s: float, motion: StateEstimate) -> "tuple[Settling, bool]":
+        """One frame of the measuring time; whether to ask for the measurement now. True once at each stop.
+
+        Motion spoils the measurement, also one in progress: the time begins again, and what was asked for is dropped.
+        """
+        t_s = motion.t_s
+        settling = self._replace(standstill=self.standstill.update(cfg, motion))
+        if settling.is_repeated:
+            settling = settling._replace(is_repeated=False)._timed(t_s, measuring_time_s)
+        if not settling.standstill.is_rest:
+            if settling.is_requested:
+                settling = settling._replace(is_requested=False)._timed(t_s, measuring_time_s)
+            settling = settling._replace(measure_at_s=t_s + measuring_time_s - TIME_EPSILON_S)
+        if settling.is_requested or t_s < settling.measure_at_s:
+            return settling, False
+        return settling._replace(rest_by_s=None, is_requested=True), True
+
+    def _timed(self, t_s: float, measuring_time_s: float) -> "Settling":
+        return self._replace(measure_at_s=t_s + measuring_time_s - TIME_EPSILON_S, rest_by_s=t_s + SETTLE_LIMIT_S)
+
+    def is_overdue(self, t_s: float) -> bool:
+        """Coming to rest, or standing still for a measurement, takes far longer than it should."""
+        return self.rest_by_s is not None and t_s > self.rest_by_s
+
+
+class ReturnHome(NamedTuple):
+    """The way along ``stops`` to base, the last; ``stop_index`` is behind that once the robot stands there."""
+
+    stops: tuple[Stop, ...]
+    stop_index: int = 0
+    leg: Leg | None = None
+    is_docking: bool = False
+    standstill: Standstill = Standstill()
 
     @property
-    def measuring_point(self) -> PointId | None:
-        """The point being measured; ``None`` for a fix that only serves to find the robot again."""
-        survey = self._survey
-        stop = survey.survey_route.current
-        return None if survey.needs_fix or stop is None else stop.point
+    def is_at_base(self) -> bool:
+        """The robot stands at base, turned as it should be."""
+        return self.stop_index >= len(self.stops)
 
-    def step(self, motion: StateEstimate, verdict: Verdict | None) -> MissionCommand:
-        """One frame."""
-        state = self._survey.state
-        if motion.t_s < self._survey.stands_until_s:
-            return HOLD_POSITION
-        if state is DRIVING or state is TURNING:
-            return self._travel(motion)
-        if state is MEASURING:
-            return self._stand(motion)
-        if state is SETTLING:
-            return self._settle(motion)
-        if state is RETURNING:
-            return self._return(motion)
-        if state is BACKING_OFF and verdict is not None:
-            return self._back_off(motion, verdict)
-        return HOLD_POSITION
+    def interrupted(self) -> "ReturnHome":
+        """The leg begins again, from wherever the robot is then."""
+        return self._replace(leg=None, is_docking=False)
 
-    # -- legs -----------------------------------------------------------------------------------------------------
+    def update(
+        self, follower: LegFollower, cfg: ControlConfig, motion: StateEstimate, *, is_slow: bool
+    ) -> "tuple[ReturnHome, Twist]":
+        """One frame of the way home: the twist until the next frame."""
+        home, stop = self._replace(standstill=self.standstill.update(cfg, motion)), self.stops[self.stop_index]
+        if home.is_docking and home.leg is not None:
+            return home._dock(follower, home.leg, motion)
+        leg, twist = follower.follow(home.leg or Leg(stop), motion, is_slow=is_slow)
+        if not leg.is_done:
+            return home._replace(leg=leg), twist
+        if stop.kind is not StopKind.BASE:
+            return home._replace(stop_index=home.stop_index + 1, leg=None), STILL
+        if stop.heading_rad is not None:
+            leg = follower.begin_turn(leg, motion, stop.heading_rad, is_slow=is_slow)
+        return home._replace(leg=leg, is_docking=True), STILL
 
-    def _is_overdue(self, motion: StateEstimate) -> bool:
-        follower = self._survey.follower
-        stop = follower.current
-        if stop is None or not follower.is_overdue(motion.t_s):
-            return False
-        where = f"({stop.x_m:.3f}, {stop.y_m:.3f}) m"
-        self._survey.fault(f"the leg to {where} is overdue: is a wheel blocked or slipping?")
-        return True
+    def _dock(self, follower: LegFollower, leg: Leg, motion: StateEstimate) -> "tuple[ReturnHome, Twist]":
+        heading_rad, tracked = leg.stop.heading_rad, leg.motion
+        if heading_rad is not None and tracked is not None and tracked.phase is LegPhase.TURN:
+            leg, twist = follower.turn(leg, tracked, motion, heading_rad)
+            return self._replace(leg=leg), twist
+        if self.standstill.is_rest:
+            return self._replace(stop_index=self.stop_index + 1, leg=None), STILL
+        return self, STILL
 
-    def _travel(self, motion: StateEstimate) -> MissionCommand:
-        survey = self._survey
-        if survey.needs_fix:
-            return self._align(motion)
-        if survey.is_review_due and self._is_out_of_time(motion):
-            return HOLD_POSITION
-        follower = survey.survey_route
-        stop = follower.current
-        if stop is not None and not survey.missed.follows_route(motion, stop, follower):
-            survey.is_off_route = True
-        if survey.is_off_route:
-            return self._find_route(motion)
-        if stop is None:
-            survey.proceed()
-            return HOLD_POSITION
-        order = self._follow(follower, motion, stop)
-        if order is not None:
-            return order
-        if stop.is_measured or self._is_vague(motion, stop):
-            survey.apply(MissionEvent.ARRIVED)
-            return self._settle(motion)
-        follower.advance()
-        survey.proceed()
-        return self._travel(motion)
 
-    def _follow(self, follower: RouteFollower, motion: StateEstimate, stop: Stop) -> MissionCommand | None:
-        survey = self._survey
-        twist = follower.follow(motion, stop)
-        if self._is_overdue(motion):
-            return HOLD_POSITION
-        phase = survey.tracker.phase
-        if phase is DONE:
-            return None
-        if (phase is DRIVE) is not (survey.state is DRIVING):
-            survey.apply(MissionEvent.TURNED if phase is DRIVE else MissionEvent.REALIGN)
-        return MissionCommand(twist)
+# A turn that met the rim is undone by at most this; more would sweep the next corner.
+UNTURN_LIMIT_RAD = 0.8
+# 60 mm at 0.05 m/s and a turn take three seconds: after this long a wheel is blocked, or nothing is permitted.
+TIME_LIMIT_S = 15.0
 
-    def _align(self, motion: StateEstimate) -> MissionCommand:
-        heading_recovery = self._survey.heading_recovery
-        leg = heading_recovery.leg(motion.deck)
-        stop = None if leg is None else leg.current
-        order = None if leg is None or stop is None else self._follow(leg, motion, stop)
-        if order is not None:
-            return order
-        heading_recovery.interrupt()
-        self._survey.apply(MissionEvent.ARRIVED)
-        return self._settle(motion)
 
-    def _is_vague(self, motion: StateEstimate, stop: Stop) -> bool:
-        """Whether to measure at a via point: they lie near the rim, and the next turn needs the room the route left."""
-        return stop.kind is StopKind.VIA and motion.sigma_of() > self._survey.cfg.mission.via_sigma_m
+class RetreatStep(StrEnum):
+    """What the retreat is at."""
 
-    def _find_route(self, motion: StateEstimate) -> MissionCommand:
-        survey, stop = self._survey, self._survey.survey_route.current
-        deck = motion.deck
-        if stop is not None and stop.kind is StopKind.CALIBRATE:
-            if is_on_drive(survey.survey_route.stops, deck.x_m, deck.y_m):
-                survey.is_off_route = False  # what was measured of the drive is not lost, and the rest of it follows
-                return HOLD_POSITION
-            survey.wants_calibration = True
-        due = survey.retries.due[:CHUNK]
-        try:
-            if due and self._plan_points is not None:
-                survey.route = self._plan_points(deck, due)
-            else:
-                survey.route = self._plan_rest(survey.route, deck, {*survey.done, *survey.skipped})
-        except PlanError as error:
-            survey.fault(f"no way on: {error}")
-            return HOLD_POSITION
-        survey.is_off_route = False
-        survey.survey_route = survey.follow_stops(survey.route.stops)
-        return HOLD_POSITION
+    BACK = "back"
+    UNTURN = "unturn"
+    TURN_AWAY = "turn away"
+    OVER = "over"
+    STUCK = "stuck"
 
-    def _is_out_of_time(self, motion: StateEstimate) -> bool:
-        survey, budget = self._survey, self._budget
-        survey.is_review_due = False
-        if budget is None:
-            return False
-        stops = survey.survey_route.stops[survey.survey_route.index :]
-        left = survey.retries.due or [stop.point for stop in stops if stop.point is not None]
-        going_on = budget.review(motion.t_s, motion.deck, left)
-        if going_on is None:
-            survey.abort_cause = survey.abort_cause or f"the time budget of {budget.budget_s:g} s is used up"
-            survey.proceed()
-            return True
-        if going_on is not left:
-            survey.retries.drop_low_priority(left, going_on, "no time for it")
-            survey.is_off_route = True
-        return False
 
-    # -- standing -------------------------------------------------------------------------------------------------
+class Retreat(NamedTuple):
+    """One back-off along the track just driven, then a turn away from the side that hung over.
 
-    def _settle(self, motion: StateEstimate) -> MissionCommand:
-        survey = self._survey
-        if survey.settling.has_settled(motion):
-            survey.apply(MissionEvent.SETTLED)
-            return MissionCommand(
-                HOLD_POSITION.twist, at_rest=True, arrived=survey.settling.arrival_at(self.measuring_point)
-            )
-        self._check_rest(motion)
-        return HOLD_POSITION
+    A robot that met the edge backwards faces away from it, and does not turn.
 
-    def _stand(self, motion: StateEstimate) -> MissionCommand:
-        if self._survey.settling.is_due(motion):
-            return MissionCommand(HOLD_POSITION.twist, measure=True)
-        self._check_rest(motion)
-        return HOLD_POSITION
+    Attributes:
+        last: the pose in the last frame.
+        away_rad: the turn away, to the side that stands on the mirror; where both or none do, to the left.
+        direction: in which it backs off, 1 forward; ``after_back``: the step after that.
+        unturn: sense in which a turn is undone.
+        turn, goal_rad: the turn away under way, and the heading in which it ends.
+    """
 
-    def _check_rest(self, motion: StateEstimate) -> None:
-        if self._survey.settling.is_settle_overdue(motion.t_s):
-            speeds = f"{motion.speed_m_s:.4f} m/s, {motion.rate_rad_s:.4f} rad/s"
-            self._survey.fault(f"the robot does not come to rest: {speeds}")
+    step: RetreatStep
+    last: PanelPose
+    away_rad: float
+    direction: float
+    after_back: RetreatStep
+    unturn: float
+    time_s: float = 0.0
+    travel_m: float = 0.0
+    turned_rad: float = 0.0
+    has_turned_away: bool = False
+    turn: LegMotion | None = None
+    goal_rad: float = 0.0
 
-    # -- edge and home --------------------------------------------------------------------------------------------
+    @classmethod
+    def begin(cls, cfg: MissionConfig, verdict: Verdict, pose: PanelPose, rate_rad_s: float) -> "Retreat":
+        """The retreat from what a verdict reports."""
+        front_left, front_right, rear_left, rear_right = verdict.off
+        front, rear = front_left or front_right, rear_left or rear_right
+        left, right = front_left or rear_left, front_right or rear_right
+        step = RetreatStep.STUCK
+        if verdict.turn and not (front and rear):
+            step = RetreatStep.UNTURN
+        elif front != rear:
+            step = RetreatStep.BACK
+        return cls(
+            step,
+            pose,
+            away_rad=-cfg.turn_away_rad if left and not right else cfg.turn_away_rad,
+            direction=-1.0 if front else 1.0,
+            after_back=RetreatStep.TURN_AWAY if front else RetreatStep.OVER,
+            unturn=-copysign(1.0, rate_rad_s),
+        )
 
-    def _back_off(self, motion: StateEstimate, verdict: Verdict) -> MissionCommand:
-        survey = self._survey
-        retreat = survey.retreat
-        if retreat is None:
-            survey.proceed()
-            return HOLD_POSITION
-        twist = retreat.step(motion, verdict)
-        if retreat.step_at is RetreatStep.TURN_AWAY and survey.abort_cause:
-            retreat.step_at = RetreatStep.OVER  # there is no route to turn to; the way home begins from here
-        if retreat.step_at is RetreatStep.STUCK:
-            survey.hold("stuck at the edge: no motion away from it is permitted, or none helps", by_hand=False)
-            survey.stuck_s = motion.t_s
-            return HOLD_POSITION
-        if retreat.step_at is RetreatStep.OVER:
-            survey.apply(MissionEvent.FIND)
-            return HOLD_POSITION
-        return MissionCommand(twist)
+    def update(
+        self, cfg: MissionConfig, tracker: LegTracker, motion: StateEstimate, verdict: Verdict, *, is_slow: bool
+    ) -> "tuple[Retreat, Twist]":
+        """One frame: the twist until the next one."""
+        pose, last = motion.pose, self.last
+        travel_m, turned_rad, time_s, step = self.travel_m, self.turned_rad, self.time_s + motion.dt_s, self.step
+        if pose.panel == last.panel:
+            travel_m += hypot(pose.x_m - last.x_m, pose.y_m - last.y_m)
+            turned_rad += abs(difference(pose.heading_rad, last.heading_rad))
+        if time_s > TIME_LIMIT_S and step is not RetreatStep.OVER:
+            step = RetreatStep.STUCK
+        now = self._replace(last=pose, travel_m=travel_m, turned_rad=turned_rad, time_s=time_s, step=step)
+        if not (verdict.forward or verdict.reverse or verdict.turn):
+            return now, STILL  # data are missing, which passes by itself
+        is_clear = verdict.code is not EventCode.NEAR_EDGE
+        if step is RetreatStep.BACK:
+            return now._back(cfg, is_clear, verdict)
+        if step is RetreatStep.UNTURN:
+            return now._undo_turn(cfg, is_clear, verdict)
+        if step is RetreatStep.TURN_AWAY:
+            return now._turn_away(tracker, motion, is_clear, verdict, is_slow)
+        return now, STILL
 
-    def _return(self, motion: StateEstimate) -> MissionCommand:
-        survey = self._survey
-        if survey.home is None:
-            try:
-                survey.home = ReturnToBase(survey.follow_stops(self._plan_home(motion.deck)), survey.tracker)
-            except PlanError as error:
-                survey.fault(f"no way home: {error}")
-            return HOLD_POSITION
-        if survey.home.is_at_base:
-            survey.outcome = SurveyOutcome.AT_BASE
-            survey.apply(MissionEvent.FINISHED)
-            return MissionCommand(HOLD_POSITION.twist, at_rest=True)
-        twist = survey.home.step(motion, survey.settling.is_quiet(motion))
-        return HOLD_POSITION if self._is_overdue(motion) else MissionCommand(twist)
+    def at(self, step: RetreatStep) -> "Retreat":
+        """The same at another step."""
+        return self._replace(step=step)
+
+    def _back(self, cfg: MissionConfig, is_clear: bool, verdict: Verdict) -> "tuple[Retreat, Twist]":
+        if self.travel_m >= cfg.backoff_m or (is_clear and self.travel_m >= 0.5 * cfg.backoff_m):
+            return self.at(self.after_back if is_clear else RetreatStep.STUCK), STILL
+        if not (verdict.reverse if self.direction < 0.0 else verdict.forward):
+            return self.at(RetreatStep.STUCK), STILL
+        return self, Twist(self.direction * cfg.backoff_speed_m_s, 0.0)
+
+    def _undo_turn(self, cfg: MissionConfig, is_clear: bool, verdict: Verdict) -> "tuple[Retreat, Twist]":
+        if is_clear:
+            return self.at(RetreatStep.OVER), STILL
+        if self.turned_rad >= UNTURN_LIMIT_RAD or not verdict.turn:
+            return self.at(RetreatStep.OVER if self.has_turned_away else RetreatStep.BACK), STILL
+        return self, Twist(0.0, self.unturn * cfg.turn_away_rad)
+
+    def _turn_away(
+        self, tracker: LegTracker, motion: StateEstimate, is_clear: bool, verdict: Verdict, is_slow: bool
+    ) -> "tuple[Retreat, Twist]":
+        if not is_clear:
+            # The turn sweeps a corner off the panels. Off the rim, back; off what may be a seam, the fix tells.
+            step = RetreatStep.UNTURN if verdict.cause.startswith(Cause.RIM) else RetreatStep.OVER
+            unturn = -copysign(1.0, self.away_rad)
+            return self._replace(step=step, has_turned_away=True, unturn=unturn, turned_rad=0.0), STILL
+        turn, goal_rad = self.turn, self.goal_rad
+        if turn is None:
+            goal_rad = motion.pose.heading_rad + self.away_rad
+            turn = tracker.begin_turn(self.away_rad, is_slow=is_slow)
+        state = motion.steered
+        remaining = difference(goal_rad, state.pose[2])
+        turn, twist = tracker.step_turn(turn, remaining, motion.dt_s, state.omega_rad_s)
+        step = RetreatStep.OVER if turn.phase is LegPhase.DONE else RetreatStep.TURN_AWAY
+        return self._replace(turn=turn, goal_rad=goal_rad, step=step), twist

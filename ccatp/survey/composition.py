@@ -14,10 +14,11 @@ from ccatp.links.robot_messages import Hello
 from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.survey.heading_recovery import TakeoverState
-from ccatp.survey.mission import Mission
 from ccatp.survey.planning.route import ORDERS, Route, RoutePlanner
 from ccatp.survey.planning.search import leg_lengths, leg_time, path_time, stop_times
 from ccatp.survey.planning.tour_bound import tour_bound
+from ccatp.survey.state import TakenOver
+from ccatp.survey.statechart import Mission, Survey
 
 # The configuration may be calibrated, the robot's own figures are nominal: this much apart they describe two robots.
 RADIUS_TOLERANCE = 0.05
@@ -39,6 +40,10 @@ class SurveyParts:
     lower_bound_s: float
     elapsed_s: float = 0.0
     recovery: TakeoverState | None = None
+
+    def heading_sigma_rad(self) -> float:
+        """How well the heading is known. No drive shows the four states theirs: the fix does not reach it."""
+        return 0.0 if self.cfg.run.filter in FOUR_STATE else self.localizer.heading_sigma_rad
 
     @property
     def total_points(self) -> int:
@@ -65,12 +70,10 @@ def assemble(cfg: Config, done: Collection[PointId] = (), recovery: TakeoverStat
     else:
         sigmas = recovery.position_sigma_m, recovery.heading_sigma_rad
         localizer = build_with_uncertainty(cfg, mirror, recovery.pose, sigmas)
-    # No drive shows the four states their heading: the fix does not reach it.
-    heading_sigma_of = float if cfg.run.filter in FOUR_STATE else lambda: localizer.heading_sigma_rad
     planner = RoutePlanner(mirror, cfg)
-    mission = Mission(cfg, mirror, route, planner.home, planner.rejoin, planner.route, heading_sigma_of)
+    mission = Mission(Survey(cfg, mirror, route, planner.home, planner.rejoin, planner.route))
     if recovery is not None:
-        mission.take_over(recovery)
+        mission.handle(TakenOver(recovery))
     return SurveyParts(
         cfg=cfg,
         mirror=mirror,

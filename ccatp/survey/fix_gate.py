@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.config.models import Config, EtalonConfig
-from ccatp.core import DeckPose, Fix, FloatArray, Vector3
+from ccatp.core import DeckPose, Fix, FloatArray, PointId, Vector3
 from ccatp.estimation.fixes import DeckFoot, FixRefused, deck_foot
 from ccatp.localizer import FOUR_STATE
 from ccatp.mirror.mirror import Mirror
@@ -237,3 +237,31 @@ class FixGate:
             return ""
         why = explain_lengths(self._cfg, expected_m, lengths_m, self._collimators_m)
         return f"the laser system's lengths do not lead to the robot's base: {why}" if why else ""
+
+
+# A puck is within the tolerance when it is so by more than the fix may be wrong (guard band, ISO 14253-1); but a laser
+# system of little precision cannot make a robot approach a point again and again.
+_GUARD_SIGMAS = 3.0
+_MOST_GUARD = 0.1  # of the tolerance
+
+
+class ApproachCounter:
+    """Decides on a correction move after each fix that is further than ``tolerance_m`` from its point.
+
+    After ``limit`` approaches a point is measured wherever the robot stands.
+    """
+
+    def __init__(self, tolerance_m: float, limit: int) -> None:
+        self._tolerance_m, self._limit = tolerance_m, limit
+        self._point: PointId | None = None
+        self.count = 0
+
+    def is_too_far(self, point: PointId, error_m: float, sigma_m: float) -> bool:
+        """Whether ``point`` has to be approached again; call once for each fix taken there.
+
+        ``sigma_m``: standard deviation of the robot's place after the fix, along its worst direction.
+        """
+        self.count = self.count + 1 if point == self._point else 1
+        self._point = point
+        guard_m = min(_GUARD_SIGMAS * sigma_m, _MOST_GUARD * self._tolerance_m)
+        return error_m > self._tolerance_m - guard_m and self.count < self._limit

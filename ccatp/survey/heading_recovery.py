@@ -1,6 +1,5 @@
 """Finding a doubtful heading by short legs with a fix at each end; what a takeover starts with."""
 
-from collections.abc import Callable, Sequence
 from math import cos, hypot, sin
 from typing import NamedTuple
 
@@ -8,10 +7,9 @@ from ccatp.config.models import MissionConfig, RobotConfig
 from ccatp.core import DeckPose, PointId, Stop, StopKind
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.legs import build_body, course_of_heading
-from ccatp.survey.route_follower import RouteFollower
 
 # There and back, twice: a filter of a heading that was far off needs more than one look.
-_MOST_LEGS = 4
+MOST_LEGS = 4
 _STEP_M = 0.01
 # A shorter leg says less of the heading than was known before.
 _SHORTEST_M = 0.04
@@ -26,66 +24,33 @@ _LOST = 2.0
 class HeadingRecovery:
     """While the heading is in doubt: which leg, straight ahead or back, shows more of it."""
 
-    def __init__(
-        self,
-        mirror: Mirror,
-        robot: RobotConfig,
-        cfg: MissionConfig,
-        heading_sigma_of: Callable[[], float],
-        follow_stops: Callable[[Sequence[Stop]], RouteFollower],
-    ) -> None:
-        self._mirror, self._limit_rad, self._wanted_m = mirror, cfg.heading_doubt_rad, cfg.alignment_leg_m
+    def __init__(self, mirror: Mirror, robot: RobotConfig, cfg: MissionConfig) -> None:
+        self._mirror, self.limit_rad, self._wanted_m = mirror, cfg.heading_doubt_rad, cfg.alignment_leg_m
         # Whatever the heading, no sensor leaves the mirror.
         self._clearance_m = max(build_body(robot, cfg).turning_depth_m, cfg.leg_clearance_m)
-        self._sigma_of, self._follow_stops = heading_sigma_of, follow_stops
-        self._legs_left = 0
-        self._was_reverse = True
-        self.follower: RouteFollower | None = None
 
-    def doubt(self) -> None:
-        """The robot may have turned while it was not observed."""
-        self._legs_left, self.follower = _MOST_LEGS, None
-
-    @property
-    def is_needed(self) -> bool:
+    def is_needed(self, sigma_rad: float) -> bool:
         """Whether the heading is known so badly that no leg of the survey should begin with it."""
-        return self._sigma_of() > _LOST * self._limit_rad
+        return sigma_rad > _LOST * self.limit_rad
 
-    @property
-    def wants_leg(self) -> bool:
-        """Whether the heading has to be found before the robot drives on; to be asked after a fix."""
-        if self._legs_left and self._sigma_of() <= self._limit_rad:
-            self._legs_left = 0
-        return self._legs_left > 0
+    def plan(self, deck: DeckPose, sigma_rad: float, *, was_reverse: bool) -> Stop | None:
+        """The stop of the next leg, ``None`` where there is no room for any.
 
-    def leg(self, deck: DeckPose) -> RouteFollower | None:
-        """The leg being driven, or a new one from a pose; ``None`` where there is no room for any."""
-        if self.follower is None:
-            stop = self._plan(deck)
-            self._legs_left = 0 if stop is None else self._legs_left - 1
-            self.follower = None if stop is None else self._follow_stops([stop])
-        return self.follower
-
-    def interrupt(self) -> None:
-        """The leg is over, or the robot stopped on it: the next one begins where it is then."""
-        self.follower = None
-
-    def _plan(self, deck: DeckPose) -> Stop | None:
-        """Back where the last one came from; where there is less room than wanted, whichever way has more."""
+        It leads back where the last one came from; where there is less room, whichever way has more.
+        """
         course = course_of_heading(self._mirror, deck)
         rooms = []
-        for is_reverse in (not self._was_reverse, self._was_reverse):
+        for is_reverse in (not was_reverse, was_reverse):
             sign = -1.0 if is_reverse else 1.0
             way = sign * cos(course), sign * sin(course)
-            rooms.append((self._room_m(deck, way), is_reverse, way))
+            rooms.append((self._room_m(deck, way, sigma_rad), is_reverse, way))
         room_m, is_reverse, (cx, cy) = max(rooms, key=lambda room: room[0])
         if room_m < _SHORTEST_M:
             return None
-        self._was_reverse = is_reverse
         return Stop(deck.x_m + room_m * cx, deck.y_m + room_m * cy, StopKind.CALIBRATE, reverse=is_reverse)
 
-    def _room_m(self, deck: DeckPose, way: tuple[float, float]) -> float:
-        rim, spread = self._mirror.rim, _SIGMAS * self._sigma_of()
+    def _room_m(self, deck: DeckPose, way: tuple[float, float], sigma_rad: float) -> float:
+        rim, spread = self._mirror.rim, _SIGMAS * sigma_rad
         room_m, wanted_m = 0.0, self._wanted_m
         depth_m = rim.signed_distance_m(deck.x_m, deck.y_m)
         while room_m < wanted_m:

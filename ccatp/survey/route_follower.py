@@ -1,55 +1,27 @@
 """A series of stops and the leg being driven (thesis 3.2), at the usual or the reduced speed; short corrections."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import atan2, ceil, cos, hypot, pi, sin
 from typing import NamedTuple
 
 import numpy as np
 
 from ccatp.config.models import ControlConfig, HealthConfig, LimitsConfig, MissionConfig, RobotConfig
-from ccatp.control.tracker import DONE, NO_CREEP, LegTracker
-from ccatp.core import DeckPose, PanelId, PanelPose, PointId, Predicted, Stop, Twist, difference
+from ccatp.control.tracker import DONE, LegMotion, LegTracker
+from ccatp.core import DeckPose, PanelId, PanelPose, Predicted, Stop, Twist, difference
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.legs import build_body, course_of_heading, sensor_depths
 
 
-class SpeedLimitedTracker(LegTracker):
-    """A leg tracker that plans with the reduced limits while ``is_slow``; a change counts from the next leg or turn."""
-
-    def __init__(self, control: ControlConfig, limits: LimitsConfig, health: HealthConfig, wheel_lag_s: float) -> None:
-        slow = limits.model_copy(
-            update={
-                "v_max_m_s": min(limits.v_max_m_s, health.slow_speed_m_s),
-                "omega_max_rad_s": min(limits.omega_max_rad_s, health.slow_rate_rad_s),
-            }
-        )
-        self._paces = LegTracker(control, limits, wheel_lag_s), LegTracker(control, slow, wheel_lag_s)
-        super().__init__(control, limits, wheel_lag_s)
-        self.is_slow = self._was_slow = False
-
-    def begin(
-        self,
-        pose: tuple[float, float, float],
-        target: tuple[float, float],
-        reverse: bool,
-        creep: tuple[float, float] = NO_CREEP,
-    ) -> None:
-        """Start a leg; see ``LegTracker.begin``."""
-        self._change_pace()
-        super().begin(pose, target, reverse, creep)
-
-    def begin_turn(self, angle_rad: float) -> None:
-        """Start a turn in place; see ``LegTracker.begin_turn``."""
-        self._change_pace()
-        super().begin_turn(angle_rad)
-
-    def _change_pace(self) -> None:
-        if self.is_slow is self._was_slow:
-            return
-        self._was_slow = self.is_slow
-        other = self._paces[self.is_slow]
-        self._along, self._forward, self._angular = other._along, other._forward, other._angular
-        self._steering, self._line, self._omega_max = other._steering, other._line, other._omega_max
+def build_tracker(control: ControlConfig, limits: LimitsConfig, health: HealthConfig, wheel_lag_s: float) -> LegTracker:
+    """The tracker of a survey, with the reduced limits for slow motions."""
+    slow = limits.model_copy(
+        update={
+            "v_max_m_s": min(limits.v_max_m_s, health.slow_speed_m_s),
+            "omega_max_rad_s": min(limits.omega_max_rad_s, health.slow_rate_rad_s),
+        }
+    )
+    return LegTracker(control, limits, wheel_lag_s, slow)
 
 
 # A sensor at 0.13 m sweeps 2 mm in a hundredth of a turn's radian; between two such steps it is 0.03 mm further out.
@@ -146,6 +118,7 @@ class StateEstimate(NamedTuple):
     creep: tuple[float, float] = (0.0, 0.0)
     ahead: Predicted | None = None
     sigma_of: Callable[[], float] = float  # hardly ever asked for either
+    heading_sigma_of: Callable[[], float] = float
 
     @property
     def steered(self) -> Predicted:
@@ -166,79 +139,77 @@ class StateEstimate(NamedTuple):
         return self.deck_of(self.pose)
 
 
-class RouteFollower:
-    """Keeps the current stop (``None`` when all are exhausted) and drives the leg to it.
+class Leg(NamedTuple):
+    """The leg to a stop, as far as it is driven.
 
-    A motion that takes longer than ``timeout_factor`` times its bang-bang time plus 5 s is overdue.
+    ``motion`` is None before the first frame of the leg; ``aim``: the leg is a correction, as long as the robot stays
+    on that panel; ``target``: the stop in the frame of a panel, m.
     """
 
-    def __init__(self, mirror: Mirror, tracker: LegTracker, timeout_factor: float, stops: Sequence[Stop]) -> None:
-        self._mirror, self._tracker, self._timeout_factor = mirror, tracker, timeout_factor
-        self.stops = tuple(stops)
-        self.index = 0
-        self.current: Stop | None = self.stops[0] if self.stops else None
-        self._is_begun = False
-        self._deadline_s = 0.0
-        self._target: tuple[PanelId, Stop, tuple[float, float]] | None = None
-        self._aim: tuple[PanelId, LegAim] | None = None
+    stop: Stop
+    motion: LegMotion | None = None
+    deadline_s: float = 0.0
+    aim: tuple[PanelId, LegAim] | None = None
+    target: tuple[PanelId, tuple[float, float]] | None = None
 
     @property
-    def next_point(self) -> PointId | None:
-        """The point to be measured next, at the current stop or a later one."""
-        return next((stop.point for stop in self.stops[self.index :] if stop.point is not None), None)
-
-    def advance(self) -> None:
-        """The current stop is done with."""
-        self.index += 1
-        self.current = self.stops[self.index] if self.index < len(self.stops) else None
-        self._is_begun, self._aim = False, None
-
-    def interrupt(self) -> None:
-        """The robot stopped on the way: the leg begins again, from wherever it is then."""
-        self._is_begun, self._aim = False, None
-
-    def correct(self, panel: PanelId, aim: LegAim) -> None:
-        """The leg to the current stop is a correction, as long as the robot stays on the panel."""
-        self._is_begun, self._aim = False, (panel, aim)
-
-    def follow(self, motion: StateEstimate, stop: Stop) -> Twist:
-        """One frame of the leg to ``stop``: the twist until the next frame."""
-        state, panel = motion.steered, motion.pose.panel
-        target, reverse = self.target_in(panel, stop), stop.reverse
-        if self._aim is not None and self._aim[0] == panel:
-            x, y, reverse, _ = self._aim[1]
-            target = x, y
-        if not self._is_begun:
-            self._is_begun = True
-            self._tracker.begin(state.pose, target, reverse, motion.creep)
-            self._set_deadline(motion.t_s)
-        tracker = self._tracker
-        before = tracker.phase
-        twist = tracker.step(state.pose, target, motion.dt_s, state, motion.creep)
-        if tracker.phase is not before and tracker.phase is not DONE:
-            self._set_deadline(motion.t_s)
-        return twist
+    def is_done(self) -> bool:
+        """The stop is reached."""
+        return self.motion is not None and self.motion.phase is DONE
 
     def is_overdue(self, t_s: float) -> bool:
-        """Whether the leg begun takes far longer than it should."""
-        return self._is_begun and t_s > self._deadline_s
+        """It takes far longer than it should."""
+        return self.motion is not None and t_s > self.deadline_s
 
-    def distance_m(self, pose: PanelPose) -> float:
-        """Distance to the current stop, m (0 where there is none)."""
-        stop = self.current
+
+class LegFollower:
+    """Drives legs. A motion that takes longer than ``timeout_factor`` times its bang-bang time plus 5 s is overdue."""
+
+    def __init__(self, mirror: Mirror, tracker: LegTracker, timeout_factor: float) -> None:
+        self._mirror, self._tracker, self._timeout_factor = mirror, tracker, timeout_factor
+
+    def follow(self, leg: Leg, motion: StateEstimate, *, is_slow: bool) -> tuple[Leg, Twist]:
+        """One frame of a leg: what it is then, and the twist until the next frame."""
+        steered, panel, tracker = motion.steered, motion.pose.panel, self._tracker
+        stop, tracked, deadline_s, aim, cached = leg
+        if cached is None or cached[0] != panel:
+            cached = panel, self.target_in(panel, stop)
+        target, reverse = cached[1], stop.reverse
+        if aim is not None and aim[0] == panel:
+            x, y, reverse, _ = aim[1]
+            target = x, y
+        if tracked is None:
+            tracked = tracker.begin(steered.pose, target, reverse, motion.creep, is_slow=is_slow)
+            deadline_s = self.deadline_s(motion.t_s, tracked)
+        before = tracked.phase
+        tracked, twist = tracker.step(tracked, steered.pose, target, motion.dt_s, steered, motion.creep)
+        if tracked.phase is not before and tracked.phase is not DONE:
+            deadline_s = self.deadline_s(motion.t_s, tracked)
+        return Leg(stop, tracked, deadline_s, aim, cached), twist
+
+    def begin_turn(self, leg: Leg, motion: StateEstimate, heading_rad: float, *, is_slow: bool) -> Leg:
+        """Begin the turn to a heading on the deck, at the end of a leg."""
+        tracked = self._tracker.begin_turn(difference(heading_rad, motion.deck.heading_rad), is_slow=is_slow)
+        return leg._replace(motion=tracked, deadline_s=self.deadline_s(motion.t_s, tracked))
+
+    def turn(self, leg: Leg, tracked: LegMotion, motion: StateEstimate, heading_rad: float) -> tuple[Leg, Twist]:
+        """One frame of that turn."""
+        remaining = difference(heading_rad, motion.deck.heading_rad + motion.lead_rad)
+        tracked, twist = self._tracker.step_turn(tracked, remaining, motion.dt_s, motion.steered.omega_rad_s)
+        return leg._replace(motion=tracked), twist
+
+    def deadline_s(self, t_s: float, tracked: LegMotion) -> float:
+        """When a motion that begins now is overdue."""
+        return t_s + 5.0 + self._timeout_factor * tracked.planned_s
+
+    def distance_m(self, stop: Stop | None, pose: PanelPose) -> float:
+        """Distance to a stop, m (0 where there is none)."""
         if stop is None:
             return 0.0
         x, y = self.target_in(pose.panel, stop)
         return hypot(x - pose.x_m, y - pose.y_m)
 
-    def _set_deadline(self, t_s: float) -> None:
-        self._deadline_s = t_s + 5.0 + self._timeout_factor * self._tracker.planned_s
-
     def target_in(self, panel: PanelId, stop: Stop) -> tuple[float, float]:
         """The stop in the frame of a panel, (x, y), m."""
-        cached = self._target
-        if cached is not None and cached[0] == panel and cached[1] is stop:
-            return cached[2]
         x, y, _ = self._mirror.panels[panel].from_deck(self._mirror.surface_point(stop.x_m, stop.y_m))
-        self._target = (panel, stop, (x, y))
         return x, y

@@ -1,18 +1,20 @@
-"""State of a survey: states, events and transitions; shared flags; failed and missed points; approaches."""
+"""State of a survey: one frozen value; modes, events and transitions; what may happen to it."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from enum import StrEnum
+from collections.abc import Mapping, Sequence
+from enum import Enum, StrEnum
 from math import inf
 from types import MappingProxyType
+from typing import NamedTuple
 
-from ccatp.config.models import Config
+import msgspec
+
 from ccatp.control.gate import Purpose
-from ccatp.core import DeckPose, PointId, Severity, Stop
-from ccatp.mirror.mirror import Mirror
-from ccatp.survey.heading_recovery import HeadingRecovery
+from ccatp.core import PointId, Severity, Stop
+from ccatp.survey.behaviours import Retreat, ReturnHome, Settling
+from ccatp.survey.budget import BudgetProgress
+from ccatp.survey.heading_recovery import TakeoverState
 from ccatp.survey.planning.route import Route
-from ccatp.survey.route_follower import Corrector, RouteFollower, SpeedLimitedTracker, StateEstimate
-from ccatp.survey.stops import EdgeRetreat, ReturnToBase, SettleAndMeasure
+from ccatp.survey.route_follower import Leg
 
 
 class MissionState(StrEnum):
@@ -56,11 +58,11 @@ class SurveyOutcome(StrEnum):
     STOPPED = "stopped"
 
 
-_ANYWHERE = {MissionEvent.HOLD: MissionState.HELD, MissionEvent.FINISHED: MissionState.DONE}
+_ANYWHERE = {MissionEvent.HOLD: HELD, MissionEvent.FINISHED: DONE}
 _SURVEYING = _ANYWHERE | {
-    MissionEvent.EDGE: MissionState.BACKING_OFF,
-    MissionEvent.GO_HOME: MissionState.RETURNING,
-    MissionEvent.GO_ON: MissionState.TURNING,
+    MissionEvent.EDGE: BACKING_OFF,
+    MissionEvent.GO_HOME: RETURNING,
+    MissionEvent.GO_ON: TURNING,
 }
 
 # (state, event) -> state. An edge outranks an abort: while backing off GO_HOME changes nothing. DONE is final.
@@ -78,19 +80,18 @@ TRANSITIONS = MappingProxyType(
     }
 )
 
-
 # What the last gate lets a state move for.
 PURPOSES = MappingProxyType(
     {
-        MissionState.IDLE: Purpose.STAND,
-        MissionState.TURNING: Purpose.SURVEY,
-        MissionState.DRIVING: Purpose.SURVEY,
-        MissionState.SETTLING: Purpose.STAND,
-        MissionState.MEASURING: Purpose.STAND,
-        MissionState.BACKING_OFF: Purpose.RETREAT,
-        MissionState.RETURNING: Purpose.HOMEWARD,
-        MissionState.HELD: Purpose.STAND,
-        MissionState.DONE: Purpose.STAND,
+        IDLE: Purpose.STAND,
+        TURNING: Purpose.SURVEY,
+        DRIVING: Purpose.SURVEY,
+        SETTLING: Purpose.STAND,
+        MEASURING: Purpose.STAND,
+        BACKING_OFF: Purpose.RETREAT,
+        RETURNING: Purpose.HOMEWARD,
+        HELD: Purpose.STAND,
+        DONE: Purpose.STAND,
     }
 )
 
@@ -100,8 +101,252 @@ def next_state(state: MissionState, event: MissionEvent) -> MissionState:
     return TRANSITIONS[state].get(event, state)
 
 
-# Planned at a time: a way through so many points takes less than the robot's frames may wait.
-CHUNK = 12
+class FixNeed(Enum):
+    """Whether a fix comes before the next move."""
+
+    NONE = "none"
+    CONFIRM = "confirm"  # at the start: the pose is not confirmed yet
+    RELOCALIZE = "relocalize"  # the pose is known to be wrong
+
+
+class Hold(NamedTuple):
+    """How the robot is held.
+
+    ``rejects_odometry``: wheels or inertial unit are not to be believed: whatever they say, the robot stands.
+    """
+
+    by_hand: bool = False  # until an operator resumes
+    is_fault: bool = False  # an operator has to look after it
+    rejects_odometry: bool = False
+
+
+class SurveyState(msgspec.Struct, frozen=True):
+    """All that a survey knows at one time; times are robot time, s.
+
+    Attributes:
+        mode: what it is at.
+        stop_index: of the stop driven to, or measured at.
+        behaviour: progress of what the mode does; made on entry, dropped on leaving it.
+        done: points measured, in order.
+        skipped: points whose measurement failed.
+        failure_causes: why points failed and were not measured since.
+        due: points to be measured next, in this order, away from the planned route.
+        retried: points that failed and were due once more.
+        abort_cause: why the survey was given up, or empty.
+        interlock: why nothing may move, an earthquake, or empty.
+        is_latched, is_shaking, severity: of the newest verdict: an emergency, an earthquake, the gravest finding.
+        inflates_covariance: the localizer shall widen its covariance; the next command says so once.
+        wants_calibration: the calibration drive was given up, too far from where it leads.
+        full_fans: the robot shall be pressed on with full fans, from now on.
+        is_missed: the last fix shows the robot too far from its point; ``corrected``: the stop of the last correction.
+        request: number of the measurement that was asked for last; ``arrived_at``: the last point with an arrival.
+        failures: failed measurements in a row.
+        heading_legs_left, was_reverse: of the search for the heading.
+        finding: the cause for which the robot was sent home last; ``emergency_epoch``: the newest emergency acted on
+            (``None``: what is latched when the first verdict comes was acted on before).
+        was_lost, has_looked: a fix was needed in the last frame; a sensor that stays off was looked at with a fix.
+        stuck_s: since when a retreat led nowhere.
+        resumes_after_s: a hold that goes on by itself lasts at least until then.
+        stands_until_s: nothing moves before then.
+        recoveries_s: when the estimate broke down lately.
+    """
+
+    route: Route
+    mode: MissionState = IDLE
+    outcome: SurveyOutcome = SurveyOutcome.NONE
+    cause: str = ""
+    stop_index: int = 0
+    behaviour: Leg | Settling | Retreat | ReturnHome | None = None
+    hold: Hold = Hold()
+    fix: FixNeed = FixNeed.NONE
+    done: tuple[PointId, ...] = ()
+    skipped: tuple[PointId, ...] = ()
+    failure_causes: Mapping[PointId, str] = MappingProxyType({})
+    due: tuple[PointId, ...] = ()
+    retried: frozenset[PointId] = frozenset()
+    abort_cause: str = ""
+    interlock: str = ""
+    is_latched: bool = False
+    is_shaking: bool = False
+    severity: Severity = Severity.NONE
+    is_slow: bool = False
+    is_off_route: bool = False
+    is_review_due: bool = False
+    inflates_covariance: bool = False
+    wants_calibration: bool = False
+    full_fans: bool = False
+    is_missed: bool = False
+    corrected: Stop | None = None
+    corrections: int = 0
+    request: int = 0
+    arrived_at: PointId | None = None
+    failures: int = 0
+    heading_legs_left: int = 0
+    was_reverse: bool = True
+    budget: BudgetProgress = BudgetProgress()
+    finding: str = ""
+    emergency_epoch: int | None = 0
+    was_lost: bool = False
+    has_looked: bool = False
+    backoffs: int = 0
+    stuck_s: float | None = None
+    resumes_after_s: float = -inf
+    stands_until_s: float = -inf
+    recoveries_s: tuple[float, ...] = ()
+
+    @property
+    def stop(self) -> Stop | None:
+        """The stop of the route that is driven to, or measured at; ``None`` behind the last."""
+        stops = self.route.stops
+        return stops[self.stop_index] if self.stop_index < len(stops) else None
+
+    @property
+    def stops(self) -> Sequence[Stop]:
+        """What is being driven along: the route, the way home, or a leg that shows the heading."""
+        behaviour = self.behaviour
+        if isinstance(behaviour, ReturnHome):
+            return behaviour.stops
+        if isinstance(behaviour, Leg) and self.fix is not FixNeed.NONE:
+            return (behaviour.stop,)
+        return self.route.stops
+
+    @property
+    def next_point(self) -> PointId | None:
+        """The point to be measured next, at the current stop or a later one."""
+        return next((stop.point for stop in self.route.stops[self.stop_index :] if stop.point is not None), None)
+
+    @property
+    def measuring_point(self) -> PointId | None:
+        """The point being measured; ``None`` for a fix that only serves to find the robot again."""
+        stop = self.stop
+        return None if self.fix is not FixNeed.NONE or stop is None else stop.point
+
+    @property
+    def purpose(self) -> Purpose:
+        """What the last gate lets the robot move for: legs that show the heading may be part of the way home."""
+        if self.abort_cause and self.fix is not FixNeed.NONE and self.mode in (TURNING, DRIVING):
+            return Purpose.HOMEWARD
+        return PURPOSES[self.mode]
+
+    @property
+    def rejects_odometry(self) -> bool:
+        """Held because wheels or inertial unit are not to be believed."""
+        return self.mode is HELD and self.hold.rejects_odometry
+
+    @property
+    def is_faulted(self) -> bool:
+        """An operator has to look after it."""
+        return self.hold.is_fault
+
+    @property
+    def is_held_by_hand(self) -> bool:
+        """Held until an operator resumes."""
+        return self.mode is HELD and self.hold.by_hand
+
+    @property
+    def is_paused(self) -> bool:
+        """Held until an operator resumes, or reports that an earthquake is over."""
+        return self.mode is HELD and (self.hold.by_hand or bool(self.interlock))
+
+    @property
+    def is_lost(self) -> bool:
+        """The pose is known to be wrong, and is to be found again; at the start it is only to be confirmed."""
+        return self.fix is FixNeed.RELOCALIZE
+
+    @property
+    def stands_for_fix(self) -> bool:
+        """It stands so that a fix shows where it is."""
+        return self.fix is not FixNeed.NONE and self.mode in (SETTLING, MEASURING)
+
+    @property
+    def is_awaiting_fix(self) -> bool:
+        """Whether the measurement asked for last, number ``request``, is still wanted."""
+        behaviour = self.behaviour
+        return self.mode is MEASURING and isinstance(behaviour, Settling) and behaviour.is_requested
+
+    @property
+    def eta_s(self) -> float:
+        """Least time that the rest of the survey takes, s; nothing is left of one that was given up or is over."""
+        return 0.0 if self.abort_cause or self.mode is DONE else self.route.remaining_s(self.stop_index)
+
+
+class Pause(NamedTuple):
+    """Hold until an operator resumes."""
+
+    cause: str
+
+
+class Resume(NamedTuple):
+    """Go on after a hold; what holds the robot must be gone."""
+
+
+class Abort(NamedTuple):
+    """Return to base and end there."""
+
+    cause: str
+
+
+class StopHere(NamedTuple):
+    """Hold the wheels and end here."""
+
+
+class Interrupted(NamedTuple):
+    """Frames or verdicts are not fresh: hold until they are."""
+
+    cause: str
+
+
+class Fault(NamedTuple):
+    """Something is wrong: hold until an operator resumes."""
+
+    cause: str
+    loses_pose: bool = False
+
+
+class EstimateDiverged(NamedTuple):
+    """The localizer is frozen until it has a fix; what comes again and again is a fault."""
+
+    cause: str
+    t_s: float
+
+
+class TrackingGap(NamedTuple):
+    """The robot may have moved while it was not observed: it does not drive on before a fix, and a sure heading."""
+
+
+class EmergencyKnown(NamedTuple):
+    """An emergency that is latched when the first verdict comes is not new."""
+
+
+class TakenOver(NamedTuple):
+    """Go on with what another process began; before the first frame. The robot is found before it moves."""
+
+    recovery: TakeoverState
+
+
+class FixStored(NamedTuple):
+    """The measurement that was asked for is taken, fused and stored; ``None``: it only serves to find the robot."""
+
+    point: PointId | None
+    heading_sigma_rad: float = 0.0
+
+
+class PointMissed(NamedTuple):
+    """The fix shows the robot too far from its point, which has to be approached again from where it really is."""
+
+
+class FixFailed(NamedTuple):
+    """The measurement failed for good: the point is skipped; several in a row hold the robot."""
+
+    point: PointId | None
+    cause: str
+    heading_sigma_rad: float = 0.0
+
+
+SurveyInput = (
+    Pause | Resume | Abort | StopHere | Interrupted | Fault | EstimateDiverged | TrackingGap | EmergencyKnown
+    | TakenOver | FixStored | PointMissed | FixFailed
+)  # fmt: skip
 
 
 def by_reason(causes: Mapping[PointId, str]) -> dict[str, list[str]]:
@@ -110,311 +355,3 @@ def by_reason(causes: Mapping[PointId, str]) -> dict[str, list[str]]:
     for point, why in causes.items():
         named.setdefault(why, []).append(f"{point.row}-{point.col}-{point.point}")
     return named
-
-
-class RetryQueue:
-    """Points that are due, in this order, away from the planned route.
-
-    Each failed one once more when the others are done.
-    """
-
-    def __init__(self) -> None:
-        self.causes: dict[PointId, str] = {}
-        self.due: list[PointId] = []
-        self._tried_again: set[PointId] = set()
-
-    def failed(self, point: PointId, cause: str) -> None:
-        """The measurement of a point failed."""
-        self.causes[point] = cause
-        self._is_over(point)
-
-    def measured(self, point: PointId) -> None:
-        """A point is measured, perhaps after it failed."""
-        self.causes.pop(point, None)
-        self._is_over(point)
-
-    def _is_over(self, point: PointId) -> None:
-        if point in self.due:
-            self.due.remove(point)
-
-    def begin_second_round(self) -> None:
-        """What failed and was not tried again yet is due; last first, because the robot is nearer to that."""
-        if not self.due:
-            self.due = [point for point in reversed(self.causes) if point not in self._tried_again]
-            self._tried_again.update(self.due)
-
-    def drop_low_priority(self, points: Sequence[PointId], wanted: Sequence[PointId], cause: str) -> None:
-        """Of these points only the wanted ones are due; there is no time for the others."""
-        self.due = list(wanted)
-        dropped = set(points).difference(wanted)
-        self.causes |= {point: cause for point in points if point in dropped}
-        self._tried_again |= dropped
-
-
-class MissedPoint:
-    """Keeps whether the current stop was missed, and at which one the last correction was made."""
-
-    def __init__(self, corrector: Corrector) -> None:
-        self._corrector = corrector
-        self._is_missed = False
-        self._corrected: Stop | None = None  # until the next leg
-        self.corrections = 0
-
-    def miss(self) -> None:
-        """The fix shows the robot too far from its point."""
-        self._is_missed = True
-
-    def interrupt(self) -> None:
-        """The robot stopped, or goes on: wherever it is, it is not where it missed the point."""
-        self._is_missed = False
-
-    def follows_route(self, motion: StateEstimate, stop: Stop, follower: RouteFollower) -> bool:
-        """Whether the leg to ``stop`` may be driven as planned, or as the correction that begins here."""
-        if self._is_missed:
-            self._is_missed = False
-            return self._correct(motion, stop, follower)
-        if self._corrected is None or self._corrected is stop:
-            return True
-        self._corrected = None
-        return self._corrector.can_proceed(motion.deck, stop)
-
-    def _correct(self, motion: StateEstimate, stop: Stop, follower: RouteFollower) -> bool:
-        panel = motion.pose.panel
-        aim = self._corrector.aim(motion.pose, follower.target_in(panel, stop))
-        if aim is None:
-            return False
-        follower.correct(panel, aim)
-        self._corrected = stop
-        self.corrections += 1
-        return True
-
-
-PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
-PlanRest = Callable[[Route, DeckPose, Collection[PointId]], Route]
-PlanPoints = Callable[[DeckPose, Sequence[PointId]], Route]
-
-
-class SurveyState:
-    """State, causes and parts of one survey.
-
-    Attributes:
-        done: points measured, in order.
-        skipped: points whose measurement failed.
-        abort_cause: why the survey was given up, or empty.
-        interlock: why nothing may move, an earthquake, or empty.
-        is_shaking: there is an earthquake, though the robot may be leaving an edge first.
-        is_faulted: an operator has to look after it.
-        is_odometry_rejected: held because wheels or inertial unit are not trusted.
-        inflates_covariance: the localizer shall widen its covariance; to be set to false when it does.
-        needs_fix: a fix comes before the next move: the pose is wrong or (``is_at_start``) not confirmed yet.
-        wants_calibration: the calibration drive was given up, too far from where it leads.
-        wants_full_fans: the robot shall be pressed on with full fans.
-        stuck_s: when a retreat led nowhere, robot time.
-        waits_until_s: a hold that goes on by itself lasts at least until then, robot time.
-        stands_until_s: nothing moves before then, whatever the state, robot time.
-    """
-
-    def __init__(
-        self, cfg: Config, mirror: Mirror, route: Route, heading_sigma_of: Callable[[], float], *, has_planner: bool
-    ) -> None:
-        self.cfg, self.mirror, self.route, self._has_planner = cfg, mirror, route, has_planner
-        self.tracker = SpeedLimitedTracker(cfg.control, cfg.limits, cfg.health, cfg.robot.wheel_lag_s)
-        self.survey_route = self.follow_stops(route.stops)
-        self.home: ReturnToBase | None = None
-        self.settling = SettleAndMeasure(cfg.control, cfg.etalon.measuring_time_s)
-        self.missed = MissedPoint(Corrector(mirror, cfg.robot, cfg.mission))
-        self.heading_recovery = HeadingRecovery(mirror, cfg.robot, cfg.mission, heading_sigma_of, self.follow_stops)
-        self.retries = RetryQueue()
-        self.state, self.outcome, self.cause = MissionState.IDLE, SurveyOutcome.NONE, ""
-        self.done: list[PointId] = []
-        self.skipped: list[PointId] = []
-        self.abort_cause = ""
-        self.interlock = ""
-        self.is_latched = self.is_shaking = False
-        self.severity = Severity.NONE
-        self.awaits_operator = self.is_faulted = self.is_odometry_rejected = False
-        self.needs_fix = self.is_at_start = cfg.mission.fix_at_start
-        self.is_off_route = self.is_review_due = self.inflates_covariance = self.wants_full_fans = False
-        self.wants_calibration = False
-        self.retreat: EdgeRetreat | None = None
-        self.stuck_s: float | None = None
-        self.backoffs = 0
-        self.waits_until_s = self.stands_until_s = -inf
-        self._recoveries_s: list[float] = []
-
-    def follow_stops(self, stops: Sequence[Stop]) -> RouteFollower:
-        """A journey along stops."""
-        return RouteFollower(self.mirror, self.tracker, self.cfg.control.leg_timeout_factor, stops)
-
-    @property
-    def follower(self) -> RouteFollower:
-        """The journey being made: the survey, the way home, or a leg that shows the heading."""
-        if self.heading_recovery.follower is not None:
-            return self.heading_recovery.follower
-        return self.survey_route if self.home is None else self.home.follower
-
-    @property
-    def rejects_odometry(self) -> bool:
-        """Held because wheels or inertial unit are not to be believed: whatever they say, the robot stands."""
-        return self.state is HELD and self.is_odometry_rejected
-
-    @property
-    def purpose(self) -> Purpose:
-        """What the last gate lets the robot move for: legs that show the heading may be part of the way home."""
-        if self.needs_fix and self.abort_cause and self.state in (MissionState.TURNING, MissionState.DRIVING):
-            return Purpose.HOMEWARD
-        return PURPOSES[self.state]
-
-    @property
-    def is_held_by_hand(self) -> bool:
-        """Held until an operator resumes."""
-        return self.state is HELD and self.awaits_operator
-
-    @property
-    def is_lost(self) -> bool:
-        """The pose is known to be wrong, and is to be found again; at the start it is only to be confirmed."""
-        return self.needs_fix and not self.is_at_start
-
-    @property
-    def is_awaiting_fix(self) -> bool:
-        """Whether the measurement asked for last, number ``request``, is still wanted."""
-        return self.state is MissionState.MEASURING and self.settling.is_requested
-
-    def apply(self, event: MissionEvent) -> None:
-        """Something happened: the table says what state that makes."""
-        self.state = next_state(self.state, event)
-
-    def invalidate_pose(self) -> None:
-        """The pose is known to be wrong: a fix comes before the next move."""
-        self.needs_fix, self.is_at_start = True, False
-
-    def interrupt_leg(self) -> None:
-        """Drive the leg again from where the robot is."""
-        (self.survey_route if self.home is None else self.home).interrupt()
-
-    def interrupt_parts(self) -> None:
-        """Forget where in a leg, a stop or a docking the robot was: it begins again from where it is."""
-        self.interrupt_leg()
-        self.settling.interrupt()
-        self.missed.interrupt()
-        self.heading_recovery.interrupt()
-
-    # -- holding and going on -------------------------------------------------------------------------------------
-
-    def hold(self, cause: str, *, by_hand: bool) -> None:
-        """Hold, until somebody resumes or until the cause is gone."""
-        self.interrupt_parts()
-        self.apply(MissionEvent.HOLD)
-        self.awaits_operator = by_hand
-        self.is_odometry_rejected = False
-        self.cause = cause
-
-    def interrupt(self, cause: str) -> bool:
-        """Hold until frames and verdicts are fresh again; returns whether that was news."""
-        if self.state in (MissionState.IDLE, MissionState.HELD, MissionState.DONE):
-            return False
-        self.hold(cause, by_hand=False)
-        return True
-
-    def fault(self, cause: str, *, is_lost: bool = False) -> None:
-        """Hold until an operator resumes, because something is wrong; where the pose is, a fix comes first then."""
-        if self.state is MissionState.DONE:
-            return
-        self.needs_fix |= is_lost
-        self.hold(cause, by_hand=True)
-        self.is_faulted = True
-
-    def await_recovery(self, cause: str, *, is_pose_doubted: bool = False) -> None:
-        """Hold until the cause is gone, and then find out where the robot is before moving on."""
-        if self.state is MissionState.DONE or self.is_held_by_hand:
-            return
-        self.invalidate_pose()
-        was_rejected = self.rejects_odometry
-        if not self.interrupt(cause):
-            self.cause = cause
-        self.is_odometry_rejected = was_rejected or is_pose_doubted
-
-    def recover(self, cause: str, t_s: float) -> None:
-        """Hold, and go on with a fix; what comes again and again is a fault."""
-        if self.state is MissionState.DONE or self.is_held_by_hand:
-            return
-        health = self.cfg.health
-        self._recoveries_s = [since_s for since_s in self._recoveries_s if t_s - since_s <= health.retry_window_s]
-        if self._recoveries_s and t_s - self._recoveries_s[-1] <= health.pause_limit_s:
-            self._recoveries_s.pop()  # still the same: frame by frame it is asked for again
-        self._recoveries_s.append(t_s)
-        if len(self._recoveries_s) > 1 + health.retries:
-            self.fault(cause, is_lost=True)
-        else:
-            self.await_recovery(cause)
-            # A filter that is frozen cannot tell when the robot stands.
-            self.waits_until_s = t_s + health.retry_after_s
-
-    def abort(self, cause: str) -> str | None:
-        """Return to base and end there; why that is refused, or ``None``."""
-        if self.state is MissionState.DONE:
-            return "the mission is over"
-        is_new = not self.abort_cause
-        self.abort_cause = self.abort_cause or cause
-        if self.interlock:
-            return None  # home, but not before the robot may move
-        # An edge outranks an abort: the retreat and its fix come first.
-        if self.state is HELD or (is_new and self.state is not MissionState.BACKING_OFF and not self.needs_fix):
-            self.proceed()
-        return None
-
-    def proceed(self) -> None:
-        """To what is next: finding the robot, home, the next stop, or the end."""
-        self.interrupt_parts()
-        self.inflates_covariance |= self.rejects_odometry
-        self.is_faulted = False
-        # Wherever a hold left the robot: the route's next turn may not be safe there.
-        self.is_off_route |= self.state is MissionState.HELD
-        if self.needs_fix:
-            self.apply(MissionEvent.FIND)
-        elif self.abort_cause:
-            self.cause = self.abort_cause
-            self.home = None  # planned again from where the robot is now
-            self.apply(MissionEvent.GO_HOME)
-        elif self.survey_route.current is None and not self._has_more():
-            self.outcome = SurveyOutcome.COMPLETE
-            self.apply(MissionEvent.FINISHED)
-        else:
-            self.cause = ""
-            self.apply(MissionEvent.GO_ON)
-
-    def _has_more(self) -> bool:
-        """Whether points are due away from the planned route: those that failed once, or a thinned rest."""
-        if not self._has_planner:
-            return False
-        self.retries.begin_second_round()
-        self.is_off_route |= bool(self.retries.due)
-        return bool(self.retries.due)
-
-
-# A puck is within the tolerance when it is so by more than the fix may be wrong (guard band, ISO 14253-1); but a laser
-# system of little precision cannot make a robot approach a point again and again.
-_GUARD_SIGMAS = 3.0
-_MOST_GUARD = 0.1  # of the tolerance
-
-
-class ApproachCounter:
-    """Decides on a correction move after each fix that is further than ``tolerance_m`` from its point.
-
-    After ``limit`` approaches a point is measured wherever the robot stands.
-    """
-
-    def __init__(self, tolerance_m: float, limit: int) -> None:
-        self._tolerance_m, self._limit = tolerance_m, limit
-        self._point: PointId | None = None
-        self.count = 0
-
-    def is_too_far(self, point: PointId, error_m: float, sigma_m: float) -> bool:
-        """Whether ``point`` has to be approached again; call once for each fix taken there.
-
-        ``sigma_m``: standard deviation of the robot's place after the fix, along its worst direction.
-        """
-        self.count = self.count + 1 if point == self._point else 1
-        self._point = point
-        guard_m = min(_GUARD_SIGMAS * sigma_m, _MOST_GUARD * self._tolerance_m)
-        return error_m > self._tolerance_m - guard_m and self.count < self._limit

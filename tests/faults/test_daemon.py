@@ -19,6 +19,7 @@ import ccatp
 from ccatp.daemon.danger_loop import DangerLoop
 from ccatp.daemon.main_loop import MainLoop
 from ccatp.errors import ExitStatus
+from ccatp.survey.state import Pause, Resume
 from tests.faults.linking import Measured
 from tests.support.daemon import Daemon, configuration, running_daemon, tell
 
@@ -199,17 +200,17 @@ async def test_planning_longer_than_a_frame_may_wait_pauses_nobody() -> None:
     async with running_daemon(configuration()) as daemon:
         await daemon.until(lambda: daemon.is_driving)
         mission: Any = daemon.main._runner.mission
-        plan, planned = mission._behaviours._plan_rest, []
+        plan, planned = mission.survey._plan_rest, []
 
         def plan_slowly(*args: object) -> object:
             time.sleep(0.12)
             planned.append(clock())
             return plan(*args)
 
-        mission._behaviours._plan_rest = plan_slowly
-        assert mission.pause("a test") is None
+        mission.survey._plan_rest = plan_slowly
+        assert mission.handle(Pause("a test")) is None
         await daemon.until(lambda: not daemon.is_driving)
-        assert mission.resume() is None
+        assert mission.handle(Resume()) is None
         await daemon.until(lambda: bool(planned))
         await moving_again(daemon, planned[0])
         # The danger loop, here in the same event loop, is blocked as well: that may cost another plan.

@@ -16,7 +16,7 @@ from ccatp.control.gate import Denial
 from ccatp.core import Twist
 from ccatp.links.robot_messages import Sensors
 from ccatp.studies.sil_run import SilRun
-from ccatp.survey.state import MissionState
+from ccatp.survey.state import FixStored, MissionState
 from tests.faults.linking import Measured
 from tests.support.scenario import config_of, one_panel
 from tests.support.sim_survey import MeasuredSurvey, RestartedSurvey
@@ -69,7 +69,7 @@ class Broken(MeasuredSurvey):
         self.drive = right, left
 
     def look(self, frame: Sensors) -> None:
-        if self.broken_at_s is None and self.mission.done and self.mission.state is MissionState.DRIVING:
+        if self.broken_at_s is None and self.mission.state.done and self.mission.state.mode is MissionState.DRIVING:
             self.broken_at_s = frame.t
             localizer: Any = self.localizer
             # The end of a block of frames: the filter is asked in this one.
@@ -81,9 +81,12 @@ class Broken(MeasuredSurvey):
         super()._serve(frame, dt_s)
         if self.broken_at_s is not None and self.held_at_s is None and self.localizer.is_frozen:
             self.held_at_s = frame.t
-            assert self.mission.cause.startswith("filter: ")
-            assert self.mission.state in (MissionState.HELD, MissionState.SETTLING)  # for a fix, and for nothing else
-            assert self.mission.measuring_point is None
+            assert self.mission.state.cause.startswith("filter: ")
+            assert self.mission.state.mode in (
+                MissionState.HELD,
+                MissionState.SETTLING,
+            )  # for a fix, and for nothing else
+            assert self.mission.state.measuring_point is None
             assert self.drive == (0.0, 0.0)
             now = self.localizer.deck_pose
             assert np.isfinite((now.x_m, now.y_m, now.heading_rad)).all()
@@ -186,7 +189,7 @@ class Burning(RestartedSurvey):
 
     def _serve(self, frame: Sensors, dt_s: float) -> None:
         is_time = frame.seq > 1000 if self._is_before else bool(self.states)
-        if not self._is_raised and is_time and self.mission.state is MissionState.DRIVING:
+        if not self._is_raised and is_time and self.mission.state.mode is MissionState.DRIVING:
             assert self.monitor.emergency("fire", "a") is None
             self._is_raised = True
             self._kills |= {frame.seq + 60} if self._is_before else set()
@@ -213,8 +216,7 @@ class Watching(RestartedSurvey):
     def _take_over(self) -> None:
         super()._take_over()
         self.early, mission = [], self.mission
-        step, self._has_fix = mission.step, False
-        fixed = mission.fixed
+        step, handle, self._has_fix = mission.step, mission.handle, False
 
         def watch(motion, verdict):  # type: ignore[no-untyped-def]
             order = step(motion, verdict)
@@ -222,11 +224,11 @@ class Watching(RestartedSurvey):
                 self.early.append(order.twist)
             return order
 
-        def note(point):  # type: ignore[no-untyped-def]
-            self._has_fix = True
-            fixed(point)
+        def note(event):  # type: ignore[no-untyped-def]
+            self._has_fix |= isinstance(event, FixStored)
+            return handle(event)
 
-        mission.step, mission.fixed = watch, note  # type: ignore[method-assign]
+        mission.step, mission.handle = watch, note  # type: ignore[method-assign]
 
 
 @pytest.mark.fault("P11", "P17")

@@ -127,8 +127,8 @@ def test_it_stops_in_time(case: Stop, measured: Measured) -> None:
     assert found.verdict.severity is expected.get("severity", found.verdict.severity)
     assert found.verdict.signal in expected.get("signals", {found.verdict.signal})
     if until is to_its_end:  # held, with its cause, and not waiting for ever
-        assert run.mission.is_faulted
-        assert expected.get("cause", "") in run.mission.cause
+        assert run.mission.state.is_faulted
+        assert expected.get("cause", "") in run.mission.state.cause
         fewest, most = expected.get("holds", (0, inf))
         assert fewest <= entered(run.seen, MissionState.HELD) <= most
         assert run.first(at_s, held(HOLD)).t_s - at_s < expected.get("hold_s", inf)
@@ -212,8 +212,8 @@ def test_wheels_that_creep_while_they_are_held(speed_m_s: float, measured: Measu
     late_s = run.first(STANDING_S, held(HOLD)).t_s - (STANDING_S + 0.002 / speed_m_s)  # after 2 mm
     assert late_s <= 0.5
     assert run.seen[-1].verdict.cause == "the right wheel turns while it is held"
-    assert run.mission.wants_full_fans
-    assert run.mission.is_faulted
+    assert run.mission.state.full_fans
+    assert run.mission.state.is_faulted
     measured("S7", 1e3 * max(late_s, 0.0))
 
 
@@ -257,7 +257,7 @@ def test_an_edge_sensor_that_stays_off_is_no_edge(corner: str, measured: Measure
     assert first.verdict.signal == corner
     assert first.t_s - DRIVING_S <= 3.0
     assert entered(run.seen, MissionState.BACKING_OFF) <= 2
-    assert run.mission.is_faulted
+    assert run.mission.state.is_faulted
     assert not run.robot.world.is_fallen
     measured("S18", first.t_s - DRIVING_S)
 
@@ -291,7 +291,7 @@ def test_a_low_battery_sends_the_robot_home(fault: str, measured: Measured) -> N
     run = watched(HARD, to_its_end, f"{fault} at_s=3.0")
     home = run.first(3.0, lambda one: one.state is MissionState.RETURNING)
     assert home.t_s - 3.0 < 5.5
-    assert run.mission.outcome is SurveyOutcome.AT_BASE
+    assert run.mission.state.outcome is SurveyOutcome.AT_BASE
     # The stand-in's charge stays what it was, so this is what is left at base, too.
     measured("F6", 100.0 * (0.2 if "soc" in fault else 1.0))
 
@@ -366,7 +366,7 @@ def test_no_reading_of_an_encoder_makes_the_pose_jump(kind: str, measured: Measu
 )
 def test_a_clock_that_jumps(by_s: float, at_s: float, measured: Measured) -> None:
     run = watched(HARD, after(at_s + 5.0), f"clock jump at_s={at_s} by_s={by_s}")
-    assert not run.mission.is_faulted
+    assert not run.mission.state.is_faulted
     near = [one for one in run.since(at_s - 0.03) if one.t_s <= at_s + 0.1]
     travelled = [hypot(b.pose.x_m - a.pose.x_m, b.pose.y_m - a.pose.y_m) for a, b in pairwise(near)]
     beyond = max(steps_m(near)) - max(travelled)
@@ -379,9 +379,9 @@ def test_a_clock_that_jumps(by_s: float, at_s: float, measured: Measured) -> Non
 @pytest.mark.parametrize("phase_s", [0.0, 0.003, 0.007])
 def test_a_clock_that_wraps_does_not_count_in_the_mission_time(phase_s: float) -> None:
     run = watched(HARD, after(12.0), f"clock wrap at_s=0.0 modulo_s={DRIVING_S + phase_s}")
-    assert not run.mission.is_faulted
+    assert not run.mission.state.is_faulted
     assert run._time.offset_s == pytest.approx(DRIVING_S + phase_s, abs=0.011)  # one period, and one wrap only
-    assert len(run.mission.done) >= 2
+    assert len(run.mission.state.done) >= 2
 
 
 # -- what passes by ----------------------------------------------------------------------------------------------------
@@ -398,8 +398,8 @@ def test_a_clock_that_wraps_does_not_count_in_the_mission_time(phase_s: float) -
 )
 def test_what_is_over_soon_does_not_end_the_mission(fault: str, until_s: float, done: int) -> None:
     run = watched(HARD, after(until_s), fault)
-    assert not run.mission.is_faulted
-    assert len(run.mission.done) >= done
+    assert not run.mission.state.is_faulted
+    assert len(run.mission.state.done) >= done
     assert max(map(error_m, run.since(TURNING_S))) < 0.02 or not fault.startswith("imu")
 
 
@@ -412,9 +412,9 @@ def test_a_battery_that_seems_low_for_a_moment_does_not() -> None:
 @pytest.mark.parametrize("at_s", [DRIVING_S, TURNING_S, STANDING_S])
 def test_a_flash_of_light_aborts_nothing(at_s: float, measured: Measured) -> None:
     run = watched(HARD, after(at_s + 9.0), *each(EDGES, f"stuck at_s={at_s} for_s=1.9 value=0.0"))
-    assert not run.mission.is_faulted
+    assert not run.mission.state.is_faulted
     assert any(map(is_moving, run.since(at_s + 2.0)))
-    measured("S26", float(run.mission.is_faulted))
+    measured("S26", float(run.mission.state.is_faulted))
 
 
 # -- fans on an overhanging mirror -------------------------------------------------------------------------------------
@@ -435,9 +435,9 @@ def test_a_fan_that_gives_too_little_holds_with_full_fans(fault: str, measured: 
     run = with_fans(OVERHANG, fault)
     first = run.first(FANS_S, lambda one: one.verdict.severity is Severity.FAULT)
     assert first.is_zero
-    assert run.mission.is_faulted
-    assert "fan" in run.mission.cause
-    assert run.mission.wants_full_fans
+    assert run.mission.state.is_faulted
+    assert "fan" in run.mission.state.cause
+    assert run.mission.state.full_fans
     assert run._has_full_fans  # sent; the rehearsal of a faulted mission ends before it arrives
     # The echo has to be low for 0.1 s; what counts is how long after that the wheels get their zero.
     late_s = first.t_s - FANS_S - (0.1 if "faults" not in fault else 0.0)
@@ -458,7 +458,7 @@ def test_where_nothing_hangs_a_weak_fan_is_only_told() -> None:
     run = with_fans(HARD, 'faults raise names=["fan_left"]')
     assert run.seen[-1].verdict.severity is Severity.INFORM
     assert run.seen[-1].verdict.forward
-    assert not run.mission.is_faulted
+    assert not run.mission.state.is_faulted
 
 
 @pytest.mark.fault("F3")

@@ -88,17 +88,17 @@ def test_points_that_fail(
     run = MeasuredSurvey(SURVEY, tmp_path, laser)
     result = run.run()
     assert result.outcome == outcome
-    assert (len(run.mission.done), len(run.mission.skipped)) == (measured, skipped)
+    assert (len(run.mission.state.done), len(run.mission.state.skipped)) == (measured, skipped)
     assert len(run.all_fixes) == result.summary["points"]["measured"] == measured
     assert result.summary["points"]["skipped"] == skipped
-    assert {point for point, status in run.stored if status == "skipped"} == set(run.mission.skipped)
+    assert {point for point, status in run.stored if status == "skipped"} == set(run.mission.state.skipped)
     if outcome == "complete":
-        assert list(run.mission.left_out.values()) == why
+        assert list(run.mission.survey.left_out(run.mission.state).values()) == why
         assert len([m for m in run.asked if is_point(m, *points)]) == 2  # not again and again
-        assert run.mission.done[-1] == failures[0].point or why  # when all others were done
+        assert run.mission.state.done[-1] == failures[0].point or why  # when all others were done
     else:
-        assert run.mission.is_faulted
-        assert run.mission.state is MissionState.HELD
+        assert run.mission.state.is_faulted
+        assert run.mission.state.mode is MissionState.HELD
         assert result.cause == "3 measurements in a row failed: no reply"
 
 
@@ -319,7 +319,7 @@ def test_a_puck_off_the_surface_is_not_believed(height_m: float, is_taken: bool,
     assert all(m.is_fused is is_taken for m in asked)
     if not is_taken:
         assert len(asked) == 6  # three times, and three times once more at the end
-        assert "off the surface" in next(iter(run.mission.left_out.values()))
+        assert "off the surface" in next(iter(run.mission.survey.left_out(run.mission.state).values()))
 
 
 @pytest.mark.fault("E4")
@@ -414,8 +414,8 @@ def test_the_check_ends_with_three_places_that_span_a_plane(config: Config) -> N
 def test_a_mission_in_a_wrong_frame_does_not_begin(tmp_path: Path) -> None:
     run = MeasuredSurvey(SURVEY, tmp_path, lambda _m, fix: moved(fix, (0.3, 0.0, 0.0)))
     run.run()
-    assert run.mission.is_faulted
-    assert run.mission.cause == (
+    assert run.mission.state.is_faulted
+    assert run.mission.state.cause == (
         "the laser system sees the robot 0.30 m from its base: no exchange of axes or units explains it; is it at "
         "base, and is this the mirror?"
     )
@@ -457,22 +457,22 @@ def test_nothing_counts_that_was_measured_while_the_robot_moved(
             async with serving(service):
                 done = 0
                 for _ in range(6000):
-                    if story.mission.state is MissionState.DONE:
+                    if story.mission.state.mode is MissionState.DONE:
                         break
-                    if story.mission.state is MissionState.MEASURING and rng.random() < 0.012:
+                    if story.mission.state.mode is MissionState.MEASURING and rng.random() < 0.012:
                         story.v, bumps = 0.02, bumps + 1
                     if abs(story.v) > cfg.control.settle_speed_m_s:
                         motion_s.append(story.t)
                     order = story.frame(FREE)
                     if order.measure:
-                        point, here = story.mission.measuring_point, story.motion().deck
-                        service.begin(FixRequest(story.mission.request, story.t, point, (0.0, 0.0, 0.0), here))
+                        point, here = story.mission.state.measuring_point, story.motion().deck
+                        service.begin(FixRequest(story.mission.state.request, story.t, point, (0.0, 0.0, 0.0), here))
                     await asyncio.sleep(0.01)
-                    if len(story.mission.done) > done:
-                        done, counted = len(story.mission.done), counted + 1
+                    if len(story.mission.state.done) > done:
+                        done, counted = len(story.mission.state.done), counted + 1
                         begun_s, taken_s = fused[-1]
                         moving += any(begun_s - 0.2 <= t <= taken_s for t in motion_s)
-                assert story.mission.state is MissionState.DONE
+                assert story.mission.state.mode is MissionState.DONE
 
     for seed in range(2):
         run_virtual(race(seed))

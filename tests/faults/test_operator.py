@@ -23,12 +23,25 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.links.rpc import REPEAT_S, RequestFailed, request
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety.emergency_latch import EmergencyLatch
-from ccatp.survey.behaviours import home_time_s
+from ccatp.survey.behaviours import MissionCommand
+from ccatp.survey.budget import home_time_s
 from ccatp.survey.planning.route import RoutePlanner
 from ccatp.survey.planning.search import path_time
 from ccatp.survey.reactions import FaultAction, UnattendedFaultTimer
-from ccatp.survey.state import BACKING_OFF, DONE, DRIVING, HELD, RETURNING, TURNING, MissionState
-from ccatp.survey.stops import MissionCommand
+from ccatp.survey.state import (
+    BACKING_OFF,
+    DONE,
+    DRIVING,
+    HELD,
+    RETURNING,
+    TURNING,
+    Abort,
+    EmergencyKnown,
+    Fault,
+    MissionState,
+    Pause,
+    Resume,
+)
 from tests.faults.linking import Measured
 from tests.support.mission_story import DT, FREE, FRONT_OFF, Story, from_first_leg
 from tests.support.scenario import config_of, mirror_of, one_panel
@@ -58,12 +71,12 @@ class Aborted(MeasuredSurvey):
         self.moved_while_held = self.was_permitted = False
 
     def look(self, frame: Sensors) -> None:
-        if self.raised_s == inf and self.mission.done and self.mission.state is self._at:
+        if self.raised_s == inf and self.mission.state.done and self.mission.state.mode is self._at:
             self.raised_s = frame.t
             assert self.monitor.emergency(self._kind, "e") is None
         if self.cleared_s == inf and frame.t - self.raised_s >= self._clear_after_s:
             self.cleared_s = frame.t
-            assert self.monitor.clear("e", at_base_or_held=self.mission.state is HELD) is None
+            assert self.monitor.clear("e", at_base_or_held=self.mission.state.mode is HELD) is None
 
     def _foresee(self, number: int, right: float, left: float) -> None:
         super()._foresee(number, right, left)
@@ -90,8 +103,8 @@ def test_a_fire_stops_the_wheels_and_leads_home(state: MissionState, tmp_path: P
     assert run.zero_s - run.raised_s <= 0.1
     assert (result.outcome, result.cause) == ("aborted, at base", "emergency: fire")
     assert run.fans == []
-    left_out = run.mission.left_out
-    assert len(left_out) + len(run.mission.done) == 9
+    left_out = run.mission.survey.left_out(run.mission.state)
+    assert len(left_out) + len(run.mission.state.done) == 9
     assert set(left_out.values()) == {"emergency: fire"}
 
 
@@ -125,26 +138,26 @@ def frames(story: Story, *verdicts: Verdict, count: int = 1) -> MissionState:
     """The state after these verdicts, ``count`` times."""
     for verdict in verdicts * count:
         story.frame(verdict)
-    return story.mission.state
+    return story.mission.state.mode
 
 
 @pytest.mark.fault("O1")
 def test_during_an_earthquake_nobody_resumes(story: Story) -> None:
     story.until_state(DRIVING)
     story.frame(emergency(1, "earthquake"))
-    assert story.mission.is_paused
-    assert story.mission.resume() == NOBODY_RESUMES
-    assert story.mission.abort("operator") is None
-    assert story.mission.state is HELD
+    assert story.mission.state.is_paused
+    assert story.mission.handle(Resume()) == NOBODY_RESUMES
+    assert story.mission.handle(Abort("operator")) is None
+    assert story.mission.state.mode is HELD
     story.until_state(DONE)  # it is over
-    assert story.mission.done == []
+    assert story.mission.state.done == ()
 
 
 @pytest.mark.fault("O1", "O3")
 def test_an_emergency_that_is_new_outranks_a_pause_and_its_level_does_not(story: Story) -> None:
     story.until_state(DRIVING)
     assert frames(story, emergency(1)) is RETURNING
-    assert story.mission.pause("operator") is None
+    assert story.mission.handle(Pause("operator")) is None
     # The level; then one of two is cleared: what is left is the older one. Last all are cleared.
     assert frames(story, emergency(1), emergency(1, "power"), count=50) is HELD
     assert frames(story, FREE) is HELD
@@ -156,11 +169,11 @@ def test_an_earthquake_at_an_edge_presses_the_robot_on_and_nobody_resumes(story:
     story.until_state(DRIVING)
     shaking = emergency(1, "earthquake", code=EventCode.NEAR_EDGE)
     assert frames(story, replace(shaking, off=(True, False, False, False), forward=False)) is BACKING_OFF
-    assert story.mission.wants_full_fans
-    assert story.mission.pause("operator") is None
-    assert story.mission.resume() == NOBODY_RESUMES
+    assert story.mission.state.full_fans
+    assert story.mission.handle(Pause("operator")) is None
+    assert story.mission.handle(Resume()) == NOBODY_RESUMES
     assert frames(story, emergency(1, "earthquake")) is HELD
-    assert story.mission.cause == "emergency: earthquake"
+    assert story.mission.state.cause == "emergency: earthquake"
 
 
 @pytest.mark.fault("O1")
@@ -168,32 +181,32 @@ def test_what_breaks_in_an_earthquake_waits_for_an_operator_when_it_is_over(stor
     story.until_state(DRIVING)
     shaking = emergency(1, "earthquake")
     frames(story, shaking, replace(shaking, severity=Severity.FAULT, cause="a wheel runs away", signal="enc"))
-    assert story.mission.is_faulted
+    assert story.mission.state.is_faulted
     assert frames(story, FREE, count=50) is HELD
-    assert story.mission.cause == "a wheel runs away"
-    assert story.mission.resume() is None
+    assert story.mission.state.cause == "a wheel runs away"
+    assert story.mission.handle(Resume()) is None
     story.until_state(DONE)
-    assert story.mission.done == []
+    assert story.mission.state.done == ()
 
 
 @pytest.mark.fault("O1")
 def test_after_a_restart_with_nothing_latched_the_first_emergency_is_new(story: Story) -> None:
     """It was on its way home by the operator's abort, and paused, when its predecessor died."""
-    story.mission.abort("operator")
-    story.mission.pause("operator")
-    story.mission.skip_present_emergency()
+    story.mission.handle(Abort("operator"))
+    story.mission.handle(Pause("operator"))
+    story.mission.handle(EmergencyKnown())
     assert frames(story, FREE) is HELD
     assert frames(story, emergency(1)) is RETURNING
 
 
 @pytest.mark.fault("O1", "O7")
 def test_what_was_latched_before_the_start_is_waited_for_at_base(story: Story) -> None:
-    story.mission.pause("restarted")
-    story.mission.skip_present_emergency()
+    story.mission.handle(Pause("restarted"))
+    story.mission.handle(EmergencyKnown())
     assert frames(story, emergency(4), count=50) is HELD
-    assert story.mission.resume() == "an emergency of before is latched: 'ccatp clear' it first"
+    assert story.mission.handle(Resume()) == "an emergency of before is latched: 'ccatp clear' it first"
     story.frame()
-    assert story.mission.resume() is None
+    assert story.mission.handle(Resume()) is None
     story.until_state(DRIVING)
     assert frames(story, emergency(5)) is RETURNING
 
@@ -222,9 +235,9 @@ def test_the_way_home_is_planned_before_the_robot_misses_it(measured: Measured) 
 def test_an_abort_during_a_back_off_never_drives_forward_and_is_home_bound_soon(
     count: int, story: Story, measured: Measured
 ) -> None:
-    story.until(lambda: story.mission.state is DRIVING and story.v > 0.09)
+    story.until(lambda: story.mission.state.mode is DRIVING and story.v > 0.09)
     frames(story, FRONT_OFF, count=1 + count)
-    story.mission.abort("fire")
+    story.mission.handle(Abort("fire"))
     begun_s, first = story.t, len(story.orders)
     frames(story, FRONT_OFF, count=20)
     story.until_state(RETURNING)
@@ -232,7 +245,7 @@ def test_an_abort_during_a_back_off_never_drives_forward_and_is_home_bound_soon(
     assert story.t - begun_s <= 2.0
     assert all(order.twist.v_m_s <= 0.0 for order in story.orders[first:])
     story.until_state(DONE)
-    assert story.mission.done == []
+    assert story.mission.state.done == ()
 
 
 def drive(config: Config, mirror: Mirror, aborts: list[int]) -> list[MissionCommand]:
@@ -240,7 +253,7 @@ def drive(config: Config, mirror: Mirror, aborts: list[int]) -> list[MissionComm
     story = Story(config, mirror)
     for k in range(900):
         if k in aborts:
-            story.mission.abort("fire")
+            story.mission.handle(Abort("fire"))
         story.frame()
     return story.orders
 
@@ -388,11 +401,11 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
 ) -> None:
     cfg = config.health
     story.until_state(DRIVING)
-    story.mission.fault("leg overdue")
+    story.mission.handle(Fault("leg overdue"))
     vigil = UnattendedFaultTimer(config, falls=True)
     reminders: list[float] = []
     soc, drain = 0.5, 1.0 / cfg.battery_life_s
-    while story.mission.is_faulted:
+    while story.mission.state.is_faulted:
         story.frame()
         soc -= 50.0 * DT * drain
         t_s = 50.0 * story.t
@@ -400,11 +413,11 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
         if call is FaultAction.REMIND:
             reminders.append(t_s)
         elif call is FaultAction.RETURN:
-            story.mission.abort("nobody came")
+            story.mission.handle(Abort("nobody came"))
     at_dock = soc - home_s * drain
     measured("O8", (soc - cfg.battery_reserve) / (home_s * drain))
     measured("F6", 100.0 * at_dock)
-    assert story.mission.state is RETURNING
+    assert story.mission.state.mode is RETURNING
     assert at_dock >= cfg.battery_reserve
     assert (soc - cfg.battery_reserve) / (home_s * drain) >= 1.5
     assert len(reminders) >= 20
@@ -481,8 +494,11 @@ def test_what_does_not_fit_into_the_budget_is_left_out(budget_s: float, tmp_path
     assert result.mission_time_s <= budget_s
     assert result.outcome in {"complete", "aborted, at base"}
     assert 0 < points["measured"] < 18
-    assert len(run.mission.left_out) == 18 - points["measured"]
-    assert set(run.mission.left_out.values()) <= {"no time for it", f"the time budget of {budget_s:g} s is used up"}
+    assert len(run.mission.survey.left_out(run.mission.state)) == 18 - points["measured"]
+    assert set(run.mission.survey.left_out(run.mission.state).values()) <= {
+        "no time for it",
+        f"the time budget of {budget_s:g} s is used up",
+    }
 
 
 @pytest.mark.fault("O10")

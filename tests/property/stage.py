@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from ccatp.config.models import Config
 from ccatp.control.gate import FanGate, Purpose
-from ccatp.core import EdgeSample, EventCode, PointId, Twist, Verdict, WheelSample, twist_of
+from ccatp.core import EdgeSample, EventCode, PointId, Stop, Twist, Verdict, WheelSample, twist_of
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.fixes import FixRefused
 from ccatp.links.robot_codec import set_point_on_wire
@@ -22,7 +22,20 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.sim.robot import Robot
 from ccatp.studies.sil_run import SilLaser, SilRun
-from ccatp.survey.state import BACKING_OFF, DONE, DRIVING, HELD, PURPOSES, RETURNING, TURNING
+from ccatp.survey.state import (
+    BACKING_OFF,
+    DONE,
+    DRIVING,
+    HELD,
+    PURPOSES,
+    RETURNING,
+    TURNING,
+    Abort,
+    Fault,
+    FixFailed,
+    FixStored,
+    Pause,
+)
 
 FRESH_S = 0.15  # I10
 BACK_IN_SIGHT_S = 1e-6  # times are multiples of a frame, up to rounding
@@ -81,7 +94,7 @@ class Stage(SilRun):
         self._at_edge: dict[int, tuple[float, float, float]] = {}
         self._pending: tuple[int, int, Sensors] | None = None
         self._emergencies: dict[str, str] = {}
-        self._follower: object = None
+        self._stops: Sequence[Stop] = ()
         self.robot.join("monitor")
         self.robot.join("controller")
         while self.robot.delivered is None:
@@ -118,7 +131,7 @@ class Stage(SilRun):
             self.monitor.emergency(kind, number)
 
     def abort(self) -> None:
-        if self.mission.abort("operator") is None:
+        if self.mission.handle(Abort("operator")) is None:
             self.aborts += 1
 
     # -- frames -------------------------------------------------------------------------------------------------------
@@ -162,7 +175,7 @@ class Stage(SilRun):
             self.robot.permit(self._permit_seq, verdict.forward, verdict.reverse, verdict.turn)
         self.localizer.step(t_s, frame.imu, frame.enc, frame.edge, frame.gravity)
         if self.localizer.hold_requested:
-            mission.fault(self.localizer.hold_cause, is_lost=self.localizer.is_frozen)
+            mission.handle(Fault(self.localizer.hold_cause, loses_pose=self.localizer.is_frozen))
             self.localizer.clear_hold()
         if dt_s <= 0.0:
             self._send(0.0, 0.0)
@@ -172,12 +185,12 @@ class Stage(SilRun):
             verdict = None
         motion = self._motion(frame, dt_s)
         order = mission.step(motion, verdict)
-        right, left = self.gate.pass_through(order.twist, verdict, dt_s, t_s, 0.0, mission.purpose)
+        right, left = self.gate.pass_through(order.twist, verdict, dt_s, t_s, 0.0, mission.state.purpose)
         if order.at_rest:
             self.localizer.rest()
-        self._publish(frame.seq, t_s, motion.pose, mission.state)
+        self._publish(frame.seq, t_s, motion.pose, mission.state.mode)
         if order.measure:
-            self._pending = mission.request, trouble.fix_frames, frame
+            self._pending = mission.state.request, trouble.fix_frames, frame
             right = left = 0.0
         self._send(right, left)
         self._collect()
@@ -197,20 +210,20 @@ class Stage(SilRun):
             return
         self._pending = None
         mission = self.mission
-        if not (mission.is_awaiting_fix and mission.request == request):
+        if not (mission.state.is_awaiting_fix and mission.state.request == request):
             return
-        point = mission.measuring_point
+        point = mission.state.measuring_point
         if self.trouble.fixes_fail:
-            mission.not_fixed(point, "no fix")
+            mission.handle(FixFailed(point, "no fix"))
             return
         try:
             self._fuse(self.laser.fix(frame.t, self.localizer.deck_pose))
         except (MultilaterationError, FixRefused) as error:
-            mission.not_fixed(point, str(error))
+            mission.handle(FixFailed(point, str(error)))
             return
         if point is not None:
             self.acknowledged.append(point)
-        mission.fixed(point)
+        mission.handle(FixStored(point))
 
     # -- the invariants -----------------------------------------------------------------------------------------------
 
@@ -233,7 +246,7 @@ class Stage(SilRun):
         assert not self.robot.world.is_fallen
 
     def _look_at_drive(self, t_s: float, right: float, left: float) -> None:
-        verdict, state, robot, limits = self._verdict, self.mission.state, self.cfg.robot, self.cfg.limits
+        verdict, state, robot, limits = self._verdict, self.mission.state.mode, self.cfg.robot, self.cfg.limits
         assert isfinite(right), "I2"
         assert isfinite(left), "I2"
         assert max(abs(right), abs(left)) <= robot.max_wheel_rad_s + 1e-9, "I2"
@@ -276,20 +289,20 @@ class Stage(SilRun):
     def _look_at_mission(self) -> None:
         mission = self.mission
         if self.aborts or (self._emergencies and self.monitor.verdict.code is EventCode.ABORTED):
-            assert mission.state not in (TURNING, DRIVING), "I6"
-        assert mission.done == self.acknowledged, "I8"
-        assert len(set(mission.done)) == len(mission.done), "I8"
-        assert not set(mission.done) & set(mission.skipped), "I8"
-        if mission.follower is not self._follower:
-            self._follower = mission.follower
-            for x, y in _goals(mission.follower.stops):
+            assert mission.state.mode not in (TURNING, DRIVING), "I6"
+        assert list(mission.state.done) == self.acknowledged, "I8"
+        assert len(set(mission.state.done)) == len(mission.state.done), "I8"
+        assert not set(mission.state.done) & set(mission.state.skipped), "I8"
+        if mission.state.stops is not self._stops:
+            self._stops = mission.state.stops
+            for x, y in _goals(self._stops):
                 assert self.mirror.rim.signed_distance_m(x, y) >= MARGIN_M, "I7"
 
     def look_at_hold(self) -> None:
         """I9: whatever it was at, a pause holds it before its next frame, and that frame drives nothing."""
-        was_over = self.mission.state is DONE
-        self.mission.pause("I9")
-        assert self.mission.state is (DONE if was_over else HELD), "I9"
+        was_over = self.mission.state.mode is DONE
+        self.mission.handle(Pause("I9"))
+        assert self.mission.state.mode is (DONE if was_over else HELD), "I9"
 
 
 def _goals(stops: Sequence[Any]) -> list[tuple[float, float]]:

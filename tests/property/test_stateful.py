@@ -11,7 +11,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 
 from ccatp.config.load import load_config
 from ccatp.core import EmergencyKind
-from ccatp.survey.state import DONE
+from ccatp.survey.state import DONE, Resume, StopHere
 from tests.property.stage import Stage
 
 WARM_UP_FRAMES = 90  # the fix at base; the first leg begins
@@ -91,7 +91,7 @@ class Survey(RuleBasedStateMachine):
 
     @rule()
     def a_resume(self) -> None:
-        self.stage.mission.resume()
+        self.stage.mission.handle(Resume())
         self.stage.advance(10)
 
     @precondition(lambda self: self.stage.frames > 400)
@@ -103,9 +103,9 @@ class Survey(RuleBasedStateMachine):
     @precondition(lambda self: self.stage.frames > 1500)
     @rule()
     def a_stop(self) -> None:
-        self.stage.mission.stop()
+        self.stage.mission.handle(StopHere())
         self.stage.advance(2)
-        assert self.stage.mission.state is DONE
+        assert self.stage.mission.state.mode is DONE
         assert self.stage.robot.sent == (0.0, 0.0)
 
     @rule(fails=st.booleans(), n=st.integers(0, 60))

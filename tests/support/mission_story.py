@@ -8,11 +8,11 @@ from msgspec.structs import replace
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.mission import Mission
+from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.planning.route import Route
 from ccatp.survey.route_follower import StateEstimate
-from ccatp.survey.state import MissionState
-from ccatp.survey.stops import MissionCommand
+from ccatp.survey.state import FixStored, MissionState
+from ccatp.survey.statechart import Mission, Survey
 
 DT, LAG = 0.01, 0.08
 PANEL = PanelId(5, 5)
@@ -31,7 +31,7 @@ class Story:
         self.stops = tuple(
             Stop(*mirror.point_on_deck(PointId(5, 5, k)), StopKind.MEASURE, PointId(5, 5, k)) for k in (1, 2, 3)
         )
-        self.mission = Mission(config, mirror, self.route(self.stops), self.plan_home, self.plan_rest)
+        self.mission = Mission(Survey(config, mirror, self.route(self.stops), self.plan_home, self.plan_rest))
         self.plans: list[DeckPose] = []
         start = mirror.point_on_deck(PointId(5, 5, 4))
         pose = mirror.panel_pose(PANEL, DeckPose(*start, 0.0))
@@ -61,7 +61,7 @@ class Story:
         order = self.mission.step(self.motion(), verdict)
         self.orders.append(order)
         if order.measure and self.auto_fix:
-            self.mission.fixed(self.mission.measuring_point)
+            self.mission.handle(FixStored(self.mission.state.measuring_point))
         self._drive(order.twist)
         return order
 
@@ -81,10 +81,10 @@ class Story:
             if is_there():
                 return
             self.frame(verdict)
-        raise AssertionError(f"still {self.mission.state} ({self.mission.cause}) after {frames} frames")
+        raise AssertionError(f"still {self.mission.state.mode} ({self.mission.state.cause}) after {frames} frames")
 
     def until_state(self, state: MissionState, verdict: Verdict | None = FREE) -> None:
-        self.until(lambda: self.mission.state is state, verdict)
+        self.until(lambda: self.mission.state.mode is state, verdict)
 
 
 def from_first_leg(config: Config) -> Config:

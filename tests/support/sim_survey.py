@@ -31,8 +31,8 @@ from ccatp.studies.sil_run import SilRun
 from ccatp.survey.composition import assemble
 from ccatp.survey.fix_gate import FixGate, nis_of
 from ccatp.survey.heading_recovery import TakeoverState, doubted
-from ccatp.survey.mission import Mission
-from ccatp.survey.state import DRIVING, RETURNING, TURNING, MissionState
+from ccatp.survey.state import DRIVING, RETURNING, TURNING, Fault, FixFailed, FixStored, MissionState, SurveyInput
+from ccatp.survey.statechart import Mission
 from tests.support.virtual_time import VirtualLoop
 
 T = TypeVar("T")
@@ -83,7 +83,7 @@ class Watched(FaultySilRun):
         super()._serve(frame, dt_s)
         deck, robot = self.localizer.deck_pose, self.robot
         place = robot.world.plant.pose
-        now = Seen(robot.t_s, self.monitor.verdict, self.mission.state, self._driven, place, (deck.x_m, deck.y_m))
+        now = Seen(robot.t_s, self.monitor.verdict, self.mission.state.mode, self._driven, place, (deck.x_m, deck.y_m))
         self.seen.append(now)
         if self._is_enough(now):
             raise _Enough
@@ -195,17 +195,23 @@ class Desk:
         self.done, self.failed, self.faults, self.said = list[Any](), list[str](), list[str](), list[str]()
         self.over, self.faulted = asyncio.Event(), asyncio.Event()
         mission = SimpleNamespace(
-            is_awaiting_fix=True, is_lost=True, request=1, survey_route=SimpleNamespace(distance_m=lambda _pose: 0.0),
-            fixed=self.done.append, not_fixed=lambda _point, cause: self.failed.append(cause), fault=self._fault,
-        )  # fmt: skip
+            state=SimpleNamespace(is_awaiting_fix=True, is_lost=True, request=1, stop=None),
+            survey=SimpleNamespace(follower=SimpleNamespace(distance_m=lambda _stop, _pose: 0.0)),
+            handle=self._handle,
+        )
         self.service = fix_service(
             cfg, measure, store, mission, on_finished=self.over.set, notify=lambda _, text: self.said.append(text),
             measuring_time_s=measuring_time_s,
         )  # fmt: skip
 
-    def _fault(self, cause: str) -> None:
-        self.faults.append(cause)
-        self.faulted.set()
+    def _handle(self, event: SurveyInput) -> None:
+        if isinstance(event, FixStored):
+            self.done.append(event.point)
+        elif isinstance(event, FixFailed):
+            self.failed.append(event.cause)
+        elif isinstance(event, Fault):
+            self.faults.append(event.cause)
+            self.faulted.set()
 
     def begin(self, point: PointId, expected_m: Vector3 = (0.0, 0.0, 0.0)) -> None:
         """Ask for a point; ``over`` tells the end."""
@@ -279,7 +285,7 @@ class MeasuredSurvey(FaultySilRun):
     def _serve(self, frame: Sensors, dt_s: float) -> None:
         self.look(frame)
         super()._serve(frame, dt_s)
-        if self.mission.wants_full_fans and not self.fans:
+        if self.mission.state.full_fans and not self.fans:
             self.fans.append((frame.t, FULL))
             self.robot.command_fans(2, *FULL)
 
@@ -289,7 +295,7 @@ class MeasuredSurvey(FaultySilRun):
     def _measure(self, frame: Sensors) -> None:
         mission, pose = self.mission, self.localizer.deck_pose
         expected = self.mirror.puck_world(pose, self.cfg.robot.puck_height_m)
-        request = FixRequest(mission.request, frame.t, mission.measuring_point, expected, pose)
+        request = FixRequest(mission.state.request, frame.t, mission.state.measuring_point, expected, pose)
         self._request = request
         self._runner.run(self._one(request))
 
@@ -354,14 +360,14 @@ class RestartedSurvey(SilRun):
             localizer = self.localizer
             sigmas = localizer.position_sigma_m, localizer.heading_sigma_rad
             speeds = localizer.speed_m_s, localizer.rate_rad_s
-            self._records.append((localizer.deck_pose, sigmas, speeds, self.mission.state))
+            self._records.append((localizer.deck_pose, sigmas, speeds, self.mission.state.mode))
         if frame.seq in self._kills:
             self._die()
 
     def _die(self) -> None:
         robot = self.robot
-        self.states.append(self.mission.state)
-        self.done += self.mission.done
+        self.states.append(self.mission.state.mode)
+        self.done += self.mission.state.done
         robot.lose("controller")
         for _ in range(SILENT_FRAMES):
             robot.advance()
@@ -374,7 +380,7 @@ class RestartedSurvey(SilRun):
         pose, sigmas, speeds, state = self._records[-1]
         limits = cfg.limits.a_max_m_s2, cfg.limits.alpha_max_rad_s2
         sigma_m, sigma_rad = doubted(sigmas, speeds, limits, stood=state not in MOVING)
-        recovery = TakeoverState(pose, sigma_m, sigma_rad, abort_cause=self.mission.abort_cause)
+        recovery = TakeoverState(pose, sigma_m, sigma_rad, abort_cause=self.mission.state.abort_cause)
         parts = assemble(cfg, self.done, recovery)
         truth = self.robot.world.plant
         self.first_moves_m.append(hypot(truth.x_m - pose.x_m, truth.y_m - pose.y_m) / sigma_m)
@@ -384,4 +390,4 @@ class RestartedSurvey(SilRun):
     @property
     def measured(self) -> list[PointId]:
         """All points measured, by whichever main loop, in their order."""
-        return self.done + self.mission.done
+        return [*self.done, *self.mission.state.done]

@@ -1,18 +1,20 @@
 """An operator's commands to a mission among beacons, and what it does without verdicts."""
 
 import sqlite3
-from math import hypot, inf, pi, radians
+from math import inf, pi, radians
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from ccatp.beacons.mission import (
     DONE,
     HELD,
     VISITING,
     BeaconMission,
+    BeaconMissionState,
     WaypointArrival,
     check_beacon_robot,
     permitted,
@@ -23,8 +25,6 @@ from ccatp.beacons.slam.motion import Steering
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.beacons.store import BeaconStore, BeaconStoreError
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.load import load_radio_config
-from ccatp.config.package import configs_dir
 from ccatp.core import EventCode, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
@@ -34,34 +34,12 @@ from ccatp.records.beacon_summary import BeaconSummary, beacon_facts
 from ccatp.safety.beacons import BeaconSafetyRules, ObstacleBuffer
 from ccatp.sim.beacon_robot import BeaconRobot
 from ccatp.sim.radio_world import RadioWorld
-from ccatp.studies.mote_navigation import BeaconSilResult, BeaconSilWorld
+from ccatp.studies.mote_navigation import BeaconSilWorld
+from ccatp.survey.state import Abort, Fault, Pause, Resume, StopHere
+from tests.unit.beacons.stories import beacon_config, moved_m, play, target_distances
 
 FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
 DENIED = Verdict(0, 0.0, EventCode.NORMAL, "no radio", "radio", 8.0, 7.0, False, False, False, severity=Severity.HOLD)
-
-
-def beacon_config(system: str, **overrides: Any) -> RadioConfig:
-    """The shipped configuration of a system; dots in keys are written as two underscores."""
-    keys = {name.replace("__", "."): value for name, value in overrides.items()}
-    return load_radio_config(Path(configs_dir() / f"{system}.toml"), keys)
-
-
-def play(stage: BeaconSilWorld, until_s: float = 1e9) -> BeaconSilWorld:
-    """Serve frames until a time, or the end."""
-    while not stage.is_over and stage.robot.t_s < until_s:
-        stage.frame()
-    return stage
-
-
-def target_distances(found: BeaconSilResult) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """True distance of the robot's origin from the target, one a frame."""
-    return np.array([hypot(row[2] - row[5], row[3] - row[6]) for row in found.truth])
-
-
-def moved_m(found: BeaconSilResult, from_s: float, until_s: float) -> float:
-    """How far the robot really went between two times."""
-    places = np.array([row[2:4] for row in found.truth if from_s <= row[1] <= until_s])
-    return float(np.hypot(*np.diff(places, axis=0).T).sum())
 
 
 @pytest.fixture
@@ -70,46 +48,51 @@ def stage() -> BeaconSilWorld:
 
 
 def test_pause_holds_until_resume(stage: BeaconSilWorld) -> None:
-    assert stage.mission.pause("operator") is None
+    assert stage.mission.handle(Pause("operator")) is None
     play(stage, until_s=15.0)
-    assert stage.mission.is_paused
+    assert stage.mission.state.is_paused
     assert set(stage.found.speeds_m_s[101:]) == {0.0}
-    assert stage.mission.resume() is None
+    assert stage.mission.handle(Resume()) is None
     play(stage, until_s=16.0)
-    assert stage.mission.state is VISITING
+    assert stage.mission.state.mode is VISITING
 
 
 def test_abort_goes_to_the_start_also_out_of_a_pause(stage: BeaconSilWorld) -> None:
-    stage.mission.pause("operator")
-    assert stage.mission.abort("operator") is None
+    stage.mission.handle(Pause("operator"))
+    assert stage.mission.handle(Abort("operator")) is None
     assert play(stage).result().outcome == "aborted, at base"
 
 
 def test_stop_ends_it_where_it_is_and_then_it_takes_no_commands(stage: BeaconSilWorld) -> None:
-    assert stage.mission.stop() is None
+    assert stage.mission.handle(StopHere()) is None
     stage.frame()
-    assert stage.mission.state is DONE
+    assert stage.mission.state.mode is DONE
     assert stage.result().outcome == "stopped"
     over = "the mission is over"
-    assert [stage.mission.pause(""), stage.mission.abort(""), stage.mission.stop()] == [over, over, over]
+    for event in (Pause(""), Abort(""), StopHere()):
+        assert stage.mission.handle(event) == over
 
 
-def test_what_holds_the_robot_says_when_it_goes_on(stage: BeaconSilWorld) -> None:
-    mission = stage.mission
-    assert mission.resume() == "the mission is not held but visiting"
-    assert not mission.react(DENIED)
-    assert mission.state is HELD
-    assert mission.resume() == "the cause persists: no radio"
-    assert mission.react(FREE)
-    stage.frame()
-    assert not mission.react(None)
-    assert mission.cause == "no fresh verdict from the danger loop"
-    assert mission.react(FREE)
-    mission.fault("lost")
-    assert mission.is_faulted
-    assert not mission.react(FREE)  # a fault waits for an operator
-    assert mission.resume() is None
-    assert mission.react(FREE)
+def test_what_holds_the_robot_says_when_it_goes_on() -> None:
+    def after(state: BeaconMissionState, verdict: Verdict | None, *, goes_on: bool) -> BeaconMissionState:
+        state, is_free = state.react(verdict)
+        assert is_free is goes_on
+        return state
+
+    state = BeaconMissionState(VISITING)
+    assert state.handle(Resume())[1] == "the mission is not held but visiting"
+    state = after(state, DENIED, goes_on=False)
+    assert state.mode is HELD
+    assert state.handle(Resume())[1] == "the cause persists: no radio"
+    state = after(state, FREE, goes_on=True)
+    state = after(replace(state, mode=VISITING), None, goes_on=False)
+    assert state.cause == "no fresh verdict from the danger loop"
+    state, _ = after(state, FREE, goes_on=True).handle(Fault("lost"))
+    assert state.is_faulted
+    state = after(state, FREE, goes_on=False)  # a fault waits for an operator
+    state, refusal = state.handle(Resume())
+    assert refusal is None
+    after(state, FREE, goes_on=True)
 
 
 NO_FORWARD = Verdict(0, 0.0, EventCode.NEAR_EDGE, "", "", 0.0, 0.0, False, True, True)
@@ -337,8 +320,8 @@ def test_silence_of_all_radios_holds_the_robot_until_they_are_heard_again() -> N
 )
 def test_what_lasts_needs_an_operator(keys: dict[str, Any], cause: str) -> None:
     stage = play(BeaconSilWorld(beacon_config("zigbee", mission__laps=1, **keys)))
-    assert stage.mission.is_faulted
-    assert stage.mission.cause.startswith(cause)
+    assert stage.mission.state.is_faulted
+    assert stage.mission.state.cause.startswith(cause)
     assert (stage.found.verdicts[-1].severity is Severity.FAULT) == ("radio" in cause)
     assert not (stage.result().summary["obstacles"] or {}).get("touched")
 
@@ -393,8 +376,8 @@ def test_nothing_moves_in_an_earthquake_and_then_the_robot_returns() -> None:
     stage = play(BeaconSilWorld(beacon_config("zigbee")), until_s=20.0)
     stage.danger.emergency("earthquake", "a")
     play(stage, until_s=30.0)
-    assert stage.mission.state == "held"
-    assert stage.mission.resume() == "emergency: earthquake: nothing moves until that is cleared"
+    assert stage.mission.state.mode == "held"
+    assert stage.mission.handle(Resume()) == "emergency: earthquake: nothing moves until that is cleared"
     assert stage.danger.clear("a", at_base_or_held=True) is None
     found = play(stage).result()
     assert moved_m(found, 20.3, 30.0) == 0.0
@@ -404,5 +387,5 @@ def test_nothing_moves_in_an_earthquake_and_then_the_robot_returns() -> None:
 def test_a_pose_too_uncertain_holds_until_readings_help() -> None:
     cfg = beacon_config("zigbee", start__position_sigma_m=0.6, danger__hold_limit_s=600.0)
     stage = play(BeaconSilWorld(cfg), until_s=10.0)
-    assert stage.mission.state == "held"
-    assert stage.mission.cause == "the position is too uncertain"
+    assert stage.mission.state.mode == "held"
+    assert stage.mission.state.cause == "the position is too uncertain"

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccatp.config.models import Config, PidConfig
-from ccatp.control.pid import Pid, Profile, ProfiledAxis, lag_feed_forward
+from ccatp.control.pid import AxisState, Pid, PidState, Profile, ProfiledAxis, lag_feed_forward
 from ccatp.control.tracker import CommandPredictor
 from ccatp.core import Predicted
 
@@ -16,10 +16,21 @@ def gains(kp: float, ki: float, kd: float, integral_limit: float = 10.0, filter_
     return PidConfig(kp=kp, ki=ki, kd=kd, derivative_filter_s=filter_s, integral_limit=integral_limit)
 
 
+class KeptPid:
+    """A PID with its memory."""
+
+    def __init__(self, gains: PidConfig, limit: float) -> None:
+        self._pid, self._memory = Pid(gains, limit), PidState()
+
+    def step(self, error: float, dt_s: float) -> float:
+        self._memory, output = self._pid.step(self._memory, error, dt_s)
+        return output
+
+
 def test_integral_counts_seconds_not_steps() -> None:
     outputs = []
     for dt in (0.1, 0.01):
-        pid = Pid(gains(0.0, 0.5, 0.0), 10.0)
+        pid = KeptPid(gains(0.0, 0.5, 0.0), 10.0)
         for _ in range(round(1.0 / dt)):
             output = pid.step(1.0, dt)
         outputs.append(output)
@@ -27,13 +38,13 @@ def test_integral_counts_seconds_not_steps() -> None:
 
 
 def test_derivative_of_a_ramp_is_its_slope() -> None:
-    pid = Pid(gains(0.0, 0.0, 0.1), 10.0)
+    pid = KeptPid(gains(0.0, 0.0, 0.1), 10.0)
     assert pid.step(0.0, 0.01) == 0.0
     assert pid.step(0.02, 0.01) == pytest.approx(0.2)
 
 
 def test_output_is_limited_and_does_not_wind_up() -> None:
-    pid = Pid(gains(1.0, 1.0, 0.0), 0.1)
+    pid = KeptPid(gains(1.0, 1.0, 0.0), 0.1)
     for _ in range(1000):
         assert pid.step(1.0, 0.01) == 0.1
     # Ten seconds of saturation have left nothing to undo: the output follows the error's sign at once.
@@ -41,7 +52,7 @@ def test_output_is_limited_and_does_not_wind_up() -> None:
 
 
 def test_integral_limit() -> None:
-    pid = Pid(gains(0.0, 1.0, 0.0, integral_limit=0.02), 1.0)
+    pid = KeptPid(gains(0.0, 1.0, 0.0, integral_limit=0.02), 1.0)
     for _ in range(1000):
         output = pid.step(1.0, 0.01)
     assert output == pytest.approx(0.02)
@@ -49,19 +60,40 @@ def test_integral_limit() -> None:
 
 def test_dt_must_be_positive() -> None:
     with pytest.raises(ValueError, match="dt of a control step must be positive"):
-        Pid(gains(1.0, 0.0, 0.0), 1.0).step(1.0, 0.0)
+        KeptPid(gains(1.0, 0.0, 0.0), 1.0).step(1.0, 0.0)
 
 
 DT, LAG, V_MAX, A_MAX = 0.01, 0.08, 0.1, 0.2
 
 
+class KeptAxis:
+    """An axis with the motion under way."""
+
+    def __init__(self, axis: ProfiledAxis) -> None:
+        self._axis, self.motion = axis, axis.begin(0.0)
+
+    def begin(self, remaining: float) -> None:
+        self.motion = self._axis.begin(remaining)
+
+    def step(self, remaining: float, dt_s: float, speed: float) -> float:
+        self.motion, set_point = self._axis.step(self.motion, remaining, dt_s, speed)
+        return set_point
+
+    def is_over(self, remaining: float, tolerance: float, speed: float | None) -> bool:
+        return self._axis.is_over(self.motion, remaining, tolerance, speed)
+
+    def renew_if_far(self, remaining: float) -> AxisState:
+        self.motion = self._axis.renewed_if_far(self.motion, remaining)
+        return self.motion
+
+
 @pytest.fixture
-def axis(config: Config) -> ProfiledAxis:
+def axis(config: Config) -> KeptAxis:
     gains = config.control.gain_sets["shipped"].forward
-    return ProfiledAxis(gains, config.control, V_MAX, A_MAX, LAG)
+    return KeptAxis(ProfiledAxis(gains, config.control, V_MAX, A_MAX, LAG))
 
 
-def driven(axis: ProfiledAxis, lag_share: float) -> float:
+def driven(axis: KeptAxis, lag_share: float) -> float:
     """Along the plan by half of 0.2 m, with wheels of which only a share reaches the ground."""
     axis.begin(0.2)
     travelled = speed = output = 0.0
@@ -72,13 +104,13 @@ def driven(axis: ProfiledAxis, lag_share: float) -> float:
     return output
 
 
-def test_on_its_plan_it_asks_for_the_plan_and_the_servos_lag(axis: ProfiledAxis) -> None:
+def test_on_its_plan_it_asks_for_the_plan_and_the_servos_lag(axis: KeptAxis) -> None:
     axis.begin(0.2)
     # T a on top of the speed, and half a frame of acceleration: (1 - exp(-dt/T))^-1 = T/dt + 1/2 + ...
     assert axis.step(0.2, DT, 0.0) == pytest.approx(A_MAX * (LAG + 0.5 * DT), rel=1e-2)
 
 
-def test_behind_the_plan_or_slower_than_it_asks_for_more(axis: ProfiledAxis, config: Config) -> None:
+def test_behind_the_plan_or_slower_than_it_asks_for_more(axis: KeptAxis, config: Config) -> None:
     gains = config.control.gain_sets["shipped"].forward
     outputs = []
     for remaining, speed in ((0.2, 0.0), (0.201, 0.0), (0.2, -0.01)):
@@ -88,27 +120,25 @@ def test_behind_the_plan_or_slower_than_it_asks_for_more(axis: ProfiledAxis, con
     assert outputs[2] - outputs[0] == pytest.approx(gains.kd * 0.01)
 
 
-def test_it_learns_the_share_that_is_lost(axis: ProfiledAxis) -> None:
+def test_it_learns_the_share_that_is_lost(axis: KeptAxis) -> None:
     assert driven(axis, 1.0) == pytest.approx(V_MAX, rel=0.01)
     # Within 1.2 s the body comes nearly up to speed; the rest is feedback.
     assert driven(axis, 0.95) == pytest.approx(V_MAX / 0.95, rel=0.015)
 
 
-def test_the_end_counts_what_the_wheels_still_run(axis: ProfiledAxis) -> None:
+def test_the_end_counts_what_the_wheels_still_run(axis: KeptAxis) -> None:
     axis.begin(0.0)
     assert axis.is_over(0.0008, 0.0002, 0.01)  # 10 mm/s for 80 ms
     assert not axis.is_over(0.0, 0.0002, 0.01)
     assert axis.is_over(0.0001, 0.0002, None)
 
 
-def test_an_end_far_off_is_followed_by_another_motion(axis: ProfiledAxis) -> None:
+def test_an_end_far_off_is_followed_by_another_motion(axis: KeptAxis) -> None:
     axis.begin(0.0)
-    axis.renew_if_far(0.001)
-    assert axis.duration_s == 0.0
-    axis.renew_if_far(-0.02)
-    assert axis.duration_s == pytest.approx(2.0 * (0.02 / A_MAX) ** 0.5)
-    axis.renew_if_far(0.05)  # not while one is under way
-    assert axis.duration_s == pytest.approx(2.0 * (0.02 / A_MAX) ** 0.5)
+    assert axis.renew_if_far(0.001).duration_s == 0.0
+    assert axis.renew_if_far(-0.02).duration_s == pytest.approx(2.0 * (0.02 / A_MAX) ** 0.5)
+    # Not while one is under way.
+    assert axis.renew_if_far(0.05).duration_s == pytest.approx(2.0 * (0.02 / A_MAX) ** 0.5)
 
 
 def test_trapezoid_takes_the_bang_bang_time() -> None:

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from math import asin, cos, exp, hypot, pi, sin, sqrt
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.linalg import solve_continuous_are
 
 from ccatp.config.models import Config
 from ccatp.control.gate import Purpose
-from ccatp.control.tracker import CommandPredictor, LegLine, LegPhase, LegTracker, LegView, line_rate
+from ccatp.control.tracker import CommandPredictor, LegLine, LegMotion, LegPhase, LegTracker, LegView, line_rate
 from ccatp.core import EventCode, Twist, Verdict, difference, twist_of
 from ccatp.survey.composition import build_gate
 from ccatp.survey.planning.search import bang_bang_time
@@ -43,7 +44,49 @@ class Robot:
         self.omega = twist.omega_rad_s + (self.omega - twist.omega_rad_s) * keep
 
 
-def run_leg(tracker: LegTracker, robot: Robot, target: tuple[float, float], reverse: bool, limit_s: float) -> float:
+class Leg:
+    """A tracker with the motion that it drives."""
+
+    def __init__(self, tracker: LegTracker) -> None:
+        self._tracker = tracker
+        self._motion: LegMotion | None = None
+
+    @property
+    def motion(self) -> LegMotion:
+        assert self._motion is not None
+        return self._motion
+
+    @property
+    def phase(self) -> LegPhase:
+        return self.motion.phase
+
+    def begin(self, *leg: Any, **more: Any) -> None:
+        self._motion = self._tracker.begin(*leg, **more)
+
+    def begin_turn(self, angle_rad: float) -> None:
+        self._motion = self._tracker.begin_turn(angle_rad)
+
+    def step(self, *frame: Any) -> Twist:
+        self._motion, twist = self._tracker.step(self.motion, *frame)
+        return twist
+
+    def step_turn(self, remaining_rad: float, dt_s: float) -> Twist:
+        self._motion, twist = self._tracker.step_turn(self.motion, remaining_rad, dt_s)
+        return twist
+
+
+class Line:
+    """A line that changes with what is seen of it."""
+
+    def __init__(self, start: Pose, target: tuple[float, float], reverse: bool) -> None:
+        self._line, self._reverse = LegLine.through(start, target), reverse
+
+    def look(self, pose: Pose, target: tuple[float, float], creep: tuple[float, float]) -> LegView:
+        self._line, view = self._line.look(pose, target, creep, self._reverse, 0.12)
+        return view
+
+
+def run_leg(tracker: Leg, robot: Robot, target: tuple[float, float], reverse: bool, limit_s: float) -> float:
     tracker.begin(robot.pose, target, reverse)
     t = 0.0
     while tracker.phase is not LegPhase.DONE:
@@ -54,13 +97,13 @@ def run_leg(tracker: LegTracker, robot: Robot, target: tuple[float, float], reve
 
 
 @pytest.fixture
-def tracker(config: Config) -> LegTracker:
-    return LegTracker(config.control, config.limits, LAG)
+def tracker(config: Config) -> Leg:
+    return Leg(LegTracker(config.control, config.limits, LAG))
 
 
 @pytest.mark.parametrize("reverse", [False, True])
 @pytest.mark.parametrize("bearing", [0.0, 0.01, 0.5, pi / 2, -2.5, pi])
-def test_arrives_in_nearly_the_bang_bang_time(tracker: LegTracker, bearing: float, reverse: bool) -> None:
+def test_arrives_in_nearly_the_bang_bang_time(tracker: Leg, bearing: float, reverse: bool) -> None:
     robot = Robot((0.3, -0.2, 0.4))
     heading = robot.heading + bearing + (pi if reverse else 0.0)
     target = (robot.x + 0.22 * cos(heading), robot.y + 0.22 * sin(heading))
@@ -73,8 +116,8 @@ def test_arrives_in_nearly_the_bang_bang_time(tracker: LegTracker, bearing: floa
     assert abs(robot.v) < 1e-3
 
 
-def test_frame_change_on_the_way_changes_nothing(tracker: LegTracker, config: Config) -> None:
-    other = LegTracker(config.control, config.limits, LAG)
+def test_frame_change_on_the_way_changes_nothing(tracker: Leg, config: Config) -> None:
+    other = Leg(LegTracker(config.control, config.limits, LAG))
     pose, target, turned = (0.1, 0.2, 0.3), (0.9, 0.5), 0.7
 
     def moved(f: Callable[[float], float], g: Callable[[float], float], p: tuple[float, float]) -> tuple[float, float]:
@@ -91,12 +134,12 @@ def test_frame_change_on_the_way_changes_nothing(tracker: LegTracker, config: Co
 def test_the_thesis_gains_arrive_too_but_slowly(config: Config) -> None:
     control = config.control.model_copy(update={"gains": "thesis"})
     robot = Robot((0.0, 0.0, 0.0))
-    spent = run_leg(LegTracker(control, config.limits, LAG), robot, (0.0, 0.22), False, limit_s=120.0)
+    spent = run_leg(Leg(LegTracker(control, config.limits, LAG)), robot, (0.0, 0.22), False, limit_s=120.0)
     assert hypot(robot.x, robot.y - 0.22) < 0.01
     assert spent > 5.0
 
 
-def test_turn_in_place_ends_within_tolerance(tracker: LegTracker) -> None:
+def test_turn_in_place_ends_within_tolerance(tracker: Leg) -> None:
     robot = Robot((0.0, 0.0, 0.0))
     tracker.begin_turn(-1.2)
     for _ in range(400):
@@ -110,13 +153,13 @@ def test_turn_in_place_ends_within_tolerance(tracker: LegTracker) -> None:
 DRIFT = (0.0, -sin(0.25))
 
 
-def test_against_a_drift_it_turns_off_the_bearing(tracker: LegTracker) -> None:
+def test_against_a_drift_it_turns_off_the_bearing(tracker: Leg) -> None:
     tracker.begin((0.0, 0.0, 0.0), (0.5, 0.0), False, DRIFT)
     assert tracker.phase is LegPhase.TURN
     assert tracker.step((0.0, 0.0, 0.0), (0.5, 0.0), DT, Twist(0.0, 0.0), DRIFT).omega_rad_s > 0.0
 
 
-def test_steering_damps_a_rate_that_it_did_not_want(tracker: LegTracker, config: Config) -> None:
+def test_steering_damps_a_rate_that_it_did_not_want(tracker: Leg, config: Config) -> None:
     rates = []
     for omega in (0.0, 0.1):
         tracker.begin((0.0, 0.0, 0.0), (0.5, 0.0), False)
@@ -124,7 +167,7 @@ def test_steering_damps_a_rate_that_it_did_not_want(tracker: LegTracker, config:
     assert rates[1] - rates[0] == pytest.approx(-0.1 * config.control.gain_sets["shipped"].angular.kd)
 
 
-def test_a_turn_does_not_chase_the_bearing_of_a_stop_at_its_feet(tracker: LegTracker) -> None:
+def test_a_turn_does_not_chase_the_bearing_of_a_stop_at_its_feet(tracker: Leg) -> None:
     # The turn carries the robot round the stop, which is always a radian further.
     stop, near_m = (0.3, 0.4), 0.002
 
@@ -134,7 +177,7 @@ def test_a_turn_does_not_chase_the_bearing_of_a_stop_at_its_feet(tracker: LegTra
     robot = Robot((0.0, 0.0, 0.0))
     carry(robot)
     tracker.begin(robot.pose, stop, reverse=False)
-    planned_s, t = tracker.planned_s, 0.0
+    planned_s, t = tracker.motion.planned_s, 0.0
     while tracker.phase is not LegPhase.DONE:
         robot.drive(tracker.step(robot.pose, stop, DT))
         carry(robot)
@@ -157,16 +200,14 @@ def test_the_rate_is_that_of_the_riccati_equation() -> None:
 
 @pytest.mark.parametrize("reverse", [False, True])
 def test_left_of_the_line_is_left_of_its_direction(reverse: bool) -> None:
-    line = LegLine(0.12)
     heading = 3.141592653589793 if reverse else 0.0
-    line.begin((0.0, 0.0, heading), (1.0, 0.0), reverse)
+    line = Line((0.0, 0.0, heading), (1.0, 0.0), reverse)
     sight = line.look((0.4, 0.01, heading + 0.1), (1.0, 0.0), NONE)
     assert sight == pytest.approx((0.6, 0.01, 0.1, 1.0))
 
 
 def test_against_a_drift_the_body_points_beside_the_line_and_progress_counts_it() -> None:
-    line = LegLine(0.12)
-    line.begin((0.0, 0.0, 0.0), (0.0, 1.0), False)
+    line = Line((0.0, 0.0, 0.0), (0.0, 1.0), False)
     angle = asin(0.04)  # the drift is towards -x, which is left of +y: the body points to the right
     sight = line.look((0.0, 0.0, np.pi / 2 - angle), (0.0, 1.0), (-0.04, 0.03))
     assert sight.off_rad == pytest.approx(0.0, abs=1e-12)
@@ -174,16 +215,14 @@ def test_against_a_drift_the_body_points_beside_the_line_and_progress_counts_it(
 
 
 def test_a_new_frame_from_afar_lays_the_line_anew_through_the_stop() -> None:
-    line = LegLine(0.12)
-    line.begin((0.0, 0.0, 0.0), (1.0, 0.0), False)
+    line = Line((0.0, 0.0, 0.0), (1.0, 0.0), False)
     line.look((0.2, 0.002, 0.01), (1.0, 0.0), NONE)
     sight = line.look((5.0, 5.0, 0.71), (5.0 + 0.8 * cos(0.7), 5.0 + 0.8 * sin(0.7)), NONE)
     assert sight == pytest.approx((0.8, 0.0, 0.01, 1.0), abs=1e-12)
 
 
 def test_a_new_frame_near_by_keeps_the_angle_to_the_robot() -> None:
-    line = LegLine(0.12)
-    line.begin((0.0, 0.0, 0.0), (1.0, 0.0), False)
+    line = Line((0.0, 0.0, 0.0), (1.0, 0.0), False)
     before = line.look((0.95, 0.002, 0.03), (1.0, 0.0), NONE)
     turned = 0.7
     c, s = cos(turned), sin(turned)
@@ -218,7 +257,7 @@ class Rig:
         self.slip, self.creep, self.lag_s = slip, creep, lag * robot.wheel_lag_s
         self.predictor = CommandPredictor(robot.wheel_lag_s, DT_CLOSED_LOOP)
         self.gate = build_gate(config)
-        self.tracker = LegTracker(config.control, config.limits, robot.wheel_lag_s)
+        self.tracker = Leg(LegTracker(config.control, config.limits, robot.wheel_lag_s))
         self.link: deque[tuple[int, float, float]] = deque([(-1, 0.0, 0.0)] * delay)
         self.echo, self.seq = -1, 0
         self.t = 0.0
@@ -350,7 +389,7 @@ def test_a_stop_moved_by_an_update_is_reached_all_the_same(config: Config) -> No
 def test_a_drive_that_cannot_end_stops_in_time_near_the_stop_and_goes_on_far_from_it(config: Config) -> None:
     budget_s = bang_bang_time(0.3, 0.1, 0.2) + config.control.stop_time_s
     for left_over_m, is_ended in ((0.002, True), (0.05, False)):
-        tracker = LegTracker(config.control, config.limits, 0.08)
+        tracker = Leg(LegTracker(config.control, config.limits, 0.08))
         tracker.begin((0.0, 0.0, 0.0), (0.3, 0.0), False)
         for _ in range(round(budget_s / DT_CLOSED_LOOP) + 2):
             tracker.step((0.3 - left_over_m, 0.0, 0.0), (0.3, 0.0), DT_CLOSED_LOOP, Twist(0.0, 0.0))

@@ -19,7 +19,7 @@ from ccatp.links.robot_messages import Hello, RobotData
 from ccatp.mirror.mirror import build_mirror
 from ccatp.records.store import MissionStore
 from ccatp.survey.composition import SurveyParts
-from ccatp.survey.state import MissionState
+from ccatp.survey.state import Abort, MissionState, Pause, StopHere
 from tests.support.mission_story import ABORT, FREE, Story, from_first_leg
 
 
@@ -113,27 +113,27 @@ def driving(config: Config) -> Story:
 
 def test_a_pause_and_an_abort(driving: Story) -> None:
     mission = driving.mission
-    assert in_force_of(mission) == ("", "")
+    assert in_force_of(mission.state) == ("", "")
     driving.frame(ABORT)
-    assert in_force_of(mission) == ("fire", "")
-    assert mission.pause("operator") is None
-    assert in_force_of(mission) == ("fire", "operator")
+    assert in_force_of(mission.state) == ("fire", "")
+    assert mission.handle(Pause("operator")) is None
+    assert in_force_of(mission.state) == ("fire", "operator")
 
 
 @pytest.mark.fault("O1")
 def test_an_earthquake_is_kept_by_the_danger_loop(driving: Story) -> None:
     """Who takes over is held by the next verdict, and goes home when it is over; nobody has to resume."""
     driving.frame(QUAKE)
-    assert driving.mission.is_paused
-    assert in_force_of(driving.mission) == ("emergency: earthquake", "")
+    assert driving.mission.state.is_paused
+    assert in_force_of(driving.mission.state) == ("emergency: earthquake", "")
 
 
 def test_what_was_stopped_on_its_way_home_goes_home_when_it_goes_on(driving: Story) -> None:
-    assert driving.mission.abort("operator") is None
-    assert driving.mission.stop() is None
-    assert in_force_of(driving.mission) == ("operator", "")
+    assert driving.mission.handle(Abort("operator")) is None
+    assert driving.mission.handle(StopHere()) is None
+    assert in_force_of(driving.mission.state) == ("operator", "")
 
 
 def test_what_is_at_base_has_nothing_in_force(driving: Story) -> None:
     driving.until_state(MissionState.DONE, ABORT)
-    assert in_force_of(driving.mission) == ("", "")
+    assert in_force_of(driving.mission.state) == ("", "")

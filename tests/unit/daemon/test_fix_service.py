@@ -1,6 +1,7 @@
 """The fix service: a localizer that refuses, a point that is measured already."""
 
 import asyncio
+from collections.abc import Callable
 from concurrent.futures import Future
 from types import SimpleNamespace
 from typing import Any
@@ -14,13 +15,18 @@ from ccatp.daemon.fix_service import FixRequest
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.links.topics import FixMessage
 from ccatp.records.store import AlreadyMeasuredError
+from ccatp.survey.state import FixStored, SurveyInput
 from tests.support.sim_survey import fix_service
 
 POINT = PointId(1, 2, 4)
 
 
 async def measured_once(
-    config: Config, refusals: list[Exception], store: Any, point: PointId | None, **mission: Any
+    config: Config,
+    refusals: list[Exception],
+    store: Any,
+    point: PointId | None,
+    handle: Callable[[SurveyInput], object],
 ) -> tuple[list[FixMessage], list[str]]:
     """One request, with a laser system that always answers: the fixes and the levels of messages that were told."""
     told, levels, over = list[FixMessage](), list[str](), asyncio.Event()
@@ -37,7 +43,11 @@ async def measured_once(
         config,
         measure,
         store,
-        SimpleNamespace(is_awaiting_fix=True, request=1, is_lost=point is None, **mission),
+        SimpleNamespace(
+            state=SimpleNamespace(is_awaiting_fix=True, request=1, is_lost=point is None, stop=None),
+            survey=SimpleNamespace(follower=SimpleNamespace(distance_m=lambda _stop, _pose: 0.0)),
+            handle=handle,
+        ),
         localizer=SimpleNamespace(
             fuse_fix=fuse_fix, notices=[], pose=None, pose_covariance=np.eye(3), position_sigma_m=5e-6
         ),
@@ -60,15 +70,14 @@ async def measured_once(
 async def test_every_fix_that_the_localizer_saw_is_told(
     refusals: list[Exception], are_fused: list[bool], config: Config
 ) -> None:
-    mission = {"fixed": lambda _point: None, "not_fixed": lambda _point, _cause: None}
-    told, _ = await measured_once(config, refusals.copy(), None, None, **mission)
+    told, _ = await measured_once(config, refusals.copy(), None, None, lambda _event: None)
     assert [(fix.point, fix.is_fused, fix.is_set_aside) for fix in told] == [(None, one, False) for one in are_fused]
 
 
 async def test_a_point_that_is_measured_already_is_done_and_needs_no_operator(config: Config) -> None:
-    done, survey = list[PointId](), SimpleNamespace(distance_m=lambda _pose: 0.0)
+    events = list[SurveyInput]()
     refused: Future[None] = Future()
     refused.set_exception(AlreadyMeasuredError("point 1/2/4 has been measured; its fix is not replaced"))
     store = SimpleNamespace(record_fix=lambda *_: refused)
-    told, levels = await measured_once(config, [], store, POINT, fixed=done.append, survey_route=survey)
-    assert (done, levels, [fix.point for fix in told]) == ([POINT], ["warning"], [(1, 2, 4)])
+    told, levels = await measured_once(config, [], store, POINT, events.append)
+    assert (events, levels, [fix.point for fix in told]) == ([FixStored(POINT, 0.0)], ["warning"], [(1, 2, 4)])

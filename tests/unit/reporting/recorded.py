@@ -24,7 +24,7 @@ from ccatp.links.topics import (
 from ccatp.records.recorder import Recorder
 from ccatp.records.store import MissionStore, PlannedPoint
 from ccatp.studies.sil_run import SilRun
-from ccatp.survey.state import MissionState
+from ccatp.survey.state import Abort, MissionState
 
 BATCH = 100
 
@@ -83,9 +83,9 @@ class RecordingRun(SilRun):
         self.recorder.write(topic, getattr(message, "t_s", 0.0), msgspec.json.encode(message))
 
     def status(self, outcome: str = "", exit_status: int = -1) -> None:
-        mission = self.mission
+        state = self.mission.state
         message = MissionStatus(
-            seq=self.seq, t_s=self.t_s, state=str(mission.state), cause=mission.cause, done=len(mission.done),
+            seq=self.seq, t_s=self.t_s, state=str(state.mode), cause=state.cause, done=len(state.done),
             total=self.parts.total_points, elapsed_s=self.t_s, outcome=outcome, exit_status=exit_status,
         )  # fmt: skip
         self.write("mission", message)
@@ -112,12 +112,12 @@ class RecordingRun(SilRun):
             self.seen = state
         if len(self.track) >= BATCH:
             self.flush()
-        if self.only is not None and len(self.mission.done) >= self.only:
+        if self.only is not None and len(self.mission.state.done) >= self.only:
             self.only = None
-            self.mission.abort("the observatory wants the robot home")
+            self.mission.handle(Abort("the observatory wants the robot home"))
 
     def _measure(self, frame: Sensors) -> None:
-        point = self.mission.measuring_point
+        point = self.mission.state.measuring_point
         before = self.localizer.deck_pose
         self.newest: Fix | None = None
         super()._measure(frame)
@@ -126,7 +126,7 @@ class RecordingRun(SilRun):
 
     def arrive(self, point: PointId, seq: int) -> None:
         self.note_arrival(point, seq)
-        error_mm = 1e3 * self.mission.survey_route.distance_m(self.localizer.pose)
+        error_mm = 1e3 * self.mission.survey.follower.distance_m(self.mission.state.stop, self.localizer.pose)
         self.write("arrival", ArrivalMessage(seq=seq, t_s=self.t_s, point=(*point,), error_mm=error_mm))
 
     def _fuse(self, fix: Fix) -> None:
@@ -144,7 +144,7 @@ class RecordingRun(SilRun):
                 residual_rms_m=fix.residual_rms_m, channels=list(fix.channels), jump_mm=jump_mm,
             ),
         )  # fmt: skip
-        if point is not None and point in self.mission.done:
+        if point is not None and point in self.mission.state.done:
             self.store.record_fix(point, fix, before).result()
 
 

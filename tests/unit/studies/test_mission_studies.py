@@ -317,8 +317,8 @@ def test_late_estimates_meet_their_truth_across_batches() -> None:
         if seq >= DELAY:
             book.note_estimate(seq - DELAY, 0.01 * (seq - DELAY), parts.mirror.base_panel_pose)
     assert book.truth_at(FRAMES - 1 - DELAY) == true_row(FRAMES - 1 - DELAY)
-    summary = book.summary(parts.mission, 25.0, {}, {})
-    unasked.summary(parts.mission, 25.0, {}, {})
+    summary = book.summary(parts.mission.state, 25.0, {}, {})
+    unasked.summary(parts.mission.state, 25.0, {}, {})
     track = book.track()
     assert track is not None
     assert unasked.track() is None

@@ -14,11 +14,12 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.safety.edge_detector import Cause
 from ccatp.studies.sil_run import SilRun
+from ccatp.survey.behaviours import SETTLE_LIMIT_S, Retreat, RetreatStep, Settling, Standstill
+from ccatp.survey.fix_gate import ApproachCounter
 from ccatp.survey.planning.escape import is_on_drive
 from ccatp.survey.reactions import PATIENCE_S, READINGS, MirrorCheck
 from ccatp.survey.route_follower import Corrector, LegAim, StateEstimate, plan_aim
-from ccatp.survey.state import ApproachCounter
-from ccatp.survey.stops import SETTLE_LIMIT_S, EdgeRetreat, RetreatStep, SettleAndMeasure, StandstillDetector
+from ccatp.survey.state import Pause, Resume
 
 DT, MEASURING_S = 0.01, 0.5
 POINT = PointId(5, 5, 1)
@@ -29,81 +30,88 @@ def mirror(config: Config) -> Mirror:
     return build_mirror(config.mirror)
 
 
+class Standing:
+    """Standing at a stop, as the survey keeps it."""
+
+    def __init__(self, config: Config) -> None:
+        self._control, self.now, self.requests = config.control, Settling(), 0
+
+    def has_settled(self, motion: StateEstimate) -> bool:
+        self.now = self.now.settle(self._control, MEASURING_S, motion)
+        return self.now.standstill.is_rest
+
+    def is_due(self, motion: StateEstimate) -> bool:
+        self.now, is_due = self.now.measure(self._control, MEASURING_S, motion)
+        self.requests += is_due
+        return is_due
+
+
 @pytest.fixture
-def settling(config: Config) -> SettleAndMeasure:
-    return SettleAndMeasure(config.control, MEASURING_S)
+def settling(config: Config) -> Standing:
+    return Standing(config)
 
 
 def at(mirror: Mirror, frame: int, speed_m_s: float = 0.0) -> StateEstimate:
     return StateEstimate(frame * DT, DT, PanelPose(PanelId(5, 5), 0.0, 0.0, 0.0), mirror.deck_pose, speed_m_s, 0.0)
 
 
-def test_asks_once_and_only_after_the_measuring_time_at_rest(settling: SettleAndMeasure, mirror: Mirror) -> None:
+def test_asks_once_and_only_after_the_measuring_time_at_rest(settling: Standing, mirror: Mirror) -> None:
     settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))
     asked = [k for k in range(settled, settled + 200) if settling.is_due(at(mirror, k))]
     assert asked == [settled + round(MEASURING_S / DT)]
-    assert (settling.request, settling.is_requested) == (1, True)
+    assert (settling.requests, settling.now.is_requested) == (1, True)
 
 
 @pytest.mark.fault("E9")
-def test_who_moves_for_ever_is_never_measured_and_restless(settling: SettleAndMeasure, mirror: Mirror) -> None:
+def test_who_moves_for_ever_is_never_measured_and_restless(settling: Standing, mirror: Mirror) -> None:
     settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))
     frames = range(settled + 1, settled + 2000)
     assert [k for k in frames if settling.is_due(at(mirror, k, speed_m_s=0.01))] == []
     limit = settled + round(SETTLE_LIMIT_S / DT)
-    assert not settling.is_settle_overdue((limit - 1) * DT)
-    assert settling.is_settle_overdue((limit + 1) * DT)
+    assert not settling.now.is_overdue((limit - 1) * DT)
+    assert settling.now.is_overdue((limit + 1) * DT)
 
 
 @pytest.mark.fault("E9")
-def test_a_measurement_during_which_the_robot_moves_is_not_wanted(settling: SettleAndMeasure, mirror: Mirror) -> None:
+def test_a_measurement_during_which_the_robot_moves_is_not_wanted(settling: Standing, mirror: Mirror) -> None:
     settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))
     asked = next(k for k in range(settled, settled + 200) if settling.is_due(at(mirror, k)))
     assert not settling.is_due(at(mirror, asked + 1))
-    assert settling.is_requested
+    assert settling.now.is_requested
     settling.is_due(at(mirror, asked + 2, speed_m_s=0.01))
-    assert not settling.is_requested
+    assert not settling.now.is_requested
     again = next(k for k in range(asked + 3, asked + 400) if settling.is_due(at(mirror, k)))
     assert again > asked + 2 + round(MEASURING_S / DT)
-    assert settling.request == 2
+    assert settling.requests == 2
 
 
-def test_who_never_rests_is_restless_after_the_limit(settling: SettleAndMeasure, mirror: Mirror) -> None:
+def test_who_never_rests_is_restless_after_the_limit(settling: Standing, mirror: Mirror) -> None:
     frames = round(SETTLE_LIMIT_S / DT)
     for k in range(frames):
         assert not settling.has_settled(at(mirror, k, speed_m_s=0.01))
-    assert not settling.is_settle_overdue((frames - 1) * DT)
-    assert settling.is_settle_overdue((frames + 1) * DT)
+    assert not settling.now.is_overdue((frames - 1) * DT)
+    assert settling.now.is_overdue((frames + 1) * DT)
 
 
-def test_a_point_is_arrived_at_once(settling: SettleAndMeasure) -> None:
-    assert settling.arrival_at(POINT) == POINT
-    assert settling.arrival_at(None) is None  # a fix that finds the robot again is no arrival
-    assert settling.arrival_at(POINT) is None
-    assert settling.arrival_at(POINT._replace(point=2)) == POINT._replace(point=2)
-
-
-DT_SETTLING = 0.01
-
-
-def first_rest(config: Config, speeds: Iterable[float], rates: Iterable[float]) -> int | None:
-    stillness = StandstillDetector(config.control)
+def first_rest(config: Config, mirror: Mirror, speeds: Iterable[float], rates: Iterable[float]) -> int | None:
+    standstill = Standstill()
     for k, (v, omega) in enumerate(zip(speeds, rates, strict=False)):
-        if stillness.is_rest(k * DT_SETTLING, DT_SETTLING, v, omega):
+        standstill = standstill.update(config.control, at(mirror, k, v)._replace(rate_rad_s=omega))
+        if standstill.is_rest:
             return k
     return None
 
 
-def test_at_rest_after_the_settling_time_below_both_limits(config: Config) -> None:
+def test_at_rest_after_the_settling_time_below_both_limits(config: Config, mirror: Mirror) -> None:
     control = config.control
     speeds = [0.1, 0.02] + [0.9 * control.settle_speed_m_s] * 10
     rates = [0.0, 0.0, 0.0] + [0.9 * control.settle_rate_rad_s] * 10
-    assert first_rest(config, speeds, rates) == 2 + round(control.settle_time_s / DT_SETTLING)
+    assert first_rest(config, mirror, speeds, rates) == 2 + round(control.settle_time_s / DT)
 
 
 @pytest.mark.parametrize("speed", [lambda c: 1.1 * c.settle_speed_m_s, lambda c: -1.1 * c.settle_speed_m_s])
-def test_a_robot_that_creeps_never_rests(config: Config, speed: Callable[[object], float]) -> None:
-    assert first_rest(config, [speed(config.control)] * 1000, [0.0] * 1000) is None
+def test_a_robot_that_creeps_never_rests(config: Config, mirror: Mirror, speed: Callable[[object], float]) -> None:
+    assert first_rest(config, mirror, [speed(config.control)] * 1000, [0.0] * 1000) is None
 
 
 POSE = (0.1, 0.2, 0.5)
@@ -241,19 +249,20 @@ def retreated(
     """Where a retreat ends that begins with the sensors that are off there, or ``blames``; wheels follow at once."""
     tracker = LegTracker(CFG.control, CFG.limits, 0.0)
     first = verdict_of(blames or off_at(pose), may_turn=False)
-    retreat = EdgeRetreat(CFG.mission, tracker, first, PanelPose(PANEL, *pose), 0.0)
-    seen, rate_rad_s = [retreat.step_at], 0.0
+    retreat = Retreat.begin(CFG.mission, first, PanelPose(PANEL, *pose), 0.0)
+    seen, rate_rad_s = [retreat.step], 0.0
     for k in range(1500):
-        if retreat.step_at in (RetreatStep.OVER, RetreatStep.STUCK):
+        if retreat.step in (RetreatStep.OVER, RetreatStep.STUCK):
             break
         motion = StateEstimate(k * FRAME_S, FRAME_S, PanelPose(PANEL, *pose), deck_of, 0.0, rate_rad_s)
-        twist = retreat.step(motion, verdict_of(off_at(pose), may_turn=may_turn, cause=cause))
+        verdict = verdict_of(off_at(pose), may_turn=may_turn, cause=cause)
+        retreat, twist = retreat.update(CFG.mission, tracker, motion, verdict, is_slow=False)
         rate_rad_s = twist.omega_rad_s
         x, y, heading = pose
         heading += twist.omega_rad_s * FRAME_S
         pose = x + twist.v_m_s * FRAME_S * cos(heading), y + twist.v_m_s * FRAME_S * sin(heading), heading
-        if retreat.step_at is not seen[-1]:
-            seen.append(retreat.step_at)
+        if retreat.step is not seen[-1]:
+            seen.append(retreat.step)
     return pose, seen
 
 
@@ -402,9 +411,9 @@ class Paused(SilRun):
     def _serve(self, frame: Sensors, dt_s: float) -> None:
         super()._serve(frame, dt_s)
         if self.pause_s <= frame.t < self.pause_s + 0.005:
-            self.mission.pause("an operator")
+            self.mission.handle(Pause("an operator"))
         elif self.pause_s + 1.0 <= frame.t < self.pause_s + 1.005:
-            self.mission.resume()
+            self.mission.handle(Resume())
 
 
 @pytest.mark.parametrize("pause_s", [6.0])

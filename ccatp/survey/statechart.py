@@ -1,0 +1,551 @@
+"""The survey: from the pose, the danger loop's verdict and events to the next state and a command. Pure."""
+
+from collections.abc import Callable, Collection, Sequence
+
+from msgspec.structs import replace
+
+from ccatp.config.models import Config
+from ccatp.control.tracker import LegPhase
+from ccatp.core import DeckPose, PointId, Severity, Stop, StopKind, Verdict
+from ccatp.mirror.mirror import Mirror
+from ccatp.survey.behaviours import (
+    HOLD_POSITION,
+    STILL,
+    MissionCommand,
+    Retreat,
+    RetreatStep,
+    ReturnHome,
+    Settling,
+)
+from ccatp.survey.budget import TimeBudget
+from ccatp.survey.failsafe import EARTHQUAKE, react
+from ccatp.survey.heading_recovery import MOST_LEGS, HeadingRecovery
+from ccatp.survey.planning.escape import is_on_drive
+from ccatp.survey.planning.legs import PlanError
+from ccatp.survey.planning.route import Route
+from ccatp.survey.route_follower import Corrector, Leg, LegFollower, StateEstimate, build_tracker
+from ccatp.survey.state import (
+    BACKING_OFF,
+    DONE,
+    DRIVING,
+    HELD,
+    IDLE,
+    MEASURING,
+    RETURNING,
+    SETTLING,
+    TURNING,
+    Abort,
+    EmergencyKnown,
+    EstimateDiverged,
+    Fault,
+    FixFailed,
+    FixNeed,
+    FixStored,
+    Hold,
+    Interrupted,
+    MissionEvent,
+    Pause,
+    PointMissed,
+    Resume,
+    StopHere,
+    SurveyInput,
+    SurveyOutcome,
+    SurveyState,
+    TakenOver,
+    TrackingGap,
+    next_state,
+)
+
+# Planned at a time: a way through so many points takes less than the robot's frames may wait.
+CHUNK = 12
+
+PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
+PlanRest = Callable[[Route, DeckPose, Collection[PointId]], Route]
+PlanPoints = Callable[[DeckPose, Sequence[PointId]], Route]
+Step = tuple[SurveyState, MissionCommand]
+
+
+class Survey:
+    """What does not change during a survey, and the functions from one state to the next.
+
+    ``plan_rest`` gives the way back to a route from a pose, without the points that are done with; ``plan_points`` a
+    route through points from a pose; without it what failed once is not tried again.
+    """
+
+    def __init__(
+        self,
+        cfg: Config,
+        mirror: Mirror,
+        route: Route,
+        plan_home: PlanHome,
+        plan_rest: PlanRest,
+        plan_points: PlanPoints | None = None,
+    ) -> None:
+        self.cfg, self._route = cfg, route
+        self._plan_home, self._plan_rest, self._plan_points = plan_home, plan_rest, plan_points
+        self._points = tuple(stop.point for stop in route.stops if stop.point is not None)
+        self._tracker = build_tracker(cfg.control, cfg.limits, cfg.health, cfg.robot.wheel_lag_s)
+        self.follower = LegFollower(mirror, self._tracker, cfg.control.leg_timeout_factor)
+        self._corrector = Corrector(mirror, cfg.robot, cfg.mission)
+        self._heading = HeadingRecovery(mirror, cfg.robot, cfg.mission)
+        self._budget: TimeBudget | None = None
+        if cfg.mission.holds_to_budget:
+            self._budget = TimeBudget(cfg.run.budget_s, mirror, cfg.limits, cfg.etalon.measuring_time_s)
+        self._is_steered_bare = not (cfg.control.predicts_delay and cfg.control.compensates_creep)
+
+    def begin(self) -> SurveyState:
+        """The state before the first frame."""
+        return SurveyState(self._route, fix=FixNeed.CONFIRM if self.cfg.mission.fix_at_start else FixNeed.NONE)
+
+    def left_out(self, s: SurveyState) -> dict[PointId, str]:
+        """Points that are skipped, or that will not be measured any more, and why."""
+        out = dict(s.failure_causes)
+        if s.mode is DONE:
+            why, over = s.cause or str(s.outcome), {*s.done, *out}
+            out |= {point: why for point in self._points if point not in over}
+        return out
+
+    # -- frames -----------------------------------------------------------------------------------------------------
+
+    def step(self, s: SurveyState, motion: StateEstimate, verdict: Verdict | None) -> Step:
+        """One frame: react to the verdict in force (``None``: none fresh enough), then do what the mode says."""
+        if self._is_steered_bare:
+            control = self.cfg.control
+            motion = motion._replace(
+                creep=motion.creep if control.compensates_creep else (0.0, 0.0),
+                ahead=motion.ahead if control.predicts_delay else None,
+            )
+        if s.budget.begun_s is None:
+            s = replace(s, budget=s.budget._replace(begun_s=motion.t_s))
+        s, command = self._behave(react(self, s, motion, verdict), motion, verdict)
+        if s.inflates_covariance:
+            s, command = replace(s, inflates_covariance=False), replace(command, inflates_covariance=True)
+        return s, command
+
+    def _behave(self, s: SurveyState, motion: StateEstimate, verdict: Verdict | None) -> Step:
+        mode = s.mode
+        if motion.t_s < s.stands_until_s:
+            return s, HOLD_POSITION
+        if mode is DRIVING or mode is TURNING:
+            return self._travel(s, motion)
+        if mode is MEASURING:
+            return self._measure(s, motion)
+        if mode is SETTLING:
+            return self._settle(s, motion)
+        if mode is RETURNING:
+            return self._return(s, motion)
+        if mode is BACKING_OFF and verdict is not None:
+            return self._back_off(s, motion, verdict)
+        return s, HOLD_POSITION
+
+    # -- transitions --------------------------------------------------------------------------------------------------
+
+    def apply(self, s: SurveyState, event: MissionEvent) -> SurveyState:
+        """The mode changes as the table says."""
+        mode = next_state(s.mode, event)
+        return s if mode is s.mode else replace(s, mode=mode)
+
+    def hold(self, s: SurveyState, cause: str, *, by_hand: bool, is_fault: bool = False) -> SurveyState:
+        """Hold, until somebody resumes or until the cause is gone; what was begun begins again afterwards."""
+        hold = Hold(by_hand, is_fault or s.hold.is_fault)
+        s = replace(s, behaviour=None, is_missed=False, hold=hold, cause=cause)
+        return self.apply(s, MissionEvent.HOLD)
+
+    def interrupt(self, s: SurveyState, cause: str) -> SurveyState:
+        """Hold until frames and verdicts are fresh again; no effect where it stands anyway."""
+        return s if s.mode in (IDLE, HELD, DONE) else self.hold(s, cause, by_hand=False)
+
+    def fault(self, s: SurveyState, cause: str, *, loses_pose: bool = False) -> SurveyState:
+        """Hold until an operator resumes, because something is wrong; without a pose, a fix comes first then."""
+        if s.mode is DONE:
+            return s
+        if loses_pose and s.fix is FixNeed.NONE:
+            s = replace(s, fix=FixNeed.RELOCALIZE)
+        return self.hold(s, cause, by_hand=True, is_fault=True)
+
+    def await_recovery(self, s: SurveyState, cause: str, *, rejects_odometry: bool = False) -> SurveyState:
+        """Hold until the cause is gone, and then find out where the robot is before moving on."""
+        if s.mode is DONE or s.is_held_by_hand:
+            return s
+        rejects_odometry |= s.rejects_odometry
+        s = replace(self.interrupt(s, cause), fix=FixNeed.RELOCALIZE, cause=cause)
+        return replace(s, hold=s.hold._replace(rejects_odometry=rejects_odometry))
+
+    def abort(self, s: SurveyState, cause: str) -> SurveyState:
+        """Return to base and end there."""
+        if s.mode is DONE:
+            return s
+        is_new = not s.abort_cause
+        s = replace(s, abort_cause=s.abort_cause or cause)
+        if s.interlock:
+            return s  # home, but not before the robot may move
+        # An edge outranks an abort: the retreat and its fix come first.
+        is_free = is_new and s.mode is not BACKING_OFF and s.fix is FixNeed.NONE
+        return self.proceed(s) if s.mode is HELD or is_free else s
+
+    def proceed(self, s: SurveyState) -> SurveyState:
+        """To what is next: finding the robot, home, the next stop, or the end."""
+        s = replace(
+            s,
+            behaviour=None,
+            is_missed=False,
+            inflates_covariance=s.inflates_covariance or s.rejects_odometry,
+            hold=s.hold._replace(is_fault=False),
+            # Wherever a hold left the robot: the route's next turn may not be safe there.
+            is_off_route=s.is_off_route or s.mode is HELD,
+        )
+        if s.fix is not FixNeed.NONE:
+            return self.apply(s, MissionEvent.FIND)
+        if s.abort_cause:
+            # The way home is planned again from where the robot is now.
+            return self.apply(replace(s, cause=s.abort_cause), MissionEvent.GO_HOME)
+        if s.stop is None:
+            s = self._begin_second_round(s)
+            if not s.due:
+                return self.apply(replace(s, outcome=SurveyOutcome.COMPLETE), MissionEvent.FINISHED)
+        return self.apply(replace(s, cause=""), MissionEvent.GO_ON)
+
+    def _begin_second_round(self, s: SurveyState) -> SurveyState:
+        """What failed and was not tried again yet is due; last first, because the robot is nearer to that."""
+        if self._plan_points is None:
+            return s
+        due, retried = s.due, s.retried
+        if not due:
+            due = tuple(point for point in reversed(tuple(s.failure_causes)) if point not in retried)
+            retried = retried.union(due)
+        return replace(s, due=due, retried=retried, is_off_route=s.is_off_route or bool(due))
+
+    # -- legs ---------------------------------------------------------------------------------------------------------
+
+    def _travel(self, s: SurveyState, motion: StateEstimate) -> Step:
+        if s.fix is not FixNeed.NONE:
+            return self._show_heading(s, motion)
+        if s.is_review_due:
+            s, goes_on = self._review_time(s, motion)
+            if not goes_on:
+                return s, HOLD_POSITION
+        stop = s.stop
+        if stop is not None and (s.is_missed or s.corrected is not None):
+            s = self._correct(s, motion, stop)
+        if s.is_off_route:
+            return self._find_route(s, motion), HOLD_POSITION
+        if stop is None:
+            return self.proceed(s), HOLD_POSITION
+        s, command = self._follow(s, motion, stop)
+        if command is not None:
+            return s, command
+        # Via points lie near the rim, and the next turn needs the room the route left.
+        is_vague = stop.kind is StopKind.VIA and motion.sigma_of() > self.cfg.mission.via_sigma_m
+        if stop.is_measured or is_vague:
+            return self._arrive(s, motion)
+        s = self.proceed(replace(s, stop_index=s.stop_index + 1))
+        return self._travel(s, motion)
+
+    def _follow(self, s: SurveyState, motion: StateEstimate, stop: Stop) -> tuple[SurveyState, MissionCommand | None]:
+        """One frame of the leg to a stop; no command where it is reached."""
+        leg = s.behaviour if isinstance(s.behaviour, Leg) else Leg(stop)
+        leg, twist = self.follower.follow(leg, motion, is_slow=s.is_slow)
+        if leg.is_overdue(motion.t_s):
+            return self._overdue(s, stop), HOLD_POSITION
+        if leg.is_done:
+            return s, None
+        is_driving = leg.motion is not None and leg.motion.phase is LegPhase.DRIVE
+        mode = s.mode
+        if is_driving is not (mode is DRIVING):
+            mode = next_state(mode, MissionEvent.TURNED if is_driving else MissionEvent.REALIGN)
+        return replace(s, behaviour=leg, mode=mode), MissionCommand(twist)
+
+    def _overdue(self, s: SurveyState, stop: Stop) -> SurveyState:
+        where = f"({stop.x_m:.3f}, {stop.y_m:.3f}) m"
+        return self.fault(s, f"the leg to {where} is overdue: is a wheel blocked or slipping?")
+
+    def _arrive(self, s: SurveyState, motion: StateEstimate) -> Step:
+        return self._settle(self.apply(replace(s, behaviour=None), MissionEvent.ARRIVED), motion)
+
+    def _show_heading(self, s: SurveyState, motion: StateEstimate) -> Step:
+        """A short leg, with a fix at each end, shows the heading."""
+        if s.behaviour is None:
+            sigma_rad = motion.heading_sigma_of()
+            stop = self._heading.plan(motion.deck, sigma_rad, was_reverse=s.was_reverse)
+            if stop is None:
+                return self._arrive(replace(s, heading_legs_left=0), motion)
+            legs_left = s.heading_legs_left - 1
+            s = replace(s, heading_legs_left=legs_left, was_reverse=stop.reverse, behaviour=Leg(stop))
+        if isinstance(s.behaviour, Leg):
+            s, command = self._follow(s, motion, s.behaviour.stop)
+            if command is not None:
+                return s, command
+        return self._arrive(s, motion)
+
+    def _correct(self, s: SurveyState, motion: StateEstimate, stop: Stop) -> SurveyState:
+        """A leg that begins where the point was missed is a correction; the one after it needs a safe turn."""
+        if s.is_missed:
+            panel = motion.pose.panel
+            aim = self._corrector.aim(motion.pose, self.follower.target_in(panel, stop))
+            if aim is None:
+                return replace(s, is_missed=False, is_off_route=True)
+            leg = Leg(stop, aim=(panel, aim))
+            return replace(s, is_missed=False, behaviour=leg, corrected=stop, corrections=s.corrections + 1)
+        if s.corrected is stop:
+            return s
+        is_safe = self._corrector.can_proceed(motion.deck, stop)
+        return replace(s, corrected=None, is_off_route=s.is_off_route or not is_safe)
+
+    def _find_route(self, s: SurveyState, motion: StateEstimate) -> SurveyState:
+        stop, deck, due = s.stop, motion.deck, s.due[:CHUNK]
+        if stop is not None and stop.kind is StopKind.CALIBRATE:
+            if is_on_drive(s.route.stops, deck.x_m, deck.y_m):
+                # What was measured of the drive is not lost, and the rest of it follows.
+                return replace(s, is_off_route=False)
+            s = replace(s, wants_calibration=True)
+        try:
+            if due and self._plan_points is not None:
+                route = self._plan_points(deck, due)
+            else:
+                route = self._plan_rest(s.route, deck, {*s.done, *s.skipped})
+        except PlanError as error:
+            return self.fault(s, f"no way on: {error}")
+        return replace(s, route=route, stop_index=0, behaviour=None, is_off_route=False)
+
+    def _review_time(self, s: SurveyState, motion: StateEstimate) -> tuple[SurveyState, bool]:
+        """After a point: the points for which there is no time are left out; false where it goes home now."""
+        s, budget = replace(s, is_review_due=False), self._budget
+        if budget is None:
+            return s, True
+        rest = s.route.stops[s.stop_index :]
+        left: Sequence[PointId] = s.due or [stop.point for stop in rest if stop.point is not None]
+        progress = budget.progress(s.budget, motion.deck, left)
+        going_on = budget.review(progress, motion.t_s, motion.deck, left)
+        s = replace(s, budget=progress)
+        if going_on is None:
+            cause = s.abort_cause or f"the time budget of {budget.budget_s:g} s is used up"
+            return self.proceed(replace(s, abort_cause=cause)), False
+        if going_on is left:
+            return s, True
+        dropped = set(left).difference(going_on)
+        causes = {**s.failure_causes, **{point: "no time for it" for point in left if point in dropped}}
+        due = tuple(going_on)
+        return replace(s, due=due, failure_causes=causes, retried=s.retried | dropped, is_off_route=True), True
+
+    # -- standing -----------------------------------------------------------------------------------------------------
+
+    def _settle(self, s: SurveyState, motion: StateEstimate) -> Step:
+        settling = s.behaviour if isinstance(s.behaviour, Settling) else Settling()
+        settling = settling.settle(self.cfg.control, self.cfg.etalon.measuring_time_s, motion)
+        if not settling.standstill.is_rest:
+            return self._check_rest(s, settling, motion), HOLD_POSITION
+        point = s.measuring_point
+        arrived = None if point is None or point == s.arrived_at else point
+        s = replace(s, behaviour=settling, arrived_at=s.arrived_at if arrived is None else arrived)
+        return self.apply(s, MissionEvent.SETTLED), MissionCommand(STILL, at_rest=True, arrived=arrived)
+
+    def _measure(self, s: SurveyState, motion: StateEstimate) -> Step:
+        settling = s.behaviour if isinstance(s.behaviour, Settling) else Settling()
+        settling, is_due = settling.measure(self.cfg.control, self.cfg.etalon.measuring_time_s, motion)
+        if is_due:
+            return replace(s, behaviour=settling, request=s.request + 1), MissionCommand(STILL, measure=True)
+        return self._check_rest(s, settling, motion), HOLD_POSITION
+
+    def _check_rest(self, s: SurveyState, settling: Settling, motion: StateEstimate) -> SurveyState:
+        if settling.is_overdue(motion.t_s):
+            speeds = f"{motion.speed_m_s:.4f} m/s, {motion.rate_rad_s:.4f} rad/s"
+            return self.fault(s, f"the robot does not come to rest: {speeds}")
+        return replace(s, behaviour=settling)
+
+    # -- edge and home ------------------------------------------------------------------------------------------------
+
+    def _back_off(self, s: SurveyState, motion: StateEstimate, verdict: Verdict) -> Step:
+        if not isinstance(s.behaviour, Retreat):
+            return self.proceed(s), HOLD_POSITION
+        mission = self.cfg.mission
+        retreat, twist = s.behaviour.update(mission, self._tracker, motion, verdict, is_slow=s.is_slow)
+        # On the way home there is no route to turn to; the way home begins from here.
+        if retreat.step is RetreatStep.OVER or (retreat.step is RetreatStep.TURN_AWAY and s.abort_cause):
+            return self.apply(replace(s, behaviour=None), MissionEvent.FIND), HOLD_POSITION
+        if retreat.step is RetreatStep.STUCK:
+            cause = "stuck at the edge: no motion away from it is permitted, or none helps"
+            return replace(self.hold(s, cause, by_hand=False), stuck_s=motion.t_s), HOLD_POSITION
+        return replace(s, behaviour=retreat), MissionCommand(twist)
+
+    def _return(self, s: SurveyState, motion: StateEstimate) -> Step:
+        home = s.behaviour
+        if not isinstance(home, ReturnHome):
+            try:
+                return replace(s, behaviour=ReturnHome(self._plan_home(motion.deck))), HOLD_POSITION
+            except PlanError as error:
+                return self.fault(s, f"no way home: {error}"), HOLD_POSITION
+        if home.is_at_base:
+            s = self.apply(replace(s, outcome=SurveyOutcome.AT_BASE), MissionEvent.FINISHED)
+            return s, MissionCommand(STILL, at_rest=True)
+        home, twist = home.update(self.follower, self.cfg.control, motion, is_slow=s.is_slow)
+        if home.leg is not None and home.leg.is_overdue(motion.t_s):
+            return self._overdue(s, home.leg.stop), HOLD_POSITION
+        return replace(s, behaviour=home), MissionCommand(twist)
+
+    # -- events between two frames ------------------------------------------------------------------------------------
+
+    def handle(self, s: SurveyState, event: SurveyInput) -> tuple[SurveyState, str | None]:
+        """The state after an event between two frames, and why it was refused, or ``None``."""
+        if isinstance(event, Pause | Resume | Abort | StopHere):
+            return self._obey(s, event)
+        match event:
+            case Interrupted(cause):
+                s = self.interrupt(s, cause)
+            case Fault(cause, loses_pose):
+                s = self.fault(s, cause, loses_pose=loses_pose)
+            case EstimateDiverged(cause, t_s):
+                s = self._recover(s, cause, t_s)
+            case TrackingGap():
+                s = replace(s, fix=FixNeed.RELOCALIZE, heading_legs_left=MOST_LEGS)
+            case EmergencyKnown():
+                s = replace(s, emergency_epoch=None)
+            case TakenOver():
+                s = self._take_over(s, event)
+            case FixStored():
+                s = self._fixed(s, event)
+            case FixFailed():
+                s = self._not_fixed(s, event)
+            case PointMissed():
+                is_wanted = s.is_awaiting_fix
+                s = replace(self.proceed(s), is_missed=True) if is_wanted else replace(s, is_off_route=True)
+        return s, None
+
+    def _obey(self, s: SurveyState, command: Pause | Resume | Abort | StopHere) -> tuple[SurveyState, str | None]:
+        """A command of an operator."""
+        if isinstance(command, Resume):
+            refusal = _resume_refusal(s)
+            return (self.proceed(s), None) if refusal is None else (s, refusal)
+        if s.mode is DONE:
+            return s, "the mission is over"
+        if isinstance(command, Pause):
+            return self.hold(s, command.cause, by_hand=True), None
+        if isinstance(command, Abort):
+            return self.abort(s, command.cause), None
+        return self.apply(replace(s, outcome=SurveyOutcome.STOPPED), MissionEvent.FINISHED), None
+
+    def _take_over(self, s: SurveyState, event: TakenOver) -> SurveyState:
+        recovery = event.recovery
+        s, _ = self.handle(s, TrackingGap())
+        s = replace(s, skipped=(*s.skipped, *recovery.skipped), abort_cause=recovery.abort_cause)
+        if recovery.held_cause:
+            s = self.hold(s, recovery.held_cause, by_hand=True)
+        return replace(s, emergency_epoch=None) if recovery.abort_cause else s
+
+    def _recover(self, s: SurveyState, cause: str, t_s: float) -> SurveyState:
+        """Hold, and go on with a fix; what comes again and again is a fault."""
+        if s.mode is DONE or s.is_held_by_hand:
+            return s
+        health = self.cfg.health
+        times_s = [since_s for since_s in s.recoveries_s if t_s - since_s <= health.retry_window_s]
+        if times_s and t_s - times_s[-1] <= health.pause_limit_s:
+            times_s.pop()  # still the same: frame by frame it is asked for again
+        s = replace(s, recoveries_s=(*times_s, t_s))
+        if len(s.recoveries_s) > 1 + health.retries:
+            return self.fault(s, cause, loses_pose=True)
+        # A filter that is frozen cannot tell when the robot stands.
+        return replace(self.await_recovery(s, cause), resumes_after_s=t_s + health.retry_after_s)
+
+    def _fixed(self, s: SurveyState, event: FixStored) -> SurveyState:
+        s, point = replace(s, failures=0), event.point
+        if point is not None:
+            return self._leave_stop(s, point, event.heading_sigma_rad, is_measured=True)
+        if s.fix is FixNeed.NONE:
+            return self._leave_pointless(s, event.heading_sigma_rad)
+        # The heading has to be found before the robot drives on.
+        legs_left = 0 if event.heading_sigma_rad <= self._heading.limit_rad else s.heading_legs_left
+        s = replace(s, heading_legs_left=legs_left)
+        if legs_left > 0:
+            return self.apply(replace(s, behaviour=None, is_missed=False), MissionEvent.GO_ON)
+        goes_on = s.is_awaiting_fix
+        # Found again, the robot stands where the route never led. Unless it never left the start.
+        s = replace(s, fix=FixNeed.NONE, is_off_route=s.is_lost)
+        return self.proceed(s) if goes_on else s
+
+    def _not_fixed(self, s: SurveyState, event: FixFailed) -> SurveyState:
+        point, cause, sigma_rad = event
+        if point is None and s.fix is FixNeed.NONE:
+            return self._leave_pointless(s, sigma_rad)  # the survey can do without
+        limit, failures = self.cfg.mission.failed_points_before_hold, s.failures + 1
+        s = replace(s, failures=0 if failures >= limit else failures)
+        if point is None:
+            if failures >= limit:
+                return self.fault(s, f"the robot cannot be found again: {cause}")
+            if isinstance(s.behaviour, Settling):  # it may not have stood quite still, and cannot do without
+                s = replace(s, behaviour=s.behaviour._replace(is_requested=False, is_repeated=True))
+            return s
+        s = replace(s, failure_causes={**s.failure_causes, point: cause}, due=_without(s.due, point))
+        if failures >= limit:
+            s = self.fault(s, f"{limit} measurements in a row failed: {cause}")
+        return self._leave_stop(s, point, sigma_rad, is_measured=False)
+
+    def _leave_pointless(self, s: SurveyState, heading_sigma_rad: float) -> SurveyState:
+        """A fix without a point was taken, or failed, where the survey can do without."""
+        stop = s.stop
+        if s.is_awaiting_fix and stop is not None and stop.kind in (StopKind.CALIBRATE, StopKind.VIA):
+            s = replace(s, stop_index=s.stop_index + 1, behaviour=None)
+            return self.proceed(self._doubt_heading(s, heading_sigma_rad))
+        return s
+
+    def _doubt_heading(self, s: SurveyState, heading_sigma_rad: float) -> SurveyState:
+        """Where the fix showed that the pose was wrong, the heading is found before the robot drives on."""
+        if self._heading.is_needed(heading_sigma_rad) and s.fix is not FixNeed.CONFIRM:
+            return replace(s, heading_legs_left=MOST_LEGS, fix=FixNeed.RELOCALIZE)
+        return s
+
+    def _leave_stop(
+        self, s: SurveyState, point: PointId, heading_sigma_rad: float, *, is_measured: bool
+    ) -> SurveyState:
+        goes_on, stop = s.is_awaiting_fix, s.stop
+        # A pause may come while the fix is being committed, and a new way to the point: it counts all the same.
+        is_here = stop is not None and stop.point == point
+        if is_here or point not in (s.done if is_measured else s.skipped):
+            s = replace(s, skipped=_without(s.skipped, point), is_review_due=self._budget is not None, backoffs=0)
+            if is_measured:
+                causes = {other: why for other, why in s.failure_causes.items() if other != point}
+                s = replace(s, done=(*s.done, point), failure_causes=causes, due=_without(s.due, point))
+            else:
+                s = replace(s, skipped=(*s.skipped, point))
+            if not is_here:
+                s = replace(s, is_off_route=True)  # the way that was planned leads to it once more
+            elif isinstance(s.behaviour, Leg) and s.fix is FixNeed.NONE:
+                s = replace(s, stop_index=s.stop_index + 1, behaviour=None)
+            else:
+                s = replace(s, stop_index=s.stop_index + 1)
+            s = self._doubt_heading(s, heading_sigma_rad)
+            # So it does where the robot was pushed meanwhile and waits to be measured again: there is no need any more.
+            goes_on |= s.mode in (SETTLING, MEASURING)
+        return self.proceed(s) if goes_on else s
+
+
+def _without(points: tuple[PointId, ...], point: PointId) -> tuple[PointId, ...]:
+    return tuple(other for other in points if other != point) if point in points else points
+
+
+def _resume_refusal(s: SurveyState) -> str | None:
+    if s.mode is not HELD:
+        return f"the mission is not held but {s.mode}"
+    if s.interlock or s.is_shaking:
+        return f"{s.interlock or EARTHQUAKE}: nothing moves until that is cleared"
+    if s.is_latched and not s.abort_cause:
+        return "an emergency of before is latched: 'ccatp clear' it first"
+    if s.severity >= Severity.HOLD and s.severity is not Severity.RETURN:
+        return f"the cause persists: {s.cause}"
+    return None
+
+
+class Mission:
+    """One survey under way: the state, shared by those who send frames and those who send events."""
+
+    def __init__(self, survey: Survey) -> None:
+        self.survey = survey
+        self.state = survey.begin()
+
+    def step(self, motion: StateEstimate, verdict: Verdict | None) -> MissionCommand:
+        """One frame."""
+        self.state, command = self.survey.step(self.state, motion, verdict)
+        return command
+
+    def handle(self, event: SurveyInput) -> str | None:
+        """An event between two frames; why it was refused, or ``None``."""
+        self.state, refusal = self.survey.handle(self.state, event)
+        return refusal
