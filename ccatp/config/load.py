@@ -11,9 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import tomlkit
 from pydantic import BaseModel, ValidationError
-from tomlkit.exceptions import TOMLKitError
 
 from ccatp.config.beacon_models import RadioConfig, RecordingsConfig
 from ccatp.config.checks import check_config, check_radio_config, is_file_name
@@ -361,6 +359,10 @@ def with_values(text: str, values: Mapping[str, float], file: Path) -> str:
     Raises:
         ConfigError: the text is not TOML, or a key stands where no key can be.
     """
+    # Imported late: only a command that edits a file needs it, and every process reads one.
+    import tomlkit  # noqa: PLC0415
+    from tomlkit.exceptions import TOMLKitError  # noqa: PLC0415
+
     try:
         document = tomlkit.parse(text)
         for dotted, value in values.items():

@@ -1,5 +1,6 @@
 """The child processes of a run: start, supervision by pidfd and heartbeat, restart policy, stop, listening sockets."""
 
+import errno
 import os
 import socket
 import subprocess
@@ -10,10 +11,10 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
-from typing import TypeVar, cast
+from typing import NamedTuple, TypeVar, cast
 
 from ccatp.config.beacon_models import RadioConfig, SimBeaconRobotConfig
-from ccatp.config.models import Config, ProcessesConfig, SimEtalonConfig, SimRobotConfig
+from ccatp.config.models import Config, DashboardConfig, ProcessesConfig, SimEtalonConfig, SimRobotConfig
 from ccatp.config.package import child_environment
 from ccatp.daemon.process import SUPERVISOR_PID, listen_at
 from ccatp.errors import ConfigError, ExitStatus
@@ -260,6 +261,41 @@ def listen(section: str, host: str, port: int) -> socket.socket:
             f"{section}.port: cannot listen on {host}:{port}: {error.strerror}; "
             f"stop who uses it, or choose another with --set {section}.port=0 (0 = any free port)"
         ) from error
+
+
+class PageSocket(NamedTuple):
+    """The listening socket, ``None`` without a dashboard, and the message for the operator, which may be empty."""
+
+    socket: socket.socket | None
+    config: DashboardConfig
+    level: str
+    text: str
+
+
+def open_page_socket(cfg: DashboardConfig) -> PageSocket:
+    """Listen at the configured address, or at another port if that one is in use; a survey runs without a page, too."""
+    if not cfg.enabled:
+        return PageSocket(None, cfg, "info", "")
+    level, before = "info", "dashboard: "
+    try:
+        try:
+            listener = listen_at(cfg.host, cfg.port)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+            level, before = "warning", f"dashboard: port {cfg.port} is in use, so it is at "
+            listener = listen_at(cfg.host, 0)
+    except OSError as error:
+        where = f"{cfg.host}:{cfg.port}"
+        text = f"no dashboard: cannot listen on {where}: {error.strerror}; choose another dashboard.host"
+        return PageSocket(None, cfg, "warning", text)
+    port = listener.getsockname()[1]
+    return PageSocket(listener, cfg.model_copy(update={"port": port}), level, before + page_url(cfg.host, port))
+
+
+def page_url(host: str, port: int) -> str:
+    """The page's address."""
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
 
 
 SimulatedServer = SimRobotConfig | SimEtalonConfig | SimBeaconRobotConfig

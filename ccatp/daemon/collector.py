@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
 import numpy as np
@@ -22,10 +22,6 @@ from ccatp.links.topics import (
     RECORD_FORMAT,
     TOPICS,
     ArrivalMessage,
-    BeaconArrival,
-    BeaconMapMessage,
-    BeaconPlaces,
-    BeaconTrack,
     BeaconTruth,
     DangerEvent,
     Heartbeat,
@@ -38,12 +34,14 @@ from ccatp.links.topics import (
 )
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_poses
 from ccatp.mirror.misalignment import fit_panels
-from ccatp.records.beacon_summary import BeaconSummary, Reached, beacon_facts
 from ccatp.records.recorder import TELEMETRY, Recorder, iter_messages, recordings
 from ccatp.records.store import StoredSurvey, StoreError, read_survey
 from ccatp.records.summary import PanelFits, survey_summary
 from ccatp.report.foxglove import Views, recorded_schemas
 from ccatp.survey.planning.route import ORDERS
+
+if TYPE_CHECKING:
+    from ccatp.records.beacon_summary import BeaconSummary
 
 RECEIVED = tuple(topic.name for topic in TOPICS if topic.recorded or topic.message in (Timing, Heartbeat))
 FINISH_TIMEOUT_S = 5.0
@@ -73,11 +71,14 @@ class Collector:
         self._context, self._endpoints, self._on_heartbeat, self._is_sim = context, endpoints, on_heartbeat, is_sim
         names = ("main", "danger", "dashboard", *(("truth",) if is_sim else ()))
         self._subscriber = Subscriber(context, [endpoints.of(name) for name in names], RECEIVED)
-        self._record: BeaconRecord | SurveyRecord
+        self._record: BeaconSummary | SurveyRecord
         self._views: Views | None = None
         if isinstance(cfg, RadioConfig):
+            # Imported late: a survey does not need it, and its libraries are large.
+            from ccatp.records import beacon_summary  # noqa: PLC0415
+
             what = {"system": cfg.system, "seed": str(cfg.run.seed)}
-            self._record = BeaconRecord(cfg, is_sim=is_sim)
+            self._record = beacon_summary.BeaconSummary(beacon_summary.beacon_facts(cfg, is_sim=is_sim))
         else:
             what = {"mirror": cfg.mirror.name, "seed": str(cfg.run.seed), "world": cfg.world.name}
             self._record = SurveyRecord(cfg, run_dir, is_sim=is_sim)
@@ -98,7 +99,7 @@ class Collector:
     @property
     def remarks(self) -> list[str]:
         """Warnings for the operator at the end."""
-        return self._record.remarks
+        return self._record.remarks if isinstance(self._record, SurveyRecord) else []
 
     def finish(self) -> None:
         """Request the last rows of the simulated truth, and wait for messages on their way."""
@@ -114,7 +115,7 @@ class Collector:
 
     def summary(self, wall_s: float) -> dict[str, Any]:
         """``summary.json``; call it when main has closed the mission's database."""
-        return self._record.summary(wall_s)
+        return self._record.build(wall_s)
 
     def __enter__(self) -> Self:
         return self
@@ -192,43 +193,6 @@ class Collector:
             return reply
 
 
-class BeaconRecord:
-    """Messages of a mission among beacons, for its summary."""
-
-    def __init__(self, cfg: RadioConfig, *, is_sim: bool) -> None:
-        self._summary = BeaconSummary(beacon_facts(cfg, is_sim=is_sim))
-        self._signal = ""
-        self.remarks: list[str] = []
-
-    def take(self, message: Message) -> None:
-        """Take one message."""
-        summary = self._summary
-        if isinstance(message, BeaconTrack):
-            summary.track += message.rows
-        elif isinstance(message, BeaconTruth):
-            summary.truth += message.rows
-        elif isinstance(message, BeaconPlaces):
-            summary.places = message.places
-        elif isinstance(message, BeaconMapMessage):
-            summary.beacons, summary.notes = message.beacons, message.notes
-            summary.score = message.nis_sum, message.nis_size, message.refused
-        elif isinstance(message, BeaconArrival):
-            summary.reached.append(Reached(message.seq, message.estimate))
-        elif isinstance(message, Timing):
-            summary.ticks_us += message.tick_us
-        elif isinstance(message, DangerEvent):
-            if message.signal and message.signal != self._signal:
-                summary.events[message.signal] += 1
-            self._signal = message.signal
-        elif isinstance(message, MissionStatus):
-            summary.mission_time_s, summary.outcome = message.elapsed_s, message.outcome
-            summary.cause = message.cause
-
-    def summary(self, wall_s: float) -> dict[str, Any]:
-        """The summary."""
-        return self._summary.build(wall_s)
-
-
 class _SurveySession:
     """Messages of one session of a survey."""
 
@@ -280,7 +244,7 @@ class SurveyRecord:
         """How the simulated panels really lie, rows as of ``Misalignment``."""
         self._injected = {PanelId(int(row), int(col)): (piston, tip, tilt) for row, col, piston, tip, tilt in rows}
 
-    def summary(self, wall_s: float) -> dict[str, Any]:
+    def build(self, wall_s: float) -> dict[str, Any]:
         """The summary, when main has closed the mission's database."""
         survey = self._stored()
         if not self._session.has_status:

@@ -4,7 +4,6 @@ The supervisor binds the socket, so that a restarted dashboard has the same addr
 """
 
 import asyncio
-import errno
 import logging
 import os
 import socket
@@ -13,17 +12,17 @@ from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import structlog
 import zmq
 
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.models import Config, DashboardConfig
+from ccatp.config.models import Config
+from ccatp.daemon.child_processes import open_page_socket
 from ccatp.daemon.command_handlers import LOGGED_LINES, LOGGED_PERIOD_S
 from ccatp.daemon.process import (
     Endpoints,
-    listen_at,
     open_log,
     read_config,
     run_dir_in,
@@ -40,7 +39,6 @@ from ccatp.records.recorder import TELEMETRY, read_metadata
 from ccatp.records.store import StoreError, read_survey
 from ccatp.report.dashboard.access import read_token
 from ccatp.report.dashboard.app import CommandEndpoint, build_app, serve
-from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground
 from ccatp.report.dashboard.hub import BEACONS, SURVEY, BusReader, StateBroadcaster
 from ccatp.report.dashboard.survey_view import SurveyView
 from ccatp.report.dashboard.survey_view import ground as survey_ground
@@ -72,6 +70,9 @@ async def serve_page(
     settings, token, is_over = cfg.dashboard, read_token(cfg.dashboard), asyncio.Event()
     view: RunStateView
     if isinstance(cfg, RadioConfig):
+        # Imported late: a survey does not need it, and its libraries are large.
+        from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground  # noqa: PLC0415
+
         view, wants = BeaconView(cfg, is_sim=is_sim), BEACONS
         ground = beacon_ground(cfg, is_sim=is_sim, needs_token=token is not None)
     else:
@@ -161,41 +162,6 @@ def main() -> int:
     listener = socket.socket(fileno=args.listen_fd)
     places = args.run_dir, args.endpoints, listener
     return _run(args.run_dir, partial(serve_page, args.config, *places, is_sim=args.is_sim, has_heartbeat=True))
-
-
-class PageSocket(NamedTuple):
-    """The listening socket, ``None`` without a dashboard, and the message for the operator, which may be empty."""
-
-    socket: socket.socket | None
-    config: DashboardConfig
-    level: str
-    text: str
-
-
-def open_page_socket(cfg: DashboardConfig) -> PageSocket:
-    """Listen at the configured address, or at another port if that one is in use; a survey runs without a page, too."""
-    if not cfg.enabled:
-        return PageSocket(None, cfg, "info", "")
-    level, before = "info", "dashboard: "
-    try:
-        try:
-            listener = listen_at(cfg.host, cfg.port)
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise
-            level, before = "warning", f"dashboard: port {cfg.port} is in use, so it is at "
-            listener = listen_at(cfg.host, 0)
-    except OSError as error:
-        where = f"{cfg.host}:{cfg.port}"
-        text = f"no dashboard: cannot listen on {where}: {error.strerror}; choose another dashboard.host"
-        return PageSocket(None, cfg, "warning", text)
-    port = listener.getsockname()[1]
-    return PageSocket(listener, cfg.model_copy(update={"port": port}), level, before + page_url(cfg.host, port))
-
-
-def page_url(host: str, port: int) -> str:
-    """The page's address."""
-    return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
 
 
 def attach(runtime_dir: Path | None, settings: Mapping[str, object], report: Callable[[str], None]) -> int:

@@ -20,16 +20,17 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.daemon.child_processes import (
+    PageSocket,
     ProcessEnd,
     ProcessManager,
     ProcessSpec,
     listen,
+    open_page_socket,
     simulated_servers,
     with_addresses,
 )
 from ccatp.daemon.collector import Collector
 from ccatp.daemon.command_handlers import check_observatory
-from ccatp.daemon.dashboard import PageSocket, open_page_socket
 from ccatp.daemon.process import (
     FAULTS_FILE,
     LEVELS,

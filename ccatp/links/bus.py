@@ -1,6 +1,5 @@
 """State shared between the processes over ZeroMQ PUB and SUB: single frames of the topic table."""
 
-import time
 from collections.abc import Iterable
 
 import zmq
@@ -79,6 +78,7 @@ class Subscriber:
             self.socket.setsockopt(zmq.SUBSCRIBE, BY_NAME[name].name.encode() + (b" {" if is_uncounted else b" "))
         for endpoint in endpoints:
             self.socket.connect(endpoint)
+        self._timeout_ms = -1
         self.bad_messages = 0
 
     def receive(self, timeout_s: float = 0.0) -> tuple[str, Message | Verdict] | None:
@@ -88,17 +88,15 @@ class Subscriber:
 
     def receive_raw(self, timeout_s: float = 0.0) -> tuple[str, bytes, Message | Verdict] | None:
         """As ``receive``, with the JSON text in the middle."""
-        deadline_s = time.monotonic() + timeout_s
+        timeout_ms = round(1000 * timeout_s)
+        if timeout_ms != self._timeout_ms:
+            self.socket.setsockopt(zmq.RCVTIMEO, timeout_ms)
+            self._timeout_ms = timeout_ms
         while True:
             try:
-                frame = self.socket.recv(zmq.DONTWAIT)
+                return unpack(self.socket.recv())
             except zmq.Again:
-                left_s = deadline_s - time.monotonic()
-                if left_s <= 0.0 or not self.socket.poll(max(1, int(left_s * 1000))):
-                    return None
-                continue
-            try:
-                return unpack(frame)
+                return None
             except BadMessage:
                 self.bad_messages += 1
 

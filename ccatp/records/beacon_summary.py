@@ -19,6 +19,17 @@ from ccatp.links.beacon_messages import (
     pose_truth,
     table,
 )
+from ccatp.links.topics import (
+    BeaconArrival,
+    BeaconMapMessage,
+    BeaconPlaces,
+    BeaconTrack,
+    BeaconTruth,
+    DangerEvent,
+    Message,
+    MissionStatus,
+    Timing,
+)
 from ccatp.records.summary import distribution, rounded, wall_figures
 
 WITHIN_SIGMAS = 3.0
@@ -75,6 +86,7 @@ class BeaconSummary:
         events: how often the danger loop began to deny motion, by the signal.
         mission_time_s: by the robot's clock.
         ticks_us: wall times of main-loop ticks.
+        signal: that by which motion is denied at present.
     """
 
     facts: BeaconFacts
@@ -90,6 +102,29 @@ class BeaconSummary:
     outcome: str = ""
     cause: str = ""
     ticks_us: list[float] = field(default_factory=list)
+    signal: str = ""
+
+    def take(self, message: Message) -> None:
+        """Take one message of the run."""
+        if isinstance(message, BeaconTrack):
+            self.track += message.rows
+        elif isinstance(message, BeaconTruth):
+            self.truth += message.rows
+        elif isinstance(message, BeaconPlaces):
+            self.places = message.places
+        elif isinstance(message, BeaconMapMessage):
+            self.beacons, self.notes = message.beacons, message.notes
+            self.score = message.nis_sum, message.nis_size, message.refused
+        elif isinstance(message, BeaconArrival):
+            self.reached.append(Reached(message.seq, message.estimate))
+        elif isinstance(message, Timing):
+            self.ticks_us += message.tick_us
+        elif isinstance(message, DangerEvent):
+            if message.signal and message.signal != self.signal:
+                self.events[message.signal] += 1
+            self.signal = message.signal
+        elif isinstance(message, MissionStatus):
+            self.mission_time_s, self.outcome, self.cause = message.elapsed_s, message.outcome, message.cause
 
     def build(self, wall_s: float) -> dict[str, Any]:
         """The summary; lengths in m, angles in rad, times in s. Values that need the truth are null without it."""

@@ -11,8 +11,15 @@ import pytest
 
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.daemon.child_processes import ProcessEnd, ProcessManager, ProcessSpec, RestartPolicy, SilenceWatch
-from ccatp.daemon.dashboard import open_page_socket, page_url
+from ccatp.daemon.child_processes import (
+    ProcessEnd,
+    ProcessManager,
+    ProcessSpec,
+    RestartPolicy,
+    SilenceWatch,
+    open_page_socket,
+    page_url,
+)
 from ccatp.daemon.process import parse_args, unless_stopped
 from ccatp.errors import DaemonUnreachableError
 
@@ -181,7 +188,7 @@ def test_an_address_that_cannot_be_had_is_no_end_of_a_survey(config: Config, mon
     def refuse(_host: str, _port: int) -> socket.socket:
         raise OSError(98, "Address already in use")
 
-    monkeypatch.setattr("ccatp.daemon.dashboard.listen_at", refuse)
+    monkeypatch.setattr("ccatp.daemon.child_processes.listen_at", refuse)
     for page, why in (
         (elsewhere, "192.0.2.1:7080: Cannot assign requested address; choose another dashboard.host"),
         (open_page_socket(config.dashboard), "127.0.0.1:7080: Address already in use; choose another dashboard.host"),
