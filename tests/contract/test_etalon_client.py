@@ -22,6 +22,7 @@ from ccatp.etalon_client import (
     TooFewChannels,
 )
 from ccatp.links.multiline import ChannelData, ChannelRecord, Connected, Environment, LaserReady, Remark, format_reply
+from tests.support.scenario import config_of
 
 CHANNELS = (1, 2, 3, 4, 5, 6, 7, 8)
 COLLIMATORS = np.array([[x, y, z] for x in (-4.0, 5.0) for y in (-5.0, 4.0) for z in (-3.0, 6.0)])
@@ -119,24 +120,10 @@ async def server() -> AsyncIterator[ScriptedServer]:
 
 
 def config(port: int, **changes: float) -> EtalonConfig:
-    values = {
-        "connect_timeout_s": 1.0,
-        "request_timeout_s": 1.0,
-        "retries": 0,
-        "reconnect_delay_s": 0.001,
-        "measuring_time_s": 0.001,
-        "length_sigma_m": 1e-6,
-        "length_sigma_per_m": 2.5e-7,
-        "max_residual_m": 5e-4,
-        "max_dop": 20.0,
-        "max_distance_m": 0.5,
-        "reconnect_for_s": 0.0,
-        "max_surface_residual_m": 0.005,
-        "doubt_nis": 13.8,
-        "repeat_m": 0.001,
-        "start_distance_m": 0.05,
-    }
-    return EtalonConfig.model_validate({"host": "127.0.0.1", "port": port} | values | changes)
+    quick = {"connect_timeout_s": 1.0, "request_timeout_s": 1.0, "reconnect_delay_s": 0.001, "measuring_time_s": 0.001}
+    sigmas = {"length_sigma_m": 1e-6, "length_sigma_per_m": 2.5e-7}
+    values = {"host": "127.0.0.1", "port": port, "retries": 0, "reconnect_for_s": 0.0, **quick, **sigmas, **changes}
+    return EtalonConfig.model_validate(config_of().etalon.model_dump() | values)
 
 
 @asynccontextmanager
@@ -266,25 +253,23 @@ async def test_a_lost_connection_is_a_typed_error_and_made_anew(server: Scripted
 
 
 @pytest.mark.fault("E2")
-async def test_a_line_that_came_unasked_is_not_taken_for_the_reply(server: ScriptedServer) -> None:
-    server.greeting.append(lengths(ELSEWHERE))
+@pytest.mark.parametrize(
+    ("greeting", "fault"),
+    # After a whole line it is closed: a flood could not fill the memory.
+    [(lengths(ELSEWHERE), "server sent a line unasked"), (b"channeldata_1,12", "")],
+)
+async def test_what_came_unasked_is_not_taken_for_the_reply(
+    server: ScriptedServer, greeting: bytes, fault: str
+) -> None:
+    server.greeting.append(greeting)
     async with client_of(server.port) as client:
         await client.connect()
         await server_has_spoken(client)
         assert client._link is not None
-        assert client._link.fault == "server sent a line unasked"  # closed by now, a flood could not fill the memory
+        assert client._link.fault == fault
         assert_at(await client.measure(1.0, EXPECTED), PUCK)
         assert client.counts["drained"] == 1
         assert server.asked == [GOOD_ASK]
-
-
-async def test_half_a_line_left_over_is_not_taken_for_the_reply(server: ScriptedServer) -> None:
-    server.greeting.append(b"channeldata_1,12")
-    async with client_of(server.port) as client:
-        await client.connect()
-        await server_has_spoken(client)
-        assert_at(await client.measure(1.0, EXPECTED), PUCK)
-        assert client.counts["drained"] == 1
 
 
 async def server_has_spoken(client: EtalonClient) -> None:

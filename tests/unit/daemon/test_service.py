@@ -92,17 +92,6 @@ def test_the_watchdog_is_for_the_process_it_names(environ: dict[str, str], perio
 # -- what is alive ----------------------------------------------------------------------------------------------------
 
 
-def test_both_loops_must_have_joined() -> None:
-    liveness = Liveness(1.0)
-    for one, has_joined in (
-        (presence("main", 0.0), False),
-        (presence("danger", 0.0, "starting"), False),
-        (presence("danger", 0.0), True),
-    ):
-        liveness.update(one)
-        assert liveness.has_joined is has_joined
-
-
 @pytest.mark.parametrize(
     ("main", "danger", "trouble"),
     [
@@ -127,6 +116,8 @@ def test_a_service_from_its_start_to_its_end(manager: Manager) -> None:
     service = Service(Notifier(manager.address), 2.0)
     service.update(0.0, None)
     service.on_heartbeat(presence("main", 0.0))
+    service.update(0.1, None)
+    service.on_heartbeat(presence("danger", 0.1, "starting"))
     service.update(0.1, None)
     assert manager.heard() == []  # danger has not joined
     service.on_heartbeat(presence("danger", 0.1))

@@ -1,6 +1,5 @@
 """Reports of missions among beacons: what is read, what it amounts to, the page, its figures, and what is missing."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from ccatp.report.beacon_record import (
 )
 from ccatp.report.plots import NARROW, PX_PER_IN, WIDE, ellipse_outline
 from ccatp.report.run_page import beacon_data, beacon_drawings, beacon_page
+from tests.support.command import answered
 from tests.unit.reporting.beacon_recorded import FRAMES, OFF_M, SIGMA_M, beacon_config, record_beacons
 from tests.unit.reporting.markup import Markup
 
@@ -58,8 +58,9 @@ def test_a_waypoint_that_was_reached(run_dir: Path) -> None:
 
 def test_the_command_and_the_page(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "page.html"
-    assert main(["report", str(run_dir), "--out", str(path), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    assert main(["report", str(run_dir), "--out", str(path)]) == 0
+    assert capsys.readouterr().out == f"{path}\n"
+    told = answered(capsys, "report", run_dir, "--out", path)
     assert told["report"] == str(path)
     assert (told["system"], told["seed"], told["outcome"]) == ("zigbee", 5, "complete")
     assert told["waypoints"] == {"total": 4, "reached": 1, "within_3_sigma": 1}

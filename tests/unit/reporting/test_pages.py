@@ -18,6 +18,7 @@ from ccatp.report.findings import findings_of, outcome_of
 from ccatp.report.html import POLICY, ReportError, clock_text, environment, events_of, gathered, number_text
 from ccatp.report.record import read_record
 from ccatp.report.run_page import report_run, run_page
+from tests.support.command import answered, refused
 from tests.unit.reporting.markup import Markup
 from tests.unit.reporting.recorded import record
 
@@ -74,8 +75,8 @@ def test_sections_by_what_a_run_holds(gone: tuple[str, ...], left: list[str], wi
         assert f"<li>{name}: " in found
 
 
-def test_text_stays_text(recorded: Path) -> None:
-    whole = read_record(recorded)
+def test_text_stays_text(without: Callable[..., Path]) -> None:
+    whole = read_record(without("telemetry.mcap", "mission.sqlite"))  # what is drawn has no text from outside
     evil = '<script>alert("1")</script>&'
     line = LogLine("2026-01-01T00:00:00", None, "error", evil, evil)
     texts = {"name": evil, "log": (line,), "config_text": evil, "files": {evil: 1}}
@@ -257,14 +258,11 @@ def test_names_of_points_are_no_numbers() -> None:
 
 
 def test_the_command(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["report", str(run_dir)]) == 0
-    assert capsys.readouterr().out == f"{run_dir / 'report.html'}\n"
+    figures = tmp_path / "figures" / "deep"
+    told = answered(capsys, "report", run_dir, "--figures", figures)
+    assert told["report"] == str(run_dir / "report.html")
+    assert (run_dir / "report.html").stat().st_size > 100_000
     assert not list(run_dir.glob("*.new"))
-    out, figures = tmp_path / "a.html", tmp_path / "figures" / "deep"
-    assert main(["report", str(run_dir), "--out", str(out), "--figures", str(figures), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["report"] == str(out)
-    assert out.read_text() == (run_dir / "report.html").read_text()
     names = ("path", "surface", "time", "localization")
     assert {path.name for path in figures.iterdir()} == {f"{n}.{s}" for n in names for s in ("svg", "png", "pdf")}
     summary = json.loads((run_dir / "summary.json").read_text())
@@ -275,13 +273,14 @@ def test_the_command(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
 
 def test_refusals_and_warnings(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
+    for name in ("telemetry.mcap", "mission.sqlite"):  # whose figures take their time
+        (run_dir / name).unlink()
     for command, why in (
-        (["report", str(tmp_path / "nothing")], "nothing: no such directory; name the directory of a run"),
-        (["compare", str(run_dir), str(tmp_path)], "no config.toml there"),
-        (["report", str(run_dir), "--figures", str(tmp_path / "file" / "figures")], "cannot be made: Not a directory"),
+        (("report", tmp_path / "nothing"), "nothing: no such directory; name the directory of a run"),
+        (("compare", run_dir, tmp_path), "no config.toml there"),
+        (("report", run_dir, "--figures", tmp_path / "file" / "figures"), "cannot be made: Not a directory"),
     ):
-        assert main(command) == 2
-        assert why in capsys.readouterr().err
+        assert why in refused(capsys, *command)
     with pytest.raises(ReportError, match=r"no/a\.html: cannot be written: No such file or directory"):
         report_run(run_dir, tmp_path / "no" / "a.html")
     (run_dir / "summary.json").write_text("{")
