@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
+from playwright.async_api import Page, async_playwright, expect
 from prometheus_client import CONTENT_TYPE_LATEST
 
 from ccatp.config.load import load_config
@@ -17,7 +18,7 @@ from ccatp.links.channels import format_error, format_ok
 from ccatp.links.topics import LogMessage
 from ccatp.report.dashboard.hub import IDLE_PERIOD_S
 from tests.contract.page_rig import DEADLINE_S, Rig, mission, page_rig
-from tests.unit.dashboard.prometheus import parse
+from tests.unit.dashboard.test_metrics import parse
 
 FILES = (
     "page.js", "map.js", "plots.js", "commands.js", "page.css", "icon.svg", "uPlot.iife.min.js", "uPlot.min.css"
@@ -336,3 +337,48 @@ async def test_garbage_is_answered_and_noted_sparingly(rig: Rig) -> None:
         assert (await closed(reader)).startswith(b"HTTP/1.1 400 ")
         writer.close()
     assert (await rig.ask("GET", "/ground")).code == 200
+
+
+# -- in a real browser ------------------------------------------------------------------------------------------------
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the page is not tried in a browser")
+async def test_what_a_page_shows_and_that_its_end_is_not_that_of_the_survey(folder: Path) -> None:
+    async with async_playwright() as playwright:
+        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = await browser.new_page(viewport={"width": 1280, "height": 900})
+        page.set_default_timeout(20_000)
+        async with page_rig(load_config(None, {"run.panels": 1}), folder) as rig:
+            await page.goto(f"http://127.0.0.1:{rig.port}/")
+            await expect(page.locator("#state")).not_to_have_text("connecting")
+            rig.tell_alive()
+            await expect(page.locator("#state")).to_have_text("driving")
+            await is_laid_out(page)
+        await expect(page.locator("#alarm")).to_contain_text("LINK LOST")
+        await expect(page.locator("#alarm-text")).to_have_text("the dashboard has ended; the survey may go on")
+        await expect(page.locator("#ended")).to_be_hidden()
+        await expect(page.locator("#abort")).to_be_disabled()
+        await browser.close()
+
+
+async def is_laid_out(page: Page) -> None:
+    heights = await page.locator("figcaption:visible").evaluate_all("nodes => nodes.map(node => node.clientHeight)")
+    assert len(heights) == 4
+    assert max(heights) < 1.5 * min(heights)  # one line each
+    await expect(page.locator("#plot-arrival")).to_have_attribute("data-empty", "")
+    await expect(page.locator("#plot-arrival .uplot")).to_be_hidden()
+    await expect(page.locator("figcaption", has_text="Position error")).to_contain_text("mm, 3\u03c3 dashed")
+    # At one instant: a banner that comes would move them.
+    places = await page.evaluate("""() => [".map", ".plots", ".side", ".log"].map(part => {
+        const box = document.querySelector(part).getBoundingClientRect();
+        return [box.top, box.bottom];
+    })""")
+    (_, map_end), (plots_top, plots_end), (_, side_end), (log_top, _) = places
+    assert map_end <= 900.0  # all of the map without scrolling
+    assert 0.0 < plots_top - map_end < 30.0
+    assert abs(plots_end - side_end) < 60.0  # no room empty on either side
+    assert log_top > plots_end
+    overflows = "nodes => nodes.filter(node => node.scrollWidth > node.clientWidth).length"
+    assert await page.locator("figcaption:visible").evaluate_all(overflows) == 0

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from ccatp.studies.mote_navigation import BeaconSilResult, rehearse_beacons
-from tests.unit.beacons.stories import beacon_config, target_distances
+from tests.unit.beacons.test_mission import beacon_config, target_distances
 
 pytestmark = pytest.mark.xdist_group("beacon-missions")  # the missions by motes are driven once
 

@@ -1,7 +1,7 @@
 """An operator's commands to a mission among beacons, and what it does without verdicts."""
 
 import sqlite3
-from math import inf, pi, radians
+from math import hypot, inf, pi, radians
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ from ccatp.beacons.slam.motion import Steering
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.beacons.store import BeaconStore, BeaconStoreError
 from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.load import load_radio_config
+from ccatp.config.package import configs_dir
 from ccatp.core import EventCode, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
@@ -34,12 +36,35 @@ from ccatp.records.beacon_summary import BeaconSummary, beacon_facts
 from ccatp.safety.beacons import BeaconSafetyRules, ObstacleBuffer
 from ccatp.sim.beacon_robot import BeaconRobot
 from ccatp.sim.radio_world import RadioWorld
-from ccatp.studies.mote_navigation import BeaconSilWorld
+from ccatp.studies.mote_navigation import BeaconSilResult, BeaconSilWorld
 from ccatp.survey.state import Abort, Fault, Pause, Resume, StopHere
-from tests.unit.beacons.stories import beacon_config, moved_m, play, target_distances
 
 FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
 DENIED = Verdict(0, 0.0, EventCode.NORMAL, "no radio", "radio", 8.0, 7.0, False, False, False, severity=Severity.HOLD)
+
+
+def beacon_config(system: str, **overrides: Any) -> RadioConfig:
+    """The shipped configuration of a system; dots in keys are written as two underscores."""
+    keys = {name.replace("__", "."): value for name, value in overrides.items()}
+    return load_radio_config(Path(configs_dir() / f"{system}.toml"), keys)
+
+
+def play(stage: BeaconSilWorld, until_s: float = 1e9) -> BeaconSilWorld:
+    """Serve frames until a time, or the end."""
+    while not stage.is_over and stage.robot.t_s < until_s:
+        stage.frame()
+    return stage
+
+
+def target_distances(found: BeaconSilResult) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """True distance of the robot's origin from the target, one a frame."""
+    return np.array([hypot(row[2] - row[5], row[3] - row[6]) for row in found.truth])
+
+
+def moved_m(found: BeaconSilResult, from_s: float, until_s: float) -> float:
+    """How far the robot really went between two times."""
+    places = np.array([row[2:4] for row in found.truth if from_s <= row[1] <= until_s])
+    return float(np.hypot(*np.diff(places, axis=0).T).sum())
 
 
 @pytest.fixture

@@ -4,12 +4,12 @@ from typing import Any
 
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.parser import text_string_to_metric_families
 
 from ccatp.links.topics import DisplayState
 from ccatp.report.dashboard.app import StateCollector
 from ccatp.report.dashboard.view import NO_LINE, LinkState
 from ccatp.survey.state import MissionState
-from tests.unit.dashboard.prometheus import parse
 
 GROUND: dict[str, Any] = {"title": "fyst-m1", "states": [str(state) for state in MissionState]}
 NOTHING: dict[str, Any] = {
@@ -33,6 +33,15 @@ ALL: dict[str, Any] = NOTHING | {
         nis=2.0, size=2, line=NO_LINE,
     ),
 }  # fmt: skip
+
+
+def parse(text: str) -> dict[str, dict[tuple[str, ...], float]]:
+    """Samples by the names of the metrics and the values of their labels."""
+    found: dict[str, dict[tuple[str, ...], float]] = {}
+    for family in text_string_to_metric_families(text):
+        for sample in family.samples:
+            found.setdefault(sample.name, {})[tuple(sample.labels.values())] = sample.value
+    return found
 
 
 def metrics_of(state: dict[str, Any], pages: int = 0, **ground: Any) -> dict[str, dict[tuple[str, ...], float]]:

@@ -1,4 +1,4 @@
-"""Pure. Nonlinear filters: consistent where the noise is as modelled, and right where quadrature tells the answer."""
+"""Pure. Filters: consistent where the noise is as modelled, and right where quadrature tells the answer."""
 
 from typing import NamedTuple
 
@@ -182,3 +182,40 @@ def test_a_model_that_is_linear_is_the_matrix(name: str) -> None:
     np.testing.assert_allclose(model.mean, matrix.mean, rtol=1e-13)  # rounding
     np.testing.assert_allclose(model.covariance, matrix.covariance, rtol=1e-13)
     np.testing.assert_allclose(model.transition, A, rtol=1e-13)
+
+
+# -- the linear filter on the thesis's four states --------------------------------------------------------------------
+
+KF_STEPS, KF_DT_S = 40, 0.01
+KF_F = np.eye(4)
+KF_F[0, 1] = KF_F[2, 3] = KF_DT_S
+IMPULSE = np.array([0.0, 1.0, 0.0, 2.0]) * np.sqrt(KF_DT_S)
+KF_Q = KF_F @ np.diag(IMPULSE**2) @ KF_F.T
+WHEELS = np.array([[33.0, 0.0, 0.0, 2.5], [33.0, 0.0, 0.0, -2.5]])
+INERTIAL = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+KF_START = np.diag([1e-4, 1e-2, 1e-4, 1e-2])
+
+
+def rows(count: int) -> tuple[FloatArray, FloatArray]:
+    """H and R of ``count`` samples of each wheel and one of the inertial unit; shipped noise."""
+    H = np.vstack([np.repeat(WHEELS, count, axis=0), INERTIAL])
+    return H, np.concatenate([np.full(2 * count, 1e-6), [3.5e-5, 7.6e-5]])
+
+
+@pytest.mark.parametrize("count", [0, 1, 10])
+def test_errors_and_innovations_are_as_large_as_said(count: int) -> None:
+    H, R = rows(count)
+    nis, nees = 0.0, []
+    for seed in range(SEEDS):
+        rng = np.random.default_rng(seed)
+        x = np.sqrt(KF_START.diagonal()) * rng.normal(size=4)
+        kf = FILTERS["kf"](np.zeros(4), KF_START)
+        for _ in range(KF_STEPS):
+            x = KF_F @ (x + IMPULSE * rng.normal(size=4))
+            kf.predict(KF_F, KF_Q)
+            nis += kf.update(H @ x + np.sqrt(R) * rng.normal(size=R.size), H, R).nis
+        error = x - kf.mean
+        nees.append(float(error @ np.linalg.solve(kf.covariance, error)))
+    # The 95 % bands; innovations are white, so all of them count.
+    assert chi2.ppf(0.025, R.size * KF_STEPS * SEEDS) < nis < chi2.ppf(0.975, R.size * KF_STEPS * SEEDS)
+    assert chi2.ppf(0.025, 4 * SEEDS) < sum(nees) < chi2.ppf(0.975, 4 * SEEDS)
