@@ -32,6 +32,7 @@ from ccatp.survey.composition import assemble
 from tests.support.sim_survey import plan_of
 
 SIGMA_M, SIGMA_RAD = 1e-3, 2e-3
+ONE_PANEL: dict[str, object] = {"run.panels": 1, "mission.calibration_length_m": 0.0}  # a mission of a minute
 
 
 def stops_of(errors_m: list[float], approaches: list[int] | None = None) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -150,7 +151,7 @@ def test_each_group_of_disturbances_is_added_and_taken_away() -> None:
 def test_a_real_job_has_every_figure(
     study: Study, only: Mapping[str, Any], settings: Mapping[str, object], tmp_path: Path
 ) -> None:
-    settings = {"run.panels": 1, **settings}
+    settings = {**ONE_PANEL, **settings}
     options = CampaignOptions(tmp_path, runs=1, workers=1, only=only, settings=settings)
     result = run_campaign(study, lambda keys: load_config(None, keys), options)
     (cell,) = result["cells"]
@@ -285,7 +286,7 @@ def test_the_band_holds_the_mean_of_a_consistent_filter() -> None:
 
 
 def test_a_real_mission_says_the_same_as_its_summary() -> None:
-    cfg = load_config(None, {"run.mirror": "thesis-m1", "run.panels": 1, "run.filter": "ekf", "run.world": "hard"})
+    cfg = load_config(None, {**ONE_PANEL, "run.mirror": "thesis-m1", "run.filter": "ekf", "run.world": "hard"})
     outcome = run_mission(Job("trial", {}, cfg.run.seed, cfg))
     values, _ = combine_missions({}, [outcome])
     # A summary is rounded to 1 um. Between its stop and the end of the measurement the fans shake the robot: by 7 um
@@ -332,7 +333,7 @@ def test_late_estimates_meet_their_truth_across_batches() -> None:
 
 
 def run(faults: str, seed: int = 5) -> Mapping[str, Any]:
-    keys = {"run.mirror": "fyst-m2", "run.panels": 1, "run.seed": seed, **faults_study.STUDY.defaults}
+    keys = {**ONE_PANEL, "run.mirror": "fyst-m2", "run.seed": seed, **faults_study.STUDY.defaults}
     return faults_study.run_job(Job("faults", {"faults": faults}, seed, load_config(None, keys))).values
 
 

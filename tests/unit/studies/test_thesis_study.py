@@ -14,15 +14,7 @@ from ccatp.filters import FILTERS
 from ccatp.mirror.mirror import build_mirror
 from ccatp.studies.campaign import CellResult, Job, JobOutcome
 from ccatp.studies.mission_study import Histogram
-from ccatp.studies.thesis_study import (
-    PUBLISHED,
-    ThesisLocalizer,
-    cells,
-    combine,
-    draw,
-    overrides_of,
-    run_job,
-)
+from ccatp.studies.thesis_study import PUBLISHED, ThesisLocalizer, cells, combine, draw, overrides_of, run_job
 
 
 @pytest.mark.parametrize(("noise", "table"), [("normal", 0.0087), ("twice", 0.0175)])
