@@ -7,6 +7,7 @@ import signal
 import socket
 import tempfile
 from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
 
 import psutil
 import pytest
@@ -101,6 +102,13 @@ def _describe(child: psutil.Process) -> str:
         return f"{child.pid} {' '.join(child.cmdline()) or child.name()}"
     except psutil.Error:  # it ended in between
         return str(child.pid)
+
+
+@pytest.fixture
+def runtime_dir() -> Iterator[Path]:
+    """A short path: unix sockets do not take a long one."""
+    with tempfile.TemporaryDirectory(prefix="ccatp-", ignore_cleanup_errors=True) as folder:
+        yield Path(folder)
 
 
 @pytest.fixture

@@ -3,9 +3,8 @@
 import asyncio
 import shutil
 import socket
-import tempfile
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
@@ -26,21 +25,14 @@ FILES = (
 TOKEN = "0123456789abcdef0123456789abcdef"
 
 
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    path = Path(tempfile.mkdtemp(prefix="ccatp-"))
-    yield path
-    shutil.rmtree(path, ignore_errors=True)
-
-
 @pytest.fixture(scope="module")
 def cfg() -> Config:
     return load_config(None, {"run.panels": 1, "dashboard.slow_client_s": 0.4, "dashboard.command_timeout_s": 0.5})
 
 
 @pytest.fixture
-async def rig(cfg: Config, folder: Path) -> AsyncIterator[Rig]:
-    async with page_rig(cfg, folder) as rig:
+async def rig(cfg: Config, runtime_dir: Path) -> AsyncIterator[Rig]:
+    async with page_rig(cfg, runtime_dir) as rig:
         yield rig
 
 
@@ -147,8 +139,8 @@ async def test_a_refusal_has_its_reason(rig: Rig) -> None:
         assert (reply.code, reply.data) == (code, {"status": "error", "message": f"{command}: {why}"})
 
 
-async def test_no_daemon_is_told_within_the_time(cfg: Config, folder: Path) -> None:
-    async with page_rig(cfg, folder, has_daemon=False) as rig:
+async def test_no_daemon_is_told_within_the_time(cfg: Config, runtime_dir: Path) -> None:
+    async with page_rig(cfg, runtime_dir, has_daemon=False) as rig:
         reply = await rig.ask("POST", "/abort")
     assert reply.code == 504
     assert reply.data["message"] == "abort: no answer from the main loop within 0.5 s"
@@ -183,12 +175,12 @@ async def test_pages_of_others_command_nothing_and_read_nothing(rig: Rig) -> Non
         assert "access-control-allow-origin" not in reply.headers  # what a browser does not hand to their script
 
 
-async def test_commands_with_a_token(cfg: Config, folder: Path) -> None:
-    path = folder / "token"
+async def test_commands_with_a_token(cfg: Config, runtime_dir: Path) -> None:
+    path = runtime_dir / "token"
     path.write_text(TOKEN)
     path.chmod(0o600)
     guarded = cfg.dashboard.model_copy(update={"token_file": str(path), "host_names": ("m1.local",)})
-    async with page_rig(cfg.model_copy(update={"dashboard": guarded}), folder) as rig:
+    async with page_rig(cfg.model_copy(update={"dashboard": guarded}), runtime_dir) as rig:
         assert (await rig.ask("GET", "/ground", host="m1.local")).data["needs_token"] is True
         for none in ({}, {"authorization": "Bearer wrong"}):
             reply = await rig.ask("POST", "/abort", **none)
@@ -316,9 +308,9 @@ async def test_who_takes_nothing_is_dropped(rig: Rig) -> None:
                 metrics = parse((await rig.ask("GET", "/metrics")).body.decode())["ccatp_dashboard_pages"]
 
 
-async def test_newcomers_beyond_the_limit_are_turned_away(cfg: Config, folder: Path) -> None:
+async def test_newcomers_beyond_the_limit_are_turned_away(cfg: Config, runtime_dir: Path) -> None:
     few = cfg.dashboard.model_copy(update={"max_connections": 2, "slow_client_s": DEADLINE_S})
-    async with page_rig(cfg.model_copy(update={"dashboard": few}), folder) as rig, rig.page() as page:
+    async with page_rig(cfg.model_copy(update={"dashboard": few}), runtime_dir) as rig, rig.page() as page:
         await page.event()
         reader, writer = await asyncio.open_connection("127.0.0.1", rig.port)
         third, other = await asyncio.open_connection("127.0.0.1", rig.port)
@@ -345,12 +337,12 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the page is not tried in a browser")
-async def test_what_a_page_shows_and_that_its_end_is_not_that_of_the_survey(folder: Path) -> None:
+async def test_what_a_page_shows_and_that_its_end_is_not_that_of_the_survey(runtime_dir: Path) -> None:
     async with async_playwright() as playwright:
         browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = await browser.new_page(viewport={"width": 1280, "height": 900})
         page.set_default_timeout(20_000)
-        async with page_rig(load_config(None, {"run.panels": 1}), folder) as rig:
+        async with page_rig(load_config(None, {"run.panels": 1}), runtime_dir) as rig:
             await page.goto(f"http://127.0.0.1:{rig.port}/")
             await expect(page.locator("#state")).not_to_have_text("connecting")
             rig.tell_alive()

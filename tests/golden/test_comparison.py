@@ -96,6 +96,11 @@ def test_each_change_is_found(base: Observation, stream: str, row: int, field: s
     assert f"{field}: base " in str(found[0])
 
 
+def test_the_first_of_several_differences_is_shown(base: Observation) -> None:
+    new = changed(changed(base, "frames", 0, "drive.wr", 0.2), "frames", 1, "drive.wr", 0.2)
+    assert [(one.key, one.rows) for one in compare(base, new, Renames())] == [("frame 0", 2)]
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -113,12 +118,6 @@ def test_what_is_missing_or_too_much_is_found(base: Observation, change: Callabl
     assert len(compare(new, base, Renames())) == 1
 
 
-def test_the_first_of_several_differences_is_shown(base: Observation) -> None:
-    new = changed(changed(base, "frames", 0, "drive.wr", 0.2), "frames", 1, "drive.wr", 0.2)
-    found = compare(base, new, Renames())
-    assert [(one.key, one.rows) for one in found] == [("frame 0", 2)]
-
-
 def test_frames_after_a_reboot_are_others(base: Observation, tmp_path: Path) -> None:
     again = [line.replace('"boot":7', '"boot":8') for line in WIRE]
     frames = left_behind(tmp_path / "new", wire=[*WIRE, *again])["frames"]
@@ -127,14 +126,8 @@ def test_frames_after_a_reboot_are_others(base: Observation, tmp_path: Path) -> 
 
 
 def test_a_rename_in_the_table_is_no_difference(base: Observation, tmp_path: Path) -> None:
-    state = {
-        "logger": "main",
-        "event": "state_changed",
-        "timestamp": "now",
-        "seq": 1,
-        "from": "idle",
-        "after": "moving",
-    }
+    state = {"logger": "main", "event": "state_changed", "timestamp": "now", "seq": 1}
+    state |= {"from": "idle", "after": "moving"}
     new = left_behind(tmp_path / "new", state=state, topic="pose_track")
     assert {one.stream for one in compare(base, new, Renames())} == {"event:state", "track"}
     renames = Renames(

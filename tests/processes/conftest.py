@@ -1,7 +1,5 @@
 """Real runs on real sockets; `tests.support.runs` starts them."""
 
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -23,14 +21,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             # Who reads the recorded run waits for it: all of them in the queue that records it.
             is_second = item.path.stem in SECOND or "recorded_run" in getattr(item, "fixturenames", ())
             item.add_marker(pytest.mark.xdist_group("processes-2" if is_second else "processes-1"))
-
-
-@pytest.fixture
-def runtime_dir() -> Iterator[Path]:
-    """A short path: unix sockets do not take a long one."""
-    folder = Path(tempfile.mkdtemp(prefix="ccatp-"))
-    yield folder
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture

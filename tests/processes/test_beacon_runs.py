@@ -68,16 +68,3 @@ def test_an_operator_pauses_resumes_and_aborts(begin: Begin) -> None:
     assert run.ask("abort")["ok"]
     assert run.wait() == 3, run.stderr
     assert run.summary["outcome"] == "aborted, at base"
-
-
-def test_silence_of_all_radios_ends_held(begin: Begin, tmp_path: Path) -> None:
-    config = tmp_path / "silent.toml"
-    config.write_text(
-        'system = "zigbee"\n[danger]\nhold_limit_s = 2.0\n[[sim.incidents]]\n'
-        'type = "radio_loss"\nat_s = 10.0\nfor_s = 1000.0\nbeacons = []\n',
-        encoding="utf-8",
-    )
-    run = begin("zigbee", "--config", str(config))
-    assert run.wait() == 4, run.stderr
-    assert "no radio is heard" in run.stderr
-    assert run.summary["danger"] == {"radio": 1}

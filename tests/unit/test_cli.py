@@ -2,7 +2,6 @@
 
 import importlib.metadata
 import json
-import socket
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,7 +17,7 @@ from ccatp.cli.common import parse_setting
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
 from ccatp.daemon.run_dir import RunOptions
-from ccatp.errors import ConfigError, DaemonUnreachableError
+from ccatp.errors import ConfigError, DaemonUnreachableError, RefusedError
 from ccatp.links.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked
 from tests.support.command import refused
 
@@ -207,6 +206,7 @@ def test_a_resumed_run_takes_the_configuration_of_its_directory(stub: Stub) -> N
     [
         (ConfigError("a.toml:3: run.seed is odd"), 2, "ccatp: a.toml:3: run.seed is odd\n"),
         (DaemonUnreachableError("robot 127.0.0.1:1 refuses"), 5, "ccatp: robot 127.0.0.1:1 refuses\n"),
+        (RefusedError("resume refused: not paused"), 1, "ccatp: resume refused: not paused\n"),
         (KeyboardInterrupt(), 130, "ccatp: interrupted\n"),
     ],
 )
@@ -266,20 +266,6 @@ def test_an_emergency_that_is_not_in_force_is_no_success(
 ) -> None:
     router(answer)
     refused(capsys, "emergency", "fire", status=5 if answer["ok"] is True else 1)
-
-
-def test_a_silent_daemon_is_one_line_and_exit_5(daemon_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (daemon_dir / "control").unlink()
-    with socket.socket(socket.AF_UNIX) as silent:
-        silent.bind(str(daemon_dir / "control"))
-        told = refused(capsys, "status", "--timeout", "0.05", status=5)
-    assert told.startswith(f"ccatp: no answer from ipc://{daemon_dir}/control within 0.05 s")
-
-
-def test_a_refusal_tells_the_reason(router: Router, daemon_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    calls = router({"ok": False, "error": "not paused"})
-    assert refused(capsys, "resume", status=1) == "ccatp: resume refused: not paused\n"
-    assert calls[0][0].startswith(f"ipc://{daemon_dir}")
 
 
 def test_the_robot_alone_gets_its_address(stub: Stub) -> None:

@@ -6,8 +6,6 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,7 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.survey.composition import assemble, make_plan, plan_lines
 from ccatp.survey.planning.search import leg_lengths
 from tests.support.command import answered, refused
-from tests.unit.serving import serving
+from tests.unit.test_client import serving
 
 
 @pytest.mark.parametrize(
@@ -223,12 +221,6 @@ STATUS = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="ccatp-") as path:  # short: unix sockets take no long one
-        yield Path(path)
-
-
 def test_the_table() -> None:
     assert status_rows(STATUS) == [
         ("state", "driving 3-4-5"),
@@ -266,11 +258,13 @@ def test_one_line() -> None:
 
 
 @pytest.mark.parametrize("command", ["status", "pause", "resume", "abort", "stop"])
-def test_commands_answer_with_the_same_table(folder: Path, command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with serving(folder, "control", lambda _: {"ok": True, "status": STATUS}):
-        assert main([command, "--runtime-dir", str(folder)]) == 0
+def test_commands_answer_with_the_same_table(
+    runtime_dir: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with serving(runtime_dir, "control", lambda _: {"ok": True, "status": STATUS}):
+        assert main([command, "--runtime-dir", str(runtime_dir)]) == 0
         assert capsys.readouterr().out.splitlines()[0] == "state    driving 3-4-5"
-        assert main([command, "--runtime-dir", str(folder), "--json"]) == 0
+        assert main([command, "--runtime-dir", str(runtime_dir), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["status"] == STATUS
 
 
@@ -279,39 +273,39 @@ def answers(*found: dict[str, Any]) -> Any:
     return lambda _: {"ok": True, "status": {**STATUS, **(left.pop(0) if len(left) > 1 else left[0])}}
 
 
-def test_watching_tells_changes_until_the_end(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_watching_tells_changes_until_the_end(runtime_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     course = answers({}, {}, {"done": 121}, {"done": 693, "state": "done", "exit_status": 0})
-    command = ["status", "--watch", "--every", "0.1", "--runtime-dir", str(folder)]
-    with serving(folder, "control", course) as asked:
+    command = ["status", "--watch", "--every", "0.1", "--runtime-dir", str(runtime_dir)]
+    with serving(runtime_dir, "control", course) as asked:
         assert main(command) == 0
     assert len(asked) == 4
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 3  # what did not change is not told again
     assert lines[-1].startswith("100 %: 693 of 693 points, done")
-    with serving(folder, "control", answers({}, {"exit_status": 3})):
+    with serving(runtime_dir, "control", answers({}, {"exit_status": 3})):
         assert main([*command, "--json"]) == 0
     assert [json.loads(line)["status"]["exit_status"] for line in capsys.readouterr().out.splitlines()] == [-1, 3]
 
 
 def test_watching_a_daemon_that_goes_ends_well(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    runtime_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    command = ["status", "--watch", "--runtime-dir", str(folder)]
+    command = ["status", "--watch", "--runtime-dir", str(runtime_dir)]
     assert main(command) == 5  # nobody was there
-    with serving(folder, "control", answers({})):
+    with serving(runtime_dir, "control", answers({})):
         # The daemon goes between two looks.
-        monkeypatch.setattr("ccatp.cli.operate.time.sleep", lambda _: (folder / "control").unlink())
+        monkeypatch.setattr("ccatp.cli.operate.time.sleep", lambda _: (runtime_dir / "control").unlink())
         assert main(command) == 0
     assert "driving" in capsys.readouterr().out
 
 
 def test_a_terminal_gets_a_table(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    runtime_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "120")
-    with serving(folder, "control", answers({}, {"exit_status": 0})):
-        assert main(["status", "--watch", "--every", "0.1", "--runtime-dir", str(folder)]) == 0
+    with serving(runtime_dir, "control", answers({}, {"exit_status": 0})):
+        assert main(["status", "--watch", "--every", "0.1", "--runtime-dir", str(runtime_dir)]) == 0
     assert "120 of 693 measured" in capsys.readouterr().out

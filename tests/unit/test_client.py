@@ -1,7 +1,7 @@
 """Clients of a daemon in Python: over its sockets and its page."""
 
+import asyncio
 import json
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,65 +12,99 @@ from typing import Any
 
 import msgspec
 import pytest
+import zmq.asyncio
 
 from ccatp.errors import ConfigError, DaemonUnreachableError, RefusedError
 from ccatp.links.client import HttpClient, Latched, OperatorClient, Pong, StillWaiting
+from ccatp.links.rpc import Router
 from ccatp.links.topics import MissionStatus
-from tests.unit.serving import serving
 
-# -- tests of the client: what it asks over real sockets, and what it makes of the answers ----------------------------
+
+@contextmanager
+def serving(
+    runtime_dir: Path, channel: str, answer: Callable[[dict[str, Any]], dict[str, Any]]
+) -> Iterator[list[dict[str, Any]]]:
+    """A real ROUTER in a thread of its own; yields what it was asked."""
+    asked: list[dict[str, Any]] = []
+    ready, loop = threading.Event(), asyncio.new_event_loop()
+
+    def handle(frame: bytes) -> bytes:
+        asked.append(json.loads(frame))
+        return json.dumps(answer(asked[-1])).encode()
+
+    async def serve() -> None:
+        context = zmq.asyncio.Context()
+        try:
+            async with Router(f"ipc://{runtime_dir / channel}", handle, context) as router:
+                ready.set()
+                await router.serve()
+        finally:
+            context.destroy(linger=0)
+
+    task = loop.create_task(serve())
+
+    def run() -> None:
+        try:
+            loop.run_until_complete(task)
+        except asyncio.CancelledError:
+            pass
+        finally:
+            loop.close()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    assert ready.wait(10.0)
+    try:
+        yield asked
+    finally:
+        loop.call_soon_threadsafe(task.cancel)
+        thread.join()
 
 
 NO_STATUS = MissionStatus(seq=-1, t_s=0.0, state="")
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="ccatp-") as path:  # short: unix sockets take no long one
-        yield Path(path)
 
 
 def status(**fields: object) -> dict[str, Any]:
     return {"ok": True, "status": {**msgspec.to_builtins(NO_STATUS), **fields}}
 
 
-def test_commands_and_typed_answers(folder: Path) -> None:
-    with serving(folder, "control", lambda request: status(state=request["cmd"], done=3)) as asked:
-        daemon = OperatorClient(folder)
+def test_commands_and_typed_answers(runtime_dir: Path) -> None:
+    with serving(runtime_dir, "control", lambda request: status(state=request["cmd"], done=3)) as asked:
+        daemon = OperatorClient(runtime_dir)
         for order in (daemon.status, daemon.pause, daemon.resume, daemon.abort, daemon.stop):
             found = order()
             assert (found.state, found.done) == (order.__name__, 3)
     assert [request["cmd"] for request in asked] == ["status", "pause", "resume", "abort", "stop"]
 
 
-def test_a_refusal_says_why(folder: Path) -> None:
+def test_a_refusal_says_why(runtime_dir: Path) -> None:
     with (
-        serving(folder, "control", lambda _: {"ok": False, "error": "nothing is paused"}),
+        serving(runtime_dir, "control", lambda _: {"ok": False, "error": "nothing is paused"}),
         pytest.raises(RefusedError, match="resume refused: nothing is paused"),
     ):
-        OperatorClient(folder).resume()
+        OperatorClient(runtime_dir).resume()
 
 
-def test_nobody_there(folder: Path) -> None:
+def test_nobody_there(runtime_dir: Path) -> None:
     with pytest.raises(DaemonUnreachableError, match=r"no daemon in .*; start one with ccatp run"):
-        OperatorClient(folder).status()
-    (folder / "control").touch()
+        OperatorClient(runtime_dir).status()
+    (runtime_dir / "control").touch()
     with pytest.raises(DaemonUnreachableError, match=r"no answer from .* within 0\.1 s"):
-        OperatorClient(folder, timeout_s=0.1).status()
+        OperatorClient(runtime_dir, timeout_s=0.1).status()
 
 
-def test_an_answer_of_another_shape_is_told(folder: Path) -> None:
+def test_an_answer_of_another_shape_is_told(runtime_dir: Path) -> None:
     with (
-        serving(folder, "control", lambda _: {"ok": True, "status": {"state": 7}}),
+        serving(runtime_dir, "control", lambda _: {"ok": True, "status": {"state": 7}}),
         pytest.raises(DaemonUnreachableError, match="not what was asked for"),
     ):
-        OperatorClient(folder).status()
+        OperatorClient(runtime_dir).status()
 
 
-def test_waiting(folder: Path) -> None:
+def test_waiting(runtime_dir: Path) -> None:
     done = iter(range(100))
-    with serving(folder, "control", lambda _: status(done=next(done), total=9, state="driving")):
-        daemon = OperatorClient(folder)
+    with serving(runtime_dir, "control", lambda _: status(done=next(done), total=9, state="driving")):
+        daemon = OperatorClient(runtime_dir)
         assert daemon.wait(lambda found: found.done >= 3, timeout_s=20.0, period_s=0.001).done == 3
         begin = time.monotonic()
         with pytest.raises(StillWaiting, match=r"not within 0\.05 s: the mission is driving, \d+ points done"):
@@ -78,7 +112,7 @@ def test_waiting(folder: Path) -> None:
         assert time.monotonic() - begin >= 0.05
 
 
-def test_observatory(folder: Path) -> None:
+def test_observatory(runtime_dir: Path) -> None:
     def answer(request: dict[str, Any]) -> dict[str, Any]:
         if request["cmd"] == "ping":
             return {"ok": True, "code": 1, "age_s": None}
@@ -86,8 +120,8 @@ def test_observatory(folder: Path) -> None:
             return {"ok": False, "id": request["id"], "error": "the robot moves"}
         return {"ok": True, "id": request["id"], "latched": True, "code": 2}
 
-    with serving(folder, "emergency", answer) as asked:
-        observatory = OperatorClient(folder).observatory
+    with serving(runtime_dir, "emergency", answer) as asked:
+        observatory = OperatorClient(runtime_dir).observatory
         assert observatory.ping() == Pong(1, None)
         latched = observatory.emergency("fire", "smoke")
         assert latched == Latched(latched.id, 2)

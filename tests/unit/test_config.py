@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from ccatp.cli import main
 from ccatp.config.load import (
     available,
-    difference,
     dump_config,
     is_radio_file,
     load_config,
@@ -394,12 +393,6 @@ def test_what_is_no_toml_or_no_section_is_told() -> None:
         with_values("[robot", {"robot.a": 1.0}, FILE)
     with pytest.raises(ConfigError, match=r"x\.toml: robot is a value, not a section"):
         with_values("robot = 3\n", {"robot.a": 1.0}, FILE)
-
-
-def test_the_difference_shows_both() -> None:
-    shown = difference("a = 1\n", "a = 2\n", FILE)
-    assert "-a = 1\n+a = 2" in shown
-    assert difference("a = 1\n", "a = 1\n", FILE) == ""
 
 
 def test_a_link_stays_a_link_and_the_mode_stays(tmp_path: Path) -> None:

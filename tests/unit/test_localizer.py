@@ -4,7 +4,6 @@ The truth drives on the curved deck with given v(t) and omega(t), integrated in 
 mirror's geometry with the localizer, and nothing else.
 """
 
-from collections.abc import Callable
 from functools import cache
 from math import atan, cos, hypot, inf, nan, pi, sin
 
@@ -23,8 +22,8 @@ from ccatp.filters import FILTERS, FilterDiverged, Innovation, KalmanFilter
 from ccatp.filters.base import Observation
 from ccatp.mirror.mirror import Mirror, build_mirror
 from tests.support.scenario import transport_rad
+from tests.unit.estimation.drive import Rate, trapeze
 
-Rate = Callable[[float], float]
 Frame = tuple[float, list[ImuSample], list[WheelSample], list[EdgeSample]]
 
 DT_S = 1e-3
@@ -44,16 +43,6 @@ def mirror_of(name: str = "fyst-m1") -> Mirror:
 
 def still(_: float) -> float:
     return 0.0
-
-
-def trapeze(begin_s: float, duration_s: float, top: float, ramp: float) -> Rate:
-    """A rate that rises with slope ``ramp``, stays at ``top`` and falls again."""
-
-    def at(t: float) -> float:
-        t -= begin_s
-        return top * max(0.0, min(1.0, t * ramp / abs(top), (duration_s - t) * ramp / abs(top)))
-
-    return at
 
 
 class Truth:

@@ -206,6 +206,10 @@ def test_the_table_and_the_csv(run_dir: Path, tmp_path: Path, capsys: pytest.Cap
     assert status == 1
     assert "does not reproduce the recorded estimates" in err
     assert len((tmp_path / "o.csv").read_text().splitlines()) == 201
+    # Another setting is asked to change something.
+    status, out, err = replay(capsys, run_dir, "--filter", "ekf")
+    assert (status, err) == (0, "")
+    assert out.endswith("the replay differs from the recorded estimates\n")
 
 
 @pytest.mark.parametrize(

@@ -119,8 +119,7 @@ def test_contradictions_beyond_outliers_are_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "why"),
-    [(n, f"{n} of 3 points that it takes") for n in range(3)] + [(3, "its points lie on one line")],
+    ("count", "why"), [(n, f"{n} of 3 points that it takes") for n in range(3)] + [(3, "its points lie on one line")]
 )
 def test_too_few_points_determine_nothing(count: int, why: str) -> None:
     result = result_of(exact()[:count])

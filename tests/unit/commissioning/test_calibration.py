@@ -21,6 +21,7 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import RECORD_FORMAT, TOPICS, FixMessage, SensorLines, pack, schema_of
 from ccatp.records.recorder import Recorder
 from ccatp.studies.sil_run import SilRun
+from tests.support.command import refused
 
 # A robot that is not what the configuration says, in a world without slip: thesis with these.
 OTHER_ROBOT = {
@@ -234,10 +235,9 @@ def test_what_is_replaced_is_shown_and_nothing_without_a_configuration(
 
 
 def test_misuse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["calibrate"]) == 2
-    assert "name the robot's configuration with --config FILE, or add --sim" in capsys.readouterr().err
-    assert main(["calibrate", "--from", str(tmp_path)]) == 2
-    assert "no telemetry.mcap there" in capsys.readouterr().err
+    told = "name the robot's configuration with --config FILE, or add --sim"
+    assert told in refused(capsys, "calibrate")
+    assert "no telemetry.mcap there" in refused(capsys, "calibrate", "--from", tmp_path)
 
 
 @pytest.mark.slow

@@ -25,14 +25,8 @@ from ccatp.commissioning.conformance.server_checks import (
 
 TTL_S, FRAME_S = 0.25, 0.01
 CMD: dict[str, Any] = {"seq": 1, "age": 0.01, "permit_age": 0.02, "held": False}
-SENSORS: dict[str, Any] = {
-    "type": "sensors",
-    "seq": 5,
-    "t": 0.05,
-    "enc": [[0.05, 1.0, 2.0]],
-    "fans": [0, 1],
-    "cmd": CMD,
-}
+SENSORS: dict[str, Any] = {"type": "sensors", "seq": 5, "t": 0.05, "cmd": CMD}
+SENSORS |= {"enc": [[0.05, 1.0, 2.0]], "fans": [0, 1]}
 
 
 def frame(t_s: float, age_s: float = 0.01, permit_age_s: float = 0.01, held: bool = False, seq: int = 1) -> Frame:

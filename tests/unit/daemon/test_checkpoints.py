@@ -42,15 +42,10 @@ def parts(tmp_path: Path) -> SurveyParts:
 
 def hello(config: Config, **changes: Any) -> Hello:
     robot = config.robot
-    fields: dict[str, Any] = {
-        "wheel_radius_m": robot.wheel_radius_m,
-        "wheel_base_m": robot.wheel_base_m,
-        "edge_sensors_m": robot.edge_sensors_m,
-        "puck_m": (0.0, 0.0, robot.puck_height_m),
-        "max_wheel_rad_s": robot.max_wheel_rad_s,
-        "fan_floor": 0.0,
-    }
-    return Hello("ccatp-robot/1", 1, "0" * 32, "none", True, 100.0, 0.25, RobotData(**{**fields, **changes}))
+    names = ("wheel_radius_m", "wheel_base_m", "edge_sensors_m", "max_wheel_rad_s")
+    same = {name: getattr(robot, name) for name in names}
+    fields: dict[str, Any] = {**same, "puck_m": (0.0, 0.0, robot.puck_height_m), "fan_floor": 0.0, **changes}
+    return Hello("ccatp-robot/1", 1, "0" * 32, "none", True, 100.0, 0.25, RobotData(**fields))
 
 
 def test_a_plan_measures_every_point_once(parts: SurveyParts) -> None:

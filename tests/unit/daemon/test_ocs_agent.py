@@ -2,11 +2,9 @@
 
 import argparse
 import sys
-import tempfile
 import threading
 import time
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -18,7 +16,7 @@ from ccatp.daemon import ocs_agent
 from ccatp.daemon.ocs_agent import OcsMissing, SurveyTask, add_arguments, main, register, survey_command
 from ccatp.links.client import OperatorClient
 from ccatp.links.topics import MissionStatus
-from tests.unit.serving import serving
+from tests.unit.test_client import serving
 
 NO_STATUS = MissionStatus(seq=-1, t_s=0.0, state="")
 
@@ -34,20 +32,14 @@ class Session:
         self.status = status
 
 
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="ccatp-") as path:  # short: unix sockets take no long one
-        yield Path(path)
-
-
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ccatp.daemon.ocs_agent.PERIOD_S", 0.01)
 
 
-def surveys_of(folder: Path, program: str = "") -> SurveyTask:
+def surveys_of(runtime_dir: Path, program: str = "") -> SurveyTask:
     command = [sys.executable, "-c", program]
-    return SurveyTask(OperatorClient(folder, 5.0), command, {}, lambda _: None)
+    return SurveyTask(OperatorClient(runtime_dir, 5.0), command, {}, lambda _: None)
 
 
 def status(**fields: object) -> dict[str, Any]:
@@ -66,23 +58,23 @@ def status(**fields: object) -> dict[str, Any]:
     ],
 )
 def test_a_survey_ends_as_its_process_does(
-    program: str, panels: int | None, code: int, success: bool, told: str, folder: Path
+    program: str, panels: int | None, code: int, success: bool, told: str, runtime_dir: Path
 ) -> None:
     session = Session()
-    done, text = surveys_of(folder, f"import sys; raise SystemExit({program})").survey(session, panels)
+    done, text = surveys_of(runtime_dir, f"import sys; raise SystemExit({program})").survey(session, panels)
     assert done is success
     assert told in text
     assert session.data["exit_status"] == code
 
 
-def test_a_survey_that_says_nothing_is_ended(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_survey_that_says_nothing_is_ended(runtime_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ccatp.daemon.ocs_agent.START_TIMEOUT_S", 0.2)
-    done, text = surveys_of(folder, "import time; time.sleep(60)").survey(Session())
+    done, text = surveys_of(runtime_dir, "import time; time.sleep(60)").survey(Session())
     assert not done
     assert "said nothing within 0.2 s" in text
 
 
-def test_a_survey_that_runs_already_is_followed_and_aborted_when_the_session_stops(folder: Path) -> None:
+def test_a_survey_that_runs_already_is_followed_and_aborted_when_the_session_stops(runtime_dir: Path) -> None:
     session, asked = Session(), []
 
     def answer(request: dict[str, Any]) -> dict[str, Any]:
@@ -91,37 +83,37 @@ def test_a_survey_that_runs_already_is_followed_and_aborted_when_the_session_sto
             session.status = "stopping"
         return status(done=len(asked), exit_status=3 if "abort" in asked else -1)
 
-    with serving(folder, "control", answer):
+    with serving(runtime_dir, "control", answer):
 
         def go_away() -> None:
             while "abort" not in asked:
                 time.sleep(0.001)
             # what the daemon's end looks like from here
-            (folder / "control").unlink(missing_ok=True)
+            (runtime_dir / "control").unlink(missing_ok=True)
 
         thread = threading.Thread(target=go_away)
         thread.start()
-        done, text = surveys_of(folder, "raise SystemExit(9)").survey(session)
+        done, text = surveys_of(runtime_dir, "raise SystemExit(9)").survey(session)
         thread.join()
     assert "abort" in asked
     assert session.data["state"] == "driving"
     assert (done, text) in ((True, "aborted, the robot is at base"), (False, "the survey is over"))
 
 
-def test_orders_and_refusals(folder: Path) -> None:
+def test_orders_and_refusals(runtime_dir: Path) -> None:
     session = Session()
-    surveys = surveys_of(folder)
+    surveys = surveys_of(runtime_dir)
     done, text = surveys.ask("status", session)
     assert not done
     assert "no daemon in" in text
-    with serving(folder, "control", lambda request: status(state=request["cmd"])):
+    with serving(runtime_dir, "control", lambda request: status(state=request["cmd"])):
         assert surveys.ask("pause", session) == (True, "pause: pause")
         assert session.data["state"] == "pause"
-    with serving(folder, "control", lambda _: {"ok": False, "error": "nothing is paused"}):
+    with serving(runtime_dir, "control", lambda _: {"ok": False, "error": "nothing is paused"}):
         assert surveys.ask("resume") == (False, "resume refused: nothing is paused")
 
 
-def test_the_monitor_publishes_until_it_is_stopped(folder: Path) -> None:
+def test_the_monitor_publishes_until_it_is_stopped(runtime_dir: Path) -> None:
     session = Session()
     blocks: list[dict[str, Any]] = []
 
@@ -130,20 +122,20 @@ def test_the_monitor_publishes_until_it_is_stopped(folder: Path) -> None:
         if len(blocks) >= 3:
             session.status = "stopping"
 
-    with serving(folder, "control", lambda _: status(done=5)):
-        assert surveys_of(folder).monitor(session, publish, 0.01) == (True, "monitoring ended")
+    with serving(runtime_dir, "control", lambda _: status(done=5)):
+        assert surveys_of(runtime_dir).monitor(session, publish, 0.01) == (True, "monitoring ended")
     assert [block["block_name"] for block in blocks] == ["daemon", "survey", "daemon", "survey"]
     assert blocks[0]["data"] == {"running": 1}
     assert blocks[1]["data"]["done"] == 5
     assert all(isinstance(value, int | float | str) for value in blocks[1]["data"].values())
     session.status, blocks[:] = "running", []
-    surveys_of(folder / "none").monitor(session, publish, 0.01)
+    surveys_of(runtime_dir / "none").monitor(session, publish, 0.01)
     assert [block["data"] for block in blocks] == [{"running": 0}] * 3
 
 
-def test_what_the_agent_offers(folder: Path) -> None:
+def test_what_the_agent_offers(runtime_dir: Path) -> None:
     agent, session = MagicMock(), Session()
-    register(agent, surveys_of(folder, "raise SystemExit(0)"), lambda *_, **__: lambda function: function, 0.01)
+    register(agent, surveys_of(runtime_dir, "raise SystemExit(0)"), lambda *_, **__: lambda function: function, 0.01)
     processes = {call.args[0]: call.args[1:] for call in agent.register_process.call_args_list}
     tasks = {call.args[0]: call.args[1] for call in agent.register_task.call_args_list}
     assert processes.keys() == {"survey", "monitor"}

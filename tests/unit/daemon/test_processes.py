@@ -171,10 +171,7 @@ def test_any_free_port_a_port_in_use_and_no_page(config: Config) -> None:
     assert (none.socket, none.text) == (None, "")
     with socket.create_server(("127.0.0.1", 0)) as other:
         taken = other.getsockname()[1]
-        for port, level, before in (
-            (0, "info", ""),
-            (taken, "warning", f"port {taken} is in use, so it is at "),
-        ):
+        for port, level, before in ((0, "info", ""), (taken, "warning", f"port {taken} is in use, so it is at ")):
             page = open_page_socket(config.dashboard.model_copy(update={"port": port}))
             assert page.socket is not None
             with page.socket:

@@ -153,10 +153,7 @@ def serve(lag: LatenessStatistics, late_s: dict[int, float], frames: int = 100, 
     return [lag.add(0.01 * k, 500.0 + (1.0 + drift) * 0.01 * k + 0.003 + late_s.get(k, 0.0)) for k in range(frames)]
 
 
-@pytest.mark.parametrize(
-    ("late_s", "slips"),
-    [({}, 0), ({20: 0.3, 21: 0.29, 22: 0.28, 40: 0.019, 60: 0.021}, 4)],
-)
+@pytest.mark.parametrize(("late_s", "slips"), [({}, 0), ({20: 0.3, 21: 0.29, 22: 0.28, 40: 0.019, 60: 0.021}, 4)])
 def test_late_frames_are_as_late_as_they_are_and_slips_are_counted(late_s: dict[int, float], slips: int) -> None:
     lag = LatenessStatistics(0.02)
     assert serve(lag, late_s) == pytest.approx([late_s.get(k, 0.0) for k in range(100)], abs=1e-4)

@@ -144,10 +144,7 @@ def test_a_service_from_its_start_to_its_end(manager: Manager) -> None:
     ("watchdog_s", "told"),
     [
         # Silence counts well before a short watchdog bites.
-        (
-            0.4,
-            ["WATCHDOG=1", "STATUS=joined the robot", "STATUS=trouble: main sent its last heartbeat 0.3 s ago"],
-        ),
+        (0.4, ["WATCHDOG=1", "STATUS=joined the robot", "STATUS=trouble: main sent its last heartbeat 0.3 s ago"]),
         (None, ["STATUS=joined the robot"]),
     ],
 )

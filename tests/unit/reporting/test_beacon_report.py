@@ -19,7 +19,7 @@ from ccatp.report.plots import NARROW, PX_PER_IN, WIDE, ellipse_outline
 from ccatp.report.run_page import beacon_data, beacon_drawings, beacon_page
 from tests.support.command import answered
 from tests.unit.reporting.beacon_recorded import FRAMES, OFF_M, SIGMA_M, beacon_config, record_beacons
-from tests.unit.reporting.markup import Markup
+from tests.unit.reporting.conftest import Markup
 
 ALL = ["map", "waypoints", "localization", "consistency", "events", "configuration"]
 

@@ -19,7 +19,7 @@ from ccatp.report.html import POLICY, ReportError, clock_text, environment, even
 from ccatp.report.record import read_record
 from ccatp.report.run_page import report_run, run_page
 from tests.support.command import answered, refused
-from tests.unit.reporting.markup import Markup
+from tests.unit.reporting.conftest import Markup
 from tests.unit.reporting.recorded import record
 
 ALL = ["map", "points", "surface", "panels", "time", "localization", "events", "configuration"]

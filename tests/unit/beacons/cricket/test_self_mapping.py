@@ -16,12 +16,7 @@ from ccatp.beacons.cricket.range_network import (
     range_sigma,
     sound_speed,
 )
-from ccatp.beacons.cricket.self_mapping import (
-    MoteMapper,
-    complete_stands,
-    network_plan,
-    run_phase_two,
-)
+from ccatp.beacons.cricket.self_mapping import MoteMapper, complete_stands, network_plan, run_phase_two
 from ccatp.config.beacon_models import AirConfig, PhaseTwoConfig
 from ccatp.config.load import load_radio_config
 from ccatp.sim.motes import true_motes

@@ -7,15 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.linalg import LinAlgError
 
-from ccatp.beacons.slam.batch_problem import (
-    BEACON,
-    CALIBRATION,
-    SHARED,
-    BatchProblem,
-    BatchState,
-    Reckoning,
-    repeats,
-)
+from ccatp.beacons.slam.batch_problem import BEACON, CALIBRATION, SHARED, BatchProblem, BatchState, Reckoning, repeats
 from ccatp.beacons.slam.batch_smoother import Factored, smooth, t_cost, t_weights
 from ccatp.beacons.slam.evaluation import judge
 from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun, Steps, dead_reckoned

@@ -8,16 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from ccatp.beacons.slam.evaluation import judge, truth_at
 from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, ReferencePath
-from ccatp.filters.metrics import (
-    RigidMotion,
-    aligned_rms_m,
-    best_motion,
-    consistency,
-    nees,
-    rigid_modes,
-    rms,
-    wrapped,
-)
+from ccatp.filters.metrics import RigidMotion, aligned_rms_m, best_motion, consistency, nees, rigid_modes, rms, wrapped
 from tests.unit.beacons.datasets.sets import BEACONS, recorded, world
 
 
