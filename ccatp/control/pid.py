@@ -3,10 +3,13 @@
 from math import copysign, exp, sqrt
 from typing import NamedTuple
 
+import msgspec
+from msgspec.structs import replace
+
 from ccatp.config.models import ControlConfig, PidConfig
 
 
-class PidState(NamedTuple):
+class PidState(msgspec.Struct, frozen=True):
     """Memory of a PID between two steps."""
 
     integral: float = 0.0
@@ -32,7 +35,7 @@ class Pid:
         """The next memory, and the output within its limit, ``dt_s`` > 0 after the last step."""
         if dt_s <= 0.0:
             raise ValueError(f"dt of a control step must be positive, got {dt_s} s")
-        integral, derivative, last_error = memory
+        integral, derivative, last_error = memory.integral, memory.derivative, memory.last_error
         if self._kd and last_error is not None:
             slope = (error - last_error) / dt_s
             keep = exp(-dt_s / self._filter_s) if self._filter_s > 0.0 else 0.0
@@ -111,7 +114,7 @@ def clamped(value: float, limit: float) -> float:
 FEEDBACK_SHARE = 0.25
 
 
-class AxisState(NamedTuple):
+class AxisState(msgspec.Struct, frozen=True):
     """Progress of a motion.
 
     ``planned``: position and speed of the plan now; ``slip``: the share by which the wheels travel further than the
@@ -150,7 +153,7 @@ class BareAxis:
     def step(self, motion: AxisState, remaining: float, dt_s: float, _speed: float | None) -> tuple[AxisState, float]:
         """The PID's output."""
         pid, output = self._pid.step(motion.pid, remaining, dt_s)
-        return motion._replace(pid=pid), output
+        return replace(motion, pid=pid), output
 
 
 class ProfiledAxis:
@@ -194,13 +197,12 @@ class ProfiledAxis:
 
     def step(self, motion: AxisState, remaining: float, dt_s: float, speed: float | None) -> tuple[AxisState, float]:
         """The motion ``dt_s`` later, and its set point until then, in the unit of the quantity per s."""
-        duration_s, profile, t_s, (position, now), slip, pid = motion
-        t_s += dt_s
+        profile, (position, now), t_s = motion.profile, motion.planned, motion.t_s + dt_s
         planned = profile.at(t_s)
         error = remaining - (profile.distance - position)
         feedback = clamped(self._kp * error, self._feedback_limit)
-        slip = clamped(slip + self._slip_gain * feedback * now * dt_s, self._slip_limit)
+        slip = clamped(motion.slip + self._slip_gain * feedback * now * dt_s, self._slip_limit)
         if speed is not None:
             feedback += self._kd * (now - speed)
         set_point = (1.0 + slip) * lag_feed_forward(now, planned[1], dt_s, self._lag_s) + feedback
-        return AxisState(duration_s, profile, t_s, planned, slip, pid), set_point
+        return AxisState(motion.duration_s, profile, t_s, planned, slip), set_point

@@ -3,7 +3,9 @@
 from collections import deque
 from enum import StrEnum
 from math import asin, atan2, cos, exp, hypot, pi, sin, sqrt
-from typing import NamedTuple
+
+import msgspec
+from msgspec.structs import replace
 
 from ccatp.config.models import ControlConfig, GainsConfig, LimitsConfig
 from ccatp.control.pid import AxisState, BareAxis, Pid, PidState, ProfiledAxis, clamped
@@ -13,7 +15,7 @@ from ccatp.core import Predicted, Twist, wrap_pi
 CREEP_LIMIT = 0.3
 
 
-class LegView(NamedTuple):
+class LegView(msgspec.Struct, frozen=True):
     """The line as seen from the robot.
 
     ``beside_m``: how far the robot stands to the left of it; ``gain``: progress along it per metre that the wheels
@@ -26,7 +28,7 @@ class LegView(NamedTuple):
     gain: float
 
 
-class LegLine(NamedTuple):
+class LegLine(msgspec.Struct, frozen=True):
     """The straight line through the stop along which a leg is driven, held by its course alone.
 
     So it passes through the stop wherever an update moves that. A stop whose coordinates change is one seen in another
@@ -71,7 +73,7 @@ class LegLine(NamedTuple):
             is_far = dx * dx + dy * dy > lookahead_m * lookahead_m
             angle = crab(self.course_rad, creep)
             line = LegLine.lay(target, atan2(dy, dx) if is_far else wrap_pi(motion - angle - self.off_rad))
-        _, course_rad, c, s, _ = line
+        course_rad, c, s = line.course_rad, line.cos, line.sin
         creep_x, creep_y = creep
         angle = -asin(clamped(c * creep_y - s * creep_x, CREEP_LIMIT))
         off = wrap_pi(motion - course_rad - angle)
@@ -120,7 +122,7 @@ class LegPhase(StrEnum):
 TURN, DRIVE, DONE = LegPhase
 
 
-class LegMotion(NamedTuple):
+class LegMotion(msgspec.Struct, frozen=True):
     """Progress of a leg or of a turn in place, as ``LegTracker`` makes it.
 
     ``axis``: the turn or the way along the line, by ``phase``; ``aim``: stop and heading for which a turn began.
@@ -202,9 +204,9 @@ class LegTracker:
         """One step of a turn in place; ``phase`` becomes DONE when it is over."""
         angular = self._paces[motion.is_slow].angular
         if angular.is_over(motion.axis, remaining_rad, self._heading_tolerance_rad, rate_rad_s):
-            return motion._replace(phase=DONE), STILL
+            return replace(motion, phase=DONE), STILL
         axis, rate = angular.step(motion.axis, remaining_rad, dt_s, rate_rad_s)
-        return motion._replace(axis=axis), Twist(0.0, rate)
+        return replace(motion, axis=axis), Twist(0.0, rate)
 
     def step(
         self,
@@ -222,11 +224,11 @@ class LegTracker:
             if motion.axis.is_overtime:
                 motion, has_run_away = self._look_at_bearing(motion, pose, target, angle)
                 if has_run_away:
-                    return motion._replace(phase=DONE), STILL
+                    return replace(motion, phase=DONE), STILL
             angular = self._paces[motion.is_slow].angular
             if not angular.is_over(motion.axis, angle, self._heading_tolerance_rad, rate_rad_s):
                 axis, rate = angular.step(motion.axis, angle, dt_s, rate_rad_s)
-                return motion._replace(axis=axis), Twist(0.0, rate)
+                return replace(motion, axis=axis), Twist(0.0, rate)
             motion = self._begin_drive(pose, target, motion.reverse, motion.is_slow)
         if motion.phase is DONE:
             return motion, STILL
@@ -253,7 +255,7 @@ class LegTracker:
             return motion, False
         aimed_at, heading_rad = motion.aim
         if target != aimed_at:
-            return motion._replace(aim=(target, pose[2] + angle_rad)), False
+            return replace(motion, aim=(target, pose[2] + angle_rad)), False
         return motion, abs(wrap_pi(pose[2] + angle_rad - heading_rad)) > REALIGN_RAD
 
     def _begin_drive(
@@ -283,8 +285,10 @@ class LegTracker:
         creep: tuple[float, float],
     ) -> tuple[LegMotion, Twist]:
         control, pace = self._control, self._paces[motion.is_slow]
-        _, is_slow, reverse, axis, line, aim, steering = motion
-        line, view = (line or LegLine.through(pose, target)).look(pose, target, creep, reverse, control.lookahead_m)
+        reverse, axis = motion.reverse, motion.axis
+        line, view = (motion.line or LegLine.through(pose, target)).look(
+            pose, target, creep, reverse, control.lookahead_m
+        )
         sign = -1.0 if reverse else 1.0
         ahead_m, gain = view.ahead_m, view.gain
         speed = None if speeds is None else sign * speeds.v_m_s * gain
@@ -292,14 +296,14 @@ class LegTracker:
             axis = pace.along.renewed_if_far(axis, ahead_m)
             is_late = axis.t_s - axis.duration_s >= control.stop_time_s
             if pace.along.is_over(axis, ahead_m, control.stop_tolerance_m, speed) or is_late:
-                return motion._replace(phase=DONE), STILL
+                return replace(motion, phase=DONE), STILL
         planned = axis.planned[1]
         axis, wanted = pace.along.step(axis, ahead_m, dt_s, speed)
         wanted /= gain
         rate = line_rate(view, planned, control.cross_track_gain_rad_m2, control.heading_weight_1_s2)
         if speeds is not None:
             rate += self._steering_damping * (rate - speeds.omega_rad_s)
-        next_motion = LegMotion(DRIVE, is_slow, reverse, axis, line, aim, steering)
+        next_motion = LegMotion(DRIVE, motion.is_slow, reverse, axis, line)
         return next_motion, Twist(sign * wanted, clamped(rate, pace.omega_max))
 
     def _head_on(
@@ -315,13 +319,14 @@ class LegTracker:
         remaining = hypot(ahead, left)
         pace = self._paces[motion.is_slow]
         if pace.forward.is_over(motion.axis, remaining, self._position_tolerance_m, None):
-            return motion._replace(phase=DONE), STILL
+            return replace(motion, phase=DONE), STILL
         error = atan2(left, ahead)
         if abs(error) > REALIGN_RAD:
             return self._begin_alignment(pose, target, error, motion.reverse, motion.is_slow), STILL
         axis, speed = pace.forward.step(motion.axis, remaining, dt_s, None)
         steering, rate = pace.steering.step(motion.steering, error, dt_s)
-        return motion._replace(axis=axis, steering=steering), Twist(-speed if motion.reverse else speed, rate)
+        speed = -speed if motion.reverse else speed
+        return replace(motion, axis=axis, steering=steering), Twist(speed, rate)
 
 
 Pose = tuple[float, float, float]

@@ -5,9 +5,9 @@
 
 from enum import StrEnum
 from math import copysign, hypot
-from typing import NamedTuple
 
 import msgspec
+from msgspec.structs import replace
 
 from ccatp.config.models import ControlConfig, MissionConfig
 from ccatp.control.tracker import LegMotion, LegPhase, LegTracker
@@ -43,7 +43,7 @@ class MissionCommand(msgspec.Struct, frozen=True):
 HOLD_POSITION = MissionCommand(STILL)
 
 
-class Standstill(NamedTuple):
+class Standstill(msgspec.Struct, frozen=True):
     """At rest: both speeds, or both of their running means, have been below the limits for the settling time.
 
     Fans shake the body with a mean of zero; wheels that run down, or that creep, move the mean as well.
@@ -57,7 +57,7 @@ class Standstill(NamedTuple):
     def update(self, cfg: ControlConfig, motion: StateEstimate) -> "Standstill":
         """Take the speeds of a frame."""
         t_s, dt_s, speed_m_s, rate_rad_s = motion.t_s, motion.dt_s, motion.speed_m_s, motion.rate_rad_s
-        _, since_s, mean_m_s, mean_rad_s = self
+        since_s, mean_m_s, mean_rad_s = self.since_s, self.mean_speed_m_s, self.mean_rate_rad_s
         if mean_m_s is None:
             mean_m_s, mean_rad_s = speed_m_s, rate_rad_s
         share = dt_s / (cfg.settle_mean_time_s + dt_s)
@@ -72,7 +72,7 @@ class Standstill(NamedTuple):
         return Standstill(t_s - since_s >= cfg.settle_time_s - TIME_EPSILON_S, since_s, mean_m_s, mean_rad_s)
 
 
-class Settling(NamedTuple):
+class Settling(msgspec.Struct, frozen=True):
     """From the end of a leg to the request for a measurement, after standing for the measuring time.
 
     ``rest_by_s``: coming to rest, or standing still for the measurement, takes no longer; ``measure_at_s``: the
@@ -90,7 +90,7 @@ class Settling(NamedTuple):
         """One frame of coming to rest; over when ``standstill.is_rest``, and the measuring time begins."""
         standstill = self.standstill.update(cfg, motion)
         rest_by_s = motion.t_s + SETTLE_LIMIT_S if self.rest_by_s is None else self.rest_by_s
-        settling = self._replace(standstill=standstill, rest_by_s=rest_by_s)
+        settling = replace(self, standstill=standstill, rest_by_s=rest_by_s)
         return settling._timed(motion.t_s, measuring_time_s) if standstill.is_rest else settling
 
     def measure(self, cfg: ControlConfig, measuring_time_s: float, motion: StateEstimate) -> "tuple[Settling, bool]":
@@ -99,26 +99,26 @@ class Settling(NamedTuple):
         Motion spoils the measurement, also one in progress: the time begins again, and what was asked for is dropped.
         """
         t_s = motion.t_s
-        settling = self._replace(standstill=self.standstill.update(cfg, motion))
+        settling = replace(self, standstill=self.standstill.update(cfg, motion))
         if settling.is_repeated:
-            settling = settling._replace(is_repeated=False)._timed(t_s, measuring_time_s)
+            settling = replace(settling, is_repeated=False)._timed(t_s, measuring_time_s)
         if not settling.standstill.is_rest:
             if settling.is_requested:
-                settling = settling._replace(is_requested=False)._timed(t_s, measuring_time_s)
-            settling = settling._replace(measure_at_s=t_s + measuring_time_s - TIME_EPSILON_S)
+                settling = replace(settling, is_requested=False)._timed(t_s, measuring_time_s)
+            settling = replace(settling, measure_at_s=t_s + measuring_time_s - TIME_EPSILON_S)
         if settling.is_requested or t_s < settling.measure_at_s:
             return settling, False
-        return settling._replace(rest_by_s=None, is_requested=True), True
+        return replace(settling, rest_by_s=None, is_requested=True), True
 
     def _timed(self, t_s: float, measuring_time_s: float) -> "Settling":
-        return self._replace(measure_at_s=t_s + measuring_time_s - TIME_EPSILON_S, rest_by_s=t_s + SETTLE_LIMIT_S)
+        return replace(self, measure_at_s=t_s + measuring_time_s - TIME_EPSILON_S, rest_by_s=t_s + SETTLE_LIMIT_S)
 
     def is_overdue(self, t_s: float) -> bool:
         """Coming to rest, or standing still for a measurement, takes far longer than it should."""
         return self.rest_by_s is not None and t_s > self.rest_by_s
 
 
-class ReturnHome(NamedTuple):
+class ReturnHome(msgspec.Struct, frozen=True):
     """The way along ``stops`` to base, the last; ``stop_index`` is behind that once the robot stands there."""
 
     stops: tuple[Stop, ...]
@@ -134,31 +134,31 @@ class ReturnHome(NamedTuple):
 
     def interrupted(self) -> "ReturnHome":
         """The leg begins again, from wherever the robot is then."""
-        return self._replace(leg=None, is_docking=False)
+        return replace(self, leg=None, is_docking=False)
 
     def update(
         self, follower: LegFollower, cfg: ControlConfig, motion: StateEstimate, *, is_slow: bool
     ) -> "tuple[ReturnHome, Twist]":
         """One frame of the way home: the twist until the next frame."""
-        home, stop = self._replace(standstill=self.standstill.update(cfg, motion)), self.stops[self.stop_index]
+        home, stop = replace(self, standstill=self.standstill.update(cfg, motion)), self.stops[self.stop_index]
         if home.is_docking and home.leg is not None:
             return home._dock(follower, home.leg, motion)
         leg, twist = follower.follow(home.leg or Leg(stop), motion, is_slow=is_slow)
         if not leg.is_done:
-            return home._replace(leg=leg), twist
+            return replace(home, leg=leg), twist
         if stop.kind is not StopKind.BASE:
-            return home._replace(stop_index=home.stop_index + 1, leg=None), STILL
+            return replace(home, stop_index=home.stop_index + 1, leg=None), STILL
         if stop.heading_rad is not None:
             leg = follower.begin_turn(leg, motion, stop.heading_rad, is_slow=is_slow)
-        return home._replace(leg=leg, is_docking=True), STILL
+        return replace(home, leg=leg, is_docking=True), STILL
 
     def _dock(self, follower: LegFollower, leg: Leg, motion: StateEstimate) -> "tuple[ReturnHome, Twist]":
         heading_rad, tracked = leg.stop.heading_rad, leg.motion
         if heading_rad is not None and tracked is not None and tracked.phase is LegPhase.TURN:
             leg, twist = follower.turn(leg, tracked, motion, heading_rad)
-            return self._replace(leg=leg), twist
+            return replace(self, leg=leg), twist
         if self.standstill.is_rest:
-            return self._replace(stop_index=self.stop_index + 1, leg=None), STILL
+            return replace(self, stop_index=self.stop_index + 1, leg=None), STILL
         return self, STILL
 
 
@@ -178,7 +178,7 @@ class RetreatStep(StrEnum):
     STUCK = "stuck"
 
 
-class Retreat(NamedTuple):
+class Retreat(msgspec.Struct, frozen=True):
     """One back-off along the track just driven, then a turn away from the side that hung over.
 
     A robot that met the edge backwards faces away from it, and does not turn.
@@ -235,7 +235,7 @@ class Retreat(NamedTuple):
             turned_rad += abs(difference(pose.heading_rad, last.heading_rad))
         if time_s > TIME_LIMIT_S and step is not RetreatStep.OVER:
             step = RetreatStep.STUCK
-        now = self._replace(last=pose, travel_m=travel_m, turned_rad=turned_rad, time_s=time_s, step=step)
+        now = replace(self, last=pose, travel_m=travel_m, turned_rad=turned_rad, time_s=time_s, step=step)
         if not (verdict.forward or verdict.reverse or verdict.turn):
             return now, STILL  # data are missing, which passes by itself
         is_clear = verdict.code is not EventCode.NEAR_EDGE
@@ -249,7 +249,7 @@ class Retreat(NamedTuple):
 
     def at(self, step: RetreatStep) -> "Retreat":
         """The same at another step."""
-        return self._replace(step=step)
+        return replace(self, step=step)
 
     def _back(self, cfg: MissionConfig, is_clear: bool, verdict: Verdict) -> "tuple[Retreat, Twist]":
         if self.travel_m >= cfg.backoff_m or (is_clear and self.travel_m >= 0.5 * cfg.backoff_m):
@@ -272,7 +272,7 @@ class Retreat(NamedTuple):
             # The turn sweeps a corner off the panels. Off the rim, back; off what may be a seam, the fix tells.
             step = RetreatStep.UNTURN if verdict.cause.startswith(Cause.RIM) else RetreatStep.OVER
             unturn = -copysign(1.0, self.away_rad)
-            return self._replace(step=step, has_turned_away=True, unturn=unturn, turned_rad=0.0), STILL
+            return replace(self, step=step, has_turned_away=True, unturn=unturn, turned_rad=0.0), STILL
         turn, goal_rad = self.turn, self.goal_rad
         if turn is None:
             goal_rad = motion.pose.heading_rad + self.away_rad
@@ -281,4 +281,4 @@ class Retreat(NamedTuple):
         remaining = difference(goal_rad, state.pose[2])
         turn, twist = tracker.step_turn(turn, remaining, motion.dt_s, state.omega_rad_s)
         step = RetreatStep.OVER if turn.phase is LegPhase.DONE else RetreatStep.TURN_AWAY
-        return self._replace(turn=turn, goal_rad=goal_rad, step=step), twist
+        return replace(self, turn=turn, goal_rad=goal_rad, step=step), twist

@@ -4,7 +4,9 @@ from collections.abc import Callable
 from math import atan2, ceil, cos, hypot, pi, sin
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from ccatp.config.models import ControlConfig, HealthConfig, LimitsConfig, MissionConfig, RobotConfig
 from ccatp.control.tracker import DONE, LegMotion, LegTracker
@@ -100,7 +102,7 @@ class Corrector:
         return bool(depths.min() >= body.turn_clearance_m)
 
 
-class StateEstimate(NamedTuple):
+class StateEstimate(msgspec.Struct, frozen=True):
     """What the localizer says about the present frame.
 
     ``creep`` is the drift (dx, dy) per metre of travel in the plane of ``pose``. ``ahead`` is where the robot will be,
@@ -139,7 +141,7 @@ class StateEstimate(NamedTuple):
         return self.deck_of(self.pose)
 
 
-class Leg(NamedTuple):
+class Leg(msgspec.Struct, frozen=True):
     """The leg to a stop, as far as it is driven.
 
     ``motion`` is None before the first frame of the leg; ``aim``: the leg is a correction, as long as the robot stays
@@ -171,7 +173,7 @@ class LegFollower:
     def follow(self, leg: Leg, motion: StateEstimate, *, is_slow: bool) -> tuple[Leg, Twist]:
         """One frame of a leg: what it is then, and the twist until the next frame."""
         steered, panel, tracker = motion.steered, motion.pose.panel, self._tracker
-        stop, tracked, deadline_s, aim, cached = leg
+        stop, tracked, deadline_s, aim, cached = leg.stop, leg.motion, leg.deadline_s, leg.aim, leg.target
         if cached is None or cached[0] != panel:
             cached = panel, self.target_in(panel, stop)
         target, reverse = cached[1], stop.reverse
@@ -190,13 +192,13 @@ class LegFollower:
     def begin_turn(self, leg: Leg, motion: StateEstimate, heading_rad: float, *, is_slow: bool) -> Leg:
         """Begin the turn to a heading on the deck, at the end of a leg."""
         tracked = self._tracker.begin_turn(difference(heading_rad, motion.deck.heading_rad), is_slow=is_slow)
-        return leg._replace(motion=tracked, deadline_s=self.deadline_s(motion.t_s, tracked))
+        return replace(leg, motion=tracked, deadline_s=self.deadline_s(motion.t_s, tracked))
 
     def turn(self, leg: Leg, tracked: LegMotion, motion: StateEstimate, heading_rad: float) -> tuple[Leg, Twist]:
         """One frame of that turn."""
         remaining = difference(heading_rad, motion.deck.heading_rad + motion.lead_rad)
         tracked, twist = self._tracker.step_turn(tracked, remaining, motion.dt_s, motion.steered.omega_rad_s)
-        return leg._replace(motion=tracked), twist
+        return replace(leg, motion=tracked), twist
 
     def deadline_s(self, t_s: float, tracked: LegMotion) -> float:
         """When a motion that begins now is overdue."""

@@ -111,7 +111,8 @@ class Survey:
         """One frame: react to the verdict in force (``None``: none fresh enough), then do what the mode says."""
         if self._is_steered_bare:
             control = self.cfg.control
-            motion = motion._replace(
+            motion = replace(
+                motion,
                 creep=motion.creep if control.compensates_creep else (0.0, 0.0),
                 ahead=motion.ahead if control.predicts_delay else None,
             )
@@ -471,7 +472,7 @@ class Survey:
             if failures >= limit:
                 return self.fault(s, f"the robot cannot be found again: {cause}")
             if isinstance(s.behaviour, Settling):  # it may not have stood quite still, and cannot do without
-                s = replace(s, behaviour=s.behaviour._replace(is_requested=False, is_repeated=True))
+                s = replace(s, behaviour=replace(s.behaviour, is_requested=False, is_repeated=True))
             return s
         s = replace(s, failure_causes={**s.failure_causes, point: cause}, due=_without(s.due, point))
         if failures >= limit:

@@ -5,6 +5,7 @@ from math import cos, hypot, pi, sin
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
@@ -96,7 +97,7 @@ def test_who_never_rests_is_restless_after_the_limit(settling: Standing, mirror:
 def first_rest(config: Config, mirror: Mirror, speeds: Iterable[float], rates: Iterable[float]) -> int | None:
     standstill = Standstill()
     for k, (v, omega) in enumerate(zip(speeds, rates, strict=False)):
-        standstill = standstill.update(config.control, at(mirror, k, v)._replace(rate_rad_s=omega))
+        standstill = standstill.update(config.control, replace(at(mirror, k, v), rate_rad_s=omega))
         if standstill.is_rest:
             return k
     return None

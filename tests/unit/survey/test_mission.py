@@ -422,7 +422,7 @@ def test_the_robot_is_steered_by_where_it_will_be_and_judged_by_where_it_is(stor
     x, y, heading = now.steered.pose
     assert (x, y, heading) == (story.x, story.y, story.heading)
     aside = Predicted((x - 0.002 * sin(heading), y + 0.002 * cos(heading), heading + 0.05), story.v, story.omega)
-    seen = now._replace(ahead=aside)
+    seen = replace(now, ahead=aside)
     assert seen.lead_rad == pytest.approx(0.05)
     assert story.mission.step(seen, FREE).twist.omega_rad_s < -0.1  # it will be left of its line and heading off it
 
@@ -436,9 +436,9 @@ def test_what_is_switched_off_does_not_steer(config: Config, mirror: Mirror, key
     x, y, heading = now.steered.pose
     ahead = Predicted((x, y, heading + 0.05), story.v, story.omega)
     used = (
-        now._replace(ahead=ahead)
+        replace(now, ahead=ahead)
         if key == "predicts_delay"
-        else now._replace(creep=(-0.1 * sin(heading), 0.1 * cos(heading)))
+        else replace(now, creep=(-0.1 * sin(heading), 0.1 * cos(heading)))
     )
     with_it, without = (Story(config, mirror), story)
     with_it.until(lambda: with_it.mission.state.mode is MissionState.DRIVING and with_it.v > 0.09)
