@@ -10,7 +10,7 @@ sensors alone. The rim over which the robot falls stays the ideal one.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain, pairwise, repeat
 from math import exp, hypot, inf, pi
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -26,7 +26,6 @@ _SAME_RATIO = 1e-9  # rates this near to a whole ratio are meant to be one
 _BLOCK_FRAMES = 512  # instants are computed ahead for so many frames
 _PER_UNIT = 1e7  # resolution of rates in rad/s: far below every noise, short on the wire
 
-Instants = tuple[list[float], list[float], list[float]]
 WheelTuple = tuple[float, float, float]
 ImuTuple = tuple[float, float, float]
 GravityTuple = tuple[float, float, float, float]
@@ -46,52 +45,45 @@ _Line = tuple[int, float, float, float, float]
 _Row = TypeVar("_Row", ImuSample, WheelSample, EdgeSample)
 
 
-class SampleTimes:
-    """Instants ``n / hz`` that fall into the frames ``((k-1)/frame_hz, k/frame_hz]``.
+class SampleTimes(NamedTuple):
+    """Instants of a sensor in one frame.
 
     Attributes:
-        times_s: the instants of the frame entered last.
-        fractions: the same, as fractions of the frame, in (0, 1].
-        decays: ``exp(-tau/lag_s)`` of the wheel servo at the same instants, tau counted from the start of the frame.
+        fractions: the instants as fractions of the frame, in (0, 1].
+        decays: ``exp(-tau/lag_s)`` of the wheel servo at the instants, tau counted from the start of the frame.
     """
 
-    def __init__(self, hz: float, frame_hz: float, lag_s: float) -> None:
-        self._hz, self._frame_hz, self._lag_s = hz, frame_hz, lag_s
-        ratio = hz / frame_hz
-        self._count = round(ratio) if abs(ratio - round(ratio)) < _SAME_RATIO * ratio else 0
-        self._ahead: list[Instants] = []
-        self._ahead_from = 0
-        self.times_s: list[float] = []
-        self.fractions: list[float] = []
-        self.decays: list[float] = []
+    times_s: list[float]
+    fractions: list[float]
+    decays: list[float]
 
-    def enter(self, frame: int) -> None:
-        """Go on to a frame; frame 0 is the single instant of boot."""
-        at = frame - self._ahead_from
-        if not 0 <= at < len(self._ahead):
-            self._ahead, self._ahead_from, at = self._look_ahead(frame), frame, 0
-        self.times_s, self.fractions, self.decays = self._ahead[at]
 
-    def _look_ahead(self, frame: int) -> list[Instants]:
-        if frame == 0:
-            return [([0.0], [1.0], [1.0])]
-        frames = np.arange(frame - 1, frame + _BLOCK_FRAMES)
-        lasts = np.floor(frames * (self._hz / self._frame_hz) + _SAME_RATIO).astype(np.int64)
-        times_s = np.arange(lasts[0] + 1, lasts[-1] + 1) / self._hz
-        if self._count:  # the same number of instants in every frame, always at the same fractions of it
-            fractions = [(j + 1) / self._count for j in range(self._count)]
-            decays = self._decays(fractions)
-            return [(row, fractions, decays) for row in times_s.reshape(-1, self._count).tolist()]
-        found: list[Instants] = []
-        times, starts = times_s.tolist(), (lasts - lasts[0]).tolist()
-        for before, (start, end) in enumerate(pairwise(starts), frame - 1):
-            row = times[start:end]
-            fractions = [t * self._frame_hz - before for t in row]
-            found.append((row, fractions, self._decays(fractions)))
-        return found
+def sample_times(hz: float, frame_hz: float, lag_s: float, frame: int, count: int) -> list[SampleTimes]:
+    """Instants ``n / hz`` that fall into ``count`` frames ``((k-1)/frame_hz, k/frame_hz]`` from k = ``frame`` on.
 
-    def _decays(self, fractions: Sequence[float]) -> list[float]:
-        return [exp(-f / (self._frame_hz * self._lag_s)) for f in fractions]
+    Frame 0 is the single instant of boot, and is alone.
+    """
+    if frame == 0:
+        return [SampleTimes([0.0], [1.0], [1.0])]
+
+    def decays_at(fractions: Sequence[float]) -> list[float]:
+        return [exp(-f / (frame_hz * lag_s)) for f in fractions]
+
+    ratio = hz / frame_hz
+    lasts = np.floor(np.arange(frame - 1, frame + count) * ratio + _SAME_RATIO).astype(np.int64)
+    times_s = np.arange(lasts[0] + 1, lasts[-1] + 1) / hz
+    per_frame = round(ratio)
+    if abs(ratio - per_frame) < _SAME_RATIO * ratio:  # always at the same fractions of a frame
+        fractions = [(j + 1) / per_frame for j in range(per_frame)]
+        decays = decays_at(fractions)
+        return [SampleTimes(row, fractions, decays) for row in times_s.reshape(-1, per_frame).tolist()]
+    found: list[SampleTimes] = []
+    times, starts = times_s.tolist(), (lasts - lasts[0]).tolist()
+    for before, (start, end) in enumerate(pairwise(starts), frame - 1):
+        row = times[start:end]
+        fractions = [t * frame_hz - before for t in row]
+        found.append(SampleTimes(row, fractions, decays_at(fractions)))
+    return found
 
 
 class RateEncoders:
@@ -365,10 +357,10 @@ class SensorSuite:
         self._gravity_pose: DeckPose | None = None
         self._gravity = (0.0, 0.0, 0.0)
         self._gravity_sigma = sim.gravity_sigma_rad
-        rates_hz = sim.imu_hz, sim.encoder_hz, sim.edge_hz, sim.gravity_hz
-        times = {hz: SampleTimes(hz, sim.frame_hz, lag_s) for hz in rates_hz}
-        self._times = tuple(times.values())  # sensors of the same rate are read at the same instants
-        self._imu_times, self._encoder_times, self._edge_times, self._gravity_times = (times[hz] for hz in rates_hz)
+        self._rates_hz = sim.edge_hz, sim.imu_hz, sim.encoder_hz, sim.gravity_hz
+        self._frame_hz, self._lag_s = sim.frame_hz, lag_s
+        self._ahead: list[tuple[SampleTimes, ...]] = []  # of the sensors in the order of their rates, frame by frame
+        self._ahead_from = 0
         self._imu = InertialUnit(world, sim.imu_hz, imu, biases)
         self._encoders: CountingEncoders | RateEncoders
         if world.encoder_counts_per_rev:
@@ -387,16 +379,26 @@ class SensorSuite:
 
         Frames count from 1; frame 0 is the instant of boot. Once per frame, after the plant's step.
         """
-        for times in self._times:
-            times.enter(frame)
+        at = frame - self._ahead_from
+        if not 0 <= at < len(self._ahead):
+            self._look_ahead(frame)
+            at = 0
+        edge_times, imu_times, encoder_times, gravity_times = self._ahead[at]
         return (
-            self.edges.read(plant, self._edge_times.times_s, self._edge_times.fractions),
-            self._imu.read(plant, self._imu_times),
-            self._encoders.read(plant, self._encoder_times),
-            self._read_gravity(plant) if self._gravity_times.times_s else None,
+            self.edges.read(plant, edge_times.times_s, edge_times.fractions),
+            self._imu.read(plant, imu_times),
+            self._encoders.read(plant, encoder_times),
+            self._read_gravity(plant, gravity_times.times_s[-1]) if gravity_times.times_s else None,
         )
 
-    def _read_gravity(self, plant: Plant) -> GravityTuple:
+    def _look_ahead(self, frame: int) -> None:
+        rates_hz = self._rates_hz
+        # Sensors of the same rate are read at the same instants.
+        times = {hz: sample_times(hz, self._frame_hz, self._lag_s, frame, _BLOCK_FRAMES) for hz in set(rates_hz)}
+        self._ahead = list(zip(*(times[hz] for hz in rates_hz), strict=True))
+        self._ahead_from = frame
+
+    def _read_gravity(self, plant: Plant, t_s: float) -> GravityTuple:
         pose = plant.pose
         if pose != self._gravity_pose:
             self._gravity_pose, self._gravity = pose, self._gravity_at(pose)
@@ -405,7 +407,7 @@ class SensorSuite:
         x, y, z = x + sigma * noise(), y + sigma * noise(), z + sigma * noise()
         scale = unit / hypot(x, y, z)
         gx, gy, gz = ((component * scale + whole - whole) / unit for component in (x, y, z))
-        return self._gravity_times.times_s[-1], gx, gy, gz
+        return t_s, gx, gy, gz
 
     def _gravity_at(self, pose: DeckPose) -> Vector3:
         gx, gy, gz = self._gravity_on_deck

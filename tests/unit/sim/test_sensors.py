@@ -20,10 +20,10 @@ from ccatp.sim.sensors import (
     InertialUnit,
     RateEncoders,
     Rectangle,
-    SampleTimes,
     SensorSuite,
     draw_rectangles,
     nominal_rectangles,
+    sample_times,
 )
 
 OFFSETS = ((0.09, 0.09), (0.09, -0.09), (-0.09, 0.09), (-0.09, -0.09))
@@ -44,10 +44,8 @@ def suite(config: Config, mirror: Mirror, **rates: float) -> SensorSuite:
     ("hz", "frame_hz"), [(1000.0, 100.0), (100.0, 100.0), (20.0, 100.0), (333.0, 100.0), (50.0, 30.0), (7.3, 100.0)]
 )
 def test_every_instant_falls_into_exactly_one_frame(hz: float, frame_hz: float) -> None:
-    times = SampleTimes(hz, frame_hz, 0.08)
     found: list[float] = []
-    for frame in range(1, 301):
-        times.enter(frame)
+    for frame, times in enumerate(sample_times(hz, frame_hz, 0.08, 1, 300), start=1):
         for t, fraction, decay in zip(times.times_s, times.fractions, times.decays, strict=True):
             assert (frame - 1) / frame_hz < t + 1e-12  # times are rounded to the last bit
             assert t <= frame / frame_hz + 1e-12
@@ -253,11 +251,11 @@ def test_the_sum_of_the_rates_is_the_counted_angle(config: Config, mirror: Mirro
     world = world_of(config, encoder_counts_per_rev=COUNTS)
     plant, encoders = plant_on_deck(mirror), CountingEncoders(world, hz, DT_S, np.random.default_rng(2))
     phases = np.random.default_rng(2).random(2)
-    times = SampleTimes(hz, FRAME_HZ, LAG_S)
     sums, turned = np.zeros(2), 0.0
-    for frame, (right, left) in enumerate(orders(4000), start=1):
+    for frame, ((right, left), times) in enumerate(
+        zip(orders(4000), sample_times(hz, FRAME_HZ, LAG_S, 1, 4000), strict=True), start=1
+    ):
         plant.step((frame - 1) * DT_S, DT_S, right, left)
-        times.enter(frame)
         for _, *rates in encoders.read(plant, times):
             counts = np.array(rates) / hz / QUANTUM_RAD
             assert counts == pytest.approx(np.round(counts), abs=1e-9)  # whole counts but for rounding
@@ -277,13 +275,11 @@ def test_the_counted_angle_is_that_of_the_wheel_at_every_sample(config: Config, 
     """Against an integration of the servo's equation by many small steps."""
     world = world_of(config, encoder_counts_per_rev=100_000)
     plant, encoders = plant_on_deck(mirror), CountingEncoders(world, HZ, DT_S, np.random.default_rng(2))
-    times = SampleTimes(HZ, FRAME_HZ, LAG_S)
     rate = angle = counted = 0.0
     small = 1e-5
-    for frame in range(1, 21):
+    for frame, times in enumerate(sample_times(HZ, FRAME_HZ, LAG_S, 1, 20), start=1):
         set_point = 5.0 if frame <= 10 else -2.0
         plant.step((frame - 1) * DT_S, DT_S, set_point, 0.0)
-        times.enter(frame)
         for _, right, left in encoders.read(plant, times):
             assert left == 0.0
             for _ in range(100):
@@ -298,10 +294,8 @@ def test_noise_at_rest_is_that_in_motion(config: Config, mirror: Mirror) -> None
     """The short way for wheels that stand takes the same numbers of the stream."""
     still, moving = plant_on_deck(mirror), plant_on_deck(mirror)
     moving.step(0.0, DT_S, 1e-12, 1e-12)  # so slow that nothing of it is left after rounding
-    times = SampleTimes(HZ, FRAME_HZ, LAG_S)
     encoders = [RateEncoders(0.001, np.random.default_rng(2)) for _ in range(2)]
-    for frame in range(1, 700):  # more than two blocks of the stream
-        times.enter(frame)
+    for times in sample_times(HZ, FRAME_HZ, LAG_S, 1, 700):  # more than two blocks of the stream
         at_rest, in_motion = (e.read(plant, times) for e, plant in zip(encoders, (still, moving), strict=True))
         assert np.array(at_rest) == pytest.approx(np.array(in_motion), abs=1.5e-7)  # the last digit
 
@@ -320,22 +314,21 @@ OFF = dict.fromkeys((*BIASES, "accelerometer_sigma_m_s2", "gyroscope_sigma_rad_s
 
 
 @cache
-def turning_on(mirror: Mirror) -> tuple[Plant, SampleTimes]:
+def turning_on(mirror: Mirror) -> Plant:
     """A robot that turns at 0.8 rad/s; the same for all readings, which leave it as it is."""
     plant = plant_on_deck(mirror)
     plant.right_rad_s, plant.left_rad_s = 2.0, -2.0
     plant.step(0.0, DT_S, 2.0, -2.0)
-    return plant, SampleTimes(100.0, FRAME_HZ, LAG_S)
+    return plant
 
 
 def readings(config: Config, mirror: Mirror, seed: int, frames: int, **values: float) -> list[tuple[float, float]]:
     """(ax, wz) of a robot that turns at 0.8 rad/s."""
-    plant, times = turning_on(mirror)
+    plant = turning_on(mirror)
     noise, biases = np.random.default_rng(seed).spawn(2)
     unit = InertialUnit(world_of(config, **{**OFF, **values}), 100.0, noise, biases)
     found = []
-    for frame in range(1, frames + 1):
-        times.enter(frame)
+    for times in sample_times(100.0, FRAME_HZ, LAG_S, 1, frames):
         ((_, ax, wz),) = unit.read(plant, times)
         found.append((ax, wz))
     return found
