@@ -196,8 +196,7 @@ class DangerMonitor:
         if jump is not None and jump.seq == sensors.seq:
             board.jumped(t_s, jump.by_s)
         if known is not None:
-            episodes = self._edges.episodes
-            board.learn(known.t_s, known, self._edges.opened, [e is not None for e in episodes])
+            board.learn(known.t_s, known, self._edges.opened, self._edges.episodes)
         last = self.verdict
         is_permitted = last.forward and last.reverse and last.turn
         board.step(t_s, sensors, wheels, samples, is_permitted=is_permitted, is_any_off=not self._edges.is_idle)

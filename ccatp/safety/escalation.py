@@ -29,10 +29,11 @@ class FindingLatch:
             self.finding = finding
         self._seen_s = t_s
 
-    def settle(self, t_s: float) -> None:
-        """Let the finding go if its last evidence is long ago at ``t_s``."""
+    def settle(self, t_s: float) -> MonitorFinding | None:
+        """The finding, which is let go if its last evidence is long ago at ``t_s``."""
         if self.finding is not None and t_s - self._seen_s >= self._clear_s:
             self.finding = None
+        return self.finding
 
 
 class Since:

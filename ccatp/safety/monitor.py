@@ -84,16 +84,17 @@ class HealthMonitor:
 
     def jumped(self, t_s: float, by_s: float) -> None:
         """The robot's clock has jumped before the frame at ``t_s``."""
-        self._clock.see(t_s, CLOCK_JUMPED.found("clock", by_s, self._cfg.clock_jump_s))
+        finding = CLOCK_JUMPED.found("clock", by_s, self._cfg.clock_jump_s)
+        self._clock.see(t_s, finding)
         self._gate.reset()
-        self.findings = self._found()
+        self.findings = [finding]
 
     def garbled(self) -> MonitorFinding:
         """Too many lines that are no frames came since the last frame; what is found stays until frames come again."""
         lines = float(self._cfg.garbled_lines)
         finding = LINES_GARBLED.found("lines", lines, lines)
         self._garbled.see(self._t_s or 0.0, finding)
-        self.findings = self._found()
+        self.findings = [finding]
         return finding
 
     def step(
@@ -134,7 +135,7 @@ class HealthMonitor:
             self._judge(t_s, frame, wheels)
             if is_flickering:
                 self.flicker.step(t_s, edges, self._speed_m_s)
-            self.findings = self._found()
+            self.findings = self._found(t_s)
 
     def _judge(self, t_s: float, frame: Sensors, wheels: Sequence[WheelSample]) -> None:
         now = self._sums
@@ -155,11 +156,7 @@ class HealthMonitor:
             self._speed_m_s = max(abs(shortly.right_m), abs(shortly.left_m)) / shortly.t_s
         if turning is not None:
             self._yaw.step(t_s, turning)
-        self._yaw.alarm.settle(t_s)
         self._latency.step(t_s, frame.cmd.seq)
-        self._clock.settle(t_s)
-        self._gap.settle(t_s)
-        self._garbled.settle(t_s)
         faults = frame.faults
         if faults or self._own.alarms:
             self._own.step(t_s, faults)
@@ -199,7 +196,7 @@ class HealthMonitor:
         if estimate.commanded is not None:
             self._wheels.commands.push(t_s, estimate.commanded)
 
-    def learn(self, t_s: float, estimate: EstimateMessage, opened: Sequence[int], is_off: Sequence[bool]) -> None:
+    def learn(self, t_s: float, estimate: EstimateMessage, opened: Sequence[int], is_off: Sequence[object]) -> None:
         """Take a fresh estimate of main's; a repeated one changes nothing.
 
         ``opened``: how often each edge sensor went off.
@@ -219,10 +216,16 @@ class HealthMonitor:
         self.seams.step(t_s, (x, y, estimate.heading_rad), estimate.sigma_m)
         self._home_m = hypot(x - self._base.x_m, y - self._base.y_m)
 
-    def _found(self) -> list[MonitorFinding]:
-        found = [alarm.finding for alarm in self._alarms if alarm.finding is not None]
-        others = imu_finding(self._gate), self._rates.finding, self._battery.finding, self.seams.finding
-        found += [finding for finding in others if finding is not None]
+    def _found(self, t_s: float) -> list[MonitorFinding]:
+        found = []
+        for alarm in self._alarms:
+            if alarm.finding is not None and (finding := alarm.settle(t_s)) is not None:
+                found.append(finding)
+        for other in (self._rates.finding, self._battery.finding, self.seams.finding):
+            if other is not None:
+                found.append(other)
+        if self._gate.cause:
+            found.append(imu_finding(self._gate))
         if self._own.alarms:
             found += [alarm.finding for alarm in self._own.alarms.values() if alarm.finding is not None]
         return found

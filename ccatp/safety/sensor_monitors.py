@@ -80,8 +80,6 @@ class FlickerMonitor:
                 limit = self._cfg.chatter_transitions
                 self.chatter.see(t_s, EDGE_SENSOR_CHATTERS.found(_CORNERS[i], len(changes), limit))
         self._judge_flashes(t_s)
-        self.chatter.settle(t_s)
-        self.flash.settle(t_s)
 
     def _change(self, t_s: float, state: tuple[int, ...], *, is_still: bool) -> None:
         for i, (before, now) in enumerate(zip(self._last, state, strict=True)):
@@ -188,7 +186,6 @@ class LatencyMonitor:
                 self.alarm.see(t_s, DRIVES_TOO_LATE.found("latency", latency_s, cfg.latency_pause_s))
             elif latency_s > cfg.latency_slow_s:
                 self.alarm.see(t_s, DRIVES_LATE.found("latency", latency_s, cfg.latency_slow_s))
-        self.alarm.settle(t_s)
 
 
 class FramingErrorRate:
@@ -219,6 +216,7 @@ class SeamMonitor:
     def __init__(self, cfg: HealthConfig, mirror: Mirror, robot: RobotConfig, sigmas: float) -> None:
         self._cfg, self._mirror, self._sensors_m, self._sigmas = cfg, mirror, robot.edge_sensors_m, sigmas
         self._fastest_m_s = robot.wheel_radius_m * robot.max_wheel_rad_s
+        self._reach_m = max(hypot(*offset_m) for offset_m in robot.edge_sensors_m)
         self.missed = [0, 0, 0, 0]
         self.crossed = 0
         self._blind = FindingLatch(cfg.retry_after_s)
@@ -229,6 +227,7 @@ class SeamMonitor:
         self._panels: list[PanelId | None] = [None, None, None, None]
         self._seen = [False, False, False, False]
         self._pose: tuple[float, float, float, float] | None = None
+        self._inside_m = 0.0  # at least so far inside the edges of their panels are all sensors; 0: look again
 
     def went_off(self, sensor: int) -> None:
         """A sensor has gone off, or is off: it is not blind."""
@@ -243,20 +242,28 @@ class SeamMonitor:
         margin_m = self._cfg.seam_margin_m + self._sigmas * sigma_m
         if before is not None:
             reach_m = self._fastest_m_s * abs(t_s - before[0]) + self._cfg.seam_margin_m
-            if hypot(x - before[1], y - before[2]) > reach_m:
+            moved_m = hypot(x - before[1], y - before[2])
+            if moved_m > reach_m:
                 self._panels = [None, None, None, None]
-        for i, offset_m in enumerate(self._sensors_m):
-            panel = self._panel_under(self._mirror.body_offset(DeckPose(*pose), *offset_m), margin_m)
+            # Twice what they can have moved: the axes of the robot in the deck plane change with the slope, too.
+            self._inside_m -= 2.0 * (moved_m + self._reach_m * abs(heading - before[3]))
+            if margin_m < self._inside_m and moved_m <= reach_m:
+                return
+        least_m = inf
+        hx, hy, lx, ly = self._mirror.body_axes(DeckPose(x, y, heading))
+        for i, (ox, oy) in enumerate(self._sensors_m):
+            found, inside_m = self._panel_under(x + ox * hx + oy * lx, y + ox * hy + oy * ly)
+            least_m = min(least_m, inside_m)
+            panel = found if inside_m > margin_m else None
             if panel is not None and panel != self._panels[i]:
                 self._enter(i, panel)
+        self._inside_m = least_m if least_m > margin_m else 0.0
 
-    def _panel_under(self, place: tuple[float, float], margin_m: float) -> PanelId | None:
-        x, y = place
+    def _panel_under(self, x: float, y: float) -> tuple[PanelId, float]:
+        """The panel nearest to a place, and how far inside its edges the place is, m."""
         found = self._mirror.nearest_panel(x, y)
         panel = self._mirror.panels[found]
-        dx, dy = x - panel.x_m, y - panel.y_m
-        is_inside = abs(dx) < panel.half_x_m - margin_m and abs(dy) < panel.half_y_m - margin_m
-        return found if is_inside else None
+        return found, min(panel.half_x_m - abs(x - panel.x_m), panel.half_y_m - abs(y - panel.y_m))
 
     def _enter(self, i: int, panel: PanelId) -> None:
         if self._panels[i] is not None:
@@ -318,12 +325,16 @@ class FanMonitor:
         self.alarm.reset()
         self._low, self._weak, self._first_s = Since(), Since(), None
         self._was_right = False
+        self._sound: tuple[float, float] | None = None  # the newest duties, if nothing is wrong with them
 
     _first_s: float | None
 
     def step(self, t_s: float, fans: tuple[float, float], faults: Sequence[str]) -> None:
         """Judge a frame."""
+        if fans == self._sound and not faults:
+            return
         left, right = self._least
+        is_weak = False
         is_low = fans[0] < left or fans[1] < right
         self._was_right = self._was_right or not is_low
         if self._first_s is None:
@@ -343,7 +354,7 @@ class FanMonitor:
             if name in _FANS:
                 reported = FAN_REPORTED if self._overhang else FAN_REPORTED_ON_THE_FLAT
                 self.alarm.see(t_s, reported.found(name, 1.0, 0.0, side=name[4:]))
-        self.alarm.settle(t_s)
+        self._sound = None if is_low or is_weak else fans
 
 
 class BatteryMonitor:

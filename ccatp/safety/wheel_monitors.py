@@ -72,15 +72,15 @@ class Commands:
     def over(self, t_s: float, memory_s: float) -> Span | None:
         """The span of all drives of the last ``memory_s``; ``None`` if they are not all known."""
         spans, since_s = self._spans, t_s - memory_s
-        if not spans or spans[0].t_s > since_s or t_s - spans[-1].t_s > _LATENCY_S:
+        if not spans or spans[0][0] > since_s or t_s - spans[-1][0] > _LATENCY_S:
             return None
-        _, right_low, right_high, left_low, left_high = spans[-1]
+        recent = []
         for span in reversed(spans):
-            right_low, right_high = min(right_low, span.right_low), max(right_high, span.right_high)
-            left_low, left_high = min(left_low, span.left_low), max(left_high, span.left_high)
-            if span.t_s <= since_s:
+            recent.append(span)
+            if span[0] <= since_s:
                 break
-        return Span(t_s, right_low, right_high, left_low, left_high)
+        _, right_low, right_high, left_low, left_high = zip(*recent)  # noqa: B905 - of one length
+        return Span(t_s, min(right_low), max(right_high), min(left_low), max(left_high))
 
 
 class WheelMonitor:
@@ -155,7 +155,6 @@ class WheelMonitor:
             if stalling is not None:
                 self._find_stall(t_s, stalling)
                 self._find_creep(now, stalling, lately, samples)
-        self.alarm.settle(t_s)
 
     def _told(self, t_s: float) -> Span | None:
         """Recent set points of the wheels; ``None`` where they are not known."""
@@ -251,7 +250,9 @@ def _what_is_broken(samples: Sequence[WheelSample], side: int) -> str:
 
 
 def _excess(speed: float, low: float, high: float) -> float:
-    return max(speed - max(high, 0.0), min(low, 0.0) - speed)
+    above = speed - high if high > 0.0 else speed
+    below = low - speed if low < 0.0 else -speed
+    return max(above, below)
 
 
 class CommandSpan:
@@ -319,8 +320,6 @@ class YawMonitor:
             self.alarm.see(t_s, YAW_DISAGREES.found("imu_wz", difference, limit))
 
 
-def imu_finding(gate: ImuGate) -> MonitorFinding | None:
+def imu_finding(gate: ImuGate) -> MonitorFinding:
     """What the gate has against the inertial unit: it is left out, and the robot goes slowly by its wheels."""
-    if not gate.cause:
-        return None
     return IMU_LEFT_OUT.found("imu", gate.value, gate.limit, what=gate.cause)

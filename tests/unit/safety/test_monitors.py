@@ -6,8 +6,10 @@ from ccatp.config.load import load_config
 from ccatp.control.motion_checks import MotionSum
 from ccatp.core import EmergencyKind
 from ccatp.safety.emergency_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, EmergencyLatch, is_at_base_or_held
+from ccatp.safety.sensor_monitors import SeamMonitor
 from ccatp.safety.wheel_monitors import WheelMonitor
 from ccatp.survey.state import MissionState
+from tests.support.scenario import mirror_of
 
 FRAME_S = 0.01
 ROLLS_M_S = 0.0054  # just above what a standing wheel may show
@@ -77,6 +79,24 @@ def test_where_main_is_silent_only_a_robot_that_holds_its_wheels_shall_stand(
             break
     found_s = t_s if monitor.alarm.finding is not None else None
     assert found_s == (None if expected_s is None else pytest.approx(expected_s, abs=0.05))
+
+
+@pytest.mark.parametrize("step_m", [0.0005, 0.004])
+def test_each_seam_that_a_sensor_has_crossed_is_counted(step_m: float) -> None:
+    """Along a row of panels and back to the middle, then half a turn: no sensor leaves its panel in a turn there."""
+    cfg, mirror = load_config(), mirror_of()
+    monitor = SeamMonitor(cfg.health, mirror, cfg.robot, cfg.danger.map_sigmas)
+    panel = mirror.panels[mirror.nearest_panel(0.3, 0.3)]
+    length_m = 2.0 * (2.0 * panel.half_x_m + mirror.gap_m)
+    steps = round(length_m / step_m)
+    way = [k * length_m / steps for k in range(steps + 1)]
+    for k, x_m in enumerate(way + way[::-1]):
+        sigma_m = 0.05 if k % 100 < 10 else 1e-3  # so uncertain now and then that no sensor is on a panel for certain
+        monitor.step(0.05 * k, (panel.x_m + x_m, panel.y_m, 0.0), sigma_m)
+    assert monitor.crossed == 4 * 4  # sensors, seams
+    for turned in range(60):
+        monitor.step(0.05 * (2 * steps + turned), (panel.x_m, panel.y_m, 0.05 * turned), 1e-3)
+    assert monitor.crossed == 4 * 4
 
 
 @pytest.mark.parametrize("kind", list(EmergencyKind))
