@@ -155,8 +155,9 @@ class RobotLink(asyncio.Protocol):
                 self._oddity = str(error)
                 self._count_bad()
                 continue
-            if type(message) is Sensors:
-                self._take_frame(message, line)
+            if type(message) is Sensors and self._is_joined and message.seq > self._last_seq:
+                self._last_seq = message.seq
+                self._on_sensors(message, line)
             else:
                 self._take(message)
         if self._lines.error is not None:
@@ -180,19 +181,13 @@ class RobotLink(asyncio.Protocol):
     def resume_writing(self) -> None:
         self._is_paused = False
 
-    def _take_frame(self, frame: Sensors, line: bytes) -> None:
-        if not self._is_joined:
-            self.counts["unexpected"] += 1
-        elif frame.seq <= self._last_seq:
-            self.counts["repeated_frames"] += 1
-        else:
-            self._last_seq = frame.seq
-            self._on_sensors(frame, line)
-
     def _take(self, message: FromRobot | Unknown) -> None:
+        """Take whatever is not a new frame of a joined session."""
         joining = self._joining
         if isinstance(message, Unknown):
             self.counts["unknown_types"] += 1
+        elif isinstance(message, Sensors):
+            self.counts["repeated_frames" if self._is_joined else "unexpected"] += 1
         elif joining is None or joining.done():
             self.counts["unexpected"] += 1
         elif isinstance(message, Refused):
