@@ -72,7 +72,7 @@ class FullStateLocalizer(LocalizerBase):
     ) -> None:
         super().__init__(cfg.history_s)
         self.fix_deviation_m = 0.0
-        self._mirror, self._full = mirror, cfg.full_state
+        self._filter, self._mirror, self._full = filter_, mirror, cfg.full_state
         self._rest_rate_rad_s = cfg.full_state.rest_rate_rad_s
         self._update_period_s = cfg.full_state.update_period_s - _ROUNDING_S
         self._puck_height_m = robot.puck_height_m
@@ -108,7 +108,7 @@ class FullStateLocalizer(LocalizerBase):
     def pose(self) -> PanelPose:
         """The same in the frame of the panel under the robot."""
         now = self._running
-        height_m = self._estimate.height_m(now.x_m, now.y_m)
+        height_m = self._estimate.terrain.height_m(now.x_m, now.y_m)
         return self._panel.pose((now.x_m, now.y_m, now.heading_rad), height_m, self._slope)
 
     @property
@@ -124,18 +124,18 @@ class FullStateLocalizer(LocalizerBase):
     @property
     def position_sigma_m(self) -> float:
         """Standard deviation of the position along its worst direction, at the last step of the filter."""
-        (a, b), (_, d) = self._estimate.covariance[:2, :2].tolist()
+        (a, b), (_, d) = self._filter.covariance[:2, :2].tolist()
         return sqrt(max(0.5 * (a + d) + sqrt(0.25 * (a - d) ** 2 + b * b), 0.0))
 
     @property
     def heading_sigma_rad(self) -> float:
         """Standard deviation of the heading, at the last step of the filter."""
-        return sqrt(max(float(self._estimate.covariance[PSI, PSI]), 0.0))
+        return sqrt(max(float(self._filter.covariance[PSI, PSI]), 0.0))
 
     @property
     def pose_covariance(self) -> FloatArray:
         """Covariance of (x, y, heading), deck frame, shape (3, 3), at the last step of the filter."""
-        return self._estimate.covariance[:3, :3]
+        return self._filter.covariance[:3, :3]
 
     @property
     def creep(self) -> tuple[float, float]:
@@ -145,8 +145,8 @@ class FullStateLocalizer(LocalizerBase):
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
-        """Mean (n,) and covariance (n, n) of the whole state at the last step of the filter; see ``survey_model``."""
-        return self._estimate.mean, self._estimate.covariance
+        """Mean (n,) and covariance (n, n) of the whole state at the last step of the filter; see ``state_model``."""
+        return self._filter.mean, self._filter.covariance
 
     @property
     def innovation(self) -> Innovation | None:
@@ -240,13 +240,13 @@ class FullStateLocalizer(LocalizerBase):
         self._half_s = 0.5 * block.dt_s
         self._estimate.begin(t_s, block.dt_s)
         self._estimate.move(block, self._right, self._left, (self._gyro.variance, self._accelerometer.variance))
-        _, _, _, v, _, w = self._estimate.mean[: W + 1].tolist()
+        _, _, _, v, _, w = self._filter.mean[: W + 1].tolist()
         if abs(v) > self._v_limit_m_s or abs(w) > self._omega_limit_rad_s:
             raise FilterDiverged(f"{v:.3g} m/s and {w:.3g} rad/s are more than the wheels can do")
 
     def _predict_pose(self, half_s: float) -> None:
         self._slope = self._estimate.slope()
-        self._running.begin(self._estimate.mean, self._slope, half_s)
+        self._running.begin(self._filter.mean, self._slope, half_s)
         if self._rest.is_resting:
             self._running.stand()
             return

@@ -71,7 +71,7 @@ class SurveyFilter:
         self._filter, self._counts = filter_, counts
         self._is_again = False
         self._cfg, self._full = cfg, cfg.full_state
-        self._mirror, self._terrain = mirror, Terrain(mirror)
+        self._mirror, self.terrain = mirror, Terrain(mirror)
         self._motion = SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m)
         self._rows = SensorRows()
         self._drift = np.zeros(STATES)
@@ -98,24 +98,10 @@ class SurveyFilter:
         mean[_DRAWN], P[_WHERE_DRAWN] = self._legs.first()
         return mean, P
 
-    @property
-    def mean(self) -> FloatArray:
-        """Of the state, shape (n,); see ``survey_model``."""
-        return self._filter.mean
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Of the state, shape (n, n)."""
-        return self._filter.covariance
-
     def slope(self) -> Slope:
         """The ground under the estimated position."""
         mean = self._filter.mean
-        return self._terrain.at(float(mean[X]), float(mean[Y]))
-
-    def height_m(self, x_m: float, y_m: float) -> float:
-        """Height of the surface over a deck point."""
-        return self._terrain.height_m(x_m, y_m)
+        return self.terrain.at(float(mean[X]), float(mean[Y]))
 
     def _count(self, what: str) -> None:
         self._counts[what] += not self._is_again
@@ -174,7 +160,7 @@ class SurveyFilter:
 
     def _predict(self, dt_s: float, slip: float, creep: float, encoders: float) -> None:
         full, mean = self._full, self._filter.mean
-        motion = self._motion.over(dt_s, self._terrain.at(float(mean[X]), float(mean[Y])))
+        motion = self._motion.over(dt_s, self.terrain.at(float(mean[X]), float(mean[Y])))
         jerk, twist = full.jerk_density_m2_s5 * dt_s, full.angular_acceleration_density_rad2_s3 * dt_s
         impulses = np.array((jerk, twist, slip, slip, creep))
         drift = self._drift  # work space, of which the model keeps nothing
@@ -313,7 +299,7 @@ class SurveyFilter:
         return self._filter.update(H.dot(mean) + residual, H, variance)
 
     def _fix_row(self, z: FloatArray, mean: FloatArray, late_s: float) -> tuple[FloatArray, FloatArray]:
-        return fix_row(z, mean, self._terrain.at(float(mean[X]), float(mean[Y])), late_s)
+        return fix_row(z, mean, self.terrain.at(float(mean[X]), float(mean[Y])), late_s)
 
     def fix_residual(self, t_s: float, z: FloatArray) -> FloatArray:
         """How far a position (2,) lies from what the filter held for true at ``t_s``."""

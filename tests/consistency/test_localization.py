@@ -18,7 +18,7 @@ from ccatp.estimation.odometry import PreintegratedMotion, WheelAngle
 from ccatp.estimation.slip_prior import SlipPrior
 from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import BA, BG, KG, KL, PL, PR, PSI, SL, SR, STATES, A, C, V, W, X, Y
-from ccatp.filters import FILTERS
+from ccatp.filters import FILTERS, Filter
 from ccatp.mirror.mirror import Mirror
 from tests.support.scenario import transport_rad
 from tests.unit.estimation.drive import config, mirror
@@ -73,7 +73,7 @@ class Run(NamedTuple):
     nis: list[float]
 
 
-def nees(x: FloatArray, filter_: SurveyFilter, which: list[int]) -> float:
+def nees(x: FloatArray, filter_: Filter, which: list[int]) -> float:
     error = (x - filter_.mean)[which]
     return float(error @ np.linalg.solve(filter_.covariance[np.ix_(which, which)], error))
 
@@ -83,7 +83,7 @@ def run(name: str, seed: int) -> Run:
     rng, m, full = np.random.default_rng(seed), mirror(), cfg().full_state
     inner = FILTERS[name](np.zeros(STATES), np.eye(STATES))
     found = SurveyFilter(inner, m, config().robot, cfg(), {}, m.deck_pose(START))
-    mean, P = found.mean.copy(), found.covariance.copy()
+    mean, P = inner.mean.copy(), inner.covariance.copy()
     mean[V] = 0.1
     inner.reset(mean, P)
     x = mean + np.linalg.cholesky(P + 1e-24 * np.eye(STATES)) @ rng.normal(size=STATES)
@@ -112,8 +112,8 @@ def run(name: str, seed: int) -> Run:
             assert found.innovation is not None
             result.nis.append(found.innovation.nis)
         if k in LOOKS:
-            result.pose.append(nees(x, found, POSE))
-            result.state.append(nees(x, found, KNOWN))
+            result.pose.append(nees(x, inner, POSE))
+            result.state.append(nees(x, inner, KNOWN))
     return result
 
 

@@ -133,15 +133,16 @@ def test_a_standstill_longer_than_the_reach_keeps_its_beginning() -> None:
 
 @pytest.mark.parametrize("late_s", [0.01, 0.03])
 def test_the_row_of_a_late_fix_is_its_derivative(late_s: float) -> None:
+    inner = FILTERS["ekf"](np.zeros(STATES), np.eye(STATES))
     found = SurveyFilter(
-        FILTERS["ekf"](np.zeros(STATES), np.eye(STATES)),
+        inner,
         mirror(),
         config().robot,
         config().localizer,
         {},
         mirror().deck_pose(STEEP),
     )
-    x, z, step = found.mean.copy(), found.mean[:2] + 1e-3, 1e-6
+    x, z, step = inner.mean.copy(), inner.mean[:2] + 1e-3, 1e-6
     x[[V, W]] = 0.1, 0.5
     _, row = found._fix_row(z, x, late_s)
     residuals = [
