@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from math import atan2, cos, pi, sin, tau
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
@@ -14,37 +15,46 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 Vector3 = tuple[float, float, float]
 
+# Ranges that a decoder of samples checks.
+MAX_TIME_S = 1e9  # some thirty years
+MAX_RATE_RAD_S = 1e4  # wheels and body; beyond every machine, so that squares stay finite
+MAX_ACCELERATION_M_S2 = 1e4
+Time = Annotated[float, Meta(ge=0.0, le=MAX_TIME_S)]
+Rate = Annotated[float, Meta(ge=-MAX_RATE_RAD_S, le=MAX_RATE_RAD_S)]
+Acceleration = Annotated[float, Meta(ge=-MAX_ACCELERATION_M_S2, le=MAX_ACCELERATION_M_S2)]
+Bit = Annotated[int, Meta(ge=0, le=1)]
+
 
 class ImuSample(NamedTuple):
     """One reading of the inertial unit: acceleration along robot x (gravity removed) and angular rate about robot z."""
 
-    t_s: float
-    ax_m_s2: float
-    wz_rad_s: float
+    t_s: Time
+    ax_m_s2: Acceleration
+    wz_rad_s: Rate
 
 
 class WheelSample(NamedTuple):
     """One reading of the wheel encoders. ``None`` marks a wheel that gave no sample."""
 
-    t_s: float
-    right_rad_s: float | None
-    left_rad_s: float | None
+    t_s: Time
+    right_rad_s: Rate | None
+    left_rad_s: Rate | None
 
 
 class EdgeSample(NamedTuple):
     """One reading of the edge sensors: 1 = panel under the sensor, 0 = none."""
 
-    t_s: float
-    front_left: int
-    front_right: int
-    rear_left: int
-    rear_right: int
+    t_s: Time
+    front_left: Bit
+    front_right: Bit
+    rear_left: Bit
+    rear_right: Bit
 
 
 class GravitySample(NamedTuple):
     """Unit direction of gravity in the robot frame."""
 
-    t_s: float
+    t_s: Time
     gx: float
     gy: float
     gz: float

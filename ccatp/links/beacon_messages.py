@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from ccatp.core import FloatArray
+from ccatp.core import FloatArray, Time
 from ccatp.links.robot_codec import BadLine
-from ccatp.links.robot_messages import Name, Time
+from ccatp.links.robot_messages import Name
 
 Angle = Annotated[float, Meta(ge=-100.0, le=100.0)]
 Level = Annotated[float, Meta(ge=-200.0, le=100.0)]

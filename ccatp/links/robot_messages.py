@@ -9,21 +9,15 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from ccatp.core import EdgeSample, GravitySample, ImuSample, WheelSample
+from ccatp.core import EdgeSample, GravitySample, ImuSample, Rate, Time, WheelSample
 
 PROTOCOL = "ccatp-robot/1"
 AUTH_NONE: Literal["none"] = "none"
 AUTH_HMAC: Literal["hmac-sha256"] = "hmac-sha256"
 
-MAX_TIME_S = 1e9  # some thirty years
-MAX_RATE_RAD_S = 1e4  # wheels and body; beyond every machine, so that squares stay finite
-MAX_ACCELERATION_M_S2 = 1e4
-
 Role = Literal["controller", "monitor"]
 RefusalReason = Literal["role taken", "bad mac", "bad join", "busy"]
 Sequence53 = Annotated[int, Meta(ge=0, le=2**53 - 1)]  # what every JSON reader keeps exact
-Time = Annotated[float, Meta(ge=0.0, le=MAX_TIME_S)]
-Rate = Annotated[float, Meta(ge=-MAX_RATE_RAD_S, le=MAX_RATE_RAD_S)]
 Steer = Annotated[float, Meta(ge=-1.6, le=1.6)]
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 Length = Annotated[float, Meta(ge=-10.0, le=10.0)]
