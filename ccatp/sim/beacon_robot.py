@@ -69,10 +69,6 @@ class BeaconRobot(SimulatedRobot):
         return (self.seq + 1) * self.frame_s
 
     @property
-    def delivered_seq(self) -> int:
-        return self.seq
-
-    @property
     def delivered_line(self) -> bytes:
         return self._line
 
@@ -113,7 +109,7 @@ class BeaconRobot(SimulatedRobot):
         return SimDriveCommand(speed_m_s, 0.0, radius_m * (right_rad_s - left_rad_s) / vehicle.track_m)
 
     def _read(self, frame: WorldFrame | None) -> None:
-        t_s = self.t_s
+        t_s, self.delivered_seq = self.t_s, self.seq
         seq, age_s, permit_age_s, is_held = self.rules.echo(t_s)
         cmd = CommandEcho(seq, round(age_s, 6), round(permit_age_s, 6), is_held)
         wheels: list[tuple[float, float, float]] = []

@@ -32,6 +32,7 @@ from ccatp.links.topics import Misalignment, TruthMessage
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_injector import Injector
 from ccatp.sim.fault_plan import FaultPlan
+from ccatp.sim.plant import WHOLE
 from ccatp.sim.rules import SimulatedRobot
 from ccatp.sim.sensors import SensorSuite, as_message
 from ccatp.sim.world import TruthRow, World
@@ -42,6 +43,10 @@ _FRAME_BYTES, _IMU_BYTES, _ENCODER_BYTES, _COUNTER_BYTES, _EDGE_BYTES = 420, 48,
 
 class Robot(SimulatedRobot):
     """The robot from one boot to the next, at base where no ``start`` is given.
+
+    Attributes:
+        delivered_rows: ``delivered`` with plain tuples for samples, before the faults of its delivery; leave it as it
+            is.
 
     ``rng`` is the parent of every random draw. ``ValueError``: the rates put more samples in a frame than a line may
     hold, or a frame outlasts the TTL.
@@ -77,6 +82,7 @@ class Robot(SimulatedRobot):
         # The newest frame last; the first is delivered once the deque is full.
         self._frames: deque[RobotFrame] = deque(maxlen=self.sensors_delay_frames + 1)
         self._delivered: Sensors | None = None
+        self.delivered_rows: RobotFrame | None = None
         self._line = b""
         self._read()
 
@@ -138,14 +144,6 @@ class Robot(SimulatedRobot):
         injector.reboot(self.seq, self.t_s)
 
     @property
-    def delivered_seq(self) -> int:
-        if self.injector is not None:
-            message = self.injector.outgoing.message
-            return -1 if message is None else message.seq
-        frame = self.delivered_rows
-        return -1 if frame is None else frame.seq
-
-    @property
     def delivered(self) -> Sensors | None:
         """The frame that reached the clients at this instant, ``None`` while none has.
 
@@ -153,24 +151,16 @@ class Robot(SimulatedRobot):
         """
         if self.injector is not None:
             return self.injector.outgoing.message
-        frame = self.delivered_rows
-        if self._delivered is None and frame is not None:
-            self._delivered = as_message(frame)
+        if self._delivered is None and self.delivered_rows is not None:
+            self._delivered = as_message(self.delivered_rows)
         return self._delivered
-
-    @property
-    def delivered_rows(self) -> RobotFrame | None:
-        """The same with plain tuples for samples, at no cost, before the faults of its delivery; leave it as it is."""
-        frames = self._frames
-        return frames[0] if len(frames) > self.sensors_delay_frames else None
 
     @property
     def delivered_line(self) -> bytes:
         if self.injector is not None:
             return self.injector.outgoing.line
-        frame = self.delivered_rows
-        if not self._line and frame is not None:
-            self._line = encode(frame)
+        if not self._line and self.delivered_rows is not None:
+            self._line = encode(self.delivered_rows)
         return self._line
 
     def _read(self) -> None:
@@ -178,13 +168,18 @@ class Robot(SimulatedRobot):
         edges, imu, encoders, gravity = self._sensors.read(seq, plant)
         drive_seq, age_s, permit_age_s, is_held = self.rules.echo(t_s)
         is_held = is_held or self.world.is_fallen
-        cmd = CommandEcho(drive_seq, round(age_s * 1e6) / 1e6, round(permit_age_s * 1e6) / 1e6, is_held)
+        age_s, permit_age_s = (age_s * 1e6 + WHOLE - WHOLE) / 1e6, (permit_age_s * 1e6 + WHOLE - WHOLE) / 1e6
+        cmd = CommandEcho(drive_seq, age_s, permit_age_s, is_held)
         frame = RobotFrame(seq, t_s, imu, encoders, edges, gravity, self.fans.duty, 1.0, cmd, ())
-        injector = self.injector
-        self._frames.append(frame if injector is None else injector.sense(frame))
+        injector, frames = self.injector, self._frames
+        frames.append(frame if injector is None else injector.sense(frame))
         self._delivered, self._line = None, b""
+        self.delivered_rows = delivered = frames[0] if len(frames) > self.sensors_delay_frames else None
+        self.delivered_seq = -1 if delivered is None else delivered.seq
         if injector is not None:
-            injector.deliver(t_s, self.delivered_rows)
+            injector.deliver(t_s, delivered)
+            message = injector.outgoing.message
+            self.delivered_seq = -1 if message is None else message.seq
 
 
 def _check_rates(cfg: Config) -> None:

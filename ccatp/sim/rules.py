@@ -150,6 +150,10 @@ class SimulatedRobot(ABC):
     A command that arrives while frame n is the newest takes effect in the frame that follows n + the delay of the
     commands, in whole frames. Its age counts from its arrival, so the time-to-live covers the delay, too. Whether it is
     newer than the one before is decided when it arrives.
+
+    Attributes:
+        delivered_seq: number of the frame that reached the clients at this instant; -1 while none has, or a fault took
+            it.
     """
 
     truth_rows = 100  # a batch of the log of the true state
@@ -162,6 +166,7 @@ class SimulatedRobot(ABC):
         self.frame_s, self.frame_hz = frame_s, frame_hz
         self.commands_delay_frames = commands_delay_frames
         self.seq, self.t_s, self.reboots = 0, 0.0, 0
+        self.delivered_seq = -1
         self.truth_requests: dict[str, Callable[[], dict[str, object]]] = {}  # replies for the true state, by request
         self._boot(0.0)
 
@@ -185,11 +190,6 @@ class SimulatedRobot(ABC):
     @abstractmethod
     def next_t_s(self) -> float:
         """Time of the next frame."""
-
-    @property
-    @abstractmethod
-    def delivered_seq(self) -> int:
-        """Number of the frame that reached the clients at this instant; -1 while none has, or a fault took it."""
 
     @property
     @abstractmethod
@@ -255,34 +255,38 @@ class SimulatedRobot(ABC):
         ``steer_rad`` has no effect.
         """
         steer = steer_rad if steer_rad is not None and self.is_steerable else 0.0
-        return self._take("drive", seq, right_rad_s, left_rad_s, self.t_s if now_s is None else now_s, steer)
+        values = right_rad_s, left_rad_s, self.t_s if now_s is None else now_s, steer
+        return self._delay("drive", seq, values) if self.commands_delay_frames else self.rules.drive(seq, *values)
 
     def permit(self, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None) -> bool:
         """Take a permit; false for an old or equal ``seq``. ``now_s`` as for ``drive``."""
-        return self._take("permit", seq, forward, reverse, turn, self.t_s if now_s is None else now_s)
+        values = forward, reverse, turn, self.t_s if now_s is None else now_s
+        return self._delay("permit", seq, values) if self.commands_delay_frames else self.rules.permit(seq, *values)
 
     def command_fans(self, seq: int, left: float, right: float) -> bool:
         """Take fan duties; false for an old or equal ``seq`` and for numbers that are not finite."""
-        return self._take("fans", seq, left, right)
+        return (
+            self._delay("fans", seq, (left, right))
+            if self.commands_delay_frames
+            else self.fans.command(seq, left, right)
+        )
 
-    def _take(self, kind: str, seq: int, *values: Any) -> bool:
-        if not self.commands_delay_frames:
-            return self._apply(kind, seq, values)
+    def _delay(self, kind: str, seq: int, values: tuple[float, ...]) -> bool:
         if seq <= self._newest[kind] or not all(map(isfinite, values)):
             return False
         self._newest[kind] = seq
         self._waiting.append((self.seq + self.commands_delay_frames, kind, seq, values))
         return True
 
-    def _apply(self, kind: str, seq: int, values: Any) -> bool:
-        if kind == "drive":
-            return self.rules.drive(seq, *values)
-        if kind == "permit":
-            return self.rules.permit(seq, *values)
-        return self.fans.command(seq, *values)
-
     def _release_commands(self) -> None:
         """Apply what is due when the step after the newest frame begins."""
+        if not self._waiting:
+            return
+        take: dict[str, Callable[..., bool]] = {
+            "drive": self.rules.drive,
+            "permit": self.rules.permit,
+            "fans": self.fans.command,
+        }
         while self._waiting and self._waiting[0][0] <= self.seq:
             _, kind, seq, values = self._waiting.popleft()
-            self._apply(kind, seq, values)
+            take[kind](seq, *values)

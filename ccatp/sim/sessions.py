@@ -128,7 +128,7 @@ class RobotServer:
         on_frame: Callable[[], None],
     ) -> None:
         self.robot = robot
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter(stale=0)
         self.oldest_ack_frames = self.fan_changes = 0
         self._is_lockstep, self._boot, self._key = lockstep, boot, key
         self._make_nonce, self._note, self._on_frame = make_nonce, note, on_frame
@@ -232,26 +232,26 @@ class RobotServer:
 
     def command(self, session: RobotSession, role: Role, message: FromClient, now_s: float) -> bool:
         """A message of a session that has a role; false when it is not for this role."""
-        robot_s = self._robot_time_s(now_s)
-        robot = self.robot
-        if role == "controller" and isinstance(message, Drive):
+        robot, robot_s = self.robot, self._robot_time_s(now_s)
+        if type(message) is Drive and role == "controller":
             taken = robot.drive(message.seq, message.wr, message.wl, robot_s, message.steer)
             if taken and (message.wr or message.wl):
                 self.oldest_ack_frames = max(self.oldest_ack_frames, robot.delivered_seq - message.ack)
-        elif role == "monitor" and isinstance(message, Permit):
+        elif type(message) is Permit and role == "monitor":
             taken = robot.permit(message.seq, message.forward, message.reverse, message.turn, robot_s)
-        elif role == "controller" and isinstance(message, FansMessage):
+        elif type(message) is FansMessage and role == "controller":
             before = robot.fans.duty
             taken = robot.command_fans(message.seq, *message.duty)
             self.fan_changes += robot.fans.duty != before
         else:
             return False
         session.received_s = robot_s
-        self.counts["stale"] += not taken
-        if taken and not isinstance(message, FansMessage) and message.ack == robot.delivered_seq:
+        if not taken:
+            self.counts["stale"] += 1
+        elif not isinstance(message, FansMessage) and message.ack == robot.delivered_seq:
             self._acked.add(role)
-        needed = {"controller", "monitor"} if robot.rules.has_monitor_joined else {"controller"}
-        if self._is_lockstep and needed <= self._acked:
+        acked = self._acked
+        if self._is_lockstep and "controller" in acked and ("monitor" in acked or not robot.rules.has_monitor_joined):
             self._advance(now_s)
         return True
 
