@@ -241,14 +241,16 @@ def markdown_rows(cases: Iterable[Mapping[str, Any]]) -> list[list[str]]:
         [
             case["name"], f"{case['us_p50']:.0f}", " to ".join(f"{us:.0f}" for us in case["us_spread"]),
             case["peer"], f"{case['peer_us_p50']:.0f}", " to ".join(f"{us:.0f}" for us in case["peer_us_spread"]),
-            f"{case['ratio']:.3f}", _text(case, "times_real_time", ".1f"), _text(case, "wake_ups", ".2f"),
+            f"{case['ratio']:.3f}", _text(case, "times_real_time", ".1f"), _text(case, "whole_times_real_time", ".1f"),
+            _text(case, "wake_ups", ".2f"),
         ]
         for case in cases
     ]  # fmt: skip
 
 
 HEAD = (
-    "case", "µs a frame", "spread", "peer", "peer, µs", "spread", "ratio", "times real time", "wake-ups a frame",
+    "case", "µs a frame", "spread", "peer", "peer, µs", "spread", "ratio",
+    "times real time", "with start and end", "wake-ups a frame",
 )  # fmt: skip
 
 
@@ -264,4 +266,8 @@ def terminal_line(case: Mapping[str, Any]) -> str:
         text += f"   p99 {case['us_p99']:.0f} us"
     if "times_real_time" in case:
         text += f"   {case['times_real_time']:.1f} times real time"
+    if "whole_times_real_time" in case:
+        text += f", {case['whole_times_real_time']:.1f} with start and end"
+    if "wake_ups" in case:
+        text += f"   {case['wake_ups']:.2f} wake-ups"
     return text
