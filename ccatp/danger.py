@@ -43,7 +43,7 @@ from ccatp.safety.conditions import (
 )
 from ccatp.safety.edge_detector import EdgeDetector, EdgeMap, EdgePhase
 from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
-from ccatp.safety.emergency_latch import HEARD_AFTER_FRAMES, EmergencyLatch, is_at_base_or_held
+from ccatp.safety.emergency_latch import INFORMED_AFTER_FRAMES, EmergencyLatch, is_at_base_or_held
 from ccatp.safety.escalation import SeverityEscalation, denies, gravest
 from ccatp.safety.monitor import HealthMonitor
 from ccatp.safety.robot_clock import SteadyTime
@@ -85,7 +85,7 @@ class DangerMonitor:
         self._edge_t_s: float | None = None
         self._state = ""
         self._known: EstimateMessage | None = None
-        self._raised_seq = -HEARD_AFTER_FRAMES - 1  # the frame in which the newest emergency was raised
+        self._raised_seq = -INFORMED_AFTER_FRAMES - 1  # the frame in which the newest emergency was raised
         self._time.reset()
         self._is_climbing = False
         if self._board is not None:
@@ -119,7 +119,7 @@ class DangerMonitor:
     def at_base_or_held(self) -> bool:
         """Whether main's newest estimate says so, if it is fresh and knows of the newest emergency."""
         known = self._known
-        if known is None or known.seq <= self._raised_seq + HEARD_AFTER_FRAMES:
+        if known is None or known.seq <= self._raised_seq + INFORMED_AFTER_FRAMES:
             return False
         return is_at_base_or_held(self._state)
 
@@ -172,7 +172,7 @@ class DangerMonitor:
             self._edge_t_s = samples[-1][0]
         missing = self._missing(t_s, estimate, known is not None)
         if known is None and estimate is not None and self._board is not None and isfinite(estimate.t_s):
-            self._board.hear(estimate.t_s, estimate)
+            self._board.take_commands(estimate.t_s, estimate)
         found = self._look(sensors, t_s, wheels, samples) if self._board is not None else ()
         if not found and missing is None and edges.is_idle and not origin.direction and not self.latch.is_latched:
             self.verdict = verdict = Verdict(seq, sensors.t, _NORMAL, "", "", 0.0, 0.0, True, True, True)
@@ -182,7 +182,7 @@ class DangerMonitor:
             verdict = self._arbitrate(seq, sensors.t, missing)
             if self._board is not None:
                 verdict = self._weigh(verdict, self._climb(t_s, [*found, *self._own_findings(missing)]))
-            self.verdict = verdict = self.latch.told(verdict)
+            self.verdict = verdict = self.latch.with_emergencies(verdict)
         return verdict
 
     # -- monitors -------------------------------------------------------------------------------------------------
@@ -265,13 +265,13 @@ class DangerMonitor:
     def stale(self, seq: int, t_s: float) -> Verdict:
         """The verdict when no sensors frame came for ``stale_after_s`` after frame ``seq``: nothing permitted."""
         limit_s = self._stale_after_s
-        return self.latch.told(self._denied(seq, t_s, NO_FRAME.found("sensors", limit_s, limit_s)))
+        return self.latch.with_emergencies(self._denied(seq, t_s, NO_FRAME.found("sensors", limit_s, limit_s)))
 
     def garbled(self, seq: int, t_s: float, at_s: float) -> Verdict | None:
         """A line after frame ``seq`` was no frame. The verdict where there were too many: nothing permitted."""
         if self._board is None or not self._garbled.add(at_s):
             return None
-        return self.latch.told(self._denied(seq, t_s, self._board.garbled()))
+        return self.latch.with_emergencies(self._denied(seq, t_s, self._board.garbled()))
 
     def _denied(self, seq: int, t_s: float, finding: MonitorFinding) -> Verdict:
         shown = finding.cause, finding.signal, finding.value, finding.limit

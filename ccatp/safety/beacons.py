@@ -35,7 +35,7 @@ from ccatp.safety.conditions import (
     TARGET_NEAR,
     MonitorFinding,
 )
-from ccatp.safety.emergency_latch import HEARD_AFTER_FRAMES, EmergencyLatch, is_at_base_or_held
+from ccatp.safety.emergency_latch import INFORMED_AFTER_FRAMES, EmergencyLatch, is_at_base_or_held
 
 
 class _Obstacle(NamedTuple):
@@ -105,7 +105,7 @@ class BeaconSafetyRules:
 
     def reset(self) -> None:
         """The robot has booted: its clock starts again. Emergencies stay latched."""
-        self._heard_s: float | None = None
+        self._radio_s: float | None = None
         self._levels: deque[tuple[float, float]] = deque()
         avoidance = self._avoidance
         self._echoes = ObstacleBuffer(avoidance.sensors_rad, avoidance.influence_m, self._danger.memory_s)
@@ -115,7 +115,7 @@ class BeaconSafetyRules:
         self._is_vague = False
         self._state, self._state_seq = "idle", -1
         self._frame_seq = -1
-        self._raised_seq = -HEARD_AFTER_FRAMES - 2  # the frame in which the newest emergency was raised
+        self._raised_seq = -INFORMED_AFTER_FRAMES - 2  # the frame in which the newest emergency was raised
         self._code = _NORMAL
 
     # -- for the observatory --------------------------------------------------------------------------------------
@@ -128,7 +128,7 @@ class BeaconSafetyRules:
     @property
     def at_base_or_held(self) -> bool:
         """Whether main's newest estimate says so; see ``DangerMonitor.at_base_or_held``."""
-        return self._state_seq > self._raised_seq + HEARD_AFTER_FRAMES and is_at_base_or_held(self._state)
+        return self._state_seq > self._raised_seq + INFORMED_AFTER_FRAMES and is_at_base_or_held(self._state)
 
     def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
         """Latch an emergency; returns why it was refused, or None."""
@@ -151,7 +151,7 @@ class BeaconSafetyRules:
     def step(self, sensors: Sensors, extras: BeaconFrame, estimate: EstimateMessage | None) -> Verdict:
         """The verdict on one frame."""
         self._frame_seq = sensors.seq
-        self._hear(sensors.t, extras)
+        self._take_readings(sensors.t, extras)
         self._roll(sensors, extras)
         self._echoes.see(sensors.t, extras.distances)
         if estimate is not None:
@@ -165,12 +165,12 @@ class BeaconSafetyRules:
         self._code = verdict.code
         if verdict.signal:
             self._denials[verdict.signal] += 1
-        return self.latch.told(verdict)
+        return self.latch.with_emergencies(verdict)
 
     def stale(self, seq: int, t_s: float) -> Verdict:
         """The verdict when no frame came for ``stale_after_s``: nothing permitted."""
         limit_s = self._danger.stale_after_s
-        return self.latch.told(self._denied(seq, t_s, NO_FRAME.found("sensors", limit_s, limit_s)))
+        return self.latch.with_emergencies(self._denied(seq, t_s, NO_FRAME.found("sensors", limit_s, limit_s)))
 
     def garbled(self, seq: int, t_s: float, _at_s: float) -> Verdict | None:
         """A line of the robot was no frame: nothing permitted until the next one."""
@@ -181,13 +181,13 @@ class BeaconSafetyRules:
         """Frames on which motion was denied, by signal."""
         return {"denied": dict(self._denials)}
 
-    def _hear(self, t_s: float, extras: BeaconFrame) -> None:
+    def _take_readings(self, t_s: float, extras: BeaconFrame) -> None:
         names = {sample.beacon for sample in extras.radio}
         if extras.scan is not None:
             names |= {name for name, levels in extras.scan.levels.items() if any(z is not None for z in levels)}
-        is_heard = bool(names - {self._follow.target}) or bool(extras.motes)
-        if self._heard_s is None or is_heard:
-            self._heard_s = t_s
+        has_reading = bool(names - {self._follow.target}) or bool(extras.motes)
+        if self._radio_s is None or has_reading:
+            self._radio_s = t_s
         self._levels.extend((t_s, sample.rssi_dbm) for sample in extras.radio if sample.beacon == self._follow.target)
         if extras.scan is not None:
             levels = [z for z in extras.scan.levels.get(self._follow.target, ()) if z is not None]
@@ -215,9 +215,9 @@ class BeaconSafetyRules:
 
     def _hold(self, t_s: float, estimate: EstimateMessage | None) -> MonitorFinding | None:
         danger = self._danger
-        heard_s = t_s if self._heard_s is None else self._heard_s
-        if t_s - heard_s > danger.radio_timeout_s:
-            return RADIO_SILENT.found("radio", t_s - heard_s, danger.radio_timeout_s)
+        newest_s = t_s if self._radio_s is None else self._radio_s
+        if t_s - newest_s > danger.radio_timeout_s:
+            return RADIO_SILENT.found("radio", t_s - newest_s, danger.radio_timeout_s)
         age_s = inf if estimate is None else t_s - estimate.t_s
         if estimate is None or not age_s <= danger.estimate_timeout_s:
             limit_s = danger.estimate_timeout_s

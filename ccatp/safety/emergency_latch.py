@@ -10,7 +10,7 @@ from ccatp.core import EmergencyKind, Verdict
 MAX_ACTIVE = 256
 MAX_CLEARED = 1024
 # Main acts on a verdict in the frame after it at the latest; what it says of a frame later than that knows of it.
-HEARD_AFTER_FRAMES = 2
+INFORMED_AFTER_FRAMES = 2
 # The mission's states (``ccatp.survey.state``) in which the robot stands at base or is held.
 AT_BASE_OR_HELD = frozenset({"idle", "held", "done"})
 
@@ -58,7 +58,7 @@ class EmergencyLatch:
         """The emergency raised last among the active ones."""
         return next(reversed(self._active.values())) if self._active else None
 
-    def told(self, verdict: Verdict) -> Verdict:
+    def with_emergencies(self, verdict: Verdict) -> Verdict:
         """A verdict, with what it does not say of emergencies where something else gave its code."""
         if not self._active:
             return verdict

@@ -71,7 +71,7 @@ class HealthMonitor:
             *(self._clock, self._gap, self._garbled),
         ):
             part.reset()
-        self._estimate_seq = self._heard_seq = -1
+        self._estimate_seq = self._commands_seq = -1
         self._opened = (0, 0, 0, 0)
         self._home_m = 0.0
         self._frames = 0
@@ -185,14 +185,14 @@ class HealthMonitor:
             turned = means.yaw_rad_s * dt_s
         return MotionSum(t_s, sums[1] + right * rolled_m, sums[2] + left * rolled_m, sums[3] + turned)
 
-    def hear(self, t_s: float, estimate: EstimateMessage) -> None:
+    def take_commands(self, t_s: float, estimate: EstimateMessage) -> None:
         """Take the set points from an estimate that may be too old for anything else.
 
         A repeated one changes nothing.
         """
-        if estimate.seq == self._heard_seq:
+        if estimate.seq == self._commands_seq:
             return
-        self._heard_seq = estimate.seq
+        self._commands_seq = estimate.seq
         if estimate.commanded is not None:
             self._wheels.commands.push(t_s, estimate.commanded)
 
@@ -204,7 +204,7 @@ class HealthMonitor:
         if estimate.seq == self._estimate_seq:
             return
         self._estimate_seq = estimate.seq
-        self.hear(t_s, estimate)
+        self.take_commands(t_s, estimate)
         self._wheels.learn(t_s)
         if estimate.drive_seq >= 0:
             self._latency.sent(estimate.drive_seq, t_s)

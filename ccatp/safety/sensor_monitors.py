@@ -370,16 +370,16 @@ class BatteryMonitor:
 
     def reset(self) -> None:
         """The clock was reset."""
-        self._low, self._told = Since(), Since()
+        self._low, self._reported = Since(), Since()
 
-    def step(self, t_s: float, soc: float, is_told: bool, home_m: float) -> None:
+    def step(self, t_s: float, soc: float, is_reported: bool, home_m: float) -> None:
         """Judge a frame; ``soc`` from 0 to 1."""
         cfg = self._cfg
         least = cfg.battery_reserve
         least += cfg.battery_margin * _DETOUR * home_m / cfg.slow_speed_m_s / cfg.battery_life_s
         if self._low.lasts(t_s, soc < least) >= cfg.battery_time_s:
             self.finding = BATTERY_LOW.found("soc", soc, least)
-        if self._told.lasts(t_s, is_told) >= cfg.battery_time_s:
+        if self._reported.lasts(t_s, is_reported) >= cfg.battery_time_s:
             self.finding = BATTERY_REPORTED.found("battery_low", soc, least)
 
 

@@ -144,7 +144,7 @@ class WheelMonitor:
             self._late_s = t_s
         if is_sparse:
             self._sparse_s = t_s
-        lately = self._told(t_s)
+        lately = self._commanded(t_s)
         if lately is not None:
             limit = self._cfg.runaway_m_s
             is_vague = self._sparse_s is not None and t_s - self._sparse_s < self._cfg.stall_time_s
@@ -156,20 +156,23 @@ class WheelMonitor:
                 self._find_stall(t_s, stalling)
                 self._find_creep(now, stalling, lately, samples)
 
-    def _told(self, t_s: float) -> Span | None:
+    def _commanded(self, t_s: float) -> Span | None:
         """Recent set points of the wheels; ``None`` where they are not known."""
         lately = self._lately
         if lately is not None and t_s - lately.t_s <= _LATENCY_S:
             return lately
-        # Main may have told them anything since. Where the robot holds its wheels, whatever it was has been forgotten.
+        # Main may have commanded anything since. Where the robot holds its wheels, whatever it was has been forgotten.
         is_held = self._held_since_s is not None and t_s - self._held_since_s >= _MEMORY_S
         return Span(t_s, 0.0, 0.0, 0.0, 0.0) if is_held else None
 
     def _find_runaway(
-        self, t_s: float, moved: MotionSum, told: Span, samples: Sequence[WheelSample], limit: float
+        self, t_s: float, moved: MotionSum, commanded: Span, samples: Sequence[WheelSample], limit: float
     ) -> None:
         right, left = moved.right_m / moved.t_s, moved.left_m / moved.t_s
-        above = _excess(right, told.right_low, told.right_high), _excess(left, told.left_low, told.left_high)
+        above = (
+            _excess(right, commanded.right_low, commanded.right_high),
+            _excess(left, commanded.left_low, commanded.left_high),
+        )
         worst = max(above)
         if worst <= limit:
             return
@@ -181,13 +184,13 @@ class WheelMonitor:
             self.alarm.see(t_s, WHEEL_RUNS_AWAY.found(f"{side}_wheel", worst, limit, side=side))
 
     def _find_stall(self, t_s: float, moved: MotionSum) -> None:
-        told, cfg = self._stall, self._cfg
-        if told is None or (self._held_s is not None and t_s - self._held_s < cfg.stall_time_s + _LATENCY_S):
+        commanded, cfg = self._stall, self._cfg
+        if commanded is None or (self._held_s is not None and t_s - self._held_s < cfg.stall_time_s + _LATENCY_S):
             return
         right, left = moved.right_m / moved.t_s, moved.left_m / moved.t_s
         stands = (
-            self._is_told(told.right_low, told.right_high) and abs(right) < cfg.stall_speed_m_s,
-            self._is_told(told.left_low, told.left_high) and abs(left) < cfg.stall_speed_m_s,
+            self._is_commanded(commanded.right_low, commanded.right_high) and abs(right) < cfg.stall_speed_m_s,
+            self._is_commanded(commanded.left_low, commanded.left_high) and abs(left) < cfg.stall_speed_m_s,
         )
         if not any(stands):
             return
@@ -202,15 +205,15 @@ class WheelMonitor:
             finding = WHEEL_BLOCKED.found(f"{side}_wheel", speed, cfg.stall_speed_m_s, side=side)
         self.alarm.see(t_s, finding)
 
-    def _is_told(self, low: float, high: float) -> bool:
+    def _is_commanded(self, low: float, high: float) -> bool:
         limit = self._cfg.stall_command_m_s
         return low >= limit or high <= -limit
 
-    def _find_creep(self, now: MotionSum, moved: MotionSum, told: Span, samples: Sequence[WheelSample]) -> None:
+    def _find_creep(self, now: MotionSum, moved: MotionSum, commanded: Span, samples: Sequence[WheelSample]) -> None:
         """Motion against a set point of zero. While the link stalls the robot keeps its last command, then stops."""
         runs_down_s = _MEMORY_S + self._cfg.stall_time_s
         is_running_down = self._late_s is not None and now.t_s - self._late_s < runs_down_s
-        if is_running_down or told[1:] != (0.0, 0.0, 0.0, 0.0):
+        if is_running_down or commanded[1:] != (0.0, 0.0, 0.0, 0.0):
             self._stood = None
             return
         if self._stood is None:

@@ -42,7 +42,7 @@ class WheelTrack:
         """Forget everything (the robot's clock was reset)."""
         self._frames: deque[Sequence[WheelSample]] = deque(maxlen=HISTORY_FRAMES)
         self._right = self._left = 0.0
-        self._right_t_s = self._left_t_s = self._heard_t_s = -inf
+        self._right_t_s = self._left_t_s = self._usable_t_s = -inf
         self.knots: list[Knot] = []
         self.dropped = 0
 
@@ -56,7 +56,7 @@ class WheelTrack:
         if right is None or left is None or not (-limit <= right <= limit and -limit <= left <= limit):
             self.update(t_s)
             t_s = min(self._right_t_s, self._left_t_s)
-        self._heard_t_s = max(self._heard_t_s, t_s)
+        self._usable_t_s = max(self._usable_t_s, t_s)
 
     def update(self, t_s: float) -> None:
         """Read the frames pushed since the last call; samples that go back in time or are not finite are dropped."""
@@ -88,9 +88,9 @@ class WheelTrack:
 
         A wheel without any sample yet is silent since the robot's boot.
         """
-        if self._heard_t_s == -inf:
+        if self._usable_t_s == -inf:
             return max(t_s, self._hold_s)
-        silent_s = t_s - self._heard_t_s
+        silent_s = t_s - self._usable_t_s
         return silent_s if silent_s > self._hold_s else 0.0
 
 
