@@ -88,7 +88,7 @@ def trapeze(begin_s: float, duration_s: float, top: float, ramp: float) -> Rate:
 
 @dataclass(frozen=True)
 class Errors:
-    """What is wrong with the robot; names and signs as in ``survey_model``."""
+    """What is wrong with the robot; names and signs as in ``state_model``."""
 
     right_slip: float = 0.0
     left_slip: float = 0.0
