@@ -22,6 +22,7 @@ from ccatp.links.channels import BadRequest, OperatorCommand, format_error, form
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.rpc import Router
 from ccatp.links.topics import MissionStatus
+from ccatp.survey.conditions import advice_for
 from ccatp.survey.state import Abort, Interrupted, Pause, Resume, StopHere
 
 # After the end the last messages must reach the supervisor, which then ends this process.
@@ -32,6 +33,30 @@ UNSEEN_S = 0.1
 CATCH_UP_S = 0.5
 # A robot at 0.1 m/s is at rest within half a second; a command that took no effect by then has failed.
 EFFECT_TIMEOUT_S = 5.0
+
+
+# A robot that stands for longer is reported, with the reason and what to do, and again after each minute.
+STANDS_REPORT_S, STANDS_REPEAT_S = 30.0, 60.0
+
+
+class StandstillReport:
+    """When to report that the robot stands: after ``STANDS_REPORT_S``, and again after each ``STANDS_REPEAT_S``."""
+
+    def __init__(self) -> None:
+        self._since_s: float | None = None
+        self._due_s = inf
+
+    def lasts_s(self, now_s: float, *, stands: bool) -> float | None:
+        """How long it stands, where that is to be reported now."""
+        if not stands:
+            self._since_s = None
+            return None
+        if self._since_s is None:
+            self._since_s, self._due_s = now_s, now_s + STANDS_REPORT_S
+        if now_s < self._due_s:
+            return None
+        self._due_s = now_s + STANDS_REPEAT_S
+        return now_s - self._since_s
 
 
 class UnhandledError(CcatpError):
@@ -66,6 +91,7 @@ class MainLoop(RobotLoop):
         self._was_at_rest = False
         self._unanswered: int | None = None
         self._failure: Exception | None = None
+        self._standstill = StandstillReport()
         self.exit_status = ExitStatus.INTERRUPTED
         self._runner = make_runner(self)
         self._telemetry = self._runner.telemetry
@@ -155,6 +181,31 @@ class MainLoop(RobotLoop):
             self._publish_status()
         if self._runner.mission.state.is_paused and not self._runner.is_busy:
             self._answer_held_frame()  # a frame now and then, so that an emergency acts in a pause, too
+        stands = self.heartbeat.phase != "done" and self._runner.is_at_rest
+        lasts_s = self._standstill.lasts_s(time.monotonic(), stands=stands)
+        if lasts_s is not None:
+            self._telemetry.notify_operator("warning", f"the robot stands for {lasts_s:.0f} s: {self._why_it_stands()}")
+
+    def _why_it_stands(self) -> str:
+        """The reason, and what to do."""
+        phase, state, age_s = self.heartbeat.phase, self._runner.mission.state, self.heartbeat.frame_age_s
+        robot = f"the robot at {self.robot_cfg.host}:{self.robot_cfg.port}"
+        if phase == "starting":
+            return "waiting for the laser system; is its server running?"
+        if phase == "ready":
+            return f"waiting for the danger loop and {robot}; is it on, the network up?"
+        if phase == "rejoining":
+            return f"the link to {robot} is lost; is it on, the network up?"
+        if self._unanswered is None and (age_s is None or age_s > STANDS_REPORT_S):
+            return f"{robot} sends no frames; is it on, the network up?"
+        if self._runner.is_busy:
+            return "waiting for a measurement of the laser system; is it ready, the line of sight free?"
+        cause = state.cause or str(state.mode)
+        advice = advice_for(cause) or ("'ccatp resume' goes on" if state.is_paused else "it goes on by itself")
+        return f"{state.mode}: {cause}; {advice}"
+
+    def is_frame_due(self) -> bool:
+        return self._unanswered is None
 
     def on_silence(self, age_s: float) -> None:
         if age_s <= self.robot_cfg.sensors_timeout_s:

@@ -17,6 +17,8 @@ from ccatp.links.bus import Publisher
 from ccatp.links.robot_messages import Role
 
 WAIT_PERIOD_S = 0.02
+# In lockstep the robot sends the next frame as soon as it has its answers, or the last one again: it has lost both.
+LOCKSTEP_SILENCE_S = 30.0
 
 
 class RobotLoop(RobotSession):
@@ -85,6 +87,10 @@ class RobotLoop(RobotSession):
     def publish_levels(self) -> None:
         """Publish what is repeated beside the heartbeat."""
 
+    def is_frame_due(self) -> bool:
+        """In lockstep: the last frame was answered, and it is the robot's turn."""
+        return False
+
     @abstractmethod
     def on_silence(self, age_s: float) -> None:
         """No frame came for so long, in real time; called all the time, also while frames are prompt."""
@@ -107,7 +113,11 @@ class RobotLoop(RobotSession):
             await asyncio.sleep(WAIT_PERIOD_S)
             self.peer.maintain()
             age_s = self.heartbeat.frame_age_s
-            if self.heartbeat.phase != "joined" or self.is_lockstep or age_s is None:
+            if self.heartbeat.phase != "joined" or age_s is None:
+                continue
+            if self.is_lockstep:
+                if age_s > LOCKSTEP_SILENCE_S and self.is_frame_due():
+                    self.drop(f"no sensors frame for {age_s:.0f} s in lockstep though the last one was answered")
                 continue
             self.on_silence(age_s)
             if age_s > self.robot_cfg.silence_timeout_s:

@@ -1,7 +1,9 @@
 """What the survey, the localizer and the main loop hold the robot for: rows as those of ``ccatp.safety.conditions``."""
 
+import re
+
 from ccatp.core import Severity
-from ccatp.safety.conditions import Clear, Condition, Group, fault, go_home, hold, pause
+from ccatp.safety.conditions import DANGER, Clear, Condition, Group, fault, go_home, hold, pause
 
 # fmt: off
 BACK_OFFS = fault(
@@ -103,3 +105,13 @@ OPERATOR = go_home(
 # fmt: on
 
 SURVEY: tuple[Condition, ...] = tuple(row for row in list(globals().values()) if isinstance(row, Condition))
+
+
+def advice_for(cause: str) -> str:
+    """What an operator can do about a cause as it is shown; empty where nothing is known."""
+    for row in (*DANGER, *SURVEY):
+        # What lasts or comes again has its duration or count behind the message.
+        pattern = re.sub(r"\\\{\w+\\\}", ".*", re.escape(row.message)) + r"(, (for|again after) .*|; .*)?"
+        if row.message and re.fullmatch(pattern, cause):
+            return row.advice
+    return ""

@@ -1,0 +1,65 @@
+"""Reports of a robot that stands, and the advice that goes with a cause."""
+
+import asyncio
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from ccatp.daemon.main_loop import STANDS_REPEAT_S, STANDS_REPORT_S, StandstillReport
+from ccatp.daemon.robot_loop import RobotLoop
+from ccatp.safety.conditions import DANGER
+from ccatp.survey.conditions import SURVEY, advice_for
+
+
+def test_it_is_reported_after_half_a_minute_and_again_after_each_minute() -> None:
+    report, said = StandstillReport(), dict[int, float]()
+    for k in range(2000):
+        lasts_s = report.lasts_s(0.1 * k, stands=k != 1500)
+        if lasts_s is not None:
+            said[k] = lasts_s
+    first, again = 10.0 * STANDS_REPORT_S, 10.0 * STANDS_REPEAT_S
+    assert list(said) == pytest.approx([first, first + again, 1501 + first], abs=1)  # a frame
+    assert list(said.values()) == pytest.approx([30.0, 90.0, 30.0], abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("cause", "advice"),
+    [
+        pytest.param("no way on: walled in", "`ccatp abort`", id="a text that varies"),
+        pytest.param("an edge sensor chatters, for 30 s", "Clean it", id="a hold that lasts"),
+        pytest.param("an edge sensor chatters, again after 2 retries", "Clean it", id="a hold that comes again"),
+        pytest.param("nobody has heard of this", "", id="unknown"),
+    ],
+)
+def test_advice_is_that_of_the_row_whose_message_it_is(cause: str, advice: str) -> None:
+    assert advice_for(cause).startswith(advice)
+    assert bool(advice_for(cause)) is bool(advice)
+
+
+def test_each_row_finds_its_own_advice() -> None:
+    for row in (*DANGER, *SURVEY):
+        shown = row.message.replace("{", "").replace("}", "")
+        assert advice_for(shown), row.name
+
+
+@pytest.mark.parametrize(
+    ("age_s", "is_due", "is_dropped"), [(31.0, True, True), (29.0, True, False), (31.0, False, False)]
+)
+async def test_a_lockstep_robot_that_owes_a_frame_loses_its_session(
+    age_s: float, is_due: bool, is_dropped: bool
+) -> None:
+    why, begun = list[str](), asyncio.Event()
+    loop: Any = SimpleNamespace(
+        peer=SimpleNamespace(maintain=begun.set),
+        heartbeat=SimpleNamespace(phase="joined", frame_age_s=age_s),
+        is_lockstep=True,
+        is_frame_due=lambda: is_due,
+        drop=why.append,
+    )
+    watching = asyncio.get_running_loop().create_task(RobotLoop.watch(loop))
+    await begun.wait()
+    await asyncio.sleep(0)
+    watching.cancel()
+    expected = ["no sensors frame for 31 s in lockstep though the last one was answered"] if is_dropped else []
+    assert why == expected
