@@ -3,6 +3,7 @@
 A course is a direction in the deck plane; a heading is the angle in the tangent plane that projects on it.
 """
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -216,11 +217,11 @@ class LegRules:
                 high = low + way
                 if low > high:
                     low, high = high, low
-                for line in lines:
-                    if low - self._beside_m < line < high + self._beside_m:
-                        if self._runs_along(low, high, line, length):
-                            return Grazing.ALONG
-                        found = Grazing.BESIDE
+                first, last = bisect_right(lines, low - self._beside_m), bisect_left(lines, high + self._beside_m)
+                for line in lines[first:last]:
+                    if self._runs_along(low, high, line, length):
+                        return Grazing.ALONG
+                    found = Grazing.BESIDE
         return found
 
     def _runs_along(self, low: float, high: float, line: float, length: float) -> bool:
