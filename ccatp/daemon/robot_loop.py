@@ -1,6 +1,7 @@
 """What the main loop and the danger loop have in common: session at the robot, bus, and tasks that end together."""
 
 import asyncio
+import gc
 import time
 from abc import abstractmethod
 from collections.abc import Coroutine
@@ -62,6 +63,7 @@ class RobotLoop(RobotSession):
             if stop.is_set():
                 return
             await asyncio.sleep(WAIT_PERIOD_S)
+        gc.freeze()  # else a collection in the middle of the run visits every object of the libraries, some 50 ms long
         joins = self.join(is_patient=self._args.is_taking_over)
         if await unless_stopped(stop, joins) and not self.is_lockstep:
             realtime.enter(processes_of(self._args.config).realtime_priority, self.log)
