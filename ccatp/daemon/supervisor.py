@@ -123,6 +123,7 @@ class SupervisedRun:
         cfg, is_sim, view = self._cfg, self._options.sim, self._view
         what = {"system": cfg.system} if isinstance(cfg, RadioConfig) else {"mirror": cfg.mirror.name}
         self._log.info("run_started", **what, seed=cfg.run.seed, sim=is_sim)
+        niceness = os.getpriority(os.PRIO_PROCESS, 0)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         # A flag and no exception: a signal must neither be lost in a handler of exceptions nor end the shutdown.
         previous = {n: signal.signal(n, self._interrupt) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
@@ -130,6 +131,8 @@ class SupervisedRun:
             collector = Collector(context, self._endpoints, self._run_dir, cfg, self._on_heartbeat, is_sim=is_sim)
             with collector, view:
                 status = self._watch(collector)
+                with suppress(PermissionError):  # beside other work the end would take ten times as long
+                    os.setpriority(os.PRIO_PROCESS, 0, niceness)
                 self._service.stopping()
                 collector.finish()
                 self._children.stop_all()
