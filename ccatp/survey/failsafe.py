@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from msgspec.structs import replace
 
 from ccatp.core import Corner, EventCode, Severity, Verdict
+from ccatp.safety.conditions import Clear, Motion
 from ccatp.survey.behaviours import Retreat, ReturnHome
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.state import (
@@ -54,11 +55,18 @@ class Action(Enum):
 
 
 class Row(NamedTuple):
-    """One row: what is wrong, and what follows."""
+    """One row: what is wrong, and what follows.
+
+    Attributes:
+        motion: what the robot may still do.
+        clear: what ends the reaction, once the condition is over.
+    """
 
     name: str
     applies: Callable[[SurveyState, Verdict | None], bool]
     action: Action
+    motion: Motion
+    clear: Clear
 
 
 def _is_denied(v: Verdict) -> bool:
@@ -76,24 +84,44 @@ def _is_clear(v: Verdict) -> bool:
 
 
 ROWS = (
-    Row("earthquake", lambda _, v: v is not None and v.is_shaking and v.code is not NEAR_EDGE, Action.SHAKEN),
-    Row("fault", lambda _, v: v is not None and v.severity is FAULT, Action.FAULT),
-    Row("sensor stays off", lambda _, v: v is not None and _may_locate(v), Action.LOCATE),
-    Row("hold", lambda _, v: _is_hold(v), Action.HOLD),
-    Row("slow", lambda s, v: v is not None and s.is_slow is not (v.severity in (SLOW, RETURN)), Action.SLOW),
+    Row(
+        "earthquake",
+        lambda _, v: v is not None and v.is_shaking and v.code is not NEAR_EDGE,
+        *(Action.SHAKEN, Motion.NONE, Clear.OPERATOR),
+    ),
+    Row("fault", lambda _, v: v is not None and v.severity is FAULT, Action.FAULT, Motion.NONE, Clear.OPERATOR),
+    Row(
+        "sensor stays off",
+        lambda _, v: v is not None and _may_locate(v),
+        *(Action.LOCATE, Motion.NONE, Clear.AFTER_FIX),
+    ),
+    Row("hold", lambda _, v: _is_hold(v), Action.HOLD, Motion.NONE, Clear.AFTER_FIX),
+    Row(
+        "slow",
+        lambda s, v: v is not None and s.is_slow is not (v.severity in (SLOW, RETURN)),
+        *(Action.SLOW, Motion.ANY, Clear.AUTO),
+    ),
     Row(
         "return",
         lambda s, v: v is not None and v.severity is RETURN and v.code is not NEAR_EDGE and v.cause != s.finding,
-        Action.RETURN,
+        *(Action.RETURN, Motion.RETURN, Clear.OPERATOR),
     ),
-    Row("stuck", lambda s, _: s.stuck_s is not None, Action.WAIT_AT_EDGE),
-    Row("edge", lambda _, v: v is not None and v.code is NEAR_EDGE, Action.RETREAT),
-    Row("no verdict", lambda _, v: v is None, Action.PAUSE),
-    Row("not permitted", lambda _, v: v is not None and not (v.forward and v.reverse and v.turn), Action.PAUSE),
+    Row("stuck", lambda s, _: s.stuck_s is not None, Action.WAIT_AT_EDGE, Motion.NONE, Clear.AUTO),
+    Row(
+        "edge",
+        lambda _, v: v is not None and v.code is NEAR_EDGE,
+        *(Action.RETREAT, Motion.RETREAT, Clear.AFTER_FIX),
+    ),
+    Row("no verdict", lambda _, v: v is None, Action.PAUSE, Motion.NONE, Clear.AUTO),
+    Row(
+        "not permitted",
+        lambda _, v: v is not None and not (v.forward and v.reverse and v.turn),
+        *(Action.PAUSE, Motion.NONE, Clear.AUTO),
+    ),
     Row(
         "emergency",
         lambda s, v: v is not None and v.code is ABORTED and v.raised != s.emergency_epoch,
-        Action.RETURN,
+        *(Action.RETURN, Motion.RETURN, Clear.OPERATOR),
     ),
 )
 

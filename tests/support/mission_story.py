@@ -62,10 +62,10 @@ class Story:
         self.orders.append(order)
         if order.measure and self.auto_fix:
             self.mission.handle(FixStored(self.mission.state.measuring_point))
-        self._drive(order.twist)
+        self.move(order.twist)
         return order
 
-    def _drive(self, twist: Twist) -> None:
+    def move(self, twist: Twist) -> None:
         keep = exp(-DT / LAG)
         v, omega = twist.v_m_s, twist.omega_rad_s
         middle = self.heading + 0.5 * self.omega * DT
