@@ -24,7 +24,7 @@ from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon.command_handlers import ObservatoryServer
 from ccatp.daemon.process import ProcessArgs, run_process, start_process
 from ccatp.daemon.robot_loop import RobotLoop
-from ccatp.daemon.subscribers import EstimateSubscriber, VerdictSocket
+from ccatp.daemon.subscribers import EstimateSubscriber
 from ccatp.danger import DangerMonitor
 from ccatp.errors import ExitStatus
 from ccatp.links.beacon_messages import decode_beacon_frame
@@ -153,7 +153,6 @@ class DangerLoop(RobotLoop):
         self.peer = self._estimates = EstimateSubscriber(
             context, args.endpoints.of("main"), self.heartbeat.publish_if_due, is_taking_over=args.is_taking_over
         )
-        self._verdicts = VerdictSocket(args.endpoints.verdicts)
         self._has_heard_main = False
         self._published = (EventCode.NORMAL, "", Severity.NONE)
         self._seq, self._t_s = -1, 0.0
@@ -173,7 +172,7 @@ class DangerLoop(RobotLoop):
     def is_peer_ready(self) -> bool:
         """Messages get through, both ways: the first ones must not be lost."""
         self._has_heard_main = self._has_heard_main or self._estimates.has_received()
-        return self._has_heard_main
+        return self._has_heard_main and self.publisher.has_subscriber("verdict")
 
     async def end(self, _stop: asyncio.Event) -> None:
         self.log.info("danger_statistics", **self.monitor.counts)
@@ -233,7 +232,6 @@ class DangerLoop(RobotLoop):
         if ack >= 0:  # the robot first: the permit does not wait for the publication
             self._permit_seq += 1
             self.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
-        self._verdicts.send(verdict)
         self.publisher.send("verdict", verdict)
         if (verdict.code, verdict.cause, verdict.severity) == self._published:
             return

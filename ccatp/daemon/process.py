@@ -58,11 +58,6 @@ class Endpoints:
         """``ipc://`` endpoint of a name: main, danger, truth, puck, control, emergency."""
         return f"ipc://{self.runtime_dir / name}"
 
-    @property
-    def verdicts(self) -> Path:
-        """Main's socket for the verdicts of danger."""
-        return self.runtime_dir / "verdicts"
-
 
 def run_dir_in(runtime_dir: Path) -> Path | None:
     """The run directory of the run that goes on in a runtime directory, or of the last one."""

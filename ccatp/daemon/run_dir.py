@@ -149,7 +149,7 @@ def default_run_dir(mirror: str, seed: int, now_utc: datetime, parent: Path = Pa
 
 
 # In the runtime directory. Those of the truth may be of a simulated robot that runs alone, beside a run without one.
-SOCKETS = ("main", "danger", "verdicts", "control", "emergency", "dashboard")
+SOCKETS = ("main", "danger", "control", "emergency", "dashboard")
 TRUTH_SOCKETS = ("truth", "puck")
 
 

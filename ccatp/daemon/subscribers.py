@@ -1,13 +1,9 @@
 """Heartbeats, verdicts for main and estimates for danger; in lockstep a loop waits for the message of its frame."""
 
 import os
-import socket
 import time
 from collections.abc import Callable
-from contextlib import suppress
-from pathlib import Path
 
-import msgspec
 import zmq
 
 from ccatp.core import Verdict
@@ -21,8 +17,6 @@ WAIT_SLICE_S = 0.02
 # Danger is at most a few frames ahead of main: a number far beyond the present one is of the robot's last boot.
 MAX_FRAMES_AHEAD = 100
 PERIOD_S = 0.1
-MAX_VERDICT_BYTES = 4096
-_encode, _decode = msgspec.json.Encoder().encode, msgspec.json.Decoder(Verdict).decode
 
 
 class PeerSubscriber:
@@ -42,31 +36,22 @@ class PeerSubscriber:
     ) -> None:
         self._subscriber = Subscriber(context, [endpoint], topics, is_watching=True)
         self._on_wait = on_wait
-
-    def maintain(self) -> None:
-        """Renew a connection that is silent for long; to be called all the time."""
-        self._subscriber.maintain()
-
-    def close(self) -> None:
-        """Close the sockets."""
-        self._subscriber.close()
+        # Renews a connection that is silent for long.
+        self.maintain = self._subscriber.maintain
+        self.close = self._subscriber.close
 
     def take_new(self, take: Callable[[Message | Verdict], bool]) -> None:
         """Give all messages that have arrived to ``take``."""
-        while (message := self._receive(0.0)) is not None:
-            take(message)
-
-    def _receive(self, timeout_s: float) -> Message | Verdict | None:
-        received = self._subscriber.receive(timeout_s)
-        return None if received is None else received[1]
+        while (received := self._subscriber.receive()) is not None:
+            take(received[1])
 
     def take_until(self, take: Callable[[Message | Verdict], bool]) -> None:
         """The same until ``take`` returns True for one, the other process is gone, or the time is up."""
         deadline = time.monotonic() + LOCKSTEP_WAIT_S
         while True:
-            message = self._receive(WAIT_SLICE_S)
-            if message is not None:
-                if take(message):
+            received = self._subscriber.receive(WAIT_SLICE_S)
+            if received is not None:
+                if take(received[1]):
                     return
             elif self._subscriber.is_cut or time.monotonic() > deadline:
                 return
@@ -74,68 +59,27 @@ class PeerSubscriber:
                 self._on_wait()
 
 
-class VerdictSocket:
-    """Danger's end of the socket of verdicts, a datagram each.
-
-    The bus has the verdict for displays. Main waits for it in each frame, and the bus passes a message through a thread
-    on each side, with some twenty system calls; this takes two.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = str(path)
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-
-    def send(self, verdict: Verdict) -> None:
-        """Send; the verdict is dropped where main is not there, or has not received the last ones."""
-        with suppress(OSError):
-            self._socket.sendto(_encode(verdict), socket.MSG_DONTWAIT, self._path)
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
-
-
 class VerdictSubscriber(PeerSubscriber):
-    """Receives danger's verdicts, as datagrams at ``path``; ``timeout_s``: an older one is not in force."""
+    """Receives danger's verdicts; ``timeout_s``: an older one is not in force."""
 
     def __init__(
         self,
         context: zmq.Context[zmq.Socket[bytes]],
         endpoint: str,
-        path: Path,
         timeout_s: float,
         on_wait: Callable[[], None] = lambda: None,
     ) -> None:
-        super().__init__(context, endpoint, ("heartbeat.danger",), on_wait)
-        path.unlink(missing_ok=True)
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._socket.bind(str(path))
-        self._timeout_s, self._wall_s, self._is_danger_joined = timeout_s, 0.0, False
+        super().__init__(context, endpoint, ("verdict", "heartbeat.danger"), on_wait)
+        self._timeout_s, self._wall_s = timeout_s, 0.0
         self.verdict: Verdict | None = None
-
-    def _receive(self, timeout_s: float) -> Message | Verdict | None:
-        self._socket.settimeout(timeout_s)
-        try:
-            return _decode(self._socket.recv(MAX_VERDICT_BYTES))
-        except (TimeoutError, BlockingIOError, msgspec.MsgspecError):
-            return None
-
-    def maintain(self) -> None:
-        """See ``PeerSubscriber``; and take the heartbeats, which would pile up."""
-        while (received := self._subscriber.receive()) is not None:
-            message = received[1]
-            if isinstance(message, Heartbeat) and message.phase == "joined":
-                self._is_danger_joined = True
-
-    def close(self) -> None:
-        """See ``PeerSubscriber``."""
-        super().close()
-        self._socket.close()
 
     def is_danger_joined(self) -> bool:
         """Whether danger has reported that it joined the robot; it repeats that."""
-        self.maintain()
-        return self._is_danger_joined
+        while (received := self._subscriber.receive()) is not None:
+            message = received[1]
+            if isinstance(message, Heartbeat) and message.phase == "joined":
+                return True
+        return False
 
     def reset(self) -> None:
         """The robot's frames restarted: forget the verdict."""

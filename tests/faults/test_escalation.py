@@ -147,7 +147,7 @@ class Waiting:
     def __init__(self, *_: object, **__: object) -> None:
         self.messages: deque[EstimateMessage] = deque()
 
-    def receive(self, _timeout_s: float = 0.0) -> tuple[str, EstimateMessage] | None:
+    def receive(self) -> tuple[str, EstimateMessage] | None:
         return ("estimate", self.messages.popleft()) if self.messages else None
 
     def maintain(self) -> None:
