@@ -6,7 +6,7 @@ the order of ``scipy.linalg.blas``: keywords cost three times what a product of 
 
 import numpy as np
 from numpy import ndarray
-from scipy.linalg.blas import daxpy, dcopy, ddot, dgemm, dsymm, dtrmm, dtrsm
+from scipy.linalg.blas import daxpy, dcopy, ddot, dgemm, dsymm, dsyrk, dtrmm, dtrsm
 from scipy.linalg.lapack import dgeqrf, dpotrf
 
 from ccatp.core import FloatArray
@@ -48,7 +48,7 @@ class _Rows:
         self.spread = 1.0, self.H, self.V, 0.0, self.S, 1, 0, 1  # S = H V
         self.factor = self.S, 1, 0, 1  # S -> C
         self.solve = 1.0, self.S, self.V, 1, 1, 1, 0, 1  # V -> V C^-T
-        self.reduce = -1.0, self.V, self.V, 1.0, M, 0, 1, 1  # M -> M - V V^T
+        self.reduce = -1.0, self.V, 1.0, M, 0, 0, 1  # M -> M - V V^T
         self.squares = self.V_flat, self.V_flat, m, n, n + 1, n, n + 1  # y^T y
         self.load = self.H.ravel(order="K"), self.V_flat
         self.rotate = 1.0, U, self.V, 0, 0, 0, 0, 1  # V -> U V
@@ -64,10 +64,8 @@ class KalmanFilter:
 
     The printed form of 2.10 loses symmetry and then definiteness by rounding. With S = H P H^T + R = C C^T,
     V = P H^T C^-T and y = C^-1 nu the same posterior is x + V y, P - V V^T, and y^T y is the normalised innovation
-    squared. Mean and covariance are kept as one matrix M = [P -x; -x^T 0]: a product with M is one with P and one with
-    x, and one product, of V above y^T with its transpose, gives all three results. Both triangles of M are computed,
-    because general products of small matrices cost less than symmetric ones. They differ by rounding; results are taken
-    from the upper one, and a prediction begins with it alone, so that the difference does not grow.
+    squared. Mean and covariance are kept as one matrix M = [P -x; -x^T 0], of which only the upper triangle is used:
+    a product with M is one with P and one with x, and one symmetric product, of V above y^T, gives all three results.
 
     The subtraction errs by 1e-16 of the prior. Where the posterior is much smaller, or rows nearly repeat each other, a
     QR factorisation takes its place (``_rotate``).
@@ -80,14 +78,13 @@ class KalmanFilter:
         self._M, kept, product, self._U, self._C = (np.zeros((n + 1, n + 1), order="F") for _ in range(5))
         self._F, Q = np.eye(n + 1), np.zeros((n + 1, n + 1))  # with the row and the column of the mean
         M, self._flat = self._M, self._M.ravel(order="K")
-        self._P_rows, self._minus_x, self._minus_x_row = M.T[:n, :n], M[:n, n], M[n, :n]
+        self._P_rows, self._minus_x, self._diagonal = M.T[:n, :n], M[:n, n], self._flat[: -1 : n + 2]
         self._F_rows, self._Q_rows = self._F[:n, :n], Q[:n, :n]
         self._keep = self._flat, kept.ravel(order="K")
         self._restore = self._keep[::-1]
         self._multiply = 1.0, M, self._F.T, 0.0, product, 0, 0, 1  # product = M F^T
         self._load = Q.ravel(), self._flat
         self._propagate = 1.0, self._F.T, product, 1.0, M, 1, 0, 1  # M -> F product + M
-        self._square = 1.0, self._U, self._U, 0.0, M, 1, 0, 1  # M = U^T U
         self._squares = self._flat, self._flat
         self._load_root = self._flat, self._U.ravel(order="K")
         self._U_column, self._U_row, self._unit = self._U[:, n], self._U[n, :n], np.eye(n + 1)[n]
@@ -158,7 +155,7 @@ class KalmanFilter:
                 return Innovation(np.empty(0), 0.0)
             rows = self._new_rows(z.size)
         rows.H_rows[...] = H
-        dgemm(*rows.project)
+        dsymm(*rows.project)
         n = self._n
         daxpy(z, rows.V_flat, shape[0], 1.0, 0, 1, n, n + 1)
         return self._condition(rows, R)
@@ -170,8 +167,7 @@ class KalmanFilter:
         raise FilterModelError("KalmanFilter", h)
 
     def _start(self, mean: FloatArray, covariance: FloatArray) -> None:
-        self._minus_x[:] = self._minus_x_row[:] = -mean
-        self._P_rows[:] = covariance
+        self._minus_x[:], self._P_rows[:] = -mean, covariance
         self._F_rows[:] = np.eye(self._n)
         self._mean = self._covariance = None
 
@@ -205,7 +201,7 @@ class KalmanFilter:
         nis: float = ddot(*rows.squares)
         if not nis < HUGE:
             raise FilterDiverged(f"update is not finite: NIS {nis:.3g}, residuals {residual}")
-        dgemm(*rows.reduce)
+        dsyrk(*rows.reduce)
         self._flat[-1] = 0.0
         self._mean = self._covariance = None
         return Innovation(residual, nis)
@@ -247,9 +243,8 @@ class KalmanFilter:
         if not nis + ddot(minus_x, minus_x) < HUGE:
             raise FilterDiverged(f"update is not finite: NIS {nis:.3g}, residuals {residual}")
         self._U_row[...] = 0.0
-        dgemm(*self._square)
-        self._minus_x[...] = self._minus_x_row[...] = minus_x
-        self._flat[-1] = 0.0
+        dsyrk(1.0, U, 0.0, self._M, 1, 0, 1)
+        self._minus_x[...], self._flat[-1] = minus_x, 0.0
         self._mean = self._covariance = None
         return Innovation(residual, nis)
 
@@ -269,7 +264,7 @@ class ExtendedKalmanFilter(KalmanFilter):
         if not ddot(x, x) < HUGE:
             raise FilterDiverged(f"prediction is not finite: mean {x.tolist()}")
         self.predict(jacobian, Q)
-        self._minus_x[...] = self._minus_x_row[...] = -x
+        np.negative(x, self._minus_x)
 
     def _update_model(self, z: FloatArray, h: Observation, R: FloatArray) -> Innovation:
         expected, jacobian = h.at(self.mean)
@@ -284,7 +279,7 @@ class ExtendedKalmanFilter(KalmanFilter):
             return Innovation(np.empty(0), 0.0)
         rows = self._rows.get(z.shape) or self._new_rows(m)
         rows.H_rows[...] = jacobian
-        dgemm(*rows.project)
+        dsymm(*rows.project)
         np.subtract(z, expected, rows.residual)
         return self._condition(rows, R)
 
