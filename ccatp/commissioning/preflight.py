@@ -13,8 +13,8 @@ from ccatp.links.multiline import Environment
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import ConvergenceError
+from ccatp.survey.checks import MirrorCheck
 from ccatp.survey.composition import robot_problems
-from ccatp.survey.reactions import MirrorCheck
 
 
 class CheckOutcome(StrEnum):

@@ -30,9 +30,9 @@ from ccatp.records.store import MissionStore
 from ccatp.safety.wheel_monitors import CommandSpan
 from ccatp.survey.behaviours import HOLD_POSITION, MissionCommand
 from ccatp.survey.budget import home_time_s
+from ccatp.survey.checks import FaultAction, MirrorCheck, UnattendedFaultTimer
 from ccatp.survey.composition import SurveyParts
 from ccatp.survey.fix_gate import FixGate
-from ccatp.survey.reactions import FaultAction, MirrorCheck, UnattendedFaultTimer
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.state import (
     Abort,

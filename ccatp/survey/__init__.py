@@ -1,4 +1,4 @@
-"""The survey of a mirror: states, reactions to verdicts, behaviours, fix gate, route planning.
+"""The survey of a mirror: one frozen state, pure steps, reactions to verdicts, behaviours, fix gate, route planning.
 
-See ``mission.Mission``.
+See ``statechart.Survey``.
 """

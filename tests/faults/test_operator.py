@@ -25,9 +25,9 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.safety.emergency_latch import EmergencyLatch
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.budget import home_time_s
+from ccatp.survey.checks import FaultAction, UnattendedFaultTimer
 from ccatp.survey.planning.route import RoutePlanner
 from ccatp.survey.planning.search import path_time
-from ccatp.survey.reactions import FaultAction, UnattendedFaultTimer
 from ccatp.survey.state import (
     BACKING_OFF,
     DONE,

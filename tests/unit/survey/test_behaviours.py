@@ -16,9 +16,9 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.safety.edge_detector import Cause
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.behaviours import SETTLE_LIMIT_S, Retreat, RetreatStep, Settling, Standstill
+from ccatp.survey.checks import PATIENCE_S, READINGS, MirrorCheck
 from ccatp.survey.fix_gate import ApproachCounter
 from ccatp.survey.planning.escape import is_on_drive
-from ccatp.survey.reactions import PATIENCE_S, READINGS, MirrorCheck
 from ccatp.survey.route_follower import Corrector, LegAim, StateEstimate, plan_aim
 from ccatp.survey.state import Pause, Resume
 

@@ -1,4 +1,4 @@
-"""How a survey reacts to the danger loop's verdict, an unattended fault, and a mirror that contradicts gravity."""
+"""Checks of a survey beside its frames: a fault that nobody looks after, and a mirror that contradicts gravity."""
 
 from collections.abc import Sequence
 from enum import StrEnum
