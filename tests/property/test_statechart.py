@@ -126,12 +126,12 @@ def walk(config: Config, mirror: Mirror, seed: int, steps: int) -> int:
 
 
 def test_no_motion_against_a_row_in_any_order_of_verdicts_and_events(config: Config, mirror: Mirror) -> None:
-    assert walk(config, mirror, 1, 20_000) > 1_000  # of them it drove
+    assert walk(config, mirror, 1, 20_000) > 1_000  # a tenth is usual; else it was held all the time
 
 
 @pytest.mark.slow
 def test_no_motion_against_a_row_in_a_million_steps(config: Config, mirror: Mirror) -> None:
-    assert sum(walk(config, mirror, seed, 100_000) for seed in range(2, 12)) > 100_000
+    assert sum(walk(config, mirror, seed, 100_000) for seed in range(2, 12)) > 50_000  # a tenth is usual
 
 
 @pytest.mark.parametrize(("first", "second"), list(product(VERDICTS, VERDICTS)))
