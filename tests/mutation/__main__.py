@@ -70,6 +70,7 @@ class Runner:
             threading.setprofile(None)
             assert is_sound, f"{item.nodeid} fails without a mutant"
             self._cost_s[item] = time.process_time() - began_s
+        gc.unfreeze()  # a loop that ran in a test has frozen what there was, and hidden it
         self._functions = [one for one in gc.get_objects() if isinstance(one, FunctionType)]
         self._functions = [one for one in self._functions if one.__code__.co_filename in self._files]
         self._work(self)
