@@ -301,8 +301,7 @@ class MainLoop(RobotLoop):
             return
         waiting = time.perf_counter()
         verdict = None
-        # Danger judges each frame once, the first one of this session perhaps before the session began.
-        if not (frame.is_first and (self._args.is_taking_over or self.sessions > 1)):
+        if not frame.is_first:  # of a session; no frame of it came before, on which there could be one
             verdict = self._verdicts.latest(seq, self.frame_period_s, is_lockstep=self.is_lockstep)
         decided = time.perf_counter()
         self._answer(seq, self._decide(frame, verdict))

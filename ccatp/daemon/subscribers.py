@@ -72,6 +72,7 @@ class VerdictSubscriber(PeerSubscriber):
         super().__init__(context, endpoint, ("verdict", "heartbeat.danger"), on_wait)
         self._timeout_s, self._wall_s = timeout_s, 0.0
         self.verdict: Verdict | None = None
+        self._early: Verdict | None = None
 
     def is_danger_joined(self) -> bool:
         """Whether danger has reported that it joined the robot; it repeats that."""
@@ -83,24 +84,33 @@ class VerdictSubscriber(PeerSubscriber):
 
     def reset(self) -> None:
         """The robot's frames restarted: forget the verdict."""
-        self.verdict = None
+        self.verdict = self._early = None
 
     def latest(self, seq: int, frame_s: float, *, is_lockstep: bool) -> Verdict | None:
-        """The verdict in force for frame ``seq``: in lockstep that of this frame, else the newest that is fresh."""
+        """The verdict in force for frame ``seq``: in lockstep that of the frame before, else the newest that is fresh.
+
+        In lockstep danger judges a frame while main serves it. Where danger did not judge the frame before, the
+        verdict on an earlier one counts as long as it is fresh.
+        """
         newest = seq + MAX_FRAMES_AHEAD
 
         def take(message: Message | Verdict) -> bool:
-            if isinstance(message, Verdict) and message.seq <= newest:
-                self.verdict, self._wall_s = message, time.monotonic()
-                return message.seq >= seq
-            return False
+            if not isinstance(message, Verdict) or message.seq > newest:
+                return False
+            if is_lockstep and message.seq >= seq:
+                self._early = message
+                return True
+            self.verdict, self._wall_s = message, time.monotonic()
+            return message.seq >= seq - 1
 
+        if self._early is not None and self._early.seq < seq:
+            self.verdict, self._early = self._early, None
         if not is_lockstep:
             self.take_new(take)
-        elif self.verdict is None or self.verdict.seq < seq:
+        elif self._early is None and (self.verdict is None or self.verdict.seq < seq - 1):
             self.take_until(take)
         verdict = self.verdict
-        if verdict is None or (is_lockstep and verdict.seq < seq):
+        if verdict is None or (is_lockstep and verdict.seq < seq - 1 and self._early is None):
             return None
         age_s = max((seq - verdict.seq) * frame_s, 0.0)
         if not is_lockstep:

@@ -70,6 +70,7 @@ class BeaconSilWorld:
         self._reader = MeasurementReader(cfg)
         self._summary = BeaconSummary(beacon_facts(cfg, is_sim=True))
         self._estimate: EstimateMessage | None = None
+        self._verdict: Verdict | None = None
         self._signal = ""
         self.robot.join("controller")
         self.robot.join("monitor")
@@ -86,9 +87,11 @@ class BeaconSilWorld:
         if not isinstance(sensors, Sensors):
             raise TypeError(f"not a sensors frame: {line[:80]!r}")
         extras = decode_beacon_frame(line)
-        verdict = self.danger.step(sensors, extras, self._estimate)
+        # The decision in a frame goes by the verdict on the one before.
+        in_force, verdict = self._verdict, self.danger.step(sensors, extras, self._estimate)
+        self._verdict = verdict
         before = len(self.mission.arrivals)
-        drive = self.mission.step(self._reader.read(sensors, extras), self.robot.frame_s, verdict)
+        drive = self.mission.step(self._reader.read(sensors, extras), self.robot.frame_s, in_force)
         drive = HALT if self.mission.state.mode is DONE else drive
         self._note(sensors, verdict, drive)
         for arrival in self.mission.arrivals[before:]:

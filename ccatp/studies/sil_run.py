@@ -14,7 +14,7 @@ import numpy as np
 from ccatp.config.models import Config
 from ccatp.control.motion_checks import as_standing
 from ccatp.control.tracker import CommandPredictor
-from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelId, PanelPose, PointId, difference, twist_of
+from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelId, PanelPose, PointId, Verdict, difference, twist_of
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.links import multiline
@@ -228,6 +228,7 @@ class SilRun:
         self.states_s: defaultdict[MissionState, float] = defaultdict(float)
         self.notices: list[str] = []
         self._published: EstimateMessage | None = None
+        self._verdict: Verdict | None = None
         self._sigma_of = lambda: self.localizer.position_sigma_m
         self._code = EventCode.NORMAL
         self._drive_seq = 0
@@ -273,7 +274,8 @@ class SilRun:
         localizer, mission, robot = self.localizer, self.mission, self.robot
         seq, t_s = frame.seq, frame.t
         # Main publishes a pose in five frames; the verdict on a frame waits for the newest that is due before it.
-        verdict = self.monitor.step(frame, self._published)
+        before, verdict = self._verdict, self.monitor.step(frame, self._published)
+        self._verdict = verdict
         if verdict.code is not self._code:
             self._code = verdict.code
             self.trace.builder.add_verdict_event(seq, verdict.code)
@@ -283,13 +285,13 @@ class SilRun:
             mission.handle(EstimateDiverged(localizer.hold_cause, t_s + self._time.offset_s))
             localizer.clear_hold()
         motion = self._motion(frame, dt_s)
-        order = mission.step(motion, verdict)
+        order = mission.step(motion, before)  # the decision in a frame goes by the verdict on the one before
         if order.inflates_covariance:
             localizer.inflate_covariance(self.cfg.health.doubt_position_m, self.cfg.health.doubt_heading_rad)
         if mission.state.full_fans and not self._has_full_fans:
             self._has_full_fans = True
             robot.command_fans(2, 1.0, 1.0)
-        right, left = self.gate.pass_through(order.twist, verdict, dt_s, t_s, 0.0, mission.state.purpose)
+        right, left = self.gate.pass_through(order.twist, before, dt_s, t_s, 0.0, mission.state.purpose)
         if order.at_rest:
             localizer.rest()
             if order.arrived is not None:
