@@ -21,12 +21,7 @@ from math import isfinite
 
 import msgspec
 
-from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
-from ccatp.core import Corner, EdgeSample, EmergencyKind, EventCode, Severity, Verdict, WheelSample
-from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import EstimateMessage
-from ccatp.mirror.mirror import Mirror
-from ccatp.safety.conditions import (
+from ccatp.conditions import (
     ALL_OFF,
     CENTRE_NEAR_RIM,
     EDGE_SENSOR_STAYS_OFF,
@@ -41,6 +36,11 @@ from ccatp.safety.conditions import (
     NO_FRAME,
     MonitorFinding,
 )
+from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
+from ccatp.core import Corner, EdgeSample, EmergencyKind, EventCode, Severity, Verdict, WheelSample
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import EstimateMessage
+from ccatp.mirror.mirror import Mirror
 from ccatp.safety.edge_detector import EdgeDetector, EdgeMap, EdgePhase
 from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 from ccatp.safety.emergency_latch import INFORMED_AFTER_FRAMES, EmergencyLatch, is_at_base_or_held

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from ccatp.beacons.navigation import BeaconMeasurements, MoteNavigator, Navigator, PoseBelief, RadioNavigator
 from ccatp.beacons.pilot import BeaconPilot
 from ccatp.beacons.steering import HALT, SteeringCommand
+from ccatp.conditions import EARTHQUAKE, MISSION_TOO_LONG, NO_VERDICT
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import EventCode, Severity, Verdict
 from ccatp.errors import ConfigError
@@ -30,9 +31,6 @@ class BeaconState(StrEnum):
 
 
 IDLE, MAPPING, VISITING, FOLLOWING, RETURNING, HELD, DONE = BeaconState
-
-# Nothing moves while the ground shakes.
-EARTHQUAKE = "emergency: earthquake"
 
 
 def permitted(drive: SteeringCommand, verdict: Verdict, back_speed_m_s: float) -> SteeringCommand:
@@ -146,15 +144,15 @@ class BeaconMissionState(msgspec.Struct, frozen=True):
         s = replace(s, raised=verdict.raised)
         if s.interlock:
             return s
-        s = replace(s, interlock=EARTHQUAKE, abort_cause=s.abort_cause or EARTHQUAKE)
-        return s.held(EARTHQUAKE, by_hand=s.mode is HELD and s.is_by_hand)
+        s = replace(s, interlock=EARTHQUAKE.message, abort_cause=s.abort_cause or EARTHQUAKE.message)
+        return s.held(EARTHQUAKE.message, by_hand=s.mode is HELD and s.is_by_hand)
 
     def react(self, verdict: Verdict | None) -> "tuple[BeaconMissionState, bool]":
         """Do what a verdict demands; whether the robot may go about its business."""
         if self.mode is DONE:
             return self, False
         if verdict is None:
-            return self.interrupted("no fresh verdict from the danger loop"), False
+            return self.interrupted(NO_VERDICT.message), False
         s = self._with_levels(verdict)
         if verdict.severity is Severity.FAULT:
             return s.faulted(verdict.cause), False
@@ -235,7 +233,7 @@ class BeaconMission:
             return HALT
         limit_s = self._cfg.mission.time_limit_s
         if t_s - self._begun_s > limit_s and self.state.mode is not IDLE and not self.state.abort_cause:
-            self.state = self.state.faulted(f"the mission takes longer than mission.time_limit_s = {limit_s:g}")
+            self.state = self.state.faulted(MISSION_TOO_LONG.text(limit_s=limit_s))
             return HALT
         drive = self._wanted(measurements, interval_s)
         return permitted(drive, verdict, self._cfg.avoidance.back_speed_m_s)

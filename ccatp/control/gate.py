@@ -7,6 +7,7 @@ that direction whatever its permits say, and a survey moves under a normal verdi
 from enum import Enum, StrEnum
 from math import isfinite
 
+from ccatp.conditions import FANS_REFUSED
 from ccatp.config.models import LimitsConfig
 from ccatp.core import EventCode, Twist, Verdict, wheel_rates
 
@@ -164,5 +165,5 @@ class FanGate:
             else:
                 continue
             self.refused += 1
-            return f"fan command refused: {why}; set robot.fan_duty"
+            return FANS_REFUSED.text(why=why)
         return None

@@ -20,6 +20,7 @@ from ccatp.beacons.mission import (
 from ccatp.beacons.navigation import BeaconMeasurements, Ellipse, MeasurementReader
 from ccatp.beacons.steering import HALT
 from ccatp.beacons.store import BeaconStore
+from ccatp.conditions import FRAMES_MISSED
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import Verdict
 from ccatp.daemon.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionRunner, TimedFrame
@@ -114,7 +115,7 @@ class BeaconRunner(MissionRunner):
     def on_tracking_gap(self) -> None:
         """A fault: the robot's place is not known, and its map depends on that."""
         self._reader.forget()
-        self.mission.handle(Fault("no frames while the robot moved: put it at its start and start a new mission"))
+        self.mission.handle(Fault(FRAMES_MISSED.message))
 
     def publish_state(self) -> None:
         state, before, was_faulted = self.mission.state, self._state, self._was_faulted

@@ -6,6 +6,7 @@ from concurrent.futures import Future
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from ccatp.conditions import DISK_STALLS, FIX_NOT_STORED, SKIP_NOT_STORED
 from ccatp.config.models import MissionConfig
 from ccatp.core import DeckPose, Fix, PointId, Vector3
 from ccatp.daemon.telemetry import Telemetry
@@ -177,7 +178,7 @@ class FixService:
             try:
                 await self._await_commit(self._store.record_skipped(request.point, request.t_s), request.point)
             except StoreError as error:
-                self._mission.handle(Fault(f"that {_name(request.point)} is skipped cannot be stored: {error}"))
+                self._mission.handle(Fault(SKIP_NOT_STORED.text(point=_name(request.point), why=error)))
                 return
         self._mission.handle(FixFailed(request.point, cause, self._heading_sigma_of()))
 
@@ -194,7 +195,7 @@ class FixService:
             except AlreadyMeasuredError as error:
                 self._notify("warning", str(error))  # nothing is lost, and nobody has to be waited for
             except StoreError as error:
-                mission.handle(Fault(f"the fix of {_name(request.point)} cannot be stored: {error}"))
+                mission.handle(Fault(FIX_NOT_STORED.text(point=_name(request.point), why=error)))
                 return
         self._mission.handle(FixStored(request.point, self._heading_sigma_of()))
 
@@ -211,7 +212,7 @@ class FixService:
                 self._notify("warning", f"the disk is slow: {_name(point)} waits for its commit")
                 await asyncio.wait([waiting], timeout=STALLED_DISK_S - SLOW_DISK_S)
             if not waiting.done():
-                self._mission.handle(Fault(f"the disk stalls: {_name(point)} is not stored after {STALLED_DISK_S:g} s"))
+                self._mission.handle(Fault(DISK_STALLS.text(point=_name(point), time_s=STALLED_DISK_S)))
                 self._on_finished()
             await waiting
         finally:

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import zmq
 
+from ccatp.conditions import FRAME_LATE, LINK_LOST, NO_FRAME_FOR, condition_of
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import Verdict
 from ccatp.daemon.mission_runner import STILL, DriveCommand, MissionClock, MissionRunner, TimedFrame
@@ -22,7 +23,6 @@ from ccatp.links.channels import BadRequest, OperatorCommand, format_error, form
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.rpc import Router
 from ccatp.links.topics import MissionStatus
-from ccatp.survey.conditions import advice_for
 from ccatp.survey.state import Abort, Interrupted, Pause, Resume, StopHere
 
 # After the end the last messages must reach the supervisor, which then ends this process.
@@ -134,8 +134,9 @@ class MainLoop(RobotLoop):
         # The robot's motion since the last frame shows in the next one, if that comes soon.
         self._was_at_rest = self._runner.is_at_rest
         self.heartbeat.phase, self._unanswered = "rejoining", None
-        self._runner.mission.handle(Interrupted(f"robot link lost: {reason}"))
-        self._telemetry.notify_operator("warning", f"robot link lost: {reason}; reconnecting")
+        cause = LINK_LOST.text(reason=reason)
+        self._runner.mission.handle(Interrupted(cause))
+        self._telemetry.notify_operator("warning", f"{cause}; reconnecting")
 
     def _fail(self, error: Exception) -> None:
         """End this process, held; the supervisor restarts it."""
@@ -201,8 +202,8 @@ class MainLoop(RobotLoop):
         if self._runner.is_busy:
             return "waiting for a measurement of the laser system; is it ready, the line of sight free?"
         cause = state.cause or str(state.mode)
-        advice = advice_for(cause) or ("'ccatp resume' goes on" if state.is_paused else "it goes on by itself")
-        return f"{state.mode}: {cause}; {advice}"
+        row, otherwise = condition_of(cause), "'ccatp resume' goes on" if state.is_paused else "it goes on by itself"
+        return f"{state.mode}: {cause}; {row.advice if row is not None else otherwise}"
 
     def is_frame_due(self) -> bool:
         return self._unanswered is None
@@ -210,7 +211,7 @@ class MainLoop(RobotLoop):
     def on_silence(self, age_s: float) -> None:
         if age_s <= self.robot_cfg.sensors_timeout_s:
             return
-        if self._interrupt(f"no sensors frame for {age_s:.2f} s"):
+        if self._interrupt(NO_FRAME_FOR.text(age_s=age_s)):
             self._telemetry.notify_operator("warning", self._runner.mission.state.cause)
             self.send_drive(self.clock.seq, STILL)
 
@@ -326,7 +327,7 @@ class MainLoop(RobotLoop):
                 return runner.hold(frame)
             verdict = None
             # Paused until frames are prompt again.
-            if self._interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):
+            if self._interrupt(FRAME_LATE.text(lag_ms=1e3 * lag_s)):
                 lateness_ms, limit_ms = 1e3 * lag_s, 1e3 * limit_s
                 self.log.warning("frame_late", seq=self.clock.seq, lateness_ms=lateness_ms, limit_ms=limit_ms)
         drive = runner.plan(frame, verdict, lag_s)

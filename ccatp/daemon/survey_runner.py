@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from ccatp.conditions import UNATTENDED_FAULT
 from ccatp.config.models import Config
 from ccatp.control.gate import Denial, DriveGate, FanGate
 from ccatp.control.motion_checks import as_standing
@@ -343,8 +344,7 @@ class SurveyRunner(MissionRunner):
                 "error", f"held for {held_s:.0f} s, waiting for an operator: {mission.state.cause}"
             )
         elif action is FaultAction.RETURN:
-            cause = f"unattended fault: the battery ({sensors.soc:.0%}) lasts for little more than the way home"
-            mission.handle(Abort(cause))
+            mission.handle(Abort(UNATTENDED_FAULT.text(charge=sensors.soc)))
 
     def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
         mission, seq = self.mission, self._clock.seq

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from math import hypot, inf, isfinite
 from operator import lt
 
+from ccatp.conditions import FILTER_DIVERGED, FRAMES_BACKWARD, SENSOR_BACKWARD
 from ccatp.control.motion_checks import ImuGate, WheelMeans
 from ccatp.core import EdgeSample, GravitySample, ImuSample, WheelSample
 from ccatp.filters.base import FilterDiverged
@@ -200,7 +201,7 @@ class LocalizerBase(ABC):
         intake = self._intake
         imu, (right, left) = intake.imu(t_s, imu), intake.wheels(t_s, encoders)
         if intake.backward_source:
-            self._request_hold(f"time stamps of the {intake.backward_source} run backward")
+            self._request_hold(SENSOR_BACKWARD.text(sensor=intake.backward_source))
             intake.backward_source = ""
         try:
             self._use(t_s, dt_s, imu, right, left, edges, gravity)
@@ -222,13 +223,13 @@ class LocalizerBase(ABC):
                 return True
             self.counts["suspect_frames"] += 1
         if self._stale_run >= BACKWARD_LIMIT:
-            self._request_hold("time stamps of the frames run backward")
+            self._request_hold(FRAMES_BACKWARD.message)
         return False
 
     def _freeze(self, error: FilterDiverged) -> None:
         self.is_frozen = True
         self.counts["diverged"] += 1
-        self._request_hold(f"filter: {error}")
+        self._request_hold(FILTER_DIVERGED.text(why=error))
 
     def _request_hold(self, cause: str) -> None:
         self.hold_cause = self.hold_cause or cause

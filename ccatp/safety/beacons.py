@@ -19,12 +19,7 @@ from collections.abc import Sequence
 from math import atan2, cos, hypot, inf, isfinite, log, pi, sin, sqrt
 from typing import NamedTuple
 
-from ccatp.config.beacon_models import RadioConfig
-from ccatp.core import EmergencyKind, EventCode, Severity, Verdict, wrap_pi
-from ccatp.links.beacon_messages import BeaconFrame
-from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import EstimateMessage
-from ccatp.safety.conditions import (
+from ccatp.conditions import (
     EMERGENCY,
     NO_FRAME,
     NO_FRESH_ESTIMATE,
@@ -35,6 +30,11 @@ from ccatp.safety.conditions import (
     TARGET_NEAR,
     MonitorFinding,
 )
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.core import EmergencyKind, EventCode, Severity, Verdict, wrap_pi
+from ccatp.links.beacon_messages import BeaconFrame
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import EstimateMessage
 from ccatp.safety.emergency_latch import INFORMED_AFTER_FRAMES, EmergencyLatch, is_at_base_or_held
 
 

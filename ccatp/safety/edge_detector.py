@@ -1,9 +1,10 @@
 """One edge sensor off the panels: where it went off, how far it has moved since, and when that is an edge."""
 
-from enum import Enum, StrEnum, auto
+from enum import Enum, auto
 from math import cos, hypot, inf, sin, sqrt
 from typing import Literal, NamedTuple
 
+from ccatp.conditions import Cause
 from ccatp.config.models import DangerConfig
 from ccatp.core import DeckPose, PanelId
 from ccatp.mirror.mirror import Mirror
@@ -92,15 +93,6 @@ class EdgePhase(Enum):
     NO_MAP = auto()  # the map does not explain it
     RIM = auto()  # the map has the rim ahead
     DECLARED = auto()  # an edge
-
-
-class Cause(StrEnum):
-    """Why an edge was declared."""
-
-    RIM = "rim ahead on the map"
-    SEAM = "further off the panel than the seam is wide"
-    NO_MAP = "off the panel where the map has no seam"
-    SILENT_WHEELS = "off the panel while the wheels are not heard"
 
 
 class EdgeLimits:

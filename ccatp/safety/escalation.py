@@ -4,9 +4,9 @@ from collections import deque
 from collections.abc import Iterable
 from math import inf
 
+from ccatp.conditions import PRECEDENCE, MonitorFinding
 from ccatp.config.models import HealthConfig
 from ccatp.core import Severity
-from ccatp.safety.conditions import PRECEDENCE, MonitorFinding
 
 
 class FindingLatch:

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Sequence
 from math import hypot
 
+from ccatp.conditions import CLOCK_JUMPED, FRAMES_LOST, LINES_GARBLED, MonitorFinding
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
 from ccatp.control.motion_checks import ImuGate, MotionSum, SlidingWindow, WheelMeans
 from ccatp.core import EdgeSample, ImuSample, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror
-from ccatp.safety.conditions import CLOCK_JUMPED, FRAMES_LOST, LINES_GARBLED, MonitorFinding
 from ccatp.safety.escalation import FindingLatch
 from ccatp.safety.sensor_monitors import (
     BatteryMonitor,

@@ -4,10 +4,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from math import hypot, inf
 
-from ccatp.config.models import HealthConfig, RobotConfig
-from ccatp.core import Corner, DeckPose, EdgeSample, PanelId
-from ccatp.mirror.mirror import Mirror
-from ccatp.safety.conditions import (
+from ccatp.conditions import (
     BATTERY_LOW,
     BATTERY_REPORTED,
     DRIVES_LATE,
@@ -29,6 +26,9 @@ from ccatp.safety.conditions import (
     UNKNOWN_REPORTED,
     MonitorFinding,
 )
+from ccatp.config.models import HealthConfig, RobotConfig
+from ccatp.core import Corner, DeckPose, EdgeSample, PanelId
+from ccatp.mirror.mirror import Mirror
 from ccatp.safety.escalation import FindingLatch, Since
 
 _CORNERS = tuple(corner.value for corner in Corner)

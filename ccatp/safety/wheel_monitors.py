@@ -4,10 +4,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ccatp.config.models import HealthConfig, RobotConfig
-from ccatp.control.motion_checks import ImuGate, MotionSum
-from ccatp.core import WheelSample
-from ccatp.safety.conditions import (
+from ccatp.conditions import (
     ENCODER_BROKEN,
     ENCODER_COUNTS_NOTHING,
     IMU_LEFT_OUT,
@@ -20,6 +17,9 @@ from ccatp.safety.conditions import (
     YAW_DISAGREES,
     MonitorFinding,
 )
+from ccatp.config.models import HealthConfig, RobotConfig
+from ccatp.control.motion_checks import ImuGate, MotionSum
+from ccatp.core import WheelSample
 from ccatp.safety.escalation import FindingLatch, Since
 
 # A servo of 0.1 s and a link of 40 ms have forgotten a command after this long, to within 2 %.

@@ -9,10 +9,10 @@ from math import copysign, hypot
 import msgspec
 from msgspec.structs import replace
 
+from ccatp.conditions import Cause
 from ccatp.config.models import ControlConfig, MissionConfig
 from ccatp.control.tracker import LegMotion, LegPhase, LegTracker
 from ccatp.core import EventCode, PanelPose, PointId, Stop, StopKind, Twist, Verdict, difference
-from ccatp.safety.edge_detector import Cause
 from ccatp.survey.route_follower import Leg, LegFollower, StateEstimate
 
 # Sums of frame periods are not exact: half a nanosecond must not cost a frame.

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from msgspec.structs import replace
 
+from ccatp.conditions import BACK_OFFS, EARTHQUAKE, NO_VERDICT, Clear, Motion
 from ccatp.core import Corner, EventCode, Severity, Verdict
-from ccatp.safety.conditions import Clear, Motion
 from ccatp.survey.behaviours import Retreat, ReturnHome
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.state import (
@@ -33,8 +33,6 @@ NONE, SLOW, HOLD, RETURN, FAULT = Severity.NONE, Severity.SLOW, Severity.HOLD, S
 _CORNERS = frozenset(Corner)
 # So long after a fix found the robot the danger loop has received where it is: a pose in five frames, and a verdict.
 _NOTICED_S = 0.2
-EARTHQUAKE = "emergency: earthquake"
-NO_VERDICT = "no fresh verdict from the danger loop"
 
 Reaction = tuple[SurveyState, bool]  # the state, and whether that is all for this frame
 Frame = tuple[StateEstimate, Verdict | None]
@@ -173,15 +171,17 @@ def _take_levels(s: SurveyState, t_s: float, v: Verdict | None) -> SurveyState:
 
 
 def _cause(v: Verdict | None) -> str:
-    return NO_VERDICT if v is None else v.cause
+    return NO_VERDICT.message if v is None else v.cause
 
 
 def _shaken(survey: "Survey", s: SurveyState, _motion: StateEstimate, v: Verdict | None) -> Reaction:
     """Nothing moves while the ground shakes; home when it is over, and a pose from before is not to be trusted then."""
     s = replace(s, emergency_epoch=0 if v is None else v.raised)
     if not s.interlock and s.mode is not DONE:
-        s = replace(s, interlock=EARTHQUAKE, abort_cause=s.abort_cause or EARTHQUAKE, fix=FixNeed.RELOCALIZE)
-        s = survey.hold(s, EARTHQUAKE, by_hand=s.is_held_by_hand)
+        s = replace(
+            s, interlock=EARTHQUAKE.message, abort_cause=s.abort_cause or EARTHQUAKE.message, fix=FixNeed.RELOCALIZE
+        )
+        s = survey.hold(s, EARTHQUAKE.message, by_hand=s.is_held_by_hand)
     # A fault has to be looked after by an operator, too.
     return s, v is not None and v.severity is not FAULT
 
@@ -255,7 +255,7 @@ def _retreat(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Verdict
         return s, True
     mission, backoffs = survey.cfg.mission, s.backoffs + 1
     if backoffs > mission.max_backoffs_per_stop:
-        cause = f"at the edge again after {mission.max_backoffs_per_stop} back-offs: is an edge sensor dirty?"
+        cause = BACK_OFFS.text(count=mission.max_backoffs_per_stop)
         return survey.fault(replace(s, backoffs=0), cause), True
     s = replace(
         s,

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ccatp.conditions import FRAME_REFUSED, LENGTHS_REFUSED
 from ccatp.config.models import Config, EtalonConfig
 from ccatp.core import DeckPose, Fix, FloatArray, PointId, Vector3
 from ccatp.estimation.fixes import DeckFoot, FixRefused, deck_foot
@@ -228,7 +229,7 @@ class FixGate:
         fault = None if is_lost else self._frame.look(fix.position_m, expected_m)
         if fault is not None and (is_first or fault.is_explained):
             where = "its base" if is_first else "the place it drove to"
-            return FixFinding(refusal=f"the laser system sees the robot {fault.distance_m:.2f} m from {where}: {fault}")
+            return FixFinding(refusal=FRAME_REFUSED.text(distance_m=fault.distance_m, place=where, why=fault))
         return FixFinding(doubt=self._judge.doubt(fix, pose, covariance))
 
     def refusal_of(self, lengths_m: Mapping[int, float], expected_m: Vector3) -> str:
@@ -236,7 +237,7 @@ class FixGate:
         if not self._is_first:
             return ""
         why = explain_lengths(self._cfg, expected_m, lengths_m, self._collimators_m)
-        return f"the laser system's lengths do not lead to the robot's base: {why}" if why else ""
+        return LENGTHS_REFUSED.text(why=why) if why else ""
 
 
 # A puck is within the tolerance when it is so by more than the fix may be wrong (guard band, ISO 14253-1); but a laser

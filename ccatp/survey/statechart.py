@@ -4,6 +4,17 @@ from collections.abc import Callable, Collection, Sequence
 
 from msgspec.structs import replace
 
+from ccatp.conditions import (
+    EARTHQUAKE,
+    LEG_OVERDUE,
+    MEASUREMENTS_FAILED,
+    NO_REST,
+    NO_WAY_HOME,
+    NO_WAY_ON,
+    NOT_FOUND,
+    STUCK_AT_EDGE,
+    TIME_USED_UP,
+)
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegPhase
 from ccatp.core import DeckPose, PointId, Severity, Stop, StopKind, Verdict
@@ -18,7 +29,7 @@ from ccatp.survey.behaviours import (
     Settling,
 )
 from ccatp.survey.budget import TimeBudget
-from ccatp.survey.failsafe import EARTHQUAKE, react
+from ccatp.survey.failsafe import react
 from ccatp.survey.heading_recovery import MOST_LEGS, HeadingRecovery
 from ccatp.survey.planning.escape import is_on_drive
 from ccatp.survey.planning.legs import PlanError
@@ -257,8 +268,7 @@ class Survey:
         return replace(s, behaviour=leg, mode=mode), MissionCommand(twist)
 
     def _overdue(self, s: SurveyState, stop: Stop) -> SurveyState:
-        where = f"({stop.x_m:.3f}, {stop.y_m:.3f}) m"
-        return self.fault(s, f"the leg to {where} is overdue: is a wheel blocked or slipping?")
+        return self.fault(s, LEG_OVERDUE.text(x_m=stop.x_m, y_m=stop.y_m))
 
     def _arrive(self, s: SurveyState, motion: StateEstimate) -> Step:
         return self._settle(self.apply(replace(s, behaviour=None), MissionEvent.ARRIVED), motion)
@@ -305,7 +315,7 @@ class Survey:
             else:
                 route = self._plan_rest(s.route, deck, {*s.done, *s.skipped})
         except PlanError as error:
-            return self.fault(s, f"no way on: {error}")
+            return self.fault(s, NO_WAY_ON.text(why=error))
         return replace(s, route=route, stop_index=0, behaviour=None, is_off_route=False)
 
     def _review_time(self, s: SurveyState, motion: StateEstimate) -> tuple[SurveyState, bool]:
@@ -319,7 +329,7 @@ class Survey:
         going_on = budget.review(progress, motion.t_s, motion.deck, left)
         s = replace(s, budget=progress)
         if going_on is None:
-            cause = s.abort_cause or f"the time budget of {budget.budget_s:g} s is used up"
+            cause = s.abort_cause or TIME_USED_UP.text(budget_s=budget.budget_s)
             return self.proceed(replace(s, abort_cause=cause)), False
         if going_on is left:
             return s, True
@@ -349,8 +359,7 @@ class Survey:
 
     def _check_rest(self, s: SurveyState, settling: Settling, motion: StateEstimate) -> SurveyState:
         if settling.is_overdue(motion.t_s):
-            speeds = f"{motion.speed_m_s:.4f} m/s, {motion.rate_rad_s:.4f} rad/s"
-            return self.fault(s, f"the robot does not come to rest: {speeds}")
+            return self.fault(s, NO_REST.text(v_m_s=motion.speed_m_s, omega_rad_s=motion.rate_rad_s))
         return replace(s, behaviour=settling)
 
     # -- edge and home ------------------------------------------------------------------------------------------------
@@ -364,8 +373,7 @@ class Survey:
         if retreat.step is RetreatStep.OVER or (retreat.step is RetreatStep.TURN_AWAY and s.abort_cause):
             return self.apply(replace(s, behaviour=None), MissionEvent.FIND), HOLD_POSITION
         if retreat.step is RetreatStep.STUCK:
-            cause = "stuck at the edge: no motion away from it is permitted, or none helps"
-            return replace(self.hold(s, cause, by_hand=False), stuck_s=motion.t_s), HOLD_POSITION
+            return replace(self.hold(s, STUCK_AT_EDGE.message, by_hand=False), stuck_s=motion.t_s), HOLD_POSITION
         return replace(s, behaviour=retreat), MissionCommand(twist)
 
     def _return(self, s: SurveyState, motion: StateEstimate) -> Step:
@@ -374,7 +382,7 @@ class Survey:
             try:
                 return replace(s, behaviour=ReturnHome(self._plan_home(motion.deck))), HOLD_POSITION
             except PlanError as error:
-                return self.fault(s, f"no way home: {error}"), HOLD_POSITION
+                return self.fault(s, NO_WAY_HOME.text(why=error)), HOLD_POSITION
         if home.is_at_base:
             s = self.apply(replace(s, outcome=SurveyOutcome.AT_BASE), MissionEvent.FINISHED)
             return s, MissionCommand(STILL, at_rest=True)
@@ -470,13 +478,13 @@ class Survey:
         s = replace(s, failures=0 if failures >= limit else failures)
         if point is None:
             if failures >= limit:
-                return self.fault(s, f"the robot cannot be found again: {cause}")
+                return self.fault(s, NOT_FOUND.text(why=cause))
             if isinstance(s.behaviour, Settling):  # it may not have stood quite still, and cannot do without
                 s = replace(s, behaviour=replace(s.behaviour, is_requested=False, is_repeated=True))
             return s
         s = replace(s, failure_causes={**s.failure_causes, point: cause}, due=_without(s.due, point))
         if failures >= limit:
-            s = self.fault(s, f"{limit} measurements in a row failed: {cause}")
+            s = self.fault(s, MEASUREMENTS_FAILED.text(count=limit, why=cause))
         return self._leave_stop(s, point, sigma_rad, is_measured=False)
 
     def _leave_pointless(self, s: SurveyState, heading_sigma_rad: float) -> SurveyState:
@@ -526,7 +534,7 @@ def _resume_refusal(s: SurveyState) -> str | None:
     if s.mode is not HELD:
         return f"the mission is not held but {s.mode}"
     if s.interlock or s.is_shaking:
-        return f"{s.interlock or EARTHQUAKE}: nothing moves until that is cleared"
+        return f"{s.interlock or EARTHQUAKE.message}: nothing moves until that is cleared"
     if s.is_latched and not s.abort_cause:
         return "an emergency of before is latched: 'ccatp clear' it first"
     if s.severity >= Severity.HOLD and s.severity is not Severity.RETURN:

@@ -12,24 +12,14 @@ from pathlib import Path
 import click
 
 from ccatp.cli import cli
+from ccatp.conditions import DANGER, SURVEY, Action, Condition, Group
 from ccatp.core import EventCode, Severity
 from ccatp.daemon.supervisor import PROCESSES
 from ccatp.links.topics import TOPICS
-from ccatp.safety.conditions import DANGER, Clear, Condition, Group, Motion
-from ccatp.survey.conditions import SURVEY
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 MARKED = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- made -->)", re.DOTALL)
-REACTIONS = {
-    "none": "nothing",
-    "inform": "reported",
-    "slow": "half the speed",
-    "pause": "pause: wheels held, goes on by itself",
-    "hold": "hold: wheels held, a fix, then on by itself",
-    "return": "home",
-    "fault": "fault: held until an operator resumes",
-}
 ABOUT = {
     Group.EDGES: (
         "The robot stops, backs off along the way it came, has itself measured, and goes on: no operator is "
@@ -85,7 +75,7 @@ def _alarm(row: Condition) -> tuple[str, ...]:
     retries = "" if row.retries is None else f"; at the {('first', 'second')[row.retries]} return: fault"
     return (
         shown(row.message),
-        _reaction(row),
+        row.action.value,
         row.motion.value,
         row.clear.value,
         limit + retries,
@@ -94,18 +84,10 @@ def _alarm(row: Condition) -> tuple[str, ...]:
     )
 
 
-def _reaction(row: Condition) -> str:
-    if row.severity is not Severity.NONE:
-        return REACTIONS[row.severity.name.lower()]
-    if row.motion is Motion.RETREAT:
-        return "back off" if row.clear is Clear.AFTER_FIX else "no motion towards it"
-    return "home" if row.motion is Motion.RETURN else "wheels held"
-
-
 def severities() -> str:
     """The severities, least first."""
-    names = [(severity, severity.name.lower()) for severity in Severity]
-    return table("| | severity | what happens |", [(int(one), f"`{name}`", REACTIONS[name]) for one, name in names])
+    rows = [(int(one), f"`{one.name.lower()}`", Action[one.name].value if one else "nothing") for one in Severity]
+    return table("| | severity | what happens |", rows)
 
 
 def topics() -> str:

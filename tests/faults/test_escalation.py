@@ -10,13 +10,13 @@ import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ccatp.conditions import DANGER, MonitorFinding
 from ccatp.config.load import load_config
 from ccatp.core import Severity, Verdict
 from ccatp.daemon.subscribers import EstimateSubscriber
 from ccatp.danger import DangerMonitor
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.mirror.mirror import build_mirror
-from ccatp.safety.conditions import DANGER, MonitorFinding
 from ccatp.safety.escalation import SeverityEscalation, denies, gravest
 from ccatp.safety.wheel_monitors import CommandSpan
 from ccatp.sim.robot import Robot

@@ -6,10 +6,10 @@ from itertools import product
 import pytest
 from msgspec.structs import replace
 
+from ccatp.conditions import Motion
 from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Twist, Verdict
 from ccatp.mirror.mirror import Mirror
-from ccatp.safety.conditions import Motion
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.failsafe import ROWS, Action
 from ccatp.survey.state import (

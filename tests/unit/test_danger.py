@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from ccatp.conditions import CENTRE_NEAR_RIM, Cause
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import Corner, EdgeSample, EventCode, Verdict, WheelSample
@@ -13,8 +14,7 @@ from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.safety.conditions import CENTRE_NEAR_RIM
-from ccatp.safety.edge_detector import Cause, EdgeMap
+from ccatp.safety.edge_detector import EdgeMap
 from ccatp.safety.wheel_odometry import KNOTS_KEPT, Odometry, WheelTrack, pose_at
 
 FL, FR, RL, RR = ("front_left",), ("front_right",), ("rear_left",), ("rear_right",)

@@ -10,14 +10,13 @@ from typing import Any
 
 import pytest
 
+from ccatp import conditions as rows
+from ccatp.conditions import DANGER, SURVEY, Condition, Group, Motion
 from ccatp.core import EdgeSample, EventCode, ImuSample, Severity, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
-from ccatp.safety import conditions as rows
-from ccatp.safety.conditions import DANGER, Condition, Group, Motion
 from ccatp.safety.escalation import gravest
-from ccatp.survey.conditions import SURVEY
 from tests.support.scenario import config_of, mirror_of
 
 FRAME_S, SAMPLE_S = 0.01, 0.001

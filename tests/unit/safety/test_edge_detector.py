@@ -7,13 +7,13 @@ from typing import Any, cast
 
 import pytest
 
+from ccatp.conditions import Cause
 from ccatp.config.load import load_config
 from ccatp.config.models import DangerConfig
 from ccatp.safety.edge_detector import (
     DIRECTION_TRAVEL_M,
     LONG_ON,
     Axis,
-    Cause,
     EdgeDetector,
     EdgeLimits,
     EdgeMap,

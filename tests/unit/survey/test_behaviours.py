@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from ccatp.conditions import Cause
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegTracker
 from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Verdict
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.safety.edge_detector import Cause
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.behaviours import SETTLE_LIMIT_S, Retreat, RetreatStep, Settling, Standstill
 from ccatp.survey.checks import PATIENCE_S, READINGS, MirrorCheck

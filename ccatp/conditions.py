@@ -1,17 +1,21 @@
-"""What the danger loop can find wrong: one row per condition, and what follows from it.
+"""THE table of conditions: everything that slows, pauses, holds, returns or stops the robot, one row per condition.
 
-Of several at once the gravest counts, of equally grave ones the first row of ``DANGER``. Exceptions, for the verdict's
-cause only: a declared edge keeps it unless a hold or a fault is found, an emergency unless a return or a fault is.
-``docs/alarms.md`` is made of these rows and of those of ``ccatp.survey.conditions``.
+The danger loop finds those of ``DANGER``: of several at once the gravest counts, of equally grave ones the first row.
+Exceptions, for the verdict's cause only: a declared edge keeps it unless a hold or a fault is found, an emergency
+unless a return or a fault is. A mission, its localizer or the main loop find those of ``SURVEY``. What a mission does
+follows from a row's action; of several that apply at once the first in ``Action`` counts. ``docs/alarms.md`` is made of
+these rows.
 """
 
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, StrEnum
-from functools import partial
-from typing import NamedTuple
+from functools import cache, lru_cache, partial
+from operator import itemgetter
+from typing import Any, NamedTuple
 
 from ccatp.core import Severity
-from ccatp.safety.edge_detector import Cause
 
 
 class Motion(Enum):
@@ -31,6 +35,22 @@ class Clear(Enum):
     OPERATOR = "by an operator"
 
 
+class Action(Enum):
+    """What is done about a condition, in the order of precedence."""
+
+    EARTHQUAKE = "wheels held, then home"
+    FAULT = "fault: held until an operator resumes"
+    LOCATE = "hold: wheels held, one fix at rest, then held until it is over"
+    HOLD = "hold: wheels held, a fix, then on by itself"
+    SLOW = "half the speed"
+    RETURN = "home"
+    WAIT = "hold: wheels held until no sensor hangs over"
+    RETREAT = "back off"
+    PAUSE = "pause: wheels held, goes on by itself"
+    KEEP_AWAY = "no motion towards it"
+    INFORM = "reported"
+
+
 class Group(StrEnum):
     """The chapters of the list of alarms."""
 
@@ -46,13 +66,24 @@ class Group(StrEnum):
     OBSERVATORY = "The observatory"
 
 
+class Cause(StrEnum):
+    """Why an edge is declared."""
+
+    RIM = "rim ahead on the map"
+    SEAM = "further off the panel than the seam is wide"
+    NO_MAP = "off the panel where the map has no seam"
+    SILENT_WHEELS = "off the panel while the wheels are not heard"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Condition:
     """One row.
 
     Attributes:
         message: the cause as it is shown; "{...}" for what varies.
-        severity: what is done; NONE where event code and permits say it.
+        meaning: when it is met, and what that means; ``advice``: what an operator can do.
+        severity: of the verdict; NONE where event code and permits say it.
+        motion: what the robot may still do; ``clear``: what ends the reaction, once the condition is over.
         trusts_odometry: the pose is carried on by wheels and gyroscope meanwhile.
         limit: the key of the configuration after which it is of severity ``escalates_to``; empty: it does not escalate.
         full_fans: the fans give all they can meanwhile.
@@ -64,6 +95,7 @@ class Condition:
     group: Group
     meaning: str
     advice: str
+    action: Action
     severity: Severity
     motion: Motion
     clear: Clear
@@ -78,6 +110,10 @@ class Condition:
         cause = self.message.format(**text) if text else self.message
         return MonitorFinding(self, self.severity, cause, signal, value, limit)
 
+    def text(self, **varies: object) -> str:
+        """The cause as it is shown."""
+        return self.message.format(**varies)
+
 
 class MonitorFinding(NamedTuple):
     """A condition that is met; ``value`` is in the unit of ``limit``. Severity and cause grow while it lasts."""
@@ -90,37 +126,29 @@ class MonitorFinding(NamedTuple):
     limit: float
 
 
-# What a severity usually means; a row may say otherwise.
-inform = partial(Condition, severity=Severity.INFORM, motion=Motion.ANY, clear=Clear.AUTO)
-slow = partial(Condition, severity=Severity.SLOW, motion=Motion.ANY, clear=Clear.AUTO)
-pause = partial(
-    Condition,
-    severity=Severity.PAUSE,
-    motion=Motion.NONE,
-    clear=Clear.AUTO,
-    limit="health.pause_limit_s",
-    escalates_to=Severity.HOLD,
-)
-hold = partial(
-    Condition,
-    severity=Severity.HOLD,
-    motion=Motion.NONE,
-    clear=Clear.AFTER_FIX,
+def _columns(action: Action, severity: Severity, motion: Motion, clear: Clear, **more: Any) -> Callable[..., Condition]:
+    return partial(Condition, action=action, severity=severity, motion=motion, clear=clear, **more)
+
+
+# What an action usually goes with; a row may say otherwise.
+inform = _columns(Action.INFORM, Severity.INFORM, Motion.ANY, Clear.AUTO)
+slow = _columns(Action.SLOW, Severity.SLOW, Motion.ANY, Clear.AUTO)
+_paused = Action.PAUSE, Severity.PAUSE, Motion.NONE, Clear.AUTO
+pause = _columns(*_paused, limit="health.pause_limit_s", escalates_to=Severity.HOLD)
+wait = _columns(*_paused)
+hold = _columns(
+    *(Action.HOLD, Severity.HOLD, Motion.NONE, Clear.AFTER_FIX),
     trusts_odometry=False,
     limit="health.hold_limit_s",
     escalates_to=Severity.FAULT,
 )
-go_home = partial(Condition, severity=Severity.RETURN, motion=Motion.RETURN, clear=Clear.OPERATOR)
-fault = partial(Condition, severity=Severity.FAULT, motion=Motion.NONE, clear=Clear.OPERATOR)
-edge = partial(Condition, severity=Severity.NONE, motion=Motion.RETREAT, clear=Clear.AFTER_FIX)
-near = partial(Condition, severity=Severity.NONE, motion=Motion.RETREAT, clear=Clear.AUTO)
-beacon_hold = partial(
-    Condition,
-    severity=Severity.HOLD,
-    motion=Motion.NONE,
-    clear=Clear.AUTO,
-    limit="danger.hold_limit_s",
-    escalates_to=Severity.FAULT,
+go_home = _columns(Action.RETURN, Severity.RETURN, Motion.RETURN, Clear.OPERATOR)
+fault = _columns(Action.FAULT, Severity.FAULT, Motion.NONE, Clear.OPERATOR)
+shaken = _columns(Action.EARTHQUAKE, Severity.NONE, Motion.NONE, Clear.OPERATOR)
+edge = _columns(Action.RETREAT, Severity.NONE, Motion.RETREAT, Clear.AFTER_FIX)
+near = _columns(Action.KEEP_AWAY, Severity.NONE, Motion.RETREAT, Clear.AUTO)
+beacon_hold = _columns(
+    *(Action.HOLD, Severity.HOLD, Motion.NONE, Clear.AUTO), limit="danger.hold_limit_s", escalates_to=Severity.FAULT
 )
 
 # fmt: off
@@ -288,11 +316,12 @@ LIFTED = hold(
     limit="health.lifted_limit_s", full_fans=True)
 ALL_OFF = edge(
     "all_off", "lifted or fallen", Group.EDGES,
-    "As above, in the first frame of it: code 1, nothing is permitted.", "As above.", motion=Motion.NONE)
+    "As above, in the first frame of it: code 1, nothing is permitted.", "As above.",
+    action=Action.WAIT, motion=Motion.NONE)
 EDGE_SENSOR_STAYS_OFF = hold(
     "edge_sensor_stays_off", "an edge sensor stays off though it was moved back and the others are on", Group.SENSORS,
     "The sensor and no edge, unless one fix, taken at once, shows a seam or the rim there: then it goes on by itself.",
-    "Clean or replace it. `ccatp resume` goes on if it is on again.", trusts_odometry=True)
+    "Clean or replace it. `ccatp resume` goes on if it is on again.", action=Action.LOCATE, trusts_odometry=True)
 RIM_AHEAD = edge(
     "rim_ahead", Cause.RIM, Group.EDGES,
     "A sensor hangs out where the map has the rim.",
@@ -314,14 +343,14 @@ CENTRE_NEAR_RIM = edge(
     "By the pose alone the robot is about to drive over the rim; no sensor has said so yet.",
     "Is the pose plausible? If the robot is elsewhere: `ccatp stop`, carry it to base, remove `checkpoint`, "
     "`--resume`.")
-EARTHQUAKE = edge(
+EARTHQUAKE = shaken(
     "earthquake", "emergency: earthquake", Group.OBSERVATORY,
     "Held, fans at their maximum, until it is cleared; then home.",
-    "Clear it when its cause is gone and the robot is at base or held.", motion=Motion.NONE, clear=Clear.OPERATOR)
-EMERGENCY = edge(
+    "Clear it when its cause is gone and the robot is at base or held.")
+EMERGENCY = go_home(
     "emergency", "emergency: {kind}", Group.OBSERVATORY,
     "Fire, power, weather or an operator's emergency: the robot goes home at once.",
-    "Clear it when its cause is gone and the robot is at base or held.", motion=Motion.RETURN, clear=Clear.OPERATOR)
+    "Clear it when its cause is gone and the robot is at base or held.", severity=Severity.NONE)
 
 # -- among beacons ----------------------------------------------------------------------------------------------------
 
@@ -347,7 +376,126 @@ OBSTACLE_BEHIND = near(
     "obstacle_behind", "an obstacle behind", Group.BEACONS,
     "Something is nearer than `danger.obstacle_m` behind the robot: no reverse. Code 1.", "Nothing.")
 
-# fmt: on
-
 DANGER: tuple[Condition, ...] = tuple(row for row in list(globals().values()) if isinstance(row, Condition))
 PRECEDENCE = {row: -number for number, row in enumerate(DANGER)}
+
+# == what a mission, its localizer or the main loop finds =============================================================
+
+BACK_OFFS = fault(
+    "back_offs", "at the edge again after {count} back-offs: is an edge sensor dirty?", Group.EDGES,
+    "The same point ends at an edge over and over.",
+    "Clean the sensors, look at the place; `ccatp resume`, or abort.")
+STUCK_AT_EDGE = hold(
+    "stuck_at_edge", "stuck at the edge: no motion away from it is permitted, or none helps", Group.EDGES,
+    "Sensors bar every way out.",
+    "Look at the robot. It tries again by itself as soon as a sensor is back on.",
+    action=Action.WAIT, clear=Clear.AUTO, trusts_odometry=True)
+
+NO_FRAME_FOR = wait(
+    "no_frame_for", "no sensors frame for {age_s:.2f} s", Group.DATA,
+    "Main has no frame of the robot.", "As above.")
+NO_VERDICT = wait(
+    "no_verdict", "no fresh verdict from the danger loop", Group.DATA,
+    "Danger is too slow, hangs, or is being restarted.", "As for a stale estimate.")
+FRAME_LATE = wait(
+    "frame_late", "a frame was served {lag_ms:.0f} ms late", Group.DATA,
+    "This machine was too slow for one frame.",
+    "Nothing once; often: other programs, or no real-time rights (`no real time` in `log.jsonl`).")
+
+UNATTENDED_FAULT = go_home(
+    "unattended_fault", "unattended fault: the battery ({charge:.0%}) lasts for little more than the way home",
+    Group.FANS, "Held on an overhanging mirror without a reaction of an operator: it goes home by itself, once.",
+    "Look after held robots; a fault is reported every minute.")
+FANS_REFUSED = fault(
+    "fans_refused", "fan command refused: {why}; set robot.fan_duty", Group.FANS,
+    "The robot would fall with the configured duty of its fans.", "Correct the configuration; start again.")
+
+LINK_LOST = wait(
+    "link_lost", "robot link lost: {reason}", Group.LINK,
+    "The connection ended. The robot holds its wheels by itself; it is looked for for `robot.reconnect_timeout_s`.",
+    "Network, robot. After that time the run ends with status 5; `--resume` goes on.",
+    clear=Clear.AFTER_FIX)
+FRAMES_BACKWARD = hold(
+    "frames_backward", "time stamps of the frames run backward", Group.LINK,
+    "Five in a row. Held.", "The firmware's clock.", trusts_odometry=True, limit="health.retries")
+SENSOR_BACKWARD = hold(
+    "sensor_backward", "time stamps of the {sensor} run backward", Group.LINK,
+    "The same of one sensor.", "The firmware's clock.", trusts_odometry=True, limit="health.retries")
+
+LEG_OVERDUE = fault(
+    "leg_overdue", "the leg to ({x_m:.3f}, {y_m:.3f}) m is overdue: is a wheel blocked or slipping?", Group.SURVEY,
+    "It takes many times longer than it should.", "Look at the robot.")
+NO_REST = fault(
+    "no_rest", "the robot does not come to rest: {v_m_s:.4f} m/s, {omega_rad_s:.4f} rad/s", Group.SURVEY,
+    "It stands at a point and still moves.", "Fans that shake, a slope that is slippery.")
+NO_WAY_ON = fault(
+    "no_way_on", "no way on: {why}", Group.SURVEY,
+    "From where it stands no safe way leads to the next point.",
+    "`ccatp abort`; if there is no way home either, carry it.")
+NO_WAY_HOME = fault(
+    "no_way_home", "no way home: {why}", Group.SURVEY,
+    "From where it stands no safe way leads to base.", "Carry it to base.")
+TIME_USED_UP = go_home(
+    "time_used_up", "the time budget of {budget_s:g} s is used up", Group.SURVEY,
+    "The way home would take what is left of it.", "Nothing; `ccatp run --resume` measures what is left.")
+MEASUREMENTS_FAILED = fault(
+    "measurements_failed", "{count} measurements in a row failed: {why}", Group.SURVEY,
+    "The laser system does not see the puck; the reason stands behind the colon.",
+    "Laser, line of sight, the puck's cleanliness; `ccatp resume`.")
+NOT_FOUND = fault(
+    "not_found", "the robot cannot be found again: {why}", Group.SURVEY,
+    "Its pose is not to be trusted, and no fix tells where it is.", "Laser and line of sight; `ccatp resume`.")
+FRAME_REFUSED = fault(
+    "frame_refused", "the laser system sees the robot {distance_m:.2f} m from {place}: {why}", Group.SURVEY,
+    "The first fix, or one in motion, lies where the robot cannot be: the laser system's frame is another one.",
+    "Configured collimators, base and start of the robot.")
+LENGTHS_REFUSED = fault(
+    "lengths_refused", "the laser system's lengths do not lead to the robot's base: {why}", Group.SURVEY,
+    "The lengths of the first fix give no position.", "Configured collimators and base.")
+FILTER_DIVERGED = hold(
+    "filter_diverged", "filter: {why}", Group.SURVEY,
+    "The estimate is no Gaussian any more. The pose is frozen; a fix starts it again.",
+    "Keep the run directory if it comes again.", limit="health.retries")
+
+FRAMES_MISSED = fault(
+    "frames_missed", "no frames while the robot moved: put it at its start and start a new mission", Group.BEACONS,
+    "The robot booted, or the link was away while it may have moved; the map of the beacons is not kept.",
+    "`ccatp stop`, put it at its start, start again.", trusts_odometry=False)
+MISSION_TOO_LONG = fault(
+    "mission_too_long", "the mission takes longer than mission.time_limit_s = {limit_s:g}", Group.BEACONS,
+    "The robot is held where it is.", "`ccatp abort` leads it home; or a longer time in the configuration.")
+
+FIX_NOT_STORED = fault(
+    "fix_not_stored", "the fix of {point} cannot be stored: {why}", Group.STORAGE,
+    "The database refused or the disk is full.", "Make room; `ccatp resume` measures that point again.")
+SKIP_NOT_STORED = fault(
+    "skip_not_stored", "that {point} is skipped cannot be stored: {why}", Group.STORAGE,
+    "The same of a point that was given up.", "Make room; `ccatp resume`.")
+DISK_STALLS = fault(
+    "disk_stalls", "the disk stalls: {point} is not stored after {time_s:g} s", Group.STORAGE,
+    "The disk does not answer.", "The disk; `ccatp resume` when it is back.")
+
+OPERATOR = go_home(
+    "operator", "operator", Group.OBSERVATORY,
+    "An operator called the robot home.", "Nothing; a new survey measures what is left.")
+# fmt: on
+
+SURVEY = tuple(row for row in list(globals().values()) if isinstance(row, Condition) and row not in DANGER)
+
+
+@cache
+def _patterns() -> list[tuple[re.Pattern[str], Condition]]:
+    found = []
+    for row in (*DANGER, *SURVEY):
+        fixed = re.split(r"{.*?}", row.message)
+        # What lasts or comes again has its duration or count behind the message.
+        pattern = ".*".join(map(re.escape, fixed)) + r"(,? (for|again after) .*|; .*)?"
+        found.append((sum(map(len, fixed)), re.compile(pattern), row))
+    # Of two that match, the row that says more is meant.
+    return [(pattern, row) for _, pattern, row in sorted(found, key=itemgetter(0), reverse=True)]
+
+
+@lru_cache(256)
+def condition_of(cause: str) -> Condition | None:
+    """The row of a cause as it is shown; ``None`` for what is no condition."""
+    return next((row for pattern, row in _patterns() if pattern.fullmatch(cause)), None)
