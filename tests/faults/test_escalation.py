@@ -2,11 +2,11 @@
 
 from collections import deque
 from collections.abc import Callable
+from typing import cast
 
 import msgspec
 import numpy as np
 import pytest
-import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,6 +15,7 @@ from ccatp.config.load import load_config
 from ccatp.core import Severity, Verdict
 from ccatp.daemon.subscribers import EstimateSubscriber
 from ccatp.danger import DangerMonitor
+from ccatp.links.bus import PeerSocket
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.mirror.mirror import build_mirror
 from ccatp.safety.escalation import SeverityEscalation, denies, gravest
@@ -144,17 +145,11 @@ def test_monitors_are_silent_where_nothing_is_wrong(
 class Waiting:
     """What main has published and the danger loop has not received yet."""
 
-    def __init__(self, *_: object, **__: object) -> None:
+    def __init__(self) -> None:
         self.messages: deque[EstimateMessage] = deque()
 
-    def receive(self) -> tuple[str, EstimateMessage] | None:
-        return ("estimate", self.messages.popleft()) if self.messages else None
-
-    def maintain(self) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
+    def receive(self) -> EstimateMessage | None:
+        return self.messages.popleft() if self.messages else None
 
 
 @pytest.mark.fault("P8")
@@ -167,14 +162,11 @@ class Waiting:
     ],
 )
 def test_drives_that_the_danger_loop_hears_of_late_have_moved_the_wheels(
-    frames: int, dv_m_s: float, heard_until: Callable[[int], int], seed: int, monkeypatch: pytest.MonkeyPatch
+    frames: int, dv_m_s: float, heard_until: Callable[[int], int], seed: int
 ) -> None:
     """A robot that has stood for long drives on for a moment, and the estimates of that wait for the danger loop."""
-    monkeypatch.setattr("ccatp.daemon.subscribers.Subscriber", Waiting)
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    ear = EstimateSubscriber(context, "inproc://main")
-    context.destroy()
-    waiting: deque[EstimateMessage] = ear._subscriber.messages  # type: ignore[attr-defined]
+    socket = Waiting()
+    ear, waiting = EstimateSubscriber(cast(PeerSocket, socket)), socket.messages
     arrived = 0
 
     def heard(told: list[EstimateMessage], k: int) -> EstimateMessage | None:
