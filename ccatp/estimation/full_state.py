@@ -173,7 +173,7 @@ class FullStateLocalizer(LocalizerBase):
         edges: Sequence[EdgeSample],
         gravity: GravitySample | None,
     ) -> None:
-        right_rad, left_rad = self._right.add(*right), self._left.add(*left)
+        right_rad, left_rad = self._right.add(*right, dt_s), self._left.add(*left, dt_s)
         if self._is_new_base:
             self._is_new_base = False
             # What the wheels did in the frame that begins a new time base lies in the gap before it, for the filter.

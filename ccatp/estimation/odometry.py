@@ -242,6 +242,8 @@ _COUNTER_NOISE = 1.0 / 12.0  # variance of a uniform distribution over one count
 _MIN_VARIANCE_RAD2 = 1e-10  # a third of a micrometre of travel: less would cost the filter digits and tell it nothing
 # A wheel that gave no sample for this long may have done anything meanwhile.
 _GAP_S = 0.02
+# So long a wheel without samples is taken to turn as it did lately.
+_BRIDGED_S = 0.1
 _LOST = 1.5  # periods between two samples of a counter beyond which one is missing
 _LATELY_S = 0.05
 _EVEN = 0.05  # of a period: what a frame's periods may be longer than the shortest, all together
@@ -261,6 +263,7 @@ class WheelAngle:
         self.angle_rad = 0.0
         self.is_fresh = False
         self._gap_rad = 0.0
+        self._bridged_s = self._bridged_rad = 0.0
         self._mean_rate = 0.0
         self._period_s = inf
         self._seen = 0
@@ -274,16 +277,20 @@ class WheelAngle:
     def restart(self) -> None:
         """The robot's clock has jumped: the next sample begins a new sum."""
         self._t_s = -inf
+        self._bridged_s = self._bridged_rad = 0.0
 
     def rebase(self) -> None:
         """Count from here."""
         self.angle_rad = 0.0
 
-    def add(self, times_s: Sequence[float], rates_rad_s: Sequence[float]) -> float:
-        """Add a frame's samples, oldest first; returns by how much the wheel has turned, rad."""
+    def add(self, times_s: Sequence[float], rates_rad_s: Sequence[float], dt_s: float = 0.0) -> float:
+        """Add the samples of a frame of ``dt_s``, oldest first; returns by how much the wheel has turned, rad.
+
+        Without samples that is what it did lately, for a while: the pose would jump by it when samples come again.
+        """
         self.is_fresh = bool(times_s)
         if not times_s:
-            return 0.0
+            return self._bridge(dt_s)
         if self._t_s == -inf:
             self._t_s, self._rate = times_s[0], rates_rad_s[0]
         is_counter = self.is_counter
@@ -302,6 +309,19 @@ class WheelAngle:
         if elapsed_s > 0.0:
             self._mean_rate += (turned - self._mean_rate * elapsed_s) / (elapsed_s + _LATELY_S)
         self._t_s, self._rate = times_s[-1], rates_rad_s[-1]
+        if self._bridged_s:
+            turned -= self._bridged_rad
+            self._bridged_s = self._bridged_rad = 0.0
+        self.angle_rad += turned
+        return turned
+
+    def _bridge(self, dt_s: float) -> float:
+        if self._t_s == -inf or self._bridged_s >= _BRIDGED_S:
+            return 0.0
+        turned = self._mean_rate * dt_s
+        self._bridged_s += dt_s
+        self._bridged_rad += turned
+        self._gap_rad += abs(turned)
         self.angle_rad += turned
         return turned
 
