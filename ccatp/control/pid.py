@@ -101,15 +101,6 @@ def lag_feed_forward(now: float, after: float, dt_s: float, lag_s: float) -> flo
     return now + (after - now) / (1.0 - exp(-dt_s / lag_s))
 
 
-def clamped(value: float, limit: float) -> float:
-    """``value`` within [-limit, limit]; what is not a number stays so."""
-    if value > limit:
-        return limit
-    if value < -limit:
-        return -limit
-    return value
-
-
 # What feedback may add to the planned speed, as part of the limit: more would outrun the gate's headroom.
 FEEDBACK_SHARE = 0.25
 
@@ -127,11 +118,6 @@ class AxisState(msgspec.Struct, frozen=True):
     planned: tuple[float, float] = (0.0, 0.0)
     slip: float = 0.0
     pid: PidState = PidState()
-
-    @property
-    def is_overtime(self) -> bool:
-        """The plan is out."""
-        return self.t_s - self.duration_s >= 0.0
 
 
 class BareAxis:
@@ -191,7 +177,7 @@ class ProfiledAxis:
 
     def renewed_if_far(self, motion: AxisState, remaining: float) -> AxisState:
         """Another motion where the last one ended further off than feedback can bring it in time."""
-        if motion.is_overtime and abs(remaining) > 0.5 * self._feedback_limit * self._stop_time_s:
+        if motion.t_s >= motion.duration_s and abs(remaining) > 0.5 * self._feedback_limit * self._stop_time_s:
             return self.begin(remaining)
         return motion
 
@@ -200,8 +186,9 @@ class ProfiledAxis:
         profile, (position, now), t_s = motion.profile, motion.planned, motion.t_s + dt_s
         planned = profile.at(t_s)
         error = remaining - (profile.distance - position)
-        feedback = clamped(self._kp * error, self._feedback_limit)
-        slip = clamped(motion.slip + self._slip_gain * feedback * now * dt_s, self._slip_limit)
+        bound, slip_bound = self._feedback_limit, self._slip_limit
+        feedback = min(max(self._kp * error, -bound), bound)
+        slip = min(max(motion.slip + self._slip_gain * feedback * now * dt_s, -slip_bound), slip_bound)
         if speed is not None:
             feedback += self._kd * (now - speed)
         set_point = (1.0 + slip) * lag_feed_forward(now, planned[1], dt_s, self._lag_s) + feedback

@@ -1,14 +1,13 @@
 """Turn-and-move waypoint tracking, thesis 3.3.1 and fig. 3.3."""
 
-from collections import deque
 from enum import StrEnum
-from math import asin, atan2, cos, exp, hypot, pi, sin, sqrt
+from math import asin, atan2, cos, hypot, pi, sin, sqrt
 
 import msgspec
 from msgspec.structs import replace
 
 from ccatp.config.models import ControlConfig, GainsConfig, LimitsConfig
-from ccatp.control.pid import AxisState, BareAxis, Pid, PidState, ProfiledAxis, clamped
+from ccatp.control.pid import AxisState, BareAxis, Pid, PidState, ProfiledAxis
 from ccatp.core import Predicted, Twist, wrap_pi
 
 # Drift per metre beyond which an estimate is nonsense: a robot carried off that fast has lost its wheels' grip.
@@ -75,9 +74,9 @@ class LegLine(msgspec.Struct, frozen=True):
             line = LegLine.lay(target, atan2(dy, dx) if is_far else wrap_pi(motion - angle - self.off_rad))
         course_rad, c, s = line.course_rad, line.cos, line.sin
         creep_x, creep_y = creep
-        angle = -asin(clamped(c * creep_y - s * creep_x, CREEP_LIMIT))
+        angle = -asin(min(max(c * creep_y - s * creep_x, -CREEP_LIMIT), CREEP_LIMIT))
         off = wrap_pi(motion - course_rad - angle)
-        along = clamped(c * creep_x + s * creep_y, CREEP_LIMIT)
+        along = min(max(c * creep_x + s * creep_y, -CREEP_LIMIT), CREEP_LIMIT)
         view = LegView(c * dx + s * dy, s * dx - c * dy, off, cos(angle) + along)
         return LegLine(target, course_rad, c, s, off), view
 
@@ -85,7 +84,7 @@ class LegLine(msgspec.Struct, frozen=True):
 def crab(course_rad: float, creep: tuple[float, float]) -> float:
     """Angle by which the body has to point beside a course so that it is not carried off it, rad."""
     across = cos(course_rad) * creep[1] - sin(course_rad) * creep[0]
-    return -asin(clamped(across, CREEP_LIMIT))
+    return -asin(min(max(across, -CREEP_LIMIT), CREEP_LIMIT))
 
 
 def line_rate(sight: LegView, v_m_s: float, cross_gain_rad_m2: float, heading_weight_1_s2: float) -> float:
@@ -221,7 +220,7 @@ class LegTracker:
         if motion.phase is TURN:
             angle = self._bearing_error(pose, target, creep, motion.reverse)
             rate_rad_s = None if speeds is None else speeds.omega_rad_s
-            if motion.axis.is_overtime:
+            if motion.axis.t_s >= motion.axis.duration_s:
                 motion, has_run_away = self._look_at_bearing(motion, pose, target, angle)
                 if has_run_away:
                     return replace(motion, phase=DONE), STILL
@@ -292,7 +291,7 @@ class LegTracker:
         sign = -1.0 if reverse else 1.0
         ahead_m, gain = view.ahead_m, view.gain
         speed = None if speeds is None else sign * speeds.v_m_s * gain
-        if axis.is_overtime:
+        if axis.t_s >= axis.duration_s:
             axis = pace.along.renewed_if_far(axis, ahead_m)
             is_late = axis.t_s - axis.duration_s >= control.stop_time_s
             if pace.along.is_over(axis, ahead_m, control.stop_tolerance_m, speed) or is_late:
@@ -304,7 +303,7 @@ class LegTracker:
         if speeds is not None:
             rate += self._steering_damping * (rate - speeds.omega_rad_s)
         next_motion = LegMotion(DRIVE, motion.is_slow, reverse, axis, line)
-        return next_motion, Twist(sign * wanted, clamped(rate, pace.omega_max))
+        return next_motion, Twist(sign * wanted, min(max(rate, -pace.omega_max), pace.omega_max))
 
     def _head_on(
         self, motion: LegMotion, pose: tuple[float, float, float], target: tuple[float, float], dt_s: float
@@ -327,87 +326,3 @@ class LegTracker:
         steering, rate = pace.steering.step(motion.steering, error, dt_s)
         speed = -speed if motion.reverse else speed
         return replace(motion, axis=axis, steering=steering), Twist(speed, rate)
-
-
-Pose = tuple[float, float, float]
-
-# A delay below a thousandth of a frame is rounding of the robot's clock.
-ROUNDING = 1e-3
-# A robot whose echo is older than its own time-to-live holds its wheels: beyond that nothing is on the way any more.
-REACH_S = 0.25
-
-
-class CommandPredictor:
-    """Carries a frame's estimate forward over the commands that are on their way to the wheels.
-
-    The echo tells which drive was in force last and for how long; those sent after it follow one per frame. Each wheel
-    is a first-order servo, so with a set point u over t
-
-        v(t) = u + (v - u) exp(-t/T),    mean = u + (v - u) (T/t) (1 - exp(-t/T)),
-
-    and the body goes on along the mean heading, carried off by the drift per metre of travel.
-    """
-
-    __slots__ = ("_frame", "_frame_s", "_lag_s", "_sent")
-
-    def __init__(self, wheel_lag_s: float, frame_s: float) -> None:
-        if frame_s <= 0.0:
-            raise ValueError(f"frame_s = {frame_s}: the period of the frames must be positive")
-        self._lag_s, self._frame_s = wheel_lag_s, frame_s
-        self._frame = frame_s, *_servo(wheel_lag_s, frame_s)
-        self._sent: deque[tuple[int, float, float]] = deque(maxlen=max(1, round(REACH_S / frame_s)))
-
-    def reset(self) -> None:
-        """Forget what was sent: a new session begins."""
-        self._sent.clear()
-
-    def sent(self, seq: int, v_m_s: float, omega_rad_s: float) -> None:
-        """A drive has been sent: its number and the twist that its wheel rates mean."""
-        if self._sent and seq <= self._sent[-1][0]:
-            self._sent.clear()
-        self._sent.append((seq, v_m_s, omega_rad_s))
-
-    def ahead(
-        self,
-        pose: Pose,
-        v_m_s: float,
-        omega_rad_s: float,
-        echo_seq: int,
-        echo_age_s: float,
-        is_held: bool,
-        creep: tuple[float, float] = (0.0, 0.0),
-    ) -> Predicted:
-        """The state in which the next command will find the robot.
-
-        ``pose`` is (x, y, heading) in any plane, ``creep`` the drift per metre in it. ``echo_seq`` is the drive in
-        force (-1: none) and ``echo_age_s`` its age; ``is_held``: the robot holds its wheels whatever was sent, and they
-        run down.
-        """
-        sent, frame_s = self._sent, self._frame_s
-        while len(sent) > 1 and sent[1][0] <= echo_seq:
-            sent.popleft()
-        (x, y, heading), v, omega = pose, v_m_s, omega_rad_s
-        creep_x, creep_y = creep
-        for seq, v_sent, omega_sent in sent:
-            if seq > echo_seq:
-                dt_s, keep, mean = self._frame
-            else:  # the one in force
-                dt_s = frame_s - echo_age_s
-                if dt_s <= ROUNDING * frame_s:
-                    continue
-                keep, mean = _servo(self._lag_s, dt_s)
-            v_set, omega_set = (0.0, 0.0) if is_held else (v_sent, omega_sent)
-            travel = (v_set + (v - v_set) * mean) * dt_s
-            turn = (omega_set + (omega - omega_set) * mean) * dt_s
-            middle, length = heading + 0.5 * turn, abs(travel)
-            x, y = x + travel * cos(middle) + length * creep_x, y + travel * sin(middle) + length * creep_y
-            heading, v, omega = heading + turn, v_set + (v - v_set) * keep, omega_set + (omega - omega_set) * keep
-        return Predicted((x, y, heading), v, omega)
-
-
-def _servo(lag_s: float, dt_s: float) -> tuple[float, float]:
-    """Shares of the difference to the set point: what is left after ``dt_s``, and its mean on the way."""
-    if lag_s <= 0.0:
-        return 0.0, 0.0
-    keep = exp(-dt_s / lag_s)
-    return keep, lag_s * (1.0 - keep) / dt_s

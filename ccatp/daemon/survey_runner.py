@@ -8,8 +8,8 @@ from ccatp.conditions import UNATTENDED_FAULT
 from ccatp.config.models import Config
 from ccatp.control.gate import Denial, DriveGate, FanGate
 from ccatp.control.motion_checks import as_standing
-from ccatp.control.tracker import CommandPredictor
-from ccatp.core import Verdict, twist_of
+from ccatp.control.sent_drives import SentDrives
+from ccatp.core import Verdict
 from ccatp.daemon.checkpoints import CheckpointWriter, build_parts
 from ccatp.daemon.fix_service import FixRequest, FixService
 from ccatp.daemon.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionRunner, TimedFrame
@@ -28,7 +28,6 @@ from ccatp.links.topics import (
     TreatmentKind,
 )
 from ccatp.records.store import MissionStore
-from ccatp.safety.wheel_monitors import CommandSpan
 from ccatp.survey.behaviours import HOLD_POSITION, MissionCommand
 from ccatp.survey.budget import home_time_s
 from ccatp.survey.checks import FaultAction, MirrorCheck, UnattendedFaultTimer
@@ -102,9 +101,7 @@ class SurveyRunner(MissionRunner):
         self._clock.before_s = parts.elapsed_s
         self._gate_log = GateLog(self._gate, self.telemetry.notify_operator)
         self._fan_gate, self._has_full_fans, self._fans_seq = FanGate(0.0), False, 0
-        # The drives that were sent: prediction of the motion, and span of the set points for the danger loop.
-        self._predictor = CommandPredictor(cfg.robot.wheel_lag_s, 1.0 / cfg.sim.robot.frame_hz)
-        self._span, self._newest_drive, self._driven = CommandSpan(), 0, (0.0, 0.0)
+        self._sent = SentDrives(cfg.robot, 1.0 / cfg.sim.robot.frame_hz)
         self._sent_commands: tuple[tuple[float, float, float, float] | None, int] = None, -1
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
         self._fix_service = FixService(
@@ -202,8 +199,7 @@ class SurveyRunner(MissionRunner):
         self._parts.check_robot(hello)
 
     def begin_session(self, hello: Hello) -> None:
-        # No drive of the last session is still to act.
-        self._predictor = CommandPredictor(self._cfg.robot.wheel_lag_s, 1.0 / hello.frame_hz)
+        self._sent.begin_session(1.0 / hello.frame_hz)
         self._checkpoint.boot = hello.boot
         # The robot's own floor counts where the mirror overhangs.
         self._fan_gate = FanGate(hello.robot.fan_floor if self._mirror.overhang else 0.0)
@@ -220,11 +216,7 @@ class SurveyRunner(MissionRunner):
             self.mission.handle(Fault(refusal))
 
     def on_drive(self, seq: int, right_rad_s: float, left_rad_s: float) -> None:
-        robot = self._cfg.robot
-        self._newest_drive, self._driven = seq, (right_rad_s, left_rad_s)
-        self._span.add(right_rad_s, left_rad_s)
-        twist = twist_of(right_rad_s, left_rad_s, robot.wheel_radius_m, robot.wheel_base_m)
-        self._predictor.sent(seq, twist.v_m_s, twist.omega_rad_s)
+        self._sent.add(seq, right_rad_s, left_rad_s)
 
     def on_tracking_gap(self) -> None:
         self.mission.handle(TrackingGap())
@@ -264,7 +256,7 @@ class SurveyRunner(MissionRunner):
         localizer, echo = self._localizer, frame.sensors.cmd
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         place = pose.x_m, pose.y_m, pose.heading_rad
-        ahead = self._predictor.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
+        ahead = self._sent.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
         return StateEstimate(
             *(frame.t_s, frame.dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead),
             sigma_of=self._position_sigma_m,
@@ -295,7 +287,7 @@ class SurveyRunner(MissionRunner):
 
     def _note_commands(self, frame: TimedFrame) -> None:
         if frame.is_estimate_due:
-            self._sent_commands = self._span.take(*self._driven), self._newest_drive
+            self._sent_commands = self._sent.take_span(), self._sent.newest
 
     def _is_on_mirror(self, sensors: Sensors) -> bool:
         """Whether gravity permits motion: the robot stands on the mirror of the configuration.

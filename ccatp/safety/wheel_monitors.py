@@ -258,33 +258,6 @@ def _excess(speed: float, low: float, high: float) -> float:
     return max(above, below)
 
 
-class CommandSpan:
-    """Lowest and highest set points of both wheels since they were last taken."""
-
-    __slots__ = ("_left_high", "_left_low", "_right_high", "_right_low")
-
-    def __init__(self) -> None:
-        self._right_low = self._right_high = self._left_low = self._left_high = 0.0
-
-    def add(self, right_rad_s: float, left_rad_s: float) -> None:
-        """A drive was sent."""
-        if right_rad_s < self._right_low:
-            self._right_low = right_rad_s
-        elif right_rad_s > self._right_high:
-            self._right_high = right_rad_s
-        if left_rad_s < self._left_low:
-            self._left_low = left_rad_s
-        elif left_rad_s > self._left_high:
-            self._left_high = left_rad_s
-
-    def take(self, right_rad_s: float, left_rad_s: float) -> tuple[float, float, float, float]:
-        """The span up to now; the next one begins with the drive in force."""
-        span = self._right_low, self._right_high, self._left_low, self._left_high
-        self._right_low = self._right_high = right_rad_s
-        self._left_low = self._left_high = left_rad_s
-        return span
-
-
 _BIAS_TIME_S = 0.5
 _LARGEST_BIAS_RAD_S = 0.35
 

@@ -118,7 +118,7 @@ class FaultySilRun(SilRun):
             return
         self.localizer.step(frame.t, frame.imu, frame.enc, frame.edge, frame.gravity)
         self._drive_seq += 1
-        self._foresee(self._drive_seq, 0.0, 0.0)
+        self._note_drive(self._drive_seq, 0.0, 0.0)
         self.robot.drive(self._drive_seq, 0.0, 0.0)
 
 

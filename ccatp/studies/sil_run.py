@@ -13,8 +13,8 @@ import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.control.motion_checks import as_standing
-from ccatp.control.tracker import CommandPredictor
-from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelId, PanelPose, PointId, Verdict, difference, twist_of
+from ccatp.control.sent_drives import SentDrives
+from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelId, PanelPose, PointId, Verdict, difference
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.links import multiline
@@ -27,7 +27,6 @@ from ccatp.mirror.misalignment import fit_panels
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 from ccatp.records.summary import PanelFits, survey_summary
 from ccatp.safety.robot_clock import SteadyTime
-from ccatp.safety.wheel_monitors import CommandSpan
 from ccatp.sim.fault_plan import FaultPlan
 from ccatp.sim.laser import SEED_STREAM, EtalonModel, PuckTruth
 from ccatp.sim.robot import Robot
@@ -222,7 +221,7 @@ class SilRun:
         self.mission, self.gate = parts.mission, parts.gate
         self.robot = Robot(cfg, self.mirror, np.random.default_rng(cfg.run.seed), faults)
         self.monitor = DangerMonitor(self.mirror, cfg.robot, cfg.danger, cfg.health)
-        self.predictor = CommandPredictor(cfg.robot.wheel_lag_s, self.robot.frame_s)
+        self.sent = SentDrives(cfg.robot, self.robot.frame_s)
         self.laser = SilLaser(cfg, self.mirror, self.robot)
         self.trace = SilTrace(parts, with_track=with_track)
         self.states_s: defaultdict[MissionState, float] = defaultdict(float)
@@ -232,12 +231,9 @@ class SilRun:
         self._sigma_of = lambda: self.localizer.position_sigma_m
         self._code = EventCode.NORMAL
         self._drive_seq = 0
-        self._driven = (0.0, 0.0)
-        self._span = CommandSpan()
         self._time = SteadyTime(cfg.health.clock_jump_s)
         self._has_full_fans = False
         self._state, self._state_s = MissionState.IDLE, 0.0
-        self._wheels_m = cfg.robot.wheel_radius_m, cfg.robot.wheel_base_m
 
     def run(self) -> SilResult:
         """From the first frame to the end of the mission."""
@@ -305,7 +301,7 @@ class SilRun:
             self._measure(frame)
             right = left = 0.0  # the held frame is answered by zeros
         self._drive_seq = number = self._drive_seq + 1
-        self._foresee(number, right, left)
+        self._note_drive(number, right, left)
         robot.permit(number, verdict.forward, verdict.reverse, verdict.turn)
         robot.drive(number, set_point_on_wire(right), set_point_on_wire(left))
 
@@ -313,7 +309,7 @@ class SilRun:
         localizer, echo = self.localizer, frame.cmd
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         here = pose.x_m, pose.y_m, pose.heading_rad
-        ahead = self.predictor.ahead(here, v, omega, echo.seq, echo.age, echo.held, creep)
+        ahead = self.sent.ahead(here, v, omega, echo.seq, echo.age, echo.held, creep)
         return StateEstimate(
             frame.t + self._time.offset_s,
             dt_s,
@@ -327,11 +323,8 @@ class SilRun:
             self.parts.heading_sigma_rad,
         )
 
-    def _foresee(self, number: int, right: float, left: float) -> None:
-        self._driven = right, left
-        self._span.add(right, left)
-        twist = twist_of(right, left, *self._wheels_m)
-        self.predictor.sent(number, twist.v_m_s, twist.omega_rad_s)
+    def _note_drive(self, number: int, right: float, left: float) -> None:
+        self.sent.add(number, right, left)
 
     def _note_state(self, state: MissionState) -> None:
         """Another state begins, or the mission is over in it."""
@@ -344,7 +337,7 @@ class SilRun:
             deck = self.localizer.deck_pose
             self._published = EstimateMessage(
                 seq=seq, t_s=t_s, x_m=deck.x_m, y_m=deck.y_m, heading_rad=deck.heading_rad,
-                sigma_m=self.localizer.position_sigma_m, state=state, commanded=self._span.take(*self._driven),
+                sigma_m=self.localizer.position_sigma_m, state=state, commanded=self.sent.take_span(),
                 drive_seq=self._drive_seq,
             )  # fmt: skip
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from ccatp.conditions import DANGER, MonitorFinding
 from ccatp.config.load import load_config
+from ccatp.control.sent_drives import SentDrives
 from ccatp.core import Severity, Verdict
 from ccatp.daemon.subscribers import EstimateSubscriber
 from ccatp.danger import DangerMonitor
@@ -19,7 +20,6 @@ from ccatp.links.bus import PeerSocket
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.mirror.mirror import build_mirror
 from ccatp.safety.escalation import SeverityEscalation, denies, gravest
-from ccatp.safety.wheel_monitors import CommandSpan
 from ccatp.sim.robot import Robot
 
 HEALTH = load_config().health
@@ -103,9 +103,13 @@ def found_on_the_way(
     robot._sensors.edges.place(robot.world.plant)
     robot.command_fans(1, *cfg.robot.fan_duty)
     monitor = DangerMonitor(mirror, cfg.robot, cfg.danger, cfg.health)
-    span, told, number, radius_m = CommandSpan(), list[EstimateMessage](), 0, cfg.robot.wheel_radius_m
+    sent, told, number, radius_m = (
+        SentDrives(cfg.robot, robot.frame_s),
+        list[EstimateMessage](),
+        0,
+        cfg.robot.wheel_radius_m,
+    )
     v = omega = 0.0
-    driven = (0.0, 0.0)
     found: list[Verdict] = []
     for v_wanted, omega_wanted in wanted:
         robot.advance()
@@ -122,12 +126,12 @@ def found_on_the_way(
             pose = robot.world.plant.pose
             told.append(EstimateMessage(
                 seq=frame.seq, t_s=frame.t, x_m=pose.x_m, y_m=pose.y_m, heading_rad=pose.heading_rad, sigma_m=1e-3,
-                state="driving", commanded=span.take(*driven), drive_seq=number,
+                state="driving", commanded=sent.take_span(), drive_seq=number,
             ))  # fmt: skip
         number += 1
         half = 0.5 * omega * cfg.robot.wheel_base_m
         driven = (v + half) / radius_m, (v - half) / radius_m
-        span.add(*driven)
+        sent.add(number, *driven)
         robot.drive(number, *driven)
         robot.permit(number, verdict.forward, verdict.reverse, verdict.turn)
     return found

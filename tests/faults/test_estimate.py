@@ -64,8 +64,8 @@ class Broken(MeasuredSurvey):
     held_at_s: float | None = None
     drive = (0.0, 0.0)
 
-    def _foresee(self, number: int, right: float, left: float) -> None:
-        super()._foresee(number, right, left)
+    def _note_drive(self, number: int, right: float, left: float) -> None:
+        super()._note_drive(number, right, left)
         self.drive = right, left
 
     def look(self, frame: Sensors) -> None:

@@ -78,8 +78,8 @@ class Aborted(MeasuredSurvey):
             self.cleared_s = frame.t
             assert self.monitor.clear("e", at_base_or_held=self.mission.state.mode is HELD) is None
 
-    def _foresee(self, number: int, right: float, left: float) -> None:
-        super()._foresee(number, right, left)
+    def _note_drive(self, number: int, right: float, left: float) -> None:
+        super()._note_drive(number, right, left)
         frame = self.robot.delivered
         assert frame is not None
         if self.raised_s <= frame.t and right == left == 0.0:
@@ -117,7 +117,7 @@ def test_an_earthquake_presses_on_holds_and_leads_home_when_it_is_over(
     result = run.run()
     measured("O1", 1e3 * (run.zero_s - run.raised_s))
     assert run.zero_s - run.raised_s <= 0.1
-    assert run.fans == [(run.raised_s, FULL)]  # in the same frame
+    assert run.fans == [(pytest.approx(run.raised_s + run.robot.frame_s), FULL)]  # in the next frame
     assert run.cleared_s < inf
     assert not run.moved_while_held
     assert not run.was_permitted  # danger holds it, too

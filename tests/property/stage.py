@@ -197,7 +197,7 @@ class Stage(SilRun):
 
     def _send(self, right: float, left: float) -> None:
         self._drive_seq += 1
-        self._foresee(self._drive_seq, right, left)
+        self._note_drive(self._drive_seq, right, left)
         self.robot.drive(self._drive_seq, set_point_on_wire(right), set_point_on_wire(left))
 
     def _collect(self) -> None:

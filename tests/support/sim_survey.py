@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.control.tracker import CommandPredictor
+from ccatp.control.sent_drives import SentDrives
 from ccatp.core import DeckPose, Fix, PointId, Severity, Vector3, Verdict
 from ccatp.daemon.fix_service import FixRequest, FixService
 from ccatp.daemon.telemetry import Telemetry
@@ -52,6 +52,13 @@ def plan_of(*faults: str) -> FaultPlan:
 # -- watched frame by frame -------------------------------------------------------------------------------------------
 
 
+def executed(drive: tuple[float, float], verdict: Verdict) -> tuple[float, float]:
+    """The set points that both keys together leave: the permit on a frame counts for the drive that answers it."""
+    right, left = drive
+    is_denied = not verdict.forward if right + left > 0.0 else not verdict.reverse and right + left < 0.0
+    return (0.0, 0.0) if is_denied or (right != left and not verdict.turn) else drive
+
+
 class Seen(NamedTuple):
     """One frame of a watched mission: what the robot was told after it, and where it really was."""
 
@@ -83,7 +90,9 @@ class Watched(FaultySilRun):
         super()._serve(frame, dt_s)
         deck, robot = self.localizer.deck_pose, self.robot
         place = robot.world.plant.pose
-        now = Seen(robot.t_s, self.monitor.verdict, self.mission.state.mode, self._driven, place, (deck.x_m, deck.y_m))
+        verdict, estimate = self.monitor.verdict, (deck.x_m, deck.y_m)
+        drive = executed(self.sent.rates, verdict)
+        now = Seen(robot.t_s, verdict, self.mission.state.mode, drive, place, estimate)
         self.seen.append(now)
         if self._is_enough(now):
             raise _Enough
@@ -385,7 +394,7 @@ class RestartedSurvey(SilRun):
         truth = self.robot.world.plant
         self.first_moves_m.append(hypot(truth.x_m - pose.x_m, truth.y_m - pose.y_m) / sigma_m)
         self.localizer, self.mission, self.gate = parts.localizer, parts.mission, parts.gate
-        self.predictor = CommandPredictor(cfg.robot.wheel_lag_s, self.robot.frame_s)
+        self.sent = SentDrives(cfg.robot, self.robot.frame_s)
 
     @property
     def measured(self) -> list[PointId]:

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.config.models import Config, PidConfig
+from ccatp.config.models import Config, PidConfig, RobotConfig
 from ccatp.control.pid import AxisState, Pid, PidState, Profile, ProfiledAxis, lag_feed_forward
-from ccatp.control.tracker import CommandPredictor
-from ccatp.core import Predicted
+from ccatp.control.sent_drives import SentDrives
+from ccatp.core import Predicted, Twist, wheel_rates
 
 
 def gains(kp: float, ki: float, kd: float, integral_limit: float = 10.0, filter_s: float = 0.0) -> PidConfig:
@@ -197,19 +197,35 @@ def rolled(commands: list[tuple[float, float]], v: float, omega: float, steps: i
     return Predicted((x, y, heading), v, omega)
 
 
+class Sender:
+    """Drives given as velocities."""
+
+    def __init__(self, robot: RobotConfig) -> None:
+        robot = robot.model_copy(update={"wheel_lag_s": LAG_PREDICTION})
+        self.drives = SentDrives(robot, DT_PREDICTION)
+        self.ahead, self._geometry = self.drives.ahead, (robot.wheel_radius_m, robot.wheel_base_m)
+
+    def add(self, seq: int, v_m_s: float, omega_rad_s: float) -> None:
+        self.drives.add(seq, *wheel_rates(Twist(v_m_s, omega_rad_s), *self._geometry))
+
+
 @pytest.fixture
-def predictor() -> CommandPredictor:
-    predictor = CommandPredictor(LAG_PREDICTION, DT_PREDICTION)
+def sender(config: Config) -> Sender:
+    return Sender(config.robot)
+
+
+@pytest.fixture
+def predictor(sender: Sender) -> Sender:
     for seq in range(1, 7):
-        predictor.sent(seq, 0.01 * seq, 0.1 * seq)
-    return predictor
+        sender.add(seq, 0.01 * seq, 0.1 * seq)
+    return sender
 
 
-def test_without_delay_the_estimate_is_returned_unchanged(predictor: CommandPredictor) -> None:
+def test_without_delay_the_estimate_is_returned_unchanged(predictor: Sender) -> None:
     assert predictor.ahead(POSE, 0.05, 0.3, 6, DT_PREDICTION, False, (0.05, 0.05)) == Predicted(POSE, 0.05, 0.3)
 
 
-def test_commands_on_the_way_act_for_a_frame_each(predictor: CommandPredictor) -> None:
+def test_commands_on_the_way_act_for_a_frame_each(predictor: Sender) -> None:
     ahead = predictor.ahead(POSE, 0.05, 0.3, 3, DT_PREDICTION, False)
     expected = rolled([(0.04, 0.4), (0.05, 0.5), (0.06, 0.6)], 0.05, 0.3)
     # Steps of 10 us are good to 1e-6 of the 1.5 mm and 9 mrad travelled; the midpoint rule to less.
@@ -217,45 +233,43 @@ def test_commands_on_the_way_act_for_a_frame_each(predictor: CommandPredictor) -
     assert (ahead.v_m_s, ahead.omega_rad_s) == pytest.approx((expected.v_m_s, expected.omega_rad_s), abs=1e-4)
 
 
-def test_an_echo_younger_than_a_frame_acts_for_the_rest_of_it(predictor: CommandPredictor) -> None:
+def test_an_echo_younger_than_a_frame_acts_for_the_rest_of_it(predictor: Sender) -> None:
     fresh = predictor.ahead(POSE, 0.05, 0.3, 6, 0.0, False)
     keep = exp(-DT_PREDICTION / LAG_PREDICTION)
     assert fresh.v_m_s == pytest.approx(0.06 - 0.01 * keep)
     assert predictor.ahead(POSE, 0.05, 0.3, 6, 0.4 * DT_PREDICTION, False).v_m_s < fresh.v_m_s
 
 
-def test_nothing_in_force_means_that_all_is_on_the_way() -> None:
-    predictor = CommandPredictor(LAG_PREDICTION, DT_PREDICTION)
-    predictor.sent(1, 0.1, 0.0)
-    assert predictor.ahead(POSE, 0.0, 0.0, -1, 0.5, False).v_m_s == pytest.approx(
+def test_nothing_in_force_means_that_all_is_on_the_way(sender: Sender) -> None:
+    sender.add(1, 0.1, 0.0)
+    assert sender.ahead(POSE, 0.0, 0.0, -1, 0.5, False).v_m_s == pytest.approx(
         0.1 * (1.0 - exp(-DT_PREDICTION / LAG_PREDICTION))
     )
 
 
-def test_held_wheels_run_down_whatever_was_sent(predictor: CommandPredictor) -> None:
+def test_held_wheels_run_down_whatever_was_sent(predictor: Sender) -> None:
     assert predictor.ahead(POSE, 0.0, 0.0, 2, DT_PREDICTION, True) == Predicted(POSE, 0.0, 0.0)
     assert predictor.ahead(POSE, 0.05, 0.0, 2, DT_PREDICTION, True).v_m_s == pytest.approx(
         0.05 * exp(-4 * DT_PREDICTION / LAG_PREDICTION)
     )
 
 
-def test_a_restart_forgets_what_was_sent(predictor: CommandPredictor) -> None:
-    predictor.sent(1, 0.0, 0.0)
+def test_a_restart_forgets_what_was_sent(predictor: Sender) -> None:
+    predictor.add(1, 0.0, 0.0)
     assert predictor.ahead(POSE, 0.0, 0.0, -1, DT_PREDICTION, False) == Predicted(POSE, 0.0, 0.0)
-    predictor.sent(2, 0.1, 0.0)
-    predictor.reset()
+    predictor.add(2, 0.1, 0.0)
+    predictor.drives.begin_session(DT_PREDICTION)
     assert predictor.ahead(POSE, 0.0, 0.0, -1, DT_PREDICTION, False) == Predicted(POSE, 0.0, 0.0)
 
 
-def test_the_reach_is_bounded() -> None:
-    predictor = CommandPredictor(LAG_PREDICTION, DT_PREDICTION)
+def test_the_reach_is_bounded(sender: Sender) -> None:
     for seq in range(1000):
-        predictor.sent(seq, 0.1, 0.0)
-    ahead = predictor.ahead((0.0, 0.0, 0.0), 0.1, 0.0, -1, 9.0, False)
+        sender.add(seq, 0.1, 0.0)
+    ahead = sender.ahead((0.0, 0.0, 0.0), 0.1, 0.0, -1, 9.0, False)
     assert ahead.pose[0] == pytest.approx(0.1 * 0.25)  # a quarter of a second: the time-to-live of a drive
 
 
-def test_drift_carries_the_body_along(predictor: CommandPredictor) -> None:
+def test_drift_carries_the_body_along(predictor: Sender) -> None:
     still = predictor.ahead(POSE, 0.05, 0.0, 4, DT_PREDICTION, False).pose
     carried = predictor.ahead(POSE, 0.05, 0.0, 4, DT_PREDICTION, False, (0.1, -0.2)).pose
     travel = ((still[0] - POSE[0]) ** 2 + (still[1] - POSE[1]) ** 2) ** 0.5
@@ -263,6 +277,16 @@ def test_drift_carries_the_body_along(predictor: CommandPredictor) -> None:
     assert carried[1] - still[1] == pytest.approx(-0.2 * travel, rel=1e-3)
 
 
-def test_a_frame_takes_time() -> None:
+def test_a_frame_takes_time(config: Config) -> None:
     with pytest.raises(ValueError, match=r"frame_s = 0\.0: the period of the frames must be positive"):
-        CommandPredictor(LAG_PREDICTION, 0.0)
+        SentDrives(config.robot, 0.0)
+
+
+def test_the_span_begins_with_the_drive_in_force(config: Config) -> None:
+    drives = SentDrives(config.robot, DT_PREDICTION)
+    for seq, rates in enumerate([(1.0, -1.0), (3.0, -2.0), (2.0, 0.5)]):
+        drives.add(seq, *rates)
+    assert drives.take_span() == (0.0, 3.0, -2.0, 0.5)
+    assert drives.take_span() == (2.0, 2.0, 0.5, 0.5)
+    drives.add(3, 0.0, 0.0)
+    assert drives.take_span() == (0.0, 2.0, 0.0, 0.5)

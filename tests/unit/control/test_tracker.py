@@ -12,7 +12,8 @@ from scipy.linalg import solve_continuous_are
 
 from ccatp.config.models import Config
 from ccatp.control.gate import Purpose
-from ccatp.control.tracker import CommandPredictor, LegLine, LegMotion, LegPhase, LegTracker, LegView, line_rate
+from ccatp.control.sent_drives import SentDrives
+from ccatp.control.tracker import LegLine, LegMotion, LegPhase, LegTracker, LegView, line_rate
 from ccatp.core import EventCode, Twist, Verdict, difference, twist_of
 from ccatp.survey.composition import build_gate
 from ccatp.survey.planning.search import bang_bang_time
@@ -256,7 +257,7 @@ class Rig:
         self.heading = heading
         self.wheels = [0.0, 0.0]
         self.slip, self.creep, self.lag_s = slip, creep, lag * robot.wheel_lag_s
-        self.predictor = CommandPredictor(robot.wheel_lag_s, DT_CLOSED_LOOP)
+        self.sent = SentDrives(robot, DT_CLOSED_LOOP)
         self.gate = build_gate(config)
         self.tracker = Leg(LegTracker(config.control, config.limits, robot.wheel_lag_s))
         self.link: deque[tuple[int, float, float]] = deque([(-1, 0.0, 0.0)] * delay)
@@ -283,14 +284,13 @@ class Rig:
         v, omega = self.twist.v_m_s, self.twist.omega_rad_s
         if not self.is_predicting:
             return self.pose, Twist(v, omega)
-        seen = self.predictor.ahead(self.pose, v, omega, self.echo, DT_CLOSED_LOOP, self.echo < 0, self.creep)
+        seen = self.sent.ahead(self.pose, v, omega, self.echo, DT_CLOSED_LOOP, self.echo < 0, self.creep)
         return seen.pose, Twist(seen.v_m_s, seen.omega_rad_s)
 
     def drive(self, wanted: Twist) -> None:
         right, left = self.gate.pass_through(wanted, FREE, DT_CLOSED_LOOP, FREE.t_s, 0.0, Purpose.SURVEY)
         self.seq += 1
-        twist = twist_of(right, left, self.r, self.base)
-        self.predictor.sent(self.seq, twist.v_m_s, twist.omega_rad_s)
+        self.sent.add(self.seq, right, left)
         self.link.append((self.seq, right, left))
         self.echo, right, left = self.link.popleft()
         keep = exp(-DT_CLOSED_LOOP / self.lag_s)
