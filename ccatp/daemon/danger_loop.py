@@ -150,9 +150,10 @@ class DangerLoop(RobotLoop):
         self._cfg = cfg = args.config
         self.monitor, self._judge = build_safety_monitor(cfg)
         self.monitor.latch = PersistentEmergencyLatch(args.run_dir / FILE, self.log)
-        self._estimates = EstimateSubscriber(
-            self.peer, self.heartbeat.publish_if_due, is_taking_over=args.is_taking_over
+        self.peer = self._estimates = EstimateSubscriber(
+            context, args.endpoints.of("main"), self.heartbeat.publish_if_due, is_taking_over=args.is_taking_over
         )
+        self._has_heard_main = False
         self._published = (EventCode.NORMAL, "", Severity.NONE)
         self._seq, self._t_s = -1, 0.0
         self._bad_lines = self._permit_seq = 0
@@ -169,14 +170,9 @@ class DangerLoop(RobotLoop):
         return self._observatory.serve(self._shadow), self.publish_heartbeat(), self.watch(), self.serve()
 
     def is_peer_ready(self) -> bool:
-        return self.peer.is_connected
-
-    def publish_levels(self) -> None:
-        """Report once to each main loop that danger has joined the robot; notice who subscribes to the verdict."""
-        self.publisher.has_subscriber("verdict")
-        if self.peer.is_new and self.heartbeat.phase == "joined":
-            self.peer.is_new = False
-            self.peer.send("heartbeat.danger", self.heartbeat.next())
+        """Messages get through, both ways: the first ones must not be lost."""
+        self._has_heard_main = self._has_heard_main or self._estimates.has_received()
+        return self._has_heard_main and self.publisher.has_subscriber("verdict")
 
     async def end(self, _stop: asyncio.Event) -> None:
         self.log.info("danger_statistics", **self.monitor.counts)

@@ -82,8 +82,8 @@ class MainLoop(RobotLoop):
     ) -> None:
         super().__init__("main", "controller", args, context)
         cfg = args.config
-        timeout_s = cfg.mission.verdict_timeout_s
-        self._verdicts = VerdictSubscriber(self.peer, timeout_s, self.heartbeat.publish_if_due)
+        danger, timeout_s = args.endpoints.of("danger"), cfg.mission.verdict_timeout_s
+        self.peer = self._verdicts = VerdictSubscriber(context, danger, timeout_s, self.heartbeat.publish_if_due)
         self.clock = MissionClock(10.0 * cfg.run.step_s if isinstance(cfg, RadioConfig) else cfg.health.clock_jump_s)
         self.frame_period_s = 0.0
         self._is_new_session, self._drive_seq = False, 0
@@ -106,7 +106,8 @@ class MainLoop(RobotLoop):
         self.heartbeat.phase = "ready"
 
     def is_peer_ready(self) -> bool:
-        return self.publisher.has_subscriber("track") and self._verdicts.is_danger_joined()
+        has_subscriber = self.publisher.has_subscriber
+        return has_subscriber("track") and has_subscriber("estimate") and self._verdicts.is_danger_joined()
 
     def on_joined(self, hello: Hello) -> None:
         try:

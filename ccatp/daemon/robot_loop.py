@@ -13,8 +13,8 @@ import zmq.asyncio
 from ccatp.daemon import realtime
 from ccatp.daemon.process import ProcessArgs, open_log, processes_of, unless_stopped
 from ccatp.daemon.robot_session import LatenessStatistics, RobotSession
-from ccatp.daemon.subscribers import PERIOD_S, HeartbeatPublisher
-from ccatp.links.bus import PeerSocket, Publisher
+from ccatp.daemon.subscribers import PERIOD_S, HeartbeatPublisher, PeerSubscriber
+from ccatp.links.bus import Publisher
 from ccatp.links.robot_messages import Role
 
 WAIT_PERIOD_S = 0.02
@@ -26,17 +26,18 @@ class RobotLoop(RobotSession):
     """A loop at the robot, and the process around it.
 
     Attributes:
-        peer: connection to the other loop.
+        peer: the messages of the other loop.
         over: set when the loop ends by itself.
     """
+
+    peer: PeerSubscriber
 
     def __init__(self, name: str, role: Role, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
         super().__init__(args.config.robot, role, name)
         self._args = args
         self._shadow = zmq.asyncio.Context.shadow(context)
         self.log = open_log(args.run_dir / "log.jsonl", name)
-        self.peer = PeerSocket(args.endpoints.runtime_dir / "peer", is_listening=role == "monitor")
-        self.publisher = Publisher(context, args.endpoints.of(name), self.peer)
+        self.publisher = Publisher(context, args.endpoints.of(name))
         self.heartbeat = HeartbeatPublisher(self.publisher, name)
         self.lateness = LatenessStatistics(self.robot_cfg.slip_after_s)
         self.over = asyncio.Event()
@@ -54,7 +55,6 @@ class RobotLoop(RobotSession):
                     task.cancel()
                 self.leave()
                 await self.close()
-                self.peer.close()
 
     async def _join(self, stop: asyncio.Event) -> None:
         if not await unless_stopped(stop, self.connect()):

@@ -1,11 +1,13 @@
-"""Verdicts for main and estimates for danger, and heartbeats; in lockstep a loop waits for the message of its frame."""
+"""Heartbeats, verdicts for main and estimates for danger; in lockstep a loop waits for the message of its frame."""
 
 import os
 import time
 from collections.abc import Callable
 
+import zmq
+
 from ccatp.core import Verdict
-from ccatp.links.bus import PeerSocket, Publisher
+from ccatp.links.bus import Publisher, Subscriber
 from ccatp.links.topics import EstimateMessage, Heartbeat, Message, last_estimate_before
 
 # In lockstep simulated time stands still while a loop waits; longer than this the other loop hangs.
@@ -18,25 +20,40 @@ PERIOD_S = 0.1
 
 
 class PeerSubscriber:
-    """Receives what the other loop publishes for each frame; ``on_wait``: called now and then while lockstep waits."""
+    """Receives what the other loop publishes for each frame, and its heartbeats.
 
-    def __init__(self, socket: PeerSocket, on_wait: Callable[[], None]) -> None:
-        self.socket, self._on_wait = socket, on_wait
+    Args:
+        topics: of the messages.
+        on_wait: called now and then while lockstep waits.
+    """
+
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        topics: tuple[str, ...],
+        on_wait: Callable[[], None],
+    ) -> None:
+        self._subscriber = Subscriber(context, [endpoint], topics, is_watching=True)
+        self._on_wait = on_wait
+        # Renews a connection that is silent for long.
+        self.maintain = self._subscriber.maintain
+        self.close = self._subscriber.close
 
     def take_new(self, take: Callable[[Message | Verdict], bool]) -> None:
         """Give all messages that have arrived to ``take``."""
-        while (message := self.socket.receive()) is not None:
-            take(message)
+        while (received := self._subscriber.receive()) is not None:
+            take(received[1])
 
     def take_until(self, take: Callable[[Message | Verdict], bool]) -> None:
         """The same until ``take`` returns True for one, the other process is gone, or the time is up."""
         deadline = time.monotonic() + LOCKSTEP_WAIT_S
         while True:
-            message = self.socket.receive(WAIT_SLICE_S)
-            if message is not None:
-                if take(message):
+            received = self._subscriber.receive(WAIT_SLICE_S)
+            if received is not None:
+                if take(received[1]):
                     return
-            elif not self.socket.is_connected or time.monotonic() > deadline:
+            elif self._subscriber.is_cut or time.monotonic() > deadline:
                 return
             else:
                 self._on_wait()
@@ -45,15 +62,22 @@ class PeerSubscriber:
 class VerdictSubscriber(PeerSubscriber):
     """Receives danger's verdicts; ``timeout_s``: an older one is not in force."""
 
-    def __init__(self, socket: PeerSocket, timeout_s: float, on_wait: Callable[[], None] = lambda: None) -> None:
-        super().__init__(socket, on_wait)
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        timeout_s: float,
+        on_wait: Callable[[], None] = lambda: None,
+    ) -> None:
+        super().__init__(context, endpoint, ("verdict", "heartbeat.danger"), on_wait)
         self._timeout_s, self._wall_s = timeout_s, 0.0
         self.verdict: Verdict | None = None
         self._early: Verdict | None = None
 
     def is_danger_joined(self) -> bool:
-        """Whether danger has reported that it joined the robot; each connection begins with that."""
-        while (message := self.socket.receive()) is not None:
+        """Whether danger has reported that it joined the robot; it repeats that."""
+        while (received := self._subscriber.receive()) is not None:
+            message = received[1]
             if isinstance(message, Heartbeat) and message.phase == "joined":
                 return True
         return False
@@ -98,11 +122,20 @@ class EstimateSubscriber(PeerSubscriber):
     """Receives main's estimates; ``is_taking_over``: the one for the first frame may have been missed."""
 
     def __init__(
-        self, socket: PeerSocket, on_wait: Callable[[], None] = lambda: None, *, is_taking_over: bool = False
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        on_wait: Callable[[], None] = lambda: None,
+        *,
+        is_taking_over: bool = False,
     ) -> None:
-        super().__init__(socket, on_wait)
+        super().__init__(context, endpoint, ("estimate", "heartbeat.main"), on_wait)
         self._is_taking_over = is_taking_over
         self.reset()
+
+    def has_received(self) -> bool:
+        """Whether a message was received."""
+        return self._subscriber.receive() is not None
 
     def reset(self) -> None:
         """The robot's frames restarted: forget the estimate."""
@@ -159,22 +192,15 @@ class HeartbeatPublisher:
         """Time since the newest frame was served."""
         return None if self.frame_s is None else time.monotonic() - self.frame_s
 
-    def next(self) -> Heartbeat:
-        """The next message."""
-        self._count += 1
-        return Heartbeat(
-            seq=self._count - 1,
-            t_s=time.monotonic(),
-            process=self._process,
-            pid=os.getpid(),
-            phase=self.phase,
-            frame_age_s=self.frame_age_s,
-        )
-
     def publish(self) -> None:
         """Publish now."""
-        self._published_s = time.monotonic()
-        self._publisher.send(f"heartbeat.{self._process}", self.next())
+        self._published_s = now_s = time.monotonic()
+        age_s, pid = self.frame_age_s, os.getpid()
+        heartbeat = Heartbeat(
+            seq=self._count, t_s=now_s, process=self._process, pid=pid, phase=self.phase, frame_age_s=age_s
+        )
+        self._publisher.send(f"heartbeat.{self._process}", heartbeat)
+        self._count += 1
 
     def publish_if_due(self) -> None:
         """Publish if it is due."""

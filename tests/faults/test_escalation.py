@@ -2,11 +2,11 @@
 
 from collections import deque
 from collections.abc import Callable
-from typing import cast
 
 import msgspec
 import numpy as np
 import pytest
+import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,7 +16,6 @@ from ccatp.control.sent_drives import SentDrives
 from ccatp.core import Severity, Verdict
 from ccatp.daemon.subscribers import EstimateSubscriber
 from ccatp.danger import DangerMonitor
-from ccatp.links.bus import PeerSocket
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.mirror.mirror import build_mirror
 from ccatp.safety.escalation import SeverityEscalation, denies, gravest
@@ -149,11 +148,17 @@ def test_monitors_are_silent_where_nothing_is_wrong(
 class Waiting:
     """What main has published and the danger loop has not received yet."""
 
-    def __init__(self) -> None:
+    def __init__(self, *_: object, **__: object) -> None:
         self.messages: deque[EstimateMessage] = deque()
 
-    def receive(self) -> EstimateMessage | None:
-        return self.messages.popleft() if self.messages else None
+    def receive(self) -> tuple[str, EstimateMessage] | None:
+        return ("estimate", self.messages.popleft()) if self.messages else None
+
+    def maintain(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
 
 
 @pytest.mark.fault("P8")
@@ -166,11 +171,14 @@ class Waiting:
     ],
 )
 def test_drives_that_the_danger_loop_hears_of_late_have_moved_the_wheels(
-    frames: int, dv_m_s: float, heard_until: Callable[[int], int], seed: int
+    frames: int, dv_m_s: float, heard_until: Callable[[int], int], seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A robot that has stood for long drives on for a moment, and the estimates of that wait for the danger loop."""
-    socket = Waiting()
-    ear, waiting = EstimateSubscriber(cast(PeerSocket, socket)), socket.messages
+    monkeypatch.setattr("ccatp.daemon.subscribers.Subscriber", Waiting)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    ear = EstimateSubscriber(context, "inproc://main")
+    context.destroy()
+    waiting: deque[EstimateMessage] = ear._subscriber.messages  # type: ignore[attr-defined]
     arrived = 0
 
     def heard(told: list[EstimateMessage], k: int) -> EstimateMessage | None:

@@ -22,7 +22,7 @@ from ccatp.config.load import dump_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, PanelId, Twist, twist_of, wheel_rates
 from ccatp.daemon.process import Endpoints
-from ccatp.links.bus import PeerSocket, Subscriber
+from ccatp.links.bus import Publisher, Subscriber
 from ccatp.links.robot_link import RobotLink
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import DangerEvent, EstimateMessage, Heartbeat, TruthMessage
@@ -79,14 +79,18 @@ def configure(case: RimCase) -> Config:
 class RecklessMain:
     """Stands in for the main loop: claims a pose, never listens to a verdict."""
 
-    def __init__(self, case: RimCase, cfg: Config, peer: PeerSocket) -> None:
-        self._robot, self._peer, self._is_pose_right = cfg.robot, peer, case.is_pose_right
+    def __init__(self, case: RimCase, cfg: Config, publisher: Publisher) -> None:
+        self._robot, self._publisher, self._is_pose_right = cfg.robot, publisher, case.is_pose_right
         self._mirror = build_mirror(cfg.mirror)
         # A wrong pose: it believes itself in the middle of the mirror, with no rim and no seam anywhere near.
         self._pose = self._mirror.base_pose if case.is_pose_right else DeckPose(0.05, 0.05, 0.3)
         self._t_s = 0.0
         self._wheels = wheel_rates(Twist(case.speed_m_s, 0.0), cfg.robot.wheel_radius_m, cfg.robot.wheel_base_m)
         self.held_frames = self.frames = 0
+
+    def presence(self) -> None:
+        """Be seen by the danger loop."""
+        self._publisher.send("heartbeat.main", Heartbeat(seq=0, t_s=0.0, process="main", pid=0, phase="ready"))
 
     def on_sensors(self, link: RobotLink, sensors: Sensors) -> None:
         """Dead-reckon, claim the pose, drive on."""
@@ -111,7 +115,7 @@ class RecklessMain:
             seq=sensors.seq, t_s=sensors.t, x_m=pose.x_m, y_m=pose.y_m, heading_rad=pose.heading_rad, sigma_m=0.001,
             state="driving",
         )  # fmt: skip
-        self._peer.send("estimate", claim)
+        self._publisher.send("estimate", claim)
         link.send_drive(sensors.seq, sensors.seq, *self._wheels)
 
 
@@ -146,14 +150,14 @@ async def check(case: RimCase, run_dir: Path, runtime_dir: Path) -> None:
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     sources = [endpoints.of("truth"), endpoints.of("danger")]
     heard = Subscriber(context, sources, ["truth", "danger_event", "heartbeat.danger", "verdict"])
-    peer = PeerSocket(runtime_dir / "peer")
-    main, deadline = RecklessMain(case, cfg, peer), time.monotonic() + PATIENCE_S
+    publisher = Publisher(context, endpoints.of("main"))
+    main, deadline = RecklessMain(case, cfg, publisher), time.monotonic() + PATIENCE_S
     try:
         with processes(cfg, case, run_dir, endpoints) as port:
             is_joined = False
             while not is_joined:
                 assert time.monotonic() < deadline, "the danger loop never joined"
-                peer.maintain()
+                main.presence()
                 while (received := heard.receive()) is not None:
                     message = received[1]
                     is_joined = is_joined or (isinstance(message, Heartbeat) and message.phase == "joined")
@@ -181,7 +185,7 @@ async def check(case: RimCase, run_dir: Path, runtime_dir: Path) -> None:
                         declared_at = message.seq
             link.close()
     finally:
-        peer.close()
+        publisher.close()
         heard.close()
         context.destroy(linger=0)
     assert not has_fallen

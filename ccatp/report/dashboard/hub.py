@@ -43,13 +43,13 @@ class BusReader:
         wants: Wants = SURVEY,
     ) -> None:
         self._context, self._endpoint_of, self._view = context, endpoint_of, view
-        # Display state and verdict are published only for counted subscribers.
+        # The main loop makes a display state only for counted subscribers; a run counts those of the verdict.
         uncounted, watched = {"is_uncounted": True}, {"is_uncounted": True, "is_watching": True}
         newest = {"keeps_newest": True}
         # By whether they are read: publisher, topics, how.
         self._rows: dict[str, list[tuple[str, tuple[str, ...], dict[str, bool]]]] = {
             "always": [("main", (*_OF_MAIN, *wants.main), watched), ("danger", _OF_DANGER, watched)],
-            "levels": [("main", ("display_state",), newest), ("danger", ("verdict",), newest)],
+            "levels": [("main", ("display_state",), newest), ("danger", ("verdict",), newest | uncounted)],
             "track": [("main", (wants.track,), uncounted)],
         }
         if is_sim:

@@ -2,8 +2,7 @@
 
 Where a process sends the first line of the robot link, its connection is written to CCATP_GOLDEN_DIR/wire.<n>, one line
 per message: ``>`` from or ``<`` to the robot, and the message; a frame that goes to several clients is written once.
-What any process publishes by ZeroMQ, or sends to another in packets, goes to CCATP_GOLDEN_DIR/bus.<n>, but for long
-messages: set points have all their
+What any process publishes by ZeroMQ goes to CCATP_GOLDEN_DIR/bus.<n>, but for long messages: set points have all their
 digits there. Nothing here depends on names of the package: the link and the channels are documented interfaces.
 
 CCATP_GOLDEN_ACTIONS is a JSON list of actions in their order. An action is done when the frame of that number is about
@@ -97,34 +96,22 @@ def _ask(endpoint: str, request: bytes, wait_s: float) -> bytes:
         return bytes(peer.recv()) if peer.poll(round(1000 * wait_s)) else b"null"
 
 
-class _Bus:
-    """What this process publishes, and sends to another by packets."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder, self._file = folder, -1
-
-    def note(self, data: Any) -> None:
-        if isinstance(data, bytes) and len(data) < _LONG_MESSAGE:
-            if self._file < 0:
-                self._file = _open_next(self._folder, "bus")
-            os.write(self._file, data + b"\n")
-
-
-def _write_down_bus(bus: _Bus) -> None:
+def _write_down_bus(folder: Path) -> None:
     send = zmq.Socket.send
+    files: list[int] = []
 
     def publish(self: zmq.Socket[Any], data: Any, *arguments: Any, **options: Any) -> Any:
-        if self.type in (zmq.PUB, zmq.XPUB):
-            bus.note(data)
+        if self.type in (zmq.PUB, zmq.XPUB) and isinstance(data, bytes) and len(data) < _LONG_MESSAGE:
+            if not files:
+                files.append(_open_next(folder, "bus"))
+            os.write(files[0], data + b"\n")
         return send(self, data, *arguments, **options)
 
     zmq.Socket.send = publish  # type: ignore[method-assign]
 
 
-def _write_down_link(wire: _Wire, bus: _Bus) -> None:
+def _write_down_link(wire: _Wire) -> None:
     def send(self: socket.socket, data: Any, *flags: int) -> int:
-        if self.type == socket.SOCK_SEQPACKET:
-            bus.note(data)
         if not wire.is_known(self, bytes(data[:200])):
             return _send(self, data, *flags)
         wire.act_before(bytes(data))
@@ -142,6 +129,5 @@ def _write_down_link(wire: _Wire, bus: _Bus) -> None:
 
 
 if (_folder := os.environ.get("CCATP_GOLDEN_DIR")) is not None:
-    _bus = _Bus(Path(_folder))
-    _write_down_bus(_bus)
-    _write_down_link(_Wire(Path(_folder), json.loads(os.environ.get("CCATP_GOLDEN_ACTIONS", "[]"))), _bus)
+    _write_down_bus(Path(_folder))
+    _write_down_link(_Wire(Path(_folder), json.loads(os.environ.get("CCATP_GOLDEN_ACTIONS", "[]"))))
