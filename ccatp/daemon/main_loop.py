@@ -13,7 +13,7 @@ import zmq
 from ccatp.conditions import FRAME_LATE, LINK_LOST, NO_FRAME_FOR, condition_of
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import Verdict
-from ccatp.daemon.mission_runner import STILL, DriveCommand, MissionClock, MissionRunner, TimedFrame
+from ccatp.daemon.mission_runner import STILL, DriveCommand, MissionRunner, TimedFrame
 from ccatp.daemon.process import ProcessArgs, run_process, start_process
 from ccatp.daemon.robot_loop import WAIT_PERIOD_S, RobotLoop
 from ccatp.daemon.subscribers import VerdictSubscriber
@@ -22,7 +22,8 @@ from ccatp.errors import CcatpError, ConfigError, ExitStatus
 from ccatp.links.channels import BadRequest, OperatorCommand, format_error, format_ok, parse_operator
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.rpc import Router
-from ccatp.links.topics import MissionStatus
+from ccatp.links.topics import MissionStatus, is_estimate_due
+from ccatp.safety.robot_clock import MissionClock
 from ccatp.survey.state import Abort, Interrupted, Pause, Resume, StopHere
 
 # After the end the last messages must reach the supervisor, which then ends this process.
@@ -275,53 +276,56 @@ class MainLoop(RobotLoop):
     # -- the frame ------------------------------------------------------------------------------------------------
 
     def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
-        """Serve one sensors frame. An unexpected error ends the process, held, and not just the connection."""
+        """Serve one frame: estimate, decide, drive; then telemetry.
+
+        An unexpected error ends the process, held, and not just the connection.
+        """
         if self.over.is_set():
             return
+        runner, clock, seq, begun_s = self._runner, self.clock, sensors.seq, time.perf_counter()
         try:
-            self._serve(sensors, raw)
+            is_first, is_going_on = self._is_new_session, clock.has_begun
+            t_s, dt_s = clock.take(seq, sensors.t, self.frame_period_s)
+            frame = TimedFrame(sensors, raw, t_s, dt_s, is_first, is_first or is_estimate_due(seq))
+            if is_first:
+                self._begin_drives(dt_s if is_going_on else 0.0)
+            self.heartbeat.frame_s = time.monotonic()
+
+            runner.estimate(frame)
+            if dt_s <= 0.0:  # counted by the localizer; a controller cannot go back in time
+                self._telemetry.add_line(seq, raw)
+                self._answer(seq, STILL)
+                return
+
+            asked_s = time.perf_counter()
+            verdict = None
+            if not is_first:  # of a session; no frame of it came before, on which there could be one
+                verdict = self._verdicts.latest(seq, self.frame_period_s, is_lockstep=self.is_lockstep)
+            decided_s = time.perf_counter()
+            drive = runner.plan(frame, verdict, 0.0) if self.is_lockstep else self._plan_in_time(frame, verdict)
+            self._answer(seq, drive)
+
+            runner.publish(frame)
+            self._telemetry.add_tick(1e6 * (time.perf_counter() - decided_s + asked_s - begun_s))
         except Exception as error:
-            self.log.exception("unhandled_exception", seq=self.clock.seq)
+            self.log.exception("unhandled_exception", seq=seq)
             what = f"{type(error).__name__}: {error}"
             self._telemetry.notify_operator("error", f"internal error, wheels held: {what}; see log.jsonl")
             self._fail(UnhandledError(f"internal error: {what}"))
 
-    def _serve(self, sensors: Sensors, raw: bytes) -> None:
-        start = time.perf_counter()
-        clock, runner, seq = self.clock, self._runner, sensors.seq
-        steady_s, dt_s = clock.time_of(seq, sensors.t, self.frame_period_s)
-        frame = TimedFrame(sensors, raw, steady_s, dt_s, self._is_new_session)
-        if frame.is_first:
-            self._begin_drives(dt_s)
-        clock.advance(seq, steady_s)
-        self.heartbeat.frame_s = time.monotonic()
-        runner.estimate(frame)
-        if dt_s <= 0.0:  # counted by the localizer; a controller cannot go back in time
-            self._telemetry.add_line(seq, raw)
-            self._answer(seq, STILL)
-            return
-        waiting = time.perf_counter()
-        verdict = None
-        if not frame.is_first:  # of a session; no frame of it came before, on which there could be one
-            verdict = self._verdicts.latest(seq, self.frame_period_s, is_lockstep=self.is_lockstep)
-        decided = time.perf_counter()
-        self._answer(seq, self._decide(frame, verdict))
-        runner.publish(frame)
-        self._telemetry.add_tick(1e6 * (time.perf_counter() - decided + waiting - start))
-
-    def _begin_drives(self, dt_s: float) -> None:
+    def _begin_drives(self, unseen_s: float) -> None:
         """Before the first drive and not on joining, so that in lockstep the robot gets it in a certain frame."""
         self._is_new_session = False
         self._runner.begin_drives()
-        if self.clock.has_begun and dt_s > UNSEEN_S and not self._was_at_rest:
-            text = f"the robot moved and sent no frame for {dt_s:.2f} s: relocalizing"
+        if unseen_s > UNSEEN_S and not self._was_at_rest:
+            text = f"the robot moved and sent no frame for {unseen_s:.2f} s: relocalizing"
             self._telemetry.notify_operator("warning", text)
             self._runner.on_tracking_gap()
 
-    def _decide(self, frame: TimedFrame, verdict: Verdict | None) -> DriveCommand:
-        """The drive that answers a frame. One that is too late moves nothing."""
+    def _plan_in_time(self, frame: TimedFrame, verdict: Verdict | None) -> DriveCommand:
+        """The drive that answers a frame on the wall clock. One that is too late moves nothing."""
         runner, limit_s, begun_s = self._runner, self.robot_cfg.lag_limit_s, time.monotonic()
-        lag_s = 0.0 if self.is_lockstep else self.lateness.add(frame.sensors.t, begun_s)
+        lag_s = self.lateness.add(frame.sensors.t, begun_s)
         if lag_s > limit_s:
             if begun_s < self._catches_up_until_s:
                 return runner.hold(frame)
@@ -345,18 +349,13 @@ class MainLoop(RobotLoop):
         steering = () if steer is None else (steer,)
         self.link.send_drive(self._drive_seq, max(ack, 0), right, left, *steering)
 
-    def _may_answer(self) -> bool:
-        """In lockstep simulated time stands still while a peer is awaited, and all but still in a pause."""
-        if not self.is_lockstep:
-            return True
-        runner = self._runner
-        return not runner.is_busy and not (runner.mission.state.is_paused and runner.is_at_rest)
-
     def _answer(self, seq: int, drive: DriveCommand) -> None:
-        if self._may_answer():
-            self.send_drive(seq, drive)
-        else:
+        # A robot that is driven waits for nobody.
+        is_still = not (drive.right_rad_s or drive.left_rad_s)
+        if is_still and self.is_lockstep and self._runner.stops_time:
             self._unanswered = seq
+        else:
+            self.send_drive(seq, drive)
 
     def _answer_held_frame(self) -> None:
         """Answer the frame that waits, standing."""
@@ -366,7 +365,7 @@ class MainLoop(RobotLoop):
 
     def release_time(self) -> None:
         """Something changed between two frames, as after a measurement or a pause: lockstep time may go on."""
-        if self._may_answer():
+        if not (self.is_lockstep and self._runner.stops_time):
             self._answer_held_frame()
         self._save_checkpoint()
         self._runner.publish_state()

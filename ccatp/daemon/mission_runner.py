@@ -1,4 +1,4 @@
-"""The interface of missions in the main loop, the clock of their frames, and the frames and drives between the two.
+"""The interface of missions in the main loop, and the frames and drives between the two.
 
 The process keeps links, clock, order and end; the mission keeps everything that depends on its kind. A new kind of
 mission is a subclass of ``MissionRunner`` and a row in ``main_loop.open_runner``.
@@ -14,8 +14,7 @@ from ccatp.core import Verdict
 from ccatp.daemon.telemetry import Telemetry
 from ccatp.errors import ExitStatus
 from ccatp.links.robot_messages import Hello, Sensors
-from ccatp.links.topics import DisplayState, EstimateMessage, MissionStatus, is_estimate_due
-from ccatp.safety.robot_clock import SteadyTime
+from ccatp.links.topics import DisplayState, EstimateMessage, MissionStatus
 from ccatp.survey.state import SurveyOutcome
 
 if TYPE_CHECKING:  # each main loop imports its own
@@ -30,57 +29,6 @@ EXIT_STATUS = {
 }
 
 
-class MissionClock:
-    """Numbers and times of the frames.
-
-    Args:
-        jump_s: the robot's clock has jumped if a frame is further off.
-
-    Attributes:
-        seq: the newest frame.
-        t_s: its time, without jumps.
-        before_s: robot time of the mission before the first frame that is served here.
-    """
-
-    def __init__(self, jump_s: float) -> None:
-        self._jump_s, self.before_s = jump_s, 0.0
-        self._steady = SteadyTime(jump_s)
-        self._first_s: float | None = None
-        self.seq, self.t_s = -1, 0.0
-
-    @property
-    def has_begun(self) -> bool:
-        """A frame was served, in this boot of the robot."""
-        return self._first_s is not None
-
-    @property
-    def elapsed_s(self) -> float:
-        """Robot time of the mission, s."""
-        return self.before_s + (0.0 if self._first_s is None else self.t_s - self._first_s)
-
-    @property
-    def offset_s(self) -> float:
-        """``t_s`` less the robot's time."""
-        return self._steady.offset_s
-
-    def time_of(self, seq: int, t_s: float, period_s: float) -> tuple[float, float]:
-        """Time of a frame and time since the last one (``period_s`` without one), s; ``advance`` takes them over."""
-        # Durations are counted by a time that does not jump; everything else by the robot's own.
-        steady_s = self._steady.at(seq, t_s) if seq > self.seq else self.t_s
-        return steady_s, steady_s - self.t_s if self._first_s is not None else period_s
-
-    def advance(self, seq: int, steady_s: float) -> None:
-        """The frame is served now."""
-        if self._first_s is None:
-            self._first_s = steady_s
-        self.t_s, self.seq = steady_s, max(seq, self.seq)
-
-    def reset(self) -> None:
-        """The robot's frames and clock restarted."""
-        self.before_s, self._first_s, self.seq = self.elapsed_s, None, -1
-        self._steady = SteadyTime(self._jump_s)
-
-
 class TimedFrame(NamedTuple):
     """A frame as it is served.
 
@@ -88,6 +36,7 @@ class TimedFrame(NamedTuple):
         t_s: its time, without jumps; that of the robot stands in ``sensors``.
         dt_s: since the frame before; not positive where the robot's clock or frames went back.
         is_first: of a session.
+        is_estimate_due: the danger loop is sent the estimate; of a first frame always, because it may wait for that.
     """
 
     sensors: Sensors
@@ -95,11 +44,7 @@ class TimedFrame(NamedTuple):
     t_s: float
     dt_s: float
     is_first: bool
-
-    @property
-    def is_estimate_due(self) -> bool:
-        """That of the first frame of a session is always due, because the danger loop may wait for it."""
-        return self.is_first or is_estimate_due(self.sensors.seq)
+    is_estimate_due: bool
 
 
 class DriveCommand(NamedTuple):
@@ -128,6 +73,11 @@ class MissionRunner(ABC):
     @abstractmethod
     def is_at_rest(self) -> bool:
         """The robot is at rest."""
+
+    @property
+    def stops_time(self) -> bool:
+        """In lockstep simulated time stands still while a peer is awaited, and all but still in a pause."""
+        return self.is_busy or (self.mission.state.is_paused and self.is_at_rest)
 
     @abstractmethod
     def status(self) -> MissionStatus:

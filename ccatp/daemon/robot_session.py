@@ -31,13 +31,14 @@ class RobotSession(ABC):
     Attributes:
         sessions: their number so far.
         hello: of the newest session.
+        is_lockstep: simulated time waits for the answers; false before the first session.
         has_rebooted: the robot has restarted between the last session and this one.
     """
 
     def __init__(self, cfg: LinkConfig, role: Role, client: str) -> None:
         self.robot_cfg, self._role, self._client, self._key = cfg, role, client, read_key(cfg.key_file)
         self._lost = asyncio.Event()
-        self._is_joined = self.has_rebooted = False
+        self._is_joined = self.has_rebooted = self.is_lockstep = False
         # A session without a valid frame counts as a failure.
         self._failures = self.sessions = 0
         self._deadline_s: float | None = None
@@ -59,11 +60,6 @@ class RobotSession(ABC):
     def on_bad_line(self) -> None:  # noqa: B027 - nothing has to be done
         """A line failed a check."""
 
-    @property
-    def is_lockstep(self) -> bool:
-        """Simulated time waits for the answers; false before the first session."""
-        return self.hello is not None and self.hello.lockstep
-
     def _make(self) -> RobotLink:
         return RobotLink(
             host=self.robot_cfg.host,
@@ -71,7 +67,7 @@ class RobotSession(ABC):
             role=self._role,
             client=self._client,
             key=self._key,
-            on_sensors=self._handle_frame,
+            on_sensors=self.on_sensors,
             on_lost=self._handle_loss,
             on_joined=self._handle_join,
             on_bad_line=self.on_bad_line,
@@ -103,6 +99,8 @@ class RobotSession(ABC):
 
     async def _join_again(self) -> None:
         loop = asyncio.get_running_loop()
+        if self.link.has_frames:
+            self._failures, self._deadline_s = 0, None
         if self._deadline_s is None:
             self._deadline_s = loop.time() + self.robot_cfg.reconnect_timeout_s
         elif self._failures:
@@ -124,13 +122,9 @@ class RobotSession(ABC):
             self._failures += 1
         raise RobotTimeout(f"the robot did not come back within {self.robot_cfg.reconnect_timeout_s:g} s: {why}")
 
-    def _handle_frame(self, frame: Sensors, line: bytes) -> None:
-        self._failures, self._deadline_s = 0, None
-        self.on_sensors(frame, line)
-
     def _handle_join(self, hello: Hello) -> None:
         self.has_rebooted = self.hello is not None and self.hello.boot != hello.boot
-        self.hello = hello
+        self.hello, self.is_lockstep = hello, hello.lockstep
         self._is_joined = True
         self.sessions += 1
         self.on_joined(hello)

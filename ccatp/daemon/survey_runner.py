@@ -238,26 +238,26 @@ class SurveyRunner(MissionRunner):
         sensors, mission, localizer = frame.sensors, self.mission, self._localizer
         recovery, self._recovery = self._recovery, None
         if recovery is not None:  # a replay has to know where the localizer of a loop that takes over begins
-            pose, sigmas = recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad)
-            self._publish_treatment(sensors, "begun", (pose.x_m, pose.y_m, pose.heading_rad, *sigmas))
+            begun, sigmas = recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad)
+            self._publish_treatment(sensors, "begun", (begun.x_m, begun.y_m, begun.heading_rad, *sigmas))
         is_odometry_off = mission.state.rejects_odometry
         if is_odometry_off is not self._is_odometry_off:
             self._is_odometry_off = is_odometry_off
             self._publish_treatment(sensors, "odometry_off" if is_odometry_off else "odometry_on")
         imu, enc = ((), as_standing(sensors.enc)) if is_odometry_off else (sensors.imu, sensors.enc)
         localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
-        if localizer.hold_requested:
+        if localizer.hold_cause:
             # A filter that diverged is frozen until it has a fix.
             mission.handle(EstimateDiverged(localizer.hold_cause, frame.t_s))
             localizer.clear_hold()
-        self._motion = self._state_estimate(frame) if frame.dt_s > 0.0 else None
-
-    def _state_estimate(self, frame: TimedFrame) -> StateEstimate:
-        localizer, echo = self._localizer, frame.sensors.cmd
+        if frame.dt_s <= 0.0:
+            self._motion = None
+            return
+        echo = sensors.cmd
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         place = pose.x_m, pose.y_m, pose.heading_rad
         ahead = self._sent.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
-        return StateEstimate(
+        self._motion = StateEstimate(
             *(frame.t_s, frame.dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead),
             sigma_of=self._position_sigma_m,
             heading_sigma_of=self._parts.heading_sigma_rad,
@@ -271,23 +271,25 @@ class SurveyRunner(MissionRunner):
         mission, motion = self.mission, self._motion
         if motion is None:
             raise RuntimeError("plan comes after estimate, and not for a stale frame")
-        command = mission.step(motion, verdict) if self._is_on_mirror(frame.sensors) else HOLD_POSITION
-        self._apply_requests(frame.sensors, command)
-        purpose = mission.state.purpose
-        right, left = self._gate.pass_through(command.twist, verdict, motion.dt_s, motion.t_s, lag_s, purpose)
-        self._gate_log.update(motion.t_s)
+        is_placed = self._mirror_check is None or self._is_on_mirror(frame.sensors)
+        command = mission.step(motion, verdict) if is_placed else HOLD_POSITION
+        state, gate = mission.state, self._gate
+        if command.inflates_covariance or state.wants_calibration or state.full_fans or state.hold.is_fault:
+            self._apply_requests(frame.sensors, command)
+            state = mission.state
+        right, left = gate.pass_through(command.twist, verdict, motion.dt_s, motion.t_s, lag_s, state.purpose)
+        if gate.denial is not None:
+            self._gate_log.update(motion.t_s)
         if command.at_rest or command.measure:
             self._execute(command, motion)
-        self._note_commands(frame)
+        if frame.is_estimate_due:
+            self._sent_commands = self._sent.take_span(), self._sent.newest
         return DriveCommand(right, left)
 
     def hold(self, frame: TimedFrame) -> DriveCommand:
-        self._note_commands(frame)
-        return STILL
-
-    def _note_commands(self, frame: TimedFrame) -> None:
         if frame.is_estimate_due:
             self._sent_commands = self._sent.take_span(), self._sent.newest
+        return STILL
 
     def _is_on_mirror(self, sensors: Sensors) -> bool:
         """Whether gravity permits motion: the robot stands on the mirror of the configuration.
@@ -362,12 +364,13 @@ class SurveyRunner(MissionRunner):
         seq, t_s, telemetry, localizer = frame.sensors.seq, frame.sensors.t, self.telemetry, self._localizer
         pose, sigma_m = localizer.pose, localizer.position_sigma_m
         if frame.is_estimate_due:
+            self._checkpoint.write_if_due(seq, t_s, self._clock.elapsed_s)
             deck = localizer.deck_pose
             self.publish_estimate(frame, (deck.x_m, deck.y_m, deck.heading_rad), sigma_m, *self._sent_commands)
         row = telemetry.number_of(seq), t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, sigma_m
         telemetry.add_frame(seq, t_s, frame.raw, row)
-        self._checkpoint.write_if_due(seq, t_s, self._clock.elapsed_s)
-        self.publish_state()
+        if self.mission.state.mode is not self._state:
+            self.publish_state()
 
     def publish_state(self) -> None:
         state, telemetry, before = self.mission.state, self.telemetry, self._state

@@ -58,7 +58,10 @@ class Telemetry:
         """Keep the line of frame ``seq`` and its row of the track, which has the recorded number."""
         self.t_s, self.newest_line = t_s, msgspec.Raw(raw)
         self._rows.append(row)
-        self.add_line(seq, raw)
+        self.seq = seq
+        self._lines.append(self.newest_line)
+        if len(self._lines) >= BATCH_FRAMES:
+            self.flush()
 
     def add_line(self, seq: int, raw: bytes) -> None:
         """Keep the line alone, of a frame that is not newer than the last one."""

@@ -15,6 +15,7 @@ from ccatp.estimation.seams import EdgeScanner
 from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import PSI, Slope, W
 from ccatp.filters.base import Filter, FilterDiverged, Innovation
+from ccatp.mirror.layout import Panel
 from ccatp.mirror.mirror import Mirror
 
 _IMPOSSIBLE = 2.0  # an estimate of this many times the wheels' largest rate is no estimate
@@ -33,23 +34,19 @@ class PanelFrame:
         self._mirror = mirror
         self.at = mirror.panel(panel)
 
-    def hand_over(self, x: float, y: float) -> None:
-        """The robot is at this deck point."""
+    def locate(self, deck: tuple[float, float, float], height_m: float, slope: Slope) -> PanelPose:
+        """A deck pose (x, y, heading) on a surface of this height and slope, as ``Mirror.panel_pose``."""
+        x, y, psi = deck
         at = self.at
         if abs(x - at.x_m) > _NEAR_BORDER * at.half_x_m or abs(y - at.y_m) > _NEAR_BORDER * at.half_y_m:
             panel = self._mirror.panel_at(x, y)
             if panel is not None:
-                self.at = self._mirror.panel(panel)
-
-    def pose(self, deck: tuple[float, float, float], height_m: float, slope: Slope) -> PanelPose:
-        """A deck pose (x, y, heading) on a surface of this height and slope, as ``Mirror.panel_pose``."""
-        x, y, psi = deck
+                self.at = at = self._mirror.panel(panel)
         fx, fy = slope[0], slope[1]
         s2 = 1.0 + fx * fx
         s, norm = sqrt(s2), sqrt(s2 + fy * fy)
         c, d = cos(psi), sin(psi)
         hx, hy = c / s - d * fx * fy / (norm * s), d * s / norm
-        at = self.at
         (ax, ay, az), (bx, by, bz), _ = at.axes
         ox, oy, oz = at.origin
         hz, dx, dy, dz = fx * hx + fy * hy, x - ox, y - oy, height_m - oz
@@ -64,7 +61,14 @@ class FullStateLocalizer(LocalizerBase):
     frame to frame in between. A transition of an edge sensor ends a block and is a line at a panel's edge; a fix of the
     puck is a position. Both correct the whole state through its covariance, so two fixes in a row give the heading. At
     true rest the speeds are zero and the inertial unit shows its biases. When the robot drives off, slip and creep are
-    drawn from what the legs so far showed. ``fix_deviation_m``: height of the last fix above the ideal surface.
+    drawn from what the legs so far showed.
+
+    Attributes:
+        pose: estimated pose, in the frame of the panel under the robot.
+        speed_m_s, rate_rad_s: estimated forward speed and angular rate.
+        creep: estimated downhill drift per metre of travel, in the plane of ``pose``.
+        position_sigma_m: standard deviation of the position along its worst direction, at the last step of the filter.
+        fix_deviation_m: height of the last fix above the ideal surface.
     """
 
     def __init__(
@@ -93,8 +97,10 @@ class FullStateLocalizer(LocalizerBase):
         self._is_relocated = False  # no fix has agreed since it began again
         self._is_new_base = False
         self._half_s = 0.0
+        self._creep_on: Panel | None = None
         self._frame_s = _NOMINAL_FRAME_S
         self._predict_pose(0.0)
+        self._locate()
 
     # -- what it knows ------------------------------------------------------------------------------------------------
 
@@ -105,29 +111,6 @@ class FullStateLocalizer(LocalizerBase):
         return DeckPose(now.x_m, now.y_m, wrap_pi(now.heading_rad))
 
     @property
-    def pose(self) -> PanelPose:
-        """The same in the frame of the panel under the robot."""
-        now = self._running
-        height_m = self._estimate.terrain.height_m(now.x_m, now.y_m)
-        return self._panel.pose((now.x_m, now.y_m, now.heading_rad), height_m, self._slope)
-
-    @property
-    def speed_m_s(self) -> float:
-        """Estimated forward speed."""
-        return self._running.v_m_s
-
-    @property
-    def rate_rad_s(self) -> float:
-        """Estimated angular rate."""
-        return self._running.omega_rad_s
-
-    @property
-    def position_sigma_m(self) -> float:
-        """Standard deviation of the position along its worst direction, at the last step of the filter."""
-        (a, b), (_, d) = self._filter.covariance[:2, :2].tolist()
-        return sqrt(max(0.5 * (a + d) + sqrt(0.25 * (a - d) ** 2 + b * b), 0.0))
-
-    @property
     def heading_sigma_rad(self) -> float:
         """Standard deviation of the heading, at the last step of the filter."""
         return sqrt(max(float(self._filter.covariance[PSI, PSI]), 0.0))
@@ -136,12 +119,6 @@ class FullStateLocalizer(LocalizerBase):
     def pose_covariance(self) -> FloatArray:
         """Covariance of (x, y, heading), deck frame, shape (3, 3), at the last step of the filter."""
         return self._filter.covariance[:3, :3]
-
-    @property
-    def creep(self) -> tuple[float, float]:
-        """Estimated downhill drift per metre of travel, in the plane of ``pose``."""
-        x, y, slope = self._running.creep_x, self._running.creep_y, self._slope
-        return self._panel.at.rotate_from_deck((x, y, slope[0] * x + slope[1] * y))[:2]
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
@@ -189,6 +166,7 @@ class FullStateLocalizer(LocalizerBase):
             if is_still:
                 self._hold_position(t_s, dt_s, imu, right[1], left[1], gravity)
                 self._edges.scan(edges)
+                self._locate()
                 return
             self._use_rest(t_s - dt_s)
             self._estimate.begin_leg()
@@ -211,7 +189,7 @@ class FullStateLocalizer(LocalizerBase):
                 self._estimate.stop((self._right.angle_rad, self._left.angle_rad))
                 self._rebase()
             self._predict_pose(self._half_s)
-        self._panel.hand_over(self._running.x_m, self._running.y_m)
+        self._locate()
 
     def _hold_position(
         self,
@@ -244,7 +222,27 @@ class FullStateLocalizer(LocalizerBase):
         if abs(v) > self._v_limit_m_s or abs(w) > self._omega_limit_rad_s:
             raise FilterDiverged(f"{v:.3g} m/s and {w:.3g} rad/s are more than the wheels can do")
 
+    def _locate(self) -> None:
+        """Take over where dead reckoning has led."""
+        now, slope, panel = self._running, self._slope, self._panel
+        x, y = now.x_m, now.y_m
+        self.pose = panel.locate((x, y, now.heading_rad), self._estimate.terrain.height_m(x, y), slope)
+        self.speed_m_s, self.rate_rad_s = now.v_m_s, now.omega_rad_s
+        if panel.at is not self._creep_on:  # or the filter has taken a step
+            self._creep_on = panel.at
+            x, y = now.creep_x, now.creep_y
+            self.creep = panel.at.rotate_from_deck((x, y, slope[0] * x + slope[1] * y))[:2]
+
+    def _freeze(self, error: FilterDiverged) -> None:
+        super()._freeze(error)
+        self._locate()
+
+    def _worst_sigma_m(self) -> float:
+        (a, b), (_, d) = self._filter.covariance[:2, :2].tolist()
+        return sqrt(max(0.5 * (a + d) + sqrt(0.25 * (a - d) ** 2 + b * b), 0.0))
+
     def _predict_pose(self, half_s: float) -> None:
+        self.position_sigma_m, self._creep_on = self._worst_sigma_m(), None
         self._slope = self._estimate.slope()
         self._running.begin(self._filter.mean, self._slope, half_s)
         if self._rest.is_resting:
@@ -288,8 +286,8 @@ class FullStateLocalizer(LocalizerBase):
         self.counts["fixes"] += 1
         self.fix_deviation_m = foot.deviation_m
         self._predict_pose(0.0)
+        self._locate()
         now = self._running
-        self._panel.hand_over(now.x_m, now.y_m)
         return sqrt((now.x_m - before[0]) ** 2 + (now.y_m - before[1]) ** 2)
 
     def _condition(self, t_s: float, z: FloatArray, variance: FloatArray) -> None:
@@ -328,7 +326,7 @@ class FullStateLocalizer(LocalizerBase):
         distance_mm = 1e3 * sqrt(float(residual.dot(residual)))
         self.counts["fixes_gated"] += 1
         if len(self._refused) < _CONSISTENT:
-            raise FixGated(f"fix is {distance_mm:.1f} mm from the estimate, sigma {1e3 * self.position_sigma_m:.2f} mm")
+            raise FixGated(f"fix is {distance_mm:.1f} mm from the estimate, sigma {1e3 * self._worst_sigma_m():.2f} mm")
         self._refused.clear()
         self._relocate(t_s, z, variance, is_lost=False)
         self.counts["reinitialised"] += 1
@@ -347,6 +345,7 @@ class FullStateLocalizer(LocalizerBase):
             self._take_block(self.t_s)
         self._estimate.inflate_covariance(way_m, turn_rad)
         self._predict_pose(self._half_s)
+        self._locate()
         self._estimate.journal.restart()
         self._block.restart()
 

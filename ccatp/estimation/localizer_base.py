@@ -104,6 +104,15 @@ class SampleValidator:
 
     def imu(self, frame_s: float, samples: Sequence[ImuSample]) -> Sequence[ImuSample]:
         """The usable IMU samples."""
+        if len(samples) == 1:
+            (sample_s, ax, wz), source, oldest_s = samples[0], self._imu, frame_s - self._history_s
+            if (
+                source.newest_s < sample_s >= oldest_s
+                and sample_s <= frame_s + _ROUNDING_S
+                and hypot(ax, wz) < _READABLE
+            ):
+                source.use((sample_s,), oldest_s)
+                return samples
         kept: list[ImuSample] = []
         for sample in samples:
             sample_s, ax, wz = sample
@@ -136,9 +145,10 @@ class SampleValidator:
 class LocalizerBase(ABC):
     """Admits frames in order of time, and asks to hold when time or the filter go wrong.
 
-    ``t_s``: robot time to which the pose belongs, that of the last frame used; -inf before the first. ``hold_cause``
-    stays until ``clear_hold``; ``is_frozen``: the filter has diverged, and the pose stands still until the next fix;
-    ``notices`` for the operator are removed by their reader. Samples older than ``history_s`` are refused.
+    ``t_s``: robot time to which the pose belongs, that of the last frame used; -inf before the first. ``hold_cause``,
+    why the mission should hold, stays until ``clear_hold``; ``is_frozen``: the filter has diverged, and the pose stands
+    still until the next fix; ``notices`` for the operator are removed by their reader. Samples older than ``history_s``
+    are refused.
     """
 
     def __init__(self, history_s: float) -> None:
@@ -156,11 +166,6 @@ class LocalizerBase(ABC):
         """From now on leave out inertial samples that the gate does not believe, and wheels faster than any is."""
         self._guard = gate, means
         self._intake.largest_rate_rad_s = largest_rate_rad_s
-
-    @property
-    def hold_requested(self) -> bool:
-        """Whether the mission should hold."""
-        return bool(self.hold_cause)
 
     def clear_hold(self) -> None:
         """Forget the cause for a hold; one that persists comes back."""

@@ -105,6 +105,11 @@ class RobotLink(asyncio.Protocol):
         self._why = self._oddity = ""
 
     @property
+    def has_frames(self) -> bool:
+        """A valid frame came in this session."""
+        return self._last_seq >= 0
+
+    @property
     def _where(self) -> str:
         return f"{self._host}:{self._port}"
 
@@ -250,8 +255,8 @@ class RobotLink(asyncio.Protocol):
     def _send_fresh(self, line: bytes) -> None:
         if self._is_paused:
             self.counts["unsent"] += 1
-        else:
-            self.send_raw(line)
+        elif self._transport is not None and not self._transport.is_closing():
+            self._transport.write(line)
 
     def send_raw(self, data: bytes) -> None:
         """Send bytes as they are; nothing happens when the connection is gone."""

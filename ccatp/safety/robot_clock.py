@@ -67,3 +67,54 @@ class SteadyTime:
             is_other = abs(own_s - t_s) > limit_s and abs(other_s - t_s) < abs(own_s - t_s)
             found.append(sample._replace(t_s=other_s if is_other else own_s))
         return found
+
+
+class MissionClock:
+    """Numbers and times of the frames.
+
+    Args:
+        jump_s: the robot's clock has jumped if a frame is further off.
+
+    Attributes:
+        seq: the newest frame.
+        t_s: its time, without jumps.
+        before_s: robot time of the mission before the first frame that is served here.
+    """
+
+    def __init__(self, jump_s: float) -> None:
+        self._jump_s, self.before_s = jump_s, 0.0
+        self._steady = SteadyTime(jump_s)
+        self._first_s: float | None = None
+        self.seq, self.t_s = -1, 0.0
+
+    @property
+    def has_begun(self) -> bool:
+        """A frame was served, in this boot of the robot."""
+        return self._first_s is not None
+
+    @property
+    def elapsed_s(self) -> float:
+        """Robot time of the mission, s."""
+        return self.before_s + (0.0 if self._first_s is None else self.t_s - self._first_s)
+
+    @property
+    def offset_s(self) -> float:
+        """``t_s`` less the robot's time."""
+        return self._steady.offset_s
+
+    def take(self, seq: int, t_s: float, period_s: float) -> tuple[float, float]:
+        """A frame is served now: its time, and the time since the last one (``period_s`` without one), s."""
+        # Durations are counted by a time that does not jump; everything else by the robot's own.
+        before_s, steady_s = self.t_s, self.t_s
+        if seq > self.seq:
+            self.seq, steady_s = seq, self._steady.at(seq, t_s)
+        self.t_s = steady_s
+        if self._first_s is None:
+            self._first_s = steady_s
+            return steady_s, period_s
+        return steady_s, steady_s - before_s
+
+    def reset(self) -> None:
+        """The robot's frames and clock restarted."""
+        self.before_s, self._first_s, self.seq = self.elapsed_s, None, -1
+        self._steady = SteadyTime(self._jump_s)

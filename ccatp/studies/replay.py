@@ -274,7 +274,7 @@ class _Player:
         localizer, sensors = self._localizer, event.sensors
         imu, enc = ((), as_standing(sensors.enc)) if event.is_odometry_off else (sensors.imu, sensors.enc)
         localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
-        if localizer.hold_requested:
+        if localizer.hold_cause:
             localizer.clear_hold()
         if event.doubted is not None:
             localizer.inflate_covariance(*event.doubted)

@@ -277,7 +277,7 @@ class SilRun:
             self.trace.builder.add_verdict_event(seq, verdict.code)
         imu, enc = ((), as_standing(frame.enc)) if mission.state.rejects_odometry else (frame.imu, frame.enc)
         localizer.step(t_s, imu, enc, frame.edge, frame.gravity)
-        if localizer.hold_requested:
+        if localizer.hold_cause:
             mission.handle(EstimateDiverged(localizer.hold_cause, t_s + self._time.offset_s))
             localizer.clear_hold()
         motion = self._motion(frame, dt_s)

@@ -174,7 +174,7 @@ class Stage(SilRun):
             self._permit_seq += 1
             self.robot.permit(self._permit_seq, verdict.forward, verdict.reverse, verdict.turn)
         self.localizer.step(t_s, frame.imu, frame.enc, frame.edge, frame.gravity)
-        if self.localizer.hold_requested:
+        if self.localizer.hold_cause:
             mission.handle(Fault(self.localizer.hold_cause, loses_pose=self.localizer.is_frozen))
             self.localizer.clear_hold()
         if dt_s <= 0.0:

@@ -478,7 +478,7 @@ def test_a_diverged_filter_freezes_the_pose_until_the_next_fix() -> None:
     filter_.is_broken = True
     localizer.step(*world.frame())
     assert localizer.is_frozen
-    assert localizer.hold_requested
+    assert localizer.hold_cause
     assert localizer.hold_cause == "filter: broken for the test"
     pose = localizer.pose
     filter_.is_broken = False
@@ -492,7 +492,7 @@ def test_a_diverged_filter_freezes_the_pose_until_the_next_fix() -> None:
     assert errors(localizer, world.pose)[0] < 1e-6
     assert localizer.heading_sigma_rad == pytest.approx(0.01 * 2**0.5, rel=0.02)  # the start's sigma on top; one frame
     run(localizer, world.frames(0.2))
-    assert not localizer.hold_requested
+    assert not localizer.hold_cause
 
 
 @pytest.mark.parametrize(
@@ -554,7 +554,7 @@ def test_five_backward_frames_in_a_row_ask_for_a_hold() -> None:
     frames = truth().frames(0.2)
     run(localizer, frames)
     for k in range(5):
-        assert not localizer.hold_requested
+        assert not localizer.hold_cause
         localizer.step(*frames[-2 - k])
     assert localizer.hold_cause == "time stamps of the frames run backward"
 
@@ -565,7 +565,7 @@ def test_five_backward_samples_in_a_row_ask_for_a_hold(source: str) -> None:
     localizer = make()
     run(localizer, truth().frames(0.2))
     for k in range(5):
-        assert not localizer.hold_requested
+        assert not localizer.hold_cause
         t = 0.1505 - 0.001 * k
         imu = [ImuSample(t, 0.0, 0.0)] if source == "imu" else []
         right, left = (0.0 if source == name else None for name in ("right encoder", "left encoder"))
@@ -573,4 +573,4 @@ def test_five_backward_samples_in_a_row_ask_for_a_hold(source: str) -> None:
     assert localizer.hold_cause == f"time stamps of the {source} run backward"
     assert localizer.counts["backward"] == 5
     localizer.clear_hold()
-    assert not localizer.hold_requested
+    assert not localizer.hold_cause

@@ -271,14 +271,14 @@ def test_a_filter_that_diverges_freezes_the_pose_and_asks_to_hold() -> None:
     filter_.is_broken = True
     run(found, robot.frames(0.1))
     assert found.is_frozen
-    assert found.hold_requested
+    assert found.hold_cause
     assert found.hold_cause == "filter: for the sake of the test"
     assert found.counts["diverged"] == 1
     before = found.pose
     found.clear_hold()
     run(found, robot.frames(0.5))
     assert found.pose == before
-    assert not found.hold_requested  # told once
+    assert not found.hold_cause  # told once
 
 
 def test_a_speed_that_no_wheel_can_give_is_a_divergence() -> None:
@@ -333,7 +333,7 @@ def test_when_the_clock_jumps_the_pose_does_not_step(jump_s: float) -> None:
     for frame in robot.frames(0.5):
         found.step(*shifted(frame, jump_s))
     assert not found.is_frozen
-    assert not found.hold_requested
+    assert not found.hold_cause
 
 
 def test_a_gap_in_the_link_is_a_jump_too() -> None:
@@ -359,7 +359,7 @@ def test_frames_that_come_twice_or_backward_change_nothing() -> None:
     assert found.pose == plain.pose
     assert np.array_equal(found.state[0], plain.state[0])
     assert found.counts["stale_frames"] == 100
-    assert not found.hold_requested
+    assert not found.hold_cause
 
 
 # -- techniques -------------------------------------------------------------------------------------------------------

@@ -326,7 +326,7 @@ def test_a_revived_filter_stays_alive() -> None:
     found.fuse_fix(robot.fix())
     found.clear_hold()
     run(found, robot.frames(1.0))
-    assert not found.hold_requested
+    assert not found.hold_cause
     assert errors_of(found, robot.pose)[0] < 1e-6  # it stands
     assert found.is_resting
 

@@ -263,34 +263,33 @@ def test_the_robots_axes_are_the_mirrors(mirror: Mirror) -> None:
 
 def test_a_pose_in_a_panels_frame_is_the_mirrors(mirror: Mirror) -> None:
     for k, (x, y) in enumerate(places(mirror, 50, 6)):
-        panel = list(mirror.panels)[7 * k % len(mirror.panels)]  # not the one under the robot
-        frame, psi = PanelFrame(mirror, panel), 0.37 * k - 9.0
-        found = frame.pose((x, y, psi), mirror.surface.height_m(x, y), Terrain(mirror).at(x, y))
-        expected = mirror.panel_pose(panel, DeckPose(x, y, psi))
-        assert found.panel == panel
+        frame, psi = PanelFrame(mirror, PanelId(4, 4)), 0.37 * k - 9.0
+        found = frame.locate((x, y, psi), mirror.surface.height_m(x, y), Terrain(mirror).at(x, y))
+        expected = mirror.panel_pose(mirror.panel_at(x, y) or PanelId(4, 4), DeckPose(x, y, psi))
+        assert found.panel == expected.panel
         assert (found.x_m, found.y_m) == pytest.approx((expected.x_m, expected.y_m), abs=1e-14)  # rounding of metres
         assert abs(difference(found.heading_rad, expected.heading_rad)) < 1e-14
+
+
+def panel_below(frame: PanelFrame, mirror: Mirror, x_m: float, y_m: float) -> PanelId:
+    return frame.locate((x_m, y_m, 0.0), 0.0, Terrain(mirror).at(x_m, y_m)).panel
 
 
 def test_the_panel_changes_in_the_middle_of_the_gap(mirror: Mirror) -> None:
     here, there = mirror.panel(PanelId(4, 4)), mirror.panel(PanelId(4, 5))
     frame, middle = PanelFrame(mirror, here.id), 0.5 * (here.x_m + there.x_m)
     for x, panel in ((here.x_m, here), (middle - 1e-6, here), (middle + 1e-6, there), (middle - 1e-6, here)):
-        frame.hand_over(x, here.y_m)
-        assert frame.at.id == panel.id
-        assert frame.pose(
-            (panel.x_m, panel.y_m, 0.0), panel.origin[2], Terrain(mirror).at(panel.x_m, panel.y_m)
-        ).x_m == (pytest.approx(0.0, abs=1e-15))
+        assert panel_below(frame, mirror, x, here.y_m) == panel.id
+        centre = (panel.x_m, panel.y_m, 0.0), panel.origin[2], Terrain(mirror).at(panel.x_m, panel.y_m)
+        assert frame.locate(*centre).x_m == pytest.approx(0.0, abs=1e-15)
 
 
 def test_the_panel_changes_along_y_and_far_away(mirror: Mirror) -> None:
     frame = PanelFrame(mirror, PanelId(4, 4))
     for wanted in (PanelId(5, 4), PanelId(2, 6)):
-        frame.hand_over(mirror.panel(wanted).x_m, mirror.panel(wanted).y_m)
-        assert frame.at.id == wanted
+        assert panel_below(frame, mirror, mirror.panel(wanted).x_m, mirror.panel(wanted).y_m) == wanted
 
 
 def test_beside_the_mirror_the_last_panel_stays(mirror: Mirror) -> None:
     frame = PanelFrame(mirror, PanelId(5, 1))
-    frame.hand_over(mirror.panel(PanelId(5, 1)).x_m - 1.0, 0.0)
-    assert frame.at.id == PanelId(5, 1)
+    assert panel_below(frame, mirror, mirror.panel(PanelId(5, 1)).x_m - 1.0, 0.0) == PanelId(5, 1)
