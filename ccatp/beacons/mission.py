@@ -1,36 +1,63 @@
 """A mission among beacons: from readings and the verdict of the danger loop to set points. Time is an argument."""
 
-from enum import StrEnum
 from math import isfinite
 from typing import NamedTuple
 
-import msgspec
 from msgspec.structs import replace
 
 from ccatp.beacons.navigation import BeaconMeasurements, MoteNavigator, Navigator, PoseBelief, RadioNavigator
 from ccatp.beacons.pilot import BeaconPilot
 from ccatp.beacons.steering import HALT, SteeringCommand
-from ccatp.conditions import EARTHQUAKE, MISSION_TOO_LONG, NO_VERDICT
+from ccatp.conditions import MISSION_TOO_LONG, Action
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.core import EventCode, Severity, Verdict
+from ccatp.core import Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
-from ccatp.survey.state import Abort, Fault, Interrupted, Pause, Resume, SurveyInput, SurveyOutcome
+from ccatp.survey.holding import (
+    ON_EARTHQUAKE,
+    ON_EMERGENCY,
+    ON_FAULT,
+    ON_HOLD,
+    ON_NO_VERDICT,
+    HoldRules,
+    Row,
+    is_denied,
+    pause,
+)
+from ccatp.survey.state import (
+    DONE,
+    FOLLOWING,
+    HELD,
+    IDLE,
+    MAPPING,
+    RETURNING,
+    VISITING,
+    Hold,
+    HoldState,
+    MissionState,
+    SurveyInput,
+    SurveyOutcome,
+)
+
+# What such a mission is at; idle, held and done mean to the danger loop that the robot stands.
+MODES = IDLE, MAPPING, VISITING, FOLLOWING, RETURNING, HELD, DONE
 
 
-class BeaconState(StrEnum):
-    """What the mission is at; idle, held and done mean to the danger loop that the robot stands."""
+class BeaconRules(HoldRules[HoldState]):
+    """A mission among beacons goes about its business as soon as any motion is permitted."""
 
-    IDLE = "idle"
-    MAPPING = "mapping"  # stands while motes map themselves
-    VISITING = "visiting"  # on the way to a waypoint
-    FOLLOWING = "following"  # behind the target
-    RETURNING = "returning"  # to where it started
-    HELD = "held"
-    DONE = "done"
+    rows = (
+        *(ON_EARTHQUAKE, ON_FAULT, ON_HOLD, ON_NO_VERDICT),
+        Row("nothing is permitted", Action.PAUSE, lambda _, v: v is not None and is_denied(v), pause),
+        ON_EMERGENCY,
+    )
+
+    def proceed(self, s: HoldState) -> HoldState:
+        """The next frame says where to."""
+        return replace(s, mode=IDLE, cause=s.abort_cause, hold=Hold())
 
 
-IDLE, MAPPING, VISITING, FOLLOWING, RETURNING, HELD, DONE = BeaconState
+RULES = BeaconRules()
 
 
 def permitted(drive: SteeringCommand, verdict: Verdict, back_speed_m_s: float) -> SteeringCommand:
@@ -63,113 +90,6 @@ class WaypointArrival(NamedTuple):
     belief: PoseBelief
 
 
-class BeaconMissionState(msgspec.Struct, frozen=True):
-    """What the mission is at, and why.
-
-    Attributes:
-        interlock: why nothing may move, an earthquake, or empty.
-        raised: the newest emergency acted on.
-        severity: of the newest verdict.
-    """
-
-    mode: BeaconState = IDLE
-    outcome: SurveyOutcome = SurveyOutcome.NONE
-    cause: str = ""
-    abort_cause: str = ""
-    is_by_hand: bool = False
-    is_faulted: bool = False
-    interlock: str = ""
-    raised: int = 0
-    severity: Severity = Severity.NONE
-
-    @property
-    def is_paused(self) -> bool:
-        """Held until somebody resumes, or says that an earthquake is over."""
-        return self.mode is HELD and (self.is_by_hand or bool(self.interlock))
-
-    def held(self, cause: str, *, by_hand: bool) -> "BeaconMissionState":
-        """Held until somebody resumes, or until the cause is gone."""
-        return replace(self, mode=HELD, cause=cause, is_by_hand=by_hand)
-
-    def proceeding(self) -> "BeaconMissionState":
-        """Not held any more."""
-        return replace(self, mode=IDLE, cause=self.abort_cause, is_by_hand=False, is_faulted=False)
-
-    def aborted(self, cause: str) -> "BeaconMissionState":
-        """On the way to where the robot started, as soon as it may move."""
-        s = replace(self, abort_cause=self.abort_cause or cause)
-        return s if s.interlock or s.mode is DONE else s.proceeding()
-
-    def faulted(self, cause: str) -> "BeaconMissionState":
-        """Held until an operator resumes, because something is wrong."""
-        if self.mode is DONE or self.is_faulted:
-            return self
-        return replace(self.held(cause, by_hand=True), is_faulted=True)
-
-    def interrupted(self, cause: str) -> "BeaconMissionState":
-        """Held until frames and verdicts are fresh again."""
-        return self if self.mode in (IDLE, HELD, DONE) else self.held(cause, by_hand=False)
-
-    def handle(self, event: SurveyInput) -> "tuple[BeaconMissionState, str | None]":
-        """The state after an event between two frames, and why it was refused, or ``None``."""
-        if isinstance(event, Fault):
-            return self.faulted(event.cause), None
-        if isinstance(event, Interrupted):
-            return self.interrupted(event.cause), None
-        if isinstance(event, Resume):
-            refusal = self._resume_refusal()
-            return (self.proceeding(), None) if refusal is None else (self, refusal)
-        if self.mode is DONE:
-            return self, "the mission is over"
-        if isinstance(event, Pause):
-            return self.held(event.cause, by_hand=True), None
-        if isinstance(event, Abort):
-            return self.aborted(event.cause), None
-        return replace(self, mode=DONE, outcome=SurveyOutcome.STOPPED), None
-
-    def _resume_refusal(self) -> str | None:
-        if self.mode is not HELD:
-            return f"the mission is not held but {self.mode}"
-        if self.interlock:
-            return f"{self.interlock}: nothing moves until that is cleared"
-        if self.severity >= Severity.HOLD:
-            return f"the cause persists: {self.cause}"
-        return None
-
-    def _with_levels(self, verdict: Verdict) -> "BeaconMissionState":
-        """What the verdict says that is remembered; an earthquake holds, and home when it is over."""
-        s = self if self.severity is verdict.severity else replace(self, severity=verdict.severity)
-        if not verdict.is_shaking:
-            return replace(s, interlock="") if s.interlock else s
-        s = replace(s, raised=verdict.raised)
-        if s.interlock:
-            return s
-        s = replace(s, interlock=EARTHQUAKE.message, abort_cause=s.abort_cause or EARTHQUAKE.message)
-        return s.held(EARTHQUAKE.message, by_hand=s.mode is HELD and s.is_by_hand)
-
-    def react(self, verdict: Verdict | None) -> "tuple[BeaconMissionState, bool]":
-        """Do what a verdict demands; whether the robot may go about its business."""
-        if self.mode is DONE:
-            return self, False
-        if verdict is None:
-            return self.interrupted(NO_VERDICT.message), False
-        s = self._with_levels(verdict)
-        if verdict.severity is Severity.FAULT:
-            return s.faulted(verdict.cause), False
-        if verdict.is_shaking:
-            return s, False
-        if not (verdict.forward or verdict.reverse or verdict.turn):
-            if s.mode is HELD and not s.is_by_hand:
-                return replace(s, cause=verdict.cause), False
-            return s.interrupted(verdict.cause), False
-        if verdict.code is EventCode.ABORTED and verdict.raised != s.raised:
-            # The level is repeated; what counts is that it is new.
-            s = replace(s, raised=verdict.raised).aborted(verdict.cause)
-        if s.mode is IDLE or (s.mode is HELD and not s.is_by_hand):
-            s = s.proceeding()
-        return s, s.mode is not HELD
-
-
 class BeaconMission:
     """Maps and visits waypoints, or follows a radio, and returns to its start when it is given up.
 
@@ -185,17 +105,17 @@ class BeaconMission:
         self._begun_s: float | None = None
         self._followed_s = 0.0
         self._is_following = cfg.follow.is_active
-        self.state = BeaconMissionState()
+        self.state = HoldState()
 
     def handle(self, event: SurveyInput) -> str | None:
         """An event between two frames; why it was refused, or ``None``."""
-        self.state, refusal = self.state.handle(event)
+        self.state, refusal = RULES.handle(self.state, event)
         return refusal
 
     def _finish(self, outcome: SurveyOutcome) -> None:
         self.state = replace(self.state, mode=DONE, outcome=outcome)
 
-    def _enter(self, mode: BeaconState) -> None:
+    def _enter(self, mode: MissionState) -> None:
         if self.state.mode is not mode:
             self.state = replace(self.state, mode=mode)
 
@@ -228,19 +148,17 @@ class BeaconMission:
         t_s = measurements.t_s
         if self._begun_s is None:
             self._begun_s = t_s
-        self.state, goes_on = self.state.react(verdict)
-        if not goes_on or verdict is None:
+        self.state = RULES.react(self.state, measurements, verdict)
+        if verdict is None or is_denied(verdict) or self.state.mode in (HELD, DONE):
             return HALT
         limit_s = self._cfg.mission.time_limit_s
         if t_s - self._begun_s > limit_s and self.state.mode is not IDLE and not self.state.abort_cause:
-            self.state = self.state.faulted(MISSION_TOO_LONG.text(limit_s=limit_s))
+            self.state = RULES.fault(self.state, MISSION_TOO_LONG.text(limit_s=limit_s))
             return HALT
         drive = self._wanted(measurements, interval_s)
         return permitted(drive, verdict, self._cfg.avoidance.back_speed_m_s)
 
     def _wanted(self, measurements: BeaconMeasurements, interval_s: float) -> SteeringCommand:
-        if self.state.mode is HELD:
-            return HALT
         if self.navigator.is_mapping:
             if self.state.abort_cause:
                 self._finish(SurveyOutcome.AT_BASE)  # it never left

@@ -7,12 +7,7 @@ from math import cos, sin
 from typing import TYPE_CHECKING
 
 from ccatp.beacons.mission import (
-    DONE,
-    HELD,
-    IDLE,
-    RETURNING,
     BeaconMission,
-    BeaconState,
     check_beacon_robot,
     track_row,
     wheel_rates,
@@ -39,7 +34,7 @@ from ccatp.links.topics import (
     RobotShape,
     Scene,
 )
-from ccatp.survey.state import Fault
+from ccatp.survey.state import DONE, HELD, IDLE, RETURNING, Fault, MissionState
 
 if TYPE_CHECKING:
     from ccatp.daemon.main_loop import MainLoop
@@ -62,7 +57,7 @@ class BeaconRunner(MissionRunner):
         self._reader = MeasurementReader(cfg)
         self._measurements: BeaconMeasurements | None = None
         self._speed_m_s = 0.0
-        self._state: BeaconState = IDLE
+        self._state: MissionState = IDLE
         self._was_faulted = False
         self._published_arrivals = 0
         self._echoes: deque[tuple[float, float]] = deque(maxlen=ECHO_MEMORY)

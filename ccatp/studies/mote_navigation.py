@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from ccatp.beacons.mission import DONE, BeaconMission, TrackRow, track_row, wheel_rates
+from ccatp.beacons.mission import BeaconMission, TrackRow, track_row, wheel_rates
 from ccatp.beacons.navigation import MeasurementReader
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.config.beacon_models import RadioConfig
@@ -37,6 +37,7 @@ from ccatp.safety.beacons import BeaconSafetyRules
 from ccatp.sim.beacon_robot import build_beacon_robot
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.results import LIMIT, colour, plot
+from ccatp.survey.state import DONE
 
 
 @dataclass(slots=True)

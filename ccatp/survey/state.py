@@ -1,4 +1,4 @@
-"""State of a survey: one frozen value; modes, events and transitions; what may happen to it."""
+"""State of a mission: one frozen value; modes, events and transitions; what may happen to it."""
 
 from collections.abc import Mapping, Sequence
 from enum import Enum, StrEnum
@@ -29,9 +29,14 @@ class MissionState(StrEnum):
     RETURNING = "returning"
     HELD = "held"
     DONE = "done"
+    # Among beacons:
+    MAPPING = "mapping"  # stands while motes map themselves
+    VISITING = "visiting"  # on the way to a waypoint
+    FOLLOWING = "following"  # behind the target
 
 
-IDLE, TURNING, DRIVING, SETTLING, MEASURING, BACKING_OFF, RETURNING, HELD, DONE = MissionState
+IDLE, TURNING, DRIVING, SETTLING, MEASURING, BACKING_OFF, RETURNING, HELD, DONE, *AMONG_BEACONS = MissionState
+MAPPING, VISITING, FOLLOWING = AMONG_BEACONS
 
 
 class MissionEvent(StrEnum):
@@ -77,10 +82,11 @@ TRANSITIONS = MappingProxyType(
         RETURNING: _ANYWHERE | {MissionEvent.EDGE: BACKING_OFF},
         HELD: _SURVEYING | {MissionEvent.FIND: SETTLING},
         DONE: {},
+        **dict.fromkeys(AMONG_BEACONS, _ANYWHERE),
     }
 )
 
-# What the last gate lets a state move for.
+# What the last gate lets a state of a survey move for.
 PURPOSES = MappingProxyType(
     {
         IDLE: Purpose.STAND,
@@ -120,11 +126,74 @@ class Hold(NamedTuple):
     rejects_odometry: bool = False
 
 
-class SurveyState(msgspec.Struct, frozen=True):
-    """All that a survey knows at one time; times are robot time, s.
+class HoldState(msgspec.Struct, frozen=True):
+    """What every mission knows at one time: what it is at, how it is held, and why; times are robot time, s.
 
     Attributes:
         mode: what it is at.
+        abort_cause: why the mission was given up, or empty.
+        interlock: why nothing may move, an earthquake, or empty.
+        is_latched, is_shaking, severity: of the newest verdict: an emergency, an earthquake, the gravest finding.
+        full_fans: the robot shall be pressed on with full fans, from now on.
+        has_looked: a sensor that stays off was looked at with a fix.
+        finding: the cause for which the robot was sent home last; ``emergency_epoch``: the newest emergency acted on
+            (``None``: what is latched when the first verdict comes was acted on before).
+        stuck_s: since when a retreat led nowhere.
+        resumes_after_s: a hold that goes on by itself lasts at least until then.
+    """
+
+    mode: MissionState = IDLE
+    outcome: SurveyOutcome = SurveyOutcome.NONE
+    cause: str = ""
+    hold: Hold = Hold()
+    abort_cause: str = ""
+    interlock: str = ""
+    is_latched: bool = False
+    is_shaking: bool = False
+    severity: Severity = Severity.NONE
+    is_slow: bool = False
+    full_fans: bool = False
+    has_looked: bool = False
+    finding: str = ""
+    emergency_epoch: int | None = 0
+    stuck_s: float | None = None
+    resumes_after_s: float = -inf
+
+    @property
+    def rejects_odometry(self) -> bool:
+        """Held because wheels or inertial unit are not to be believed."""
+        return self.mode is HELD and self.hold.rejects_odometry
+
+    @property
+    def is_faulted(self) -> bool:
+        """An operator has to look after it."""
+        return self.hold.is_fault
+
+    @property
+    def is_held_by_hand(self) -> bool:
+        """Held until an operator resumes."""
+        return self.mode is HELD and self.hold.by_hand
+
+    @property
+    def is_paused(self) -> bool:
+        """Held until an operator resumes, or reports that an earthquake is over."""
+        return self.mode is HELD and (self.hold.by_hand or bool(self.interlock))
+
+    @property
+    def stands_for_fix(self) -> bool:
+        """It stands so that a fix shows where it is."""
+        return False
+
+    @property
+    def is_recovering(self) -> bool:
+        """It leaves an edge, or has to be found, before it may go home."""
+        return False
+
+
+class SurveyState(HoldState, frozen=True, kw_only=True):
+    """All that a survey knows at one time.
+
+    Attributes:
         stop_index: of the stop driven to, or measured at.
         behaviour: progress of what the mode does; made on entry, dropped on leaving it.
         done: points measured, in order.
@@ -132,49 +201,29 @@ class SurveyState(msgspec.Struct, frozen=True):
         failure_causes: why points failed and were not measured since.
         due: points to be measured next, in this order, away from the planned route.
         retried: points that failed and were due once more.
-        abort_cause: why the survey was given up, or empty.
-        interlock: why nothing may move, an earthquake, or empty.
-        is_latched, is_shaking, severity: of the newest verdict: an emergency, an earthquake, the gravest finding.
         inflates_covariance: the localizer shall widen its covariance; the next command says so once.
         wants_calibration: the calibration drive was given up, too far from where it leads.
-        full_fans: the robot shall be pressed on with full fans, from now on.
         is_missed: the last fix shows the robot too far from its point; ``corrected``: the stop of the last correction.
         request: number of the measurement that was asked for last; ``arrived_at``: the last point with an arrival.
         failures: failed measurements in a row.
         heading_legs_left, was_reverse: of the search for the heading.
-        finding: the cause for which the robot was sent home last; ``emergency_epoch``: the newest emergency acted on
-            (``None``: what is latched when the first verdict comes was acted on before).
-        was_lost, has_looked: a fix was needed in the last frame; a sensor that stays off was looked at with a fix.
-        stuck_s: since when a retreat led nowhere.
-        resumes_after_s: a hold that goes on by itself lasts at least until then.
-        stands_until_s: nothing moves before then.
+        is_found: a fix has just found the robot; ``stands_until_s``: nothing moves before then.
         recoveries_s: when the estimate broke down lately.
     """
 
     route: Route
-    mode: MissionState = IDLE
-    outcome: SurveyOutcome = SurveyOutcome.NONE
-    cause: str = ""
     stop_index: int = 0
     behaviour: Leg | Settling | Retreat | ReturnHome | None = None
-    hold: Hold = Hold()
     fix: FixNeed = FixNeed.NONE
     done: tuple[PointId, ...] = ()
     skipped: tuple[PointId, ...] = ()
     failure_causes: Mapping[PointId, str] = MappingProxyType({})
     due: tuple[PointId, ...] = ()
     retried: frozenset[PointId] = frozenset()
-    abort_cause: str = ""
-    interlock: str = ""
-    is_latched: bool = False
-    is_shaking: bool = False
-    severity: Severity = Severity.NONE
-    is_slow: bool = False
     is_off_route: bool = False
     is_review_due: bool = False
     inflates_covariance: bool = False
     wants_calibration: bool = False
-    full_fans: bool = False
     is_missed: bool = False
     corrected: Stop | None = None
     corrections: int = 0
@@ -184,13 +233,8 @@ class SurveyState(msgspec.Struct, frozen=True):
     heading_legs_left: int = 0
     was_reverse: bool = True
     budget: BudgetProgress = BudgetProgress()
-    finding: str = ""
-    emergency_epoch: int | None = 0
-    was_lost: bool = False
-    has_looked: bool = False
+    is_found: bool = False
     backoffs: int = 0
-    stuck_s: float | None = None
-    resumes_after_s: float = -inf
     stands_until_s: float = -inf
     recoveries_s: tuple[float, ...] = ()
 
@@ -229,26 +273,6 @@ class SurveyState(msgspec.Struct, frozen=True):
         return PURPOSES[self.mode]
 
     @property
-    def rejects_odometry(self) -> bool:
-        """Held because wheels or inertial unit are not to be believed."""
-        return self.mode is HELD and self.hold.rejects_odometry
-
-    @property
-    def is_faulted(self) -> bool:
-        """An operator has to look after it."""
-        return self.hold.is_fault
-
-    @property
-    def is_held_by_hand(self) -> bool:
-        """Held until an operator resumes."""
-        return self.mode is HELD and self.hold.by_hand
-
-    @property
-    def is_paused(self) -> bool:
-        """Held until an operator resumes, or reports that an earthquake is over."""
-        return self.mode is HELD and (self.hold.by_hand or bool(self.interlock))
-
-    @property
     def is_lost(self) -> bool:
         """The pose is known to be wrong, and is to be found again; at the start it is only to be confirmed."""
         return self.fix is FixNeed.RELOCALIZE
@@ -257,6 +281,11 @@ class SurveyState(msgspec.Struct, frozen=True):
     def stands_for_fix(self) -> bool:
         """It stands so that a fix shows where it is."""
         return self.fix is not FixNeed.NONE and self.mode in (SETTLING, MEASURING)
+
+    @property
+    def is_recovering(self) -> bool:
+        """It leaves an edge, or has to be found, before it may go home."""
+        return self.mode is BACKING_OFF or self.fix is not FixNeed.NONE
 
     @property
     def is_awaiting_fix(self) -> bool:

@@ -5,7 +5,6 @@ from collections.abc import Callable, Collection, Sequence
 from msgspec.structs import replace
 
 from ccatp.conditions import (
-    EARTHQUAKE,
     LEG_OVERDUE,
     MEASUREMENTS_FAILED,
     NO_REST,
@@ -17,7 +16,7 @@ from ccatp.conditions import (
 )
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegPhase
-from ccatp.core import DeckPose, PointId, Severity, Stop, StopKind, Verdict
+from ccatp.core import DeckPose, EventCode, PointId, Stop, StopKind, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import (
     HOLD_POSITION,
@@ -29,8 +28,9 @@ from ccatp.survey.behaviours import (
     Settling,
 )
 from ccatp.survey.budget import TimeBudget
-from ccatp.survey.failsafe import react
+from ccatp.survey.failsafe import ROWS
 from ccatp.survey.heading_recovery import MOST_LEGS, HeadingRecovery
+from ccatp.survey.holding import HoldRules
 from ccatp.survey.planning.escape import is_on_drive
 from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import Route
@@ -40,25 +40,17 @@ from ccatp.survey.state import (
     DONE,
     DRIVING,
     HELD,
-    IDLE,
     MEASURING,
     RETURNING,
     SETTLING,
     TURNING,
-    Abort,
     EmergencyKnown,
     EstimateDiverged,
-    Fault,
     FixFailed,
     FixNeed,
     FixStored,
-    Hold,
-    Interrupted,
     MissionEvent,
-    Pause,
     PointMissed,
-    Resume,
-    StopHere,
     SurveyInput,
     SurveyOutcome,
     SurveyState,
@@ -67,6 +59,8 @@ from ccatp.survey.state import (
     next_state,
 )
 
+# So long after a fix found the robot the danger loop has received where it is: a pose in five frames, and a verdict.
+_NOTICED_S = 0.2
 # Planned at a time: a way through so many points takes less than the robot's frames may wait.
 CHUNK = 12
 
@@ -76,12 +70,14 @@ PlanPoints = Callable[[DeckPose, Sequence[PointId]], Route]
 Step = tuple[SurveyState, MissionCommand]
 
 
-class Survey:
+class Survey(HoldRules[SurveyState]):
     """What does not change during a survey, and the functions from one state to the next.
 
     ``plan_rest`` gives the way back to a route from a pose, without the points that are done with; ``plan_points`` a
     route through points from a pose; without it what failed once is not tried again.
     """
+
+    rows = ROWS
 
     def __init__(
         self,
@@ -106,7 +102,7 @@ class Survey:
 
     def begin(self) -> SurveyState:
         """The state before the first frame."""
-        return SurveyState(self._route, fix=FixNeed.CONFIRM if self.cfg.mission.fix_at_start else FixNeed.NONE)
+        return SurveyState(route=self._route, fix=FixNeed.CONFIRM if self.cfg.mission.fix_at_start else FixNeed.NONE)
 
     def left_out(self, s: SurveyState) -> dict[PointId, str]:
         """Points that are skipped, or that will not be measured any more, and why."""
@@ -129,7 +125,12 @@ class Survey:
             )
         if s.budget.begun_s is None:
             s = replace(s, budget=s.budget._replace(begun_s=motion.t_s))
-        s, command = self._behave(react(self, s, motion, verdict), motion, verdict)
+        if s.is_found:
+            # At an edge it stands until the danger loop knows where: what it met may have been a seam.
+            is_at_edge = verdict is not None and verdict.code is EventCode.NEAR_EDGE and s.fix is FixNeed.NONE
+            until_s = motion.t_s + _NOTICED_S if is_at_edge else s.stands_until_s
+            s = replace(s, is_found=False, stands_until_s=until_s)
+        s, command = self._behave(self.react(s, motion, verdict), motion, verdict)
         if s.inflates_covariance:
             s, command = replace(s, inflates_covariance=False), replace(command, inflates_covariance=True)
         return s, command
@@ -152,48 +153,19 @@ class Survey:
 
     # -- transitions --------------------------------------------------------------------------------------------------
 
-    def apply(self, s: SurveyState, event: MissionEvent) -> SurveyState:
-        """The mode changes as the table says."""
-        mode = next_state(s.mode, event)
-        return s if mode is s.mode else replace(s, mode=mode)
-
     def hold(self, s: SurveyState, cause: str, *, by_hand: bool, is_fault: bool = False) -> SurveyState:
-        """Hold, until somebody resumes or until the cause is gone; what was begun begins again afterwards."""
-        hold = Hold(by_hand, is_fault or s.hold.is_fault)
-        s = replace(s, behaviour=None, is_missed=False, hold=hold, cause=cause)
-        return self.apply(s, MissionEvent.HOLD)
-
-    def interrupt(self, s: SurveyState, cause: str) -> SurveyState:
-        """Hold until frames and verdicts are fresh again; no effect where it stands anyway."""
-        return s if s.mode in (IDLE, HELD, DONE) else self.hold(s, cause, by_hand=False)
+        """What was begun begins again afterwards."""
+        return super().hold(replace(s, behaviour=None, is_missed=False), cause, by_hand=by_hand, is_fault=is_fault)
 
     def fault(self, s: SurveyState, cause: str, *, loses_pose: bool = False) -> SurveyState:
-        """Hold until an operator resumes, because something is wrong; without a pose, a fix comes first then."""
-        if s.mode is DONE:
-            return s
-        if loses_pose and s.fix is FixNeed.NONE:
-            s = replace(s, fix=FixNeed.RELOCALIZE)
-        return self.hold(s, cause, by_hand=True, is_fault=True)
+        """Without a pose, a fix comes first then."""
+        if loses_pose and s.fix is FixNeed.NONE and s.mode is not DONE:
+            s = self.lose_pose(s)
+        return super().fault(s, cause)
 
-    def await_recovery(self, s: SurveyState, cause: str, *, rejects_odometry: bool = False) -> SurveyState:
-        """Hold until the cause is gone, and then find out where the robot is before moving on."""
-        if s.mode is DONE or s.is_held_by_hand:
-            return s
-        rejects_odometry |= s.rejects_odometry
-        s = replace(self.interrupt(s, cause), fix=FixNeed.RELOCALIZE, cause=cause)
-        return replace(s, hold=s.hold._replace(rejects_odometry=rejects_odometry))
-
-    def abort(self, s: SurveyState, cause: str) -> SurveyState:
-        """Return to base and end there."""
-        if s.mode is DONE:
-            return s
-        is_new = not s.abort_cause
-        s = replace(s, abort_cause=s.abort_cause or cause)
-        if s.interlock:
-            return s  # home, but not before the robot may move
-        # An edge outranks an abort: the retreat and its fix come first.
-        is_free = is_new and s.mode is not BACKING_OFF and s.fix is FixNeed.NONE
-        return self.proceed(s) if s.mode is HELD or is_free else s
+    def lose_pose(self, s: SurveyState) -> SurveyState:
+        """A fix comes before the next move."""
+        return replace(s, fix=FixNeed.RELOCALIZE)
 
     def proceed(self, s: SurveyState) -> SurveyState:
         """To what is next: finding the robot, home, the next stop, or the end."""
@@ -395,13 +367,7 @@ class Survey:
 
     def handle(self, s: SurveyState, event: SurveyInput) -> tuple[SurveyState, str | None]:
         """The state after an event between two frames, and why it was refused, or ``None``."""
-        if isinstance(event, Pause | Resume | Abort | StopHere):
-            return self._obey(s, event)
         match event:
-            case Interrupted(cause):
-                s = self.interrupt(s, cause)
-            case Fault(cause, loses_pose):
-                s = self.fault(s, cause, loses_pose=loses_pose)
             case EstimateDiverged(cause, t_s):
                 s = self._recover(s, cause, t_s)
             case TrackingGap():
@@ -417,20 +383,9 @@ class Survey:
             case PointMissed():
                 is_wanted = s.is_awaiting_fix
                 s = replace(self.proceed(s), is_missed=True) if is_wanted else replace(s, is_off_route=True)
+            case _:
+                return super().handle(s, event)
         return s, None
-
-    def _obey(self, s: SurveyState, command: Pause | Resume | Abort | StopHere) -> tuple[SurveyState, str | None]:
-        """A command of an operator."""
-        if isinstance(command, Resume):
-            refusal = _resume_refusal(s)
-            return (self.proceed(s), None) if refusal is None else (s, refusal)
-        if s.mode is DONE:
-            return s, "the mission is over"
-        if isinstance(command, Pause):
-            return self.hold(s, command.cause, by_hand=True), None
-        if isinstance(command, Abort):
-            return self.abort(s, command.cause), None
-        return self.apply(replace(s, outcome=SurveyOutcome.STOPPED), MissionEvent.FINISHED), None
 
     def _take_over(self, s: SurveyState, event: TakenOver) -> SurveyState:
         recovery = event.recovery
@@ -467,7 +422,7 @@ class Survey:
             return self.apply(replace(s, behaviour=None, is_missed=False), MissionEvent.GO_ON)
         goes_on = s.is_awaiting_fix
         # Found again, the robot stands where the route never led. Unless it never left the start.
-        s = replace(s, fix=FixNeed.NONE, is_off_route=s.is_lost)
+        s = replace(s, fix=FixNeed.NONE, is_found=True, is_off_route=s.is_lost)
         return self.proceed(s) if goes_on else s
 
     def _not_fixed(self, s: SurveyState, event: FixFailed) -> SurveyState:
@@ -528,18 +483,6 @@ class Survey:
 
 def _without(points: tuple[PointId, ...], point: PointId) -> tuple[PointId, ...]:
     return tuple(other for other in points if other != point) if point in points else points
-
-
-def _resume_refusal(s: SurveyState) -> str | None:
-    if s.mode is not HELD:
-        return f"the mission is not held but {s.mode}"
-    if s.interlock or s.is_shaking:
-        return f"{s.interlock or EARTHQUAKE.message}: nothing moves until that is cleared"
-    if s.is_latched and not s.abort_cause:
-        return "an emergency of before is latched: 'ccatp clear' it first"
-    if s.severity >= Severity.HOLD and s.severity is not Severity.RETURN:
-        return f"the cause persists: {s.cause}"
-    return None
 
 
 class Mission:

@@ -11,11 +11,13 @@ from pathlib import Path
 
 import click
 
+from ccatp.beacons.mission import RULES
 from ccatp.cli import cli
 from ccatp.conditions import DANGER, SURVEY, Action, Condition, Group
 from ccatp.core import EventCode, Severity
 from ccatp.daemon.supervisor import PROCESSES
 from ccatp.links.topics import TOPICS
+from ccatp.survey.failsafe import ROWS
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -84,6 +86,13 @@ def _alarm(row: Condition) -> tuple[str, ...]:
     )
 
 
+def reactions() -> str:
+    """What missions do about verdicts, in the order of precedence."""
+    rows = [(k, row.when, row.action.value, "yes" if row in RULES.rows else "") for k, row in enumerate(ROWS, 1)]
+    rows += [("", row.when, row.action.value, "yes") for row in RULES.rows if row not in ROWS]
+    return table("| | when | what happens | also among beacons |", rows)
+
+
 def severities() -> str:
     """The severities, least first."""
     rows = [(int(one), f"`{one.name.lower()}`", Action[one.name].value if one else "nothing") for one in Severity]
@@ -147,6 +156,7 @@ def _option(option: click.Option) -> str:
 MADE: dict[str, Callable[[], str]] = {
     "alarms": alarms,
     "severities": severities,
+    "reactions": reactions,
     "topics": topics,
     "processes": processes,
     "codes": codes,

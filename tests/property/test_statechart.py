@@ -6,12 +6,12 @@ from itertools import product
 import pytest
 from msgspec.structs import replace
 
-from ccatp.conditions import Motion
+from ccatp.conditions import Action
 from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Twist, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import MissionCommand
-from ccatp.survey.failsafe import ROWS, Action
+from ccatp.survey.failsafe import ROWS
 from ccatp.survey.state import (
     BACKING_OFF,
     DONE,
@@ -85,9 +85,10 @@ def check(before: SurveyState, verdict: Verdict | None, s: SurveyState, command:
     stands = command.twist == STILL
     for row in ROWS:
         if row.applies(before, verdict):
-            is_passed = row.action is Action.WAIT_AT_EDGE and s.stuck_s is None
-            assert row.motion is not Motion.NONE or stands or is_passed, row.name
-            assert row.motion is not Motion.RETREAT or stands or s.mode is BACKING_OFF, row.name
+            is_passed = row.action is Action.WAIT and s.stuck_s is None
+            is_free = row.action in (Action.SLOW, Action.RETURN, Action.RETREAT)
+            assert is_free or stands or is_passed, row.when
+            assert row.action is not Action.RETREAT or stands or s.mode is BACKING_OFF
             if row.action not in (Action.SLOW, Action.RETURN) and not is_passed:
                 break  # the first such row decides
     if not stands:

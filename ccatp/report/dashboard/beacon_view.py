@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from math import dist, hypot, sqrt
 from typing import Any
 
-from ccatp.beacons.mission import BeaconState
+from ccatp.beacons.mission import MODES
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.links.topics import BeaconArrival, BeaconMapMessage, BeaconPlaces, BeaconTrack
 from ccatp.report.beacon_record import expected_rms_m, standing_beacons, true_rms_m
@@ -45,7 +45,7 @@ def beacon_ground(cfg: RadioConfig, *, is_sim: bool, needs_token: bool) -> dict[
         "wheel_base_m": cfg.vehicle.track_m,
         "arrival_tolerance_mm": 1e3 * cfg.control.arrival_radius_m,
         "rate_hz": cfg.dashboard.rate_hz,
-        "states": [str(state) for state in BeaconState],
+        "states": [str(state) for state in MODES],
         "codes": CODES,
         "plots": ["error", "map", "nis", *last],
         "hides": HIDDEN,

@@ -11,7 +11,7 @@ from ccatp.mirror.mirror import Mirror, deck_poses
 from ccatp.mirror.surface import ConvergenceError
 from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView, TruthCompare
 from ccatp.survey.planning.route import ORDERS
-from ccatp.survey.state import MissionState
+from ccatp.survey.state import PURPOSES
 
 CODES = ["normal operation", "near the mirror's edge", "operation aborted"]
 # Terms of the page, by the id of their element or for its own sentences.
@@ -57,7 +57,7 @@ def ground(mirror: Mirror, cfg: Config, *, is_sim: bool, needs_token: bool) -> d
         "wheel_base_m": cfg.robot.wheel_base_m,
         "arrival_tolerance_mm": 1e3 * cfg.mission.arrival_tolerance_m,
         "rate_hz": cfg.dashboard.rate_hz,
-        "states": [str(state) for state in MissionState],
+        "states": [str(state) for state in PURPOSES],
         "codes": CODES,
         "plots": ["arrival", "error", "jump", "nis"],
         "hides": [],

@@ -10,17 +10,14 @@ import pytest
 from msgspec.structs import replace
 
 from ccatp.beacons.mission import (
-    DONE,
-    HELD,
-    VISITING,
+    RULES,
     BeaconMission,
-    BeaconMissionState,
     WaypointArrival,
     check_beacon_robot,
     permitted,
     wheel_rates,
 )
-from ccatp.beacons.navigation import MeasurementReader, PoseBelief, SelfMap
+from ccatp.beacons.navigation import BeaconMeasurements, MeasurementReader, PoseBelief, SelfMap
 from ccatp.beacons.slam.motion import Steering
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.beacons.store import BeaconStore, BeaconStoreError
@@ -37,7 +34,7 @@ from ccatp.safety.beacons import BeaconSafetyRules, ObstacleBuffer
 from ccatp.sim.beacon_robot import BeaconRobot
 from ccatp.sim.radio_world import RadioWorld
 from ccatp.studies.mote_navigation import BeaconSilResult, BeaconSilWorld
-from ccatp.survey.state import Abort, Fault, Pause, Resume, StopHere
+from ccatp.survey.state import DONE, HELD, VISITING, Abort, Fault, HoldState, Pause, Resume, StopHere
 
 FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
 DENIED = Verdict(0, 0.0, EventCode.NORMAL, "no radio", "radio", 8.0, 7.0, False, False, False, severity=Severity.HOLD)
@@ -99,23 +96,24 @@ def test_stop_ends_it_where_it_is_and_then_it_takes_no_commands(stage: BeaconSil
 
 
 def test_what_holds_the_robot_says_when_it_goes_on() -> None:
-    def after(state: BeaconMissionState, verdict: Verdict | None, *, goes_on: bool) -> BeaconMissionState:
-        state, is_free = state.react(verdict)
-        assert is_free is goes_on
+    frame = BeaconMeasurements(0.0, (), (), (), ())
+
+    def after(state: HoldState, verdict: Verdict | None, *, goes_on: bool) -> HoldState:
+        state = RULES.react(state, frame, verdict)
+        assert (state.mode is not HELD) is goes_on
         return state
 
-    state = BeaconMissionState(VISITING)
-    assert state.handle(Resume())[1] == "the mission is not held but visiting"
+    state = HoldState(VISITING)
+    assert RULES.handle(state, Resume())[1] == "the mission is not held but visiting"
     state = after(state, DENIED, goes_on=False)
-    assert state.mode is HELD
-    assert state.handle(Resume())[1] == "the cause persists: no radio"
+    assert RULES.handle(state, Resume())[1] == "the cause persists: no radio"
     state = after(state, FREE, goes_on=True)
     state = after(replace(state, mode=VISITING), None, goes_on=False)
     assert state.cause == "no fresh verdict from the danger loop"
-    state, _ = after(state, FREE, goes_on=True).handle(Fault("lost"))
+    state, _ = RULES.handle(after(state, FREE, goes_on=True), Fault("lost"))
     assert state.is_faulted
     state = after(state, FREE, goes_on=False)  # a fault waits for an operator
-    state, refusal = state.handle(Resume())
+    state, refusal = RULES.handle(state, Resume())
     assert refusal is None
     after(state, FREE, goes_on=True)
 

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from ccatp.beacons.mission import BeaconState
+from ccatp.beacons.mission import MODES
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_radio_config
 from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Severity, Verdict
@@ -320,7 +320,7 @@ def test_the_ground_of_a_room(system: str) -> None:
     cfg, is_following = radio(system), system == "follow"
     found = json.loads(msgspec.json.encode(beacon_ground(cfg, is_sim=True, needs_token=True)))
     assert (found["needs_token"], found["rim"][2]) == (True, list(cfg.workspace.size_m))
-    assert found["states"] == [str(state) for state in BeaconState]
+    assert found["states"] == [str(state) for state in MODES]
     names = [] if is_following else [f"waypoint {k + 1}" for k in range(len(cfg.workspace.waypoints_m))]
     assert [point[0] for point in found["points"]] == names
     assert ("target" in found["plots"]) is is_following
