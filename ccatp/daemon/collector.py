@@ -144,14 +144,14 @@ class Collector:
     def collect(self, timeout_ms: int, view: RunView | None = None) -> None:
         """Take all messages that have arrived, waiting at most ``timeout_ms`` for the first."""
         self._view = view
-        received = self._subscriber.receive_raw(timeout_ms / 1000.0)
+        received = self._subscriber.receive(timeout_ms / 1000.0)
         while received is not None:
             name, body, message = received
             if isinstance(message, Heartbeat):
                 self._on_heartbeat(message)
             elif isinstance(message, Message):
                 self._take(name, body, message)
-            received = self._subscriber.receive_raw()
+            received = self._subscriber.receive()
         self._recorder.flush_if_due()
 
     def _take(self, name: str, body: bytes, message: Message) -> None:

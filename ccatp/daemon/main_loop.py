@@ -284,7 +284,8 @@ class MainLoop(RobotLoop):
             return
         runner, clock, seq, begun_s = self._runner, self.clock, sensors.seq, time.perf_counter()
         try:
-            is_first, is_going_on = self._is_new_session, clock.has_begun
+            is_first = self._is_new_session
+            is_going_on = is_first and clock.has_begun
             t_s, dt_s = clock.take(seq, sensors.t, self.frame_period_s)
             frame = TimedFrame(sensors, raw, t_s, dt_s, is_first, is_first or is_estimate_due(seq))
             if is_first:

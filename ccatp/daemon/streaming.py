@@ -85,9 +85,9 @@ class Streamer:
             poller.register(socket, zmq.POLLIN)
         poller.poll(PERIOD_MS)
         while (received := self._heartbeats.receive()) is not None:
-            if isinstance(received[1], Heartbeat):
-                self._on_heartbeat(received[1])
-        while self._run is not None and (raw := self._run.receive_raw()) is not None:
+            if isinstance(received[2], Heartbeat):
+                self._on_heartbeat(received[2])
+        while self._run is not None and (raw := self._run.receive()) is not None:
             if isinstance(raw[2], Message):
                 self._pass_on(raw[0], raw[1], raw[2])
         for stream in self._streams:

@@ -8,7 +8,7 @@ import zmq
 
 from ccatp.core import Verdict
 from ccatp.links.bus import Publisher, Subscriber
-from ccatp.links.topics import EstimateMessage, Heartbeat, Message, last_estimate_before
+from ccatp.links.topics import EstimateMessage, Heartbeat, last_estimate_before
 
 # In lockstep simulated time stands still while a loop waits; longer than this the other loop hangs.
 LOCKSTEP_WAIT_S = 10.0
@@ -40,23 +40,12 @@ class PeerSubscriber:
         self.maintain = self._subscriber.maintain
         self.close = self._subscriber.close
 
-    def take_new(self, take: Callable[[Message | Verdict], bool]) -> None:
-        """Give all messages that have arrived to ``take``."""
-        while (received := self._subscriber.receive()) is not None:
-            take(received[1])
-
-    def take_until(self, take: Callable[[Message | Verdict], bool]) -> None:
-        """The same until ``take`` returns True for one, the other process is gone, or the time is up."""
-        deadline = time.monotonic() + LOCKSTEP_WAIT_S
-        while True:
-            received = self._subscriber.receive(WAIT_SLICE_S)
-            if received is not None:
-                if take(received[1]):
-                    return
-            elif self._subscriber.is_cut or time.monotonic() > deadline:
-                return
-            else:
-                self._on_wait()
+    def goes_on_waiting(self, deadline_s: float) -> bool:
+        """Nothing came for a slice: whether the other process is there, and there is time until ``deadline_s``."""
+        if self._subscriber.is_cut or time.monotonic() > deadline_s:
+            return False
+        self._on_wait()
+        return True
 
 
 class VerdictSubscriber(PeerSubscriber):
@@ -77,7 +66,7 @@ class VerdictSubscriber(PeerSubscriber):
     def is_danger_joined(self) -> bool:
         """Whether danger has reported that it joined the robot; it repeats that."""
         while (received := self._subscriber.receive()) is not None:
-            message = received[1]
+            message = received[2]
             if isinstance(message, Heartbeat) and message.phase == "joined":
                 return True
         return False
@@ -92,23 +81,22 @@ class VerdictSubscriber(PeerSubscriber):
         In lockstep danger judges a frame while main serves it. Where danger did not judge the frame before, the
         verdict on an earlier one counts as long as it is fresh.
         """
-        newest = seq + MAX_FRAMES_AHEAD
-
-        def take(message: Message | Verdict) -> bool:
-            if not isinstance(message, Verdict) or message.seq > newest:
-                return False
-            if is_lockstep and message.seq >= seq:
-                self._early = message
-                return True
-            self.verdict, self._wall_s = message, time.monotonic()
-            return message.seq >= seq - 1
-
         if self._early is not None and self._early.seq < seq:
             self.verdict, self._early = self._early, None
-        if not is_lockstep:
-            self.take_new(take)
-        elif self._early is None and (self.verdict is None or self.verdict.seq < seq - 1):
-            self.take_until(take)
+        wait_s, deadline_s = (WAIT_SLICE_S if is_lockstep else 0.0), time.monotonic() + LOCKSTEP_WAIT_S
+        while not is_lockstep or (self._early is None and (self.verdict is None or self.verdict.seq < seq - 1)):
+            received = self._subscriber.receive(wait_s)
+            if received is None:
+                if is_lockstep and self.goes_on_waiting(deadline_s):
+                    continue
+                break
+            message = received[2]
+            if not isinstance(message, Verdict) or message.seq > seq + MAX_FRAMES_AHEAD:
+                continue
+            if is_lockstep and message.seq >= seq:
+                self._early = message
+            else:
+                self.verdict, self._wall_s = message, time.monotonic()
         verdict = self.verdict
         if verdict is None or (is_lockstep and verdict.seq < seq - 1 and self._early is None):
             return None
@@ -148,22 +136,22 @@ class EstimateSubscriber(PeerSubscriber):
         Where several waited, after a stall, the newest counts, but the drives of each have moved the wheels:
         ``commanded`` spans those of all that no frame was judged with.
         """
-
-        def take(message: Message | Verdict) -> bool:
-            # An estimate for a frame far ahead is of the robot's last boot.
-            if not isinstance(message, EstimateMessage) or message.seq > seq + MAX_FRAMES_AHEAD:
-                return False
-            missed = self._newest if self._newest_seq > self._judged else None
-            self._newest = message if missed is None else message.following(missed)
-            return message.seq >= wanted
-
         if self._first_seq < 0:
             self._first_seq = seq + self._is_taking_over
         wanted = last_estimate_before(seq)
-        if not is_lockstep:
-            self.take_new(take)
-        elif wanted >= self._first_seq and self._newest_seq < wanted:
-            self.take_until(take)
+        is_waiting = is_lockstep and wanted >= self._first_seq
+        wait_s, deadline_s = (WAIT_SLICE_S if is_waiting else 0.0), time.monotonic() + LOCKSTEP_WAIT_S
+        while not is_lockstep or (is_waiting and self._newest_seq < wanted):
+            received = self._subscriber.receive(wait_s)
+            if received is None:
+                if is_waiting and self.goes_on_waiting(deadline_s):
+                    continue
+                break
+            message = received[2]
+            # An estimate for a frame far ahead is of the robot's last boot.
+            if isinstance(message, EstimateMessage) and message.seq <= seq + MAX_FRAMES_AHEAD:
+                missed = self._newest if self._newest_seq > self._judged else None
+                self._newest = message if missed is None else message.following(missed)
         if seq > self._judged_frame:  # an older one is not judged
             self._judged_frame, self._judged = seq, self._newest_seq
         return self._newest

@@ -240,7 +240,8 @@ class SurveyRunner(MissionRunner):
         if recovery is not None:  # a replay has to know where the localizer of a loop that takes over begins
             begun, sigmas = recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad)
             self._publish_treatment(sensors, "begun", (begun.x_m, begun.y_m, begun.heading_rad, *sigmas))
-        is_odometry_off = mission.state.rejects_odometry
+        state = mission.state
+        is_odometry_off = state.mode is MissionState.HELD and state.rejects_odometry
         if is_odometry_off is not self._is_odometry_off:
             self._is_odometry_off = is_odometry_off
             self._publish_treatment(sensors, "odometry_off" if is_odometry_off else "odometry_on")

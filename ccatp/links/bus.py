@@ -81,13 +81,11 @@ class Subscriber:
         self._timeout_ms = -1
         self.bad_messages = 0
 
-    def receive(self, timeout_s: float = 0.0) -> tuple[str, Message | Verdict] | None:
-        """The next message, or ``None`` when none came within ``timeout_s``. Bad ones are counted and dropped."""
-        received = self.receive_raw(timeout_s)
-        return None if received is None else (received[0], received[2])
+    def receive(self, timeout_s: float = 0.0) -> tuple[str, bytes, Message | Verdict] | None:
+        """Topic, JSON text and message of the next frame, or ``None`` when none came within ``timeout_s``.
 
-    def receive_raw(self, timeout_s: float = 0.0) -> tuple[str, bytes, Message | Verdict] | None:
-        """As ``receive``, with the JSON text in the middle."""
+        Bad ones are counted and dropped.
+        """
         timeout_ms = round(1000 * timeout_s)
         if timeout_ms != self._timeout_ms:
             self.socket.setsockopt(zmq.RCVTIMEO, timeout_ms)

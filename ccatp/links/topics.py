@@ -342,7 +342,7 @@ BY_NAME = {topic.name: topic for topic in TOPICS}
 # Danger carries a pose on by the wheels itself: a pose in five frames is fresh enough and costs a fifth.
 ESTIMATE_FRAMES = 5
 _encoder = msgspec.json.Encoder()
-_decoders: dict[str, msgspec.json.Decoder[Any]] = {t.name: msgspec.json.Decoder(t.message) for t in TOPICS}
+_decoders = {topic.name.encode(): (topic.name, msgspec.json.Decoder[Any](topic.message)) for topic in TOPICS}
 _prefixes = {topic.name: topic.name.encode() + b" " for topic in TOPICS}
 
 
@@ -367,15 +367,16 @@ def pack(name: str, message: Message | Verdict) -> bytes:
 
 def unpack(frame: bytes) -> tuple[str, bytes, Message | Verdict]:
     """The topic's name, JSON text and message of a frame; raises ``BadMessage``."""
-    name, _, body = frame.partition(b" ")
-    decoder = _decoders.get(name.decode("ascii", "replace"))
-    if decoder is None:
-        raise BadMessage(f"unknown topic {name[:40]!r}")
+    prefix, _, body = frame.partition(b" ")
+    known = _decoders.get(prefix)
+    if known is None:
+        raise BadMessage(f"unknown topic {prefix[:40]!r}")
+    name, decoder = known
     try:
         message: Message | Verdict = decoder.decode(body)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise BadMessage(f"topic {name.decode()}: {error}") from error
-    return name.decode(), body, message
+        raise BadMessage(f"topic {name}: {error}") from error
+    return name, body, message
 
 
 def decode_recorded(topic: str, payload: bytes) -> Message | Verdict:

@@ -151,8 +151,8 @@ class Waiting:
     def __init__(self, *_: object, **__: object) -> None:
         self.messages: deque[EstimateMessage] = deque()
 
-    def receive(self) -> tuple[str, EstimateMessage] | None:
-        return ("estimate", self.messages.popleft()) if self.messages else None
+    def receive(self, _timeout_s: float) -> tuple[str, bytes, EstimateMessage] | None:
+        return ("estimate", b"", self.messages.popleft()) if self.messages else None
 
     def maintain(self) -> None:
         pass

@@ -38,8 +38,8 @@ def ticks_us(subscriber: Subscriber, seconds: float) -> np.ndarray:
     ticks: list[float] = []
     while (left_s := end_s - time.monotonic()) > 0.0:
         received = subscriber.receive(left_s)
-        if received is not None and isinstance(received[1], Timing):
-            ticks += received[1].tick_us
+        if received is not None and isinstance(received[2], Timing):
+            ticks += received[2].tick_us
     return np.array(ticks)
 
 

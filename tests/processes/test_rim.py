@@ -159,7 +159,7 @@ async def check(case: RimCase, run_dir: Path, runtime_dir: Path) -> None:
                 assert time.monotonic() < deadline, "the danger loop never joined"
                 main.presence()
                 while (received := heard.receive()) is not None:
-                    message = received[1]
+                    message = received[2]
                     is_joined = is_joined or (isinstance(message, Heartbeat) and message.phase == "joined")
                 await asyncio.sleep(0.02)
             link = RobotLink(
@@ -177,7 +177,7 @@ async def check(case: RimCase, run_dir: Path, runtime_dir: Path) -> None:
                     flush(context, endpoints)
                     await asyncio.sleep(0.2)  # what is on its way when the robot stands must be heard too
                 while (received := heard.receive()) is not None:
-                    message = received[1]
+                    message = received[2]
                     if isinstance(message, TruthMessage):
                         clearances.update({row[0]: row[8] for row in message.rows})
                         has_fallen = has_fallen or any(row[9] for row in message.rows)

@@ -57,6 +57,11 @@ def presence(seq: int) -> Heartbeat:
     return Heartbeat(seq=seq, t_s=0.0, process="main", pid=1, phase="ready")
 
 
+def next_of(subscriber: Subscriber) -> tuple[str, object]:
+    name, _, message = subscriber.receive(1.0) or ("", b"", None)
+    return name, message
+
+
 def test_a_subscriber_gets_its_topics_only_in_order(bus: Bus) -> None:
     publisher = bus.publisher()
     subscriber = bus.subscriber("heartbeat.main")
@@ -64,8 +69,8 @@ def test_a_subscriber_gets_its_topics_only_in_order(bus: Bus) -> None:
     publisher.send("heartbeat.main", presence(1))
     publisher.send("log", LogMessage(seq=0, t_s=0.0, level="info", process="main", text="not for you"))
     publisher.send("heartbeat.main", presence(2))
-    assert subscriber.receive(1.0) == ("heartbeat.main", presence(1))
-    assert subscriber.receive(1.0) == ("heartbeat.main", presence(2))
+    assert next_of(subscriber) == ("heartbeat.main", presence(1))
+    assert next_of(subscriber) == ("heartbeat.main", presence(2))
     assert subscriber.receive() is None
 
 
@@ -95,7 +100,7 @@ def test_bad_messages_are_counted_and_dropped(bus: Bus) -> None:
     publisher.has_subscriber("heartbeat.main")
     publisher._socket.send(b"heartbeat.main nonsense")
     publisher.send("heartbeat.main", presence(3))
-    assert subscriber.receive(1.0) == ("heartbeat.main", presence(3))
+    assert next_of(subscriber) == ("heartbeat.main", presence(3))
     assert subscriber.bad_messages == 1
 
 
@@ -109,7 +114,7 @@ def test_nobody_waits_for_an_onlooker_who_gets_it_all_the_same(bus: Bus) -> None
     while received is None:  # until the other subscription has arrived as well
         publisher.send("heartbeat.main", presence(1))
         received = onlooker.receive(0.05)
-    assert received == ("heartbeat.main", presence(1))
+    assert (received[0], received[2]) == ("heartbeat.main", presence(1))
     assert not publisher.has_subscriber("heartbeat.main")
     assert other.receive() is None
 
@@ -125,8 +130,8 @@ def test_of_what_waits_the_newest_is_kept(bus: Bus) -> None:
     while 199 not in seen:
         received = newest.receive(5.0)
         assert received is not None
-        assert isinstance(received[1], Heartbeat)
-        seen.append(received[1].seq)
+        assert isinstance(received[2], Heartbeat)
+        seen.append(received[2].seq)
     assert len(seen) < 200
     assert newest.receive() is None
 

@@ -80,7 +80,7 @@ class BusReader:
                 received = subscriber.receive()
                 if received is None:
                     break
-                self._view.receive(received[1], now_s)
+                self._view.receive(received[2], now_s)
 
     def close(self) -> None:
         """Close the sockets."""
