@@ -151,7 +151,8 @@ class MainLoop(RobotLoop):
         self.over.set()
 
     async def end(self, stop: asyncio.Event) -> None:
-        self.send_drive(self.clock.seq, STILL)
+        if not self.is_lockstep:  # there the last frame has its answer, and a second one would race with the permit
+            self.send_drive(self.clock.seq, STILL)
         self._runner.log_statistics()
         self._save_checkpoint()
         self._telemetry.flush()
