@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from ccatp.core import WheelSample
 
-# A frame may be as short as an encoder period; this many of them reach back further than any estimate that is used.
+# A frame may be as short as an encoder period.
 HISTORY_FRAMES = 256
 KNOTS_KEPT = 512
 LARGEST = 1e9  # rad/s: finite, at least
@@ -50,8 +50,11 @@ class WheelTrack:
         """Take the encoder samples of a frame, oldest first."""
         if not samples:
             return
-        self._frames.append(samples)
+        frames = self._frames
+        frames.append(samples)
         t_s, right, left = samples[-1]
+        if frames[0][-1][0] < t_s - self._reach_s:  # never read; what is kept for long costs a cache miss in the end
+            frames.popleft()
         limit = self._limit_rad_s
         if right is None or left is None or not (-limit <= right <= limit and -limit <= left <= limit):
             self.update(t_s)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from math import cos, inf, nan, pi, sin
 from typing import Any
+from weakref import ReferenceType, ref
 
 import pytest
 
@@ -721,6 +722,23 @@ def test_a_track_reads_each_wheel_on_its_own_and_forgets_the_distant_past() -> N
     track.push([WheelSample(101.0, 1.0, 1.0)])
     track.update(101.0)
     assert track.knots[-2].t_s < 100.0  # beyond the reach: not read
+
+
+class Samples(list[WheelSample]):
+    """Of a frame; shows when nothing refers to it any more."""
+
+
+def test_a_track_lets_go_of_frames_that_it_will_not_read() -> None:
+    track = WheelTrack(0.03, 0.15, 0.15, 0.25)
+    frames: list[ReferenceType[Samples]] = []
+    for k in range(64):
+        samples = Samples([WheelSample(0.125 * k, 1.0, 1.0)])
+        track.push(samples)
+        frames.append(ref(samples))
+    del samples
+    assert [frame() is None for frame in frames] == 61 * [True] + 3 * [False]  # 0.25 s back, not more
+    track.update(7.875)
+    assert [knot.t_s for knot in track.knots] == [7.625, 7.75, 7.875]
 
 
 def test_odometry_survives_the_tracks_forgetting() -> None:
