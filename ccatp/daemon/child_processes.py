@@ -1,4 +1,4 @@
-"""The child processes of a run: start, supervision by pidfd and heartbeat, restart policy, stop, listening sockets."""
+"""The child processes of a run: start, supervision by heartbeat, restart policy, stop, listening sockets."""
 
 import errno
 import os
@@ -127,14 +127,8 @@ class SilenceWatch:
 class _Child:
     spec: ProcessSpec
     process: subprocess.Popen[bytes]
-    pidfd: int
     watch: SilenceWatch | None
     why_killed: str = ""
-
-    def close(self) -> None:
-        if self.pidfd >= 0:
-            os.close(self.pidfd)
-            self.pidfd = -1
 
 
 class ProcessManager:
@@ -158,11 +152,6 @@ class ProcessManager:
         self._is_recovering_until_s = 0.0
         self.restarts = 0
 
-    @property
-    def fds(self) -> list[int]:
-        """Readable when a child has died."""
-        return [child.pidfd for child in self._children.values() if child.pidfd >= 0]
-
     def is_recovering(self, now_s: float) -> bool:
         """Whether one was restarted a short while ago."""
         return now_s < self._is_recovering_until_s
@@ -179,7 +168,6 @@ class ProcessManager:
             start_new_session=True,
             env={**child_environment(os.environ), **ENVIRONMENT, SUPERVISOR_PID: str(os.getpid())},
         )
-        pidfd = os.pidfd_open(process.pid) if hasattr(os, "pidfd_open") else -1
         if spec.niceness:
             # From outside, so that it holds before the process has read its first module.
             with suppress(OSError):  # it has ended already
@@ -187,7 +175,7 @@ class ProcessManager:
                 os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
         hang_timeout_s = spec.hang_timeout_s or self._cfg.hang_timeout_s
         watch = SilenceWatch(max(self._cfg.start_timeout_s, hang_timeout_s), hang_timeout_s) if spec.is_loop else None
-        self._children[spec.name] = _Child(spec, process, pidfd, watch)
+        self._children[spec.name] = _Child(spec, process, watch)
 
     def on_heartbeat(self, heartbeat: Heartbeat) -> None:
         """A heartbeat was received; that of a dead process does not count."""
@@ -212,7 +200,6 @@ class ProcessManager:
             if end in (ProcessEnd.END, ProcessEnd.HELD):
                 return name, code, end, text
             self._notify_operator("warning", text)
-            child.close()
             if end is ProcessEnd.WITHOUT:
                 del self._children[name]
                 continue
@@ -245,7 +232,6 @@ class ProcessManager:
             if child.process.poll() is None:
                 child.process.kill()
                 child.process.wait()
-            child.close()
 
 
 def listen(section: str, host: str, port: int) -> socket.socket:

@@ -1,7 +1,7 @@
 """Receives a run's messages from start to end: recording, progress, mission status, summary."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -133,13 +133,6 @@ class Collector:
     def exit_status(self) -> ExitStatus:
         """Exit status of the run by main."""
         return ExitStatus(self.status.exit_status) if self.status is not None else ExitStatus.HELD
-
-    def wait(self, timeout_ms: int, fds: Sequence[int] = ()) -> None:
-        """Wait for a message or for a readable file descriptor, at most ``timeout_ms``."""
-        poller = zmq.Poller()
-        for waited_for in (self._subscriber.socket, *fds):
-            poller.register(waited_for, zmq.POLLIN)
-        poller.poll(timeout_ms)
 
     def collect(self, timeout_ms: int, view: RunView | None = None) -> None:
         """Take all messages that have arrived, waiting at most ``timeout_ms`` for the first."""

@@ -62,7 +62,8 @@ from ccatp.links.topics import Heartbeat
 from ccatp.records.recorder import RUN_LOCK
 from ccatp.report.dashboard.access import read_token
 
-POLL_MS = 20
+# Between two looks at messages and processes: in lockstep a message in each of them would cost as much again.
+POLL_S = 0.02
 # In lockstep the three that answer each other keep both cores of a small machine busy: recording takes what they leave.
 LOCKSTEP_NICENESS = 10
 
@@ -178,7 +179,7 @@ class SupervisedRun:
         if not self._options.is_paced:
             os.nice(LOCKSTEP_NICENESS)
         while not self._is_interrupted:
-            collector.wait(POLL_MS, self._children.fds)
+            time.sleep(POLL_S)
             collector.collect(0, self._view)
             now_s = time.monotonic()
             self._service.update(now_s, collector.status, is_recovering=self._children.is_recovering(now_s))
