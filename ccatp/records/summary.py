@@ -104,7 +104,8 @@ class RunningStatistics:
     """
 
     def __init__(self, capacity: int) -> None:
-        self._keys, self._values = np.empty(capacity, dtype=np.uint32), np.empty(capacity)
+        # Written at once: memory does not grow while the day goes on.
+        self._keys, self._values = np.full(capacity, 0, dtype=np.uint32), np.full(capacity, 0.0)
         self._size, self._stride = 0, 1
         self.count = 0
         self._sum = self._max = 0.0
@@ -201,7 +202,7 @@ class SummaryBuilder:
         self._falls += int(np.count_nonzero(fallen[1:] & ~fallen[:-1]))
         self._is_fallen = bool(fallen[-1])
         self._overrun_m = max(self._overrun_m, -float(truth[:, _CLEARANCE].min()))
-        self._history.append(truth)
+        self._history.append(truth[:, : _CLEARANCE + 1].copy())
         self._history_rows += len(truth)
         while self._history_rows - len(self._history[0]) >= HISTORY_ROWS:
             self._history_rows -= len(self._history.popleft())
@@ -359,7 +360,7 @@ class SummaryBuilder:
                 break
             if batch[0, _SEQ] <= last:
                 found.append(batch[(batch[:, _SEQ] >= first) & (batch[:, _SEQ] <= last)])
-        return np.concatenate(found) if found else np.empty((0, 11))
+        return np.concatenate(found) if found else np.empty((0, _CLEARANCE + 1))
 
 
 def format_table(summary: Mapping[str, Any]) -> str:
