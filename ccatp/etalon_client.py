@@ -23,11 +23,7 @@ from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 
 
 class EtalonLink(asyncio.Protocol):
-    """One connection: a line is asked for at a time.
-
-    Attributes:
-        fault: why it must not be used again; empty while it may.
-    """
+    """One connection: a line is asked for at a time. ``fault``: why it must not be used again; empty while it may."""
 
     def __init__(self) -> None:
         self.fault = ""
@@ -144,10 +140,8 @@ class EtalonClient:
 
     ``on_retry`` is called with each error after which it is tried again, and how many tries are left then.
 
-    Attributes:
-        counts: connects, requests, retries, drained (connections closed for unasked or left-over bytes).
-
-    ``ValueError``: channels and collimators do not fit, or are too few.
+    ``ValueError``: channels and collimators do not fit, or are too few. ``counts``: connects, requests, retries,
+    drained (connections closed for unasked or left-over bytes).
     """
 
     def __init__(

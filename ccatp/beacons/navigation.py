@@ -25,10 +25,8 @@ class SelfMap:
     """Collects the pulses between motes until their map is good enough.
 
     Phase 1 begins when every pair of its plan has been read as often as configured, phase 2 takes the readings after
-    that one by one (Patil et al., figure 8).
-
-    Attributes:
-        notes: errors that are expected after each phase, m; updates of phase 2.
+    that one by one (Patil et al., figure 8). ``notes``: errors that are expected after each phase, m; updates of phase
+    2.
     """
 
     def __init__(self, cfg: CricketConfig) -> None:
@@ -60,9 +58,8 @@ class SelfMap:
     def take(self, burst: MoteBurst) -> None:
         """A pulse from one mote to another; those of others are none of ours.
 
-        Raises:
-            MappingError: phase 1 cannot be made of these ranges.
-            TdoaError: a delay or a temperature that none can be.
+        Raises MappingError: phase 1 cannot be made of these ranges. Raises TdoaError: a delay or a temperature that
+        none can be.
         """
         first, second = self._index.get(burst.sender), self._index.get(burst.listener)
         if first is None or second is None or self.is_done:
@@ -114,9 +111,8 @@ _EPSILON_S = 1e-9  # an interval shorter than this is none
 class BeaconMeasurements(NamedTuple):
     """A frame as a mission takes it.
 
-    Attributes:
-        packets: answers of radios: name, direction of the reflector left of the heading (rad), level (dBm).
-        sightings: results of scans: radio, level (dBm), bearing left of the heading (rad; None where not known).
+    ``packets``: answers of radios: name, direction of the reflector left of the heading (rad), level (dBm).
+    ``sightings``: results of scans: radio, level (dBm), bearing left of the heading (rad; None where not known).
     """
 
     t_s: float
@@ -350,9 +346,7 @@ class MoteNavigator(_DeadReckoning):
     def take(self, measurements: BeaconMeasurements) -> None:
         """Predict over the wheels' intervals, then take the readings of the frame.
 
-        Raises:
-            MappingError: the motes cannot be mapped.
-            TdoaError: a delay or a temperature that none can be.
+        Raises MappingError: the motes cannot be mapped. Raises TdoaError: a delay or a temperature that none can be.
         """
         state = self._filter
         for odometry in measurements.wheels:

@@ -146,8 +146,7 @@ class ObstacleAvoider:
     def clear_m(self, pose: PlanarPose, direction_rad: float) -> float:
         """Distance to the nearest remembered obstacle in the way of a body that moves in a direction, m.
 
-        Args:
-            direction_rad: of the motion, left of the heading: 0 forwards, pi backwards.
+        ``direction_rad``: of the motion, left of the heading: 0 forwards, pi backwards.
         """
         in_way = (d for d, angle_rad in self._near(pose) if abs(wrap_pi(angle_rad - direction_rad)) < _AHEAD_RAD)
         return min(in_way, default=inf)
@@ -281,8 +280,7 @@ class PilotState(StrEnum):
 class BeaconPilot:
     """Turns a pose, a target and the distance sensors into set points, step by step.
 
-    Raises:
-        FuzzyGapError: the rules leave a gap.
+    Raises FuzzyGapError: the rules leave a gap.
     """
 
     def __init__(self, cfg: RadioConfig) -> None:

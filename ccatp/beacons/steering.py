@@ -25,10 +25,8 @@ class Sugeno:
     """Output u = sum(w_i u_i) / sum(w_i), w_i the product of the memberships that rule i names (Takagi, Sugeno 1985).
 
     Memberships are trapezoids. Beyond its first and last shoulder an input counts as standing there, so a rule base
-    without a gap between its corners has none anywhere.
-
-    Raises:
-        FuzzyGapError: a combination of corners, or a place halfway between two, where no rule fires.
+    without a gap between its corners has none anywhere. Raises FuzzyGapError: a combination of corners, or a place
+    halfway between two, where no rule fires.
     """
 
     def __init__(self, cfg: FuzzyConfig) -> None:
@@ -123,8 +121,7 @@ class WaypointSteering:
     * ``pi``: of the distance, slower the more the heading is off (Auth and Hovey 2018, section 2.4).
     * ``constant``: always the same (2018, as built).
 
-    Raises:
-        FuzzyGapError: the rules leave a gap.
+    Raises FuzzyGapError: the rules leave a gap.
     """
 
     def __init__(self, control: RadioControlConfig, vehicle: VehicleConfig) -> None:

@@ -28,11 +28,8 @@ class BeaconStoreError(CcatpError):
 class BeaconStore:
     """The database of one run.
 
-    Args:
-        laps: how often they are visited; 0 where there are none to visit.
-
-    Raises:
-        BeaconStoreError: the file exists, or cannot be made.
+    ``laps``: how often they are visited; 0 where there are none to visit. Raises BeaconStoreError: the file exists, or
+    cannot be made.
     """
 
     def __init__(self, path: Path, meta: dict[str, str], waypoints: tuple[tuple[float, float], ...], laps: int) -> None:

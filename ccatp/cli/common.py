@@ -85,11 +85,7 @@ class SuggestingGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command that ``args`` starts with.
-
-        Raises:
-            click.UsageError: there is none of that name.
-        """
+        """The command that ``args`` starts with. Raises click.UsageError: there is none of that name."""
         name = args[0]
         if self.get_command(ctx, name) is None and not name.startswith("-"):
             new_name = RENAMED_COMMANDS.get(name)
@@ -150,11 +146,7 @@ def print_lines(lines: Iterable[str]) -> None:
 
 
 def write_lines(option: str, path: Path, lines: Iterable[str]) -> None:
-    """Write the text file that an option names.
-
-    Raises:
-        ConfigError: it cannot be written.
-    """
+    """Write the text file that an option names. Raises ConfigError: it cannot be written."""
     try:
         with path.open("w", encoding="utf-8") as file:
             file.writelines(line + "\n" for line in lines)
@@ -192,8 +184,7 @@ def renamed_flag(old: str, new: str) -> Callable[[Command], Command]:
 def parse_setting(text: str) -> tuple[str, object]:
     """``run.seed=2`` as ``("run.seed", 2)``. The value is TOML, or else text.
 
-    Raises:
-        ValueError: there is no key or no ``=``.
+    Raises ValueError: there is no key or no ``=``.
     """
     key, equals, value = text.partition("=")
     key = key.strip()

@@ -46,8 +46,7 @@ class SlamCommandError(CcatpError):
 def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "EstimatedPath":
     """A run through one of ``FILTERS``.
 
-    Raises:
-        SlamCommandError: the data drove the estimator beyond finite numbers, or leave it without an answer.
+    Raises SlamCommandError: the data drove the estimator beyond finite numbers, or leave it without an answer.
     """
     from time import perf_counter
 

@@ -47,10 +47,8 @@ class Estimate(NamedTuple):
 class Calibration:
     """What a drive shows: radius and base in m, bias in rad/s, the difference of the radii (right less left) in m.
 
-    Attributes:
-        covariance: of radius, base and bias, shape (3, 3).
-        slip_sigma: how much slip varies from motion to motion; 0 where nothing shows that it does.
-        chi2, degrees: of all residuals, with ``slip_sigma`` as it is.
+    ``covariance``: of radius, base and bias, shape (3, 3). ``slip_sigma``: how much slip varies from motion to motion;
+    0 where nothing shows that it does. ``chi2``, ``degrees``: of all residuals, with ``slip_sigma`` as it is.
     """
 
     radius: Estimate
@@ -70,10 +68,8 @@ def calibrate(mirror: Mirror, drive: RecordedDrive, cfg: Config) -> Calibration:
     """Estimate the parameters.
 
     The search begins at the configured radius and base, which have no weight; scale of the gyroscope and downhill drift
-    (creep, part of the way) have the configured standard deviations about 0.
-
-    Raises:
-        CalibrationError: too few segments, or no turns or ways among them.
+    (creep, part of the way) have the configured standard deviations about 0. Raises CalibrationError: too few segments,
+    or no turns or ways among them.
     """
     _check(drive, cfg.robot)
     problem = _Problem(mirror, drive, cfg.localizer.full_state)
@@ -282,8 +278,7 @@ def rows(cfg: Config, found: Calibration) -> tuple[CalibrationRow, CalibrationRo
 def check_usable(table: tuple[CalibrationRow, ...]) -> None:
     """Refuse what must not get into a configuration.
 
-    Raises:
-        CalibrationError: a length is too uncertain, or far from what is configured.
+    Raises CalibrationError: a length is too uncertain, or far from what is configured.
     """
     for row in table[:2]:
         if row.sigma > MOST_SIGMA * row.found:

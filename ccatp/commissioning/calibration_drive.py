@@ -297,9 +297,7 @@ MAX_FIXES = 60
 def read_drive(run_dir: Path) -> tuple[RecordedDrive, Mirror, Config]:
     """The newest recording of a run: its drive, its mirror, its configuration.
 
-    Raises:
-        RunReadError: there is no recording that can be read.
-        ConfigError: its configuration cannot be used.
+    Raises RunReadError: there is no recording that can be read. Raises ConfigError: its configuration cannot be used.
     """
     recording = open_run(run_dir)[-1]
     cfg = recording.config({})

@@ -58,8 +58,7 @@ def probe_all(
 ) -> list[PreflightResult]:
     """Everything a mission needs; with ``sim`` on stand-ins of robot and laser system, which are started for it.
 
-    Raises:
-        ConfigError: the stand-ins cannot listen.
+    Raises ConfigError: the stand-ins cannot listen.
     """
     mirror = build_mirror(cfg.mirror)
     where = config_file or "the default one"

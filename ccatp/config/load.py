@@ -92,8 +92,7 @@ class ConfigSource:
 def read_source(path: Path, root: Key = ()) -> ConfigSource:
     """The content of a TOML file, as the section ``root`` of a configuration.
 
-    Raises:
-        ConfigError: there is no such file, or it is not TOML.
+    Raises ConfigError: there is no such file, or it is not TOML.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -113,8 +112,7 @@ def read_source(path: Path, root: Key = ()) -> ConfigSource:
 def nested(dotted: Mapping[str, object]) -> Tree:
     """``{"run.seed": 2}`` as ``{"run": {"seed": 2}}``; ``None`` values are left out.
 
-    Raises:
-        ConfigError: a key is given both as a value and as a section.
+    Raises ConfigError: a key is given both as a value and as a section.
     """
     tree: Tree = {}
     for key, value in dotted.items():
@@ -195,11 +193,9 @@ def load_config(file: Path | None = None, overrides: Overrides = None, config_di
     that ``run.mirror`` and ``run.world`` name, a name or the path of a ``.toml`` file; a file with complete sections
     ``[mirror]`` and ``[world]``, as a run directory holds, is taken as it is, and single keys of these sections are
     laid over the named file. Dotted keys in ``overrides`` are stronger than the file; ``None`` values are left out.
-    ``config_dir`` (the shipped one by default) has ``ccatp.toml``, ``mirrors/`` and ``worlds/``.
-
-    Raises:
-        ConfigError: one line with file, line, key, what is wrong and what to do.
-        NotASurvey: the file is of a mission among beacons.
+    ``config_dir`` (the shipped one by default) has ``ccatp.toml``, ``mirrors/`` and ``worlds/``. Raises ConfigError:
+    one line with file, line, key, what is wrong and what to do. Raises NotASurvey: the file is of a mission among
+    beacons.
     """
     config_dir = config_dir or configs_dir()
     sources = _layers(read_source(config_dir / DEFAULT_FILE), file, overrides)
@@ -295,10 +291,7 @@ def load_radio_config(
 
     ``system`` of the user's file, else of the base file ``radio.toml``, says which of ``zigbee.toml``, ``follow.toml``
     and ``cricket.toml`` lies between the two. ``simulates`` says whether a field of motes is simulated, or its ranges
-    were measured.
-
-    Raises:
-        ConfigError: one line with file, line, key, what is wrong and what to do.
+    were measured. Raises ConfigError: one line with file, line, key, what is wrong and what to do.
     """
     config_dir = config_dir or configs_dir()
     command, user, base = sources = _layers(read_source(config_dir / BEACON_FILE), file, overrides)
@@ -321,8 +314,7 @@ def load_radio_config(
 def is_radio_file(file: Path) -> bool:
     """Whether a configuration file is one of a robot among radio beacons: it names its ``system``.
 
-    Raises:
-        ConfigError: it cannot be read.
+    Raises ConfigError: it cannot be read.
     """
     return "system" in read_source(file).tree
 
@@ -340,8 +332,7 @@ def _system(sources: list[ConfigSource]) -> str:
 def load_recordings_config(file: Path | None = None, overrides: Overrides = None) -> RecordingsConfig:
     """What is assumed of recorded radio data, by format, as in ``plaza.priors.range_scale``.
 
-    Raises:
-        ConfigError: one line with file, line, key, what is wrong and what to do.
+    Raises ConfigError: one line with file, line, key, what is wrong and what to do.
     """
     sources = _layers(read_source(configs_dir() / RECORDING_FILE), file, overrides)
     return _validated(RecordingsConfig, _stacked(sources), sources)
@@ -353,11 +344,8 @@ def load_recordings_config(file: Path | None = None, overrides: Overrides = None
 def with_values(text: str, values: Mapping[str, float], file: Path) -> str:
     """The text with other values of some keys, ``section.key``; everything else, comments included, stays.
 
-    A key that is there keeps its comment, but for the mark of unmeasured values; one that is not is
-    added to its section.
-
-    Raises:
-        ConfigError: the text is not TOML, or a key stands where no key can be.
+    A key that is there keeps its comment, but for the mark of unmeasured values; one that is not is added to its
+    section. Raises ConfigError: the text is not TOML, or a key stands where no key can be.
     """
     # Imported late: only a command that edits a file needs it, and every process reads one.
     import tomlkit  # noqa: PLC0415
@@ -391,10 +379,8 @@ def difference(before: str, after: str, file: Path) -> str:
 def write_in_place(file: Path, text: str) -> None:
     """Replace a file's contents at once: a reader finds the old ones or the new ones, also after a power cut.
 
-    Its mode stays as it is; where it is a link, what it points to is replaced.
-
-    Raises:
-        ConfigError: it cannot be written.
+    Its mode stays as it is; where it is a link, what it points to is replaced. Raises ConfigError: it cannot be
+    written.
     """
     file = file.resolve()
     name: str | None = None

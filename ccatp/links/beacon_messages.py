@@ -40,9 +40,8 @@ class RadioSample(NamedTuple):
 class RadioScan(msgspec.Struct, frozen=True):
     """One turn of a reflector.
 
-    Attributes:
-        step: between two directions, rad; the first is straight ahead, they go to the left.
-        levels: of each radio, dBm, one for each direction, ``None`` where a packet was lost.
+    ``step``: between two directions, rad; the first is straight ahead, they go to the left. ``levels``: of each radio,
+    dBm, one for each direction, ``None`` where a packet was lost.
     """
 
     t: Time
@@ -63,9 +62,8 @@ class MoteBurst(NamedTuple):
 class BeaconFrame(msgspec.Struct, frozen=True):
     """The extra keys of a frame.
 
-    Attributes:
-        steer: steering angles since the last frame.
-        distances: of the distance sensors, m, in the order of the robot's ``hello``; empty where there was no reading.
+    ``steer``: steering angles since the last frame. ``distances``: of the distance sensors, m, in the order of the
+    robot's ``hello``; empty where there was no reading.
     """
 
     steer: list[SteerSample] = []

@@ -59,12 +59,8 @@ class Router:
     Use as an async context manager around ``serve``; a ``RouterError`` where the endpoint may not or cannot be bound.
     While a handler's later reply is awaited, others are served. An exception of the handler ends ``serve``. Without
     ``keys`` the endpoint is ``ipc://`` or ``inproc://``; with them it is ``tcp://ADDRESS:PORT`` for CURVE clients that
-    a ``ZapHandler`` admits.
-
-    Attributes:
-        bound: the endpoint as bound, with its port.
-        refused: requests that never reached the handler.
-        turned_away: connections beyond ``MAX_CONNECTIONS``.
+    a ``ZapHandler`` admits. ``bound``: the endpoint as bound, with its port. ``refused``: requests that never reached
+    the handler. ``turned_away``: connections beyond ``MAX_CONNECTIONS``.
     """
 
     def __init__(

@@ -39,9 +39,8 @@ _DISTRIBUTION = ("rmse", "mean", "p50", "p99", "max")
 class BeaconFacts(NamedTuple):
     """Facts of a run that are known before it starts.
 
-    Attributes:
-        safe_distance_m: to be kept from the target; ``None`` without one.
-        settled_s: the least distance to the target counts from this time on.
+    ``safe_distance_m``: to be kept from the target; ``None`` without one. ``settled_s``: the least distance to the
+    target counts from this time on.
     """
 
     system: str

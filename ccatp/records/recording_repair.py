@@ -42,8 +42,7 @@ class RecordingError(CcatpError):
 class Condition:
     """Condition of a file, known when the scan has come to its end.
 
-    Attributes:
-        lost: beginning and end of each stretch of bytes that holds no intact record.
+    ``lost``: beginning and end of each stretch of bytes that holds no intact record.
     """
 
     size_bytes: int = 0

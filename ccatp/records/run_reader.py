@@ -41,10 +41,9 @@ Injected = dict[PanelId, Vector3]
 class Marked:
     """A frame, and the treatment of the localizer in it.
 
-    Attributes:
-        begun: before the frame the localizer was reset, with these values of ``Treatment``.
-        is_odometry_off: whatever wheels and inertial unit report, the robot stands.
-        doubted: after the samples its uncertainty was increased by this much, m and rad.
+    ``begun``: before the frame the localizer was reset, with these values of ``Treatment``. ``is_odometry_off``:
+    whatever wheels and inertial unit report, the robot stands. ``doubted``: after the samples its uncertainty was
+    increased by this much, m and rad.
     """
 
     sensors: Sensors
@@ -195,9 +194,8 @@ class RunReadError(CcatpError):
 class Recording:
     """One recording of a run; a run that was resumed has several, each from the robot's start at base.
 
-    Attributes:
-        warnings: defects; complete when ``messages`` has come to its end.
-        arrivals: frames at which the robot stood at a point for the first time; complete likewise.
+    ``warnings``: defects; complete when ``messages`` has come to its end. ``arrivals``: frames at which the robot stood
+    at a point for the first time; complete likewise.
     """
 
     path: Path
@@ -307,8 +305,7 @@ def _readable(path: Path, read: Callable[[Path], _T]) -> _T:
 class Survey(NamedTuple):
     """A run's survey.
 
-    Attributes:
-        injected: piston (m), tip and tilt (rad) of the simulated panels; None on a real robot or where not recorded.
+    ``injected``: piston (m), tip and tilt (rad) of the simulated panels; None on a real robot or where not recorded.
     """
 
     cfg: Config

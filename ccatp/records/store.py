@@ -142,12 +142,9 @@ class MissionStore:
     """The mission database of one run, owned by one process; made by ``create`` or ``open``.
 
     Recording returns at once and may be done from an asyncio loop; each request is one transaction. ``points``,
-    ``fixes`` and ``close`` wait for the writer thread.
-
-    Attributes:
-        damaged: points whose stored fix did not match its checksum at ``open``; they are planned again.
-        failure: the error that ended all writing, if any.
-        arrivals_dropped: arrivals that found the queue or the disk full.
+    ``fixes`` and ``close`` wait for the writer thread. ``damaged``: points whose stored fix did not match its checksum
+    at ``open``; they are planned again. ``failure``: the error that ended all writing, if any. ``arrivals_dropped``:
+    arrivals that found the queue or the disk full.
     """
 
     def __init__(self, path: Path, db: sqlite3.Connection) -> None:
@@ -177,10 +174,8 @@ class MissionStore:
     ) -> Self:
         """Make a new store with all points planned; the file appears complete or not at all.
 
-        Args:
-            config_toml: the run's exact configuration; its SHA-256 is kept.
-
-        ``StoreError``: the file exists, or cannot be made.
+        ``StoreError``: the file exists, or cannot be made. ``config_toml``: the run's exact configuration; its SHA-256
+        is kept.
         """
         if path.exists():
             raise StoreError(f"{path}: exists already; resume it or choose another run directory")
@@ -234,10 +229,9 @@ class MissionStore:
     def record_fix(self, point: PointId, fix: Fix, estimate: DeckPose) -> "Future[int]":
         """Store a fix (world frame) and make its point measured, in one transaction.
 
-        Returns:
-            Resolves to the number of the fix after the commit (await it with ``asyncio.wrap_future``). Fails with
-            ``AlreadyMeasuredError``, ``UnknownPointError``, ``StoreRefusal`` (not finite, or a covariance not of nine
-            values) or, where nothing will be stored any more, another ``StoreError``.
+        Returns resolves to the number of the fix after the commit (await it with ``asyncio.wrap_future``). Fails with
+        ``AlreadyMeasuredError``, ``UnknownPointError``, ``StoreRefusal`` (not finite, or a covariance not of nine
+        values) or, where nothing will be stored any more, another ``StoreError``.
         """
         return self._submit(lambda db: _insert_fix(db, point, fix, estimate), point)
 

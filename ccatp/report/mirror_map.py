@@ -170,10 +170,8 @@ def paths_figure(mirror: Mirror, records: Mapping[str, RunRecord], width_px: flo
 def draw_from_run_dir(run_dir: Path, out: Path) -> None:
     """Draw the map of a run into a file, with the distances that the laser system measured.
 
-    Raises:
-        PictureError: the run holds no points, or the map cannot be drawn.
-        RunReadError: the directory holds no run.
-        ConfigError: its configuration cannot be read.
+    Raises PictureError: the run holds no points, or the map cannot be drawn. Raises RunReadError: the directory holds
+    no run. Raises ConfigError: its configuration cannot be read.
     """
     record = read_record(run_dir)
     if record.points is None:

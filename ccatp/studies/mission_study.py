@@ -247,9 +247,8 @@ def nees(rows: FloatArray, states: int) -> FloatArray:
 def chi_square_figures(values: FloatArray, freedom: int) -> dict[str, Any]:
     """How values (k,) compare with chi-square; those that are not finite are left out.
 
-    Returns:
-        ``count``; ``mean`` and ``band_95``, in which that of a consistent filter lies; ``is_within_band``; ``p50``;
-        ``within_95_fraction``, the share below the 95 % quantile of a single value.
+    Returns ``count``; ``mean`` and ``band_95``, in which that of a consistent filter lies; ``is_within_band``; ``p50``;
+    ``within_95_fraction``, the share below the 95 % quantile of a single value.
     """
     known = values[np.isfinite(values)]
     if not known.size:

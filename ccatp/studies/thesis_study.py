@@ -62,10 +62,8 @@ def overrides_of(
 ) -> dict[str, object]:
     """Dotted configuration keys of one set-up.
 
-    Args:
-        noise: ``normal`` or ``twice``.
-        period_error: by which part of the filter's step the loop takes longer.
-        is_ours: the daemon's filter and control in the same set-up, all encoder samples included.
+    ``noise``: ``normal`` or ``twice``. ``period_error``: by which part of the filter's step the loop takes longer.
+    ``is_ours``: the daemon's filter and control in the same set-up, all encoder samples included.
     """
     sigmas = [sqrt(value) if noise_is_variance else value for value in _TABLE[noise]]
     keys: dict[str, object] = {**_LAYOUT, "run.world": _WORLDS[noise]}

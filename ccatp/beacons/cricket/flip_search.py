@@ -234,10 +234,8 @@ def scaled(model: MapModel, first: MapFit, settings: MapFitSettings) -> ScaledFi
 
     Residuals of a fit that wrong ranges have bent are all too large, those of a robust fit are not: the scale follows
     from the fit and the fit from the scale, in turn (S-estimate: Rousseeuw and Yohai 1984). Where it comes out larger
-    than the sigmas were taken for, grown maps are tried too.
-
-    Args:
-        model: network with sigmas that are right up to a factor.
+    than the sigmas were taken for, grown maps are tried too. ``model``: network with sigmas that are right up to a
+    factor.
     """
     best = _settled(model, first, settings)
     # Shapes of bodies hold a map together by themselves.

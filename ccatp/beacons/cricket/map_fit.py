@@ -154,8 +154,7 @@ class MapModel:
 def _body_block(arms: FloatArray) -> FloatArray:
     """Derivatives of the motes of a body by its place and its rotation about its frame's origin.
 
-    Args:
-        arms: R times local places, shape (k, d).
+    ``arms``: R times local places, shape (k, d).
     """
     count, d = arms.shape
     block = np.zeros((count, d, d + d * (d - 1) // 2))
@@ -186,8 +185,7 @@ _NULL = 1e-9  # eigenvalues below this share of the largest are directions that 
 class MapFitSettings(NamedTuple):
     """How to fit.
 
-    Attributes:
-        robust_scale: Cauchy loss: residuals beyond this many sigmas weigh less and less; infinite for least squares.
+    ``robust_scale``: Cauchy loss: residuals beyond this many sigmas weigh less and less; infinite for least squares.
     """
 
     robust_scale: float = float("inf")
@@ -254,9 +252,7 @@ def position_covariance(model: MapModel, fit: MapFit) -> tuple[FloatArray, int]:
     Where nothing pins the frame, the covariance is that of the map after the rigid motion that brings it nearest to the
     truth (inner constraints of a free network): C = S B N^+ B^T S^T with B = dp/dq, N the normal matrix and S the
     projection across all rigid motions. Directions without information count as known: look at the second value.
-
-    Returns:
-        Covariance (n d, n d), and the number of directions without information, the frame's included.
+    Returns covariance (n d, n d), and the number of directions without information, the frame's included.
     """
     normal, _ = _normal(model, fit.state, fit.residuals_m, np.where(fit.weights > 0.5, 1.0, 0.0))
     dense = normal if isinstance(normal, np.ndarray) else normal.toarray()
@@ -307,11 +303,8 @@ def _solved(normal: csr_array | FloatArray, gradient: FloatArray, damping: float
 def bound_rms_m(model: MapModel, true_m: FloatArray, motes: Sequence[int], *, aligned: bool) -> float | None:
     """sqrt(tr C / n) of some motes, C = (J^T Sigma^-1 J)^-1 at the true places.
 
-    Args:
-        true_m: places of all motes, shape (n, d).
-
-    Returns:
-        The bound in metres; None where the ranges leave the map free to move.
+    ``true_m``: places of all motes, shape (n, d). Returns the bound in metres; None where the ranges leave the map free
+    to move.
     """
     state = model.state(true_m)
     count = len(model.network.ranges_m)
@@ -326,8 +319,7 @@ def bound_rms_m(model: MapModel, true_m: FloatArray, motes: Sequence[int], *, al
 def map_rms_m(covariance_m2: FloatArray, positions_m: FloatArray, motes: Sequence[int], *, aligned: bool) -> float:
     """Root mean square error that a covariance of all coordinates (n d, n d) expects of some motes.
 
-    Args:
-        positions_m: shape (n, d).
+    ``positions_m``: shape (n, d).
     """
     d = positions_m.shape[1]
     at = coordinates_of(motes, d)

@@ -35,13 +35,9 @@ def grown(
     """Places of n points, nan where d ranges do not reach, shape (n, d); None where there is no triangle to begin with.
 
     Least squares lets a wrong range bend the whole map. Here no range is used that is not drawn: d + 1 points that all
-    know their distances come first; then the point that most ranges agree on, at the crossing of d spheres that has
-    the least robust cost of all ranges to points with a place (consensus: Fischler and Bolles 1981).
-
-    Args:
-        pairs: known distances, each pair once, shape (e, 2).
-        distances_m: shape (e,).
-        sigmas_m: shape (e,).
+    know their distances come first; then the point that most ranges agree on, at the crossing of d spheres that has the
+    least robust cost of all ranges to points with a place (consensus: Fischler and Bolles 1981). ``pairs``: known
+    distances, each pair once, shape (e, 2). ``distances_m``: shape (e,). ``sigmas_m``: shape (e,).
     """
     table, scale = np.full((2, count, count), np.nan)
     for i, j in (pairs.T, pairs.T[::-1]):
@@ -289,8 +285,7 @@ _MAX_DOP = 60.0  # of a trilateration that is but a start
 def map_starts(network: RangeNetwork, given_m: FloatArray | None) -> Iterator[list[FloatArray]]:
     """Places to begin, the most promising first; each with its mirror image, where bodies distinguish them.
 
-    Args:
-        given_m: what the caller has, shape (n, d), nan where nothing is known.
+    ``given_m``: what the caller has, shape (n, d), nan where nothing is known.
     """
     means = PairMeans(network)
     pairs, distances_m, sigmas_m = _with_bodies(network, means)

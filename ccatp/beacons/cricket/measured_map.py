@@ -56,8 +56,7 @@ def disagreeing(network: RangeNetwork) -> Iterator[str]:
 def doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[str]:
     """Warnings of folds, contradictions, scatter and outliers of a batch map.
 
-    Args:
-        factor: of the sigmas, by the residuals.
+    ``factor``: of the sigmas, by the residuals.
     """
     for fold in found.folds[:_FOLDS]:
         motes = list_names([network.names[mote] for mote in fold.motes])
@@ -84,8 +83,7 @@ def doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[str
 def hidden_offset(found: MoteMap, network: RangeNetwork, settings: MapFitSettings) -> Iterator[str]:
     """A warning of an offset that the ranges show, where none is estimated.
 
-    Args:
-        network: its ranges, with the sigmas that they were found to have.
+    ``network``: its ranges, with the sigmas that they were found to have.
     """
     model = MapModel(network, with_offset=True)
     dof = len(network.ranges_m) - model.size
@@ -122,8 +120,7 @@ def left_out_heights(
 def is_flat(error_m: float | None, places_m: FloatArray) -> bool:
     """Whether an error expected is larger than the map's least extent, root mean square.
 
-    Args:
-        places_m: shape (n, d); of n motes, n - 1 extents count.
+    ``places_m``: shape (n, d); of n motes, n - 1 extents count.
     """
     extents_m = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False) / np.sqrt(len(places_m))
     extents_m = extents_m[: len(places_m) - 1]
@@ -138,8 +135,7 @@ Places = Mapping[str, tuple[float, ...]]
 class MeasuredRanges(NamedTuple):
     """Ranges as they were recorded.
 
-    Attributes:
-        groups: names of motes that move together, by the name of their pose: tags of a trolley that stood there.
+    ``groups``: names of motes that move together, by the name of their pose: tags of a trolley that stood there.
     """
 
     readings: tuple[MoteRange, ...]
@@ -172,12 +168,7 @@ def map_measured(
     """Map what a file of ranges holds.
 
     Places of a trolley that stood somewhere are mapped along with the anchors, which are what the result is about.
-
-    Args:
-        method: ``ekf`` or ``batch``.
-
-    Raises:
-        MappingError: the ranges make no map, or the files do not fit each other.
+    ``method``: ``ekf`` or ``batch``. Raises MappingError: the ranges make no map, or the files do not fit each other.
     """
     network = _network(cfg, file, tags_m)
     rng = np.random.default_rng(0)
@@ -322,8 +313,7 @@ def _truth(truth_m: Places, names: tuple[str, ...], dimension: int) -> FloatArra
 def report_lines(data: dict[str, Any]) -> Iterator[str]:
     """What ``ccatp radio map`` prints without ``--json``: first what the ranges determine, then what was found.
 
-    Args:
-        data: as ``--json`` prints it.
+    ``data``: as ``--json`` prints it.
     """
     yield f"{data['motes']} motes, {data['method']}, frame {data['frame']}, {data['seeds']} runs"
     yield ""

@@ -64,11 +64,8 @@ def map_motes(
     A fit goes down to the nearest minimum, and most of them are folded maps. So it begins with the map unfolded from
     more dimensions (``unfolded``) or stitched from patches (``stitched``), and its mirror image where bodies
     distinguish them; then places that contradict their ranges are mapped again (``repaired``), and motes that could
-    stand on the other side are tried there (``unfold``).
-
-    Args:
-        start_m: one more place to begin, shape (n, d), nan where unknown.
-        finds_sigma: the sigmas are right up to a factor, which follows from the residuals (``scaled``).
+    stand on the other side are tried there (``unfold``). ``start_m``: one more place to begin, shape (n, d), nan where
+    unknown. ``finds_sigma``: the sigmas are right up to a factor, which follows from the residuals (``scaled``).
     """
     model = MapModel(network, with_offset=with_offset, with_scale=with_scale)
     if finds_sigma:
@@ -208,8 +205,7 @@ def pinned_map(
 def plain_frame(positions_m: FloatArray) -> RigidMotion:
     """The motion to a frame of the map's own: the first mote its origin, the second on +x, the third at y > 0.
 
-    Args:
-        positions_m: shape (n, d), of motes that are not all on a line.
+    ``positions_m``: shape (n, d), of motes that are not all on a line.
     """
     offsets = positions_m - positions_m[0]
     d = positions_m.shape[1]

@@ -34,8 +34,7 @@ class MoteRange(NamedTuple):
 def sound_speed(air: AirConfig, temperature_c: float) -> float:
     """Speed of sound c = c_0 sqrt(T / T_0), T in kelvin: that of an ideal gas.
 
-    Raises:
-        TdoaError: no temperature of air.
+    Raises TdoaError: no temperature of air.
     """
     if not COLDEST_C <= temperature_c <= HOTTEST_C:
         raise TdoaError(f"temperature of {temperature_c:g} C is outside {COLDEST_C:g} to {HOTTEST_C:g} C")
@@ -45,8 +44,7 @@ def sound_speed(air: AirConfig, temperature_c: float) -> float:
 def range_from_delay(air: AirConfig, delay_s: float, temperature_c: float) -> float:
     """Distance d = c(T) (t_2 - t_1), Patil et al. eq. 1; the radio message takes no time.
 
-    Raises:
-        TdoaError: a delay that is negative or not finite, or no temperature of air.
+    Raises TdoaError: a delay that is negative or not finite, or no temperature of air.
     """
     if not 0.0 <= delay_s < float("inf"):
         raise TdoaError(f"delay of {delay_s:g} s: the pulse cannot arrive before the message")
@@ -87,11 +85,7 @@ class RigidBody:
 
 @dataclass(frozen=True, slots=True)
 class RangeNetwork:
-    """A graph of ranges.
-
-    Attributes:
-        first, second: ends of each of the m ranges, indices of motes, shape (m,).
-    """
+    """A graph of ranges. ``first``, ``second``: ends of each of the m ranges, indices of motes, shape (m,)."""
 
     names: tuple[str, ...]
     dimension: int  # d, 2 or 3
@@ -128,13 +122,10 @@ def build_network(
 ) -> RangeNetwork:
     """The graph of some ranges, checked.
 
-    Args:
-        names: the motes in their order; those of the readings, as they come, if ``None``.
-        known_m: known coordinates, nan elsewhere, shape (n, d).
-
-    Raises:
-        MappingError: a range names a mote that is not among ``names``, is from a mote to itself, negative or not
-            finite, or has no positive sigma; there are no ranges, fewer than two motes, or the motes fall apart.
+    ``names``: the motes in their order; those of the readings, as they come, if ``None``. ``known_m``: known
+    coordinates, nan elsewhere, shape (n, d). Raises MappingError: a range names a mote that is not among ``names``, is
+    from a mote to itself, negative or not finite, or has no positive sigma; there are no ranges, fewer than two motes,
+    or the motes fall apart.
     """
     rows = list(readings)
     if names is None:
@@ -220,10 +211,8 @@ def _check_connected(network: RangeNetwork) -> None:
 class PairMeans:
     """Ranges by pair, r = sum(r_i / sigma_i^2) / sum(1 / sigma_i^2).
 
-    Attributes:
-        pairs: each once, the smaller index first, shape (e, 2).
-        ranges_m: shape (e,).
-        sigmas_m: of the means, shape (e,).
+    ``pairs``: each once, the smaller index first, shape (e, 2). ``ranges_m``: shape (e,). ``sigmas_m``: of the means,
+    shape (e,).
     """
 
     def __init__(self, network: RangeNetwork) -> None:
@@ -273,11 +262,8 @@ def pair_range(
 ) -> MoteRange:
     """The range of a pair from its readings.
 
-    Args:
-        delays_s: pulse after message, one for each reading, shape (k,), k >= 1.
-
-    Raises:
-        TdoaError: a delay or a temperature that none can be.
+    ``delays_s``: pulse after message, one for each reading, shape (k,), k >= 1. Raises TdoaError: a delay or a
+    temperature that none can be.
     """
     delay_s = float(np.median(delays_s) if cfg.ranging.combine == "median" else np.mean(delays_s))
     range_m = range_from_delay(cfg.air, delay_s, temperature_c)

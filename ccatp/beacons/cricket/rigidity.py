@@ -87,9 +87,7 @@ def find_freedom(model: MapModel, state: MapState) -> Freedom:
 def rigid_parts(moves: FloatArray, points: FloatArray, extra: int) -> tuple[tuple[int, ...], ...]:
     """Sets of motes whose distances stay in every free direction, largest first.
 
-    Args:
-        moves: free directions, shape (n d, k).
-        points: shape (n, d).
+    ``moves``: free directions, shape (n d, k). ``points``: shape (n, d).
     """
     count, d = points.shape
     if extra <= 0:
@@ -197,8 +195,7 @@ _SHOWN = 8
 class FoldOver(NamedTuple):
     """What may fold.
 
-    Attributes:
-        mirrors: (separator, motes): these motes may be mirrored across the line (plane) through the separator.
+    ``mirrors``: (separator, motes): these motes may be mirrored across the line (plane) through the separator.
     """
 
     is_unique: bool  # whether almost all places give a map that is the only one, up to a rigid motion and the mirror

@@ -205,9 +205,7 @@ def run_phase_two(
 ) -> PhaseTwo:
     """Observe one distance after the other until the expected error is small enough, or there are no more.
 
-    Args:
-        readings: first, second, range_m, sigma_m.
-        target_rms_m: of ``MoteMapper.expected_rms_m``.
+    ``readings``: first, second, range_m, sigma_m. ``target_rms_m``: of ``MoteMapper.expected_rms_m``.
     """
     places, expected, nis = [mapper.positions_m], [mapper.expected_rms_m], []
     refused = 0
@@ -225,10 +223,8 @@ def run_phase_two(
 def conditioned(mean: FloatArray, covariance: FloatArray, known: FloatArray) -> tuple[FloatArray, FloatArray]:
     """A Gaussian, given some of its coordinates exactly: m + P_k P_kk^+ (z - m_k), P - P_k P_kk^+ P_k^T.
 
-    Args:
-        mean: shape (n,).
-        covariance: shape (n, n).
-        known: values, nan where a coordinate is not known, shape (n,).
+    ``mean``: shape (n,). ``covariance``: shape (n, n). ``known``: values, nan where a coordinate is not known, shape
+    (n,).
     """
     at = np.flatnonzero(np.isfinite(known))
     if at.size == 0:
@@ -260,9 +256,8 @@ Pairs = tuple[tuple[int, int], ...]
 class MotePlan:
     """The motes of a configuration.
 
-    Attributes:
-        networks: indices of the motes of each stand, in the order of mapping; empty where there are none.
-        axes_m: where A stands and the direction towards B, shape (2, d): what takes the map's frame to the field's.
+    ``networks``: indices of the motes of each stand, in the order of mapping; empty where there are none. ``axes_m``:
+    where A stands and the direction towards B, shape (2, d): what takes the map's frame to the field's.
     """
 
     names: tuple[str, ...]
@@ -332,8 +327,7 @@ def loose_plan(cfg: CricketConfig, names: tuple[str, ...]) -> MotePlan:
 def head_pairs(count: int, programme: str) -> list[tuple[int, int]]:
     """Pairs of stands that measure each other in phase 2.
 
-    Args:
-        programme: ``zigzag``: each with the next; ``adjacent``: and with the one after it; ``all``.
+    ``programme``: ``zigzag``: each with the next; ``adjacent``: and with the one after it; ``all``.
     """
     if programme == "all":
         return [(i, j) for i in range(count) for j in range(i + 1, count)]

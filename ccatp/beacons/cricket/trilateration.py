@@ -84,9 +84,7 @@ class Sketch:
 
         y = (d_A^2 + d_AB^2 - d_B^2) / (2 d_AB), x = sqrt(d_A^2 - y^2)
 
-        Raises:
-            MappingError: a range to A or B is missing.
-            DegenerateStep: the mote is on the axis, or nearly.
+        Raises MappingError: a range to A or B is missing. Raises DegenerateStep: the mote is on the axis, or nearly.
         """
         (a, sigma_a), (b, sigma_b), (c, _) = (
             self._range(origin, mote),
@@ -123,9 +121,8 @@ class Sketch:
     def add_by_ranges(self, mote: int, references: Sequence[int]) -> None:
         """A mote by trilateration from motes that have places, with the solver of the laser system.
 
-        Raises:
-            MappingError: a range to a reference is missing.
-            DegenerateStep: the references lie on a line with the mote, or nearly.
+        Raises MappingError: a range to a reference is missing. Raises DegenerateStep: the references lie on a line with
+        the mote, or nearly.
         """
         ranges = [self._range(reference, mote) for reference in references]
         solution = self._solve(mote, references, ranges)
@@ -224,12 +221,9 @@ def draw_errors(
     At places close to those that were found, ranges with errors as they are expected are drawn, and the same steps made
     of them. Derivatives give the size of the errors as well, but not how they hang together: from a small stand errors
     grow to decimetres, and along so wide an arc no line is a tangent everywhere. What a line takes to be known within a
-    millimetre is known within centimetres.
-
-    Args:
-        places_m: where the motes might be, nan for those without a place, shape (n, d); A at the origin, B on the
-            second axis, where the steps begin with these two.
-        seed_covariance_m2: of the motes that began the map together, shape (n d, n d); those of axes need none.
+    millimetre is known within centimetres. ``places_m``: where the motes might be, nan for those without a place, shape
+    (n, d); A at the origin, B on the second axis, where the steps begin with these two. ``seed_covariance_m2``: of the
+    motes that began the map together, shape (n d, n d); those of axes need none.
     """
     count, d = places_m.shape
     drawn = np.broadcast_to(places_m, (draws, count, d)).copy()
@@ -323,10 +317,7 @@ def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: in
 
     A is the origin, B on the second axis, the first stand follows by the law of cosines, every other one by
     trilateration from all motes of the stand before it. Bias and covariance of the errors are drawn; without draws the
-    covariance is by derivatives.
-
-    Raises:
-        MappingError: a step that cannot be made; the message names its motes.
+    covariance is by derivatives. Raises MappingError: a step that cannot be made; the message names its motes.
     """
     means = PairMeans(network)
     sketch = Sketch(plan.names, means, plan.dimension, max_dop)
@@ -361,10 +352,8 @@ def _errors(sketch: Sketch, places_m: FloatArray, means: PairMeans, draws: int) 
 def map_as_possible(network: RangeNetwork, max_dop: float, draws: int = 0) -> FirstMap:
     """A trilateration without a plan: a good triangle (tetrahedron) of motes begins, whoever has most ranges follows.
 
-    Motes that cannot be placed well enough, from d + 1 others at least, are left out.
-
-    Raises:
-        DegenerateStep: there is no triangle (tetrahedron) to begin with.
+    Motes that cannot be placed well enough, from d + 1 others at least, are left out. Raises DegenerateStep: there is
+    no triangle (tetrahedron) to begin with.
     """
     means = PairMeans(network)
     sketch = Sketch(network.names, means, network.dimension, max_dop)

@@ -157,11 +157,7 @@ class Agreement:
 
 
 def agreement_of(fit: MapFit, sigmas_m: FloatArray, dof: int) -> Agreement:
-    """How the ranges fit a map.
-
-    Args:
-        sigmas_m: of its ranges, shape (m,).
-    """
+    """How the ranges fit a map. ``sigmas_m``: of its ranges, shape (m,)."""
     is_out = fit.weights < 0.5
     cost = float(((fit.residuals_m / sigmas_m)[~is_out] ** 2).sum())
     return Agreement(tuple(np.flatnonzero(is_out).tolist()), cost, dof)

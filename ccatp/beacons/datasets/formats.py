@@ -86,12 +86,9 @@ def is_plaza(file: Path) -> bool:
 def read_plaza(path: Path) -> RecordedRun:
     """Read a Plaza set (Djugash, Hamner, Roth, JFR 2009): odometry (DR), ranges (TD), beacons (TL) and truth (GT).
 
-    Args:
-        path: the ``.mat``; or one of the texts ``NAME_DR.txt``, ``NAME_TD.txt``, ``NAME_GT.txt``, ``NAME_TL.txt``
-            (plain or gzipped; the last two may be missing); or a folder with one set, whose ``.mat`` goes before texts.
-
-    Raises:
-        RadioDataError: a file is missing or is not what it should be.
+    ``path``: the ``.mat``; or one of the texts ``NAME_DR.txt``, ``NAME_TD.txt``, ``NAME_GT.txt``, ``NAME_TL.txt``
+    (plain or gzipped; the last two may be missing); or a folder with one set, whose ``.mat`` goes before texts. Raises
+    RadioDataError: a file is missing or is not what it should be.
     """
     file = _plaza_file(path) if path.is_dir() else path
     tables = _mat_tables(file) if file.suffix == ".mat" else _text_tables(file)
@@ -192,12 +189,9 @@ def robots_in(folder: Path) -> list[int]:
 def read_mrclam(path: Path, robot: int | None) -> RecordedRun:
     """Read one robot's run: odometry and a camera that sees barcodes on landmarks and robots.
 
-    Args:
-        path: the folder, or one of its ``RobotN_...`` files (which then names the robot); plain or gzipped.
-        robot: number of the robot; the first that is there if ``None``.
-
-    Raises:
-        RadioDataError: there is no such robot, a file is missing or is not what it should be.
+    ``path``: the folder, or one of its ``RobotN_...`` files (which then names the robot); plain or gzipped. ``robot``:
+    number of the robot; the first that is there if ``None``. Raises RadioDataError: there is no such robot, a file is
+    missing or is not what it should be.
     """
     folder = path
     if path.is_file():
@@ -278,8 +272,7 @@ def is_labyrinth(text: str) -> bool:
 def read_labyrinth(path: Path) -> RecordedRun:
     """Read a Labyrinth text, plain or gzipped: UWB ranges, wheel speeds and positions, a line each.
 
-    Raises:
-        RadioDataError: a line is not one of the set's, or there is no odometry or no range.
+    Raises RadioDataError: a line is not one of the set's, or there is no odometry or no range.
     """
     file = _labyrinth_file(path) if path.is_dir() else path
     warnings: list[str] = []
@@ -357,8 +350,7 @@ def is_events_csv(text: str) -> bool:
 def read_events_csv(file: Path) -> RecordedRun:
     """Read a run from a CSV of events (docs/radio_data.md), plain or gzipped.
 
-    Raises:
-        RadioDataError: a line is no event, or there is no odometry or no reading of a beacon.
+    Raises RadioDataError: a line is no event, or there is no odometry or no reading of a beacon.
     """
     if file.is_dir():
         raise RadioDataError(file, "is a folder: name the CSV file in it")

@@ -29,11 +29,8 @@ FORMATS = ("plaza", "mrclam", "labyrinth", "csv")
 def read_run(path: Path, data_format: str | None, robot: int | None) -> RecordedRun:
     """Read and check a recorded run.
 
-    Args:
-        data_format: one of ``FORMATS``; found out from the files if ``None``.
-
-    Raises:
-        RadioDataError: it cannot be read, or is not what it claims to be.
+    ``data_format``: one of ``FORMATS``; found out from the files if ``None``. Raises RadioDataError: it cannot be read,
+    or is not what it claims to be.
     """
     data_format = found_format(path, data_format)
     if robot is not None and data_format != "mrclam":
@@ -53,11 +50,8 @@ def read_run(path: Path, data_format: str | None, robot: int | None) -> Recorded
 def robots_of(path: Path, data_format: str | None = None) -> list[int | None]:
     """The robots of a set: numbers if it has several, ``[None]`` for the only one.
 
-    Args:
-        data_format: one of ``FORMATS``; found out from the files if ``None``.
-
-    Raises:
-        RadioDataError: there is no such set.
+    ``data_format``: one of ``FORMATS``; found out from the files if ``None``. Raises RadioDataError: there is no such
+    set.
     """
     return [*robots_in(path)] if found_format(path, data_format) == "mrclam" and path.is_dir() else [None]
 
@@ -65,8 +59,7 @@ def robots_of(path: Path, data_format: str | None = None) -> list[int | None]:
 def found_format(path: Path, given: str | None = None) -> str:
     """Which format a file or folder has: the one given, or else by its names and its first line.
 
-    Raises:
-        RadioDataError: it does not exist, is empty, or has none of the formats.
+    Raises RadioDataError: it does not exist, is empty, or has none of the formats.
     """
     if not path.exists():
         raise RadioDataError(path, "no such file or folder")

@@ -49,8 +49,7 @@ class Sheet(NamedTuple):
     def numbers(self, *columns: int) -> list[list[float]]:
         """The numbers in some columns, a row each.
 
-        Raises:
-            RadioDataError: one is no number, or larger than any level or place.
+        Raises RadioDataError: one is no number, or larger than any level or place.
         """
         found = []
         for line, row in self.rows:
@@ -66,8 +65,7 @@ class Sheet(NamedTuple):
 def read_sheet(path: Path, sheet: str | None = None) -> Sheet:
     """A CSV file with commas, semicolons, tabs or white space, or a sheet of a workbook, the first if not named.
 
-    Raises:
-        RadioDataError: it cannot be read, or holds no rows below a head.
+    Raises RadioDataError: it cannot be read, or holds no rows below a head.
     """
     if path.suffix.lower() == ".xlsx":
         sheets = read_workbook(path)
@@ -94,8 +92,7 @@ def read_sheet(path: Path, sheet: str | None = None) -> Sheet:
 def read_workbook(file: Path) -> dict[str, list[list[str]]]:
     """Rows of cells by name of the sheet, in the workbook's order; empty cells are empty text.
 
-    Raises:
-        RadioDataError: it is missing or no workbook.
+    Raises RadioDataError: it is missing or no workbook.
     """
     from openpyxl import load_workbook  # noqa: PLC0415 - the other formats do not wait for it
 
@@ -139,11 +136,8 @@ LevelsByPlace = tuple[str, tuple[HeardPlace, ...], list[str]]
 def read_levels(path: Path, sheet: str | None = None, points: Path | None = None) -> Levels:
     """Pairs of distance (m) and level (dBm) of a sheet, or XBee logs with a table of their ``points``.
 
-    Returns:
-        Name of the data, the pairs, and what was odd about them.
-
-    Raises:
-        RadioDataError: it cannot be read, or has no such columns.
+    Returns name of the data, the pairs, and what was odd about them. Raises RadioDataError: it cannot be read, or has
+    no such columns.
     """
     if path.is_dir():
         return _read_logs(path, sheet, points)
@@ -156,8 +150,7 @@ def read_levels(path: Path, sheet: str | None = None, points: Path | None = None
 def read_heard_places(path: Path, sheet: str | None = None) -> LevelsByPlace:
     """Places and levels: columns ``x``, ``y`` (m) and ``RSSI A``, ``RSSI B``, ... (dBm); see ``read_levels``.
 
-    Raises:
-        RadioDataError: it cannot be read, or has no such columns.
+    Raises RadioDataError: it cannot be read, or has no such columns.
     """
     table = read_sheet(path, sheet)
     nodes = {match["node"]: i for i, cell in enumerate(table.head) if (match := _LEVEL_OF.fullmatch(cell))}
@@ -175,8 +168,7 @@ def read_heard_places(path: Path, sheet: str | None = None) -> LevelsByPlace:
 def read_log(file: Path) -> dict[str, list[float]]:
     """Levels by node of an XBee log with lines as ``Node A: -56``.
 
-    Raises:
-        RadioDataError: it cannot be read, or a line is none of these.
+    Raises RadioDataError: it cannot be read, or a line is none of these.
     """
     found: dict[str, list[float]] = {}
     for line, content in content_lines(read_text(file)):
@@ -224,10 +216,8 @@ def read_ranges(path: Path, sigma_m: float) -> MeasuredRanges:
 
     Two forms are read. ``first,second,range_m`` with ``sigma_m`` where ranges differ in quality: one range a line.
     ``session,pos,deg,anchor,tag,n,mean_m,...``: a trolley with tags among anchors, one line for the mean range of an
-    anchor to a tag while the trolley stood at a position with a heading; tags of one standstill move together.
-
-    Raises:
-        RadioDataError: it cannot be read, or a line is no range.
+    anchor to a tag while the trolley stood at a position with a heading; tags of one standstill move together. Raises
+    RadioDataError: it cannot be read, or a line is no range.
     """
     table = read_sheet(path)
     is_session = set(SESSION) <= set(table.head)
@@ -255,8 +245,7 @@ def read_ranges(path: Path, sigma_m: float) -> MeasuredRanges:
 def read_places(path: Path) -> dict[str, tuple[float, ...]]:
     """Places of motes by name: a sheet with ``name,x_m,y_m`` and, in space, ``z_m``.
 
-    Raises:
-        RadioDataError: it cannot be read, or a line is no place.
+    Raises RadioDataError: it cannot be read, or a line is no place.
     """
     table = read_sheet(path)
     _check_columns(table, PLACES, "[,z_m]")

@@ -42,8 +42,7 @@ def listed(names: Sequence[str], most: int = 8) -> str:
 def read_text(file: Path, wanted: str = "a data set of the formats plaza, mrclam, labyrinth or csv") -> str:
     """The text of a file, unpacked if it is gzipped, whatever its name.
 
-    Raises:
-        RadioDataError: it is missing, cannot be read, or is no text.
+    Raises RadioDataError: it is missing, cannot be read, or is no text.
     """
     try:
         data = file.read_bytes()
@@ -74,8 +73,7 @@ def split_cells(content: str, delimiter: str | None = ",") -> list[str]:
 def number(file: Path, line: int, text: str, what: str) -> float:
     """A number, NaN and infinity included: ``Table.in_order`` leaves those out with a warning.
 
-    Raises:
-        RadioDataError: it is none.
+    Raises RadioDataError: it is none.
     """
     try:
         return float(text)
@@ -163,11 +161,8 @@ def tables_of(file: Path, rows: Iterable[tuple[str, int, list[float]]]) -> dict[
 def read_table(file: Path, names: tuple[str, ...], *, more: bool = False) -> Table:
     """A table of numbers between white space or commas; a first line of words is a header.
 
-    Args:
-        more: further columns are allowed, and left out.
-
-    Raises:
-        RadioDataError: the file cannot be read, has no rows, or a row is not ``names``.
+    ``more``: further columns are allowed, and left out. Raises RadioDataError: the file cannot be read, has no rows, or
+    a row is not ``names``.
     """
     rows: list[tuple[str, int, list[float]]] = []
     for line, content in content_lines(read_text(file)):
@@ -187,13 +182,9 @@ def tagged_row(
 ) -> tuple[str, int, list[float]]:
     """A line whose first word is its kind: kind, line, and the values of that kind's columns.
 
-    Args:
-        layout: columns by kind; those in parentheses may be missing. The column ``beacon`` is a name, all others are
-            numbers.
-        names: number of each name so far; new ones are added.
-
-    Raises:
-        RadioDataError: the line is of no such kind, or its values are not the columns.
+    ``layout``: columns by kind; those in parentheses may be missing. The column ``beacon`` is a name, all others are
+    numbers. ``names``: number of each name so far; new ones are added. Raises RadioDataError: the line is of no such
+    kind, or its values are not the columns.
     """
     kind, *cells = words
     if kind not in layout:

@@ -22,8 +22,7 @@ FINEST_S = 0.1
 class Reckoning:
     """Steps of odometry, cut at given instants and put together between them.
 
-    Args:
-        times_s: the instants, shape (n + 1,), rising, within the steps.
+    ``times_s``: the instants, shape (n + 1,), rising, within the steps.
     """
 
     def __init__(self, steps: Steps, times_s: FloatArray, *, delayed: bool = True) -> None:
@@ -202,9 +201,8 @@ class Residuals:
 class BatchProblem:
     """Odometry and readings of a run up to an instant.
 
-    Args:
-        times_s: instants of the poses, the first one the first odometry time, shape (n,).
-        used: which beacons take part, shape (b,); readings of others count nothing.
+    ``times_s``: instants of the poses, the first one the first odometry time, shape (n,). ``used``: which beacons take
+    part, shape (b,); readings of others count nothing.
     """
 
     def __init__(

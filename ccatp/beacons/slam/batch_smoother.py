@@ -37,11 +37,8 @@ CONVERGED = 1e-5  # relative gain below which a cost has converged
 class Factored:
     """Cholesky factors of an arrow system: A by bands, then the Schur complement S = C - B^T A^-1 B.
 
-    Args:
-        damping: the diagonal is multiplied by 1 + damping (Levenberg and Marquardt).
-
-    Raises:
-        LinAlgError: not positive definite.
+    ``damping``: the diagonal is multiplied by 1 + damping (Levenberg and Marquardt). Raises LinAlgError: not positive
+    definite.
     """
 
     def __init__(self, system: ArrowSystem, damping: float = 0.0) -> None:
@@ -190,12 +187,8 @@ class Placement(NamedTuple):
 def place_by_distances(poses: FloatArray, distance_m: FloatArray, variance: FloatArray) -> Placement:
     """Best of the minima of the robust cost of distances, sought from all around the nearest reading.
 
-    A straight path leaves two mirror images that cost the same: see ``margin``.
-
-    Args:
-        poses: of the readings, shape (m, 3).
-        distance_m: to one beacon, shape (m,).
-        variance: of the distances, m^2, shape (m,).
+    A straight path leaves two mirror images that cost the same: see ``margin``. ``poses``: of the readings, shape (m,
+    3). ``distance_m``: to one beacon, shape (m,). ``variance``: of the distances, m^2, shape (m,).
     """
     thin = max(1, -(-len(distance_m) // MOST_READINGS))
     x, y, distance, information = poses[::thin, 0], poses[::thin, 1], distance_m[::thin], 1.0 / variance[::thin]
@@ -241,8 +234,7 @@ class Start(NamedTuple):
 def grown(run: RecordedRun, times_s: FloatArray, settings: RecordingConfig) -> Start:
     """Solve ever longer beginnings of the run.
 
-    Args:
-        times_s: instants of the poses, shape (n,): the readings' and the first of all.
+    ``times_s``: instants of the poses, shape (n,): the readings' and the first of all.
     """
     steps, readings, beacons = run.steps, run.readings, len(run.beacon_ids)
     used, doubtful = np.zeros(beacons, dtype=bool), np.zeros(beacons, dtype=bool)

@@ -15,13 +15,10 @@ from ccatp.filters.ekf_slam import Columns, EkfSlam, columns_of
 class NoiseLevel:
     """A factor f on the variances of a noise, by maximum likelihood on the way (Fisher scoring).
 
-    An innovation of variance S, of which the share a = f r / S is this noise, has the log-likelihood
-    -(ln S + nu^2 / S) / 2: its derivative by ln f is a (nis - 1) / 2, its Fisher information a^2 / 2. So
-    J <- J + a^2, ln f <- ln f + a (nis - 1) / J.
-
-    Args:
-        prior: J at the start, the innovations that the starting value counts for.
-        memory: largest J: older innovations fade; 0: the factor stays one.
+    An innovation of variance S, of which the share a = f r / S is this noise, has the log-likelihood -(ln S + nu^2 / S)
+    / 2: its derivative by ln f is a (nis - 1) / 2, its Fisher information a^2 / 2. So J <- J + a^2, ln f <- ln f + a
+    (nis - 1) / J. ``prior``: J at the start, the innovations that the starting value counts for. ``memory``: largest J:
+    older innovations fade; 0: the factor stays one.
     """
 
     def __init__(self, prior: float, memory: float) -> None:
@@ -66,11 +63,7 @@ WANDER = "wander"  # first part of the name of a block that holds a wandering er
 
 @dataclass(slots=True)
 class MapEntry:
-    """A beacon on the map.
-
-    Attributes:
-        way_m, time_s: of the vehicle when the wandering error was last looked at.
-    """
+    """A beacon on the map. ``way_m``, ``time_s``: of the vehicle when the wandering error was last looked at."""
 
     columns: Columns  # pose, calibration, beacon and its wandering error, shape (k,)
     size: int
@@ -153,9 +146,8 @@ class HeadingTransport:
     def follow(self, before: FloatArray) -> None:
         """The state was corrected.
 
-        Args:
-            before: its mean before that, shape (n,) or, without what joined since, less; work space afterwards. Where
-                something left the state since, nothing is done.
+        ``before``: its mean before that, shape (n,) or, without what joined since, less; work space afterwards. Where
+        something left the state since, nothing is done.
         """
         engine = self._engine
         P = engine.covariance

@@ -20,9 +20,8 @@ LEAST_KNOWN = 3  # instants with a truth: one always fits, and two but for their
 class TrackEvaluation(NamedTuple):
     """Errors of a track; None where there is no truth.
 
-    Attributes:
-        nees: of the poses as they are, without alignment; positions alone if the truth has no headings; None where the
-            first pose was not the truth's of that time.
+    ``nees``: of the poses as they are, without alignment; positions alone if the truth has no headings; None where the
+    first pose was not the truth's of that time.
     """
 
     alignment: RigidMotion

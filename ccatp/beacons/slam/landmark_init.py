@@ -68,10 +68,8 @@ class PendingLandmark:
 
     The vehicle's place at each of them is kept in the state as a clone (Mourikis and Roumeliotis 2007), so that what
     they say of the beacon comes with the right correlations, however long they wait. With H the derivatives by clones
-    and calibration, S = H P H^T + R, each candidate minimises e^T S^-1 e.
-
-    Attributes:
-        candidates: where it may be, best first; two as long as a mirror image is possible.
+    and calibration, S = H P H^T + R, each candidate minimises e^T S^-1 e. ``candidates``: where it may be, best first;
+    two as long as a mirror image is possible.
     """
 
     beacon: BeaconId
@@ -85,9 +83,8 @@ class PendingLandmark:
     ) -> bool:
         """Keep a reading, if the vehicle has moved since the last one that was kept.
 
-        Args:
-            place: x_m, y_m of the vehicle then, shape (2,).
-            by: columns (k,) of the state that it depends on, and its derivatives, shape (2, k).
+        ``place``: x_m, y_m of the vehicle then, shape (2,). ``by``: columns (k,) of the state that it depends on, and
+        its derivatives, shape (2, k).
         """
         x, y = place.tolist()
         if not self.records:
@@ -236,10 +233,8 @@ def stacked_rows(
 def _weighed(e: FloatArray, S: FloatArray, R: FloatArray, step: int) -> tuple[FloatArray, float]:
     """Variances of the readings at a step of the iteration, and what those that are left out cost.
 
-    Args:
-        e: residuals, shape (m,).
-        S: their variances by all that is unknown, shape (m,).
-        R: those of the readings, shape (m,).
+    ``e``: residuals, shape (m,). ``S``: their variances by all that is unknown, shape (m,). ``R``: those of the
+    readings, shape (m,).
     """
     if step < PLAIN:
         return R, 0.0

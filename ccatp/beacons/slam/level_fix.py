@@ -87,8 +87,7 @@ class LevelLocator:
     def fix(self, levels_dbm: Mapping[str, float]) -> LevelFix:
         """The position of a receiver of these levels; beacons without a level are left out.
 
-        Raises:
-            ValueError: there is no level.
+        Raises ValueError: there is no level.
         """
         if not any(name in levels_dbm for name in self.names):
             raise ValueError(f"none of the beacons {', '.join(self.names)} was heard; a fix needs one at least")
@@ -119,9 +118,8 @@ class LevelLocator:
 def likeliest_names(locator: LevelLocator, places: Sequence[HeardPlace]) -> tuple[dict[str, str], float]:
     """Which names the beacons of a data set with known places should have.
 
-    Returns:
-        The likeliest permutation, from the name in the data to the beacon's, and how much its log-likelihood exceeds
-        that of the names as they are.
+    Returns the likeliest permutation, from the name in the data to the beacon's, and how much its log-likelihood
+    exceeds that of the names as they are.
     """
     names = locator.names
     if len(names) > _MOST_PERMUTED:
@@ -140,8 +138,7 @@ def fingerprint_fits(
 ) -> dict[str, PathLossFit]:
     """Path loss of each beacon from its levels at known places, but for one of them.
 
-    Raises:
-        PathLossError: no path loss follows from them.
+    Raises PathLossError: no path loss follows from them.
     """
     used = [heard for index, heard in enumerate(places) if index != left_out]
     found = {}

@@ -194,8 +194,7 @@ class SlippingVehicle:
     def step(self, states: FloatArray, odometry: Odometry) -> MotionStep:
         """The states, shape (v,), after the interval.
 
-        Raises:
-            TypeError: the odometry is of the other kind of vehicle.
+        Raises TypeError: the odometry is of the other kind of vehicle.
         """
         T, v, reading = self._read(odometry)
         values: list[float] = states.tolist()

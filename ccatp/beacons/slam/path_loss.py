@@ -155,11 +155,8 @@ def fit_path_loss(pairs: Iterable[LevelPair]) -> PathLossFit:
     """Least squares line of level over -10 log10(distance).
 
     Every place counts once, with the mean of its readings: what is off at a place is off for all of them, so a hundred
-    readings at one place do not count as a hundred.
-
-    Raises:
-        PathLossError: fewer than three distances, one that is not positive, one that is not finite, or levels that
-            do not fall with distance.
+    readings at one place do not count as a hundred. Raises PathLossError: fewer than three distances, one that is not
+    positive, one that is not finite, or levels that do not fall with distance.
     """
     by_place: dict[tuple[float, tuple[float, float] | None], list[float]] = {}
     for pair in pairs:

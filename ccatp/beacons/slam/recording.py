@@ -15,9 +15,8 @@ BoolArray = npt.NDArray[np.bool_]
 class Steps(NamedTuple):
     """Dead reckoning, one step a row: step k carries the vehicle from times_s[k] to times_s[k + 1].
 
-    Args:
-        guess_m2: variance of the end of a step, along and across, where the odometry was silent and the way is guessed,
-            m^2, shape (n,); 0.0: none is.
+    ``guess_m2``: variance of the end of a step, along and across, where the odometry was silent and the way is guessed,
+    m^2, shape (n,); 0.0: none is.
     """
 
     times_s: FloatArray  # where steps begin and end, s, shape (n + 1,), rising
@@ -57,10 +56,9 @@ class ReferencePath(NamedTuple):
 class RecordedRun:
     """One vehicle's run among beacons.
 
-    Attributes:
-        beacon_truth_m: surveyed x, y by name, world frame, m; beacons that were not surveyed are missing.
-        first_pose: x_m, y_m, heading_rad at the first odometry time, world frame: the one thing that an estimator may
-            take from the truth; the origin if there is no truth.
+    ``beacon_truth_m``: surveyed x, y by name, world frame, m; beacons that were not surveyed are missing.
+    ``first_pose``: x_m, y_m, heading_rad at the first odometry time, world frame: the one thing that an estimator may
+    take from the truth; the origin if there is no truth.
     """
 
     name: str
@@ -110,12 +108,10 @@ class Calibrated(NamedTuple):
 class EstimatedPath(NamedTuple):
     """An estimate of a run.
 
-    Attributes:
-        nis: normalised innovations squared of the readings that were used, shape (u,); none from a smoother.
-        update_s: wall time of each reading, the prediction to it included, s; of a smoother its whole time shared among
-            the readings.
-        scalar_s: wall time of each scalar of a reading of a beacon on the map, s, without prediction; none from a
-            smoother.
+    ``nis``: normalised innovations squared of the readings that were used, shape (u,); none from a smoother.
+    ``update_s``: wall time of each reading, the prediction to it included, s; of a smoother its whole time shared among
+    the readings. ``scalar_s``: wall time of each scalar of a reading of a beacon on the map, s, without prediction;
+    none from a smoother.
     """
 
     times_s: FloatArray  # shape (n,), rising
@@ -150,8 +146,7 @@ class RangeReading:
 class RssiReading:
     """A received signal strength, with the direction where it was strongest if an antenna turns.
 
-    Attributes:
-        bearing_rad: from the vehicle's heading, counter-clockwise; None without a directional antenna.
+    ``bearing_rad``: from the vehicle's heading, counter-clockwise; None without a directional antenna.
     """
 
     time_s: float

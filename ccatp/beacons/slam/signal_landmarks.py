@@ -189,8 +189,7 @@ class SignalLandmarkInitializer:
     def linearisation(self, beacon: BeaconId) -> FloatArray:
         """The whole state, the poses that are kept where the guesses have them, and a radio of the state likewise.
 
-        Raises:
-            BlockError: the radio is not in the state.
+        Raises BlockError: the radio is not in the state.
         """
         x = self._engine.mean.copy()
         for i, key in enumerate(self._keys):
@@ -374,12 +373,9 @@ class ShadowingMap:
     """Kriging of a Gaussian field with covariance sigma^2 exp(-d / L) (Gudmundson 1991) from its values at grid points.
 
     The field at a place is k^T C^-1 f + rest, with f the values at the points, C their covariance, k the covariances
-    between place and points; the rest has the variance sigma^2 - k^T C^-1 k and counts as white. The states are
-    w = R^-1 f with C = R R^T, so that a prior of them is the identity, and the row of a place is k^T R^-T.
-
-    Args:
-        spacing_m: between grid points; the outermost lie on the walls.
-        sigma_db: sigma.
+    between place and points; the rest has the variance sigma^2 - k^T C^-1 k and counts as white. The states are w =
+    R^-1 f with C = R R^T, so that a prior of them is the identity, and the row of a place is k^T R^-T. ``spacing_m``:
+    between grid points; the outermost lie on the walls. ``sigma_db``: sigma.
     """
 
     def __init__(self, size_m: tuple[float, float], spacing_m: float, sigma_db: float, length_m: float) -> None:

@@ -67,8 +67,7 @@ class ReflectorScan:
     def results(self, packets: Iterable[tuple[str, float, float]]) -> list[ScanResult]:
         """One result for each radio, in the order of their first packets.
 
-        Args:
-            packets: radio, direction of the reflector left of the heading (rad), level (dBm).
+        ``packets``: radio, direction of the reflector left of the heading (rad), level (dBm).
         """
         by_beacon: dict[str, list[tuple[float, float]]] = {}
         for beacon, direction_rad, level_dbm in packets:
@@ -219,8 +218,7 @@ class SignalSlam:
     def joint(self, beacons: Sequence[BeaconId]) -> tuple[FloatArray, FloatArray]:
         """Pose and the places of some radios on the map together: mean (3 + 2 k,) and covariance.
 
-        Raises:
-            BlockError: one is not on the map.
+        Raises BlockError: one is not on the map.
         """
         starts = [self.engine.block(beacon).start for beacon in beacons]
         columns = columns_of(range(POSE), *(range(start, start + PLACE) for start in starts))

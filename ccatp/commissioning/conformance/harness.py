@@ -214,10 +214,8 @@ def shorten(line: bytes, most: int = 60) -> str:
 class RawConnection:
     """One connection; ``lines`` were received and not yet taken, without their LF.
 
-    ``timeout_s`` is the longest wait for the connection, and for the server to take what is sent.
-
-    Raises:
-        OSError: no connection.
+    ``timeout_s`` is the longest wait for the connection, and for the server to take what is sent. Raises OSError: no
+    connection.
     """
 
     def __init__(self, address: tuple[str, int], timeout_s: float) -> None:
@@ -286,11 +284,7 @@ class CheckContext:
         return self.last_seq
 
     def connect(self) -> RawConnection:
-        """A new connection.
-
-        Raises:
-            OSError: it is not accepted.
-        """
+        """A new connection. Raises OSError: it is not accepted."""
         self._connections.append(RawConnection(self._address, self.timeout_s))
         return self._connections[-1]
 
@@ -378,10 +372,9 @@ class CheckContext:
 class ControllerAndMonitor:
     """Two sessions that answer every frame.
 
-    Attributes:
-        rates: (right, left) set points of the drive that answers each frame, rad/s; ``None`` sends none.
-        allowed: (forward, reverse, turn) of the permit that answers each frame; ``None`` sends none.
-        messages: sensors messages as they came, of the controller and of the monitor.
+    ``rates``: (right, left) set points of the drive that answers each frame, rad/s; ``None`` sends none. ``allowed``:
+    (forward, reverse, turn) of the permit that answers each frame; ``None`` sends none. ``messages``: sensors messages
+    as they came, of the controller and of the monitor.
     """
 
     def __init__(self, context: CheckContext) -> None:

@@ -62,9 +62,7 @@ class KeyNeeded(CcatpError):
 class Conformance:
     """The checks of one server; ``facts`` of its hello are ``None`` if it lacks what the checks need.
 
-    Raises:
-        NoRobot: nothing at the address says hello.
-        KeyNeeded: it asks for a key.
+    Raises NoRobot: nothing at the address says hello. Raises KeyNeeded: it asks for a key.
     """
 
     def __init__(self, address: tuple[str, int], key: bytes | None, timeout_s: float) -> None:
@@ -86,8 +84,7 @@ class Conformance:
     ) -> list[Result]:
         """Run the checks in their order, or only those named; ``report`` is called with each result.
 
-        Raises:
-            NoRobot: another program holds the robot.
+        Raises NoRobot: another program holds the robot.
         """
         results = []
         if self.facts is not None:
