@@ -174,7 +174,7 @@ class BeaconRunner(MissionRunner):
         if t_s >= self._map_due_s:
             self._map_due_s = t_s + self._cfg.mission.map_period_s
             self._publish_map(seq, t_s)
-        number = telemetry.number_of(seq)
+        number = seq + telemetry.frames_before
         telemetry.add_frame(seq, t_s, frame.raw, track_row(number, t_s, mission.navigator))
         for at in range(self._published_arrivals, len(mission.arrivals)):
             reached = mission.arrivals[at]

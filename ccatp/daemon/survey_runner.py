@@ -348,7 +348,7 @@ class SurveyRunner(MissionRunner):
             self.telemetry.send("rest", Rest(seq=seq, t_s=motion.t_s))
         if command.arrived is not None:
             error_m = mission.survey.follower.distance_m(mission.state.stop, motion.pose)
-            number, point = self.telemetry.number_of(seq), (*command.arrived,)
+            number, point = seq + self.telemetry.frames_before, (*command.arrived,)
             arrival = ArrivalMessage(seq=number, t_s=motion.t_s, point=point, error_mm=1e3 * error_m)
             self.telemetry.send("arrival", arrival)
             self._store.record_arrival(command.arrived, motion.t_s, error_m)
@@ -368,7 +368,7 @@ class SurveyRunner(MissionRunner):
             self._checkpoint.write_if_due(seq, t_s, self._clock.elapsed_s)
             deck = localizer.deck_pose
             self.publish_estimate(frame, (deck.x_m, deck.y_m, deck.heading_rad), sigma_m, *self._sent_commands)
-        row = telemetry.number_of(seq), t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, sigma_m
+        row = seq + telemetry.frames_before, t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, sigma_m
         telemetry.add_frame(seq, t_s, frame.raw, row)
         if self.mission.state.mode is not self._state:
             self.publish_state()

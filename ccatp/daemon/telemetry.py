@@ -26,6 +26,7 @@ class Telemetry:
     Attributes:
         send: publishes one message of a topic.
         seq, t_s: the newest frame.
+        frames_before: the recorded number of a frame is its ``seq`` and this.
         newest_line: of the newest frame with an estimate.
     """
 
@@ -41,18 +42,14 @@ class Telemetry:
         self._rows: list[tuple[Any, ...]] = []
         self._tick_us: list[float] = []
         self._flushed_wall_s = time.monotonic()
-        self._frames_before = 0
+        self.frames_before = 0
         self.newest_line = msgspec.Raw(b"null")
         self.seq = -1
         self.t_s = 0.0
 
     def continue_numbering(self) -> None:
         """The robot's frames restarted: recorded numbers go on, as far as the number of frames is known."""
-        self._frames_before += max(self.seq, 0)
-
-    def number_of(self, seq: int) -> int:
-        """The recorded number of frame ``seq``."""
-        return seq + self._frames_before
+        self.frames_before += max(self.seq, 0)
 
     def add_frame(self, seq: int, t_s: float, raw: bytes, row: tuple[Any, ...]) -> None:
         """Keep the line of frame ``seq`` and its row of the track, which has the recorded number."""

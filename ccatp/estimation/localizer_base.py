@@ -32,10 +32,13 @@ class SampleSource:
         self.newest_s = -inf
         self.used: deque[Sequence[float]] = deque()
 
-    def use(self, times_s: Sequence[float], oldest_s: float) -> None:
-        """Samples of these times, newer than any before and increasing, are used; older ones are forgotten."""
-        self.newest_s, self.backward_run = times_s[-1], 0
-        used = self.used
+
+def use_samples(times_s: Sequence[float], oldest_s: float, *sources: SampleSource) -> None:
+    """Samples of these times, newer than any before and increasing, are used; older ones are forgotten."""
+    newest_s = times_s[-1]
+    for source in sources:
+        source.newest_s, source.backward_run = newest_s, 0
+        used = source.used
         used.append(times_s)
         while used[0][-1] < oldest_s:
             used.popleft()
@@ -78,8 +81,7 @@ class SampleValidator:
             # No less than each rate; not true of what is not a number.
             and hypot(*right) <= largest >= hypot(*left)
         ):
-            self._right.use(times, oldest_s)
-            self._left.use(times, oldest_s)
+            use_samples(times, oldest_s, self._right, self._left)
             return (times, right), (times, left)
         return self._judged_wheels(frame_s, encoders)
 
@@ -111,7 +113,7 @@ class SampleValidator:
                 and sample_s <= frame_s + _ROUNDING_S
                 and hypot(ax, wz) < _READABLE
             ):
-                source.use((sample_s,), oldest_s)
+                use_samples((sample_s,), oldest_s, source)
                 return samples
         kept: list[ImuSample] = []
         for sample in samples:
@@ -129,7 +131,7 @@ class SampleValidator:
         elif sample_s < oldest_s:
             reason = "late"
         elif sample_s > source.newest_s:
-            source.use((sample_s,), oldest_s)
+            use_samples((sample_s,), oldest_s, source)
             return True
         elif any(sample_s in times_s for times_s in source.used):
             reason = "duplicate"
