@@ -22,7 +22,7 @@ from ccatp.errors import CcatpError, ConfigError, ExitStatus
 from ccatp.links.channels import BadRequest, OperatorCommand, format_error, format_ok, parse_operator
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.rpc import Router
-from ccatp.links.topics import MissionStatus, is_estimate_due
+from ccatp.links.topics import ESTIMATE_FRAMES, MissionStatus
 from ccatp.safety.robot_clock import MissionClock
 from ccatp.survey.state import Abort, Interrupted, Pause, Resume, StopHere
 
@@ -288,7 +288,7 @@ class MainLoop(RobotLoop):
             is_first = self._is_new_session
             is_going_on = is_first and clock.has_begun
             t_s, dt_s = clock.take(seq, sensors.t, self.frame_period_s)
-            frame = TimedFrame(sensors, raw, t_s, dt_s, is_first, is_first or is_estimate_due(seq))
+            frame = TimedFrame(sensors, raw, t_s, dt_s, is_first, is_first or seq % ESTIMATE_FRAMES == 0)
             if is_first:
                 self._begin_drives(dt_s if is_going_on else 0.0)
             self.heartbeat.frame_s = time.monotonic()

@@ -8,6 +8,7 @@ mission is a subclass of ``MissionRunner`` and a row in ``main_loop.open_runner`
 
 import asyncio
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 from ccatp.core import Verdict
@@ -59,10 +60,15 @@ STILL = DriveCommand(0.0, 0.0)
 
 
 class MissionRunner(ABC):
-    """A mission in the main-loop process."""
+    """A mission in the main-loop process. ``on_drive``: called with number and set points of each drive sent."""
 
-    def __init__(self, mission: "Mission | BeaconMission", telemetry: Telemetry) -> None:
-        self.mission, self.telemetry = mission, telemetry
+    def __init__(
+        self,
+        mission: "Mission | BeaconMission",
+        telemetry: Telemetry,
+        on_drive: Callable[[int, float, float], None] = lambda *_: None,
+    ) -> None:
+        self.mission, self.telemetry, self.on_drive = mission, telemetry, on_drive
 
     @property
     def is_busy(self) -> bool:
@@ -106,9 +112,6 @@ class MissionRunner(ABC):
 
     def begin_drives(self) -> None:
         """The first frame of a session is here, and is answered next: send commands that are due once."""
-
-    def on_drive(self, seq: int, right_rad_s: float, left_rad_s: float) -> None:
-        """Drive ``seq`` is sent."""
 
     @abstractmethod
     def on_tracking_gap(self) -> None:

@@ -95,13 +95,13 @@ class SurveyRunner(MissionRunner):
     def __init__(
         self, cfg: Config, args: ProcessArgs, loop: "MainLoop", parts: SurveyParts, store: MissionStore
     ) -> None:
-        super().__init__(parts.mission, Telemetry(loop.publisher, loop.log, "track", TrackMessage))
+        self._sent = SentDrives(cfg.robot, 1.0 / cfg.sim.robot.frame_hz)
+        super().__init__(parts.mission, Telemetry(loop.publisher, loop.log, "track", TrackMessage), self._sent.add)
         self._cfg, self._loop, self._clock, self._parts, self._store = cfg, loop, loop.clock, parts, store
         self._mirror, self._localizer, self._gate = parts.mirror, parts.localizer, parts.gate
         self._clock.before_s = parts.elapsed_s
         self._gate_log = GateLog(self._gate, self.telemetry.notify_operator)
         self._fan_gate, self._has_full_fans, self._fans_seq = FanGate(0.0), False, 0
-        self._sent = SentDrives(cfg.robot, 1.0 / cfg.sim.robot.frame_hz)
         self._sent_commands: tuple[tuple[float, float, float, float] | None, int] = None, -1
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
         self._fix_service = FixService(
@@ -214,9 +214,6 @@ class SurveyRunner(MissionRunner):
         else:
             self.telemetry.notify_operator("error", refusal)
             self.mission.handle(Fault(refusal))
-
-    def on_drive(self, seq: int, right_rad_s: float, left_rad_s: float) -> None:
-        self._sent.add(seq, right_rad_s, left_rad_s)
 
     def on_tracking_gap(self) -> None:
         self.mission.handle(TrackingGap())

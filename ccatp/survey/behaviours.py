@@ -144,7 +144,7 @@ class ReturnHome(msgspec.Struct, frozen=True):
         if home.is_docking and home.leg is not None:
             return home._dock(follower, home.leg, motion)
         leg, twist = follower.follow(home.leg or Leg(stop), motion, is_slow=is_slow)
-        if not leg.is_done:
+        if leg.motion is not None and leg.motion.phase is not LegPhase.DONE:
             return replace(home, leg=leg), twist
         if stop.kind is not StopKind.BASE:
             return replace(home, stop_index=home.stop_index + 1, leg=None), STILL

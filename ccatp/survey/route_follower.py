@@ -144,8 +144,9 @@ class StateEstimate(msgspec.Struct, frozen=True):
 class Leg(msgspec.Struct, frozen=True):
     """The leg to a stop, as far as it is driven.
 
-    ``motion`` is None before the first frame of the leg; ``aim``: the leg is a correction, as long as the robot stays
-    on that panel; ``target``: the stop in the frame of a panel, m.
+    ``motion`` is None before the first frame of the leg; after ``deadline_s`` it takes far longer than it should;
+    ``aim``: the leg is a correction, as long as the robot stays on that panel; ``target``: the stop in the frame of a
+    panel, m.
     """
 
     stop: Stop
@@ -153,15 +154,6 @@ class Leg(msgspec.Struct, frozen=True):
     deadline_s: float = 0.0
     aim: tuple[PanelId, LegAim] | None = None
     target: tuple[PanelId, tuple[float, float]] | None = None
-
-    @property
-    def is_done(self) -> bool:
-        """The stop is reached."""
-        return self.motion is not None and self.motion.phase is DONE
-
-    def is_overdue(self, t_s: float) -> bool:
-        """It takes far longer than it should."""
-        return self.motion is not None and t_s > self.deadline_s
 
 
 class LegFollower:

@@ -130,26 +130,22 @@ class Survey(HoldRules[SurveyState]):
             is_at_edge = verdict is not None and verdict.code is EventCode.NEAR_EDGE and s.fix is FixNeed.NONE
             until_s = motion.t_s + _NOTICED_S if is_at_edge else s.stands_until_s
             s = replace(s, is_found=False, stands_until_s=until_s)
-        s, command = self._behave(self.react(s, motion, verdict), motion, verdict)
+        s = self.react(s, motion, verdict)
+        mode, command = s.mode, HOLD_POSITION
+        if motion.t_s >= s.stands_until_s:
+            if mode is DRIVING or mode is TURNING:
+                s, command = self._travel(s, motion)
+            elif mode is MEASURING:
+                s, command = self._measure(s, motion)
+            elif mode is SETTLING:
+                s, command = self._settle(s, motion)
+            elif mode is RETURNING:
+                s, command = self._return(s, motion)
+            elif mode is BACKING_OFF and verdict is not None:
+                s, command = self._back_off(s, motion, verdict)
         if s.inflates_covariance:
             s, command = replace(s, inflates_covariance=False), replace(command, inflates_covariance=True)
         return s, command
-
-    def _behave(self, s: SurveyState, motion: StateEstimate, verdict: Verdict | None) -> Step:
-        mode = s.mode
-        if motion.t_s < s.stands_until_s:
-            return s, HOLD_POSITION
-        if mode is DRIVING or mode is TURNING:
-            return self._travel(s, motion)
-        if mode is MEASURING:
-            return self._measure(s, motion)
-        if mode is SETTLING:
-            return self._settle(s, motion)
-        if mode is RETURNING:
-            return self._return(s, motion)
-        if mode is BACKING_OFF and verdict is not None:
-            return self._back_off(s, motion, verdict)
-        return s, HOLD_POSITION
 
     # -- transitions --------------------------------------------------------------------------------------------------
 
@@ -229,12 +225,11 @@ class Survey(HoldRules[SurveyState]):
         """One frame of the leg to a stop; no command where it is reached."""
         leg = s.behaviour if isinstance(s.behaviour, Leg) else Leg(stop)
         leg, twist = self.follower.follow(leg, motion, is_slow=s.is_slow)
-        if leg.is_overdue(motion.t_s):
+        if motion.t_s > leg.deadline_s:
             return self._overdue(s, stop), HOLD_POSITION
-        if leg.is_done:
+        if leg.motion is None or leg.motion.phase is LegPhase.DONE:
             return s, None
-        is_driving = leg.motion is not None and leg.motion.phase is LegPhase.DRIVE
-        mode = s.mode
+        is_driving, mode = leg.motion.phase is LegPhase.DRIVE, s.mode
         if is_driving is not (mode is DRIVING):
             mode = next_state(mode, MissionEvent.TURNED if is_driving else MissionEvent.REALIGN)
         return replace(s, behaviour=leg, mode=mode), MissionCommand(twist)
@@ -359,7 +354,7 @@ class Survey(HoldRules[SurveyState]):
             s = self.apply(replace(s, outcome=SurveyOutcome.AT_BASE), MissionEvent.FINISHED)
             return s, MissionCommand(STILL, at_rest=True)
         home, twist = home.update(self.follower, self.cfg.control, motion, is_slow=s.is_slow)
-        if home.leg is not None and home.leg.is_overdue(motion.t_s):
+        if home.leg is not None and motion.t_s > home.leg.deadline_s:
             return self._overdue(s, home.leg.stop), HOLD_POSITION
         return replace(s, behaviour=home), MissionCommand(twist)
 
