@@ -9,12 +9,18 @@ import os
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import cos, inf, sin
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from ccatp.core import DeckPose, EventCode, Verdict
+from ccatp.danger import DangerMonitor
+from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.sim.fault_plan import FaultPlan, Injected
+from ccatp.sim.robot import Robot
 from ccatp.studies.faults_study import FaultySilRun, random_plan
 from ccatp.studies.sil_run import SilResult
 from tests.faults import edge_sweep
@@ -270,3 +276,59 @@ def test_no_retreat_falls_at_a_corner(measured: Measured) -> None:
         edges += danger["true_edges"]
         assert result.outcome == "complete" or result.cause  # held, and it is said why
     assert edges >= 4
+
+
+# -- the verdict of the frame before -----------------------------------------------------------------------------------
+
+
+def furthest_over_the_rim_m(name: str, start: DeckPose, v_m_s: float, seed: int, *, is_previous: bool) -> float:
+    """How far a sensor comes beyond the rim where main goes by the verdict on this frame, or on the one before."""
+    cfg, mirror = edge_sweep.world(name)
+    robot = Robot(cfg, mirror, np.random.default_rng(seed))
+    robot.join("controller")
+    robot.join("monitor")
+    plant, rate = robot.world.plant, v_m_s / cfg.robot.wheel_radius_m
+    plant.place(start.x_m, start.y_m, start.heading_rad)
+    robot._sensors.edges.place(plant)
+    robot.command_fans(1, *cfg.robot.fan_duty)
+    monitor = DangerMonitor(mirror, cfg.robot, cfg.danger, cfg.health)
+    estimate: EstimateMessage | None = None
+    before: Verdict | None = None
+    furthest_m, frames_left = -inf, 700
+    while frames_left:
+        frames_left -= 1
+        robot.advance()
+        frame = robot.delivered
+        if frame is None:
+            continue
+        verdict = monitor.step(frame, estimate)
+        in_force, before = (before if is_previous else verdict), verdict
+        drive = (rate, rate) if in_force is not None and in_force.code is EventCode.NORMAL else (0.0, 0.0)
+        robot.permit(frame.seq, verdict.forward, verdict.reverse, verdict.turn)
+        robot.drive(frame.seq, *drive)
+        pose = plant.pose
+        if is_estimate_due(frame.seq):
+            estimate = EstimateMessage(
+                seq=frame.seq, t_s=frame.t, x_m=pose.x_m, y_m=pose.y_m, heading_rad=pose.heading_rad, sigma_m=1e-3,
+                state="driving", commanded=(0.0, rate, 0.0, rate), drive_seq=frame.seq,
+            )  # fmt: skip
+        c, s = cos(pose.heading_rad), sin(pose.heading_rad)
+        corners = [(pose.x_m + a * c - b * s, pose.y_m + a * s + b * c) for a, b in cfg.robot.edge_sensors_m]
+        furthest_m = max(furthest_m, *(-mirror.rim.signed_distance_m(*corner) for corner in corners))
+        if verdict.code is EventCode.NEAR_EDGE:
+            frames_left = min(frames_left, 60)  # it stands within half a second
+    return furthest_m
+
+
+@pytest.mark.parametrize("v_m_s", edge_sweep.SPEEDS_M_S[1:])
+def test_a_decision_by_the_verdict_on_the_frame_before_costs_nothing_at_the_rim(v_m_s: float) -> None:
+    """The permit on the present frame holds the wheels whatever main has decided."""
+    for seed, name in enumerate(edge_sweep.MIRRORS):
+        place = edge_sweep.places(name)[7]
+        start = edge_sweep.start_before(name, place, place.normal_rad + 0.6 * (seed % 2), 1.0)
+        assert start is not None
+        now_m, before_m = (
+            furthest_over_the_rim_m(name, start, v_m_s, seed, is_previous=is_previous) for is_previous in (False, True)
+        )
+        assert 0.0 < before_m <= edge_sweep.OVERRUN_M
+        assert before_m <= now_m + 1e-4
