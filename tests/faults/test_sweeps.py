@@ -324,9 +324,11 @@ def furthest_over_the_rim_m(name: str, start: DeckPose, v_m_s: float, seed: int,
 def test_a_decision_by_the_verdict_on_the_frame_before_costs_nothing_at_the_rim(v_m_s: float) -> None:
     """The permit on the present frame holds the wheels whatever main has decided."""
     for seed, name in enumerate(edge_sweep.MIRRORS):
-        place = edge_sweep.places(name)[7]
-        start = edge_sweep.start_before(name, place, place.normal_rad + 0.6 * (seed % 2), 1.0)
-        assert start is not None
+        starts = (
+            edge_sweep.start_before(name, place, place.normal_rad + 0.6 * (seed % 2), 1.0)
+            for place in edge_sweep.places(name)[7::40]
+        )
+        start = next(found for found in starts if found is not None)  # it cannot stand everywhere
         now_m, before_m = (
             furthest_over_the_rim_m(name, start, v_m_s, seed, is_previous=is_previous) for is_previous in (False, True)
         )
