@@ -16,7 +16,7 @@ from ccatp.beacons.cricket.map_fit import (
 )
 from ccatp.beacons.cricket.map_start import FEW, map_starts
 from ccatp.beacons.cricket.range_network import RangeNetwork
-from ccatp.beacons.cricket.unfolding import Agreement, agreement_of, repaired
+from ccatp.beacons.cricket.unfolding import Agreement, agreement_of
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import RigidMotion, rigid_modes
 
@@ -62,10 +62,9 @@ def map_motes(
     """The map that fits all ranges best.
 
     A fit goes down to the nearest minimum, and most of them are folded maps. So it begins with the map unfolded from
-    more dimensions (``unfolded``) or stitched from patches (``stitched``), and its mirror image where bodies
-    distinguish them; then places that contradict their ranges are mapped again (``repaired``), and motes that could
-    stand on the other side are tried there (``unfold``). ``start_m``: one more place to begin, shape (n, d), nan where
-    unknown. ``finds_sigma``: the sigmas are right up to a factor, which follows from the residuals (``scaled``).
+    more dimensions (``unfolded``), and its mirror image where bodies distinguish them; then motes that could stand on
+    the other side are tried there (``unfold``). ``start_m``: one more place to begin, shape (n, d), nan where unknown.
+    ``finds_sigma``: the sigmas are right up to a factor, which follows from the residuals (``scaled``).
     """
     model = MapModel(network, with_offset=with_offset, with_scale=with_scale)
     if finds_sigma:
@@ -104,7 +103,6 @@ def _unfolded_map(
     network = model.network
     best = min(fits, key=lambda fit: fit.cost)
     steps = sum(fit.iterations for fit in fits)
-    best = repaired(model, best, settings)
     if not _is_sure(model, best) and np.isfinite(settings.robust_scale):
         best, is_settled = searched(model, best, settings)
         if not (is_settled and _is_sound(model, best)):

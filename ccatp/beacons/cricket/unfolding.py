@@ -1,35 +1,26 @@
-"""A first map of a few dozen motes, unfolded in more dimensions; whether a map and its ranges agree; local repairs."""
+"""A first map of a few dozen motes, unfolded in more dimensions; whether a map and its ranges agree."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import shortest_path
+from scipy.sparse.linalg import splu
 
-from ccatp.beacons.cricket.map_fit import MapFit, MapFitSettings, MapModel, fit_map
-from ccatp.beacons.cricket.range_network import IndexArray, PairMeans, RangeNetwork, components, every_pair
+from ccatp.beacons.cricket.map_fit import MapFit
+from ccatp.beacons.cricket.range_network import IndexArray
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import best_motion
 
 _SPARE = 2  # dimensions more than the map has, in which what is folded can turn over
-_SQUEEZES = tuple(
-    np.geomspace(1e-3, 1e3, 7).tolist()
-)  # weight of the spare dimensions, in units of the mean weight of a range
+# Weights of the spare dimensions one after the other, in units of the median weight of a distance.
+_SQUEEZES = tuple(np.geomspace(1e-3, 1e3, 7).tolist())
 _STEPS = 25  # of each squeeze; the last fit of all is left to others
 
 
 def unfolded(
-    count: int,
-    pairs: IndexArray,
-    distances_m: FloatArray,
-    sigmas_m: FloatArray,
-    dimension: int,
-    *,
-    squeezes: Sequence[float] = _SQUEEZES,
+    count: int, pairs: IndexArray, distances_m: FloatArray, sigmas_m: FloatArray, dimension: int,
     rng: np.random.Generator | None = None,
-) -> FloatArray:
+) -> FloatArray:  # fmt: skip
     """Places of n points from some of their distances, shape (n, d); as ranges do, it leaves frame and mirror open.
 
     The missing distances are taken as the shortest way along known ones (Shang et al., MDS-MAP, 2003), classical
@@ -37,11 +28,7 @@ def unfolded(
     go on from there, while a weight on the spare dimensions grows until the points lie in d. A map that is folded over
     in d dimensions often has a way down through the spare ones.
 
-    Args:
-        pairs: known distances, shape (e, 2), connected.
-        distances_m: shape (e,).
-        sigmas_m: shape (e,).
-        squeezes: weights of the spare dimensions one after the other, in units of the median weight of a distance.
+    ``pairs`` whose distances (e,) and sigmas (e,) are known have the shape (e, 2), connected.
     """
     wide = dimension + _SPARE
     if rng is None:
@@ -51,7 +38,7 @@ def unfolded(
     weights = 1.0 / sigmas_m**2
     # Weights that differ by orders of magnitude would freeze the strong ones before the weak ones have turned.
     weights = np.minimum(weights / np.median(weights), 25.0)
-    for squeeze in squeezes:
+    for squeeze in _SQUEEZES:
         points = _relaxed(points, pairs, distances_m, weights, squeeze, dimension)
         centred = points - points.mean(axis=0)
         points = np.asarray(centred @ np.linalg.svd(centred, full_matrices=False)[2].T)
@@ -85,12 +72,11 @@ def _relaxed(
     It is sum w (d - |p_i - p_j|)^2 + squeeze |spare coordinates|^2.
     """
     count, wide = points.shape
-    size = count * wide
-    i, j = pairs.T
+    size, (i, j) = count * wide, pairs.T
     penalty = np.where(np.arange(wide) < dimension, 0.0, squeeze)
     frame = np.arange(wide)
     at = np.concatenate([i[:, None] * wide + frame, j[:, None] * wide + frame], axis=1)
-    cells = (at[:, :, None] * size + at[:, None, :]).ravel()
+    indptr = np.arange(len(pairs) + 1) * 2 * wide
 
     def look(places: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Cost, errors of the distances (e,), and unit vectors (e, wide)."""
@@ -103,14 +89,11 @@ def _relaxed(
     cost, errors, units = look(points)
     damping = 1e-2
     for _ in range(_STEPS):
-        rows = np.concatenate([units, -units], axis=1)
-        weighted = weights[:, None] * rows
-        blocks = weighted[:, :, None] * rows[:, None, :]
-        normal = np.asarray(np.bincount(cells, blocks.ravel(), size**2), dtype=np.float64).reshape(size, size)
-        pull = np.bincount(at.ravel(), (errors[:, None] * weighted).ravel(), size)
-        normal[np.diag_indices_from(normal)] += np.tile(penalty, count) + damping
-        gradient = pull - (points * penalty).ravel()
-        step = cho_solve(cho_factor(normal, check_finite=False), gradient, check_finite=False)
+        J = csr_array((np.concatenate([units, -units], axis=1).ravel(), at.ravel(), indptr), shape=(len(pairs), size))
+        heavy = diags_array(weights) @ J
+        normal = (J.T @ heavy + diags_array(np.tile(penalty, count) + damping)).tocsc()
+        gradient = heavy.T @ errors - (points * penalty).ravel()
+        step = splu(normal, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(gradient)
         trial = points + step.reshape(count, wide)
         seen = look(trial)
         if seen[0] < cost:
@@ -161,82 +144,3 @@ def agreement_of(fit: MapFit, sigmas_m: FloatArray, dof: int) -> Agreement:
     is_out = fit.weights < 0.5
     cost = float(((fit.residuals_m / sigmas_m)[~is_out] ** 2).sum())
     return Agreement(tuple(np.flatnonzero(is_out).tolist()), cost, dof)
-
-
-_SUSPECT = 4.0  # residual in sigmas that makes both ends of a range suspects
-_LARGEST = 60  # motes of one place that is mapped again
-_ROUNDS = 3
-
-
-def repaired(model: MapModel, fit: MapFit, settings: MapFitSettings) -> MapFit:
-    """A map whose contradictions were looked at one place at a time; bodies and known motes stay as they are.
-
-    A few motes that are folded over together are a minimum of their own. Where ranges disagree with the map, the motes
-    at their ends and all their partners are taken out and unfolded afresh between the motes that hold them.
-    """
-    network = model.network
-    if network.bodies:
-        return fit
-    for _ in range(_ROUNDS):
-        better = False
-        for motes in _contradicted(network, fit):
-            places = _mapped_anew(network, fit, motes, settings)
-            if places is None:
-                continue
-            other = fit_map(model, model.state(places, fit.state.offset_m, fit.state.scale), settings)
-            if other.cost < fit.cost * (1.0 - 1e-6):
-                fit, better = other, True
-        if not better:
-            break
-    return fit
-
-
-def _contradicted(network: RangeNetwork, fit: MapFit) -> list[IndexArray]:
-    bad = np.abs(fit.residuals_m) > _SUSPECT * network.sigmas_m
-    if not bad.any():
-        return []
-    pairs = network.pairs
-    suspects = np.unique(pairs[bad])
-    near = np.unique(pairs[np.isin(pairs, suspects).any(axis=1)])
-    inside = np.isin(pairs, near).all(axis=1)
-    labels = components(network.count, pairs[inside])
-    groups = [near[labels[near] == label] for label in np.unique(labels[near])]
-    return [group for group in groups if len(group) <= _LARGEST]
-
-
-def _mapped_anew(network: RangeNetwork, fit: MapFit, motes: IndexArray, settings: MapFitSettings) -> FloatArray | None:
-    d = network.dimension
-    pairs = network.pairs
-    rows = np.flatnonzero(np.isin(pairs, motes).any(axis=1))
-    members = np.unique(pairs[rows])
-    ring = np.setdiff1d(members, motes)
-    if len(ring) < d + 1:
-        return None
-    known = np.where(np.isin(members, ring)[:, None], fit.state.positions_m[members], np.nan)
-    part = RangeNetwork(
-        names=tuple(network.names[mote] for mote in members),
-        dimension=d,
-        first=np.searchsorted(members, network.first[rows]),
-        second=np.searchsorted(members, network.second[rows]),
-        ranges_m=(network.ranges_m[rows] - fit.state.offset_m) / (1.0 + fit.state.scale),
-        sigmas_m=network.sigmas_m[rows],
-        bodies=(),
-        known_m=known,
-    )
-    means = PairMeans(part)
-    at = np.flatnonzero(np.isfinite(known[:, 0]))
-    held = every_pair(at)
-    held_m = np.linalg.norm(known[held[:, 0]] - known[held[:, 1]], axis=1)
-    start = unfolded(
-        len(members),
-        np.concatenate([means.pairs, held]),
-        np.concatenate([means.ranges_m, held_m]),
-        np.concatenate([means.sigmas_m, np.full(len(held), float(means.sigmas_m.min()))]),
-        d,
-    )
-    start = best_motion(start[at], known[at], mirrors=True).moved(start)
-    model = MapModel(part)
-    found = fit_map(model, model.state(start), settings)
-    places = fit.state.positions_m.copy()
-    places[members] = found.state.positions_m
-    return places
