@@ -88,7 +88,7 @@ def _alarm(row: Condition) -> tuple[str, ...]:
 
 def reactions() -> str:
     """What missions do about verdicts, in the order of precedence."""
-    rows = [(k, row.when, row.action.value, "yes" if row in RULES.rows else "") for k, row in enumerate(ROWS, 1)]
+    rows = [(str(k), row.when, row.action.value, "yes" if row in RULES.rows else "") for k, row in enumerate(ROWS, 1)]
     rows += [("", row.when, row.action.value, "yes") for row in RULES.rows if row not in ROWS]
     return table("| | when | what happens | also among beacons |", rows)
 
