@@ -13,7 +13,7 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
-from ccatp.survey.holding import (
+from ccatp.survey.failsafe import (
     ON_EARTHQUAKE,
     ON_EMERGENCY,
     ON_FAULT,

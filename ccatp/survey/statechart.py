@@ -28,9 +28,8 @@ from ccatp.survey.behaviours import (
     Settling,
 )
 from ccatp.survey.budget import TimeBudget
-from ccatp.survey.failsafe import ROWS
+from ccatp.survey.failsafe import ROWS, HoldRules
 from ccatp.survey.heading_recovery import MOST_LEGS, HeadingRecovery
-from ccatp.survey.holding import HoldRules
 from ccatp.survey.planning.escape import is_on_drive
 from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import Route
