@@ -477,7 +477,8 @@ DISK_STALLS = fault(
 
 OPERATOR = go_home(
     "operator", "operator", Group.OBSERVATORY,
-    "An operator called the robot home.", "Nothing; a new survey measures what is left.")
+    "An operator called the robot home, or paused it: then it is held.",
+    "`ccatp resume` after a pause; otherwise nothing, a new survey measures what is left.", severity=Severity.NONE)
 # fmt: on
 
 SURVEY = tuple(row for row in list(globals().values()) if isinstance(row, Condition) and row not in DANGER)

@@ -118,6 +118,7 @@ class BeaconRunner(MissionRunner):
         if mode is before and state.is_faulted is was_faulted:
             return
         self._state, self._was_faulted = mode, state.is_faulted
+        self.since_s = self._clock.t_s
         self.telemetry.log.debug("state_changed", seq=self._clock.seq, before=before, after=mode)
         if HELD in (mode, before) or mode is RETURNING:
             text = f"{mode}: {state.cause}" if state.cause else f"{mode}"

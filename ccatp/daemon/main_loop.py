@@ -231,9 +231,11 @@ class MainLoop(RobotLoop):
 
     def status(self) -> MissionStatus:
         """Progress of the mission."""
-        status, lateness = self._runner.status(), self.lateness
+        status, lateness, verdict = self._runner.status(), self.lateness, self._verdicts.verdict
         status.elapsed_s = round(self.clock.elapsed_s, 6)
-        status.code = 0 if self._verdicts.verdict is None else int(self._verdicts.verdict.code)
+        status.since_s = self._runner.since_s
+        if verdict is not None:
+            status.code, status.severity = int(verdict.code), int(verdict.severity)
         status.exit_status = int(self.exit_status) if self.over.is_set() else -1
         status.missed_deadlines = lateness.missed_deadlines
         status.worst_lateness_ms = round(1e3 * lateness.worst_s, 3)

@@ -69,6 +69,7 @@ class MissionRunner(ABC):
         on_drive: Callable[[int, float, float], None] = lambda *_: None,
     ) -> None:
         self.mission, self.telemetry, self.on_drive = mission, telemetry, on_drive
+        self.since_s = 0.0  # when the state began
 
     @property
     def is_busy(self) -> bool:

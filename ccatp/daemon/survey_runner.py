@@ -376,6 +376,7 @@ class SurveyRunner(MissionRunner):
         if mode is before:
             return
         self._state = mode
+        self.since_s = self._clock.t_s
         if not state.is_faulted:
             self._fault_timer.over()
         telemetry.log.debug("state_changed", seq=self._clock.seq, before=before, after=mode, cause=state.cause)

@@ -12,9 +12,10 @@ import structlog
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from ccatp.conditions import condition_of
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
-from ccatp.core import danger_text
+from ccatp.core import Severity, danger_text
 from ccatp.errors import ExitStatus
 from ccatp.links.liveness import RateLimitedLog
 from ccatp.links.topics import DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
@@ -190,10 +191,15 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
     bound = f"no path takes less than {clock(status.lower_bound_s)}"
     # The error is exactly zero before the first arrival.
     arrival = f"{status.error_mm:.2f} mm from the last point, as estimated" if status.error_mm else "none yet"
+    row = condition_of(status.cause)
+    severity = Severity(max(status.severity, row.severity if row is not None else 0))
     late = f"{status.missed_deadlines}, the latest by {status.worst_lateness_ms:.0f} ms"
     rows = [
         ("state", f"{status.state} {status.point}".strip()),
         ("cause", status.cause),
+        ("severity", severity.name.lower() if severity else ""),
+        ("since", f"{clock(status.t_s - status.since_s)} ago" if status.cause else ""),
+        ("what to do", row.advice if row is not None else ""),
         ("outcome", status.outcome),
         ("points", f"{status.done} of {status.total} measured{skips}  [{'#' * filled}{'.' * (BAR - filled)}]"),
         ("time", f"{clock(status.elapsed_s)} elapsed, {clock(status.eta_s)} to go, {bound}"),

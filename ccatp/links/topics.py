@@ -69,6 +69,8 @@ class MissionStatus(Message):
     eta_s: float = 0.0
     error_mm: float = 0.0
     code: int = 0
+    severity: int = 0  # of the newest verdict
+    since_s: float = 0.0  # robot time at which the state began
     outcome: str = ""
     lower_bound_s: float = 0.0
     exit_status: int = -1  # what the run ends with; -1 while it goes on

@@ -58,7 +58,7 @@ class Row(NamedTuple):
     when: str
     action: Action
     applies: Callable[[Any, Verdict | None], bool]
-    react: Callable[[Any, Any, Any, Verdict | None], tuple[Any, bool]]
+    react: Callable[[Any, Any, Any, Any], tuple[Any, bool]]
 
 
 class HoldRules(Generic[S]):

@@ -14,8 +14,10 @@ import msgspec
 import pytest
 
 from ccatp.cli import main
+from ccatp.conditions import WHEEL_BLOCKED
 from ccatp.config.load import available, load_config
 from ccatp.config.package import child_environment
+from ccatp.core import Severity
 from ccatp.daemon.terminal import clock, status_line, status_rows
 from ccatp.links.topics import MissionStatus
 from ccatp.mirror.mirror import build_mirror
@@ -248,6 +250,17 @@ def test_the_table() -> None:
             "outcome": "stopped",
         }.items()
     )
+
+
+def test_what_holds_the_robot_is_shown_with_severity_duration_and_advice() -> None:
+    wheel = {**STATUS, "state": "held", "cause": WHEEL_BLOCKED.text(side="left"), "t_s": 95.0, "since_s": 20.0}
+    shown = dict(status_rows(wheel))
+    assert (shown["severity"], shown["since"], shown["what to do"]) == ("hold", "1:15 ago", WHEEL_BLOCKED.advice)
+    assert dict(status_rows({**wheel, "severity": int(Severity.FAULT)}))["severity"] == "fault"  # it has escalated
+    paused = dict(status_rows({**wheel, "cause": "operator"}))
+    assert "severity" not in paused
+    assert paused["what to do"].startswith("`ccatp resume`")
+    assert "what to do" not in dict(status_rows({**wheel, "cause": "nobody knows this"}))
 
 
 def test_one_line() -> None:

@@ -92,6 +92,7 @@ class StateCollector(Collector):
         for name, text, part, value_of in GAUGES:
             if state[part] is not None:
                 yield name, text, (), [((), value_of(state[part]))]
+        yield "condition", "1 for each active condition.", ("name",), [((c["name"],), 1.0) for c in state["conditions"]]
         if mission is not None:
             states = [((known,), known == mission["state"]) for known in self._ground["states"]]
             yield "mission_state", "1 for the state of the mission.", ("state",), states

@@ -14,10 +14,11 @@ from ccatp.survey.state import MissionState
 GROUND: dict[str, Any] = {"title": "fyst-m1", "states": [str(state) for state in MissionState]}
 NOTHING: dict[str, Any] = {
     "is_sim": False, "trouble": "main has sent no heartbeat", "links": [], "restarts": {"main": 0, "danger": 2},
-    "mission": None, "verdict": None, "robot": None, "pose": None,
+    "mission": None, "verdict": None, "robot": None, "pose": None, "conditions": [],
 }  # fmt: skip
 ALL: dict[str, Any] = NOTHING | {
     "trouble": "",
+    "conditions": [{"name": "no_way_on", "cause": "no way on: walled in", "advice": "carry it"}],
     "links": [LinkState("main loop", "joined", 0.05, True), LinkState("robot", "no frame yet", None, False)],
     "mission": {
         "state": "driving", "total": 693, "done": 12, "skipped": 1, "elapsed_s": 61.5, "eta_s": 3000.0,
@@ -68,6 +69,7 @@ def test_all_metrics() -> None:
         "ccatp_frame_lag_seconds": {(): 0.021},
         "ccatp_event_code": {(): 1.0},
         "ccatp_severity": {(): 2.0},
+        "ccatp_condition": {("no_way_on",): 1.0},
         "ccatp_battery_charge_ratio": {(): 0.93},
         "ccatp_fan_duty_ratio": {("left",): 0.8, ("right",): 0.75},
         "ccatp_wheels_held": {(): 1.0},

@@ -127,6 +127,7 @@ function show(state, isAll) {
   showMission(state);
   showFacts(state.facts);
   showVerdict(state.verdict);
+  text("advice", state.conditions.map(({ cause, advice }) => `${cause}: ${advice}`).join(" "));
   showRobot(state.robot, state.pose);
   showLinks(state);
   showLog(state.log, isAll);
