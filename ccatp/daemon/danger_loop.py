@@ -157,6 +157,7 @@ class DangerLoop(RobotLoop):
         self._published = (EventCode.NORMAL, "", Severity.NONE)
         self._seq, self._t_s = -1, 0.0
         self._bad_lines = self._permit_seq = 0
+        self._sent: tuple[int, Verdict] | None = None  # newest permit of the session, and its frame
         self._is_stale = False
         self._observatory = ObservatoryServer(
             args.endpoints.of("emergency"),
@@ -182,6 +183,7 @@ class DangerLoop(RobotLoop):
             self.monitor.reset()
             self._estimates.reset()
             self._seq = -1
+        self._sent = None
         self.begin_session()
         port = self.robot_cfg.port
         self.log.info("robot_joined", port=port, lockstep=hello.lockstep, session=self.sessions)
@@ -220,6 +222,7 @@ class DangerLoop(RobotLoop):
 
     def on_bad_line(self) -> None:
         """In lockstep each stands for a frame's time, so that the run is repeatable."""
+        super().on_bad_line()
         self._bad_lines += 1
         hello = self.hello
         is_timed = hello is not None and hello.lockstep
@@ -228,10 +231,19 @@ class DangerLoop(RobotLoop):
         if verdict is not None:
             self._publish_verdict(verdict, self._seq)
 
+    def answer_again(self) -> None:
+        if self._sent is not None:
+            self._permit_seq += 1
+            ack, verdict = self._sent
+            self.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
+
+    def report_overdue(self, text: str) -> None:
+        self.log.warning("frame_overdue", text=text)
+
     def _publish_verdict(self, verdict: Verdict, ack: int) -> None:
         if ack >= 0:  # the robot first: the permit does not wait for the publication
-            self._permit_seq += 1
-            self.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
+            self._sent = ack, verdict
+            self.answer_again()
         self.publisher.send("verdict", verdict)
         if (verdict.code, verdict.cause, verdict.severity) == self._published:
             return

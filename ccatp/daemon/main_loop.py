@@ -88,6 +88,7 @@ class MainLoop(RobotLoop):
         self.clock = MissionClock(10.0 * cfg.run.step_s if isinstance(cfg, RadioConfig) else cfg.health.clock_jump_s)
         self.frame_period_s = 0.0
         self._is_new_session, self._drive_seq = False, 0
+        self._sent: tuple[int, DriveCommand] | None = None  # newest drive of the session, and its frame
         self._catches_up_until_s = -inf
         self._was_at_rest = False
         self._unanswered: int | None = None
@@ -116,7 +117,7 @@ class MainLoop(RobotLoop):
         except ConfigError as error:
             self._fail(error)
             return
-        self.frame_period_s, self._is_new_session = 1.0 / hello.frame_hz, True
+        self.frame_period_s, self._is_new_session, self._sent = 1.0 / hello.frame_hz, True, None
         self._runner.begin_session(hello)
         self.begin_session()
         again = " again" if self.sessions > 1 else ""
@@ -209,6 +210,9 @@ class MainLoop(RobotLoop):
 
     def is_frame_due(self) -> bool:
         return self._unanswered is None
+
+    def report_overdue(self, text: str) -> None:
+        self._telemetry.notify_operator("warning", text)
 
     def on_silence(self, age_s: float) -> None:
         if age_s <= self.robot_cfg.sensors_timeout_s:
@@ -347,11 +351,17 @@ class MainLoop(RobotLoop):
 
     def send_drive(self, ack: int, drive: DriveCommand) -> None:
         """Send the drive that was computed from frame ``ack``."""
-        self._drive_seq += 1
-        right, left, steer = drive
-        self._runner.on_drive(self._drive_seq, right, left)
-        steering = () if steer is None else (steer,)
-        self.link.send_drive(self._drive_seq, max(ack, 0), right, left, *steering)
+        right, left, _ = drive
+        self._runner.on_drive(self._drive_seq + 1, right, left)
+        self._sent = max(ack, 0), drive
+        self.answer_again()
+
+    def answer_again(self) -> None:
+        if self._sent is not None:
+            self._drive_seq += 1
+            ack, (right, left, steer) = self._sent
+            steering = () if steer is None else (steer,)
+            self.link.send_drive(self._drive_seq, ack, right, left, *steering)
 
     def _answer(self, seq: int, drive: DriveCommand) -> None:
         # A robot that is driven waits for nobody.

@@ -18,7 +18,13 @@ from ccatp.links.bus import Publisher
 from ccatp.links.robot_messages import Role
 
 WAIT_PERIOD_S = 0.02
-# In lockstep the robot sends the next frame as soon as it has its answers, or the last one again: it has lost both.
+# In lockstep the robot sends the next frame as soon as it has its answers, or the last one again after a second.
+REPEAT_S = 1.0
+# A copy of a frame that comes sooner is a duplicated line: the robot has the answer, or sends the frame once more.
+DUPLICATE_S = 0.5
+# A frame that does not come is reported after this time; one whose line was not valid comes again, and was missed for
+# at least so long.
+OVERDUE_S, INVALID_S = 3.0, 0.5
 LOCKSTEP_SILENCE_S = 30.0
 
 
@@ -41,6 +47,9 @@ class RobotLoop(RobotSession):
         self.heartbeat = HeartbeatPublisher(self.publisher, name)
         self.lateness = LatenessStatistics(self.robot_cfg.slip_after_s)
         self.over = asyncio.Event()
+        # In lockstep, on the monotonic clock: begin of the session, frame received again, answer sent again, line that
+        # was not valid; and the frame whose successor was reported as overdue.
+        self._joined_s = self._repeated_s = self._answered_again_s = self._invalid_s = self._reported_s = 0.0
 
     async def run(self, stop: asyncio.Event) -> None:
         """Join the robot together with the other loop, then serve frames until the end or until ``stop`` is set."""
@@ -94,13 +103,56 @@ class RobotLoop(RobotSession):
         return False
 
     @abstractmethod
+    def answer_again(self) -> None:
+        """Send the last answer of the session again, if there is one, with a new number and nothing else changed."""
+
+    @abstractmethod
+    def report_overdue(self, text: str) -> None:
+        """In lockstep a frame does not come, and the robot stands: tell those whom it concerns."""
+
+    def on_bad_line(self) -> None:
+        """See ``RobotSession``."""
+        self._invalid_s = time.monotonic()
+
+    def on_repeated(self) -> None:
+        """In lockstep the robot misses an answer, of this loop or of the other one."""
+        if self.is_lockstep:
+            self._repeated_s = time.monotonic()
+            self._answer_again_after(DUPLICATE_S)
+
+    def _answer_again_after(self, quiet_s: float) -> None:
+        now_s = time.monotonic()
+        if now_s - max(self.heartbeat.frame_s or 0.0, self._answered_again_s) >= quiet_s:
+            self._answered_again_s = now_s
+            self.answer_again()
+
+    def _watch_lockstep(self, frame_s: float) -> None:
+        """Send the answer again each second, report a frame that does not come, and drop a robot that is silent.
+
+        The answer is also sent again while a newer one is withheld: that keeps the session.
+        """
+        self._answer_again_after(REPEAT_S)
+        now_s = time.monotonic()
+        age_s, silent_s = now_s - frame_s, now_s - max(frame_s, self._repeated_s)
+        is_invalid, is_repeated = self._invalid_s > frame_s, self._repeated_s > frame_s
+        is_overdue = age_s > INVALID_S if is_invalid else age_s > OVERDUE_S and self.is_frame_due()
+        if is_overdue and self._reported_s != frame_s:
+            self._reported_s = frame_s
+            sends = "a line that is not valid" if is_invalid else "its last frame again" if is_repeated else "nothing"
+            self.report_overdue(f"the robot stands: no new frame for {age_s:.1f} s in lockstep; it sends {sends}")
+        # The monitor gets no frame before a controller has joined.
+        if silent_s > LOCKSTEP_SILENCE_S and (self._role == "controller" or frame_s > self._joined_s):
+            self.drop(f"no sensors frame for {silent_s:.0f} s in lockstep, not even the last one again")
+
+    @abstractmethod
     def on_silence(self, age_s: float) -> None:
         """No frame came for so long, in real time; called all the time, also while frames are prompt."""
 
     def begin_session(self) -> None:
         """Frames are judged and counted from here on."""
         self.lateness.reset()
-        self.heartbeat.phase, self.heartbeat.frame_s = "joined", time.monotonic()
+        self._joined_s = time.monotonic()
+        self.heartbeat.phase, self.heartbeat.frame_s = "joined", self._joined_s
 
     async def publish_heartbeat(self) -> None:
         """Publish periodically, until cancelled."""
@@ -114,13 +166,13 @@ class RobotLoop(RobotSession):
         while True:
             await asyncio.sleep(WAIT_PERIOD_S)
             self.peer.maintain()
-            age_s = self.heartbeat.frame_age_s
-            if self.heartbeat.phase != "joined" or age_s is None:
+            frame_s = self.heartbeat.frame_s
+            if self.heartbeat.phase != "joined" or frame_s is None:
                 continue
             if self.is_lockstep:
-                if age_s > LOCKSTEP_SILENCE_S and self.is_frame_due():
-                    self.drop(f"no sensors frame for {age_s:.0f} s in lockstep though the last one was answered")
+                self._watch_lockstep(frame_s)
                 continue
+            age_s = time.monotonic() - frame_s
             self.on_silence(age_s)
             if age_s > self.robot_cfg.silence_timeout_s:
                 self.drop(f"no sensors frame for {age_s:.2f} s")

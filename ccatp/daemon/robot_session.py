@@ -60,6 +60,9 @@ class RobotSession(ABC):
     def on_bad_line(self) -> None:  # noqa: B027 - nothing has to be done
         """A line failed a check."""
 
+    def on_repeated(self) -> None:  # noqa: B027 - nothing has to be done
+        """The newest frame came again."""
+
     def _make(self) -> RobotLink:
         return RobotLink(
             host=self.robot_cfg.host,
@@ -71,6 +74,7 @@ class RobotSession(ABC):
             on_lost=self._handle_loss,
             on_joined=self._handle_join,
             on_bad_line=self.on_bad_line,
+            on_repeated=self.on_repeated,
         )
 
     async def join(self, *, is_patient: bool) -> None:

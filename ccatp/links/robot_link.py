@@ -71,7 +71,8 @@ class RobotLink(asyncio.Protocol):
 
     ``on_sensors`` is called with each frame and its line (without LF), within the event loop's read; ``on_lost`` once
     with the reason when a joined session ends, unless ``close`` ended it; ``on_joined`` with the robot's hello when the
-    session begins, before its first frame; ``on_bad_line`` after each line of a joined session that fails a check.
+    session begins, before its first frame; ``on_bad_line`` after each line of a joined session that fails a check;
+    ``on_repeated`` when its newest frame comes again.
 
     Attributes:
         counts: bad_lines, unknown_types, unexpected, repeated_frames, unsent.
@@ -89,10 +90,11 @@ class RobotLink(asyncio.Protocol):
         on_lost: Callable[[str], None],
         on_joined: Callable[[Hello], None] = lambda _hello: None,
         on_bad_line: Callable[[], None] = lambda: None,
+        on_repeated: Callable[[], None] = lambda: None,
     ) -> None:
         self._host, self._port, self._role, self._client, self._key = host, port, role, client, key
         self._on_sensors, self._on_lost, self._on_joined = on_sensors, on_lost, on_joined
-        self._on_bad_line = on_bad_line
+        self._on_bad_line, self._on_repeated = on_bad_line, on_repeated
         self.counts: Counter[str] = Counter()
         self._transport: asyncio.Transport | None = None
         self._hello: Hello | None = None
@@ -193,6 +195,8 @@ class RobotLink(asyncio.Protocol):
             self.counts["unknown_types"] += 1
         elif isinstance(message, Sensors):
             self.counts["repeated_frames" if self._is_joined else "unexpected"] += 1
+            if self._is_joined and message.seq == self._last_seq:
+                self._on_repeated()
         elif joining is None or joining.done():
             self.counts["unexpected"] += 1
         elif isinstance(message, Refused):

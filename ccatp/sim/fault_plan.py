@@ -200,8 +200,9 @@ LINK_TYPES: dict[str, type[LinkFault]] = {
     ),
 }
 
-LOCKSTEP_TYPES = ("reset", "close", "duplicate", "fragment", "garbage")
-"""What makes sense where simulated time waits for every line: the others would only make it wait, some for ever."""
+LOCKSTEP_TYPES = ("reset", "close", "duplicate", "fragment", "garbage", "corrupt", "reorder", "delay")
+"""What makes sense where simulated time waits for every line: the others would make it wait until they end, which they
+never do."""
 
 
 class Injected(NamedTuple):

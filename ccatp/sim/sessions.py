@@ -8,8 +8,8 @@ Choices the interface leaves open:
 * Before the join a malformed line is dropped and counted as always; a wrong join and any other message are refused as
   ``bad join``, and so is silence for ``JOIN_TIMEOUT_S``. ``busy`` means too many connections.
 * A message that does not belong to the sender's role is a bad line. Messages of unknown type keep no role alive.
-* The silence after which a role may be taken over is measured on the robot's clock: in lockstep, where a client may
-  hold its answer back for as long as it likes, no client is silent while simulated time stands still.
+* In lockstep too the limits of sessions and roles are in wall time: a client that holds its answer back sends its last
+  one again meanwhile.
 * Sequence numbers start again with each session.
 * In lockstep a delay of the sensors keeps its length: each answer to the newest frame delivered drives one frame, and
   delivers the next. What a client has is old by the delay, as it is on a wall clock. The frames before the first
@@ -44,7 +44,10 @@ from ccatp.sim.rules import SimulatedRobot
 
 JOIN_TIMEOUT_S = 2.0
 SILENCE_S = 5.0
+# Wall time in lockstep after which a frame without answers is sent again, is noted, and ends a silent client's session.
+REPEAT_S = 1.0
 STALL_S = 5.0
+LOCKSTEP_SILENCE_S = 60.0
 MAX_LAG_S = 0.25
 NO_DELIVERY_S = 60.0
 MAX_SESSIONS = 32
@@ -64,14 +67,15 @@ class RobotSession:
     """One client.
 
     Attributes:
-        joined_s, received_s: when it connected (wall clock) and when it last sent something valid (the robot's clock).
+        joined_s, received_s: when it connected and when it last sent something valid; wall clock, but for the latter in
+            real time: there a stop of the robot's own process is no silence of its clients.
         is_open: not closed by us.
     """
 
     def __init__(self, server: "RobotServer", wire: Wire, nonce: str, now_s: float) -> None:
         self._server, self.wire, self.nonce = server, wire, nonce
         self.role: Role | None = None
-        self.joined_s, self.received_s = now_s, 0.0
+        self.joined_s = self.received_s = now_s
         self.is_open = True
         self._lines = LineBuffer()
         self._bad = BadLineCounter()
@@ -111,7 +115,7 @@ class RobotServer:
 
     Attributes:
         counts: bad_lines, unknown_types, oversized_lines, refused, stale (drives, permits and fans not newer),
-            slips (frames more than a period late).
+            slips (frames more than a period late), repeats (frames that were sent again in lockstep).
         oldest_ack_frames: how many frames a drive that moves the robot was behind at most (not in lockstep).
     """
 
@@ -137,7 +141,7 @@ class RobotServer:
         self._holders: dict[Role, RobotSession] = {}
         self._last_session = 0
         self._acked: set[Role] = set()  # roles that have answered the newest frame
-        self._frame_wall_s = now_s
+        self._frame_wall_s = self._repeated_s = now_s
         self._is_stall_noted = False
         self._reboots = robot.reboots
 
@@ -176,13 +180,20 @@ class RobotServer:
         self.drop(session, f"refused: {reason}")
 
     def check_time(self, now_s: float) -> None:
-        """Refuse those who do not join, report a stall. To be called a few times a second."""
+        """Refuse who does not join; in lockstep see to a frame without answers. To be called a few times a second."""
         for session in tuple(self._sessions):
             if session.role is None and now_s - session.joined_s > JOIN_TIMEOUT_S:
                 self.refuse(session, "bad join")
-        if not self._is_lockstep or "controller" not in self._holders or self._is_stall_noted:
+        if not self._is_lockstep or "controller" not in self._holders:
             return
-        if now_s - self._frame_wall_s > STALL_S:
+        if now_s - max(self._frame_wall_s, self._repeated_s) >= REPEAT_S:
+            self._repeated_s = now_s
+            self.counts["repeats"] += 1
+            self._send_frame()
+        for session in tuple(self._holders.values()):
+            if now_s - max(session.received_s, self._frame_wall_s) > LOCKSTEP_SILENCE_S:
+                self.drop(session, f"no line for {LOCKSTEP_SILENCE_S:g} s")
+        if now_s - self._frame_wall_s > STALL_S and not self._is_stall_noted:
             self._is_stall_noted = True
             missing = "permit" if "controller" in self._acked else "drive"
             self._note(f"stall: frame {self.robot.delivered_seq} waits for its {missing}")
@@ -196,15 +207,15 @@ class RobotServer:
         if self._key is not None and not is_mac_right(self._key, session.nonce, message):
             self.refuse(session, "bad mac")
             return
-        robot_s = self._robot_time_s(now_s)
+        clock_s = now_s if self._is_lockstep else self._robot_time_s(now_s)
         holder = self._holders.get(message.role)
         if holder is not None:
-            if robot_s - holder.received_s <= SILENCE_S:
+            if clock_s - holder.received_s <= SILENCE_S:
                 self.refuse(session, "role taken")
                 return
             self.drop(holder, "silent, taken over")
         self._holders[message.role] = session
-        session.role, session.received_s = message.role, robot_s
+        session.role, session.received_s = message.role, clock_s
         self._last_session += 1
         session.wire.write(encode(Joined(role=message.role, session=self._last_session)))
         self._note(f"{message.role} joined: {message.client}")
@@ -245,7 +256,7 @@ class RobotServer:
             self.fan_changes += robot.fans.duty != before
         else:
             return False
-        session.received_s = robot_s
+        session.received_s = now_s if self._is_lockstep else robot_s
         if not taken:
             self.counts["stale"] += 1
         elif not isinstance(message, FansMessage) and message.ack == robot.delivered_seq:

@@ -325,12 +325,25 @@ def _sides(frame: Message) -> None:
     frame["enc"] = [[t, left, right] for t, right, left in frame["enc"]]
 
 
+def _only_once(loop: DataLoop, send: Any) -> None:
+    if loop.server._repeated_s <= loop.server._frame_wall_s:
+        send()
+
+
+def _emptied(message: Message, middle: Middle) -> None:
+    message["soc"] = 1.0 / middle.count
+
+
 STEPS = [
     Crooked("does not wait for drives", "lockstep-drive", LOCKSTEP[:2], twist=_never_waits("controller")),
     Crooked("does not wait for permits", "lockstep-permit", LOCKSTEP[:2], twist=_never_waits("monitor")),
     Crooked("takes any ack", "lockstep-ack", LOCKSTEP, twist=around("server.command", _any_ack)),
     Crooked("takes two steps", "lockstep-step", LOCKSTEP[3:4], twist=around("server._advance", _two_steps)),
-    Crooked("measures ages on the wall clock", "lockstep-ages", LOCKSTEP, says=of("sensors", _wall_ages)),
+    Crooked(
+        "measures ages on the wall clock", "lockstep-ages lockstep-repeat", LOCKSTEP, says=of("sensors", _wall_ages)
+    ),
+    Crooked("sends no frame again", "lockstep-repeat", LOCKSTEP, twist=around("server._send_frame", _only_once)),
+    Crooked("sends another frame of the same number", "lockstep-repeat", LOCKSTEP[-1:], says=of("sensors", _emptied)),
     Crooked("drives forward without permit", "move-forward", MOVES, twist=_allowing(forward=True)),
     Crooked("reverses without permit", "move-reverse move-curve-back", MOVES, twist=_allowing(reverse=True)),
     Crooked("turns without permit", "move-turn move-turn-back move-curve", MOVES, twist=_allowing(turn=True)),

@@ -215,6 +215,55 @@ def test_a_whole_mirror(start: Start, mirror: str, world: str, seed: int) -> Non
 
 # -- what goes wrong on purpose ---------------------------------------------------------------------------------------
 
+LINES = """
+[[link]]
+type = "corrupt"
+direction = "both"
+at_s = 1.0
+for_s = 0.2
+every = 9
+
+[[link]]
+type = "duplicate"
+direction = "both"
+at_s = 3.0
+for_s = 0.5
+every = 3
+
+[[link]]
+type = "reorder"
+direction = "to_client"
+at_s = 5.0
+for_s = 0.1
+every = 7
+
+[[link]]
+type = "delay"
+direction = "both"
+at_s = 6.0
+for_s = 0.01
+delay_s = 0.8
+jitter_s = 0.4
+"""
+
+
+@pytest.mark.fault("S14", "S15")
+def test_lines_that_are_corrupt_late_twice_or_missing_are_waited_for_and_reported(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "plan.toml").write_text(LINES)
+    run = start("--panels", "1", "--faults", str(tmp_path / "plan.toml"))
+    assert run.wait() == 0, run.stderr
+    assert run.summary["points"]["first_arrival_within_10mm"] == run.summary["points"]["total"] == 9
+    assert run.summary["danger"] == SOUND
+    assert "robot link lost" not in run.stderr
+    injected = {e["type"]: e["samples"] for e in run.log if e["event"] == "fault_injected"}
+    assert min(injected[kind] for kind in ("corrupt", "duplicate", "reorder", "delay")) > 0
+    robot = next(e for e in run.log if e["event"] == "robot_statistics")
+    assert robot["repeats"] > 0
+    overdue = [e for e in run.log if "a line that is not valid" in str(e.get("text"))]
+    assert overdue or robot["bad_lines"] > 0
+    assert all("no new frame for" in e["text"] for e in overdue)
+
+
 FAULTS = """
 [[link]]
 type = "fragment"

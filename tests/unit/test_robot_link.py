@@ -38,7 +38,7 @@ class Seen:
         self.frames: list[int] = []
         self.lines: list[bytes] = []
         self.lost: list[str] = []
-        self.bad_lines = 0
+        self.bad_lines = self.repeated = 0
         self.changed = asyncio.Event()
 
     def on_sensors(self, sensors: Sensors, line: bytes) -> None:
@@ -48,6 +48,9 @@ class Seen:
 
     def on_bad_line(self) -> None:
         self.bad_lines += 1
+
+    def on_repeated(self) -> None:
+        self.repeated += 1
 
     def on_lost(self, reason: str) -> None:
         self.lost.append(reason)
@@ -85,6 +88,7 @@ async def robot(script: Script, *, key: bytes | None = None) -> AsyncIterator[tu
         on_sensors=seen.on_sensors,
         on_lost=seen.on_lost,
         on_bad_line=seen.on_bad_line,
+        on_repeated=seen.on_repeated,
     )
     try:
         yield link, seen
@@ -146,6 +150,7 @@ async def test_repeated_and_older_frames_are_dropped_and_counted() -> None:
         await link.connect(DEADLINE_S)
         await seen.until(lambda: seen.frames == [0, 1, 3, 4])
     assert link.counts["repeated_frames"] == 3
+    assert seen.repeated == 1  # only the newest one is to be answered again
 
 
 async def test_bad_lines_and_unknown_types_are_counted_and_dropped() -> None:

@@ -25,6 +25,7 @@ from ccatp.commissioning.conformance.harness import (
 CHECKS = CheckList()
 check_steady = CHECKS.using(steady)
 WAIT_S = 0.3  # wall time in which a frame would have come
+REPEATED_S = 1.7  # wall time in which a frame without answers comes again
 BEYOND_TTL_S = 0.2
 RATE_RAD_S = 0.5
 MOVE_S = 0.8  # longest time in which a drive must show in the encoders
@@ -89,6 +90,19 @@ def _time_stands_still(pair: ControllerAndMonitor) -> str:
     grown_s = max(after.age - before.age, after.permit_age - before.permit_age)
     require(grown_s < pair.facts.frame_s * 1.5, f"ages grew by {grown_s:.3f} s while time stood still")
     return f"{wait_s:.2f} s of waiting, the ages {ages}"
+
+
+@check_steady("lockstep-repeat", "a frame without answers is sent again after 1 s of wall time, unchanged", "lockstep")
+def _sends_again(pair: ControllerAndMonitor) -> str:
+    pair.pause(WAIT_S)  # both clients have the newest frame
+    counts = [len(messages) for messages in pair.messages]
+    require(not pair.pause(REPEATED_S), "a frame without answers to the one before")
+    for role, messages, count in zip(("controller", "monitor"), pair.messages, counts, strict=True):
+        again = messages[count:]
+        require(bool(again), f"the {role} does not get the frame again within {WAIT_S + REPEATED_S:g} s")
+        require(all(one == messages[count - 1] for one in again), f"the {role} gets another frame of the same number")
+    pair.next_frame("no frame on answers to a frame that was sent again")
+    return "the same frame to both clients, and the next one on their answers"
 
 
 # -- motion -----------------------------------------------------------------------------------------------------------

@@ -1,15 +1,11 @@
 """Reports of a robot that stands, and the advice that goes with a cause."""
 
-import asyncio
 import re
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
 from ccatp.conditions import DANGER, SURVEY, condition_of
 from ccatp.daemon.main_loop import STANDS_REPEAT_S, STANDS_REPORT_S, StandstillReport
-from ccatp.daemon.robot_loop import RobotLoop
 
 
 def test_it_is_reported_after_half_a_minute_and_again_after_each_minute() -> None:
@@ -43,25 +39,3 @@ def test_each_row_is_found_by_its_message() -> None:
         found = condition_of(re.sub(r"{.*?}", "left", row.message))
         assert found is not None
         assert found.message == row.message
-
-
-@pytest.mark.parametrize(
-    ("age_s", "is_due", "is_dropped"), [(31.0, True, True), (29.0, True, False), (31.0, False, False)]
-)
-async def test_a_lockstep_robot_that_owes_a_frame_loses_its_session(
-    age_s: float, is_due: bool, is_dropped: bool
-) -> None:
-    why, begun = list[str](), asyncio.Event()
-    loop: Any = SimpleNamespace(
-        peer=SimpleNamespace(maintain=begun.set),
-        heartbeat=SimpleNamespace(phase="joined", frame_age_s=age_s),
-        is_lockstep=True,
-        is_frame_due=lambda: is_due,
-        drop=why.append,
-    )
-    watching = asyncio.get_running_loop().create_task(RobotLoop.watch(loop))
-    await begun.wait()
-    await asyncio.sleep(0)
-    watching.cancel()
-    expected = ["no sensors frame for 31 s in lockstep though the last one was answered"] if is_dropped else []
-    assert why == expected

@@ -9,10 +9,12 @@ from typing import Any
 
 import pytest
 
+from ccatp import dataloop
 from ccatp.config.load import load_config
 from ccatp.dataloop import serve
 from ccatp.links.robot_link import RobotLink
 from ccatp.links.robot_messages import Sensors
+from ccatp.sim import sessions
 from ccatp.sim.fault_plan import LINK_TYPES, LOCKSTEP_TYPES, parse_plan
 
 DEADLINE_S = 20.0
@@ -37,6 +39,7 @@ class Client:
     def __init__(self, port: int) -> None:
         self.frames: list[int] = []
         self.lost = ""
+        self._answers = 0
         self.changed = asyncio.Event()
         self.link = RobotLink(
             host="127.0.0.1",
@@ -46,12 +49,17 @@ class Client:
             key=None,
             on_sensors=self._on_sensors,
             on_lost=self._on_lost,
+            on_repeated=self._answer,
         )
 
     def _on_sensors(self, frame: Sensors, line: bytes) -> None:
         self.frames.append(frame.seq)
-        self.link.send_drive(frame.seq + 1, frame.seq, 1.0, 1.0)
+        self._answer()
         self.changed.set()
+
+    def _answer(self) -> None:
+        self._answers += 1
+        self.link.send_drive(self._answers, self.frames[-1], 1.0, 1.0)
 
     def _on_lost(self, reason: str) -> None:
         self.lost = reason
@@ -148,7 +156,11 @@ async def test_on_the_wall_clock_each_fault_reaches_the_client_and_the_log(kind:
 
 @pytest.mark.parametrize("kind", LOCKSTEP_TYPES)
 @pytest.mark.parametrize("trigger", ["at_s = 0.2", "after_lines = 20", "after_bytes = 20000"])
-async def test_in_lockstep_each_fault_that_makes_sense_there(kind: str, trigger: str) -> None:
+async def test_in_lockstep_each_fault_that_makes_sense_there(
+    kind: str, trigger: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sessions, "REPEAT_S", 0.4)  # of a line that is lost
+    monkeypatch.setattr(dataloop, "HOUSEKEEPING_S", 0.02)
     keys, seen = TABLE[kind]
     client, log = await drive(plan_of(kind, trigger, keys), reached(100), lockstep=True)
     assert seen(client), (client.frames, client.lost, client.link.counts)

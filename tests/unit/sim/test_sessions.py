@@ -7,7 +7,7 @@ import pytest
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_plan import parse_plan
-from ccatp.sim.sessions import MAX_LAG_S, MAX_SESSIONS, NO_DELIVERY_S
+from ccatp.sim.sessions import LOCKSTEP_SILENCE_S, MAX_LAG_S, MAX_SESSIONS, NO_DELIVERY_S, SILENCE_S
 from tests.support.scenario import ServedRobot, boot, config_of, fault_plan
 
 JOIN = b'{"type":"join","role":"controller","client":"test"}\n'
@@ -40,11 +40,18 @@ def test_too_many_connections(rig: Rig) -> None:
     assert r.client(JOIN).kinds == ["hello", "joined", "0"]
 
 
-def test_in_lockstep_nobody_is_silent_while_simulated_time_stands_still(rig: Rig) -> None:
+def test_in_lockstep_the_silence_after_which_a_role_is_free_is_in_wall_time(rig: Rig) -> None:
     r = rig()
-    r.client(JOIN)
-    r.now_s += 3600.0
-    assert r.client(JOIN).messages[-1] == {"type": "refused", "reason": "role taken"}
+    holder = r.client(JOIN)
+    holder.drive(0, 0)
+    for number in range(1, 10):  # an answer that is held back
+        r.now_s += 0.9 * SILENCE_S
+        holder.drive(number, 0)
+        assert r.client(JOIN).messages[-1] == {"type": "refused", "reason": "role taken"}
+    assert r.robot.seq == 1
+    r.now_s += 1.1 * SILENCE_S
+    assert r.client(JOIN).kinds == ["hello", "joined", "1"]
+    assert holder.wire.is_closed
 
 
 # -- bad lines --------------------------------------------------------------------------------------------------------
@@ -120,6 +127,68 @@ def test_a_stall_is_noted_once_per_frame_and_waited_for(rig: Rig) -> None:
     controller.drive(1, 1)
     r.server.check_time(r.now_s + 6.0)
     assert r.notes[-1] == "stall: frame 1 waits for its permit"
+
+
+def test_a_frame_without_its_answers_is_sent_again_each_second_unchanged(rig: Rig) -> None:
+    r = rig()
+    monitor, controller = r.client(JOIN_MONITOR), r.client(JOIN)
+    monitor.permit(0, 0)
+    controller.drive(0, 0, 1.0, 1.0)
+    controller.drive(1, 1, 2.0, 2.0)
+    for client in (monitor, controller):
+        client.messages.clear()
+    for tenths in range(1, 31):
+        r.server.check_time(r.now_s + 0.1 * tenths)
+    assert monitor.wire.sent == controller.wire.sent == 3 * r.robot.delivered_line
+    assert r.server.counts["repeats"] == 3
+    controller.drive(2, 1, 2.0, 2.0)  # it answers again
+    assert r.robot.seq == 1
+    monitor.permit(1, 1)
+    assert r.robot.seq == 2
+    r.server.check_time(r.now_s + 0.9)
+    assert r.server.counts["repeats"] == 3
+
+
+def test_a_late_copy_of_an_answer_does_not_advance_the_clock(rig: Rig) -> None:
+    r = rig()
+    controller = r.client(JOIN)
+    controller.drive(0, 0, 1.0, 1.0)
+    controller.drive(1, 0, 1.0, 1.0)
+    assert r.robot.seq == 1
+    controller.drive(2, 1, 2.0, 2.0)
+    assert r.robot.seq == 2
+    assert r.robot.rules.set_points(r.robot.next_t_s) == (2.0, 2.0)
+
+
+def test_a_client_without_a_line_for_a_minute_loses_its_session(rig: Rig) -> None:
+    r = rig()
+    monitor, controller = r.client(JOIN_MONITOR), r.client(JOIN)
+    controller.drive(0, 0)
+    for number in range(1, 13):
+        r.now_s += 5.0
+        controller.drive(number, 0)
+        r.server.check_time(r.now_s)
+        assert not monitor.wire.is_closed
+    r.now_s += 1.0
+    r.server.check_time(r.now_s)
+    assert monitor.wire.is_closed
+    assert not controller.wire.is_closed
+    assert "monitor dropped: no line for 60 s" in r.notes
+    r.now_s += LOCKSTEP_SILENCE_S + 1.0
+    r.server.check_time(r.now_s)
+    assert controller.wire.is_closed
+    assert r.robot.seq == 0
+
+
+def test_a_monitor_that_waits_for_a_controller_keeps_its_session(rig: Rig) -> None:
+    r = rig()
+    monitor = r.client(JOIN_MONITOR)
+    r.now_s += 3600.0
+    r.server.check_time(r.now_s)
+    controller = r.client(JOIN)
+    r.server.check_time(r.now_s + 1.0)
+    assert not monitor.wire.is_closed
+    assert monitor.kinds == controller.kinds == ["hello", "joined", "0", "0"]
 
 
 # -- realtime ---------------------------------------------------------------------------------------------------------
