@@ -99,7 +99,7 @@ class SurveyRunner(MissionRunner):
         super().__init__(parts.mission, Telemetry(loop.publisher, loop.log, "track", TrackMessage), self._sent.add)
         self._cfg, self._loop, self._clock, self._parts, self._store = cfg, loop, loop.clock, parts, store
         self._mirror, self._localizer, self._gate = parts.mirror, parts.localizer, parts.gate
-        self._clock.before_s = parts.elapsed_s
+        self._clock.before_s = parts.mission.state.budget.before_s
         self._gate_log = GateLog(self._gate, self.telemetry.notify_operator)
         self._fan_gate, self._has_full_fans, self._fans_seq = FanGate(0.0), False, 0
         self._sent_commands: tuple[tuple[float, float, float, float] | None, int] = None, -1
@@ -120,7 +120,7 @@ class SurveyRunner(MissionRunner):
         self._checkpoint = CheckpointWriter(args.run_dir, parts.localizer, self.mission, not args.is_realtime)
         self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
-        self._recovery = parts.recovery
+        self._start = parts.start
         self._is_odometry_off = False
         self._state = MissionState.IDLE
         self._motion: StateEstimate | None = None
@@ -148,7 +148,7 @@ class SurveyRunner(MissionRunner):
             t_s=self._clock.t_s,
             state=str(state.mode),
             cause=state.cause,
-            done=len(state.done) + self._parts.already_done,
+            done=len(state.done),
             skipped=len(state.skipped),
             total=self._parts.total_points,
             point=f"{point.row}-{point.col}-{point.point}" if point is not None else "",
@@ -233,9 +233,9 @@ class SurveyRunner(MissionRunner):
     def estimate(self, frame: TimedFrame) -> None:
         """Give the frame's samples to the localizer, as far as they can be trusted."""
         sensors, mission, localizer = frame.sensors, self.mission, self._localizer
-        recovery, self._recovery = self._recovery, None
-        if recovery is not None:  # a replay has to know where the localizer of a loop that takes over begins
-            begun, sigmas = recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad)
+        start, self._start = self._start, None
+        if start is not None:  # a replay has to know where the localizer of a loop that takes over begins
+            begun, sigmas = start
             self._publish_treatment(sensors, "begun", (begun.x_m, begun.y_m, begun.heading_rad, *sigmas))
         state = mission.state
         is_odometry_off = state.mode is MissionState.HELD and state.rejects_odometry
@@ -362,11 +362,12 @@ class SurveyRunner(MissionRunner):
         seq, t_s, telemetry, localizer = frame.sensors.seq, frame.sensors.t, self.telemetry, self._localizer
         pose, sigma_m = localizer.pose, localizer.position_sigma_m
         if frame.is_estimate_due:
-            self._checkpoint.write_if_due(seq, t_s, self._clock.elapsed_s)
             deck = localizer.deck_pose
             self.publish_estimate(frame, (deck.x_m, deck.y_m, deck.heading_rad), sigma_m, *self._sent_commands)
         row = seq + telemetry.frames_before, t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, sigma_m
         telemetry.add_frame(seq, t_s, frame.raw, row)
+        if self._checkpoint.is_due():
+            self._checkpoint.write(seq, t_s, self._clock.elapsed_s)
         if self.mission.state.mode is not self._state:
             self.publish_state()
 

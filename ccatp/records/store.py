@@ -133,7 +133,6 @@ _Work = Callable[[sqlite3.Connection], Any]
 @dataclass(frozen=True, slots=True)
 class _Job:
     work: _Work
-    point: PointId | None = None  # measured once committed
     is_optional: bool = False  # gives way where there is no room
     future: "Future[Any]" = field(default_factory=Future)
 
@@ -155,7 +154,6 @@ class MissionStore:
         self.failure: StoreError | None = None
         self.arrivals_dropped = 0
         self._db = db
-        self._measured = {p.point for p in select_points(db) if p.status == "measured"}
         self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
         self._is_closed = False
         self._thread = threading.Thread(target=self._run, name="store", daemon=True)
@@ -233,7 +231,7 @@ class MissionStore:
         ``AlreadyMeasuredError``, ``UnknownPointError``, ``StoreRefusal`` (not finite, or a covariance not of nine
         values) or, where nothing will be stored any more, another ``StoreError``.
         """
-        return self._submit(lambda db: _insert_fix(db, point, fix, estimate), point)
+        return self._submit(lambda db: _insert_fix(db, point, fix, estimate))
 
     def record_skipped(self, point: PointId, t_s: float) -> "Future[None]":
         """Mark a point as skipped (it may still be measured later); resolves and fails like ``record_fix``."""
@@ -254,10 +252,6 @@ class MissionStore:
         insert = "INSERT INTO arrivals VALUES (NULL, ?, ?, ?, ?, ?)"
         self._jobs.put(_Job(lambda db: db.execute(insert, row), is_optional=True))
         return True
-
-    def measured_points(self) -> set[PointId]:
-        """The points whose fix is committed."""
-        return set(self._measured)
 
     def points(self) -> list[StoredPoint]:
         """All points, by row, column and number."""
@@ -282,8 +276,8 @@ class MissionStore:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _submit(self, work: _Work, point: PointId | None = None) -> "Future[Any]":
-        job = _Job(work, point)
+    def _submit(self, work: _Work) -> "Future[Any]":
+        job = _Job(work)
         if self._is_closed:
             job.future.set_exception(self.failure or StoreError(f"{self.path}: is closed"))
         else:
@@ -303,8 +297,6 @@ class MissionStore:
                 self.arrivals_dropped += job.is_optional
                 job.future.set_exception(error)
             else:
-                if job.point is not None:
-                    self._measured.add(job.point)
                 job.future.set_result(result)
         with suppress(sqlite3.Error):
             self._db.execute("PRAGMA journal_mode = DELETE")

@@ -72,7 +72,7 @@ class Standstill(msgspec.Struct, frozen=True):
         return Standstill(t_s - since_s >= cfg.settle_time_s - TIME_EPSILON_S, since_s, mean_m_s, mean_rad_s)
 
 
-class Settling(msgspec.Struct, frozen=True):
+class Settling(msgspec.Struct, frozen=True, tag=True):
     """From the end of a leg to the request for a measurement, after standing for the measuring time.
 
     ``rest_by_s``: coming to rest, or standing still for the measurement, takes no longer; ``measure_at_s``: the
@@ -118,7 +118,7 @@ class Settling(msgspec.Struct, frozen=True):
         return self.rest_by_s is not None and t_s > self.rest_by_s
 
 
-class ReturnHome(msgspec.Struct, frozen=True):
+class ReturnHome(msgspec.Struct, frozen=True, tag=True):
     """The way along ``stops`` to base, the last; ``stop_index`` is behind that once the robot stands there."""
 
     stops: tuple[Stop, ...]
@@ -178,7 +178,7 @@ class RetreatStep(StrEnum):
     STUCK = "stuck"
 
 
-class Retreat(msgspec.Struct, frozen=True):
+class Retreat(msgspec.Struct, frozen=True, tag=True):
     """One back-off along the track just driven, then a turn away from the side that hung over.
 
     A robot that met the edge backwards faces away from it, and does not turn.

@@ -26,11 +26,15 @@ def home_time_s(base: DeckPose, limits: LimitsConfig, x_m: float, y_m: float) ->
 
 
 class BudgetProgress(NamedTuple):
-    """Begin of the mission (robot time), planned time of what was done, and of what comes next, s."""
+    """Begin (robot time), planned time of what was done, and of what comes next, s.
+
+    ``before_s``: mission time before that begin, in other processes.
+    """
 
     begun_s: float | None = None
     planned_s: float = 0.0
     next_s: float = 0.0
+    before_s: float = 0.0
 
 
 class TimeBudget:
@@ -57,9 +61,8 @@ class TimeBudget:
 
     def progress(self, before: BudgetProgress, pose: DeckPose, left: Sequence[PointId]) -> BudgetProgress:
         """After a point: the progress, with the ``left`` points to do."""
-        return BudgetProgress(
-            before.begun_s, before.planned_s + before.next_s, self.tour_s(pose.x_m, pose.y_m, left[:1])
-        )
+        next_s = self.tour_s(pose.x_m, pose.y_m, left[:1])
+        return before._replace(planned_s=before.planned_s + before.next_s, next_s=next_s)
 
     def review(
         self, progress: BudgetProgress, t_s: float, pose: DeckPose, left: Sequence[PointId]
@@ -68,7 +71,7 @@ class TimeBudget:
 
         None to go home now.
         """
-        elapsed_s = t_s - (progress.begun_s if progress.begun_s is not None else t_s)
+        elapsed_s = progress.before_s + t_s - (progress.begun_s if progress.begun_s is not None else t_s)
         late = elapsed_s / progress.planned_s if progress.planned_s > _FIRST_S else 1.0
         pace = min(max(late, 1.0), _LARGEST_PACE)
         left_s = self.budget_s - elapsed_s

@@ -1,4 +1,4 @@
-"""Assembles the parts of a main loop from a configuration; a survey's plan before anything moves."""
+"""Assembles the parts of a main loop from a configuration and a checkpoint; a survey's plan before anything moves."""
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -6,28 +6,90 @@ from itertools import groupby
 from math import hypot
 from typing import Any
 
-from ccatp.config.models import Config
+import msgspec
+from msgspec.structs import replace
+
+from ccatp.config.models import Config, LimitsConfig
 from ccatp.control.gate import DriveGate
-from ccatp.core import PointId, Stop, StopKind
+from ccatp.core import DeckPose, PointId, Stop, StopKind
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
 from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.survey.heading_recovery import TakeoverState
 from ccatp.survey.planning.route import ORDERS, Route, RoutePlanner
 from ccatp.survey.planning.search import leg_lengths, leg_time, path_time, stop_times
 from ccatp.survey.planning.tour_bound import tour_bound
-from ccatp.survey.state import TakenOver
+from ccatp.survey.state import HELD, IDLE, MEASURING, SETTLING, MissionState, SurveyState, TakenOver
 from ccatp.survey.statechart import Mission, Survey
 
 # The configuration may be calibrated, the robot's own figures are nominal: this much apart they describe two robots.
 RADIUS_TOLERANCE = 0.05
 SENSOR_TOLERANCE_M = 0.005
 
+# Below this a robot that is in a standing state is at rest.
+_STILL_M_S, _STILL_RAD_S = 0.002, 0.01
+_STANDING = (IDLE, SETTLING, MEASURING, HELD, MissionState.DONE)
+# Of a robot that stood: it may have crept, or been touched.
+_STOOD_M, _STOOD_RAD = 0.005, 0.01
+# Of one that moved: the record is up to 0.1 s old, the last command lives for 0.25 s, the wheels run down in 0.1 s.
+_UNSEEN_S = 0.45
+# Within the age of the record it may have begun to move.
+_BEGUN_S = 0.1
+_NO_ROUTE = Route((), (0.0,))
+
+
+class Checkpoint(msgspec.Struct, frozen=True, array_like=True, tag=2, forbid_unknown_fields=True):
+    """What one main loop leaves to the next: the state of the survey, and where the robot was.
+
+    Without route and measured points: the next one plans again, and finds the points in the mission's database. The tag
+    is the number of the format.
+    """
+
+    boot: int
+    seq: int
+    t_s: float
+    elapsed_s: float
+    pose: DeckPose
+    sigma_m: float
+    heading_sigma_rad: float
+    speed_m_s: float
+    rate_rad_s: float
+    state: SurveyState
+
+    @classmethod
+    def of(
+        cls, localizer: Localizer, state: SurveyState, seq: int, t_s: float, elapsed_s: float, boot: int = -1
+    ) -> "Checkpoint":
+        """That of frame ``seq``; ``boot`` is the robot's, whose clock counts from there."""
+        return cls(
+            boot,
+            seq,
+            t_s,
+            elapsed_s,
+            localizer.deck_pose,
+            localizer.position_sigma_m,
+            localizer.heading_sigma_rad,
+            localizer.speed_m_s,
+            localizer.rate_rad_s,
+            replace(state, route=_NO_ROUTE, done=()),
+        )
+
+    def sigmas(self, limits: LimitsConfig) -> tuple[float, float]:
+        """Standard deviations of position (m) and heading (rad) of the robot, which was not observed since."""
+        v, omega = abs(self.speed_m_s), abs(self.rate_rad_s)
+        way_m = turn_rad = 0.0
+        if self.state.mode not in _STANDING or v >= _STILL_M_S or omega >= _STILL_RAD_S:
+            way_m = _UNSEEN_S * (v + _BEGUN_S * limits.a_max_m_s2)
+            turn_rad = _UNSEEN_S * (omega + _BEGUN_S * limits.alpha_max_rad_s2)
+        return hypot(self.sigma_m, way_m, _STOOD_M), hypot(self.heading_sigma_rad, turn_rad, _STOOD_RAD)
+
 
 @dataclass(frozen=True, slots=True)
 class SurveyParts:
-    """The pure parts of a main loop, and what a summary needs to know of the plan."""
+    """The pure parts of a main loop, and what a summary needs to know of the plan.
+
+    ``start``: pose, and its standard deviations (m, rad), of a robot that another main loop left; ``None``: at base.
+    """
 
     cfg: Config
     mirror: Mirror
@@ -36,10 +98,8 @@ class SurveyParts:
     gate: DriveGate
     route: Route
     points: tuple[PointId, ...]
-    already_done: int
     lower_bound_s: float
-    elapsed_s: float = 0.0
-    recovery: TakeoverState | None = None
+    start: tuple[DeckPose, tuple[float, float]] | None = None
 
     def heading_sigma_rad(self) -> float:
         """How well the heading is known. No drive shows the four states theirs: the fix does not reach it."""
@@ -57,23 +117,21 @@ class SurveyParts:
             raise ConfigError(f"robot: the configuration is not of this robot: {'; '.join(problems)}")
 
 
-def assemble(cfg: Config, done: Collection[PointId] = (), recovery: TakeoverState | None = None) -> SurveyParts:
-    """All pure parts of a main loop, the robot at base or where ``recovery`` says.
+def assemble(cfg: Config, done: Collection[PointId] = (), checkpoint: Checkpoint | None = None) -> SurveyParts:
+    """All pure parts of a main loop, the robot at base or where ``checkpoint`` says.
 
     Raises ``PlanError`` (unreachable point).
     """
     mirror = build_mirror(cfg.mirror)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
-    route = plan_survey(cfg, mirror, points, done, calibrates=recovery is None)
-    if recovery is None:
-        localizer = build_localizer(cfg, mirror)
-    else:
-        sigmas = recovery.position_sigma_m, recovery.heading_sigma_rad
-        localizer = build_with_uncertainty(cfg, mirror, recovery.pose, sigmas)
+    route = plan_survey(cfg, mirror, points, done, calibrates=checkpoint is None)
     planner = RoutePlanner(mirror, cfg)
-    mission = Mission(Survey(cfg, mirror, route, planner.home, planner.rejoin, planner.route))
-    if recovery is not None:
-        mission.handle(TakenOver(recovery))
+    survey = Survey(cfg, mirror, route, planner.home, planner.rejoin, planner.route)
+    if checkpoint is None:
+        start, localizer, mission = None, build_localizer(cfg, mirror), Mission(survey)
+    else:
+        start = checkpoint.pose, checkpoint.sigmas(cfg.limits)
+        localizer, mission = build_with_uncertainty(cfg, mirror, *start), Mission(survey, checkpoint.state)
     return SurveyParts(
         cfg=cfg,
         mirror=mirror,
@@ -82,11 +140,18 @@ def assemble(cfg: Config, done: Collection[PointId] = (), recovery: TakeoverStat
         gate=build_gate(cfg),
         route=route,
         points=tuple(points),
-        already_done=len(set(done)),
-        elapsed_s=0.0 if recovery is None else recovery.elapsed_s,
-        recovery=recovery,
         lower_bound_s=path_time(route.stops, mirror.base_pose, cfg.limits, mirror, cfg.etalon.measuring_time_s),
+        start=start,
     )
+
+
+def take_over(cfg: Config, checkpoint: Checkpoint, event: TakenOver) -> SurveyParts:
+    """The parts of a main loop that goes on where another one ended. Raises as ``assemble``."""
+    # What failed, and what there was no time for, is a matter of the state.
+    failed = () if event.is_new_run else (*checkpoint.state.failure_causes, *event.skipped)
+    parts = assemble(cfg, {*event.measured, *failed}, checkpoint)
+    parts.mission.handle(event)
+    return parts
 
 
 def plan_survey(

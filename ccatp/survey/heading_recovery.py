@@ -1,10 +1,9 @@
-"""Finding a doubtful heading by short legs with a fix at each end; what a takeover starts with."""
+"""Finding a doubtful heading by short legs with a fix at each end."""
 
-from math import cos, hypot, sin
-from typing import NamedTuple
+from math import cos, sin
 
 from ccatp.config.models import MissionConfig, RobotConfig
-from ccatp.core import DeckPose, PointId, Stop, StopKind
+from ccatp.core import DeckPose, Stop, StopKind
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.legs import build_body, course_of_heading
 
@@ -62,40 +61,3 @@ class HeadingRecovery:
                 break
             room_m = step_m
         return room_m
-
-
-# Of a robot that stood: it may have crept, or been touched.
-_STOOD_M, _STOOD_RAD = 0.005, 0.01
-# Of one that moved: the record is up to 0.1 s old, the last command lives for 0.25 s, the wheels run down in 0.1 s.
-_UNSEEN_S = 0.45
-# Within the age of the record it may have begun to move.
-_BEGUN_S = 0.1
-
-
-class TakeoverState(NamedTuple):
-    """Where and how to go on after a takeover: deck pose seen last, and how far the robot may be from it now.
-
-    ``abort_cause``: why the robot is on its way home; ``held_cause``: why an operator has to resume it; or empty.
-    """
-
-    pose: DeckPose
-    position_sigma_m: float
-    heading_sigma_rad: float
-    elapsed_s: float = 0.0
-    skipped: tuple[PointId, ...] = ()
-    abort_cause: str = ""
-    held_cause: str = ""
-
-
-def doubted(
-    sigmas: tuple[float, float], speeds: tuple[float, float], accelerations: tuple[float, float], *, stood: bool
-) -> tuple[float, float]:
-    """Standard deviations of position (m) and heading (rad) of a robot that was not observed since ``sigmas``.
-
-    Speeds then and largest accelerations in m/s, rad/s, m/s^2, rad/s^2; ``stood``: it stood and was not to move.
-    """
-    way, turn = (
-        0.0 if stood else _UNSEEN_S * (abs(speed) + _BEGUN_S * largest)
-        for speed, largest in zip(speeds, accelerations, strict=True)
-    )
-    return hypot(sigmas[0], way, _STOOD_M), hypot(sigmas[1], turn, _STOOD_RAD)

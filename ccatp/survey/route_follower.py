@@ -141,7 +141,7 @@ class StateEstimate(msgspec.Struct, frozen=True):
         return self.deck_of(self.pose)
 
 
-class Leg(msgspec.Struct, frozen=True):
+class Leg(msgspec.Struct, frozen=True, tag=True):
     """The leg to a stop, as far as it is driven.
 
     ``motion`` is None before the first frame of the leg; after ``deadline_s`` it takes far longer than it should;

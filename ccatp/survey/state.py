@@ -12,7 +12,6 @@ from ccatp.control.gate import Purpose
 from ccatp.core import PointId, Severity, Stop
 from ccatp.survey.behaviours import Retreat, ReturnHome, Settling
 from ccatp.survey.budget import BudgetProgress
-from ccatp.survey.heading_recovery import TakeoverState
 from ccatp.survey.planning.route import Route
 from ccatp.survey.route_follower import Leg
 
@@ -190,7 +189,7 @@ class HoldState(msgspec.Struct, frozen=True):
         return False
 
 
-class SurveyState(HoldState, frozen=True, kw_only=True):
+class SurveyState(HoldState, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
     """All that a survey knows at one time.
 
     Attributes:
@@ -217,7 +216,7 @@ class SurveyState(HoldState, frozen=True, kw_only=True):
     fix: FixNeed = FixNeed.NONE
     done: tuple[PointId, ...] = ()
     skipped: tuple[PointId, ...] = ()
-    failure_causes: Mapping[PointId, str] = MappingProxyType({})
+    failure_causes: Mapping[PointId, str] = msgspec.field(default_factory=dict)
     due: tuple[PointId, ...] = ()
     retried: frozenset[PointId] = frozenset()
     is_off_route: bool = False
@@ -348,9 +347,16 @@ class EmergencyKnown(NamedTuple):
 
 
 class TakenOver(NamedTuple):
-    """Go on with what another process began; before the first frame. The robot is found before it moves."""
+    """Go on with a state that another process left; before the first frame. The robot is found before it moves.
 
-    recovery: TakeoverState
+    ``measured``, in this order, and ``skipped`` as the mission's database has them; ``elapsed_s``: mission time so far.
+    ``is_new_run``: an operator goes on with what had ended: what failed is tried again, and time counts from here.
+    """
+
+    measured: tuple[PointId, ...]
+    skipped: tuple[PointId, ...] = ()
+    elapsed_s: float = 0.0
+    is_new_run: bool = False
 
 
 class FixStored(NamedTuple):

@@ -1,6 +1,7 @@
 """The survey: from the pose, the danger loop's verdict and events to the next state and a command. Pure."""
 
 from collections.abc import Callable, Collection, Sequence
+from math import inf
 
 from msgspec.structs import replace
 
@@ -16,7 +17,7 @@ from ccatp.conditions import (
 )
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegPhase
-from ccatp.core import DeckPose, EventCode, PointId, Stop, StopKind, Verdict
+from ccatp.core import DeckPose, EventCode, PointId, Severity, Stop, StopKind, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import (
     HOLD_POSITION,
@@ -27,7 +28,7 @@ from ccatp.survey.behaviours import (
     ReturnHome,
     Settling,
 )
-from ccatp.survey.budget import TimeBudget
+from ccatp.survey.budget import BudgetProgress, TimeBudget
 from ccatp.survey.failsafe import ROWS, HoldRules
 from ccatp.survey.heading_recovery import MOST_LEGS, HeadingRecovery
 from ccatp.survey.planning.escape import is_on_drive
@@ -39,6 +40,7 @@ from ccatp.survey.state import (
     DONE,
     DRIVING,
     HELD,
+    IDLE,
     MEASURING,
     RETURNING,
     SETTLING,
@@ -48,6 +50,7 @@ from ccatp.survey.state import (
     FixFailed,
     FixNeed,
     FixStored,
+    Hold,
     MissionEvent,
     PointMissed,
     SurveyInput,
@@ -382,12 +385,49 @@ class Survey(HoldRules[SurveyState]):
         return s, None
 
     def _take_over(self, s: SurveyState, event: TakenOver) -> SurveyState:
-        recovery = event.recovery
-        s, _ = self.handle(s, TrackingGap())
-        s = replace(s, skipped=(*s.skipped, *recovery.skipped), abort_cause=recovery.abort_cause)
-        if recovery.held_cause:
-            s = self.hold(s, recovery.held_cause, by_hand=True)
-        return replace(s, emergency_epoch=None) if recovery.abort_cause else s
+        """What had a meaning in the other process only is dropped: what it was doing, its times, the last verdict."""
+        measured, skipped, elapsed_s, is_new_run = event
+        if is_new_run:
+            if s.mode is DONE and s.outcome is not SurveyOutcome.STOPPED:
+                s = self.begin()
+            s = replace(s, failure_causes={}, due=(), retried=frozenset(), failures=0, budget=BudgetProgress())
+        # The database is newer than the state.
+        failed = {point: "not measured" for point in skipped if point not in s.failure_causes}
+        causes = {point: why for point, why in {**s.failure_causes, **failed}.items() if point not in measured}
+        is_held = s.is_held_by_hand
+        return replace(
+            s,
+            route=self._route,
+            mode=HELD if is_held else IDLE,
+            outcome=SurveyOutcome.NONE,
+            cause=s.cause if is_held else "",
+            stop_index=0,
+            behaviour=None,
+            hold=Hold(is_held, is_held and s.hold.is_fault and not is_new_run),
+            fix=FixNeed.RELOCALIZE,
+            heading_legs_left=MOST_LEGS,
+            done=measured,
+            skipped=skipped,
+            failure_causes=causes,
+            due=tuple(point for point in s.due if point not in failed and point not in measured),
+            budget=s.budget._replace(begun_s=None, before_s=elapsed_s),
+            arrived_at=None,
+            is_missed=False,
+            corrected=None,
+            inflates_covariance=False,
+            wants_calibration=False,
+            interlock="",
+            is_latched=False,
+            is_shaking=False,
+            severity=Severity.NONE,
+            is_slow=False,
+            is_found=False,
+            has_looked=False,
+            stuck_s=None,
+            resumes_after_s=-inf,
+            stands_until_s=-inf,
+            recoveries_s=(),
+        )
 
     def _recover(self, s: SurveyState, cause: str, t_s: float) -> SurveyState:
         """Hold, and go on with a fix; what comes again and again is a fault."""
@@ -482,9 +522,9 @@ def _without(points: tuple[PointId, ...], point: PointId) -> tuple[PointId, ...]
 class Mission:
     """One survey under way: the state, shared by those who send frames and those who send events."""
 
-    def __init__(self, survey: Survey) -> None:
+    def __init__(self, survey: Survey, state: SurveyState | None = None) -> None:
         self.survey = survey
-        self.state = survey.begin()
+        self.state = state or survey.begin()
 
     def step(self, motion: StateEstimate, verdict: Verdict | None) -> MissionCommand:
         """One frame."""

@@ -155,7 +155,7 @@ def restarted(seed: int, **overrides: object) -> Config:
 
 def check(rehearsal: RestartedSurvey) -> None:
     result = rehearsal.run()
-    measured = rehearsal.measured
+    measured = rehearsal.mission.state.done
     assert result.outcome == "complete", result.cause
     assert rehearsal.states, "nobody was killed"
     assert len(measured) == len(set(measured)) == 9

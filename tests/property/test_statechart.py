@@ -1,8 +1,9 @@
-"""The pure step of a survey: no order of verdicts and events makes it move against a row, or forget a point."""
+"""The pure step of a survey: no order of verdicts, events and kills makes it move against a row, or forget a point."""
 
 import random
 from itertools import product
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
@@ -24,6 +25,7 @@ from ccatp.survey.state import (
     EstimateDiverged,
     Fault,
     FixFailed,
+    FixNeed,
     FixStored,
     Interrupted,
     Pause,
@@ -31,8 +33,10 @@ from ccatp.survey.state import (
     Resume,
     SurveyInput,
     SurveyState,
+    TakenOver,
     TrackingGap,
 )
+from ccatp.survey.statechart import Survey
 from tests.support.mission_story import ABORT, FREE, FRONT_OFF, Story
 
 DENIED = replace(FREE, forward=False, reverse=False, turn=False)
@@ -100,14 +104,45 @@ def check(before: SurveyState, verdict: Verdict | None, s: SurveyState, command:
     assert s.is_faulted <= (s.mode in (HELD, DONE))
 
 
+def decoded(s: SurveyState) -> SurveyState:
+    """The state behind a checkpoint: it is the same."""
+    found = msgspec.msgpack.decode(msgspec.msgpack.encode(s), type=SurveyState)
+    assert found == s
+    assert list(found.failure_causes) == list(s.failure_causes)
+    return found
+
+
+def killed(survey: Survey, old: SurveyState, s: SurveyState, rng: random.Random) -> SurveyState:
+    """Another process goes on with an older state, and with the database as it is now."""
+    event = TakenOver(s.done, s.skipped, 1.0, is_new_run=rng.random() < 0.3)
+    after, refusal = survey.handle(old, event)
+    assert refusal is None
+    assert after.fix is FixNeed.RELOCALIZE  # before it moves
+    assert after.is_held_by_hand is old.is_held_by_hand
+    assert after.done == s.done
+    assert not {*after.due, *after.failure_causes} & set(s.done)
+    if not event.is_new_run:
+        assert (after.skipped, after.abort_cause) == (s.skipped, old.abort_cause)
+        assert after.is_faulted is (old.mode is HELD and old.is_faulted)
+        assert set(s.skipped) <= after.failure_causes.keys()
+        assert after.retried == old.retried
+    return after
+
+
 def walk(config: Config, mirror: Mirror, seed: int, steps: int) -> int:
     """Random steps, survey after survey; the number of those that moved the robot."""
     rng, story, moved = random.Random(seed), Story(config, mirror), 0
     names, name = list(VERDICTS), "free"
-    for _ in range(steps):
+    old = story.mission.state
+    for step in range(steps):
         survey, s = story.mission.survey, story.mission.state
+        same = decoded(s)
+        old = same if step % 10 == 0 else old
+        if rng.random() < 0.001:
+            s = killed(survey, old, s, rng)
         if s.mode is DONE:
             story = Story(config, mirror)
+            old = story.mission.state
             continue
         for event in events(s, story.t, rng):
             after, refusal = survey.handle(s, event)

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeVar, cast
 
+import msgspec
 import numpy as np
 
 from ccatp.config.models import Config
@@ -28,10 +29,9 @@ from ccatp.records.store import MissionStore, PlannedPoint
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.studies.faults_study import FaultySilRun
 from ccatp.studies.sil_run import SilRun
-from ccatp.survey.composition import assemble
+from ccatp.survey.composition import Checkpoint, take_over
 from ccatp.survey.fix_gate import FixGate, nis_of
-from ccatp.survey.heading_recovery import TakeoverState, doubted
-from ccatp.survey.state import DRIVING, RETURNING, TURNING, Fault, FixFailed, FixStored, MissionState, SurveyInput
+from ccatp.survey.state import Fault, FixFailed, FixStored, MissionState, SurveyInput, TakenOver
 from ccatp.survey.statechart import Mission
 from tests.support.virtual_time import VirtualLoop
 
@@ -343,7 +343,6 @@ def failing(_measured: LaserRequest, _fix: Fix) -> Fix:
 
 # -- main loops that are killed ----------------------------------------------------------------------------------------
 
-MOVING = (TURNING, DRIVING, RETURNING, MissionState.BACKING_OFF)
 RECORD_FRAMES, SILENT_FRAMES = 10, 150
 
 
@@ -358,25 +357,21 @@ class RestartedSurvey(SilRun):
     def __init__(self, cfg: Config, kills: set[int]) -> None:
         super().__init__(cfg, with_track=False)
         self._kills = kills
-        self._records: list[tuple[DeckPose, tuple[float, float], tuple[float, float], MissionState]] = []
-        self.done: list[PointId] = []
+        self._checkpoint = b""
         self.states: list[MissionState] = []
         self.first_moves_m: list[float] = []
 
     def _serve(self, frame: Sensors, dt_s: float) -> None:
         super()._serve(frame, dt_s)
         if frame.seq % RECORD_FRAMES == 0:
-            localizer = self.localizer
-            sigmas = localizer.position_sigma_m, localizer.heading_sigma_rad
-            speeds = localizer.speed_m_s, localizer.rate_rad_s
-            self._records.append((localizer.deck_pose, sigmas, speeds, self.mission.state.mode))
+            record = Checkpoint.of(self.localizer, self.mission.state, frame.seq, frame.t, frame.t)
+            self._checkpoint = msgspec.msgpack.encode(record)
         if frame.seq in self._kills:
             self._die()
 
     def _die(self) -> None:
         robot = self.robot
         self.states.append(self.mission.state.mode)
-        self.done += self.mission.state.done
         robot.lose("controller")
         for _ in range(SILENT_FRAMES):
             robot.advance()
@@ -385,18 +380,10 @@ class RestartedSurvey(SilRun):
         self._take_over()
 
     def _take_over(self) -> None:
-        cfg = self.cfg
-        pose, sigmas, speeds, state = self._records[-1]
-        limits = cfg.limits.a_max_m_s2, cfg.limits.alpha_max_rad_s2
-        sigma_m, sigma_rad = doubted(sigmas, speeds, limits, stood=state not in MOVING)
-        recovery = TakeoverState(pose, sigma_m, sigma_rad, abort_cause=self.mission.state.abort_cause)
-        parts = assemble(cfg, self.done, recovery)
-        truth = self.robot.world.plant
-        self.first_moves_m.append(hypot(truth.x_m - pose.x_m, truth.y_m - pose.y_m) / sigma_m)
+        cfg, before = self.cfg, self.mission.state
+        checkpoint = msgspec.msgpack.decode(self._checkpoint, type=Checkpoint)
+        parts = take_over(cfg, checkpoint, TakenOver(before.done, before.skipped, checkpoint.elapsed_s))
+        truth, pose = self.robot.world.plant, checkpoint.pose
+        self.first_moves_m.append(hypot(truth.x_m - pose.x_m, truth.y_m - pose.y_m) / checkpoint.sigmas(cfg.limits)[0])
         self.localizer, self.mission, self.gate = parts.localizer, parts.mission, parts.gate
         self.sent = SentDrives(cfg.robot, self.robot.frame_s)
-
-    @property
-    def measured(self) -> list[PointId]:
-        """All points measured, by whichever main loop, in their order."""
-        return [*self.done, *self.mission.state.done]

@@ -1,19 +1,24 @@
-"""The checkpoint: whatever byte is wrong, one whole record remains."""
+"""The checkpoint: whatever byte is wrong, one whole record remains; one of another version is refused."""
 
+import zlib
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from ccatp.records.checkpoint import Checkpoint, CheckpointError, CheckpointFile, read_checkpoint
+from ccatp.records.checkpoint import CheckpointError, CheckpointFile, read_checkpoint
+
+SLOT = 65536
 
 
-def record(count: int) -> Checkpoint:
-    return Checkpoint(
-        count=count, boot=7, seq=10 * count, t_s=0.1 * count, x_m=1.25, y_m=-0.5, heading_rad=0.75, sigma_m=1e-4,
-        heading_sigma_rad=1e-3, speed_m_s=0.1, rate_rad_s=0.0, state="driving", abort_cause="", held_cause="",
-        elapsed_s=3.0, last_fix="1-2-3",
-    )  # fmt: skip
+class Place(msgspec.Struct, frozen=True, tag=2, forbid_unknown_fields=True):
+    number: int
+    x_m: float = 1.25
+    note: str = "driving"
+
+
+class NewerPlace(Place, frozen=True, tag=2, forbid_unknown_fields=True):
+    y_m: float = -0.5
 
 
 @pytest.mark.parametrize("is_patient", [True, False])
@@ -21,56 +26,74 @@ def test_the_newest_record_is_read_back(tmp_path: Path, is_patient: bool) -> Non
     path = tmp_path / "checkpoint"
     file = CheckpointFile(path, is_patient=is_patient)
     for count in range(1, 8):
-        file.write(record(count), is_durable=count % 3 == 0)
+        file.write(Place(count), is_durable=count % 3 == 0)
     file.close()
-    found = read_checkpoint(path)
-    assert found is not None
-    assert (found.count, found.x_m, found.last_fix) == (7, 1.25, "1-2-3")
+    assert read_checkpoint(path, Place) == Place(7)
     assert file.failure == ""
+    again = CheckpointFile(path, is_patient=is_patient)
+    again.write(Place(8))
+    again.close()
+    assert read_checkpoint(path, Place) == Place(8)
 
 
 def test_nothing_there(tmp_path: Path) -> None:
-    assert read_checkpoint(tmp_path / "none") is None
+    assert read_checkpoint(tmp_path / "none", Place) is None
     (tmp_path / "empty").touch()
-    assert read_checkpoint(tmp_path / "empty") is None
+    assert read_checkpoint(tmp_path / "empty", Place) is None
 
 
 @pytest.mark.fault("P16")
 def test_flipped_bits_and_cuts_leave_a_whole_record_or_none(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint"
     file = CheckpointFile(path, is_patient=True)
-    written = {count: msgspec.to_builtins(record(count)) for count in (1, 2)}
-    file.write(record(1))
-    file.write(record(2))
+    file.write(Place(1))
+    file.write(Place(2))
     file.close()
     whole = path.read_bytes()
-    for offset in (*range(8), *range(8, len(whole), 5)):  # length and checksum of a slot, and all over the records
+    length = len(whole) - SLOT  # of either slot: length, checksum, count and record
+    for offset in (*range(length), *range(SLOT, len(whole))):
         path.write_bytes(whole[:offset] + bytes([whole[offset] ^ 1 << offset % 8]) + whole[offset + 1 :])
-        found = read_checkpoint(path)
-        assert found is not None  # one slot is untouched
-        assert msgspec.to_builtins(found) == written[found.count]
-    whole_from = 8 + int.from_bytes(whole[:4], "little")  # length and checksum, and the record of an even count
-    for length in range(1, len(whole), 7):
-        path.write_bytes(whole[:length])
-        if length < whole_from:  # nobody knows where the robot is, and least of all is it at base
+        assert read_checkpoint(path, Place) == Place(1 if offset < length else 2)  # the other slot is untouched
+    for cut in (*range(1, length), *range(length, SLOT, 997), *range(SLOT, len(whole))):
+        path.write_bytes(whole[:cut])
+        if cut < length:  # nobody knows where the robot is, and least of all is it at base
             with pytest.raises(CheckpointError, match="damaged"):
-                read_checkpoint(path)
+                read_checkpoint(path, Place)
         else:
-            found = read_checkpoint(path)
-            assert found is not None
-            assert msgspec.to_builtins(found) == written[found.count]
+            assert read_checkpoint(path, Place) == Place(2)
 
 
-def test_a_sound_checksum_over_something_else_is_no_record(tmp_path: Path) -> None:
-    import zlib
+def test_a_record_longer_than_a_slot_takes_the_older_one_with_it(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint"
+    file = CheckpointFile(path, is_patient=True)
+    for number in (1, 2, 3):
+        file.write(Place(number, note=SLOT * "x"))
+        found = read_checkpoint(path, Place)
+        assert found is not None
+        assert found.number == number
+    file.close()
 
-    body = b'{"count": 1}'
+
+@pytest.mark.parametrize(
+    "record", [{"count": 1, "boot": 7}, {"type": 1, "number": 1}, NewerPlace(1), {"type": 2, "x_m": 0.0}, 1]
+)
+def test_a_record_of_another_version_is_refused(tmp_path: Path, record: object) -> None:
+    path = tmp_path / "checkpoint"
+    file = CheckpointFile(path, is_patient=True)
+    file.write(record)  # type: ignore[arg-type]
+    file.close()
+    refusal = r"^\S*checkpoint: of another version of ccatp \(.*\), so the robot's place is not known; set it at base"
+    with pytest.raises(CheckpointError, match=refusal):
+        read_checkpoint(path, Place)
+
+
+def test_a_record_of_before_is_refused(tmp_path: Path) -> None:
+    """Slots of 4096 bytes with JSON behind length and checksum."""
+    body = b'{"count": 1, "boot": 7, "state": "driving"}'
     path = tmp_path / "checkpoint"
     path.write_bytes(len(body).to_bytes(4, "little") + zlib.crc32(body).to_bytes(4, "little") + body)
-    with pytest.raises(
-        CheckpointError, match=r"checkpoint: damaged, so the robot's place is not known; set it at base"
-    ):
-        read_checkpoint(path)
+    with pytest.raises(CheckpointError, match="of another version of ccatp"):
+        read_checkpoint(path, Place)
 
 
 def test_a_disk_that_refuses_is_told_and_does_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,8 +103,8 @@ def test_a_disk_that_refuses_is_told_and_does_no_harm(tmp_path: Path, monkeypatc
     file = CheckpointFile(tmp_path / "checkpoint", is_patient=True)
     with monkeypatch.context() as patch:
         patch.setattr("os.pwrite", refuse)
-        file.write(record(1))
+        file.write(Place(1))
     assert file.failure == "No space left on device"
-    file.write(record(2))
+    file.write(Place(2))
     assert file.failure == ""
     file.close()

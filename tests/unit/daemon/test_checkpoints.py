@@ -1,25 +1,48 @@
 """Parts, database and checkpoint of a main loop: new, resumed, taken over."""
 
+import random
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from math import nan
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import msgspec
 import numpy as np
 import pytest
 from msgspec import structs
 
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, EventCode, Fix, StopKind
-from ccatp.daemon.checkpoints import StoreUnusable, build_parts, in_force_of
+from ccatp.core import DeckPose, EventCode, Fix, PointId, Severity, StopKind, Verdict
+from ccatp.daemon.checkpoints import CheckpointWriter, StoreUnusable, build_parts
 from ccatp.daemon.process import Endpoints, ProcessArgs
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello, RobotData
+from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import build_mirror
+from ccatp.records.checkpoint import FILE, CheckpointFile, read_checkpoint
 from ccatp.records.store import MissionStore
-from ccatp.survey.composition import SurveyParts
-from ccatp.survey.state import Abort, MissionState, Pause, StopHere
+from ccatp.survey.behaviours import MissionCommand
+from ccatp.survey.budget import BudgetProgress, TimeBudget
+from ccatp.survey.composition import Checkpoint, SurveyParts
+from ccatp.survey.planning.route import Route
+from ccatp.survey.state import (
+    Abort,
+    Fault,
+    FixFailed,
+    FixNeed,
+    FixStored,
+    MissionState,
+    Pause,
+    StopHere,
+    SurveyOutcome,
+    SurveyState,
+    TakenOver,
+)
+from ccatp.survey.statechart import Mission, Survey
 from tests.support.mission_story import ABORT, FREE, Story, from_first_leg
 
 
@@ -51,7 +74,7 @@ def hello(config: Config, **changes: Any) -> Hello:
 def test_a_plan_measures_every_point_once(parts: SurveyParts) -> None:
     points = [stop.point for stop in parts.route.stops if stop.kind is StopKind.MEASURE]
     assert len(points) == len(set(points)) == parts.total_points == 9
-    assert parts.already_done == 0
+    assert parts.mission.state.done == ()
     assert 0.0 < parts.lower_bound_s < 100.0  # 40 s of it are the calibration drive
 
 
@@ -88,14 +111,17 @@ def test_a_store_is_not_overwritten_and_a_resumed_plan_leaves_out_what_is_measur
         build(where)
     again, store = build(replace(where, is_resuming=True))
     store.close()
-    assert (again.already_done, again.total_points) == (1, 9)
+    assert (again.mission.state.done, again.total_points) == ((first,), 9)
     assert first not in {stop.point for stop in again.route.stops}
 
+
+# -- taken over --------------------------------------------------------------------------------------------------------
 
 QUAKE = structs.replace(
     FREE, code=EventCode.ABORTED, cause="emergency: earthquake", forward=False, reverse=False, turn=False, raised=1,
     is_shaking=True,
 )  # fmt: skip
+FIX = Fix(1.0, (0.0, 0.0, 0.0), tuple(np.eye(3).ravel().tolist()), 1.0, (1, 2, 3, 4), 0.0)
 
 
 @pytest.fixture
@@ -106,13 +132,29 @@ def driving(config: Config) -> Story:
     return story
 
 
-def test_a_pause_and_an_abort(driving: Story) -> None:
+def taken_over(story: Story, **event: Any) -> SurveyState:
+    """What another main loop begins with."""
+    survey, state = story.mission.survey, story.mission.state
+    after, _ = survey.handle(state, TakenOver(**{"measured": state.done, "skipped": state.skipped, **event}))
+    assert after.fix is FixNeed.RELOCALIZE
+    assert (after.behaviour, after.corrected, after.interlock, after.severity) == (None, None, "", Severity.NONE)
+    return after
+
+
+def in_force(state: SurveyState) -> tuple[str, str]:
+    """Cause of an abort, and of a hold that an operator has to end."""
+    return state.abort_cause, state.cause if state.is_held_by_hand else ""
+
+
+@pytest.mark.parametrize("is_new_run", [False, True])
+def test_a_pause_and_an_abort(driving: Story, is_new_run: bool) -> None:
     mission = driving.mission
-    assert in_force_of(mission.state) == ("", "")
+    assert in_force(taken_over(driving, is_new_run=is_new_run)) == ("", "")
     driving.frame(ABORT)
-    assert in_force_of(mission.state) == ("fire", "")
+    assert in_force(taken_over(driving, is_new_run=is_new_run)) == ("fire", "")
     assert mission.handle(Pause("operator")) is None
-    assert in_force_of(mission.state) == ("fire", "operator")
+    after = taken_over(driving, is_new_run=is_new_run)
+    assert (in_force(after), after.emergency_epoch) == (("fire", "operator"), 1)  # that emergency is not new
 
 
 @pytest.mark.fault("O1")
@@ -120,15 +162,201 @@ def test_an_earthquake_is_kept_by_the_danger_loop(driving: Story) -> None:
     """Who takes over is held by the next verdict, and goes home when it is over; nobody has to resume."""
     driving.frame(QUAKE)
     assert driving.mission.state.is_paused
-    assert in_force_of(driving.mission.state) == ("emergency: earthquake", "")
+    after = taken_over(driving)
+    assert (in_force(after), after.is_paused, after.full_fans) == (("emergency: earthquake", ""), False, True)
+    driving.mission.state = after
+    driving.frame(QUAKE)
+    assert driving.mission.state.is_paused
 
 
 def test_what_was_stopped_on_its_way_home_goes_home_when_it_goes_on(driving: Story) -> None:
     assert driving.mission.handle(Abort("operator")) is None
     assert driving.mission.handle(StopHere()) is None
-    assert in_force_of(driving.mission.state) == ("operator", "")
+    after = taken_over(driving, is_new_run=True)
+    assert (in_force(after), after.mode) == (("operator", ""), MissionState.IDLE)
 
 
 def test_what_is_at_base_has_nothing_in_force(driving: Story) -> None:
     driving.until_state(MissionState.DONE, ABORT)
-    assert in_force_of(driving.mission.state) == ("", "")
+    after = taken_over(driving, is_new_run=True)
+    assert (in_force(after), after.emergency_epoch, after.outcome) == (("", ""), 0, SurveyOutcome.NONE)
+    assert in_force(taken_over(driving)) == ("fire", "")  # died there: it is not another survey
+
+
+def test_a_fault_waits_for_an_operator_who_begins_again_instead(driving: Story) -> None:
+    driving.mission.handle(Fault("a wheel is blocked"))
+    after = taken_over(driving)
+    assert (in_force(after), after.is_faulted) == (("", "a wheel is blocked"), True)
+    after = taken_over(driving, is_new_run=True)
+    assert (in_force(after), after.is_faulted) == (("", "a wheel is blocked"), False)
+
+
+def test_what_failed_and_the_time_that_passed_outlive_a_process(driving: Story) -> None:
+    first, second, third = (stop.point for stop in driving.stops)
+    assert first
+    assert second
+    assert third
+    budget = BudgetProgress(begun_s=1.0, planned_s=50.0, next_s=5.0)
+    driving.mission.state = structs.replace(
+        driving.mission.state, skipped=(first,), failure_causes={first: "no lengths", third: "no time for it"},
+        due=(first, second), retried=frozenset((first, third)), failures=2, backoffs=1, budget=budget, full_fans=True,
+    )  # fmt: skip
+    after = taken_over(driving, elapsed_s=80.0)
+    kept = ("skipped", "failure_causes", "due", "retried", "failures", "backoffs", "full_fans", "request")
+    for name in kept:
+        assert getattr(after, name) == getattr(driving.mission.state, name), name
+    assert after.budget == BudgetProgress(None, 50.0, 5.0, before_s=80.0)
+    # Measured, or failed, after the checkpoint was written.
+    after = taken_over(driving, measured=(first,), skipped=(second,))
+    assert (after.done, after.skipped, after.due) == ((first,), (second,), ())
+    assert after.failure_causes == {third: "no time for it", second: "not measured"}
+    # An operator begins again: all that is not measured is tried.
+    after = taken_over(driving, skipped=(), is_new_run=True)
+    assert (after.skipped, after.failure_causes, after.due, after.retried) == ((), {}, (), frozenset())
+    assert (after.budget, after.failures) == (BudgetProgress(), 0)
+
+
+def test_the_time_before_a_kill_counts(config: Config) -> None:
+    mirror = build_mirror(config.mirror)
+    budget = TimeBudget(600.0, mirror, config.limits, 1.0)
+    points = [PointId(5, 5, k) for k in (1, 2, 3)]
+    progress = BudgetProgress(begun_s=0.0)
+    assert budget.review(progress, 100.0, mirror.base_pose, points) is points
+    assert budget.review(progress._replace(before_s=495.0), 100.0, mirror.base_pose, points) is None
+    assert budget.progress(progress._replace(before_s=9.0), mirror.base_pose, points).before_s == 9.0
+
+
+class Doomed(Story):
+    """Point 2 cannot be measured; main is killed after the given frames, and another one goes on with what is kept."""
+
+    def __init__(self, config: Config, kills: set[int]) -> None:
+        super().__init__(config, build_mirror(config.mirror))
+        self.survey = Survey(config, self.mirror, self.route(self.stops), self.plan_home, self.plan_rest, self.plan_due)
+        self.mission, self.auto_fix = Mission(self.survey), False
+        self.kills, self.tries, self.frames = kills, list[PointId](), 0
+        self.kept = self.mission.state
+
+    def plan_due(self, _start: DeckPose, due: Sequence[PointId]) -> Route:
+        return self.route(tuple(stop for point in due for stop in self.stops if stop.point == point))
+
+    def frame(self, verdict: Verdict | None = FREE) -> MissionCommand:
+        order, mission = super().frame(verdict), self.mission
+        point = mission.state.measuring_point
+        if order.measure and point is not None:
+            self.tries.append(point)
+        if order.measure:
+            failed = point is not None and point.point == 2
+            mission.handle(FixFailed(point, "no lengths") if failed else FixStored(point))
+        if self.frames % 10 == 0:
+            self.kept = msgspec.msgpack.decode(msgspec.msgpack.encode(mission.state), type=SurveyState)
+        self.frames += 1
+        if self.frames in self.kills:
+            done, skipped = mission.state.done, mission.state.skipped
+            mission.state, _ = self.survey.handle(self.kept, TakenOver(done, skipped, self.t))
+        return order
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_point_is_retried_once_however_often_main_is_killed(config: Config, seed: int) -> None:
+    cfg = from_first_leg(config)
+    alone = Doomed(cfg, set())
+    alone.until_state(MissionState.DONE)
+    assert [point.point for point in alone.tries] == [1, 2, 3, 2]
+    killed = Doomed(cfg, set(random.Random(seed).sample(range(1, 2 * alone.frames), 6)))
+    killed.until(lambda: killed.mission.state.mode is MissionState.DONE, frames=20_000)
+    here, there = killed.mission.state, alone.mission.state
+    assert (here.done, here.skipped, here.outcome) == (there.done, there.skipped, there.outcome)
+    assert here.failure_causes == there.failure_causes
+    assert killed.tries == alone.tries
+
+
+# -- in files ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_survey_goes_on_from_its_directory(tmp_path: Path) -> None:
+    where = args(load_config(None, {"run.panels": 1}), tmp_path)
+    built, store = build(where)
+    one, two, three, *_ = (stop.point for stop in built.route.stops if stop.point is not None)
+    store.record_fix(one, FIX, DeckPose(0.0, 0.0, 0.0)).result(5.0)
+    store.record_skipped(two, 2.0).result(5.0)
+    built.mission.state = structs.replace(
+        built.mission.state, skipped=(two,), failure_causes={two: "no lengths", three: "no time for it"}
+    )
+    assert built.mission.handle(Fault("a wheel is blocked")) is None
+    writer = CheckpointWriter(tmp_path, built.localizer, built.mission, is_patient=True)
+    writer.boot = 7
+    assert writer.is_due()
+    writer.write(3, 0.03, 12.5)
+    writer.close()
+    store.close()
+
+    restarted, store = build(replace(where, is_restarted=True))
+    store.close()
+    state = restarted.mission.state
+    assert (state.mode, state.cause, state.is_faulted) == (MissionState.HELD, "a wheel is blocked", True)
+    assert (state.done, state.skipped, state.budget.before_s) == ((one,), (two,), 12.5)
+    assert state.failure_causes == {two: "no lengths", three: "no time for it"}
+    assert len({stop.point for stop in state.route.stops} - {None}) == 6
+    assert restarted.start is not None
+    assert restarted.start[0] == built.localizer.deck_pose
+    assert restarted.start[1][0] >= 0.005  # it stood, and may have been touched
+    assert restarted.localizer.position_sigma_m == pytest.approx(restarted.start[1][0], rel=1e-9)
+
+    resumed, store = build(replace(where, is_resuming=True, is_held=True))
+    store.close()
+    state = resumed.mission.state
+    assert (state.mode, state.cause, state.is_faulted) == (MissionState.HELD, "a wheel is blocked", False)
+    assert (state.done, state.skipped, state.failure_causes, state.budget.before_s) == ((one,), (), {}, 0.0)
+    assert len({stop.point for stop in state.route.stops} - {None}) == 8
+
+
+def test_it_is_written_ten_times_a_second_at_once_in_a_hold_or_abort_and_never_without_a_place(
+    driving: Story, tmp_path: Path
+) -> None:
+    localizer = SimpleNamespace(
+        deck_pose=DeckPose(1.0, 2.0, 0.5), position_sigma_m=1e-4, heading_sigma_rad=1e-3, speed_m_s=0.1, rate_rad_s=0.2
+    )
+    mission, seqs = driving.mission, []
+    writer = CheckpointWriter(tmp_path, cast(Localizer, localizer), mission, is_patient=True)
+    for seq in range(60):
+        if seq == 15:
+            mission.handle(Abort("fire"))
+        if seq == 38:
+            mission.handle(Pause("operator"))
+        if seq == 42:
+            mission.handle(Fault("x"))
+        if seq == 55:
+            localizer.deck_pose = DeckPose(nan, 0.0, 0.0)
+        if writer.is_due():
+            writer.write(seq, 0.01 * seq, 0.02 * seq)
+        writer.close()
+        found = read_checkpoint(tmp_path / FILE, Checkpoint)
+        writer._file = CheckpointFile(tmp_path / FILE, is_patient=True)
+        assert found is not None
+        seqs.append(found.seq)
+    writer.close()
+    assert found is not None
+    assert [k for k, seq in enumerate(seqs) if k == seq] == [0, 10, 15, 25, 35, 38, 42, 52]
+    assert (found.t_s, found.elapsed_s, found.boot) == (0.52, 1.04, -1)
+    assert (found.pose, found.sigma_m, found.heading_sigma_rad) == (DeckPose(1.0, 2.0, 0.5), 1e-4, 1e-3)
+    assert (found.speed_m_s, found.rate_rad_s) == (0.1, 0.2)
+    assert found.state == structs.replace(mission.state, route=Route((), (0.0,)), done=())
+
+
+@pytest.mark.parametrize(
+    ("state", "v", "omega", "sigmas"),
+    [
+        (MissionState.SETTLING, 0.0, 0.0, (0.005, 0.010)),
+        (MissionState.HELD, 0.0019, -0.0099, (0.005, 0.010)),
+        (MissionState.HELD, -0.002, 0.0, (0.0110, 0.0905)),
+        (MissionState.HELD, 0.0, 0.01, (0.0103, 0.0950)),
+        (MissionState.DRIVING, 0.0, 0.0, (0.0103, 0.0905)),
+        (MissionState.DRIVING, -0.1, 0.5, (0.0542, 0.3152)),
+    ],
+)
+def test_a_robot_that_was_not_observed_may_be_elsewhere(
+    driving: Story, state: MissionState, v: float, omega: float, sigmas: tuple[float, float]
+) -> None:
+    survey_state = structs.replace(driving.mission.state, mode=state)
+    found = Checkpoint(1, 1, 0.01, 0.01, DeckPose(0.0, 0.0, 0.0), 1e-4, 1e-3, v, omega, survey_state)
+    assert found.sigmas(driving.config.limits) == pytest.approx(sigmas, abs=1e-4)  # as they are written here
