@@ -1,6 +1,6 @@
 """Driving among beacons, on a vehicle that does what it is told: arrives, follows, keeps away, goes round."""
 
-from math import cos, hypot, pi, sin
+from math import hypot, pi
 
 import pytest
 from numpy.random import default_rng
@@ -8,13 +8,9 @@ from numpy.random import default_rng
 from ccatp.beacons.pilot import BackOff, BeaconPilot, FollowState, PilotState, TargetSight
 from ccatp.beacons.steering import (
     HALT,
-    BearingToPoint,
     FuzzyGapError,
     Point,
     Sugeno,
-    WaypointList,
-    WaypointSteering,
-    aim_at,
 )
 from ccatp.config.beacon_models import FuzzyConfig, RadioConfig
 from ccatp.config.load import load_radio_config
@@ -45,21 +41,6 @@ def test_a_loop_of_waypoints_is_visited(kind: str, mode: str) -> None:
         robot.step(SimDriveCommand(*drive), 0.1)
     assert pilot.waypoints.reached == 4
     assert drive == HALT
-
-
-def test_steering_is_proportional_and_limited() -> None:
-    cfg = config()
-    driver = WaypointSteering(cfg.control, cfg.vehicle)
-    assert driver.drive(BearingToPoint(1.0, 0.2), 0.1).steer_rad == pytest.approx(1.2 * 0.2)
-    assert driver.drive(BearingToPoint(1.0, -2.0), 0.1).steer_rad == -cfg.vehicle.steer_max_rad
-
-
-def test_waypoints_begin_again_only_where_they_loop() -> None:
-    once = WaypointList([(0.0, 0.0)], 0.1, loops=False)
-    assert once.visit((0.0, 0.0, 0.0)) is None
-    again = WaypointList([(0.0, 0.0), (1.0, 0.0)], 0.1, loops=True)
-    assert again.visit((0.0, 0.0, 0.0)) == (1.0, 0.0)
-    assert again.visit((1.0, 0.0, 0.0)) == (0.0, 0.0)
 
 
 def follow(cfg: RadioConfig, start: tuple[float, float, float], path: list[tuple[float, float]]) -> list[float]:
@@ -146,16 +127,6 @@ def test_nothing_is_backed_into_that_was_seen_before() -> None:
     assert drive.speed_m_s == 0.0
 
 
-def test_backing_off_turns_the_vehicle_towards_the_target() -> None:
-    for kind in ("ackermann", "differential"):
-        cfg = config(vehicle__kind=kind)
-        robot = vehicle(cfg, (0.0, 0.0, 0.0))
-        before = aim_at(robot.pose, (cos(0.5), sin(0.5))).error_rad
-        for _ in range(20):
-            robot.step(SimDriveCommand(*WaypointSteering(cfg.control, cfg.vehicle).away(0.1, before)), 0.1)
-        assert robot.pose.heading_rad > 0.0
-
-
 def two_terms(rules: list[dict[str, object]]) -> FuzzyConfig:
     terms = {"low": (-1.0, -1.0, 0.0, 1.0), "high": (0.0, 1.0, 9.0, 9.0)}
     inputs = {"a": {"terms": terms}, "b": {"terms": terms}}
@@ -185,16 +156,6 @@ def test_output_is_the_mean_weighted_by_products(values: tuple[float, float], ou
 def test_rules_with_a_gap_are_refused() -> None:
     with pytest.raises(FuzzyGapError, match="no rule of the fuzzy controller fires at a = 1, b = 1; add a rule"):
         Sugeno(two_terms(FULL[:2]))
-
-
-def test_the_shipped_speed_falls_with_the_error_and_rises_with_the_distance() -> None:
-    sugeno = Sugeno(load_radio_config().control.fuzzy)
-    assert sugeno.inputs == ("distance_m", "heading_error_rad")
-    by_error = [sugeno.evaluate((1.5, 0.1 * k)) for k in range(20)]
-    by_distance = [sugeno.evaluate((0.1 * k, 0.0)) for k in range(20)]
-    assert by_error == sorted(by_error, reverse=True)
-    assert by_distance == sorted(by_distance)
-    assert by_error[0] == by_distance[-1] == 0.15
 
 
 STILL = (0.0, 0.0)

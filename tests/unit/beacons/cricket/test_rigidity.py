@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
+from ccatp.beacons.cricket.map_fit import MapModel
 from ccatp.beacons.cricket.range_network import RigidBody
 from ccatp.beacons.cricket.rigidity import Freedom, find_fold_over, find_freedom, generic_state
 from tests.unit.beacons.cricket.fields import ADJACENT, ALL, HEADS, ZIGZAG, FloatArray, Pairs, near_pairs, network_of
@@ -104,20 +104,6 @@ def test_nine_pairs_fold_at_every_pair_between() -> None:
     assert ((2, 3), (0, 1)) in found.mirrors or ((2, 3), (4, 5)) in found.mirrors
     assert "M0 may be mirrored across the line through M1, M2" in found.warnings
     assert len(found.single_pairs) == 9  # nothing confirms any of them
-
-
-def test_what_may_fold_does_fold_and_fits_as_well() -> None:
-    network = network_of(HEADS, ADJACENT)
-    (separator, motes), *_ = find_fold_over(network, np.random.default_rng(0)).mirrors
-    through = HEADS[list(separator)]
-    along = (through[1] - through[0]) / np.linalg.norm(through[1] - through[0])
-    folded = HEADS.copy()
-    offset = folded[list(motes)] - through[0]
-    folded[list(motes)] = through[0] + 2.0 * np.outer(offset @ along, along) - offset
-    model = MapModel(network)
-    fit = fit_map(model, model.state(folded), MapFitSettings())
-    assert np.abs(fit.residuals_m).max() < 1e-9
-    assert np.abs(fit.state.positions_m - HEADS).max() > 1.0
 
 
 def test_a_prism_names_the_ranges_that_nothing_confirms() -> None:

@@ -7,11 +7,8 @@ from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
 from ccatp.beacons.cricket.range_network import (
     MappingError,
     MoteRange,
-    PairMeans,
-    RigidBody,
     TdoaError,
     build_network,
-    graph_pairs,
     range_from_delay,
     range_sigma,
     sound_speed,
@@ -208,13 +205,6 @@ def test_delays_of_no_range(delay_s: float, temperature_c: float, what: str) -> 
         range_from_delay(AIR, delay_s, temperature_c)
 
 
-def test_a_body_joins_its_motes() -> None:
-    body = RigidBody("stand", (1, 2), np.array([[0.0, 0.0], [0.3, 0.4]]))
-    network = build_network([row("A", "B"), row("C", "D")], 2, ["A", "B", "C", "D"], [body])
-    assert graph_pairs(network).tolist() == [[0, 1], [1, 2], [2, 3]]
-    assert network.loose == (0, 3)
-
-
 def test_parts_that_hang_on_known_places_are_no_error() -> None:
     known = np.array([[0.0, 0.0], [1.0, 0.0], [np.nan, np.nan], [0.0, 5.0], [1.0, 5.0], [np.nan, np.nan]])
     rows = [row("a", "c"), row("b", "c"), row("d", "f")]
@@ -222,13 +212,3 @@ def test_parts_that_hang_on_known_places_are_no_error() -> None:
     known[3] = np.nan
     with pytest.raises(MappingError, match="into 2 parts with no range between them: d, f on one side"):
         build_network(rows, 2, list("abcdef"), (), known)
-
-
-def test_means_of_pairs_weigh_by_variance() -> None:
-    means = PairMeans(build_network([row("A", "B", 1.0, 0.1), row("B", "A", 2.0, 0.2), row("B", "C")], 2))
-    found = means.between(1, 0)
-    assert found is not None
-    assert found == pytest.approx((1.2, np.sqrt(1.0 / 125.0)))
-    assert means.between(0, 2) is None
-    assert means.partners(1) == [0, 2]
-    assert not means.are_all_linked([0, 1, 2])

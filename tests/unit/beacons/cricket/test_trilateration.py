@@ -104,20 +104,6 @@ def test_exact_ranges_give_the_field_in_its_frame(cfg: CricketConfig) -> None:
     assert 10.0 < min(dops) < max(dops) < 25.0
 
 
-def test_errors_grow_from_stand_to_stand(cfg: CricketConfig) -> None:
-    rng, errors, expected = np.random.default_rng(2), [], []
-    truth = true_motes(cfg, np.random.default_rng(0)).positions_m
-    for _ in range(30):
-        plan, network = field_ranges(cfg, rng, 2e-4)
-        found = map_by_plan(plan, network, cfg.phase1.max_dop)
-        errors.append(((found.positions_m - truth) ** 2).sum(axis=1))
-        expected.append(found.covariance_m2.diagonal().reshape(-1, 2).sum(axis=1))
-    rms, wanted = np.sqrt(np.mean(errors, axis=0)), np.sqrt(np.mean(expected, axis=0))
-    heads = list(plan.heads)
-    assert all(later > 1.2 * before for before, later in zip(rms[heads][:-2], rms[heads][2:], strict=True))
-    assert rms[heads] == pytest.approx(wanted[heads], rel=0.4)  # 30 runs: 13 % a value
-
-
 @pytest.mark.parametrize(("dimension", "reach_m"), [(2, 5.5), (3, 7.5)])
 def test_without_a_plan_mote_after_mote(dimension: int, reach_m: float) -> None:
     rng = np.random.default_rng(6)
@@ -183,21 +169,9 @@ def apart(found: FirstMap, other: FirstMap) -> float:
     return float(np.abs((found.covariance_m2 - other.covariance_m2) / np.outer(sigmas, sigmas)).max())
 
 
-def test_small_errors_are_those_of_the_derivatives(cfg: CricketConfig) -> None:
-    plan, network = field_ranges(cfg, None, 1e-6)
-    drawn = map_by_plan(plan, network, cfg.phase1.max_dop, 4000)
-    straight = map_by_plan(plan, network, cfg.phase1.max_dop)
-    assert (drawn.positions_m == straight.positions_m).all()
-    assert (
-        apart(drawn, straight) < 0.1
-    )  # 4000 draws tell a correlation within 0.016; 36 x 36 of them within six times that
-    assert np.abs(drawn.bias_m).max() < 0.1 * np.sqrt(drawn.covariance_m2.diagonal().max())
-    assert (straight.bias_m == 0.0).all()
-
-
 def test_derivatives_are_too_sure_and_draws_are_not(cfg: CricketConfig) -> None:
     assert after_phase_one(cfg, range(20), 0).mean > 1.8
-    assert after_phase_one(cfg, range(20), DRAWS).mean < 1.4  # 180 degrees of freedom: 1.0 within 0.21
+    assert after_phase_one(cfg, range(10), DRAWS).mean < 1.4  # 90 degrees of freedom: 1.0 within 0.30
 
 
 @pytest.mark.slow

@@ -203,11 +203,6 @@ def steps_of(distance_m: FloatArray, turn_rad: FloatArray, interval_s: float = 0
     return Steps(interval_s * np.arange(distance_m.size + 1.0), distance_m, turn_rad, np.zeros(distance_m.size))
 
 
-def test_steps_without_a_gap_stay_as_they_are() -> None:
-    steps = steps_of(np.full(100, 0.05), np.full(100, 0.01))
-    assert bridged(steps) is steps
-
-
 def test_a_row_that_is_lost_goes_on_as_before() -> None:
     rng = np.random.default_rng(1)
     distance: FloatArray = 0.05 + 0.001 * rng.standard_normal(1000)

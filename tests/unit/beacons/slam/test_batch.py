@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.linalg import LinAlgError
 
-from ccatp.beacons.slam.batch_problem import BEACON, CALIBRATION, SHARED, BatchProblem, BatchState, Reckoning, repeats
+from ccatp.beacons.slam.batch_problem import BEACON, CALIBRATION, SHARED, BatchProblem, BatchState, repeats
 from ccatp.beacons.slam.batch_smoother import Factored, smooth, t_cost, t_weights
 from ccatp.beacons.slam.evaluation import judge
 from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun, Steps, dead_reckoned
@@ -114,42 +114,6 @@ def test_the_gradient_is_that_of_the_cost() -> None:
             assert -side[k] == pytest.approx((up - down) / (2.0 * h), rel=1e-4, abs=1e-4), k
 
 
-def test_increments_by_the_delay() -> None:
-    """On odometry whose rates change little within the 50 ms of the difference."""
-    t = np.arange(0.0, 8.0, 0.02)
-    v, w = 0.5 + 0.2 * np.sin(t[:-1]), 0.4 * np.cos(0.7 * t[:-1])
-    s = Steps(t, 0.02 * v, 0.02 * w, 0.02 * 0.1 * v)
-    reckoning = Reckoning(s, np.array([1.0, 2.5, 6.0]))
-    calibration = np.array([0.05, -0.03, 0.02, 0.01, 0.3])
-    found = reckoning.increments(calibration, ODOMETRY)[1][:, :, DELAY]
-    h = np.array([0.0, 0.0, 0.0, 0.0, 0.04])
-    up, down = (reckoning.increments(calibration + sign * h, ODOMETRY)[0] for sign in (1.0, -1.0))
-    assert found == pytest.approx((up - down) / 0.08, rel=0.02, abs=2e-3)
-
-
-def test_the_matrix_is_that_of_the_residuals() -> None:
-    """J^T W J by differences of the residuals."""
-    made, state = problem()
-    A, _ = dense(made, state, np.ones(6))
-    found = made.residuals(state)
-    roots = np.linalg.cholesky(found.odometry_information).transpose(0, 2, 1)
-
-    def whitened(x: FloatArray) -> FloatArray:
-        r = made.residuals(unflat(x, state))
-        return np.concatenate(
-            [np.einsum("kij,kj->ki", roots, r.odometry).ravel(), (r.readings * np.sqrt(found.information)).ravel()]
-        )
-
-    x, h = flat(state), 1e-6
-    J = np.column_stack([(whitened(x + h * e) - whitened(x - h * e)) / (2.0 * h) for e in np.eye(x.size)])
-    expected = J.T @ J
-    expected[:3, :3] += np.diag(made.first_information)
-    n = state.poses.size
-    expected[n:, n:] += np.diag(made.prior_information)
-    keep = np.arange(x.size) != n + DELAY
-    assert A[np.ix_(keep, keep)] == pytest.approx(expected[np.ix_(keep, keep)], rel=1e-4, abs=1e-3)
-
-
 def test_solution_and_covariances_are_those_of_the_full_matrix() -> None:
     made, state = problem()
     A, side = dense(made, state, np.ones(6))
@@ -161,14 +125,6 @@ def test_solution_and_covariances_are_those_of_the_full_matrix() -> None:
     assert factored.shared_covariance() == pytest.approx(C[n:, n:], rel=1e-6, abs=1e-12)
     for k, covariance in enumerate(factored.pose_covariances()):
         assert covariance == pytest.approx(C[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rel=1e-6, abs=1e-12)
-
-
-def test_damping_multiplies_the_diagonal() -> None:
-    made, state = problem()
-    A, side = dense(made, state, np.ones(6))
-    poses, shared = Factored(made.normal_equations(state, np.ones(6)), damping=0.5).solution()
-    expected = np.linalg.solve(A + 0.5 * np.diag(np.diag(A)), side)
-    assert np.concatenate([poses.ravel(), shared]) == pytest.approx(expected, rel=1e-8)
 
 
 def test_a_matrix_that_is_not_positive_definite_is_refused() -> None:
@@ -187,28 +143,6 @@ def test_what_has_no_prior_is_not_estimated() -> None:
     )  # fmt: skip
     assert np.flatnonzero(fixed.free).tolist() == [len(SHARED), len(SHARED) + 1]  # x and y of the first beacon
     assert fixed.residuals(state).information[1::2].sum() == 0.0  # readings of the other one count nothing
-
-
-def test_the_noise_of_an_increment_is_that_of_its_steps() -> None:
-    """Against many noisy runs of the same steps."""
-    rng = np.random.default_rng(2)
-    s = steps(n=25)
-    ends = s.times_s[[0, -1]]
-    found = Reckoning(s, ends).increments(np.zeros(len(CALIBRATION)), ODOMETRY)[2][0]
-    dt = np.diff(s.times_s)
-    way, turned = np.hypot(s.distance_m, s.lateral_m), np.abs(s.turn_rad)
-    sigma_way = np.sqrt(0.02**2 * way + 0.01**2 * turned)
-    sigma_turn = np.sqrt(0.02**2 * way + 0.05**2 * turned + 0.01**2 * dt)
-    sigma_side = 0.015 * np.sqrt(way)
-    draws = []
-    for _ in range(4000):
-        e = rng.standard_normal((3, way.size))
-        noisy = Steps(
-            s.times_s, s.distance_m + sigma_way * e[0], s.turn_rad + sigma_turn * e[1], s.lateral_m + sigma_side * e[2]
-        )
-        draws.append(dead_reckoned(noisy, (0.0, 0.0, 0.0))[-1])
-    # 4000 draws tell a variance to 2 per cent; correlations of curved ways are not quite linear
-    assert np.cov(np.array(draws).T) == pytest.approx(found, rel=0.12, abs=2e-4)
 
 
 def test_weights_are_the_gradient_of_the_cost() -> None:
@@ -323,15 +257,6 @@ def test_outliers_hardly_move_it() -> None:
     assert judge(clean, run).trajectory_rmse_m == pytest.approx(0.0, abs=0.06)
     assert judge(found, hit).trajectory_rmse_m == pytest.approx(0.0, abs=0.08)
     assert found.refused > 0.8 * wild.sum()
-
-
-def test_noise_wider_than_assumed_widens_the_covariance() -> None:
-    settings = with_priors(range_scale=0.0, range_offset_m=0.0, pose_m=1e-3, heading_rad=1e-3)
-    run = noisy(recorded(world(6, 60.0, range_sigma_m=0.5, bearing_sigma_rad=0.25)), 6)
-    usual = smooth(run_of(6, bearings=True, seconds=60.0), settings, no_clock)
-    track = smooth(run, settings, no_clock)
-    ratio = np.sqrt(track.beacons["8"].covariance[0, 0] / usual.beacons["8"].covariance[0, 0])
-    assert 2.0 < ratio < 5.0  # of noise five times as wide; odometry is the same
 
 
 def test_signal_strengths_alone_place_beacons() -> None:

@@ -8,14 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from ccatp.beacons.slam.evaluation import judge, truth_at
 from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, ReferencePath
-from ccatp.filters.metrics import RigidMotion, aligned_rms_m, best_motion, consistency, nees, rigid_modes, rms, wrapped
+from ccatp.filters.metrics import RigidMotion, aligned_rms_m, best_motion, consistency, nees
 from tests.unit.beacons.datasets.sets import BEACONS, recorded, world
-
-
-def test_root_mean_square_leaves_out_what_is_not_finite() -> None:
-    assert rms(np.array([3.0, np.nan, -4.0])) == pytest.approx(np.sqrt(12.5))
-    assert rms(np.array([np.nan])) is None
-    assert wrapped(np.array([3.5, -3.5])) == pytest.approx([3.5 - 2 * np.pi, 2 * np.pi - 3.5])
 
 
 def test_squares_of_gaussian_errors_lie_in_the_band_and_others_do_not() -> None:
@@ -103,20 +97,6 @@ def test_a_mirror_image_is_another_map_unless_told() -> None:
     assert aligned_rms_m(mirrored, points, mirrors=True) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_alignment_is_that_of_scipy_and_neither_scales_nor_reflects() -> None:
-    rng = np.random.default_rng(2)
-    p = rng.normal(size=(40, 2))
-    q = 1.5 * p * (1.0, -1.0) + rng.normal(scale=0.3, size=(40, 2))  # scaled, mirrored, noisy
-    found = best_motion(p, q)
-    planar = [np.column_stack([x - x.mean(axis=0), np.zeros(40)]) for x in (p, q)]
-    angles = np.linspace(-np.pi, np.pi, 20001)
-    misfits = [((Rotation.from_euler("z", a).apply(planar[0]) - planar[1]) ** 2).sum() for a in angles]
-    assert found.angle_rad == pytest.approx(angles[int(np.argmin(misfits))], abs=4e-4)
-    moved = found.moved(p)
-    assert np.ptp(moved, axis=0) != pytest.approx(np.ptp(q, axis=0), rel=0.1)
-    assert moved.mean(axis=0) == pytest.approx(q.mean(axis=0))
-
-
 def test_covariances_turn_with_the_points() -> None:
     rng = np.random.default_rng(3)
     points = rng.multivariate_normal((0.0, 0.0), ((4.0, 1.0), (1.0, 0.5)), size=200)
@@ -132,15 +112,3 @@ def test_a_single_point_fixes_no_turn() -> None:
     found = best_motion(np.array([[1.0, 2.0]]), np.array([[4.0, 1.0]]))
     assert found.rotation == pytest.approx(np.eye(2))
     assert found.translation_m == pytest.approx([3.0, -1.0])
-
-
-@pytest.mark.parametrize(("dimension", "count"), [(2, 3), (3, 6)])
-def test_modes_keep_all_distances(dimension: int, count: int) -> None:
-    points = RNG.normal(size=(6, dimension))
-    modes = rigid_modes(points)
-    assert modes.shape == (6 * dimension, count)
-    assert modes.T @ modes == pytest.approx(np.eye(count), abs=1e-12)
-    for mode in modes.T:
-        rates = mode.reshape(6, dimension)
-        ways, speeds = points[:, None] - points[None], rates[:, None] - rates[None]
-        assert np.abs(np.einsum("ijk,ijk->ij", ways, speeds)).max() < 1e-12

@@ -10,7 +10,7 @@ from ccatp.beacons.slam.level_fix import HeardPlace, LevelLocator, Room, likelie
 from ccatp.beacons.slam.motion import Increment, Odometry, SlippingVehicle, Steering
 from ccatp.beacons.slam.path_loss import LevelPair, PathLoss, PathLossError, PathLossFit, fit_path_loss
 from ccatp.beacons.slam.recording import RssiReading
-from ccatp.beacons.slam.signal_landmarks import MovingRadio, RadioModel, ShadowingMap, rows_of
+from ccatp.beacons.slam.signal_landmarks import MovingRadio, RadioModel, rows_of
 from ccatp.beacons.slam.signal_slam import SignalSlam
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_radio_config
@@ -63,11 +63,6 @@ def test_motion_noise_is_that_of_its_readings(kind: str) -> None:
     assert np.sqrt(np.diag(Q)) == pytest.approx(np.std(drawn, axis=0), rel=0.06)
 
 
-def test_wheels_that_stand_have_no_noise() -> None:
-    step = vehicle("ackermann").step(np.zeros(5), Steering(0.1, 0.1, 0.0, 0.3))
-    assert not step.Q.any()
-
-
 def test_a_vehicle_takes_the_odometry_of_its_kind() -> None:
     with pytest.raises(TypeError, match="takes speed and steering angle, not Increment"):
         vehicle("ackermann").step(np.zeros(5), ODOMETRY["differential"])
@@ -92,19 +87,6 @@ def test_rows_have_the_derivatives_of_level_and_bearing() -> None:
         assert H[:, k] == pytest.approx(-slope, abs=1e-6)
 
 
-def test_shadowing_map_reproduces_its_points_and_its_variance() -> None:
-    grid = ShadowingMap((2.0, 1.0), 0.5, 5.0, 1.5)
-    assert grid.size == 15
-    row, rest = grid.row(0.5, 0.5)
-    assert float(row @ row) == pytest.approx(25.0)
-    assert rest == pytest.approx(0.0, abs=1e-6)
-    far, _ = grid.row(2.0, 0.5)
-    assert float(row @ far) == pytest.approx(25.0 * np.exp(-1.0))
-    between, rest = grid.row(0.75, 0.75)
-    assert float(between @ between) + rest == pytest.approx(25.0)
-    assert 1.0 < rest < 12.0
-
-
 def moving() -> tuple[EkfSlam, MovingRadio]:
     engine = EkfSlam(np.array((1.0, 1.0, 0.5)), np.diag((0.01, 0.01, 0.001)))
     radio = MovingRadio("t", 0.02, 20.0, 5.0, 1.5, (3.0, 3.0))
@@ -127,18 +109,6 @@ def test_many_levels_with_one_unknown_offset_do_not_tell_the_range() -> None:
     sigma = float(np.sqrt(along @ engine.covariance[place, place][:2, :2] @ along)) / r
     # prior of ln r (ln 2) and 5 dB of shadowing (0.576): together 0.443; three hundred levels add nothing to that
     assert sigma == pytest.approx(1.0 / np.hypot(1.0 / log(2.0), 1.0 / 0.576), rel=0.05)
-
-
-def test_a_velocity_is_carried_into_the_place() -> None:
-    engine, radio = moving()
-    block = engine.block("t")
-    start = engine.mean[block][:2].copy()
-    engine.mean[block.start + 2 : block.start + 4] = (0.02, 0.0)
-    for _ in range(100):
-        radio.predict(engine, 0.1, 0.0)
-    # T (1 - exp(-t / T)) v after 10 s
-    assert engine.mean[block][0] - start[0] == pytest.approx(20.0 * (1.0 - np.exp(-0.5)) * 0.02)
-    assert float(np.linalg.eigvalsh(engine.covariance)[0]) > -1e-12
 
 
 def heard(slam_cfg: RadioConfig, scans: int) -> tuple[SignalSlam, float]:
@@ -180,19 +150,10 @@ def test_ignored_shadowing_is_overconfident_and_mapped_shadowing_is_not() -> Non
     hits = {}
     for mode in ("none", "map"):
         keys = {**SHADOW, "estimator.shadowing": mode, "run.steps": 450}
-        runs = [run_radio(load_radio_config(None, {**keys, "run.seed": seed})) for seed in range(1, 4)]
+        runs = [run_radio(load_radio_config(None, {**keys, "run.seed": seed})) for seed in (1, 2)]
         hits[mode] = np.mean([run.beacon_nees[name][-1] < 4.605 for run in runs for name in run.places])
     assert hits["none"] < 0.5
     assert hits["map"] > 0.7
-
-
-def test_slip_is_found_and_the_pose_gains_by_it() -> None:
-    keys = {"sim.vehicle.slip": 0.05, "odometry.slip_sigma": 0.05, "observation.every_steps": 2}
-    run = run_radio(load_radio_config(None, keys))
-    squares = [
-        np.mean(np.array(errors)[:, :2] ** 2) for errors in (run.pose_errors, [e[:2] for e in run.reckoned_errors])
-    ]
-    assert squares[0] < 0.5 * squares[1]
 
 
 BEACONS = {"A": (0.0, 0.0), "B": (0.0, 4.0), "C": (4.0, 0.0)}
@@ -284,12 +245,6 @@ def test_repeated_readings_tell_white_from_static() -> None:
     assert fit.shadowing_sigma_db == pytest.approx(4.0, rel=0.3)
     once = fit_path_loss(drawn(3, 40, 1, 4.0, 1.5))
     assert fit.sigma_db == pytest.approx(once.sigma_db, rel=0.3)  # thirty readings of a place are one witness
-
-
-def test_places_at_the_same_distance_stay_places() -> None:
-    pairs = [LevelPair(d, -45.0 - d + s, (d, s)) for d in (1.0, 2.0, 4.0) for s in (-1.0, 1.0)]
-    assert fit_path_loss(pairs).places == 6
-    assert fit_path_loss([LevelPair(*pair[:2]) for pair in pairs]).places == 3
 
 
 def test_doubts_are_told() -> None:
