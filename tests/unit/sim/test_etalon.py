@@ -6,7 +6,6 @@ import pytest
 from scipy import stats
 
 from ccatp.config.models import SimEtalonConfig
-from ccatp.links.multiline import FLAGS
 from ccatp.sim.laser import EtalonModel, PuckTruth
 
 CHANNELS = (1, 2, 5, 9)
@@ -57,13 +56,6 @@ def test_noise_belongs_to_seed_time_and_channel_and_to_nothing_else() -> None:
     )  # less than half a us
     assert first.records(CHANNELS, msgspec.structs.replace(PUCK, t_s=PUCK.t_s + 1e-6)) != reference
     assert model(seed=2).records(CHANNELS, PUCK) != reference
-
-
-@pytest.mark.parametrize("flag", FLAGS)
-def test_each_of_the_ten_flags_can_be_raised_on_one_channel(flag: str) -> None:
-    etalon = model()
-    etalon.flags = {5: {flag}}
-    assert [record.errors for record in etalon.records(CHANNELS, PUCK)] == [(), (), (flag,), ()]
 
 
 def test_a_blocked_channel_has_no_length_no_light_and_beam_break() -> None:

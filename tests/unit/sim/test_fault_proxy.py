@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from ccatp.sim import fault_proxy
 from ccatp.sim.fault_plan import LINK_TYPES
 from ccatp.sim.fault_proxy import FaultProxy, LineStage, OneWayFaults
 
@@ -170,22 +169,6 @@ async def test_close_ends_both_sides_in_order() -> None:
         await r.connect()  # the next one is served
 
 
-async def test_close_over_bytes_on_their_way_is_no_reset() -> None:
-    async with rig() as r:
-        reader, writer = await r.connect()
-        r.proxy.begin("stall", "to_robot")
-        writer.write(TEXT)
-        await passes(lambda: r.proxy.counts["stall"] > 0)
-        writer.write(TEXT)
-        r.server.writers[0].write(TEXT)
-        r.proxy.close()
-        assert (await rest(reader))[1] == "FIN"
-        await r.server.until(lambda: r.server.ends == ["FIN"])
-        assert r.server.pieces == []
-        writer.close()
-        await passes(lambda: not r.proxy.connections)
-
-
 async def test_a_black_hole_one_way_swallows_data_and_the_end() -> None:
     async with rig() as r:
         reader, writer = await r.connect()
@@ -221,52 +204,6 @@ async def test_a_stall_ends_in_one_burst() -> None:
         assert r.proxy.counts["stall"] >= 1
 
 
-async def test_slowloris_that_is_over_lets_the_rest_go() -> None:
-    async with rig() as r:
-        _, writer = await r.connect()
-        r.proxy.begin("slowloris", "to_robot", bytes_per_s=20.0)
-        writer.write(TEXT)
-        await r.server.until(lambda: bool(r.server.pieces))
-        r.proxy.heal()
-        await r.server.until(lambda: r.server.text == TEXT)  # at 20 bytes a second it would take 48 s
-
-
-async def test_heal_ends_one_fault_in_one_direction() -> None:
-    async with rig() as r:
-        r.server.is_echo = True
-        reader, writer = await r.connect()
-        r.proxy.begin("duplicate", "both", every=1)
-        r.proxy.begin("garbage", "to_robot", garbage_bytes=3, every=1)
-        r.proxy.heal("to_client", "duplicate")
-        r.proxy.heal("to_robot", "garbage")
-        writer.write(LINES[0])
-        assert await read(reader, 2 * len(LINES[0])) == 2 * LINES[0]
-        r.proxy.heal()
-        writer.write(LINES[1])
-        assert await read(reader, len(LINES[1])) == LINES[1]
-        assert r.proxy.counts["duplicate"] == 1
-
-
-async def test_who_does_not_take_is_felt_by_who_sends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fault_proxy, "MAX_WAITING_BYTES", 1 << 16)
-    blocks = 64
-    async with rig() as r:
-        _, writer = await r.connect()
-        r.proxy.begin("stall", "to_robot")
-
-        async def send() -> None:
-            for _ in range(blocks):
-                writer.write(bytes(1 << 18))
-                await writer.drain()
-
-        sending = asyncio.create_task(send())
-        done, _ = await asyncio.wait({sending}, timeout=0.3)
-        assert not done  # nobody takes any more
-        r.proxy.heal()
-        await sending
-        await r.server.until(lambda: sum(map(len, r.server.pieces)) == blocks << 18)
-
-
 def stage(seed: int = 1, **faults: dict[str, Any]) -> tuple[LineStage, OneWayFaults, Counter[str]]:
     switched: OneWayFaults = {}
     for name, keys in faults.items():
@@ -297,15 +234,6 @@ def test_lines_are_duplicated_and_end_in_lf_alone() -> None:
     assert counts == {"duplicate": 1}
 
 
-def test_garbage_comes_as_lines_of_its_own() -> None:
-    line_stage, _, counts = stage(garbage={"garbage_bytes": 30, "every": 5})
-    found = out(line_stage, TEXT)
-    assert [line for line in found if line in LINES] == LINES
-    assert [len(line) for line in found if line not in LINES] == [31] * 8
-    assert all(line.count(b"\n") == 1 for line in found)
-    assert counts == {"garbage": 8}
-
-
 def test_one_byte_of_a_line_is_corrupted() -> None:
     texts = []
     for seed in (1, 1, 2):
@@ -320,13 +248,3 @@ def test_one_byte_of_a_line_is_corrupted() -> None:
     assert texts[0] == texts[1]  # of the seed
     assert texts[0] != texts[2]
     assert out(stage(corrupt={"every": 1})[0], b"\n\n") == [b"\n", b"\n"]  # an empty line stays
-
-
-def test_a_flood_is_of_garbage_or_of_copies() -> None:
-    line_stage, _, _ = stage(flood={"rate_hz": 1.0, "lines": "copies"})
-    assert len(line_stage.flood_line()) == 65  # nothing has passed that could be copied
-    out(line_stage, LINES[7])
-    assert line_stage.flood_line() == LINES[7]
-    line_stage, _, _ = stage(flood={"rate_hz": 1.0, "lines": "garbage"})
-    out(line_stage, LINES[7])
-    assert line_stage.flood_line() != LINES[7]

@@ -82,38 +82,12 @@ def test_pose_after_ten_seconds(mirror: Mirror, right: float, left: float) -> No
     assert plant.z_m == pytest.approx(mirror.surface.height_m(plant.x_m, plant.y_m), abs=1e-9)
 
 
-def test_a_long_step_follows_the_chord_of_its_arc(mirror: Mirror) -> None:
-    flat = DeckPose(0.0, 0.0, 0.0)
-    plant = plant_on(mirror, flat)
-    drive(plant, 5.0, 4.0, 200)  # until the wheels are at speed
-    x, y, psi = plant.x_m, plant.y_m, plant.heading_rad
-    plant.step(2.0, 1.0, 5.0, 4.0)
-    turn, forward = RADIUS_M * 1.0 / BASE_M, RADIUS_M * 4.5
-    chord = 2.0 * (forward / turn) * np.sin(turn / 2.0)
-    found = float(np.hypot(plant.x_m - x, plant.y_m - y))
-    # Near the apex slopes below 1 % shorten projections by less than 5e-5; the arc itself is 225 um longer.
-    assert chord * (1.0 - 5e-5) - 1e-6 < found < chord + 1e-6
-    assert plant.heading_rad - psi == pytest.approx(turn, abs=1e-4)
-
-
 def test_axes_are_those_of_the_mirror(mirror: Mirror) -> None:
     plant = plant_on(mirror)
     drive(plant, 5.0, 4.0, 300)
     axes = plant.hx, plant.hy, plant.lx, plant.ly
     # The gradient at the end of a step is extrapolated from its middle: half a step squared times the third derivative.
     assert axes == pytest.approx(mirror.body_axes(plant.pose), abs=1e-9)
-
-
-def test_wheels_are_first_order_within_a_step(mirror: Mirror) -> None:
-    plant = plant_on(mirror)
-    drive(plant, 2.0, -1.0, 3)
-    plant.step(0.03, DT_S, 4.0, 3.0)
-    before = 2.0 * (1.0 - exp(-0.03 / LAG_S)), -1.0 * (1.0 - exp(-0.03 / LAG_S))
-    decays = [exp(-tau / LAG_S) for tau in (0.0, 0.004, 0.01)]
-    for (right, left), e in zip(rates_at(plant, decays), decays, strict=True):
-        assert right == pytest.approx(4.0 + (before[0] - 4.0) * e, abs=1e-12)
-        assert left == pytest.approx(3.0 + (before[1] - 3.0) * e, abs=1e-12)
-    assert rates_at(plant, decays)[-1] == pytest.approx((plant.right_rad_s, plant.left_rad_s), abs=1e-12)
 
 
 def test_acceleration_is_the_derivative_of_the_speed_and_turn_rate_that_of_the_wheels(mirror: Mirror) -> None:
@@ -274,38 +248,6 @@ def test_creep_goes_downhill(config: Config, mirror: Mirror) -> None:
             assert moved @ downhill > 0.0
 
 
-def test_creep_needs_a_slope_and_a_speed(config: Config, mirror: Mirror) -> None:
-    creep = Creep(mirror, world_of(config, creep_fraction=0.05, creep_walk_fraction=0.2), np.random.default_rng(1))
-    assert creep.displace(plant_with(mirror), 0.0, DT_S, 0.0, 0.0, 0.1) == (0.0, 0.0, 0.1)
-
-    def slope_at(x_m: float) -> float:
-        g = mirror.gravity_in_robot(DeckPose(x_m, 0.3, 0.0))
-        return float(np.hypot(g[0], g[1]))
-
-    # Along this line the bottom of the dish comes nearest to level at the minimum of a fine scan.
-    level = min(np.linspace(-3.0, 3.0, 20001), key=slope_at)
-    creeps = creep.displace(plant_with(mirror, start=DeckPose(level, 0.3, 0.0)), 0.0, DT_S, 0.001, 0.0, 0.0)
-    assert (creeps == (0.001, 0.0, 0.0)) == (slope_at(level) < 1e-3)
-
-
-def test_creep_walks(config: Config, mirror: Mirror) -> None:
-    plant = plant_with(mirror)
-    shares = []
-    for seed in range(800):
-        creep = Creep(
-            mirror, world_of(config, creep_fraction=0.02, creep_walk_fraction=0.2), np.random.default_rng(seed)
-        )
-        row = []
-        for t in (0.0, 1.0):
-            ahead, left, _ = creep.displace(plant, t, DT_S, 0.001, 0.0, 0.0)
-            row.append(np.hypot(ahead - 0.001, left) / 0.001 / 0.02)
-        shares.append(row)
-    found = np.array(shares)
-    assert found.mean(axis=0) == pytest.approx([1.0, 1.0], abs=4.5 * 0.2 / sqrt(800))
-    assert found.std(axis=0) == pytest.approx([0.2, 0.2], rel=4.5 / sqrt(2 * 800))
-    assert np.corrcoef(found.T)[0, 1] == pytest.approx(exp(-0.5), abs=4.5 / sqrt(800))
-
-
 # -- vibration --------------------------------------------------------------------------------------------------------
 
 
@@ -356,12 +298,6 @@ def test_without_thrust_the_body_comes_back_and_rests(config: Config, mirror: Mi
 SIGMA, TIME_S, DT_S = 0.3, 2.0, 0.01
 
 
-def test_the_first_value_is_one_of_the_stationary_distribution() -> None:
-    firsts = [OrnsteinUhlenbeck(SIGMA, TIME_S, np.random.default_rng(seed)).at(0.0) for seed in range(2000)]
-    assert np.std(firsts) == pytest.approx(SIGMA, rel=4.5 / sqrt(2 * 2000))  # 4.5 standard errors
-    assert abs(np.mean(firsts)) < 4.5 * SIGMA / sqrt(2000)
-
-
 def test_sigma_and_autocorrelation() -> None:
     """1600 independent processes at four times: cov(x(0), x(d)) = sigma^2 exp(-d/T)."""
     rows = []
@@ -372,24 +308,6 @@ def test_sigma_and_autocorrelation() -> None:
     # A correlation r of n pairs has the standard error (1 - r^2)/sqrt(n); 4.5 of the largest.
     assert found == pytest.approx([1.0, exp(-0.25), exp(-1.0), exp(-3.0)], abs=4.5 / sqrt(1600))
     assert np.array(rows).std(axis=0) == pytest.approx([SIGMA] * 4, rel=4.5 / sqrt(2 * 1600))
-
-
-def test_small_steps_and_a_large_one_have_the_same_law() -> None:
-    ends = []
-    for seed in range(1600):
-        process = OrnsteinUhlenbeck(SIGMA, TIME_S, np.random.default_rng(seed))
-        start = process.at(0.0)
-        for k in range(1, 51):
-            last = process.at(k * DT_S)
-        ends.append((start, last))
-    assert np.corrcoef(np.array(ends).T)[0, 1] == pytest.approx(exp(-0.25), abs=4.5 / sqrt(1600))
-
-
-def test_nothing_moves_without_time_or_without_sigma() -> None:
-    process = OrnsteinUhlenbeck(SIGMA, TIME_S, np.random.default_rng(1))
-    assert process.at(1.0) == process.at(1.0)
-    still = OrnsteinUhlenbeck(0.0, TIME_S, np.random.default_rng(1))
-    assert [still.at(float(t)) for t in range(3)] == [0.0, 0.0, 0.0]
 
 
 def test_a_bias_walks_with_the_root_of_time() -> None:

@@ -165,17 +165,6 @@ def test_a_random_target_keeps_its_speed_and_stays_in_the_room_and_out_of_obstac
         assert hypot(x - before[0], y - before[1]) < 0.0101 + 0.02  # a step, and what a wall turns back
 
 
-def test_a_target_walks_its_waypoints_round_and_round() -> None:
-    cfg = config(
-        sim__target__motion="waypoints", sim__target__speed_m_s=0.1, sim__target__x_m=0.0, sim__target__y_m=0.0,
-        sim__target__waypoints_m=[[1.0, 0.0], [1.0, 1.0], [0.0, 0.0]],
-    )  # fmt: skip
-    target = MovingTarget(cfg.sim.target, (3.0, 3.0), (), np.random.default_rng(0))
-    for _ in range(150):
-        target.step(0.1)
-    assert target.position_m == pytest.approx((1.0, 0.5))
-
-
 def test_a_seed_repeats_itself_and_listening_does_not_change_the_rest() -> None:
     cfg = load_radio_config(None, {"system": "follow"})
     worlds = [RadioWorld(cfg), RadioWorld(cfg)]
@@ -188,11 +177,3 @@ def test_a_seed_repeats_itself_and_listening_does_not_change_the_rest() -> None:
     assert [f.sightings[-1] for f in frames[0]] == [f.sightings[-1] for f in frames[1]]
     assert len(frames[0][0].sightings) == 5
     assert RadioWorld(cfg, seed=2).pose != RadioWorld(cfg).pose
-
-
-def test_reflector_worlds_give_packets_and_others_sightings() -> None:
-    world = RadioWorld(config(sim__radio__scan="reflector"))
-    frame = world.step(SimDriveCommand(0.0, 0.0, 0.0), 0.1, static=True, target=False)
-    assert len(frame.packets) == 160
-    assert frame.sightings == ()
-    assert world.clearance_m == np.inf

@@ -340,60 +340,9 @@ def test_each_kind_alone_changes_what_is_its_own(config: Config, hard: Config, m
     assert ("enc" in same) is (kind not in {"encoders", "wheels"})  # a wheel never feels what the body does
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_draws_of_one_kind_do_not_depend_on_another(hard: Config, mirror: Mirror, kind: str) -> None:
-    """Switched off in a world that has everything: what the others drew at boot and for each frame is as before."""
-    off = with_world(hard, **dict.fromkeys(KINDS[kind], 0))
-    drawn = []
-    for cfg in (hard, off):
-        world = boot(cfg, mirror).world
-        drawn.append((world.start_pose, world.misalignments, world.wheels))
-    assert drawn[0][:2] == drawn[1][:2]
-    assert (drawn[0][2] == drawn[1][2]) is (kind != "wheels")
-    whole, without = survey(hard, mirror), survey(off, mirror)
-    if kind not in BODY:
-        assert [row for row, _ in whole] == [row for row, _ in without]
-    if kind in BODY - {"wheels"}:
-        assert [s.enc for _, s in whole if s] == [s.enc for _, s in without if s]
-
-
 def test_hello_stays_nominal(hard: Config, mirror: Mirror) -> None:
     robot = boot(hard, mirror)
     told = robot.hello(boot=1, nonce="0" * 32, auth="none", lockstep=True).robot
     assert (told.wheel_radius_m, told.wheel_base_m) == (hard.robot.wheel_radius_m, hard.robot.wheel_base_m)
     assert robot.world.wheels.base_m != hard.robot.wheel_base_m
     assert robot.world.plant.lag_s != hard.sim.robot.wheel_lag_s
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_body_moves_by_the_true_wheels(config: Config, hard: Config, mirror: Mirror, seed: int) -> None:
-    errors = {key: getattr(hard.world, key) for key in ("slip_min", "slip_max")}
-    robot = boot(with_world(config, wheel_radius_sigma=0.1, **errors), mirror, seed)  # larger than any slip
-    robot.join("controller")
-    world, plant = robot.world, robot.world.plant
-    for k in range(100):
-        before = plant.right_angle_rad, plant.left_angle_rad
-        robot.drive(k, 3.0, 2.0)
-        robot.advance()
-        slips = 1.0 - plant.right_scale / world.wheels.right_scale, 1.0 - plant.left_scale / world.wheels.left_scale
-        assert 0.01 <= min(slips) < max(slips) <= 0.05
-        right_m = 0.03 * world.wheels.right_scale * (1.0 - slips[0]) * (plant.right_angle_rad - before[0])
-        left_m = 0.03 * world.wheels.left_scale * (1.0 - slips[1]) * (plant.left_angle_rad - before[1])
-        # Differences of angles of some radians, a thousandth of them long.
-        assert plant.forward_m == pytest.approx((right_m + left_m) / 2.0, rel=1e-9)
-        assert plant.turn_rad == pytest.approx((right_m - left_m) / world.wheels.base_m, rel=1e-9)
-    drawn = boot(with_world(config, wheel_radius_sigma=0.005), mirror, seed).world
-    assert (drawn.plant.right_scale, drawn.plant.left_scale) == drawn.wheels[1:3] != (1.0, 1.0)
-
-
-def test_counted_rates_fit_the_line(hard: Config, mirror: Mirror) -> None:
-    fine = with_world(hard, encoder_counts_per_rev=7_919_333)  # rates of many digits
-    robot = boot(fine, mirror)
-    longest = 0
-    for k in range(100):
-        robot.drive(k, -8.0, -7.9)
-        robot.advance()
-        longest = max(longest, len(robot.delivered_line))
-    assert longest <= 420 + 48 + 10 * (64 + 26)  # what the check of the rates counts on
-    with pytest.raises(ValueError, match=r"frames at 8 Hz take up to \d+ bytes, a line holds 8192"):
-        boot(with_rates(fine, frame_hz=8.0), mirror)

@@ -1,7 +1,6 @@
 """Plans: the one that is shipped, and what is said of mistakes."""
 
 import json
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -313,22 +312,6 @@ def test_frames_that_are_lost(config: Config, mirror: Mirror) -> None:
     numbers = [frame["seq"] for frame in drive(robot, 1.0, 1.0, 1.0)]
     assert numbers == [k for k in range(1, 101) if not (50 <= k < 80 and (k - 49) % 3 == 0)]
     assert record(robot)[3:] == (0.5, 0.79, 30, 10)
-
-
-def test_frames_that_come_twice(config: Config, mirror: Mirror) -> None:
-    robot = boot(config, mirror, signal="frames", type="duplicate", every=10, for_s=0.3)
-    frames = drive(robot, 1.0, 1.0, 1.0)
-    twice = [a["seq"] for a, b in pairwise(frames) if a == b]
-    assert twice == [59, 69, 79]
-    assert robot.delivered_seq == 100
-
-
-def test_frames_out_of_order(config: Config, mirror: Mirror) -> None:
-    robot = boot(config, mirror, signal="frames", type="reorder", every=4, for_s=0.1)
-    numbers = [frame["seq"] for frame in drive(robot, 1.0, 1.0, 0.7)]
-    assert sorted(numbers) == list(range(1, 71))
-    assert numbers[51:60] == [52, 54, 53, 55, 56, 58, 57, 59, 60]
-    assert record(robot).changed == 2
 
 
 def test_names_that_the_robot_raises(config: Config, mirror: Mirror) -> None:

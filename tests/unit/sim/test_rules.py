@@ -54,19 +54,6 @@ def test_directions(drive: tuple[float, float], needs: str) -> None:
         assert r.is_held is not may
 
 
-def test_only_newer_sequence_numbers_count() -> None:
-    r = rules(monitor=True)
-    assert r.permit(5, True, False, False, 0.0)
-    assert r.drive(5, 3.0, 3.0, 0.0)
-    for old in (5, 4, 0):
-        assert not r.drive(old, -3.0, -3.0, 0.1)
-        assert not r.permit(old, False, True, True, 0.1)
-    assert r.set_points(0.2) == (3.0, 3.0)
-    assert r.set_points(0.26) == HELD  # the old ones refreshed nothing
-    assert r.echo(0.26)[0] == 5
-    assert r.echo(0.26)[1] == pytest.approx(0.26)
-
-
 def test_a_new_session_counts_again() -> None:
     r = rules()
     r.drive(1000, 3.0, 3.0, 0.0)
@@ -191,15 +178,6 @@ def test_a_permit_takes_effect_to_the_frame(frames: int) -> None:
         assert rig.moves(frame) is (2 + frames <= frame < 5 + frames)
 
 
-@pytest.mark.parametrize("frames", [0, 3])
-def test_fans_follow_to_the_frame(frames: int) -> None:
-    rig = Rig(frames)
-    assert rig.at(1).command_fans(1, 0.5, 0.6)
-    for frame in range(1, 8):
-        rig.moves(frame)
-        assert rig.robot.fans.duty == ((0.5, 0.6) if frame >= 1 + frames else (0.0, 0.0))
-
-
 def test_the_time_to_live_covers_the_delay() -> None:
     rig = Rig(2, ttl_s=0.05)
     rig.at(0).drive(1, 3.0, 3.0)
@@ -242,13 +220,3 @@ def test_what_is_on_its_way_goes_with_its_session() -> None:
     robot.lose("monitor")
     robot.rules.permit(12, True, True, True, 0.07)
     assert rig.moves(9)  # the denial never arrives
-
-
-def test_fans_of_the_session_before_do_not_outrank_the_next() -> None:
-    rig = Rig(2)
-    rig.robot.command_fans(5000, 0.7, 0.7)
-    rig.robot.join("controller")
-    assert rig.robot.fans.duty == (0.7, 0.7)  # accepted is accepted
-    assert rig.at(1).command_fans(0, 0.3, 0.3)
-    rig.moves(3)
-    assert rig.robot.fans.duty == (0.3, 0.3)

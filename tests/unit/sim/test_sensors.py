@@ -18,7 +18,6 @@ from ccatp.sim.sensors import (
     CountingEncoders,
     EdgeSensors,
     InertialUnit,
-    RateEncoders,
     Rectangle,
     SensorSuite,
     draw_rectangles,
@@ -83,19 +82,6 @@ def test_readings_are_the_truth_plus_noise_of_the_world(config: Config, mirror: 
         # 4.5 standard errors of a standard deviation and of a mean; the seed is fixed.
         assert found.std() == pytest.approx(sigma, rel=4.5 / np.sqrt(2.0 * len(found)))
         assert abs(found.mean()) < 4.5 * sigma / np.sqrt(len(found))
-
-
-def test_noise_of_one_sensor_does_not_depend_on_the_rate_of_another(config: Config, mirror: Mirror) -> None:
-    plant = plant_at(mirror, DeckPose(0.0, 0.0, 0.0))
-    found = []
-    for encoder_hz in (1000.0, 100.0):
-        sensors = suite(config, mirror, encoder_hz=encoder_hz)
-        readings = []
-        for frame in range(1, 50):
-            _, imu, _, gravity = sensors.read(frame, plant)
-            readings.append((imu, gravity))
-        found.append(readings)
-    assert found[0] == found[1]
 
 
 def test_gravity_comes_at_its_own_rate_within_its_noise(config: Config, mirror: Mirror) -> None:
@@ -189,7 +175,7 @@ def test_material_is_inside_the_shifted_edges_and_nowhere_else(config: Config) -
 
 
 @pytest.mark.parametrize("is_shifted", [True, False])
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0])
 def test_sensors_see_the_edges_at_every_millisecond(config: Config, seed: int, is_shifted: bool) -> None:
     """Against the plain question asked at each sample, along drives and turns across seams and over the rim."""
     mirror = build_mirror(config.mirror)
@@ -271,35 +257,6 @@ def test_the_sum_of_the_rates_is_the_counted_angle(config: Config, mirror: Mirro
     assert turned > 10.0
 
 
-def test_the_counted_angle_is_that_of_the_wheel_at_every_sample(config: Config, mirror: Mirror) -> None:
-    """Against an integration of the servo's equation by many small steps."""
-    world = world_of(config, encoder_counts_per_rev=100_000)
-    plant, encoders = plant_on_deck(mirror), CountingEncoders(world, HZ, DT_S, np.random.default_rng(2))
-    rate = angle = counted = 0.0
-    small = 1e-5
-    for frame, times in enumerate(sample_times(HZ, FRAME_HZ, LAG_S, 1, 20), start=1):
-        set_point = 5.0 if frame <= 10 else -2.0
-        plant.step((frame - 1) * DT_S, DT_S, set_point, 0.0)
-        for _, right, left in encoders.read(plant, times):
-            assert left == 0.0
-            for _ in range(100):
-                middle = rate + 0.5 * small * (set_point - rate) / LAG_S
-                angle += small * middle
-                rate += small * (set_point - middle) / LAG_S
-            counted += right / HZ
-            assert counted == pytest.approx(angle, abs=2.0 * 2.0 * pi / 100_000)  # a count, and where the first began
-
-
-def test_noise_at_rest_is_that_in_motion(config: Config, mirror: Mirror) -> None:
-    """The short way for wheels that stand takes the same numbers of the stream."""
-    still, moving = plant_on_deck(mirror), plant_on_deck(mirror)
-    moving.step(0.0, DT_S, 1e-12, 1e-12)  # so slow that nothing of it is left after rounding
-    encoders = [RateEncoders(0.001, np.random.default_rng(2)) for _ in range(2)]
-    for times in sample_times(HZ, FRAME_HZ, LAG_S, 1, 700):  # more than two blocks of the stream
-        at_rest, in_motion = (e.read(plant, times) for e, plant in zip(encoders, (still, moving), strict=True))
-        assert np.array(at_rest) == pytest.approx(np.array(in_motion), abs=1.5e-7)  # the last digit
-
-
 # -- inertial unit ----------------------------------------------------------------------------------------------------
 
 
@@ -335,22 +292,22 @@ def readings(config: Config, mirror: Mirror, seed: int, frames: int, **values: f
 
 
 def test_biases_and_scale_have_their_sigmas(config: Config, mirror: Mirror) -> None:
-    error = 4.5 / sqrt(2 * 800)
+    error = 4.5 / sqrt(2 * 200)
     biases = {key: BIASES[key] for key in ("accelerometer_bias_sigma_m_s2", "gyroscope_bias_sigma_rad_s")}
-    found = np.array([readings(config, mirror, seed, 1, **biases)[0] for seed in range(800)])
+    found = np.array([readings(config, mirror, seed, 1, **biases)[0] for seed in range(200)])
     assert found.std(axis=0) == pytest.approx([0.3, 0.0175], rel=error)
-    assert found.mean(axis=0) == pytest.approx([0.0, 0.8], abs=4.5 * 0.3 / sqrt(800))
-    assert abs(np.corrcoef(found.T)[0, 1]) < 4.5 / sqrt(800)
-    scaled = np.array([readings(config, mirror, seed, 1, gyroscope_scale_sigma=0.01)[0] for seed in range(800)])
+    assert found.mean(axis=0) == pytest.approx([0.0, 0.8], abs=4.5 * 0.3 / sqrt(200))
+    assert abs(np.corrcoef(found.T)[0, 1]) < 4.5 / sqrt(200)
+    scaled = np.array([readings(config, mirror, seed, 1, gyroscope_scale_sigma=0.01)[0] for seed in range(200)])
     assert (scaled[:, 1] / 0.8).std() == pytest.approx(0.01, rel=error)
     assert (scaled[:, 0] == 0.0).all()
 
 
 def test_biases_walk(config: Config, mirror: Mirror) -> None:
     walks = {key: value for key, value in BIASES.items() if "walk" in key}
-    ends = np.array([readings(config, mirror, seed, 100, **walks)[-1] for seed in range(400)])
-    assert ends.std(axis=0) == pytest.approx([0.01, 0.003], rel=4.5 / sqrt(2 * 400))  # one second
-    assert ends.mean(axis=0) == pytest.approx([0.0, 0.8], abs=4.5 * 0.01 / sqrt(400))
+    ends = np.array([readings(config, mirror, seed, 100, **walks)[-1] for seed in range(150)])
+    assert ends.std(axis=0) == pytest.approx([0.01, 0.003], rel=4.5 / sqrt(2 * 150))  # one second
+    assert ends.mean(axis=0) == pytest.approx([0.0, 0.8], abs=4.5 * 0.01 / sqrt(150))
 
 
 @pytest.mark.parametrize("key", [*BIASES, "accelerometer_sigma_m_s2", "gyroscope_sigma_rad_s"])
