@@ -9,12 +9,9 @@ import pytest
 from ccatp.beacons.cricket.range_network import MappingError
 from ccatp.config.load import load_radio_config
 from ccatp.config.models import Config
-from ccatp.links.beacon_messages import PoseTrack, PoseTruth, pose_track, pose_truth
 from ccatp.studies import cricket_study
 from ccatp.studies.campaign import Cell, CellResult, Job, JobOutcome
 from ccatp.studies.cricket_study import CASES, STUDY, combine, draw, run_job
-from ccatp.studies.mote_navigation import STUDY as MoteNavigationSTUDY
-from ccatp.studies.mote_navigation import band, seconds_of
 from ccatp.studies.mote_navigation import combine as mote_navigation_combine
 from ccatp.studies.mote_navigation import draw as mote_navigation_draw
 from ccatp.studies.mote_runs import run_batch, run_filter, simulate_field
@@ -99,24 +96,6 @@ def test_sizes(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert cell["bound_m"] is None or cell["rms_of_others_m"] < 3.0 * cell["bound_m"]
 
 
-def poses(frames: int) -> tuple[PoseTrack, PoseTruth]:
-    """Estimates with sigmas of 0.02, 0.02 m and 0.1 rad, and a truth 0.04 m and a turn of 0.2 rad away from them."""
-    track, truth = np.zeros((frames, 13)), np.zeros((frames, 8))
-    track[:, 0] = truth[:, 0] = np.arange(frames)
-    track[:, 1] = truth[:, 1] = 0.1 * np.arange(frames)
-    track[:, [5, 7]], track[:, 10] = 4e-4, 1e-2
-    truth[:, 2], truth[:, 4] = 0.04, 2.0 * np.pi - 0.2
-    return pose_track(track), pose_truth(truth)
-
-
-def test_errors_by_the_second_from_the_map_on() -> None:
-    found = seconds_of(*poses(60), 2.0)
-    assert {name: len(values) for name, values in found.items()} == {"nees": 4, "error_m": 4, "sigma_m": 4}
-    assert found["nees"] == pytest.approx(8.0)  # (0.04 / 0.02)^2 + (0.2 / 0.1)^2: the turn is wrapped
-    assert found["error_m"] == pytest.approx(0.04)
-    assert found["sigma_m"] == pytest.approx(0.02 * 2**0.5)
-
-
 def outcome(nees: float) -> JobOutcome:
     values = {"outcome": "complete", "reached": 6, "within": 5, "nis_mean": 1.0, "readings": 100, "updates": 20.0}
     errors_m = {"position_m": 0.004, "map_m": 0.002, "map_expected_m": 0.005}
@@ -132,10 +111,3 @@ def test_missions_put_together_and_drawn(tmp_path: Path) -> None:
     assert mote_navigation_combine({}, [outcome(30.0), outcome(30.0)]).values["in_band"] == 0.0
     mote_navigation_draw([CellResult({"case": "route"}, found.values, found.arrays)], tmp_path)
     assert (tmp_path / "mote_navigation.png").exists()
-
-
-def test_the_band_narrows() -> None:
-    few, many = band(2), band(50)
-    assert few[0] < many[0] < 1.0 < many[1] < few[1]
-    assert many == pytest.approx((0.787, 1.239), abs=1e-3)
-    assert MoteNavigationSTUDY.runs == 50

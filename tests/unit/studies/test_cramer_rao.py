@@ -121,24 +121,6 @@ def test_the_scatter_of_slip_is_the_floor_of_a_leg() -> None:
     assert np.sqrt(last_covariance(cfg)[0, 0]) == pytest.approx(expected_m, rel=1e-3)  # the model is linear along x
 
 
-def test_less_noise_and_the_accelerometer_give_a_lower_bound() -> None:
-    changes = ({"gyroscope_sigma_rad_s": 0.001}, {"slip_max": 0.03}, {"slip_walk_sigma": 0.0})
-    noisy = np.trace(last_covariance(config()))
-    assert all(np.trace(last_covariance(config(**change))) < noisy for change in changes)
-    cfg = config(accelerometer_bias_sigma_m_s2=0.1)
-    assert np.trace(last_covariance(cfg, with_accelerometer=True)) < np.trace(last_covariance(cfg))
-
-
-def test_a_counted_angle_costs_a_part_of_a_count() -> None:
-    noiseless = {"slip_max": 0.02, "slip_walk_sigma": 0.0, "start_heading_sigma_rad": 0.0, "gyroscope_sigma_rad_s": 1.0}
-    plain, counted = (
-        last_covariance(cfg)[0, 0] for cfg in (config(**noiseless), config(**noiseless, encoder_counts_per_rev=1200))
-    )
-    count_m = 0.97 * 2.0 * np.pi / 1200.0 * 0.03
-    # Half a count's variance for the mean of two wheels, at the beginning of the leg and at its end.
-    assert counted - plain == pytest.approx(count_m**2 / 12.0, rel=0.02)  # the gyroscope says a little
-
-
 def test_an_estimator_does_not_beat_the_bound() -> None:
     keys = {"run.mirror": "thesis-m1", "run.world": "hard", "run.filter": "ekf", "run.panels": 1, "run.seed": 3}
     cfg = load_config(overrides=keys)

@@ -11,19 +11,17 @@ from ccatp.config.models import Config
 from ccatp.core import EdgeSample
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.studies.campaign import CellResult, Job, JobOutcome, with_seed
+from ccatp.studies.campaign import CellResult, JobOutcome
 from ccatp.studies.danger_study import (
     OFF_S,
     RULES,
     STUDY,
-    bootstrap,
     build_rule,
     combine,
     draw,
     drive_frame,
     drive_to_rim,
     off_time_rule,
-    run_job,
     transit,
     wilson,
 )
@@ -104,14 +102,6 @@ def test_wilson_is_that_of_the_tables(hits: int, of: int) -> None:
         wilson(hits, of)
 
 
-def test_the_interval_of_a_quantile_holds_it_and_is_reproducible() -> None:
-    values = np.random.default_rng(4).normal(10.0, 1.0, 400)
-    low, high = bootstrap(values, 0.95)
-    assert low < 11.645 < high  # the quantile of the normal distribution
-    assert high - low < 1.0
-    assert bootstrap(values, 0.95) == (low, high)
-
-
 def outcome(false_edges: int, overrun_m: list[float]) -> JobOutcome:
     figures = {"false_edges": false_edges, "falls": 1}
     arrays = {f"{name}_overrun_m": np.array(overrun_m) for name in RULES}
@@ -126,17 +116,6 @@ def test_a_cell_pools_its_jobs() -> None:
     assert values["shipped"]["overrun_max_mm"] == pytest.approx(40.0)
     assert values["shipped"]["falls"] == 2
     assert arrays["thesis_overrun_m"].tolist() == [0.01, 0.02, 0.03, 0.04]
-
-
-def test_a_job_is_a_function_of_its_seed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ccatp.studies.danger_study._DRIVES", 8)
-    cfg, _ = loaded("fyst-m1", "hard")
-    job = Job("danger", {"mirror": "fyst-m1", "speed_m_s": 0.2, "crossing": 0}, cfg.run.seed, cfg)
-    first, again, other = run_job(job), run_job(job), run_job(Job("danger", job.factors, 9, with_seed(cfg, 9)))
-    key = "shipped_overrun_m"
-    assert first.values == again.values
-    assert (first.arrays[key] == again.arrays[key]).all()
-    assert not (first.arrays[key] == other.arrays[key]).all()
 
 
 def test_turns_have_no_overrun_and_every_cell_can_be_drawn(tmp_path: Path) -> None:

@@ -71,31 +71,12 @@ def test_the_gain_margin_is_where_the_closed_loop_tips_over() -> None:
     assert inner.real.max() < 0.0 < outer.real.max()
 
 
-def test_an_unstable_loop_says_so() -> None:
-    one = loop(gains(100.0, 0.0, 0.0), "true", frames=4)
-    found = margins(one)
-    assert (found.is_stable, found.gain_db < 0.0, found.phase_rad < 0.0, loops.overshoot(one)) == (
-        False,
-        True,
-        True,
-        inf,
-    )
-
-
 def test_overshoot_of_a_second_order_loop() -> None:
     # K / (s (T s + 1)), damping zeta = 1 / (2 sqrt(K T)): overshoot exp(-pi zeta / sqrt(1 - zeta^2)).
     kp = 25.0
     zeta = 0.5 / sqrt(kp * LAG_S)
     found = loops.overshoot(loop(gains(kp, 0.0, 0.0), "true"))
     assert found == pytest.approx(np.exp(-pi * zeta / sqrt(1.0 - zeta * zeta)), abs=1e-3)  # the grid of the step
-
-
-def test_the_phase_is_continuous_and_starts_at_the_integrators() -> None:
-    omega = np.geomspace(1e-3, 300.0, 2000)
-    for plant, start_deg in (("printed", -90.0), ("true", -180.0)):
-        phase = loops.response(loop(ANGULAR, plant), omega)[1]
-        assert degrees(phase[0]) == pytest.approx(start_deg, abs=0.3)  # atan of the zeros at 1e-3 rad/s
-        assert np.abs(np.diff(phase)).max() < 0.1
 
 
 def test_every_set_of_gains_is_analysed() -> None:

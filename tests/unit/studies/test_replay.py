@@ -1,6 +1,6 @@
 """A run made of frames by hand, through the localizers; its smoother; figures against a reference, done by hand."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from math import cos, pi, sin, sqrt
 
 import numpy as np
@@ -21,17 +21,14 @@ from ccatp.studies.replay import (
     RecordingFilter,
     Replayed,
     ReplayEvaluation,
-    added_noise,
     csv_lines,
     difference,
     errors_of,
     figures,
-    fix_distances_m,
     has_smoother,
     judge,
     replay,
     table_lines,
-    transition_of_reset,
 )
 
 FRAME_S = 0.01
@@ -300,80 +297,6 @@ def test_what_was_taken_back_is_removed() -> None:
     assert_smoothed_as_by_hand(filter_, "ekf")
 
 
-@pytest.mark.parametrize("name", ["ekf", "ukf"])
-def test_a_shift_of_the_state_shifts_what_is_smoothed(name: str) -> None:
-    # The model is linear: from the shift on, everything is as before plus what becomes of the shift.
-    shift, filter_ = np.array([10.0, 0.0, -7.0, 1.0]), started(name)
-    drive(filter_, READINGS[:6])
-    filter_.reset(filter_.mean + shift, filter_.covariance)
-    for z in READINGS[6:]:
-        shift = F.dot(shift)
-        filter_.predict(F, Q)
-        filter_.update(z + H.dot(shift), H, R)
-    means, _ = by_hand(name)
-    found = filter_.smooth().means
-    assert len(found) == len(means) + 1  # the shift is a transition
-    assert_same(found[:7], means[:7])
-    assert_same(found[7], means[6] + [10.0, 0.0, -7.0])
-
-
-def test_nothing_is_known_across_a_state_drawn_anew() -> None:
-    filter_ = started("ekf")
-    drive(filter_, READINGS[:6])
-    before = filter_.mean[:3].copy(), filter_.covariance[:3, :3].copy()
-    filter_.reset(np.zeros(N), 9.0 * np.eye(N))
-    drive(filter_, READINGS[6:])
-    found = filter_.smooth()
-    assert_same(found.means[6], before[0])
-    assert_same(found.covariances[6], before[1])
-
-
-ROOT = np.random.default_rng(1).normal(size=(N, N))
-P = np.asarray(ROOT @ ROOT.T + np.eye(N))
-
-
-def redrawn(before: FloatArray) -> FloatArray:
-    after = before.copy()
-    after[1, :] = after[:, 1] = 0.0
-    after[1, 1] = 7.0
-    return after
-
-
-def asymmetric_in_the_last_bit(before: FloatArray) -> FloatArray:
-    after = before.copy()
-    after[0, 1] = np.nextafter(after[0, 1], np.inf)
-    return after
-
-
-@pytest.mark.parametrize(
-    ("change", "diagonal_of_F", "variance"),
-    [
-        (np.copy, [1, 1, 1, 1], 0.0),
-        (asymmetric_in_the_last_bit, [1, 1, 1, 1], 0.0),
-        (redrawn, [1, 0, 1, 1], 7.0),
-        (lambda before: 0.5 * before, [0, 0, 0, 0], None),
-        (lambda before: before + np.diag([1.0, 0.0, 0.0, 0.0]), [0, 0, 0, 0], None),
-    ],
-)
-def test_what_a_reset_was(
-    change: Callable[[FloatArray], FloatArray], diagonal_of_F: list[int], variance: float | None
-) -> None:
-    after = change(P)
-    transition, noise = transition_of_reset(P, after)
-    np.testing.assert_array_equal(transition, np.diag(diagonal_of_F))
-    # 1e-12: P is of order 10, and what was redrawn is exactly what stands there.
-    np.testing.assert_allclose(transition @ P @ transition.T + noise, after, atol=1e-12)
-    if variance is not None:
-        assert noise[1, 1] == variance
-
-
-def test_noise_is_what_was_given_unless_the_prediction_added_more() -> None:
-    predicted = F @ P @ F.T + Q
-    assert added_noise(P, F, predicted, Q) is Q
-    more = np.diag([0.0, 0.0, 0.0, 1e-3])
-    np.testing.assert_allclose(added_noise(P, F, predicted + more, Q), Q + more, atol=1e-12)  # rounding of 10
-
-
 # -- figures against a reference --------------------------------------------------------------------------------------
 
 
@@ -422,13 +345,6 @@ def test_a_replay_reproduces_up_to_rounding(by_m: float, is_same: bool) -> None:
     assert found["position_mm"] == pytest.approx({"rms": 1e3 * by_m / sqrt(2.0), "max": 1e3 * by_m}, abs=1e-15)
     assert difference(errors_of(trace([0.0], by_m), trace([0.0]), NONE, NONE))["reproduced"] is is_same
     assert not difference(errors_of(trace([1.0]), trace([1.0], first=7), NONE, NONE))["reproduced"]  # no common frame
-
-
-def test_the_distance_of_a_fix_is_that_to_the_estimate_before_it() -> None:
-    heights = MIRROR.surface.heights_m(np.array([0.0, 0.1, 0.2]), np.zeros(3))
-    estimate = trace([0.0, 0.1, 0.2], first=5)._replace(height_m=heights)
-    found = fix_distances_m(estimate, np.array([[6.0, 0.1, 0.003], [7.0, 0.2, 0.0]]), MIRROR)
-    assert found == pytest.approx([0.003, 0.0], abs=2e-5)  # the surface falls by less than that over 3 mm
 
 
 def judged(*, has_truth: bool, is_smoothed: bool = True, first: int = 0) -> ReplayEvaluation:

@@ -1,6 +1,5 @@
 """The study `thesis`: readings of its text, its localizer and its published figures."""
 
-from math import nan
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.core import EdgeSample, Fix, ImuSample, WheelSample
-from ccatp.estimation.seams import HeadingFix
 from ccatp.estimation.thesis_localizer import STATES
 from ccatp.filters import FILTERS
 from ccatp.mirror.mirror import build_mirror
@@ -97,18 +95,6 @@ def test_a_published_figure_is_measured_in_scatters_of_a_run() -> None:
     assert values["complete"] == 2
 
 
-def test_scatter_needs_two_runs_and_a_lost_run_is_not_complete() -> None:
-    agreed, _ = combine({"noise": "normal"}, [outcome(1.0, 3.4), outcome(1.0, 3.4)])
-    assert agreed["localization"]["within_10mm_fraction"]["is_published_within"] is False
-    assert agreed["localization"]["mean"]["is_published_within"] is True
-    one, _ = combine({"noise": "twice"}, [outcome(0.9, 3.0)])
-    assert one["localization"]["mean"]["is_published_within"] is None
-    assert one["localization"]["is_published_within"] is None
-    lost = outcome(nan, nan)
-    lost.values["waypoints"] = 3  # type: ignore[index]  # the test's own dict
-    assert combine({"noise": "normal"}, [lost, outcome(0.9, 3.0)]).values["complete"] == 1
-
-
 def test_every_figure_of_the_thesis_is_drawn(tmp_path: Path) -> None:
     results = []
     for cell in cells():
@@ -117,18 +103,6 @@ def test_every_figure_of_the_thesis_is_drawn(tmp_path: Path) -> None:
     draw(results, tmp_path)
     stems = ("trajectory", "localization", "waypoints")
     assert {path.name for path in tmp_path.glob("*.png")} == {f"{s}_{noise}.png" for s in stems for noise in PUBLISHED}
-
-
-def test_a_seam_replaces_the_heading(monkeypatch: pytest.MonkeyPatch) -> None:
-    localizer = built()
-    step(localizer, 0.0, 0.0)
-    before_rad = localizer.pose.heading_rad
-    monkeypatch.setattr(localizer._crossings, "scan", lambda *_: ["a transition"])
-    monkeypatch.setattr(localizer._crossings, "headings", lambda *_: [HeadingFix(0.3, 1e-6)])
-    step(localizer, 0.01, 0.0)
-    # Thirty sigmas of the start heading: the daemon's localizer would not believe it.
-    assert localizer.pose.heading_rad - before_rad == pytest.approx(0.3, abs=1e-3)
-    assert localizer.heading_sigma_rad == pytest.approx(1e-3)
 
 
 @pytest.mark.slow
