@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from ccatp.cli import main
@@ -15,7 +14,7 @@ from ccatp.report.beacon_record import (
     readings_of,
     waypoint_rows,
 )
-from ccatp.report.plots import NARROW, PX_PER_IN, WIDE, ellipse_outline
+from ccatp.report.plots import NARROW, PX_PER_IN, WIDE
 from ccatp.report.run_page import beacon_data, beacon_drawings, beacon_page
 from tests.support.command import answered
 from tests.unit.reporting.beacon_recorded import FRAMES, OFF_M, SIGMA_M, beacon_config, record_beacons
@@ -87,12 +86,6 @@ def test_its_figures_are_drawn_for_screens_and_telephones(run_dir: Path) -> None
             picture = draw(width)
             assert picture.get_figwidth() * PX_PER_IN == pytest.approx(width)
             assert picture.get_figheight() * PX_PER_IN > 200.0
-
-
-def test_an_ellipse_of_three_sigma() -> None:
-    outline = np.array([1.0, 2.0]) + ellipse_outline(np.array(((0.04, 0.0), (0.0, 0.01))), 3.0)
-    assert outline.min(axis=0) == pytest.approx((0.4, 1.7), abs=2e-3)
-    assert outline.max(axis=0) == pytest.approx((1.6, 2.3), abs=2e-3)
 
 
 def test_a_robot_that_follows(tmp_path: Path) -> None:

@@ -21,13 +21,11 @@ from ccatp.report.findings import (
     Grade,
     TimeBreakdown,
     findings_of,
-    least_times,
     point_verdicts,
     sampled_spells,
-    spells_of,
     time_budget,
 )
-from ccatp.report.record import TOPICS_READ, RecordedSession, RunRecord, changed_keys, read_record
+from ccatp.report.record import TOPICS_READ, RecordedSession, RunRecord, read_record
 from ccatp.survey.composition import assemble
 
 
@@ -94,19 +92,6 @@ def test_grades(record: RunRecord) -> None:
     assert found[3].why == "no fix: too few channels"
 
 
-def test_truth_and_laser_tell_the_same_of_arrivals(record: RunRecord) -> None:
-    blind = replace(record, sessions=(replace(only(record), truth=None),))
-    for seen, true in zip(point_verdicts(blind), point_verdicts(record), strict=True):
-        assert seen.first_mm == pytest.approx(true.first_mm, rel=0.02, abs=0.02)  # curved surface, noise
-
-
-def test_changed_keys() -> None:
-    ours = {"a": {"b": 1, "c": [1]}, "d": 2}
-    shipped = {"a": {"b": 1, "c": [2]}, "e": 3}
-    assert changed_keys(ours, shipped) == {"a.c": ([1], [2]), "d": (2, None), "e": (None, 3)}
-    assert changed_keys(ours, ours) == {}
-
-
 # -- time budget ------------------------------------------------------------------------------------------------------
 
 
@@ -137,31 +122,10 @@ def test_the_times_add_up_to_the_mission(record: RunRecord) -> None:
     assert time_budget(replace(record, sessions=())) is None
 
 
-def test_the_least_time_of_half_a_mission_ends_at_its_last_point(record: RunRecord) -> None:
-    whole, _ = least_times(record)
-    half, covers = least_times(replace(record, measured=record.measured[:3]))
-    assert whole is not None
-    assert half is not None
-    assert half["measure"] == pytest.approx(3 * 0.5)
-    assert 0.0 < half["drive"] < 0.5 * whole["drive"]
-    assert covers == "the planned way to the last measured point"
-    assert least_times(replace(record, measured=()))[0] is None
-
-
 def test_a_longer_measurement_waited(record: RunRecord) -> None:
     found = budget_of(record, (100, "idle", "measuring"), (250, "measuring", "held"), (300, "held", "done"))
     # 1 s idle, 1.5 s measuring of which half a second is due, half a second held, and nothing after the end.
     assert found.spent_s == {"measure": pytest.approx(0.5), "wait": pytest.approx(2.5)}
-
-
-def test_a_main_loop_that_died_leaves_a_wait(record: RunRecord) -> None:
-    changes = ((100, "idle", "driving"), (300, "idle", "settling"), (310, "settling", "done"))
-    spells = spells_of(replace(only(record), changes=tuple(StateChange(*change) for change in changes)))
-    assert [(state, round(spell_s, 6)) for state, spell_s in spells or ()] == [
-        ("idle", 1.0),
-        ("idle", 2.0),
-        ("settling", 0.1),
-    ]
 
 
 def test_what_passed_while_main_was_restarted_is_a_row(record: RunRecord) -> None:

@@ -15,7 +15,7 @@ from ccatp.cli import main
 from ccatp.records.state_log import LogLine
 from ccatp.report.compare import RunPair, compare_lines, compare_page, compared_figures
 from ccatp.report.findings import findings_of, outcome_of
-from ccatp.report.html import POLICY, ReportError, clock_text, environment, events_of, gathered, number_text
+from ccatp.report.html import POLICY, ReportError, environment, events_of
 from ccatp.report.record import read_record
 from ccatp.report.run_page import report_run, run_page
 from tests.support.command import answered, refused
@@ -63,8 +63,7 @@ def test_a_real_robot_is_called_one_and_has_no_truth(tmp_path: Path) -> None:
     ("gone", "left"),
     [
         (("telemetry.mcap",), ["map", "points", "surface", "panels", "events", "configuration"]),
-        (("mission.sqlite",), ["map", "time", "localization", "events", "configuration"]),
-        (("log.jsonl", "summary.json"), [name for name in ALL if name != "events"]),
+        (("mission.sqlite", "log.jsonl", "summary.json"), ["map", "time", "localization", "configuration"]),
         (("telemetry.mcap", "mission.sqlite", "log.jsonl", "summary.json"), ["configuration"]),
     ],
 )
@@ -117,12 +116,6 @@ def test_outcomes(recorded: Path, changes: dict[str, object], outcome: tuple[str
     (session,) = whole.sessions
     status = msgspec.structs.replace(session.statuses[-1], **changes)
     assert outcome_of(replace(whole, sessions=(replace(session, statuses=(status,)),))) == outcome
-
-
-def test_numbers_of_a_page() -> None:
-    cells = [number_text(value) for value in (None, -0.001, 1.005, -2.5, 3, "<")]
-    assert cells == ["\u2013", "0.00", "1.00", "\u22122.50", "3", "<"]
-    assert [clock_text(value) for value in (3.4, 59.6, 3091.4)] == ["3 s", "1 min 00 s", "51 min 31 s"]
 
 
 # -- two runs ---------------------------------------------------------------------------------------------------------
@@ -178,29 +171,6 @@ def test_different_mirrors_are_not_compared_point_by_point(recorded: Path, tmp_p
     assert not [one.name for one in compared_figures(pair) if "wavefront" in one.name and one.change is not None]
 
 
-def test_runs_without_anything_are_compared(recorded: Path, without: Callable[..., Path]) -> None:
-    bare = findings_of(read_record(without("telemetry.mcap", "mission.sqlite", "log.jsonl", "summary.json")))
-    both = RunPair(bare, findings_of(read_record(recorded)))
-    assert Markup(compare_page(RunPair(bare, bare))).anchors == ["figures", "configuration"]
-    assert Markup(compare_page(both)).anchors == [
-        "figures", "configuration", "map", "time", "errors", "surface", "adjusters", "events",
-    ]  # fmt: skip
-
-
-def test_wavefronts_are_of_the_panels_that_both_have(recorded: Path) -> None:
-    whole = findings_of(read_record(recorded))
-    assert whole.alignment is not None
-    assert whole.alignment.wavefront is not None
-    (panel,) = whole.alignment.panels
-    more = replace(panel, panel=panel.panel._replace(col=panel.panel.col + 1))
-    wider = replace(whole, alignment=replace(whole.alignment, panels=(panel, more)))
-    found = {one.name: one for one in compared_figures(RunPair(whole, wider))}
-    assert not [name for name in found if "_" in name]
-    error = found["half-wavefront error, \u00b5m, common panels (1)"]
-    assert error.change == 0.0
-    assert error.a == pytest.approx(1e6 * whole.alignment.wavefront.before_m, abs=1e-3)
-
-
 # -- lines of the log -------------------------------------------------------------------------------------------------
 
 
@@ -235,23 +205,6 @@ def test_a_flood_hides_nothing() -> None:
     few = events_body(LATE[:3])
     assert "<details>" not in few
     assert few.count("late frame") == 3
-
-
-def test_kinds_beyond_the_limit_are_counted_and_errors_are_always_there() -> None:
-    words = [f"{chr(97 + k // 26)}{chr(97 + k % 26)}" for k in range(60)]
-    calm = [line(f"calm {word}", level="info") for word in words]
-    before, _ = events_body([*calm, *(line(f"careful {word}") for word in words)]).split("<details>")
-    assert before.count("careful") == 40
-    assert "and 20 more kinds of warnings" in before
-    assert "calm" not in before
-    before, _ = events_body([line(f"broken {word}", level="error") for word in words]).split("<details>")
-    assert before.count("broken") == 60
-    assert "more kinds" not in before
-
-
-def test_names_of_points_are_no_numbers() -> None:
-    (kind,) = gathered([line(f"measurement of 1-{k}-7 failed: no fix") for k in range(3)])
-    assert kind.text == "measurement of 1-0-7 and 2 others failed: no fix"
 
 
 # -- the commands -----------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import pytest
 from ccatp.core import DeckPose, PanelId, PointId
 from ccatp.mirror.mirror import Mirror
 from ccatp.records.run_reader import RunReadError
-from ccatp.report.figures import distribution_figure, error_figure, time_figure
+from ccatp.report.figures import error_figure, time_figure
 from ccatp.report.findings import ErrorSeries, Grade, PointVerdict, TimeBreakdown, arrival_error_m, point_verdicts
 from ccatp.report.mirror_map import MAP_WIDTH_PX, draw_from_run_dir, record_map, run_map
 from ccatp.report.plots import (
@@ -22,7 +22,6 @@ from ccatp.report.plots import (
     PictureError,
     add_legend,
     add_tooltips,
-    distinct,
     envelope,
     new_plot,
     save_figure,
@@ -50,12 +49,6 @@ def test_an_envelope() -> None:
     assert found.mean[0] == pytest.approx(49 / 99)
     assert len(envelope(np.empty(0), np.empty(0), 10).x) == 0
     assert envelope(np.array([3.0]), np.array([2.0]), 10).high.tolist() == [2.0]
-
-
-def test_marks_on_one_pixel_are_one() -> None:
-    x, y = distinct(np.array([0.0, 0.01, 100.0, 50.0]), np.array([1.0, 1.0, 2.0, 1.5]), 100.0)
-    assert (x.tolist(), y.tolist()) == ([0.0, 100.0, 50.0], [1.0, 2.0, 1.5])
-    assert len(distinct(np.empty(0), np.empty(0), 100.0)[0]) == 0
 
 
 @pytest.mark.parametrize("width_px", [WIDE, NARROW])
@@ -166,13 +159,6 @@ def test_where_the_time_went() -> None:
     assert "budget" not in axes.get_legend_handles_labels()[1]
     (axes,) = time_figure([("this run", budget)], 120.0, WIDE).axes
     assert "budget" in axes.get_legend_handles_labels()[1]
-
-
-def test_a_distribution() -> None:
-    (axes,) = distribution_figure({"A": np.array([2.0, 1.0]), "B": np.array([0.5])}, "error, mm", NARROW).axes
-    assert [line.get_label() for line in axes.lines] == ["A", "B"]
-    assert axes.lines[0].get_xydata().tolist() == [[1.0, 50.0], [2.0, 100.0]]  # type: ignore[union-attr]
-    assert axes.get_xlim() == pytest.approx((0.1, 10.0))
 
 
 # -- map of a run directory -------------------------------------------------------------------------------------------
