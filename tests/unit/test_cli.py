@@ -343,18 +343,3 @@ def test_config_check_lists_every_problem(tmp_path: Path, capsys: pytest.Capture
 )
 def test_settings_are_toml_or_text(text: str, setting: tuple[str, object]) -> None:
     assert parse_setting(text) == setting
-
-
-@pytest.mark.parametrize("text", ["seed", "=2", "run.=2", ".seed=2"])
-def test_a_setting_needs_key_and_value(text: str) -> None:
-    with pytest.raises(ValueError, match=r"is not KEY=VALUE, as in run\.seed=2"):
-        parse_setting(text)
-
-
-def test_all_problems_of_a_fault_plan_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    plan = tmp_path / "plan.toml"
-    plan.write_text('[[link]]\ntype = "delay"\nstart_s = 8.0\n')
-    said = refused(capsys, "run", "--sim", "--faults", plan)
-    for problem in ("link[0].start_s is unknown", "link[0].delay_s is missing"):
-        assert problem in said
-    assert "config check" not in said

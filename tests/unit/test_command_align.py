@@ -62,7 +62,7 @@ def run_dir(tmp_path: Path) -> Path:
     return make_run(tmp_path / "run", CFG, planned, measured, truth)
 
 
-@pytest.mark.parametrize("name", [*NAMES[::3], *(pytest.param(name, marks=pytest.mark.slow) for name in NAMES[1:3])])
+@pytest.mark.parametrize("name", [NAMES[0], *(pytest.param(name, marks=pytest.mark.slow) for name in NAMES[1:])])
 def test_a_survey_recovers_what_was_simulated(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cfg = load_config(overrides={"run.mirror": name, "run.panels": 1, "mission.calibration_length_m": 0.0})
     found = aligned(capsys, surveyed(tmp_path / "run", cfg))
@@ -123,11 +123,10 @@ def test_the_csv_has_a_line_a_panel(run_dir: Path, tmp_path: Path, capsys: pytes
     assert float(row["sigma_piston_um"]) == found["panels"][0]["sigma"][0]
 
 
-@pytest.mark.parametrize(("suffix", "magic"), [("png", b"\x89PNG"), ("pdf", b"%PDF")])
-def test_the_figure_is_drawn(suffix: str, magic: bytes, run_dir: Path, tmp_path: Path) -> None:
-    picture = tmp_path / f"panels.{suffix}"
+def test_the_figure_is_drawn(run_dir: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "panels.pdf"
     assert main(["align", str(run_dir), "--figure", str(picture)]) == 0
-    assert picture.read_bytes().startswith(magic)
+    assert picture.read_bytes().startswith(b"%PDF")
 
 
 def test_settings_act(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,7 +3,6 @@
 import json
 import os
 import stat
-import tempfile
 import tomllib
 from pathlib import Path
 
@@ -204,14 +203,6 @@ def test_the_list_is_read_anew_and_a_bad_one_names_nobody(folder: Path) -> None:
 
 
 # -- the command ``ccatp dashboard``, where there is nothing to attach to ---------------------------------------------
-
-
-def test_no_daemon(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with tempfile.TemporaryDirectory(prefix="ccatp-") as folder:
-        assert main(["dashboard", "--runtime-dir", folder]) == 5
-        assert capsys.readouterr().err == (
-            f"ccatp: no daemon in {folder}; start one with ccatp run, or name its folder with --runtime-dir\n"
-        )
 
 
 def test_a_key_of_the_daemon_is_not_the_pages(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.beacons.slam.evaluation import judge, markdown, with_means
+from ccatp.beacons.slam.evaluation import judge
 from ccatp.cli import main
 from ccatp.config.load import load_recordings_config
 from ccatp.config.package import configs_dir
@@ -88,14 +88,11 @@ def test_what_is_not_known_is_null(tmp_path: Path, capsys: pytest.CaptureFixture
     assert len(data["beacons"]) == len(BEACONS)
 
 
-@pytest.mark.parametrize("filter_name", ["ekf-slam", "smoother"])
-def test_a_truth_of_one_row_is_no_trajectory(
-    tmp_path: Path, filter_name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_truth_of_one_row_is_no_trajectory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = labyrinth_lines(world(seconds=30.0))
     first = next(line for line in lines if line.startswith("gt2"))
     file = write_lines(tmp_path / "lab.txt", [first, *(line for line in lines if not line.startswith("gt2"))])
-    data = told(capsys, "slam", file, "--filter", filter_name)
+    data = told(capsys, "slam", file, "--filter", "smoother")
     assert data["trajectory_rmse_m"] is data["nees_mean"] is None
     assert data["beacon_rmse_m"] < 0.5
     assert any("no reference trajectory: the truth has 1 row" in warning for warning in data["warnings"])
@@ -355,16 +352,3 @@ def test_compare_takes_all_robots_and_gives_their_mean(tmp_path: Path, capsys: p
     assert len(rows) == 6
     assert [cell.strip() for cell in rows[-1].split("|")[1:3]] == [f"{tmp_path.name}, mean", "smoother"]
     assert "missing: no such file or folder" in refused(capsys, "radio", "compare", tmp_path / "missing")
-
-
-def test_means_are_of_each_estimator_and_missing_figures_are_dashes() -> None:
-    blank = dict.fromkeys(
-        ("heading_rmse_rad", "beacon_rmse_m", "range_scale", "nis_mean", "nees_mean", "update_us_p50", "run_s")
-    )
-    rows = [{"dataset": "a", "filter": "f", "trajectory_rmse_m": value, **blank} for value in (1.0, 3.0)]
-    found = with_means(rows, "all")
-    assert found[-1]["trajectory_rmse_m"] == 2.0
-    assert with_means(rows[:1], "all") == rows[:1]
-    lines = markdown(found)
-    assert len({len(line) for line in lines}) == 1
-    assert lines[-1].split("|")[4].strip() == "-"

@@ -285,18 +285,3 @@ def test_equal_heights_and_a_thin_field_raise_no_doubt(places: FloatArray, tell:
     data = tell(places)
     assert data["warnings"] == []
     assert data["expected_rms_m"] < 0.05
-
-
-def test_motes_in_a_plane_mapped_in_space(tell: Any) -> None:
-    data = tell(np.column_stack([FLAT, np.ones(8)]), "--dimension", "3")
-    assert data["expected_rms_m"] is None
-    assert data["warnings"][-1].startswith("the motes lie in a plane, or nearly")
-
-
-def test_unknown_scale_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "r.csv"
-    path.write_text("first,second,range_m\nA,B,3\nB,C,4\nA,C,5\n")
-    assert main(["radio", "map", "--scale", "--offset", "--ranges", str(path)]) == 0
-    shown = capsys.readouterr().out
-    assert "common offset of the ranges        unknown" in shown
-    assert "common scale of the ranges         unknown" in shown

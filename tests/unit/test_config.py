@@ -1,7 +1,6 @@
 """Reading the configuration, what a problem looks like, and changing single keys of a file."""
 
 import json
-import math
 import os
 import tomllib
 from pathlib import Path
@@ -21,7 +20,7 @@ from ccatp.config.load import (
     with_values,
     write_in_place,
 )
-from ccatp.config.messages import choice_hint, faults_of, find_line, format_toml, format_value, slip_hint
+from ccatp.config.messages import find_line, format_toml
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
@@ -270,27 +269,6 @@ def test_the_fault_is_told_in_one_line(file: Path) -> None:
     assert caught.value.exit_status == 2
 
 
-def test_the_longest_suffix_tells_the_unit() -> None:
-    assert slip_hint(("limits", "v_max_m_s"), 100.0, 0.3) == "; looks like mm/s: 100 mm/s are 0.1 m/s"
-    assert slip_hint(("limits", "omega_max_rad_s"), 60.0, 5.0) == "; looks like deg/s: 60 deg/s are 1.0472 rad/s"
-    assert slip_hint(("robot", "edge_sensors_m", 0, 1), 90.0, 2.0).endswith("are 0.09 m")
-
-
-def test_no_unit_is_guessed_that_would_not_fit_either() -> None:
-    assert slip_hint(("robot", "wheel_radius_m"), 3000.0, 0.2) == ""
-    assert slip_hint(("robot", "port"), 70000.0, 65535.0) == ""
-
-
-def test_a_choice_names_the_nearest_and_all() -> None:
-    assert choice_hint("fyst-m1x", ["fyst-m2", "fyst-m1"]) == "did you mean fyst-m1? available: fyst-m1, fyst-m2"
-    assert choice_hint("x", []) == "available: none"
-
-
-def test_a_finding_of_unknown_kind_keeps_pydantics_words() -> None:
-    (fault,) = faults_of([{"type": "new", "loc": ("run", "seed"), "input": "x" * 100, "msg": "is odd"}])
-    assert fault.what == f'= "{"x" * 59}... is odd'
-
-
 TEXT = """# comment with x = 1
 top = 1
 [robot]   # [not] a = header
@@ -322,12 +300,6 @@ trees = st.recursive(
 @given(trees)
 def test_what_is_written_reads_back_equal(tree: dict[str, object]) -> None:
     assert tomllib.loads(format_toml(tree)) == tree
-
-
-@given(st.floats(allow_nan=False))
-def test_floats_keep_every_bit(value: float) -> None:
-    back = tomllib.loads(f"v = {format_value(value)}")["v"]
-    assert (back, math.copysign(1.0, back)) == (value, math.copysign(1.0, value))
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,7 @@ from ccatp.report.foxglove import (
     VIEWS,
     ViewMessage,
     Views,
-    colour_of,
     panel_scene,
-    plain_schema,
     point_scene,
     recorded_schemas,
     time_of,
@@ -51,22 +49,6 @@ def test_viewers_can_read_the_schema_of_every_recorded_topic_and_view() -> None:
     track = dict(schemas)["track"]  # what viewers do not understand stays in the schema
     assert set(track["properties"]) == {"seq", "t_s"}
     assert track["patternProperties"]["^rows$"]["items"]["minItems"] == 8
-
-
-def test_a_nested_type_stands_in_its_place() -> None:
-    class Inner(msgspec.Struct):
-        n: int
-
-    class Outer(msgspec.Struct):
-        one: Inner
-        some: list[Inner]
-        maybe: Inner | None
-
-    schema = plain_schema(msgspec.json.schema(Outer), "x.Outer")
-    assert schema["title"] == "x.Outer"
-    assert schema["properties"]["one"]["properties"] == {"n": {"type": "integer"}}
-    assert schema["properties"]["some"]["items"]["properties"] == {"n": {"type": "integer"}}
-    assert set(schema["patternProperties"]) == {"^maybe$"}
 
 
 SDK_TYPES: dict[str, Any] = {
@@ -128,15 +110,6 @@ def test_measured_points_carry_their_deviation() -> None:
     x, y = MIRROR.point_on_deck(PointId(4, 4, 5))
     at = entity["spheres"][0]["pose"]["position"]
     assert (at["x"], at["y"], at["z"]) == pytest.approx(MIRROR.surface_point(x, y), abs=1e-5)  # rounded
-
-
-def test_colours_run_from_blue_to_red() -> None:
-    low, even, high = colour_of(-1.0), colour_of(0.0), colour_of(1.0)
-    assert low[2] > low[0]
-    assert high[0] > high[2]
-    assert even[0] == pytest.approx(even[1])
-    assert colour_of(2e-4) == high
-    assert colour_of(1e-4) != high
 
 
 # -- views ------------------------------------------------------------------------------------------------------------
