@@ -1,7 +1,7 @@
 """Pure. Poses, puck, seam normals and gravity on the shipped mirrors."""
 
 from collections.abc import Callable
-from math import cos, hypot, inf, nan, pi, sin, sqrt
+from math import hypot, inf, nan, pi, sqrt
 from typing import Any
 
 import numpy as np
@@ -46,13 +46,6 @@ def test_body_offset_is_the_projection_of_the_robot_frame(mirror: Mirror) -> Non
     hx, hy, lx, ly = mirror.body_axes(POSE)
     h, left, _ = mirror.robot_axes(POSE)
     assert (hx, hy, lx, ly) == pytest.approx((*h[:2], *left[:2]), abs=1e-15)
-
-
-def test_panel_heading_is_the_projection_on_the_panel_plane(mirror: Mirror) -> None:
-    panel = mirror.panels[PanelId(3, 4)]
-    pose = mirror.deck_pose(PanelPose(panel.id, 0.21, -0.24, 2.2))
-    x, y, _ = panel.rotate_from_deck(mirror.robot_axes(pose)[0])
-    assert (x / hypot(x, y), y / hypot(x, y)) == pytest.approx((cos(2.2), sin(2.2)), abs=1e-12)
 
 
 def test_puck_stands_on_the_normal(mirror: Mirror) -> None:
@@ -179,12 +172,6 @@ def test_contradictions_are_refused(raw: Raw, change: Callable[[Raw], None], mes
         build_mirror(MirrorConfig.model_validate(raw))
 
 
-def test_m1_columns_run_against_the_mirror_frames_x(m1: Mirror) -> None:
-    # Data file: x = -(c - 5) pitch_x, y = (r - 5) pitch_y + y_offset, mirror frame, mm.
-    x, y, _ = m1.mirror_from_deck(m1.panels[PanelId(2, 9)].origin)
-    assert (x, y) == pytest.approx((-4 * 0.6712022, -3 * 0.7512022 + 0.035), abs=1e-12)
-
-
 def test_outline_of_the_telescope_as_built(m1: Mirror, m2: Mirror) -> None:
     # Data files, outer corners with half a gap; mm.
     for mirror, x, low, high in ((m1, 3020.41, -3345.409, 3415.409), (m2, 3155.454, -3201.435, 3199.457)):
@@ -223,18 +210,6 @@ def test_nearest_panel_against_a_search_over_all_cells(mirror: Mirror) -> None:
                 for pid, p in mirror.panels.items()
             }
             assert distances[mirror.nearest_panel(x, y)] == pytest.approx(min(distances.values()), abs=1e-12)
-
-
-def test_nearest_seam_left_and_right_of_it(m1: Mirror) -> None:
-    half = 0.6712022 / 2
-    seam = m1.nearest_seam(half - 0.02, 0.1)
-    assert seam is not None
-    assert seam.axis == "x"
-    assert seam.position_m == pytest.approx(half, abs=1e-12)
-    assert seam.distance_m == pytest.approx(-0.02, abs=1e-12)
-    seam = m1.nearest_seam(half + 0.01, 0.1)
-    assert seam is not None
-    assert seam.distance_m == pytest.approx(0.01, abs=1e-12)
 
 
 def test_seams_of_every_panel_have_a_panel_on_both_sides(mirror: Mirror) -> None:
