@@ -13,7 +13,7 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, ImuSample, PanelId, PanelPose, WheelSample, difference
-from ccatp.estimation.fixes import FixRefused, PositionSigma
+from ccatp.estimation.fixes import FixRefused
 from ccatp.estimation.odometry import Odometer, OdometryPose, arc_step
 from ccatp.estimation.seams import HeadingFix, HeadingGate, heading_from_pair
 from ccatp.estimation.thesis_localizer import ConstantAcceleration, MeasurementBuilder
@@ -167,31 +167,6 @@ def test_sigmas_cover_the_error_and_grow_with_the_way() -> None:
     assert localizer.position_sigma_m == pytest.approx(hypot(0.002, 0.2 * 0.01, 0.2 * 0.002), rel=0.02)
 
 
-def test_handover_by_itself_is_continuous() -> None:
-    # A fix that lands 1 nm beyond the seam changes the panel and nothing else. Far from the mirror's centre, where the
-    # two panels' frames are turned against each other.
-    mirror = mirror_of()
-    panel = PanelId(2, 2)
-    found = mirror.panels[panel]
-    start = mirror.panel_pose(panel, DeckPose(found.x_m + 0.3356, found.y_m + 0.1, 0.2))
-    localizer = make(start)
-    localizer.step(0.0, [], [], [])
-    before = localizer.deck_pose
-    seam = mirror.nearest_seam(before.x_m, before.y_m)
-    assert seam is not None
-    target = DeckPose(seam.position_m + 1e-9, before.y_m, before.heading_rad)
-    world = Truth(target, still, still)
-    localizer.fuse_fix(world.fix(1e-9))
-    assert localizer.pose.panel == PanelId(2, 3)
-    distance, heading = errors(localizer, target)
-    assert distance < 1e-9
-    # Before the hand-over the fix moves the robot 10 um along the old panel, whose heading turns by some 1e-8 against
-    # the deck's; the frames of the two panels differ by 1e-4.
-    assert abs(heading) < 1e-7
-    assert abs(difference(localizer.pose.heading_rad, start.heading_rad)) > 1e-5
-    assert localizer.heading_sigma_rad == pytest.approx(config().localizer.start_heading_sigma_rad)
-
-
 # --- measurement model -----------------------------------------------------------------------------------------------
 
 
@@ -204,16 +179,6 @@ def test_rows_are_those_of_equation_2_12_and_not_of_2_3() -> None:
     expected = np.array([[per_r, 0, 0, turn], [per_r, 0, 0, -turn], [0, 1, 0, 0], [0, 0, 0, 1]])
     np.testing.assert_allclose(H, expected)  # the last row as printed in 2.4 would be (0, 0, 1, 0)
     np.testing.assert_allclose(R, np.square([0.001, 0.001, 0.0059, 0.0087]))
-
-
-def test_samples_count_at_their_own_time() -> None:
-    cfg = config()
-    builder = MeasurementBuilder(cfg.robot, cfg.localizer)
-    times = [0.991, 0.994, 1.0]
-    speed = {t: 0.05 + 0.2 * (t - 1.0) for t in times}  # v = 0.05, a = 0.2 at t = 1
-    wheel = times, [speed[t] / 0.03 for t in times]
-    z, H, _ = builder.stack(1.0, [], wheel, wheel)
-    np.testing.assert_allclose(H @ np.array([0.05, 0.2, 0.0, 0.0]), z, rtol=1e-12)  # the model is exact here
 
 
 def test_one_wheel_missing_is_used_with_the_other() -> None:
@@ -283,16 +248,6 @@ def test_entering_angle_for_every_edge_and_direction(normal: float, entering: fl
     assert length == pytest.approx(0.18 / abs(cos(e)))
     travel = places[0].x_m - places[1].x_m
     assert (normal + atan(travel / 0.18) - heading + pi / 2) % pi - pi / 2 == pytest.approx(0.0, abs=1e-12)
-
-
-def test_a_turn_between_the_two_sensors_is_taken_out() -> None:
-    # The left sensor crosses with the robot at heading 0.10, the right one at 0.13; both stand on the line x = 1.
-    def place_on_line(heading: float, ahead: float, aside: float, y: float) -> OdometryPose:
-        return OdometryPose(1.0 - ahead * cos(heading) + aside * sin(heading), y, heading)
-
-    left, right = place_on_line(0.10, 0.09, 0.09, 0.0), place_on_line(0.13, 0.09, -0.09, 0.002)
-    heading, _, _ = heading_from_pair(left, right, (0.09, 0.09), (0.09, -0.09), 0.0)
-    assert heading % pi == pytest.approx(0.13, abs=1e-12)  # exact geometry
 
 
 @pytest.mark.parametrize(("direction", "backward"), [(0.08, False), (1.5, True), (-1.7, False), (-0.5, True)])
@@ -426,17 +381,6 @@ def test_fixes_that_are_refused(change: dict[str, object], message: str) -> None
     with pytest.raises(FixRefused, match=message):
         localizer.fuse_fix(Fix(**values))
     assert localizer.pose == pose
-
-
-def test_position_sigma() -> None:
-    sigma = PositionSigma(3e-3, 0.01)
-    sigma.travel(0.4, 0.0)
-    assert sigma.sigma_m == pytest.approx(5e-3)
-    sigma.widen(12e-3)
-    assert sigma.sigma_m == pytest.approx(13e-3)
-    assert sigma.fuse(13e-3**2) == pytest.approx(0.5)
-    assert sigma.sigma_m == pytest.approx(13e-3 / 2**0.5)
-    assert sigma.growth_m2(2.0, 0.0) == pytest.approx(0.02**2)
 
 
 def test_odometer_keeps_the_standstill_and_forgets_the_rest() -> None:

@@ -80,20 +80,6 @@ def test_fixes_of_a_panel_share_its_tilt() -> None:
     assert found.position_sigma_m == pytest.approx(1e-4, rel=0.2)  # the tilt itself cannot be told from the place
 
 
-def test_another_panel_has_a_tilt_of_its_own() -> None:
-    found = build(start=PanelPose(PanelId(2, 7), 0.25, 0.0, 0.0))
-    robot = Robot(PanelPose(PanelId(2, 7), 0.25, 0.0, 0.0), v=STRAIGHT)
-    prior = found.state[1][TX, TX]
-    run(found, robot.frames(0.4))
-    found.fuse_fix(robot.fix(sigma_m=1e-6))
-    assert abs(found.state[1][X, TX]) > 0.5 * prior  # the fix ties it to the place
-    run(found, robot.frames(2.2))
-    P = found.state[1]
-    assert found.pose.panel == PanelId(2, 8)
-    assert P[TX, TX] == pytest.approx(prior)
-    assert not np.delete(P[TX], TX).any()
-
-
 def test_how_far_the_fix_is_above_the_surface() -> None:
     found = build()
     robot = rested(found)
@@ -334,17 +320,6 @@ def test_when_the_clock_jumps_the_pose_does_not_step(jump_s: float) -> None:
         found.step(*shifted(frame, jump_s))
     assert not found.is_frozen
     assert not found.hold_cause
-
-
-def test_a_gap_in_the_link_is_a_jump_too() -> None:
-    found = build()
-    robot = driven(found)
-    before = found.deck_pose
-    robot.frames(0.3)
-    run(found, [robot.frame(), robot.frame()])
-    assert found.counts["resyncs"] == 1
-    assert at_constant_speed(before, found.deck_pose, 0.0)
-    assert found.position_sigma_m > 0.0098
 
 
 def test_frames_that_come_twice_or_backward_change_nothing() -> None:

@@ -1,7 +1,7 @@
 """Pure. From one step of the filter to the next: frames gathered for it, and the pose carried on in between."""
 
 from itertools import pairwise
-from math import floor, nextafter, pi, sin
+from math import floor, pi, sin
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ccatp.core import FloatArray, ImuSample
 from ccatp.estimation.odometry import PosePredictor, PreintegratedMotion, Preintegrator, WheelAngle
-from ccatp.estimation.state_model import BG, KG, PL, PR, PSI, STATES, A, Slope, SurveyMotion, V, W, X, Y
+from ccatp.estimation.state_model import BG, KG, PL, PR, PSI, STATES, Slope, SurveyMotion, W, X, Y
 from tests.unit.estimation.drive import config
 from tests.unit.estimation.test_state_model import LEVEL, slopes, states
 
@@ -36,18 +36,6 @@ def test_it_drives_the_filters_arc(x: FloatArray, slope: Slope, dt_s: float, ste
         # The wheel angles are differences of numbers up to 10.
         assert [pose.x_m, pose.y_m, pose.heading_rad] == pytest.approx(expected, abs=1e-13)
     assert pose.omega_rad_s == pytest.approx(float(x[W]), abs=1e-11)
-
-
-def test_speed_and_rate_begin_with_the_filters() -> None:
-    x, pose = np.zeros(STATES), running()
-    x[[V, A, W]] = 0.08, 0.2, 0.5
-    pose.begin(x, LEVEL, 0.02)
-    # The filter's speed is the mean over its last step, so it belongs to the middle.
-    assert (pose.v_m_s, pose.omega_rad_s) == pytest.approx((0.084, 0.5), abs=1e-15)
-    pose.stand()
-    assert (pose.v_m_s, pose.omega_rad_s) == (0.0, 0.0)
-    pose.advance(0.01, 0.0, 0.0, None)
-    assert pose.v_m_s == 0.0
 
 
 def trusted(angle_variance: float, rate_variance: float = 1e-4, dt_s: float = 0.01) -> PosePredictor:
@@ -87,14 +75,6 @@ def test_the_gyroscope_is_freed_of_its_errors() -> None:
     assert pose.omega_rad_s == pytest.approx(0.4, rel=1e-9)
 
 
-def test_a_frame_of_no_length_leaves_the_speeds() -> None:
-    x, pose = np.zeros(STATES), running()
-    x[[V, W]] = 0.1, 0.3
-    pose.begin(x, LEVEL, 0.0)
-    pose.advance(0.0, 0.0, 0.0, None)
-    assert (pose.v_m_s, pose.omega_rad_s) == (0.1, 0.3)
-
-
 # -- blocks -----------------------------------------------------------------------------------------------------------
 
 
@@ -116,16 +96,6 @@ def test_means_over_a_block() -> None:
     assert second.rate_rad_s == pytest.approx(0.06, abs=1e-15)
     # From the middle of the first block, 0.02 s, to that of the second.
     assert second.acceleration_m_s2 == pytest.approx(0.04, abs=1e-15)
-
-
-def test_the_first_sample_begins_a_trapezoid_and_a_gap_ends_it() -> None:
-    builder = Preintegrator()
-    assert fill(builder, [0.01]).samples == 0
-    assert fill(builder, [0.02]).rate_rad_s == pytest.approx(0.015, abs=1e-15)
-    builder.add(0.01, [], is_turning=True)
-    block = fill(builder, [0.04, 0.05])
-    assert block.samples == 1
-    assert block.rate_rad_s == pytest.approx(0.045, abs=1e-15)
 
 
 def test_nothing_reaches_across_a_restart_or_a_rest() -> None:
@@ -220,17 +190,6 @@ def test_the_smallest_step_is_the_quantum() -> None:
     assert wheel.quantum_rad == pytest.approx(COUNT_RAD, rel=1e-9)
 
 
-def test_rates_are_summed_by_trapezoids() -> None:
-    wheel, t = WheelAngle(), 0.0
-    wheel.add([0.0], [0.0])
-    for _ in range(20):
-        times = [t + DT_S * i for i in range(1, 11)]
-        t = times[-1]
-        wheel.add(times, [2.0 * s for s in times])
-    assert wheel.angle_rad == pytest.approx(t * t, rel=1e-12)  # exact for a rate that grows linearly
-    assert wheel.variance_rad2() == 1e-10
-
-
 def test_a_jump_of_the_clock_is_no_angle() -> None:
     for wheel in (WheelAngle(), counter()):
         wheel.add([1.0, 1.001], [3.0, 3.0])
@@ -249,27 +208,6 @@ def test_a_frame_without_samples_is_not_fresh() -> None:
     assert wheel.is_fresh
     assert wheel.add([], []) == 0.0
     assert not wheel.is_fresh
-
-
-def test_a_gap_is_told_once() -> None:
-    wheel = WheelAngle()
-    wheel.add([0.0, nextafter(0.02, 0.0)], [2.0, 2.0])
-    assert wheel.take_gap() == 0.0
-    wheel.add([0.12], [2.0])
-    assert wheel.take_gap() == pytest.approx(0.2)
-    assert wheel.take_gap() == 0.0
-
-
-def test_a_wheel_at_rest_forgets_its_last_motion() -> None:
-    wheel = WheelAngle()
-    wheel.rest([0.1])
-    assert wheel.noise_rad2_s2 == pytest.approx(0.01)
-    for _ in range(500):
-        wheel.rest([0.001, -0.001])
-    found = wheel.noise_rad2_s2
-    assert found == pytest.approx(1e-6 + 0.98**500 * (0.01 - 1e-6), rel=1e-9)
-    wheel.rest([])
-    assert wheel.noise_rad2_s2 == found
 
 
 def test_lost_samples_of_a_counter_are_told() -> None:

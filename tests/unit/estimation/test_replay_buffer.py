@@ -85,16 +85,6 @@ def test_late_measurements_in_any_order(order: tuple[int, ...]) -> None:
     same(late, in_time)
 
 
-def test_in_the_middle_of_a_step_it_is_told_by_how_much_it_is_late() -> None:
-    told: list[float] = []
-    found = Recorded()
-    for k in range(1, 4):
-        found.step(k)
-    for t_s in (0.13, 0.2, 0.3, 0.5):
-        found.journal.take(t_s, told.append, found.filter)
-    assert told == pytest.approx([0.07, 0.0, 0.0, 0.0], abs=1e-12)
-
-
 def test_a_look_back_changes_nothing() -> None:
     found, means = Recorded(), []
     for k in range(1, 5):
@@ -105,30 +95,6 @@ def test_a_look_back_changes_nothing() -> None:
         assert mean is means[index]
         assert late == pytest.approx(late_s, abs=1e-12)
     assert found.filter.mean is means[-1]
-
-
-def test_how_far_back_it_reaches() -> None:
-    found = Recorded(reach_s=0.5)
-    assert found.journal.oldest_s == -np.inf
-    for k in range(1, 21):
-        found.step(k)
-    # The first entry kept is the last one that ended before the reach.
-    assert found.journal.oldest_s == pytest.approx(1.4)
-    found.journal.restart()
-    assert found.journal.oldest_s == -np.inf
-
-
-def test_a_standstill_longer_than_the_reach_keeps_its_beginning() -> None:
-    found = Recorded(reach_s=0.5)
-    told: list[float] = []
-    found.step(1)
-    found.step(2)
-    found.journal.begin(9.0, 0.0, found.filter)
-    assert found.journal.oldest_s == pytest.approx(0.2)
-    found.journal.begin(9.1, 0.1, found.filter)  # it drives off
-    assert found.journal.oldest_s <= 9.0
-    found.journal.take(3.0, told.append, found.filter)
-    assert told == [0.0]
 
 
 @pytest.mark.parametrize("late_s", [0.01, 0.03])
@@ -411,18 +377,3 @@ def test_what_is_done_again_does_not_count_again() -> None:
     found.fuse_fix(fix)
     assert found.counts["crossings_used"] == 8
     assert found.counts["late_fixes"] == 1
-
-
-def test_the_innovation_is_that_of_the_last_fix() -> None:
-    """Of the one that came last, not of the one that was taken last, which is done again after it."""
-    story = Story("straight on")
-    early, later = story.end_after(1.2), story.end_after(2.0)
-    alone = story.tell({later: [story.fixes[early]]}).innovation
-    found = build()
-    for frame in story.frames[: later + 1]:
-        found.step(*frame)
-    found.fuse_fix(story.fixes[later - 4])
-    found.fuse_fix(story.fixes[early])
-    assert found.innovation is not None
-    assert alone is not None
-    assert found.innovation.residual == pytest.approx(alone.residual, abs=1e-9)

@@ -73,15 +73,6 @@ def test_five_backward_samples_in_a_row_name_the_sensor() -> None:
     assert found.backward_source == "right encoder"
 
 
-def test_a_good_sample_ends_the_row() -> None:
-    found = intake()
-    for k in range(4):
-        found.wheels(1.01, [WheelSample(0.99 - 0.001 * k, 1.0, 1.0)])
-    found.wheels(1.01, [ONE])
-    found.wheels(1.01, [WheelSample(0.9, 1.0, 1.0)])
-    assert found.backward_source == ""
-
-
 IMU = {
     "nonfinite": ImuSample(1.002, nan, 0.0),
     "ahead": ImuSample(1.02, 0.0, 0.0),
@@ -119,16 +110,6 @@ def test_rest_begins_after_its_time_and_only_once() -> None:
     assert found.is_resting
 
 
-def test_motion_begins_the_count_anew() -> None:
-    found = watch()
-    found.stood(0.24)
-    found.moved()
-    assert not found.stood(0.24)
-    assert found.stood(0.01)
-    found.moved()
-    assert not found.is_resting
-
-
 def test_means_over_a_rest() -> None:
     found = watch()
     for k in range(4):
@@ -158,27 +139,6 @@ def test_of_white_noise_the_variance_is_learned(sigma: float) -> None:
     scatter = sqrt(2.0 / 67.0 * 1.5)
     assert np.mean(found) == pytest.approx(sigma**2, rel=4.0 * scatter / sqrt(20))
     assert np.std(found) < 1.5 * scatter * sigma**2
-
-
-def test_what_was_expected_holds_until_something_is_learned() -> None:
-    floor = NoiseFloor(0.5)
-    for k in range(2 * WINDOW - 1):
-        floor.add(float(k % 7))
-    assert floor.variance == 0.5
-    floor.add(0.0)
-    assert floor.variance != 0.5
-
-
-def test_a_vibration_counts_for_what_its_integral_feels() -> None:
-    """A sine of 0.2 rad/s and 23 Hz: 0.02 (rad/s)^2 of power, of which a mean of 15 samples keeps little."""
-    t, rng = 0.01 * np.arange(6000), np.random.default_rng(2)
-    white = 0.0087 * rng.normal(size=t.size)
-    found = learned(0.2 * np.sin(2.0 * pi * 23.0 * t) + white, 1e-4)
-    means = (0.2 * np.sin(2.0 * pi * 23.0 * t)).reshape(-1, WINDOW).mean(axis=1)
-    kept = WINDOW * float(np.var(means)) + 0.0087**2
-    # Neighbours that alternate differ by twice what white noise would make of them; 13 % of scatter as above.
-    assert 0.7 * kept < found < 2.0 * 1.3 * kept
-    assert found < 0.02 / 3.0
 
 
 def test_a_bias_is_no_noise_and_a_restart_drops_half_a_mean() -> None:
@@ -291,15 +251,3 @@ def test_gravity_that_contradicts_is_gated(mirror: Mirror) -> None:
     run(found, with_gravity(robot.frames(1.3), mirror, DeckPose(robot.x_m, robot.y_m, before + 0.5)))
     assert found.counts["gravity_gated"] == 1
     assert found.state[0][PSI] == pytest.approx(before, abs=1e-12)
-
-
-def test_the_tilt_against_the_least(mirror: Mirror) -> None:
-    """Gravity counts by the sine of the angle between the surface and the horizontal."""
-    pose = mirror.deck_pose(STEEP)
-    gx, gy, _ = mirror.gravity_in_robot(pose)
-    tilt = float(np.hypot(gx, gy))
-    for least, is_used in ((1.001 * tilt, False), (0.999 * tilt, True)):
-        robot, found = Robot(), build(gravity_least_tilt=least)
-        run(found, with_gravity(robot.frames(1.3), mirror, DeckPose(pose.x_m, pose.y_m, pose.heading_rad + 0.02)))
-        assert bool(found.state[0][PSI] - pose.heading_rad > 1e-4) is is_used
-        assert found.counts["gravity_gated"] == 0

@@ -135,14 +135,6 @@ def test_the_variance_is_that_of_the_timing_and_of_the_sensor(seams: SeamLines) 
         assert line[2] == pytest.approx((v * interval_s) ** 2 / 12.0 + 1e-10, rel=0.01)  # the slope: 0.1 %
 
 
-def test_the_sensors_share_the_edge_and_its_offset(seams: SeamLines) -> None:
-    first = Meeting(0, True, False, 0, 0.0, 0.1, 0.0, 0.0).meet(seams)
-    for corner in (1, 2, 3):
-        again = Meeting(0, True, False, corner, 0.0, 0.1, 0.0, 0.0).meet(seams)
-        assert first is not None
-        assert again == first._replace(is_new=False)
-
-
 def test_the_two_edges_of_a_gap_have_an_offset_each(seams: SeamLines) -> None:
     left = Meeting(0, True, False, 0, 0.0, 0.1, 0.0, 0.0).meet(seams)
     reached = Meeting(0, True, True, 0, 0.0, 0.1, 0.0, 0.0).meet(seams)
@@ -283,13 +275,6 @@ def test_legs_that_differ_show_by_how_much(scatter: float) -> None:
     assert float((off**2).mean()) == pytest.approx(1.0, abs=4.0 * sqrt(2.0 / 20))
 
 
-def test_a_world_that_changes_is_noticed() -> None:
-    found, rng = taught(0.0, 60, 1), np.random.default_rng(2)
-    for _ in range(40):
-        found.learn([(0.03 + 0.008 * float(rng.normal()), 25e-8)])
-    assert sqrt(found.scatter) > 0.004
-
-
 # -- the book ---------------------------------------------------------------------------------------------------------
 
 TO_PARAMETERS = np.array([[0.5, 0.5, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -371,25 +356,6 @@ def test_the_next_leg_is_given_what_bayes_gives_it(full: FullStateConfig) -> Non
         x[DRAWN], P[np.ix_(DRAWN, DRAWN)] = mean, covariance
 
 
-def test_what_wandered_within_a_leg_is_no_knowledge_lost(
-    full: FullStateConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The leg's own variance is that of its measurements; the wander counts with the scatter of which it is a share."""
-    told: list[tuple[list[tuple[float, float]], float]] = []
-    monkeypatch.setattr(SlipPopulation, "learn", lambda _, samples, share: told.append((samples, share)))
-    book = SlipPrior(full)
-    x, P = state(*book.first())
-    slip, creep = book.wander(2.0)
-    P[[SR, SL, C], [SR, SL, C]] += slip, slip, creep
-    for wheel, z in ((SR, 0.05), (SL, 0.03)):
-        x, P = update(x, P, np.eye(STATES)[wheel], z, 4e-4)
-    book.end(x, P)
-    (mean, half), share = told[0]
-    assert mean == pytest.approx((0.04, 2e-4), rel=1e-9)
-    assert half == pytest.approx((0.01, 2e-4), rel=1e-9)
-    assert share == pytest.approx(1.0 + full.wander_fraction**2 / full.wander_time_s * 2.0)
-
-
 def drive(book: SlipPrior, slips: list[tuple[float, float]], noise: float) -> None:
     """Legs of these slips (right, left), each seen with the variance ``noise`` and ended by a fix."""
     rng = np.random.default_rng(3)
@@ -428,10 +394,3 @@ def test_only_a_leg_that_was_ended_by_a_fix_teaches_its_scatter(full: FullStateC
         once = book._slip_scatter.scatter
         book.end(x, P)  # a second fix of the same leg
         assert book._slip_scatter.scatter == once
-
-
-def test_a_leg_that_showed_nothing_new_does_not_count(full: FullStateConfig) -> None:
-    book = SlipPrior(full)
-    before = book._slip_scatter.scatter
-    book.end(*state(*book.first()))
-    assert book._slip_scatter.scatter == before

@@ -2,8 +2,6 @@
 
 from itertools import product
 from math import cos, hypot, sin, sqrt
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
@@ -36,7 +34,6 @@ from ccatp.estimation.state_model import (
     Y,
 )
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.surface import Surface
 from tests.unit.estimation.drive import STEEP, Errors, Robot, config
 
 R_M, BASE_M = config().robot.wheel_radius_m, config().robot.wheel_base_m
@@ -102,14 +99,6 @@ def test_noise_is_that_of_impulses_carried_through_the_step(
     expected = (columns * impulses).dot(columns.T) + np.diag(drift)
     # A product of two derivatives below 10, each off by the tolerance.
     np.testing.assert_allclose(motion.noise(x, np.array(impulses), drift), expected, atol=40.0 * TOLERANCE)
-
-
-def test_a_new_step_is_not_the_last_one() -> None:
-    x, motion = np.full(STATES, 0.1), SurveyMotion(R_M, BASE_M)
-    first = motion.over(0.01, LEVEL).at(x)[0].copy()
-    assert motion.over(0.01, LEVEL).at(x)[0] == pytest.approx(first, abs=0.0)
-    assert motion.over(0.02, LEVEL).at(x)[0][X] - x[X] == pytest.approx(2.0 * (first[X] - x[X]), rel=0.02)  # a dt / v
-    assert motion.over(0.01, LEVEL._replace(fx=0.5)).at(x)[0][X] < first[X]
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -192,13 +181,6 @@ def test_rows_say_what_each_sensor_reads() -> None:
     assert expected == pytest.approx({1.0: 5.0, 2.0: 6.0, 3.0: 0.56, 4.0: 0.23}, abs=1e-15)
 
 
-def test_rows_that_follow_each_other_do_not_mix() -> None:
-    rows, x = SensorRows(), np.full(STATES, 0.5)
-    first = rows.take(None, (3.0, 0.2), None).at(x)[1].copy()
-    rows.take((1.0, 2.0, 0.1), (3.0, 0.2), (4.0, 0.3)).at(2.0 * x)
-    assert np.array_equal(rows.take(None, (3.0, 0.2), None).at(x)[1], first)
-
-
 REACH_M = 5e-3
 
 
@@ -247,11 +229,6 @@ def test_downhill_is_where_gravity_points_along_the_surface(mirror: Mirror) -> N
         assert (slope.gx, slope.gy) == pytest.approx(expected, abs=1e-14)  # rounding
 
 
-def test_level_ground_has_no_downhill() -> None:
-    flat = SimpleNamespace(surface=Surface(np.zeros((2, 2))), rotate_deck_from_world=lambda v: v)
-    assert Terrain(cast(Mirror, flat)).at(0.3, 0.4) == Slope(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-
-
 def test_the_robots_axes_are_the_mirrors(mirror: Mirror) -> None:
     for psi, (x, y) in enumerate(places(mirror, 20, 4)):
         expected = mirror.body_axes(DeckPose(x, y, float(psi)))
@@ -282,12 +259,6 @@ def test_the_panel_changes_in_the_middle_of_the_gap(mirror: Mirror) -> None:
         assert panel_below(frame, mirror, x, here.y_m) == panel.id
         centre = (panel.x_m, panel.y_m, 0.0), panel.origin[2], Terrain(mirror).at(panel.x_m, panel.y_m)
         assert frame.locate(*centre).x_m == pytest.approx(0.0, abs=1e-15)
-
-
-def test_the_panel_changes_along_y_and_far_away(mirror: Mirror) -> None:
-    frame = PanelFrame(mirror, PanelId(4, 4))
-    for wanted in (PanelId(5, 4), PanelId(2, 6)):
-        assert panel_below(frame, mirror, mirror.panel(wanted).x_m, mirror.panel(wanted).y_m) == wanted
 
 
 def test_beside_the_mirror_the_last_panel_stays(mirror: Mirror) -> None:
