@@ -1,11 +1,9 @@
 """Links in virtual time, what grows during a run, and the estimate against the simulated truth."""
 
-from itertools import pairwise
-
 import pytest
 
 from ccatp.links.topics import Heartbeat
-from ccatp.report.dashboard.view import WAITING, Growing, Lines, Links, Second, Trail, TruthCompare
+from ccatp.report.dashboard.view import Growing, Lines, Links, Second, TruthCompare
 
 
 def presence(process: str, t_s: float, *, pid: int = 1, phase: str = "joined", age_s: float | None = 0.01) -> Heartbeat:
@@ -107,15 +105,6 @@ def test_what_is_new_is_told_once_and_the_older_half_gets_thin() -> None:
     assert grown.take_new() == [(k,) for k in range(900, 1000)]  # nobody took for long
 
 
-def test_the_trail_leaves_out_what_nobody_sees() -> None:
-    trail = Trail(100)
-    for k in range(101):
-        trail.add(0.001 * k, 1.0)
-    steps_m = [b[0] - a[0] for a, b in pairwise(trail.rows)]
-    assert len(steps_m) >= 4
-    assert 0.0199 < min(steps_m) <= max(steps_m) < 0.0221  # rounded to 1 mm
-
-
 def test_a_line_that_comes_again_is_one_row_with_its_newest_text_and_old_ones_go() -> None:
     lines = Lines(3)
     lines.add(0.5, "warning", "process main was killed")
@@ -155,12 +144,3 @@ def test_either_may_come_first_and_frames_between_are_not_compared() -> None:
     assert [found for found in one if found] == [found for found in two if found]
     assert len([found for found in one if found]) == 2
     assert [TruthCompare.is_compared(seq) for seq in (7, 20)] == [False, True]
-
-
-def test_what_has_no_other_half_is_forgotten() -> None:
-    compare = TruthCompare()
-    for k in range(WAITING + 1):
-        assert compare.estimate(10 * k, 0.0, 0.0, 0.001) is None
-    assert compare.truth(0, 0.0, 0.0, 0.0) is None
-    assert compare.truth(10, 0.1, 0.0, 0.0) is None
-    assert compare.truth(10 * WAITING, 1.5, 0.0, 0.0) == Second(0.1, 0.0, 3.0)

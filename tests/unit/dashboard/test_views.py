@@ -31,8 +31,7 @@ from ccatp.links.topics import (
     TrackMessage,
     TruthMessage,
 )
-from ccatp.report.beacon_record import expected_rms_m, true_rms_m
-from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground, worst_sigma_m
+from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground
 from ccatp.report.dashboard.survey_view import SurveyView, ground
 from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView
 from tests.support.scenario import config_of, mirror_of
@@ -159,11 +158,6 @@ def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(view: Surv
     assert [[round(value, 3) for value in row[1:]] for row in state["series"]["error"]] == [[2.0, 3.0], [2.0, 3.0]]
     blind = SurveyView(MIRROR, CFG, is_sim=False)  # without a truth sigma alone is shown
     assert told(blind, track)["series"]["error"] == [[0.0, None, 3.0], [1.0, None, 3.0], [2.0, None, 3.0]]
-
-
-def test_innovations_are_told_when_they_change(view: SurveyView) -> None:
-    state = told(view, *(picture(t_s, nis) for t_s, nis in ((1.0, 2.0), (1.1, 2.0), (1.2, 3.5))))
-    assert state["series"]["nis"] == [[1.0, 2.0, 2], [1.2, 3.5, 2]]
 
 
 def test_the_verdict_and_its_cause(view: SurveyView) -> None:
@@ -321,16 +315,6 @@ def test_the_scene_without_what_the_page_draws_itself(room: BeaconView) -> None:
     assert [shape["kind"] for shape in state["shapes"]] == ["true", "beacon", "obstacle"]
     assert state["shapes"][0]["y_m"] == 1.0
     assert [link["name"] for link in state["links"]] == ["main loop", "danger loop", "robot"]  # no laser
-
-
-def test_the_path_comes_with_the_map(room: BeaconView) -> None:
-    told(room, *(told_map(t_s, pose=(x_m, 0.8, 0.0)) for t_s, x_m in ((1.0, 0.8), (1.5, 0.801), (2.0, 0.9))))
-    assert room.everything(0.0)["path"] == [(0.8, 0.8), (0.9, 0.8)]  # nobody sees a millimetre
-
-
-def test_figures() -> None:
-    assert (expected_rms_m({}), true_rms_m({"a": ELLIPSE}, {})) == (None, None)
-    assert [worst_sigma_m(1.0, 0.0, 4.0), worst_sigma_m(2.0, 1.0, 2.0)] == pytest.approx([2.0, 3.0**0.5])
 
 
 @pytest.mark.parametrize("system", ["zigbee", "follow", "cricket"])

@@ -128,17 +128,6 @@ def test_no_measurement_leaves_the_prediction() -> None:
     np.testing.assert_array_equal(kf.covariance, before[1])
 
 
-def test_innovation() -> None:
-    kf = make()
-    H, z, R = np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 2.0]]), np.array([1.5, 2.0, 5.0]), np.array([0.5, 0.1, 2.0])
-    residual = z - H @ kf.mean
-    S = H @ kf.covariance @ H.T + np.diag(R)
-    innovation = kf.update(z, H, R)
-    np.testing.assert_allclose(innovation.residual, residual, rtol=1e-15)  # the same subtraction
-    assert innovation.nis == pytest.approx(residual @ np.linalg.solve(S, residual), rel=1e-13)  # rounding of a 3 x 3
-    assert innovation.size == 3
-
-
 def test_a_semidefinite_prior() -> None:
     # One state known exactly: the update must not touch it, and the other is a scalar average.
     kf = KalmanFilter(np.array([1.0, 0.0]), np.diag([0.0, 1.0]))
@@ -370,22 +359,6 @@ def test_no_measurement_of_a_model(name: str) -> None:
     filter_ = build(name)
     innovation = filter_.update(np.empty(0), Bent(0), np.empty(0))
     assert (innovation.nis, innovation.size) == (0.0, 0)
-
-
-@BOTH
-def test_work_space_is_neither_kept_nor_changed(name: str) -> None:
-    filter_ = build(name)
-    f, F = np.array([3.0, 4.0]), np.array([[1.0, 0.5], [0.0, 1.0]])
-
-    class Reused(Bent):
-        def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-            return f, F
-
-    filter_.predict(Reused(2), EYE)
-    mean, transition = filter_.mean.copy(), filter_.transition.copy()
-    f[:], F[:] = 9.0, 9.0
-    np.testing.assert_array_equal(filter_.mean, mean)
-    np.testing.assert_array_equal(filter_.transition, transition)
 
 
 def test_smoother_refuses() -> None:

@@ -76,37 +76,12 @@ def test_whole_surveys_fit_into_the_hour(world: Any) -> None:
     assert straight_s < route.remaining_s(0) < 1.045 * straight_s
 
 
-def test_largest_leg_of_thesis_m1(thesis: Any) -> None:
-    points, cfg = thesis_order(thesis.mirror), thesis.cfg
-
-    def legs_of(longest_m: float) -> list[float]:
-        route = with_clearances(thesis, longest_leg_m=longest_m).route(thesis.mirror.base_pose, points)
-        ends = [(stop.x_m, stop.y_m) for stop in route.stops]
-        return sorted(hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(ends))
-
-    legs = legs_of(2.0)
-    # Around the stepped corners straight up and across: on the diagonals, shorter by 0.3 m, a sensor runs along a seam.
-    assert legs[-1] == pytest.approx(0.733, abs=0.002)  # the retreats before and after lie on a grid of 5 mm
-    assert legs[-9] == pytest.approx(0.254, abs=0.012)  # else 744 - 490 mm, between two rows; a retreat may slant it
-    assert legs_of(cfg.mission.longest_leg_m)[-1] <= cfg.mission.longest_leg_m
-
-
 def test_done_points_are_left_out(thesis: Any) -> None:
     points = thesis_order(thesis.mirror, 2)
     route = plan(thesis, points, skip=points[3:12])
     assert [stop.point for stop in route.stops if stop.point] == points[:3] + points[12:]
     assert plan(thesis, points, skip=points) == Route((), (0.0,))
     assert plan(thesis, []).remaining_s(0) == 0.0
-
-
-def test_remaining_time_and_way(thesis: Any) -> None:
-    points = thesis_order(thesis.mirror, 1)
-    route = plan(thesis, points)
-    base, cfg, mirror = thesis.mirror.base_pose, thesis.cfg, thesis.mirror
-    assert route.remaining_s(0) == pytest.approx(path_time(route.stops, base, cfg.limits, mirror, 0.5), rel=1e-12)
-    last = len(route.stops) - 1
-    assert 0.5 < route.remaining_s(last) < 10.0
-    assert route.remaining_s(last + 1) == 0.0
 
 
 def test_start_beyond_the_rim(thesis: Any) -> None:
