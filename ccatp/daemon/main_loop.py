@@ -351,17 +351,17 @@ class MainLoop(RobotLoop):
 
     def send_drive(self, ack: int, drive: DriveCommand) -> None:
         """Send the drive that was computed from frame ``ack``."""
-        right, left, _ = drive
-        self._runner.on_drive(self._drive_seq + 1, right, left)
-        self._sent = max(ack, 0), drive
-        self.answer_again()
+        self._drive_seq += 1
+        ack, (right, left, steer) = max(ack, 0), drive
+        self._runner.on_drive(self._drive_seq, right, left)
+        self._sent = ack, drive
+        self.link.send_drive(self._drive_seq, ack, right, left, steer)
 
     def answer_again(self) -> None:
         if self._sent is not None:
             self._drive_seq += 1
             ack, (right, left, steer) = self._sent
-            steering = () if steer is None else (steer,)
-            self.link.send_drive(self._drive_seq, ack, right, left, *steering)
+            self.link.send_drive(self._drive_seq, ack, right, left, steer)
 
     def _answer(self, seq: int, drive: DriveCommand) -> None:
         # A robot that is driven waits for nobody.

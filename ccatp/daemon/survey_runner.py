@@ -270,7 +270,9 @@ class SurveyRunner(MissionRunner):
         if motion is None:
             raise RuntimeError("plan comes after estimate, and not for a stale frame")
         is_placed = self._mirror_check is None or self._is_on_mirror(frame.sensors)
-        command = mission.step(motion, verdict) if is_placed else HOLD_POSITION
+        command = HOLD_POSITION
+        if is_placed:
+            mission.state, command = mission.survey.step(mission.state, motion, verdict)
         state, gate = mission.state, self._gate
         if command.inflates_covariance or state.wants_calibration or state.full_fans or state.hold.is_fault:
             self._apply_requests(frame.sensors, command)

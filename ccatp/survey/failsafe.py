@@ -139,9 +139,8 @@ class HoldRules(Generic[S]):
 
     def react(self, s: S, frame: Any, verdict: Verdict | None) -> S:
         """Do what the verdict in force demands (``None``: none fresh enough) in a frame at ``frame.t_s``."""
-        if verdict is not None:
-            s = _with_levels(s, verdict)
-        if verdict is None or not _is_clear(verdict) or s.is_slow or s.stuck_s is not None:
+        if verdict is None or not _is_routine(s, verdict):
+            s = s if verdict is None else _with_levels(s, verdict)
             for row in self.rows:
                 if row.applies(s, verdict):
                     s, is_over = row.react(self, s, frame, verdict)
@@ -163,10 +162,12 @@ def _resume_refusal(s: HoldState) -> str | None:
     return None
 
 
-def _is_clear(v: Verdict) -> bool:
-    """No row applies to such a verdict."""
-    is_normal = v.severity is NONE and v.code is EventCode.NORMAL and not v.is_shaking
-    return is_normal and v.forward and v.reverse and v.turn
+def _is_routine(s: HoldState, v: Verdict) -> bool:
+    """No row applies to such a verdict in such a state, and it says nothing that has to be remembered."""
+    is_normal = v.severity is NONE and v.code is EventCode.NORMAL and not (v.is_shaking or v.raised or v.full_fans)
+    was_normal = s.severity is NONE and not (s.is_latched or s.is_shaking or s.interlock or s.has_looked or s.is_slow)
+    is_known = s.emergency_epoch is not None and s.stuck_s is None
+    return is_normal and was_normal and is_known and v.forward and v.reverse and v.turn
 
 
 def _with_levels(s: S, v: Verdict) -> S:

@@ -164,7 +164,7 @@ class LegFollower:
 
     def follow(self, leg: Leg, motion: StateEstimate, *, is_slow: bool) -> tuple[Leg, Twist]:
         """One frame of a leg: what it is then, and the twist until the next frame."""
-        steered, panel, tracker = motion.steered, motion.pose.panel, self._tracker
+        steered, panel, tracker = motion.ahead or motion.steered, motion.pose.panel, self._tracker
         stop, tracked, deadline_s, aim, cached = leg.stop, leg.motion, leg.deadline_s, leg.aim, leg.target
         if cached is None or cached[0] != panel:
             cached = panel, self.target_in(panel, stop)
