@@ -13,7 +13,7 @@ import ccatp
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
-from ccatp.core import Fix, FloatArray, PanelId, PanelPose, PointId
+from ccatp.core import FloatArray, PanelId, PanelPose, PointId
 from ccatp.daemon.process import Endpoints
 from ccatp.daemon.terminal import RunView
 from ccatp.errors import ExitStatus
@@ -33,7 +33,7 @@ from ccatp.links.topics import (
     decode_recorded,
 )
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_poses
-from ccatp.mirror.misalignment import fit_panels
+from ccatp.mirror.panel_alignment import Measured, fit_panels
 from ccatp.records.recorder import TELEMETRY, Recorder, iter_messages, recordings
 from ccatp.records.store import StoredSurvey, StoreError, read_survey
 from ccatp.records.summary import PanelFits, survey_summary
@@ -269,10 +269,8 @@ class SurveyRecord:
             return None
 
     def _fits(self, survey: StoredSurvey) -> PanelFits:
-        fixes: dict[PanelId, list[Fix]] = {}
-        for stored in survey.fixes:
-            fixes.setdefault(stored.point.panel, []).append(stored.fix)
-        return fit_panels(self.mirror, fixes, self._cfg.robot.puck_height_m)
+        measured = (Measured(stored.point, stored.fix) for stored in survey.fixes)
+        return fit_panels(self.mirror, measured, self._cfg.robot.puck_height_m)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -8,11 +8,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ccatp.config.models import BaseConfig, CollimatorsConfig, FrameConfig, MirrorConfig
+from ccatp.config.models import FrameConfig, MirrorConfig
 from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose, PointId, Vector3, wrap_pi
 from ccatp.mirror.layout import POINTS_PER_PANEL, POINTS_PER_ROW, Panel, PanelGrid
 from ccatp.mirror.rim import build_rim
-from ccatp.mirror.surface import Axes, LayoutError, Surface, UnknownPanelError, build_surface
+from ccatp.mirror.surface import Axes, Surface, UnknownPanelError, build_surface
 
 
 class MirrorFrames:
@@ -66,9 +66,6 @@ class MirrorFrames:
         return self.deck_from_mirror((x, self.c * y + self.s * z, self.c * z - self.s * y))
 
 
-_MIN_CHANNELS = 4
-
-
 class Mirror(MirrorFrames):
     """A telescope mirror: geometry only, without state. Points are in metres.
 
@@ -97,11 +94,15 @@ class Mirror(MirrorFrames):
             name: (self.drive_side * x * 1e-3, y * 1e-3)
             for name, (x, y) in cfg.panels.adjusters_mm.items()
         }
-        self.channels, self.collimators_m = _collimators(cfg.collimators)
+        self.channels = cfg.collimators.channels
+        self.collimators_m: FloatArray = np.array(cfg.collimators.positions_world_mm, dtype=np.float64) * 1e-3
         self.panel_at, self.is_on_panel = self.grid.panel_at, self.grid.is_on_panel
         self.nearest_panel, self.nearest_seam = self.grid.nearest_panel, self.grid.nearest_seam
         self.surface_point = self.surface.point
-        self.base_panel_pose = _base(cfg.base, self.panels)
+        base = cfg.base
+        self.base_panel_pose = PanelPose(
+            PanelId(base.row, base.col), base.x_mm * 1e-3, base.y_mm * 1e-3, base.heading_rad
+        )
         self.base_pose = self.deck_pose(self.base_panel_pose)
 
     def panel(self, panel: PanelId) -> Panel:
@@ -219,28 +220,8 @@ def _dot(a: Vector3, b: Vector3) -> float:
 
 
 def build_mirror(cfg: MirrorConfig) -> Mirror:
-    """Geometry of a configured mirror; raises ``LayoutError`` where the configuration contradicts itself."""
+    """Geometry of a mirror of a checked configuration."""
     return Mirror(cfg)
-
-
-def _base(cfg: BaseConfig, panels: dict[PanelId, Panel]) -> PanelPose:
-    panel = panels.get(PanelId(cfg.row, cfg.col))
-    if panel is None:
-        raise LayoutError(f"base: there is no panel in row {cfg.row}, column {cfg.col}")
-    x, y = cfg.x_mm * 1e-3, cfg.y_mm * 1e-3
-    if abs(x) >= panel.half_x_m or abs(y) >= panel.half_y_m:
-        raise LayoutError(f"base: ({cfg.x_mm}, {cfg.y_mm}) mm is not on panel ({cfg.row}, {cfg.col})")
-    return PanelPose(panel.id, x, y, cfg.heading_rad)
-
-
-def _collimators(cfg: CollimatorsConfig) -> tuple[tuple[int, ...], FloatArray]:
-    if len(cfg.channels) != len(cfg.positions_world_mm):
-        raise LayoutError(f"collimators: {len(cfg.channels)} channels, {len(cfg.positions_world_mm)} positions")
-    if len(set(cfg.channels)) != len(cfg.channels):
-        raise LayoutError(f"collimators: channels {cfg.channels} are not distinct")
-    if len(cfg.channels) < _MIN_CHANNELS:
-        raise LayoutError(f"collimators: {len(cfg.channels)} channels; a position needs at least {_MIN_CHANNELS}")
-    return cfg.channels, np.array(cfg.positions_world_mm, dtype=np.float64) * 1e-3
 
 
 # Along the panel's normal down to the surface. It starts at the sag of some mm, on which the slope hardly changes: the

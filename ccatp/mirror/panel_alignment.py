@@ -41,7 +41,7 @@ import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from ccatp.config.models import LightConfig
-from ccatp.core import BoolArray, Fix, FloatArray, PanelId, PointId
+from ccatp.core import BoolArray, Fix, FloatArray, PanelId, PointId, Vector3
 from ccatp.mirror.layout import Panel
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.misalignment import panel_deviations
@@ -348,6 +348,27 @@ def mirror_wavefront(panels: Iterable[PanelWavefront]) -> MirrorWavefront | None
     left = max(unexplained, 0.0)
     level = max(fitted - mean * mean, 0.0) + left
     return MirrorWavefront(sqrt(fitted + left), sqrt(level), sqrt(uncertain + left), sqrt(noise))
+
+
+# Of one row of points the tolerance of their arrivals, 10 mm, would make a plane: one with tilts of some 0.1 rad.
+_MIN_SPREAD_M = 0.02
+
+
+def fit_panels(mirror: Mirror, measured: Iterable[Measured], puck_height_m: float) -> dict[PanelId, Vector3]:
+    """Piston (m), tip and tilt (rad) of every panel whose points span it; for the summary of a survey."""
+    by_panel: dict[PanelId, list[Measured]] = {}
+    for one in measured:
+        by_panel.setdefault(one.point.panel, []).append(one)
+    fits = {}
+    for panel, own in sorted(by_panel.items()):
+        found = deviations_of(mirror, panel, own, puck_height_m, 0.0)
+        centred = found.places_m - found.places_m.mean(axis=0)
+        spread_m = float(np.linalg.svd(centred, compute_uv=False)[-1]) / sqrt(len(own))
+        fit = fit_modes(found.lever[:, None] * rigid(found.places_m), found.values_m, found.sigmas_m)
+        if fit is not None and spread_m >= _MIN_SPREAD_M:  # else a survey that ended early
+            piston_m, tip_rad, tilt_rad = fit.values.tolist()
+            fits[panel] = piston_m, tip_rad, tilt_rad
+    return fits
 
 
 SHAPE = slice(3, 6)

@@ -14,7 +14,7 @@ import numpy as np
 from ccatp.config.models import Config
 from ccatp.control.motion_checks import as_standing
 from ccatp.control.sent_drives import SentDrives
-from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelId, PanelPose, PointId, Verdict, difference
+from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelPose, PointId, Verdict, difference
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.links import multiline
@@ -23,8 +23,8 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror, deck_poses
-from ccatp.mirror.misalignment import fit_panels
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
+from ccatp.mirror.panel_alignment import Measured, fit_panels
 from ccatp.records.summary import PanelFits, survey_summary
 from ccatp.safety.robot_clock import SteadyTime
 from ccatp.sim.fault_plan import FaultPlan
@@ -161,7 +161,7 @@ class SilLaser:
         self._etalon = EtalonModel(cfg.sim.etalon, channels, collimators_m, rng)
         self._collimators_m = dict(zip(channels, collimators_m, strict=True))
         self._approaches = ApproachCounter(cfg.mission.correction_tolerance_m, cfg.mission.max_approaches)
-        self._fixes: dict[PanelId, list[Fix]] = {}
+        self._fixes: list[Measured] = []
         self.stops: list[StopRow] = []
 
     def fix(self, t_s: float, estimate: DeckPose) -> Fix:
@@ -194,7 +194,7 @@ class SilLaser:
         row.approach = self._approaches.count
         self.stops.append(row)
         if not is_too_far:
-            self._fixes.setdefault(point.panel, []).append(fix)
+            self._fixes.append(Measured(point, fix))
         return is_too_far
 
     def panel_fits(self) -> PanelFits:

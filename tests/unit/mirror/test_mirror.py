@@ -1,17 +1,17 @@
 """Pure. Poses, puck, seam normals and gravity on the shipped mirrors."""
 
 from collections.abc import Callable
-from math import hypot, inf, nan, pi, sqrt
+from math import cos, hypot, inf, nan, pi, sin, sqrt
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ccatp.config.models import MirrorConfig, PanelsConfig
+from ccatp.config.models import PanelsConfig
 from ccatp.core import DeckPose, PanelId, PanelPose, PointId, bearing, difference
 from ccatp.mirror.layout import PanelGrid
-from ccatp.mirror.mirror import Mirror, build_mirror, deck_poses
-from ccatp.mirror.surface import ConvergenceError, LayoutError, UnknownPanelError
+from ccatp.mirror.mirror import Mirror, deck_poses
+from ccatp.mirror.surface import ConvergenceError, UnknownPanelError
 
 POSE = DeckPose(1.1, -1.7, 0.6)
 
@@ -46,6 +46,13 @@ def test_body_offset_is_the_projection_of_the_robot_frame(mirror: Mirror) -> Non
     hx, hy, lx, ly = mirror.body_axes(POSE)
     h, left, _ = mirror.robot_axes(POSE)
     assert (hx, hy, lx, ly) == pytest.approx((*h[:2], *left[:2]), abs=1e-15)
+
+
+def test_panel_heading_is_the_projection_on_the_panel_plane(mirror: Mirror) -> None:
+    panel = mirror.panels[PanelId(3, 4)]
+    pose = mirror.deck_pose(PanelPose(panel.id, 0.21, -0.24, 2.2))
+    x, y, _ = panel.rotate_from_deck(mirror.robot_axes(pose)[0])
+    assert (x / hypot(x, y), y / hypot(x, y)) == pytest.approx((cos(2.2), sin(2.2)), abs=1e-12)
 
 
 def test_puck_stands_on_the_normal(mirror: Mirror) -> None:
@@ -138,38 +145,10 @@ def test_collimators_see_every_corner_of_every_panel_well(mirror: Mirror) -> Non
                 assert dop < MAX_DOP
 
 
-def _set(section: str, key: str, value: object) -> Callable[[Raw], None]:
-    def change(raw: Raw) -> None:
-        raw[section][key] = value
-
-    return change
-
-
-def _three_collimators(raw: Raw) -> None:
-    raw["collimators"] = {"channels": [1, 2, 3], "positions_world_mm": raw["collimators"]["positions_world_mm"][:3]}
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (_set("panels", "count", 78), "panels_per_row adds up to 77 panels, count says 78"),
-        (_set("panels", "panels_per_row", [8, 9, 9, 9, 9, 9, 9, 9, 6]), "row 1 with 8 panels cannot be centred on 9"),
-        (_set("panels", "panels_per_row", [11, 9, 9, 9, 9, 9, 9, 9, 3]), "row 1 with 11 panels cannot be centred on 9"),
-        (_set("panels", "pitch_x_mm", 680.0), r"pitch_x_mm 680.0 is not size 670.0 \+ gap 1.2"),
-        (_set("panels", "size_y_mm", 700.0), r"pitch_y_mm 751.2022 is not size 700.0 \+ gap 1.2"),
-        (_set("panels", "points_x_mm", [-220.0, 0.0, 340.0]), r"points_x_mm \(-220.0, 0.0, 340.0\) must ascend"),
-        (_set("panels", "points_y_mm", [250.0, 0.0, -250.0]), r"points_y_mm \(250.0, 0.0, -250.0\) must ascend"),
-        (_set("base", "col", 1), "base: there is no panel in row 1, column 1"),
-        (_set("base", "y_mm", -376.0), r"base: \(-150.0, -376.0\) mm is not on panel \(1, 2\)"),
-        (_set("collimators", "channels", [1, 2, 3, 4]), "4 channels, 8 positions"),
-        (_set("collimators", "channels", [1, 2, 3, 4, 5, 6, 7, 7]), "are not distinct"),
-        (_three_collimators, "3 channels; a position needs at least 4"),
-    ],
-)
-def test_contradictions_are_refused(raw: Raw, change: Callable[[Raw], None], message: str) -> None:
-    change(raw)
-    with pytest.raises(LayoutError, match=message):
-        build_mirror(MirrorConfig.model_validate(raw))
+def test_m1_columns_run_against_the_mirror_frames_x(m1: Mirror) -> None:
+    # Data file: x = -(c - 5) pitch_x, y = (r - 5) pitch_y + y_offset, mirror frame, mm.
+    x, y, _ = m1.mirror_from_deck(m1.panels[PanelId(2, 9)].origin)
+    assert (x, y) == pytest.approx((-4 * 0.6712022, -3 * 0.7512022 + 0.035), abs=1e-12)
 
 
 def test_outline_of_the_telescope_as_built(m1: Mirror, m2: Mirror) -> None:
@@ -210,6 +189,18 @@ def test_nearest_panel_against_a_search_over_all_cells(mirror: Mirror) -> None:
                 for pid, p in mirror.panels.items()
             }
             assert distances[mirror.nearest_panel(x, y)] == pytest.approx(min(distances.values()), abs=1e-12)
+
+
+def test_nearest_seam_left_and_right_of_it(m1: Mirror) -> None:
+    half = 0.6712022 / 2
+    seam = m1.nearest_seam(half - 0.02, 0.1)
+    assert seam is not None
+    assert seam.axis == "x"
+    assert seam.position_m == pytest.approx(half, abs=1e-12)
+    assert seam.distance_m == pytest.approx(-0.02, abs=1e-12)
+    seam = m1.nearest_seam(half + 0.01, 0.1)
+    assert seam is not None
+    assert seam.distance_m == pytest.approx(0.01, abs=1e-12)
 
 
 def test_seams_of_every_panel_have_a_panel_on_both_sides(mirror: Mirror) -> None:
