@@ -17,7 +17,7 @@ from ccatp.links.channels import format_error, format_ok
 from ccatp.links.topics import LogMessage
 from ccatp.report.dashboard.hub import IDLE_PERIOD_S
 from tests.contract.page_rig import DEADLINE_S, Rig, mission, page_rig
-from tests.unit.dashboard.test_metrics import parse
+from tests.unit.dashboard.test_view import parse
 
 FILES = (
     "page.js", "map.js", "plots.js", "commands.js", "page.css", "icon.svg", "uPlot.iife.min.js", "uPlot.min.css"

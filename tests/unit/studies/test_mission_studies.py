@@ -1,5 +1,7 @@
 """The studies of whole missions: their cells, the figures of a cell, what they draw."""
 
+import gc
+import tracemalloc
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,7 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.mirror.mirror import build_mirror
+from ccatp.records import summary
 from ccatp.sim.world import TruthRow
 from ccatp.studies import faults_study
 from ccatp.studies.campaign import CellResult, Job, JobOutcome, Study, cells_of, jobs_of
@@ -25,9 +28,10 @@ from ccatp.studies.mission_study import (
     run_mission,
 )
 from ccatp.studies.results import plain, table
-from ccatp.studies.sil_run import SilTrace
+from ccatp.studies.sil_run import SilRun, SilTrace
 from ccatp.studies.survey_studies import ABLATION, FILTERS, GROUPS, SENSITIVITY, TIME, combine_filters
 from ccatp.survey.composition import assemble
+from ccatp.survey.state import Pause
 from tests.support.sim_survey import plan_of
 
 SIGMA_M, SIGMA_RAD = 1e-3, 2e-3
@@ -352,3 +356,56 @@ def test_a_cell_says_who_was_not_completed_and_is_drawn(tmp_path: Path) -> None:
     assert "seed 2 stopped: held" in lines[3]
     faults_study.STUDY.draw(results, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"faults.png", "faults.pdf"}
+
+
+# -- memory over a day -------------------------------------------------------------------------------------------------
+
+
+DAY_FRAMES = 24 * 3600 * 100
+MOST_IN_A_DAY_BYTES = 5 << 20
+# Caches fill; then the frames that are compared. Half way between two hand-overs of a thousand frames to the summary.
+WARM_UP_FRAMES, COMPARED_FRAMES = 12_500, 40_000
+# A point that was measured is kept with its fix.
+POINT_BYTES = 4096
+
+
+class Enough(Exception):
+    """The frames that are compared have been served."""
+
+
+class MeasuredRun(SilRun):
+    """Traced memory after the warm-up and at the end, and how many points were done then."""
+
+    def __init__(self, *, is_paused: bool) -> None:
+        super().__init__(load_config(), with_track=False)
+        self._is_paused, self._frames = is_paused, 0
+        self.bytes: list[int] = []
+        self.points: list[int] = []
+
+    def _note_truth(self) -> None:
+        super()._note_truth()
+        self._frames += 1
+        if self._frames == 1000 and self._is_paused:
+            self.mission.handle(Pause("operator"))
+        if self._frames in (WARM_UP_FRAMES, WARM_UP_FRAMES + COMPARED_FRAMES):
+            gc.collect()
+            self.bytes.append(tracemalloc.get_traced_memory()[0])
+            self.points.append(len(self.mission.state.done))
+            if len(self.bytes) == 2:
+                raise Enough
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_paused", [True, False], ids=["held", "driving"])
+def test_frames_leave_nothing_behind(is_paused: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(summary, "HISTORY_ROWS", 5000)  # bounded, but as it is full only after the warm-up
+    run = MeasuredRun(is_paused=is_paused)
+    tracemalloc.start()
+    try:
+        with pytest.raises(Enough):
+            run.run()
+    finally:
+        tracemalloc.stop()
+    grown, points = run.bytes[1] - run.bytes[0], run.points[1] - run.points[0]
+    assert (points == 0) is is_paused
+    assert grown - points * POINT_BYTES <= MOST_IN_A_DAY_BYTES * COMPARED_FRAMES / DAY_FRAMES
