@@ -78,11 +78,13 @@ class Daemon:
         """Functions in place of the methods of links and robot: bound methods would not get the link itself."""
         clock = asyncio.get_running_loop().time
 
-        def send_drive(link: RobotLink, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float) -> None:
+        def send_drive(
+            link: RobotLink, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float, steer: float | None = None
+        ) -> None:
             if wr_rad_s or wl_rad_s:
                 self.sent[seq] = clock()
                 self._note_late("drive", ack)
-            SEND_DRIVE(link, seq, ack, wr_rad_s, wl_rad_s)
+            SEND_DRIVE(link, seq, ack, wr_rad_s, wl_rad_s, steer)
 
         def send_permit(link: RobotLink, seq: int, ack: int, *allowed: bool) -> None:
             if any(allowed):
