@@ -91,14 +91,6 @@ class CellResult(NamedTuple):
     arrays: Arrays
 
 
-class Column(NamedTuple):
-    """A column of ``table.md``: heading with unit, dotted key of the value, format of numbers."""
-
-    heading: str
-    key: str
-    spec: str = ""
-
-
 @dataclass(frozen=True, slots=True)
 class Study:
     """A campaign that has a name.
@@ -112,7 +104,7 @@ class Study:
     cells: Callable[[], Sequence[Cell]]
     run_job: Callable[[Job], JobOutcome]
     combine: Callable[[Factors, Sequence[JobOutcome]], JobOutcome]
-    columns: Sequence[Column]
+    columns: str  # of ``table.md``: see ``results.columns_of``
     draw: Callable[[Sequence[CellResult], Path], None]
     # Dotted keys: stronger than the configuration file, weaker than the command line.
     defaults: Mapping[str, object] = field(default_factory=dict)

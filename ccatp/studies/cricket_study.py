@@ -19,9 +19,9 @@ from ccatp.config.load import load_radio_config
 from ccatp.config.models import Config
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import best_motion
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
+from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
 from ccatp.studies.mote_runs import look_ahead, percentiles, run_batch, run_filter, simulate_field
-from ccatp.studies.results import LIMIT, Measure, Range, Row, band, colour, draw_ranges, plot, write_analysis
+from ccatp.studies.results import LIMIT, Measure, Row, band, colour, draw_ranges, plot, write_analysis
 
 UPDATES = 300  # of figures 11 and 12 as we read them
 SHOWN = 30  # updates within which figure 14 comes down
@@ -151,7 +151,7 @@ def draw(cells: Sequence[CellResult], out: Path) -> None:
             _draw_traces(found, shown, title, goal_m, out / stem)
     if maps := [(name, title) for name, title in _MAPS if name in found]:
         _draw_maps(found, maps, out / "figure_9_10_13")
-    draw_ranges([Row(str(cell.factors["case"]), cell) for cell in cells], WAYS, "All ways", out / "ways")
+    draw_ranges([Row(str(cell.factors["case"]), cell) for cell in cells], [WAYS], "All ways", out / "ways")
 
 
 def _draw_traces(found: Mapping[str, CellResult], names: Sequence[str], title: str, goal_m: float, stem: Path) -> None:
@@ -177,17 +177,12 @@ def _draw_maps(found: Mapping[str, CellResult], maps: Sequence[tuple[str, str]],
             axes.set(xlabel="x, m", ylabel="y, m", aspect="equal", xlim=(-1.2, 6.2), ylim=(-0.2, 9.2), title=title)
 
 
-def _rms(cell: CellResult) -> Range:
-    rms = cell.values["rms_m"]
-    return rms["p10"], rms["p50"], rms["p90"]
-
-
-WAYS = (
-    Measure(
-        "root mean square error of a place, m: median (dot), 10 to 90 % (bar), Cramér-Rao bound (mark)",
-        _rms, lambda cell: cell.values["bound_m"],
-    ),
-)  # fmt: skip
+WAYS = Measure(
+    "root mean square error of a place, m: median (dot), 10 to 90 % (bar), Cramér-Rao bound (mark)",
+    ("rms_m.p10", "rms_m.p90"),
+    "rms_m.p50",
+    "bound_m",
+)
 
 
 STUDY = Study(
@@ -196,21 +191,11 @@ STUDY = Study(
     cells=lambda: [Cell({"case": name}) for name in CASES],
     run_job=run_job,
     combine=combine,
-    columns=(
-        Column("figure", "figure"),
-        Column("after phase 1, m", "phase1_rms_m", ".4f"),
-        Column("p10, m", "rms_m.p10", ".4f"),
-        Column("median, m", "rms_m.p50", ".4f"),
-        Column("p90, m", "rms_m.p90", ".4f"),
-        Column("median after 30 updates, m", "rms_at_30_m", ".4f"),
-        Column("of a coordinate, m", "coordinate_rms_at_30_m", ".4f"),
-        Column("expected, m", "expected_rms_m", ".4f"),
-        Column("bound, m", "bound_m", ".4f"),
-        Column("rms of all / bound", "ratio", ".2f"),
-        Column("rank deficiency", "rank_deficiency"),
-        Column("unique", "is_unique"),
-        Column("cost, ms", "spent_ms", ".0f"),
-    ),
+    columns="""
+        figure phase1_rms_m
+        rms_m: p10 p50 p90
+        rms_at_30_m coordinate_rms_at_30_m expected_rms_m bound_m ratio rank_deficiency is_unique spent_ms
+    """,
     draw=draw,
     mirrors=(),
     runs=200,
@@ -228,7 +213,7 @@ def run_sizes(cfg: Config, out: Path) -> dict[str, Any]:
     """Map drawn fields of growing size, once each, and write ``result.json``, ``table.md`` and the figure."""
     began_s = time.perf_counter()
     cells = [_sized_cell(size, cfg.run.seed) for size in SIZES]
-    result = write_analysis("mote-sizes", cells, {key: key for key in cells[0]}, out, began_s)
+    result = write_analysis("mote-sizes", cells, " ".join(list(cells[0])[3:]), out, began_s)
     with plot(out / "mote_sizes", 6.5, 4.2, legend=2) as (axes,):
         for number, (key, label) in enumerate((("map_s", "map"), ("outlook_s", "rank and folds, before"))):
             motes, times_s = [cell["motes"] for cell in cells], [cell[key] for cell in cells]

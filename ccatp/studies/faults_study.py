@@ -11,8 +11,8 @@ from ccatp.config.models import Config
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_plan import SENSOR_SIGNALS, FaultPlan, Injected, parse_plan
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
-from ccatp.studies.mission_study import dangers, mission_columns, sums, times
+from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
+from ccatp.studies.mission_study import dangers, sums, times
 from ccatp.studies.results import LIMIT, colour, levels, plot
 from ccatp.studies.sil_run import SilRun, rehearse
 from ccatp.survey.composition import assemble
@@ -197,19 +197,15 @@ STUDY = Study(
     cells=lambda: [Cell({"faults": kind}) for kind in (NONE, RANDOM)],
     run_job=run_job,
     combine=combine,
-    columns=(
-        *mission_columns("complete"),
-        Column("recoverable", "recoverable.runs"),
-        Column("of these complete", "recoverable.complete"),
-        *mission_columns("danger: falls false_edges max_overrun_mm"),
-        Column("frames below the fans' floor", "weak_frames"),
-        Column("points measured", "points.measured"),
-        Column("of", "points.total"),
-        Column("faults", "injected.planned"),
-        Column("that acted", "injected.acted"),
-        *mission_columns("mission_time_s time_ratio"),
-        Column("ended by", "ended"),
-    ),
+    columns="""
+        complete
+        recoverable: runs complete
+        danger: falls false_edges max_overrun_mm
+        weak_frames
+        points: measured total
+        injected: planned acted
+        mission_time_s time_ratio ended
+    """,
     draw=draw,
     defaults={"run.filter": "ekf", "run.world": "hard"},
     mirrors=("thesis-m1", "thesis-m2", "fyst-m1", "fyst-m2"),

@@ -286,19 +286,9 @@ def _draw_locus(loops: Sequence[Loop], out: Path) -> None:
         panels[0].set_ylabel("imaginary part, 1/s")
 
 
-COLUMNS = {
-    "gains": "gains",
-    "axis": "axis",
-    "plant": "plant",
-    "lag_s": "T, s",
-    "delay_frames": "delay, frames",
-    "gain_margin_db": "gain margin, dB",
-    "phase_margin_deg": "phase margin, deg",
-    "gain_crossover_rad_s": "crossover, rad/s",
-    "delay_margin_s": "delay margin, s",
-    "modulus_margin": "least distance from -1",
-    "overshoot_percent": "overshoot, %",
-}
+COLUMNS = """
+    gain_margin_db phase_margin_deg gain_crossover_rad_s delay_margin_s modulus_margin overshoot_percent
+"""
 
 
 def run(cfg: Config, out: Path) -> dict[str, Any]:

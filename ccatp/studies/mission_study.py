@@ -18,7 +18,7 @@ from ccatp.config.models import Config
 from ccatp.core import FloatArray, IntArray, PointId
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.records.summary import WITHIN_M, arrival_error_m, puck_targets
-from ccatp.studies.campaign import Arrays, Column, Factors, Job, JobOutcome
+from ccatp.studies.campaign import Arrays, Factors, Job, JobOutcome
 from ccatp.studies.sil_run import SilResult, StopRow, rehearse
 
 # Columns of the array ``stops``: one row for each measurement, in the order they were taken. Errors are true minus
@@ -32,66 +32,6 @@ PER_DECADE = 1000
 LEAST = 1e-9  # anything smaller falls into the first bin
 _T, _X, _Y, _HEADING, _EST_X, _EST_Y, _EST_HEADING = range(7)  # columns of a mission's track
 _PARTS = ("mean", "p50", "p99", "p99_9", "max")
-
-# Headings and formats of what a mission study may show, by the dotted key of the figure.
-_HEADINGS = {
-    "complete": ("complete", ""),
-    "causes": ("ended by", ""),
-    "localization_error_mm.mean": ("localization mean, mm", ".3f"),
-    "localization_error_mm.p99": ("p99", ".3f"),
-    "localization_error_mm.p99_9": ("p99.9", ".3f"),
-    "localization_error_mm.max": ("max", ".2f"),
-    "localization_error_mm.within_10mm_fraction": ("within 10 mm", ".4%"),
-    "localization_error_after_first_leg_mm.max": ("max after first leg", ".2f"),
-    "heading_error_mrad.rms": ("heading rms, mrad", ".3f"),
-    "arrival_error_mm.mean": ("arrival mean, mm", ".3f"),
-    "arrival_error_mm.p99": ("p99", ".3f"),
-    "arrival_error_mm.p99_9": ("p99.9", ".3f"),
-    "arrival_error_mm.max": ("max", ".2f"),
-    "arrival_error_mm.within_10mm_fraction": ("first arrivals within 10 mm", ".3%"),
-    "arrival_error_after_first_leg_mm.max": ("max after first leg", ".2f"),
-    "stop_error_mm.rms": ("stop error rms, mm", ".3f"),
-    "bound.error_rms_mm": ("stop error rms, mm", ".3f"),
-    "bound.rms_mm": ("bound rms, mm", ".3f"),
-    "bound.ratio": ("ratio", ".3f"),
-    "bound.with_accelerometer.rms_mm": ("bound with accelerometer", ".3f"),
-    "bound.with_accelerometer.ratio": ("ratio", ".3f"),
-    "nees.pose.mean": ("NEES pose (3)", ".2f"),
-    "nees.pose.band_95": ("95 % band", ".2f"),
-    "nees.position.mean": ("NEES position (2)", ".2f"),
-    "nis.mean": ("NIS of fixes (2)", ".2f"),
-    "corrections": ("corrections", ""),
-    "after_correction_mm.max": ("largest distance left, mm", ".2f"),
-    "mission_time_s": ("mission, s", ".0f"),
-    "lower_bound_s": ("bound of the path, s", ".0f"),
-    "time_ratio": ("time / bound", ".4f"),
-    "tour_bound_s": ("bound of any tour, s", ".0f"),
-    "tour_ratio": ("time / any tour", ".4f"),
-    "margin_s": ("margin to the budget, s", ".0f"),
-    "states_s.turning": ("turning, s", ".0f"),
-    "states_s.driving": ("driving, s", ".0f"),
-    "states_s.settling": ("settling, s", ".0f"),
-    "states_s.measuring": ("measuring, s", ".0f"),
-    "danger.falls": ("falls", ""),
-    "danger.false_edges": ("false edges", ""),
-    "danger.max_overrun_mm": ("largest overrun, mm", ".1f"),
-}
-
-
-def mission_columns(text: str) -> tuple[Column, ...]:
-    """Columns of figures of missions, a group a line: ``arrival_error_mm: mean p99=.2f``, or plain keys.
-
-    What follows an equals sign replaces the usual format.
-    """
-    columns = []
-    for line in text.strip().splitlines():
-        group, colon, names = line.strip().rpartition(":")
-        for name in names.split():
-            part, _, spec = name.partition("=")
-            key = f"{group}.{part}" if colon else part
-            heading, usual = _HEADINGS[key]
-            columns.append(Column(heading, key, spec or usual))
-    return tuple(columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,12 +187,13 @@ def nees(rows: FloatArray, states: int) -> FloatArray:
 def chi_square_figures(values: FloatArray, freedom: int) -> dict[str, Any]:
     """How values (k,) compare with chi-square; those that are not finite are left out.
 
-    Returns ``count``; ``mean`` and ``band_95``, in which that of a consistent filter lies; ``is_within_band``; ``p50``;
-    ``within_95_fraction``, the share below the 95 % quantile of a single value.
+    Returns ``count``; ``mean`` and ``band_95``, in which that of a consistent filter lies; ``is_within_band``; 5, 50
+    and 95 %; ``within_95_fraction``, the share below the 95 % quantile of a single value.
     """
     known = values[np.isfinite(values)]
     if not known.size:
-        return {"count": 0, **dict.fromkeys(("mean", "band_95", "is_within_band", "p50", "within_95_fraction"))}
+        names = ("mean", "band_95", "is_within_band", "p5", "p50", "p95", "within_95_fraction")
+        return {"count": 0, **dict.fromkeys(names)}
     total = known.size * freedom
     low, high = (float(chdtri(total, tail)) / known.size for tail in (0.975, 0.025))
     mean = float(known.mean())
@@ -261,7 +202,7 @@ def chi_square_figures(values: FloatArray, freedom: int) -> dict[str, Any]:
         "mean": round(mean, 4),
         "band_95": [round(low, 4), round(high, 4)],
         "is_within_band": low <= mean <= high,
-        "p50": round(float(np.median(known)), 4),
+        **{f"p{share}": round(float(np.percentile(known, share)), 4) for share in (5, 50, 95)},
         "within_95_fraction": round(float(np.mean(known <= chdtri(freedom, 0.05))), 4),
     }
 

@@ -35,7 +35,7 @@ from ccatp.records.beacon_summary import BeaconSummary, Reached, beacon_facts
 from ccatp.report.plots import QUIET
 from ccatp.safety.beacons import BeaconSafetyRules
 from ccatp.sim.beacon_robot import build_beacon_robot
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
+from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
 from ccatp.studies.results import LIMIT, colour, plot
 from ccatp.survey.state import DONE
 
@@ -242,19 +242,10 @@ STUDY = Study(
     cells=lambda: [Cell({"case": "route"})],
     run_job=run_job,
     combine=combine,
-    columns=(
-        Column("complete", "complete"),
-        Column("waypoints", "waypoints"),
-        Column("within 3 sigma", "within_3_sigma"),
-        Column("NEES / states", "nees", ".3f"),
-        Column("95 % band", "band"),
-        Column("seconds in the band", "in_band", ".2f"),
-        Column("NIS / readings", "nis", ".3f"),
-        Column("position, m", "position_m", ".4f"),
-        Column("expected, m", "position_expected_m", ".4f"),
-        Column("map, m", "map_m", ".4f"),
-        Column("expected, m", "map_expected_m", ".4f"),
-    ),
+    columns="""
+        complete waypoints within_3_sigma nees band in_band nis
+        position_m position_expected_m map_m map_expected_m
+    """,
     draw=draw,
     defaults={"system": "cricket"},
     mirrors=(),

@@ -34,8 +34,8 @@ from ccatp.filters.metrics import best_motion
 from ccatp.report.plots import INK
 from ccatp.sim.radio import SimDriveCommand, TruePose, TrueRadio
 from ccatp.sim.radio_world import RadioWorld
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
-from ccatp.studies.results import LIMIT, Measure, Range, Row, band, colour, draw_ranges, grouped, plot
+from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
+from ccatp.studies.results import LIMIT, Measure, Row, band, colour, draw_ranges, grouped, plot
 
 RadioStudy = partial(Study, mirrors=(), is_radio=True)
 
@@ -120,20 +120,11 @@ _POINT_S = 1.0
 _HIT = float(chdtri(2, 0.1))
 _BAND = 0.95
 
-COLUMNS = (
-    Column("beacons mean, m", "beacons_m.mean", ".3f"),
-    Column("median", "beacons_m.median", ".3f"),
-    Column("aligned mean, m", "beacons_aligned_m.mean", ".3f"),
-    Column("in 90 % ellipses", "beacons_covered", ".3f"),
-    Column("pose RMSE, m", "pose_m", ".3f"),
-    Column("dead reckoning, m", "reckoned_m", ".3f"),
-    Column("ratio", "pose_ratio", ".2f"),
-    Column("heading RMSE, rad", "heading_rad", ".3f"),
-    Column("NIS / rows", "nis", ".3f"),
-    Column("95 % band", "nis_band"),
-    Column("NEES / states", "nees", ".2f"),
-    Column("95 % band", "nees_band"),
-)
+COLUMNS = """
+    beacons_m: mean median
+    beacons_aligned_m: mean
+    beacons_covered pose_m reckoned_m pose_ratio heading_rad nis nis_band nees nees_band
+"""
 _MEANS = ("pose_m", "reckoned_m", "pose_aligned_m", "reckoned_aligned_m", "heading_rad", "target_covered")
 
 
@@ -373,21 +364,11 @@ RADIO_SIGNALS = RadioStudy(
     ],
     run_job=run_signals,
     combine=combine_signals,
-    columns=(
-        Column("range, m", "range_m", ".2f"),
-        Column("2017: level, dBm", "printed.level_dbm", ".1f"),
-        Column("model, dBm", "model_dbm", ".1f"),
-        Column("ours, dBm", "level_dbm", ".1f"),
-        Column("±, dB", "level_sigma_db", ".1f"),
-        Column("2017: range, m", "printed.estimate_m", ".2f"),
-        Column("ours, m", "estimate_m", ".2f"),
-        Column("2017: error, m", "printed.error_m", ".2f"),
-        Column("ours RMS, m", "range_rms_m", ".2f"),
-        Column("bearing, deg", "bearing_deg", ".0f"),
-        Column("2017: error, deg", "printed.bearing_error_deg", ".0f"),
-        Column("ours RMS, deg", "bearing_rms_deg", ".1f"),
-        Column("ours median, deg", "bearing_median_deg", ".1f"),
-    ),
+    columns="""
+        range_m printed.level_dbm model_dbm level_dbm level_sigma_db
+        printed.estimate_m estimate_m printed.error_m range_rms_m
+        bearing_deg printed.bearing_error_deg bearing_rms_deg bearing_median_deg
+    """,
     draw=draw_signals,
     defaults={"system": "zigbee"},
     runs=40,
@@ -424,23 +405,12 @@ def combine_cases(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcom
 
 def draw_cases(results: Sequence[CellResult], out: Path) -> None:
     """Figure ``radio_cases``: the errors of pose and beacons of each case, ours (dot) and printed (mark)."""
+    shown = {"pose_m": "pose_m", **{name: f"beacon_rmse_m.{name}" for name in NAMES[2:]}}
     measures = [
-        Measure(f"{name}, RMSE, m", partial(_case_error, name), partial(_printed_error, name), is_log=False)
-        for name in NAMES
-        if name != "heading_rad"
+        Measure(f"{name}, RMSE, m", (key, key), key, f"printed.{name}", is_log=False) for name, key in shown.items()
     ]
     rows = [Row(f"case {result.factors['case']}", result) for result in results]
     draw_ranges(rows, measures, "Mean of the runs (dot), 2017 (mark)", out / "radio_cases")
-
-
-def _case_error(name: str, cell: CellResult) -> Range:
-    found = cell.values["pose_m"] if name == "pose_m" else cell.values["beacon_rmse_m"].get(name)
-    return None if found is None else (found, found, found)
-
-
-def _printed_error(name: str, cell: CellResult) -> float:
-    printed: float = cell.values["printed"][name]
-    return printed
 
 
 RADIO_CASES = RadioStudy(
@@ -449,21 +419,11 @@ RADIO_CASES = RadioStudy(
     cells=lambda: [Cell({"case": case}, {**RADIO, "workspace.waypoints_m": path}) for case, path in PATHS.items()],
     run_job=run_job,
     combine=combine_cases,
-    columns=(
-        Column("2017: RMSE, m", "printed.pose_m", ".2f"),
-        Column("ours", "pose_m", ".3f"),
-        Column("2017: RMSE heading, rad", "printed.heading_rad", ".2f"),
-        Column("ours", "heading_rad", ".3f"),
-        *(
-            column
-            for name in NAMES[2:]
-            for column in (
-                Column(f"2017: {name}, m", f"printed.{name}", ".2f"),
-                Column("ours", f"beacon_rmse_m.{name}", ".2f"),
-            )
-        ),
-        *(column for column in COLUMNS if column.key not in {"pose_m", "heading_rad"}),
-    ),
+    columns=f"""
+        printed: {" ".join(NAMES)}
+        beacon_rmse_m: {" ".join(NAMES[2:])}
+        {COLUMNS.strip()}
+    """,
     draw=draw_cases,
     defaults={"system": "zigbee"},
     runs=50,
@@ -517,17 +477,13 @@ RADIO_FOLLOW = RadioStudy(
     ],
     run_job=run_job,
     combine=combine_follow,
-    columns=(
-        Column("2018: target, m", "printed.target_m"),
-        Column("target RMSE, m", "target_m.mean", ".3f"),
-        Column("median", "target_m.median", ".3f"),
-        Column("aligned, m", "target_aligned_m.mean", ".3f"),
-        Column("in 90 % ellipses", "target_covered", ".3f"),
-        Column("nearest to it, m", "nearest_m", ".2f"),
-        Column("runs with a collision", "collisions"),
-        Column("2018: beacons, m", "printed.beacons_m"),
-        *COLUMNS,
-    ),
+    columns=f"""
+        printed: target_m beacons_m
+        target_m: mean median
+        target_aligned_m: mean
+        target_covered nearest_m collisions
+        {COLUMNS.strip()}
+    """,
     draw=draw_follow,
     defaults={"system": "follow"},
     runs=50,

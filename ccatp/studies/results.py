@@ -3,7 +3,7 @@
 import json
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ccatp.core import FloatArray
 from ccatp.report.plots import INK, dress, new_figure, save_figure
-from ccatp.studies.campaign import CellResult, Column, Study
+from ccatp.studies.campaign import CellResult, Study
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 LIMIT = "#c0392b"
 # Distinguishable with any colour vision, and in print by their lightness.
 CYCLE = ("#0b3c5d", "#d08c00", "#1d9a8a", "#b5478a", "#6b7785", "#7a3e00")
+_WHOLE = 1e4  # numbers as large as this are shown without a fraction
 
 
 def plain(value: Any) -> Any:
@@ -34,31 +35,45 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
+def columns_of(text: str) -> list[str]:
+    """Dotted keys of figures; a line of ``text`` has some of one group, ``error_mm: mean max``, or whole keys."""
+    keys = []
+    for line in text.strip().splitlines():
+        group, colon, names = line.strip().rpartition(":")
+        keys += [f"{group}.{name}" if colon else name for name in names.split()]
+    return keys
+
+
+def value_at(values: Mapping[str, Any], key: str) -> Any:
+    """The value of a dotted key; None where there is none."""
+    value: Any = values
+    for part in key.split("."):
+        value = value.get(part) if isinstance(value, Mapping) else None
+    return value
+
+
 def markdown_table(head: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
-    """A Markdown table; floats with four digits, None as a dash."""
+    """A Markdown table; floats with four digits, None as a dash, lists as intervals or remarks."""
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
-    for row in rows:
-        texts = ("-" if v is None else f"{v:.4g}" if isinstance(v, float) else str(v) for v in row)
-        lines.append(f"| {' | '.join(texts)} |")
+    lines += [f"| {' | '.join(map(_text, row))} |" for row in rows]
     return "\n".join(lines) + "\n"
 
 
-def table(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> str:
-    """Cells as a Markdown table: their factors first, then the columns."""
-    names = list(rows[0]) if rows else ["runs"]
-    shown = [*(Column(name, name) for name in names[: names.index("runs") + 1]), *columns]
-    return markdown_table([column.heading for column in shown], ([_text(row, c) for c in shown] for row in rows))
-
-
-def _text(row: Mapping[str, Any], column: Column) -> str:
-    value: Any = row
-    for part in column.key.split("."):
-        value = value.get(part) if isinstance(value, Mapping) else None
+def _text(value: Any) -> str:
     if value is None or value == []:
         return "-"
-    parts = value if isinstance(value, list) else [value]  # an interval, or remarks
-    texts = (format(v, column.spec) if isinstance(v, int | float) and column.spec else str(v) for v in parts)
-    return (" to " if column.spec else "; ").join(texts)
+    if isinstance(value, list):
+        return (" to " if isinstance(value[0], float) else "; ").join(map(_text, value))
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= _WHOLE else f"{value:.4g}"
+    return str(value)
+
+
+def table(rows: Sequence[Mapping[str, Any]], columns: str) -> str:
+    """Cells as a Markdown table: their factors first, then the columns, headed by the keys of ``result.json``."""
+    names = list(rows[0]) if rows else ["runs"]
+    keys = [*names[: names.index("runs") + 1], *columns_of(columns)]
+    return markdown_table(keys, ([value_at(row, key) for key in keys] for row in rows))
 
 
 # -- files ------------------------------------------------------------------------------------------------------------
@@ -84,15 +99,11 @@ def write_results(
 
 
 def write_analysis(
-    name: str, cells: Sequence[Mapping[str, Any]], columns: Mapping[str, str], out: Path, started_s: float
+    name: str, cells: Sequence[Mapping[str, Any]], columns: str, out: Path, started_s: float
 ) -> dict[str, Any]:
-    """Write ``result.json`` and ``table.md`` of a study without runs, begun at ``started_s`` of ``perf_counter``.
-
-    ``columns`` are the headings of the table, by key of a cell.
-    """
+    """Write ``result.json`` and ``table.md`` of a study without runs, begun at ``started_s`` of ``perf_counter``."""
     result = {"study": name, "cells": list(cells), "wall_s": time.perf_counter() - started_s}
-    rows = ([cell[key] for key in columns] for cell in cells)
-    _write_whole(out / "table.md", markdown_table(list(columns.values()), rows))
+    _write_whole(out / "table.md", table(cells, columns))
     _write_whole(out / "result.json", json.dumps(result, indent=1) + "\n")
     return result
 
@@ -155,16 +166,13 @@ def band(
     axes.fill_between(x, ends[0], ends[2], color=shade, alpha=0.1, linewidth=0)
 
 
-Range = tuple[float, float, float] | None
-"""Low, middle and high; None where nothing is known."""
-
-
 class Measure(NamedTuple):
-    """A panel of a figure of ranges."""
+    """A panel of a figure of ranges; keys are those of a cell's values."""
 
     label: str
-    of: Callable[[CellResult], Range]  # of a cell: its middle is a dot on a bar between the ends
-    mark: Callable[[CellResult], float | None] = lambda _: None  # beside it: a bound, or what was published
+    ends: tuple[str, str]  # of a bar
+    middle: str  # a dot on it
+    mark: str = ""  # beside it: a bound, or what was published
     line: float | None = None  # where all should be
     is_log: bool = True
 
@@ -192,18 +200,17 @@ def draw_ranges(rows: Sequence[Row], measures: Sequence[Measure], title: str, st
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter  # noqa: PLC0415 - takes a second
 
     with plot(stem, 10.5, 0.27 * len(rows) + 1.6, 1, len(measures), title=title, sharey=True) as panels:
-        for axes, (label, of, mark_of, line, is_log) in zip(panels, measures, strict=True):
+        for axes, (label, ends, dot, mark, line, is_log) in zip(panels, measures, strict=True):
             for place, (_, cell, shade, is_base) in enumerate(rows):
-                found, mark = of(cell), mark_of(cell)
-                if found is None:
+                low, middle, high, beside = (value_at(cell.values, key) for key in (ends[0], dot, ends[1], mark))
+                if middle is None:
                     continue
-                low, middle, high = found
                 if is_base:
                     axes.axvline(middle, color=colour(shade), linewidth=0.9, linestyle="--", alpha=0.7)
                 axes.plot([low, high], [place] * 2, color=colour(shade), linewidth=3.0, alpha=0.35)
                 axes.plot(middle, place, "D" if is_base else "o", color=colour(shade), markersize=5)
-                if mark is not None:
-                    axes.plot(mark, place, "|", color=INK, markersize=9, markeredgewidth=1.5)
+                if beside is not None:
+                    axes.plot(beside, place, "|", color=INK, markersize=9, markeredgewidth=1.5)
             if line is not None:
                 axes.axvline(line, color=LIMIT, linewidth=1.0, linestyle=":")
             axes.set_xlabel(label)

@@ -15,19 +15,17 @@ from ccatp.config.load import load_config
 from ccatp.core import FloatArray
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.plots import INK, QUIET
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
+from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
 from ccatp.studies.cramer_rao import bounds_of, rehearse_recorded
 from ccatp.studies.mission_study import (
     COLUMN,
     Histogram,
     combine_missions,
     first_arrivals,
-    mission_columns,
     mission_outcome,
-    nees,
     run_mission,
 )
-from ccatp.studies.results import LIMIT, Measure, Range, Row, colour, draw_ranges, grouped, levels, plot, rows_by
+from ccatp.studies.results import LIMIT, Measure, Row, colour, draw_ranges, grouped, levels, plot, rows_by
 from ccatp.survey.planning.route import ORDERS
 from ccatp.survey.planning.tour_bound import tour_bound
 
@@ -131,35 +129,16 @@ def _draw_exceedance(
         panels[0].text(_LIMIT_MM * 1.08, 0.9, "10 mm", color=LIMIT, fontsize=8, va="top")
 
 
-def _stop_error(cell: CellResult) -> Range:
-    bound = cell.values["bound"]
-    return None if bound["rms_mm"] is None else (bound["rms_mm"], bound["error_rms_mm"], bound["error_rms_mm"])
-
-
-def _spread(of: Callable[[FloatArray], FloatArray]) -> Callable[[CellResult], Range]:
-    """5 %, mean and 95 % of what is known of the stops of a cell."""
-
-    def range_of(cell: CellResult) -> Range:
-        values = of(cell.arrays["stops"][:, 1:])
-        known = values[np.isfinite(values)]
-        if not known.size:
-            return None
-        low, high = np.percentile(known, (5.0, 95.0)).tolist()
-        return max(low, 1e-3), float(known.mean()), high
-
-    return range_of
-
-
 BOUND = (
     Measure(
         "rms position error at the stops (dot), posterior Cramér-Rao bound (end), with the accelerometer (mark), mm",
-        _stop_error, lambda cell: cell.values["bound"]["with_accelerometer"]["rms_mm"],
+        ("bound.rms_mm", "bound.error_rms_mm"), "bound.error_rms_mm", "bound.with_accelerometer.rms_mm",
     ),
 )  # fmt: skip
 CONSISTENCY = (
-    Measure("NEES of the pose", _spread(lambda stops: nees(first_arrivals(stops), 3)), line=3.0),
-    Measure("NEES of the position", _spread(lambda stops: nees(first_arrivals(stops), 2)), line=2.0),
-    Measure("NIS of the fixes", _spread(lambda stops: stops[:, COLUMN["nis"]]), line=2.0),
+    Measure("NEES of the pose", ("nees.pose.p5", "nees.pose.p95"), "nees.pose.mean", line=3.0),
+    Measure("NEES of the position", ("nees.position.p5", "nees.position.p95"), "nees.position.mean", line=2.0),
+    Measure("NIS of the fixes", ("nis.p5", "nis.p95"), "nis.mean", line=2.0),
 )
 
 
@@ -173,7 +152,7 @@ FILTERS = Study(
     ],
     run_job=run_filter_mission,
     combine=combine_filters,
-    columns=mission_columns("""
+    columns="""
         complete
         localization_error_mm: mean p99 p99_9 max within_10mm_fraction
         localization_error_after_first_leg_mm: max
@@ -187,7 +166,7 @@ FILTERS = Study(
         after_correction_mm: max
         mission_time_s time_ratio
         danger: falls false_edges
-    """),
+    """,
     draw=draw_filters,
 )
 
@@ -265,16 +244,13 @@ TIME = Study(
     ],
     run_job=run_timed_mission,
     combine=combine_times,
-    columns=(
-        *mission_columns("""
-            complete mission_time_s lower_bound_s time_ratio tour_bound_s tour_ratio margin_s
-            states_s: turning driving settling measuring
-            corrections
-            localization_error_mm: mean
-            arrival_error_mm: mean
-        """),
-        Column("arrival max, mm", "arrival_error_mm.max", ".2f"),
-    ),
+    columns="""
+        complete mission_time_s lower_bound_s time_ratio tour_bound_s tour_ratio margin_s
+        states_s: turning driving settling measuring
+        corrections
+        localization_error_mm: mean
+        arrival_error_mm: mean max
+    """,
     draw=draw_times,
     runs=2,
 )
@@ -308,23 +284,15 @@ def sensitivity_cells() -> Sequence[Cell]:
     return found
 
 
-def _mean_to_p99(name: str) -> Callable[[CellResult], Range]:
-    def range_of(cell: CellResult) -> Range:
-        found = cell.values[name]
-        return None if found["mean"] is None else (found["mean"], found["mean"], found["p99"])
-
-    return range_of
-
-
-def _time_ratio(cell: CellResult) -> Range:
-    ratio = cell.values["time_ratio"]
-    return None if ratio is None else (ratio, ratio, ratio)
-
-
 MISSION = (
-    Measure("localization error, mm", _mean_to_p99("localization_error_mm")),
-    Measure("first arrival error, mm", _mean_to_p99("arrival_error_mm")),
-    Measure("time / bound of the path", _time_ratio, is_log=False),
+    *(
+        Measure(label, (f"{key}.mean", f"{key}.p99"), f"{key}.mean")
+        for label, key in (
+            ("localization error, mm", "localization_error_mm"),
+            ("first arrival error, mm", "arrival_error_mm"),
+        )
+    ),
+    Measure("time / bound of the path", ("time_ratio", "time_ratio"), "time_ratio", is_log=False),
 )
 _SHOWN = "mean (dot), 99th percentile (end of the bar)"
 
@@ -347,7 +315,7 @@ SENSITIVITY = Study(
     cells=sensitivity_cells,
     run_job=run_mission,
     combine=combine_missions,
-    columns=mission_columns("""
+    columns="""
         complete
         localization_error_mm: mean p99 max
         heading_error_mrad: rms
@@ -356,7 +324,7 @@ SENSITIVITY = Study(
         nees: pose.mean
         corrections mission_time_s time_ratio
         danger: false_edges
-    """),
+    """,
     draw=draw_sensitivity,
     defaults={"run.filter": "ekf"},
     runs=5,
@@ -414,17 +382,17 @@ ABLATION = Study(
     ],
     run_job=run_mission,
     combine=combine_missions,
-    columns=mission_columns("""
+    columns="""
         complete
-        localization_error_mm: mean p99=.2f max
-        arrival_error_mm: mean p99=.2f max within_10mm_fraction=.2%
+        localization_error_mm: mean p99 max
+        arrival_error_mm: mean p99 max within_10mm_fraction
         stop_error_mm: rms
-        heading_error_mrad: rms=.2f
+        heading_error_mrad: rms
         nees: pose.mean
         corrections mission_time_s time_ratio
         danger: false_edges
         causes
-    """),
+    """,
     draw=draw_ablation,
     defaults={"run.filter": "ekf"},
     runs=3,

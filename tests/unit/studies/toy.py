@@ -8,7 +8,7 @@ import numpy as np
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
+from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
 
 SPEEDS_M_S = (0.05, 0.1)
 FAULTS = "CCATP_TOY_FAULTS"  # key of a job=what it does instead of its work, in the environment
@@ -56,7 +56,7 @@ STUDY = Study(
     cells=lambda: [Cell({"speed_m_s": v}, {"limits.v_max_m_s": v}) for v in SPEEDS_M_S],
     run_job=run_job,
     combine=combine,
-    columns=(Column("mean", "mean", ".2f"),),
+    columns="mean",
     draw=draw,
     mirrors=(),
     runs=3,
