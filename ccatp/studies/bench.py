@@ -5,6 +5,7 @@ import os
 import platform
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 from ccatp.config.models import Config
 from ccatp.core import FloatArray
 from ccatp.studies.bench_cases import STEPS, Contender, races
-from ccatp.studies.bench_frame import HEAD, BenchError, frame_cases, markdown_rows, terminal_line
+from ccatp.studies.bench_frame import BenchError, frame_cases
 from ccatp.studies.results import markdown_table
 
 EQUAL_WITHIN = 1e-10  # every entry of mean and covariance, SI units
@@ -106,11 +107,10 @@ def race(ours: Contender, peer: Contender | None, rounds: int, steps: int = STEP
 def largest_difference(ours: Contender, peer: Contender, steps: int = STEPS) -> float:
     """Largest difference between any entries of the results of two contenders, after any of the steps; SI units."""
     solutions = ours(), peer()
-    for solution in solutions:
-        next(solution)
+    readers = [next(solution) for solution in solutions]
     largest = 0.0
     for _ in range(steps):
-        results = [next(solution)() for solution in solutions]
+        results = [read(next(solution)) for read, solution in zip(readers, solutions, strict=True)]
         for one, other in zip(*results, strict=True):
             found, expected = (np.asarray(result, dtype=np.float64).ravel() for result in (one, other))
             largest = max(largest, float(np.abs(found - expected).max()))
@@ -145,10 +145,9 @@ def cpu_model(cpu_info: Path) -> str:
 
 
 def _version(package: str) -> str | None:
-    try:
+    with suppress(PackageNotFoundError):
         return version(package)
-    except PackageNotFoundError:
-        return None
+    return None
 
 
 BY_HAND = "<!-- by hand -->\n"
@@ -165,28 +164,41 @@ on a machine that does nothing else. Ratio = ours / peer: below 1 ours is faster
 
 Machine: {machine}
 """
-_FRAMES = """
-## A frame
-
-The peer of a frame is the calibrator, `python -m ccatp.studies.calibrator`: two plain asyncio processes that exchange
-the same lines over loopback TCP, with the standard library's json, and do nothing else. It runs before each of our
-runs, under the same load: the ratio compares versions and machines. Medians and spread over the rounds. A lockstep
-frame is timed between two moments of a run, after its start and before its end, recording included; a process's CPU
-time is user and system time together.
-
-"""
-_STEPS = """
-## A step
-
-A filter step is a prediction and an update, called from Python. Ours and the peer take turns in rounds of fifty steps,
-and who begins by turns as well.
-
-All compute the same: *difference* is the largest one between any entry of the two means and covariances after any of
-the steps, in its own SI unit, and more than {equal_within:g} ends the run. n = 4 is the thesis's filter, its readings a
-hundred times less exact than they are: as they are, forms with an inverse and (I - W H) P lose up to half their digits.
-n = 19 is the full state, its models as matrices; the unscented filters evaluate the models themselves.
-
-"""
+# Key of a case, heading, format; those of a frame have a spread.
+FRAME_COLUMNS = (
+    ("name", "case", ""),
+    ("us_p50", "µs a frame", ".0f"),
+    ("us_spread", "spread", ".0f"),
+    ("peer", "peer", ""),
+    ("peer_us_p50", "peer, µs", ".0f"),
+    ("peer_us_spread", "spread", ".0f"),
+    ("ratio", "ratio", ".3f"),
+    ("times_real_time", "times real time", ".1f"),
+    ("whole_times_real_time", "with start and end", ".1f"),
+    ("wake_ups", "wake-ups a frame", ".2f"),
+)
+STEP_COLUMNS = (
+    ("name", "case", ""),
+    ("us_p50", "ours p50, µs", ".1f"),
+    ("us_p99", "ours p99, µs", ".1f"),
+    ("peer", "peer", ""),
+    ("peer_us_p50", "peer p50, µs", ".1f"),
+    ("ratio", "ratio", ".3f"),
+    ("largest_difference", "difference", ".0e"),
+)
+# What a line on the terminal says of a case, where it is known.
+_LINE = (
+    ("us_p50", "{us_p50:8.1f} us"),
+    ("us_spread", "({us_spread[0]:.0f} to {us_spread[1]:.0f})"),
+    ("us_p99", "p99 {us_p99:.0f} us"),
+    ("peer", "{peer} {peer_us_p50:.1f} us"),
+    ("ratio", "ratio {ratio:.3f}"),
+    ("largest_difference", "difference {largest_difference:.0e}"),
+    ("times_real_time", "{times_real_time:.1f} times real time"),
+    ("whole_times_real_time", "{whole_times_real_time:.1f} with start and end"),
+    ("wake_ups", "{wake_ups:.2f} wake-ups"),
+    ("note", "{note}"),
+)
 
 
 def write_page(path: Path, result: Mapping[str, Any]) -> None:
@@ -197,32 +209,20 @@ def write_page(path: Path, result: Mapping[str, Any]) -> None:
 
 
 def markdown(result: Mapping[str, Any]) -> str:
-    """The tables of ``docs/bench.md``, with what they are."""
-    steps, frames = [], []
-    notes: dict[str, None] = {}
-    for case in result["cases"]:
-        if "us_spread" in case:
-            frames.append(case)
-        else:
-            steps.append([case["name"], *(_cell(case.get(key), spec) for key, spec in _STEP_KEYS)])
-        if "note" in case:
-            notes[f"* {case['note']}\n"] = None
-    text = _PAGE.format(machine=machine_line(result["machine"]))
-    if frames:
-        text += _FRAMES + markdown_table(HEAD, markdown_rows(frames))
-    if steps:
-        head = ("case", "ours p50, µs", "ours p99, µs", "peer", "peer p50, µs", "ratio", "difference")
-        text += _STEPS.format(equal_within=result["equal_within"]) + markdown_table(head, steps)
+    """The tables of ``docs/bench.md``."""
+    text, cases = _PAGE.format(machine=machine_line(result["machine"])), result["cases"]
+    for title, columns, is_frame in (("A frame", FRAME_COLUMNS, True), ("A step", STEP_COLUMNS, False)):
+        there = [case for case in cases if ("us_spread" in case) is is_frame]
+        if there:
+            rows = ([_cell(case.get(key), spec) for key, _, spec in columns] for case in there)
+            text += f"\n## {title}\n\n" + markdown_table([heading for _, heading, _ in columns], rows)
+    notes = dict.fromkeys(f"* {case['note']}\n" for case in cases if "note" in case)
     return text + ("\n" + "".join(notes) if notes else "")
 
 
-_STEP_KEYS = (
-    ("us_p50", ".1f"), ("us_p99", ".1f"), ("peer", ""), ("peer_us_p50", ".1f"), ("ratio", ".3f"),
-    ("largest_difference", ".0e"),
-)  # fmt: skip
-
-
 def _cell(value: Any, spec: str) -> str:
+    if isinstance(value, list):
+        return " to ".join(format(part, spec) for part in value)
     return "-" if value is None else format(value, spec)
 
 
@@ -230,17 +230,8 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     """One line for the machine and one for each case."""
     lines = [machine_line(result["machine"])]
     for case in result["cases"]:
-        if "us_spread" in case:
-            lines.append(terminal_line(case))
-            continue
-        if case["peer"] is None:
-            figures = f"{case['us_p50']:8.1f} us   {case['note']}"
-        else:
-            figures = (
-                f"{case['us_p50']:8.1f} us {case['peer']:>28} {case['peer_us_p50']:8.1f} us"
-                f"   ratio {case['ratio']:.3f}   difference {case['largest_difference']:.0e}"
-            )
-        lines.append(f"{case['name']:<52} {figures}")
+        known = [text.format(**case) for key, text in _LINE if case.get(key) is not None]
+        lines.append(f"{case['name']:<62} {'   '.join(known)}")
     return lines
 
 

@@ -7,6 +7,7 @@ the clock starts. What the peers compute has to be what this project computes: t
 from collections.abc import Callable, Iterator
 from functools import partial
 from math import cos, hypot, sin, sqrt, tau
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,10 +29,10 @@ frame leaves unknown costs forms with an inverse and (I - W H) P half their digi
 _SURVEY_START = (0.3, -0.4, 0.5, 0.05, 0.1)  # on the mirror, under way and turning: X, Y, PSI, V, W
 _ANGLE_RAD2, _POSITION_M2, _HEADING_RAD2 = 1e-6, 1e-8, 1e-4  # variances of a wheel's angle, a fix, a heading
 
-Solution = Iterator[Callable[[], tuple[Any, Any]]]
-"""Set up by the first ``next``, which is not timed; each other one works on a reading.
+Solution = Iterator[Any]
+"""Set up by the first ``next``, which is not timed; each other one works on a reading and yields the state.
 
-It yields what reads mean (n,) and covariance (n, n), which is not timed either.
+The first one yields how to read mean (n,) and covariance (n, n) of a state, which is not timed either.
 """
 Contender = Callable[[], Solution]
 """Begins again."""
@@ -169,33 +170,25 @@ def our_filter(name: str, problem: FilterProblem) -> Solution:
     """A filter of ``FILTERS``."""
     mean, covariance, F, H, Q, R, readings = problem
     ours = FILTERS[name](mean, covariance)
-
-    def state() -> tuple[FloatArray, FloatArray]:
-        return ours.mean, ours.covariance
-
-    yield state
+    yield attrgetter("mean", "covariance")
     for z in readings:
         ours.predict(F, Q)
         ours.update(z, H, R)
-        yield state
+        yield ours
 
 
 def printed_filter(problem: FilterProblem) -> Solution:
     """Thesis eq. 2.13 with its inverse and its (I - W H) P in bare numpy, without a check."""
     x, P, F, H, Q, variances, readings = problem
     R, identity = np.diag(variances), np.eye(x.size)
-
-    def state() -> tuple[FloatArray, FloatArray]:
-        return x, P
-
-    yield state
+    yield tuple
     for z in readings:
         x = F @ x
         P = F @ P @ F.T + Q
         K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
         x = x + K @ (z - H @ x)
         P = (identity - K @ H) @ P
-        yield state
+        yield x, P
 
 
 def _sigma_points(problem: FilterProblem) -> dict[str, float]:
@@ -220,15 +213,11 @@ def filterpy(problem: FilterProblem) -> Solution:
         )  # fmt: skip
     peer.x, peer.P, peer.Q, peer.R = mean.reshape(shape).copy(), covariance.copy(), Q, np.diag(variances)
     columns = [reading.reshape(shape) for reading in readings]
-
-    def state() -> tuple[FloatArray, FloatArray]:
-        return peer.x, peer.P
-
-    yield state
+    yield attrgetter("x", "P")
     for column in columns:
         peer.predict()
         peer.update(column)
-        yield state
+        yield peer
 
 
 def stonesoup(problem: FilterProblem) -> Solution:
@@ -246,14 +235,10 @@ def stonesoup(problem: FilterProblem) -> Solution:
     updater = getattr(updaters, kind + "Updater")(measurement, **points)
     detections = [Detection(reading[:, None]) for reading in problem.readings]
     estimate: Any = GaussianState(problem.mean[:, None].copy(), problem.covariance.copy())
-
-    def state() -> tuple[Any, Any]:
-        return estimate.state_vector, estimate.covar
-
-    yield state
+    yield attrgetter("state_vector", "covar")
     for detection in detections:
         estimate = updater.update(SingleHypothesis(predictor.predict(estimate), detection))
-        yield state
+        yield estimate
 
 
 def _stonesoup_models(problem: FilterProblem, *, is_linear: bool) -> tuple[Any, Any]:
@@ -339,18 +324,14 @@ def our_slam(problem: SlamProblem) -> Solution:
         at, none = slice(states[-2], states[-1] + 1), np.empty(0, dtype=np.intp)
         ours.augment(beacon, x[at], none, np.zeros((_BLOCK, 0)), np.eye(_BLOCK), P[at, at])
     columns = [columns_of(states) for states in touched]
-
-    def state() -> tuple[FloatArray, FloatArray]:
-        return ours.mean, ours.covariance
-
-    yield state
+    yield attrgetter("mean", "covariance")
     for i in range(STEPS):
         new, F = _moved(ours.mean[:_VEHICLE])
         ours.predict(new, F, _SLAM_NOISE)
         seen = columns[i % len(columns)]
         expected, h = _range(ours.mean.take(seen).tolist())
         ours.update_row(seen, np.array(h), ranges_m[i] - expected, _RANGE_SIGMA_M**2)
-        yield state
+        yield ours
 
 
 def dense_slam(problem: SlamProblem) -> Solution:
@@ -359,11 +340,7 @@ def dense_slam(problem: SlamProblem) -> Solution:
     x, n = x.copy(), x.size
     identity, Q = np.eye(n), np.zeros((n, n))
     Q[:_VEHICLE, :_VEHICLE] = _SLAM_NOISE
-
-    def state() -> tuple[FloatArray, FloatArray]:
-        return x, P
-
-    yield state
+    yield tuple
     for i in range(STEPS):
         F, H = np.eye(n), np.zeros(n)
         x[:_VEHICLE], F[:_VEHICLE, :_VEHICLE] = _moved(x[:_VEHICLE])
@@ -373,7 +350,7 @@ def dense_slam(problem: SlamProblem) -> Solution:
         K = P @ H / (H @ P @ H + _RANGE_SIGMA_M**2)
         x += K * (ranges_m[i] - expected)
         P = (identity - np.outer(K, H)) @ P
-        yield state
+        yield x, P
 
 
 def _moved(pose: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -422,16 +399,9 @@ def range_problem(cfg: Config) -> RangeProblem:
 def our_position(problem: RangeProblem) -> Solution:
     """``multilaterate``."""
     anchors_m, *pucks = problem
-    position_m = covariance_m2 = np.empty(0)
-
-    def state() -> tuple[FloatArray, FloatArray]:
-        return position_m, covariance_m2
-
-    yield state
+    yield attrgetter("position_m", "covariance_m2")
     for ranges, sigmas, expected_m in zip(*pucks, strict=True):
-        found = multilaterate(anchors_m, ranges, sigmas, expected_m)
-        position_m, covariance_m2 = found.position_m, found.covariance_m2
-        yield state
+        yield multilaterate(anchors_m, ranges, sigmas, expected_m)
 
 
 def scipy_position(problem: RangeProblem) -> Solution:
@@ -449,18 +419,11 @@ def scipy_position(problem: RangeProblem) -> Solution:
         slopes: FloatArray = offsets / (np.sqrt((offsets * offsets).sum(axis=1)) * sigmas)[:, None]
         return slopes
 
-    position_m: FloatArray = np.empty(0)
-    covariance_m2: FloatArray = np.empty((0, 0))
-
-    def state() -> tuple[FloatArray, FloatArray]:
-        return position_m, covariance_m2
-
-    yield state
+    yield tuple
     for ranges, sigmas, expected_m in zip(*pucks, strict=True):
         found = least_squares(
             residuals, expected_m, jac=jacobian, method="lm", args=(ranges, sigmas),
             xtol=tolerance, ftol=tolerance, gtol=tolerance,
         )  # fmt: skip
         slopes = np.asarray(found.jac, dtype=np.float64)
-        position_m, covariance_m2 = found.x, np.asarray(np.linalg.inv(slopes.T @ slopes), dtype=np.float64)
-        yield state
+        yield found.x, np.linalg.inv(slopes.T @ slopes)

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -230,44 +230,3 @@ def real_time_case(frame_us: float, run_args: Sequence[str]) -> dict[str, Any]:
     wall = lockstep_run(1, (*run_args, "--realtime")).summary["wall"]
     case = _case("main loop in real time, computing", [wall["tick_us_p50"]], "the time between two frames", [frame_us])
     return case | {"us_p99": wall["tick_us_p99"]}
-
-
-# -- as text ----------------------------------------------------------------------------------------------------------
-
-
-def markdown_rows(cases: Iterable[Mapping[str, Any]]) -> list[list[str]]:
-    """A row of the page for each case of this file, under ``HEAD``."""
-    return [
-        [
-            case["name"], f"{case['us_p50']:.0f}", " to ".join(f"{us:.0f}" for us in case["us_spread"]),
-            case["peer"], f"{case['peer_us_p50']:.0f}", " to ".join(f"{us:.0f}" for us in case["peer_us_spread"]),
-            f"{case['ratio']:.3f}", _text(case, "times_real_time", ".1f"), _text(case, "whole_times_real_time", ".1f"),
-            _text(case, "wake_ups", ".2f"),
-        ]
-        for case in cases
-    ]  # fmt: skip
-
-
-HEAD = (
-    "case", "µs a frame", "spread", "peer", "peer, µs", "spread", "ratio",
-    "times real time", "with start and end", "wake-ups a frame",
-)  # fmt: skip
-
-
-def _text(case: Mapping[str, Any], key: str, spec: str) -> str:
-    return format(case[key], spec) if key in case else "-"
-
-
-def terminal_line(case: Mapping[str, Any]) -> str:
-    """A case of this file in a line."""
-    low, high = case["us_spread"]
-    text = f"{case['name']:<62} {case['us_p50']:8.1f} us ({low:.0f} to {high:.0f})   ratio {case['ratio']:.3f}"
-    if case["us_p99"] is not None:
-        text += f"   p99 {case['us_p99']:.0f} us"
-    if "times_real_time" in case:
-        text += f"   {case['times_real_time']:.1f} times real time"
-    if "whole_times_real_time" in case:
-        text += f", {case['whole_times_real_time']:.1f} with start and end"
-    if "wake_ups" in case:
-        text += f"   {case['wake_ups']:.2f} wake-ups"
-    return text

@@ -9,8 +9,9 @@ processes only read, write and wake each other, with the standard library's json
 import argparse
 import asyncio
 import json
+import multiprocessing
 import os
-import subprocess
+import socket
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -18,12 +19,11 @@ from contextlib import contextmanager
 from statistics import median
 from typing import Any
 
-from ccatp.config.package import child_environment
-
 FRAMES, ROUNDS, WARM_UP_FRAMES = 4000, 5, 200
 TIMEOUT_S = 120.0
 IDLE, ONE_CORE, BUSY = "idle", "all on one core", "one busy process per core"
 LOADS = (IDLE, ONE_CORE, BUSY)
+SPAWN = multiprocessing.get_context("spawn")  # plain: nothing of this process is in them
 # A frame of a robot that drives: ten samples of wheels and edge sensors, as in the configuration that is shipped.
 SENSORS: dict[str, Any] = {
     "type": "sensors", "seq": 300, "t": 3.0,
@@ -38,11 +38,13 @@ DRIVE: dict[str, Any] = {"type": "drive", "seq": 300, "ack": 300, "wr": 1.000273
 
 def calibrate(frames: int = FRAMES) -> tuple[float, float]:
     """Wall time of a frame there and back, and CPU time of both processes for it, us, in the present load."""
-    with _started("--robot", str(frames)) as robot, _started("--controller", _line(robot), str(frames)) as controller:
-        robot_out, _ = robot.communicate(timeout=TIMEOUT_S)
-        controller_out, _ = controller.communicate(timeout=TIMEOUT_S)
-    (wall_us, robot_us), (_, controller_us) = json.loads(robot_out), json.loads(controller_out)
-    return wall_us, robot_us + controller_us
+    found = SPAWN.Queue()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+        robot, controller = (_exchange, (found, frames, listener)), (_exchange, (found, frames, port))
+        with _started(robot, controller):
+            times_s = [found.get(timeout=TIMEOUT_S) for _ in (robot, controller)]
+    return 1e6 * max(wall_s for wall_s, _ in times_s) / frames, 1e6 * sum(cpu_s for _, cpu_s in times_s) / frames
 
 
 @contextmanager
@@ -52,27 +54,37 @@ def load(name: str) -> Iterator[None]:
         yield
         return
     cores = os.sched_getaffinity(0)
-    if name == ONE_CORE:
-        os.sched_setaffinity(0, {min(cores)})
+    busy = SPAWN.Semaphore(0)
+    with _started(*((_be_busy, (core, busy)) for core in sorted(cores) if name == BUSY)) as processes:
+        for _ in processes:
+            busy.acquire(timeout=TIMEOUT_S)
+        if name == ONE_CORE:
+            os.sched_setaffinity(0, {min(cores)})
         try:
             yield
         finally:
             os.sched_setaffinity(0, cores)
-        return
-    busy: list[subprocess.Popen[str]] = []
+
+
+@contextmanager
+def _started(*calls: tuple[Any, tuple[Any, ...]]) -> Iterator[list[Any]]:
+    """A process for each call of a function; they are ended afterwards."""
+    processes = [SPAWN.Process(target=function, args=arguments, daemon=True) for function, arguments in calls]
     try:
-        if name == BUSY:
-            for core in sorted(cores):
-                busy.append(_start("--busy", str(core)))
-                _line(busy[-1])
-        yield
+        for process in processes:
+            process.start()
+        yield processes
     finally:
-        for process in busy:
+        for process in processes:
             process.kill()
-            process.communicate()
+            process.join()
 
 
-async def _drive_robot(frames: int) -> tuple[float, float]:
+def _exchange(found: Any, frames: int, end: socket.socket | int) -> None:
+    found.put(asyncio.run(_control(end) if isinstance(end, int) else _drive_robot(end, frames)))
+
+
+async def _drive_robot(listener: socket.socket, frames: int) -> tuple[float, float]:
     """Serve one client: send a frame, await its drive."""
     done: asyncio.Future[tuple[float, float]] = asyncio.get_running_loop().create_future()
 
@@ -87,8 +99,7 @@ async def _drive_robot(frames: int) -> tuple[float, float]:
         done.set_result((time.perf_counter() - wall_s, time.process_time() - cpu_s))
         writer.close()
 
-    server = await asyncio.start_server(serve, "127.0.0.1", 0)
-    _print(str(server.sockets[0].getsockname()[1]))
+    await asyncio.start_server(serve, sock=listener)
     return await done
 
 
@@ -105,74 +116,37 @@ async def _control(port: int) -> tuple[float, float]:
     return time.perf_counter() - wall_s, time.process_time() - cpu_s
 
 
-def _be_busy(core: int) -> None:
+def _be_busy(core: int, busy: Any) -> None:
     """Load a core as long as whoever started this lives."""
     os.sched_setaffinity(0, {core})
     parent = os.getppid()
-    _print("busy")
+    busy.release()
     while os.getppid() == parent:
         for _ in range(100_000):
             pass
 
 
-def _print(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
-
-
-def _start(*arguments: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "ccatp.studies.calibrator", *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=child_environment(os.environ))
-
-
-def _line(process: subprocess.Popen[str]) -> str:
-    return "" if process.stdout is None else process.stdout.readline().strip()
-
-
-@contextmanager
-def _started(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    process = _start(*arguments)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print wall and CPU time of a frame in each load."""
+    """Print wall and CPU time of a frame in each load; the loads by turns: a machine that slows down slows all."""
     parser = argparse.ArgumentParser(prog="python -m ccatp.studies.calibrator", description="A frame of two processes.")
     parser.add_argument("--frames", type=int, default=FRAMES, help="Frames of a round.")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     parser.add_argument("--json", action="store_true", help="Result as JSON.")
-    for role, words in (("--robot", 1), ("--controller", 2), ("--busy", 1)):
-        parser.add_argument(role, type=int, nargs=words, help=argparse.SUPPRESS)
     options = parser.parse_args(argv)
-    if options.busy is not None:
-        _be_busy(*options.busy)
-    elif options.robot is not None or options.controller is not None:
-        frames = (options.robot or options.controller)[-1]
-        times_s = asyncio.run(_control(options.controller[0]) if options.controller else _drive_robot(frames))
-        _print(json.dumps([1e6 * time_s / frames for time_s in times_s]))
-    else:
-        _report(options.rounds, options.frames, is_json=options.json)
-    return 0
-
-
-def _report(rounds: int, frames: int, *, is_json: bool) -> None:
-    """The loads by turns, so that a machine that slows down for a while slows all."""
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in LOADS}
-    for _ in range(rounds):
+    for _ in range(options.rounds):
         for name in LOADS:
             with load(name):
-                found[name].append(calibrate(frames))
+                found[name].append(calibrate(options.frames))
     rows = {name: [sorted(column) for column in zip(*times, strict=True)] for name, times in found.items()}
-    if is_json:
-        _print(json.dumps({name: {"us": wall_us, "cpu_us": cpu_us} for name, (wall_us, cpu_us) in rows.items()}))
-        return
-    for name, (wall_us, cpu_us) in rows.items():
-        spread = f"{wall_us[0]:.1f} to {wall_us[-1]:.1f}"
-        _print(f"{name:<28} {median(wall_us):8.1f} us a frame ({spread})   CPU {median(cpu_us):8.1f} us")
+    lines = [
+        f"{name:<28} {median(us):8.1f} us a frame ({us[0]:.1f} to {us[-1]:.1f})   CPU {median(cpu_us):8.1f} us"
+        for name, (us, cpu_us) in rows.items()
+    ]
+    if options.json:
+        lines = [json.dumps({name: {"us": us, "cpu_us": cpu_us} for name, (us, cpu_us) in rows.items()})]
+    sys.stdout.write("\n".join(lines) + "\n")
+    return 0
 
 
 if __name__ == "__main__":

@@ -111,6 +111,8 @@ class Study:
     mirrors: tuple[str, ...] = ("thesis-m1",)  # crossed with the cells; empty where these choose the mirror
     runs: int = 20  # seeds of each cell, by default
     is_radio: bool = False  # its configurations are those of robots among radio beacons
+    # What was published of a cell: ``printed`` in its result.
+    published: Callable[[Factors], Mapping[str, Any]] | None = None
 
 
 class Shard(NamedTuple):

@@ -38,6 +38,7 @@ from ccatp.studies.campaign import (
     CampaignInterrupted,
     CellResult,
     ClusterUnreachable,
+    Factors,
     Job,
     JobOutcome,
     Load,
@@ -312,8 +313,7 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
     results = []
     for group, outcomes in zip(plan, found, strict=True):
         there = [outcome for outcome in outcomes if outcome is not None]
-        values, arrays = study.combine(group[0].factors, there) if there else JobOutcome({})
-        results.append(CellResult(group[0].factors, {"runs": len(there), **values}, arrays))
+        results.append(cell_result(study, group[0].factors, there))
     missing = sum(outcome is None for outcomes in found for outcome in outcomes)
     about: dict[str, Any] = {
         "wall_s": round(time.perf_counter() - started_s, 3),
@@ -335,6 +335,13 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
         )
     _print(console, study, text)
     return result
+
+
+def cell_result(study: Study, factors: Factors, outcomes: Sequence[JobOutcome]) -> CellResult:
+    """The jobs of a cell together, and what was published of it."""
+    values, arrays = study.combine(factors, outcomes) if outcomes else JobOutcome({})
+    printed = {"printed": study.published(factors)} if study.published and outcomes else {}
+    return CellResult(factors, {"runs": len(outcomes), **values, **printed}, arrays)
 
 
 def _print(console: Console, study: Study, text: str) -> None:

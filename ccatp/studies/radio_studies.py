@@ -13,7 +13,8 @@ radios with 5 dB of static shadowing and reflected rays, read through the turnin
 `radio-slam`: EKF-SLAM among four ZigBee radios, in two rooms, with slip and with shadowing.
 """
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from math import atan2, degrees, inf, pi
@@ -30,33 +31,32 @@ from ccatp.beacons.slam.signal_slam import ReflectorScan, ScanResult
 from ccatp.beacons.steering import HALT
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import FloatArray, wrap_pi
-from ccatp.filters.metrics import best_motion
+from ccatp.filters.metrics import best_motion, rms, rms_m
 from ccatp.report.plots import INK
 from ccatp.sim.radio import SimDriveCommand, TruePose, TrueRadio
 from ccatp.sim.radio_world import RadioWorld
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
 from ccatp.studies.results import LIMIT, Measure, Row, band, colour, draw_ranges, grouped, plot
 
-RadioStudy = partial(Study, mirrors=(), is_radio=True)
-
 # -- a run with the truth beside the estimates -------------------------------------------------------------------------
+
+Place = tuple[float, float]  # x_m, y_m
 
 
 @dataclass(slots=True)
 class RadioRun:
-    """What a run leaves, one entry a step where nothing else is said; paths are x_m, y_m."""
+    """What a run leaves, one entry a step where nothing else is said; errors are estimate minus truth."""
 
-    # x_m, y_m and heading_rad, estimate minus truth; x_m, y_m of dead reckoning by the same odometry.
-    pose_errors: list[tuple[float, float, float]] = field(default_factory=list)
-    reckoned_errors: list[tuple[float, float]] = field(default_factory=list)
+    truth: list[Place] = field(default_factory=list)
+    estimates: list[Place] = field(default_factory=list)
+    heading_errors_rad: list[float] = field(default_factory=list)
+    reckoned_errors: list[Place] = field(default_factory=list)  # of dead reckoning by the same odometry
     # By name, from the first estimate on: distance of estimate and truth, and NEES with 2 degrees of freedom.
-    beacon_errors_m: dict[str, list[float]] = field(default_factory=dict)
-    beacon_nees: dict[str, list[float]] = field(default_factory=dict)
+    beacon_errors_m: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    beacon_nees: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     nis: list[tuple[float, int]] = field(default_factory=list)  # of each reading, and its degrees of freedom
-    truth: list[tuple[float, float]] = field(default_factory=list)
-    estimates: list[tuple[float, float]] = field(default_factory=list)
-    targets: list[tuple[float, float]] = field(default_factory=list)
-    believed: list[tuple[float, float]] = field(default_factory=list)
+    targets: list[Place] = field(default_factory=list)
+    believed: list[Place] = field(default_factory=list)
     places: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)  # at the end: mean and truth
     joint_nees: tuple[float, int] = (0.0, 0)  # at the end, of pose and static radios on the map; degrees of freedom
     nearest_m: float = inf  # to the target
@@ -67,7 +67,7 @@ def run_radio(cfg: RadioConfig) -> RadioRun:
     """A whole run; a function of the configuration and its seed."""
     world, navigator, pilot, run = RadioWorld(cfg), RadioNavigator(cfg), BeaconPilot(cfg), RadioRun()
     drive, observation, slam = HALT, cfg.observation, navigator.slam
-    truths: dict[str, tuple[float, float]] = {}
+    truths: dict[str, Place] = {}
     for step in range(1, cfg.run.steps + 1):
         static, target = step % observation.every_steps == 0, step % observation.target_every_steps == 0
         frame = world.step(SimDriveCommand(*drive), cfg.run.step_s, static=static, target=target)
@@ -75,8 +75,9 @@ def run_radio(cfg: RadioConfig) -> RadioRun:
         wheels = (odometry_of(cfg, t_s, *frame.wheels),)
         navigator.take(BeaconMeasurements(t_s, wheels, frame.packets, frame.sightings, distances_m))
         drive = pilot.drive(t_s, frame.wheels.interval_s, slam.pose, navigator.target(t_s), distances_m)
-        moving = {} if world.target_m is None else {cfg.follow.target: world.target_m}
-        truths = {**world.beacons_m, **moving}
+        truths = dict(world.beacons_m)
+        if world.target_m is not None:
+            truths[cfg.follow.target] = world.target_m
         _note(run, world, navigator, truths, cfg.follow.target)
     for name, estimate in slam.beacons.items():
         run.places[str(name)] = (estimate.mean, np.array(truths[str(name)]))
@@ -88,21 +89,19 @@ def run_radio(cfg: RadioConfig) -> RadioRun:
     return run
 
 
-def _note(
-    run: RadioRun, world: RadioWorld, navigator: RadioNavigator, truths: dict[str, tuple[float, float]], target: str
-) -> None:
+def _note(run: RadioRun, world: RadioWorld, navigator: RadioNavigator, truths: dict[str, Place], target: str) -> None:
     true, slam = world.pose, navigator.slam
     pose, (reckoned_x_m, reckoned_y_m) = slam.pose, navigator.reckoned_m
-    run.pose_errors.append((pose.x_m - true.x_m, pose.y_m - true.y_m, wrap_pi(pose.heading_rad - true.heading_rad)))
+    run.truth.append(true[:2])
+    run.estimates.append(pose[:2])
+    run.heading_errors_rad.append(wrap_pi(pose.heading_rad - true.heading_rad))
     run.reckoned_errors.append((reckoned_x_m - true.x_m, reckoned_y_m - true.y_m))
     run.nis += [(learned.nis, learned.size) for learned in slam.learned]
     run.clearance_m = min(run.clearance_m, world.clearance_m)
-    run.truth.append(true[:2])
-    run.estimates.append(pose[:2])
     for name, estimate in slam.beacons.items():
         off = estimate.mean - truths[str(name)]
-        run.beacon_errors_m.setdefault(str(name), []).append(float(np.hypot(*off)))
-        run.beacon_nees.setdefault(str(name), []).append(_nees(off, estimate.covariance))
+        run.beacon_errors_m[str(name)].append(float(np.hypot(*off)))
+        run.beacon_nees[str(name)].append(_nees(off, estimate.covariance))
     if world.target_m is not None:
         run.targets.append(world.target_m)
         run.nearest_m = min(run.nearest_m, float(np.hypot(world.target_m[0] - true.x_m, world.target_m[1] - true.y_m)))
@@ -118,7 +117,6 @@ SETTLED_SHARE = 0.3  # of a run: errors over time are counted after it, when rad
 _CURVE_EVERY = 10  # steps of 0.1 s between the points of a curve
 _POINT_S = 1.0
 _HIT = float(chdtri(2, 0.1))
-_BAND = 0.95
 
 COLUMNS = """
     beacons_m: mean median
@@ -140,13 +138,13 @@ def run_job(job: Job) -> JobOutcome:
         "beacons_aligned_m": {
             name: float(np.hypot(*(motion.moved(mean) - true))) for name, (mean, true) in finals.items()
         },
-        "beacons_rmse_m": {name: _rms(np.array(run.beacon_errors_m[name])) for name in finals},
+        "beacons_rmse_m": {name: rms(np.array(run.beacon_errors_m[name])) for name in finals},
         "beacons_hit": {name: run.beacon_nees[name][-1] < _HIT for name in finals},
-        "pose_m": _rms(estimates - truth),
-        "pose_aligned_m": _rms(motion.moved(estimates) - truth),
-        "reckoned_m": _rms(reckoned - truth),
-        "reckoned_aligned_m": _rms(reckoned_motion.moved(reckoned) - truth),
-        "heading_rad": _rms(np.array(run.pose_errors)[:, 2]),
+        "pose_m": rms_m(estimates, truth),
+        "pose_aligned_m": rms_m(motion.moved(estimates), truth),
+        "reckoned_m": rms_m(reckoned, truth),
+        "reckoned_aligned_m": rms_m(reckoned_motion.moved(reckoned), truth),
+        "heading_rad": rms(np.array(run.heading_errors_rad)),
         "nis": [sum(nis for nis, _ in run.nis), sum(size for _, size in run.nis)],
         "nees": list(run.joint_nees),
         "collided": run.clearance_m < 0.0,
@@ -158,8 +156,8 @@ def run_job(job: Job) -> JobOutcome:
         known = np.isfinite(believed[:, 0])
         covered = np.array(run.beacon_nees.get(target, [np.inf]))[-len(targets) :] < _HIT
         values |= {
-            "target_m": _rms((believed - targets)[known]),
-            "target_aligned_m": _rms((motion.moved(believed) - targets)[known]),
+            "target_m": rms_m(believed[known], targets[known]),
+            "target_aligned_m": rms_m(motion.moved(believed)[known], targets[known]),
             "target_covered": float(np.mean(covered)),
             "nearest_m": run.nearest_m,
         }
@@ -170,36 +168,30 @@ def run_job(job: Job) -> JobOutcome:
 def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """The runs of a cell pooled: errors, coverage, consistency with the 95 % bands of their chi-squared sums."""
     runs = [outcome.values for outcome in outcomes]
-    shared = [key for key in _MEANS if key in runs[0]]
-    means = {key: float(np.mean([run[key] for run in runs])) for key in shared}
-    nis, rows = (float(sum(run["nis"][k] for run in runs)) for k in (0, 1))
-    nees, states = (float(sum(run["nees"][k] for run in runs)) for k in (0, 1))
-    values: dict[str, Any] = {
-        "beacons_m": _spread([e for run in runs for e in run["beacons_m"].values()]),
-        "beacons_aligned_m": _spread([e for run in runs for e in run["beacons_aligned_m"].values()]),
-        "beacons_covered": float(np.mean([hit for run in runs for hit in run["beacons_hit"].values()])),
+
+    def each(key: str) -> list[Any]:
+        return [value for run in runs for value in run[key].values()]
+
+    values: dict[str, Any] = {key: float(np.mean([run[key] for run in runs])) for key in _MEANS if key in runs[0]}
+    values |= {
+        "beacons_m": _spread(each("beacons_m")),
+        "beacons_aligned_m": _spread(each("beacons_aligned_m")),
+        "beacons_covered": float(np.mean(each("beacons_hit"))),
         "beacon_rmse_m": {
             name: float(np.mean([run["beacons_rmse_m"][name] for run in runs if name in run["beacons_rmse_m"]]))
             for name in runs[0]["beacons_rmse_m"]
         },
-        **means,
-        "pose_ratio": means["pose_m"] / means["reckoned_m"],
-        "nis": nis / max(rows, 1.0),
-        "nis_band": _band(rows),
-        "nees": nees / max(states, 1.0),
-        "nees_band": _band(states),
+        "pose_ratio": values["pose_m"] / values["reckoned_m"],
         "collisions": sum(run["collided"] for run in runs),
     }
+    for name in ("nis", "nees"):
+        total, freedom = (float(sum(run[name][k] for run in runs)) for k in (0, 1))
+        values[name], values[f"{name}_band"] = total / max(freedom, 1.0), _band(freedom)
     if "target_m" in runs[0]:
         values |= {name: _spread([run[name] for run in runs]) for name in ("target_m", "target_aligned_m")}
         values["nearest_m"] = min(run["nearest_m"] for run in runs)
     arrays = {name: np.stack([o.arrays[name] for o in outcomes if name in o.arrays]) for name in outcomes[0].arrays}
     return JobOutcome(values, arrays)
-
-
-def _rms(errors: FloatArray) -> float:
-    squares = errors**2 if errors.ndim == 1 else np.sum(errors**2, axis=1)
-    return float(np.sqrt(np.mean(squares)))
 
 
 def _spread(values: Sequence[float]) -> dict[str, float]:
@@ -211,7 +203,7 @@ def _band(freedom: float) -> str:
     """Where the mean of so many normalised squares lies with 95 % probability."""
     if freedom < 1.0:
         return "-"
-    low, high = (float(chdtri(freedom, share)) / freedom for share in (0.5 + 0.5 * _BAND, 0.5 - 0.5 * _BAND))
+    low, high = (float(chdtri(freedom, share)) / freedom for share in (0.975, 0.025))
     return f"{low:.3f} to {high:.3f}"
 
 
@@ -244,6 +236,8 @@ def _draw_errors(results: Sequence[CellResult], name: str, label: str, keys: Seq
             axes.legend(frameon=False, fontsize=7)
         panels[0].set_ylabel(label)
 
+
+RadioStudy = partial(Study, run_job=run_job, combine=combine, columns=COLUMNS, mirrors=(), runs=50, is_radio=True)
 
 # -- radio-signals ----------------------------------------------------------------------------------------------------
 
@@ -285,31 +279,31 @@ def run_signals(job: Job) -> JobOutcome:
     return JobOutcome(values)
 
 
-def combine_signals(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """Means and spreads over the seeds, and what 2017 prints."""
-    place = str(factors["place"])
+def combine_signals(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
+    """Means and spreads over the seeds."""
     runs = [outcome.values for outcome in outcomes]
     errors = np.array([error for run in runs for error in run["bearing_errors_deg"]])
     ranges, levels_dbm = (np.array([run[key] for run in runs]) for key in ("estimate_m", "level_dbm"))
-    if place in CORNERS_M:
-        printed = {"bearing_error_deg": PRINTED_DEG[place]}
-    else:
-        index = _RANGE_NAMES.index(place)
-        printed = {"level_dbm": PRINTED_DBM[index], "estimate_m": PRINTED_M[index]}
-        printed["error_m"] = RANGES_M[index] - PRINTED_M[index]
     values: dict[str, Any] = {
-        "range_m": runs[0]["range_m"],
+        **{key: runs[0][key] for key in ("range_m", "model_dbm", "bearing_deg")},
         "level_dbm": float(np.mean(levels_dbm)),
         "level_sigma_db": float(np.std(levels_dbm)),
-        "model_dbm": runs[0]["model_dbm"],
         "estimate_m": float(np.mean(ranges)),
-        "range_rms_m": float(np.sqrt(np.mean((ranges - runs[0]["range_m"]) ** 2))),
-        "bearing_deg": runs[0]["bearing_deg"],
-        "bearing_rms_deg": float(np.sqrt(np.mean(errors**2))),
+        "range_rms_m": rms(ranges - runs[0]["range_m"]),
+        "bearing_rms_deg": rms(errors),
         "bearing_median_deg": float(np.median(np.abs(errors))),
-        "printed": printed,
     }
     return JobOutcome(values)
+
+
+def printed_signals(factors: Factors) -> Mapping[str, Any]:
+    """Of a place, in 2017."""
+    place = str(factors["place"])
+    if place in CORNERS_M:
+        return {"bearing_error_deg": PRINTED_DEG[place]}
+    index = _RANGE_NAMES.index(place)
+    error_m = RANGES_M[index] - PRINTED_M[index]
+    return {"level_dbm": PRINTED_DBM[index], "estimate_m": PRINTED_M[index], "error_m": error_m}
 
 
 def draw_signals(results: Sequence[CellResult], out: Path) -> None:
@@ -372,6 +366,7 @@ RADIO_SIGNALS = RadioStudy(
     draw=draw_signals,
     defaults={"system": "zigbee"},
     runs=40,
+    published=printed_signals,
 )
 
 # -- radio-cases ------------------------------------------------------------------------------------------------------
@@ -397,12 +392,6 @@ RADIO: dict[str, object] = {
 NAMES = ("pose_m", "heading_rad", "beacon1", "beacon2", "beacon3", "beacon4")
 
 
-def combine_cases(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """The runs pooled, and what 2017 prints."""
-    values, arrays = combine(factors, outcomes)
-    return JobOutcome({**values, "printed": dict(zip(NAMES, CASES_PRINTED[str(factors["case"])], strict=True))}, arrays)
-
-
 def draw_cases(results: Sequence[CellResult], out: Path) -> None:
     """Figure ``radio_cases``: the errors of pose and beacons of each case, ours (dot) and printed (mark)."""
     shown = {"pose_m": "pose_m", **{name: f"beacon_rmse_m.{name}" for name in NAMES[2:]}}
@@ -417,8 +406,6 @@ RADIO_CASES = RadioStudy(
     name="radio-cases",
     title="Cases I to III of 2017",
     cells=lambda: [Cell({"case": case}, {**RADIO, "workspace.waypoints_m": path}) for case, path in PATHS.items()],
-    run_job=run_job,
-    combine=combine_cases,
     columns=f"""
         printed: {" ".join(NAMES)}
         beacon_rmse_m: {" ".join(NAMES[2:])}
@@ -426,7 +413,7 @@ RADIO_CASES = RadioStudy(
     """,
     draw=draw_cases,
     defaults={"system": "zigbee"},
-    runs=50,
+    published=lambda factors: dict(zip(NAMES, CASES_PRINTED[str(factors["case"])], strict=True)),
 )
 
 # -- radio-follow -----------------------------------------------------------------------------------------------------
@@ -452,14 +439,6 @@ FOLLOW_CONDITIONS: dict[str, dict[str, object]] = {
 }
 
 
-def combine_follow(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
-    """The runs pooled, and what 2018 prints."""
-    values, arrays = combine(factors, outcomes)
-    is_printed = factors["condition"] == "as printed"
-    printed: dict[str, Any] = dict(FOLLOW_PRINTED[str(factors["case"])]) if is_printed else {}
-    return JobOutcome({**values, "printed": printed}, arrays)
-
-
 def draw_follow(results: Sequence[CellResult], out: Path) -> None:
     """Figures ``radio_follow_target`` and ``radio_follow_beacons``: errors over time."""
     keys = ("case", "condition")
@@ -475,8 +454,6 @@ RADIO_FOLLOW = RadioStudy(
         for condition, keys in FOLLOW_CONDITIONS.items()
         for case, every in CASES.items()
     ],
-    run_job=run_job,
-    combine=combine_follow,
     columns=f"""
         printed: target_m beacons_m
         target_m: mean median
@@ -486,7 +463,7 @@ RADIO_FOLLOW = RadioStudy(
     """,
     draw=draw_follow,
     defaults={"system": "follow"},
-    runs=50,
+    published=lambda factors: FOLLOW_PRINTED[str(factors["case"])] if factors["condition"] == "as printed" else {},
 )
 
 # -- radio-slam -------------------------------------------------------------------------------------------------------
@@ -544,10 +521,6 @@ RADIO_SLAM = RadioStudy(
     name="radio-slam",
     title="EKF-SLAM among ZigBee radios",
     cells=slam_cells,
-    run_job=run_job,
-    combine=combine,
-    columns=COLUMNS,
     draw=draw_slam,
     defaults={"system": "zigbee"},
-    runs=50,
 )

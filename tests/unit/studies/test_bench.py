@@ -1,6 +1,7 @@
 """The benchmarks: equality with the peers, the same problems each time, the format. No times are asserted."""
 
 import json
+import multiprocessing
 import os
 import subprocess
 import sys
@@ -39,7 +40,7 @@ def test_every_peer_computes_the_same(one: Race) -> None:
 
 def fixed(value: float) -> Contender:
     """A contender whose result does not change."""
-    return lambda: iter([lambda: (np.full(2, value), np.eye(2))] * (1 + bench_cases.STEPS))
+    return lambda: iter([tuple, *[(np.full(2, value), np.eye(2))] * bench_cases.STEPS])
 
 
 @pytest.mark.parametrize(("value", "difference"), [(1.0 + 2e-10, "2e-10"), (float("nan"), "nan")])
@@ -162,7 +163,8 @@ def test_the_rows_of_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len({line.count("|") for line in table}) == 1
     lines = bench.terminal_lines({"machine": bench.machine(), "cases": cases})
     assert len(lines) == len(cases) + 1
-    assert lines[-1].endswith("ratio 0.010   p99 200 us")
+    assert "p99 200 us" in lines[-1]
+    assert lines[-1].endswith("ratio 0.010")
 
 
 def test_a_mission_that_measured_too_little_gives_no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -233,7 +235,6 @@ def test_a_load_ends_with_its_block() -> None:
     with load(ONE_CORE):
         assert os.sched_getaffinity(0) == {min(cores)}
     assert os.sched_getaffinity(0) == cores
-    children = Path(f"/proc/self/task/{os.getpid()}/children")
     with load(BUSY):
-        assert len(children.read_text().split()) == len(cores)
-    assert not children.read_text().split()
+        assert len(multiprocessing.active_children()) == len(cores)
+    assert not multiprocessing.active_children()
