@@ -7,19 +7,19 @@ Known limitations: the battery stays full, and nothing fails without a fault pla
 """
 
 import asyncio
-import secrets
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack
 from functools import partial
 from pathlib import Path
-from typing import Protocol, cast
+from typing import cast
 
 import numpy as np
 
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.core import DeckPose
+from ccatp.links.auth import read_key
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.beacon_robot import build_beacon_robot
 from ccatp.sim.fault_injector import Injector
@@ -28,29 +28,18 @@ from ccatp.sim.fault_proxy import FaultProxy, LinkFaults
 from ccatp.sim.ground_truth import GroundTruthPublisher, SimPoseFile
 from ccatp.sim.robot import Robot
 from ccatp.sim.rules import SimulatedRobot
-from ccatp.sim.sessions import RobotServer, RobotSession
+from ccatp.sim.sessions import RobotServer, RobotSession, ServerLog
 
 HOUSEKEEPING_S = 0.25
 # A client that does not read gets no more frames once this much waits for it; it finds the newest when it reads on.
 MAX_UNSENT_BYTES = 1 << 18
 
 
-class ServerLog(Protocol):
-    """A structlog logger, or whatever has this method."""
-
-    def info(self, event: str, **fields: object) -> object:
-        """Take one line and its fields."""
-
-
-class RobotLinkServer:
+class DataLoop(RobotServer):
     """The server of one simulated robot on ``address`` (port 0 = any free port).
 
-    In lockstep simulated time waits for the clients; otherwise the wall clock paces it. Without a ``key`` there is no
-    authentication.
-
-    Attributes:
-        each_frame: called after each frame, before ``truth`` takes it.
-        faults: at work; each fault is logged when it begins and ends, and with what it did.
+    In lockstep simulated time waits for the clients; otherwise the wall clock paces it. Each of the ``faults`` is
+    logged when it begins and ends, and with what it did.
     """
 
     def __init__(
@@ -59,19 +48,17 @@ class RobotLinkServer:
         address: tuple[str, int],
         *,
         lockstep: bool,
-        key: bytes | None,
-        log: ServerLog | None,
+        key: bytes | None = None,
+        log: ServerLog | None = None,
+        faults: Sequence[Injector | LinkFaults] = (),
     ) -> None:
-        self._served, self._address, self._is_lockstep = robot, address, lockstep
-        self._key, self._log = key, log
-        self._boot = secrets.randbits(31)
+        super().__init__(robot, lockstep=lockstep, key=key, log=log)
+        self._address, self._faults = address, faults
         self._listener: asyncio.Server | None = None
         self._timer: asyncio.TimerHandle | None = None
         self.connections: set[Connection] = set()
         self._failure: asyncio.Future[None]
-        self.truth: GroundTruthPublisher | None = None
-        self.each_frame: list[Callable[[], None]] = []
-        self.faults: list[Injector | LinkFaults] = []
+        self.each_frame.append(self._log_faults)
 
     async def start(self, sock: socket.socket | None = None) -> int:
         """Boot and listen on the configured address or on a bound socket; return the port.
@@ -80,22 +67,13 @@ class RobotLinkServer:
         """
         loop = asyncio.get_running_loop()
         self._failure = loop.create_future()
-        self.server = RobotServer(
-            self._served,
-            lockstep=self._is_lockstep,
-            boot=self._boot,
-            key=self._key,
-            make_nonce=lambda: secrets.token_hex(16),
-            now_s=loop.time(),
-            note=self._note,
-            on_frame=self._on_frame,
-        )
+        self.begin(loop.time())
         if sock is None:
             self._listener = await loop.create_server(self.connect, *self._address)
         else:
             self._listener = await loop.create_server(self.connect, sock=sock)
         if not self._is_lockstep:
-            self._timer = loop.call_at(self.server.next_frame_s, self._tick)
+            self._timer = loop.call_at(self.next_frame_s, self._on_timer)
         return int(self._listener.sockets[0].getsockname()[1])
 
     def connect(self) -> "Connection":
@@ -110,7 +88,7 @@ class RobotLinkServer:
         stopped = asyncio.ensure_future(stop.wait())
         try:
             while not (stopped.done() or failure.done()):
-                self.server.check_time(asyncio.get_running_loop().time())
+                self.check_time(asyncio.get_running_loop().time())
                 await asyncio.wait((stopped, failure), timeout=HOUSEKEEPING_S, return_when="FIRST_COMPLETED")
             if failure.done():
                 failure.result()
@@ -122,36 +100,25 @@ class RobotLinkServer:
         """Stop: no timer, no listener, no session."""
         if self._timer is not None:
             self._timer.cancel()
-        if self._listener is not None:
-            self._listener.close()
+        if self._listener is None:
+            return
+        self._listener.close()
         for connection in tuple(self.connections):
             connection.close()
-        self._finish()
-        if self._listener is not None:
-            if self._log is not None:
-                counts = {"fan_changes": self.server.fan_changes, "oldest_ack_frames": self.server.oldest_ack_frames}
-                self._log.info("robot_statistics", **counts, **self.server.counts)
-            await self._listener.wait_closed()
-            self._listener = None
-
-    def _on_frame(self) -> None:
-        for call in self.each_frame:
-            call()
-        if self.truth is not None:
-            self.truth.add()
-        for faults in self.faults:
-            for what, injected in faults.changes(self._served.t_s):
-                self._log_fault(what, injected)
-
-    def _finish(self) -> None:
-        """Publish the last true states; log what each fault did."""
-        if self.truth is not None:
-            self.truth.flush()
-        for faults in self.faults:
-            if isinstance(faults, LinkFaults):
-                faults.changes(self._served.t_s)  # what happened since the last frame
+        self._log_faults()  # what happened since the last frame
+        for faults in self._faults:
             for injected in faults.injected:
                 self._log_fault("injected", injected)
+        if self._log is not None:
+            counts = {"fan_changes": self.fan_changes, "oldest_ack_frames": self.oldest_ack_frames}
+            self._log.info("robot_statistics", **counts, **self.counts)
+        await self._listener.wait_closed()
+        self._listener = None
+
+    def _log_faults(self) -> None:
+        for faults in self._faults:
+            for what, injected in faults.changes(self.robot.t_s):
+                self._log_fault(what, injected)
 
     def _log_fault(self, what: str, injected: Injected) -> None:
         if self._log is not None:
@@ -162,27 +129,24 @@ class RobotLinkServer:
         if not self._failure.done():
             self._failure.set_exception(error)
 
-    def _tick(self) -> None:
+    def _on_timer(self) -> None:
         loop = asyncio.get_running_loop()
         try:
-            self.server.tick(loop.time())
+            self.tick(loop.time())
         except Exception as error:
             self.fail(error)
             return
-        self._timer = loop.call_at(self.server.next_frame_s, self._tick)
-
-    def _note(self, text: str) -> None:
-        if self._log is not None:
-            self._log.info("robot_session", text=text)
+        self._timer = loop.call_at(self.next_frame_s, self._on_timer)
 
 
-class Connection(asyncio.Protocol):
-    """One client of a ``RobotLinkServer``."""
+class Connection(RobotSession, asyncio.Protocol):
+    """One client of a ``DataLoop``."""
 
-    def __init__(self, owner: RobotLinkServer) -> None:
+    _transport: asyncio.Transport
+
+    def __init__(self, owner: "DataLoop") -> None:
+        super().__init__(owner)
         self._owner = owner
-        self._transport: asyncio.Transport | None = None
-        self._session: RobotSession | None = None
         self._is_paused = False
         self._clock = asyncio.get_running_loop().time
 
@@ -193,25 +157,21 @@ class Connection(asyncio.Protocol):
         peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         self._owner.connections.add(self)
-        self._session = self._owner.server.accept(self, self._clock())
+        self._owner.accept(self, self._clock())
 
     def data_received(self, data: bytes) -> None:
-        if self._session is None:
-            return
         try:
-            self._session.receive(data, self._clock())
+            self.receive(data, self._clock())
         except Exception as error:
             self._owner.fail(error)
 
     def eof_received(self) -> None:
         # The transport closes only when the client has taken what waits for it; the session ends here and now.
-        if self._session is not None:
-            self._owner.server.lost(self._session)
+        self._owner.lost(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        if self._session is not None:
-            self._owner.connections.discard(self)
-            self._owner.server.lost(self._session)
+        self._owner.connections.discard(self)
+        self._owner.lost(self)
 
     def pause_writing(self) -> None:
         self._is_paused = True
@@ -221,103 +181,67 @@ class Connection(asyncio.Protocol):
 
     def write(self, data: bytes) -> None:
         """Send, unless the client does not read."""
-        if not self._is_paused and self._transport is not None:
+        if not self._is_paused:
             self._transport.write(data)
 
     def close(self) -> None:
-        """Close when everything is sent."""
-        if self._transport is not None:
-            self._transport.close()
+        self._transport.close()
 
 
-class DataLoop(RobotLinkServer):
-    """The server of the survey robot, with a fault plan; the robot is at base where no ``start`` is given."""
-
-    def __init__(
-        self,
-        cfg: Config,
-        lockstep: bool,
-        seed: int,
-        key: bytes | None = None,
-        log: ServerLog | None = None,
-        faults: FaultPlan | None = None,
-        start: DeckPose | None = None,
-    ) -> None:
-        self.robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(seed), faults, start)
-        super().__init__(self.robot, (cfg.sim.robot.host, cfg.sim.robot.port), lockstep=lockstep, key=key, log=log)
-        if self.robot.injector is not None:
-            self.faults.append(self.robot.injector)
+def survey_robot(cfg: Config, faults: FaultPlan | None = None, start: DeckPose | None = None) -> Robot:
+    """The survey robot of a configuration, just booted; at base where no ``start`` is given."""
+    return Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(cfg.run.seed), faults, start)
 
 
 async def serve(
-    cfg: Config,
+    cfg: Config | RadioConfig,
     *,
     lockstep: bool,
-    seed: int,
     stop: asyncio.Event,
     listen_sock: socket.socket | None = None,
     truth_rep: str | None = None,
     truth_pub: str | None = None,
-    key: bytes | None = None,
     log: ServerLog | None = None,
     faults: FaultPlan | None = None,
     body_file: Path | None = None,
     is_resuming: bool = False,
 ) -> None:
-    """Run a DataLoop until ``stop`` is set.
+    """Run the simulated robot of a configuration until ``stop`` is set.
 
-    ``faults`` may be those of the robot and of its link; for the link a proxy listens in the robot's place.
-    ``body_file`` keeps the true pose of the robot between runs. ``OSError``: the address cannot be had;
+    ``faults`` of a survey may be those of the robot and of its link; for the link a proxy listens in the robot's place.
+    ``body_file`` keeps the true pose of the survey robot between runs. ``OSError``: the address cannot be had;
     ``zmq.ZMQError``: an endpoint cannot be had.
     """
-    body = None if body_file is None else SimPoseFile(body_file)
-    start = body.read() if body is not None and is_resuming else None
-    data_loop = DataLoop(cfg, lockstep, seed, key, log, faults, start)
-    if body is not None:
-        data_loop.each_frame.append(partial(body.keep, data_loop.robot))
-    try:
-        async with AsyncExitStack() as stack:
-            if faults is not None and faults.link:
-                behind = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
-                at = cfg.sim.robot.host, cfg.sim.robot.port
-                before = listen_sock or stack.enter_context(socket.create_server(at))
-                proxy = FaultProxy(*behind.getsockname()[:2], seed=cfg.run.seed, listener=before)
-                await stack.enter_async_context(proxy)
-                data_loop.faults.append(LinkFaults(faults.link, proxy))
-                listen_sock = behind
-            truth = GroundTruthPublisher(data_loop.robot, truth_rep, truth_pub)
-            await _serve(data_loop, truth, listen_sock, stop)
-    finally:
-        if body is not None:
-            body.close()
-
-
-async def serve_beacons(
-    cfg: RadioConfig,
-    *,
-    lockstep: bool,
-    stop: asyncio.Event,
-    listen_sock: socket.socket | None = None,
-    truth_rep: str | None = None,
-    truth_pub: str | None = None,
-    key: bytes | None = None,
-    log: ServerLog | None = None,
-) -> None:
-    """The same with a robot among beacons."""
-    robot = build_beacon_robot(cfg)
-    server = RobotLinkServer(robot, (cfg.sim.robot.host, cfg.sim.robot.port), lockstep=lockstep, key=key, log=log)
-    await _serve(server, GroundTruthPublisher(robot, truth_rep, truth_pub), listen_sock, stop)
-
-
-async def _serve(
-    server: RobotLinkServer, truth: GroundTruthPublisher, listen_sock: socket.socket | None, stop: asyncio.Event
-) -> None:
-    server.truth = truth
-    try:
+    at = cfg.sim.robot.host, cfg.sim.robot.port
+    robot: SimulatedRobot
+    at_work: list[Injector | LinkFaults] = []
+    each_frame: list[Callable[[], object]] = []
+    async with AsyncExitStack() as stack:
+        if isinstance(cfg, RadioConfig):
+            robot = build_beacon_robot(cfg)
+        else:
+            body = None if body_file is None else SimPoseFile(body_file)
+            robot = survey_robot(cfg, faults, body.read() if body is not None and is_resuming else None)
+            if body is not None:
+                stack.callback(body.close)
+                each_frame.append(partial(body.keep, robot))
+            if robot.injector is not None:
+                at_work.append(robot.injector)
+        if faults is not None and faults.link:
+            behind = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+            before = listen_sock or stack.enter_context(socket.create_server(at))
+            proxy = FaultProxy(*behind.getsockname()[:2], seed=cfg.run.seed, listener=before)
+            at_work.append(LinkFaults(faults.link, await stack.enter_async_context(proxy)))
+            listen_sock = behind
+        server = DataLoop(robot, at, lockstep=lockstep, key=read_key(cfg.robot.key_file), log=log, faults=at_work)
+        truth = GroundTruthPublisher(robot, truth_rep, truth_pub)
+        stack.callback(truth.close)
+        server.each_frame += [truth.add, *each_frame]
         await server.start(listen_sock)
         async with asyncio.TaskGroup() as tasks:
             answering = tasks.create_task(truth.serve())
-            await server.run(stop)
-            answering.cancel()
-    finally:
-        truth.close()
+            try:
+                await server.run(stop)
+            finally:
+                truth.flush()
+                answering.cancel()

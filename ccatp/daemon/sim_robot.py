@@ -4,10 +4,7 @@ import asyncio
 import os
 import socket
 import sys
-from collections.abc import Callable, Coroutine
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import structlog
 
@@ -22,19 +19,11 @@ from ccatp.daemon.process import (
     run_until_stopped,
     start_process,
 )
-from ccatp.dataloop import serve, serve_beacons
+from ccatp.dataloop import serve
 from ccatp.errors import ConfigError
-from ccatp.links.auth import read_key
 from ccatp.links.runtime_dir import TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
 from ccatp.sim.fault_plan import FaultPlan, read_plan
 from ccatp.sim.ground_truth import FILE
-
-Serve = Callable[..., Coroutine[Any, Any, None]]
-
-
-def _robot_of(cfg: Config | RadioConfig, **of_surveys: Any) -> Serve:
-    """How the robot of a configuration is served; what is known of surveys alone is left out among beacons."""
-    return partial(serve_beacons, cfg) if isinstance(cfg, RadioConfig) else partial(serve, cfg, **of_surveys)
 
 
 def main() -> int:
@@ -42,18 +31,19 @@ def main() -> int:
     args = start_process()
     cfg, lockstep = args.config, not args.is_realtime
     plan = read_plan(args.run_dir / FAULTS_FILE, lockstep=lockstep) if args.has_faults else None
-    body_file = args.run_dir / FILE
-    serve_robot = _robot_of(cfg, seed=cfg.run.seed, faults=plan, body_file=body_file, is_resuming=args.is_resuming)
 
     async def run(stop: asyncio.Event) -> int:
-        await serve_robot(
+        await serve(
+            cfg,
             lockstep=lockstep,
             stop=stop,
             listen_sock=socket.socket(fileno=args.listen_fd),
             truth_rep=args.endpoints.of("puck"),
             truth_pub=args.endpoints.of("truth"),
-            key=read_key(cfg.robot.key_file),
             log=open_log(args.run_dir / "log.jsonl", "dataloop"),
+            faults=plan,
+            body_file=args.run_dir / FILE,
+            is_resuming=args.is_resuming,
         )
         return 0
 
@@ -74,9 +64,9 @@ def run_alone(
     """
     folder = make_runtime_dir(str(runtime_dir or processes_of(cfg).runtime_dir), os.environ)
     truth, what = Endpoints(folder).of("puck"), cfg.system if isinstance(cfg, RadioConfig) else cfg.mirror.name
+    at, log = cfg.sim.robot, structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
     refusal = f"another simulated robot uses {folder}; end it, or give this one its own --runtime-dir"
     with locked(folder / TRUTH_LOCK_FILE, refusal):
-        at = cfg.sim.robot
         try:
             listener = listen_at(at.host, at.port)
         except OSError as error:
@@ -85,9 +75,9 @@ def run_alone(
             ) from error
 
         async def run(stop: asyncio.Event) -> int:
-            key, log = read_key(cfg.robot.key_file), structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
-            serve_robot = _robot_of(cfg, seed=cfg.run.seed, faults=faults)
-            await serve_robot(lockstep=lockstep, stop=stop, listen_sock=listener, truth_rep=truth, key=key, log=log)
+            await serve(
+                cfg, lockstep=lockstep, stop=stop, listen_sock=listener, truth_rep=truth, log=log, faults=faults
+            )
             return 0
 
         with listener:

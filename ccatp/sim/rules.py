@@ -23,8 +23,8 @@ class MotionRules:
 
     Wheels turn only while the newest drive is at most ``ttl_s`` old and, once a monitor has joined in this boot, the
     newest permit is at most ``ttl_s`` old and allows the direction: v = r (wr + wl)/2 > 0 needs ``forward``, < 0
-    ``reverse``, wr != wl needs ``turn``. Sequence numbers count per kind and per session: a new session begins again.
-    A drive over ``max_wheel_rad_s`` is slowed down as a whole, so that its path stays the same.
+    ``reverse``, wr != wl or a steering angle needs ``turn``. A drive over ``max_wheel_rad_s`` is slowed down as a
+    whole, so that its path stays the same.
 
     Attributes:
         is_held: the last ``set_points`` held the wheels.
@@ -35,52 +35,31 @@ class MotionRules:
         self._ttl_s, self._max_wheel_rad_s = ttl_s, max_wheel_rad_s
         self._drive: tuple[float, float] | None = None
         self._permit: tuple[bool, bool, bool] | None = None
-        self._drive_seq = self._permit_seq = -1
+        self._drive_seq = -1
         self._drive_s = self._permit_s = boot_s  # as old as the boot
         self.steer_rad = 0.0
         self.has_monitor_joined = False
         self.is_held = True
 
-    def join(self, role: Role) -> None:
-        """A new session has a role: nothing of the one before is in force; from now on a monitor's permit is needed."""
-        self.lose(role)
-        if role == "controller":
-            self._drive_seq = -1
-        else:
-            self.has_monitor_joined = True
-            self._permit_seq = -1
-
     def lose(self, role: Role) -> None:
-        """The session of a role has ended: hold."""
+        """Nothing that a role sent is in force any more."""
         if role == "controller":
             self._drive = None
         else:
             self._permit = None
 
-    def drive(self, seq: int, right_rad_s: float, left_rad_s: float, now_s: float, steer_rad: float = 0.0) -> bool:
-        """Take a drive that arrived at ``now_s``; false for an old or equal ``seq`` and for numbers not finite.
-
-        A steering angle other than zero makes a turn of it.
-        """
-        if seq <= self._drive_seq or not isfinite(steer_rad):
-            return False
-        limit = self._max_wheel_rad_s
-        if not (-limit <= right_rad_s <= limit and -limit <= left_rad_s <= limit):
-            if not isfinite(right_rad_s) or not isfinite(left_rad_s):
-                return False
-            scale = limit / max(abs(right_rad_s), abs(left_rad_s))
+    def drive(self, seq: int, right_rad_s: float, left_rad_s: float, now_s: float, steer_rad: float = 0.0) -> None:
+        """A drive that arrived at ``now_s``."""
+        fastest = max(abs(right_rad_s), abs(left_rad_s))
+        if fastest > self._max_wheel_rad_s:
+            scale = self._max_wheel_rad_s / fastest
             right_rad_s, left_rad_s = scale * right_rad_s, scale * left_rad_s
         self._drive = (float(right_rad_s), float(left_rad_s))  # one number of numpy's would slow down all that follows
         self._drive_seq, self._drive_s, self.steer_rad = seq, now_s, steer_rad
-        return True
 
-    def permit(self, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float) -> bool:
-        """Take a permit that arrived at ``now_s``; false for an old or equal ``seq``."""
-        if seq <= self._permit_seq:
-            return False
-        self._permit = (forward, reverse, turn)
-        self._permit_seq, self._permit_s = seq, now_s
-        return True
+    def permit(self, forward: bool, reverse: bool, turn: bool, now_s: float) -> None:
+        """A permit that arrived at ``now_s``."""
+        self._permit, self._permit_s = (forward, reverse, turn), now_s
 
     def set_points(self, until_s: float) -> tuple[float, float]:
         """(right, left) wheel set points, rad/s, of a step to ``until_s``: drive and permit must last to its end."""
@@ -122,21 +101,13 @@ class FanRules:
     """
 
     def __init__(self, floor: float) -> None:
-        self._floor, self._seq = floor, -1
+        self._floor = floor
         self.duty = (floor, floor)
         self.health = (1.0, 1.0)
 
-    def join(self) -> None:
-        """A new session counts from the start; the duties stay."""
-        self._seq = -1
-
-    def command(self, seq: int, left: float, right: float) -> bool:
-        """Take a command, clamped to the floor; false for an old or equal ``seq`` and for numbers not finite."""
-        if seq <= self._seq or not isfinite(left) or not isfinite(right):
-            return False
-        self._seq = seq
+    def command(self, left: float, right: float) -> None:
+        """Set the duties, clamped to the floor."""
         self.duty = (min(max(left, self._floor), 1.0), min(max(right, self._floor), 1.0))
-        return True
 
     @property
     def thrust(self) -> float:
@@ -149,7 +120,7 @@ class SimulatedRobot(ABC):
 
     A command that arrives while frame n is the newest takes effect in the frame that follows n + the delay of the
     commands, in whole frames. Its age counts from its arrival, so the time-to-live covers the delay, too. Whether it is
-    newer than the one before is decided when it arrives.
+    newer than the one before is decided when it arrives; sequence numbers count per kind and session.
 
     Attributes:
         delivered_seq: number of the frame that reached the clients at this instant; -1 while none has, or a fault took
@@ -223,13 +194,13 @@ class SimulatedRobot(ABC):
     def join(self, role: Role) -> None:
         """A new session has a role; fan duties of the controller before, already accepted, come into force."""
         if role == "controller":
-            for _, kind, seq, values in self._waiting:
+            for _, kind, _, values in self._waiting:
                 if kind == "fans":
-                    self.fans.command(seq, *values)
-            self.fans.join()
+                    self.fans.command(*values)
             self._forget("fans")
-        self._forget(_MOTION[role])
-        self.rules.join(role)
+        else:
+            self.rules.has_monitor_joined = True
+        self.lose(role)
 
     def lose(self, role: Role) -> None:
         """The session of a role has ended: hold. Fan duties stay."""
@@ -238,8 +209,7 @@ class SimulatedRobot(ABC):
 
     def _forget(self, kind: str) -> None:
         self._newest[kind] = -1
-        if self._waiting:
-            self._waiting = deque(command for command in self._waiting if command[1] != kind)
+        self._waiting = deque(command for command in self._waiting if command[1] != kind)
 
     def drive(
         self,
@@ -255,38 +225,35 @@ class SimulatedRobot(ABC):
         ``steer_rad`` has no effect.
         """
         steer = steer_rad if steer_rad is not None and self.is_steerable else 0.0
-        values = right_rad_s, left_rad_s, self.t_s if now_s is None else now_s, steer
-        return self._delay("drive", seq, values) if self.commands_delay_frames else self.rules.drive(seq, *values)
+        return self._take("drive", seq, (right_rad_s, left_rad_s, self.t_s if now_s is None else now_s, steer))
 
     def permit(self, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None) -> bool:
         """Take a permit; false for an old or equal ``seq``. ``now_s`` as for ``drive``."""
-        values = forward, reverse, turn, self.t_s if now_s is None else now_s
-        return self._delay("permit", seq, values) if self.commands_delay_frames else self.rules.permit(seq, *values)
+        return self._take("permit", seq, (forward, reverse, turn, self.t_s if now_s is None else now_s))
 
     def command_fans(self, seq: int, left: float, right: float) -> bool:
         """Take fan duties; false for an old or equal ``seq`` and for numbers that are not finite."""
-        return (
-            self._delay("fans", seq, (left, right))
-            if self.commands_delay_frames
-            else self.fans.command(seq, left, right)
-        )
+        return self._take("fans", seq, (left, right))
 
-    def _delay(self, kind: str, seq: int, values: tuple[float, ...]) -> bool:
+    def _take(self, kind: str, seq: int, values: tuple[Any, ...]) -> bool:
         if seq <= self._newest[kind] or not all(map(isfinite, values)):
             return False
         self._newest[kind] = seq
-        self._waiting.append((self.seq + self.commands_delay_frames, kind, seq, values))
+        if self.commands_delay_frames:
+            self._waiting.append((self.seq + self.commands_delay_frames, kind, seq, values))
+        else:
+            self._apply(kind, seq, values)
         return True
+
+    def _apply(self, kind: str, seq: int, values: tuple[Any, ...]) -> None:
+        if kind == "drive":
+            self.rules.drive(seq, *values)
+        elif kind == "permit":
+            self.rules.permit(*values)
+        else:
+            self.fans.command(*values)
 
     def _release_commands(self) -> None:
         """Apply what is due when the step after the newest frame begins."""
-        if not self._waiting:
-            return
-        take: dict[str, Callable[..., bool]] = {
-            "drive": self.rules.drive,
-            "permit": self.rules.permit,
-            "fans": self.fans.command,
-        }
         while self._waiting and self._waiting[0][0] <= self.seq:
-            _, kind, seq, values = self._waiting.popleft()
-            take[kind](seq, *values)
+            self._apply(*self._waiting.popleft()[1:])

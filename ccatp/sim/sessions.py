@@ -19,6 +19,8 @@ Choices the interface leaves open:
 * A reboot by plan closes every session.
 """
 
+import secrets
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
@@ -53,18 +55,15 @@ NO_DELIVERY_S = 60.0
 MAX_SESSIONS = 32
 
 
-class Wire(Protocol):
-    """One connection."""
+class ServerLog(Protocol):
+    """A structlog logger, or whatever has this method."""
 
-    def write(self, data: bytes) -> None:
-        """Send without waiting."""
-
-    def close(self) -> None:
-        """Close when everything is sent; nothing is received any more."""
+    def info(self, event: str, **fields: object) -> object:
+        """Take one line and its fields."""
 
 
-class RobotSession:
-    """One client.
+class RobotSession(ABC):
+    """One client; what sends its bytes is added by a transport.
 
     Attributes:
         joined_s, received_s: when it connected and when it last sent something valid; wall clock, but for the latter in
@@ -72,13 +71,22 @@ class RobotSession:
         is_open: not closed by us.
     """
 
-    def __init__(self, server: "RobotServer", wire: Wire, nonce: str, now_s: float) -> None:
-        self._server, self.wire, self.nonce = server, wire, nonce
+    def __init__(self, server: "RobotServer") -> None:
+        self._server = server
+        self.nonce = secrets.token_hex(16)
         self.role: Role | None = None
-        self.joined_s = self.received_s = now_s
+        self.joined_s = self.received_s = 0.0
         self.is_open = True
         self._lines = LineBuffer()
         self._bad = BadLineCounter()
+
+    @abstractmethod
+    def write(self, data: bytes) -> None:
+        """Send without waiting."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close when everything is sent; nothing is received any more."""
 
     def receive(self, data: bytes, now_s: float) -> None:
         """Take bytes as they come."""
@@ -108,52 +116,43 @@ class RobotSession:
 
 
 class RobotServer:
-    """The robot behind its link.
-
-    Without a ``key`` of the HMAC there is no authentication. ``make_nonce`` returns 32 fresh hex digits, ``note`` takes
-    lines of the log, ``on_frame`` is called after each frame that was driven.
+    """The robot behind its link; ``begin`` first. Without a ``key`` of the HMAC there is no authentication.
 
     Attributes:
         counts: bad_lines, unknown_types, oversized_lines, refused, stale (drives, permits and fans not newer),
             slips (frames more than a period late), repeats (frames that were sent again in lockstep).
         oldest_ack_frames: how many frames a drive that moves the robot was behind at most (not in lockstep).
+        each_frame: called after each frame that was driven.
     """
 
     def __init__(
-        self,
-        robot: SimulatedRobot,
-        *,
-        lockstep: bool,
-        boot: int,
-        key: bytes | None,
-        make_nonce: Callable[[], str],
-        now_s: float,
-        note: Callable[[str], None],
-        on_frame: Callable[[], None],
+        self, robot: SimulatedRobot, *, lockstep: bool, key: bytes | None = None, log: ServerLog | None = None
     ) -> None:
         self.robot = robot
         self.counts: Counter[str] = Counter(stale=0)
         self.oldest_ack_frames = self.fan_changes = 0
-        self._is_lockstep, self._boot, self._key = lockstep, boot, key
-        self._make_nonce, self._note, self._on_frame = make_nonce, note, on_frame
-        self._boot_s = now_s
+        self.each_frame: list[Callable[[], object]] = []
+        self._is_lockstep, self._key, self._log = lockstep, key, log
+        self._boot = secrets.randbits(31)
         self._sessions: set[RobotSession] = set()
         self._holders: dict[Role, RobotSession] = {}
         self._last_session = 0
         self._acked: set[Role] = set()  # roles that have answered the newest frame
-        self._frame_wall_s = self._repeated_s = now_s
         self._is_stall_noted = False
         self._reboots = robot.reboots
 
-    def accept(self, wire: Wire, now_s: float) -> RobotSession:
+    def begin(self, now_s: float) -> None:
+        """The robot boots."""
+        self._boot_s = self._frame_wall_s = self._repeated_s = now_s
+
+    def accept(self, session: RobotSession, now_s: float) -> None:
         """A client connected."""
-        session = RobotSession(self, wire, self._make_nonce(), now_s)
+        session.joined_s = session.received_s = now_s
         auth, boot = AUTH_NONE if self._key is None else AUTH_HMAC, self._boot + self._reboots
-        wire.write(encode(self.robot.hello(boot=boot, nonce=session.nonce, auth=auth, lockstep=self._is_lockstep)))
+        session.write(encode(self.robot.hello(boot=boot, nonce=session.nonce, auth=auth, lockstep=self._is_lockstep)))
         self._sessions.add(session)
         if len(self._sessions) > MAX_SESSIONS:
             self.refuse(session, "busy")
-        return session
 
     def lost(self, session: RobotSession) -> None:
         """The connection of a session is gone (or shall be forgotten): its role is free, the wheels are held."""
@@ -171,12 +170,12 @@ class RobotServer:
         """Close a session."""
         self._note(f"{session.role or 'client'} dropped: {why}")
         self.lost(session)
-        session.wire.close()
+        session.close()
 
     def refuse(self, session: RobotSession, reason: RefusalReason) -> None:
         """Refuse a role to a client, and close."""
         self.counts["refused"] += 1
-        session.wire.write(encode(Refused(reason=reason)))
+        session.write(encode(Refused(reason=reason)))
         self.drop(session, f"refused: {reason}")
 
     def check_time(self, now_s: float) -> None:
@@ -217,7 +216,7 @@ class RobotServer:
         self._holders[message.role] = session
         session.role, session.received_s = message.role, clock_s
         self._last_session += 1
-        session.wire.write(encode(Joined(role=message.role, session=self._last_session)))
+        session.write(encode(Joined(role=message.role, session=self._last_session)))
         self._note(f"{message.role} joined: {message.client}")
         self._frame_wall_s, self._is_stall_noted = now_s, False
         self.robot.join(message.role)
@@ -227,7 +226,7 @@ class RobotServer:
             self._run_to_delivery()
             self._send_frame()
         elif "controller" in self._holders:
-            session.wire.write(self.robot.delivered_line)
+            session.write(self.robot.delivered_line)
 
     def _run_to_delivery(self) -> None:
         """No client can answer what is still on its way, or lost: the frames until one arrives run by themselves."""
@@ -237,15 +236,13 @@ class RobotServer:
                 self._drop_all(f"no frame could be delivered for {NO_DELIVERY_S:g} s")
                 return
             self._send_frame()
-            robot.advance()
-            self._on_frame()
-            self._close_after_reboot()
+            self._drive_frame()
 
     def command(self, session: RobotSession, role: Role, message: FromClient, now_s: float) -> bool:
         """A message of a session that has a role; false when it is not for this role."""
         robot, robot_s = self.robot, self._robot_time_s(now_s)
         if type(message) is Drive and role == "controller":
-            taken = robot.drive(message.seq, message.wr, message.wl, robot_s, message.steer)
+            taken = robot.drive(message.seq, message.wr, message.wl, robot_s, message.steer or 0.0)
             if taken and (message.wr or message.wl):
                 self.oldest_ack_frames = max(self.oldest_ack_frames, robot.delivered_seq - message.ack)
         elif type(message) is Permit and role == "monitor":
@@ -292,14 +289,15 @@ class RobotServer:
     def _advance(self, now_s: float) -> None:
         self._acked.clear()
         self._frame_wall_s, self._is_stall_noted = now_s, False
-        self.robot.advance()
-        self._on_frame()
-        self._close_after_reboot()
+        self._drive_frame()
         if self._is_lockstep:
             self._run_to_delivery()
         self._send_frame()
 
-    def _close_after_reboot(self) -> None:
+    def _drive_frame(self) -> None:
+        self.robot.advance()
+        for call in self.each_frame:
+            call()
         if self.robot.reboots != self._reboots:
             self._reboots = self.robot.reboots
             self._drop_all("the robot rebooted")
@@ -315,7 +313,7 @@ class RobotServer:
         for role in ("controller", "monitor"):  # the controller has more to do
             session = self._holders.get(role)
             if session is not None:
-                session.wire.write(line)
+                session.write(line)
 
     def _robot_time_s(self, now_s: float) -> float:
         robot_s = self.robot.t_s
@@ -324,3 +322,7 @@ class RobotServer:
         # A command that is read before the first frame after a stop must not count as one of the time to come.
         self._skip_stop(now_s)
         return max(robot_s, now_s - self._boot_s)
+
+    def _note(self, text: str) -> None:
+        if self._log is not None:
+            self._log.info("robot_session", text=text)

@@ -1,4 +1,4 @@
-"""DataLoops that break the interface page in one place: messages changed on their way, or other rules inside."""
+"""SurveyLoops that break the interface page in one place: messages changed on their way, or other rules inside."""
 
 import asyncio
 import json
@@ -6,15 +6,15 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, asynccontextmanager
-from functools import partial
 from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
 from ccatp.commissioning.conformance.runner import Conformance, Result
 from ccatp.config.models import Config
-from ccatp.dataloop import Connection, DataLoop
-from ccatp.sim.rules import FanRules, MotionRules
+from ccatp.dataloop import Connection
+from ccatp.sim.rules import MotionRules
+from tests.support.scenario import SurveyLoop
 
 Message = dict[str, Any]
 STOP_S = 10.0
@@ -38,14 +38,14 @@ class Crooked(NamedTuple):
     runs: tuple[str, ...] = ()
     says: Callable[[Message, "Middle"], Message | bytes | None] | None = None
     hears: Callable[[bytes, "Middle"], bytes] | None = None
-    twist: Callable[[DataLoop], object] | None = None
+    twist: Callable[[SurveyLoop], object] | None = None
 
 
 class Middle(Connection):
     """A connection whose messages are changed on their way.
 
     Attributes:
-        owner: the DataLoop.
+        owner: the SurveyLoop.
         hello: what it said first.
         count: messages of the robot so far.
     """
@@ -71,14 +71,9 @@ class Middle(Connection):
     def data_received(self, data: bytes) -> None:
         super().data_received(data if self._crooked.hears is None else self._crooked.hears(data, self))
 
-    @property
-    def session(self) -> Any:
-        """The robot's side of it."""
-        return self._session
 
-
-class CrookedLoop(DataLoop):
-    """A DataLoop whose messages are changed on their way."""
+class CrookedLoop(SurveyLoop):
+    """A server whose messages are changed on their way."""
 
     crooked: Crooked
 
@@ -139,24 +134,23 @@ def swap(old: bytes, new: bytes) -> Callable[[bytes, Middle], bytes]:
     return lambda data, _: data.replace(old, new)
 
 
-def _other(part: str, base: type, **methods: Any) -> Callable[[DataLoop], None]:
-    def twist(loop: DataLoop) -> None:
-        getattr(loop.robot, part).__class__ = type("Other", (base,), {"__slots__": (), **methods})
+def rules(**methods: Any) -> Callable[[SurveyLoop], None]:
+    """Other rules of motion, by method."""
+
+    def twist(loop: SurveyLoop) -> None:
+        loop.robot.rules.__class__ = type("Other", (MotionRules,), methods)
 
     return twist
 
 
-rules = partial(_other, "rules", MotionRules)  # other rules of motion, by method
-fans = partial(_other, "fans", FanRules)
+def around(path: str, new: Callable[..., Any]) -> Callable[[SurveyLoop], None]:
+    """A method of the robot or its server (no dot), replaced by ``new(loop, method, *arguments)``."""
 
-
-def around(path: str, new: Callable[..., Any]) -> Callable[[DataLoop], None]:
-    """A method of the robot or its server, replaced by ``new(loop, method, *arguments)``."""
-
-    def twist(loop: DataLoop) -> None:
-        part, name = path.split(".")
-        method = getattr(getattr(loop, part), name)
-        setattr(getattr(loop, part), name, lambda *args, **kwargs: new(loop, method, *args, **kwargs))
+    def twist(loop: SurveyLoop) -> None:
+        *parts, name = path.split(".")
+        owner = getattr(loop, *parts) if parts else loop
+        method = getattr(owner, name)
+        setattr(owner, name, lambda *args, **kwargs: new(loop, method, *args, **kwargs))
 
     return twist
 
@@ -166,9 +160,7 @@ async def serving(
     config: Config, *, lockstep: bool, key: bytes | None = None, crooked: Crooked = HONEST
 ) -> AsyncIterator[int]:
     """Run a server; its port."""
-    robot = config.sim.robot.model_copy(update={"port": 0})
-    config = config.model_copy(update={"sim": config.sim.model_copy(update={"robot": robot})})
-    loop = CrookedLoop(config, lockstep, 1, key)
+    loop = CrookedLoop(config, lockstep=lockstep, key=key)
     loop.crooked = crooked
     port = await loop.start()
     if crooked.twist is not None:

@@ -14,9 +14,9 @@ from ccatp.cli import main
 from ccatp.commissioning.conformance.runner import CHECKS, Conformance, Result, check_ids
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.dataloop import DataLoop
 from tests.contract.crooked import HONEST, Crooked, checked, serving
 from tests.faults.table import conformance_rows, load_table
+from tests.support.scenario import SurveyLoop
 
 KEY = b"secret"
 PATIENT_S = 10.0  # an answer takes milliseconds; a loaded machine may take this long
@@ -70,7 +70,7 @@ async def run_on(port: int, motion: bool, only: tuple[str, ...] = ()) -> list[Re
 
 
 async def test_the_robot_is_left_held_and_its_fans_as_they_were(config: Config) -> None:
-    loops: list[DataLoop] = []
+    loops: list[SurveyLoop] = []
     crooked = Crooked("seen from within", twist=loops.append)
     async with serving(config, lockstep=False, crooked=crooked) as port:
         robot = loops[0].robot

@@ -13,13 +13,13 @@ from ccatp.commissioning.conformance.command_checks import BAD_DRIVES
 from ccatp.commissioning.conformance.runner import check_ids
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.dataloop import DataLoop
 from ccatp.links.robot_codec import join_mac
 from ccatp.links.robot_messages import BadLineCounter, Drive, LineBuffer, Role
 from ccatp.links.robot_messages import Fans as FansMessage
 from ccatp.sim import sessions
-from ccatp.sim.rules import FanRules, MotionRules
-from tests.contract.crooked import Crooked, Message, Middle, around, checked, fans, of, put, rules, server_time, swap
+from ccatp.sim.rules import MotionRules
+from tests.contract.crooked import Crooked, Message, Middle, around, checked, of, put, rules, server_time, swap
+from tests.support.scenario import SurveyLoop
 
 AT_ONCE = 8  # servers
 KEY = b"secret"
@@ -45,38 +45,37 @@ def _edges(hello: Message, _: Middle) -> None:
 
 
 def _boots(hello: Message, middle: Middle) -> None:
-    middle.owner.server.counts["boots"] += 1
-    hello["boot"] = middle.owner.server.counts["boots"]
+    middle.owner.counts["boots"] += 1
+    hello["boot"] = middle.owner.counts["boots"]
 
 
-def _throw_out(loop: DataLoop, join: Any, session: Any, message: Any, now_s: float) -> None:
-    holder = loop.server._holders.get(getattr(message, "role", "controller"))
+def _throw_out(loop: SurveyLoop, join: Any, session: Any, message: Any, now_s: float) -> None:
+    holder = loop._holders.get(getattr(message, "role", "controller"))
     if holder is not None:
-        loop.server.drop(holder, "thrown out")
+        loop.drop(holder, "thrown out")
     join(session, message, now_s)
 
 
-def _disturb(loop: DataLoop, refuse: Any, session: Any, reason: Any) -> None:
-    for holder in list(loop.server._holders.values()):
-        holder.wire.close()
+def _disturb(loop: SurveyLoop, refuse: Any, session: Any, reason: Any) -> None:
+    for holder in list(loop._holders.values()):
+        holder.close()
     refuse(session, reason)
 
 
-def _each_session(change: Callable[[Any], object]) -> Callable[[DataLoop], None]:
-    def accept(_: DataLoop, method: Any, wire: Any, now_s: float) -> Any:
-        session = method(wire, now_s)
+def _each_session(change: Callable[[Any], object]) -> Callable[[SurveyLoop], None]:
+    def accept(_: SurveyLoop, method: Any, session: Any, now_s: float) -> None:
+        method(session, now_s)
         change(session)
-        return session
 
-    return around("server.accept", accept)
+    return around("accept", accept)
 
 
-def _patient(extra_s: float) -> Callable[[DataLoop], None]:
+def _patient(extra_s: float) -> Callable[[SurveyLoop], None]:
     return _each_session(lambda session: setattr(session, "joined_s", session.joined_s + extra_s))
 
 
 def _join_by_drive(data: bytes, middle: Middle) -> bytes:
-    if middle.session.role is None and b"drive" in data:
+    if middle.role is None and b"drive" in data:
         return b'{"type":"join","role":"controller","client":"x"}\n'
     return data
 
@@ -117,9 +116,9 @@ SESSIONS = [
     Crooked("a join without client", "join-client", JOIN, hears=swap(b'"controller"}', b'"controller","client":"x"}')),
     Crooked("joined by a drive", "join-first", JOIN, hears=_join_by_drive),
     Crooked("the last to come has the role", "role-taken refused-harmless", JOIN,
-            twist=around("server.join", _throw_out)),
+            twist=around("join", _throw_out)),
     Crooked("a refusal closes the holders, too", "role-taken refused-harmless", JOIN,
-            twist=around("server.refuse", _disturb)),
+            twist=around("refuse", _disturb)),
     Crooked("waits for joins for ever", "join-late", ("join-late", "join"), twist=_patient(60.0)),
     Crooked("waits for joins half a second", "join-late join-in-time",
             ("join-late", "join-in-time", "join"), twist=_patient(-1.5)),
@@ -145,16 +144,16 @@ def _thrice(frame: Message) -> None:
 
 
 def _not_each_to_the_monitor(message: Message, middle: Middle) -> Message | None:
-    is_left_out = message["type"] == "sensors" and middle.session.role == "monitor" and message["seq"] % 7 == 0
+    is_left_out = message["type"] == "sensors" and middle.role == "monitor" and message["seq"] % 7 == 0
     return None if is_left_out else message
 
 
-def _to_all(loop: DataLoop, send: Any) -> None:
+def _to_all(loop: SurveyLoop, send: Any) -> None:
     send()
-    if len(loop.server._holders) == 2:
-        for session in loop.server._sessions:
+    if len(loop._holders) == 2:
+        for session in loop._sessions:
             if session.role is None:
-                session.wire.write(loop.robot.delivered_line)
+                session.write(loop.robot.delivered_line)
 
 
 def _key_twice(message: Message, _: Middle) -> Message | bytes:
@@ -185,7 +184,7 @@ STREAMS = [
     Crooked("ages below zero", "frames-cmd", FRAMES,
             says=_each(lambda frame: frame["cmd"].update(age=frame["cmd"]["age"] - 0.02))),
     Crooked("a monitor that misses frames", "frames-all", FRAMES, says=_not_each_to_the_monitor),
-    Crooked("frames for all who connect", "frames-joined", FRAMES, twist=around("server._send_frame", _to_all)),
+    Crooked("frames for all who connect", "frames-joined", FRAMES, twist=around("_send_frame", _to_all)),
     Crooked("an echo that jumps", "echo", FRAMES,
             says=_each(lambda frame: frame["seq"] % 5 or frame["cmd"].update(seq=7))),
 ]  # fmt: skip
@@ -193,35 +192,34 @@ STREAMS = [
 # -- what is newest, fans, lines --------------------------------------------------------------------------------------
 
 
-def _take(name: str, seen: str, is_taken: Callable[[int, int], bool]) -> Callable[[DataLoop], None]:
-    """Rules that take a command whose number is older than the newest, or the same."""
-    make, base = (fans, FanRules) if name == "command" else (rules, MotionRules)
+def _taken(kind: str, is_taken: Callable[[int, int], bool]) -> Callable[[SurveyLoop], None]:
+    """A robot that takes a command whose number is older than the newest, or the same."""
 
-    def take(self: Any, seq: int, *args: Any, **kwargs: Any) -> bool:
-        if is_taken(seq, getattr(self, seen)):
-            setattr(self, seen, -1)
-        return bool(getattr(base, name)(self, seq, *args, **kwargs))
+    def take(loop: SurveyLoop, method: Any, of: str, seq: int, values: Any) -> Any:
+        if of == kind and is_taken(seq, loop.robot._newest[kind]):
+            loop.robot._newest[kind] = -1
+        return method(of, seq, values)
 
-    return make(**{name: take})
+    return around("robot._take", take)
 
 
-def _obey(kind: type[Drive] | type[FansMessage]) -> Callable[[DataLoop], None]:
+def _obey(kind: type[Drive] | type[FansMessage]) -> Callable[[SurveyLoop], None]:
     """Messages of one kind from whatever role."""
 
-    def command(_: DataLoop, method: Any, session: Any, role: Any, message: Any, now_s: float) -> bool:
+    def command(_: SurveyLoop, method: Any, session: Any, role: Any, message: Any, now_s: float) -> bool:
         return bool(method(session, "controller" if isinstance(message, kind) else role, message, now_s))
 
-    return around("server.command", command)
+    return around("command", command)
 
 
-def _fans_off_when_lost(loop: DataLoop, lose: Any, role: Role) -> None:
+def _fans_off_when_lost(loop: SurveyLoop, lose: Any, role: Role) -> None:
     lose(role)
     if role == "controller":
         loop.robot.fans.duty = (0.0, 0.0)
 
 
 def _fans_off_when_denied(
-    loop: DataLoop, permit: Any, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None
+    loop: SurveyLoop, permit: Any, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None
 ) -> Any:
     if not (forward or reverse or turn):
         loop.robot.fans.duty = (0.0, 0.0)
@@ -229,7 +227,7 @@ def _fans_off_when_denied(
 
 
 def _no_buffer(data: bytes, middle: Middle) -> bytes:
-    middle.session._lines = LineBuffer()
+    middle._lines = LineBuffer()
     return data
 
 
@@ -244,10 +242,9 @@ CORRECTED = {
     "no-utf-8": swap(b"\xff", b"?"),
 }
 COMMANDS = [
-    *(Crooked(f"obeys {what} {order}", f"newest-{what}", NEWEST, twist=_take(name, seen, is_taken))
+    *(Crooked(f"obeys {what} {order}", f"newest-{what}", NEWEST, twist=_taken(what, is_taken))
       for order, is_taken in (("that are old", int.__lt__), ("twice", int.__eq__))
-      for what, name, seen in (("drive", "drive", "_drive_seq"), ("permit", "permit", "_permit_seq"),
-                               ("fans", "command", "_seq"))),
+      for what in ("drive", "permit", "fans")),
     Crooked("obeys drives of the monitor", "role-drive", NEWEST, twist=_obey(Drive)),
     Crooked("obeys fans of the monitor", "role-fans", NEWEST, twist=_obey(FansMessage)),
     Crooked("has no fans", "fans", ("fans",), hears=swap(b'"fans"', b'"sails"')),
@@ -278,21 +275,21 @@ FLOORS = [
 # -- lockstep and motion ----------------------------------------------------------------------------------------------
 
 
-def _never_waits(missing: Role) -> Callable[[DataLoop], None]:
-    def command(loop: DataLoop, method: Any, *args: Any) -> Any:
-        loop.server._acked.add(missing)
+def _never_waits(missing: Role) -> Callable[[SurveyLoop], None]:
+    def command(loop: SurveyLoop, method: Any, *args: Any) -> Any:
+        loop._acked.add(missing)
         return method(*args)
 
-    return around("server.command", command)
+    return around("command", command)
 
 
-def _any_ack(loop: DataLoop, command: Any, session: Any, role: Any, message: Any, now_s: float) -> Any:
+def _any_ack(loop: SurveyLoop, command: Any, session: Any, role: Any, message: Any, now_s: float) -> Any:
     if hasattr(message, "ack"):
         message.ack = loop.robot.delivered_seq
     return command(session, role, message, now_s)
 
 
-def _two_steps(_: DataLoop, advance: Any, now_s: float) -> None:
+def _two_steps(_: SurveyLoop, advance: Any, now_s: float) -> None:
     advance(now_s)
     advance(now_s)
 
@@ -305,12 +302,12 @@ def _wall_ages(frame: Message, middle: Middle) -> None:
     frame["cmd"]["permit_age"] += now_s - before_s
 
 
-def _allowing(**forced: bool) -> Callable[[DataLoop], None]:
+def _allowing(**forced: bool) -> Callable[[SurveyLoop], None]:
     """Directions that are allowed, or denied, whatever a permit says."""
 
-    def permit(self: MotionRules, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float) -> bool:
+    def permit(self: MotionRules, forward: bool, reverse: bool, turn: bool, now_s: float) -> None:
         allowed = {"forward": forward, "reverse": reverse, "turn": turn, **forced}
-        return MotionRules.permit(self, seq, **allowed, now_s=now_s)
+        MotionRules.permit(self, **allowed, now_s=now_s)
 
     return rules(permit=permit)
 
@@ -325,8 +322,8 @@ def _sides(frame: Message) -> None:
     frame["enc"] = [[t, left, right] for t, right, left in frame["enc"]]
 
 
-def _only_once(loop: DataLoop, send: Any) -> None:
-    if loop.server._repeated_s <= loop.server._frame_wall_s:
+def _only_once(loop: SurveyLoop, send: Any) -> None:
+    if loop._repeated_s <= loop._frame_wall_s:
         send()
 
 
@@ -337,12 +334,12 @@ def _emptied(message: Message, middle: Middle) -> None:
 STEPS = [
     Crooked("does not wait for drives", "lockstep-drive", LOCKSTEP[:2], twist=_never_waits("controller")),
     Crooked("does not wait for permits", "lockstep-permit", LOCKSTEP[:2], twist=_never_waits("monitor")),
-    Crooked("takes any ack", "lockstep-ack", LOCKSTEP, twist=around("server.command", _any_ack)),
-    Crooked("takes two steps", "lockstep-step", LOCKSTEP[3:4], twist=around("server._advance", _two_steps)),
+    Crooked("takes any ack", "lockstep-ack", LOCKSTEP, twist=around("command", _any_ack)),
+    Crooked("takes two steps", "lockstep-step", LOCKSTEP[3:4], twist=around("_advance", _two_steps)),
     Crooked(
         "measures ages on the wall clock", "lockstep-ages lockstep-repeat", LOCKSTEP, says=of("sensors", _wall_ages)
     ),
-    Crooked("sends no frame again", "lockstep-repeat", LOCKSTEP, twist=around("server._send_frame", _only_once)),
+    Crooked("sends no frame again", "lockstep-repeat", LOCKSTEP, twist=around("_send_frame", _only_once)),
     Crooked("sends another frame of the same number", "lockstep-repeat", LOCKSTEP[-1:], says=of("sensors", _emptied)),
     Crooked("drives forward without permit", "move-forward", MOVES, twist=_allowing(forward=True)),
     Crooked("reverses without permit", "move-reverse move-curve-back", MOVES, twist=_allowing(reverse=True)),
@@ -355,7 +352,7 @@ STEPS = [
 # -- on the wall clock ------------------------------------------------------------------------------------------------
 
 
-def _ageless(key: str) -> Callable[[DataLoop], None]:
+def _ageless(key: str) -> Callable[[SurveyLoop], None]:
     """Rules that take one key for new for ever."""
 
     def may_move(self: MotionRules, drive: tuple[float, float], until_s: float) -> bool:
@@ -382,7 +379,7 @@ def _free_without_drive(self: MotionRules, until_s: float) -> tuple[float, float
     return found
 
 
-def _short_lived(loop: DataLoop) -> None:
+def _short_lived(loop: SurveyLoop) -> None:
     loop.robot.rules._ttl_s = 0.1
 
 
@@ -393,17 +390,17 @@ def _noise_refreshes(data: bytes, middle: Middle) -> bytes:
 
 
 def _noise_keeps_the_role(data: bytes, middle: Middle) -> bytes:
-    middle.session.received_s = max(middle.session.received_s, middle.owner.robot.t_s)
+    middle.received_s = max(middle.received_s, middle.owner.robot.t_s)
     return data
 
 
-def _soon_taken_over(_: DataLoop, command: Any, session: Any, *args: Any) -> Any:
+def _soon_taken_over(_: SurveyLoop, command: Any, session: Any, *args: Any) -> Any:
     result = command(session, *args)
     session.received_s -= 3.0
     return result
 
 
-def _fans_stop_with_wheels(loop: DataLoop) -> None:
+def _fans_stop_with_wheels(loop: SurveyLoop) -> None:
     set_points = loop.robot.rules.set_points
 
     def crooked(_: MotionRules, until_s: float) -> tuple[float, float]:
@@ -415,14 +412,14 @@ def _fans_stop_with_wheels(loop: DataLoop) -> None:
     rules(set_points=crooked)(loop)
 
 
-def _forgets(forgotten: Role) -> Callable[[DataLoop], None]:
+def _forgets(forgotten: Role) -> Callable[[SurveyLoop], None]:
     return around("robot.lose", lambda _, lose, role: None if role == forgotten else lose(role))
 
 
 LOST = {role: f"lost-{role}-fin lost-{role}-rst" for role in ("controller", "monitor")}
 REALTIME = [
     Crooked("keeps a role for bad lines", "take-over", ("take-over",), hears=_noise_keeps_the_role),
-    Crooked("gives roles away too soon", "take-over", ("take-over",), twist=around("server.command", _soon_taken_over)),
+    Crooked("gives roles away too soon", "take-over", ("take-over",), twist=around("command", _soon_taken_over)),
     Crooked("ignores the age of drives", "ttl-drive ttl-noise", TIMED, twist=_ageless("drive")),
     Crooked("ignores the age of permits", "ttl-permit", TIMED, twist=_ageless("permit")),
     Crooked("needs one key only", f"no-permit ttl-permit {LOST['monitor']}", TIMED, twist=rules(_may_move=_one_key)),

@@ -18,16 +18,11 @@ from ccatp.config.models import Config
 from ccatp.dataloop import DataLoop, serve
 from ccatp.links.robot_link import RobotLink
 from ccatp.links.robot_messages import Role, Sensors
-from tests.support.scenario import config_of
+from tests.support.scenario import SurveyLoop, config_of
 
 DEADLINE_S = 5.0  # what takes milliseconds in a good run may take this long on a loaded machine
 JOIN = b'{"type":"join","role":"controller","client":"peer"}\n'
 JOIN_MONITOR = b'{"type":"join","role":"monitor","client":"peer"}\n'
-
-
-def on_port_0(config: Config) -> Config:
-    robot = config.sim.robot.model_copy(update={"port": 0})
-    return config.model_copy(update={"sim": config.sim.model_copy(update={"robot": robot})})
 
 
 class Peer:
@@ -113,9 +108,9 @@ class Rig:
 
 
 @asynccontextmanager
-async def running(config: Config, *, lockstep: bool = True, seed: int = 1) -> AsyncIterator[Rig]:
+async def running(config: Config, *, lockstep: bool = True) -> AsyncIterator[Rig]:
     notes = Notes()
-    loop = DataLoop(on_port_0(config), lockstep, seed, None, notes)
+    loop = SurveyLoop(config, lockstep=lockstep, log=notes)
     stop = asyncio.Event()
     rig = Rig(loop, await loop.start(), notes)
     serving = asyncio.create_task(loop.run(stop))
@@ -140,7 +135,7 @@ async def test_a_line_of_a_megabyte(config: Config) -> None:
             rogue = await rig.peer(first)
             rogue.send(b"x" * 1_000_000)
             assert await rogue.is_closed()
-        assert rig.loop.server.counts["oversized_lines"] == 2
+        assert rig.loop.counts["oversized_lines"] == 2
         assert (await holder.expect("sensors"))["seq"] > 0
 
 
@@ -195,11 +190,11 @@ def _link(port: int, role: Role) -> RobotLink:
     )
 
 
-async def _drive_through(config: Config, seed: int, frames: int) -> list[bytes]:
+async def _drive_through(config: Config, frames: int) -> list[bytes]:
     """Our own two clients, driving until frame ``frames``; every line of the controller."""
     lines: list[bytes] = []
     over = asyncio.Event()
-    async with running(config, seed=seed) as rig:
+    async with running(config) as rig:
         controller, monitor = _link(rig.port, "controller"), _link(rig.port, "monitor")
 
         def on_frame(sensors: Sensors, line: bytes) -> None:
@@ -228,10 +223,10 @@ async def _drive_through(config: Config, seed: int, frames: int) -> list[bytes]:
 @pytest.mark.parametrize("world", ["thesis", "extreme"])
 async def test_the_same_seed_gives_the_same_bytes(world: str) -> None:
     cfg = config_of(run__world=world)
-    first = await _drive_through(cfg, 1, 300)
+    first = await _drive_through(cfg, 300)
     assert [json.loads(line)["seq"] for line in first] == list(range(301))
-    assert await _drive_through(cfg, 1, 300) == first
-    assert await _drive_through(cfg, 2, 300) != first
+    assert await _drive_through(cfg, 300) == first
+    assert await _drive_through(config_of(run__world=world, run__seed=cfg.run.seed + 1), 300) != first
 
 
 # -- truth ------------------------------------------------------------------------------------------------------------
@@ -242,7 +237,7 @@ async def test_truth_leaves_by_its_own_sockets(config: Config, tmp_path: Path) -
     listening = socket.create_server(("127.0.0.1", 0))
     stop = asyncio.Event()
     task = asyncio.create_task(
-        serve(config, lockstep=True, seed=1, stop=stop, listen_sock=listening, truth_rep=rep, truth_pub=pub)
+        serve(config, lockstep=True, stop=stop, listen_sock=listening, truth_rep=rep, truth_pub=pub)
     )
     context = zmq.asyncio.Context()
     asking, listener = context.socket(zmq.REQ), context.socket(zmq.SUB)
@@ -293,7 +288,7 @@ async def test_truth_leaves_by_its_own_sockets(config: Config, tmp_path: Path) -
 
 async def test_an_unforeseen_error_ends_the_loop_aloud(config: Config) -> None:
     for lockstep in (True, False):
-        loop = DataLoop(on_port_0(config), lockstep, 1)
+        loop = SurveyLoop(config, lockstep=lockstep)
         port = await loop.start()
 
         def fail() -> None:

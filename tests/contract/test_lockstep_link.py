@@ -17,14 +17,13 @@ from ccatp.config.models import Config
 from ccatp.daemon import robot_loop
 from ccatp.daemon.process import Endpoints, ProcessArgs
 from ccatp.daemon.robot_loop import RobotLoop
-from ccatp.dataloop import DataLoop
 from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_link import RobotTimeout
 from ccatp.links.robot_messages import CommandEcho, Hello, Joined, Role, Sensors
 from ccatp.sim import sessions
 from ccatp.sim.fault_proxy import FaultProxy
 from tests.faults.test_link import HELLO
-from tests.support.scenario import config_of
+from tests.support.scenario import SurveyLoop, config_of
 
 DEADLINE_S = 30.0  # what never happens in a good run may take this long in a bad one
 FRAMES = 40
@@ -119,7 +118,7 @@ async def until(condition: Callable[[], bool]) -> None:
 class Rig:
     """A robot in lockstep, and its two clients, each through a proxy of its own."""
 
-    robot: DataLoop
+    robot: SurveyLoop
     proxies: dict[Role, FaultProxy]
     clients: dict[Role, Answering]
     notes: list[str]
@@ -141,10 +140,10 @@ def at_port(cfg: Config, port: int) -> Config:
 
 @asynccontextmanager
 async def running(folder: Path) -> AsyncIterator[Rig]:
-    rig, cfg, stop = Rig(), config_of(run__seed=SEED, sim__robot__port=0), asyncio.Event()
+    rig, cfg, stop = Rig(), config_of(run__seed=SEED), asyncio.Event()
     rig.notes, rig.proxies, rig.clients = [], {}, {}
     log: Any = SimpleNamespace(info=lambda _event, **fields: rig.notes.append(str(fields.get("text", ""))))
-    rig.robot = DataLoop(cfg, True, SEED, None, log)
+    rig.robot = SurveyLoop(cfg, lockstep=True, log=log)
     async with AsyncExitStack() as stack:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         stack.callback(context.destroy, linger=0)
@@ -226,10 +225,10 @@ async def test_a_faulty_link_stops_nobody_and_changes_nothing(tmp_path: Path, fa
 async def test_a_line_that_is_gone_for_good_is_sent_again(tmp_path: Path, fault: str, role: Role, way: Any) -> None:
     async with running(tmp_path) as rig:
         await rig.drive(5)
-        client, proxy, repeats = rig.clients[role], rig.proxies[role], rig.robot.server.counts["repeats"]
+        client, proxy, repeats = rig.clients[role], rig.proxies[role], rig.robot.counts["repeats"]
         kind, values = ("corrupt", {"every": 1}) if fault == "corrupt" else ("black_hole", {})
         proxy.begin(kind, way, **values)
-        await until(lambda: proxy.counts[kind] > 0 and rig.robot.server.counts["repeats"] > repeats)
+        await until(lambda: proxy.counts[kind] > 0 and rig.robot.counts["repeats"] > repeats)
         stands_at = rig.robot.robot.seq
         proxy.heal()
         await rig.drive(stands_at + 10)

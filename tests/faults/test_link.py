@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.dataloop import DataLoop
 from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_link import BACKLOG_S, FLOOD_FACTOR, RobotLink, RobotTimeout, WrongProtocol
 from ccatp.links.robot_messages import PROTOCOL, BadLineLimit, CommandEcho, Hello, RobotData, Sensors
@@ -22,7 +21,7 @@ from ccatp.sim.fault_proxy import FaultProxy
 from tests.faults.linking import Measured
 from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S
 from tests.support.daemon import Driver, robot_behind_proxy
-from tests.support.scenario import ServedRobot, config_of, mirror_of
+from tests.support.scenario import ServedRobot, SurveyLoop, config_of, mirror_of
 
 FRAMES = 60
 KEY = b"secret"
@@ -44,7 +43,7 @@ def frame(seq: int, samples: int = 10) -> bytes:
 
 
 @asynccontextmanager
-async def driving(*, lockstep: bool) -> AsyncIterator[tuple[DataLoop, FaultProxy, Driver]]:
+async def driving(*, lockstep: bool) -> AsyncIterator[tuple[SurveyLoop, FaultProxy, Driver]]:
     """A robot, a proxy before it that may be told to misbehave, and who drives."""
     async with robot_behind_proxy(lockstep=lockstep) as (loop, proxy):
         driver = Driver(proxy.port)
@@ -199,16 +198,16 @@ def test_a_client_that_trickles_is_closed_in_time_and_nobody_else_notices(measur
     for k in range(1, 400):
         served.run(0.01)
         driver.drive(k, 0, 1.0, 1.0)
-        if not trickler.wire.is_closed and k % 100 == 0:
+        if not trickler.is_closed and k % 100 == 0:
             trickler.send(text[k // 100 : k // 100 + 1])  # a byte a second
         if k % 25 == 0:
             served.server.check_time(served.now_s)
-        if trickler.wire.is_closed and closed_s is None:
+        if trickler.is_closed and closed_s is None:
             closed_s = served.now_s - begun_s
     assert closed_s is not None
     measured("L6", closed_s)
-    assert b"bad join" in trickler.wire.sent
-    assert driver.wire.sent.count(b'"type":"sensors"') == served.frames > 300
+    assert b"bad join" in trickler.sent
+    assert driver.sent.count(b'"type":"sensors"') == served.frames > 300
     assert not served.robot.rules.is_held
 
 
@@ -252,11 +251,11 @@ def test_a_thousand_others_do_not_disturb_who_drives(measured: Measured) -> None
             begun = time.thread_time()
             for _ in range(rogues):
                 rogue = served.client(random.choice((JOIN, b"\xff\n", b"GET / HTTP/1.1\r\n")))
-                served.server.lost(rogue.session)
+                served.server.lost(rogue)
             costs_s.append(time.thread_time() - begun)
             served.now_s += 0.01
             client.drive(k, served.robot.delivered_seq, 1.0, 0.9)
-        return client.wire.sent.partition(b"\n")[2]
+        return client.sent.partition(b"\n")[2]
 
     alone, crowded = drive(0), drive(10)  # of 10 ms each: 1000 a second
     assert alone == crowded
@@ -287,7 +286,7 @@ async def test_a_recorded_session_opens_no_door(measured: Measured) -> None:
         while not loop.robot.rules.is_held or proxy.connections:
             await asyncio.sleep(0.001)  # the last of its drives and its end are on their way
             loop.robot.rules.set_points(loop.robot.t_s)
-        before = loop.server.counts["refused"], loop.robot.seq
+        before = loop.counts["refused"], loop.robot.seq
         for guess in guesses:
             reader, writer = await asyncio.open_connection("127.0.0.1", proxy.port)
             writer.write(guess)
@@ -297,7 +296,7 @@ async def test_a_recorded_session_opens_no_door(measured: Measured) -> None:
             assert b'"refused"' in answer
             writer.close()
             await writer.wait_closed()
-        assert loop.server.counts["refused"] == before[0] + len(guesses)
+        assert loop.counts["refused"] == before[0] + len(guesses)
         assert loop.robot.seq == before[1]
     measured("L9", accepted)
 
@@ -307,7 +306,7 @@ async def test_commands_that_come_again_are_dropped() -> None:
     async with driving(lockstep=True) as (loop, proxy, driver):
         proxy.begin("duplicate", "to_robot", every=1)
         await driver.drive(FRAMES)
-        assert loop.server.counts["stale"] >= FRAMES - 5
+        assert loop.counts["stale"] >= FRAMES - 5
 
 
 @pytest.mark.fault("L12")
@@ -344,8 +343,7 @@ async def test_no_other_version_is_joined(protocol: str, measured: Measured) -> 
 async def round_trips(count: int) -> list[float]:
     """Times from a frame to the next one in lockstep: our answer's way, the robot's step, the frame's way."""
     times_s: list[float] = []
-    cfg = config_of(sim__robot__port=0)
-    robot, stop = DataLoop(cfg, True, 1), asyncio.Event()
+    robot, stop = SurveyLoop(config_of(), lockstep=True), asyncio.Event()
     port = await robot.start()
     async with asyncio.TaskGroup() as tasks:
         tasks.create_task(robot.run(stop))

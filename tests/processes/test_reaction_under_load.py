@@ -23,10 +23,10 @@ import psutil
 import pytest
 
 from ccatp.config.load import dump_config, load_config
-from ccatp.dataloop import DataLoop
 from ccatp.sim.fault_proxy import FaultProxy, Pipe
 from tests.faults.linking import Measured
 from tests.support.daemon import stand_ins
+from tests.support.scenario import SurveyLoop
 
 TIMES = int(os.environ.get("CCATP_REACTIONS", "3"))
 IN_A_SURVEY = 10  # faults that one daemon has to bear, at most ...
@@ -73,7 +73,7 @@ class Wire:
         duties: every fan duty that there was.
     """
 
-    def __init__(self, robot: DataLoop) -> None:
+    def __init__(self, robot: SurveyLoop) -> None:
         self._robot = robot.robot
         self.turned_s = 0.0
         self.stale = 0
@@ -145,7 +145,7 @@ async def survey(folder: Path, runtime_dir: Path) -> AsyncIterator[Survey]:
     settings = {"sim.robot.port": 0, "run.mirror": "fyst-m2", "run.filter": "kf", "run.panels": 20,
                 "run.restart_limit": IN_A_SURVEY, "mission.calibration_length_m": 0}  # fmt: skip
     async with AsyncExitStack() as stack:
-        peers = stand_ins(load_config(overrides=settings), runtime_dir, 1)
+        peers = stand_ins(load_config(overrides=settings), runtime_dir)
         robot, port, laser_port = await stack.enter_async_context(peers)
         wire = Wire(robot)
         proxy = await stack.enter_async_context(FaultProxy("127.0.0.1", port, seed=1))

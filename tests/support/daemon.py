@@ -22,7 +22,6 @@ from ccatp.core import PanelPose
 from ccatp.daemon.danger_loop import DangerLoop
 from ccatp.daemon.main_loop import MainLoop, open_runner
 from ccatp.daemon.process import Endpoints, ProcessArgs
-from ccatp.dataloop import DataLoop
 from ccatp.links.robot_link import RobotLink
 from ccatp.links.robot_messages import Sensors
 from ccatp.localizer import Localizer, build_localizer
@@ -30,7 +29,7 @@ from ccatp.sim.etalon_server import EtalonSimulator, ZmqPuck
 from ccatp.sim.fault_proxy import FaultProxy
 from ccatp.sim.ground_truth import GroundTruthPublisher
 from ccatp.sim.rules import MotionRules
-from tests.support.scenario import config_of, mirror_of, one_panel
+from tests.support.scenario import SurveyLoop, config_of, mirror_of, one_panel
 
 DEADLINE_S = 60.0
 LINK_DEADLINE_S = 30.0  # what never happens in a good run may take this long in a bad one
@@ -62,7 +61,7 @@ class Daemon:
     """
 
     def __init__(
-        self, main: MainLoop, danger: DangerLoop, robot: DataLoop, proxies: tuple[FaultProxy, FaultProxy]
+        self, main: MainLoop, danger: DangerLoop, robot: SurveyLoop, proxies: tuple[FaultProxy, FaultProxy]
     ) -> None:
         self.main, self.danger, self.robot = main, danger, robot
         self.to_main, self.to_danger = proxies
@@ -146,16 +145,17 @@ def _logging_to(entries: list[dict[str, Any]]) -> Iterator[None]:
 
 @asynccontextmanager
 async def stand_ins(
-    cfg: Config, folder: Path, seed: int, robot_cfg: Config | None = None
-) -> AsyncIterator[tuple[DataLoop, int, int]]:
+    cfg: Config, folder: Path, robot_cfg: Config | None = None
+) -> AsyncIterator[tuple[SurveyLoop, int, int]]:
     """Robot (of another configuration, where that is given) and laser system in real time, and their ports.
 
     The true state of the robot is at the sockets ``puck`` and ``truth`` in a folder.
     """
     endpoints, mirror, stop = Endpoints(folder), mirror_of(cfg.mirror.name), asyncio.Event()
     async with AsyncExitStack() as stack:
-        robot = DataLoop(robot_cfg or cfg, False, seed)
-        robot.truth = outlet = GroundTruthPublisher(robot.robot, endpoints.of("puck"), endpoints.of("truth"))
+        robot = SurveyLoop(robot_cfg or cfg, lockstep=False)
+        outlet = GroundTruthPublisher(robot.robot, endpoints.of("puck"), endpoints.of("truth"))
+        robot.each_frame.append(outlet.add)
         stack.callback(outlet.close)
         puck = ZmqPuck(endpoints.of("puck"))
         stack.callback(puck.close)
@@ -185,7 +185,7 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
     async with AsyncExitStack() as stack:
         run_dir = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ccatp-")))
         stack.enter_context(_logging_to(entries))
-        robot, port, laser_port = await stack.enter_async_context(stand_ins(cfg, run_dir, cfg.run.seed, robot_cfg))
+        robot, port, laser_port = await stack.enter_async_context(stand_ins(cfg, run_dir, robot_cfg))
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         stack.callback(context.destroy, linger=0)
         proxies = [await stack.enter_async_context(FaultProxy("127.0.0.1", port, seed=seed)) for seed in (1, 2)]
@@ -267,9 +267,11 @@ class Driver:
 
 
 @asynccontextmanager
-async def robot_behind_proxy(*, lockstep: bool, key: bytes | None = None) -> AsyncIterator[tuple[DataLoop, FaultProxy]]:
+async def robot_behind_proxy(
+    *, lockstep: bool, key: bytes | None = None
+) -> AsyncIterator[tuple[SurveyLoop, FaultProxy]]:
     """A running DataLoop with a proxy before it."""
-    loop = DataLoop(config_of(run__seed=SEED, sim__robot__port=0), lockstep, SEED, key)
+    loop = SurveyLoop(config_of(run__seed=SEED), lockstep=lockstep, key=key)
     port = await loop.start()
     stop = asyncio.Event()
     async with asyncio.TaskGroup() as tasks:

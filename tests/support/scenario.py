@@ -10,12 +10,13 @@ import numpy as np
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.dataloop import DataLoop, survey_robot
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.sim.robot import Robot
-from ccatp.sim.sessions import RobotServer, RobotSession
+from ccatp.sim.sessions import RobotServer, RobotSession, ServerLog
 
 
 def config_of(mirror: str = "fyst-m1", **overrides: object) -> Config:
@@ -76,12 +77,24 @@ def drive(robot: Robot, right_rad_s: float, left_rad_s: float, frames: int) -> l
     return [json.loads(line) for line in lines.splitlines()]
 
 
-class Wire:
-    """The server's side of a connection: keeps what is sent."""
+class SurveyLoop(DataLoop):
+    """A survey robot behind the link, at any free port."""
 
-    def __init__(self) -> None:
-        self.sent = b""
-        self.is_closed = False
+    robot: Robot
+
+    def __init__(
+        self, config: Config, *, lockstep: bool, key: bytes | None = None, log: ServerLog | None = None
+    ) -> None:
+        super().__init__(survey_robot(config), ("127.0.0.1", 0), lockstep=lockstep, key=key, log=log)
+
+
+class Client(RobotSession):
+    """One end of a connection to a `ServedRobot`; `sent` is what the robot sent."""
+
+    def __init__(self, server: RobotServer, now_s: Callable[[], float]) -> None:
+        super().__init__(server)
+        self.sent, self.is_closed, self._now_s = b"", False, now_s
+        server.accept(self, now_s())
 
     def write(self, data: bytes) -> None:
         assert not self.is_closed
@@ -90,16 +103,8 @@ class Wire:
     def close(self) -> None:
         self.is_closed = True
 
-
-class Client:
-    """One end of a connection to a `ServedRobot`."""
-
-    def __init__(self, server: RobotServer, now_s: Callable[[], float]) -> None:
-        self.wire, self._now_s = Wire(), now_s
-        self.session: RobotSession = server.accept(self.wire, now_s())
-
     def send(self, data: bytes) -> None:
-        self.session.receive(data, self._now_s())
+        self.receive(data, self._now_s())
 
     def join(self, role: str = "controller") -> None:
         self.send(json.dumps({"type": "join", "role": role, "client": "test"}).encode() + b"\n")
@@ -114,7 +119,7 @@ class Client:
     @property
     def messages(self) -> list[dict[str, Any]]:
         """Everything received since the last call."""
-        lines, self.wire.sent = self.wire.sent.splitlines(), b""
+        lines, self.sent = self.sent.splitlines(), b""
         return [json.loads(line) for line in lines]
 
     @property
@@ -138,16 +143,13 @@ class ServedRobot:
         self.notes: list[str] = []
         self.frames = 0
         self.robot = boot(config, mirror, plan=plan)
-        self.server = RobotServer(
-            self.robot,
-            lockstep=lockstep,
-            boot=417,
-            key=key,
-            make_nonce=lambda: "0123456789abcdef" * 2,
-            now_s=self.now_s,
-            note=self.notes.append,
-            on_frame=self._count,
-        )
+        self.server = RobotServer(self.robot, lockstep=lockstep, key=key, log=self)
+        self.server.each_frame.append(self._count)
+        self.server.begin(self.now_s)
+
+    def info(self, event: str, **fields: object) -> None:
+        """Take a line of the log."""
+        self.notes.append(str(fields.get("text", event)))
 
     def _count(self) -> None:
         self.frames += 1

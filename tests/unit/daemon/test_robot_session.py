@@ -16,11 +16,11 @@ from ccatp.daemon.robot_session import (
     RobotSession,
     delay_s,
 )
-from ccatp.dataloop import DataLoop
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_link import RobotTimeout
 from ccatp.links.robot_messages import Hello, Joined, Sensors
 from tests.faults.test_link import HELLO
+from tests.support.scenario import SurveyLoop
 
 
 def test_the_delay_grows_and_is_spread() -> None:
@@ -57,9 +57,9 @@ class Client(RobotSession):
                 await self.changed.wait()
 
 
-async def with_robot(story: Callable[[Config, DataLoop], Coroutine[Any, Any, None]]) -> None:
-    cfg = load_config(overrides={"sim.robot.port": 0, "robot.reconnect_timeout_s": 10.0})
-    robot = DataLoop(cfg, lockstep=True, seed=1)
+async def with_robot(story: Callable[[Config, SurveyLoop], Coroutine[Any, Any, None]]) -> None:
+    cfg = load_config(overrides={"robot.reconnect_timeout_s": 10.0})
+    robot = SurveyLoop(cfg, lockstep=True)
     port = await robot.start()
     cfg = cfg.model_copy(update={"robot": cfg.robot.model_copy(update={"port": port})})
     try:
@@ -70,13 +70,13 @@ async def with_robot(story: Callable[[Config, DataLoop], Coroutine[Any, Any, Non
 
 @pytest.mark.fault("L1")
 async def test_a_lost_session_is_followed_by_another_one_with_the_same_frame() -> None:
-    async def story(cfg: Config, robot: DataLoop) -> None:
+    async def story(cfg: Config, robot: SurveyLoop) -> None:
         client = Client(cfg)
         await client.join(is_patient=False)
         serving = asyncio.create_task(client.serve())
         await client.until(lambda: len(client.frames) == 1)
         for session in range(1, 4):
-            robot.server._drop_all("reset")
+            robot._drop_all("reset")
             await client.until(lambda session=session: len(client.frames) == session + 1)  # type: ignore[misc]
         assert client.frames == [0, 0, 0, 0]  # nobody answered: time stood still
         assert len(client.losses) == 3
@@ -93,7 +93,7 @@ async def test_a_lost_session_is_followed_by_another_one_with_the_same_frame() -
 
 @pytest.mark.fault("L1")
 async def test_a_robot_that_stays_away_ends_it() -> None:
-    async def story(cfg: Config, robot: DataLoop) -> None:
+    async def story(cfg: Config, robot: SurveyLoop) -> None:
         quick = cfg.model_copy(update={"robot": cfg.robot.model_copy(update={"reconnect_timeout_s": 0.3})})
         client = Client(quick)
         await client.join(is_patient=True)
@@ -106,12 +106,12 @@ async def test_a_robot_that_stays_away_ends_it() -> None:
 
 
 async def test_a_role_that_is_taken_is_tried_again_by_who_takes_over_and_not_by_others() -> None:
-    async def story(cfg: Config, robot: DataLoop) -> None:
+    async def story(cfg: Config, robot: SurveyLoop) -> None:
         first, second = Client(cfg), Client(cfg)
         await first.join(is_patient=False)
         joining = asyncio.create_task(second.join(is_patient=True))
         async with asyncio.timeout(20.0):
-            while not robot.server.counts["refused"]:  # noqa: ASYNC110 - the server has no event for it
+            while not robot.counts["refused"]:  # noqa: ASYNC110 - the server has no event for it
                 await asyncio.sleep(0.005)
         first.leave()
         await joining

@@ -80,9 +80,7 @@ async def drive(plan: str, is_over: Callable[[Client], bool], *, lockstep: bool)
         faults = parse_plan(plan, "plan")
         client = Client(listener.getsockname()[1])
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(
-                serve(cfg, lockstep=lockstep, seed=3, stop=stop, listen_sock=listener, log=log, faults=faults)
-            )
+            tasks.create_task(serve(cfg, lockstep=lockstep, stop=stop, listen_sock=listener, log=log, faults=faults))
             try:
                 await client.link.connect(DEADLINE_S)
                 await client.until(lambda: is_over(client))

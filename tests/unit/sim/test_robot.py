@@ -145,7 +145,7 @@ def test_on_an_overhang_thrust_below_the_floor_lets_it_fall(overhang: Config) ->
     robot = boot(overhang, mirror_of("fyst-m2"))
     assert sensors_of(robot).fans == (0.6, 0.6)
     drive(robot, 0.0, 0.0, 100)
-    robot.fans.command(1, 0.0, 0.0)
+    robot.fans.command(0.0, 0.0)
     drive(robot, 0.0, 0.0, 100)
     assert not robot.world.is_fallen  # clamped to the floor
     robot.fans.health = (1.0, 0.5)

@@ -6,21 +6,29 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.sim.rules import HELD, FanRules, MotionRules, SimulatedRobot
+from ccatp.sim.rules import HELD, MotionRules, SimulatedRobot
 
-TTL_S, FASTEST = 0.25, 8.0
+DT_S, TTL_S, FASTEST = 0.01, 0.25, 8.0
+# A robot with nothing but roles and commands.
+Bare = type("Bare", (SimulatedRobot,), dict.fromkeys(SimulatedRobot.__abstractmethods__))
 
 
-def rules(*, monitor: bool = False) -> MotionRules:
-    made = MotionRules(TTL_S, FASTEST)
-    made.join("controller")
-    if monitor:
-        made.join("monitor")
-    return made
+class Rig:
+    def __init__(self, frames: int = 0, ttl_s: float = TTL_S, floor: float = 0.0) -> None:
+        self.robot: SimulatedRobot = Bare((ttl_s, FASTEST, floor), DT_S, 1.0 / DT_S, frames)
+
+    def moves(self, frame: int) -> bool:
+        """Whether the wheels turn in the step after ``frame``."""
+        self.at(frame)._release_commands()
+        return self.robot.rules.set_points((frame + 1) * DT_S) != HELD
+
+    def at(self, frame: int) -> SimulatedRobot:
+        self.robot.seq, self.robot.t_s = frame, frame * DT_S
+        return self.robot
 
 
 def test_a_drive_dies_with_its_time_to_live() -> None:
-    r = rules()
+    r = MotionRules(TTL_S, FASTEST)
     r.drive(1, 3.0, 3.0, 1.0)
     assert r.set_points(1.25) == (3.0, 3.0)
     assert r.set_points(1.2501) == HELD
@@ -46,41 +54,41 @@ def test_a_drive_dies_with_its_time_to_live() -> None:
 def test_directions(drive: tuple[float, float], needs: str) -> None:
     for bits in range(8):
         allowed = {name for k, name in enumerate(("forward", "reverse", "turn")) if bits >> k & 1}
-        r = rules(monitor=True)
-        r.drive(1, *drive, 0.0)
-        r.permit(1, "forward" in allowed, "reverse" in allowed, "turn" in allowed, 0.0)
+        robot = Rig().robot
+        robot.join("monitor")
+        robot.drive(1, *drive)
+        robot.permit(1, "forward" in allowed, "reverse" in allowed, "turn" in allowed)
         may = set(needs.split()) <= allowed
-        assert r.set_points(0.01) == (drive if may else HELD)
-        assert r.is_held is not may
+        assert robot.rules.set_points(0.01) == (drive if may else HELD)
+        assert robot.rules.is_held is not may
 
 
 def test_a_new_session_counts_again() -> None:
-    r = rules()
-    r.drive(1000, 3.0, 3.0, 0.0)
-    r.lose("controller")
-    assert r.set_points(0.01) == HELD
-    r.join("controller")
-    assert r.set_points(0.01) == HELD
-    assert r.drive(0, 1.0, 1.0, 0.01)
-    assert r.set_points(0.02) == (1.0, 1.0)
+    robot = Rig().robot
+    robot.drive(1000, 3.0, 3.0)
+    robot.lose("controller")
+    assert robot.rules.set_points(0.01) == HELD
+    robot.join("controller")
+    assert robot.rules.set_points(0.01) == HELD
+    assert robot.drive(0, 1.0, 1.0)
+    assert robot.rules.set_points(0.02) == (1.0, 1.0)
 
 
 def test_a_drive_that_is_too_fast_keeps_its_path() -> None:
-    r = rules()
+    r = MotionRules(TTL_S, FASTEST)
     r.drive(1, 16.0, -8.0, 0.0)
     assert r.set_points(0.01) == (8.0, -4.0)
 
 
 def test_fans_keep_their_floor_and_their_duty() -> None:
-    fans = FanRules(0.6)
+    robot = Rig(floor=0.6).robot
+    fans = robot.fans
     assert fans.duty == (0.6, 0.6)
-    assert fans.command(1, 0.0, 0.9)
+    assert robot.command_fans(1, 0.0, 0.9)
     assert fans.duty == (0.6, 0.9)
-    assert not fans.command(1, 1.0, 1.0)
-    assert not fans.command(0, 1.0, 1.0)
-    fans.join()
+    robot.join("controller")
     assert fans.duty == (0.6, 0.9)
-    assert fans.command(0, 2.0, 0.7)
+    assert robot.command_fans(0, 2.0, 0.7)
     assert fans.duty == (1.0, 0.7)
     fans.health = (1.0, 0.0)
     assert fans.thrust == 0.5
@@ -97,7 +105,8 @@ EVENTS = st.one_of(
 @given(st.lists(EVENTS, max_size=40))
 def test_wheels_turn_only_with_both_keys(events: list[tuple[object, ...]]) -> None:
     """Invariant I1 against a plain model that remembers the newest of each kind."""
-    r = MotionRules(TTL_S, FASTEST)
+    robot = Rig().robot
+    r = robot.rules
     now, needs_permit = 0.0, False
     drive: tuple[int, float, float, float] | None = None
     permit: tuple[int, bool, bool, bool, float] | None = None
@@ -106,7 +115,7 @@ def test_wheels_turn_only_with_both_keys(events: list[tuple[object, ...]]) -> No
         if name == "wait":
             now += float(args[0])  # type: ignore[arg-type]
         elif name in ("drive", "permit"):
-            getattr(r, str(name))(*args, now)
+            getattr(robot, str(name))(*args, now_s=now)
             if name == "drive" and args[0] > drive_seq:  # type: ignore[operator]
                 drive = (*args, now)  # type: ignore[assignment]
                 drive_seq = args[0]  # type: ignore[assignment]
@@ -114,11 +123,11 @@ def test_wheels_turn_only_with_both_keys(events: list[tuple[object, ...]]) -> No
                 permit = (*args, now)  # type: ignore[assignment]
                 permit_seq = args[0]  # type: ignore[assignment]
         else:
-            getattr(r, str(name))(*args)
+            getattr(robot, str(name))(*args)
             if args == ["controller"]:
-                drive, drive_seq = None, -1 if name == "join" else drive_seq
+                drive, drive_seq = None, -1
             else:
-                permit, permit_seq = None, -1 if name == "join" else permit_seq
+                permit, permit_seq = None, -1
                 needs_permit |= name == "join"
         right, left = r.set_points(now + 0.01)
         assert max(abs(right), abs(left)) <= FASTEST * (1 + 1e-12)
@@ -132,25 +141,6 @@ def test_wheels_turn_only_with_both_keys(events: list[tuple[object, ...]]) -> No
                 assert permit[1] or right + left <= 0
                 assert permit[2] or right + left >= 0
                 assert permit[3] or right == left
-
-
-DT_S = 0.01
-# A robot with nothing but roles and commands.
-Bare = type("Bare", (SimulatedRobot,), dict.fromkeys(SimulatedRobot.__abstractmethods__))
-
-
-class Rig:
-    def __init__(self, frames: int, ttl_s: float = 0.25) -> None:
-        self.robot: SimulatedRobot = Bare((ttl_s, 8.0, 0.0), DT_S, 1.0 / DT_S, frames)
-
-    def moves(self, frame: int) -> bool:
-        """Whether the wheels turn in the step after ``frame``."""
-        self.at(frame)._release_commands()
-        return self.robot.rules.set_points((frame + 1) * DT_S) != HELD
-
-    def at(self, frame: int) -> SimulatedRobot:
-        self.robot.seq, self.robot.t_s = frame, frame * DT_S
-        return self.robot
 
 
 @pytest.mark.parametrize("frames", [0, 1, 2, 5])
@@ -218,5 +208,5 @@ def test_what_is_on_its_way_goes_with_its_session() -> None:
     assert [rig.moves(frame) for frame in range(5, 8)] == [False, False, True]
     robot.permit(11, False, False, False)
     robot.lose("monitor")
-    robot.rules.permit(12, True, True, True, 0.07)
+    robot.rules.permit(True, True, True, 0.07)
     assert rig.moves(9)  # the denial never arrives

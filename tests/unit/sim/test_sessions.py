@@ -36,7 +36,7 @@ def test_too_many_connections(rig: Rig) -> None:
     r = rig()
     clients = [r.client() for _ in range(MAX_SESSIONS)]
     assert r.client().messages[-1] == {"type": "refused", "reason": "busy"}
-    r.server.lost(clients[0].session)
+    r.server.lost(clients[0])
     assert r.client(JOIN).kinds == ["hello", "joined", "0"]
 
 
@@ -51,7 +51,7 @@ def test_in_lockstep_the_silence_after_which_a_role_is_free_is_in_wall_time(rig:
     assert r.robot.seq == 1
     r.now_s += 1.1 * SILENCE_S
     assert r.client(JOIN).kinds == ["hello", "joined", "1"]
-    assert holder.wire.is_closed
+    assert holder.is_closed
 
 
 # -- bad lines --------------------------------------------------------------------------------------------------------
@@ -68,7 +68,7 @@ def test_bad_lines_are_counted_and_refresh_nothing(rig: Rig) -> None:
     r.run(0.01)
     assert client.messages[-1]["cmd"]["held"]
     assert r.server.counts["bad_lines"] == 26
-    assert not client.wire.is_closed
+    assert not client.is_closed
 
 
 # -- lockstep ---------------------------------------------------------------------------------------------------------
@@ -79,13 +79,13 @@ def test_a_lost_monitor_stops_simulated_time_until_another_joins(rig: Rig) -> No
     controller, monitor = r.client(JOIN), r.client(JOIN_MONITOR)
     monitor.permit(0, 0)
     controller.drive(0, 0)
-    r.server.lost(monitor.session)
+    r.server.lost(monitor)
     controller.drive(1, 1)
     assert r.robot.seq == 1
     half = r.client(JOIN_MONITOR)
-    r.server.lost(controller.session)
+    r.server.lost(controller)
     half.permit(0, 1)
-    r.server.lost(half.session)  # its answer goes with it
+    r.server.lost(half)  # its answer goes with it
     controller = r.client(JOIN)
     controller.drive(0, 1)
     assert r.robot.seq == 1
@@ -100,7 +100,7 @@ def test_a_lost_controller_and_the_next_one(rig: Rig) -> None:
     r = rig()
     controller, monitor = r.client(JOIN), r.client(JOIN_MONITOR)
     controller.drive(0, 0)
-    r.server.lost(controller.session)
+    r.server.lost(controller)
     monitor.permit(0, 0)
     assert r.robot.seq == 0  # the answer went with the one who gave it
     assert monitor.kinds == ["hello", "joined", "0"]
@@ -139,7 +139,7 @@ def test_a_frame_without_its_answers_is_sent_again_each_second_unchanged(rig: Ri
         client.messages.clear()
     for tenths in range(1, 31):
         r.server.check_time(r.now_s + 0.1 * tenths)
-    assert monitor.wire.sent == controller.wire.sent == 3 * r.robot.delivered_line
+    assert monitor.sent == controller.sent == 3 * r.robot.delivered_line
     assert r.server.counts["repeats"] == 3
     controller.drive(2, 1, 2.0, 2.0)  # it answers again
     assert r.robot.seq == 1
@@ -168,15 +168,15 @@ def test_a_client_without_a_line_for_a_minute_loses_its_session(rig: Rig) -> Non
         r.now_s += 5.0
         controller.drive(number, 0)
         r.server.check_time(r.now_s)
-        assert not monitor.wire.is_closed
+        assert not monitor.is_closed
     r.now_s += 1.0
     r.server.check_time(r.now_s)
-    assert monitor.wire.is_closed
-    assert not controller.wire.is_closed
+    assert monitor.is_closed
+    assert not controller.is_closed
     assert "monitor dropped: no line for 60 s" in r.notes
     r.now_s += LOCKSTEP_SILENCE_S + 1.0
     r.server.check_time(r.now_s)
-    assert controller.wire.is_closed
+    assert controller.is_closed
     assert r.robot.seq == 0
 
 
@@ -187,7 +187,7 @@ def test_a_monitor_that_waits_for_a_controller_keeps_its_session(rig: Rig) -> No
     r.server.check_time(r.now_s)
     controller = r.client(JOIN)
     r.server.check_time(r.now_s + 1.0)
-    assert not monitor.wire.is_closed
+    assert not monitor.is_closed
     assert monitor.kinds == controller.kinds == ["hello", "joined", "0", "0"]
 
 
@@ -271,7 +271,7 @@ def test_in_lockstep_the_newest_frame_delivered_is_to_be_acknowledged(config: Co
     assert r.robot.seq == 2
     controller.drive(1, 0)
     assert r.robot.seq == 3
-    r.server.lost(controller.session)
+    r.server.lost(controller)
     again = r.client(JOIN)
     assert again.kinds == ["hello", "joined", "1"]  # no frame is lost or driven by joining anew
     assert r.robot.seq == 3
@@ -315,7 +315,7 @@ def test_the_server_and_the_calls_give_the_same_frames(mirror: Mirror) -> None:
         robot.drive(k, 3.0, 2.5)
         robot.advance()
         lines.append(robot.delivered_line)
-    assert controller.wire.sent.splitlines(keepends=True)[2:] == lines
+    assert controller.sent.splitlines(keepends=True)[2:] == lines
 
 
 # -- faults: lockstep waits for no frame that nobody can answer, a reboot ends every session ---------------------------
@@ -350,30 +350,31 @@ def test_a_robot_that_is_never_heard_again_ends_the_session(rig: Rig) -> None:
     controller = r.client(JOIN)
     for number in range(6):
         controller.drive(number, r.robot.delivered_seq)
-    assert controller.wire.is_closed
+    assert controller.is_closed
     assert f"controller dropped: no frame could be delivered for {NO_DELIVERY_S:g} s" in r.notes
     assert r.robot.t_s == pytest.approx(NO_DELIVERY_S, abs=0.2)
-    assert r.client(JOIN).wire.is_closed
+    assert r.client(JOIN).is_closed
 
 
 @pytest.mark.parametrize("lockstep", [True, False])
 def test_a_reboot_ends_every_session_and_changes_the_boot(rig: Rig, lockstep: bool) -> None:
     r = rig(plan=fault_plan({"signal": "robot", "type": "reboot", "at_s": 0.05}), lockstep=lockstep)
     controller, monitor, visitor = r.client(JOIN), r.client(JOIN_MONITOR), r.client()
+    boot = visitor.messages[0]["boot"]
     number = 0
-    while not controller.wire.is_closed:
+    while not controller.is_closed:
         if lockstep:
             monitor.permit(number, r.robot.delivered_seq)
             controller.drive(number, r.robot.delivered_seq)
             number += 1
         else:
             r.run(0.01)
-    assert monitor.wire.is_closed
-    assert visitor.wire.is_closed
+    assert monitor.is_closed
+    assert visitor.is_closed
     assert r.robot.reboots == 1
     assert r.robot.t_s == pytest.approx(0.06)
     assert "controller dropped: the robot rebooted" in r.notes
     hello, joined, *rest = r.client(JOIN).messages
-    assert (hello["boot"], joined["type"]) == (418, "joined")
+    assert (hello["boot"], joined["type"]) == (boot + 1, "joined")
     if lockstep:
         assert (rest[0]["seq"], rest[0]["cmd"]["held"]) == (1, True)
