@@ -1,16 +1,10 @@
 """The localizers, and which one a configuration asks for."""
 
-from collections.abc import Callable
-
-import numpy as np
-
 from ccatp.config.models import Config
-from ccatp.control.motion_checks import ImuGate, WheelMeans, largest_rate_rad_s
 from ccatp.core import DeckPose, PanelPose
-from ccatp.estimation import state_model, thesis_localizer
 from ccatp.estimation.full_state import FullStateLocalizer
+from ccatp.estimation.localizer_base import FilterWrap, unwrapped
 from ccatp.estimation.thesis_localizer import FourStateLocalizer
-from ccatp.filters import FILTERS, Filter
 from ccatp.mirror.mirror import Mirror
 
 FOUR_STATE = ("kf",)
@@ -24,23 +18,15 @@ Localizer = FourStateLocalizer | FullStateLocalizer
 def build_localizer(
     cfg: Config,
     mirror: Mirror,
-    wrap: Callable[[Filter], Filter] = lambda filter_: filter_,
+    wrap: FilterWrap = unwrapped,
     start: PanelPose | None = None,
 ) -> Localizer:
     """The localizer for ``run.filter``, the robot at base or at ``start``; ``wrap`` is put around the filter.
 
     ``start`` is as well known as ``localizer.start_..._sigma`` says.
     """
-    name = cfg.run.filter
-    start = mirror.base_panel_pose if start is None else start
-    is_thesis = name in FOUR_STATE
-    # The localizer re-initialises its filter at once; what counts is its size.
-    n = thesis_localizer.STATES if is_thesis else state_model.STATES
-    filter_ = wrap(FILTERS[name](np.zeros(n), np.eye(n)))
-    kind: type[Localizer] = FourStateLocalizer if is_thesis else FullStateLocalizer
-    made = kind(filter_, mirror, cfg.robot, cfg.localizer, start)
-    made.guard(ImuGate(cfg.health), WheelMeans(cfg.robot), largest_rate_rad_s(cfg.robot))
-    return made
+    kind: type[Localizer] = FourStateLocalizer if cfg.run.filter in FOUR_STATE else FullStateLocalizer
+    return kind(cfg, mirror, start or mirror.base_panel_pose, wrap)
 
 
 def build_with_uncertainty(
@@ -48,7 +34,7 @@ def build_with_uncertainty(
     mirror: Mirror,
     pose: DeckPose,
     sigmas: tuple[float, float],
-    wrap: Callable[[Filter], Filter] = lambda filter_: filter_,
+    wrap: FilterWrap = unwrapped,
 ) -> Localizer:
     """The localizer for ``run.filter`` at a deck ``pose`` seen last, with sigmas of place (m) and heading (rad)."""
     start = {"start_position_sigma_m": sigmas[0], "start_heading_sigma_rad": sigmas[1]}

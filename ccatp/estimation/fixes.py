@@ -1,13 +1,13 @@
 """What a fix of the puck says about the robot's position and the full state, and how well the position is known."""
 
-from math import isfinite, sqrt
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.core import DeckPose, Fix, FloatArray, PanelId
+from ccatp.core import Fix, FloatArray
 from ccatp.estimation.seams import axes_on
-from ccatp.estimation.state_model import PL, PR, PSI, STATES, TX, TY, A, Slope, V, W, X, Y
+from ccatp.estimation.state_model import ANGLES, POSE, PSI, SPEEDS, STATES, TILT, TX, TY, Slope, V, W, X, Y
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import MirrorError
 
@@ -23,23 +23,11 @@ class FixGated(FixRefused):
 
 
 class DeckFoot(NamedTuple):
-    """Where the robot's origin stood when a fix was taken, deck frame; covariance (2, 2).
-
-    Deviation from the ideal height.
-    """
+    """Where the robot's origin stood when a fix was taken, deck frame; covariance (2, 2); deviation from the height."""
 
     x_m: float
     y_m: float
     covariance_m2: FloatArray
-    deviation_m: float
-
-
-class Foot(NamedTuple):
-    """Where the robot's origin stood when a fix was taken, panel frame; deviation from the ideal height."""
-
-    x_m: float
-    y_m: float
-    variance_m2: float
     deviation_m: float
 
 
@@ -51,37 +39,17 @@ def check_fix(fix: Fix, oldest_s: float, newest_s: float) -> None:
         raise FixRefused(f"fix of {fix.t_s:.3f} s is outside the known path, {oldest_s:.3f} s to {newest_s:.3f} s")
 
 
-def _foot(mirror: Mirror, fix: Fix, puck_height_m: float) -> tuple[float, float, float]:
-    try:
-        return mirror.foot_of_puck(fix.position_m, puck_height_m)
-    except MirrorError as error:
-        raise FixRefused(f"fix at {fix.position_m} m has no foot on the mirror: {error}") from error
-
-
-def foot_of_fix(mirror: Mirror, fix: Fix, puck_height_m: float, panel: PanelId) -> Foot:
-    """Foot of the puck on the surface, in the frame of ``panel``.
-
-    The puck stands ``puck_height_m`` above the robot's origin along the surface normal. Of the fix's covariance only
-    the part along the surface counts: half its trace without the normal's share. Raises ``FixRefused`` far from the
-    mirror, or where the covariance has no positive part along the surface.
-    """
-    x, y, deviation = _foot(mirror, fix, puck_height_m)
-    normal = np.array(mirror.rotate_world_from_deck(mirror.surface.normal(x, y)))
-    covariance = np.array(fix.covariance_m2, dtype=np.float64).reshape(3, 3)
-    variance = 0.5 * float(np.trace(covariance) - normal @ covariance @ normal)
-    if not variance > 0.0:
-        raise FixRefused(f"fix has the variance {variance:.3g} m^2 along the surface")
-    foot = mirror.panel_pose(panel, DeckPose(x, y, 0.0))  # the heading plays no part
-    return Foot(foot.x_m, foot.y_m, variance, deviation)
-
-
 def deck_foot(mirror: Mirror, fix: Fix, puck_height_m: float) -> DeckFoot:
     """Foot of the puck on the surface, deck frame, with its whole covariance along the surface.
 
     An error along the normal leaves the foot where it is, so the fix's covariance is projected along the normal on the
-    deck plane: ``J = [[1, 0, -nx/nz], [0, 1, -ny/nz]]``, ``J R^T C R J^T``. Raises ``FixRefused`` as ``foot_of_fix``.
+    deck plane: ``J = [[1, 0, -nx/nz], [0, 1, -ny/nz]]``, ``J R^T C R J^T``. Raises ``FixRefused`` far from the mirror,
+    or where that is not positive definite.
     """
-    x, y, deviation = _foot(mirror, fix, puck_height_m)
+    try:
+        x, y, deviation = mirror.foot_of_puck(fix.position_m, puck_height_m)
+    except MirrorError as error:
+        raise FixRefused(f"fix at {fix.position_m} m has no foot on the mirror: {error}") from error
     fx, fy = mirror.surface.gradient(x, y)
     # The normal is along (-fx, -fy, 1).
     J = np.array([[1.0, 0.0, fx], [0.0, 1.0, fy]])
@@ -97,15 +65,10 @@ _UNKNOWN_SPEEDS = 0.1**2, 0.5**2, 1.0**2  # variances of v, a, w of a robot of w
 
 
 def fix_row(z: FloatArray, mean: FloatArray, slope: Slope, late_s: float) -> tuple[FloatArray, FloatArray]:
-    """Residual (2,) and row (2, n) of the measurement model of a deck position ``z`` (2,), m.
-
-    The state is ``late_s`` later.
-
-    V and W are taken as constant meanwhile.
-    """
+    """Residual (2,) and row (2, n) of a deck position ``z`` (2,), m, by a state ``late_s`` later; V and W constant."""
     H = np.zeros((2, STATES))
     H[0, X] = H[1, Y] = H[0, TX] = H[1, TY] = 1.0
-    residual = z - mean[[X, Y]] - mean[[TX, TY]]
+    residual = z - mean[:2] - mean[TILT]
     if late_s == 0.0:
         return residual, H
     v, w = float(mean[V]), float(mean[W])
@@ -136,59 +99,15 @@ def relocated(
     """
     x, P = mean.copy(), covariance.copy()
     heading_rad2 = float(P[PSI, PSI]) + heading_variance_rad2
-    new = [X, Y, PSI, PR, PL, TX, TY, *((V, A, W) if is_lost else ())]
+    new = POSE + ANGLES + TILT + (SPEEDS if is_lost else [])
     P[new, :] = 0.0
     P[:, new] = 0.0
     P[:2, :2], P[PSI, PSI] = variance, heading_rad2
     P[[X, Y, TX, TY], [X, Y, TX, TY]] += tilt_variance_m2
     P[[X, Y, TX, TY], [TX, TY, X, Y]] -= tilt_variance_m2
-    x[:2] += residual + x[[TX, TY]]
-    x[[PR, PL, TX, TY]] = 0.0
+    x[:2] += residual + x[TILT]
+    x[ANGLES + TILT] = 0.0
     if is_lost:
-        x[[V, A, W]] = 0.0
-        P[V, V], P[A, A], P[W, W] = _UNKNOWN_SPEEDS
+        x[SPEEDS] = 0.0
+        P[SPEEDS, SPEEDS] = _UNKNOWN_SPEEDS
     return x, P
-
-
-class PositionSigma:
-    """Standard deviation of the position along any one direction.
-
-    Slip and a heading error last from one fix to the next, so their contributions grow with the travel, not with its
-    root: sigma^2 = fix^2 + (slip_fraction s)^2 + (integral of sigma_theta ds)^2.
-    """
-
-    def __init__(self, sigma_m: float, slip_fraction: float) -> None:
-        self._slip_fraction = slip_fraction
-        self._known_m2 = sigma_m**2
-        self._along_m = 0.0
-        self._across_m = 0.0
-
-    @property
-    def sigma_m(self) -> float:
-        """The standard deviation, m."""
-        return sqrt(self._variance_m2)
-
-    def travel(self, distance_m: float, heading_sigma_rad: float) -> None:
-        """The robot moved on by ``distance_m`` >= 0 at a heading known to ``heading_sigma_rad``."""
-        self._along_m += self._slip_fraction * distance_m
-        self._across_m += heading_sigma_rad * distance_m
-
-    def growth_m2(self, distance_m: float, heading_sigma_rad: float) -> float:
-        """Variance that a displacement of ``distance_m`` alone brings in, m^2."""
-        return distance_m**2 * (self._slip_fraction**2 + heading_sigma_rad**2)
-
-    def widen(self, sigma_m: float) -> None:
-        """Add an independent error of ``sigma_m``."""
-        self._known_m2 += sigma_m**2
-
-    def fuse(self, variance_m2: float) -> float:
-        """Fuse a measured position of ``variance_m2`` > 0; returns its weight, 0 to 1."""
-        prior = self._variance_m2
-        gain = prior / (prior + variance_m2)
-        self._known_m2 = gain * variance_m2
-        self._along_m = self._across_m = 0.0
-        return gain
-
-    @property
-    def _variance_m2(self) -> float:
-        return self._known_m2 + self._along_m**2 + self._across_m**2

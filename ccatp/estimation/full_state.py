@@ -1,57 +1,37 @@
 """The full-state localizer: pose, speeds and the sensors' own errors in one filter, on the curved surface."""
 
 from collections.abc import Sequence
-from math import atan2, cos, hypot, isfinite, sin, sqrt
+from math import atan2, cos, hypot, inf, sin, sqrt
 
 import numpy as np
 
-from ccatp.config.models import LocalizerConfig, RobotConfig
-from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, GravitySample, ImuSample, PanelId, PanelPose, wrap_pi
-from ccatp.estimation.fixes import FixGated, check_fix, deck_foot
-from ccatp.estimation.localizer_base import LONGEST_GAP_S, MAX_FRAME_STEP_S, LocalizerBase, WheelReadings
+from ccatp.config.models import Config
+from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, GravitySample, PanelPose, wrap_pi
+from ccatp.estimation.fixes import FixGated
+from ccatp.estimation.localizer_base import (
+    LONGEST_GAP_S,
+    MAX_FRAME_STEP_S,
+    FilterWrap,
+    ImuReadings,
+    LocalizerBase,
+    WheelReadings,
+    unwrapped,
+)
 from ccatp.estimation.odometry import PosePredictor, Preintegrator, WheelAngle
 from ccatp.estimation.rest import NoiseFloor, ZeroVelocityDetector
 from ccatp.estimation.seams import EdgeScanner
 from ccatp.estimation.state_filter import SurveyFilter
-from ccatp.estimation.state_model import PSI, Slope, W
-from ccatp.filters.base import Filter, FilterDiverged, Innovation
+from ccatp.estimation.state_model import STATES, V, W
+from ccatp.filters.base import FilterDiverged, Innovation
 from ccatp.mirror.layout import Panel
 from ccatp.mirror.mirror import Mirror
 
-_IMPOSSIBLE = 2.0  # an estimate of this many times the wheels' largest rate is no estimate
 _CHUNK = 100  # samples at rest after which their mean is used, however long the rest
 _CONSISTENT = 3  # this many refused fixes that agree with each other are right, and the pose is wrong
 _ROUNDING_S = 1e-6
 _NOMINAL_FRAME_S = 0.01
 _SHORTEST_LEG_M, _LARGEST_DOUBT_RAD = 0.02, 0.5  # of a heading, from where a leg ended instead
 _NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up
-
-
-class PanelFrame:
-    """The panel under the robot, and poses in its frame."""
-
-    def __init__(self, mirror: Mirror, panel: PanelId) -> None:
-        self._mirror = mirror
-        self.at = mirror.panel(panel)
-
-    def locate(self, deck: tuple[float, float, float], height_m: float, slope: Slope) -> PanelPose:
-        """A deck pose (x, y, heading) on a surface of this height and slope, as ``Mirror.panel_pose``."""
-        x, y, psi = deck
-        at = self.at
-        if abs(x - at.x_m) > _NEAR_BORDER * at.half_x_m or abs(y - at.y_m) > _NEAR_BORDER * at.half_y_m:
-            panel = self._mirror.panel_at(x, y)
-            if panel is not None:
-                self.at = at = self._mirror.panel(panel)
-        fx, fy = slope[0], slope[1]
-        s2 = 1.0 + fx * fx
-        s, norm = sqrt(s2), sqrt(s2 + fy * fy)
-        c, d = cos(psi), sin(psi)
-        hx, hy = c / s - d * fx * fy / (norm * s), d * s / norm
-        (ax, ay, az), (bx, by, bz), _ = at.axes
-        ox, oy, oz = at.origin
-        hz, dx, dy, dz = fx * hx + fy * hy, x - ox, y - oy, height_m - oz
-        heading = atan2(bx * hx + by * hy + bz * hz, ax * hx + ay * hy + az * hz)
-        return PanelPose(at.id, ax * dx + ay * dy + az * dz, bx * dx + by * dy + bz * dz, heading)
 
 
 class FullStateLocalizer(LocalizerBase):
@@ -68,30 +48,23 @@ class FullStateLocalizer(LocalizerBase):
         speed_m_s, rate_rad_s: estimated forward speed and angular rate.
         creep: estimated downhill drift per metre of travel, in the plane of ``pose``.
         position_sigma_m: standard deviation of the position along its worst direction, at the last step of the filter.
-        fix_deviation_m: height of the last fix above the ideal surface.
     """
 
-    def __init__(
-        self, filter_: Filter, mirror: Mirror, robot: RobotConfig, cfg: LocalizerConfig, start: PanelPose
-    ) -> None:
-        super().__init__(cfg.history_s)
-        self.fix_deviation_m = 0.0
-        self._filter, self._mirror, self._full = filter_, mirror, cfg.full_state
-        self._rest_rate_rad_s = cfg.full_state.rest_rate_rad_s
-        self._update_period_s = cfg.full_state.update_period_s - _ROUNDING_S
-        self._puck_height_m = robot.puck_height_m
-        self._v_limit_m_s = _IMPOSSIBLE * robot.wheel_radius_m * robot.max_wheel_rad_s
-        self._omega_limit_rad_s = 2.0 * self._v_limit_m_s / robot.wheel_base_m
+    def __init__(self, cfg: Config, mirror: Mirror, start: PanelPose, wrap: FilterWrap = unwrapped) -> None:
+        super().__init__(cfg, mirror, STATES, wrap)
+        robot, self._full = cfg.robot, cfg.localizer.full_state
+        self._rest_rate_rad_s = self._full.rest_rate_rad_s
+        self._update_period_s = self._full.update_period_s - _ROUNDING_S
         self._right, self._left = WheelAngle(), WheelAngle()
-        self._gyro = NoiseFloor(cfg.gyroscope_sigma_rad_s**2)
-        self._accelerometer = NoiseFloor(cfg.accelerometer_sigma_m_s2**2)
+        self._gyro = NoiseFloor(cfg.localizer.gyroscope_sigma_rad_s**2)
+        self._accelerometer = NoiseFloor(cfg.localizer.accelerometer_sigma_m_s2**2)
         self._rest = ZeroVelocityDetector(self._full.rest_after_s, self._gyro, self._accelerometer)
         self._rested_s = 0.0
         self._edges = EdgeScanner()
         self._block = Preintegrator()
-        self._estimate = SurveyFilter(filter_, mirror, robot, cfg, self.counts, mirror.deck_pose(start))
+        self._estimate = SurveyFilter(self._filter, mirror, cfg, self.counts, mirror.deck_pose(start))
         self._running = PosePredictor(robot.wheel_radius_m, robot.wheel_base_m, self._full.jerk_density_m2_s5)
-        self._panel = PanelFrame(mirror, start.panel)
+        self._panel = mirror.panel(start.panel)
         self._refused: list[FloatArray] = []
         self._fixed_m: FloatArray | None = None  # where the last fix that counted was
         self._is_relocated = False  # no fix has agreed since it began again
@@ -109,11 +82,6 @@ class FullStateLocalizer(LocalizerBase):
         """Estimated pose, deck frame."""
         now = self._running
         return DeckPose(now.x_m, now.y_m, wrap_pi(now.heading_rad))
-
-    @property
-    def heading_sigma_rad(self) -> float:
-        """Standard deviation of the heading, at the last step of the filter."""
-        return sqrt(max(float(self._filter.covariance[PSI, PSI]), 0.0))
 
     @property
     def pose_covariance(self) -> FloatArray:
@@ -142,9 +110,8 @@ class FullStateLocalizer(LocalizerBase):
 
     def _use(
         self,
-        t_s: float,
         dt_s: float,
-        imu: Sequence[ImuSample],
+        imu: ImuReadings,
         right: WheelReadings,
         left: WheelReadings,
         edges: Sequence[EdgeSample],
@@ -164,11 +131,18 @@ class FullStateLocalizer(LocalizerBase):
         is_still = -limit <= right_rad <= limit and -limit <= left_rad <= limit
         if rest.is_resting:
             if is_still:
-                self._hold_position(t_s, dt_s, imu, right[1], left[1], gravity)
+                self._right.rest(right[1])
+                self._left.rest(left[1])
+                self._rebase()  # what adds up meanwhile is noise
+                self._rested_s += dt_s
+                self._block.stand(imu)
+                rest.add(imu, gravity)
+                if rest.count >= _CHUNK:
+                    self._use_rest(self.t_s)
                 self._edges.scan(edges)
                 self._locate()
                 return
-            self._use_rest(t_s - dt_s)
+            self._use_rest(self.t_s - dt_s)
             self._estimate.begin_leg()
             rest.moved()
             self._predict_pose(0.0)
@@ -182,32 +156,14 @@ class FullStateLocalizer(LocalizerBase):
         # Wheels that say nothing do not stand for that reason.
         is_stop = is_still and self._right.is_fresh and self._left.is_fresh and rest.stood(dt_s)
         if transitions or is_stop or block.dt_s >= self._update_period_s:
-            self._take_block(t_s)
+            self._take_block(self.t_s)
             for transition in transitions:
-                self._estimate.cross(transition, t_s)
+                self._estimate.cross(transition, self.t_s)
             if is_stop:
                 self._estimate.stop((self._right.angle_rad, self._left.angle_rad))
                 self._rebase()
             self._predict_pose(self._half_s)
         self._locate()
-
-    def _hold_position(
-        self,
-        t_s: float,
-        dt_s: float,
-        imu: Sequence[ImuSample],
-        right_rad_s: Sequence[float],
-        left_rad_s: Sequence[float],
-        gravity: GravitySample | None,
-    ) -> None:
-        self._right.rest(right_rad_s)
-        self._left.rest(left_rad_s)
-        self._rebase()  # what adds up meanwhile is noise
-        self._rested_s += dt_s
-        self._block.stand(imu)
-        self._rest.add(imu, gravity)
-        if self._rest.count >= _CHUNK:
-            self._use_rest(t_s)
 
     def _rebase(self) -> None:
         self._right.rebase()
@@ -216,22 +172,35 @@ class FullStateLocalizer(LocalizerBase):
     def _take_block(self, t_s: float) -> None:
         block = self._block.take()
         self._half_s = 0.5 * block.dt_s
-        self._estimate.begin(t_s, block.dt_s)
+        self._estimate.journal.begin(t_s, block.dt_s)
         self._estimate.move(block, self._right, self._left, (self._gyro.variance, self._accelerometer.variance))
-        _, _, _, v, _, w = self._filter.mean[: W + 1].tolist()
-        if abs(v) > self._v_limit_m_s or abs(w) > self._omega_limit_rad_s:
-            raise FilterDiverged(f"{v:.3g} m/s and {w:.3g} rad/s are more than the wheels can do")
+        mean = self._filter.mean
+        self._check_speeds(float(mean[V]), float(mean[W]))
 
     def _locate(self) -> None:
         """Take over where dead reckoning has led."""
-        now, slope, panel = self._running, self._slope, self._panel
-        x, y = now.x_m, now.y_m
-        self.pose = panel.locate((x, y, now.heading_rad), self._estimate.terrain.height_m(x, y), slope)
+        now, slope, at = self._running, self._slope, self._panel
+        x, y, psi = now.x_m, now.y_m, now.heading_rad
+        if abs(x - at.x_m) > _NEAR_BORDER * at.half_x_m or abs(y - at.y_m) > _NEAR_BORDER * at.half_y_m:
+            panel = self._mirror.panel_at(x, y)
+            if panel is not None:
+                self._panel = at = self._mirror.panel(panel)
+        # As ``Mirror.panel_pose``, on a surface of this height and slope.
+        fx, fy = slope[0], slope[1]
+        s2 = 1.0 + fx * fx
+        s, norm = sqrt(s2), sqrt(s2 + fy * fy)
+        c, d = cos(psi), sin(psi)
+        hx, hy = c / s - d * fx * fy / (norm * s), d * s / norm
+        (ax, ay, az), (bx, by, bz), _ = at.axes
+        ox, oy, oz = at.origin
+        hz, dx, dy, dz = fx * hx + fy * hy, x - ox, y - oy, self._estimate.terrain.height_m(x, y) - oz
+        heading = atan2(bx * hx + by * hy + bz * hz, ax * hx + ay * hy + az * hz)
+        self.pose = PanelPose(at.id, ax * dx + ay * dy + az * dz, bx * dx + by * dy + bz * dz, heading)
         self.speed_m_s, self.rate_rad_s = now.v_m_s, now.omega_rad_s
-        if panel.at is not self._creep_on:  # or the filter has taken a step
-            self._creep_on = panel.at
+        if at is not self._creep_on:  # or the filter has taken a step
+            self._creep_on = at
             x, y = now.creep_x, now.creep_y
-            self.creep = panel.at.rotate_from_deck((x, y, slope[0] * x + slope[1] * y))[:2]
+            self.creep = at.rotate_from_deck((x, y, fx * x + fy * y))[:2]
 
     def _freeze(self, error: FilterDiverged) -> None:
         super()._freeze(error)
@@ -256,10 +225,9 @@ class FullStateLocalizer(LocalizerBase):
     def _use_rest(self, t_s: float) -> None:
         rested_s, self._rested_s = self._rested_s, 0.0
         reading = self._rest.take()
-        self._estimate.begin(t_s, 0.0)
+        self._estimate.journal.begin(t_s, 0.0)
         if reading.samples:
-            variances = self._gyro.variance, self._accelerometer.variance
-            self._estimate.calibrate(reading, rested_s, variances)
+            self._estimate.calibrate(reading, rested_s, (self._gyro.variance, self._accelerometer.variance))
         self._predict_pose(0.0)
 
     # -- fixes --------------------------------------------------------------------------------------------------------
@@ -270,9 +238,7 @@ class FullStateLocalizer(LocalizerBase):
         Raises ``FixGated``: it contradicts the estimate, and not often enough yet to be used all the same;
         ``FixRefused``: not finite, too old, from the future, or far from the mirror. The pose is unchanged by both.
         """
-        estimate, t_s = self._estimate, self.t_s
-        check_fix(fix, estimate.journal.oldest_s, t_s + MAX_FRAME_STEP_S)
-        foot = deck_foot(self._mirror, fix, self._puck_height_m)
+        foot = self._foot_of(fix, self._estimate.journal.oldest_s)
         z, variance = np.array([foot.x_m, foot.y_m]), foot.covariance_m2
         before = self._running.x_m, self._running.y_m
         try:
@@ -281,10 +247,9 @@ class FullStateLocalizer(LocalizerBase):
         except FilterDiverged as error:
             self._freeze(error)
         if self.is_frozen:
-            self._relocate(fix.t_s, z, variance, is_lost=True)
+            self._relocate(z, self._estimate.expect(fix.t_s, z)[0], variance, is_lost=True)
             self.is_frozen = False
         self.counts["fixes"] += 1
-        self.fix_deviation_m = foot.deviation_m
         self._predict_pose(0.0)
         self._locate()
         now = self._running
@@ -292,35 +257,32 @@ class FullStateLocalizer(LocalizerBase):
 
     def _condition(self, t_s: float, z: FloatArray, variance: FloatArray) -> None:
         """Update with a position (2,) of time ``t_s`` and its covariance (2, 2), if it does not contradict."""
-        estimate = self._estimate
         if self._block.dt_s > 0.0:
             self._take_block(self.t_s)
-        if estimate.is_gated(t_s, z, variance):
-            self._refuse(t_s, z, variance)
+        residual, expected = self._estimate.expect(t_s, z)
+        if float(residual.dot(np.linalg.solve(expected + variance, residual))) > self._full.fix_gate_nis:
+            self._refuse(z, residual, variance)
             return
         self._refused.clear()
         self._fixed_m, self._is_relocated = z, False
-        self.counts["late_fixes"] += estimate.fix(t_s, z, variance) > 0
-        estimate.end_leg()
+        self.counts["late_fixes"] += self._estimate.fix(t_s, z, variance) > 0
+        self._estimate.end_leg()
 
-    def _relocate(self, t_s: float, z: FloatArray, variance: FloatArray, *, is_lost: bool) -> None:
-        turn_rad = self._turn_to(z, self._estimate.fix_residual(t_s, z))
-        self._estimate.relocate(t_s, z, variance, is_lost=is_lost, turn_rad=turn_rad, again=self._is_relocated)
+    def _relocate(self, z: FloatArray, residual: FloatArray, variance: FloatArray, *, is_lost: bool) -> None:
+        turn_rad = 0.0
+        if self._fixed_m is not None:
+            # How wrong the heading has been, if that alone led the robot to ``z`` on the leg since the last fix.
+            leg_m, off_m = hypot(*(z - residual - self._fixed_m)), hypot(*residual)
+            if leg_m > _SHORTEST_LEG_M:
+                turn_rad = min(_LARGEST_DOUBT_RAD, off_m / leg_m)
+        self._estimate.relocate(residual, variance, turn_rad, is_lost=is_lost, again=self._is_relocated)
         self._is_relocated = True
         self._fixed_m = z
         self._block.restart()
         self._rebase()
 
-    def _turn_to(self, z: FloatArray, residual: FloatArray) -> float:
-        """How wrong the heading has been, if that alone led the robot to ``z`` on the leg since the last fix."""
-        if self._fixed_m is None:
-            return 0.0
-        leg_m, off_m = hypot(*(z - residual - self._fixed_m)), hypot(*residual)
-        return min(_LARGEST_DOUBT_RAD, off_m / leg_m) if leg_m > _SHORTEST_LEG_M else 0.0
-
-    def _refuse(self, t_s: float, z: FloatArray, variance: FloatArray) -> None:
+    def _refuse(self, z: FloatArray, residual: FloatArray, variance: FloatArray) -> None:
         """Lock-out recovery: an estimate that is sure of itself and wrong would refuse every true fix from now on."""
-        residual = self._estimate.fix_residual(t_s, z)
         refused = [r for r in self._refused if sqrt(float(np.sum((r - residual) ** 2))) <= self._full.consistent_m]
         self._refused = [*refused, residual]
         distance_mm = 1e3 * sqrt(float(residual.dot(residual)))
@@ -328,7 +290,7 @@ class FullStateLocalizer(LocalizerBase):
         if len(self._refused) < _CONSISTENT:
             raise FixGated(f"fix is {distance_mm:.1f} mm from the estimate, sigma {1e3 * self._worst_sigma_m():.2f} mm")
         self._refused.clear()
-        self._relocate(t_s, z, variance, is_lost=False)
+        self._relocate(z, residual, variance, is_lost=False)
         self.counts["reinitialised"] += 1
         self.notices.append(
             f"{_CONSISTENT} fixes in a row say that the pose is {distance_mm:.1f} mm wrong: it begins anew"
@@ -352,17 +314,11 @@ class FullStateLocalizer(LocalizerBase):
     # -- time ---------------------------------------------------------------------------------------------------------
 
     def _resync(self, t_s: float, last_s: float) -> None:
-        """Go on in a new time base: the pose does not step, what may have happened meanwhile goes to the covariance."""
         self._is_new_base = True
         self._right.restart()
         self._left.restart()
-        if not isfinite(last_s):
-            self._estimate.journal.restart()
-            return
-        self.counts["resyncs"] += 1
-        self._intake.restart()
         self._edges.restart()
-        if not self.is_frozen:
+        if last_s > -inf and not self.is_frozen:
             if self._block.dt_s > 0.0:
                 self._take_block(last_s)
             # A gap without frames, if it is one and no jump of the clock, ends with the robot's own time-to-live.

@@ -2,17 +2,26 @@
 
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Sequence
-from math import hypot, inf, isfinite
+from collections.abc import Callable, Sequence
+from math import hypot, inf, isfinite, sqrt
 from operator import lt
 
-from ccatp.conditions import FILTER_DIVERGED, FRAMES_BACKWARD, SENSOR_BACKWARD
-from ccatp.control.motion_checks import ImuGate, WheelMeans
-from ccatp.core import EdgeSample, GravitySample, ImuSample, WheelSample
-from ccatp.filters.base import FilterDiverged
+import numpy as np
 
+from ccatp.conditions import FILTER_DIVERGED, FRAMES_BACKWARD, SENSOR_BACKWARD
+from ccatp.config.models import Config
+from ccatp.control.motion_checks import ImuGate, WheelMeans, largest_rate_rad_s
+from ccatp.core import EdgeSample, Fix, GravitySample, ImuSample, WheelSample
+from ccatp.estimation.fixes import DeckFoot, check_fix, deck_foot
+from ccatp.filters import FILTERS
+from ccatp.filters.base import Filter, FilterDiverged
+from ccatp.mirror.mirror import Mirror
+
+ImuReadings = Sequence[ImuSample]
 WheelReadings = tuple[Sequence[float], Sequence[float]]
 """Times (s) and rates (rad/s) of one wheel."""
+HEADING = 2
+"""Index of the heading in the states of both localizers."""
 MAX_FRAME_STEP_S = 0.1
 """A frame further than this from the last one is a jump of the robot's clock or a gap in the link."""
 LONGEST_GAP_S = 0.4
@@ -52,11 +61,10 @@ class SampleValidator:
     until it is emptied.
     """
 
-    def __init__(self, history_s: float, counts: dict[str, int]) -> None:
-        self._history_s = history_s
+    def __init__(self, history_s: float, largest_rate_rad_s: float, counts: dict[str, int]) -> None:
+        self._history_s, self._largest_rad_s = history_s, largest_rate_rad_s
         self._counts = counts
         self.backward_source = ""
-        self.largest_rate_rad_s = 0.5 * _READABLE
         self.restart()
 
     def restart(self) -> None:
@@ -70,7 +78,7 @@ class SampleValidator:
             return ((), ()), ((), ())
         times, right, left = zip(*encoders)  # noqa: B905 - of one length; checking that takes longer
         newest_right_s, newest_left_s = self._right.newest_s, self._left.newest_s
-        first_s, oldest_s, largest = times[0], frame_s - self._history_s, self.largest_rate_rad_s
+        first_s, oldest_s, largest = times[0], frame_s - self._history_s, self._largest_rad_s
         if (
             newest_right_s < first_s > newest_left_s
             and oldest_s <= first_s
@@ -89,7 +97,7 @@ class SampleValidator:
         """Each sample judged by itself."""
         right: tuple[list[float], list[float]] = [], []
         left: tuple[list[float], list[float]] = [], []
-        largest = self.largest_rate_rad_s
+        largest = self._largest_rad_s
         for sample_s, right_rad_s, left_rad_s in encoders:
             if not (isfinite(sample_s) and hypot(right_rad_s or 0.0, left_rad_s or 0.0) < _READABLE):
                 self._counts["nonfinite"] += 1
@@ -144,30 +152,49 @@ class SampleValidator:
         return False
 
 
+FilterWrap = Callable[[Filter], Filter]
+"""Makes a filter of a filter, which it may record or replace."""
+
+
+def unwrapped(filter_: Filter) -> Filter:
+    """The filter itself."""
+    return filter_
+
+
+_IMPOSSIBLE = 2.0  # an estimate of this many times the wheels' largest rate is no estimate
+
+
 class LocalizerBase(ABC):
     """Admits frames in order of time, and asks to hold when time or the filter go wrong.
 
-    ``t_s``: robot time to which the pose belongs, that of the last frame used; -inf before the first. ``hold_cause``,
-    why the mission should hold, stays until ``clear_hold``; ``is_frozen``: the filter has diverged, and the pose stands
-    still until the next fix; ``notices`` for the operator are removed by their reader. Samples older than ``history_s``
-    are refused.
+    ``wrap`` is put around the filter of ``run.filter``. ``t_s``: robot time to which the pose belongs, that of the last
+    frame used; -inf before the first. ``hold_cause``, why the mission should hold, stays until ``clear_hold``;
+    ``is_frozen``: the filter has diverged, and the pose stands still until the next fix; ``notices`` for the operator
+    are removed by their reader. Samples older than ``localizer.history_s`` are refused, and so are inertial samples
+    that contradict the wheels and rates that no wheel turns at.
     """
 
-    def __init__(self, history_s: float) -> None:
+    def __init__(self, cfg: Config, mirror: Mirror, states: int, wrap: FilterWrap) -> None:
         self.t_s = -inf
         self.counts: dict[str, int] = Counter()
         self.hold_cause = ""
         self.is_frozen = False
         self.notices: list[str] = []
+        # Whoever derives re-initialises the filter at once; what counts is its size.
+        self._filter = wrap(FILTERS[cfg.run.filter](np.zeros(states), np.eye(states)))
+        self._mirror = mirror
+        self._puck_height_m = cfg.robot.puck_height_m
+        self._v_limit_m_s = _IMPOSSIBLE * cfg.robot.wheel_radius_m * cfg.robot.max_wheel_rad_s
+        self._omega_limit_rad_s = 2.0 * self._v_limit_m_s / cfg.robot.wheel_base_m
         self._stale_run = 0
         self._suspect_s: float | None = None
-        self._intake = SampleValidator(history_s, self.counts)
-        self._guard: tuple[ImuGate, WheelMeans] | None = None
+        self._intake = SampleValidator(cfg.localizer.history_s, largest_rate_rad_s(cfg.robot), self.counts)
+        self._imu_gate, self._wheel_means = ImuGate(cfg.health), WheelMeans(cfg.robot)
 
-    def guard(self, gate: ImuGate, means: WheelMeans, largest_rate_rad_s: float) -> None:
-        """From now on leave out inertial samples that the gate does not believe, and wheels faster than any is."""
-        self._guard = gate, means
-        self._intake.largest_rate_rad_s = largest_rate_rad_s
+    @property
+    def heading_sigma_rad(self) -> float:
+        """Standard deviation of the heading, at the last step of the filter."""
+        return sqrt(max(float(self._filter.covariance[HEADING, HEADING]), 0.0))
 
     def clear_hold(self) -> None:
         """Forget the cause for a hold; one that persists comes back."""
@@ -176,7 +203,7 @@ class LocalizerBase(ABC):
     def step(
         self,
         t_s: float,
-        imu: Sequence[ImuSample],
+        imu: ImuReadings,
         encoders: Sequence[WheelSample],
         edges: Sequence[EdgeSample],
         gravity: GravitySample | None = None,
@@ -193,25 +220,26 @@ class LocalizerBase(ABC):
         if not (is_next or self._is_new_time_base(t_s)):
             return
         self.t_s, self._stale_run, self._suspect_s = t_s, 0, None
+        intake, means = self._intake, self._wheel_means
         if not is_next:
             dt_s = 0.0
-            if self._guard is not None:
-                self._guard[0].reset()
+            self._imu_gate.reset()
+            if last_s > -inf:
+                self.counts["resyncs"] += 1
+                intake.restart()
             self._resync(t_s, last_s)
-        if self._guard is not None:
-            gate, means = self._guard
-            means.take(encoders, dt_s)
-            believed = gate.admit(imu, means.yaw_rad_s) if imu else imu
+        means.take(encoders, dt_s)
+        if imu:
+            believed = self._imu_gate.admit(imu, means.yaw_rad_s)
             if len(believed) != len(imu):
                 self.counts["imu_doubted"] += len(imu)
             imu = believed
-        intake = self._intake
         imu, (right, left) = intake.imu(t_s, imu), intake.wheels(t_s, encoders)
         if intake.backward_source:
             self._request_hold(SENSOR_BACKWARD.text(sensor=intake.backward_source))
             intake.backward_source = ""
         try:
-            self._use(t_s, dt_s, imu, right, left, edges, gravity)
+            self._use(dt_s, imu, right, left, edges, gravity)
         except FilterDiverged as error:
             self._freeze(error)
 
@@ -233,6 +261,15 @@ class LocalizerBase(ABC):
             self._request_hold(FRAMES_BACKWARD.message)
         return False
 
+    def _check_speeds(self, v_m_s: float, omega_rad_s: float) -> None:
+        if abs(v_m_s) > self._v_limit_m_s or abs(omega_rad_s) > self._omega_limit_rad_s:
+            raise FilterDiverged(f"{v_m_s:.3g} m/s and {omega_rad_s:.3g} rad/s are more than the wheels can do")
+
+    def _foot_of(self, fix: Fix, oldest_s: float) -> DeckFoot:
+        """Raises ``FixRefused``: not finite, older than ``oldest_s``, from the future, or far from the mirror."""
+        check_fix(fix, oldest_s, self.t_s + MAX_FRAME_STEP_S)
+        return deck_foot(self._mirror, fix, self._puck_height_m)
+
     def _freeze(self, error: FilterDiverged) -> None:
         self.is_frozen = True
         self.counts["diverged"] += 1
@@ -243,14 +280,16 @@ class LocalizerBase(ABC):
 
     @abstractmethod
     def _resync(self, t_s: float, last_s: float) -> None:
-        """Go on in a new time base that begins at ``t_s``; ``last_s`` is the end of the old one, -inf at the start."""
+        """Go on in a new time base that begins at ``t_s``; ``last_s`` is the end of the old one, -inf at the start.
+
+        The pose does not step; what may have happened meanwhile goes to the covariance.
+        """
 
     @abstractmethod
     def _use(
         self,
-        t_s: float,
         dt_s: float,
-        imu: Sequence[ImuSample],
+        imu: ImuReadings,
         right: WheelReadings,
         left: WheelReadings,
         edges: Sequence[EdgeSample],

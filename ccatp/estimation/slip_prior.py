@@ -2,13 +2,12 @@
 
 from collections.abc import Sequence
 from math import exp, log
-from typing import NamedTuple
 
 import numpy as np
 
 from ccatp.config.models import FullStateConfig
 from ccatp.core import FloatArray
-from ccatp.estimation.state_model import SL, SR, C
+from ccatp.estimation.state_model import SLIPS
 
 # Candidates for the scatter, from "does not change" to "anything goes"; a factor of sqrt(2) apart.
 _CANDIDATES = tuple(1e-7 * 2.0 ** (k / 2.0) for k in range(38))
@@ -82,42 +81,13 @@ _DIFFERENCE = 4.0
 # Parameters (mean slip, difference of the slips, creep) out of the states (SR, SL, C), and back.
 _PARAMETERS = np.array([[0.5, 0.5, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
 _STATES = np.linalg.inv(_PARAMETERS)
-_WHERE = [SR, SL, C]
+_SLIP_BLOCK = np.ix_(SLIPS, SLIPS)
 
 
-class Redraw(NamedTuple):
-    """Transition of (right slip, left slip, creep) from one leg to the next: ``s' = F (s - found) + mean + e``.
-
-    ``found`` and ``mean`` (3,) are the expectations of both legs; F (3, 3); Q (3, 3) is the covariance of e.
-    """
-
-    found: FloatArray
-    F: FloatArray
-    mean: FloatArray
-    Q: FloatArray
-
-
-class _Parameter:
-    """One parameter: leg by leg it is m + d, the mean m unknown with variance v, d drawn anew with variance scatter."""
-
-    def __init__(self, mean: float, sigma: float) -> None:
-        self.mean, self.variance = mean, sigma * sigma
-        self.prior = (mean, sigma * sigma)
-
-    def pass_on(self, found: float, known: float, old_scatter: float, scatter: float) -> tuple[float, float]:
-        """From a leg's posterior (mean ``found``, variance ``known``) to the next leg's prior.
-
-        The leg's parameter tells of m by the share beta = v / (v + scatter) of what was not known of it.
-
-        Returns:
-            beta, and the variance of what the next leg's parameter has of its own.
-        """
-        beta = self.variance / (self.variance + old_scatter)
-        own = self.variance * (1.0 - beta)
-        self.mean += beta * (found - self.mean)
-        self.variance = own + beta * beta * known
-        self.prior = (self.mean, self.variance + scatter)
-        return beta, own + scatter
+def _parameters_of(mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Means (3,) and variances (3,) of the parameters in a state (n,), (n, n)."""
+    known = _PARAMETERS.dot(covariance[_SLIP_BLOCK]).dot(_PARAMETERS.T).diagonal()
+    return _PARAMETERS.dot(mean[SLIPS]), known
 
 
 class SlipPrior:
@@ -127,26 +97,29 @@ class SlipPrior:
     heading shows). Both wheels draw from one population, so both tell how much legs differ. Where legs hardly differ,
     the next leg keeps the state and all its correlations; where each leg slips differently, it begins with the mean of
     all legs. How much they differ is learned (``SlipPopulation``); creep varies by a share of itself.
+
+    Leg by leg a parameter is m + d: the mean m is unknown, d is drawn again with the learned scatter.
     """
 
     def __init__(self, cfg: FullStateConfig) -> None:
         # Half the difference of two draws scatters as their mean does.
         expected = (cfg.slip_mean, cfg.slip_sigma), (0.0, 0.5 * cfg.slip_difference_sigma)
         self._slip_scatter = SlipPopulation(expected, cfg.slip_scatter_max)
-        self._parameters = (
-            _Parameter(cfg.slip_mean, cfg.slip_sigma),
-            _Parameter(0.0, cfg.slip_difference_sigma),
-            _Parameter(0.0, cfg.creep_sigma),
-        )
+        self._means = np.array((cfg.slip_mean, 0.0, 0.0))
+        self._variances = np.square((cfg.slip_sigma, cfg.slip_difference_sigma, cfg.creep_sigma))
         self._creep_share = cfg.creep_scatter_share**2
-        self._scatters = self._learned()
         self._wander = cfg.wander_fraction**2 / cfg.wander_time_s
-        self._wandered = 0.0  # variance of the mean slip's wander in this leg, part of the scatter
+        self._scatters = self._learned()
         self._is_open = False
+        self._wandered = 0.0  # variance of the mean slip's wander in this leg, part of the scatter
 
     def _learned(self) -> tuple[float, float, float]:
-        slip, creep = self._slip_scatter.scatter, self._parameters[2]
-        return slip, _DIFFERENCE * slip, self._creep_share * (creep.mean * creep.mean + creep.variance)
+        slip, creep, variance = self._slip_scatter.scatter, float(self._means[2]), float(self._variances[2])
+        return slip, _DIFFERENCE * slip, self._creep_share * (creep * creep + variance)
+
+    def _open(self) -> None:
+        self._is_open, self._wandered = True, 0.0
+        self._prior = self._means, self._variances + self._scatters
 
     @property
     def scatter(self) -> tuple[float, float]:
@@ -156,32 +129,24 @@ class SlipPrior:
     def first(self) -> tuple[FloatArray, FloatArray]:
         """Prior of (right slip, left slip, creep) before the first leg: mean (3,), covariance (3, 3)."""
         self._open()
-        means, variances = [], []
-        for parameter, scatter in zip(self._parameters, self._scatters, strict=True):
-            parameter.prior = (parameter.mean, parameter.variance + scatter)
-            means.append(parameter.mean)
-            variances.append(parameter.variance + scatter)
-        return _STATES.dot(np.array(means)), (_STATES * variances).dot(_STATES.T)
+        means, variances = self._prior
+        return _STATES.dot(means), (_STATES * variances).dot(_STATES.T)
 
-    def begin(self, mean: FloatArray, covariance: FloatArray) -> Redraw:
-        """A leg begins; the state before it, mean (n,) and covariance (n, n), ends the last one."""
-        states = mean[_WHERE]
-        found = _PARAMETERS.dot(states)
-        known = _PARAMETERS.dot(covariance[np.ix_(_WHERE, _WHERE)]).dot(_PARAMETERS.T).diagonal()
+    def begin(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """A leg begins; the state before it, mean (n,) and covariance (n, n), ends the last one.
+
+        Transition of (right slip, left slip, creep) to the next leg, s' = F s + b + e: F (3, 3), b (3,), and the
+        covariance (3, 3) of e.
+        """
+        found, known = _parameters_of(mean, covariance)
+        # A leg shows m by the share beta of what was not known of it; ``own`` is what is left.
         before, self._scatters = self._scatters, self._learned()
-        betas, owns = [], []
-        for k, parameter in enumerate(self._parameters):
-            beta, own = parameter.pass_on(float(found[k]), float(known[k]), before[k], self._scatters[k])
-            betas.append(beta)
-            owns.append(own)
+        beta = self._variances / (self._variances + before)
+        own = self._variances * (1.0 - beta)
+        self._means, self._variances = self._means + beta * (found - self._means), own + beta * beta * known
         self._open()
-        means = np.array([parameter.mean for parameter in self._parameters])
-        F, Q = (_STATES * betas).dot(_PARAMETERS), (_STATES * owns).dot(_STATES.T)
-        return Redraw(states, F, _STATES.dot(means), Q)
-
-    def _open(self) -> None:
-        self._is_open = True
-        self._wandered = 0.0
+        F, Q = (_STATES * beta).dot(_PARAMETERS), (_STATES * (own + self._scatters)).dot(_STATES.T)
+        return F, _STATES.dot(self._means) - F.dot(mean[SLIPS]), Q
 
     def wander(self, dt_s: float) -> tuple[float, float]:
         """Slip (of each wheel) and creep wander within the leg for a step of ``dt_s``: by which variance."""
@@ -194,26 +159,22 @@ class SlipPrior:
         if not self._is_open:
             return
         self._is_open = False
-        found = _PARAMETERS.dot(mean[_WHERE])
-        known = _PARAMETERS.dot(covariance[np.ix_(_WHERE, _WHERE)]).dot(_PARAMETERS.T).diagonal()
+        found, known = (values.tolist() for values in _parameters_of(mean, covariance))
+        means, variances = (values.tolist() for values in self._prior)
         wander = self._wandered * self._scatters[0]
-        alone = []
+        alone: list[tuple[float, float] | None] = []
         for k, (scale, weight) in enumerate(((1.0, 1.0), (0.5, _DIFFERENCE))):
-            expected, variance = self._parameters[k].prior
-            says = _leg_alone((expected, variance + weight * wander), (float(found[k]), float(known[k])))
-            alone.append(None if says is None else (scale * says[0], scale * scale * says[1]))
+            before = variances[k] + weight * wander
+            if not 0.0 < known[k] < _TAUGHT * before:
+                alone.append(None)
+                continue
+            # The posterior divided by the prior, both Gaussian, is what the leg alone says.
+            information = 1.0 / known[k] - 1.0 / before
+            value = (found[k] / known[k] - means[k] / before) / information
+            alone.append((scale * value, scale * scale * (1.0 / information)))
         if any(alone):
             self._slip_scatter.learn(alone, 1.0 + self._wandered)
 
     def forget_leg(self) -> None:
         """The leg's measurements are not to be trusted."""
         self._is_open = False
-
-
-def _leg_alone(prior: tuple[float, float], posterior: tuple[float, float]) -> tuple[float, float] | None:
-    """What the leg alone says, (estimate, variance): the posterior divided by the prior, both Gaussian; or nothing."""
-    (m0, p0), (m1, p1) = prior, posterior
-    if not 0.0 < p1 < _TAUGHT * p0:
-        return None
-    information = 1.0 / p1 - 1.0 / p0
-    return (m1 / p1 - m0 / p0) / information, 1.0 / information

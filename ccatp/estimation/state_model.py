@@ -5,6 +5,7 @@ states: the encoders' counts measure them with an error that never grows, which 
 more than its rate (a rate out of counts jumps by 0.5 rad/s per 10 ms).
 """
 
+from collections.abc import Sequence
 from math import cos, sin, sqrt
 from typing import NamedTuple
 
@@ -19,11 +20,6 @@ class Affine:
 
     def __init__(self, F: FloatArray, b: FloatArray) -> None:
         self._F, self._b = F, b
-
-    @classmethod
-    def shift(cls, b: FloatArray) -> "Affine":
-        """Translate by b: x <- x + b."""
-        return cls(np.eye(b.size), b)
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Image of x (n,) and the Jacobian (n, n)."""
@@ -60,8 +56,6 @@ class Terrain:
         self._surface = mirror.surface
         self._gravity = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))  # the telescope points to the zenith
         self._x_m = self._y_m = float("inf")
-        self._f_m = 0.0
-        self._slope = Slope(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     def at(self, x_m: float, y_m: float) -> Slope:
         """Slopes at a deck point."""
@@ -76,25 +70,22 @@ class Terrain:
         dx, dy = x_m - self._x_m, y_m - self._y_m
         if not -_REACH_M < dx < _REACH_M or not -_REACH_M < dy < _REACH_M:
             self._evaluate(x_m, y_m)
-            return self._f_m
+            dx = dy = 0.0
         fx, fy, fxx, fxy, fyy, _, _ = self._slope
         return self._f_m + fx * dx + fy * dy + 0.5 * (fxx * dx * dx + fyy * dy * dy) + fxy * dx * dy
 
     def _evaluate(self, x_m: float, y_m: float) -> Slope:
         self._f_m, fx, fy, fxx, fxy, fyy = self._surface.jet(x_m, y_m)
         self._x_m, self._y_m = x_m, y_m
-        self._slope = Slope(fx, fy, fxx, fxy, fyy, *self._downhill(fx, fy))
-        return self._slope
-
-    def _downhill(self, fx: float, fy: float) -> tuple[float, float]:
-        """Deck components of gravity's part along the surface, as a unit vector."""
         gx, gy, gz = self._gravity
         norm = 1.0 + fx * fx + fy * fy
         # n = (-fx, -fy, 1)/W; what is left of g without its part along n.
         along = (gz - fx * gx - fy * gy) / norm
         tx, ty, tz = gx + along * fx, gy + along * fy, gz - along
         length = sqrt(tx * tx + ty * ty + tz * tz)
-        return (tx / length, ty / length) if length > _LEVEL else (0.0, 0.0)
+        downhill = (tx / length, ty / length) if length > _LEVEL else (0.0, 0.0)
+        self._slope = Slope(fx, fy, fxx, fxy, fyy, *downhill)
+        return self._slope
 
 
 X, Y, PSI, V, A, W, BG, KG, BA, SR, SL, KL, C, PR, PL, E0, E1, TX, TY = range(19)
@@ -109,23 +100,13 @@ how far the two edges of the seam crossed last lie from where the map has them, 
 its place over the robot because the panel under it is tilted, deck frame, m.
 """
 STATES = 19
+POSE, SPEEDS, SLIPS, ANGLES, EDGES, TILT = [X, Y, PSI], [V, A, W], [SR, SL, C], [PR, PL], [E0, E1], [TX, TY]
 _NOISY = np.array([A, W, SR, SL, C])  # whose noise enters at the beginning of a step and is carried through it
-_SPEEDS = (PSI, V, A, W)
+_MOVED = np.array([X, Y, PSI, V, PR, PL])  # by a step, in the order of `SurveyMotion.at`
 # Entries of the motion's Jacobian beside those of the identity, as `SurveyMotion.at` lists them: one call sets all.
-_ENTRIES = np.array(
-    [
-        row * STATES + column
-        for row, columns in (
-            (X, (*_SPEEDS, C)),
-            (Y, (*_SPEEDS, C)),
-            (PSI, (*_SPEEDS, C)),
-            (V, (A,)),
-            (PR, (V, A, W, SR, KL)),
-            (PL, (V, A, W, SL, KL)),
-        )
-        for column in columns
-    ]
-)
+_COLUMNS: dict[int, tuple[int, ...]] = dict.fromkeys((X, Y, PSI), (PSI, V, A, W, C))
+_COLUMNS |= {V: (A,), PR: (V, A, W, SR, KL), PL: (V, A, W, SL, KL)}
+_ENTRIES = np.array([row * STATES + column for row, columns in _COLUMNS.items() for column in columns])
 
 
 class SurveyMotion:
@@ -144,17 +125,13 @@ class SurveyMotion:
 
     def __init__(self, wheel_radius_m: float, wheel_base_m: float) -> None:
         self._radius_m, self._half_base_m = wheel_radius_m, 0.5 * wheel_base_m
-        self._dt_s = 0.0
-        self._slope = Slope(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        self._of: FloatArray | None = None
-        self._x = np.zeros(STATES)
-        self._F = np.eye(STATES)
+        self._x, self._F = np.zeros(STATES), np.eye(STATES)
         self._flat = self._F.reshape(-1)
 
     def over(self, dt_s: float, slope: Slope) -> "SurveyMotion":
         """Set the step's duration and the ground under it."""
         self._dt_s, self._slope = dt_s, slope
-        self._of = None
+        self._of: FloatArray | None = None
         return self
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -163,7 +140,7 @@ class SurveyMotion:
             return self._x, self._F
         self._of = x
         state: list[float] = x.tolist()
-        x_m, y_m, psi, v, a, w, bg, kg, ba, s_r, s_l, kl, c, p_r, p_l, e0, e1, tx, ty = state
+        x_m, y_m, psi, v, a, w, _, _, _, s_r, s_l, kl, c, p_r, p_l, *_ = state
         dt, (fx, fy, fxx, fxy, _, gx, gy) = self._dt_s, self._slope
         v += a * dt
         d, turn = v * dt, w * dt
@@ -180,37 +157,17 @@ class SurveyMotion:
         half = self._half_base_m
         side = turn * (1.0 + kl) * half
         right, left = d + side, d - side
-        self._x[:] = (
-            x_m + dx,
-            y_m + dy,
-            psi + turn - k1 * dx - k2 * dy,
-            v,
-            a,
-            w,
-            bg,
-            kg,
-            ba,
-            s_r,
-            s_l,
-            kl,
-            c,
-            p_r + right * per_r,
-            p_l + left * per_l,
-            *(e0, e1, tx, ty),
-        )
+        self._x[:] = x
+        self._x[_MOVED] = x_m + dx, y_m + dy, psi + turn - k1 * dx - k2 * dy, v, p_r + right * per_r, p_l + left * per_l
         sign = c if d >= 0.0 else -c
         xv, yv = dt * (hx + sign * gx), dt * (hy + sign * gy)
         x_psi, y_psi, x_c, y_c = d * lx, d * ly, way * gx, way * gy
-        w_dt, turn_dt = 0.5 * dt, dt * (1.0 + kl) * half
+        psi_v, w_dt, turn_dt = -k1 * xv - k2 * yv, 0.5 * dt, dt * (1.0 + kl) * half
         self._flat[_ENTRIES] = (
             *(x_psi, xv, dt * xv, w_dt * x_psi, x_c),
             *(y_psi, yv, dt * yv, w_dt * y_psi, y_c),
-            1.0 - k1 * x_psi - k2 * y_psi,
-            -k1 * xv - k2 * yv,
-            dt * (-k1 * xv - k2 * yv),
-            dt - w_dt * (k1 * x_psi + k2 * y_psi),
-            -k1 * x_c - k2 * y_c,
-            dt,
+            *(1.0 - k1 * x_psi - k2 * y_psi, psi_v, dt * psi_v),
+            *(dt - w_dt * (k1 * x_psi + k2 * y_psi), -k1 * x_c - k2 * y_c, dt),
             *(dt * per_r, dt * dt * per_r, turn_dt * per_r, right * per_r / (1.0 - s_r), turn * half * per_r),
             *(dt * per_l, dt * dt * per_l, -turn_dt * per_l, left * per_l / (1.0 - s_l), -turn * half * per_l),
         )
@@ -251,6 +208,10 @@ class SurveyMotion:
         return Q
 
 
+_SENSORS = np.eye(STATES)  # Jacobian of a reading of each state; that by the scale error is set where it is used
+_SENSORS[W, BG] = _SENSORS[A, BA] = 1.0
+
+
 class SensorRows:
     """What one frame measures: wheel angles, angular rate, acceleration; any of them may be missing.
 
@@ -258,51 +219,18 @@ class SensorRows:
 
         counts_R = phi_R,   counts_L = phi_L,   omega_z = (1 + kg) w + bg,   a_x = a + ba
 
-    ``z`` and ``R`` (variances) are of the rows taken, shape (m,).
+    A reading is the state it is of, its value and its variance; one of W stands first, one of A last. ``z`` and ``R``
+    (variances) have shape (m,).
     """
 
-    def __init__(self) -> None:
-        self._rows: tuple[int, ...] = ()
-        self._H: dict[tuple[int, ...], FloatArray] = {}
-        self.z = self.R = np.empty(0)
-
-    def take(
-        self,
-        counts: tuple[float, float, float] | None,
-        rate: tuple[float, float] | None,
-        acceleration: tuple[float, float] | None,
-    ) -> "SensorRows":
-        """Set the rows.
-
-        Wheel angles right, left, rad, and rate, rad/s, and acceleration, m/s^2, each with its variance.
-        """
-        z: list[float] = []
-        R: list[float] = []
-        rows: tuple[int, ...] = ()
-        # The rate before the angles: the other way round little is left of its variance, and digits go with the rest.
-        if rate is not None:
-            z, R, rows = [rate[0]], [rate[1]], (W,)
-        if counts is not None:
-            z += counts[:2]
-            R += (counts[2], counts[2])
-            rows += (PR, PL)
-        if acceleration is not None:
-            z.append(acceleration[0])
-            R.append(acceleration[1])
-            rows += (A,)
-        self.z, self.R, self._rows = np.array(z), np.array(R), rows
-        return self
+    def __init__(self, readings: Sequence[tuple[int, float, float]]) -> None:
+        states, z, R = zip(*readings, strict=True)
+        self._rows, self.z, self.R = states, np.array(z), np.array(R)
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Expected measurements (m,) and the Jacobian (m, n); work space that holds until the next call."""
+        """Expected measurements (m,) and the Jacobian (m, n)."""
         rows = self._rows
-        H = self._H.get(rows)
-        if H is None:
-            H = self._H[rows] = np.zeros((len(rows), STATES))
-            H[np.arange(len(rows)), rows] = 1.0
-            for state, bias in ((W, BG), (A, BA)):
-                if state in rows:
-                    H[rows.index(state), bias] = 1.0
+        H: FloatArray = _SENSORS.take(rows, axis=0)
         h: FloatArray = x.take(rows)
         if rows[0] == W:
             w = float(x[W])

@@ -1,30 +1,35 @@
 """The localizer of thesis chapter 2: four states in a filter (eqs 2.4 to 2.12), the pose integrated beside it."""
 
 from collections.abc import Sequence
-from math import hypot, isfinite, sqrt
-from typing import NamedTuple
+from functools import lru_cache
+from math import hypot, inf, sqrt
 
 import numpy as np
 
-from ccatp.config.models import LocalizerConfig, RobotConfig
+from ccatp.config.models import Config, LocalizerConfig, RobotConfig
 from ccatp.core import (
     DeckPose,
     EdgeSample,
     Fix,
     FloatArray,
     GravitySample,
-    ImuSample,
     PanelId,
     PanelPose,
     difference,
     rotate,
     wrap_pi,
 )
-from ccatp.estimation.fixes import PositionSigma, check_fix, foot_of_fix
-from ccatp.estimation.localizer_base import MAX_FRAME_STEP_S, LocalizerBase, WheelReadings
+from ccatp.estimation.localizer_base import (
+    MAX_FRAME_STEP_S,
+    FilterWrap,
+    ImuReadings,
+    LocalizerBase,
+    WheelReadings,
+    unwrapped,
+)
 from ccatp.estimation.odometry import Odometer, arc_step
 from ccatp.estimation.seams import CrossingDetector, HeadingFix, HeadingGate, SensorTransition
-from ccatp.filters.base import Filter, FilterDiverged, Innovation
+from ccatp.filters.base import FilterDiverged, Innovation
 from ccatp.mirror.mirror import Mirror
 
 V, A, THETA, OMEGA = range(4)
@@ -33,15 +38,8 @@ V, A, THETA, OMEGA = range(4)
 The thesis prints m^2/s as the unit of the acceleration; m/s^2 is meant.
 """
 STATES = 4
-_CACHE_LIMIT = 256
-
-
-class Stack(NamedTuple):
-    """z = H q + noise with independent rows: z (m,), H (m, 4), variances R (m,)."""
-
-    z: FloatArray
-    H: FloatArray
-    R: FloatArray
+Stack = tuple[FloatArray, FloatArray, FloatArray]
+"""z = H q + noise with independent rows: z (m,), H (m, 4), variances R (m,)."""
 
 
 class MeasurementBuilder:
@@ -69,22 +67,15 @@ class MeasurementBuilder:
         self._var_wz = cfg.gyroscope_sigma_rad_s**2
         self._bias_wz = cfg.gyroscope_bias_rad_s
         self._var_wheel = cfg.encoder_sigma_rad_s**2
-        self._stacks: dict[tuple[int, int, int], Stack] = {}
+        self._of_size = lru_cache(maxsize=256)(self._build)
 
-    def stack(
-        self,
-        t_s: float,
-        imu: Sequence[ImuSample],
-        right: tuple[Sequence[float], Sequence[float]],
-        left: tuple[Sequence[float], Sequence[float]],
-    ) -> Stack:
+    def stack(self, t_s: float, imu: ImuReadings, right: WheelReadings, left: WheelReadings) -> Stack:
         """Stack of a frame with any number of samples; of each wheel the times (s) and the rates (rad/s).
 
         The arrays are work space: they hold until the next call.
         """
-        stack = self._of_size(len(right[0]), len(left[0]), len(imu))
-        z, H, _ = stack
         wheels, n = len(right[0]) + len(left[0]), len(imu)
+        stack = z, H, _ = self._of_size(len(right[0]), len(left[0]), n)
         for i, (t, rate) in enumerate(zip((*right[0], *left[0]), (*right[1], *left[1]), strict=True)):
             H[i, A] = (t - t_s) * self._per_radius
             z[i] = rate
@@ -93,26 +84,16 @@ class MeasurementBuilder:
             z[i + n] = wz - self._bias_wz
         return stack
 
-    def _of_size(self, right: int, left: int, imu: int) -> Stack:
-        found = self._stacks.get((right, left, imu))
-        if found is not None:
-            return found
-        if len(self._stacks) >= _CACHE_LIMIT:
-            self._stacks.clear()
+    def _build(self, right: int, left: int, imu: int) -> Stack:
         wheels = right + left
-        m = wheels + 2 * imu
-        H = np.zeros((m, STATES))
+        H, R = np.zeros((wheels + 2 * imu, STATES)), np.empty(wheels + 2 * imu)
         H[:wheels, V] = self._per_radius
         H[:right, OMEGA] = self._turn
         H[right:wheels, OMEGA] = -self._turn
         H[wheels : wheels + imu, A] = 1.0
         H[wheels + imu :, OMEGA] = 1.0
-        R = np.empty(m)
-        R[:wheels] = self._var_wheel
-        R[wheels : wheels + imu] = self._var_ax
-        R[wheels + imu :] = self._var_wz
-        found = self._stacks[right, left, imu] = Stack(np.zeros(m), H, R)
-        return found
+        R[:wheels], R[wheels : wheels + imu], R[wheels + imu :] = self._var_wheel, self._var_ax, self._var_wz
+        return np.zeros(R.size), H, R
 
 
 class ConstantAcceleration:
@@ -146,8 +127,46 @@ class ConstantAcceleration:
 
 
 _NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up
-_IMPOSSIBLE = 2.0  # an estimate of this many times the wheels' largest rate is no estimate
 _SELECT_HEADING = np.eye(STATES)[THETA : THETA + 1]
+
+
+class PositionSigma:
+    """Standard deviation of the position along any one direction.
+
+    Slip and a heading error last from one fix to the next, so their contributions grow with the travel, not with its
+    root: sigma^2 = fix^2 + (slip_fraction s)^2 + (integral of sigma_theta ds)^2.
+    """
+
+    def __init__(self, sigma_m: float, slip_fraction: float) -> None:
+        self._slip_fraction = slip_fraction
+        self._known_m2 = sigma_m**2
+        self._along_m = self._across_m = 0.0
+
+    @property
+    def sigma_m(self) -> float:
+        """The standard deviation, m."""
+        return sqrt(self._known_m2 + self._along_m**2 + self._across_m**2)
+
+    def travel(self, distance_m: float, heading_sigma_rad: float) -> None:
+        """The robot moved on by ``distance_m`` >= 0 at a heading known to ``heading_sigma_rad``."""
+        self._along_m += self._slip_fraction * distance_m
+        self._across_m += heading_sigma_rad * distance_m
+
+    def growth_m2(self, distance_m: float, heading_sigma_rad: float) -> float:
+        """Variance that a displacement of ``distance_m`` alone brings in, m^2."""
+        return distance_m**2 * (self._slip_fraction**2 + heading_sigma_rad**2)
+
+    def widen(self, sigma_m: float) -> None:
+        """Add an independent error of ``sigma_m``."""
+        self._known_m2 += sigma_m**2
+
+    def fuse(self, variance_m2: float) -> float:
+        """Fuse a measured position of ``variance_m2`` > 0; returns its weight, 0 to 1."""
+        prior = self._known_m2 + self._along_m**2 + self._across_m**2
+        gain = prior / (prior + variance_m2)
+        self._known_m2 = gain * variance_m2
+        self._along_m = self._across_m = 0.0
+        return gain
 
 
 class FourStateLocalizer(LocalizerBase):
@@ -157,26 +176,17 @@ class FourStateLocalizer(LocalizerBase):
     own time (``MeasurementBuilder``); speed and heading move the position (eq. 2.14); a seam crossed by a pair of edge
     sensors updates the heading. Where the robot's origin enters another cell, pose and heading continue in the frame of
     that panel. Departure: the thesis overwrites the heading at a crossing; here it is a measurement of theta with the
-    variance of its timing, so that state and covariance stay consistent. ``fix_deviation_m``: height of the last fix
-    above the ideal surface.
+    variance of its timing, so that state and covariance stay consistent.
     """
 
-    def __init__(
-        self, filter_: Filter, mirror: Mirror, robot: RobotConfig, cfg: LocalizerConfig, start: PanelPose
-    ) -> None:
-        super().__init__(cfg.history_s)
+    def __init__(self, config: Config, mirror: Mirror, start: PanelPose, wrap: FilterWrap = unwrapped) -> None:
+        super().__init__(config, mirror, STATES, wrap)
         self.innovation: Innovation | None = None
-        self.fix_deviation_m = 0.0
-        self._filter = filter_
-        self._mirror = mirror
-        self._cfg = cfg
-        self._puck_height_m = robot.puck_height_m
-        self._v_limit_m_s = _IMPOSSIBLE * robot.wheel_radius_m * robot.max_wheel_rad_s
-        self._omega_limit_rad_s = 2.0 * self._v_limit_m_s / robot.wheel_base_m
+        self._cfg = cfg = config.localizer
         self._process = ConstantAcceleration(cfg)
-        self._builder = MeasurementBuilder(robot, cfg)
+        self._builder = MeasurementBuilder(config.robot, cfg)
         self._odometer = Odometer(cfg.history_s)
-        self._crossings = CrossingDetector(mirror, robot, cfg)
+        self._crossings = CrossingDetector(mirror, config.robot, cfg)
         self._gate = HeadingGate(cfg.crossing_gate_sigma)
         self._sigma = PositionSigma(cfg.start_position_sigma_m, cfg.slip_fraction)
         self._deck: DeckPose | None = None
@@ -212,11 +222,6 @@ class FourStateLocalizer(LocalizerBase):
         return self._sigma.sigma_m
 
     @property
-    def heading_sigma_rad(self) -> float:
-        """Standard deviation of the heading."""
-        return sqrt(float(self._filter.covariance[THETA, THETA]))
-
-    @property
     def pose_covariance(self) -> FloatArray:
         """Covariance of (x, y, heading) along the surface, shape (3, 3); correlations are not known."""
         return np.diag((self.position_sigma_m**2, self.position_sigma_m**2, self.heading_sigma_rad**2))
@@ -228,9 +233,8 @@ class FourStateLocalizer(LocalizerBase):
 
     def _use(
         self,
-        t_s: float,
         dt_s: float,
-        imu: Sequence[ImuSample],
+        imu: ImuReadings,
         right: WheelReadings,
         left: WheelReadings,
         edges: Sequence[EdgeSample],
@@ -238,8 +242,8 @@ class FourStateLocalizer(LocalizerBase):
     ) -> None:
         if self.is_frozen:
             return
-        self._advance(t_s, dt_s, self._builder.stack(t_s, imu, right, left))
-        transitions = self._crossings.scan(t_s, self.speed_m_s, self.rate_rad_s, edges)
+        self._advance(dt_s, self._builder.stack(self.t_s, imu, right, left))
+        transitions = self._crossings.scan(self.t_s, self.speed_m_s, self.rate_rad_s, edges)
         if transitions:
             self._use_crossings(transitions)
 
@@ -272,15 +276,18 @@ class FourStateLocalizer(LocalizerBase):
         Position and fix are weighted by their variances. Raises ``FixRefused``: not finite, too old, from the future,
         or far from the mirror; the pose is unchanged.
         """
-        check_fix(fix, self._odometer.oldest_s, self.t_s + MAX_FRAME_STEP_S)
-        foot = foot_of_fix(self._mirror, fix, self._puck_height_m, self._panel)
-        self.fix_deviation_m = foot.deviation_m
+        foot = self._foot_of(fix, self._odometer.oldest_s)
+        place = self._mirror.panel_pose(self._panel, DeckPose(foot.x_m, foot.y_m, 0.0))  # the heading plays no part
+        # Of the fix's covariance only the part along the surface counts: half its trace without the normal's share.
+        normal = np.array(self._mirror.rotate_world_from_deck(self._mirror.surface.normal(foot.x_m, foot.y_m)))
+        covariance = np.array(fix.covariance_m2).reshape(3, 3)
+        variance = 0.5 * float(np.trace(covariance) - normal @ covariance @ normal)
         then, here = self._odometer.at(fix.t_s), self._odometer.place
         # The odometer's frame is turned against the panel's by the difference of their headings.
         turned = float(self._filter.mean[THETA]) - here.heading_rad
         dx, dy = rotate(here.x_m - then.x_m, here.y_m - then.y_m, turned)
-        ex, ey = foot.x_m + dx - self._x_m, foot.y_m + dy - self._y_m
-        variance = foot.variance_m2 + self._sigma.growth_m2(hypot(dx, dy), self.heading_sigma_rad)
+        ex, ey = place.x_m + dx - self._x_m, place.y_m + dy - self._y_m
+        variance += self._sigma.growth_m2(hypot(dx, dy), self.heading_sigma_rad)
         if self.is_frozen:
             # Whatever turned the filter over may have turned the heading as well.
             prior = float(self._filter.covariance[THETA, THETA]) + self._cfg.start_heading_sigma_rad**2
@@ -293,7 +300,7 @@ class FourStateLocalizer(LocalizerBase):
         self._hand_over()
         return gain * hypot(ex, ey)
 
-    def _advance(self, t_s: float, dt_s: float, stack: Stack) -> None:
+    def _advance(self, dt_s: float, stack: Stack) -> None:
         before = self._filter.mean, self._filter.covariance
         self._filter.predict(*self._process.over(dt_s))
         innovation = self._filter.update(*stack)
@@ -301,14 +308,16 @@ class FourStateLocalizer(LocalizerBase):
             self.innovation = innovation
         v0, _, theta0, _ = before[0].tolist()
         v1, _, theta1, omega1 = self._filter.mean.tolist()
-        if abs(v1) > self._v_limit_m_s or abs(omega1) > self._omega_limit_rad_s:
+        try:
+            self._check_speeds(v1, omega1)
+        except FilterDiverged:
             self._filter.reset(*before)
-            raise FilterDiverged(f"{v1:.3g} m/s and {omega1:.3g} rad/s are more than the wheels can do")
+            raise
         v, turn = 0.5 * (v0 + v1), theta1 - theta0
         dx, dy = arc_step(v, theta0, turn, dt_s)
         self._x_m, self._y_m = self._x_m + dx, self._y_m + dy
         self._deck = None
-        self._odometer.advance(t_s, v, turn, dt_s)
+        self._odometer.advance(self.t_s, v, turn, dt_s)
         self._sigma.travel(abs(v) * dt_s, self.heading_sigma_rad)
         if abs(self._x_m) > self._near_x_m or abs(self._y_m) > self._near_y_m:
             self._hand_over()
@@ -365,12 +374,9 @@ class FourStateLocalizer(LocalizerBase):
         self._filter.predict(np.eye(STATES), wider)
 
     def _resync(self, t_s: float, last_s: float) -> None:
-        """Go on in a new time base: the pose does not step, what may have happened meanwhile goes to the sigmas."""
         self._odometer.start(t_s)
-        if not isfinite(last_s):
+        if last_s == -inf:
             return
-        self.counts["resyncs"] += 1
-        self._intake.restart()
         self._crossings.restart()
         self._sigma.widen(abs(self.speed_m_s) * MAX_FRAME_STEP_S)
         if not self.is_frozen:

@@ -139,7 +139,8 @@ def survey_problem(cfg: Config) -> FilterProblem:
     drift[[sm.PR, sm.PL]] = cfg.localizer.encoder_sigma_rad_s**2 * full.encoder_period_s * DT_S
     Q = motion.noise(mean, impulses, drift)
     gyroscope, accelerometer = cfg.localizer.gyroscope_sigma_rad_s**2, cfg.localizer.accelerometer_sigma_m_s2**2
-    sight = sm.SensorRows().take((0.0, 0.0, _ANGLE_RAD2), (0.0, gyroscope), (0.0, accelerometer))
+    variances = {sm.W: gyroscope, sm.PR: _ANGLE_RAD2, sm.PL: _ANGLE_RAD2, sm.A: accelerometer}
+    sight = sm.SensorRows([(state, 0.0, variance) for state, variance in variances.items()])
     x, readings = mean + 0.5 * sigma * rng.normal(size=sm.STATES), np.empty((STEPS, sight.R.size))
     for i in range(STEPS):
         x = motion.at(x)[0] + rng.multivariate_normal(np.zeros(sm.STATES), Q, method="svd")

@@ -25,8 +25,7 @@ from ccatp.config.models import Config
 from ccatp.core import EdgeSample, EventCode, Fix, FloatArray, GravitySample, ImuSample, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.seams import SensorTransition
-from ccatp.estimation.thesis_localizer import STATES, THETA, FourStateLocalizer
-from ccatp.filters import FILTERS
+from ccatp.estimation.thesis_localizer import THETA, FourStateLocalizer
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.records.summary import WITHIN_M
@@ -145,9 +144,7 @@ class _Replica(SilRun):
         self.monitor = _NoEdges(self.mirror, cfg.robot, cfg.danger)
         self.localizer, self.mission, self.gate = parts.localizer, parts.mission, parts.gate
         if cfg.run.filter == "kf":
-            filter_ = FILTERS["kf"](np.zeros(STATES), np.eye(STATES))
-            start = self.mirror.base_panel_pose
-            localizer = ThesisLocalizer(filter_, self.mirror, cfg.robot, cfg.localizer, start)
+            localizer = ThesisLocalizer(cfg, self.mirror, self.mirror.base_panel_pose)
             localizer.period_factor = 1.0 + period_error
             self.localizer = localizer
 

@@ -86,7 +86,7 @@ def nees(x: FloatArray, filter_: Filter, which: list[int]) -> float:
 def run(name: str, seed: int) -> Run:
     rng, m, full = np.random.default_rng(seed), mirror(), cfg().full_state
     inner = FILTERS[name](np.zeros(STATES), np.eye(STATES))
-    found = SurveyFilter(inner, m, config().robot, cfg(), {}, m.deck_pose(START))
+    found = SurveyFilter(inner, m, config(), {}, m.deck_pose(START))
     mean, P = inner.mean.copy(), inner.covariance.copy()
     mean[V] = 0.1
     inner.reset(mean, P)
@@ -109,7 +109,7 @@ def run(name: str, seed: int) -> Run:
         rate = (1.0 + x[KG]) * x[W] + x[BG] + sqrt(gyro / SAMPLES) * rng.normal()
         jumps = accelerometer / SAMPLES + full.acceleration_jump_m_s2**2
         block = PreintegratedMotion(DT_S, DT_S, float(rate), float(x[A] + x[BA] + sqrt(jumps) * rng.normal()), SAMPLES)
-        found.begin(k * DT_S, DT_S)
+        found.journal.begin(k * DT_S, DT_S)
         found.move(block, right, left, (gyro, accelerometer))
         if k in FIX_STEPS:
             found.fix(k * DT_S, x[:2] + FIX_SIGMA_M * rng.normal(size=2), FIX_SIGMA_M**2 * np.eye(2))

@@ -16,9 +16,19 @@ from ccatp.core import EdgeSample, GravitySample, ImuSample, PanelPose, WheelSam
 from ccatp.estimation.fixes import FixRefused
 from ccatp.estimation.odometry import arc_step
 from ccatp.estimation.thesis_localizer import FourStateLocalizer
-from ccatp.filters import FILTERS
 from tests.faults.linking import Measured
-from tests.unit.estimation.drive import STEEP, Errors, Frame, Robot, build, config, fix_at, mirror, run, trapeze
+from tests.unit.estimation.drive import (
+    STEEP,
+    Errors,
+    Frame,
+    Robot,
+    build,
+    changed,
+    fix_at,
+    mirror,
+    run,
+    trapeze,
+)
 
 FRAMES = 40
 WRONG = Errors(right_slip=0.02, left_slip=0.01, creep=0.02, gyro_bias=0.01, noise=1.0)
@@ -27,8 +37,7 @@ again_frames = st.lists(st.tuples(st.integers(0, FRAMES - 1), st.integers(0, 4))
 
 
 def four_states() -> FourStateLocalizer:
-    cfg = config()
-    return FourStateLocalizer(FILTERS["kf"](np.zeros(4), np.eye(4)), mirror(), cfg.robot, cfg.localizer, STEEP)
+    return FourStateLocalizer(changed("kf"), mirror(), STEEP)
 
 
 MAKE: dict[str, Callable[[], Any]] = {"four states": four_states, "full state": build}

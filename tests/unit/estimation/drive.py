@@ -28,8 +28,8 @@ from ccatp.core import (
     difference,
 )
 from ccatp.estimation.full_state import FullStateLocalizer
-from ccatp.estimation.state_model import STATES
-from ccatp.filters import FILTERS
+from ccatp.estimation.localizer_base import FilterWrap, unwrapped
+from ccatp.localizer import Localizer, build_localizer
 from ccatp.mirror.mirror import Mirror, build_mirror
 
 Rate = Callable[[float], float]
@@ -60,16 +60,27 @@ def mirror() -> Mirror:
 
 
 def build(
-    name: str = "ekf", start: PanelPose = STEEP, use: dict[str, bool] | None = None, **changes: float
+    name: str = "ekf",
+    start: PanelPose = STEEP,
+    use: dict[str, bool] | None = None,
+    wrap: FilterWrap = unwrapped,
+    **changes: float,
 ) -> FullStateLocalizer:
     """A localizer; ``use`` sets switches, ``changes`` entries of [localizer.full_state] and [localizer]."""
+    found = build_localizer(changed(name, use, **changes), mirror(), wrap, start)
+    assert isinstance(found, FullStateLocalizer)
+    return found
+
+
+def changed(name: str = "ekf", use: dict[str, bool] | None = None, **changes: float) -> Config:
     cfg = config().localizer
     full = cfg.full_state
     of_full = {key: value for key, value in changes.items() if hasattr(full, key)}
     of_both = {key: value for key, value in changes.items() if hasattr(cfg, key) and key not in of_full}
     full = full.model_copy(update={"use": full.use.model_copy(update=use or {}), **of_full})
     cfg = cfg.model_copy(update={"full_state": full, **of_both})
-    return FullStateLocalizer(FILTERS[name](np.zeros(STATES), np.eye(STATES)), mirror(), config().robot, cfg, start)
+    run = config().run.model_copy(update={"filter": name})
+    return config().model_copy(update={"localizer": cfg, "run": run})
 
 
 def nothing(_: float) -> float:
@@ -229,6 +240,17 @@ class Robot:
         return fix_at(self.t_s if t_s is None else t_s, (self.x_m + off_m[0], self.y_m + off_m[1]), sigma_m)
 
 
+def shifted(frame: Frame, by_s: float) -> Frame:
+    """A frame of a robot whose clock is ahead."""
+    return Frame(
+        frame.t_s + by_s,
+        [s._replace(t_s=s.t_s + by_s) for s in frame.imu],
+        [s._replace(t_s=s.t_s + by_s) for s in frame.encoders],
+        [s._replace(t_s=s.t_s + by_s) for s in frame.edges],
+        None,
+    )
+
+
 def fix_at(t_s: float, xy_m: tuple[float, float], sigma_m: float = 1e-5) -> Fix:
     """A fix of a robot that stands at a deck point."""
     puck: Vector3 = mirror().puck_world(DeckPose(*xy_m, 0.0), config().robot.puck_height_m)
@@ -236,12 +258,12 @@ def fix_at(t_s: float, xy_m: tuple[float, float], sigma_m: float = 1e-5) -> Fix:
     return Fix(t_s, puck, (c, 0.0, 0.0, 0.0, c, 0.0, 0.0, 0.0, c), 1.5, (1, 2, 3, 4), 1e-6)
 
 
-def run(localizer: FullStateLocalizer, frames: list[Frame]) -> None:
+def run(localizer: Localizer, frames: list[Frame]) -> None:
     for frame in frames:
         localizer.step(*frame)
 
 
-def errors_of(localizer: FullStateLocalizer, pose: DeckPose) -> tuple[float, float]:
+def errors_of(localizer: Localizer, pose: DeckPose) -> tuple[float, float]:
     """Distance (m) and heading error (rad) of the estimate."""
     found = localizer.deck_pose
     return hypot(found.x_m - pose.x_m, found.y_m - pose.y_m), difference(found.heading_rad, pose.heading_rad)

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from ccatp.core import Fix, FloatArray
-from ccatp.estimation.fixes import FixGated, FixRefused
+from ccatp.estimation.fixes import FixGated, FixRefused, fix_row
 from ccatp.estimation.full_state import FullStateLocalizer
-from ccatp.estimation.state_filter import ReplayBuffer, Step, SurveyFilter
-from ccatp.estimation.state_model import STATES, V, W
-from ccatp.filters import FILTERS, KalmanFilter
+from ccatp.estimation.localizer_base import unwrapped
+from ccatp.estimation.state_filter import ReplayBuffer
+from ccatp.estimation.state_model import STATES, Terrain, V, W, X, Y
+from ccatp.filters import KalmanFilter
 from tests.unit.estimation.drive import (
     FRAME_S,
     STEEP,
@@ -20,14 +21,14 @@ from tests.unit.estimation.drive import (
     Rate,
     Robot,
     build,
-    config,
     errors_of,
     fix_at,
     mirror,
     run,
+    shifted,
     trapeze,
 )
-from tests.unit.estimation.test_full_state import NOISY, fragile, shifted
+from tests.unit.estimation.test_full_state import NOISY, fragile
 from tests.unit.estimation.test_full_state import STRAIGHT as RecoveriesSTRAIGHT
 from tests.unit.estimation.test_seams import across_it, before_a_seam
 
@@ -39,20 +40,19 @@ class Recorded:
     """A linear filter of two states and its journal; a step every 0.1 s."""
 
     def __init__(self, reach_s: float = 10.0) -> None:
-        self.filter, self.journal = KalmanFilter(np.zeros(2), np.eye(2)), ReplayBuffer(reach_s)
+        self.filter = KalmanFilter(np.zeros(2), np.eye(2))
+        self.journal = ReplayBuffer(self.filter, reach_s)
 
     def step(self, k: int) -> None:
-        self.journal.begin(0.1 * k, 0.1, self.filter)
-        steps: tuple[Step, ...] = (lambda: self.filter.predict(F, Q), lambda: self.measure(0.3 * k, H))
-        for step in steps:
-            self.journal.add(step)
-            step()
+        self.journal.begin(0.1 * k, 0.1)
+        self.journal.do(lambda: self.filter.predict(F, Q))
+        self.journal.do(lambda: self.measure(0.3 * k, H))
 
     def measure(self, z: float, row: FloatArray) -> None:
         self.filter.update(np.array([z]), row, R)
 
     def late(self, t_s: float, z: float) -> int:
-        return self.journal.take(t_s, lambda _: self.measure(z, np.array([[0.2, 1.0]])), self.filter)
+        return self.journal.take(t_s, lambda _: self.measure(z, np.array([[0.2, 1.0]])))
 
 
 def same(one: Recorded, other: Recorded) -> None:
@@ -91,7 +91,7 @@ def test_a_look_back_changes_nothing() -> None:
         found.step(k)
         means.append(found.filter.mean)
     for t_s, index, late_s in ((0.1, 0, 0.0), (0.15, 1, 0.05), (0.2, 1, 0.0), (0.4, 3, 0.0), (9.0, 3, 0.0)):
-        mean, _, late = found.journal.look(t_s, found.filter)
+        mean, _, late = found.journal.look(t_s)
         assert mean is means[index]
         assert late == pytest.approx(late_s, abs=1e-12)
     assert found.filter.mean is means[-1]
@@ -99,21 +99,15 @@ def test_a_look_back_changes_nothing() -> None:
 
 @pytest.mark.parametrize("late_s", [0.01, 0.03])
 def test_the_row_of_a_late_fix_is_its_derivative(late_s: float) -> None:
-    inner = FILTERS["ekf"](np.zeros(STATES), np.eye(STATES))
-    found = SurveyFilter(
-        inner,
-        mirror(),
-        config().robot,
-        config().localizer,
-        {},
-        mirror().deck_pose(STEEP),
-    )
-    x, z, step = inner.mean.copy(), inner.mean[:2] + 1e-3, 1e-6
+    x, terrain, step = build().state[0].copy(), Terrain(mirror()), 1e-6
+    z = x[:2] + 1e-3
     x[[V, W]] = 0.1, 0.5
-    _, row = found._fix_row(z, x, late_s)
-    residuals = [
-        [found._fix_row(z, x + sign * step * unit, late_s)[0] for sign in (-1.0, 1.0)] for unit in np.eye(STATES)
-    ]
+
+    def row_at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return fix_row(z, x, terrain.at(float(x[X]), float(x[Y])), late_s)
+
+    _, row = row_at(x)
+    residuals = [[row_at(x + sign * step * unit)[0] for sign in (-1.0, 1.0)] for unit in np.eye(STATES)]
     numeric = np.array([(before - after) / (2.0 * step) for before, after in residuals]).T
     # Rounding of metres over the step; that the slope under the robot moves with it is left out: f'' v late = 5e-5.
     np.testing.assert_allclose(row, numeric, atol=1e-4)
@@ -161,7 +155,7 @@ class Story:
         self, name: str, filter_name: str = "ekf", use: dict[str, bool] | None = None, **changes: float
     ) -> None:
         self.frames, self.fixes = driven(name)
-        self._listener = partial(build, filter_name, STEEP, use, **changes)
+        self._listener = partial(build, filter_name, STEEP, use, unwrapped, **changes)
         self.ends: list[int] = []
         listener = self._listener()
         for k, frame in enumerate(self.frames):
@@ -259,10 +253,8 @@ def test_a_standstill_however_long_does_not_grow_and_takes_a_measurement_of_its_
     stood_s, z = 0.1 * walked, 0.7
     row = np.array([[0.0, 1.0]])
     for k in range(1000):
-        recorded.journal.begin(stood_s + 0.1 * (k + 1), 0.0, recorded.filter)
-        step = partial(recorded.measure, 0.0, row)
-        recorded.journal.add(step)
-        step()
+        recorded.journal.begin(stood_s + 0.1 * (k + 1), 0.0)
+        recorded.journal.do(partial(recorded.measure, 0.0, row))
         kept = sum(len(entry.steps) for entry in recorded.journal._entries)
         assert kept <= 2 * walked + reach_s / 0.1 + 1
     assert len(recorded.journal._entries) == 2

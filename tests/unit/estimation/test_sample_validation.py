@@ -20,7 +20,7 @@ ONE = WheelSample(1.002, 1.0, 2.0)
 
 def intake() -> SampleValidator:
     """One that has used samples up to 1.001 s."""
-    found = SampleValidator(HISTORY_S, Counter())
+    found = SampleValidator(HISTORY_S, 7.0, Counter())
     found.wheels(1.001, [WheelSample(1.0, 0.0, 0.0), WheelSample(1.001, 0.0, 0.0)])
     return found
 
@@ -57,7 +57,6 @@ def test_wheel_samples_are_judged_one_by_one(
     samples: list[WheelSample], right: list[float], left: list[float], refused: dict[str, int]
 ) -> None:
     found = intake()
-    found.largest_rate_rad_s = 7.0
     (right_times, right_rates), (left_times, left_rates) = found.wheels(1.01, samples)
     assert (list(right_times), list(left_times)) == (right, left)
     assert (len(right_rates), len(left_rates)) == (len(right), len(left))

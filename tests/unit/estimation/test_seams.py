@@ -342,12 +342,11 @@ def test_the_next_leg_is_given_what_bayes_gives_it(full: FullStateConfig) -> Non
             row[DRAWN] = TO_PARAMETERS[k]
             x, P = update(x, P, row, z, noise)
             seen[k].append(z)
-        redraw = book.begin(x, P)  # no fix has ended the leg: the scatter of the slip is as before
+        F, b, Q = book.begin(x, P)  # no fix has ended the leg: the scatter of the slip is as before
         posterior = P[np.ix_(DRAWN, DRAWN)]
-        mean = redraw.mean + redraw.F @ (x[DRAWN] - redraw.found)
-        covariance = redraw.F @ posterior @ redraw.F.T + redraw.Q
+        mean, covariance = F @ x[DRAWN] + b, F @ posterior @ F.T + Q
         found = TO_PARAMETERS @ covariance @ TO_PARAMETERS.T
-        across = TO_PARAMETERS @ redraw.F @ posterior @ TO_PARAMETERS.T  # of the next leg's with the last one's
+        across = TO_PARAMETERS @ F @ posterior @ TO_PARAMETERS.T  # of the next leg's with the last one's
         for k in range(3 if leg == 0 else 2):
             told = by_bayes(*priors[k], scatters[k], seen[k], noises[k])
             assert TO_PARAMETERS[k] @ mean == pytest.approx(told.mean, rel=1e-9)  # rounding
@@ -362,11 +361,9 @@ def drive(book: SlipPrior, slips: list[tuple[float, float]], noise: float) -> No
     x, P = state(*book.first())
     for k, (right, left) in enumerate(slips):
         if k:
-            redraw = book.begin(x, P)
-            F, Q = np.eye(STATES), np.zeros((STATES, STATES))
-            F[np.ix_(DRAWN, DRAWN)], Q[np.ix_(DRAWN, DRAWN)] = redraw.F, redraw.Q
-            x[DRAWN] = redraw.mean + redraw.F @ (x[DRAWN] - redraw.found)
-            P = F @ P @ F.T + Q
+            F, b, Q = np.eye(STATES), np.zeros(STATES), np.zeros((STATES, STATES))
+            F[np.ix_(DRAWN, DRAWN)], b[DRAWN], Q[np.ix_(DRAWN, DRAWN)] = book.begin(x, P)
+            x, P = F @ x + b, F @ P @ F.T + Q
         for state_, slip in ((SR, right), (SL, left)):
             x, P = update(x, P, np.eye(STATES)[state_], slip + sqrt(noise) * float(rng.normal()), noise)
         book.end(x, P)

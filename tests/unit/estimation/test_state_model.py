@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccatp.core import DeckPose, FloatArray, PanelId, difference
-from ccatp.estimation.full_state import PanelFrame
 from ccatp.estimation.seams import axes_on
 from ccatp.estimation.state_model import (
     BA,
@@ -34,7 +33,7 @@ from ccatp.estimation.state_model import (
     Y,
 )
 from ccatp.mirror.mirror import Mirror
-from tests.unit.estimation.drive import STEEP, Errors, Robot, config
+from tests.unit.estimation.drive import STEEP, Errors, Robot, build, config
 
 R_M, BASE_M = config().robot.wheel_radius_m, config().robot.wheel_base_m
 STEP = 1e-5
@@ -160,11 +159,8 @@ def test_rows_jacobian_is_their_derivative(given_rows: tuple[bool, bool, bool]) 
 
 
 def taken(has_counts: bool, has_rate: bool, has_acceleration: bool) -> SensorRows:
-    return SensorRows().take(
-        (1.0, 2.0, 0.1) if has_counts else None,
-        (3.0, 0.2) if has_rate else None,
-        (4.0, 0.3) if has_acceleration else None,
-    )
+    rate, counts, acceleration = [(W, 3.0, 0.2)], [(PR, 1.0, 0.1), (PL, 2.0, 0.1)], [(A, 4.0, 0.3)]
+    return SensorRows(has_rate * rate + has_counts * counts + has_acceleration * acceleration)
 
 
 def test_rows_say_what_each_sensor_reads() -> None:
@@ -240,27 +236,21 @@ def test_the_robots_axes_are_the_mirrors(mirror: Mirror) -> None:
 
 def test_a_pose_in_a_panels_frame_is_the_mirrors(mirror: Mirror) -> None:
     for k, (x, y) in enumerate(places(mirror, 50, 6)):
-        frame, psi = PanelFrame(mirror, PanelId(4, 4)), 0.37 * k - 9.0
-        found = frame.locate((x, y, psi), mirror.surface.height_m(x, y), Terrain(mirror).at(x, y))
-        expected = mirror.panel_pose(mirror.panel_at(x, y) or PanelId(4, 4), DeckPose(x, y, psi))
-        assert found.panel == expected.panel
-        assert (found.x_m, found.y_m) == pytest.approx((expected.x_m, expected.y_m), abs=1e-14)  # rounding of metres
-        assert abs(difference(found.heading_rad, expected.heading_rad)) < 1e-14
+        found = build(start=mirror.panel_pose(mirror.nearest_panel(x, y), DeckPose(x, y, 0.37 * k - 9.0)))
+        expected = mirror.panel_pose(mirror.nearest_panel(x, y), found.deck_pose)
+        assert found.pose.panel == expected.panel
+        assert (found.pose.x_m, found.pose.y_m) == pytest.approx((expected.x_m, expected.y_m), abs=1e-14)  # rounding
+        assert abs(difference(found.pose.heading_rad, expected.heading_rad)) < 1e-14
 
 
-def panel_below(frame: PanelFrame, mirror: Mirror, x_m: float, y_m: float) -> PanelId:
-    return frame.locate((x_m, y_m, 0.0), 0.0, Terrain(mirror).at(x_m, y_m)).panel
-
-
-def test_the_panel_changes_in_the_middle_of_the_gap(mirror: Mirror) -> None:
+@pytest.mark.parametrize(
+    ("panel", "off_m", "under"),  # in the frame of the first
+    [((4, 4), -1e-6, (4, 4)), ((4, 4), 1e-6, (4, 5)), ((4, 5), -1e-6, (4, 4)), ((5, 1), -1.0, (5, 1))],
+)
+def test_the_panel_changes_in_the_middle_of_the_gap_and_stays_beside_the_mirror(
+    mirror: Mirror, panel: tuple[int, int], off_m: float, under: tuple[int, int]
+) -> None:
     here, there = mirror.panel(PanelId(4, 4)), mirror.panel(PanelId(4, 5))
-    frame, middle = PanelFrame(mirror, here.id), 0.5 * (here.x_m + there.x_m)
-    for x, panel in ((here.x_m, here), (middle - 1e-6, here), (middle + 1e-6, there), (middle - 1e-6, here)):
-        assert panel_below(frame, mirror, x, here.y_m) == panel.id
-        centre = (panel.x_m, panel.y_m, 0.0), panel.origin[2], Terrain(mirror).at(panel.x_m, panel.y_m)
-        assert frame.locate(*centre).x_m == pytest.approx(0.0, abs=1e-15)
-
-
-def test_beside_the_mirror_the_last_panel_stays(mirror: Mirror) -> None:
-    frame = PanelFrame(mirror, PanelId(5, 1))
-    assert panel_below(frame, mirror, mirror.panel(PanelId(5, 1)).x_m - 1.0, 0.0) == PanelId(5, 1)
+    x_m = mirror.panel(PanelId(*panel)).x_m if panel == (5, 1) else 0.5 * (here.x_m + there.x_m)
+    start = mirror.panel_pose(PanelId(*panel), DeckPose(x_m + off_m, here.y_m, 0.0))
+    assert build(start=start).pose.panel == under

@@ -8,8 +8,6 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import EdgeSample, Fix, ImuSample, PanelId, WheelSample
-from ccatp.estimation.thesis_localizer import STATES
-from ccatp.filters import FILTERS
 from ccatp.mirror.mirror import build_mirror
 from ccatp.studies import cramer_rao as cr
 from ccatp.studies.campaign import CellResult, Job, JobOutcome
@@ -35,8 +33,7 @@ MIRROR = build_mirror(CFG.mirror)
 
 
 def built() -> ThesisLocalizer:
-    filter_ = FILTERS["kf"](np.zeros(STATES), np.eye(STATES))
-    return ThesisLocalizer(filter_, MIRROR, CFG.robot, CFG.localizer, MIRROR.base_panel_pose)
+    return ThesisLocalizer(CFG, MIRROR, MIRROR.base_panel_pose)
 
 
 def step(localizer: ThesisLocalizer, t_s: float, rate: float) -> None:
