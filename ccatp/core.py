@@ -265,14 +265,7 @@ def twist_of(right_rad_s: float, left_rad_s: float, wheel_radius_m: float, wheel
 
 
 # By the signal; whatever is stale or missing has an age. A signal that stands for several quantities has none.
-_UNITS = {
-    "estimate": "s",
-    "sensors": "s",
-    "enc": "s",
-    "frames": "s",
-    "clock": "s",
-    "latency": "s",
-    "radio": "s",
+_UNITS = dict.fromkeys(("estimate", "sensors", "enc", "frames", "clock", "latency", "radio"), "s") | {
     "encoders": "m/s",
     "imu_wz": "rad/s",
     "position": "m",
@@ -290,6 +283,6 @@ def danger_text(cause: str, signal: str, value: float, limit: float) -> str:
         return cause + where
     is_age = cause.startswith("no ") or "stale" in cause
     unit = "s" if is_age else _UNITS.get(signal, "")
-    told, bound = (f"{number:.4g} {unit}".rstrip() for number in (value, limit))
+    shown, bound = (f"{number:.4g} {unit}".rstrip() for number in (value, limit))
     # Of what was never there the age is put at the limit.
-    return f"{cause}{where}: " + (f"limit {bound}" if told == bound else f"{told} (limit {bound})")
+    return f"{cause}{where}: " + (f"limit {bound}" if shown == bound else f"{shown} (limit {bound})")

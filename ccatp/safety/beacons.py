@@ -20,7 +20,6 @@ from math import atan2, cos, hypot, inf, isfinite, log, pi, sin, sqrt
 from typing import NamedTuple
 
 from ccatp.conditions import (
-    EMERGENCY,
     NO_FRAME,
     NO_FRESH_ESTIMATE,
     OBSTACLE_AHEAD,
@@ -31,11 +30,11 @@ from ccatp.conditions import (
     MonitorFinding,
 )
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.core import EmergencyKind, EventCode, Severity, Verdict, wrap_pi
+from ccatp.core import EventCode, Severity, Verdict, wrap_pi
 from ccatp.links.beacon_messages import BeaconFrame
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
-from ccatp.safety.emergency_latch import INFORMED_AFTER_FRAMES, EmergencyLatch, is_at_base_or_held
+from ccatp.safety.emergency_latch import EmergencyRules
 
 
 class _Obstacle(NamedTuple):
@@ -93,18 +92,18 @@ class ObstacleBuffer:
 _NORMAL, _NEAR, _ABORTED = EventCode
 
 
-class BeaconSafetyRules:
+class BeaconSafetyRules(EmergencyRules):
     """Judges frames. Call ``step`` once per frame, ``stale`` when no frame came in time."""
 
     def __init__(self, cfg: RadioConfig) -> None:
         self._danger, self._follow, self._loss = cfg.danger, cfg.follow, cfg.path_loss
         self._avoidance, self._vehicle, self._radius_m = cfg.avoidance, cfg.vehicle, cfg.robot.wheel_radius_m
-        self.latch = EmergencyLatch()
         self._denials: Counter[str] = Counter()
-        self.reset()
+        super().__init__()
 
     def reset(self) -> None:
         """The robot has booted: its clock starts again. Emergencies stay latched."""
+        super().reset()
         self._radio_s: float | None = None
         self._levels: deque[tuple[float, float]] = deque()
         avoidance = self._avoidance
@@ -113,38 +112,9 @@ class BeaconSafetyRules:
         self._steer_rad = 0.0
         self._held_since_s: float | None = None
         self._is_vague = False
-        self._state, self._state_seq = "idle", -1
+        self._state, self._state_seq = "idle", 0
         self._frame_seq = -1
-        self._raised_seq = -INFORMED_AFTER_FRAMES - 2  # the frame in which the newest emergency was raised
-        self._code = _NORMAL
-
-    # -- for the observatory --------------------------------------------------------------------------------------
-
-    @property
-    def code(self) -> EventCode:
-        """The event code now."""
-        return self._code
-
-    @property
-    def at_base_or_held(self) -> bool:
-        """Whether main's newest estimate says so; see ``DangerMonitor.at_base_or_held``."""
-        return self._state_seq > self._raised_seq + INFORMED_AFTER_FRAMES and is_at_base_or_held(self._state)
-
-    def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
-        """Latch an emergency; returns why it was refused, or None."""
-        before = self.latch.raised
-        refusal = self.latch.raise_emergency(kind, emergency_id, note)
-        if self.latch.raised != before:
-            self._raised_seq = self._frame_seq
-        return refusal
-
-    def holds(self, emergency_id: str) -> bool:
-        """Whether the emergency with that id is active."""
-        return self.latch.holds(emergency_id)
-
-    def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
-        """End an emergency; returns why it was refused, or None."""
-        return self.latch.clear(emergency_id, at_base_or_held)
+        self.code = _NORMAL
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
@@ -162,7 +132,7 @@ class BeaconSafetyRules:
         else:
             self._held_since_s = None
             verdict = self._near(sensors)
-        self._code = verdict.code
+        self.code = verdict.code
         if verdict.signal:
             self._denials[verdict.signal] += 1
         return self.latch.with_emergencies(verdict)
@@ -170,7 +140,8 @@ class BeaconSafetyRules:
     def stale(self, seq: int, t_s: float) -> Verdict:
         """The verdict when no frame came for ``stale_after_s``: nothing permitted."""
         limit_s = self._danger.stale_after_s
-        return self.latch.with_emergencies(self._denied(seq, t_s, NO_FRAME.found("sensors", limit_s, limit_s)))
+        found = NO_FRAME.found("sensors", limit_s, limit_s)
+        return self.latch.with_emergencies(found.verdict(seq, t_s, self._unmoved_code))
 
     def garbled(self, seq: int, t_s: float, _at_s: float) -> Verdict | None:
         """A line of the robot was no frame: nothing permitted until the next one."""
@@ -235,16 +206,15 @@ class BeaconSafetyRules:
         held_s = sensors.t - self._held_since_s
         if held_s > self._danger.hold_limit_s:
             hold = hold._replace(severity=Severity.FAULT, cause=f"{hold.cause} for {held_s:.0f} s")
-        return self._denied(sensors.seq, sensors.t, hold)
+        return hold.verdict(sensors.seq, sensors.t, self._unmoved_code)
 
-    def _denied(self, seq: int, t_s: float, found: MonitorFinding) -> Verdict:
-        code = _ABORTED if self.latch.is_latched else _NORMAL
-        shown = found.cause, found.signal, found.value, found.limit
-        return Verdict(seq, t_s, code, *shown, False, False, False, severity=found.severity)
+    @property
+    def _unmoved_code(self) -> EventCode:
+        return _ABORTED if self.latch.is_latched else _NORMAL
 
     def _near(self, sensors: Sensors) -> Verdict:
         seq, t_s, danger = sensors.seq, sensors.t, self._danger
-        emergency = self._emergency(seq, t_s)
+        emergency = self.latch.verdict(seq, t_s)
         if emergency is not None and not emergency.forward:
             return emergency
         ahead_m = self._echoes.nearest_m(self._steer_rad, danger.ahead_rad)
@@ -271,12 +241,3 @@ class BeaconSafetyRules:
         decades = (reference_dbm - mean_dbm) / (10.0 * loss.exponent)
         sigma = self._danger.target_level_sigma_db * log(10.0) / (10.0 * loss.exponent) / sqrt(len(self._levels))
         return float(10.0**decades) * (1.0 - min(sigma, 1.0))
-
-    def _emergency(self, seq: int, t_s: float) -> Verdict | None:
-        newest = self.latch.newest
-        if newest is None:
-            return None
-        # Whoever drives while the ground shakes slips; the others are fled from.
-        kind, may_move = (EmergencyKind.EARTHQUAKE, False) if self.latch.is_shaking else (newest.kind, True)
-        cause, signal = EMERGENCY.message.format(kind=kind), f"emergency:{kind}"
-        return Verdict(seq, t_s, _ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move)

@@ -4,7 +4,7 @@ from enum import Enum, auto
 from math import cos, hypot, inf, sin, sqrt
 from typing import Literal, NamedTuple
 
-from ccatp.conditions import Cause
+from ccatp.conditions import BEYOND_SEAM, NO_SEAM, OFF_WITHOUT_WHEELS, RIM_AHEAD, Condition
 from ccatp.config.models import DangerConfig
 from ccatp.core import DeckPose, PanelId
 from ccatp.mirror.mirror import Mirror
@@ -157,7 +157,7 @@ class EdgeDetector:
         self.retreat_m = 0.0
         self.is_doubted = False
         self.phase = EdgePhase.FRESH
-        self.cause: Cause | None = None
+        self.cause: Condition = NO_SEAM  # once it is declared
         self.value_m = self.limit_m = 0.0
 
     def place_on_map(self, place: Place, deck_heading_rad: float, sigma_m: float) -> None:
@@ -197,7 +197,7 @@ class EdgeDetector:
             return False
         self._declared_place = place
         if worst_m > self._limits.no_map_m:
-            return self._declare(Cause.SILENT_WHEELS, worst_m, self._limits.no_map_m)
+            return self._declare(OFF_WITHOUT_WHEELS, worst_m, self._limits.no_map_m)
         c, s, sensor0, robot0 = self._cos, self._sin, self._sensor0, self._robot0
         dx, dy = place[0] - sensor0[0], place[1] - sensor0[1]
         self._moved = c * dx - s * dy, s * dx + c * dy
@@ -285,19 +285,19 @@ class EdgeDetector:
         return self.phase is EdgePhase.SEAM and self._judge_seam(robot)
 
     def _declare_rim(self) -> bool:
-        return self._declare(Cause.RIM, hypot(*self._moved), 0.0)
+        return self._declare(RIM_AHEAD, hypot(*self._moved), 0.0)
 
     def _judge_no_map(self) -> bool:
         ux, uy = self._direction
         mx, my = self._moved
         travel = hypot(max(ux * mx + uy * my, 0.0), ux * my - uy * mx)
-        return travel > self._limits.no_map_m and self._declare(Cause.NO_MAP, travel, self._limits.no_map_m)
+        return travel > self._limits.no_map_m and self._declare(NO_SEAM, travel, self._limits.no_map_m)
 
     def _judge_seam(self, robot: Place) -> bool:
         value, limit = self._seam_excess(robot)
         if value <= limit or self._switch_seam(robot):
             return False
-        return self._declare(Cause.SEAM, value, limit)
+        return self._declare(BEYOND_SEAM, value, limit)
 
     def _seam_excess(self, robot: Place) -> tuple[float, float]:
         """The travel that is over its limit, and that limit; else what translation has used up of its allowance."""
@@ -337,7 +337,7 @@ class EdgeDetector:
         self._set_seam(seam.axis)
         return True
 
-    def _declare(self, cause: Cause, value_m: float, limit_m: float) -> bool:
+    def _declare(self, cause: Condition, value_m: float, limit_m: float) -> bool:
         self.phase = EdgePhase.DECLARED
         self.cause, self.value_m, self.limit_m = cause, value_m, limit_m
         self._declared_heading = self._heading

@@ -49,12 +49,9 @@ class EdgeRule:
     """
 
     def __init__(self, edge_map: EdgeMap, robot: RobotConfig, cfg: DangerConfig) -> None:
-        self._map = edge_map
+        self._map, self._robot, self._stale_after_s = edge_map, robot, cfg.stale_after_s
+        self._reach_s = 2.0 * max(cfg.stale_after_s, cfg.estimate_stale_after_s)
         self._offsets = robot.edge_sensors_m
-        reach_s = 2.0 * max(cfg.stale_after_s, cfg.estimate_stale_after_s)
-        self.track = WheelTrack(
-            robot.wheel_radius_m, robot.wheel_base_m, cfg.stale_after_s, reach_s, largest_rate_rad_s(robot)
-        )
         self._limits = EdgeLimits(edge_map.gap_m, cfg)
         self._half_base_m = 0.5 * robot.wheel_base_m
         self._clear_samples, self._lifted_samples = cfg.clear_samples, cfg.lifted_samples
@@ -64,8 +61,11 @@ class EdgeRule:
 
     def reset(self) -> None:
         """Forget episodes, odometry and times: the robot's clock was reset."""
-        self.track.reset()
-        self.episodes: tuple[EdgeDetector | None, ...] = (None, None, None, None)
+        robot = self._robot
+        self.track = WheelTrack(
+            robot.wheel_radius_m, robot.wheel_base_m, self._stale_after_s, self._reach_s, largest_rate_rad_s(robot)
+        )
+        self.episodes: list[EdgeDetector | None] = [None] * SENSORS
         self._odometry: Odometry | None = None
         self._last_t_s: float | None = None
         self._all_off = self._all_on = 0
@@ -95,7 +95,10 @@ class EdgeRule:
             if self._last_t_s is None or sample[0] > self._last_t_s:
                 self._sample(sample, self._odometry, estimate)
                 self._last_t_s = sample[0]
-        self._look_ahead()
+        # Rule (a) again, once per frame, for what is off and moves: a seam may lead to the rim.
+        for i, episode in enumerate(self.episodes):
+            if episode is not None and episode.phase is not EdgePhase.DECLARED and episode.look_ahead():
+                self.declared[i] += 1
         if estimate is not None and self._has_fix(self._odometry, estimate.sigma_m):
             self._look_again(self._odometry, estimate)
         if not any(self.episodes) and not self.is_lifted:
@@ -119,7 +122,7 @@ class EdgeRule:
             place = odometry.x_m + c * ox - s * oy, odometry.y_m + s * ox + c * oy
             if is_on:
                 if episode.see_on(place):
-                    self._replace(i, None)
+                    self.episodes[i] = None
             elif episode.see_off(odometry, place, silent_s * self._worst_m_s[i]):
                 self.declared[i] += 1
         self._count_all(off)
@@ -174,11 +177,8 @@ class EdgeRule:
         if estimate is not None:
             self._place(episode, (ox, oy), odometry, estimate)
         self.opened[i] += 1
-        self._replace(i, episode)
+        self.episodes[i] = episode
         return episode
-
-    def _replace(self, i: int, episode: EdgeDetector | None) -> None:
-        self.episodes = (*self.episodes[:i], episode, *self.episodes[i + 1 :])
 
     def _count_all(self, off: int) -> None:
         self._all_off = self._all_off + 1 if off == SENSORS else 0
@@ -186,18 +186,8 @@ class EdgeRule:
         if self._all_off >= self._lifted_samples:
             self.is_lifted = True
         elif self.is_lifted and self._all_on >= self._clear_samples:
-            self.reset_episodes()
-
-    def reset_episodes(self) -> None:
-        """Begin again on the panels: the robot has been put back."""
-        self.is_lifted = False
-        self.episodes = (None, None, None, None)
-
-    def _look_ahead(self) -> None:
-        """Rule (a) again, once per frame, for what is off and moves: a seam may lead to the rim."""
-        for i, episode in enumerate(self.episodes):
-            if episode is not None and episode.phase is not EdgePhase.DECLARED and episode.look_ahead():
-                self.declared[i] += 1
+            self.is_lifted = False  # put back on the panels
+            self.episodes = [None] * SENSORS
 
 
 def _are_all_on(samples: list[EdgeSample]) -> bool:
@@ -233,11 +223,6 @@ class CentreClearanceCheck:
         self._lead_m = min(min(abs(x), abs(y)) for x, y in robot.edge_sensors_m)
         self._sigmas, self._margin_m = cfg.map_sigmas, cfg.map_margin_m
         self._fastest_m_s = robot.wheel_radius_m * robot.max_wheel_rad_s
-        self.declared = 0
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget: the robot's clock was reset."""
         self.direction = 0
         self.clearance_m, self.limit_m = inf, 0.0
         self._look_at_s = -inf
@@ -269,4 +254,3 @@ class CentreClearanceCheck:
         y = estimate.y_m + ahead_m * sin(estimate.heading_rad)
         if self._rim.signed_distance_m(x, y) < self.clearance_m:
             self.direction = direction
-            self.declared += 1

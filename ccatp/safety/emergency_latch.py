@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import msgspec
 
-from ccatp.core import EmergencyKind, Verdict
+from ccatp.conditions import EMERGENCY
+from ccatp.core import EmergencyKind, EventCode, Verdict
 
 # An observatory has a handful at a time; a peer that floods the latch must not fill the memory.
 MAX_ACTIVE = 256
@@ -22,11 +23,6 @@ class Emergency:
     kind: EmergencyKind
     id: str
     note: str
-
-
-def is_at_base_or_held(state: str) -> bool:
-    """Whether a mission state, as main publishes it, means that the robot is at base or held."""
-    return state in AT_BASE_OR_HELD
 
 
 class EmergencyLatch:
@@ -57,6 +53,16 @@ class EmergencyLatch:
     def newest(self) -> Emergency | None:
         """The emergency raised last among the active ones."""
         return next(reversed(self._active.values())) if self._active else None
+
+    def verdict(self, seq: int, t_s: float) -> Verdict | None:
+        """That of the newest emergency, ``None`` without one; motion is permitted: the robot shall drive home."""
+        newest = self.newest
+        if newest is None:
+            return None
+        # Whoever drives while the ground shakes slips; the others are fled from.
+        kind, may_move = (EmergencyKind.EARTHQUAKE, False) if self.is_shaking else (newest.kind, True)
+        cause, signal = EMERGENCY.text(kind=kind), f"emergency:{kind}"
+        return Verdict(seq, t_s, EventCode.ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move)
 
     def with_emergencies(self, verdict: Verdict) -> Verdict:
         """A verdict, with what it does not say of emergencies where something else gave its code."""
@@ -109,3 +115,44 @@ class EmergencyLatch:
         if len(self._cleared) > MAX_CLEARED:
             del self._cleared[next(iter(self._cleared))]
         return None
+
+
+class EmergencyRules:
+    """What the observatory asks of the rules of a robot, of whatever kind.
+
+    A subclass keeps the number of the newest frame and main's newest word: the state
+    of the mission, empty where it is not known, and the frame of which it was said.
+    """
+
+    _frame_seq: int
+    _state: str
+    _state_seq: int
+
+    def __init__(self) -> None:
+        self.latch = EmergencyLatch()
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new session with the robot (its clock and numbers start again). Emergencies stay latched."""
+        self._raised_seq = -INFORMED_AFTER_FRAMES - 1  # the frame in which the newest emergency was raised
+
+    @property
+    def at_base_or_held(self) -> bool:
+        """Whether main's newest estimate says so, and knows of the newest emergency."""
+        return self._state_seq > self._raised_seq + INFORMED_AFTER_FRAMES and self._state in AT_BASE_OR_HELD
+
+    def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
+        """Latch an emergency; returns why it was refused, or None. The same id again is harmless."""
+        before = self.latch.raised
+        refusal = self.latch.raise_emergency(kind, emergency_id, note)
+        if self.latch.raised != before:
+            self._raised_seq = self._frame_seq
+        return refusal
+
+    def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
+        """End an emergency; returns why it was refused, or None."""
+        return self.latch.clear(emergency_id, at_base_or_held)
+
+    def holds(self, emergency_id: str) -> bool:
+        """Whether the emergency with that id is active."""
+        return self.latch.holds(emergency_id)

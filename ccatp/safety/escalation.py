@@ -15,13 +15,8 @@ class FindingLatch:
     __slots__ = ("_clear_s", "_seen_s", "finding")
 
     def __init__(self, clear_s: float) -> None:
-        self._clear_s = clear_s
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget."""
+        self._clear_s, self._seen_s = clear_s, -inf
         self.finding: MonitorFinding | None = None
-        self._seen_s = -inf
 
     def see(self, t_s: float, finding: MonitorFinding) -> None:
         """There is evidence at ``t_s``. The first values are kept, unless it has become graver."""
@@ -42,7 +37,6 @@ class Since:
     __slots__ = ("t_s",)
 
     def __init__(self) -> None:
-        """It is not so."""
         self.t_s: float | None = None
 
     def lasts(self, t_s: float, is_so: bool) -> float:
@@ -81,10 +75,10 @@ class SeverityEscalation:
         self._since_s: dict[str, float] = {}
         self._held: dict[str, deque[float]] = {}
 
-    def reset(self) -> None:
-        """The robot's clock was reset; what came back before does not count."""
-        self._since_s.clear()
-        self._held.clear()
+    @property
+    def is_counting(self) -> bool:
+        """Something was found in the last frame."""
+        return bool(self._since_s)
 
     def climb(self, t_s: float, findings: list[MonitorFinding]) -> list[MonitorFinding]:
         """All findings of a frame, raised where their time is up; an empty list ends every count of duration."""

@@ -1,30 +1,42 @@
 """All monitors of the danger loop but the edge rule, frame by frame, and what they find together."""
 
+from collections import deque
 from collections.abc import Callable, Sequence
-from math import hypot
+from math import hypot, inf
 
-from ccatp.conditions import CLOCK_JUMPED, FRAMES_LOST, LINES_GARBLED, MonitorFinding
+from ccatp.conditions import (
+    CLOCK_JUMPED,
+    FRAMES_LOST,
+    IMU_LEFT_OUT,
+    LINES_GARBLED,
+    UNKNOWN_REPORTED,
+    MonitorFinding,
+)
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
-from ccatp.control.motion_checks import ImuGate, MotionSum, SlidingWindow, WheelMeans
+from ccatp.control.motion_checks import ImuGate, MotionSum, WheelMeans
 from ccatp.core import EdgeSample, ImuSample, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety.escalation import FindingLatch
 from ccatp.safety.sensor_monitors import (
+    FANS,
+    REPORTED,
     BatteryMonitor,
     FanMonitor,
     FlickerMonitor,
     LatencyMonitor,
-    OwnFaults,
     RateMonitor,
     SeamMonitor,
 )
-from ccatp.safety.wheel_monitors import LATE_S, GyroscopeBias, WheelMonitor, YawMonitor, imu_finding
+from ccatp.safety.wheel_monitors import LATE_S, WheelMonitor
 
 _STANDS_RAD_S = 0.02  # a wheel's mean over a frame below which it stands: 0.6 mm/s
 _LOOK_FRAMES = 2  # the monitors judge one frame in so many while nothing is wrong; sums are kept in every one
 _SLOW_LOOK_FRAMES = 10  # what changes slowly is looked at this often
+# What the gyroscope shows at rest is bounded: garbage must not move it far.
+_BIAS_TIME_S = 0.5
+_LARGEST_BIAS_RAD_S = 0.35
 
 
 class HealthMonitor:
@@ -41,43 +53,37 @@ class HealthMonitor:
         mirror: Mirror,
         is_explained: Callable[[int], bool],
     ) -> None:
-        self._cfg, self._radius_m, self._base = cfg, robot.wheel_radius_m, mirror.base_pose
+        self._cfg, self._robot, self._mirror, self._is_explained = cfg, robot, mirror, is_explained
         self._means = WheelMeans(robot)
-        self._gate = ImuGate(cfg)
-        self._bias = GyroscopeBias()
-        self._shortly, self._stalling = SlidingWindow(cfg.runaway_time_s), SlidingWindow(cfg.stall_time_s)
-        self._turning = SlidingWindow(cfg.yaw_time_s)
-        self._wheels, self._yaw = WheelMonitor(cfg, robot), YawMonitor(cfg, robot)
-        self._rates, self._latency = RateMonitor(cfg), LatencyMonitor(cfg)
-        self._fans, self._battery = FanMonitor(cfg, robot.fan_duty, mirror.overhang), BatteryMonitor(cfg)
-        self._own = OwnFaults(cfg)
-        self.seams = SeamMonitor(cfg, mirror, robot, danger.map_sigmas)
-        self.flicker = FlickerMonitor(cfg, is_explained)
-        self._clock, self._gap = FindingLatch(cfg.imu_quarantine_s), FindingLatch(cfg.imu_quarantine_s)
-        self._garbled = FindingLatch(cfg.retry_after_s)
-        self._alarms = (
-            *(self._wheels.alarm, self._yaw.alarm, self._fans.alarm, self._latency.alarm),
-            *(self._clock, self._gap, self._garbled, self.flicker.chatter, self.flicker.flash),
-        )
+        self._bias_rad_s = 0.0
+        self._battery, self._seams = BatteryMonitor(cfg), SeamMonitor(cfg, mirror, robot, danger.map_sigmas)
+        self._garbled_s = deque([-inf] * cfg.garbled_lines, maxlen=cfg.garbled_lines)
         self.reset()
 
     def reset(self) -> None:
-        """Another boot of the robot."""
+        """Another boot of the robot. What was found of battery, gyroscope and blind edge sensors stays."""
+        cfg, robot = self._cfg, self._robot
+        self._gate = ImuGate(cfg)
+        self._wheels, self._rates, self._latency = WheelMonitor(cfg, robot), RateMonitor(cfg), LatencyMonitor(cfg)
+        self._fans = FanMonitor(cfg, robot.fan_duty, self._mirror.overhang)
+        self._flicker = FlickerMonitor(cfg, self._is_explained)
+        self._clock, self._gap = FindingLatch(cfg.imu_quarantine_s), FindingLatch(cfg.imu_quarantine_s)
+        self._garbled = FindingLatch(cfg.retry_after_s)
+        self._reported: dict[str, FindingLatch] = {}
+        self._latches = (
+            *(self._wheels.alarm, self._wheels.yaw, self._fans.alarm, self._latency.alarm),
+            *(self._clock, self._gap, self._garbled, self._flicker.chatter, self._flicker.flash),
+        )
+        self._battery.reset()
+        self._seams.reset()
         self._t_s: float | None = None
         self._sums = MotionSum(0.0, 0.0, 0.0, 0.0)
-        for part in (
-            *(self._gate, self._shortly, self._stalling, self._turning, self._wheels, self._yaw, self._rates),
-            *(self._latency, self._fans, self._battery, self._own, self.seams, self.flicker),
-            *(self._clock, self._gap, self._garbled),
-        ):
-            part.reset()
         self._estimate_seq = self._commands_seq = -1
         self._opened = (0, 0, 0, 0)
         self._home_m = 0.0
         self._frames = 0
         self._counts = [0, 0, 0]
         self._is_free, self._is_held, self._is_late = True, True, False
-        self._speed_m_s = 0.0
         self.findings: list[MonitorFinding] = []
 
     # -- frames ---------------------------------------------------------------------------------------------------
@@ -89,9 +95,15 @@ class HealthMonitor:
         self._gate.reset()
         self.findings = [finding]
 
-    def garbled(self) -> MonitorFinding:
-        """Too many lines that are no frames came since the last frame; what is found stays until frames come again."""
-        lines = float(self._cfg.garbled_lines)
+    def garbled(self, at_s: float) -> MonitorFinding | None:
+        """A line at ``at_s``, on any monotonic clock, was no frame; what is found where there were too many.
+
+        That stays until frames come again.
+        """
+        times_s, lines = self._garbled_s, float(self._cfg.garbled_lines)
+        times_s.append(at_s)
+        if at_s - times_s[0] > self._cfg.garbled_window_s:
+            return None
         finding = LINES_GARBLED.found("lines", lines, lines)
         self._garbled.see(self._t_s or 0.0, finding)
         self.findings = [finding]
@@ -122,47 +134,35 @@ class HealthMonitor:
         self._is_free = self._is_free and is_permitted and not frame.cmd.held
         self._is_held = self._is_held and frame.cmd.held
         self._is_late = self._is_late or (frame.cmd.age > LATE_S and not frame.cmd.held)
-        is_flickering = is_any_off or not self.flicker.is_quiet
+        is_flickering = is_any_off or not self._flicker.is_quiet
         self._frames += 1
-        if (
-            self._frames % _LOOK_FRAMES == 0
-            or is_flickering
-            or is_gap
-            or frame.faults
-            or self.findings
-            or self._gate.cause
-        ):
+        is_due = self._frames % _LOOK_FRAMES == 0 or is_flickering or is_gap
+        if is_due or frame.faults or self.findings or self._gate.cause:
             self._judge(t_s, frame, wheels)
             if is_flickering:
-                self.flicker.step(t_s, edges, self._speed_m_s)
+                self._flicker.step(t_s, edges, self._wheels.speed_m_s)
             self.findings = self._found(t_s)
 
     def _judge(self, t_s: float, frame: Sensors, wheels: Sequence[WheelSample]) -> None:
-        now = self._sums
-        shortly, stalling = self._shortly.push(now), self._stalling.push(now)
-        turning = self._turning.push(now)
         self._rates.step(t_s, *self._counts)
         self._counts = [0, 0, 0]
         self._wheels.step(
-            *(now, shortly, stalling, wheels),
+            *(self._sums, wheels),
             is_free=self._is_free,
             is_held=self._is_held,
             is_late=self._is_late,
             is_sparse=self._rates.are_encoders_sparse,
         )
         self._is_free, self._is_held, self._is_late = True, True, False
-        self._speed_m_s = 0.0
-        if shortly is not None:
-            self._speed_m_s = max(abs(shortly.right_m), abs(shortly.left_m)) / shortly.t_s
-        if turning is not None:
-            self._yaw.step(t_s, turning)
         self._latency.step(t_s, frame.cmd.seq)
-        faults = frame.faults
-        if faults or self._own.alarms:
-            self._own.step(t_s, faults)
-        self._fans.step(t_s, frame.fans, faults)
+        for name in frame.faults:
+            if name not in FANS and name != "battery_low":
+                latch = self._reported.setdefault(name, FindingLatch(self._cfg.retry_after_s))
+                condition = REPORTED.get(name, UNKNOWN_REPORTED)
+                latch.see(t_s, condition.found(name, 1.0, 0.0, side=name.removeprefix("encoder_")))
+        self._fans.step(t_s, frame.fans, frame.faults)
         if self._frames % _SLOW_LOOK_FRAMES < _LOOK_FRAMES:
-            self._battery.step(t_s, frame.soc, "battery_low" in faults, self._home_m)
+            self._battery.step(t_s, frame.soc, "battery_low" in frame.faults, self._home_m)
 
     def _added(self, imu: Sequence[ImuSample], dt_s: float) -> MotionSum:
         """The sums with this frame's motion. What is not known of it is taken to be none, of all."""
@@ -173,14 +173,15 @@ class HealthMonitor:
         if right is None or left is None:
             # Without one of them none is counted, so that they do not disagree about what is not known.
             return MotionSum(t_s, *sums[1:])
-        rolled_m = self._radius_m * dt_s
+        rolled_m = self._robot.wheel_radius_m * dt_s
         if usable:
             wz = usable[-1][2]
             if -_STANDS_RAD_S < right < _STANDS_RAD_S and -_STANDS_RAD_S < left < _STANDS_RAD_S:
-                self._bias.stand(wz, dt_s)
+                bounded = min(max(wz, -_LARGEST_BIAS_RAD_S), _LARGEST_BIAS_RAD_S)
+                self._bias_rad_s += dt_s / (_BIAS_TIME_S + dt_s) * (bounded - self._bias_rad_s)
                 turned = 0.0
             else:
-                turned = (wz - self._bias.rad_s) * dt_s
+                turned = (wz - self._bias_rad_s) * dt_s
         else:
             turned = means.yaw_rad_s * dt_s
         return MotionSum(t_s, sums[1] + right * rolled_m, sums[2] + left * rolled_m, sums[3] + turned)
@@ -194,7 +195,7 @@ class HealthMonitor:
             return
         self._commands_seq = estimate.seq
         if estimate.commanded is not None:
-            self._wheels.commands.push(t_s, estimate.commanded)
+            self._wheels.take_commands(t_s, estimate.commanded)
 
     def learn(self, t_s: float, estimate: EstimateMessage, opened: Sequence[int], is_off: Sequence[object]) -> None:
         """Take a fresh estimate of main's; a repeated one changes nothing.
@@ -210,22 +211,27 @@ class HealthMonitor:
             self._latency.sent(estimate.drive_seq, t_s)
         for i, count in enumerate(opened):
             if is_off[i] or count != self._opened[i]:
-                self.seams.went_off(i)
+                self._seams.went_off(i)
         self._opened = (opened[0], opened[1], opened[2], opened[3])
         x, y = estimate.x_m, estimate.y_m
-        self.seams.step(t_s, (x, y, estimate.heading_rad), estimate.sigma_m)
-        self._home_m = hypot(x - self._base.x_m, y - self._base.y_m)
+        self._seams.step(t_s, (x, y, estimate.heading_rad), estimate.sigma_m)
+        base = self._mirror.base_pose
+        self._home_m = hypot(x - base.x_m, y - base.y_m)
 
     def _found(self, t_s: float) -> list[MonitorFinding]:
         found = []
-        for alarm in self._alarms:
-            if alarm.finding is not None and (finding := alarm.settle(t_s)) is not None:
+        for latch in self._latches:
+            if latch.finding is not None and (finding := latch.settle(t_s)) is not None:
                 found.append(finding)
-        for other in (self._rates.finding, self._battery.finding, self.seams.finding):
+        for other in (self._rates.finding, self._battery.finding, self._seams.finding):
             if other is not None:
                 found.append(other)
-        if self._gate.cause:
-            found.append(imu_finding(self._gate))
-        if self._own.alarms:
-            found += [alarm.finding for alarm in self._own.alarms.values() if alarm.finding is not None]
+        gate = self._gate
+        if gate.cause:
+            found.append(IMU_LEFT_OUT.found("imu", gate.value, gate.limit, what=gate.cause))
+        for name, latch in list(self._reported.items()):
+            if (finding := latch.settle(t_s)) is None:
+                del self._reported[name]
+            else:
+                found.append(finding)
         return found

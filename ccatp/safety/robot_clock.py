@@ -25,12 +25,7 @@ class SteadyTime:
 
     def __init__(self, limit_s: float) -> None:
         self._limit_s = limit_s
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin again: another boot of the robot."""
-        self._seq, self._t_s = -1, 0.0
-        self._period_s = 0.0
+        self._seq, self._t_s, self._period_s = -1, 0.0, 0.0
         self.offset_s = self._before_s = 0.0
         self.jump: ClockJump | None = None
 

@@ -23,7 +23,6 @@ from ccatp.conditions import (
     SAMPLES_TOO_FEW,
     SEAM_MISSED,
     STALL_REPORTED,
-    UNKNOWN_REPORTED,
     MonitorFinding,
 )
 from ccatp.config.models import HealthConfig, RobotConfig
@@ -51,12 +50,6 @@ class FlickerMonitor:
     def __init__(self, cfg: HealthConfig, is_explained: Callable[[int], bool]) -> None:
         self._cfg, self._is_explained = cfg, is_explained
         self.chatter, self.flash = FindingLatch(cfg.retry_after_s), FindingLatch(_CLEAR_S)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget."""
-        self.chatter.reset()
-        self.flash.reset()
         self._last: tuple[int, ...] = (1, 1, 1, 1)
         self._changes: tuple[deque[float], ...] = (deque(), deque(), deque(), deque())
         self._flashing_s: list[float | None] = [None, None, None, None]
@@ -114,10 +107,6 @@ class RateMonitor:
 
     def __init__(self, cfg: HealthConfig) -> None:
         self._cfg = cfg
-        self.reset()
-
-    def reset(self) -> None:
-        """Learn again."""
         self.finding: MonitorFinding | None = None
         self.are_encoders_sparse = False
         self._begin_s: float | None = None
@@ -163,11 +152,6 @@ class LatencyMonitor:
     def __init__(self, cfg: HealthConfig) -> None:
         self._cfg = cfg
         self.alarm = FindingLatch(cfg.rate_time_s)
-        self.reset()
-
-    def reset(self) -> None:
-        """Another session: drives are numbered from the start."""
-        self.alarm.reset()
         self._sent: deque[tuple[int, float]] = deque(maxlen=64)
 
     def sent(self, number: int, t_s: float) -> None:
@@ -188,21 +172,6 @@ class LatencyMonitor:
                 self.alarm.see(t_s, DRIVES_LATE.found("latency", latency_s, cfg.latency_slow_s))
 
 
-class FramingErrorRate:
-    """Whether ``limit`` lines that are not frames came within ``window_s``, on any monotonic clock."""
-
-    __slots__ = ("_times_s", "_window_s")
-
-    def __init__(self, limit: int, window_s: float) -> None:
-        self._times_s = deque([-inf] * limit, maxlen=limit)
-        self._window_s = window_s
-
-    def add(self, at_s: float) -> bool:
-        """Count one at ``at_s``; true where this and those before it are too many."""
-        self._times_s.append(at_s)
-        return at_s - self._times_s[0] <= self._window_s
-
-
 class SeamMonitor:
     """Counts the seams that each sensor (places in the robot frame) crossed without going off.
 
@@ -218,7 +187,6 @@ class SeamMonitor:
         self._fastest_m_s = robot.wheel_radius_m * robot.max_wheel_rad_s
         self._reach_m = max(hypot(*offset_m) for offset_m in robot.edge_sensors_m)
         self.missed = [0, 0, 0, 0]
-        self.crossed = 0
         self._blind = FindingLatch(cfg.retry_after_s)
         self.reset()
 
@@ -266,10 +234,8 @@ class SeamMonitor:
         return found, min(panel.half_x_m - abs(x - panel.x_m), panel.half_y_m - abs(y - panel.y_m))
 
     def _enter(self, i: int, panel: PanelId) -> None:
-        if self._panels[i] is not None:
-            self.crossed += 1
-            if not self._seen[i]:
-                self._miss(i)
+        if self._panels[i] is not None and not self._seen[i]:
+            self._miss(i)
         self._panels[i] = panel
         self._seen[i] = False
 
@@ -296,14 +262,14 @@ class SeamMonitor:
 _FIRST_COMMAND_S = 1.0
 # The way home goes along rows and columns of panels.
 _DETOUR = 1.6
-_OWN = {
+REPORTED = {
     "imu": IMU_REPORTED,
     "encoder_left": ENCODER_REPORTED,
     "encoder_right": ENCODER_REPORTED,
     "edge": EDGE_REPORTED,
     "stall": STALL_REPORTED,
 }
-_FANS, _SIDES = ("fan_left", "fan_right"), ("left", "right")
+FANS, _SIDES = ("fan_left", "fan_right"), ("left", "right")
 
 
 class FanMonitor:
@@ -318,16 +284,10 @@ class FanMonitor:
         self._enough = cfg.fan_early_share * duty[0], cfg.fan_early_share * duty[1]
         self._least = cfg.fan_share * duty[0], cfg.fan_share * duty[1]
         self.alarm = FindingLatch(cfg.retry_after_s)
-        self.reset()
-
-    def reset(self) -> None:
-        """The robot has booted: its fans wait for their command."""
-        self.alarm.reset()
-        self._low, self._weak, self._first_s = Since(), Since(), None
+        self._low, self._weak = Since(), Since()
+        self._first_s: float | None = None
         self._was_right = False
         self._sound: tuple[float, float] | None = None  # the newest duties, if nothing is wrong with them
-
-    _first_s: float | None
 
     def step(self, t_s: float, fans: tuple[float, float], faults: Sequence[str]) -> None:
         """Judge a frame."""
@@ -343,15 +303,15 @@ class FanMonitor:
         lasts_s = self._low.lasts(t_s, is_low and is_due)
         if lasts_s >= self._cfg.fan_time_s - 1e-6 and self._overhang:
             k = 0 if fans[0] / left < fans[1] / right else 1
-            self.alarm.see(t_s, FAN_TOO_LITTLE.found(_FANS[k], fans[k], self._least[k], side=_SIDES[k]))
+            self.alarm.see(t_s, FAN_TOO_LITTLE.found(FANS[k], fans[k], self._least[k], side=_SIDES[k]))
         elif self._overhang:
             is_weak = fans[0] < self._enough[0] or fans[1] < self._enough[1]
             if self._weak.lasts(t_s, is_weak and is_due) >= self._cfg.fan_time_s - 1e-6:
                 k = 0 if fans[0] - self._enough[0] < fans[1] - self._enough[1] else 1
-                finding = FAN_WEAK.found(_FANS[k], fans[k], self._enough[k], side=_SIDES[k])
+                finding = FAN_WEAK.found(FANS[k], fans[k], self._enough[k], side=_SIDES[k])
                 self.alarm.see(t_s, finding)
         for name in faults:
-            if name in _FANS:
+            if name in FANS:
                 reported = FAN_REPORTED if self._overhang else FAN_REPORTED_ON_THE_FLAT
                 self.alarm.see(t_s, reported.found(name, 1.0, 0.0, side=name[4:]))
         self._sound = None if is_low or is_weak else fans
@@ -381,27 +341,3 @@ class BatteryMonitor:
             self.finding = BATTERY_LOW.found("soc", soc, least)
         if self._reported.lasts(t_s, is_reported) >= cfg.battery_time_s:
             self.finding = BATTERY_REPORTED.found("battery_low", soc, least)
-
-
-class OwnFaults:
-    """Faults that the robot reports of itself, but those of fans and battery."""
-
-    def __init__(self, cfg: HealthConfig) -> None:
-        self._clear_s = cfg.retry_after_s
-        self.alarms: dict[str, FindingLatch] = {}
-
-    def reset(self) -> None:
-        """Forget."""
-        self.alarms.clear()
-
-    def step(self, t_s: float, faults: Sequence[str]) -> None:
-        """Take the names of a frame; unknown ones are reported."""
-        for name in faults:
-            if name in _FANS or name == "battery_low":
-                continue
-            finding = _OWN.get(name, UNKNOWN_REPORTED).found(name, 1.0, 0.0, side=name.removeprefix("encoder_"))
-            self.alarms.setdefault(name, FindingLatch(self._clear_s)).see(t_s, finding)
-        for name, alarm in list(self.alarms.items()):
-            alarm.settle(t_s)
-            if alarm.finding is None:
-                del self.alarms[name]

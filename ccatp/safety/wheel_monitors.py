@@ -7,7 +7,6 @@ from typing import NamedTuple
 from ccatp.conditions import (
     ENCODER_BROKEN,
     ENCODER_COUNTS_NOTHING,
-    IMU_LEFT_OUT,
     WHEEL_BLOCKED,
     WHEEL_CREEPS,
     WHEEL_CREEPS_ON,
@@ -15,10 +14,9 @@ from ccatp.conditions import (
     WHEEL_RUNS_AWAY,
     WHEELS_STAND,
     YAW_DISAGREES,
-    MonitorFinding,
 )
 from ccatp.config.models import HealthConfig, RobotConfig
-from ccatp.control.motion_checks import ImuGate, MotionSum
+from ccatp.control.motion_checks import MotionSum, SlidingWindow
 from ccatp.core import WheelSample
 from ccatp.safety.escalation import FindingLatch, Since
 
@@ -51,27 +49,48 @@ class Span(NamedTuple):
     left_low: float
     left_high: float
 
+    def of(self, side: int) -> tuple[float, float]:
+        """Those of one wheel, by its place in ``_SIDES``."""
+        return self[1 + 2 * side], self[2 + 2 * side]
 
-class Commands:
-    """Recent set points of the wheels."""
 
-    def __init__(self, wheel_radius_m: float) -> None:
-        self._radius_m = wheel_radius_m
-        self.reset()
+class WheelMonitor:
+    """Runaway, stall, dead and frozen encoders, wheels that creep; gyroscope and wheels that turn differently.
 
-    def reset(self) -> None:
-        """Forget."""
-        self._spans: deque[Span] = deque(maxlen=64)
+    The rules use the lowest and highest set points of a while, so they need no model of the servo: a wheel that was
+    commanded to go fast all the while and stands, or that is faster than any set point.
+    """
 
-    def push(self, t_s: float, commanded: tuple[float, float, float, float]) -> None:
+    def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
+        self._cfg, self._radius_m, self._base_m = cfg, robot.wheel_radius_m, robot.wheel_base_m
+        self.alarm, self.yaw = FindingLatch(cfg.retry_after_s), FindingLatch(cfg.retry_after_s)
+        self._shortly, self._stalling = SlidingWindow(cfg.runaway_time_s), SlidingWindow(cfg.stall_time_s)
+        self._turning = SlidingWindow(cfg.yaw_time_s)
+        self.speed_m_s = 0.0  # of the faster wheel, lately
+        self.spans: deque[Span] = deque(maxlen=64)
+        self._lately: Span | None = None
+        self._stall: Span | None = None
+        self._held_s: float | None = None
+        self._held_since_s: float | None = None
+        self._late_s: float | None = None
+        self._sparse_s: float | None = None
+        self._stood: MotionSum | None = None
+        self._creeping = Since(), Since()
+
+    def take_commands(self, t_s: float, commanded: tuple[float, float, float, float]) -> None:
         """Take the span (rad/s) of the drives up to ``t_s``."""
         r = self._radius_m
         a, b, c, d = commanded
-        self._spans.append(Span(t_s, r * a, r * b, r * c, r * d))
+        self.spans.append(Span(t_s, r * a, r * b, r * c, r * d))
 
-    def over(self, t_s: float, memory_s: float) -> Span | None:
+    def learn(self, t_s: float) -> None:
+        """Look at the commands again: at ``t_s`` a new span has been taken, or should have been."""
+        self._lately = self._commanded_over(t_s, _MEMORY_S)
+        self._stall = self._commanded_over(t_s, self._cfg.stall_time_s + _LATENCY_S)
+
+    def _commanded_over(self, t_s: float, memory_s: float) -> Span | None:
         """The span of all drives of the last ``memory_s``; ``None`` if they are not all known."""
-        spans, since_s = self._spans, t_s - memory_s
+        spans, since_s = self.spans, t_s - memory_s
         if not spans or spans[0][0] > since_s or t_s - spans[-1][0] > _LATENCY_S:
             return None
         recent = []
@@ -82,43 +101,9 @@ class Commands:
         _, right_low, right_high, left_low, left_high = zip(*recent)  # noqa: B905 - of one length
         return Span(t_s, min(right_low), max(right_high), min(left_low), max(left_high))
 
-
-class WheelMonitor:
-    """Runaway, stall, dead and frozen encoders, wheels that creep.
-
-    The rules use the lowest and highest set points of a while, so they need no model of the servo: a wheel that was
-    commanded to go fast all the while and stands, or that is faster than any set point.
-    """
-
-    def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
-        self._cfg, self._base_m = cfg, robot.wheel_base_m
-        self.commands = Commands(robot.wheel_radius_m)
-        self.alarm = FindingLatch(cfg.retry_after_s)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget."""
-        self.alarm.reset()
-        self.commands.reset()
-        self._lately: Span | None = None
-        self._stall: Span | None = None
-        self._held_s: float | None = None
-        self._held_since_s: float | None = None
-        self._late_s: float | None = None
-        self._sparse_s: float | None = None
-        self._stood: MotionSum | None = None
-        self._creeping = Since(), Since()
-
-    def learn(self, t_s: float) -> None:
-        """Look at the commands again: at ``t_s`` a new span has been pushed, or should have been."""
-        self._lately = self.commands.over(t_s, _MEMORY_S)
-        self._stall = self.commands.over(t_s, self._cfg.stall_time_s + _LATENCY_S)
-
     def step(
         self,
         now: MotionSum,
-        shortly: MotionSum | None,
-        stalling: MotionSum | None,
         samples: Sequence[WheelSample],
         *,
         is_free: bool,
@@ -126,14 +111,14 @@ class WheelMonitor:
         is_late: bool,
         is_sparse: bool,
     ) -> None:
-        """Judge a frame; ``shortly`` and ``stalling``.
-
-        Change of the sums over ``runaway_time_s`` and over ``stall_time_s``.
+        """Judge a frame by the running sums at its end.
 
         Since the last look, ``is_free``: the robot executed its commands, and was permitted to go anywhere;
         ``is_late``: it executed an old command; ``is_sparse``: the encoders gave fewer samples than usual.
         """
         t_s = now.t_s
+        shortly, stalling, turning = self._shortly.push(now), self._stalling.push(now), self._turning.push(now)
+        self.speed_m_s = 0.0 if shortly is None else max(abs(shortly.right_m), abs(shortly.left_m)) / shortly.t_s
         if not is_free:
             self._held_s = t_s
         if not is_held:
@@ -155,6 +140,8 @@ class WheelMonitor:
             if stalling is not None:
                 self._find_stall(t_s, stalling)
                 self._find_creep(now, stalling, lately, samples)
+        if turning is not None:
+            self._compare_turns(t_s, turning)
 
     def _commanded(self, t_s: float) -> Span | None:
         """Recent set points of the wheels; ``None`` where they are not known."""
@@ -168,15 +155,11 @@ class WheelMonitor:
     def _find_runaway(
         self, t_s: float, moved: MotionSum, commanded: Span, samples: Sequence[WheelSample], limit: float
     ) -> None:
-        right, left = moved.right_m / moved.t_s, moved.left_m / moved.t_s
-        above = (
-            _excess(right, commanded.right_low, commanded.right_high),
-            _excess(left, commanded.left_low, commanded.left_high),
-        )
+        above = [_excess(moved[1 + k] / moved.t_s, *commanded.of(k)) for k in range(2)]
         worst = max(above)
         if worst <= limit:
             return
-        k = 0 if above[0] >= above[1] else 1
+        k = above.index(worst)
         side = _SIDES[k]
         if broken := _what_is_broken(samples, k):
             self.alarm.see(t_s, ENCODER_BROKEN.found(f"encoder_{side}", worst, limit, side=side, what=broken))
@@ -187,22 +170,18 @@ class WheelMonitor:
         commanded, cfg = self._stall, self._cfg
         if commanded is None or (self._held_s is not None and t_s - self._held_s < cfg.stall_time_s + _LATENCY_S):
             return
-        right, left = moved.right_m / moved.t_s, moved.left_m / moved.t_s
-        stands = (
-            self._is_commanded(commanded.right_low, commanded.right_high) and abs(right) < cfg.stall_speed_m_s,
-            self._is_commanded(commanded.left_low, commanded.left_high) and abs(left) < cfg.stall_speed_m_s,
-        )
-        if not any(stands):
+        speeds, limit = [abs(moved[1 + k]) / moved.t_s for k in range(2)], cfg.stall_speed_m_s
+        still = [k for k in range(2) if speeds[k] < limit and self._is_commanded(*commanded.of(k))]
+        if not still:
             return
         disagreement = abs((moved.right_m - moved.left_m) / self._base_m - moved.turned_rad)
-        speed = min(abs(rate) for rate, is_still in ((right, stands[0]), (left, stands[1])) if is_still)
-        side = "right" if stands[0] else "left"
-        if all(stands):
-            finding = WHEELS_STAND.found("encoders", speed, cfg.stall_speed_m_s)
+        speed, side = min(speeds[k] for k in still), _SIDES[still[0]]
+        if len(still) == len(_SIDES):
+            finding = WHEELS_STAND.found("encoders", speed, limit)
         elif disagreement > _SAME_TURN_RAD:
-            finding = ENCODER_COUNTS_NOTHING.found(f"encoder_{side}", speed, cfg.stall_speed_m_s, side=side)
+            finding = ENCODER_COUNTS_NOTHING.found(f"encoder_{side}", speed, limit, side=side)
         else:
-            finding = WHEEL_BLOCKED.found(f"{side}_wheel", speed, cfg.stall_speed_m_s, side=side)
+            finding = WHEEL_BLOCKED.found(f"{side}_wheel", speed, limit, side=side)
         self.alarm.see(t_s, finding)
 
     def _is_commanded(self, low: float, high: float) -> bool:
@@ -240,6 +219,15 @@ class WheelMonitor:
                 finding = WHEEL_DOES_NOT_STOP.found(f"{side}_wheel", speed_m_s, cfg.stop_speed_m_s, side=side)
             self.alarm.see(t_s, finding)
 
+    def _compare_turns(self, t_s: float, moved: MotionSum) -> None:
+        """The turn of the gyroscope, while it was believed, with that of the wheels."""
+        cfg, by_gyroscope = self._cfg, moved.turned_rad
+        by_wheels = (moved.right_m - moved.left_m) / self._base_m
+        difference = by_gyroscope - by_wheels
+        limit = cfg.yaw_limit_rad + cfg.yaw_share * max(abs(by_wheels), abs(by_gyroscope))
+        if not -limit <= difference <= limit:
+            self.yaw.see(t_s, YAW_DISAGREES.found("imu_wz", difference, limit))
+
 
 def _what_is_broken(samples: Sequence[WheelSample], side: int) -> str:
     """What shows that it is the encoder and not the wheel, or nothing."""
@@ -256,46 +244,3 @@ def _excess(speed: float, low: float, high: float) -> float:
     above = speed - high if high > 0.0 else speed
     below = low - speed if low < 0.0 else -speed
     return max(above, below)
-
-
-_BIAS_TIME_S = 0.5
-_LARGEST_BIAS_RAD_S = 0.35
-
-
-class GyroscopeBias:
-    """What the gyroscope shows at rest, from samples whose size is bounded: garbage must not move it far."""
-
-    def __init__(self) -> None:
-        self.rad_s = 0.0
-
-    def stand(self, wz_rad_s: float, dt_s: float) -> None:
-        """Take a sample at rest."""
-        bounded = min(max(wz_rad_s, -_LARGEST_BIAS_RAD_S), _LARGEST_BIAS_RAD_S)
-        self.rad_s += dt_s / (_BIAS_TIME_S + dt_s) * (bounded - self.rad_s)
-
-
-class YawMonitor:
-    """Compares the turn of the gyroscope with that of the wheels while the robot moves."""
-
-    def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
-        self._cfg, self._base_m = cfg, robot.wheel_base_m
-        self.alarm = FindingLatch(cfg.retry_after_s)
-
-    def reset(self) -> None:
-        """Forget."""
-        self.alarm.reset()
-
-    def step(self, t_s: float, moved: MotionSum) -> None:
-        """Judge a frame; ``moved`` is the change of the sums over ``yaw_time_s``, while the unit was believed."""
-        cfg = self._cfg
-        by_wheels = (moved.right_m - moved.left_m) / self._base_m
-        by_gyroscope = moved.turned_rad
-        difference = by_gyroscope - by_wheels
-        limit = cfg.yaw_limit_rad + cfg.yaw_share * max(abs(by_wheels), abs(by_gyroscope))
-        if not -limit <= difference <= limit:
-            self.alarm.see(t_s, YAW_DISAGREES.found("imu_wz", difference, limit))
-
-
-def imu_finding(gate: ImuGate) -> MonitorFinding:
-    """What the gate has against the inertial unit: it is left out, and the robot goes slowly by its wheels."""
-    return IMU_LEFT_OUT.found("imu", gate.value, gate.limit, what=gate.cause)

@@ -36,10 +36,6 @@ class WheelTrack:
         self._half_radius_m = 0.5 * wheel_radius_m
         self._radius_per_base = wheel_radius_m / wheel_base_m
         self._hold_s, self._reach_s = hold_s, reach_s
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything (the robot's clock was reset)."""
         self._frames: deque[Sequence[WheelSample]] = deque(maxlen=HISTORY_FRAMES)
         self._right = self._left = 0.0
         self._right_t_s = self._left_t_s = self._usable_t_s = -inf

@@ -9,7 +9,7 @@ from math import copysign, hypot
 import msgspec
 from msgspec.structs import replace
 
-from ccatp.conditions import Cause
+from ccatp.conditions import RIM_AHEAD
 from ccatp.config.models import ControlConfig, MissionConfig
 from ccatp.control.tracker import LegMotion, LegPhase, LegTracker
 from ccatp.core import EventCode, PanelPose, PointId, Stop, StopKind, Twist, Verdict, difference
@@ -270,7 +270,7 @@ class Retreat(msgspec.Struct, frozen=True, tag=True):
     ) -> "tuple[Retreat, Twist]":
         if not is_clear:
             # The turn sweeps a corner off the panels. Off the rim, back; off what may be a seam, the fix tells.
-            step = RetreatStep.UNTURN if verdict.cause.startswith(Cause.RIM) else RetreatStep.OVER
+            step = RetreatStep.UNTURN if verdict.cause.startswith(RIM_AHEAD.message) else RetreatStep.OVER
             unturn = -copysign(1.0, self.away_rad)
             return replace(self, step=step, has_turned_away=True, unturn=unturn, turned_rad=0.0), STILL
         turn, goal_rad = self.turn, self.goal_rad

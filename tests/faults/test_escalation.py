@@ -201,8 +201,8 @@ def test_what_the_wheels_were_told_counts_however_old_the_estimate(seq: int, t_s
     cfg = load_config()
     monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)
     robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(1))
-    commands = monitor._board._wheels.commands  # type: ignore[union-attr]
-    commands.push(0.5, (0.0, 0.0, 0.0, 0.0))
+    wheels = monitor._board._wheels  # type: ignore[union-attr]
+    wheels.take_commands(0.5, (0.0, 0.0, 0.0, 0.0))
     while (frame := robot.delivered) is None or frame.seq < 100:
         robot.advance()
         if frame is not None and frame.seq < 99:
@@ -214,4 +214,4 @@ def test_what_the_wheels_were_told_counts_however_old_the_estimate(seq: int, t_s
     for _ in range(3):
         monitor.step(frame, estimate)
         frame = msgspec.structs.replace(frame, seq=frame.seq + 1)
-    assert [span.right_high / cfg.robot.wheel_radius_m for span in commands._spans] == expected
+    assert [span.right_high / cfg.robot.wheel_radius_m for span in wheels.spans] == expected

@@ -7,7 +7,7 @@ from weakref import ReferenceType, ref
 
 import pytest
 
-from ccatp.conditions import CENTRE_NEAR_RIM, Cause
+from ccatp.conditions import BEYOND_SEAM, CENTRE_NEAR_RIM, NO_SEAM, OFF_WITHOUT_WHEELS, RIM_AHEAD
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import Corner, EdgeSample, EventCode, Verdict, WheelSample
@@ -116,7 +116,7 @@ def permits(verdict: Verdict) -> tuple[bool, bool, bool]:
 def test_normal_operation_permits_everything(on_panel: Story) -> None:
     verdict = on_panel.run(3, v=0.1)
     assert verdict == Verdict(3, verdict.t_s, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
-    assert on_panel.monitor.episodes_opened == dict.fromkeys(Corner, 0)
+    assert on_panel.monitor.counts["episodes"] == dict.fromkeys(Corner, 0)
 
 
 def test_nothing_is_permitted_before_the_first_frame(on_panel: Story) -> None:
@@ -130,11 +130,11 @@ def test_a_rim_is_an_edge_at_the_second_off_sample(at_rim: Story) -> None:
     verdict = at_rim.frame(0.1, off=FRONT, flags="1111111100")
     assert verdict.code is EventCode.NORMAL  # not moved far enough to have a direction
     verdict = at_rim.frame(0.1, off=FRONT)
-    assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.NEAR_EDGE, Cause.RIM.value, "front_left")
+    assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.NEAR_EDGE, RIM_AHEAD.message, "front_left")
     assert verdict.value < 0.0005  # m of travel: three samples at 0.1 m/s
     assert permits(verdict) == (False, True, False)
     assert verdict.off == (True, True, False, False)
-    assert at_rim.monitor.edges_declared[Corner.FRONT_LEFT] == 1
+    assert at_rim.monitor.counts["edges"][Corner.FRONT_LEFT] == 1
 
 
 def test_a_single_glitch_near_the_rim_is_no_edge(at_rim: Story) -> None:
@@ -180,7 +180,7 @@ def test_a_seam_allows_its_width_and_then_is_an_edge(at_seam: Story) -> None:
     verdict = at_seam.run(14, v=0.1, off=FRONT)  # 14 mm: gap 10 + tolerance 1 + extra 3, less the first sample
     assert verdict.code is EventCode.NORMAL
     verdict = at_seam.frame(0.1, off=FRONT)
-    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, Cause.SEAM.value)
+    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, BEYOND_SEAM.message)
     assert verdict.limit == pytest.approx(0.014, abs=1e-6)  # m; the direction is along the normal to 1e-3 rad
     assert verdict.value == pytest.approx(0.014, abs=2e-4)  # m; two samples at 0.1 m/s
 
@@ -200,7 +200,7 @@ def test_standing_over_a_gap_is_no_edge_however_long(at_seam: Story) -> None:
     assert at_seam.run(6000, off=FRONT).code is EventCode.NORMAL  # a minute
     assert at_seam.run(5, v=0.1, off=FRONT).code is EventCode.NORMAL
     assert at_seam.run(2, v=0.1).code is EventCode.NORMAL
-    assert at_seam.monitor.episodes_opened[Corner.FRONT_LEFT] == 1
+    assert at_seam.monitor.counts["episodes"][Corner.FRONT_LEFT] == 1
 
 
 def test_going_back_adds_nothing(at_seam: Story) -> None:
@@ -242,7 +242,7 @@ def test_the_rim_beyond_a_seam_is_seen_while_off(at_rim: Story) -> None:
     at_rim.run(2, v=0.1, off=FRONT)
     assert at_rim.monitor.verdict.code is EventCode.NORMAL
     verdict = at_rim.run(2, v=0.1, off=FRONT)
-    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, Cause.RIM.value)
+    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, RIM_AHEAD.message)
 
 
 # -- (c) no map -------------------------------------------------------------------------------------------------------
@@ -251,7 +251,7 @@ def test_the_rim_beyond_a_seam_is_seen_while_off(at_rim: Story) -> None:
 def test_off_without_an_explanation_is_an_edge_after_5_mm(on_panel: Story) -> None:
     assert on_panel.run(5, v=0.1, off=FL).code is EventCode.NORMAL
     verdict = on_panel.frame(0.1, off=FL)
-    assert (verdict.code, verdict.cause, verdict.limit) == (EventCode.NEAR_EDGE, Cause.NO_MAP.value, 0.005)
+    assert (verdict.code, verdict.cause, verdict.limit) == (EventCode.NEAR_EDGE, NO_SEAM.message, 0.005)
     assert permits(verdict) == (False, True, False)
 
 
@@ -259,7 +259,7 @@ def test_without_an_estimate_a_seam_is_not_believed_and_nothing_is_permitted(at_
     at_seam.has_estimate = False
     verdict = at_seam.run(6, v=0.1, off=FRONT)
     assert verdict.code is EventCode.NEAR_EDGE
-    assert verdict.cause == f"{Cause.NO_MAP}; no estimate"
+    assert verdict.cause == f"{NO_SEAM.message}; no estimate"
     assert permits(verdict) == NO_PERMIT
 
 
@@ -294,7 +294,7 @@ def test_an_edge_that_a_fix_shows_to_be_a_seam_was_none(at_seam: Story) -> None:
     assert permits(at_seam.run(4, v=0.1, off=FRONT)) == ANY_PERMIT
     # A seam, and no more: its width and tolerances are allowed once.
     verdict = at_seam.run(12, v=0.1, off=FRONT)
-    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, Cause.SEAM.value)
+    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, BEYOND_SEAM.message)
     # Without another fix that stays so, however long it stands.
     assert at_seam.run(200, off=FRONT).code is EventCode.NEAR_EDGE
 
@@ -354,7 +354,7 @@ def test_a_turn_across_a_seam_allows_its_width(cfg: Config, mirror: Mirror) -> N
     story = Story(cfg, mirror, (panel.x_m + panel.half_x_m + 1e-4, panel.y_m, -pi / 4))
     assert story.run(10, omega=1.0, off=FR).code is EventCode.NORMAL  # 12.7 mm of arc
     verdict = story.run(2, omega=1.0, off=FR)
-    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, Cause.SEAM.value)
+    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, BEYOND_SEAM.message)
     assert verdict.limit == pytest.approx(0.014, abs=1e-9)  # m; 10 + 1 + 3 mm
 
 
@@ -370,7 +370,7 @@ def test_a_path_out_of_one_seam_into_another_is_allowed_both_and_no_more(
     # 27 mm: one seam alone allows 11 / cos + 3 = 18.6 mm at 45 deg and 25.1 mm at 60
     assert story.run(27, v=0.1, off=FR).code is EventCode.NORMAL
     verdict = story.run(12, v=0.1, off=FR)
-    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, Cause.SEAM.value)
+    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, BEYOND_SEAM.message)
 
 
 def test_a_turn_has_a_limit_even_along_a_seam(cfg: Config, mirror: Mirror) -> None:
@@ -416,7 +416,7 @@ def test_a_silent_wheel_permits_nothing_and_counts_as_fastest(on_panel: Story, b
         frame_of(200, t_s, [], [EdgeSample(t_s, 0, 1, 1, 1), EdgeSample(t_s + 1e-3, 0, 1, 1, 1)]), None
     )
     assert verdict.code is EventCode.NEAR_EDGE
-    assert verdict.cause.startswith(Cause.SILENT_WHEELS)
+    assert verdict.cause.startswith(OFF_WITHOUT_WHEELS.message)
     assert verdict.value > 0.06  # m: 0.17 s at the 0.41 m/s of a corner sensor with one wheel against the other
 
 
@@ -518,7 +518,7 @@ def test_the_age_of_an_estimate(on_panel: Story, age_s: float, expected: tuple[b
 def test_every_value_is_finite_before_anything_is_heard(on_panel: Story) -> None:
     edge = [EdgeSample(1e-3 * k, 0, 0, 0, 1) for k in range(1, 4)]
     verdict = on_panel.monitor.step(frame_of(1, 0.003, [], edge), None)
-    assert verdict.cause == f"{Cause.SILENT_WHEELS}; encoder samples stale"
+    assert verdict.cause == f"{OFF_WITHOUT_WHEELS.message}; encoder samples stale"
     assert verdict.value == pytest.approx(0.061, abs=1e-3)  # m: 0.15 s at 0.41 m/s
 
 
@@ -564,14 +564,14 @@ def test_edge_samples_that_go_back_in_time_are_dropped(on_panel: Story) -> None:
     old = [EdgeSample(t_s - 5e-3, 0, 0, 0, 0), EdgeSample(t_s - 4e-3, 0, 0, 0, 0)]
     frame = frame_of(9, t_s + 1e-3, [WheelSample(t_s + 1e-3, 0.0, 0.0)], [*old, EdgeSample(t_s + 1e-3, 1, 1, 1, 1)])
     assert on_panel.monitor.step(frame, None).code is EventCode.NORMAL
-    assert on_panel.monitor.episodes_opened == dict.fromkeys(Corner, 0)
+    assert on_panel.monitor.counts["episodes"] == dict.fromkeys(Corner, 0)
 
 
 def test_a_value_that_is_neither_0_nor_1_counts_as_off(on_panel: Story) -> None:
     on_panel.run(1)
     t_s = on_panel.t + 1e-3
     on_panel.monitor.step(frame_of(9, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 2, 1, 1, 1)]), None)
-    assert on_panel.monitor.episodes_opened[Corner.FRONT_LEFT] == 1
+    assert on_panel.monitor.counts["episodes"][Corner.FRONT_LEFT] == 1
 
 
 def test_reset_begins_a_new_session_and_keeps_the_abort(at_rim: Story) -> None:

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import pytest
 
-from ccatp.conditions import Cause
+from ccatp.conditions import BEYOND_SEAM, NO_SEAM, OFF_WITHOUT_WHEELS, RIM_AHEAD
 from ccatp.config.load import load_config
 from ccatp.config.models import DangerConfig
 from ccatp.safety.edge_detector import (
@@ -124,7 +124,6 @@ def test_a_new_episode(danger: DangerConfig) -> None:
     sensor = Sensor(danger, Map(is_rim=True), has_map=False)
     episode = sensor.episode
     assert episode.phase is EdgePhase.FRESH
-    assert episode.cause is None
     assert (episode.value_m, episode.limit_m) == (0.0, 0.0)
     assert not episode.is_from_turn
     assert not episode.is_doubted
@@ -181,7 +180,7 @@ def test_the_rim_counts_from_the_debounced_sample_on(danger: DangerConfig) -> No
     assert sensor.episode.phase is EdgePhase.RIM
     assert sensor.off(0.001)
     episode = sensor.episode
-    assert (episode.cause, episode.limit_m) == (Cause.RIM, 0.0)
+    assert (episode.cause, episode.limit_m) == (RIM_AHEAD, 0.0)
     assert episode.value_m == pytest.approx(0.002)
     assert not sensor.off(0.001)  # declared once
 
@@ -193,7 +192,7 @@ def test_without_a_map_the_travel_away_from_the_panel_counts(danger: DangerConfi
         assert not sensor.walk(limit - UM)
         assert sensor.episode.phase is EdgePhase.NO_MAP
         assert sensor.off(2 * UM)
-        assert sensor.episode.cause is Cause.NO_MAP
+        assert sensor.episode.cause is NO_SEAM
         assert sensor.episode.value_m == pytest.approx(limit + UM)
         assert sensor.episode.limit_m == limit
 
@@ -219,7 +218,7 @@ def test_unheard_wheels_count_as_the_fastest(danger: DangerConfig) -> None:
     sensor = Sensor(danger, Map(seams=("x",)))
     assert not sensor.off(0.0, worst_m=limit)
     assert sensor.off(0.0, worst_m=limit + UM)
-    assert sensor.episode.cause is Cause.SILENT_WHEELS
+    assert sensor.episode.cause is OFF_WITHOUT_WHEELS
     assert (sensor.episode.value_m, sensor.episode.limit_m) == (limit + UM, limit)
 
 
@@ -237,7 +236,7 @@ def test_a_seam_allows_its_width_across(danger: DangerConfig, axis: Axis, k: int
     assert sensor.episode.phase is EdgePhase.SEAM
     assert not sensor.episode.is_from_turn
     assert sensor.off(step[0] * 2 * UM, step[1] * 2 * UM)
-    assert sensor.episode.cause is Cause.SEAM
+    assert sensor.episode.cause is BEYOND_SEAM
     assert sensor.episode.value_m == pytest.approx(limit + UM)
     assert sensor.episode.limit_m == pytest.approx(limit)
 
@@ -274,7 +273,7 @@ def test_how_far_along_a_seam_as_built(danger: DangerConfig, degrees: float, all
     c, s = cos(radians(degrees)), sin(radians(degrees))
     assert not sensor.walk((allowed_m - 5e-5) * c, (allowed_m - 5e-5) * s, 40)
     assert sensor.walk(1e-4 * c, 1e-4 * s, 2)
-    assert sensor.episode.cause is Cause.SEAM
+    assert sensor.episode.cause is BEYOND_SEAM
 
 
 def test_back_over_the_seam_is_no_way_across(danger: DangerConfig) -> None:
@@ -308,7 +307,7 @@ def test_more_than_both_chords_is_no_crossing(danger: DangerConfig) -> None:
     sensor = Sensor(danger, Map(seams=("x", "y")))
     # Forth and back along the seam within its width: the way from the start is what counts.
     assert sensor.walk(0.001, crossing + 0.001, 60)
-    assert sensor.episode.cause is Cause.SEAM
+    assert sensor.episode.cause is BEYOND_SEAM
     assert sensor.episode.value_m <= crossing + 0.001
 
 
@@ -325,7 +324,7 @@ def test_one_seam_may_be_left_along_another_once(danger: DangerConfig) -> None:
     assert slack_m > danger.gap_tolerance_m
     # The second allows what is left of both chords, and there is no third.
     assert sensor.walk(0.1, steps=200)
-    assert sensor.episode.cause is Cause.SEAM
+    assert sensor.episode.cause is BEYOND_SEAM
 
 
 def test_a_single_seam_is_not_left_along_another(danger: DangerConfig) -> None:
@@ -392,7 +391,7 @@ def test_a_seam_may_lead_to_the_rim(danger: DangerConfig) -> None:
     sensor.off(0.0, -0.2 * DIRECTION_TRAVEL_M)
     assert sensor.episode.look_ahead()
     assert sensor.map.asked_rim[0][1] == pytest.approx((0.0, -1.0))
-    assert sensor.episode.cause is Cause.RIM
+    assert sensor.episode.cause is RIM_AHEAD
     assert sensor.episode.value_m == pytest.approx(hypot(0.002, 1.1 * DIRECTION_TRAVEL_M))
 
 
@@ -412,7 +411,7 @@ def test_no_looking_ahead_while_on_or_without_a_place(danger: DangerConfig) -> N
     sensor.map.is_rim = True
     assert not sensor.on(0.001)
     assert not sensor.episode.look_ahead()
-    assert sensor.episode.cause is None
+    assert sensor.episode.phase is not EdgePhase.DECLARED
     lost = Sensor(danger, Map(is_rim=True), has_map=False)
     lost.off(0.001)
     lost.off(0.001)

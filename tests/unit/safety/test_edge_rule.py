@@ -83,7 +83,7 @@ def test_a_new_rule_is_idle(rule: Rule) -> None:
     under_test = rule.rule
     assert under_test.is_idle
     assert not under_test.is_lifted
-    assert under_test.episodes == (None,) * 4
+    assert under_test.episodes == [None] * 4
     assert under_test.opened == under_test.declared == [0, 0, 0, 0]
     rule.feed([])
     rule.feed([ON] * 10)
@@ -180,13 +180,13 @@ def test_lifted_needs_as_many_samples_in_a_row_and_so_does_being_put_back(rule: 
     assert not under_test.is_idle
     rule.feed([ON])
     assert not under_test.is_lifted
-    assert under_test.episodes == (None,) * 4
+    assert under_test.episodes == [None] * 4
     assert under_test.is_idle
 
 
 def test_lifted_keeps_the_rule_awake_without_an_episode(rule: Rule) -> None:
     rule.feed([OFF] * 3)
-    rule.rule.episodes = (None, None, None, None)
+    rule.rule.episodes = [None] * 4
     rule.feed([ON])
     assert not rule.rule.is_idle
 
@@ -212,8 +212,8 @@ def test_put_back_the_episodes_begin_anew(rule: Rule) -> None:
     rule.feed([OFF_FL] * 80, v=0.1)
     assert rule.rule.episodes[0] is not None
     assert rule.rule.episodes[0].phase is EdgePhase.DECLARED
-    rule.rule.reset_episodes()
-    assert rule.rule.episodes == (None,) * 4
+    rule.feed([OFF] * 3 + [ON] * 20)  # lifted, and on its wheels for as long as it takes
+    assert rule.rule.episodes == [None] * 4
 
 
 def test_an_edge_seen_ahead_is_counted_once(rule: Rule) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from ccatp.conditions import Cause
+from ccatp.conditions import BEYOND_SEAM, NO_SEAM, RIM_AHEAD
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegTracker
@@ -233,7 +233,7 @@ def off_at(pose: Pose) -> Four:
     return a, b, rear_a, rear_b
 
 
-def verdict_of(off: Four, *, may_turn: bool, cause: Cause = Cause.RIM) -> Verdict:
+def verdict_of(off: Four, *, may_turn: bool, cause: str = RIM_AHEAD.message) -> Verdict:
     code = EventCode.NEAR_EDGE if any(off) else EventCode.NORMAL
     is_free = not any(off)
     forward, reverse = not (off[0] or off[1]), not (off[2] or off[3])
@@ -245,7 +245,7 @@ def deck_of(pose: PanelPose) -> DeckPose:
 
 
 def retreated(
-    pose: Pose, *, may_turn: bool, blames: Four | None = None, cause: Cause = Cause.RIM
+    pose: Pose, *, may_turn: bool, blames: Four | None = None, cause: str = RIM_AHEAD.message
 ) -> tuple[Pose, list[RetreatStep]]:
     """Where a retreat ends that begins with the sensors that are off there, or ``blames``; wheels follow at once."""
     tracker = LegTracker(CFG.control, CFG.limits, 0.0)
@@ -290,8 +290,8 @@ def test_a_turn_away_that_sweeps_a_corner_over_the_rim_is_undone() -> None:
     assert 0.0 < turned < CFG.mission.turn_away_rad
 
 
-@pytest.mark.parametrize("cause", [Cause.NO_MAP, Cause.SEAM])
-def test_off_what_may_be_a_seam_it_stands(cause: Cause) -> None:
+@pytest.mark.parametrize("cause", [NO_SEAM.message, BEYOND_SEAM.message])
+def test_off_what_may_be_a_seam_it_stands(cause: str) -> None:
     _, seen = retreated((1.0, 0.1, 0.0), may_turn=True, blames=(True, False, False, False), cause=cause)
     assert seen == [RetreatStep.BACK, RetreatStep.TURN_AWAY, RetreatStep.OVER]
 
