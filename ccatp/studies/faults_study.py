@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from ccatp.config.models import Config
-from ccatp.links.robot_messages import Sensors
-from ccatp.mirror.mirror import Mirror
-from ccatp.sim.fault_plan import SENSOR_SIGNALS, FaultPlan, Injected, parse_plan
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.sim.fault_plan import SENSOR_SIGNALS, FaultPlan, parse_plan
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
 from ccatp.studies.mission_study import dangers, sums, times
 from ccatp.studies.results import LIMIT, colour, levels, plot
-from ccatp.studies.sil_run import SilRun, rehearse
+from ccatp.studies.sil_run import SilRun
 from ccatp.survey.composition import assemble
 
 LONGEST_S = 2.0
@@ -22,10 +20,6 @@ FIRST_S = 3.0  # not before the sensors have sent anything
 NONE, RANDOM = "none", "random"
 FAULTS_PER_MISSION = 12
 _SPREAD = 0.3  # dots of a row lie beside each other
-
-
-class NoFrames(RuntimeError):
-    """The robot sends no frame any more, which no plan of passing faults causes."""
 
 
 def random_plan(seed: int, count: int, last_s: float) -> FaultPlan:
@@ -72,78 +66,22 @@ def _draw(rng: random.Random) -> tuple[str, str, str]:
     return signal, *rng.choice(kinds)
 
 
-_LOST_FRAMES = 500  # without a frame for so long a mission is over
-
-
-class FaultySilRun(SilRun):
-    """As the processes: a frame that cannot be decoded is passed over, one that is not newer is answered with zeros."""
-
-    def __init__(self, cfg: Config, plan: FaultPlan, *, with_track: bool = False) -> None:
-        super().__init__(cfg, with_track=with_track, faults=plan)
-        self.denied_s: list[float] = []  # when lines that were no frames took the permit away
-        self.weak_frames = 0  # on an overhang, in which the fans gave less than their floor
-
-    @property
-    def injected(self) -> tuple[Injected, ...]:
-        """The effect of each fault of the plan."""
-        injector = self.robot.injector
-        return () if injector is None else injector.injected
-
-    def _note_truth(self) -> None:
-        super()._note_truth()
-        for _ in range(_LOST_FRAMES):
-            if self.robot.delivered is not None:
-                return
-            self._receive_garbled()
-            self.robot.advance()
-            super()._note_truth()
-        raise NoFrames(f"no frame arrives any more after {self.robot.t_s:.2f} s")
-
-    def _receive_garbled(self) -> None:
-        """As the danger loop on a line that is not a frame."""
-        last = self.monitor.verdict
-        if not self.robot.delivered_line or last.seq < 0:
-            return
-        verdict = self.monitor.garbled(last.seq, last.t_s, self.robot.t_s)
-        if verdict is not None:
-            self.denied_s.append(self.robot.t_s)
-            self._drive_seq += 1  # numbers drives and permits alike here
-            self.robot.permit(self._drive_seq, verdict.forward, verdict.reverse, verdict.turn)
-
-    def _serve(self, frame: Sensors, dt_s: float) -> None:
-        if self.mirror.overhang and self.robot.fans.thrust < self.cfg.sim.robot.fan_floor:
-            self.weak_frames += 1
-        if dt_s > 0.0:
-            super()._serve(frame, dt_s)
-            return
-        self.localizer.step(frame.t, frame.imu, frame.enc, frame.edge, frame.gravity)
-        self._drive_seq += 1
-        self._note_drive(self._drive_seq, 0.0, 0.0)
-        self.robot.drive(self._drive_seq, 0.0, 0.0)
-
-
 def run_job(job: Job) -> JobOutcome:
     """One mission."""
-    about: dict[str, Any] = {"injected": {"planned": 0, "acted": 0}, "is_recoverable": True, "weak_frames": 0}
-    if job.factors["faults"] == NONE:
-        found = rehearse(job.cfg)
-    else:
-        parts = assemble(job.cfg)
-        plan = random_plan(job.seed, FAULTS_PER_MISSION, parts.lower_bound_s)
-        faulty = FaultySilRun(job.cfg, plan)
-        found = faulty.run()
-        about = {
-            # A fault that comes after the end, or between two readings of a slow sensor, does nothing.
-            "injected": {"planned": len(plan.faults), "acted": sum(one.samples > 0 for one in faulty.injected)},
-            "is_recoverable": is_recoverable(plan, parts.mirror),
-            "weak_frames": faulty.weak_frames,
-        }
+    cfg, plan, mirror = job.cfg, FaultPlan(), build_mirror(job.cfg.mirror)
+    if job.factors["faults"] == RANDOM:
+        plan = random_plan(job.seed, FAULTS_PER_MISSION, assemble(cfg).lower_bound_s)
+    run = SilRun(cfg, plan)
+    found = run.run()
     names = ("points", "danger", "mission_time_s", "lower_bound_s", "within_budget")
     values: dict[str, Any] = {
         "seed": job.seed,
         "outcome": found.outcome,
         "cause": found.cause,
-        **about,
+        # A fault that comes after the end, or between two readings of a slow sensor, does nothing.
+        "injected": {"planned": len(plan.faults), "acted": sum(one.samples > 0 for one in run.injected)},
+        "is_recoverable": is_recoverable(plan, mirror),
+        "weak_frames": run.weak_frames,
         **{name: found.summary[name] for name in names},
         "states_s": found.states_s,
     }

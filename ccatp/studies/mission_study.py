@@ -117,7 +117,7 @@ def run_mission(job: Job) -> JobOutcome:
 def mission_outcome(cfg: Config, found: SilResult) -> JobOutcome:
     """What a campaign keeps of a mission that was run with its track."""
     mirror = build_mirror(cfg.mirror)
-    track = found.track if found.track is not None else np.empty((0, 7))
+    track = found.track
     places = [
         np.column_stack([track[:, x], track[:, y], mirror.surface.heights_m(track[:, x], track[:, y])])
         for x, y in ((_X, _Y), (_EST_X, _EST_Y))

@@ -1,8 +1,9 @@
 """Replay: the events of a recorded run through a localizer, judged against the truth or against the run itself."""
 
 from array import array
-from collections import deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, cast
 
@@ -21,7 +22,7 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import MirrorError
 from ccatp.records.run_reader import Event, Fixed, Marked, Trace, TraceBuilder
 
-# Calls that may still be taken back. A late fix reaches back some seconds, which are a few hundred.
+# Calls that may be taken back. A late fix reaches back some seconds, which are a few hundred.
 REACH = 2000
 # Steps in one smoother: some 30 MB at 19 states, so that going back needs little more memory than the record itself.
 CHAPTER = 4096
@@ -56,25 +57,18 @@ class RecordingFilter:
     after is removed. From a state in which nothing was recorded yet: the beginning. Anything else is a transition of
     its own (``transition_of_reset``).
 
-    The record costs ``Smoother``'s memory, 9 kB a transition at 19 states.
+    The record costs 12 kB a transition at 19 states. ``count``: transitions so far.
     """
 
     def __init__(self, filter_: Filter) -> None:
         self._filter = filter_
-        self._past: deque[_Past] = deque()
-        self._chapters: list[Smoother] = []
-        self._recorded = 0  # in the chapters
-        self._pending = 0  # transitions among the past
+        self._past: list[_Past] = []
+        self.count = 0
         self._look()
 
     def _look(self) -> None:
         filter_ = self._filter
         self.mean, self.covariance, self.transition = filter_.mean, filter_.covariance, filter_.transition
-
-    @property
-    def count(self) -> int:
-        """Transitions so far: the present state is that after as many."""
-        return self._recorded + self._pending
 
     def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
         """As ``Filter.predict``."""
@@ -82,71 +76,55 @@ class RecordingFilter:
         self._filter.predict(F, Q)
         self._look()
         noise = added_noise(covariance, self.transition, self.covariance, Q)
-        self._keep(_Past(mean, covariance, (self.transition, self.mean, noise)))
+        self._past.append(_Past(mean, covariance, (self.transition, self.mean, noise)))
+        self.count += 1
 
     def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
         """As ``Filter.update``."""
         past = _Past(self.mean, self.covariance, None)
         innovation = self._filter.update(z, H, R)
         self._look()
-        self._keep(past)
+        self._past.append(past)
         return innovation
 
     def reset(self, mean: FloatArray, covariance: FloatArray) -> None:
         """As ``Filter.reset``."""
         mean_before, covariance_before = self.mean, self.covariance
-        is_beginning = not self.count and not self._past
-        is_back = self._take_back(mean, covariance)
+        is_transition = bool(self._past) and not self._take_back(mean, covariance)
         self._filter.reset(mean, covariance)
         self._look()
-        if is_beginning or is_back:
-            return
-        F, Q = transition_of_reset(covariance_before, self.covariance)
-        self._keep(_Past(mean_before, covariance_before, (F, self.mean, Q)))
+        if is_transition:
+            F, Q = transition_of_reset(covariance_before, self.covariance)
+            self._past.append(_Past(mean_before, covariance_before, (F, self.mean, Q)))
+            self.count += 1
 
     def _take_back(self, mean: FloatArray, covariance: FloatArray) -> bool:
         """Remove everything after the state with these arrays, where the filter has been in it."""
         if mean is self.mean and covariance is self.covariance:
             return True
         past = self._past
-        for k in range(len(past) - 1, -1, -1):
+        for k in range(len(past) - 1, max(len(past) - REACH, 0) - 1, -1):
             if past[k].mean is mean and past[k].covariance is covariance:
-                while len(past) > k:
-                    self._pending -= past.pop().step is not None
+                self.count -= sum(one.step is not None for one in past[k:])
+                del past[k:]
                 return True
         return False
-
-    def _keep(self, past: _Past) -> None:
-        self._past.append(past)
-        self._pending += past.step is not None
-        if len(self._past) > REACH:
-            self._settle()
-
-    def _settle(self) -> None:
-        mean, covariance, step = self._past.popleft()
-        if step is None:
-            return
-        self._pending -= 1
-        if self._recorded % CHAPTER == 0:
-            self._chapters.append(Smoother(mean.size))
-        self._chapters[-1].record(mean, covariance, *step)
-        self._recorded += 1
 
     def smooth(self) -> Smoothed:
         """The first three states after 0, 1, ... ``count`` transitions, given everything; (k, 3) and (k, 3, 3).
 
-        Nothing can be taken back afterwards. Raises FilterDiverged where a smoothed state is not finite.
+        Raises FilterDiverged where a smoothed state is not finite.
         """
-        while self._past:
-            self._settle()
-        n = self._recorded
+        steps = [(mean, covariance, *step) for mean, covariance, step in self._past if step is not None]
+        n = len(steps)
         means, covariances = np.empty((n + 1, 3)), np.empty((n + 1, 3, 3))
         end = _State(self.mean, self.covariance)
         means[n], covariances[n] = end.mean[:3], end.covariance[:3, :3]
-        for number in range(len(self._chapters) - 1, -1, -1):
-            chapter, first = self._chapters[number], number * CHAPTER
+        for first in reversed(range(0, n, CHAPTER)):
+            chapter, last = Smoother(end.mean.size), min(first + CHAPTER, n)
+            for step in steps[first:last]:
+                chapter.record(*step)
             found = chapter.smooth(cast(Filter, end))  # of which it reads the mean and the covariance
-            last = first + len(chapter)
             means[first:last], covariances[first:last] = found.means[:-1, :3], found.covariances[:-1, :3, :3]
             end = _State(found.means[0], found.covariances[0])
         return Smoothed(means, covariances)
@@ -194,8 +172,8 @@ class Replayed:
 
     trace: Trace
     moving: IntArray
+    feet: FloatArray
     smoothed: Trace | None = None
-    feet: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     fixes: int = 0
     refused: int = 0  # by this localizer
     set_aside: int = 0  # kept from the localizer in the run, and here
@@ -220,12 +198,20 @@ def replay(
     """
     if smooth and not has_smoother(cfg):
         raise ValueError(f"no smoother for filter {cfg.run.filter}: the pose is not in it")
-    return _Player(cfg, mirror, smooth).play(events, on_frame)
+    player = _Player(cfg, mirror, smooth)
+    for event in events:
+        if isinstance(event, Fixed):
+            player.take_fix(event)
+        else:
+            player.take_frame(event)
+            if on_frame is not None:
+                on_frame(event.sensors.t)
+    return player.result()
 
 
 class _Player:
     def __init__(self, cfg: Config, mirror: Mirror, smooth: bool) -> None:
-        self._cfg, self._mirror, self._puck_height_m = cfg, mirror, cfg.robot.puck_height_m
+        self._cfg, self._mirror = cfg, mirror
         self._recording: RecordingFilter | None = None
         self._wrap: Callable[[Filter], Filter] = self._record if smooth else lambda filter_: filter_
         self._localizer: Localizer = build_localizer(cfg, mirror, self._wrap)
@@ -235,35 +221,14 @@ class _Player:
         self._moving = array("q")
         self._feet = array("d")
         self._seq = -1
-        self._fixes = self._refused = self._set_aside = 0
+        self._fates: Counter[str] = Counter()
         self._first: tuple[float, str] | None = None
 
     def _record(self, filter_: Filter) -> Filter:
         self._recording = RecordingFilter(filter_)
         return self._recording
 
-    def play(self, events: Iterable[Event], on_frame: Callable[[float], None] | None) -> Replayed:
-        for event in events:
-            if isinstance(event, Fixed):
-                self._take_fix(event)
-            else:
-                self._take_frame(event)
-                if on_frame is not None:
-                    on_frame(event.sensors.t)
-        trace = self._builder.build(self._mirror)
-        return Replayed(
-            trace=trace,
-            moving=np.array(self._moving, dtype=np.int64),
-            smoothed=self._smooth(trace, self._recording) if self._recording is not None else None,
-            feet=np.array(self._feet).reshape(-1, 3),
-            fixes=self._fixes,
-            refused=self._refused,
-            set_aside=self._set_aside,
-            first_difference=self._first,
-            counts=dict(self._localizer.counts),
-        )
-
-    def _take_frame(self, event: Marked) -> None:
+    def take_frame(self, event: Marked) -> None:
         if event.begun is not None:
             # A main loop that took over from another one began where the robot was seen last.
             if self._recording is not None and self._seq >= 0:
@@ -284,40 +249,47 @@ class _Player:
         if any(abs(right or 0.0) > TURNING_RAD_S or abs(left or 0.0) > TURNING_RAD_S for _, right, left in sensors.enc):
             self._moving.append(sensors.seq)
         here = localizer.pose
-        row, col = here.panel
-        self._builder.add(sensors.seq, sensors.t, row, col, (here.x_m, here.y_m, here.heading_rad))
+        self._builder.add(sensors.seq, sensors.t, *here.panel, (here.x_m, here.y_m, here.heading_rad))
         self._builder.add_covariance(localizer.pose_covariance)
         if self._recording is not None:
             self._steps.append(self._recording.count)
             self._states.extend(self._recording.mean[:3].tolist())
 
-    def _take_fix(self, event: Fixed) -> None:
-        self._fixes += 1
+    def take_fix(self, event: Fixed) -> None:
+        self._fates["fixes"] += 1
         if event.was_set_aside:
             # The mission measured again for it: that has happened, whatever this localizer would have said.
-            self._set_aside += 1
+            self._fates["set_aside"] += 1
             return
         said = ""
         try:
             self._localizer.fuse_fix(event.fix)
         except (FixRefused, FilterError) as refusal:
             said = str(refusal)
-            self._refused += 1
+            self._fates["refused"] += 1
         if bool(said) is event.was_fused and self._first is None:
             self._first = event.fix.t_s, said
         if event.was_fused:
-            try:
-                x, y, _ = self._mirror.foot_of_puck(event.fix.position_m, self._puck_height_m)
-            except MirrorError:
-                return
-            self._feet.extend((self._seq, x, y))
+            with suppress(MirrorError):
+                x, y, _ = self._mirror.foot_of_puck(event.fix.position_m, self._cfg.robot.puck_height_m)
+                self._feet.extend((self._seq, x, y))
 
-    def _smooth(self, trace: Trace, recording: RecordingFilter) -> Trace:
-        """Each pose corrected as the state of the filter that it was carried on from."""
-        means, covariances = recording.smooth()
-        steps = np.array(self._steps, dtype=np.int64)
-        corrections = means[steps] - np.array(self._states).reshape(-1, 3)
-        return trace.moved_to(self._mirror, trace.pose + corrections, covariances[steps])
+    def result(self) -> Replayed:
+        trace, smoothed = self._builder.build(self._mirror), None
+        if self._recording is not None:  # each pose corrected as the state of the filter that it was carried on from
+            means, covariances = self._recording.smooth()
+            steps = np.array(self._steps, dtype=np.int64)
+            corrections = means[steps] - np.array(self._states).reshape(-1, 3)
+            smoothed = trace.moved_to(self._mirror, trace.pose + corrections, covariances[steps])
+        return Replayed(
+            trace=trace,
+            moving=np.array(self._moving, dtype=np.int64),
+            feet=np.array(self._feet).reshape(-1, 3),
+            smoothed=smoothed,
+            first_difference=self._first,
+            counts=dict(self._localizer.counts),
+            **self._fates,
+        )
 
 
 # -- judgement --------------------------------------------------------------------------------------------------------
@@ -409,12 +381,10 @@ def judge(parts: Sequence[ReplayEvaluation]) -> dict[str, Any]:
     Errors are those against the truth where every recording has one, else against the run's own estimates: then there
     are none of the recorded ones. How far each fix was from the estimate before it is known without any truth.
     """
-    truths = [part.truth for part in parts if part.truth is not None]
-    recorded = [part.recorded for part in parts]
-    replayed = [part.replayed.trace for part in parts]
+    has_truth = all(part.truth is not None for part in parts)
+    recorded, replayed = [part.recorded for part in parts], [part.replayed.trace for part in parts]
+    references = [part.truth if has_truth and part.truth is not None else part.recorded for part in parts]
     smoothed = [part.replayed.smoothed for part in parts if part.replayed.smoothed is not None]
-    has_truth = len(truths) == len(parts)
-    references = truths if has_truth else recorded
 
     def errors(estimates: Sequence[Trace], references: Sequence[Trace]) -> ReplayErrors:
         each = [
@@ -433,7 +403,7 @@ def judge(parts: Sequence[ReplayEvaluation]) -> dict[str, Any]:
     return {
         "reference": "truth" if has_truth else "recorded",
         "recorded": {
-            **(figures(errors(recorded, truths)) if has_truth else {}),
+            **(figures(errors(recorded, references)) if has_truth else {}),
             "fix_distance_mm": fix_distance_mm(recorded),
         },
         "replayed": {**figures(errors(replayed, references)), "fix_distance_mm": fix_distance_mm(replayed)},

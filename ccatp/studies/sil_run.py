@@ -27,7 +27,7 @@ from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 from ccatp.mirror.panel_alignment import Measured, fit_panels
 from ccatp.records.summary import PanelFits, survey_summary
 from ccatp.safety.robot_clock import SteadyTime
-from ccatp.sim.fault_plan import FaultPlan
+from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.sim.laser import SEED_STREAM, EtalonModel, PuckTruth
 from ccatp.sim.robot import Robot
 from ccatp.sim.world import TruthRow
@@ -47,6 +47,7 @@ from ccatp.survey.state import (
 
 # A mission that takes this many times its bound hangs; the robot's own deadlines should have ended it long before.
 _ENDLESS = 6.0
+_LOST_FRAMES = 500  # without a frame for so long a mission is over
 _BATCH = 1000  # frames that go to the summary at a time
 _RECENT = 64  # frames of truth at hand: more than any delay of the sensors
 
@@ -69,7 +70,7 @@ class StopRow:
 class SilResult:
     """The result of a mission; ``summary`` as in ``summary.json``.
 
-    ``track``: rows of t, true x, y, heading, estimated x, y, heading (deck), shape (k, 7), where it was asked for.
+    ``track``: rows of t, true x, y, heading, estimated x, y, heading (deck), shape (k, 7), k = 0 where not asked for.
     """
 
     summary: dict[str, Any]
@@ -79,7 +80,7 @@ class SilResult:
     outcome: str
     cause: str
     states_s: dict[str, float]
-    track: FloatArray | None = None
+    track: FloatArray
     notices: list[str] = field(default_factory=list)
 
     @property
@@ -142,10 +143,10 @@ class SilTrace:
         self.builder.set_panels(fits, injected)
         return self.builder.build()
 
-    def track(self) -> FloatArray | None:
-        """Rows of t, true x, y, heading, estimated x, y, heading, shape (k, 7), after the summary; None without."""
+    def track(self) -> FloatArray:
+        """Rows of t, true x, y, heading, estimated x, y, heading, shape (k, 7), after the summary; none if unasked."""
         if not self._track_rows:
-            return None
+            return np.empty((0, 7))
         true, rows = np.concatenate(self._true_rows), np.concatenate(self._track_rows)
         _, i, j = np.intersect1d(true[:, 0], rows[:, 0], return_indices=True)
         return np.column_stack([true[i, 1:], rows[j, 2:]])
@@ -207,13 +208,18 @@ def rehearse(cfg: Config, *, with_track: bool = False) -> SilResult:
     return SilRun(cfg, with_track=with_track).run()
 
 
+class NoFrames(RuntimeError):
+    """The robot sends no frame any more, which no plan of passing faults causes."""
+
+
 class SilRun:
     """The processes' parts side by side; a subclass may exchange some before ``run``, or override a frame.
 
-    ``with_track``: keep true and estimated pose of every frame. ``faults``: of the robot, for ``FaultySilRun``.
+    ``faults``: of the robot. A frame that cannot be decoded is passed over, one that is not newer is answered with
+    zeros. ``with_track``: keep true and estimated pose of every frame.
     """
 
-    def __init__(self, cfg: Config, *, with_track: bool, faults: FaultPlan | None = None) -> None:
+    def __init__(self, cfg: Config, faults: FaultPlan | None = None, *, with_track: bool = False) -> None:
         self.cfg = cfg
         parts: SurveyParts = assemble(cfg)
         self.parts, self.mirror = parts, parts.mirror
@@ -224,8 +230,10 @@ class SilRun:
         self.sent = SentDrives(cfg.robot, self.robot.frame_s)
         self.laser = SilLaser(cfg, self.mirror, self.robot)
         self.trace = SilTrace(parts, with_track=with_track)
-        self.states_s: defaultdict[MissionState, float] = defaultdict(float)
+        self.states_s = defaultdict(float, {MissionState.IDLE: 0.0})
         self.notices: list[str] = []
+        self.denied_s: list[float] = []  # when lines that were no frames took the permit away
+        self.weak_frames = 0  # on an overhang, in which the fans gave less than their floor
         self._published: EstimateMessage | None = None
         self._verdict: Verdict | None = None
         self._sigma_of = lambda: self.localizer.position_sigma_m
@@ -233,23 +241,24 @@ class SilRun:
         self._drive_seq = 0
         self._time = SteadyTime(cfg.health.clock_jump_s)
         self._has_full_fans = False
-        self._state, self._state_s = MissionState.IDLE, 0.0
+
+    @property
+    def injected(self) -> tuple[Injected, ...]:
+        """The effect of each fault of the plan."""
+        injector = self.robot.injector
+        return () if injector is None else injector.injected
 
     def run(self) -> SilResult:
-        """From the first frame to the end of the mission."""
+        """From the first frame to the end of the mission (raises NoFrames)."""
         robot = self.robot
         robot.join("monitor")
         robot.join("controller")
-        self._note_truth()
-        while robot.delivered is None:
-            robot.advance()
-            self._note_truth()
+        frame = self._receive()
         robot.command_fans(1, *self.cfg.robot.fan_duty)
-        first_s = t_s = self._time.at(robot.delivered.seq, robot.delivered.t)
+        first_s = t_s = self._time.at(frame.seq, frame.t)
         last_s = first_s - robot.frame_s
         limit_s = _ENDLESS * self.parts.lower_bound_s + 600.0
         while self.mission.state.mode is not DONE:  # a subclass may exchange it
-            frame = robot.delivered
             is_new = frame.seq > self.monitor.verdict.seq
             t_s = self._time.at(frame.seq, frame.t) if is_new else last_s
             self._serve(frame, t_s - last_s)
@@ -257,8 +266,30 @@ class SilRun:
             if self.mission.state.is_faulted or t_s - first_s > limit_s:
                 break
             robot.advance()
-            self._note_truth()
+            frame = self._receive()
         return self._result(t_s - first_s)
+
+    def _receive(self) -> Sensors:
+        """The newest frame, or the next one that arrives."""
+        robot = self.robot
+        for _ in range(_LOST_FRAMES):
+            self._note_truth()
+            if robot.delivered is not None:
+                return robot.delivered
+            self._receive_garbled()
+            robot.advance()
+        raise NoFrames(f"no frame arrives any more after {robot.t_s:.2f} s")
+
+    def _receive_garbled(self) -> None:
+        """As the danger loop on a line that is not a frame."""
+        last = self.monitor.verdict
+        if not self.robot.delivered_line or last.seq < 0:
+            return
+        verdict = self.monitor.garbled(last.seq, last.t_s, self.robot.t_s)
+        if verdict is not None:
+            self.denied_s.append(self.robot.t_s)
+            self._drive_seq += 1  # numbers drives and permits alike here
+            self.robot.permit(self._drive_seq, verdict.forward, verdict.reverse, verdict.turn)
 
     def _note_truth(self) -> None:
         robot = self.robot
@@ -269,6 +300,14 @@ class SilRun:
     def _serve(self, frame: Sensors, dt_s: float) -> None:
         localizer, mission, robot = self.localizer, self.mission, self.robot
         seq, t_s = frame.seq, frame.t
+        if self.mirror.overhang and robot.fans.thrust < self.cfg.sim.robot.fan_floor:
+            self.weak_frames += 1
+        if dt_s <= 0.0:
+            localizer.step(t_s, frame.imu, frame.enc, frame.edge, frame.gravity)
+            self._drive_seq += 1
+            self._note_drive(self._drive_seq, 0.0, 0.0)
+            robot.drive(self._drive_seq, 0.0, 0.0)
+            return
         # Main publishes a pose in five frames; the verdict on a frame waits for the newest that is due before it.
         before, verdict = self._verdict, self.monitor.step(frame, self._published)
         self._verdict = verdict
@@ -293,9 +332,7 @@ class SilRun:
             if order.arrived is not None:
                 self.trace.builder.add_arrival(order.arrived, seq)
         state = mission.state.mode
-        if state is not self._state:
-            self._note_state(state)
-        self._state_s += dt_s
+        self.states_s[state] += dt_s
         self._publish(seq, t_s, motion.pose, state)
         if order.measure:
             self._measure(frame)
@@ -311,25 +348,13 @@ class SilRun:
         here = pose.x_m, pose.y_m, pose.heading_rad
         ahead = self.sent.ahead(here, v, omega, echo.seq, echo.age, echo.held, creep)
         return StateEstimate(
-            frame.t + self._time.offset_s,
-            dt_s,
-            pose,
-            self.mirror.deck_pose,
-            v,
-            omega,
-            creep,
-            ahead,
-            self._sigma_of,
-            self.parts.heading_sigma_rad,
+            *(frame.t + self._time.offset_s, dt_s, pose, self.mirror.deck_pose, v, omega, creep, ahead),
+            sigma_of=self._sigma_of,
+            heading_sigma_of=self.parts.heading_sigma_rad,
         )
 
     def _note_drive(self, number: int, right: float, left: float) -> None:
         self.sent.add(number, right, left)
-
-    def _note_state(self, state: MissionState) -> None:
-        """Another state begins, or the mission is over in it."""
-        self.states_s[self._state] = self._state_s
-        self._state, self._state_s = state, self.states_s[state]
 
     def _publish(self, seq: int, t_s: float, pose: PanelPose, state: MissionState) -> None:
         self.trace.note_estimate(seq, t_s, pose)
@@ -376,7 +401,6 @@ class SilRun:
     def _result(self, mission_time_s: float) -> SilResult:
         state, misalignments = self.mission.state, self.robot.world.misalignments
         injected = {panel: (m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in misalignments.items()}
-        self._note_state(self._state)
         return SilResult(
             summary=self.trace.summary(state, mission_time_s, self.laser.panel_fits(), injected),
             stops=self.laser.stops,

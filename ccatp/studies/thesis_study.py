@@ -191,7 +191,7 @@ def run_job(job: Job) -> JobOutcome:
     (j, 5); histogram of the distance of true and estimated position, every frame until the last stop.
     """
     found = _Replica(job.cfg, float(job.factors["period_error"])).run()
-    track = found.track if found.track is not None else np.empty((0, 7))
+    track = found.track
     stops = [stop for stop in found.stops if stop.approach == 1]
     # The way back to base is not part of the thesis's runs.
     track = track[track[:, 0] <= (stops[-1].t_s if stops else 0.0)]

@@ -21,8 +21,8 @@ from ccatp.danger import DangerMonitor
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.sim.robot import Robot
-from ccatp.studies.faults_study import FaultySilRun, random_plan
-from ccatp.studies.sil_run import SilResult
+from ccatp.studies.faults_study import random_plan
+from ccatp.studies.sil_run import SilResult, SilRun
 from tests.faults import edge_sweep
 from tests.faults.edge_sweep import (
     Tally,
@@ -202,7 +202,7 @@ class Ending:
 def survey(seed: int, plan: FaultPlan) -> Ending:
     """One panel in the hard world with the extended filter."""
     cfg = config_of(run__world="hard", run__panels=1, run__seed=seed)
-    rehearsal = FaultySilRun(cfg, plan)
+    rehearsal = SilRun(cfg, plan)
     result = rehearsal.run()
     return Ending(plan, rehearsal.injected, result)
 
@@ -268,7 +268,7 @@ def test_no_retreat_falls_at_a_corner(measured: Measured) -> None:
         ranges = {"at_s": (3, 40), "dx_m": (-0.1, 0.1), "dy_m": (-0.1, 0.1), "dheading_rad": (-0.8, 0.8)}
         drawn = {key: round(rng.uniform(*ends), 2 if key == "at_s" else 3) for key, ends in ranges.items()}
         plan = plan_of(" ".join(["body kidnap", *(f"{key}={value:.3f}" for key, value in drawn.items())]))
-        rehearsal = FaultySilRun(one_panel(run__world="hard", run__seed=seed), plan)
+        rehearsal = SilRun(one_panel(run__world="hard", run__seed=seed), plan)
         result = rehearsal.run()
         assert rehearsal.injected[0].changed
         danger = result.summary["danger"]

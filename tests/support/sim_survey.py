@@ -27,7 +27,6 @@ from ccatp.localizer import Localizer
 from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.records.store import MissionStore, PlannedPoint
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
-from ccatp.studies.faults_study import FaultySilRun
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.composition import Checkpoint, take_over
 from ccatp.survey.fix_gate import FixGate, nis_of
@@ -78,7 +77,7 @@ class _Enough(Exception):
     """Seen what was to be seen."""
 
 
-class Watched(FaultySilRun):
+class Watched(SilRun):
     """Keeps what happened frame by frame; ends as soon as somebody has seen enough."""
 
     def __init__(self, cfg: Config, plan: FaultPlan, is_enough: Callable[[Seen], bool]) -> None:
@@ -248,7 +247,7 @@ def moved(fix: Fix, offset_m: Vector3) -> Fix:
     return Fix(fix.t_s, (x, y, z), fix.covariance_m2, fix.dop, fix.channels, fix.residual_rms_m)
 
 
-class MeasuredSurvey(FaultySilRun):
+class MeasuredSurvey(SilRun):
     """A survey that measures as the main loop does: fix service, fix gate, store.
 
     Attributes:

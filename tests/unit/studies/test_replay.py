@@ -349,7 +349,9 @@ def test_a_replay_reproduces_up_to_rounding(by_m: float, is_same: bool) -> None:
 
 def judged(*, has_truth: bool, is_smoothed: bool = True, first: int = 0) -> ReplayEvaluation:
     smoothed = trace([0.001, 0.0], first=first) if is_smoothed else None
-    replayed = Replayed(trace([0.002, 0.002], first=first, covariance=np.eye(3)), np.array([first]), smoothed=smoothed)
+    replayed = Replayed(
+        trace([0.002, 0.002], first=first, covariance=np.eye(3)), np.array([first]), np.empty((0, 3)), smoothed
+    )
     truth = trace([0.0, 0.0], first=first) if has_truth else None
     return ReplayEvaluation(replayed, trace([0.004, 0.002], first=first), truth, NONE, MIRROR)
 
