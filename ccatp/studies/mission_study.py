@@ -16,9 +16,11 @@ from scipy.special import chdtri
 
 from ccatp.config.models import Config
 from ccatp.core import FloatArray, IntArray, PointId
+from ccatp.filters.metrics import nees
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.records.summary import WITHIN_M, arrival_error_m, puck_targets
 from ccatp.studies.campaign import Arrays, Factors, Job, JobOutcome
+from ccatp.studies.results import chi_square_band
 from ccatp.studies.sil_run import SilResult, StopRow, rehearse
 
 # Columns of the array ``stops``: one row for each measurement, in the order they were taken. Errors are true minus
@@ -165,23 +167,15 @@ def _stop_rows(mirror: Mirror, puck_height_m: float, stops: list[StopRow], track
 # -- the missions of a cell -------------------------------------------------------------------------------------------
 
 
-def nees(rows: FloatArray, states: int) -> FloatArray:
-    """Normalised estimation error squared, e' P^-1 e, of the first ``states`` of x, y, heading, shape (k,).
-
-    NaN where the covariance is not positive definite. ``rows``: stops, columns ``STOP_COLUMNS``.
-    """
-    full = np.empty((len(rows), 3, 3))
+def _nees_figures(stops: FloatArray, states: int) -> dict[str, Any]:
+    """Of the first ``states`` of x, y, heading, where the covariance is positive definite."""
+    full = np.empty((len(stops), 3, 3))
     upper = np.triu_indices(3)
-    full[:, upper[0], upper[1]] = full[:, upper[1], upper[0]] = rows[:, COLUMN["p_xx"] : COLUMN["p_hh"] + 1]
-    result = np.full(len(rows), np.nan)
-    first = COLUMN["error_x_m"]
-    for k, covariance in enumerate(full[:, :states, :states]):
-        try:
-            half = np.linalg.solve(np.linalg.cholesky(covariance), rows[k, first : first + states])
-        except np.linalg.LinAlgError:
-            continue
-        result[k] = half @ half
-    return result
+    full[:, upper[0], upper[1]] = full[:, upper[1], upper[0]] = stops[:, COLUMN["p_xx"] : COLUMN["p_hh"] + 1]
+    errors = stops[:, COLUMN["error_x_m"] : COLUMN["error_x_m"] + states]
+    covariances = full[:, :states, :states]
+    is_definite = np.linalg.eigvalsh(covariances)[:, 0] > 0.0
+    return chi_square_figures(nees(errors[is_definite], covariances[is_definite]), states)
 
 
 def chi_square_figures(values: FloatArray, freedom: int) -> dict[str, Any]:
@@ -194,8 +188,7 @@ def chi_square_figures(values: FloatArray, freedom: int) -> dict[str, Any]:
     if not known.size:
         names = ("mean", "band_95", "is_within_band", "p5", "p50", "p95", "within_95_fraction")
         return {"count": 0, **dict.fromkeys(names)}
-    total = known.size * freedom
-    low, high = (float(chdtri(total, tail)) / known.size for tail in (0.975, 0.025))
+    low, high = (freedom * end for end in chi_square_band(known.size * freedom))
     mean = float(known.mean())
     return {
         "count": int(known.size),
@@ -232,9 +225,7 @@ def combine_missions(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
         "localization_error_after_first_leg_mm": of_histogram(afterwards),
         "heading_error_mrad": {"rms": None if turn_square is None else round(float(np.sqrt(turn_square)), 3)},
         "stop_error_mm": {**_stop_errors(arrivals), "after_first_leg": _stop_errors(later)},
-        "nees": {
-            name: chi_square_figures(nees(arrivals, states), states) for name, states in (("pose", 3), ("position", 2))
-        },
+        "nees": {"pose": _nees_figures(arrivals, 3), "position": _nees_figures(arrivals, 2)},
         "nis": chi_square_figures(stops[:, COLUMN["nis"]], 2),
         "corrections": sum(v["corrections"] for v in values),
         # Distance of the robot from its points when it left them, as the last fix shows it and in truth.
@@ -268,29 +259,30 @@ def of_values(errors_m: FloatArray) -> dict[str, Any]:
     """Distribution of some errors, mm."""
     if not errors_m.size:
         return dict.fromkeys((*_PARTS, "within_10mm_fraction"))
-    quantiles = np.percentile(errors_m, (50.0, 99.0, 99.9))
-    return _distribution((errors_m.mean(), *quantiles, errors_m.max()), float(np.mean(errors_m <= WITHIN_M)))
+    figures_m = errors_m.mean(), *np.percentile(errors_m, (50.0, 99.0, 99.9)), errors_m.max()
+    named = {name: _mm(value) for name, value in zip(_PARTS, figures_m, strict=True)}
+    return {**named, "within_10mm_fraction": round(float(np.mean(errors_m <= WITHIN_M)), 6)}
 
 
 def of_histogram(errors_m: Histogram) -> dict[str, Any]:
     """The same of pooled errors."""
     if not errors_m.count:
         return of_values(np.empty(0))
-    quantiles = [errors_m.quantile(share) for share in (0.5, 0.99, 0.999)]
-    return _distribution((errors_m.mean, *quantiles, errors_m.largest), errors_m.within / errors_m.count)
-
-
-def _distribution(figures_m: Sequence[float], within: float) -> dict[str, float]:
+    figures_m = errors_m.mean, *map(errors_m.quantile, (0.5, 0.99, 0.999)), errors_m.largest
     named = {name: _mm(value) for name, value in zip(_PARTS, figures_m, strict=True)}
-    return {**named, "within_10mm_fraction": round(within, 6)}
+    return {**named, "within_10mm_fraction": round(errors_m.within / errors_m.count, 6)}
 
 
-def _stop_errors(rows: FloatArray) -> dict[str, Any]:
-    """Error of the estimated position at the stops, before the fix: rms and median, mm."""
-    squares = rows[:, COLUMN["error_x_m"]] ** 2 + rows[:, COLUMN["error_y_m"]] ** 2
-    if not squares.size:
+def rms_and_p50(squares_m2: FloatArray) -> dict[str, float | None]:
+    """Root mean square and median of distances, mm; None of none."""
+    if not squares_m2.size:
         return {"rms": None, "p50": None}
-    return {"rms": _mm(np.sqrt(squares.mean())), "p50": _mm(np.sqrt(np.median(squares)))}
+    return {"rms": _mm(np.sqrt(squares_m2.mean())), "p50": _mm(np.sqrt(np.median(squares_m2)))}
+
+
+def _stop_errors(rows: FloatArray) -> dict[str, float | None]:
+    """Of the estimated position at the stops, before the fix."""
+    return rms_and_p50(rows[:, COLUMN["error_x_m"]] ** 2 + rows[:, COLUMN["error_y_m"]] ** 2)
 
 
 def times(values: Sequence[Any]) -> dict[str, Any]:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri
 
 from ccatp.beacons.mission import BeaconMission, TrackRow, track_row, wheel_rates
 from ccatp.beacons.navigation import MeasurementReader
@@ -36,7 +35,7 @@ from ccatp.report.plots import QUIET
 from ccatp.safety.beacons import BeaconSafetyRules
 from ccatp.sim.beacon_robot import build_beacon_robot
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
-from ccatp.studies.results import LIMIT, colour, plot
+from ccatp.studies.results import LIMIT, chi_square_band, colour, plot
 from ccatp.survey.state import DONE
 
 
@@ -145,7 +144,6 @@ def rehearse_beacons(cfg: RadioConfig) -> BeaconSilResult:
 
 SECOND = 10  # frames; errors are compared once in so many
 _STATES = 3  # x, y, heading
-_BAND = 0.95
 
 
 def run_job(job: Job) -> JobOutcome:
@@ -186,7 +184,7 @@ def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     squares, errors, sigmas = (
         np.array([outcome.arrays[key][:length] for outcome in outcomes]) for key in ("nees", "error_m", "sigma_m")
     )
-    low, high = band(len(outcomes))
+    low, high = chi_square_band(_STATES * len(outcomes))
     each = squares.mean(axis=0) / _STATES
     readings = sum(run["readings"] for run in runs)
     values: dict[str, Any] = {
@@ -204,13 +202,6 @@ def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     }
     arrays = {"nees": each, "error_m": np.sqrt((errors**2).mean(axis=0)), "sigma_m": np.sqrt((sigmas**2).mean(axis=0))}
     return JobOutcome(values, arrays)
-
-
-def band(runs: int) -> tuple[float, float]:
-    """Where the mean NEES of so many poses lies in 95 of 100 cases, for each degree of freedom."""
-    dof = _STATES * runs
-    low, high = (float(chdtri(dof, at)) / dof for at in (0.5 + _BAND / 2, 0.5 - _BAND / 2))
-    return low, high
 
 
 def draw(cells: Sequence[CellResult], out: Path) -> None:

@@ -36,7 +36,7 @@ from ccatp.report.plots import INK
 from ccatp.sim.radio import SimDriveCommand, TruePose, TrueRadio
 from ccatp.sim.radio_world import RadioWorld
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
-from ccatp.studies.results import LIMIT, Measure, Row, band, colour, draw_ranges, grouped, plot
+from ccatp.studies.results import LIMIT, Measure, Row, band, chi_square_band, colour, draw_ranges, grouped, plot
 
 # -- a run with the truth beside the estimates -------------------------------------------------------------------------
 
@@ -203,7 +203,7 @@ def _band(freedom: float) -> str:
     """Where the mean of so many normalised squares lies with 95 % probability."""
     if freedom < 1.0:
         return "-"
-    low, high = (float(chdtri(freedom, share)) / freedom for share in (0.975, 0.025))
+    low, high = chi_square_band(freedom)
     return f"{low:.3f} to {high:.3f}"
 
 

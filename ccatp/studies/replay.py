@@ -15,7 +15,7 @@ from ccatp.control.motion_checks import as_standing
 from ccatp.core import DeckPose, FloatArray, IntArray
 from ccatp.estimation.fixes import FixRefused
 from ccatp.filters.base import Filter, FilterError, Innovation, Observation, Transition
-from ccatp.filters.metrics import rms
+from ccatp.filters.metrics import nees, rms
 from ccatp.filters.smoother import ROUNDING, Smoothed, Smoother
 from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror
@@ -311,15 +311,14 @@ def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: Arr
     offset = estimate.place[i] - reference.place[j]
     turn = estimate.pose[i, 2] - reference.pose[j, 2]
     turn = turn - 2.0 * np.pi * np.round(turn / (2.0 * np.pi))  # exactly zero for equal angles
-    nees = np.full(len(seqs), np.nan)
+    squares = np.full(len(seqs), np.nan)
     if estimate.covariance is not None:
         error = np.column_stack([offset[:, :2], turn])
         covariance = estimate.covariance[i]
         is_usable = np.linalg.det(covariance) > 0.0
-        solved = np.linalg.solve(covariance[is_usable], error[is_usable][:, :, None])[:, :, 0]
-        nees[is_usable] = (error[is_usable] * solved).sum(axis=1)
+        squares[is_usable] = nees(error[is_usable], covariance[is_usable])
     distance = np.linalg.norm(offset, axis=1)
-    return ReplayErrors(distance, turn, np.isin(seqs, moving), np.isin(seqs, arrivals), nees)
+    return ReplayErrors(distance, turn, np.isin(seqs, moving), np.isin(seqs, arrivals), squares)
 
 
 def fix_distances_m(estimate: Trace, feet: FloatArray, mirror: Mirror) -> FloatArray:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from ccatp.core import FloatArray
 from ccatp.report.plots import INK, dress, new_figure, save_figure
@@ -33,6 +34,12 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def chi_square_band(freedom: float) -> tuple[float, float]:
+    """Where the mean of so many normalised squares lies with 95 % probability."""
+    low, high = (float(chdtri(freedom, tail)) / freedom for tail in (0.975, 0.025))
+    return low, high
 
 
 def columns_of(text: str) -> list[str]:

@@ -23,6 +23,7 @@ from ccatp.studies.mission_study import (
     combine_missions,
     first_arrivals,
     mission_outcome,
+    rms_and_p50,
     run_mission,
 )
 from ccatp.studies.results import LIMIT, Measure, Row, colour, draw_ranges, grouped, levels, plot, rows_by
@@ -64,7 +65,7 @@ def combine_filters(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutc
     values, arrays = combine_missions(factors, outcomes)
     # At the first point of a run the start errors count: it says little about the filter.
     bounds = np.concatenate([outcome.arrays["bounds"][1:] for outcome in outcomes])
-    error_rms_mm = _root_mean(np.sqrt(np.sum(bounds[:, 3:] ** 2, axis=1)) ** 2)
+    error_rms_mm = rms_and_p50(np.sqrt(np.sum(bounds[:, 3:] ** 2, axis=1)) ** 2)["rms"]
     bound: dict[str, Any] = {
         **_bound(bounds[:, 1], error_rms_mm),
         "error_rms_mm": error_rms_mm,
@@ -74,15 +75,10 @@ def combine_filters(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutc
 
 
 def _bound(squares_m2: FloatArray, error_rms_mm: float | None) -> dict[str, float | None]:
-    rms = _root_mean(squares_m2)
-    if rms is None or error_rms_mm is None:
-        return dict.fromkeys(("rms_mm", "p50_mm", "ratio"))
-    median = round(1e3 * float(np.sqrt(np.median(squares_m2))), 4)
-    return {"rms_mm": rms, "p50_mm": median, "ratio": round(error_rms_mm / rms, 4)}
-
-
-def _root_mean(squares_m2: FloatArray) -> float | None:
-    return round(1e3 * float(np.sqrt(squares_m2.mean())), 4) if squares_m2.size else None
+    found = rms_and_p50(squares_m2)
+    rms_mm = found["rms"]
+    ratio = None if rms_mm is None or error_rms_mm is None else round(error_rms_mm / rms_mm, 4)
+    return {"rms_mm": rms_mm, "p50_mm": found["p50"], "ratio": ratio}
 
 
 def draw_filters(cells: Sequence[CellResult], out: Path) -> None:
@@ -270,6 +266,7 @@ GROUPS = {
     "panel edges": ("panel_edge_sigma_m",),
 }
 _BASES = ("none", "all")
+WORLDS = ("thesis", "hard")
 
 
 def sensitivity_cells() -> Sequence[Cell]:
@@ -299,13 +296,12 @@ _SHOWN = "mean (dot), 99th percentile (end of the bar)"
 
 def draw_sensitivity(cells: Sequence[CellResult], out: Path) -> None:
     """One figure for each mirror, the undisturbed and the fully disturbed world as lines."""
-    worlds = levels(cells, "world")
     for (mirror,), there in grouped(cells, "mirror").items():
         rows = []
         for cell in there:
             world, group = cell.factors["world"], str(cell.factors["group"])
             is_base = group in _BASES
-            rows.append(Row(f"world {world}" if is_base else group, cell, worlds.index(world), is_base))
+            rows.append(Row(f"world {world}" if is_base else group, cell, WORLDS.index(world), is_base))
         draw_ranges(rows, MISSION, f"What each disturbance costs on {mirror}: {_SHOWN}", out / f"sensitivity-{mirror}")
 
 
@@ -332,7 +328,6 @@ SENSITIVITY = Study(
 
 # -- ablation ---------------------------------------------------------------------------------------------------------
 
-WORLDS = ("thesis", "hard")
 ALL_ON = "nothing"
 _USE = "localizer.full_state.use"
 # What is off, and the keys that switch it off.
