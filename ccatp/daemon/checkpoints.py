@@ -15,7 +15,7 @@ from ccatp.errors import CcatpError, ExitStatus
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import build_mirror
 from ccatp.records.checkpoint import FILE, CheckpointFile, read_checkpoint
-from ccatp.records.store import MissionStore, PlannedPoint, StoreError
+from ccatp.records.store import MissionStore, StoredPoint, StoreError
 from ccatp.survey.composition import Checkpoint, SurveyParts, assemble, take_over
 from ccatp.survey.planning.route import ORDERS
 from ccatp.survey.state import HELD, EmergencyKnown, Pause, SurveyState, TakenOver
@@ -110,6 +110,6 @@ def _open_store(cfg: Config, args: ProcessArgs, mirror: str, points: Sequence[Po
     planned = []
     for point in points:
         row, column = divmod(point.point - 1, len(grid.points_x_mm))
-        planned.append(PlannedPoint(point, 1e-3 * grid.points_x_mm[column], 1e-3 * grid.points_y_mm[row]))
+        planned.append(StoredPoint(point, 1e-3 * grid.points_x_mm[column], 1e-3 * grid.points_y_mm[row]))
     text = (args.run_dir / "config.toml").read_text(encoding="utf-8")
     return MissionStore.create(path, mirror=mirror, seed=cfg.run.seed, config_toml=text, points=planned)

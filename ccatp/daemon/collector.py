@@ -33,12 +33,11 @@ from ccatp.links.topics import (
     decode_recorded,
 )
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_poses
-from ccatp.mirror.panel_alignment import Measured, fit_panels
+from ccatp.mirror.panel_alignment import fit_panels
 from ccatp.records.recorder import TELEMETRY, Recorder, iter_messages, recordings
 from ccatp.records.store import StoredSurvey, StoreError, read_survey
-from ccatp.records.summary import PanelFits, survey_summary
+from ccatp.records.summary import PanelFits, SummaryBuilder
 from ccatp.report.foxglove import Views, recorded_schemas
-from ccatp.survey.planning.route import ORDERS
 
 if TYPE_CHECKING:
     from ccatp.records.beacon_summary import BeaconSummary
@@ -191,8 +190,7 @@ class _SurveySession:
 
     def __init__(self, cfg: Config, mirror: Mirror, *, is_sim: bool) -> None:
         self._mirror, self._code, self.has_status = mirror, 0, False
-        points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
-        self.builder = survey_summary(cfg, mirror, points, 0, 0.0, is_sim=is_sim)
+        self.builder = SummaryBuilder(cfg, mirror, is_sim=is_sim)
 
     def take(self, message: Message) -> None:
         builder = self.builder
@@ -269,8 +267,7 @@ class SurveyRecord:
             return None
 
     def _fits(self, survey: StoredSurvey) -> PanelFits:
-        measured = (Measured(stored.point, stored.fix) for stored in survey.fixes)
-        return fit_panels(self.mirror, measured, self._cfg.robot.puck_height_m)
+        return fit_panels(self.mirror, survey.fixes, self._cfg.robot.puck_height_m)
 
 
 def _read(path: Path) -> dict[str, Any]:

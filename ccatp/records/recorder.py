@@ -1,22 +1,25 @@
 """Telemetry of a run as an MCAP file: JSON messages with a JSON schema for every channel; and its readers.
 
-Chunks are small, none is held back for long, and the file is not buffered, so that a ``kill -9`` costs the last moment
-at most; the reader takes a file that ends anywhere. Recording never disturbs a mission: the first write that fails ends
+Chunks are small and none is held back for long, so that a ``kill -9`` costs the last moment at most; the reader takes a
+file that ends anywhere. Recording never disturbs a mission: the first write that fails ends
 it, with one report.
 """
 
 import json
-import os
+import mmap
 import struct
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.writer import Writer
@@ -29,6 +32,7 @@ RUN_LOCK = ".lock"  # in a run directory; held by the daemon that writes there
 CHUNK_BYTES = 16 * 1024
 FLUSH_AFTER_S = 1.0  # of message time: slow topics do not wait for a full chunk
 HELD_BACK_S = 0.25  # of the machine's time: nor does anything else
+MAGIC = b"\x89MCAP0\r\n"
 # Errors of the format's reader on damaged bytes.
 DAMAGE = (
     McapError,
@@ -42,6 +46,11 @@ DAMAGE = (
     EOFError,
 )
 _COPIED_BYTES = 1 << 20  # at a time
+_HEAD = struct.Struct("<BQ")
+# Times, size and checksum stand between a chunk's head and the name of its compression.
+_TO_COMPRESSION = _HEAD.size + 8 + 8 + 8 + 4
+_COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
+_LAST_OPCODE = max(opcode.value for opcode in Opcode)
 _METADATA = "ccatp"
 _SIMULATION = "simulation"
 _MAX_T_S = 1e9  # thirty years of uptime: anything beyond is not a time since boot
@@ -56,42 +65,14 @@ class RecordedMessage(NamedTuple):
     payload: bytes
 
 
-class _RawFile:
-    """A file without a buffer that writes everything or raises.
-
-    The MCAP writer puts a buffer of its own around a plain unbuffered file; what lies in it dies with the process.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        self._position = 0
-
-    def write(self, data: bytes) -> int:
-        rest = memoryview(data)
-        while rest:
-            done = os.write(self._handle, rest)
-            self._position += done
-            rest = rest[done:]
-        return len(data)
-
-    def tell(self) -> int:
-        return self._position
-
-    def flush(self) -> None:
-        """Nothing is held back."""
-
-    def close(self) -> None:
-        os.close(self._handle)
-
-
 class _ChunkIndexes:
     """The records of the chunks that end the file, until then on the disk: those of a day take hundreds of megabytes.
 
     The MCAP writer keeps a list of them, adds to it and iterates over it once.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._file = TemporaryFile(dir=folder)  # noqa: SIM115 - open as long as the recording
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
 
     def append(self, index: ChunkIndex) -> None:
         builder = RecordBuilder()
@@ -107,24 +88,14 @@ class _ChunkIndexes:
         while part := self._file.read(_COPIED_BYTES):
             builder.write(part)
 
-    def close(self) -> None:
-        self._file.close()
-
 
 class Recorder:
-    """Writes messages of a fixed set of topics to one MCAP file.
+    """Writes messages of a fixed set of topics to one MCAP file; never raises.
 
-    An existing file at ``path`` is kept: it is renamed ``<stem>.<n><suffix>`` (see ``recordings``).
-
-    Attributes:
-        is_recording: False after ``close`` or a failure.
-        dropped: messages not recorded: after a failure, of an unknown topic, or with an invalid time.
-
-    Args:
-        topics: name and JSON schema of each topic; viewers show the schema's title.
-        is_simulation: marks the file and every channel as simulation, or as real.
-        metadata: what distinguishes runs (mirror, seed, ...), kept in the file.
-        on_failure: called once with the reason when recording ends early.
+    An existing file at ``path`` is kept: it is renamed ``<stem>.<n><suffix>`` (see ``recordings``). ``topics``: name
+    and JSON schema of each; viewers show the schema's title. ``metadata``: what distinguishes runs (mirror, seed, ...).
+    ``on_failure`` is called once with the reason when recording ends early; ``is_recording`` is False from then on, and
+    after ``close``.
     """
 
     def __init__(
@@ -137,24 +108,22 @@ class Recorder:
         on_failure: Callable[[str], None] | None = None,
     ) -> None:
         self.path = path
-        self.is_recording = False
-        self.dropped = 0
+        self.is_recording = True
         self._on_failure = on_failure
         self._channels: dict[str, int] = {}
         self._flushed_s = 0.0
         self._waiting_since_s: float | None = None
         self._sequence = 0
-        self._file: _RawFile | None = None
-        self._chunk_indexes: _ChunkIndexes | None = None
+        self._files = ExitStack()
         mark = str(is_simulation).lower()
-        try:
+        with self._ending_at_a_failure():
             if path.exists():
                 number = 1 + max(map(_part_number, recordings(path)), default=0)
                 path.rename(path.with_name(f"{path.stem}.{number}{path.suffix}"))
-            self._file = _RawFile(path)
-            self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)  # type: ignore[arg-type]
-            self._chunk_indexes = _ChunkIndexes(path.parent)
-            vars(self._writer)["_Writer__chunk_indices"] = self._chunk_indexes
+            self._file = self._files.enter_context(path.open("xb"))
+            self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
+            indexes = TemporaryFile(dir=path.parent)  # noqa: SIM115 - open as long as the recording
+            vars(self._writer)["_Writer__chunk_indices"] = _ChunkIndexes(self._files.enter_context(indexes))
             self._writer.start(library="ccatp")
             self._writer.add_metadata(_METADATA, {**(metadata or {}), _SIMULATION: mark})
             for name, schema in topics:
@@ -162,65 +131,56 @@ class Recorder:
                 title = str(schema.get("title", name))
                 schema_id = int(self._writer.register_schema(name=title, encoding="jsonschema", data=data))
                 self._channels[name] = self._writer.register_channel(name, "json", schema_id, {_SIMULATION: mark})
-            self.is_recording = True
-        except Exception as error:
-            self._fail(error)
+            self._file.flush()
 
     def write(self, topic: str, t_s: float, payload: bytes) -> None:
-        """Record one message with the robot time, s since its boot, as log time; never raises."""
+        """Record one message with the robot time, s since its boot, as log time.
+
+        One of an unknown topic or with an invalid time is left out.
+        """
         channel = self._channels.get(topic)
         if channel is None or not self.is_recording or not 0.0 <= t_s < _MAX_T_S:
-            self.dropped += 1
             return
         time_ns = round(t_s * _NS)
         self._sequence += 1
-        try:
+        with self._ending_at_a_failure():
             self._writer.add_message(channel, time_ns, payload, time_ns, self._sequence)
             if not 0.0 <= t_s - self._flushed_s < FLUSH_AFTER_S:
                 self._flush(t_s)
             elif self._waiting_since_s is None:
                 self._waiting_since_s = time.monotonic()
-        except Exception as error:
-            # Whatever it is, the mission is worth more than its recording.
-            self.dropped += 1
-            self._fail(error)
+            self._file.flush()  # a chunk that was full
 
     def flush_if_due(self) -> None:
-        """To be called several times a second: what waits for a full chunk does not wait for long. Never raises."""
-        if self._waiting_since_s is None or not self.is_recording:
-            return
-        if time.monotonic() - self._waiting_since_s >= HELD_BACK_S:
-            try:
+        """To be called several times a second: what waits for a full chunk does not wait for long."""
+        waiting_s = 0.0 if self._waiting_since_s is None else time.monotonic() - self._waiting_since_s
+        if self.is_recording and waiting_s >= HELD_BACK_S:
+            with self._ending_at_a_failure():
                 self._flush(self._flushed_s)
-            except Exception as error:
-                self._fail(error)
 
     def _flush(self, t_s: float) -> None:
         self._flushed_s, self._waiting_since_s = t_s, None
         self._writer.flush()  # type: ignore[no-untyped-call]
+        self._file.flush()
 
     def close(self) -> None:
-        """Write what is left and the index; may be repeated. Never raises."""
+        """Write what is left and the index; may be repeated."""
         if self.is_recording:
-            self.is_recording = False
-            try:
+            with self._ending_at_a_failure():
                 self._writer.finish()  # type: ignore[no-untyped-call]
-            except Exception as error:
-                self._fail(error)
-        self._close_file()
+                self._files.close()
+            self.is_recording = False
 
-    def _fail(self, error: Exception) -> None:
-        self.is_recording = False
-        self._close_file()
-        if self._on_failure is not None:
-            self._on_failure(f"{self.path}: recording ended: {error}")
-
-    def _close_file(self) -> None:
-        for file in (self._file, self._chunk_indexes):
-            if file is not None:
-                with suppress(OSError):
-                    file.close()
-        self._file = self._chunk_indexes = None
+    @contextmanager
+    def _ending_at_a_failure(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # whatever it is, the mission is worth more than its recording
+            self.is_recording = False
+            with suppress(OSError):
+                self._files.close()
+            if self._on_failure is not None:
+                self._on_failure(f"{self.path}: recording ended: {error}")
 
 
 def recordings(path: Path) -> list[Path]:
@@ -235,55 +195,119 @@ def _part_number(path: Path) -> int:
     return int(number) if number.isdecimal() else 0
 
 
+@dataclass(slots=True)
+class Condition:
+    """Condition of a file, known when the scan has come to its end.
+
+    ``lost``: beginning and end of each stretch of bytes that holds no intact record.
+    """
+
+    size_bytes: int = 0
+    lost: list[tuple[int, int]] = field(default_factory=list)
+    is_complete: bool = False
+    chunks: int = 0
+
+    @property
+    def lost_bytes(self) -> int:
+        """Bytes in ``lost``."""
+        return sum(end - begin for begin, end in self.lost)
+
+    def lose(self, begin: int, end: int) -> None:
+        """Note a stretch; it is joined to an adjacent one before it."""
+        if self.lost and self.lost[-1][1] >= begin:
+            begin = self.lost.pop()[0]
+        if end > begin:
+            self.lost.append((begin, end))
+
+
+def scan(path: Path, condition: Condition) -> Iterator[McapRecord]:
+    """The intact records of a file, chunks broken up. Raises ``OSError`` where it cannot be read.
+
+    A chunk carries a checksum, so a damaged one is left out. Where the lengths are damaged, the next chunk is found by
+    how it begins, and taken if its checksum is right.
+    """
+    condition.size_bytes = path.stat().st_size
+    if not condition.size_bytes:
+        return
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        at = len(MAGIC) if data[: len(MAGIC)] == MAGIC else 0
+        has_footer = False
+        while at < len(data):
+            if has_footer and data[at:] == MAGIC:
+                condition.is_complete = not condition.lost
+                return
+            end = _end_of_record(data, at)
+            records = None if end is None else _parsed(data, at, end)
+            if end is None or records is None:
+                # A record that is whole but for its contents is followed by another; otherwise one has to be searched.
+                is_framed = end is not None and (data[end:] == MAGIC or _end_of_record(data, end) is not None)
+                after = end if is_framed and end is not None else _next_chunk(data, at + 1)
+                condition.lose(at, after)
+                at = after
+                continue
+            condition.chunks += data[at] == Opcode.CHUNK
+            has_footer = has_footer or data[at] == Opcode.FOOTER
+            yield from records
+            at = end
+
+
+def _end_of_record(data: mmap.mmap, at: int) -> int | None:
+    if at + _HEAD.size > len(data):
+        return None
+    opcode, length = _HEAD.unpack_from(data, at)
+    end = at + _HEAD.size + int(length)
+    return end if 0 < opcode <= _LAST_OPCODE and end <= len(data) else None
+
+
+def _parsed(data: mmap.mmap, at: int, end: int) -> list[McapRecord] | None:
+    """The records in a record: those of a chunk, or itself; ``None`` if damaged."""
+    stream = BytesIO(data[at:end])
+    try:
+        record = next(StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=None).records)
+        return breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+    except (StopIteration, *DAMAGE):
+        return None
+
+
+def _next_chunk(data: mmap.mmap, start: int) -> int:
+    """Where the next intact chunk begins; the end of the file where there is none."""
+    place = start + _TO_COMPRESSION
+    while True:
+        found = [at for name in _COMPRESSIONS if (at := data.find(name, place)) >= 0]
+        if not found:
+            return len(data)
+        at, place = min(found) - _TO_COMPRESSION, min(found) + 1
+        end = _end_of_record(data, at)
+        if end is not None and data[at] == Opcode.CHUNK and _parsed(data, at, end):
+            return at
+
+
 def iter_messages(path: Path, on_damage: Callable[[str], None] | None = None) -> Iterator[RecordedMessage]:
     """All messages of a file in the order of recording, up to its end or to the first damage.
 
-    A damaged chunk gives none of its messages.
-
-    Args:
-        path: an MCAP file; it may end anywhere, as after a ``kill -9``.
-        on_damage: called with the reason where the file ends early or is damaged; nothing behind that is read.
-
-    ``OSError``: the file cannot be read.
+    The file may end anywhere, as after a ``kill -9``; a damaged chunk gives none of its messages. ``on_damage`` is
+    called with the reason where the file ends early or is damaged. ``OSError``: the file cannot be read.
     """
     channels: dict[int, str] = {}
-    for record in _iter_records(path, on_damage):
+    condition = Condition()
+    for record in scan(path, condition):
+        if condition.lost:
+            break
         if isinstance(record, Channel):
             channels[record.id] = record.topic
         elif isinstance(record, Message) and record.channel_id in channels:
             yield RecordedMessage(channels[record.channel_id], record.log_time / _NS, record.data)
+    if on_damage is not None and not condition.is_complete:
+        at = condition.lost[0][0] if condition.lost else condition.size_bytes
+        on_damage(f"{path}: damaged or cut off at byte {at}")
 
 
 def read_metadata(path: Path) -> dict[str, str]:
     """The recorder's metadata; ``simulation`` is ``"true"`` or ``"false"``. Empty if there is none."""
-    for record in _iter_records(path, None):
+    for record in scan(path, Condition()):
         if isinstance(record, Metadata) and record.name == _METADATA:
             return dict(record.metadata)
     return {}
-
-
-def _iter_records(path: Path, on_damage: Callable[[str], None] | None) -> Iterator[McapRecord]:
-    with path.open("rb") as file:
-        # No record is longer than the file; without this limit a flipped bit in a length asks for any amount of memory.
-        reader = StreamReader(file, emit_chunks=True, record_size_limit=path.stat().st_size)
-        records = iter(reader.records)
-        while True:
-            try:
-                record = next(records)
-                inner = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
-            except StopIteration:
-                return
-            except DAMAGE as error:
-                if on_damage is not None:
-                    on_damage(f"{path}: damaged or cut off before byte {file.tell()}: {error_text(error)}")
-                return
-            yield from inner
-
-
-def error_text(error: Exception) -> str:
-    """Name and message of an error of the format's reader; some of them have a name alone."""
-    name = type(error).__name__
-    return f"{name}: {error}" if str(error) else name
 
 
 def is_being_written(path: Path) -> bool:

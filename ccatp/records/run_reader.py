@@ -4,6 +4,7 @@ import tempfile
 from array import array
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -32,13 +33,12 @@ from ccatp.links.topics import (
 from ccatp.mirror.mirror import Mirror, deck_poses
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.recorder import TELEMETRY, iter_messages, read_metadata, recordings
-from ccatp.records.store import StoreError, point_name, read_survey
+from ccatp.records.store import StoreError, read_survey
 
 Injected = dict[PanelId, Vector3]
 
 
-@dataclass(frozen=True, slots=True)
-class Marked:
+class Marked(NamedTuple):
     """A frame, and the treatment of the localizer in it.
 
     ``begun``: before the frame the localizer was reset, with these values of ``Treatment``. ``is_odometry_off``:
@@ -53,8 +53,7 @@ class Marked:
     doubted: tuple[float, ...] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Fixed:
+class Fixed(NamedTuple):
     """A fix after the frame before it; one that ``was_set_aside`` was doubted and never given to the localizer."""
 
     fix: Fix
@@ -63,8 +62,6 @@ class Fixed:
 
 
 Event = Marked | Fixed
-
-
 Message = Sensors | Rest | FixMessage | Treatment
 
 
@@ -103,32 +100,23 @@ def in_order(messages: Iterable[Message]) -> Iterator[Event]:
             while fixes and fixes[0].seq < message.seq:
                 yield _fixed(fixes.popleft())
             last = message.seq
-            at_rest = last in rests
-            rests.discard(last)
             begun = treatments.pop((last, "begun"), None)
             if (last, "odometry_off") in treatments or (last, "odometry_on") in treatments or begun is not None:
                 is_odometry_off = (last, "odometry_off") in treatments
-            yield Marked(message, at_rest, begun, is_odometry_off, treatments.pop((last, "doubted"), None))
+            yield Marked(message, last in rests, begun, is_odometry_off, treatments.pop((last, "doubted"), None))
+            rests.discard(last)
     while fixes and fixes[0].seq <= last:
         yield _fixed(fixes.popleft())
 
 
 class Trace(NamedTuple):
-    """Poses after k frames.
+    """Poses after k frames."""
 
-    Attributes:
-        seq: numbers of the frames, growing, shape (k,).
-        t_s: robot time, shape (k,).
-        pose: deck x, y (m) and heading (rad), shape (k, 3).
-        height_m: of the surface there, deck frame, shape (k,).
-        covariance: of ``pose``, shape (k, 3, 3); None where it is not known.
-    """
-
-    seq: IntArray
-    t_s: FloatArray
-    pose: FloatArray
-    height_m: FloatArray
-    covariance: FloatArray | None = None
+    seq: IntArray  # numbers of the frames, growing, shape (k,)
+    t_s: FloatArray  # robot time, shape (k,)
+    pose: FloatArray  # deck x, y (m) and heading (rad), shape (k, 3)
+    height_m: FloatArray  # of the surface there, deck frame, shape (k,)
+    covariance: FloatArray | None = None  # of ``pose``, shape (k, 3, 3); None where it is not known
 
     @property
     def place(self) -> FloatArray:
@@ -269,17 +257,21 @@ class Recording:
         return trace_of_truth(self._truth) if self._truth else None
 
 
+def check_run_dir(run_dir: Path, file: str = CONFIG) -> None:
+    """``RunReadError``: there is no such directory, or no such file of a run in it."""
+    if not run_dir.is_dir():
+        raise RunReadError(f"{run_dir}: no such directory; name the directory of a run")
+    if not (recordings(run_dir / file) if file == TELEMETRY else (run_dir / file).is_file()):
+        raise RunReadError(f"{run_dir}: no {file} there; name the directory of a run")
+
+
 def open_run(run_dir: Path) -> list[Recording]:
     """The recordings of a run directory, oldest first.
 
     ``RunReadError``: there is no such directory, it holds no recording or no configuration, or one of a newer format.
     """
-    if not run_dir.is_dir():
-        raise RunReadError(f"{run_dir}: no such directory; name the directory of a run")
-    paths = recordings(run_dir / TELEMETRY)
-    if not paths:
-        raise RunReadError(f"{run_dir}: no {TELEMETRY} there; name the directory of a run")
-    return [_open(path) for path in paths]
+    check_run_dir(run_dir, TELEMETRY)
+    return [_open(path) for path in recordings(run_dir / TELEMETRY)]
 
 
 def _open(path: Path) -> Recording:
@@ -290,8 +282,8 @@ def _open(path: Path) -> Recording:
             f"{path}: recorded in format {number} by ccatp {metadata.get('ccatp', 'unknown')}, this one reads "
             f"up to {RECORD_FORMAT}: replay it with a newer ccatp"
         )
-    if "config" not in metadata and not path.with_name(CONFIG).is_file():
-        raise RunReadError(f"{path.parent}: no {CONFIG} there; name the directory of a run")
+    if "config" not in metadata:
+        check_run_dir(path.parent)
     return Recording(path, metadata)
 
 
@@ -322,23 +314,17 @@ def read_run(run_dir: Path, overrides: Mapping[str, object]) -> Survey:
     ``RunReadError``: no such directory, or no run in it, or a database that cannot be read; ``ConfigError``: its
     configuration cannot be used.
     """
-    if not run_dir.is_dir():
-        raise RunReadError(f"{run_dir}: no such directory; name the directory of a run")
-    if not (run_dir / CONFIG).is_file():
-        raise RunReadError(f"{run_dir}: no {CONFIG} there; name the directory of a run")
+    check_run_dir(run_dir)
     cfg = load_config(run_dir / CONFIG, overrides)
     try:
         stored = read_survey(run_dir / STORE, cfg.mirror.name)
     except StoreError as error:
         raise RunReadError(str(error)) from error
-    warnings = [
-        f"point {point_name(point)}: its stored fix is damaged and left out; measure it again"
-        for point in stored.damaged
-    ]
+    warnings = [*stored.warnings]
     injected, is_simulation = read_truth(run_dir, warnings)
-    planned = tuple(row.point for row in stored.points)
-    measured = tuple(Measured(one.point, one.fix) for one in stored.fixes)
-    return Survey(cfg, planned, measured, injected, is_simulation, tuple(warnings))
+    return Survey(
+        cfg, tuple(row.point for row in stored.points), stored.fixes, injected, is_simulation, tuple(warnings)
+    )
 
 
 def read_truth(run_dir: Path, warnings: list[str]) -> tuple[Injected | None, bool | None]:
@@ -363,13 +349,11 @@ def read_truth(run_dir: Path, warnings: list[str]) -> tuple[Injected | None, boo
 def _injected(path: Path) -> Injected | None:
     for topic, _, payload in iter_messages(path):
         if topic == "truth":  # before the misalignment: an older recording, which does not have it
-            return None
+            break
         if topic == "misalignment":
-            try:
+            with suppress(BadMessage):
                 message = decode_recorded(topic, payload)
-            except BadMessage:
-                return None
-            if not isinstance(message, Misalignment):
-                return None
-            return {PanelId(row, col): (piston, tip, tilt) for row, col, piston, tip, tilt in message.panels}
+                if isinstance(message, Misalignment):
+                    return {PanelId(row, col): (piston, tip, tilt) for row, col, piston, tip, tilt in message.panels}
+            break
     return None

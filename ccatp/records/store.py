@@ -24,9 +24,9 @@ from math import isfinite
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, NamedTuple, Self
-from urllib.parse import quote
 
 from ccatp.core import DeckPose, Fix, PointId
+from ccatp.mirror.panel_alignment import Measured
 
 SCHEMA_VERSION = 1
 BUSY_TIMEOUT_S = 30.0  # an outside reader may hold its lock for this long
@@ -66,6 +66,8 @@ _CRC_KEY = "crc"
 _INSERT_FIX = "INSERT INTO fixes VALUES (NULL,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)"
 _STATUS = "SELECT status FROM points WHERE row = ? AND col = ? AND point = ?"
 _SET_STATUS = "UPDATE points SET status = ?, t_s = ?, fix_id = ? WHERE row = ? AND col = ? AND point = ?"
+# Errors of a request, not of the file.
+_NOT_STORABLE = (sqlite3.IntegrityError, sqlite3.ProgrammingError, TypeError, OverflowError)
 # SQLite's errors for a file whose last transaction was cut off: it must be rolled back before it can be read.
 _CUT_OFF = ("SQLITE_READONLY", "SQLITE_CANTOPEN")
 
@@ -82,44 +84,29 @@ class AlreadyMeasuredError(StoreRefusal):
     """The point already has a committed fix."""
 
 
-class UnknownPointError(StoreRefusal):
-    """The point is not one of this mission's."""
-
-
-class PlannedPoint(NamedTuple):
-    """A point to be measured and its target in the tangent plane of its panel, panel frame."""
-
-    point: PointId
-    x_m: float
-    y_m: float
-
-
 class StoredPoint(NamedTuple):
-    """A row of ``points``; ``status`` is planned, measured or skipped, ``t_s`` the time of the latter two."""
+    """A point and its target in the tangent plane of its panel, panel frame; a row of ``points``.
+
+    ``status`` is planned, measured or skipped, ``t_s`` the time of the latter two.
+    """
 
     point: PointId
     x_m: float
     y_m: float
-    status: str
-    t_s: float | None
-    fix_id: int | None
-
-
-class StoredFix(NamedTuple):
-    """A committed fix (world frame), and the estimated pose (deck) at that time."""
-
-    id: int
-    point: PointId
-    fix: Fix
-    estimate: DeckPose
+    status: str = "planned"
+    t_s: float | None = None
+    fix_id: int | None = None
 
 
 class StoredSurvey(NamedTuple):
-    """Content of a mission database; ``damaged`` are the points whose fix does not match its checksum."""
+    """Content of a mission database: points by row, column and number, fixes (world frame) in the order of measuring.
 
-    points: list[StoredPoint]
-    fixes: list[StoredFix]
-    damaged: list[PointId]
+    ``warnings``: the points whose fix does not match its checksum, a line each.
+    """
+
+    points: tuple[StoredPoint, ...]
+    fixes: tuple[Measured, ...]
+    warnings: tuple[str, ...]
 
 
 def point_name(point: PointId) -> str:
@@ -141,9 +128,8 @@ class MissionStore:
     """The mission database of one run, owned by one process; made by ``create`` or ``open``.
 
     Recording returns at once and may be done from an asyncio loop; each request is one transaction. ``points``,
-    ``fixes`` and ``close`` wait for the writer thread. ``damaged``: points whose stored fix did not match its checksum
-    at ``open``; they are planned again. ``failure``: the error that ended all writing, if any. ``arrivals_dropped``:
-    arrivals that found the queue or the disk full.
+    ``fixes`` and ``close`` wait for the writer thread. ``damaged``: points whose stored fix did not match its
+    checksum at ``open``; they are planned again. ``failure``: the error that ended all writing, if any.
     """
 
     def __init__(self, path: Path, db: sqlite3.Connection) -> None:
@@ -152,7 +138,6 @@ class MissionStore:
         for point in self.damaged:
             db.execute(_SET_STATUS, ("planned", None, None, *point))
         self.failure: StoreError | None = None
-        self.arrivals_dropped = 0
         self._db = db
         self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
         self._is_closed = False
@@ -167,7 +152,7 @@ class MissionStore:
         mirror: str,
         seed: int,
         config_toml: str,
-        points: Iterable[PlannedPoint],
+        points: Iterable[StoredPoint],
         reserve_bytes: int = RESERVE_BYTES,
     ) -> Self:
         """Make a new store with all points planned; the file appears complete or not at all.
@@ -228,8 +213,8 @@ class MissionStore:
         """Store a fix (world frame) and make its point measured, in one transaction.
 
         Returns resolves to the number of the fix after the commit (await it with ``asyncio.wrap_future``). Fails with
-        ``AlreadyMeasuredError``, ``UnknownPointError``, ``StoreRefusal`` (not finite, or a covariance not of nine
-        values) or, where nothing will be stored any more, another ``StoreError``.
+        ``AlreadyMeasuredError``, ``StoreRefusal`` (not finite, a covariance not of nine values, or no point of this
+        mission) or, where nothing will be stored any more, another ``StoreError``.
         """
         return self._submit(lambda db: _insert_fix(db, point, fix, estimate))
 
@@ -243,23 +228,20 @@ class MissionStore:
 
         return self._submit(skip)
 
-    def record_arrival(self, point: PointId, t_s: float, estimated_error_m: float) -> bool:
-        """Store that the robot came to rest at a point; False where it was dropped: a full queue, or writing ended."""
-        if self._jobs.qsize() >= QUEUE_LIMIT or self._is_closed or self.failure is not None:
-            self.arrivals_dropped += 1
-            return False
-        row = (*point, t_s, estimated_error_m)
-        insert = "INSERT INTO arrivals VALUES (NULL, ?, ?, ?, ?, ?)"
-        self._jobs.put(_Job(lambda db: db.execute(insert, row), is_optional=True))
-        return True
+    def record_arrival(self, point: PointId, t_s: float, estimated_error_m: float) -> None:
+        """Store that the robot came to rest at a point; dropped where the queue or the disk is full."""
+        if self._jobs.qsize() < QUEUE_LIMIT and not self._is_closed and self.failure is None:
+            row = (*point, t_s, estimated_error_m)
+            insert = "INSERT INTO arrivals VALUES (NULL, ?, ?, ?, ?, ?)"
+            self._jobs.put(_Job(lambda db: db.execute(insert, row), is_optional=True))
 
     def points(self) -> list[StoredPoint]:
         """All points, by row, column and number."""
-        return list(self._submit(select_points).result())
+        return list(self._submit(_points).result())
 
-    def fixes(self) -> list[StoredFix]:
+    def fixes(self) -> list[Measured]:
         """The fix of each measured point in the order of measuring."""
-        return list(self._submit(select_fixes).result())
+        return list(self._submit(_fixes).result())
 
     def close(self, timeout_s: float = 10.0) -> None:
         """Commit what is queued and close the file; may be repeated. Raises ``StoreError`` after the time-out."""
@@ -287,41 +269,34 @@ class MissionStore:
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
             # A request cancelled before it began is left out; from here on it can no longer be cancelled.
-            if not job.future.set_running_or_notify_cancel():
-                continue
-            try:
-                if self.failure is not None:
-                    raise self.failure
-                result = self._commit(job)
-            except StoreError as error:
-                self.arrivals_dropped += job.is_optional
-                job.future.set_exception(error)
-            else:
-                job.future.set_result(result)
+            if job.future.set_running_or_notify_cancel():
+                try:
+                    job.future.set_result(self._commit(job))
+                except StoreError as error:
+                    job.future.set_exception(error)
         with suppress(sqlite3.Error):
             self._db.execute("PRAGMA journal_mode = DELETE")
         self._db.close()
 
     def _commit(self, job: _Job) -> Any:
         """Raises ``StoreRefusal`` where the store can go on, another ``StoreError`` where it cannot."""
+        if self.failure is not None:
+            raise self.failure
         try:
             self._db.execute("BEGIN IMMEDIATE")
-            try:
-                result = job.work(self._db)
-            except (StoreRefusal, sqlite3.IntegrityError, sqlite3.ProgrammingError, TypeError, OverflowError) as error:
-                self._db.execute("ROLLBACK")
-                if isinstance(error, StoreRefusal):
-                    raise
-                raise StoreRefusal(f"{self.path}: not storable: {error}") from error
+            result = job.work(self._db)
             self._db.execute("COMMIT")
-        except StoreRefusal:
-            raise
         except Exception as error:
             name = getattr(error, "sqlite_errorname", "")
             reason = f"{error} ({name})" if name else f"{type(error).__name__}: {error}"
-            # Arrivals give way to fixes, for which there may be room in what was taken at the start.
-            if self._is_rolled_back() and job.is_optional and name == "SQLITE_FULL":
-                raise StoreRefusal(f"{self.path}: {reason}") from error
+            if self._is_rolled_back():
+                if isinstance(error, StoreRefusal):
+                    raise
+                if isinstance(error, _NOT_STORABLE):
+                    raise StoreRefusal(f"{self.path}: not storable: {error}") from error
+                # Arrivals give way to fixes, for which there may be room in what was taken at the start.
+                if job.is_optional and name == "SQLITE_FULL":
+                    raise StoreRefusal(f"{self.path}: {reason}") from error
             # Final: after a failed fsync a repeated one may report a success that never reached the disk.
             self.failure = StoreError(f"{self.path}: cannot write any more: {reason}")
             raise self.failure from error
@@ -344,7 +319,7 @@ def read_survey(path: Path, mirror: str) -> StoredSurvey:
         raise StoreError(f"{path}: no such file; name the directory of a run")
     try:
         try:
-            return _read(f"file:{quote(str(path.absolute()))}?mode=ro", path, mirror)
+            return _read(f"{path.absolute().as_uri()}?mode=ro", path, mirror)
         except sqlite3.OperationalError as error:
             if not error.sqlite_errorname.startswith(_CUT_OFF):
                 raise
@@ -353,7 +328,7 @@ def read_survey(path: Path, mirror: str) -> StoredSurvey:
             for file in (path, path.with_name(path.name + "-journal")):
                 if file.exists():
                     shutil.copyfile(file, Path(folder) / file.name)
-            return _read(f"file:{quote(str(Path(folder) / path.name))}?mode=rw", path, mirror)
+            return _read(f"{(Path(folder) / path.name).as_uri()}?mode=rw", path, mirror)
     except (sqlite3.Error, UnicodeDecodeError, OSError, ValueError, TypeError) as error:
         raise StoreError(f"{path}: damaged or not a mission store: {error}") from error
 
@@ -363,8 +338,11 @@ def _read(uri: str, path: Path, mirror: str) -> StoredSurvey:
         db.execute("BEGIN")  # all of it at one instant, while a run goes on
         _check_file(db, path, mirror)
         damaged = _damaged_points(db)
-        fixes = [stored for stored in select_fixes(db) if stored.point not in damaged]
-        return StoredSurvey(select_points(db), fixes, damaged)
+        warnings = [
+            f"point {point_name(point)}: its stored fix is damaged and left out; measure it again" for point in damaged
+        ]
+        fixes = tuple(one for one in _fixes(db) if one.point not in damaged)
+        return StoredSurvey(tuple(_points(db)), fixes, tuple(warnings))
 
 
 def _connect(path: Path) -> sqlite3.Connection:
@@ -382,7 +360,7 @@ def _connect(path: Path) -> sqlite3.Connection:
 
 
 def _fill(
-    db: sqlite3.Connection, points: Iterable[PlannedPoint], meta: list[tuple[str, str]], reserve_bytes: int
+    db: sqlite3.Connection, points: Iterable[StoredPoint], meta: list[tuple[str, str]], reserve_bytes: int
 ) -> None:
     db.executescript(f"BEGIN; {_SCHEMA} COMMIT;")
     db.execute("BEGIN")
@@ -452,25 +430,23 @@ def _insert_fix(db: sqlite3.Connection, point: PointId, fix: Fix, estimate: Deck
     return int(number or 0)
 
 
-def select_points(db: sqlite3.Connection) -> list[StoredPoint]:
-    """All points, by row, column and number."""
+def _points(db: sqlite3.Connection) -> list[StoredPoint]:
     return [StoredPoint(PointId(*r[:3]), *r[3:8]) for r in db.execute("SELECT * FROM points ORDER BY row, col, point")]
 
 
-def select_fixes(db: sqlite3.Connection) -> list[StoredFix]:
-    """The fix of each measured point in the order of measuring."""
-    fixes = []
+def _fixes(db: sqlite3.Connection) -> list[Measured]:
+    found = []
     for r in db.execute("SELECT * FROM fixes WHERE id IN (SELECT fix_id FROM points) ORDER BY id"):
         channels = tuple(int(c) for c in r[19].split(",") if c)
         fix = Fix(r[4], (r[5], r[6], r[7]), tuple(r[8:17]), r[17], channels, r[18])
-        fixes.append(StoredFix(r[0], PointId(*r[1:4]), fix, DeckPose(*r[20:23])))
-    return fixes
+        found.append(Measured(PointId(*r[1:4]), fix))
+    return found
 
 
 def _status(db: sqlite3.Connection, point: PointId) -> str:
     found = db.execute(_STATUS, tuple(point)).fetchone()
     if found is None:
-        raise UnknownPointError(f"point {point_name(point)} is not one of this mission's points")
+        raise StoreRefusal(f"point {point_name(point)} is not one of this mission's points")
     return str(found[0])
 
 

@@ -5,17 +5,16 @@ run gives the same file. Values that need the truth are null on a real robot.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
 from math import nan, sqrt
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, EventCode, FloatArray, IntArray, PanelId, PointId, Vector3
+from ccatp.core import DeckPose, EventCode, FloatArray, IntArray, PanelId, PointId
 from ccatp.mirror.mirror import Mirror
 
 PanelFits = Mapping[PanelId, tuple[float, float, float]]  # piston (m), tip (rad), tilt (rad)
@@ -27,73 +26,24 @@ EXACT_ROWS = 360_000  # distances whose percentiles are exact: an hour at 100 Hz
 TICKS = 50_000  # of the main loop
 
 # Columns that truth and track share, and those of the truth alone.
-_SEQ, _X, _Y, _PSI, _SURFACE = 0, 2, 3, 4, slice(5, 8)
+_SEQ, _PSI, _SURFACE = 0, 4, slice(5, 8)
 _CLEARANCE, _FALLEN = 8, 9
 _IN_MM = ("mean", "p50", "p99", "max")
 
 
-class PuckTarget(NamedTuple):
-    """Where the puck shall be at a measurement point, and the normal of its panel; deck frame, m."""
+def arrival_error_m(
+    mirror: Mirror, point: PointId, place_m: Sequence[float] | FloatArray, puck_height_m: float
+) -> float:
+    """Distance of the puck from its target at a point, in the tangent plane of the point's panel, m.
 
-    position_m: Vector3
-    normal: Vector3
-
-
-def puck_targets(mirror: Mirror, points: Iterable[PointId], puck_height_m: float) -> dict[PointId, PuckTarget]:
-    """Target of the puck at each point: the point on the surface plus ``puck_height_m`` along the normal there."""
-    targets = {}
-    for point in points:
-        x, y = mirror.point_on_deck(point)
-        puck = mirror.deck_from_robot(DeckPose(x, y, 0.0), (0.0, 0.0, puck_height_m))
-        targets[point] = PuckTarget(puck, mirror.panels[point.panel].axes[2])
-    return targets
-
-
-def arrival_error_m(target: PuckTarget, place_m: FloatArray, normal: Vector3, puck_height_m: float) -> float:
-    """Distance of the puck from its target in the tangent plane of the target's panel, m.
-
-    ``place_m`` is the surface point under the robot, deck frame, shape (3,).
+    ``place_m`` is the surface point under the robot, deck frame. Target: the measurement point plus ``puck_height_m``
+    along the normal there.
     """
-    offset, across = place_m + puck_height_m * np.array(normal) - target.position_m, np.array(target.normal)
+    target_m = mirror.deck_from_robot(DeckPose(*mirror.point_on_deck(point), 0.0), (0.0, 0.0, puck_height_m))
+    normal = np.array(mirror.surface.normal(float(place_m[0]), float(place_m[1])))
+    across = np.array(mirror.panels[point.panel].axes[2])
+    offset = place_m + puck_height_m * normal - target_m
     return float(np.linalg.norm(offset - (offset @ across) * across))
-
-
-@dataclass(frozen=True, slots=True)
-class RunFacts:
-    """Facts of a run that are known before it starts.
-
-    Attributes:
-        world: None on a real robot.
-        lower_bound_s: rest-to-rest time of the same path under the same limits, with the measuring.
-    """
-
-    mirror: str
-    world: str | None
-    filter: str
-    seed: int
-    total_points: int
-    lower_bound_s: float
-    budget_s: float
-    puck_height_m: float
-    has_truth: bool
-
-
-def survey_summary(
-    cfg: Config, mirror: Mirror, points: Iterable[PointId], total: int, lower_bound_s: float, *, is_sim: bool
-) -> "SummaryBuilder":
-    """The summary of a survey that begins; ``total`` points are all of the mission, measured or not."""
-    facts = RunFacts(
-        mirror=cfg.mirror.name,
-        world=cfg.world.name if is_sim else None,
-        filter=cfg.run.filter,
-        seed=cfg.run.seed,
-        total_points=total,
-        lower_bound_s=lower_bound_s,
-        budget_s=cfg.run.budget_s,
-        puck_height_m=cfg.robot.puck_height_m,
-        has_truth=is_sim,
-    )
-    return SummaryBuilder(facts, puck_targets(mirror, points, cfg.robot.puck_height_m), mirror.surface.normal)
 
 
 class RunningStatistics:
@@ -155,20 +105,15 @@ class RunningStatistics:
 
 
 class SummaryBuilder:
-    """Collects a run and builds its summary.
+    """Collects a session of a survey and builds the summary.
 
     Rows may come in batches of any size, and truth and track in any order against each other; of joined rows only
     statistics of the errors are kept.
-
-    Args:
-        targets: of every point, see ``puck_targets``.
-        normal_at: normal of the surface at deck (x, y), deck frame (``mirror.surface.normal``).
     """
 
-    def __init__(
-        self, facts: RunFacts, targets: Mapping[PointId, PuckTarget], normal_at: Callable[[float, float], Vector3]
-    ) -> None:
-        self._facts, self._targets, self._normal_at = facts, targets, normal_at
+    def __init__(self, cfg: Config, mirror: Mirror, *, is_sim: bool) -> None:
+        self._cfg, self._mirror, self._is_sim = cfg, mirror, is_sim
+        self._points, self._lower_bound_s = 0, 0.0
         self._measured = self._skipped = 0
         self._left_out: Mapping[str, Sequence[str]] = {}
         self._mission_time_s = 0.0
@@ -212,7 +157,7 @@ class SummaryBuilder:
 
     def add_track(self, rows: Sequence[Sequence[float]] | FloatArray) -> None:
         """Add estimates of the same frames: the first eight columns of ``add_truth``."""
-        if len(rows) and self._facts.has_truth:
+        if len(rows) and self._is_sim:
             track = np.asarray(rows, dtype=np.float64)[:, :8]
             self._open_track = np.concatenate((self._open_track, track))[-HISTORY_ROWS:]
             self._join()
@@ -235,8 +180,8 @@ class SummaryBuilder:
         self._ticks_us.add(self._ticks_us.count + np.arange(len(ticks_us)), ticks_us)
 
     def set_plan(self, total_points: int, lower_bound_s: float) -> None:
-        """All points of the mission, measured or not, and the bound of the path, as planned."""
-        self._facts = replace(self._facts, total_points=total_points, lower_bound_s=lower_bound_s)
+        """All points of the mission, measured or not, and the rest-to-rest time of its path with the measuring."""
+        self._points, self._lower_bound_s = total_points, lower_bound_s
 
     def set_mission(
         self,
@@ -260,8 +205,7 @@ class SummaryBuilder:
         earlier one began.
         """
         earlier._settle(is_over=True)
-        if earlier._facts.lower_bound_s > 0.0:
-            self._facts = replace(self._facts, lower_bound_s=earlier._facts.lower_bound_s)
+        self._lower_bound_s = earlier._lower_bound_s or self._lower_bound_s
         self._mission_time_s += earlier._mission_time_s
         self._arrivals = earlier._arrivals | self._arrivals | earlier._arrivals  # the first arrival counts
         self._distances.include(earlier._distances)
@@ -280,19 +224,19 @@ class SummaryBuilder:
     def build(self, wall_s: float | None = None) -> dict[str, Any]:
         """The summary, keys in the order of the command line contract; ``wall_s`` is the wall time of the run."""
         self._settle(is_over=True)
-        facts, has_truth = self._facts, self._facts.has_truth
+        cfg, is_sim = self._cfg, self._is_sim
         arrivals = np.array(list(self._arrivals.values()))
         distances, count = self._distances, self._distances.count
         rms_rad = sqrt(self._squared_turns / count) if count else nan
         return {
-            "mirror": facts.mirror,
-            "world": facts.world,
-            "filter": facts.filter,
-            "seed": facts.seed,
+            "mirror": cfg.mirror.name,
+            "world": cfg.world.name if is_sim else None,
+            "filter": cfg.run.filter,
+            "seed": cfg.run.seed,
             "points": {
-                "total": facts.total_points,
+                "total": self._points,
                 "measured": self._measured,
-                "first_arrival_within_10mm": int(np.count_nonzero(arrivals <= WITHIN_M)) if has_truth else None,
+                "first_arrival_within_10mm": int(np.count_nonzero(arrivals <= WITHIN_M)) if is_sim else None,
                 "skipped": self._skipped,
                 **({"left_out": {why: list(names) for why, names in self._left_out.items()}} if self._left_out else {}),
             },
@@ -303,13 +247,13 @@ class SummaryBuilder:
             },
             "heading_error_mrad": {"rms": rounded(1e3 * rms_rad, 3)},
             "mission_time_s": rounded(self._mission_time_s, 3),
-            "lower_bound_s": rounded(facts.lower_bound_s, 3),
-            "within_budget": self._mission_time_s <= facts.budget_s,
+            "lower_bound_s": rounded(self._lower_bound_s, 3),
+            "within_budget": self._mission_time_s <= cfg.run.budget_s,
             "danger": {
-                "true_edges": self._true_edges if has_truth else None,
-                "false_edges": self._false_edges if has_truth else None,
-                "falls": self._falls if has_truth else None,
-                "max_overrun_mm": rounded(self._overrun_m * 1e3, 3) if has_truth else None,
+                "true_edges": self._true_edges if is_sim else None,
+                "false_edges": self._false_edges if is_sim else None,
+                "falls": self._falls if is_sim else None,
+                "max_overrun_mm": rounded(self._overrun_m * 1e3, 3) if is_sim else None,
             },
             "panels": self._panels(),
             "wall": wall_figures(self._mission_time_s, wall_s, self._ticks_us.sample),
@@ -340,9 +284,8 @@ class SummaryBuilder:
     def _settle(self, *, is_over: bool) -> None:
         for point, seq in list(self._waiting_arrivals.items()):
             if seq <= self._newest_seq and len(found := self._truth(seq, seq)):
-                place_m, normal = found[0][_SURFACE], self._normal_at(float(found[0][_X]), float(found[0][_Y]))
-                height_m = self._facts.puck_height_m
-                self._arrivals[point] = arrival_error_m(self._targets[point], place_m, normal, height_m)
+                height_m = self._cfg.robot.puck_height_m
+                self._arrivals[point] = arrival_error_m(self._mirror, point, found[0][_SURFACE], height_m)
                 del self._waiting_arrivals[point]
         for seq in list(self._waiting_edges):
             first, last = seq - EDGE_FRAMES, seq + EDGE_FRAMES

@@ -15,7 +15,6 @@ from ccatp.links.topics import MissionStatus
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, compare, survey_result
 from ccatp.records.summary import arrival_error_m as true_arrival_error_m
-from ccatp.records.summary import puck_targets
 from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, RecordedSession, RunRecord
 from ccatp.survey.composition import plan_survey
 from ccatp.survey.planning.legs import PlanError
@@ -97,13 +96,10 @@ def first_arrivals_mm(record: RunRecord) -> dict[PointId, float]:
             first = {point: 1e3 * arrival_error_m(mirror, point, puck_m, height_m) for point, puck_m in pucks.items()}
         elif len(truth.seq):
             frames = {PointId(*arrival.point): arrival.seq for arrival in reversed(session.arrivals)}
-            targets = puck_targets(mirror, frames, height_m)
             rows = zip(frames, np.searchsorted(truth.seq, [*frames.values()]).tolist(), frames.values(), strict=True)
             for point, at, seq in rows:
                 if at < len(truth.seq) and truth.seq[at] == seq:
-                    place = truth.place_m[at]
-                    normal = mirror.surface.normal(float(place[0]), float(place[1]))
-                    first[point] = 1e3 * true_arrival_error_m(targets[point], place, normal, height_m)
+                    first[point] = 1e3 * true_arrival_error_m(mirror, point, truth.place_m[at], height_m)
         found = first | found
     return found
 

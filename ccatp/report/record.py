@@ -20,9 +20,9 @@ from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.mirror.surface import MirrorError
 from ccatp.records.recorder import TELEMETRY, damage_text, iter_messages, read_metadata, recordings
-from ccatp.records.run_reader import CONFIG, STORE, RunReadError, read_truth
+from ccatp.records.run_reader import CONFIG, STORE, RunReadError, check_run_dir, read_truth
 from ccatp.records.state_log import LogLine, StateChange, changes_of, read_log
-from ccatp.records.store import StoredPoint, StoreError, point_name, read_survey
+from ccatp.records.store import StoredPoint, StoreError, read_survey
 
 COMPLETE = "complete"
 WITHIN_MM = 10.0  # the thesis's requirement on arrivals
@@ -163,10 +163,7 @@ def is_beacon_run(run_dir: Path) -> bool:
 
     Raises RunReadError: no such directory, or no run in it. Raises ConfigError: its configuration cannot be read.
     """
-    if not run_dir.is_dir():
-        raise RunReadError(f"{run_dir}: no such directory; name the directory of a run")
-    if not (run_dir / CONFIG).is_file():
-        raise RunReadError(f"{run_dir}: no {CONFIG} there; name the directory of a run")
+    check_run_dir(run_dir)
     return is_radio_file(run_dir / CONFIG)
 
 
@@ -317,8 +314,5 @@ def _survey(folder: RunFolder, mirror: Mirror) -> tuple[tuple[StoredPoint, ...] 
     except StoreError as error:
         folder.warnings.append(str(error).replace(f"{folder.run_dir}/", ""))
         return None, ()
-    folder.warnings += [
-        f"point {point_name(point)}: its stored fix is damaged and left out; measure it again"
-        for point in stored.damaged
-    ]
-    return tuple(stored.points), tuple(Measured(one.point, one.fix) for one in stored.fixes)
+    folder.warnings += stored.warnings
+    return stored.points, stored.fixes

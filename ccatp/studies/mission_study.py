@@ -18,7 +18,7 @@ from ccatp.config.models import Config
 from ccatp.core import FloatArray, IntArray, PointId
 from ccatp.filters.metrics import nees
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.records.summary import WITHIN_M, arrival_error_m, puck_targets
+from ccatp.records.summary import WITHIN_M, arrival_error_m
 from ccatp.studies.campaign import Arrays, Factors, Job, JobOutcome
 from ccatp.studies.results import chi_square_band
 from ccatp.studies.sil_run import SilResult, StopRow, rehearse
@@ -151,15 +151,13 @@ def mission_outcome(cfg: Config, found: SilResult) -> JobOutcome:
 
 
 def _stop_rows(mirror: Mirror, puck_height_m: float, stops: list[StopRow], track: FloatArray) -> FloatArray:
-    points = [PointId(*stop.point) for stop in stops]
-    targets = puck_targets(mirror, dict.fromkeys(points), puck_height_m)
     true = track[np.searchsorted(track[:, _T], [stop.t_s for stop in stops])][:, [_X, _Y]].reshape(-1, 2)
     rows = []
-    for stop, point, (x_m, y_m) in zip(stops, points, true.tolist(), strict=True):
-        place_m, normal = np.array(mirror.surface_point(x_m, y_m)), mirror.surface.normal(x_m, y_m)
+    for stop, place_m in zip(stops, true.tolist(), strict=True):
+        arrival_m = arrival_error_m(mirror, PointId(*stop.point), mirror.surface_point(*place_m), puck_height_m)
         rows.append((
             stop.t_s, *stop.point, stop.approach, *stop.error, *stop.covariance[np.triu_indices(3)], stop.distance_m,
-            stop.nis, stop.fix_distance_m, arrival_error_m(targets[point], place_m, normal, puck_height_m),
+            stop.nis, stop.fix_distance_m, arrival_m,
         ))  # fmt: skip
     return np.array(rows, dtype=np.float64).reshape(-1, len(STOP_COLUMNS))
 

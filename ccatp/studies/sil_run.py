@@ -25,7 +25,7 @@ from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror, deck_poses
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 from ccatp.mirror.panel_alignment import Measured, fit_panels
-from ccatp.records.summary import PanelFits, survey_summary
+from ccatp.records.summary import PanelFits, SummaryBuilder
 from ccatp.safety.robot_clock import SteadyTime
 from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.sim.laser import SEED_STREAM, EtalonModel, PuckTruth
@@ -93,10 +93,9 @@ class SilTrace:
     """Truth and estimate of every frame on their way to the summary, converted a thousand at a time."""
 
     def __init__(self, parts: SurveyParts, *, with_track: bool) -> None:
-        cfg, mirror = parts.cfg, parts.mirror
-        counted = parts.total_points, parts.lower_bound_s
-        self.builder = survey_summary(cfg, mirror, parts.points, *counted, is_sim=True)
-        self._mirror, self._with_track = mirror, with_track
+        self.builder = SummaryBuilder(parts.cfg, parts.mirror, is_sim=True)
+        self.builder.set_plan(parts.total_points, parts.lower_bound_s)
+        self._mirror, self._with_track = parts.mirror, with_track
         self._truth: list[TruthRow] = []
         self._recent: deque[TruthRow] = deque(maxlen=_RECENT)
         self._estimates: list[tuple[int, float, PanelPose]] = []

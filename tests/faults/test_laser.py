@@ -20,7 +20,7 @@ from ccatp.links import multiline
 from ccatp.localizer import build_localizer
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
-from ccatp.records.store import MissionStore, PlannedPoint
+from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck
 from ccatp.survey.fix_gate import FixGate, FrameCheck, explain, signed_axes
 from ccatp.survey.state import MissionState
@@ -111,7 +111,7 @@ def daemon_client(config: Config, port: int) -> EtalonClient:
 async def desk_of(config: Config, port: int, folder: Path) -> AsyncIterator[tuple[Desk, EtalonClient, MissionStore]]:
     """The fix service with a real client and a real store of one point."""
     client = daemon_client(config, port)
-    plan = [PlannedPoint(POINT, 0.0, 0.0)]
+    plan = [StoredPoint(POINT, 0.0, 0.0)]
     with MissionStore.create(folder / "m.sqlite", mirror="x", seed=1, config_toml="", points=plan) as store:
         desk = Desk(config, client.measure, patient(store), config.etalon.measuring_time_s)
         async with serving(desk.service):
@@ -246,7 +246,8 @@ def test_a_server_that_is_restarted_is_found_and_the_point_counts_once(
             starting = asyncio.get_running_loop().create_task(restart())
             await time_of_a_point(desk)
             late_s = asyncio.get_running_loop().time() - await starting
-            number = store.fixes()[-1].id  # counts fixes that were stored, replaced ones too
+            count = "SELECT count(*) FROM fixes"  # replaced ones too
+            number: int = store._submit(lambda db: db.execute(count).fetchone()[0]).result()
         await server.stop()
         return late_s, desk.done, number
 
@@ -433,7 +434,7 @@ def test_nothing_counts_that_was_measured_while_the_robot_moved(
     """Frames and replies race: the robot is pushed at random times, the server takes its time."""
     cfg, mirror = from_first_leg(config), mirror_of()
     far = cfg.model_copy(update={"mission": cfg.mission.model_copy(update={"correction_tolerance_m": 1e3})})
-    points = [PlannedPoint(PointId(5, 5, k), 0.0, 0.0) for k in (1, 2, 3)]
+    points = [StoredPoint(PointId(5, 5, k), 0.0, 0.0) for k in (1, 2, 3)]
     moving = bumps = counted = 0
 
     async def race(seed: int) -> None:

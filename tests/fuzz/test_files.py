@@ -20,7 +20,7 @@ from ccatp.errors import ConfigError
 from ccatp.links.topics import TOPICS, FixMessage, Rest, SensorLines, TrackMessage, pack, schema_of
 from ccatp.records.recorder import Recorder, iter_messages
 from ccatp.records.run_reader import RunReadError, open_run
-from ccatp.records.store import MissionStore, PlannedPoint, StoreError
+from ccatp.records.store import MissionStore, StoredPoint, StoreError
 from tests.fuzz.fuzzer import Target, fuzz
 from tests.fuzz.test_decoders import SENSORS
 
@@ -107,7 +107,7 @@ def a_fix(t_s: float = 1.5) -> Fix:
 def sound_store(folder: Path) -> bytes:
     """A database with six points measured, one skipped, two planned."""
     path = folder / "sound.sqlite"
-    plan = [PlannedPoint(p, 0.22, -0.25) for p in PANEL]
+    plan = [StoredPoint(p, 0.22, -0.25) for p in PANEL]
     with MissionStore.create(path, mirror="fyst-m1", seed=1, config_toml="[run]\n", points=plan, reserve_bytes=0) as db:
         for k, point in enumerate(PANEL[:6]):
             db.record_fix(point, a_fix(float(k)), DeckPose(0.1, 0.2, 0.3)).result()

@@ -25,7 +25,7 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import FixMessage
 from ccatp.localizer import Localizer
 from ccatp.mirror.multilateration import MultilaterationError
-from ccatp.records.store import MissionStore, PlannedPoint
+from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.composition import Checkpoint, take_over
@@ -266,7 +266,7 @@ class MeasuredSurvey(SilRun):
         self._scripted, self._folder = laser, folder
 
     def run(self) -> Any:
-        points = [PlannedPoint(point, 0.0, 0.0) for point in self.parts.points]
+        points = [StoredPoint(point, 0.0, 0.0) for point in self.parts.points]
         path = self._folder / "mission.sqlite"
         with (
             asyncio.Runner(loop_factory=VirtualLoop) as runner,

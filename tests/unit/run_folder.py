@@ -12,7 +12,7 @@ from ccatp.links.topics import Misalignment, schema_of
 from ccatp.mirror.misalignment import PanelMisalignment
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.recorder import Recorder
-from ccatp.records.store import MissionStore, PlannedPoint
+from ccatp.records.store import MissionStore, StoredPoint
 
 HERE = DeckPose(0.0, 0.0, 0.0)
 
@@ -27,7 +27,7 @@ def make_run(
     """A run directory: configuration, database, and a recording where the truth is known."""
     run_dir.mkdir(exist_ok=True)
     (run_dir / "config.toml").write_text(dump_config(cfg))
-    points = [PlannedPoint(point, 0.0, 0.0) for point in planned]
+    points = [StoredPoint(point, 0.0, 0.0) for point in planned]
     with MissionStore.create(
         run_dir / "mission.sqlite", mirror=cfg.mirror.name, seed=cfg.run.seed, config_toml="", points=points
     ) as store:

@@ -1,47 +1,36 @@
 """Tests of the summary against a plain recomputation, whatever the order and size of the batches."""
 
 import json
-import tomllib
-from dataclasses import replace
 from math import hypot, pi
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ccatp.config.models import MirrorConfig
 from ccatp.core import PanelId, PointId
-from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.records import summary as summary_module
-from ccatp.records.summary import RunFacts, RunningStatistics, SummaryBuilder, format_table, puck_targets
+from ccatp.records.summary import RunningStatistics, SummaryBuilder, format_table
+from tests.support.scenario import config_of, mirror_of
 
-HEIGHT_M = 0.05
-POINT = PointId(5, 5, 3)
-FACTS = RunFacts("fyst-m1", "thesis", "kf", 1, 693, 3000.0, 3600.0, HEIGHT_M, True)
-CONFIGS = Path(__file__).parents[2] / "configs" / "mirrors"
-
-
-@pytest.fixture(scope="module")
-def mirror() -> Mirror:
-    return build_mirror(MirrorConfig.model_validate(tomllib.loads((CONFIGS / "fyst-m1.toml").read_text())))
+POINT, OTHER = PointId(5, 5, 3), PointId(5, 5, 4)
+CFG, MIRROR = config_of(), mirror_of()
 
 
 @pytest.fixture
-def builder(mirror: Mirror) -> SummaryBuilder:
-    return make(mirror)
+def builder() -> SummaryBuilder:
+    return make()
 
 
-def make(mirror: Mirror, **changes: Any) -> SummaryBuilder:
-    facts = replace(FACTS, **changes)
-    return SummaryBuilder(facts, puck_targets(mirror, mirror.point_ids(PanelId(5, 5)), HEIGHT_M), mirror.surface.normal)
+def make(*, lower_bound_s: float = 3000.0, is_sim: bool = True) -> SummaryBuilder:
+    made = SummaryBuilder(CFG, MIRROR, is_sim=is_sim)
+    made.set_plan(693, lower_bound_s)
+    return made
 
 
 def truth_row(
-    mirror: Mirror, seq: int, x: float = 0.0, y: float = 0.0, psi: float = 0.0, clearance: float = 1.0, fallen: int = 0
+    seq: int, x: float = 0.0, y: float = 0.0, psi: float = 0.0, clearance: float = 1.0, fallen: int = 0
 ) -> list[float]:
-    return [seq, seq / 100, x, y, psi, *mirror.surface.point(x, y), clearance, fallen, int(clearance < 0)]
+    return [seq, seq / 100, x, y, psi, *MIRROR.surface_point(x, y), clearance, fallen, int(clearance < 0)]
 
 
 def tables(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -74,7 +63,7 @@ def test_errors_are_those_of_a_plain_recomputation(builder: SummaryBuilder) -> N
     assert built["heading_error_mrad"]["rms"] == pytest.approx(1e3 * (sum(turns**2) / 970) ** 0.5, abs=6e-4)
 
 
-def test_batches_of_any_size_and_order_give_the_same_summary(mirror: Mirror) -> None:
+def test_batches_of_any_size_and_order_give_the_same_summary() -> None:
     truth, track = tables(900)
     results = []
     for seed in range(4):
@@ -84,7 +73,7 @@ def test_batches_of_any_size_and_order_give_the_same_summary(mirror: Mirror) -> 
         order = rng.permutation(13)
         for position, part in zip(order, np.split(track, cuts), strict=True):
             parts.insert(int(position) * 2, ("track", part))
-        made = make(mirror)
+        made = make()
         made.add_arrival(POINT, 450)
         made.add_verdict_event(449, 1)
         for kind, part in parts:
@@ -119,17 +108,17 @@ def test_statistics_of_a_long_run_take_bounded_memory() -> None:
     assert whole.figures(("max",), scale=1.0, decimals=9) == {"max": found[0]["max"]}
 
 
-def test_heading_error_is_wrapped(builder: SummaryBuilder, mirror: Mirror) -> None:
-    builder.add_truth([truth_row(mirror, 1, psi=pi - 0.001)])
-    builder.add_track([truth_row(mirror, 1, psi=-pi + 0.002)])
+def test_heading_error_is_wrapped(builder: SummaryBuilder) -> None:
+    builder.add_truth([truth_row(1, psi=pi - 0.001)])
+    builder.add_track([truth_row(1, psi=-pi + 0.002)])
     assert builder.build()["heading_error_mrad"]["rms"] == 3.0
 
 
 @pytest.mark.parametrize("truth_first", [True, False])
-def test_arrival_error_is_that_of_the_puck_in_the_panel_plane(mirror: Mirror, truth_first: bool) -> None:
-    builder = make(mirror)
-    x, y = mirror.point_on_deck(POINT)
-    row = truth_row(mirror, 7, x + 3e-3, y - 4e-3)
+def test_arrival_error_is_that_of_the_puck_in_the_panel_plane(truth_first: bool) -> None:
+    builder = make()
+    x, y = MIRROR.point_on_deck(POINT)
+    row = truth_row(7, x + 3e-3, y - 4e-3)
     row[7] += 5e-3  # along the normal, nearly: a misaligned panel is no arrival error
     if truth_first:
         builder.add_truth([row])
@@ -144,9 +133,9 @@ def test_arrival_error_is_that_of_the_puck_in_the_panel_plane(mirror: Mirror, tr
     assert built["points"]["first_arrival_within_10mm"] == 1
 
 
-def test_arrival_at_the_target_has_no_error_and_only_the_first_counts(builder: SummaryBuilder, mirror: Mirror) -> None:
-    x, y = mirror.point_on_deck(POINT)
-    builder.add_truth([truth_row(mirror, 1, x, y), truth_row(mirror, 2, x + 0.02, y), truth_row(mirror, 3, x, y)])
+def test_arrival_at_the_target_has_no_error_and_only_the_first_counts(builder: SummaryBuilder) -> None:
+    x, y = MIRROR.point_on_deck(POINT)
+    builder.add_truth([truth_row(1, x, y), truth_row(2, x + 0.02, y), truth_row(3, x, y)])
     builder.add_arrival(POINT, 1)
     builder.add_arrival(POINT, 2)
     builder.add_arrival(PointId(5, 5, 1), 2)
@@ -157,34 +146,32 @@ def test_arrival_at_the_target_has_no_error_and_only_the_first_counts(builder: S
     assert built["arrival_error_mm"]["max"] > 100.0
 
 
-def test_an_arrival_is_found_long_after_its_frame(
-    builder: SummaryBuilder, mirror: Mirror, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_arrival_is_found_long_after_its_frame(builder: SummaryBuilder, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(summary_module, "HISTORY_ROWS", 100)
     for start in range(0, 300, 10):
-        builder.add_truth([truth_row(mirror, seq) for seq in range(start, start + 10)])
+        builder.add_truth([truth_row(seq) for seq in range(start, start + 10)])
     builder.add_arrival(POINT, 205)
     assert builder.unresolved == 0
     builder.add_arrival(PointId(5, 5, 1), 100)  # beyond what is kept: reported as unresolved, never guessed
     assert builder.unresolved == 1
 
 
-def test_an_edge_is_true_where_a_sensor_was_beyond_the_rim(builder: SummaryBuilder, mirror: Mirror) -> None:
+def test_an_edge_is_true_where_a_sensor_was_beyond_the_rim(builder: SummaryBuilder) -> None:
     clearance = {20: -0.004, 33: -0.0021}
     builder.add_verdict_event(17, 1)  # three frames before the truth's
     builder.add_verdict_event(24, 1)  # four frames after
-    builder.add_truth([truth_row(mirror, seq, clearance=clearance.get(seq, 0.1)) for seq in range(30)])
+    builder.add_truth([truth_row(seq, clearance=clearance.get(seq, 0.1)) for seq in range(30)])
     builder.add_verdict_event(30, 1)  # its frames are not all there yet
     assert builder.unresolved == 1
-    builder.add_truth([truth_row(mirror, seq, clearance=clearance.get(seq, 0.1)) for seq in range(30, 40)])
+    builder.add_truth([truth_row(seq, clearance=clearance.get(seq, 0.1)) for seq in range(30, 40)])
     builder.add_verdict_event(39, 1)  # the run ends before its last frames
     builder.add_verdict_event(20, 2)  # an abort is no edge
     assert builder.build()["danger"] == {"true_edges": 2, "false_edges": 2, "falls": 0, "max_overrun_mm": 4.0}
 
 
-def test_falls_are_counted_once_each_across_batches(builder: SummaryBuilder, mirror: Mirror) -> None:
+def test_falls_are_counted_once_each_across_batches(builder: SummaryBuilder) -> None:
     for batch in ([0, 1], [1, 1], [0, 0], [1]):
-        builder.add_truth([truth_row(mirror, i, fallen=f) for i, f in enumerate(batch)])
+        builder.add_truth([truth_row(i, fallen=f) for i, f in enumerate(batch)])
     assert builder.build()["danger"]["falls"] == 2
 
 
@@ -214,8 +201,8 @@ def test_a_whole_summary_has_the_keys_of_the_contract_in_their_order(builder: Su
     json.dumps(built, allow_nan=False)
 
 
-def test_a_real_robot_has_null_where_the_truth_is_needed(mirror: Mirror) -> None:
-    builder = make(mirror, has_truth=False, world=None)
+def test_a_real_robot_has_null_where_the_truth_is_needed() -> None:
+    builder = make(is_sim=False)
     builder.add_track(tables(10)[1])
     builder.add_arrival(POINT, 3)
     builder.add_verdict_event(3, 1)
@@ -252,20 +239,19 @@ def test_the_table_has_every_figure_and_counts_points_left_out_by_reason(builder
     assert line.endswith("left_out 2 (operator), 1 (no fix)")
 
 
-def test_a_mission_in_two_sessions_has_one_summary(mirror: Mirror) -> None:
-    first, second = make(mirror, lower_bound_s=50.0), make(mirror, lower_bound_s=20.0)
-    other = PointId(5, 5, 4)
-    places = {point: mirror.point_on_deck(point) for point in (POINT, other)}
+def test_a_mission_in_two_sessions_has_one_summary() -> None:
+    first, second = make(lower_bound_s=50.0), make(lower_bound_s=20.0)
+    places = {point: MIRROR.point_on_deck(point) for point in (POINT, OTHER)}
     truth, track = tables(40)
-    first.add_truth([truth_row(mirror, 1, *places[POINT], clearance=-0.002)])
+    first.add_truth([truth_row(1, *places[POINT], clearance=-0.002)])
     first.add_arrival(POINT, 1)
     first.add_verdict_event(1, 1)
     first.set_mission(1, 0, 30.0)
     second.add_truth(truth[:20])  # its frames are counted anew
     second.add_track(track[:20])
-    second.add_truth([truth_row(mirror, 30, 0.3, 0.3), truth_row(mirror, 31, *places[other])])
+    second.add_truth([truth_row(30, 0.3, 0.3), truth_row(31, *places[OTHER])])
     second.add_arrival(POINT, 30)  # approached once more: the first time counts
-    second.add_arrival(other, 31)
+    second.add_arrival(OTHER, 31)
     second.set_mission(2, 0, 25.0)
     alone = second.build()
     second.precede(first)

@@ -22,7 +22,7 @@ from ccatp.links.topics import (
     schema_of,
 )
 from ccatp.records.recorder import Recorder
-from ccatp.records.store import MissionStore, PlannedPoint
+from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.state import Abort, MissionState
 
@@ -47,7 +47,7 @@ class RecordingRun(SilRun):
             is_simulation=is_simulation,
             metadata={"ccatp": "0.0.test", "config": dump_config(cfg)},
         )
-        points = [PlannedPoint(point, 0.0, 0.0) for point in self.parts.points]
+        points = [StoredPoint(point, 0.0, 0.0) for point in self.parts.points]
         self.store = MissionStore.create(
             run_dir / "mission.sqlite", mirror=cfg.mirror.name, seed=cfg.run.seed, config_toml="", points=points
         )

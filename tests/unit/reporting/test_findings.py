@@ -158,7 +158,7 @@ def test_a_run_that_was_killed(without: Callable[..., Path]) -> None:
     assert {path.name: path.read_bytes() for path in run_dir.iterdir()} == before  # nothing is written
     assert found.missing == ("summary.json: the run goes on, or was killed before its end",)
     torn, line = sorted(found.warnings, reverse=True)
-    assert torn.startswith("telemetry.mcap: damaged or cut off before byte ")
+    assert torn.startswith("telemetry.mcap: damaged or cut off at byte ")
     assert torn.endswith("; what came before it is in this report")
     assert line == "log.jsonl: 1 lines cannot be read and are left out"
     assert len(only(found).track.seq) > 500
