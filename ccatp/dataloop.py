@@ -20,6 +20,7 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.core import DeckPose
 from ccatp.links.auth import read_key
+from ccatp.links.robot_link import LineWriter
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.beacon_robot import build_beacon_robot
 from ccatp.sim.fault_injector import Injector
@@ -153,6 +154,7 @@ class Connection(RobotSession, asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)  # a TCP connection has no other
         self._transport.set_write_buffer_limits(high=MAX_UNSENT_BYTES)
+        self._writer = LineWriter(self._transport)
         peer = self._transport.get_extra_info("socket")
         peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -182,7 +184,7 @@ class Connection(RobotSession, asyncio.Protocol):
     def write(self, data: bytes) -> None:
         """Send, unless the client does not read."""
         if not self._is_paused:
-            self._transport.write(data)
+            self._writer.write(data)
 
     def close(self) -> None:
         self._transport.close()

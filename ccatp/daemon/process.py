@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, TextIO, cast
 
 import structlog
+import uvloop
 import zmq
 
 from ccatp.config.beacon_models import RadioConfig
@@ -226,7 +227,8 @@ def run_until_stopped(serve: Callable[[asyncio.Event], Coroutine[Any, Any, int]]
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
         return await serve(stop)
 
-    return asyncio.run(run())
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        return runner.run(run())
 
 
 def run_process(name: str, serve: Callable[["zmq.Context[zmq.Socket[bytes]]", asyncio.Event], Awaitable[int]]) -> int:

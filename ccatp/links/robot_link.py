@@ -1,6 +1,7 @@
 """The client's end of the robot link: joins the robot, hands over its frames, sends commands. Decides nothing."""
 
 import asyncio
+import os
 import socket
 from collections import Counter
 from collections.abc import Callable
@@ -62,6 +63,30 @@ _HINTS = {
 }
 
 
+class LineWriter:
+    """Sends lines on a TCP connection at once, not when the event loop goes on; ends with the transport.
+
+    Only what the kernel does not take waits in the transport. Lines after the end of the connection are dropped.
+    """
+
+    def __init__(self, transport: asyncio.Transport) -> None:
+        self._transport = transport
+        self._fd: int = transport.get_extra_info("socket").fileno()
+
+    def write(self, data: bytes) -> None:
+        """Send one or more lines."""
+        transport, written = self._transport, 0
+        if transport.is_closing():
+            return
+        if not transport.get_write_buffer_size():
+            try:
+                written = os.write(self._fd, data)
+            except OSError:  # nothing is taken now; an error of the connection shows again in the transport
+                written = 0
+        if written < len(data):
+            transport.write(data[written:])
+
+
 class RobotLink(asyncio.Protocol):
     """One session with the robot.
 
@@ -97,6 +122,7 @@ class RobotLink(asyncio.Protocol):
         self._on_bad_line, self._on_repeated = on_bad_line, on_repeated
         self.counts: Counter[str] = Counter()
         self._transport: asyncio.Transport | None = None
+        self._writer: LineWriter | None = None
         self._hello: Hello | None = None
         self._joining: asyncio.Future[Hello] | None = None
         self._is_joined = self._is_closing = self._is_paused = False
@@ -142,6 +168,7 @@ class RobotLink(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)  # a TCP connection has no other
         self._transport.set_write_buffer_limits(high=MAX_UNSENT_BYTES)
+        self._writer = LineWriter(self._transport)
         peer = self._transport.get_extra_info("socket")
         peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -172,7 +199,7 @@ class RobotLink(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         why = self._why or (f"connection lost: {exc}" if exc else "the robot closed the connection")
-        self._transport = None
+        self._transport = self._writer = None
         if self._joining is not None and not self._joining.done():
             if self._hello is None and self._bad.total:
                 self._joining.set_exception(WrongProtocol(f"no robot answers at {self._where}: {why}"))
@@ -259,13 +286,13 @@ class RobotLink(asyncio.Protocol):
     def _send_fresh(self, line: bytes) -> None:
         if self._is_paused:
             self.counts["unsent"] += 1
-        elif self._transport is not None and not self._transport.is_closing():
-            self._transport.write(line)
+        elif self._writer is not None:
+            self._writer.write(line)
 
     def send_raw(self, data: bytes) -> None:
         """Send bytes as they are; nothing happens when the connection is gone."""
-        if self._transport is not None and not self._transport.is_closing():
-            self._transport.write(data)
+        if self._writer is not None:
+            self._writer.write(data)
 
     def close(self) -> None:
         """End the session after what was sent; ``on_lost`` is not called."""

@@ -1,16 +1,18 @@
 """The client's end of the robot link against a scripted robot."""
 
 import asyncio
+import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
+import uvloop
 
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.auth import read_key
 from ccatp.links.robot_codec import RobotFrame, encode, join_mac
-from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout, WrongProtocol
+from ccatp.links.robot_link import LineWriter, RobotLink, RobotLinkError, RobotRefused, RobotTimeout, WrongProtocol
 from ccatp.links.robot_messages import CommandEcho, Sensors
 
 NONCE = "ab" * 16
@@ -356,3 +358,20 @@ async def test_commands_do_not_pile_up() -> None:
         assert link._transport is not None
         assert link._transport.get_write_buffer_size() < 3 * 4096
         resume.set()
+
+
+def test_a_line_is_sent_before_the_event_loop_goes_on() -> None:
+    async def send() -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            transport, _ = await asyncio.get_running_loop().create_connection(asyncio.Protocol, sock=ours)
+            writer = LineWriter(transport)
+            writer.write(b"a line\n")
+            assert theirs.recv(100, socket.MSG_DONTWAIT) == b"a line\n"
+            transport.abort()
+            writer.write(b"after the end\n")
+            await asyncio.sleep(0.01)
+            assert theirs.recv(100, socket.MSG_DONTWAIT) == b""
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        runner.run(send())

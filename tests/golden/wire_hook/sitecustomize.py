@@ -2,6 +2,7 @@
 
 Where a process sends the first line of the robot link, its connection is written to CCATP_GOLDEN_DIR/wire.<n>, one line
 per message: ``>`` from or ``<`` to the robot, and the message; a frame that goes to several clients is written once.
+The processes run on asyncio's own event loop here, whose sockets can be watched, and not on that of uvloop.
 What any process publishes by ZeroMQ goes to CCATP_GOLDEN_DIR/bus.<n>, but for long messages: set points have all their
 digits there. Nothing here depends on names of the package: the link and the channels are documented interfaces.
 
@@ -15,20 +16,22 @@ action falls between the same two frames in each run.
   and this one end at once, as by ``kill -9``.
 """
 
+import asyncio
 import json
 import os
 import signal
 import socket
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import zmq
 
 _HELLO = b'"hello"', b'"ccatp-robot/'
 _SENSORS = b'"sensors"'
-_recv, _send = socket.socket.recv, socket.socket.send
+_recv, _send, _write = socket.socket.recv, socket.socket.send, os.write
 _LONG_MESSAGE = 1000  # batches, which are in the recording
 
 
@@ -37,22 +40,20 @@ class _Wire:
 
     def __init__(self, folder: Path, actions: list[dict[str, Any]]) -> None:
         self._folder, self._actions = folder, actions
-        self._rests: WeakKeyDictionary[socket.socket, dict[bytes, bytes]] = WeakKeyDictionary()
+        self._rests: dict[int, dict[bytes, bytes]] = {}  # by the number of the connection's file
         self._last_frame = b""
         self._file = -1
 
-    def is_known(self, connection: socket.socket, data: bytes) -> bool:
+    def is_known(self, connection: int, data: bytes) -> bool:
         """Whether this is a connection of the robot link, or becomes one by its first line."""
-        if connection in self._rests:
-            return True
         if not all(part in data for part in _HELLO):
-            return False
+            return connection in self._rests
         if self._file < 0:
             self._file = _open_next(self._folder, "wire")
         self._rests[connection] = {b"<": b"", b">": b""}
         return True
 
-    def note(self, connection: socket.socket, direction: bytes, data: bytes) -> None:
+    def note(self, connection: int, direction: bytes, data: bytes) -> None:
         rests = self._rests.get(connection)
         if rests is None:
             return
@@ -62,7 +63,7 @@ class _Wire:
                 if line == self._last_frame:
                     continue
                 self._last_frame = line
-            os.write(self._file, direction + line + b"\n")
+            _write(self._file, direction + line + b"\n")
 
     def act_before(self, data: bytes) -> None:
         for line in data.split(b"\n"):
@@ -104,28 +105,39 @@ def _write_down_bus(folder: Path) -> None:
         if self.type in (zmq.PUB, zmq.XPUB) and isinstance(data, bytes) and len(data) < _LONG_MESSAGE:
             if not files:
                 files.append(_open_next(folder, "bus"))
-            os.write(files[0], data + b"\n")
+            _write(files[0], data + b"\n")
         return send(self, data, *arguments, **options)
 
     zmq.Socket.send = publish  # type: ignore[method-assign]
 
 
 def _write_down_link(wire: _Wire) -> None:
-    def send(self: socket.socket, data: Any, *flags: int) -> int:
-        if not wire.is_known(self, bytes(data[:200])):
-            return _send(self, data, *flags)
-        wire.act_before(bytes(data))
-        sent = _send(self, data, *flags)
-        wire.note(self, b">", bytes(data[:sent]))
+    def sent_by(connection: int, data: bytes, send: Callable[[], int]) -> int:
+        if not wire.is_known(connection, data[:200]):
+            return send()
+        wire.act_before(data)
+        sent = send()
+        wire.note(connection, b">", data[:sent])
         return sent
+
+    def write(file: int, data: Any) -> int:
+        return sent_by(file, bytes(data), lambda: _write(file, data))
+
+    def send(self: socket.socket, data: Any, *flags: int) -> int:
+        return sent_by(self.fileno(), bytes(data), lambda: _send(self, data, *flags))
 
     def recv(self: socket.socket, size: int, *flags: int) -> bytes:
         data = _recv(self, size, *flags)
-        wire.note(self, b"<", data)
+        wire.note(self.fileno(), b"<", data)
         return data
 
+    os.write = write
     socket.socket.send = send  # type: ignore[assignment,method-assign]
     socket.socket.recv = recv  # type: ignore[assignment,method-assign]
+    with suppress(ImportError):  # an older base is without it
+        import uvloop
+
+        uvloop.new_event_loop = asyncio.new_event_loop  # type: ignore[assignment]
 
 
 if (_folder := os.environ.get("CCATP_GOLDEN_DIR")) is not None:
