@@ -227,7 +227,7 @@ def _config(recording: "Recording", changes: Mapping[str, object], smooth: bool)
 
 
 def _judged(recording: "Recording", cfg: "Config", smooth: bool) -> "ReplayEvaluation":
-    from ccatp.filters import FilterError
+    from ccatp.filters.base import FilterError
     from ccatp.mirror.mirror import build_mirror
     from ccatp.mirror.surface import MirrorError
     from ccatp.records.run_reader import in_order

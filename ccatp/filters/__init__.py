@@ -3,41 +3,13 @@
 from collections.abc import Callable
 
 from ccatp.core import FloatArray
-from ccatp.filters.base import (
-    Filter,
-    FilterDiverged,
-    FilterError,
-    FilterModelError,
-    FilterShapeError,
-    Innovation,
-    Observation,
-    Transition,
-)
-from ccatp.filters.kalman import ExtendedKalmanFilter, KalmanFilter
-from ccatp.filters.smoother import Smoothed, Smoother, SmootherEmpty
+from ccatp.filters.base import Filter
+from ccatp.filters.kalman import KalmanFilter
 from ccatp.filters.unscented import UnscentedKalmanFilter
 
 FILTERS: dict[str, Callable[[FloatArray, FloatArray], Filter]] = {
     "kf": KalmanFilter,
-    "ekf": ExtendedKalmanFilter,
+    "ekf": KalmanFilter,
     "ukf": UnscentedKalmanFilter,
 }
-"""Constructors of (mean (n,), covariance (n, n))."""
-
-__all__ = [
-    "FILTERS",
-    "ExtendedKalmanFilter",
-    "Filter",
-    "FilterDiverged",
-    "FilterError",
-    "FilterModelError",
-    "FilterShapeError",
-    "Innovation",
-    "KalmanFilter",
-    "Observation",
-    "Smoothed",
-    "Smoother",
-    "SmootherEmpty",
-    "Transition",
-    "UnscentedKalmanFilter",
-]
+"""Constructors of (mean (n,), covariance (n, n)); for linear models, ``kf`` and ``ekf`` are one."""

@@ -21,15 +21,6 @@ class FilterShapeError(FilterError):
         self.shape = shape
 
 
-class FilterModelError(FilterError):
-    """A nonlinear model was given to a filter of linear ones: carries the name of the model's class."""
-
-    def __init__(self, filter_name: str, model: object) -> None:
-        name = type(model).__name__
-        super().__init__(f"{filter_name} takes arrays, not the nonlinear {name}: linearise it, or choose ekf or ukf")
-        self.model = name
-
-
 class FilterDiverged(FilterError):
     """A mean, a covariance or a noise is not a finite Gaussian: the message says which."""
 
@@ -109,15 +100,14 @@ class Filter(Protocol):
     def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
         """Advance the state: x <- F x, P <- F P F^T + Q (thesis eqs 2.5, 2.6), or the same with a nonlinear f.
 
-        F and Q have shape (n, n). Raises ``FilterShapeError``, ``FilterDiverged`` (not finite), and
-        ``FilterModelError`` where the filter takes no nonlinear model.
+        F and Q have shape (n, n). Raises ``FilterShapeError`` and ``FilterDiverged`` (not finite).
         """
 
     def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
         """Condition the state on z = H x + noise (thesis eqs 2.7 to 2.10), or on z = h(x) + noise.
 
         z (m,), m = 0 leaves the prediction; H (m, n) or a model; R variances (m,) or covariance (m, m). Raises
-        ``FilterShapeError``, ``FilterModelError``, and ``FilterDiverged``: posterior not finite, P or R not positive
+        ``FilterShapeError``, and ``FilterDiverged``: posterior not finite, P or R not positive
         definite.
         """
 

@@ -14,7 +14,6 @@ from ccatp.filters.base import (
     HUGE,
     NEGATIVITY,
     FilterDiverged,
-    FilterModelError,
     FilterShapeError,
     Innovation,
     Observation,
@@ -69,6 +68,8 @@ class KalmanFilter:
 
     The subtraction errs by 1e-16 of the prior. Where the posterior is much smaller, or rows nearly repeat each other, a
     QR factorisation takes its place (``_rotate``).
+
+    A nonlinear model is taken with its Jacobian at the mean, F = df/dx and H = dh/dx: the extended filter.
     """
 
     def __init__(self, mean: FloatArray, covariance: FloatArray) -> None:
@@ -122,11 +123,15 @@ class KalmanFilter:
 
     def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
         """Advance by F (n, n) and Q (n, n), thesis eqs 2.5 and 2.6; see ``Filter.predict``."""
+        x = None
         if not isinstance(F, ndarray):
-            self._predict_model(F, Q)
-            return
+            x, F = F.at(self.mean)
+            if x.shape != self._shape[:1]:
+                raise FilterShapeError("f(x)", x.shape, str(self._shape[:1]))
+            if not ddot(x, x) < HUGE:
+                raise FilterDiverged(f"prediction is not finite: mean {x.tolist()}")
         if F.shape != self._shape:
-            raise FilterShapeError("F", F.shape, str(self._shape))
+            raise FilterShapeError("F" if x is None else "df/dx", F.shape, str(self._shape))
         if Q.shape != self._shape:
             raise FilterShapeError("Q", Q.shape, str(self._shape))
         self._F_rows[...] = F
@@ -141,12 +146,17 @@ class KalmanFilter:
             dcopy(*self._restore)
             self._F_rows[...] = np.eye(self._n)
             raise FilterDiverged(f"prediction is not finite: mean {predicted.tolist()}")
+        if x is not None:
+            np.negative(x, self._minus_x)
         self._mean = self._covariance = None
 
     def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
-        """Condition on z (m,) with H (m, n) and R (m,) or (m, m), thesis eqs 2.7 to 2.10; see ``Filter.update``."""
+        """Condition on z (m,) = H x + noise, thesis eqs 2.7 to 2.10; see ``Filter.update``."""
+        expected = None
         if not isinstance(H, ndarray):
-            return self._update_model(z, H, R)
+            expected, H = H.at(self.mean)
+            if expected.shape != z.shape:
+                raise FilterShapeError("z", z.shape, f"{expected.shape} of h(x)")
         shape = z.shape
         rows = self._rows.get(shape)
         if rows is None or H.shape != rows.H_shape or not (R.shape == shape or R.shape == rows.S_shape):  # noqa: PLR1714
@@ -156,28 +166,11 @@ class KalmanFilter:
             rows = self._new_rows(z.size)
         rows.H_rows[...] = H
         dsymm(*rows.project)
-        n = self._n
-        daxpy(z, rows.V_flat, shape[0], 1.0, 0, 1, n, n + 1)
-        return self._condition(rows, R)
-
-    def _predict_model(self, f: Transition, Q: FloatArray) -> None:
-        raise FilterModelError("KalmanFilter", f)
-
-    def _update_model(self, z: FloatArray, h: Observation, R: FloatArray) -> Innovation:
-        raise FilterModelError("KalmanFilter", h)
-
-    def _start(self, mean: FloatArray, covariance: FloatArray) -> None:
-        self._minus_x[:], self._P_rows[:] = -mean, covariance
-        self._F_rows[:] = np.eye(self._n)
-        self._mean = self._covariance = None
-
-    def _new_rows(self, m: int) -> _Rows:
-        rows = self._rows[(m,)] = _Rows(self._n, m, self._M, self._U)
-        return rows
-
-    def _condition(self, rows: _Rows, R: FloatArray) -> Innovation:
+        m, n = shape[0], self._n
+        daxpy(z, rows.V_flat, m, 1.0, 0, 1, n, n + 1)
+        if expected is not None:
+            np.subtract(z, expected, rows.residual)
         residual = rows.residual.tolist()
-        m = len(residual)
         if m <= MANY:
             dgemm(*rows.spread)
             if R.ndim == 1:
@@ -194,6 +187,15 @@ class KalmanFilter:
                 if not dpotrf(*rows.factor)[1]:
                     return self._subtract(rows, residual)
         return self._rotate(rows, residual, R)
+
+    def _start(self, mean: FloatArray, covariance: FloatArray) -> None:
+        self._minus_x[:], self._P_rows[:] = -mean, covariance
+        self._F_rows[:] = np.eye(self._n)
+        self._mean = self._covariance = None
+
+    def _new_rows(self, m: int) -> _Rows:
+        rows = self._rows[(m,)] = _Rows(self._n, m, self._M, self._U)
+        return rows
 
     def _subtract(self, rows: _Rows, residual: list[float]) -> Innovation:
         """Update M to x + V y and P - V V^T, from P H^T above the residual and C in ``rows``."""
@@ -247,41 +249,6 @@ class KalmanFilter:
         self._minus_x[...], self._flat[-1] = minus_x, 0.0
         self._mean = self._covariance = None
         return Innovation(residual, nis)
-
-
-class ExtendedKalmanFilter(KalmanFilter):
-    """The Kalman filter with F = df/dx and H = dh/dx at the mean (thesis eqs 2.5 to 2.10 with f and h in place).
-
-    Arrays are taken as the linear filter takes them, and cost and result are the same.
-    """
-
-    def _predict_model(self, f: Transition, Q: FloatArray) -> None:
-        x, jacobian = f.at(self.mean)
-        if x.shape != self._shape[:1]:
-            raise FilterShapeError("f(x)", x.shape, str(self._shape[:1]))
-        if jacobian.shape != self._shape:
-            raise FilterShapeError("df/dx", jacobian.shape, str(self._shape))
-        if not ddot(x, x) < HUGE:
-            raise FilterDiverged(f"prediction is not finite: mean {x.tolist()}")
-        self.predict(jacobian, Q)
-        np.negative(x, self._minus_x)
-
-    def _update_model(self, z: FloatArray, h: Observation, R: FloatArray) -> Innovation:
-        expected, jacobian = h.at(self.mean)
-        m = z.size
-        if z.ndim != 1 or expected.shape != z.shape:
-            raise FilterShapeError("z", z.shape, f"{expected.shape} of h(x)")
-        if jacobian.shape != (m, self._n):
-            raise FilterShapeError("dh/dx", jacobian.shape, f"({m}, {self._n})")
-        if R.shape not in (z.shape, (m, m)):
-            raise FilterShapeError("R", R.shape, f"({m},) or ({m}, {m})")
-        if not m:
-            return Innovation(np.empty(0), 0.0)
-        rows = self._rows.get(z.shape) or self._new_rows(m)
-        rows.H_rows[...] = jacobian
-        dsymm(*rows.project)
-        np.subtract(z, expected, rows.residual)
-        return self._condition(rows, R)
 
 
 def square_root(P: FloatArray) -> FloatArray:

@@ -5,14 +5,7 @@ from scipy.linalg.blas import ddot, dgemm, dsyrk
 from scipy.linalg.lapack import dpotrf
 
 from ccatp.core import FloatArray
-from ccatp.filters.base import (
-    HUGE,
-    FilterDiverged,
-    FilterShapeError,
-    Innovation,
-    Observation,
-    Transition,
-)
+from ccatp.filters.base import HUGE, FilterDiverged, FilterShapeError, Innovation, Observation, Transition
 from ccatp.filters.kalman import KalmanFilter, noise_root, square_root
 
 ALPHA = 1.0
@@ -72,12 +65,12 @@ class UnscentedKalmanFilter(KalmanFilter):
     def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
         """Advance by F, a matrix (n, n) or a model, and Q (n, n); see ``Filter.predict``."""
         self._predicted = None
-        super().predict(F, Q)
-
-    def _predict_model(self, f: Transition, Q: FloatArray) -> None:
+        if isinstance(F, np.ndarray):
+            super().predict(F, Q)
+            return
         n = self._n
         L = self._draw()
-        images = f.through(self.mean + self._offsets)
+        images = F.through(self.mean + self._offsets)
         if images.shape != (2 * n + 1, n):
             raise FilterShapeError("f(X)", images.shape, f"({2 * n + 1}, {n})")
         if Q.shape != (n, n):
@@ -91,10 +84,13 @@ class UnscentedKalmanFilter(KalmanFilter):
         self._mean = self._covariance = None
         self._predicted = dgemm(1.0, (self._offsets * self._roots).T, deviations.T, 0.0, None, 0, 1), L
 
-    def _update_model(self, z: FloatArray, h: Observation, R: FloatArray) -> Innovation:
+    def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
+        """Condition on z (m,) by H, a matrix (m, n) or a model; see ``Filter.update``."""
+        if isinstance(H, np.ndarray):
+            return super().update(z, H, R)
         m = z.size
         self._draw()
-        images = h.through(self.mean + self._offsets)
+        images = H.through(self.mean + self._offsets)
         if z.ndim != 1 or images.shape != (len(self._offsets), m):
             raise FilterShapeError("h(X)", images.shape, f"({len(self._offsets)}, m) with z of shape {z.shape}")
         if R.shape not in ((m,), (m, m)):

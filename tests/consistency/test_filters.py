@@ -7,7 +7,8 @@ import pytest
 from scipy.stats import chi2
 
 from ccatp.core import FloatArray
-from ccatp.filters import FILTERS, Smoother
+from ccatp.filters import FILTERS
+from ccatp.filters.smoother import Smoother
 
 BOTH = pytest.mark.parametrize("name", ["ekf", "ukf"])
 DT_S, SEEDS, STEPS = 0.1, 50, 60

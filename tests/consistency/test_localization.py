@@ -21,7 +21,8 @@ from ccatp.estimation.odometry import PreintegratedMotion, WheelAngle
 from ccatp.estimation.slip_prior import SlipPrior
 from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import BA, BG, KG, KL, PL, PR, PSI, SL, SR, STATES, A, C, V, W, X, Y
-from ccatp.filters import FILTERS, Filter
+from ccatp.filters import FILTERS
+from ccatp.filters.base import Filter
 from ccatp.mirror.mirror import Mirror
 from tests.support.scenario import transport_rad
 from tests.support.slam_settings import odometry, settings, trust

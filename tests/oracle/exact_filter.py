@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ccatp.core import FloatArray
-from ccatp.filters import Observation, Transition
+from ccatp.filters.base import Observation, Transition
 from ccatp.filters.unscented import ALPHA, BETA, KURTOSIS
 
 DIGITS = 50

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from ccatp.config.load import load_config
 from ccatp.core import FloatArray
-from ccatp.filters import FILTERS, Smoother
+from ccatp.filters import FILTERS
 from ccatp.filters.base import FilterDiverged, FilterShapeError
 from ccatp.filters.ekf_slam import BlockError, EkfSlam, columns_of
+from ccatp.filters.smoother import Smoother
 from ccatp.studies.bench_cases import survey_problem
 from tests.oracle.exact_filter import ExactFilter
 

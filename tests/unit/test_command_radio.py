@@ -14,7 +14,7 @@ from ccatp.beacons.slam.evaluation import judge
 from ccatp.cli import main
 from ccatp.config.load import load_recordings_config
 from ccatp.config.package import configs_dir
-from ccatp.filters import FilterDiverged
+from ccatp.filters.base import FilterDiverged
 from ccatp.links.topics import schema_of
 from ccatp.records.recorder import Recorder
 from ccatp.studies.gtsam_peer import PeerError, run_gtsam

@@ -12,8 +12,8 @@ from ccatp.estimation.odometry import Odometer, OdometryPose, arc_step
 from ccatp.estimation.seams import HeadingFix, HeadingGate, heading_from_pair
 from ccatp.estimation.thesis_localizer import ConstantAcceleration, MeasurementBuilder
 from ccatp.estimation.thesis_localizer import FourStateLocalizer as Localizer
-from ccatp.filters import FilterDiverged, Innovation, KalmanFilter
-from ccatp.filters.base import Observation
+from ccatp.filters.base import FilterDiverged, Innovation, Observation
+from ccatp.filters.kalman import KalmanFilter
 from tests.unit.estimation.drive import Errors, Rate, Robot, changed, config, mirror, nothing, run, shifted, trapeze
 from tests.unit.estimation.drive import errors_of as errors
 

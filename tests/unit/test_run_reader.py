@@ -15,7 +15,7 @@ from ccatp.cli import main
 from ccatp.config.load import dump_config, load_config
 from ccatp.core import PanelId
 from ccatp.errors import ConfigError
-from ccatp.filters import FilterDiverged
+from ccatp.filters.base import FilterDiverged
 from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import (

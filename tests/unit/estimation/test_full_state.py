@@ -12,7 +12,8 @@ from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.localizer_base import MAX_FRAME_STEP_S
 from ccatp.estimation.state_model import BG, PSI, SL, SR, STATES, TX, A, V, W, X, Y
-from ccatp.filters import FILTERS, Filter, FilterDiverged
+from ccatp.filters import FILTERS
+from ccatp.filters.base import Filter, FilterDiverged
 from tests.unit.estimation.drive import (
     STEEP,
     Errors,

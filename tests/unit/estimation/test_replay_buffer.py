@@ -12,7 +12,7 @@ from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.localizer_base import unwrapped
 from ccatp.estimation.state_filter import ReplayBuffer
 from ccatp.estimation.state_model import STATES, Terrain, V, W, X, Y
-from ccatp.filters import KalmanFilter
+from ccatp.filters.kalman import KalmanFilter
 from tests.unit.estimation.drive import (
     FRAME_S,
     STEEP,

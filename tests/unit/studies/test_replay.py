@@ -9,7 +9,8 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, ImuSample, WheelSample
-from ccatp.filters import FILTERS, Smoother
+from ccatp.filters import FILTERS
+from ccatp.filters.smoother import Smoother
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import FixMessage, Rest
 from ccatp.localizer import build_localizer
