@@ -223,7 +223,7 @@ def _replaced(config_file: Path | None, driven: "Config") -> "Config":
 
 def _write(config_file: Path | None, table: "tuple[CalibrationRow, ...]", *, dry_run: bool) -> tuple[str | None, str]:
     """The file written, if one was, and what changes in it."""
-    from ccatp.config.load import difference, load_config, with_values, write_in_place
+    from ccatp.config.load import difference, load_config, with_values, write_file
 
     values = {row.key: row.rounded for row in table}
     if config_file is None:
@@ -234,5 +234,5 @@ def _write(config_file: Path | None, table: "tuple[CalibrationRow, ...]", *, dry
     changed = difference(before, after, config_file)
     if dry_run or not changed:
         return None, changed
-    write_in_place(config_file, after)
+    write_file(config_file, after)
     return str(config_file), changed

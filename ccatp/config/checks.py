@@ -11,13 +11,10 @@ from pydantic import BaseModel
 
 from ccatp.config.beacon_models import CricketConfig, FuzzyConfig, RadioConfig
 from ccatp.config.messages import ConfigProblem, Key, choice_hint, slip_hint
-from ccatp.config.models import Config, DashboardConfig, LimitsConfig, MirrorConfig, PanelsConfig, RobotConfig
+from ccatp.config.models import Config, DashboardConfig, MirrorConfig
 
-FILTERS = ("kf", "ekf", "ukf")
-ORDERS = ("thesis", "optimised", "calibration")
 FUZZY_INPUTS = ("distance_m", "heading_error_rad")
 
-_MIN_COLLIMATORS = 4  # three unknowns and one length to spare, interface control document 2
 _LARGEST_LENGTH_M = 2.0  # no length outside the mirror's own files reaches it
 _SMALLEST_PANEL_MM = 10.0
 _WHOLE_FRAMES = 1e-6  # decimal fractions of a second are not exact
@@ -26,7 +23,7 @@ _NEAREST_COLLIMATOR_MM = 100.0
 _PITCH_AGREEMENT_MM = 0.1  # the fitted pitches of the telescope differ by up to 0.012 mm
 _TCP_ENDPOINT = re.compile(r"tcp://[^\s/@;]+:(\d{1,5})")
 _LARGEST_PORT = 65535
-_CORNERS = ((1, 1, "front-left"), (1, -1, "front-right"), (-1, 1, "rear-left"), (-1, -1, "rear-right"))
+_CORNERS = {"front-left": (1, 1), "front-right": (1, -1), "rear-left": (-1, 1), "rear-right": (-1, -1)}
 _ANCHORS = 2  # A is the origin, B shows the second axis
 _LEAST_DRAWS = 200
 _LEAST_NETWORK = 3  # motes of a stand that can trilaterate others in the plane
@@ -34,33 +31,30 @@ _LEAST_NETWORK = 3  # motes of a stand that can trilaterate others in the plane
 Problems = Iterator[ConfigProblem]
 
 
-def check_config(cfg: Config) -> list[ConfigProblem]:
+def check_config(cfg: Config) -> Problems:
     """Everything wrong with a survey's configuration whose values are each in range."""
-    return [
-        *_check_run(cfg),
-        *_check_units(cfg),
-        *_check_wheels(cfg.robot, cfg.limits),
-        *_check_world(cfg),
-        *_check_network(cfg),
-        *_check_dashboard(cfg.dashboard),
-        *_check_panels(cfg.mirror.panels),
-        *_check_base(cfg.mirror),
-        *_check_collimators(cfg.mirror),
-    ]
+    yield from _check_run(cfg)
+    yield from _check_units(cfg)
+    yield from _check_wheels(cfg)
+    yield from _check_world(cfg)
+    yield from _check_network(cfg)
+    yield from _check_dashboard(cfg.dashboard)
+    yield from _check_panels(cfg.mirror)
+    yield from _check_collimators(cfg.mirror)
 
 
-def check_radio_config(cfg: RadioConfig, *, simulates: bool = True) -> list[ConfigProblem]:
+def check_radio_config(cfg: RadioConfig, *, simulates: bool = True) -> Problems:
     """Everything wrong with a configuration among beacons whose values are each in range.
 
     ``simulates`` says whether the field of motes is simulated; layout and places do not matter for measured ranges.
     """
-    return [
-        *_check_fuzzy(cfg.control.fuzzy),
-        *_check_follow(cfg),
-        *([*_check_layout(cfg.cricket), *_check_places(cfg.cricket)] if simulates else []),
-        *_check_motes(cfg.cricket),
-        *_check_dashboard(cfg.dashboard),
-    ]
+    yield from _check_fuzzy(cfg.control.fuzzy)
+    yield from _check_follow(cfg)
+    if simulates:
+        yield from _check_layout(cfg.cricket)
+        yield from _check_places(cfg.cricket)
+    yield from _check_motes(cfg.cricket)
+    yield from _check_dashboard(cfg.dashboard)
 
 
 def is_file_name(name: str) -> bool:
@@ -68,47 +62,46 @@ def is_file_name(name: str) -> bool:
     return name.endswith(".toml") or "/" in name
 
 
-def _problem(section: str, part: str | int | Key, what: str, *related: str) -> ConfigProblem:
-    """A problem of a dotted section's part, which may be a path; ``related`` keys are dotted."""
-    path = part if isinstance(part, tuple) else (part,)
-    return ConfigProblem((*section.split("."), *path), what, tuple(tuple(key.split(".")) for key in related))
+def _problem(key: str, what: str, *related: str) -> ConfigProblem:
+    """A problem of a dotted key, in which numbers are those of an array; ``related`` keys are dotted, too."""
+    parts = tuple(int(part) if part.isdecimal() else part for part in key.split("."))
+    return ConfigProblem(parts, what, tuple(tuple(other.split(".")) for other in related))
 
 
-def _choice(section: str, part: str | Key, name: str, names: Iterable[str], kind: str) -> Problems:
+def _choice(key: str, name: str, names: Iterable[str], kind: str) -> Problems:
     if name not in (names := list(names)):
-        yield _problem(section, part, f'= "{name}" is no {kind}; {choice_hint(name, names)}')
+        yield _problem(key, f'= "{name}" is no {kind}; {choice_hint(name, names)}')
 
 
 # -- surveys of mirrors -----------------------------------------------------------------------------------------------
 
 
 def _check_run(cfg: Config) -> Problems:
-    yield from _choice("run", "filter", cfg.run.filter, FILTERS, "filter")
-    yield from _choice("run", "order", cfg.run.order, ORDERS, "traversal order")
     if cfg.run.panels > (there := cfg.mirror.panels.count):
-        what = f"= {cfg.run.panels}, but {cfg.mirror.name} has {there} panels; 0 takes all of them"
-        yield _problem("run", "panels", what)
-    yield from _choice("control", "gains", cfg.control.gains, cfg.control.gain_sets, "set of gains")
+        yield _problem(
+            "run.panels", f"= {cfg.run.panels}, but {cfg.mirror.name} has {there} panels; 0 takes all of them"
+        )
+    yield from _choice("control.gains", cfg.control.gains, cfg.control.gain_sets, "set of gains")
     for section, named, found in ("mirror", cfg.run.mirror, cfg.mirror.name), ("world", cfg.run.world, cfg.world.name):
         if not is_file_name(named) and named != found:
             what = f'= "{found}", but run.{section} = "{PurePath(named)}"; name the same in both'
-            yield _problem(section, "name", what, f"run.{section}")
+            yield _problem(f"{section}.name", what, f"run.{section}")
     # Nothing is measured before the robot has stood still for long enough.
     settle_s, measuring_s = cfg.control.settle_time_s, cfg.etalon.measuring_time_s
     if settle_s + measuring_s < _LEAST_STANDSTILL_S:
         must = f"the robot must stand still for {_LEAST_STANDSTILL_S:g} s"
         what = f"= {measuring_s:g} is too short: with control.settle_time_s = {settle_s:g} {must}"
-        yield _problem("etalon", "measuring_time_s", what, "control.settle_time_s")
+        yield _problem("etalon.measuring_time_s", what, "control.settle_time_s")
     for name, light in cfg.align.light.items():
         if not any(light.direction_world):
-            yield _problem("align.light", (name, "direction_world"), "= [0, 0, 0] is no direction")
+            yield _problem(f"align.light.{name}.direction_world", "= [0, 0, 0] is no direction")
 
 
 def _check_units(cfg: Config) -> Problems:
     """Lengths and angles that have no limit of their own, but that cannot be meant."""
-    for name in type(cfg).model_fields:
+    for name, value in cfg:
         if name != "mirror":
-            yield from _slips(getattr(cfg, name), (name,))
+            yield from _slips(value, (name,))
     yield from _slips(cfg.mirror.frame, ("mirror", "frame"))
     yield from _slips(cfg.mirror.base, ("mirror", "base"))
 
@@ -130,24 +123,25 @@ def _slips(value: object, key: Key) -> Problems:
         yield from _slips(item, (*key, part))
 
 
-def _check_wheels(robot: RobotConfig, limits: LimitsConfig) -> Problems:
+def _check_wheels(cfg: Config) -> Problems:
     """The wheels must give the motion that the limits allow; edge sensors have x to the front, y to the left."""
+    robot, limits = cfg.robot, cfg.limits
+    formula, related = "max_wheel_rad_s * wheel_radius_m", ("robot.max_wheel_rad_s", "robot.wheel_radius_m")
     rim_m_s = robot.max_wheel_rad_s * robot.wheel_radius_m
-    formula = "max_wheel_rad_s * wheel_radius_m"
-    wheels = ("robot.max_wheel_rad_s", "robot.wheel_radius_m")
-    if limits.v_max_m_s > rim_m_s:
-        what = f"= {limits.v_max_m_s:g} is more than the wheels give: robot.{formula} = {rim_m_s:.4g}"
-        yield _problem("limits", "v_max_m_s", what, *wheels)
-    if limits.omega_max_rad_s * robot.wheel_base_m / 2.0 > rim_m_s:
-        most = 2.0 * rim_m_s / robot.wheel_base_m
-        what = f"= {limits.omega_max_rad_s:g} is more than the wheels give: 2 * {formula} / wheel_base_m = {most:.4g}"
-        yield _problem("limits", "omega_max_rad_s", what, *wheels, "robot.wheel_base_m")
-    for index, ((x, y), (sign_x, sign_y, corner)) in enumerate(zip(robot.edge_sensors_m, _CORNERS, strict=True)):
+    turning_rad_s = 2.0 * rim_m_s / robot.wheel_base_m
+    for key, value, limit, of in (
+        ("limits.v_max_m_s", limits.v_max_m_s, rim_m_s, f"robot.{formula}"),
+        ("limits.omega_max_rad_s", limits.omega_max_rad_s, turning_rad_s, f"2 * {formula} / wheel_base_m"),
+    ):
+        if value > limit:
+            what = f"= {value:g} is more than the wheels give: {of} = {limit:.4g}"
+            yield _problem(key, what, *related, "robot.wheel_base_m")
+    for index, (corner, (sign_x, sign_y)) in enumerate(_CORNERS.items()):
+        x, y = robot.edge_sensors_m[index]
         if x * sign_x <= 0.0 or y * sign_y <= 0.0:
             where = f"x {'>' if sign_x > 0 else '<'} 0 and y {'>' if sign_y > 0 else '<'} 0"
-            order = ", ".join(name for *_, name in _CORNERS)
-            what = f"= [{x:g}, {y:g}] is not {corner}, where {where}; the order is {order}"
-            yield _problem("robot", ("edge_sensors_m", index), what)
+            what = f"= [{x:g}, {y:g}] is not {corner}, where {where}; the order is {', '.join(_CORNERS)}"
+            yield _problem(f"robot.edge_sensors_m.{index}", what)
 
 
 def _check_world(cfg: Config) -> Problems:
@@ -155,17 +149,17 @@ def _check_world(cfg: Config) -> Problems:
     world, sim = cfg.world, cfg.sim.robot
     if world.slip_min > world.slip_max:
         what = f"= {world.slip_min:g} is more than slip_max = {world.slip_max:g}"
-        yield _problem("world", "slip_min", what, "world.slip_max")
+        yield _problem("world.slip_min", what, "world.slip_max")
     frame_s = 1.0 / sim.frame_hz
     for name in ("sensors_delay_s", "commands_delay_s"):
         delay_s = getattr(world, name)
         frames = delay_s * sim.frame_hz
         if abs(frames - round(frames)) > _WHOLE_FRAMES:
             what = f"= {delay_s:g} must be a whole number of frames of {frame_s:g} s"
-            yield _problem("world", name, what, "sim.robot.frame_hz")
+            yield _problem(f"world.{name}", what, "sim.robot.frame_hz")
         elif delay_s and delay_s + frame_s > sim.ttl_s * (1.0 + _WHOLE_FRAMES):
             what = f"= {delay_s:g} and a frame of {frame_s:g} s outlast sim.robot.ttl_s = {sim.ttl_s:g}"
-            yield _problem("world", name, what, "sim.robot.ttl_s", "sim.robot.frame_hz")
+            yield _problem(f"world.{name}", what, "sim.robot.ttl_s", "sim.robot.frame_hz")
 
 
 def is_loopback(host: str) -> bool:
@@ -182,88 +176,81 @@ def _check_network(cfg: Config) -> Problems:
     matched = _TCP_ENDPOINT.fullmatch(endpoint)
     if endpoint and (matched is None or int(matched[1]) > _LARGEST_PORT):
         what = f'= "{endpoint}" must be tcp://ADDRESS:PORT, or empty for the unix socket alone'
-        yield _problem("observatory", "endpoint", what)
+        yield _problem("observatory.endpoint", what)
     elif endpoint:
         for name in ("key_file", "clients_file"):
             if not getattr(cfg.observatory, name):
                 what = f'= "", but endpoint = "{endpoint}" wants keys and a list; see ccatp keys generate'
-                yield _problem("observatory", name, what, "observatory.endpoint")
+                yield _problem(f"observatory.{name}", what, "observatory.endpoint")
+    if cfg.sim.open_to_network:
+        return
     hint = "set sim.open_to_network if everyone there may command it"
-    for name, has_key, without in (
-        ("robot", bool(cfg.robot.key_file), f"; name a key in robot.key_file, or {hint}"),
-        ("etalon", False, f", and its protocol has no keys; {hint}"),
-    ):
-        host = getattr(cfg.sim, name).host
-        if not (cfg.sim.open_to_network or has_key or is_loopback(host)):
-            yield _problem(f"sim.{name}", "host", f'= "{host}" is beyond this machine{without}')
+    if not (cfg.robot.key_file or is_loopback(host := cfg.sim.robot.host)):
+        what = f'= "{host}" is beyond this machine; name a key in robot.key_file, or {hint}'
+        yield _problem("sim.robot.host", what)
+    if not is_loopback(host := cfg.sim.etalon.host):
+        yield _problem("sim.etalon.host", f'= "{host}" is beyond this machine, and its protocol has no keys; {hint}')
 
 
 def _check_dashboard(dashboard: DashboardConfig) -> Problems:
     """Whoever reaches the page may stop the robot, unless there is a token."""
     if not (is_loopback(dashboard.host) or dashboard.token_file):
         what = f'= "{dashboard.host}" is beyond this machine; name a file with a token in dashboard.token_file'
-        yield _problem("dashboard", "host", what, "dashboard.token_file")
+        yield _problem("dashboard.host", what, "dashboard.token_file")
 
 
-def _check_panels(panels: PanelsConfig) -> Problems:
-    root = "mirror.panels"
+def _check_panels(mirror: MirrorConfig) -> Problems:
+    """Panels that fit each other, and a base that stands on one of them."""
+    panels, base, root = mirror.panels, mirror.base, "mirror.panels"
     for name in ("size_x_mm", "size_y_mm", "pitch_x_mm", "pitch_y_mm"):
         value = getattr(panels, name)
         if value < _SMALLEST_PANEL_MM:
-            yield _problem(root, name, f"= {value:g} looks like metres: {value:g} m are {value * 1e3:g} mm")
+            yield _problem(f"{root}.{name}", f"= {value:g} looks like metres: {value:g} m are {value * 1e3:g} mm")
             return
-    total = sum(panels.panels_per_row)
+    total, rows = sum(panels.panels_per_row), len(panels.panels_per_row)
     if total != panels.count:
         what = f"= {panels.count}, but panels_per_row adds up to {total}; correct one of them"
-        yield _problem(root, "count", what, f"{root}.panels_per_row")
+        yield _problem(f"{root}.count", what, f"{root}.panels_per_row")
     for row, n in enumerate(panels.panels_per_row):
         if n > panels.cols or (panels.cols - n) % 2:
             what = f"= {n} panels cannot be centred on cols = {panels.cols}; both even or both odd, and not more"
-            yield _problem(root, ("panels_per_row", row), what, f"{root}.cols")
+            yield _problem(f"{root}.panels_per_row.{row}", what, f"{root}.cols")
+    if base.row > rows:
+        yield _problem("mirror.base.row", f"= {base.row}, but there are {rows} rows")
+    else:
+        n = panels.panels_per_row[base.row - 1]
+        first = (panels.cols - n) // 2 + 1
+        if not first <= base.col < first + n:
+            what = f"= {base.col}: no panel stands there, row {base.row} has columns {first} to {first + n - 1}"
+            yield _problem("mirror.base.col", what)
     for axis in "xy":
         size, pitch = getattr(panels, f"size_{axis}_mm"), getattr(panels, f"pitch_{axis}_mm")
+        half = size / 2.0
         if abs(pitch - size - panels.gap_mm) > _PITCH_AGREEMENT_MM:
             what = f"= {pitch:g} must be size + gap = {size + panels.gap_mm:g}"
-            yield _problem(root, f"pitch_{axis}_mm", what, f"{root}.size_{axis}_mm", f"{root}.gap_mm")
+            yield _problem(f"{root}.pitch_{axis}_mm", what, f"{root}.size_{axis}_mm", f"{root}.gap_mm")
         low, middle, high = getattr(panels, f"points_{axis}_mm")
-        if not -size / 2.0 < low < middle < high < size / 2.0:
-            what = f"= [{low:g}, {middle:g}, {high:g}] must ascend within the panel, {-size / 2.0:g} to {size / 2.0:g}"
-            yield _problem(root, f"points_{axis}_mm", what, f"{root}.size_{axis}_mm")
-
-
-def _check_base(mirror: MirrorConfig) -> Problems:
-    """The base must stand on a panel that exists."""
-    base, panels, root = mirror.base, mirror.panels, "mirror.base"
-    rows = len(panels.panels_per_row)
-    if base.row > rows:
-        yield _problem(root, "row", f"= {base.row}, but there are {rows} rows")
-        return
-    n = panels.panels_per_row[base.row - 1]
-    first = (panels.cols - n) // 2 + 1
-    if not first <= base.col < first + n:
-        what = f"= {base.col}: no panel stands there, row {base.row} has columns {first} to {first + n - 1}"
-        yield _problem(root, "col", what)
-    for axis in "xy":
-        value, half = getattr(base, f"{axis}_mm"), getattr(panels, f"size_{axis}_mm") / 2.0
+        if not -half < low < middle < high < half:
+            what = f"= [{low:g}, {middle:g}, {high:g}] must ascend within the panel, {-half:g} to {half:g}"
+            yield _problem(f"{root}.points_{axis}_mm", what, f"{root}.size_{axis}_mm")
+        value = getattr(base, f"{axis}_mm")
         if abs(value) >= half:
             what = f"= {value:g} is off the panel, which reaches from {-half:g} to {half:g}"
-            yield _problem(root, f"{axis}_mm", what)
+            yield _problem(f"mirror.base.{axis}_mm", what)
 
 
 def _check_collimators(mirror: MirrorConfig) -> Problems:
     channels, positions = mirror.collimators.channels, mirror.collimators.positions_world_mm
     root = "mirror.collimators"
-    if len(channels) < _MIN_COLLIMATORS:
-        yield _problem(root, "channels", f"has {len(channels)}; a position needs at least {_MIN_COLLIMATORS}")
     if len(set(channels)) != len(channels):
-        yield _problem(root, "channels", f"= {list(channels)} names a channel twice")
+        yield _problem(f"{root}.channels", f"= {list(channels)} names a channel twice")
     if len(channels) != len(positions):
         what = f"has {len(positions)} positions for {len(channels)} channels"
-        yield _problem(root, "positions_world_mm", what, f"{root}.channels")
+        yield _problem(f"{root}.positions_world_mm", what, f"{root}.channels")
     for index, position in enumerate(positions):
-        if math.hypot(*position) < _NEAREST_COLLIMATOR_MM:
-            what = f"= {list(position)} is {math.hypot(*position):.3g} mm from the world's origin; looks like metres"
-            yield _problem(root, ("positions_world_mm", index), what)
+        if (distance_mm := math.hypot(*position)) < _NEAREST_COLLIMATOR_MM:
+            what = f"= {list(position)} is {distance_mm:.3g} mm from the world's origin; looks like metres"
+            yield _problem(f"{root}.positions_world_mm.{index}", what)
 
 
 # -- robots among radio beacons ---------------------------------------------------------------------------------------
@@ -273,38 +260,37 @@ def _check_fuzzy(fuzzy: FuzzyConfig) -> Problems:
     root = "control.fuzzy"
     for name, given in fuzzy.inputs.items():
         if name not in FUZZY_INPUTS:
-            yield _problem(root, ("inputs", name), f"is no input of the speed; {choice_hint(name, FUZZY_INPUTS)}")
+            yield _problem(f"{root}.inputs.{name}", f"is no input of the speed; {choice_hint(name, FUZZY_INPUTS)}")
         for term, corners in given.terms.items():
             if list(corners) != sorted(corners):
                 what = f"= {list(corners)} must rise: left foot, left shoulder, right shoulder, right foot"
-                yield _problem(root, ("inputs", name, "terms", term), what)
+                yield _problem(f"{root}.inputs.{name}.terms.{term}", what)
     for index, rule in enumerate(fuzzy.rules):
-        yield from _choice(root, ("rules", index, "then"), rule.then, fuzzy.outputs, "output")
+        key = f"{root}.rules.{index}"
+        yield from _choice(f"{key}.then", rule.then, fuzzy.outputs, "output")
         for name, term in rule.when.items():
             if name not in fuzzy.inputs:
-                what = f'names "{name}", no input; {choice_hint(name, fuzzy.inputs)}'
-                yield _problem(root, ("rules", index, "when"), what)
+                yield _problem(f"{key}.when", f'names "{name}", no input; {choice_hint(name, fuzzy.inputs)}')
             else:
-                key = ("rules", index, "when", name)
-                yield from _choice(root, key, term, fuzzy.inputs[name].terms, "term of it")
+                yield from _choice(f"{key}.when.{name}", term, fuzzy.inputs[name].terms, "term of it")
 
 
 def _check_follow(cfg: RadioConfig) -> Problems:
     follow, avoidance = cfg.follow, cfg.avoidance
     if follow.is_active and follow.target in cfg.sim.beacons:
         what = f'= "{follow.target}" is also a static beacon of sim.beacons; give the radio that moves its own name'
-        yield _problem("follow", "target", what)
-    for section, name, value, limit, most in (
-        ("follow", "band_m", follow.band_m, "follow.safe_distance_m", follow.safe_distance_m),
-        ("avoidance", "stop_m", avoidance.stop_m, "avoidance.influence_m", avoidance.influence_m),
+        yield _problem("follow.target", what)
+    for key, value, limit, most in (
+        ("follow.band_m", follow.band_m, "follow.safe_distance_m", follow.safe_distance_m),
+        ("avoidance.stop_m", avoidance.stop_m, "avoidance.influence_m", avoidance.influence_m),
     ):
         if value >= most:
-            yield _problem(section, name, f"= {value:g} must be less than {limit} = {most:g}", limit)
+            yield _problem(key, f"= {value:g} must be less than {limit} = {most:g}", limit)
     width_m, height_m = cfg.workspace.size_m
     for index, (x_m, y_m) in enumerate(cfg.workspace.waypoints_m):
         if not (0.0 <= x_m <= width_m and 0.0 <= y_m <= height_m):
             what = f"= [{x_m:g}, {y_m:g}] lies outside the room of {width_m:g} by {height_m:g} m"
-            yield _problem("workspace", ("waypoints_m", index), what, "workspace.size_m")
+            yield _problem(f"workspace.waypoints_m.{index}", what, "workspace.size_m")
 
 
 def _check_layout(cfg: CricketConfig) -> Problems:
@@ -319,25 +305,26 @@ def _check_layout(cfg: CricketConfig) -> Problems:
     )  # fmt: skip
     for layout, is_wrong, name, what in found:
         if is_wrong and cfg.layout == layout:
-            yield _problem("cricket", name, what)
+            yield _problem(f"cricket.{name}", what)
 
 
 def _check_places(cfg: CricketConfig) -> Problems:
-    given: list[tuple[Key, tuple[float, ...]]] = []
+    given: list[tuple[str, tuple[float, ...]]] = []
     motes = {"networks": cfg.networks, "motes": cfg.motes, "random": {}}[cfg.layout]
     if cfg.layout == "random":
-        given += [(("random", "size_m"), cfg.random.size_m)]
+        given += [("random.size_m", cfg.random.size_m)]
     elif cfg.layout == "networks":
-        given += [(("stand_m", number), place) for number, place in enumerate(cfg.stand_m)]
-        given += [(("anchors", name), place) for name, place in cfg.anchors.items()]
+        given += [(f"stand_m.{number}", place) for number, place in enumerate(cfg.stand_m)]
+        given += [(f"anchors.{name}", place) for name, place in cfg.anchors.items()]
     for name, mote in motes.items():
-        given += [((cfg.layout, name, part), getattr(mote, part)) for part in ("place_m", "facing")]
+        key = f"{cfg.layout}.{name}"
+        given += [(f"{key}.place_m", mote.place_m), (f"{key}.facing", mote.facing)]
         if not any(mote.facing):
-            yield _problem("cricket", (cfg.layout, name, "facing"), "is no direction: all its parts are 0")
+            yield _problem(f"cricket.{key}.facing", "is no direction: all its parts are 0")
     for key, coordinates in given:
         if len(coordinates) != cfg.dimension:
             wanted = f"cricket.dimension = {cfg.dimension} asks for {cfg.dimension}"
-            yield _problem("cricket", key, f"has {len(coordinates)} coordinates, {wanted}")
+            yield _problem(f"cricket.{key}", f"has {len(coordinates)} coordinates, {wanted}")
 
 
 def _check_motes(cfg: CricketConfig) -> Problems:
@@ -345,9 +332,9 @@ def _check_motes(cfg: CricketConfig) -> Problems:
     root = "cricket.transducer"
     if len(angles) != len(reaches):
         what = f"has {len(reaches)} values for {len(angles)} angles of off_axis_rad"
-        yield _problem(root, "reach_m", what, f"{root}.off_axis_rad")
+        yield _problem(f"{root}.reach_m", what, f"{root}.off_axis_rad")
     if angles[0] != 0.0 or any(later <= before for before, later in pairwise(angles)):
-        yield _problem(root, "off_axis_rad", f"= {list(angles)} must begin with 0 and rise")
+        yield _problem(f"{root}.off_axis_rad", f"= {list(angles)} must begin with 0 and rise")
     if 0 < cfg.phase1.draws < _LEAST_DRAWS:
         what = f"= {cfg.phase1.draws} give no covariance of dozens of coordinates; 0, or {_LEAST_DRAWS} at least"
-        yield _problem("cricket.phase1", "draws", what)
+        yield _problem("cricket.phase1.draws", what)

@@ -6,7 +6,7 @@ import os
 import re
 import tempfile
 import tomllib
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,10 +19,10 @@ from ccatp.config.messages import (
     ConfigProblem,
     Key,
     choice_hint,
+    depth_in,
     faults_of,
     find_line,
     format_key,
-    format_toml,
     format_value,
 )
 from ccatp.config.models import Config, MirrorConfig, WorldConfig
@@ -68,20 +68,11 @@ class ConfigSource:
     text: str
     tree: Tree
     root: Key = ()
-    folder: Path = Path()
 
     def depth(self, key: Key) -> int:
-        """How many parts of a key this source holds; all of them where it holds a value in place of a section."""
-        if key[: len(self.root)] != self.root:
-            return 0
-        node: object = self.tree
-        for depth, part in enumerate(key[len(self.root) :], start=len(self.root)):
-            if not isinstance(node, Mapping):
-                break
-            if part not in node:
-                return depth
-            node = node[part]
-        return len(key)
+        """How many parts of a key this source holds."""
+        inside = len(self.root)
+        return inside + depth_in(self.tree, key[inside:]) if key[:inside] == self.root else 0
 
     def place(self, key: Key) -> str:
         """``file:line`` of a key."""
@@ -101,7 +92,7 @@ def read_source(path: Path, root: Key = ()) -> ConfigSource:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
     try:
-        return ConfigSource(str(path), text, tomllib.loads(text), root, path.parent)
+        return ConfigSource(str(path), text, tomllib.loads(text), root)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
         at = re.search(r" \(at line (\d+), column (\d+)\)", str(error))
         line = int(at[1]) if at else max(1, len(text.splitlines()))
@@ -140,47 +131,60 @@ def merged(
     return tree
 
 
-def _layers(base: ConfigSource, file: Path | None, overrides: Overrides) -> list[ConfigSource]:
+def _layers(base: str, file: Path | None, overrides: Overrides, config_dir: Path | None = None) -> list[ConfigSource]:
     """Command line, the user's file, base: the strongest first."""
     user = read_source(file) if file else ConfigSource("", "", {})
-    return [ConfigSource("command line", "", nested(overrides or {})), user, base]
+    command = ConfigSource("command line", "", nested(overrides or {}))
+    return [command, user, read_source((config_dir or configs_dir()) / base)]
 
 
-def _stacked(sources: Sequence[ConfigSource]) -> Tree:
-    tree: Tree = {}
-    for source in reversed(sources):
-        tree = merged(tree, source.tree)
+def _strongest(sources: list[ConfigSource], *keys: Key) -> tuple[ConfigSource, Key]:
+    """The key, of those that contradict each other, that stands nearest to the user, and the source that holds it."""
+    held: list[tuple[ConfigSource, Key]] = []
+    for key in keys:
+        depths = [source.depth(key) for source in sources]
+        held.append((sources[depths.index(max(depths))], key))
+    return min(held, key=lambda pair: sources.index(pair[0]))
+
+
+def _place(sources: list[ConfigSource], *keys: Key) -> str:
+    """``file:line`` of the key that stands nearest to the user."""
+    source, key = _strongest(sources, *keys)
+    return source.place(key)
+
+
+def _value(tree: object, *key: str) -> Any:
+    """What stands at a key; ``None`` where nothing does."""
+    for part in key:
+        tree = tree.get(part) if isinstance(tree, Mapping) else None
     return tree
 
 
-def _source_of(key: Key, sources: Iterable[ConfigSource]) -> ConfigSource:
-    """The source that holds most of a key; of equals the strongest, which stands first."""
-    return max(sources, key=lambda source: source.depth(key))
-
-
-def _fault_line(fault: ConfigProblem, sources: list[ConfigSource]) -> str:
-    """The line for the reader. Of keys that contradict each other it points to the one nearest to the user."""
-    held = [(sources.index(_source_of(key, sources)), key) for key in (fault.key, *fault.related)]
-    strength, key = min(held, key=lambda pair: pair[0])
-    return f"{sources[strength].place(key)}: {format_key(fault.key)} {fault.what}"
-
-
-def _validated(
+def validated(
     model: type[M],
     tree: Tree,
     sources: list[ConfigSource],
-    check: Callable[[M], list[ConfigProblem]] = lambda _: [],
+    check: Callable[[M], Iterable[ConfigProblem]] = lambda _: (),
 ) -> M:
+    """The values of a tree as a model.
+
+    Raises ConfigError: one line with file, line, key, what is wrong and what to do.
+    """
     try:
         # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
         cfg = model.model_validate_json(json.dumps(tree, default=str), strict=True)
     except ValidationError as error:
-        faults = faults_of(error.errors(), model)
+        problems = faults_of(error.errors(), model)
     else:
-        faults = check(cfg)
-        if not faults:
+        problems = list(check(cfg))
+        if not problems:
             return cfg
-    raise ConfigError(*(_fault_line(fault, sources) for fault in faults))
+    raise ConfigError(
+        *(
+            f"{_place(sources, problem.key, *problem.related)}: {format_key(problem.key)} {problem.what}"
+            for problem in problems
+        )
+    )
 
 
 # -- surveys of mirrors -----------------------------------------------------------------------------------------------
@@ -197,22 +201,23 @@ def load_config(file: Path | None = None, overrides: Overrides = None, config_di
     one line with file, line, key, what is wrong and what to do. Raises NotASurvey: the file is of a mission among
     beacons.
     """
-    config_dir = config_dir or configs_dir()
-    sources = _layers(read_source(config_dir / DEFAULT_FILE), file, overrides)
-    system = sources[1].tree.get("system")
+    command, user, base = sources = _layers(DEFAULT_FILE, file, overrides, config_dir)
+    system = user.tree.get("system")
     if file is not None and system is not None:
         use = f"ccatp report {file.parent}" if file.name == _RUN_FILE else "ccatp run or ccatp study with it"
         what = f"{file}: is of a mission among beacons (system = {format_value(system)})"
         raise NotASurvey(f"{what}, and this is for surveys of mirrors alone; use {use}")
-    tree = _stacked(sources)
+    tree = merged(merged(base.tree, user.tree), command.tree)
     for section in _SECTIONS:
-        _add_section(section, tree, sources, config_dir)
-    return _validated(Config, tree, sources, check_config)
+        tree[section] = _section(section, tree, sources, config_dir or configs_dir())
+    return validated(Config, tree, sources, check_config)
 
 
 def dump_config(cfg: Config | RadioConfig) -> str:
     """The complete configuration as TOML; the loader of its kind gives an equal one."""
-    return _RUN_HEAD + format_toml(cfg.model_dump())
+    import tomlkit  # noqa: PLC0415 - only a command that writes a file needs it, and every process reads one
+
+    return _RUN_HEAD + tomlkit.dumps(cfg.model_dump())
 
 
 def json_schema() -> dict[str, Any]:
@@ -229,56 +234,45 @@ def available(kind: str, config_dir: Path | None = None) -> list[str]:
     return sorted(path.stem for path in folder.glob("*.toml"))
 
 
-def _add_section(section: str, tree: Tree, sources: list[ConfigSource], config_dir: Path) -> None:
-    """Put mirror or world into the tree: the file that ``run`` names, and over it what file and command line say.
+def _section(section: str, tree: Tree, sources: list[ConfigSource], config_dir: Path) -> Tree:
+    """Mirror or world: the file that ``run`` names, which joins the sources, under what file and command line say.
 
     Where the user's file holds all of it, this is taken, unless the command line names another one.
     """
     command, user = sources[:2]
-    held = user.tree.get(section)
+    held, wanted = _value(user.tree, section), _value(command.tree, "run", section)
     is_complete = isinstance(held, Mapping) and set(_SECTIONS[section][1].model_fields) <= set(held)
-    runs = [source.tree.get("run") for source in (command, user)]
-    wanted, before = (run.get(section) if isinstance(run, Mapping) else None for run in runs)
-    is_replaced = wanted is not None and wanted != before
-    if is_complete and not is_replaced:
-        named = ConfigSource("", "", {}, (section,))
-    else:
-        named = _read_named(section, tree["run"], sources, config_dir)
+    is_replaced = wanted not in (None, _value(user.tree, "run", section))
     overlay = (command.tree if is_complete and is_replaced else tree).get(section, {})
     if not isinstance(overlay, Mapping):
-        place = _source_of((section,), sources).place((section,))
+        place = _place(sources, (section,))
         raise ConfigError(f"{place}: {section}: must be a section; name a {section} with run.{section}")
-    tree[section] = merged(named.tree, overlay)
+    if is_complete and not is_replaced:
+        return dict(overlay)
+    named = _read_named(section, tree["run"], sources, config_dir)
     sources.append(named)
+    return merged(named.tree, overlay)
 
 
 def _read_named(section: str, run: object, sources: list[ConfigSource], config_dir: Path) -> ConfigSource:
     """The file that ``run.mirror`` or ``run.world`` names."""
-    key: Key = ("run", section)
-    source = _source_of(key, sources)
-    place = source.place(key)
+    source, key = _strongest(sources, ("run", section))
     if not isinstance(run, Mapping):
-        raise ConfigError(f"{place}: run = {format_value(run)} must be a section, not a value")
+        raise ConfigError(f"{source.place(key)}: run = {format_value(run)} must be a section, not a value")
     name = run.get(section)
+    shown = f"{source.place(key)}: run.{section} = {format_value(name)}"
     if not isinstance(name, str) or not name:
-        raise ConfigError(f"{place}: run.{section} = {format_value(name)} must be the name of a {section}")
-    shown = f"{place}: run.{section} = {format_value(name)}"
-    folder = config_dir / _SECTIONS[section][0]
-    path = source.folder / name if is_file_name(name) else folder / f"{name}.toml"
-    if not _is_file(path):
-        hint = f"no file {path}" if is_file_name(name) else choice_hint(name, available(section, config_dir))
-        raise ConfigError(f"{shown} is no {section}; {hint}")
+        raise ConfigError(f"{shown} must be the name of a {section}")
+    if is_file_name(name):
+        path = Path(source.name).parent / name
+    elif name in (names := available(section, config_dir)):
+        path = config_dir / _SECTIONS[section][0] / f"{name}.toml"
+    else:
+        raise ConfigError(f"{shown} is no {section}; {choice_hint(name, names)}")
     try:
         return read_source(path, (section,))
     except ConfigError as error:
         raise ConfigError(f"{shown}: {error}") from error
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # no name that a file may have, or in a folder that is not ours
-        return False
 
 
 # -- robots among radio beacons ---------------------------------------------------------------------------------------
@@ -293,21 +287,25 @@ def load_radio_config(
     and ``cricket.toml`` lies between the two. ``simulates`` says whether a field of motes is simulated, or its ranges
     were measured. Raises ConfigError: one line with file, line, key, what is wrong and what to do.
     """
-    config_dir = config_dir or configs_dir()
-    command, user, base = sources = _layers(read_source(config_dir / BEACON_FILE), file, overrides)
+    command, user, base = sources = _layers(BEACON_FILE, file, overrides, config_dir)
     run = user.tree.get("run")
     named = set(user.tree) | (set(run) if isinstance(run, Mapping) else set())
     if "system" not in user.tree and {"mirror", "world"} & named:  # which only surveys have
         raise ConfigError(
             f"{file}: is the configuration of a survey of a mirror; give that of a robot among beacons, as cricket.toml"
         )
-    system = read_source(config_dir / f"{_system(sources)}.toml")
-    tree: Tree = {}
-    for source in (base, system, user):
-        tree = merged(tree, source.tree, _WHOLE)
-    tree = merged(tree, command.tree)
-    return _validated(
-        RadioConfig, tree, [command, user, system, base], lambda cfg: check_radio_config(cfg, simulates=simulates)
+    source, key = _strongest(sources, ("system",))
+    name = source.tree.get("system")
+    if name is None:
+        raise ConfigError(f"{base.name}: system is missing; {choice_hint('', SYSTEMS)}")
+    if name not in SYSTEMS:
+        hint = choice_hint(str(name), SYSTEMS)
+        raise ConfigError(f"{source.place(key)}: system = {format_value(name)} is no system; {hint}")
+    system = read_source((config_dir or configs_dir()) / f"{name}.toml")
+    tree = merged(merged(base.tree, system.tree, _WHOLE), user.tree, _WHOLE)
+    sources = [command, user, system, base]
+    return validated(
+        RadioConfig, merged(tree, command.tree), sources, lambda cfg: check_radio_config(cfg, simulates=simulates)
     )
 
 
@@ -319,23 +317,13 @@ def is_radio_file(file: Path) -> bool:
     return "system" in read_source(file).tree
 
 
-def _system(sources: list[ConfigSource]) -> str:
-    for source in sources:
-        if (name := source.tree.get("system")) is not None:
-            if name not in SYSTEMS:
-                hint = choice_hint(str(name), SYSTEMS)
-                raise ConfigError(f"{source.place(('system',))}: system = {format_value(name)} is no system; {hint}")
-            return str(name)
-    raise ConfigError(f"{sources[-1].name}: system is missing; {choice_hint('', SYSTEMS)}")
-
-
 def load_recordings_config(file: Path | None = None, overrides: Overrides = None) -> RecordingsConfig:
     """What is assumed of recorded radio data, by format, as in ``plaza.priors.range_scale``.
 
     Raises ConfigError: one line with file, line, key, what is wrong and what to do.
     """
-    sources = _layers(read_source(configs_dir() / RECORDING_FILE), file, overrides)
-    return _validated(RecordingsConfig, _stacked(sources), sources)
+    command, user, base = sources = _layers(RECORDING_FILE, file, overrides)
+    return validated(RecordingsConfig, merged(merged(base.tree, user.tree), command.tree), sources)
 
 
 # -- changing a file --------------------------------------------------------------------------------------------------
@@ -347,8 +335,7 @@ def with_values(text: str, values: Mapping[str, float], file: Path) -> str:
     A key that is there keeps its comment, but for the mark of unmeasured values; one that is not is added to its
     section. Raises ConfigError: the text is not TOML, or a key stands where no key can be.
     """
-    # Imported late: only a command that edits a file needs it, and every process reads one.
-    import tomlkit  # noqa: PLC0415
+    import tomlkit  # noqa: PLC0415 - as in dump_config
     from tomlkit.exceptions import TOMLKitError  # noqa: PLC0415
 
     try:
@@ -376,28 +363,33 @@ def difference(before: str, after: str, file: Path) -> str:
     return "".join(difflib.unified_diff(old, new, fromfile=str(file), tofile=f"{file} (new)"))
 
 
-def write_in_place(file: Path, text: str) -> None:
-    """Replace a file's contents at once: a reader finds the old ones or the new ones, also after a power cut.
+def write_file(path: Path, text: str, mode: int | None = None, *, is_replacing: bool = True) -> None:
+    """Write a file at once: a reader finds all of it or the old one, also after a power cut.
 
-    Its mode stays as it is; where it is a link, what it points to is replaced. Raises ConfigError: it cannot be
-    written.
+    ``mode``: that of the old file by default. Where ``path`` is a link, what it points to is replaced. Raises
+    ConfigError: it cannot be written, or is there and not to be replaced.
     """
-    file = file.resolve()
-    name: str | None = None
+    path = path.resolve()
+    new: Path | None = None
     try:
-        handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        new = Path(name)
         with os.fdopen(handle, "w", encoding="utf-8") as out:
             out.write(text)
             out.flush()
-            os.fchmod(out.fileno(), file.stat().st_mode & 0o7777)
+            os.fchmod(out.fileno(), path.stat().st_mode & 0o7777 if mode is None else mode)
             os.fsync(out.fileno())
-        Path(name).replace(file)
-        folder = os.open(file.parent, os.O_RDONLY)
+        if is_replacing:
+            new.replace(path)
+        else:
+            os.link(new, path)  # unlike a rename, this fails where the file exists by now
+        folder = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
         finally:
             os.close(folder)
     except OSError as error:
-        if name is not None:
-            Path(name).unlink(missing_ok=True)
-        raise ConfigError(f"{file}: cannot be written: {error.strerror or error}") from error
+        raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        if new is not None:
+            new.unlink(missing_ok=True)

@@ -36,9 +36,9 @@ class RunConfig(ProcessesConfig):
     mirror: str
     world: str
     seed: Annotated[int, Field(ge=0)]
-    filter: str
+    filter: Literal["kf", "ekf", "ukf"]
     panels: Annotated[int, Field(ge=0)]  # 0 = the whole mirror
-    order: str
+    order: Literal["thesis", "optimised", "calibration"]
     budget_s: Positive
 
 
@@ -480,7 +480,8 @@ class BaseConfig(Model):
 class CollimatorsConfig(Model):
     """Surveyed collimator positions of the laser system, world frame."""
 
-    channels: tuple[Annotated[int, Field(ge=1, le=32)], ...]
+    # a position has three unknowns, and one length is to spare: interface control document 2
+    channels: Annotated[tuple[Annotated[int, Field(ge=1, le=32)], ...], Field(min_length=4)]
     positions_world_mm: tuple[tuple[float, float, float], ...]
 
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import msgspec
 import pytest
+import tomlkit
 
 from ccatp.config.load import dump_config, load_config
-from ccatp.config.messages import format_toml
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.errors import ConfigError
 from ccatp.links.topics import TOPICS, FixMessage, Rest, SensorLines, TrackMessage, pack, schema_of
@@ -274,7 +274,7 @@ def mistakes() -> list[tuple[Key, str, object]]:
 def refused(folder: Path, key: Key, name: str, bad: object) -> str:
     """What the loader says to a mistake; empty where it takes it."""
     file = folder / "user.toml"
-    file.write_text(format_toml(with_leaf(dumped_config(), key, name, bad)))
+    file.write_text(tomlkit.dumps(with_leaf(dumped_config(), key, name, bad)))
     try:
         load_config(file)
     except ConfigError as error:

@@ -326,7 +326,7 @@ def test_config_check_lists_every_problem(tmp_path: Path, capsys: pytest.Capture
     assert not out
     assert err.splitlines() == [
         f"ccatp: {file}:3: run.sed is unknown; did you mean run.seed?",
-        f"ccatp: {file}:2: run.seed = -3 must be at least 0",
+        f"ccatp: {file}:2: run.seed = -3 must be greater than or equal to 0",
     ]
 
 

@@ -172,10 +172,10 @@ def test_the_figure_is_drawn(tmp_path: Path) -> None:
         (["--mirror", "fyst-m3"], "fyst-m3"),
         (["--panels", "-1"], "run.panels"),
         (["--panels", "999"], "run.panels = 999, but fyst-m1 has 77 panels; 0 takes all of them"),
-        (["--set", "limits.v_max_m_s=1e-300"], "limits.v_max_m_s = 1e-300 must be at least 0.001"),
+        (["--set", "limits.v_max_m_s=1e-300"], "limits.v_max_m_s = 1e-300 must be greater than or equal to 0.001"),
         (
             ["--set", "mirror.surface.normalisation_radius_mm=1e-300"],
-            "normalisation_radius_mm = 1e-300 must be at least",
+            "normalisation_radius_mm = 1e-300 must be greater than or equal to",
         ),
         (["--figure", "nowhere/plan.png"], "--figure: no directory nowhere; make it first"),
         (

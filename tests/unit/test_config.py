@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ccatp.cli import main
 from ccatp.config.load import (
@@ -18,9 +16,9 @@ from ccatp.config.load import (
     load_config,
     load_radio_config,
     with_values,
-    write_in_place,
+    write_file,
 )
-from ccatp.config.messages import find_line, format_toml
+from ccatp.config.messages import find_line
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
@@ -120,8 +118,11 @@ def test_another_mirror_replaces_the_one_written_in_full(tmp_path: Path, config:
     [
         ({"run.mirror": "fyst-m"}, 'run.mirror = "fyst-m" is no mirror; did you mean'),
         ({"run.sed": 2}, r"run.sed is unknown; did you mean run.seed\?"),
-        ({"robot.wheel_radius_m": 30}, r"robot.wheel_radius_m = 30 must be at most 0.2; looks like millimetres"),
-        ({"run": 3}, "run = 3 must be a section, not a value"),
+        (
+            {"robot.wheel_radius_m": 30},
+            r"robot.wheel_radius_m = 30 must be less than or equal to 0.2; looks like millimetres",
+        ),
+        ({"run": 3}, "run = 3 must be a section"),
         ({"robot": 3, "robot.port": 4}, "robot.port: robot is given as a value already"),
         ({"mirror": "fyst-m2"}, "mirror: must be a section; name a mirror with run.mirror"),
     ],
@@ -144,7 +145,7 @@ def test_several_faults_are_all_listed_and_the_first_one_told(tmp_path: Path) ->
         load_config(file)
     assert caught.value.problems == [
         f"{file}:3: robot.wheel_radius is unknown; did you mean robot.wheel_radius_m?",
-        f"{file}:2: robot.port = -1 must be at least 0",
+        f"{file}:2: robot.port = -1 must be greater than or equal to 0",
     ]
 
 
@@ -281,26 +282,6 @@ forward = { kp = 3.0 }
 a.b = 1
 """
 
-scalars = st.one_of(
-    st.booleans(),
-    st.integers(-(2**53), 2**53),
-    st.floats(allow_nan=False),
-    st.text(st.characters(exclude_categories=["Cs"]), max_size=20),
-)
-# 60 values fold over several lines
-arrays = st.one_of(st.lists(scalars, max_size=3), st.lists(st.floats(allow_nan=False), max_size=60))
-names = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
-trees = st.recursive(
-    st.dictionaries(names, st.one_of(scalars, arrays, st.lists(arrays, max_size=3)), max_size=4),
-    lambda inner: st.dictionaries(names, st.one_of(scalars, inner), max_size=4),
-    max_leaves=8,
-)
-
-
-@given(trees)
-def test_what_is_written_reads_back_equal(tree: dict[str, object]) -> None:
-    assert tomllib.loads(format_toml(tree)) == tree
-
 
 @pytest.mark.parametrize(
     ("key", "line"),
@@ -372,7 +353,7 @@ def test_a_link_stays_a_link_and_the_mode_stays(tmp_path: Path) -> None:
     file.write_text("a = 1\n")
     file.chmod(0o604)
     link.symlink_to(file)
-    write_in_place(link, "a = 2\n")
+    write_file(link, "a = 2\n")
     assert link.is_symlink()
     assert file.read_text() == "a = 2\n"
     assert file.stat().st_mode & 0o777 == 0o604
@@ -388,8 +369,8 @@ def test_a_failure_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Monke
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
         with pytest.raises(ConfigError, match=r"a\.toml: cannot be written: No space left"):
-            write_in_place(file, "a = 2\n")
+            write_file(file, "a = 2\n")
     assert file.read_text() == "a = 1\n"
     assert list(tmp_path.iterdir()) == [file]
     with pytest.raises(ConfigError, match="cannot be written: No such file"):
-        write_in_place(tmp_path / "missing" / "a.toml", "")
+        write_file(tmp_path / "missing" / "a.toml", "")

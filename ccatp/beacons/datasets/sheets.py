@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import tomlkit
 
 from ccatp.beacons.cricket.measured_map import MeasuredRanges
 from ccatp.beacons.cricket.range_network import MoteRange
 from ccatp.beacons.datasets.tables import RadioDataError, content_lines, number, read_text, split_cells
 from ccatp.beacons.slam.level_fix import HeardPlace
 from ccatp.beacons.slam.path_loss import LevelPair
-from ccatp.config.messages import format_toml
 from ccatp.core import FloatArray
 
 _LARGEST_PART = 50_000_000  # bytes: a table that people measured is smaller, a decompression bomb is not
@@ -306,7 +306,7 @@ def write_beacons(path: Path, found: BeaconPositions) -> None:
     tree = {"frame": found.frame, "dimension": found.positions_m.shape[1], "beacons": beacons}
     joint = {"joint": {"covariance_m2": found.covariance_m2.tolist()}}
     try:
-        path.write_text(_HEAD + format_toml(tree | joint), encoding="utf-8")
+        path.write_text(_HEAD + tomlkit.dumps(tree | joint), encoding="utf-8")
     except OSError as error:
         raise RadioDataError(path, f"cannot be written: {error.strerror or error}") from error
 
