@@ -13,20 +13,19 @@ may take (a token that is no number, a reading beyond the range of the link) goe
 delivered: in lockstep no client can answer it, and simulated time must not wait.
 """
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from functools import partial
 from math import inf, sqrt
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from ccatp.core import Vector3
 from ccatp.links.robot_codec import BadLine, RobotFrame, decode_from_robot, encode
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
-from ccatp.sim.fault_plan import SIGNALS, FaultPlan, Injected, InjectedFault
+from ccatp.sim.fault_plan import SIGNALS, FaultPlan, Injected, InjectionRecord
 from ccatp.sim.plant import LEVEL_SLOPE, BodyStep, Disturbance, Plant, downhill
 from ccatp.sim.rules import FanRules
 from ccatp.sim.world import World
@@ -46,71 +45,6 @@ _ALWAYS = ("fans", "soc")
 _CATCH_UP = 3  # rows that arrive late come this many times as fast as they are taken, so that a line can hold them
 _LEAST_CATCH_UP = 10
 _BODY_SIGNALS = ("right_wheel", "left_wheel", "right_fan", "left_fan", "body")
-
-
-class InjectionRecord:
-    """The record of one fault while it is written."""
-
-    def __init__(self, fault: InjectedFault) -> None:
-        self.fault: Any = fault
-        self._from_s: float | None = None
-        self._until_s: float | None = None
-        self.samples = self._changed = self._reported = 0
-
-    def add(self, t_s: float, *, is_changed: bool = True) -> None:
-        """Count one sample, frame or step."""
-        if self._from_s is None:
-            self._from_s = t_s
-        self._until_s = t_s
-        self.samples += 1
-        self._changed += is_changed
-
-    @property
-    def injected(self) -> Injected:
-        """The record so far."""
-        fault = self.fault
-        return Injected(fault.signal, fault.type, fault.at_s, self._from_s, self._until_s, self.samples, self._changed)
-
-    def change(self, t_s: float) -> str:
-        """``begins`` or ``ended`` once each, else empty; a fault of an instant ends as it begins."""
-        if self._reported == 0 and self._from_s is not None:
-            self._reported = 1
-            return "begins"
-        if self._reported == 1 and t_s >= self.fault.end_s:
-            self._reported = 2
-            return "ended"
-        return ""
-
-
-class BodyFaults:
-    """All faults of the body; ``drifts`` disturb the plant."""
-
-    def __init__(self, records: list[InjectionRecord], mirror: Mirror) -> None:
-        self._records = records
-        gravity = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
-        self.drifts: list[Disturbance] = [partial(_drift, one, gravity) for one in records if one.fault.type == "drift"]
-        self._has_weak_fan = any(one.fault.type == "weak" for one in records)
-
-    def act(
-        self, world: World, fans: FanRules, t_s: float, set_points_rad_s: tuple[float, float]
-    ) -> tuple[float, float]:
-        """Wheel rates (right, left) of the next step, rad/s; a kidnap moves the world's body, a slip takes its grip."""
-        rates, grip, health = [*set_points_rad_s], [1.0, 1.0], [1.0, 1.0]  # right, left
-        for record in self._records:
-            fault = record.fault
-            if fault.type == "kidnap":
-                if fault.has_begun(t_s) and not record.samples:
-                    world.displace(fault.dx_m, fault.dy_m, fault.dheading_rad)
-                    record.add(t_s)
-            elif fault.type != "drift" and fault.is_active(t_s):
-                is_changed = False
-                for k in {"right": (0,), "left": (1,)}.get(fault.signal.partition("_")[0], (0, 1)):
-                    is_changed |= _act_on_side(fault, k, world.plant, fans, rates, grip, health)
-                record.add(t_s, is_changed=is_changed)
-        if self._has_weak_fan:
-            fans.health = health[1], health[0]  # the fans' own order
-        world.grip = grip[0], grip[1]
-        return rates[0], rates[1]
 
 
 def _act_on_side(
@@ -133,36 +67,11 @@ def _act_on_side(
     return is_changed
 
 
-def _drift(
-    record: InjectionRecord,
-    gravity: Vector3,
-    plant: Plant,
-    t_s: float,
-    dt_s: float,
-    forward_m: float,
-    left_m: float,
-    turn_rad: float,
-) -> BodyStep:
-    """A disturbance of the plant: downhill while the wheels are held at zero."""
-    right_set, _, left_set, _ = plant.servo
-    if right_set or left_set or not record.fault.is_active(t_s):
-        return forward_m, left_m, turn_rad
-    ahead, aside, slope = downhill(plant, gravity)
-    is_level = slope < LEVEL_SLOPE
-    record.add(t_s, is_changed=not is_level)
-    if is_level:
-        return forward_m, left_m, turn_rad
-    glide_m = record.fault.speed_m_s * dt_s / slope
-    return forward_m + glide_m * ahead, left_m + glide_m * aside, turn_rad
-
-
 class SensorFault:
     """A fault that changes readings; ``past`` holds the readings that it needs later, with their times."""
 
     def __init__(self, record: InjectionRecord, rng: np.random.Generator) -> None:
         self.record, self.fault = record, record.fault
-        if self.fault.type not in EFFECTS:
-            raise TypeError(f"no effect on readings: {self.fault.type}")
         self._effect = EFFECTS[self.fault.type]
         self.signal, self.rng, self.count = SIGNALS[self.fault.signal], rng, 0
         self.past: deque[tuple[float, Reading]] = deque()
@@ -305,44 +214,32 @@ class LateRows:
         return [waiting.popleft() for _ in range(min(due, len(waiting)))]
 
 
-def make_sensor_fault(record: InjectionRecord, rng: np.random.Generator) -> SensorFault | LateRows:
-    """A fault of a sensor's signal, ready to act."""
-    fault = record.fault
-    # Fans and battery are reported in every frame and have no time of their own: late they are old readings.
-    if fault.type == "delayed" and fault.stamps == "old" and fault.signal not in _ALWAYS:
-        return LateRows(record)
-    return SensorFault(record, rng)
-
-
-class Outgoing(NamedTuple):
-    """What leaves the robot at one instant: none, one or several lines, and the newest frame that a client can take."""
-
-    line: bytes
-    message: Sensors | None
-
-
-NOTHING = Outgoing(b"", None)
-
-
 class Injector:
-    """The faults of the robot in a plan at work."""
+    """The faults of the robot in a plan at work; ``drifts`` disturb the plant."""
 
     def __init__(self, plan: FaultPlan, mirror: Mirror, rng: np.random.Generator) -> None:
         self._records = records = [InjectionRecord(fault) for fault in plan.faults]
+        self._on: defaultdict[str, list[InjectionRecord]] = defaultdict(list)
+        self._sensing: list[SensorFault | LateRows] = []
         children = rng.spawn(len(records)) if records else []
-        self._sensing = [
-            make_sensor_fault(record, child)
-            for record, child in zip(records, children, strict=True)
-            if record.fault.signal in SIGNALS
+        for record, child in zip(records, children, strict=True):
+            fault = record.fault
+            if fault.signal not in SIGNALS:
+                self._on["body" if fault.signal in _BODY_SIGNALS else fault.signal].append(record)
+            # Fans and battery are reported in every frame and have no time of their own: late they are old readings.
+            elif fault.type == "delayed" and fault.stamps == "old" and fault.signal not in _ALWAYS:
+                self._sensing.append(LateRows(record))
+            else:
+                self._sensing.append(SensorFault(record, child))
+        self._gravity = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
+        self.drifts: list[Disturbance] = [
+            partial(self._drift, one) for one in self._on["body"] if one.fault.type == "drift"
         ]
-        self.body = BodyFaults([one for one in records if one.fault.signal in _BODY_SIGNALS], mirror)
-        self._on = {
-            name: [one for one in records if one.fault.signal == name]
-            for name in ("clock", "faults", "frames", "robot")
-        }
+        self._has_weak_fan = any(one.fault.type == "weak" for one in records)
+        self._begun: set[InjectionRecord] = set()
+        self._ended: set[InjectionRecord] = set()
         self._withheld = b""
         self._seq_0, self._boot_s = 0, 0.0
-        self.outgoing = NOTHING
 
     @property
     def injected(self) -> tuple[Injected, ...]:
@@ -350,10 +247,53 @@ class Injector:
         return tuple(record.injected for record in self._records)
 
     def changes(self, t_s: float) -> Iterator[tuple[str, Injected]]:
-        """Faults that began or ended since the last call: ``begins`` or ``ended``, and the record."""
+        """Faults that began or ended since the last call: ``begins`` or ``ended``, and the record.
+
+        A fault of an instant ends as it begins.
+        """
         for record in self._records:
-            if what := record.change(t_s):
-                yield what, record.injected
+            if record not in self._begun:
+                if record.from_s is not None:
+                    self._begun.add(record)
+                    yield "begins", record.injected
+            elif record not in self._ended and t_s >= record.fault.end_s:
+                self._ended.add(record)
+                yield "ended", record.injected
+
+    def act(
+        self, world: World, fans: FanRules, t_s: float, set_points_rad_s: tuple[float, float]
+    ) -> tuple[float, float]:
+        """Wheel rates (right, left) of the next step, rad/s; a kidnap moves the world's body, a slip takes its grip."""
+        rates, grip, health = [*set_points_rad_s], [1.0, 1.0], [1.0, 1.0]  # right, left
+        for record in self._on["body"]:
+            fault = record.fault
+            if fault.type == "kidnap":
+                if fault.has_begun(t_s) and not record.samples:
+                    world.displace(fault.dx_m, fault.dy_m, fault.dheading_rad)
+                    record.add(t_s)
+            elif fault.type != "drift" and fault.is_active(t_s):
+                is_changed = False
+                for k in {"right": (0,), "left": (1,)}.get(fault.signal.partition("_")[0], (0, 1)):
+                    is_changed |= _act_on_side(fault, k, world.plant, fans, rates, grip, health)
+                record.add(t_s, is_changed=is_changed)
+        if self._has_weak_fan:
+            fans.health = health[1], health[0]  # the fans' own order
+        world.grip = grip[0], grip[1]
+        return rates[0], rates[1]
+
+    def _drift(self, record: InjectionRecord, plant: Plant, t_s: float, dt_s: float, *moved: float) -> BodyStep:
+        """A disturbance of the plant: downhill while the wheels are held at zero."""
+        forward_m, left_m, turn_rad = moved
+        right_set, _, left_set, _ = plant.servo
+        if right_set or left_set or not record.fault.is_active(t_s):
+            return forward_m, left_m, turn_rad
+        ahead, aside, slope = downhill(plant, self._gravity)
+        is_level = slope < LEVEL_SLOPE
+        record.add(t_s, is_changed=not is_level)
+        if is_level:
+            return forward_m, left_m, turn_rad
+        glide_m = record.fault.speed_m_s * dt_s / slope
+        return forward_m + glide_m * ahead, left_m + glide_m * aside, turn_rad
 
     def is_rebooting(self, t_s: float) -> bool:
         """Whether the robot reboots now; true once for each reboot."""
@@ -417,11 +357,12 @@ class Injector:
                 names.update(dict.fromkeys(record.fault.names))
         return tuple(names)
 
-    def deliver(self, t_s: float, frame: RobotFrame | None) -> None:
-        """Let ``frame`` leave, if one is due."""
-        self.outgoing = NOTHING if frame is None else self._send(t_s, frame)
-
-    def _send(self, t_s: float, frame: RobotFrame) -> Outgoing:
+    def deliver(self, t_s: float, frame: RobotFrame | None) -> tuple[bytes, Sensors | None]:
+        """What leaves the robot at this instant if ``frame`` is due: none, one or several lines, and the newest frame
+        that a client can take.
+        """
+        if frame is None:
+            return b"", None
         line = encode(frame)
         for mark, token in _MARKS:
             line = line.replace(mark, token)
@@ -440,17 +381,12 @@ class Injector:
             elif is_hit:
                 is_late = not withheld
         if is_lost:
-            return Outgoing(withheld, None)
+            return withheld, None
         if is_late:
             self._withheld = line
-            return NOTHING
-        return Outgoing(line + withheld, _taken(line))
-
-
-def _taken(line: bytes) -> Sensors | None:
-    """What a client makes of a line, or of its first copy."""
-    try:
-        message = decode_from_robot(line[: line.index(b"\n")])
-    except BadLine:
-        return None
-    return message if isinstance(message, Sensors) else None
+            return b"", None
+        try:
+            message = decode_from_robot(line[: line.index(b"\n")])
+        except BadLine:
+            message = None
+        return line + withheld, message if isinstance(message, Sensors) else None

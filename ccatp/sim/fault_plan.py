@@ -8,14 +8,13 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
 
 from pydantic import Field, ValidationError, create_model
 
-from ccatp.config.messages import choice_hint, faults_of, format_key, format_value, nearest
+from ccatp.config.messages import choice_hint, faults_of, find_line, format_key, format_value
 from ccatp.config.models import Model, NonNegative, Positive
 from ccatp.errors import ConfigError
 
@@ -83,6 +82,7 @@ class LastingFault(InjectedFault):
 class LinkFault(Model):
     """A fault of the link; it begins at a robot time, or once so much has gone to all clients."""
 
+    signal: ClassVar[str] = "link"
     type: str
     at_s: NonNegative | None = None
     after_lines: Annotated[int, Field(ge=1)] | None = None
@@ -223,6 +223,30 @@ class Injected(NamedTuple):
     changed: int
 
 
+class InjectionRecord:
+    """The record of one fault while it is written."""
+
+    def __init__(self, fault: Any) -> None:
+        self.fault = fault
+        self.from_s: float | None = None
+        self.until_s: float | None = None
+        self.samples = self.changed = 0
+
+    def add(self, t_s: float, *, is_changed: bool = True) -> None:
+        """Count one sample, frame or step."""
+        if self.from_s is None:
+            self.from_s = t_s
+        self.until_s = t_s
+        self.samples += 1
+        self.changed += is_changed
+
+    @property
+    def injected(self) -> Injected:
+        """The record so far."""
+        fault = self.fault
+        return Injected(fault.signal, fault.type, fault.at_s, self.from_s, self.until_s, self.samples, self.changed)
+
+
 class FaultPlan(NamedTuple):
     """What shall go wrong in a run; the robot's faults in the order of the file, which is that of their application."""
 
@@ -241,12 +265,21 @@ def parse_plan(text: str, name: str) -> FaultPlan:
         for section in tree
         if section not in _SECTIONS
     ]
-    rows, link_rows = (_rows(tree, section, problems, name) for section in _SECTIONS)
-    faults = [_Entry(name, text, "fault", k, row, problems).fault() for k, row in enumerate(rows)]
-    link = [_Entry(name, text, "link", k, row, problems).link() for k, row in enumerate(link_rows)]
+    found: dict[str, list[Any]] = {section: [] for section in _SECTIONS}
+    for section in _SECTIONS:
+        rows = tree.get(section, [])
+        if not (isinstance(rows, list) and all(isinstance(row, dict) for row in rows)):
+            problems.append(f"{name}: {section} must be a list of tables; begin each with [[{section}]]")
+            continue
+        for index, row in enumerate(rows):
+            fault, wrong = _parse_fault(row) if section == "fault" else _parse_link_fault(row)
+            found[section].append(fault)
+            for key, what in wrong:
+                place = _place(name, text, section, index, key.split("[", maxsplit=1)[0])
+                problems.append(f"{place}: {section}[{index}].{key} {what}")
     if problems:
         raise ConfigError(*problems, shows_all=True)
-    return FaultPlan(tuple(f for f in faults if f is not None), tuple(f for f in link if f is not None))
+    return FaultPlan(tuple(found["fault"]), tuple(found["link"]))
 
 
 def read_plan(file: Path, *, lockstep: bool) -> FaultPlan:
@@ -264,100 +297,70 @@ def read_plan(file: Path, *, lockstep: bool) -> FaultPlan:
 
 def check_pacing(plan: FaultPlan, name: str, *, lockstep: bool) -> None:
     """Refuse faults of the link that make no sense in lockstep, with a ``ConfigError``."""
-    if not lockstep:
-        return
     problems = [
         f"{name}: link[{k}].type = {format_value(one.type)} makes no sense in lockstep, where simulated time waits for "
         f"every line; add --realtime, or take one of {', '.join(LOCKSTEP_TYPES)}"
         for k, one in enumerate(plan.link)
-        if one.type not in LOCKSTEP_TYPES
+        if lockstep and one.type not in LOCKSTEP_TYPES
     ]
     if problems:
         raise ConfigError(*problems, shows_all=True)
 
 
-@dataclass(frozen=True, slots=True)
-class _Entry:
-    """One table of the file on its way to a model."""
-
-    name: str
-    text: str
-    section: str
-    index: int
-    row: Mapping[str, Any]
-    problems: list[str]
-
-    def fault(self) -> InjectedFault | None:
-        types = self._choice("signal", TYPES)
-        model = self._choice("type", types) if types is not None else None
-        fault: Any = self._validated(model)
-        if model is _ON_SENSORS["wrong"] and fault and (fault.offset, fault.factor, fault.sign) == (None, None, None):
-            self._complain("type", '= "wrong" needs an offset, a factor or a sign')
-        if model is _ON_SENSORS["saturated"] and fault:
-            low = -math.inf if fault.low is None else fault.low
-            high = math.inf if fault.high is None else fault.high
-            if not low < high or (low, high) == (-math.inf, math.inf):
-                self._complain("type", '= "saturated" needs low or high, and low below high')
-        return fault  # type: ignore[no-any-return]
-
-    def link(self) -> LinkFault | None:
-        fault: LinkFault | None = self._validated(self._choice("type", LINK_TYPES))
-        if fault is not None and [fault.at_s, fault.after_lines, fault.after_bytes].count(None) != 2:
-            self._complain("type", f"= {format_value(fault.type)} needs one of at_s, after_lines, after_bytes")
-        return fault
-
-    def _choice(self, key: str, choices: Mapping[str, Any]) -> Any:
-        value = self.row.get(key)
-        if value is None:
-            self._complain(key, f"is missing; {choice_hint('', choices)}")
-        elif not isinstance(value, str):
-            self._complain(key, f"= {format_value(value)} must be text in quotes")
-        elif value not in choices:
-            of = f" of {self.row['signal']}" if key == "type" and self.section == "fault" else ""
-            self._complain(key, f"= {format_value(value)} is no {key}{of}; {choice_hint(value, choices)}")
-        else:
-            return choices[value]
-        return None
-
-    def _validated(self, model: Any) -> Any:
-        if model is None:
-            return None
-        try:
-            # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
-            return model.model_validate_json(json.dumps(self.row, default=str), strict=True)
-        except ValidationError as error:
-            for one in sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden"):
-                key = format_key(tuple(one["loc"]))
-                if one["type"] == "extra_forbidden":
-                    near, known = nearest(key, list(model.model_fields)), ", ".join(model.model_fields)
-                    self._complain(key, f"is unknown; {f'did you mean {near}?' if near else f'known here: {known}'}")
-                else:
-                    self._complain(key, faults_of([one])[0].what)
-        return None
-
-    def _complain(self, key: str, what: str) -> None:
-        place = _place(self.name, self.text, self.section, self.index, key.split("[", maxsplit=1)[0])
-        self.problems.append(f"{place}: {self.section}[{self.index}].{key} {what}")
+_Problems = list[tuple[str, str]]
+"""Keys, and what is wrong with each."""
 
 
-def _rows(tree: Mapping[str, Any], section: str, problems: list[str], name: str) -> Sequence[Mapping[str, Any]]:
-    rows = tree.get(section, [])
-    if isinstance(rows, list) and all(isinstance(row, dict) for row in rows):
-        return rows
-    problems.append(f"{name}: {section} must be a list of tables; begin each with [[{section}]]")
-    return []
+def _parse_fault(row: Mapping[str, Any]) -> tuple[Any, _Problems]:
+    types, problems = _choose(row, "signal", TYPES)
+    if types is None:
+        return None, problems
+    model, problems = _choose(row, "type", types, f" of {row['signal']}")
+    fault, problems = _validate(model, problems, row)
+    if model is _ON_SENSORS["wrong"] and fault and (fault.offset, fault.factor, fault.sign) == (None, None, None):
+        problems.append(("type", '= "wrong" needs an offset, a factor or a sign'))
+    if model is _ON_SENSORS["saturated"] and fault:
+        low = -math.inf if fault.low is None else fault.low
+        high = math.inf if fault.high is None else fault.high
+        if not low < high or (low, high) == (-math.inf, math.inf):
+            problems.append(("type", '= "saturated" needs low or high, and low below high'))
+    return fault, problems
+
+
+def _parse_link_fault(row: Mapping[str, Any]) -> tuple[Any, _Problems]:
+    fault, problems = _validate(*_choose(row, "type", LINK_TYPES), row)
+    if fault is not None and [fault.at_s, fault.after_lines, fault.after_bytes].count(None) != 2:
+        problems.append(("type", f"= {format_value(fault.type)} needs one of at_s, after_lines, after_bytes"))
+    return fault, problems
+
+
+def _choose(row: Mapping[str, Any], key: str, choices: Mapping[str, Any], of: str = "") -> tuple[Any, _Problems]:
+    value = row.get(key)
+    if value is None:
+        return None, [(key, f"is missing; {choice_hint('', choices)}")]
+    if not isinstance(value, str):
+        return None, [(key, f"= {format_value(value)} must be text in quotes")]
+    if value not in choices:
+        return None, [(key, f"= {format_value(value)} is no {key}{of}; {choice_hint(value, choices)}")]
+    return choices[value], []
+
+
+def _validate(model: Any, problems: _Problems, row: Mapping[str, Any]) -> tuple[Any, _Problems]:
+    if model is None:
+        return None, problems
+    try:
+        # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
+        return model.model_validate_json(json.dumps(row, default=str), strict=True), problems
+    except ValidationError as error:
+        return None, [(format_key(one.key), one.what) for one in faults_of(error.errors(), model)]
 
 
 def _place(name: str, text: str, section: str, index: int, key: str) -> str:
     """``file:line`` of a key in the table of that number, or of the table; the bare name where neither is found."""
-    header = re.compile(rf"\s*\[\[?\s*{re.escape(section)}\s*\]")
-    seen, found = -1, 0
-    for number, line in enumerate(text.splitlines(), start=1):
-        if header.match(line):
-            seen += 1
-            if seen > index:
-                break
-            found = number
-        elif seen == index and key and re.match(rf"\s*{re.escape(key)}\s*=", line):
-            return f"{name}:{number}"
-    return f"{name}:{found}" if seen >= index and found else name
+    lines = text.splitlines()
+    headers = [k for k, line in enumerate(lines) if re.match(rf"\s*\[\[?\s*{re.escape(section)}\s*\]", line)]
+    if index >= len(headers):
+        return name
+    first, last = headers[index], [*headers, len(lines)][index + 1]
+    line = find_line("\n".join(lines[first:last]), (section, key))
+    return f"{name}:{first + (line or 1)}"

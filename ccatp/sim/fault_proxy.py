@@ -13,7 +13,7 @@ from collections.abc import Callable
 from math import inf
 from typing import Any, Literal, Self, cast
 
-from ccatp.sim.fault_plan import LINK_TYPES, Direction, Injected, LinkFault
+from ccatp.sim.fault_plan import LINK_TYPES, Direction, Injected, InjectionRecord, LinkFault
 
 OneWay = Literal["to_client", "to_robot"]
 OneWayFaults = dict[str, Any]
@@ -421,59 +421,44 @@ class FaultProxy:
             before_s = now_s
 
 
-class _Watched:
-    """One fault of the plan and what became of it."""
-
-    def __init__(self, fault: LinkFault) -> None:
-        self.fault: Any = fault
-        self.from_s: float | None = None
-        self.until_s: float | None = None
-        self.count_before = self.count = 0
-        # A reset after so many bytes: the proxy itself waits for the moment, to the byte.
-        self.is_armed = fault.type == "reset" and fault.after_bytes is not None
-
-    @property
-    def injected(self) -> Injected:
-        return Injected("link", self.fault.type, self.fault.at_s, self.from_s, self.until_s, self.count, self.count)
-
-
 class LinkFaults:
     """Faults of the link, ruled by the robot's clock."""
 
     def __init__(self, plan: tuple[LinkFault, ...], proxy: FaultProxy) -> None:
         self._proxy = proxy
-        self._watched = [_Watched(fault) for fault in plan]
-        for one in self._watched:
-            if one.is_armed:
-                proxy.reset_after(one.fault.after_bytes)
+        self._records = [InjectionRecord(fault) for fault in plan]
+        self._counts_before = dict.fromkeys(self._records, 0)
+        for record in self._records:
+            if _is_armed(record.fault):
+                proxy.reset_after(record.fault.after_bytes)
 
     @property
     def injected(self) -> tuple[Injected, ...]:
         """The record of each fault, in the order of the plan."""
-        for one in self._watched:
-            if one.from_s is not None and one.until_s is None:
-                self._count(one)
-        return tuple(one.injected for one in self._watched)
+        for record in self._records:
+            if record.from_s is not None and record.until_s is None:
+                self._count(record)
+        return tuple(record.injected for record in self._records)
 
     def changes(self, t_s: float) -> list[tuple[str, Injected]]:
         """Begin and end what is due at a robot time; what began (``begins``) and ended (``ended``)."""
         news = []
-        for one in self._watched:
-            fault = one.fault
-            if one.from_s is None and self._is_due(fault, t_s):
-                one.from_s = t_s
-                if not one.is_armed:
-                    one.count_before = self._proxy.counts[fault.type]
+        for record in self._records:
+            fault = record.fault
+            if record.from_s is None and self._is_due(fault, t_s):
+                record.from_s = t_s
+                if not _is_armed(fault):
+                    self._counts_before[record] = self._proxy.counts[fault.type]
                     self._proxy.switch_on(fault)
                 if fault.type in _AT_ONCE:
-                    one.until_s = t_s
-                self._count(one)
-                news.append(("begins", one.injected))
-            elif one.from_s is not None and one.until_s is None and t_s >= one.from_s + (fault.for_s or inf):
-                self._count(one)
-                one.until_s = t_s
+                    record.until_s = t_s
+                self._count(record)
+                news.append(("begins", record.injected))
+            elif record.from_s is not None and record.until_s is None and t_s >= record.from_s + (fault.for_s or inf):
+                self._count(record)
+                record.until_s = t_s
                 self._proxy.heal(fault.direction, fault.type)
-                news.append(("ended", one.injected))
+                news.append(("ended", record.injected))
         return news
 
     def _is_due(self, fault: LinkFault, t_s: float) -> bool:
@@ -483,5 +468,10 @@ class LinkFaults:
             return self._proxy.passed_lines >= fault.after_lines
         return fault.after_bytes is not None and self._proxy.passed_bytes >= fault.after_bytes
 
-    def _count(self, one: _Watched) -> None:
-        one.count = self._proxy.counts[one.fault.type] - one.count_before
+    def _count(self, record: InjectionRecord) -> None:
+        record.samples = record.changed = self._proxy.counts[record.fault.type] - self._counts_before[record]
+
+
+def _is_armed(fault: LinkFault) -> bool:
+    """A reset after so many bytes: the proxy itself waits for the moment, to the byte."""
+    return fault.type == "reset" and fault.after_bytes is not None

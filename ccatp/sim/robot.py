@@ -70,7 +70,7 @@ class Robot(SimulatedRobot):
         super().__init__(limits, 1.0 / sim.frame_hz, sim.frame_hz, round(cfg.world.commands_delay_s * sim.frame_hz))
         self.injector = None if faults is None else Injector(faults, mirror, rng.spawn(1)[0])
         window_frames = max(1, round(cfg.etalon.measuring_time_s * sim.frame_hz))
-        pushes = () if self.injector is None else self.injector.body.drifts
+        pushes = () if self.injector is None else self.injector.drifts
         self.world = world = World(cfg, mirror, world_rng, window_frames, pushes, start)
         self.truth_requests = {
             "puck": lambda: {"t": self.t_s, "puck": world.puck_world(), "moved_m": world.moved_m()},
@@ -128,7 +128,7 @@ class Robot(SimulatedRobot):
         right, left = self.rules.set_points(t_s)
         if injector is not None and not self.world.is_fallen:
             before = self.world.plant.pose
-            right, left = injector.body.act(self.world, self.fans, before_s, (right, left))
+            right, left = injector.act(self.world, self.fans, before_s, (right, left))
             if self.world.plant.pose != before:
                 self._sensors.edges.place(self.world.plant)  # they do not see the way of a body that was put elsewhere
         self.world.step(before_s, self.frame_s, right, left, self.fans.thrust)
@@ -149,17 +149,13 @@ class Robot(SimulatedRobot):
 
         Equal in every number to decoding ``delivered_line``. Made at the first use and then shared: do not change it.
         """
-        if self.injector is not None:
-            return self.injector.outgoing.message
-        if self._delivered is None and self.delivered_rows is not None:
+        if self._delivered is None and self.delivered_rows is not None and self.injector is None:
             self._delivered = as_message(self.delivered_rows)
         return self._delivered
 
     @property
     def delivered_line(self) -> bytes:
-        if self.injector is not None:
-            return self.injector.outgoing.line
-        if not self._line and self.delivered_rows is not None:
+        if not self._line and self.delivered_rows is not None and self.injector is None:
             self._line = encode(self.delivered_rows)
         return self._line
 
@@ -177,9 +173,8 @@ class Robot(SimulatedRobot):
         self.delivered_rows = delivered = frames[0] if len(frames) > self.sensors_delay_frames else None
         self.delivered_seq = -1 if delivered is None else delivered.seq
         if injector is not None:
-            injector.deliver(t_s, delivered)
-            message = injector.outgoing.message
-            self.delivered_seq = -1 if message is None else message.seq
+            self._line, message = injector.deliver(t_s, delivered)
+            self._delivered, self.delivered_seq = message, -1 if message is None else message.seq
 
 
 def _check_rates(cfg: Config) -> None:

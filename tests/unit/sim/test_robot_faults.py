@@ -12,7 +12,6 @@ from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
 from ccatp.mirror.mirror import Mirror
-from ccatp.sim.fault_injector import InjectionRecord, make_sensor_fault
 from ccatp.sim.fault_plan import LINK_TYPES, TYPES, FaultPlan, Injected, check_pacing, parse_plan, read_plan
 from ccatp.sim.robot import Robot
 from tests.support.scenario import config_of, fault_plan, mirror_of
@@ -161,12 +160,6 @@ def record(robot: Robot) -> Injected:
     assert robot.injector is not None
     (found,) = robot.injector.injected
     return found
-
-
-def test_an_effect_that_is_none_is_refused() -> None:
-    (drift,) = plan_of(signal="body", type="drift", speed_m_s=0.1).faults
-    with pytest.raises(TypeError, match="no effect on readings: drift"):
-        make_sensor_fault(InjectionRecord(drift), np.random.default_rng(1))
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
