@@ -9,7 +9,7 @@ sensors alone. The rim over which the robot falls stays the ideal one.
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain, pairwise, repeat
-from math import exp, hypot, inf, pi
+from math import exp, hypot, pi
 from typing import NamedTuple, TypeVar
 
 import msgspec
@@ -31,8 +31,7 @@ ImuTuple = tuple[float, float, float]
 GravityTuple = tuple[float, float, float, float]
 MIN_GAP_M = 2e-4
 
-# A sensor is sampled along the chord of its way within a frame; the arc departs from it by microns. A chord whose ends
-# lie on one panel lies on it, and one whose ends lie beyond one side of it lies beyond, but for rounding.
+# A sensor is sampled along the chord of its way within a frame; the arc departs from it by microns.
 _ROUNDING_M = 1e-9
 # Way of a sensor in the deck plane over that of the body; the curvature turns the body's axes by less than this.
 _CURVED = 1.01
@@ -41,7 +40,6 @@ Rectangle = tuple[float, float, float, float]
 """Low x, high x, low y, high y, m, deck plane."""
 EdgeTuple = tuple[float, int, int, int, int]
 _Body = tuple[float, float, float, float, float, float]
-_Line = tuple[int, float, float, float, float]
 _Row = TypeVar("_Row", ImuSample, WheelSample, EdgeSample)
 
 
@@ -90,38 +88,21 @@ class RateEncoders:
     """Wheel rates with white noise, right and left independent."""
 
     def __init__(self, sigma_rad_s: float, rng: np.random.Generator) -> None:
-        self._rng = rng
+        self._noise = noise_stream(rng)
         self._sigma = sigma_rad_s * _PER_UNIT
-        self._noise: list[float] = []
-        self._still: list[float] = []  # what a wheel at rest reads with that noise
-        self._next = 0
 
     def read(self, plant: Plant, times: SampleTimes) -> list[WheelTuple]:
         """(t, right, left) wheel rates of the frame."""
-        times_s = times.times_s
-        count = len(times_s)
-        if self._next + 2 * count > len(self._noise):
-            self._draw()
-        start = self._next
-        middle, self._next = start + count, start + 2 * count
-        if plant.are_wheels_still:
-            return list(zip(times_s, self._still[start:middle], self._still[middle : self._next], strict=True))
-        right_noise, left_noise = self._noise[start:middle], self._noise[middle : self._next]
-        right, right_lag, left, left_lag = plant.servo
-        unit, whole = _PER_UNIT, WHOLE
-        right, right_lag, left, left_lag = right * unit, right_lag * unit, left * unit, left_lag * unit
+        sigma, noise, unit, whole = self._sigma, self._noise, _PER_UNIT, WHOLE
+        right_noise = [sigma * noise() for _ in times.times_s]
+        left_noise = [sigma * noise() for _ in times.times_s]
+        right, right_lag, left, left_lag = (unit * rate_rad_s for rate_rad_s in plant.servo)
         found: list[WheelTuple] = []
-        for t, e, a, b in zip(times_s, times.decays, right_noise, left_noise):  # noqa: B905 - of one length; bare it compiles to a plain loop
+        for t, e, a, b in zip(times.times_s, times.decays, right_noise, left_noise):  # noqa: B905 - of one length; bare it compiles to a plain loop
             right_rad_s = (right + right_lag * e + a + whole - whole) / unit
             left_rad_s = (left + left_lag * e + b + whole - whole) / unit
             found.append((t, right_rad_s, left_rad_s))
         return found
-
-    def _draw(self) -> None:
-        fresh = self._sigma * self._rng.standard_normal(BLOCK)  # more than two wheels read in a frame
-        self._noise = self._noise[self._next :] + fresh.tolist()
-        self._still = self._still[self._next :] + (np.floor(fresh + 0.5) / _PER_UNIT).tolist()
-        self._next = 0
 
 
 class CountingEncoders:
@@ -206,14 +187,6 @@ class InertialUnit:
         return rows
 
 
-def nominal_rectangles(mirror: Mirror) -> dict[PanelId, Rectangle]:
-    """The material of each panel as designed."""
-    return {
-        pid: (p.x_m - p.half_x_m, p.x_m + p.half_x_m, p.y_m - p.half_y_m, p.y_m + p.half_y_m)
-        for pid, p in mirror.panels.items()
-    }
-
-
 def draw_rectangles(
     mirror: Mirror, panels: PanelsConfig, sigma_m: float, rng: np.random.Generator
 ) -> dict[PanelId, Rectangle]:
@@ -225,32 +198,24 @@ def draw_rectangles(
     x_out = max(0.0, 5e-4 * (panels.pitch_x_mm - panels.size_x_mm) - 0.5 * MIN_GAP_M)
     y_out = max(0.0, 5e-4 * (panels.pitch_y_mm - panels.size_y_mm) - 0.5 * MIN_GAP_M)
     found = {}
-    for pid, (x0, x1, y0, y1) in nominal_rectangles(mirror).items():
+    for pid, p in mirror.panels.items():
         west, east, south, north = (sigma_m * rng.standard_normal(4)).tolist()
-        found[pid] = x0 - min(west, x_out), x1 + min(east, x_out), y0 - min(south, y_out), y1 + min(north, y_out)
+        x0, x1 = p.x_m - p.half_x_m - min(west, x_out), p.x_m + p.half_x_m + min(east, x_out)
+        found[pid] = x0, x1, p.y_m - p.half_y_m - min(south, y_out), p.y_m + p.half_y_m + min(north, y_out)
     return found
 
 
 class EdgeSensors:
     """Whether there is panel material under each edge sensor; ``place`` before the first ``read``.
 
-    While every sensor is known to be further from the edges of its panel than the body has moved since, nothing is
-    looked up. ``offsets_m``: places of the sensors, robot frame, shape (4, 2). ``shifted``: the material of the panels,
-    if not as the mirror says.
+    While every sensor is known to be further from the edges of its panel than it has moved since, nothing is looked up.
+    ``offsets_m``: places of the sensors, robot frame, shape (4, 2). ``material`` is that of the panels.
     """
 
     def __init__(
-        self,
-        mirror: Mirror,
-        offsets_m: Sequence[tuple[float, float]],
-        shifted: Mapping[PanelId, Rectangle] | None = None,
+        self, mirror: Mirror, offsets_m: Sequence[tuple[float, float]], material: Mapping[PanelId, Rectangle]
     ) -> None:
-        self._mirror, self._shifted = mirror, shifted
-        m = _ROUNDING_M
-        material = nominal_rectangles(mirror) if shifted is None else shifted
-        self._inner = {pid: (x0 + m, x1 - m, y0 + m, y1 - m) for pid, (x0, x1, y0, y1) in material.items()}
-        # The inner rectangle on which each sensor was seen last.
-        self._under: list[Rectangle] = [(inf, -inf, inf, -inf)] * len(offsets_m)
+        self._panel_at, self._material = mirror.panel_at, material
         self._offsets = [(float(x), float(y)) for x, y in offsets_m]
         self._reach_m = _CURVED * max(hypot(x, y) for x, y in self._offsets)
         self._values = (1, 1, 1, 1)
@@ -260,25 +225,33 @@ class EdgeSensors:
     @property
     def places(self) -> list[tuple[float, float]]:
         """Deck (x, y) of the sensors at the end of the last frame, m."""
-        x, y, hx, hy, lx, ly = self._body
+        return self._places_of(self._body)
+
+    def _places_of(self, body: _Body) -> list[tuple[float, float]]:
+        x, y, hx, hy, lx, ly = body
         return [(x + a * hx + b * lx, y + a * hy + b * ly) for a, b in self._offsets]
 
     def place(self, plant: Plant) -> None:
         """Put the sensors where the plant is."""
         self._body = plant.x_m, plant.y_m, plant.hx, plant.hy, plant.lx, plant.ly
-        self._slack_m = 0.0
-        a, b, c, d = (int(self.is_on(x, y)) for x, y in self.places)
-        self._values = a, b, c, d
+        self._look()
 
     def is_on(self, x: float, y: float) -> bool:
         """Whether there is material at a point of the deck plane."""
-        if self._shifted is None:
-            return self._mirror.is_on_panel(x, y)
-        panel = self._mirror.panel_at(x, y)
+        return self._inside_m(x, y) >= 0.0
+
+    def _inside_m(self, x: float, y: float) -> float:
+        """Distance from the edges of the panel under a point; negative beside it."""
+        panel = self._panel_at(x, y)
         if panel is None:
-            return False
-        x0, x1, y0, y1 = self._shifted[panel]
-        return x0 <= x <= x1 and y0 <= y <= y1
+            return -1.0
+        x0, x1, y0, y1 = self._material[panel]
+        return min(x - x0, x1 - x, y - y0, y1 - y)
+
+    def _look(self) -> None:
+        inside_m = [self._inside_m(x, y) for x, y in self.places]
+        a, b, c, d = (int(one >= 0.0) for one in inside_m)
+        self._values, self._slack_m = (a, b, c, d), min(inside_m) - _ROUNDING_M
 
     def read(self, plant: Plant, times_s: Sequence[float], fractions: Sequence[float]) -> list[EdgeTuple]:
         """Readings at the times of a frame, after the plant's step.
@@ -286,62 +259,19 @@ class EdgeSensors:
         ``fractions``: the times as fractions of the frame, ascending to at most 1.
         """
         if plant.is_moving:
-            before = self._body
-            self._body = plant.x_m, plant.y_m, plant.hx, plant.hy, plant.lx, plant.ly
+            before, self._body = self._body, (plant.x_m, plant.y_m, plant.hx, plant.hy, plant.lx, plant.ly)
             way_m = _CURVED * (abs(plant.forward_m) + abs(plant.left_m)) + self._reach_m * abs(plant.turn_rad)
             self._slack_m -= way_m
             if self._slack_m <= 0.0:
-                changing = self._look(before)
-                if changing:
-                    return self._sample(changing, times_s, fractions)
+                chords = list(zip(self._places_of(before), self.places, strict=True))
+                found: list[EdgeTuple] = []
+                for t, f in zip(times_s, fractions, strict=True):
+                    a, b, c, d = (int(self.is_on(x + f * (u - x), y + f * (v - y))) for (x, y), (u, v) in chords)
+                    found.append((t, a, b, c, d))
+                self._look()
+                return found
         a, b, c, d = self._values
         return [(t, a, b, c, d) for t in times_s]
-
-    def _look(self, before: _Body) -> list[_Line]:
-        """Values and slack of a frame in which an edge may be near; the chords of sensors whose value may change."""
-        x0, y0, hx0, hy0, lx0, ly0 = before
-        x1, y1, hx1, hy1, lx1, ly1 = self._body
-        values, changing, slack_m = list(self._values), [], inf
-        for k, (a, b) in enumerate(self._offsets):
-            u, v = x0 + a * hx0 + b * lx0, y0 + a * hy0 + b * ly0
-            x, y = x1 + a * hx1 + b * lx1, y1 + a * hy1 + b * ly1
-            west, east, south, north = self._under[k]
-            if west <= u <= east and south <= v <= north and west <= x <= east and south <= y <= north:
-                values[k] = 1
-                slack_m = min(slack_m, x - west, east - x, y - south, north - y)
-                continue
-            slack_m = 0.0
-            if self._is_beside(k, u, v, x, y):
-                values[k] = 0
-            else:
-                changing.append((k, u, v, x, y))
-        self._values, self._slack_m = (values[0], values[1], values[2], values[3]), slack_m
-        return changing
-
-    def _is_beside(self, k: int, u: float, v: float, x: float, y: float) -> bool:
-        """Whether a sensor stays in the gap beside one side of a panel throughout its chord from (u, v) to (x, y)."""
-        panel = self._mirror.panel_at(x, y)
-        if panel is None:
-            return False
-        self._under[k] = west, east, south, north = self._inner[panel]
-        if self._mirror.panel_at(u, v) != panel:
-            return False
-        m = 2.0 * _ROUNDING_M  # from the inner rectangle to beyond the outer one
-        return max(x, u) < west - m or min(x, u) > east + m or max(y, v) < south - m or min(y, v) > north + m
-
-    def _sample(
-        self, changing: Sequence[_Line], times_s: Sequence[float], fractions: Sequence[float]
-    ) -> list[EdgeTuple]:
-        values = list(self._values)
-        found: list[EdgeTuple] = []
-        for t, f in zip(times_s, fractions, strict=True):
-            for k, x0, y0, x1, y1 in changing:
-                values[k] = int(self.is_on(x0 + f * (x1 - x0), y0 + f * (y1 - y0)))
-            found.append((t, values[0], values[1], values[2], values[3]))
-        for k, _, _, x1, y1 in changing:
-            values[k] = int(self.is_on(x1, y1))
-        self._values = values[0], values[1], values[2], values[3]
-        return found
 
 
 class SensorSuite:
@@ -367,10 +297,8 @@ class SensorSuite:
             self._encoders = CountingEncoders(world, sim.encoder_hz, 1.0 / sim.frame_hz, counts)
         else:
             self._encoders = RateEncoders(world.encoder_sigma_rad_s, encoders)
-        shifted = None
-        if world.panel_edge_sigma_m:
-            shifted = draw_rectangles(mirror, cfg.mirror.panels, world.panel_edge_sigma_m, panel_edges)
-        self.edges = EdgeSensors(mirror, cfg.robot.edge_sensors_m, shifted)
+        material = draw_rectangles(mirror, cfg.mirror.panels, world.panel_edge_sigma_m, panel_edges)
+        self.edges = EdgeSensors(mirror, cfg.robot.edge_sensors_m, material)
 
     def read(
         self, frame: int, plant: Plant

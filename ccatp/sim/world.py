@@ -18,7 +18,6 @@ from ccatp.sim.sensors import EdgeSensors
 TruthRow = tuple[int, float, float, float, float, float, float, float, float, int, int]
 
 NEAR_RIM_M = 0.25
-FULL_GRIP = (1.0, 1.0)
 FAR_CLEARANCE_M = 1.0
 """Stands for the clearance while the robot's origin is more than ``NEAR_RIM_M`` from the rim."""
 
@@ -52,30 +51,21 @@ class World:
         self.start_pose = mirror.deck_pose(self.start_panel_pose) if start is None else start
         robot, sim, world = cfg.robot, cfg.sim.robot, cfg.world
         self.wheels = wheels = draw_wheels(robot, sim.wheel_lag_s, world, wheels_rng)
-        has_slip = world.slip_max > 0.0 or world.slip_walk_sigma > 0.0
-        self._slip = WheelSlip(world, slip_rng) if has_slip else None
-        has_vibration = world.vibration_rate_rad_s or world.vibration_speed_m_s or world.vibration_acceleration_m_s2
-        self._vibration = Vibration(world, 1.0 / sim.frame_hz, vibration_rng) if has_vibration else None
-        disturbances: list[Disturbance] = []
-        if world.creep_fraction > 0.0:
-            disturbances.append(Creep(mirror, world, creep_rng).displace)
-        if self._vibration is not None:
-            disturbances.append(self._vibration.displace)
+        self._slip = WheelSlip(world, slip_rng)
+        self._vibration = Vibration(world, 1.0 / sim.frame_hz, vibration_rng)
         self.plant = Plant(
             mirror.surface,
             self.start_pose,
             wheel_radius_m=wheels.radius_m,
             wheel_base_m=wheels.base_m,
             wheel_lag_s=wheels.lag_s,
-            disturbances=[*disturbances, *pushes],
+            disturbances=[Creep(mirror, world, creep_rng).displace, self._vibration.displace, *pushes],
         )
-        self.plant.right_scale, self.plant.left_scale = wheels.right_scale, wheels.left_scale
         self._puck_height_m = robot.puck_height_m
         self._thrust_floor, self._fall_thrust_s = sim.fan_floor, sim.fall_thrust_s
         self._weak_s = 0.0
         self.is_fallen = False
-        self.grip = FULL_GRIP
-        self._full_scales: tuple[float, float] | None = None  # while the wheels have less grip
+        self.grip = (1.0, 1.0)
         self._places: deque[tuple[float, float]] = deque(maxlen=window_frames + 1)
         self._places.append((self.plant.x_m, self.plant.y_m))
         self._overhang, self._rim = mirror.overhang, NearOutline(mirror.rim)
@@ -95,19 +85,13 @@ class World:
         if self.is_fallen:
             plant.is_moving = False
             return
-        if self._full_scales is not None:
-            (plant.right_scale, plant.left_scale), self._full_scales = self._full_scales, None
         is_ordered = right_rad_s != 0.0 or left_rad_s != 0.0
-        if self._slip is not None and (is_ordered or plant.right_rad_s or plant.left_rad_s):
+        if is_ordered or plant.right_rad_s or plant.left_rad_s:
             self._slip.step(t_s, dt_s, is_ordered)
-            plant.right_scale = self.wheels.right_scale * (1.0 - self._slip.right)
-            plant.left_scale = self.wheels.left_scale * (1.0 - self._slip.left)
-        if self.grip != FULL_GRIP:
-            right_grip, left_grip = self.grip
-            self._full_scales = right_scale, left_scale = plant.right_scale, plant.left_scale
-            plant.right_scale, plant.left_scale = right_grip * right_scale, left_grip * left_scale
-        if self._vibration is not None:
-            self._vibration.is_thrusting = thrust > 0.0
+        right_grip, left_grip = self.grip
+        plant.right_scale = right_grip * (self.wheels.right_scale * (1.0 - self._slip.right))
+        plant.left_scale = left_grip * (self.wheels.left_scale * (1.0 - self._slip.left))
+        self._vibration.is_thrusting = thrust > 0.0
         plant.step(t_s, dt_s, right_rad_s, left_rad_s)
         self._places.append((plant.x_m, plant.y_m))
         if self._overhang:
