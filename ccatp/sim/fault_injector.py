@@ -358,7 +358,7 @@ class Injector:
         return tuple(names)
 
     def deliver(self, t_s: float, frame: RobotFrame | None) -> tuple[bytes, Sensors | None]:
-        """What leaves the robot if ``frame`` is due: no, one or several lines, and the newest frame that can be read."""
+        """What leaves if ``frame`` is due: lines, none or several, and the newest frame that can be read."""
         if frame is None:
             return b"", None
         line = encode(frame)
