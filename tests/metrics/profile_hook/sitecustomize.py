@@ -16,8 +16,10 @@ from pathlib import Path
 from types import FrameType
 
 _PERIOD_S = 0.001  # the kernel may round it up to its own tick
-# Serving: whatever else there is on the stack. The rest is start and end.
-_LOOPS = ("_run_once", "_watch")
+# The outermost functions of serving: ``asyncio.Runner.run``, whatever the event loop, and that of the supervisor. A
+# process that serves a connection has begun with the first data of it; what was before is the start.
+_LOOPS = ("run", "runners.py"), ("_watch", "supervisor.py")
+_FIRST = "data_received"
 
 
 class _Samples:
@@ -28,6 +30,7 @@ class _Samples:
         self._times_s: defaultdict[tuple[str, str], float] = defaultdict(float)
         self._thread_s = time.thread_time()
         self._others_s = time.process_time() - self._thread_s
+        self._has_begun = False
 
     def __call__(self, _number: int, frame: FrameType | None) -> None:
         now_s = time.thread_time()
@@ -38,7 +41,10 @@ class _Samples:
             inner = inner or _name(code.co_filename, code.co_name)
             if not own and code.co_filename.startswith(self._package):
                 own = _name(code.co_filename, code.co_name)
-            if code.co_name in _LOOPS:
+            if code.co_name == _FIRST and not self._has_begun:
+                self._has_begun = True
+                self._times_s.clear()
+            if (code.co_name, Path(code.co_filename).name) in _LOOPS:
                 self._times_s[own or "the event loop", inner] += spent_s
                 return
             frame = frame.f_back
