@@ -314,7 +314,7 @@ class MainLoop(RobotLoop):
             self._answer(seq, drive)
 
             runner.publish(frame)
-            self._telemetry.add_tick(1e6 * (time.perf_counter() - decided_s + asked_s - begun_s))
+            self._telemetry.tick_us.append(1e6 * (time.perf_counter() - decided_s + asked_s - begun_s))
         except Exception as error:
             self.log.exception("unhandled_exception", seq=seq)
             what = f"{type(error).__name__}: {error}"

@@ -28,6 +28,7 @@ class Telemetry:
         seq, t_s: the newest frame.
         frames_before: the recorded number of a frame is its ``seq`` and this.
         newest_line: of the newest frame with an estimate.
+        tick_us: wall times of frames for the next batch.
     """
 
     def __init__(
@@ -40,7 +41,7 @@ class Telemetry:
         self.send, self.log, self._topic, self._track = publisher.send, log, topic, track
         self._lines: list[msgspec.Raw] = []
         self._rows: list[tuple[Any, ...]] = []
-        self._tick_us: list[float] = []
+        self.tick_us: list[float] = []
         self._flushed_wall_s = time.monotonic()
         self.frames_before = 0
         self.newest_line = msgspec.Raw(b"null")
@@ -67,10 +68,6 @@ class Telemetry:
         if len(self._lines) >= BATCH_FRAMES:
             self.flush()
 
-    def add_tick(self, microseconds: float) -> None:
-        """Note the wall time of a tick."""
-        self._tick_us.append(microseconds)
-
     def flush(self, least_age_s: float = 0.0) -> None:
         """Publish the batches where the last time is at least so long ago."""
         now_s = time.monotonic()
@@ -82,9 +79,9 @@ class Telemetry:
         seq, t_s = self.seq, self.t_s
         if self._rows:
             self.send(self._topic, self._track(seq=seq, t_s=t_s, rows=self._rows))
-            self.send("timing", Timing(seq=seq, t_s=t_s, tick_us=self._tick_us))
+            self.send("timing", Timing(seq=seq, t_s=t_s, tick_us=self.tick_us))
         self.send("sensors", SensorLines(seq=seq, t_s=t_s, lines=self._lines))
-        self._lines, self._rows, self._tick_us = [], [], []
+        self._lines, self._rows, self.tick_us = [], [], []
 
     def notify_operator(self, level: str, text: str) -> None:
         """One line for the log file and for the operator's terminal."""

@@ -39,7 +39,7 @@ def test_a_frame_that_is_not_newer_is_recorded_without_an_estimate(telemetry: Te
     telemetry.add_line(8, b'{"seq":8}')
     assert (telemetry.seq, telemetry.t_s, bytes(telemetry.newest_line)) == (8, 1.0, b'{"seq":7}')
     telemetry.add_frame(9, 1.01, b'{"seq":9}', row(9))
-    telemetry.add_tick(250.0)
+    telemetry.tick_us.append(250.0)
     telemetry.flush(60.0)  # the last time is not so long ago
     assert not received
     telemetry.flush()
