@@ -37,12 +37,6 @@ class ConfigError(CcatpError):
         super().__init__(self.problems[0] + more)
 
 
-class RuntimeDirError(CcatpError):
-    """A runtime directory in which no socket can or may be made."""
-
-    exit_status = ExitStatus.USAGE
-
-
 class RefusedError(CcatpError):
     """A running daemon refused a command."""
 

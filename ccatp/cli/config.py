@@ -87,12 +87,13 @@ def keys() -> None:
 def generate(folder: Path, name: str, is_client: bool, force: bool) -> None:
     """Make a CURVE pair for the observatory channel and a key for the robot link."""
     from ccatp.links import auth as files
+    from ccatp.links.runtime_dir import make_own_dir
 
-    suffixes = [files.PUBLIC_SUFFIX, files.SECRET_SUFFIX, *([] if is_client else [files.LINK_SUFFIX])]
-    if not force and (there := files.files_in_the_way(folder, name, suffixes)):
-        raise ConfigError(f"--dir: {there[0]} exists; choose another --name, or replace it with --force")
-    folder = folder.absolute()
-    files.make_key_dir(folder)
+    folder = folder.resolve()
+    for suffix in (files.PUBLIC_SUFFIX, files.SECRET_SUFFIX, *(() if is_client else (files.LINK_SUFFIX,))):
+        if not force and (there := folder / f"{name}{suffix}").exists():
+            raise ConfigError(f"--dir: {there} exists; choose another --name, or replace it with --force")
+    make_own_dir(folder, "--dir", files.FOR_OTHERS)
     public, secret = files.write_pair(folder, name, is_replacing=force)
     print_lines([f"{public}  (public, for the peers)", f"{secret}  (secret, stays here)"])
     if is_client:

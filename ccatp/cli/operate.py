@@ -126,24 +126,17 @@ def _ask_observatory(
     config_file: Path | None, runtime_dir: Path | None, timeout_s: float,
 ) -> dict[str, Any]:  # fmt: skip
     """One request to the observatory channel of a daemon here, or by TCP of one elsewhere."""
-    folder = configured_folder(config_file, runtime_dir)
+    from ccatp.links.client import ObservatoryClient, OperatorClient
+
     if endpoint is None:
         if server_key is not None or key_file is not None:
             raise click.UsageError("--server-key and --key go with --endpoint tcp://HOST:PORT")
-        from ccatp.links.client import OperatorClient
-
-        return OperatorClient(folder, timeout_s).observatory.ask(payload)
+        return OperatorClient(configured_folder(config_file, runtime_dir), timeout_s).observatory.ask(payload)
     if not endpoint.startswith("tcp://"):
         raise click.UsageError(f"--endpoint {endpoint!r} is not tcp://HOST:PORT; a daemon here has --runtime-dir")
     if server_key is None or key_file is None:
         raise click.UsageError("--endpoint needs --server-key and --key; make keys with ccatp keys generate")
-    from ccatp.links.auth import read_pair, read_public
-    from ccatp.links.client import exchange
-    from ccatp.links.rpc import CurveClient
-
-    pair = read_pair(key_file, "--key")
-    curve = CurveClient(read_public(server_key, "--server-key"), pair.public, pair.secret)
-    return exchange(endpoint, payload, timeout_s, curve, repeats=True)
+    return ObservatoryClient.connect(endpoint, server_key, key_file, timeout_s).ask(payload)
 
 
 @click.command(

@@ -11,7 +11,7 @@ import structlog
 import zmq.asyncio
 
 from ccatp.config.models import ObservatoryConfig
-from ccatp.links.auth import AuthorizedClient, ClientsFile, KeyPair, Role, read_clients, read_pair
+from ccatp.links.auth import AuthorizedClient, ClientsFile, KeyPair, read_clients, read_pair
 from ccatp.links.channels import answer_observatory, format_error, parse_reply
 from ccatp.links.liveness import LogRateLimit
 from ccatp.links.rpc import Router, ZapHandler
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 KEY_FILE, CLIENTS_FILE = "observatory.key_file", "observatory.clients_file"
 # Access to the unix socket takes the daemon's own user, who might as well stop the daemon.
-LOCAL = AuthorizedClient("local", Role.CLEAR)
+LOCAL = AuthorizedClient("local", "clear")
 # Repeated requests must not fill the log.
 LOGGED_LINES, LOGGED_PERIOD_S = 10, 60.0
 
@@ -69,7 +69,7 @@ class ObservatoryServer:
 
     def answer(self, frame: bytes, client: AuthorizedClient = LOCAL) -> bytes:
         """The reply to a request of a client."""
-        monitor, may_clear = self._monitor, client.role is Role.CLEAR
+        monitor, may_clear = self._monitor, client.role == "clear"
         reply = answer_observatory(
             frame, monitor, at_base_or_held=monitor.at_base_or_held, age_s=self._age_s(), may_clear=may_clear
         )
@@ -83,7 +83,7 @@ class ObservatoryServer:
 
     def _answer_remote(self, frame: bytes, user_id: str) -> bytes:
         """A client that is taken off the list loses its rights at once, connected or not."""
-        client = self._clients.clients.get(bytes.fromhex(user_id))
+        client = self._clients.clients.get(user_id)
         if client is None:
             self._log_unknown(f"key {user_id} is not on the list any more")
             return format_error("this client is not on the list any more")

@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager
 from math import inf
 from typing import Any
 
-import msgspec
 import zmq
 
 from ccatp.conditions import FRAME_LATE, LINK_LOST, NO_FRAME_FOR, condition_of
@@ -254,7 +253,7 @@ class MainLoop(RobotLoop):
     async def _answer_operator(self, frame: bytes) -> bytes:
         """A command is answered after it took effect or was refused."""
         try:
-            command = parse_operator(frame).cmd
+            command = parse_operator(frame)
         except BadRequest as error:
             return format_error(str(error))
         if command is not OperatorCommand.STATUS:
@@ -270,7 +269,7 @@ class MainLoop(RobotLoop):
                         await asyncio.sleep(WAIT_PERIOD_S)
             except TimeoutError:
                 return format_error(f"{command}: accepted, but the robot is not at rest after {EFFECT_TIMEOUT_S:.0f} s")
-        return format_ok(status=msgspec.to_builtins(self.status()))
+        return format_ok(status=self.status())
 
     def _apply(self, command: OperatorCommand) -> str | None:
         events: dict[OperatorCommand, Pause | Resume | Abort] = {

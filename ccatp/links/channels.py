@@ -6,14 +6,12 @@ request that is not of the form gets ``{"ok": false, "error": why}`` and changes
 
 import json
 from enum import StrEnum
-from typing import Annotated, Any, Literal, NoReturn, Protocol, TypeVar
+from typing import Annotated, Any, NoReturn, Protocol
 from uuid import UUID
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+import msgspec
 
 from ccatp.core import EmergencyKind, EventCode
-
-T = TypeVar("T")
 
 MAX_REQUEST_BYTES = 4096
 MAX_NOTE_CHARACTERS = 2000
@@ -23,35 +21,28 @@ class BadRequest(ValueError):
     """A frame that is no request of its channel; the text is the reply's ``error``."""
 
 
-def _check_uuid(text: str) -> str:
-    UUID(text)  # raises ValueError; the id itself is answered as it was sent
-    return text
-
-
-class _Request(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
-
-
-class EmergencyRequest(_Request):
+class EmergencyRequest(msgspec.Struct, frozen=True, tag_field="cmd", tag="emergency"):
     """The observatory reports an emergency; the same id again is harmless."""
 
-    cmd: Literal["emergency"]
-    kind: Annotated[EmergencyKind, Field(strict=False)]
-    id: Annotated[str, AfterValidator(_check_uuid)]
-    note: Annotated[str, Field(max_length=MAX_NOTE_CHARACTERS)] = ""
+    kind: EmergencyKind
+    id: str
+    note: Annotated[str, msgspec.Meta(max_length=MAX_NOTE_CHARACTERS)] = ""
+
+    def __post_init__(self) -> None:
+        _uuid_of(self.id)
 
 
-class ClearRequest(_Request):
+class ClearRequest(msgspec.Struct, frozen=True, tag_field="cmd", tag="clear"):
     """The observatory says that the cause of an emergency is gone."""
 
-    cmd: Literal["clear"]
-    id: Annotated[str, AfterValidator(_check_uuid)]
+    id: str
+
+    def __post_init__(self) -> None:
+        _uuid_of(self.id)
 
 
-class PingRequest(_Request):
+class PingRequest(msgspec.Struct, frozen=True, tag_field="cmd", tag="ping"):
     """Request of the event code."""
-
-    cmd: Literal["ping"]
 
 
 ObservatoryRequest = EmergencyRequest | ClearRequest | PingRequest
@@ -67,47 +58,44 @@ class OperatorCommand(StrEnum):
     STOP = "stop"
 
 
-class OperatorRequest(_Request):
-    """One command of an operator."""
-
-    cmd: Annotated[OperatorCommand, Field(strict=False)]
-
-
-_observatory: TypeAdapter[ObservatoryRequest] = TypeAdapter(Annotated[ObservatoryRequest, Field(discriminator="cmd")])
-_operator: TypeAdapter[OperatorRequest] = TypeAdapter(OperatorRequest)
-
-
 def parse_observatory(frame: bytes) -> ObservatoryRequest:
     """The request in a frame of the observatory channel.
 
     ``BadRequest``: too long, not JSON, not an object, or not of the form.
     """
-    return _validated(_observatory, _parse_object(frame))
+    try:
+        return msgspec.convert(_parse_request(frame), ObservatoryRequest)  # type: ignore[no-any-return]
+    except (msgspec.ValidationError, UnicodeError) as error:  # JSON may hold half a surrogate pair
+        raise BadRequest(str(error)) from error
 
 
-def parse_operator(frame: bytes) -> OperatorRequest:
-    """The request in a frame of the operator channel; errors as of ``parse_observatory``."""
-    return _validated(_operator, _parse_object(frame))
+def parse_operator(frame: bytes) -> OperatorCommand:
+    """The command in a frame of the operator channel; errors as of ``parse_observatory``."""
+    command = str(_parse_request(frame).get("cmd"))
+    try:
+        return OperatorCommand(command)
+    except ValueError as error:
+        raise BadRequest(f"cmd: {command!a} is none of {', '.join(OperatorCommand)}") from error
 
 
 def format_request(cmd: str, **fields: object) -> bytes:
     """A request of either channel as it goes over the wire."""
-    return _dump({"cmd": cmd, **fields})
+    return msgspec.json.encode({"cmd": cmd, **fields})
 
 
 def format_ok(**fields: object) -> bytes:
     """``{"ok": true, ...}``."""
-    return _dump({"ok": True, **fields})
+    return msgspec.json.encode({"ok": True, **fields})
 
 
 def format_error(error: str, **fields: object) -> bytes:
     """``{"ok": false, ..., "error": why}``."""
-    return _dump({"ok": False, **fields, "error": error})
+    return msgspec.json.encode({"ok": False, **fields, "error": error})
 
 
 def parse_reply(frame: bytes) -> dict[str, Any]:
     """The object in a reply; ``BadRequest``: not a JSON object with a boolean ``ok``."""
-    reply = _object_in(frame)
+    reply = _parse_object(frame)
     if not isinstance(reply.get("ok"), bool):
         raise BadRequest('a reply without "ok"')
     return reply
@@ -140,7 +128,7 @@ def answer_observatory(
         return format_error(str(error))
     if isinstance(request, PingRequest):
         return format_ok(code=int(handler.code), age_s=age_s)
-    key = str(UUID(request.id))  # one of many ways to write it
+    key = _uuid_of(request.id)
     if isinstance(request, EmergencyRequest):
         refusal = handler.emergency(request.kind.value, key, request.note)
         # An edge may hide the abort's code until the robot is off it; the answer is about the latch. What was cleared
@@ -155,17 +143,18 @@ def answer_observatory(
     return accepted if refusal is None else format_error(refusal, id=request.id)
 
 
-def _dump(value: dict[str, object]) -> bytes:
-    return json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
+def _uuid_of(text: str) -> str:
+    """The one form of an id that may be written in many; the id itself is answered as it was sent."""
+    return str(UUID(text))
+
+
+def _parse_request(frame: bytes) -> dict[str, Any]:
+    if len(frame) > MAX_REQUEST_BYTES:
+        raise BadRequest(f"request of {len(frame)} bytes; at most {MAX_REQUEST_BYTES}")
+    return _parse_object(frame)
 
 
 def _parse_object(frame: bytes) -> dict[str, Any]:
-    if len(frame) > MAX_REQUEST_BYTES:
-        raise BadRequest(f"request of {len(frame)} bytes; at most {MAX_REQUEST_BYTES}")
-    return _object_in(frame)
-
-
-def _object_in(frame: bytes) -> dict[str, Any]:
     try:
         value = json.loads(frame.decode(), object_pairs_hook=_without_duplicates, parse_constant=_refuse_constant)
     except BadRequest:
@@ -185,13 +174,3 @@ def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _refuse_constant(text: str) -> NoReturn:
     raise BadRequest(f"{text} is no number")
-
-
-def _validated(adapter: TypeAdapter[T], value: dict[str, Any]) -> T:
-    try:
-        return adapter.validate_python(value)
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        where = ".".join(str(part) for part in first["loc"] if part not in ("emergency", "clear", "ping"))
-        message = first["msg"]
-        raise BadRequest(f"{where}: {message}" if where else message) from error

@@ -76,8 +76,8 @@ class ObservatoryClient:
 
         ``ConfigError``: a key file cannot be used.
         """
-        pair = read_pair(key, "key")
-        return cls(endpoint, CurveClient(read_public(server_key, "server_key"), pair.public, pair.secret), timeout_s)
+        own = read_pair(key, "key")
+        return cls(endpoint, CurveClient(read_public(server_key, "server key"), own), timeout_s)
 
     def emergency(self, kind: EmergencyKind, note: str = "", emergency_id: str | None = None) -> Latched:
         """Report an emergency: the robot drives to its base. The request is repeated until it is answered.
@@ -97,7 +97,7 @@ class ObservatoryClient:
 
     def ask(self, payload: Mapping[str, object]) -> dict[str, Any]:
         """Send a request as it is; returns the whole answer."""
-        return exchange(self.endpoint, payload, self.timeout_s, self.curve, repeats=True)
+        return _exchange(self.endpoint, payload, self.timeout_s, self.curve, repeats=True)
 
 
 class OperatorClient:
@@ -151,7 +151,7 @@ class OperatorClient:
 
     def ask(self, cmd: str) -> dict[str, Any]:
         """Send a command as it is; returns the whole answer."""
-        return exchange(self._endpoint("control"), {"cmd": cmd}, self.timeout_s)
+        return _exchange(self._endpoint("control"), {"cmd": cmd}, self.timeout_s)
 
     def _order(self, cmd: str) -> MissionStatus:
         return _as(MissionStatus, self.ask(cmd).get("status"))
@@ -164,7 +164,7 @@ class OperatorClient:
         return f"ipc://{self.runtime_dir / channel}"
 
 
-def exchange(
+def _exchange(
     endpoint: str,
     payload: Mapping[str, object],
     timeout_s: float,
@@ -180,11 +180,11 @@ def exchange(
     if reply.get("ok") is not True:
         raise RefusedError(f"{payload.get('cmd')} refused: {reply.get('error', 'no reason given')}")
     # Only an answer that names this emergency counts as its confirmation.
-    if payload.get("cmd") == "emergency" and reply.get("id") == payload["id"] and reply.get("latched") is False:
-        raise RequestFailed(
-            "emergency not in force: the one with that id was cleared; report another with an id of its own"
-        )
-    if payload.get("cmd") == "emergency" and (reply.get("id") != payload["id"] or reply.get("latched") is not True):
+    if payload.get("cmd") == "emergency" and (reply.get("id"), reply.get("latched")) != (payload["id"], True):
+        if (reply.get("id"), reply.get("latched")) == (payload["id"], False):
+            raise RequestFailed(
+                "emergency not in force: the one with that id was cleared; report another with an id of its own"
+            )
         raise RequestFailed(
             f"{endpoint}: something answers there, but not that this emergency is in force; is it a daemon of ccatp?"
         )

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple, Self
 import zmq
 import zmq.asyncio
 from zmq.auth.base import Authenticator
-from zmq.utils import z85
 from zmq.utils.monitor import parse_monitor_message
 
 from ccatp.errors import CcatpError, DaemonUnreachableError, ExitStatus
@@ -22,7 +21,7 @@ from ccatp.links.auth import Clients, KeyPair
 from ccatp.links.channels import BadRequest, format_error, parse_reply
 
 Handler = Callable[..., bytes | Awaitable[bytes]]
-"""Takes the request, and on TCP the client's public key in hexadecimal; returns the reply or an awaitable of it."""
+"""Takes the request, and on TCP the client's public key (Z85); returns the reply or an awaitable of it."""
 
 # libzmq cuts off a peer whose frame is longer than this; what lies between it and the limit of a request is answered.
 MAX_FRAME_BYTES = 1 << 13
@@ -67,18 +66,16 @@ class Router:
         self, endpoint: str, handler: Handler, context: zmq.asyncio.Context, keys: KeyPair | None = None
     ) -> None:
         self._endpoint, self._handler, self._context, self._keys = endpoint, handler, context, keys
-        self._socket: zmq.asyncio.Socket | None = None
-        self._monitor: zmq.asyncio.Socket | None = None
+        self._socket: zmq.asyncio.Socket
+        self._monitor: zmq.asyncio.Socket
         self.bound = ""
         self._pending: set[asyncio.Task[None]] = set()
         self._connections: set[int] = set()
         self.refused = self.turned_away = 0
 
     async def __aenter__(self) -> Self:
-        if self._keys is None and not self._endpoint.startswith(("ipc://", "inproc://")):
-            raise RouterError(f"{self._endpoint}: only ipc:// and inproc:// are served without keys")
-        if self._keys is not None and not self._endpoint.startswith("tcp://"):
-            raise RouterError(f"{self._endpoint}: CURVE keys are for tcp://")
+        if self._endpoint.startswith(("ipc://", "inproc://")) is not (self._keys is None):
+            raise RouterError(f"{self._endpoint}: ipc:// and inproc:// are served without keys, tcp:// with keys alone")
         self._socket = router = self._context.socket(zmq.ROUTER)
         router.setsockopt(zmq.LINGER, 0)
         router.setsockopt(zmq.RCVHWM, HIGH_WATER_MARK)
@@ -106,20 +103,16 @@ class Router:
 
     async def __aexit__(self, *_: object) -> None:
         """Close; undelivered replies are dropped."""
-        if self._socket is not None and self._monitor is not None:
-            self._socket.disable_monitor()
-            self._monitor.close()
-            self._socket.close()
-            self._socket = self._monitor = None
+        self._socket.disable_monitor()
+        self._monitor.close()
+        self._socket.close()
 
     async def serve(self) -> None:
         """Answer requests until cancelled."""
-        if self._socket is None:
-            raise RouterError(f"{self._endpoint}: not bound")
         async with asyncio.TaskGroup() as later:
             later.create_task(self._limit_connections())
-            while (router := self._socket) is not None:
-                frames = await router.recv_multipart(copy=False)
+            while True:
+                frames = await self._socket.recv_multipart(copy=False)
                 envelope, payload = split_envelope([frame.bytes for frame in frames])
                 if payload is None:
                     await self._refuse(envelope, NOT_SINGLE)
@@ -139,8 +132,8 @@ class Router:
                 await asyncio.sleep(0)
 
     async def _limit_connections(self) -> None:
-        while (monitor := self._monitor) is not None:
-            event = parse_monitor_message(await monitor.recv_multipart())
+        while True:
+            event = parse_monitor_message(await self._monitor.recv_multipart())
             if event["event"] == zmq.EVENT_DISCONNECTED:
                 self._connections.discard(event["value"])
             elif len(self._connections) < MAX_CONNECTIONS:
@@ -158,8 +151,7 @@ class Router:
 
     async def _send(self, envelope: list[bytes], reply: bytes) -> None:
         # A ROUTER never blocks: a reply to a peer that is gone or too slow is dropped.
-        if self._socket is not None:
-            await self._socket.send_multipart([*envelope, reply])
+        await self._socket.send_multipart([*envelope, reply])
 
 
 def turn_away(descriptor: int, endpoint: str) -> bool:
@@ -196,11 +188,10 @@ def split_envelope(frames: list[bytes]) -> tuple[list[bytes], bytes | None]:
 
 
 class CurveClient(NamedTuple):
-    """Keys of a client, each 40 characters of Z85."""
+    """Keys of a client: the server's public one, 40 characters of Z85, and its own."""
 
     server: bytes
-    public: bytes
-    secret: bytes
+    own: KeyPair
 
 
 def request(
@@ -216,8 +207,8 @@ def request(
         peer.setsockopt(zmq.MAXMSGSIZE, MAX_REPLY_BYTES)
         if curve is not None:
             peer.setsockopt(zmq.CURVE_SERVERKEY, curve.server)
-            peer.setsockopt(zmq.CURVE_PUBLICKEY, curve.public)
-            peer.setsockopt(zmq.CURVE_SECRETKEY, curve.secret)
+            peer.setsockopt(zmq.CURVE_PUBLICKEY, curve.own.public)
+            peer.setsockopt(zmq.CURVE_SECRETKEY, curve.own.secret)
         try:
             peer.connect(endpoint)
         except zmq.ZMQError as error:
@@ -273,12 +264,7 @@ class ZapHandler(Authenticator):
 
     def callback(self, _domain: str, key: bytes) -> bool:
         """Whether a client with this public key (Z85) is admitted."""
-        raw = z85.decode(key)
-        if raw in self._clients():
+        if key.decode() in self._clients():
             return True
-        self._on_refused(f"{self._address}: key {raw.hex()} is not on the list")
+        self._on_refused(f"{self._address}: key {key.decode()} is not on the list")
         return False
-
-    def curve_user_id(self, client_public_key: bytes) -> str:
-        """The key in hexadecimal."""
-        return client_public_key.hex()

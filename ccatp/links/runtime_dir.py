@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from fcntl import LOCK_EX, LOCK_NB, LOCK_SH, flock
 from pathlib import Path
 
-from ccatp.errors import RefusedError, RuntimeDirError
+from ccatp.errors import ConfigError, RefusedError
 
 LOCK_FILE = "lock"
 # Held by the simulated robot that publishes its truth there.
@@ -27,7 +27,7 @@ def runtime_dir_path(configured: str, environ: Mapping[str, str]) -> Path:
     """The folder, which need not exist: the configured one, or the first that the environment offers.
 
     ``configured`` (``run.runtime_dir``) unless empty, else ``$CCATP_RUNTIME_DIR``, else ``$XDG_RUNTIME_DIR/ccatp``,
-    else ``ccatp-<uid>`` in the temporary directory. ``RuntimeDirError``: the path is too long for a unix socket in it.
+    else ``ccatp-<uid>`` in the temporary directory. ``ConfigError``: the path is too long for a unix socket in it.
     """
     if configured:
         path = Path(configured).expanduser()
@@ -40,7 +40,7 @@ def runtime_dir_path(configured: str, environ: Mapping[str, str]) -> Path:
     path = path.absolute()
     longest = len(os.fsencode(path)) + 1 + MAX_SOCKET_NAME_BYTES
     if longest > MAX_SOCKET_PATH_BYTES:
-        raise RuntimeDirError(
+        raise ConfigError(
             f"runtime directory {path}: {longest} bytes with a socket's name, a unix socket takes at most "
             f"{MAX_SOCKET_PATH_BYTES}; choose a shorter one with --runtime-dir or CCATP_RUNTIME_DIR"
         )
@@ -50,29 +50,31 @@ def runtime_dir_path(configured: str, environ: Mapping[str, str]) -> Path:
 def make_runtime_dir(configured: str, environ: Mapping[str, str]) -> Path:
     """The folder, made with mode 0700 when it is missing, and checked to be the caller's own.
 
-    ``RuntimeDirError``: it cannot be made, is not a folder, belongs to another user or is writable for others.
+    ``ConfigError``: it cannot be made, is not a folder, belongs to another user or is writable for others.
     """
     path = runtime_dir_path(configured, environ)
+    make_own_dir(path, "--runtime-dir", stat.S_IWGRP | stat.S_IWOTH)
+    return path
+
+
+def make_own_dir(path: Path, option: str, forbidden: int) -> None:
+    """Make a folder with mode 0700, or check that it is the caller's own, without the ``forbidden`` bits of a mode.
+
+    ``option`` names the folder on the command line. ``ConfigError``: it cannot be made, or may not be used.
+    """
+    instead = f"choose another with {option}"
     try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
         info = path.lstat()
     except OSError as error:
-        raise RuntimeDirError(
-            f"runtime directory {path}: {error.strerror}; choose another with --runtime-dir"
-        ) from error
+        raise ConfigError(f"folder {path} cannot be made: {error.strerror}; {instead}") from error
     if not stat.S_ISDIR(info.st_mode):
-        raise RuntimeDirError(f"runtime directory {path}: is a link, not a folder; choose another with --runtime-dir")
+        raise ConfigError(f"folder {path} is a link, not a folder; {instead}")
     if info.st_uid != os.getuid():
-        raise RuntimeDirError(
-            f"runtime directory {path}: belongs to user {info.st_uid}, not to {os.getuid()}; "
-            "choose another with --runtime-dir"
-        )
-    if info.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise RuntimeDirError(
-            f"runtime directory {path}: others may write there (mode {stat.S_IMODE(info.st_mode):04o}); "
-            f"chmod 700 {path}"
-        )
-    return path
+        raise ConfigError(f"folder {path} belongs to user {info.st_uid}, not to {os.getuid()}; {instead}")
+    if info.st_mode & forbidden:
+        mode = stat.S_IMODE(info.st_mode)
+        raise ConfigError(f"folder {path} is open to others (mode {mode:04o}); chmod 700 {path}")
 
 
 @contextmanager

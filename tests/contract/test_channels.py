@@ -81,9 +81,7 @@ def ask(desk: Desk, text: str | bytes, *, at_base_or_held: bool = False) -> dict
 def test_emergency_and_its_reply_are_as_in_the_interface(kind: str) -> None:
     desk = Desk()
     text = f'{{"cmd":"emergency","kind":"{kind}","id":"{ID}","note":"sensor 4"}}'
-    assert parse_observatory(text.encode()) == EmergencyRequest(
-        cmd="emergency", kind=EmergencyKind(kind), id=ID, note="sensor 4"
-    )
+    assert parse_observatory(text.encode()) == EmergencyRequest(kind=EmergencyKind(kind), id=ID, note="sensor 4")
     for _ in range(3):  # the same id again is harmless
         assert ask(desk, text) == {"ok": True, "id": ID, "latched": True, "code": 2}
     assert desk.latch.is_latched
@@ -102,7 +100,7 @@ def test_clear_only_at_base_or_held() -> None:
     desk = Desk()
     ask(desk, format_request("emergency", kind="fire", id=ID, note=""))
     clear = format_request("clear", id=ID)
-    assert parse_observatory(clear) == ClearRequest(cmd="clear", id=ID)
+    assert parse_observatory(clear) == ClearRequest(id=ID)
     assert ask(desk, clear) == {"ok": False, "id": ID, "error": "the robot is neither at base nor held"}
     assert desk.latch.is_latched
     assert ask(desk, clear, at_base_or_held=True) == {"ok": True, "id": ID, "code": 0}
@@ -122,7 +120,7 @@ def test_an_id_may_be_written_in_capitals_and_what_was_cleared_is_not_in_force()
 
 def test_ping_tells_code_and_age() -> None:
     desk = Desk()
-    assert parse_observatory(b'{"cmd":"ping"}') == PingRequest(cmd="ping")
+    assert parse_observatory(b'{"cmd":"ping"}') == PingRequest()
     assert ask(desk, '{"cmd":"ping"}') == {"ok": True, "code": 0, "age_s": 0.01}
     ask(desk, format_request("emergency", kind="power", id=ID))
     assert ask(desk, '{"cmd":"ping"}')["code"] == 2
@@ -131,7 +129,7 @@ def test_ping_tells_code_and_age() -> None:
 
 def test_unknown_keys_are_ignored_and_the_note_may_be_absent() -> None:
     parsed = parse_observatory(f'{{"cmd":"emergency","kind":"fire","id":"{ID}","from":"dome"}}'.encode())
-    assert parsed == EmergencyRequest(cmd="emergency", kind=EmergencyKind.FIRE, id=ID, note="")
+    assert parsed == EmergencyRequest(kind=EmergencyKind.FIRE, id=ID, note="")
 
 
 BAD = {
@@ -146,17 +144,17 @@ BAD = {
     "huge number": (b'{"cmd":"ping","x":' + b"9" * 4050 + b"}", None),
     "key twice": (b'{"cmd":"ping","cmd":"ping"}', "a key stands twice"),
     "not finite": (b'{"cmd":"ping","x":NaN}', "NaN is no number"),
-    "no cmd": (b"{}", "Unable to extract tag"),
-    "unknown cmd": (b'{"cmd":"reboot"}', "does not match any of the expected tags"),
-    "cmd of another type": (b'{"cmd":1}', "tag"),
-    "cmd is an object": (b'{"cmd":{}}', "tag"),
-    "unknown kind": (f'{{"cmd":"emergency","kind":"flood","id":"{ID}","note":""}}'.encode(), "kind: Input should be"),
-    "no kind": (f'{{"cmd":"emergency","id":"{ID}","note":""}}'.encode(), "kind: Field required"),
-    "no id": (b'{"cmd":"emergency","kind":"fire","note":""}', "id: Field required"),
-    "id is a number": (b'{"cmd":"emergency","kind":"fire","id":5,"note":""}', "id: Input should be a valid string"),
-    "id is no uuid": (b'{"cmd":"emergency","kind":"fire","id":"five","note":""}', "id: Value error"),
-    "note is a number": (f'{{"cmd":"emergency","kind":"fire","id":"{ID}","note":1}}'.encode(), "note: Input should"),
-    "clear without id": (b'{"cmd":"clear"}', "id: Field required"),
+    "no cmd": (b"{}", "missing required field `cmd`"),
+    "unknown cmd": (b'{"cmd":"reboot"}', "Invalid value 'reboot'"),
+    "cmd of another type": (b'{"cmd":1}', "$.cmd"),
+    "cmd is an object": (b'{"cmd":{}}', "$.cmd"),
+    "unknown kind": (f'{{"cmd":"emergency","kind":"flood","id":"{ID}","note":""}}'.encode(), "$.kind"),
+    "no kind": (f'{{"cmd":"emergency","id":"{ID}","note":""}}'.encode(), "missing required field `kind`"),
+    "no id": (b'{"cmd":"emergency","kind":"fire","note":""}', "missing required field `id`"),
+    "id is a number": (b'{"cmd":"emergency","kind":"fire","id":5,"note":""}', "$.id"),
+    "id is no uuid": (b'{"cmd":"emergency","kind":"fire","id":"five","note":""}', "UUID"),
+    "note is a number": (f'{{"cmd":"emergency","kind":"fire","id":"{ID}","note":1}}'.encode(), "$.note"),
+    "clear without id": (b'{"cmd":"clear"}', "missing required field `id`"),
     "too long": (b'{"cmd":"ping"' + b" " * MAX_REQUEST_BYTES + b"}", "request of 4110 bytes; at most 4096"),
 }
 
@@ -195,7 +193,7 @@ def test_bad_requests_raise() -> None:
 
 @pytest.mark.parametrize("cmd", ["status", "pause", "resume", "abort", "stop"])
 def test_operator_commands(cmd: str) -> None:
-    assert parse_operator(format_request(cmd)).cmd is OperatorCommand(cmd)
+    assert parse_operator(format_request(cmd)) is OperatorCommand(cmd)
 
 
 @pytest.mark.parametrize("frame", [b"{}", b'{"cmd":"go"}', b'{"cmd":null}', b'{"cmd":["stop"]}', b'{"cmd":"STOP"}'])
@@ -355,7 +353,7 @@ async def test_an_exception_of_the_handler_ends_the_service(endpoint: str) -> No
 async def test_only_local_endpoints_are_served(bad: str) -> None:
     with zmq.asyncio.Context() as context:
         router = Router(bad, echo, context)
-        with pytest.raises(RouterError, match="only ipc:// and inproc:// are served without keys"):
+        with pytest.raises(RouterError, match="are served without keys, tcp:// with keys alone"):
             await router.__aenter__()
 
 
@@ -364,8 +362,6 @@ async def test_an_endpoint_that_cannot_be_bound(tmp_path: Path) -> None:
         router = Router(f"ipc://{tmp_path}/missing/r", echo, context)
         with pytest.raises(RouterError, match="No such file or directory"):
             await router.__aenter__()
-        with pytest.raises(RouterError, match="not bound"):
-            await router.serve()
 
 
 def test_a_request_has_a_deadline(endpoint: str) -> None:

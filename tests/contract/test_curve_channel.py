@@ -21,7 +21,7 @@ from ccatp.config.models import ObservatoryConfig
 from ccatp.daemon.command_handlers import ObservatoryServer
 from ccatp.danger import DangerMonitor
 from ccatp.errors import ConfigError
-from ccatp.links.auth import AuthorizedClient, KeyPair, Role, decode_key, read_pair, write_pair
+from ccatp.links.auth import AuthorizedClient, KeyPair, read_pair, write_pair
 from ccatp.links.channels import format_ok, format_request, parse_reply
 from ccatp.links.rpc import MAX_CONNECTIONS, CurveClient, Router, RouterError, ZapHandler, request, turn_away
 from tests.contract.test_channels import Desk
@@ -59,7 +59,7 @@ class Site:
         (self.folder / "clients.toml").write_text("\n".join(tables) + "\n")
 
     def client(self, name: str, server: str = "server") -> CurveClient:
-        return CurveClient(self.pair(server).public, *self.pair(name))
+        return CurveClient(self.pair(server).public, self.pair(name))
 
     @property
     def config(self) -> ObservatoryConfig:
@@ -137,8 +137,8 @@ async def parse_event(events: Any) -> None:
 def with_curve(keys: CurveClient) -> Setup:
     def set_up(peer: zmq.asyncio.Socket) -> None:
         peer.setsockopt(zmq.CURVE_SERVERKEY, keys.server)
-        peer.setsockopt(zmq.CURVE_PUBLICKEY, keys.public)
-        peer.setsockopt(zmq.CURVE_SECRETKEY, keys.secret)
+        peer.setsockopt(zmq.CURVE_PUBLICKEY, keys.own.public)
+        peer.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret)
 
     return set_up
 
@@ -162,7 +162,7 @@ async def test_the_listed_get_answers_and_nobody_else_gets_in(site: Site, measur
             assert await is_locked_out(site.endpoint, set_up), name
         assert not site.monitor.latch.is_latched
         assert (await site.ask("weather"))["ok"]  # the server lives on
-        stranger = decode_key(site.pair("stranger").public.decode()).hex()
+        stranger = site.pair("stranger").public.decode()
         assert f"127.0.0.1: key {stranger} is not on the list" in site.refusals()
     measured("O5", site.monitor.latch.is_latched)
 
@@ -239,7 +239,7 @@ async def test_who_is_taken_off_the_list_loses_their_rights_while_connected(site
 async def test_without_its_handler_nobody_gets_in(site: Site) -> None:
     # Left to itself libzmq would let in everybody who knows the server's key.
     context = zmq.asyncio.Context()
-    listed = {decode_key(site.pair("observatory").public.decode()): AuthorizedClient("observatory", Role.CLEAR)}
+    listed = {site.pair("observatory").public.decode(): AuthorizedClient("observatory", "clear")}
     asked: list[str] = []
 
     def answer(_frame: bytes, user_id: str) -> bytes:
@@ -294,7 +294,7 @@ def test_what_cannot_be_served(site: Site) -> None:
 async def test_keys_are_for_tcp(site: Site) -> None:
     with zmq.asyncio.Context() as context:
         router = Router(f"ipc://{site.folder}/x", lambda *_: b"", context, site.pair("server"))
-        with pytest.raises(RouterError, match="CURVE keys are for tcp://"):
+        with pytest.raises(RouterError, match="tcp:// with keys alone"):
             await router.__aenter__()
 
 
@@ -322,7 +322,7 @@ async def test_the_command_talks_to_a_daemon_elsewhere(site: Site, capsys: pytes
         (["--endpoint", "tcp://h:1"], "--endpoint needs --server-key and --key"),
         (["--endpoint", "tcp://h:1", "--key", "k"], "--endpoint needs --server-key and --key"),
         (["--endpoint", "ipc://x"], "is not tcp://HOST:PORT"),
-        (["--endpoint", "tcp://h:1", "--key", "none", "--server-key", "none"], "--key: cannot read none"),
+        (["--endpoint", "tcp://h:1", "--key", "none", "--server-key", "none"], "key: cannot read none"),
     ],
 )
 def test_half_an_address_is_misuse(argv: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,7 +4,9 @@ import json
 import math
 import os
 import random
+import tempfile
 from collections.abc import Callable, Hashable
+from pathlib import Path
 
 import pytest
 
@@ -12,7 +14,7 @@ from ccatp.core import EventCode, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links import channels, multiline, topics
 from ccatp.links import robot_codec as robot
-from ccatp.links.auth import BadAccess, parse_clients
+from ccatp.links.auth import read_clients
 from ccatp.links.robot_messages import LineBuffer, LineTooLong, Sensors
 from ccatp.sim.fault_plan import parse_plan
 from tests.fuzz.fuzzer import Target, fuzz
@@ -77,7 +79,7 @@ def targets() -> list[Target]:
         Target("observatory channel", _observatory(), _emergency, (channels.BadRequest,)),
         Target("operator channel", [b'{"cmd":"status"}', b'{"cmd":"abort"}'], _operator, (channels.BadRequest,)),
         Target("replies of both channels", [b'{"ok":true,"code":0}'], _channel_reply, (channels.BadRequest,)),
-        Target("observatory's clients", [CLIENTS], _clients, (BadAccess,)),
+        Target("observatory's clients", [CLIENTS], _clients, (ConfigError,)),
         Target("bus", _bus(), _topic, (topics.BadMessage,)),
         Target("fault plan", [PLAN], _plan, (ConfigError,)),
     ]
@@ -215,7 +217,7 @@ def _emergency(frame: bytes) -> Hashable:
 
 
 def _operator(frame: bytes) -> Hashable:
-    return channels.parse_operator(frame).cmd
+    return channels.parse_operator(frame)
 
 
 def _channel_reply(frame: bytes) -> Hashable:
@@ -224,7 +226,10 @@ def _channel_reply(frame: bytes) -> Hashable:
 
 
 def _clients(data: bytes) -> Hashable:
-    return tuple(sorted(client.role for client in parse_clients(data.decode("utf-8", "replace")).values()))
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(data)
+        file.flush()
+        return tuple(sorted(client.role for client in read_clients(Path(file.name), "list").values()))
 
 
 # -- the rest ---------------------------------------------------------------------------------------------------------

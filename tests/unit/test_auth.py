@@ -1,4 +1,6 @@
-"""Keys and the list of clients."""
+"""The list of clients of the observatory channel."""
+
+from pathlib import Path
 
 import pytest
 import zmq
@@ -6,54 +8,50 @@ from hypothesis import given
 from hypothesis import strategies as st
 from zmq.utils import z85
 
-from ccatp.links.auth import AuthorizedClient, BadAccess, Role, decode_key, parse_clients
+from ccatp.errors import ConfigError
+from ccatp.links.auth import AuthorizedClient, check_key, read_clients
 
-KEY = b"k" * 32
-TEXT = z85.encode(KEY).decode()
+KEY = z85.encode(b"k" * 32).decode()
+OTHER = zmq.curve_keypair()[0].decode()
+ENTRY = f'[clients.a]\npublic_key = "{KEY}"\nrole = "raise"\n'
+NO_KEY = "is no key: a key has 40 characters of Z85"
 
 
 @given(st.binary(min_size=32, max_size=32))
 def test_keys_are_z85(key: bytes) -> None:
-    assert decode_key(z85.encode(key).decode()) == key
+    assert check_key(z85.encode(key).decode()) == ""
 
 
-@pytest.mark.parametrize("text", ["", TEXT[:-1], TEXT + "0", TEXT[:-1] + '"', TEXT[:-1] + "é"])
+@pytest.mark.parametrize("text", ["", KEY[:-1], KEY + "0", KEY[:-1] + '"', KEY[:-1] + "é"])
 def test_what_is_no_key(text: str) -> None:
-    with pytest.raises(BadAccess, match="a key has 40 characters of Z85"):
-        decode_key(text)
+    assert check_key(text).startswith(NO_KEY)
+    assert "more than 32 bytes" in check_key("#####" + KEY[5:])
 
 
-def test_five_characters_may_stand_for_too_much() -> None:
-    with pytest.raises(BadAccess, match="more than 32 bytes"):
-        decode_key("#####" + TEXT[5:])
-
-
-def test_a_list_of_clients() -> None:
-    other = zmq.curve_keypair()[0].decode()
-    text = f'[clients.a]\npublic_key = "{TEXT}"\nrole = "raise"\n[clients.b]\npublic_key = "{other}"\nrole = "clear"\n'
-    clients = parse_clients(text)
-    assert clients == {KEY: AuthorizedClient("a", Role.RAISE), decode_key(other): AuthorizedClient("b", Role.CLEAR)}
-    assert parse_clients("# nobody\n") == {}
+def test_a_list_of_clients(tmp_path: Path) -> None:
+    path = tmp_path / "clients.toml"
+    path.write_text(f'{ENTRY}[clients.b]\npublic_key = "{OTHER}"\nrole = "clear"\n')
+    assert read_clients(path, "list") == {KEY: AuthorizedClient("a", "raise"), OTHER: AuthorizedClient("b", "clear")}
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("clients = [", "is not TOML"),
-        ("[client.a]", "has client, but only tables"),
-        ("clients = 3", "must be tables"),
-        ("[clients]\na = 3", "clients.a must have public_key and role"),
-        (f'[clients.a]\npublic_key = "{TEXT}"', "clients.a must have public_key and role"),
-        (f'[clients.a]\npublic_key = "{TEXT}"\nrole = "clear"\nip = "x"', "nothing else"),
-        (f'[clients.a]\npublic_key = "{TEXT}"\nrole = "king"', "'king' must be raise or clear"),
-        (f'[clients.a]\npublic_key = "{TEXT}"\nrole = []', r"\[\] must be raise or clear"),
-        ('[clients.a]\npublic_key = "x"\nrole = "clear"', "clients.a.public_key: a key has 40"),
-        (
-            f'[clients.a]\npublic_key = "{TEXT}"\nrole = "raise"\n[clients.b]\npublic_key = "{TEXT}"\nrole = "clear"',
-            "a and b have the same key",
-        ),
+        ("# nobody\n", "lists no client; add a table"),
+        ("clients = [", "1: is not TOML"),
+        ("[client.a]", r"1: client is unknown; did you mean clients\?"),
+        ("clients = 3", "1: clients = 3 must be a section"),
+        ("[clients]\na = 3", "2: clients.a = 3 must be a section"),
+        (f'[clients.a]\npublic_key = "{KEY}"', "1: clients.a.role is missing"),
+        (f'{ENTRY}ip = "x"', "4: clients.a.ip is unknown; known here: public_key, role"),
+        (ENTRY.replace("raise", "king"), "3: clients.a.role = \"king\" must be 'raise' or 'clear'"),
+        (ENTRY.replace('"raise"', "[]"), r"3: clients.a.role = \[\] must be 'raise' or 'clear'"),
+        (ENTRY.replace(KEY, "x"), f"2: clients.a.public_key {NO_KEY}, this one 1"),
+        (ENTRY + ENTRY.replace(".a]", ".b]"), "5: clients.b.public_key is that of a, too"),
     ],
 )
-def test_lists_that_count_for_nothing(text: str, message: str) -> None:
-    with pytest.raises(BadAccess, match=message):
-        parse_clients(text)
+def test_lists_that_count_for_nothing(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "clients.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=f"^list: {path}:?{message}|^list: {path} {message}"):
+        read_clients(path, "list")

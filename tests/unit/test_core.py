@@ -12,7 +12,7 @@ import pytest
 import ccatp
 from ccatp.config import package
 from ccatp.core import danger_text
-from ccatp.errors import CcatpError, ConfigError, DaemonUnreachableError, ExitStatus, RefusedError, RuntimeDirError
+from ccatp.errors import CcatpError, ConfigError, DaemonUnreachableError, ExitStatus, RefusedError
 
 
 @pytest.mark.parametrize("is_installed", [True, False])
@@ -43,7 +43,6 @@ def test_the_paths_of_the_parent_are_kept(monkeypatch: pytest.MonkeyPatch) -> No
     [
         (CcatpError("x"), ExitStatus.HELD),
         (ConfigError("x"), ExitStatus.USAGE),
-        (RuntimeDirError("x"), ExitStatus.USAGE),
         (RefusedError("x"), ExitStatus.REFUSED),
         (DaemonUnreachableError("x"), ExitStatus.UNREACHABLE),
     ],

@@ -26,7 +26,7 @@ from ccatp.daemon.run_dir import (
     take_over_emergencies,
 )
 from ccatp.daemon.supervisor import BEACON_PROCESSES, PROCESSES, run
-from ccatp.errors import ConfigError, ExitStatus, RefusedError, RuntimeDirError
+from ccatp.errors import ConfigError, ExitStatus, RefusedError
 from ccatp.links.runtime_dir import (
     MAX_SOCKET_NAME_BYTES,
     MAX_SOCKET_PATH_BYTES,
@@ -293,7 +293,7 @@ def test_the_folder_is_made_for_its_owner_alone(tmp_path: Path) -> None:
 def test_a_path_just_short_enough_for_a_socket_is_taken() -> None:
     path = "/" + "x" * (MAX_SOCKET_PATH_BYTES - MAX_SOCKET_NAME_BYTES - 2)
     assert runtime_dir_path(path, {}) == Path(path)
-    with pytest.raises(RuntimeDirError, match="108 bytes with a socket's name, a unix socket takes at most 107"):
+    with pytest.raises(ConfigError, match="108 bytes with a socket's name, a unix socket takes at most 107"):
         runtime_dir_path(path + "x", {})
 
 
@@ -304,11 +304,11 @@ def test_folders_that_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     for mode in (0o777, 0o720, 0o702):
         (tmp_path / f"{mode:o}").mkdir()
         (tmp_path / f"{mode:o}").chmod(mode)
-        refused[f"{mode:o}"] = rf"others may write there \(mode {mode:04o}\); chmod 700"
+        refused[f"{mode:o}"] = rf"is open to others \(mode {mode:04o}\); chmod 700"
     for name, why in refused.items():
-        with pytest.raises(RuntimeDirError, match=why):
+        with pytest.raises(ConfigError, match=why):
             make_runtime_dir(str(tmp_path / name), {})
     owner = tmp_path.stat().st_uid
     monkeypatch.setattr(os, "getuid", lambda: owner + 1)
-    with pytest.raises(RuntimeDirError, match=f"belongs to user {owner}, not to {owner + 1}"):
+    with pytest.raises(ConfigError, match=f"belongs to user {owner}, not to {owner + 1}"):
         make_runtime_dir(str(tmp_path), {})
