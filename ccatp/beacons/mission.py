@@ -48,7 +48,7 @@ class BeaconRules(HoldRules[HoldState]):
 
     rows = (
         *(ON_EARTHQUAKE, ON_FAULT, ON_HOLD, ON_NO_VERDICT),
-        Row("nothing is permitted", Action.PAUSE, lambda _, v: v is not None and is_denied(v), pause),
+        Row("nothing is permitted", Action.PAUSE, lambda _, v: is_denied(v), pause),
         ON_EMERGENCY,
     )
 

@@ -45,20 +45,22 @@ CORNERS = frozenset(Corner)
 S = TypeVar("S", bound=HoldState)
 
 
+# In place of a verdict where none is fresh enough.
+NO_FRESH_VERDICT = NO_VERDICT.found("verdict", 0.0, 0.0).verdict(-1, 0.0, EventCode.NORMAL)
+
+
 class Row(NamedTuple):
     """What a mission does about a verdict: one row.
 
-    Attributes:
-        when: it applies, in words.
-        applies: to a state and the verdict in force (``None``: none fresh enough).
-        react: takes the rules, a state, the frame and the verdict; returns the state, and whether that is all for this
-            frame. Otherwise the rows below count as well.
+    ``applies`` to a state and the verdict in force; ``when`` says so in words. ``react`` takes the rules, a state, the
+    frame and the verdict, and returns the state, and whether that is all for this frame; otherwise the rows below count
+    as well.
     """
 
     when: str
     action: Action
-    applies: Callable[[Any, Verdict | None], bool]
-    react: Callable[[Any, Any, Any, Any], tuple[Any, bool]]
+    applies: Callable[[Any, Verdict], bool]
+    react: Callable[[Any, Any, Any, Verdict], tuple[Any, bool]]
 
 
 class HoldRules(Generic[S]):
@@ -141,9 +143,10 @@ class HoldRules(Generic[S]):
         """Do what the verdict in force demands (``None``: none fresh enough) in a frame at ``frame.t_s``."""
         if verdict is None or not _is_routine(s, verdict):
             s = s if verdict is None else _with_levels(s, verdict)
+            v = verdict or NO_FRESH_VERDICT
             for row in self.rows:
-                if row.applies(s, verdict):
-                    s, is_over = row.react(self, s, frame, verdict)
+                if row.applies(s, v):
+                    s, is_over = row.react(self, s, frame, v)
                     if is_over:
                         return s
         is_waiting = s.mode is HELD and (s.hold.by_hand or frame.t_s < s.resumes_after_s)
@@ -219,12 +222,12 @@ def _hold(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, boo
     return rules.await_recovery(s, v.cause, rejects_odometry=v.signal not in CORNERS), True
 
 
-def pause(rules: HoldRules[S], s: S, _frame: object, v: Verdict | None) -> tuple[S, bool]:
+def pause(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
     """Hold until it is over."""
     # A robot that stands to be found needs no permission, and without a pose gets none before it is.
-    if v is not None and s.stands_for_fix:
+    if s.stands_for_fix and v is not NO_FRESH_VERDICT:
         return s, True
-    return rules.interrupt(s, NO_VERDICT.message if v is None else v.cause), True
+    return rules.interrupt(s, v.cause), True
 
 
 def _go_home(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, bool]:
@@ -235,21 +238,21 @@ def _go_home(rules: HoldRules[S], s: S, _frame: object, v: Verdict) -> tuple[S, 
 ON_EARTHQUAKE = Row(
     "an earthquake is latched, and no edge is to be left",
     Action.EARTHQUAKE,
-    lambda _, v: v is not None and v.is_shaking and v.code is not NEAR_EDGE,
+    lambda _, v: v.is_shaking and v.code is not NEAR_EDGE,
     _stand_in_earthquake,
 )
-ON_FAULT = Row("the severity is fault", Action.FAULT, lambda _, v: v is not None and v.severity is FAULT, _fault)
+ON_FAULT = Row("the severity is fault", Action.FAULT, lambda _, v: v.severity is FAULT, _fault)
 ON_HOLD = Row(
     "the severity is hold or above, and nothing is permitted",
     Action.HOLD,
-    lambda _, v: v is not None and v.severity >= HOLD and is_denied(v),
+    lambda _, v: v.severity >= HOLD and is_denied(v),
     _hold,
 )
-ON_NO_VERDICT = Row("no verdict is fresh enough", Action.PAUSE, lambda _, v: v is None, pause)
+ON_NO_VERDICT = Row("no verdict is fresh enough", Action.PAUSE, lambda _, v: v is NO_FRESH_VERDICT, pause)
 ON_EMERGENCY = Row(
     "an emergency is new",
     Action.RETURN,
-    lambda s, v: v is not None and v.code is ABORTED and v.raised != s.emergency_epoch,
+    lambda s, v: v.code is ABORTED and v.raised != s.emergency_epoch,
     _go_home,
 )
 
@@ -284,9 +287,9 @@ def _return(survey: "Survey", s: SurveyState, _motion: StateEstimate, v: Verdict
     return survey.abort(replace(s, finding=v.cause), v.cause), False
 
 
-def _wait_at_edge(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Verdict | None) -> Reaction:
+def _wait_at_edge(survey: "Survey", s: SurveyState, motion: StateEstimate, v: Verdict) -> Reaction:
     """After a retreat that led nowhere."""
-    is_over = s.mode is not HELD or s.hold.by_hand or (v is not None and v.code is not NEAR_EDGE)
+    is_over = s.mode is not HELD or s.hold.by_hand or (v.code is not NEAR_EDGE and v is not NO_FRESH_VERDICT)
     if s.stuck_s is None or is_over:
         return replace(s, stuck_s=None), False
     if motion.t_s - s.stuck_s > survey.cfg.health.hold_limit_s:
@@ -325,29 +328,29 @@ ROWS = (
     Row(
         "one edge sensor stays off: hold for its signal, and nothing is permitted",
         Action.LOCATE,
-        lambda _, v: v is not None and v.severity is HOLD and v.signal in CORNERS and is_denied(v),
+        lambda _, v: v.severity is HOLD and v.signal in CORNERS and is_denied(v),
         _locate,
     ),
     ON_HOLD,
     Row(
         "the severity begins or ceases to be slow or return",
         Action.SLOW,
-        lambda s, v: v is not None and s.is_slow is not (v.severity in REDUCED),
+        lambda s, v: s.is_slow is not (v.severity in REDUCED) and v is not NO_FRESH_VERDICT,
         _slow,
     ),
     Row(
         "the severity is return for a new cause, and no edge is to be left",
         Action.RETURN,
-        lambda s, v: v is not None and v.severity is RETURN and v.code is not NEAR_EDGE and v.cause != s.finding,
+        lambda s, v: v.severity is RETURN and v.code is not NEAR_EDGE and v.cause != s.finding,
         _return,
     ),
     Row("a retreat led nowhere", Action.WAIT, lambda s, _: s.stuck_s is not None, _wait_at_edge),
-    Row("an edge is declared (code 1)", Action.RETREAT, lambda _, v: v is not None and v.code is NEAR_EDGE, _retreat),
+    Row("an edge is declared (code 1)", Action.RETREAT, lambda _, v: v.code is NEAR_EDGE, _retreat),
     ON_NO_VERDICT,
     Row(
         "some motion is not permitted",
         Action.PAUSE,
-        lambda _, v: v is not None and not (v.forward and v.reverse and v.turn),
+        lambda _, v: not (v.forward and v.reverse and v.turn),
         pause,
     ),
     ON_EMERGENCY,

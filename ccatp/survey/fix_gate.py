@@ -24,48 +24,6 @@ _CONSISTENT = 3  # so many fixes that agree are right against any estimate
 _FAR = 4.0  # where the localizer has no gate of its own, this many times the limit asks for them
 
 
-class FixPlausibility:
-    """Judges the fixes of one standstill; ``begin`` starts the next.
-
-    A fix off the surface is never used. One that contradicts the estimate is used once another of the same standstill
-    agrees with it; one that contradicts it beyond the localizer's own gate ``gate_nis`` once two others do. A localizer
-    that has such a gate keeps that count itself.
-    """
-
-    def __init__(self, mirror: Mirror, cfg: EtalonConfig, puck_height_m: float, gate_nis: float | None) -> None:
-        self._mirror, self._cfg, self._puck_height_m, self._gate_nis = mirror, cfg, puck_height_m, gate_nis
-        self._seen: list[Vector3] = []
-
-    def begin(self) -> None:
-        """The robot stands again: what was measured before says nothing about here."""
-        self._seen.clear()
-
-    def doubt(self, fix: Fix, pose: DeckPose, covariance: FloatArray) -> str:
-        """Why to measure again instead of using ``fix``, or empty.
-
-        Covariance of the estimate's (x, y, heading), (3, 3).
-        """
-        try:
-            foot = deck_foot(self._mirror, fix, self._puck_height_m)
-        except FixRefused as refusal:
-            return str(refusal)
-        if not abs(foot.deviation_m) <= self._cfg.max_surface_residual_m:
-            limit_mm = 1e3 * self._cfg.max_surface_residual_m
-            return f"the puck is {1e3 * foot.deviation_m:.1f} mm off the surface, at most {limit_mm:g} mm are possible"
-        agreeing = 1 + sum(dist(fix.position_m, other) <= self._cfg.repeat_m for other in self._seen)
-        self._seen.append(fix.position_m)
-        nis = nis_of(foot, pose, covariance)
-        # A localizer that is frozen has no estimate to contradict.
-        if not isfinite(nis) or nis <= self._cfg.doubt_nis:
-            return ""
-        if self._gate_nis is not None and nis > self._gate_nis:
-            return ""
-        beyond = self._gate_nis is None and nis > _FAR * self._cfg.doubt_nis
-        if agreeing >= (_CONSISTENT if beyond else 2):
-            return ""
-        return f"it is {1e3 * hypot(foot.x_m - pose.x_m, foot.y_m - pose.y_m):.1f} mm from the estimate (NIS {nis:.3g})"
-
-
 def nis_of(foot: DeckFoot, pose: DeckPose, covariance: FloatArray) -> float:
     """Normalised innovation squared of a fix against an estimate, two degrees of freedom; NaN where there is none."""
     residual = np.array((foot.x_m - pose.x_m, foot.y_m - pose.y_m))
@@ -81,37 +39,13 @@ _ENOUGH = 3  # places that do not lie on a line determine a frame
 _AREA_M2 = 1e-3  # of their triangle: 0.2 m and 10 mm
 
 
-def signed_axes() -> tuple[FloatArray, ...]:
-    """All 48 matrices that exchange and turn round axes, each (3, 3); the first is the identity."""
-    found = []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            matrix = np.zeros((3, 3))
-            matrix[range(3), order] = signs
-            found.append(matrix)
-    return tuple(found)
-
-
-_SIGNED_AXES = signed_axes()
-
-
-class FrameFault(NamedTuple):
-    """What is wrong with the first fixes: distance from where the robot must be.
-
-    The one mistake that explains it, or empty.
-    """
-
-    distance_m: float
-    explanation: str
-
-    @property
-    def is_explained(self) -> bool:
-        """Whether one mistake in axes or units explains it."""
-        return bool(self.explanation)
-
-    def __str__(self) -> str:
-        """The explanation, or what else may be wrong."""
-        return self.explanation or "no exchange of axes or units explains it; is it at base, and is this the mirror?"
+# All 48 matrices that exchange and turn round axes, each (3, 3); the first is the identity.
+SIGNED_AXES: tuple[FloatArray, ...] = tuple(
+    np.eye(3)[list(order)] * np.array(signs)[:, None]
+    for order in permutations(range(3))
+    for signs in product((1.0, -1.0), repeat=3)
+)
+_UNEXPLAINED = "no exchange of axes or units explains it; is it at base, and is this the mirror?"
 
 
 class FrameCheck:
@@ -122,16 +56,15 @@ class FrameCheck:
         self._places: list[FloatArray] = []
         self.is_over = False
 
-    def look(self, measured_m: Vector3, expected_m: Vector3) -> FrameFault | None:
-        """What is wrong with one of the first fixes, or None.
+    def look(self, measured_m: Vector3, expected_m: Vector3) -> str | None:
+        """The one mistake that explains what is wrong with one of the first fixes, or empty; ``None``: nothing is.
 
         Puck positions in the world frame, the robot standing still.
         """
         if self.is_over:
             return None
-        distance_m = dist(measured_m, expected_m)
-        if not distance_m <= self._limit_m:
-            return FrameFault(distance_m, explain(measured_m, expected_m, self._limit_m))
+        if not dist(measured_m, expected_m) <= self._limit_m:
+            return explain(measured_m, expected_m, self._limit_m)
         self._places.append(np.array(measured_m))
         self.is_over = len(self._places) >= _ENOUGH and _spans_a_plane(self._places)
         return None
@@ -149,10 +82,10 @@ def explain(measured_m: Vector3, expected_m: Vector3, limit_m: float) -> str:
     for name, factor in UNITS:
         if np.linalg.norm(factor * measured - expected) <= limit_m:
             return f"the unit is wrong: {name}"
-    errors = [float(np.linalg.norm(matrix.T @ measured - expected)) for matrix in _SIGNED_AXES]
+    errors = [float(np.linalg.norm(matrix.T @ measured - expected)) for matrix in SIGNED_AXES]
     best = int(np.argmin(errors))
     if best and errors[best] <= limit_m:
-        return f"the axes are wrong: what should be (x, y, z) is {_name(_SIGNED_AXES[best])}"
+        return f"the axes are wrong: what should be (x, y, z) is {_name(SIGNED_AXES[best])}"
     return ""
 
 
@@ -170,7 +103,7 @@ def explain_lengths(
         places = {channel: factor * place for channel, place in collimators_m.items()}
         if _fits(cfg, expected_m, lengths_m, places):
             return f"the collimators' unit is wrong: {name}"
-    for matrix in _SIGNED_AXES[1:]:
+    for matrix in SIGNED_AXES[1:]:
         turned = {channel: matrix.T @ place for channel, place in collimators_m.items()}
         if _fits(cfg, expected_m, lengths_m, turned):
             return f"the collimators' axes are wrong: what should be (x, y, z) is {_name(matrix)}"
@@ -196,7 +129,8 @@ def _name(matrix: FloatArray) -> str:
 class FixFinding(NamedTuple):
     """What was found: nothing where both are empty.
 
-    ``refusal``: why this laser system must not be used for this mission.
+    ``doubt``: why to measure again instead of using the fix; ``refusal``: why this laser system must not be used for
+    this mission.
     """
 
     doubt: str = ""
@@ -204,19 +138,24 @@ class FixFinding(NamedTuple):
 
 
 class FixGate:
-    """Looks at every fix of a mission before the localizer gets it."""
+    """Looks at every fix of a mission before the localizer gets it.
+
+    A fix off the surface is never used. One that contradicts the estimate is used once another of the same standstill
+    agrees with it; one that contradicts it beyond the localizer's own gate once two others do. A localizer that has
+    such a gate keeps that count itself.
+    """
 
     def __init__(self, mirror: Mirror, cfg: Config) -> None:
-        gate = None if cfg.run.filter in FOUR_STATE else cfg.localizer.full_state.fix_gate_nis
-        self._judge = FixPlausibility(mirror, cfg.etalon, cfg.robot.puck_height_m, gate)
+        self._gate_nis = None if cfg.run.filter in FOUR_STATE else cfg.localizer.full_state.fix_gate_nis
+        self._mirror, self._cfg, self._puck_height_m = mirror, cfg.etalon, cfg.robot.puck_height_m
         self._frame = FrameCheck(cfg.etalon)
-        self._cfg = cfg.etalon
         self._collimators_m = dict(zip(mirror.channels, np.asarray(mirror.collimators_m), strict=True))
         self._is_first = True
+        self._seen: list[Vector3] = []
 
     def begin(self) -> None:
-        """The robot stands again."""
-        self._judge.begin()
+        """The robot stands again: what was measured before says nothing about here."""
+        self._seen.clear()
 
     def review(
         self, fix: Fix, expected_m: Vector3, pose: DeckPose, covariance: FloatArray, *, is_lost: bool = False
@@ -226,11 +165,34 @@ class FixGate:
         Covariance of its (x, y, heading), (3, 3).
         """
         is_first, self._is_first = self._is_first, False
-        fault = None if is_lost else self._frame.look(fix.position_m, expected_m)
-        if fault is not None and (is_first or fault.is_explained):
+        why = None if is_lost else self._frame.look(fix.position_m, expected_m)
+        if why is not None and (is_first or why):
             where = "its base" if is_first else "the place it drove to"
-            return FixFinding(refusal=FRAME_REFUSED.text(distance_m=fault.distance_m, place=where, why=fault))
-        return FixFinding(doubt=self._judge.doubt(fix, pose, covariance))
+            distance_m = dist(fix.position_m, expected_m)
+            return FixFinding(refusal=FRAME_REFUSED.text(distance_m=distance_m, place=where, why=why or _UNEXPLAINED))
+        return FixFinding(doubt=self._doubt(fix, pose, covariance))
+
+    def _doubt(self, fix: Fix, pose: DeckPose, covariance: FloatArray) -> str:
+        cfg = self._cfg
+        try:
+            foot = deck_foot(self._mirror, fix, self._puck_height_m)
+        except FixRefused as refusal:
+            return str(refusal)
+        if not abs(foot.deviation_m) <= cfg.max_surface_residual_m:
+            limit_mm = 1e3 * cfg.max_surface_residual_m
+            return f"the puck is {1e3 * foot.deviation_m:.1f} mm off the surface, at most {limit_mm:g} mm are possible"
+        agreeing = 1 + sum(dist(fix.position_m, other) <= cfg.repeat_m for other in self._seen)
+        self._seen.append(fix.position_m)
+        nis = nis_of(foot, pose, covariance)
+        # A localizer that is frozen has no estimate to contradict.
+        if not isfinite(nis) or nis <= cfg.doubt_nis:
+            return ""
+        if self._gate_nis is not None and nis > self._gate_nis:
+            return ""
+        beyond = self._gate_nis is None and nis > _FAR * cfg.doubt_nis
+        if agreeing >= (_CONSISTENT if beyond else 2):
+            return ""
+        return f"it is {1e3 * hypot(foot.x_m - pose.x_m, foot.y_m - pose.y_m):.1f} mm from the estimate (NIS {nis:.3g})"
 
     def refusal_of(self, lengths_m: Mapping[int, float], expected_m: Vector3) -> str:
         """Why lengths that gave no position speak against the laser system; empty once a fix has been right."""

@@ -1,33 +1,28 @@
-"""A series of stops and the leg being driven (thesis 3.2), at the usual or the reduced speed; short corrections."""
+"""The leg being driven (thesis 3.2), at the usual or the reduced speed; corrections, and legs that show the heading."""
 
 from collections.abc import Callable
 from math import atan2, ceil, cos, hypot, pi, sin
+from operator import itemgetter
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from ccatp.config.models import ControlConfig, HealthConfig, LimitsConfig, MissionConfig, RobotConfig
+from ccatp.config.models import Config
 from ccatp.control.tracker import DONE, LegMotion, LegTracker
-from ccatp.core import DeckPose, PanelId, PanelPose, Predicted, Stop, Twist, difference
+from ccatp.core import DeckPose, PanelId, PanelPose, Predicted, Stop, StopKind, Twist, difference
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.planning.legs import build_body, course_of_heading, sensor_depths
-
-
-def build_tracker(control: ControlConfig, limits: LimitsConfig, health: HealthConfig, wheel_lag_s: float) -> LegTracker:
-    """The tracker of a survey, with the reduced limits for slow motions."""
-    slow = limits.model_copy(
-        update={
-            "v_max_m_s": min(limits.v_max_m_s, health.slow_speed_m_s),
-            "omega_max_rad_s": min(limits.omega_max_rad_s, health.slow_rate_rad_s),
-        }
-    )
-    return LegTracker(control, limits, wheel_lag_s, slow)
-
+from ccatp.survey.planning.legs import build_body, course_of_heading, room_m, sensor_depths
 
 # A sensor at 0.13 m sweeps 2 mm in a hundredth of a turn's radian; between two such steps it is 0.03 mm further out.
 _SWEEP_RAD = 0.04
+# A leg that shows the heading: in steps of so much, not shorter, within so many standard deviations of the heading to
+# either side, and where it could not turn with at least this part of the way leading away from the rim.
+_STEP_M = 0.01
+_SHORTEST_M = 0.04
+_SIGMAS = 2.0
+_LEAVING = 0.5
 
 
 class LegAim(NamedTuple):
@@ -57,49 +52,6 @@ def plan_aim(
     if abs(turn) <= 0.5 * pi:
         return LegAim(*target, False, turn)
     return LegAim(*target, True, difference(turn, pi))
-
-
-class Corrector:
-    """Says where a correction leads, or that none is to be had; and whether a turn after it is safe."""
-
-    def __init__(self, mirror: Mirror, robot: RobotConfig, cfg: MissionConfig) -> None:
-        self._mirror, self._cfg = mirror, cfg
-        self._body = build_body(robot, cfg)
-
-    def aim(self, pose: PanelPose, target: tuple[float, float]) -> LegAim | None:
-        """The correction to a target in its panel's frame, m.
-
-        ``None`` where it is too far or a sensor would pass the rim.
-        """
-        cfg = self._cfg
-        distance_m = hypot(target[0] - pose.x_m, target[1] - pose.y_m)
-        if distance_m > cfg.correction_reach_m:
-            return None
-        aim = plan_aim(
-            (pose.x_m, pose.y_m, pose.heading_rad), target, cfg.correction_tolerance_m, cfg.correction_margin
-        )
-        turned = PanelPose(pose.panel, pose.x_m, pose.y_m, pose.heading_rad + aim.turn_rad)
-        there = PanelPose(pose.panel, aim.x_m, aim.y_m, turned.heading_rad)
-        start, end = self._mirror.deck_pose(pose), self._mirror.deck_pose(there)
-        if not self._is_clear(start, aim.turn_rad):
-            return None
-        # Between the ends of a few centimetres a sensor is never nearer to the rim than by half of them.
-        is_safe = self._is_clear(self._mirror.deck_pose(turned), 0.0) and self._is_clear(end, 0.0)
-        return aim if is_safe else None
-
-    def can_proceed(self, pose: DeckPose, stop: Stop) -> bool:
-        """Whether the turn towards ``stop`` from where a correction ended keeps every sensor on the mirror."""
-        bearing = atan2(stop.y_m - pose.y_m, stop.x_m - pose.x_m) + (pi if stop.reverse else 0.0)
-        return self._is_clear(pose, difference(bearing, course_of_heading(self._mirror, pose)))
-
-    def _is_clear(self, pose: DeckPose, turn_rad: float) -> bool:
-        body = self._body
-        if self._mirror.rim.signed_distance_m(pose.x_m, pose.y_m) >= body.turning_depth_m:
-            return True
-        course = course_of_heading(self._mirror, pose)
-        courses = np.linspace(course, course + turn_rad, 1 + ceil(abs(turn_rad) / _SWEEP_RAD))
-        depths = sensor_depths(self._mirror, body, np.array(pose.x_m), np.array(pose.y_m), courses)
-        return bool(depths.min() >= body.turn_clearance_m)
 
 
 class StateEstimate(msgspec.Struct, frozen=True):
@@ -157,14 +109,23 @@ class Leg(msgspec.Struct, frozen=True, tag=True):
 
 
 class LegFollower:
-    """Drives legs. A motion that takes longer than ``timeout_factor`` times its bang-bang time plus 5 s is overdue."""
+    """Drives legs, and says which short ones are safe."""
 
-    def __init__(self, mirror: Mirror, tracker: LegTracker, timeout_factor: float) -> None:
-        self._mirror, self._tracker, self._timeout_factor = mirror, tracker, timeout_factor
+    def __init__(self, mirror: Mirror, cfg: Config) -> None:
+        self._mirror, self._mission, self._timeout_factor = mirror, cfg.mission, cfg.control.leg_timeout_factor
+        self._body = build_body(cfg.robot, cfg.mission)
+        limits, health = cfg.limits, cfg.health
+        slow = limits.model_copy(
+            update={
+                "v_max_m_s": min(limits.v_max_m_s, health.slow_speed_m_s),
+                "omega_max_rad_s": min(limits.omega_max_rad_s, health.slow_rate_rad_s),
+            }
+        )
+        self.tracker = LegTracker(cfg.control, limits, cfg.robot.wheel_lag_s, slow)
 
     def follow(self, leg: Leg, motion: StateEstimate, *, is_slow: bool) -> tuple[Leg, Twist]:
         """One frame of a leg: what it is then, and the twist until the next frame."""
-        steered, panel, tracker = motion.ahead or motion.steered, motion.pose.panel, self._tracker
+        steered, panel, tracker = motion.ahead or motion.steered, motion.pose.panel, self.tracker
         stop, tracked, deadline_s, aim, cached = leg.stop, leg.motion, leg.deadline_s, leg.aim, leg.target
         if cached is None or cached[0] != panel:
             cached = panel, self.target_in(panel, stop)
@@ -183,17 +144,17 @@ class LegFollower:
 
     def begin_turn(self, leg: Leg, motion: StateEstimate, heading_rad: float, *, is_slow: bool) -> Leg:
         """Begin the turn to a heading on the deck, at the end of a leg."""
-        tracked = self._tracker.begin_turn(difference(heading_rad, motion.deck.heading_rad), is_slow=is_slow)
+        tracked = self.tracker.begin_turn(difference(heading_rad, motion.deck.heading_rad), is_slow=is_slow)
         return replace(leg, motion=tracked, deadline_s=self.deadline_s(motion.t_s, tracked))
 
     def turn(self, leg: Leg, tracked: LegMotion, motion: StateEstimate, heading_rad: float) -> tuple[Leg, Twist]:
         """One frame of that turn."""
         remaining = difference(heading_rad, motion.deck.heading_rad + motion.lead_rad)
-        tracked, twist = self._tracker.step_turn(tracked, remaining, motion.dt_s, motion.steered.omega_rad_s)
+        tracked, twist = self.tracker.step_turn(tracked, remaining, motion.dt_s, motion.steered.omega_rad_s)
         return replace(leg, motion=tracked), twist
 
     def deadline_s(self, t_s: float, tracked: LegMotion) -> float:
-        """When a motion that begins now is overdue."""
+        """When a motion that begins now takes far longer than its bang-bang time, robot time."""
         return t_s + 5.0 + self._timeout_factor * tracked.planned_s
 
     def distance_m(self, stop: Stop | None, pose: PanelPose) -> float:
@@ -207,3 +168,50 @@ class LegFollower:
         """The stop in the frame of a panel, (x, y), m."""
         x, y, _ = self._mirror.panels[panel].from_deck(self._mirror.surface_point(stop.x_m, stop.y_m))
         return x, y
+
+    def correction(self, pose: PanelPose, target: tuple[float, float]) -> LegAim | None:
+        """The correction to a target in its panel's frame, m; ``None``: too far, or a sensor would pass the rim."""
+        cfg = self._mission
+        if hypot(target[0] - pose.x_m, target[1] - pose.y_m) > cfg.correction_reach_m:
+            return None
+        here = pose.x_m, pose.y_m, pose.heading_rad
+        aim = plan_aim(here, target, cfg.correction_tolerance_m, cfg.correction_margin)
+        turned = PanelPose(pose.panel, pose.x_m, pose.y_m, pose.heading_rad + aim.turn_rad)
+        there = PanelPose(pose.panel, aim.x_m, aim.y_m, turned.heading_rad)
+        deck_pose = self._mirror.deck_pose
+        # Between the ends of a few centimetres a sensor is never nearer to the rim than by half of them.
+        is_safe = self._can_turn(deck_pose(pose), aim.turn_rad) and self._can_turn(deck_pose(turned), 0.0)
+        return aim if is_safe and self._can_turn(deck_pose(there), 0.0) else None
+
+    def can_proceed(self, pose: DeckPose, stop: Stop) -> bool:
+        """Whether the turn towards ``stop`` from where a correction ended keeps every sensor on the mirror."""
+        bearing = atan2(stop.y_m - pose.y_m, stop.x_m - pose.x_m) + (pi if stop.reverse else 0.0)
+        return self._can_turn(pose, difference(bearing, course_of_heading(self._mirror, pose)))
+
+    def _can_turn(self, pose: DeckPose, turn_rad: float) -> bool:
+        body = self._body
+        if self._mirror.rim.signed_distance_m(pose.x_m, pose.y_m) >= body.turning_depth_m:
+            return True
+        course = course_of_heading(self._mirror, pose)
+        courses = np.linspace(course, course + turn_rad, 1 + ceil(abs(turn_rad) / _SWEEP_RAD))
+        depths = sensor_depths(self._mirror, body, np.array(pose.x_m), np.array(pose.y_m), courses)
+        return bool(depths.min() >= body.turn_clearance_m)
+
+    def heading_leg(self, deck: DeckPose, sigma_rad: float, *, was_reverse: bool) -> Stop | None:
+        """The stop of a leg, straight ahead or back, that shows more of a doubtful heading; ``None``: there is no room.
+
+        It leads back where the last one came from; where there is less room, whichever way has more.
+        """
+        course, cfg = course_of_heading(self._mirror, deck), self._mission
+        # Whatever the heading, no sensor leaves the mirror.
+        clearance_m = max(self._body.turning_depth_m, cfg.leg_clearance_m)
+        legs = []
+        for is_reverse in (not was_reverse, was_reverse):
+            sign = -1.0 if is_reverse else 1.0
+            way = sign * cos(course), sign * sin(course)
+            wanted_m, spread = cfg.alignment_leg_m, _SIGMAS * sigma_rad
+            way_m = room_m(self._mirror.rim, deck, way, wanted_m, _STEP_M, clearance_m, spread=spread, leaving=_LEAVING)
+            x_m, y_m = deck.x_m + way_m * way[0], deck.y_m + way_m * way[1]
+            legs.append((way_m, Stop(x_m, y_m, StopKind.CALIBRATE, reverse=is_reverse)))
+        way_m, stop = max(legs, key=itemgetter(0))
+        return stop if way_m >= _SHORTEST_M else None

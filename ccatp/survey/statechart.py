@@ -1,7 +1,6 @@
 """The survey: from the pose, the danger loop's verdict and events to the next state and a command. Pure."""
 
 from collections.abc import Callable, Collection, Sequence
-from math import inf
 
 from msgspec.structs import replace
 
@@ -17,7 +16,7 @@ from ccatp.conditions import (
 )
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegPhase
-from ccatp.core import DeckPose, EventCode, PointId, Severity, Stop, StopKind, Verdict
+from ccatp.core import DeckPose, EventCode, PointId, Stop, StopKind, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import (
     HOLD_POSITION,
@@ -30,11 +29,10 @@ from ccatp.survey.behaviours import (
 )
 from ccatp.survey.budget import BudgetProgress, TimeBudget
 from ccatp.survey.failsafe import ROWS, HoldRules
-from ccatp.survey.heading_recovery import MOST_LEGS, HeadingRecovery
 from ccatp.survey.planning.escape import is_on_drive
 from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import Route
-from ccatp.survey.route_follower import Corrector, Leg, LegFollower, StateEstimate, build_tracker
+from ccatp.survey.route_follower import Leg, LegFollower, StateEstimate
 from ccatp.survey.state import (
     BACKING_OFF,
     DONE,
@@ -65,6 +63,16 @@ from ccatp.survey.state import (
 _NOTICED_S = 0.2
 # Planned at a time: a way through so many points takes less than the robot's frames may wait.
 CHUNK = 12
+# Legs that show the heading: there and back, twice. A filter of one that was far off needs more than one look.
+MOST_LEGS = 4
+# A heading that so many times the limit is wrong leads a leg of the survey astray.
+_LOST = 2.0
+
+# What goes on unchanged in another process.
+_KEPT = (
+    *("abort_cause", "full_fans", "finding", "emergency_epoch", "retried", "is_off_route", "is_review_due"),
+    *("corrections", "request", "failures", "was_reverse", "backoffs"),
+)
 
 PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
 PlanRest = Callable[[Route, DeckPose, Collection[PointId]], Route]
@@ -93,10 +101,7 @@ class Survey(HoldRules[SurveyState]):
         self.cfg, self._route = cfg, route
         self._plan_home, self._plan_rest, self._plan_points = plan_home, plan_rest, plan_points
         self._points = tuple(stop.point for stop in route.stops if stop.point is not None)
-        self._tracker = build_tracker(cfg.control, cfg.limits, cfg.health, cfg.robot.wheel_lag_s)
-        self.follower = LegFollower(mirror, self._tracker, cfg.control.leg_timeout_factor)
-        self._corrector = Corrector(mirror, cfg.robot, cfg.mission)
-        self._heading = HeadingRecovery(mirror, cfg.robot, cfg.mission)
+        self.follower = LegFollower(mirror, cfg)
         self._budget: TimeBudget | None = None
         if cfg.mission.holds_to_budget:
             self._budget = TimeBudget(cfg.run.budget_s, mirror, cfg.limits, cfg.etalon.measuring_time_s)
@@ -245,8 +250,7 @@ class Survey(HoldRules[SurveyState]):
     def _show_heading(self, s: SurveyState, motion: StateEstimate) -> Step:
         """A short leg, with a fix at each end, shows the heading."""
         if s.behaviour is None:
-            sigma_rad = motion.heading_sigma_of()
-            stop = self._heading.plan(motion.deck, sigma_rad, was_reverse=s.was_reverse)
+            stop = self.follower.heading_leg(motion.deck, motion.heading_sigma_of(), was_reverse=s.was_reverse)
             if stop is None:
                 return self._arrive(replace(s, heading_legs_left=0), motion)
             legs_left = s.heading_legs_left - 1
@@ -261,14 +265,14 @@ class Survey(HoldRules[SurveyState]):
         """A leg that begins where the point was missed is a correction; the one after it needs a safe turn."""
         if s.is_missed:
             panel = motion.pose.panel
-            aim = self._corrector.aim(motion.pose, self.follower.target_in(panel, stop))
+            aim = self.follower.correction(motion.pose, self.follower.target_in(panel, stop))
             if aim is None:
                 return replace(s, is_missed=False, is_off_route=True)
             leg = Leg(stop, aim=(panel, aim))
             return replace(s, is_missed=False, behaviour=leg, corrected=stop, corrections=s.corrections + 1)
         if s.corrected is stop:
             return s
-        is_safe = self._corrector.can_proceed(motion.deck, stop)
+        is_safe = self.follower.can_proceed(motion.deck, stop)
         return replace(s, corrected=None, is_off_route=s.is_off_route or not is_safe)
 
     def _find_route(self, s: SurveyState, motion: StateEstimate) -> SurveyState:
@@ -337,7 +341,7 @@ class Survey(HoldRules[SurveyState]):
         if not isinstance(s.behaviour, Retreat):
             return self.proceed(s), HOLD_POSITION
         mission = self.cfg.mission
-        retreat, twist = s.behaviour.update(mission, self._tracker, motion, verdict, is_slow=s.is_slow)
+        retreat, twist = s.behaviour.update(mission, self.follower.tracker, motion, verdict, is_slow=s.is_slow)
         # On the way home there is no route to turn to; the way home begins from here.
         if retreat.step is RetreatStep.OVER or (retreat.step is RetreatStep.TURN_AWAY and s.abort_cause):
             return self.apply(replace(s, behaviour=None), MissionEvent.FIND), HOLD_POSITION
@@ -385,7 +389,7 @@ class Survey(HoldRules[SurveyState]):
         return s, None
 
     def _take_over(self, s: SurveyState, event: TakenOver) -> SurveyState:
-        """What had a meaning in the other process only is dropped: what it was doing, its times, the last verdict."""
+        """What has a meaning in any process is kept: not what it was doing, its times, and the last verdict."""
         measured, skipped, elapsed_s, is_new_run = event
         if is_new_run:
             if s.mode is DONE and s.outcome is not SurveyOutcome.STOPPED:
@@ -393,40 +397,20 @@ class Survey(HoldRules[SurveyState]):
             s = replace(s, failure_causes={}, due=(), retried=frozenset(), failures=0, budget=BudgetProgress())
         # The database is newer than the state.
         failed = {point: "not measured" for point in skipped if point not in s.failure_causes}
-        causes = {point: why for point, why in {**s.failure_causes, **failed}.items() if point not in measured}
         is_held = s.is_held_by_hand
-        return replace(
-            s,
+        return SurveyState(
             route=self._route,
             mode=HELD if is_held else IDLE,
-            outcome=SurveyOutcome.NONE,
             cause=s.cause if is_held else "",
-            stop_index=0,
-            behaviour=None,
             hold=Hold(is_held, is_held and s.hold.is_fault and not is_new_run),
             fix=FixNeed.RELOCALIZE,
             heading_legs_left=MOST_LEGS,
             done=measured,
             skipped=skipped,
-            failure_causes=causes,
+            failure_causes={p: why for p, why in {**s.failure_causes, **failed}.items() if p not in measured},
             due=tuple(point for point in s.due if point not in failed and point not in measured),
             budget=s.budget._replace(begun_s=None, before_s=elapsed_s),
-            arrived_at=None,
-            is_missed=False,
-            corrected=None,
-            inflates_covariance=False,
-            wants_calibration=False,
-            interlock="",
-            is_latched=False,
-            is_shaking=False,
-            severity=Severity.NONE,
-            is_slow=False,
-            is_found=False,
-            has_looked=False,
-            stuck_s=None,
-            resumes_after_s=-inf,
-            stands_until_s=-inf,
-            recoveries_s=(),
+            **{name: getattr(s, name) for name in _KEPT},
         )
 
     def _recover(self, s: SurveyState, cause: str, t_s: float) -> SurveyState:
@@ -450,7 +434,7 @@ class Survey(HoldRules[SurveyState]):
         if s.fix is FixNeed.NONE:
             return self._leave_pointless(s, event.heading_sigma_rad)
         # The heading has to be found before the robot drives on.
-        legs_left = 0 if event.heading_sigma_rad <= self._heading.limit_rad else s.heading_legs_left
+        legs_left = 0 if event.heading_sigma_rad <= self.cfg.mission.heading_doubt_rad else s.heading_legs_left
         s = replace(s, heading_legs_left=legs_left)
         if legs_left > 0:
             return self.apply(replace(s, behaviour=None, is_missed=False), MissionEvent.GO_ON)
@@ -486,7 +470,7 @@ class Survey(HoldRules[SurveyState]):
 
     def _doubt_heading(self, s: SurveyState, heading_sigma_rad: float) -> SurveyState:
         """Where the fix showed that the pose was wrong, the heading is found before the robot drives on."""
-        if self._heading.is_needed(heading_sigma_rad) and s.fix is not FixNeed.CONFIRM:
+        if heading_sigma_rad > _LOST * self.cfg.mission.heading_doubt_rad and s.fix is not FixNeed.CONFIRM:
             return replace(s, heading_legs_left=MOST_LEGS, fix=FixNeed.RELOCALIZE)
         return s
 

@@ -22,7 +22,7 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck
-from ccatp.survey.fix_gate import FixGate, FrameCheck, explain, signed_axes
+from ccatp.survey.fix_gate import SIGNED_AXES, FixGate, FrameCheck, explain
 from ccatp.survey.state import MissionState
 from tests.contract.test_etalon_client import (
     CHANNELS,
@@ -350,7 +350,7 @@ def test_every_exchange_of_axes_and_units_is_refused_at_the_first_fix(name: str,
     puck = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)
     true_m = {c: float(np.linalg.norm(p - puck)) for c, p in zip(mirror.channels, mirror.collimators_m, strict=True)}
     accepted, explained, lies = 0, 0, 0
-    for matrix in signed_axes()[1:]:
+    for matrix in SIGNED_AXES[1:]:
         lies += 1
         accepted += refusal(cfg, mirror, mirror.collimators_m @ matrix.T, true_m, explained_too=lies % 8 == 0) == ""
     for factor in (1e-3, 1e3, 25.4, 1.0 / 25.4):
@@ -389,13 +389,13 @@ def refusal(
     ("seen", "expected", "why"),
     [  # a robot in the plane of symmetry sees a mirrored axis only once it has moved
         ((-0.2, 2.0, 5.0), (0.2, 2.0, 5.0), "the axes are wrong: what should be (x, y, z) is (-x, y, z)"),
-        ((1.0, 2.0, 3.0), (1.0, 2.0, 3.4), "no exchange of axes or units explains it"),
+        ((1.0, 2.0, 3.0), (1.0, 2.0, 3.4), ""),
     ],
 )
 def test_what_the_first_place_hides_the_second_shows(seen: Any, expected: Any, why: str, config: Config) -> None:
     check = FrameCheck(config.etalon)
     assert check.look((0.0, 2.0, 5.0), (0.0, 2.0, 5.001)) is None
-    assert str(check.look(seen, expected)).startswith(why)
+    assert check.look(seen, expected) == why
     assert not check.is_over
     assert explain((1.0, 2.0, 3.0), (1.0, 2.0, 3.4), 0.05) == ""
 

@@ -12,7 +12,7 @@ from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Twist, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import MissionCommand
-from ccatp.survey.failsafe import ROWS
+from ccatp.survey.failsafe import NO_FRESH_VERDICT, ROWS
 from ccatp.survey.state import (
     BACKING_OFF,
     DONE,
@@ -88,7 +88,7 @@ def check(before: SurveyState, verdict: Verdict | None, s: SurveyState, command:
     """The active rows permit the motion; what was measured stays so, once."""
     stands = command.twist == STILL
     for row in ROWS:
-        if row.applies(before, verdict):
+        if row.applies(before, verdict or NO_FRESH_VERDICT):
             is_passed = row.action is Action.WAIT and s.stuck_s is None
             is_free = row.action in (Action.SLOW, Action.RETURN, Action.RETREAT)
             assert is_free or stands or is_passed, row.when

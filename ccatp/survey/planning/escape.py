@@ -13,6 +13,7 @@ from ccatp.survey.planning.legs import (
     LegPlace,
     UnreachablePointError,
     course_of_heading,
+    room_m,
     sensor_depths,
 )
 from ccatp.survey.planning.search import SearchNode, leg_time, turn_time
@@ -87,7 +88,7 @@ def find_retreats(mirror: Mirror, body: Body, places: list[LegPlace]) -> list[tu
     At most one to each side of the grid of panels, straight or slightly slanted: slanted where the place is in a
     corner, or to move off along the rim.
     """
-    near = [k for k, place in enumerate(places) if place.stance is not None]
+    near = [k for k, place in enumerate(places) if place.blocked is not None]
     x0 = np.array([places[k].x_m for k in near]).reshape(-1, 1, 1, 1)
     y0 = np.array([places[k].y_m for k in near]).reshape(-1, 1, 1, 1)
     depths = mirror.rim.signed_distances_m(
@@ -127,34 +128,19 @@ def plan_calibration(mirror: Mirror, body: Body, mission: MissionConfig, base: D
     second round shows whether slip and creep are the same again. No stops where there is no room.
     """
     depth_m = max(body.turning_depth_m, mission.leg_clearance_m)
-    course = course_of_heading(mirror, base)
-    if mirror.rim.signed_distance_m(base.x_m, base.y_m) < depth_m:
+    course, home = course_of_heading(mirror, base), (base.x_m, base.y_m)
+    if mirror.rim.signed_distance_m(*home) < depth_m:
         return ()
     for is_reverse in (True, False):
         sign = -1.0 if is_reverse else 1.0
-        way_m = _room_m(mirror, base, sign * cos(course), sign * sin(course), depth_m, mission.calibration_length_m)
+        cx, cy = sign * cos(course), sign * sin(course)
+        way_m = room_m(mirror.rim, base, (cx, cy), mission.calibration_length_m, _STEP_M, depth_m)
         if way_m >= _SHORTEST_M:
-            away = base.x_m + sign * way_m * cos(course), base.y_m + sign * way_m * sin(course)
-            home = base.x_m, base.y_m
-            drive = (
-                Stop(*away, StopKind.CALIBRATE, reverse=is_reverse),
-                Stop(*home, StopKind.CALIBRATE, reverse=not is_reverse),
-                Stop(*away, StopKind.CALIBRATE, reverse=not is_reverse),
-                Stop(*home, StopKind.CALIBRATE, reverse=not is_reverse),
-            )
+            away = base.x_m + way_m * cx, base.y_m + way_m * cy
+            legs = (away, is_reverse), (home, not is_reverse), (away, not is_reverse), (home, not is_reverse)
+            drive = tuple(Stop(x, y, StopKind.CALIBRATE, reverse=reverse) for (x, y), reverse in legs)
             return drive * mission.calibration_rounds
     return ()
-
-
-def _room_m(mirror: Mirror, base: DeckPose, cx: float, cy: float, depth_m: float, wanted_m: float) -> float:
-    """How far the robot can go from base in a direction of the deck plane and still turn there, up to ``wanted_m``."""
-    way_m = 0.0
-    while way_m < wanted_m:
-        step_m = min(way_m + _STEP_M, wanted_m)
-        if mirror.rim.signed_distance_m(base.x_m + step_m * cx, base.y_m + step_m * cy) < depth_m:
-            break
-        way_m = step_m
-    return way_m
 
 
 def is_on_drive(stops: Sequence[Stop], x_m: float, y_m: float) -> bool:

@@ -7,17 +7,16 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from itertools import accumulate
 from math import atan2, ceil, cos, floor, hypot, inf, pi, sin, tau
 from typing import NamedTuple
 
 import numpy as np
 
 from ccatp.config.models import MissionConfig, RobotConfig
-from ccatp.core import BoolArray, DeckPose, FloatArray, PanelId, Stop, StopKind, bearing, difference
+from ccatp.core import DeckPose, FloatArray, PanelId, bearing, difference
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.rim import to_segment_m
+from ccatp.mirror.rim import Rim, to_segment_m
 
 _BINS = 360
 _BIN_RAD = tau / _BINS
@@ -29,20 +28,21 @@ _AMBIGUOUS_RAD = 0.1
 _SPARE_M = 0.001
 
 
-class Stance:
-    """Courses that the robot can face at one place near the rim, 360 of them, and turns between them."""
+@dataclass(frozen=True, slots=True, eq=False)
+class LegPlace:
+    """A place on the deck, and near the rim which courses the robot can face there.
 
-    __slots__ = ("_blocked",)
+    ``blocked`` is the running number of the courses, of 360, on which a sensor does not keep its clearance, over four
+    turns: any arc is one difference. ``None`` where the robot can turn freely.
+    """
 
-    def __init__(self, free: BoolArray) -> None:
-        """``free`` (360,): whether all sensors keep their clearance on the course of k degrees.
-
-        The running number of blocked courses is kept over four turns: any arc is one difference.
-        """
-        self._blocked: list[int] = [0, *accumulate(np.tile(~free, 4).astype(int).tolist())]
+    x_m: float
+    y_m: float
+    depth_m: float
+    blocked: list[int] | None = None
 
     def can_face(self, course_rad: float) -> bool:
-        """Whether the robot can face a course."""
+        """Whether the robot can face a course here."""
         return self._is_free(course_rad % tau + tau, 0.0)
 
     def can_turn(self, from_rad: float, to_rad: float) -> bool:
@@ -56,27 +56,11 @@ class Stance:
         return self._is_free(start, angle - tau if angle > 0.0 else angle + tau)
 
     def _is_free(self, start_rad: float, angle_rad: float) -> bool:
+        if self.blocked is None:
+            return True
         low, high = sorted((start_rad, start_rad + angle_rad))
         first, last = floor(low / _BIN_RAD), ceil(high / _BIN_RAD)
-        return self._blocked[last + 1] == self._blocked[first]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LegPlace:
-    """A place on the deck; ``stance``: what the robot can do there, ``None`` where it can turn freely."""
-
-    x_m: float
-    y_m: float
-    depth_m: float
-    stance: Stance | None = None
-
-    def can_face(self, course_rad: float) -> bool:
-        """Whether the robot can face a course here."""
-        return self.stance is None or self.stance.can_face(course_rad)
-
-    def can_turn(self, from_rad: float, to_rad: float) -> bool:
-        """Whether the robot can turn in place here, the short way."""
-        return self.stance is None or self.stance.can_turn(from_rad, to_rad)
+        return self.blocked[last + 1] == self.blocked[first]
 
 
 class Body(NamedTuple):
@@ -120,16 +104,15 @@ def sensor_depths(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray, co
 
 
 def build_places(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray) -> list[LegPlace]:
-    """Places at deck coordinates of shape (n,), m, each with its stance where it is near the rim."""
+    """Places at deck coordinates of shape (n,), m; at those near the rim it is known which courses are free."""
     depths = mirror.rim.signed_distances_m(xs, ys)
     near = np.flatnonzero(depths < body.turning_depth_m)
     courses: FloatArray = np.arange(_BINS, dtype=np.float64) * _BIN_RAD
-    free = (
-        sensor_depths(mirror, body, xs[near, None], ys[near, None], courses) >= body.turn_clearance_m + _BETWEEN_BINS_M
-    )
-    stances = {int(k): Stance(row) for k, row in zip(near, free, strict=True)}
+    clearances = sensor_depths(mirror, body, xs[near, None], ys[near, None], courses)
+    is_blocked = np.tile(clearances < body.turn_clearance_m + _BETWEEN_BINS_M, 4)
+    blocked = {int(k): [0, *np.cumsum(row).tolist()] for k, row in zip(near, is_blocked, strict=True)}
     return [
-        LegPlace(x, y, depth, stances.get(k))
+        LegPlace(x, y, depth, blocked.get(k))
         for k, (x, y, depth) in enumerate(zip(xs.tolist(), ys.tolist(), depths.tolist(), strict=True))
     ]
 
@@ -337,7 +320,7 @@ def course_of_heading(mirror: Mirror, pose: DeckPose) -> float:
 
 
 class PlanError(CcatpError):
-    """Base of every refusal of this room."""
+    """Base of every refusal of a planner."""
 
 
 class OutsideMirrorError(PlanError):
@@ -350,11 +333,28 @@ class UnreachablePointError(PlanError):
     exit_status = ExitStatus.USAGE
 
 
-def in_parts(x_m: float, y_m: float, stop: Stop, longest_m: float) -> list[Stop]:
-    """The straight leg from a deck place to a stop as equal parts, the stop itself the last."""
-    dx, dy = stop.x_m - x_m, stop.y_m - y_m
-    parts = max(1, ceil(hypot(dx, dy) / longest_m))
-    between = (
-        Stop(x_m + dx * k / parts, y_m + dy * k / parts, StopKind.VIA, reverse=stop.reverse) for k in range(1, parts)
-    )
-    return [*between, stop]
+def room_m(
+    rim: Rim,
+    deck: DeckPose,
+    way: tuple[float, float],
+    wanted_m: float,
+    step_m: float,
+    clearance_m: float,
+    *,
+    spread: float = 0.0,
+    leaving: float = inf,
+) -> float:
+    """How far a leg may go in a direction of the deck plane so that the robot can turn at its end, up to ``wanted_m``.
+
+    The clearance grows by ``spread`` along the leg; it is not asked for where at least the part ``leaving`` of a step
+    leads away from the rim.
+    """
+    way_m, depth_m = 0.0, rim.signed_distance_m(deck.x_m, deck.y_m)
+    while way_m < wanted_m:
+        end_m = min(way_m + step_m, wanted_m)
+        before_m, depth_m = depth_m, rim.signed_distance_m(deck.x_m + end_m * way[0], deck.y_m + end_m * way[1])
+        is_leaving = depth_m - before_m > leaving * (end_m - way_m)
+        if depth_m < clearance_m + spread * end_m and not is_leaving:
+            break
+        way_m = end_m
+    return way_m

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, chain, groupby
+from math import ceil, hypot
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from ccatp.survey.planning.legs import (
     build_body,
     build_places,
     course_of_heading,
-    in_parts,
 )
 from ccatp.survey.planning.search import Search, SearchNode, Target, path_time, stop_times, turn_time
 
@@ -123,12 +123,12 @@ class RoutePlanner:
         path = min(arrivals, key=rank).path()
         ends = [Stop(a.place.x_m, a.place.y_m, StopKind.VIA, None, a.reverse) for a in path[:-1]]
         ends.append(Stop(base.x_m, base.y_m, StopKind.BASE, None, path[-1].reverse, base.heading_rad))
-        return _in_parts((here.x_m, here.y_m), ends, _LONGEST_LEG_HOME_M)
+        return in_parts((here.x_m, here.y_m), ends, _LONGEST_LEG_HOME_M)
 
     def _first(self, place: LegPlace, start: DeckPose) -> SearchNode:
         """Where the robot stands; too near the rim to turn, where its first move away from it ends."""
         first = SearchNode(place, course_of_heading(self._mirror, start), 0.0)
-        return first if place.stance is None else find_escape(self._mirror, self._body, first, self._limits)
+        return first if place.blocked is None else find_escape(self._mirror, self._body, first, self._limits)
 
     def _stops(self, points: list[PointId], start: DeckPose, out_of_reach: list[PointId] | None) -> tuple[Stop, ...]:
         mirror, body, mission = self._mirror, self._body, self._mission
@@ -140,7 +140,7 @@ class RoutePlanner:
                 f"{mirror.name}"
             )
         retreats = find_retreats(mirror, body, places)
-        if places[0].stance is not None:
+        if places[0].blocked is not None:
             retreats[0] = ()  # away from the rim first, as on the way home
         arrivals, before = [self._first(places[0], start)], 0
         for k, point in enumerate(points, start=1):
@@ -168,7 +168,7 @@ class RoutePlanner:
             for arrival in best.path()
         ]
         # A heading that is off by 10 mrad misses by a centimetre after a metre: long legs are looked after on the way.
-        return _in_parts((start.x_m, start.y_m), ends, mission.longest_leg_m)
+        return in_parts((start.x_m, start.y_m), ends, mission.longest_leg_m)
 
     def _timed(self, stops: tuple[Stop, ...], start: DeckPose) -> Route:
         times = [
@@ -185,9 +185,18 @@ def _followed(head: Route, route: Route, index: int) -> Route:
     return Route(head.stops + route.stops[index:], times_s)
 
 
-def _in_parts(start: tuple[float, float], ends: list[Stop], longest_m: float) -> tuple[Stop, ...]:
-    begins = [start, *((stop.x_m, stop.y_m) for stop in ends)]
-    return tuple(part for begin, end in zip(begins, ends, strict=False) for part in in_parts(*begin, end, longest_m))
+def in_parts(start: tuple[float, float], ends: Sequence[Stop], longest_m: float) -> tuple[Stop, ...]:
+    """The straight legs from a deck place through stops, each in equal parts that are not too long."""
+    stops: list[Stop] = []
+    x_m, y_m = start
+    for end in ends:
+        dx, dy = end.x_m - x_m, end.y_m - y_m
+        parts = max(1, ceil(hypot(dx, dy) / longest_m))
+        for k in range(1, parts):
+            stops.append(Stop(x_m + dx * k / parts, y_m + dy * k / parts, StopKind.VIA, reverse=end.reverse))
+        stops.append(end)
+        x_m, y_m = end.x_m, end.y_m
+    return tuple(stops)
 
 
 def fastest_serpentine(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig) -> list[PointId]:

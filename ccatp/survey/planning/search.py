@@ -17,12 +17,10 @@ STRAIGHT_RAD = 0.05
 
 
 def bang_bang_time(distance: float, v_max: float, a_max: float) -> float:
-    """Least time from rest to rest under bounded speed and acceleration, s; raises ``ValueError`` for a limit <= 0.
+    """Least time from rest to rest under bounded speed and acceleration, s.
 
     ``2 sqrt(d/a)`` while the peak stays below v (d < v^2/a), else ``d/v + v/a``; d in m or rad, sign ignored.
     """
-    if v_max <= 0.0 or a_max <= 0.0:
-        raise ValueError(f"limits must be positive, got v_max={v_max}, a_max={a_max}")
     length = abs(distance)
     if length * a_max < v_max * v_max:
         return 2.0 * sqrt(length / a_max)

@@ -95,20 +95,26 @@ def _choices(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig) ->
     surface = np.array([mirror.surface_point(x, y) for x, y in xy.tolist()])
     parts = []
     for k, ((x, y), near) in enumerate(zip(xy.tolist(), _near(surface, limits), strict=True)):
-        legs_s = _leg_times(surface, k, limits)
-        near_s, far_s = legs_s[near], _least_far(legs_s, near, k)
-        headings = _headings(mirror, x, y, xy[near])
+        legs_s, headings = _leg_times(surface, k, limits), _headings(mirror, x, y, xy[near])
+        near_s = legs_s[near]
+        halves_s, far_s = near_s / 2.0, _least_far(legs_s, near, k) / 2.0
+        one = np.r_[np.c_[near, np.full(len(near), _NONE)], [(_NONE, _NONE)]]  # joined to one place alone
         if k == 0:
             turns_s = np.where(near_s > 0.0, _turn_times(headings - base.heading_rad, limits), 0.0)
-            parts.append(_of_base(near, near_s / 2.0 + turns_s, far_s[0] / 2.0))
+            joined, costs_s, ends = one, np.r_[halves_s + turns_s, far_s[0]], 0
         else:
             # A leg of no length has no direction.
             angles = np.where(near_s > 0.0, headings, np.nan)
             turns_s = np.nan_to_num(_turn_times(angles[:, None] - angles, limits), nan=0.0)
-            parts.append(_of_point(k, near, near_s / 2.0, turns_s, far_s / 2.0))
-    place, near_places, is_end, cost_s = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    possible = np.isfinite(cost_s)
-    return _Choices(place[possible], near_places[possible], is_end[possible], cost_s[possible])
+            first, second = np.triu_indices(len(near), 1)
+            pairs_s = halves_s[first] + halves_s[second] + turns_s[first, second]
+            joined, ends = np.r_[np.c_[near[first], near[second]], one, one], len(one)
+            costs_s = np.r_[pairs_s, halves_s + far_s[0], far_s[0] + far_s[1], halves_s, far_s[0]]
+        is_end = np.arange(len(costs_s)) >= len(costs_s) - ends
+        parts.append((np.full(len(costs_s), k), joined, is_end, costs_s))
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    possible = np.isfinite(columns[-1])
+    return _Choices(*(column[possible] for column in columns))
 
 
 def _near(surface: FloatArray, limits: LimitsConfig) -> list[IntArray]:
@@ -129,47 +135,11 @@ def _least_far(legs_s: FloatArray, near: IntArray, own: int) -> FloatArray:
     return np.partition(np.r_[far_s, np.inf, np.inf], 1)[:2]
 
 
-def _of_base(near: IntArray, near_s: FloatArray, far_s: float) -> _Choices:
-    costs = np.r_[near_s, far_s]
-    joined = np.full((len(costs), 2), _NONE)
-    joined[:-1, 0] = near
-    return _Choices(np.zeros(len(costs), dtype=np.int64), joined, np.zeros(len(costs), dtype=np.bool_), costs)
-
-
-def _of_point(place: int, near: IntArray, halves_s: FloatArray, turns_s: FloatArray, far_s: FloatArray) -> _Choices:
-    first, second = np.triu_indices(len(near), 1)
-    none = np.full(len(near), _NONE)
-    joined = np.r_[
-        np.c_[near[first], near[second]], np.c_[near, none], [(_NONE, _NONE)], np.c_[near, none], [(_NONE, _NONE)]
-    ]
-    pairs_s = halves_s[first] + halves_s[second] + turns_s[first, second]
-    costs = np.r_[pairs_s, halves_s + far_s[0], far_s[0] + far_s[1], halves_s, far_s[0]]
-    is_end = np.arange(len(costs)) >= len(costs) - len(near) - 1
-    return _Choices(np.full(len(costs), place), joined, is_end, costs)
-
-
 def _priced(choices: _Choices) -> float:
-    """The sum of the cheapest choices at the prices that make it largest, s."""
-    one_each, agreement = _constraints(choices)
-    wanted = np.zeros(agreement.shape[0])
-    wanted[-1] = 1.0
-    constraints: Any = vstack((one_each, agreement))  # its type says that it takes none that are sparse; it does
-    solution = linprog(
-        choices.cost_s,
-        A_eq=constraints,
-        b_eq=np.r_[np.ones(one_each.shape[0]), wanted],
-        method="highs-ipm",  # a tenth of the simplex method's time
-    )
-    prices = np.asarray(solution.eqlin.marginals, dtype=np.float64)[one_each.shape[0] :]
-    at_prices = choices.cost_s - agreement.T @ prices
-    first = np.flatnonzero(np.diff(choices.place, prepend=-1))
-    return float(np.minimum.reduceat(at_prices, first).sum() + prices[-1])
+    """The sum of the cheapest choices at the prices that make it largest, s.
 
-
-def _constraints(choices: _Choices) -> tuple[csr_array, csr_array]:
-    """Which choices are whose, shape (places, m), and on what they have to agree, shape (legs + 1, m).
-
-    Of a leg's two ends the one pays what the other gets. The last row counts the ends of the tour.
+    The constraints: one choice for each place; of a leg's two ends the one pays what the other gets; the tour has one
+    end, the last row.
     """
     places, m = int(choices.place[-1]) + 1, len(choices.cost_s)
     row, side = np.nonzero(choices.near != _NONE)
@@ -179,4 +149,15 @@ def _constraints(choices: _Choices) -> tuple[csr_array, csr_array]:
     signs = np.r_[np.where(own < other, 1.0, -1.0), np.ones(len(ends))]
     where = np.r_[leg, np.full(len(ends), len(legs))], np.r_[row, ends]
     agreement = csr_array((signs, where), shape=(len(legs) + 1, m))
-    return csr_array((np.ones(m), (choices.place, np.arange(m))), shape=(places, m)), agreement
+    one_each = csr_array((np.ones(m), (choices.place, np.arange(m))), shape=(places, m))
+    constraints: Any = vstack((one_each, agreement))  # its type says that it takes none that are sparse; it does
+    solution = linprog(
+        choices.cost_s,
+        A_eq=constraints,
+        b_eq=np.r_[np.ones(places), np.zeros(len(legs)), 1.0],
+        method="highs-ipm",  # a tenth of the simplex method's time
+    )
+    prices = np.asarray(solution.eqlin.marginals, dtype=np.float64)[places:]
+    at_prices = choices.cost_s - agreement.T @ prices
+    first = np.flatnonzero(np.diff(choices.place, prepend=-1))
+    return float(np.minimum.reduceat(at_prices, first).sum() + prices[-1])

@@ -19,7 +19,7 @@ from ccatp.survey.behaviours import SETTLE_LIMIT_S, Retreat, RetreatStep, Settli
 from ccatp.survey.checks import PATIENCE_S, READINGS, MirrorCheck
 from ccatp.survey.fix_gate import ApproachCounter
 from ccatp.survey.planning.escape import is_on_drive
-from ccatp.survey.route_follower import Corrector, LegAim, StateEstimate, plan_aim
+from ccatp.survey.route_follower import LegAim, LegFollower, StateEstimate, plan_aim
 from ccatp.survey.state import Pause, Resume
 
 DT, MEASURING_S = 0.01, 0.5
@@ -119,8 +119,8 @@ POSE = (0.1, 0.2, 0.5)
 
 
 @pytest.fixture
-def corrector(config: Config, mirror: Mirror) -> Corrector:
-    return Corrector(mirror, config.robot, config.mission)
+def follower(config: Config, mirror: Mirror) -> LegFollower:
+    return LegFollower(mirror, config)
 
 
 def seen(ahead_m: float, left_m: float) -> tuple[float, float]:
@@ -158,11 +158,11 @@ def test_else_the_robot_turns_by_the_smaller_angle(
     assert POSE[1] + sign * distance * sin(heading) == pytest.approx(target[1])
 
 
-def test_beyond_its_reach_there_is_no_correction(corrector: Corrector, config: Config) -> None:
+def test_beyond_its_reach_there_is_no_correction(follower: LegFollower, config: Config) -> None:
     pose = PanelPose(PanelId(5, 5), 0.0, 0.0, 0.0)
     reach = config.mission.correction_reach_m
-    assert corrector.aim(pose, (0.99 * reach, 0.0)) is not None
-    assert corrector.aim(pose, (1.01 * reach, 0.0)) is None
+    assert follower.correction(pose, (0.99 * reach, 0.0)) is not None
+    assert follower.correction(pose, (1.01 * reach, 0.0)) is None
 
 
 def at_the_rim(mirror: Mirror, depth_m: float) -> PanelPose:
@@ -173,22 +173,22 @@ def at_the_rim(mirror: Mirror, depth_m: float) -> PanelPose:
     return mirror.panel_pose(PanelId(5, col), DeckPose(x, y, pi / 2))
 
 
-def test_no_sensor_may_pass_the_rim_on_the_way(corrector: Corrector, mirror: Mirror) -> None:
+def test_no_sensor_may_pass_the_rim_on_the_way(follower: LegFollower, mirror: Mirror) -> None:
     # Sensors 0.09 m beside the robot stand 15 mm inside the rim; turning they reach out to 0.127 m.
     pose = at_the_rim(mirror, 0.105)
     along = (pose.x_m, pose.y_m + 0.03)
-    assert corrector.aim(pose, along) is not None
+    assert follower.correction(pose, along) is not None
     for depth_m, is_safe in ((0.105, False), (0.2, True)):
         pose = at_the_rim(mirror, depth_m)  # it would have to turn
-        assert (corrector.aim(pose, (pose.x_m - 0.03, pose.y_m + 0.001)) is not None) is is_safe
+        assert (follower.correction(pose, (pose.x_m - 0.03, pose.y_m + 0.001)) is not None) is is_safe
 
 
-def test_after_a_correction_a_turn_at_the_rim_is_looked_at(corrector: Corrector, mirror: Mirror) -> None:
+def test_after_a_correction_a_turn_at_the_rim_is_looked_at(follower: LegFollower, mirror: Mirror) -> None:
     for depth_m, is_safe in ((0.105, False), (0.2, True)):
         pose = mirror.deck_pose(at_the_rim(mirror, depth_m))
-        assert corrector.can_proceed(pose, Stop(pose.x_m, pose.y_m + 0.2, StopKind.MEASURE))
-        assert corrector.can_proceed(pose, Stop(pose.x_m - 0.2, pose.y_m, StopKind.MEASURE)) is is_safe
-        assert corrector.can_proceed(pose, Stop(pose.x_m, pose.y_m - 0.2, StopKind.MEASURE, reverse=True))
+        assert follower.can_proceed(pose, Stop(pose.x_m, pose.y_m + 0.2, StopKind.MEASURE))
+        assert follower.can_proceed(pose, Stop(pose.x_m - 0.2, pose.y_m, StopKind.MEASURE)) is is_safe
+        assert follower.can_proceed(pose, Stop(pose.x_m, pose.y_m - 0.2, StopKind.MEASURE, reverse=True))
 
 
 HERE, THERE = PointId(1, 2, 3), PointId(1, 2, 4)

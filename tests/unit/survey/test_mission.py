@@ -18,7 +18,7 @@ from ccatp.core import (
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import Route
-from ccatp.survey.route_follower import Corrector
+from ccatp.survey.route_follower import LegFollower
 from ccatp.survey.state import (
     AMONG_BEACONS,
     Abort,
@@ -409,7 +409,7 @@ def test_a_miss_that_a_pause_overtakes_ends_in_a_new_route(story: Story) -> None
 
 
 def test_after_a_correction_an_unsafe_turn_is_planned_anew(story: Story, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Corrector, "can_proceed", lambda *_: False)
+    monkeypatch.setattr(LegFollower, "can_proceed", lambda *_: False)
     miss(story, 0.02, 0.0)
     story.auto_fix = True
     story.until_state(MissionState.DONE)
