@@ -2,8 +2,6 @@
 
 import gc
 import tracemalloc
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,8 +12,7 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.records import summary
 from ccatp.sim.world import TruthRow
 from ccatp.studies import faults_study
-from ccatp.studies.campaign import CellResult, Job, JobOutcome, Study, cells_of, jobs_of
-from ccatp.studies.engine import CampaignOptions, run_campaign
+from ccatp.studies.campaign import Job, JobOutcome
 from ccatp.studies.faults_study import FIRST_S, LONGEST_S, is_recoverable, random_plan
 from ccatp.studies.mission_study import (
     COLUMN,
@@ -27,9 +24,9 @@ from ccatp.studies.mission_study import (
     pooled,
     run_mission,
 )
-from ccatp.studies.results import plain, table
+from ccatp.studies.results import plain
 from ccatp.studies.sil_run import SilRun, SilTrace
-from ccatp.studies.survey_studies import ABLATION, FILTERS, GROUPS, SENSITIVITY, TIME, combine_filters
+from ccatp.studies.survey_studies import GROUPS, SENSITIVITY, TIME, combine_filters
 from ccatp.survey.composition import assemble
 from ccatp.survey.state import Pause
 from tests.support.sim_survey import plan_of
@@ -77,41 +74,6 @@ def mission(errors_m: list[float], approaches: list[int] | None = None, **change
     return JobOutcome(values, arrays)
 
 
-# Each with the stems of its figures.
-CAMPAIGNS = (
-    (FILTERS, {f"{kind}-thesis-m1" for kind in ("localization", "arrival", "bound", "consistency")}),
-    (TIME, {"time-thesis-m1"}),
-    (SENSITIVITY, {"sensitivity-thesis-m1"}),
-    (ABLATION, {"ablation-thesis-m1-thesis", "ablation-thesis-m1-hard"}),
-)
-
-
-def results_of(study: Study) -> list[CellResult]:
-    """Cells of two made-up missions each."""
-    found = []
-    for k, cell in enumerate(cells_of(study)):
-        scale = 1e-3 * (1 + k % 5)
-        runs = [mission([scale, 2 * scale], cause="wind"), mission([3 * scale, scale])]
-        values, arrays = study.combine(cell.factors, runs)
-        found.append(CellResult(cell.factors, {"runs": 2, **values}, arrays))
-    return found
-
-
-@pytest.mark.parametrize(("study", "stems"), CAMPAIGNS)
-def test_cells_are_configurations_of_their_own_and_all_shown(study: Study, stems: set[str], tmp_path: Path) -> None:
-    plan = jobs_of(study, cells_of(study), lambda keys: load_config(None, keys), {}, 1)
-    configurations = [group[0].cfg.model_dump_json() for group in plan]
-    assert len(set(configurations)) == len(configurations) > 1
-    results = results_of(study)
-    study.draw(results, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {f"{stem}.{kind}" for stem in stems for kind in ("png", "pdf")}
-    lines = table([plain({**cell.factors, **cell.values}) for cell in results], study.columns).splitlines()
-    assert len(lines) == 2 + len(results)
-    # Every column finds its figure.
-    shown = [line.split(" | ") for line in lines[2:]]
-    assert not any(all(row[k] == "-" for row in shown) for k in range(len(shown[0])))
-
-
 def test_stop_errors_stand_beside_the_bound_without_each_first_stop() -> None:
     values, arrays = combine_filters({}, [mission([0.1, 0.003]), mission([0.1, 0.004])])
     assert values["bound"]["rms_mm"] == pytest.approx(2.0 * 2.0**0.5, abs=1e-3)
@@ -142,17 +104,6 @@ def test_each_group_of_disturbances_is_added_and_taken_away() -> None:
     keys = set(type(quiet).model_fields) - {"name"}
     differing = {key for key in keys if getattr(quiet, key) != getattr(hard, key)}
     assert differing <= {key for group in GROUPS.values() for key in group}
-
-
-def test_a_real_job_has_every_figure(tmp_path: Path) -> None:
-    only = {"world": ("thesis",), "filter": ("ekf",)}
-    options = CampaignOptions(tmp_path, runs=1, workers=1, only=only, settings=ONE_PANEL)
-    result = run_campaign(FILTERS, lambda keys: load_config(None, keys), options)
-    (cell,) = result["cells"]
-    assert (cell["complete"], cell["points"]["measured"]) == (1, 9)
-    assert cell["time_ratio"] > 1.0
-    line = (tmp_path / "table.md").read_text().splitlines()[-1]
-    assert " - " not in line
 
 
 # -- the missions of a cell -------------------------------------------------------------------------------------------
@@ -304,26 +255,12 @@ def test_late_estimates_meet_their_truth_across_batches() -> None:
 # -- the study `faults` -----------------------------------------------------------------------------------------------
 
 
-def run(faults: str, seed: int = 5) -> Mapping[str, Any]:
-    keys = {**ONE_PANEL, "run.mirror": "fyst-m2", "run.seed": seed, **faults_study.STUDY.defaults}
-    return faults_study.run_job(Job("faults", {"faults": faults}, seed, load_config(None, keys))).values
-
-
 def test_a_plan_lies_within_its_mission_and_is_of_its_seed() -> None:
     plan = random_plan(7, 40, 500.0)
     assert plan == random_plan(7, 40, 500.0) != random_plan(8, 40, 500.0)
     assert len(plan.faults) == 40
     assert all(FIRST_S <= fault.at_s <= 500.0 and fault.end_s - fault.at_s <= LONGEST_S for fault in plan.faults)
     assert max(fault.at_s for fault in plan.faults) > 400.0
-
-
-def test_a_real_job() -> None:
-    values = run(faults_study.RANDOM)
-    assert values["outcome"] == "complete", values["cause"]
-    assert values["points"]["measured"] == values["points"]["total"] == 9
-    assert (values["danger"]["falls"], values["weak_frames"]) == (0, 0)
-    assert values["injected"]["planned"] == (planned := faults_study.FAULTS_PER_MISSION)
-    assert planned / 2 <= values["injected"]["acted"] <= planned
 
 
 @pytest.mark.parametrize(
@@ -334,28 +271,15 @@ def test_fans_that_seem_to_fail_on_an_overhang_wait_for_an_operator(signal: str,
     assert is_recoverable(plan, build_mirror(load_config(None, {"run.mirror": mirror}).mirror)) is is_so
 
 
-def test_a_cell_says_who_was_not_completed_and_is_drawn(tmp_path: Path) -> None:
-    results = []
-    for cell in cells_of(faults_study.STUDY):
-        injected: Any = {"injected": {"planned": 12, "acted": 11}}
-        ended: Any = {"is_recoverable": False, "weak_frames": 4, "outcome": "stopped", "cause": "held"}
-        runs = [
-            mission([0.001], seed=1, is_recoverable=True, weak_frames=0, **injected),
-            mission([0.001], seed=2, **ended, **injected),
-        ]
-        values, arrays = faults_study.STUDY.combine(cell.factors, runs)
-        results.append(CellResult(cell.factors, {"runs": 2, **values}, arrays))
-    first = results[0].values
-    assert (first["complete"], first["ended"]) == (1, ["seed 2 stopped: held"])
-    assert first["recoverable"] == {"runs": 1, "complete": 1}
-    assert (first["danger"]["false_edges"], first["weak_frames"]) == (2, 4)
-    assert (first["injected"]["acted"], first["points"]["total"], first["time_ratio"]) == (22, 18, 1.1)
-    lines = table([plain({**cell.factors, **cell.values}) for cell in results], faults_study.STUDY.columns).splitlines()
-    assert len(lines) == 2 + 8
-    assert lines[3].startswith("| thesis-m1 | random | 2 | 1 |")
-    assert "seed 2 stopped: held" in lines[3]
-    faults_study.STUDY.draw(results, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"faults.png", "faults.pdf"}
+def test_a_cell_says_who_was_not_completed() -> None:
+    injected: Any = {"injected": {"planned": 12, "acted": 11}}
+    ended: Any = {"is_recoverable": False, "weak_frames": 4, "outcome": "stopped", "cause": "held"}
+    whole = mission([0.001], seed=1, is_recoverable=True, weak_frames=0, **injected)
+    values, _ = faults_study.STUDY.combine({}, [whole, mission([0.001], seed=2, **ended, **injected)])
+    assert (values["complete"], values["ended"]) == (1, ["seed 2 stopped: held"])
+    assert values["recoverable"] == {"runs": 1, "complete": 1}
+    assert (values["danger"]["false_edges"], values["weak_frames"]) == (2, 4)
+    assert (values["injected"]["acted"], values["points"]["total"], values["time_ratio"]) == (22, 18, 1.1)
 
 
 # -- memory over a day -------------------------------------------------------------------------------------------------

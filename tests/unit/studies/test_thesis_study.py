@@ -1,7 +1,5 @@
 """The study `thesis`: readings of its text, its localizer and its published figures."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -10,10 +8,10 @@ from ccatp.config.models import Config
 from ccatp.core import EdgeSample, Fix, ImuSample, PanelId, WheelSample
 from ccatp.mirror.mirror import build_mirror
 from ccatp.studies import cramer_rao as cr
-from ccatp.studies.campaign import CellResult, Job, JobOutcome
+from ccatp.studies.campaign import Job, JobOutcome
 from ccatp.studies.cramer_rao import SeamPass, StopFix, TrueRecord, bounds_of, rehearse_recorded
 from ccatp.studies.mission_study import Histogram
-from ccatp.studies.thesis_study import PUBLISHED, ThesisLocalizer, cells, combine, draw, overrides_of, run_job
+from ccatp.studies.thesis_study import ThesisLocalizer, combine, overrides_of, run_job
 
 
 @pytest.mark.parametrize(("noise", "table"), [("normal", 0.0087), ("twice", 0.0175)])
@@ -63,15 +61,6 @@ def test_only_a_filter_with_a_fixed_step_can_have_a_period_error() -> None:
         run_job(Job("thesis", {"period_error": 0.013}, 1, cfg))
 
 
-def test_the_cells_are_all_readings_of_both_systems() -> None:
-    factors = [cell.factors for cell in cells()]
-    assert len(factors) == 14
-    assert sum(f["system"] == "thesis" for f in factors) == 10
-    assert not any(f["period_error"] for f in factors if f["system"] == "ours")
-    for cell in cells():
-        load_config(overrides=cell.overrides)
-
-
 def outcome(fraction: float, mean: float) -> JobOutcome:
     figures = {"within_10mm_fraction": fraction, "mean": mean, "max": 20.0}
     values = {"outcome": "complete", "cause": "", "waypoints": 36, "wanted": 36, "time_s": 500.0}
@@ -93,16 +82,6 @@ def test_a_published_figure_is_measured_in_scatters_of_a_run() -> None:
     assert values["waypoint"]["max"]["is_published_within"] is None  # the largest of five runs is no mean
     assert values["localization"]["is_published_within"] is False  # share and mean are, the largest is not
     assert values["complete"] == 2
-
-
-def test_every_figure_of_the_thesis_is_drawn(tmp_path: Path) -> None:
-    results = []
-    for cell in cells():
-        values, arrays = combine(cell.factors, [outcome(0.9, 3.0), outcome(1.0, 4.0)])
-        results.append(CellResult(cell.factors, values, arrays))
-    draw(results, tmp_path)
-    stems = ("trajectory", "localization", "waypoints")
-    assert {path.name for path in tmp_path.glob("*.png")} == {f"{s}_{noise}.png" for s in stems for noise in PUBLISHED}
 
 
 @pytest.mark.slow
