@@ -22,7 +22,7 @@ from multiprocessing import connection
 from pathlib import Path
 from threading import Thread
 from traceback import format_exception
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -32,7 +32,6 @@ from ccatp.errors import CcatpError
 from ccatp.studies import limit_threads
 from ccatp.studies.campaign import (
     WHOLE,
-    Arrays,
     CampaignError,
     CampaignFailed,
     CampaignInterrupted,
@@ -75,6 +74,15 @@ def make_out(out: Path) -> None:
         raise CampaignError(f"--out: cannot make {out}: {error.strerror or error}; choose another --out") from error
 
 
+class Finished(NamedTuple):
+    """A finished job, as a file has it."""
+
+    fingerprint: str
+    path: Path
+    outcome: JobOutcome
+    took_s: float
+
+
 @contextmanager
 def open_store(out: Path, shard: Shard = WHOLE, others: Iterable[Path] = ()) -> "Iterator[JobStore]":
     """The finished jobs in a directory, which is made if it is not there.
@@ -107,23 +115,17 @@ class JobStore:
 
     def __init__(self, file: BinaryIO, path: Path) -> None:
         self._file, self._path = file, path
-        self._done: dict[str, tuple[str, Path, JobOutcome, float]] = {}
+        self._done: dict[str, Finished] = {}
 
-    def outcome(self, job: Job) -> JobOutcome | None:
-        """The outcome of a job, None where it is to do (raises CampaignError: done under other circumstances)."""
-        if job.key not in self._done:
-            return None
-        fingerprint, path, outcome, _ = self._done[job.key]
-        if fingerprint != job.fingerprint:
+    def find(self, job: Job) -> Finished | None:
+        """A finished job, None where it is to do (raises CampaignError: done under other circumstances)."""
+        found = self._done.get(job.key)
+        if found is not None and found.fingerprint != job.fingerprint:
             raise CampaignError(
-                f"{path}: job {job.key} was done with another configuration or version; "
+                f"{found.path}: job {job.key} was done with another configuration or version; "
                 "give the options of then, or another --out"
             )
-        return outcome
-
-    def took_s(self, job: Job) -> float:
-        """Working time of a job; 0 where it is still to do."""
-        return self._done[job.key][3] if job.key in self._done else 0.0
+        return found
 
     def add(self, job: Job, outcome: JobOutcome, took_s: float = 0.0) -> None:
         """Keep a finished job and its working time; returns when it is on the disk."""
@@ -157,9 +159,8 @@ class JobStore:
     def _take(self, line: bytes, path: Path) -> None:
         record = json.loads(line)
         with np.load(io.BytesIO(base64.b64decode(record["arrays"])), allow_pickle=False) as stored:
-            arrays: Arrays = dict(stored)
-        outcome = JobOutcome(record["values"], arrays)
-        self._done.setdefault(record["key"], (record["fingerprint"], path, outcome, float(record["took_s"])))
+            outcome = JobOutcome(record["values"], dict(stored))
+        self._done.setdefault(record["key"], Finished(record["fingerprint"], path, outcome, float(record["took_s"])))
 
 
 # -- where jobs run ---------------------------------------------------------------------------------------------------
@@ -173,24 +174,22 @@ def timed(run_job: Callable[[Job], JobOutcome], job: Job) -> tuple[JobOutcome, f
     return outcome, time.perf_counter() - started_s
 
 
-Finished = Iterator[tuple[Job, "Future[tuple[JobOutcome, float]]"]]
+Ended = Iterator[tuple[Job, "Future[tuple[JobOutcome, float]]"]]
 
 
 @contextmanager
-def _started(study: Study, jobs: Sequence[Job], workers: int | None, cluster: str | None) -> Iterator[Finished]:
+def _started(study: Study, jobs: Sequence[Job], workers: int | None, cluster: str | None) -> Iterator[Ended]:
     """The jobs as they are finished: on the cluster, in this process (one worker), or in processes of this machine."""
     count = min(workers or len(os.sched_getaffinity(0)), len(jobs))
-    if cluster:
-        with _cluster(cluster) as executor:
-            yield _finished(executor, study, jobs)
-    elif count == 1:
+    if count == 1 and not cluster:
         yield _in_turn(study, jobs)
-    else:
-        with _pool(count) as executor:
-            yield _finished(executor, study, jobs)
+        return
+    with _cluster(cluster) if cluster else _pool(count) as executor:
+        sent = {executor.submit(timed, study.run_job, job): job for job in jobs}
+        yield ((sent.pop(future), future) for future in as_completed(list(sent)))  # outcomes are large: none is kept
 
 
-def _in_turn(study: Study, jobs: Sequence[Job]) -> Finished:
+def _in_turn(study: Study, jobs: Sequence[Job]) -> Ended:
     for job in jobs:
         future: Future[tuple[JobOutcome, float]] = Future()
         try:
@@ -198,12 +197,6 @@ def _in_turn(study: Study, jobs: Sequence[Job]) -> Finished:
         except Exception as error:  # raised when the result is taken, as by any executor
             future.set_exception(error)
         yield job, future
-
-
-def _finished(executor: Executor, study: Study, jobs: Sequence[Job]) -> Finished:
-    sent = {executor.submit(timed, study.run_job, job): job for job in jobs}
-    for future in as_completed(list(sent)):
-        yield sent.pop(future), future  # outcomes are large: none is kept here
 
 
 @contextmanager
@@ -303,21 +296,20 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
     jobs = [job for group in plan for job in group]
     console = Console(stderr=True, highlight=False)
     with open_store(options.out, options.shard, options.others) as store:
-        done = {job.key for job in jobs if store.outcome(job) is not None}
+        done = {job.key for job in jobs if store.find(job) is not None}
         todo = [job for job in jobs[options.shard.number - 1 :: options.shard.of] if job.key not in done]
         todo.sort(key=lambda job: job.seed)  # one job of each cell first
         _print(console, study, f"{len(todo)} jobs to do" + (f", {len(done)} done before" if done else ""))
         failures = _run_jobs(study, todo, store, console, options) if todo else []
-        found = [[store.outcome(job) for job in group] for group in plan]
-        work_s = sum(store.took_s(job) for job in jobs)
-    results = []
-    for group, outcomes in zip(plan, found, strict=True):
-        there = [outcome for outcome in outcomes if outcome is not None]
-        results.append(cell_result(study, group[0].factors, there))
-    missing = sum(outcome is None for outcomes in found for outcome in outcomes)
+        found = [[one for job in group if (one := store.find(job)) is not None] for group in plan]
+    results = [
+        cell_result(study, group[0].factors, [one.outcome for one in there])
+        for group, there in zip(plan, found, strict=True)
+    ]
+    missing = len(jobs) - sum(map(len, found))
     about: dict[str, Any] = {
         "wall_s": round(time.perf_counter() - started_s, 3),
-        "work_s": round(work_s, 3),
+        "work_s": round(sum(one.took_s for there in found for one in there), 3),
         "settings": dict(options.settings),
         **({"missing": missing} if missing else {}),
     }
@@ -360,7 +352,14 @@ def _run_jobs(
         task = progress.add_task(f"study {study.name}", total=total)
         for count, (job, future) in enumerate(finished, start=1):
             try:
-                outcome, took_s = _result(future, options.out)
+                outcome, took_s = future.result()
+            except (BrokenExecutor, CancelledError) as error:
+                what, how = "a worker died, perhaps for want of memory", "the same options, or with fewer --workers"
+                if isinstance(error, CancelledError):
+                    what, how = "the cluster has given up a job, perhaps its scheduler ended", "the same options"
+                raise CampaignFailed(
+                    f"{what}; what is done is kept in {options.out}: start again with {how}"
+                ) from error
             except CcatpError:
                 raise
             except Exception as error:  # whatever a mission dies of, the others go on
@@ -381,13 +380,3 @@ def _run_jobs(
                     console, study, f"{count} of {total} jobs ({100 * count // total} %), {left} left; last {job.key}"
                 )
     return failures
-
-
-def _result(future: "Future[tuple[JobOutcome, float]]", out: Path) -> tuple[JobOutcome, float]:
-    try:
-        return future.result()
-    except (BrokenExecutor, CancelledError) as error:
-        what, how = "a worker died, perhaps for want of memory", "the same options, or with fewer --workers"
-        if isinstance(error, CancelledError):
-            what, how = "the cluster has given up a job, perhaps its scheduler ended", "the same options"
-        raise CampaignFailed(f"{what}; what is done is kept in {out}: start again with {how}") from error

@@ -236,12 +236,11 @@ def test_finished_jobs_are_found_again_and_a_torn_line_is_not(tmp_path: Path, sh
     (path,) = (tmp_path / "new").iterdir()
     path.write_bytes(torn := path.read_bytes()[:-1])
     with open_store(tmp_path / "new") as store:
-        found = store.outcome(one)
+        found = store.find(one)
         assert found is not None
-        assert found.values == {"value": 1.5, "lost": None}
-        assert found.arrays["values"].tolist() == [0.0, 1.0, 2.0]
-        assert store.outcome(other) is None
-        assert (store.took_s(one), store.took_s(other)) == (2.5, 0.0)
+        assert (found.outcome.values, found.took_s) == ({"value": 1.5, "lost": None}, 2.5)
+        assert found.outcome.arrays["values"].tolist() == [0.0, 1.0, 2.0]
+        assert store.find(other) is None
         assert path.read_bytes() == (torn if shard.of == 2 else torn[: torn.rfind(b"\n") + 1])  # another's is left
         store.add(other, OUTCOME)
     assert len((tmp_path / "new" / "jobs.jsonl").read_bytes().splitlines()) == (1 if shard.of == 2 else 2)
