@@ -244,7 +244,8 @@ def _simulated(
 
     campaign = run_campaign(cfg, method, seeds, _progress(len(seeds)))
     if out_file is not None:
-        _write(out_file, campaign.runs[0].whole, cfg.layout)
+        run = campaign.runs[0]
+        _write(out_file, run.whole or (run.names, run.positions_m, run.covariance_m2), cfg.layout)
     if figure_file is not None:
         draw_mote_map(*pictured(campaign, seeds[0]), figure_file)
     return campaign_data(campaign)

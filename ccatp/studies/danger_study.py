@@ -2,18 +2,16 @@
 
 A cell is a mirror (width of the gaps), a speed and a way of crossing: an angle to the seam's normal, or a quarter turn
 in place whose sensors move at that speed. Both rules judge the same transits; each stops its own drives to the rim.
-
-The robot drives on constant set points; its wheels slip, its sensors err and the panels' edges lie as the world says
-(creep and vibration are left out). The rules see what the danger loop sees: edge and encoder samples frame by frame,
-and an estimate of the pose every fifth frame.
+Set points are constant; slip, sensors and panel edges are as in the world, creep and vibration are left out.
 """
 
 from collections.abc import Callable, Sequence
-from math import cos, hypot, pi, radians, sin, sqrt
+from math import cos, hypot, pi, radians, sin
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EdgeSample, EventCode, FloatArray, PanelId, WheelSample
@@ -46,7 +44,6 @@ _RUN_DOWN_S = 1.0  # a robot without set point has stopped after this: a dozen t
 _BLIND_M = 0.4  # an edge that was not seen by now is not going to be seen
 _DRIVES = 25  # of each kind in a job
 _TRANSITS, _RIM = 3, 4  # streams of random numbers of a seed
-_Z_95 = 1.96  # quantiles of the normal distribution
 _RESAMPLES = 2000
 
 
@@ -84,13 +81,11 @@ def off_time_rule(off_s: float) -> EdgeRule:
 
 
 def build_rule(name: str, mirror: Mirror, cfg: Config) -> EdgeRule:
-    """A rule of ``RULES``: the thesis's, or the daemon's, which compares travel and map (ValueError: no such rule)."""
+    """A rule of ``RULES``: the thesis's, or the daemon's, which compares travel and map."""
     if name == "thesis":
         return off_time_rule(OFF_S)
-    if name == "shipped":
-        monitor = DangerMonitor(mirror, cfg.robot, cfg.danger)
-        return lambda frame, estimate: monitor.step(frame, estimate).code is EventCode.NEAR_EDGE
-    raise ValueError(f"no edge rule is called {name!r}: take one of {', '.join(RULES)}")
+    monitor = DangerMonitor(mirror, cfg.robot, cfg.danger)
+    return lambda frame, estimate: monitor.step(frame, estimate).code is EventCode.NEAR_EDGE
 
 
 class Rig:
@@ -254,12 +249,13 @@ def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     arrays: dict[str, FloatArray] = {}
     for name in RULES:
         false_edges = sum(outcome.values[name]["false_edges"] for outcome in outcomes)
-        low, high = wilson(false_edges, transits)
+        # Wilson 1927: sensible for 0 hits, too
+        interval = binomtest(false_edges, transits).proportion_ci(method="wilson")
         values[name] = {
             "false_edges": false_edges,
             "false_edge_probability": false_edges / transits,
-            "false_edge_low": low,
-            "false_edge_high": high,
+            "false_edge_low": float(interval.low),
+            "false_edge_high": float(interval.high),
         }
         key = f"{name}_overrun_m"
         kept = [outcome.arrays[key] for outcome in outcomes if key in outcome.arrays]
@@ -280,19 +276,6 @@ def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     return JobOutcome(values, arrays)
 
 
-def wilson(hits: int, of: int) -> tuple[float, float]:
-    """95 % interval of a probability after ``hits`` out of ``of`` (Wilson 1927); sensible for 0 hits, too.
-
-    ValueError: no trials, or more hits than trials.
-    """
-    if not 0 <= hits <= of or of == 0:
-        raise ValueError(f"{hits} hits out of {of} trials have no probability: count again")
-    p, z2 = hits / of, _Z_95 * _Z_95
-    centre = (p + z2 / (2.0 * of)) / (1.0 + z2 / of)
-    half = _Z_95 / (1.0 + z2 / of) * sqrt(p * (1.0 - p) / of + z2 / (4.0 * of * of))
-    return max(centre - half, 0.0), min(centre + half, 1.0)
-
-
 def bootstrap(values: FloatArray, q: float) -> tuple[float, float]:
     """95 % interval of the quantile ``q`` (0 to 1) of values (k,) by resampling with a fixed seed."""
     drawn = np.random.default_rng(0).choice(values, (_RESAMPLES, values.size))
@@ -302,22 +285,12 @@ def bootstrap(values: FloatArray, q: float) -> tuple[float, float]:
 
 def draw(results: Sequence[CellResult], out: Path) -> None:
     """Figures ``danger_false_edges_<mirror>`` and ``danger_overrun_<mirror>``, one panel per rule."""
-    false_edges = [
-        Measure(
-            name, (f"{rule}.false_edge_low", f"{rule}.false_edge_high"), f"{rule}.false_edge_probability", is_log=False
-        )
-        for rule, name in RULES.items()
-    ]
-    overruns = [
-        Measure(
-            name,
-            (f"{rule}.overrun_min_mm", f"{rule}.overrun_max_mm"),
-            f"{rule}.overrun_median_mm",
-            line=0.0,
-            is_log=False,
-        )
-        for rule, name in RULES.items()
-    ]
+    false_edges, overruns = [], []
+    for rule, name in RULES.items():
+        ends = f"{rule}.false_edge_low", f"{rule}.false_edge_high"
+        false_edges.append(Measure(name, ends, f"{rule}.false_edge_probability", is_log=False))
+        ends = f"{rule}.overrun_min_mm", f"{rule}.overrun_max_mm"
+        overruns.append(Measure(name, ends, f"{rule}.overrun_median_mm", line=0.0, is_log=False))
     for (mirror,), there in grouped(results, "mirror").items():
         title, names = f"A seam taken for an edge on {mirror}: probability, 95 %", ("speed_m_s", "crossing")
         draw_ranges(rows_by(there, *names), false_edges, title, out / f"danger_false_edges_{mirror}")

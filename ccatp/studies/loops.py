@@ -10,6 +10,7 @@ Needs the extra ``tune`` (python-control), imported only when a system is built.
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from math import degrees, inf, isfinite, pi, sqrt, tau
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -299,10 +300,11 @@ def run(cfg: Config, out: Path) -> dict[str, Any]:
     """
     started_s = time.perf_counter()
     loops = list(loops_of(cfg))
-    cells = [_cell(loop, margins(loop)) for loop in (*loops, *limit_of(cfg))]
-    for gains, axis in dict.fromkeys((loop.gains, loop.axis) for loop in loops):
-        group = [loop for loop in loops if (loop.gains, loop.axis) == (gains, axis)]
-        _draw_bode(group, [margins(loop) for loop in group], out)
+    found = {loop: margins(loop) for loop in (*loops, *limit_of(cfg))}
+    cells = [_cell(loop, each) for loop, each in found.items()]
+    for _, alike in groupby(loops, key=lambda loop: (loop.gains, loop.axis)):
+        group = list(alike)
+        _draw_bode(group, [found[loop] for loop in group], out)
         _draw_locus(group, out)
     omega = np.geomspace(*OMEGA_RAD_S, GRID_POINTS)
     magnitude, phase = (np.array(part) for part in zip(*(response(loop, omega) for loop in loops), strict=True))

@@ -1,7 +1,8 @@
 """Self-mapping of simulated fields of motes by filter or batch: one field, and many of one configuration."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from itertools import cycle, islice
 from typing import Any, NamedTuple
 
@@ -87,18 +88,26 @@ class MoteRun:
     positions_m: FloatArray
     covariance_m2: FloatArray
     true_m: FloatArray
-    rms_m: float  # error; after the best rigid motion where is_aligned
-    phase1_rms_m: float | None  # the same of phase 1; None where it could not place all motes
-    expected_rms_m: float
-    iterations: int
-    trace_m: FloatArray  # error after each update, phase 1 first; of the batch just both
+    phase1_rms_m: float | None  # error of phase 1; None where it could not place all motes
+    trace_m: FloatArray  # error after each update, phase 1 first; of the batch just both; aligned where is_aligned
     expected_trace_m: FloatArray
-    is_aligned: bool  # whether the frame was free
+    is_aligned: bool  # whether the frame was free: errors are those after the best rigid motion
+    iterations: int
     offset_m: float
     scale: float
-    nis: FloatArray
-    doubtful: tuple[int, ...]  # rows of motes whose mirror image fits as well, or that hang on too few ranges
-    whole: tuple[tuple[str, ...], FloatArray, FloatArray]  # of all motes of the stands, if there are others
+    nis: FloatArray = field(default_factory=lambda: np.zeros(0))
+    doubtful: tuple[int, ...] = ()  # rows of motes whose mirror image fits as well, or that hang on too few ranges
+    whole: tuple[tuple[str, ...], FloatArray, FloatArray] | None = None  # all motes of the stands, if there are others
+
+    @property
+    def rms_m(self) -> float:
+        """Error at the end."""
+        return float(self.trace_m[-1])
+
+    @property
+    def expected_rms_m(self) -> float:
+        """The same as the map's covariance has it."""
+        return float(self.expected_trace_m[-1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,28 +148,23 @@ def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
     went = run_phase_two(mapper, readings, cfg.phase2.target_rms_m)
     aligned = bool(np.isnan(known).all())
     true_m = field.true_m[motes]
-    trace = np.array([_error_m(found, true_m, aligned) for found in went.positions_m])
-    names = tuple(plan.names[mote] for mote in motes)
-    whole = plan.names, mapper.positions_m, mapper.covariance_m2
+    whole = None
     if plan.networks:
         every = complete_stands(plan, first.positions_m, first.covariance_m2, mapper.positions_m, mapper.covariance_m2)
         whole = tuple(plan.names[mote] for mote in every.motes), every.positions_m, every.covariance_m2
     return MoteRun(
-        names=names,
+        names=tuple(plan.names[mote] for mote in motes),
         positions_m=mapper.positions_m,
         covariance_m2=mapper.covariance_m2,
         true_m=true_m,
-        rms_m=float(trace[-1]),
         phase1_rms_m=_error_m(places, true_m, aligned),
-        expected_rms_m=float(went.expected_rms_m[-1]),
-        iterations=len(went.nis),
-        trace_m=trace,
+        trace_m=np.array([_error_m(found, true_m, aligned) for found in went.positions_m]),
         expected_trace_m=went.expected_rms_m,
         is_aligned=aligned,
+        iterations=len(went.nis),
         offset_m=mapper.offset_m,
         scale=mapper.scale,
         nis=went.nis,
-        doubtful=(),
         whole=whole,
     )
 
@@ -173,10 +177,9 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
     """
     plan = field.plan
     network = batch_network(cfg, field)
-    try:
+    first = None
+    with suppress(MappingError):  # the batch needs no trilateration
         first = first_map(cfg, field)
-    except MappingError:  # the batch needs no trilateration
-        first = None
     start_m = None if first is None else first.positions_m
     mirrors = () if outlook is None else outlook.folds.mirrors
     settings = MapFitSettings(cfg.batch.robust_scale, cfg.batch.max_iterations)
@@ -189,28 +192,20 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
     positions, covariance = _in_field(field, found)
     positions, covariance = positions[motes], _block(covariance, motes, plan.dimension)
     error_m = aligned_rms_m(positions, true_m, mirrors=not plan.bodies)
-    expected_m = map_rms_m(found.covariance_m2, found.positions_m, motes, aligned=True)
-    names = tuple(plan.names[mote] for mote in motes)
-    lost = {mote for fold in found.folds for mote in fold.motes}
-    if outlook is not None:
-        lost |= {mote for _, moved in outlook.folds.mirrors for mote in moved}
+    lost = {mote for fold in found.folds for mote in fold.motes} | {mote for _, moved in mirrors for mote in moved}
     return MoteRun(
-        names=names,
+        names=tuple(plan.names[mote] for mote in motes),
         positions_m=positions,
         covariance_m2=covariance,
         true_m=true_m,
-        rms_m=error_m,
         phase1_rms_m=phase1_m,
-        expected_rms_m=expected_m,
-        iterations=found.iterations,
         trace_m=np.array([error_m if phase1_m is None else phase1_m, error_m]),
-        expected_trace_m=np.array([expected_m]),
+        expected_trace_m=np.array([map_rms_m(found.covariance_m2, found.positions_m, motes, aligned=True)]),
         is_aligned=True,
+        iterations=found.iterations,
         offset_m=found.fit.state.offset_m,
         scale=found.fit.state.scale,
-        nis=np.zeros(0),
         doubtful=tuple(row for row, mote in enumerate(motes) if mote in lost),
-        whole=(names, positions, covariance),
     )
 
 
@@ -326,13 +321,17 @@ def run_campaign(
 def campaign_data(campaign: MoteCampaign) -> dict[str, Any]:
     """What ``ccatp radio map --json`` prints."""
     runs, outlook = campaign.runs, campaign.outlook
-    phase1_m = [run.phase1_rms_m for run in runs if run.phase1_rms_m is not None]
+
+    def median(of: Callable[[MoteRun], float | None]) -> float | None:
+        known = [value for run in runs if (value := of(run)) is not None]
+        return float(np.median(known)) if known else None
+
     return {
         "rms_m": percentiles([run.rms_m for run in runs]),
         "crlb_m": outlook.bound_rms_m,
         "rank_deficiency": outlook.freedom.deficiency,
         "fold_over_risk": not outlook.folds.is_unique,
-        "phase1_rms_m": float(np.median(phase1_m)) if phase1_m else None,
+        "phase1_rms_m": median(lambda run: run.phase1_rms_m),
         "iterations": int(np.median([run.iterations for run in runs])),
         "method": campaign.method,
         "seeds": len(runs),
@@ -340,9 +339,9 @@ def campaign_data(campaign: MoteCampaign) -> dict[str, Any]:
         "frame": "aligned" if runs[0].is_aligned else "surveyed",
         "rms_of_all_m": float(np.sqrt(np.mean([run.rms_m**2 for run in runs]))),
         "motes_in_doubt": int(np.median([len(run.doubtful) for run in runs])),
-        "rms_of_others_m": float(np.median([sure_rms_m(run) for run in runs])),
-        "expected_rms_m": float(np.median([run.expected_rms_m for run in runs])),
-        "offset_m": float(np.median([run.offset_m for run in runs])),
+        "rms_of_others_m": median(sure_rms_m),
+        "expected_rms_m": median(lambda run: run.expected_rms_m),
+        "offset_m": median(lambda run: run.offset_m),
         "scale": 1.0 + float(np.median([run.scale for run in runs])),
         "free_directions": [*outlook.freedom.frame, *outlook.freedom.flexes, *outlook.freedom.calibration],
         "warnings": list(outlook.folds.warnings),
