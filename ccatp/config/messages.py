@@ -40,12 +40,14 @@ class ConfigProblem(NamedTuple):
     related: tuple[Key, ...] = ()
 
 
-def depth_in(tree: object, key: Key) -> int:
+def depth_in(tree: Any, key: Key) -> int:
     """How many parts of a key a tree holds; all of them where it holds a value in place of a section."""
     for depth, part in enumerate(key):
-        if not isinstance(tree, Mapping):
+        is_list_of_tables = isinstance(tree, list) and all(isinstance(one, Mapping) for one in tree)
+        known = range(len(tree)) if is_list_of_tables else tree
+        if not isinstance(known, Mapping | range):
             break
-        if part not in tree:
+        if part not in known:
             return depth
         tree = tree[part]
     return len(key)

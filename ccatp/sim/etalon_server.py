@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from ccatp.config.models import SimEtalonConfig
 from ccatp.core import Vector3
 from ccatp.links import multiline
-from ccatp.links.multiline import ChannelData, Command, Connected, LaserReady, MultilineRequest, Notice, Remark, Reply
+from ccatp.links.multiline import ChannelData, Command, Connected, LaserReady, Notice, Remark, Reply
 from ccatp.links.robot_messages import LineBuffer, LineTooLong
 from ccatp.sim.laser import EtalonModel, PuckTruth
 
@@ -108,7 +108,6 @@ class EtalonSimulator:
     Attributes:
         model: lengths and flags; ``blocked``, ``flags`` and ``laser_ready`` may be changed at any time.
         connected: answer to ``isconnected``.
-        streaming: the session that has the push stream.
         counts: requests, bad_requests, oversized_lines, truth_failures, refused_clients, lost_clients.
     """
 
@@ -127,7 +126,8 @@ class EtalonSimulator:
         self._truth = truth
         self._server: asyncio.Server | None = None
         self._sessions: set[asyncio.Task[None]] = set()
-        self.streaming: _Session | None = None
+        self._streaming: asyncio.StreamWriter | None = None  # the client that has the push stream
+        self._push: asyncio.Task[None] | None = None
         self._end: asyncio.Future[None] | None = None
 
     async def start(self, host: str, port: int, sock: socket.socket | None = None) -> int:
@@ -170,7 +170,7 @@ class EtalonSimulator:
             return
         self._sessions.add(task)
         try:
-            await _Session(self, writer).run(reader)
+            await self._converse(reader, writer)
         except* asyncio.CancelledError:
             pass  # by close(); asyncio logs a connection's task that ends cancelled as an error
         except* LineTooLong:
@@ -184,7 +184,51 @@ class EtalonSimulator:
             self._sessions.discard(task)
             writer.transport.abort()
 
-    async def lengths(self, channels: Sequence[int]) -> ChannelData:
+    async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer one client until it ends its side."""
+        buffer = LineBuffer(multiline.MAX_LINE_BYTES)
+        async with asyncio.TaskGroup() as group:
+            try:
+                while data := await reader.read(_READ_BYTES):
+                    for line in buffer.feed(data):
+                        reply = await self._answer(line.rstrip(b"\r"), writer)
+                        await _send(writer, reply)
+                        if reply is Notice.STARTED:
+                            self._push = group.create_task(self._stream(writer))
+                    if buffer.error is not None:
+                        raise buffer.error
+            finally:
+                self._stop_stream(writer)
+        writer.close()
+        async with asyncio.timeout(_SEND_TIMEOUT_S):
+            await writer.wait_closed()
+
+    async def _answer(self, line: bytes, writer: asyncio.StreamWriter) -> Reply:
+        try:
+            request = multiline.parse_request(line)
+        except multiline.BadMultilineRequest as error:
+            self.counts["bad_requests"] += 1
+            return Remark("error", error.reason)
+        self.counts["requests"] += 1
+        is_streaming = writer is self._streaming
+        match request.command:
+            case Command.STOP_MEASUREMENT:
+                self._stop_stream(writer)
+                return Notice.STOPPED
+            case Command.LATEST_LENGTH_VALID if not is_streaming:
+                return await self._lengths(request.channels)
+            case Command.IS_CONNECTED if not is_streaming:
+                return Connected(self.connected)
+            case Command.LASER_READY if not is_streaming:
+                return LaserReady(self.model.laser_ready)
+            case Command.ENVIRONMENT_DATA if not is_streaming:
+                return self.model.environment
+        if self._streaming is not None:
+            return _BUSY
+        self._streaming = writer
+        return Notice.STARTED
+
+    async def _lengths(self, channels: Sequence[int]) -> ChannelData:
         """Measure once."""
         try:
             puck = await self._truth.puck()
@@ -193,77 +237,20 @@ class EtalonSimulator:
             return ChannelData(self.model.failed_records(channels), server_error=1)
         return ChannelData(self.model.records(channels, puck))
 
-
-class _Session:
-    def __init__(self, server: EtalonSimulator, writer: asyncio.StreamWriter) -> None:
-        self._server = server
-        self._writer = writer
-        self._push: asyncio.Task[None] | None = None
-
-    async def run(self, reader: asyncio.StreamReader) -> None:
-        buffer = LineBuffer(multiline.MAX_LINE_BYTES)
-        async with asyncio.TaskGroup() as group:
-            try:
-                while data := await reader.read(_READ_BYTES):
-                    for line in buffer.feed(data):
-                        await self._handle(line.rstrip(b"\r"), group)
-                    if buffer.error is not None:
-                        raise buffer.error
-            finally:
-                self._stop_stream()
-        self._writer.close()
-        async with asyncio.timeout(_SEND_TIMEOUT_S):
-            await self._writer.wait_closed()
-
-    async def _handle(self, line: bytes, group: asyncio.TaskGroup) -> None:
-        try:
-            request = multiline.parse_request(line)
-        except multiline.BadMultilineRequest as error:
-            self._server.counts["bad_requests"] += 1
-            await self._send(Remark("error", error.reason))
-            return
-        self._server.counts["requests"] += 1
-        reply = await self._answer(request)
-        await self._send(reply)
-        if reply is Notice.STARTED:
-            self._push = group.create_task(self._stream())
-
-    async def _answer(self, request: MultilineRequest) -> Reply:
-        server = self._server
-        command = request.command
-        reply: Reply = _BUSY
-        if command is Command.STOP_MEASUREMENT:
-            self._stop_stream()
-            reply = Notice.STOPPED
-        elif self._push is not None:
-            pass
-        elif command is Command.LATEST_LENGTH_VALID:
-            reply = await server.lengths(request.channels)
-        elif command is Command.IS_CONNECTED:
-            reply = Connected(server.connected)
-        elif command is Command.LASER_READY:
-            reply = LaserReady(server.model.laser_ready)
-        elif command is Command.ENVIRONMENT_DATA:
-            reply = server.model.environment
-        elif server.streaming is None:
-            server.streaming = self
-            reply = Notice.STARTED
-        return reply
-
-    async def _stream(self) -> None:
+    async def _stream(self, writer: asyncio.StreamWriter) -> None:
         while True:
-            await self._send(await self._server.lengths(self._server.model.channels))
-            await asyncio.sleep(1.0 / self._server.push_hz)
+            await _send(writer, await self._lengths(self.model.channels))
+            await asyncio.sleep(1.0 / self.push_hz)
 
-    def _stop_stream(self) -> None:
+    def _stop_stream(self, writer: asyncio.StreamWriter) -> None:
         """End the stream: a record is written in one piece, so after this none follows."""
-        if self._push is not None:
-            self._push.cancel()
-            self._push = None
-        if self._server.streaming is self:
-            self._server.streaming = None
+        if self._streaming is writer:
+            self._streaming = None
+            if self._push is not None:
+                self._push.cancel()
 
-    async def _send(self, reply: Reply) -> None:
-        self._writer.write(multiline.format_reply(reply))
-        async with asyncio.timeout(_SEND_TIMEOUT_S):
-            await self._writer.drain()
+
+async def _send(writer: asyncio.StreamWriter, reply: Reply) -> None:
+    writer.write(multiline.format_reply(reply))
+    async with asyncio.timeout(_SEND_TIMEOUT_S):
+        await writer.drain()

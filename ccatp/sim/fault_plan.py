@@ -6,7 +6,6 @@ The plan is TOML and strict: each mistake is one line with file, line, key and a
 
 import json
 import math
-import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -261,7 +260,7 @@ def parse_plan(text: str, name: str) -> FaultPlan:
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
         raise ConfigError(f"{name}: is not TOML: {error}") from error
     problems = [
-        f"{_place(name, text, section, 0, '')}: {section} is unknown; {choice_hint(section, _SECTIONS)}"
+        f"{name}:{find_line(text, (section,))}: {section} is unknown; {choice_hint(section, _SECTIONS)}"
         for section in tree
         if section not in _SECTIONS
     ]
@@ -275,8 +274,8 @@ def parse_plan(text: str, name: str) -> FaultPlan:
             fault, wrong = _parse_fault(row) if section == "fault" else _parse_link_fault(row)
             found[section].append(fault)
             for key, what in wrong:
-                place = _place(name, text, section, index, key.split("[", maxsplit=1)[0])
-                problems.append(f"{place}: {section}[{index}].{key} {what}")
+                line = find_line(text, (section, index, key.split("[", maxsplit=1)[0]))
+                problems.append(f"{name}:{line}: {section}[{index}].{key} {what}")
     if problems:
         raise ConfigError(*problems, shows_all=True)
     return FaultPlan(tuple(found["fault"]), tuple(found["link"]))
@@ -353,14 +352,3 @@ def _validate(model: Any, problems: _Problems, row: Mapping[str, Any]) -> tuple[
         return model.model_validate_json(json.dumps(row, default=str), strict=True), problems
     except ValidationError as error:
         return None, [(format_key(one.key), one.what) for one in faults_of(error.errors(), model)]
-
-
-def _place(name: str, text: str, section: str, index: int, key: str) -> str:
-    """``file:line`` of a key in the table of that number, or of the table; the bare name where neither is found."""
-    lines = text.splitlines()
-    headers = [k for k, line in enumerate(lines) if re.match(rf"\s*\[\[?\s*{re.escape(section)}\s*\]", line)]
-    if index >= len(headers):
-        return name
-    first, last = headers[index], [*headers, len(lines)][index + 1]
-    line = find_line("\n".join(lines[first:last]), (section, key))
-    return f"{name}:{first + (line or 1)}"

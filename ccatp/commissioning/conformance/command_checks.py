@@ -31,7 +31,7 @@ from ccatp.links.robot_codec import format_drive
 from ccatp.links.robot_messages import MAX_LINE_BYTES
 
 CHECKS = CheckList()
-check, check_steady = CHECKS.add, CHECKS.using(steady)
+check, check_steady = CHECKS.add, partial(CHECKS.add, fixture=steady)
 AFTER_TTL_S = 0.3  # watched beyond the time-to-live
 SHORT_S = 0.12  # wall time in which a message on loopback or a local network has arrived, below every useful ttl_s
 NOISE_S = 0.08  # between bad lines: fewer than 20 a second
@@ -51,7 +51,7 @@ BYTE_S = 0.002  # between single bytes
 
 def _always_held(key: Key, context: CheckContext) -> str:
     pair = ControllerAndMonitor(context)
-    pair.withhold(key)
+    _withhold(pair, key)
     facts = context.facts
     frames = pair.run(facts.ttl_s + AFTER_TTL_S)
     begin_s = frames[0].t + facts.ttl_s + LATE_FRAMES * facts.frame_s
@@ -62,9 +62,16 @@ def _always_held(key: Key, context: CheckContext) -> str:
 
 
 def _ttl(key: Key, pair: ControllerAndMonitor) -> str:
-    pair.withhold(key)
+    _withhold(pair, key)
     frames = pair.run(pair.facts.ttl_s + AFTER_TTL_S)
     return check_ttl(frames, key, pair.facts.ttl_s, pair.facts.frame_s)
+
+
+def _withhold(pair: ControllerAndMonitor, key: Key) -> None:
+    if key == "drive":
+        pair.rates = None
+    else:
+        pair.allowed = None
 
 
 check("no-permit", "once a monitor has joined, wheels are held without its permit", "real time")(
@@ -204,7 +211,7 @@ def _lost(key: Key, ending: Ending, context: CheckContext) -> str:
     """The session that sends one of the two ends, and the other sends a last message right behind."""
     witness: Key = "permit" if key == "drive" else "drive"
     for _ in range(ATTEMPTS):
-        with steady(context) as (pair,):
+        with steady(context) as pair:
             frames = _end(pair, key, witness, ending)
         seen = check_lost(frames, witness, context.facts.ttl_s, context.facts.frame_s)
         if seen is not None:
@@ -260,15 +267,15 @@ for _role, _key in LOST:
 
 
 @contextmanager
-def _changed_fans(context: CheckContext) -> Iterator[tuple[ControllerAndMonitor, Pair]]:
+def _changed_fans(context: CheckContext) -> Iterator[ControllerAndMonitor]:
     """Fans at another duty than they were found at; put back at the end."""
     pair = ControllerAndMonitor(context)
     left, right = pair.steady().fans
-    duty = other_duty((left, right), context.facts.robot.fan_floor)
+    pair.duty = duty = other_duty((left, right), context.facts.robot.fan_floor)
     try:
         pair.fans(duty)
         pair.expect(lambda frame: frame.has_fans(duty), f"fans never went to {_shown(duty)}")
-        yield pair, duty
+        yield pair
     finally:
         with suppress(CheckFailed):
             if pair.controller.is_ended or not pair.controller.is_open:
@@ -278,7 +285,7 @@ def _changed_fans(context: CheckContext) -> Iterator[tuple[ControllerAndMonitor,
             pair.expect(lambda frame: frame.has_fans((left, right)), "")
 
 
-check_fans = CHECKS.using(_changed_fans)
+check_fans = partial(CHECKS.add, fixture=_changed_fans)
 
 
 def other_duty(duty: Pair, lowest: float) -> Pair:
@@ -289,9 +296,9 @@ def other_duty(duty: Pair, lowest: float) -> Pair:
     return left, right
 
 
-def _check_unchanged(frames: Sequence[Frame], fans: Pair, cause: str) -> None:
+def _check_unchanged(pair: ControllerAndMonitor, frames: Sequence[Frame], cause: str) -> None:
     for frame in frames:
-        require(frame.has_fans(fans), f"fans went from {list(fans)} to {frame.fans} {cause}")
+        require(frame.has_fans(pair.duty), f"fans went from {list(pair.duty)} to {frame.fans} {cause}")
 
 
 def _shown(duty: Sequence[float]) -> str:
@@ -299,78 +306,79 @@ def _shown(duty: Sequence[float]) -> str:
 
 
 @check_fans("fans", "duties stay in force until changed")
-def _fans_obeyed(pair: ControllerAndMonitor, duty: Pair) -> str:
+def _fans_obeyed(pair: ControllerAndMonitor) -> str:
     pair.settle()
-    _check_unchanged(pair.settle(), duty, "by themselves")
-    return f"fans at {_shown(duty)}"
+    _check_unchanged(pair, pair.settle(), "by themselves")
+    return f"fans at {_shown(pair.duty)}"
 
 
 @check_fans("newest-fans", "a fans command with an older or equal seq is dropped")
-def _newest_fans(pair: ControllerAndMonitor, duty: Pair) -> str:
-    last = pair.fans(duty)
+def _newest_fans(pair: ControllerAndMonitor) -> str:
+    last = pair.fans(pair.duty)
     pair.settle()
-    other = other_duty(duty, pair.facts.robot.fan_floor)
+    other = other_duty(pair.duty, pair.facts.robot.fan_floor)
     for seq in (last - 1, last):
         pair.fans(other, seq)
-        _check_unchanged([*pair.settle(), *pair.run_frames(2)], duty, f"by command {seq} after {last}")
+        _check_unchanged(pair, [*pair.settle(), *pair.run_frames(2)], f"by command {seq} after {last}")
     return f"commands {last - 1} and {last} after {last} dropped"
 
 
 @check_fans("role-fans", "fans are the controller's")
-def _fans_of_the_monitor(pair: ControllerAndMonitor, duty: Pair) -> str:
-    left, right = other_duty(duty, pair.facts.robot.fan_floor)
+def _fans_of_the_monitor(pair: ControllerAndMonitor) -> str:
+    left, right = other_duty(pair.duty, pair.facts.robot.fan_floor)
     pair.monitor.send(b'{"type":"fans","seq":%d,"duty":[%.3f,%.3f]}\n' % (pair.context.next_seq(), left, right))
-    _check_unchanged([*pair.run_frames(10), *pair.settle()], duty, "by a command of the monitor")
+    _check_unchanged(pair, [*pair.run_frames(10), *pair.settle()], "by a command of the monitor")
     return "a command of the monitor does nothing"
 
 
 @check_fans("fans-ttl", "fans are never changed by a time-out", "real time")
-def _fans_after_time_out(pair: ControllerAndMonitor, duty: Pair) -> str:
+def _fans_after_time_out(pair: ControllerAndMonitor) -> str:
     silence_s = pair.facts.ttl_s + AFTER_TTL_S
     pair.rates = pair.allowed = None
-    _check_unchanged(pair.run(silence_s), duty, "by a time-out")
-    return f"{_shown(duty)} over {silence_s:.2f} s without drive and permit"
+    _check_unchanged(pair, pair.run(silence_s), "by a time-out")
+    return f"{_shown(pair.duty)} over {silence_s:.2f} s without drive and permit"
 
 
 @check_fans("fans-stop", "fans are never changed by a stop")
-def _fans_after_stop(pair: ControllerAndMonitor, duty: Pair) -> str:
+def _fans_after_stop(pair: ControllerAndMonitor) -> str:
     pair.allowed = NOTHING
-    _check_unchanged(pair.run_frames(10), duty, "by a permit that allows nothing")
-    return f"{_shown(duty)} while nothing is allowed"
+    _check_unchanged(pair, pair.run_frames(10), "by a permit that allows nothing")
+    return f"{_shown(pair.duty)} while nothing is allowed"
 
 
-def _fans_after_lost(ending: Ending, pair: ControllerAndMonitor, duty: Pair) -> str:
+def _fans_after_lost(ending: Ending, pair: ControllerAndMonitor) -> str:
     """Both sessions end, one after the other, and join again."""
     pair.controller.end(ending)
     if not pair.facts.lockstep:  # there the monitor sees no frame without the controller
         pair.rates = None
-        _check_unchanged(pair.run_frames(10), duty, f"by a lost controller ({ending})")
+        _check_unchanged(pair, pair.run_frames(10), f"by a lost controller ({ending})")
     pair.monitor.end(ending)
     pair.rejoin()
     first = len(pair.frames)
     pair.steady()
-    _check_unchanged(pair.frames[first:], duty, f"by lost sessions ({ending})")
-    return f"{_shown(duty)} after {ending}"
+    _check_unchanged(pair, pair.frames[first:], f"by lost sessions ({ending})")
+    return f"{_shown(pair.duty)} after {ending}"
 
 
-check_fans("fans-fin", "fans are never changed by a lost session")(partial(_fans_after_lost, "FIN"))
-check_fans("fans-rst", "fans are never changed by a lost session")(partial(_fans_after_lost, "RST"))
+for _ending in ENDINGS:
+    check_fans(f"fans-{_ending.lower()}", "fans are never changed by a lost session")(
+        partial(_fans_after_lost, _ending)
+    )
 
 
-@check("fan-floor", "a duty below fan_floor is clamped to it, without a fault")
-def _fan_floor(context: CheckContext) -> str:
-    lowest = context.facts.robot.fan_floor
+@check_fans("fan-floor", "a duty below fan_floor is clamped to it, without a fault")
+def _fan_floor(pair: ControllerAndMonitor) -> str:
+    lowest = pair.facts.robot.fan_floor
     if lowest <= 0.0:
         raise NotApplicable("fan_floor 0")
-    with _changed_fans(context) as (pair, _):
-        below = max(0.0, lowest - FAN_STEP)
-        pair.fans((below, below))
-        for frame in [*pair.settle(), *pair.run_frames(2)]:
-            require(min(frame.fans) >= lowest - DUTY_TOLERANCE, f"fans at {_shown(frame.fans)}, floor {lowest:g}")
-        require(pair.newest.has_fans((lowest, lowest)), f"fans at {_shown(pair.newest.fans)}")
-        faults = pair.messages[0][-1].get("faults", [])
-        require("fan_left" not in faults and "fan_right" not in faults, f"faults {faults} for a duty below the floor")
-        return f"duty {below:g} clamped to {lowest:g}"
+    below = max(0.0, lowest - FAN_STEP)
+    pair.fans((below, below))
+    for frame in [*pair.settle(), *pair.run_frames(2)]:
+        require(min(frame.fans) >= lowest - DUTY_TOLERANCE, f"fans at {_shown(frame.fans)}, floor {lowest:g}")
+    require(pair.newest.has_fans((lowest, lowest)), f"fans at {_shown(pair.newest.fans)}")
+    faults = pair.messages[0][-1].get("faults", [])
+    require("fan_left" not in faults and "fan_right" not in faults, f"faults {faults} for a duty below the floor")
+    return f"duty {below:g} clamped to {lowest:g}"
 
 
 # -- lines ------------------------------------------------------------------------------------------------------------
@@ -460,7 +468,7 @@ def _single_bytes(context: CheckContext) -> str:
         time.sleep(BYTE_S)
     require(context.answer(connection)["type"] == "joined", "a join in single bytes is refused")
     context.clear()
-    with steady(context) as (pair,):
+    with steady(context) as pair:
         seq = context.next_seq()
         for byte in format_drive(seq, pair.newest.seq, 0.0, 0.0):
             pair.controller.send(bytes((byte,)))

@@ -9,7 +9,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -46,9 +46,8 @@ class NotApplicable(Exception):
     """The server promises nothing here, or nothing that can be seen; the text is the reason."""
 
 
-Run = Callable[["CheckContext"], str]
-FixtureRun = Callable[..., str]
-Fixture = Callable[["CheckContext"], AbstractContextManager[tuple[Any, ...]]]
+Run = Callable[[Any], str]
+Fixture = Callable[["CheckContext"], AbstractContextManager[Any]]
 
 
 class Check(NamedTuple):
@@ -56,37 +55,28 @@ class Check(NamedTuple):
 
     check_id: str
     promise: str
-    run: Run
-    needs: tuple[Need, ...] = ()
+    run: Callable[["CheckContext"], str]
+    needs: tuple[Need, ...]
 
 
 class CheckList(list[Check]):
     """Checks in the order in which they run."""
 
-    def add(self, check_id: str, promise: str, *needs: Need) -> Callable[[Run], Run]:
-        """Decorator: append a function. Without what it needs a check is not applicable."""
+    def add(self, check_id: str, promise: str, *needs: Need, fixture: Fixture = nullcontext) -> Callable[[Run], Run]:
+        """Decorator: append a function of what the fixture makes of the context, which is the context by default.
+
+        Without what it needs a check is not applicable.
+        """
 
         def append(run: Run) -> Run:
-            self.append(Check(check_id, promise, run, needs))
+            def check(context: CheckContext) -> str:
+                with fixture(context) as given:
+                    return run(given)
+
+            self.append(Check(check_id, promise, check, needs))
             return run
 
         return append
-
-    def using(self, fixture: Fixture) -> Callable[..., Callable[[FixtureRun], FixtureRun]]:
-        """A decorator as ``add``, for functions that take what a fixture gives them."""
-
-        def add(check_id: str, promise: str, *needs: Need) -> Callable[[FixtureRun], FixtureRun]:
-            def append(run: FixtureRun) -> FixtureRun:
-                @self.add(check_id, promise, *needs)
-                def _(context: CheckContext) -> str:
-                    with fixture(context) as given:
-                        return run(*given)
-
-                return run
-
-            return append
-
-        return add
 
 
 def require(is_kept: bool, seen: str) -> None:
@@ -374,19 +364,21 @@ class ControllerAndMonitor:
 
     ``rates``: (right, left) set points of the drive that answers each frame, rad/s; ``None`` sends none. ``allowed``:
     (forward, reverse, turn) of the permit that answers each frame; ``None`` sends none. ``messages``: sensors messages
-    as they came, of the controller and of the monitor.
+    as they came, of the controller and of the monitor. ``duty``: of the fans, (left, right), where a check changed it.
     """
 
     def __init__(self, context: CheckContext) -> None:
         self.context, self.facts = context, context.facts
-        self._join()
+        self.join()
         self.rates: Pair | None = STILL
         self.allowed: Allowed | None = ALL
+        self.duty: Pair = STILL
         self.frames: list[Frame] = []
         self.messages: tuple[list[Message], list[Message]] = ([], [])
         self.raw: list[bytes] = []
 
-    def _join(self) -> None:
+    def join(self) -> None:
+        """Begin both sessions."""
         # The monitor first: from its join on the robot needs both keys, so it never waits for one alone.
         self.monitor = self.context.join("monitor")
         self.controller = self.context.join("controller")
@@ -397,7 +389,7 @@ class ControllerAndMonitor:
         self._take()
         self.controller.close()
         self.monitor.close()
-        self._join()
+        self.join()
 
     @property
     def newest(self) -> Frame:
@@ -427,13 +419,6 @@ class ControllerAndMonitor:
         seq = self.context.next_seq() if seq is None else seq
         self.controller.send(encode(Fans(seq=seq, duty=duty)))
         return seq
-
-    def withhold(self, key: Key) -> None:
-        """Answer frames without drives, or without permits."""
-        if key == "drive":
-            self.rates = None
-        else:
-            self.allowed = None
 
     def mark_driven(self) -> None:
         """The newest frame has been answered by a drive."""
@@ -558,8 +543,8 @@ class ControllerAndMonitor:
 
 
 @contextmanager
-def steady(context: CheckContext) -> Iterator[tuple[ControllerAndMonitor]]:
+def steady(context: CheckContext) -> Iterator[ControllerAndMonitor]:
     """Both sessions joined, with drive and permit in force."""
     pair = ControllerAndMonitor(context)
     pair.steady()
-    yield (pair,)
+    yield pair

@@ -23,7 +23,7 @@ from ccatp.commissioning.conformance.harness import (
 )
 
 CHECKS = CheckList()
-check_steady = CHECKS.using(steady)
+check_steady = partial(CHECKS.add, fixture=steady)
 WAIT_S = 0.3  # wall time in which a frame would have come
 REPEATED_S = 1.7  # wall time in which a frame without answers comes again
 BEYOND_TTL_S = 0.2
@@ -137,13 +137,13 @@ DIRECTIONS: tuple[tuple[str, str, Pair, Allowed, Allowed], ...] = (
 
 
 @contextmanager
-def _at_rest(context: CheckContext) -> Iterator[tuple[ControllerAndMonitor]]:
+def _at_rest(context: CheckContext) -> Iterator[ControllerAndMonitor]:
     """Both sessions, with the wheels at rest before and after, whatever happens."""
     pair = ControllerAndMonitor(context)
     try:
         pair.steady()
         pair.expect(lambda _: _is_still(pair.frames[-WINDOW:], _rate(pair.facts)), "wheels turn at a drive of zero")
-        yield (pair,)
+        yield pair
     finally:
         pair.rates = STILL
         with suppress(CheckFailed):
@@ -151,7 +151,7 @@ def _at_rest(context: CheckContext) -> Iterator[tuple[ControllerAndMonitor]]:
                 pair.steady()
 
 
-check_at_rest = CHECKS.using(_at_rest)
+check_at_rest = partial(CHECKS.add, fixture=_at_rest)
 
 
 def _direction(shares: Pair, allowed: Allowed, denied: Allowed, pair: ControllerAndMonitor) -> str:

@@ -5,6 +5,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from itertools import pairwise
 from statistics import median
 from typing import Annotated, Any, Literal, NoReturn
@@ -36,7 +37,7 @@ from ccatp.links.robot_codec import encode, join_mac
 from ccatp.links.robot_messages import MAX_LINE_BYTES, PROTOCOL, Drive, Role
 
 CHECKS = CheckList()
-check, check_steady = CHECKS.add, CHECKS.using(steady)
+check, check_steady = CHECKS.add, partial(CHECKS.add, fixture=steady)
 CONNECTIONS = 8
 JOIN_S = 2.0
 IN_TIME_S, LATE_S = 1.0, 2.1  # after the hello
@@ -298,20 +299,20 @@ class _FaultsPart(Part):
 
 
 @contextmanager
-def _recorded(context: CheckContext) -> Iterator[tuple[ControllerAndMonitor]]:
+def _recorded(context: CheckContext) -> Iterator[ControllerAndMonitor]:
     pair = ControllerAndMonitor(context)
     pair.run_frames(FRAMES)
     require(len(pair.messages[0]) > 2, "fewer than three frames for the controller")
-    yield (pair,)
+    yield pair
 
 
 @contextmanager
-def _received(context: CheckContext) -> Iterator[tuple[Frames]]:
-    with _recorded(context) as (pair,):
-        yield (pair.messages[0],)
+def _received(context: CheckContext) -> Iterator[Frames]:
+    with _recorded(context) as pair:
+        yield pair.messages[0]
 
 
-check_recorded, check_frames = CHECKS.using(_recorded), CHECKS.using(_received)
+check_recorded, check_frames = partial(CHECKS.add, fixture=_recorded), partial(CHECKS.add, fixture=_received)
 
 
 @check_recorded("frames-lines", "one JSON object a line, finite numbers, no key twice, at most 8192 bytes")
