@@ -458,22 +458,22 @@ def test_nothing_counts_that_was_measured_while_the_robot_moved(
             async with serving(service):
                 done = 0
                 for _ in range(6000):
-                    if story.mission.state.mode is MissionState.DONE:
+                    if story.state.mode is MissionState.DONE:
                         break
-                    if story.mission.state.mode is MissionState.MEASURING and rng.random() < 0.012:
+                    if story.state.mode is MissionState.MEASURING and rng.random() < 0.012:
                         story.v, bumps = 0.02, bumps + 1
                     if abs(story.v) > cfg.control.settle_speed_m_s:
                         motion_s.append(story.t)
                     order = story.frame(FREE)
                     if order.measure:
-                        point, here = story.mission.state.measuring_point, story.motion().deck
-                        service.begin(FixRequest(story.mission.state.request, story.t, point, (0.0, 0.0, 0.0), here))
+                        point, here = story.state.measuring_point, story.motion().deck
+                        service.begin(FixRequest(story.state.request, story.t, point, (0.0, 0.0, 0.0), here))
                     await asyncio.sleep(0.01)
-                    if len(story.mission.state.done) > done:
-                        done, counted = len(story.mission.state.done), counted + 1
+                    if len(story.state.done) > done:
+                        done, counted = len(story.state.done), counted + 1
                         begun_s, taken_s = fused[-1]
                         moving += any(begun_s - 0.2 <= t <= taken_s for t in motion_s)
-                assert story.mission.state.mode is MissionState.DONE
+                assert story.state.mode is MissionState.DONE
 
     for seed in range(2):
         run_virtual(race(seed))

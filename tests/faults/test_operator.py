@@ -139,19 +139,19 @@ def frames(story: Story, *verdicts: Verdict, count: int = 1) -> MissionState:
     """The state after these verdicts, ``count`` times."""
     for verdict in verdicts * count:
         story.frame(verdict)
-    return story.mission.state.mode
+    return story.state.mode
 
 
 @pytest.mark.fault("O1")
 def test_during_an_earthquake_nobody_resumes(story: Story) -> None:
     story.until_state(DRIVING)
     story.frame(emergency(1, "earthquake"))
-    assert story.mission.state.is_paused
+    assert story.state.is_paused
     assert story.mission.handle(Resume()) == NOBODY_RESUMES
     assert story.mission.handle(Abort("operator")) is None
-    assert story.mission.state.mode is HELD
+    assert story.state.mode is HELD
     story.until_state(DONE)  # it is over
-    assert story.mission.state.done == ()
+    assert story.state.done == ()
 
 
 @pytest.mark.fault("O1", "O3")
@@ -170,11 +170,11 @@ def test_an_earthquake_at_an_edge_presses_the_robot_on_and_nobody_resumes(story:
     story.until_state(DRIVING)
     shaking = emergency(1, "earthquake", code=EventCode.NEAR_EDGE)
     assert frames(story, replace(shaking, off=(True, False, False, False), forward=False)) is BACKING_OFF
-    assert story.mission.state.full_fans
+    assert story.state.full_fans
     assert story.mission.handle(Pause("operator")) is None
     assert story.mission.handle(Resume()) == NOBODY_RESUMES
     assert frames(story, emergency(1, "earthquake")) is HELD
-    assert story.mission.state.cause == "emergency: earthquake"
+    assert story.state.cause == "emergency: earthquake"
 
 
 @pytest.mark.fault("O1")
@@ -182,12 +182,12 @@ def test_what_breaks_in_an_earthquake_waits_for_an_operator_when_it_is_over(stor
     story.until_state(DRIVING)
     shaking = emergency(1, "earthquake")
     frames(story, shaking, replace(shaking, severity=Severity.FAULT, cause="a wheel runs away", signal="enc"))
-    assert story.mission.state.is_faulted
+    assert story.state.is_faulted
     assert frames(story, FREE, count=50) is HELD
-    assert story.mission.state.cause == "a wheel runs away"
+    assert story.state.cause == "a wheel runs away"
     assert story.mission.handle(Resume()) is None
     story.until_state(DONE)
-    assert story.mission.state.done == ()
+    assert story.state.done == ()
 
 
 @pytest.mark.fault("O1")
@@ -236,7 +236,7 @@ def test_the_way_home_is_planned_before_the_robot_misses_it(measured: Measured) 
 def test_an_abort_during_a_back_off_never_drives_forward_and_is_home_bound_soon(
     count: int, story: Story, measured: Measured
 ) -> None:
-    story.until(lambda: story.mission.state.mode is DRIVING and story.v > 0.09)
+    story.until(lambda: story.state.mode is DRIVING and story.v > 0.09)
     frames(story, FRONT_OFF, count=1 + count)
     story.mission.handle(Abort("fire"))
     begun_s, first = story.t, len(story.orders)
@@ -246,7 +246,7 @@ def test_an_abort_during_a_back_off_never_drives_forward_and_is_home_bound_soon(
     assert story.t - begun_s <= 2.0
     assert all(order.twist.v_m_s <= 0.0 for order in story.orders[first:])
     story.until_state(DONE)
-    assert story.mission.state.done == ()
+    assert story.state.done == ()
 
 
 def drive(config: Config, mirror: Mirror, aborts: list[int]) -> list[MissionCommand]:
@@ -406,7 +406,7 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
     vigil = UnattendedFaultTimer(config, falls=True)
     reminders: list[float] = []
     soc, drain = 0.5, 1.0 / cfg.battery_life_s
-    while story.mission.state.is_faulted:
+    while story.state.is_faulted:
         story.frame()
         soc -= 50.0 * DT * drain
         t_s = 50.0 * story.t
@@ -418,7 +418,7 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
     at_dock = soc - home_s * drain
     measured("O8", (soc - cfg.battery_reserve) / (home_s * drain))
     measured("F6", 100.0 * at_dock)
-    assert story.mission.state.mode is RETURNING
+    assert story.state.mode is RETURNING
     assert at_dock >= cfg.battery_reserve
     assert (soc - cfg.battery_reserve) / (home_s * drain) >= 1.5
     assert len(reminders) >= 20

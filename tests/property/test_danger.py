@@ -1,6 +1,5 @@
 """Properties of the edge rule on the real mirrors, with the plant and the drives of ``tests.faults.edge_sweep``."""
 
-from collections.abc import Sequence
 from functools import lru_cache
 from math import atan2, copysign, cos, hypot, pi, radians, sin
 
@@ -9,7 +8,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from ccatp.core import DeckPose, PanelId, PointId
+from ccatp.core import DeckPose, PointId
 from tests.faults.edge_sweep import BLIND, MIRRORS, OVERRUN_M, Drive, Error, Tally, places, run_off, world
 
 names = st.sampled_from(MIRRORS)
@@ -56,15 +55,6 @@ def check_stopped(tally: Tally, centre_m: float) -> None:
     assert -tally.centre_m > centre_m
 
 
-@few
-@given(names, spots, angles, speeds, errors, st.booleans())
-def test_no_fall_with_a_right_estimate(
-    name: str, spot: int, angle: float, speed: float, error: Error, backwards: bool
-) -> None:
-    tally, _ = drive_off(name, spot, angle, -speed if backwards else speed, error)
-    check_stopped(tally, 0.02)  # half the lead of the sensors less 15 mm of stopping and 4 mm of error
-
-
 def far_off(name: str, spot: int) -> list[Error]:
     """A metre off; moved in by one panel and a gap and a half, so that the rim lies in a seam's middle; and none."""
     _, mirror = world(name)
@@ -91,84 +81,6 @@ def test_no_fall_into_an_inner_corner_with_a_right_estimate(name: str) -> None:
         start = DeckPose(x - 0.15 * cos(course), y - 0.15 * sin(course), course)
         tally = run_off(name, start, 0.15, 0.0, np.random.default_rng(1), (0.002, -0.002, 0.005))
         check_stopped(tally, 0.02)  # 45 mm less 15 mm of stopping and 3 mm of error
-
-
-# -- seams ------------------------------------------------------------------------------------------------------------
-
-
-def sees_an_edge(
-    name: str, at: tuple[int, bool, bool, float], angle: float, speed: float, error: Error, stops: Sequence[float] = ()
-) -> bool:
-    """Drive a whole robot over a seam of a panel, at ``angle`` to the seam's normal, pausing at each of ``stops``.
-
-    ``at``: number of the panel, which of its four sides (two flags), place along the side (-1 to 1).
-    """
-    cfg, mirror = world(name)
-    number, is_x, is_positive, along = at
-    panel = list(mirror.panels.values())[number % len(mirror.panels)]
-    side = 1 if is_positive else -1
-    row, col = panel.id
-    assume((PanelId(row, col + side) if is_x else PanelId(row + side, col)) in mirror.panels)
-    half_gap = 0.5 * mirror.gap_m
-    x = panel.x_m + (side * (panel.half_x_m + half_gap) if is_x else along * (panel.half_x_m - 0.01))
-    y = panel.y_m + (along * (panel.half_y_m - 0.01) if is_x else side * (panel.half_y_m + half_gap))
-    course = ((0.0 if side > 0 else pi) if is_x else side * pi / 2) + angle
-    length = 0.14 + mirror.gap_m / cos(angle)
-    start = DeckPose(x - length * cos(course), y - length * sin(course), course)
-    assume(is_free(name, start, 2.0 * length, is_x, angle))
-    drive = Drive(name, start, np.random.default_rng(number), error)
-    set_points = drive.rig.at_speed(speed, 0.0, cfg)
-    for part in (*np.cumsum(stops).tolist(), 1.0):
-        while drive.has_gone_m(start) < part * 2.0 * length:
-            drive.frame(*set_points)
-        for _ in range(50):
-            drive.frame(0.0, 0.0)
-    return drive.has_edge
-
-
-def is_free(name: str, start: DeckPose, length: float, is_x: bool, angle: float) -> bool:
-    """The robot stays on the mirror, and meets a crossing seam only at 60 degrees to its normal or less."""
-    mirror = world(name)[1]
-    for k in range(31):
-        x = start.x_m + k / 30 * length * cos(start.heading_rad)
-        y = start.y_m + k / 30 * length * sin(start.heading_rad)
-        if mirror.rim.signed_distance_m(x, y) < 0.16:
-            return False
-        if abs(angle) >= radians(30.0):
-            continue
-        panel = mirror.panels[mirror.nearest_panel(x, y)]
-        to_side = panel.half_y_m - abs(y - panel.y_m) if is_x else panel.half_x_m - abs(x - panel.x_m)
-        # 127 mm: a corner sensor's radius; 10 mm: how far the path moves between two looks
-        if to_side < 0.127 + 0.010:
-            return False
-    return True
-
-
-sides = st.tuples(st.integers(0, 200), st.booleans(), st.booleans(), st.floats(-1.0, 1.0))
-
-
-@few
-@given(names, sides, angles, speeds, errors)
-def test_no_false_edge_at_a_seam(
-    name: str, at: tuple[int, bool, bool, float], angle: float, speed: float, error: Error
-) -> None:
-    assert not sees_an_edge(name, at, angle, speed, error)
-
-
-@few
-@given(names, sides, angles, errors, st.lists(st.floats(0.05, 0.4), min_size=1, max_size=2))
-def test_no_false_edge_with_stops_over_the_gap(
-    name: str, at: tuple[int, bool, bool, float], angle: float, error: Error, stops: list[float]
-) -> None:
-    assert not sees_an_edge(name, at, angle, 0.08, error, stops)
-
-
-@settings(max_examples=3, deadline=None)
-@given(names, sides, angles, errors)
-def test_no_false_edge_at_5_mm_a_second(
-    name: str, at: tuple[int, bool, bool, float], angle: float, error: Error
-) -> None:
-    assert not sees_an_edge(name, at, angle, 0.005, error)
 
 
 # -- turns in place ---------------------------------------------------------------------------------------------------

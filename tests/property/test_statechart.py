@@ -181,6 +181,6 @@ def test_each_pair_of_verdicts_from_each_mode(config: Config, mirror: Mirror, fi
             check(s, verdict, story.mission.state, command)
         shaken = [name.startswith("earthquake") for name in (first, second)]
         if shaken[1] and "edge" not in second:
-            assert story.mission.state.interlock  # whatever came before, it holds
+            assert story.state.interlock  # whatever came before, it holds
         if second == "free" and not any(shaken) and first not in ("fault", "hold", "sensor stays off"):
-            assert story.mission.state.mode is not HELD
+            assert story.state.mode is not HELD

@@ -11,7 +11,7 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.planning.route import Route
 from ccatp.survey.route_follower import StateEstimate
-from ccatp.survey.state import FixStored, MissionState
+from ccatp.survey.state import FixStored, MissionState, SurveyState
 from ccatp.survey.statechart import Mission, Survey
 
 DT, LAG = 0.01, 0.08
@@ -46,6 +46,10 @@ class Story:
         left = tuple(float(len(stops) - k) for k in range(len(stops) + 1))
         return Route(stops, left)
 
+    @property
+    def state(self) -> SurveyState:
+        return self.mission.state
+
     def plan_rest(self, _route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
         self.plans.append(start)
         return self.route(tuple(stop for stop in self.stops if stop.point not in skip))
@@ -61,7 +65,7 @@ class Story:
         order = self.mission.step(self.motion(), verdict)
         self.orders.append(order)
         if order.measure and self.auto_fix:
-            self.mission.handle(FixStored(self.mission.state.measuring_point))
+            self.mission.handle(FixStored(self.state.measuring_point))
         self.move(order.twist)
         return order
 
@@ -81,10 +85,19 @@ class Story:
             if is_there():
                 return
             self.frame(verdict)
-        raise AssertionError(f"still {self.mission.state.mode} ({self.mission.state.cause}) after {frames} frames")
+        raise AssertionError(f"still {self.state.mode} ({self.state.cause}) after {frames} frames")
+
+    def drive_on(self) -> None:
+        """Until it is at speed on a leg."""
+        self.until(lambda: self.state.mode is MissionState.DRIVING and self.v > 0.09)
+
+    def finish(self) -> None:
+        """The rest of the survey: it is complete."""
+        self.until_state(MissionState.DONE)
+        assert [p.point for p in self.state.done] == [1, 2, 3]
 
     def until_state(self, state: MissionState, verdict: Verdict | None = FREE) -> None:
-        self.until(lambda: self.mission.state.mode is state, verdict)
+        self.until(lambda: self.state.mode is state, verdict)
 
 
 def from_first_leg(config: Config) -> Config:

@@ -67,107 +67,45 @@ def test_each_seam_that_a_sensor_has_crossed_is_counted(step_m: float) -> None:
     assert monitor.missed == [4] * 4
 
 
-@pytest.mark.parametrize("kind", list(EmergencyKind))
-def test_each_kind_latches_until_cleared(kind: EmergencyKind) -> None:
+FULL = f"{MAX_ACTIVE} emergencies are active already (the operation is aborted)"
+OUT, UNKNOWN = "the robot is neither at base nor held", "no emergency with that id"
+
+
+@pytest.mark.parametrize(
+    ("steps", "newest", "raised"),
+    [  # (kind or "clear" or "out", id, why it is refused): "out" clears while the robot is out on the mirror
+        *([[(kind.value, "a", None)], kind.value, 1] for kind in EmergencyKind),
+        ([("fire", "a", None), ("clear", "a", None)], None, 1),
+        ([("flood", "a", "unknown kind 'flood'"), ("clear", "a", UNKNOWN)], None, 0),
+        ([("fire", "a", None), ("out", "a", OUT)], "fire", 1),
+        # The same id again is the same emergency, also after its clear; but an earthquake holds the robot.
+        ([("fire", "a", None), ("power", "a", None)], "fire", 1),
+        ([("fire", "a", None), ("clear", "a", None), ("out", "a", None), ("fire", "a", None)], None, 1),
+        ([("weather", "a", None), ("earthquake", "a", None), ("fire", "a", None)], "earthquake", 2),
+        # The latch opens with the last emergency.
+        ([("fire", "a", None), ("power", "b", None), ("clear", "b", None)], "fire", 2),
+        ([("fire", "a", None), ("power", "b", None), ("clear", "b", None), ("clear", "a", None)], None, 2),
+        # A flood is bounded and stays latched; there is room for another kind.
+        ([*(("weather", str(k), None) for k in range(MAX_ACTIVE)), ("weather", "x", FULL)], "weather", MAX_ACTIVE),
+        ([*(("fire", str(k), None) for k in range(MAX_ACTIVE)), ("earthquake", "x", None)], "earthquake", 257),
+        # The memory of cleared ids is bounded, too: raised again the oldest is a new one.
+        ([(kind, str(k), None) for k in range(MAX_CLEARED + 1) for kind in ("fire", "clear")] + [("fire", "0", None)],
+         "fire", MAX_CLEARED + 2),
+    ],
+)  # fmt: skip
+def test_an_emergency_is_latched_until_it_is_cleared(
+    steps: list[tuple[str, str, str | None]], newest: str | None, raised: int
+) -> None:
     latch = EmergencyLatch()
-    assert not latch.is_latched
-    assert latch.newest is None
-    assert latch.raise_emergency(kind.value, "a", "smoke") is None
-    assert latch.is_latched
-    assert latch.newest is not None
-    assert (latch.newest.kind, latch.newest.id, latch.newest.note) == (kind, "a", "smoke")
-    assert latch.clear("a", at_base_or_held=True) is None
-    assert not latch.is_latched
-
-
-def test_the_same_id_again_is_harmless_also_after_its_clear() -> None:
-    latch = EmergencyLatch()
-    latch.raise_emergency("fire", "a")
-    assert latch.raise_emergency("power", "a", "retransmitted") is None
-    assert latch.newest is not None
-    assert latch.newest.kind is EmergencyKind.FIRE
-    assert latch.clear("a", at_base_or_held=True) is None
-    assert latch.clear("a", at_base_or_held=False) is None
-    # a late retransmission must not abort the next survey
-    assert latch.raise_emergency("fire", "a") is None
-    assert not latch.is_latched
-
-
-def test_unknown_kind_and_unknown_id_change_nothing() -> None:
-    latch = EmergencyLatch()
-    assert latch.raise_emergency("flood", "a") == "unknown kind 'flood'"
-    assert latch.clear("a", at_base_or_held=True) == "no emergency with that id"
-    assert not latch.is_latched
-
-
-def test_clear_is_refused_while_the_robot_is_out_on_the_mirror() -> None:
-    latch = EmergencyLatch()
-    latch.raise_emergency("fire", "a")
-    assert latch.clear("a", at_base_or_held=False) == "the robot is neither at base nor held"
-    assert latch.is_latched
-
-
-def test_clear_is_refused_while_the_cause_persists() -> None:
-    latch = EmergencyLatch()
-    latch.raise_emergency("fire", "a")
-    latch.set_level(EmergencyKind.FIRE, True)
-    latch.set_level(EmergencyKind.POWER, True)
-    assert latch.clear("a", at_base_or_held=True) == "the cause persists: fire"
-    assert latch.is_latched
-    latch.set_level(EmergencyKind.FIRE, False)
-    assert latch.clear("a", at_base_or_held=True) is None
-
-
-def test_the_latch_opens_with_the_last_emergency() -> None:
-    latch = EmergencyLatch()
-    latch.raise_emergency("fire", "a")
-    latch.raise_emergency("power", "b")
-    assert latch.newest is not None
-    assert latch.newest.id == "b"
-    assert latch.clear("b", at_base_or_held=True) is None
-    assert latch.is_latched
-    assert latch.newest.id == "a"
-    assert latch.clear("a", at_base_or_held=True) is None
-    assert not latch.is_latched
-
-
-def test_a_flood_of_emergencies_is_bounded_and_stays_latched() -> None:
-    latch = EmergencyLatch()
-    for number in range(MAX_ACTIVE):
-        assert latch.raise_emergency("weather", str(number)) is None
-    assert latch.raise_emergency("weather", "one more") == (
-        f"{MAX_ACTIVE} emergencies are active already (the operation is aborted)"
-    )
-    assert latch.is_latched
-    assert not latch.is_shaking
-    assert latch.raise_emergency("earthquake", "and this") is None  # of another kind: more than what there is
-    assert latch.is_shaking
-
-
-def test_an_id_is_that_of_one_emergency() -> None:
-    latch = EmergencyLatch()
-    assert latch.raise_emergency("weather", "a") is None
-    assert latch.raise_emergency("weather", "a") is None
-    assert latch.raise_emergency("fire", "a") is None
-    assert (latch.raised, latch.holds("a")) == (1, True)
-    assert latch.raise_emergency("earthquake", "a") is None
-    assert latch.raise_emergency("fire", "a") is None
-    assert (latch.raised, latch.is_shaking) == (2, True)
-    assert latch.clear("a", at_base_or_held=True) is None
-    assert latch.raise_emergency("weather", "a") is None
-    assert (latch.raised, latch.holds("a"), latch.is_latched) == (2, False, False)
-    assert latch.raise_emergency("weather", "b") is None
-    assert latch.raised == 3
-
-
-def test_memory_of_cleared_ids_is_bounded() -> None:
-    latch = EmergencyLatch()
-    for number in range(MAX_CLEARED + 1):
-        latch.raise_emergency("weather", str(number))
-        assert latch.clear(str(number), at_base_or_held=True) is None
-    # the oldest is forgotten: raised again it is a new one
-    latch.raise_emergency("weather", "0")
-    assert latch.is_latched
+    for what, name, refusal in steps:
+        if what in ("clear", "out"):
+            assert latch.clear(name, at_base_or_held=what == "clear") == refusal
+        else:
+            assert latch.raise_emergency(what, name, f"note {name}") == refusal
+    assert (latch.raised, latch.is_latched, latch.is_shaking) == (raised, newest is not None, newest == "earthquake")
+    found = latch.newest
+    assert (found and found.kind) == newest
+    assert found is None or (latch.holds(found.id) and found.note == f"note {found.id}")
 
 
 def test_the_states_are_those_of_the_mission() -> None:

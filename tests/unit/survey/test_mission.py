@@ -64,8 +64,8 @@ def test_the_table_is_total_and_hold_is_one_event_away() -> None:
 
 def test_measures_every_point_once_and_is_complete(story: Story) -> None:
     story.until_state(MissionState.DONE)
-    assert story.mission.state.outcome is SurveyOutcome.COMPLETE
-    assert [p.point for p in story.mission.state.done] == [1, 2, 3]
+    assert story.state.outcome is SurveyOutcome.COMPLETE
+    assert [p.point for p in story.state.done] == [1, 2, 3]
     arrived = [order.arrived for order in story.orders if order.arrived is not None]
     assert [p.point for p in arrived] == [1, 2, 3]
 
@@ -74,9 +74,8 @@ def test_a_fix_at_the_start_comes_before_the_first_leg_and_costs_no_route(config
     first = config.mission.model_copy(update={"fix_at_start": True})
     story = Story(config.model_copy(update={"mission": first}), mirror)
     story.until(lambda: story.orders != [] and story.orders[-1].measure)
-    assert (story.v, story.omega, story.mission.state.done) == (0.0, 0.0, ())
-    story.until_state(MissionState.DONE)
-    assert [p.point for p in story.mission.state.done] == [1, 2, 3]
+    assert (story.v, story.omega, story.state.done) == (0.0, 0.0, ())
+    story.finish()
     assert story.plans == []
 
 
@@ -86,11 +85,10 @@ def test_pause_and_resume_from_every_state(story: Story, state: MissionState) ->
     assert story.mission.handle(Pause("operator")) is None
     for _ in range(100):
         assert story.frame().twist == Twist(0.0, 0.0)
-    assert story.mission.state.mode is MissionState.HELD
-    assert story.mission.state.is_paused
+    assert story.state.mode is MissionState.HELD
+    assert story.state.is_paused
     assert story.mission.handle(Resume()) is None
-    story.until_state(MissionState.DONE)
-    assert [p.point for p in story.mission.state.done] == [1, 2, 3]
+    story.finish()
 
 
 def test_resume_is_refused_where_nothing_is_held(story: Story) -> None:
@@ -109,8 +107,8 @@ def test_abort_goes_home_from_every_state(story: Story, state: MissionState) -> 
     else:
         story.until_state(state)
     story.until_state(MissionState.DONE, ABORT)
-    assert story.mission.state.outcome is SurveyOutcome.AT_BASE
-    assert story.mission.state.cause == "fire"
+    assert story.state.outcome is SurveyOutcome.AT_BASE
+    assert story.state.cause == "fire"
     x, y = story.motion().deck.x_m, story.motion().deck.y_m
     assert hypot(x - story.base[0], y - story.base[1]) < 2e-3  # twice the arrival tolerance
     assert story.motion().deck.heading_rad == pytest.approx(1.0, abs=0.011)  # heading tolerance and 1e-3 of frames
@@ -119,38 +117,36 @@ def test_abort_goes_home_from_every_state(story: Story, state: MissionState) -> 
 def test_no_verdict_holds_and_comes_back_by_itself(story: Story) -> None:
     story.until_state(MissionState.DRIVING)
     assert story.frame(None).twist == Twist(0.0, 0.0)
-    assert story.mission.state.mode is MissionState.HELD
-    story.until_state(MissionState.DONE)
-    assert len(story.mission.state.done) == 3
+    assert story.state.mode is MissionState.HELD
+    story.finish()
 
 
 def test_edge_backs_off_at_most_60_mm_turns_away_fixes_and_resumes(story: Story, config: Config) -> None:
-    story.until(lambda: story.mission.state.mode is MissionState.DRIVING and story.v > 0.09)
+    story.drive_on()
     start = (story.x, story.y)
     story.frame(FRONT_OFF)
     for _ in range(60):
         assert story.frame(FRONT_OFF).twist.v_m_s <= 0.0
     backed = len(story.orders)
-    assert story.mission.state.cause == "rim"
-    story.until(lambda: story.mission.state.mode is not MissionState.BACKING_OFF)
+    assert story.state.cause == "rim"
+    story.until(lambda: story.state.mode is not MissionState.BACKING_OFF)
     assert all(-config.mission.backoff_speed_m_s <= o.twist.v_m_s <= 0.0 for o in story.orders[backed:])
     assert hypot(story.x - start[0], story.y - start[1]) <= config.mission.backoff_m + 0.01
-    assert story.mission.state.mode is MissionState.SETTLING
+    assert story.state.mode is MissionState.SETTLING
     story.until(lambda: story.orders[-1].measure)
-    assert story.mission.state.done == ()  # that fix was none of a point
-    story.until(lambda: story.mission.state.mode is MissionState.DRIVING)
+    assert story.state.done == ()  # that fix was none of a point
+    story.until(lambda: story.state.mode is MissionState.DRIVING)
     assert len(story.plans) == 1  # the route goes on from where the robot really is
-    story.until_state(MissionState.DONE)
-    assert len(story.mission.state.done) == 3
+    story.finish()
 
 
 def test_an_edge_that_does_not_clear_faults(story: Story) -> None:
-    story.until(lambda: story.mission.state.mode is MissionState.DRIVING and story.v > 0.09)
+    story.drive_on()
     story.until_state(MissionState.HELD, FRONT_OFF)
-    assert "stuck at the edge" in story.mission.state.cause
-    assert not story.mission.state.is_faulted  # it may have been a flash of light
-    story.until(lambda: story.mission.state.is_faulted, FRONT_OFF, frames=3100)
-    assert "stuck at the edge" in story.mission.state.cause
+    assert "stuck at the edge" in story.state.cause
+    assert not story.state.is_faulted  # it may have been a flash of light
+    story.until(lambda: story.state.is_faulted, FRONT_OFF, frames=3100)
+    assert "stuck at the edge" in story.state.cause
 
 
 def found_at_the_edge(story: Story) -> None:
@@ -160,7 +156,7 @@ def found_at_the_edge(story: Story) -> None:
     for _ in range(12):
         story.frame(FRONT_OFF)
     story.until_state(MissionState.MEASURING)
-    story.until(lambda: not story.mission.state.is_lost)
+    story.until(lambda: not story.state.is_lost)
     story.orders.clear()
 
 
@@ -169,16 +165,16 @@ def test_found_at_an_edge_it_stands_until_the_danger_loop_knows_where(story: Sto
     for _ in range(19):
         story.frame(FRONT_OFF)
     assert not any(order.twist.v_m_s or order.twist.omega_rad_s for order in story.orders)
-    assert story.mission.state.mode is not MissionState.BACKING_OFF
+    assert story.state.mode is not MissionState.BACKING_OFF
     story.until_state(MissionState.DRIVING)
-    story.until(lambda: len(story.mission.state.done) == 3)
+    story.finish()
 
 
 def test_an_edge_that_the_danger_loop_still_sees_then_is_left_again(story: Story) -> None:
     found_at_the_edge(story)
     for _ in range(22):
         story.frame(FRONT_OFF)
-    assert story.mission.state.mode is MissionState.BACKING_OFF
+    assert story.state.mode is MissionState.BACKING_OFF
 
 
 def test_a_sensor_that_stays_off_is_looked_at_with_one_fix(story: Story) -> None:
@@ -186,30 +182,30 @@ def test_a_sensor_that_stays_off_is_looked_at_with_one_fix(story: Story) -> None
         FRONT_OFF, cause="an edge sensor stays off", signal="front_left", severity=Severity.HOLD, reverse=False
     )
     story.until_state(MissionState.DRIVING)
-    measured = len(story.mission.state.done)
+    measured = len(story.state.done)
     for _ in range(300):
         story.frame(stays_off)
-    assert story.mission.state.mode is MissionState.HELD
-    assert story.mission.state.cause == "an edge sensor stays off"
+    assert story.state.mode is MissionState.HELD
+    assert story.state.cause == "an edge sensor stays off"
     assert sum(order.measure for order in story.orders[-300:]) == 1
     assert not any(order.twist.v_m_s or order.twist.omega_rad_s for order in story.orders[-300:])
-    assert len(story.mission.state.done) == measured  # the fix is nobody's point
-    story.until(lambda: len(story.mission.state.done) == 3)  # it came on: the survey goes on by itself
+    assert len(story.state.done) == measured  # the fix is nobody's point
+    story.until(lambda: len(story.state.done) == 3)  # it came on: the survey goes on by itself
 
 
 def test_abort_during_back_off_waits_for_the_retreat(story: Story) -> None:
-    story.until(lambda: story.mission.state.mode is MissionState.DRIVING and story.v > 0.09)
+    story.drive_on()
     story.frame(FRONT_OFF)
     story.mission.handle(Abort("operator"))
-    assert story.mission.state.mode is MissionState.BACKING_OFF
+    assert story.state.mode is MissionState.BACKING_OFF
     for _ in range(30):
         assert story.frame(FRONT_OFF).twist.v_m_s <= 0.0
     story.until_state(MissionState.DONE, ABORT)
-    assert story.mission.state.outcome is SurveyOutcome.AT_BASE
+    assert story.state.outcome is SurveyOutcome.AT_BASE
 
 
 def test_pause_while_backing_off_holds_and_resume_finds_the_robot_first(story: Story) -> None:
-    story.until(lambda: story.mission.state.mode is MissionState.DRIVING and story.v > 0.09)
+    story.drive_on()
     story.frame(FRONT_OFF)
     assert story.mission.handle(Pause("operator")) is None
     for _ in range(50):
@@ -217,36 +213,35 @@ def test_pause_while_backing_off_holds_and_resume_finds_the_robot_first(story: S
     assert story.mission.handle(Resume()) is None
     story.until(lambda: story.orders[-1].measure)  # nothing but a fix comes first
     assert all(order.twist == Twist(0.0, 0.0) for order in story.orders[-30:])
-    story.until_state(MissionState.DONE)
-    assert len(story.mission.state.done) == 3
+    story.finish()
 
 
 def test_missing_data_during_a_back_off_only_pause_it(story: Story) -> None:
-    story.until(lambda: story.mission.state.mode is MissionState.DRIVING and story.v > 0.09)
+    story.drive_on()
     story.frame(FRONT_OFF)
     for _ in range(20):
         assert story.frame(replace(FRONT_OFF, reverse=False)).twist == Twist(0.0, 0.0)
-    assert story.mission.state.mode is MissionState.BACKING_OFF
+    assert story.state.mode is MissionState.BACKING_OFF
     assert story.frame(FRONT_OFF).twist.v_m_s < 0.0
 
 
 def test_a_robot_that_cannot_be_found_does_not_drive(story: Story) -> None:
     story.auto_fix = False
-    story.until(lambda: story.mission.state.mode is MissionState.DRIVING and story.v > 0.09)
+    story.drive_on()
     for _ in range(60):
         story.frame(FRONT_OFF)
     for _ in range(3):
-        assert not story.mission.state.is_faulted
-        story.until(lambda: story.mission.state.is_awaiting_fix)
+        assert not story.state.is_faulted
+        story.until(lambda: story.state.is_awaiting_fix)
         asked = story.t
-        story.mission.handle(FixFailed(story.mission.state.measuring_point, "no answer"))
+        story.mission.handle(FixFailed(story.state.measuring_point, "no answer"))
         story.frame()
-        assert not story.mission.state.is_awaiting_fix  # not before the robot has stood for another measuring time
+        assert not story.state.is_awaiting_fix  # not before the robot has stood for another measuring time
     assert story.t - asked < 0.02
-    assert story.mission.state.is_faulted
-    assert "cannot be found again: no answer" in story.mission.state.cause
+    assert story.state.is_faulted
+    assert "cannot be found again: no answer" in story.state.cause
     story.mission.handle(Resume())
-    story.until(lambda: story.mission.state.is_awaiting_fix)  # it tries again, and does not move before
+    story.until(lambda: story.state.is_awaiting_fix)  # it tries again, and does not move before
     assert all(order.twist == Twist(0.0, 0.0) for order in story.orders[-60:])
 
 
@@ -257,9 +252,8 @@ def test_a_robot_that_stands_to_be_found_needs_no_permission(story: Story) -> No
     denied = replace(FREE, forward=False, reverse=False, turn=False, cause="estimate not finite")
     story.until(lambda: story.orders[-1].measure, denied)
     story.frame(denied)
-    assert story.mission.state.mode is MissionState.HELD  # found, and waits for the permission to move
-    story.until_state(MissionState.DONE)
-    assert len(story.mission.state.done) == 3
+    assert story.state.mode is MissionState.HELD  # found, and waits for the permission to move
+    story.finish()
 
 
 def test_a_robot_that_never_rests_is_a_fault(story: Story) -> None:
@@ -267,9 +261,9 @@ def test_a_robot_that_never_rests_is_a_fault(story: Story) -> None:
     for _ in range(1100):
         story.v = 0.01
         story.frame()
-        if story.mission.state.is_faulted:
+        if story.state.is_faulted:
             break
-    assert "does not come to rest" in story.mission.state.cause
+    assert "does not come to rest" in story.state.cause
 
 
 def test_abort_after_a_hold_goes_home_all_the_same(story: Story) -> None:
@@ -278,11 +272,11 @@ def test_abort_after_a_hold_goes_home_all_the_same(story: Story) -> None:
     story.frame()
     story.mission.handle(Pause("operator"))
     assert story.mission.handle(Abort("operator")) is None
-    states = [story.mission.state.mode]
+    states = [story.state.mode]
     for _ in range(2):
         story.mission.handle(Pause("operator"))
         story.frame(ABORT)
-        states.append(story.mission.state.mode)
+        states.append(story.state.mode)
     # An emergency that is new outranks the pause; its level, repeated, does not.
     assert states == [MissionState.RETURNING, MissionState.RETURNING, MissionState.HELD]
 
@@ -290,11 +284,11 @@ def test_abort_after_a_hold_goes_home_all_the_same(story: Story) -> None:
 def test_failed_measurements_are_skipped_and_three_in_a_row_hold(story: Story) -> None:
     story.auto_fix = False
     for _ in range(3):
-        story.until(lambda: story.mission.state.is_awaiting_fix)
-        story.mission.handle(FixFailed(story.mission.state.measuring_point, "no answer"))
-    assert story.mission.state.is_faulted
-    assert "3 measurements in a row failed: no answer" in story.mission.state.cause
-    assert len(story.mission.state.skipped) == 3
+        story.until(lambda: story.state.is_awaiting_fix)
+        story.mission.handle(FixFailed(story.state.measuring_point, "no answer"))
+    assert story.state.is_faulted
+    assert "3 measurements in a row failed: no answer" in story.state.cause
+    assert len(story.state.skipped) == 3
 
 
 def test_a_fix_committed_after_the_way_was_planned_anew_counts_once(story: Story) -> None:
@@ -306,20 +300,20 @@ def test_a_fix_committed_after_the_way_was_planned_anew_counts_once(story: Story
     )  # fmt: skip
     story.mission = Mission(survey)
     story.auto_fix = False
-    story.until(lambda: story.mission.state.is_awaiting_fix)
-    point = story.mission.state.measuring_point
+    story.until(lambda: story.state.is_awaiting_fix)
+    point = story.state.measuring_point
     assert point is not None
     story.mission.handle(Interrupted("a late frame"))
     story.until(lambda: bool(story.plans))
     story.mission.handle(FixStored(point))
-    assert story.mission.state.done == (point,)
+    assert story.state.done == (point,)
     asked = []
-    while story.mission.state.mode is not MissionState.DONE:
+    while story.state.mode is not MissionState.DONE:
         if story.frame().measure:
-            asked.append(story.mission.state.measuring_point)
-            story.mission.handle(FixStored(story.mission.state.measuring_point))
+            asked.append(story.state.measuring_point)
+            story.mission.handle(FixStored(story.state.measuring_point))
     assert point not in asked
-    assert [p.point for p in story.mission.state.done] == [1, 2, 3]
+    assert [p.point for p in story.state.done] == [1, 2, 3]
 
 
 def test_a_leg_that_does_not_end_faults(story: Story) -> None:
@@ -328,16 +322,16 @@ def test_a_leg_that_does_not_end_faults(story: Story) -> None:
     for _ in range(3000):
         story.frame()
         story.x, story.y = x, y  # the wheels spin
-        if story.mission.state.mode is MissionState.HELD:
+        if story.state.mode is MissionState.HELD:
             break
-    assert story.mission.state.is_faulted
-    assert "overdue" in story.mission.state.cause
+    assert story.state.is_faulted
+    assert "overdue" in story.state.cause
 
 
 def test_stop_ends_where_the_robot_stands(story: Story) -> None:
     story.until_state(MissionState.DRIVING)
     story.mission.handle(StopHere())
-    assert story.mission.state.outcome is SurveyOutcome.STOPPED
+    assert story.state.outcome is SurveyOutcome.STOPPED
     assert story.frame().twist == Twist(0.0, 0.0)
     assert story.mission.handle(Pause("late")) == "the mission is over"
     assert story.mission.handle(Abort("late")) == "the mission is over"
@@ -346,12 +340,12 @@ def test_stop_ends_where_the_robot_stands(story: Story) -> None:
 def miss(story: Story, ahead_m: float, left_m: float) -> None:
     """The fix at the first point shows the robot beside it: the stop lies so far ahead of and left of it."""
     story.auto_fix = False
-    story.until(lambda: story.mission.state.is_awaiting_fix)
+    story.until(lambda: story.state.is_awaiting_fix)
     c, s = cos(story.heading), sin(story.heading)
     story.x -= c * ahead_m - s * left_m
     story.y -= s * ahead_m + c * left_m
     story.mission.handle(PointMissed())
-    assert story.mission.state.done == ()
+    assert story.state.done == ()
 
 
 def speeds_until_rest(story: Story) -> list[float]:
@@ -367,7 +361,7 @@ def speeds_until_rest(story: Story) -> list[float]:
 
 
 def distance_m(story: Story) -> float:
-    return story.mission.survey.follower.distance_m(story.mission.state.stop, story.motion().pose)
+    return story.mission.survey.follower.distance_m(story.state.stop, story.motion().pose)
 
 
 @pytest.mark.parametrize("ahead_m", [0.02, -0.02])
@@ -378,7 +372,7 @@ def test_a_point_missed_along_the_heading_is_approached_straight(story: Story, a
         assert speed * ahead_m > -1e-5  # 0.5 mm/s: the end of the feed-forward may overshoot
     assert story.heading == pytest.approx(heading, abs=1e-6)  # what lies beside is within tolerance
     assert distance_m(story) == pytest.approx(0.004, abs=3e-4)  # stop tolerance
-    assert (story.plans, story.mission.state.corrections) == ([], 1)
+    assert (story.plans, story.state.corrections) == ([], 1)
 
 
 @pytest.mark.parametrize(("ahead_m", "sign"), [(0.01, 1.0), (-0.01, -1.0)])
@@ -390,13 +384,13 @@ def test_a_point_missed_beside_the_heading_is_turned_to_by_the_smaller_angle(
     assert all(speed * sign > -5e-4 for speed in speeds_until_rest(story))  # forward, or in reverse, all the way
     assert story.heading - heading == pytest.approx(sign * 0.983, abs=0.02)  # atan(15/10), twice the heading tolerance
     assert distance_m(story) < 5e-4  # stop tolerance, and the heading tolerance over 18 mm
-    assert (story.plans, story.mission.state.corrections) == ([], 1)
+    assert (story.plans, story.state.corrections) == ([], 1)
 
 
 def test_a_point_missed_by_far_is_reached_by_a_new_route(story: Story) -> None:
     miss(story, 0.04, 0.04)
-    story.until(lambda: story.mission.state.is_awaiting_fix)
-    assert (len(story.plans), story.mission.state.corrections) == (1, 0)
+    story.until(lambda: story.state.is_awaiting_fix)
+    assert (len(story.plans), story.state.corrections) == (1, 0)
     assert distance_m(story) < 5e-4  # stop tolerance
 
 
@@ -414,11 +408,11 @@ def test_after_a_correction_an_unsafe_turn_is_planned_anew(story: Story, monkeyp
     story.auto_fix = True
     story.until_state(MissionState.DONE)
     assert len(story.plans) == 1  # of the leg after the correction; the one after that is as planned
-    assert len(story.mission.state.done) == 3
+    assert len(story.state.done) == 3
 
 
 def test_the_robot_is_steered_by_where_it_will_be_and_judged_by_where_it_is(story: Story) -> None:
-    story.until(lambda: story.mission.state.mode is MissionState.DRIVING and story.v > 0.09)
+    story.drive_on()
     now = story.motion()
     x, y, heading = now.steered.pose
     assert (x, y, heading) == (story.x, story.y, story.heading)
@@ -432,7 +426,7 @@ def test_the_robot_is_steered_by_where_it_will_be_and_judged_by_where_it_is(stor
 def test_what_is_switched_off_does_not_steer(config: Config, mirror: Mirror, key: str) -> None:
     control = config.control.model_copy(update={key: False})
     story = Story(config.model_copy(update={"control": control}), mirror)
-    story.until(lambda: story.mission.state.mode is MissionState.DRIVING and story.v > 0.09)
+    story.drive_on()
     now = story.motion()
     x, y, heading = now.steered.pose
     ahead = Predicted((x, y, heading + 0.05), story.v, story.omega)
@@ -460,18 +454,18 @@ def test_no_way_on_and_no_way_home_are_faults(config: Config, mirror: Mirror) ->
     story.mission.handle(Pause("operator"))
     story.mission.handle(Resume())
     story.frame()
-    assert story.mission.state.is_faulted
-    assert story.mission.state.cause == "no way on: walled in"
+    assert story.state.is_faulted
+    assert story.state.cause == "no way on: walled in"
     story.mission.handle(Abort("fire"))
     story.frame()
-    assert story.mission.state.cause == "no way home: walled in"
+    assert story.state.cause == "no way home: walled in"
 
 
 def test_eta_falls_as_stops_are_done(story: Story) -> None:
-    assert story.mission.state.eta_s == 3.0
-    story.until(lambda: len(story.mission.state.done) == 2)
-    assert story.mission.state.eta_s == 1.0
+    assert story.state.eta_s == 3.0
+    story.until(lambda: len(story.state.done) == 2)
+    assert story.state.eta_s == 1.0
     story.mission.handle(Abort("operator"))
-    assert story.mission.state.eta_s == 0.0
+    assert story.state.eta_s == 0.0
     story.until_state(MissionState.DONE)
-    assert story.mission.state.eta_s == 0.0
+    assert story.state.eta_s == 0.0
