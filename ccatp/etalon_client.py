@@ -8,7 +8,7 @@ import asyncio
 from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
 from math import dist
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,65 +18,7 @@ from ccatp.core import Fix, Vector3
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.links import multiline
 from ccatp.links.multiline import ChannelData, Command, Connected, Environment, LaserReady, MultilineRequest, Remark
-from ccatp.links.robot_messages import LineBuffer, LineTooLong
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
-
-
-class EtalonLink(asyncio.Protocol):
-    """One connection: a line is asked for at a time. ``fault``: why it must not be used again; empty while it may."""
-
-    def __init__(self) -> None:
-        self.fault = ""
-        self._unasked = False
-        self._lines = LineBuffer(multiline.MAX_LINE_BYTES)
-        self._waiting: asyncio.Future[bytes] | None = None
-        self._transport: asyncio.Transport | None = None
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(asyncio.Transport, transport)  # a TCP connection has no other
-
-    def data_received(self, data: bytes) -> None:
-        for line in self._lines.feed(data):
-            if self.fault:
-                break
-            if self._waiting is not None and not self._waiting.done():
-                self._waiting.set_result(line.rstrip(b"\r"))
-            else:
-                self._unasked = True
-                self._fail(ConnectionError("server sent a line unasked"))
-        if self._lines.error is not None:
-            self._fail(self._lines.error)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self._fail(ConnectionError(f"connection lost: {exc}" if exc else "server closed the connection"))
-
-    def _fail(self, error: Exception) -> None:
-        self.fault = self.fault or str(error)
-        if self._waiting is not None and not self._waiting.done():
-            self._waiting.set_exception(error)
-        self.abort()
-
-    @property
-    def has_leftovers(self) -> bool:
-        """More came than was asked for, so no line can be trusted to answer what it seems to."""
-        return self._unasked or self._lines.has_rest
-
-    async def ask(self, request: MultilineRequest) -> bytes:
-        """Send and wait for one line; the deadline is the caller's.
-
-        ``ConnectionError``: the connection is lost; ``LineTooLong``: the reply never ends.
-        """
-        if self._transport is None or self.fault:
-            raise ConnectionError(self.fault or "not connected")
-        self._waiting = asyncio.get_running_loop().create_future()
-        self._transport.write(multiline.format_request(request))
-        return await self._waiting
-
-    def abort(self) -> None:
-        """Close at once; the other end's bytes, sent or to come, are lost."""
-        self.fault = self.fault or "closed"
-        if self._transport is not None:
-            self._transport.abort()
 
 
 class EtalonError(CcatpError):
@@ -159,14 +101,14 @@ class EtalonClient:
         self._channels = tuple(channels)
         self._collimators = dict(zip(self._channels, np.asarray(collimators_m, dtype=np.float64), strict=True))
         self._request = MultilineRequest(Command.LATEST_LENGTH_VALID, self._channels)
-        self._link: EtalonLink | None = None
+        self._connection: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self._turn = asyncio.Lock()
         self._last: tuple[dict[int, float], Vector3] | None = None  # lengths of the last fix, and where it was expected
 
     async def connect(self) -> None:
         """Connect, unless connected; ``EtalonUnreachable``: not within the configured number of tries."""
         async with self._turn:
-            await self._retry(self._usable_link)
+            await self._retry(self._usable_connection)
 
     async def close(self) -> None:
         """Close the connection. A request under way ends first."""
@@ -211,62 +153,62 @@ class EtalonClient:
                 elif not isinstance(error, EtalonTimeout):
                     await asyncio.sleep(self._cfg.measuring_time_s)
 
-    async def _usable_link(self) -> EtalonLink:
-        """The connection, or a new one where there is none that is free of leftovers."""
-        if self._link is not None:
+    async def _usable_connection(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        """The connection, or a new one where there is none on which nothing has come since the last reply."""
+        if self._connection is not None:
             # Two turns of the event loop: what lies in the socket by now is delivered, and seen here.
             await asyncio.sleep(0)
             await asyncio.sleep(0)
-            if not self._link.fault and not self._link.has_leftovers:
-                return self._link
+            if await _next_byte(self._connection[0]) is None:
+                return self._connection
             self.counts["drained"] += 1
             self._drop()
         try:
             async with asyncio.timeout(self._cfg.connect_timeout_s):
-                _, self._link = await asyncio.get_running_loop().create_connection(
-                    EtalonLink, self._cfg.host, self._cfg.port
+                self._connection = await asyncio.open_connection(
+                    self._cfg.host, self._cfg.port, limit=multiline.MAX_LINE_BYTES
                 )
         except (OSError, TimeoutError) as error:
             reason = str(error) or f"no connection within {self._cfg.connect_timeout_s} s"
             raise EtalonUnreachable(f"{self._where}: {reason}; is it running, are [etalon] host, port right?") from None
         self.counts["connects"] += 1
-        return self._link
+        return self._connection
 
     def _drop(self) -> None:
-        if self._link is not None:
-            self._link.abort()
-            self._link = None
+        if self._connection is not None:
+            self._connection[1].transport.abort()
+            self._connection = None
 
     async def _ask(self, request: MultilineRequest, expected: type[_ReplyT]) -> _ReplyT:
         """One request, one reply of the expected kind; whatever else happens, the connection is gone."""
-        link = await self._usable_link()
+        reader, writer = await self._usable_connection()
         self.counts["requests"] += 1
+        is_answered = False
         try:
+            writer.write(multiline.format_request(request))
             async with asyncio.timeout(self._cfg.request_timeout_s):
-                line = await link.ask(request)
-            reply = multiline.parse_reply(line)
-            if link.has_leftovers:
+                line = await reader.readuntil(b"\n")
+            reply = multiline.parse_reply(line.rstrip(b"\r\n"))
+            if await _next_byte(reader):
                 raise multiline.BadReply("more than one line in reply to one request")
             if isinstance(reply, Remark) and reply.name == "error":
                 raise EtalonServerError(f"{self._where}: refused {request.command}: {reply.text!r}; see its log")
             if not isinstance(reply, expected):
                 raise multiline.BadReply(f"{type(reply).__name__} in reply to {request.command}")
+            is_answered = True
+            return reply
         except TimeoutError:
-            self._drop()
             raise EtalonTimeout(
                 f"{self._where}: no reply to {request.command} within {self._cfg.request_timeout_s} s; restart its "
                 "laser driver or raise [etalon] request_timeout_s"
             ) from None
-        except (multiline.BadReply, LineTooLong) as error:
-            self._drop()
+        except (multiline.BadReply, asyncio.LimitOverrunError) as error:
             raise EtalonBadReply(f"{self._where}: {error}; is this a MultiLine server?") from None
-        except ConnectionError as error:
-            self._drop()
-            raise EtalonUnreachable(f"{self._where}: {error}; is it running?") from None
-        except BaseException:  # cancelled: the reply is still to come
-            self._drop()
-            raise
-        return reply
+        except (ConnectionError, asyncio.IncompleteReadError):
+            raise EtalonUnreachable(f"{self._where}: server closed the connection; is it running?") from None
+        finally:
+            if not is_answered:
+                self._drop()
 
     async def _ask_readiness(self) -> Readiness:
         connected = await self._ask(MultilineRequest(Command.IS_CONNECTED), Connected)
@@ -306,3 +248,14 @@ class EtalonClient:
                 f"{self._where}: the lengths are those of the last place, {1e3 * moved_m:.0f} mm from here, to the "
                 "last digit; restart its laser driver"
             )
+
+
+async def _next_byte(reader: asyncio.StreamReader) -> bytes | None:
+    """A byte that has come already, empty where the connection has ended; ``None`` where nothing has happened."""
+    try:
+        async with asyncio.timeout(0.0):
+            return await reader.read(1)
+    except TimeoutError:
+        return None
+    except ConnectionError:
+        return b""
