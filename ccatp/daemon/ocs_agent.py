@@ -17,12 +17,13 @@ from typing import Any
 import msgspec
 
 from ccatp.config.package import child_environment
-from ccatp.errors import CcatpError, DaemonUnreachableError, ExitStatus
+from ccatp.errors import CcatpError, ConfigError, DaemonUnreachableError, ExitStatus
 from ccatp.links.client import OperatorClient
 from ccatp.links.topics import MissionStatus
 
 Answer = tuple[bool, str]
 PERIOD_S = 0.5
+RUNNING = ("starting", "running")  # states of a session of OCS
 # A survey that was started publishes its status within this: processes, planning, joining.
 START_TIMEOUT_S = 60.0
 ENDINGS: Mapping[int, str] = {
@@ -83,14 +84,14 @@ class SurveyTask:
             if status is not None:
                 last = status
                 session.data = msgspec.to_builtins(status)
+                if session.status not in RUNNING and not is_aborted:
+                    is_aborted = self.ask("abort")[0]
             elif child is None:  # it was there, and is gone
                 break
             elif last is None and time.monotonic() > deadline_s:
                 child.terminate()
                 child.wait()
                 return False, f"the survey said nothing within {START_TIMEOUT_S:g} s and was ended"
-            if session.status not in ("starting", "running") and not is_aborted and status is not None:
-                is_aborted = self.ask("abort")[0]
             time.sleep(PERIOD_S)
         code = child.returncode if child is not None else (-1 if last is None else last.exit_status)
         session.data = {**session.data, "exit_status": code}
@@ -112,18 +113,16 @@ class SurveyTask:
 
     def monitor(self, session: Any, publish: Callable[[dict[str, Any]], None], period_s: float) -> Answer:
         """Publish the status periodically until the session is stopped; ``session.data`` is what was published last."""
-        while session.status in ("starting", "running"):
-            status = self._status()
-            now_s = time.time()
-            publish({"timestamp": now_s, "block_name": "daemon", "data": {"running": int(status is not None)}})
-            if status is not None:
-                data = {field: getattr(status, name) for field, name in FEED_FIELDS.items()}
-                publish({"timestamp": now_s, "block_name": "survey", "data": data})
+        while session.status in RUNNING:
+            status, now_s, until_s = self._status(), time.time(), time.monotonic() + period_s
+            blocks = {"daemon": {"running": int(status is not None)}}
             session.data = {"timestamp": now_s, "running": status is not None}
             if status is not None:
+                blocks["survey"] = {field: getattr(status, name) for field, name in FEED_FIELDS.items()}
                 session.data |= msgspec.to_builtins(status)
-            until_s = time.monotonic() + period_s
-            while session.status in ("starting", "running") and time.monotonic() < until_s:
+            for name, data in blocks.items():
+                publish({"timestamp": now_s, "block_name": name, "data": data})
+            while session.status in RUNNING and time.monotonic() < until_s:
                 time.sleep(min(0.1, period_s))
         return True, "monitoring ended"
 
@@ -144,20 +143,21 @@ ORDERS = ("status", "pause", "resume", "abort", "stop")
 TIMEOUT_S = 10.0
 
 
-class OcsMissing(CcatpError):
-    """The extra is not installed."""
-
-    exit_status = ExitStatus.USAGE
+# Of the agent's command line; all but the period are those of ``ccatp run``.
+OPTIONS: dict[str, dict[str, Any]] = {
+    "--sim": {"action": "store_true", "help": "simulate robot and laser system"},
+    "--realtime": {"action": "store_true", "help": "with --sim: pace the simulation on the wall clock"},
+    "--config": {"type": Path, "help": "configuration of the surveys"},
+    "--mirror": {"help": "mirror of the surveys, if not that of the configuration"},
+    "--runtime-dir": {"type": Path, "help": "folder of the daemon's sockets, if not the usual one"},
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     """Add the agent's own options to those of OCS."""
     own = parser.add_argument_group("Agent options")
-    own.add_argument("--config", type=Path, help="configuration of the surveys")
-    own.add_argument("--sim", action="store_true", help="simulate robot and laser system")
-    own.add_argument("--realtime", action="store_true", help="with --sim: pace the simulation on the wall clock")
-    own.add_argument("--mirror", help="mirror of the surveys, if not that of the configuration")
-    own.add_argument("--runtime-dir", type=Path, help="folder of the daemon's sockets, if not the usual one")
+    for option, attributes in OPTIONS.items():
+        own.add_argument(option, **attributes)
     own.add_argument("--period", type=float, default=1.0, help="seconds between two blocks of the feed")
     return parser
 
@@ -165,24 +165,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
 def survey_command(args: argparse.Namespace) -> list[str]:
     """``ccatp run`` with the agent's options."""
     command = [sys.executable, "-m", "ccatp", "run"]
-    command += [flag for flag, is_given in (("--sim", args.sim), ("--realtime", args.realtime)) if is_given]
-    for option, value in (("--config", args.config), ("--mirror", args.mirror), ("--runtime-dir", args.runtime_dir)):
-        if value is not None:
-            command += [option, str(value)]
+    for option in OPTIONS:
+        value = getattr(args, option.strip("-").replace("-", "_"))
+        if value:
+            command += [option] if value is True else [option, str(value)]
     return command
 
 
 def main(args: Sequence[str] | None = None) -> None:
     """Entry of ``ocs-agent-cli --agent CcatpAgent``: join the crossbar router and serve until it ends.
 
-    Raises:
-        OcsMissing: the extra is not installed.
+    Raises ConfigError: the extra is not installed.
     """
     try:
         import txaio  # type: ignore[import-untyped, unused-ignore]  # noqa: PLC0415 - belongs to an extra
         from ocs import ocs_agent, site_config  # noqa: PLC0415
     except ImportError as error:
-        raise OcsMissing("the agent needs OCS: install ccatp with its extra, ccatp[ocs]") from error
+        raise ConfigError("the agent needs OCS: install ccatp with its extra, ccatp[ocs]") from error
     txaio.start_logging(  # type: ignore[attr-defined, unused-ignore]
         level=os.environ.get("LOGLEVEL", "info")
     )
@@ -201,8 +200,7 @@ def main(args: Sequence[str] | None = None) -> None:
 def register(agent: Any, surveys: SurveyTask, param: Any, period_s: float) -> None:
     """Register processes, tasks and feed at an ``OCSAgent``; ``param`` is ``ocs.ocs_agent.param``."""
 
-    def stop(session: Any, params: Any) -> Answer:
-        del params
+    def stop(session: Any, _params: Any) -> Answer:
         session.set_status("stopping")
         return True, "asked to stop"
 
@@ -214,12 +212,11 @@ def register(agent: Any, surveys: SurveyTask, param: Any, period_s: float) -> No
         """
         return surveys.survey(session, params["panels"])
 
-    def monitor(session: Any, params: Any) -> Answer:
+    def monitor(session: Any, _params: Any) -> Answer:
         """Publish the state of the survey to the feed ``survey``, whether one runs or not.
 
         **Process** - begins with the agent.
         """
-        del params
         return surveys.monitor(session, lambda block: agent.publish_to_feed(FEED, block), period_s)
 
     panels = param("panels", default=None, type=int, check=lambda number: number >= 0)
@@ -229,8 +226,7 @@ def register(agent: Any, surveys: SurveyTask, param: Any, period_s: float) -> No
     agent.register_process("monitor", nothing(monitor), stop, blocking=True, startup=True)
     for order in ORDERS:
 
-        def task(session: Any, params: Any, order: str = order) -> Answer:
-            del params
+        def task(session: Any, _params: Any, order: str = order) -> Answer:
             return surveys.ask(order, session)
 
         task.__doc__ = (

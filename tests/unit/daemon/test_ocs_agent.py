@@ -13,7 +13,8 @@ import msgspec
 import pytest
 
 from ccatp.daemon import ocs_agent
-from ccatp.daemon.ocs_agent import OcsMissing, SurveyTask, add_arguments, main, register, survey_command
+from ccatp.daemon.ocs_agent import SurveyTask, add_arguments, main, register, survey_command
+from ccatp.errors import ConfigError
 from ccatp.links.client import OperatorClient
 from ccatp.links.topics import MissionStatus
 from tests.unit.test_client import serving
@@ -159,7 +160,7 @@ def test_the_command_of_a_survey() -> None:
 
 def test_without_the_extra_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ocs", None)
-    with pytest.raises(OcsMissing, match=r"install ccatp with its extra, ccatp\[ocs\]"):
+    with pytest.raises(ConfigError, match=r"install ccatp with its extra, ccatp\[ocs\]"):
         main([])
 
 
