@@ -9,7 +9,7 @@ import click
 
 import ccatp
 from ccatp.cli import config, operate, prepare, radio, recording, report, run, sim, study
-from ccatp.cli.common import SuggestingGroup, example, run_command_line
+from ccatp.cli.common import CommandGroup, example, run_command_line
 
 COMMANDS = (
     # before a mission
@@ -30,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 @click.group(
-    cls=SuggestingGroup,
+    cls=CommandGroup,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog=example("ccatp run --sim", "ccatp run --sim --mirror fyst-m2 --seed 2", "ccatp status --json"),
 )

@@ -1,6 +1,5 @@
-"""What every command shares: suggestions, one-line errors, exit statuses, options, talk with a running daemon."""
+"""What every command shares: one-line errors, exit statuses, options, talk with a running daemon."""
 
-import difflib
 import math
 import os
 import sys
@@ -22,23 +21,6 @@ LONGEST_WAIT_S = 86_400.0
 
 
 PATH = click.Path(path_type=Path)
-
-
-def nearest_hint(name: str, names: Iterable[str]) -> str:
-    """``did you mean run?``, or else what there is."""
-    near = difflib.get_close_matches(name, list(names), n=1)
-    return f"did you mean {near[0]}?" if near else f"there are {', '.join(names)}"
-
-
-class NearestChoice(click.Choice[str]):
-    """A choice that answers a misspelt one with the nearest."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """As ``click.Choice.convert``."""
-        near = difflib.get_close_matches(str(value), [str(choice) for choice in self.choices], n=1)
-        if near and value not in self.choices:
-            self.fail(f"{value!r} is none of {', '.join(self.choices)}; did you mean {near[0]}?", param, ctx)
-        return super().convert(value, param, ctx)
 
 
 class WaitingTime(click.ParamType[float]):
@@ -79,19 +61,16 @@ class OutputFile(click.Path):
         return path
 
 
-class SuggestingGroup(click.Group):
-    """A group of commands that answers a misspelt one with the nearest."""
+class CommandGroup(click.Group):
+    """A group of commands that refuses a former name of one with the present one."""
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command that ``args`` starts with. Raises click.UsageError: there is none of that name."""
-        name = args[0]
-        if self.get_command(ctx, name) is None and not name.startswith("-"):
-            new_name = RENAMED_COMMANDS.get(name)
-            if new_name is not None and self.get_command(ctx, new_name) is not None:
-                raise click.UsageError(f"the command {name!r} is now called {new_name!r}", ctx)
-            raise click.UsageError(f"no command {name!r}; {nearest_hint(name, self.list_commands(ctx))}", ctx)
+        """As ``click.Group.resolve_command``."""
+        name, new_name = args[0], RENAMED_COMMANDS.get(args[0])
+        if name not in self.commands and new_name in self.commands:
+            raise click.UsageError(f"the command {name!r} is now called {new_name!r}", ctx)
         return super().resolve_command(ctx, args)
 
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import click
 
-from ccatp.cli.common import PATH, NearestChoice, SuggestingGroup, complain, example, json_option, print_lines
+from ccatp.cli.common import PATH, CommandGroup, complain, example, json_option, print_lines
 from ccatp.errors import ConfigError
 
 
 @click.group(
-    cls=SuggestingGroup, epilog=example("ccatp config check telescope.toml", "ccatp config schema > ccatp.schema.json")
+    cls=CommandGroup, epilog=example("ccatp config check telescope.toml", "ccatp config schema > ccatp.schema.json")
 )
 def config() -> None:
     """Check and describe configurations."""
@@ -67,7 +67,7 @@ DIR_OPTION = click.option(
 )  # fmt: skip
 
 
-@click.group(cls=SuggestingGroup, epilog=example("ccatp keys generate --dir /etc/ccatp/keys"))
+@click.group(cls=CommandGroup, epilog=example("ccatp keys generate --dir /etc/ccatp/keys"))
 def keys() -> None:
     """Make keys and show the public ones."""
 
@@ -141,7 +141,7 @@ VARIABLE = "_CCATP_COMPLETE"
         "ccatp completion fish > ~/.config/fish/completions/ccatp.fish",
     )
 )
-@click.argument("shell", type=NearestChoice(SHELLS), metavar="SHELL")
+@click.argument("shell", type=click.Choice(SHELLS), metavar="SHELL")
 @click.pass_context
 def completion(context: click.Context, shell: str) -> int:
     """Print the completion for SHELL: bash, zsh or fish.

@@ -15,11 +15,11 @@ from ccatp.cli.common import (
     PATH,
     RUNTIME_DIR_OPTION,
     TIMEOUT_OPTION,
-    NearestChoice,
     configured_folder,
     example,
     json_option,
     options,
+    print_lines,
 )
 from ccatp.errors import DaemonUnreachableError
 
@@ -46,25 +46,12 @@ def _print_reply(reply: Mapping[str, Any], json_output: bool) -> None:
     if json_output:
         click.echo(json.dumps(reply))
         return
-    if isinstance(status := reply.get("status"), Mapping):
-        from ccatp.daemon.terminal import status_rows
+    from ccatp.daemon.terminal import status_rows
 
-        rows = list(status_rows(status))
-    else:
-        rows = [(k, v) for k, v in _flat({key: value for key, value in reply.items() if key != "ok"}) if v]
+    facts = ((name, value) for name, value in reply.items() if name != "ok")
+    rows = list(status_rows(reply["status"]) if "status" in reply else facts)
     width = max((len(name) for name, _ in rows), default=0)
-    for name, value in rows:
-        click.echo(f"{name:<{width}}  {value}")
-    if not rows:
-        click.echo("ok")
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, f"{value:.6g}" if isinstance(value, float) else "-" if value is None else str(value)
+    print_lines([f"{name:<{width}}  {value}" for name, value in rows] or ["ok"])
 
 
 def _operator_command(name: str, help_text: str) -> click.Command:
@@ -95,7 +82,7 @@ OBSERVATORY_OPTIONS = options(
         "ccatp emergency fire --endpoint tcp://m1:7020 --server-key ccatp.key --key observatory.key_secret",
     )
 )
-@click.argument("kind", type=NearestChoice(EMERGENCY_KINDS), metavar="KIND")
+@click.argument("kind", type=click.Choice(EMERGENCY_KINDS), metavar="KIND")
 @click.option("--note", default="", help="What happened, for the log.")
 @click.option(
     "--id", "emergency_id", type=click.UUID, help="Identity of the emergency; sending the same one again is harmless."
@@ -142,15 +129,12 @@ def _ask_observatory(
 @click.command(
     epilog=example("ccatp status", "ccatp status --watch", "ccatp status --watch --json | jq -c .status.done")
 )
-@CONFIG_OPTION
-@RUNTIME_DIR_OPTION
-@TIMEOUT_OPTION
-@click.option("--watch", is_flag=True, help="Go on until the run is over.")
+@DAEMON_OPTIONS
+@click.option("--watch", is_flag=True, help="Go on until the run is over; with --json one answer a line.")
 @click.option(
     "--every", "period_s", type=click.FloatRange(0.1, 3600.0), default=1.0, show_default=True, metavar="SECONDS",
     help="With --watch: look this often.",
 )  # fmt: skip
-@json_option("The daemon's answer as JSON; with --watch one a line.")
 def status(
     config_file: Path | None, runtime_dir: Path | None, timeout_s: float, watch: bool, period_s: float,
     json_output: bool,

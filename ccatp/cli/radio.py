@@ -12,8 +12,8 @@ from ccatp.cli.common import (
     CONFIG_OPTION,
     JSON_OPTION,
     PATH,
+    CommandGroup,
     OutputFile,
-    SuggestingGroup,
     complain,
     example,
     figure_option,
@@ -298,7 +298,7 @@ def _progress(total: int) -> Callable[[int], None]:
     return show
 
 
-@click.group(cls=SuggestingGroup, epilog=example("ccatp radio slam recordings/Plaza2_.mat"))
+@click.group(cls=CommandGroup, epilog=example("ccatp radio slam recordings/Plaza2_.mat"))
 def radio() -> None:
     """Robots among radio beacons: mapping them, finding the way by them."""
 

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ccatp.cli.common import PATH, SuggestingGroup, example, json_option
+from ccatp.cli.common import PATH, CommandGroup, example, json_option
 
 if TYPE_CHECKING:
     from ccatp.records.recording_repair import RecordingFacts
 
 
 @click.group(
-    cls=SuggestingGroup, epilog=example("ccatp recording info runs/tonight", "ccatp recording repair telemetry.mcap")
+    cls=CommandGroup, epilog=example("ccatp recording info runs/tonight", "ccatp recording repair telemetry.mcap")
 )
 def recording() -> None:
     """Show what recordings hold and repair damaged ones."""

@@ -13,12 +13,11 @@ from ccatp.cli.common import (
     PATH,
     RUNTIME_DIR_OPTION,
     WORLD_OPTIONS,
-    SuggestingGroup,
+    CommandGroup,
     WaitingTime,
     address_options,
     complain,
     example,
-    nearest_hint,
 )
 from ccatp.errors import ConfigError
 
@@ -40,7 +39,7 @@ def _endpoint(_ctx: click.Context, _param: click.Parameter, endpoint: str | None
     return endpoint
 
 
-@click.group(cls=SuggestingGroup, epilog=example("ccatp sim robot --port 7010"))
+@click.group(cls=CommandGroup, epilog=example("ccatp sim robot --port 7010"))
 def sim() -> None:
     """Stand-ins of robot and laser system, alone."""
 
@@ -129,6 +128,7 @@ def conformance(
     """
     from ccatp.commissioning.conformance.motion_checks import notice
     from ccatp.commissioning.conformance.runner import CHECKS, Conformance, as_json, check_ids, last_line, table_line
+    from ccatp.config.messages import choice_hint
     from ccatp.links.auth import read_key
 
     host, _, port = server.rpartition(":")
@@ -136,7 +136,7 @@ def conformance(
     if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
         raise click.UsageError(f"{server!r} is not HOST:PORT, as in 127.0.0.1:7010")
     if unknown := [name for name in only if name not in check_ids()]:
-        raise click.UsageError(f"--only: no check {unknown[0]!r}; {nearest_hint(unknown[0], check_ids())}")
+        raise click.UsageError(f"--only: no check {unknown[0]!r}; {choice_hint(unknown[0], check_ids())}")
     try:
         key = read_key(key_file or "")
     except ConfigError as error:
