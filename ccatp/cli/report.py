@@ -4,7 +4,7 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,8 +28,7 @@ from ccatp.errors import CcatpError, ConfigError, ExitStatus
 
 if TYPE_CHECKING:
     from ccatp.config.models import Config
-    from ccatp.mirror.mirror_alignment import SurveyResult
-    from ccatp.records.run_reader import Recording, Survey
+    from ccatp.records.run_reader import Recording
     from ccatp.studies.replay import ReplayEvaluation
 
 
@@ -54,9 +53,9 @@ def report(run_dir: Path, out: Path | None, figures: Path | None, json_output: b
     """
     from ccatp.report.run_page import report_run
 
-    path, data, warnings = report_run(run_dir, out, figures)
+    data, warnings = report_run(run_dir, out, figures)
     warn(warnings)
-    click.echo(json.dumps({"report": str(path), **data}) if json_output else path)
+    click.echo(json.dumps(data) if json_output else data["report"])
     return 0
 
 
@@ -94,8 +93,22 @@ def plot(run_dir: Path, out: Path | None) -> int:
     return 0
 
 
-# What the fixes are judged by; everything else has acted on the run already.
+# What the fixes are judged by, and what a localizer is built from; everything else has acted on the run already.
 ALIGN_KEYS = ("align.", "robot.puck_height_m", "mirror.")
+REPLAY_KEYS = ("localizer.", "robot.", "mirror.", "run.filter")
+PROGRESS_S = 50.0
+
+
+class ReplayError(CcatpError):
+    """A run that cannot be replayed."""
+
+    exit_status = ExitStatus.USAGE
+
+
+def _check_effect(settings: Mapping[str, object], keys: tuple[str, ...], what: str) -> None:
+    """ConfigError: a key has no effect on ``what``."""
+    if idle := [key for key in settings if not key.startswith(keys)]:
+        raise ConfigError(f"command line: {idle[0]}: has no effect on {what}; what has: {', '.join(keys)}")
 
 
 @click.command(
@@ -119,15 +132,23 @@ def align(
     from ccatp.records.run_reader import read_run
     from ccatp.report.alignment import csv_lines, result_data, table_lines
 
-    if idle := [key for key in settings if not key.startswith(ALIGN_KEYS)]:
-        raise ConfigError(f"command line: {idle[0]}: has no effect on the alignment; what has: {', '.join(ALIGN_KEYS)}")
+    _check_effect(settings, ALIGN_KEYS, "the alignment")
     survey = read_run(run_dir, settings)
     cfg = survey.cfg
     mirror = build_mirror(cfg.mirror)
     planned = {point.panel for point in survey.planned}
     result = survey_result(mirror, cfg.align, cfg.robot.puck_height_m, survey.measured, planned)
     comparison = None if survey.injected is None else compare(result.panels, survey.injected)
-    facts = _facts(run_dir, survey, result)
+    outliers = sum(len(panel.outliers) for panel in result.panels)
+    facts = {
+        "run_dir": str(run_dir),
+        "mirror": cfg.mirror.name,
+        "world": cfg.world.name if survey.is_simulation else None,
+        "seed": cfg.run.seed,
+        "points": {"total": len(survey.planned), "measured": len(survey.measured), "outliers": outliers},
+        "adjusters": list(result.panels[0].adjusters) if result.panels else [],
+        "puck_height_sigma_um": round(cfg.align.puck_height_sigma_m * 1e6, 4),
+    }
     warnings = [*survey.warnings, *result.warnings]
     warn(warnings)
     if csv_file is not None:
@@ -141,34 +162,6 @@ def align(
     else:
         print_lines(table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m))
     return 0
-
-
-def _facts(run_dir: Path, survey: "Survey", result: "SurveyResult") -> dict[str, Any]:
-    cfg = survey.cfg
-    return {
-        "run_dir": str(run_dir),
-        "mirror": cfg.mirror.name,
-        "world": cfg.world.name if survey.is_simulation else None,
-        "seed": cfg.run.seed,
-        "points": {
-            "total": len(survey.planned),
-            "measured": len(survey.measured),
-            "outliers": sum(len(panel.outliers) for panel in result.panels),
-        },
-        "adjusters": list(result.panels[0].adjusters) if result.panels else [],
-        "puck_height_sigma_um": round(cfg.align.puck_height_sigma_m * 1e6, 4),
-    }
-
-
-# The sections of the configuration that a localizer is built from. Everything else has acted on the run already.
-REPLAY_ACTING = ("localizer.", "robot.", "mirror.", "run.filter")
-PROGRESS_S = 50.0
-
-
-class ReplayError(CcatpError):
-    """A run that cannot be replayed."""
-
-    exit_status = ExitStatus.USAGE
 
 
 @click.command(
@@ -187,15 +180,20 @@ class ReplayError(CcatpError):
 def replay(run_dir: Path, settings: Mapping[str, object], smooth: bool, out: Path | None, json_output: bool) -> int:
     """Run an estimator again over the recorded samples of a run, as it was or with other settings."""
     from ccatp.records.run_reader import open_run
-    from ccatp.studies.replay import csv_lines, judge, table_lines
+    from ccatp.studies.replay import csv_lines, has_smoother, judge, table_lines
 
     recordings = open_run(run_dir)
-    configs = [_config(recording, settings, smooth) for recording in recordings]
+    configs = [recording.config(settings) for recording in recordings]
+    _check_effect(settings, REPLAY_KEYS, "a replay")
+    if smooth and not all(map(has_smoother, configs)):
+        raise ConfigError(
+            f"--smooth: the pose is no state of filter {configs[-1].run.filter}; choose --filter ekf or ukf"
+        )
     started = time.monotonic()
-    parts = [_judged(recording, cfg, smooth) for recording, cfg in zip(recordings, configs, strict=True)]
+    parts = [_replayed(recording, cfg, smooth) for recording, cfg in zip(recordings, configs, strict=True)]
     result = {
         "run_dir": str(run_dir),
-        **_replay_facts(recordings, configs, parts, settings),
+        **_replay_facts(configs[-1], parts, settings, is_simulation=recordings[-1].is_simulation),
         **judge(parts),
         "warnings": [warning for recording in recordings for warning in recording.warnings],
         "wall": {"time_s": round(time.monotonic() - started, 3)},
@@ -215,18 +213,7 @@ def replay(run_dir: Path, settings: Mapping[str, object], smooth: bool, out: Pat
     return complain(f"{run_dir}: the replay does not reproduce the recorded estimates: {why}", ExitStatus.REFUSED)
 
 
-def _config(recording: "Recording", changes: Mapping[str, object], smooth: bool) -> "Config":
-    from ccatp.studies.replay import has_smoother
-
-    cfg = recording.config(changes)
-    if idle := [key for key in changes if not key.startswith(REPLAY_ACTING)]:
-        raise ConfigError(f"command line: {idle[0]}: has no effect on a replay; what has: localizer, robot, mirror")
-    if smooth and not has_smoother(cfg):
-        raise ConfigError(f"--smooth: the pose is no state of filter {cfg.run.filter}; choose --filter ekf or ukf")
-    return cfg
-
-
-def _judged(recording: "Recording", cfg: "Config", smooth: bool) -> "ReplayEvaluation":
+def _replayed(recording: "Recording", cfg: "Config", smooth: bool) -> "ReplayEvaluation":
     from ccatp.filters.base import FilterError
     from ccatp.mirror.mirror import build_mirror
     from ccatp.mirror.surface import MirrorError
@@ -234,9 +221,18 @@ def _judged(recording: "Recording", cfg: "Config", smooth: bool) -> "ReplayEvalu
     from ccatp.studies.replay import ReplayEvaluation
     from ccatp.studies.replay import replay as play
 
+    shown_s = float("-inf")
+
+    def show(t_s: float) -> None:
+        nonlocal shown_s
+        if t_s - shown_s >= PROGRESS_S:
+            shown_s = t_s
+            click.echo(f"\rreplayed {t_s:.0f} s \r", nl=False, err=True)
+
     mirror = build_mirror(cfg.mirror)
+    on_frame = show if sys.stderr.isatty() else None
     try:
-        replayed = play(cfg, mirror, in_order(recording.messages()), smooth=smooth, on_frame=_progress())
+        replayed = play(cfg, mirror, in_order(recording.messages()), smooth=smooth, on_frame=on_frame)
     except (FilterError, MirrorError) as error:
         raise ReplayError(f"{recording.path}: the estimator gave up: {error}; try other settings") from error
     if not len(replayed.trace.seq):
@@ -246,29 +242,28 @@ def _judged(recording: "Recording", cfg: "Config", smooth: bool) -> "ReplayEvalu
 
 
 def _replay_facts(
-    recordings: Sequence["Recording"], configs: Sequence["Config"], parts: Sequence["ReplayEvaluation"],
-    changes: Mapping[str, object],
-) -> dict[str, Any]:  # fmt: skip
-    traces = [part.replayed.trace for part in parts]
+    cfg: "Config", parts: Sequence["ReplayEvaluation"], settings: Mapping[str, object], *, is_simulation: bool
+) -> dict[str, Any]:
     outcomes = [part.replayed for part in parts]
-    counts: Counter[str] = Counter()
+    counts = Counter[str]()
     for outcome in outcomes:
         counts.update(outcome.counts)
+    times_s = [outcome.trace.t_s for outcome in outcomes]
     first = next((outcome.first_difference for outcome in outcomes if outcome.first_difference), None)
     return {
-        "mirror": configs[-1].mirror.name,
-        "world": configs[-1].world.name if recordings[-1].is_simulation else None,
-        "seed": configs[-1].run.seed,
-        "recordings": len(recordings),
-        "frames": sum(len(trace.seq) for trace in traces),
-        "span_s": round(sum(float(trace.t_s[-1] - trace.t_s[0]) for trace in traces), 3),
-        "filter": configs[-1].run.filter,
-        "settings": dict(changes),
+        "mirror": cfg.mirror.name,
+        "world": cfg.world.name if is_simulation else None,
+        "seed": cfg.run.seed,
+        "recordings": len(parts),
+        "frames": sum(map(len, times_s)),
+        "span_s": round(sum(float(t_s[-1] - t_s[0]) for t_s in times_s), 3),
+        "filter": cfg.run.filter,
+        "settings": dict(settings),
         "fixes": {
             "given": sum(outcome.fixes for outcome in outcomes),
             "refused": sum(outcome.refused for outcome in outcomes),
             "set_aside": sum(outcome.set_aside for outcome in outcomes),
-            "first_difference": None if first is None else {"t_s": first[0], "said": first[1]},
+            "first_difference": first and {"t_s": first[0], "said": first[1]},
         },
         "counts": dict(counts),
     }
@@ -289,17 +284,3 @@ def _head(result: Mapping[str, Any]) -> list[str]:
         what = f"is refused here: {first['said']}" if first["said"] else "is taken here and was refused in the run"
         lines.append(f"the fix of {first['t_s']:.2f} s {what}")
     return [*lines, ""]
-
-
-def _progress() -> Callable[[float], None] | None:
-    if not sys.stderr.isatty():
-        return None
-    shown_s = float("-inf")
-
-    def show(t_s: float) -> None:
-        nonlocal shown_s
-        if t_s - shown_s >= PROGRESS_S:
-            shown_s = t_s
-            click.echo(f"\rreplayed {t_s:.0f} s \r", nl=False, err=True)
-
-    return show

@@ -21,24 +21,25 @@ from ccatp.links.bus import Subscriber
 from ccatp.links.runtime_dir import runtime_dir_path
 from ccatp.links.topics import BY_NAME, Heartbeat, Message, schema_of
 from ccatp.mirror.mirror import build_mirror
-from ccatp.records.recorder import TELEMETRY, read_metadata
+from ccatp.records.recorder import TELEMETRY, RecordedMessage, read_metadata
 from ccatp.report.foxglove import (
     VIEWS,
     FoxgloveStream,
     LiveStream,
     PlotJugglerStream,
-    ViewMessage,
     Views,
     check_host,
     plain_schema,
+    repeat_latched,
     view_schemas,
 )
 
 # Topics that are streamed as they are; batches are streamed as their views.
 PASSED_ON = ("mission", "arrival", "rest", "treatment", "fix", "danger_event")
 TURNED_INTO_VIEWS = ("estimate", "sensors", "fix", "truth", "log")
-LATCHED = frozenset(view.name for view in VIEWS if view.is_latched)
 RUN = "run"
+# A late subscriber gets their last message.
+LATCHED = {RUN, *(view.name for view in VIEWS if view.is_latched)}
 PERIOD_MS = 20
 NICENESS = 10
 
@@ -75,6 +76,7 @@ class Streamer:
         self._heartbeats = Subscriber(context, [self._endpoints.of("main")], ["heartbeat.main"])
         self._run: Subscriber | None = None
         self._views: Views | None = None
+        self._latched: dict[str, RecordedMessage] = {}
         self._pid = -1
 
     def step(self) -> None:
@@ -91,7 +93,7 @@ class Streamer:
             if isinstance(raw[2], Message):
                 self._pass_on(raw[0], raw[1], raw[2])
         for stream in self._streams:
-            stream.tend()
+            repeat_latched(stream, self._latched)
 
     def close(self) -> None:
         """Close the sockets."""
@@ -115,7 +117,7 @@ class Streamer:
         self._views = Views(build_mirror(cfg.mirror), cfg.robot.puck_height_m)
         mirror, world, run = cfg.mirror.name, cfg.world.name if is_sim else "", cfg.run
         fact = RunFact(mirror, world, is_sim, run.seed, run.filter, str(run_dir))
-        self._send((ViewMessage(RUN, 0.0, json.dumps(msgspec.to_builtins(fact)).encode()), *self._views.begin()))
+        self._send((RecordedMessage(RUN, 0.0, json.dumps(msgspec.to_builtins(fact)).encode()), *self._views.begin()))
         names = ("main", "danger", "truth") if is_sim else ("main", "danger")
         topics = dict.fromkeys((*PASSED_ON, *TURNED_INTO_VIEWS))
         self._run = Subscriber(self._context, [self._endpoints.of(name) for name in names], topics)
@@ -123,14 +125,16 @@ class Streamer:
 
     def _pass_on(self, name: str, body: bytes, message: Message) -> None:
         if name in PASSED_ON:
-            self._send([ViewMessage(name, max(message.t_s, 0.0), body)])
+            self._send([RecordedMessage(name, max(message.t_s, 0.0), body)])
         if name in TURNED_INTO_VIEWS and self._views is not None:
             self._send(self._views.of(message))
 
-    def _send(self, messages: Iterable[ViewMessage]) -> None:
+    def _send(self, messages: Iterable[RecordedMessage]) -> None:
         for shown in messages:
+            if shown.topic in LATCHED:
+                self._latched[shown.topic] = shown
             for stream in self._streams:
-                stream.send(shown, is_latched=shown.topic == RUN or shown.topic in LATCHED)
+                stream.send(shown)
 
     def _close_run(self) -> None:
         if self._run is not None:

@@ -152,7 +152,8 @@ def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.Fi
     try:
         from ccatp.report.run_page import report_run  # noqa: PLC0415
 
-        return str(report_run(run_dir).path)
+        data, _ = report_run(run_dir)
+        return str(data["report"])
     except RunReadError as error:
         return f"none; {error}"
     except Exception as error:

@@ -32,8 +32,7 @@ def error_figure(series: ErrorSeries, width_px: float) -> Figure:
     usual_mm = float(np.percentile(errors, 2)) if len(errors) else 0.1
     low_mm = 10.0 ** floor(log10(max(min(usual_mm, float(series.sigma3_mm.min())), _LEAST_MM)))
     high_mm = 1.5 * max(float(np.concatenate([series.sigma3_mm, errors, series.fix_mm]).max()), 0.1)
-    begin_s, end_s = float(series.t_s[0]), max(float(series.t_s[-1]), float(series.t_s[0]) + 1.0)
-    axes.set(xlabel="robot time, min", ylabel="mm", xlim=(begin_s / 60.0, end_s / 60.0), ylim=(low_mm, high_mm))
+    axes.set(ylabel="mm", ylim=(low_mm, high_mm))
     bands = (
         ("true error, least to largest", series.error_mm, SERIES[0]),
         ("3 \u03c3 of the estimate", series.sigma3_mm, SERIES[1]),
@@ -58,7 +57,7 @@ def error_figure(series: ErrorSeries, width_px: float) -> Figure:
         axes.axvline(at_s / 60.0, color=INK, linewidth=0.9, linestyle=":")
     if high_mm >= WITHIN_MM:
         axes.axhline(WITHIN_MM, color=BAD, linewidth=1.0, linestyle="--", label=f"{WITHIN_MM:.0f} mm")
-    return add_legend(axes)
+    return _over_time(axes, series.t_s)
 
 
 def time_figure(budgets: Sequence[tuple[str, TimeBreakdown]], budget_s: float, width_px: float) -> Figure:

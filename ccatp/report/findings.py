@@ -1,7 +1,7 @@
 """What follows from a recorded survey, computed once for page, figures and data: points, errors, times, alignment."""
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import chain, pairwise
@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.core import FloatArray, PointId, StopKind, Vector3
-from ccatp.links.topics import MissionStatus
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, compare, survey_result
 from ccatp.records.summary import arrival_error_m as true_arrival_error_m
@@ -99,7 +98,7 @@ def first_arrivals_mm(record: RunRecord) -> dict[PointId, float]:
             rows = zip(frames, np.searchsorted(truth.seq, [*frames.values()]).tolist(), frames.values(), strict=True)
             for point, at, seq in rows:
                 if at < len(truth.seq) and truth.seq[at] == seq:
-                    first[point] = 1e3 * true_arrival_error_m(mirror, point, truth.place_m[at], height_m)
+                    first[point] = 1e3 * true_arrival_error_m(mirror, point, truth.place[at], height_m)
         found = first | found
     return found
 
@@ -132,17 +131,6 @@ class ErrorSeries(NamedTuple):
     fix_fused: "np.ndarray[tuple[int, ...], np.dtype[np.bool_]]"
 
 
-class ErrorFigures(NamedTuple):
-    """Localization error over all frames with a truth, mm; the share within three sigma and within 10 mm."""
-
-    mean_mm: float
-    p50_mm: float
-    p99_mm: float
-    max_mm: float
-    within_sigma3: float
-    within_limit: float
-
-
 def error_series(record: RunRecord) -> ErrorSeries | None:
     """The series; None without an estimate."""
     sessions = [session for session in record.sessions if len(session.track.seq)]
@@ -158,7 +146,7 @@ def error_series(record: RunRecord) -> ErrorSeries | None:
         errors = np.full(len(track.seq), np.nan)
         if truth is not None:
             _, i, j = np.intersect1d(track.seq, truth.seq, assume_unique=True, return_indices=True)
-            errors[i] = 1e3 * np.linalg.norm(track.place_m[i] - truth.place_m[j], axis=1)
+            errors[i] = 1e3 * np.linalg.norm(track.place_m[i] - truth.place[j], axis=1)
         all_errors.append(errors)
         fixes += [(fix.t_s + offset_s, fix.jump_mm, fix.is_fused) for fix in session.fixes]
         start_s += session.span_s
@@ -175,16 +163,21 @@ def error_series(record: RunRecord) -> ErrorSeries | None:
     )
 
 
-def error_figures(series: ErrorSeries) -> ErrorFigures | None:
-    """The distribution of the errors; None where no truth is known."""
+def error_figures(series: ErrorSeries) -> dict[str, float] | None:
+    """The distribution of the errors, mm, and the share within three sigma and within 10 mm; None without a truth."""
     is_known = np.isfinite(series.error_mm)
     errors = series.error_mm[is_known]
     if not len(errors):
         return None
     p50, p99 = np.percentile(errors, (50, 99)).tolist()
-    within_sigma3 = float(np.mean(errors <= series.sigma3_mm[is_known]))
-    within_limit = float(np.mean(errors <= WITHIN_MM))
-    return ErrorFigures(float(errors.mean()), p50, p99, float(errors.max()), within_sigma3, within_limit)
+    return {
+        "mean_mm": float(errors.mean()),
+        "p50_mm": p50,
+        "p99_mm": p99,
+        "max_mm": float(errors.max()),
+        "within_sigma3": float(np.mean(errors <= series.sigma3_mm[is_known])),
+        "within_limit": float(np.mean(errors <= WITHIN_MM)),
+    }
 
 
 # -- time budget ------------------------------------------------------------------------------------------------------
@@ -230,71 +223,53 @@ class TimeBreakdown(NamedTuple):
 def time_budget(record: RunRecord) -> TimeBreakdown | None:
     """The budget of a run; None where its states are not recorded. A longer measurement than is due waited."""
     measuring_s = record.cfg.etalon.measuring_time_s
-    exact = [spells_of(session) for session in record.sessions]
-    spells = [
-        sampled_spells(session) if found is None else found
-        for session, found in zip(record.sessions, exact, strict=True)
-    ]
+    found = [spells_of(session) for session in record.sessions]
     spent, visits = defaultdict[str, float](float), defaultdict[str, int](int)
-    for state, duration_s in chain.from_iterable(spells):
+    for state, duration_s in chain.from_iterable(spells for spells, _ in found):
         kind = _KIND_OF.get(state, "wait")
         visits[kind] += state != _NEVER_BEGUN
         waited_s = max(duration_s - measuring_s, 0.0) if kind == "measure" else 0.0
         spent["wait"] += waited_s
         spent[kind] += measuring_s if waited_s else duration_s
-    if not any(spells):
+    if not spent:
         return None
     least, covers = least_times(record)
     # Sums of a hundredth of a second do not come out at 0.
     kinds = [kind for kind in KINDS if spent[kind] > 1e-6]
     by_kind, counts = {kind: spent[kind] for kind in kinds}, {kind: visits[kind] for kind in kinds}
-    return TimeBreakdown(by_kind, least, counts, None not in exact, covers)
+    return TimeBreakdown(by_kind, least, counts, all(is_exact for _, is_exact in found), covers)
 
 
-def spells_of(session: RecordedSession) -> list[TimeSpan] | None:
-    """Spells between the state changes in the log; None where it holds none, or the frames are not known.
+def spells_of(session: RecordedSession) -> tuple[list[TimeSpan], bool]:
+    """Spells of one state, and whether they are exact: between the changes in the log, else as the status shows them.
 
     The last state of a main loop that died is not logged; the time until the first status of its successor counts as
     waiting, but for that in which there was none.
     """
+    spells: list[TimeSpan] = []
+    absent_s = 0.0  # robot time that no mission counted: main was restarted
+    for one, later in pairwise(status for status in session.statuses if status.seq >= 0):
+        passed_s = later.t_s - one.t_s
+        missing_s = passed_s - (later.elapsed_s - one.elapsed_s)
+        part_s = missing_s if passed_s > 0.0 and missing_s > _ROUNDING_S else 0.0
+        absent_s += part_s
+        spells += [(one.state, passed_s - part_s), (START_ANEW, part_s)]
     track = session.track
-    if not session.changes or not len(track.seq):
-        return None
-    at = np.clip(np.searchsorted(track.seq, [change.seq for change in session.changes]), 0, len(track.seq) - 1)
-    times = [float(track.t_s[0]), *track.t_s[at].tolist(), float(track.t_s[-1])]
-    states = [*(change.before for change in session.changes), session.changes[-1].after]
-    spells = [(state, end - start) for state, (start, end) in zip(states, pairwise(times), strict=True)]
-    absent_s = sum(uncounted_s(one, later) for one, later in pairwise(_of_frames(session.statuses)))
-    restarts = [index for index, state in enumerate(states) if index and state == _NEVER_BEGUN]
-    # What its predecessor did last was not written down in time, so that it is not counted either.
-    for index in (place for last in restarts for place in (last, last - 1)):
-        state, duration_s = spells[index]
-        part_s = min(duration_s, absent_s)
-        absent_s -= part_s
-        spells[index] = state, duration_s - part_s
-        spells.append((START_ANEW, part_s))
-    return [(state, duration_s) for state, duration_s in spells if duration_s > 0.0 and state != _OVER]
-
-
-def uncounted_s(one: MissionStatus, later: MissionStatus) -> float:
-    """Robot time between two statuses of main that no mission counted: it was restarted in between."""
-    passed_s = later.t_s - one.t_s
-    missing_s = passed_s - (later.elapsed_s - one.elapsed_s)
-    return missing_s if passed_s > 0.0 and missing_s > _ROUNDING_S else 0.0
-
-
-def _of_frames(statuses: Iterable[MissionStatus]) -> list[MissionStatus]:
-    """Those of a main loop that has received a frame."""
-    return [status for status in statuses if status.seq >= 0]
-
-
-def sampled_spells(session: RecordedSession) -> list[TimeSpan]:
-    """Spells as the status shows them: each lasts until the next."""
-    spells = []
-    for one, later in pairwise(_of_frames(session.statuses)):
-        absent_s = uncounted_s(one, later)
-        spells += [(one.state, later.t_s - one.t_s - absent_s), (START_ANEW, absent_s)]
-    return [(state, duration_s) for state, duration_s in spells if state != _OVER and duration_s > 0.0]
+    is_exact = bool(session.changes and len(track.seq))
+    if is_exact:
+        at = np.clip(np.searchsorted(track.seq, [change.seq for change in session.changes]), 0, len(track.seq) - 1)
+        times = [float(track.t_s[0]), *track.t_s[at].tolist(), float(track.t_s[-1])]
+        states = [*(change.before for change in session.changes), session.changes[-1].after]
+        spells = [(state, end - start) for state, (start, end) in zip(states, pairwise(times), strict=True)]
+        restarts = [index for index, state in enumerate(states) if index and state == _NEVER_BEGUN]
+        # What its predecessor did last was not written down in time, so that it is not counted either.
+        for index in (place for last in restarts for place in (last, last - 1)):
+            state, duration_s = spells[index]
+            part_s = min(duration_s, absent_s)
+            absent_s -= part_s
+            spells[index] = state, duration_s - part_s
+            spells.append((START_ANEW, part_s))
+    return [(state, duration_s) for state, duration_s in spells if duration_s > 0.0 and state != _OVER], is_exact
 
 
 def least_times(record: RunRecord) -> tuple[dict[str, float] | None, str]:
@@ -332,7 +307,7 @@ class Findings:
     outcome: PointOutcome
     points: list[PointVerdict]
     errors: ErrorSeries | None  # over time
-    figures: ErrorFigures | None  # of their distribution
+    figures: dict[str, float] | None  # of their distribution
     budget: TimeBreakdown | None
     alignment: SurveyResult | None
     against: Comparison | None

@@ -15,7 +15,6 @@ latched: a late subscriber gets the last message.
 import ipaddress
 import json
 import queue
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import cos, hypot, sin
 from types import GenericAlias
@@ -31,6 +30,7 @@ from ccatp.links import topics
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import FixMessage, Message, TrackMessage, TruthMessage
 from ccatp.mirror.mirror import Mirror
+from ccatp.records.recorder import RecordedMessage
 
 LOOP = 1  # of LinePrimitive.type
 LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
@@ -230,14 +230,6 @@ class TopicView(NamedTuple):
     is_latched: bool = False
 
 
-class ViewMessage(NamedTuple):
-    """A message of a view: topic, robot time (s), JSON."""
-
-    topic: str
-    t_s: float
-    payload: bytes
-
-
 VIEWS = (
     TopicView("view/frames", FrameTransform, "foxglove.FrameTransform", True),
     TopicView("view/panels", SceneUpdate, "foxglove.SceneUpdate", True),
@@ -280,7 +272,7 @@ class Views:
         self._points_sent_s = 0.0
         self._has_begun = False
 
-    def begin(self, t_s: float = 0.0) -> Iterator[ViewMessage]:
+    def begin(self, t_s: float = 0.0) -> Iterator[RecordedMessage]:
         """The latched views: frame of the world and map of the panels."""
         self._has_begun = True
         mirror, now = self._mirror, time_of(t_s)
@@ -289,7 +281,7 @@ class Views:
         yield _shown("view/frames", t_s, FrameTransform(now, WORLD, DECK, origin, quaternion((x, y, z))))
         yield _shown("view/panels", t_s, panel_scene(mirror, now))
 
-    def of(self, message: Message) -> Iterator[ViewMessage]:
+    def of(self, message: Message) -> Iterator[RecordedMessage]:
         """The views of one message."""
         if not self._has_begun:
             yield from self.begin(max(message.t_s, 0.0))
@@ -309,19 +301,19 @@ class Views:
             log = Log(time_of(max(message.t_s, 0.0)), level, message.text, message.process)
             yield _shown("view/log", message.t_s, log)
 
-    def all_points(self, t_s: float) -> Iterator[ViewMessage]:
+    def all_points(self, t_s: float) -> Iterator[RecordedMessage]:
         """All measured points so far."""
         panels = dict.fromkeys(point.panel for point in self._deviations_m)
         if panels:
             yield _shown("view/points", t_s, point_scene(self._mirror, panels, self._deviations_m, time_of(t_s)))
 
-    def _of_track(self, track: TrackMessage) -> Iterator[ViewMessage]:
+    def _of_track(self, track: TrackMessage) -> Iterator[RecordedMessage]:
         for seq, t_s, row, col, x, y, heading, sigma_m in track.rows:
             if seq % EVERY_FRAMES == 0:
                 pose = self._mirror.deck_pose(PanelPose(PanelId(row, col), x, y, heading))
                 yield from self._of_pose(seq, t_s, pose, sigma_m)
 
-    def _of_pose(self, seq: int, t_s: float, pose: DeckPose, sigma_m: float) -> Iterator[ViewMessage]:
+    def _of_pose(self, seq: int, t_s: float, pose: DeckPose, sigma_m: float) -> Iterator[RecordedMessage]:
         if seq % EVERY_FRAMES == 0:
             yield from self._compared(seq, t_s, self._estimates, pose)
         now, shown = time_of(t_s), self._pose_of(pose)
@@ -330,7 +322,7 @@ class Views:
         yield _shown("view/robot_frame", t_s, frame)
         yield _shown("view/robot", t_s, RobotView(t_s, seq, pose.x_m, pose.y_m, pose.heading_rad, sigma_m))
 
-    def _of_truth(self, truth: TruthMessage) -> Iterator[ViewMessage]:
+    def _of_truth(self, truth: TruthMessage) -> Iterator[RecordedMessage]:
         for seq, t_s, x, y, heading, *_ in truth.rows:
             if seq % EVERY_FRAMES:
                 continue
@@ -338,7 +330,7 @@ class Views:
             yield _shown("view/true_pose", t_s, PoseInFrame(time_of(t_s), DECK, self._pose_of(pose)))
             yield from self._compared(seq, t_s, self._truths, pose)
 
-    def _compared(self, seq: int, t_s: float, own: dict[int, DeckPose], pose: DeckPose) -> Iterator[ViewMessage]:
+    def _compared(self, seq: int, t_s: float, own: dict[int, DeckPose], pose: DeckPose) -> Iterator[RecordedMessage]:
         """The error of a frame when both its estimate and its truth have arrived."""
         own[seq] = pose
         if seq in self._estimates and seq in self._truths:
@@ -351,7 +343,7 @@ class Views:
         elif len(own) > _KEPT:
             del own[next(iter(own))]
 
-    def _of_fix(self, fix: FixMessage) -> Iterator[ViewMessage]:
+    def _of_fix(self, fix: FixMessage) -> Iterator[RecordedMessage]:
         if fix.point is None or not fix.is_fused:
             return
         point = PointId(*fix.point)
@@ -368,7 +360,7 @@ class Views:
         return Pose(place, quaternion(self._mirror.robot_axes(pose)))
 
 
-def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[ViewMessage]:
+def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[RecordedMessage]:
     for raw in lines[::EVERY_FRAMES]:
         try:
             line = _sensors.decode(raw)
@@ -384,8 +376,8 @@ def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[ViewMessage]:
         ))  # fmt: skip
 
 
-def _shown(topic: str, t_s: float, message: object) -> ViewMessage:
-    return ViewMessage(topic, max(t_s, 0.0), _encode(message))
+def _shown(topic: str, t_s: float, message: object) -> RecordedMessage:
+    return RecordedMessage(topic, max(t_s, 0.0), _encode(message))
 
 
 # -- live streams: PlotJuggler's framing over ZeroMQ, Foxglove's WebSocket --------------------------------------------
@@ -401,38 +393,6 @@ class StreamError(CcatpError):
     exit_status = ExitStatus.USAGE
 
 
-class LiveStream(ABC):
-    """A stream that repeats the last message of each latched topic to late subscribers."""
-
-    where: str
-
-    def __init__(self) -> None:
-        self._latched: dict[str, ViewMessage] = {}
-
-    def send(self, shown: ViewMessage, *, is_latched: bool = False) -> None:
-        """Publish a message; never blocks."""
-        if is_latched:
-            self._latched[shown.topic] = shown
-        self._publish(shown)
-
-    def tend(self) -> None:
-        """Repeat latched messages after new subscriptions; to be called several times a second."""
-        for topic in sorted(self._latched.keys() & self._new_subscriptions()):
-            self._publish(self._latched[topic])
-
-    @abstractmethod
-    def close(self) -> None:
-        """Stop serving."""
-
-    @abstractmethod
-    def _publish(self, shown: ViewMessage) -> None:
-        """Send to all subscribers."""
-
-    @abstractmethod
-    def _new_subscriptions(self) -> set[str]:
-        """Topics that have a new subscriber."""
-
-
 def check_host(host: str, *, is_open: bool) -> None:
     """StreamError: the host is not this machine, and ``is_open`` is not given; every client may watch."""
     try:
@@ -445,14 +405,13 @@ def check_host(host: str, *, is_open: bool) -> None:
         )
 
 
-class PlotJugglerStream(LiveStream):
-    """Messages of three frames: topic, JSON, time as ASCII seconds. A latched message is repeated to all subscribers.
+class PlotJugglerStream:
+    """Messages of three frames: topic, JSON, time as ASCII seconds.
 
     Port 0 takes any free one; ``StreamError`` if the port is in use.
     """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], host: str, port: int) -> None:
-        super().__init__()
         self._socket = context.socket(zmq.XPUB)
         self._socket.setsockopt(zmq.SNDHWM, HIGH_WATER_MARK)
         self._socket.setsockopt(zmq.LINGER, LINGER_MS)
@@ -466,31 +425,31 @@ class PlotJugglerStream(LiveStream):
             raise StreamError(f"PlotJuggler: {why}") from error
         self.where = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
-    def _publish(self, shown: ViewMessage) -> None:
+    def send(self, shown: RecordedMessage) -> None:
+        """Send to all subscribers; never blocks."""
         self._socket.send_multipart((shown.topic.encode(), shown.payload, f"{shown.t_s:.6f}".encode()))
 
-    def _new_subscriptions(self) -> set[str]:
-        found: set[str] = set()
+    def new_subscriptions(self) -> tuple[str, ...]:
+        """Beginnings of topics that have a new subscriber."""
+        found = []
         while self._socket.poll(0, zmq.POLLIN):
             change = self._socket.recv()
             if change[:1] == b"\x01":
-                prefix = change[1:].decode("utf-8", "replace")
-                found |= {topic for topic in self._latched if topic.startswith(prefix)}
-        return found
+                found.append(change[1:].decode("utf-8", "replace"))
+        return tuple(found)
 
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
 
 
-class FoxgloveStream(LiveStream):
+class FoxgloveStream:
     """A WebSocket server for Foxglove and Lichtblick; needs the extra ``foxglove``.
 
     Port 0 takes any free one; ``StreamError`` if the port is in use or the extra is not installed.
     """
 
     def __init__(self, name: str, host: str, port: int, schemas: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
-        super().__init__()
         try:
             import foxglove  # noqa: PLC0415 - belongs to an extra
             from foxglove.websocket import ServerListener  # noqa: PLC0415
@@ -518,19 +477,29 @@ class FoxgloveStream(LiveStream):
             self._channels[topic] = foxglove.Channel(topic, schema=data, message_encoding="json", context=context)
         self.where = f"ws://{host}:{self._server.port}"
 
-    def _publish(self, shown: ViewMessage) -> None:
+    def send(self, shown: RecordedMessage) -> None:
+        """Send to all subscribers; never blocks."""
         channel = self._channels.get(shown.topic)
         if channel is not None:
             channel.log(shown.payload, log_time=round(shown.t_s * _NS))
 
-    def _new_subscriptions(self) -> set[str]:
-        found: set[str] = set()
-        while not self._subscribed.empty():
-            found.add(self._subscribed.get())
-        return found
+    def new_subscriptions(self) -> tuple[str, ...]:
+        """Topics that have a new subscriber."""
+        return tuple(self._subscribed.get() for _ in range(self._subscribed.qsize()))
 
     def close(self) -> None:
         """Stop the server."""
         self._server.stop()
         for channel in self._channels.values():
             channel.close()
+
+
+LiveStream = PlotJugglerStream | FoxgloveStream
+
+
+def repeat_latched(stream: LiveStream, latched: Mapping[str, RecordedMessage]) -> None:
+    """Send the last message of each latched topic to new subscribers; to be called several times a second."""
+    new = stream.new_subscriptions()
+    for topic, shown in latched.items():
+        if topic.startswith(new):
+            stream.send(shown)

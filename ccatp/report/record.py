@@ -20,7 +20,7 @@ from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.mirror.surface import MirrorError
 from ccatp.records.recorder import TELEMETRY, damage_text, iter_messages, read_metadata, recordings
-from ccatp.records.run_reader import CONFIG, STORE, RunReadError, check_run_dir, read_truth
+from ccatp.records.run_reader import CONFIG, STORE, RunReadError, Trace, check_run_dir, read_truth, trace_of_truth
 from ccatp.records.state_log import LogLine, StateChange, changes_of, read_log
 from ccatp.records.store import StoredPoint, StoreError, read_survey
 
@@ -39,13 +39,6 @@ class EstimatedTrack(NamedTuple):
     sigma_m: FloatArray  # standard deviation of the place along any one direction, shape (k,)
 
 
-class TrueTrack(NamedTuple):
-    """True places after k frames, as in ``EstimatedTrack``."""
-
-    seq: IntArray
-    place_m: FloatArray
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedSession:
     """One recording; a run that was resumed has several."""
@@ -53,7 +46,7 @@ class RecordedSession:
     name: str
     version: str
     track: EstimatedTrack
-    truth: TrueTrack | None  # None on a real robot
+    truth: Trace | None  # None on a real robot
     arrivals: tuple[ArrivalMessage, ...]
     fixes: tuple[FixMessage, ...]
     statuses: tuple[MissionStatus, ...]
@@ -296,7 +289,7 @@ def _session(found: Recording, mirror: Mirror, changes: Sequence[StateChange], w
         name=found.name,
         version=found.version,
         track=EstimatedTrack(track[:, 0].astype(np.int64), track[:, 1], deck[:, [0, 1, 3]], track[:, 7]),
-        truth=TrueTrack(truth[:, 0].astype(np.int64), truth[:, 5:8]) if messages["truth"] else None,
+        truth=trace_of_truth(truth) if messages["truth"] else None,
         arrivals=tuple(messages["arrival"]),
         fixes=tuple(messages["fix"]),
         statuses=tuple(messages["mission"]),

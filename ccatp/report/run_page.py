@@ -6,7 +6,7 @@ Lengths of the data of a survey in mm, times in s, unless a name says otherwise;
 from collections import Counter
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -23,22 +23,13 @@ REPORT = "report.html"
 _FEW = 12  # panels of a table; more are folded
 
 
-class Report(NamedTuple):
-    """A report that was written."""
-
-    path: Path
-    data: dict[str, Any]
-    warnings: tuple[str, ...]
-
-
-def report_run(run_dir: Path, out: Path | None = None, figures_dir: Path | None = None) -> Report:
+def report_run(
+    run_dir: Path, out: Path | None = None, figures_dir: Path | None = None
+) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Write the report of a run, by default into its directory, and its figures if a directory is given.
 
-    Raises:
-        RunReadError: no run there.
-        ConfigError: its configuration cannot be used.
-        ReportError: the page cannot be written.
-        PictureError: a figure cannot be written.
+    Returns what ``ccatp report --json`` prints, and warnings. RunReadError: no run there; ConfigError: its
+    configuration cannot be used; ReportError, PictureError: page or figures cannot be written.
     """
     path = out or run_dir / REPORT
     if is_beacon_run(run_dir):
@@ -52,7 +43,7 @@ def report_run(run_dir: Path, out: Path | None = None, figures_dir: Path | None 
     write_page(markup, path)
     if figures_dir is not None:
         write_pictures(pictures, figures_dir)
-    return Report(path, data, warnings)
+    return {"report": str(path), **data}, warnings
 
 
 def run_page(found: Findings) -> str:
@@ -98,7 +89,7 @@ def run_drawings(found: Findings) -> dict[str, Draw]:
 
 
 def run_data(found: Findings) -> dict[str, Any]:
-    """What ``ccatp report --json`` prints."""
+    """A survey's part of what ``ccatp report --json`` prints."""
     record, budget = found.record, found.budget
     first = [one.first_mm for one in found.points if one.first_mm is not None]
     return {
@@ -114,7 +105,7 @@ def run_data(found: Findings) -> dict[str, Any]:
             **{str(grade).replace(" ", "_"): sum(v.grade is grade for v in found.points) for grade in Grade},
         },
         "arrival_error_mm": _rounded({"mean": sum(first) / len(first), "max": max(first)}) if first else None,
-        "localization_error_mm": found.figures and _rounded(found.figures._asdict()),
+        "localization_error_mm": found.figures and _rounded(found.figures),
         "time_budget_s": budget
         and {
             "spent": _rounded(budget.spent_s),

@@ -15,7 +15,6 @@ from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.links.channels import format_error, format_ok
 from ccatp.links.topics import LogMessage
-from ccatp.report.dashboard.hub import IDLE_PERIOD_S
 from tests.contract.page_rig import DEADLINE_S, Rig, mission, page_rig
 from tests.unit.dashboard.test_view import parse
 
@@ -94,7 +93,7 @@ async def test_the_first_status_has_a_pose(rig: Rig) -> None:
 
     async with asyncio.TaskGroup() as tasks:
         living = tasks.create_task(live())
-        await asyncio.sleep(IDLE_PERIOD_S)  # it hears of the mission, and nobody has looked
+        await asyncio.sleep(0.5)  # it hears of the mission, and nobody has looked
         status = (await rig.ask("GET", "/status")).data
         living.cancel()
     assert status["pose"] is not None

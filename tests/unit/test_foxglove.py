@@ -14,7 +14,6 @@ from ccatp.links.topics import TOPICS, FixMessage, LogMessage, Message, SensorLi
 from ccatp.report.foxglove import (
     POINTS_AGAIN_S,
     VIEWS,
-    ViewMessage,
     Views,
     panel_scene,
     point_scene,
@@ -127,7 +126,6 @@ def views() -> Views:
 def shown(views: Views, message: Message) -> dict[str, list[dict[str, Any]]]:
     found: dict[str, list[dict[str, Any]]] = {}
     for one in views.of(message):
-        assert isinstance(one, ViewMessage)
         found.setdefault(one.topic, []).append(json.loads(one.payload))
     return found
 

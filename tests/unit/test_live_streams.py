@@ -6,8 +6,8 @@ import os
 import socket
 import struct
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, Self
 
@@ -16,10 +16,18 @@ import zmq
 
 from ccatp.cli import main
 from ccatp.daemon.streaming import RUN, streamed_schemas
-from ccatp.report.foxglove import FoxgloveStream, LiveStream, PlotJugglerStream, StreamError, ViewMessage, check_host
+from ccatp.records.recorder import RecordedMessage
+from ccatp.report.foxglove import (
+    FoxgloveStream,
+    LiveStream,
+    PlotJugglerStream,
+    StreamError,
+    check_host,
+    repeat_latched,
+)
 
-PANELS = ViewMessage("view/panels", 0.0, b'{"deletions":[],"entities":[]}')
-ROBOT = ViewMessage("view/robot", 1.25, b'{"t_s":1.25,"seq":125,"x_m":0.5,"y_m":0.0,"heading_rad":0.0,"sigma_m":0.001}')
+PANELS = RecordedMessage("view/panels", 0.0, b'{"deletions":[],"entities":[]}')
+ROBOT = RecordedMessage("view/robot", 1.25, b'{"t_s":1.25,"seq":125,"x_m":0.5,"y_m":0.0}')
 PROTOCOL = "foxglove.sdk.v1"
 
 
@@ -43,26 +51,22 @@ def foxglove() -> Iterator[FoxgloveStream]:
     stream.close()
 
 
-class Tending:
-    """Serves a stream in a thread, as the process would; messages may be sent meanwhile."""
+@contextmanager
+def tending(stream: LiveStream, *messages: RecordedMessage, latched: Sequence[RecordedMessage] = ()) -> Iterator[None]:
+    """Serves a stream in a thread, as the process would; messages are sent meanwhile."""
+    is_over = threading.Event()
 
-    def __init__(self, stream: LiveStream, *messages: Callable[[], None]) -> None:
-        self._stream, self._is_over, self._todo = stream, False, list(messages)
-        self._thread = threading.Thread(target=self._run)
+    def run() -> None:
+        while not is_over.wait(0.005):
+            repeat_latched(stream, {one.topic: one for one in latched})
+            for message in messages:
+                stream.send(message)
 
-    def _run(self) -> None:
-        while not self._is_over:
-            self._stream.tend()
-            for message in self._todo:
-                message()
-            time.sleep(0.005)
-
-    def __enter__(self) -> None:
-        self._thread.start()
-
-    def __exit__(self, *_: object) -> None:
-        self._is_over = True
-        self._thread.join()
+    thread = threading.Thread(target=run)
+    thread.start()
+    yield
+    is_over.set()
+    thread.join()
 
 
 def subscribed(context: zmq.Context[zmq.Socket[bytes]], where: str, prefix: bytes) -> zmq.Socket[bytes]:
@@ -77,7 +81,7 @@ def subscribed(context: zmq.Context[zmq.Socket[bytes]], where: str, prefix: byte
 def test_plotjuggler_gets_topic_json_and_seconds(
     context: zmq.Context[zmq.Socket[bytes]], plotjuggler: PlotJugglerStream
 ) -> None:
-    with Tending(plotjuggler, lambda: plotjuggler.send(ROBOT)), subscribed(context, plotjuggler.where, b"") as peer:
+    with tending(plotjuggler, ROBOT), subscribed(context, plotjuggler.where, b"") as peer:
         topic, payload, t_s = peer.recv_multipart()
     assert topic == b"view/robot"
     assert json.loads(payload)["x_m"] == 0.5
@@ -88,9 +92,7 @@ def test_plotjuggler_gets_topic_json_and_seconds(
 def test_a_late_subscriber_gets_what_is_latched(
     context: zmq.Context[zmq.Socket[bytes]], plotjuggler: PlotJugglerStream
 ) -> None:
-    plotjuggler.send(PANELS, is_latched=True)
-    plotjuggler.send(ROBOT)
-    with Tending(plotjuggler):
+    with tending(plotjuggler, latched=[PANELS]):
         for prefix in (b"view/panels", b"", b""):
             with subscribed(context, plotjuggler.where, prefix) as peer:
                 assert peer.recv_multipart()[0] == b"view/panels"
@@ -183,7 +185,6 @@ def test_foxglove_gets_channels_schemas_and_messages(foxglove: FoxgloveStream) -
     schemas = dict(streamed_schemas())
     assert next(iter(schemas)) == RUN
     port = int(foxglove.where.rpartition(":")[2])
-    foxglove.send(PANELS, is_latched=True)
     with WebSocket(port, PROTOCOL) as peer:
         assert next_of(peer, "serverInfo")["name"] == "ccatp"
         channels = advertised(peer, len(schemas))
@@ -193,7 +194,7 @@ def test_foxglove_gets_channels_schemas_and_messages(foxglove: FoxgloveStream) -
         assert json.loads(panels["schema"]) == json.loads(json.dumps(schemas["view/panels"]))
         wanted = {7: channels["view/panels"]["id"], 8: channels["view/robot"]["id"]}
         peer.send({"op": "subscribe", "subscriptions": [{"id": k, "channelId": v} for k, v in wanted.items()]})
-        with Tending(foxglove, lambda: foxglove.send(ROBOT)):
+        with tending(foxglove, ROBOT, latched=[PANELS]):
             found: dict[int, tuple[int, bytes]] = {}
             while len(found) < 2:
                 message = peer.receive()

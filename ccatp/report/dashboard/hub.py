@@ -98,8 +98,6 @@ class BusReader:
             opened.clear()
 
 
-# Of reading the bus while no page is open.
-IDLE_PERIOD_S = 0.5
 # After a request for the state the levels stay subscribed for this time.
 LEVELS_S = 35.0
 # The main loop publishes display states ten times a second while it has a subscriber.
@@ -108,13 +106,12 @@ _encoder = msgspec.json.Encoder()
 
 
 class StateBroadcaster:
-    """Sends the state to the open pages at a fixed rate, and idles while none is open."""
+    """Sends the state to the open pages at a fixed rate."""
 
     def __init__(self, reader: BusReader, view: RunStateView, rate_hz: float) -> None:
         self._reader, self._view, self._period_s = reader, view, 1.0 / rate_hz
         # The next payload of each open page, and whether that must be the whole state: it is new, or was too slow.
         self._pages: dict[asyncio.Queue[bytes], bool] = {}
-        self._wake = asyncio.Event()
         self._requested_s = float("-inf")
         self._is_over = False
 
@@ -128,7 +125,6 @@ class StateBroadcaster:
         page: asyncio.Queue[bytes] = asyncio.Queue(maxsize=1)
         self._pages[page] = True
         self._subscribe()
-        self._wake.set()
         try:
             while not (self._is_over and page.empty()):
                 yield await page.get()
@@ -157,11 +153,8 @@ class StateBroadcaster:
         """Send until ``stop`` is set; then end all streams."""
         due_s = time.monotonic()
         while not stop.is_set():
+            self._subscribe()
             self.tick()
-            if not self._pages:
-                await self._rest(stop)
-                due_s = time.monotonic()
-                continue
             # Missed ticks are dropped: a page shows the present.
             due_s = max(due_s + self._period_s, time.monotonic())
             with suppress(TimeoutError):
@@ -193,15 +186,6 @@ class StateBroadcaster:
         has_pages = bool(self._pages)
         self._reader.read_track(has_pages)
         self._reader.read_levels(has_pages or time.monotonic() - self._requested_s < LEVELS_S)
-
-    async def _rest(self, stop: asyncio.Event) -> None:
-        self._subscribe()
-        self._wake.clear()
-        async with asyncio.TaskGroup() as tasks:
-            waits = [tasks.create_task(self._wake.wait()), tasks.create_task(stop.wait())]
-            await asyncio.wait(waits, timeout=IDLE_PERIOD_S, return_when=asyncio.FIRST_COMPLETED)
-            for wait in waits:
-                wait.cancel()
 
 
 def _event(name: str, data: dict[str, Any]) -> bytes:

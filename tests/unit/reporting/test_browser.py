@@ -20,7 +20,8 @@ def test_the_pages_open_by_themselves(recorded: Path, tmp_path: Path) -> None:
     # One test with one browser: its processes end with the test.
     from playwright.sync_api import sync_playwright
 
-    report = report_run(recorded, tmp_path / "report.html").path
+    report = tmp_path / "report.html"
+    report_run(recorded, report)
     compare_runs(recorded, recorded, tmp_path / "compare.html")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])

@@ -174,7 +174,7 @@ def test_a_run_directory_becomes_a_picture(run_dir: Path) -> None:
     assert "simulation, world hard  ·  seed 1  ·  filter ekf  ·  arrival error: mean" in axes.get_title(loc="left")
     path_m, truth = np.asarray(axes.lines[0].get_xydata()), found.sessions[0].truth
     assert truth is not None  # which is drawn, not the estimate
-    np.testing.assert_array_equal(path_m, [*truth.place_m[:, :2], [np.nan, np.nan]])
+    np.testing.assert_array_equal(path_m, [*truth.place[:, :2], [np.nan, np.nan]])
     assert axes.collections[-1].get_array().tolist() == [one.left_mm for one in point_verdicts(found)]  # type: ignore[union-attr]
     for name in ("summary.json", "telemetry.mcap"):  # as after kill -9
         (run_dir / name).unlink()
