@@ -30,9 +30,8 @@ def run_bench(
 ) -> dict[str, Any]:
     """Run every benchmark, ``quick`` with a tenth of the repeats and missions of one panel.
 
-    ``run_args`` is what else ``ccatp run`` needs to work on the same configuration. A case holds name, us_p50, us_p99,
-    peer, peer_us_p50 and ratio = ours / peer, None without a peer; and how far the results differ, or how to install
-    the peer. BenchError: a peer's result differs, or a mission failed.
+    ``run_args``: what else ``ccatp run`` needs to work on the same configuration. BenchError: a peer's result differs,
+    or a mission failed.
     """
     # Missions first: they start in a process that has allocated little.
     of_frames = frame_cases(cfg, run_args, quick=quick) if frames else []
@@ -77,10 +76,8 @@ def step_case(name: str, ours: Contender, peer_name: str, peer: Contender | None
 def race(ours: Contender, peer: Contender | None, rounds: int, steps: int = STEPS) -> FloatArray:
     """Time every step of both, a round of steps each by turns, who begins by turns as well.
 
-    So a machine that slows down for a while slows both, and neither runs on caches that the other one has filled. A
-    round begins anew; one round before them warms up.
-
-    The result has the wall times of single steps of ours and of the peer, if any, us, shape (1 or 2, rounds, steps).
+    So a machine that slows down slows both, and neither runs on caches that the other one has filled. One round more
+    warms up. Returns wall times of single steps of ours and of the peer, if any, us, shape (1 or 2, rounds, steps).
     """
     both = [ours] if peer is None else [ours, peer]
     taken = np.zeros((len(both), rounds, steps))

@@ -1,8 +1,4 @@
-"""What a frame costs: in a run of all processes in lockstep, in each process, in one process, and in real time.
-
-Every figure is taken beside the calibrator under the same load, by turns, so that their ratio compares versions and
-machines.
-"""
+"""What a frame costs in lockstep, in each process, in one process, and in real time, beside the calibrator's."""
 
 import json
 import os

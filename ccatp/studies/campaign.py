@@ -93,11 +93,7 @@ class CellResult(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """A campaign that has a name.
-
-    ``run_job`` is a pure function of the job, in a module, from which workers import it by its name. ``combine`` has
-    the factors of a cell and the outcomes of its jobs in the order of their seeds.
-    """
+    """A campaign that has a name; workers import ``run_job`` by its name, outcomes are combined in order of seeds."""
 
     name: str
     title: str

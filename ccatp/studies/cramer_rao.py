@@ -18,7 +18,7 @@ What is approximated:
 """
 
 from array import array
-from collections import OrderedDict
+from collections import OrderedDict, defaultdict
 from collections.abc import Hashable
 from math import exp, pi, sqrt
 from typing import NamedTuple
@@ -32,7 +32,7 @@ from ccatp.estimation.seams import EdgeScanner, SensorTransition
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.plant import LEG_PAUSE_S, LEVEL_SLOPE
-from ccatp.studies.sil_run import SilResult, SilRun
+from ccatp.studies.sil_run import SilRun
 
 # -- the record: true way, seams, fixes --------------------------------------------------------------------------------
 
@@ -140,12 +140,6 @@ class RecordedSilRun(SilRun):
         super()._fuse(fix)
 
 
-def rehearse_recorded(cfg: Config, *, with_track: bool = False) -> tuple[SilResult, TrueRecord]:
-    """Survey the mirror of a configuration in its world, and keep the record; see ``sil_run.rehearse``."""
-    run = RecordedSilRun(cfg, with_track=with_track)
-    return run.run(), run.record()
-
-
 # -- the bound ---------------------------------------------------------------------------------------------------------
 
 (X, Y, PSI, BG, KG, BA, SR, SL, UR, UL, RR, RL, KL, C, ER, ER0, EL, EL0, J, J0, JA, JA0) = range(22)
@@ -163,16 +157,8 @@ _UNIFORM = 1.0 / 12.0  # variance of a uniform distribution over one interval
 _STILL_M = 1e-7  # a frame in which no wheel moves further is a frame at rest
 
 
-class StopBound(NamedTuple):
-    """The bound of the covariance of (x, y) at one fix, before it is used, shape (2, 2)."""
-
-    t_s: float
-    fix: StopFix
-    covariance_m2: FloatArray
-
-
-def bounds_of(cfg: Config, mirror: Mirror, record: TrueRecord, *, with_accelerometer: bool = False) -> list[StopBound]:
-    """The bound at each fix of a run."""
+def bounds_of(cfg: Config, mirror: Mirror, record: TrueRecord, *, with_accelerometer: bool = False) -> list[FloatArray]:
+    """The bound of the covariance of (x, y) at each fix of a run, before it is used, m^2, shape (2, 2)."""
     return _Recursion(cfg, mirror, record, with_accelerometer).run()
 
 
@@ -197,17 +183,17 @@ class _Recursion:
         self._F = np.eye(_STATES)
         self._ordered_s = -np.inf
 
-    def run(self) -> list[StopBound]:
+    def run(self) -> list[FloatArray]:
         record = self._record
-        passes: dict[int, list[SeamPass]] = {}
-        fixes: dict[int, list[StopFix]] = {}
+        passes: defaultdict[int, list[SeamPass]] = defaultdict(list)
+        fixes: defaultdict[int, list[StopFix]] = defaultdict(list)
         for one in record.passes:
-            passes.setdefault(one.frame, []).append(one)
+            passes[one.frame].append(one)
         for fix in record.fixes:
-            fixes.setdefault(fix.frame, []).append(fix)
+            fixes[fix.frame].append(fix)
         still = (np.abs(self._right_m) < _STILL_M) & (np.abs(self._left_m) < _STILL_M)
         resting = 0
-        found: list[StopBound] = []
+        found: list[FloatArray] = []
         for k in range(1, len(record.way)):
             resting += bool(still[k])
             if resting and (k in fixes or not still[k]):
@@ -219,7 +205,7 @@ class _Recursion:
             for one in passes.get(k, ()):
                 self._cross(one)
             for fix in fixes.get(k, ()):
-                found.append(StopBound(float(record.way[fix.frame, WAY_T]), fix, self._P[:2, :2].copy()))
+                found.append(self._P[:2, :2].copy())
                 self._fix(fix)
         return found
 

@@ -1,8 +1,4 @@
-"""Runs the jobs of a campaign and puts their outcomes together.
-
-The outcome of a job does not depend on where or when it runs, and outcomes are combined in the order of the plan: the
-cells are the same whatever the number of workers.
-"""
+"""Runs the jobs of a campaign and puts their outcomes together in the order of the plan, whoever worked on them."""
 
 import base64
 import fcntl
@@ -56,8 +52,7 @@ _MOST_FAILURES = 5  # one bad seed must not cost a night; what fails this often 
 def settle() -> None:
     """Collect garbage, and exempt what is left: modules and tables stay to the end.
 
-    A mission makes tuples by the million and hardly a cycle; going through everything imported again and again for
-    them costs it 3 % of its time.
+    A mission makes tuples by the million and hardly a cycle; going through all modules for them costs 3 % of its time.
     """
     gc.collect()
     gc.freeze()
@@ -87,9 +82,8 @@ class Finished(NamedTuple):
 def open_store(out: Path, shard: Shard = WHOLE, others: Iterable[Path] = ()) -> "Iterator[JobStore]":
     """The finished jobs in a directory, which is made if it is not there.
 
-    Each shard writes a file of its own, so that shards may share a directory; all of them are read, and those in
-    ``others`` are taken over. CampaignError: ``out`` cannot be made, another campaign writes here, a directory does not
-    exist, or a line is not a finished job.
+    Each shard writes a file of its own; all of them are read, and those in ``others`` are taken over. CampaignError:
+    ``out`` cannot be made, another campaign writes here, a directory does not exist, or a line is not a finished job.
     """
     make_out(out)
     path = out / ("jobs.jsonl" if shard == WHOLE else f"jobs-{shard.number}of{shard.of}.jsonl")
@@ -108,10 +102,7 @@ def open_store(out: Path, shard: Shard = WHOLE, others: Iterable[Path] = ()) -> 
 
 
 class JobStore:
-    """Finished jobs: one line each, safe on the disk before the next begins.
-
-    A campaign that is killed at any instant continues from its store.
-    """
+    """Finished jobs: one line each, safe on the disk before the next begins, so that a killed campaign continues."""
 
     def __init__(self, file: BinaryIO, path: Path) -> None:
         self._file, self._path = file, path

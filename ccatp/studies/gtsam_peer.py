@@ -1,9 +1,8 @@
 """GTSAM on the same raw input as our own estimators: iSAM2 as the run goes on, Levenberg-Marquardt at its end.
 
-Needs the extra ``peers`` (gtsam), imported only when it is asked for. Its stock factors hold poses, points, ranges and
-bearings; calibration they do not know, so ranges and odometry go in as they were recorded. Noise is the same as ours,
-readings are robust (Huber), beacons without bearings begin where our placing puts them on
-its own path.
+Needs the extra ``peers`` (gtsam), imported only when it is asked for. Its stock factors know no calibration: ranges and
+odometry go in as they were recorded. Noise is the same as ours, readings are robust (Huber), beacons without bearings
+begin where our placing puts them on its own path.
 """
 
 from collections.abc import Callable

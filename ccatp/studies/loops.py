@@ -2,9 +2,7 @@
 
 The thesis judges its two loops on the plant 1/(T s + 1), from speed command to speed. What they close is the way from
 speed command to position, which has an integrator more: 1/(s (T s + 1)). The study sets both side by side, without and
-with the delay of the link, and beside them every other set of gains of the configuration.
-
-Needs the extra ``tune`` (python-control), imported only when a system is built.
+with the delay of the link. Needs the extra ``tune`` (python-control), imported only when a system is built.
 """
 
 import time
@@ -49,8 +47,7 @@ class LoopsError(CcatpError):
 class Loop:
     """One open loop L(s) = C(s) P(s) exp(-s tau).
 
-    Plant ``printed`` is 1/(T s + 1), ``true`` 1/(s (T s + 1)): a speed command reaches the position by way of an
-    integrator, which the thesis leaves out.
+    Plant ``printed`` is 1/(T s + 1), ``true`` 1/(s (T s + 1)).
     """
 
     gains: str
@@ -293,9 +290,8 @@ COLUMNS = """
 
 
 def run(cfg: Config, out: Path) -> dict[str, Any]:
-    """Analyse every loop of the configuration and write ``result.json``, ``result.npz``, ``table.md`` and the figures.
+    """Analyse every loop of the configuration and write all files; a cell is one loop with its margins, None for none.
 
-    A cell is one loop with its margins; what does not exist (a gain margin without a phase crossover) is None.
     LoopsError: python-control is not installed.
     """
     started_s = time.perf_counter()

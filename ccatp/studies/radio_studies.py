@@ -1,16 +1,13 @@
 """The studies of radio beacons.
 
-`radio-signals`: levels against range and bearings of the reflector, beside Hevrdejs and Knoll 2017. A turn of the
-reflector is simulated packet by packet and read as on the robot: the level is that next to the strongest reading, the
-bearing that of the strongest reading.
+`radio-signals`: levels against range and bearings of the reflector, beside Hevrdejs and Knoll 2017, packet by packet.
 
-`radio-cases`: the three experimental cases of Hevrdejs and Knoll 2017, side by side with ours. The slides print the
-errors of three drives in a laboratory and nothing of the drives. Ours are three paths in the same room, among the same
-radios with 5 dB of static shadowing and reflected rays, read through the turning reflector.
+`radio-cases`: the three experimental cases of the same slides. They print the errors of three drives in a laboratory
+and nothing of the drives. Ours are three paths in the same room, among the same radios with 5 dB of static shadowing
+and reflected rays, read through the turning reflector.
 
-`radio-follow`: a moving radio is mapped and followed, side by side with Auth and Hovey 2018.
-
-`radio-slam`: EKF-SLAM among four ZigBee radios, in two rooms, with slip and with shadowing.
+`radio-follow`: a moving radio is mapped and followed, side by side with Auth and Hovey 2018. `radio-slam`: EKF-SLAM
+among four ZigBee radios, in two rooms, with slip and with shadowing.
 """
 
 from collections import defaultdict

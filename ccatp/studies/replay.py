@@ -53,11 +53,9 @@ class _Past(NamedTuple):
 class RecordingFilter:
     """Does what the filter in it does, and records every transition of the state, so that a smoother can go back.
 
-    A ``reset`` is one of three things. To a state that the filter has been in: it is taken back there, and what came
-    after is removed. From a state in which nothing was recorded yet: the beginning. Anything else is a transition of
-    its own (``transition_of_reset``).
-
-    The record costs 12 kB a transition at 19 states. ``count``: transitions so far.
+    A ``reset`` to a state that the filter has been in takes it back there; one before anything is recorded is the
+    beginning; any other is a transition of its own (``transition_of_reset``). The record costs 12 kB a transition at
+    19 states. ``count``: transitions so far.
     """
 
     def __init__(self, filter_: Filter) -> None:
@@ -145,9 +143,9 @@ def added_noise(P: FloatArray, F: FloatArray, predicted: FloatArray, Q: FloatArr
 def transition_of_reset(before: FloatArray, after: FloatArray) -> tuple[FloatArray, FloatArray]:
     """F and Q (n, n) of a reset, from the covariances (n, n) around it.
 
-    States whose variance changed are drawn again (their rows of F are zero), the others keep what was known of them; a
-    change of the mean alone shifts the state. That holds where the reset left the covariance of the others as it was
-    and cut them from those that it drew; otherwise nothing before it says anything of what came after.
+    States whose variance changed are drawn again (their rows of F are zero), the others keep what was known of them.
+    That holds where the reset left the covariance of the others as it was and cut them from those that it drew;
+    otherwise nothing before it says anything of what came after.
     """
     rounding = ROUNDING * np.sqrt(np.outer(after.diagonal(), after.diagonal()).clip(0.0))
     has_changed = np.abs(after - before) > rounding
@@ -192,9 +190,8 @@ def replay(
 ) -> Replayed:  # fmt: skip
     """Run the localizer of a configuration over the events of a run, from its start at base.
 
-    ``smooth``: go back over the run with the smoother afterwards. ``on_frame`` gets the robot time of each frame, s.
-    ValueError: the filter has no smoother. FilterError: the smoothed state is not finite, or the smoother would have to
-    go across a restart.
+    ``on_frame`` gets the robot time of each frame, s. ValueError: the filter has no smoother. FilterError: the smoothed
+    state is not finite, or the smoother would have to go across a restart.
     """
     if smooth and not has_smoother(cfg):
         raise ValueError(f"no smoother for filter {cfg.run.filter}: the pose is not in it")

@@ -16,7 +16,7 @@ from ccatp.core import FloatArray
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.plots import INK, QUIET
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
-from ccatp.studies.cramer_rao import bounds_of, rehearse_recorded
+from ccatp.studies.cramer_rao import WAY_T, RecordedSilRun, bounds_of
 from ccatp.studies.mission_study import (
     COLUMN,
     Histogram,
@@ -43,14 +43,14 @@ def run_filter_mission(job: Job) -> JobOutcome:
     if job.seed % _BOUND_EVERY != 1:
         values, arrays = run_mission(job)
         return JobOutcome(values, {**arrays, "bounds": np.empty((0, 5))})
-    found, record = rehearse_recorded(job.cfg, with_track=True)
-    values, arrays = mission_outcome(job.cfg, found)
-    mirror = build_mirror(job.cfg.mirror)
+    run = RecordedSilRun(job.cfg, with_track=True)
+    values, arrays = mission_outcome(job.cfg, run.run())
+    record, mirror = run.record(), build_mirror(job.cfg.mirror)
     without, with_it = (bounds_of(job.cfg, mirror, record, with_accelerometer=flag) for flag in (False, True))
     bounds = [
-        (stop.t_s, float(np.trace(stop.covariance_m2)), float(np.trace(more.covariance_m2)), *stop.fix.error_m)
-        for stop, more in zip(without, with_it, strict=True)
-        if stop.fix.point is not None
+        (record.way[fix.frame, WAY_T], np.trace(bound_m2), np.trace(better_m2), *fix.error_m)
+        for fix, bound_m2, better_m2 in zip(record.fixes, without, with_it, strict=True)
+        if fix.point is not None
     ]
     return JobOutcome(values, {**arrays, "bounds": np.array(bounds, dtype=np.float64).reshape(-1, 5)})
 
@@ -59,8 +59,7 @@ def combine_filters(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutc
     """The missions pooled, and their stop errors beside the bound.
 
     Array ``bounds``: rows of t (s), the least mean square distance without and with the accelerometer (m^2), error
-    x, y (m), shape (k, 5). ``rms_mm`` and ``p50_mm`` of a bound, ``error_rms_mm`` of the same fixes, and their
-    ``ratio``; the bound with ``with_accelerometer`` has its own.
+    x, y (m), shape (k, 5).
     """
     values, arrays = combine_missions(factors, outcomes)
     # At the first point of a run the start errors count: it says little about the filter.

@@ -9,7 +9,7 @@ from ccatp.core import EdgeSample, Fix, ImuSample, PanelId, WheelSample
 from ccatp.mirror.mirror import build_mirror
 from ccatp.studies import cramer_rao as cr
 from ccatp.studies.campaign import Job, JobOutcome
-from ccatp.studies.cramer_rao import SeamPass, StopFix, TrueRecord, bounds_of, rehearse_recorded
+from ccatp.studies.cramer_rao import RecordedSilRun, SeamPass, StopFix, TrueRecord, bounds_of
 from ccatp.studies.mission_study import Histogram
 from ccatp.studies.thesis_study import ThesisLocalizer, combine, overrides_of, run_job
 
@@ -182,7 +182,7 @@ def drawn(cfg: Config, *, sensor_passes: bool) -> tuple[np.ndarray, np.ndarray]:
 def last_covariance(cfg: Config, *, sensor_passes: bool = False, with_accelerometer: bool = False) -> np.ndarray:
     """Bound of the covariance at the end of the leg, m^2."""
     record = straight(cfg, sensor_passes=sensor_passes)
-    return bounds_of(cfg, build_mirror(cfg.mirror), record, with_accelerometer=with_accelerometer)[-1].covariance_m2
+    return bounds_of(cfg, build_mirror(cfg.mirror), record, with_accelerometer=with_accelerometer)[-1]
 
 
 @pytest.mark.parametrize("sensor_passes", [False, True])
@@ -208,15 +208,16 @@ def test_the_scatter_of_slip_is_the_floor_of_a_leg() -> None:
 def test_an_estimator_does_not_beat_the_bound() -> None:
     keys = {"run.mirror": "thesis-m1", "run.world": "hard", "run.filter": "ekf", "run.panels": 1, "run.seed": 3}
     cfg = load_config(overrides=keys)
-    found, record = rehearse_recorded(cfg)
+    run = RecordedSilRun(cfg)
+    found, record = run.run(), run.record()
     assert np.diff(record.way[:, cr.WAY_T]) == pytest.approx(0.01)
     assert len(record.fixes) == found.counts["fixes"]
     assert record.passes  # the base lies on another panel
     assert len({one.edge for one in record.passes}) < len(record.passes)  # four sensors cross the same edge
     bounds = bounds_of(cfg, build_mirror(cfg.mirror), record)[1:]  # until the second fix only the start errors count
-    errors = np.array([stop.fix.error_m for stop in bounds])
-    squares = [e @ np.linalg.solve(stop.covariance_m2, e) for e, stop in zip(errors, bounds, strict=True)]
-    median_m = np.median([np.sqrt(np.trace(stop.covariance_m2)) for stop in bounds])
+    errors = np.array([fix.error_m for fix in record.fixes[1:]])
+    squares = [e @ np.linalg.solve(bound, e) for e, bound in zip(errors, bounds, strict=True)]
+    median_m = np.median([np.sqrt(np.trace(bound)) for bound in bounds])
     assert 0.5e-3 < median_m < 3e-3  # the scatter of slip on legs of 0.22 and 0.245 m
     # In units of their own bound, over eight stops: a chi-square of 16 degrees falls below half its mean once in 200.
     assert np.sqrt(np.mean(squares) / 2.0) > 0.6
