@@ -73,14 +73,14 @@ def step_case(name: str, ours: Contender, peer_name: str, peer: Contender | None
     return found
 
 
-def race(ours: Contender, peer: Contender | None, rounds: int, steps: int = STEPS) -> FloatArray:
+def race(ours: Contender, peer: Contender | None, rounds: int) -> FloatArray:
     """Time every step of both, a round of steps each by turns, who begins by turns as well.
 
     So a machine that slows down slows both, and neither runs on caches that the other one has filled. One round more
-    warms up. Returns wall times of single steps of ours and of the peer, if any, us, shape (1 or 2, rounds, steps).
+    warms up. Returns wall times of single steps of ours and of the peer, if any, us, shape (1 or 2, rounds, STEPS).
     """
     both = [ours] if peer is None else [ours, peer]
-    taken = np.zeros((len(both), rounds, steps))
+    taken = np.zeros((len(both), rounds, STEPS))
     collecting = gc.isenabled()
     gc.disable()
     try:
@@ -88,7 +88,7 @@ def race(ours: Contender, peer: Contender | None, rounds: int, steps: int = STEP
             for which in range(len(both)) if turn % 2 else reversed(range(len(both))):
                 solution = both[which]()
                 next(solution)
-                for i in range(steps):
+                for i in range(STEPS):
                     start_ns = time.perf_counter_ns()
                     next(solution)
                     spent_ns = time.perf_counter_ns() - start_ns
@@ -101,12 +101,12 @@ def race(ours: Contender, peer: Contender | None, rounds: int, steps: int = STEP
     return taken
 
 
-def largest_difference(ours: Contender, peer: Contender, steps: int = STEPS) -> float:
+def largest_difference(ours: Contender, peer: Contender) -> float:
     """Largest difference between any entries of the results of two contenders, after any of the steps; SI units."""
     solutions = ours(), peer()
     readers = [next(solution) for solution in solutions]
     largest = 0.0
-    for _ in range(steps):
+    for _ in range(STEPS):
         results = [read(next(solution)) for read, solution in zip(readers, solutions, strict=True)]
         for one, other in zip(*results, strict=True):
             found, expected = (np.asarray(result, dtype=np.float64).ravel() for result in (one, other))
@@ -116,14 +116,14 @@ def largest_difference(ours: Contender, peer: Contender, steps: int = STEPS) -> 
     return largest
 
 
-def machine(cpu_info: Path = CPU_INFO) -> dict[str, object]:
+def machine() -> dict[str, object]:
     """Processor, usable cores, Python, build and versions of what takes part, threads of the linear algebra."""
     try:
         cores = len(os.sched_getaffinity(0))
     except AttributeError:  # not on every system
         cores = os.cpu_count() or 1
     return {
-        "cpu": cpu_model(cpu_info),
+        "cpu": _cpu_model(),
         "cores": cores,
         "python": platform.python_version(),
         **{name: _version(name) for name in PACKAGES},
@@ -131,14 +131,13 @@ def machine(cpu_info: Path = CPU_INFO) -> dict[str, object]:
     }
 
 
-def cpu_model(cpu_info: Path) -> str:
+def _cpu_model() -> str:
     """The model as the kernel names it, or what the platform knows."""
-    try:
-        lines = cpu_info.read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(named, "") or platform.processor() or platform.machine()
+    with suppress(OSError):
+        for line in CPU_INFO.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 def _version(package: str) -> str | None:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ccatp.commissioning.conformance.runner import check_ids
-from ccatp.studies.bench import CPU_INFO, cpu_model, machine
+from ccatp.studies.bench import machine
 
 PATH = Path(__file__).with_name("table.toml")
 # Rows of each kind in the list that the project works from; a row may be added, none may be lost.
@@ -148,4 +148,4 @@ def machine_line() -> str:
     """Processor, cores, Python, and whether real-time scheduling was permitted."""
     facts = machine()
     scheduling = "with" if is_realtime_permitted() else "without"
-    return f"{cpu_model(CPU_INFO)}, {facts['cores']} cores, Python {facts['python']}, {scheduling} real-time scheduling"
+    return f"{facts['cpu']}, {facts['cores']} cores, Python {facts['python']}, {scheduling} real-time scheduling"

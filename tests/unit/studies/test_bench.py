@@ -20,22 +20,14 @@ from ccatp.links.robot_messages import Drive, Sensors
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.robot import Robot
 from ccatp.studies import bench, bench_cases, bench_frame, calibrator
-from ccatp.studies.bench import largest_difference, machine, race, step_case
-from ccatp.studies.bench_cases import Contender, Race, races
+from ccatp.studies.bench import machine, step_case
+from ccatp.studies.bench_cases import Contender, races
 from ccatp.studies.bench_frame import BenchError, LockstepRun, Moment, ProcessUse
 from ccatp.studies.calibrator import BUSY, IDLE, LOADS, ONE_CORE, load
 
 STEPS = 10
 CFG = load_config()
 RACES = list(races(CFG))
-
-
-@pytest.mark.parametrize("one", [one for one in RACES if one.peers], ids=lambda one: one.name)
-def test_every_peer_computes_the_same(one: Race) -> None:
-    for peer in one.peers.values():
-        assert largest_difference(one.ours, peer, STEPS) < bench.EQUAL_WITHIN
-    states = list(one.ours())
-    assert len(states) == 1 + bench_cases.STEPS
 
 
 def fixed(value: float) -> Contender:
@@ -48,13 +40,6 @@ def test_a_peer_with_another_result_ends_the_run(value: float, difference: str) 
     assert step_case("case", fixed(1.0), "P", fixed(1.0 + 5e-11), 1)["largest_difference"] == pytest.approx(5e-11)
     with pytest.raises(BenchError, match=f"case: results differ from those of P by {difference}, more than 1e-10"):
         step_case("case", fixed(1.0), "P", fixed(value), 1)
-
-
-def test_a_race_times_every_step_of_both() -> None:
-    times_us = race(RACES[0].ours, RACES[0].peers["eq. 2.13 in numpy"], 2, STEPS)
-    assert times_us.shape == (2, 2, STEPS)
-    assert times_us.min() > 0.0
-    assert race(RACES[0].ours, None, 1, STEPS).shape == (1, 1, STEPS)
 
 
 def test_a_missing_peer_leaves_ours_and_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,11 +65,10 @@ def test_the_command_and_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert {"cpu", "cores", "python", "numpy"} <= result["machine"].keys()
     assert result["equal_within"] == 1e-10
     for case in result["cases"]:
+        assert case["us_p99"] >= case["us_p50"] > 0.0
         if case["peer"] is None:
             assert case["name"].startswith("ekf-slam, 200")  # whole matrices of that size take too long
-            assert case["us_p50"] > 0.0
             continue
-        assert case["us_p99"] >= case["us_p50"]
         assert case["ratio"] == pytest.approx(case["us_p50"] / case["peer_us_p50"])
         assert case["largest_difference"] <= 1e-10
     names = {case["peer"] for case in result["cases"]} - {None}
@@ -157,14 +141,13 @@ def test_the_rows_of_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (in_process["times_real_time"], in_process["ratio"]) == (pytest.approx(20.0), pytest.approx(10.0))
     assert idle["name"].endswith("2 panels, idle")
     assert (cases[-1]["us_p50"], cases[-1]["us_p99"], cases[-1]["ratio"]) == (100.0, 200.0, pytest.approx(0.01))
-    page = bench.markdown({"machine": bench.machine(), "equal_within": 1e-10, "cases": cases})
-    table = [line for line in page.splitlines() if line.startswith("|")]
+    result = {"machine": bench.machine(), "cases": cases}
+    table = [line for line in bench.markdown(result).splitlines() if line.startswith("|")]
     assert len(table) == len(cases) + 2
     assert len({line.count("|") for line in table}) == 1
-    lines = bench.terminal_lines({"machine": bench.machine(), "cases": cases})
-    assert len(lines) == len(cases) + 1
-    assert "p99 200 us" in lines[-1]
-    assert lines[-1].endswith("ratio 0.010")
+    last = bench.terminal_lines(result)[-1]
+    assert "p99 200 us" in last
+    assert last.endswith("ratio 0.010")
 
 
 def test_a_mission_that_measured_too_little_gives_no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
