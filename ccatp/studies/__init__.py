@@ -5,6 +5,7 @@ This file holds the table of studies. It imports nothing heavy, since the help o
 
 import difflib
 import os
+from dataclasses import replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 Analysis: TypeAlias = "Callable[[Config, Path], dict[str, Any]]"
 """A study without runs: a configuration and a directory, to what ``result.json`` holds."""
 
-# Name: module and name in it of a Study or an Analysis, one line for the help.
+# Name: module and name in it of a Study or an Analysis, title.
 STUDIES = {
     "thesis": ("thesis_study:STUDY", "the thesis's own simulation again, under several readings"),
     "filters": ("survey_studies:FILTERS", "filters in four worlds, over whole missions"),
@@ -40,15 +41,16 @@ STUDIES = {
 
 def find_study(name: str) -> "Study | Analysis":
     """The study of a name (raises CampaignError: there is none)."""
-    if name not in STUDIES:
-        from ccatp.studies.campaign import CampaignError  # noqa: PLC0415
+    from ccatp.studies.campaign import CampaignError, Study  # noqa: PLC0415
 
+    if name not in STUDIES:
         near = difflib.get_close_matches(name, STUDIES, n=1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(STUDIES)}"
         raise CampaignError(f"no study {name!r}; {hint}")
-    module, _, attribute = STUDIES[name][0].partition(":")
+    place, title = STUDIES[name]
+    module, _, attribute = place.partition(":")
     found: Study | Analysis = getattr(import_module(f"ccatp.studies.{module}"), attribute)
-    return found
+    return replace(found, name=name, title=title) if isinstance(found, Study) else found
 
 
 def limit_threads() -> None:

@@ -95,8 +95,6 @@ class CellResult(NamedTuple):
 class Study:
     """A campaign that has a name; workers import ``run_job`` by its name, outcomes are combined in order of seeds."""
 
-    name: str
-    title: str
     cells: Callable[[], Sequence[Cell]]
     run_job: Callable[[Job], JobOutcome]
     combine: Callable[[Factors, Sequence[JobOutcome]], JobOutcome]
@@ -109,6 +107,8 @@ class Study:
     is_radio: bool = False  # its configurations are those of robots among radio beacons
     # What was published of a cell: ``printed`` in its result.
     published: Callable[[Factors], Mapping[str, Any]] | None = None
+    name: str = ""  # both as in the table of studies, see ``find_study``
+    title: str = ""
 
 
 class Shard(NamedTuple):

@@ -186,8 +186,6 @@ WAYS = Measure(
 
 
 STUDY = Study(
-    name="cricket",
-    title="self-mapping of ultrasonic motes: the published figures, and better ways",
     cells=lambda: [Cell({"case": name}) for name in CASES],
     run_job=run_job,
     combine=combine,

@@ -300,8 +300,6 @@ def draw(results: Sequence[CellResult], out: Path) -> None:
 
 
 STUDY = Study(
-    name="danger",
-    title="False edges and overrun of the thesis's edge rule and of the daemon's",
     cells=lambda: [Cell({"speed_m_s": v_m_s, "crossing": way}) for v_m_s in SPEEDS_M_S for way in CROSSINGS],
     run_job=run_job,
     combine=combine,

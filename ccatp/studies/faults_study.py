@@ -130,8 +130,6 @@ def draw(cells: Sequence[CellResult], out: Path) -> None:
 
 
 STUDY = Study(
-    name="faults",
-    title="Whole missions without faults, and with faults that pass by",
     cells=lambda: [Cell({"faults": kind}) for kind in (NONE, RANDOM)],
     run_job=run_job,
     combine=combine,

@@ -228,8 +228,6 @@ def _root(values: Sequence[float]) -> float:
 
 
 STUDY = Study(
-    name="mote-navigation",
-    title="A robot that navigates by motes which mapped themselves",
     cells=lambda: [Cell({"case": "route"})],
     run_job=run_job,
     combine=combine,

@@ -346,8 +346,6 @@ def _turns(cfg: RadioConfig, sender_m: tuple[float, float]) -> list[ScanResult]:
 
 
 RADIO_SIGNALS = RadioStudy(
-    name="radio-signals",
-    title="Levels and bearings of ZigBee radios",
     cells=lambda: [
         Cell({"place": place, "condition": condition}, dict(keys))
         for condition, keys in CONDITIONS.items()
@@ -400,8 +398,6 @@ def draw_cases(results: Sequence[CellResult], out: Path) -> None:
 
 
 RADIO_CASES = RadioStudy(
-    name="radio-cases",
-    title="Cases I to III of 2017",
     cells=lambda: [Cell({"case": case}, {**RADIO, "workspace.waypoints_m": path}) for case, path in PATHS.items()],
     columns=f"""
         printed: {" ".join(NAMES)}
@@ -444,8 +440,6 @@ def draw_follow(results: Sequence[CellResult], out: Path) -> None:
 
 
 RADIO_FOLLOW = RadioStudy(
-    name="radio-follow",
-    title="A moving radio followed",
     cells=lambda: [
         Cell({"case": case, "condition": condition}, {**keys, "observation.target_every_steps": every})
         for condition, keys in FOLLOW_CONDITIONS.items()
@@ -515,8 +509,6 @@ def draw_slam(results: Sequence[CellResult], out: Path) -> None:
 
 
 RADIO_SLAM = RadioStudy(
-    name="radio-slam",
-    title="EKF-SLAM among ZigBee radios",
     cells=slam_cells,
     draw=draw_slam,
     defaults={"system": "zigbee"},

@@ -98,7 +98,10 @@ def write_results(
     there = [cell for cell in cells if cell.values["runs"]]
     arrays = {f"{k}/{name}": array for k, cell in enumerate(cells) for name, array in cell.arrays.items()}
     np.savez_compressed(out / "result.npz", allow_pickle=False, **arrays)
-    _write_whole(out / "table.md", f"# {study.title}\n\n" + table([row for row in rows if row["runs"]], study.columns))
+    _write_whole(
+        out / "table.md",
+        f"# {study.name}: {study.title}\n\n" + table([row for row in rows if row["runs"]], study.columns),
+    )
     _write_whole(out / "result.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
     if with_figures and there:
         study.draw(there, out)

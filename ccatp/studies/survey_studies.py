@@ -138,8 +138,6 @@ CONSISTENCY = (
 
 
 FILTERS = Study(
-    name="filters",
-    title="Filters in four worlds",
     cells=lambda: [
         Cell({"world": world, "filter": name}, {"run.world": world, "run.filter": name})
         for world in ("thesis", "thesis-x2", "hard", "extreme")
@@ -226,8 +224,6 @@ def draw_times(cells: Sequence[CellResult], out: Path) -> None:
 
 
 TIME = Study(
-    name="time",
-    title="Order, speed and measuring time against the hour",
     cells=lambda: [
         Cell(
             {"order": order, "v_max_m_s": v_m_s, "measuring_time_s": measuring_s},
@@ -305,8 +301,6 @@ def draw_sensitivity(cells: Sequence[CellResult], out: Path) -> None:
 
 
 SENSITIVITY = Study(
-    name="sensitivity",
-    title="What each disturbance costs",
     cells=sensitivity_cells,
     run_job=run_mission,
     combine=combine_missions,
@@ -367,8 +361,6 @@ def draw_ablation(cells: Sequence[CellResult], out: Path) -> None:
 
 
 ABLATION = Study(
-    name="ablation",
-    title="What each technique gives: one switched off at a time",
     cells=lambda: [
         Cell({"world": world, "without": name}, {"run.world": world, **keys})
         for world in WORLDS

@@ -339,8 +339,6 @@ def _draw_waypoints(result: CellResult, published: Mapping[str, float], title: s
 
 
 STUDY = Study(
-    name="thesis",
-    title="The thesis's own simulation again, under several readings",
     cells=cells,
     run_job=run_job,
     combine=combine,

@@ -135,7 +135,7 @@ def test_a_campaign_writes_all_its_files_and_json_alone_on_standard_output(
     with np.load(tmp_path / "result.npz") as arrays:
         assert arrays["1/values"].tolist() == pytest.approx([0.1, 0.2, 0.3])
     rows = "| speed_m_s | runs | mean |\n|---|---|---|\n| 0.05 | 3 | 0.1 |\n| 0.1 | 3 | 0.2 |\n"
-    assert (tmp_path / "table.md").read_text() == f"# A toy\n\n{rows}"
+    assert (tmp_path / "table.md").read_text() == f"# toy: A toy\n\n{rows}"
     assert (tmp_path / "figure.txt").read_text() == "2"
     seeds = [key.rpartition("=")[2] for key in jobs_done(tmp_path)]
     assert seeds == ["1", "1", "2", "2", "3", "3"]  # one job of each cell first
@@ -295,7 +295,7 @@ def test_without_json_the_table_is_shown(
     monkeypatch.chdir(tmp_path)
     args = ["--workers", "1", "--only", "speed_m_s=0.1", "--no-figures", "--seed", "5", "--set", "run.filter=ekf"]
     assert main(["study", "toy", *args]) == 0
-    assert capsys.readouterr().out == "# A toy\n\n| speed_m_s | runs | mean |\n|---|---|---|\n| 0.1 | 3 | 0.6 |\n"
+    assert capsys.readouterr().out == "# toy: A toy\n\n| speed_m_s | runs | mean |\n|---|---|---|\n| 0.1 | 3 | 0.6 |\n"
     settings = json.loads((tmp_path / "studies/toy/result.json").read_text())["settings"]
     assert settings == {"run.seed": 5, "run.filter": "ekf"}
 
