@@ -120,9 +120,7 @@ async def _send_heartbeats(context: zmq.Context[zmq.Socket[bytes]], endpoints: E
 def _survey_view(mirror: Mirror, cfg: Config, run_dir: Path, *, is_sim: bool) -> SurveyView:
     view = SurveyView(mirror, cfg, is_sim=is_sim)
     with suppress(StoreError):  # nothing has been measured yet
-        survey = read_survey(run_dir / "mission.sqlite", mirror.name)
-        measured = [(stored.point, stored.fix.t_s, stored.fix.position_m) for stored in survey.fixes]
-        view.begin_with(measured, [stored.point for stored in survey.points if stored.status == "skipped"])
+        view.begin_with(read_survey(run_dir / "mission.sqlite", mirror.name))
     return view
 
 

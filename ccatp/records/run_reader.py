@@ -13,7 +13,7 @@ import numpy as np
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.core import Fix, FloatArray, IntArray, PanelId, PanelPose, PointId, Vector3
+from ccatp.core import Fix, FloatArray, IntArray, PanelId, PointId, Vector3
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
@@ -30,7 +30,7 @@ from ccatp.links.topics import (
     TruthMessage,
     decode_recorded,
 )
-from ccatp.mirror.mirror import Mirror, deck_poses
+from ccatp.mirror.mirror import Mirror, deck_rows
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.recorder import TELEMETRY, iter_messages, read_metadata, recordings
 from ccatp.records.store import StoreError, read_survey
@@ -150,11 +150,7 @@ class TraceBuilder:
         """The trace, in the deck frame."""
         names = np.array(self._names, dtype=np.int64).reshape(-1, 3)
         rows = np.array(self._rows).reshape(-1, 4)
-        poses = [
-            PanelPose(PanelId(row, col), x, y, heading)
-            for (_, row, col), (_, x, y, heading) in zip(names.tolist(), rows.tolist(), strict=True)
-        ]
-        deck = deck_poses(mirror, poses)
+        deck = deck_rows(mirror, names[:, 1:], rows[:, 1:])
         covariance = np.array(self._covariances).reshape(-1, 3, 3) if self._covariances else None
         return Trace(names[:, 0], rows[:, 0], deck[:, :3], deck[:, 3], covariance)
 

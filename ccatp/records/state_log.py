@@ -73,10 +73,13 @@ def _parsed(text: str) -> ReadLine | None:
     if not isinstance(fields, dict) or not isinstance(fields.get("event"), str):
         return None
     process = str(fields.get("logger", fields.get(_OLD_LOGGER, "")))
-    fields["event"] = _OLD_EVENTS.get(fields["event"], fields["event"])
-    begins = fields["event"] == "run_started" and process == "supervisor"
+    event = fields["event"] = _OLD_EVENTS.get(fields["event"], fields["event"])
+    begins = event == "run_started" and process == "supervisor"
     if fields.get("level") == _DEBUG:
-        return ReadLine(None, _change(fields), begins)
+        change = None
+        if event == "state_changed" and isinstance(fields.get("seq"), int):
+            change = StateChange(fields["seq"], str(fields.get("before")), str(fields.get("after")))
+        return ReadLine(None, change, begins)
     t_s = fields.get("t_s")
     line = LogLine(
         wall=str(fields.get("timestamp", fields.get(_OLD_TIME, ""))),
@@ -88,13 +91,6 @@ def _parsed(text: str) -> ReadLine | None:
     return ReadLine(line, None, begins)
 
 
-def _change(fields: dict[str, Any]) -> StateChange | None:
-    seq, before, after = (fields.get(key) for key in ("seq", "before", "after"))
-    if fields["event"] != "state_changed" or not isinstance(seq, int):
-        return None
-    return StateChange(seq, str(before), str(after))
-
-
 def _text(fields: dict[str, Any]) -> str:
     event = str(fields["event"])
     if event == "verdict_changed":
@@ -103,11 +99,7 @@ def _text(fields: dict[str, Any]) -> str:
         return str(fields.get("text", ""))
     if _EVENT_NAME.fullmatch(event):  # older logs have sentences
         event = event.replace("_", " ")
-    more = [
-        f"{_named(key)} {_shown(value)}{_unit(key)}"
-        for key, value in fields.items()
-        if key not in _OWN and value not in ("", {}, [], None)
-    ]
+    more = [_shown(key, value) for key, value in fields.items() if key not in _OWN and value not in ("", {}, [], None)]
     return f"{event}: {', '.join(more)}" if more else event
 
 
@@ -119,25 +111,23 @@ def _verdict(fields: dict[str, Any]) -> str:
     return f"danger: {danger_text(cause, signal, value, limit)}, event code {fields.get('code')}"
 
 
-def _named(key: str) -> str:
-    stem, _, last = key.rpartition("_")
-    return (stem if last in _UNITS and stem else key).replace("_", " ")
+def _shown(key: str, value: object) -> str:
+    """``fan_time_ms``, 3.5 as "fan time 3.5 ms"."""
+    stem, _, unit = key.rpartition("_")
+    has_unit = bool(stem) and unit in _UNITS
+    name = (stem if has_unit else key).replace("_", " ")
+    return f"{name} {_value(value)} {unit}" if has_unit else f"{name} {_value(value)}"
 
 
-def _unit(key: str) -> str:
-    stem, _, last = key.rpartition("_")
-    return f" {last}" if last in _UNITS and stem else ""
-
-
-def _shown(value: object) -> str:
+def _value(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, dict):
-        return ", ".join(f"{_named(str(key))} {_shown(inner)}" for key, inner in value.items())
+        return ", ".join(_shown(str(key), inner).strip() for key, inner in value.items())
     if isinstance(value, list):
-        return ", ".join(map(_shown, value))
+        return ", ".join(map(_value, value))
     return str(value)
 
 

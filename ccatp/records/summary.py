@@ -97,11 +97,11 @@ class RunningStatistics:
 
     def figures(self, names: Sequence[str], *, scale: float, decimals: int) -> dict[str, Any]:
         """As ``distribution``, without rmse."""
-        if not self.count:
-            return dict.fromkeys(names)
-        p50, p99 = np.percentile(self.sample, (50, 99))
-        found = {"mean": self._sum / self.count, "p50": p50, "p99": p99, "max": self._max}
-        return {name: rounded(found[name] * scale, decimals) for name in names}
+        found = distribution(self.sample, names, scale=scale, decimals=decimals)
+        if self.count:
+            mean, most = self._sum / self.count, self._max
+            found |= {"mean": rounded(mean * scale, decimals), "max": rounded(most * scale, decimals)}
+        return {name: found[name] for name in names}
 
 
 class SummaryBuilder:
@@ -215,11 +215,6 @@ class SummaryBuilder:
         self._false_edges += earlier._false_edges
         self._falls += earlier._falls
         self._overrun_m = max(self._overrun_m, earlier._overrun_m)
-
-    @property
-    def unresolved(self) -> int:
-        """Arrivals and edges that wait for their frame's truth; those left at the end count as neither good nor bad."""
-        return len(self._waiting_arrivals) + len(self._waiting_edges)
 
     def build(self, wall_s: float | None = None) -> dict[str, Any]:
         """The summary, keys in the order of the command line contract; ``wall_s`` is the wall time of the run."""

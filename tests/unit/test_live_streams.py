@@ -1,18 +1,17 @@
 """Tests of the live streams with real subscribers: ZeroMQ as PlotJuggler's plugin, a WebSocket as Foxglove."""
 
-import base64
+import asyncio
 import json
-import os
 import socket
 import struct
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import pytest
 import zmq
+from autobahn.asyncio.websocket import WebSocketClientFactory, WebSocketClientProtocol
 
 from ccatp.cli import main
 from ccatp.daemon.streaming import RUN, streamed_schemas
@@ -28,7 +27,6 @@ from ccatp.report.foxglove import (
 
 PANELS = RecordedMessage("view/panels", 0.0, b'{"deletions":[],"entities":[]}')
 ROBOT = RecordedMessage("view/robot", 1.25, b'{"t_s":1.25,"seq":125,"x_m":0.5,"y_m":0.0}')
-PROTOCOL = "foxglove.sdk.v1"
 
 
 @pytest.fixture
@@ -111,100 +109,54 @@ def test_a_port_that_is_taken_is_told(context: zmq.Context[zmq.Socket[bytes]]) -
             FoxgloveStream("ccatp", "127.0.0.1", port, [])
 
 
-TEXT, BINARY, CLOSE, PING = 1, 2, 8, 9
+class Peer(WebSocketClientProtocol):
+    """A client; messages are JSON as text, and binary."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.messages: asyncio.Queue[Any] = asyncio.Queue()
+
+    def onMessage(self, payload: bytes, isBinary: bool) -> None:
+        self.messages.put_nowait(payload if isBinary else json.loads(payload))
+
+    async def next_of(self, operation: str) -> dict[str, Any]:
+        async with asyncio.timeout(10.0):
+            while True:
+                message = await self.messages.get()
+                if isinstance(message, dict) and message["op"] == operation:
+                    return message
 
 
-class WebSocket:
-    """A client of RFC 6455 at a port of 127.0.0.1, blocking."""
-
-    def __init__(self, port: int, protocol: str, timeout_s: float = 10.0) -> None:
-        self._socket = socket.create_connection(("127.0.0.1", port), timeout_s)
-        self._file = self._socket.makefile("rb")
-        key = base64.b64encode(os.urandom(16)).decode()
-        head = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        head += f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: {protocol}\r\n\r\n"
-        self._socket.sendall(head.encode())
-        status = self._file.readline()
-        assert b" 101 " in status, status
-        while self._file.readline() not in (b"\r\n", b""):
-            pass
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._file.close()
-        self._socket.close()
-
-    def send(self, message: dict[str, Any]) -> None:
-        """One JSON message; a client masks what it sends."""
-        data, mask = json.dumps(message).encode(), os.urandom(4)
-        length = bytes([0x80 | len(data)]) if len(data) < 126 else bytes([0x80 | 126]) + struct.pack(">H", len(data))
-        masked = bytes(byte ^ mask[i % 4] for i, byte in enumerate(data))
-        self._socket.sendall(bytes([0x80 | TEXT]) + length + mask + masked)
-
-    def receive(self) -> bytes | dict[str, Any]:
-        """The next message: binary as it is, text as JSON."""
-        kind, data = self._frame()
-        while kind == PING:
-            kind, data = self._frame()
-        assert kind in (TEXT, BINARY), kind
-        found: bytes | dict[str, Any] = json.loads(data) if kind == TEXT else data
-        return found
-
-    def _frame(self) -> tuple[int, bytes]:
-        data, kind = b"", 0
-        while True:
-            first, second = self._file.read(2)
-            length = second & 0x7F
-            if length == 126:
-                (length,) = struct.unpack(">H", self._file.read(2))
-            elif length == 127:
-                (length,) = struct.unpack(">Q", self._file.read(8))
-            data += self._file.read(length)
-            kind = kind or first & 0x0F
-            if first & 0x80:
-                return kind, data
-
-
-def next_of(peer: WebSocket, operation: str) -> dict[str, Any]:
-    while True:
-        message = peer.receive()
-        if isinstance(message, dict) and message["op"] == operation:
-            return message
-
-
-def advertised(peer: WebSocket, count: int) -> dict[str, dict[str, Any]]:
-    channels: dict[str, dict[str, Any]] = {}
-    while len(channels) < count:
-        channels |= {channel["topic"]: channel for channel in next_of(peer, "advertise")["channels"]}
-    return channels
-
-
-def test_foxglove_gets_channels_schemas_and_messages(foxglove: FoxgloveStream) -> None:
+async def test_foxglove_gets_channels_schemas_and_messages(foxglove: FoxgloveStream) -> None:
     schemas = dict(streamed_schemas())
     assert next(iter(schemas)) == RUN
     port = int(foxglove.where.rpartition(":")[2])
-    with WebSocket(port, PROTOCOL) as peer:
-        assert next_of(peer, "serverInfo")["name"] == "ccatp"
-        channels = advertised(peer, len(schemas))
-        assert channels.keys() == schemas.keys()
-        panels = channels["view/panels"]
-        assert (panels["schemaName"], panels["encoding"]) == ("foxglove.SceneUpdate", "json")
-        assert json.loads(panels["schema"]) == json.loads(json.dumps(schemas["view/panels"]))
-        wanted = {7: channels["view/panels"]["id"], 8: channels["view/robot"]["id"]}
-        peer.send({"op": "subscribe", "subscriptions": [{"id": k, "channelId": v} for k, v in wanted.items()]})
-        with tending(foxglove, ROBOT, latched=[PANELS]):
-            found: dict[int, tuple[int, bytes]] = {}
-            while len(found) < 2:
-                message = peer.receive()
-                if isinstance(message, bytes):
-                    opcode, subscription, log_time = struct.unpack_from("<BIQ", message)
-                    assert opcode == 1
-                    found[subscription] = (log_time, message[13:])
-    # The map was sent before anybody was there.
-    assert found[7] == (0, PANELS.payload)
-    assert found[8] == (1_250_000_000, ROBOT.payload)
+    url, protocols = f"ws://127.0.0.1:{port}", ["foxglove.sdk.v1"]
+    factory = WebSocketClientFactory(url, protocols=protocols)  # type: ignore[no-untyped-call]
+    factory.protocol = Peer
+    transport, peer = await asyncio.get_running_loop().create_connection(factory, "127.0.0.1", port)
+    assert (await peer.next_of("serverInfo"))["name"] == "ccatp"
+    channels: dict[str, dict[str, Any]] = {}
+    while len(channels) < len(schemas):
+        channels |= {channel["topic"]: channel for channel in (await peer.next_of("advertise"))["channels"]}
+    assert channels.keys() == schemas.keys()
+    panels = channels["view/panels"]
+    assert (panels["schemaName"], panels["encoding"]) == ("foxglove.SceneUpdate", "json")
+    assert json.loads(panels["schema"]) == json.loads(json.dumps(schemas["view/panels"]))
+    wanted = {7: channels["view/panels"]["id"], 8: channels["view/robot"]["id"]}
+    subscriptions = [{"id": k, "channelId": v} for k, v in wanted.items()]
+    peer.sendMessage(json.dumps({"op": "subscribe", "subscriptions": subscriptions}).encode())
+    found: dict[int, tuple[int, bytes]] = {}
+    with tending(foxglove, ROBOT, latched=[PANELS]):
+        while len(found) < 2:
+            message = await asyncio.wait_for(peer.messages.get(), 10.0)
+            if isinstance(message, bytes):
+                opcode, subscription, log_time = struct.unpack_from("<BIQ", message)
+                assert opcode == 1
+                found[subscription] = (log_time, message[13:])
+    transport.abort()
+    # The map was latched before anybody was there.
+    assert found == {7: (0, PANELS.payload), 8: (1_250_000_000, ROBOT.payload)}
 
 
 def test_foxglove_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,5 @@
 """The page of a survey: its points, arrival errors by the laser, errors against the simulated truth, the path."""
 
-from collections.abc import Iterable
 from math import dist
 from typing import Any
 
@@ -9,6 +8,7 @@ from ccatp.core import PanelId, PanelPose, PointId, Vector3
 from ccatp.links.topics import ArrivalMessage, DisplayState, FixMessage, MissionStatus, TrackMessage
 from ccatp.mirror.mirror import Mirror, deck_poses
 from ccatp.mirror.surface import ConvergenceError
+from ccatp.records.store import StoredSurvey
 from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView, TruthCompare
 from ccatp.survey.planning.route import ORDERS
 from ccatp.survey.state import PURPOSES
@@ -85,13 +85,13 @@ class SurveyView(RunStateView):
             TrackMessage: self._take_track,
         }
 
-    def begin_with(self, measured: Iterable[tuple[PointId, float, Vector3]], skipped: Iterable[PointId]) -> None:
-        """Take the points of the mission database; measured ones with time (s) and puck (world frame, m)."""
-        for point, t_s, position_m in sorted(measured, key=lambda row: row[1]):
-            self._measured(point, t_s, position_m)
-        for point in skipped:
-            if point in self._index:
-                self._mark(self._index[point], SKIPPED)
+    def begin_with(self, survey: StoredSurvey) -> None:
+        """Take what was measured and skipped before."""
+        for point, fix in sorted(survey.fixes, key=lambda one: one.fix.t_s):
+            self._measured(point, fix.t_s, fix.position_m)
+        for row in survey.points:
+            if row.status == "skipped" and row.point in self._index:
+                self._mark(self._index[row.point], SKIPPED)
 
     def _take_status(self, status: MissionStatus, now_s: float) -> None:
         super()._take_status(status, now_s)

@@ -14,7 +14,7 @@ from ccatp.conditions import NO_WAY_ON, RIM_AHEAD
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_radio_config
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Severity, Verdict
+from ccatp.core import DeckPose, EventCode, Fix, PanelId, PanelPose, PointId, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.topics import (
     ArrivalMessage,
@@ -33,6 +33,8 @@ from ccatp.links.topics import (
     TrackMessage,
     TruthMessage,
 )
+from ccatp.mirror.panel_alignment import Measured
+from ccatp.records.store import StoredPoint, StoredSurvey
 from ccatp.report.dashboard.access import command_refusal, host_refusal, read_token
 from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground
 from ccatp.report.dashboard.survey_view import SurveyView, ground
@@ -227,9 +229,13 @@ def test_everything_is_the_sum_of_the_news_and_stops_are_the_path_where_nobody_l
 
 def test_what_was_measured_before_is_there(view: SurveyView) -> None:
     fixes = [fix_at(view.points[k], 0.001, t_s=10.0 - k) for k in range(3)]
-    measured = [(view.points[k], fix.t_s, fix.position_m) for k, fix in enumerate(fixes)]
-    elsewhere = (PointId(5, 5, 5), 1.0, fixes[0].position_m)
-    view.begin_with([*measured, elsewhere], [view.points[4], PointId(5, 5, 6)])
+    points = [*view.points[:3], PointId(5, 5, 5)]
+    measured = [
+        Measured(point, Fix(fix.t_s, fix.position_m, (0.0,) * 9, 1.0, (), 0.0))
+        for point, fix in zip(points, [*fixes, fixes[0]], strict=True)
+    ]
+    skipped = [StoredPoint(point, 0.0, 0.0, "skipped") for point in (view.points[4], PointId(5, 5, 6))]
+    view.begin_with(StoredSurvey(tuple(skipped), tuple(measured), ()))
     everything = view.everything(0.0)
     assert [row[:2] for row in everything["points"]] == [[0, MEASURED], [1, MEASURED], [2, MEASURED], [4, SKIPPED]]
     assert [row[0] for row in everything["series"]["arrival"]] == [8.0, 9.0, 10.0]
