@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import accumulate, groupby
 from math import hypot
 from typing import Any
 
@@ -112,8 +112,7 @@ class SurveyParts:
 
     def check_robot(self, hello: Hello) -> None:
         """Refuse a robot whose own geometry contradicts the configuration."""
-        problems = robot_problems(self.cfg, self.mirror, hello)
-        if problems:
+        if problems := robot_problems(self.cfg, self.mirror, hello):
             raise ConfigError(f"robot: the configuration is not of this robot: {'; '.join(problems)}")
 
 
@@ -125,8 +124,7 @@ def assemble(cfg: Config, done: Collection[PointId] = (), checkpoint: Checkpoint
     mirror = build_mirror(cfg.mirror)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
     route = plan_survey(cfg, mirror, points, done, calibrates=checkpoint is None)
-    planner = RoutePlanner(mirror, cfg)
-    survey = Survey(cfg, mirror, route, planner.home, planner.rejoin, planner.route)
+    survey = Survey(cfg, mirror, route, RoutePlanner(mirror, cfg))
     if checkpoint is None:
         start, localizer, mission = None, build_localizer(cfg, mirror), Mission(survey)
     else:
@@ -245,22 +243,22 @@ def make_plan(cfg: Config, mirror: Mirror) -> SurveyPlan:
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
     out_of_reach: list[PointId] = []
     stops = plan_survey(cfg, mirror, points, (), out_of_reach).stops
-    legs_s = [leg_time(length, cfg.limits) for length in leg_lengths(stops, mirror.base_pose, mirror)]
-    times_s = stop_times(stops, mirror.base_pose, cfg.limits, mirror)
+    lengths_m, times_s = (
+        leg_lengths(stops, mirror.base_pose, mirror),
+        stop_times(stops, mirror.base_pose, cfg.limits, mirror),
+    )
+    driving_s = sum(leg_time(length, cfg.limits) for length in lengths_m)
     rests_s = [cfg.etalon.measuring_time_s * stop.is_measured for stop in stops]
-    clock_s, arrivals_s = 0.0, []
-    for time_s, rest_s in zip(times_s, rests_s, strict=True):
-        arrivals_s.append(clock_s + time_s)
-        clock_s += time_s + rest_s
+    begins_s = accumulate((time_s + rest_s for time_s, rest_s in zip(times_s, rests_s, strict=True)), initial=0.0)
     reached = [point for point in points if point not in set(out_of_reach)]
     return SurveyPlan(
         points=tuple(points),
         out_of_reach=tuple(out_of_reach),
         stops=stops,
-        times_s=tuple(arrivals_s),
-        length_m=sum(leg_lengths(stops, mirror.base_pose, mirror)),
-        driving_s=sum(legs_s),
-        turning_s=sum(times_s) - sum(legs_s),
+        times_s=tuple(begin_s + time_s for begin_s, time_s in zip(begins_s, times_s, strict=False)),
+        length_m=sum(lengths_m),
+        driving_s=driving_s,
+        turning_s=sum(times_s) - driving_s,
         measuring_s=sum(rests_s),
         any_order_s=tour_bound(mirror, reached, cfg.limits, cfg.etalon.measuring_time_s),
     )

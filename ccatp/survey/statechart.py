@@ -1,6 +1,6 @@
 """The survey: from the pose, the danger loop's verdict and events to the next state and a command. Pure."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 
 from msgspec.structs import replace
 
@@ -16,7 +16,7 @@ from ccatp.conditions import (
 )
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegPhase
-from ccatp.core import DeckPose, EventCode, PointId, Stop, StopKind, Verdict
+from ccatp.core import EventCode, PointId, Stop, StopKind, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import (
     HOLD_POSITION,
@@ -31,7 +31,7 @@ from ccatp.survey.budget import BudgetProgress, TimeBudget
 from ccatp.survey.failsafe import ROWS, HoldRules
 from ccatp.survey.planning.escape import is_on_drive
 from ccatp.survey.planning.legs import PlanError
-from ccatp.survey.planning.route import Route
+from ccatp.survey.planning.route import Route, RoutePlanner
 from ccatp.survey.route_follower import Leg, LegFollower, StateEstimate
 from ccatp.survey.state import (
     BACKING_OFF,
@@ -74,32 +74,16 @@ _KEPT = (
     *("corrections", "request", "failures", "was_reverse", "backoffs"),
 )
 
-PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
-PlanRest = Callable[[Route, DeckPose, Collection[PointId]], Route]
-PlanPoints = Callable[[DeckPose, Sequence[PointId]], Route]
 Step = tuple[SurveyState, MissionCommand]
 
 
 class Survey(HoldRules[SurveyState]):
-    """What does not change during a survey, and the functions from one state to the next.
-
-    ``plan_rest`` gives the way back to a route from a pose, without the points that are done with; ``plan_points`` a
-    route through points from a pose; without it what failed once is not tried again.
-    """
+    """What does not change during a survey, and the functions from one state to the next."""
 
     rows = ROWS
 
-    def __init__(
-        self,
-        cfg: Config,
-        mirror: Mirror,
-        route: Route,
-        plan_home: PlanHome,
-        plan_rest: PlanRest,
-        plan_points: PlanPoints | None = None,
-    ) -> None:
-        self.cfg, self._route = cfg, route
-        self._plan_home, self._plan_rest, self._plan_points = plan_home, plan_rest, plan_points
+    def __init__(self, cfg: Config, mirror: Mirror, route: Route, planner: RoutePlanner) -> None:
+        self.cfg, self._route, self.planner = cfg, route, planner
         self._points = tuple(stop.point for stop in route.stops if stop.point is not None)
         self.follower = LegFollower(mirror, cfg)
         self._budget: TimeBudget | None = None
@@ -194,8 +178,6 @@ class Survey(HoldRules[SurveyState]):
 
     def _begin_second_round(self, s: SurveyState) -> SurveyState:
         """What failed and was not tried again yet is due; last first, because the robot is nearer to that."""
-        if self._plan_points is None:
-            return s
         due, retried = s.due, s.retried
         if not due:
             due = tuple(point for point in reversed(tuple(s.failure_causes)) if point not in retried)
@@ -283,10 +265,8 @@ class Survey(HoldRules[SurveyState]):
                 return replace(s, is_off_route=False)
             s = replace(s, wants_calibration=True)
         try:
-            if due and self._plan_points is not None:
-                route = self._plan_points(deck, due)
-            else:
-                route = self._plan_rest(s.route, deck, {*s.done, *s.skipped})
+            planner, over = self.planner, {*s.done, *s.skipped}
+            route = planner.route(deck, due) if due else planner.rejoin(s.route, deck, over)
         except PlanError as error:
             return self.fault(s, NO_WAY_ON.text(why=error))
         return replace(s, route=route, stop_index=0, behaviour=None, is_off_route=False)
@@ -353,7 +333,7 @@ class Survey(HoldRules[SurveyState]):
         home = s.behaviour
         if not isinstance(home, ReturnHome):
             try:
-                return replace(s, behaviour=ReturnHome(self._plan_home(motion.deck))), HOLD_POSITION
+                return replace(s, behaviour=ReturnHome(self.planner.home(motion.deck))), HOLD_POSITION
             except PlanError as error:
                 return self.fault(s, NO_WAY_HOME.text(why=error)), HOLD_POSITION
         if home.is_at_base:

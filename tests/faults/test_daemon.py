@@ -200,14 +200,14 @@ async def test_planning_longer_than_a_frame_may_wait_pauses_nobody() -> None:
     async with running_daemon(configuration()) as daemon:
         await daemon.until(lambda: daemon.is_driving)
         mission: Any = daemon.main._runner.mission
-        plan, planned = mission.survey._plan_rest, []
+        plan, planned = mission.survey.planner.rejoin, []
 
         def plan_slowly(*args: object) -> object:
             time.sleep(0.12)
             planned.append(clock())
             return plan(*args)
 
-        mission.survey._plan_rest = plan_slowly
+        mission.survey.planner.rejoin = plan_slowly
         assert mission.handle(Pause("a test")) is None
         await daemon.until(lambda: not daemon.is_driving)
         assert mission.handle(Resume()) is None

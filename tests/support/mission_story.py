@@ -1,7 +1,9 @@
 """The mission in virtual time: an ideal robot on one panel, verdicts as scripted."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from math import cos, exp, sin
+from types import SimpleNamespace
+from typing import Any, cast
 
 from msgspec.structs import replace
 
@@ -9,7 +11,7 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import MissionCommand
-from ccatp.survey.planning.route import Route
+from ccatp.survey.planning.route import Route, RoutePlanner
 from ccatp.survey.route_follower import StateEstimate
 from ccatp.survey.state import FixStored, MissionState, SurveyState
 from ccatp.survey.statechart import Mission, Survey
@@ -31,7 +33,7 @@ class Story:
         self.stops = tuple(
             Stop(*mirror.point_on_deck(PointId(5, 5, k)), StopKind.MEASURE, PointId(5, 5, k)) for k in (1, 2, 3)
         )
-        self.mission = Mission(Survey(config, mirror, self.route(self.stops), self.plan_home, self.plan_rest))
+        self.mission = Mission(Survey(config, mirror, self.route_of(self.stops), self.planner()))
         self.plans: list[DeckPose] = []
         start = mirror.point_on_deck(PointId(5, 5, 4))
         pose = mirror.panel_pose(PANEL, DeckPose(*start, 0.0))
@@ -42,7 +44,7 @@ class Story:
         self.auto_fix = True
 
     @staticmethod
-    def route(stops: tuple[Stop, ...]) -> Route:
+    def route_of(stops: tuple[Stop, ...]) -> Route:
         left = tuple(float(len(stops) - k) for k in range(len(stops) + 1))
         return Route(stops, left)
 
@@ -50,9 +52,18 @@ class Story:
     def state(self) -> SurveyState:
         return self.mission.state
 
+    def planner(self, **methods: Any) -> RoutePlanner:
+        """Of the story, but for some methods."""
+        plans = {"home": self.plan_home, "rejoin": self.plan_rest, "route": self.plan_due} | methods
+        return cast(RoutePlanner, SimpleNamespace(**plans))
+
+    def plan_due(self, start: DeckPose, points: Sequence[PointId]) -> Route:
+        self.plans.append(start)
+        return self.route_of(tuple(stop for point in points for stop in self.stops if stop.point == point))
+
     def plan_rest(self, _route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
         self.plans.append(start)
-        return self.route(tuple(stop for stop in self.stops if stop.point not in skip))
+        return self.route_of(tuple(stop for stop in self.stops if stop.point not in skip))
 
     def plan_home(self, _start: DeckPose) -> tuple[Stop, ...]:
         return (Stop(*self.base, StopKind.BASE, heading_rad=1.0),)

@@ -21,7 +21,7 @@ from ccatp.survey.planning.legs import (
     build_places,
     course_of_heading,
 )
-from ccatp.survey.planning.search import Search, SearchNode, Target, path_time, stop_times, turn_time
+from ccatp.survey.planning.search import Search, SearchNode, path_time, stop_times, turn_time
 
 _REPLANNED_POINTS = 4  # at least, before the old route is joined again
 _LONGEST_LEG_HOME_M = 0.75  # about one stop per panel: there the robot points itself at base again
@@ -97,23 +97,12 @@ class RoutePlanner:
         From there on legs and turns keep the clearances of a survey. Raises ``OutsideMirrorError`` (start), and
         ``UnreachableError`` if base lies where the clearances allow no way.
         """
-        mirror, body, mission = self._mirror, self._body, self._mission
-        base = base or mirror.base_pose
-        here, goal = build_places(mirror, body, np.array([start.x_m, base.x_m]), np.array([start.y_m, base.y_m]))
-        if not here.depth_m > 0.0:
-            raise OutsideMirrorError(
-                f"no way home from ({start.x_m:.3f}, {start.y_m:.3f}) m: {-here.depth_m:.3f} m beyond the rim of "
-                f"{mirror.name}"
-            )
-        target = Target(goal, find_retreats(mirror, body, [goal])[0])
-        arrivals = self._search.advance([self._first(here, start)], (), target)
+        base = base or self._mirror.base_pose
+        places, first = self._places(start, [(base.x_m, base.y_m)])
+        goal, course = places[1], course_of_heading(self._mirror, base)
+        arrivals = self._search.advance([first], (), goal, self._retreats(places)[1])
         if not arrivals:
-            raise UnreachablePointError(
-                f"no safe way to base at ({base.x_m:.3f}, {base.y_m:.3f}) m, {goal.depth_m:.3f} m from the rim of "
-                f"{mirror.name}, with leg_clearance_m = {mission.leg_clearance_m} and "
-                f"turn_clearance_m = {mission.turn_clearance_m}"
-            )
-        course = course_of_heading(mirror, base)
+            raise self._unreachable(f"base at ({base.x_m:.3f}, {base.y_m:.3f}) m", goal)
 
         def rank(arrival: SearchNode) -> tuple[bool, float]:
             """One from which the turn to the final course is safe, if there is; then the cheapest, with that turn."""
@@ -123,52 +112,50 @@ class RoutePlanner:
         path = min(arrivals, key=rank).path()
         ends = [Stop(a.place.x_m, a.place.y_m, StopKind.VIA, None, a.reverse) for a in path[:-1]]
         ends.append(Stop(base.x_m, base.y_m, StopKind.BASE, None, path[-1].reverse, base.heading_rad))
-        return in_parts((here.x_m, here.y_m), ends, _LONGEST_LEG_HOME_M)
+        return in_parts((start.x_m, start.y_m), ends, _LONGEST_LEG_HOME_M)
 
-    def _first(self, place: LegPlace, start: DeckPose) -> SearchNode:
-        """Where the robot stands; too near the rim to turn, where its first move away from it ends."""
-        first = SearchNode(place, course_of_heading(self._mirror, start), 0.0)
-        return first if place.blocked is None else find_escape(self._mirror, self._body, first, self._limits)
-
-    def _stops(self, points: list[PointId], start: DeckPose, out_of_reach: list[PointId] | None) -> tuple[Stop, ...]:
-        mirror, body, mission = self._mirror, self._body, self._mission
-        xy = np.array([(start.x_m, start.y_m), *(mirror.point_on_deck(point) for point in points)])
+    def _places(self, start: DeckPose, targets: list[tuple[float, float]]) -> tuple[list[LegPlace], SearchNode]:
+        """The start and the targets; where the robot stands, or too near the rim to turn, its first move ends."""
+        mirror, body = self._mirror, self._body
+        xy = np.array([(start.x_m, start.y_m), *targets])
         places = build_places(mirror, body, xy[:, 0], xy[:, 1])
         if not places[0].depth_m > 0.0:
-            raise OutsideMirrorError(
-                f"start ({start.x_m:.3f}, {start.y_m:.3f}) m is {-places[0].depth_m:.3f} m beyond the rim of "
-                f"{mirror.name}"
-            )
-        retreats = find_retreats(mirror, body, places)
-        if places[0].blocked is not None:
-            retreats[0] = ()  # away from the rim first, as on the way home
-        arrivals, before = [self._first(places[0], start)], 0
+            where, beyond_m = f"({start.x_m:.3f}, {start.y_m:.3f}) m", -places[0].depth_m
+            raise OutsideMirrorError(f"start {where} is {beyond_m:.3f} m beyond the rim of {mirror.name}")
+        first = SearchNode(places[0], course_of_heading(mirror, start), 0.0)
+        return places, first if places[0].blocked is None else find_escape(mirror, body, first, self._limits)
+
+    def _retreats(self, places: list[LegPlace]) -> list[tuple[LegPlace, ...]]:
+        """Where to turn near each place; at the start, near the rim, it is away from the rim first."""
+        return [(), *find_retreats(self._mirror, self._body, places[1:])]
+
+    def _unreachable(self, what: str, place: LegPlace) -> UnreachablePointError:
+        mission = self._mission
+        return UnreachablePointError(
+            f"mission: no safe way to {what}, {place.depth_m:.3f} m from the rim of {self._mirror.name}, with "
+            f"leg_clearance_m = {mission.leg_clearance_m} and turn_clearance_m = {mission.turn_clearance_m}"
+        )
+
+    def _stops(self, points: list[PointId], start: DeckPose, out_of_reach: list[PointId] | None) -> tuple[Stop, ...]:
+        places, first = self._places(start, [self._mirror.point_on_deck(point) for point in points])
+        retreats = self._retreats(places)
+        arrivals, before = [first], 0
         for k, point in enumerate(points, start=1):
-            found = self._search.advance(arrivals, retreats[before], Target(places[k], retreats[k]))
+            found = self._search.advance(arrivals, retreats[before], places[k], retreats[k])
             if found:
                 arrivals, before = found, k
             elif out_of_reach is not None:
                 out_of_reach.append(point)
             else:
-                raise UnreachablePointError(
-                    f"mission: no safe way to point {point.row}-{point.col}-{point.point} of {mirror.name}, "
-                    f"{places[k].depth_m:.3f} m from the rim, with leg_clearance_m = {mission.leg_clearance_m} and "
-                    f"turn_clearance_m = {mission.turn_clearance_m}"
-                )
+                raise self._unreachable(f"point {point.row}-{point.col}-{point.point}", places[k])
         point_of = dict(zip(places[1:], points, strict=True))
-        best = min(arrivals, key=lambda arrival: arrival.cost_s)
-        ends = [
-            Stop(
-                arrival.place.x_m,
-                arrival.place.y_m,
-                StopKind.MEASURE if arrival.place in point_of else StopKind.VIA,
-                point_of.get(arrival.place),
-                arrival.reverse,
-            )
-            for arrival in best.path()
-        ]
+        ends = []
+        for arrival in min(arrivals, key=lambda arrival: arrival.cost_s).path():
+            place, point_there = arrival.place, point_of.get(arrival.place)
+            kind = StopKind.VIA if point_there is None else StopKind.MEASURE
+            ends.append(Stop(place.x_m, place.y_m, kind, point_there, arrival.reverse))
         # A heading that is off by 10 mrad misses by a centimetre after a metre: long legs are looked after on the way.
-        return in_parts((start.x_m, start.y_m), ends, mission.longest_leg_m)
+        return in_parts((start.x_m, start.y_m), ends, self._mission.longest_leg_m)
 
     def _timed(self, stops: tuple[Stop, ...], start: DeckPose) -> Route:
         times = [

@@ -4,7 +4,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import dist, hypot, pi, sqrt
-from typing import NamedTuple
 
 from ccatp.config.models import LimitsConfig
 from ccatp.core import DeckPose, Stop, bearing, difference
@@ -84,13 +83,6 @@ _REVERSE_S = 0.01
 _GRAZING_S = (0.0, 3.0, 60.0)
 
 
-class Target(NamedTuple):
-    """A place to be reached, and the places near it where the robot may turn before and after."""
-
-    place: LegPlace
-    retreats: tuple[LegPlace, ...] = ()
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchNode:
     """The cheapest arrival at a place with this leg, facing the deck direction ``course_rad``.
@@ -128,22 +120,25 @@ class Search:
         self._rules, self._limits = rules, limits
 
     def advance(
-        self, arrivals: Sequence[SearchNode], retreats: tuple[LegPlace, ...], target: Target
+        self,
+        arrivals: Sequence[SearchNode],
+        retreats: tuple[LegPlace, ...],
+        target: LegPlace,
+        target_retreats: tuple[LegPlace, ...] = (),
     ) -> list[SearchNode]:
-        """All sensible ways on from one place to the next target; none where there is no way."""
+        """All sensible ways on to the next target, by places to turn near either end; none where there is no way."""
         here = arrivals[0].place
         frontier: Frontier = {here: list(arrivals)}
         frontier |= self._extend(frontier, retreats)
-        elbows = self._rules.elbows(frontier, (target.place, *target.retreats))
-        if elbows:
-            frontier = _merged(frontier, self._extend(frontier, elbows))
+        elbows = self._rules.elbows(frontier, (target, *target_retreats))
+        frontier = _merged(frontier, self._extend(frontier, elbows))
         around = frontier
-        for corner in self._rules.way_around(here, target.place):
+        for corner in self._rules.way_around(here, target):
             around = self._extend(around, (corner,))
         if around is not frontier:
             frontier = _merged(frontier, around)
-        frontier = _merged(frontier, self._extend(frontier, target.retreats))
-        return self._extend(frontier, (target.place,)).get(target.place, [])
+        frontier = _merged(frontier, self._extend(frontier, target_retreats))
+        return self._extend(frontier, (target,)).get(target, [])
 
     def _extend(self, frontier: Frontier, targets: Iterable[LegPlace]) -> Frontier:
         reached: Frontier = {}

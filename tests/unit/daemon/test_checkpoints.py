@@ -1,7 +1,6 @@
 """Parts, database and checkpoint of a main loop: new, resumed, taken over."""
 
 import random
-from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from math import nan
@@ -42,7 +41,6 @@ from ccatp.survey.state import (
     SurveyState,
     TakenOver,
 )
-from ccatp.survey.statechart import Mission, Survey
 from tests.support.mission_story import ABORT, FREE, Story, from_first_leg
 
 
@@ -231,13 +229,10 @@ class Doomed(Story):
 
     def __init__(self, config: Config, kills: set[int]) -> None:
         super().__init__(config, build_mirror(config.mirror))
-        self.survey = Survey(config, self.mirror, self.route(self.stops), self.plan_home, self.plan_rest, self.plan_due)
-        self.mission, self.auto_fix = Mission(self.survey), False
+        self.survey = self.mission.survey
+        self.auto_fix = False
         self.kills, self.tries, self.frames = kills, list[PointId](), 0
         self.kept = self.mission.state
-
-    def plan_due(self, _start: DeckPose, due: Sequence[PointId]) -> Route:
-        return self.route(tuple(stop for point in due for stop in self.stops if stop.point == point))
 
     def frame(self, verdict: Verdict | None = FREE) -> MissionCommand:
         order, mission = super().frame(verdict), self.mission

@@ -294,11 +294,10 @@ def test_failed_measurements_are_skipped_and_three_in_a_row_hold(story: Story) -
 def test_a_fix_committed_after_the_way_was_planned_anew_counts_once(story: Story) -> None:
     # A slow disk: the robot was paused meanwhile, and went on by a way whose next stop is not the point.
     via = Stop(*story.mirror.point_on_deck(PointId(5, 5, 5)), StopKind.VIA)
-    survey = Survey(
-        story.config, story.mirror, story.route(story.stops), story.plan_home,
-        lambda route, start, skip: story.route((via, *story.plan_rest(route, start, skip).stops)),
-    )  # fmt: skip
-    story.mission = Mission(survey)
+    planner = story.planner(
+        rejoin=lambda route, start, skip: story.route_of((via, *story.plan_rest(route, start, skip).stops))
+    )
+    story.mission = Mission(Survey(story.config, story.mirror, story.route_of(story.stops), planner))
     story.auto_fix = False
     story.until(lambda: story.state.is_awaiting_fix)
     point = story.state.measuring_point
@@ -447,8 +446,8 @@ def test_no_way_on_and_no_way_home_are_faults(config: Config, mirror: Mirror) ->
     def refuse(*_: object) -> Route:
         raise PlanError("walled in")
 
-    survey = Survey(config, mirror, story.route(story.stops), refuse, refuse)  # type: ignore[arg-type]
-    story.mission = Mission(survey)
+    planner = story.planner(home=refuse, rejoin=refuse)
+    story.mission = Mission(Survey(config, mirror, story.route_of(story.stops), planner))
     story.until_state(MissionState.DRIVING)
     story.mission.handle(PointMissed())
     story.mission.handle(Pause("operator"))
