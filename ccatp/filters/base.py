@@ -1,8 +1,8 @@
 """What every filter offers: the ``Filter`` protocol, the innovation of an update, typed refusals."""
 
-from collections.abc import Sequence
 from typing import Protocol
 
+import msgspec
 import numpy as np
 
 from ccatp.core import FloatArray
@@ -25,27 +25,25 @@ class FilterDiverged(FilterError):
     """A mean, a covariance or a noise is not a finite Gaussian: the message says which."""
 
 
-class Innovation:
+class Innovation(msgspec.Struct, frozen=True, gc=False):
     """What an update found.
 
     ``nis`` is nu^T (H P H^T + R)^-1 nu of all rows, chi-squared with m degrees of freedom when the filter is
     consistent.
     """
 
-    __slots__ = ("_residual", "nis")
-
-    def __init__(self, residual: Sequence[float] | FloatArray, nis: float) -> None:
-        self._residual, self.nis = residual, nis  # a list costs a third of an array, which few ask for
+    rows: list[float]  # costs a third of an array, which few ask for
+    nis: float
 
     @property
     def residual(self) -> FloatArray:
         """Nu = z - H x with the predicted state, shape (m,)."""
-        return np.array(self._residual, dtype=np.float64)
+        return np.array(self.rows, dtype=np.float64)
 
     @property
     def size(self) -> int:
         """m, the number of measurement rows."""
-        return len(self._residual)
+        return len(self.rows)
 
 
 class Transition(Protocol):

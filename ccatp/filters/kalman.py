@@ -32,26 +32,28 @@ MANY = 32
 class _Rows:
     """Buffers for m measurement rows: H^T above zeros (n + 1, m), V (n + 1, m), S (m, m), and arguments of their calls.
 
-    V is P H^T above the residual nu^T, in the end P H^T C^-T above (C^-1 nu)^T, with S = H P H^T + R = C C^T.
+    V is P H^T above the residual nu^T, in the end P H^T C^-T above (C^-1 nu)^T, with S = H P H^T + R = C C^T. More than
+    four rows are filled up with empty ones to a multiple of four, which BLAS computes faster.
     """
 
     def __init__(self, n: int, m: int, M: FloatArray, U: FloatArray) -> None:
-        self.H, self.V = np.zeros((n + 1, m), order="F"), np.empty((n + 1, m), order="F")
-        self.S, stack = np.empty((m, m), order="F"), np.empty((n + m, n + 1), order="F")
-        self.H_rows, self.S_rows, self.V_rows = self.H.T[:, :n], self.S.T, self.V.T
-        self.V_flat, self.S_flat, self.residual = self.V.ravel(order="K"), self.S.ravel(order="K"), self.V[n]
-        self.S_diagonal, self.sigma = self.S_flat[:: m + 1], np.empty(m)
-        self.sigmas, self.top, self.bottom, self.triangle = self.sigma[:, None], stack[:m], stack[m:], stack[: n + 1]
-        self.H_shape, self.S_shape = (m, n), (m, m)
-        self.project = 1.0, M, self.H, 0.0, self.V, 0, 0, 1  # V = M H^T
-        self.spread = 1.0, self.H, self.V, 0.0, self.S, 1, 0, 1  # S = H V
-        self.factor = self.S, 1, 0, 1  # S -> C
-        self.solve = 1.0, self.S, self.V, 1, 1, 1, 0, 1  # V -> V C^-T
-        self.reduce = -1.0, self.V, 1.0, M, 0, 0, 1  # M -> M - V V^T
+        size = m if m <= 4 else m + -m % 4
+        H, V, S = (np.zeros((rows, size), order="F") for rows in (n + 1, n + 1, size))
+        self.V, self.S, self.S_flat = V, S, S.ravel(order="K")
+        self.H_rows, self.S_rows, self.V_rows = H.T[:m, :n], S.T[:m, :m], V.T[:m]
+        self.V_flat, self.residual = V.ravel(order="K"), V[n, :m]
+        self.step, self.is_many, self.is_filled_up = size + 1, m > MANY, size > m
+        self.S_diagonal, self.empty = self.S_flat[: m * size : size + 1], self.S_flat[m * size + m :: size + 1]
+        self.project = 1.0, M, H, 0.0, V, 0, 0, 1  # V = M H^T
+        self.spread = 1.0, H, V, 0.0, S, 1, 0, 1  # S = H V
+        self.factor = S, 1, 0, 1  # S -> C
+        self.solve = 1.0, S, V, 1, 1, 1, 0, 1  # V -> V C^-T
+        self.reduce = -1.0, V, 1.0, M, 0, 0, 1  # M -> M - V V^T
         self.squares = self.V_flat, self.V_flat, m, n, n + 1, n, n + 1  # y^T y
-        self.load = self.H.ravel(order="K"), self.V_flat
-        self.rotate = 1.0, U, self.V, 0, 0, 0, 0, 1  # V -> U V
-        self.triangulate = stack, n + 1, 1  # R of QR in the upper triangle
+        self.load = H.ravel(order="K"), self.V_flat
+        self.rotate = 1.0, U, V, 0, 0, 0, 0, 1  # V -> U V
+        self.stack, self.sigma = np.empty((n + m, n + 1), order="F"), np.empty(m)
+        self.checked_H = self.checked_R = np.empty(0)
 
 
 class KalmanFilter:
@@ -63,8 +65,9 @@ class KalmanFilter:
 
     The printed form of 2.10 loses symmetry and then definiteness by rounding. With S = H P H^T + R = C C^T,
     V = P H^T C^-T and y = C^-1 nu the same posterior is x + V y, P - V V^T, and y^T y is the normalised innovation
-    squared. Mean and covariance are kept as one matrix M = [P -x; -x^T 0], of which only the upper triangle is used:
-    a product with M is one with P and one with x, and one symmetric product, of V above y^T, gives all three results.
+    squared. Mean and covariance are kept as one matrix M = [P -x; -x^T c], of which only the upper triangle is used:
+    a product with M is one with P and one with x, and one symmetric product, of V above y^T, gives all three
+    results. The corner c meets nothing but zeros.
 
     The subtraction errs by 1e-16 of the prior. Where the posterior is much smaller, or rows nearly repeat each other, a
     QR factorisation takes its place (``_rotate``).
@@ -76,21 +79,18 @@ class KalmanFilter:
         self._shape: tuple[int, ...] = np.shape(covariance)
         checked = checked_gaussian(mean, covariance, self._shape)
         self._n = n = checked[0].size
-        self._M, kept, product, self._U, self._C = (np.zeros((n + 1, n + 1), order="F") for _ in range(5))
-        self._F, Q = np.eye(n + 1), np.zeros((n + 1, n + 1))  # with the row and the column of the mean
+        self._M, predicted, product, self._U, self._C = (np.zeros((n + 1, n + 1), order="F") for _ in range(5))
+        self._F = np.eye(n + 1)  # with the row and the column of the mean
         M, self._flat = self._M, self._M.ravel(order="K")
-        self._P_rows, self._minus_x, self._diagonal = M.T[:n, :n], M[:n, n], self._flat[: -1 : n + 2]
-        self._F_rows, self._Q_rows = self._F[:n, :n], Q[:n, :n]
-        self._keep = self._flat, kept.ravel(order="K")
-        self._restore = self._keep[::-1]
+        self._P_rows, self._minus_x = M.T[:n, :n], M[:n, n]
+        self._F_rows, self._Q_rows, self._predicted_minus_x = self._F[:n, :n], predicted.T[:n, :n], predicted[:, n]
         self._multiply = 1.0, M, self._F.T, 0.0, product, 0, 0, 1  # product = M F^T
-        self._load = Q.ravel(), self._flat
-        self._propagate = 1.0, self._F.T, product, 1.0, M, 1, 0, 1  # M -> F product + M
-        self._squares = self._flat, self._flat
-        self._load_root = self._flat, self._U.ravel(order="K")
+        self._propagate = 1.0, self._F.T, product, 1.0, predicted, 1, 0, 1  # predicted = F product + Q
+        self._accept = predicted.ravel(order="K"), self._flat
+        self._squares = self._accept[0], self._accept[0], (n + 1) ** 2 - 1  # without the corner
         self._U_column, self._U_row, self._unit = self._U[:, n], self._U[n, :n], np.eye(n + 1)[n]
-        self._C_flat = self._C.ravel(order="K")
         self._rows: dict[tuple[int, ...], _Rows] = {}
+        self._checked_F = self._checked_Q = np.empty(0)
         self._identity = np.eye(n, n + 1)
         row, column = np.indices((n, n))
         self._mirror = np.minimum(row, column) + (n + 1) * np.maximum(row, column)  # of the upper triangle in M
@@ -124,58 +124,59 @@ class KalmanFilter:
     def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
         """Advance by F (n, n) and Q (n, n), thesis eqs 2.5 and 2.6; see ``Filter.predict``."""
         x = None
+        if F is not self._checked_F or Q is not self._checked_Q:
+            F, x = self._check_transition(F, Q)
+        self._F_rows[...] = F
+        self._Q_rows[...] = Q
+        self._predicted_minus_x.fill(0.0)
+        dsymm(*self._multiply)
+        dgemm(*self._propagate)
+        # BLAS does not warn where it overflows.
+        if not ddot(*self._squares) < HUGE:
+            self._F_rows[...] = np.eye(self._n)
+            raise FilterDiverged(f"prediction is not finite: mean {(-self._predicted_minus_x[:-1]).tolist()}")
+        dcopy(*self._accept)
+        if x is not None:
+            np.negative(x, self._minus_x)
+        self._mean = self._covariance = None
+
+    def _check_transition(self, F: FloatArray | Transition, Q: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+        """F, and of a model f(x); both arrays are as they shall be."""
+        name, x = "F", None
         if not isinstance(F, ndarray):
             x, F = F.at(self.mean)
+            name = "df/dx"
             if x.shape != self._shape[:1]:
                 raise FilterShapeError("f(x)", x.shape, str(self._shape[:1]))
             if not ddot(x, x) < HUGE:
                 raise FilterDiverged(f"prediction is not finite: mean {x.tolist()}")
         if F.shape != self._shape:
-            raise FilterShapeError("F" if x is None else "df/dx", F.shape, str(self._shape))
+            raise FilterShapeError(name, F.shape, str(self._shape))
         if Q.shape != self._shape:
             raise FilterShapeError("Q", Q.shape, str(self._shape))
-        self._F_rows[...] = F
-        self._Q_rows[...] = Q
-        dcopy(*self._keep)
-        dsymm(*self._multiply)
-        dcopy(*self._load)
-        dgemm(*self._propagate)
-        # BLAS does not warn where it overflows.
-        if not ddot(*self._squares) < HUGE:
-            predicted = -self._minus_x
-            dcopy(*self._restore)
-            self._F_rows[...] = np.eye(self._n)
-            raise FilterDiverged(f"prediction is not finite: mean {predicted.tolist()}")
-        if x is not None:
-            np.negative(x, self._minus_x)
-        self._mean = self._covariance = None
+        self._checked_F, self._checked_Q = F, Q
+        return F, x
 
     def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
         """Condition on z (m,) = H x + noise, thesis eqs 2.7 to 2.10; see ``Filter.update``."""
         expected = None
-        if not isinstance(H, ndarray):
-            expected, H = H.at(self.mean)
-            if expected.shape != z.shape:
-                raise FilterShapeError("z", z.shape, f"{expected.shape} of h(x)")
-        shape = z.shape
-        rows = self._rows.get(shape)
-        if rows is None or H.shape != rows.H_shape or not (R.shape == shape or R.shape == rows.S_shape):  # noqa: PLR1714
-            check_rows(z, H, R, self._n)
-            if not z.size:
-                return Innovation(np.empty(0), 0.0)
-            rows = self._new_rows(z.size)
+        rows = self._rows.get(z.shape)
+        if rows is None or H is not rows.checked_H or R is not rows.checked_R:
+            rows, H, expected = self._check_measurement(z, H, R)
+            if rows is None:
+                return Innovation([], 0.0)
         rows.H_rows[...] = H
         dsymm(*rows.project)
-        m, n = shape[0], self._n
-        daxpy(z, rows.V_flat, m, 1.0, 0, 1, n, n + 1)
+        n = self._n
+        daxpy(z, rows.V_flat, z.size, 1.0, 0, 1, n, n + 1)
         if expected is not None:
             np.subtract(z, expected, rows.residual)
         residual = rows.residual.tolist()
-        if m <= MANY:
+        if not rows.is_many:
             dgemm(*rows.spread)
             if R.ndim == 1:
                 noise = R.tolist()
-                daxpy(R, rows.S_flat, m, 1.0, 0, 1, 0, m + 1)
+                daxpy(R, rows.S_flat, z.size, 1.0, 0, 1, 0, rows.step)
             else:
                 noise = (noise_root(R).diagonal() ** 2).tolist()
                 np.add(rows.S_rows, R, rows.S_rows)
@@ -184,9 +185,27 @@ class KalmanFilter:
                 if not r <= s < STRONGEST * r:
                     break
             else:
+                if rows.is_filled_up:
+                    rows.empty.fill(1.0)
                 if not dpotrf(*rows.factor)[1]:
                     return self._subtract(rows, residual)
         return self._rotate(rows, residual, R)
+
+    def _check_measurement(
+        self, z: FloatArray, H: FloatArray | Observation, R: FloatArray
+    ) -> tuple[_Rows | None, FloatArray, FloatArray | None]:
+        """Buffers, None for no rows, H, and of a model h(x); all arrays fit each other."""
+        expected = None
+        if not isinstance(H, ndarray):
+            expected, H = H.at(self.mean)
+            if expected.shape != z.shape:
+                raise FilterShapeError("z", z.shape, f"{expected.shape} of h(x)")
+        check_rows(z, H, R, self._n)
+        if not z.size:
+            return None, H, expected
+        rows = self._rows.get(z.shape) or self._new_rows(z.size)
+        rows.checked_H, rows.checked_R = H, R
+        return rows, H, expected
 
     def _start(self, mean: FloatArray, covariance: FloatArray) -> None:
         self._minus_x[:], self._P_rows[:] = -mean, covariance
@@ -204,7 +223,6 @@ class KalmanFilter:
         if not nis < HUGE:
             raise FilterDiverged(f"update is not finite: NIS {nis:.3g}, residuals {residual}")
         dsyrk(*rows.reduce)
-        self._flat[-1] = 0.0
         self._mean = self._covariance = None
         return Innovation(residual, nis)
 
@@ -216,8 +234,8 @@ class KalmanFilter:
         C^T C = I + A^T A gives P = (L C^-1) (L C^-1)^T, its last column gives u, and the corner squared is the NIS.
         A prior far wider than the measurement costs no digits, and many rows cost little.
         """
-        U, C = self._U, self._C
-        dcopy(*self._load_root)
+        m, n, U, C, stack = len(residual), self._n, self._U, self._C, rows.stack
+        U[...] = self._M
         self._U_column[...] = self._unit
         if dpotrf(U, 0, 1, 1)[1]:
             U[:-1, :-1] = np.triu(dgeqrf(square_root(self.covariance).T)[0])
@@ -232,21 +250,21 @@ class KalmanFilter:
             if not (least > 0.0 and ddot(R, R) + ddot(rows.V_flat, rows.V_flat) < HUGE):
                 raise FilterDiverged(f"update is not finite: residuals {residual}, least variance {least:.3g}")
             np.sqrt(R, rows.sigma)
-            np.divide(rows.V_rows, rows.sigmas, rows.top)
+            np.divide(rows.V_rows, rows.sigma[:, None], stack[:m])
         else:
-            rows.top[...] = dtrsm(1.0, noise_root(R), rows.V_rows, 0, 1)
-        rows.bottom[...] = self._identity
-        dgeqrf(*rows.triangulate)
-        C[...] = rows.triangle
+            stack[:m] = dtrsm(1.0, noise_root(R), rows.V_rows, 0, 1)
+        stack[m:] = self._identity
+        dgeqrf(stack, n + 1, 1)  # R of QR in the upper triangle
+        C[...] = stack[: n + 1]
         corner = C.item(-1)
-        self._C_flat[-1] = 1.0
+        C[n, n] = 1.0
         dtrsm(1.0, C, U, 0, 0, 1, 0, 1)  # (L C^-1)^T above the negative change of x
         minus_x, nis = self._minus_x + self._U_row, corner * corner
         if not nis + ddot(minus_x, minus_x) < HUGE:
             raise FilterDiverged(f"update is not finite: NIS {nis:.3g}, residuals {residual}")
         self._U_row[...] = 0.0
         dsyrk(1.0, U, 0.0, self._M, 1, 0, 1)
-        self._minus_x[...], self._flat[-1] = minus_x, 0.0
+        self._minus_x[...] = minus_x
         self._mean = self._covariance = None
         return Innovation(residual, nis)
 

@@ -96,7 +96,7 @@ class UnscentedKalmanFilter(KalmanFilter):
         if R.shape not in ((m,), (m, m)):
             raise FilterShapeError("R", R.shape, f"({m},) or ({m}, {m})")
         if m == 0:
-            return Innovation(np.empty(0), 0.0)
+            return Innovation([], 0.0)
         if not np.vdot(images, images) + ddot(z, z) + np.vdot(R, R) < HUGE:
             raise FilterDiverged(f"update is not finite: readings {z.tolist()}, or their expectation or noise")
         if R.ndim == 2:
