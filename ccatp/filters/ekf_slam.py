@@ -207,16 +207,17 @@ class EkfSlam:
         return learned
 
     def update_iterated(
-        self, columns: Columns, linearise: Linearise, R: FloatArray, iterations: int, gate: float = inf
-    ) -> Update:
+        self, columns: Columns, linearise: Linearise, R: FloatArray, iterations: int, gate: float = inf,
+        start: FloatArray | None = None,
+    ) -> Update:  # fmt: skip
         """Condition on m rows, linearised again at each estimate: Gauss-Newton on the posterior (Bell and Cathey 1993).
 
-        ``linearise``: x (n,) -> (z - h(x), shape (m,); H at x, shape (m, k)). The gate applies at the last
-        linearisation.
+        ``linearise``: x (n,) -> (z - h(x), shape (m,); H at x, shape (m, k)). ``start``: the first x, the mean if not
+        given. The gate applies at the last linearisation.
         """
         prior = self.mean.copy()
-        x = prior
-        residual, H = linearise(prior)
+        x = prior if start is None else start
+        residual, H = linearise(x)
         for _ in range(iterations - 1):
             rows = _checked_rows(columns, H, residual, R)
             cross, S = self._moments(columns, H, rows)
@@ -263,16 +264,18 @@ class EkfSlam:
         self._blocks[block] = slice(n, n + b)
         self._take(grown, P)
 
-    def remove(self, block: BlockId) -> None:
-        """Marginalise a landmark: its rows and columns go; raises ``BlockError``."""
-        gone = self.block(block)
-        n, b = self.size, gone.stop - gone.start
-        keep = np.r_[0 : gone.start, gone.stop : n]
+    def remove(self, *blocks: BlockId) -> None:
+        """Marginalise landmarks: their rows and columns go; raises ``BlockError``."""
+        keep = np.ones(self.size, dtype=np.bool_)
+        for block in blocks:
+            keep[self.block(block)] = False
+        before = np.concatenate(((0,), np.cumsum(keep))).tolist()
         self._take(self.mean[keep], self.covariance[np.ix_(keep, keep)])
-        del self._blocks[block]
-        for name, place in self._blocks.items():
-            if place.start > gone.start:
-                self._blocks[name] = slice(place.start - b, place.stop - b)
+        self._blocks = {
+            name: slice(before[place.start], before[place.stop])
+            for name, place in self._blocks.items()
+            if name not in blocks
+        }
 
     def _moments(self, columns: Columns, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
         cross = H.dot(self.covariance[columns]).T

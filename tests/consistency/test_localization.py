@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from ccatp.beacons.slam.beacon_slam import BeaconSlam, recorded_slam
 from ccatp.beacons.slam.motion import Increment
-from ccatp.beacons.slam.range_slam import BeaconSlam
 from ccatp.beacons.slam.recording import RangeReading, Reading
 from ccatp.config.models import LocalizerConfig
 from ccatp.core import FloatArray, PanelId, PanelPose, wrap_pi
@@ -200,7 +200,7 @@ def drive(slam: BeaconSlam, seed: int, steps: int, *, bearings: bool) -> tuple[f
 def check_consistent(seeds: int, steps: int, *, bearings: bool) -> None:
     nees, nis, size = 0.0, 0.0, 0
     for seed in range(seeds):
-        slam = BeaconSlam(*PLAIN, (0.0, 0.0, 0.0), P0)
+        slam = recorded_slam(*PLAIN, (0.0, 0.0, 0.0), P0)
         found = drive(slam, seed, steps, bearings=bearings)
         assert set(slam.beacons) == set(BEACONS)
         nees, nis, size = nees + found[0], nis + found[1], size + found[2]
@@ -219,7 +219,7 @@ def test_a_filter_that_believes_too_much_is_found_out() -> None:
     sure = PLAIN.but(radio__range_sigma_m=0.9 * SIGMA_M, radio__bearing_sigma_rad=0.9 * SIGMA_RAD)
     nis, size = 0.0, 0
     for seed in range(10):
-        found = drive(BeaconSlam(*sure, (0.0, 0.0, 0.0), P0), seed, 60, bearings=True)
+        found = drive(recorded_slam(*sure, (0.0, 0.0, 0.0), P0), seed, 60, bearings=True)
         nis, size = nis + found[1], size + found[2]
     assert nis > chi2.ppf(0.975, size)
 

@@ -9,8 +9,8 @@ from math import inf, pi, sqrt
 import numpy as np
 
 from ccatp.beacons.slam.beacon_map import HEADING
+from ccatp.beacons.slam.beacon_slam import BeaconInnovation, BeaconSlam, recorded_slam
 from ccatp.beacons.slam.motion import Increment
-from ccatp.beacons.slam.range_slam import BeaconInnovation, BeaconSlam
 from ccatp.beacons.slam.recording import (
     BeaconFix,
     Calibrated,
@@ -119,7 +119,7 @@ def filter_run(
     """Run the filter over a recording; nothing of the truth is used but the first pose."""
     position, heading = cfg.priors.pose_m, cfg.priors.heading_rad
     first = np.diag((position**2, position**2, heading**2))
-    search = HeadingRelocalizer(BeaconSlam(cfg, how, run.first_pose, first))
+    search = HeadingRelocalizer(recorded_slam(cfg, how, run.first_pose, first))
     times = np.union1d(_spaced(run.steps.times_s), run.readings.times_s)
     increments, readings = _increments(run.steps, times), list(_readings(run))
     ends = np.searchsorted([reading.time_s for reading in readings], times, side="right").tolist()

@@ -1,20 +1,22 @@
-"""Readings of a beacon without a bearing wait until they suffice to place it; derivatives at a reading's time."""
+"""Readings of a beacon that is not on the map yet wait with copies of the poses where they were taken."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from math import cos, hypot, inf, isfinite, log1p, pi, sin, sqrt
+from math import cos, hypot, inf, isfinite, pi, sin, sqrt
 from statistics import median
 from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.slam.measurement_models import MeasurementRow, strength_of
-from ccatp.beacons.slam.motion import CarriedOdometry
+from ccatp.beacons.slam.measurement_models import MeasurementRow, scalars_of
+from ccatp.beacons.slam.motion import POSE
 from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
-from ccatp.core import FloatArray
+from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
 
-RowOf = Callable[[Reading, list[float], list[float], list[float]], MeasurementRow]
+# Kind, pose, calibration and states of the beacon to a row.
+RowOf = Callable[[str, list[float], list[float], list[float]], MeasurementRow]
+PriorAt = Callable[[float, float], BeaconEstimate]
 
 MOST = 24  # readings of a beacon that are kept; beyond, every other one goes, and they are taken twice as far apart
 LEAST = 8  # readings without which a beacon is not looked for: what its place needs, four times over
@@ -46,7 +48,9 @@ class ReadingRecord(NamedTuple):
     """A reading that waits."""
 
     reading: Reading
-    place: BlockId  # block of the state that holds the place (x_m, y_m) where it was taken
+    place: (
+        BlockId  # block of the state with the place (x_m, y_m), or the pose if there is a bearing, where it was taken
+    )
     distance_m: float
 
 
@@ -59,14 +63,41 @@ class Candidate(NamedTuple):
     variances: FloatArray  # of the readings' noise, larger where they look too far off, shape (m,)
 
 
-PriorAt = Callable[[float, float], BeaconEstimate]
+class StackedRows:
+    """All scalars of waiting readings of one beacon, over the poses that wait with them and the calibration."""
+
+    def __init__(self, engine: EkfSlam, records: Sequence[ReadingRecord], shared: slice, row_of: RowOf) -> None:
+        self.blocks = [engine.block(record.place) for record in records]
+        self.columns = columns_of(*self.blocks, shared)
+        self._shared, self._row_of = shared, row_of
+        starts = np.cumsum([0, *(block.stop - block.start for block in self.blocks)]).tolist()
+        self._scalars = [
+            (kind, z, block, start)
+            for record, block, start in zip(records, self.blocks, starts, strict=False)
+            for kind, z in scalars_of(record.reading)
+        ]
+        self.size, self._shared_start = len(self._scalars), starts[-1]
+
+    def at(self, x: FloatArray, beacon: list[float]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """At a state x (n,): derivatives by ``columns`` (m, k) and the beacon (m, b), z - h and variances (m,)."""
+        m, calibration, first = self.size, x[self._shared].tolist(), self._shared_start
+        H, G, e, R = np.zeros((m, self.columns.size)), np.zeros((m, len(beacon))), np.zeros(m), np.zeros(m)
+        for i, (kind, z, block, start) in enumerate(self._scalars):
+            pose: list[float] = x[block].tolist()
+            size = len(pose)
+            row = self._row_of(kind, [*pose, 0.0][:POSE], calibration, beacon)
+            H[i, start : start + size] = row.pose[:size]
+            H[i, first : first + len(row.calibration)] = row.calibration
+            G[i], R[i] = row.beacon, row.variance
+            e[i] = wrap_pi(z - row.expected) if kind == "bearing" else z - row.expected
+        return H, G, e, R
 
 
 @dataclass(slots=True)
 class PendingLandmark:
     """Readings of a beacon that is not on the map yet.
 
-    The vehicle's place at each of them is kept in the state as a clone (Mourikis and Roumeliotis 2007), so that what
+    The vehicle's pose at each of them is kept in the state as a clone (Mourikis and Roumeliotis 2007), so that what
     they say of the beacon comes with the right correlations, however long they wait. With H the derivatives by clones
     and calibration, S = H P H^T + R, each candidate minimises e^T S^-1 e. ``candidates``: where it may be, best first;
     two as long as a mirror image is possible.
@@ -78,56 +109,49 @@ class PendingLandmark:
     spacing_m: float = 0.0
     count: int = 0
 
-    def take(
-        self, engine: EkfSlam, reading: Reading, place: FloatArray, by: tuple[Columns, FloatArray], range_m: float
-    ) -> bool:
-        """Keep a reading, if the vehicle has moved since the last one that was kept.
-
-        ``place``: x_m, y_m of the vehicle then, shape (2,). ``by``: columns (k,) of the state that it depends on, and
-        its derivatives, shape (2, k).
-        """
-        x, y = place.tolist()
+    def is_apart(self, engine: EkfSlam, place: Sequence[float], range_m: float) -> bool:
+        """Whether the vehicle has moved to a place since the last reading that was kept."""
         if not self.records:
             self.spacing_m = SPACING * range_m
-        else:
-            last_x, last_y = engine.mean[engine.block(self.records[-1].place)].tolist()
-            if hypot(x - last_x, y - last_y) < self.spacing_m:
-                return False
-        block = ("place", self.beacon, self.count)
+            return True
+        last_x, last_y = engine.mean[engine.block(self.records[-1].place)][:2].tolist()
+        return hypot(place[0] - last_x, place[1] - last_y) >= self.spacing_m
+
+    def take(self, engine: EkfSlam, record: ReadingRecord, pose: FloatArray, columns: Columns, J: FloatArray) -> None:
+        """Keep a reading with a copy of the pose (2,) or (3,), and its derivatives (2 or 3, k) by some columns."""
         self.count += 1
-        engine.augment(block, place, *by)
-        self.records.append(ReadingRecord(reading, block, range_m))
+        engine.augment(record.place, pose, columns, J)
+        self.records.append(record)
+
+    def thin(self, engine: EkfSlam) -> None:
+        """Drop every other reading where there are too many."""
         if len(self.records) > MOST:
             self.spacing_m *= 2.0
-            for record in self.records[1::2]:
-                engine.remove(record.place)
+            engine.remove(*(record.place for record in self.records[1::2]))
             self.records = self.records[::2]
-        return True
 
     def drop(self, engine: EkfSlam) -> None:
         """Forget the readings."""
-        for record in self.records:
-            engine.remove(record.place)
+        engine.remove(*(record.place for record in self.records))
         self.records = []
 
-    def look(self, engine: EkfSlam, row_of: RowOf, shared: slice, prior_at: PriorAt, reach_m: float) -> None:
+    def look(self, engine: EkfSlam, rows: StackedRows, prior_at: PriorAt) -> None:
         """Look for the beacon: sets ``candidates``."""
-        readings = [record.reading for record in self.records]
-        z = np.array([strength_of(reading) for reading in readings])
-        blocks = [engine.block(record.place) for record in self.records]
-        columns = columns_of(*blocks, shared)
-        P = engine.covariance[np.ix_(columns, columns)]
-        places = [engine.mean[block].tolist() for block in blocks]
-        problem = _Problem(readings, z, places, engine.mean[shared].tolist(), P, row_of, reach_m)
-        starts: list[BeaconEstimate] = []
-        # The last distance may have gone round a corner: the usual one is tried, too.
-        for radius_m in {reach_m, median([record.distance_m for record in self.records])}:
-            starts += problem.around(prior_at, radius_m)
-        starts += [BeaconEstimate(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]
+        reach_m = self.records[-1].distance_m
+        problem = _Problem(engine.mean.copy(), engine.covariance[np.ix_(rows.columns, rows.columns)], rows, reach_m)
+        starts = [BeaconEstimate(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]
+        places = [engine.mean[block].tolist() for block in rows.blocks]
+        pointed = self.pointed(engine)
+        if pointed is not None and not starts:
+            starts.append(prior_at(*pointed))
+        elif pointed is None:
+            # The last distance may have gone round a corner: the usual one is tried, too.
+            for radius_m in {reach_m, median([record.distance_m for record in self.records])}:
+                starts = [*problem.around(prior_at, places[-1], radius_m), *starts]
         found = [candidate for candidate in map(problem.refine, starts) if candidate is not None]
         best = min(found, key=lambda c: c.cost, default=None)
-        if best is not None:
-            mirrored = problem.refine(prior_at(*problem.mirrored(best.mean[:2])))
+        if best is not None and pointed is None:
+            mirrored = problem.refine(prior_at(*_mirrored(np.array(places), best.mean[:2])))
             found += [] if mirrored is None else [mirrored]
         found.sort(key=lambda c: c.cost)
         apart: list[Candidate] = []
@@ -136,13 +160,21 @@ class PendingLandmark:
                 apart.append(candidate)
         self.candidates = apart[:2]
 
+    def pointed(self, engine: EkfSlam) -> tuple[float, float] | None:
+        """Where the first reading with a bearing points, as far as it reaches; None where there is no such reading."""
+        for reading, place, distance_m in self.records:
+            if reading.bearing_rad is not None:
+                x, y, heading = engine.mean[engine.block(place)].tolist()
+                way_rad = heading + reading.bearing_rad
+                return x + distance_m * cos(way_rad), y + distance_m * sin(way_rad)
+        return None
+
     def found(self, engine: EkfSlam) -> Candidate | None:
         """The beacon's place, if there is only one, well enough known to be linearised at, and the readings agree."""
         if not self.candidates:
             return None
         best = self.candidates[0]
-        x, y = engine.mean[engine.block(self.records[-1].place)].tolist()
-        sight = best.mean[:2] - (x, y)
+        sight = best.mean[:2] - engine.mean[engine.block(self.records[-1].place)][:2]
         distance = hypot(*sight.tolist())
         along, across = sight / distance, np.array((-sight[1], sight[0])) / distance
         C = best.covariance[:2, :2]
@@ -159,46 +191,30 @@ class PendingLandmark:
 
 
 class _Problem(NamedTuple):
-    readings: list[Reading]
-    z: FloatArray
-    places: list[list[float]]
-    calibration: list[float]
-    P: FloatArray
-    row_of: RowOf
+    x: FloatArray
+    P: FloatArray  # of the columns of the rows
+    rows: StackedRows
     reach_m: float
 
-    def around(self, prior_at: PriorAt, radius_m: float) -> list[BeaconEstimate]:
-        """Where to begin: the best directions on a circle about the last place."""
-        x, y = self.places[-1]
+    def around(self, prior_at: PriorAt, place: Sequence[float], radius_m: float) -> list[BeaconEstimate]:
+        """Where to begin: the best directions on a circle about the last place, poses and calibration as they are.
+
+        A reading that is off counts little (Cauchy).
+        """
         angles = [2.0 * pi * k / STARTS for k in range(STARTS)]
-        ring = [prior_at(x + radius_m * cos(angle), y + radius_m * sin(angle)) for angle in angles]
-        costs = [self.rough(prior) for prior in ring]
+        ring = [prior_at(place[0] + radius_m * cos(angle), place[1] + radius_m * sin(angle)) for angle in angles]
+        costs = []
+        for prior in ring:
+            _, _, e, R = self.rows.at(self.x, prior.mean.tolist())
+            costs.append(float(np.log1p(e * e / R).sum()))
         return [ring[k] for k in range(STARTS) if costs[k] <= min(costs[k - 1], costs[(k + 1) % STARTS])]
 
-    def mirrored(self, point: FloatArray) -> tuple[float, float]:
-        """The image of a point (2,) on the other side of the way, which ranges distinguish last."""
-        places = np.array(self.places)
-        middle = places.mean(axis=0)
-        along = np.linalg.svd(places - middle)[2][0]
-        x, y = middle + 2.0 * along * along.dot(point - middle) - (point - middle)
-        return float(x), float(y)
-
-    def rough(self, prior: BeaconEstimate) -> float:
-        """How badly a guess fits, places and calibration as they are; a reading that is off counts little (Cauchy)."""
-        b = prior.mean.tolist()
-        cost = 0.0
-        for reading, z, place in zip(self.readings, self.z.tolist(), self.places, strict=True):
-            row = self.row_of(reading, [*place, 0.0], self.calibration, b)
-            cost += log1p((z - row.expected) ** 2 / row.variance)
-        return cost
-
     def refine(self, prior: BeaconEstimate) -> Candidate | None:
+        """Gauss-Newton from a guess."""
         b, W, stride = prior.mean.copy(), np.linalg.inv(prior.covariance), 0.5 * self.reach_m
-        variances, A, cost = self.z, W, inf
+        variances, A, cost = b, W, inf
         for k in range(ITERATIONS):
-            H, G, e, R = stacked_rows(
-                self.readings, self.z.tolist(), self.places, self.calibration, b.tolist(), self.row_of
-            )
+            H, G, e, R = self.rows.at(self.x, b.tolist())
             spread = H.dot(self.P).dot(H.T)
             variances, left_out = _weighed(e, spread.diagonal() + R, R, k)
             S = spread + np.diag(variances)
@@ -215,19 +231,12 @@ class _Problem(NamedTuple):
         return Candidate(b, np.linalg.inv(A), cost, variances)
 
 
-def stacked_rows(
-    readings: Sequence[Reading], z: Sequence[float], places: Sequence[list[float]], calibration: list[float],
-    beacon: list[float], row_of: RowOf,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
-    """Derivatives by places and calibration (m, 2 m + c) and by the beacon (m, b), residuals and variances (m,)."""
-    m, c = len(z), len(calibration)
-    H, G, e, R = np.zeros((m, 2 * m + c)), np.zeros((m, len(beacon))), np.zeros(m), np.zeros(m)
-    for i, (reading, place) in enumerate(zip(readings, places, strict=True)):
-        row = row_of(reading, [*place, 0.0], calibration, beacon)
-        H[i, 2 * i : 2 * i + 2] = row.pose[:2]
-        H[i, 2 * m : 2 * m + len(row.calibration)] = row.calibration
-        G[i], R[i], e[i] = row.beacon, row.variance, z[i] - row.expected
-    return H, G, e, R
+def _mirrored(places: FloatArray, point: FloatArray) -> tuple[float, float]:
+    """The image of a point (2,) on the other side of the way (m, 2), which ranges distinguish last."""
+    middle = places.mean(axis=0)
+    along = np.linalg.svd(places - middle)[2][0]
+    x, y = middle + 2.0 * along * along.dot(point - middle) - (point - middle)
+    return float(x), float(y)
 
 
 def _weighed(e: FloatArray, S: FloatArray, R: FloatArray, step: int) -> tuple[FloatArray, float]:
@@ -245,16 +254,3 @@ def _weighed(e: FloatArray, S: FloatArray, R: FloatArray, step: int) -> tuple[Fl
     limit = KNEE * max(1.0, MEDIAN_TO_SIGMA * float(np.median(sigmas)))
     is_out = sigmas > limit
     return R + np.where(is_out, OUT * e * e, 0.0), limit**2 * float(is_out.sum())
-
-
-def derivatives(row: MeasurementRow, at: CarriedOdometry, *, delayed: bool) -> list[float]:
-    """Dh by the pose and the calibration of the state: a row at the pose that was carried to a reading's time."""
-    hx, hy, turned = row.pose
-    if not delayed and at.back_s == 0.0:
-        return [hx, hy, turned, *row.calibration]
-    vx, vy, turn = at.velocity
-    by_heading = at.back_s * (hx * vy - hy * vx)
-    found = [hx, hy, turned + by_heading, *row.calibration]
-    if delayed:  # the heading turns at ``turn``, too
-        found.append(-hx * vx - hy * vy - turn * (turned + by_heading))
-    return found

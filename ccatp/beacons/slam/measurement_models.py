@@ -1,14 +1,43 @@
-"""What a reading of a beacon should be, with its derivatives: ranges, bearings, signal strengths."""
+"""What a reading of a beacon should be, with its derivatives: ranges, bearings, signal strengths.
 
-from math import atan2, isnan, log, log10, sqrt
-from typing import NamedTuple
+``range_row``, ``bearing_row`` and ``level_row`` compute one reading with ``math`` and all of a run with ``numpy``.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from ccatp.beacons.slam.motion import estimated
-from ccatp.beacons.slam.recording import RangeReading, Reading, RssiReading
+from ccatp.beacons.slam.path_loss import PathLoss
+from ccatp.beacons.slam.recording import BeaconId, RangeReading, Reading, RssiReading
 from ccatp.config.beacon_models import PriorsConfig, RadioNoiseConfig
+from ccatp.core import FloatArray
 
-LEAST_RANGE_M = 1e-3  # nearer than that a range has no direction: derivatives are taken there
-_DB = 10.0 / log(10.0)
+DB = 10.0 / math.log(10.0)
+NEAREST_M2 = 1e-6  # added to squared distances: at a beacon a range has no direction
+
+
+def range_row(xp: ModuleType, dx: Any, dy: Any, scale: Any) -> tuple[Any, Any, Any, Any]:
+    """Of the way (dx, dy) to a beacon: (1 + e) r, its derivatives by dx and dy, and r, that by the scale."""
+    r = xp.sqrt(dx * dx + dy * dy + NEAREST_M2)
+    return scale * r, scale * dx / r, scale * dy / r, r
+
+
+def bearing_row(xp: ModuleType, dx: Any, dy: Any) -> tuple[Any, Any, Any]:
+    """Direction of (dx, dy) in the frame of the map, and its derivatives."""
+    q = dx * dx + dy * dy + NEAREST_M2
+    return xp.atan2(dy, dx), -dy / q, dx / q
+
+
+def level_row(xp: ModuleType, dx: Any, dy: Any, reference: Any, exponent: Any) -> tuple[Any, Any, Any, Any]:
+    """P_ref - 10 eta log10(r / 1 m), its derivatives by dx, dy and eta (Hevrdejs and Knoll 2017, eq. 4)."""
+    q = dx * dx + dy * dy + NEAREST_M2
+    by_exponent, slope = -5.0 * xp.log10(q), -DB * exponent / q
+    return reference + exponent * by_exponent, slope * dx, slope * dy, by_exponent
 
 
 class MeasurementRow(NamedTuple):
@@ -16,98 +45,167 @@ class MeasurementRow(NamedTuple):
 
     expected: float  # h(x), in the reading's unit
     pose: tuple[float, float, float]  # dh by x_m, y_m and heading_rad of the vehicle
-    calibration: tuple[float, ...]  # dh by range_scale and range_offset_m, as far as they are estimated
+    calibration: tuple[float, ...]  # dh by what all readings share, as far as it is estimated
     beacon: tuple[float, ...]
     variance: float
 
 
-class MeasurementModels:
-    """The radios of a run, as rows of measurement.
+class MeasurementModel(ABC):
+    """One kind of reading. ``extra_prior``: mean and standard deviation of the states of a beacon behind x and y."""
 
-    * range: z = (1 + e) r + o, scale e and offset o shared by all, each estimated where its prior is not zero;
-      var = sigma^2 + (sigma_per_m r)^2;
-    * bearing: beta = atan2(dy, dx) - heading;
-    * signal strength: z = P_ref - 10 eta log10(r / 1 m) (Hevrdejs and Knoll, eq. 4); P_ref and eta are states of each
-      beacon behind x and y, each where its prior is not zero.
+    extra_prior: tuple[tuple[float, float], ...] = ()
+
+    @abstractmethod
+    def row(self, pose: list[float], calibration: list[float], beacon: list[float], name: BeaconId) -> MeasurementRow:
+        """What is expected at a state."""
+
+    def distance_m(self, z: float, _name: BeaconId) -> float:
+        """What a reading says of the distance alone."""
+        return max(z, 1e-3)
+
+
+class RangeModel(MeasurementModel):
+    """z = (1 + e) r + o, scale e and offset o shared by all, each estimated where its prior is not zero.
+
+    The variance is sigma^2 + (sigma_per_m r)^2.
     """
 
     def __init__(self, radio: RadioNoiseConfig, priors: PriorsConfig) -> None:
-        self._radio = radio
+        self._variance, self._per_m2 = radio.range_sigma_m**2, radio.range_sigma_per_m**2
         self._has_scale, self._has_offset = priors.range_scale > 0.0, priors.range_offset_m > 0.0
-        self.names, self.prior_sigmas = estimated(
-            {"range_scale": priors.range_scale, "range_offset_m": priors.range_offset_m}
-        )
-        self._reference_sigma_db = (priors.rssi_reference_db**2 + priors.beacon_reference_db**2) ** 0.5
-        self._exponent_sigma = priors.rssi_exponent
+        calibrated = {"range_scale": priors.range_scale, "range_offset_m": priors.range_offset_m}
+        self.names, self.prior_sigmas = estimated(calibrated)
 
-    def row(self, reading: Reading, pose: list[float], calibration: list[float], beacon: list[float]) -> MeasurementRow:
-        """The range or the signal strength."""
-        if isinstance(reading, RssiReading):
-            return self._rssi(pose, beacon)
-        dx, dy = beacon[0] - pose[0], beacon[1] - pose[1]
-        r = max(sqrt(dx * dx + dy * dy), LEAST_RANGE_M)
+    def row(self, pose: list[float], calibration: list[float], beacon: list[float], name: BeaconId) -> MeasurementRow:
+        """The range."""
         scale, offset = 1.0, 0.0
-        by: tuple[float, ...] = ()
         if self._has_scale:
             scale += calibration[0]
-            by = (r,)
         if self._has_offset:
-            offset = calibration[len(by)]
-            by = (*by, 1.0)
-        ux, uy = scale * dx / r, scale * dy / r
-        variance = self._radio.range_sigma_m**2 + (self._radio.range_sigma_per_m * r) ** 2
-        return MeasurementRow(scale * r + offset, (-ux, -uy, 0.0), by, (ux, uy), variance)
+            offset = calibration[-1]
+        expected, ux, uy, r = range_row(math, beacon[0] - pose[0], beacon[1] - pose[1], scale)
+        by = (r,) * self._has_scale + (1.0,) * self._has_offset
+        return MeasurementRow(expected + offset, (-ux, -uy, 0.0), by, (ux, uy), self._variance + self._per_m2 * r * r)
 
-    def bearing(self, pose: list[float], beacon: list[float]) -> MeasurementRow:
+
+class BearingModel(MeasurementModel):
+    """beta = atan2(dy, dx) - heading."""
+
+    def __init__(self, sigma_rad: float, shared: int) -> None:
+        self._variance, self._shared = sigma_rad**2, (0.0,) * shared
+
+    def row(self, pose: list[float], calibration: list[float], beacon: list[float], name: BeaconId) -> MeasurementRow:
         """The bearing."""
-        dx, dy = beacon[0] - pose[0], beacon[1] - pose[1]
-        q = max(dx * dx + dy * dy, LEAST_RANGE_M**2)
-        across, tail = (-dy / q, dx / q), (0.0,) * (len(beacon) - 2)
-        expected, shared = atan2(dy, dx) - pose[2], (0.0,) * len(self.names)
-        variance = self._radio.bearing_sigma_rad**2
-        return MeasurementRow(expected, (dy / q, -dx / q, -1.0), shared, across + tail, variance)
+        direction, gx, gy = bearing_row(math, beacon[0] - pose[0], beacon[1] - pose[1])
+        by_beacon = (gx, gy, *(0.0,) * (len(beacon) - 2))
+        return MeasurementRow(direction - pose[2], (-gx, -gy, -1.0), self._shared, by_beacon, self._variance)
 
-    def _rssi(self, pose: list[float], beacon: list[float]) -> MeasurementRow:
-        dx, dy = beacon[0] - pose[0], beacon[1] - pose[1]
-        q = max(dx * dx + dy * dy, LEAST_RANGE_M**2)
-        reference, exponent = self._radio.rssi_reference_dbm, self._radio.rssi_exponent
-        decades, tail = 0.5 * log10(q), []
-        if self._reference_sigma_db > 0.0:
-            reference = beacon[2]
-            tail.append(1.0)
-        if self._exponent_sigma > 0.0:
-            exponent = beacon[2 + len(tail)]
-            tail.append(-10.0 * decades)
-        gx, gy = -_DB * exponent * dx / q, -_DB * exponent * dy / q
-        expected, shared = reference - 10.0 * exponent * decades, (0.0,) * len(self.names)
-        return MeasurementRow(expected, (-gx, -gy, 0.0), shared, (gx, gy, *tail), self._radio.rssi_sigma_db**2)
 
-    def distance_m(self, reading: Reading) -> float:
-        """What a reading says of the distance alone."""
-        if not isinstance(reading, RssiReading):
-            return max(reading.range_m, LEAST_RANGE_M)
-        radio = self._radio
-        return float(10.0 ** ((radio.rssi_reference_dbm - reading.rssi_dbm) / (10.0 * radio.rssi_exponent)))
+class LevelModel(MeasurementModel):
+    """z = P_ref - 10 eta log10(r / 1 m) + b (Hevrdejs and Knoll 2017, eq. 4; Auth and Hovey 2018, eq. 2.3).
 
-    def extra_prior(self, reading: Reading) -> tuple[tuple[float, float], ...]:
-        """Mean and standard deviation of the states of a beacon behind x and y."""
-        if not isinstance(reading, RssiReading):
-            return ()
-        radio = self._radio
-        priors = ((radio.rssi_reference_dbm, self._reference_sigma_db), (radio.rssi_exponent, self._exponent_sigma))
-        return tuple((mean, sigma) for mean, sigma in priors if sigma > 0.0)
+    States of each beacon behind x and y: P_ref and eta, each where its prior is not zero, and the values of the
+    static shadowing b, where there is a map of it.
+    """
+
+    def __init__(
+        self, loss_of: Callable[[BeaconId], PathLoss], reference_sigma_db: float = 0.0, exponent_sigma: float = 0.0,
+        shadowing: "ShadowingMap | None" = None, shared: int = 0,
+    ) -> None:  # fmt: skip
+        self._loss_of, self._shadowing, self._shared = loss_of, shadowing, (0.0,) * shared
+        self._has_reference, self._has_exponent = reference_sigma_db > 0.0, exponent_sigma > 0.0
+        loss = loss_of("")
+        states = ((loss.reference_dbm, reference_sigma_db), (loss.exponent, exponent_sigma))
+        self.extra_prior = tuple((mean, sigma) for mean, sigma in states if sigma > 0.0)
+        if shadowing is not None:
+            self.extra_prior += ((0.0, 1.0),) * shadowing.size
+
+    def row(self, pose: list[float], calibration: list[float], beacon: list[float], name: BeaconId) -> MeasurementRow:
+        """The signal strength."""
+        reference, exponent, sigma_db = self._loss_of(name)
+        at = 2
+        if self._has_reference:
+            reference, at = beacon[at], at + 1
+        if self._has_exponent:
+            exponent, at = beacon[at], at + 1
+        expected, gx, gy, by_exponent = level_row(math, beacon[0] - pose[0], beacon[1] - pose[1], reference, exponent)
+        tail, variance = (1.0,) * self._has_reference + (by_exponent,) * self._has_exponent, sigma_db**2
+        if self._shadowing is not None:
+            field, rest_db2 = self._shadowing.row(pose[0], pose[1])
+            expected += float(field.dot(beacon[at:]))
+            tail += tuple(field.tolist())
+            variance += rest_db2
+        return MeasurementRow(expected, (-gx, -gy, 0.0), self._shared, (gx, gy, *tail), variance)
+
+    def distance_m(self, z: float, name: BeaconId) -> float:
+        """Half of such distances are too long."""
+        return self._loss_of(name).median_range_m(z)
+
+
+class ShadowingMap:
+    """Kriging of a Gaussian field with covariance sigma^2 exp(-d / L) (Gudmundson 1991) from its values at grid points.
+
+    The field at a place is k^T C^-1 f + rest, with f the values at the points, C their covariance, k the covariances
+    between place and points; the rest has the variance sigma^2 - k^T C^-1 k and counts as white. The states are w =
+    R^-1 f with C = R R^T, so that a prior of them is the identity, and the row of a place is k^T R^-T. ``spacing_m``:
+    between grid points; the outermost lie on the walls. ``sigma_db``: sigma.
+    """
+
+    def __init__(self, size_m: tuple[float, float], spacing_m: float, sigma_db: float, length_m: float) -> None:
+        axes = [np.linspace(0.0, size, max(2, round(size / spacing_m) + 1)) for size in size_m]
+        self._points = np.column_stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
+        self._variance, self._length_m = sigma_db**2, length_m
+        offsets = self._points[:, None] - self._points[None, :]
+        root = np.linalg.cholesky(self._covariance(np.hypot(offsets[..., 0], offsets[..., 1])))
+        self._inverse_root: FloatArray = np.linalg.inv(root)
+
+    @property
+    def size(self) -> int:
+        """How many states it takes."""
+        return len(self._points)
+
+    def row(self, x_m: float, y_m: float) -> tuple[FloatArray, float]:
+        """Derivatives of the field at a place by the states, shape (size,), and the variance of the rest, dB^2."""
+        row = self._inverse_root @ self._covariance(np.hypot(*(self._points - (x_m, y_m)).T))
+        return row, max(self._variance - float(row @ row), 0.0)
+
+    def _covariance(self, distance_m: FloatArray) -> FloatArray:
+        return np.asarray(self._variance * np.exp(-distance_m / self._length_m))
+
+
+class MeasurementModels(NamedTuple):
+    """The models by kind of reading, and what they share."""
+
+    by_kind: Mapping[str, MeasurementModel]
+    names: tuple[str, ...] = ()  # calibration that is estimated
+    prior_sigmas: tuple[float, ...] = ()
+
+
+def recorded_models(radio: RadioNoiseConfig, priors: PriorsConfig) -> MeasurementModels:
+    """Of a recorded run: levels of beacons of their own, where the priors leave them open."""
+    ranges = RangeModel(radio, priors)
+    shared = len(ranges.names)
+    loss = PathLoss(radio.rssi_reference_dbm, radio.rssi_exponent, radio.rssi_sigma_db)
+    reference_sigma_db = math.hypot(priors.rssi_reference_db, priors.beacon_reference_db)
+    levels = LevelModel(lambda _: loss, reference_sigma_db, priors.rssi_exponent, shared=shared)
+    by_kind: dict[str, MeasurementModel] = {
+        "range": ranges,
+        "bearing": BearingModel(radio.bearing_sigma_rad, shared),
+        "rssi": levels,
+    }
+    return MeasurementModels(by_kind, ranges.names, ranges.prior_sigmas)
 
 
 def is_direction(reading: Reading) -> bool:
     """Whether it has a bearing and nothing else."""
-    return isinstance(reading, RangeReading) and isnan(reading.range_m)
+    return isinstance(reading, RangeReading) and math.isnan(reading.range_m)
 
 
-def strength_of(reading: Reading) -> float:
-    """The range, m, or the signal strength, dBm."""
-    return reading.rssi_dbm if isinstance(reading, RssiReading) else reading.range_m
-
-
-def kind_of(reading: Reading) -> str:
-    """Which noise its range or strength has."""
-    return "rssi" if isinstance(reading, RssiReading) else "range"
+def scalars_of(reading: Reading) -> list[tuple[str, float]]:
+    """The numbers of a reading, each with its kind: the bearing, then the range or the signal strength."""
+    found = [] if reading.bearing_rad is None else [("bearing", reading.bearing_rad)]
+    if isinstance(reading, RssiReading):
+        found.append(("rssi", reading.rssi_dbm))
+    elif not math.isnan(reading.range_m):
+        found.append(("range", reading.range_m))
+    return found

@@ -1,8 +1,7 @@
 """How a vehicle moves between two readings, with Jacobian and noise; where it was at the time of a reading."""
 
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from math import cos, hypot, nan, sin
 from typing import NamedTuple
 
@@ -29,8 +28,7 @@ class VehiclePose(NamedTuple):
     heading_rad: float
 
 
-@dataclass(frozen=True, slots=True)
-class Increment:
+class Increment(NamedTuple):
     """Odometry of an interval: what the wheels, or wheels and gyroscope, say was travelled."""
 
     time_s: float
@@ -42,8 +40,7 @@ class Increment:
     guess_rad2: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Steering:
+class Steering(NamedTuple):
     """Odometry of a steered vehicle over an interval."""
 
     time_s: float
@@ -69,6 +66,12 @@ def estimated(priors: Mapping[str, float]) -> tuple[tuple[str, ...], tuple[float
     return tuple(kept), tuple(kept.values())
 
 
+def _increment(odometry: Odometry) -> Increment:
+    if not isinstance(odometry, Increment):
+        raise TypeError(f"a differential drive takes increments, not {type(odometry).__name__}")
+    return odometry
+
+
 class DifferentialDrive:
     """Odometry by increments: the chord of a circular arc (thesis eq. 2.14 as it is meant).
 
@@ -92,8 +95,9 @@ class DifferentialDrive:
         size = POSE + len(self.names)
         self._F, self._Q = np.eye(size), np.zeros((size, size))
 
-    def step(self, states: FloatArray, odometry: Increment) -> MotionStep:
-        """The states, shape (v,), after the interval."""
+    def step(self, states: FloatArray, odometry: Odometry) -> MotionStep:
+        """The states, shape (v,), after the interval. Raises TypeError: the odometry is of a steered vehicle."""
+        odometry = _increment(odometry)
         values: list[float] = states.tolist()
         scaled = 1.0 + values[self._way_scale] if self._way_scale >= 0 else 1.0
         way, side = odometry.distance_m / scaled, odometry.lateral_m / scaled
@@ -117,12 +121,12 @@ class DifferentialDrive:
         Q = self._spread(odometry, (c, s), (x_turn, y_turn), chord, 0.0 if is_at_rest else 1.0)
         return MotionStep(mean, F, Q)
 
-    def at_rest(self, odometry: Increment) -> tuple[int, float, float] | None:
+    def at_rest(self, odometry: Odometry) -> tuple[int, float, float] | None:
         """Column, value and variance of the bias, which is the turn read at rest; None while the vehicle drives.
 
         Its noise is the gyroscope's angle random walk.
         """
-        if self._bias < 0 or not self._rests(odometry):
+        if self._bias < 0 or not isinstance(odometry, Increment) or not self._rests(odometry):
             return None
         dt = odometry.interval_s
         return self._bias, odometry.turn_rad / dt, self._noise.turn_per_sqrt_s**2 / dt
@@ -229,14 +233,15 @@ class SlippingVehicle:
         L *= (0.0, 0.0) if stands else self._sigmas
         return MotionStep(mean, F, L @ L.T)
 
+    def at_rest(self, _odometry: Odometry) -> None:
+        """Standing still shows nothing of drift or slip."""
+
     def _read(self, odometry: Odometry) -> tuple[float, float, float]:
         if self._is_steered:
             if not isinstance(odometry, Steering):
                 raise TypeError(f"a steered vehicle takes speed and steering angle, not {type(odometry).__name__}")
             return odometry.interval_s, odometry.speed_m_s, odometry.steer_rad
-        if not isinstance(odometry, Increment):
-            raise TypeError(f"a differential drive takes increments, not {type(odometry).__name__}")
-        T = odometry.interval_s
+        odometry, T = _increment(odometry), odometry.interval_s
         return T, odometry.distance_m / T, odometry.turn_rad / T
 
 
@@ -250,14 +255,14 @@ class CarriedOdometry(NamedTuple):
     velocity: tuple[float, float, float]  # vx_m_s, vy_m_s in the frame of the map, turn_rad_s
     back_s: float  # the time it was carried back by; negative: forwards
 
-    def by_heading(self) -> tuple[float, float]:
-        """Derivatives of x and y by the heading of the state."""
-        return self.back_s * self.velocity[1], -self.back_s * self.velocity[0]
-
-    def by_delay(self) -> tuple[float, float, float]:
-        """Derivatives of x, y and heading by the delay."""
-        (vx, vy, turn), (x_heading, y_heading) = self.velocity, self.by_heading()
-        return -vx - turn * x_heading, -vy - turn * y_heading, -turn
+    def derivatives(self, hx: float, hy: float, turned: float, *, delayed: bool) -> list[float]:
+        """By the pose of the state, and by the delay if there is one, of what has these by the carried pose."""
+        if not delayed and self.back_s == 0.0:
+            return [hx, hy, turned]
+        vx, vy, turn = self.velocity
+        turned += self.back_s * (hx * vy - hy * vx)
+        # the heading turns at ``turn``, too
+        return [hx, hy, turned, -hx * vx - hy * vy - turn * turned] if delayed else [hx, hy, turned]
 
 
 class DeadReckoning:
@@ -276,30 +281,30 @@ class DeadReckoning:
         self._until_s, self._interval_s = nan, 0.0
         self._rates = (0.0, 0.0, 0.0)  # forwards, to the left, turn
 
-    def due(self, odometry: Increment, delay_s: float) -> list[Increment]:
+    def due(self, odometry: Odometry, delay_s: float) -> Sequence[Odometry]:
         """The steps, or parts of one, to be taken when ``odometry`` arrives."""
-        if not self._is_delayed:
-            return [odometry]
-        steps, found = self._steps, []
+        if not self._is_delayed or not isinstance(odometry, Increment):
+            return (odometry,)
+        steps, found = self._steps, list[Increment]()
         steps.append(odometry)
         until_s = odometry.time_s - delay_s
         while steps and steps[0].time_s <= until_s:
             found.append(steps.popleft())
         if steps:
             first = steps[0]
-            part = (until_s - first.time_s + first.interval_s) / first.interval_s if first.interval_s > 0.0 else 0.0
+            begin_s = first.time_s - first.interval_s
+            part = (until_s - begin_s) / first.interval_s if first.interval_s > 0.0 else 0.0
             if SLIVER < part < 1.0 - SLIVER:
-                done, steps[0] = _split(first, part)
-                found.append(done)
+                found.append(_part(first, part, begin_s + part * first.interval_s))
+                steps[0] = _part(first, 1.0 - part, first.time_s)
         return found
 
-    def took(self, odometry: Increment, before: FloatArray, after: FloatArray) -> float:
+    def took(self, odometry: Odometry, before: FloatArray, after: FloatArray) -> float:
         """A step was taken, from one state to another; its length, m."""
-        self._until_s, dt = odometry.time_s, odometry.interval_s
-        self._interval_s = dt
+        self._until_s, self._interval_s = odometry.time_s, odometry.interval_s
         x, y, heading = before[:POSE].tolist()
         new_x, new_y, new_heading = after[:POSE].tolist()
-        dx, dy, turn = new_x - x, new_y - y, new_heading - heading
+        dx, dy, turn, dt = new_x - x, new_y - y, new_heading - heading, odometry.interval_s
         if dt > 0.0:
             c, s = cos(heading + 0.5 * turn), sin(heading + 0.5 * turn)
             self._rates = ((dx * c + dy * s) / dt, (dy * c - dx * s) / dt, turn / dt)
@@ -319,14 +324,5 @@ class DeadReckoning:
         return CarriedOdometry([pose[0] - back_s * vx, pose[1] - back_s * vy, heading], (vx, vy, turn), back_s)
 
 
-def _split(step: Increment, part: float) -> tuple[Increment, Increment]:
-    rest_s = (1.0 - part) * step.interval_s
-    first = _scaled(step, part, step.time_s - rest_s, part * step.interval_s)
-    return first, _scaled(step, 1.0 - part, step.time_s, rest_s)
-
-
-def _scaled(step: Increment, part: float, time_s: float, interval_s: float) -> Increment:
-    return Increment(
-        time_s, interval_s, part * step.distance_m, part * step.turn_rad, part * step.lateral_m,
-        part * step.guess_m2, part * step.guess_rad2,
-    )  # fmt: skip
+def _part(step: Increment, part: float, end_s: float) -> Increment:
+    return Increment(end_s, part * step.interval_s, *(part * amount for amount in step[2:]))

@@ -13,8 +13,7 @@ from ccatp.core import FloatArray
 _NEPER_PER_DB = log(10.0) / 10.0
 
 
-@dataclass(frozen=True, slots=True)
-class PathLoss:
+class PathLoss(NamedTuple):
     """z = P_ref - 10 eta log10(r / 1 m) + n, n ~ N(0, sigma^2): Hevrdejs and Knoll 2017, eq. 4; Auth and Hovey, 2.9."""
 
     reference_dbm: float  # P_ref, at 1 m

@@ -1,39 +1,32 @@
 """EKF-SLAM by levels and bearings of radios, one of which moves; from packets of a turning reflector to a bearing."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
-from math import atan2, cos, hypot, pi, sin, sqrt, tau
+from math import atan2, cos, exp, hypot, log, pi, sin, sqrt, tau
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
+from ccatp.beacons.slam.beacon_slam import PLACE, BeaconInnovation, BeaconSlam
+from ccatp.beacons.slam.landmark_init import PendingLandmark
+from ccatp.beacons.slam.measurement_models import BearingModel, LevelModel, MeasurementModels, ShadowingMap
 from ccatp.beacons.slam.motion import POSE, Odometry, SlippingVehicle, VehiclePose
 from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.range_slam import BeaconInnovation
 from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, RssiReading
-from ccatp.beacons.slam.signal_landmarks import (
-    PLACE,
-    MovingRadio,
-    PoseKey,
-    RadioModel,
-    ShadowingMap,
-    SignalLandmarkInitializer,
-    SignalPrior,
-    SignalRecord,
-    SignalRows,
-    rows_of,
-)
-from ccatp.config.beacon_models import RadioConfig, ScanConfig
+from ccatp.config.beacon_models import RadioConfig, ScanConfig, SlamFilterConfig
 from ccatp.core import FloatArray, wrap_pi
-from ccatp.filters.ekf_slam import EkfSlam, Update, columns_of
+from ccatp.filters.ekf_slam import Columns, EkfSlam, Update, columns_of
 
-_POSE_COLUMNS = columns_of(range(POSE))
 _ITERATIONS = 4
-_WIDE = 10.0  # spread of a radio before its first reading, in ranges of that reading
 _NEAREST_M = 0.02  # nearer than that a distance has no derivative worth the name
-
-
+# The textbook's filter: no knee, nothing learned, no pose and no radio doubted.
+_PLAIN = SlamFilterConfig(
+    knee_sigmas=1e3, learn_memory=0.0, learn_prior=1.0, doubt_pose_after=10**9, doubt_beacon_after=10**9, jump_m=1.0,
+    jump_rad=1.0, transports=False, wander_share=0.0, wander_length_m=1.0, rest_speed_m_s=0.0, rest_turn_rad_s=0.0,
+    turn_bias_walk_rad_s_sqrt_s=0.0,
+)  # fmt: skip
 _APART_RAD = pi / 2.0  # strongest readings further apart than this are two directions, not one
 
 
@@ -96,111 +89,138 @@ class ReflectorScan:
         return middle_rad if is_one else None
 
 
-class SignalSlam:
-    """EKF-SLAM of a vehicle among radios, by ``EkfSlam``; levels are used as they are, in dB.
+class SignalSlam(BeaconSlam):
+    """EKF-SLAM of a vehicle among radios whose path loss is known; levels are used as they are, in dB.
 
     A level is z = P_ref - 10 eta log10(r) + b + noise with b the static shadowing, a bearing
     beta = atan2(dy, dx) - heading + noise (Auth and Hovey 2018, eqs 2.3 and 2.9). States of a static radio:
     x_m, y_m, and those of its shadowing where there is a map of it; of the moving one: x_m, y_m, its velocity, and its
-    shadowing where there is any. Updates are iterated (Gauss-Newton on the posterior), because an error of 18 degrees
-    is too large for one linearisation.
+    shadowing where there is any. Updates are iterated, because an error of 18 degrees is too large for one
+    linearisation. A level of unknown shadowing gives the range up to a factor; an update that is linearised there is
+    wrong later, when bearings from elsewhere have given the range. So the readings of a new radio wait until they
+    place it. A radio of which no bearing is known is not used: a level alone is a circle.
 
     The vehicle begins at the believed start of the configuration, which defines the frame of the map.
     """
 
     def __init__(self, cfg: RadioConfig) -> None:
         start, loss, estimator, room_m = cfg.start, cfg.path_loss, cfg.estimator, cfg.workspace.size_m
-        self._motion = SlippingVehicle(cfg.vehicle, cfg.odometry)
-        v = self._motion.size
-        mean, sigmas = np.zeros(v), np.zeros(v)
-        mean[:POSE] = start.x_m, start.y_m, start.heading_rad
-        sigmas[:POSE] = start.position_sigma_m, start.position_sigma_m, start.heading_sigma_rad
-        sigmas[POSE:] = self._motion.prior_sigmas
-        self.engine = EkfSlam(mean, np.diag(sigmas**2))
-        self.learned: list[BeaconInnovation] = []
-        self.waiting = SignalLandmarkInitializer(self.engine)
-        self._default = PathLoss(loss.reference_dbm, loss.exponent, loss.white_sigma_db)
-        self._path_loss = {
-            name: PathLoss(reference_dbm, loss.exponent, loss.white_sigma_db)
-            for name, reference_dbm in loss.reference_dbm_of.items()
-        }
         # Static shadowing without a map of it counts as white noise.
-        sigma_db, length_m = loss.shadowing_sigma_db, loss.shadowing_length_m
-        self._sigma_db = sigma_db = sigma_db if estimator.shadowing != "none" else 0.0
-        self._shadowing: ShadowingMap | None = None
+        sigma_db = loss.shadowing_sigma_db if estimator.shadowing != "none" else 0.0
+        length_m, shadowing, white_db = loss.shadowing_length_m, None, hypot(loss.white_sigma_db, sigma_db)
         if estimator.shadowing == "map" and sigma_db > 0.0:
-            self._shadowing = ShadowingMap(room_m, estimator.shadowing_grid_m, sigma_db, length_m)
+            shadowing = ShadowingMap(room_m, estimator.shadowing_grid_m, sigma_db, length_m)
+            white_db = loss.white_sigma_db
+        self._loss = PathLoss(loss.reference_dbm, loss.exponent, white_db)
+        self._reference_dbm_of = loss.reference_dbm_of
+        bearing_sigma_rad = ReflectorScan(cfg.scan).sigma_rad
+        models = MeasurementModels(
+            {"bearing": BearingModel(bearing_sigma_rad, 0), "rssi": LevelModel(self.path_loss_of, shadowing=shadowing)}
+        )
+        P0 = np.diag(np.square((start.position_sigma_m, start.position_sigma_m, start.heading_sigma_rad)))
+        super().__init__(
+            SlippingVehicle(cfg.vehicle, cfg.odometry), models, _PLAIN, (start.x_m, start.y_m, start.heading_rad), P0,
+            gate=float(chdtri(1, 1.0 - estimator.gate_probability)), iterations=_ITERATIONS,
+        )  # fmt: skip
+        self._ahead: SignalSlam | None = None
         # In a room without a radio that moves, its name is never received.
         speed_m_s, course_time_s = estimator.target_speed_sigma_m_s, estimator.target_course_time_s
         self._moving = MovingRadio(cfg.follow.target, speed_m_s, course_time_s, sigma_db, length_m, room_m)
-        self._bearing_sigma_rad = ReflectorScan(cfg.scan).sigma_rad
+        self._moving_variances = loss.white_sigma_db**2, bearing_sigma_rad**2
         self._placed_share, self._waiting_scans = estimator.placed_share, estimator.waiting_scans
-        # Largest normalised innovation squared that is used, of one row and of two.
+        # Largest normalised innovation squared that is used of the radio that moves, of one row and of two.
         self._gates = tuple(float(chdtri(rows, 1.0 - estimator.gate_probability)) for rows in (1, 2))
+
+    @property
+    def _likely(self) -> "SignalSlam":
+        """The filter as it is most likely: with the radios on the map that still wait."""
+        return self if self._ahead is None else self._ahead
 
     @property
     def pose(self) -> VehiclePose:
         """The vehicle; the heading does not wrap."""
-        return VehiclePose(*self.waiting.conditioned(_POSE_COLUMNS)[0].tolist())
+        return VehiclePose(*self._likely.engine.mean[:POSE].tolist())
 
     @property
     def pose_covariance(self) -> FloatArray:
         """Of x_m, y_m, heading_rad, shape (3, 3)."""
-        return self.waiting.conditioned(_POSE_COLUMNS)[1]
+        return self._likely.engine.covariance[:POSE, :POSE].copy()
 
     @property
     def beacons(self) -> dict[BeaconId, BeaconEstimate]:
-        """The map: places alone, x_m and y_m."""
-        found: dict[BeaconId, BeaconEstimate] = {
-            beacon: BeaconEstimate(guess.mean[:PLACE], guess.covariance[:PLACE, :PLACE])
-            for beacon, guess in self.waiting.guesses.items()
-        }
-        for beacon in self.engine.blocks:
+        """The map, and where the radios are likely that still wait: places alone, x_m and y_m."""
+        found: dict[BeaconId, BeaconEstimate] = {}
+        for beacon in self._likely.engine.blocks:
             if isinstance(beacon, int | str):
-                start = self.engine.block(beacon).start
-                found[beacon] = BeaconEstimate(*self.waiting.conditioned(columns_of(range(start, start + PLACE))))
+                start = self._likely.engine.block(beacon).start
+                found[beacon] = BeaconEstimate(*self._of(columns_of(range(start, start + PLACE))))
         return found
-
-    @property
-    def calibration(self) -> dict[str, tuple[float, float]]:
-        """Mean and standard deviation of the vehicle's calibration states, by name."""
-        mean, variances = self.engine.mean.tolist(), self.engine.covariance.diagonal().tolist()
-        return {name: (mean[POSE + i], sqrt(variances[POSE + i])) for i, name in enumerate(self._motion.names)}
 
     def predict(self, odometry: Odometry) -> None:
         """Carry the vehicle and the moving radio on."""
-        before = self.engine.mean[:PLACE].tolist()
-        step = self._motion.step(self.engine.mean[: self.engine.vehicle_size], odometry)
-        self.engine.predict(step.mean, step.F, step.Q)
+        before_m = self._way_m
+        super().predict(odometry)
         if self._moving.beacon in self.engine:
-            travel_m = hypot(step.mean[0] - before[0], step.mean[1] - before[1])
-            self._moving.predict(self.engine, odometry.interval_s, travel_m)
+            self._moving.predict(self.engine, odometry.interval_s, self._way_m - before_m)
+        if self._ahead is not None:
+            self._ahead.predict(odometry)
 
-    def observe(self, readings: Iterable[RssiReading]) -> list[BeaconInnovation]:
-        """Take readings of any radios, one after the other; new ones are placed when their readings suffice.
-
-        A new radio of which no bearing is known is not used: a level alone is a circle.
-        """
-        self.learned = []
-        waiting = []
+    def observe(self, readings: Sequence[RssiReading]) -> list[BeaconInnovation]:  # type: ignore[override]
+        """Take readings of any radios, one after the other; new ones are placed when their readings suffice."""
+        moving, of_others, learned = self._moving, list[RssiReading](), list[BeaconInnovation]()
+        if self._ahead is not None:
+            self._ahead.observe([reading for reading in readings if reading.beacon not in self.waiting])
         for reading in readings:
-            is_known, is_moving = reading.beacon in self.engine, reading.beacon == self._moving.beacon
-            if is_known or is_moving:
-                found = self._update_moving(reading) if is_moving else self._update(reading)
-                if found is not None and is_known:
-                    self.learned.append(
-                        BeaconInnovation(reading.beacon, found.residual, found.nis, found.size, found.accepted)
-                    )
-            else:
-                waiting.append(reading)
-        self._wait(waiting)
+            if reading.beacon != moving.beacon:
+                of_others.append(reading)
+            elif moving.beacon in self.engine:
+                found = self._update_moving(reading)
+                learned.append(BeaconInnovation(reading.beacon, found.residual, found.nis, found.size, found.accepted))
+            elif reading.bearing_rad is not None:  # it joins at its first bearing: it would be elsewhere later
+                moving.join(self.engine, reading.bearing_rad)
+                self._update_moving(reading)
+        self.learned = learned + super().observe(of_others)
+        if any(reading.beacon in self.waiting for reading in of_others):
+            self._ahead = self._with_all()
+            ready = [waiting for waiting in self.waiting.values() if self._is_ready(waiting)]
+            for waiting in ready:
+                self._place(waiting)
+            if ready:
+                self._ahead = self._with_all() if self.waiting else None
         return self.learned
+
+    def _with_all(self) -> "SignalSlam":
+        """The filter with all radios on the map that wait, sure or not."""
+        self._ahead = None
+        ahead = deepcopy(self)
+        for waiting in list(ahead.waiting.values()):
+            ahead._place(waiting)
+            self.waiting[waiting.beacon].candidates = waiting.candidates
+        return ahead
+
+    def _place(self, waiting: PendingLandmark) -> None:
+        if waiting.pointed(self.engine) is not None:
+            self._look(waiting)
+            for likely in waiting.candidates[:1]:
+                self._join(waiting, likely)
+
+    def _place_new(self, waiting: PendingLandmark) -> None:
+        """Not before all readings have been taken."""
+
+    def _is_ready(self, waiting: PendingLandmark) -> bool:
+        if waiting.beacon not in self._likely.engine:
+            return False
+        if len(waiting.records) >= self._waiting_scans:
+            return True
+        mean, covariance = self.joint((waiting.beacon,))
+        x, y, _, bx, by = mean.tolist()
+        largest = float(np.linalg.eigvalsh(covariance[POSE:, POSE:])[-1])
+        return largest < (self._placed_share * hypot(bx - x, by - y)) ** 2
 
     def distance(self, beacon: BeaconId) -> tuple[float, float]:
         """Between the vehicle and a radio, m, and its standard deviation. Raises BlockError: it is not on the map."""
-        start = self.engine.block(beacon).start
-        columns = columns_of(range(PLACE), range(start, start + PLACE))
-        mean, covariance = self.waiting.conditioned(columns)
+        start = self._likely.engine.block(beacon).start
+        mean, covariance = self._of(columns_of(range(PLACE), range(start, start + PLACE)))
         x, y, bx, by = mean.tolist()
         r = max(hypot(bx - x, by - y), _NEAREST_M)
         h = np.array((x - bx, y - by, bx - x, by - y)) / r
@@ -220,91 +240,129 @@ class SignalSlam:
 
         Raises BlockError: one is not on the map.
         """
-        starts = [self.engine.block(beacon).start for beacon in beacons]
-        columns = columns_of(range(POSE), *(range(start, start + PLACE) for start in starts))
-        return self.waiting.conditioned(columns)
+        starts = [self._likely.engine.block(beacon).start for beacon in beacons]
+        return self._of(columns_of(range(POSE), *(range(start, start + PLACE) for start in starts)))
 
     def path_loss_of(self, beacon: BeaconId) -> PathLoss:
         """The calibration of a radio."""
-        return self._path_loss.get(str(beacon), self._default)
+        reference_dbm = self._reference_dbm_of.get(str(beacon))
+        return self._loss if reference_dbm is None else self._loss._replace(reference_dbm=reference_dbm)
 
-    def _prior(self, reading: RssiReading, bearing_rad: float, pose: Sequence[float]) -> SignalPrior:
-        range_m = self.path_loss_of(reading.beacon).median_range_m(reading.rssi_dbm)
-        way_rad = pose[2] + bearing_rad
-        spread = [_WIDE * range_m] * PLACE
-        if self._shadowing is not None:
-            spread += [1.0] * self._shadowing.size
-        mean = np.zeros(len(spread))
-        mean[:PLACE] = pose[0] + range_m * cos(way_rad), pose[1] + range_m * sin(way_rad)
-        return SignalPrior(mean, np.array(spread))
+    def _of(self, columns: Columns) -> tuple[FloatArray, FloatArray]:
+        engine = self._likely.engine
+        return engine.mean.take(columns), engine.covariance[np.ix_(columns, columns)]
 
-    def _wait(self, readings: list[RssiReading]) -> None:
-        if not readings:
-            return
-        pose = self.waiting.keep_pose()
-        for reading in readings:
-            self.waiting.records.setdefault(reading.beacon, []).append(SignalRecord(reading, pose))
-        priors = {}
-        for beacon in self.waiting.records:
-            with_bearing = (r for r in self.waiting.records[beacon] if r.reading.bearing_rad is not None)
-            if first := next(with_bearing, None):  # a level alone is a circle
-                at = self.engine.mean[self.engine.block(first.pose)].tolist()
-                priors[beacon] = self._prior(first.reading, first.reading.bearing_rad or 0.0, at)
-        if not priors:
-            return
-        self.waiting.solve(priors, self._rows_at)
-        ready = [beacon for beacon in priors if self._is_ready(beacon)]
-        for beacon in ready:
-            self._settle(beacon, priors[beacon])
-        if left := {beacon: prior for beacon, prior in priors.items() if beacon not in ready and ready}:
-            self.waiting.solve(left, self._rows_at)
+    def _update_moving(self, reading: RssiReading) -> Update:
+        loss = self.path_loss_of(reading.beacon)
+        return self._moving.update(self.engine, reading, loss, self._moving_variances, self._gates)
 
-    def _is_ready(self, beacon: BeaconId) -> bool:
-        if len(self.waiting.records[beacon]) >= self._waiting_scans:
-            return True
-        guess, pose = self.waiting.guesses[beacon], self.engine.mean
-        range_m = hypot(guess.mean[0] - pose[0], guess.mean[1] - pose[1])
-        largest = float(np.linalg.eigvalsh(guess.covariance[:PLACE, :PLACE])[-1])
-        return largest < (self._placed_share * range_m) ** 2
 
-    def _settle(self, beacon: BeaconId, prior: SignalPrior) -> None:
-        none, size = np.empty(0, dtype=np.intp), prior.mean.size
-        self.engine.augment(beacon, prior.mean, none, np.zeros((size, 0)), np.eye(size), np.diag(prior.sigmas**2))
-        rows = self._rows_at(
-            self.waiting.records[beacon], lambda key: self.engine.block(key).start, self.engine.block(beacon)
-        )
-        x = self.waiting.linearisation(beacon)
-        residual, H = rows.linearise(x)
-        off = residual + H @ (x - self.engine.mean)[rows.columns]
-        self.engine.update(rows.columns, H, off, rows.variances)
-        self.waiting.drop(beacon)
+_TYPICAL = 0.4  # mean distance of two places in a square over its diagonal: 0.521 / sqrt(2)
+_STATES = 4  # x_m, y_m, and the velocity
 
-    def _update(self, reading: RssiReading) -> Update:
-        radio, path_loss = self.engine.block(reading.beacon), self.path_loss_of(reading.beacon)
-        rows = rows_of([self._sight(reading, 0)], radio, path_loss, self._bearing_sigma_rad)
-        gate = self._gates[rows.variances.size - 1]
-        return self.engine.update_iterated(rows.columns, rows.linearise, rows.variances, _ITERATIONS, gate)
 
-    def _update_moving(self, reading: RssiReading) -> Update | None:
-        """The radio that moves joins at its first bearing: it would be elsewhere later."""
-        if reading.beacon not in self.engine:
-            if reading.bearing_rad is None:
-                return None
-            self._moving.join(self.engine, reading.bearing_rad)
-        path_loss = self.path_loss_of(reading.beacon)
-        return self._moving.update(self.engine, reading, path_loss, self._bearing_sigma_rad, self._gates)
+@dataclass(frozen=True, slots=True)
+class MovingRadio:
+    """A point whose velocity is a stationary process: v has the spread s by axis and forgets it over a time T.
 
-    def _rows_at(self, records: list[SignalRecord], pose_at: Callable[[PoseKey], int], radio: slice) -> SignalRows:
-        sights = []
-        for record in records:
-            place = self.engine.block(record.pose).start
-            sights.append(self._sight(record.reading, place)._replace(pose=pose_at(record.pose)))
-        path_loss = self.path_loss_of(records[0].reading.beacon)
-        return rows_of(sights, radio, path_loss, self._bearing_sigma_rad)
+    Over t, with a = exp(-t / T): v <- a v, p <- p + T (1 - a) v, and
 
-    def _sight(self, reading: RssiReading, pose: int) -> RadioModel:
-        x_m, y_m = self.engine.mean[pose : pose + PLACE].tolist()
-        shadow, rest_db2 = np.empty(0), self._sigma_db**2
-        if self._shadowing is not None:
-            shadow, rest_db2 = self._shadowing.row(x_m, y_m)
-        return RadioModel(reading, pose, shadow, self.path_loss_of(reading.beacon).sigma_db ** 2 + rest_db2)
+        var(v) += s^2 (1 - a^2),  cov(p, v) += s^2 T (1 - a)^2,  var(p) += s^2 T (2 t - T (1 - a) (3 - a))
+
+    (Singer 1970 with the velocity in place of the acceleration). Shadowing at both ends decorrelates with the ways of
+    both: b <- c b with c = exp(-(d_vehicle + d_radio) / L), d_radio = sqrt(2) s t, and var(b) += sigma^2 (1 - c^2).
+    """
+
+    beacon: BeaconId
+    speed_sigma_m_s: float  # s
+    course_time_s: float  # T
+    shadowing_sigma_db: float  # sigma; 0: no such state
+    shadowing_length_m: float
+    room_m: tuple[float, float]  # lengths of its walls; it never leaves the room
+
+    def join(self, engine: EkfSlam, bearing_rad: float) -> None:
+        """Begin in the direction of a first bearing, anywhere in the room; the reading itself is to follow.
+
+        In polar coordinates about the vehicle: the direction is spread over the circle, and the distance as between
+        two places in the room, by a factor of two about 0.4 of its diagonal.
+        """
+        direction, log_range = float(engine.mean[2]) + bearing_rad, log(_TYPICAL * hypot(*self.room_m))
+        behind = [self.speed_sigma_m_s] * 2
+        if self.shadowing_sigma_db > 0.0:
+            behind.append(self.shadowing_sigma_db)
+        spread = np.array([pi, log(2.0), *behind])
+        mean = np.zeros(spread.size)
+        mean[:PLACE] = direction, log_range
+        none: Columns = np.empty(0, dtype=np.intp)
+        engine.augment(self.beacon, mean, none, np.zeros((mean.size, 0)), np.eye(mean.size), np.diag(spread**2))
+        self._to_plane(engine)
+
+    def update(
+        self, engine: EkfSlam, reading: RssiReading, path_loss: PathLoss, variances: tuple[float, float],
+        gates: Sequence[float],
+    ) -> Update:  # fmt: skip
+        """Condition on a reading, in polar coordinates about the vehicle.
+
+        There level and bearing are linear: z = P_ref - (10 eta / ln 10) ln r + b, beta = direction - heading. In the
+        plane a level has another slope at each estimate, and many levels with one unknown b would seem to give the
+        range (modified polar coordinates, Aidala and Hammel 1983).
+        """
+        self._to_polar(engine)
+        slope = 10.0 * path_loss.exponent / log(10.0)
+        columns = columns_of((2,), engine.block(self.beacon))
+        x = engine.mean.take(columns)
+        m = 1 if reading.bearing_rad is None else 2
+        H = np.zeros((2, columns.size))
+        H[0, 2], H[0, 1 + _STATES :] = -slope, 1.0  # the shadowing state, if there is one
+        H[1, 0], H[1, 1] = -1.0, 1.0
+        off_rad = wrap_pi((reading.bearing_rad or 0.0) - float(x[1] - x[0]))
+        residual = np.array((reading.rssi_dbm - path_loss.reference_dbm - float(H[0] @ x), off_rad))
+        found = engine.update(columns, H[:m], residual[:m], np.array(variances[:m]), gates[m - 1])
+        self._to_plane(engine)
+        return found
+
+    def _to_polar(self, engine: EkfSlam) -> None:
+        start = engine.block(self.beacon).start
+        dx, dy = (engine.mean[start : start + PLACE] - engine.mean[:PLACE]).tolist()
+        r = max(hypot(dx, dy), _NEAREST_M)
+        J = np.array(((-dy, dx), (dx, dy))) / (r * r)
+        _transformed(engine, start, J, -J, (atan2(dy, dx), log(r)))
+
+    def _to_plane(self, engine: EkfSlam) -> None:
+        start = engine.block(self.beacon).start
+        direction, log_range = engine.mean[start : start + PLACE].tolist()
+        dx, dy = exp(log_range) * cos(direction), exp(log_range) * sin(direction)
+        x, y = engine.mean[:PLACE].tolist()
+        _transformed(engine, start, np.array(((-dy, dx), (dx, dy))), np.eye(PLACE), (x + dx, y + dy))
+
+    def predict(self, engine: EkfSlam, interval_s: float, travel_m: float) -> None:
+        """Carry the radio's block on over an interval in which the vehicle travelled so far."""
+        block = engine.block(self.beacon)
+        s2, T = self.speed_sigma_m_s**2, self.course_time_s
+        a = exp(-interval_s / T)
+        size = block.stop - block.start
+        F, Q = np.eye(size), np.zeros((size, size))
+        for p, v in ((0, 2), (1, 3)):
+            F[p, v], F[v, v] = T * (1.0 - a), a
+            Q[v, v] = s2 * (1.0 - a * a)
+            Q[p, v] = Q[v, p] = s2 * T * (1.0 - a) ** 2
+            Q[p, p] = s2 * T * (2.0 * interval_s - T * (1.0 - a) * (3.0 - a))
+        if size > _STATES:
+            way_m = travel_m + sqrt(2.0) * self.speed_sigma_m_s * interval_s
+            c = exp(-way_m / self.shadowing_length_m)
+            F[_STATES, _STATES] = c
+            Q[_STATES, _STATES] = self.shadowing_sigma_db**2 * (1.0 - c * c)
+        P, x = engine.covariance, engine.mean
+        x[block] = F @ x[block]
+        P[block] = F @ P[block]
+        P[:, block] = P[:, block] @ F.T
+        P[block, block] += Q
+
+
+def _transformed(
+    engine: EkfSlam, start: int, by_place: FloatArray, by_vehicle: FloatArray, place: tuple[float, float]
+) -> None:
+    P, rows = engine.covariance, slice(start, start + PLACE)
+    P[rows] = by_place @ P[rows] + by_vehicle @ P[:PLACE]
+    P[:, rows] = P[:, rows] @ by_place.T + P[:, :PLACE] @ by_vehicle.T
+    engine.mean[rows] = place

@@ -1,0 +1,371 @@
+"""EKF-SLAM over readings: a vehicle among beacons places them on a map while it finds itself on it."""
+
+from collections.abc import Iterable, Sequence
+from functools import partial
+from math import log, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.beacons.slam.beacon_map import (
+    HEADING,
+    AddedPoseNoise,
+    BeaconMap,
+    GaussMarkovBias,
+    HeadingTransport,
+    MapEntry,
+    NoiseLevel,
+)
+from ccatp.beacons.slam.landmark_init import (
+    FLAT,
+    LEAST,
+    LINEARISATIONS,
+    TRIAL,
+    Candidate,
+    PendingLandmark,
+    ReadingRecord,
+    StackedRows,
+)
+from ccatp.beacons.slam.measurement_models import (
+    MeasurementModels,
+    MeasurementRow,
+    is_direction,
+    recorded_models,
+    scalars_of,
+)
+from ccatp.beacons.slam.motion import (
+    POSE,
+    CarriedOdometry,
+    DeadReckoning,
+    DifferentialDrive,
+    Increment,
+    Odometry,
+    SlippingVehicle,
+    VehiclePose,
+    estimated,
+)
+from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
+from ccatp.config.beacon_models import RecordingConfig, SlamFilterConfig
+from ccatp.core import FloatArray, wrap_pi
+from ccatp.filters.ekf_slam import BlockError, Columns, EkfSlam, RowUpdate, columns_of
+
+DELAY = "odometry_delay_s"
+PLACE = 2  # x_m, y_m
+UNITS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+class BeaconInnovation(NamedTuple):
+    """What one reading did."""
+
+    beacon: BeaconId
+    residual: FloatArray  # z - h(x) of the bearing, if there is one, and of the range or the strength, shape (m,)
+    nis: float  # nu^T S^-1 nu, with the larger noise where a reading was beyond the knee
+    size: int  # m; a reading whose bearing is refused has its range left out
+    accepted: bool  # False where it was refused; the state is then as before, or has taken the bearing alone
+    surprise: float = 0.0  # minus twice its log-likelihood, up to a constant: sum of nis + ln S
+
+
+class BeaconSlam:
+    """EKF-SLAM of a vehicle among beacons, by ``EkfSlam``; docs/slam.md has the models.
+
+    Args:
+        motion: how the vehicle moves.
+        models: of the kinds of readings.
+        how: which readings are believed, and what is learned from them.
+        pose0: where the vehicle begins; it defines the frame of the map.
+        P0: covariance of that, shape (3, 3).
+        gate: largest normalised innovation squared that is used.
+        delay_sigma_s: of the vehicle behind its odometry, before any reading; 0: it is not estimated.
+        correlation_s: how long an error of a beacon's readings stays; 0: they are independent.
+        iterations: of each update; one linearisation is enough where bearings are exact.
+
+    Attributes:
+        engine: the state: vehicle | calibration | beacons, wandering errors and poses whose readings wait.
+        learned: what the readings of the last ``observe`` did.
+        waiting: beacons with readings that are not on the map yet, with the candidates for their places.
+        levels: what the noise of each sensor and of the motion is, relative to the settings, in variance.
+        prior_sigmas: standard deviations of ``calibration`` before any reading, in its order.
+        unplaced: directions alone, of beacons that were not on the map then: they are not used.
+        moved: beacons that had to be placed again, each with the time_s of the reading that decided it.
+    """
+
+    def __init__(
+        self, motion: DifferentialDrive | SlippingVehicle, models: MeasurementModels, how: SlamFilterConfig,
+        pose0: VehiclePose | Sequence[float], P0: FloatArray, *, gate: float, delay_sigma_s: float = 0.0,
+        correlation_s: float = 0.0, iterations: int = 1,
+    ) -> None:  # fmt: skip
+        self._motion, self._models, self._how = motion, models, how
+        delay_names, delay_sigmas = estimated({DELAY: delay_sigma_s})
+        own, shared = motion.prior_sigmas, (*models.prior_sigmas, *delay_sigmas)
+        v, self._ranges = POSE + len(own), len(models.names)
+        mean, P = np.zeros(v), np.zeros((v, v))
+        mean[:POSE], P[:POSE, :POSE] = pose0, P0
+        P[range(POSE, v), range(POSE, v)] = np.square(own)
+        self.engine = EkfSlam(mean, P, np.zeros(len(shared)), np.diag(np.square(shared)))
+        self._shared = slice(v, v + len(shared))
+        self._delay = v + len(shared) - 1 if delay_names else -1
+        self._shown = POSE + len(shared)  # of the columns of a row, those before the beacon
+        self.prior_sigmas = (*own, *shared)
+        self._names = (*motion.names, *models.names, *delay_names)
+        self._wander = None
+        if correlation_s > 0.0:
+            self._wander = GaussMarkovBias(how.wander_share, how.wander_length_m, correlation_s)
+        self._clock = DeadReckoning(is_delayed=bool(delay_names))
+        self._map = BeaconMap(self.engine, self._shared)
+        self._transport = HeadingTransport(self.engine) if how.transports else None
+        self.levels = {kind: NoiseLevel(how.learn_prior, how.learn_memory) for kind in (*models.by_kind, "motion")}
+        self._learns = how.learn_memory > 0.0
+        self._fresh = AddedPoseNoise()
+        self._gate, self._knee, self._iterations = gate, how.knee_sigmas, iterations
+        self._refused, self.jumps, self.unplaced = 0, 0, 0
+        self.moved: list[tuple[BeaconId, float]] = []
+        self._way_m = 0.0
+        self.waiting: dict[BeaconId, PendingLandmark] = {}
+        self.learned: list[BeaconInnovation] = []
+
+    @property
+    def pose(self) -> VehiclePose:
+        """The vehicle after the last odometry; the heading does not wrap."""
+        return VehiclePose(*self.engine.mean[:POSE].tolist())
+
+    @property
+    def pose_covariance(self) -> FloatArray:
+        """Of x_m, y_m, heading_rad, shape (3, 3)."""
+        return self.engine.covariance[:POSE, :POSE].copy()
+
+    @property
+    def beacons(self) -> dict[BeaconId, BeaconEstimate]:
+        """The map."""
+        x, P, place = self.engine.mean, self.engine.covariance, self.engine.block
+        return {b: BeaconEstimate(x[place(b)].copy(), P[place(b), place(b)].copy()) for b in self._map}
+
+    @property
+    def calibration(self) -> dict[str, tuple[float, float]]:
+        """Mean and standard deviation of what is calibrated on the way, by name."""
+        mean, variances = self.engine.mean.tolist(), self.engine.covariance.diagonal().tolist()
+        return {name: (mean[POSE + i], sqrt(variances[POSE + i])) for i, name in enumerate(self._names)}
+
+    def predict(self, odometry: Odometry) -> None:
+        """Carry the vehicle on."""
+        delay_s = float(self.engine.mean[self._delay]) if self._delay >= 0 else 0.0
+        for step in self._clock.due(odometry, delay_s):
+            self._step(step)
+
+    def _step(self, odometry: Odometry) -> None:
+        engine, motion = self.engine, self._motion
+        before = engine.mean[: engine.vehicle_size].copy()
+        mean, F, Q = motion.step(before, odometry)
+        if self._learns:
+            Q = Q * self.levels["motion"].factor
+            self._fresh.step(F, Q)
+        if isinstance(odometry, Increment) and odometry.guess_m2 > 0.0:
+            Q = Q.copy()  # a guessed way says nothing of the noise of odometry
+            Q[range(POSE), range(POSE)] += odometry.guess_m2, odometry.guess_m2, odometry.guess_rad2
+        engine.predict(mean, F, Q)
+        self._way_m += self._clock.took(odometry, before, mean)
+        if (rest := motion.at_rest(odometry)) is not None:
+            column, bias, variance = rest
+            self._correct(column, bias - float(engine.mean[column]), variance)
+
+    def observe(self, readings: Iterable[Reading]) -> list[BeaconInnovation]:
+        """Take readings of any beacons, one after the other; those of new ones begin their place on the map."""
+        self.learned = []
+        for reading in readings:
+            entry, before = self._map.get(reading.beacon), self.engine.mean.copy()
+            if entry is None and is_direction(reading):
+                self.unplaced += 1  # it may lie anywhere along it
+            elif entry is None:
+                self._begin(reading)
+            else:
+                self.learned.append(self._update(reading, entry))
+                if entry.on_trial and reading.beacon not in self._map and not is_direction(reading):
+                    before = self.engine.mean.copy()
+                    self._begin(reading)
+            self._follow(before)
+        return self.learned
+
+    def _follow(self, before: FloatArray) -> None:
+        if self._transport is not None:
+            self._transport.follow(before)
+
+    def correct_heading(self, off_rad: float, sigma_rad: float) -> float:
+        """Take a heading that is ``off_rad`` from the estimated one; returns the NIS of that."""
+        return self._correct(HEADING, off_rad, sigma_rad**2)
+
+    def _correct(self, column: int, residual: float, variance: float) -> float:
+        before = self.engine.mean.copy()
+        found = self.engine.update_row(np.array((column,)), np.ones(1), residual, variance)
+        self._follow(before)
+        return found.nis
+
+    def remove(self, beacon: BeaconId) -> None:
+        """Forget a beacon; its next reading begins it again. Raises BlockError: there was no reading of it."""
+        if (waiting := self.waiting.pop(beacon, None)) is not None:
+            waiting.drop(self.engine)
+            self._map.renumber()
+        elif beacon in self._map:
+            self._map.leave(beacon)
+        else:
+            raise BlockError(beacon, "is not on the map")
+
+    def _begin(self, reading: Reading) -> None:
+        """Keep a reading of a new beacon with the pose where it was taken, and place the beacon when they suffice."""
+        engine, name = self.engine, reading.beacon
+        kind, z = scalars_of(reading)[-1]
+        model = self._models.by_kind[kind]
+        reach_m, at = model.distance_m(z, name), self._carried(reading)
+        waiting = self.waiting.setdefault(name, PendingLandmark(name))
+        record = ReadingRecord(reading, ("place", name, waiting.count), reach_m)
+        if reading.bearing_rad is not None:
+            waiting.take(engine, record, *self._clone(at, POSE))
+        elif waiting.is_apart(engine, at.pose, reach_m):
+            waiting.take(engine, record, *self._clone(at, PLACE))
+            waiting.thin(engine)
+        else:
+            return
+
+        self._place_new(waiting)
+        self._map.renumber()
+
+    def _place_new(self, waiting: PendingLandmark) -> None:
+        """A reading with a bearing places a beacon at once, on trial; others do when they agree."""
+        is_pointed = waiting.pointed(self.engine) is not None
+        if len(waiting.records) >= LEAST or is_pointed:
+            self._look(waiting)
+            found = waiting.candidates[0] if is_pointed and waiting.candidates else waiting.found(self.engine)
+            if found is not None:
+                self._join(waiting, found)
+                self._map[waiting.beacon].on_trial = TRIAL if is_pointed else 0
+
+    def _prior_at(self, waiting: PendingLandmark, x_m: float, y_m: float) -> BeaconEstimate:
+        last = waiting.records[-1]
+        extra, sigma_m = self._models.by_kind[scalars_of(last.reading)[-1][0]].extra_prior, FLAT * last.distance_m
+        means, sigmas = zip((x_m, sigma_m), (y_m, sigma_m), *extra, strict=True)
+        return BeaconEstimate(np.array(means), np.diag(np.square(sigmas)))
+
+    def _look(self, waiting: PendingLandmark) -> None:
+        waiting.look(self.engine, self._stacked(waiting), partial(self._prior_at, waiting))
+
+    def _clone(self, at: CarriedOdometry, size: int) -> tuple[FloatArray, Columns, FloatArray]:
+        """A copy of a pose, or its place alone, the columns that it depends on, and its derivatives by these."""
+        is_delayed = self._delay >= 0
+        J = [at.derivatives(*unit, delayed=is_delayed) for unit in UNITS[:size]]
+        columns = columns_of(range(POSE), (self._delay,) if is_delayed else ())
+        return np.array(at.pose[:size]), columns, np.array(J)
+
+    def _stacked(self, waiting: PendingLandmark) -> StackedRows:
+        def row_of(kind: str, pose: list[float], calibration: list[float], beacon: list[float]) -> MeasurementRow:
+            row = self._models.by_kind[kind].row(pose, calibration[: self._ranges], beacon, waiting.beacon)
+            return row._replace(variance=row.variance * self.levels[kind].factor)
+
+        return StackedRows(self.engine, waiting.records, self._shared, row_of)
+
+    def _join(self, waiting: PendingLandmark, found: Candidate) -> None:
+        """Condition the beacon, the poses of its readings, the calibration and all else on them, iterated."""
+        engine, rows = self.engine, self._stacked(waiting)
+        self._map.join(waiting.beacon, *self._prior_at(waiting, *found.mean[:PLACE].tolist()))
+        block = engine.block(waiting.beacon)
+
+        def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+            H, G, residual, _ = rows.at(x, x[block].tolist())
+            return residual, np.hstack([H, G])
+
+        start = engine.mean.copy()
+        start[block] = found.mean
+        columns = columns_of(rows.columns.tolist(), block)
+        engine.update_iterated(columns, linearise, found.variances, LINEARISATIONS, start=start)
+        waiting.drop(engine)
+        del self.waiting[waiting.beacon]
+        self._map.renumber()
+
+    def _carried(self, reading: Reading) -> CarriedOdometry:
+        """The pose at a reading's time."""
+        x = self.engine.mean
+        return self._clock.at(x[:POSE].tolist(), reading.time_s, float(x[self._delay]) if self._delay >= 0 else 0.0)
+
+    def _update(self, reading: Reading, entry: MapEntry) -> BeaconInnovation:
+        """The bearing is taken first: if it is refused, so is the rest."""
+        model = None if is_direction(reading) else self._wander
+        if model is not None:
+            self._map.wander_to(reading.beacon, model, self._way_m, reading.time_s)
+        residuals, nis, spread, accepted = [], 0.0, 1.0, True
+        for kind, z in scalars_of(reading):
+            if accepted:
+                found = self._take(reading, entry, kind, z, model)
+                residuals.append(found.residual)
+                nis, spread, accepted = nis + found.nis, spread * found.spread, found.accepted
+        if self._learns:
+            self._fresh.clear()
+        self._judge(reading, entry, accepted=accepted)
+        return BeaconInnovation(reading.beacon, np.array(residuals), nis, len(residuals), accepted, nis + log(spread))
+
+    def _take(self, reading: Reading, entry: MapEntry, kind: str, z: float, model: GaussMarkovBias | None) -> RowUpdate:
+        engine, level, columns = self.engine, self.levels[kind], entry.columns
+        prior = engine.mean.take(columns)
+        h, residual, r, own = self._linearised(reading, entry, kind, z, model, prior.tolist())
+        if self._iterations > 1:
+            P = engine.covariance[np.ix_(columns, columns)]
+            for _ in range(self._iterations - 1):
+                Ph = P.dot(h)
+                x = prior + Ph * (residual / (float(h.dot(Ph)) + r))
+                h, residual, r, own = self._linearised(reading, entry, kind, z, model, x.tolist())
+                residual += float(h.dot(x - prior))
+        found = engine.update_row(columns, h, residual, r, self._gate, self._knee)
+        if found.accepted and self._learns:
+            level.learn(found.nis, own / found.spread)
+            self.levels["motion"].learn(found.nis, self._fresh.seen(*h[:POSE].tolist()) / found.spread)
+        return found
+
+    def _linearised(
+        self, reading: Reading, entry: MapEntry, kind: str, z: float, model: GaussMarkovBias | None, x: list[float]
+    ) -> tuple[FloatArray, float, float, float]:
+        """Derivatives by the columns of a beacon, residual, noise variance, and that with the wandering error."""
+        is_delayed, shown = self._delay >= 0, self._shown
+        at = self._clock.at(x, reading.time_s, x[shown - 1] if is_delayed else 0.0)
+        calibration, beacon = x[POSE : POSE + self._ranges], x[shown : shown + entry.size]
+        row = self._models.by_kind[kind].row(at.pose, calibration, beacon, reading.beacon)
+        hx, hy, turned, *by_delay = at.derivatives(*row.pose, delayed=is_delayed)
+        h = [hx, hy, turned, *row.calibration, *by_delay, *row.beacon]
+        expected = row.expected
+        r = own = row.variance * self.levels[kind].factor
+        if entry.wander >= 0:
+            share = 0.0 if model is None or kind == "bearing" else model.share
+            by_wander = sqrt(share * r)
+            h.append(by_wander)
+            expected += by_wander * x[-1]
+            r *= 1.0 - share
+            own = r + entry.fresh * by_wander * by_wander
+        residual = wrap_pi(z - expected) if kind == "bearing" else z - expected
+        return np.array(h), residual, r, own
+
+    def _judge(self, reading: Reading, entry: MapEntry, *, accepted: bool) -> None:
+        if accepted:
+            entry.refused = 0
+            entry.on_trial = max(entry.on_trial - 1, 0)
+            self._refused = 0
+            return
+        if entry.on_trial:
+            self._map.leave(reading.beacon)
+            return
+        entry.refused += 1
+        self._refused += 1
+        if self._refused >= self._how.doubt_pose_after:
+            self._refused = 0
+            v = self.engine.vehicle_size
+            jump = np.zeros(v)
+            jump[:POSE] = self._how.jump_m, self._how.jump_m, self._how.jump_rad
+            self.engine.predict(self.engine.mean[:v].copy(), np.eye(v), np.diag(jump**2))
+            self.jumps += 1
+        if entry.refused >= self._how.doubt_beacon_after:
+            self._map.leave(reading.beacon)
+            self.moved.append((reading.beacon, reading.time_s))
+
+
+def recorded_slam(
+    cfg: RecordingConfig, how: SlamFilterConfig, pose0: VehiclePose | Sequence[float], P0: FloatArray
+) -> BeaconSlam:
+    """The filter of recorded runs."""
+    return BeaconSlam(
+        DifferentialDrive(cfg.odometry, cfg.priors, how), recorded_models(cfg.radio, cfg.priors), how, pose0, P0,
+        gate=cfg.radio.gate_sigmas**2, delay_sigma_s=cfg.priors.delay_s, correlation_s=cfg.radio.correlation_s,
+    )  # fmt: skip
