@@ -104,39 +104,39 @@ GOLDEN_FROM_CLIENT: list[tuple[FromClient, bytes]] = [
 # Every way found so far of being no good line of a client: values of one key, whole members, and whole lines.
 DRIVE = b'{"type":"drive","seq":%b,"ack":1,"wr":%b,"wl":0%b}'
 HUGE = b"1" + b"0" * 500
-BAD_RATES = [
-    b"NaN", b"Infinity", b"-Infinity", b"1e999", HUGE, b"1e6", b"null", b'"0"', b"true", b"[0]", b"01", b".5", b"0x1",
-]  # fmt: skip
-BAD_NUMBERS = [b"true", b"1.5", b"-1", b"9007199254740992", b'"1"']
-BAD_MEMBERS = [
-    b',"seq":1', b',"wl":0', b',"w\\u006c":8', b',"type":"drive"', b',"x":{"a":1,"a":1}', b',"x":1e999', b',"x":NaN',
-    b',"x":' + HUGE, b',"x":' + b"[" * 7000, b',"x":"\xff"', b",",
-]  # fmt: skip
-BAD_PERMITS = [
-    b'"forward":1,"reverse":false,"turn":true', b'"forward":"true","reverse":false,"turn":true',
-    b'"forward":true,"reverse":null,"turn":true', b'"forward":true,"turn":true',
-    b'"forward":true,"reverse":true,"turn":true,"turn":false',
-]  # fmt: skip
-BAD_DUTIES = [b"[0.8]", b"[0.8,0.8,0.8]", b"[0.8,1.1]", b"[-0.1,0.8]", b"0.8", b"[true,0.8]"]
-BAD_JOINS = [
-    b'"role":"controller"', b'"role":"king","client":"main"', b'"role":"controller","client":7',
-    b'"role":"controller","role":"monitor","client":"main"',
-]  # fmt: skip
+BAD_RATES = b'NaN Infinity -Infinity 1e999 1e6 null "0" true [0] 01 .5 0x1'.split()
+BAD_NUMBERS = b'true 1.5 -1 9007199254740992 "1"'.split()
+BAD_MEMBERS = (
+    b',"seq":1 ,"wl":0 ,"w\\u006c":8 ,"type":"drive" ,"x":{"a":1,"a":1} ,"x":1e999 ,"x":NaN ,"x":"\xff" , '
+    b',"x":' + HUGE + b' ,"x":' + b"[" * 7000
+).split()
+BAD_PERMITS = (
+    b'"forward":1,"reverse":false,"turn":true "forward":"true","reverse":false,"turn":true '
+    b'"forward":true,"reverse":null,"turn":true "forward":true,"turn":true '
+    b'"forward":true,"reverse":true,"turn":true,"turn":false'
+).split()
+BAD_DUTIES = b"[0.8] [0.8,0.8,0.8] [0.8,1.1] [-0.1,0.8] 0.8 [true,0.8]".split()
+BAD_JOINS = (
+    b'"role":"controller" "role":"king","client":"main" "role":"controller","client":7 '
+    b'"role":"controller","role":"monitor","client":"main"'
+).split()
+BAD_LINES = (
+    b'garbage null [] 42 "drive" {} {"seq":1} {"type":1} {"type":null,"seq":1} {"type":"drive"} '
+    b'{"type":"drive","seq":1,"ack":1,"wr":0} {"type":"wink","a":1,"a":2} {"type":"wink","a":Infinity} ' + b"[" * 8000
+).split()
 GOOD = DRIVE % (b"1", b"0", b"")
 MALFORMED_FROM_CLIENT: list[bytes] = [
-    b"", b"\r", b"garbage", b"null", b"[]", b"42", b'"drive"', b"{}", b'{"seq":1}', b'{"type":1}',
-    b'{"type":null,"seq":1}', b'{"type":"drive"}', b'{"type":"drive","seq":1,"ack":1,"wr":0}',
-    b'{"type":"wink","a":1,"a":2}', b'{"type":"wink","a":Infinity}', b"[" * 8000,
-    b'{"type":"drive","seq" :2,"seq":1,"ack":1,"wr":0,"wl":0}',
-    GOOD[:-1], GOOD + b"x", GOOD + b"{}", GOOD.replace(b'"', b"'"), b"\xef\xbb\xbf" + GOOD,
+    *BAD_LINES,
+    *(GOOD[:-1], GOOD + b"x", GOOD + b"{}", GOOD.replace(b'"', b"'"), b"\xef\xbb\xbf" + GOOD, b"", b"\r"),
     GOOD.decode().encode("utf-16"),
-    *(DRIVE % (b"1", rate, b"") for rate in BAD_RATES),
+    GOOD.replace(b'"seq":1', b'"seq" :2,"seq":1'),
+    *(DRIVE % (b"1", rate, b"") for rate in (*BAD_RATES, HUGE)),
     *(DRIVE % (number, b"0", b"") for number in BAD_NUMBERS),
     *(DRIVE % (b"1", b"0", member) for member in BAD_MEMBERS),
     *(b'{"type":"permit","seq":1,"ack":1,%b}' % members for members in BAD_PERMITS),
     *(b'{"type":"fans","seq":1,"duty":%b}' % duty for duty in BAD_DUTIES),
     *(b'{"type":"join",%b}' % members for members in BAD_JOINS),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("message", "line"), GOLDEN_FROM_ROBOT)
