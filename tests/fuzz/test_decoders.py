@@ -5,7 +5,7 @@ import math
 import os
 import random
 import tempfile
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
 
 import pytest
@@ -17,21 +17,11 @@ from ccatp.links import robot_codec as robot
 from ccatp.links.auth import read_clients
 from ccatp.links.robot_messages import LineBuffer, LineTooLong, Sensors
 from ccatp.sim.fault_plan import parse_plan
+from tests.contract.test_channels import ID, Desk
+from tests.contract.test_multiline import REPLIES
+from tests.contract.test_robot_wire import GOLDEN_FROM_CLIENT, GOLDEN_FROM_ROBOT, HELLO_LINE, SENSORS_LINE
 from tests.fuzz.fuzzer import Target, fuzz
 
-HELLO = (
-    b'{"type":"hello","protocol":"ccatp-robot/1","boot":7,"nonce":"0123456789abcdef0123456789abcdef","auth":"none",'
-    b'"frame_hz":100.0,"ttl_s":0.25,"lockstep":true,"robot":{"wheel_radius_m":0.03,"wheel_base_m":0.15,'
-    b'"max_wheel_rad_s":8.0,"edge_sensors_m":[[0.09,0.09],[0.09,-0.09],[-0.09,0.09],[-0.09,-0.09]],'
-    b'"puck_m":[0.0,0.0,0.05],"fan_floor":0.6}}'
-)
-SENSORS = (
-    b'{"type":"sensors","seq":12,"t":0.12,"imu":[[0.115,0.01,-0.002]],"enc":[[0.111,1.5,null],[0.112,1.5,-1.5]],'
-    b'"edge":[[0.111,1,1,1,1],[0.112,0,1,1,1]],"gravity":[0.11,0.1,-0.2,-0.97],"fans":[0.8,0.8],"soc":0.9,'
-    b'"cmd":{"seq":3,"age":0.01,"permit_age":0.01,"held":false},"faults":["imu"]}'
-)
-JOIN = b'{"type":"join","protocol":"ccatp-robot/1","role":"controller","client":"main","mac":"00ff"}'
-RECORD = "1,1234.5678,20,90,20.1,1013.2,45.0,0,0,0,0,0,0,0,0,0,0"
 PLAN = b"""[[fault]]
 signal = "imu_wz"
 type = "stuck"
@@ -60,22 +50,21 @@ public_key = "rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7"
 role = "raise"
 """
 VERDICT = Verdict(7, 0.07, EventCode.NEAR_EDGE, "rim ahead", "front_left", 0.01, 0.0, False, True, False)
-_ID = "12345678-1234-5678-1234-567812345678"
 
 
 def targets() -> list[Target]:
     """All decoders that work on bytes in memory."""
     return [
-        Target("robot link, from the robot", _from_robot(), _robot, (robot.BadLine,)),
-        Target("robot link, from a client", _from_client(), _client, (robot.BadLine,)),
-        Target("robot link, lines", [SENSORS + b"\n" + HELLO + b"\n"], _lines, (LineTooLong,)),
+        Target("robot link, from the robot", [*_lines_of(GOLDEN_FROM_ROBOT), UNKNOWN], _robot, (robot.BadLine,)),
+        Target("robot link, from a client", [*_lines_of(GOLDEN_FROM_CLIENT), UNKNOWN], _client, (robot.BadLine,)),
+        Target("robot link, lines", [SENSORS_LINE + HELLO_LINE], _lines, (LineTooLong,)),
         Target(
             "MultiLine, requests",
             [b"isconnected", b"latestlengthvalid,1,2,32"],
             _request,
             (multiline.BadMultilineRequest,),
         ),
-        Target("MultiLine, replies", _replies(), _reply, (multiline.BadReply,)),
+        Target("MultiLine, replies", [line.strip() for _, line in REPLIES], _reply, (multiline.BadReply,)),
         Target("observatory channel", _observatory(), _emergency, (channels.BadRequest,)),
         Target("operator channel", [b'{"cmd":"status"}', b'{"cmd":"abort"}'], _operator, (channels.BadRequest,)),
         Target("replies of both channels", [b'{"ok":true,"code":0}'], _channel_reply, (channels.BadRequest,)),
@@ -88,15 +77,11 @@ def targets() -> list[Target]:
 # -- robot link -------------------------------------------------------------------------------------------------------
 
 
-def _from_robot() -> list[bytes]:
-    joined, refused = b'{"type":"joined","role":"monitor","session":3}', b'{"type":"refused","reason":"busy"}'
-    return [HELLO, SENSORS, joined, refused, b'{"type":"x"}']
+UNKNOWN = b'{"type":"x","y":{"z":[1,2.5]}}'
 
 
-def _from_client() -> list[bytes]:
-    drive = robot.format_drive(3, 12, 1.25, -0.5)[:-1]
-    permit = robot.format_permit(4, 12, True, False, True)[:-1]
-    return [JOIN, drive, permit, b'{"type":"fans","seq":1,"duty":[0.8,0.8]}', b'{"type":"x","y":{"z":[1,2.5]}}']
+def _lines_of(golden: Sequence[tuple[object, bytes]]) -> list[bytes]:
+    return [line.rstrip() for _, line in golden]
 
 
 def _robot(line: bytes) -> Hashable:
@@ -152,20 +137,6 @@ def _fed(buffer: LineBuffer, parts: list[bytes]) -> tuple[list[bytes], bool]:
 # -- MultiLine --------------------------------------------------------------------------------------------------------
 
 
-def _replies() -> list[bytes]:
-    texts = [
-        "isconnected_1",
-        "laserready_0",
-        "environmentdata_20.5,1013.25,40.0",
-        f"channeldata_{RECORD}_{RECORD.replace('1,', '2,', 1)}_0",
-        "defanadata_x",
-        "error_unknown-request",
-        "measstarted",
-        "measurementfinished",
-    ]
-    return [text.encode() for text in texts]
-
-
 def _request(line: bytes) -> Hashable:
     request = multiline.parse_request(line)
     assert set(request.channels) <= set(multiline.CHANNEL_NUMBERS)
@@ -189,29 +160,14 @@ def _reply(line: bytes) -> Hashable:
 def _observatory() -> list[bytes]:
     return [
         b'{"cmd":"ping"}',
-        json.dumps({"cmd": "emergency", "kind": "fire", "id": _ID, "note": "north wing"}).encode(),
-        json.dumps({"cmd": "clear", "id": _ID}).encode(),
+        json.dumps({"cmd": "emergency", "kind": "fire", "id": ID, "note": "north wing"}).encode(),
+        json.dumps({"cmd": "clear", "id": ID}).encode(),
     ]
-
-
-class _Desk:
-    code = EventCode.NORMAL
-
-    def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
-        del kind, note
-        return None if emergency_id else "no id"
-
-    def holds(self, emergency_id: str) -> bool:
-        return emergency_id < "8"
-
-    def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
-        del emergency_id
-        return None if at_base_or_held else "no"
 
 
 def _emergency(frame: bytes) -> Hashable:
     # Whatever comes is answered, with an answer that can be read.
-    answer = channels.answer_observatory(frame, _Desk(), at_base_or_held=True, age_s=0.1)
+    answer = channels.answer_observatory(frame, Desk(), at_base_or_held=True, age_s=0.1)
     assert channels.parse_reply(answer)["ok"] in (True, False)
     return type(channels.parse_observatory(frame)).__name__
 

@@ -21,8 +21,8 @@ from ccatp.links.topics import TOPICS, FixMessage, Rest, SensorLines, TrackMessa
 from ccatp.records.recorder import Recorder, iter_messages
 from ccatp.records.run_reader import RunReadError, open_run
 from ccatp.records.store import MissionStore, StoredPoint, StoreError
+from tests.contract.test_robot_wire import SENSORS_LINE
 from tests.fuzz.fuzzer import Target, fuzz
-from tests.fuzz.test_decoders import SENSORS
 
 USER_FILE = b"""[run]
 mirror = "fyst-m1"
@@ -159,7 +159,7 @@ def sound_recording(folder: Path) -> bytes:
         channels=[1, 2, 3, 4],
         jump_mm=0.1,
     )
-    lines = [json.loads(SENSORS) | {"seq": k, "t": 0.01 * k} for k in range(3)]
+    lines = [json.loads(SENSORS_LINE) | {"seq": k, "t": 0.01 * k} for k in range(3)]
     raw = [json.dumps(line).encode() for line in lines]
     messages = {
         "sensors": SensorLines(seq=12, t_s=0.12, lines=[msgspec.Raw(line) for line in raw]),

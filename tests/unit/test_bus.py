@@ -1,6 +1,5 @@
 """Publisher and subscriber on inproc endpoints."""
 
-import json
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 
@@ -85,19 +84,13 @@ def test_a_publisher_knows_who_listens(bus: Bus) -> None:
         pass
 
 
-def test_a_topic_is_not_a_prefix(bus: Bus) -> None:
+def test_a_topic_is_not_a_prefix_and_bad_messages_are_counted_and_dropped(bus: Bus) -> None:
     publisher = bus.publisher()
     subscriber = bus.subscriber("heartbeat.main")
     publisher.has_subscriber("heartbeat.main")
     publisher._socket.send(b"heartbeat.mainframe {}")
     assert subscriber.receive(0.05) is None
     assert subscriber.bad_messages == 0
-
-
-def test_bad_messages_are_counted_and_dropped(bus: Bus) -> None:
-    publisher = bus.publisher()
-    subscriber = bus.subscriber("heartbeat.main")
-    publisher.has_subscriber("heartbeat.main")
     publisher._socket.send(b"heartbeat.main nonsense")
     publisher.send("heartbeat.main", presence(3))
     assert next_of(subscriber) == ("heartbeat.main", presence(3))
@@ -139,17 +132,13 @@ def test_of_what_waits_the_newest_is_kept(bus: Bus) -> None:
 ESTIMATE = EstimateMessage(seq=5, t_s=0.05, x_m=1.0, y_m=-2.0, heading_rad=0.5, sigma_m=1e-3, state="driving")
 
 
-def test_golden_frame() -> None:
-    assert pack("estimate", ESTIMATE) == (
-        b'estimate {"x_m":1.0,"y_m":-2.0,"heading_rad":0.5,"sigma_m":0.001,"state":"driving","commanded":null,'
+def test_golden_frame_and_round_trip() -> None:
+    body = (
+        b'{"x_m":1.0,"y_m":-2.0,"heading_rad":0.5,"sigma_m":0.001,"state":"driving","commanded":null,'
         b'"drive_seq":-1,"seq":5,"t_s":0.05}'
     )
-
-
-def test_round_trip_with_the_text_in_the_middle() -> None:
-    name, body, message = unpack(pack("estimate", ESTIMATE))
-    assert (name, message) == ("estimate", ESTIMATE)
-    assert json.loads(body)["seq"] == 5
+    assert pack("estimate", ESTIMATE) == b"estimate " + body
+    assert unpack(b"estimate " + body) == ("estimate", body, ESTIMATE)
 
 
 def test_a_batch_of_lines_holds_them_as_they_came() -> None:
@@ -190,21 +179,18 @@ def test_every_recorded_topic_has_a_schema() -> None:
 
 
 def test_verdicts_survive_the_bus() -> None:
-    verdict = Verdict(
-        7, 0.07, EventCode.NEAR_EDGE, "rim", "front_left", 0.01, 0.005, False, True, False, (True, False, False, False)
-    )
+    verdict = Verdict(7, 0.07, EventCode.NEAR_EDGE, "rim", "front_left", 0.01, 0.005, False, True, False, (True,) * 4)
     name, _, message = unpack(pack("verdict", verdict))
-    assert name == "verdict"
-    assert message == verdict
+    assert (name, message) == ("verdict", verdict)
     assert isinstance(message, Verdict)
     assert message.code is EventCode.NEAR_EDGE
 
 
-@pytest.mark.parametrize("seq", range(1, 30))
-def test_danger_waits_for_an_estimate_that_main_publishes(seq: int) -> None:
-    wanted = last_estimate_before(seq)
-    assert is_estimate_due(wanted)
-    assert 0 < seq - wanted <= ESTIMATE_FRAMES
+def test_danger_waits_for_an_estimate_that_main_publishes() -> None:
+    for seq in range(1, 30):
+        wanted = last_estimate_before(seq)
+        assert is_estimate_due(wanted)
+        assert 0 < seq - wanted <= ESTIMATE_FRAMES
     assert last_estimate_before(0) < 0
 
 
@@ -214,8 +200,8 @@ def test_danger_waits_for_an_estimate_that_main_publishes(seq: int) -> None:
         ("treatment", b'{"seq":1,"t_s":0.1,"kind":"deaf","values":[]}', "kind", "odometry_off"),
         ("treatment", b'{"seq":1,"t_s":0.1,"kind":"hearing"}', "kind", "odometry_on"),
         ("treatment", b'{"seq":1,"t_s":0.1,"kind":"odometry_on"}', "kind", "odometry_on"),
-        ("mission", b'{"seq":1,"t_s":0.1,"state":"idle","slips":3,"lag_ms":21.5}', "missed_deadlines", 3),
-        ("mission", b'{"seq":1,"t_s":0.1,"state":"idle","slips":3,"lag_ms":21.5}', "worst_lateness_ms", 21.5),
+        ("mission", b'{"seq":1,"t_s":0.1,"state":"idle","slips":3}', "missed_deadlines", 3),
+        ("mission", b'{"seq":1,"t_s":0.1,"state":"idle","lag_ms":21.5}', "worst_lateness_ms", 21.5),
     ],
 )
 def test_recordings_of_older_formats_are_read(topic: str, payload: bytes, field: str, value: object) -> None:

@@ -77,22 +77,6 @@ def test_commands_and_typed_answers(runtime_dir: Path) -> None:
     assert [request["cmd"] for request in asked] == ["status", "pause", "resume", "abort", "stop"]
 
 
-def test_a_refusal_says_why(runtime_dir: Path) -> None:
-    with (
-        serving(runtime_dir, "control", lambda _: {"ok": False, "error": "nothing is paused"}),
-        pytest.raises(RefusedError, match="resume refused: nothing is paused"),
-    ):
-        OperatorClient(runtime_dir).resume()
-
-
-def test_nobody_there(runtime_dir: Path) -> None:
-    with pytest.raises(DaemonUnreachableError, match=r"no daemon in .*; start one with ccatp run"):
-        OperatorClient(runtime_dir).status()
-    (runtime_dir / "control").touch()
-    with pytest.raises(DaemonUnreachableError, match=r"no answer from .* within 0\.1 s"):
-        OperatorClient(runtime_dir, timeout_s=0.1).status()
-
-
 def test_an_answer_of_another_shape_is_told(runtime_dir: Path) -> None:
     with (
         serving(runtime_dir, "control", lambda _: {"ok": True, "status": {"state": 7}}),
