@@ -323,11 +323,14 @@ STUCK_AT_EDGE = hold(Group.EDGES, "stuck at the edge: no motion away from it is 
 
 NO_FRAME_FOR = wait(Group.DATA, "no sensors frame for {age_s:.2f} s",
     "Main has no frame of the robot.", "As above.")
-NO_VERDICT = wait(Group.DATA, "no fresh verdict from the danger loop",
+NO_VERDICT = pause(Group.DATA, "no fresh verdict from the danger loop",
     "Danger is too slow, hangs, or is being restarted.", "As for a stale estimate.")
-FRAME_LATE = wait(Group.DATA, "a frame was served {lag_ms:.0f} ms late",
+FRAME_LATE = pause(Group.DATA, "a frame was served {late_ms:.0f} ms late (limit {limit_ms:.0f} ms)",
     "This machine was too slow for one frame.",
     "Nothing once; often: other programs, or no real-time rights (`no real time` in `log.jsonl`).")
+FRAMES_OLD = pause(Group.DATA, "frames are {late_ms:.0f} ms old (limit {limit_ms:.0f} ms)",
+    "By the robot's echo of our drives its frames, or our drives, are that long on their way: the network or a queue.",
+    "Network; load of the robot's computer.")
 
 UNATTENDED_FAULT = go_home(Group.FANS,
     "unattended fault: the battery ({charge:.0%}) lasts for little more than the way home",

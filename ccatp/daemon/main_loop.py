@@ -8,13 +8,15 @@ from math import inf
 from typing import Any
 
 import zmq
+from msgspec.structs import replace
 
-from ccatp.conditions import FRAME_LATE, LINK_LOST, NO_FRAME_FOR, condition_of
+from ccatp.conditions import FRAME_LATE, FRAMES_OLD, LINK_LOST, NO_FRAME_FOR, NO_VERDICT, Condition, condition_of
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import Verdict
 from ccatp.daemon.mission_runner import STILL, DriveCommand, MissionRunner, TimedFrame
 from ccatp.daemon.process import ProcessArgs, run_process, start_process
 from ccatp.daemon.robot_loop import WAIT_PERIOD_S, RobotLoop
+from ccatp.daemon.robot_session import FrameAge
 from ccatp.daemon.subscribers import VerdictSubscriber
 from ccatp.daemon.telemetry import BATCH_WALL_S
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
@@ -22,8 +24,9 @@ from ccatp.links.channels import BadRequest, OperatorCommand, format_error, form
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.rpc import Router
 from ccatp.links.topics import ESTIMATE_FRAMES, MissionStatus
+from ccatp.safety.escalation import Since
 from ccatp.safety.robot_clock import MissionClock
-from ccatp.survey.state import Abort, Interrupted, Pause, Resume, StopHere
+from ccatp.survey.state import HELD, Abort, Fault, Interrupted, Pause, Resume, StopHere
 
 # After the end the last messages must reach the supervisor, which then ends this process.
 SHUTDOWN_TIMEOUT_S = 5.0
@@ -37,6 +40,12 @@ EFFECT_TIMEOUT_S = 5.0
 
 # A robot that stands for longer is reported, with the reason and what to do, and again after each minute.
 STANDS_REPORT_S, STANDS_REPEAT_S = 30.0, 60.0
+
+
+# Causes of a pause that only this loop knows, so that none of danger's monitors counts how long it lasts.
+OWN_PAUSES = FRAME_LATE, FRAMES_OLD, NO_VERDICT
+# Of a mission among beacons; its map does not outlive a gap, so that there is no hold before a fault.
+BEACON_PAUSE_LIMITS_S = inf, 30.0
 
 
 class StandstillReport:
@@ -92,7 +101,10 @@ class MainLoop(RobotLoop):
         self._was_at_rest = False
         self._unanswered: int | None = None
         self._failure: Exception | None = None
-        self._standstill = StandstillReport()
+        self._standstill, self._frame_age = StandstillReport(), FrameAge()
+        health = None if isinstance(cfg, RadioConfig) else cfg.health
+        self._pause_limits_s = (health.pause_limit_s, health.hold_limit_s) if health else BEACON_PAUSE_LIMITS_S
+        self._own_pause, self._has_gap = Since(), False
         self.exit_status = ExitStatus.INTERRUPTED
         self._runner = make_runner(self)
         self._telemetry = self._runner.telemetry
@@ -185,9 +197,27 @@ class MainLoop(RobotLoop):
         if self._runner.mission.state.is_paused and not self._runner.is_busy:
             self._answer_held_frame()  # a frame now and then, so that an emergency acts in a pause, too
         stands = self.heartbeat.phase != "done" and self._runner.is_at_rest
-        lasts_s = self._standstill.lasts_s(time.monotonic(), stands=stands)
+        now_s = time.monotonic()
+        self._escalate_pause(now_s)
+        lasts_s = self._standstill.lasts_s(now_s, stands=stands)
         if lasts_s is not None:
             self._telemetry.notify_operator("warning", f"the robot stands for {lasts_s:.0f} s: {self._why_it_stands()}")
+
+    def _escalate_pause(self, now_s: float) -> None:
+        """A pause that persists needs a fix before the robot moves again, and then an operator."""
+        mission = self._runner.mission
+        state = mission.state
+        waits = state.mode is HELD and not state.is_held_by_hand and condition_of(state.cause) in OWN_PAUSES
+        lasts_s = self._own_pause.lasts(now_s, waits and not self.is_lockstep)
+        hold_s, fault_s = self._pause_limits_s
+        self._has_gap = self._has_gap and lasts_s >= 0.0
+        if lasts_s >= hold_s and not self._has_gap:
+            self._has_gap = True
+            self._runner.on_tracking_gap()
+        if lasts_s >= fault_s:
+            cause = f"{state.cause}, for {fault_s:g} s"
+            mission.handle(Fault(cause))
+            self._telemetry.notify_operator("error", cause)
 
     def _why_it_stands(self) -> str:
         """The reason, and what to do."""
@@ -216,15 +246,17 @@ class MainLoop(RobotLoop):
     def on_silence(self, age_s: float) -> None:
         if age_s <= self.robot_cfg.sensors_timeout_s:
             return
-        if self._interrupt(NO_FRAME_FOR.text(age_s=age_s)):
+        if self._interrupt(NO_FRAME_FOR, age_s=age_s):
             self._telemetry.notify_operator("warning", self._runner.mission.state.cause)
             self.send_drive(self.clock.seq, STILL)
 
-    def _interrupt(self, cause: str) -> bool:
-        """Hold the mission until frames are fresh; whether it was not held before."""
-        mission = self._runner.mission
+    def _interrupt(self, row: Condition, **values: float) -> bool:
+        """Hold the mission until frames are fresh; whether it was not held before, or for another of these causes."""
+        mission, cause = self._runner.mission, row.text(**values)
         before = mission.state
         mission.handle(Interrupted(cause))
+        if before.mode is HELD and condition_of(before.cause) in {NO_FRAME_FOR, *OWN_PAUSES} - {row}:
+            mission.state = replace(before, cause=cause)
         return mission.state is not before
 
     def _publish_status(self) -> None:
@@ -331,16 +363,22 @@ class MainLoop(RobotLoop):
 
     def _plan_in_time(self, frame: TimedFrame, verdict: Verdict | None) -> DriveCommand:
         """The drive that answers a frame on the wall clock. One that is too late moves nothing."""
-        runner, limit_s, begun_s = self._runner, self.robot_cfg.lag_limit_s, time.monotonic()
+        runner, robot, begun_s = self._runner, self.robot_cfg, time.monotonic()
         lag_s = self.lateness.add(frame.sensors.t, begun_s)
-        if lag_s > limit_s:
+        age_s = self._frame_age.largest_s(frame.sensors.cmd, begun_s)
+        is_old = age_s > robot.sensors_timeout_s
+        if is_old or lag_s > robot.lag_limit_s:
             if begun_s < self._catches_up_until_s:
                 return runner.hold(frame)
             verdict = None
             # Paused until frames are prompt again.
-            if self._interrupt(FRAME_LATE.text(lag_ms=1e3 * lag_s)):
-                lateness_ms, limit_ms = 1e3 * lag_s, 1e3 * limit_s
-                self.log.warning("frame_late", seq=self.clock.seq, lateness_ms=lateness_ms, limit_ms=limit_ms)
+            row, late_ms, limit_ms = FRAME_LATE, 1e3 * lag_s, 1e3 * robot.lag_limit_s
+            if is_old:
+                row, late_ms, limit_ms = FRAMES_OLD, 1e3 * age_s, 1e3 * robot.sensors_timeout_s
+            if self._interrupt(row, late_ms=late_ms, limit_ms=limit_ms):
+                self.log.warning("frame_late", seq=self.clock.seq, lateness_ms=late_ms, limit_ms=limit_ms)
+                if is_old:
+                    self._telemetry.notify_operator("warning", runner.mission.state.cause)
         drive = runner.plan(frame, verdict, lag_s)
         now_s = time.monotonic()
         is_slow, is_still = now_s - begun_s > self.frame_period_s, drive == STILL
@@ -354,6 +392,8 @@ class MainLoop(RobotLoop):
         ack, (right, left, steer) = max(ack, 0), drive
         self._runner.on_drive(self._drive_seq, right, left)
         self._sent = ack, drive
+        if not self.is_lockstep:
+            self._frame_age.add_drive(self._drive_seq, time.monotonic())
         self.link.send_drive(self._drive_seq, ack, right, left, steer)
 
     def answer_again(self) -> None:

@@ -9,15 +9,17 @@ from ccatp.config.models import LinkConfig
 from ccatp.errors import DaemonUnreachableError
 from ccatp.links.auth import read_key
 from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout
-from ccatp.links.robot_messages import Hello, Role, Sensors
+from ccatp.links.robot_messages import CommandEcho, Hello, Role, Sensors
 
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.05, 1.0
 # After this time without an answer the connection is closed and another one is tried.
 ATTEMPT_S = 2.0
 # Refusals that will be repeated.
 FINAL = ("bad mac",)
-# The robot's clock and the host's drift apart by less than this share; a quartz is ten times better.
-MAX_DRIFT = 2e-4
+# The rate of the robot's clock may be wrong by a hundredth and may wander; that of the host is much better.
+MAX_DRIFT = 1.02e-2
+# Drives whose times are known: ten seconds of them at 100 Hz.
+SENT_DRIVES = 1024
 
 
 def delay_s(failures: int, share: float) -> float:
@@ -152,7 +154,8 @@ class LatenessStatistics:
     """Measures the lag of each frame against the promptest recent one.
 
     The difference of the host's clock to the robot's is least for a frame that was served at once. It may grow by the
-    drift of the clocks; the rest is the frame's lag. A constant delay does not show.
+    drift of the clocks; the rest is the frame's lag. A constant delay does not show, nor a queue that grows as slowly
+    as clocks may drift: those show in the age by the echo (``FrameAge``).
 
     Args:
         late_after_s: a frame served later than this misses its deadline.
@@ -161,11 +164,11 @@ class LatenessStatistics:
         missed_deadlines: frames served later than ``late_after_s``.
     """
 
-    __slots__ = ("_late_after_s", "_least_s", "_t_s", "_wall_s", "missed_deadlines", "worst_s")
+    __slots__ = ("_late_after_s", "_least_s", "_t_s", "missed_deadlines", "worst_s")
 
     def __init__(self, late_after_s: float) -> None:
         self._late_after_s = late_after_s
-        self._t_s, self._wall_s, self._least_s = inf, 0.0, 0.0
+        self._t_s, self._least_s = inf, 0.0
         self.missed_deadlines = 0
         self.worst_s = 0.0
 
@@ -182,10 +185,30 @@ class LatenessStatistics:
         if t_s < self._t_s:
             self._least_s = offset_s
         else:
-            self._least_s = min(offset_s, self._least_s + MAX_DRIFT * (wall_s - self._wall_s))
-        self._t_s, self._wall_s = t_s, wall_s
+            self._least_s = min(offset_s, self._least_s + MAX_DRIFT * (t_s - self._t_s))
+        self._t_s = t_s
         lag_s = offset_s - self._least_s
         if lag_s > self._late_after_s:
             self.missed_deadlines += 1
         self.worst_s = max(self.worst_s, lag_s)
         return lag_s
+
+
+class FrameAge:
+    """The largest age that a frame may have, by the echo of a drive: no clock has to agree with another one for it.
+
+    The robot got the drive after it was sent, and took the frame ``cmd.age`` later. What is left of the time until now
+    is the way of the drive and the way of the frame; how it is shared between the two is not known.
+    """
+
+    def __init__(self) -> None:
+        self._sent: list[tuple[int, float]] = [(-1, 0.0)] * SENT_DRIVES
+
+    def add_drive(self, seq: int, wall_s: float) -> None:
+        """A drive is sent."""
+        self._sent[seq % SENT_DRIVES] = seq, wall_s
+
+    def largest_s(self, echo: CommandEcho, wall_s: float) -> float:
+        """The largest age of a frame that is served now, s; 0 where it echoes no drive of this process."""
+        seq, sent_s = self._sent[echo.seq % SENT_DRIVES]
+        return max(wall_s - sent_s - echo.age, 0.0) if seq == echo.seq >= 0 else 0.0

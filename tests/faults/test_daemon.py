@@ -5,6 +5,7 @@ import asyncio
 import inspect
 import os
 import random
+import re
 import textwrap
 import time
 from collections.abc import Iterator
@@ -19,9 +20,10 @@ import ccatp
 from ccatp.daemon.danger_loop import DangerLoop
 from ccatp.daemon.main_loop import MainLoop
 from ccatp.errors import ExitStatus
-from ccatp.survey.state import Pause, Resume
+from ccatp.survey.state import FixNeed, Pause, Resume
 from tests.faults.linking import Measured
 from tests.support.daemon import Daemon, configuration, running_daemon, tell
+from tests.support.scenario import SurveyLoop
 
 PACKAGE = Path(ccatp.__file__).parent
 
@@ -216,6 +218,39 @@ async def test_planning_longer_than_a_frame_may_wait_pauses_nobody() -> None:
         # The danger loop, here in the same event loop, is blocked as well: that may cost another plan.
         assert len(planned) < 5
         assert not stale(daemon, planned[0] - 0.12, planned[-1] + 0.2)
+
+
+@pytest.mark.fault("L13")
+async def test_frames_that_are_old_for_good_are_reported_as_that_and_are_a_fault() -> None:
+    async with running_daemon(configuration(health__pause_limit_s=1.0, health__hold_limit_s=3.0)) as daemon:
+        await daemon.until(lambda: daemon.is_driving)
+        daemon.to_main.begin("delay", "to_client", delay_s=0.3, jitter_s=0.0)
+        mission: Any = daemon.main._runner.mission
+        await daemon.until(lambda: mission.state.cause.startswith("frames are 3"))
+        assert not daemon.is_driving
+        assert re.fullmatch(r"frames are 3\d\d ms old \(limit 150 ms\)", mission.state.cause)
+        assert not mission.state.is_faulted
+        await daemon.until(lambda: mission.state.is_faulted)
+        assert mission.state.cause.endswith("(limit 150 ms), for 3 s")
+        assert mission.state.fix is FixNeed.RELOCALIZE
+        assert {(entry["level"], entry["text"]) for entry in daemon.events("operator_message")} >= {
+            ("error", mission.state.cause)
+        }
+
+
+@pytest.mark.parametrize("rate", [-0.01, 0.01])
+async def test_a_robot_whose_clock_is_wrong_by_a_hundredth_is_not_late(rate: float) -> None:
+    """Its frames come every (1 + ``rate``) times their period."""
+    boot_s = asyncio.get_running_loop().time()
+    due_s = property(lambda robot: boot_s + (1.0 + rate) * robot.robot.next_t_s)
+    with patch.object(SurveyLoop, "next_frame_s", due_s):
+        async with running_daemon(configuration()) as daemon:
+            await daemon.until(lambda: daemon.is_driving)
+            begun_s = daemon.robot.robot.t_s
+            await daemon.until(lambda: daemon.robot.robot.t_s > begun_s + 8.0)
+            # By then it would be late by 80 ms, and for good.
+            await moving_again(daemon, asyncio.get_running_loop().time())
+            assert not daemon.main._runner.mission.state.is_faulted
 
 
 # -- another mirror ----------------------------------------------------------------------------------------------------

@@ -126,10 +126,10 @@ class Daemon:
         return [entry for entry in self.log if entry["event"] == event]
 
 
-def configuration(mirror: str = "fyst-m1") -> Config:
+def configuration(mirror: str = "fyst-m1", **settings: object) -> Config:
     """A survey of one panel, which begins to drive as soon as gravity is known."""
     how = {"run__filter": "kf", "run__seed": 5, "run__realtime_priority": 0, "sim__robot__port": 0}
-    return one_panel(run__mirror=mirror, **how)
+    return one_panel(run__mirror=mirror, **how, **settings)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable, Coroutine
+from math import sin
 from typing import Any
 
 import pytest
@@ -11,14 +12,14 @@ from ccatp.config.models import Config
 from ccatp.daemon.robot_session import (
     FIRST_DELAY_S,
     LONGEST_DELAY_S,
-    MAX_DRIFT,
+    FrameAge,
     LatenessStatistics,
     RobotSession,
     delay_s,
 )
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_link import RobotTimeout
-from ccatp.links.robot_messages import Hello, Joined, Sensors
+from ccatp.links.robot_messages import CommandEcho, Hello, Joined, Sensors
 from tests.faults.test_link import HELLO
 from tests.support.scenario import SurveyLoop
 
@@ -156,9 +157,10 @@ def serve(lag: LatenessStatistics, late_s: dict[int, float], frames: int = 100, 
 @pytest.mark.parametrize(("late_s", "slips"), [({}, 0), ({20: 0.3, 21: 0.29, 22: 0.28, 40: 0.019, 60: 0.021}, 4)])
 def test_late_frames_are_as_late_as_they_are_and_slips_are_counted(late_s: dict[int, float], slips: int) -> None:
     lag = LatenessStatistics(0.02)
-    assert serve(lag, late_s) == pytest.approx([late_s.get(k, 0.0) for k in range(100)], abs=1e-4)
+    # 0.1 ms a frame may be the drift of the clock, since the last one that was prompt.
+    assert serve(lag, late_s) == pytest.approx([late_s.get(k, 0.0) for k in range(100)], abs=4e-4)
     assert lag.missed_deadlines == slips
-    assert lag.worst_s == pytest.approx(max(late_s.values(), default=0.0), abs=1e-4)
+    assert lag.worst_s == pytest.approx(max(late_s.values(), default=0.0), abs=2e-4)
 
 
 def test_a_first_frame_that_was_late_is_soon_no_measure() -> None:
@@ -167,10 +169,37 @@ def test_a_first_frame_that_was_late_is_soon_no_measure() -> None:
     assert lag.add(1.0, 501.003 + 0.03) == pytest.approx(0.03, abs=1e-3)
 
 
-@pytest.mark.parametrize("drift", [-0.9 * MAX_DRIFT, 0.9 * MAX_DRIFT])
-def test_clocks_may_drift_apart(drift: float) -> None:
+@pytest.mark.parametrize("drift", [-0.01, -0.002, 0.002, 0.01])
+def test_clocks_may_drift_apart_by_a_hundredth(drift: float) -> None:
     assert max(serve(LatenessStatistics(0.02), {}, 50_000, drift)) == pytest.approx(0.0, abs=1e-6)
-    assert serve(LatenessStatistics(0.02), {49_999: 0.1}, 50_000, drift)[-1] == pytest.approx(0.1, abs=1e-4)
+    # What the drift may have been since the frame before, 0.2 ms, is not known.
+    assert serve(LatenessStatistics(0.02), {49_999: 0.1}, 50_000, drift)[-1] == pytest.approx(0.1, abs=3e-4)
+
+
+def test_the_rate_of_a_clock_may_wander() -> None:
+    lag, wall_s, worst_s = LatenessStatistics(0.02), 500.0, 0.0
+    for k in range(60_000):
+        wall_s += 0.01 * (1.0 + 0.01 * sin(2e-4 * k))
+        worst_s = max(worst_s, lag.add(0.01 * k, wall_s))
+    assert worst_s < 1e-6
+    assert lag.add(600.0, wall_s + 0.01 + 0.06) == pytest.approx(0.06, abs=3e-4)
+
+
+def test_the_age_of_frames_by_the_drives_that_they_echo() -> None:
+    age = FrameAge()
+    for k in range(
+        3000
+    ):  # each frame is 120 ms on its way, and echoes the drive that was sent 5 ms before it was taken
+        age.add_drive(k, 10.0 + 0.01 * k)
+        if k >= 12:
+            assert age.largest_s(CommandEcho(k - 12, 0.005, 0.005, held=False), 10.005 + 0.01 * k) == pytest.approx(
+                0.12
+            )
+    assert (
+        age.largest_s(CommandEcho(2990, 0.3, 0.3, held=True), 40.1) == 0.0
+    )  # ages say that it was received before it was sent
+    # Of another process, of none, and of so long ago that its time is not known any more.
+    assert [age.largest_s(CommandEcho(seq, 0.0, 0.0, held=True), 99.0) for seq in (9000, -1, 100)] == [0.0, 0.0, 0.0]
 
 
 def test_a_clock_that_was_set_begins_anew() -> None:
