@@ -149,11 +149,7 @@ def svg_of(figure: "Figure", *, is_file: bool = False) -> str:
         figure.savefig(
             text, format="svg", dpi=_RASTER_DPI, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
         )
-    root = ET.fromstring(text.getvalue())  # noqa: S314 - from matplotlib
-    for parent in list(root.iter()):
-        for child in list(parent):
-            if child.tag in (f"{{{SVG}}}metadata", f"{{{SVG}}}style"):
-                parent.remove(child)
+    root = ET.fromstring(re.sub("<style.*?</style>", "", text.getvalue()))  # noqa: S314 - from matplotlib
     for element in root.iter():
         _shorten(element)
     if not is_file:

@@ -161,13 +161,8 @@ async def test_too_many_commands_at_a_time(rig: Rig) -> None:
 
 
 async def test_pages_of_others_command_nothing_and_read_nothing(rig: Rig) -> None:
-    for headers, code, message in (
-        ({"origin": "http://evil.example"}, 403, "commands from pages of http://evil.example are not taken"),
-        ({"sec_fetch_site": "cross-site"}, 403, "commands from pages of other sites (cross-site) are not taken"),
-        ({"host": "evil.org"}, 421, "this is not evil.org; ask by address, or add the name to dashboard.host_names"),
-    ):
-        reply = await rig.ask("POST", "/abort", **headers)
-        assert (reply.code, reply.data["message"], rig.asked) == (code, message, [])
+    for headers, code in (({"origin": "http://evil.example"}, 403), ({"host": "evil.org"}, 421)):
+        assert ((await rig.ask("POST", "/abort", **headers)).code, rig.asked) == (code, [])
     for path in ("/", "/status", "/events", "/ground", "/metrics", "/static/page.js"):
         assert (await rig.ask("GET", path, host="evil.example")).code == 421
         reply = await rig.ask("GET", path if path != "/events" else "/status", origin="http://evil.example")

@@ -184,7 +184,10 @@ class Broken:
         return getattr(self._db, name)
 
 
-ERRORS = ("SQLITE_IOERR_FSYNC", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_DIR_FSYNC", "SQLITE_CORRUPT", "SQLITE_READONLY")
+ERRORS = (
+    "SQLITE_IOERR_FSYNC", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_DIR_FSYNC", "SQLITE_CORRUPT", "SQLITE_READONLY",
+    "SQLITE_FULL",
+)  # fmt: skip
 
 
 @pytest.mark.fault("P15")
@@ -204,6 +207,7 @@ def test_after_an_error_nothing_is_acknowledged(tmp_path: Path, name: str, measu
         store.record_arrival(POINTS[0], 1.0, 0.0)
         assert broken.commits == commits  # it is not even tried
         assert store.failure is not None
+    assert store.record_skipped(POINTS[1], 1.0).exception() is store.failure
     measured("P15", acknowledged)
     assert acknowledged == 0
     with MissionStore.open(path, mirror="fyst-m1") as store:

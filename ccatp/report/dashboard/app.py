@@ -52,7 +52,8 @@ GAUGES: tuple[tuple[str, str, str, Callable[[Any], float | None]], ...] = (
     ("drive_age_seconds", "Age of the drive in force, by the robot.", "robot", lambda r: r["drive_age_s"]),
     ("permit_age_seconds", "Age of the permit in force, by the robot.", "robot", lambda r: r["permit_age_s"]),
     ("robot_faults", "Faults that the robot reports.", "robot", lambda r: len(r["faults"])),
-    ("position_sigma_meters", "Root of the summed variances of x and y.", "pose", lambda p: _sigma_m(*p.covariance_m2)),
+    ("position_sigma_meters", "Root of the summed variances of x and y.", "pose",
+     lambda p: sqrt(max(p.covariance_m2[0] + p.covariance_m2[2], 0.0))),
 )  # fmt: skip
 COUNTERS = {"late_frames", "process_restarts"}
 POINT_COUNTS = {"planned": "total", "measured": "done", "skipped": "skipped"}
@@ -103,10 +104,6 @@ class StateCollector(Collector):
             yield "fan_duty_ratio", "Duty of the fans, as the robot echoes it, 0 to 1.", ("side",), fans
 
 
-def _sigma_m(xx: float, _xy: float, yy: float) -> float:
-    return sqrt(max(xx + yy, 0.0))
-
-
 STATIC = Path(__file__).resolve().parent / "static"
 COMMANDS = (OperatorCommand.PAUSE, OperatorCommand.RESUME, OperatorCommand.ABORT, OperatorCommand.STOP)
 # Of all pages together; an operator has one at a time.
@@ -138,15 +135,14 @@ class CommandEndpoint:
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, timeout_s: float) -> None:
         self._context: zmq.asyncio.Context = zmq.asyncio.Context.shadow(context)
         self._endpoint, self._timeout_s = endpoint, timeout_s
-        self._pending = 0
+        self._slots = asyncio.Semaphore(MAX_COMMANDS)
 
     async def ask(self, command: OperatorCommand) -> CommandRefusal | None:
         """Send a command and wait until it took effect, or return why it did not."""
-        if self._pending >= MAX_COMMANDS:
+        if self._slots.locked():
             return CommandRefusal(503, f"{command}: {MAX_COMMANDS} commands wait for their answers already")
-        self._pending += 1
         try:
-            async with asyncio.timeout(self._timeout_s):
+            async with self._slots, asyncio.timeout(self._timeout_s):
                 with self._context.socket(zmq.DEALER) as peer:
                     peer.setsockopt(zmq.LINGER, 0)
                     peer.setsockopt(zmq.MAXMSGSIZE, MAX_REPLY_BYTES)
@@ -158,8 +154,6 @@ class CommandEndpoint:
             return CommandRefusal(504, f"{command}: no answer from the main loop within {self._timeout_s:g} s")
         except BadRequest as error:
             return CommandRefusal(502, f"{command}: the main loop answered with {error}")
-        finally:
-            self._pending -= 1
         return None if reply["ok"] else CommandRefusal(409, f"{command}: {reply.get('error', 'refused')}")
 
 
@@ -201,7 +195,6 @@ def build_app(
     ``ground`` is what does not change during a run, see ``survey_view.ground``; ``token`` is required with commands.
     """
     static = StaticFiles(directory=STATIC)
-    ground_json = msgspec.json.encode(ground)
     registry = CollectorRegistry()
     registry.register(StateCollector(hub.state, lambda: hub.pages, ground))
 
@@ -209,7 +202,7 @@ def build_app(
         return await static.get_response("index.html", request.scope)
 
     async def send_ground(_request: Request) -> Response:
-        return Response(ground_json, media_type="application/json")
+        return _json(ground)
 
     async def events(_request: Request) -> Response:
         return StreamingResponse(hub.events(), media_type="text/event-stream", headers={"x-accel-buffering": "no"})

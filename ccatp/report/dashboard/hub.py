@@ -59,16 +59,13 @@ class BusReader:
         self._open: dict[str, dict[str, Subscriber]] = {name: {} for name in self._rows}
         self._read("always", True)
 
-    def read_levels(self, wanted: bool) -> None:
-        """Subscribe to display state and verdict, of which only the newest counts, or end that."""
-        if self._open["levels"] and not wanted:
+    def read(self, *, levels: bool, track: bool) -> None:
+        """Subscribe, or end that: to display state and verdict, of which only the newest counts; to path and truth."""
+        if self._open["levels"] and not levels:
             self._view.discard_picture()
-        self._read("levels", wanted)
-
-    def read_track(self, wanted: bool) -> None:
-        """Subscribe to the path as it is driven and, in simulation, the truth, or end that."""
-        self._view.is_tracking = wanted
-        self._read("track", wanted)
+        self._view.is_tracking = track
+        self._read("levels", levels)
+        self._read("track", track)
 
     def drain(self, now_s: float) -> None:
         """Pass the received messages on to the view."""
@@ -184,8 +181,8 @@ class StateBroadcaster:
 
     def _subscribe(self) -> None:
         has_pages = bool(self._pages)
-        self._reader.read_track(has_pages)
-        self._reader.read_levels(has_pages or time.monotonic() - self._requested_s < LEVELS_S)
+        is_asked = time.monotonic() - self._requested_s < LEVELS_S
+        self._reader.read(levels=has_pages or is_asked, track=has_pages)
 
 
 def _event(name: str, data: dict[str, Any]) -> bytes:

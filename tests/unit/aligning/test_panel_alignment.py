@@ -247,10 +247,6 @@ def test_panels_count_with_their_area_across_the_beam() -> None:
     assert found.after_m == pytest.approx(1e-6)
 
 
-def test_no_panels_have_no_error() -> None:
-    assert mirror_wavefront([]) is None
-
-
 # -- whole mirrors -----------------------------------------------------------------------------------------------------
 
 

@@ -37,7 +37,7 @@ from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.store import StoredPoint, StoredSurvey
 from ccatp.report.dashboard.access import command_refusal, host_refusal, read_token
 from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground
-from ccatp.report.dashboard.survey_view import SurveyView, ground
+from ccatp.report.dashboard.survey_view import SurveyView
 from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView
 from tests.support.scenario import config_of, mirror_of
 
@@ -239,13 +239,6 @@ def test_what_was_measured_before_is_there(view: SurveyView) -> None:
     everything = view.everything(0.0)
     assert [row[:2] for row in everything["points"]] == [[0, MEASURED], [1, MEASURED], [2, MEASURED], [4, SKIPPED]]
     assert [row[0] for row in everything["series"]["arrival"]] == [8.0, 9.0, 10.0]
-
-
-def test_the_ground_of_a_survey() -> None:
-    found = json.loads(msgspec.json.encode(ground(MIRROR, CFG, is_sim=True, needs_token=False)))
-    assert (found["title"], found["is_sim"]) == ("fyst-m1", True)
-    assert (len(found["panels"]), len(found["points"]), found["points"][0][0]) == (77, 18, "1-2-7")
-    assert len(found["rim"]) > 4
 
 
 # -- missions among beacons -------------------------------------------------------------------------------------------
