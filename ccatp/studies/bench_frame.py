@@ -79,7 +79,11 @@ def frame_cases(cfg: Config, run_args: Sequence[str], *, quick: bool) -> list[di
         *(lockstep_case(f"lockstep, {what}, {name}", runs[name], frame_us, wall_us[name]) for name in LOADS),
         *process_cases(runs[IDLE], frame_us, [cpu_us for _, cpu_us in calibrated[IDLE]]),
     ]
-    return cases if quick else [*cases, real_time_case(frame_us, run_args)]
+    if quick:
+        return cases
+    wall = lockstep_run(1, (*run_args, "--realtime")).summary["wall"]
+    case = _case("main loop in real time, computing", [wall["tick_us_p50"]], "the time between two frames", [frame_us])
+    return [*cases, case | {"us_p99": wall["tick_us_p99"]}]
 
 
 def rehearsal(cfg: Config, panels: int) -> tuple[float, float]:
@@ -219,10 +223,3 @@ def process_cases(runs: Sequence[LockstepRun], frame_us: float, peer_us: Sequenc
             f"CPU time of a lockstep frame, {name}", [us for us, _ in uses], f"{CALIBRATOR}, CPU time", peer_us
         )
         yield case | {"wake_ups": median(wake_ups for _, wake_ups in uses)}
-
-
-def real_time_case(frame_us: float, run_args: Sequence[str]) -> dict[str, Any]:
-    """Computing time of the main loop in real time, against the time between two frames."""
-    wall = lockstep_run(1, (*run_args, "--realtime")).summary["wall"]
-    case = _case("main loop in real time, computing", [wall["tick_us_p50"]], "the time between two frames", [frame_us])
-    return case | {"us_p99": wall["tick_us_p99"]}

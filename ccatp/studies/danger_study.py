@@ -6,7 +6,7 @@ Set points are constant; slip, sensors and panel edges are as in the world, cree
 """
 
 from collections.abc import Callable, Sequence
-from math import cos, hypot, pi, radians, sin
+from math import cos, erf, hypot, pi, radians, sin, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,7 @@ _RUN_DOWN_S = 1.0  # a robot without set point has stopped after this: a dozen t
 _BLIND_M = 0.4  # an edge that was not seen by now is not going to be seen
 _DRIVES = 25  # of each kind in a job
 _TRANSITS, _RIM = 3, 4  # streams of random numbers of a seed
+_CONFIDENCE = erf(1.96 / sqrt(2.0))  # 95 %: within 1.96 standard deviations
 _RESAMPLES = 2000
 
 
@@ -250,7 +251,7 @@ def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     for name in RULES:
         false_edges = sum(outcome.values[name]["false_edges"] for outcome in outcomes)
         # Wilson 1927: sensible for 0 hits, too
-        interval = binomtest(false_edges, transits).proportion_ci(method="wilson")
+        interval = binomtest(false_edges, transits).proportion_ci(_CONFIDENCE, "wilson")
         values[name] = {
             "false_edges": false_edges,
             "false_edge_probability": false_edges / transits,

@@ -15,7 +15,7 @@ from ccatp.beacons.navigation import MeasurementReader
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import FloatArray, Verdict
-from ccatp.filters.metrics import nees
+from ccatp.filters.metrics import nees, rms
 from ccatp.links.beacon_messages import (
     TRACK_COLUMNS,
     TRUTH_COLUMNS,
@@ -195,10 +195,10 @@ def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
         "band": [low, high],
         "in_band": float(np.mean((each >= low) & (each <= high))),
         "nis": sum(run["nis_mean"] * run["readings"] for run in runs) / readings,
-        "position_m": _root([run["position_m"] for run in runs]),
-        "position_expected_m": float(np.sqrt(np.mean(sigmas**2))),
-        "map_m": _root([run["map_m"] for run in runs]),
-        "map_expected_m": _root([run["map_expected_m"] for run in runs]),
+        "position_m": rms(np.array([run["position_m"] for run in runs])),
+        "position_expected_m": rms(sigmas),
+        "map_m": rms(np.array([run["map_m"] for run in runs])),
+        "map_expected_m": rms(np.array([run["map_expected_m"] for run in runs])),
     }
     arrays = {"nees": each, "error_m": np.sqrt((errors**2).mean(axis=0)), "sigma_m": np.sqrt((sigmas**2).mean(axis=0))}
     return JobOutcome(values, arrays)
@@ -221,10 +221,6 @@ def draw(cells: Sequence[CellResult], out: Path) -> None:
         below.plot(seconds, cell.arrays["nees"], color=colour(0), linewidth=1.2, label="mean NEES of the pose")
         below.set(xlabel="seconds since the map", ylabel="for each degree of freedom", ylim=(0.0, 2.5))
         below.legend(frameon=False, fontsize=8, ncols=2)
-
-
-def _root(values: Sequence[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 STUDY = Study(

@@ -190,11 +190,9 @@ def replay(
 ) -> Replayed:  # fmt: skip
     """Run the localizer of a configuration over the events of a run, from its start at base.
 
-    ``on_frame`` gets the robot time of each frame, s. ValueError: the filter has no smoother. FilterError: the smoothed
+    ``smooth`` only where ``has_smoother``. ``on_frame`` gets the robot time of each frame, s. FilterError: the smoothed
     state is not finite, or the smoother would have to go across a restart.
     """
-    if smooth and not has_smoother(cfg):
-        raise ValueError(f"no smoother for filter {cfg.run.filter}: the pose is not in it")
     player = _Player(cfg, mirror, smooth)
     for event in events:
         if isinstance(event, Fixed):
@@ -318,14 +316,6 @@ def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: Arr
     return ReplayErrors(distance, turn, np.isin(seqs, moving), np.isin(seqs, arrivals), squares)
 
 
-def fix_distances_m(estimate: Trace, feet: FloatArray, mirror: Mirror) -> FloatArray:
-    """How far each fix was from the estimate before it, m, shape (f,); ``feet`` as in ``Replayed``."""
-    x, y = feet[:, 1], feet[:, 2]
-    places = estimate.place[np.searchsorted(estimate.seq, feet[:, 0])]
-    distances: FloatArray = np.linalg.norm(places - np.column_stack([x, y, mirror.surface.heights_m(x, y)]), axis=1)
-    return distances
-
-
 def figures(errors: ReplayErrors) -> dict[str, Any]:
     """The figures of a table: lengths in mm, angles in mrad; None where there is nothing to take them from."""
     distance_mm = 1e3 * errors.distance_m
@@ -390,11 +380,13 @@ def judge(parts: Sequence[ReplayEvaluation]) -> dict[str, Any]:
         return ReplayErrors(*(np.concatenate(column) for column in zip(*each, strict=True)))
 
     def fix_distance_mm(estimates: Sequence[Trace]) -> dict[str, float | None]:
-        each = [
-            fix_distances_m(estimate, part.replayed.feet, part.mirror)
-            for part, estimate in zip(parts, estimates, strict=True)
-        ]
-        return _distribution(1e3 * np.concatenate(each))
+        """How far each fix was from the estimate before it."""
+        each = []
+        for part, estimate in zip(parts, estimates, strict=True):
+            seq, x, y = part.replayed.feet.T
+            places = estimate.place[np.searchsorted(estimate.seq, seq)]
+            each.append(places - np.column_stack([x, y, part.mirror.surface.heights_m(x, y)]))
+        return _distribution(1e3 * np.linalg.norm(np.concatenate(each), axis=1))
 
     return {
         "reference": "truth" if has_truth else "recorded",

@@ -132,8 +132,6 @@ class _Replica(SilRun):
     """A mission over the block's waypoints that may have the period error; ``run.panels`` counts the block's."""
 
     def __init__(self, cfg: Config, period_error: float) -> None:
-        if period_error and cfg.run.filter != "kf":
-            raise ValueError(f"the filter {cfg.run.filter!r} reads time stamps: only kf can have a period error")
         panels = cfg.run.panels
         cfg = cfg.model_copy(update={"run": cfg.run.model_copy(update={"panels": 0})})
         super().__init__(cfg, with_track=True)
@@ -185,7 +183,7 @@ def cells() -> Sequence[Cell]:
 
 
 def run_job(job: Job) -> JobOutcome:
-    """One simulation run, as the thesis measures it (ValueError: a period error of a filter that reads time stamps).
+    """One simulation run, as the thesis measures it.
 
     Arrays: ``waypoint_m``, distance of each stop from its waypoint; ``track``: t, true x, y, estimated x, y, shape
     (j, 5); histogram of the distance of true and estimated position, every frame until the last stop.

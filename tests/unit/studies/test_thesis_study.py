@@ -55,12 +55,6 @@ def test_a_fixed_step_believes_in_a_shorter_way() -> None:
     assert localizer.counts["fixes"] == 1
 
 
-def test_only_a_filter_with_a_fixed_step_can_have_a_period_error() -> None:
-    cfg = load_config(overrides=overrides_of("normal", noise_is_variance=False, period_error=0.0, is_ours=True))
-    with pytest.raises(ValueError, match="'ekf' reads time stamps: only kf can have a period error"):
-        run_job(Job("thesis", {"period_error": 0.013}, 1, cfg))
-
-
 def outcome(fraction: float, mean: float) -> JobOutcome:
     figures = {"within_10mm_fraction": fraction, "mean": mean, "max": 20.0}
     values = {"outcome": "complete", "cause": "", "waypoints": 36, "wanted": 36, "time_s": 500.0}
