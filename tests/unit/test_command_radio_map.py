@@ -1,6 +1,7 @@
 """The command ``ccatp radio map``: its JSON and files, recorded and wrong ranges, ranges in space, its refusals."""
 
 import re
+import tomllib
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
@@ -9,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.beacons.datasets.sheets import read_beacons
 from ccatp.cli import main
 from tests.support.command import answered, refused
 from tests.unit.beacons.cricket.fields import ALL, HEADS, FloatArray
@@ -58,7 +58,7 @@ def test_few_pairs_are_told_before_they_are_estimated(capsys: pytest.CaptureFixt
 def test_all_pairs_reach_the_target(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, figure = tmp_path / "beacons.toml", tmp_path / "map.svg"
     data = mapped(capsys, "--method", "ekf", "--seeds", "5", "--out", str(out), "--figure", str(figure))
-    assert len(read_beacons(out).names) == 18
+    assert len(tomllib.loads(out.read_text())["beacons"]) == 18
     assert figure.stat().st_size > 10_000
     assert (data["rank_deficiency"], data["fold_over_risk"]) == (0, False)
     assert data["rms_m"]["p50"] < 0.007
@@ -74,13 +74,12 @@ def test_the_batch_and_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[s
     data = mapped(capsys, "--config", str(config), "--seed", "4", "--out", str(out), "--figure", str(figure))
     assert data["rms_m"]["p50"] < 1.6 * data["crlb_m"]
     assert figure.read_bytes().startswith(b"\x89PNG")
-    beacons = read_beacons(out)
-    assert len(beacons.names) == 18
-    at = beacons.names.index("N1-1")
-    assert beacons.positions_m[at] == pytest.approx([0.0, 1.0])
-    assert beacons.positions_m[beacons.names.index("N6-1")] == pytest.approx([5.0, 8.0], abs=0.05)
-    assert beacons.covariance_m2.shape == (36, 36)
-    assert np.linalg.eigvalsh(beacons.covariance_m2)[0] > -1e-12
+    written = tomllib.loads(out.read_text())
+    assert len(written["beacons"]) == 18
+    assert written["beacons"]["N1-1"]["position_m"] == pytest.approx([0.0, 1.0])
+    assert written["beacons"]["N6-1"]["position_m"] == pytest.approx([5.0, 8.0], abs=0.05)
+    assert np.shape(written["joint"]["covariance_m2"]) == (36, 36)
+    assert np.linalg.eigvalsh(written["joint"]["covariance_m2"])[0] > -1e-12
 
 
 def test_measured_ranges(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -92,7 +91,8 @@ def test_measured_ranges(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     out = tmp_path / "b.toml"
     data = mapped(capsys, "--ranges", str(path), "--out", str(out), "--figure", str(tmp_path / "m.png"))
     assert data["rms_m"] == {"p10": None, "p50": None, "p90": None}
-    assert read_beacons(out).positions_m[0] == pytest.approx([0.0, 0.0], abs=1e-12)
+    first = next(iter(tomllib.loads(out.read_text())["beacons"].values()))
+    assert first["position_m"] == pytest.approx([0.0, 0.0], abs=1e-12)
 
 
 def test_the_report_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -269,7 +269,8 @@ def test_ranges_in_space_mapped_in_the_plane(tell: Any, tmp_path: Path) -> None:
     assert "--dimension 3" in denied
     assert data["expected_rms_m"] is None
     assert not any("--offset" in warning for warning in data["warnings"])
-    assert np.sqrt(read_beacons(out).covariance_m2.diagonal().max()) > 0.1  # metres off, and it shows
+    covariance_m2 = tomllib.loads(out.read_text())["joint"]["covariance_m2"]
+    assert np.sqrt(np.diag(covariance_m2).max()) > 0.1  # metres off, and it shows
 
 
 def test_no_scale_where_none_can_be_told(tell: Any) -> None:

@@ -22,17 +22,9 @@ from ccatp.beacons.datasets.tables import (
 )
 from ccatp.beacons.datasets.trajectory import bridged, checked_heading, pose_of_truth, steps_of_speeds, turning_factor
 from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
-from ccatp.core import FloatArray, IntArray
+from ccatp.core import FloatArray
 
 NO_RANGE = "no range within the time of the odometry"
-
-
-def _run(
-    name: str, kind: str, steps: Steps, readings: Readings, beacon_ids: tuple[str, ...],
-    places_m: dict[str, tuple[float, float]], truth: ReferencePath | None, warnings: list[str],
-) -> RecordedRun:  # fmt: skip
-    first_pose = pose_of_truth(truth, steps, warnings)
-    return RecordedRun(name, kind, steps, readings, beacon_ids, places_m, truth, first_pose, tuple(warnings))
 
 
 def _truth(reference: Table | None, steps: Steps, warnings: list[str]) -> ReferencePath | None:
@@ -48,14 +40,25 @@ def _truth(reference: Table | None, steps: Steps, warnings: list[str]) -> Refere
     return checked_heading(ReferencePath(t, x, y, heading), steps, warnings)
 
 
-def _readings(times_s: FloatArray, beacon: IntArray, range_m: FloatArray) -> Readings:
-    return Readings(times_s, beacon, range_m, np.full(len(times_s), np.nan), np.full(len(times_s), np.nan))
+def _run(
+    name: str, kind: str, steps: Steps, heard: FloatArray, places_m: dict[str, tuple[float, float]],
+    truth: ReferencePath | None, warnings: list[str],
+) -> RecordedRun:  # fmt: skip
+    """``heard``: time, number of the beacon, range and, if there are any, bearing, shape (m, 3 or 4)."""
+    ids, index = np.unique(heard[:, 1].astype(np.int64), return_inverse=True)
+    unknown = np.full(len(heard), np.nan)
+    bearing_rad = heard[:, 3] if heard.shape[1] > 3 else unknown
+    readings = Readings(heard[:, 0], index.astype(np.int64), heard[:, 2], bearing_rad, unknown)
+    first_pose, names = pose_of_truth(truth, steps, warnings), tuple(map(str, ids.tolist()))
+    return RecordedRun(name, kind, steps, readings, names, places_m, truth, first_pose, tuple(warnings))
 
 
-def _names_of(ids: FloatArray) -> tuple[tuple[str, ...], IntArray]:
-    """Names of beacons and the index of each row into them, from a column of whole numbers."""
-    unique, index = np.unique(ids.astype(np.int64), return_inverse=True)
-    return tuple(str(i) for i in unique.tolist()), index.astype(np.int64)
+def _inside(file: Path, rows: FloatArray, steps: Steps, what: str, warnings: list[str]) -> FloatArray:
+    """Rows within the time of the odometry. Raises RadioDataError: there are none."""
+    rows = rows[within(rows[:, 0], steps.times_s, what, warnings)]
+    if not len(rows):
+        raise RadioDataError(file, NO_RANGE)
+    return rows
 
 
 def _plain_or_gzipped(folder: Path, name: str) -> Path | None:
@@ -97,18 +100,14 @@ def read_plaza(path: Path) -> RecordedRun:
     ranges = tables["TD"].in_order(warnings).values
     reference = tables["GT"].in_order(warnings) if "GT" in tables else None
     steps = _plaza_steps(file, odometry, None if reference is None else float(reference.values[0, 0]))
-    ranges = ranges[within(ranges[:, 0], steps.times_s, "range", warnings)]
-    if not len(ranges):
-        raise RadioDataError(file, NO_RANGE)
-    beacon_ids, beacon = _names_of(ranges[:, 2])
+    ranges = _inside(file, ranges, steps, "range", warnings)
     truth = _truth(reference, steps, warnings)
     surveyed = tables["TL"].finite(warnings).values.tolist() if "TL" in tables else []
     places_m = {str(int(i)): (x, y) for i, x, y in surveyed}
     name = file.name.split(".")[0]
     for kind in PLAZA:
         name = name.removesuffix(f"_{kind}")
-    readings = _readings(ranges[:, 0], beacon, ranges[:, 3])
-    return _run(name.rstrip("_"), "plaza", steps, readings, beacon_ids, places_m, truth, warnings)
+    return _run(name.rstrip("_"), "plaza", steps, ranges[:, [0, 2, 3]], places_m, truth, warnings)
 
 
 def _plaza_file(folder: Path) -> Path:
@@ -217,14 +216,12 @@ def read_mrclam(path: Path, robot: int | None) -> RecordedRun:
     kept = subjects > LAST_ROBOT_SUBJECT
     if not kept.any():
         raise RadioDataError(seen_file, "no reading of a landmark within the time of the odometry")
-    beacon_ids, beacon = _names_of(subjects[kept])
     reference = _plain_or_gzipped(folder, f"Robot{robot}_Groundtruth.dat")
     rows = None if reference is None else read_table(reference, REFERENCE).in_order(warnings)
     truth = _truth(rows, steps, warnings)
     places_m = _landmarks(folder, warnings)
-    readings = _readings(seen[kept, 0], beacon, seen[kept, 2])._replace(bearing_rad=seen[kept, 3])
-    name = f"{folder.resolve().name} robot {robot}"
-    return _run(name, "mrclam", steps, readings, beacon_ids, places_m, truth, warnings)
+    heard = np.column_stack([seen[:, 0], subjects, seen[:, 2:]])[kept]
+    return _run(f"{folder.resolve().name} robot {robot}", "mrclam", steps, heard, places_m, truth, warnings)
 
 
 def _subjects(folder: Path, barcodes: FloatArray, warnings: list[str]) -> FloatArray:
@@ -289,20 +286,15 @@ def read_labyrinth(path: Path) -> RecordedRun:
         line = int(odometry.lines[half_track <= 0.0][0])
         raise RadioDataError(file, "the distance between the wheels is not positive", line)
     steps = steps_of_speeds(t, 0.5 * (left + right), (right - left) / (2.0 * half_track), side)
-    ranges = tables["range2"].values
-    ranges = ranges[within(ranges[:, 0], steps.times_s, "range", warnings)]
-    if not len(ranges):
-        raise RadioDataError(file, NO_RANGE)
-    beacon_ids, beacon = _names_of(ranges[:, 5])
+    ranges = _inside(file, tables["range2"].values, steps, "range", warnings)
     truth = _truth(tables.get("gt2"), steps, warnings)
     if truth is not None:
         warnings += _wheel_columns(truth, steps, float(np.median(half_track)))
     places_m = {}
-    for k, name in enumerate(beacon_ids):
-        x_m, y_m = np.median(ranges[beacon == k, 3:5], axis=0).tolist()
-        places_m[name] = (x_m, y_m)
-    readings = _readings(ranges[:, 0], beacon, ranges[:, 1])
-    return _run(file.name.split(".")[0], "labyrinth", steps, readings, beacon_ids, places_m, truth, warnings)
+    for anchor in np.unique(ranges[:, 5]):
+        x_m, y_m = np.median(ranges[ranges[:, 5] == anchor, 3:5], axis=0).tolist()
+        places_m[str(int(anchor))] = (x_m, y_m)
+    return _run(file.name.split(".")[0], "labyrinth", steps, ranges[:, [0, 5, 1]], places_m, truth, warnings)
 
 
 def _wheel_columns(truth: ReferencePath, steps: Steps, half_track_m: float) -> list[str]:
@@ -384,7 +376,8 @@ def read_events_csv(file: Path) -> RecordedRun:
             name = names[int(index)]
             if places_m.setdefault(name, (x_m, y_m)) != (x_m, y_m):
                 raise RadioDataError(file, f"beacon {name} was surveyed at another place before", line)
-    return _run(file.name.split(".")[0], "csv", steps, readings, heard_ids, places_m, truth, warnings)
+    first_pose, name = pose_of_truth(truth, steps, warnings), file.name.split(".")[0]
+    return RecordedRun(name, "csv", steps, readings, heard_ids, places_m, truth, first_pose, tuple(warnings))
 
 
 def _event_steps(odometry: Table) -> Steps:

@@ -1,14 +1,13 @@
 """Sheets with a head that names the columns: signal levels by distance or place, ranges between motes, their places.
 
-CSV, sheets of a workbook, and folders of XBee logs ("Node A: -56"). Maps of beacons are written and read as TOML.
+CSV, sheets of a workbook, and folders of XBee logs ("Node A: -56"). Maps of beacons are written as TOML.
 """
 
 import csv
 import re
-import tomllib
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -309,21 +308,3 @@ def write_beacons(path: Path, found: BeaconPositions) -> None:
         path.write_text(_HEAD + tomlkit.dumps(tree | joint), encoding="utf-8")
     except OSError as error:
         raise RadioDataError(path, f"cannot be written: {error.strerror or error}") from error
-
-
-def read_beacons(path: Path) -> BeaconPositions:
-    """Read a map that ``write_beacons`` wrote. Raises RadioDataError: it cannot be read, or it is no such map."""
-    try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RadioDataError(path, f"cannot be read as a map of beacons: {error}") from error
-    try:
-        beacons: Mapping[str, Mapping[str, object]] = tree["beacons"]
-        positions = np.array([beacon["position_m"] for beacon in beacons.values()], dtype=np.float64)
-        covariance = np.array(tree["joint"]["covariance_m2"], dtype=np.float64)
-        frame = str(tree["frame"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise RadioDataError(path, f"is no map of beacons: {error}") from error
-    if positions.ndim != 2 or covariance.shape != (positions.size, positions.size):
-        raise RadioDataError(path, f"covariance of shape {covariance.shape} for {positions.size} coordinates")
-    return BeaconPositions(tuple(beacons), positions, covariance, frame)
