@@ -10,7 +10,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import Any
 
 import msgspec
 
@@ -49,6 +49,7 @@ class BadLine(ValueError):
 # colons has no other key and none twice: every key brings a colon of its own.
 _KEYS: dict[type, int] = {Sensors: 15, Drive: 5, Permit: 6, Fans: 3}
 _MAX_INTEGER_DIGITS = 400
+_NAMES_NOT_FINITE = {"nan": "NaN", "inf": "Infinity", "-inf": "-Infinity"}
 _FROM_ROBOT_TYPES = frozenset(("hello", "joined", "refused", "sensors"))
 _FROM_CLIENT_TYPES = frozenset(("join", "drive", "permit", "fans"))
 
@@ -164,17 +165,28 @@ def _unknown_or_bad(line: bytes, reason: str, known: frozenset[str]) -> Unknown:
 def _check_keys(line: bytes) -> Any:
     """Read the whole line slowly: no key twice, every number finite, also where the fast decoder skips."""
     try:
-        return json.loads(
-            line.decode("utf-8"),
-            object_pairs_hook=_object,
-            parse_float=_finite,
-            parse_int=_integer,
-            parse_constant=_refuse_constant,
-        )
+        value = json.loads(line.decode("utf-8"), object_pairs_hook=_object, parse_int=_integer)
+        place = _place_not_finite(value)
     except BadLine:
         raise
     except (ValueError, RecursionError) as error:
         raise BadLine(f"{type(error).__name__}: {str(error)[:80]}") from None
+    if place:
+        raise BadLine(place)
+    return value
+
+
+def _place_not_finite(value: Any, place: str = "") -> str:
+    """Where the first number is that JSON does not have, and what it is; or nothing."""
+    if isinstance(value, float):
+        return "" if math.isfinite(value) else f"{place or 'the line'} is {_NAMES_NOT_FINITE[str(value)]}"
+    if isinstance(value, dict):
+        parts = ((f"{place}.{key}" if place else key, item) for key, item in value.items())
+    elif isinstance(value, list):
+        parts = ((f"{place}[{k}]", item) for k, item in enumerate(value))
+    else:
+        return ""
+    return next(filter(None, (_place_not_finite(item, name) for name, item in parts)), "")
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -184,19 +196,8 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def _finite(text: str) -> float:
-    number = float(text)
-    if not math.isfinite(number):
-        raise BadLine(f"number {text[:20]} is not finite")
-    return number
-
-
 def _integer(text: str) -> int:
     # As a float it would be infinite: what is a number to one reader must not be none to the next.
     if len(text) > _MAX_INTEGER_DIGITS or not math.isfinite(float(text)):
         raise BadLine("integer of too many digits")
     return int(text)
-
-
-def _refuse_constant(text: str) -> NoReturn:
-    raise BadLine(f"{text} is no number of JSON")

@@ -187,7 +187,7 @@ class RobotLink(asyncio.Protocol):
                 message = decode_from_robot(line)
             except BadLine as error:
                 self._oddity = str(error)
-                self._count_bad()
+                self._count_bad(self._oddity)
                 continue
             if type(message) is Sensors and self._is_joined and message.seq > self._last_seq:
                 self._last_seq = message.seq
@@ -255,10 +255,10 @@ class RobotLink(asyncio.Protocol):
             self._hello = hello
             self.send_raw(encode(Join(role=self._role, client=self._client, mac=mac)))
 
-    def _count_bad(self) -> None:
+    def _count_bad(self, reason: str) -> None:
         self.counts["bad_lines"] += 1
-        if self._bad.add(asyncio.get_running_loop().time()):
-            self.abort("too many bad lines from the robot")
+        if self._bad.add(asyncio.get_running_loop().time(), reason):
+            self.abort(f"too many bad lines from the robot, the first: {self._bad.first_reason}")
         elif self._is_joined:
             self._on_bad_line()
 

@@ -209,11 +209,16 @@ class BadLineCounter:
 
     def __init__(self, limit: int = 20, window_s: float = 1.0) -> None:
         self._limit, self._window_s = limit, window_s
-        self._times_s: deque[float] = deque(maxlen=limit + 1)
+        self._lines: deque[tuple[float, str]] = deque(maxlen=limit + 1)
         self.total = 0
 
-    def add(self, now_s: float) -> bool:
+    @property
+    def first_reason(self) -> str:
+        """Reason of the oldest line of the window."""
+        return self._lines[0][1] if self._lines else ""
+
+    def add(self, now_s: float, reason: str) -> bool:
         """Count one bad line at ``now_s``; true when the session has to be closed."""
         self.total += 1
-        self._times_s.append(now_s)
-        return len(self._times_s) > self._limit and now_s - self._times_s[0] <= self._window_s
+        self._lines.append((now_s, reason))
+        return len(self._lines) > self._limit and now_s - self._lines[0][0] <= self._window_s

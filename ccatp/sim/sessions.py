@@ -111,8 +111,8 @@ class RobotSession(ABC):
                 self._server.refuse(self, "bad join")
                 return
             self._server.counts["bad_lines"] += 1
-            if self._bad.add(now_s):
-                self._server.drop(self, "too many bad lines")
+            if self._bad.add(now_s, str(error)):
+                self._server.drop(self, f"too many bad lines, the first: {self._bad.first_reason}")
 
 
 class RobotServer:

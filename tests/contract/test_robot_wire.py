@@ -187,8 +187,13 @@ def test_malformed_lines_of_a_client_are_refused(line: bytes) -> None:
     ("line", "reason"),
     [
         (b'{"type":"drive","seq":1,"seq":1,"ack":1,"wr":0,"wl":0}', "a key stands twice"),
-        (b'{"type":"drive","seq":1,"ack":1,"wr":0,"wl":0,"x":1e999}', "is not finite"),
-        (b'{"type":"drive","seq":1,"ack":1,"wr":0,"wl":0,"x":NaN}', "no number of JSON"),
+        (b'{"type":"drive","seq":1,"ack":1,"wr":0,"wl":0,"x":1e999}', "bad line: x is Infinity"),
+        (b'{"type":"drive","seq":1,"ack":1,"wr":NaN,"wl":0}', "bad line: wr is NaN"),
+        (
+            b'{"type":"drive","seq":1,"ack":1,"wr":0,"wl":0,"x":{"y":[[1,2],[3,-Infinity]]}}',
+            r"x\.y\[1\]\[1\] is -Infinity",
+        ),
+        (b"NaN", "the line is NaN"),
         (b'{"type":"drive","seq":1,"ack":1,"wr":0,"wl":0,"x":1' + b"0" * 500 + b"}", "too many digits"),
         (b'{"seq":1}', "no object with a type"),
         (b'{"type":"drive"}', "missing required field"),
@@ -336,8 +341,9 @@ def test_a_line_at_the_limit_passes_and_nothing_beyond_it_is_kept(limit: int) ->
 
 def test_bad_lines_are_counted_within_a_window() -> None:
     counter = BadLineCounter(limit=20, window_s=1.0)
-    assert not any(counter.add(0.04 * k) for k in range(20))
-    assert counter.add(0.9)
+    assert not any(counter.add(0.04 * k, f"reason {k}") for k in range(20))
+    assert counter.add(0.9, "reason 20")
+    assert counter.first_reason == "reason 0"
     slow = BadLineCounter(limit=20, window_s=1.0)
-    assert not any(slow.add(0.051 * k) for k in range(100))  # 19.6 a second
+    assert not any(slow.add(0.051 * k, "") for k in range(100))  # 19.6 a second
     assert slow.total == 100

@@ -167,7 +167,11 @@ async def test_bad_lines_and_unknown_types_are_counted_and_dropped() -> None:
 @pytest.mark.fault("S15")
 @pytest.mark.parametrize(
     ("flood", "reason"),
-    [(b"garbage\n" * 21, "too many bad lines"), (b"x" * 8193, "line over the limit")],
+    [
+        (frame(1).replace(b'"imu":[]', b'"imu":[[0.01,NaN,0.0]]') * 21, "the first: bad line: imu[0][1] is NaN"),
+        (b"garbage\n" * 21, "too many bad lines from the robot, the first: bad line: JSONDecodeError"),
+        (b"x" * 8193, "line over the limit"),
+    ],
 )
 async def test_a_robot_that_talks_nonsense_is_left(flood: bytes, reason: str) -> None:
     async with robot(after_join(frame(0) + flood + frame(1))) as (link, seen):
