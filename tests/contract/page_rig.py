@@ -171,6 +171,7 @@ async def page_rig(cfg: Config, folder: Path, *, has_daemon: bool = True) -> Asy
                     answering = tasks.create_task(router.serve())
                     yield rig
                     answering.cancel()
+                    await asyncio.wait([answering])
             else:
                 yield rig
             stop.set()
