@@ -5,7 +5,7 @@ from enum import IntEnum
 
 
 class ExitStatus(IntEnum):
-    """What ``ccatp`` tells the shell."""
+    """The exit status of ``ccatp``."""
 
     COMPLETE = 0
     REFUSED = 1  # a running daemon refused the command, and said why

@@ -51,7 +51,7 @@ class EstimateMessage(Message):
         """This estimate for one who has not looked at the one before: ``commanded`` spans the drives of both."""
         mine, its = self.commanded, missed.commanded
         if mine is None or its is None:
-            return self  # what is not told is not known
+            return self  # an unknown span stays unknown
         span = min(its[0], mine[0]), max(its[1], mine[1]), min(its[2], mine[2]), max(its[3], mine[3])
         return msgspec.structs.replace(self, commanded=span)
 
@@ -171,7 +171,7 @@ class Treatment(Message):
     """What the localizer is treated with from frame ``seq`` on, besides samples and fixes.
 
     Attributes:
-        kind: ``begun``: it begins anew before this frame, values are x (m), y (m), heading (rad), deck frame, and the
+        kind: ``begun``: it begins again before this frame, values are x (m), y (m), heading (rad), deck frame, and the
             standard deviations of place (m) and heading (rad); ``doubted``: after the samples of this frame its pose
             may be wrong by so much, m and rad; ``odometry_off``: from here on wheels and inertial unit are not used,
             the robot stands; ``odometry_on``: they are used again.
@@ -241,7 +241,7 @@ class BeaconMapMessage(Message):
     Attributes:
         pose_ellipse: x, y, and their covariance xx, xy, yy, m2.
         beacons: of each radio or mote on the map, the same.
-        target: of the radio that is followed, the same; ``None`` before it was heard.
+        target: of the radio that is followed, the same; ``None`` before it was received.
         obstacles: points in the room that the distance sensors saw lately.
         waypoints: all of them, in order; ``next_waypoint`` is the number of the one driven to, -1 for none.
         nis_sum, nis_size, refused: of all readings so far: normalised innovations squared, their degrees of freedom,

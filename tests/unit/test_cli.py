@@ -20,10 +20,10 @@ from ccatp.daemon.run_dir import RunOptions
 from ccatp.errors import ConfigError, DaemonUnreachableError, RefusedError
 from ccatp.links.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked
 from tests.support.command import refused
+from tests.unit.test_client import serving
 
 EMERGENCY_ID = "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"
 
-Router = Callable[[dict[str, Any]], list[tuple[str, Any]]]
 Stub = Callable[[str, str, Any], list[tuple[Any, ...]]]
 
 
@@ -46,36 +46,6 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> Stub:
         return calls
 
     return put
-
-
-@pytest.fixture
-def router(monkeypatch: pytest.MonkeyPatch) -> Router:
-    """Answers requests to a daemon; returns the list of them, as endpoint and payload."""
-
-    def put(answer: dict[str, Any]) -> list[tuple[str, Any]]:
-        calls: list[tuple[str, Any]] = []
-
-        def request(
-            endpoint: str, payload: bytes, timeout_s: float, curve: object, *, repeats: bool = False
-        ) -> dict[str, Any]:
-            assert timeout_s in {3.0, 10.0}  # as asked for, and as the default
-            asked = json.loads(payload)
-            calls.append((endpoint, asked))
-            return answer | {"id": asked["id"]} if answer.get("id") == "the same" else answer
-
-        monkeypatch.setattr("ccatp.links.client.request", request)
-        return calls
-
-    return put
-
-
-@pytest.fixture
-def daemon_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A runtime directory that looks as if a daemon had its sockets there."""
-    for name in ("control", "emergency"):
-        (tmp_path / name).touch()
-    monkeypatch.setenv("CCATP_RUNTIME_DIR", str(tmp_path))
-    return tmp_path
 
 
 def commands(group: click.Group, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -220,52 +190,55 @@ def test_expected_errors_are_one_line_and_their_exit_status(
 
 @pytest.mark.parametrize("command", ["status", "pause", "resume", "abort", "stop"])
 def test_the_operator_commands_ask_the_daemon(
-    command: str, router: Router, daemon_dir: Path, capsys: pytest.CaptureFixture[str]
+    command: str, runtime_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    calls = router({"ok": True, "id": "7", "code": 2})
-    assert main([command, "--timeout", "3"]) == 0
-    assert calls == [(f"ipc://{daemon_dir}/control", {"cmd": command})]
+    monkeypatch.setenv("CCATP_RUNTIME_DIR", str(runtime_dir))
+    with serving(runtime_dir, "control", lambda _: {"ok": True, "id": "7", "code": 2}) as asked:
+        assert main([command, "--timeout", "3"]) == 0
+    assert asked == [{"cmd": command}]
     assert capsys.readouterr().out == "id    7\ncode  2\n"
 
 
 def test_an_answer_may_be_shown_as_json_or_be_empty(
-    router: Router, daemon_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    runtime_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     reply = {"ok": True, "state": "driving", "error_mm": 0.25}
-    router(reply)
-    (tmp_path / "mine.toml").write_text(f'[run]\nruntime_dir = "{daemon_dir}"\n')
-    for where in (["--runtime-dir", str(daemon_dir)], ["--config", str(tmp_path / "mine.toml")]):
-        assert main(["status", "--json", *where]) == 0
-        assert json.loads(capsys.readouterr().out) == reply
-    router({"ok": True})
-    assert main(["pause"]) == 0
+    (tmp_path / "mine.toml").write_text(f'[run]\nruntime_dir = "{runtime_dir}"\n')
+    here = ["--runtime-dir", str(runtime_dir)]
+    with serving(runtime_dir, "control", lambda asked: reply if asked["cmd"] == "status" else {"ok": True}):
+        for where in (here, ["--config", str(tmp_path / "mine.toml")]):
+            assert main(["status", "--json", *where]) == 0
+            assert json.loads(capsys.readouterr().out) == reply
+        assert main(["pause", *here]) == 0
     assert capsys.readouterr().out == "ok\n"
 
 
-def test_an_emergency_goes_to_the_danger_process_with_an_id_of_its_own(router: Router, daemon_dir: Path) -> None:
-    calls = router({"ok": True, "id": "the same", "latched": True, "code": 2})
-    assert main(["emergency", "fire", "--note", "smoke", "--id", EMERGENCY_ID]) == 0
-    payload = {"cmd": "emergency", "kind": "fire", "id": EMERGENCY_ID, "note": "smoke"}
-    assert calls == [(f"ipc://{daemon_dir}/emergency", payload)]
-    assert main(["emergency", "power"]) == main(["emergency", "power"]) == 0
-    assert len({asked["id"] for _, asked in calls}) == 3
+def test_an_emergency_goes_to_the_danger_process_with_an_id_of_its_own(runtime_dir: Path) -> None:
+    here = ["--runtime-dir", str(runtime_dir)]
+    answer = {"ok": True, "latched": True, "code": 2}
+    with serving(runtime_dir, "emergency", lambda request: answer | {"id": request["id"]}) as asked:
+        assert main(["emergency", "fire", "--note", "smoke", "--id", EMERGENCY_ID, *here]) == 0
+        assert asked[0] == {"cmd": "emergency", "kind": "fire", "id": EMERGENCY_ID, "note": "smoke"}
+        assert main(["emergency", "power", *here]) == main(["emergency", "power", *here]) == 0
+    assert len({request["id"] for request in asked}) == 3
 
 
 @pytest.mark.parametrize(
     "answer",
     [
         {"ok": True},
-        {"ok": True, "id": "the same", "code": 0},
-        {"ok": True, "id": "the same", "latched": False, "code": 0},
-        {"ok": True, "id": "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11", "latched": True, "code": 2},
-        {"ok": 1, "id": "the same", "latched": True, "code": 2},
+        {"ok": True, "id": EMERGENCY_ID, "code": 0},
+        {"ok": True, "id": EMERGENCY_ID, "latched": False, "code": 0},
+        {"ok": True, "id": "7f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11", "latched": True, "code": 2},
+        {"ok": False},
     ],
 )
 def test_an_emergency_that_is_not_in_force_is_no_success(
-    answer: dict[str, Any], router: Router, daemon_dir: Path, capsys: pytest.CaptureFixture[str]
+    answer: dict[str, Any], runtime_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    router(answer)
-    refused(capsys, "emergency", "fire", status=5 if answer["ok"] is True else 1)
+    argv = ("emergency", "fire", "--id", EMERGENCY_ID, "--runtime-dir", runtime_dir)
+    with serving(runtime_dir, "emergency", lambda _: answer):
+        refused(capsys, *argv, status=5 if answer["ok"] else 1)
 
 
 def test_the_robot_alone_gets_its_address(stub: Stub) -> None:
@@ -289,16 +262,16 @@ def test_two_robots_alone_want_two_places(tmp_path: Path, capsys: pytest.Capture
         assert f"a simulated robot runs alone in {tmp_path}" in err
 
 
-def test_a_daemon_that_is_gone_is_told_at_once(
-    daemon_dir: Path, router: Router, capsys: pytest.CaptureFixture[str]
-) -> None:
-    calls = router({"ok": True})
-    with locked(daemon_dir / LOCK_FILE, ""):
-        assert main(["status"]) == 0
-    capsys.readouterr()
-    expected = f"ccatp: no daemon in {daemon_dir}; start one with ccatp run, or name its folder with --runtime-dir\n"
-    assert refused(capsys, "status", status=5) == expected
-    assert len(calls) == 1
+def test_a_daemon_that_is_gone_is_reported_at_once(runtime_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    here = ("status", "--runtime-dir", runtime_dir)
+    expected = f"ccatp: no daemon in {runtime_dir}; start one with ccatp run, or name its folder with --runtime-dir\n"
+    assert refused(capsys, *here, status=5) == expected
+    with serving(runtime_dir, "control", lambda _: {"ok": True}) as asked:
+        with locked(runtime_dir / LOCK_FILE, ""):
+            assert main([*map(str, here)]) == 0
+        capsys.readouterr()
+        assert refused(capsys, *here, status=5) == expected
+    assert len(asked) == 1
 
 
 def test_the_laser_system_alone_gets_its_puck(stub: Stub, tmp_path: Path) -> None:
@@ -311,15 +284,11 @@ def test_the_laser_system_alone_gets_its_puck(stub: Stub, tmp_path: Path) -> Non
     assert of_robot == [None, f"ipc://{tmp_path}/puck"]
 
 
-def test_a_good_configuration_is_called_ok(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_config_check_lists_every_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "mine.toml"
     file.write_text("[run]\nseed = 3\n")
     assert main(["config", "check", str(file)]) == 0
     assert capsys.readouterr().out == f"{file}: ok: mirror fyst-m1, 77 panels, world thesis, seed 3\n"
-
-
-def test_config_check_lists_every_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "mine.toml"
     file.write_text("[run]\nseed = -3\nsed = 2\n")
     assert main(["config", "check", str(file)]) == 2
     out, err = capsys.readouterr()
