@@ -7,6 +7,7 @@ import tempfile
 import tomllib
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,7 @@ def assert_in_force(said: Any, got: Any, where: str) -> None:
         assert isinstance(said, bool) == isinstance(got, bool), where
 
 
+@cache
 def dumped_config() -> dict[str, Any]:
     """The whole default configuration as a tree."""
     return tomllib.loads(dump_config(load_config()))
