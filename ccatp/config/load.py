@@ -3,9 +3,7 @@
 import difflib
 import json
 import os
-import re
 import tempfile
-import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +22,8 @@ from ccatp.config.messages import (
     find_line,
     format_key,
     format_value,
+    parse_toml,
+    read_text,
 )
 from ccatp.config.models import Config, MirrorConfig, WorldConfig
 from ccatp.config.package import configs_dir
@@ -85,19 +85,8 @@ def read_source(path: Path, root: Key = ()) -> ConfigSource:
 
     Raises ConfigError: there is no such file, or it is not TOML.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; name a TOML file that exists") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
-    try:
-        return ConfigSource(str(path), text, tomllib.loads(text), root)
-    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
-        at = re.search(r" \(at line (\d+), column (\d+)\)", str(error))
-        line = int(at[1]) if at else max(1, len(text.splitlines()))
-        what = re.sub(r" \(at .*\)$", "", str(error))
-        raise ConfigError(f"{path}:{line}: is not TOML: {what[:1].lower()}{what[1:]}") from error
+    text = read_text(path)
+    return ConfigSource(str(path), text, parse_toml(text, str(path)), root)
 
 
 def nested(dotted: Mapping[str, object]) -> Tree:

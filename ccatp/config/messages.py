@@ -1,4 +1,4 @@
-"""Keys, values and problems of a configuration as text: one line for each finding."""
+"""Configuration files as text; keys, values and problems in messages: one line for each finding."""
 
 import difflib
 import json
@@ -7,11 +7,13 @@ import re
 import tomllib
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 from pydantic import BaseModel
 
 from ccatp.config.models import Config
+from ccatp.errors import ConfigError
 
 Key = tuple[str | int, ...]
 
@@ -38,6 +40,27 @@ class ConfigProblem(NamedTuple):
     key: Key
     what: str
     related: tuple[Key, ...] = ()
+
+
+def read_text(path: Path) -> str:
+    """The text of a TOML file; raises ConfigError where there is none."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; name a TOML file that exists") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
+
+
+def parse_toml(text: str, name: str) -> dict[str, Any]:
+    """The content of the TOML file of that name; raises ConfigError, with the line, where it is not TOML."""
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
+        at = re.search(r" \(at line (\d+), column (\d+)\)", str(error))
+        line = int(at[1]) if at else max(1, len(text.splitlines()))
+        what = re.sub(r" \(at .*\)$", "", str(error))
+        raise ConfigError(f"{name}:{line}: is not TOML: {what[:1].lower()}{what[1:]}") from error
 
 
 def depth_in(tree: Any, key: Key) -> int:

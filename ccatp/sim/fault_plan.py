@@ -6,14 +6,13 @@ The plan is TOML and strict: each mistake is one line with file, line, key and a
 
 import json
 import math
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
 
 from pydantic import Field, ValidationError, create_model
 
-from ccatp.config.messages import choice_hint, faults_of, find_line, format_key, format_value
+from ccatp.config.messages import choice_hint, faults_of, find_line, format_key, format_value, parse_toml, read_text
 from ccatp.config.models import Model, NonNegative, Positive
 from ccatp.errors import ConfigError
 
@@ -255,10 +254,7 @@ class FaultPlan(NamedTuple):
 
 def parse_plan(text: str, name: str) -> FaultPlan:
     """The plan in a text; a ``ConfigError`` has a line per problem with file, line, key, what is wrong, what to do."""
-    try:
-        tree = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
-        raise ConfigError(f"{name}: is not TOML: {error}") from error
+    tree = parse_toml(text, name)
     problems = [
         f"{name}:{find_line(text, (section,))}: {section} is unknown; {choice_hint(section, _SECTIONS)}"
         for section in tree
@@ -283,13 +279,7 @@ def parse_plan(text: str, name: str) -> FaultPlan:
 
 def read_plan(file: Path, *, lockstep: bool) -> FaultPlan:
     """The plan in a file; errors as of ``parse_plan`` and ``check_pacing``."""
-    try:
-        text = file.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{file}: {(error.strerror or str(error)).lower()}; name a TOML file that exists") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{file}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
-    plan = parse_plan(text, str(file))
+    plan = parse_plan(read_text(file), str(file))
     check_pacing(plan, str(file), lockstep=lockstep)
     return plan
 

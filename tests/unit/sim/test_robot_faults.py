@@ -45,7 +45,7 @@ def test_the_page_names_every_signal_and_type() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[[fault]", "plan: is not TOML: "),
+        ("[[fault]", "plan:1: is not TOML: "),
         ("[[faults]]\nat_s = 1.0", "plan:1: faults is unknown; did you mean fault? available: fault, link"),
         ("fault = 3", "plan: fault must be a list of tables; begin each with [[fault]]"),
         ("[link]\nat_s = 1.0", "plan: link must be a list of tables; begin each with [[link]]"),
