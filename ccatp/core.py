@@ -102,10 +102,7 @@ class DeckPose(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """A multilaterated position of the puck, world frame.
-
-    ``covariance_m2`` is 3 x 3, row-major; ``dop`` is sqrt(trace((J^T J)^-1)), dimensionless.
-    """
+    """A multilaterated position of the puck, world frame; covariance 3 x 3, row-major; DOP sqrt(trace((J^T J)^-1))."""
 
     t_s: float
     position_m: Vector3
@@ -238,10 +235,7 @@ def difference(a_rad: float, b_rad: float) -> float:
 
 
 def bearing(dx_m: float, dy_m: float) -> float:
-    """Direction of the vector (dx, dy), rad from the x axis, counter-clockwise.
-
-    Thesis eq. 3.2 prints ``arctan(x, y)``; the angle from the x axis is ``atan2(y, x)``.
-    """
+    """Direction of (dx, dy), rad from the x axis, left positive. Thesis eq. 3.2 prints ``arctan(x, y)`` for it."""
     return atan2(dy_m, dx_m)
 
 
@@ -273,10 +267,7 @@ _UNITS = dict.fromkeys(("estimate", "sensors", "enc", "frames", "clock", "latenc
 
 
 def danger_text(cause: str, signal: str, value: float, limit: float) -> str:
-    """One line such as ``estimate stale: 0.31 s (limit 0.15 s)``.
-
-    A limit of 0 is none, a signal that ``cause`` names is left out.
-    """
+    """As ``estimate stale: 0.31 s (limit 0.15 s)``. A limit of 0 is none, a signal that ``cause`` names is left out."""
     named = signal.replace("_", " ")
     where = "" if not named or named in cause or signal.startswith("emergency") else f" ({named})"
     if not limit:

@@ -22,20 +22,8 @@ from typing import Any
 
 import msgspec
 
-from ccatp.conditions import (
-    ALL_OFF,
-    CENTRE_NEAR_RIM,
-    EDGE_SENSOR_STAYS_OFF,
-    EDGE_STALE,
-    ENCODERS_STALE,
-    ESTIMATE_NOT_FINITE,
-    ESTIMATE_STALE,
-    LIFTED,
-    NO_EDGE_SAMPLES,
-    NO_ESTIMATE,
-    NO_FRAME,
-    MonitorFinding,
-)
+from ccatp import conditions
+from ccatp.conditions import MonitorFinding
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
 from ccatp.core import Corner, EdgeSample, EventCode, Severity, Verdict, WheelSample
 from ccatp.links.robot_messages import Sensors
@@ -55,10 +43,7 @@ _NORMAL = EventCode.NORMAL  # a member looked up on its class in every frame cos
 
 
 class DangerMonitor(EmergencyRules):
-    """Judges sensors frames. Call ``step`` once per frame, ``stale`` when no frame came in time.
-
-    Without ``health`` there are no monitors: only the rules of edges, ages and emergencies.
-    """
+    """Judges sensors frames. Without ``health`` there are only the rules of edges, ages and emergencies."""
 
     def __init__(
         self, mirror: Mirror, robot: RobotConfig, cfg: DangerConfig, health: HealthConfig | None = None
@@ -177,11 +162,11 @@ class DangerMonitor(EmergencyRules):
         if self._health is None:
             return found
         if self._edges.is_lifted:
-            found.append(LIFTED.found("edge", 4.0, 3.0))
+            found.append(conditions.LIFTED.found("edge", 4.0, 3.0))
         limit_m = self._health.stuck_off_m
         for i, episode in enumerate(self._edges.episodes):
             if episode is not None and self._stays_off(i, episode, limit_m):
-                found.append(EDGE_SENSOR_STAYS_OFF.found(CORNERS[i].value, episode.retreat_m, limit_m))
+                found.append(conditions.EDGE_SENSOR_STAYS_OFF.found(CORNERS[i].value, episode.retreat_m, limit_m))
         return found
 
     def _stays_off(self, sensor: int, episode: EdgeDetector, limit_m: float) -> bool:
@@ -216,7 +201,7 @@ class DangerMonitor(EmergencyRules):
     def stale(self, seq: int, t_s: float) -> Verdict:
         """The verdict when no sensors frame came for ``stale_after_s`` after frame ``seq``: nothing permitted."""
         limit_s = self._cfg.stale_after_s
-        return self._denied(seq, t_s, NO_FRAME.found("sensors", limit_s, limit_s))
+        return self._denied(seq, t_s, conditions.NO_FRAME.found("sensors", limit_s, limit_s))
 
     def garbled(self, seq: int, t_s: float, at_s: float) -> Verdict | None:
         """A line after frame ``seq`` was no frame. The verdict where there were too many: nothing permitted."""
@@ -229,25 +214,25 @@ class DangerMonitor(EmergencyRules):
     def _samples_missing(self, t_s: float) -> MonitorFinding | None:
         limit_s = self._cfg.stale_after_s
         if self._edge_t_s is None:
-            return NO_EDGE_SAMPLES.found("edge", limit_s, limit_s)
+            return conditions.NO_EDGE_SAMPLES.found("edge", limit_s, limit_s)
         age_s = abs(t_s - self._edge_t_s)
         if not age_s <= limit_s:
-            return EDGE_STALE.found("edge", age_s, limit_s)
+            return conditions.EDGE_STALE.found("edge", age_s, limit_s)
         silent_s = self._edges.track.silence_s(t_s)
         # Without its wheels it is not known where the robot went meanwhile.
-        return ENCODERS_STALE.found("enc", silent_s, limit_s) if silent_s > 0.0 else None
+        return conditions.ENCODERS_STALE.found("enc", silent_s, limit_s) if silent_s > 0.0 else None
 
     def _estimate_missing(self, t_s: float, estimate: EstimateMessage | None) -> MonitorFinding | None:
         limit_s = self._cfg.estimate_stale_after_s
         if estimate is None:
-            return NO_ESTIMATE.found("estimate", limit_s, limit_s)
+            return conditions.NO_ESTIMATE.found("estimate", limit_s, limit_s)
         age_s = abs(t_s - estimate.t_s)
         if isfinite(age_s) and age_s > limit_s:
-            return ESTIMATE_STALE.found("estimate", age_s, limit_s)
+            return conditions.ESTIMATE_STALE.found("estimate", age_s, limit_s)
         if isfinite(age_s + estimate.x_m + estimate.y_m + estimate.heading_rad + estimate.sigma_m):
             return None
         # The values go out as JSON: an age that is not finite is no number there.
-        return ESTIMATE_NOT_FINITE.found("estimate", limit_s, limit_s)
+        return conditions.ESTIMATE_NOT_FINITE.found("estimate", limit_s, limit_s)
 
     # -- arbitration ----------------------------------------------------------------------------------------------
 
@@ -256,7 +241,7 @@ class DangerMonitor(EmergencyRules):
 
     def _arbitrate(self, seq: int, t_s: float, missing: MonitorFinding | None) -> Verdict:
         if self._edges.is_lifted:
-            shown = ALL_OFF.message, "edge", 4.0, 3.0
+            shown = conditions.ALL_OFF.message, "edge", 4.0, 3.0
             return Verdict(seq, t_s, EventCode.NEAR_EDGE, *shown, False, False, False, EVERYWHERE)
         declared = self._declared()
         if declared is not None or self._origin.direction:
@@ -277,7 +262,8 @@ class DangerMonitor(EmergencyRules):
             value, limit = declared.value_m, declared.limit_m
         else:
             off, turn = (barred > 0, barred > 0, barred < 0, barred < 0), False
-            cause, signal, value, limit = CENTRE_NEAR_RIM.message, "estimate", origin.clearance_m, origin.limit_m
+            cause, signal = conditions.CENTRE_NEAR_RIM.message, "estimate"
+            value, limit = origin.clearance_m, origin.limit_m
         forward, reverse = barred <= 0 and not (off[0] or off[1]), barred >= 0 and not (off[2] or off[3])
         permits = (forward, reverse, turn)
         if missing is not None:

@@ -51,10 +51,7 @@ class EdgeMap:
         return self._rim.signed_distance_m(*place) <= slack_m or self.seam_at(place, slack_m) is not None
 
     def seam_at(self, place: tuple[float, float], slack_m: float, not_axis: Axis | None = None) -> SeamNear | None:
-        """The nearest interior seam whose gap, widened by ``slack_m`` on both sides, holds the deck place.
-
-        Seams along which the coordinate ``not_axis`` is constant are left out.
-        """
+        """The nearest interior seam, not of ``not_axis``, whose gap, ``slack_m`` wider on both sides, holds a place."""
         x, y = place
         panel = self._mirror.panels[self._mirror.nearest_panel(x, y)]
         half_gap = 0.5 * self.gap_m
@@ -184,10 +181,7 @@ class EdgeDetector:
         return hypot(place[0] - self._on_place[0], place[1] - self._on_place[1]) >= self._limits.no_map_m
 
     def see_off(self, odometry: Odometry, place: Place, worst_m: float) -> bool:
-        """The sensor is off at ``place``. Returns whether that declares an edge now.
-
-        ``worst_m``: travel that wheels without samples may have added, rule (g).
-        """
+        """The sensor is off; whether that declares an edge. ``worst_m``: travel that silent wheels add, rule (g)."""
         self._off_samples += 1
         self._on_samples = 0
         self._heading, self._place = odometry.heading_rad, place
@@ -255,10 +249,7 @@ class EdgeDetector:
             self._set_seam(seam.axis)
 
     def _slack_m(self) -> float:
-        """How far the map place may be wrong across a seam.
-
-        The extra covers the heading's part, which the estimate's sigma leaves out: 3 mm are 1.3 deg at a corner sensor.
-        """
+        """How far off it may be across a seam. The extra is the heading's part: 3 mm are 1.3 deg at a corner."""
         limits = self._limits
         return limits.tolerance_m + limits.extra_m + limits.sigmas * self._sigma_m + self._moved_m
 

@@ -78,10 +78,7 @@ class EdgeRule:
         return self._odometry is None
 
     def step(self, samples: list[EdgeSample], estimate: EstimateMessage | None) -> None:
-        """Judge a frame's samples, oldest first; those that go back in time are dropped.
-
-        The frame's encoder samples must have been pushed to ``track``; ``estimate`` is fresh and finite, or None.
-        """
+        """Judge a frame's samples; its encoder samples are in ``track``. ``estimate`` is fresh and finite, or None."""
         if not samples:
             return
         if self._odometry is None and _are_all_on(samples):
@@ -139,10 +136,7 @@ class EdgeRule:
         return has_fix
 
     def _look_again(self, odometry: Odometry, estimate: EstimateMessage) -> None:
-        """A sensor that a fix shows over a seam begins again there: the edge was declared where the robot was not.
-
-        One that it shows at the rim is not to blame for staying off, however far it was moved along there.
-        """
+        """A sensor that a fix shows over a seam begins again there; one at the rim is not to blame for staying off."""
         limits = self._limits
         for i, episode in enumerate(self.episodes):
             if episode is None or episode.phase is not EdgePhase.DECLARED or episode.is_on:

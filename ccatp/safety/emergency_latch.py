@@ -79,10 +79,7 @@ class EmergencyLatch:
         (self._levels.add if active else self._levels.discard)(kind)
 
     def raise_emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
-        """Latch an emergency; returns why it was refused, or None.
-
-        The same id again, also after its clear, has no effect.
-        """
+        """Latch an emergency; why it was refused, or None. The same id again, also after its clear, has no effect."""
         if emergency_id in self._cleared:
             return None
         # The same id is the same emergency, whatever is said of it; but one that shakes the robot holds it.

@@ -4,14 +4,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from math import hypot, inf
 
-from ccatp.conditions import (
-    CLOCK_JUMPED,
-    FRAMES_LOST,
-    IMU_LEFT_OUT,
-    LINES_GARBLED,
-    UNKNOWN_REPORTED,
-    MonitorFinding,
-)
+from ccatp import conditions
+from ccatp.conditions import MonitorFinding
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
 from ccatp.control.motion_checks import ImuGate, MotionSum, WheelMeans
 from ccatp.core import EdgeSample, ImuSample, WheelSample
@@ -40,10 +34,7 @@ _LARGEST_BIAS_RAD_S = 0.35
 
 
 class HealthMonitor:
-    """All monitors but the edge rule's.
-
-    ``is_explained``: whether the map has an edge of a panel near a sensor, by its index.
-    """
+    """All monitors but the edge rule's. ``is_explained``: the map has a panel's edge near the sensor of an index."""
 
     def __init__(
         self,
@@ -90,21 +81,18 @@ class HealthMonitor:
 
     def jumped(self, t_s: float, by_s: float) -> None:
         """The robot's clock has jumped before the frame at ``t_s``."""
-        finding = CLOCK_JUMPED.found("clock", by_s, self._cfg.clock_jump_s)
+        finding = conditions.CLOCK_JUMPED.found("clock", by_s, self._cfg.clock_jump_s)
         self._clock.see(t_s, finding)
         self._gate.reset()
         self.findings = [finding]
 
     def garbled(self, at_s: float) -> MonitorFinding | None:
-        """A line at ``at_s``, on any monotonic clock, was no frame; what is found where there were too many.
-
-        That stays until frames come again.
-        """
+        """A line at ``at_s``, any monotonic clock, was no frame; of too many, what stays until frames come."""
         times_s, lines = self._garbled_s, float(self._cfg.garbled_lines)
         times_s.append(at_s)
         if at_s - times_s[0] > self._cfg.garbled_window_s:
             return None
-        finding = LINES_GARBLED.found("lines", lines, lines)
+        finding = conditions.LINES_GARBLED.found("lines", lines, lines)
         self._garbled.see(self._t_s or 0.0, finding)
         self.findings = [finding]
         return finding
@@ -124,7 +112,7 @@ class HealthMonitor:
         self._t_s = t_s
         is_gap = dt_s > self._cfg.gap_s
         if is_gap:
-            self._gap.see(t_s, FRAMES_LOST.found("frames", dt_s, self._cfg.gap_s))
+            self._gap.see(t_s, conditions.FRAMES_LOST.found("frames", dt_s, self._cfg.gap_s))
         imu = frame.imu
         self._means.take(wheels, dt_s)
         self._sums = self._added(imu, dt_s)
@@ -158,7 +146,7 @@ class HealthMonitor:
         for name in frame.faults:
             if name not in FANS and name != "battery_low":
                 latch = self._reported.setdefault(name, FindingLatch(self._cfg.retry_after_s))
-                condition = REPORTED.get(name, UNKNOWN_REPORTED)
+                condition = REPORTED.get(name, conditions.UNKNOWN_REPORTED)
                 latch.see(t_s, condition.found(name, 1.0, 0.0, side=name.removeprefix("encoder_")))
         self._fans.step(t_s, frame.fans, frame.faults)
         if self._frames % _SLOW_LOOK_FRAMES < _LOOK_FRAMES:
@@ -187,10 +175,7 @@ class HealthMonitor:
         return MotionSum(t_s, sums[1] + right * rolled_m, sums[2] + left * rolled_m, sums[3] + turned)
 
     def take_commands(self, t_s: float, estimate: EstimateMessage) -> None:
-        """Take the set points from an estimate that may be too old for anything else.
-
-        A repeated one changes nothing.
-        """
+        """Take the set points from an estimate, too old or not; a repeated one changes nothing."""
         if estimate.seq == self._commands_seq:
             return
         self._commands_seq = estimate.seq
@@ -198,10 +183,7 @@ class HealthMonitor:
             self._wheels.take_commands(t_s, estimate.commanded)
 
     def learn(self, t_s: float, estimate: EstimateMessage, opened: Sequence[int], is_off: Sequence[object]) -> None:
-        """Take a fresh estimate of main's; a repeated one changes nothing.
-
-        ``opened``: how often each edge sensor went off.
-        """
+        """Take a fresh estimate; a repeated one changes nothing. ``opened``: how often each edge sensor went off."""
         if estimate.seq == self._estimate_seq:
             return
         self._estimate_seq = estimate.seq
@@ -228,7 +210,7 @@ class HealthMonitor:
                 found.append(other)
         gate = self._gate
         if gate.cause:
-            found.append(IMU_LEFT_OUT.found("imu", gate.value, gate.limit, what=gate.cause))
+            found.append(conditions.IMU_LEFT_OUT.found("imu", gate.value, gate.limit, what=gate.cause))
         for name, latch in list(self._reported.items()):
             if (finding := latch.settle(t_s)) is None:
                 del self._reported[name]

@@ -51,10 +51,7 @@ class SteadyTime:
         return t_s + (self._before_s if is_before else self.offset_s)
 
     def of_samples(self, samples: Sequence[_Sample], t_s: float) -> list[_Sample]:
-        """Samples of the newest frame, of steady time ``t_s``, with steady times.
-
-        A sample that is far nearer to the frame in the time base before belongs to that.
-        """
+        """Samples of the newest frame at steady times, each in the time base in which it is near to the frame."""
         now_s, before_s, limit_s = self.offset_s, self._before_s, self._limit_s
         found = []
         for sample in samples:

@@ -4,27 +4,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from math import hypot, inf
 
-from ccatp.conditions import (
-    BATTERY_LOW,
-    BATTERY_REPORTED,
-    DRIVES_LATE,
-    DRIVES_TOO_LATE,
-    EDGE_REPORTED,
-    EDGE_SENSOR_BLIND,
-    EDGE_SENSOR_CHATTERS,
-    EDGE_SENSOR_FLASHES,
-    EDGE_SENSOR_STAYS_DARK,
-    ENCODER_REPORTED,
-    FAN_REPORTED,
-    FAN_REPORTED_ON_THE_FLAT,
-    FAN_TOO_LITTLE,
-    FAN_WEAK,
-    IMU_REPORTED,
-    SAMPLES_TOO_FEW,
-    SEAM_MISSED,
-    STALL_REPORTED,
-    MonitorFinding,
-)
+from ccatp import conditions
+from ccatp.conditions import MonitorFinding
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.core import Corner, DeckPose, EdgeSample, PanelId
 from ccatp.mirror.mirror import Mirror
@@ -71,7 +52,7 @@ class FlickerMonitor:
                 changes.popleft()
             if len(changes) > self._cfg.chatter_transitions and not self._is_explained(i):
                 limit = self._cfg.chatter_transitions
-                self.chatter.see(t_s, EDGE_SENSOR_CHATTERS.found(_CORNERS[i], len(changes), limit))
+                self.chatter.see(t_s, conditions.EDGE_SENSOR_CHATTERS.found(_CORNERS[i], len(changes), limit))
         self._judge_flashes(t_s)
 
     def _change(self, t_s: float, state: tuple[int, ...], *, is_still: bool) -> None:
@@ -91,9 +72,10 @@ class FlickerMonitor:
             return
         longest_s = max(t_s - (self._flashing_s[i] or t_s) for i in off)
         limit_s = self._cfg.pause_limit_s
-        condition = EDGE_SENSOR_FLASHES if longest_s < limit_s - _CLEAR_S else EDGE_SENSOR_STAYS_DARK
+        is_short = longest_s < limit_s - _CLEAR_S
+        condition = conditions.EDGE_SENSOR_FLASHES if is_short else conditions.EDGE_SENSOR_STAYS_DARK
         self.flash.see(t_s, condition.found(_CORNERS[off[0]], len(off), 0.0))
-        if condition is EDGE_SENSOR_STAYS_DARK and self.flash.finding is not None:
+        if condition is conditions.EDGE_SENSOR_STAYS_DARK and self.flash.finding is not None:
             self.flash.finding = self.flash.finding._replace(condition=condition, severity=condition.severity)
 
 
@@ -143,7 +125,7 @@ class RateMonitor:
             self.finding = None
             return
         name = _SOURCES[shares.index(least)]
-        self.finding = SAMPLES_TOO_FEW.found(name, least, limit)
+        self.finding = conditions.SAMPLES_TOO_FEW.found(name, least, limit)
 
 
 class LatencyMonitor:
@@ -167,9 +149,9 @@ class LatencyMonitor:
             # The second one is not in force yet.
             latency_s, cfg = t_s - sent[1][1], self._cfg
             if latency_s > cfg.latency_pause_s:
-                self.alarm.see(t_s, DRIVES_TOO_LATE.found("latency", latency_s, cfg.latency_pause_s))
+                self.alarm.see(t_s, conditions.DRIVES_TOO_LATE.found("latency", latency_s, cfg.latency_pause_s))
             elif latency_s > cfg.latency_slow_s:
-                self.alarm.see(t_s, DRIVES_LATE.found("latency", latency_s, cfg.latency_slow_s))
+                self.alarm.see(t_s, conditions.DRIVES_LATE.found("latency", latency_s, cfg.latency_slow_s))
 
 
 class SeamMonitor:
@@ -244,7 +226,7 @@ class SeamMonitor:
         limit = self._cfg.seams_failed
         if missed >= limit and self._pose is not None:
             # The pose may be wrong instead: the hold brings a fix, and one more seam shows which.
-            self._blind.see(self._pose[0], EDGE_SENSOR_BLIND.found(_CORNERS[i], missed, limit))
+            self._blind.see(self._pose[0], conditions.EDGE_SENSOR_BLIND.found(_CORNERS[i], missed, limit))
 
     @property
     def finding(self) -> MonitorFinding | None:
@@ -255,7 +237,7 @@ class SeamMonitor:
         if most < limit:
             return None
         corner = _CORNERS[self.missed.index(most)]
-        return SEAM_MISSED.found(corner, most, limit)
+        return conditions.SEAM_MISSED.found(corner, most, limit)
 
 
 # A fan command is in force two delays of the link after it was sent, at the latest.
@@ -263,11 +245,11 @@ _FIRST_COMMAND_S = 1.0
 # The way home goes along rows and columns of panels.
 _DETOUR = 1.6
 REPORTED = {
-    "imu": IMU_REPORTED,
-    "encoder_left": ENCODER_REPORTED,
-    "encoder_right": ENCODER_REPORTED,
-    "edge": EDGE_REPORTED,
-    "stall": STALL_REPORTED,
+    "imu": conditions.IMU_REPORTED,
+    "encoder_left": conditions.ENCODER_REPORTED,
+    "encoder_right": conditions.ENCODER_REPORTED,
+    "edge": conditions.EDGE_REPORTED,
+    "stall": conditions.STALL_REPORTED,
 }
 FANS, _SIDES = ("fan_left", "fan_right"), ("left", "right")
 
@@ -303,25 +285,22 @@ class FanMonitor:
         lasts_s = self._low.lasts(t_s, is_low and is_due)
         if lasts_s >= self._cfg.fan_time_s - 1e-6 and self._overhang:
             k = 0 if fans[0] / left < fans[1] / right else 1
-            self.alarm.see(t_s, FAN_TOO_LITTLE.found(FANS[k], fans[k], self._least[k], side=_SIDES[k]))
+            self.alarm.see(t_s, conditions.FAN_TOO_LITTLE.found(FANS[k], fans[k], self._least[k], side=_SIDES[k]))
         elif self._overhang:
             is_weak = fans[0] < self._enough[0] or fans[1] < self._enough[1]
             if self._weak.lasts(t_s, is_weak and is_due) >= self._cfg.fan_time_s - 1e-6:
                 k = 0 if fans[0] - self._enough[0] < fans[1] - self._enough[1] else 1
-                finding = FAN_WEAK.found(FANS[k], fans[k], self._enough[k], side=_SIDES[k])
+                finding = conditions.FAN_WEAK.found(FANS[k], fans[k], self._enough[k], side=_SIDES[k])
                 self.alarm.see(t_s, finding)
         for name in faults:
             if name in FANS:
-                reported = FAN_REPORTED if self._overhang else FAN_REPORTED_ON_THE_FLAT
+                reported = conditions.FAN_REPORTED if self._overhang else conditions.FAN_REPORTED_ON_THE_FLAT
                 self.alarm.see(t_s, reported.found(name, 1.0, 0.0, side=name[4:]))
         self._sound = None if is_low or is_weak else fans
 
 
 class BatteryMonitor:
-    """Whether the charge still is enough for the way home.
-
-    A finding stays, because a battery does not charge on the way.
-    """
+    """Whether the charge is enough for the way home. A finding stays: a battery does not charge on the way."""
 
     def __init__(self, cfg: HealthConfig) -> None:
         self._cfg = cfg
@@ -338,6 +317,6 @@ class BatteryMonitor:
         least = cfg.battery_reserve
         least += cfg.battery_margin * _DETOUR * home_m / cfg.slow_speed_m_s / cfg.battery_life_s
         if self._low.lasts(t_s, soc < least) >= cfg.battery_time_s:
-            self.finding = BATTERY_LOW.found("soc", soc, least)
+            self.finding = conditions.BATTERY_LOW.found("soc", soc, least)
         if self._reported.lasts(t_s, is_reported) >= cfg.battery_time_s:
-            self.finding = BATTERY_REPORTED.found("battery_low", soc, least)
+            self.finding = conditions.BATTERY_REPORTED.found("battery_low", soc, least)

@@ -4,17 +4,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ccatp.conditions import (
-    ENCODER_BROKEN,
-    ENCODER_COUNTS_NOTHING,
-    WHEEL_BLOCKED,
-    WHEEL_CREEPS,
-    WHEEL_CREEPS_ON,
-    WHEEL_DOES_NOT_STOP,
-    WHEEL_RUNS_AWAY,
-    WHEELS_STAND,
-    YAW_DISAGREES,
-)
+from ccatp import conditions
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.control.motion_checks import MotionSum, SlidingWindow
 from ccatp.core import WheelSample
@@ -162,9 +152,13 @@ class WheelMonitor:
         k = above.index(worst)
         side = _SIDES[k]
         if broken := _what_is_broken(samples, k):
-            self.alarm.see(t_s, ENCODER_BROKEN.found(f"encoder_{side}", worst, limit, side=side, what=broken))
+            self.alarm.see(t_s, self._broken(side, worst, limit, broken))
         else:
-            self.alarm.see(t_s, WHEEL_RUNS_AWAY.found(f"{side}_wheel", worst, limit, side=side))
+            self.alarm.see(t_s, conditions.WHEEL_RUNS_AWAY.found(f"{side}_wheel", worst, limit, side=side))
+
+    @staticmethod
+    def _broken(side: str, value: float, limit: float, what: str) -> conditions.MonitorFinding:
+        return conditions.ENCODER_BROKEN.found(f"encoder_{side}", value, limit, side=side, what=what)
 
     def _find_stall(self, t_s: float, moved: MotionSum) -> None:
         commanded, cfg = self._stall, self._cfg
@@ -177,11 +171,11 @@ class WheelMonitor:
         disagreement = abs((moved.right_m - moved.left_m) / self._base_m - moved.turned_rad)
         speed, side = min(speeds[k] for k in still), _SIDES[still[0]]
         if len(still) == len(_SIDES):
-            finding = WHEELS_STAND.found("encoders", speed, limit)
+            finding = conditions.WHEELS_STAND.found("encoders", speed, limit)
         elif disagreement > _SAME_TURN_RAD:
-            finding = ENCODER_COUNTS_NOTHING.found(f"encoder_{side}", speed, limit, side=side)
+            finding = conditions.ENCODER_COUNTS_NOTHING.found(f"encoder_{side}", speed, limit, side=side)
         else:
-            finding = WHEEL_BLOCKED.found(f"{side}_wheel", speed, limit, side=side)
+            finding = conditions.WHEEL_BLOCKED.found(f"{side}_wheel", speed, limit, side=side)
         self.alarm.see(t_s, finding)
 
     def _is_commanded(self, low: float, high: float) -> bool:
@@ -208,15 +202,15 @@ class WheelMonitor:
             lasts_s = self._creeping[k].lasts(t_s, creeps and not broken)
             if not is_moving:
                 continue
+            limit_m_s, wheel = cfg.stop_speed_m_s, f"{side}_wheel"
             if broken:
                 self._stood = now  # what it says it went, it did not
-                limit_m_s = cfg.stop_speed_m_s
-                finding = ENCODER_BROKEN.found(f"encoder_{side}", speed_m_s, limit_m_s, side=side, what=broken)
+                finding = self._broken(side, speed_m_s, limit_m_s, broken)
             elif creeps:
-                condition = WHEEL_CREEPS_ON if lasts_s >= _CREEP_FAULT_S else WHEEL_CREEPS
-                finding = condition.found(f"{side}_wheel", crept_m, cfg.creep_m, side=side)
+                condition = conditions.WHEEL_CREEPS_ON if lasts_s >= _CREEP_FAULT_S else conditions.WHEEL_CREEPS
+                finding = condition.found(wheel, crept_m, cfg.creep_m, side=side)
             else:
-                finding = WHEEL_DOES_NOT_STOP.found(f"{side}_wheel", speed_m_s, cfg.stop_speed_m_s, side=side)
+                finding = conditions.WHEEL_DOES_NOT_STOP.found(wheel, speed_m_s, limit_m_s, side=side)
             self.alarm.see(t_s, finding)
 
     def _compare_turns(self, t_s: float, moved: MotionSum) -> None:
@@ -226,7 +220,7 @@ class WheelMonitor:
         difference = by_gyroscope - by_wheels
         limit = cfg.yaw_limit_rad + cfg.yaw_share * max(abs(by_wheels), abs(by_gyroscope))
         if not -limit <= difference <= limit:
-            self.yaw.see(t_s, YAW_DISAGREES.found("imu_wz", difference, limit))
+            self.yaw.see(t_s, conditions.YAW_DISAGREES.found("imu_wz", difference, limit))
 
 
 def _what_is_broken(samples: Sequence[WheelSample], side: int) -> str:

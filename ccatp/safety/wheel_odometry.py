@@ -83,10 +83,7 @@ class WheelTrack:
                 self.knots.append(Knot(t_s, half_radius_m * both, radius_per_base * turning))
 
     def silence_s(self, t_s: float) -> float:
-        """How long at ``t_s`` one of the wheels has been without a usable sample; 0 while the last one is held.
-
-        A wheel without any sample yet is silent since the robot's boot.
-        """
+        """How long a wheel is without a usable sample, s; 0 while the last one is held, since the boot without any."""
         if self._usable_t_s == -inf:
             return max(t_s, self._hold_s)
         silent_s = t_s - self._usable_t_s

@@ -1,7 +1,4 @@
-"""Behaviours of a survey: standing until a measurement, backing off an edge, driving home. Frozen values.
-
-``update`` takes a frame and returns what the behaviour is then.
-"""
+"""Behaviours of a survey, frozen values: standing until a measurement, backing off an edge, driving home."""
 
 from enum import StrEnum
 from math import copysign, hypot
@@ -94,10 +91,7 @@ class Settling(msgspec.Struct, frozen=True, tag=True):
         return settling._timed(motion.t_s, measuring_time_s) if standstill.is_rest else settling
 
     def measure(self, cfg: ControlConfig, measuring_time_s: float, motion: StateEstimate) -> "tuple[Settling, bool]":
-        """One frame of the measuring time; whether to ask for the measurement now. True once at each stop.
-
-        Motion spoils the measurement, also one in progress: the time begins again, and what was asked for is dropped.
-        """
+        """One frame of the measuring time, which motion begins again; whether to ask for the measurement now."""
         t_s = motion.t_s
         settling = replace(self, standstill=self.standstill.update(cfg, motion))
         if settling.is_repeated:

@@ -26,10 +26,7 @@ def home_time_s(base: DeckPose, limits: LimitsConfig, x_m: float, y_m: float) ->
 
 
 class BudgetProgress(NamedTuple):
-    """Begin (robot time), planned time of what was done, and of what comes next, s.
-
-    ``before_s``: mission time before that begin, in other processes.
-    """
+    """Begin (robot time), planned time of what was done and of what comes next; time in other processes before, s."""
 
     begun_s: float | None = None
     planned_s: float = 0.0
@@ -67,10 +64,7 @@ class TimeBudget:
     def review(
         self, progress: BudgetProgress, t_s: float, pose: DeckPose, left: Sequence[PointId]
     ) -> Sequence[PointId] | None:
-        """After a point: those of the ``left`` ones, in order, to go on with (``left`` itself: all).
-
-        None to go home now.
-        """
+        """Those of the ``left`` points to go on with (``left`` itself: all); None to go home now."""
         elapsed_s = progress.before_s + t_s - (progress.begun_s if progress.begun_s is not None else t_s)
         late = elapsed_s / progress.planned_s if progress.planned_s > _FIRST_S else 1.0
         pace = min(max(late, 1.0), _LARGEST_PACE)

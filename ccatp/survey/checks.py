@@ -41,10 +41,7 @@ class UnattendedFaultTimer:
         self._since_s = None
 
     def watch(self, t_s: float, soc: float, home_s: float | None) -> FaultAction:
-        """One frame of a fault; state of charge 0 to 1.
-
-        ``home_s`` is None where the robot does not know where it is.
-        """
+        """One frame of a fault; charge 0 to 1; ``home_s`` is None where the robot does not know where it is."""
         if self._since_s is None or t_s < self._since_s:
             self._since_s, self._remind_at_s = t_s, t_s + self._alarm_period_s
         # Once: a return that failed may have failed for the reason of the fault.
@@ -83,10 +80,7 @@ class MirrorCheck:
         self.contradiction = self.warning = ""
 
     def update(self, t_s: float, gravity: Sequence[float] | None, pose: DeckPose) -> bool:
-        """Take a frame and gravity's direction in the robot frame, where it was read.
-
-        True once the check is complete.
-        """
+        """Take a frame and gravity's direction in the robot frame, where it was read; whether the check is complete."""
         if self._first_s is None:
             self._first_s = t_s
         if gravity is not None:

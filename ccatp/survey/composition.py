@@ -117,10 +117,7 @@ class SurveyParts:
 
 
 def assemble(cfg: Config, done: Collection[PointId] = (), checkpoint: Checkpoint | None = None) -> SurveyParts:
-    """All pure parts of a main loop, the robot at base or where ``checkpoint`` says.
-
-    Raises ``PlanError`` (unreachable point).
-    """
+    """All pure parts, the robot at base or where ``checkpoint`` says; raises ``PlanError`` (unreachable point)."""
     mirror = build_mirror(cfg.mirror)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
     route = plan_survey(cfg, mirror, points, done, calibrates=checkpoint is None)
@@ -236,10 +233,7 @@ class SurveyPlan:
 
 
 def make_plan(cfg: Config, mirror: Mirror) -> SurveyPlan:
-    """Plan the survey of a configuration as a run would.
-
-    Raises ``PlanError`` where base is not on the mirror or a dead end.
-    """
+    """Plan a survey as a run would; raises ``PlanError`` where base is not on the mirror or a dead end."""
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
     out_of_reach: list[PointId] = []
     stops = plan_survey(cfg, mirror, points, (), out_of_reach).stops

@@ -57,10 +57,7 @@ class FrameCheck:
         self.is_over = False
 
     def look(self, measured_m: Vector3, expected_m: Vector3) -> str | None:
-        """The one mistake that explains what is wrong with one of the first fixes, or empty; ``None``: nothing is.
-
-        Puck positions in the world frame, the robot standing still.
-        """
+        """The mistake that explains what is wrong with a fix, world frame, or empty; ``None``: nothing is."""
         if self.is_over:
             return None
         if not dist(measured_m, expected_m) <= self._limit_m:
@@ -92,10 +89,7 @@ def explain(measured_m: Vector3, expected_m: Vector3, limit_m: float) -> str:
 def explain_lengths(
     cfg: EtalonConfig, expected_m: Vector3, lengths_m: Mapping[int, float], collimators_m: Mapping[int, FloatArray]
 ) -> str:
-    """What turns lengths without a position near the expected one (world frame) into ones with it.
-
-    Axes or unit, or empty.
-    """
+    """The mistake in axes or unit by which lengths give no position near the expected one (world frame), or empty."""
     for name, factor in UNITS:
         scaled = {channel: factor * length for channel, length in lengths_m.items()}
         if _fits(cfg, expected_m, scaled, collimators_m):
@@ -160,10 +154,7 @@ class FixGate:
     def review(
         self, fix: Fix, expected_m: Vector3, pose: DeckPose, covariance: FloatArray, *, is_lost: bool = False
     ) -> FixFinding:
-        """Judge a fix against the puck expected by the estimate, world frame.
-
-        Covariance of its (x, y, heading), (3, 3).
-        """
+        """Judge a fix by the expected puck, world frame, and by the pose with its covariance, (3, 3)."""
         is_first, self._is_first = self._is_first, False
         why = None if is_lost else self._frame.look(fix.position_m, expected_m)
         if why is not None and (is_first or why):
@@ -220,10 +211,7 @@ class ApproachCounter:
         self.count = 0
 
     def is_too_far(self, point: PointId, error_m: float, sigma_m: float) -> bool:
-        """Whether ``point`` has to be approached again; call once for each fix taken there.
-
-        ``sigma_m``: standard deviation of the robot's place after the fix, along its worst direction.
-        """
+        """Whether to approach a point again; call once a fix. ``sigma_m``: of the place, in its worst direction."""
         self.count = self.count + 1 if point == self._point else 1
         self._point = point
         guard_m = min(_GUARD_SIGMAS * sigma_m, _MOST_GUARD * self._tolerance_m)

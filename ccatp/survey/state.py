@@ -115,14 +115,11 @@ class FixNeed(Enum):
 
 
 class Hold(NamedTuple):
-    """How the robot is held.
-
-    ``rejects_odometry``: wheels or inertial unit are not to be believed: whatever they say, the robot stands.
-    """
+    """How the robot is held."""
 
     by_hand: bool = False  # until an operator resumes
     is_fault: bool = False  # an operator has to look after it
-    rejects_odometry: bool = False
+    rejects_odometry: bool = False  # whatever wheels and inertial unit say, the robot stands
 
 
 class HoldState(msgspec.Struct, frozen=True):

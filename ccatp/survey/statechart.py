@@ -4,16 +4,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from ccatp.conditions import (
-    LEG_OVERDUE,
-    MEASUREMENTS_FAILED,
-    NO_REST,
-    NO_WAY_HOME,
-    NO_WAY_ON,
-    NOT_FOUND,
-    STUCK_AT_EDGE,
-    TIME_USED_UP,
-)
+from ccatp import conditions
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegPhase
 from ccatp.core import EventCode, PointId, Stop, StopKind, Verdict
@@ -224,7 +215,7 @@ class Survey(HoldRules[SurveyState]):
         return replace(s, behaviour=leg, mode=mode), MissionCommand(twist)
 
     def _overdue(self, s: SurveyState, stop: Stop) -> SurveyState:
-        return self.fault(s, LEG_OVERDUE.text(x_m=stop.x_m, y_m=stop.y_m))
+        return self.fault(s, conditions.LEG_OVERDUE.text(x_m=stop.x_m, y_m=stop.y_m))
 
     def _arrive(self, s: SurveyState, motion: StateEstimate) -> Step:
         return self._settle(self.apply(replace(s, behaviour=None), MissionEvent.ARRIVED), motion)
@@ -268,7 +259,7 @@ class Survey(HoldRules[SurveyState]):
             planner, over = self.planner, {*s.done, *s.skipped}
             route = planner.route(deck, due) if due else planner.rejoin(s.route, deck, over)
         except PlanError as error:
-            return self.fault(s, NO_WAY_ON.text(why=error))
+            return self.fault(s, conditions.NO_WAY_ON.text(why=error))
         return replace(s, route=route, stop_index=0, behaviour=None, is_off_route=False)
 
     def _review_time(self, s: SurveyState, motion: StateEstimate) -> tuple[SurveyState, bool]:
@@ -282,7 +273,7 @@ class Survey(HoldRules[SurveyState]):
         going_on = budget.review(progress, motion.t_s, motion.deck, left)
         s = replace(s, budget=progress)
         if going_on is None:
-            cause = s.abort_cause or TIME_USED_UP.text(budget_s=budget.budget_s)
+            cause = s.abort_cause or conditions.TIME_USED_UP.text(budget_s=budget.budget_s)
             return self.proceed(replace(s, abort_cause=cause)), False
         if going_on is left:
             return s, True
@@ -312,7 +303,7 @@ class Survey(HoldRules[SurveyState]):
 
     def _check_rest(self, s: SurveyState, settling: Settling, motion: StateEstimate) -> SurveyState:
         if settling.is_overdue(motion.t_s):
-            return self.fault(s, NO_REST.text(v_m_s=motion.speed_m_s, omega_rad_s=motion.rate_rad_s))
+            return self.fault(s, conditions.NO_REST.text(v_m_s=motion.speed_m_s, omega_rad_s=motion.rate_rad_s))
         return replace(s, behaviour=settling)
 
     # -- edge and home ------------------------------------------------------------------------------------------------
@@ -326,7 +317,8 @@ class Survey(HoldRules[SurveyState]):
         if retreat.step is RetreatStep.OVER or (retreat.step is RetreatStep.TURN_AWAY and s.abort_cause):
             return self.apply(replace(s, behaviour=None), MissionEvent.FIND), HOLD_POSITION
         if retreat.step is RetreatStep.STUCK:
-            return replace(self.hold(s, STUCK_AT_EDGE.message, by_hand=False), stuck_s=motion.t_s), HOLD_POSITION
+            s = self.hold(s, conditions.STUCK_AT_EDGE.message, by_hand=False)
+            return replace(s, stuck_s=motion.t_s), HOLD_POSITION
         return replace(s, behaviour=retreat), MissionCommand(twist)
 
     def _return(self, s: SurveyState, motion: StateEstimate) -> Step:
@@ -335,7 +327,7 @@ class Survey(HoldRules[SurveyState]):
             try:
                 return replace(s, behaviour=ReturnHome(self.planner.home(motion.deck))), HOLD_POSITION
             except PlanError as error:
-                return self.fault(s, NO_WAY_HOME.text(why=error)), HOLD_POSITION
+                return self.fault(s, conditions.NO_WAY_HOME.text(why=error)), HOLD_POSITION
         if home.is_at_base:
             s = self.apply(replace(s, outcome=SurveyOutcome.AT_BASE), MissionEvent.FINISHED)
             return s, MissionCommand(STILL, at_rest=True)
@@ -431,13 +423,13 @@ class Survey(HoldRules[SurveyState]):
         s = replace(s, failures=0 if failures >= limit else failures)
         if point is None:
             if failures >= limit:
-                return self.fault(s, NOT_FOUND.text(why=cause))
+                return self.fault(s, conditions.NOT_FOUND.text(why=cause))
             if isinstance(s.behaviour, Settling):  # it may not have stood quite still, and cannot do without
                 s = replace(s, behaviour=replace(s.behaviour, is_requested=False, is_repeated=True))
             return s
         s = replace(s, failure_causes={**s.failure_causes, point: cause}, due=_without(s.due, point))
         if failures >= limit:
-            s = self.fault(s, MEASUREMENTS_FAILED.text(count=limit, why=cause))
+            s = self.fault(s, conditions.MEASUREMENTS_FAILED.text(count=limit, why=cause))
         return self._leave_stop(s, point, sigma_rad, is_measured=False)
 
     def _leave_pointless(self, s: SurveyState, heading_sigma_rad: float) -> SurveyState:

@@ -144,10 +144,7 @@ def plan_calibration(mirror: Mirror, body: Body, mission: MissionConfig, base: D
 
 
 def is_on_drive(stops: Sequence[Stop], x_m: float, y_m: float) -> bool:
-    """Whether a calibration drive can go on from a deck place.
-
-    It lies on its line, where the robot may turn anywhere.
-    """
+    """Whether a calibration drive can go on from a deck place: it lies on its line."""
     ends = dict.fromkeys((stop.x_m, stop.y_m) for stop in stops if stop.kind is StopKind.CALIBRATE)
     if len(ends) != 2:
         return False

@@ -262,10 +262,7 @@ def thesis_order(mirror: Mirror, panels: int = 0) -> list[PointId]:
 
 
 def optimised_order(mirror: Mirror, panels: int = 0, limits: LimitsConfig = NOMINAL_LIMITS) -> list[PointId]:
-    """The same points in whole lines across the panels, see ``fastest_serpentine``.
-
-    Raises ``ValueError`` as ``thesis_order``.
-    """
+    """The same points in whole lines across the panels, see ``fastest_serpentine``; raises as ``thesis_order``."""
     return fastest_serpentine(mirror, thesis_order(mirror, panels), limits)
 
 

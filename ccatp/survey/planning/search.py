@@ -16,10 +16,7 @@ STRAIGHT_RAD = 0.05
 
 
 def bang_bang_time(distance: float, v_max: float, a_max: float) -> float:
-    """Least time from rest to rest under bounded speed and acceleration, s.
-
-    ``2 sqrt(d/a)`` while the peak stays below v (d < v^2/a), else ``d/v + v/a``; d in m or rad, sign ignored.
-    """
+    """Least time from rest to rest, s: ``2 sqrt(d/a)`` for d < v^2/a, else ``d/v + v/a``; d > 0 or < 0."""
     length = abs(distance)
     if length * a_max < v_max * v_max:
         return 2.0 * sqrt(length / a_max)
@@ -39,10 +36,7 @@ def turn_time(angle_rad: float, limits: LimitsConfig, straight_rad: float = STRA
 
 
 def stop_times(stops: Sequence[Stop], start: DeckPose, limits: LimitsConfig, mirror: Mirror) -> list[float]:
-    """Bang-bang time from each stop's predecessor (``start`` for the first) until the robot stands on the stop, s.
-
-    Turns are measured in the tangent plane where the robot stands, and go the short way.
-    """
+    """Bang-bang time from each stop's predecessor to the stop, s; turns in the tangent plane there, the short way."""
     times = []
     x, y, heading = start.x_m, start.y_m, start.heading_rad
     for stop, length_m in zip(stops, leg_lengths(stops, start, mirror), strict=True):
@@ -85,10 +79,7 @@ _GRAZING_S = (0.0, 3.0, 60.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchNode:
-    """The cheapest arrival at a place with this leg, facing the deck direction ``course_rad``.
-
-    ``before``: the arrival before, None at the start.
-    """
+    """The cheapest arrival at a place with this leg, facing ``course_rad``; ``before``: None at the start."""
 
     place: LegPlace
     course_rad: float
