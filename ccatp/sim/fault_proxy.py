@@ -9,17 +9,16 @@ import random
 import socket
 import struct
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Coroutine
 from math import inf
 from typing import Any, Literal, Self, cast
 
-from ccatp.sim.fault_plan import LINK_TYPES, Direction, Injected, InjectionRecord, LinkFault
+from ccatp.sim.fault_plan import Direction, Injected, InjectionRecord, LinkFault
 
 OneWay = Literal["to_client", "to_robot"]
 OneWayFaults = dict[str, Any]
 """What is switched on in one direction, one fault of each type."""
 
-READ_BYTES = 65536
 # While nothing goes out, no more than this is taken in: then the sender feels it.
 MAX_WAITING_BYTES = 8 << 20
 _LF = b"\n"
@@ -101,208 +100,245 @@ class LineStage:
         return line[:at] + bytes((self._rng.choice(other),)) + line[at + 1 :]
 
 
-class Pipe:
-    """One direction of a connection: reader, queue, writer, and the faults switched on in it.
+class Pipe(asyncio.Protocol):
+    """One end of a connection: what its peer sends goes to the peer of the other end, with the faults of this way."""
 
-    ``may_write`` returns the part of a write that may go out; the rest is dropped.
-    """
+    transport: asyncio.Transport
 
-    def __init__(
-        self,
-        reader: asyncio.StreamReader,
-        writer: asyncio.StreamWriter,
-        faults: OneWayFaults,
-        counts: "Counter[str]",
-        rng: random.Random,
-        may_write: Callable[[bytes], bytes],
-    ) -> None:
-        self._reader, self._writer, self._faults, self._counts, self._rng = reader, writer, faults, counts, rng
-        self._may_write = may_write
-        self._stage = LineStage(faults, counts, rng)
-        self._waiting: deque[tuple[float, bytes]] = deque()
+    def __init__(self, proxy: "FaultProxy", way: OneWay, other: "Pipe | None" = None) -> None:
+        self.way, self.other, self._proxy = way, other, proxy
+        self._faults, self._counts, self._rng = proxy.faults[way], proxy.counts, random.Random(proxy.rng.random())
+        self._stage = LineStage(self._faults, self._counts, self._rng)
+        self._waiting: deque[tuple[float, bytes]] = deque()  # when it is due, and what
         self._waiting_bytes = 0
-        self._due_s = 0.0
-        self._is_at_end = self._is_shut = False
-        self._changed = asyncio.Event()
+        self._due_s = self._next_write_s = 0.0
+        self._is_at_end = self._is_shut = self._is_full = self._is_done = False
+        self._loop = asyncio.get_running_loop()
+        self._timer: asyncio.Handle | None = None
+        if other is not None:
+            other.other = self
 
-    def wake(self) -> None:
-        """The faults have changed."""
-        self._changed.set()
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = cast(asyncio.Transport, transport)  # a TCP connection has no other
+        self.transport.set_write_buffer_limits(0)  # written means: given to the kernel
+        self.transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if self.other is None:
+            self.transport.pause_reading()
+            self._proxy.connect(self)
 
-    def put(self, data: bytes) -> None:
+    def data_received(self, data: bytes) -> None:
+        if "black_hole" in self._faults:
+            self._counts["black_hole"] += len(data)
+            return
+        for piece in self._stage.feed(data):
+            self._put(piece)
+        self.send()
+
+    def eof_received(self) -> bool:
+        self._is_at_end = True
+        self.send()
+        return True  # what goes the other way still goes
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.eof_received()
+        self.resume_writing()  # what waited for this end has nowhere to go
+
+    def pause_writing(self) -> None:
+        self._is_full = True
+
+    def resume_writing(self) -> None:
+        self._is_full = False
+        if self.other is not None:
+            self.other.send()
+
+    def _put(self, data: bytes) -> None:
         """Let something wait for its time to go out; what is over the limit is lost."""
         if not data or self._is_shut or self._waiting_bytes + len(data) > 2 * MAX_WAITING_BYTES:
             return
-        now_s, late_s = asyncio.get_running_loop().time(), 0.0
+        late_s = 0.0
         delay = self._faults.get("delay")
         if delay is not None:
             late_s = delay.delay_s + (delay.jitter_s * self._rng.random() if delay.jitter_s else 0.0)
         if late_s:
             self._counts["delay"] += 1
-        self._due_s = max(self._due_s, now_s + late_s)
+        self._due_s = max(self._due_s, self._loop.time() + late_s)
         self._waiting.append((self._due_s, data))
         self._waiting_bytes += len(data)
-        self.wake()
-
-    def shut(self) -> None:
-        """Send the end now; nothing goes out any more."""
-        self._is_shut = True
-        self._waiting.clear()
-        self._waiting_bytes = 0
-        self._send_end()
-        self.wake()
-
-    def abort(self) -> None:
-        """End the connection to whom it sends, now."""
-        self._writer.transport.abort()
-
-    def reset(self) -> None:
-        """The same by RST."""
-        peer = self._writer.get_extra_info("socket")
-        if not self._writer.is_closing() and peer is not None:
-            peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RST_ON_CLOSE)
-        self.abort()
-        self.wake()
+        if self._waiting_bytes > MAX_WAITING_BYTES:
+            self.transport.pause_reading()
 
     def flood(self, lines: int) -> None:
         """Let further lines wait, after what waits already."""
         self._counts["flood"] += lines
-        self.put(b"".join(self._stage.flood_line() for _ in range(lines)))
+        self._put(b"".join(self._stage.flood_line() for _ in range(lines)))
+        self.send()
 
-    async def receive(self) -> None:
-        """Take in until the sender ends or is gone."""
-        while data := await self._read():
-            if "black_hole" in self._faults:
-                self._counts["black_hole"] += len(data)
-                continue
-            for piece in self._stage.feed(data):
-                self.put(piece)
-            while self._waiting_bytes > MAX_WAITING_BYTES:
-                await self._change()
-        while "black_hole" in self._faults and not self._writer.is_closing():
-            await self._change()
-        self.put(self._stage.finish())
-        self._is_at_end = True
-        self.wake()
-
-    async def send(self) -> None:
-        """Give out until the end."""
-        while (data := await self._next()) is not None:
-            await self._write(data)
-        if not self._is_shut:
-            self._send_end()
-
-    def _send_end(self) -> None:
-        if self._writer.can_write_eof() and not self._writer.is_closing():
-            with contextlib.suppress(OSError):  # the peer may be gone already
-                self._writer.write_eof()
-
-    async def _read(self) -> bytes:
-        try:
-            return await self._reader.read(READ_BYTES)
-        except ConnectionError:
-            return b""
-
-    async def _change(self) -> None:
-        self._changed.clear()
-        await self._changed.wait()
-
-    async def _next(self) -> bytes | None:
-        """What is due, all of it in one piece; ``None`` at the end."""
-        loop = asyncio.get_running_loop()
-        while True:
-            if "stall" in self._faults or not self._waiting:
-                if self._is_at_end and not self._waiting:
-                    return None
-                if self._waiting:
-                    self._counts["stall"] += 1
-                await self._change()
-                continue
-            early_s = self._waiting[0][0] - loop.time()
+    def send(self) -> None:
+        """Give out what is due, or the end; to be called whenever that may have changed."""
+        if self._timer is not None:
+            self._timer.cancel()
+        other = self.other
+        if other is None or self._is_done:
+            return
+        is_lost = other.transport.is_closing()
+        is_ending = self._is_at_end and (is_lost or "black_hole" not in self._faults)
+        if is_ending:
+            self._put(self._stage.finish())
+        if is_lost:
+            self._forget()
+        if not self._waiting:
+            if is_ending:
+                self._finish(other)
+        elif "stall" in self._faults:
+            self._counts["stall"] += 1
+        elif not other._is_full:
+            early_s = max(self._waiting[0][0], self._next_write_s) - self._loop.time()
             if early_s <= 0.0:
-                break
-            await asyncio.sleep(early_s)
-        now_s, found = loop.time(), b""
-        while self._waiting and self._waiting[0][0] <= now_s:
-            found += self._waiting.popleft()[1]
-        self._waiting_bytes -= len(found)
-        self.wake()  # there is room again
-        return found
+                self._write(other)
+            self._timer = self._loop.call_later(max(early_s, 0.0), self.send)
 
-    async def _write(self, data: bytes) -> None:
-        while data and not self._is_shut:
-            slow, fragment = self._faults.get("slowloris"), self._faults.get("fragment")
-            size = len(data) if fragment is None else fragment.write_bytes
-            piece = data[: size if slow is None else 1]
-            part = self._may_write(piece)
-            try:
-                self._writer.write(part)
-                await self._writer.drain()
-            except ConnectionError:
-                return
-            if len(part) < len(piece):  # the rest never goes out: see ``FaultProxy.reset_after``
-                return
-            data = data[len(piece) :]
-            if slow is not None:
-                self._counts["slowloris"] += 1
-                await asyncio.sleep(1.0 / slow.bytes_per_s)
-            elif fragment is not None:
-                self._counts["fragment"] += 1
-                await asyncio.sleep(0)
+    def _write(self, other: "Pipe") -> None:
+        """Write what is due in one piece, or a part of it where the faults want that."""
+        now_s, data = self._loop.time(), b""
+        while self._waiting and self._waiting[0][0] <= now_s:
+            data += self._waiting.popleft()[1]
+        slow, fragment = self._faults.get("slowloris"), self._faults.get("fragment")
+        size = 1 if slow is not None else len(data) if fragment is None else fragment.write_bytes
+        piece, rest = data[:size], data[size:]
+        if rest:
+            self._waiting.appendleft((0.0, rest))
+        self._waiting_bytes -= len(piece)
+        if self._waiting_bytes <= MAX_WAITING_BYTES:
+            self.transport.resume_reading()
+        if slow is not None:
+            self._counts["slowloris"] += 1
+            self._next_write_s = now_s + 1.0 / slow.bytes_per_s
+        elif fragment is not None:
+            self._counts["fragment"] += 1
+        if self.way == "to_client":
+            self._proxy.pass_on(piece, other.transport)
+        else:
+            other.transport.write(piece)
+
+    def _finish(self, other: "Pipe") -> None:
+        self._is_done = True
+        other.send_end()
+        if other._is_done:
+            self._proxy.forget(self)
+            self.transport.close()
+            other.transport.close()
+
+    def _forget(self) -> None:
+        self._waiting.clear()
+        self._waiting_bytes = 0
+
+    def shut(self) -> None:
+        """Send the end now; nothing goes out any more."""
+        self._forget()
+        self._is_shut = True
+        if self.other is not None:
+            self.other.send_end()
+
+    def send_end(self) -> None:
+        """Send FIN to the peer."""
+        with contextlib.suppress(OSError):  # the peer may be gone already
+            if not self.transport.is_closing():
+                self.transport.write_eof()
+
+    def reset(self) -> None:
+        """End the connection to the peer by RST, now."""
+        if not self.transport.is_closing():
+            peer = self.transport.get_extra_info("socket")
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RST_ON_CLOSE)
+            self.transport.abort()
 
 
 class FaultProxy:
     """A proxy for one server; an asynchronous context manager.
 
-    A fault that lasts acts on the connections that are and on those to come, from ``begin`` to ``heal``; ``reset`` and
-    ``close`` act at once. ``listener`` is a bound socket; any free port of 127.0.0.1 if not given.
+    A fault that lasts acts on the connections that are and on those to come, from ``switch_on`` to ``heal``; ``reset``
+    and ``close`` act at once. ``listener`` is a bound socket; any free port of 127.0.0.1 if not given.
 
     Attributes:
         counts: what was really done, by the types of the faults: lines hit, writes, bytes swallowed, connections
             ended; ``connections`` taken, ``refused`` because the server could not be reached.
-        connections: the two pipes of each that there is now.
+        faults: those that are switched on.
+        connections: both ends of each that there is now.
     """
 
     def __init__(self, host: str, port: int, *, seed: int, listener: socket.socket | None = None) -> None:
-        self._address, self._own_listener = (host, port), listener
-        self._rng = random.Random(seed)
-        self._faults: dict[OneWay, OneWayFaults] = {way: {} for way in _BOTH}
-        self.connections: list[dict[OneWay, Pipe]] = []
-        self._handlers: set[asyncio.Task[None]] = set()
+        self._address, self._listener = (host, port), listener
+        self.rng = random.Random(seed)
+        self.faults: dict[OneWay, OneWayFaults] = {way: {} for way in _BOTH}
+        self.connections: list[tuple[Pipe, Pipe]] = []
+        self._tasks: set[asyncio.Task[None]] = set()
         self._flooding: asyncio.Task[None] | None = None
-        self._server: asyncio.Server | None = None
         self._reset_after_bytes: int | None = None
         self.port = 0
         self.counts: Counter[str] = Counter()
         self.passed_bytes = self.passed_lines = 0
 
     async def __aenter__(self) -> Self:
-        if self._own_listener is None:
-            self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
-        else:
-            self._server = await asyncio.start_server(self._serve, sock=self._own_listener)
-        self.port = int(self._server.sockets[0].getsockname()[1])
+        loop = asyncio.get_running_loop()
+        listener = self._listener or socket.create_server(("127.0.0.1", 0))
+        self._server = await loop.create_server(lambda: Pipe(self, "to_robot"), sock=listener)
+        self.port = int(listener.getsockname()[1])
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await self.stop()
-
-    def _pipes(self) -> list[Pipe]:
-        return [pipe for pipes in self.connections for pipe in pipes.values()]
-
-    async def stop(self) -> None:
-        """End everything."""
-        if self._server is not None:
-            self._server.close()
-        tasks = [*self._handlers, *([self._flooding] if self._flooding else [])]
+        self._server.close()
+        tasks = [*self._tasks]
         for task in tasks:
             task.cancel()
         for pipe in self._pipes():
-            pipe.abort()
+            pipe.transport.abort()
         await asyncio.gather(*tasks, return_exceptions=True)
-        if self._server is not None:
-            await self._server.wait_closed()
-            self._server = None
+        await asyncio.sleep(0)  # the transports close
+        await self._server.wait_closed()
+
+    def _pipes(self) -> list[Pipe]:
+        return [pipe for pipes in self.connections for pipe in pipes]
+
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    def connect(self, client: Pipe) -> None:
+        """Connect a client that has come to the server."""
+        self._spawn(self._connect(client))
+
+    async def _connect(self, client: Pipe) -> None:
+        try:
+            _, server = await asyncio.get_running_loop().create_connection(
+                lambda: Pipe(self, "to_client", client), *self._address
+            )
+        except OSError:
+            self.counts["refused"] += 1
+            client.transport.abort()
+            return
+        self.connections.append((client, server))
+        self.counts["connections"] += 1
+        client.transport.resume_reading()
+        client.send()
+
+    def forget(self, pipe: Pipe) -> None:
+        """Both ends of a connection have ended."""
+        self.connections = [pipes for pipes in self.connections if pipe not in pipes]
+
+    def pass_on(self, data: bytes, client: asyncio.Transport) -> None:
+        """Write to a client what may go to it, and count it."""
+        limit = self._reset_after_bytes
+        is_last = limit is not None and self.passed_bytes + len(data) >= limit
+        if limit is not None and is_last:
+            data = data[: limit - self.passed_bytes]
+            self._reset_after_bytes = None
+        self.passed_bytes += len(data)
+        self.passed_lines += data.count(b"\n")
+        client.write(data)
+        if is_last:
+            self.reset()
 
     def reset(self) -> None:
         """Break every connection by RST, on both sides."""
@@ -323,101 +359,42 @@ class FaultProxy:
         for pipe in self._pipes():
             pipe.shut()
 
-    def begin(self, name: str, direction: Direction = "both", **values: Any) -> None:
-        """Switch on a fault that lasts: a type of the fault plan and its keys."""
-        self.switch_on(LINK_TYPES[name].model_validate({"type": name, "direction": direction, **values}))
-
     def switch_on(self, fault: Any) -> None:
-        """The same with the fault of a plan, whatever its type."""
+        """Switch on a fault of a plan, whatever its type."""
         if fault.type in _AT_ONCE:
             (self.reset if fault.type == "reset" else self.close)()
             return
         for way in _BOTH:
             if fault.direction in {way, "both"}:
-                self._faults[way][fault.type] = fault
-        self._wake()
+                self.faults[way][fault.type] = fault
         if fault.type == "flood" and (self._flooding is None or self._flooding.done()):
-            self._flooding = asyncio.get_running_loop().create_task(self._flood())
+            self._flooding = self._spawn(self._flood())
 
     def heal(self, direction: Direction = "both", name: str | None = None) -> None:
         """End every fault that lasts, or that of one type; what was stalled goes in one burst."""
         for way in _BOTH:
             if direction in {way, "both"}:
-                for kind in [kind for kind in self._faults[way] if name in {None, kind}]:
-                    del self._faults[way][kind]
-        self._wake()
-
-    def _wake(self) -> None:
+                for kind in [kind for kind in self.faults[way] if name in {None, kind}]:
+                    del self.faults[way][kind]
         for pipe in self._pipes():
-            pipe.wake()
-
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = cast(asyncio.Task[None], asyncio.current_task())  # asyncio runs this as a task of its own
-        self._handlers.add(task)
-        try:
-            await self._connect(reader, writer)
-        except asyncio.CancelledError:
-            pass  # ``stop``; a task of asyncio's own must not end cancelled
-        finally:
-            self._handlers.discard(task)
-            writer.transport.abort()
-
-    async def _connect(self, reader: asyncio.StreamReader, client: asyncio.StreamWriter) -> None:
-        try:
-            server_reader, server = await asyncio.open_connection(*self._address)
-        except OSError:
-            self.counts["refused"] += 1
-            return
-        for writer in (client, server):
-            writer.transport.set_write_buffer_limits(0)  # written means: given to the kernel
-            writer.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        pipes: dict[OneWay, Pipe] = {
-            "to_robot": self._pipe("to_robot", reader, server),
-            "to_client": self._pipe("to_client", server_reader, client),
-        }
-        self.connections.append(pipes)
-        self.counts["connections"] += 1
-        try:
-            async with asyncio.TaskGroup() as tasks:
-                for pipe in pipes.values():
-                    tasks.create_task(pipe.receive())
-                    tasks.create_task(pipe.send())
-        finally:
-            self.connections.remove(pipes)
-            client.close()
-            server.close()
-
-    def _pipe(self, way: OneWay, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Pipe:
-        may_write = self._passing if way == "to_client" else bytes
-        return Pipe(reader, writer, self._faults[way], self.counts, random.Random(self._rng.random()), may_write)
-
-    def _passing(self, data: bytes) -> bytes:
-        """What of ``data`` may go to a client, and is counted as gone."""
-        limit = self._reset_after_bytes
-        if limit is not None and self.passed_bytes + len(data) >= limit:
-            data = data[: limit - self.passed_bytes]
-            self._reset_after_bytes = None
-            # After the write that follows, which the kernel takes at once on a loopback.
-            asyncio.get_running_loop().call_soon(self.reset)
-        self.passed_bytes += len(data)
-        self.passed_lines += data.count(b"\n")
-        return data
+            pipe.send()
 
     async def _flood(self) -> None:
         owed = dict.fromkeys(_BOTH, 0.0)
         clock = asyncio.get_running_loop().time
         before_s = clock()
-        while any("flood" in faults for faults in self._faults.values()):
+        while any("flood" in faults for faults in self.faults.values()):
             await asyncio.sleep(_FLOOD_PERIOD_S)
             now_s = clock()
             for way in _BOTH:
-                flood = self._faults[way].get("flood")
+                flood = self.faults[way].get("flood")
                 if flood is None:
                     continue
                 owed[way] += (now_s - before_s) * flood.rate_hz
                 lines, owed[way] = int(owed[way]), owed[way] % 1.0
-                for pipes in self.connections if lines else ():
-                    pipes[way].flood(lines)
+                for pipe in self._pipes() if lines else ():
+                    if pipe.way == way:
+                        pipe.flood(lines)
             before_s = now_s
 
 

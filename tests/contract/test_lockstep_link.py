@@ -23,7 +23,7 @@ from ccatp.links.robot_messages import CommandEcho, Hello, Joined, Role, Sensors
 from ccatp.sim import sessions
 from ccatp.sim.fault_proxy import FaultProxy
 from tests.faults.test_link import HELLO
-from tests.support.scenario import SurveyLoop, config_of
+from tests.support.scenario import SurveyLoop, begin, config_of
 
 DEADLINE_S = 30.0  # what never happens in a good run may take this long in a bad one
 FRAMES = 40
@@ -198,7 +198,7 @@ async def test_a_faulty_link_stops_nobody_and_changes_nothing(tmp_path: Path, fa
     kind, values = FAULTS[fault]
 
     async def disturb(rig: Rig) -> None:
-        rig.proxies[role].begin(kind, way, **values)
+        begin(rig.proxies[role], kind, way, **values)
         seq = rig.robot.robot.seq
         await rig.drive(seq + 10)
         rig.proxies[role].heal()
@@ -227,7 +227,7 @@ async def test_a_line_that_is_gone_for_good_is_sent_again(tmp_path: Path, fault:
         await rig.drive(5)
         client, proxy, repeats = rig.clients[role], rig.proxies[role], rig.robot.counts["repeats"]
         kind, values = ("corrupt", {"every": 1}) if fault == "corrupt" else ("black_hole", {})
-        proxy.begin(kind, way, **values)
+        begin(proxy, kind, way, **values)
         await until(lambda: proxy.counts[kind] > 0 and rig.robot.counts["repeats"] > repeats)
         stands_at = rig.robot.robot.seq
         proxy.heal()
@@ -243,8 +243,8 @@ async def test_an_invalid_line_is_reported_while_the_robot_stands(tmp_path: Path
         async with running(tmp_path) as rig:
             client, proxy = rig.clients[role], rig.proxies[role]
             await rig.drive(5)
-            proxy.begin("garbage", "to_client", every=1, garbage_bytes=20)
-            proxy.begin("black_hole", "to_robot")
+            begin(proxy, "garbage", "to_client", every=1, garbage_bytes=20)
+            begin(proxy, "black_hole", "to_robot")
             await until(partial(bool, client.reports))
             proxy.heal()
             stood_at = rig.robot.robot.seq
@@ -288,7 +288,7 @@ async def test_a_connection_that_is_silent_is_dropped_and_the_next_one_goes_on(
     async with running(tmp_path) as rig:
         client, proxy = rig.clients[role], rig.proxies[role]
         await rig.drive(5)
-        proxy.begin("black_hole", "to_client")
+        begin(proxy, "black_hole", "to_client")
         await until(lambda: client.losses != [])
         assert client.losses[0].endswith("in lockstep, not even the last one again")
         proxy.heal()

@@ -23,7 +23,7 @@ from ccatp.errors import ExitStatus
 from ccatp.survey.state import FixNeed, Pause, Resume
 from tests.faults.linking import Measured
 from tests.support.daemon import Daemon, configuration, running_daemon, tell
-from tests.support.scenario import SurveyLoop
+from tests.support.scenario import SurveyLoop, begin
 
 PACKAGE = Path(ccatp.__file__).parent
 
@@ -63,7 +63,7 @@ async def test_while_a_robot_that_took_the_connection_says_nothing(measured: Mea
     loop = asyncio.get_running_loop()
     async with running_daemon(configuration()) as daemon:
         for proxy in (daemon.to_main, daemon.to_danger):
-            proxy.begin("stall", "to_client")
+            begin(proxy, "stall", "to_client")
         await asyncio.sleep(1.0)
         assert not daemon.sent
         begun_s = loop.time()
@@ -173,7 +173,7 @@ async def test_stalls_and_blocks(measured: Measured) -> None:
             await daemon.until(lambda: daemon.is_driving)
             begun_s = clock()
             for proxy in proxies:
-                proxy.begin("stall", direction)  # type: ignore[arg-type]
+                begin(proxy, "stall", direction)
             await asyncio.sleep(LONG_S)
             assert not daemon.is_driving, tell(daemon)  # held by the robot itself, or by zero drives
             healed_s = clock()

@@ -21,7 +21,7 @@ from ccatp.sim.fault_proxy import FaultProxy
 from tests.faults.linking import Measured
 from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S
 from tests.support.daemon import Driver, robot_behind_proxy
-from tests.support.scenario import ServedRobot, SurveyLoop, config_of, mirror_of
+from tests.support.scenario import ServedRobot, SurveyLoop, begin, config_of, mirror_of
 
 FRAMES = 60
 KEY = b"secret"
@@ -66,7 +66,7 @@ async def test_frames_that_come_twice_leave_the_pose_as_it_is(measured: Measured
     for is_disturbed in (False, True):
         async with driving(lockstep=True) as (_, proxy, driver):
             if is_disturbed:
-                proxy.begin("duplicate", "both", every=1)
+                begin(proxy, "duplicate", "both", every=1)
             await driver.drive(FRAMES)
         assert not driver.lost
         drivers.append(driver)
@@ -79,7 +79,7 @@ async def test_frames_that_come_twice_leave_the_pose_as_it_is(measured: Measured
 @pytest.mark.fault("S14")
 async def test_frames_out_of_order_never_reach_the_localizer() -> None:
     async with driving(lockstep=False) as (_, proxy, driver):
-        proxy.begin("reorder", "to_client", every=3)
+        begin(proxy, "reorder", "to_client", every=3)
         await driver.drive(FRAMES)
         assert proxy.counts["reorder"] >= 5
         assert driver.link.counts["repeated_frames"] >= 5
@@ -90,7 +90,7 @@ async def test_frames_out_of_order_never_reach_the_localizer() -> None:
 @pytest.mark.fault("S15")
 async def test_a_damaged_line_costs_itself_alone(measured: Measured) -> None:
     async with driving(lockstep=False) as (_, proxy, driver):
-        proxy.begin("corrupt", "to_client", every=10)  # ten a second; more than twenty would end the session
+        begin(proxy, "corrupt", "to_client", every=10)  # ten a second; more than twenty would end the session
         await driver.drive(2 * FRAMES)
         assert not driver.lost
         assert proxy.counts["corrupt"] >= 8
@@ -304,7 +304,7 @@ async def test_a_recorded_session_opens_no_door(measured: Measured) -> None:
 @pytest.mark.fault("L9")
 async def test_commands_that_come_again_are_dropped() -> None:
     async with driving(lockstep=True) as (loop, proxy, driver):
-        proxy.begin("duplicate", "to_robot", every=1)
+        begin(proxy, "duplicate", "to_robot", every=1)
         await driver.drive(FRAMES)
         assert loop.counts["stale"] >= FRAMES - 5
 

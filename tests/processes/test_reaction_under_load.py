@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 from unittest.mock import patch
@@ -26,7 +26,7 @@ from ccatp.config.load import dump_config, load_config
 from ccatp.sim.fault_proxy import FaultProxy, Pipe
 from tests.faults.linking import Measured
 from tests.support.daemon import stand_ins
-from tests.support.scenario import SurveyLoop
+from tests.support.scenario import SurveyLoop, begin
 
 TIMES = int(os.environ.get("CCATP_REACTIONS", "3"))
 IN_A_SURVEY = 10  # faults that one daemon has to bear, at most ...
@@ -149,7 +149,8 @@ async def survey(folder: Path, runtime_dir: Path) -> AsyncIterator[Survey]:
         robot, port, laser_port = await stack.enter_async_context(peers)
         wire = Wire(robot)
         proxy = await stack.enter_async_context(FaultProxy("127.0.0.1", port, seed=1))
-        stack.enter_context(patch.object(Pipe, "_read", _tapped(wire, proxy)))
+        stack.enter_context(patch.object(Pipe, "data_received", _tapped(wire)))
+        stack.enter_context(patch.object(Pipe, "eof_received", _tapped_end(wire)))
         at = load_config(overrides={**settings, "robot.port": proxy.port, "etalon.port": laser_port})
         (folder / "config.toml").write_text(dump_config(at), encoding="utf-8")
         said = stack.enter_context((folder / "said").open("w"))
@@ -162,14 +163,24 @@ async def survey(folder: Path, runtime_dir: Path) -> AsyncIterator[Survey]:
             await asyncio.to_thread(end, daemon)
 
 
-def _tapped(wire: Wire, proxy: FaultProxy) -> Callable[[Pipe], Awaitable[bytes]]:
-    read, to_robot = Pipe._read, proxy._faults["to_robot"]
+def _tapped(wire: Wire) -> Callable[[Pipe, bytes], None]:
+    receive = Pipe.data_received
 
-    async def tapped(pipe: Pipe) -> bytes:
-        data = await read(pipe)
-        if pipe._faults is to_robot:
+    def tapped(pipe: Pipe, data: bytes) -> None:
+        if pipe.way == "to_robot":
             wire.heard(id(pipe), data)
-        return data
+        receive(pipe, data)
+
+    return tapped
+
+
+def _tapped_end(wire: Wire) -> Callable[[Pipe], bool]:
+    end = Pipe.eof_received
+
+    def tapped(pipe: Pipe) -> bool:
+        if pipe.way == "to_robot":
+            wire.heard(id(pipe), b"")
+        return end(pipe)
 
     return tapped
 
@@ -206,7 +217,7 @@ FAULTS: dict[str, tuple[Callable[[Survey], None], float]] = {
     "kill all": (kill_all, 0.0),
     "stop main": (sends("main", signal.SIGSTOP), EVIDENCE_S),
     "stop danger": (sends("danger", signal.SIGSTOP), EVIDENCE_S),
-    "black hole": (lambda it: it.proxy.begin("black_hole", "both"), EVIDENCE_S),
+    "black hole": (lambda it: begin(it.proxy, "black_hole", "both"), EVIDENCE_S),
 }
 
 

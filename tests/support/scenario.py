@@ -15,6 +15,7 @@ from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
+from ccatp.sim.fault_proxy import FaultProxy
 from ccatp.sim.robot import Robot
 from ccatp.sim.sessions import RobotServer, RobotSession, ServerLog
 
@@ -53,6 +54,12 @@ def fault_plan(*rows: dict[str, object], section: str = "fault") -> FaultPlan:
         f"[[{section}]]\n" + "\n".join(f"{key} = {json.dumps(value)}" for key, value in row.items()) for row in rows
     ]
     return parse_plan("\n".join(text), "plan")
+
+
+def begin(proxy: FaultProxy, kind: str, direction: str = "both", **values: object) -> None:
+    """Switch on a fault of the link that lasts."""
+    (fault,) = fault_plan({"type": kind, "at_s": 0.0, "direction": direction, **values}, section="link").link
+    proxy.switch_on(fault)
 
 
 def boot(config: Config, mirror: Mirror, seed: int = 1, plan: FaultPlan | None = None) -> Robot:

@@ -12,6 +12,7 @@ import pytest
 
 from ccatp.sim.fault_plan import LINK_TYPES
 from ccatp.sim.fault_proxy import FaultProxy, LineStage, OneWayFaults
+from tests.support.scenario import begin
 
 DEADLINE_S = 5.0  # what never happens in a good run may take this long in a bad one
 LINES = [b"line %d of some length\n" % k for k in range(40)]
@@ -172,7 +173,7 @@ async def test_close_ends_both_sides_in_order() -> None:
 async def test_a_black_hole_one_way_swallows_data_and_the_end() -> None:
     async with rig() as r:
         reader, writer = await r.connect()
-        r.proxy.begin("black_hole", "to_robot")
+        begin(r.proxy, "black_hole", "to_robot")
         writer.write(TEXT)
         r.server.writers[0].write(b"still here\n")
         assert await read(reader, 11) == b"still here\n"  # the other way is open
@@ -190,7 +191,7 @@ async def test_a_black_hole_one_way_swallows_data_and_the_end() -> None:
 async def test_a_stall_ends_in_one_burst() -> None:
     async with rig() as r:
         reader, writer = await r.connect()
-        r.proxy.begin("stall", "to_robot")
+        begin(r.proxy, "stall", "to_robot")
         for line in LINES:
             writer.write(line)
             await writer.drain()
