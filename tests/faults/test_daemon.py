@@ -224,7 +224,7 @@ async def test_planning_longer_than_a_frame_may_wait_pauses_nobody() -> None:
 async def test_frames_that_are_old_for_good_are_reported_as_that_and_are_a_fault() -> None:
     async with running_daemon(configuration(health__pause_limit_s=1.0, health__hold_limit_s=3.0)) as daemon:
         await daemon.until(lambda: daemon.is_driving)
-        daemon.to_main.begin("delay", "to_client", delay_s=0.3, jitter_s=0.0)
+        begin(daemon.to_main, "delay", "to_client", delay_s=0.3, jitter_s=0.0)
         mission: Any = daemon.main._runner.mission
         await daemon.until(lambda: mission.state.cause.startswith("frames are 3"))
         assert not daemon.is_driving
