@@ -8,10 +8,15 @@ from msgspec.structs import replace
 
 from ccatp.config.models import ControlConfig, GainsConfig, LimitsConfig
 from ccatp.control.pid import AxisState, BareAxis, Pid, PidState, ProfiledAxis
+from ccatp.control.sent_drives import Pose
 from ccatp.core import Predicted, Twist, wrap_pi
 
 # Drift per metre beyond which an estimate is nonsense: a robot carried off that fast has lost its wheels' grip.
 CREEP_LIMIT = 0.3
+
+
+Vector2 = tuple[float, float]
+Speeds = Twist | Predicted | None
 
 
 class LegView(msgspec.Struct, frozen=True):
@@ -35,29 +40,24 @@ class LegLine(msgspec.Struct, frozen=True):
     the robot, because the bearing of a near stop is noise.
     """
 
-    target: tuple[float, float]
+    target: Vector2
     course_rad: float
     cos: float
     sin: float
     off_rad: float = 0.0
 
     @classmethod
-    def lay(cls, target: tuple[float, float], course_rad: float) -> "LegLine":
+    def lay(cls, target: Vector2, course_rad: float) -> "LegLine":
         """The line through a stop with a course."""
         return cls(target, course_rad, cos(course_rad), sin(course_rad))
 
     @classmethod
-    def through(cls, pose: tuple[float, float, float], target: tuple[float, float]) -> "LegLine":
+    def through(cls, pose: Pose, target: Vector2) -> "LegLine":
         """The line from the robot at (x, y, heading) to the stop."""
         return cls.lay(target, atan2(target[1] - pose[1], target[0] - pose[0]))
 
     def look(
-        self,
-        pose: tuple[float, float, float],
-        target: tuple[float, float],
-        creep: tuple[float, float],
-        reverse: bool,
-        lookahead_m: float,
+        self, pose: Pose, target: Vector2, creep: Vector2, reverse: bool, lookahead_m: float
     ) -> "tuple[LegLine, LegView]":
         """Where the robot at ``pose`` = (x, y, heading) stands, and the line as it is from now on.
 
@@ -70,8 +70,8 @@ class LegLine(msgspec.Struct, frozen=True):
         line = self
         if target != self.target:
             is_far = dx * dx + dy * dy > lookahead_m * lookahead_m
-            angle = crab(self.course_rad, creep)
-            line = LegLine.lay(target, atan2(dy, dx) if is_far else wrap_pi(motion - angle - self.off_rad))
+            kept_rad = motion - crab(self.course_rad, creep) - self.off_rad
+            line = LegLine.lay(target, atan2(dy, dx) if is_far else wrap_pi(kept_rad))
         course_rad, c, s = line.course_rad, line.cos, line.sin
         creep_x, creep_y = creep
         angle = -asin(min(max(c * creep_y - s * creep_x, -CREEP_LIMIT), CREEP_LIMIT))
@@ -81,7 +81,7 @@ class LegLine(msgspec.Struct, frozen=True):
         return LegLine(target, course_rad, c, s, off), view
 
 
-def crab(course_rad: float, creep: tuple[float, float]) -> float:
+def crab(course_rad: float, creep: Vector2) -> float:
     """Angle by which the body has to point beside a course so that it is not carried off it, rad."""
     across = cos(course_rad) * creep[1] - sin(course_rad) * creep[0]
     return -asin(min(max(across, -CREEP_LIMIT), CREEP_LIMIT))
@@ -132,7 +132,7 @@ class LegMotion(msgspec.Struct, frozen=True):
     reverse: bool
     axis: AxisState
     line: LegLine | None = None
-    aim: tuple[tuple[float, float], float] = ((0.0, 0.0), 0.0)
+    aim: tuple[Vector2, float] = ((0.0, 0.0), 0.0)
     steering: PidState = PidState()
 
     @property
@@ -176,15 +176,9 @@ class LegTracker:
         self._paces = tuple(_Pace(gains, control, one, wheel_lag_s) for one in (limits, slow_limits or limits))
 
     def begin(
-        self,
-        pose: tuple[float, float, float],
-        target: tuple[float, float],
-        reverse: bool,
-        creep: tuple[float, float] = NO_CREEP,
-        *,
-        is_slow: bool = False,
+        self, pose: Pose, target: Vector2, reverse: bool, creep: Vector2 = NO_CREEP, *, is_slow: bool = False
     ) -> LegMotion:
-        """Start a leg from ``pose`` = (x, y, heading)."""
+        """Start a leg from ``pose``."""
         if hypot(target[0] - pose[0], target[1] - pose[1]) <= self._position_tolerance_m:
             # It is there, and the bearing of a stop so near is noise.
             return LegMotion(DONE, is_slow, reverse, self._paces[is_slow].forward.begin(0.0))
@@ -210,11 +204,11 @@ class LegTracker:
     def step(
         self,
         motion: LegMotion,
-        pose: tuple[float, float, float],
-        target: tuple[float, float],
+        pose: Pose,
+        target: Vector2,
         dt_s: float,
-        speeds: Twist | Predicted | None = None,
-        creep: tuple[float, float] = NO_CREEP,
+        speeds: Speeds = None,
+        creep: Vector2 = NO_CREEP,
     ) -> tuple[LegMotion, Twist]:
         """The next motion, and the twist for ``dt_s``; ``pose`` is that at which it will take effect."""
         if motion.phase is TURN:
@@ -236,18 +230,13 @@ class LegTracker:
         return self._head_on(motion, pose, target, dt_s)
 
     def _begin_alignment(
-        self,
-        pose: tuple[float, float, float],
-        target: tuple[float, float],
-        angle_rad: float,
-        reverse: bool,
-        is_slow: bool,
+        self, pose: Pose, target: Vector2, angle_rad: float, reverse: bool, is_slow: bool
     ) -> LegMotion:
         axis = self._paces[is_slow].angular.begin(angle_rad)
         return LegMotion(TURN, is_slow, reverse, axis, aim=(target, pose[2] + angle_rad))
 
     def _look_at_bearing(
-        self, motion: LegMotion, pose: tuple[float, float, float], target: tuple[float, float], angle_rad: float
+        self, motion: LegMotion, pose: Pose, target: Vector2, angle_rad: float
     ) -> tuple[LegMotion, bool]:
         """Whether a stop that is all but reached lies on another bearing than the turn began for (same frame)."""
         if hypot(target[0] - pose[0], target[1] - pose[1]) > ALL_BUT_THERE_M:
@@ -257,15 +246,11 @@ class LegTracker:
             return replace(motion, aim=(target, pose[2] + angle_rad)), False
         return motion, abs(wrap_pi(pose[2] + angle_rad - heading_rad)) > REALIGN_RAD
 
-    def _begin_drive(
-        self, pose: tuple[float, float, float], target: tuple[float, float], reverse: bool, is_slow: bool
-    ) -> LegMotion:
+    def _begin_drive(self, pose: Pose, target: Vector2, reverse: bool, is_slow: bool) -> LegMotion:
         axis = self._paces[is_slow].forward.begin(hypot(target[0] - pose[0], target[1] - pose[1]))
         return LegMotion(DRIVE, is_slow, reverse, axis, LegLine.through(pose, target))
 
-    def _bearing_error(
-        self, pose: tuple[float, float, float], target: tuple[float, float], creep: tuple[float, float], reverse: bool
-    ) -> float:
+    def _bearing_error(self, pose: Pose, target: Vector2, creep: Vector2, reverse: bool) -> float:
         """Thesis eq. 3.2, e = beta - theta with beta = atan2(dy, dx); printed there with the arguments exchanged.
 
         In reverse the tail has to point at the target; against a drift the robot points beside it.
@@ -275,13 +260,7 @@ class LegTracker:
         return wrap_pi(beta - pose[2] - (pi if reverse else 0.0))
 
     def _drive(
-        self,
-        motion: LegMotion,
-        pose: tuple[float, float, float],
-        target: tuple[float, float],
-        dt_s: float,
-        speeds: Twist | Predicted | None,
-        creep: tuple[float, float],
+        self, motion: LegMotion, pose: Pose, target: Vector2, dt_s: float, speeds: Speeds, creep: Vector2
     ) -> tuple[LegMotion, Twist]:
         control, pace = self._control, self._paces[motion.is_slow]
         reverse, axis = motion.reverse, motion.axis
@@ -305,9 +284,7 @@ class LegTracker:
         next_motion = LegMotion(DRIVE, motion.is_slow, reverse, axis, line)
         return next_motion, Twist(sign * wanted, min(max(rate, -pace.omega_max), pace.omega_max))
 
-    def _head_on(
-        self, motion: LegMotion, pose: tuple[float, float, float], target: tuple[float, float], dt_s: float
-    ) -> tuple[LegMotion, Twist]:
+    def _head_on(self, motion: LegMotion, pose: Pose, target: Vector2, dt_s: float) -> tuple[LegMotion, Twist]:
         """The thesis's drive: one PID on the distance, one on the bearing, eqs 3.1 to 3.4."""
         x, y, heading = pose
         dx, dy = target[0] - x, target[1] - y

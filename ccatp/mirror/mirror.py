@@ -16,10 +16,9 @@ from ccatp.mirror.surface import Axes, Surface, UnknownPanelError, build_surface
 
 
 class MirrorFrames:
-    """Where a mirror stands in the world.
+    """Where a mirror stands in the world: p_mirror = R (p_world - origin), R = [[1, 0, 0], [0, c, s], [0, -s, c]].
 
-    ``p_mirror = R (p_world - origin)`` with ``R = [[1, 0, 0], [0, c, s], [0, -s, c]]``; the deck frame is the mirror
-    frame turned by pi about its y axis where ``drive_side`` is -1, and the mirror frame itself where it is +1.
+    The deck frame is the mirror frame turned by pi about its y axis where ``drive_side`` is -1, else the mirror frame.
     """
 
     def __init__(self, cfg: FrameConfig) -> None:
@@ -29,12 +28,10 @@ class MirrorFrames:
         self.drive_side: int = cfg.reflecting_side_sign
 
     def deck_from_mirror(self, p: Vector3) -> Vector3:
-        """Deck coordinates of a point given in the mirror frame, m. Its own inverse."""
+        """Deck coordinates of a point given in the mirror frame, m; and the other way round."""
         return p if self.drive_side > 0 else (-p[0], p[1], -p[2])
 
-    def mirror_from_deck(self, p: Vector3) -> Vector3:
-        """Mirror coordinates of a point given in the deck frame, m."""
-        return p if self.drive_side > 0 else (-p[0], p[1], -p[2])
+    mirror_from_deck = deck_from_mirror
 
     def mirror_from_world(self, p: Vector3) -> Vector3:
         """Mirror coordinates of a point given in the world frame, m."""

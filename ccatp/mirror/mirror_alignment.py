@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from ccatp.config.models import AlignConfig
-from ccatp.core import PanelId, PointId, Vector3
+from ccatp.core import PanelId, Vector3
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panel_alignment import (
     Deviations,
@@ -18,7 +18,6 @@ from ccatp.mirror.panel_alignment import (
     Prices,
     cos_incidence,
     deviations_of,
-    explain,
     mirror_wavefront,
     panel_result,
     prices,
@@ -64,14 +63,21 @@ def survey_result(
     by_panel: dict[PanelId, list[Measured]] = {panel: [] for panel in sorted(set(planned))}
     for one in measured:
         by_panel.setdefault(one.point.panel, []).append(one)
-    usable, undetermined = _usable(mirror, cfg, puck_height_m, by_panel)
+    usable: dict[PanelId, Deviations] = {}
+    undetermined = []
+    for panel, some in by_panel.items():
+        deviations, why = _deviations(mirror, cfg, puck_height_m, panel, some)
+        if deviations is None:
+            undetermined.append(Undetermined(panel, len(some), why))
+        else:
+            usable[panel] = deviations
     light = cfg.light.get(mirror.name)
     if light is None:
         warnings.append(f"no light is configured for {mirror.name} (align.light): its angle of incidence is taken as 0")
     price = prices(cfg.false_alarm, sum(len(found.points) for found in usable.values()), len(usable))
     panels = []
     for panel, found in usable.items():
-        result = panel_result(mirror, panel, found, explain(found, price), cos_incidence(mirror, panel, light))
+        result = panel_result(mirror, panel, found, price, cos_incidence(mirror, panel, light))
         if result is None:
             undetermined.append(Undetermined(panel, len(found.points), "its points lie on one line"))
         else:
@@ -88,42 +94,31 @@ def survey_result(
     )
 
 
-def _usable(
-    mirror: Mirror, cfg: AlignConfig, puck_height_m: float, by_panel: Mapping[PanelId, Sequence[Measured]]
-) -> tuple[dict[PanelId, Deviations], list[Undetermined]]:
-    usable: dict[PanelId, Deviations] = {}
-    others: list[Undetermined] = []
-    for panel, some in by_panel.items():
-        if len(some) < ENOUGH:
-            others.append(Undetermined(panel, len(some), f"{len(some)} of {ENOUGH} points that it takes"))
-            continue
-        try:
-            found = deviations_of(mirror, panel, some, puck_height_m, cfg.point_floor_m)
-        except ConvergenceError as error:
-            others.append(Undetermined(panel, len(some), f"a fix is far from the mirror: {error}"))
-            continue
-        if not (found.sigmas_m > 0.0).all():
-            others.append(Undetermined(panel, len(some), "a fix claims to be exact: its covariance is not positive"))
-            continue
-        usable[panel] = found
-    return usable, others
-
-
-def point_text(point: PointId) -> str:
-    """A point as in the other commands: row/column/number."""
-    return "/".join(map(str, point))
+def _deviations(
+    mirror: Mirror, cfg: AlignConfig, puck_height_m: float, panel: PanelId, measured: Sequence[Measured]
+) -> tuple[Deviations | None, str]:
+    """Deviations that can be fitted, or why there are none."""
+    if len(measured) < ENOUGH:
+        return None, f"{len(measured)} of {ENOUGH} points that it takes"
+    try:
+        found = deviations_of(mirror, panel, measured, puck_height_m, cfg.point_floor_m)
+    except ConvergenceError as error:
+        return None, f"a fix is far from the mirror: {error}"
+    if not (found.sigmas_m > 0.0).all():
+        return None, "a fix claims to be exact: its covariance is not positive"
+    return found, ""
 
 
 def _remarks(result: PanelResult, rare: float) -> list[str]:
     where = f"panel {result.panel.row}/{result.panel.col}"
     lines = []
     if result.outliers:
-        names = ", ".join(map(point_text, result.outliers))
+        names = ", ".join(f"{row}/{col}/{number}" for row, col, number in result.outliers)
         lines.append(f"{where}: left out as outliers: {names}; measure them again")
     if result.probability < rare:
         lines.append(
             f"{where}: its points contradict each other by more than they are uncertain (chance "
-            f"{result.probability:.1g} with {result.model_dof} degrees of freedom); its sigmas are too small"
+            f"{result.probability:.1g} with {result.model.dof} degrees of freedom); its sigmas are too small"
         )
     return lines
 

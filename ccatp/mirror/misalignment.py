@@ -1,4 +1,4 @@
-"""Misalignment of panels: the model, the puck on a misaligned panel, and deviations of measured positions.
+"""Misalignment of panels: the model, and the puck on a misaligned panel.
 
 A panel is a rigid body, displaced along its own normal by ``D(x_p, y_p) = piston + tilt x_p + tip y_p`` with (x_p, y_p)
 the panel coordinates of the surface point. Angles are small (100 urad), so the sideways motion of second order is
@@ -8,9 +8,7 @@ left out.
 from dataclasses import dataclass
 from math import sqrt
 
-import numpy as np
-
-from ccatp.core import DeckPose, FloatArray, PanelId, Vector3
+from ccatp.core import DeckPose, PanelId, Vector3
 from ccatp.mirror.mirror import Mirror
 
 
@@ -49,15 +47,3 @@ def misaligned_puck_world(
     scale = height_m / sqrt(mx * mx + my * my + mz * mz)
     ox, oy, oz = body.rotate_to_deck((scale * mx, scale * my, scale * mz + d))
     return mirror.world_from_deck((point[0] + ox, point[1] + oy, point[2] + oz))
-
-
-def panel_deviations(mirror: Mirror, panel: PanelId, points_world: FloatArray, puck_height_m: float) -> FloatArray:
-    """Rows (x_p, y_p, deviation along the local normal), m, shape (k, 3), of puck centres in the world frame (k, 3).
-
-    Raises ``UnknownPanelError``, and ``ConvergenceError`` far from the mirror.
-    """
-    body, rows = mirror.panel(panel), []
-    for world_x, world_y, world_z in points_world.tolist():
-        x, y, deviation = mirror.foot_of_puck((world_x, world_y, world_z), puck_height_m)
-        rows.append((*body.from_deck(mirror.surface.point(x, y))[:2], deviation))
-    return np.array(rows).reshape(-1, 3)

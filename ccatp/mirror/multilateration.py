@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,31 +15,7 @@ _FIRST_DAMPING = 1e-6  # of the mean diagonal of H^T W H: as good as Gauss-Newto
 
 
 class MultilaterationError(ValueError):
-    """Base: no position that can be used. The message carries the numbers."""
-
-
-class TooFewRanges(MultilaterationError):
-    """Fewer ranges than dimension + 1."""
-
-
-class DegenerateGeometry(MultilaterationError):
-    """Anchors and position leave a direction undetermined."""
-
-
-class NoConvergence(MultilaterationError):
-    """The iteration did not come to rest."""
-
-
-class ResidualTooLarge(MultilaterationError):
-    """The ranges contradict each other by more than the limit."""
-
-
-class DilutionTooLarge(MultilaterationError):
-    """The geometry magnifies range errors by more than the limit."""
-
-
-class TooFarFromExpected(MultilaterationError):
-    """The position is further than the limit from where it was expected."""
+    """No position that can be used. The message says why, with the numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +32,6 @@ class RangeSolution:
     residuals_m: FloatArray
     chi_squared: float
     iterations: int
-
-    @property
-    def residual_rms_m(self) -> float:
-        """Root mean square of the residuals."""
-        return float(np.sqrt(np.mean(self.residuals_m**2)))
 
 
 def multilaterate(
@@ -82,20 +52,22 @@ def multilaterate(
 
     Anchors that lie in one plane (in two dimensions: on one line) see two mirror images of the position equally well.
     The expected position then selects the side: the image on its side of the plane is returned. An expected position
-    in that plane selects none and gives ``DegenerateGeometry``.
+    in that plane selects none and is refused.
 
-    Raises ``ValueError`` (shapes, numbers that are not finite, sigmas that are not positive), ``TooFewRanges``,
-    ``DegenerateGeometry``, ``NoConvergence``.
+    Raises ``ValueError`` (shapes, numbers that are not finite, sigmas that are not positive) and
+    ``MultilaterationError``: too few ranges, a degenerate geometry, no convergence.
     """
-    problem = _checked(anchors_m, ranges_m, sigmas_m, expected_m)
-    anchors, ranges, sigmas, start = problem
-    position, iterations = _iterate(problem, max_iterations, tolerance_m)
+    given = (np.asarray(values, dtype=np.float64) for values in (anchors_m, ranges_m, sigmas_m, expected_m))
+    anchors, ranges, sigmas, start = given
+    _check(anchors, ranges, sigmas, start)
+    position, iterations = _iterate(anchors, ranges, sigmas, start, max_iterations, tolerance_m)
     position = _on_side_of(start, position, anchors)
     distances, directions = _geometry(anchors, position)
     singular = np.linalg.svd(directions, compute_uv=False)
     if singular[-1] <= _RANK_TOLERANCE * singular[0]:
-        raise DegenerateGeometry(
-            f"{len(ranges)} anchors leave a direction undetermined at {_text(position)} m "
+        at = ", ".join(f"{value:.4f}" for value in position)
+        raise MultilaterationError(
+            f"{len(ranges)} anchors leave a direction undetermined at ({at}) m "
             f"(singular values {singular[0]:.3g} to {singular[-1]:.3g}); they lie on a line, or in a plane with it"
         )
     weighted = directions / sigmas[:, None]
@@ -111,35 +83,7 @@ def multilaterate(
     )
 
 
-def check_solution(
-    solution: RangeSolution, expected_m: ArrayLike, *, max_residual_m: float, max_dop: float, max_distance_m: float
-) -> None:
-    """Refuse a solution that cannot be trusted.
-
-    Raises ``ResidualTooLarge``, ``DilutionTooLarge``, ``TooFarFromExpected``, in this order.
-    """
-    residual_m = float(np.max(np.abs(solution.residuals_m)))
-    if not residual_m <= max_residual_m:
-        raise ResidualTooLarge(f"largest residual {residual_m * 1e3:.4g} mm exceeds {max_residual_m * 1e3:.4g} mm")
-    if not solution.dop <= max_dop:
-        raise DilutionTooLarge(f"dilution of precision {solution.dop:.4g} exceeds {max_dop:.4g}")
-    distance_m = float(np.linalg.norm(solution.position_m - np.asarray(expected_m, dtype=np.float64)))
-    if not distance_m <= max_distance_m:
-        raise TooFarFromExpected(f"position {distance_m:.4g} m from the expected one exceeds {max_distance_m:.4g} m")
-
-
-class _Problem(NamedTuple):
-    anchors: FloatArray
-    ranges: FloatArray
-    sigmas: FloatArray
-    start: FloatArray
-
-
-def _checked(anchors_m: ArrayLike, ranges_m: ArrayLike, sigmas_m: ArrayLike, expected_m: ArrayLike) -> _Problem:
-    anchors = np.asarray(anchors_m, dtype=np.float64)
-    ranges = np.asarray(ranges_m, dtype=np.float64)
-    sigmas = np.asarray(sigmas_m, dtype=np.float64)
-    expected = np.asarray(expected_m, dtype=np.float64)
+def _check(anchors: FloatArray, ranges: FloatArray, sigmas: FloatArray, expected: FloatArray) -> None:
     dimension = expected.size
     if expected.shape not in ((2,), (3,)):
         raise ValueError(f"expected position of shape {expected.shape}, not (2,) or (3,)")
@@ -152,8 +96,7 @@ def _checked(anchors_m: ArrayLike, ranges_m: ArrayLike, sigmas_m: ArrayLike, exp
     if bool((sigmas <= 0.0).any()):
         raise ValueError(f"sigma of {float(sigmas.min())} m, must be positive")
     if ranges.size < dimension + 1:
-        raise TooFewRanges(f"{ranges.size} ranges, at least {dimension + 1} needed in {dimension} dimensions")
-    return _Problem(anchors, ranges, sigmas, expected)
+        raise MultilaterationError(f"{ranges.size} ranges, at least {dimension + 1} needed in {dimension} dimensions")
 
 
 def _geometry(anchors: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -164,19 +107,24 @@ def _geometry(anchors: FloatArray, position: FloatArray) -> tuple[FloatArray, Fl
     return distances, offsets / np.maximum(distances, 1e-12)[:, None]
 
 
-def _iterate(problem: _Problem, max_iterations: int, tolerance_m: float) -> tuple[FloatArray, int]:
-    anchors, ranges, sigmas, start = problem
-    position = start
+def _iterate(
+    anchors: FloatArray,
+    ranges: FloatArray,
+    sigmas: FloatArray,
+    position: FloatArray,
+    max_iterations: int,
+    tolerance_m: float,
+) -> tuple[FloatArray, int]:
     distances, directions = _geometry(anchors, position)
     residuals = (ranges - distances) / sigmas
     cost = float(residuals @ residuals)
     damping = _FIRST_DAMPING
     step_m = float("inf")
-    identity = np.eye(start.size)
+    identity = np.eye(position.size)
     for iteration in range(1, max_iterations + 1):
         weighted = directions / sigmas[:, None]
         normal = weighted.T @ weighted
-        scale = float(np.trace(normal)) / start.size
+        scale = float(np.trace(normal)) / position.size
         step = np.linalg.solve(normal + damping * scale * identity, weighted.T @ residuals)
         step_m = float(np.sqrt(step @ step))
         trial = position + step
@@ -190,7 +138,7 @@ def _iterate(problem: _Problem, max_iterations: int, tolerance_m: float) -> tupl
             damping *= 10.0
         if step_m <= tolerance_m:
             return position, iteration
-    raise NoConvergence(
+    raise MultilaterationError(
         f"no rest after {max_iterations} iterations: last step {step_m:.3g} m, limit {tolerance_m:.3g} m"
     )
 
@@ -208,10 +156,6 @@ def _on_side_of(start: FloatArray, position: FloatArray, anchors: FloatArray) ->
     return position
 
 
-def _text(position: FloatArray) -> str:
-    return "(" + ", ".join(f"{value:.4f}" for value in position) + ")"
-
-
 def solve_fix(
     cfg: EtalonConfig,
     t_s: float,
@@ -227,13 +171,15 @@ def solve_fix(
     sigmas_m = cfg.length_sigma_m + cfg.length_sigma_per_m * ranges_m
     anchors_m = np.array([collimators_m[channel] for channel in lengths_m]).reshape(-1, 3)  # none is too few, too
     solution = multilaterate(anchors_m, ranges_m, sigmas_m, expected_m)
-    check_solution(
-        solution,
-        expected_m,
-        max_residual_m=cfg.max_residual_m,
-        max_dop=cfg.max_dop,
-        max_distance_m=cfg.max_distance_m,
-    )
+    residual_m = float(np.max(np.abs(solution.residuals_m)))
+    if not residual_m <= cfg.max_residual_m:
+        limit_mm = cfg.max_residual_m * 1e3
+        raise MultilaterationError(f"largest residual {residual_m * 1e3:.4g} mm exceeds {limit_mm:.4g} mm")
+    if not solution.dop <= cfg.max_dop:
+        raise MultilaterationError(f"dilution of precision {solution.dop:.4g} exceeds {cfg.max_dop:.4g}")
+    distance_m, limit_m = float(np.linalg.norm(solution.position_m - np.array(expected_m))), cfg.max_distance_m
+    if not distance_m <= limit_m:
+        raise MultilaterationError(f"position {distance_m:.4g} m from the expected one exceeds {limit_m:.4g} m")
     x, y, z = solution.position_m.tolist()
     return Fix(
         t_s=t_s,
@@ -241,5 +187,5 @@ def solve_fix(
         covariance_m2=tuple(solution.covariance_m2.ravel().tolist()),
         dop=solution.dop,
         channels=tuple(lengths_m),
-        residual_rms_m=solution.residual_rms_m,
+        residual_rms_m=float(np.sqrt(np.mean(solution.residuals_m**2))),
     )

@@ -1,34 +1,8 @@
 """The alignment of one panel: deviations, modes, adjuster moves, outliers and shape, half-wavefront error.
 
-The displacement along a panel's normal is ``D(x, y) = sum c_i m_i(x, y)`` with the modes
-
-* ``RIGID``: 1, y, x: piston, tip, tilt, as in ``ccatp.mirror.misalignment``;
-* ``QUADRATIC``: these and x^2/2, x y, y^2/2: the coefficients are the curvatures D_xx, D_xy, D_yy;
-* ``ADJUSTABLE``: the rigid ones and what five adjusters in the corners and the centre can bend besides: x y, a twist,
-  and (x^2 + y^2)/2, a bowl. How a panel bends between its adjusters is taken to be this.
-
-An adjuster moves its place along the panel's normal, > 0 towards the robot. Moving the adjusters at (X_j, Y_j) by
-``a_j = -sum c_i m_i(X_j, Y_j)`` adds ``-D`` to the panel, D being the fitted displacement. For the rigid modes the
-moves lie on a plane: they turn and shift the panel and do not bend it, so no stiffness needs to be known.
-
-Each explanation of the deviations is a fit, rigid or with curvatures, to all points but a few. It costs its
-chi-square, a price for every point left out and a price for the curvatures; the cheapest one holds. Leaving a point out
-is the same as giving it a shift of its own (mean-shift model), so its price is the chi-square of one degree of freedom
-that noise reaches only with the agreed probability, shared by all points of the mirror. Baarda's data snooping asks the
-same of one point at a time; a bent panel would make it throw good points away.
-
-A surface that is off by d along its normal changes the path of a ray that meets it at the angle of incidence i by
-``2 d cos(i)``, to first order in d; half of it, ``d cos(i)``, is the half-wavefront error. For a paraboloid in axial
-light this is Ruze's effective tolerance (J. Ruze, Antenna tolerance theory - a review, Proc. IEEE 54 (1966) 633), as
-cos(i) = 1 / sqrt(1 + (r/2f)^2) there. The root mean square is taken over the beam: a panel counts with its area times
-cos(i). For one panel, with the fitted coefficients c, their covariance C, and G the panel's mean of the products of
-the modes,
-
-    before^2 = cos(i)^2 (c^T G c + u)        after^2 = cos(i)^2 (tr(C G) + u)
-
-where u is the mean square of the residuals beyond what the uncertainty of the points explains (shape that the moves
-cannot take away), and tr(C G) what the uncertain moves leave. Noise makes the u of a panel without shape negative as
-often as positive, so the mean over the mirror is taken first, and cut off at zero then.
+The displacement along a panel's normal is ``D(x, y) = sum c_i m_i(x, y)``: ``rigid`` modes (as in ``misalignment``),
+``quadratic`` ones, whose coefficients are the curvatures D_xx, D_xy, D_yy, or ``adjustable`` ones, twist and bowl,
+which five adjusters can bend. docs/align.md has the method: outliers and shape, moves, half-wavefront error.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -44,7 +18,6 @@ from ccatp.config.models import LightConfig
 from ccatp.core import BoolArray, Fix, FloatArray, PanelId, PointId, Vector3
 from ccatp.mirror.layout import Panel
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.misalignment import panel_deviations
 
 
 class Measured(NamedTuple):
@@ -57,13 +30,9 @@ class Measured(NamedTuple):
 class Deviations(NamedTuple):
     """The measured points of one panel, in the order of their numbers.
 
-    Attributes:
-        places_m: (x, y) in the panel frame of the surface point under the puck, shape (k, 2).
-        deck_m: the same in the deck frame, shape (k, 2).
-        values_m: deviation along the local normal, > 0 towards the robot, shape (k,).
-        sigmas_m: standard deviation of each, shape (k,).
-        lever: local normal times the panel's, shape (k,): a displacement D along the panel's normal is a deviation of
-            D times this.
+    ``places_m`` (k, 2) in the panel frame and ``deck_m`` (k, 2) are the surface points under the puck, ``values_m``
+    (k,) the deviations along the local normal, > 0 towards the robot. ``lever`` (k,): local normal times the panel's; a
+    displacement D along the panel's normal is a deviation of D times this.
     """
 
     points: tuple[PointId, ...]
@@ -84,17 +53,18 @@ def deviations_of(
     """
     chosen = sorted(measured, key=lambda one: one.point)
     body = mirror.panel(panel)
-    rows = panel_deviations(mirror, panel, np.array([one.fix.position_m for one in chosen]), puck_height_m)
-    deck = np.array([mirror.surface.drop(body.to_deck((x, y, 0.0)), body.axes[2])[:2] for x, y, _ in rows.tolist()])
+    feet = [mirror.foot_of_puck(one.fix.position_m, puck_height_m) for one in chosen]
+    places = [body.from_deck(mirror.surface.point(x, y))[:2] for x, y, _ in feet]
+    deck = np.array([mirror.surface.drop(body.to_deck((x, y, 0.0)), body.axes[2])[:2] for x, y in places])
     normals = [mirror.surface.normal(x, y) for x, y in deck.tolist()]
     world = np.array([mirror.rotate_world_from_deck(normal) for normal in normals])
     covariances = np.array([one.fix.covariance_m2 for one in chosen], dtype=np.float64).reshape(-1, 3, 3)
     variances = np.einsum("ki,kij,kj->k", world, covariances, world) + floor_m**2
     return Deviations(
         points=tuple(one.point for one in chosen),
-        places_m=rows[:, :2],
+        places_m=np.array(places),
         deck_m=deck,
-        values_m=rows[:, 2],
+        values_m=np.array([deviation for _, _, deviation in feet]),
         sigmas_m=np.sqrt(variances),
         lever=np.array(normals) @ np.array(body.axes[2]),
     )
@@ -222,13 +192,6 @@ class Prices(NamedTuple):
     shape: float
 
 
-class Explanation(NamedTuple):
-    """Points that count, and whether the curvatures are significant."""
-
-    is_kept: BoolArray
-    has_shape: bool
-
-
 def prices(false_alarm: float, points: int, panels: int) -> Prices:
     """What an explanation costs.
 
@@ -239,14 +202,16 @@ def prices(false_alarm: float, points: int, panels: int) -> Prices:
     )
 
 
-def explain(deviations: Deviations, price: Prices) -> Explanation:
-    """The cheapest explanation of a panel's deviations.
+def explain(deviations: Deviations, price: Prices) -> tuple[BoolArray, bool]:
+    """The cheapest explanation of a panel's deviations: which points count, and whether the curvatures are significant.
 
-    A panel that cannot be fitted, or has hardly more points than it takes, keeps all of them.
+    Leaving a point out is the same as giving it a shift of its own, so its price is a chi-square of one degree of
+    freedom. Baarda's data snooping asks the same of one point at a time; a bent panel would make it throw good points
+    away. A panel that cannot be fitted, or has hardly more points than it takes, keeps all of them.
     """
     count = len(deviations.points)
     target = deviations.values_m / deviations.sigmas_m
-    best, lowest = Explanation(np.ones(count, dtype=np.bool_), has_shape=False), np.inf
+    best, lowest = (np.ones(count, dtype=np.bool_), False), np.inf
     for modes, needed in ((rigid, 3), (quadratic, 6)):
         has_shape = modes is quadratic
         extra = price.shape if has_shape else 0.0
@@ -258,7 +223,7 @@ def explain(deviations: Deviations, price: Prices) -> Explanation:
                 continue
             cost += _chi2(whitened[is_kept], target[is_kept])
             if cost < lowest:
-                best, lowest = Explanation(is_kept, has_shape), cost
+                best, lowest = (is_kept, has_shape), cost
     return best
 
 
@@ -421,22 +386,21 @@ class PanelResult:
         return tuple(p for p, kept in zip(self.deviations.points, self.is_kept, strict=True) if not kept)
 
     @property
-    def probability(self) -> float:
-        """That the points' uncertainty alone gives what the chosen model leaves, or more."""
-        found = self.shape if self.shape is not None and self.shape.is_significant else self.fit
-        return float(chdtrc(found.dof, found.chi2)) if found.dof > 0 else 1.0
+    def model(self) -> "ModeFit | PanelShape":
+        """The chosen model, with ``chi2`` and ``dof`` that it leaves."""
+        return self.shape if self.shape is not None and self.shape.is_significant else self.fit
 
     @property
-    def model_dof(self) -> int:
-        """Degrees of freedom that the chosen model leaves."""
-        return self.shape.dof if self.shape is not None and self.shape.is_significant else self.fit.dof
+    def probability(self) -> float:
+        """That the points' uncertainty alone gives what the chosen model leaves, or more."""
+        return float(chdtrc(self.model.dof, self.model.chi2)) if self.model.dof > 0 else 1.0
 
 
 def panel_result(
-    mirror: Mirror, panel: PanelId, deviations: Deviations, explanation: Explanation, cos_i: float
+    mirror: Mirror, panel: PanelId, deviations: Deviations, price: Prices, cos_i: float
 ) -> PanelResult | None:
     """Fit a panel; None where its points do not determine piston, tip and tilt."""
-    kept = explanation.is_kept
+    kept, has_shape = explain(deviations, price)
     places, lever = deviations.places_m[kept], deviations.lever[kept, None]
     values, sigmas = deviations.values_m[kept], deviations.sigmas_m[kept]
     fit = fit_modes(lever * rigid(places), values, sigmas)
@@ -456,7 +420,7 @@ def panel_result(
         gain = fit.chi2 - full.chi2
         chance = float(chdtrc(_CURVATURES, max(gain, 0.0)))
         values_1_m, sigma_1_m = full.values[SHAPE], full.sigma[SHAPE]
-        shape = PanelShape(values_1_m, sigma_1_m, gain, chance, full.chi2, full.dof, explanation.has_shape)
+        shape = PanelShape(values_1_m, sigma_1_m, gain, chance, full.chi2, full.dof, has_shape)
     return PanelResult(
         panel=panel,
         deviations=deviations,
@@ -470,20 +434,10 @@ def panel_result(
     )
 
 
-def displacement_m(panel: PanelResult, places_m: FloatArray) -> FloatArray:
-    """Along the panel's normal at panel places (k, 2), m, with curvatures where they are significant, shape (k,)."""
-    found = rigid(places_m) @ panel.fit.values
-    if panel.shape is not None and panel.shape.is_significant:
-        # The rigid fit has taken the mean of the curvatures' part away; so does what is drawn.
-        bend = quadratic(places_m)[:, 3:] @ panel.shape.values_1_m
-        found += bend - bend.mean()
-    return np.asarray(found)
-
-
 def on_grid_m(mirror: Mirror, panel: PanelResult, cells: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The displacement in a grid of cells.
+    """The displacement along the panel's normal in a grid of cells, with curvatures where they are significant.
 
-    Edges along deck x and deck y (cells + 1,), values (cells, cells), rows along x.
+    Edges along deck x and deck y (cells + 1,), values (cells, cells), rows along x, m.
     """
     body = mirror.panel(panel.panel)
     x = np.linspace(body.x_m - body.half_x_m, body.x_m + body.half_x_m, cells + 1)
@@ -491,4 +445,9 @@ def on_grid_m(mirror: Mirror, panel: PanelResult, cells: int) -> tuple[FloatArra
     middle_x, middle_y = np.meshgrid((x[1:] + x[:-1]) / 2.0, (y[1:] + y[:-1]) / 2.0)
     deck = np.column_stack([middle_x.ravel(), middle_y.ravel()]).tolist()
     places = np.array([body.from_deck(mirror.surface.point(*place))[:2] for place in deck])
-    return x, y, displacement_m(panel, places).reshape(cells, cells)
+    found = rigid(places) @ panel.fit.values
+    if panel.shape is not None and panel.shape.is_significant:
+        # The rigid fit has taken the mean of the curvatures' part away; so does what is drawn.
+        bend = quadratic(places)[:, 3:] @ panel.shape.values_1_m
+        found += bend - bend.mean()
+    return x, y, found.reshape(cells, cells)
