@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from ccatp.beacons.cricket.range_network import build_network, coordinates_of, pair_range
-from ccatp.beacons.cricket.self_mapping import MoteMapper, network_plan, printed_prior
+from ccatp.beacons.cricket.mote_plan import network_plan
+from ccatp.beacons.cricket.range_network import build_network, pair_range
+from ccatp.beacons.cricket.self_mapping import MoteMapper, begin_phase_two
 from ccatp.beacons.cricket.trilateration import map_by_plan
 from ccatp.beacons.pilot import TargetSight
 from ccatp.beacons.slam.motion import POSE, Increment, Odometry, SlippingVehicle, Steering
@@ -81,15 +82,8 @@ class SelfMap:
             pair = frozenset((i, j))
             temperature_c = float(np.mean(self._temperatures[pair]))
             rows.append(pair_range(cfg, (plan.names[i], plan.names[j]), self._delays[pair], temperature_c))
-        laid = map_by_plan(plan, build_network(rows, plan.dimension, plan.names), cfg.phase1.max_dop, cfg.phase1.draws)
-        motes, d = list(plan.heads), plan.dimension
-        at = coordinates_of(motes, d)
-        known, covariance = plan.surveyed_m[motes], laid.covariance_m2[np.ix_(at, at)]
-        mean = (laid.positions_m + laid.bias_m)[motes]
-        if cfg.phase2.prior == "printed":
-            fixed = np.flatnonzero(np.isfinite(known.ravel())).tolist()
-            covariance = printed_prior(len(motes), d, fixed, cfg.phase2.printed_variance_m2)
-        mapper = MoteMapper(mean, covariance, cfg.phase2, known, cfg.batch)
+        network = build_network(rows, plan.dimension, plan.names)
+        mapper = begin_phase_two(cfg, plan, map_by_plan(plan, network, cfg.phase1.max_dop, cfg.phase1.draws))
         self.notes = {"map_phase1_expected_m": mapper.expected_rms_m, "map_updates": 0.0}
         self.notes["map_expected_m"] = mapper.expected_rms_m
         return mapper

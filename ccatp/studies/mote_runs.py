@@ -10,6 +10,7 @@ import numpy as np
 
 from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, bound_rms_m, map_rms_m
 from ccatp.beacons.cricket.mote_map import MoteMap, map_motes, pinned_map, plain_frame
+from ccatp.beacons.cricket.mote_plan import MotePlan, loose_plan, network_plan
 from ccatp.beacons.cricket.range_network import (
     MappingError,
     MoteRange,
@@ -19,15 +20,7 @@ from ccatp.beacons.cricket.range_network import (
     pair_range,
 )
 from ccatp.beacons.cricket.rigidity import FoldOver, Freedom, find_fold_over, find_freedom, generic_state
-from ccatp.beacons.cricket.self_mapping import (
-    MoteMapper,
-    MotePlan,
-    complete_stands,
-    loose_plan,
-    network_plan,
-    printed_prior,
-    run_phase_two,
-)
+from ccatp.beacons.cricket.self_mapping import begin_phase_two, complete_stands, run_phase_two
 from ccatp.beacons.cricket.trilateration import FirstMap, map_as_possible, map_by_plan
 from ccatp.config.beacon_models import CricketConfig
 from ccatp.core import FloatArray
@@ -122,7 +115,7 @@ class MoteOutlook:
 def first_map(cfg: CricketConfig, field: SimulatedField, draws: int = 0) -> FirstMap:
     """Phase 1, its bias and covariance by so many draws (raises MappingError: a step that cannot be made)."""
     network = field.network()
-    if field.plan.networks:
+    if field.plan.bodies:
         return map_by_plan(field.plan, network, cfg.phase1.max_dop, draws)
     return map_as_possible(network, cfg.phase1.max_dop, draws)
 
@@ -134,30 +127,22 @@ def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
     """
     plan, first = field.plan, first_map(cfg, field, cfg.phase1.draws)
     motes = list(plan.heads or plan.mapped)
-    if lost := [plan.names[mote] for mote in motes if mote in first.unplaced]:
-        raise MappingError(f"phase 1 cannot place {lost[0]} (and {len(lost) - 1} more); the batch needs no such start")
-    known, places = plan.surveyed_m[motes], first.positions_m[motes]
-    mean, covariance = places + first.bias_m[motes], _block(first.covariance_m2, motes, plan.dimension)
-    if cfg.phase2.prior == "printed":
-        fixed = np.flatnonzero(np.isfinite(known.ravel())).tolist()
-        covariance = printed_prior(len(motes), plan.dimension, fixed, cfg.phase2.printed_variance_m2)
-        mean = places
-    mapper = MoteMapper(mean, covariance, cfg.phase2, known, cfg.batch)
+    mapper = begin_phase_two(cfg, plan, first)
     index = {mote: row for row, mote in enumerate(motes)}
     readings = [(index[i], index[j], range_m, sigma_m) for i, j, range_m, sigma_m in field.second]
     went = run_phase_two(mapper, readings, cfg.phase2.target_rms_m)
-    aligned = bool(np.isnan(known).all())
+    aligned = bool(np.isnan(plan.surveyed_m[motes]).all())
     true_m = field.true_m[motes]
     whole = None
-    if plan.networks:
-        every = complete_stands(plan, first.positions_m, first.covariance_m2, mapper.positions_m, mapper.covariance_m2)
+    if plan.bodies:
+        every = complete_stands(plan, first, mapper)
         whole = tuple(plan.names[mote] for mote in every.motes), every.positions_m, every.covariance_m2
     return MoteRun(
         names=tuple(plan.names[mote] for mote in motes),
         positions_m=mapper.positions_m,
         covariance_m2=mapper.covariance_m2,
         true_m=true_m,
-        phase1_rms_m=_error_m(places, true_m, aligned),
+        phase1_rms_m=_error_m(first.positions_m[motes], true_m, aligned),
         trace_m=np.array([_error_m(found, true_m, aligned) for found in went.positions_m]),
         expected_trace_m=went.expected_rms_m,
         is_aligned=aligned,
@@ -343,7 +328,7 @@ def campaign_data(campaign: MoteCampaign) -> dict[str, Any]:
         "expected_rms_m": median(lambda run: run.expected_rms_m),
         "offset_m": median(lambda run: run.offset_m),
         "scale": 1.0 + float(np.median([run.scale for run in runs])),
-        "free_directions": [*outlook.freedom.frame, *outlook.freedom.flexes, *outlook.freedom.calibration],
+        "free_directions": outlook.freedom.lines,
         "warnings": list(outlook.folds.warnings),
     }
 

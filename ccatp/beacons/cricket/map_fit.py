@@ -1,26 +1,24 @@
 """The map that fits all ranges best: model, sparse damped least squares with a robust loss, covariance, least error."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_array, csr_array, diags_array, hstack
 from scipy.sparse.linalg import splu
-from scipy.spatial.transform import Rotation
 
 from ccatp.beacons.cricket.range_network import IndexArray, RangeNetwork, coordinates_of
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import best_motion, rigid_modes
+from ccatp.filters.metrics import rigid_modes
 
 
-@dataclass(frozen=True, slots=True)
-class MapState:
+class MapState(NamedTuple):
     """A map."""
 
     positions_m: FloatArray  # of all motes, shape (n, d)
-    rotations: FloatArray  # of the bodies, world from body, shape (b, d, d)
     offset_m: float = 0.0
     scale: float = 0.0
 
@@ -28,158 +26,114 @@ class MapState:
 class MapModel:
     """Ranges z = (1 + s) |p_i - p_j| + o and their derivatives.
 
-    The unknowns are the coordinates of loose motes that are not known, a place and a small rotation of each body, then
-    o and s where they are asked for.
+    The unknowns are the coordinates of loose motes that are not known, a shift of each body and a small rotation about
+    its first mote, then o and s where they are asked for.
     """
 
     def __init__(self, network: RangeNetwork, *, with_offset: bool = False, with_scale: bool = False) -> None:
         self.network = network
         self.with_offset, self.with_scale = with_offset, with_scale
         d = network.dimension
-        loose = np.array(network.loose, dtype=np.intp)
-        is_free = np.isnan(network.known_m[loose]) if loose.size else np.zeros((0, d), dtype=bool)
-        rows, axes = np.nonzero(is_free)
-        self._loose_at: IndexArray = loose[rows] * d + axes  # flat coordinate of each unknown of a loose mote
-        self.body_size = d + d * (d - 1) // 2
-        self._body_at = [coordinates_of(body.motes, d) for body in network.bodies]
-        self._bodies_from = len(self._loose_at)
-        self.coordinates = self._bodies_from + self.body_size * len(network.bodies)
+        is_free = np.isnan(network.known_m)
+        is_free[[mote for body in network.bodies for mote in body.motes]] = False
+        self._free_at: IndexArray = np.flatnonzero(is_free)  # flat coordinate of each unknown of a loose mote
+        self._turns = np.zeros((d * (d - 1) // 2, d, d))  # the rotations in each plane, to first order
+        for number, (a, b) in enumerate(combinations(range(d), 2)):
+            self._turns[number, b, a], self._turns[number, a, b] = 1.0, -1.0
+        self._body_size = d + len(self._turns)
+        self.coordinates = len(self._free_at) + self._body_size * len(network.bodies)
         self.size = self.coordinates + int(with_offset) + int(with_scale)
-        m = len(network.ranges_m)
-        axis = np.arange(d)
-        self._indices = np.concatenate(
-            [network.first[:, None] * d + axis, network.second[:, None] * d + axis], axis=1
-        ).ravel()
-        self._indptr = np.arange(m + 1) * 2 * d
+        self._loose_jacobian = self._jacobian_of_positions(network.known_m) if not network.bodies else None
+
+    def with_sigmas(self, factor: float) -> "MapModel":
+        """The same with all sigmas multiplied by a factor."""
+        network = replace(self.network, sigmas_m=self.network.sigmas_m * factor)
+        return MapModel(network, with_offset=self.with_offset, with_scale=self.with_scale)
 
     def state(self, positions_m: FloatArray, offset_m: float = 0.0, scale: float = 0.0) -> MapState:
         """The state nearest to positions of the motes, shape (n, d): known coordinates in place, bodies made rigid."""
         known = self.network.known_m
         positions = np.where(np.isnan(known), positions_m, known)
-        rotations = []
         for body in self.network.bodies:
-            motes = list(body.motes)
-            motion = best_motion(body.local_m, positions_m[motes])
-            positions[motes] = motion.moved(body.local_m)
-            rotations.append(motion.rotation)
-        d = self.network.dimension
-        return MapState(positions, np.array(rotations).reshape(-1, d, d), offset_m, scale)
+            positions[list(body.motes)] = body.placed(positions_m)
+        return MapState(positions, offset_m, scale)
 
     def residuals(self, state: MapState) -> FloatArray:
         """Measured less computed ranges, shape (m,)."""
-        return self.network.ranges_m - (1.0 + state.scale) * self._distances(state)[0] - state.offset_m
+        distances = directions(state.positions_m, self.network.first, self.network.second)[0]
+        return self.network.ranges_m - (1.0 + state.scale) * distances - state.offset_m
 
     def jacobian(self, state: MapState) -> csr_array:
         """dz/dq, shape (m, size)."""
-        distances, directions = self._distances(state)
-        parts = [self.range_rows(state, directions) @ self.position_jacobian(state)]
+        first, second = self.network.first, self.network.second
+        rows = (1.0 + state.scale) * rigidity_matrix(state.positions_m, first, second)
+        parts = [rows @ self.position_jacobian(state)]
         if self.with_offset:
-            parts.append(csr_array(np.ones((len(distances), 1))))
+            parts.append(csr_array(np.ones((len(first), 1))))
         if self.with_scale:
-            parts.append(csr_array(distances[:, None]))
-        return csr_array(hstack(parts)) if len(parts) > 1 else csr_array(parts[0])
-
-    def dense_jacobian(self, state: MapState) -> FloatArray:
-        """The same as a full array: for small maps, where sparse arrays cost more than their zeros."""
-        distances, u = self._distances(state)
-        m, coordinates = len(u), self.network.count * self.network.dimension
-        rows = np.zeros((m, coordinates))
-        rows[np.arange(m)[:, None], self._indices.reshape(m, -1)] = (1.0 + state.scale) * np.concatenate(
-            [u, -u], axis=1
-        )
-        B = np.zeros((coordinates, self.coordinates))
-        for (at, cols), values in self._position_blocks(state):
-            B[at, cols] = values
-        J = np.empty((m, self.size))
-        J[:, : self.coordinates] = rows @ B
-        if self.with_offset:
-            J[:, self.coordinates] = 1.0
-        if self.with_scale:
-            J[:, -1] = distances
-        return J
-
-    def range_rows(self, state: MapState, directions: FloatArray | None = None) -> csr_array:
-        """dz/dp, the rigidity matrix with rows of unit length times 1 + s, shape (m, n d)."""
-        u = self._distances(state)[1] if directions is None else directions
-        values = (1.0 + state.scale) * np.concatenate([u, -u], axis=1).ravel()
-        shape = (len(u), self.network.count * self.network.dimension)
-        return csr_array((values, self._indices, self._indptr), shape=shape)
+            parts.append(csr_array(directions(state.positions_m, first, second)[0][:, None]))
+        return csr_array(hstack(parts)) if len(parts) > 1 else parts[0]
 
     def position_jacobian(self, state: MapState) -> csr_array:
         """dp/dq without offset and scale, shape (n d, coordinates)."""
-        blocks = list(self._position_blocks(state))
-        rows = np.concatenate([at for (at, _), _ in blocks])
-        cols = np.concatenate([cols for (_, cols), _ in blocks])
-        values = np.concatenate([values for _, values in blocks])
-        shape = (self.network.count * self.network.dimension, self.coordinates)
-        return coo_array((values, (rows, cols)), shape=shape).tocsr()
+        if self._loose_jacobian is not None:
+            return self._loose_jacobian
+        return self._jacobian_of_positions(state.positions_m)
 
-    def _position_blocks(self, state: MapState) -> Iterator[tuple[tuple[IndexArray, IndexArray], FloatArray]]:
-        yield (self._loose_at, np.arange(self._bodies_from)), np.ones(self._bodies_from)
-        for number, (body, at) in enumerate(zip(self.network.bodies, self._body_at, strict=True)):
-            block = _body_block(body.local_m @ state.rotations[number].T)
-            start = self._bodies_from + number * self.body_size
-            cols = np.tile(start + np.arange(self.body_size), len(at))
-            yield (np.repeat(at, self.body_size), cols), block.ravel()
+    def _jacobian_of_positions(self, positions_m: FloatArray) -> csr_array:
+        d, start = self.network.dimension, len(self._free_at)
+        rows, columns, values = [self._free_at], [np.arange(start)], [np.ones(start)]
+        for body in self.network.bodies:
+            motes = list(body.motes)
+            arms = positions_m[motes] - positions_m[motes[0]]
+            block = np.concatenate([np.tile(np.eye(d), (len(motes), 1, 1)), (self._turns @ arms.T).T], 2)
+            rows.append(np.repeat(coordinates_of(motes, d), self._body_size))
+            columns.append(np.tile(start + np.arange(self._body_size), len(motes) * d))
+            values.append(block.ravel())
+            start += self._body_size
+        entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+        return coo_array(entries, shape=(positions_m.size, self.coordinates)).tocsr()
 
     def moved(self, state: MapState, step: FloatArray) -> MapState:
         """The state after a step of the unknowns, shape (size,)."""
-        d = self.network.dimension
-        flat = state.positions_m.ravel().copy()
-        flat[self._loose_at] += step[: self._bodies_from]
-        positions = flat.reshape(-1, d)
-        rotations = state.rotations.copy()
-        for number, body in enumerate(self.network.bodies):
-            start = self._bodies_from + number * self.body_size
-            shift, turn = step[start : start + d], step[start + d : start + self.body_size]
+        d, start = self.network.dimension, len(self._free_at)
+        positions = state.positions_m.copy()
+        positions.reshape(-1)[self._free_at] += step[:start]
+        for body in self.network.bodies:
             motes = list(body.motes)
-            origin = state.positions_m[motes[0]] - rotations[number] @ body.local_m[0]
-            rotations[number] = _turn(turn) @ rotations[number]
-            positions[motes] = body.local_m @ rotations[number].T + origin + shift
-        offset_m, scale = state.offset_m, state.scale
-        if self.with_offset:
-            offset_m += float(step[self.coordinates])
-        if self.with_scale:
-            scale += float(step[-1])
-        return replace(state, positions_m=positions, rotations=rotations, offset_m=offset_m, scale=scale)
-
-    def _distances(self, state: MapState) -> tuple[FloatArray, FloatArray]:
-        """Distances (m,) and unit vectors from the second mote to the first, shape (m, d)."""
-        offsets = state.positions_m[self.network.first] - state.positions_m[self.network.second]
-        distances = np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
-        # Motes in one place have no direction: a zero row leaves the range out of this step.
-        return distances, offsets / np.maximum(distances, 1e-12)[:, None]
+            shift, angles = np.split(step[start : start + self._body_size], [d])
+            half = 0.5 * np.tensordot(angles, self._turns, 1)
+            rotation = np.linalg.solve(
+                np.eye(d) - half, np.eye(d) + half
+            )  # Cayley: orthogonal, and right at first order
+            origin = state.positions_m[motes[0]]
+            positions[motes] = (state.positions_m[motes] - origin) @ rotation.T + origin + shift
+            start += self._body_size
+        offset_m = state.offset_m + float(step[self.coordinates]) if self.with_offset else state.offset_m
+        scale = state.scale + float(step[-1]) if self.with_scale else state.scale
+        return MapState(positions, offset_m, scale)
 
 
-def _body_block(arms: FloatArray) -> FloatArray:
-    """Derivatives of the motes of a body by its place and its rotation about its frame's origin.
-
-    ``arms``: R times local places, shape (k, d).
-    """
-    count, d = arms.shape
-    block = np.zeros((count, d, d + d * (d - 1) // 2))
-    block[:, :, :d] = np.eye(d)
-    if d == 2:
-        block[:, 0, 2], block[:, 1, 2] = -arms[:, 1], arms[:, 0]
-    else:
-        x, y, z = arms.T
-        block[:, 1, 3], block[:, 2, 3] = -z, y  # about x
-        block[:, 0, 4], block[:, 2, 4] = z, -x  # about y
-        block[:, 0, 5], block[:, 1, 5] = -y, x  # about z
-    return block
+def directions(positions_m: FloatArray, first: IndexArray, second: IndexArray) -> tuple[FloatArray, FloatArray]:
+    """Distances of pairs (m,) and unit vectors from the second mote to the first, shape (m, d)."""
+    ways = positions_m[first] - positions_m[second]
+    distances = np.sqrt(np.einsum("ij,ij->i", ways, ways))
+    # Motes in one place have no direction: a zero row leaves the range out of this step.
+    return distances, ways / np.maximum(distances, 1e-12)[:, None]
 
 
-def _turn(angles_rad: FloatArray) -> FloatArray:
-    """Rotation matrix of a rotation vector, shape (1,) in the plane, (3,) in space."""
-    if angles_rad.size == 1:
-        c, s = np.cos(angles_rad[0]), np.sin(angles_rad[0])
-        return np.array([[c, -s], [s, c]])
-    return np.asarray(Rotation.from_rotvec(angles_rad).as_matrix())
+def rigidity_matrix(positions_m: FloatArray, first: IndexArray, second: IndexArray) -> csr_array:
+    """Derivatives of the distances of pairs by all coordinates, shape (m, n d)."""
+    d, u = positions_m.shape[1], directions(positions_m, first, second)[1]
+    columns = coordinates_of(np.column_stack([first, second]).ravel(), d)
+    values = np.concatenate([u, -u], axis=1).ravel()
+    return csr_array((values, columns, np.arange(len(u) + 1) * 2 * d), shape=(len(u), positions_m.size))
 
 
-_FIRST_DAMPING = 1e-4  # of the largest diagonal of the normal matrix
 _DENSE = 240  # unknowns up to which dense Cholesky is quicker than sparse LU
 _NULL = 1e-9  # eigenvalues below this share of the largest are directions that no range sees
+_NO_GAIN = 1e-12  # relative drop of the cost that ends the iteration
+_REST_M = 1e-8  # a step whose largest part is shorter ends it, too
 
 
 class MapFitSettings(NamedTuple):
@@ -190,7 +144,7 @@ class MapFitSettings(NamedTuple):
 
     robust_scale: float = float("inf")
     max_iterations: int = 200
-    tolerance_m: float = 1e-8  # a step whose largest part is shorter ends the iteration
+    damping: float = 1e-4  # of the first step
 
 
 class MapFit(NamedTuple):
@@ -204,28 +158,35 @@ class MapFit(NamedTuple):
     is_at_rest: bool  # whether the steps had ended before ``max_iterations``
 
 
-def fit_map(model: MapModel, start: MapState, settings: MapFitSettings) -> MapFit:
+def fit_map(model: MapModel, start: MapState, settings: MapFitSettings, penalty: FloatArray | None = None) -> MapFit:
     """Minimise the loss of all ranges from a start.
 
     Steps (J^T W J + lambda D) dq = J^T W r (Levenberg 1944, Marquardt 1963) with W = w / sigma^2 and the weights
     w = 1 / (1 + (r / (c sigma))^2) of the Cauchy loss. A network without known coordinates may shift and turn: the
-    damping keeps it where it started.
+    damping keeps it where it started. ``penalty``: weights of the squares of all coordinates, shape (n d,), of a model
+    without bodies and known coordinates.
     """
-    sigmas = model.network.sigmas_m
-    state, damping = start, _FIRST_DAMPING
-    residuals = model.residuals(state)
-    cost, weights = _loss(residuals / sigmas, settings.robust_scale)
+
+    def judge(state: MapState) -> tuple[float, FloatArray, FloatArray]:
+        residuals = model.residuals(state)
+        cost, weights = robust_loss(residuals / model.network.sigmas_m, settings.robust_scale)
+        if penalty is not None:
+            cost += penalty @ state.positions_m.ravel() ** 2
+        return float(cost), weights, residuals
+
+    state, damping = start, settings.damping
+    cost, weights, residuals = judge(state)
     for iteration in range(1, settings.max_iterations + 1):
         normal, gradient = _normal(model, state, residuals, weights)
-        step = _solved(normal, gradient, damping)
+        if penalty is not None:
+            gradient = gradient - penalty * state.positions_m.ravel()
+        step = _solved(normal, gradient, damping, penalty)
         trial = model.moved(state, step)
-        trial_residuals = model.residuals(trial)
-        trial_cost, trial_weights = _loss(trial_residuals / sigmas, settings.robust_scale)
-        if trial_cost <= cost:
-            gain = cost - trial_cost
-            state, residuals, cost, weights = trial, trial_residuals, trial_cost, trial_weights
-            damping = max(damping * 0.2, 1e-12)
-            if float(np.abs(step).max()) <= settings.tolerance_m or gain <= 1e-12 * cost:
+        seen = judge(trial)
+        if seen[0] <= cost:
+            gain = cost - seen[0]
+            state, (cost, weights, residuals), damping = trial, seen, max(damping * 0.2, 1e-12)
+            if float(np.abs(step).max()) <= _REST_M or gain <= _NO_GAIN * cost:
                 return MapFit(state, cost, weights, residuals, iteration, True)
         else:
             damping *= 6.0
@@ -244,6 +205,44 @@ def fit_from_afar(model: MapModel, start: MapState, settings: MapFitSettings) ->
     near = fit_map(model, start, settings._replace(robust_scale=float("inf")))
     fit = fit_map(model, near.state, settings)
     return fit._replace(iterations=near.iterations + fit.iterations)
+
+
+def robust_loss(scaled: FloatArray, robust_scale: float) -> tuple[FloatArray, FloatArray]:
+    """Sum of the loss of residuals in sigmas, over the last axis, and the weight of each, 0 to 1."""
+    squares = scaled**2
+    if not np.isfinite(robust_scale):
+        return squares.sum(axis=-1), np.ones_like(scaled)
+    ratio = squares / robust_scale**2
+    return robust_scale**2 * np.log1p(ratio).sum(axis=-1), 1.0 / (1.0 + ratio)
+
+
+def _normal(
+    model: MapModel, state: MapState, residuals: FloatArray, weights: FloatArray
+) -> tuple[csr_array | FloatArray, FloatArray]:
+    W = weights / model.network.sigmas_m**2
+    sparse = model.jacobian(state)
+    if model.size <= _DENSE:
+        J = sparse.toarray()
+        weighted = J * W[:, None]
+        return J.T @ weighted, residuals @ weighted
+    heavy = diags_array(W) @ sparse
+    return csr_array(sparse.T @ heavy), np.asarray(heavy.T @ residuals)
+
+
+def _solved(
+    normal: csr_array | FloatArray, gradient: FloatArray, damping: float, penalty: FloatArray | None
+) -> FloatArray:
+    diagonal = normal.diagonal()
+    # Unknowns that no range sees still get a damping, so that they stay where they are.
+    more = damping * np.maximum(diagonal, 1e-6 * float(diagonal.max()))
+    if penalty is not None:
+        more = damping + penalty  # without what the ranges make of it: it grows stiff in the squeezed ones
+    if isinstance(normal, np.ndarray):
+        damped = normal.copy()
+        damped[np.diag_indices_from(damped)] += more
+        return np.asarray(cho_solve(cho_factor(damped, check_finite=False), gradient, check_finite=False))
+    sparse = (normal + diags_array(more)).tocsc()
+    return np.asarray(splu(sparse, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(gradient))
 
 
 def position_covariance(model: MapModel, fit: MapFit) -> tuple[FloatArray, int]:
@@ -267,39 +266,6 @@ def position_covariance(model: MapModel, fit: MapFit) -> tuple[FloatArray, int]:
     return at_positions @ at_positions.T, int((~is_seen).sum())
 
 
-def _loss(scaled: FloatArray, robust_scale: float) -> tuple[float, FloatArray]:
-    squares = scaled**2
-    if not np.isfinite(robust_scale):
-        return float(squares.sum()), np.ones(len(scaled))
-    ratio = squares / robust_scale**2
-    return float(robust_scale**2 * np.log1p(ratio).sum()), 1.0 / (1.0 + ratio)
-
-
-def _normal(
-    model: MapModel, state: MapState, residuals: FloatArray, weights: FloatArray
-) -> tuple[csr_array | FloatArray, FloatArray]:
-    W = weights / model.network.sigmas_m**2
-    if model.size <= _DENSE:
-        J = model.dense_jacobian(state)
-        weighted = J * W[:, None]
-        return J.T @ weighted, residuals @ weighted
-    sparse = model.jacobian(state)
-    heavy = diags_array(W) @ sparse
-    return csr_array(sparse.T @ heavy), np.asarray(heavy.T @ residuals)
-
-
-def _solved(normal: csr_array | FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
-    diagonal = normal.diagonal()
-    # Unknowns that no range sees still get a damping, so that they stay where they are.
-    floor = np.maximum(diagonal, 1e-6 * float(diagonal.max()))
-    if isinstance(normal, np.ndarray):
-        damped = normal.copy()
-        damped[np.diag_indices_from(damped)] += damping * floor
-        return np.asarray(cho_solve(cho_factor(damped, check_finite=False), gradient, check_finite=False))
-    sparse = (normal + diags_array(damping * floor)).tocsc()
-    return np.asarray(splu(sparse, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(gradient))
-
-
 def bound_rms_m(model: MapModel, true_m: FloatArray, motes: Sequence[int], *, aligned: bool) -> float | None:
     """sqrt(tr C / n) of some motes, C = (J^T Sigma^-1 J)^-1 at the true places.
 
@@ -308,8 +274,7 @@ def bound_rms_m(model: MapModel, true_m: FloatArray, motes: Sequence[int], *, al
     """
     state = model.state(true_m)
     count = len(model.network.ranges_m)
-    fit = MapFit(state, 0.0, np.ones(count), np.zeros(count), 0, True)
-    covariance, free = position_covariance(model, fit)
+    covariance, free = position_covariance(model, MapFit(state, 0.0, np.ones(count), np.zeros(count), 0, True))
     d = model.network.dimension
     if free > (d * (d + 1) // 2 if np.isnan(model.network.known_m).all() else 0):
         return None
@@ -321,11 +286,34 @@ def map_rms_m(covariance_m2: FloatArray, positions_m: FloatArray, motes: Sequenc
 
     ``positions_m``: shape (n, d).
     """
-    d = positions_m.shape[1]
-    at = coordinates_of(motes, d)
+    at = coordinates_of(motes, positions_m.shape[1])
     part = covariance_m2[np.ix_(at, at)]
     if aligned:
         modes = rigid_modes(positions_m[list(motes)])
         part = part - modes @ (modes.T @ part)
         part = part - (part @ modes) @ modes.T
     return float(np.sqrt(max(float(np.trace(part)), 0.0) / len(motes)))
+
+
+_DENIED = 3.0  # chi-squared for each degree of freedom
+
+
+class Agreement(NamedTuple):
+    """How the ranges fit a map."""
+
+    outlying: tuple[int, ...]  # ranges of which the loss left less than half
+    factor: float  # chi-squared of the others by their degree of freedom: 1 where the sigmas are right
+    is_denied: bool  # whether the others do not fit, or more than half of those to spare are outliers
+
+
+def agreement_of(fit: MapFit, sigmas_m: FloatArray, dof: int) -> Agreement:
+    """How the ranges fit a map. ``sigmas_m``: of its ranges, shape (m,).
+
+    As many outliers as half of those to spare can agree on another map (breakdown point: Rousseeuw 1984).
+    """
+    is_out = fit.weights < 0.5
+    outliers = int(is_out.sum())
+    cost = float(((fit.residuals_m / sigmas_m)[~is_out] ** 2).sum())
+    factor = cost / (dof - outliers) if dof > outliers else 1.0
+    is_denied = factor > _DENIED or 2 * outliers > dof > 0
+    return Agreement(tuple(np.flatnonzero(is_out).tolist()), factor, is_denied)

@@ -1,22 +1,59 @@
-"""Places for a fit to begin with: unfolded, trilaterated, drawn, or grown mote by mote."""
+"""Places for a fit to begin with: unfolded in more dimensions, trilaterated, drawn, or grown mote by mote."""
 
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
+from scipy.sparse.csgraph import shortest_path
 
-from ccatp.beacons.cricket.range_network import (
-    IndexArray,
-    MappingError,
-    PairMeans,
-    RangeNetwork,
-    every_pair,
-)
-from ccatp.beacons.cricket.trilateration import map_as_possible
-from ccatp.beacons.cricket.unfolding import classical_scaling, unfolded
+from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
+from ccatp.beacons.cricket.range_network import MappingError, PairMeans, RangeNetwork, adjacency, every_pair
+from ccatp.beacons.cricket.trilateration import classical_scaling, map_as_possible
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import best_motion
+
+_SPARE = 2  # dimensions more than the map has, in which what is folded can turn over
+# Weights of the spare dimensions one after the other, in units of the median weight of a distance.
+_SQUEEZES = tuple(np.geomspace(1e-3, 1e3, 7).tolist())
+_SQUEEZED = MapFitSettings(max_iterations=25, damping=1e-2)  # of each squeeze; the last fit of all is left to others
+# Weights that differ by orders of magnitude would freeze the strong ones before the weak ones have turned.
+_HEAVIEST = 25.0
+
+
+def unfolded(network: RangeNetwork, rng: np.random.Generator | None = None) -> FloatArray:
+    """Places of n motes from their ranges, shape (n, d); as ranges do, it leaves frame and mirror open.
+
+    Classical scaling gives places in d + 2 dimensions (without a generator, which draws them), and weighted least
+    squares on the ranges alone goes on from there, while a weight on the spare dimensions grows until the points lie in
+    d. A map that is folded over in d dimensions often has a way down through the spare ones. ``network``: without
+    bodies and known places.
+    """
+    count, d = network.count, network.dimension
+    wide = d + _SPARE
+    if rng is None:
+        points = classical_scaling(completed(network), wide)
+    else:
+        points = rng.normal(0.0, float(np.median(network.ranges_m)), (count, wide))
+    weights = 1.0 / network.sigmas_m**2
+    weights = np.minimum(weights / np.median(weights), _HEAVIEST)
+    known_m = np.full((count, wide), np.nan)
+    model = MapModel(replace(network, dimension=wide, sigmas_m=1.0 / np.sqrt(weights), known_m=known_m))
+    for squeeze in _SQUEEZES:
+        penalty = np.tile(np.where(np.arange(wide) < d, 0.0, squeeze), count)
+        points = fit_map(model, model.state(points), _SQUEEZED, penalty).state.positions_m
+        centred = points - points.mean(axis=0)
+        points = np.asarray(centred @ np.linalg.eigh(centred.T @ centred)[1][:, ::-1])  # along the principal axes
+    return np.ascontiguousarray(points[:, :d])
+
+
+def completed(network: RangeNetwork) -> FloatArray:
+    """All distances, unknown ones as the shortest way along ranges, shape (n, n) (Shang et al., MDS-MAP, 2003)."""
+    # A distance of nought would be no edge.
+    graph = adjacency(network.count, network.pairs, np.maximum(network.ranges_m, 1e-9))
+    return np.asarray(shortest_path(graph, directed=False))
+
 
 _SEEDS = 30  # draws of a first triangle (tetrahedron) before there is taken to be none
 _CROSSINGS = 30  # crossings of spheres that are tried for one mote
@@ -24,22 +61,17 @@ _WIDE = 3.0  # places that were just found are off by more than a range: robust 
 _FLAT = 0.05  # height over length of a triangle that is too flat to begin with
 
 
-def grown(
-    count: int, pairs: IndexArray, distances_m: FloatArray, sigmas_m: FloatArray, dimension: int, robust_scale: float,
-    rng: np.random.Generator,
-) -> FloatArray | None:  # fmt: skip
-    """Places of n points, nan where d ranges do not reach, shape (n, d); None where there is no triangle to begin with.
+def grown(network: RangeNetwork, robust_scale: float, rng: np.random.Generator) -> FloatArray | None:
+    """Places of n motes, nan where d ranges do not reach, shape (n, d); None where there is no triangle to begin with.
 
-    Least squares lets a wrong range bend the whole map. Here no range is used that is not drawn: d + 1 points that all
-    know their distances come first; then the point that most ranges agree on, at the crossing of d spheres that has the
-    least robust cost of all ranges to points with a place (consensus: Fischler and Bolles 1981). ``pairs``: known
-    distances, each pair once, shape (e, 2). ``distances_m``: shape (e,). ``sigmas_m``: shape (e,).
+    Least squares lets a wrong range bend the whole map. Here no range is used that is not drawn: d + 1 motes that all
+    know their distances come first; then the mote that most ranges agree on, at the crossing of d spheres that has the
+    least robust cost of all ranges to motes with a place (consensus: Fischler and Bolles 1981).
     """
-    table, scale = np.full((2, count, count), np.nan)
-    for i, j in (pairs.T, pairs.T[::-1]):
-        table[i, j], scale[i, j] = distances_m, _WIDE * robust_scale * sigmas_m
+    means, count, dimension = PairMeans(network), network.count, network.dimension
+    table, scale = means.table_m, _WIDE * robust_scale * means.sigma_table_m
     places = np.full((count, dimension), np.nan)
-    seed = _seed(table, scale, dimension, rng)
+    seed = _drawn_simplex(table, scale, dimension, rng)
     if seed is None:
         return None
     places[seed[0]] = seed[1]
@@ -58,7 +90,7 @@ def grown(
         fresh = np.flatnonzero(np.isfinite(table[mote])).tolist()
 
 
-def _seed(
+def _drawn_simplex(
     table: FloatArray, scale: FloatArray, dimension: int, rng: np.random.Generator
 ) -> tuple[list[int], FloatArray] | None:
     for _ in range(_SEEDS):
@@ -115,28 +147,24 @@ def map_starts(network: RangeNetwork, given_m: FloatArray | None) -> Iterator[li
 
     ``given_m``: what the caller has, shape (n, d), nan where nothing is known.
     """
-    means = PairMeans(network)
-    pairs, distances_m, sigmas_m = _with_bodies(network, means)
-    count, d = network.count, network.dimension
-    yield _images(network, unfolded(count, pairs, distances_m, sigmas_m, d))
+    whole = _with_bodies(network)
+    yield _images(network, unfolded(whole))
     if given_m is not None:
-        yield [_filled(given_m, means)]
+        yield [_filled(given_m, network)]
     with suppress(MappingError):  # no triangle to begin with, or none that is good: the other starts need none
-        yield _images(network, _filled(map_as_possible(network, _MAX_DOP).positions_m, means))
-    if count <= FEW:
+        yield _images(network, _filled(map_as_possible(network, _MAX_DOP).positions_m, network))
+    if network.count <= FEW:
         for draw in range(_DRAWS):  # the same ranges give the same map
-            yield _images(network, unfolded(count, pairs, distances_m, sigmas_m, d, rng=np.random.default_rng(draw)))
+            yield _images(network, unfolded(whole, np.random.default_rng(draw)))
 
 
 def grown_starts(network: RangeNetwork, robust_scale: float) -> Iterator[list[FloatArray]]:
     """Maps grown from drawn triangles, which a few wrong ranges do not bend; with their mirror images as before."""
-    means = PairMeans(network)
-    pairs, distances_m, sigmas_m = _with_bodies(network, means)
+    whole = _with_bodies(network)
     for draw in range(_DRAWS if network.count <= FEW else _FEW_DRAWS):
-        rng = np.random.default_rng(draw)
-        places = grown(network.count, pairs, distances_m, sigmas_m, network.dimension, robust_scale, rng)
+        places = grown(whole, robust_scale, np.random.default_rng(draw))
         if places is not None:
-            yield _images(network, _filled(places, means))
+            yield _images(network, _filled(places, network))
 
 
 def _images(network: RangeNetwork, places_m: FloatArray) -> list[FloatArray]:
@@ -145,31 +173,35 @@ def _images(network: RangeNetwork, places_m: FloatArray) -> list[FloatArray]:
         return [best_motion(places_m[known], network.known_m[known], mirrors=True).moved(places_m)]
     if not network.bodies and not np.isfinite(network.known_m).any():
         return [places_m]
-    flip = np.ones(network.dimension)
-    flip[0] = -1.0
-    return [places_m, places_m * flip]
+    return [places_m, places_m * np.where(np.arange(network.dimension) == 0, -1.0, 1.0)]
 
 
-def _filled(places_m: FloatArray, means: PairMeans) -> FloatArray:
-    places = places_m.copy()
+def _filled(places_m: FloatArray, network: RangeNetwork) -> FloatArray:
+    places, pairs = places_m.copy(), network.pairs
     for _ in range(len(places)):
-        missing = np.flatnonzero(np.isnan(places[:, 0]))
-        if missing.size == 0:
-            break
-        for mote in missing.tolist():
-            partners = places[means.partners(mote)]
-            known = partners[np.isfinite(partners[:, 0])] if len(partners) else partners
-            if len(known):
+        is_known = np.isfinite(places[:, 0])
+        for mote in np.flatnonzero(~is_known).tolist():
+            partners = np.setdiff1d(pairs[(pairs == mote).any(axis=1)], [mote])
+            if (near := partners[np.isfinite(places[partners, 0])]).size:
                 # Beside the mean: two motes in one place would have no direction between them.
-                places[mote] = known.mean(axis=0) + 1e-3 * (1.0 + mote % 7)
+                places[mote] = places[near].mean(axis=0) + 1e-3 * (1.0 + mote % 7)
+        if np.isfinite(places[:, 0]).sum() == is_known.sum():
+            break
     return np.nan_to_num(places)
 
 
-def _with_bodies(network: RangeNetwork, means: PairMeans) -> tuple[IndexArray, FloatArray, FloatArray]:
-    pairs, distances, sigmas = [means.pairs], [means.ranges_m], [means.sigmas_m]
+def _with_bodies(network: RangeNetwork) -> RangeNetwork:
+    """One range for each pair, those of the bodies' shapes among them; nothing else is known."""
+    means = PairMeans(network)
+    pairs, ranges, sigmas = [means.pairs], [means.ranges_m], [means.sigmas_m]
     for body in network.bodies:
         a, b = every_pair(np.arange(len(body.motes))).T
         pairs.append(every_pair(np.array(body.motes, dtype=np.intp)))
-        distances.append(np.linalg.norm(body.local_m[a] - body.local_m[b], axis=1))
+        ranges.append(np.linalg.norm(body.local_m[a] - body.local_m[b], axis=1))
         sigmas.append(np.full(len(a), float(means.sigmas_m.min())))
-    return np.concatenate(pairs), np.concatenate(distances), np.concatenate(sigmas)
+    first, second = np.concatenate(pairs).T
+    known_m = np.full_like(network.known_m, np.nan)
+    return replace(
+        network, first=first, second=second, ranges_m=np.concatenate(ranges), sigmas_m=np.concatenate(sigmas),
+        bodies=(), known_m=known_m,
+    )  # fmt: skip

@@ -7,11 +7,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc
 
-from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, MapState, bound_rms_m, fit_map, map_rms_m
-from ccatp.beacons.cricket.mote_map import MoteMap, map_motes, plain_frame
+from ccatp.beacons.cricket.map_fit import (
+    MapFitSettings,
+    MapModel,
+    MapState,
+    agreement_of,
+    bound_rms_m,
+    fit_map,
+    map_rms_m,
+)
+from ccatp.beacons.cricket.mote_map import Mirrors, MoteMap, map_motes, plain_frame
 from ccatp.beacons.cricket.range_network import (
     MappingError,
     MoteRange,
+    PairMeans,
     RangeNetwork,
     RigidBody,
     build_network,
@@ -21,7 +30,6 @@ from ccatp.beacons.cricket.range_network import (
 from ccatp.beacons.cricket.rigidity import find_fold_over, find_freedom, generic_state
 from ccatp.beacons.cricket.self_mapping import MoteMapper, run_phase_two
 from ccatp.beacons.cricket.trilateration import map_as_possible
-from ccatp.beacons.cricket.unfolding import agreement_of
 from ccatp.config.beacon_models import CricketConfig
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import aligned_rms_m, best_motion
@@ -33,27 +41,24 @@ _FOLDS = 5  # sets of motes that are named
 _IN_SPACE = ", or the motes are not in a plane: --dimension 3 maps them in space"
 
 
-def disagreeing(network: RangeNetwork) -> Iterator[str]:
+def _disagreeing(network: RangeNetwork) -> Iterator[str]:
     """A warning of the pair whose own ranges contradict each other most, more than by chance."""
-    found, place = np.unique(network.pairs, axis=0, return_inverse=True)
-    place = place.ravel()
-    weights = network.sigmas_m**-2.0
-    means = np.bincount(place, weights * network.ranges_m) / np.bincount(place, weights)
-    squares = np.bincount(place, weights * (network.ranges_m - means[place]) ** 2)
-    chances = chdtrc(np.maximum(np.bincount(place) - 1, 1), squares)
-    if not (bad := np.flatnonzero(chances < _CHANCE / len(found))).size:
+    means = PairMeans(network)
+    squares = np.bincount(means.pair_of, ((network.ranges_m - means.ranges_m[means.pair_of]) / network.sigmas_m) ** 2)
+    chances = chdtrc(np.maximum(np.bincount(means.pair_of) - 1, 1), squares)
+    if not (bad := np.flatnonzero(chances < _CHANCE / len(means.pairs))).size:
         return
     worst = int(bad[np.argmax(squares[bad])])
-    ranges = network.ranges_m[place == worst]
-    more = f" and {bad.size - 1} more pairs" if bad.size > 1 else ""
-    first, second = (network.names[mote] for mote in found[worst])
+    is_worst = means.pair_of == worst
+    ranges_m, more = network.ranges_m[is_worst], f" and {bad.size - 1} more pairs" if bad.size > 1 else ""
+    first, second = (network.names[mote] for mote in means.pairs[worst])
     yield (
-        f"ranges between {first} and {second}{more} disagree among themselves: {ranges.min():.4g} to "
-        f"{ranges.max():.4g} m with a sigma of {network.sigmas_m[place == worst].min():.3g} m"
+        f"ranges between {first} and {second}{more} disagree among themselves: {ranges_m.min():.4g} to "
+        f"{ranges_m.max():.4g} m with a sigma of {network.sigmas_m[is_worst].min():.3g} m"
     )
 
 
-def doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[str]:
+def _doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[str]:
     """Warnings of folds, contradictions, scatter and outliers of a batch map.
 
     ``factor``: of the sigmas, by the residuals.
@@ -62,17 +67,16 @@ def doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[str
         motes = list_names([network.names[mote] for mote in fold.motes])
         yield f"{motes}: the mirror image fits almost as well (chi-squared {fold.cost_gap:.1f} more)"
     in_space = _IN_SPACE if network.dimension == 2 else ""
-    agreement, count = found.agreement, len(network.ranges_m)
-    if agreement.is_denied:
+    rows, count = found.agreement.outlying, len(network.ranges_m)
+    if found.agreement.is_denied:
         yield (
-            f"the map contradicts its ranges: {agreement.outliers} of {count} far off it, chi-squared "
-            f"{agreement.factor:.1f} for each degree of freedom of the others; it is folded, or the sigmas are too "
-            f"small{in_space}"
+            f"the map contradicts its ranges: {len(rows)} of {count} far off it, chi-squared "
+            f"{found.agreement.factor:.1f} for each degree of freedom of the others; it is folded, or the sigmas are "
+            f"too small{in_space}"
         )
-    elif agreement.outliers:
-        rows = agreement.outlying
+    elif rows:
         pairs = [f"{network.names[network.first[row]]} to {network.names[network.second[row]]}" for row in rows]
-        yield f"{agreement.outliers} of {count} ranges contradict the others and count for little: {list_names(pairs)}"
+        yield f"{len(rows)} of {count} ranges contradict the others and count for little: {list_names(pairs)}"
     if factor > _SCATTER:
         yield (
             f"ranges scatter by {1e3 * found.sigma_m:.3g} mm, {factor:.1f} times what they were taken for: they are "
@@ -80,7 +84,7 @@ def doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[str
         )
 
 
-def hidden_offset(found: MoteMap, network: RangeNetwork, settings: MapFitSettings) -> Iterator[str]:
+def _hidden_offset(found: MoteMap, network: RangeNetwork, settings: MapFitSettings) -> Iterator[str]:
     """A warning of an offset that the ranges show, where none is estimated.
 
     ``network``: its ranges, with the sigmas that they were found to have.
@@ -91,21 +95,20 @@ def hidden_offset(found: MoteMap, network: RangeNetwork, settings: MapFitSetting
         return
     state = model.state(found.positions_m, 0.0, found.fit.state.scale)
     without, shown = fit_map(MapModel(network), state, settings), fit_map(model, state, settings)
-    cost, offset_m = shown.cost, shown.state.offset_m
     agreement = agreement_of(shown, network.sigmas_m, dof)
     if found.agreement.is_denied:
         # An offset may have bent the map too far to be seen from there.
         again = map_motes(network, settings, with_offset=True)
-        cost, offset_m, agreement = again.fit.cost, again.fit.state.offset_m, again.agreement
+        shown, agreement = again.fit, again.agreement
     # Where the ranges deny the map even so, any unknown more betters it, and means nothing.
-    if without.cost - cost > _TELLING and not agreement.is_denied:
+    if without.cost - shown.cost > _TELLING and not agreement.is_denied:
         yield (
-            f"all ranges look {1e3 * offset_m:.0f} mm long in common (chi-squared {without.cost:.0f}, "
-            f"{cost:.0f} with an offset); --offset estimates it"
+            f"all ranges look {1e3 * shown.state.offset_m:.0f} mm long in common (chi-squared {without.cost:.0f}, "
+            f"{shown.cost:.0f} with an offset); --offset estimates it"
         )
 
 
-def left_out_heights(
+def _left_out_heights(
     option: str, places_m: Mapping[str, tuple[float, ...]], dimension: int, least_m: float
 ) -> Iterator[str]:
     """A warning of third coordinates that a map in the plane leaves out, where they differ by more than so much."""
@@ -117,14 +120,10 @@ def left_out_heights(
         )
 
 
-def is_flat(error_m: float | None, places_m: FloatArray) -> bool:
-    """Whether an error expected is larger than the map's least extent, root mean square.
-
-    ``places_m``: shape (n, d); of n motes, n - 1 extents count.
-    """
+def _is_flat(error_m: float | None, places_m: FloatArray) -> bool:
+    """Whether an error expected is larger than the map's least extent, root mean square; places of shape (n, d)."""
     extents_m = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False) / np.sqrt(len(places_m))
-    extents_m = extents_m[: len(places_m) - 1]
-    return error_m is not None and bool(extents_m.size) and error_m > float(extents_m[-1])
+    return error_m is not None and bool((extents_m[: len(places_m) - 1] < error_m).any())
 
 
 _WIDER = 1e4  # of variances: what a range that is used twice adds by its first use is then a ten-thousandth
@@ -191,15 +190,15 @@ def map_measured(
         word
         for option, given in (("--tags", tags_m), ("--truth", truth_m))
         if given
-        for word in left_out_heights(option, given, network.dimension, cfg.ranging.sigma_m)
+        for word in _left_out_heights(option, given, network.dimension, cfg.ranging.sigma_m)
     ]
-    warnings += [*disagreeing(network), *folds.warnings, *found.warnings]
+    warnings += [*_disagreeing(network), *folds.warnings, *found.warnings]
     warnings += [
         f"no {name} can be told from these ranges: the map takes it up, and its own size is free; leave --{name} out"
         for name in freedom.untold
     ]
     # Derivatives at a place where they vanish: what comes out is large, and means that nothing is known.
-    if is_thin := is_flat(bound_m, places) or (found.is_trusted and is_flat(expected_m, places)):
+    if is_thin := _is_flat(bound_m, places) or (found.is_trusted and _is_flat(expected_m, places)):
         shape = "in a line" if network.dimension == 2 else "in a plane"
         warnings.append(f"the motes lie {shape}, or nearly: the ranges do not tell how far each is off it")
     is_known = found.is_trusted and bound_m is not None and not is_thin
@@ -217,7 +216,7 @@ def map_measured(
         "expected_rms_m": expected_m if is_known else None,
         "offset_m": None if "offset" in freedom.untold else found.state.offset_m,
         "scale": None if "scale" in freedom.untold else 1.0 + found.state.scale,
-        "free_directions": [*freedom.frame, *freedom.flexes, *freedom.calibration],
+        "free_directions": freedom.lines,
         "warnings": warnings,
     }
     return MeasuredMap(names, places, covariance, true_m, data)
@@ -250,7 +249,7 @@ def _check_enough(model: MapModel, network: RangeNetwork) -> None:
         )
 
 
-def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Any) -> _Found:
+def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Mirrors) -> _Found:
     settings = MapFitSettings(cfg.batch.robust_scale, cfg.batch.max_iterations)
     found = map_motes(
         network,
@@ -262,8 +261,8 @@ def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Any) -> _Found:
     )
     factor = found.sigma_m / float(np.median(network.sigmas_m))
     scaled = replace(network, sigmas_m=network.sigmas_m * factor)
-    warnings = [*hidden_offset(found, scaled, settings)] if not cfg.batch.estimates_offset else []
-    warnings += doubts(found, network, factor)
+    warnings = [*_hidden_offset(found, scaled, settings)] if not cfg.batch.estimates_offset else []
+    warnings += _doubts(found, network, factor)
     is_denied = found.agreement.is_denied
     # Of a map that its ranges deny, at least what they miss it by.
     inflation = float(((found.fit.residuals_m / scaled.sigmas_m) ** 2).sum()) / found.dof if is_denied else 1.0
@@ -284,8 +283,7 @@ def _filter(cfg: CricketConfig, network: RangeNetwork) -> _Found:
     rows = zip(*(column.tolist() for column in columns), strict=True)
     went = run_phase_two(mapper, rows, 0.0)
     warnings = (f"{went.refused} of {len(went.nis)} ranges were refused by the gate",) if went.refused else ()
-    state = MapState(mapper.positions_m, np.zeros((0, network.dimension, network.dimension)))
-    return _Found(state, mapper.covariance_m2, network, len(went.nis), True, warnings)
+    return _Found(MapState(mapper.positions_m), mapper.covariance_m2, network, len(went.nis), True, warnings)
 
 
 def _phase1_error_m(

@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from ccatp.config.beacon_models import AirConfig, CricketConfig
+from ccatp.config.beacon_models import CricketConfig
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus
+from ccatp.filters.metrics import RigidMotion, best_motion
 
 ABSOLUTE_ZERO_C = -273.15
 COLDEST_C, HOTTEST_C = -60.0, 80.0  # beyond, a thermometer is broken
@@ -29,38 +30,6 @@ class MoteRange(NamedTuple):
     second: str
     range_m: float
     sigma_m: float
-
-
-def sound_speed(air: AirConfig, temperature_c: float) -> float:
-    """Speed of sound c = c_0 sqrt(T / T_0), T in kelvin: that of an ideal gas.
-
-    Raises TdoaError: no temperature of air.
-    """
-    if not COLDEST_C <= temperature_c <= HOTTEST_C:
-        raise TdoaError(f"temperature of {temperature_c:g} C is outside {COLDEST_C:g} to {HOTTEST_C:g} C")
-    return air.sound_speed_m_s * sqrt((temperature_c - ABSOLUTE_ZERO_C) / (air.temperature_c - ABSOLUTE_ZERO_C))
-
-
-def range_from_delay(air: AirConfig, delay_s: float, temperature_c: float) -> float:
-    """Distance d = c(T) (t_2 - t_1), Patil et al. eq. 1; the radio message takes no time.
-
-    Raises TdoaError: a delay that is negative or not finite, or no temperature of air.
-    """
-    if not 0.0 <= delay_s < float("inf"):
-        raise TdoaError(f"delay of {delay_s:g} s: the pulse cannot arrive before the message")
-    return sound_speed(air, temperature_c) * delay_s
-
-
-def range_sigma(
-    sigma_m: float, range_m: float, temperature_sigma_c: float, temperature_c: float, repeats: int
-) -> float:
-    """Standard deviation of the mean of repeated ranges.
-
-    sigma^2 = sigma_1^2 / n + (d sigma_T / (2 T))^2: repeating lessens the noise of a reading, not what a wrong
-    thermometer does, dc/c = dT / (2 T).
-    """
-    scale = temperature_sigma_c / (2.0 * (temperature_c - ABSOLUTE_ZERO_C))
-    return sqrt(sigma_m**2 / repeats + (range_m * scale) ** 2)
 
 
 IndexArray = NDArray[np.intp]
@@ -81,6 +50,14 @@ class RigidBody:
     name: str
     motes: tuple[int, ...]
     local_m: FloatArray  # their places in the body's own frame, shape (k, d)
+
+    def motion(self, positions_m: FloatArray) -> RigidMotion:
+        """From its own frame to where its motes stand best at places of all motes, shape (n, d)."""
+        return best_motion(self.local_m, positions_m[list(self.motes)])
+
+    def placed(self, positions_m: FloatArray) -> FloatArray:
+        """Its motes there, as they are known to stand relative to each other, shape (k, d)."""
+        return self.motion(positions_m).moved(self.local_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,11 +143,15 @@ def coordinates_of(motes: Sequence[int] | IndexArray, dimension: int) -> IndexAr
     return (np.asarray(motes, dtype=np.intp)[:, None] * dimension + np.arange(dimension)).ravel()
 
 
+def adjacency(count: int, pairs: IndexArray, weights: FloatArray | None = None) -> csr_array:
+    """The graph of some pairs (e, 2), with weights (e,) or ones, each in one direction; shape (n, n)."""
+    values = np.ones(len(pairs)) if weights is None else weights
+    return coo_array((values, (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
+
+
 def components(count: int, pairs: IndexArray) -> IndexArray:
     """The number of the connected part that each vertex is in, shape (n,)."""
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    labels = connected_components(graph, directed=False)[1]
-    return np.asarray(labels, dtype=np.intp)
+    return np.asarray(connected_components(adjacency(count, pairs), directed=False)[1], dtype=np.intp)
 
 
 def list_names(names: Sequence[str]) -> str:
@@ -211,47 +192,26 @@ def _check_connected(network: RangeNetwork) -> None:
 class PairMeans:
     """Ranges by pair, r = sum(r_i / sigma_i^2) / sum(1 / sigma_i^2).
 
-    ``pairs``: each once, the smaller index first, shape (e, 2). ``ranges_m``: shape (e,). ``sigmas_m``: of the means,
-    shape (e,).
+    ``pairs``: each once, the smaller index first, shape (e, 2). ``pair_of``: of each range, shape (m,). ``ranges_m``,
+    ``sigmas_m``: of the means, shape (e,). ``table_m``, ``sigma_table_m``: the same between all motes in either order,
+    nan without a range, shape (n, n).
     """
 
     def __init__(self, network: RangeNetwork) -> None:
         self.pairs: IndexArray
         self.pairs, place = np.unique(network.pairs, axis=0, return_inverse=True)
+        self.pair_of: IndexArray = place.ravel()
         weights = 1.0 / network.sigmas_m**2
-        total = np.bincount(place.ravel(), weights)
-        self.ranges_m: FloatArray = np.bincount(place.ravel(), weights * network.ranges_m) / total
+        total = np.bincount(self.pair_of, weights)
+        self.ranges_m: FloatArray = np.bincount(self.pair_of, weights * network.ranges_m) / total
         self.sigmas_m: FloatArray = 1.0 / np.sqrt(total)
-        self._index = {(int(i), int(j)): row for row, (i, j) in enumerate(self.pairs)}
-        self._partners: dict[int, list[int]] = {}
-        for i, j in self.pairs.tolist():
-            self._partners.setdefault(i, []).append(j)
-            self._partners.setdefault(j, []).append(i)
+        self.table_m, self.sigma_table_m = np.full((2, network.count, network.count), np.nan)
+        for i, j in (self.pairs.T, self.pairs.T[::-1]):
+            self.table_m[i, j], self.sigma_table_m[i, j] = self.ranges_m, self.sigmas_m
 
-    def between(self, first: int, second: int) -> tuple[float, float] | None:
-        """Range and sigma of a pair in either order, or None."""
-        row = self._index.get((min(first, second), max(first, second)))
-        return None if row is None else self.values(row)
-
-    def row(self, first: int, second: int) -> int:
-        """Which of the pairs these two are, in either order. Raises MappingError: they have no range."""
-        row = self._index.get((min(first, second), max(first, second)))
-        if row is None:
-            raise MappingError(f"no range between motes {first} and {second}")
-        return row
-
-    def values(self, row: int) -> tuple[float, float]:
-        """Range and sigma of one of the pairs."""
-        return float(self.ranges_m[row]), float(self.sigmas_m[row])
-
-    def partners(self, mote: int) -> list[int]:
+    def partners(self, mote: int) -> IndexArray:
         """The motes that have a range to this one."""
-        return self._partners.get(mote, [])
-
-    def are_all_linked(self, motes: Iterable[int]) -> bool:
-        """Whether every two of some motes have a range."""
-        listed = list(motes)
-        return all(self.between(a, b) is not None for k, a in enumerate(listed) for b in listed[k + 1 :])
+        return np.flatnonzero(np.isfinite(self.table_m[mote]))
 
 
 _MEDIAN_COST = np.sqrt(np.pi / 2.0)  # of the median's standard deviation against the mean's, for normal noise
@@ -260,15 +220,22 @@ _MEDIAN_COST = np.sqrt(np.pi / 2.0)  # of the median's standard deviation agains
 def pair_range(
     cfg: CricketConfig, names: tuple[str, str], delays_s: FloatArray | Sequence[float], temperature_c: float
 ) -> MoteRange:
-    """The range of a pair from its readings.
+    """The range of a pair from its readings, d = c(T) (t_2 - t_1), Patil et al. eq. 1.
 
-    ``delays_s``: pulse after message, one for each reading, shape (k,), k >= 1. Raises TdoaError: a delay or a
-    temperature that none can be.
+    The speed of sound is that of an ideal gas, c = c_0 sqrt(T / T_0), T in kelvin; the radio message takes no time.
+    sigma^2 = sigma_1^2 / n + (d sigma_T / (2 T))^2: repeating lessens the noise of a reading, not what a wrong
+    thermometer does, dc/c = dT / (2 T). ``delays_s``: pulse after message, one for each reading, shape (n,), n >= 1.
+    Raises TdoaError: a delay or a temperature that none can be.
     """
-    delay_s = float(np.median(delays_s) if cfg.ranging.combine == "median" else np.mean(delays_s))
-    range_m = range_from_delay(cfg.air, delay_s, temperature_c)
-    count = len(delays_s)
-    sigma_m = range_sigma(cfg.ranging.sigma_m, range_m, cfg.ranging.thermometer_sigma_c, temperature_c, count)
-    if cfg.ranging.combine == "median" and count > 2:
+    air, ranging, count = cfg.air, cfg.ranging, len(delays_s)
+    delay_s = float(np.median(delays_s) if ranging.combine == "median" else np.mean(delays_s))
+    if not 0.0 <= delay_s < float("inf"):
+        raise TdoaError(f"delay of {delay_s:g} s: the pulse cannot arrive before the message")
+    if not COLDEST_C <= temperature_c <= HOTTEST_C:
+        raise TdoaError(f"temperature of {temperature_c:g} C is outside {COLDEST_C:g} to {HOTTEST_C:g} C")
+    kelvin = temperature_c - ABSOLUTE_ZERO_C
+    range_m = air.sound_speed_m_s * sqrt(kelvin / (air.temperature_c - ABSOLUTE_ZERO_C)) * delay_s
+    sigma_m = sqrt(ranging.sigma_m**2 / count + (range_m * (ranging.thermometer_sigma_c / (2.0 * kelvin))) ** 2)
+    if ranging.combine == "median" and count > 2:
         sigma_m *= float(_MEDIAN_COST)
     return MoteRange(*names, range_m, sigma_m)

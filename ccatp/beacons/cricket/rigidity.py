@@ -1,18 +1,17 @@
 """What ranges can determine: free directions by name, and whether several maps fit equally well (global rigidity)."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import depth_first_order, dijkstra
 
-from ccatp.beacons.cricket.map_fit import MapModel, MapState
+from ccatp.beacons.cricket.map_fit import MapModel, MapState, rigidity_matrix
 from ccatp.beacons.cricket.range_network import (
     IndexArray,
     RangeNetwork,
+    adjacency,
     components,
     coordinates_of,
     every_pair,
@@ -35,7 +34,6 @@ class Freedom(NamedTuple):
     frame: tuple[str, ...]  # names of rigid motions of the whole map that are free
     flexes: tuple[str, ...]
     untold: tuple[str, ...]  # what of offset and scale cannot be separated from the map
-    parts: tuple[tuple[int, ...], ...]
 
     @property
     def deficiency(self) -> int:
@@ -43,80 +41,59 @@ class Freedom(NamedTuple):
         return self.unknowns - self.rank - len(self.frame)
 
     @property
-    def calibration(self) -> tuple[str, ...]:
-        """A line for each of ``untold``."""
-        return tuple(f"range {name}: the map takes it up" for name in self.untold)
+    def lines(self) -> list[str]:
+        """All of them by name."""
+        return [*self.frame, *self.flexes, *(f"range {name}: the map takes it up" for name in self.untold)]
 
 
 def generic_state(model: MapModel, rng: np.random.Generator) -> MapState:
     """Motes anywhere: what holds there holds for almost all places, so it can be said before any is known."""
     network = model.network
     places = rng.standard_normal((network.count, network.dimension))
-    for body in network.bodies:
-        size = float(np.abs(body.local_m).max()) or 1.0
+    sizes = [float(np.abs(body.local_m).max()) or 1.0 for body in network.bodies]
+    for body, size in zip(network.bodies, sizes, strict=True):
         turn = np.linalg.qr(rng.standard_normal((network.dimension, network.dimension)))[0]
         if np.linalg.det(turn) < 0.0:
             turn[:, 0] = -turn[:, 0]
         # Bodies as large as the rest, so that rounding does not hide what they determine.
         places[list(body.motes)] = places[body.motes[0]] * 3.0 * size + body.local_m @ turn.T
-    if network.bodies:
-        size = max(float(np.abs(body.local_m).max()) for body in network.bodies)
-        loose = list(network.loose)
-        places[loose] *= 3.0 * size
+    places[list(network.loose)] *= 3.0 * max(sizes, default=1.0 / 3.0)
     return model.state(places)
 
 
 def find_freedom(model: MapModel, state: MapState) -> Freedom:
     """Rank and free directions at a state."""
-    network = model.network
     null = _null_space(model, state)
     moves = np.asarray(model.position_jacobian(state) @ null[: model.coordinates])
     names = [name for name, on in (("offset", model.with_offset), ("scale", model.with_scale)) if on]
-    untold = tuple(
-        name
-        for row, name in enumerate(names)
-        if null.shape[1] and float(np.abs(null[model.coordinates + row]).max()) > 1e-7
-    )
+    shares = np.abs(null[model.coordinates :]).max(axis=1, initial=0.0)
+    untold = tuple(name for name, share in zip(names, shares, strict=True) if share > 1e-7)
     frame = _frame(moves, state.positions_m)
-    extra = null.shape[1] - len(frame)
-    parts = rigid_parts(moves, state.positions_m, extra)
-    flexes = _flexes(moves, state.positions_m, parts, network) if extra > len(untold) else ()
-    return Freedom(model.size, model.size - null.shape[1], frame, flexes, untold, parts)
+    is_flexible = null.shape[1] - len(frame) > len(untold)
+    flexes = _flexes(moves, state.positions_m, model.network) if is_flexible else ()
+    return Freedom(model.size, model.size - null.shape[1], frame, flexes, untold)
 
 
-def rigid_parts(moves: FloatArray, points: FloatArray, extra: int) -> tuple[tuple[int, ...], ...]:
-    """Sets of motes whose distances stay in every free direction, largest first.
-
-    ``moves``: free directions, shape (n d, k). ``points``: shape (n, d).
-    """
+def _largest_rigid_part(moves: FloatArray, points: FloatArray) -> list[int]:
+    """Motes whose distances stay in every free direction (n d, k); points of shape (n, d)."""
     count, d = points.shape
-    if extra <= 0:
-        return (tuple(range(count)),)
     # One combination of all directions, with weights that no accident makes cancel.
     mixed = (moves @ np.sin(1.0 + np.arange(moves.shape[1]))).reshape(count, d)
     scale = float(np.abs(mixed).max() * np.abs(points).max())
     offsets, rates = points[:, None] - points[None], mixed[:, None] - mixed[None]
     holds = np.abs(np.einsum("ijk,ijk->ij", offsets, rates)) < 1e-7 * scale
-    parts: list[tuple[int, ...]] = []
-    covered = np.eye(count, dtype=bool)
-    for i in range(count):
-        for j in np.flatnonzero(holds[i] & ~covered[i]):
-            if covered[i, j]:
-                continue
-            members = _clique(holds, i, int(j))
-            covered[np.ix_(members, members)] = True
-            parts.append(tuple(members))
-    alone = [(mote,) for mote in range(count) if not any(mote in part for part in parts)]
-    return tuple(sorted({*parts, *alone}, key=lambda part: (-len(part), part)))
-
-
-def _clique(holds: NDArray[np.bool_], first: int, second: int) -> list[int]:
-    left, chosen = holds[first] & holds[second], [first, second]
-    while (rest := np.setdiff1d(np.flatnonzero(left), chosen)).size:
-        chosen.append(int(rest[0]))
-        left = left & holds[rest[0]]
-        left[chosen] = True
-    return sorted(chosen)
+    best = [0]
+    is_covered = np.eye(count, dtype=bool)
+    for i, j in np.argwhere(np.triu(holds, 1)).tolist():
+        if is_covered[i, j]:
+            continue
+        part, left = [i, j], holds[i] & holds[j]
+        while (rest := np.setdiff1d(np.flatnonzero(left), part)).size:
+            part.append(int(rest[0]))
+            left = left & holds[rest[0]]
+        is_covered[np.ix_(part, part)] = True
+        best = max(best, sorted(part), key=len)
+    return best
 
 
 def _null_space(model: MapModel, state: MapState) -> FloatArray:
@@ -132,58 +109,43 @@ def _null_space(model: MapModel, state: MapState) -> FloatArray:
 def _frame(moves: FloatArray, points: FloatArray) -> tuple[str, ...]:
     if moves.shape[1] == 0:
         return ()
-    basis = np.linalg.qr(moves)[0]
-    modes = rigid_modes(points)
+    d, basis, modes = points.shape[1], np.linalg.qr(moves)[0], rigid_modes(points)
     # Cosines of the angles between both spaces: 1 for what they share.
     shared = int((np.linalg.svd(basis.T @ modes, compute_uv=False) > 1.0 - 1e-7).sum())
-    d = points.shape[1]
-    names = []
-    for axis in range(d):
-        mode = np.zeros_like(points)
-        mode[:, axis] = 1.0 / np.sqrt(len(points))
-        if float(np.linalg.norm(basis.T @ mode.ravel())) > 1.0 - 1e-7:
-            names.append(f"translation along {_AXES[axis]}")
-    turns = shared - len(names)
-    if turns > 0:
-        names += ["rotation"] if d == 2 else [f"rotation {number + 1}" for number in range(turns)]
+    is_free = np.linalg.norm(basis.T @ modes[:, :d], axis=0) > 1.0 - 1e-7  # the first modes are translations
+    names = [f"translation along {_AXES[axis]}" for axis in np.flatnonzero(is_free)]
+    names += ["rotation"] if d == 2 else [f"rotation {number + 1}" for number in range(shared)]
     return tuple(names[:shared])
 
 
-def _flexes(
-    moves: FloatArray, points: FloatArray, parts: Sequence[tuple[int, ...]], network: RangeNetwork
-) -> tuple[str, ...]:
+def _flexes(moves: FloatArray, points: FloatArray, network: RangeNetwork) -> tuple[str, ...]:
     count, d = points.shape
-    base = list(parts[0])
+    base = _largest_rigid_part(moves, points)
     at = coordinates_of(base, d)
     # Take from each direction the rigid motion that its base makes.
     rigid = rigid_modes(points)
     moves = moves - rigid @ np.linalg.lstsq(rigid[at], moves[at], rcond=1e-9)[0]
     U, singular, _ = np.linalg.svd(moves, full_matrices=False)
-    rows = U[:, singular > 1e-7].T
     names, lines = network.names, Counter[str]()
-    pairs = graph_pairs(network)
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count)).tocsr()
+    graph = adjacency(count, graph_pairs(network))
     steps = np.asarray(dijkstra(graph, directed=False, unweighted=True, indices=base, min_only=True))
-    for row in _echelon(rows, steps, d):
+    for row in _echelon(U[:, singular > 1e-7].T, coordinates_of(np.argsort(steps, kind="stable"), d)):
         speeds = np.linalg.norm(row.reshape(count, d), axis=1)
         moving = [names[mote] for mote in np.flatnonzero(speeds > _STILL * speeds.max())]
         lines[f"{list_names(moving)} against {list_names([names[mote] for mote in base])}"] += 1
     return tuple(line if times == 1 else f"{line} ({times} ways)" for line, times in lines.items())
 
 
-def _echelon(rows: FloatArray, steps: FloatArray, d: int) -> list[FloatArray]:
-    order = coordinates_of(np.argsort(steps, kind="stable"), d)
-    left = [row.copy() for row in rows]
-    found = []
+def _echelon(rows: FloatArray, order: IndexArray) -> list[FloatArray]:
+    left, found = list(rows), list[FloatArray]()
     for at in order:
         if not left:
             break
         pivot = max(range(len(left)), key=lambda k: abs(left[k][at]))
-        if abs(left[pivot][at]) < 1e-8:
-            continue
-        row = left.pop(pivot)
-        found.append(row)
-        left = [other - row * (other[at] / row[at]) for other in left]
+        if abs(left[pivot][at]) >= 1e-8:
+            row = left.pop(pivot)
+            found.append(row)
+            left = [other - row * (other[at] / row[at]) for other in left]
     return found
 
 
@@ -237,47 +199,36 @@ def _all_pairs(network: RangeNetwork) -> IndexArray:
 
 
 def _stress(pairs: IndexArray, points: FloatArray, rng: np.random.Generator) -> tuple[IndexArray, int]:
-    count, d = points.shape
-    i, j = pairs[:, 0], pairs[:, 1]
-    ways = points[i] - points[j]
-    ways /= np.linalg.norm(ways, axis=1)[:, None]
-    axis = np.arange(d)
-    at = np.concatenate([i[:, None] * d + axis, j[:, None] * d + axis], axis=1)
-    rows = np.repeat(np.arange(len(pairs)), 2 * d)
-    R = coo_array(
-        (np.concatenate([ways, -ways], axis=1).ravel(), (rows, at.ravel())), shape=(len(pairs), count * d)
-    ).tocsr()
+    """Pairs without which something moves, and the rank of a random stress matrix."""
+    count = len(points)
+    i, j = pairs.T
+    R = rigidity_matrix(points, i, j)
     values, vectors = np.linalg.eigh((R.T @ R).toarray())
     seen = values > _FOLD_OVER_NULL * values[-1]
     # Orthonormal basis of the column space of R; what a random vector has across it is an equilibrium stress.
     columns = np.asarray(R @ (vectors[:, seen] / np.sqrt(values[seen])))
-    leverage = (columns**2).sum(axis=1)
-    single = pairs[leverage > 1.0 - 1e-7]
+    is_single = (columns**2).sum(axis=1) > 1.0 - 1e-7
     draw = rng.standard_normal(len(pairs))
     stress = draw - columns @ (columns.T @ draw)
-    if len(single) == len(pairs) or float(np.abs(stress).max()) < 1e-8:
-        return single, 0
-    stress = np.where(leverage > 1.0 - 1e-7, 0.0, stress) / np.linalg.norm(points[i] - points[j], axis=1)
-    omega = np.zeros((count, count))
-    np.subtract.at(omega, (i, j), stress)
-    np.subtract.at(omega, (j, i), stress)
-    omega[np.diag_indices(count)] = -omega.sum(axis=1)
+    if is_single.all() or float(np.abs(stress).max()) < 1e-8:
+        return pairs[is_single], 0
+    stress = np.where(is_single, 0.0, stress) / np.linalg.norm(points[i] - points[j], axis=1)
+    stresses = adjacency(count, pairs, stress).toarray()
+    stresses += stresses.T
+    omega = np.diag(stresses.sum(axis=0)) - stresses
     eigenvalues = np.abs(np.linalg.eigvalsh(omega))
-    return single, int((eigenvalues > _FOLD_OVER_NULL * eigenvalues.max()).sum())
+    return pairs[is_single], int((eigenvalues > _FOLD_OVER_NULL * eigenvalues.max()).sum())
 
 
 def _mirrors(pairs: IndexArray, count: int, d: int) -> Iterator[tuple[tuple[int, ...], tuple[int, ...]]]:
-    partners = [set[int]() for _ in range(count)]
-    for i, j in pairs.tolist():
-        partners[i].add(j)
-        partners[j].add(i)
+    partners = [pairs[(pairs == mote).any(axis=1)].sum(axis=1) - mote for mote in range(count)]
     for mote in range(count):
         if len(partners[mote]) <= d and count > len(partners[mote]) + 1:
-            yield tuple(sorted(partners[mote])), (mote,)
+            yield tuple(sorted(partners[mote].tolist())), (mote,)
     if d != 2 or count > _NAMED:
         return
     for first in range(count):
-        for second in _cut_vertices(partners, first):
+        for second in _cut_vertices(pairs, count, first):
             if second > first:
                 yield from _sides(pairs, count, (first, second))
 
@@ -285,8 +236,7 @@ def _mirrors(pairs: IndexArray, count: int, d: int) -> Iterator[tuple[tuple[int,
 def _sides(
     pairs: IndexArray, count: int, separator: tuple[int, int]
 ) -> Iterator[tuple[tuple[int, ...], tuple[int, ...]]]:
-    kept = ~np.isin(pairs, separator).any(axis=1)
-    labels = components(count, pairs[kept])
+    labels = components(count, pairs[~np.isin(pairs, separator).any(axis=1)])
     labels[list(separator)] = -1
     sides = [np.flatnonzero(labels == label) for label in np.unique(labels[labels >= 0])]
     for side in sorted(sides, key=len)[:-1]:
@@ -294,40 +244,27 @@ def _sides(
             yield separator, tuple(side.tolist())
 
 
-def _cut_vertices(partners: list[set[int]], without: int) -> list[int]:
-    """Vertices that part the graph once ``without`` is gone (Hopcroft and Tarjan 1973), without recursion."""
-    count = len(partners)
-    order, low = [-1] * count, [0] * count
-    cuts: set[int] = set()
-    clock = 0
-    for root in range(count):
-        if root == without or order[root] >= 0:
-            continue
-        branches = 0
-        order[root] = low[root] = clock
-        clock += 1
-        stack = [(root, -1, iter(partners[root]))]
-        while stack:
-            vertex, parent, rest = stack[-1]
-            for other in rest:
-                if other in (without, parent):
-                    continue
-                if order[other] >= 0:
-                    low[vertex] = min(low[vertex], order[other])
-                    continue
-                order[other] = low[other] = clock
-                clock += 1
-                branches += vertex == root
-                stack.append((other, vertex, iter(partners[other])))
-                break
-            else:
-                stack.pop()
-                if stack:
-                    above = stack[-1][0]
-                    low[above] = min(low[above], low[vertex])
-                    if above != root and low[vertex] >= order[above]:
-                        cuts.add(above)
-        if branches > 1:
+def _cut_vertices(pairs: IndexArray, count: int, without: int) -> list[int]:
+    """Vertices that part the graph once ``without`` is gone (low points: Hopcroft and Tarjan 1973)."""
+    kept = pairs[(pairs != without).all(axis=1)]
+    graph = adjacency(count, kept)
+    low, cuts, left = np.full(count, -1), set[int](), set(range(count)) - {without}
+    while left:
+        root = min(left)
+        nodes, before = depth_first_order(graph, root, directed=False)
+        left -= set(nodes.tolist())
+        order = np.full(count, -1)
+        order[nodes] = np.arange(len(nodes))
+        low[nodes] = order[nodes]
+        i, j = kept[order[kept[:, 0]] >= 0].T
+        np.minimum.at(low, i, order[j])
+        np.minimum.at(low, j, order[i])
+        for vertex in nodes[:0:-1].tolist():  # children before their parents
+            above = int(before[vertex])
+            low[above] = min(low[above], low[vertex])
+            if above != root and low[vertex] >= order[above]:
+                cuts.add(above)
+        if int((before[nodes[1:]] == root).sum()) > 1:
             cuts.add(root)
     return sorted(cuts)
 

@@ -1,18 +1,17 @@
-"""Phase 2 of self-mapping: an extended Kalman filter over distances between motes; the plan of who maps whom."""
+"""Phase 2 of self-mapping: an extended Kalman filter over distances between motes, and the stands that it completes."""
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
-from ccatp.beacons.cricket.range_network import MappingError, RigidBody, coordinates_of
+from ccatp.beacons.cricket.mote_plan import MotePlan
+from ccatp.beacons.cricket.range_network import MappingError, coordinates_of
+from ccatp.beacons.cricket.trilateration import FirstMap
 from ccatp.config.beacon_models import BatchConfig, CricketConfig, PhaseTwoConfig
 from ccatp.core import FloatArray
 from ccatp.filters.ekf_slam import EkfSlam, Update
-from ccatp.filters.metrics import best_motion
 
 _STRAIGHT = 0.01  # share of the variance of a range up to which its curvature does not matter
 _CURVED = 2  # times that all pairs are taken together: how far the map is from straight depends on its errors
@@ -116,11 +115,18 @@ class MoteMapper:
         totals, weights = np.array(list(self._pairs.values())).T
         rows = _Rows(self._dimension, self._count, list(self._pairs), totals / weights)
         for _ in range(_CURVED):
-            start = self._filter.mean.copy()
-            curvature = rows.curvature(start, self._filter.covariance)
-            R = np.diag(1.0 / weights) + curvature
+            curvature = rows.curvature(self._filter.mean, self._filter.covariance)
+            starts = iter([self._filter.mean.copy()])
+
+            def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+                # First at a better place than the prior; what lies between is taken along the same lines of sight.
+                at = next(starts, x)  # noqa: B023
+                residual, H = rows(at)
+                return residual + H @ (at - x)[rows.columns], H
+
             self._filter = self._at_prior()
-            self._filter.update_iterated(rows.columns, rows.starting_at(start), R, self._how.linearisations)
+            R = np.diag(1.0 / weights) + curvature
+            self._filter.update_iterated(rows.columns, linearise, R, self._how.linearisations)
             if float((curvature.diagonal() * weights).max()) < _STRAIGHT:
                 break
 
@@ -153,21 +159,6 @@ class _Rows:
         H[:, -2], H[:, -1] = 1.0, distances
         return self._ranges_m - scale * distances - offset_m, H
 
-    def starting_at(self, start: FloatArray) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-        """The rows with their first linearisation at a better place than the prior."""
-        is_first = True
-
-        def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-            nonlocal is_first
-            if not is_first:
-                return self(x)
-            is_first = False
-            residual, H = self(start)
-            # As if linearised at x: what lies between is taken along the same lines of sight.
-            return residual + H @ (start - x)[self.columns], H
-
-        return linearise
-
     def curvature(self, x: FloatArray, P: FloatArray) -> FloatArray:
         """Covariance of what the rows leave out of second order, tr(A_k P_kl A_l P_lk) / 2, shape (m, m).
 
@@ -190,6 +181,25 @@ class _Rows:
         return ways, np.sqrt((ways**2).sum(axis=1))
 
 
+def begin_phase_two(cfg: CricketConfig, plan: MotePlan, first: FirstMap) -> MoteMapper:
+    """The filter over the first motes of the stands, or over all motes where there are none, after phase 1.
+
+    The printed prior, the covariance of Patil et al. eq. 25, is one variance for all coordinates. It is no prior of a
+    map by trilateration: its errors are centimetres to decimetres and hang together. Raises MappingError: phase 1 has
+    left one of these motes without a place.
+    """
+    motes = list(plan.heads or plan.mapped)
+    if lost := [plan.names[mote] for mote in motes if mote in first.unplaced]:
+        raise MappingError(f"phase 1 cannot place {lost[0]} (and {len(lost) - 1} more); the batch needs no such start")
+    at = coordinates_of(motes, plan.dimension)
+    mean, covariance = (first.positions_m + first.bias_m)[motes], first.covariance_m2[np.ix_(at, at)]
+    known = plan.surveyed_m[motes]
+    if cfg.phase2.prior == "printed":
+        mean = first.positions_m[motes]
+        covariance = np.diag(np.where(np.isnan(known.ravel()), cfg.phase2.printed_variance_m2, 0.0))
+    return MoteMapper(mean, covariance, cfg.phase2, known, cfg.batch)
+
+
 class PhaseTwo(NamedTuple):
     """How phase 2 went."""
 
@@ -197,7 +207,6 @@ class PhaseTwo(NamedTuple):
     expected_rms_m: FloatArray  # likewise, shape (k + 1,)
     nis: FloatArray  # of each update, shape (k,)
     refused: int
-    reached: bool
 
 
 def run_phase_two(
@@ -217,7 +226,7 @@ def run_phase_two(
         nis.append(learned.nis)
         places.append(mapper.positions_m)
         expected.append(mapper.expected_rms_m)
-    return PhaseTwo(np.array(places), np.array(expected), np.array(nis), refused, expected[-1] <= target_rms_m)
+    return PhaseTwo(np.array(places), np.array(expected), np.array(nis), refused)
 
 
 def conditioned(mean: FloatArray, covariance: FloatArray, known: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -239,104 +248,6 @@ def conditioned(mean: FloatArray, covariance: FloatArray, known: FloatArray) -> 
     return mean, 0.5 * (covariance + covariance.T)
 
 
-def printed_prior(count: int, dimension: int, known: Sequence[int], variance_m2: float) -> FloatArray:
-    """The covariance of Patil et al. eq. 25: one variance for all coordinates, none for those that are known.
-
-    It is no prior of a map by trilateration: its errors are centimetres to decimetres and hang together.
-    """
-    variances = np.full(count * dimension, variance_m2)
-    variances[list(known)] = 0.0
-    return np.diag(variances)
-
-
-Pairs = tuple[tuple[int, int], ...]
-
-
-@dataclass(frozen=True, slots=True)
-class MotePlan:
-    """The motes of a configuration.
-
-    ``networks``: indices of the motes of each stand, in the order of mapping; empty where there are none. ``axes_m``:
-    where A stands and the direction towards B, shape (2, d): what takes the map's frame to the field's.
-    """
-
-    names: tuple[str, ...]
-    dimension: int
-    anchors: tuple[int, ...]
-    networks: tuple[tuple[int, ...], ...]
-    bodies: tuple[RigidBody, ...]  # the stands, whose shapes are known
-    axes_m: FloatArray
-    phase1_pairs: Pairs  # pairs that are measured in phase 1
-    phase2_pairs: Pairs  # pairs that phase 2 goes through
-    surveyed_m: FloatArray  # coordinates that phase 2 takes as known, nan elsewhere, shape (n, d)
-
-    @property
-    def heads(self) -> tuple[int, ...]:
-        """The first mote of each stand, which phase 2 places."""
-        return tuple(network[0] for network in self.networks)
-
-    @property
-    def mapped(self) -> tuple[int, ...]:
-        """The motes that the map is for: all but the anchors."""
-        return tuple(mote for mote in range(len(self.names)) if mote not in self.anchors)
-
-
-def network_plan(cfg: CricketConfig) -> MotePlan:
-    """The plan of stands of motes (Patil et al., section 3): each stand is mapped by the one before it."""
-    size = len(cfg.stand_m)
-    anchors = tuple(range(len(cfg.anchors)))
-    networks = tuple(
-        tuple(range(len(anchors) + size * number, len(anchors) + size * (number + 1)))
-        for number in range(len(cfg.networks))
-    )
-    names = (*cfg.anchors, *(f"{name}-{mote + 1}" for name in cfg.networks for mote in range(size)))
-    places = np.array(list(cfg.anchors.values()), dtype=np.float64)
-    local_m = np.array(cfg.stand_m, dtype=np.float64)
-    heads = [network[0] for network in networks]
-    first, second = anchors
-    # A to B, both to the first network, then all of a network to all of the next.
-    phase1_pairs = [(first, second), *((anchor, mote) for anchor in anchors for mote in networks[0])]
-    for before, after in pairwise(networks):
-        phase1_pairs += [(old, new) for old in before for new in after]
-    surveyed_m = np.full((len(names), cfg.dimension), np.nan)
-    if cfg.phase2.frame == "surveyed":  # place of the first head and y of the second: the zeros of Patil et al. eq. 25
-        origin, along = list(cfg.networks.values())[:2]
-        surveyed_m[heads[0]] = origin.place_m
-        surveyed_m[heads[1], 1] = along.place_m[1]
-    return MotePlan(
-        names=names,
-        dimension=cfg.dimension,
-        anchors=anchors,
-        networks=networks,
-        bodies=tuple(RigidBody(name, motes, local_m) for name, motes in zip(cfg.networks, networks, strict=True)),
-        axes_m=np.array([places[0], places[1] - places[0]]),
-        phase1_pairs=tuple(phase1_pairs),
-        phase2_pairs=tuple((heads[i], heads[j]) for i, j in head_pairs(len(heads), cfg.phase2.pairs)),
-        surveyed_m=surveyed_m,
-    )
-
-
-def loose_plan(cfg: CricketConfig, names: tuple[str, ...]) -> MotePlan:
-    """The plan of motes by themselves: every pair in reach is measured and used."""
-    count, d = len(names), cfg.dimension
-    pairs = tuple((i, j) for i in range(count) for j in range(i + 1, count))
-    nowhere = np.full((count, d), np.nan)
-    return MotePlan(names, d, (), (), (), np.zeros((2, d)), pairs, pairs, nowhere)
-
-
-def head_pairs(count: int, programme: str) -> list[tuple[int, int]]:
-    """Pairs of stands that measure each other in phase 2.
-
-    ``programme``: ``zigzag``: each with the next; ``adjacent``: and with the one after it; ``all``.
-    """
-    if programme == "all":
-        return [(i, j) for i in range(count) for j in range(i + 1, count)]
-    pairs = list(pairwise(range(count)))
-    if programme == "adjacent":
-        pairs += [(i, i + 2) for i in range(count - 2)]
-    return pairs
-
-
 class CompletedMap(NamedTuple):
     """All motes of all stands."""
 
@@ -345,39 +256,29 @@ class CompletedMap(NamedTuple):
     covariance_m2: FloatArray  # shape (k d, k d)
 
 
-def complete_stands(
-    plan: MotePlan, first_m: FloatArray, first_covariance_m2: FloatArray, heads_m: FloatArray,
-    heads_covariance_m2: FloatArray,
-) -> CompletedMap:  # fmt: skip
+def complete_stands(plan: MotePlan, first: FirstMap, mapper: MoteMapper) -> CompletedMap:
     """Patil et al., figure 8, last box: motes 2 and 3 of each stand with respect to mote 1; in the plane.
 
     Where a stand looks is what phase 1 found of its three motes, by the best turn of the known shape; its error is that
     of the turn, dtheta = sum(w_k x dp_k) / sum(|w_k|^2) over the arms w_k about their mean, and is taken as independent
     of the heads, which phase 2 has placed far better than phase 1 had.
-
-    Args:
-        first_m: places of all motes after phase 1, shape (n, 2).
-        first_covariance_m2: shape (2 n, 2 n).
-        heads_m: places of the first motes after phase 2, shape (s, 2).
-        heads_covariance_m2: shape (2 s, 2 s).
     """
-    sizes = [len(network) for network in plan.networks]
-    heads = np.repeat(np.arange(len(sizes)), sizes)
-    at_heads = coordinates_of(heads, 2)
-    covariance = heads_covariance_m2[np.ix_(at_heads, at_heads)].copy()
+    motes = [mote for body in plan.bodies for mote in body.motes]
+    at_heads = coordinates_of(np.repeat(np.arange(len(plan.bodies)), [len(body.motes) for body in plan.bodies]), 2)
+    covariance = mapper.covariance_m2[np.ix_(at_heads, at_heads)]
     places, row = [], 0
-    for stand, body in enumerate(plan.bodies):
-        motes = list(body.motes)
-        rotation = best_motion(body.local_m, first_m[motes]).rotation
-        arms = (body.local_m - body.local_m[0]) @ rotation.T
-        places.append(heads_m[stand] + arms)
-        middle = (body.local_m - body.local_m.mean(axis=0)) @ rotation.T
-        lever = np.column_stack([-middle[:, 1], middle[:, 0]]).ravel() / float((middle**2).sum())
-        at = coordinates_of(motes, 2)
-        variance = float(lever @ first_covariance_m2[np.ix_(at, at)] @ lever)
-        turned = np.column_stack([-arms[:, 1], arms[:, 0]]).ravel()
-        block = slice(2 * row, 2 * (row + len(motes)))
-        covariance[block, block] += variance * np.outer(turned, turned)
-        row += len(motes)
-    motes_of_all = tuple(mote for network in plan.networks for mote in network)
-    return CompletedMap(motes_of_all, np.concatenate(places), covariance)
+    for head_m, body in zip(mapper.positions_m, plan.bodies, strict=True):
+        rotated = body.local_m @ body.motion(first.positions_m).rotation.T
+        arms, middle = rotated - rotated[0], rotated - rotated.mean(axis=0)
+        lever = _across(middle) / float((middle**2).sum())
+        at = coordinates_of(body.motes, 2)
+        variance = float(lever @ first.covariance_m2[np.ix_(at, at)] @ lever)
+        places.append(head_m + arms)
+        block = slice(row, row + at.size)
+        covariance[block, block] += variance * np.outer(_across(arms), _across(arms))
+        row += at.size
+    return CompletedMap(tuple(motes), np.concatenate(places), covariance)
+
+
+def _across(arms: FloatArray) -> FloatArray:
+    return np.column_stack([-arms[:, 1], arms[:, 0]]).ravel()

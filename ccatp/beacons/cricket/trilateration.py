@@ -5,25 +5,70 @@ from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map, position_covariance
-from ccatp.beacons.cricket.range_network import (
-    MappingError,
-    MoteRange,
-    PairMeans,
-    RangeNetwork,
-    build_network,
-    coordinates_of,
-    list_names,
-)
-from ccatp.beacons.cricket.self_mapping import MotePlan
-from ccatp.beacons.cricket.unfolding import classical_scaling
+from ccatp.beacons.cricket.map_fit import rigidity_matrix, robust_loss
+from ccatp.beacons.cricket.mote_plan import MotePlan
+from ccatp.beacons.cricket.range_network import MappingError, PairMeans, RangeNetwork, coordinates_of, list_names
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import RigidMotion, best_motion
-from ccatp.mirror.multilateration import MultilaterationError, RangeSolution, multilaterate
+from ccatp.filters.metrics import RigidMotion
 
 _APART = 10.0  # sigmas between two solutions that are not the same one
 _ALIKE = 9.0  # difference of chi-squared up to which a mirror image may as well be the truth
+_DRAWN_STEPS = 15  # of each drawn trilateration; references that are decimetres off make it go slowly
+_STEPS = 100
+_REST_M = 1e-6
+_DAMPING = 1e-6  # of the trace of the normal matrix: references of a draw may come to lie in line
+
+
+def trilaterate(
+    starts_m: FloatArray, anchors_m: FloatArray, ranges_m: FloatArray, sigmas_m: FloatArray,
+    robust_scale: float = float("inf"), steps: int = _STEPS,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Places from ranges to anchors, and their costs: damped Gauss-Newton steps of many problems at once.
+
+    Args:
+        starts_m: shape (b, d).
+        anchors_m: shape (b, k, d), or (k, d) where they are the same for all.
+        ranges_m: shape (b, k) or (k,).
+        sigmas_m: shape (k,).
+        robust_scale: as of ``MapFitSettings``.
+    """
+    d = starts_m.shape[1]
+
+    def look(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        ways = points[:, None] - anchors_m
+        distances = np.maximum(np.sqrt((ways**2).sum(axis=2)), 1e-9)
+        J = ways / (distances * sigmas_m)[:, :, None]
+        residuals = (ranges_m - distances) / sigmas_m
+        costs, weights = robust_loss(residuals, robust_scale)
+        heavy = J * weights[:, :, None]
+        return costs, np.einsum("nk,nkd->nd", residuals, heavy), np.einsum("nki,nkj->nij", heavy, J)
+
+    points, damping = starts_m.copy(), np.full(len(starts_m), _DAMPING)
+    costs, gradient, normal = look(points)
+    for _ in range(steps):
+        ridge = (damping * np.trace(normal, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(d)
+        step = np.linalg.solve(normal + ridge, gradient[:, :, None])[:, :, 0]
+        seen = look(points + step)
+        better = seen[0] <= costs
+        points[better] += step[better]
+        costs, gradient[better], normal[better] = np.where(better, seen[0], costs), seen[1][better], seen[2][better]
+        damping = np.where(better, np.maximum(0.2 * damping, _DAMPING), 10.0 * damping)
+        if float(np.abs(step).max()) < _REST_M:
+            break
+    return points, costs
+
+
+def classical_scaling(distances_m: FloatArray, dimension: int) -> FloatArray:
+    """Torgerson's scaling (1952): the leading eigenvectors of -1/2 J D^2 J, shape (n, dimension)."""
+    squares = distances_m**2
+    centred = squares - squares.mean(axis=0) - squares.mean(axis=1)[:, None] + squares.mean()
+    values, vectors = np.linalg.eigh(-0.5 * centred)
+    points = np.zeros((len(distances_m), dimension))
+    kept = min(dimension, len(distances_m))
+    points[:, :kept] = vectors[:, ::-1][:, :kept] * np.sqrt(np.maximum(values[::-1][:kept], 0.0))
+    return points
 
 
 class DegenerateStep(MappingError):
@@ -46,21 +91,19 @@ class Sketch:
     dx = G (dr + U da), G = (H^T W H)^-1 H^T W, U da the errors of the references along the lines of sight.
     """
 
-    def __init__(self, names: Sequence[str], means: PairMeans, dimension: int, max_dop: float) -> None:
-        count = len(names)
-        self.positions_m = np.full((count, dimension), np.nan)
-        self.covariance_m2 = np.zeros((count * dimension, count * dimension))
-        self._seen_m = np.full((count, dimension), np.nan)  # places at which derivatives are taken
+    def __init__(self, network: RangeNetwork, max_dop: float) -> None:
+        self.means = PairMeans(network)
+        self._names, self._dimension, self._max_dop = network.names, network.dimension, max_dop
+        size = network.count * network.dimension
+        self.positions_m = np.full((network.count, network.dimension), np.nan)
+        self.covariance_m2 = np.zeros((size, size))
+        self._seen_m = self.positions_m.copy()  # places at which derivatives are taken
         self.steps: list[TrilaterationStep] = []
-        self._names, self._means, self._dimension, self._max_dop = names, means, dimension, max_dop
 
-    def is_placed(self, mote: int) -> bool:
-        """Whether a mote has a place."""
-        return bool(np.isfinite(self.positions_m[mote, 0]))
-
-    def coordinates(self, mote: int) -> slice:
-        """Where a mote stands in the covariance."""
-        return slice(mote * self._dimension, (mote + 1) * self._dimension)
+    @property
+    def is_placed(self) -> NDArray[np.bool_]:
+        """Which motes have a place, shape (n,)."""
+        return np.asarray(np.isfinite(self.positions_m[:, 0]))
 
     def linearise_at(self, motes: Sequence[int], places_m: FloatArray) -> None:
         """Take the derivatives of later steps at better places than those found, shape (k, d).
@@ -72,234 +115,144 @@ class Sketch:
 
     def set_axes(self, origin: int, axis: int) -> None:
         """Origin and second axis: A (0, 0), B (0, d_AB); in the plane alone. Raises MappingError: A and B have none."""
-        range_m, sigma_m = self._range(origin, axis)
-        self.positions_m[origin] = self._seen_m[origin] = 0.0
-        self.positions_m[axis] = self._seen_m[axis] = (0.0, range_m)
-        at = self.coordinates(axis).start + 1
-        self.covariance_m2[at, at] = sigma_m**2
-        self.steps += [TrilaterationStep(origin, (), 0.0, "axes"), TrilaterationStep(axis, (origin,), 1.0, "axes")]
+        range_m, sigma_m = (values[0] for values in self._ranges(axis, [origin]))
+        variances = np.zeros((4, 4))
+        variances[3, 3] = sigma_m**2
+        self.add_together([origin, axis], np.array([[0.0, 0.0], [0.0, range_m]]), variances, "axes")
+
+    def add_together(self, motes: Sequence[int], places_m: FloatArray, covariance_m2: FloatArray, how: str) -> None:
+        """Motes that begin a map together, with their covariance, shapes (k, d) and (k d, k d)."""
+        at = coordinates_of(motes, self._dimension)
+        self.positions_m[list(motes)] = self._seen_m[list(motes)] = places_m
+        self.covariance_m2[np.ix_(at, at)] = covariance_m2
+        self.steps += [TrilaterationStep(mote, (), 0.0, how) for mote in motes]
 
     def add_by_cosines(self, mote: int, origin: int, axis: int) -> None:
         """A mote on the right of the axis from A to B, by the law of cosines.
 
-        y = (d_A^2 + d_AB^2 - d_B^2) / (2 d_AB), x = sqrt(d_A^2 - y^2)
-
         Raises MappingError: a range to A or B is missing. Raises DegenerateStep: the mote is on the axis, or nearly.
         """
-        (a, sigma_a), (b, sigma_b), (c, _) = (
-            self._range(origin, mote),
-            self._range(axis, mote),
-            self._range(origin, axis),
-        )
-        y = (a * a + c * c - b * b) / (2.0 * c)
-        square = a * a - y * y
-        if square <= 0.0:
+        (a, b), c = self._ranges(mote, [origin, axis])[0], self.positions_m[axis, 1]
+        x, y = _by_cosines(a, b, c)
+        if not x > 0.0:
             raise DegenerateStep(
                 f"{self._names[mote]}: ranges of {a:.3f} and {b:.3f} m to {self._names[origin]} and "
                 f"{self._names[axis]}, {c:.3f} m apart, meet on their line or not at all; move the anchors off it"
             )
-        x = float(np.sqrt(square))
-        dy = np.array([a / c, -b / c, (c * c + b * b - a * a) / (2.0 * c * c)])
-        dx = (np.array([a, 0.0, 0.0]) - y * dy) / x
-        jacobian = np.array([dx, dy])
-        dop = float(np.sqrt((jacobian[:, :2] ** 2).sum()))
-        self._check_dop(mote, (origin, axis), dop)
-        own = jacobian[:, :2] * (sigma_a, sigma_b)
-        # d_AB is B's own y: its error is B's and stays correlated with it.
-        inherited = np.zeros((2, len(self.covariance_m2)))
-        inherited[:, self.coordinates(axis).start + 1] = jacobian[:, 2]
-        self._insert(mote, np.array([x, y]), own @ own.T, inherited)
-        self.steps.append(TrilaterationStep(mote, (origin, axis), dop, "cosines"))
-
-    def add_seed(self, motes: Sequence[int], places_m: FloatArray, covariance_m2: FloatArray) -> None:
-        """Motes that begin a map together, with their covariance, shapes (k, d) and (k d, k d)."""
-        at = np.concatenate([np.arange(len(self.covariance_m2))[self.coordinates(mote)] for mote in motes])
-        self.positions_m[list(motes)] = self._seen_m[list(motes)] = places_m
-        self.covariance_m2[np.ix_(at, at)] = covariance_m2
-        self.steps += [TrilaterationStep(mote, (), 0.0, "seed") for mote in motes]
+        self._add(mote, (origin, axis), np.array([x, y]), "cosines")
 
     def add_by_ranges(self, mote: int, references: Sequence[int]) -> None:
-        """A mote by trilateration from motes that have places, with the solver of the laser system.
+        """A mote by trilateration from motes that have places.
 
         Raises MappingError: a range to a reference is missing. Raises DegenerateStep: the references lie on a line with
-        the mote, or nearly.
+        the mote, or nearly, or its mirror image across them fits as well.
         """
-        ranges = [self._range(reference, mote) for reference in references]
-        solution = self._solve(mote, references, ranges)
-        lines = solution.position_m - self._seen_m[list(references)]
+        ranges, sigmas = self._ranges(mote, references)
+        anchors = self.positions_m[list(references)]
+        found, costs = trilaterate(_starts(anchors, ranges), anchors, ranges, sigmas)
+        apart_m = float(np.linalg.norm(found[1] - found[0]))
+        if apart_m > _APART * float(sigmas.max()) and abs(costs[1] - costs[0]) < _ALIKE:
+            raise DegenerateStep(
+                f"{self._names[mote]} from {self._listed(references)}: the mirror image across them, "
+                f"{apart_m:.3g} m away, fits as well; spread the motes it is measured from"
+            )
+        self._add(mote, references, found[np.argmin(costs)], "trilateration")
+
+    def _add(self, mote: int, references: Sequence[int], place: FloatArray, how: str) -> None:
+        lines = place - self._seen_m[list(references)]
         H = lines / np.linalg.norm(lines, axis=1)[:, None]
         singular = np.linalg.svd(H, compute_uv=False)
         dop = float(np.sqrt((singular**-2.0).sum())) if singular[-1] > 0.0 else float("inf")
-        self._check_dop(mote, references, dop)
-        weighted = H / np.array([sigma_m**2 for _, sigma_m in ranges])[:, None]
-        G = np.linalg.solve(H.T @ weighted, weighted.T)
-        along = np.zeros((len(references), len(self.covariance_m2)))
-        for row, reference in enumerate(references):
-            along[row, self.coordinates(reference)] = H[row]
-        own = np.linalg.solve(H.T @ weighted, np.eye(self._dimension))
-        self._insert(mote, solution.position_m, own, G @ along)
-        self.steps.append(TrilaterationStep(mote, tuple(references), dop, "trilateration"))
-
-    def _solve(self, mote: int, references: Sequence[int], ranges: Sequence[tuple[float, float]]) -> RangeSolution:
-        anchors = self.positions_m[list(references)]
-        values, sigmas = np.array(ranges).T
-        found, refusal = [], ""
-        for start in _starts(anchors, values):
-            try:
-                # A hundredth of a sigma is rest enough: errors of the references are larger.
-                found.append(multilaterate(anchors, values, sigmas, start, tolerance_m=1e-2 * float(sigmas.min())))
-            except MultilaterationError as error:
-                refusal = str(error)
-        if not found:
-            raise DegenerateStep(f"{self._names[mote]} from {self._listed(references)}: {refusal}")
-        best, *others = sorted(found, key=lambda solution: solution.chi_squared)
-        for other in others:
-            apart_m = float(np.linalg.norm(other.position_m - best.position_m))
-            if apart_m > _APART * float(sigmas.max()) and other.chi_squared - best.chi_squared < _ALIKE:
-                raise DegenerateStep(
-                    f"{self._names[mote]} from {self._listed(references)}: the mirror image across them, "
-                    f"{apart_m:.3g} m away, fits as well; spread the motes it is measured from"
-                )
-        return best
-
-    def _insert(self, mote: int, place: FloatArray, own: FloatArray, inherited: FloatArray) -> None:
-        """A place with its own covariance (d, d) and its derivatives by all coordinates before it (d, n d)."""
-        at = self.coordinates(mote)
-        cross = inherited @ self.covariance_m2
-        self.covariance_m2[at, :] = cross
-        self.covariance_m2[:, at] = cross.T
-        self.covariance_m2[at, at] = own + cross @ inherited.T
-        self.positions_m[mote] = self._seen_m[mote] = place
-
-    def _range(self, first: int, second: int) -> tuple[float, float]:
-        found = self._means.between(first, second)
-        if found is None:
-            raise MappingError(
-                f"no range between {self._names[first]} and {self._names[second]}: phase 1 cannot place "
-                f"{self._names[second]}; move it into reach"
-            )
-        return found
-
-    def _check_dop(self, mote: int, references: Sequence[int], dop: float) -> None:
         if not dop <= self._max_dop:
             raise DegenerateStep(
                 f"{self._names[mote]} from {self._listed(references)}: dilution of precision {dop:.4g} exceeds "
                 f"{self._max_dop:.4g}; spread the motes it is measured from"
             )
+        weighted = H / self._ranges(mote, references)[1][:, None] ** 2
+        own = np.linalg.inv(H.T @ weighted)
+        d, at = self._dimension, coordinates_of([mote], self._dimension)
+        along = np.zeros((len(references), len(self.covariance_m2)))
+        for row, reference in enumerate(references):
+            along[row, reference * d : (reference + 1) * d] = H[row]
+        inherited = own @ weighted.T @ along
+        cross = inherited @ self.covariance_m2
+        self.covariance_m2[at, :] = cross
+        self.covariance_m2[:, at] = cross.T
+        self.covariance_m2[np.ix_(at, at)] = own + cross @ inherited.T
+        self.positions_m[mote] = self._seen_m[mote] = place
+        self.steps.append(TrilaterationStep(mote, tuple(references), dop, how))
+
+    def _ranges(self, mote: int, references: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        ranges, sigmas = self.means.table_m[mote, list(references)], self.means.sigma_table_m[mote, list(references)]
+        if (missing := np.flatnonzero(np.isnan(ranges))).size:
+            raise MappingError(
+                f"no range between {self._names[references[missing[0]]]} and {self._names[mote]}: phase 1 cannot place "
+                f"{self._names[mote]}; move it into reach"
+            )
+        return ranges, sigmas
 
     def _listed(self, motes: Sequence[int]) -> str:
         return list_names([self._names[mote] for mote in motes])
 
+    def draw_errors(self, places_m: FloatArray, draws: int) -> tuple[FloatArray, FloatArray]:
+        """Mean (n, d) and covariance (n d, n d) of the errors, by the parametric bootstrap (Efron 1979).
 
-def _starts(anchors: FloatArray, ranges: FloatArray) -> list[FloatArray]:
+        At places close to those that were found, ranges with errors as they are expected are drawn, and the same steps
+        made of them. Derivatives give the size of the errors as well, but not how they hang together: from a small
+        stand errors grow to decimetres, and along so wide an arc no line is a tangent everywhere. What a line takes to
+        be known within a millimetre is known within centimetres. ``places_m``: where the motes might be, nan for those
+        without a place, shape (n, d). Without draws the errors are those of the derivatives.
+        """
+        if draws == 0:
+            return np.zeros_like(places_m), self.covariance_m2
+        count, d = places_m.shape
+        rng = np.random.default_rng(0)  # the same draws for every map: the same ranges give the same one
+        first, second = self.means.pairs.T
+        true_m = np.linalg.norm(places_m[first] - places_m[second], axis=1)
+        errors_of = rng.normal(0.0, 1.0, (len(true_m), draws))
+        lengths = np.full((count, count, draws), np.nan)
+        lengths[first, second] = true_m[:, None] + self.means.sigmas_m[:, None] * errors_of
+        lengths[second, first] = lengths[first, second]
+        drawn = np.broadcast_to(places_m, (draws, count, d)).copy()
+        first_of_all = [step.mote for step in self.steps if not step.references]
+        if self.steps[0].how == "axes":
+            drawn[:, first_of_all[1], 1] = lengths[first_of_all[0], first_of_all[1]]
+        else:
+            at = coordinates_of(first_of_all, d)
+            covariance = self.covariance_m2[np.ix_(at, at)]
+            errors = rng.multivariate_normal(np.zeros(at.size), covariance, draws, method="eigh")
+            drawn[:, first_of_all] += errors.reshape(draws, -1, d)
+        for step in self.steps:
+            references, own = list(step.references), lengths[list(step.references), step.mote].T
+            if step.how == "cosines":
+                x, y = _by_cosines(own[:, 0], own[:, 1], drawn[:, references[1], 1])
+                drawn[:, step.mote] = np.column_stack([x, y])
+            elif step.how == "trilateration":
+                starts = np.broadcast_to(places_m[step.mote], (draws, d))
+                sigmas = self.means.sigma_table_m[step.mote, references]
+                drawn[:, step.mote] = trilaterate(starts, drawn[:, references], own, sigmas, steps=_DRAWN_STEPS)[0]
+        errors = np.nan_to_num(drawn - places_m)
+        bias = errors.mean(axis=0)
+        flat = (errors - bias).reshape(draws, -1)
+        return bias, flat.T @ flat / (draws - 1)
+
+
+def _by_cosines(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
+    # y = (d_A^2 + d_AB^2 - d_B^2) / (2 d_AB), x = sqrt(d_A^2 - y^2); x is nought where the circles do not meet.
+    y = (a * a + c * c - b * b) / (2.0 * c)
+    return np.sqrt(np.maximum(a * a - y * y, 0.0)), y
+
+
+def _starts(anchors: FloatArray, ranges: FloatArray) -> FloatArray:
+    """Both crossings of the spheres about anchors, on either side of the plane through them, shape (2, d)."""
     centre = anchors.mean(axis=0)
     offsets = anchors - centre
-    arms = (offsets**2).sum(axis=1)
-    squares = ranges**2 - arms
+    squares = ranges**2 - (offsets**2).sum(axis=1)
     linear = np.linalg.lstsq(-2.0 * offsets, squares - squares.mean(), rcond=1e-6)[0]
     normal = np.linalg.svd(offsets)[2][-1]
     flat = linear - float(linear @ normal) * normal
     height = float(np.sqrt(max(float(np.mean(squares)) - float(flat @ flat), 1e-12)))
-    return [centre + flat + height * normal, centre + flat - height * normal]
-
-
-_STEPS = 15  # of each trilateration; references that are decimetres off make it go slowly
-_REST_M = 1e-5
-_DAMPING = 1e-6  # of the trace of the normal matrix: references of a draw may come to lie in line
-
-
-def draw_errors(
-    places_m: FloatArray,
-    steps: Sequence[TrilaterationStep],
-    means: PairMeans,
-    seed_covariance_m2: FloatArray,
-    rng: np.random.Generator,
-    draws: int,
-) -> tuple[FloatArray, FloatArray]:
-    """Mean (n, d) and covariance (n d, n d) of the errors of a trilateration, by the parametric bootstrap (Efron 1979).
-
-    At places close to those that were found, ranges with errors as they are expected are drawn, and the same steps made
-    of them. Derivatives give the size of the errors as well, but not how they hang together: from a small stand errors
-    grow to decimetres, and along so wide an arc no line is a tangent everywhere. What a line takes to be known within a
-    millimetre is known within centimetres. ``places_m``: where the motes might be, nan for those without a place, shape
-    (n, d); A at the origin, B on the second axis, where the steps begin with these two. ``seed_covariance_m2``: of the
-    motes that began the map together, shape (n d, n d); those of axes need none.
-    """
-    count, d = places_m.shape
-    drawn = np.broadcast_to(places_m, (draws, count, d)).copy()
-    errors_of = rng.normal(0.0, 1.0, (len(means.pairs), draws))
-
-    def ranges_of(first: int, second: int) -> FloatArray:
-        row = means.row(first, second)
-        true = float(np.linalg.norm(places_m[first] - places_m[second]))
-        return np.asarray(true + float(means.sigmas_m[row]) * errors_of[row])
-
-    seeds = [step.mote for step in steps if step.how == "seed"]
-    if seeds:
-        at = coordinates_of(seeds, d)
-        errors = rng.multivariate_normal(np.zeros(at.size), seed_covariance_m2[np.ix_(at, at)], draws, method="eigh")
-        drawn[:, seeds] += errors.reshape(draws, len(seeds), d)
-    for step in steps:
-        if step.how == "axes":
-            drawn[:, step.mote] = 0.0
-            if step.references:
-                drawn[:, step.mote, 1] = ranges_of(step.references[0], step.mote)
-        elif step.how == "cosines":
-            origin, axis = step.references
-            a, b, c = (ranges_of(*pair) for pair in ((origin, step.mote), (axis, step.mote), (origin, axis)))
-            y = (a * a + c * c - b * b) / (2.0 * c)
-            drawn[:, step.mote] = np.column_stack([np.sqrt(np.maximum(a * a - y * y, 0.0)), y])
-        elif step.how == "trilateration":
-            lengths = np.column_stack([ranges_of(reference, step.mote) for reference in step.references])
-            sigmas = np.array([means.sigmas_m[means.row(reference, step.mote)] for reference in step.references])
-            drawn[:, step.mote] = _trilaterated(drawn[:, list(step.references)], lengths, sigmas, places_m[step.mote])
-    errors = np.nan_to_num(drawn - places_m)
-    bias = errors.mean(axis=0)
-    flat = (errors - bias).reshape(draws, -1)
-    return bias, flat.T @ flat / (draws - 1)
-
-
-def _trilaterated(anchors: FloatArray, lengths: FloatArray, sigmas: FloatArray, start: FloatArray) -> FloatArray:
-    """Least squares on the lengths, damped Gauss-Newton of all draws at once.
-
-    Args:
-        anchors: places of the references, shape (draws, k, d).
-        lengths: to them, shape (draws, k).
-        sigmas: shape (k,).
-        start: shape (d,).
-
-    Returns:
-        Shape (draws, d).
-    """
-    d = anchors.shape[2]
-    points = np.broadcast_to(start, (len(anchors), d)).copy()
-    damping = np.full(len(anchors), _DAMPING)
-    cost, gradient, normal = _look(points, anchors, lengths, sigmas)
-    for _ in range(_STEPS):
-        ridge = (damping * np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(d)
-        step = np.linalg.solve(normal + ridge, gradient[:, :, None])[:, :, 0]
-        seen = _look(points + step, anchors, lengths, sigmas)
-        better = seen[0] <= cost
-        points[better] += step[better]
-        cost, gradient[better], normal[better] = np.where(better, seen[0], cost), seen[1][better], seen[2][better]
-        damping = np.where(better, np.maximum(0.2 * damping, _DAMPING), 10.0 * damping)
-        if float(np.abs(step).max()) < _REST_M:
-            break
-    return points
-
-
-def _look(
-    points: FloatArray, anchors: FloatArray, lengths: FloatArray, sigmas: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    ways = points[:, None] - anchors
-    distances = np.maximum(np.sqrt((ways**2).sum(axis=2)), 1e-9)
-    J = ways / (distances * sigmas)[:, :, None]
-    residuals = (lengths - distances) / sigmas
-    return ((residuals**2).sum(axis=1), np.einsum("nk,nkd->nd", residuals, J), np.einsum("nki,nkj->nij", J, J))
-
-
-_FLAT = 4.0  # of range errors that may make a flat beginning look high
-_CLIQUES = 4000  # first motes looked at; the best of them begins the map
+    return np.array([centre + flat + height * normal, centre + flat - height * normal])
 
 
 class FirstMap(NamedTuple):
@@ -319,34 +272,23 @@ def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: in
     trilateration from all motes of the stand before it. Bias and covariance of the errors are drawn; without draws the
     covariance is by derivatives. Raises MappingError: a step that cannot be made; the message names its motes.
     """
-    means = PairMeans(network)
-    sketch = Sketch(plan.names, means, plan.dimension, max_dop)
+    sketch = Sketch(network, max_dop)
     origin, axis = plan.anchors
     sketch.set_axes(origin, axis)
-    for mote in plan.networks[0]:
+    for mote in plan.bodies[0].motes:
         sketch.add_by_cosines(mote, origin, axis)
-    for (stand, before), (_, after) in pairwise(zip(plan.bodies, plan.networks, strict=True)):
-        shape = best_motion(stand.local_m, sketch.positions_m[list(before)]).moved(stand.local_m)
-        sketch.linearise_at(before, shape)
-        for mote in after:
-            sketch.add_by_ranges(mote, before)
-    up = plan.axes_m[1] / np.linalg.norm(plan.axes_m[1])
-    field_from_map = np.column_stack([(up[1], -up[0]), up])
+    for before, after in pairwise(plan.bodies):
+        sketch.linearise_at(before.motes, before.placed(sketch.positions_m))
+        for mote in after.motes:
+            sketch.add_by_ranges(mote, before.motes)
     shaped = sketch.positions_m.copy()  # with the stands as they are known to be
     for stand in plan.bodies:
-        motes = list(stand.motes)
-        shaped[motes] = best_motion(stand.local_m, sketch.positions_m[motes]).moved(stand.local_m)
-    bias, covariance = _errors(sketch, shaped, means, draws)
-    motion = RigidMotion(field_from_map, plan.axes_m[0])
+        shaped[list(stand.motes)] = stand.placed(sketch.positions_m)
+    bias, covariance = sketch.draw_errors(shaped, draws)
+    up = plan.axes_m[1] / np.linalg.norm(plan.axes_m[1])
+    motion = RigidMotion(np.column_stack([(up[1], -up[0]), up]), plan.axes_m[0])
     positions, covariance = motion.moved(sketch.positions_m), motion.turned_map(covariance)
-    return FirstMap(positions, covariance, bias @ field_from_map.T, tuple(sketch.steps), ())
-
-
-def _errors(sketch: Sketch, places_m: FloatArray, means: PairMeans, draws: int) -> tuple[FloatArray, FloatArray]:
-    if draws == 0:
-        return np.zeros_like(places_m), sketch.covariance_m2
-    # The same draws for every map: the same ranges give the same one.
-    return draw_errors(places_m, sketch.steps, means, sketch.covariance_m2, np.random.default_rng(0), draws)
+    return FirstMap(positions, covariance, bias @ motion.rotation.T, tuple(sketch.steps), ())
 
 
 def map_as_possible(network: RangeNetwork, max_dop: float, draws: int = 0) -> FirstMap:
@@ -355,73 +297,65 @@ def map_as_possible(network: RangeNetwork, max_dop: float, draws: int = 0) -> Fi
     Motes that cannot be placed well enough, from d + 1 others at least, are left out. Raises DegenerateStep: there is
     no triangle (tetrahedron) to begin with.
     """
-    means = PairMeans(network)
-    sketch = Sketch(network.names, means, network.dimension, max_dop)
-    _seed(network, means, sketch)
+    sketch = Sketch(network, max_dop)
+    _begin(network, sketch)
+    has_range = np.isfinite(sketch.means.table_m)
     refused: set[int] = set()
     while True:
-        reach = {
-            mote: [partner for partner in means.partners(mote) if sketch.is_placed(partner)]
-            for mote in range(network.count)
-            if mote not in refused and not sketch.is_placed(mote)
-        }
-        ready = [mote for mote, references in reach.items() if len(references) > network.dimension]
-        if not ready:
+        is_placed = sketch.is_placed
+        reach = np.where(is_placed, 0, (has_range & is_placed).sum(axis=1))
+        reach[list(refused)] = 0
+        mote = int(np.argmax(reach))
+        if reach[mote] <= network.dimension:
             break
-        mote = max(ready, key=lambda candidate: len(reach[candidate]))
         try:
-            sketch.add_by_ranges(mote, reach[mote])
+            sketch.add_by_ranges(mote, np.flatnonzero(has_range[mote] & is_placed).tolist())
             refused.clear()  # what was refused for want of references may have one more now
         except DegenerateStep:
             refused.add(mote)
-    unplaced = tuple(mote for mote in range(network.count) if not sketch.is_placed(mote))
-    bias, covariance = _errors(sketch, sketch.positions_m, means, draws)
+    bias, covariance = sketch.draw_errors(sketch.positions_m, draws)
+    unplaced = tuple(np.flatnonzero(~sketch.is_placed).tolist())
     return FirstMap(sketch.positions_m, covariance, bias, tuple(sketch.steps), unplaced)
 
 
-def _seed(network: RangeNetwork, means: PairMeans, sketch: Sketch) -> None:
-    d = network.dimension
-    best, best_height_m, seen = None, 0.0, 0
+_FLAT = 4.0  # of range errors that may make a flat beginning look high
+_CLIQUES = 4000  # first motes looked at; the best of them begins the map
+
+
+def _begin(network: RangeNetwork, sketch: Sketch) -> None:
+    """Place the simplex of greatest height, its least extent along a principal axis."""
+    d, means = network.dimension, sketch.means
+    best, best_height_m, seen = tuple[int, ...](), 0.0, 0
     for i, j in means.pairs.tolist():
-        common = sorted(set(means.partners(i)) & set(means.partners(j)))
+        common = np.intersect1d(means.partners(i), means.partners(j)).tolist()
         for rest in combinations([mote for mote in common if mote > j], d - 1):
-            if not means.are_all_linked(rest):
+            lengths = _lengths(means.table_m, (i, j, *rest))
+            if np.isnan(lengths).any():
                 continue
             seen += 1
-            height_m = _height(means, (i, j, *rest))
+            height_m = float(np.linalg.svd(classical_scaling(lengths, d), compute_uv=False)[-1])
             if height_m > best_height_m:
                 best, best_height_m = (i, j, *rest), height_m
         if seen > _CLIQUES:
             break
-    if best is None:
+    if not best:
         shape = "triangle" if d == 2 else "tetrahedron"
         raise DegenerateStep(f"no {shape} of motes with ranges between all of them: trilateration has no beginning")
-    names = [network.names[mote] for mote in best]
-    longest_m = float(_distances(means, best).max())
+    lengths, sigmas = _lengths(means.table_m, best), _lengths(means.sigma_table_m, best)
     # A simplex that is flat looks as high as this by the errors of its ranges alone.
-    sides = [means.row(a, b) for a, b in combinations(best, 2)]
-    if best_height_m**2 < _FLAT * longest_m * max(means.sigmas_m[sides].tolist()):
+    if best_height_m**2 < _FLAT * float(lengths.max()) * float(sigmas.max()):
         raise DegenerateStep(
-            f"{', '.join(names)}: the best motes to begin with lie {'in a line' if d == 2 else 'in a plane'}, or "
-            "nearly: trilateration has no beginning"
+            f"{', '.join(network.names[mote] for mote in best)}: the best motes to begin with lie "
+            f"{'in a line' if d == 2 else 'in a plane'}, or nearly: trilateration has no beginning"
         )
-    at = zip(combinations(range(d + 1), 2), sides, strict=True)
-    rows = [MoteRange(names[a], names[b], *means.values(row)) for (a, b), row in at]
-    model = MapModel(build_network(rows, d, names))
-    start = classical_scaling(_distances(means, best), d)
-    fit = fit_map(model, model.state(start), MapFitSettings())
-    covariance, _ = position_covariance(model, fit)
-    sketch.add_seed(best, fit.state.positions_m, covariance)
+    places = classical_scaling(lengths, d)
+    a, b = np.triu_indices(d + 1, 1)
+    J = rigidity_matrix(places, a, b).toarray() / sigmas[a, b][:, None]
+    # Six (three) ranges determine as many distances: the pseudoinverse leaves out the frame alone.
+    sketch.add_together(best, places, np.asarray(np.linalg.pinv(J.T @ J, rcond=1e-9), dtype=np.float64), "seed")
 
 
-def _height(means: PairMeans, motes: tuple[int, ...]) -> float:
-    # Least width of a simplex, m: its smallest extent along a principal axis.
-    points = classical_scaling(_distances(means, motes), len(motes) - 1)
-    return float(np.linalg.svd(points, compute_uv=False)[-1])
-
-
-def _distances(means: PairMeans, motes: tuple[int, ...]) -> FloatArray:
-    matrix = np.zeros((len(motes), len(motes)))
-    for a, b in combinations(range(len(motes)), 2):
-        matrix[a, b] = matrix[b, a] = means.ranges_m[means.row(motes[a], motes[b])]
-    return matrix
+def _lengths(table: FloatArray, motes: Sequence[int]) -> FloatArray:
+    lengths = table[np.ix_(motes, motes)]
+    np.fill_diagonal(lengths, 0.0)
+    return lengths

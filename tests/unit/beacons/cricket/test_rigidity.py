@@ -30,7 +30,6 @@ def test_a_zigzag_turns_at_its_four_hinges() -> None:
         "M4, M5 against M0, M1",
         "M5 against M0, M1",
     )
-    assert [set(part) for part in found.parts] == [{0, 1}, {1, 2}, {2, 3}, {3, 4}, {4, 5}]
 
 
 @pytest.mark.parametrize("pairs", [ADJACENT, ALL])
@@ -39,20 +38,18 @@ def test_nine_pairs_hold_the_field(pairs: Pairs) -> None:
     free = freedom(pairs)
     assert (free.deficiency, free.rank) == (0, 9)
     assert free.frame == ("translation along x", "translation along y", "rotation")
-    assert free.parts == ((0, 1, 2, 3, 4, 5),)
 
 
 def test_one_mote_that_hangs_on_one_range() -> None:
     found = freedom([pair for pair in ALL if 5 not in pair] + [(0, 5)])
     assert found.deficiency == 1
     assert found.flexes == ("M5 against M0, M1, M2, M3, M4",)
-    assert found.parts == ((0, 1, 2, 3, 4), (0, 5))
 
 
 def test_a_scale_is_taken_for_the_size_of_the_map() -> None:
     found = freedom(ALL, with_scale=True)
     assert found.deficiency == 1
-    assert found.calibration == ("range scale: the map takes it up",)
+    assert "range scale: the map takes it up" in found.lines
     assert found.flexes == ()
     assert freedom(ALL, with_offset=True).deficiency == 0
     known = NOWHERE.copy()
