@@ -1,6 +1,6 @@
 """Where a robot among beacons is: radios mapped on the way, or ultrasonic motes that map themselves first."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import hypot
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from ccatp.beacons.slam.signal_slam import ReflectorScan, SignalSlam
 from ccatp.config.beacon_models import CricketConfig, RadioConfig
 from ccatp.core import FloatArray, WheelSample
 from ccatp.filters.ekf_slam import EkfSlam, columns_of
-from ccatp.links.beacon_messages import BeaconFrame, MoteBurst
+from ccatp.links.beacon_messages import BeaconFrame, Ellipse, MoteBurst, worst_sigma_m
 from ccatp.links.robot_messages import Sensors
 
 
@@ -175,9 +175,6 @@ class MeasurementReader:
         return odometry_of(self._cfg, sample.t_s, interval_s, speed_m_s, self._steer_rad, rate_rad_s)
 
 
-Ellipse = tuple[float, float, float, float, float]
-
-
 class PoseBelief(NamedTuple):
     """What is believed now."""
 
@@ -187,15 +184,12 @@ class PoseBelief(NamedTuple):
     @property
     def ellipse(self) -> Ellipse:
         """x, y and their covariance xx, xy, yy."""
-        P = self.covariance
-        return self.pose[0], self.pose[1], float(P[0, 0]), float(P[0, 1]), float(P[1, 1])
+        return ellipse_of(self.pose, self.covariance)
 
     @property
     def sigma_m(self) -> float:
         """Standard deviation of the position in its worst direction."""
-        xx, xy, yy = self.ellipse[2:]
-        middle, spread = 0.5 * (xx + yy), (0.25 * (xx - yy) ** 2 + xy * xy) ** 0.5
-        return float(max(middle + spread, 0.0) ** 0.5)
+        return worst_sigma_m(*self.ellipse[2:])
 
 
 class Score(NamedTuple):
@@ -206,7 +200,7 @@ class Score(NamedTuple):
     refused: int
 
 
-def ellipse_of(mean: FloatArray, covariance: FloatArray) -> Ellipse:
+def ellipse_of(mean: FloatArray | Sequence[float], covariance: FloatArray) -> Ellipse:
     """x, y and their covariance of a place, shapes (2+,) and (2+, 2+)."""
     return (float(mean[0]), float(mean[1]), float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1]))
 

@@ -12,7 +12,7 @@ from ccatp.beacons.mission import (
     track_row,
     wheel_rates,
 )
-from ccatp.beacons.navigation import BeaconMeasurements, Ellipse, MeasurementReader
+from ccatp.beacons.navigation import BeaconMeasurements, MeasurementReader
 from ccatp.beacons.steering import HALT
 from ccatp.beacons.store import BeaconStore
 from ccatp.conditions import FRAMES_MISSED
@@ -22,7 +22,7 @@ from ccatp.daemon.mission_runner import EXIT_STATUS, STILL, DriveCommand, Missio
 from ccatp.daemon.process import ProcessArgs
 from ccatp.daemon.telemetry import Telemetry
 from ccatp.errors import ExitStatus
-from ccatp.links.beacon_messages import NOTHING, decode_beacon_frame
+from ccatp.links.beacon_messages import NOTHING, Ellipse, decode_beacon_frame
 from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Hello
 from ccatp.links.topics import (

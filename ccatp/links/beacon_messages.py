@@ -93,6 +93,15 @@ def with_extras(line: bytes, extras: BeaconFrame) -> bytes:
     return line if more == b"{}" else line.rstrip()[:-1] + b"," + more[1:] + b"\n"
 
 
+Ellipse = tuple[float, float, float, float, float]  # x, y and their covariance xx, xy, yy
+
+
+def worst_sigma_m(xx: float, xy: float, yy: float) -> float:
+    """Standard deviation of a position in its worst direction."""
+    middle, spread = 0.5 * (xx + yy), (0.25 * (xx - yy) ** 2 + xy * xy) ** 0.5
+    return float(max(middle + spread, 0.0) ** 0.5)
+
+
 TRACK_COLUMNS, TRUTH_COLUMNS = 13, 8
 _COVARIANCE = [5, 6, 8, 6, 7, 9, 8, 9, 10]  # stored as xx, xy, yy, xh, yh, hh
 

@@ -66,13 +66,6 @@ def beacon_facts(cfg: RadioConfig, *, is_sim: bool) -> BeaconFacts:
     )
 
 
-class Reached(NamedTuple):
-    """A waypoint reached in a frame, by the estimate: x, y and covariance xx, xy, yy."""
-
-    seq: int
-    estimate: tuple[float, float, float, float, float]
-
-
 @dataclass(slots=True)
 class BeaconSummary:
     """Collects a run.
@@ -80,6 +73,7 @@ class BeaconSummary:
     Attributes:
         track, truth: rows of the topics ``beacon_track`` and ``beacon_truth``.
         places: true places of radios and motes.
+        reached: frame of each waypoint that was reached, and x, y, xx, xy, yy by the estimate.
         beacons: ellipses of the newest map, by name.
         score: of the newest map: sum of NIS, its degrees of freedom, readings refused.
         events: how often the danger loop began to deny motion, by the signal.
@@ -95,7 +89,7 @@ class BeaconSummary:
     beacons: Mapping[str, Sequence[float]] = field(default_factory=dict)
     score: tuple[float, int, int] = (0.0, 0, 0)
     notes: Mapping[str, float] = field(default_factory=dict)
-    reached: list[Reached] = field(default_factory=list)
+    reached: list[tuple[int, Sequence[float]]] = field(default_factory=list)
     events: Counter[str] = field(default_factory=Counter)
     mission_time_s: float = 0.0
     outcome: str = ""
@@ -115,7 +109,7 @@ class BeaconSummary:
             self.beacons, self.notes = message.beacons, message.notes
             self.score = message.nis_sum, message.nis_size, message.refused
         elif isinstance(message, BeaconArrival):
-            self.reached.append(Reached(message.seq, message.estimate))
+            self.reached.append((message.seq, message.estimate))
         elif isinstance(message, Timing):
             self.ticks_us += message.tick_us
         elif isinstance(message, DangerEvent):
@@ -171,23 +165,20 @@ class BeaconSummary:
         within: int | None = None
         if truth is not None:
             places = dict(zip(truth.seq.astype(int).tolist(), truth.place_m, strict=True))
-            within = sum(_sigmas(one, places[one.seq]) <= WITHIN_SIGMAS for one in self.reached if one.seq in places)
+            reached = [(estimate, places[seq]) for seq, estimate in self.reached if seq in places]
+            within = sum(sigmas_off(estimate, place_m) <= WITHIN_SIGMAS for estimate, place_m in reached)
         return {"total": self.facts.waypoints, "reached": len(self.reached), "within_3_sigma": within}
 
     def _beacon_figures(self, *, known: bool) -> dict[str, Any]:
         found = {name: place for name, place in self.beacons.items() if name != self.facts.target}
-        errors, nees = [], []
-        for name, (x, y, xx, xy, yy) in sorted(found.items()) if known else ():
-            if name in self.places:
-                off = np.subtract((x, y), self.places[name])
-                errors.append(float(np.hypot(*off)))
-                nees.append(float(off @ np.linalg.pinv(np.array(((xx, xy), (xy, yy)))) @ off))
+        judged = beacon_errors(found, self.places) if known else {}
+        errors, squares = [error_m for error_m, _ in judged.values()], [nees for _, nees in judged.values()]
         return {
             "count": len(self.places) if known else None,
             "mapped": len(found),
             "rmse_m": rounded(np.sqrt(np.mean(np.square(errors)))) if errors else None,
             "max_m": rounded(max(errors)) if errors else None,
-            "nees_mean": rounded(np.mean(nees)) if nees else None,
+            "nees_mean": rounded(np.mean(squares)) if squares else None,
             "places_m": {name: [rounded(place[0]), rounded(place[1])] for name, place in sorted(found.items())},
         }
 
@@ -218,7 +209,20 @@ def _obstacle_figures(truth: PoseTruth, *, known: bool) -> dict[str, Any] | None
     return {"least_clearance_m": rounded(least_m), "touched": None if least_m is None else bool(least_m <= 0.0)}
 
 
-def _sigmas(reached: Reached, true_m: FloatArray) -> float:
-    x, y, xx, xy, yy = reached.estimate
+def sigmas_off(estimate: Sequence[float], true_m: FloatArray) -> float:
+    """How many standard deviations an estimate, x, y, xx, xy, yy, is off the true place, root(e^T P^-1 e)."""
+    x, y, xx, xy, yy = estimate
     off = true_m - (x, y)
     return float(np.sqrt(off @ np.linalg.solve(np.array(((xx, xy), (xy, yy))), off)))
+
+
+def beacon_errors(
+    beacons: Mapping[str, Sequence[float]], places: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[float, float]]:
+    """Distance from the true place and NEES (2 is expected) of the beacons whose place is known, by name."""
+    found = {}
+    for name, (x, y, xx, xy, yy) in sorted(beacons.items()):
+        if name in places:
+            off = np.subtract((x, y), places[name])
+            found[name] = float(np.hypot(*off)), float(off @ np.linalg.pinv(np.array(((xx, xy), (xy, yy)))) @ off)
+    return found

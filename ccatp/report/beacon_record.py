@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import sqrt
+from math import dist, sqrt
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,8 +21,10 @@ from ccatp.links.beacon_messages import (
     pose_track,
     pose_truth,
     truth_in,
+    worst_sigma_m,
 )
 from ccatp.links.topics import BeaconArrival, BeaconEllipse, BeaconMapMessage, MissionStatus
+from ccatp.records.beacon_summary import beacon_errors, sigmas_off
 from ccatp.records.run_reader import CONFIG
 from ccatp.report.record import RunFiles, RunFolder, changed_keys, joined, simulation_in
 
@@ -155,17 +157,15 @@ def waypoint_rows(record: BeaconRecord) -> list[WaypointRow]:
     rows = []
     for number, arrival in enumerate(record.arrivals, start=1):
         x, y, *ellipse = arrival.estimate
-        P, sigma_m = _covariance(*ellipse)
         true_off_m = error_m = sigmas = None
         if record.truth is not None and arrival.seq in index:
             true = record.truth.place_m[index[arrival.seq]]
             if np.isfinite(true).all():
-                off = np.array((x, y)) - true
-                true_off_m, error_m = float(np.hypot(*(true - arrival.place))), float(np.hypot(*off))
-                sigmas = float(np.sqrt(off @ np.linalg.solve(P, off)))
-        off_m = float(np.hypot(x - arrival.place[0], y - arrival.place[1]))
+                true_off_m, error_m = dist(true, arrival.place), dist(true, (x, y))
+                sigmas = sigmas_off(arrival.estimate, true)
+        off_m = dist((x, y), arrival.place)
         where = (number, arrival.lap + 1, arrival.waypoint + 1, arrival.t_s, arrival.place)
-        rows.append(WaypointRow(*where, sigma_m, off_m, true_off_m, error_m, sigmas))
+        rows.append(WaypointRow(*where, worst_sigma_m(*ellipse), off_m, true_off_m, error_m, sigmas))
     return rows
 
 
@@ -181,18 +181,8 @@ class BeaconRow(NamedTuple):
 
 def beacon_rows(record: BeaconRecord) -> list[BeaconRow]:
     """The beacons that stand, by name."""
-    rows = []
-    for name, (x, y, *ellipse) in sorted(record.beacons.items()):
-        P, sigma_m = _covariance(*ellipse)
-        error_m = ratio = None
-        if name in record.places:
-            off = np.subtract((x, y), record.places[name])
-            error_m, ratio = float(np.hypot(*off)), float(off @ np.linalg.pinv(P) @ off)
-        rows.append(BeaconRow(name, (x, y), sigma_m, error_m, ratio))
-    return rows
-
-
-def _covariance(xx: float, xy: float, yy: float) -> tuple[FloatArray, float]:
-    """As a matrix, and the standard deviation in its worst direction."""
-    P = np.array(((xx, xy), (xy, yy)))
-    return P, float(np.sqrt(max(np.linalg.eigvalsh(P)[-1], 0.0)))
+    judged = beacon_errors(record.beacons, record.places)
+    return [
+        BeaconRow(name, (x, y), worst_sigma_m(*ellipse), *judged.get(name, (None, None)))
+        for name, (x, y, *ellipse) in sorted(record.beacons.items())
+    ]

@@ -30,7 +30,7 @@ from ccatp.links.beacon_messages import (
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage, is_estimate_due
-from ccatp.records.beacon_summary import BeaconSummary, Reached, beacon_facts
+from ccatp.records.beacon_summary import BeaconSummary, beacon_facts
 from ccatp.report.plots import QUIET
 from ccatp.safety.beacons import BeaconSafetyRules
 from ccatp.sim.beacon_robot import build_beacon_robot
@@ -95,7 +95,7 @@ class BeaconSilWorld:
         drive = HALT if self.mission.state.mode is DONE else drive
         self._note(sensors, verdict, drive)
         for arrival in self.mission.arrivals[before:]:
-            self._summary.reached.append(Reached(sensors.seq, arrival.belief.ellipse))
+            self._summary.reached.append((sensors.seq, arrival.belief.ellipse))
         if not self.is_over:
             right, left, steer = wheel_rates(drive, self._cfg)
             self.robot.permit(sensors.seq + 1, verdict.forward, verdict.reverse, verdict.turn)

@@ -1,11 +1,12 @@
 """The page of a mission among beacons: waypoints, the map of the beacons, errors against the simulated truth."""
 
 from collections.abc import Mapping
-from math import dist, hypot, sqrt
+from math import dist
 from typing import Any
 
 from ccatp.beacons.mission import MODES
 from ccatp.config.beacon_models import RadioConfig
+from ccatp.links.beacon_messages import worst_sigma_m
 from ccatp.links.topics import BeaconArrival, BeaconMapMessage, BeaconPlaces, BeaconTrack
 from ccatp.report.beacon_record import expected_rms_m, standing_beacons, true_rms_m
 from ccatp.report.dashboard.view import MEASURED, PLANNED, RunStateView, TruthCompare
@@ -153,9 +154,3 @@ class BeaconView(RunStateView):
             {"id": f"true {name}", "kind": "true", "x_m": x_m, "y_m": y_m} for name, (x_m, y_m) in self._places.items()
         ]
         return [*true, *shapes]
-
-
-def worst_sigma_m(xx: float, xy: float, yy: float) -> float:
-    """Standard deviation of a position in its worst direction."""
-    middle, spread = 0.5 * (xx + yy), hypot(0.5 * (xx - yy), xy)
-    return sqrt(max(middle + spread, 0.0))
