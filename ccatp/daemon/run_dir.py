@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
 from typing import Any
@@ -13,12 +13,15 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.daemon.danger_loop import FILE as EMERGENCIES
-from ccatp.errors import ConfigError, ExitStatus
+from ccatp.errors import CcatpError, ConfigError, ExitStatus
 from ccatp.links.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked, remove_sockets
+from ccatp.records.recorder import TELEMETRY, read_metadata
 
 FILE = Path("runs") / "unfinished"
 # What was latched when a run finished, for the next one: whoever has to clear it finds no daemon in between.
 LATCHED_FILE = Path("runs") / EMERGENCIES
+# In the run directory: what cannot change when it is resumed, and does not stand in its configuration.
+ORIGIN_FILE = "origin.json"
 # Complete, or at base after an abort: there is nothing to go on with.
 FINISHED = (ExitStatus.COMPLETE, ExitStatus.ABORTED)
 
@@ -172,6 +175,35 @@ def own_runtime_dir(stack: ExitStack, runtime_dir: Path, *, is_sim: bool) -> Non
     stack.callback(remove_sockets, runtime_dir, (*SOCKETS, *(TRUTH_SOCKETS if is_sim else ())))
 
 
+def with_origin(options: RunOptions) -> RunOptions:
+    """The options of a run that is resumed, simulated or not as it began.
+
+    ConfigError: it began at a real robot, and a simulated one is wanted.
+    """
+    if not options.resume or options.run_dir is None or (began := _began_simulated(options.run_dir)) is None:
+        return options
+    if options.sim and not began:
+        raise ConfigError(f"--sim: the run in {options.run_dir} is of a real robot; leave --sim out to resume it")
+    return replace(options, sim=began)
+
+
+def _began_simulated(run_dir: Path) -> bool | None:
+    """Whether a run began in simulation; ``None`` where that is not known."""
+    try:
+        return bool(json.loads((run_dir / ORIGIN_FILE).read_text(encoding="utf-8"))["simulation"])
+    except (OSError, ValueError, KeyError, TypeError):  # of an older version: the recording says so as well
+        try:
+            simulation = read_metadata(run_dir / TELEMETRY).get("simulation")
+        except (OSError, CcatpError):
+            return None
+        return None if simulation is None else simulation == "true"
+
+
+def keep_origin(run_dir: Path, *, is_sim: bool) -> None:
+    """Note what a run begins with, for ``with_origin``."""
+    _write(run_dir / ORIGIN_FILE, json.dumps({"simulation": is_sim}).encode())
+
+
 def make_run_dir(options: RunOptions, cfg: Config | RadioConfig) -> Path:
     """The directory of a run that is new, or of a survey that is resumed with the points that it was planned with.
 
@@ -194,11 +226,15 @@ def make_run_dir(options: RunOptions, cfg: Config | RadioConfig) -> Path:
             ("run.mirror", before.mirror.name, cfg.mirror.name),
             ("run.order", before.run.order, cfg.run.order),
             ("run.panels", before.run.panels, cfg.run.panels),
+            ("run.seed", before.run.seed, cfg.run.seed),
+            ("run.world", before.world.name, cfg.world.name),
         ):
             if was != wanted:
                 raise ConfigError(
-                    f"--resume: {key} was {was} in {run_dir} and is {wanted} now; resume with what it was"
+                    f"--resume: {key} was {was} in {run_dir} and is {wanted} now; leave it out to keep what it was"
                 )
+        if before.world != cfg.world:
+            raise ConfigError(f"--resume: section world is not that of {run_dir}; leave it out to keep what it was")
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:

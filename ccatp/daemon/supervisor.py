@@ -47,11 +47,13 @@ from ccatp.daemon.run_dir import (
     default_run_dir,
     find_resumable,
     finished_summary,
+    keep_origin,
     make_run_dir,
     mark_resumable,
     own_runtime_dir,
     owned,
     take_over_emergencies,
+    with_origin,
 )
 from ccatp.daemon.service import Service, take_from
 from ccatp.daemon.terminal import RunView, write_run_report
@@ -250,6 +252,7 @@ def run_survey(options: RunOptions) -> int:
 
 
 def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
+    options = with_origin(options)
     # The processes read the files of these again; here they are refused before anything has begun.
     check_observatory(cfg.observatory)
     read_key(cfg.robot.key_file, must_be_private=not options.sim)
@@ -276,6 +279,7 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
             count = done["points"]["total"]
             print(f"nothing left to do: all {count} points of {run_dir} are measured", file=sys.stderr)
             return ExitStatus.COMPLETE
+        keep_origin(run_dir, is_sim=options.sim)
         (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         if options.faults_file is not None:

@@ -3,6 +3,7 @@
 import os
 import socket
 from contextlib import ExitStack
+from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,11 +20,13 @@ from ccatp.daemon.run_dir import (
     default_run_dir,
     find_resumable,
     finished_summary,
+    keep_origin,
     make_run_dir,
     mark_resumable,
     own_runtime_dir,
     owned,
     take_over_emergencies,
+    with_origin,
 )
 from ccatp.daemon.supervisor import BEACON_PROCESSES, PROCESSES, run
 from ccatp.errors import ConfigError, ExitStatus, RefusedError
@@ -34,6 +37,7 @@ from ccatp.links.runtime_dir import (
     make_runtime_dir,
     runtime_dir_path,
 )
+from ccatp.records.recorder import TELEMETRY, Recorder
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 ONE_PANEL = {"run.panels": 1}
@@ -112,6 +116,9 @@ def test_what_missions_among_beacons_do_not_have(tmp_path: Path, fields: dict[st
         (True, {"run.panels": 2}, "run.panels was 1 in .* and is 2 now"),
         (True, {**ONE_PANEL, "run.order": "optimised"}, "run.order was thesis in .* and is optimised now"),
         (True, {**ONE_PANEL, "run.mirror": "thesis-m2"}, "run.mirror was fyst-m1 in .* and is thesis-m2 now"),
+        (True, {**ONE_PANEL, "run.seed": 2}, "run.seed was 1 in .* and is 2 now; leave it out"),
+        (True, {**ONE_PANEL, "run.world": "hard"}, "run.world was thesis in .* and is hard now"),
+        (True, {**ONE_PANEL, "world.start_position_sigma_m": 0.5}, "section world is not that of"),
     ],
 )
 def test_a_survey_is_resumed_with_its_own_points(
@@ -125,6 +132,20 @@ def test_a_survey_is_resumed_with_its_own_points(
         make_run_dir(options(run_dir=tmp_path, resume=resume), load_config(overrides=changes))
     assert (tmp_path / "config.toml").read_text() == before
     assert make_run_dir(options(run_dir=tmp_path, resume=True), same) == tmp_path
+
+
+def test_a_run_is_resumed_simulated_or_not_as_it_began(tmp_path: Path) -> None:
+    resumed = RunOptions(sim=False, run_dir=tmp_path, resume=True)
+    assert with_origin(resumed) is resumed  # of an older version, and without a recording
+    Recorder(tmp_path / TELEMETRY, [], is_simulation=True).close()
+    assert with_origin(resumed).sim  # of an older version
+    keep_origin(tmp_path, is_sim=False)
+    assert not with_origin(resumed).sim
+    with pytest.raises(ConfigError, match=r"--sim: the run in .* is of a real robot; leave --sim out to resume it"):
+        with_origin(replace(resumed, sim=True))
+    keep_origin(tmp_path, is_sim=True)
+    assert with_origin(resumed).sim
+    assert not with_origin(replace(resumed, resume=False)).sim
 
 
 def test_directories_that_cannot_be_used(tmp_path: Path) -> None:
