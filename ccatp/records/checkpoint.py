@@ -31,13 +31,9 @@ class CheckpointError(CcatpError):
 
 
 class CheckpointFile:
-    """Writes records.
+    """Writes records; ``failure``: why the last one could not be written, or empty.
 
-    Args:
-        is_patient: simulated time waits for the writer, so that a place may be written at once and not by the thread.
-
-    Attributes:
-        failure: why the last record could not be written, or empty.
+    ``is_patient``: simulated time waits for the writer, so that a place may be written at once and not by the thread.
     """
 
     def __init__(self, path: Path, *, is_patient: bool) -> None:

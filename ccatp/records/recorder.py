@@ -1,8 +1,7 @@
 """Telemetry of a run as an MCAP file: JSON messages with a JSON schema for every channel; and its readers.
 
 Chunks are small and none is held back for long, so that a ``kill -9`` costs the last moment at most; the reader takes a
-file that ends anywhere. Recording never disturbs a mission: the first write that fails ends
-it, with one report.
+file that ends anywhere. Recording never disturbs a mission: the first write that fails ends it, with one report.
 """
 
 import json
@@ -134,10 +133,7 @@ class Recorder:
             self._file.flush()
 
     def write(self, topic: str, t_s: float, payload: bytes) -> None:
-        """Record one message with the robot time, s since its boot, as log time.
-
-        One of an unknown topic or with an invalid time is left out.
-        """
+        """Record one message at the robot time, s since its boot; one of no topic or at no time is left out."""
         channel = self._channels.get(topic)
         if channel is None or not self.is_recording or not 0.0 <= t_s < _MAX_T_S:
             return
@@ -197,10 +193,7 @@ def _part_number(path: Path) -> int:
 
 @dataclass(slots=True)
 class Condition:
-    """Condition of a file, known when the scan has come to its end.
-
-    ``lost``: beginning and end of each stretch of bytes that holds no intact record.
-    """
+    """Condition of a file, known at the end of a scan; ``lost``: the stretches of bytes without an intact record."""
 
     size_bytes: int = 0
     lost: list[tuple[int, int]] = field(default_factory=list)

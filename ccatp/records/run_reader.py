@@ -35,7 +35,7 @@ from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.recorder import TELEMETRY, iter_messages, read_metadata, recordings
 from ccatp.records.store import StoreError, read_survey
 
-Injected = dict[PanelId, Vector3]
+Injected = dict[PanelId, Vector3]  # piston (m), tip and tilt (rad)
 
 
 class Marked(NamedTuple):
@@ -291,10 +291,7 @@ def _readable(path: Path, read: Callable[[Path], _T]) -> _T:
 
 
 class Survey(NamedTuple):
-    """A run's survey.
-
-    ``injected``: piston (m), tip and tilt (rad) of the simulated panels; None on a real robot or where not recorded.
-    """
+    """A run's survey; ``injected``: how the simulated panels lie, None on a real robot or where not recorded."""
 
     cfg: Config
     planned: tuple[PointId, ...]

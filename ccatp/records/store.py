@@ -99,10 +99,7 @@ class StoredPoint(NamedTuple):
 
 
 class StoredSurvey(NamedTuple):
-    """Content of a mission database: points by row, column and number, fixes (world frame) in the order of measuring.
-
-    ``warnings``: the points whose fix does not match its checksum, a line each.
-    """
+    """Points by row, column and number; fixes in the order of measuring; a line for each that is damaged."""
 
     points: tuple[StoredPoint, ...]
     fixes: tuple[Measured, ...]
@@ -189,10 +186,7 @@ class MissionStore:
 
     @classmethod
     def open(cls, path: Path, *, mirror: str) -> Self:
-        """Open the store of an earlier run to go on with it.
-
-        ``StoreError``: no such file, not a mission store, another schema or mirror, or damaged.
-        """
+        """Open the store of an earlier run to go on with it; raises as ``read_survey``."""
         if not path.is_file():
             raise StoreError(f"{path}: no such file; nothing to resume")
         db: sqlite3.Connection | None = None

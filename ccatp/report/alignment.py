@@ -129,10 +129,7 @@ def _um(value: float) -> float:
 def table_lines(
     facts: Mapping[str, Any], result: SurveyResult, truth: Comparison | None, puck_height_sigma_m: float
 ) -> list[str]:
-    """What was analysed, one line a panel, the mirror, and the comparison with the simulated truth, if there is one.
-
-    ``facts`` as in the JSON result.
-    """
+    """What was analysed (``facts`` as in the JSON result), a line a panel, the mirror, the simulated truth."""
     values = {"facts": facts, "result": result, "truth": truth, "puck_height_sigma_m": puck_height_sigma_m}
     text = render("align.txt", **values, shown=_SHOWN)
     return [line.rstrip() for line in text.lstrip("\n").splitlines()]

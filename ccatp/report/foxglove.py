@@ -1,7 +1,6 @@
 """Message types of Foxglove, the mirror as a 3D scene, and JSON schemas that viewers can read.
 
-Field names and numbers are those of Foxglove's schemas; fields that are not used are left out, viewers take them as
-empty.
+Field names and numbers are those of Foxglove's schemas; viewers take fields that are left out as empty.
 
 Foxglove and Lichtblick read a channel's schema as a list of fields: the root and every object have ``properties``, each
 of a plain type, and arrays hold plain types or objects. They refuse a channel with references, alternatives or arrays
@@ -38,10 +37,7 @@ _NS = 1_000_000_000
 
 
 def _message(title: str, doc: str | None = None, /, **fields: Any) -> Any:
-    """A message type; a field is a type, an array of a type (written as a list of it), or one of these and its default.
-
-    ``doc`` is the description in its schema.
-    """
+    """A message type; a field is a type, a list of one type (an array of it), or a pair of one of these and a default."""
     rows = []
     for name, field in fields.items():
         kind, *default = field if isinstance(field, tuple) else (field,)
@@ -444,10 +440,7 @@ class PlotJugglerStream:
 
 
 class FoxgloveStream:
-    """A WebSocket server for Foxglove and Lichtblick; needs the extra ``foxglove``.
-
-    Port 0 takes any free one; ``StreamError`` if the port is in use or the extra is not installed.
-    """
+    """A WebSocket server for Foxglove and Lichtblick; ``StreamError`` also where the extra ``foxglove`` is missing."""
 
     def __init__(self, name: str, host: str, port: int, schemas: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
         try:

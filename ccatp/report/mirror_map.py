@@ -1,7 +1,4 @@
-"""Maps of a mirror for reports and picture files: a driven path with arrival errors, a plan, the surface of the panels.
-
-All are drawn on one ground (panels, rim, base), deck frame, x to the right.
-"""
+"""Maps of a mirror (deck frame, x to the right): a driven path with arrival errors, a plan, the surface of panels."""
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -170,8 +167,7 @@ def paths_figure(mirror: Mirror, records: Mapping[str, RunRecord], width_px: flo
 def draw_from_run_dir(run_dir: Path, out: Path) -> None:
     """Draw the map of a run into a file, with the distances that the laser system measured.
 
-    Raises PictureError: the run holds no points, or the map cannot be drawn. Raises RunReadError: the directory holds
-    no run. Raises ConfigError: its configuration cannot be read.
+    PictureError: the run holds no points, or the map cannot be drawn; else as ``read_record``.
     """
     record = read_record(run_dir)
     if record.points is None:

@@ -113,8 +113,7 @@ class RunRecord(RunFiles):
 def read_record(run_dir: Path) -> RunRecord:
     """Everything that a report shows of a run.
 
-    Raises RunReadError: no such directory, no run in it, or none of a survey. Raises ConfigError: its configuration
-    cannot be used.
+    RunReadError: no such directory, no run in it, or none of a survey; ConfigError: its configuration cannot be used.
     """
     if is_beacon_run(run_dir):
         raise RunReadError(f"{run_dir}: a mission among beacons; this is for surveys, ccatp report takes both")
@@ -152,10 +151,7 @@ def read_record(run_dir: Path) -> RunRecord:
 
 
 def is_beacon_run(run_dir: Path) -> bool:
-    """Whether a run is a mission among beacons.
-
-    Raises RunReadError: no such directory, or no run in it. Raises ConfigError: its configuration cannot be read.
-    """
+    """Whether a run is a mission among beacons; RunReadError, ConfigError: there is none, or it cannot be read."""
     check_run_dir(run_dir)
     return is_radio_file(run_dir / CONFIG)
 

@@ -158,10 +158,7 @@ class CommandEndpoint:
 
 
 class HostCheckMiddleware:
-    """Refuses requests under a foreign host name, and adds the security headers to every answer.
-
-    Starlette's ``TrustedHostMiddleware`` refuses addresses and answers without a reason.
-    """
+    """Refuses foreign host names with a reason, which Starlette's middleware does not; adds the security headers."""
 
     def __init__(self, app: ASGIApp, names: Collection[str]) -> None:
         self._app, self._names = app, names
@@ -190,10 +187,7 @@ def build_app(
     token: str | None,
     note: Note,
 ) -> ASGIApp:
-    """The application.
-
-    ``ground`` is what does not change during a run, see ``survey_view.ground``; ``token`` is required with commands.
-    """
+    """The application; ``ground``: see ``survey_view.ground``; ``token`` is required with commands."""
     static = StaticFiles(directory=STATIC)
     registry = CollectorRegistry()
     registry.register(StateCollector(hub.state, lambda: hub.pages, ground))

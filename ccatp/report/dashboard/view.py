@@ -161,10 +161,7 @@ class Trail(Growing):
 
 
 class Lines:
-    """The last messages to the operator, of each kind the newest.
-
-    Rows: robot time (s), level, text, number of messages of its kind, number of the kind.
-    """
+    """The newest message of each kind to the operator: robot time (s), level, text, count and number of its kind."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
