@@ -108,7 +108,7 @@ def read_clients(path: Path, what: str) -> Clients:
 
     ``ConfigError``: the file cannot be read, others may write it, it is malformed, or it lists no client.
     """
-    with _reading(path, what, stat.S_IWGRP | stat.S_IWOTH):
+    with reading(path, what, stat.S_IWGRP | stat.S_IWOTH):
         try:
             source = read_source(path)
             listed = validated(ClientList, source.tree, [source], _check_clients).clients
@@ -162,7 +162,7 @@ def read_public(path: Path, what: str) -> bytes:
 
 
 def _load(path: Path, what: str, forbidden: int, suffix: str) -> tuple[bytes, bytes | None]:
-    with _reading(path, what, forbidden):
+    with reading(path, what, forbidden):
         try:
             public, secret = load_certificate(path)
         except ValueError as error:
@@ -173,7 +173,7 @@ def _load(path: Path, what: str, forbidden: int, suffix: str) -> tuple[bytes, by
 
 
 @contextmanager
-def _reading(path: Path, what: str, forbidden: int) -> Iterator[None]:
+def reading(path: Path, what: str, forbidden: int, make: str = "make keys with ccatp keys generate") -> Iterator[None]:
     """Read a file that is not open to others, nor longer than it can be."""
     try:
         info = path.stat()
@@ -184,9 +184,7 @@ def _reading(path: Path, what: str, forbidden: int) -> Iterator[None]:
             raise ConfigError(f"{what}: {path} is longer than {MAX_FILE_BYTES} bytes; name the right file")
         yield
     except OSError as error:
-        raise ConfigError(
-            f"{what}: cannot read {path}: {error.strerror}; make keys with ccatp keys generate"
-        ) from error
+        raise ConfigError(f"{what}: cannot read {path}: {error.strerror}; {make}") from error
 
 
 def read_key(key_file: str, *, must_be_private: bool = False) -> bytes | None:
@@ -197,7 +195,7 @@ def read_key(key_file: str, *, must_be_private: bool = False) -> bytes | None:
     """
     if not key_file:
         return None
-    with _reading(Path(key_file), "robot.key_file", FOR_OTHERS if must_be_private else 0):
+    with reading(Path(key_file), "robot.key_file", FOR_OTHERS if must_be_private else 0):
         key = Path(key_file).read_bytes().strip()
     if not key:
         raise ConfigError(f"robot.key_file: {key_file} is empty")

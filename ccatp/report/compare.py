@@ -8,15 +8,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
+from ccatp.config.load import write_file
 from ccatp.core import FloatArray, PanelId
 from ccatp.mirror.panel_alignment import PanelResult, mirror_wavefront
 from ccatp.report.figures import distribution_figure, errors_figure, time_figure
 from ccatp.report.findings import KINDS, Findings, findings_of
-from ccatp.report.html import MICRO, Draw, events_of, inline, page_figures, render, write_page, write_pictures
+from ccatp.report.html import MICRO, Draw, events_of, inline, page_figures, render, write_pictures
 from ccatp.report.mirror_map import change_figure, paths_figure, surface_figure
 from ccatp.report.plots import NARROW
 from ccatp.report.record import changed_keys, read_record
-from ccatp.report.run_page import run_data, wavefront_data
+from ccatp.report.run_page import PAGE_MODE, run_data, wavefront_data
 
 COMPARISON = "compare.html"
 _MODES = 3
@@ -95,7 +96,7 @@ class RunPair:
 def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = None) -> RunPair:
     """Write two runs beside each other, and their figures if a directory is given; raises as ``report_run``."""
     pair = RunPair(findings_of(read_record(run_a)), findings_of(read_record(run_b)))
-    write_page(compare_page(pair), out)
+    write_file(out, compare_page(pair), PAGE_MODE)
     if figures is not None:
         write_pictures(compare_drawings(pair), figures)
     return pair

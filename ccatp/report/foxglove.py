@@ -11,7 +11,6 @@ Topics for viewers, named ``view/...``, have at most a tenth of the frame rate. 
 latched: a late subscriber gets the last message.
 """
 
-import ipaddress
 import json
 import queue
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,6 +22,7 @@ import msgspec
 import numpy as np
 import zmq
 
+from ccatp.config.checks import is_loopback
 from ccatp.core import DeckPose, PanelId, PanelPose, PointId, wrap_pi
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.links import topics
@@ -37,7 +37,7 @@ _NS = 1_000_000_000
 
 
 def _message(title: str, doc: str | None = None, /, **fields: Any) -> Any:
-    """A message type; a field is a type, a list of one type (an array of it), or a pair of one of these and a default."""
+    """A message type; a field is a type, a list of one type (an array of it), or a pair of these and its default."""
     rows = []
     for name, field in fields.items():
         kind, *default = field if isinstance(field, tuple) else (field,)
@@ -391,11 +391,7 @@ class StreamError(CcatpError):
 
 def check_host(host: str, *, is_open: bool) -> None:
     """StreamError: the host is not this machine, and ``is_open`` is not given; every client may watch."""
-    try:
-        is_local = ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        is_local = host == "localhost"
-    if not is_local and not is_open:
+    if not (is_open or is_loopback(host)):
         raise StreamError(
             f"--host {host}: any host there could watch; permit it with --open-to-network, or use ssh -L and 127.0.0.1"
         )

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from ccatp.errors import CcatpError, ExitStatus
 from ccatp.records.state_log import LogLine
 from ccatp.report.plots import NARROW, WIDE, PictureError, save_figure, svg_of
 
@@ -83,22 +82,6 @@ def clock_text(time_s: float) -> str:
 
 
 # -- files ------------------------------------------------------------------------------------------------------------
-
-
-class ReportError(CcatpError):
-    """A report that cannot be written."""
-
-    exit_status = ExitStatus.USAGE
-
-
-def write_page(markup: str, path: Path) -> None:
-    """Write a page, complete or not at all; ReportError: it cannot be written."""
-    new = path.with_name(path.name + ".new")
-    try:
-        new.write_text(markup, encoding="utf-8")
-        new.replace(path)
-    except OSError as error:
-        raise ReportError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def write_pictures(drawings: dict[str, Draw], folder: Path) -> None:

@@ -9,17 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri
 
+from ccatp.config.load import write_file
+from ccatp.filters.metrics import consistency
 from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront
 from ccatp.report import beacon_record, figures
 from ccatp.report.beacon_record import BeaconRecord
 from ccatp.report.findings import Findings, Grade, findings_of
-from ccatp.report.html import MICRO, Draw, events_of, page_figures, render, write_page, write_pictures
+from ccatp.report.html import MICRO, Draw, events_of, page_figures, render, write_pictures
 from ccatp.report.mirror_map import path_figure, surface_figure
 from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, is_beacon_run, read_record
 
 REPORT = "report.html"
+PAGE_MODE = 0o644
 _FEW = 12  # panels of a table; more are folded
 
 
@@ -29,7 +31,7 @@ def report_run(
     """Write the report of a run, by default into its directory, and its figures if a directory is given.
 
     Returns what ``ccatp report --json`` prints, and warnings. RunReadError: no run there; ConfigError: its
-    configuration cannot be used; ReportError, PictureError: page or figures cannot be written.
+    configuration cannot be used, or the page cannot be written; PictureError: a figure cannot be written.
     """
     path = out or run_dir / REPORT
     if is_beacon_run(run_dir):
@@ -40,7 +42,7 @@ def report_run(
         found = findings_of(read_record(run_dir))
         markup, data, pictures = run_page(found), run_data(found), run_drawings(found)
         warnings = found.record.warnings
-    write_page(markup, path)
+    write_file(path, markup, PAGE_MODE)
     if figures_dir is not None:
         write_pictures(pictures, figures_dir)
     return {"report": str(path), **data}, warnings
@@ -132,7 +134,6 @@ def wavefront_data(wavefront: MirrorWavefront | None) -> dict[str, float] | None
 # -- missions among beacons -------------------------------------------------------------------------------------------
 
 _SIGMAS = 3.0
-_BAND = 0.95
 TITLES = {
     "zigbee": "Waypoints among ZigBee beacons",
     "follow": "Following a radio",
@@ -189,7 +190,7 @@ def beacon_data(record: BeaconRecord) -> dict[str, Any]:
         },
         "position_error_m": errors and {"rms": errors["rms_m"], "max": round(errors["max_m"], 6)},
         "pose_nees_mean": None if pose_nees is None else round(pose_nees, 4),
-        "nis_mean": nis and round(nis["mean"], 4),
+        "nis_mean": nis and round(nis.mean, 4),
         "beacons": {
             row.name: {
                 "x_m": round(row.place_m[0], 4),
@@ -216,7 +217,6 @@ def _beacon_findings(record: BeaconRecord) -> dict[str, Any]:
         "waypoints": beacon_record.waypoint_rows(record),
         "errors": None,
         "pose_nees": None,
-        "nis": None,
     }
     if errors is not None and nees is not None:
         does_count = record.track.t_s >= record.settled_s
@@ -231,11 +231,8 @@ def _beacon_findings(record: BeaconRecord) -> dict[str, Any]:
                 "max_m": float(settled.max()),
                 "within_sigma3": float((ratios <= _SIGMAS).mean()),
             }
-    if size := sum(reading.size for reading in readings):
-        # NIS by its degrees of freedom, and the band noise alone keeps it in.
-        low, high = (float(chdtri(size, at)) / size for at in (0.5 + _BAND / 2, 0.5 - _BAND / 2))
-        mean = sum(reading.nis for reading in readings) / size
-        found["nis"] = {"mean": mean, "low": low, "high": high, "size": size}
+    found["nis"] = consistency(np.array([one.nis for one in readings]), np.array([one.size for one in readings]))
+    found["nis_size"] = sum(one.size for one in readings)
     return found
 
 

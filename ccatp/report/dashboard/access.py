@@ -8,13 +8,13 @@ import contextlib
 import hmac
 import ipaddress
 import re
-import stat
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 from ccatp.config.models import DashboardConfig
 from ccatp.errors import ConfigError
+from ccatp.links.auth import FOR_OTHERS, reading
 
 # 128 bits in hexadecimal digits: nothing limits the attempts.
 MIN_CHARACTERS = 32
@@ -71,17 +71,11 @@ def read_token(cfg: DashboardConfig) -> str | None:
     if not cfg.token_file:
         return None
     path = Path(cfg.token_file)
-    try:
-        mode = path.stat().st_mode
-        token = path.read_text(encoding="ascii").strip()
-    except OSError as error:
-        raise ConfigError(f"dashboard.token_file: cannot read {path}: {error.strerror}; {_MAKE}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"dashboard.token_file: {path} is no text of ASCII characters; {_MAKE}") from error
-    if mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise ConfigError(
-            f"dashboard.token_file: {path} is open to others (mode {stat.S_IMODE(mode):04o}); chmod go= {path}"
-        )
+    with reading(path, "dashboard.token_file", FOR_OTHERS, _MAKE):
+        data = path.read_bytes()
+    if not data.isascii():
+        raise ConfigError(f"dashboard.token_file: {path} is no text of ASCII characters; {_MAKE}")
+    token = data.decode().strip()
     if len(token) < MIN_CHARACTERS or not token.isprintable() or " " in token:
         raise ConfigError(
             f"dashboard.token_file: {path} must hold one word of at least {MIN_CHARACTERS} characters; {_MAKE}"

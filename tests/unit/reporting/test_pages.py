@@ -12,10 +12,11 @@ import pytest
 from markupsafe import escape
 
 from ccatp.cli import main
+from ccatp.errors import ConfigError
 from ccatp.records.state_log import LogLine
 from ccatp.report.compare import RunPair, compare_lines, compare_page, compared_figures
 from ccatp.report.findings import findings_of, outcome_of
-from ccatp.report.html import POLICY, ReportError, environment, events_of
+from ccatp.report.html import POLICY, environment, events_of
 from ccatp.report.record import read_record
 from ccatp.report.run_page import report_run, run_page
 from tests.support.command import answered, refused
@@ -234,7 +235,7 @@ def test_refusals_and_warnings(run_dir: Path, tmp_path: Path, capsys: pytest.Cap
         (("report", run_dir, "--figures", tmp_path / "file" / "figures"), "cannot be made: Not a directory"),
     ):
         assert why in refused(capsys, *command)
-    with pytest.raises(ReportError, match=r"no/a\.html: cannot be written: No such file or directory"):
+    with pytest.raises(ConfigError, match=r"no/a\.html: cannot be written: No such file or directory"):
         report_run(run_dir, tmp_path / "no" / "a.html")
     (run_dir / "summary.json").write_text("{")
     assert main(["report", str(run_dir), "--json"]) == 0
