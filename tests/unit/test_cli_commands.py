@@ -24,6 +24,8 @@ from ccatp.survey.planning.search import leg_lengths
 from tests.support.command import answered, refused
 from tests.unit.test_client import serving
 
+BASH = shutil.which("bash")
+
 
 @pytest.mark.parametrize(
     ("shell", "sign"),
@@ -39,43 +41,33 @@ def test_each_shell_gets_its_script(shell: str, sign: str, tmp_path: Path, capsy
         subprocess.run([program, "-n", str(tmp_path / "script")], check=True, timeout=20)
 
 
-@pytest.fixture(scope="module")
-def bash(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, dict[str, str]]:
-    """A bash, and an environment in which ``ccatp`` is this package."""
-    shell = shutil.which("bash")
-    if shell is None:
-        pytest.skip("no bash here")
-    folder = tmp_path_factory.mktemp("bin")
-    program = folder / "ccatp"
-    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ccatp "$@"\n')
-    program.chmod(0o755)
-    environment = child_environment(os.environ)
-    return shell, {**environment, "PATH": f"{folder}:{environment['PATH']}"}
-
-
 # Each TAB is one start of the program: as few as show that every kind of word is completed.
+@pytest.mark.skipif(BASH is None, reason="no bash here")
 @pytest.mark.parametrize(
     ("words", "offered"),
     [
-        (("ccatp", "re"), ("replay", "resume")),
-        (("ccatp", "run", "--mirror", "fyst"), ("fyst-m1", "fyst-m2")),
+        (("ccatp", "re"), {"replay", "resume"}),
+        (("ccatp", "run", "--mirror", "fyst"), {"fyst-m1", "fyst-m2"}),
     ],
     ids=" ".join,
 )
-def test_bash_completes(words: tuple[str, ...], offered: tuple[str, ...], bash: tuple[str, dict[str, str]]) -> None:
-    shell, environment = bash
-    quoted = " ".join(f"'{word}'" for word in words)
+def test_bash_completes(words: tuple[str, ...], offered: set[str], tmp_path: Path) -> None:
+    program = tmp_path / "ccatp"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ccatp "$@"\n')
+    program.chmod(0o755)
+    environment = child_environment(os.environ)
     script = f"""
 eval "$(ccatp completion bash)"
-COMP_WORDS=({quoted}); COMP_CWORD={len(words) - 1}
+COMP_WORDS=({" ".join(words)}); COMP_CWORD={len(words) - 1}
 _ccatp_completion ccatp
 printf '%s\\n' "${{COMPREPLY[@]}}"
 """
-    done = subprocess.run(
-        [shell, "-c", script], env=environment, capture_output=True, text=True, check=True, timeout=60
+    path = {"PATH": f"{tmp_path}:{environment['PATH']}"}
+    found = set(
+        subprocess.check_output([str(BASH), "-c", script], env=environment | path, text=True, timeout=60).split()
     )
-    assert set(offered) <= set(done.stdout.split())
-    assert all(word.startswith(words[-1]) for word in done.stdout.split())
+    assert offered <= found
+    assert all(word.startswith(words[-1]) for word in found)
 
 
 NAMES = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
@@ -129,9 +121,10 @@ def test_settings_act(capsys: pytest.CaptureFixture[str]) -> None:
     assert not other["fits_budget"]
 
 
-def test_points_out_of_reach_are_told(capsys: pytest.CaptureFixture[str]) -> None:
-    args = ("--panels", "1", "--set", "mission.leg_clearance_m=0.12")
+def test_points_out_of_reach_are_reported_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = ("--panels", "1", "--set", "mission.leg_clearance_m=0.12", "--figure", str(tmp_path / "plan.svg"))
     found = planned(capsys, *args, status=2)
+    assert (tmp_path / "plan.svg").read_bytes().startswith(b"<svg")
     # Points lie 115 mm from the rim at least; the first panel of M1 has it below and on its left.
     lost = [tuple(point) for point in found["out_of_reach"]]
     assert lost
@@ -157,13 +150,6 @@ def test_the_text_tells_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     assert out.splitlines()[1].endswith(" ...")
     assert main(["plan", "--mirror", "fyst-m2", "--panels", "1"]) == 0
     assert "fyst-m2: 9 points of 1 panel, order thesis\n" in capsys.readouterr().out
-
-
-def test_the_figure_is_drawn(tmp_path: Path) -> None:
-    picture = tmp_path / "plan.svg"
-    args = ["--panels", "1", "--set", "mission.leg_clearance_m=0.12", "--figure", str(picture)]
-    assert main(["plan", *args]) == 2
-    assert picture.read_bytes().startswith(b"<svg")
 
 
 @pytest.mark.parametrize(

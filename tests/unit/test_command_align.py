@@ -114,19 +114,17 @@ def test_a_survey_without_a_panel_is_told(tmp_path: Path, capsys: pytest.Capture
     assert "1 panel not measured" in capsys.readouterr().out
 
 
-def test_the_csv_has_a_line_a_panel(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = aligned(capsys, run_dir, "--csv", str(tmp_path / "moves.csv"))
+def test_the_csv_has_a_line_a_panel_and_the_figure_is_drawn(
+    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = tmp_path / "panels.pdf"
+    found = aligned(capsys, run_dir, "--csv", str(tmp_path / "moves.csv"), "--figure", str(picture))
+    assert picture.read_bytes().startswith(b"%PDF")
     with (tmp_path / "moves.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)
     assert (row["row"], row["col"], row["points"], row["outliers"], row["is_bent"]) == ("3", "7", "9", "6", "0")
     assert [float(row[f"V{k}_um"]) for k in range(1, 6)] == found["panels"][0]["adjusters_um"]
     assert float(row["sigma_piston_um"]) == found["panels"][0]["sigma"][0]
-
-
-def test_the_figure_is_drawn(run_dir: Path, tmp_path: Path) -> None:
-    picture = tmp_path / "panels.pdf"
-    assert main(["align", str(run_dir), "--figure", str(picture)]) == 0
-    assert picture.read_bytes().startswith(b"%PDF")
 
 
 def test_settings_act(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
