@@ -249,19 +249,22 @@ def _read_named(section: str, run: object, sources: list[ConfigSource], config_d
     if not isinstance(run, Mapping):
         raise ConfigError(f"{source.place(key)}: run = {format_value(run)} must be a section, not a value")
     name = run.get(section)
-    shown = f"{source.place(key)}: run.{section} = {format_value(name)}"
+
+    def refusal(why: str) -> ConfigError:
+        return ConfigError(f"{source.place(key)}: run.{section} = {format_value(name)}{why}")
+
     if not isinstance(name, str) or not name:
-        raise ConfigError(f"{shown} must be the name of a {section}")
+        raise refusal(f" must be the name of a {section}")
     if is_file_name(name):
         path = Path(source.name).parent / name
     elif name in (names := available(section, config_dir)):
         path = config_dir / _SECTIONS[section][0] / f"{name}.toml"
     else:
-        raise ConfigError(f"{shown} is no {section}; {choice_hint(name, names)}")
+        raise refusal(f" is no {section}; {choice_hint(name, names)}")
     try:
         return read_source(path, (section,))
     except ConfigError as error:
-        raise ConfigError(f"{shown}: {error}") from error
+        raise refusal(f": {error}") from error
 
 
 # -- robots among radio beacons ---------------------------------------------------------------------------------------
