@@ -1,17 +1,18 @@
 """The full-state localizer: pose, speeds and the sensors' own errors in one filter, on the curved surface."""
 
-from collections.abc import Sequence
 from math import atan2, cos, hypot, inf, sin, sqrt
 
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, GravitySample, PanelPose, wrap_pi
+from ccatp.core import DeckPose, Fix, FloatArray, PanelPose, wrap_pi
 from ccatp.estimation.fixes import FixGated
 from ccatp.estimation.localizer_base import (
     LONGEST_GAP_S,
     MAX_FRAME_STEP_S,
+    Edges,
     FilterWrap,
+    Gravity,
     ImuReadings,
     LocalizerBase,
     WheelReadings,
@@ -68,10 +69,8 @@ class FullStateLocalizer(LocalizerBase):
         self._refused: list[FloatArray] = []
         self._fixed_m: FloatArray | None = None  # where the last fix that counted was
         self._is_relocated = False  # no fix has agreed since it began again
-        self._is_new_base = False
-        self._half_s = 0.0
         self._creep_on: Panel | None = None
-        self._frame_s = _NOMINAL_FRAME_S
+        self._is_new_base, self._half_s, self._frame_s = False, 0.0, _NOMINAL_FRAME_S
         self._predict_pose(0.0)
         self._locate()
 
@@ -109,13 +108,7 @@ class FullStateLocalizer(LocalizerBase):
     # -- frames -------------------------------------------------------------------------------------------------------
 
     def _use(
-        self,
-        dt_s: float,
-        imu: ImuReadings,
-        right: WheelReadings,
-        left: WheelReadings,
-        edges: Sequence[EdgeSample],
-        gravity: GravitySample | None,
+        self, dt_s: float, imu: ImuReadings, right: WheelReadings, left: WheelReadings, edges: Edges, gravity: Gravity
     ) -> None:
         right_rad, left_rad = self._right.add(*right, dt_s), self._left.add(*left, dt_s)
         if self._is_new_base:
@@ -223,8 +216,7 @@ class FullStateLocalizer(LocalizerBase):
         self._running.trust(angle, self._gyro.variance, frame_s)
 
     def _use_rest(self, t_s: float) -> None:
-        rested_s, self._rested_s = self._rested_s, 0.0
-        reading = self._rest.take()
+        reading, rested_s, self._rested_s = self._rest.take(), self._rested_s, 0.0
         self._estimate.journal.begin(t_s, 0.0)
         if reading.samples:
             self._estimate.calibrate(reading, rested_s, (self._gyro.variance, self._accelerometer.variance))

@@ -18,6 +18,8 @@ from ccatp.filters.base import Filter, FilterDiverged
 from ccatp.mirror.mirror import Mirror
 
 ImuReadings = Sequence[ImuSample]
+Edges = Sequence[EdgeSample]
+Gravity = GravitySample | None
 WheelReadings = tuple[Sequence[float], Sequence[float]]
 """Times (s) and rates (rad/s) of one wheel."""
 HEADING = 2
@@ -36,9 +38,7 @@ class SampleSource:
     """The time stamps of one sensor: each is used once, in increasing order."""
 
     def __init__(self, name: str) -> None:
-        self.name = name
-        self.backward_run = 0
-        self.newest_s = -inf
+        self.name, self.newest_s, self.backward_run = name, -inf, 0
         self.used: deque[Sequence[float]] = deque()
 
 
@@ -116,11 +116,8 @@ class SampleValidator:
         """The usable IMU samples."""
         if len(samples) == 1:
             (sample_s, ax, wz), source, oldest_s = samples[0], self._imu, frame_s - self._history_s
-            if (
-                source.newest_s < sample_s >= oldest_s
-                and sample_s <= frame_s + _ROUNDING_S
-                and hypot(ax, wz) < _READABLE
-            ):
+            is_in_time = source.newest_s < sample_s >= oldest_s and sample_s <= frame_s + _ROUNDING_S
+            if is_in_time and hypot(ax, wz) < _READABLE:
                 use_samples((sample_s,), oldest_s, source)
                 return samples
         kept: list[ImuSample] = []
@@ -175,10 +172,8 @@ class LocalizerBase(ABC):
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, states: int, wrap: FilterWrap) -> None:
-        self.t_s = -inf
+        self.t_s, self.hold_cause, self.is_frozen = -inf, "", False
         self.counts: dict[str, int] = Counter()
-        self.hold_cause = ""
-        self.is_frozen = False
         self.notices: list[str] = []
         # Whoever derives re-initialises the filter at once; what counts is its size.
         self._filter = wrap(FILTERS[cfg.run.filter](np.zeros(states), np.eye(states)))
@@ -201,12 +196,7 @@ class LocalizerBase(ABC):
         self.hold_cause = ""
 
     def step(
-        self,
-        t_s: float,
-        imu: ImuReadings,
-        encoders: Sequence[WheelSample],
-        edges: Sequence[EdgeSample],
-        gravity: GravitySample | None = None,
+        self, t_s: float, imu: ImuReadings, encoders: Sequence[WheelSample], edges: Edges, gravity: Gravity = None
     ) -> None:
         """Take one sensors frame of robot time ``t_s``, to which the pose belongs afterwards.
 
@@ -287,13 +277,7 @@ class LocalizerBase(ABC):
 
     @abstractmethod
     def _use(
-        self,
-        dt_s: float,
-        imu: ImuReadings,
-        right: WheelReadings,
-        left: WheelReadings,
-        edges: Sequence[EdgeSample],
-        gravity: GravitySample | None,
+        self, dt_s: float, imu: ImuReadings, right: WheelReadings, left: WheelReadings, edges: Edges, gravity: Gravity
     ) -> None:
         """Bring the filter to ``t_s``, ``dt_s`` after the last frame (0 in a new time base). May diverge.
 

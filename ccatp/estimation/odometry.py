@@ -63,10 +63,12 @@ class Odometer:
         dx, dy = arc_step(v_m_s, here.heading_rad, turn_rad, dt_s)
         self.place = OdometryPose(here.x_m + dx, here.y_m + dy, here.heading_rad + turn_rad)
         path = self._path
-        if len(path) > 1 and _is_still(path[-2][1], self.place):
-            path[-1] = (t_s, self.place)
-        else:
-            path.append((t_s, self.place))
+        if len(path) > 1:
+            before, now = path[-2][1], self.place
+            way_m, turned_rad = hypot(now.x_m - before.x_m, now.y_m - before.y_m), now.heading_rad - before.heading_rad
+            if way_m < _STILL_M and abs(turned_rad) < _STILL_RAD:
+                path.pop()
+        path.append((t_s, self.place))
         oldest = t_s - self._history_s
         while len(path) > 2 and path[1][0] < oldest:
             path.popleft()
@@ -87,10 +89,6 @@ class Odometer:
                 return OdometryPose(*(p + part * (q - p) for p, q in zip(entry[1], later[1], strict=True)))
             later = entry
         return later[1] if later is not None else self.place
-
-
-def _is_still(a: OdometryPose, b: OdometryPose) -> bool:
-    return hypot(b.x_m - a.x_m, b.y_m - a.y_m) < _STILL_M and abs(b.heading_rad - a.heading_rad) < _STILL_RAD
 
 
 class PosePredictor:
@@ -260,18 +258,11 @@ class WheelAngle:
     """
 
     def __init__(self) -> None:
-        self.angle_rad = 0.0
-        self.is_fresh = False
-        self._gap_rad = 0.0
-        self._bridged_s = self._bridged_rad = 0.0
-        self._mean_rate = 0.0
-        self._period_s = inf
-        self._seen = 0
+        self.angle_rad = self._gap_rad = self._bridged_s = self._bridged_rad = self._mean_rate = self._rate = 0.0
+        self.is_fresh = self.is_counter = False
+        self.quantum_rad = self._period_s = inf
         self._t_s = -inf
-        self._rate = 0.0
-        self._zeros = 0
-        self.is_counter = False
-        self.quantum_rad = inf
+        self._seen = self._zeros = 0
         self.noise_rad2_s2: float | None = None
 
     def restart(self) -> None:

@@ -36,13 +36,12 @@ class EdgeScanner:
     """Finds the transitions in the stream of edge samples. Samples that are not newer than the last are skipped."""
 
     def __init__(self) -> None:
-        self._t_s = -inf
-        self._values: tuple[int, ...] = ()
+        self.restart()
 
     def restart(self) -> None:
         """Forget the last sample: the robot's clock has jumped."""
         self._t_s = -inf
-        self._values = ()
+        self._values: tuple[int, ...] = ()
 
     def scan(self, edges: Sequence[EdgeSample]) -> list[SensorTransition]:
         """Transitions of a frame, oldest first; normally none."""
@@ -123,8 +122,7 @@ class CrossingDetector:
         self._scanner = EdgeScanner()
         self._marks: dict[tuple[int, bool], _Mark] = {}
         self._disturbed_s = -inf
-        panel = next(iter(mirror.panels.values()))
-        self._reach_m = _REACH * 2.0 * min(panel.half_x_m, panel.half_y_m)
+        self._reach_m = _REACH * 2.0 * min(mirror.grid.half_x_m, mirror.grid.half_y_m)
 
     def restart(self) -> None:
         """Forget everything seen: the robot's clock has jumped."""
@@ -157,7 +155,10 @@ class CrossingDetector:
         self, pair: tuple[int, int], is_on: bool, now: OdometryPose, pose: PanelPose, v_m_s: float
     ) -> HeadingFix | None:
         left, right = self._marks.get((pair[0], is_on)), self._marks.get((pair[1], is_on))
-        if left is None or right is None or not self._belong_together(left, right):
+        if left is None or right is None or min(left.t_s, right.t_s) <= self._disturbed_s:
+            return None
+        apart_m = abs(left.seam.position_m - right.seam.position_m)
+        if left.seam.axis != right.seam.axis or apart_m >= self._reach_m:
             return None
         del self._marks[pair[0], is_on], self._marks[pair[1], is_on]
         x, y = 0.5 * (left.x_m + right.x_m), 0.5 * (left.y_m + right.y_m)
@@ -182,10 +183,6 @@ class CrossingDetector:
         on_seam = (seam.position_m, y) if seam.axis == "x" else (x, seam.position_m)
         return _Mark(transition.t_s, transition.interval_s, place, seam, *on_seam)
 
-    def _belong_together(self, left: _Mark, right: _Mark) -> bool:
-        same = left.seam.axis == right.seam.axis and abs(left.seam.position_m - right.seam.position_m) < self._reach_m
-        return same and min(left.t_s, right.t_s) > self._disturbed_s
-
     def _timing_variance(self, mark: _Mark) -> float:
         """Variance of a transition's time, s^2: as configured, but never better than its sampling interval."""
         return max(self._cfg.crossing_time_sigma_s**2, mark.interval_s**2 * _UNIFORM)
@@ -204,18 +201,16 @@ class HeadingGate:
 
     def extra_variance(self, seen: HeadingFix, prior_rad2: float) -> float | None:
         """Variance (rad^2) by which the estimate has to be widened before it takes ``seen``; None = refused."""
+        before, self._refused = self._refused, None
         if self._is_within(seen.innovation_rad, seen.variance_rad2 + prior_rad2):
-            self._refused = None
             return 0.0
-        before, self._refused = self._refused, seen
-        if before is None:
-            return None
-        apart = seen.innovation_rad - before.innovation_rad
-        # The estimate's own drift from one crossing to the next is part of what the two may differ by.
-        if not self._is_within(apart, seen.variance_rad2 + before.variance_rad2 + prior_rad2):
-            return None
-        self._refused = None
-        return seen.innovation_rad**2
+        if before is not None:
+            apart = seen.innovation_rad - before.innovation_rad
+            # The estimate's own drift from one crossing to the next is part of what the two may differ by.
+            if self._is_within(apart, seen.variance_rad2 + before.variance_rad2 + prior_rad2):
+                return seen.innovation_rad**2
+        self._refused = seen
+        return None
 
     def _is_within(self, deviation_rad: float, variance_rad2: float) -> bool:
         return abs(deviation_rad) <= self._gate_sigma * sqrt(variance_rad2)
@@ -247,9 +242,8 @@ class SeamLines:
     def __init__(self, mirror: Mirror, robot: RobotConfig) -> None:
         self._mirror = mirror
         self._sensors = robot.edge_sensors_m
-        panel = next(iter(mirror.panels.values()))
-        self._reach_m = _REACH * 2.0 * min(panel.half_x_m, panel.half_y_m)
-        self._half = {"x": panel.half_x_m, "y": panel.half_y_m}
+        self._half = mirror.grid.half_x_m, mirror.grid.half_y_m
+        self._reach_m = _REACH * 2.0 * min(self._half)
         self._edges: dict[int, tuple[str, float, PanelId]] = {}
 
     def forget(self) -> None:
@@ -264,9 +258,15 @@ class SeamLines:
             return None
         k = 0 if seam.axis == "x" else 1
         speed = (along_x, along_y)[k]
-        edge_m, panel = self._edge(seam.axis, seam.position_m, place, is_high=(speed > 0.0) is transition.is_on)
+        # The edge above or below the seam's centre line, and its panel.
+        is_high = (speed > 0.0) is transition.is_on
+        inside = list(place)
+        inside[k] = seam.position_m + (self._half[k] if is_high else -self._half[k])
+        panel = self._mirror.panels[self._mirror.nearest_panel(*inside)]
+        centre_m = (panel.x_m, panel.y_m)[k]
+        edge_m = centre_m - self._half[k] if is_high else centre_m + self._half[k]
         state = E1 if transition.is_on else E0
-        edge = (seam.axis, edge_m, panel)
+        edge = (seam.axis, edge_m, panel.id)
         is_new = self._edges.get(state) != edge
         self._edges[state] = edge
         return Edge(k, edge_m, state, is_new)
@@ -306,15 +306,6 @@ class SeamLines:
         place = x_m - v * late_s * hx + ox * hx + oy * lx, y_m - v * late_s * hy + ox * hy + oy * ly
         velocity = v * hx + w * turn_x, v * hy + w * turn_y
         return place, velocity, ((hx, lx, turn_x) if k == 0 else (hy, ly, turn_y))
-
-    def _edge(self, axis: str, position_m: float, place: tuple[float, float], is_high: bool) -> tuple[float, PanelId]:
-        """The edge above (``is_high``) or below a seam's centre line, and its panel."""
-        k = 0 if axis == "x" else 1
-        inside = [place[0], place[1]]
-        inside[k] = position_m + (self._half[axis] if is_high else -self._half[axis])
-        panel = self._mirror.panels[self._mirror.nearest_panel(*inside)]
-        centre = (panel.x_m, panel.y_m)[k]
-        return centre - self._half[axis] if is_high else centre + self._half[axis], panel.id
 
 
 def axes_on(slope: Slope, psi: float) -> tuple[float, float, float, float]:

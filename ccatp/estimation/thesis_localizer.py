@@ -9,10 +9,8 @@ import numpy as np
 from ccatp.config.models import Config, LocalizerConfig, RobotConfig
 from ccatp.core import (
     DeckPose,
-    EdgeSample,
     Fix,
     FloatArray,
-    GravitySample,
     PanelId,
     PanelPose,
     difference,
@@ -21,7 +19,9 @@ from ccatp.core import (
 )
 from ccatp.estimation.localizer_base import (
     MAX_FRAME_STEP_S,
+    Edges,
     FilterWrap,
+    Gravity,
     ImuReadings,
     LocalizerBase,
     WheelReadings,
@@ -109,10 +109,8 @@ class ConstantAcceleration:
     """
 
     def __init__(self, cfg: LocalizerConfig) -> None:
-        self._jerk = cfg.jerk_density_m2_s5
-        self._alpha = cfg.angular_acceleration_density_rad2_s3
-        self._F = np.eye(STATES)
-        self._Q = np.zeros((STATES, STATES))
+        self._jerk, self._alpha = cfg.jerk_density_m2_s5, cfg.angular_acceleration_density_rad2_s3
+        self._F, self._Q = np.eye(STATES), np.zeros((STATES, STATES))
 
     def over(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
         """F and Q (4, 4) over dt_s; work space that holds until the next call."""
@@ -232,13 +230,7 @@ class FourStateLocalizer(LocalizerBase):
         return 0.0, 0.0
 
     def _use(
-        self,
-        dt_s: float,
-        imu: ImuReadings,
-        right: WheelReadings,
-        left: WheelReadings,
-        edges: Sequence[EdgeSample],
-        gravity: GravitySample | None,  # the thesis does without
+        self, dt_s: float, imu: ImuReadings, right: WheelReadings, left: WheelReadings, edges: Edges, gravity: Gravity
     ) -> None:
         if self.is_frozen:
             return
