@@ -19,8 +19,8 @@ from scipy.optimize import brentq
 
 from ccatp.config.models import Config, ControlConfig, LimitsConfig, PidConfig
 from ccatp.core import FloatArray, wrap_pi
-from ccatp.errors import CcatpError, ExitStatus
 from ccatp.report.plots import INK, QUIET
+from ccatp.studies.campaign import CampaignError
 from ccatp.studies.results import plot, write_analysis
 
 if TYPE_CHECKING:
@@ -35,12 +35,6 @@ OMEGA_RAD_S = (1e-4, 300.0)  # the controller samples at 100 Hz: beyond 314 rad/
 GRID_POINTS = 4001
 # Of the delay, for poles and step responses only: right to 1e-5 rad up to 2 rad per delay.
 PADE_ORDER = 4
-
-
-class LoopsError(CcatpError):
-    """The analysis cannot be made: a package of an extra is missing."""
-
-    exit_status = ExitStatus.USAGE
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,12 +137,12 @@ def _control() -> Any:
     try:
         import control  # noqa: PLC0415 - takes seconds, and belongs to an extra
     except ImportError as error:
-        raise LoopsError("the loops study needs python-control: install ccatp[tune]") from error
+        raise CampaignError("the loops study needs python-control: install ccatp[tune]") from error
     return control
 
 
 def system(loop: Loop) -> "TransferFunction":
-    """L(s) with the delay as a Pade approximant (raises LoopsError: python-control is not installed)."""
+    """L(s) with the delay as a Pade approximant (raises CampaignError: python-control is not installed)."""
     control = _control()
     rational = control.TransferFunction(loop.numerator, loop.denominator)
     if loop.delay_s == 0.0:
@@ -292,7 +286,7 @@ COLUMNS = """
 def run(cfg: Config, out: Path) -> dict[str, Any]:
     """Analyse every loop of the configuration and write all files; a cell is one loop with its margins, None for none.
 
-    LoopsError: python-control is not installed.
+    CampaignError: python-control is not installed.
     """
     started_s = time.perf_counter()
     loops = list(loops_of(cfg))

@@ -260,7 +260,8 @@ GROUPS = {
     "delays": ("sensors_delay_s", "commands_delay_s"),
     "panel edges": ("panel_edge_sigma_m",),
 }
-_BASES = ("none", "all")
+ALL_ON = "nothing"
+_BASES = {"none": "world {}", "all": "world {}", ALL_ON: "with all"}  # nothing is changed, and how it is labelled
 WORLDS = ("thesis", "hard")
 
 
@@ -292,12 +293,15 @@ _SHOWN = "mean (dot), 99th percentile (end of the bar)"
 def draw_sensitivity(cells: Sequence[CellResult], out: Path) -> None:
     """One figure for each mirror, the undisturbed and the fully disturbed world as lines."""
     for (mirror,), there in grouped(cells, "mirror").items():
-        rows = []
-        for cell in there:
-            world, group = cell.factors["world"], str(cell.factors["group"])
-            is_base = group in _BASES
-            rows.append(Row(f"world {world}" if is_base else group, cell, WORLDS.index(world), is_base))
-        draw_ranges(rows, MISSION, f"What each disturbance costs on {mirror}: {_SHOWN}", out / f"sensitivity-{mirror}")
+        title = f"What each disturbance costs on {mirror}: {_SHOWN}"
+        draw_ranges([_row(cell, "group") for cell in there], MISSION, title, out / f"sensitivity-{mirror}")
+
+
+def _row(cell: CellResult, factor: str) -> Row:
+    """A colour for each world; the cells in which nothing is changed are lines through all others."""
+    world, level = str(cell.factors["world"]), str(cell.factors[factor])
+    label = {"group": level, "without": f"without {level}"}[factor]
+    return Row(_BASES.get(level, label).format(world), cell, WORLDS.index(world), level in _BASES)
 
 
 SENSITIVITY = Study(
@@ -321,7 +325,6 @@ SENSITIVITY = Study(
 
 # -- ablation ---------------------------------------------------------------------------------------------------------
 
-ALL_ON = "nothing"
 _USE = "localizer.full_state.use"
 # What is off, and the keys that switch it off.
 WITHOUT: Mapping[str, Mapping[str, object]] = {
@@ -351,13 +354,8 @@ WITHOUT: Mapping[str, Mapping[str, object]] = {
 def draw_ablation(cells: Sequence[CellResult], out: Path) -> None:
     """Figures ``ablation-<mirror>-<world>``, the mission with everything as a line."""
     for (mirror, world), there in grouped(cells, "mirror", "world").items():
-        rows = []
-        for cell in there:
-            name = str(cell.factors["without"])
-            label = "with all" if name == ALL_ON else f"without {name}"
-            rows.append(Row(label, cell, WORLDS.index(world), name == ALL_ON))
         title = f"Without a technique, world {world} on {mirror}: {_SHOWN}"
-        draw_ranges(rows, MISSION, title, out / f"ablation-{mirror}-{world}")
+        draw_ranges([_row(cell, "without") for cell in there], MISSION, title, out / f"ablation-{mirror}-{world}")
 
 
 ABLATION = Study(

@@ -13,7 +13,8 @@ from ccatp.config.load import load_config
 from ccatp.config.models import PidConfig
 from ccatp.control.tracker import LegView, line_rate
 from ccatp.studies import loops
-from ccatp.studies.loops import Loop, LoopsError, margins, open_loop
+from ccatp.studies.campaign import CampaignError
+from ccatp.studies.loops import Loop, margins, open_loop
 
 LAG_S, FRAME_S = 0.08, 0.01
 CFG = load_config()
@@ -112,5 +113,5 @@ def test_the_files(tmp_path: Path) -> None:
 
 def test_without_python_control(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "control", None)
-    with pytest.raises(LoopsError, match=r"install ccatp\[tune\]"):
+    with pytest.raises(CampaignError, match=r"install ccatp\[tune\]"):
         loops.system(loop(FORWARD, "true"))
