@@ -142,10 +142,10 @@ def mission(**fields: Any) -> MissionStatus:
     return MissionStatus(**(known | fields))
 
 
-def picture(seq: int) -> DisplayState:
+def picture(seq: int, line: bytes = b"null") -> DisplayState:
     return DisplayState(
         seq=seq, t_s=0.1 * seq, x_m=1.0, y_m=-2.0, heading_rad=0.5, covariance_m2=(1e-6, 0.0, 1e-6),
-        heading_sigma_rad=0.01, nis=2.0, size=2, line=msgspec.Raw(b"null"),
+        heading_sigma_rad=0.01, nis=2.0, size=2, line=msgspec.Raw(line),
     )  # fmt: skip
 
 

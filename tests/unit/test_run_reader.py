@@ -19,7 +19,6 @@ from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import (
     RECORD_FORMAT,
-    TOPICS,
     ArrivalMessage,
     Message,
     Rest,
@@ -27,7 +26,6 @@ from ccatp.links.topics import (
     TrackMessage,
     TruthMessage,
     pack,
-    schema_of,
 )
 from ccatp.mirror.mirror import build_mirror
 from ccatp.mirror.misalignment import PanelMisalignment
@@ -36,7 +34,7 @@ from ccatp.records.run_reader import RunReadError, open_run, read_run
 from ccatp.studies import replay as player
 from tests.support.command import refused
 from tests.unit.aligning.conftest import exact_fix, load
-from tests.unit.run_folder import make_run, record_truth
+from tests.unit.run_folder import make_run, record_truth, recorder_in
 
 
 def line_of(seq: int) -> bytes:
@@ -56,13 +54,11 @@ def track(*seqs: int) -> TrackMessage:
 
 def record(run_dir: Path, messages: list[tuple[str, Message]], **metadata: str) -> Path:
     run_dir.mkdir(exist_ok=True)
-    path = run_dir / "telemetry.mcap"
-    topics = [(topic.name, schema_of(topic.name)) for topic in TOPICS if topic.recorded]
-    recorder = Recorder(path, topics, is_simulation=True, metadata=metadata)
+    recorder = recorder_in(run_dir, metadata)
     for name, message in messages:
         recorder.write(name, message.t_s, pack(name, message).partition(b" ")[2])
     recorder.close()
-    return path
+    return recorder.path
 
 
 @pytest.fixture

@@ -24,10 +24,8 @@ from ccatp.links.topics import (
     BeaconTrack,
     BeaconTruth,
     DangerEvent,
-    DisplayState,
     FixMessage,
     LogMessage,
-    MissionStatus,
     RobotShape,
     Scene,
     TrackMessage,
@@ -39,6 +37,7 @@ from ccatp.report.dashboard.access import command_refusal, host_refusal, read_to
 from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground
 from ccatp.report.dashboard.survey_view import SurveyView
 from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView
+from tests.contract.page_rig import mission, picture
 from tests.support.scenario import config_of, mirror_of
 
 LINE = (
@@ -51,18 +50,6 @@ CFG, MIRROR = config_of(run__panels=2), mirror_of()
 @pytest.fixture
 def view() -> SurveyView:
     return SurveyView(MIRROR, CFG, is_sim=True)
-
-
-def mission(**fields: Any) -> MissionStatus:
-    known: dict[str, Any] = {"seq": 1, "t_s": 1.0, "state": "driving", "total": 18}
-    return MissionStatus(**(known | fields))
-
-
-def picture(t_s: float = 1.5, nis: float = 2.0, line: bytes = LINE) -> DisplayState:
-    return DisplayState(
-        seq=5, t_s=t_s, x_m=1.0, y_m=-2.0, heading_rad=0.5, covariance_m2=(1e-6, 0.0, 4e-6), heading_sigma_rad=0.01,
-        nis=nis, size=2, line=msgspec.Raw(line),
-    )  # fmt: skip
 
 
 def fix_at(point: PointId | None, ahead_m: float, t_s: float = 2.0) -> FixMessage:
@@ -87,7 +74,7 @@ def test_levels_are_there_each_time(view: SurveyView) -> None:
     assert state["mission"] is state["pose"] is state["verdict"] is state["robot"] is None
     assert state["points"] == state["path"] == state["log"] == []
     assert state["is_sim"] is True
-    told(view, mission(), picture())
+    told(view, mission(), picture(15, LINE))
     for now_s in (1.1, 1.9):
         state = told(view, now_s=now_s)
         assert (state["mission"]["state"], state["pose"]["x_m"]) == ("driving", 1.0)
@@ -97,7 +84,7 @@ def test_levels_are_there_each_time(view: SurveyView) -> None:
             "is_held": False, "faults": ["stall"],
         }  # fmt: skip
     assert told(view, now_s=2.1)["mission"]["is_stale"]
-    state = told(view, picture(line=b"null"))  # before the first frame
+    state = told(view, picture(15))  # before the first frame
     assert (state["robot"], state["pose"] is None) == (None, False)
     view.discard_picture()
     assert told(view)["pose"] is None

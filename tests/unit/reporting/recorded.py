@@ -12,19 +12,17 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PanelPose, PointId
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import (
-    TOPICS,
     ArrivalMessage,
     FixMessage,
     Misalignment,
     MissionStatus,
     TrackMessage,
     TruthMessage,
-    schema_of,
 )
-from ccatp.records.recorder import Recorder
 from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.state import Abort, MissionState
+from tests.unit.run_folder import recorder_in
 
 BATCH = 100
 
@@ -41,11 +39,8 @@ class RecordingRun(SilRun):
         run_dir.mkdir(parents=True, exist_ok=True)
         self.run_dir, self.is_simulation, self.only = run_dir, is_simulation, only
         (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
-        self.recorder = Recorder(
-            run_dir / "telemetry.mcap",
-            [(topic.name, schema_of(topic.name)) for topic in TOPICS if topic.recorded],
-            is_simulation=is_simulation,
-            metadata={"ccatp": "0.0.test", "config": dump_config(cfg)},
+        self.recorder = recorder_in(
+            run_dir, {"ccatp": "0.0.test", "config": dump_config(cfg)}, is_simulation=is_simulation
         )
         points = [StoredPoint(point, 0.0, 0.0) for point in self.parts.points]
         self.store = MissionStore.create(
