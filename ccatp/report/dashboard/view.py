@@ -198,46 +198,46 @@ EVERY = 10
 WAITING = 500
 
 
-class Second(NamedTuple):
-    """The largest error of one second: robot time (s), true error of the position and its three sigma (mm)."""
-
-    t_s: float
-    error_mm: float
-    three_sigma_mm: float
-
-
 class TruthCompare:
-    """Joins estimates with the simulated truth of the same frame; either may arrive first."""
+    """Joins estimates with the simulated truth of the same frame; either may arrive first.
 
-    def __init__(self) -> None:
+    The largest error of each second is a row of ``errors``: robot time (s), error and three sigma of the position (mm).
+    """
+
+    def __init__(self, errors: Growing) -> None:
+        self._errors = errors
         self._waiting: tuple[dict[int, tuple[float, ...]], dict[int, tuple[float, ...]]] = ({}, {})
-        self._worst: Second | None = None
+        self._worst: tuple[float, float, float] | None = None
 
     @staticmethod
     def is_compared(seq: int) -> bool:
         """Whether a frame is one of those that are compared."""
         return seq % EVERY == 0
 
-    def estimate(self, seq: int, x_m: float, y_m: float, sigma_m: float) -> Second | None:
-        """Add the estimate after frame ``seq``, deck frame; returns the second that it completes."""
-        return self._join(seq, 0, (x_m, y_m, sigma_m))
+    def estimate(self, seq: int, x_m: float, y_m: float, sigma_m: float) -> None:
+        """Add the estimate after frame ``seq``, deck frame."""
+        self._join(seq, 0, (x_m, y_m, sigma_m))
 
-    def truth(self, seq: int, t_s: float, x_m: float, y_m: float) -> Second | None:
-        """Add the true position in frame ``seq``; returns the second that it completes."""
-        return self._join(seq, 1, (t_s, x_m, y_m)) if self.is_compared(seq) else None
+    def truth(self, seq: int, t_s: float, x_m: float, y_m: float) -> None:
+        """Add the true position in frame ``seq``."""
+        if self.is_compared(seq):
+            self._join(seq, 1, (t_s, x_m, y_m))
 
-    def _join(self, seq: int, side: int, value: tuple[float, ...]) -> Second | None:
+    def _join(self, seq: int, side: int, value: tuple[float, ...]) -> None:
         own = self._waiting[side]
         own[seq] = value
         if len(own) > WAITING:
             del own[next(iter(own))]
         if not all(seq in waiting for waiting in self._waiting):
-            return None
+            return
         (x_m, y_m, sigma_m), (t_s, true_x_m, true_y_m) = (waiting.pop(seq) for waiting in self._waiting)
-        here, before = Second(t_s, 1e3 * hypot(x_m - true_x_m, y_m - true_y_m), 3e3 * sigma_m), self._worst
-        is_same = before is not None and int(t_s) == int(before.t_s)
-        self._worst = max(before, here, key=lambda second: second.error_mm) if before and is_same else here
-        return None if is_same else before
+        here, before = (t_s, 1e3 * hypot(x_m - true_x_m, y_m - true_y_m), 3e3 * sigma_m), self._worst
+        if before is not None and int(t_s) == int(before[0]):
+            self._worst = max(before, here, key=lambda second: second[1])
+            return
+        self._worst = here
+        if before is not None:
+            self._errors.add(round(before[0], 2), round(before[1], 3), round(before[2], 3))
 
 
 # State of a point; arrived: the robot is at rest there.
@@ -267,7 +267,7 @@ class RunStateView:
         self._states = [PLANNED] * points
         self._errors_mm: list[float | None] = [None] * points
         self._changed: set[int] = set()
-        self._truth = TruthCompare()
+        self._truth = TruthCompare(self._series["error"])
         self._sigma_second = -1
         self._ticks = 0
         self._handlers: dict[type, Callable[[Any, float], None]] = {
@@ -347,18 +347,14 @@ class RunStateView:
 
     def _take_estimate(self, seq: int, t_s: float, x_m: float, y_m: float, sigma_m: float) -> None:
         if self._is_sim:
-            self._add_error(self._truth.estimate(seq, x_m, y_m, sigma_m))
+            self._truth.estimate(seq, x_m, y_m, sigma_m)
         elif int(t_s) != self._sigma_second:
             self._sigma_second = int(t_s)
             self._series["error"].add(round(t_s, 2), None, round(3e3 * sigma_m, 3))
 
     def _take_truth(self, truth: TruthMessage | BeaconTruth, _now_s: float) -> None:
         for seq, t_s, x_m, y_m, *_ in truth.rows:
-            self._add_error(self._truth.truth(seq, t_s, x_m, y_m))
-
-    def _add_error(self, second: Second | None) -> None:
-        if second is not None:
-            self._series["error"].add(round(second.t_s, 2), round(second.error_mm, 3), round(second.three_sigma_mm, 3))
+            self._truth.truth(seq, t_s, x_m, y_m)
 
     def _next_point(self, status: MissionStatus) -> str:
         return status.point

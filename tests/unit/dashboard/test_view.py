@@ -8,7 +8,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from ccatp.links.topics import DisplayState, Heartbeat
 from ccatp.report.dashboard.app import StateCollector
-from ccatp.report.dashboard.view import NO_LINE, Growing, Lines, Links, LinkState, Second, TruthCompare
+from ccatp.report.dashboard.view import NO_LINE, Growing, Lines, Links, LinkState, TruthCompare
 from ccatp.survey.state import MissionState
 
 
@@ -129,26 +129,27 @@ def test_a_line_that_comes_again_is_one_row_with_its_newest_text_and_old_ones_go
 
 
 def test_the_worst_of_each_second_is_told_when_the_next_begins() -> None:
-    compare = TruthCompare()
-    found: list[Second | None] = []
+    errors = Growing(100)
+    compare = TruthCompare(errors)
     for k in range(25):
         error_m = 0.003 if k == 7 else 0.001
-        found += [compare.estimate(10 * k, 1.0 + error_m, 2.0, 0.002), compare.truth(10 * k, 0.1 * k + 0.05, 1.0, 2.0)]
-    first, second = (second for second in found if second is not None)
-    assert first == pytest.approx((0.75, 3.0, 6.0))
-    assert second == pytest.approx((1.05, 1.0, 6.0))
+        compare.estimate(10 * k, 1.0 + error_m, 2.0, 0.002)
+        compare.truth(10 * k, 0.1 * k + 0.05, 1.0, 2.0)
+    assert errors.rows == [(0.75, 3.0, 6.0), (1.05, 1.0, 6.0)]
 
 
 def test_either_may_come_first_and_frames_between_are_not_compared() -> None:
-    first, second = TruthCompare(), TruthCompare()
-    one = [first.truth(seq, 0.01 * seq, 0.0, 0.0) for seq in range(300)]
-    two = []
+    one, two = Growing(100), Growing(100)
+    first, second = TruthCompare(one), TruthCompare(two)
+    for seq in range(300):
+        first.truth(seq, 0.01 * seq, 0.0, 0.0)
     for seq in range(0, 300, 10):
-        one.append(first.estimate(seq, 0.001, 0.0, 0.001))
-        two.append(second.estimate(seq, 0.001, 0.0, 0.001))
-    two += [second.truth(seq, 0.01 * seq, 0.0, 0.0) for seq in range(300)]
-    assert [found for found in one if found] == [found for found in two if found]
-    assert len([found for found in one if found]) == 2
+        first.estimate(seq, 0.001, 0.0, 0.001)
+        second.estimate(seq, 0.001, 0.0, 0.001)
+    for seq in range(300):
+        second.truth(seq, 0.01 * seq, 0.0, 0.0)
+    assert one.rows == two.rows
+    assert len(one.rows) == 2
     assert [TruthCompare.is_compared(seq) for seq in (7, 20)] == [False, True]
 
 
