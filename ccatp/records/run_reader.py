@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
+import msgspec
 import numpy as np
 
 from ccatp.config.load import load_config
@@ -66,15 +67,7 @@ Message = Sensors | Rest | FixMessage | Treatment
 
 
 def _fixed(message: FixMessage) -> Fixed:
-    fix = Fix(
-        t_s=message.t_s,
-        position_m=message.position_m,
-        covariance_m2=tuple(message.covariance_m2),
-        dop=message.dop,
-        channels=tuple(message.channels),
-        residual_rms_m=message.residual_rms_m,
-    )
-    return Fixed(fix, message.is_fused, message.is_set_aside)
+    return Fixed(msgspec.convert(message, Fix, from_attributes=True), message.is_fused, message.is_set_aside)
 
 
 def in_order(messages: Iterable[Message]) -> Iterator[Event]:
