@@ -48,8 +48,8 @@ def _print_reply(reply: Mapping[str, Any], json_output: bool) -> None:
         return
     from ccatp.daemon.terminal import status_rows
 
-    facts = ((name, value) for name, value in reply.items() if name != "ok")
-    rows = list(status_rows(reply["status"]) if "status" in reply else facts)
+    facts, status = [(name, value) for name, value in reply.items() if name != "ok"], reply.get("status")
+    rows = list(status_rows(status)) if isinstance(status, Mapping) else facts
     width = max((len(name) for name, _ in rows), default=0)
     print_lines([f"{name:<{width}}  {value}" for name, value in rows] or ["ok"])
 

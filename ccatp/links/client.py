@@ -179,15 +179,18 @@ def _exchange(
     reply = request(endpoint, json.dumps(payload).encode(), timeout_s, curve, repeats=repeats)
     if reply.get("ok") is not True:
         raise RefusedError(f"{payload.get('cmd')} refused: {reply.get('error', 'no reason given')}")
-    # Only an answer that names this emergency counts as its confirmation.
-    if payload.get("cmd") == "emergency" and (reply.get("id"), reply.get("latched")) != (payload["id"], True):
-        if (reply.get("id"), reply.get("latched")) == (payload["id"], False):
+    if payload.get("cmd") == "emergency":
+        # Only an answer that names this emergency counts as its confirmation.
+        is_named, latched = reply.get("id") == payload["id"], reply.get("latched")
+        if is_named and latched is False:
             raise RequestFailed(
                 "emergency not in force: the one with that id was cleared; report another with an id of its own"
             )
-        raise RequestFailed(
-            f"{endpoint}: something answers there, but not that this emergency is in force; is it a daemon of ccatp?"
-        )
+        if not is_named or latched is not True:
+            raise RequestFailed(
+                f"{endpoint}: something answers there, but not that this emergency is in force; "
+                "is it a daemon of ccatp?"
+            )
     return reply
 
 

@@ -229,6 +229,7 @@ def test_an_emergency_goes_to_the_danger_process_with_an_id_of_its_own(runtime_d
         {"ok": True},
         {"ok": True, "id": EMERGENCY_ID, "code": 0},
         {"ok": True, "id": EMERGENCY_ID, "latched": False, "code": 0},
+        {"ok": True, "id": EMERGENCY_ID, "latched": 1, "code": 2},
         {"ok": True, "id": "7f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11", "latched": True, "code": 2},
         {"ok": False},
     ],
