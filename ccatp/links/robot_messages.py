@@ -168,11 +168,6 @@ class LineBuffer:
         self._rest = b""
         self.error: LineTooLong | None = None
 
-    @property
-    def has_rest(self) -> bool:
-        """Whether there is the beginning of a line."""
-        return bool(self._rest)
-
     def feed(self, data: bytes) -> list[bytes]:
         """Whole lines, without their LF, after ``data`` was appended; none from one over the limit on."""
         if self._rest:
