@@ -226,7 +226,6 @@ class Rig:
         creep: tuple[float, float] = (0.0, 0.0),
         delay: int = 0,
         heading: float = 0.0,
-        is_predicting: bool = True,
     ) -> None:
         robot = config.robot
         self.r, self.base = robot.wheel_radius_m, robot.wheel_base_m
@@ -240,7 +239,6 @@ class Rig:
         self.link: deque[tuple[int, float, float]] = deque([(-1, 0.0, 0.0)] * delay)
         self.echo, self.seq = -1, 0
         self.t = 0.0
-        self.is_predicting = is_predicting
         self.trace: list[tuple[float, float, float]] = []
 
     @property
@@ -259,8 +257,6 @@ class Rig:
 
     def look(self) -> tuple[Pose, Twist]:
         v, omega = self.twist.v_m_s, self.twist.omega_rad_s
-        if not self.is_predicting:
-            return self.pose, Twist(v, omega)
         seen = self.sent.ahead(self.pose, v, omega, self.echo, DT_CLOSED_LOOP, self.echo < 0, self.creep)
         return seen.pose, Twist(seen.v_m_s, seen.omega_rad_s)
 

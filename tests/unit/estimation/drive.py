@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from math import atan2, cos, floor, hypot, pi, sin, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from ccatp.core import (
     DeckPose,
     EdgeSample,
     Fix,
+    FloatArray,
     GravitySample,
     ImuSample,
     PanelId,
@@ -29,6 +30,7 @@ from ccatp.core import (
 )
 from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.localizer_base import FilterWrap, unwrapped
+from ccatp.filters.base import Filter, FilterDiverged
 from ccatp.localizer import Localizer, build_localizer
 from ccatp.mirror.mirror import Mirror, build_mirror
 
@@ -249,6 +251,22 @@ def shifted(frame: Frame, by_s: float) -> Frame:
         [s._replace(t_s=s.t_s + by_s) for s in frame.edges],
         None,
     )
+
+
+class Fragile:
+    """A filter that diverges when it is told to."""
+
+    def __init__(self, filter_: Filter) -> None:
+        self._filter = filter_
+        self.is_broken = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._filter, name)
+
+    def predict(self, F: Any, Q: FloatArray) -> None:
+        if self.is_broken:
+            raise FilterDiverged("for the sake of the test")
+        self._filter.predict(F, Q)
 
 
 def fix_at(t_s: float, xy_m: tuple[float, float], sigma_m: float = 1e-5) -> Fix:

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.core import DeckPose, Fix, FloatArray, GravitySample, PanelId, PanelPose
+from ccatp.core import DeckPose, GravitySample, PanelId, PanelPose
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.localizer_base import MAX_FRAME_STEP_S
 from ccatp.estimation.state_model import BG, PSI, SL, SR, STATES, TX, A, V, W, X, Y
 from ccatp.filters import FILTERS
-from ccatp.filters.base import Filter, FilterDiverged
 from tests.unit.estimation.drive import (
     STEEP,
     Errors,
+    Fragile,
     Frame,
     Robot,
     build,
@@ -80,20 +80,6 @@ def test_fixes_of_a_panel_share_its_tilt() -> None:
     assert found.heading_sigma_rad < 2e-4
     assert abs(errors_of(found, robot.pose)[1]) < 4.0 * found.heading_sigma_rad
     assert found.position_sigma_m == pytest.approx(1e-4, rel=0.2)  # the tilt itself cannot be told from the place
-
-
-def test_how_far_the_fix_is_above_the_surface() -> None:
-    found = build()
-    robot = rested(found)
-    fix = robot.fix()
-    n = np.array(mirror().rotate_world_from_deck(mirror().surface.normal(robot.x_m, robot.y_m)))
-    lifted = Fix(fix.t_s, tuple((np.array(fix.position_m) + 2e-4 * n).tolist()), *list_of(fix)[2:])
-    found.fuse_fix(lifted)
-    assert errors_of(found, robot.pose)[0] < 2e-5
-
-
-def list_of(fix: Fix) -> list[Any]:
-    return [fix.t_s, fix.position_m, fix.covariance_m2, fix.dop, fix.channels, fix.residual_rms_m]
 
 
 def test_one_wild_fix_is_gated(filter_name: str) -> None:
@@ -195,10 +181,8 @@ def test_a_fix_that_says_nothing_is_refused(change: dict[str, Any], match: str) 
     robot = rested(found)
     run(found, robot.frames(2.8))
     before = found.pose, found.state[0]
-    names = ("t_s", "position_m", "covariance_m2", "dop", "channels", "residual_rms_m")
-    good = dict(zip(names, list_of(robot.fix()), strict=True))
     with pytest.raises(FixRefused, match=match) as refusal:
-        found.fuse_fix(Fix(**{**good, **change}))
+        found.fuse_fix(replace(robot.fix(), **change))
     assert not isinstance(refusal.value, FixGated)
     assert found.pose == before[0]
     assert np.array_equal(found.state[0], before[1])
@@ -229,42 +213,9 @@ def test_only_three_in_a_row_that_agree_are_right(offs: list[tuple[float, float]
 # -- divergence -------------------------------------------------------------------------------------------------------
 
 
-class Fragile:
-    """A filter that diverges when it is told to."""
-
-    def __init__(self, filter_: Filter) -> None:
-        self._filter = filter_
-        self.is_broken = False
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._filter, name)
-
-    def predict(self, F: Any, Q: FloatArray) -> None:
-        if self.is_broken:
-            raise FilterDiverged("for the sake of the test")
-        self._filter.predict(F, Q)
-
-
 def fragile() -> tuple[FullStateLocalizer, Fragile]:
     filter_ = Fragile(FILTERS["ekf"](np.zeros(STATES), np.eye(STATES)))
     return build(wrap=lambda _: filter_), filter_
-
-
-def test_a_filter_that_diverges_freezes_the_pose_and_asks_to_hold() -> None:
-    found, filter_ = fragile()
-    robot = Robot(v=STRAIGHT, errors=NOISY)
-    run(found, robot.frames(1.2))
-    filter_.is_broken = True
-    run(found, robot.frames(0.1))
-    assert found.is_frozen
-    assert found.hold_cause
-    assert found.hold_cause == "filter: for the sake of the test"
-    assert found.counts["diverged"] == 1
-    before = found.pose
-    found.clear_hold()
-    run(found, robot.frames(0.5))
-    assert found.pose == before
-    assert not found.hold_cause  # told once
 
 
 def test_a_speed_that_no_wheel_can_give_is_a_divergence() -> None:
@@ -310,21 +261,6 @@ def test_when_the_clock_jumps_the_pose_does_not_step(jump_s: float) -> None:
     for frame in robot.frames(0.5):
         found.step(*shifted(frame, jump_s))
     assert not found.is_frozen
-    assert not found.hold_cause
-
-
-def test_frames_that_come_twice_or_backward_change_nothing() -> None:
-    plain, found = build(), build()
-    robot = Robot(v=STRAIGHT, errors=NOISY)
-    frames = robot.frames(2.5)
-    for k, frame in enumerate(frames):
-        plain.step(*frame)
-        found.step(*frame)
-        for back in (0, 3) if k % 5 == 4 else ():
-            found.step(*frames[k - back])
-    assert found.pose == plain.pose
-    assert np.array_equal(found.state[0], plain.state[0])
-    assert found.counts["stale_frames"] == 100
     assert not found.hold_cause
 
 

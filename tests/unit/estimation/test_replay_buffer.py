@@ -60,20 +60,8 @@ def same(one: Recorded, other: Recorded) -> None:
     np.testing.assert_allclose(one.filter.covariance, other.filter.covariance, rtol=1e-13)
 
 
-@pytest.mark.parametrize("back", [0, 1, 5, 9])
-def test_a_late_measurement_is_as_good_as_one_in_time(back: int) -> None:
-    in_time, late = Recorded(), Recorded()
-    for k in range(1, 11):
-        in_time.step(k)
-        late.step(k)
-        if k == 10 - back:
-            in_time.measure(2.0, np.array([[0.2, 1.0]]))
-    assert late.late(1.0 - 0.1 * back, 2.0) == back
-    same(late, in_time)
-
-
-@pytest.mark.parametrize("order", [(3, 6, 9), (9, 3, 6), (9, 6, 3), (6, 6, 3)])
-def test_late_measurements_in_any_order(order: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("order", [(1,), (5,), (9,), (10,), (3, 6, 9), (9, 3, 6), (9, 6, 3), (6, 6, 3)])
+def test_late_measurements_in_any_order_are_as_good_as_in_time(order: tuple[int, ...]) -> None:
     in_time, late = Recorded(), Recorded()
     for k in range(1, 11):
         in_time.step(k)
@@ -81,7 +69,7 @@ def test_late_measurements_in_any_order(order: tuple[int, ...]) -> None:
         for _ in range(order.count(k)):
             in_time.measure(float(k), np.array([[0.2, 1.0]]))
     for k in order:
-        late.late(0.1 * k, float(k))
+        assert late.late(0.1 * k, float(k)) == 10 - k
     same(late, in_time)
 
 

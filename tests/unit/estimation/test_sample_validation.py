@@ -63,15 +63,6 @@ def test_wheel_samples_are_judged_one_by_one(
     assert counts(found) == refused
 
 
-def test_five_backward_samples_in_a_row_name_the_sensor() -> None:
-    found = intake()
-    for k in range(4):
-        found.wheels(1.01, [WheelSample(0.99 - 0.001 * k, 1.0, None)])
-    assert found.backward_source == ""
-    found.wheels(1.01, [WheelSample(0.9, 1.0, None)])
-    assert found.backward_source == "right encoder"
-
-
 IMU = {
     "nonfinite": ImuSample(1.002, nan, 0.0),
     "ahead": ImuSample(1.02, 0.0, 0.0),
