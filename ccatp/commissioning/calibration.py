@@ -5,7 +5,7 @@ lead from each pose to the next, and the change of heading that the gyroscope me
 to motion is chosen so that chi^2 equals the degrees of freedom, and widens all uncertainties with it.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from math import floor, log10, sqrt
 from typing import Any, NamedTuple
 
@@ -55,8 +55,8 @@ class Calibration:
     base: Estimate
     bias: Estimate
     covariance: FloatArray
-    radius_difference: Estimate
-    gyro_scale: Estimate
+    radius_difference_m: Estimate
+    gyroscope_scale: Estimate
     creep: Estimate
     slip_sigma: float
     chi2: float
@@ -299,15 +299,10 @@ def lines(table: tuple[CalibrationRow, ...], found: Calibration) -> list[str]:
     for row in table:
         off = (row.found - row.configured) / row.sigma
         shown.append((row.key, f"{row.configured:.6g}", f"{row.found:.7g}", f"{row.sigma:.2g}", f"{off:+.1f} sigma"))
-    widths = [max(len(one[i]) for one in shown) for i in range(5)]
-    text = [
-        "  ".join([one[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(one[1:], widths[1:], strict=True))])
-        for one in shown
-    ]
-    difference, scale, creep = found.radius_difference, found.gyro_scale, found.creep
+    difference, scale, creep = found.radius_difference_m, found.gyroscope_scale, found.creep
     slip = f", slip varies by {100.0 * found.slip_sigma:.2g} % from motion to motion"
     return [
-        *text,
+        *(f"{key:<30}  {old:>12}  {new:>12}  {sigma:>8}  {off:>12}" for key, old, new, sigma, off in shown),
         f"right wheel larger than left by {1e3 * difference.value:.4f} +- {1e3 * difference.sigma:.4f} mm; "
         f"gyroscope reads {100.0 * scale.value:+.2f} +- {100.0 * scale.sigma:.2f} % too much; "
         f"downhill drift {100.0 * creep.value:.2f} +- {100.0 * creep.sigma:.2f} % of the way",
@@ -319,14 +314,5 @@ def lines(table: tuple[CalibrationRow, ...], found: Calibration) -> list[str]:
 def as_json(table: tuple[CalibrationRow, ...], found: Calibration) -> dict[str, Any]:
     """For ``--json``."""
     parameters = {row.key: {"configured": row.configured, "found": row.found, "sigma": row.sigma} for row in table}
-    return {
-        "parameters": parameters,
-        "covariance": found.covariance.tolist(),
-        "radius_difference_m": found.radius_difference,
-        "gyroscope_scale": found.gyro_scale,
-        "creep": found.creep,
-        "slip_sigma": found.slip_sigma,
-        "chi2": found.chi2,
-        "degrees": found.degrees,
-        "segments": found.segments,
-    }
+    others = {name: value for name, value in asdict(found).items() if name not in {"radius", "base", "bias"}}
+    return {"parameters": parameters, **others, "covariance": found.covariance.tolist()}

@@ -10,7 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from fcntl import LOCK_EX, LOCK_NB, flock
 from pathlib import Path
 
@@ -116,18 +116,14 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
     frames: list[Sensors] = []
     arrived_s: list[float] = []
     hellos: list[Hello] = []
-    lost: list[str] = []
-    has_changed, is_lost = asyncio.Event(), asyncio.Event()
+    is_first: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+    is_lost: asyncio.Future[str] = asyncio.get_running_loop().create_future()
 
     def take(sensors: Sensors, _raw: bytes) -> None:
         frames.append(sensors)
         arrived_s.append(time.monotonic())
-        has_changed.set()
-
-    def lose(reason: str) -> None:
-        lost.append(reason)
-        has_changed.set()
-        is_lost.set()
+        if not is_first.done():
+            is_first.set_result(None)
 
     def without(finding: PreflightResult, why: str) -> list[PreflightResult]:
         return [*named(robot_link=finding), *skipped(ROBOT_CHECKS, why)]
@@ -138,22 +134,20 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
         return without(failed(str(error), "see ccatp keys"), "no robot link")
     link = RobotLink(
         host=cfg.robot.host, port=cfg.robot.port, role="monitor", client="check", key=key,
-        on_sensors=take, on_lost=lose, on_joined=hellos.append,
+        on_sensors=take, on_lost=is_lost.set_result, on_joined=hellos.append,
     )  # fmt: skip
     try:
         await link.connect(cfg.robot.connect_timeout_s)
-        with suppress(TimeoutError):
-            async with asyncio.timeout(FIRST_FRAME_S):
-                await has_changed.wait()
-            async with asyncio.timeout(listen_s):
-                await is_lost.wait()
+        await asyncio.wait((is_first, is_lost), timeout=FIRST_FRAME_S, return_when=asyncio.FIRST_COMPLETED)
+        if frames:
+            await asyncio.wait((is_lost,), timeout=listen_s)
     except RobotLinkError as error:
         todo = "switch the robot on; check [robot] host, port and key_file; end what else drives it"
         return without(failed(str(error), todo), "no robot link")
     finally:
         link.close()
-    if lost or not frames:
-        why = lost[0] if lost else f"no sensors frame within {FIRST_FRAME_S:g} s"
+    if is_lost.done() or not frames:
+        why = is_lost.result() if is_lost.done() else f"no sensors frame within {FIRST_FRAME_S:g} s"
         return without(failed(why, "read the robot's own log"), "no frames")
     hello = hellos[0]
     found = passed(f"{cfg.robot.host}:{cfg.robot.port}, {hello.protocol}, auth {hello.auth}")

@@ -234,7 +234,7 @@ class EtalonSimulator:
             puck = await self._truth.puck()
         except TruthUnavailable:
             self.counts["truth_failures"] += 1
-            return ChannelData(self.model.failed_records(channels), server_error=1)
+            return ChannelData(self.model.records(channels, None), server_error=1)
         return ChannelData(self.model.records(channels, puck))
 
     async def _stream(self, writer: asyncio.StreamWriter) -> None:

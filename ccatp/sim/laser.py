@@ -68,29 +68,25 @@ class EtalonModel:
         """The installed channels."""
         return tuple(self._collimators)
 
-    def records(self, channels: Sequence[int], puck: PuckTruth) -> tuple[ChannelRecord, ...]:
+    def records(self, channels: Sequence[int], puck: PuckTruth | None) -> tuple[ChannelRecord, ...]:
         """One record per asked channel, in the order asked.
 
         The length is |puck - collimator| plus noise of sigma = length_sigma_m + length_sigma_per_m * length. A channel
         that is not installed gives ``daq_error`` and the length 0, a blocked one ``beam_break`` and the length 0, a
-        puck that moved further than the tolerance ``motion_tolerance_error``.
+        puck that moved further than the tolerance ``motion_tolerance_error``. Where the puck is not known each record
+        is that of a channel that is not installed.
         """
-        common = set()
-        if not puck.moved_m <= self._motion_tolerance_m:
-            common.add("motion_tolerance_error")
-        if not self.laser_ready:
-            common.add("laser_temp_error")
-        return tuple(self._record(channel, puck, common) for channel in channels)
+        return tuple(self._record(channel, puck) for channel in channels)
 
-    def failed_records(self, channels: Sequence[int]) -> tuple[ChannelRecord, ...]:
-        """One record of length 0 with ``daq_error`` per asked channel: nothing could be measured."""
-        return tuple(self._format(channel, 0.0, {"daq_error"}) for channel in channels)
-
-    def _record(self, channel: int, puck: PuckTruth, common: set[str]) -> ChannelRecord:
+    def _record(self, channel: int, puck: PuckTruth | None) -> ChannelRecord:
         collimator = self._collimators.get(channel)
-        if collimator is None:
+        if puck is None or collimator is None:
             return self._format(channel, 0.0, {"daq_error"})
-        flags = common | self.flags.get(channel, set())
+        flags = set(self.flags.get(channel, ()))
+        if not puck.moved_m <= self._motion_tolerance_m:
+            flags.add("motion_tolerance_error")
+        if not self.laser_ready:
+            flags.add("laser_temp_error")
         if channel in self.blocked:
             return self._format(channel, 0.0, flags | {"beam_break"})
         length_m = math.dist(collimator, puck.position_m)

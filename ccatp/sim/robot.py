@@ -98,10 +98,6 @@ class Robot(SimulatedRobot):
         )
 
     @property
-    def next_t_s(self) -> float:
-        return (self.seq + 1) / self.frame_hz
-
-    @property
     def is_fallen(self) -> bool:
         return self.world.is_fallen
 

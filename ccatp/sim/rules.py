@@ -158,9 +158,9 @@ class SimulatedRobot(ABC):
         """What the hello says of the robot."""
 
     @property
-    @abstractmethod
     def next_t_s(self) -> float:
         """Time of the next frame."""
+        return (self.seq + 1) / self.frame_hz
 
     @property
     @abstractmethod

@@ -123,7 +123,7 @@ def test_the_true_robot_is_found(driven: CalibrationDrive, found: Calibration) -
     assert found.bias.sigma < 3e-4
     wheels = driven.robot.world.wheels
     difference_m = wheels.radius_m * (wheels.right_scale - wheels.left_scale)
-    assert abs(found.radius_difference.value - difference_m) < 5.0 * found.radius_difference.sigma
+    assert abs(found.radius_difference_m.value - difference_m) < 5.0 * found.radius_difference_m.sigma
 
 
 def test_a_drive_has_a_segment_for_each_leg(drive: RecordedDrive) -> None:

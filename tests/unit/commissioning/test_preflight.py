@@ -286,7 +286,7 @@ def test_a_daemon_that_runs_is_told(tmp_path: Path) -> None:
         flock(file, LOCK_EX)
         assert "a daemon runs in" in machine(tmp_path)["runtime directory"].found
     (tmp_path / "rt").chmod(0o777)
-    assert "others may write there" in machine(tmp_path)["runtime directory"].found
+    assert "open to others" in machine(tmp_path)["runtime directory"].found
 
 
 def test_clock_and_real_time(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -14,8 +14,6 @@ from ccatp.sim.plant import (
     BodyStep,
     Creep,
     Disturbance,
-    DriftingBias,
-    OrnsteinUhlenbeck,
     Plant,
     Vibration,
     WheelSlip,
@@ -150,12 +148,6 @@ def world_of(config: Config, **values: float) -> WorldConfig:
     return config.world.model_copy(update=values)
 
 
-def plant_with(mirror: Mirror, *disturbances: Disturbance, start: DeckPose = START) -> Plant:
-    return Plant(
-        mirror.surface, start, wheel_radius_m=0.03, wheel_base_m=0.15, wheel_lag_s=0.08, disturbances=disturbances
-    )
-
-
 # -- measures of the true robot ---------------------------------------------------------------------------------------
 
 
@@ -229,7 +221,7 @@ def test_creep_goes_downhill(config: Config, mirror: Mirror) -> None:
 
     for _ in range(50):
         start = DeckPose(rng.uniform(-2.0, 2.0), rng.uniform(-2.0, 2.0), rng.uniform(-pi, pi))
-        plant = plant_with(mirror, start=start)
+        plant = plant_on(mirror, start)
         for forward_m in (0.001, -0.001):
             ahead, left, turn = creep.displace(plant, 0.0, DT_S, forward_m, 0.0, 0.1)
             assert turn == 0.1
@@ -256,7 +248,7 @@ def shaken(config: Config, mirror: Mirror, frames: int, **values: float) -> NDAr
     values = {"vibration_rate_rad_s": 0.02, "vibration_speed_m_s": 0.001, "vibration_acceleration_m_s2": 0.3, **values}
     vibration = Vibration(world_of(config, **values), DT_S, np.random.default_rng(1))
     vibration.is_thrusting = True
-    plant = plant_with(mirror, vibration.displace)
+    plant = plant_on(mirror, disturbances=(vibration.displace,))
     rows = []
     for k in range(frames):
         plant.step(k * DT_S, DT_S, 0.0, 0.0)
@@ -285,7 +277,7 @@ def test_vibration_has_its_sigmas_and_stays_where_it_is(config: Config, mirror: 
 def test_without_thrust_the_body_comes_back_and_rests(config: Config, mirror: Mirror) -> None:
     values = {"vibration_rate_rad_s": 0.02, "vibration_speed_m_s": 0.001, "vibration_acceleration_m_s2": 0.3}
     vibration = Vibration(world_of(config, **values), DT_S, np.random.default_rng(1))
-    plant = plant_with(mirror, vibration.displace)
+    plant = plant_on(mirror, disturbances=(vibration.displace,))
     for k in range(40):
         vibration.is_thrusting = 10 <= k < 30
         plant.step(k * DT_S, DT_S, 0.0, 0.0)
@@ -293,25 +285,3 @@ def test_without_thrust_the_body_comes_back_and_rests(config: Config, mirror: Mi
     assert (plant.x_m, plant.y_m) == pytest.approx((START.x_m, START.y_m), abs=1e-8)  # steps along a heading that shook
     assert plant.heading_rad == pytest.approx(START.heading_rad, abs=1e-8)
     assert (plant.turn_rate_at(1.0), plant.acceleration_at(1.0)) == (0.0, 0.0)
-
-
-SIGMA, TIME_S, DT_S = 0.3, 2.0, 0.01
-
-
-def test_sigma_and_autocorrelation() -> None:
-    """1600 independent processes at four times: cov(x(0), x(d)) = sigma^2 exp(-d/T)."""
-    rows = []
-    for seed in range(1600):
-        process = OrnsteinUhlenbeck(SIGMA, TIME_S, np.random.default_rng(seed))
-        rows.append([process.at(t) for t in (0.0, 0.5, 2.0, 6.0)])
-    found = np.corrcoef(np.array(rows).T)[0]
-    # A correlation r of n pairs has the standard error (1 - r^2)/sqrt(n); 4.5 of the largest.
-    assert found == pytest.approx([1.0, exp(-0.25), exp(-1.0), exp(-3.0)], abs=4.5 / sqrt(1600))
-    assert np.array(rows).std(axis=0) == pytest.approx([SIGMA] * 4, rel=4.5 / sqrt(2 * 1600))
-
-
-def test_a_bias_walks_with_the_root_of_time() -> None:
-    ends = [DriftingBias(0.5, 0.02, DT_S, np.random.default_rng(seed)).ahead(900)[-1] for seed in range(400)]
-    assert np.std(ends) == pytest.approx(0.02 * 3.0, rel=4.5 / sqrt(2 * 400))  # 9 s
-    assert np.mean(ends) == pytest.approx(0.5, abs=4.5 * 0.06 / sqrt(400))
-    assert DriftingBias(0.5, 0.0, DT_S, np.random.default_rng(1)).ahead(3).tolist() == [0.5, 0.5, 0.5]
