@@ -9,7 +9,6 @@ import random
 import socket
 import struct
 from collections import Counter, deque
-from collections.abc import Coroutine
 from math import inf
 from typing import Any, Literal, Self, cast
 
@@ -115,6 +114,8 @@ class Pipe(asyncio.Protocol):
         self._is_at_end = self._is_shut = self._is_full = self._is_done = False
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.Handle | None = None
+        self._flood_timer: asyncio.Handle | None = None
+        self._owed_lines = 0.0
         if other is not None:
             other.other = self
 
@@ -167,11 +168,20 @@ class Pipe(asyncio.Protocol):
         if self._waiting_bytes > MAX_WAITING_BYTES:
             self.transport.pause_reading()
 
-    def flood(self, lines: int) -> None:
-        """Let further lines wait, after what waits already."""
-        self._counts["flood"] += lines
-        self._put(b"".join(self._stage.flood_line() for _ in range(lines)))
-        self.send()
+    def flood(self, since_s: float | None = None) -> None:
+        """Let further lines wait, after what waits already, at the rate of the fault and while it lasts."""
+        now_s, flood = self._loop.time(), self._faults.get("flood")
+        if since_s is None and self._flood_timer is not None:
+            self._flood_timer.cancel()
+        if flood is None or self._is_done:
+            return
+        owed = self._owed_lines + (now_s - (now_s if since_s is None else since_s)) * flood.rate_hz
+        lines, self._owed_lines = int(owed), owed % 1.0
+        if lines:
+            self._counts["flood"] += lines
+            self._put(b"".join(self._stage.flood_line() for _ in range(lines)))
+            self.send()
+        self._flood_timer = self._loop.call_later(_FLOOD_PERIOD_S, self.flood, now_s)
 
     def send(self) -> None:
         """Give out what is due, or the end; to be called whenever that may have changed."""
@@ -272,7 +282,6 @@ class FaultProxy:
         self.faults: dict[OneWay, OneWayFaults] = {way: {} for way in _BOTH}
         self.connections: list[tuple[Pipe, Pipe]] = []
         self._tasks: set[asyncio.Task[None]] = set()
-        self._flooding: asyncio.Task[None] | None = None
         self._reset_after_bytes: int | None = None
         self.port = 0
         self.counts: Counter[str] = Counter()
@@ -299,15 +308,11 @@ class FaultProxy:
     def _pipes(self) -> list[Pipe]:
         return [pipe for pipes in self.connections for pipe in pipes]
 
-    def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        return task
-
     def connect(self, client: Pipe) -> None:
         """Connect a client that has come to the server."""
-        self._spawn(self._connect(client))
+        task = asyncio.get_running_loop().create_task(self._connect(client))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     async def _connect(self, client: Pipe) -> None:
         try:
@@ -322,6 +327,8 @@ class FaultProxy:
         self.counts["connections"] += 1
         client.transport.resume_reading()
         client.send()
+        client.flood()
+        server.flood()
 
     def forget(self, pipe: Pipe) -> None:
         """Both ends of a connection have ended."""
@@ -367,8 +374,9 @@ class FaultProxy:
         for way in _BOTH:
             if fault.direction in {way, "both"}:
                 self.faults[way][fault.type] = fault
-        if fault.type == "flood" and (self._flooding is None or self._flooding.done()):
-            self._flooding = self._spawn(self._flood())
+        if fault.type == "flood":
+            for pipe in self._pipes():
+                pipe.flood()
 
     def heal(self, direction: Direction = "both", name: str | None = None) -> None:
         """End every fault that lasts, or that of one type; what was stalled goes in one burst."""
@@ -378,24 +386,6 @@ class FaultProxy:
                     del self.faults[way][kind]
         for pipe in self._pipes():
             pipe.send()
-
-    async def _flood(self) -> None:
-        owed = dict.fromkeys(_BOTH, 0.0)
-        clock = asyncio.get_running_loop().time
-        before_s = clock()
-        while any("flood" in faults for faults in self.faults.values()):
-            await asyncio.sleep(_FLOOD_PERIOD_S)
-            now_s = clock()
-            for way in _BOTH:
-                flood = self.faults[way].get("flood")
-                if flood is None:
-                    continue
-                owed[way] += (now_s - before_s) * flood.rate_hz
-                lines, owed[way] = int(owed[way]), owed[way] % 1.0
-                for pipe in self._pipes() if lines else ():
-                    if pipe.way == way:
-                        pipe.flood(lines)
-            before_s = now_s
 
 
 class LinkFaults:
