@@ -222,7 +222,7 @@ def tell(daemon: Daemon) -> str:
 
 
 class Driver:
-    """Joins as the controller, localizes, and answers each frame by the same drive.
+    """Joins as the controller, localizes, and answers each frame, and one that comes again, by the same drive.
 
     Args:
         port: where the robot, or the proxy before it, listens.
@@ -239,13 +239,18 @@ class Driver:
         self.lost = ""
         self.changed = asyncio.Event()
         self.link = RobotLink(host="127.0.0.1", port=port, role="controller", client="test", key=key,
-                              on_sensors=self._on_sensors, on_lost=self._on_lost)  # fmt: skip
+                              on_sensors=self._on_sensors, on_lost=self._on_lost, on_repeated=self._answer)  # fmt: skip
+        self._answers = 0
 
     def _on_sensors(self, frame: Sensors, _line: bytes) -> None:
         self.seqs.append(frame.seq)
         self.localizer.step(frame.t, frame.imu, frame.enc, frame.edge, frame.gravity)
-        self.link.send_drive(frame.seq + 1, frame.seq, 1.1, 1.0)
+        self._answer()
         self.changed.set()
+
+    def _answer(self) -> None:
+        self._answers += 1
+        self.link.send_drive(self._answers, self.seqs[-1], 1.1, 1.0)
 
     def _on_lost(self, reason: str) -> None:
         self.lost = reason

@@ -12,12 +12,10 @@ import pytest
 from ccatp import dataloop
 from ccatp.config.load import load_config
 from ccatp.dataloop import serve
-from ccatp.links.robot_link import RobotLink
-from ccatp.links.robot_messages import Sensors
 from ccatp.sim import sessions
 from ccatp.sim.fault_plan import LINK_TYPES, LOCKSTEP_TYPES, parse_plan
-
-DEADLINE_S = 20.0
+from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S
+from tests.support.daemon import Driver
 
 
 class Log:
@@ -33,52 +31,13 @@ class Log:
         return [fields for event, fields in self.entries if event == f"fault_{what}" and fields["signal"] == "link"]
 
 
-class Client:
-    """Joins through the link, answers frames, and tells what it saw."""
-
-    def __init__(self, port: int) -> None:
-        self.frames: list[int] = []
-        self.lost = ""
-        self._answers = 0
-        self.changed = asyncio.Event()
-        self.link = RobotLink(
-            host="127.0.0.1",
-            port=port,
-            role="controller",
-            client="test",
-            key=None,
-            on_sensors=self._on_sensors,
-            on_lost=self._on_lost,
-            on_repeated=self._answer,
-        )
-
-    def _on_sensors(self, frame: Sensors, line: bytes) -> None:
-        self.frames.append(frame.seq)
-        self._answer()
-        self.changed.set()
-
-    def _answer(self) -> None:
-        self._answers += 1
-        self.link.send_drive(self._answers, self.frames[-1], 1.0, 1.0)
-
-    def _on_lost(self, reason: str) -> None:
-        self.lost = reason
-        self.changed.set()
-
-    async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(DEADLINE_S):
-            while not condition():
-                self.changed.clear()
-                await self.changed.wait()
-
-
-async def drive(plan: str, is_over: Callable[[Client], bool], *, lockstep: bool) -> tuple[Client, Log]:
+async def drive(plan: str, is_over: Callable[[Driver], bool], *, lockstep: bool) -> tuple[Driver, Log]:
     """Join a robot with a plan, drive until a condition holds; what the client saw and the robot's log."""
     cfg = load_config(overrides={"run.seed": 3})
     log, stop = Log(), asyncio.Event()
     with socket.create_server(("127.0.0.1", 0)) as listener:
         faults = parse_plan(plan, "plan")
-        client = Client(listener.getsockname()[1])
+        client = Driver(listener.getsockname()[1])
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(serve(cfg, lockstep=lockstep, stop=stop, listen_sock=listener, log=log, faults=faults))
             try:
@@ -90,25 +49,26 @@ async def drive(plan: str, is_over: Callable[[Client], bool], *, lockstep: bool)
     return client, log
 
 
-def reached(seq: int) -> Callable[[Client], bool]:
-    return lambda client: bool(client.lost or (client.frames and client.frames[-1] >= seq))
+def reached(seq: int) -> Callable[[Driver], bool]:
+    return lambda client: bool(client.lost or (client.seqs and client.seqs[-1] >= seq))
 
 
 Keys = dict[str, Any]
 BOTH = {"direction": "both"}
 TO_CLIENT = {"direction": "to_client"}
 # type: keys, what the client must have seen
-TABLE: dict[str, tuple[Keys, Callable[[Client], bool]]] = {
-    "reset": ({}, lambda c: "reset" in c.lost.lower()),
+TABLE: dict[str, tuple[Keys, Callable[[Driver], bool]]] = {
+    # The client finds out when it reads, or when it writes.
+    "reset": ({}, lambda c: "Connection reset" in c.lost or "Broken pipe" in c.lost),
     "close": ({}, lambda c: "closed" in c.lost),
     "duplicate": ({**BOTH, "every": 2}, lambda c: c.link.counts["repeated_frames"] >= 5),
     "fragment": ({**BOTH, "write_bytes": 40}, lambda c: not c.link.counts),
     "garbage": ({**TO_CLIENT, "garbage_bytes": 20, "every": 4}, lambda c: c.link.counts["bad_lines"] >= 3),
-    "black_hole": (TO_CLIENT, lambda c: max(b - a for a, b in pairs(c.frames)) > 5),
-    "stall": (TO_CLIENT, lambda c: max(b - a for a, b in pairs(c.frames)) == 1),
+    "black_hole": (TO_CLIENT, lambda c: max(b - a for a, b in pairs(c.seqs)) > 5),
+    "stall": (TO_CLIENT, lambda c: max(b - a for a, b in pairs(c.seqs)) == 1),
     "delay": (
         {**TO_CLIENT, "delay_s": 0.03, "jitter_s": 0.01},
-        lambda c: max(b - a for a, b in pairs(c.frames)) == 1 and not c.link.counts,
+        lambda c: max(b - a for a, b in pairs(c.seqs)) == 1 and not c.link.counts,
     ),
     "reorder": ({**TO_CLIENT, "every": 3}, lambda c: c.link.counts["repeated_frames"] >= 2),
     "flood": (
@@ -139,7 +99,7 @@ def test_the_table_knows_every_type() -> None:
 async def test_on_the_wall_clock_each_fault_reaches_the_client_and_the_log(kind: str) -> None:
     keys, seen = TABLE[kind]
     client, log = await drive(plan_of(kind, "at_s = 0.1", keys), reached(40), lockstep=False)
-    assert seen(client), (client.frames, client.lost, client.link.counts)
+    assert seen(client), (client.seqs, client.lost, client.link.counts)
     (began,) = log.of("begins")
     assert (began["type"], began["at_s"], began["from_s"]) == (kind, 0.1, 0.1)
     (record,) = log.of("injected")
@@ -161,8 +121,8 @@ async def test_in_lockstep_each_fault_that_makes_sense_there(
     monkeypatch.setattr(dataloop, "HOUSEKEEPING_S", 0.02)
     keys, seen = TABLE[kind]
     client, log = await drive(plan_of(kind, trigger, keys), reached(100), lockstep=True)
-    assert seen(client), (client.frames, client.lost, client.link.counts)
-    assert client.frames == list(range(len(client.frames)))  # simulated time waited for each
+    assert seen(client), (client.seqs, client.lost, client.link.counts)
+    assert client.seqs == list(range(len(client.seqs)))  # simulated time waited for each
     (record,) = log.of("injected")
     assert isinstance(record["samples"], int)
     assert record["samples"] > 0
@@ -181,6 +141,6 @@ async def test_faults_of_robot_and_link_in_one_plan() -> None:
     client, log = await drive(
         plan + plan_of("fragment", "at_s = 0.1", TABLE["fragment"][0]), reached(60), lockstep=True
     )
-    assert len(client.frames) == len(range(client.frames[-1] + 1)) - 5
+    assert len(client.seqs) == len(range(client.seqs[-1] + 1)) - 5
     injected = [(fields["signal"], fields["type"]) for event, fields in log.entries if event == "fault_injected"]
     assert injected == [("frames", "drop"), ("link", "fragment")]
