@@ -30,7 +30,7 @@ import msgspec
 from ccatp.errors import CcatpError, ConfigError, DaemonUnreachableError, ExitStatus, RefusedError
 from ccatp.links.auth import read_pair, read_public
 from ccatp.links.rpc import CurveClient, RequestFailed, request
-from ccatp.links.runtime_dir import is_deserted, runtime_dir_path
+from ccatp.links.runtime_dir import LOCK_FILE, is_held, runtime_dir_path
 from ccatp.links.topics import MissionStatus
 
 EmergencyKind = Literal["fire", "earthquake", "power", "weather", "operator"]
@@ -157,7 +157,8 @@ class OperatorClient:
         return _as(MissionStatus, self.ask(cmd).get("status"))
 
     def _endpoint(self, channel: str) -> str:
-        if not (self.runtime_dir / channel).exists() or is_deserted(self.runtime_dir):
+        has_ended = is_held(self.runtime_dir / LOCK_FILE) is False
+        if has_ended or not (self.runtime_dir / channel).exists():
             raise DaemonUnreachableError(
                 f"no daemon in {self.runtime_dir}; start one with ccatp run, or name its folder with --runtime-dir"
             )

@@ -91,22 +91,13 @@ def locked(path: Path, refusal: str) -> Iterator[None]:
         yield
 
 
-def is_deserted(runtime_dir: Path) -> bool:
-    """Whether a daemon was there and is gone: its lock is there and no process holds it."""
-    try:
-        with (runtime_dir / LOCK_FILE).open() as file:
-            return _takes(file.fileno(), LOCK_SH)
-    except OSError:
-        return False  # not readable: it may be held
-
-
-def is_held(path: Path) -> bool:
-    """Whether a process holds the lock of a file; false where it cannot be read."""
+def is_held(path: Path) -> bool | None:
+    """Whether a process holds the lock of a file; ``None`` where it cannot be read."""
     try:
         with path.open() as file:
             return not _takes(file.fileno(), LOCK_SH)
     except OSError:
-        return False
+        return None
 
 
 def remove_sockets(runtime_dir: Path, names: Iterable[str]) -> None:

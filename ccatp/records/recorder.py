@@ -305,7 +305,7 @@ def read_metadata(path: Path) -> dict[str, str]:
 
 def is_being_written(path: Path) -> bool:
     """Whether a run that goes on writes this recording: the newest one of its directory, which has no number."""
-    return "." not in path.stem and is_held(path.parent / RUN_LOCK)
+    return "." not in path.stem and is_held(path.parent / RUN_LOCK) is True
 
 
 def damage_text(path: Path, damage: str) -> str:

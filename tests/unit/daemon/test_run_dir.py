@@ -31,9 +31,10 @@ from ccatp.daemon.run_dir import (
 from ccatp.daemon.supervisor import BEACON_PROCESSES, PROCESSES, run
 from ccatp.errors import ConfigError, ExitStatus, RefusedError
 from ccatp.links.runtime_dir import (
+    LOCK_FILE,
     MAX_SOCKET_NAME_BYTES,
     MAX_SOCKET_PATH_BYTES,
-    is_deserted,
+    is_held,
     make_runtime_dir,
     runtime_dir_path,
 )
@@ -282,9 +283,9 @@ def test_the_sockets_go_with_the_daemon(tmp_path: Path) -> None:
                     (tmp_path / name).unlink(missing_ok=True)
                     made.bind(str(tmp_path / name))
             (tmp_path / "main").write_text("no socket")
-            assert not is_deserted(tmp_path)
+            assert is_held(tmp_path / LOCK_FILE) is not False
         assert {path.name for path in tmp_path.iterdir() if path.is_socket()} == left
-        assert is_deserted(tmp_path)
+        assert is_held(tmp_path / LOCK_FILE) is False
         assert (tmp_path / "main").read_text() == "no socket"
 
 
