@@ -26,7 +26,7 @@ from ccatp.links.beacon_messages import (
 from ccatp.links.topics import BeaconArrival, BeaconEllipse, BeaconMapMessage, MissionStatus
 from ccatp.records.beacon_summary import beacon_errors, sigmas_off
 from ccatp.records.run_reader import CONFIG
-from ccatp.report.record import RunFiles, RunFolder, changed_keys, joined, simulation_in
+from ccatp.report.record import RunFiles, RunFolder, changed_keys, joined
 
 _COLUMNS = {"beacon_track": TRACK_COLUMNS, "beacon_truth": TRUTH_COLUMNS}
 BEACON_TOPICS_READ = frozenset((*_COLUMNS, "beacon_map", "beacon_arrival", "beacon_places", "mission"))
@@ -88,14 +88,12 @@ def read_beacon_record(run_dir: Path) -> BeaconRecord:
     recorded = folder.recordings(BEACON_TOPICS_READ, _COLUMNS, "path, map and readings over time")
     parts = [part for part in recorded if part is not None]
     found = {topic: [one for part in parts for one in part.messages[topic]] for topic in BEACON_TOPICS_READ}
-    is_simulation = simulation_in(parts)
-    if is_simulation and not found["beacon_truth"]:
+    if folder.is_simulation and not found["beacon_truth"]:
         folder.missing.append("the simulated truth: errors are not known")
     track, truth = (joined(found[topic], count, needed=5) for topic, count in _COLUMNS.items())
     return BeaconRecord(
         cfg=cfg,
         version=parts[-1].version if parts else "unknown",
-        is_simulation=is_simulation,
         changed=changed_keys(cfg.model_dump(mode="json"), shipped.model_dump(mode="json")),
         track=pose_track(track),
         truth=truth_in(pose_truth(truth), track[:, 0]) if found["beacon_truth"] else None,

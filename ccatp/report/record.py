@@ -127,11 +127,10 @@ def read_record(run_dir: Path) -> RunRecord:
         for one, changes in zip(found, all_changes, strict=True)
         if one is not None
     ]
-    is_simulation = simulation_in(found)
     if found and folder.log and not all(session.changes for session in sessions):
         why = "the time budget is taken from the status, which is coarser"
         folder.missing.append(f"the frames of each change of state: {why}")
-    if is_simulation and not any(session.truth for session in sessions):
+    if folder.is_simulation and not any(session.truth for session in sessions):
         folder.missing.append("the simulated truth: errors are those that the laser saw")
     points, measured = _survey(folder, mirror)
     injected, _ = read_truth(run_dir, folder.warnings)
@@ -144,7 +143,6 @@ def read_record(run_dir: Path) -> RunRecord:
         points=points,
         measured=measured,
         injected=injected,
-        is_simulation=is_simulation,
         changed=changed_keys(ours, shipped),
         **folder.fields(),
     )
@@ -171,18 +169,11 @@ def changed_keys(
 
 
 class Recording(NamedTuple):
-    """The messages of a recording by topic, what made it, and whether that was a simulation (None if not known)."""
+    """The messages of a recording by topic, and what made it."""
 
     name: str
     messages: dict[str, list[Any]]
     version: str
-    is_simulation: bool | None
-
-
-def simulation_in(found: Iterable[Recording | None]) -> bool | None:
-    """Whether the last recording that tells it was made by a simulation."""
-    known = [one.is_simulation for one in found if one is not None and one.is_simulation is not None]
-    return known[-1] if known else None
 
 
 class RunFolder:
@@ -190,6 +181,7 @@ class RunFolder:
 
     def __init__(self, run_dir: Path, log_holds: str) -> None:
         self.run_dir = run_dir
+        self.is_simulation: bool | None = None  # as the last recording says
         self.missing: list[str] = []
         self.warnings: list[str] = []
         self.log = [*read_log(run_dir / LOG, self.warnings)]
@@ -200,6 +192,7 @@ class RunFolder:
         """Those of ``RunFiles``; to be called when everything else has been read."""
         return {
             "name": self.run_dir.resolve().name,
+            "is_simulation": self.is_simulation,
             "config_text": (self.run_dir / CONFIG).read_text(encoding="utf-8", errors="replace"),
             "summary": self._summary(self.run_dir / SUMMARY),
             "log": tuple(line.shown for line in self.log if line.shown is not None),
@@ -258,8 +251,9 @@ class RunFolder:
         self.warnings += [damage_text(path, damage) for damage in damages]
         if lost:
             self.warnings.append(f"{path.name}: {len(lost)} messages cannot be read and are left out: {lost[0]}")
-        is_simulation = {"true": True, "false": False}.get(metadata.get("simulation", ""))
-        return Recording(path.name, found, metadata.get("ccatp", "unknown"), is_simulation)
+        if (mark := metadata.get("simulation")) is not None:
+            self.is_simulation = mark == "true"
+        return Recording(path.name, found, metadata.get("ccatp", "unknown"))
 
 
 def joined(batches: Sequence[FloatArray], columns: int, needed: int) -> FloatArray:
