@@ -1,8 +1,7 @@
 """What is done before a mission: ``ccatp plan``, ``ccatp check`` and ``ccatp calibrate``."""
 
 import json
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,11 +21,10 @@ from ccatp.cli.common import (
     key_option,
     print_lines,
 )
-from ccatp.errors import CcatpError, ConfigError, ExitStatus
+from ccatp.errors import ConfigError, ExitStatus
 
 if TYPE_CHECKING:
     from ccatp.commissioning.calibration import CalibrationRow
-    from ccatp.commissioning.preflight import PreflightResult
     from ccatp.config.models import Config
 
 
@@ -69,7 +67,7 @@ def plan(config_file: Path | None, settings: Mapping[str, object], figure_file: 
     return 0
 
 
-STYLES = {"pass": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
+COLOURS = {"pass": "green", "warn": "yellow", "fail": "bright_red", "skip": "bright_black"}
 
 
 @click.command(epilog=example("ccatp check --config telescope.toml", "ccatp check --sim", "ccatp check --sim --json"))
@@ -88,7 +86,7 @@ def check(
     """
     if not sim and config_file is None:
         raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
-    from ccatp.commissioning.preflight import as_json, failed, has_failed, named
+    from ccatp.commissioning.preflight import as_json, failed, has_failed, lines, named
     from ccatp.commissioning.probes import probe_all
     from ccatp.config.load import NotASurvey, load_config
 
@@ -102,36 +100,14 @@ def check(
     if json_output:
         click.echo(json.dumps(as_json(found)))
     else:
-        _show(found)
+        print_lines(map(_coloured, lines(found)))
     return int(ExitStatus.REFUSED if has_failed(found) else ExitStatus.COMPLETE)
 
 
-def _show(found: "Sequence[PreflightResult]") -> None:
-    from ccatp.commissioning.preflight import lines
-
-    if not sys.stdout.isatty():
-        print_lines(lines(found))
-        return
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False)
-    for title in ("check", "", "found", "what to do"):
-        table.add_column(title, overflow="fold")
-    for one in found:
-        style = STYLES[one.outcome]
-        table.add_row(one.name, f"[{style}]{one.outcome}[/{style}]", one.found, one.todo)
-    console = Console()
-    console.print(table)
-    console.print(lines(found)[-1])
-
-
-class DriveFailed(CcatpError):
-    """The drive did not come to its end."""
-
-    def __init__(self, status: int, run_dir: Path) -> None:
-        super().__init__(f"the drive did not come to its end, so nothing is calibrated; see {run_dir / 'log.jsonl'}")
-        self.exit_status = status
+def _coloured(line: str) -> str:
+    """A line of the result; a terminal shows its outcome in colour."""
+    outcome, rest = line[:4], line[4:]
+    return click.style(outcome, COLOURS[outcome]) + rest if outcome in COLOURS else line
 
 
 @click.command(
@@ -181,7 +157,8 @@ def calibrate(
             shows_summary=False,
         )  # fmt: skip
         if status := run_survey(options):
-            raise DriveFailed(status, from_dir)
+            log = from_dir / "log.jsonl"
+            return complain(f"the drive did not come to its end, so nothing is calibrated; see {log}", status)
     from ccatp.commissioning.calibration import as_json, check_usable, lines, rows
     from ccatp.commissioning.calibration import calibrate as estimate
     from ccatp.commissioning.calibration_drive import read_drive
