@@ -366,6 +366,9 @@ NOT_FOUND = fault(Group.SURVEY, "the robot cannot be found again: {why}",
 FRAME_REFUSED = fault(Group.SURVEY, "the laser system sees the robot {distance_m:.2f} m from {place}: {why}",
     "The first fix, or one in motion, lies where the robot cannot be: the laser system's frame is another one.",
     "Configured collimators, base and start of the robot.")
+LASER_NOT_READY = wait(Group.SURVEY, "the laser system is not ready (laserready_0)",
+    "Its lasers are not warm. The robot stands at its point until they are; nothing is skipped for it.",
+    "Wait, or look at the laser unit; `ccatp check` shows it as well.")
 LENGTHS_REFUSED = fault(Group.SURVEY, "the laser system's lengths do not lead to the robot's base: {why}",
     "The lengths of the first fix give no position.", "Configured collimators and base.")
 FILTER_DIVERGED = hold(Group.SURVEY, "filter: {why}",

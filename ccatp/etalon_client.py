@@ -120,6 +120,12 @@ class EtalonClient:
         async with self._turn:
             return await self._retry(self._ask_readiness)
 
+    async def is_laser_ready(self) -> bool:
+        """Ask whether the lasers are warm: before that lengths mean nothing; errors as of ``measure``."""
+        async with self._turn:
+            reply = await self._retry(lambda: self._ask(MultilineRequest(Command.LASER_READY), LaserReady))
+        return reply.value
+
     async def measure(self, t_s: float, expected_position_m: Vector3) -> Fix:
         """Measure the puck of a robot that stands still; ``t_s`` becomes the time of the fix.
 
@@ -203,7 +209,9 @@ class EtalonClient:
                 "laser driver or raise [etalon] request_timeout_s"
             ) from None
         except (multiline.BadReply, asyncio.LimitOverrunError) as error:
-            raise EtalonBadReply(f"{self._where}: {error}; is this a MultiLine server?") from None
+            is_long = isinstance(error, asyncio.LimitOverrunError)
+            why = f"line of more than {multiline.MAX_LINE_BYTES} bytes" if is_long else error
+            raise EtalonBadReply(f"{self._where}: {why}; is this a MultiLine server?") from None
         except (ConnectionError, asyncio.IncompleteReadError):
             raise EtalonUnreachable(f"{self._where}: server closed the connection; is it running?") from None
         finally:

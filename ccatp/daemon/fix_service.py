@@ -4,9 +4,10 @@ import asyncio
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass
+from math import inf
 from typing import Any
 
-from ccatp.conditions import DISK_STALLS, FIX_NOT_STORED, SKIP_NOT_STORED
+from ccatp.conditions import DISK_STALLS, FIX_NOT_STORED, LASER_NOT_READY, SKIP_NOT_STORED
 from ccatp.config.models import MissionConfig
 from ccatp.core import DeckPose, Fix, PointId, Vector3
 from ccatp.daemon.telemetry import Telemetry
@@ -22,6 +23,8 @@ from ccatp.survey.statechart import Mission
 # A commit takes milliseconds, on a busy disk a second. A longer one is reported, a much longer one holds the robot.
 SLOW_DISK_S = 2.0
 STALLED_DISK_S = 30.0
+# Between two questions whether the lasers are warm, and between two reports that they are not.
+LASER_PERIOD_S, LASER_REPORT_S = 1.0, 60.0
 # A doubtful fix is measured again this often.
 REPEATS = 2
 
@@ -52,6 +55,7 @@ class FixService:
     Attributes:
         is_busy: from ``begin`` to the end of the measurement.
         arrival_error_m: distance of the last fix from its point.
+        wait_cause: what the measurement waits for, or empty.
     """
 
     def __init__(
@@ -77,6 +81,7 @@ class FixService:
         self._wakes = asyncio.Event()
         self.is_busy = False
         self.arrival_error_m = 0.0
+        self.wait_cause = ""
 
     def begin(self, request: FixRequest) -> None:
         """Take a measurement; one in progress is finished first, and dropped."""
@@ -105,6 +110,7 @@ class FixService:
         """Measure, again where the fix is doubted, all within the time that a point may take."""
         self._fix_gate.begin()
         try:
+            await self._await_laser(request)
             async with asyncio.timeout(self._timeout_s):
                 fix, doubt = await self._measure(request)
                 for _ in range(REPEATS):
@@ -120,6 +126,19 @@ class FixService:
             await self._fail(request, doubt, None)
         else:
             await self._store_fix(request, fix)
+
+    async def _await_laser(self, request: FixRequest) -> None:
+        """Wait until the lasers are warm, or the fix is not wanted any more; reported at once and each minute."""
+        clock, reported_s = asyncio.get_running_loop().time, -inf
+        try:
+            while self._is_wanted(request) and not await self._client.is_laser_ready():
+                self.wait_cause = LASER_NOT_READY.message
+                if clock() - reported_s >= LASER_REPORT_S:
+                    reported_s = clock()
+                    self._notify("warning", f"measurement of {_name(request.point)} waits: {self.wait_cause}")
+                await asyncio.sleep(LASER_PERIOD_S)
+        finally:
+            self.wait_cause = ""
 
     async def _measure(self, request: FixRequest) -> tuple[Fix, str]:
         """One fix, handed to the localizer if it is still wanted, and why it is doubted."""

@@ -232,7 +232,8 @@ class MainLoop(RobotLoop):
         if self._unanswered is None and (age_s is None or age_s > STANDS_REPORT_S):
             return f"{robot} sends no frames; is it on, the network up?"
         if self._runner.is_busy:
-            return "waiting for a measurement of the laser system; is it ready, the line of sight free?"
+            why = self._runner.status().cause or "is it ready, the line of sight free?"
+            return f"waiting for a measurement of the laser system; {why}"
         cause = state.cause or str(state.mode)
         row, otherwise = condition_of(cause), "'ccatp resume' goes on" if state.is_paused else "it goes on by itself"
         return f"{state.mode}: {cause}; {row.advice if row is not None else otherwise}"

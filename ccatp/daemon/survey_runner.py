@@ -147,7 +147,7 @@ class SurveyRunner(MissionRunner):
             seq=self._clock.seq,
             t_s=self._clock.t_s,
             state=str(state.mode),
-            cause=state.cause,
+            cause=state.cause or self._fix_service.wait_cause,
             done=len(state.done),
             skipped=len(state.skipped),
             total=self._parts.total_points,

@@ -155,14 +155,23 @@ def fix_service(
     publish: Callable[[str, Any], None] = lambda *_: None,
     notify: Callable[[str, str], None] = lambda *_: None,
     measuring_time_s: float = 0.0,
+    not_ready: int = 0,
 ) -> FixService:
-    """The main loop's fix service; what is not given is there only to be asked."""
+    """The main loop's fix service; what is not given is there only to be asked.
+
+    ``not_ready``: so many times the lasers are not warm yet.
+    """
+    ready = iter((False,) * not_ready)
     gate = gate or SimpleNamespace(
         begin=lambda: None, review=lambda *_, **__: SimpleNamespace(doubt="", refusal=""), refusal_of=lambda *_: ""
     )
+
+    async def is_laser_ready() -> bool:
+        return next(ready, True)
+
     return FixService(
         cfg.mission,
-        cast(EtalonClient, SimpleNamespace(measure=measure)),
+        cast(EtalonClient, SimpleNamespace(measure=measure, is_laser_ready=is_laser_ready)),
         cast(FixGate, gate),
         cast(Localizer, localizer or sightless()),
         cast(Mission, mission),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccatp.conditions import LASER_NOT_READY
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.daemon.fix_service import FixRequest
@@ -27,8 +28,9 @@ async def measured_once(
     store: Any,
     point: PointId | None,
     handle: Callable[[SurveyInput], object],
+    not_ready: int = 0,
 ) -> tuple[list[FixMessage], list[str]]:
-    """One request, with a laser system that always answers: the fixes and the levels of messages that were told."""
+    """One request, with a laser system that always answers: the fixes, and texts of warnings or levels of messages."""
     told, levels, over = list[FixMessage](), list[str](), asyncio.Event()
 
     async def measure(_t_s: float, _expected_m: Any) -> Fix:
@@ -53,7 +55,8 @@ async def measured_once(
         ),
         on_finished=over.set,
         publish=lambda _topic, message: told.append(message),
-        notify=lambda level, _text: levels.append(level),
+        notify=lambda level, text: levels.append(level if level != "warning" else text),
+        not_ready=not_ready,
     )
     serving = asyncio.get_running_loop().create_task(service.run())
     service.begin(FixRequest(1, 1.0, point, (0.0, 0.0, 0.0), DeckPose(0.0, 0.0, 0.0)))
@@ -80,4 +83,17 @@ async def test_a_point_that_is_measured_already_is_done_and_needs_no_operator(co
     refused.set_exception(AlreadyMeasuredError("point 1/2/4 has been measured; its fix is not replaced"))
     store = SimpleNamespace(record_fix=lambda *_: refused)
     told, levels = await measured_once(config, [], store, POINT, events.append)
-    assert (events, levels, [fix.point for fix in told]) == ([FixStored(POINT, 0.0)], ["warning"], [(1, 2, 4)])
+    assert (events, levels, [fix.point for fix in told]) == (
+        [FixStored(POINT, 0.0)],
+        ["point 1/2/4 has been measured; its fix is not replaced"],
+        [(1, 2, 4)],
+    )
+
+
+async def test_a_laser_that_is_not_ready_is_waited_for_and_reported_once(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ccatp.daemon.fix_service.LASER_PERIOD_S", 0.0)
+    told, levels = await measured_once(config, [], None, None, lambda _event: None, not_ready=3)
+    assert [fix.is_fused for fix in told] == [True]
+    assert levels == [f"measurement of the robot's place waits: {LASER_NOT_READY.message}"]
