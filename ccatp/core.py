@@ -142,32 +142,23 @@ class Corner(StrEnum):
 
 
 class Verdict(msgspec.Struct, frozen=True):
-    """What the danger loop says about one sensor frame.
-
-    Attributes:
-        signal: what gave ``cause`` (``"front_left"``, ``"estimate"``, ``"emergency:fire"``), or empty.
-        value: the signal's value in the unit of ``limit``.
-        off: for each edge sensor whether it takes part in a declared edge.
-        severity: of what gave cause; NONE for an edge, whose reaction is in code and permits.
-        raised: number of emergencies raised so far while one is latched.
-        is_shaking: an earthquake is latched, whatever else gave code and cause.
-    """
+    """What the danger loop says about one sensor frame."""
 
     seq: int
     t_s: float
     code: EventCode
     cause: str
-    signal: str
-    value: float
+    signal: str  # what gave ``cause`` ("front_left", "estimate", "emergency:fire"), or empty
+    value: float  # of the signal, in the unit of ``limit``
     limit: float
     forward: bool
     reverse: bool
     turn: bool
-    off: tuple[bool, bool, bool, bool] = (False, False, False, False)
-    severity: Severity = Severity.NONE
+    off: tuple[bool, bool, bool, bool] = (False, False, False, False)  # the edge sensors of a declared edge
+    severity: Severity = Severity.NONE  # of what gave cause; NONE for an edge, whose reaction is in code and permits
     full_fans: bool = False
-    raised: int = 0
-    is_shaking: bool = False
+    raised: int = 0  # number of emergencies raised so far while one is latched
+    is_shaking: bool = False  # an earthquake is latched, whatever else gave code and cause
 
 
 class Twist(msgspec.Struct, frozen=True):

@@ -20,20 +20,12 @@ STILL = Twist(0.0, 0.0)
 
 
 class MissionCommand(msgspec.Struct, frozen=True):
-    """What the mission wants of the present frame.
-
-    Attributes:
-        twist: the velocity wanted until the next frame.
-        at_rest: the robot has come to rest in this frame.
-        arrived: the measurement point at which it did so for the first time; corrections are no arrivals.
-        measure: have the laser system measure now (of a point, or after a back-off to find itself again).
-        inflates_covariance: the localizer shall widen its covariance.
-    """
+    """What the mission wants of the present frame."""
 
     twist: Twist
-    at_rest: bool = False
-    arrived: PointId | None = None
-    measure: bool = False
+    at_rest: bool = False  # the robot has come to rest in this frame
+    arrived: PointId | None = None  # the point at which it did so for the first time; corrections are no arrivals
+    measure: bool = False  # of a point, or after a back-off to find itself again
     inflates_covariance: bool = False
 
 
@@ -70,18 +62,13 @@ class Standstill(msgspec.Struct, frozen=True):
 
 
 class Settling(msgspec.Struct, frozen=True, tag=True):
-    """From the end of a leg to the request for a measurement, after standing for the measuring time.
-
-    ``rest_by_s``: coming to rest, or standing still for the measurement, takes no longer; ``measure_at_s``: the
-    measuring time is over; ``is_requested``: the measurement is asked for and wanted; ``is_repeated``: it failed, and
-    is asked for once more after another measuring time.
-    """
+    """From the end of a leg to the request for a measurement, after standing for the measuring time."""
 
     standstill: Standstill = Standstill()
-    rest_by_s: float | None = None
-    measure_at_s: float = 0.0
-    is_requested: bool = False
-    is_repeated: bool = False
+    rest_by_s: float | None = None  # coming to rest, or standing still for the measurement, takes no longer
+    measure_at_s: float = 0.0  # the measuring time is over
+    is_requested: bool = False  # the measurement is asked for and wanted
+    is_repeated: bool = False  # it failed, and is asked for once more after another measuring time
 
     def settle(self, cfg: ControlConfig, measuring_time_s: float, motion: StateEstimate) -> "Settling":
         """One frame of coming to rest; over when ``standstill.is_rest``, and the measuring time begins."""
@@ -176,27 +163,20 @@ class Retreat(msgspec.Struct, frozen=True, tag=True):
     """One back-off along the track just driven, then a turn away from the side that hung over.
 
     A robot that met the edge backwards faces away from it, and does not turn.
-
-    Attributes:
-        last: the pose in the last frame.
-        away_rad: the turn away, to the side that stands on the mirror; where both or none do, to the left.
-        direction: in which it backs off, 1 forward; ``after_back``: the step after that.
-        unturn: sense in which a turn is undone.
-        turn, goal_rad: the turn away under way, and the heading in which it ends.
     """
 
     step: RetreatStep
-    last: PanelPose
-    away_rad: float
-    direction: float
+    last: PanelPose  # in the last frame
+    away_rad: float  # the turn away, to the side that stands on the mirror; where both or none do, to the left
+    direction: float  # in which it backs off, 1 forward
     after_back: RetreatStep
-    unturn: float
+    unturn: float  # sense in which a turn is undone
     time_s: float = 0.0
     travel_m: float = 0.0
     turned_rad: float = 0.0
     has_turned_away: bool = False
-    turn: LegMotion | None = None
-    goal_rad: float = 0.0
+    turn: LegMotion | None = None  # the turn away under way
+    goal_rad: float = 0.0  # the heading in which it ends
 
     @classmethod
     def begin(cls, cfg: MissionConfig, verdict: Verdict, pose: PanelPose, rate_rad_s: float) -> "Retreat":

@@ -94,18 +94,13 @@ class StateEstimate(msgspec.Struct, frozen=True):
 
 
 class Leg(msgspec.Struct, frozen=True, tag=True):
-    """The leg to a stop, as far as it is driven.
-
-    ``motion`` is None before the first frame of the leg; after ``deadline_s`` it takes far longer than it should;
-    ``aim``: the leg is a correction, as long as the robot stays on that panel; ``target``: the stop in the frame of a
-    panel, m.
-    """
+    """The leg to a stop, as far as it is driven."""
 
     stop: Stop
-    motion: LegMotion | None = None
-    deadline_s: float = 0.0
-    aim: tuple[PanelId, LegAim] | None = None
-    target: tuple[PanelId, tuple[float, float]] | None = None
+    motion: LegMotion | None = None  # None before the first frame of the leg
+    deadline_s: float = 0.0  # after that it takes far longer than it should
+    aim: tuple[PanelId, LegAim] | None = None  # it is a correction, as long as the robot stays on that panel
+    target: tuple[PanelId, tuple[float, float]] | None = None  # the stop in the frame of a panel, m
 
 
 class LegFollower:

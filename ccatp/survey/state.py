@@ -123,37 +123,24 @@ class Hold(NamedTuple):
 
 
 class HoldState(msgspec.Struct, frozen=True):
-    """What every mission knows at one time: what it is at, how it is held, and why; times are robot time, s.
-
-    Attributes:
-        mode: what it is at.
-        abort_cause: why the mission was given up, or empty.
-        interlock: why nothing may move, an earthquake, or empty.
-        is_latched, is_shaking, severity: of the newest verdict: an emergency, an earthquake, the gravest finding.
-        full_fans: the robot shall be pressed on with full fans, from now on.
-        has_looked: a sensor that stays off was looked at with a fix.
-        finding: the cause for which the robot was sent home last; ``emergency_epoch``: the newest emergency acted on
-            (``None``: what is latched when the first verdict comes was acted on before).
-        stuck_s: since when a retreat led nowhere.
-        resumes_after_s: a hold that goes on by itself lasts at least until then.
-    """
+    """What every mission knows at one time: what it is at, how it is held, and why; times are robot time, s."""
 
     mode: MissionState = IDLE
     outcome: SurveyOutcome = SurveyOutcome.NONE
     cause: str = ""
     hold: Hold = Hold()
-    abort_cause: str = ""
-    interlock: str = ""
-    is_latched: bool = False
+    abort_cause: str = ""  # why the mission was given up
+    interlock: str = ""  # why nothing may move: an earthquake
+    is_latched: bool = False  # of the newest verdict: an emergency, an earthquake, the gravest finding
     is_shaking: bool = False
     severity: Severity = Severity.NONE
     is_slow: bool = False
-    full_fans: bool = False
-    has_looked: bool = False
-    finding: str = ""
-    emergency_epoch: int | None = 0
-    stuck_s: float | None = None
-    resumes_after_s: float = -inf
+    full_fans: bool = False  # the robot shall be pressed on with full fans, from now on
+    has_looked: bool = False  # a sensor that stays off was looked at with a fix
+    finding: str = ""  # the cause for which the robot was sent home last
+    emergency_epoch: int | None = 0  # the newest emergency acted on; None: what the first verdict has is not new
+    stuck_s: float | None = None  # since when a retreat led nowhere
+    resumes_after_s: float = -inf  # a hold that goes on by itself lasts at least until then
 
     @property
     def rejects_odometry(self) -> bool:
@@ -187,52 +174,34 @@ class HoldState(msgspec.Struct, frozen=True):
 
 
 class SurveyState(HoldState, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
-    """All that a survey knows at one time.
-
-    Attributes:
-        stop_index: of the stop driven to, or measured at.
-        behaviour: progress of what the mode does; made on entry, dropped on leaving it.
-        done: points measured, in order.
-        skipped: points whose measurement failed.
-        failure_causes: why points failed and were not measured since.
-        due: points to be measured next, in this order, away from the planned route.
-        retried: points that failed and were due once more.
-        inflates_covariance: the localizer shall widen its covariance; the next command says so once.
-        wants_calibration: the calibration drive was given up, too far from where it leads.
-        is_missed: the last fix shows the robot too far from its point; ``corrected``: the stop of the last correction.
-        request: number of the measurement that was asked for last; ``arrived_at``: the last point with an arrival.
-        failures: failed measurements in a row.
-        heading_legs_left, was_reverse: of the search for the heading.
-        is_found: a fix has just found the robot; ``stands_until_s``: nothing moves before then.
-        recoveries_s: when the estimate broke down lately.
-    """
+    """All that a survey knows at one time."""
 
     route: Route
-    stop_index: int = 0
-    behaviour: Leg | Settling | Retreat | ReturnHome | None = None
+    stop_index: int = 0  # of the stop driven to, or measured at
+    behaviour: Leg | Settling | Retreat | ReturnHome | None = None  # made on entry into a mode, dropped on leaving it
     fix: FixNeed = FixNeed.NONE
-    done: tuple[PointId, ...] = ()
-    skipped: tuple[PointId, ...] = ()
-    failure_causes: Mapping[PointId, str] = msgspec.field(default_factory=dict)
-    due: tuple[PointId, ...] = ()
-    retried: frozenset[PointId] = frozenset()
+    done: tuple[PointId, ...] = ()  # points measured, in order
+    skipped: tuple[PointId, ...] = ()  # points whose measurement failed
+    failure_causes: Mapping[PointId, str] = msgspec.field(default_factory=dict)  # of those not measured since
+    due: tuple[PointId, ...] = ()  # points to be measured next, in this order, away from the planned route
+    retried: frozenset[PointId] = frozenset()  # points that failed and were due once more
     is_off_route: bool = False
     is_review_due: bool = False
-    inflates_covariance: bool = False
-    wants_calibration: bool = False
-    is_missed: bool = False
-    corrected: Stop | None = None
+    inflates_covariance: bool = False  # the localizer shall widen its covariance; the next command says so once
+    wants_calibration: bool = False  # the calibration drive was given up, too far from where it leads
+    is_missed: bool = False  # the last fix shows the robot too far from its point
+    corrected: Stop | None = None  # the stop of the last correction
     corrections: int = 0
-    request: int = 0
-    arrived_at: PointId | None = None
-    failures: int = 0
-    heading_legs_left: int = 0
+    request: int = 0  # number of the measurement that was asked for last
+    arrived_at: PointId | None = None  # the last point with an arrival
+    failures: int = 0  # failed measurements in a row
+    heading_legs_left: int = 0  # of the search for the heading
     was_reverse: bool = True
     budget: BudgetProgress = BudgetProgress()
-    is_found: bool = False
+    is_found: bool = False  # a fix has just found the robot
     backoffs: int = 0
-    stands_until_s: float = -inf
-    recoveries_s: tuple[float, ...] = ()
+    stands_until_s: float = -inf  # nothing moves before then
+    recoveries_s: tuple[float, ...] = ()  # when the estimate broke down lately
 
     @property
     def stop(self) -> Stop | None:

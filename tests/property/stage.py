@@ -6,7 +6,7 @@ invariants of the fault table are looked at, most of them by other means than th
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import cos, hypot, isfinite, sin
+from math import cos, isfinite, sin
 from typing import Any
 
 import numpy as np
@@ -295,18 +295,14 @@ class Stage(SilRun):
         assert not set(mission.state.done) & set(mission.state.skipped), "I8"
         if mission.state.stops is not self._stops:
             self._stops = mission.state.stops
-            for x, y in _goals(self._stops):
-                assert self.mirror.rim.signed_distance_m(x, y) >= MARGIN_M, "I7"
+            for stop in self._stops:
+                assert self.mirror.rim.signed_distance_m(stop.x_m, stop.y_m) >= MARGIN_M, "I7"
 
     def look_at_hold(self) -> None:
         """I9: whatever it was at, a pause holds it before its next frame, and that frame drives nothing."""
         was_over = self.mission.state.mode is DONE
         self.mission.handle(Pause("I9"))
         assert self.mission.state.mode is (DONE if was_over else HELD), "I9"
-
-
-def _goals(stops: Sequence[Any]) -> list[tuple[float, float]]:
-    return [(stop.x_m, stop.y_m) for stop in stops]
 
 
 def _without(sample: EdgeSample, off: tuple[bool, bool, bool, bool]) -> EdgeSample:
@@ -324,9 +320,3 @@ def _shifted(frame: Sensors, by_s: float) -> Sensors:
     gravity = frame.gravity._replace(t_s=frame.gravity.t_s + by_s) if frame.gravity is not None else None
     imu, enc, edge = (later(samples) for samples in (frame.imu, frame.enc, frame.edge))
     return replace(frame, t=frame.t + by_s, imu=imu, enc=enc, edge=edge, gravity=gravity)
-
-
-def distance_m(stage: Stage) -> float:
-    """How far the robot is from base."""
-    plant, base = stage.robot.world.plant, stage.mirror.base_pose
-    return hypot(plant.x_m - base.x_m, plant.y_m - base.y_m)

@@ -21,19 +21,12 @@ _NONE = -1  # in place of a near leg: a far one, or none
 
 
 class _Choices(NamedTuple):
-    """What each place can be joined to, one choice a row, the choices of a place one after the other.
+    """What each place can be joined to, one choice a row, the choices of a place one after the other."""
 
-    Attributes:
-        place: whose choice it is; 0 is base, shape (m,).
-        near: the near places it is joined to, ``_NONE`` for a far one or none, shape (m, 2).
-        is_end: the tour ends there, shape (m,).
-        cost_s: half of each leg, and the turn between them, shape (m,).
-    """
-
-    place: IntArray
-    near: IntArray
-    is_end: NDArray[np.bool_]
-    cost_s: FloatArray
+    place: IntArray  # whose choice it is; 0 is base, shape (m,)
+    near: IntArray  # the near places it is joined to, ``_NONE`` for a far one or none, shape (m, 2)
+    is_end: NDArray[np.bool_]  # the tour ends there, shape (m,)
+    cost_s: FloatArray  # half of each leg, and the turn between them, shape (m,)
 
 
 def tour_bound(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig, measuring_time_s: float) -> float:
