@@ -5,7 +5,7 @@ run of the daemon with the same configuration and seed go through the same state
 """
 
 from collections import defaultdict, deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import hypot
 from typing import Any
 
@@ -81,7 +81,6 @@ class SilResult:
     cause: str
     states_s: dict[str, float]
     track: FloatArray
-    notices: list[str] = field(default_factory=list)
 
     @property
     def mission_time_s(self) -> float:
@@ -230,7 +229,6 @@ class SilRun:
         self.laser = SilLaser(cfg, self.mirror, self.robot)
         self.trace = SilTrace(parts, with_track=with_track)
         self.states_s = defaultdict(float, {MissionState.IDLE: 0.0})
-        self.notices: list[str] = []
         self.denied_s: list[float] = []  # when lines that were no frames took the permit away
         self.weak_frames = 0  # on an overhang, in which the fans gave less than their floor
         self._published: EstimateMessage | None = None
@@ -379,7 +377,6 @@ class SilRun:
         except (MultilaterationError, FixRefused) as error:
             mission.handle(FixFailed(point, str(error), self.parts.heading_sigma_rad()))
             return
-        self.notices += localizer.notices
         localizer.notices.clear()
         if point is not None and row is not None:
             distance_m = mission.survey.follower.distance_m(mission.state.stop, localizer.pose)
@@ -409,5 +406,4 @@ class SilRun:
             cause=state.cause,
             states_s={str(state): time_s for state, time_s in self.states_s.items()},
             track=self.trace.track(),
-            notices=self.notices,
         )
