@@ -13,21 +13,21 @@ class Liveness:
 
     def __init__(self, stale_after_s: float = STALE_AFTER_S) -> None:
         self._stale_after_s = stale_after_s
-        self._heartbeats: dict[str, Heartbeat] = {}
+        self.heartbeats: dict[str, Heartbeat] = {}
 
     def update(self, heartbeat: Heartbeat) -> None:
         """Take a heartbeat. Its time is that of the machine's clock: waiting in a queue ages it."""
-        self._heartbeats[heartbeat.process] = heartbeat
+        self.heartbeats[heartbeat.process] = heartbeat
 
     @property
     def has_joined(self) -> bool:
         """Whether both loops have joined the robot."""
-        return all(name in self._heartbeats and self._heartbeats[name].phase in ("joined", "done") for name in LOOPS)
+        return all(name in self.heartbeats and self.heartbeats[name].phase in ("joined", "done") for name in LOOPS)
 
     def trouble(self, now_s: float) -> str:
         """What is wrong, or nothing."""
         for name in LOOPS:
-            heartbeat = self._heartbeats.get(name)
+            heartbeat = self.heartbeats.get(name)
             if heartbeat is None:
                 return f"{name} has sent no heartbeat"
             age_s = now_s - heartbeat.t_s

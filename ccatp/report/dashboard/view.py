@@ -44,7 +44,6 @@ class Links:
     def __init__(self, *, has_laser: bool = True) -> None:
         self._has_laser = has_laser
         self._liveness = Liveness()
-        self._presences: dict[str, Heartbeat] = {}
         self._cut_s: dict[str, float] = {}
         self.restarts = dict.fromkeys(LOOPS, 0)  # as far as they were seen from here
         # Of the last display state; None while none is requested: its absence is no loss.
@@ -55,14 +54,13 @@ class Links:
     def presence(self, presence: Heartbeat) -> None:
         """Take the heartbeat of a process."""
         name = presence.process
-        before = self._presences.get(name)
+        before = self._liveness.heartbeats.get(name)
         is_new = before is None or before.pid != presence.pid
         if before is not None and is_new:
             self.restarts[name] += 1
             self.picture_s = None if name == "main" else self.picture_s
         if name in self._cut_s and (is_new or presence.t_s > self._cut_s[name]):
             del self._cut_s[name]
-        self._presences[name] = presence
         self._liveness.update(presence)
 
     def cut(self, name: str, now_s: float) -> None:
@@ -94,7 +92,8 @@ class Links:
         return ends
 
     def _loop(self, name: str, now_s: float) -> tuple[LinkState, Loss | None]:
-        presence, cut_s, what, loss = self._presences.get(name), self._cut_s.get(name), f"the {NAMES[name]}", None
+        presence, cut_s = self._liveness.heartbeats.get(name), self._cut_s.get(name)
+        what, loss = f"the {NAMES[name]}", None
         phase, since_s = ("no heartbeat yet", None) if presence is None else (presence.phase, presence.t_s)
         if cut_s is not None:
             phase, since_s, loss = "gone", cut_s, Loss(f"{what} is gone", now_s - cut_s)
@@ -107,7 +106,7 @@ class Links:
         return LinkState(NAMES[name], phase, _age_s(since_s, now_s), is_well), loss
 
     def _robot(self, now_s: float, *, is_main_lost: bool) -> tuple[LinkState, Loss | None]:
-        main, loss = self._presences.get("main"), None
+        main, loss = self._liveness.heartbeats.get("main"), None
         frame_s = None if main is None or main.frame_age_s is None else main.t_s - main.frame_age_s
         age_s = 0.0 if frame_s is None else now_s - frame_s
         if main is not None and not is_main_lost and main.phase == "rejoining":
