@@ -1,7 +1,7 @@
 """The last gates before the wheels and the fans; they deny by default.
 
-The velocity gate trusts neither the mission nor the verdict's flags alone: a verdict that names an edge sensor bars
-that direction whatever its permits say, and a survey moves under a normal verdict only.
+A verdict that names an edge sensor bars that direction whatever its permits say; a survey moves under a normal verdict
+only.
 """
 
 from enum import Enum, StrEnum
@@ -83,11 +83,7 @@ class DriveGate:
     def pass_through(
         self, wanted: Twist, verdict: Verdict | None, dt_s: float, t_s: float, age_s: float, purpose: Purpose
     ) -> tuple[float, float]:
-        """Permitted wheel rates (right, left), rad/s, for the wanted twist.
-
-        ``t_s`` is the robot time of the answered frame, ``age_s`` its age; ``verdict`` is None when there is no fresh
-        one.
-        """
+        """Permitted wheel rates (right, left), rad/s, on a frame of robot time ``t_s`` and age ``age_s``."""
         v, omega = wanted.v_m_s, wanted.omega_rad_s
         if v == 0.0 and omega == 0.0:
             self._last, self.denial = HELD, None

@@ -44,10 +44,7 @@ class SlidingWindow:
 
 
 class WheelMeans:
-    """Mean wheel rates over a frame (``None`` for a wheel without samples), and the smoothed yaw rate.
-
-    The yaw rate is smoothed over some frames, because a count of an encoder is a jump of its rate.
-    """
+    """Mean wheel rates over a frame (``None`` without samples), and the yaw rate, smoothed over some frames."""
 
     _SMOOTH_S = 0.05
 
@@ -105,13 +102,9 @@ _STILL_RAD_S = 0.02  # yaw rate of wheels that stand
 class ImuGate:
     """Leaves out the inertial unit while its readings are impossible, and for a quarantine afterwards.
 
-    * An acceleration or an angular rate beyond what the robot can do.
-    * An angular rate that jumps away from the wheels'. One that drifts away from it, or was different all along, may be
-      right and the encoders wrong: ``ccatp.safety.wheel_monitors`` decides that.
-    * A reading that repeats itself exactly: a unit that has shown noise at rest never does. One without noise may.
-
-    The quarantine is needed because garbage is plausible now and then. ``cause`` is empty and ``out_since_s`` infinite
-    while the unit is used.
+    Impossible: an acceleration or a rate beyond what the robot can do; a rate that jumps away from the wheels' (of one
+    that drifts away ``ccatp.safety.wheel_monitors`` decides); exact repetition by a unit that has shown noise at rest.
+    ``cause`` is empty and ``out_since_s`` infinite while the unit is used.
     """
 
     def __init__(self, cfg: HealthConfig) -> None:

@@ -18,11 +18,9 @@ class PidState(msgspec.Struct, frozen=True):
 
 
 class Pid:
-    """C(s) = Kp + Ki/s + Kd s/(Tf s + 1), thesis eq. 3.4 with a filtered derivative.
+    """C(s) = Kp + Ki/s + Kd s/(Tf s + 1), thesis eq. 3.4 in SI units with a filtered derivative.
 
-    Departures from the thesis: the gains act on SI units and seconds (the thesis does not give its unit of time), the
-    derivative is low-pass filtered (``derivative_filter_s``), and the integral neither grows past its own limit nor
-    while the output is saturated in its direction (anti-windup by conditional integration).
+    The integral neither grows past its own limit nor while the output is saturated in its direction.
     """
 
     def __init__(self, gains: PidConfig, output_limit: float) -> None:
@@ -92,10 +90,7 @@ class Profile(NamedTuple):
 
 
 def lag_feed_forward(now: float, after: float, dt_s: float, lag_s: float) -> float:
-    """Set point that takes a first-order servo of time constant ``lag_s`` from ``now`` to ``after`` within ``dt_s``.
-
-    The servo obeys w(t + dt) = u + (w(t) - u) exp(-dt/T); solved for u.
-    """
+    """Set point that takes a first-order servo of time constant ``lag_s`` from ``now`` to ``after`` within ``dt_s``."""
     if lag_s <= 0.0:
         return after
     return now + (after - now) / (1.0 - exp(-dt_s / lag_s))
@@ -106,10 +101,9 @@ FEEDBACK_SHARE = 0.25
 
 
 class AxisState(msgspec.Struct, frozen=True):
-    """Progress of a motion.
+    """Progress of a motion: position and speed ``planned`` for now, its bang-bang time ``duration_s``.
 
-    ``planned``: position and speed of the plan now; ``slip``: the share by which the wheels travel further than the
-    body; ``duration_s``: bang-bang time of the motion.
+    ``slip``: the share by which the wheels travel further than the body.
     """
 
     duration_s: float
@@ -149,10 +143,8 @@ class ProfiledAxis:
 
         u = (1 + s) ff(v*) + Kp e + Kd (v* - v),    ds/dt = Kp e v* / (v_max^2 tau).
 
-    ff takes the servo's lag T out, so that the error obeys T e'' + (1 + Kd) e' + Kp e = 0. s is the share by which the
-    wheels travel further than the body: it acts in proportion to the planned speed and is gone at the end, where an
-    ordinary integral would still have to unwind. Kp e is bounded; where a plan ends further off than that brings home
-    in time, a second motion follows. The derivative is the speed's own estimate, never a difference of poses.
+    ff takes the servo's lag T out: T e'' + (1 + Kd) e' + Kp e = 0. s, the share of slip, acts in proportion to the
+    planned speed and is gone at the end. Kp e is bounded; a plan that ends far off is followed by a second motion.
     """
 
     def __init__(self, gains: PidConfig, cfg: ControlConfig, v_max: float, a_max: float, lag_s: float) -> None:

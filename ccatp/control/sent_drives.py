@@ -17,15 +17,12 @@ REACH_S = 0.25
 class SentDrives:
     """Carries a frame's estimate forward over the drives that are on their way to the wheels.
 
-    The echo tells which drive was in force last and for how long; those sent after it follow one per frame. Each wheel
+    The echo shows which drive was in force last and for how long; those sent after it follow one per frame. Each wheel
     is a first-order servo, so with a set point u over t
 
-        v(t) = u + (v - u) exp(-t/T),    mean = u + (v - u) (T/t) (1 - exp(-t/T)),
+        v(t) = u + (v - u) exp(-t/T),    mean = u + (v - u) (T/t) (1 - exp(-t/T)).
 
-    and the body goes on along the mean heading, carried off by the drift per metre of travel.
-
-    Attributes:
-        newest, rates: number of the drive that was sent last, and its set points (right, left), rad/s.
+    ``newest``, ``rates``: number and set points (right, left), rad/s, of the drive that was sent last.
     """
 
     def __init__(self, robot: RobotConfig, frame_s: float) -> None:
@@ -61,10 +58,7 @@ class SentDrives:
             self._left_high = left_rad_s
 
     def take_span(self) -> tuple[float, float, float, float]:
-        """Lowest and highest rate of the right and of the left wheel since the last call, rad/s.
-
-        The next span begins with the drive in force.
-        """
+        """Lowest and highest rate of right and left wheel since the last call, rad/s, the drive in force included."""
         span = self._right_low, self._right_high, self._left_low, self._left_high
         self._right_low = self._right_high = self.rates[0]
         self._left_low = self._left_high = self.rates[1]
@@ -80,11 +74,10 @@ class SentDrives:
         is_held: bool,
         creep: tuple[float, float] = (0.0, 0.0),
     ) -> Predicted:
-        """The state in which the next command will find the robot.
+        """The state in which the next command will find the robot; ``creep``: drift per metre in the plane of ``pose``.
 
-        ``pose`` is (x, y, heading) in any plane, ``creep`` the drift per metre in it. ``echo_seq`` is the drive in
-        force (-1: none) and ``echo_age_s`` its age; ``is_held``: the robot holds its wheels whatever was sent, and they
-        run down.
+        ``echo_seq`` is the drive in force (-1: none) and ``echo_age_s`` its age; wheels of a robot that ``is_held`` run
+        down whatever was sent.
         """
         sent, frame_s = self._sent, self._frame_s
         while len(sent) > 1 and sent[1][0] <= echo_seq:

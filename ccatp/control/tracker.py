@@ -20,11 +20,7 @@ Speeds = Twist | Predicted | None
 
 
 class LegView(msgspec.Struct, frozen=True):
-    """The line as seen from the robot.
-
-    ``beside_m``: how far the robot stands to the left of it; ``gain``: progress along it per metre that the wheels
-    drive.
-    """
+    """The line from the robot, ``beside_m`` to the left of it; ``gain``: progress per metre that the wheels drive."""
 
     ahead_m: float
     beside_m: float
@@ -88,14 +84,11 @@ def crab(course_rad: float, creep: Vector2) -> float:
 
 
 def line_rate(sight: LegView, v_m_s: float, cross_gain_rad_m2: float, heading_weight_1_s2: float) -> float:
-    """Angular rate of the optimal regulator of ``e' = v theta, theta' = omega``, rad/s.
+    """Angular rate of the optimal regulator of ``e' = v theta, theta' = omega``, rad/s; see docs/mathematics.md.
 
-    Minimising the integral of ``(g v e)^2 + w theta^2 + omega^2`` the Riccati equation is solved by
+        omega = -g v e - sqrt(w + 2 g v^2) theta
 
-        omega = -g v e - sqrt(w + 2 g v^2) theta.
-
-    The weight of e grows with the speed: a robot that has all but stopped cannot remove it, and would only turn. With
-    g = ``cross_gain_rad_m2`` the error decays over about 1/sqrt(g) of travel.
+    With g = ``cross_gain_rad_m2`` the error decays over about 1/sqrt(g) of travel.
     """
     gain = cross_gain_rad_m2 * v_m_s
     return -gain * sight.beside_m - sqrt(heading_weight_1_s2 + 2.0 * gain * v_m_s) * sight.off_rad
@@ -158,10 +151,9 @@ class _Pace:
 class LegTracker:
     """Drives one leg: turn in place to the bearing of the target, then move to it, forward or in reverse.
 
-    Pose, target and creep (drift per metre of travel) are in one plane, usually the panel frame, which may change from
-    step to step. A shaped set of gains drives along the line from where the drive begins; the thesis's heads for the
-    stop. The tracker keeps nothing: each step takes the motion and returns the next one. ``slow_limits``: of motions
-    that begin with ``is_slow``.
+    Pose, target and creep (drift per metre of travel) are in one plane, which may change from step to step. A shaped
+    set of gains drives along the line from where the drive begins; the thesis's heads for the stop. ``slow_limits``: of
+    motions that begin with ``is_slow``.
     """
 
     def __init__(

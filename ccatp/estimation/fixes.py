@@ -92,10 +92,8 @@ def relocated(
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (n,) and covariance (n, n) of a state whose position was wrong; wheel angles count from here.
 
-    The heading loses its certainty, not its value. The way since the position was measured is taken from the wrong
-    estimate: wrong about where it began, not about what the wheels did. ``residual`` (2,) and ``variance`` (2, 2), m^2,
-    are of the position; ``tilt_variance_m2`` is what the panel's tilt does to the puck's place, each way; ``is_lost``:
-    the filter has stood still meanwhile, and the speeds are not known either.
+    The heading loses its certainty, not its value. ``residual`` (2,) and ``variance`` (2, 2), m^2, are of the position;
+    ``tilt_variance_m2`` is what the panel's tilt does to the puck's place; ``is_lost``: speeds are not known either.
     """
     x, P = mean.copy(), covariance.copy()
     heading_rad2 = float(P[PSI, PSI]) + heading_variance_rad2

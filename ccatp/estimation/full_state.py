@@ -36,19 +36,11 @@ _NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under t
 
 
 class FullStateLocalizer(LocalizerBase):
-    """Estimates pose, speeds, sensor errors, slip and creep with one filter of ``STATES`` states, deck frame.
+    """Estimates pose, speeds, sensor errors, slip and creep with one filter, deck frame; see docs/localization.md.
 
-    Frames are gathered into blocks; the filter takes a block in one step, and dead reckoning carries the pose from
-    frame to frame in between. A transition of an edge sensor ends a block and is a line at a panel's edge; a fix of the
-    puck is a position. Both correct the whole state through its covariance, so two fixes in a row give the heading. At
-    true rest the speeds are zero and the inertial unit shows its biases. When the robot drives off, slip and creep are
-    drawn from what the legs so far showed.
-
-    Attributes:
-        pose: estimated pose, in the frame of the panel under the robot.
-        speed_m_s, rate_rad_s: estimated forward speed and angular rate.
-        creep: estimated downhill drift per metre of travel, in the plane of ``pose``.
-        position_sigma_m: standard deviation of the position along its worst direction, at the last step of the filter.
+    Frames are gathered into blocks, which the filter takes in one step; dead reckoning carries the pose from frame to
+    frame. ``pose`` is in the frame of the panel under the robot, ``creep`` the downhill drift per metre of travel in
+    its plane; ``position_sigma_m`` is along the worst direction, at the last step of the filter.
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, start: PanelPose, wrap: FilterWrap = unwrapped) -> None:

@@ -56,9 +56,7 @@ def use_samples(times_s: Sequence[float], oldest_s: float, *sources: SampleSourc
 class SampleValidator:
     """Picks the usable IMU and encoder samples of a frame and counts the others by reason in ``counts``.
 
-    The reasons: ahead, late (older than ``history_s``), duplicate, backward, nonfinite (or larger than any sensor can
-    show), too_fast. ``backward_source`` names a sensor that has sent ``BACKWARD_LIMIT`` backward time stamps in a row,
-    until it is emptied.
+    ``backward_source`` names a sensor that has sent ``BACKWARD_LIMIT`` backward time stamps in a row, until emptied.
     """
 
     def __init__(self, history_s: float, largest_rate_rad_s: float, counts: dict[str, int]) -> None:
@@ -198,11 +196,9 @@ class LocalizerBase(ABC):
     def step(
         self, t_s: float, imu: ImuReadings, encoders: Sequence[WheelSample], edges: Edges, gravity: Gravity = None
     ) -> None:
-        """Take one sensors frame of robot time ``t_s``, to which the pose belongs afterwards.
+        """Take one sensors frame of robot time ``t_s``: any number of samples of each kind, oldest first.
 
-        Any number of samples of each kind, each with its own time, oldest first. Unusable ones are dropped and counted;
-        a frame that is not newer than the last one changes nothing. ``gravity``: its direction in the robot frame,
-        where it was read.
+        Unusable ones are dropped and counted; a frame that is not newer than the last one changes nothing.
         """
         last_s = self.t_s
         dt_s = t_s - last_s
@@ -236,8 +232,7 @@ class LocalizerBase(ABC):
     def _is_new_time_base(self, t_s: float) -> bool:
         """Whether a frame that does not continue the last one is used all the same; if not, it is counted.
 
-        A single frame from elsewhere (replayed, corrupted) changes nothing; the second one in a row that continues it
-        shows that the robot's clock itself has jumped.
+        A single frame from elsewhere changes nothing; the second one that continues it shows that the clock has jumped.
         """
         if not isfinite(t_s) or -MAX_FRAME_STEP_S <= t_s - self.t_s <= 0.0:
             self._stale_run += 1
@@ -270,16 +265,10 @@ class LocalizerBase(ABC):
 
     @abstractmethod
     def _resync(self, t_s: float, last_s: float) -> None:
-        """Go on in a new time base that begins at ``t_s``; ``last_s`` is the end of the old one, -inf at the start.
-
-        The pose does not step; what may have happened meanwhile goes to the covariance.
-        """
+        """Begin a time base at ``t_s``, after ``last_s`` of the old one (-inf: none); the pose does not step."""
 
     @abstractmethod
     def _use(
         self, dt_s: float, imu: ImuReadings, right: WheelReadings, left: WheelReadings, edges: Edges, gravity: Gravity
     ) -> None:
-        """Bring the filter to ``t_s``, ``dt_s`` after the last frame (0 in a new time base). May diverge.
-
-        A frozen filter stays as it is.
-        """
+        """Bring a filter, if not frozen, to ``t_s``, ``dt_s`` after the last frame (0 in a new base); may diverge."""

@@ -1,8 +1,4 @@
-"""Dead reckoning: the arc of one step, the path driven lately, the pose between filter steps, preintegration.
-
-The odometer's frame is arbitrary but rigid: neither a fix nor a hand-over between panels moves it, so displacements
-and turns between two recent times can be read off it whatever happened to the pose in between.
-"""
+"""Dead reckoning: the arc of one step, the path driven lately, the pose between filter steps, preintegration."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -26,11 +22,9 @@ class OdometryPose(NamedTuple):
 
 
 def arc_step(v_m_s: float, heading_rad: float, turn_rad: float, dt_s: float) -> tuple[float, float]:
-    """Displacement (dx, dy), m, over one step at constant speed and rate from ``heading_rad`` on.
+    """Chord (dx, dy), m, of an arc from ``heading_rad`` on: v dt sinc(turn/2) at heading + turn/2.
 
-    The chord of the arc: v dt sinc(turn/2) in the direction heading + turn/2. For a small step it becomes
-    (v dt cos theta, v dt sin theta), which is what thesis eq. 2.14 means; the thesis prints ``v cos(theta dt)``, with
-    the time step inside the cosine and missing on the speed.
+    Thesis eq. 2.14 as it was meant; printed it has the time step inside the cosine and none on the speed.
     """
     half = 0.5 * turn_rad
     # Below _SMALL_RAD the series 1 - half^2/6 is exact to the last digit, and 0/0 is avoided.
@@ -39,10 +33,7 @@ def arc_step(v_m_s: float, heading_rad: float, turn_rad: float, dt_s: float) -> 
 
 
 class Odometer:
-    """The path of the last ``history_s``, and the whole of the standstill before it.
-
-    A standstill keeps two entries however long it lasts, so a fix that took its time is still found.
-    """
+    """The path of the last ``history_s``, and the whole of the standstill before it, in a frame that nothing moves."""
 
     def __init__(self, history_s: float) -> None:
         self._history_s = history_s
@@ -92,9 +83,7 @@ class Odometer:
 
 
 class PosePredictor:
-    """Deck pose and speeds at the present frame: the filter's state at its last step, and dead reckoning since.
-
-    Same motion as ``SurveyMotion``, with slip, scale errors and ground as the filter knew them at its last step.
+    """Deck pose and speeds now: the filter's state at its last step, and ``SurveyMotion`` by dead reckoning since.
 
     The speeds come from an observer of fixed gain: the filter's acceleration carries the speed on, the wheels' travel
     corrects it by as much as their resolution is worth; the rate is the mean of wheels and gyroscope by their noise.
@@ -165,10 +154,7 @@ class PosePredictor:
 
 
 class PreintegratedMotion(NamedTuple):
-    """What consecutive frames say together.
-
-    Mean angular rate, and mean acceleration from the middle of the block before.
-    """
+    """Of consecutive frames: mean angular rate, and mean acceleration from the middle of the block before."""
 
     dt_s: float
     turning_s: float
@@ -178,11 +164,10 @@ class PreintegratedMotion(NamedTuple):
 
 
 class Preintegrator:
-    """Gathers frames into blocks.
+    """Gathers frames into blocks, in which the path is an arc.
 
-    Wheel angles are exact over any time, and a mean of n rates tells as much as n rates, so nothing is lost as long as
-    the path is an arc. V and W are means over a step: the mean rate is that of the samples by the trapezoid rule, the
-    difference of two mean speeds is the mean acceleration from middle to middle.
+    The mean rate is that of the samples by the trapezoid rule, the difference of two mean speeds the mean acceleration
+    from middle to middle.
     """
 
     def __init__(self) -> None:
@@ -251,10 +236,9 @@ _ENOUGH = 200  # frames, or with a counter counts, after which the period and a 
 class WheelAngle:
     """The angle of one wheel since ``rebase``, the sum of its rate samples.
 
-    A counting encoder gives the counts of a sampling period over its length: the sum of rate times period is the
-    counted angle, exact to a count however long the drive. An analogue one gives a rate with white noise at an instant:
-    the trapezoid rule sums it. Which one it is shows at rest, where a counter gives nothing but zeros.
-    ``noise_rad2_s2``: variance of a rate sample at rest, None until it was seen at rest.
+    Of a counting encoder the sum of rate times period is exact to a count; the noisy rate of an analogue one is summed
+    by the trapezoid rule. At rest only a counter gives nothing but zeros. ``noise_rad2_s2``: variance of a sample at
+    rest, None until it was seen.
     """
 
     def __init__(self) -> None:

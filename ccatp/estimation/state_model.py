@@ -16,7 +16,7 @@ from ccatp.mirror.mirror import Mirror
 
 
 class Affine:
-    """x <- F x + b, F (n, n), b (n,), as a ``Transition`` for the nonlinear filters."""
+    """x <- F x + b, F (n, n), b (n,), as a model for the nonlinear filters."""
 
     def __init__(self, F: FloatArray, b: FloatArray) -> None:
         self._F, self._b = F, b

@@ -46,31 +46,17 @@ class Innovation(msgspec.Struct, frozen=True, gc=False):
         return len(self.rows)
 
 
-class Transition(Protocol):
-    """A nonlinear process model x <- f(x); angles are continuous in the state, nothing wraps.
+class FilterModel(Protocol):
+    """A nonlinear process model x <- f(x) or measurement model z = f(x) + noise; nothing wraps, nor needs to.
 
-    The returned arrays are the model's work space: they hold until its next call, and a filter does not change or keep
-    them.
+    The returned arrays are the model's work space: they hold until its next call, and a filter does not change them.
     """
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """f(x), shape (n,), and its Jacobian df/dx at x, shape (n, n)."""
+        """f(x), shape (m,), and its Jacobian at x, shape (m, n)."""
 
     def through(self, X: FloatArray) -> FloatArray:
-        """Image f of each row of X (k, n), shape (k, n)."""
-
-
-class Observation(Protocol):
-    """A nonlinear measurement model z = h(x) + noise; z - h(x) needs no wrapping.
-
-    Arrays are work space as in ``Transition``.
-    """
-
-    def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """h(x), shape (m,), and its Jacobian dh/dx at x, shape (m, n)."""
-
-    def through(self, X: FloatArray) -> FloatArray:
-        """Image h of each row of X (k, n), shape (k, m)."""
+        """Image f of each row of X (k, n), shape (k, m)."""
 
 
 class Filter(Protocol):
@@ -95,13 +81,13 @@ class Filter(Protocol):
         At first the identity.
         """
 
-    def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
+    def predict(self, F: FloatArray | FilterModel, Q: FloatArray) -> None:
         """Advance the state: x <- F x, P <- F P F^T + Q (thesis eqs 2.5, 2.6), or the same with a nonlinear f.
 
         F and Q have shape (n, n). Raises ``FilterShapeError`` and ``FilterDiverged`` (not finite).
         """
 
-    def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
+    def update(self, z: FloatArray, H: FloatArray | FilterModel, R: FloatArray) -> Innovation:
         """Condition the state on z = H x + noise (thesis eqs 2.7 to 2.10), or on z = h(x) + noise.
 
         z (m,), m = 0 leaves the prediction; H (m, n) or a model; R variances (m,) or covariance (m, m). Raises

@@ -14,10 +14,9 @@ from ccatp.filters.base import (
     HUGE,
     NEGATIVITY,
     FilterDiverged,
+    FilterModel,
     FilterShapeError,
     Innovation,
-    Observation,
-    Transition,
     check_rows,
     checked_gaussian,
 )
@@ -121,7 +120,7 @@ class KalmanFilter:
         """Re-initialise with copies of ``mean`` (n,) and ``covariance`` (n, n); see ``Filter.reset``."""
         self._start(*checked_gaussian(mean, covariance, self._shape))
 
-    def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
+    def predict(self, F: FloatArray | FilterModel, Q: FloatArray) -> None:
         """Advance by F (n, n) and Q (n, n), thesis eqs 2.5 and 2.6; see ``Filter.predict``."""
         x = None
         if F is not self._checked_F or Q is not self._checked_Q:
@@ -140,7 +139,7 @@ class KalmanFilter:
             np.negative(x, self._minus_x)
         self._mean = self._covariance = None
 
-    def _check_transition(self, F: FloatArray | Transition, Q: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+    def _check_transition(self, F: FloatArray | FilterModel, Q: FloatArray) -> tuple[FloatArray, FloatArray | None]:
         """F, and of a model f(x); both arrays are as they shall be."""
         name, x = "F", None
         if not isinstance(F, ndarray):
@@ -157,7 +156,7 @@ class KalmanFilter:
         self._checked_F, self._checked_Q = F, Q
         return F, x
 
-    def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
+    def update(self, z: FloatArray, H: FloatArray | FilterModel, R: FloatArray) -> Innovation:
         """Condition on z (m,) = H x + noise, thesis eqs 2.7 to 2.10; see ``Filter.update``."""
         expected = None
         rows = self._rows.get(z.shape)
@@ -192,7 +191,7 @@ class KalmanFilter:
         return self._rotate(rows, residual, R)
 
     def _check_measurement(
-        self, z: FloatArray, H: FloatArray | Observation, R: FloatArray
+        self, z: FloatArray, H: FloatArray | FilterModel, R: FloatArray
     ) -> tuple[_Rows | None, FloatArray, FloatArray | None]:
         """Buffers, None for no rows, H, and of a model h(x); all arrays fit each other."""
         expected = None

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg.lapack import dgetrf, dgetrs
 
 from ccatp.core import FloatArray
-from ccatp.filters.base import Filter, FilterDiverged, FilterError, FilterShapeError, Transition
+from ccatp.filters.base import Filter, FilterDiverged, FilterError, FilterModel, FilterShapeError
 
 BLOCK = 4096
 """Steps a block of memory holds."""
@@ -66,7 +66,7 @@ class Smoother:
         """Predictions recorded."""
         return self._count
 
-    def predict(self, filter_: Filter, F: FloatArray | Transition, Q: FloatArray) -> None:
+    def predict(self, filter_: Filter, F: FloatArray | FilterModel, Q: FloatArray) -> None:
         """Let the filter predict by F and Q, and keep the step; see ``Filter.predict`` for what it refuses."""
         mean, covariance = filter_.mean, filter_.covariance
         filter_.predict(F, Q)

@@ -5,7 +5,7 @@ from scipy.linalg.blas import ddot, dgemm, dsyrk
 from scipy.linalg.lapack import dpotrf
 
 from ccatp.core import FloatArray
-from ccatp.filters.base import HUGE, FilterDiverged, FilterShapeError, Innovation, Observation, Transition
+from ccatp.filters.base import HUGE, FilterDiverged, FilterModel, FilterShapeError, Innovation
 from ccatp.filters.kalman import KalmanFilter, noise_root, square_root
 
 ALPHA = 1.0
@@ -62,7 +62,7 @@ class UnscentedKalmanFilter(KalmanFilter):
         super().reset(mean, covariance)
         self._predicted = None
 
-    def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
+    def predict(self, F: FloatArray | FilterModel, Q: FloatArray) -> None:
         """Advance by F, a matrix (n, n) or a model, and Q (n, n); see ``Filter.predict``."""
         self._predicted = None
         if isinstance(F, np.ndarray):
@@ -84,7 +84,7 @@ class UnscentedKalmanFilter(KalmanFilter):
         self._mean = self._covariance = None
         self._predicted = dgemm(1.0, (self._offsets * self._roots).T, deviations.T, 0.0, None, 0, 1), L
 
-    def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
+    def update(self, z: FloatArray, H: FloatArray | FilterModel, R: FloatArray) -> Innovation:
         """Condition on z (m,) by H, a matrix (m, n) or a model; see ``Filter.update``."""
         if isinstance(H, np.ndarray):
             return super().update(z, H, R)

@@ -110,10 +110,9 @@ class Mirror(MirrorFrames):
             raise UnknownPanelError(f"{self.name} has no panel in row {panel[0]}, column {panel[1]}") from None
 
     def point_on_deck(self, pid: PointId) -> tuple[float, float]:
-        """Deck (x, y) of a measurement point, m; raises ``UnknownPanelError``, also for a number outside 1 to 9.
+        """Deck (x, y) of a measurement point (thesis fig. 2.2), its nominal offset dropped along the panel's normal, m.
 
-        The nominal offset in the panel's tangent plane is dropped on the surface along the panel's normal. Points are
-        numbered row by row from the panel's lower left (thesis fig. 2.2).
+        Raises ``UnknownPanelError``, also for a number outside 1 to 9.
         """
         if not 1 <= pid.point <= POINTS_PER_PANEL:
             raise UnknownPanelError(f"measurement point {pid.point} of panel {pid[:2]}: numbers run from 1 to 9")
@@ -183,18 +182,14 @@ class Mirror(MirrorFrames):
         return self.world_from_deck((x + height_m * nx, y + height_m * ny, z + height_m * nz))
 
     def foot_of_puck(self, world: Vector3, height_m: float) -> tuple[float, float, float]:
-        """Deck foot (x, y) of a puck at ``world`` and its height above the ideal surface on the drive side, m.
-
-        Raises ``ConvergenceError`` far from the mirror.
-        """
+        """Deck foot (x, y) of a puck and its height above the surface, m; raises ``ConvergenceError`` far from it."""
         x, y, distance = self.surface.foot(self.deck_from_world(world))
         return x, y, distance - height_m
 
     def seam_normal_angle(self, panel: PanelId, axis: Literal["x", "y"], x: float, y: float) -> float:
-        """Angle in the frame of ``panel`` of the normal of a seam line through the deck point (x, y), rad.
+        """Angle in the frame of ``panel`` of the normal of the seam ``axis`` = const through a deck point, rad.
 
-        The seam line is the curve ``axis`` = const on the surface. Its normal is its tangent, (0, 1, fy) or (1, 0, fx),
-        turned within the panel plane to the side on which ``axis`` grows. Raises ``UnknownPanelError``.
+        The normal is the seam's tangent turned within the panel plane to the side on which ``axis`` grows.
         """
         fx, fy = self.surface.gradient(x, y)
         tangent = (0.0, 1.0, fy) if axis == "x" else (1.0, 0.0, fx)

@@ -1,9 +1,4 @@
-"""Misalignment of panels: the model, and the puck on a misaligned panel.
-
-A panel is a rigid body, displaced along its own normal by ``D(x_p, y_p) = piston + tilt x_p + tip y_p`` with (x_p, y_p)
-the panel coordinates of the surface point. Angles are small (100 urad), so the sideways motion of second order is
-left out.
-"""
+"""Misalignment of panels: rigid, by piston + tilt x + tip y along the panel's normal, and the puck on such a panel."""
 
 from dataclasses import dataclass
 from math import sqrt
@@ -33,8 +28,7 @@ def misaligned_puck_world(
 ) -> Vector3:
     """World position of the puck's centre while the robot stands on a misaligned panel, ``p`` before the displacement.
 
-    The surface point moves by D along the panel's normal z, and the surface normal n on which the puck stands turns
-    with the panel: ``n' = n - (tilt x + tip y)`` of the panel's axes, to first order. Raises ``UnknownPanelError``.
+    The surface normal turns with the panel to first order. Raises ``UnknownPanelError``.
     """
     body = mirror.panel(panel)
     point = mirror.surface.point(p.x_m, p.y_m)

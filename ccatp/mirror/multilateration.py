@@ -43,16 +43,11 @@ def multilaterate(
     max_iterations: int = 100,
     tolerance_m: float = 1e-9,
 ) -> RangeSolution:
-    """Weighted least squares position from ranges (m,) to anchors (m, d), d = 2 or 3, m >= d + 1.
+    """Weighted least squares position from ranges (m,) to anchors (m, d), d = 2 or 3; see docs/mathematics.md.
 
-    Minimises sum(((r_i - |x - a_i|) / sigma_i)^2) from ``expected_m`` on by the steps
-    (H^T W H + lambda I) dx = H^T W (r - |x - a|), H_i = (x - a_i)^T / |x - a_i|, W = diag(1 / sigma^2); lambda falls
-    tenfold after a step that lessens the sum and rises tenfold after one that does not (Levenberg 1944). Three to five
-    steps do where the ranges agree.
-
-    Anchors that lie in one plane (in two dimensions: on one line) see two mirror images of the position equally well.
-    The expected position then selects the side: the image on its side of the plane is returned. An expected position
-    in that plane selects none and is refused.
+    Damped Gauss-Newton from ``expected_m`` on: the damping falls tenfold after a step that lessens the sum and rises
+    tenfold after one that does not (Levenberg 1944). Anchors in one plane (in two dimensions: on one line) see two
+    mirror images of the position equally well: the one on the expected position's side is returned.
 
     Raises ``ValueError`` (shapes, numbers that are not finite, sigmas that are not positive) and
     ``MultilaterationError``: too few ranges, a degenerate geometry, no convergence.

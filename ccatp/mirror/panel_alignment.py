@@ -141,10 +141,7 @@ def fit_modes(design: FloatArray, values_m: FloatArray, sigmas_m: FloatArray) ->
 
 
 def gram(modes: Modes, half_m: tuple[float, float]) -> FloatArray:
-    """Mean G of the products of the modes over a panel of half sizes ``half_m``.
-
-    ``c^T G c`` is the mean square of D.
-    """
+    """Mean G of the products of the modes over a panel of half sizes ``half_m``: c^T G c is the mean square of D."""
     x, y = np.meshgrid(_NODES * half_m[0], _NODES * half_m[1])
     weights = np.outer(_NODE_WEIGHTS, _NODE_WEIGHTS).ravel() / 4.0
     at = modes(np.column_stack([x.ravel(), y.ravel()]))
@@ -164,10 +161,7 @@ class Moves(NamedTuple):
 
 
 def adjuster_places(mirror: Mirror, panel: PanelId) -> tuple[tuple[str, ...], FloatArray]:
-    """Names of a panel's adjusters and their (x, y) in the panel frame, shape (a, 2), m.
-
-    Raises ``UnknownPanelError``.
-    """
+    """Names of a panel's adjusters and their (x, y) in the panel frame, shape (a, 2), m."""
     body = mirror.panel(panel)
     found = mirror.adjusters_on_deck(panel)
     places = [body.from_deck(mirror.surface.point(x, y))[:2] for x, y in found.values()]
@@ -193,10 +187,7 @@ class Prices(NamedTuple):
 
 
 def prices(false_alarm: float, points: int, panels: int) -> Prices:
-    """What an explanation costs.
-
-    ``false_alarm``: probability of an outlier by noise on the whole mirror, likewise of a shape.
-    """
+    """What an explanation costs; ``false_alarm``: chance of an outlier, or a shape, by noise on the whole mirror."""
     return Prices(
         float(chdtri(1, false_alarm / max(points, 1))), float(chdtri(_CURVATURES, false_alarm / max(panels, 1)))
     )
@@ -205,9 +196,7 @@ def prices(false_alarm: float, points: int, panels: int) -> Prices:
 def explain(deviations: Deviations, price: Prices) -> tuple[BoolArray, bool]:
     """The cheapest explanation of a panel's deviations: which points count, and whether the curvatures are significant.
 
-    Leaving a point out is the same as giving it a shift of its own, so its price is a chi-square of one degree of
-    freedom. Baarda's data snooping asks the same of one point at a time; a bent panel would make it throw good points
-    away. A panel that cannot be fitted, or has hardly more points than it takes, keeps all of them.
+    A panel that cannot be fitted, or has hardly more points than it takes, keeps all of them.
     """
     count = len(deviations.points)
     target = deviations.values_m / deviations.sigmas_m
@@ -340,10 +329,7 @@ SHAPE = slice(3, 6)
 
 
 class PanelShape(NamedTuple):
-    """Curvatures D_xx, D_xy, D_yy of the displacement and their standard deviations, 1/m, shape (3,).
-
-    ``gain``: chi-square of the rigid fit minus that of the fit with curvatures.
-    """
+    """Curvatures D_xx, D_xy, D_yy and their sigmas, 1/m, shape (3,); ``gain``: what they lessen the chi-square by."""
 
     values_1_m: FloatArray
     sigma_1_m: FloatArray

@@ -20,10 +20,7 @@ _BOX_M = 0.25  # half the side of the square for which edges are picked at a tim
 
 
 class Outline:
-    """Upright edges (x, low y, high y), with the slabs on their left, and level ones (y, low x, high x), m.
-
-    Of the right half of an outline in the deck plane.
-    """
+    """Edges of the right half of an outline, deck plane, m: upright (x, low y, high y), level (y, low x, high x)."""
 
     __slots__ = ("_level", "_upright")
 
@@ -161,10 +158,10 @@ class Rim(Outline):
         )
 
     def _largest_excess_m(self, x0: float, y0: float, x1: float, y1: float) -> float:
-        """Largest distance of a point of the segment from the mirror; 0 when the whole segment lies on it.
+        """Largest distance of a point of the segment from the mirror, 0 on it, by branch and bound.
 
-        Branch and bound: the distance from one box is convex along the segment, so between two points the distance
-        from the union is at most the least over the boxes of the greater of the two end values.
+        The distance from one box is convex along the segment, so between two points the distance from the union is at
+        most the least over the boxes of the greater of the two end values.
         """
         start, end = self._box_distances(x0, y0), self._box_distances(x1, y1)
         best = max(min(start), min(end))
@@ -187,11 +184,7 @@ class Rim(Outline):
 
 
 def build_rim(grid: PanelGrid) -> Rim:
-    """Rim of a panel grid.
-
-    Where a row is wider than its neighbour, the step lies on the wider row's own edge, so that the seam between the
-    two belongs to the mirror only where both have panels.
-    """
+    """Rim of a panel grid; a step between two rows lies on the wider row's own edge."""
     spans = [grid.row_span(row) for row in range(1, grid.rows + 1)]
     slabs: list[Span] = []
     low = spans[0][1]

@@ -135,10 +135,7 @@ class Surface:
         return (1.0 / s, 0.0, fx / s), (-fx * fy / ws, s / w, fy / ws), (-fx / w, -fy / w, 1.0 / w)
 
     def drop(self, start: Vector3, direction: Vector3) -> Vector3:
-        """Point where the line ``start + s direction`` meets the surface near s = 0, deck frame, m.
-
-        Raises ``ConvergenceError``.
-        """
+        """Point where the line ``start + s direction`` meets the surface near s = 0; raises ``ConvergenceError``."""
         x0, y0, z0 = start
         ux, uy, uz = direction
         s = 0.0
@@ -152,12 +149,9 @@ class Surface:
         raise ConvergenceError(f"no surface point on the line through {start} along {direction}")
 
     def foot(self, p: Vector3) -> tuple[float, float, float]:
-        """Foot (x, y) of the perpendicular from ``p`` and the distance d along the normal, > 0 on the drive side.
+        """Foot (x, y) of the perpendicular from ``p`` and distance d along the normal, > 0 on the drive side; deck, m.
 
-        Deck frame, m.
-
-        Solves ``p = S(x, y) + d n(x, y)`` by Newton's iteration; unique while |d| is small against the radius of
-        curvature (more than 30 m on these mirrors). Raises ``ConvergenceError``.
+        Solves ``p = S(x, y) + d n(x, y)`` by Newton's iteration; raises ``ConvergenceError``.
         """
         px, py, pz = p
         x, y = px, py

@@ -14,7 +14,7 @@ from ccatp.config.models import Config
 from ccatp.control.motion_checks import as_standing
 from ccatp.core import DeckPose, FloatArray, IntArray
 from ccatp.estimation.fixes import FixRefused
-from ccatp.filters.base import Filter, FilterError, Innovation, Observation, Transition
+from ccatp.filters.base import Filter, FilterError, FilterModel, Innovation
 from ccatp.filters.metrics import nees, rms
 from ccatp.filters.smoother import ROUNDING, Smoothed, Smoother
 from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
@@ -68,7 +68,7 @@ class RecordingFilter:
         filter_ = self._filter
         self.mean, self.covariance, self.transition = filter_.mean, filter_.covariance, filter_.transition
 
-    def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
+    def predict(self, F: FloatArray | FilterModel, Q: FloatArray) -> None:
         """As ``Filter.predict``."""
         mean, covariance = self.mean, self.covariance
         self._filter.predict(F, Q)
@@ -77,7 +77,7 @@ class RecordingFilter:
         self._past.append(_Past(mean, covariance, (self.transition, self.mean, noise)))
         self.count += 1
 
-    def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
+    def update(self, z: FloatArray, H: FloatArray | FilterModel, R: FloatArray) -> Innovation:
         """As ``Filter.update``."""
         past = _Past(self.mean, self.covariance, None)
         innovation = self._filter.update(z, H, R)

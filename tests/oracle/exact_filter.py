@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ccatp.core import FloatArray
-from ccatp.filters.base import Observation, Transition
+from ccatp.filters.base import FilterModel
 from ccatp.filters.unscented import ALPHA, BETA, KURTOSIS
 
 DIGITS = 50
@@ -32,7 +32,7 @@ class ExactFilter:
     def covariance(self) -> FloatArray:
         return self.P.astype(np.float64)
 
-    def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
+    def predict(self, F: FloatArray | FilterModel, Q: FloatArray) -> None:
         """Eqs 2.5 and 2.6."""
         with localcontext() as context:
             context.prec = DIGITS
@@ -43,7 +43,7 @@ class ExactFilter:
             self.x, slope = line(F, self.x)
             self.P = slope.dot(self.P).dot(slope.T) + decimals(Q)
 
-    def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> float:
+    def update(self, z: FloatArray, H: FloatArray | FilterModel, R: FloatArray) -> float:
         """Eqs 2.7 to 2.10; returns the normalised innovation squared.
 
         S is factored; no row is compared with another.
@@ -80,7 +80,7 @@ class ExactFilter:
         return mean, offsets, images - mean, weights
 
 
-def line(model: FloatArray | Transition | Observation, x: Exact) -> tuple[Exact, Exact]:
+def line(model: FloatArray | FilterModel, x: Exact) -> tuple[Exact, Exact]:
     """Value at x and slope of a model."""
     if isinstance(model, np.ndarray):
         slope = decimals(model)
