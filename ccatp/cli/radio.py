@@ -59,7 +59,7 @@ def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) 
     cfg = getattr(assumed, run.kind)
     try:
         if filter_name == "smoother":
-            return smooth(run, cfg, perf_counter)
+            return smooth(run, cfg, assumed.filter, perf_counter)
         return filter_run(run, cfg, assumed.filter, perf_counter)
     except (FilterError, LinAlgError) as error:
         raise SlamCommandError(

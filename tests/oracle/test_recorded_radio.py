@@ -18,7 +18,8 @@ pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"the recorded radio d
 def smoothed(path: str, robot: int | None = None) -> tuple[RecordedRun, EstimatedPath, TrackEvaluation]:
     """A set through the smoother as it is configured."""
     run = read_run(DATA / path, None, robot)
-    track = smooth(run, getattr(load_recordings_config(), run.kind), time.perf_counter)
+    assumed = load_recordings_config()
+    track = smooth(run, getattr(assumed, run.kind), assumed.filter, time.perf_counter)
     return run, track, judge(track, run)
 
 

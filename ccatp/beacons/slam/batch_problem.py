@@ -122,23 +122,6 @@ class Reckoning:
         return total
 
 
-def carried_on(pose: FloatArray, motion: FloatArray) -> FloatArray:
-    """Poses after one increment each, shape (..., 3)."""
-    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-    x = pose[..., 0] + c * motion[..., 0] - s * motion[..., 1]
-    y = pose[..., 1] + s * motion[..., 0] + c * motion[..., 1]
-    return np.stack([x, y, pose[..., 2] + motion[..., 2]], axis=-1)
-
-
-def chained(first: FloatArray, motion: FloatArray) -> FloatArray:
-    """Poses from the first one on, shape (n + 1, 3), by increments (n, 3)."""
-    heading = first[2] + running_total(motion[:, 2])
-    c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
-    x = first[0] + running_total(c * motion[:, 0] - s * motion[:, 1])
-    y = first[1] + running_total(s * motion[:, 0] + c * motion[:, 1])
-    return np.column_stack([x, y, heading])
-
-
 OF_READINGS = ("range_scale", "range_offset_m", "bearing_offset_rad", "rssi_reference_db", "rssi_exponent")
 # Unknowns that are neither pose nor beacon, in the order of the state: corrections, zero where all is as it should.
 SHARED = (*CALIBRATION, *OF_READINGS)
@@ -245,19 +228,6 @@ class BatchProblem:
         """Of ranges, m^2."""
         variance: FloatArray = self.radio.range_sigma_m**2 + (self.radio.range_sigma_per_m * range_m) ** 2
         return variance
-
-    def distances(self, state: BatchState, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """What readings say of the distance, m, and its variance, m^2: by the range, or by the signal strength."""
-        read, beacon = self.readings, state.beacons[self.readings.beacon[rows]]
-        scale, exponent = 1.0 + state.shared[RANGE_SCALE], self.radio.rssi_exponent + state.shared[RSSI_EXPONENT]
-        reference = self.radio.rssi_reference_dbm + state.shared[RSSI_REFERENCE] + beacon[:, 3]
-        by_range = (read.range_m[rows] - state.shared[RANGE_OFFSET] - beacon[:, 2]) / scale
-        by_rssi = 10.0 ** ((reference - read.rssi_dbm[rows]) / (10.0 * exponent))
-        ranged = np.isfinite(read.range_m[rows])
-        distance = np.maximum(np.where(ranged, by_range, by_rssi), LEAST_RANGE_M)
-        range_variance = self.range_variance(np.where(ranged, read.range_m[rows], 0.0)) / scale**2
-        rssi_variance = (distance * self.radio.rssi_sigma_db / (DB * exponent)) ** 2
-        return distance, np.where(ranged, range_variance, rssi_variance)
 
     def prior_cost(self, state: BatchState) -> float:
         """Half the sum of squares of the priors."""

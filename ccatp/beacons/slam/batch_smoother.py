@@ -1,7 +1,6 @@
 """The smoother of recorded runs: path, beacons and calibration that fit all odometry and all readings best.
 
-Levenberg-Marquardt with noise by Student's t; Cholesky of the arrow-shaped system. It starts from ever longer
-beginnings of the run, which beacons join as they can be placed.
+Levenberg-Marquardt with noise by Student's t; Cholesky of the arrow-shaped system. It starts at what the filter finds.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,26 +11,23 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, c
 
 from ccatp.beacons.slam.batch_problem import (
     BEACON,
-    BEARING_OFFSET,
-    CALIBRATION,
+    RSSI_REFERENCE,
     SHARED,
     ArrowSystem,
     BatchProblem,
     BatchState,
-    Reckoning,
-    carried_on,
-    chained,
 )
-from ccatp.beacons.slam.causal import beyond_priors
+from ccatp.beacons.slam.causal import beyond_priors, follow
 from ccatp.beacons.slam.recording import BeaconFix, BoolArray, Calibrated, EstimatedPath, RecordedRun
-from ccatp.config.beacon_models import RadioNoiseConfig, RecordingConfig
-from ccatp.core import FloatArray, IntArray
+from ccatp.config.beacon_models import RadioNoiseConfig, RecordingConfig, SlamFilterConfig
+from ccatp.core import FloatArray
 
 BLOCK = 3  # x_m, y_m, heading_rad
 BAND = 2 * BLOCK - 1
 LEAST_DAMPING = 1e-9
 MOST_DAMPING = 1e9
 CONVERGED = 1e-5  # relative gain below which a cost has converged
+WELL_CONVERGED = 1e-6  # the same before noise is widened: what has not converged looks like noise
 
 
 class Factored:
@@ -150,21 +146,9 @@ def _step(problem: BatchProblem, state: BatchState, system: ArrowSystem, damping
     return state.moved(poses, problem.spread(shared))
 
 
-STARTS = 48  # directions, around the place of a range's reading, from which a beacon is sought
-PLACING_ITERATIONS = 20
-FREEDOM = 4.0  # of Student's t by which outliers are bounded
-MOST_READINGS = 200  # of one beacon; more are thinned, since first places need no more
-APART = 0.1  # two minima are different places if they lie further apart than that part of the beacon's distance
-FIRST = 40  # instants solved at first
-GROWTH = 1.2  # ratio of the instants solved from one time to the next
-GROWING_ITERATIONS = 6
-ROUGHLY = 1e-3  # relative gain of the cost that is good enough for a beginning of the run
-SURE_MARGIN = 8.0  # half a chi-squared by which a beacon's best place must beat the next one before it joins
-LEAST_READINGS = 4  # of a beacon that joins without bearings
-# Between the places of a beacon's readings without bearings: from a single place it may lie anywhere on a circle.
-LEAST_WAY_M = 0.01
-SURE_SPREAD = 0.15  # largest standard deviation of a beacon that joins, over its distance
 SPACING_S = 0.5  # there is a pose at least that often, with a reading or without
+FAR_OFF = 4.0  # median of the normalised residuals squared, beyond which the noise is first taken for as wide
+ROUGH_ITERATIONS, ROUGHLY = 6, 1e-3
 ITERATIONS = 40
 WIDENINGS = 8
 WIDER = 1.05  # noise is widened where the residuals are larger than it by that factor
@@ -175,54 +159,6 @@ CORRECTING = ("distance_scale", "turn_scale")
 SHOWN_AS = {"delay_s": "odometry_delay_s"}
 
 
-class Placement(NamedTuple):
-    """A beacon's first place."""
-
-    x_m: float
-    y_m: float
-    margin: float  # by how much the next best place costs more (half a chi-squared); infinite if there is none
-    spread: float  # largest standard deviation over the distance of the nearest reading
-
-
-def place_by_distances(poses: FloatArray, distance_m: FloatArray, variance: FloatArray) -> Placement:
-    """Best of the minima of the robust cost of distances, sought from all around the nearest reading.
-
-    A straight path leaves two mirror images that cost the same: see ``margin``. ``poses``: of the readings, shape (m,
-    3). ``distance_m``: to one beacon, shape (m,). ``variance``: of the distances, m^2, shape (m,).
-    """
-    thin = max(1, -(-len(distance_m) // MOST_READINGS))
-    x, y, distance, information = poses[::thin, 0], poses[::thin, 1], distance_m[::thin], 1.0 / variance[::thin]
-    nearest = int(np.argmin(distance))
-    angle = 2.0 * np.pi * np.arange(STARTS) / STARTS
-    bx = x[nearest] + distance[nearest] * np.cos(angle)
-    by = y[nearest] + distance[nearest] * np.sin(angle)
-    reach = float(distance.max())
-    xx = yy = xy = np.ones(STARTS)
-    for _ in range(PLACING_ITERATIONS):
-        dx, dy = bx[:, None] - x, by[:, None] - y
-        r = np.maximum(np.hypot(dx, dy), 1e-3)
-        e, ux, uy = r - distance, dx / r, dy / r
-        w = information * (FREEDOM + 1.0) / (FREEDOM + e * e * information)
-        xx, yy, xy = (w * ux * ux).sum(1), (w * uy * uy).sum(1), (w * ux * uy).sum(1)
-        little = 1e-3 * (xx + yy)  # a straight path that points at the beacon says nothing across
-        xx, yy = xx + little, yy + little
-        gx, gy = (w * ux * e).sum(1), (w * uy * e).sum(1)
-        determinant = xx * yy - xy * xy
-        sx, sy = (yy * gx - xy * gy) / determinant, (xx * gy - xy * gx) / determinant
-        size = np.hypot(sx, sy)
-        short = np.minimum(1.0, 0.3 * reach / np.maximum(size, 1e-12))
-        bx, by = bx - short * sx, by - short * sy
-    e = np.hypot(bx[:, None] - x, by[:, None] - y) - distance
-    cost = (0.5 * (FREEDOM + 1.0) * np.log1p(e * e * information / FREEDOM)).sum(1)
-    best = int(np.argmin(cost))
-    others = np.hypot(bx - bx[best], by - by[best]) > APART * reach
-    margin = float(cost[others].min() - cost[best]) if others.any() else np.inf
-    half_trace, d = 0.5 * (xx[best] + yy[best]), xx[best] * yy[best] - xy[best] ** 2
-    least = half_trace - np.sqrt(max(half_trace**2 - d, 0.0))
-    spread = float(1.0 / np.sqrt(max(least, 1e-12)) / distance[nearest])
-    return Placement(float(bx[best]), float(by[best]), margin, spread)
-
-
 class Start(NamedTuple):
     """Where the smoother begins."""
 
@@ -231,93 +167,36 @@ class Start(NamedTuple):
     doubtful: BoolArray  # those whose mirror image fits nearly as well, shape (b,)
 
 
-def grown(run: RecordedRun, times_s: FloatArray, settings: RecordingConfig) -> Start:
-    """Solve ever longer beginnings of the run.
-
-    ``times_s``: instants of the poses, shape (n,): the readings' and the first of all.
-    """
-    steps, readings, beacons = run.steps, run.readings, len(run.beacon_ids)
-    used, doubtful = np.zeros(beacons, dtype=bool), np.zeros(beacons, dtype=bool)
-    state = BatchState(np.array([run.first_pose]), np.zeros(len(SHARED)), np.zeros((beacons, BEACON)))
-    at = np.searchsorted(times_s, readings.times_s)
-    whole = Reckoning(steps, times_s, delayed=False)
-    n, known = len(times_s), 1
-    while known < n:
-        n_now = min(n, max(FIRST, int(known * GROWTH) + 1))
-        now = readings.where(at < n_now)
-        motion = whole.increments(state.shared[: len(CALIBRATION)], settings.odometry)[0][known - 1 : n_now - 1]
-        state = BatchState(
-            np.concatenate([state.poses[:-1], chained(state.poses[-1], motion)]), state.shared, state.beacons
-        )
-        for _ in range(2):  # what is on the map draws the new poses right, then new beacons are placed by them
-            problem = BatchProblem(steps, now, times_s[:n_now], run.first_pose, settings, used)
-            state = _settled(problem, state, known)
-            joined = _join(problem, state, used, doubtful, last=n_now == n)
-            if not joined:
-                break
-        known = n_now
-    return Start(state, used, doubtful)
-
-
-def _settled(problem: BatchProblem, state: BatchState, known: int) -> BatchState:
-    new = problem.at >= known
-    counted = new & (problem.sizes > 0)
-    for forgiving in (True, False):
-        softness = np.ones(len(problem.at))
-        if forgiving:
-            if not counted.any():
-                continue
-            chi2 = problem.residuals(state).chi2
-            softness[new] = max(1.0, float(np.median(chi2[counted] / problem.sizes[counted])))
-            if softness[new].max(initial=1.0) < 4.0:
-                continue
-        state, _ = descend(problem, state, GROWING_ITERATIONS, softness, enough=ROUGHLY)
-    return state
-
-
-def _join(
-    problem: BatchProblem,
-    state: BatchState,
-    used: BoolArray,
-    doubtful: BoolArray,
-    *,
-    last: bool,
-) -> bool:
-    changed = False
-    readings = problem.readings
-    for beacon in range(len(used)):
-        rows = np.flatnonzero(readings.beacon == beacon)
-        rows = rows[np.isfinite(readings.range_m[rows]) | np.isfinite(readings.rssi_dbm[rows])]
-        pointed = rows[np.isfinite(readings.bearing_rad[rows])]
-        if pointed.size:
-            if not used[beacon]:
-                poses, bearing = state.poses[problem.at[pointed]], readings.bearing_rad[pointed]
-                distance, _ = problem.distances(state, pointed)
-                way = poses[:, 2] + bearing - state.shared[BEARING_OFFSET]
-                pointed_at = poses[:, 0] + distance * np.cos(way), poses[:, 1] + distance * np.sin(way)
-                state.beacons[beacon, :2] = np.median(pointed_at[0]), np.median(pointed_at[1])
-                used[beacon] = changed = True
+def _started(run: RecordedRun, settings: RecordingConfig, how: SlamFilterConfig, times_s: FloatArray) -> Start:
+    """The path, the map and the calibration of the filter; beacons that still wait are where they most likely are."""
+    path, slam = follow(run, settings, how, lambda: 0.0, SPACING_S)
+    poses = np.column_stack([np.interp(times_s, path.times_s, column) for column in path.poses.T])
+    priors, shared = settings.priors, np.zeros(len(SHARED))
+    for name, (value, _) in slam.calibration.items():
+        of_filter = {shown: own for own, shown in SHOWN_AS.items()}
+        shared[SHARED.index(of_filter.get(name, name))] = 1.0 / (1.0 + value) - 1.0 if name in CORRECTING else value
+    count = len(run.beacon_ids)
+    beacons, used, doubtful = np.zeros((count, BEACON)), np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    levels_db = []
+    for k, name in enumerate(run.beacon_ids):
+        waiting = slam.waiting.get(name)
+        if name in slam.beacons:
+            mean = slam.beacons[name].mean
+        elif waiting is not None and waiting.candidates:
+            mean, doubtful[k] = waiting.candidates[0].mean, True
+        else:
             continue
-        # one that is surely placed is looked at again at the end, by all readings
-        if rows.size < LEAST_READINGS or (used[beacon] and not doubtful[beacon] and not last):
-            continue
-        if np.ptp(state.poses[problem.at[rows], :2], axis=0).max() < LEAST_WAY_M:
-            continue
-        distance, variance = problem.distances(state, rows)
-        found = place_by_distances(state.poses[problem.at[rows]], distance, variance)
-        sure = found.margin > SURE_MARGIN and found.spread < SURE_SPREAD
-        doubtful[beacon] = not sure
-        if not sure and (used[beacon] or not last):
-            continue
-        away = np.hypot(found.x_m - state.beacons[beacon, 0], found.y_m - state.beacons[beacon, 1])
-        if used[beacon] and away < APART * distance.max():
-            continue
-        state.beacons[beacon, :2] = found.x_m, found.y_m
-        used[beacon] = changed = True
-    return changed
+        beacons[k, :2], used[k] = mean[:2], True
+        if mean.size > 2 and priors.rssi_reference_db > 0.0:
+            levels_db.append(mean[2] - settings.radio.rssi_reference_dbm)
+    if levels_db:
+        shared[RSSI_REFERENCE] = np.mean(levels_db)
+    return Start(BatchState(poses, shared, beacons), used, doubtful)
 
 
-def smooth(run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], float]) -> EstimatedPath:
+def smooth(
+    run: RecordedRun, settings: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float]
+) -> EstimatedPath:
     """Estimate a whole run at once.
 
     Minimises the negative log posterior of poses at the instants of the readings, beacons and calibration by
@@ -325,14 +204,17 @@ def smooth(run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], fl
     the truth is used but the first pose.
     """
     begin_s, first_radio = clock_s(), settings.radio
-    heard_s = np.union1d(run.readings.times_s, run.steps.times_s[:1])
-    start = grown(run, heard_s, settings)
     steps_s = run.steps.times_s  # there is a pose at each reading, and at an odometry step now and then between them
     _, first = np.unique(np.floor((steps_s - steps_s[0]) / SPACING_S), return_index=True)
     times_s = np.union1d(run.readings.times_s, steps_s[first])
+    start = _started(run, settings, how, times_s)
     problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used)
-    filled = _filled(problem, _anchored(start.state, run.first_pose), np.searchsorted(times_s, heard_s))
-    state, converged = descend(problem, filled, ITERATIONS)
+    counted = problem.sizes > 0
+    off = problem.residuals(start.state).chi2[counted] / problem.sizes[counted]
+    state, softness = start.state, float(np.median(off)) if counted.any() else 0.0
+    if softness > FAR_OFF:
+        state, _ = descend(problem, state, ROUGH_ITERATIONS, softness, enough=ROUGHLY)
+    state, converged = descend(problem, state, ITERATIONS, enough=WELL_CONVERGED)
     for _ in range(WIDENINGS):
         radio = _widened(problem, state)
         if radio == problem.radio:
@@ -346,7 +228,6 @@ def smooth(run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], fl
     size = problem.free.size
     covariance = np.zeros((size, size))
     covariance[np.ix_(problem.free, problem.free)] = factored.shared_covariance()
-    counted = problem.sizes > 0
     updates = int(counted.sum())
     beacons = {}
     for k in np.flatnonzero(start.used).tolist():
@@ -371,31 +252,6 @@ def smooth(run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], fl
         updates=updates,
         warnings=tuple(warnings),
     )
-
-
-def _anchored(state: BatchState, first_pose: tuple[float, float, float]) -> BatchState:
-    """The state moved as a whole, so that it begins at the first pose: nothing but the prior of that is another."""
-    x_m, y_m, heading_rad = state.poses[0].tolist()
-    turn = first_pose[2] - heading_rad
-    c, s = np.cos(turn), np.sin(turn)
-
-    def moved(points: FloatArray) -> FloatArray:
-        dx, dy = points[:, 0] - x_m, points[:, 1] - y_m
-        return np.column_stack([first_pose[0] + c * dx - s * dy, first_pose[1] + s * dx + c * dy])
-
-    poses = np.column_stack([moved(state.poses), state.poses[:, 2] + turn])
-    return BatchState(poses, state.shared, np.column_stack([moved(state.beacons), state.beacons[:, 2:]]))
-
-
-def _filled(problem: BatchProblem, state: BatchState, known: IntArray) -> BatchState:
-    motion = problem.reckoning.increments(state.shared[: len(CALIBRATION)], problem.odometry)[0]
-    poses = np.empty((len(motion) + 1, 3))
-    poses[known] = state.poses
-    is_known = np.zeros(len(poses), dtype=bool)
-    is_known[known] = True
-    for k in np.flatnonzero(~is_known).tolist():
-        poses[k] = carried_on(poses[k - 1], motion[k - 1])
-    return BatchState(poses, state.shared, state.beacons)
 
 
 def _widened(problem: BatchProblem, state: BatchState) -> RadioNoiseConfig:

@@ -17,7 +17,6 @@ from ccatp.beacons.slam.beacon_map import (
     NoiseLevel,
 )
 from ccatp.beacons.slam.landmark_init import (
-    FLAT,
     LEAST,
     LINEARISATIONS,
     TRIAL,
@@ -88,6 +87,8 @@ class BeaconSlam:
         unplaced: directions alone, of beacons that were not on the map then: they are not used.
         moved: beacons that had to be placed again, each with the time_s of the reading that decided it.
     """
+
+    flat = 100.0  # standard deviation of a beacon's place before its readings, relative to its distance
 
     def __init__(
         self, motion: DifferentialDrive | SlippingVehicle, models: MeasurementModels, how: SlamFilterConfig,
@@ -239,7 +240,7 @@ class BeaconSlam:
 
     def _prior_at(self, waiting: PendingLandmark, x_m: float, y_m: float) -> BeaconEstimate:
         last = waiting.records[-1]
-        extra, sigma_m = self._models.by_kind[scalars_of(last.reading)[-1][0]].extra_prior, FLAT * last.distance_m
+        extra, sigma_m = self._models.by_kind[scalars_of(last.reading)[-1][0]].extra_prior, self.flat * last.distance_m
         means, sigmas = zip((x_m, sigma_m), (y_m, sigma_m), *extra, strict=True)
         return BeaconEstimate(np.array(means), np.diag(np.square(sigmas)))
 

@@ -106,7 +106,7 @@ class HeadingRelocalizer:
         self.best, *self._others = (slams[k] for _, k in kept)
 
 
-FINEST_S = 0.1  # steps of odometry shorter than that are put together
+FINEST_S = 0.1
 # Mean square of normalised innovations, per degree of freedom, that is reported: of learned noise it is one.
 DOUBTFUL_NIS = 1.3
 DOUBTFUL_JUMPS = 0.003  # how often the pose has to be doubted, for each reading, that it is reported
@@ -117,10 +117,24 @@ def filter_run(
     run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float]
 ) -> EstimatedPath:
     """Run the filter over a recording; nothing of the truth is used but the first pose."""
+    return follow(run, cfg, how, clock_s)[0]
+
+
+def follow(
+    run: RecordedRun,
+    cfg: RecordingConfig,
+    how: SlamFilterConfig,
+    clock_s: Callable[[], float],
+    finest_s: float = FINEST_S,
+) -> tuple[EstimatedPath, BeaconSlam]:
+    """The path by the filter, and the filter as it is at the end.
+
+    ``finest_s``: steps of odometry shorter than that are put together.
+    """
     position, heading = cfg.priors.pose_m, cfg.priors.heading_rad
     first = np.diag((position**2, position**2, heading**2))
     search = HeadingRelocalizer(recorded_slam(cfg, how, run.first_pose, first))
-    times = np.union1d(_spaced(run.steps.times_s), run.readings.times_s)
+    times = np.union1d(_spaced(run.steps.times_s, finest_s), run.readings.times_s)
     increments, readings = _increments(run.steps, times), list(_readings(run))
     ends = np.searchsorted([reading.time_s for reading in readings], times, side="right").tolist()
     poses, covariances = np.empty((len(times), 3)), np.empty((len(times), 3, 3))
@@ -152,7 +166,7 @@ def filter_run(
         name: Calibrated(*found) for name, found in slam.calibration.items() if found[1] < UNCHANGED * priors[name]
     }
     beacons = slam.beacons.items()
-    return EstimatedPath(
+    path = EstimatedPath(
         times_s=times,
         poses=poses,
         covariances=covariances,
@@ -169,6 +183,7 @@ def filter_run(
             *_unplaced(run, slam), *beyond_priors(calibration, priors, run.kind), *_doubts(slam, nis, sizes, refused)
         ),
     )  # fmt: skip
+    return path, slam
 
 
 def _doubts(slam: BeaconSlam, nis: FloatArray, sizes: FloatArray, refused: int) -> Iterator[str]:
@@ -203,8 +218,8 @@ def _unplaced(run: RecordedRun, slam: BeaconSlam) -> Iterator[str]:
         yield f"{early} had no range or strength of the same time and came before their beacon was placed"
 
 
-def _spaced(times_s: FloatArray) -> FloatArray:
-    _, first = np.unique(np.floor((times_s - times_s[0]) / FINEST_S), return_index=True)
+def _spaced(times_s: FloatArray, finest_s: float) -> FloatArray:
+    _, first = np.unique(np.floor((times_s - times_s[0]) / finest_s), return_index=True)
     return np.union1d(times_s[first], times_s[-1:])
 
 

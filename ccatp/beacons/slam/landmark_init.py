@@ -40,7 +40,6 @@ MARGIN = 14.0 + 2.0 * KNEE**2
 # (Birge's ratio): with less noise in the settings than there is, no beacon would ever join.
 FIT = 6.0
 LINEARISATIONS = 8  # at most; Gauss-Newton on readings that a beacon joined by comes to rest within five
-FLAT = 100.0  # standard deviation of a beacon's place before its readings, relative to its distance
 TRIAL = 2  # readings that must agree with the one that a beacon joined by: a misread name would put it anywhere
 
 

@@ -103,6 +103,8 @@ class SignalSlam(BeaconSlam):
     The vehicle begins at the believed start of the configuration, which defines the frame of the map.
     """
 
+    flat = 10.0
+
     def __init__(self, cfg: RadioConfig) -> None:
         start, loss, estimator, room_m = cfg.start, cfg.path_loss, cfg.estimator, cfg.workspace.size_m
         # Static shadowing without a map of it counts as white noise.

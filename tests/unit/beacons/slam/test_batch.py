@@ -173,7 +173,7 @@ def test_readings_that_share_their_error_are_counted() -> None:
     assert repeats(readings, 0.0).tolist() == [1.0] * 5
 
 
-SETTINGS = load_recordings_config().csv
+SETTINGS, HOW = load_recordings_config().csv, load_recordings_config().filter
 
 
 def no_clock() -> float:
@@ -214,7 +214,7 @@ def run_of(seed: int, *, bearings: bool, seconds: float = 120.0, **wrong: float)
 def test_path_beacons_and_calibration_are_found(bearings: bool) -> None:
     run = run_of(3, bearings=bearings, distance_scale=1.02, bias_rad_s=0.008)
     long = replace(run, readings=run.readings._replace(range_m=1.04 * run.readings.range_m + 0.15))
-    track = smooth(long, SETTINGS, no_clock)
+    track = smooth(long, SETTINGS, HOW, no_clock)
     found = judge(track, long)
     assert found.trajectory_rmse_m == pytest.approx(0.0, abs=0.08)  # less than the noise of one range
     assert found.beacon_rmse_m == pytest.approx(0.0, abs=0.1)
@@ -241,7 +241,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
         exact = ("distance_scale", "turn_scale", "turn_per_m", "turn_bias_rad_s", "range_scale", "range_offset_m")
         tight = with_priors(**dict.fromkeys(exact, 0.0), pose_m=1e-3, heading_rad=1e-3).priors
         gaussian = SETTINGS.radio.model_copy(update={"freedom": 1e6, "range_sigma_per_m": 0.0})
-        track = smooth(run, SETTINGS.model_copy(update={"radio": gaussian, "priors": tight}), no_clock)
+        track = smooth(run, SETTINGS.model_copy(update={"radio": gaussian, "priors": tight}), HOW, no_clock)
         judged = judge(track, run)
         assert judged.nees is not None
         paths.append(judged.nees.mean)
@@ -263,7 +263,7 @@ def test_outliers_hardly_move_it() -> None:
     ranges = np.where(wild, run.readings.range_m + rng.uniform(2.0, 6.0, wild.size), run.readings.range_m)
     bearings = np.where(wild, rng.uniform(-3.0, 3.0, wild.size), run.readings.bearing_rad)
     hit = replace(run, readings=run.readings._replace(range_m=ranges, bearing_rad=bearings))
-    clean, found = smooth(run, SETTINGS, no_clock), smooth(hit, SETTINGS, no_clock)
+    clean, found = smooth(run, SETTINGS, HOW, no_clock), smooth(hit, SETTINGS, HOW, no_clock)
     assert judge(clean, run).trajectory_rmse_m == pytest.approx(0.0, abs=0.06)
     assert judge(found, hit).trajectory_rmse_m == pytest.approx(0.0, abs=0.08)
     assert found.refused > 0.8 * wild.sum()
@@ -276,7 +276,7 @@ def test_signal_strengths_alone_place_beacons() -> None:
     rssi = -43.0 - 10.0 * 2.1 * np.log10(w.range_m) + 2.0 * rng.standard_normal(w.range_m.size)
     nothing = np.full(rssi.size, np.nan)
     heard = replace(run, readings=run.readings._replace(range_m=nothing, rssi_dbm=rssi))
-    track = smooth(heard, SETTINGS, no_clock)
+    track = smooth(heard, SETTINGS, HOW, no_clock)
     judged = judge(track, heard)
     assert judged.beacon_rmse_m == pytest.approx(0.0, abs=0.6)  # 2 dB are a quarter of the distance
     assert set(track.calibration) >= {"rssi_reference_db", "rssi_exponent"}
@@ -296,7 +296,7 @@ def test_commands_that_the_vehicle_follows_late() -> None:
     inside = lagged.readings.times_s < steps.times_s[-1]
     lagged = replace(lagged, steps=steps, readings=lagged.readings.where(inside))
     settings = with_priors(delay_s=0.3)
-    delay, sigma = smooth(lagged, settings, no_clock).calibration["odometry_delay_s"]
+    delay, sigma = smooth(lagged, settings, HOW, no_clock).calibration["odometry_delay_s"]
     assert delay == pytest.approx(0.25, abs=max(4.0 * sigma, 0.02))
 
 
@@ -309,7 +309,7 @@ def test_a_straight_path_leaves_the_side_in_doubt() -> None:
     places = np.array(list(BEACONS.values()))[w.read_beacon]
     ranges = np.hypot(places[:, 0] - sx, places[:, 1] - 1.0)
     straight = changed(w, poses=poses, distance_m=np.full(n, 0.05), turn_rad=np.zeros(n), range_m=ranges)
-    track = smooth(recorded(straight, bearings=False), SETTINGS, no_clock)
+    track = smooth(recorded(straight, bearings=False), SETTINGS, HOW, no_clock)
     assert "beacon 7 may lie at its mirror image" in " ".join(track.warnings)
 
 
@@ -319,7 +319,7 @@ def test_a_robot_that_stands_places_no_beacon() -> None:
     stood = changed(
         w, poses=np.zeros((n + 1, 3)), distance_m=np.zeros(n), turn_rad=np.zeros(n), range_m=0.0 * w.range_m + 3.0
     )
-    track = smooth(recorded(stood, bearings=False), SETTINGS, no_clock)
+    track = smooth(recorded(stood, bearings=False), SETTINGS, HOW, no_clock)
     assert track.beacons == {}
     assert np.isfinite(track.covariances).all()
     assert sum("or all from one place" in warning for warning in track.warnings) == len(BEACONS)

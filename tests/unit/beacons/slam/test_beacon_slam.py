@@ -323,7 +323,7 @@ def no_clock() -> float:
 def by_both(run: RecordedRun, **priors: float) -> list[EstimatedPath]:
     """The run by filter and smoother, with other priors."""
     cfg = CONFIG.csv.model_copy(update={"priors": CONFIG.csv.priors.model_copy(update=priors)})
-    return [filter_run(run, cfg, CONFIG.filter, no_clock), smooth(run, cfg, no_clock)]
+    return [filter_run(run, cfg, CONFIG.filter, no_clock), smooth(run, cfg, CONFIG.filter, no_clock)]
 
 
 def test_filter_and_smoother_mean_the_same_by_a_name() -> None:
