@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.cricket.map_fit import MapModel
-from ccatp.beacons.cricket.range_network import RigidBody
+from ccatp.beacons.cricket.range_network import RigidBody, components
 from ccatp.beacons.cricket.rigidity import Freedom, find_fold_over, find_freedom, generic_state
 from tests.unit.beacons.cricket.fields import ADJACENT, ALL, HEADS, ZIGZAG, FloatArray, Pairs, near_pairs, network_of
 
@@ -156,12 +156,8 @@ def test_random_graphs_against_hendricksons_conditions() -> None:
 
 
 def connected(count: int, pairs: Pairs, without: set[int]) -> bool:
-    left = set(range(count)) - without
-    reached, edge = set(), {min(left)}
-    while edge:
-        reached |= edge
-        edge = {b for pair in pairs for a, b in (pair, pair[::-1]) if a in edge and b in left} - reached
-    return reached == left
+    kept = np.array([pair for pair in pairs if not without & set(pair)]).reshape(-1, 2)
+    return len(set(components(count, kept)[sorted(set(range(count)) - without)])) == 1
 
 
 def rank(places: FloatArray, pairs: Pairs) -> int:
