@@ -193,11 +193,7 @@ class BeaconMission:
     def _return(self, t_s: float, interval_s: float, distances_m: tuple[float, ...]) -> SteeringCommand:
         self._enter(RETURNING)
         if self._homing is None:
-            cfg = self._cfg
-            home = {"waypoints_m": ((cfg.start.x_m, cfg.start.y_m),), "loops": False}
-            workspace = cfg.workspace.model_copy(update=home)
-            follow = cfg.follow.model_copy(update={"is_active": False})
-            self._homing = BeaconPilot(cfg.model_copy(update={"workspace": workspace, "follow": follow}))
+            self._homing = BeaconPilot(self._cfg, (self._cfg.start.x_m, self._cfg.start.y_m))
         drive = self._homing.drive(t_s, interval_s, self.navigator.belief.pose, None, distances_m)
         if self._homing.waypoints.current_m is None:
             self._finish(SurveyOutcome.AT_BASE)

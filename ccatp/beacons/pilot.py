@@ -280,17 +280,17 @@ class PilotState(StrEnum):
 class BeaconPilot:
     """Turns a pose, a target and the distance sensors into set points, step by step.
 
-    Raises FuzzyGapError: the rules leave a gap.
+    ``home_m``: the only place to go to, whatever the configuration says. Raises FuzzyGapError: the rules leave a gap.
     """
 
-    def __init__(self, cfg: RadioConfig) -> None:
-        self._cfg = cfg
+    def __init__(self, cfg: RadioConfig, home_m: Point | None = None) -> None:
+        self._cfg, self._is_following = cfg, cfg.follow.is_active and home_m is None
         self._driver = WaypointSteering(cfg.control, cfg.vehicle)
         self._avoider = ObstacleAvoider(cfg.avoidance, cfg.vehicle.radius_m)
         self._escapes_until_s = 0.0
-        self.waypoints = WaypointList(
-            cfg.workspace.waypoints_m, cfg.control.arrival_radius_m, loops=cfg.workspace.loops
-        )
+        waypoints_m = cfg.workspace.waypoints_m if home_m is None else (home_m,)
+        loops = cfg.workspace.loops and home_m is None
+        self.waypoints = WaypointList(waypoints_m, cfg.control.arrival_radius_m, loops=loops)
         self.follower = Follower(cfg.follow, self._driver)
         self._retreat = BackOff(cfg)
         self.state = PilotState.VISITING
@@ -304,7 +304,7 @@ class BeaconPilot:
         if not self._cfg.avoidance.is_active:
             return self._without_obstacles(aim, interval_s)
         self._avoider.see(time_s, pose, distances_m)
-        if target is not None and self._cfg.follow.is_active and self.follower.state is FollowState.BACKING:
+        if target is not None and self._is_following and self.follower.state is FollowState.BACKING:
             self._driver.reset()
             return self._retreat.drive(pose, target.position_m, target.velocity_m_s, self._avoider.points_m())
         if time_s < self._escapes_until_s:
@@ -321,7 +321,7 @@ class BeaconPilot:
         return found._replace(speed_m_s=found.speed_m_s * way.speed_factor)
 
     def _aim(self, pose: PlanarPose, target: TargetSight | None) -> BearingToPoint | None:
-        if self._cfg.follow.is_active:
+        if self._is_following:
             self.state = PilotState.FOLLOWING
             return self.follower.aim(pose, target)
         reached = self.waypoints.reached
@@ -334,7 +334,7 @@ class BeaconPilot:
     def _without_obstacles(self, aim: BearingToPoint | None, interval_s: float) -> SteeringCommand:
         if aim is not None:
             return self._driver.drive(aim, interval_s)
-        return self.follower.stay() if self._cfg.follow.is_active else HALT
+        return self.follower.stay() if self._is_following else HALT
 
     def _held(self, pose: PlanarPose, drive: SteeringCommand) -> SteeringCommand:
         if not drive.speed_m_s:

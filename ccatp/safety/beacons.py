@@ -2,16 +2,7 @@
 
 Every rule looks at what the robot itself senses; of main's estimate only its uncertainty and its age count.
 
-* obstacle: something that the distance sensors see, or saw lately, is nearer than ``obstacle_m`` within ``ahead_rad``
-  of the course: no forward motion, code 1; likewise behind, and no reverse;
-* target: by the mean level of the radio that is followed, less one standard deviation of that mean, it is nearer than
-  ``target_m``: no forward motion, code 1;
-* silence: no reading of a static radio or a mote for ``radio_timeout_s``: hold;
-* estimate: too old, or its standard deviation above ``position_sigma_m`` (until below ``position_clear_m``): hold;
-* a hold that lasts ``hold_limit_s`` is a fault;
-* an emergency: code 2, latched (``ccatp.safety.emergency_latch``); in an earthquake nothing is permitted.
-
-What the distance sensors saw lately, seen from where the robot is now: carried on by the wheels alone.
+They are the table of ``docs/beacon_missions.md``.
 """
 
 from collections import Counter, deque

@@ -77,7 +77,7 @@ class MoteField:
         true = cfg.sim
         self._temperatures_c = true.temperature_c + rng.normal(0.0, true.thermometer_sigma_c, len(motes.names))
         ratio = (true.temperature_c - _ABSOLUTE_ZERO_C) / (cfg.air.temperature_c - _ABSOLUTE_ZERO_C)
-        self.sound_m_s = cfg.air.sound_speed_m_s * sqrt(ratio)
+        self._sound_m_s = cfg.air.sound_speed_m_s * sqrt(ratio)
 
     def receives(self, transmitter: int, listener: int) -> bool:
         """Whether a mote is in the usable region of another, and the other in its own."""
@@ -106,10 +106,14 @@ class MoteField:
         is_echo = rng.random(repeats) < true.multipath_probability
         ways_m[is_echo] += rng.exponential(true.multipath_excess_m, int(is_echo.sum()))
         ways_m += rng.normal(0.0, true.sigma_m, repeats)
-        delays_s = np.maximum(ways_m / self.sound_m_s + true.latency_s, 0.0)
-        if true.tick_s > 0.0:
-            delays_s = np.round(delays_s / true.tick_s) * true.tick_s
+        delays_s = self.delays_s(ways_m)
         return np.asarray(delays_s[rng.random(repeats) >= true.loss_probability])
+
+    def delays_s(self, ways_m: FloatArray) -> FloatArray:
+        """How long after its message each pulse is detected that takes such a way, by the listener's clock."""
+        true = self._cfg.sim
+        delays_s = np.maximum(ways_m / self._sound_m_s + true.latency_s, 0.0)
+        return np.asarray(np.round(delays_s / true.tick_s) * true.tick_s if true.tick_s > 0.0 else delays_s)
 
 
 def usable_reach(transducer: TransducerConfig, off_transmitter_rad: float, off_listener_rad: float) -> float:
@@ -172,25 +176,16 @@ class MoteListener:
     def _own(self, time_s: float, pose: TruePose, sender: int) -> list[MoteBurst]:
         """The robot's listener receives all round; the mote has its cone."""
         true, rng, cfg = self._cfg.sim, self._rng, self._cfg
-        dx, dy = pose.x_m - self._motes.positions_m[sender, 0], pose.y_m - self._motes.positions_m[sender, 1]
-        way_m = hypot(dx, dy)
+        way = np.array((pose.x_m, pose.y_m)) - self._motes.positions_m[sender, :2]
+        way_m = hypot(*way)
         # Drawn whatever becomes of it, so that one pulse more or less does not change all that follow.
         noise, echo_m, is_echo, is_lost = rng.normal(), rng.exponential(), rng.random(), rng.random()
-        reach_m = usable_reach(cfg.transducer, self._off_axis(sender, dx, dy), 0.0)
+        reach_m = usable_reach(cfg.transducer, _off_axis(self._motes.facings[sender, :2], way), 0.0)
         if not cfg.transducer.nearest_m <= way_m <= reach_m or is_lost < true.loss_probability:
             return []
         if is_echo < true.multipath_probability:
             way_m += true.multipath_excess_m * float(echo_m)
         way_m += true.sigma_m * float(noise)
-        delay_s = max(way_m / self._field.sound_m_s + true.latency_s, 0.0)
-        if true.tick_s > 0.0:
-            delay_s = round(delay_s / true.tick_s) * true.tick_s
+        delay_s = float(self._field.delays_s(np.array(way_m)))
         name = self._motes.names[sender]
         return [MoteBurst(time_s, name, self._listener.name, round(self._temperature_c, 6), [round(delay_s, _DIGITS)])]
-
-    def _off_axis(self, sender: int, dx: float, dy: float) -> float:
-        facing = self._motes.facings[sender]
-        way_m = hypot(dx, dy)
-        if not facing.any() or way_m <= 0.0:
-            return 0.0
-        return float(np.arccos(np.clip((facing[0] * dx + facing[1] * dy) / way_m, -1.0, 1.0)))

@@ -1,6 +1,7 @@
 """A map from measured ranges: filter or batch, doubts about it, its error where the truth is known, a report."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -291,13 +292,11 @@ def _phase1_error_m(
 ) -> float | None:
     if true_m is None:
         return None
-    try:
+    with suppress(MappingError):
         first = map_as_possible(network, cfg.phase1.max_dop)
-    except MappingError:
-        return None
-    if set(first.unplaced) & set(motes):
-        return None
-    return aligned_rms_m(first.positions_m[motes], true_m, mirrors=True)
+        if not set(first.unplaced) & set(motes):
+            return aligned_rms_m(first.positions_m[motes], true_m, mirrors=True)
+    return None
 
 
 def _truth(truth_m: Places, names: tuple[str, ...], dimension: int) -> FloatArray:

@@ -1,8 +1,8 @@
 """The batch map from ranges alone: starts, the robust fit, a look for folds, the scale of the sigmas, covariance."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.special import ndtri
@@ -19,7 +19,7 @@ from ccatp.beacons.cricket.map_fit import (
     position_covariance,
 )
 from ccatp.beacons.cricket.map_start import FEW, grown_starts, map_starts
-from ccatp.beacons.cricket.range_network import RangeNetwork, components, graph_pairs
+from ccatp.beacons.cricket.range_network import RangeNetwork, graph_pairs, sides
 from ccatp.beacons.cricket.trilateration import trilaterate
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import RigidMotion, best_motion, rigid_modes
@@ -30,6 +30,7 @@ _CORRECTIONS = 3  # times that the unfolding is repeated with ranges corrected b
 _FOUND = 3  # times that the best minimum is found before a search among grown maps ends
 
 Mirrors = Sequence[tuple[Sequence[int], Sequence[int]]]
+Found = TypeVar("Found")
 
 
 class Fold(NamedTuple):
@@ -169,14 +170,7 @@ def searched(model: MapModel, best: MapFit, settings: MapFitSettings) -> tuple[M
 
     Least squares is drawn towards wrong ranges, and a robust fit from there stays among them.
     """
-    times = 0
-    for fit in _grown_fits(model, best, settings):
-        if fit.cost < best.cost * (1.0 - _SAME):
-            best, times = fit, 0
-        times += fit.cost <= best.cost * (1.0 + _SAME)
-        if times >= _FOUND:
-            return best, True
-    return best, False
+    return _found_again(best, _grown_fits(model, best, settings), lambda fit: fit.cost, _SAME)
 
 
 def scaled(model: MapModel, first: MapFit, settings: MapFitSettings) -> tuple[MapModel, MapFit]:
@@ -190,15 +184,23 @@ def scaled(model: MapModel, first: MapFit, settings: MapFitSettings) -> tuple[Ma
     best = _settled(model, first, settings)
     # Shapes of bodies hold a map together by themselves.
     if best[0] > 1.0 and not model.network.bodies and np.isfinite(settings.robust_scale):
-        times = 0
-        for fit in _grown_fits(model, first, settings):
-            found = _settled(model, fit, settings)
-            if found[0] < best[0] * (1.0 - _SETTLED):
-                best, times = found, 0
-            times += found[0] <= best[0] * (1.0 + _SETTLED)
-            if times >= _FOUND:
-                break
+        others = (_settled(model, fit, settings) for fit in _grown_fits(model, first, settings))
+        best, _ = _found_again(best, others, lambda found: found[0], _SETTLED)
     return best[1:]
+
+
+def _found_again(
+    best: Found, others: Iterator[Found], cost: Callable[[Found], float], same: float
+) -> tuple[Found, bool]:
+    """The least of some maps, up to the one that finds it for the third time; whether one did."""
+    times = 0
+    for found in others:
+        if cost(found) < cost(best) * (1.0 - same):
+            best, times = found, 0
+        times += cost(found) <= cost(best) * (1.0 + same)
+        if times >= _FOUND:
+            return best, True
+    return best, False
 
 
 def residual_scale(model: MapModel, fit: MapFit) -> float:
@@ -323,13 +325,10 @@ def _sets(model: MapModel, fit: MapFit, mirrors: Mirrors) -> Iterator[tuple[Sequ
     yield from ((separator, motes) for separator, motes in mirrors if len(separator) >= network.dimension)
     pairs = graph_pairs(network)
     for group in _groups(model, fit):
-        labels = components(network.count, pairs[~np.isin(pairs, group).any(axis=1)])
-        labels[list(group)] = -1
-        for label in np.unique(labels[labels >= 0]):
-            side = np.flatnonzero(labels == label)
+        for side in sides(network.count, pairs, group):
             if 2 * len(side) <= network.count:
-                yield group, tuple(side.tolist())
-                yield group, (*side.tolist(), *group)
+                yield group, side
+                yield group, (*side, *group)
         yield group, group
 
 
@@ -340,8 +339,7 @@ def _groups(model: MapModel, fit: MapFit) -> list[tuple[int, ...]]:
     if _is_sure(model, fit):
         return groups
     near = np.linalg.norm(places[:, None] - places[None], axis=2) < _CLOSE_BY * float(np.median(network.ranges_m))
-    labels = components(network.count, np.argwhere(near))
-    close = [tuple(np.flatnonzero(labels == label).tolist()) for label in np.unique(labels)]
+    close = sides(network.count, np.argwhere(near), ())
     return groups + [group for group in close if 1 < len(group) < network.count // 2 and group not in groups]
 
 

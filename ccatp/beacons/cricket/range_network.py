@@ -154,6 +154,13 @@ def components(count: int, pairs: IndexArray) -> IndexArray:
     return np.asarray(connected_components(adjacency(count, pairs), directed=False)[1], dtype=np.intp)
 
 
+def sides(count: int, pairs: IndexArray, without: Sequence[int]) -> list[tuple[int, ...]]:
+    """The connected parts of the vertices that are left without some."""
+    labels = components(count, pairs[~np.isin(pairs, without).any(axis=1)])
+    labels[list(without)] = -1
+    return [tuple(np.flatnonzero(labels == label).tolist()) for label in np.unique(labels[labels >= 0])]
+
+
 def list_names(names: Sequence[str]) -> str:
     """The first few of some names, and how many there are more."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""

@@ -12,11 +12,11 @@ from ccatp.beacons.cricket.range_network import (
     IndexArray,
     RangeNetwork,
     adjacency,
-    components,
     coordinates_of,
     every_pair,
     graph_pairs,
     list_names,
+    sides,
 )
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import rigid_modes
@@ -230,18 +230,8 @@ def _mirrors(pairs: IndexArray, count: int, d: int) -> Iterator[tuple[tuple[int,
     for first in range(count):
         for second in _cut_vertices(pairs, count, first):
             if second > first:
-                yield from _sides(pairs, count, (first, second))
-
-
-def _sides(
-    pairs: IndexArray, count: int, separator: tuple[int, int]
-) -> Iterator[tuple[tuple[int, ...], tuple[int, ...]]]:
-    labels = components(count, pairs[~np.isin(pairs, separator).any(axis=1)])
-    labels[list(separator)] = -1
-    sides = [np.flatnonzero(labels == label) for label in np.unique(labels[labels >= 0])]
-    for side in sorted(sides, key=len)[:-1]:
-        if len(side) > 1:
-            yield separator, tuple(side.tolist())
+                parts = sorted(sides(count, pairs, (first, second)), key=len)[:-1]
+                yield from (((first, second), part) for part in parts if len(part) > 1)
 
 
 def _cut_vertices(pairs: IndexArray, count: int, without: int) -> list[int]:

@@ -97,11 +97,7 @@ class MoteMapper:
         """Condition the map on one distance. Raises MappingError: the motes stand in one place."""
         rows = _Rows(self._dimension, self._count, [(first, second)], np.array([range_m]))
         R = np.array([sigma_m**2])
-        if self._how.linearisations == 1:
-            residual, H = rows(self._filter.mean)
-            learned = self._filter.update(rows.columns, H, residual, R, self._gate)
-        else:
-            learned = self._filter.update_iterated(rows.columns, rows, R, self._how.linearisations, self._gate)
+        learned = self._filter.update_iterated(rows.columns, rows, R, self._how.linearisations, self._gate)
         if not (learned.accepted and self._how.pools):
             return learned
         pair = min(first, second), max(first, second)
