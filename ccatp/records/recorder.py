@@ -133,7 +133,7 @@ class Recorder:
             self._file.flush()
 
     def write(self, topic: str, t_s: float, payload: bytes) -> None:
-        """Record one message at the robot time, s since its boot; one of no topic or at no time is left out."""
+        """Record one message at a robot time, s since boot; an unknown topic or an invalid time is left out."""
         channel = self._channels.get(topic)
         if channel is None or not self.is_recording or not 0.0 <= t_s < _MAX_T_S:
             return
