@@ -24,6 +24,7 @@ from ccatp.links.topics import (
     ArrivalMessage,
     BeaconTruth,
     DangerEvent,
+    FixMessage,
     Heartbeat,
     Message,
     MissionStatus,
@@ -46,7 +47,7 @@ RECEIVED = tuple(topic.name for topic in TOPICS if topic.recorded or topic.messa
 FINISH_TIMEOUT_S = 5.0
 REQUEST_TIMEOUT_S = 1.0
 # Topics of a survey's summary; a recording holds twenty times as much.
-SUMMARISED = {"mission", "track", "truth", "arrival", "danger_event"}
+SUMMARISED = {"mission", "track", "truth", "arrival", "fix", "danger_event"}
 
 
 class Collector:
@@ -200,6 +201,9 @@ class _SurveySession:
             builder.add_track(self._on_deck(message))
         elif isinstance(message, ArrivalMessage):
             builder.add_arrival(PointId(*message.point), message.seq)
+        elif isinstance(message, FixMessage):
+            if message.point is not None and not message.is_set_aside:
+                builder.add_fix(PointId(*message.point), message.position_m)
         elif isinstance(message, Timing):
             builder.add_ticks(message.tick_us)
         elif isinstance(message, DangerEvent):

@@ -1,12 +1,12 @@
 """The summary of a run: joins estimates with the simulated truth and builds ``summary.json``.
 
 Numbers are rounded to fixed decimals, and the result does not depend on how the rows were cut into batches: the same
-run gives the same file. Values that need the truth are null on a real robot.
+run gives the same file. On a real robot arrivals are measured by the laser, and values that need the truth are null.
 """
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from math import nan, sqrt
+from math import dist, nan, sqrt
 from types import MappingProxyType
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, EventCode, FloatArray, IntArray, PanelId, PointId
+from ccatp.core import DeckPose, EventCode, FloatArray, IntArray, PanelId, PointId, Vector3
 from ccatp.mirror.mirror import Mirror
 
 PanelFits = Mapping[PanelId, tuple[float, float, float]]  # piston (m), tip (rad), tilt (rad)
@@ -44,6 +44,12 @@ def arrival_error_m(
     across = np.array(mirror.panels[point.panel].axes[2])
     offset = place_m + puck_height_m * normal - target_m
     return float(np.linalg.norm(offset - (offset @ across) * across))
+
+
+def measured_error_m(mirror: Mirror, point: PointId, puck_m: Vector3, puck_height_m: float) -> float:
+    """Distance on the surface from the foot of a measured puck (world frame) to its measurement point, m."""
+    x, y, _ = mirror.foot_of_puck(puck_m, puck_height_m)
+    return dist(mirror.surface_point(x, y), mirror.surface_point(*mirror.point_on_deck(point)))
 
 
 class RunningStatistics:
@@ -168,6 +174,12 @@ class SummaryBuilder:
             self._waiting_arrivals.setdefault(point, seq)
             self._settle(is_over=False)
 
+    def add_fix(self, point: PointId, puck_m: Vector3) -> None:
+        """The laser measured the puck at a point, world frame; on a real robot the first fix is the arrival."""
+        if not self._is_sim and point not in self._arrivals:
+            height_m = self._cfg.robot.puck_height_m
+            self._arrivals[point] = measured_error_m(self._mirror, point, puck_m, height_m)
+
     def add_verdict_event(self, seq: int, code: int) -> None:
         """The verdict's code rose to ``code`` at frame ``seq``; call once for each rise."""
         if code == EventCode.NEAR_EDGE:
@@ -228,10 +240,11 @@ class SummaryBuilder:
             "world": cfg.world.name if is_sim else None,
             "filter": cfg.run.filter,
             "seed": cfg.run.seed,
+            "reference": "truth" if is_sim else "laser",
             "points": {
                 "total": self._points,
                 "measured": self._measured,
-                "first_arrival_within_10mm": int(np.count_nonzero(arrivals <= WITHIN_M)) if is_sim else None,
+                "first_arrival_within_10mm": int(np.count_nonzero(arrivals <= WITHIN_M)),
                 "skipped": self._skipped,
                 **({"left_out": {why: list(names) for why, names in self._left_out.items()}} if self._left_out else {}),
             },

@@ -5,15 +5,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import chain, pairwise
-from math import dist
 from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.core import FloatArray, PointId, StopKind, Vector3
-from ccatp.mirror.mirror import Mirror
+from ccatp.core import FloatArray, PointId, StopKind
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, compare, survey_result
-from ccatp.records.summary import arrival_error_m as true_arrival_error_m
+from ccatp.records.summary import arrival_error_m, measured_error_m
 from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, RecordedSession, RunRecord
 from ccatp.survey.composition import plan_survey
 from ccatp.survey.planning.legs import PlanError
@@ -54,18 +52,12 @@ class PointVerdict(NamedTuple):
         return f"{'/'.join(map(str, self.point))}: {self.grade}{''.join(known)}"
 
 
-def arrival_error_m(mirror: Mirror, point: PointId, puck_m: Vector3, puck_height_m: float) -> float:
-    """Distance on the surface from the foot of a measured puck (world frame) to its measurement point, m."""
-    x, y, _ = mirror.foot_of_puck(puck_m, puck_height_m)
-    return dist(mirror.surface_point(x, y), mirror.surface_point(*mirror.point_on_deck(point)))
-
-
 def point_verdicts(record: RunRecord) -> list[PointVerdict]:
     """Every point of the mission, by row, column and number; empty where the run holds no mission."""
     first, reasons = first_arrivals_mm(record), _reasons(record)
     mirror, height_m = record.mirror, record.cfg.robot.puck_height_m
     left = {
-        one.point: 1e3 * arrival_error_m(mirror, one.point, one.fix.position_m, height_m) for one in record.measured
+        one.point: 1e3 * measured_error_m(mirror, one.point, one.fix.position_m, height_m) for one in record.measured
     }
     found = []
     for row in record.points or ():
@@ -92,13 +84,13 @@ def first_arrivals_mm(record: RunRecord) -> dict[PointId, float]:
         if truth is None:
             # The first fix of a point belongs to its first arrival: corrections follow it.
             pucks = {PointId(*fix.point): fix.position_m for fix in reversed(session.fixes) if fix.point is not None}
-            first = {point: 1e3 * arrival_error_m(mirror, point, puck_m, height_m) for point, puck_m in pucks.items()}
+            first = {point: 1e3 * measured_error_m(mirror, point, puck_m, height_m) for point, puck_m in pucks.items()}
         elif len(truth.seq):
             frames = {PointId(*arrival.point): arrival.seq for arrival in reversed(session.arrivals)}
             rows = zip(frames, np.searchsorted(truth.seq, [*frames.values()]).tolist(), frames.values(), strict=True)
             for point, at, seq in rows:
                 if at < len(truth.seq) and truth.seq[at] == seq:
-                    first[point] = 1e3 * true_arrival_error_m(mirror, point, truth.place[at], height_m)
+                    first[point] = 1e3 * arrival_error_m(mirror, point, truth.place[at], height_m)
         found = first | found
     return found
 

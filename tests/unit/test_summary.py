@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ccatp.core import PanelId, PointId
+from ccatp.core import DeckPose, PanelId, PointId
 from ccatp.records import summary as summary_module
 from ccatp.records.summary import RunningStatistics, SummaryBuilder, format_table
 from tests.support.scenario import config_of, mirror_of
@@ -186,7 +186,7 @@ def test_a_whole_summary_has_the_keys_of_the_contract_in_their_order(builder: Su
     builder.add_ticks(np.array([120.0]))
     built = builder.build(60.0)
     assert list(built) == [
-        *("mirror", "world", "filter", "seed", "points", "arrival_error_mm", "localization_error_mm"),
+        *("mirror", "world", "filter", "seed", "reference", "points", "arrival_error_mm", "localization_error_mm"),
         *("heading_error_mrad", "mission_time_s", "lower_bound_s", "within_budget", "danger", "panels", "wall"),
     ]
     assert list(built["points"]) == ["total", "measured", "first_arrival_within_10mm", "skipped"]
@@ -206,14 +206,27 @@ def test_a_real_robot_has_null_where_the_truth_is_needed() -> None:
     builder.set_mission(693, 0, 3700.0)
     builder.set_panels({PanelId(1, 1): (0.0, 0.0, 0.0)}, None)
     built = builder.build()
-    assert built["world"] is None
-    assert built["points"]["first_arrival_within_10mm"] is None
+    assert (built["world"], built["reference"]) == (None, "laser")
+    assert built["points"]["first_arrival_within_10mm"] == 0  # of none that was measured
     assert set(built["danger"].values()) == {None}
     assert {*built["arrival_error_mm"].values(), *built["localization_error_mm"].values()} == {None}
     assert built["heading_error_mrad"]["rms"] is None
     assert built["panels"] == {"count": 1, "piston_rms_um": None, "tilt_rms_urad": None}
     assert built["within_budget"] is False
     assert built["wall"]["time_s"] is None
+
+
+def test_on_a_real_robot_the_first_fix_at_a_point_is_its_arrival() -> None:
+    builder, height_m = make(is_sim=False), CFG.robot.puck_height_m
+    x, y = MIRROR.point_on_deck(POINT)
+    for offset_m in (0.012, 0.001):  # a correction move in between
+        builder.add_fix(POINT, MIRROR.puck_world(DeckPose(x + offset_m, y, 0.3), height_m))
+    builder.add_fix(OTHER, MIRROR.puck_world(DeckPose(*MIRROR.point_on_deck(OTHER), 0.0), height_m))
+    built = builder.build()
+    assert built["points"]["first_arrival_within_10mm"] == 1
+    assert built["arrival_error_mm"]["max"] == pytest.approx(12.0, abs=0.2)  # along the surface: its slope is 0.1
+    assert built["arrival_error_mm"]["mean"] == pytest.approx(6.0, abs=0.1)
+    assert make().build()["reference"] == "truth"
 
 
 def test_a_diverged_estimate_gives_a_file_that_json_can_hold(builder: SummaryBuilder) -> None:

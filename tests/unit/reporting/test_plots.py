@@ -12,8 +12,9 @@ import pytest
 from ccatp.core import DeckPose, PanelId, PointId
 from ccatp.mirror.mirror import Mirror
 from ccatp.records.run_reader import RunReadError
+from ccatp.records.summary import measured_error_m
 from ccatp.report.figures import error_figure, time_figure
-from ccatp.report.findings import ErrorSeries, Grade, PointVerdict, TimeBreakdown, arrival_error_m, point_verdicts
+from ccatp.report.findings import ErrorSeries, Grade, PointVerdict, TimeBreakdown, point_verdicts
 from ccatp.report.mirror_map import MAP_WIDTH_PX, draw_from_run_dir, record_map, run_map
 from ccatp.report.plots import (
     NARROW,
@@ -188,9 +189,9 @@ def test_arrival_error_is_the_distance_of_foot_and_point(mirror: Mirror) -> None
     x, y = mirror.point_on_deck(point)
     here, off = (mirror.puck_world(DeckPose(x + ahead, y, 0.0), HEIGHT_M) for ahead in (0.0, 2e-3))
     # foot_of_puck converges to 1e-10 m
-    assert arrival_error_m(mirror, point, here, HEIGHT_M) == pytest.approx(0.0, abs=1e-9)
+    assert measured_error_m(mirror, point, here, HEIGHT_M) == pytest.approx(0.0, abs=1e-9)
     rise = mirror.surface.height_m(x + 2e-3, y) - mirror.surface.height_m(x, y)
-    assert arrival_error_m(mirror, point, off, HEIGHT_M) == pytest.approx(hypot(2e-3, rise), abs=1e-9)
+    assert measured_error_m(mirror, point, off, HEIGHT_M) == pytest.approx(hypot(2e-3, rise), abs=1e-9)
 
 
 def test_what_cannot_be_drawn_is_said_in_one_line(tmp_path: Path, without: Callable[..., Path], run_dir: Path) -> None:
