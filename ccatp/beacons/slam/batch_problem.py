@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ccatp.beacons.slam.measurement_models import bearing_row, level_row, range_row
 from ccatp.beacons.slam.recording import BoolArray, Readings, Steps, running_total
 from ccatp.config.beacon_models import OdometryNoiseConfig, RecordingConfig
 from ccatp.core import FloatArray, IntArray
+from ccatp.filters.metrics import wrapped
 
 # What odometry is calibrated by: d = (1 + distance_scale) d_o, w = (1 + turn_scale) w_o + turn_per_m d_o - bias t.
 # Scales are what corrects, not what the odometry reads too much; ``turn_per_m`` is what wheels of unequal size do;
@@ -127,8 +129,6 @@ OF_READINGS = ("range_scale", "range_offset_m", "bearing_offset_rad", "rssi_refe
 SHARED = (*CALIBRATION, *OF_READINGS)
 RANGE_SCALE, RANGE_OFFSET, BEARING_OFFSET, RSSI_REFERENCE, RSSI_EXPONENT = (SHARED.index(name) for name in OF_READINGS)
 BEACON = 4  # x_m, y_m, the offset of its ranges, m, and of its P_ref, dB
-LEAST_RANGE_M = 1e-3
-DB = 10.0 / np.log(10.0)
 
 
 @dataclass(slots=True)
@@ -224,11 +224,6 @@ class BatchProblem:
             self._last = (state, self._linearised(state))
         return self._last[1]
 
-    def range_variance(self, range_m: FloatArray) -> FloatArray:
-        """Of ranges, m^2."""
-        variance: FloatArray = self.radio.range_sigma_m**2 + (self.radio.range_sigma_per_m * range_m) ** 2
-        return variance
-
     def prior_cost(self, state: BatchState) -> float:
         """Half the sum of squares of the priors."""
         shared = np.concatenate([state.shared, state.beacons.ravel()])
@@ -269,44 +264,35 @@ class BatchProblem:
         dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
         local = np.column_stack([c * dx + s * dy, -s * dx + c * dy, b[:, 2] - a[:, 2]])
         odometry = local - motion
-        odometry_information = np.linalg.inv(covariance)
+        odometry_information = np.asarray(np.linalg.inv(covariance))
 
         pose, beacon = state.poses[self.at], state.beacons[self.readings.beacon]
-        ux, uy = beacon[:, 0] - pose[:, 0], beacon[:, 1] - pose[:, 1]
-        r = np.maximum(np.hypot(ux, uy), LEAST_RANGE_M)
-        ux, uy = ux / r, uy / r
-        scale, exponent = 1.0 + state.shared[RANGE_SCALE], self.radio.rssi_exponent + state.shared[RSSI_EXPONENT]
-        reference = self.radio.rssi_reference_dbm + state.shared[RSSI_REFERENCE]
-        decades = np.log10(r)
-        errors = np.column_stack(
-            [
-                scale * r + state.shared[RANGE_OFFSET] + beacon[:, 2],
-                np.arctan2(uy, ux) - pose[:, 2] + state.shared[BEARING_OFFSET],
-                reference + beacon[:, 3] - 10.0 * exponent * decades,
-            ]
-        )
-        errors = (errors - self._read) * self.there
-        errors[:, 1] = (errors[:, 1] + np.pi) % (2.0 * np.pi) - np.pi
-        m = len(r)
+        dx, dy = beacon[:, 0] - pose[:, 0], beacon[:, 1] - pose[:, 1]
+        shared, radio, m = state.shared, self.radio, len(dx)
+        reference_dbm = radio.rssi_reference_dbm + shared[RSSI_REFERENCE] + beacon[:, 3]
+        exponent = radio.rssi_exponent + shared[RSSI_EXPONENT]
+        range_m, *by_range, r = range_row(np, dx, dy, 1.0 + shared[RANGE_SCALE])
+        direction, *by_bearing = bearing_row(np, dx, dy)
+        level_dbm, *by_level, by_exponent = level_row(np, dx, dy, reference_dbm, exponent)
+        expected = (
+            range_m + shared[RANGE_OFFSET] + beacon[:, 2], direction - pose[:, 2] + shared[BEARING_OFFSET], level_dbm
+        )  # fmt: skip
+        errors = (np.column_stack(expected) - self._read) * self.there
+        errors[:, 1] = wrapped(errors[:, 1])
         by_pose, by_beacon = np.zeros((m, 3, 3)), np.zeros((m, 3, BEACON))
-        by_pose[:, 0, 0], by_pose[:, 0, 1] = -scale * ux, -scale * uy
-        by_pose[:, 1, 0], by_pose[:, 1, 1], by_pose[:, 1, 2] = uy / r, -ux / r, -1.0
-        by_pose[:, 2, 0], by_pose[:, 2, 1] = DB * exponent * ux / r, DB * exponent * uy / r
-        by_beacon[:, :, :2] = -by_pose[:, :, :2]
+        by_beacon[:, :, :2] = np.array((by_range, by_bearing, by_level)).transpose(2, 0, 1)
         by_beacon[:, 0, 2] = by_beacon[:, 2, 3] = 1.0
+        by_pose[:, :, :2], by_pose[:, 1, 2] = -by_beacon[:, :, :2], -1.0
         by_shared = np.zeros((m, 3, len(OF_READINGS)))
         by_shared[:, 0, 0], by_shared[:, 0, 1], by_shared[:, 1, 2] = r, 1.0, 1.0
-        by_shared[:, 2, 3], by_shared[:, 2, 4] = 1.0, -10.0 * decades
+        by_shared[:, 2, 3], by_shared[:, 2, 4] = 1.0, by_exponent
         # By the range read, not the one predicted: a variance that moves with the state would draw it outwards.
         variances = np.empty_like(errors)
-        variances[:, 0] = self.range_variance(self._read[:, 0])
-        variances[:, 1:] = self.radio.bearing_sigma_rad**2, self.radio.rssi_sigma_db**2
+        variances[:, 0] = radio.range_sigma_m**2 + (radio.range_sigma_per_m * self._read[:, 0]) ** 2
+        variances[:, 1:] = radio.bearing_sigma_rad**2, radio.rssi_sigma_db**2
         information: FloatArray = self.there / (variances * self.repeats[:, None])
         by_rest = np.concatenate([by_shared, by_beacon], axis=2)
-        information_of_odometry = np.asarray(odometry_information)
-        return Residuals(
-            local, odometry, information_of_odometry, by_calibration, errors, information, by_pose, by_rest
-        )
+        return Residuals(local, odometry, odometry_information, by_calibration, errors, information, by_pose, by_rest)
 
     def _add_readings(self, system: ArrowSystem, residuals: Residuals, weights: FloatArray) -> None:
         by_pose, by_rest = residuals.by_pose, residuals.by_rest
