@@ -273,21 +273,22 @@ class RobotLink(asyncio.Protocol):
 
         ``ValueError``: a set point that is not finite.
         """
-        self._send_fresh(format_drive(seq, ack, wr_rad_s, wl_rad_s, steer_rad))
-
-    def send_permit(self, seq: int, ack: int, forward: bool, reverse: bool, turn: bool) -> None:
-        """Send what motion is allowed."""
-        self._send_fresh(format_permit(seq, ack, forward, reverse, turn))
-
-    def send_fans(self, seq: int, duty: tuple[float, float]) -> None:
-        """Send fan duties (left, right), 0 to 1."""
-        self.send_raw(encode(FansMessage(seq=seq, duty=duty)))
-
-    def _send_fresh(self, line: bytes) -> None:
+        line = format_drive(seq, ack, wr_rad_s, wl_rad_s, steer_rad)
         if self._is_paused:
             self.counts["unsent"] += 1
         elif self._writer is not None:
             self._writer.write(line)
+
+    def send_permit(self, seq: int, ack: int, forward: bool, reverse: bool, turn: bool) -> None:
+        """Send what motion is allowed."""
+        if self._is_paused:
+            self.counts["unsent"] += 1
+        else:
+            self.send_raw(format_permit(seq, ack, forward, reverse, turn))
+
+    def send_fans(self, seq: int, duty: tuple[float, float]) -> None:
+        """Send fan duties (left, right), 0 to 1."""
+        self.send_raw(encode(FansMessage(seq=seq, duty=duty)))
 
     def send_raw(self, data: bytes) -> None:
         """Send bytes as they are; nothing happens when the connection is gone."""
