@@ -9,17 +9,13 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
 
-import msgspec
 import pytest
 
 from ccatp.daemon import ocs_agent
 from ccatp.daemon.ocs_agent import SurveyTask, add_arguments, main, register, survey_command
 from ccatp.errors import ConfigError
 from ccatp.links.client import OperatorClient
-from ccatp.links.topics import MissionStatus
-from tests.unit.test_client import serving
-
-NO_STATUS = MissionStatus(seq=-1, t_s=0.0, state="")
+from tests.unit.test_client import serving, status
 
 
 class Session:
@@ -41,10 +37,6 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def surveys_of(runtime_dir: Path, program: str = "") -> SurveyTask:
     command = [sys.executable, "-c", program]
     return SurveyTask(OperatorClient(runtime_dir, 5.0), command, {}, lambda _: None)
-
-
-def status(**fields: object) -> dict[str, Any]:
-    return {"ok": True, "status": {**msgspec.to_builtins(NO_STATUS), "state": "driving", **fields}}
 
 
 @pytest.mark.parametrize(
@@ -82,7 +74,7 @@ def test_a_survey_that_runs_already_is_followed_and_aborted_when_the_session_sto
         asked.append(request["cmd"])
         if len(asked) == 4:
             session.status = "stopping"
-        return status(done=len(asked), exit_status=3 if "abort" in asked else -1)
+        return status(state="driving", done=len(asked), exit_status=3 if "abort" in asked else -1)
 
     with serving(runtime_dir, "control", answer):
 
@@ -123,7 +115,7 @@ def test_the_monitor_publishes_until_it_is_stopped(runtime_dir: Path) -> None:
         if len(blocks) >= 3:
             session.status = "stopping"
 
-    with serving(runtime_dir, "control", lambda _: status(done=5)):
+    with serving(runtime_dir, "control", lambda _: status(done=5, state="driving")):
         assert surveys_of(runtime_dir).monitor(session, publish, 0.01) == (True, "monitoring ended")
     assert [block["block_name"] for block in blocks] == ["daemon", "survey", "daemon", "survey"]
     assert blocks[0]["data"] == {"running": 1}
