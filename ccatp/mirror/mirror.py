@@ -6,26 +6,56 @@ from math import atan2, cos, pi, sin
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ccatp.config.models import FrameConfig, MirrorConfig
+from ccatp.config.models import MirrorConfig
 from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose, PointId, Vector3, wrap_pi
 from ccatp.mirror.layout import POINTS_PER_PANEL, POINTS_PER_ROW, Panel, PanelGrid
 from ccatp.mirror.rim import build_rim
 from ccatp.mirror.surface import Axes, Surface, UnknownPanelError, build_surface
 
 
-class MirrorFrames:
-    """Where a mirror stands in the world: p_mirror = R (p_world - origin), R = [[1, 0, 0], [0, c, s], [0, -s, c]].
+class Mirror:
+    """A telescope mirror: geometry only, without state. Points are in metres.
 
-    The deck frame is the mirror frame turned by pi about its y axis where ``drive_side`` is -1, else the mirror frame.
+    It stands in the world by p_mirror = R (p_world - origin), R = [[1, 0, 0], [0, c, s], [0, -s, c]]; the deck frame is
+    the mirror frame turned by pi about its y axis where ``drive_side`` is -1, else the mirror frame. ``surface`` is in
+    the deck frame, ``rim`` in the deck plane, ``collimators_m`` (k, 3) of the laser ``channels`` in the world frame.
     """
 
-    def __init__(self, cfg: FrameConfig) -> None:
-        x, y, z = cfg.origin_world_mm
+    def __init__(self, cfg: MirrorConfig) -> None:
+        x, y, z = cfg.frame.origin_world_mm
         self.origin_m = x * 1e-3, y * 1e-3, z * 1e-3
-        self.c, self.s = cos(cfg.rotation_about_x_rad), sin(cfg.rotation_about_x_rad)
-        self.drive_side: int = cfg.reflecting_side_sign
+        self.c, self.s = cos(cfg.frame.rotation_about_x_rad), sin(cfg.frame.rotation_about_x_rad)
+        self.drive_side: int = cfg.frame.reflecting_side_sign
+        self.name, self.overhang = cfg.name, cfg.overhang
+        self.gap_m = cfg.panels.gap_mm * 1e-3
+        self.surface = build_surface(cfg.surface, self.drive_side)
+        self.grid = PanelGrid(cfg.panels)
+        self.rows, self.cols = self.grid.rows, self.grid.cols
+        half = self.grid.half_x_m, self.grid.half_y_m
+        self.panels: dict[PanelId, Panel] = {
+            pid: Panel(pid, x, y, *half, self.surface.point(x, y), self.surface.axes(x, y))
+            for pid in self.grid.ids
+            for x, y in (self.grid.centre(pid),)
+        }
+        self.rim = build_rim(self.grid)
+        self._points_x = tuple(x * 1e-3 for x in cfg.panels.points_x_mm)
+        self._points_y = tuple(y * 1e-3 for y in cfg.panels.points_y_mm)
+        self._adjusters = {
+            # The data give offsets along the axes of the mirror frame; the deck's x runs against them on M1.
+            name: (self.drive_side * x * 1e-3, y * 1e-3)
+            for name, (x, y) in cfg.panels.adjusters_mm.items()
+        }
+        self.channels = cfg.collimators.channels
+        self.collimators_m: FloatArray = np.array(cfg.collimators.positions_world_mm, dtype=np.float64) * 1e-3
+        self.panel_at, self.is_on_panel = self.grid.panel_at, self.grid.is_on_panel
+        self.nearest_panel, self.nearest_seam = self.grid.nearest_panel, self.grid.nearest_seam
+        self.surface_point = self.surface.point
+        base = cfg.base
+        self.base_panel_pose = PanelPose(
+            PanelId(base.row, base.col), base.x_mm * 1e-3, base.y_mm * 1e-3, base.heading_rad
+        )
+        self.base_pose = self.deck_pose(self.base_panel_pose)
 
     def deck_from_mirror(self, p: Vector3) -> Vector3:
         """Deck coordinates of a point given in the mirror frame, m; and the other way round."""
@@ -61,46 +91,6 @@ class MirrorFrames:
         """Deck components of a vector given in the world frame."""
         x, y, z = v
         return self.deck_from_mirror((x, self.c * y + self.s * z, self.c * z - self.s * y))
-
-
-class Mirror(MirrorFrames):
-    """A telescope mirror: geometry only, without state. Points are in metres.
-
-    ``surface`` is in the deck frame, ``rim`` in the deck plane, ``collimators_m`` (k, 3) of the laser ``channels`` in
-    the world frame; ``drive_side`` is the sign of the mirror frame's z on the robot's side.
-    """
-
-    def __init__(self, cfg: MirrorConfig) -> None:
-        super().__init__(cfg.frame)
-        self.name, self.overhang = cfg.name, cfg.overhang
-        self.gap_m = cfg.panels.gap_mm * 1e-3
-        self.surface = build_surface(cfg.surface, self.drive_side)
-        self.grid = PanelGrid(cfg.panels)
-        self.rows, self.cols = self.grid.rows, self.grid.cols
-        half = self.grid.half_x_m, self.grid.half_y_m
-        self.panels: dict[PanelId, Panel] = {
-            pid: Panel(pid, x, y, *half, self.surface.point(x, y), self.surface.axes(x, y))
-            for pid in self.grid.ids
-            for x, y in (self.grid.centre(pid),)
-        }
-        self.rim = build_rim(self.grid)
-        self._points_x = tuple(x * 1e-3 for x in cfg.panels.points_x_mm)
-        self._points_y = tuple(y * 1e-3 for y in cfg.panels.points_y_mm)
-        self._adjusters = {
-            # The data give offsets along the axes of the mirror frame; the deck's x runs against them on M1.
-            name: (self.drive_side * x * 1e-3, y * 1e-3)
-            for name, (x, y) in cfg.panels.adjusters_mm.items()
-        }
-        self.channels = cfg.collimators.channels
-        self.collimators_m: FloatArray = np.array(cfg.collimators.positions_world_mm, dtype=np.float64) * 1e-3
-        self.panel_at, self.is_on_panel = self.grid.panel_at, self.grid.is_on_panel
-        self.nearest_panel, self.nearest_seam = self.grid.nearest_panel, self.grid.nearest_seam
-        self.surface_point = self.surface.point
-        base = cfg.base
-        self.base_panel_pose = PanelPose(
-            PanelId(base.row, base.col), base.x_mm * 1e-3, base.y_mm * 1e-3, base.heading_rad
-        )
-        self.base_pose = self.deck_pose(self.base_panel_pose)
 
     def panel(self, panel: PanelId) -> Panel:
         """The panel of that row and column; raises ``UnknownPanelError``."""
@@ -222,22 +212,18 @@ _DROP_STEPS = 2
 
 
 def deck_poses(mirror: Mirror, poses: Sequence[PanelPose]) -> FloatArray:
-    """``Mirror.deck_pose`` of many: rows of deck x, y (m), heading (rad) and surface height there (m), shape (k, 4)."""
+    """``Mirror.deck_pose`` of many; see ``deck_rows``."""
     places = np.array([[p.x_m for p in poses], [p.y_m for p in poses], [p.heading_rad for p in poses]]).T
-    return _by_runs(mirror, [p.panel for p in poses], places)
+    return deck_rows(mirror, [p.panel for p in poses], places)
 
 
-def deck_rows(mirror: Mirror, panels: NDArray[np.int64], places: FloatArray) -> FloatArray:
-    """``deck_poses`` of row and column (k, 2), and x, y (m), heading (rad) in the frames of these panels (k, 3)."""
-    return _by_runs(mirror, [PanelId(row, col) for row, col in panels.tolist()], places)
-
-
-def _by_runs(mirror: Mirror, panels: Sequence[PanelId], places: FloatArray) -> FloatArray:
+def deck_rows(mirror: Mirror, panels: Sequence[tuple[int, int]], places: FloatArray) -> FloatArray:
+    """Deck x, y (m), heading (rad) and height there (m), shape (k, 4), of ``places`` (k, 3) in frames of panels."""
     rows = np.empty((len(panels), 4))
     start = 0
     for panel, run in groupby(panels):
         end = start + sum(1 for _ in run)
-        rows[start:end] = _on_panel(mirror.surface, mirror.panel(panel), places[start:end])
+        rows[start:end] = _on_panel(mirror.surface, mirror.panel(PanelId(*panel)), places[start:end])
         start = end
     return rows
 

@@ -143,7 +143,7 @@ class TraceBuilder:
         """The trace, in the deck frame."""
         names = np.array(self._names, dtype=np.int64).reshape(-1, 3)
         rows = np.array(self._rows).reshape(-1, 4)
-        deck = deck_rows(mirror, names[:, 1:], rows[:, 1:])
+        deck = deck_rows(mirror, names[:, 1:].tolist(), rows[:, 1:])
         covariance = np.array(self._covariances).reshape(-1, 3, 3) if self._covariances else None
         return Trace(names[:, 0], rows[:, 0], deck[:, :3], deck[:, 3], covariance)
 

@@ -271,7 +271,7 @@ def _session(found: Recording, mirror: Mirror, changes: Sequence[StateChange], w
     messages = found.messages
     track, truth = (joined(messages[topic], count, count) for topic, count in _COLUMNS.items())
     try:
-        deck = deck_rows(mirror, track[:, 2:4].astype(np.int64), track[:, 4:7])
+        deck = deck_rows(mirror, track[:, 2:4].astype(np.int64).tolist(), track[:, 4:7])
     except MirrorError as error:
         warnings.append(f"{found.name}: its estimates are not of this mirror and are left out: {error}")
         track, deck = track[:0], np.empty((0, 4))
