@@ -7,6 +7,7 @@ NEWEST_VENV ?= .venv-newest
 ARGS ?=
 PYTEST_ARGS ?=
 WORKERS ?= 2
+SHARE ?= 1
 
 # Small matrices: threads of the linear algebra would only fight each other for the cores.
 export OPENBLAS_NUM_THREADS := 1
@@ -26,8 +27,8 @@ help:
 	@echo "make run [ARGS=...]   survey a simulated mirror: ccatp run --sim"
 	@echo "make test             lint, types, import contract, tests"
 	@echo "make test-newest      lint, unit and contract tests and a small survey on the newest Python installed, in $(NEWEST_VENV)"
-	@echo "make test-slow        the tests that take minutes, and new random examples"
-	@echo "make sweep            the part of that which drives over every centimetre of every rim; goes on where it was stopped"
+	@echo "make test-slow        the tests that take minutes, new random examples, and a tenth of the sweep"
+	@echo "make sweep            drives over every centimetre of every rim; goes on where it was stopped [SHARE=0.1 ARGS='--seed 2']"
 	@echo "make mutants          small changes of the safety code that the tests noticed before: do they still? [TARGETS=...]"
 	@echo "make faults           docs/fault_table.md from what the last test runs showed and measured"
 	@echo "make docs             build/docs/index.html, and the parts of docs/ that are made from the code"
@@ -62,9 +63,9 @@ newest: lint
 	$(PYTEST) tests/unit tests/contract $(PYTEST_ARGS)
 	rm -rf build/newest && $(BIN)/ccatp run --sim --panels 2 --run-dir build/newest
 
-# What fails in one part does not keep the others from being run.
+# What fails in one part does not keep the others from being run. A tenth of the sweep, chosen at random.
 test-slow:
-	@$(MAKE) --no-print-directory --keep-going slow-tests new-examples sweep
+	@$(MAKE) --no-print-directory --keep-going slow-tests new-examples sweep SHARE=0.1
 
 slow-tests: $(VENV)/.installed-dev
 	$(PYTEST) -m slow $(PYTEST_ARGS)
@@ -73,7 +74,7 @@ new-examples: $(VENV)/.installed-dev
 	$(PYTEST) tests/property tests/oracle --hypothesis-profile=explore
 
 sweep: $(VENV)/.installed-dev
-	$(BIN)/python -m tests.faults.edge_sweep build/sweep --workers $(WORKERS)
+	$(BIN)/python -m tests.faults.edge_sweep build/sweep --workers $(WORKERS) --share $(SHARE) $(ARGS)
 
 mutants: $(VENV)/.installed-dev
 	nice -n 19 $(BIN)/python -m tests.mutation $(TARGETS)

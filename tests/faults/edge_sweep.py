@@ -1,8 +1,9 @@
 """Drives over the rim, turns beside it and stops over seams, all round a mirror, on the simulated plant.
 
 The real danger rules judge frame by frame, with the estimate and the delays of a disturbed world. A case is a number:
-the same number is the same drive. `make sweep` runs all of them, five to nine hours of one core: a block is a line of
-`blocks.jsonl`. A stopped sweep goes on there; what another build swept does not count.
+the same number is the same drive. `make sweep` runs all of them, five to nine hours of one core, and `make test-slow`
+a tenth, chosen at random: a block is a line of `blocks.jsonl`. A stopped sweep goes on there; what another build swept
+does not count.
 """
 
 import argparse
@@ -434,10 +435,13 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("dir", type=Path, metavar="DIR", help="where blocks.jsonl lies or shall lie")
     parser.add_argument("--workers", type=int, default=2, metavar="N")
     parser.add_argument("--blocks", type=int, metavar="N", help="stop after so many")
+    parser.add_argument("--share", type=float, default=1.0, metavar="F", help="a random part of all blocks")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of that part")
     args = parser.parse_args(arguments)
     args.dir.mkdir(parents=True, exist_ok=True)
     path, its_build = args.dir / "blocks.jsonl", build_id()
     every, done = blocks(), read_blocks(path, its_build)
+    every = random.Random(args.seed).sample(every, ceil(args.share * len(every)))
     todo = [block for block in every if block not in done][: args.blocks]
     print(f"{len(done)} of {len(every)} blocks are done, {len(todo)} to do", flush=True)
     with path.open("a") as file:
