@@ -95,7 +95,6 @@ class RateMonitor:
         self._last_s = 0.0
         self._counts = [0, 0, 0]
         self._usual_hz: list[float] | None = None
-        self._short = [False, False, False]
 
     def step(self, t_s: float, imu: int, encoders: int, edges: int) -> None:
         """Take a frame's numbers of samples; judged once per ``rate_time_s``."""
