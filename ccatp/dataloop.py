@@ -37,7 +37,7 @@ MAX_UNSENT_BYTES = 1 << 18
 
 
 class DataLoop(RobotServer):
-    """The server of one simulated robot on ``address`` (port 0 = any free port).
+    """The server of one simulated robot.
 
     In lockstep simulated time waits for the clients; otherwise the wall clock paces it. Each of the ``faults`` is
     logged when it begins and ends, and with what it did.
@@ -46,7 +46,6 @@ class DataLoop(RobotServer):
     def __init__(
         self,
         robot: SimulatedRobot,
-        address: tuple[str, int],
         *,
         lockstep: bool,
         key: bytes | None = None,
@@ -54,37 +53,29 @@ class DataLoop(RobotServer):
         faults: Sequence[Injector | LinkFaults] = (),
     ) -> None:
         super().__init__(robot, lockstep=lockstep, key=key, log=log)
-        self._address, self._faults = address, faults
+        self._faults = faults
         self._listener: asyncio.Server | None = None
         self._timer: asyncio.TimerHandle | None = None
         self.connections: set[Connection] = set()
         self._failure: asyncio.Future[None]
         self.each_frame.append(self._log_faults)
 
-    async def start(self, sock: socket.socket | None = None) -> int:
-        """Boot and listen on the configured address or on a bound socket; return the port.
-
-        ``OSError``: the address cannot be had.
-        """
+    async def start(self, listener: socket.socket) -> int:
+        """Boot and serve who connects to a listening socket; return its port."""
         loop = asyncio.get_running_loop()
         self._failure = loop.create_future()
         self.begin(loop.time())
-        if sock is None:
-            self._listener = await loop.create_server(self.connect, *self._address)
-        else:
-            self._listener = await loop.create_server(self.connect, sock=sock)
+        self._listener = await loop.create_server(self.connect, sock=listener)
         if not self._is_lockstep:
             self._timer = loop.call_at(self.next_frame_s, self._on_timer)
-        return int(self._listener.sockets[0].getsockname()[1])
+        return int(listener.getsockname()[1])
 
     def connect(self) -> "Connection":
         """The protocol of a new connection."""
         return Connection(self)
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Serve until ``stop`` is set; ``start`` first unless it was called. An unforeseen error is raised here."""
-        if self._listener is None:
-            await self.start()
+        """Serve until ``stop`` is set; ``start`` first. An unforeseen error is raised here."""
         failure = self._failure
         stopped = asyncio.ensure_future(stop.wait())
         try:
@@ -200,7 +191,7 @@ async def serve(
     *,
     lockstep: bool,
     stop: asyncio.Event,
-    listen_sock: socket.socket | None = None,
+    listener: socket.socket,
     truth_rep: str | None = None,
     truth_pub: str | None = None,
     log: ServerLog | None = None,
@@ -211,10 +202,8 @@ async def serve(
     """Run the simulated robot of a configuration until ``stop`` is set.
 
     ``faults`` of a survey may be those of the robot and of its link; for the link a proxy listens in the robot's place.
-    ``body_file`` keeps the true pose of the survey robot between runs. ``OSError``: the address cannot be had;
-    ``zmq.ZMQError``: an endpoint cannot be had.
+    ``body_file`` keeps the true pose of the survey robot between runs. ``zmq.ZMQError``: an endpoint cannot be had.
     """
-    at = cfg.sim.robot.host, cfg.sim.robot.port
     robot: SimulatedRobot
     at_work: list[Injector | LinkFaults] = []
     each_frame: list[Callable[[], object]] = []
@@ -231,15 +220,14 @@ async def serve(
                 at_work.append(robot.injector)
         if faults is not None and faults.link:
             behind = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
-            before = listen_sock or stack.enter_context(socket.create_server(at))
-            proxy = FaultProxy(*behind.getsockname()[:2], seed=cfg.run.seed, listener=before)
+            proxy = FaultProxy(*behind.getsockname()[:2], seed=cfg.run.seed, listener=listener)
             at_work.append(LinkFaults(faults.link, await stack.enter_async_context(proxy)))
-            listen_sock = behind
-        server = DataLoop(robot, at, lockstep=lockstep, key=read_key(cfg.robot.key_file), log=log, faults=at_work)
+            listener = behind
+        server = DataLoop(robot, lockstep=lockstep, key=read_key(cfg.robot.key_file), log=log, faults=at_work)
         truth = GroundTruthPublisher(robot, truth_rep, truth_pub)
         stack.callback(truth.close)
         server.each_frame += [truth.add, *each_frame]
-        await server.start(listen_sock)
+        await server.start(listener)
         async with asyncio.TaskGroup() as tasks:
             answering = tasks.create_task(truth.serve())
             try:

@@ -9,27 +9,20 @@ import numpy as np
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.core import Vector3
+from ccatp.daemon.child_processes import listen
 from ccatp.daemon.process import run_until_stopped, start_process
-from ccatp.errors import ConfigError
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck, ZmqPuck
 from ccatp.sim.laser import SEED_STREAM
 
 
-def _run(cfg: Config, puck: ZmqPuck | FixedPuck, listener: socket.socket | None) -> int:
-    mirror, at = build_mirror(cfg.mirror), cfg.sim.etalon
+def _run(cfg: Config, puck: ZmqPuck | FixedPuck, listener: socket.socket) -> int:
+    mirror = build_mirror(cfg.mirror)
 
     async def run(stop: asyncio.Event) -> int:
         rng = np.random.default_rng([cfg.run.seed, SEED_STREAM])
-        server = EtalonSimulator(at, mirror.channels, mirror.collimators_m, puck, rng)
-        try:
-            port = await server.start(at.host, at.port, listener)
-        except OSError as error:
-            raise ConfigError(
-                f"sim.etalon.port: cannot listen on {at.host}:{at.port}: {error.strerror}; choose another with --port"
-            ) from error
-        if listener is None:
-            print(f"ccatp: simulated MultiLine server on {at.host}:{port}", file=sys.stderr, flush=True)
+        server = EtalonSimulator(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, rng)
+        await server.start(listener)
         try:
             async with asyncio.TaskGroup() as tasks:
                 serving = tasks.create_task(server.serve())
@@ -57,11 +50,13 @@ def run_alone(cfg: Config, puck_world_m: Vector3 | None, truth: str | None) -> i
 
     The puck stands still at ``puck_world_m`` (world frame), or follows ``truth``; at base where neither is given.
     """
-    if truth is not None:
-        return _run(cfg, ZmqPuck(truth), None)
-    mirror = build_mirror(cfg.mirror)
+    mirror, at = build_mirror(cfg.mirror), cfg.sim.etalon
     at_base = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)
-    return _run(cfg, FixedPuck(puck_world_m or at_base, step_s=cfg.etalon.measuring_time_s), None)
+    still = FixedPuck(puck_world_m or at_base, step_s=cfg.etalon.measuring_time_s)
+    with listen("sim.etalon", at.host, at.port) as listener:
+        port = listener.getsockname()[1]
+        print(f"ccatp: simulated MultiLine server on {at.host}:{port}", file=sys.stderr, flush=True)
+        return _run(cfg, still if truth is None else ZmqPuck(truth), listener)
 
 
 if __name__ == "__main__":

@@ -10,17 +10,16 @@ import structlog
 
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
+from ccatp.daemon.child_processes import listen
 from ccatp.daemon.process import (
     FAULTS_FILE,
     Endpoints,
-    listen_at,
     open_log,
     processes_of,
     run_until_stopped,
     start_process,
 )
 from ccatp.dataloop import serve
-from ccatp.errors import ConfigError
 from ccatp.links.runtime_dir import TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
 from ccatp.sim.fault_plan import FaultPlan, read_plan
 from ccatp.sim.ground_truth import FILE
@@ -37,7 +36,7 @@ def main() -> int:
             cfg,
             lockstep=lockstep,
             stop=stop,
-            listen_sock=socket.socket(fileno=args.listen_fd),
+            listener=socket.socket(fileno=args.listen_fd),
             truth_rep=args.endpoints.of("puck"),
             truth_pub=args.endpoints.of("truth"),
             log=open_log(args.run_dir / "log.jsonl", "dataloop"),
@@ -66,27 +65,18 @@ def run_alone(
     truth, what = Endpoints(folder).of("puck"), cfg.system if isinstance(cfg, RadioConfig) else cfg.mirror.name
     at, log = cfg.sim.robot, structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
     refusal = f"another simulated robot uses {folder}; end it, or give this one its own --runtime-dir"
-    with locked(folder / TRUTH_LOCK_FILE, refusal):
-        try:
-            listener = listen_at(at.host, at.port)
-        except OSError as error:
-            raise ConfigError(
-                f"sim.robot.port: cannot listen on {at.host}:{at.port}: {error.strerror}; choose another with --port"
-            ) from error
+    with locked(folder / TRUTH_LOCK_FILE, refusal), listen("sim.robot", at.host, at.port) as listener:
 
         async def run(stop: asyncio.Event) -> int:
-            await serve(
-                cfg, lockstep=lockstep, stop=stop, listen_sock=listener, truth_rep=truth, log=log, faults=faults
-            )
+            await serve(cfg, lockstep=lockstep, stop=stop, listener=listener, truth_rep=truth, log=log, faults=faults)
             return 0
 
-        with listener:
-            host, port = listener.getsockname()[:2]
-            print(f"ccatp: simulated robot ({what}) on {host}:{port}, truth at {truth}", file=sys.stderr, flush=True)
-            try:
-                return run_until_stopped(run)
-            finally:
-                remove_sockets(folder, ("puck",))
+        host, port = listener.getsockname()[:2]
+        print(f"ccatp: simulated robot ({what}) on {host}:{port}, truth at {truth}", file=sys.stderr, flush=True)
+        try:
+            return run_until_stopped(run)
+        finally:
+            remove_sockets(folder, ("puck",))
 
 
 if __name__ == "__main__":

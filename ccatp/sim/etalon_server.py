@@ -130,17 +130,11 @@ class EtalonSimulator:
         self._push: asyncio.Task[None] | None = None
         self._end: asyncio.Future[None] | None = None
 
-    async def start(self, host: str, port: int, sock: socket.socket | None = None) -> int:
-        """Listen on ``host:port`` (0 = any free port) or on the bound socket ``sock``; return the port.
-
-        ``OSError``: the address cannot be had.
-        """
+    async def start(self, listener: socket.socket) -> int:
+        """Serve who connects to a bound socket; return its port."""
         self._end = asyncio.get_running_loop().create_future()
-        if sock is None:
-            self._server = await asyncio.start_server(self._accept, host, port)
-        else:
-            self._server = await asyncio.start_server(self._accept, sock=sock)
-        return int(self._server.sockets[0].getsockname()[1])
+        self._server = await asyncio.start_server(self._accept, sock=listener)
+        return int(listener.getsockname()[1])
 
     async def serve(self) -> None:
         """Wait until closed. An unforeseen error in a session ends it and is raised here."""

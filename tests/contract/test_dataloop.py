@@ -237,7 +237,7 @@ async def test_truth_leaves_by_its_own_sockets(config: Config, tmp_path: Path) -
     listening = socket.create_server(("127.0.0.1", 0))
     stop = asyncio.Event()
     task = asyncio.create_task(
-        serve(config, lockstep=True, stop=stop, listen_sock=listening, truth_rep=rep, truth_pub=pub)
+        serve(config, lockstep=True, stop=stop, listener=listening, truth_rep=rep, truth_pub=pub)
     )
     context = zmq.asyncio.Context()
     asking, listener = context.socket(zmq.REQ), context.socket(zmq.SUB)

@@ -17,6 +17,7 @@ from ccatp.links.multiline import ChannelData, parse_reply
 from ccatp.sim import etalon_server as etalon_standin
 from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck, PuckSource, TruthUnavailable, ZmqPuck
 from ccatp.sim.laser import PuckTruth
+from tests.support.scenario import any_port
 
 CHANNELS = (1, 2, 3, 4)
 COLLIMATORS = np.array([[0.0, 0.0, 5.0], [3.0, 0.0, 4.0], [0.0, 4.0, 3.0], [-6.0, 0.0, 8.0]])
@@ -34,7 +35,7 @@ def standin(truth: PuckSource | None = None, cfg: SimEtalonConfig = QUIET, seed:
 
 @asynccontextmanager
 async def running(server: EtalonSimulator) -> AsyncIterator[int]:
-    port = await server.start("127.0.0.1", 0)
+    port = await server.start(any_port())
     try:
         yield port
     finally:
@@ -129,7 +130,7 @@ async def test_a_slow_client_that_ends_its_side_still_gets_every_reply() -> None
         small.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         bound.bind(("127.0.0.1", 0))
         server = standin()
-        await server.start("", 0, sock=bound)
+        await server.start(bound)
         small.connect(bound.getsockname())
         reader, writer = await asyncio.open_connection(sock=small)
         writer.write((b"latestlengthvalid," + b",".join(b"%d" % n for n in range(1, 33)) + b"\r\n") * 100)
@@ -250,7 +251,7 @@ async def test_serve_lasts_until_closed_and_wants_a_start() -> None:
     with pytest.raises(RuntimeError, match="not started"):
         await server.serve()
     await server.close()
-    await server.start("127.0.0.1", 0)
+    await server.start(any_port())
     with pytest.raises(TimeoutError):
         async with asyncio.timeout(0.02):
             await server.serve()
@@ -260,7 +261,7 @@ async def test_serve_lasts_until_closed_and_wants_a_start() -> None:
 
 async def test_closing_with_clients_connected_is_quiet(caplog: pytest.LogCaptureFixture) -> None:
     server = standin()
-    port = await server.start("127.0.0.1", 0)
+    port = await server.start(any_port())
     async with peer(port) as client, peer(port) as streaming:
         assert await client.ask(b"isconnected\r\n") == b"isconnected_1\r\n"
         assert await streaming.ask(b"startmeasnogui\r\n") == b"measstarted\r\n"

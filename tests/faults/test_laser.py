@@ -38,7 +38,7 @@ from tests.contract.test_etalon_client import (
 )  # fmt: skip
 from tests.faults.linking import Measured
 from tests.support.mission_story import FREE, Story, from_first_leg
-from tests.support.scenario import config_of, mirror_of, one_panel
+from tests.support.scenario import any_port, config_of, mirror_of, one_panel
 from tests.support.sim_survey import (
     Desk,
     LaserRequest,
@@ -150,7 +150,7 @@ def test_a_point_takes_ten_seconds_at_most(action: Any, config: Config, tmp_path
 def test_a_beam_that_is_free_again_costs_a_retry(config: Config, tmp_path: Path, measured: Measured) -> None:
     async def story() -> tuple[float, list[PointId | None], int]:
         standin = EtalonSimulator(config.sim.etalon, CHANNELS, COLLIMATORS, FixedPuck(PUCK), np.random.default_rng(4))
-        async with desk_of(config, await standin.start("127.0.0.1", 0), tmp_path) as (desk, client, _):
+        async with desk_of(config, await standin.start(any_port()), tmp_path) as (desk, client, _):
             standin.model.blocked.update(CHANNELS[3:])
             asyncio.get_running_loop().call_later(0.8, standin.model.blocked.clear)
             took_s = await time_of_a_point(desk)

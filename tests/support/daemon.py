@@ -29,7 +29,7 @@ from ccatp.sim.etalon_server import EtalonSimulator, ZmqPuck
 from ccatp.sim.fault_proxy import FaultProxy
 from ccatp.sim.ground_truth import GroundTruthPublisher
 from ccatp.sim.rules import MotionRules
-from tests.support.scenario import SurveyLoop, config_of, mirror_of, one_panel
+from tests.support.scenario import SurveyLoop, any_port, config_of, mirror_of, one_panel
 
 DEADLINE_S = 60.0
 LINK_DEADLINE_S = 30.0  # what never happens in a good run may take this long in a bad one
@@ -161,7 +161,7 @@ async def stand_ins(
         stack.callback(puck.close)
         laser = EtalonSimulator(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1))
         stack.push_async_callback(laser.close)
-        robot_port, laser_port = await robot.start(), await laser.start("127.0.0.1", 0)
+        robot_port, laser_port = await robot.start(), await laser.start(any_port())
         async with asyncio.TaskGroup() as tasks:
             serving = [tasks.create_task(work) for work in (robot.run(stop), outlet.serve(), laser.serve())]
             try:

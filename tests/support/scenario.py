@@ -1,6 +1,7 @@
 """Configurations, mirrors, and the simulated robot, as most tests want them."""
 
 import json
+import socket
 from collections.abc import Callable
 from functools import cache
 from math import sqrt
@@ -84,6 +85,11 @@ def drive(robot: Robot, right_rad_s: float, left_rad_s: float, frames: int) -> l
     return [json.loads(line) for line in lines.splitlines()]
 
 
+def any_port() -> socket.socket:
+    """A listening socket at any free port of this machine."""
+    return socket.create_server(("127.0.0.1", 0))
+
+
 class SurveyLoop(DataLoop):
     """A survey robot behind the link, at any free port."""
 
@@ -92,7 +98,10 @@ class SurveyLoop(DataLoop):
     def __init__(
         self, config: Config, *, lockstep: bool, key: bytes | None = None, log: ServerLog | None = None
     ) -> None:
-        super().__init__(survey_robot(config), ("127.0.0.1", 0), lockstep=lockstep, key=key, log=log)
+        super().__init__(survey_robot(config), lockstep=lockstep, key=key, log=log)
+
+    async def start(self, listener: socket.socket | None = None) -> int:
+        return await super().start(listener or any_port())
 
 
 class Client(RobotSession):

@@ -39,7 +39,7 @@ async def drive(plan: str, is_over: Callable[[Driver], bool], *, lockstep: bool)
         faults = parse_plan(plan, "plan")
         client = Driver(listener.getsockname()[1])
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(serve(cfg, lockstep=lockstep, stop=stop, listen_sock=listener, log=log, faults=faults))
+            tasks.create_task(serve(cfg, lockstep=lockstep, stop=stop, listener=listener, log=log, faults=faults))
             try:
                 await client.link.connect(DEADLINE_S)
                 await client.until(lambda: is_over(client))
