@@ -276,12 +276,12 @@ def _measured(
 
 
 def _write(path: Path, found: tuple[Any, Any, Any], layout: str) -> None:
-    from ccatp.beacons.datasets.sheets import BeaconPositions, write_beacons
+    from ccatp.beacons.datasets.sheets import write_beacons
 
     frame = "field: as the anchors and surveyed places of the configuration say"
     if layout != "networks":
         frame = "own: first beacon at the origin, second on +x, third at y > 0; covariance of the aligned map"
-    write_beacons(path, BeaconPositions(*found, frame))
+    write_beacons(path, *found, frame)
 
 
 def _progress(total: int) -> Callable[[int], None]:

@@ -77,7 +77,6 @@ class EkfSlam:
         x, P = checked_gaussian(vehicle_mean, vehicle_covariance, np.shape(vehicle_covariance))
         self.vehicle_size = v = x.size
         c = 0 if calibration_mean is None else int(np.size(calibration_mean))
-        self.calibration_size = c
         self._blocks: dict[BlockId, slice] = {}
         mean, covariance = np.zeros(v + c), np.zeros((v + c, v + c))
         mean[:v], covariance[:v, :v] = x, P
@@ -139,10 +138,6 @@ class EkfSlam:
         self._rows[:] = rows
         self._columns[:] = rows.T
         self._vehicle[:] = vehicle_mean
-
-    def spread(self, columns: Columns, h: FloatArray) -> float:
-        """H P H^T of one row, h (k,) over its ``columns`` (k,)."""
-        return float(h.dot(self.covariance[np.ix_(columns, columns)]).dot(h))
 
     def relax(self, index: int, factor: float, variance: float) -> None:
         """One state forgets: x <- factor x + noise, a Gauss-Markov process; ``factor`` 0 to 1."""

@@ -288,22 +288,18 @@ def _check_range(path: Path, line: int, reading: MoteRange) -> None:
 _HEAD = "# Beacons, mapped by ccatp radio map: m, and the covariance of all coordinates in their order, m^2.\n\n"
 
 
-class BeaconPositions(NamedTuple):
-    """Beacons with what is uncertain about them."""
+def write_beacons(
+    path: Path, names: Sequence[str], positions_m: FloatArray, covariance_m2: FloatArray, frame: str
+) -> None:
+    """Write a map: positions (n, d), covariance of all coordinates (n d, n d).
 
-    names: tuple[str, ...]
-    positions_m: FloatArray  # shape (n, d)
-    covariance_m2: FloatArray  # of all coordinates, shape (n d, n d)
-    frame: str
-
-
-def write_beacons(path: Path, found: BeaconPositions) -> None:
-    """Write a map. Raises RadioDataError: the file cannot be written."""
-    sigmas_m = np.sqrt(np.maximum(found.covariance_m2.diagonal(), 0.0)).reshape(found.positions_m.shape)
-    rows = zip(found.names, found.positions_m.tolist(), sigmas_m.tolist(), strict=True)
+    Raises RadioDataError: the file cannot be written.
+    """
+    sigmas_m = np.sqrt(np.maximum(covariance_m2.diagonal(), 0.0)).reshape(positions_m.shape)
+    rows = zip(names, positions_m.tolist(), sigmas_m.tolist(), strict=True)
     beacons = {name: {"position_m": place_m, "sigma_m": sigma_m} for name, place_m, sigma_m in rows}
-    tree = {"frame": found.frame, "dimension": found.positions_m.shape[1], "beacons": beacons}
-    joint = {"joint": {"covariance_m2": found.covariance_m2.tolist()}}
+    tree = {"frame": frame, "dimension": positions_m.shape[1], "beacons": beacons}
+    joint = {"joint": {"covariance_m2": covariance_m2.tolist()}}
     try:
         path.write_text(_HEAD + tomlkit.dumps(tree | joint), encoding="utf-8")
     except OSError as error:

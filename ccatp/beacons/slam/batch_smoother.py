@@ -92,7 +92,7 @@ def _diagonal_of_inverse(system: ArrowSystem) -> FloatArray:
     return np.asarray(np.linalg.inv(left + right - A))
 
 
-def t_weights(chi2: FloatArray, sizes: FloatArray, freedom: float, softness: FloatArray | float = 1.0) -> FloatArray:
+def t_weights(chi2: FloatArray, sizes: FloatArray, freedom: float, softness: float = 1.0) -> FloatArray:
     """Weight of each reading: (nu + p) / (nu + chi2 / softness), the M-estimator of Student's t with p components.
 
     A softness above one forgives large residuals: it is how a start far off is not mistaken for outliers.
@@ -101,7 +101,7 @@ def t_weights(chi2: FloatArray, sizes: FloatArray, freedom: float, softness: Flo
     return weights
 
 
-def t_cost(chi2: FloatArray, sizes: FloatArray, freedom: float, softness: FloatArray | float = 1.0) -> float:
+def t_cost(chi2: FloatArray, sizes: FloatArray, freedom: float, softness: float = 1.0) -> float:
     """Negative log likelihood of Student's t without its constants, with the weights above as its gradient's."""
     return float((0.5 * (freedom + sizes) * softness * np.log1p(chi2 / (freedom * softness))).sum())
 
@@ -110,10 +110,10 @@ def descend(
     problem: BatchProblem,
     state: BatchState,
     most: int,
-    softness: FloatArray | float = 1.0,
+    softness: float = 1.0,
     enough: float = CONVERGED,
 ) -> tuple[BatchState, bool]:
-    """Minimise the negative log posterior, with the softness of each reading's law (m,); whether that converged."""
+    """Minimise the negative log posterior, with the softness of the readings' law; whether that converged."""
     damping = 1e-6
 
     def cost_of(tried: BatchState) -> float:

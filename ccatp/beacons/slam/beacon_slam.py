@@ -57,9 +57,8 @@ class BeaconInnovation(NamedTuple):
     """What one reading did."""
 
     beacon: BeaconId
-    residual: FloatArray  # z - h(x) of the bearing, if there is one, and of the range or the strength, shape (m,)
     nis: float  # nu^T S^-1 nu, with the larger noise where a reading was beyond the knee
-    size: int  # m; a reading whose bearing is refused has its range left out
+    size: int  # scalars that were taken: bearing, range or strength; where the bearing is refused, it alone
     accepted: bool  # False where it was refused; the state is then as before, or has taken the bearing alone
     surprise: float = 0.0  # minus twice its log-likelihood, up to a constant: sum of nis + ln S
 
@@ -289,16 +288,15 @@ class BeaconSlam:
         model = None if is_direction(reading) else self._wander
         if model is not None:
             self._map.wander_to(reading.beacon, model, self._way_m, reading.time_s)
-        residuals, nis, spread, accepted = [], 0.0, 1.0, True
+        nis, spread, size, accepted = 0.0, 1.0, 0, True
         for kind, z in scalars_of(reading):
             if accepted:
                 found = self._take(reading, entry, kind, z, model)
-                residuals.append(found.residual)
-                nis, spread, accepted = nis + found.nis, spread * found.spread, found.accepted
+                nis, spread, size, accepted = nis + found.nis, spread * found.spread, size + 1, found.accepted
         if self._learns:
             self._fresh.clear()
         self._judge(reading, entry, accepted=accepted)
-        return BeaconInnovation(reading.beacon, np.array(residuals), nis, len(residuals), accepted, nis + log(spread))
+        return BeaconInnovation(reading.beacon, nis, size, accepted, nis + log(spread))
 
     def _take(self, reading: Reading, entry: MapEntry, kind: str, z: float, model: GaussMarkovBias | None) -> RowUpdate:
         engine, level, columns = self.engine, self.levels[kind], entry.columns

@@ -35,10 +35,7 @@ class ScanResult(NamedTuple):
 
     beacon: str
     rssi_dbm: float
-    readings: int
     bearing_rad: float | None  # left of the heading; None where the scan has none
-    bearing_sigma_rad: float
-    heard: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +65,13 @@ class ReflectorScan:
         return [self._result(beacon, readings) for beacon, readings in by_beacon.items()]
 
     def _result(self, beacon: str, readings: Sequence[tuple[float, float]]) -> ScanResult:
-        heard = len(readings) / self.cfg.readings
         bearing_rad = self._bearing(readings)
-        if bearing_rad is None or heard < 1.0 - self.cfg.loss_tolerance:
-            levels = [level_dbm for _, level_dbm in readings]
-            return ScanResult(beacon, max(levels), 1, None, self.sigma_rad, heard)
+        strongest_dbm = max(level_dbm for _, level_dbm in readings)
+        if bearing_rad is None or len(readings) / self.cfg.readings < 1.0 - self.cfg.loss_tolerance:
+            return ScanResult(beacon, strongest_dbm, None)
         levels = [z for direction, z in readings if abs(wrap_pi(direction - bearing_rad)) <= 1.01 * self.step_rad]
-        levels = levels or [max(level_dbm for _, level_dbm in readings)]
-        return ScanResult(beacon, sum(levels) / len(levels), len(levels), bearing_rad, self.sigma_rad, heard)
+        levels = levels or [strongest_dbm]
+        return ScanResult(beacon, sum(levels) / len(levels), bearing_rad)
 
     def _bearing(self, readings: Sequence[tuple[float, float]]) -> float | None:
         """Direction of the strongest reading, 2017 eq. 5; the middle of equals that lie together, else None."""
@@ -177,7 +173,7 @@ class SignalSlam(BeaconSlam):
                 of_others.append(reading)
             elif moving.beacon in self.engine:
                 found = self._update_moving(reading)
-                learned.append(BeaconInnovation(reading.beacon, found.residual, found.nis, found.size, found.accepted))
+                learned.append(BeaconInnovation(reading.beacon, found.nis, found.size, found.accepted))
             elif reading.bearing_rad is not None:  # it joins at its first bearing: it would be elsewhere later
                 moving.join(self.engine, reading.bearing_rad)
                 self._update_moving(reading)

@@ -10,7 +10,6 @@ import pytest
 from openpyxl import Workbook
 
 from ccatp.beacons.datasets.sheets import (
-    BeaconPositions,
     read_heard_places,
     read_levels,
     read_log,
@@ -166,11 +165,11 @@ def test_what_is_no_workbook_is_refused(tmp_path: Path) -> None:
 def test_beacon_files(tmp_path: Path) -> None:
     path, rng = tmp_path / "b.toml", np.random.default_rng(1)
     places, root = rng.normal(size=(3, 3)), rng.normal(size=(9, 9))
-    given = BeaconPositions(("N1-1", "b", "c"), places, root @ root.T, "here")
-    write_beacons(path, given)
+    given = (("N1-1", "b", "c"), places, root @ root.T, "here")
+    write_beacons(path, *given)
     found = tomllib.loads(path.read_text(encoding="utf-8"))
-    assert (tuple(found["beacons"]), found["frame"]) == (given.names, "here")
+    assert (tuple(found["beacons"]), found["frame"]) == (given[0], "here")
     assert [beacon["position_m"] for beacon in found["beacons"].values()] == places.tolist()
     assert found["joint"]["covariance_m2"] == (root @ root.T).tolist()
     with pytest.raises(RadioDataError, match="cannot be written"):
-        write_beacons(tmp_path / "no" / "b.toml", given)
+        write_beacons(tmp_path / "no" / "b.toml", *given)
