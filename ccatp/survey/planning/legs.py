@@ -170,7 +170,7 @@ class LegRules:
         """Whether the sensors of a robot that faces ``course_rad`` all the way keep ``clearance_m`` between the ends.
 
         Where no re-entrant corner is near, the mirror is convex, and a sensor is nearest to the rim at an end of its
-        straight track, which the stances check.
+        straight track, which the places check.
         """
         body = self._body
         if clearance_m >= body.reach_m + body.turn_clearance_m:
