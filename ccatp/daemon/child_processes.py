@@ -29,7 +29,7 @@ MAX_POLL_GAP_S = 0.2
 # The matrices are 4 x 4: threads of the linear algebra would only compete with the processes for the cores.
 ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 STOP_TIMEOUT_S = 4.0
-# The last process has this long, even where others have used up the time.
+# Each process has this long, even where others have used up the time.
 LEAST_STOP_S = 1.0
 # A loop that was restarted joins within this.
 RECOVERY_S = 5.0
@@ -210,19 +210,32 @@ class ProcessManager:
         return None
 
     def stop_all(self) -> None:
-        """Ask each to end, the last one started first; a deadline for all of them together."""
+        """Ask each to end, the last one started first; a deadline for all of them together.
+
+        What the survey does not need, and so has nothing to save, is asked as soon as the first has ended, and killed
+        where it is still there at the end.
+        """
         deadline_s = time.monotonic() + STOP_TIMEOUT_S
-        for name, child in reversed(self._children.items()):
-            process = child.process
-            if process.poll() is not None:
+        running = [child for child in reversed(self._children.values()) if child.process.poll() is None]
+        others = [child.process for child in running if not child.spec.is_needed]
+        for child in running:
+            if not child.spec.is_needed:
                 continue
+            child.process.terminate()
+            try:
+                child.process.wait(max(deadline_s - time.monotonic(), LEAST_STOP_S))
+            except subprocess.TimeoutExpired:
+                text = f"process {child.spec.name} did not stop within {STOP_TIMEOUT_S:g} s and was killed"
+                self._notify_operator("error", text)
+                child.process.kill()
+                child.process.wait()
+            for process in others:
+                process.terminate()
+        for process in others:
             process.terminate()
             try:
-                process.wait(max(deadline_s - time.monotonic(), LEAST_STOP_S))
+                process.wait(LEAST_STOP_S)
             except subprocess.TimeoutExpired:
-                self._notify_operator(
-                    "error", f"process {name} did not stop within {STOP_TIMEOUT_S:g} s and was killed"
-                )
                 process.kill()
                 process.wait()
 

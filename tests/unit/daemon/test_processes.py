@@ -2,6 +2,8 @@
 
 import asyncio
 import os
+import re
+import signal
 import socket
 import time
 from dataclasses import replace
@@ -25,6 +27,7 @@ from ccatp.errors import DaemonUnreachableError
 
 # Ends with the status in its variable, or waits for its end.
 CODE = "import os, sys, time; status = int(os.environ['STATUS']); sys.exit(status) if status else time.sleep(60.0)"
+UNENDING = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60.0)"
 PAGE = ProcessSpec("page", "ending_child", is_needed=False, niceness=7)
 MAIN = ProcessSpec("main", "m")
 SIMULATOR = replace(MAIN, is_replaceable=False)
@@ -69,6 +72,7 @@ def said() -> list[str]:
 @pytest.fixture
 def children(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: Config, said: list[str]) -> ProcessManager:
     (tmp_path / "ending_child.py").write_text(CODE)
+    (tmp_path / "unending_child.py").write_text(UNENDING)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     return ProcessManager(config.run, lambda _spec, _is_restarted: ([], ()), lambda _level, text: said.append(text))
 
@@ -115,6 +119,28 @@ def test_niceness_and_the_time_of_the_last_process(
     children.stop_all()
     children.kill_all()
     assert said == []
+
+
+@pytest.mark.parametrize(
+    ("spec", "lines"),
+    [
+        (replace(PAGE, module="unending_child"), []),  # has nothing to save
+        (ProcessSpec("main", "unending_child"), ["process main did not stop within 0 s and was killed"]),
+    ],
+)
+def test_who_does_not_stop_is_killed(
+    children: ProcessManager, said: list[str], monkeypatch: pytest.MonkeyPatch, spec: ProcessSpec, lines: list[str]
+) -> None:
+    monkeypatch.setattr("ccatp.daemon.child_processes.STOP_TIMEOUT_S", 0.0)
+    monkeypatch.setattr("ccatp.daemon.child_processes.LEAST_STOP_S", 0.2)
+    children.start(spec)
+    (found,) = children._children.values()
+    status = Path(f"/proc/{found.process.pid}/status")
+    while not int(re.findall(r"SigIgn:\s+(\w+)", status.read_text())[0], 16) >> (signal.SIGTERM - 1) & 1:
+        time.sleep(0.01)
+    children.stop_all()
+    assert found.process.returncode == -signal.SIGKILL
+    assert said == lines
 
 
 @pytest.mark.fault("P18")
