@@ -84,7 +84,7 @@ SWITCHES = {"allow_pickle", "shell"}
 METHODS = {"send_pyobj", "recv_pyobj", "read_pickle", "to_pickle"}
 # Studies hand jobs to processes of their own machine, or to a dask cluster that the user names: both pickle.
 POOLS = {"multiprocessing", "ProcessPoolExecutor", "distributed", "dask"}
-WITH_POOLS = {"studies/engine.py"}
+WITH_POOLS = {"studies/engine.py", "studies/calibrator.py"}  # pickles pass between this package's own processes only
 
 
 def is_false(value: ast.expr) -> bool:
