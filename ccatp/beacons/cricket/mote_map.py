@@ -285,7 +285,7 @@ def _turn_singles(model: MapModel, fit: MapFit, settings: MapFitSettings) -> tup
         if is_other[0]:
             places[mote] = ends[best]
             turned += 1
-        elif (others := costs[is_other]).size and (gap := float(others.min() - costs[best])) < _CLOSE:
+        if (others := costs[is_other]).size and (gap := float(others.min() - costs[best])) < _CLOSE:
             near[(mote,)] = gap
     if turned:
         better = fit_map(model, model.state(places, state.offset_m, state.scale), settings)

@@ -162,7 +162,6 @@ class FoldOver(NamedTuple):
 
     is_unique: bool  # whether almost all places give a map that is the only one, up to a rigid motion and the mirror
     mirrors: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
-    single_pairs: IndexArray  # pairs whose range nothing else confirms, shape (k, 2): without it something moves
     warnings: tuple[str, ...]
 
 
@@ -176,18 +175,16 @@ def find_fold_over(network: RangeNetwork, rng: np.random.Generator) -> FoldOver:
     """
     pairs = _all_pairs(network)
     count, d = network.count, network.dimension
-    complete = len(pairs) == count * (count - 1) // 2
-    if complete:
-        return FoldOver(True, (), np.zeros((0, 2), dtype=np.intp), ())
+    if len(pairs) == count * (count - 1) // 2:
+        return FoldOver(True, (), ())
     single, rank = _stress(pairs, rng.standard_normal((count, d)), rng)
-    measured = set(map(tuple, network.pairs.tolist()))
-    rows = [pair for pair in single.tolist() if tuple(pair) in measured]
-    single = np.array(rows, dtype=np.intp).reshape(-1, 2)
     if count > d + 1 and rank == count - d - 1:
-        return FoldOver(True, (), single, ())
+        return FoldOver(True, (), ())
     # The same motes may hang on many pairs, one of which is a mote they all turn about: once is enough.
     mirrors = tuple({motes: (separator, motes) for separator, motes in _mirrors(pairs, count, d)}.values())
-    return FoldOver(False, mirrors, single, tuple(_warnings(network, mirrors, single)))
+    measured = set(map(tuple, network.pairs.tolist()))
+    single_pairs = [pair for pair in single.tolist() if tuple(pair) in measured]
+    return FoldOver(False, mirrors, tuple(_warnings(network, mirrors, single_pairs)))
 
 
 def _all_pairs(network: RangeNetwork) -> IndexArray:
@@ -260,7 +257,7 @@ def _cut_vertices(pairs: IndexArray, count: int, without: int) -> list[int]:
 
 
 def _warnings(
-    network: RangeNetwork, mirrors: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...], single: IndexArray
+    network: RangeNetwork, mirrors: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...], single_pairs: list[list[int]]
 ) -> Iterator[str]:
     names, shape = network.names, "line" if network.dimension == 2 else "plane"
     for separator, motes in mirrors[:_SHOWN]:
@@ -268,8 +265,8 @@ def _warnings(
         yield f"{list_names([names[mote] for mote in motes])} may be mirrored across the {shape} through {held}"
     if len(mirrors) > _SHOWN:
         yield f"and {len(mirrors) - _SHOWN} more sets of motes may be mirrored"
-    if not mirrors and len(single):
-        shown = list_names([f"{names[i]} to {names[j]}" for i, j in single.tolist()])
+    if not mirrors and single_pairs:
+        shown = list_names([f"{names[i]} to {names[j]}" for i, j in single_pairs])
         yield f"ranges that nothing confirms, so that several maps may fit: {shown}"
-    if not mirrors and not len(single):
+    if not mirrors and not single_pairs:
         yield "several maps may fit all ranges; a few more pairs would exclude it"

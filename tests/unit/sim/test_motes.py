@@ -30,24 +30,25 @@ def heard(cfg: CricketConfig, repeats: int = 1, distance_m: float = 5.0) -> Mote
 QUIET = {"sim__sigma_m": 0.0}
 
 
-def test_sound_takes_its_time() -> None:
-    assert heard(config(**QUIET)).delays_s[0] == pytest.approx(5.0 / 344.0)
-    warm = heard(config(**QUIET, sim__temperature_c=30.0))
-    assert warm.delays_s[0] == pytest.approx(5.0 / 344.0 * np.sqrt(293.15 / 303.15))
-    assert warm.temperature_c == 30.0
+@pytest.mark.parametrize(
+    ("keys", "delay_s"),
+    [
+        ({}, 5.0 / 344.0),
+        ({"sim__temperature_c": 30.0}, 5.0 / 344.0 * np.sqrt(293.15 / 303.15)),
+        ({"sim__latency_s": 0.001}, 5.0 / 344.0 + 0.001),
+        ({"sim__tick_s": 1e-3}, 0.015),  # 14.53 ms to the nearest
+    ],
+)
+def test_flight_latency_and_clock(keys: dict[str, float], delay_s: float) -> None:
+    pulse = heard(config(**QUIET, **keys))
+    assert pulse.delays_s[0] == pytest.approx(delay_s)
+    assert pulse.temperature_c == keys.get("sim__temperature_c", 20.0)
 
 
 def test_noise_is_that_of_the_configuration() -> None:
     ranges_m = heard(config(), 4000).delays_s * 344.0
     assert ranges_m.std() == pytest.approx(0.0066667, rel=0.04)  # 4000 draws: 1.1 %
     assert ranges_m.mean() == pytest.approx(5.0, abs=4e-4)
-
-
-def test_clock_and_latency() -> None:
-    late = heard(config(**QUIET, sim__latency_s=0.001)).delays_s[0]
-    assert late == pytest.approx(5.0 / 344.0 + 0.001)
-    coarse = heard(config(**QUIET, sim__tick_s=1e-3)).delays_s[0]
-    assert coarse == pytest.approx(0.015)  # 14.53 ms to the nearest
 
 
 def test_echoes_are_longer_and_losses_are_missing() -> None:
