@@ -106,10 +106,11 @@ class UnscentedKalmanFilter(KalmanFilter):
         expected = self._weights.dot(images)
         deviations = (images - expected) * self._roots
         rows = self._rows.get(z.shape) or self._new_rows(m)
-        rows.V[: self._n] = (self._offsets * self._roots).T.dot(deviations)
+        rows.V[: self._n, :m] = (self._offsets * self._roots).T.dot(deviations)
         np.subtract(z, expected, rows.residual)
-        rows.S_rows[:] = R if R.ndim == 2 else np.diag(R)
-        dsyrk(1.0, deviations.T, 1.0, rows.S, 0, 1, 1)
+        noise = R if R.ndim == 2 else np.diag(R)
+        rows.S[:m, :m] = dsyrk(1.0, deviations.T, 1.0, noise.T, 0, 1)
+        rows.empty.fill(1.0)
         if dpotrf(*rows.factor)[1]:
             raise FilterDiverged("update is not finite, or the covariance of the measurement is not positive definite")
         return self._subtract(rows, rows.residual.tolist())

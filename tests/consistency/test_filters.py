@@ -163,25 +163,33 @@ def test_jacobians_of_the_problem_are_its_differences() -> None:
         np.testing.assert_allclose(model.at(START)[1], numeric, atol=1e-8)  # rounding of 1e-16 over the step of 1e-6
 
 
+class Linear:
+    def __init__(self, A: FloatArray) -> None:
+        self.A = A
+
+    def through(self, X: FloatArray) -> FloatArray:
+        image: FloatArray = X.dot(self.A.T)
+        return image
+
+    def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return self.A @ x, self.A
+
+
 @BOTH
-def test_a_model_that_is_linear_is_the_matrix(name: str) -> None:
-    A = np.array([[1.0, 0.3], [-0.2, 0.9]])
-
-    class Linear:
-        def through(self, X: FloatArray) -> FloatArray:
-            return X.dot(A.T)  # type: ignore[no-any-return]
-
-        def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-            return A @ x, A
+@pytest.mark.parametrize("count", [1, 2, 5, 6, 8, 23])  # rows are filled up to a multiple of four
+def test_a_model_that_is_linear_is_the_matrix(name: str, count: int) -> None:
+    A, rng = np.array([[1.0, 0.3], [-0.2, 0.9]]), np.random.default_rng(count)
+    H, z, R = rng.normal(size=(count, 2)), rng.normal(size=count), rng.uniform(0.2, 0.3, count)
 
     nis: list[float] = []
     model, matrix = (FILTERS[n](np.array([1.0, -2.0]), np.array([[2.0, 0.4], [0.4, 1.0]])) for n in (name, "kf"))
-    for F, H, filter_ in ((Linear(), Linear(), model), (A, A, matrix)):
+    for F, rows, filter_ in ((Linear(A), Linear(H), model), (A, H, matrix)):
         filter_.predict(F, 0.1 * np.eye(2))
-        nis.append(filter_.update(np.array([0.5, 0.7]), H, np.array([0.2, 0.3])).nis)
-    assert nis[0] == pytest.approx(nis[1], rel=1e-13)  # rounding
-    np.testing.assert_allclose(model.mean, matrix.mean, rtol=1e-13)  # rounding
-    np.testing.assert_allclose(model.covariance, matrix.covariance, rtol=1e-13)
+        nis.append(filter_.update(z, rows, R).nis)
+        nis.append(filter_.update(z, rows, np.diag(R)).nis)
+    assert nis[:2] == pytest.approx(nis[2:], rel=1e-13)  # rounding
+    np.testing.assert_allclose(model.mean, matrix.mean, rtol=1e-12, atol=1e-15)  # rounding of a prior of 2
+    np.testing.assert_allclose(model.covariance, matrix.covariance, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(model.transition, A, rtol=1e-13)
 
 
@@ -197,7 +205,7 @@ INERTIAL = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 KF_START = np.diag([1e-4, 1e-2, 1e-4, 1e-2])
 
 
-def rows(count: int) -> tuple[FloatArray, FloatArray]:
+def kf_rows(count: int) -> tuple[FloatArray, FloatArray]:
     """H and R of ``count`` samples of each wheel and one of the inertial unit; shipped noise."""
     H = np.vstack([np.repeat(WHEELS, count, axis=0), INERTIAL])
     return H, np.concatenate([np.full(2 * count, 1e-6), [3.5e-5, 7.6e-5]])
@@ -205,7 +213,7 @@ def rows(count: int) -> tuple[FloatArray, FloatArray]:
 
 @pytest.mark.parametrize("count", [0, 1, 10])
 def test_errors_and_innovations_are_as_large_as_said(count: int) -> None:
-    H, R = rows(count)
+    H, R = kf_rows(count)
     nis, nees = 0.0, []
     for seed in range(SEEDS):
         rng = np.random.default_rng(seed)
