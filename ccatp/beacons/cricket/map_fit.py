@@ -236,7 +236,8 @@ def _solved(
     # Unknowns that no range sees still get a damping, so that they stay where they are.
     more = damping * np.maximum(diagonal, 1e-6 * float(diagonal.max()))
     if penalty is not None:
-        more = damping + penalty  # without what the ranges make of it: it grows stiff in the squeezed ones
+        # The same damping for all: scaled by the diagonal, motes of heavy ranges would not turn over.
+        more = damping + penalty
     if isinstance(normal, np.ndarray):
         damped = normal.copy()
         damped[np.diag_indices_from(damped)] += more
