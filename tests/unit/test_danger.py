@@ -266,6 +266,34 @@ def test_turning_on_outwards_bars_the_turn_until_the_sensor_is_on(on_panel: Stor
     assert permits(on_panel.monitor.verdict) == ANY_PERMIT
 
 
+def test_a_sweep_along_a_seam_is_no_edge(cfg: Config, mirror: Mirror) -> None:
+    panel = list(mirror.panels.values())[40]
+    # The corner sensor's circle of 127.3 mm touches the seam from 122 mm on and does not reach its far side.
+    story = Story(cfg, mirror, (panel.x_m, panel.y_m + panel.half_y_m - 0.122, 0.5))
+    # front left: entering at 73.4 deg from +x, leaving at 106.6; 45 deg of them are the heading's
+    story.pose = (*story.pose[:2], 1.281 - pi / 4)
+    assert story.run(57, omega=1.0, off=FL).code is EventCode.NORMAL  # 73 mm of arc
+
+
+def test_a_turn_across_a_seam_allows_its_width(cfg: Config, mirror: Mirror) -> None:
+    panel = list(mirror.panels.values())[40]
+    # Front right points along -y and moves along +x, across the seam that begins under it.
+    story = Story(cfg, mirror, (panel.x_m + panel.half_x_m + 1e-4, panel.y_m, -pi / 4))
+    assert story.run(10, omega=1.0, off=FR).code is EventCode.NORMAL  # 12.7 mm of arc
+    verdict = story.run(2, omega=1.0, off=FR)
+    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, BEYOND_SEAM.message)
+    assert verdict.limit == pytest.approx(0.014, abs=1e-9)  # m; 10 + 1 + 3 mm
+
+
+def test_a_turn_has_a_limit_even_along_a_seam(cfg: Config, mirror: Mirror) -> None:
+    short = with_danger(cfg, turn_travel_limit_m=0.05)
+    panel = list(mirror.panels.values())[40]
+    story = Story(short, mirror, (panel.x_m, panel.y_m + panel.half_y_m - 0.122, 1.281 - pi / 4))
+    assert story.run(39, omega=1.0, off=FL).code is EventCode.NORMAL  # 49.6 mm of arc
+    verdict = story.run(2, omega=1.0, off=FL)
+    assert (verdict.code, verdict.limit) == (EventCode.NEAR_EDGE, 0.05)
+
+
 def with_danger(cfg: Config, **values: float) -> Config:
     return cfg.model_copy(update={"danger": cfg.danger.model_copy(update=values)})
 

@@ -453,6 +453,7 @@ def test_the_way_on_the_panel_counts_from_the_first_sample_on(danger: DangerConf
 def test_an_episode_ends_at_rest_after_a_long_time(danger: DangerConfig) -> None:
     sensor = Sensor(danger, Map())
     sensor.off(0.001)
+    assert LONG_ON * danger.clear_samples == 200  # 0.2 s
     assert not sensor.stay(LONG_ON * danger.clear_samples - 1)
     assert sensor.on()
 
