@@ -181,6 +181,14 @@ def test_standing_over_a_gap_is_no_edge_however_long(at_seam: Story) -> None:
     assert at_seam.monitor.counts["episodes"][Corner.FRONT_LEFT] == 1
 
 
+def test_an_episode_ends_once_the_sensor_has_moved_on(at_seam: Story) -> None:
+    at_seam.run(10, v=0.1, off=FRONT)
+    at_seam.run(3, v=0.1)
+    assert not at_seam.monitor._edges.is_idle
+    at_seam.run(4, v=0.1)  # 5 mm and 20 samples on
+    assert at_seam.monitor._edges.is_idle
+
+
 # -- (c) no map -------------------------------------------------------------------------------------------------------
 
 
