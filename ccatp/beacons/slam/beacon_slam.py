@@ -88,6 +88,7 @@ class BeaconSlam:
     """
 
     flat = 100.0  # standard deviation of a beacon's place before its readings, relative to its distance
+    linearisations = LINEARISATIONS  # of all that waits when a beacon joins, the first at the place that was found
 
     def __init__(
         self, motion: DifferentialDrive | SlippingVehicle, models: MeasurementModels, how: SlamFilterConfig,
@@ -263,7 +264,8 @@ class BeaconSlam:
     def _join(self, waiting: PendingLandmark, found: Candidate) -> None:
         """Condition the beacon, the poses of its readings, the calibration and all else on them, iterated."""
         engine, rows = self.engine, self._stacked(waiting)
-        self._map.join(waiting.beacon, *self._prior_at(waiting, *found.mean[:PLACE].tolist()))
+        centre = waiting.pointed(engine) or found.mean[:PLACE].tolist()
+        self._map.join(waiting.beacon, *self._prior_at(waiting, *centre))
         block = engine.block(waiting.beacon)
 
         def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -273,7 +275,7 @@ class BeaconSlam:
         start = engine.mean.copy()
         start[block] = found.mean
         columns = columns_of(rows.columns.tolist(), block)
-        engine.update_iterated(columns, linearise, found.variances, LINEARISATIONS, start=start)
+        engine.update_iterated(columns, linearise, found.variances, self.linearisations, start=start)
         waiting.drop(engine)
         del self.waiting[waiting.beacon]
         self._map.renumber()

@@ -136,14 +136,15 @@ class PendingLandmark:
 
     def look(self, engine: EkfSlam, rows: StackedRows, prior_at: PriorAt) -> None:
         """Look for the beacon: sets ``candidates``."""
-        reach_m = self.records[-1].distance_m
-        problem = _Problem(engine.mean.copy(), engine.covariance[np.ix_(rows.columns, rows.columns)], rows, reach_m)
+        reach_m, pointed = self.records[-1].distance_m, self.pointed(engine)
+        problem = _Problem(
+            engine.mean.copy(), engine.covariance[np.ix_(rows.columns, rows.columns)], rows, reach_m, pointed is None
+        )
         starts = [BeaconEstimate(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]
         places = [engine.mean[block].tolist() for block in rows.blocks]
-        pointed = self.pointed(engine)
-        if pointed is not None and not starts:
-            starts.append(prior_at(*pointed))
-        elif pointed is None:
+        if pointed is not None:
+            starts = [prior_at(*pointed)]
+        else:
             # The last distance may have gone round a corner: the usual one is tried, too.
             for radius_m in {reach_m, median([record.distance_m for record in self.records])}:
                 starts = [*problem.around(prior_at, places[-1], radius_m), *starts]
@@ -194,6 +195,7 @@ class _Problem(NamedTuple):
     P: FloatArray  # of the columns of the rows
     rows: StackedRows
     reach_m: float
+    is_robust: bool  # ranges that went round a corner are left out; a bearing tells which of two places it is
 
     def around(self, prior_at: PriorAt, place: Sequence[float], radius_m: float) -> list[BeaconEstimate]:
         """Where to begin: the best directions on a circle about the last place, poses and calibration as they are.
@@ -215,7 +217,7 @@ class _Problem(NamedTuple):
         for k in range(ITERATIONS):
             H, G, e, R = self.rows.at(self.x, b.tolist())
             spread = H.dot(self.P).dot(H.T)
-            variances, left_out = _weighed(e, spread.diagonal() + R, R, k)
+            variances, left_out = _weighed(e, spread.diagonal() + R, R, k if self.is_robust else 0)
             S = spread + np.diag(variances)
             SG = np.linalg.solve(S, G)
             A = G.T.dot(SG) + W
@@ -224,7 +226,7 @@ class _Problem(NamedTuple):
             cost = float(e.dot(np.linalg.solve(S, e))) + left_out
             if not (isfinite(cost) and isfinite(size)):
                 return None
-            if size < 1e-3 * stride and k > ROBUST:
+            if size < 1e-3 * stride and (k > ROBUST or not self.is_robust):
                 break
             b = b + step * min(1.0, stride / max(size, 1e-12))
         return Candidate(b, np.linalg.inv(A), cost, variances)
