@@ -140,17 +140,18 @@ class PendingLandmark:
         problem = _Problem(
             engine.mean.copy(), engine.covariance[np.ix_(rows.columns, rows.columns)], rows, reach_m, pointed is None
         )
-        starts = [BeaconEstimate(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]
         places = [engine.mean[block].tolist() for block in rows.blocks]
         if pointed is not None:
-            starts = [prior_at(*pointed)]
-        else:
-            # The last distance may have gone round a corner: the usual one is tried, too.
-            for radius_m in {reach_m, median([record.distance_m for record in self.records])}:
-                starts = [*problem.around(prior_at, places[-1], radius_m), *starts]
+            likely = problem.refine(prior_at(*pointed), self.candidates[0].mean if self.candidates else None)
+            self.candidates = [] if likely is None else [likely]
+            return
+        starts = [BeaconEstimate(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]
+        # The last distance may have gone round a corner: the usual one is tried, too.
+        for radius_m in {reach_m, median([record.distance_m for record in self.records])}:
+            starts = [*problem.around(prior_at, places[-1], radius_m), *starts]
         found = [candidate for candidate in map(problem.refine, starts) if candidate is not None]
         best = min(found, key=lambda c: c.cost, default=None)
-        if best is not None and pointed is None:
+        if best is not None:
             mirrored = problem.refine(prior_at(*_mirrored(np.array(places), best.mean[:2])))
             found += [] if mirrored is None else [mirrored]
         found.sort(key=lambda c: c.cost)
@@ -210,9 +211,9 @@ class _Problem(NamedTuple):
             costs.append(float(np.log1p(e * e / R).sum()))
         return [ring[k] for k in range(STARTS) if costs[k] <= min(costs[k - 1], costs[(k + 1) % STARTS])]
 
-    def refine(self, prior: BeaconEstimate) -> Candidate | None:
-        """Gauss-Newton from a guess."""
-        b, W, stride = prior.mean.copy(), np.linalg.inv(prior.covariance), 0.5 * self.reach_m
+    def refine(self, prior: BeaconEstimate, start: FloatArray | None = None) -> Candidate | None:
+        """Gauss-Newton from the prior's mean, or from a better place."""
+        b, W, stride = prior.mean if start is None else start, np.linalg.inv(prior.covariance), 0.5 * self.reach_m
         variances, A, cost = b, W, inf
         for k in range(ITERATIONS):
             H, G, e, R = self.rows.at(self.x, b.tolist())

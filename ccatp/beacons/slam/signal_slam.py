@@ -100,7 +100,6 @@ class SignalSlam(BeaconSlam):
     """
 
     flat = 10.0
-    linearisations = 1  # more of them run away where shadowing contradicts the bearings
 
     def __init__(self, cfg: RadioConfig) -> None:
         start, loss, estimator, room_m = cfg.start, cfg.path_loss, cfg.estimator, cfg.workspace.size_m
