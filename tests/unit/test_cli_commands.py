@@ -49,7 +49,7 @@ def test_each_shell_gets_its_script(shell: str, sign: str, tmp_path: Path, capsy
         (("ccatp", "re"), {"replay", "resume"}),
         (("ccatp", "run", "--mirror", "fyst"), {"fyst-m1", "fyst-m2"}),
     ],
-    ids=" ".join,
+    ids=("command", "mirror"),
 )
 def test_bash_completes(words: tuple[str, ...], offered: set[str], tmp_path: Path) -> None:
     program = tmp_path / "ccatp"
