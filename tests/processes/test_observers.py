@@ -184,7 +184,10 @@ def test_the_dashboard_is_restarted_and_clients_pause_resume_and_call_home(start
     assert daemon.status().total == 9
     assert daemon.pause().state == "held"
     page = HttpClient(f"http://127.0.0.1:{port}")
-    assert page.is_healthy()
+    healthy_by_s = time.monotonic() + 20.0  # the page that was restarted has to receive a heartbeat of each loop
+    while not page.is_healthy():
+        assert time.monotonic() < healthy_by_s
+        time.sleep(0.05)
     assert page.status()["mission"]["total"] == 9
     page.resume()
     daemon.wait(lambda status: status.state != "held", timeout_s=20.0)
