@@ -12,8 +12,9 @@ from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, Robo
 from ccatp.links.robot_messages import CommandEcho, Hello, Role, Sensors
 
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.05, 1.0
-# After this time without an answer the connection is closed and another one is tried.
-ATTEMPT_S = 2.0
+# After this time without an answer the connection is closed and another one is tried. The last attempt has at least the
+# shorter time, so that its reason is the robot's and not that no time was left.
+ATTEMPT_S, SHORTEST_ATTEMPT_S = 2.0, 0.25
 # Refusals that will be repeated.
 FINAL = ("bad mac",)
 # The rate of the robot's clock may be wrong by a hundredth and may wander; that of the host is much better.
@@ -117,7 +118,7 @@ class RobotSession(ABC):
             self._lost.clear()
             self.link = self._make()
             try:
-                await self.link.connect(min(ATTEMPT_S, left_s))
+                await self.link.connect(min(ATTEMPT_S, max(left_s, SHORTEST_ATTEMPT_S)))
             except RobotLinkError as error:
                 if isinstance(error, RobotRefused) and error.reason in FINAL:
                     raise
