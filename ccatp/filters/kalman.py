@@ -6,7 +6,7 @@ the order of ``scipy.linalg.blas``: keywords cost three times what a product of 
 
 import numpy as np
 from numpy import ndarray
-from scipy.linalg.blas import daxpy, dcopy, ddot, dgemm, dsymm, dsyrk, dtrmm, dtrsm
+from scipy.linalg.blas import daxpy, dcopy, ddot, dgemm, dsymm, dtrmm, dtrsm
 from scipy.linalg.lapack import dgeqrf, dpotrf
 
 from ccatp.core import FloatArray
@@ -47,7 +47,7 @@ class _Rows:
         self.spread = 1.0, H, V, 0.0, S, 1, 0, 1  # S = H V
         self.factor = S, 1, 0, 1  # S -> C
         self.solve = 1.0, S, V, 1, 1, 1, 0, 1  # V -> V C^-T
-        self.reduce = -1.0, V, 1.0, M, 0, 0, 1  # M -> M - V V^T
+        self.reduce = -1.0, V, V, 1.0, M, 0, 1, 1  # M -> M - V V^T
         self.squares = self.V_flat, self.V_flat, m, n, n + 1, n, n + 1  # y^T y
         self.load = H.ravel(order="K"), self.V_flat
         self.rotate = 1.0, U, V, 0, 0, 0, 0, 1  # V -> U V
@@ -64,9 +64,10 @@ class KalmanFilter:
 
     The printed form of 2.10 loses symmetry and then definiteness by rounding. With S = H P H^T + R = C C^T,
     V = P H^T C^-T and y = C^-1 nu the same posterior is x + V y, P - V V^T, and y^T y is the normalised innovation
-    squared. Mean and covariance are kept as one matrix M = [P -x; -x^T c], of which only the upper triangle is used:
-    a product with M is one with P and one with x, and one symmetric product, of V above y^T, gives all three
-    results. The corner c meets nothing but zeros.
+    squared. Mean and covariance are kept as one matrix M = [P -x; -x^T c]: a product with M is one with P and one
+    with x, and one product, of V above y^T, gives all three results. The corner c meets nothing but zeros. The upper
+    triangle of M is P: a prediction reads no other, so that the two halves differ by no more than one prediction and
+    the updates after it round. General products are used elsewhere: BLAS computes small symmetric ones slower.
 
     The subtraction errs by 1e-16 of the prior. Where the posterior is much smaller, or rows nearly repeat each other, a
     QR factorisation takes its place (``_rotate``).
@@ -78,13 +79,14 @@ class KalmanFilter:
         self._shape: tuple[int, ...] = np.shape(covariance)
         checked = checked_gaussian(mean, covariance, self._shape)
         self._n = n = checked[0].size
-        self._M, predicted, product, self._U, self._C = (np.zeros((n + 1, n + 1), order="F") for _ in range(5))
+        self._M, predicted, noise, product, self._U, self._C = (np.zeros((n + 1, n + 1), order="F") for _ in range(6))
         self._F = np.eye(n + 1)  # with the row and the column of the mean
         M, self._flat = self._M, self._M.ravel(order="K")
-        self._P_rows, self._minus_x = M.T[:n, :n], M[:n, n]
-        self._F_rows, self._Q_rows, self._predicted_minus_x = self._F[:n, :n], predicted.T[:n, :n], predicted[:, n]
+        self._P_rows, self._minus_x, self._minus_x_row = M.T[:n, :n], M[:n, n], M[n, :n]
+        self._F_rows, self._Q_rows, self._predicted_minus_x = self._F[:n, :n], noise.T[:n, :n], predicted[:, n]
         self._multiply = 1.0, M, self._F.T, 0.0, product, 0, 0, 1  # product = M F^T
         self._propagate = 1.0, self._F.T, product, 1.0, predicted, 1, 0, 1  # predicted = F product + Q
+        self._load = noise.ravel(order="K"), predicted.ravel(order="K")
         self._accept = predicted.ravel(order="K"), self._flat
         self._squares = self._accept[0], self._accept[0], (n + 1) ** 2 - 1  # without the corner
         self._U_column, self._U_row, self._unit = self._U[:, n], self._U[n, :n], np.eye(n + 1)[n]
@@ -127,7 +129,7 @@ class KalmanFilter:
             F, x = self._check_transition(F, Q)
         self._F_rows[...] = F
         self._Q_rows[...] = Q
-        self._predicted_minus_x.fill(0.0)
+        dcopy(*self._load)
         dsymm(*self._multiply)
         dgemm(*self._propagate)
         # BLAS does not warn where it overflows.
@@ -137,6 +139,7 @@ class KalmanFilter:
         dcopy(*self._accept)
         if x is not None:
             np.negative(x, self._minus_x)
+            np.negative(x, self._minus_x_row)
         self._mean = self._covariance = None
 
     def _check_transition(self, F: FloatArray | FilterModel, Q: FloatArray) -> tuple[FloatArray, FloatArray | None]:
@@ -165,7 +168,7 @@ class KalmanFilter:
             if rows is None:
                 return Innovation([], 0.0)
         rows.H_rows[...] = H
-        dsymm(*rows.project)
+        dgemm(*rows.project)
         n = self._n
         daxpy(z, rows.V_flat, z.size, 1.0, 0, 1, n, n + 1)
         if expected is not None:
@@ -207,7 +210,7 @@ class KalmanFilter:
         return rows, H, expected
 
     def _start(self, mean: FloatArray, covariance: FloatArray) -> None:
-        self._minus_x[:], self._P_rows[:] = -mean, covariance
+        self._minus_x[:], self._minus_x_row[:], self._P_rows[:] = -mean, -mean, covariance
         self._F_rows[:] = np.eye(self._n)
         self._mean = self._covariance = None
 
@@ -221,7 +224,7 @@ class KalmanFilter:
         nis: float = ddot(*rows.squares)
         if not nis < HUGE:
             raise FilterDiverged(f"update is not finite: NIS {nis:.3g}, residuals {residual}")
-        dsyrk(*rows.reduce)
+        dgemm(*rows.reduce)
         self._mean = self._covariance = None
         return Innovation(residual, nis)
 
@@ -262,8 +265,8 @@ class KalmanFilter:
         if not nis + ddot(minus_x, minus_x) < HUGE:
             raise FilterDiverged(f"update is not finite: NIS {nis:.3g}, residuals {residual}")
         self._U_row[...] = 0.0
-        dsyrk(1.0, U, 0.0, self._M, 1, 0, 1)
-        self._minus_x[...] = minus_x
+        dgemm(1.0, U, U, 0.0, self._M, 1, 0, 1)
+        self._minus_x[...] = self._minus_x_row[...] = minus_x
         self._mean = self._covariance = None
         return Innovation(residual, nis)
 
