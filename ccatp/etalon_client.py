@@ -198,7 +198,7 @@ class EtalonClient:
             if await _next_byte(reader):
                 raise multiline.BadReply("more than one line in reply to one request")
             if isinstance(reply, Remark) and reply.name == "error":
-                raise EtalonServerError(f"{self._where}: refused {request.command}: {reply.text!r}; see its log")
+                raise EtalonServerError(f"{self._where}: refused {request.command}: {reply.text[:80]!r}; see its log")
             if not isinstance(reply, expected):
                 raise multiline.BadReply(f"{type(reply).__name__} in reply to {request.command}")
             is_answered = True

@@ -176,7 +176,7 @@ def parse_reply(line: bytes) -> Reply:
     try:
         return _PARSERS[name](payload) if separator and name in _PARSERS else Notice(text)
     except ValueError as error:
-        raise BadReply(f"bad reply {text[:60]!r}: {error}") from None
+        raise BadReply(f"bad reply {text[:60]!r}: {error!s:.80}") from None
 
 
 def _parse_channel_data(payload: str) -> ChannelData:
