@@ -237,15 +237,13 @@ def _edge_sensors(report: RobotReport) -> PreflightResult:
 
 
 def _gravity(report: RobotReport) -> PreflightResult:
-    check = MirrorCheck(report.mirror, is_heading_known=True)
+    check = MirrorCheck(report.mirror)
     is_known = any(check.update(frame.t, frame.gravity, report.mirror.base_pose) for frame in report.frames)
     if check.contradiction:
-        todo = "set the robot down at base with its heading; check run.mirror, and the axes of docs/protocols.md"
-        return failed(check.contradiction, todo)
+        return failed(check.contradiction, "set run.mirror to where the robot stands, or set it down at base")
     if check.warning or not is_known:
         return warned(check.warning or "too few readings", "make sure by eye that this is the right mirror")
-    unseen = "".join(f"; it would look the same if {mistake}" for mistake in check.unseen)
-    return passed(f"the slope is that of {report.mirror.name} at base{unseen}")
+    return passed(f"the slope is that of {report.mirror.name} at base")
 
 
 def _fans(report: RobotReport) -> PreflightResult:

@@ -149,6 +149,7 @@ class ProcessManager:
         self._cfg, self._command_of, self._notify_operator = cfg, command_of, notify_operator
         self._policy = RestartPolicy(cfg.restart_limit, cfg.restart_window_s)
         self._children: dict[str, _Child] = {}
+        self._niceness = os.getpriority(os.PRIO_PROCESS, 0)
         self._is_recovering_until_s = 0.0
         self.restarts = 0
 
@@ -168,11 +169,9 @@ class ProcessManager:
             start_new_session=True,
             env={**child_environment(os.environ), **ENVIRONMENT, SUPERVISOR_PID: str(os.getpid())},
         )
-        if spec.niceness:
-            # From outside, so that it holds before the process has read its first module.
-            with suppress(OSError):  # it has ended already
-                niceness = os.getpriority(os.PRIO_PROCESS, 0) + spec.niceness
-                os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
+        # From outside, so that it holds before the process has read its first module. Our own may be another by now.
+        with suppress(OSError):  # it has ended already, or we may not give it more than we have
+            os.setpriority(os.PRIO_PROCESS, process.pid, self._niceness + spec.niceness)
         hang_timeout_s = spec.hang_timeout_s or self._cfg.hang_timeout_s
         watch = SilenceWatch(max(self._cfg.start_timeout_s, hang_timeout_s), hang_timeout_s) if spec.is_loop else None
         self._children[spec.name] = _Child(spec, process, watch)

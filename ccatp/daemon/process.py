@@ -77,7 +77,7 @@ class ProcessArgs:
         listen_fd: an inherited listening socket, or ``None``.
         is_resuming: go on with the mission in the run directory.
         has_faults: a fault plan is in the run directory; simulators only.
-        is_restarted: takes the place of a process of this run that died.
+        is_restarted: takes the place of a process of this run that died; of a resumed run, after its first frame.
         is_sim: robot and laser system are simulated.
     """
 

@@ -53,7 +53,7 @@ def mark_resumable(run_dir: Path) -> None:
     """Note that a run has begun; raises ``ConfigError`` where the note cannot be written."""
     try:
         FILE.parent.mkdir(parents=True, exist_ok=True)
-        _write(FILE, f"{run_dir}\n".encode())
+        write_durably(FILE, f"{run_dir}\n".encode())
     except OSError as error:
         raise ConfigError(
             f"--recover: cannot write {FILE}: {error.strerror}; start where ./runs can be made"
@@ -76,7 +76,7 @@ def clear_finished(status: int, run_dir: Path) -> None:
         is_latched = True  # damaged
     try:
         if is_latched:
-            _write(LATCHED_FILE, kept)
+            write_durably(LATCHED_FILE, kept)
         else:
             LATCHED_FILE.unlink(missing_ok=True)
     except OSError as error:
@@ -93,7 +93,7 @@ def take_over_emergencies(run_dir: Path) -> bool:
     try:
         kept = LATCHED_FILE.read_bytes()
         run_dir.mkdir(parents=True, exist_ok=True)
-        _write(run_dir / EMERGENCIES, kept)
+        write_durably(run_dir / EMERGENCIES, kept)
     except FileNotFoundError:
         return False
     except OSError as error:
@@ -101,7 +101,8 @@ def take_over_emergencies(run_dir: Path) -> bool:
     return True
 
 
-def _write(path: Path, data: bytes) -> None:
+def write_durably(path: Path, data: bytes) -> None:
+    """The file has the old content or the new one, whatever ends this process or the machine."""
     new = path.with_name(f"{path.name}.new")
     with new.open("wb") as file:
         file.write(data)
@@ -151,15 +152,35 @@ def default_run_dir(mirror: str, seed: int, now_utc: datetime, parent: Path = Pa
     return parent / f"{now_utc:%Y%m%dT%H%M%SZ}-{PurePath(mirror).stem}-s{seed}"
 
 
+# In run directory and runtime directory: held by every child of the supervisor.
+CHILDREN_LOCK = ".children"
+PREDECESSORS_S = 30.0  # a process that is just being started on an overloaded machine takes long to notice
 # In the runtime directory. Those of the truth may be of a simulated robot that runs alone, beside a run without one.
 SOCKETS = ("main", "danger", "control", "emergency", "dashboard")
 TRUTH_SOCKETS = ("truth", "puck")
 
 
-def owned(path: Path, option: str) -> AbstractContextManager[None]:
+def owned(path: Path, option: str) -> AbstractContextManager[int]:
     """Hold a lock; raises ``RefusedError``, which names the ``option`` for another place, where it is held."""
     refusal = f"another ccatp runs in {path.parent}; end it with 'ccatp stop', or give this one its own {option}"
     return locked(path, refusal)
+
+
+def await_predecessors(stack: ExitStack, *folders: Path) -> tuple[int, ...]:
+    """Locks of the folders for the children to inherit, until the stack is closed.
+
+    Children of a supervisor that was killed end by themselves, after it; meanwhile they write their last records, and
+    remove sockets as they close them. So these locks are had when the last of them has ended.
+
+    Raises:
+        RefusedError: some are still there after ``PREDECESSORS_S``.
+    """
+    locks = []
+    for folder in folders:
+        path = folder / CHILDREN_LOCK
+        text = f"processes of an earlier run still use {folder}; end them ('fuser {path}' names them), and try again"
+        locks.append(stack.enter_context(locked(path, text, PREDECESSORS_S)))
+    return tuple(locks)
 
 
 def own_runtime_dir(stack: ExitStack, runtime_dir: Path, *, is_sim: bool) -> None:
@@ -201,7 +222,7 @@ def _began_simulated(run_dir: Path) -> bool | None:
 
 def keep_origin(run_dir: Path, *, is_sim: bool) -> None:
     """Note what a run begins with, for ``with_origin``."""
-    _write(run_dir / ORIGIN_FILE, json.dumps({"simulation": is_sim}).encode())
+    write_durably(run_dir / ORIGIN_FILE, json.dumps({"simulation": is_sim}).encode())
 
 
 def make_run_dir(options: RunOptions, cfg: Config | RadioConfig) -> Path:

@@ -43,6 +43,7 @@ from ccatp.daemon.process import (
 )
 from ccatp.daemon.run_dir import (
     RunOptions,
+    await_predecessors,
     clear_finished,
     default_run_dir,
     find_resumable,
@@ -54,6 +55,7 @@ from ccatp.daemon.run_dir import (
     owned,
     take_over_emergencies,
     with_origin,
+    write_durably,
 )
 from ccatp.daemon.service import Service, take_from
 from ccatp.daemon.terminal import RunView, write_run_report
@@ -100,6 +102,7 @@ class SupervisedRun:
 
     Args:
         sockets: listening sockets of simulators and dashboard, by the name of the process.
+        locks: descriptors that every child inherits.
         started_s: of the monotonic clock, for the wall time of the run.
     """
 
@@ -110,13 +113,14 @@ class SupervisedRun:
         run_dir: Path,
         endpoints: Endpoints,
         sockets: Mapping[str, socket.socket],
+        locks: tuple[int, ...],
         page: PageSocket,
         started_s: float,
     ) -> None:
         self._options, self._cfg, self._run_dir, self._endpoints = options, cfg, run_dir, endpoints
-        self._sockets, self._page, self._started_s = sockets, page, started_s
+        self._sockets, self._locks, self._page, self._started_s = sockets, locks, page, started_s
         self._children = ProcessManager(processes_of(cfg), self._command_of, self._notify_operator)
-        self._is_interrupted = False
+        self._is_interrupted = self._has_begun = False
         self._service = Service(*take_from(os.environ))
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
         self._view = RunView(cfg, is_sim=options.sim, run_dir=run_dir)
@@ -183,6 +187,8 @@ class SupervisedRun:
         while not self._is_interrupted:
             time.sleep(POLL_S)
             collector.collect(0, self._view)
+            # From main's first frame on the checkpoint is of this session; before, the next main begins as the first.
+            self._has_begun |= collector.status is not None and collector.status.seq >= 0
             now_s = time.monotonic()
             self._service.update(now_s, collector.status, is_recovering=self._children.is_recovering(now_s))
             # A death comes first: the messages of the others are its consequence.
@@ -212,16 +218,16 @@ class SupervisedRun:
         flags = {
             "--realtime": options.is_paced,
             "--resume": options.resume,
-            "--restarted": is_restarted,
-            "--held": options.held and not is_restarted,
+            "--restarted": is_restarted and (self._has_begun or not options.resume),
+            "--held": options.held and not self._has_begun,
             "--sim": options.sim,
             "--faults": process.is_simulator and options.faults_file is not None,
         }
         arguments += [flag for flag, is_given in flags.items() if is_given]
         if process.name not in self._sockets:
-            return arguments, ()
+            return arguments, self._locks
         fd = self._sockets[process.name].fileno()
-        return [*arguments, "--listen-fd", str(fd)], (fd,)
+        return [*arguments, "--listen-fd", str(fd)], (fd, *self._locks)
 
 
 def run(options: RunOptions) -> int:
@@ -272,6 +278,7 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
             cfg = cfg.model_copy(update={"dashboard": page.config})
         run_dir = make_run_dir(options, cfg)
         stack.enter_context(owned(run_dir / RUN_LOCK, "--run-dir"))
+        locks = await_predecessors(stack, runtime_dir, run_dir)
         if options.resume and (done := finished_summary(run_dir)) is not None:
             # Nothing is left of the mission: its record stays as it is.
             if options.json_output:
@@ -280,11 +287,11 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
             print(f"nothing left to do: all {count} points of {run_dir} are measured", file=sys.stderr)
             return ExitStatus.COMPLETE
         keep_origin(run_dir, is_sim=options.sim)
-        (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
+        write_durably(run_dir / "config.toml", dump_config(cfg).encode())
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
-        return SupervisedRun(options, cfg, run_dir, Endpoints(runtime_dir), sockets, page, started_s).run()
+        return SupervisedRun(options, cfg, run_dir, Endpoints(runtime_dir), sockets, locks, page, started_s).run()
 
 
 def _recover(options: RunOptions, cfg: Config) -> int:

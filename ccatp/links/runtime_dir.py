@@ -78,17 +78,19 @@ def make_own_dir(path: Path, option: str, forbidden: int) -> None:
 
 
 @contextmanager
-def locked(path: Path, refusal: str) -> Iterator[None]:
+def locked(path: Path, refusal: str, wait_s: float = _SECOND_LOOK_S) -> Iterator[int]:
     """Hold the lock of a file for as long as the block lasts; it ends with the process, whatever ends that.
 
-    ``RefusedError``: another process holds it.
+    Yields the file's descriptor: processes that inherit it hold the lock, too. ``RefusedError``: another process still
+    holds it after ``wait_s``.
     """
     with path.open("w") as file:
-        if not _takes(file.fileno(), LOCK_EX):
-            time.sleep(_SECOND_LOOK_S)
-            if not _takes(file.fileno(), LOCK_EX):
+        deadline_s = time.monotonic() + wait_s
+        while not _takes(file.fileno(), LOCK_EX):
+            if time.monotonic() >= deadline_s:
                 raise RefusedError(refusal)
-        yield
+            time.sleep(_SECOND_LOOK_S)
+        yield file.fileno()
 
 
 def is_held(path: Path) -> bool | None:

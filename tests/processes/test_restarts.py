@@ -10,6 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from ccatp.daemon.run_dir import CHILDREN_LOCK
 from tests.faults.linking import Measured
 from tests.processes.conftest import Start
 from tests.support.runs import Run, wall_s
@@ -173,6 +174,9 @@ def test_a_service_that_is_restarted_refuses_what_is_damaged_and_waits_for_an_op
     run = start("--panels", "1")
     run.until(lambda status: status["done"] >= 2)
     orphans = psutil.Process(run.process.pid).children()
+    for orphan in orphans:  # a next run waits for them
+        held = {Path(file.path) for file in orphan.open_files()}
+        assert {folder / CHILDREN_LOCK for folder in (run.run_dir, run.runtime_dir)} <= held
     run.process.kill()
     run.wait()
     _, alive = psutil.wait_procs(orphans, timeout=10.0)
@@ -198,6 +202,7 @@ def test_a_service_that_is_restarted_refuses_what_is_damaged_and_waits_for_an_op
     unchanged = json.dumps(run.summary)
     again_s = time.monotonic()
     again = start("--resume", "--start-held", "--panels", "1", "--json", run_dir=run.run_dir)
+    again.send("main")  # before its first frame: the next one is held as well
     status = again.until(lambda status: status["seq"] >= 0)
     measured("P4", time.monotonic() - again_s)
     assert (status["state"], status["done"]) == ("held", done)

@@ -2,6 +2,7 @@
 
 import os
 import socket
+import subprocess
 from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -16,6 +17,7 @@ from ccatp.daemon.danger_loop import FILE as EMERGENCIES
 from ccatp.daemon.run_dir import (
     FILE,
     RunOptions,
+    await_predecessors,
     clear_finished,
     default_run_dir,
     find_resumable,
@@ -272,6 +274,18 @@ def test_one_daemon_in_a_runtime_directory(tmp_path: Path) -> None:
             pass
     with owned(path, "--runtime-dir"):
         pass
+
+
+def test_a_daemon_waits_for_the_children_of_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with ExitStack() as stack:
+        locks = await_predecessors(stack, tmp_path)
+        child = subprocess.Popen(["cat"], stdin=subprocess.PIPE, pass_fds=locks)
+    monkeypatch.setattr("ccatp.daemon.run_dir.PREDECESSORS_S", 0.0)
+    with child, ExitStack() as stack:
+        with pytest.raises(RefusedError, match="processes of an earlier run still use"):
+            await_predecessors(stack, tmp_path)
+        child.communicate()
+        await_predecessors(stack, tmp_path)
 
 
 def test_the_sockets_go_with_the_daemon(tmp_path: Path) -> None:
