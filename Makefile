@@ -8,6 +8,7 @@ ARGS ?=
 PYTEST_ARGS ?=
 WORKERS ?= 2
 SHARE ?= 1
+SIGNALS ?= 2000
 
 # Small matrices: threads of the linear algebra would only fight each other for the cores.
 export OPENBLAS_NUM_THREADS := 1
@@ -19,7 +20,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
 .PHONY: help run test test-newest newest test-slow slow-tests new-examples sweep tried-in faults docs metrics lint format
-.PHONY: mutants golden golden-quick lock clean
+.PHONY: kills mutants golden golden-quick lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -29,6 +30,7 @@ help:
 	@echo "make test-newest      lint, unit and contract tests and a small survey on the newest Python installed, in $(NEWEST_VENV)"
 	@echo "make test-slow        the tests that take minutes, new random examples, and a tenth of the sweep"
 	@echo "make sweep            drives over every centimetre of every rim; goes on where it was stopped [SHARE=0.1 ARGS='--seed 2']"
+	@echo "make kills            random kills of processes over whole missions; goes on where it was stopped [SIGNALS=2000]"
 	@echo "make mutants          small changes of the safety code that the tests noticed before: do they still? [TARGETS=...]"
 	@echo "make faults           docs/fault_table.md from what the last test runs showed and measured"
 	@echo "make docs             build/docs/index.html, and the parts of docs/ that are made from the code"
@@ -75,6 +77,10 @@ new-examples: $(VENV)/.installed-dev
 
 sweep: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.faults.edge_sweep build/sweep --workers $(WORKERS) --share $(SHARE) $(ARGS)
+
+kills: $(VENV)/.installed-dev
+	@mkdir -p build
+	$(BIN)/python -m tests.processes.kill_campaign build/kills.jsonl --workers $(WORKERS) --signals $(SIGNALS) $(ARGS)
 
 mutants: $(VENV)/.installed-dev
 	nice -n 19 $(BIN)/python -m tests.mutation $(TARGETS)
