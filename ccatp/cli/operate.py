@@ -1,6 +1,7 @@
 """The commands to a running daemon, for operators and for the observatory."""
 
 import json
+import os
 import sys
 import time
 import uuid
@@ -41,8 +42,8 @@ def _ask(folder: Path | None, command: str, timeout_s: float) -> dict[str, Any]:
     return OperatorClient(folder, timeout_s).ask(command)
 
 
-def _print_reply(reply: Mapping[str, Any], json_output: bool) -> None:
-    """A daemon's answer on standard output; of the operator channel's, where the mission stands."""
+def _print_reply(reply: Mapping[str, Any], json_output: bool, page: str = "") -> None:
+    """A daemon's answer on standard output; of the operator channel's, where the mission stands, and the page."""
     if json_output:
         click.echo(json.dumps(reply))
         return
@@ -50,6 +51,7 @@ def _print_reply(reply: Mapping[str, Any], json_output: bool) -> None:
 
     facts, status = [(name, value) for name, value in reply.items() if name != "ok"], reply.get("status")
     rows = list(status_rows(status)) if isinstance(status, Mapping) else facts
+    rows += [("page", page)] if page else []
     width = max((len(name) for name, _ in rows), default=0)
     print_lines([f"{name:<{width}}  {value}" for name, value in rows] or ["ok"])
 
@@ -142,7 +144,11 @@ def status(
     """Show what the running daemon is doing."""
     folder = configured_folder(config_file, runtime_dir)
     if not watch:
-        _print_reply(_ask(folder, "status", timeout_s), json_output)
+        from ccatp.daemon.child_processes import page_address
+        from ccatp.links.runtime_dir import runtime_dir_path
+
+        reply = _ask(folder, "status", timeout_s)
+        _print_reply(reply, json_output, page_address(runtime_dir_path(str(folder or ""), os.environ)))
         return
     answers = _answers(folder, timeout_s, period_s)
     if json_output:

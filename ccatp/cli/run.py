@@ -83,9 +83,7 @@ def run(
     )
 )
 @address_options("dashboard")
-@key_option(
-    "--token-file", "dashboard.token_file", type=click.Path(), help="File with the token that commands have to carry."
-)
+@key_option("--token-file", "dashboard.token_file", type=click.Path(), help="File with the tokens of commands.")
 @RUNTIME_DIR_OPTION
 @settings_option("A key of dashboard, as in dashboard.rate_hz=5.")
 def dashboard(runtime_dir: Path | None, settings: Mapping[str, object]) -> int:

@@ -319,10 +319,10 @@ class DashboardConfig(Model):
     enabled: bool
     host: str
     port: Port
-    token_file: str  # empty = none
+    token_file: str  # empty = a token that each start makes
     host_names: tuple[str, ...]
     rate_hz: Annotated[float, Field(gt=0.0, le=50.0)]
-    max_connections: Annotated[int, Field(ge=2, le=512)]
+    max_connections: Annotated[int, Field(ge=8, le=512)]  # a browser opens up to six
     slow_client_s: Positive
     command_timeout_s: Positive
 

@@ -11,14 +11,16 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
+from pathlib import Path
 from typing import NamedTuple, TypeVar, cast
 
 from ccatp.config.beacon_models import RadioConfig, SimBeaconRobotConfig
 from ccatp.config.models import Config, DashboardConfig, ProcessesConfig, SimEtalonConfig, SimRobotConfig
 from ccatp.config.package import child_environment
-from ccatp.daemon.process import SUPERVISOR_PID, listen_at
+from ccatp.daemon.process import SUPERVISOR_PID, listen_at, read_config, run_dir_in
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.topics import Heartbeat
+from ccatp.report.dashboard.access import TOKEN_FILE
 
 # The process has reported why, and a restart would end alike.
 FINAL = (ExitStatus.USAGE, ExitStatus.UNREACHABLE)
@@ -294,6 +296,27 @@ def open_page_socket(cfg: DashboardConfig) -> PageSocket:
 def page_url(host: str, port: int) -> str:
     """The page's address."""
     return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
+
+
+def token_query(cfg: DashboardConfig, runtime_dir: Path) -> str:
+    """What an operator appends to the page's address to command from it: the token of this start; never to be logged.
+
+    Empty where tokens are configured: each operator has one.
+    """
+    if cfg.token_file:
+        return ""
+    with suppress(OSError):
+        return f"?token={(runtime_dir / TOKEN_FILE).read_text(encoding='ascii').strip()}"
+    return ""
+
+
+def page_address(runtime_dir: Path) -> str:
+    """Address of the page of a daemon, as its operator opens it; empty where no page is in the runtime directory."""
+    run_dir = run_dir_in(runtime_dir)
+    if run_dir is None or not (runtime_dir / "dashboard").exists():
+        return ""
+    cfg = read_config(run_dir / "config.toml").dashboard
+    return page_url(cfg.host, cfg.port) + token_query(cfg, runtime_dir)
 
 
 SimulatedServer = SimRobotConfig | SimEtalonConfig | SimBeaconRobotConfig

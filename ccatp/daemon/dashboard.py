@@ -19,7 +19,7 @@ import zmq
 
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
-from ccatp.daemon.child_processes import open_page_socket
+from ccatp.daemon.child_processes import open_page_socket, token_query
 from ccatp.daemon.command_handlers import LOGGED_LINES, LOGGED_PERIOD_S
 from ccatp.daemon.process import (
     Endpoints,
@@ -37,7 +37,7 @@ from ccatp.links.runtime_dir import runtime_dir_path
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.records.recorder import TELEMETRY, read_metadata
 from ccatp.records.store import StoreError, read_survey
-from ccatp.report.dashboard.access import read_token
+from ccatp.report.dashboard.access import page_tokens
 from ccatp.report.dashboard.app import CommandEndpoint, build_app, serve
 from ccatp.report.dashboard.hub import BEACONS, SURVEY, BusReader, StateBroadcaster
 from ccatp.report.dashboard.survey_view import SurveyView
@@ -65,33 +65,26 @@ async def serve_page(
     Points that were measured before are read from the database in ``run_dir``.
 
     Raises:
-        ConfigError: the token cannot be read.
+        ConfigError: the tokens cannot be read.
     """
-    settings, token, is_over = cfg.dashboard, read_token(cfg.dashboard), asyncio.Event()
+    settings, is_over = cfg.dashboard, asyncio.Event()
+    tokens = page_tokens(settings, endpoints.runtime_dir)
     view: RunStateView
     if isinstance(cfg, RadioConfig):
         # Imported late: a survey does not need it, and its libraries are large.
         from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground  # noqa: PLC0415
 
         view, wants = BeaconView(cfg, is_sim=is_sim), BEACONS
-        ground = beacon_ground(cfg, is_sim=is_sim, needs_token=token is not None)
+        ground = beacon_ground(cfg, is_sim=is_sim)
     else:
         mirror = build_mirror(cfg.mirror)
         view, wants = _survey_view(mirror, cfg, run_dir, is_sim=is_sim), SURVEY
-        ground = survey_ground(mirror, cfg, is_sim=is_sim, needs_token=token is not None)
+        ground = survey_ground(mirror, cfg, is_sim=is_sim)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     reader = BusReader(context, endpoints.of, view, is_sim=is_sim, wants=wants)
     hub = StateBroadcaster(reader, view, settings.rate_hz)
-    budget = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
-
-    def note(text: str, fields: dict[str, object]) -> None:
-        # Every client of the port can cause these lines.
-        left_out = budget.take(asyncio.get_running_loop().time())
-        if left_out is not None:
-            log.info(text, **fields, left_out=left_out)
-
-    commands = CommandEndpoint(context, endpoints.of("control"), settings.command_timeout_s)
-    app = build_app(hub, commands, ground, host_names=settings.host_names, token=token, note=note)
+    commands = CommandEndpoint(context, endpoints.of, settings.command_timeout_s)
+    app = build_app(hub, commands, ground, settings, tokens, log)
 
     async def broadcast() -> None:
         await hub.run(stop)
@@ -184,7 +177,7 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], report: Cal
         raise ConfigError(page.text)
     is_sim = read_metadata(run_dir / TELEMETRY).get("simulation") == "true"
     with page.socket:
-        report(page.text)
+        report(page.text + token_query(cfg.dashboard, folder))
         places = run_dir, Endpoints(folder), page.socket
         return _run(run_dir, partial(serve_page, cfg, *places, is_sim=is_sim, has_heartbeat=False))
 

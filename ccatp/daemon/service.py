@@ -39,6 +39,12 @@ def watchdog_period_s(environ: Mapping[str, str]) -> float | None:
     return int(text) * 1e-6
 
 
+def is_journal(descriptor: int, environ: Mapping[str, str]) -> bool:
+    """Whether what is written to a descriptor goes to the journal, which keeps it and shows it to others."""
+    info = os.fstat(descriptor)
+    return environ.get("JOURNAL_STREAM") == f"{info.st_dev}:{info.st_ino}"
+
+
 def take_from(environ: MutableMapping[str, str]) -> tuple[Notifier, float | None]:
     """Notifier and watchdog period; their variables are removed, because the children must not use them."""
     notifier, period_s = Notifier(environ.get(SOCKET, "")), watchdog_period_s(environ)

@@ -27,6 +27,7 @@ from ccatp.daemon.child_processes import (
     listen,
     open_page_socket,
     simulated_servers,
+    token_query,
     with_addresses,
 )
 from ccatp.daemon.collector import Collector
@@ -57,14 +58,14 @@ from ccatp.daemon.run_dir import (
     with_origin,
     write_durably,
 )
-from ccatp.daemon.service import Service, take_from
+from ccatp.daemon.service import Service, is_journal, take_from
 from ccatp.daemon.terminal import RunView, write_run_report
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.auth import read_key
 from ccatp.links.runtime_dir import make_runtime_dir
 from ccatp.links.topics import Heartbeat
 from ccatp.records.recorder import RUN_LOCK
-from ccatp.report.dashboard.access import read_token
+from ccatp.report.dashboard.access import TOKEN_FILE, make_token, read_tokens
 
 # Between two looks at messages and processes: in lockstep a message in each of them would cost as much again.
 POLL_S = 0.02
@@ -177,7 +178,10 @@ class SupervisedRun:
 
     def _watch(self, collector: Collector) -> ExitStatus:
         if self._page.text:
-            self._notify_operator(self._page.level, self._page.text)
+            self._log.log(LEVELS[self._page.level], OPERATOR_MESSAGE, text=self._page.text)
+            has_token = self._page.socket is not None and not is_journal(sys.stderr.fileno(), os.environ)
+            token = token_query(self._cfg.dashboard, self._endpoints.runtime_dir) if has_token else ""
+            self._view.show_message(self._page.level, self._page.text + token)
         for process in BEACON_PROCESSES if isinstance(self._cfg, RadioConfig) else PROCESSES:
             # A process that listens has a socket, if it is to run at all.
             if process.name in self._sockets or not process.listens:
@@ -262,11 +266,14 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
     # The processes read the files of these again; here they are refused before anything has begun.
     check_observatory(cfg.observatory)
     read_key(cfg.robot.key_file, must_be_private=not options.sim)
-    read_token(cfg.dashboard)
+    if cfg.dashboard.token_file:
+        read_tokens(Path(cfg.dashboard.token_file))
     started_s = time.monotonic()
     with ExitStack() as stack:
         runtime_dir = make_runtime_dir(str(options.runtime_dir or processes_of(cfg).runtime_dir), os.environ)
         own_runtime_dir(stack, runtime_dir, is_sim=options.sim)
+        make_token(runtime_dir)
+        stack.callback((runtime_dir / TOKEN_FILE).unlink, missing_ok=True)
         sockets: dict[str, socket.socket] = {}
         if options.sim:
             for name, section, at in simulated_servers(cfg):

@@ -95,7 +95,7 @@ def format_error(error: str, **fields: object) -> bytes:
 
 def parse_reply(frame: bytes) -> dict[str, Any]:
     """The object in a reply; ``BadRequest``: not a JSON object with a boolean ``ok``."""
-    reply = _parse_object(frame)
+    reply = parse_object(frame)
     if not isinstance(reply.get("ok"), bool):
         raise BadRequest('a reply without "ok"')
     return reply
@@ -151,10 +151,11 @@ def _uuid_of(text: str) -> str:
 def _parse_request(frame: bytes) -> dict[str, Any]:
     if len(frame) > MAX_REQUEST_BYTES:
         raise BadRequest(f"request of {len(frame)} bytes; at most {MAX_REQUEST_BYTES}")
-    return _parse_object(frame)
+    return parse_object(frame)
 
 
-def _parse_object(frame: bytes) -> dict[str, Any]:
+def parse_object(frame: bytes) -> dict[str, Any]:
+    """A JSON object without duplicate keys; ``BadRequest``: it is none."""
     try:
         value = json.loads(frame.decode(), object_pairs_hook=_without_duplicates, parse_constant=_refuse_constant)
     except BadRequest:

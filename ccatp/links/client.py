@@ -209,7 +209,7 @@ MAX_BYTES = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class HttpClient:
-    """A dashboard at ``http://HOST:PORT``; ``token`` is that of ``dashboard.token_file``.
+    """A dashboard at ``http://HOST:PORT``; commands need a ``token``.
 
     ``ConfigError``: the URL is not one of HTTP.
     """

@@ -24,6 +24,7 @@ from ccatp.links.bus import Publisher
 from ccatp.links.channels import format_ok
 from ccatp.links.rpc import Router
 from ccatp.links.topics import DisplayState, Heartbeat, MissionStatus
+from ccatp.report.dashboard.access import make_token
 
 DEADLINE_S = 20.0
 Handler = Callable[[bytes], Awaitable[bytes]]
@@ -46,10 +47,11 @@ class Reply:
 class Rig:
     """What a test has in hand: publishers of the played daemon, what ends the dashboard and what it logged.
 
-    ``asked``: requests that came over the operator channel; ``answer``: what answers them.
+    ``asked``: requests that came over the daemon's channels; ``answer``: what answers them.
     """
 
     port: int
+    token: str
     main: Publisher
     danger: Publisher
     stop: asyncio.Event
@@ -72,12 +74,16 @@ class Rig:
         self.main.send("mission", mission(seq=self._seq))
         self.main.send("display_state", picture(self._seq))
 
-    async def ask(self, method: str, path: str, host: str = "", **headers: str) -> Reply:
-        """One request on a connection of its own; header names with _ for -."""
+    async def ask(self, method: str, path: str, host: str = "", body: bytes = b"", **headers: str) -> Reply:
+        """One request on a connection of its own, a command with the token; header names with _ for -."""
         reader, writer = await asyncio.open_connection("127.0.0.1", self.port)
         lines = [f"{method} {path} HTTP/1.1", f"host: {host or f'127.0.0.1:{self.port}'}", "connection: close"]
+        if method == "POST":
+            headers = {"authorization": f"Bearer {self.token}", **headers}
+        if body and "transfer_encoding" not in headers:
+            headers = {"content_length": str(len(body)), **headers}
         lines += [f"{name.replace('_', '-')}: {value}" for name, value in headers.items()]
-        writer.write(("\r\n".join(lines) + "\r\n\r\n").encode())
+        writer.write(("\r\n".join(lines) + "\r\n\r\n").encode() + body)
         try:
             async with asyncio.timeout(DEADLINE_S):
                 head, _, body = (await reader.read()).partition(b"\r\n\r\n")
@@ -97,9 +103,9 @@ class Rig:
                     return reply
 
     @asynccontextmanager
-    async def page(self) -> AsyncIterator["Page"]:
-        """An open page."""
-        reader, writer = await asyncio.open_connection("127.0.0.1", self.port)
+    async def page(self, address: str = "127.0.0.1") -> AsyncIterator["Page"]:
+        """An open page of a client at this address."""
+        reader, writer = await asyncio.open_connection("127.0.0.1", self.port, local_addr=(address, 0))
         writer.write(f"GET /events HTTP/1.1\r\nhost: 127.0.0.1:{self.port}\r\n\r\n".encode())
         async with asyncio.timeout(DEADLINE_S):
             head = await reader.readuntil(b"\r\n\r\n")
@@ -161,17 +167,22 @@ async def page_rig(cfg: Config, folder: Path, *, has_daemon: bool = True) -> Asy
     capture, stop = LogCapture(), asyncio.Event()
     log: FilteringBoundLogger = structlog.wrap_logger(None, processors=[capture])
     main, danger = (Publisher(context, endpoints.of(name)) for name in ("main", "danger"))
-    rig = Rig(listener.getsockname()[1], main, danger, stop, capture.entries)
+    rig = Rig(listener.getsockname()[1], make_token(folder), main, danger, stop, capture.entries)
     page = serve_page(cfg, folder, endpoints, listener, stop, log, is_sim=True, has_heartbeat=True)
     try:
         async with asyncio.TaskGroup() as tasks:
             served = tasks.create_task(page)
             if has_daemon:
-                async with Router(endpoints.of("control"), rig.handle, zmq.asyncio.Context.shadow(context)) as router:
-                    answering = tasks.create_task(router.serve())
+                of_loops = zmq.asyncio.Context.shadow(context)
+                async with (
+                    Router(endpoints.of("control"), rig.handle, of_loops) as control,
+                    Router(endpoints.of("emergency"), rig.handle, of_loops) as emergency,
+                ):
+                    answering = [tasks.create_task(router.serve()) for router in (control, emergency)]
                     yield rig
-                    answering.cancel()
-                    await asyncio.wait([answering])
+                    for task in answering:
+                        task.cancel()
+                    await asyncio.wait(answering)
             else:
                 yield rig
             stop.set()

@@ -1,10 +1,13 @@
 """The dashboard over HTTP: the real application on a real socket, a daemon played by the test behind it."""
 
 import asyncio
+import contextlib
+import json
 import shutil
 import socket
 import time
-from collections.abc import AsyncIterator
+import uuid
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import pytest
@@ -13,6 +16,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.daemon.process import open_log
 from ccatp.links.channels import format_error, format_ok
 from ccatp.links.topics import LogMessage
 from tests.contract.page_rig import DEADLINE_S, Rig, mission, page_rig
@@ -52,8 +56,23 @@ async def test_the_page_and_all_that_it_wants_come_from_here(rig: Rig) -> None:
         again = await rig.ask("GET", f"/static/{name}", if_none_match=file.headers["etag"])
         assert (again.code, again.body) == (304, b"")
     ground = (await rig.ask("GET", "/ground")).data
-    assert (ground["title"], ground["is_sim"], ground["needs_token"]) == ("fyst-m1", True, False)
+    assert (ground["title"], ground["is_sim"]) == ("fyst-m1", True)
     assert len(ground["points"]) == 9
+
+
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [
+        *(("GET", path) for path in ("/", "/ground", "/status", "/healthz", "/metrics", "/static/page.js")),
+        *(("POST", f"/{command}") for command in ("pause", "resume", "abort", "stop", "clear")),
+        ("GET", "/abort"), ("POST", "/status"),
+    ],
+)  # fmt: skip
+async def test_every_path_has_a_prefix_too(rig: Rig, method: str, path: str) -> None:
+    rig.main.send("mission", mission())
+    short, long = [await rig.ask(method, f"{prefix}{path}", body=b"{}") for prefix in ("", "/api/v1")]
+    assert short.code == long.code
+    assert short.headers.keys() == long.headers.keys()
 
 
 async def test_what_there_is_not_is_told_as_the_telescope_does(rig: Rig) -> None:
@@ -103,7 +122,57 @@ async def test_a_command_goes_to_the_operator_channel(rig: Rig) -> None:
     for command in ("pause", "resume", "abort", "stop"):
         reply = await rig.ask("POST", f"/{command}")
         assert (reply.code, reply.data) == (200, {"status": "ok"})
-        assert (rig.asked[-1], rig.lines[-1]["command"]) == ({"cmd": command}, command)
+        assert rig.asked[-1] == {"cmd": command}
+        assert (rig.lines[-1]["command"], rig.lines[-1]["by"]) == (command, "operator")
+
+
+async def test_emergencies_go_to_the_observatory_channel(rig: Rig) -> None:
+    async def latch(frame: bytes) -> bytes:
+        return format_ok(id=json.loads(frame)["id"], latched=True, code=2)
+
+    rig.answer = latch
+    for fields in ({"kind": "fire"}, {"kind": "fire", "id": str(uuid.uuid4()), "note": "smoke"}):
+        reply = await rig.ask("POST", "/emergency", body=json.dumps(fields).encode())
+        assert (reply.code, reply.data["latched"], reply.data["code"]) == (200, True, 2)
+        assert rig.asked[-1] == {"cmd": "emergency", "id": reply.data["id"], **fields}
+    reply = await rig.ask("POST", "/clear", body=b'{"id": "x", "cmd": "emergency"}')
+    assert (reply.code, rig.asked[-1]) == (200, {"cmd": "clear", "id": "x"})
+    rig.asked.clear()
+    for body in (b"", b"[1]", b"{", b'{"id": "\\ud800"}', b'{"id": 1, "id": 2}', b'{"id":' + b"[" * 60_000):
+        reply = await rig.ask("POST", "/clear", body=body)
+        assert (reply.code, rig.asked) == (400, []), body[:20]
+        assert reply.data["message"].startswith("clear: ")
+
+
+CHUNK = b"8000\r\n" + b"x" * 0x8000 + b"\r\n"
+
+
+async def test_long_and_slow_bodies_are_refused(rig: Rig) -> None:
+    chunked = {"transfer_encoding": "chunked"}
+    for body, headers, code in (
+        (b"x" * 65_536, {}, 200),
+        (2 * CHUNK + b"0\r\n\r\n", chunked, 200),
+        (b"x" * 1_000_000, {}, 413),
+        (b"", {"content_length": "1000000000000"}, 413),  # none of it has been sent
+        (3 * CHUNK, chunked, 413),  # nor the end
+        (CHUNK, chunked, 408),
+    ):
+        reply = await rig.ask("POST", "/pause", body=body, **headers)
+        assert (reply.code, len(rig.asked)) == (code, 1 if code == 200 else 0)
+        rig.asked.clear()
+    assert (await rig.ask("GET", "/status", content_length="65537")).code == 413
+
+
+async def test_an_endless_body_ends_with_its_connection(rig: Rig) -> None:
+    reader, writer = await asyncio.open_connection("127.0.0.1", rig.port)
+    writer.write(b"POST /pause HTTP/1.1\r\nhost: localhost\r\ntransfer-encoding: chunked\r\n\r\n")
+    async with asyncio.timeout(DEADLINE_S):
+        assert (await reader.readuntil(b"}\n")).startswith(b"HTTP/1.1 401 ")
+        with contextlib.suppress(ConnectionError):
+            while True:
+                writer.write(CHUNK)
+                await writer.drain()
+    writer.close()
 
 
 async def test_the_answer_comes_when_the_command_took_effect(rig: Rig) -> None:
@@ -162,27 +231,51 @@ async def test_too_many_commands_at_a_time(rig: Rig) -> None:
 
 async def test_pages_of_others_command_nothing_and_read_nothing(rig: Rig) -> None:
     for headers, code in (({"origin": "http://evil.example"}, 403), ({"host": "evil.org"}, 421)):
-        assert ((await rig.ask("POST", "/abort", **headers)).code, rig.asked) == (code, [])
+        assert ((await rig.ask("POST", "/abort", body=b"", **headers)).code, rig.asked) == (code, [])
     for path in ("/", "/status", "/events", "/ground", "/metrics", "/static/page.js"):
         assert (await rig.ask("GET", path, host="evil.example")).code == 421
         reply = await rig.ask("GET", path if path != "/events" else "/status", origin="http://evil.example")
         assert "access-control-allow-origin" not in reply.headers  # what a browser does not hand to their script
 
 
-async def test_commands_with_a_token(cfg: Config, runtime_dir: Path) -> None:
+@pytest.mark.fault("O6")
+async def test_every_command_needs_the_token_of_this_start(rig: Rig, measured: Callable[..., None]) -> None:
+    for command in ("pause", "resume", "abort", "stop", "emergency", "clear", "api/v1/resume"):
+        for wrong in ("", f"Bearer {TOKEN}", rig.token, f"Bearer {rig.token[:-1]}"):
+            reply = await rig.ask("POST", f"/{command}?token={rig.token}", authorization=wrong)
+            assert (reply.code, rig.asked) == (401, [])
+    measured("O6", len(rig.asked))
+    assert (await rig.ask("POST", "/abort")).code == 200
+    assert rig.token not in str(rig.lines)
+
+
+async def test_no_log_holds_a_token(rig: Rig, runtime_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = open_log(runtime_dir / "log.jsonl", "dashboard")
+    authorization = f"Bearer {rig.token}"
+    try:
+        raise RuntimeError("with the token among the variables")
+    except RuntimeError:
+        log.exception("asgi_failed")
+    text = (runtime_dir / "log.jsonl").read_text()
+    assert "with the token among the variables" in text
+    assert authorization not in text
+
+
+async def test_commands_with_configured_tokens(cfg: Config, runtime_dir: Path) -> None:
     path = runtime_dir / "token"
-    path.write_text(TOKEN)
+    path.write_text(f"bob {TOKEN[::-1]}\nalice {TOKEN}\n")
     path.chmod(0o600)
     guarded = cfg.dashboard.model_copy(update={"token_file": str(path), "host_names": ("m1.local",)})
     async with page_rig(cfg.model_copy(update={"dashboard": guarded}), runtime_dir) as rig:
-        assert (await rig.ask("GET", "/ground", host="m1.local")).data["needs_token"] is True
-        for none in ({}, {"authorization": "Bearer wrong"}):
-            reply = await rig.ask("POST", "/abort", **none)
+        assert (await rig.ask("GET", "/ground", host="m1.local")).code == 200
+        for none in ("", "Bearer wrong", f"Bearer {rig.token}"):
+            reply = await rig.ask("POST", "/abort", authorization=none)
             assert reply.code == 401
             assert reply.headers["www-authenticate"] == "Bearer"
             assert rig.asked == []
-        assert TOKEN not in str(rig.lines)
         assert (await rig.ask("POST", "/abort", authorization=f"Bearer {TOKEN}")).code == 200
+        assert rig.lines[-1]["by"] == "alice"
+        assert TOKEN not in str(rig.lines)
         assert (await rig.ask("GET", "/status")).code == 200  # looking needs none
 
 
@@ -302,18 +395,43 @@ async def test_who_takes_nothing_is_dropped(rig: Rig) -> None:
                 metrics = parse((await rig.ask("GET", "/metrics")).body.decode())["ccatp_dashboard_pages"]
 
 
-async def test_newcomers_beyond_the_limit_are_turned_away(cfg: Config, runtime_dir: Path) -> None:
-    few = cfg.dashboard.model_copy(update={"max_connections": 2, "slow_client_s": DEADLINE_S})
-    async with page_rig(cfg.model_copy(update={"dashboard": few}), runtime_dir) as rig, rig.page() as page:
+STREAM = b"GET /events HTTP/1.1\r\nhost: localhost\r\n\r\n"
+
+
+@pytest.mark.fault("O11")
+@pytest.mark.parametrize("sent", [STREAM, b"GET / HTTP/1.1\r\nhost: local", b""])
+async def test_many_connections_of_one_client_block_nobody(
+    cfg: Config, runtime_dir: Path, sent: bytes, measured: Callable[..., None]
+) -> None:
+    patient = cfg.dashboard.model_copy(update={"slow_client_s": DEADLINE_S, "command_timeout_s": DEADLINE_S})
+    begun, took_effect = asyncio.Event(), asyncio.Event()
+
+    async def later(_frame: bytes) -> bytes:
+        begun.set()
+        await took_effect.wait()
+        return format_ok()
+
+    async with (
+        page_rig(cfg.model_copy(update={"dashboard": patient}), runtime_dir) as rig,
+        rig.page("127.0.0.2") as page,
+    ):
+        rig.answer = later
+        async with asyncio.TaskGroup() as tasks:
+            first = tasks.create_task(rig.ask("POST", "/pause"))
+            await begun.wait()
+            crowd = [await asyncio.open_connection("127.0.0.1", rig.port) for _ in range(40)]
+            for _, writer in crowd:
+                writer.write(sent)
+            took_effect.set()
+        assert first.result().code == 200  # the oldest connection of that address, but a command
+        assert (await rig.ask("POST", "/resume")).code == 200
+        assert (await rig.ask("GET", "/healthz")).code in (200, 503)
+        async with rig.page() as another:
+            await another.event()
         await page.event()
-        reader, writer = await asyncio.open_connection("127.0.0.1", rig.port)
-        third, other = await asyncio.open_connection("127.0.0.1", rig.port)
-        assert await closed(third) == b""
-        await page.event()  # those who are in stay
-        writer.write(f"GET /ground HTTP/1.1\r\nhost: 127.0.0.1:{rig.port}\r\nconnection: close\r\n\r\n".encode())
-        assert (await closed(reader)).startswith(b"HTTP/1.1 200 ")
-        writer.close()
-        other.close()
+        measured("O11", 0)
+        for _, writer in crowd:
+            writer.close()
 
 
 async def test_garbage_is_answered_and_noted_sparingly(rig: Rig) -> None:

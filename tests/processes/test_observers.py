@@ -183,7 +183,7 @@ def test_the_dashboard_is_restarted_and_clients_pause_resume_and_call_home(start
     daemon = OperatorClient(runtime_dir)
     assert daemon.status().total == 9
     assert daemon.pause().state == "held"
-    page = HttpClient(f"http://127.0.0.1:{port}")
+    page = HttpClient(f"http://127.0.0.1:{port}", (runtime_dir / "dashboard.token").read_text().strip())
     healthy_by_s = time.monotonic() + 20.0  # the page that was restarted has to receive a heartbeat of each loop
     while not page.is_healthy():
         assert time.monotonic() < healthy_by_s
@@ -199,6 +199,10 @@ def test_the_dashboard_is_restarted_and_clients_pause_resume_and_call_home(start
     # At base the daemon ends; requests then time out, and its exit status says the rest.
     assert run.wait() == 3
     assert "process dashboard was killed by SIGKILL: restarting it, the survey goes on" in run.stderr
+    shown = re.search(r"dashboard: http://127\.0\.0\.1:\d+/\?token=([0-9a-f]{32})\n", run.stderr)
+    assert shown is not None
+    assert shown[1] == page.token  # after the restart, too
+    assert not [path for path in run.run_dir.iterdir() if page.token.encode() in path.read_bytes()]
     assert "Traceback" not in run.stderr
 
 

@@ -32,8 +32,8 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the page 
 
 
 @contextmanager
-def browser_page(port: int) -> Iterator[Page]:
-    """The page at a port in a browser; it asks nowhere else, and nothing fails in it."""
+def browser_page(port: int, runtime_dir: Path) -> Iterator[Page]:
+    """The page at a port in a browser, with its token; it asks nowhere else, and nothing fails in it."""
     asked: set[str] = set()
     errors: list[str] = []
     with sync_playwright() as playwright:
@@ -43,7 +43,7 @@ def browser_page(port: int) -> Iterator[Page]:
             page.set_default_timeout(PATIENCE_MS)
             page.on("request", lambda request: asked.add(urlsplit(request.url).netloc))
             page.on("pageerror", lambda error: errors.append(str(error)))
-            page.goto(f"http://127.0.0.1:{port}/")
+            page.goto(f"http://127.0.0.1:{port}/?token={(runtime_dir / 'dashboard.token').read_text().strip()}")
             yield page
         finally:
             browser.close()
@@ -54,7 +54,7 @@ def browser_page(port: int) -> Iterator[Page]:
 def test_an_operator_looks_and_aborts(start: Start) -> None:
     run = start("--panels", "9", *WITH_PAGE)
     run.until_state("turning", "driving")
-    with browser_page(page_port(run)) as page:
+    with browser_page(page_port(run), run.runtime_dir) as page:
         sees_a_running_survey(page)
         fits_a_phone(page)
         knows_keys(page)
@@ -152,7 +152,7 @@ def test_an_operator_looks_aborts_and_stops_among_beacons(tmp_path: Path, runtim
     with BeaconRun(tmp_path / "run", runtime_dir, *config, *options, has_report=True) as run:
         run.until(lambda status: status["done"] >= 1)
         port = load_radio_config(run.run_dir / "config.toml").dashboard.port
-        with browser_page(port) as page:
+        with browser_page(port, runtime_dir) as page:
             sees_a_mission_among_beacons(page)
             fits_a_phone(page)
             assert ask(port, "GET", "/healthz")[0] == 200

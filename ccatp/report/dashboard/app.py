@@ -8,12 +8,15 @@ import asyncio
 import contextlib
 import logging
 import socket
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from math import sqrt
 from pathlib import Path
 from typing import Any, ClassVar
+from uuid import uuid4
 
 import msgspec
+import structlog
 import uvicorn
 import zmq
 import zmq.asyncio
@@ -33,9 +36,10 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 import ccatp
 from ccatp.config.models import DashboardConfig
-from ccatp.links.channels import BadRequest, OperatorCommand, format_request, parse_reply
+from ccatp.links.channels import BadRequest, format_request, parse_object, parse_reply
+from ccatp.links.liveness import LogRateLimit
 from ccatp.links.rpc import MAX_REPLY_BYTES
-from ccatp.report.dashboard.access import CommandRefusal, command_refusal, host_refusal
+from ccatp.report.dashboard.access import CommandRefusal, check_command, host_refusal
 from ccatp.report.dashboard.hub import StateBroadcaster
 
 Samples = Iterable[tuple[tuple[str, ...], float | None]]
@@ -105,7 +109,13 @@ class StateCollector(Collector):
 
 
 STATIC = Path(__file__).resolve().parent / "static"
-COMMANDS = (OperatorCommand.PAUSE, OperatorCommand.RESUME, OperatorCommand.ABORT, OperatorCommand.STOP)
+# The channel of each command, and what answers there.
+COMMANDS = {
+    **dict.fromkeys(("pause", "resume", "abort", "stop"), "control"),
+    **dict.fromkeys(("emergency", "clear"), "emergency"),
+}
+ANSWERED_BY = {"control": "the main loop", "emergency": "the danger loop"}
+PREFIX = "/api/v1"  # every path exists with it and without
 # Of all pages together; an operator has one at a time.
 MAX_COMMANDS = 8
 HEADERS = {
@@ -120,74 +130,107 @@ HEADERS = {
     "cross-origin-resource-policy": "same-origin",
 }
 # Unsent bytes of an answer in the kernel; more of them would hide for longer that a client does not read.
-SEND_BUFFER_BYTES = 65_536
+SEND_BUFFER_BYTES = 16_384
 # For answers that are not complete at the end; event streams end before.
 GRACE_S = 1
 KEEP_ALIVE_S = 5
-MAX_REQUEST_BYTES = 16_384
-
-Note = Callable[[str, dict[str, object]], None]
+MAX_HEADER_BYTES = 16_384
+MAX_BODY_BYTES = 65_536
+TOO_LONG = f"the body of the request is longer than {MAX_BODY_BYTES} bytes"
+MAX_UNREAD_BYTES = 4_194_304
+# Every client of the port can cause lines of refusals.
+REFUSAL_LINES, REFUSAL_PERIOD_S = 10, 60.0
 
 
 class CommandEndpoint:
-    """Passes commands of the page on to the operator channel; a command is answered when it took effect."""
+    """Passes commands of the page on to the daemon's channels; a command is answered when it took effect."""
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, timeout_s: float) -> None:
+    def __init__(
+        self, context: zmq.Context[zmq.Socket[bytes]], endpoint_of: Callable[[str], str], timeout_s: float
+    ) -> None:
         self._context: zmq.asyncio.Context = zmq.asyncio.Context.shadow(context)
-        self._endpoint, self._timeout_s = endpoint, timeout_s
+        self._endpoint_of, self._timeout_s = endpoint_of, timeout_s
         self._slots = asyncio.Semaphore(MAX_COMMANDS)
 
-    async def ask(self, command: OperatorCommand) -> CommandRefusal | None:
-        """Send a command and wait until it took effect, or return why it did not."""
+    async def ask(self, command: str, frame: bytes) -> dict[str, Any] | CommandRefusal:
+        """Send a command and wait until it took effect; returns the reply, or why it did not."""
         if self._slots.locked():
             return CommandRefusal(503, f"{command}: {MAX_COMMANDS} commands wait for their answers already")
+        channel = COMMANDS[command]
+        who = ANSWERED_BY[channel]
         try:
             async with self._slots, asyncio.timeout(self._timeout_s):
                 with self._context.socket(zmq.DEALER) as peer:
                     peer.setsockopt(zmq.LINGER, 0)
                     peer.setsockopt(zmq.MAXMSGSIZE, MAX_REPLY_BYTES)
-                    peer.connect(self._endpoint)
-                    await peer.send_multipart([b"", format_request(command)])
-                    *_, frame = await peer.recv_multipart()
-            reply = parse_reply(frame)
+                    peer.connect(self._endpoint_of(channel))
+                    await peer.send_multipart([b"", frame])
+                    *_, answer = await peer.recv_multipart()
+            reply = parse_reply(answer)
         except TimeoutError:
-            return CommandRefusal(504, f"{command}: no answer from the main loop within {self._timeout_s:g} s")
+            return CommandRefusal(504, f"{command}: no answer from {who} within {self._timeout_s:g} s")
         except BadRequest as error:
-            return CommandRefusal(502, f"{command}: the main loop answered with {error}")
-        return None if reply["ok"] else CommandRefusal(409, f"{command}: {reply.get('error', 'refused')}")
+            return CommandRefusal(502, f"{command}: {who} answered with {error}")
+        return reply if reply["ok"] else CommandRefusal(409, f"{command}: {reply.get('error', 'refused')}")
 
 
-class HostCheckMiddleware:
-    """Refuses foreign host names with a reason, which Starlette's middleware does not; adds the security headers."""
+class RequestCheckMiddleware:
+    """Refuses foreign host names with a reason, and bodies that are too long; adds the security headers.
 
-    def __init__(self, app: ASGIApp, names: Collection[str]) -> None:
-        self._app, self._names = app, names
+    After an answer to a body that was not read the rest is discarded, within limits: a client that sends all of it
+    before it reads gets the answer, too. Then the connection is closed.
+    """
+
+    def __init__(self, app: ASGIApp, cfg: DashboardConfig) -> None:
+        self._app, self._cfg = app, cfg
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
+        request = Headers(scope=scope)
+        length = int(request.get("content-length", 0))
+        is_unread = length > 0 or "transfer-encoding" in request
+
+        async def receive_body() -> Message:
+            nonlocal is_unread
+            message = await receive()
+            is_unread = bool(message.get("more_body"))
+            return message
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 headers.update(HEADERS)
                 headers.setdefault("cache-control", "no-cache" if "etag" in headers else "no-store")
+                if is_unread:
+                    headers["connection"] = "close"
+            elif is_unread and not message.get("more_body"):
+                await send({**message, "more_body": True})
+                left = MAX_UNREAD_BYTES
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(self._cfg.slow_client_s):
+                        while left > 0 and is_unread:
+                            left -= len((await receive_body()).get("body", b""))
+                message = {"type": "http.response.body"}
             await send(message)
 
-        refusal = host_refusal(Headers(scope=scope).get("host"), self._names)
-        app = self._app if refusal is None else _error(421, refusal)
-        await app(scope, receive, send_with_headers)
+        app = self._app
+        if (refusal := host_refusal(request.get("host"), self._cfg.host_names)) is not None:
+            app = _error(421, refusal)
+        elif length > MAX_BODY_BYTES:
+            app = _error(413, TOO_LONG)
+        await app(scope, receive_body, send_with_headers)
 
 
 def build_app(
     hub: StateBroadcaster,
     commands: CommandEndpoint,
     ground: Mapping[str, Any],
-    *,
-    host_names: Collection[str],
-    token: str | None,
-    note: Note,
+    cfg: DashboardConfig,
+    tokens: Mapping[str, str],
+    log: structlog.typing.FilteringBoundLogger,
 ) -> ASGIApp:
-    """The application; ``ground``: see ``survey_view.ground``; ``token`` is required with commands."""
+    """The application; ``ground``: see ``survey_view.ground``; commands need one of ``tokens``, by name."""
+    refusals = LogRateLimit(REFUSAL_LINES, REFUSAL_PERIOD_S)
     static = StaticFiles(directory=STATIC)
     registry = CollectorRegistry()
     registry.register(StateCollector(hub.state, lambda: hub.pages, ground))
@@ -211,37 +254,64 @@ def build_app(
     async def metrics(_request: Request) -> Response:
         return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
 
-    def command_route(name: OperatorCommand) -> Route:
-        async def run(request: Request) -> Response:
-            fields = {"command": str(name), "client": request.client.host if request.client is not None else "?"}
-            if (refused := command_refusal(request.headers, token)) is not None:
-                note("page_request_refused", {**fields, "why": refused.message})
-                headers = {"www-authenticate": "Bearer"} if refused.http_status == 401 else {}
-                return _error(*refused, headers)
-            refused = await commands.ask(name)
-            note("page_command", {**fields, "refusal": refused.message if refused else ""})
-            return _error(*refused) if refused else _json({"status": "ok"})
-
-        return Route(f"/{name}", run, methods=["POST"])
+    async def command(request: Request) -> Response:
+        name = request.url.path.rpartition("/")[2]
+        line = {"command": name, "client": request.client.host if request.client is not None else "?"}
+        by = check_command(request.headers, tokens)
+        if isinstance(by, CommandRefusal):
+            if (left_out := refusals.take(asyncio.get_running_loop().time())) is not None:
+                log.info("page_request_refused", **line, why=by.message, left_out=left_out)
+            return _error(*by, {"www-authenticate": "Bearer"} if by.http_status == 401 else {})
+        request.state.is_command = True  # its connection stays
+        reply = await commands.ask(name, _frame(name, await _body(request, cfg.slow_client_s)))
+        refusal = reply.message if isinstance(reply, CommandRefusal) else ""
+        log.info("page_command", **line, by=by, refusal=refusal)
+        if isinstance(reply, CommandRefusal):
+            return _error(*reply)
+        return _json({"status": "ok", **{key: reply[key] for key in ("id", "latched", "code") if key in reply}})
 
     reads = {"/": page, "/ground": send_ground, "/events": events, "/status": status, "/healthz": healthz,
              "/metrics": metrics}  # fmt: skip
+    routes = [
+        *(Route(path, answer) for path, answer in reads.items()),
+        *(Route(f"/{name}", command, methods=["POST"]) for name in COMMANDS),
+        Mount("/static", static),
+    ]
     return Starlette(
-        routes=[
-            *(Route(path, answer) for path, answer in reads.items()),
-            *map(command_route, COMMANDS),
-            Mount("/static", static),
-        ],
-        middleware=[Middleware(HostCheckMiddleware, names=host_names)],
+        routes=[*routes, Mount(PREFIX, routes=routes)],
+        middleware=[Middleware(RequestCheckMiddleware, cfg=cfg)],
         exception_handlers={HTTPException: _http_error},
     )
 
 
+async def _body(request: Request, slow_client_s: float) -> bytes:
+    body = b""
+    try:
+        async with asyncio.timeout(slow_client_s):
+            async for part in request.stream():
+                body += part
+                if len(body) > MAX_BODY_BYTES:
+                    raise HTTPException(413, TOO_LONG)
+    except TimeoutError as error:
+        raise HTTPException(408, f"the body of the request took more than {slow_client_s:g} s") from error
+    return body
+
+
+def _frame(command: str, body: bytes) -> bytes:
+    """The request of a channel; an emergency without an id gets one."""
+    if COMMANDS[command] == "control":
+        return format_request(command)
+    try:
+        return format_request(**{"id": str(uuid4()), **parse_object(body), "cmd": command})
+    except ValueError as error:
+        raise HTTPException(400, f"{command}: {error}") from error
+
+
 async def _http_error(request: Request, error: Exception) -> Response:
-    code = error.status_code if isinstance(error, HTTPException) else 500
-    method = "POST" if request.url.path.strip("/") in COMMANDS else "GET"
+    code, text = (error.status_code, error.detail) if isinstance(error, HTTPException) else (500, "internal error")
+    method = "POST" if request.url.path.strip("/").rpartition("/")[2] in COMMANDS else "GET"
     texts = {404: f"bad endpoint: {request.url.path}", 405: f"method not {method}"}
-    return _error(code, texts.get(code, "internal error"), {"allow": method} if code == 405 else {})
+    return _error(code, texts.get(code, text), {"allow": method} if code == 405 else {})
 
 
 def _json(data: Mapping[str, Any], code: int = 200, headers: Mapping[str, str] | None = None) -> Response:
@@ -253,8 +323,10 @@ def _error(code: int, message: str, headers: Mapping[str, str] | None = None) ->
 
 
 class LimitedProtocol(H11Protocol):
-    """A connection with limits: beyond ``max_connections`` a new one is closed, the open ones stay.
+    """A connection with limits of number, time and size.
 
+    Where there are ``max_connections``, or half as many of one address, a new one takes the place of the oldest of
+    that address, or of those with the most: of one that serves no request, if there is one. A command is never closed.
     One that for ``slow_client_s`` has sent no complete request, or accepted nothing of an answer, is closed, too.
     uvicorn's ``limit_concurrency`` does not fit: at the limit it answers 503 on the open connections as well.
     """
@@ -262,26 +334,28 @@ class LimitedProtocol(H11Protocol):
     max_connections: ClassVar[int]
     slow_client_s: ClassVar[float]
     _timeout: asyncio.TimerHandle | None = None
+    _opened_s = 0.0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Close it if it is one too many."""
-        if len(self.connections) >= self.max_connections:
-            transport.abort()
-            return
-        transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        """Close another one if it is one too many."""
         super().connection_made(transport)
+        self._opened_s = self.loop.time()
+        transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        transport.set_write_buffer_limits(0)
         self._limit(True)
+        if (surplus := self._find_surplus()) is not None:
+            self.connections.discard(surplus)
+            surplus.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Also called for a connection that was one too many."""
+        """The other end, or a limit, has closed it."""
         self._limit(False)
-        if self.transport is not None:
-            super().connection_lost(exc)
+        super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
         """Part of a request; the time runs until it is complete, uvicorn's keep-alive limit between requests."""
         super().data_received(data)
-        if self.headers and not self.cycle.response_complete:
+        if self._is_serving:
             if not self.flow.write_paused:
                 self._limit(False)
         elif self._timeout is None:
@@ -296,6 +370,32 @@ class LimitedProtocol(H11Protocol):
         """The client has accepted something."""
         super().resume_writing()
         self._limit(False)
+
+    @property
+    def _is_serving(self) -> bool:
+        return bool(self.headers) and not self.cycle.response_complete
+
+    @property
+    def _is_command(self) -> bool:
+        return self._is_serving and "is_command" in self.scope["state"]
+
+    def _find_surplus(self) -> "LimitedProtocol | None":
+        """The connection that gives way to this one: this one where all others are commands."""
+        address_of = {one: one.client[0] for one in self.connections if isinstance(one, LimitedProtocol) and one.client}
+        number_at = Counter(address_of.values())
+        if number_at[address_of[self]] > self.max_connections // 2:
+            addresses = {address_of[self]}
+        elif len(address_of) > self.max_connections:
+            most = max(number_at.values())
+            addresses = {address for address, number in number_at.items() if number == most}
+        else:
+            return None
+        others = [one for one, address in address_of.items() if address in addresses and one is not self]
+        return min(
+            (one for one in others if not one._is_command),
+            key=lambda one: (one._is_serving and not one.flow.write_paused, one._opened_s),
+            default=self,
+        )
 
     def _limit(self, is_limited: bool) -> None:
         if self._timeout is not None:
@@ -330,7 +430,7 @@ async def serve(app: ASGIApp, listener: socket.socket, cfg: DashboardConfig, sto
         server_header=False,
         timeout_keep_alive=KEEP_ALIVE_S,
         timeout_graceful_shutdown=GRACE_S,
-        h11_max_incomplete_event_size=MAX_REQUEST_BYTES,
+        h11_max_incomplete_event_size=MAX_HEADER_BYTES,
     )
     server = _Server(config)
 

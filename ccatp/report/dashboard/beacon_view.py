@@ -27,7 +27,7 @@ def beacon_waypoints(cfg: RadioConfig) -> list[tuple[float, float]]:
     return [] if cfg.follow.is_active else list(cfg.workspace.waypoints_m)
 
 
-def beacon_ground(cfg: RadioConfig, *, is_sim: bool, needs_token: bool) -> dict[str, Any]:
+def beacon_ground(cfg: RadioConfig, *, is_sim: bool) -> dict[str, Any]:
     """What does not change during a mission, as of ``survey_view.ground``; lengths in m, frame of the room."""
     width_m, depth_m = cfg.workspace.size_m
     is_following = cfg.follow.is_active
@@ -37,7 +37,6 @@ def beacon_ground(cfg: RadioConfig, *, is_sim: bool, needs_token: bool) -> dict[
         "title": TITLES[cfg.system],
         "is_sim": is_sim,
         "subtitle": f"{cfg.system}.toml, seed {cfg.run.seed}" if is_sim else f"{cfg.system}.toml",
-        "needs_token": needs_token,
         "panels": [],
         "rim": [[0.0, 0.0], [width_m, 0.0], [width_m, depth_m], [0.0, depth_m]],
         "points": [[waypoint_name(at), *place] for at, place in enumerate(beacon_waypoints(cfg))],

@@ -36,14 +36,13 @@ def survey_points(mirror: Mirror, cfg: Config) -> list[PointId]:
     return ORDERS[cfg.run.order](mirror, cfg.run.panels)
 
 
-def ground(mirror: Mirror, cfg: Config, *, is_sim: bool, needs_token: bool) -> dict[str, Any]:
+def ground(mirror: Mirror, cfg: Config, *, is_sim: bool) -> dict[str, Any]:
     """What does not change during a run: map and settings of the page; lengths in m, deck frame."""
     base = mirror.base_pose
     return {
         "title": mirror.name,
         "is_sim": is_sim,
         "subtitle": f"world {cfg.world.name}, seed {cfg.run.seed}" if is_sim else f"filter {cfg.run.filter}",
-        "needs_token": needs_token,
         "panels": [
             [p.id.row, p.id.col, *(round(v, 4) for v in (p.x_m, p.y_m, p.half_x_m, p.half_y_m))]
             for p in mirror.panels.values()

@@ -33,7 +33,7 @@ from ccatp.links.topics import (
 )
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.store import StoredPoint, StoredSurvey
-from ccatp.report.dashboard.access import command_refusal, host_refusal, read_token
+from ccatp.report.dashboard.access import CommandRefusal, check_command, host_refusal, make_token, page_tokens
 from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground
 from ccatp.report.dashboard.survey_view import SurveyView
 from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView
@@ -309,8 +309,8 @@ def test_the_scene_without_what_the_page_draws_itself(room: BeaconView) -> None:
 @pytest.mark.parametrize("system", ["zigbee", "follow", "cricket"])
 def test_the_ground_of_a_room(system: str) -> None:
     cfg, is_following = radio(system), system == "follow"
-    found = json.loads(msgspec.json.encode(beacon_ground(cfg, is_sim=True, needs_token=True)))
-    assert (found["needs_token"], found["rim"][2]) == (True, list(cfg.workspace.size_m))
+    found = json.loads(msgspec.json.encode(beacon_ground(cfg, is_sim=True)))
+    assert found["rim"][2] == list(cfg.workspace.size_m)
     assert found["states"] == [str(state) for state in MODES]
     names = [] if is_following else [f"waypoint {k + 1}" for k in range(len(cfg.workspace.waypoints_m))]
     assert [point[0] for point in found["points"]] == names
@@ -364,50 +364,68 @@ SITE = "sec-fetch-site"
     ],
 )
 def test_the_own_page_and_programs_command_and_pages_of_others_do_not(headers: dict[str, str], why: str | None) -> None:
-    refusal = command_refusal(HOST | headers, None)
+    found = check_command(HOST | {"authorization": f"Bearer {TOKEN}"} | headers, {"alice": TOKEN})
     if why is None:
-        assert refusal is None
+        assert found == "alice"
     else:
-        assert refusal is not None
-        assert (refusal.http_status, refusal.message.endswith(why)) == (403, True)
+        assert isinstance(found, CommandRefusal)
+        assert (found.http_status, found.message.endswith(why)) == (403, True)
 
 
 @pytest.mark.parametrize(
     ("authorization", "why"),
     [
         *((right, None) for right in (f"Bearer {TOKEN}", f"bearer  {TOKEN} ")),
-        *((none, "commands need the token") for none in ("", TOKEN, "bearer", f"Basic {TOKEN}")),
-        *((f"Bearer {wrong}", "the token is not that of") for wrong in ("", f"{TOKEN}x", TOKEN[:-1], "é")),
+        *((none, "commands need a token") for none in ("", TOKEN, "bearer", f"Basic {TOKEN}")),
+        *((f"Bearer {wrong}", "the token is not accepted") for wrong in ("", f"{TOKEN}x", TOKEN[:-1], "é")),
     ],
 )
 def test_tokens(authorization: str, why: str | None) -> None:
-    refusal = command_refusal(HOST | {"authorization": authorization}, TOKEN)
+    found = check_command(HOST | {"authorization": authorization}, {"bob": TOKEN[::-1], "alice": TOKEN})
     if why is None:
-        assert refusal is None
+        assert found == "alice"
     else:
-        assert refusal is not None
-        assert (refusal.http_status, refusal.message.startswith(why)) == (401, True)
+        assert isinstance(found, CommandRefusal)
+        assert (found.http_status, found.message.startswith(why)) == (401, True)
 
 
 @pytest.mark.parametrize(
     ("content", "mode", "why"),
     [
-        (f"{TOKEN}\n".encode(), 0o600, ""),
+        (f"{TOKEN}\n".encode(), 0o600, {"operator": TOKEN}),
+        (f"# who\n\nalice {TOKEN}\nbob\t{TOKEN[::-1]}\r\n".encode(), 0o600, {"alice": TOKEN, "bob": TOKEN[::-1]}),
         (None, 0, r"dashboard\.token_file: cannot read .*token: No such file or directory; make one with"),
         (TOKEN.encode(), 0o644, r"open to others \(mode 0644\); chmod go= "),
-        (TOKEN[1:].encode(), 0o600, "must hold one word of at least 32 characters; make one with"),
-        (b"two words of more than thirty characters", 0o600, "must hold one word of at least 32 characters"),
-        (b"\xff" * 40, 0o600, "is no text of ASCII characters; make one with"),
+        (b"", 0o600, "holds no token; make one with"),
+        (TOKEN[1:].encode(), 0o600, "line 1 of .* at least 32 ASCII characters; make one with"),
+        (b"more than two words of more than thirty characters", 0o600, "is not NAME TOKEN, or TOKEN alone"),
+        (b"\xff" * 40, 0o600, "at least 32 ASCII characters"),
+        (f"alice {TOKEN}\nbob {TOKEN}".encode(), 0o600, "line 2 of .*: name or token stands twice"),
+        (f"{TOKEN}\n{TOKEN[::-1]}".encode(), 0o600, "line 2 of .*: name or token stands twice"),
     ],
 )
-def test_the_file_of_the_token(config: Config, tmp_path: Path, content: bytes | None, mode: int, why: str) -> None:
+def test_the_file_of_the_tokens(
+    config: Config, tmp_path: Path, content: bytes | None, mode: int, why: str | dict[str, str]
+) -> None:
     path = tmp_path / "token"
     if content is not None:
         path.write_bytes(content)
         path.chmod(mode)
     cfg = config.dashboard.model_copy(update={"token_file": str(path)})
-    if not why:
-        assert (read_token(cfg), read_token(config.dashboard)) == (TOKEN, None)
+    if isinstance(why, dict):
+        assert page_tokens(cfg, tmp_path) == why
         return
-    with pytest.raises(ConfigError, match=why):
-        read_token(cfg)
+    with pytest.raises(ConfigError, match=why) as refused:
+        page_tokens(cfg, tmp_path)
+    assert TOKEN[:-1] not in str(refused.value)
+
+
+def test_a_token_is_made_at_each_start_for_the_own_user_alone(config: Config, tmp_path: Path) -> None:
+    path = tmp_path / "dashboard.token"
+    path.write_text("of a former start, and open to others")
+    path.chmod(0o644)
+    first, second = make_token(tmp_path), make_token(tmp_path)
+    assert first != second
+    assert len(second) == 32
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert page_tokens(config.dashboard, tmp_path) == {"operator": second}

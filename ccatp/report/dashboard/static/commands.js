@@ -1,8 +1,9 @@
-// Pause, resume, abort in two steps, stop: what is sent, and what the daemon answers.
+// Pause, resume, abort in two steps, stop: what is sent, and what the daemon answers. Without a token: none of them.
 const ARMED_MS = 5000;
 // A double click is one wish, not two.
 const SETTLE_MS = 350;
 const NAMES = ["pause", "resume", "abort", "stop"];
+const KEPT = "ccatp-token";
 const $ = (id) => document.getElementById(id);
 
 export class Commands {
@@ -10,11 +11,22 @@ export class Commands {
     this.armedAt = null;
     this.timer = null;
     this.waiting = null;
+    this.sensible = {};
     for (const name of ["pause", "resume", "stop"]) $(name).onclick = () => this.send(name);
     $("abort").onclick = () => (this.armedAt === null ? this.arm() : this.confirm());
     $("abort").addEventListener("blur", () => this.disarm());
-    $("token").value = sessionStorage.getItem("ccatp-token") ?? "";
-    $("token").onchange = () => sessionStorage.setItem("ccatp-token", $("token").value.trim());
+    $("token").onchange = () => this.keep($("token").value.trim());
+    const given = new URLSearchParams(location.search).get("token");
+    if (given) history.replaceState(null, "", location.pathname); // neither in a bookmark nor on a screen
+    this.keep(given ?? sessionStorage.getItem(KEPT) ?? "");
+  }
+
+  keep(token) {
+    this.token = token;
+    sessionStorage.setItem(KEPT, token);
+    $("token").value = token;
+    $("read-only").hidden = Boolean(token);
+    this.allow(this.sensible);
   }
 
   // What makes sense now; while the link is lost abort and stop may still get through.
@@ -34,8 +46,9 @@ export class Commands {
   }
 
   allow(which) {
-    for (const name of NAMES) $(name).disabled = !which[name] || this.waiting === name;
-    if (!which.abort) this.disarm();
+    this.sensible = which;
+    for (const name of NAMES) $(name).disabled = !this.token || !which[name] || this.waiting === name;
+    if ($("abort").disabled) this.disarm();
   }
 
   press(name) {
@@ -74,15 +87,11 @@ export class Commands {
     $(name).disabled = true;
     this.say(`${name} …`);
     try {
-      const token = $("token").value.trim();
-      const headers = token ? { authorization: `Bearer ${token}` } : {};
+      const headers = { authorization: `Bearer ${this.token}` };
       const answer = await fetch(name, { method: "POST", headers });
       const { message } = await answer.json();
       this.say(answer.ok ? `${name}: done` : `refused: ${message}`, answer.ok ? "" : "bad");
-      if (answer.status === 401) {
-        $("token-row").hidden = false;
-        $("token").focus();
-      }
+      if (answer.status === 401) this.keep(""); // of an earlier start
     } catch {
       this.say(`${name}: the dashboard did not answer`, "bad");
     }

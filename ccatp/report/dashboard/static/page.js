@@ -68,7 +68,6 @@ function begin(ground) {
   text("subtitle", ground.subtitle);
   document.title = `${ground.is_sim ? "SIM " : ""}${ground.title} – ccatp`;
   $("simulation").hidden = !ground.is_sim;
-  $("token-row").hidden = !ground.needs_token;
   ({ codes, words } = ground);
   for (const [id, word] of Object.entries(words)) if ($(id)) text(id, word);
   for (const id of hidden) $(id).hidden = false; // the mission before may have been of another kind
