@@ -237,13 +237,15 @@ def _edge_sensors(report: RobotReport) -> PreflightResult:
 
 
 def _gravity(report: RobotReport) -> PreflightResult:
-    check = MirrorCheck(report.mirror)
+    check = MirrorCheck(report.mirror, is_heading_known=True)
     is_known = any(check.update(frame.t, frame.gravity, report.mirror.base_pose) for frame in report.frames)
     if check.contradiction:
-        return failed(check.contradiction, "set run.mirror to where the robot stands, or set it down at base")
+        todo = "set the robot down at base with its heading; check run.mirror, and the axes of docs/protocols.md"
+        return failed(check.contradiction, todo)
     if check.warning or not is_known:
         return warned(check.warning or "too few readings", "make sure by eye that this is the right mirror")
-    return passed(f"the slope is that of {report.mirror.name} at base")
+    unseen = "".join(f"; it would look the same if {mistake}" for mistake in check.unseen)
+    return passed(f"the slope is that of {report.mirror.name} at base{unseen}")
 
 
 def _fans(report: RobotReport) -> PreflightResult:

@@ -5,6 +5,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
+from operator import mul
 from pathlib import PurePath
 
 from pydantic import BaseModel
@@ -20,6 +21,7 @@ _SMALLEST_PANEL_MM = 10.0
 _WHOLE_FRAMES = 1e-6  # decimal fractions of a second are not exact
 _LEAST_STANDSTILL_S = 0.2
 _NEAREST_COLLIMATOR_MM = 100.0
+_UNIT_LENGTH = 1e-3
 _PITCH_AGREEMENT_MM = 0.1  # the fitted pitches of the telescope differ by up to 0.012 mm
 _TCP_ENDPOINT = re.compile(r"tcp://[^\s/@;]+:(\d{1,5})")
 _LARGEST_PORT = 65535
@@ -40,6 +42,7 @@ def check_config(cfg: Config) -> Problems:
     yield from _check_network(cfg)
     yield from _check_dashboard(cfg.dashboard)
     yield from _check_panels(cfg.mirror)
+    yield from _check_gravity(cfg.mirror)
     yield from _check_collimators(cfg.mirror)
 
 
@@ -237,6 +240,19 @@ def _check_panels(mirror: MirrorConfig) -> Problems:
         if abs(value) >= half:
             what = f"= {value:g} is off the panel, which reaches from {-half:g} to {half:g}"
             yield _problem(f"mirror.base.{axis}_mm", what)
+
+
+def _check_gravity(mirror: MirrorConfig) -> Problems:
+    """A unit vector; on an overhanging mirror things fall off the side on which the robot drives."""
+    frame, key = mirror.frame, "mirror.frame.gravity_world"
+    gravity, angle_rad = frame.gravity_world, frame.rotation_about_x_rad
+    normal = 0.0, -math.sin(angle_rad), math.cos(angle_rad)  # the mirror frame's z in the world
+    falls_off = frame.reflecting_side_sign * sum(map(mul, normal, gravity))
+    if abs(math.hypot(*gravity) - 1.0) > _UNIT_LENGTH:
+        yield _problem(key, f"= {list(gravity)} must be of length 1")
+    elif (falls_off > 0.0) is not mirror.overhang:
+        what = f"= {list(gravity)} contradicts overhang = {str(mirror.overhang).lower()}; give the direction of fall"
+        yield _problem(key, what, "mirror.overhang", "mirror.frame.reflecting_side_sign")
 
 
 def _check_collimators(mirror: MirrorConfig) -> Problems:

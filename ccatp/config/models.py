@@ -448,6 +448,8 @@ class FrameConfig(Model):
     origin_world_mm: tuple[float, float, float]
     rotation_about_x_rad: float
     reflecting_side_sign: Literal[-1, 1]
+    # Unit vector along which things fall. Files of older versions lack it: they are of a telescope at the zenith.
+    gravity_world: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
 
 class PanelsConfig(Model):

@@ -41,7 +41,7 @@ class SurveyFilter:
         self._seams = SeamLines(mirror, robot)
         self._legs = SlipPrior(self._full)
         self._tilt_sigma_m = robot.puck_height_m * self._full.panel_tilt_sigma_rad
-        self._gravity_deck = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
+        self._gravity_deck = mirror.gravity_deck
         filter_.reset(*self._first(start))
         self._panel = self._panel_below()
 

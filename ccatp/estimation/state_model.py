@@ -54,7 +54,7 @@ class Terrain:
 
     def __init__(self, mirror: Mirror) -> None:
         self._surface = mirror.surface
-        self._gravity = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))  # the telescope points to the zenith
+        self._gravity = mirror.gravity_deck
         self._x_m = self._y_m = float("inf")
 
     def at(self, x_m: float, y_m: float) -> Slope:

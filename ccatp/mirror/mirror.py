@@ -20,6 +20,7 @@ class Mirror:
     It stands in the world by p_mirror = R (p_world - origin), R = [[1, 0, 0], [0, c, s], [0, -s, c]]; the deck frame is
     the mirror frame turned by pi about its y axis where ``drive_side`` is -1, else the mirror frame. ``surface`` is in
     the deck frame, ``rim`` in the deck plane, ``collimators_m`` (k, 3) of the laser ``channels`` in the world frame.
+    ``gravity_deck`` is the unit vector along which things fall.
     """
 
     def __init__(self, cfg: MirrorConfig) -> None:
@@ -27,6 +28,7 @@ class Mirror:
         self.origin_m = x * 1e-3, y * 1e-3, z * 1e-3
         self.c, self.s = cos(cfg.frame.rotation_about_x_rad), sin(cfg.frame.rotation_about_x_rad)
         self.drive_side: int = cfg.frame.reflecting_side_sign
+        self.gravity_deck = self.rotate_deck_from_world(cfg.frame.gravity_world)
         self.name, self.overhang = cfg.name, cfg.overhang
         self.gap_m = cfg.panels.gap_mm * 1e-3
         self.surface = build_surface(cfg.surface, self.drive_side)
@@ -187,8 +189,8 @@ class Mirror:
         return wrap_pi(atan2(ty, tx) + (-pi / 2.0 if axis == "x" else pi / 2.0))
 
     def gravity_in_robot(self, p: DeckPose) -> Vector3:
-        """Unit direction of gravity in the robot frame, telescope pointing to the zenith (gravity = world +z)."""
-        g = self.rotate_deck_from_world((0.0, 0.0, 1.0))
+        """Unit vector along which things fall, in the frame of a robot at ``p``."""
+        g = self.gravity_deck
         h, left, n = self.robot_axes(p)
         return _dot(h, g), _dot(left, g), _dot(n, g)
 

@@ -231,7 +231,7 @@ class Injector:
                 self._sensing.append(LateRows(record))
             else:
                 self._sensing.append(SensorFault(record, child))
-        self._gravity = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
+        self._gravity = mirror.gravity_deck
         self.drifts: list[Disturbance] = [
             partial(self._drift, one) for one in self._on["body"] if one.fault.type == "drift"
         ]

@@ -335,7 +335,7 @@ class Creep:
     """The body glides downhill while it drives; ``rng`` is that of the walk of the creep."""
 
     def __init__(self, mirror: Mirror, world: WorldConfig, rng: np.random.Generator) -> None:
-        self._gravity = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
+        self._gravity = mirror.gravity_deck
         self._fraction = world.creep_fraction
         self._walk = OrnsteinUhlenbeck(world.creep_walk_fraction, world.creep_walk_time_s, rng)
 

@@ -283,7 +283,7 @@ class SensorSuite:
         biases, counts, panel_edges = rng.spawn(3)
         self._mirror = mirror
         self._gravity_noise = noise_stream(gravity)
-        self._gravity_on_deck = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))  # the telescope points to the zenith
+        self._gravity_on_deck = mirror.gravity_deck
         self._gravity_pose: DeckPose | None = None
         self._gravity = (0.0, 0.0, 0.0)
         self._gravity_sigma = sim.gravity_sigma_rad

@@ -352,7 +352,7 @@ def _per_parameter(travel_m: float, radius_m: float, scale: float) -> FloatArray
 
 def _downhill_of(mirror: Mirror, rows: FloatArray) -> FloatArray:
     """Deck components of the unit vector downhill at each row, shape (k, 2)."""
-    gx, gy, gz = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
+    gx, gy, gz = mirror.gravity_deck
     fx, fy = rows[:, WAY_FX], rows[:, WAY_FY]
     along = (gz - fx * gx - fy * gy) / (1.0 + fx * fx + fy * fy)
     tangent = np.column_stack([gx + along * fx, gy + along * fy, gz - along])

@@ -1,12 +1,12 @@
-"""Checks of a survey beside its frames: a fault that nobody looks after, and a mirror that contradicts gravity."""
+"""Checks of a survey beside its frames: a fault that nobody looks after, and gravity that contradicts the mirror."""
 
 from collections.abc import Sequence
 from enum import StrEnum
-from math import acos, degrees, pi, radians, sqrt
+from math import acos, atan2, degrees, dist, hypot, pi, radians, sqrt
 from statistics import median
 
 from ccatp.config.models import Config
-from ccatp.core import DeckPose
+from ccatp.core import DeckPose, Vector3, wrap_pi
 from ccatp.mirror.mirror import Mirror
 
 _EARLY = 1.05  # from the decision to the first turn of a wheel some charge goes, too
@@ -67,37 +67,101 @@ READINGS = 40
 PATIENCE_S = 4.0
 
 
-class MirrorCheck:
-    """Before the first motion: does gravity agree with the slope of the configured mirror? The heading plays no part.
+# People set a robot down with the heading of base within some degrees; gravity itself leaves 4 deg of heading open.
+BEARING_RAD = radians(15.0)
+_LEAST_TILT = 0.1  # on flatter ground gravity has no direction along the surface
+# Single mistakes of a robot: what it reports as x, y and z instead.
+_MISTAKES = {
+    "gravity points the other way: the robot reports the reaction (up) instead of the direction of fall": "-x -y -z",
+    "gravity is mirrored: x has the wrong sign": "-x y z",
+    "gravity is mirrored: y has the wrong sign": "x -y z",
+    "gravity is mirrored: z has the wrong sign": "x y -z",
+    "x and y of gravity have the wrong sign": "-x -y z",
+    "x and z of gravity have the wrong sign": "-x y -z",
+    "y and z of gravity have the wrong sign": "x -y -z",
+    "x and y of gravity are exchanged": "y x z",
+    "x and z of gravity are exchanged": "z y x",
+    "y and z of gravity are exchanged": "x z y",
+    "the robot reports y, z, x of gravity as x, y, z": "y z x",
+    "the robot reports z, x, y of gravity as x, y, z": "z x y",
+}
 
-    ``contradiction``: why the mirror cannot be this one, or empty; ``warning``: what could not be checked.
+
+class MirrorCheck:
+    """Before the first motion: does gravity agree with the slope of the configured mirror?
+
+    The heading plays a part only with ``is_heading_known``. ``contradiction``: why the mirror cannot be this one, or
+    the mistake of the robot that explains what it reports, or empty; ``warning``: what could not be checked;
+    ``unseen``: mistakes that make no difference here.
     """
 
-    def __init__(self, mirror: Mirror) -> None:
-        self._mirror = mirror
-        self._slopes_rad: list[float] = []
+    def __init__(self, mirror: Mirror, *, is_heading_known: bool = False) -> None:
+        self._mirror, self._is_heading_known = mirror, is_heading_known
+        self._readings: list[Vector3] = []
         self._first_s: float | None = None
         self.contradiction = self.warning = ""
+        self.unseen: list[str] = []
 
     def update(self, t_s: float, gravity: Sequence[float] | None, pose: DeckPose) -> bool:
         """Take a frame and gravity's direction in the robot frame, where it was read; whether the check is complete."""
         if self._first_s is None:
             self._first_s = t_s
         if gravity is not None:
-            self._slopes_rad.append(_slope(gravity[1:]))
+            _, x, y, z = gravity
+            self._readings.append((x, y, z))
         is_over = abs(t_s - self._first_s) >= PATIENCE_S
-        if len(self._slopes_rad) < READINGS and not is_over:
+        if len(self._readings) < READINGS and not is_over:
             return False
-        if not self._slopes_rad:
+        if not self._readings:
             self.warning = "the robot tells no gravity: nobody knows whether it stands on the configured mirror"
             return True
-        felt_rad, expected_rad = median(self._slopes_rad), _slope(self._mirror.gravity_in_robot(pose))
-        if abs(felt_rad - expected_rad) > LIMIT_RAD:
+        self._judge(self._mirror.gravity_in_robot(pose))
+        return True
+
+    def _judge(self, expected: Vector3) -> None:
+        x, y, z = (median(values) for values in zip(*self._readings, strict=True))
+        felt = x, y, z
+        # Readings are noisy: the slope of their median differs a little from the median of their slopes.
+        felt_rad, expected_rad = median(map(_slope, self._readings)), _slope(expected)
+        is_slope_right = abs(felt_rad - expected_rad) <= LIMIT_RAD
+        mistakes = {what: _mistaken(expected, axes) for what, axes in _MISTAKES.items()}
+        fitting = [what for what, wrong in mistakes.items() if _is_alike(felt, wrong)]
+        if is_slope_right and (not self._is_heading_known or _is_alike(felt, expected)):
+            self.unseen = fitting
+        elif fitting:
+            fitting.sort(key=lambda what: dist(felt, mistakes[what]))
+            self.contradiction = f"{', or '.join(fitting)}; it is {_shown(felt)}, expected is {_shown(expected)}"
+        elif is_slope_right:
+            self.contradiction = (
+                f"gravity points {degrees(_bearing(felt, expected)):+.0f} deg to the left of where it does at base: "
+                "is the robot turned, or the axes of its gravity?"
+            )
+        else:
             self.contradiction = (
                 f"the robot stands on a slope of {degrees(felt_rad):.1f} deg, {self._mirror.name} has one of "
                 f"{degrees(expected_rad):.1f} deg there: is this the right mirror (run.mirror, --mirror)?"
             )
-        return True
+
+
+def _mistaken(gravity: Vector3, axes: str) -> Vector3:
+    """Gravity as it is reported with a mistake."""
+    x, y, z = (gravity["xyz".index(axis[-1])] * (-1.0 if axis[0] == "-" else 1.0) for axis in axes.split())
+    return x, y, z
+
+
+def _is_alike(felt: Vector3, gravity: Vector3) -> bool:
+    """Whether slope and, where the ground has one, direction of the slope agree."""
+    if abs(_slope(felt) - _slope(gravity)) > LIMIT_RAD:
+        return False
+    return hypot(gravity[0], gravity[1]) < _LEAST_TILT or abs(_bearing(felt, gravity)) <= BEARING_RAD
+
+
+def _bearing(felt: Vector3, gravity: Vector3) -> float:
+    return wrap_pi(atan2(felt[1], felt[0]) - atan2(gravity[1], gravity[0]))
+
+
+def _shown(gravity: Vector3) -> str:
+    return "({:.2f}, {:.2f}, {:.2f})".format(*gravity)
 
 
 def _slope(gravity: Sequence[float]) -> float:

@@ -89,6 +89,15 @@ def test_a_mirror_may_be_a_file_beside_the_configuration_and_go_once_it_is_writt
     assert load_config(write(tmp_path / "written.toml", dump_config(cfg))) == cfg
 
 
+def test_a_mirror_file_without_gravity_is_of_a_telescope_at_the_zenith(tmp_path: Path, config: Config) -> None:
+    text = (configs_dir() / "mirrors" / "fyst-m1.toml").read_text()
+    rows = [row for row in text.splitlines() if not row.startswith("gravity_world")]
+    write(tmp_path / "old.toml", "\n".join(rows))
+    old = load_config(write(tmp_path / "mine.toml", '[run]\nmirror = "old.toml"\n'))
+    assert len(rows) < len(text.splitlines())
+    assert old.mirror == config.mirror
+
+
 def test_a_fault_in_a_mirror_file_is_found_there(tmp_path: Path) -> None:
     shipped = (configs_dir() / "mirrors" / "fyst-m1.toml").read_text(encoding="utf-8")
     mirror = write(tmp_path / "mine.toml", shipped.replace("count = 77", "count = 87"))
@@ -124,6 +133,8 @@ def test_another_mirror_replaces_the_one_written_in_full(tmp_path: Path, config:
         ({"run": 3}, "run = 3 must be a section"),
         ({"robot": 3, "robot.port": 4}, "robot.port: robot is given as a value already"),
         ({"mirror": "fyst-m2"}, "mirror: must be a section; name a mirror with run.mirror"),
+        ({"mirror.frame.gravity_world": [0.0, 0.0, -1.0]}, r".* contradicts overhang = false; give the direction"),
+        ({"mirror.frame.gravity_world": [0.0, 0.0, 9.8]}, r".* must be of length 1"),
     ],
 )
 def test_a_fault_of_the_command_line_names_it(overrides: dict[str, object], line: str) -> None:

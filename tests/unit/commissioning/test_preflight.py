@@ -9,6 +9,7 @@ from collections import namedtuple
 from collections.abc import Callable
 from fcntl import LOCK_EX, flock
 from functools import cache
+from operator import mul
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,15 @@ def flat(frame: Sensors) -> None:
     frame.gravity = None if frame.gravity is None else GravitySample(frame.gravity[0], 0.0, 0.0, -1.0)
 
 
+def gravity(*signs: float) -> Change:
+    def change(frame: Sensors) -> None:
+        if frame.gravity is not None:
+            t, *parts = frame.gravity
+            frame.gravity = GravitySample(t, *map(mul, signs, parts))
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("change", "name", "outcome", "told"),
     [
@@ -118,6 +128,8 @@ def flat(frame: Sensors) -> None:
         (edge(0, 1, 1, 0), "edge sensors", FAIL, "front left and rear right see no panel"),
         (edge(1, 0, 1, 1, only=5), "edge sensors", FAIL, "front right see the panel on and off"),
         (flat, "gravity", FAIL, "is this the right mirror"),
+        (gravity(-1.0, -1.0, -1.0), "gravity", FAIL, "the robot reports the reaction (up)"),
+        (gravity(1.0, -1.0, 1.0), "gravity", FAIL, "y has the wrong sign"),
         (every(gravity=None), "gravity", WARN, "too few readings"),
         (every(soc=0.1), "battery", FAIL, "10%"),
         (every(soc=0.5), "battery", WARN, "50%, for 36 min"),

@@ -326,10 +326,10 @@ def tilted(mirror: Mirror, pose: DeckPose, by_deg: float, heading: float) -> np.
     return np.array([np.sin(slope) * np.cos(heading), np.sin(slope) * np.sin(heading), -np.cos(slope)])
 
 
-def check(mirror: Mirror, direction: np.ndarray, seed: int) -> MirrorCheck:
+def check(mirror: Mirror, direction: np.ndarray, seed: int, *, is_heading_known: bool = False) -> MirrorCheck:
     """Frames of 100 Hz, a reading in every fifth, until it is known."""
     rng = np.random.default_rng(seed)
-    found = MirrorCheck(mirror)
+    found = MirrorCheck(mirror, is_heading_known=is_heading_known)
     for k in range(1000):
         if found.update(0.01 * k, None if k % 5 else noisy(direction, rng), mirror.base_pose):
             assert k == 5 * (READINGS - 1)
@@ -383,6 +383,52 @@ def test_a_slow_sensor_is_judged_by_what_has_come() -> None:
     found.update(0.0, (0.0, *mirror_of("fyst-m2").gravity_in_robot(pose)), pose)
     assert found.update(PATIENCE_S, None, pose)
     assert "104" in found.contradiction or "deg" in found.contradiction
+
+
+REACTION = "gravity points the other way: the robot reports the reaction (up) instead of the direction of fall"
+
+
+@pytest.mark.parametrize("name", MIRRORS)
+def test_a_wrong_sign_and_exchanged_axes_are_named(name: str) -> None:
+    """With the heading known, each single mistake is named unless it makes no difference here, where it is said."""
+    mirror = mirror_of(name)
+    x, y, z = mirror.gravity_in_robot(mirror.base_pose)
+    wrong = [
+        (REACTION, (-x, -y, -z)), ("x has the wrong sign", (-x, y, z)), ("y has the wrong sign", (x, -y, z)),
+        ("z has the wrong sign", (x, y, -z)), ("x and y of gravity have the wrong sign", (-x, -y, z)),
+        ("x and y of gravity are exchanged", (y, x, z)), ("x and z of gravity are exchanged", (z, y, x)),
+        ("the robot reports y, z, x of gravity as x, y, z", (y, z, x)),
+    ]  # fmt: skip
+    for what, reported in wrong:
+        found = check(mirror, np.array(reported), 1, is_heading_known=True)
+        assert what in found.contradiction or what in found.unseen, (what, found.contradiction)
+        assert "right mirror" not in found.contradiction
+        # Without the heading the slope decides, and what it contradicts is named as well.
+        by_slope = check(mirror, np.array(reported), 1).contradiction
+        assert not by_slope or what in by_slope, (what, by_slope)
+    assert check(mirror, np.array((-x, -y, -z)), 1).contradiction.startswith(REACTION)
+    assert not check(mirror, np.array((x, y, z)), 1, is_heading_known=True).contradiction
+
+
+def test_exchanged_axes_show_where_they_differ() -> None:
+    x, y, z = mirror_of("fyst-m1").gravity_in_robot(mirror_of("fyst-m1").base_pose)
+    found = check(mirror_of("fyst-m1"), np.array((y, x, z)), 1, is_heading_known=True)
+    assert found.contradiction.startswith("x and y of gravity are exchanged")
+    x, y, z = mirror_of("fyst-m2").gravity_in_robot(mirror_of("fyst-m2").base_pose)
+    same = check(mirror_of("fyst-m2"), np.array((x, y, z)), 1, is_heading_known=True)
+    assert same.unseen == ["x and y of gravity are exchanged"]  # 0.69 and 0.68
+
+
+def test_a_robot_that_is_turned_is_no_other_mirror() -> None:
+    mirror = mirror_of("fyst-m1")
+    base = mirror.base_pose
+    turned = DeckPose(base.x_m, base.y_m, base.heading_rad + 0.9)
+    direction = np.array(mirror.gravity_in_robot(turned))
+    assert not check(mirror, direction, 1).contradiction
+    assert "is the robot turned" in check(mirror, direction, 1, is_heading_known=True).contradiction
+    a_little = DeckPose(base.x_m, base.y_m, base.heading_rad + 0.1)
+    direction = np.array(mirror.gravity_in_robot(a_little))
+    assert not check(mirror, direction, 1, is_heading_known=True).contradiction
 
 
 DRIVE = (
