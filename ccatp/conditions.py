@@ -139,7 +139,36 @@ shaken = partial(Condition, action=Action.EARTHQUAKE, severity=Severity.NONE, mo
 edge = partial(Condition, action=Action.RETREAT, severity=Severity.NONE, motion=Motion.RETREAT, clear=Clear.AFTER_FIX)
 near = partial(Condition, action=Action.KEEP_AWAY, severity=Severity.NONE, motion=Motion.RETREAT, clear=Clear.AUTO)
 
+
+class SampleRate(NamedTuple):
+    """How a sensor of the robot link is called, the rate that the daemon needs, and the one without which it holds."""
+
+    sensor: str
+    least_hz: float
+    hold_hz: float
+
+
+SAMPLE_RATES = {
+    # A reading in every other step of the filter; without any the wheels alone give the turn.
+    "imu": SampleRate("accelerometer and gyroscope", 20.0, 0.0),
+    # The wheel monitors add up frames of 100 Hz, of which a fifth may be empty; with 20 a second sound wheels "stand".
+    "enc": SampleRate("wheel encoders", 80.0, 40.0),
+    # Two samples within a gap of 1.2 mm at 0.1 m/s, or at half of that.
+    "edge": SampleRate("edge sensors", 200.0, 83.0),
+    # 40 readings within the three seconds of the check; it may be missing, and is not needed afterwards.
+    "gravity": SampleRate("gravity sensors", 14.0, 0.0),
+}
+
 # fmt: off
+# -- sensors that are too slow; first, because wheels and seams would be blamed for it --------------------------------
+
+_RATE = "{sensor} deliver {rate} samples/s, at least {least} are needed"
+_FIRMWARE = "Set the rate in the robot's firmware; the sensor and its cable work."
+SENSOR_MUCH_TOO_SLOW = hold(Group.SENSORS, _RATE,
+    "Encoders or edge sensors deliver less than half of what is needed. The robot stands.", _FIRMWARE)
+SENSOR_TOO_SLOW = slow(Group.SENSORS, _RATE,
+    "Samples come, and more seldom than needed at full speed. The robot goes on at half its speed.", _FIRMWARE)
+
 # -- wheels and encoders ----------------------------------------------------------------------------------------------
 
 ENCODER_BROKEN = hold(Group.WHEELS, "the {side} encoder {what}",

@@ -7,6 +7,7 @@ from math import dist
 from statistics import fmean
 from typing import Any, NamedTuple
 
+from ccatp.conditions import SAMPLE_RATES, SENSOR_TOO_SLOW
 from ccatp.config.models import Config
 from ccatp.core import Fix
 from ccatp.links.multiline import Environment
@@ -127,8 +128,6 @@ def check_fix(cfg: Config, mirror: Mirror, fix: Fix) -> PreflightResult:
 
 
 EDGES = ("front left", "front right", "rear left", "rear right")
-# The rates that a robot must have: half of what the interface allows, which the danger rules still tolerate.
-LEAST_HZ = {"imu": 20.0, "enc": 50.0, "edge": 200.0}
 CLOCK_TOLERANCE = 0.01
 STANDING_RAD_S = 0.02
 BIAS_SIGMAS = 5.0
@@ -188,17 +187,24 @@ def _faults(report: RobotReport) -> PreflightResult:
     return passed("the robot reports none")
 
 
-def _too_slow(kind: str, count: int, report: RobotReport) -> str:
-    rate = count / max(report.span_s, 1e-3)
-    return "" if rate >= LEAST_HZ[kind] else f"{rate:.0f} samples a second, {LEAST_HZ[kind]:.0f} are needed"
+def _rate(kind: str, count: int, report: RobotReport) -> PreflightResult | None:
+    """A sensor that is silent or slow; one sample may be missing at the end."""
+    sensor, least_hz, _ = SAMPLE_RATES[kind]
+    span_s = max(report.span_s, 1e-3)
+    if not count:
+        return failed(f"{sensor} deliver no samples", "check their cable and supply")
+    if (count + 1) / span_s >= least_hz:
+        return None
+    varies = {"rate": f"{count / span_s:.0f}", "least": f"{least_hz:.0f}"}
+    return failed(SENSOR_TOO_SLOW.text(sensor=sensor, **varies), SENSOR_TOO_SLOW.advice)
 
 
 def _encoders(report: RobotReport) -> PreflightResult:
     todo = "check the encoders and their cables"
     for index, side in ((1, "right"), (2, "left")):
         rates = [rate for frame in report.frames for row in frame.enc if (rate := row[index]) is not None]
-        if slow := _too_slow("enc", len(rates), report):
-            return failed(f"{side}: {slow}", todo)
+        if slow := _rate("enc", len(rates), report):
+            return slow._replace(found=f"{side}: {slow.found}")
         if abs(fmean(rates)) > STANDING_RAD_S:
             return failed(f"{side} wheel turns at {fmean(rates):.3f} rad/s, and should stand", todo)
     return passed("both wheels stand")
@@ -207,8 +213,8 @@ def _encoders(report: RobotReport) -> PreflightResult:
 def _inertial_unit(report: RobotReport) -> PreflightResult:
     rows = [row for frame in report.frames for row in frame.imu]
     todo = "check the inertial unit and its cable"
-    if slow := _too_slow("imu", len(rows), report):
-        return failed(slow, todo)
+    if slow := _rate("imu", len(rows), report):
+        return slow
     repeated = longest = 0
     for before, after in pairwise(rows):
         repeated = repeated + 1 if before[1:] == after[1:] else 0
@@ -225,8 +231,8 @@ def _inertial_unit(report: RobotReport) -> PreflightResult:
 
 def _edge_sensors(report: RobotReport) -> PreflightResult:
     rows = [row[1:] for frame in report.frames for row in frame.edge]
-    if slow := _too_slow("edge", len(rows), report):
-        return failed(slow, "check the edge sensors and their cable")
+    if slow := _rate("edge", len(rows), report):
+        return slow
     seen = dict(zip(EDGES, zip(*rows, strict=True), strict=True))
     if off := [name for name, values in seen.items() if not any(values)]:
         todo = "set the robot down at base, on a panel with all four; clean the sensors"
@@ -243,7 +249,9 @@ def _gravity(report: RobotReport) -> PreflightResult:
         todo = "set the robot down at base with its heading; check run.mirror, and the axes of docs/protocols.md"
         return failed(check.contradiction, todo)
     if check.warning or not is_known:
-        return warned(check.warning or "too few readings", "make sure by eye that this is the right mirror")
+        slow = _rate("gravity", sum(frame.gravity is not None for frame in report.frames), report)
+        found = "too few readings" if slow is None else slow.found
+        return warned(found, "make sure by eye that this is the right mirror")
     unseen = "".join(f"; it would look the same if {mistake}" for mistake in check.unseen)
     return passed(f"the slope is that of {report.mirror.name} at base{unseen}")
 

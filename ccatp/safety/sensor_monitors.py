@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from math import hypot, inf
 
 from ccatp import conditions
-from ccatp.conditions import MonitorFinding
+from ccatp.conditions import SAMPLE_RATES, MonitorFinding
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.core import Corner, DeckPose, EdgeSample, PanelId
 from ccatp.mirror.mirror import Mirror
@@ -85,7 +85,10 @@ _LEARN_S = 0.5
 
 
 class RateMonitor:
-    """Samples per time of each sensor against what was usual at the start; ``finding``: the sensor that lacks most."""
+    """Samples per time of each sensor against what is needed, and against what was usual at the start.
+
+    ``finding``: the sensor that lacks most. One without any samples is not slow: others report that.
+    """
 
     def __init__(self, cfg: HealthConfig) -> None:
         self._cfg = cfg
@@ -95,6 +98,7 @@ class RateMonitor:
         self._last_s = 0.0
         self._counts = [0, 0, 0]
         self._usual_hz: list[float] | None = None
+        self._before_hz: list[float] = []
 
     def step(self, t_s: float, imu: int, encoders: int, edges: int) -> None:
         """Take a frame's numbers of samples; judged once per ``rate_time_s``."""
@@ -116,15 +120,30 @@ class RateMonitor:
     def _judge(self, span_s: float) -> None:
         rates = [count / span_s for count in self._counts]
         if self._usual_hz is None:
-            self._usual_hz = rates
+            self._usual_hz = self._before_hz = rates
             return
-        shares = [rate / usual if usual else 1.0 for rate, usual in zip(rates, self._usual_hz, strict=True)]
+        before, self._before_hz = self._before_hz, rates
+        self.finding = self._too_slow(span_s, before, rates) or self._fewer_than_usual(self._usual_hz, rates)
+
+    def _too_slow(self, span_s: float, before: list[float], rates: list[float]) -> MonitorFinding | None:
+        """Judged over two spans, so that a sensor that was silent for a while is none that is slow."""
+        slowest, found = 1.0, None
+        for name, one_hz, other_hz in zip(_SOURCES, before, rates, strict=True):
+            sensor, least_hz, hold_hz = SAMPLE_RATES[name]
+            rate_hz = max(one_hz, other_hz)
+            if min(one_hz, other_hz) > 0.0 and rate_hz + 1.0 / span_s < slowest * least_hz:
+                slowest = rate_hz / least_hz
+                row = conditions.SENSOR_MUCH_TOO_SLOW if rate_hz < hold_hz else conditions.SENSOR_TOO_SLOW
+                varies = {"rate": f"{rate_hz:.0f}", "least": f"{least_hz:.0f}"}
+                found = row.found(name, rate_hz, least_hz, sensor=sensor, **varies)
+        return found
+
+    def _fewer_than_usual(self, usual_hz: list[float], rates: list[float]) -> MonitorFinding | None:
+        shares = [rate / usual if usual else 1.0 for rate, usual in zip(rates, usual_hz, strict=True)]
         least, limit = min(shares), self._cfg.rate_share
         if least >= limit:
-            self.finding = None
-            return
-        name = _SOURCES[shares.index(least)]
-        self.finding = conditions.SAMPLES_TOO_FEW.found(name, least, limit)
+            return None
+        return conditions.SAMPLES_TOO_FEW.found(_SOURCES[shares.index(least)], least, limit)
 
 
 class LatencyMonitor:

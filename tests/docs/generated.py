@@ -13,7 +13,7 @@ import click
 
 from ccatp.beacons.mission import RULES
 from ccatp.cli import cli
-from ccatp.conditions import DANGER, SURVEY, Action, Condition, Group
+from ccatp.conditions import DANGER, SAMPLE_RATES, SURVEY, Action, Condition, Group
 from ccatp.core import EventCode, Severity
 from ccatp.daemon.supervisor import PROCESSES
 from ccatp.links.topics import TOPICS
@@ -120,6 +120,12 @@ def processes() -> str:
     return table("| process | module | runs | when it dies |", rows)
 
 
+def rates() -> str:
+    """The sample rates that the daemon needs."""
+    rows = [(f"`{name}`", *map("{:g}".format, rate[1:])) for name, rate in SAMPLE_RATES.items()]
+    return table("| list | at full speed, samples/s | held below, samples/s |", rows)
+
+
 def codes() -> str:
     """The event codes."""
     return table("| code | |", [(int(code), code.name.lower().replace("_", " ")) for code in EventCode])
@@ -160,6 +166,7 @@ MADE: dict[str, Callable[[], str]] = {
     "topics": topics,
     "processes": processes,
     "codes": codes,
+    "rates": rates,
     "commands": commands,
 }
 

@@ -106,6 +106,20 @@ def flat(frame: Sensors) -> None:
     frame.gravity = None if frame.gravity is None else GravitySample(frame.gravity[0], 0.0, 0.0, -1.0)
 
 
+def thinned(name: str, frames: int, samples: int) -> Change:
+    """So many samples in every n-th frame only."""
+
+    def change(frame: Sensors) -> None:
+        setattr(frame, name, [] if frame.seq % frames else getattr(frame, name)[:samples])
+
+    return change
+
+
+def seldom_gravity(frame: Sensors) -> None:
+    if frame.seq % 2:
+        frame.gravity = None
+
+
 def gravity(*signs: float) -> Change:
     def change(frame: Sensors) -> None:
         if frame.gravity is not None:
@@ -119,18 +133,22 @@ def gravity(*signs: float) -> Change:
     ("change", "name", "outcome", "told"),
     [
         (every(faults=["fan_left"]), "faults", FAIL, "reports fan_left"),
-        (every(enc=[]), "encoders", FAIL, "right: 0 samples a second, 50 are needed"),
+        (every(enc=[]), "encoders", FAIL, "right: wheel encoders deliver no samples"),
+        (thinned("enc", 2, 1), "encoders", FAIL, "deliver 50 samples/s, at least 80 are needed"),
         (turning, "encoders", FAIL, "right wheel turns at 0.100 rad/s"),
-        (every(imu=[]), "inertial unit", FAIL, "0 samples a second"),
+        (every(imu=[]), "inertial unit", FAIL, "accelerometer and gyroscope deliver no samples"),
+        (thinned("imu", 10, 1), "inertial unit", FAIL, "deliver 10 samples/s, at least 20 are needed"),
         (frozen, "inertial unit", FAIL, "readings in a row are the same"),
         (spinning, "inertial unit", FAIL, "zero rate +0.1992"),
-        (every(edge=[]), "edge sensors", FAIL, "0 samples a second"),
+        (every(edge=[]), "edge sensors", FAIL, "edge sensors deliver no samples"),
+        (thinned("edge", 1, 1), "edge sensors", FAIL, "edge sensors deliver 100 samples/s, at least 200 are needed"),
         (edge(0, 1, 1, 0), "edge sensors", FAIL, "front left and rear right see no panel"),
         (edge(1, 0, 1, 1, only=5), "edge sensors", FAIL, "front right see the panel on and off"),
         (flat, "gravity", FAIL, "is this the right mirror"),
         (gravity(-1.0, -1.0, -1.0), "gravity", FAIL, "the robot reports the reaction (up)"),
         (gravity(1.0, -1.0, 1.0), "gravity", FAIL, "y has the wrong sign"),
-        (every(gravity=None), "gravity", WARN, "too few readings"),
+        (every(gravity=None), "gravity", WARN, "gravity sensors deliver no samples"),
+        (seldom_gravity, "gravity", WARN, "gravity sensors deliver 10 samples/s, at least 14 are needed"),
         (every(soc=0.1), "battery", FAIL, "10%"),
         (every(soc=0.5), "battery", WARN, "50%, for 36 min"),
     ],

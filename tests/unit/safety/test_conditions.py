@@ -156,7 +156,12 @@ class Row:
     mirror: str = "fyst-m1"
 
 
+SLOW_EDGES = "edge sensors deliver 100 samples/s, at least 200 are needed"
+SLOW_ENCODERS = "wheel encoders deliver 20 samples/s, at least 80 are needed"
+
 ROWS = [
+    Row(rows.SENSOR_TOO_SLOW, always(edge=1), cause=SLOW_EDGES, signal="edge"),
+    Row(rows.SENSOR_MUCH_TOO_SLOW, lambda frame: {"enc": frame.seq % 5 == 0}, drives, SLOW_ENCODERS, "enc"),
     Row(rows.ENCODER_BROKEN, always(rates=(SPEED_RAD_S, 0.0), noise=0.0), cause="the right encoder is frozen"),
     Row(rows.WHEEL_RUNS_AWAY, always(rates=(0.0, 8.0)), cause="the left wheel runs away", lasts=False),
     Row(rows.WHEELS_STAND, always(rates=(0.0, 0.0)), drives, signal="encoders", lasts=False),
@@ -241,6 +246,21 @@ def times_s(condition: Condition) -> Any:
     if condition.escalates_to is not Severity.NONE:
         times[Severity.FAULT] = 3.0 if condition is rows.LIFTED else LIMIT_S
     return pytest.approx(times, abs=0.025)  # two frames: the monitors look at every second one
+
+
+def test_a_sensor_that_was_slow_from_the_beginning_is_found() -> None:
+    seen = Scripted().run(2.0, always(edge=1, imu=1, enc=1))
+    assert (seen[-1].cause, seen[-1].severity, seen[-1].forward) == (SLOW_EDGES, Severity.SLOW, True)
+
+
+def test_a_sensor_that_is_silent_is_not_slow() -> None:
+    scripted = Scripted()
+    seen = scripted.run(1.5)
+    for begin_s in (2.0, 3.0, 4.0):
+        seen += scripted.run(begin_s - 0.05, always(edge=0, enc=0, imu=0)) + scripted.run(begin_s + 0.5)
+    causes = {verdict.cause for verdict in seen}
+    assert rows.EDGE_STALE.message in causes
+    assert "deliver" not in "".join(causes)
 
 
 def test_no_edge_sample_from_the_beginning() -> None:
