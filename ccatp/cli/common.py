@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from ccatp.config.package import configs_dir
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
@@ -39,6 +40,29 @@ class WaitingTime(click.ParamType[float]):
         return time_s
 
 
+class ConfigFile(click.Path):
+    """The path of a configuration, or the name of a shipped one, as zigbee."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """As ``click.Path.convert``."""
+        path, names = Path(str(super().convert(value, param, ctx))), shipped_names("")
+        if (path.exists() and not path.is_dir()) or path.name != str(value) or path.suffix == ".toml":
+            return path
+        if path.name not in names:
+            from ccatp.config.messages import choice_hint
+
+            self.fail(f"{path}: no such file, and no configuration by that name; {choice_hint(path.name, names)}")
+        return configs_dir() / f"{path}.toml"
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        """As ``click.Path.shell_complete``, with the names."""
+        names = [CompletionItem(name) for name in shipped_names("") if name.startswith(incomplete)]
+        return [*names, *super().shell_complete(ctx, param, incomplete)]
+
+
 class OutputFile(click.Path):
     """A file to be written: what cannot be is refused before the work, not after it.
 
@@ -55,9 +79,14 @@ class OutputFile(click.Path):
         option = "output" if param is None else param.opts[0]
         if not path.parent.is_dir():
             raise click.UsageError(f"{option}: no directory {path.parent}; make it first", ctx)
-        if self.formats and path.suffix.lower() not in self.formats:
-            known = ", ".join(self.formats)
-            raise click.UsageError(f"{option}: {path.name}: no format by that name; the file may end in {known}", ctx)
+        if self.formats:
+            if path.suffix.lower() not in self.formats:
+                known = ", ".join(self.formats)
+                why = f"{path.name}: no format by that name; the file may end in {known}"
+                raise click.UsageError(f"{option}: {why}", ctx)
+            from ccatp.report.plots import check_drawing
+
+            check_drawing(path.parent)
         return path
 
 
@@ -90,8 +119,10 @@ def run_command_line(group: click.Group, argv: Sequence[str] | None = None) -> i
     except click.UsageError as error:
         where = f"; see {error.ctx.command_path} --help" if error.ctx else ""
         return complain(error.format_message().rstrip(".") + where, ExitStatus.USAGE)
-    except click.ClickException as error:
-        return complain(error.format_message(), ExitStatus.USAGE)
+    except (click.ClickException, ModuleNotFoundError) as error:
+        missing = f"the package {getattr(error, 'name', '')} is not installed; install ccatp with all its dependencies"
+        what = error.format_message() if isinstance(error, click.ClickException) else missing
+        return complain(what, ExitStatus.USAGE)
     except CcatpError as error:
         return complain(str(error), error.exit_status)
     except (click.Abort, KeyboardInterrupt):
@@ -204,10 +235,14 @@ def names_of(folder: str) -> Callable[[click.Context, click.Parameter, str], lis
     """Completes the names of shipped configurations in a folder; a path of a file is the shell's own business."""
 
     def complete(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
-        names = (path.stem for path in (configs_dir() / folder).glob("*.toml"))
-        return sorted(name for name in names if name.startswith(incomplete))
+        return [name for name in shipped_names(folder) if name.startswith(incomplete)]
 
     return complete
+
+
+def shipped_names(folder: str) -> list[str]:
+    """Names of the shipped configurations in a folder."""
+    return sorted(path.stem for path in (configs_dir() / folder).glob("*.toml"))
 
 
 def json_option(help_text: str) -> Callable[[Command], Command]:
@@ -230,7 +265,10 @@ def settings_option(which: str) -> Callable[[Command], Command]:
 
 
 JSON_OPTION = json_option("Result as JSON on standard output, nothing else there.")
-CONFIG_OPTION = click.option("--config", "config_file", type=PATH, help="Configuration (TOML).")
+CONFIG_FILE = ConfigFile()
+CONFIG_OPTION = click.option(
+    "--config", "config_file", type=CONFIG_FILE, help="Configuration: a TOML file, or the name of a shipped one."
+)
 TIMEOUT_OPTION = click.option(
     "--timeout", "timeout_s", type=WaitingTime(), default=10.0, show_default=True, metavar="SECONDS",
     help="Seconds to wait.",

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from ccatp.cli.common import PATH, CommandGroup, complain, example, json_option, print_lines
+from ccatp.cli.common import CONFIG_FILE, PATH, CommandGroup, complain, example, json_option, print_lines
 from ccatp.errors import ConfigError
 
 
@@ -21,7 +21,7 @@ def config() -> None:
 
 
 @config.command("check", epilog=example("ccatp config check telescope.toml"))
-@click.argument("file", type=PATH)
+@click.argument("file", type=CONFIG_FILE)
 def config_check(file: Path) -> int:
     """Check a configuration; each problem is one line with file, line and key."""
     from ccatp.config.models import Config

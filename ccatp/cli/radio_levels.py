@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.cli.common import JSON_OPTION, PATH, SETTINGS_OPTION, example, figure_option, print_lines, warn
+from ccatp.cli.common import (
+    CONFIG_OPTION,
+    JSON_OPTION,
+    PATH,
+    SETTINGS_OPTION,
+    example,
+    figure_option,
+    print_lines,
+    warn,
+)
 
 if TYPE_CHECKING:
     from ccatp.beacons.slam.level_fix import HeardPlace, LevelLocator, Room
@@ -233,7 +242,7 @@ def _fix_lines(result: dict[str, Any]) -> Iterator[str]:
 
 
 @click.command(epilog=example("ccatp radio fuzzy --figure speed.png", "ccatp radio fuzzy --at 0.3 0.5"))
-@click.option("--config", "config_file", type=PATH, help="Configuration (TOML).")
+@CONFIG_OPTION
 @SETTINGS_OPTION
 @click.option(
     "--at", nargs=2, type=float, multiple=True, metavar="M RAD", help="Speed at a distance and a heading error."

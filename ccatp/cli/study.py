@@ -98,10 +98,12 @@ def study(
 
 
 def _analysed(analysis: Callable[[Any, Path], dict[str, Any]], cfg: Any, out: Path) -> dict[str, Any]:
+    from ccatp.report.plots import check_drawing
     from ccatp.studies.campaign import CampaignFailed
     from ccatp.studies.engine import make_out
 
     make_out(out)
+    check_drawing(out)
     try:
         return analysis(cfg, out)
     except OSError as error:

@@ -170,7 +170,7 @@ def serve(
 
     with ExitStack() as stack:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        stack.callback(context.term)
+        stack.callback(context.destroy, 0)  # term would wait without end for a socket that an error left open
         streams: list[LiveStream] = []
         if plotjuggler_port is not None:
             streams.append(PlotJugglerStream(context, host, plotjuggler_port))

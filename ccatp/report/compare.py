@@ -15,7 +15,7 @@ from ccatp.report.figures import distribution_figure, errors_figure, time_figure
 from ccatp.report.findings import KINDS, Findings, findings_of
 from ccatp.report.html import MICRO, Draw, events_of, inline, page_figures, render, write_pictures
 from ccatp.report.mirror_map import change_figure, paths_figure, surface_figure
-from ccatp.report.plots import NARROW
+from ccatp.report.plots import NARROW, check_drawing
 from ccatp.report.record import changed_keys, read_record
 from ccatp.report.run_page import PAGE_MODE, run_data, wavefront_data
 
@@ -95,6 +95,8 @@ class RunPair:
 
 def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = None) -> RunPair:
     """Write two runs beside each other, and their figures if a directory is given; raises as ``report_run``."""
+    if figures is not None:
+        check_drawing(figures)
     pair = RunPair(findings_of(read_record(run_a)), findings_of(read_record(run_b)))
     write_file(out, compare_page(pair), PAGE_MODE)
     if figures is not None:

@@ -411,9 +411,10 @@ class PlotJugglerStream:
         self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)
         try:
             self._socket.bind(f"tcp://{host}:{port or '*'}")
-        except zmq.ZMQError as error:
+        except (zmq.ZMQError, UnicodeError) as error:
             self._socket.close()
-            why = f"cannot listen on {host}:{port}: {error.strerror}; choose another port"
+            reason = error.strerror if isinstance(error, zmq.ZMQError) else "is no host name"
+            why = f"cannot listen on {host}:{port}: {reason}; choose another port"
             raise StreamError(f"PlotJuggler: {why}") from error
         self.where = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
 

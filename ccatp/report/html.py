@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from ccatp.records.state_log import LogLine
-from ccatp.report.plots import NARROW, WIDE, PictureError, save_figure, svg_of
+from ccatp.report.plots import NARROW, WIDE, save_figure, svg_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,11 +85,7 @@ def clock_text(time_s: float) -> str:
 
 
 def write_pictures(drawings: dict[str, Draw], folder: Path) -> None:
-    """Write figures as SVG, PNG and PDF; PictureError: one cannot be written."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise PictureError(f"{folder}: cannot be made: {error.strerror or error}") from error
+    """Write figures as SVG, PNG and PDF into a folder that ``check_drawing`` has made; PictureError: one cannot be."""
     for name, draw in drawings.items():
         picture = draw(WIDE)
         for suffix in (".svg", ".png", ".pdf"):

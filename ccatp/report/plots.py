@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 from xml.etree import ElementTree as ET
 
@@ -40,6 +41,16 @@ class PictureError(CcatpError):
     """A picture that cannot be drawn or written."""
 
     exit_status = ExitStatus.USAGE
+
+
+def check_drawing(folder: Path) -> None:
+    """Before the work: matplotlib is there, and the folder of the figures, which is made. PictureError: it is not."""
+    new_figure(1.0, 1.0)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise PictureError(f"{folder}: cannot be written: {error.strerror}; choose another folder") from error
 
 
 # -- layout -----------------------------------------------------------------------------------------------------------

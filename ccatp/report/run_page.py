@@ -18,6 +18,7 @@ from ccatp.report.beacon_record import BeaconRecord
 from ccatp.report.findings import Findings, Grade, findings_of
 from ccatp.report.html import MICRO, Draw, events_of, page_figures, render, write_pictures
 from ccatp.report.mirror_map import path_figure, surface_figure
+from ccatp.report.plots import check_drawing
 from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, is_beacon_run, read_record
 
 REPORT = "report.html"
@@ -34,6 +35,8 @@ def report_run(
     configuration cannot be used, or the page cannot be written; PictureError: a figure cannot be written.
     """
     path = out or run_dir / REPORT
+    if figures_dir is not None:
+        check_drawing(figures_dir)
     if is_beacon_run(run_dir):
         record = beacon_record.read_beacon_record(run_dir)
         markup, data, pictures = beacon_page(record), beacon_data(record), beacon_drawings(record)

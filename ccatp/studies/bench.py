@@ -193,7 +193,6 @@ _LINE = (
     ("times_real_time", "{times_real_time:.1f} times real time"),
     ("whole_times_real_time", "{whole_times_real_time:.1f} with start and end"),
     ("wake_ups", "{wake_ups:.2f} wake-ups"),
-    ("note", "{note}"),
 )
 
 
@@ -212,8 +211,13 @@ def markdown(result: Mapping[str, Any]) -> str:
         if there:
             rows = ([_cell(case.get(key), spec) for key, _, spec in columns] for case in there)
             text += f"\n## {title}\n\n" + markdown_table([heading for _, heading, _ in columns], rows)
-    notes = dict.fromkeys(f"* {case['note']}\n" for case in cases if "note" in case)
+    notes = [f"* {note}\n" for note in _notes(cases)]
     return text + ("\n" + "".join(notes) if notes else "")
+
+
+def _notes(cases: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Each remark once."""
+    return [*dict.fromkeys(case["note"] for case in cases if "note" in case)]
 
 
 def _cell(value: Any, spec: str) -> str:
@@ -223,12 +227,12 @@ def _cell(value: Any, spec: str) -> str:
 
 
 def terminal_lines(result: Mapping[str, Any]) -> list[str]:
-    """One line for the machine and one for each case."""
+    """One line for the machine, one for each case, and one for each remark."""
     lines = [machine_line(result["machine"])]
     for case in result["cases"]:
         known = [text.format(**case) for key, text in _LINE if case.get(key) is not None]
         lines.append(f"{case['name']:<62} {'   '.join(known)}")
-    return lines
+    return [*lines, *_notes(result["cases"])]
 
 
 def machine_line(machine: Mapping[str, Any]) -> str:

@@ -25,6 +25,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ccatp.errors import CcatpError
+from ccatp.report.plots import check_drawing
 from ccatp.studies import limit_threads
 from ccatp.studies.campaign import (
     WHOLE,
@@ -286,6 +287,9 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
     plan = jobs_of(study, cells, load, options.settings, study.runs if options.runs is None else options.runs)
     jobs = [job for group in plan for job in group]
     console = Console(stderr=True, highlight=False)
+    if options.with_figures:
+        make_out(options.out)
+        check_drawing(options.out)
     with open_store(options.out, options.shard, options.others) as store:
         done = {job.key for job in jobs if store.find(job) is not None}
         todo = [job for job in jobs[options.shard.number - 1 :: options.shard.of] if job.key not in done]

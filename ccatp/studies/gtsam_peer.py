@@ -26,7 +26,13 @@ UNKNOWN = np.full((2, 2), np.nan)  # uncertainty is not asked of the peers
 
 
 class PeerError(CcatpError):
-    """The peer is not installed, or gave up."""
+    """The peer is not installed."""
+
+    exit_status = ExitStatus.USAGE
+
+
+class PeerGaveUp(CcatpError):
+    """The peer has no result for a run."""
 
     exit_status = ExitStatus.USAGE
 
@@ -39,17 +45,23 @@ class Peers(NamedTuple):
 
 
 def run_gtsam(run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], float]) -> Peers:
-    """Both estimates of a run (raises PeerError: gtsam is not installed, or its optimisation failed)."""
-    try:
-        import gtsam  # noqa: PLC0415 -- large, and belongs to an extra
-    except ImportError as error:
-        raise PeerError("--peers needs GTSAM: install ccatp with its extra, ccatp[peers]") from error
+    """Both estimates of a run (raises PeerError: gtsam is not installed; PeerGaveUp: its optimisation failed)."""
+    gtsam = import_gtsam()
     if not np.isfinite(run.readings.range_m).all():
-        raise PeerError("--peers takes sets whose readings all have a range: GTSAM has no factor of signal strengths")
+        raise PeerGaveUp(f"{run.name}: not all readings have a range, and GTSAM has no factor of signal strengths")
     try:
         return _Session(gtsam, run, settings).solve(clock_s)
     except RuntimeError as error:
-        raise PeerError(f"GTSAM gave up on {run.name}: {' '.join(str(error).split())[:120]}") from error
+        raise PeerGaveUp(f"{run.name}: GTSAM gave up: {' '.join(str(error).split())[:120]}") from error
+
+
+def import_gtsam() -> Any:
+    """The module, which is large and belongs to an extra (raises PeerError: it is not installed)."""
+    try:
+        import gtsam  # noqa: PLC0415
+    except ImportError as error:
+        raise PeerError("--peers needs GTSAM: install ccatp with its extra, ccatp[peers]") from error
+    return gtsam
 
 
 STARTS = 48  # directions, around the place of a range's reading, from which a beacon is sought

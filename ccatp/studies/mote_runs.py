@@ -328,6 +328,7 @@ def campaign_data(campaign: MoteCampaign) -> dict[str, Any]:
         "expected_rms_m": median(lambda run: run.expected_rms_m),
         "offset_m": median(lambda run: run.offset_m),
         "scale": 1.0 + float(np.median([run.scale for run in runs])),
+        "frame_directions": list(outlook.freedom.frame),
         "free_directions": outlook.freedom.lines,
         "warnings": list(outlook.folds.warnings),
     }

@@ -117,6 +117,8 @@ NAMING = (["report"], ["replay"], ["map"], ["run", "--sim", "--mirror"], ["run",
             ["config", "check", "none.toml"],
             "ccatp: none.toml: no such file or directory; name a TOML file that exists\n",
         ),
+        (["config", "check", "zigbe"], "zigbe: no such file, and no configuration by that name; did you mean zigbee?"),
+        (["run", "--config", "tonight", "--sim"], "'--config': tonight: no such file, and no configuration by that"),
         (["conformance", "7010"], "'7010' is not HOST:PORT, as in 127.0.0.1:7010"),
         (["conformance", "host:70100"], "'host:70100' is not HOST:PORT"),
         (["conformance", "127.0.0.1:7010", "--only", "ttl-drve"], "no check 'ttl-drve'; did you mean ttl-drive?"),
@@ -127,6 +129,18 @@ NAMING = (["report"], ["replay"], ["map"], ["run", "--sim", "--mirror"], ["run",
 )
 def test_misuse_is_one_line_and_exit_2(argv: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert message in refused(capsys, *argv)
+
+
+def test_a_shipped_configuration_is_taken_by_its_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "zigbee").mkdir()
+    assert main(["config", "check", "zigbee"]) == 0
+    assert capsys.readouterr().out.endswith("zigbee.toml: ok: system zigbee, seed 1\n")
+    (tmp_path / "cricket").write_text("[run]\nseed = 7\n")  # a file of the user comes first
+    assert main(["config", "check", "cricket"]) == 0
+    assert capsys.readouterr().out.startswith("cricket: ok: mirror fyst-m1")
 
 
 @pytest.mark.parametrize(

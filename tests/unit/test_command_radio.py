@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.beacons.slam.evaluation import judge
+from ccatp.beacons.slam.evaluation import judge, row_without, with_means
 from ccatp.cli import main
 from ccatp.config.load import load_recordings_config
 from ccatp.config.package import configs_dir
 from ccatp.filters.base import FilterDiverged
 from ccatp.links.topics import schema_of
 from ccatp.records.recorder import Recorder
-from ccatp.studies.gtsam_peer import PeerError, run_gtsam
+from ccatp.studies.gtsam_peer import PeerError, PeerGaveUp, run_gtsam
 from tests.support.command import answered, refused
 from tests.unit.beacons.datasets.sets import (
     BEACONS,
@@ -327,9 +327,9 @@ def test_what_cannot_be_solved_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
     run = recorded(world(seconds=20.0))
     nothing = np.full(len(run.readings.times_s), np.nan)
     heard = replace(run, readings=run.readings._replace(range_m=nothing, rssi_dbm=nothing - 50.0))
-    with pytest.raises(PeerError, match="no factor of signal strengths"):
+    with pytest.raises(PeerGaveUp, match="no factor of signal strengths"):
         run_gtsam(heard, SETTINGS, no_clock)
-    with pytest.raises(PeerError, match=r"^GTSAM gave up on simulated: .*$"):
+    with pytest.raises(PeerGaveUp, match=r"^simulated: GTSAM gave up: .*$"):
         run_gtsam(replace(run, first_pose=(np.nan, 0.0, 0.0)), SETTINGS, no_clock)
     monkeypatch.setitem(sys.modules, "gtsam", None)
     with pytest.raises(PeerError, match=r"ccatp\[peers\]"):
@@ -352,3 +352,22 @@ def test_compare_takes_all_robots_and_gives_their_mean(tmp_path: Path, capsys: p
     assert len(rows) == 6
     assert [cell.strip() for cell in rows[-1].split("|")[1:3]] == [f"{tmp_path.name}, mean", "smoother"]
     assert "missing: no such file or folder" in refused(capsys, "radio", "compare", tmp_path / "missing")
+
+
+def test_a_peer_that_gives_up_on_one_run_leaves_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("gtsam", reason="the extra peers is not installed")
+    lines = csv_lines(world(seconds=20.0))
+    bearings = [line for line in lines if not line.startswith("range,")]
+    files = [write_lines(tmp_path / f"{name}.csv", text) for name, text in (("mine", lines), ("bearings", bearings))]
+    assert main(["radio", "compare", *map(str, files), "--peers"]) == 0
+    out, err = capsys.readouterr()
+    rows = [[cell.strip() for cell in line.split("|")[1:4]] for line in out.splitlines()[2:]]
+    assert [name for name, _, path in rows if path == "gave up"] == ["bearings", "bearings"]
+    assert len(rows) == 8
+    assert "warning: bearings: not all readings have a range" in err
+
+
+def test_the_mean_of_an_estimator_that_gave_up_once_is_none() -> None:
+    rows = [row_without(name, "peer", gave_up=name == "b") | {"run_s": 1.0} for name in "ab"]
+    mean = with_means(rows, "mean")[-1]
+    assert (mean["gave_up"], mean["run_s"]) == (True, None)

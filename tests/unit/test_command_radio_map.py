@@ -44,12 +44,21 @@ def truth_file(path: Path) -> Path:
     return path
 
 
+def test_the_directions_of_the_frame_stand_apart(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["radio", "map"]) == 0
+    out = capsys.readouterr().out
+    assert "of the frame       translation along x, translation along y, rotation\n" in out
+    assert "beyond the frame   0\n  other maps" in out
+
+
 def test_few_pairs_are_told_before_they_are_estimated(capsys: pytest.CaptureFixture[str]) -> None:
     programme = ("--set", "cricket.phase2.pairs=zigzag", "--set", "cricket.phase2.max_updates=40")
     data = mapped(capsys, "--method", "ekf", "--seeds", "3", *programme)
     assert data["rank_deficiency"] == 4
     assert data["fold_over_risk"] is True
     assert data["free_directions"][-1] == "N6-1 against N1-1, N2-1"
+    assert len(data["free_directions"]) == 4
+    assert data["frame_directions"] == []
     assert "N6-1 may be mirrored across the line through N5-1" in data["warnings"]
     assert data["crlb_m"] > 0.1
     assert data["iterations"] == 40
@@ -61,6 +70,7 @@ def test_all_pairs_reach_the_target(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert len(tomllib.loads(out.read_text())["beacons"]) == 18
     assert figure.stat().st_size > 10_000
     assert (data["rank_deficiency"], data["fold_over_risk"]) == (0, False)
+    assert (data["free_directions"], data["frame_directions"]) == ([], [])
     assert data["rms_m"]["p50"] < 0.007
     assert data["phase1_rms_m"] > 0.05
     assert data["iterations"] <= 30

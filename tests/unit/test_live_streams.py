@@ -7,6 +7,7 @@ import struct
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,7 +15,7 @@ import zmq
 from autobahn.asyncio.websocket import WebSocketClientFactory, WebSocketClientProtocol
 
 from ccatp.cli import main
-from ccatp.daemon.streaming import RUN, streamed_schemas
+from ccatp.daemon.streaming import RUN, serve, streamed_schemas
 from ccatp.records.recorder import RecordedMessage
 from ccatp.report.foxglove import (
     FoxgloveStream,
@@ -179,3 +180,14 @@ def test_misuse(capsys: pytest.CaptureFixture[str]) -> None:
     assert "nothing to serve" in capsys.readouterr().err
     assert main(["stream", "--host", "0.0.0.0"]) == 2
     assert "--open-to-network" in capsys.readouterr().err
+
+
+def test_a_host_that_is_no_name_ends_the_command(tmp_path: Path) -> None:
+    with pytest.raises(StreamError, match="is no host name; choose another"):
+        serve(tmp_path, "telescope\udcff", 0, None, is_open=True, report=print)
+
+
+def test_a_missing_extra_ends_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "foxglove", None)
+    with pytest.raises(StreamError, match=r"ccatp\[foxglove\]"):
+        serve(tmp_path, "127.0.0.1", 0, 0, is_open=False, report=print)

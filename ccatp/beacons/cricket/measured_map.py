@@ -217,6 +217,7 @@ def map_measured(
         "expected_rms_m": expected_m if is_known else None,
         "offset_m": None if "offset" in freedom.untold else found.state.offset_m,
         "scale": None if "scale" in freedom.untold else 1.0 + found.state.scale,
+        "frame_directions": list(freedom.frame),
         "free_directions": freedom.lines,
         "warnings": warnings,
     }
@@ -315,6 +316,7 @@ def report_lines(data: dict[str, Any]) -> Iterator[str]:
     yield f"{data['motes']} motes, {data['method']}, frame {data['frame']}, {data['seeds']} runs"
     yield ""
     yield "what the ranges can tell"
+    yield f"  free directions of the frame       {', '.join(data['frame_directions']) or 'none'}"
     yield f"  free directions beyond the frame   {data['rank_deficiency']}"
     for line in data["free_directions"]:
         yield f"    {line}"

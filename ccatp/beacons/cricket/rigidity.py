@@ -42,8 +42,8 @@ class Freedom(NamedTuple):
 
     @property
     def lines(self) -> list[str]:
-        """All of them by name."""
-        return [*self.frame, *self.flexes, *(f"range {name}: the map takes it up" for name in self.untold)]
+        """Those beyond the frame's by name."""
+        return [*self.flexes, *(f"range {name}: the map takes it up" for name in self.untold)]
 
 
 def generic_state(model: MapModel, rng: np.random.Generator) -> MapState:

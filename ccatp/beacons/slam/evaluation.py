@@ -1,7 +1,7 @@
 """A track against the truth of its recording; the results of ``ccatp radio slam`` and ``compare`` as data and text."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -180,7 +180,7 @@ def _parts(data: dict[str, Any]) -> str:
     return f": prediction {predict_us:.0f} us, each scalar {scalar_us:.0f} us"
 
 
-def _number(value: float | None, shape: str) -> str:
+def _number(value: Any, shape: str) -> str:
     return "-" if value is None else shape.format(value)
 
 
@@ -209,10 +209,16 @@ def row(
     """The figures of one estimator on one run; a peer has no covariance."""
     data = result_data(run, name, track, judge(track, run))
     found = {key: data.get(key) for _, key, _ in COLUMNS}
-    found["run_s"] = run_s
+    found |= {"run_s": run_s, "gave_up": False}
     if peer:
         found["nees_mean"] = None
     return found
+
+
+def row_without(dataset: str, estimator: str, *, gave_up: bool) -> dict[str, Any]:
+    """A row without figures; ``gave_up``: the estimator has no result for these data."""
+    nothing: dict[str, Any] = dict.fromkeys(key for _, key, _ in COLUMNS)
+    return nothing | {"dataset": dataset, "filter": estimator, "gave_up": gave_up}
 
 
 def with_means(rows: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]:
@@ -223,19 +229,21 @@ def with_means(rows: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]
         own = [r for r in rows if r["filter"] == estimator]
         if len(own) < 2:
             return list(rows)
-        mean: dict[str, Any] = {key: None for _, key, _ in COLUMNS}
-        mean.update(dataset=name, filter=estimator)
-        for key in AVERAGED:
+        mean = row_without(name, estimator, gave_up=any(r["gave_up"] for r in own))
+        for key in () if mean["gave_up"] else AVERAGED:  # a mean over the easier runs alone compares nothing
             values = [r[key] for r in own if r[key] is not None]
             mean[key] = float(np.mean(values)) if values else None
         means.append(mean)
     return [*rows, *means]
 
 
-def markdown(rows: Iterable[dict[str, Any]]) -> list[str]:
+def markdown(rows: Sequence[dict[str, Any]]) -> list[str]:
     """A table."""
     cells = [[title for title, _, _ in COLUMNS]]
-    cells += [["-" if r[key] is None else shape.format(r[key]) for _, key, shape in COLUMNS] for r in rows]
+    cells += [[_number(r[key], shape) for _, key, shape in COLUMNS] for r in rows]
+    for line, r in zip(cells[1:], rows, strict=True):
+        if r["gave_up"]:
+            line[2] = "gave up"
     widths = [max(len(line[k]) for line in cells) for k in range(len(COLUMNS))]
     lines = [
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in cells

@@ -161,6 +161,13 @@ def test_panels_that_moved_are_found(recorded: Path, tmp_path: Path, capsys: pyt
     assert "1 of 1 panels have moved" in (tmp_path / "c.html").read_text()
 
 
+def test_a_run_beside_itself_says_that_nothing_differs(recorded: Path) -> None:
+    found = findings_of(read_record(recorded))
+    lines = compare_lines(RunPair(found, found))
+    assert lines[0] == "no figure differs"
+    assert lines[1].startswith("the surveys agree")
+
+
 def test_different_mirrors_are_not_compared_point_by_point(recorded: Path, tmp_path: Path) -> None:
     thesis = record(tmp_path / "thesis", run__mirror="thesis-m1", only=2)
     pair = RunPair(findings_of(read_record(recorded)), findings_of(read_record(thesis)))
@@ -232,7 +239,7 @@ def test_refusals_and_warnings(run_dir: Path, tmp_path: Path, capsys: pytest.Cap
     for command, why in (
         (("report", tmp_path / "nothing"), "nothing: no such directory; name the directory of a run"),
         (("compare", run_dir, tmp_path), "no config.toml there"),
-        (("report", run_dir, "--figures", tmp_path / "file" / "figures"), "cannot be made: Not a directory"),
+        (("report", run_dir, "--figures", tmp_path / "file" / "figures"), "cannot be written: Not a directory"),
     ):
         assert why in refused(capsys, *command)
     with pytest.raises(ConfigError, match=r"no/a\.html: cannot be written: No such file or directory"):

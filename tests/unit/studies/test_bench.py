@@ -52,7 +52,9 @@ def test_a_missing_peer_leaves_ours_and_says_how_to_install_it(monkeypatch: pyte
     assert (filterpy["peer"], filterpy["ratio"], stonesoup["peer"]) == (None, None, None)
     assert filterpy["note"] == "filterpy is not installed: pip install 'ccatp[peers]'"
     assert bench.markdown(result).endswith("* Stone Soup is not installed: pip install 'ccatp[peers]'\n")
-    assert "pip install 'ccatp[peers]'" in bench.terminal_lines(result)[2]
+    lines = bench.terminal_lines({**result, "cases": cases * 2})
+    assert lines[-2:] == [filterpy["note"], stonesoup["note"]]
+    assert "\n".join(lines).count("not installed") == 2
 
 
 def test_the_command_and_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,7 +78,8 @@ def test_the_command_and_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     table = [line for line in page.read_text().splitlines() if line.startswith("|")]
     assert len(table) == len(result["cases"]) + 2
     assert len({line.count("|") for line in table}) == 1
-    assert len(bench.terminal_lines(result)) == len(result["cases"]) + 1
+    notes = {case["note"] for case in result["cases"] if "note" in case}
+    assert len(bench.terminal_lines(result)) == 1 + len(result["cases"]) + len(notes)
     written = page.read_text()
     page.write_text(f"old\n{bench.BY_HAND}kept\n")
     bench.write_page(page, result)

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -337,6 +338,18 @@ def test_what_cannot_be_is_one_line(
     (tmp_path / "taken" / "table.md").mkdir(parents=True)
     told = refused(capsys, "study", name, "--out", tmp_path / out, *args, status=status)
     assert told == message.format(out=tmp_path / out) + "\n"
+
+
+@pytest.mark.parametrize("name", ["one", "toy"])
+@pytest.mark.usefixtures("toy_study")
+def test_what_cannot_be_drawn_is_one_line_before_any_work(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("matplotlib", "matplotlib.figure"):
+        monkeypatch.setitem(sys.modules, module, None)
+    told = refused(capsys, "study", name, "--out", tmp_path / "out")
+    assert told.startswith("ccatp: the package matplotlib")
+    assert not list((tmp_path / "out").iterdir())
 
 
 def test_an_unknown_study_is_one_line_and_help_lists_the_others(
