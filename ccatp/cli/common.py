@@ -273,7 +273,9 @@ TIMEOUT_OPTION = click.option(
     "--timeout", "timeout_s", type=WaitingTime(), default=10.0, show_default=True, metavar="SECONDS",
     help="Seconds to wait.",
 )  # fmt: skip
-RUNTIME_DIR_OPTION = click.option("--runtime-dir", type=PATH, help="Folder of the sockets, if not the usual one.")
+RUNTIME_DIR_OPTION = click.option(
+    "--runtime-dir", type=PATH, help="Folder of the sockets, if not the usual one; it names one of several runs."
+)
 FAULTS_OPTION = click.option("--faults", "faults_file", type=PATH, help="Fault plan (TOML) for the simulated robot.")
 SETTINGS_OPTION = settings_option("Any key of the configuration, as in limits.v_max_m_s=0.05.")
 PANELS_OPTION = key_option(
@@ -304,10 +306,23 @@ def overrides(settings: Mapping[str, object], named: Mapping[str, object]) -> di
 
 
 def configured_folder(config_file: Path | None, runtime_dir: Path | None) -> Path | None:
-    """The runtime directory that command line or configuration names."""
+    """The runtime directory that command line or configuration names, else that of the only daemon that runs.
+
+    ``None``: none runs. Raises ConfigError: several run.
+    """
     if runtime_dir is None and config_file is not None:
         from ccatp.daemon.process import processes_of, read_config
 
         configured = processes_of(read_config(config_file)).runtime_dir
-        return Path(configured) if configured else None
-    return runtime_dir
+        runtime_dir = Path(configured) if configured else None
+    if runtime_dir is not None:
+        return runtime_dir
+    from ccatp.links.runtime_dir import running_in, runtime_dir_path
+
+    running = running_in(runtime_dir_path("", os.environ))
+    if len(running) > 1:
+        from ccatp.daemon.process import run_dir_in
+
+        runs = [f"{folder} ({run_dir.name if (run_dir := run_dir_in(folder)) else 'starts'})" for folder in running]
+        raise ConfigError(f"{len(running)} runs go on; choose one with --runtime-dir: {', '.join(runs)}")
+    return running[0] if running else None

@@ -93,7 +93,7 @@ def dashboard(runtime_dir: Path | None, settings: Mapping[str, object]) -> int:
     """
     from ccatp.daemon.dashboard import attach
 
-    return attach(runtime_dir, settings, click.echo)
+    return attach(configured_folder(None, runtime_dir), settings, click.echo)
 
 
 @click.command(

@@ -120,11 +120,17 @@ def merged(
     return tree
 
 
-def _layers(base: str, file: Path | None, overrides: Overrides, config_dir: Path | None = None) -> list[ConfigSource]:
+def _layers(
+    base: str, file: Path | None, overrides: Overrides, config_dir: Path | None = None, *, any_ports: bool = False
+) -> list[ConfigSource]:
     """Command line, the user's file, base: the strongest first."""
     user = read_source(file) if file else ConfigSource("", "", {})
     command = ConfigSource("command line", "", nested(overrides or {}))
-    return [command, user, read_source((config_dir or configs_dir()) / base)]
+    below = read_source((config_dir or configs_dir()) / base)
+    for server in below.tree["sim"].values() if any_ports else ():
+        if isinstance(server, dict) and "port" in server:
+            server["port"] = 0
+    return [command, user, below]
 
 
 def _strongest(sources: list[ConfigSource], *keys: Key) -> tuple[ConfigSource, Key]:
@@ -179,18 +185,21 @@ def validated(
 # -- surveys of mirrors -----------------------------------------------------------------------------------------------
 
 
-def load_config(file: Path | None = None, overrides: Overrides = None, config_dir: Path | None = None) -> Config:
+def load_config(
+    file: Path | None = None, overrides: Overrides = None, config_dir: Path | None = None, *, any_ports: bool = False
+) -> Config:
     """The whole configuration of a run.
 
     The user's file needs only the keys that differ from the default file. ``mirror`` and ``world`` come from the files
     that ``run.mirror`` and ``run.world`` name, a name or the path of a ``.toml`` file; a file with complete sections
     ``[mirror]`` and ``[world]``, as a run directory holds, is taken as it is, and single keys of these sections are
     laid over the named file. Dotted keys in ``overrides`` are stronger than the file; ``None`` values are left out.
-    ``config_dir`` (the shipped one by default) has ``ccatp.toml``, ``mirrors/`` and ``worlds/``. Raises ConfigError:
+    ``config_dir`` (the shipped one by default) has ``ccatp.toml``, ``mirrors/`` and ``worlds/``. ``any_ports``: the
+    simulated servers take any free port unless file or overrides name one. Raises ConfigError:
     one line with file, line, key, what is wrong and what to do. Raises NotASurvey: the file is of a mission among
     beacons.
     """
-    command, user, base = sources = _layers(DEFAULT_FILE, file, overrides, config_dir)
+    command, user, base = sources = _layers(DEFAULT_FILE, file, overrides, config_dir, any_ports=any_ports)
     system = user.tree.get("system")
     if file is not None and system is not None:
         use = f"ccatp report {file.parent}" if file.name == _RUN_FILE else "ccatp run or ccatp study with it"
@@ -271,15 +280,16 @@ def _read_named(section: str, run: object, sources: list[ConfigSource], config_d
 
 
 def load_radio_config(
-    file: Path | None = None, overrides: Overrides = None, config_dir: Path | None = None, *, simulates: bool = True
-) -> RadioConfig:
+    file: Path | None = None, overrides: Overrides = None, config_dir: Path | None = None, *, simulates: bool = True,
+    any_ports: bool = False,
+) -> RadioConfig:  # fmt: skip
     """The whole configuration of a robot among radio beacons; arguments as in ``load_config``.
 
     ``system`` of the user's file, else of the base file ``radio.toml``, says which of ``zigbee.toml``, ``follow.toml``
     and ``cricket.toml`` lies between the two. ``simulates`` says whether a field of motes is simulated, or its ranges
     were measured. Raises ConfigError: one line with file, line, key, what is wrong and what to do.
     """
-    command, user, base = sources = _layers(BEACON_FILE, file, overrides, config_dir)
+    command, user, base = sources = _layers(BEACON_FILE, file, overrides, config_dir, any_ports=any_ports)
     run = user.tree.get("run")
     named = set(user.tree) | (set(run) if isinstance(run, Mapping) else set())
     if "system" not in user.tree and {"mirror", "world"} & named:  # which only surveys have

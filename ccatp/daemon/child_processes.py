@@ -332,12 +332,13 @@ C = TypeVar("C", bound=Config | RadioConfig)
 
 
 def with_addresses(cfg: C, sockets: Mapping[str, socket.socket]) -> C:
-    """The configuration with the actual addresses of the simulated servers."""
+    """The configuration of the clients of the simulated servers.
+
+    What is asked for in ``sim`` stays: a run that is resumed with port 0 takes any free one again.
+    """
     changes: dict[str, object] = {}
-    sim: dict[str, object] = {}
-    for process, section, server in simulated_servers(cfg):
+    for process, section, _ in simulated_servers(cfg):
         host, port = sockets[process].getsockname()[:2]
-        at, name = {"host": host, "port": port}, section.removeprefix("sim.")
-        changes[name] = getattr(cfg, name).model_copy(update=at)
-        sim[name] = server.model_copy(update=at)
-    return cast(C, cfg.model_copy(update={**changes, "sim": cfg.sim.model_copy(update=sim)}))
+        name = section.removeprefix("sim.")
+        changes[name] = getattr(cfg, name).model_copy(update={"host": host, "port": port})
+    return cast(C, cfg.model_copy(update=changes))

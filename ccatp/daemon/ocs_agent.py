@@ -19,6 +19,7 @@ import msgspec
 from ccatp.config.package import child_environment
 from ccatp.errors import CcatpError, ConfigError, DaemonUnreachableError, ExitStatus
 from ccatp.links.client import OperatorClient
+from ccatp.links.runtime_dir import runtime_dir_path
 from ccatp.links.topics import MissionStatus
 
 Answer = tuple[bool, str]
@@ -189,6 +190,8 @@ def main(args: Sequence[str] | None = None) -> None:
     parsed = site_config.parse_args(agent_class=AGENT_CLASS, parser=parser, args=args)
     if not parsed.sim and parsed.config is None:
         parser.error("name the robot's configuration with --config FILE, or add --sim")
+    # Said to the survey too: a simulation for which it is not would take another folder where it is in use.
+    parsed.runtime_dir = runtime_dir_path(str(parsed.runtime_dir or ""), os.environ)
     agent, runner = ocs_agent.init_site_agent(parsed)
     surveys = SurveyTask(
         OperatorClient(parsed.runtime_dir, TIMEOUT_S), survey_command(parsed), os.environ, agent.log.info

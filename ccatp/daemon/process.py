@@ -35,6 +35,8 @@ OPERATOR_MESSAGE = "operator_message"
 FAULTS_FILE = "faults.toml"
 # In the runtime directory: the run directory of the run that goes on there, or of the last one.
 RUN_DIR_FILE = "run_dir"
+# Beside it: host and port of the robot, the laser system and the page of that run, as JSON.
+ADDRESSES_FILE = "addresses.json"
 # Environment variable with the supervisor's process number, for its children.
 SUPERVISOR_PID = "CCATP_SUPERVISOR_PID"
 
@@ -103,10 +105,16 @@ def processes_of(cfg: Config | RadioConfig) -> ProcessesConfig:
     return cfg.processes if isinstance(cfg, RadioConfig) else cfg.run
 
 
-def read_config(path: Path | None, settings: Mapping[str, object] | None = None) -> Config | RadioConfig:
-    """The configuration in a file, of a survey or of a mission among beacons, with dotted keys laid over it."""
+def read_config(
+    path: Path | None, settings: Mapping[str, object] | None = None, *, any_ports: bool = False
+) -> Config | RadioConfig:
+    """The configuration in a file, of a survey or of a mission among beacons, with dotted keys laid over it.
+
+    ``any_ports``: simulated servers take any free port where neither file nor keys name one.
+    """
     is_radio = path is not None and is_radio_file(path)
-    return load_radio_config(path, settings) if is_radio else load_config(path, settings)
+    load = load_radio_config if is_radio else load_config
+    return load(path, settings, any_ports=any_ports)
 
 
 def start_process(argv: list[str] | None = None) -> ProcessArgs:

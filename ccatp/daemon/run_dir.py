@@ -1,7 +1,9 @@
 """Run directory and runtime directory, each locked by one daemon; the resumable run; the options of ``ccatp run``."""
 
+import itertools
 import json
 import os
+import sys
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
@@ -13,8 +15,8 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.daemon.danger_loop import FILE as EMERGENCIES
-from ccatp.errors import CcatpError, ConfigError, ExitStatus
-from ccatp.links.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked, remove_sockets
+from ccatp.errors import CcatpError, ConfigError, ExitStatus, RefusedError
+from ccatp.links.runtime_dir import BESIDE, LOCK_FILE, TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
 from ccatp.records.recorder import TELEMETRY, read_metadata
 
 FILE = Path("runs") / "unfinished"
@@ -158,6 +160,7 @@ PREDECESSORS_S = 30.0  # a process that is just being started on an overloaded m
 # In the runtime directory. Those of the truth may be of a simulated robot that runs alone, beside a run without one.
 SOCKETS = ("main", "danger", "control", "emergency", "dashboard")
 TRUTH_SOCKETS = ("truth", "puck")
+MOST_BESIDE = 99  # simulations at a time that no runtime directory is configured for
 
 
 def owned(path: Path, option: str) -> AbstractContextManager[int]:
@@ -181,6 +184,31 @@ def await_predecessors(stack: ExitStack, *folders: Path) -> tuple[int, ...]:
         text = f"processes of an earlier run still use {folder}; end them ('fuser {path}' names them), and try again"
         locks.append(stack.enter_context(locked(path, text, PREDECESSORS_S)))
     return tuple(locks)
+
+
+def take_runtime_dir(stack: ExitStack, configured: str, *, is_sim: bool) -> Path:
+    """Make a runtime directory and own it until the stack is closed: the configured one, else the usual one.
+
+    A simulation for which none is configured takes another one beside the usual one while that is in use.
+
+    Raises:
+        ConfigError: it cannot be made.
+        RefusedError: it is in use.
+    """
+    usual = folder = make_runtime_dir(configured, os.environ)
+    for number in itertools.count(2):
+        try:
+            with ExitStack() as trial:
+                own_runtime_dir(trial, folder, is_sim=is_sim)
+                stack.enter_context(trial.pop_all())
+                break
+        except RefusedError:
+            if configured or not is_sim or number > MOST_BESIDE:
+                raise
+        folder = make_runtime_dir(str(usual / BESIDE.format(number)), {})
+    if folder != usual:
+        print(f"ccatp: {usual} is in use; commands to this run take --runtime-dir {folder}", file=sys.stderr)
+    return folder
 
 
 def own_runtime_dir(stack: ExitStack, runtime_dir: Path, *, is_sim: bool) -> None:
@@ -233,7 +261,7 @@ def make_run_dir(options: RunOptions, cfg: Config | RadioConfig) -> Path:
     """
     is_survey = isinstance(cfg, Config)
     name = cfg.run.mirror if isinstance(cfg, Config) else cfg.system
-    run_dir = options.run_dir or default_run_dir(name, cfg.run.seed, datetime.now(UTC))
+    run_dir = options.run_dir or _make_new(default_run_dir(name, cfg.run.seed, datetime.now(UTC)))
     has_mission = (run_dir / "mission.sqlite").exists()
     if has_mission and not options.resume:
         advice = "give --resume to go on with it, or another folder" if is_survey else "name another folder"
@@ -261,3 +289,17 @@ def make_run_dir(options: RunOptions, cfg: Config | RadioConfig) -> Path:
     except OSError as error:
         raise ConfigError(f"--run-dir: cannot make {run_dir}: {error.strerror}") from error
     return run_dir.absolute()
+
+
+def _make_new(path: Path) -> Path:
+    """Make a run directory, with a number behind its name where another run began in the same second."""
+    made = path
+    for number in itertools.count(2):
+        try:
+            made.mkdir(parents=True)
+            break
+        except FileExistsError:
+            made = path.with_name(f"{path.name}-{number}")
+        except OSError as error:
+            raise ConfigError(f"--run-dir: cannot make {made}: {error.strerror}; name another folder") from error
+    return made

@@ -33,6 +33,7 @@ from ccatp.daemon.child_processes import (
 from ccatp.daemon.collector import Collector
 from ccatp.daemon.command_handlers import check_observatory
 from ccatp.daemon.process import (
+    ADDRESSES_FILE,
     FAULTS_FILE,
     LEVELS,
     OPERATOR_MESSAGE,
@@ -52,9 +53,9 @@ from ccatp.daemon.run_dir import (
     keep_origin,
     make_run_dir,
     mark_resumable,
-    own_runtime_dir,
     owned,
     take_over_emergencies,
+    take_runtime_dir,
     with_origin,
     write_durably,
 )
@@ -62,7 +63,6 @@ from ccatp.daemon.service import Service, is_journal, take_from
 from ccatp.daemon.terminal import RunView, write_run_report
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.auth import read_key
-from ccatp.links.runtime_dir import make_runtime_dir
 from ccatp.links.topics import Heartbeat
 from ccatp.records.recorder import RUN_LOCK
 from ccatp.report.dashboard.access import TOKEN_FILE, make_token, read_tokens
@@ -243,7 +243,7 @@ def run(options: RunOptions) -> int:
     Raises:
         CcatpError: the run could not begin.
     """
-    cfg = read_config(options.config_file, dict(options.overrides))
+    cfg = read_config(options.config_file, dict(options.overrides), any_ports=options.sim)
     if isinstance(cfg, Config):
         return _recover(options, cfg) if options.recover else _run(options, cfg)
     if options.resume or options.recover:
@@ -258,7 +258,7 @@ def run(options: RunOptions) -> int:
 
 def run_survey(options: RunOptions) -> int:
     """Run one survey to its end, and nothing else; status and errors as of ``run``."""
-    return _run(options, load_config(options.config_file, dict(options.overrides)))
+    return _run(options, load_config(options.config_file, dict(options.overrides), any_ports=options.sim))
 
 
 def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
@@ -270,8 +270,8 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
         read_tokens(Path(cfg.dashboard.token_file))
     started_s = time.monotonic()
     with ExitStack() as stack:
-        runtime_dir = make_runtime_dir(str(options.runtime_dir or processes_of(cfg).runtime_dir), os.environ)
-        own_runtime_dir(stack, runtime_dir, is_sim=options.sim)
+        configured = str(options.runtime_dir or processes_of(cfg).runtime_dir)
+        runtime_dir = take_runtime_dir(stack, configured, is_sim=options.sim)
         make_token(runtime_dir)
         stack.callback((runtime_dir / TOKEN_FILE).unlink, missing_ok=True)
         sockets: dict[str, socket.socket] = {}
@@ -296,9 +296,17 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
         keep_origin(run_dir, is_sim=options.sim)
         write_durably(run_dir / "config.toml", dump_config(cfg).encode())
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
+        (runtime_dir / ADDRESSES_FILE).write_text(json.dumps(_addresses(cfg)) + "\n", encoding="utf-8")
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
         return SupervisedRun(options, cfg, run_dir, Endpoints(runtime_dir), sockets, locks, page, started_s).run()
+
+
+def _addresses(cfg: Config | RadioConfig) -> dict[str, dict[str, object]]:
+    """Host and port of each peer and of the page."""
+    sections = {"robot": cfg.robot, "etalon": getattr(cfg, "etalon", None)}
+    sections["dashboard"] = cfg.dashboard if cfg.dashboard.enabled else None
+    return {name: {"host": at.host, "port": at.port} for name, at in sections.items() if at is not None}
 
 
 def _recover(options: RunOptions, cfg: Config) -> int:

@@ -14,6 +14,8 @@ from ccatp.errors import ConfigError, RefusedError
 LOCK_FILE = "lock"
 # Held by the simulated robot that publishes its truth there.
 TRUTH_LOCK_FILE = "truth.lock"
+# In the usual folder, each the folder of a simulation that began while another daemon ran.
+BESIDE = "sim-{}"
 # A process that asks whether a lock is held has it for an instant.
 _SECOND_LOOK_S = 0.05
 
@@ -75,6 +77,11 @@ def make_own_dir(path: Path, option: str, forbidden: int) -> None:
     if info.st_mode & forbidden:
         mode = stat.S_IMODE(info.st_mode)
         raise ConfigError(f"folder {path} is open to others (mode {mode:04o}); chmod 700 {path}")
+
+
+def running_in(usual: Path) -> list[Path]:
+    """The folders in which a daemon runs: the usual one, and those of simulations beside it."""
+    return [folder for folder in (usual, *sorted(usual.glob(BESIDE.format("*")))) if is_held(folder / LOCK_FILE)]
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import pytest
 
 import ccatp
 from ccatp.cli import cli, main
-from ccatp.cli.common import parse_setting
+from ccatp.cli.common import configured_folder, parse_setting
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
 from ccatp.daemon.run_dir import RunOptions
@@ -275,6 +275,22 @@ def test_two_robots_alone_want_two_places(tmp_path: Path, capsys: pytest.Capture
             assert err.startswith(f"ccatp: another simulated robot uses {tmp_path}; end it, or give this")
         err = refused(capsys, "run", "--sim", "--runtime-dir", tmp_path, status=1)
         assert f"a simulated robot runs alone in {tmp_path}" in err
+
+
+@pytest.mark.parametrize("command", [["status"], ["stop"], ["emergency", "fire"], ["dashboard"], ["stream"]])
+def test_of_several_runs_one_is_chosen(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CCATP_RUNTIME_DIR", str(tmp_path))
+    beside = tmp_path / "sim-2"
+    beside.mkdir()
+    (beside / "run_dir").write_text("/runs/tonight\n")
+    with locked(tmp_path / LOCK_FILE, ""), locked(beside / LOCK_FILE, ""):
+        err = refused(capsys, *command)
+    choice = f"{tmp_path} (starts), {beside} (tonight)"
+    assert err == f"ccatp: 2 runs go on; choose one with --runtime-dir: {choice}\n"
+    with locked(beside / LOCK_FILE, ""):
+        assert configured_folder(None, None) == beside
 
 
 def test_a_daemon_that_is_gone_is_reported_at_once(runtime_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -55,6 +55,16 @@ def test_the_disturbed_worlds_have_every_disturbance(world: str) -> None:
     assert [key for key, value in values.items() if not value] == ["encoder_sigma_rad_s"]  # counts are counted
 
 
+def test_a_simulation_takes_any_ports_but_those_that_are_named(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text("[sim.etalon]\nport = 2001\n")
+    sim = load_config(file, any_ports=True).sim
+    assert (sim.robot.port, sim.etalon.port) == (0, 2001)
+    assert load_config(None, {"sim.robot.port": 7010}, any_ports=True).sim.robot.port == 7010
+    assert (load_config().sim.robot.port, load_config().sim.etalon.port) == (7010, 2001)
+    assert load_radio_config(None, any_ports=True).sim.robot.port == 0
+
+
 def test_a_file_needs_only_what_differs_and_the_command_line_is_stronger(tmp_path: Path, config: Config) -> None:
     file = write(tmp_path / "mine.toml", "[limits]\nv_max_m_s = 0.05\n[run]\nseed = 2\npanels = 3\n")
     cfg = load_config(file, {"run.seed": 5, "run.panels": None})

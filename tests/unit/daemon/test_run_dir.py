@@ -28,6 +28,7 @@ from ccatp.daemon.run_dir import (
     own_runtime_dir,
     owned,
     take_over_emergencies,
+    take_runtime_dir,
     with_origin,
 )
 from ccatp.daemon.supervisor import BEACON_PROCESSES, PROCESSES, run
@@ -36,8 +37,11 @@ from ccatp.links.runtime_dir import (
     LOCK_FILE,
     MAX_SOCKET_NAME_BYTES,
     MAX_SOCKET_PATH_BYTES,
+    TRUTH_LOCK_FILE,
     is_held,
+    locked,
     make_runtime_dir,
+    running_in,
     runtime_dir_path,
 )
 from ccatp.records.recorder import TELEMETRY, Recorder
@@ -135,6 +139,18 @@ def test_a_survey_is_resumed_with_its_own_points(
         make_run_dir(options(run_dir=tmp_path, resume=resume), load_config(overrides=changes))
     assert (tmp_path / "config.toml").read_text() == before
     assert make_run_dir(options(run_dir=tmp_path, resume=True), same) == tmp_path
+
+
+def test_runs_of_one_second_have_directories_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ccatp.daemon.run_dir.default_run_dir", lambda *_: Path("runs/same"))
+    made = []
+    for _ in range(3):
+        made.append(make_run_dir(options(), load_config()))
+        (made[-1] / "mission.sqlite").touch()
+    assert [path.name for path in made] == ["same", "same-2", "same-3"]
+    monkeypatch.setattr("ccatp.daemon.run_dir.default_run_dir", lambda *_: Path("runs/same/mission.sqlite/x"))
+    with pytest.raises(ConfigError, match=r"--run-dir: cannot make .*; name another folder"):
+        make_run_dir(options(), load_config())
 
 
 def test_a_run_is_resumed_simulated_or_not_as_it_began(tmp_path: Path) -> None:
@@ -286,6 +302,27 @@ def test_a_daemon_waits_for_the_children_of_the_one_before(tmp_path: Path, monke
             await_predecessors(stack, tmp_path)
         child.communicate()
         await_predecessors(stack, tmp_path)
+
+
+def test_simulations_run_beside_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = tmp_path / "rt"
+    monkeypatch.setenv("CCATP_RUNTIME_DIR", str(usual))
+    places = [usual, usual / "sim-2", usual / "sim-3"]
+    with ExitStack() as stack, locked(make_runtime_dir("", os.environ) / TRUTH_LOCK_FILE, ""):
+        # Beside a simulated robot that runs alone.
+        assert [take_runtime_dir(stack, "", is_sim=True) for _ in range(2)] == places[1:]
+        assert running_in(usual) == places[1:]
+    with ExitStack() as first, ExitStack() as others:
+        assert take_runtime_dir(first, "", is_sim=True) == usual
+        assert [take_runtime_dir(others, "", is_sim=True) for _ in range(2)] == places[1:]
+        assert running_in(usual) == places
+        for configured, is_sim in ((str(usual), True), ("", False)):
+            with pytest.raises(RefusedError, match="another ccatp runs in"):
+                take_runtime_dir(others, configured, is_sim=is_sim)
+        first.close()
+        assert running_in(usual) == places[1:]
+        assert take_runtime_dir(first, "", is_sim=True) == usual
+    assert running_in(usual) == []
 
 
 def test_the_sockets_go_with_the_daemon(tmp_path: Path) -> None:
