@@ -315,8 +315,10 @@ def page_address(runtime_dir: Path) -> str:
     run_dir = run_dir_in(runtime_dir)
     if run_dir is None or not (runtime_dir / "dashboard").exists():
         return ""
-    cfg = read_config(run_dir / "config.toml").dashboard
-    return page_url(cfg.host, cfg.port) + token_query(cfg, runtime_dir)
+    with suppress(ConfigError):  # the run directory was removed
+        cfg = read_config(run_dir / "config.toml").dashboard
+        return page_url(cfg.host, cfg.port) + token_query(cfg, runtime_dir)
+    return ""
 
 
 SimulatedServer = SimRobotConfig | SimEtalonConfig | SimBeaconRobotConfig

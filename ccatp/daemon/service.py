@@ -41,8 +41,10 @@ def watchdog_period_s(environ: Mapping[str, str]) -> float | None:
 
 def is_journal(descriptor: int, environ: Mapping[str, str]) -> bool:
     """Whether what is written to a descriptor goes to the journal, which keeps it and shows it to others."""
-    info = os.fstat(descriptor)
-    return environ.get("JOURNAL_STREAM") == f"{info.st_dev}:{info.st_ino}"
+    with contextlib.suppress(OSError):  # closed
+        info = os.fstat(descriptor)
+        return environ.get("JOURNAL_STREAM") == f"{info.st_dev}:{info.st_ino}"
+    return False
 
 
 def take_from(environ: MutableMapping[str, str]) -> tuple[Notifier, float | None]:

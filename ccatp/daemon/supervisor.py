@@ -69,6 +69,7 @@ from ccatp.report.dashboard.access import TOKEN_FILE, make_token, read_tokens
 
 # Between two looks at messages and processes: in lockstep a message in each of them would cost as much again.
 POLL_S = 0.02
+STDERR = 2  # its descriptor
 # In lockstep the three that answer each other keep both cores of a small machine busy: recording takes what they leave.
 LOCKSTEP_NICENESS = 10
 
@@ -179,7 +180,7 @@ class SupervisedRun:
     def _watch(self, collector: Collector) -> ExitStatus:
         if self._page.text:
             self._log.log(LEVELS[self._page.level], OPERATOR_MESSAGE, text=self._page.text)
-            has_token = self._page.socket is not None and not is_journal(sys.stderr.fileno(), os.environ)
+            has_token = self._page.socket is not None and not is_journal(STDERR, os.environ)
             token = token_query(self._cfg.dashboard, self._endpoints.runtime_dir) if has_token else ""
             self._view.show_message(self._page.level, self._page.text + token)
         for process in BEACON_PROCESSES if isinstance(self._cfg, RadioConfig) else PROCESSES:

@@ -460,11 +460,26 @@ async def test_what_a_page_shows_and_that_its_end_is_not_that_of_the_survey(runt
             rig.tell_alive()
             await expect(page.locator("#state")).to_have_text("driving")
             await is_laid_out(page)
+            await takes_a_token(page, rig)
         await expect(page.locator("#alarm")).to_contain_text("LINK LOST")
         await expect(page.locator("#alarm-text")).to_have_text("the dashboard has ended; the survey may go on")
         await expect(page.locator("#ended")).to_be_hidden()
         await expect(page.locator("#abort")).to_be_disabled()
         await browser.close()
+
+
+async def takes_a_token(page: Page, rig: Rig) -> None:
+    await expect(page.locator("#read-only")).to_contain_text("Read-only: commands need a token")
+    await expect(page.locator("#pause")).to_be_disabled()
+    for token, answer in ((rig.token[::-1], "refused: the token is not accepted"), (rig.token, "pause: done")):
+        await page.goto(f"http://127.0.0.1:{rig.port}/?token={token}")
+        await expect(page).to_have_url(f"http://127.0.0.1:{rig.port}/")
+        rig.tell_alive()
+        await expect(page.locator("#pause")).to_be_enabled()
+        await page.locator("#pause").click()
+        await expect(page.locator("#answer")).to_contain_text(answer)
+        await expect(page.locator("#read-only")).to_be_visible(visible=token != rig.token)
+    assert [request["cmd"] for request in rig.asked] == ["pause"]
 
 
 async def is_laid_out(page: Page) -> None:

@@ -189,6 +189,8 @@ def test_the_dashboard_is_restarted_and_clients_pause_resume_and_call_home(start
         assert time.monotonic() < healthy_by_s
         time.sleep(0.05)
     assert page.status()["mission"]["total"] == 9
+    command = [sys.executable, "-m", "ccatp", "status", "--runtime-dir", str(runtime_dir)]
+    status = subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=True).stdout
     page.resume()
     daemon.wait(lambda status: status.state != "held", timeout_s=20.0)
     with pytest.raises(RefusedError, match="resume refused"):
@@ -202,6 +204,7 @@ def test_the_dashboard_is_restarted_and_clients_pause_resume_and_call_home(start
     shown = re.search(r"dashboard: http://127\.0\.0\.1:\d+/\?token=([0-9a-f]{32})\n", run.stderr)
     assert shown is not None
     assert shown[1] == page.token  # after the restart, too
+    assert f"http://127.0.0.1:{port}/?token={page.token}\n" in status
     assert not [path for path in run.run_dir.iterdir() if page.token.encode() in path.read_bytes()]
     assert "Traceback" not in run.stderr
 

@@ -18,7 +18,7 @@ from structlog.testing import capture_logs
 
 from ccatp.config.load import load_config
 from ccatp.daemon import realtime
-from ccatp.daemon.service import Notifier, Service, take_from
+from ccatp.daemon.service import Notifier, Service, is_journal, take_from
 from ccatp.links.liveness import Liveness
 from ccatp.links.topics import Heartbeat, MissionStatus
 
@@ -58,6 +58,16 @@ def presence(name: str, t_s: float, phase: str = "joined", frame_age_s: float | 
 def both_alive(service: Service, t_s: float) -> None:
     for name in ("main", "danger"):
         service.on_heartbeat(presence(name, t_s))
+
+
+def test_the_journal_is_known_by_its_descriptor(tmp_path: Path) -> None:
+    with (tmp_path / "journal").open("w") as file:
+        info = os.fstat(file.fileno())
+        stream = {"JOURNAL_STREAM": f"{info.st_dev}:{info.st_ino}"}
+        assert is_journal(file.fileno(), stream)
+        assert not is_journal(file.fileno(), {})
+        assert not is_journal(0, stream)
+    assert not is_journal(-1, stream)
 
 
 def test_a_service_manager_that_is_gone_or_deaf_holds_nobody_up(tmp_path: Path) -> None:
