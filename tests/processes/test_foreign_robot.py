@@ -1,0 +1,40 @@
+"""Surveys of a robot and a laser system that share no code with this project, measured by their own truth."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support import foreign_robot
+
+OTHER_CLOCK = "--clock-error 0.005 --clock-wander 0.003 --age-s 0.03 --age-jitter-s 0.01"
+SLOW_SENSORS = "--lockstep --encoder-hz 250 --edge-hz 500 --lose-samples 0.01"
+CONFIG = """
+robot = {{ port = {robot}, wheel_radius_m = 0.0305, wheel_base_m = 0.147 }}
+etalon.port = {laser}
+dashboard.enabled = false
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [OTHER_CLOCK, SLOW_SENSORS], ids=["real time", "lockstep"])
+def test_a_panel_of_a_foreign_robot_is_surveyed(tmp_path: Path, runtime_dir: Path, options: str) -> None:
+    command = [sys.executable, foreign_robot.__file__, "--port", "0", "--laser-port", "0", *options.split()]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as robot:
+        try:
+            assert robot.stdout is not None
+            config = tmp_path / "foreign.toml"
+            config.write_text(CONFIG.format(**json.loads(robot.stdout.readline())))
+            survey = [sys.executable, "-m", "ccatp", "run", "--config", str(config), "--panels", "1", "--json"]
+            survey += ["--run-dir", str(tmp_path / "run"), "--runtime-dir", str(runtime_dir)]
+            run = subprocess.run(survey, capture_output=True, text=True, timeout=600.0, check=False)
+        finally:
+            robot.terminate()
+        truth = json.loads(robot.stdout.read())
+    assert run.returncode == 0, run.stderr
+    summary = json.loads(run.stdout)
+    assert (summary["reference"], summary["points"]["measured"]) == ("laser", 9)
+    assert (truth["points"], truth["falls"], truth["outside_s"], truth["measured_moving"]) == (9, 0, 0.0, 0), truth
+    assert truth["best_max_mm"] < 10.0  # a point counts within 1 cm
