@@ -216,11 +216,11 @@ DRIVES_LATE = slow(Group.LINK, "drives reach the wheels late",
     "Commands take long. Half the speed.", "Network.")
 CLOCK_JUMPED = pause(Group.LINK, "the robot's clock has jumped",
     "Its times are off by more than `health.clock_jump_s`. The clock's offset is measured again.", "Nothing once.")
-FRAMES_LOST = hold(Group.DATA, "frames were lost: nobody saw where the robot went",
+FRAMES_LOST = hold(Group.DATA, "frames were lost while the robot may have moved",
     "A gap in the frames while the robot moved. A fix comes first.", "Network, if it comes often.")
 LINES_GARBLED = hold(Group.DATA, "lines of the robot were no frames",
     "Several lines in a short time could not be read.",
-    "Network or firmware. `ccatp conformance` tells what the robot sends wrong.")
+    "Network or firmware. `ccatp conformance` reports what the robot sends wrong.")
 
 # -- edge sensors and inertial unit -----------------------------------------------------------------------------------
 
@@ -307,7 +307,7 @@ BEYOND_SEAM = edge(Group.EDGES, "further off the panel than the seam is wide",
 NO_SEAM = edge(Group.EDGES, "off the panel where the map has no seam",
     "A sensor went off in the middle of a panel: a hole, a dark spot, or a pose that is wrong.",
     "Look at the place. A dirty sensor does this everywhere, a wrong pose near seams.")
-OFF_WITHOUT_WHEELS = edge(Group.EDGES, "off the panel while the wheels are not heard",
+OFF_WITHOUT_WHEELS = edge(Group.EDGES, "off the panel while no encoder samples are received",
     "A sensor is off and it is unknown how far the robot moved meanwhile.",
     "See the encoder's alarm that comes with it.")
 CENTRE_NEAR_RIM = edge(Group.EDGES, "the robot's centre is close to the rim on the map",
@@ -323,7 +323,7 @@ EMERGENCY = go_home(Group.OBSERVATORY, "emergency: {kind}",
 
 # -- among beacons ----------------------------------------------------------------------------------------------------
 
-RADIO_SILENT = beacon_hold(Group.BEACONS, "no radio is heard",
+RADIO_SILENT = beacon_hold(Group.BEACONS, "no beacon is received",
     "No reading of a beacon for `danger.radio_timeout_s`.", "The robot's radio; the beacons' supply.")
 NO_FRESH_ESTIMATE = beacon_hold(Group.BEACONS, "no fresh estimate",
     "Main has not reported where the robot is for `danger.estimate_timeout_s`.",
@@ -391,7 +391,7 @@ MEASUREMENTS_FAILED = fault(Group.SURVEY, "{count} measurements in a row failed:
     "The laser system does not see the puck; the reason stands behind the colon.",
     "Laser, line of sight, the puck's cleanliness; `ccatp resume`.")
 NOT_FOUND = fault(Group.SURVEY, "the robot cannot be found again: {why}",
-    "Its pose is not to be trusted, and no fix tells where it is.", "Laser and line of sight; `ccatp resume`.")
+    "Its pose is not to be trusted, and no fix determines where it is.", "Laser and line of sight; `ccatp resume`.")
 FRAME_REFUSED = fault(Group.SURVEY, "the laser system sees the robot {distance_m:.2f} m from {place}: {why}",
     "The first fix, or one in motion, lies where the robot cannot be: the laser system's frame is another one.",
     "Configured collimators, base and start of the robot.")

@@ -229,7 +229,7 @@ class RadioNavigator(_DeadReckoning):
         super().__init__(cfg)
         self._scan, self._target = ReflectorScan(cfg.scan), cfg.follow.target
         self.slam = SignalSlam(cfg)
-        self._heard_s: float | None = None
+        self._received_s: float | None = None
 
     @property
     def belief(self) -> PoseBelief:
@@ -249,11 +249,11 @@ class RadioNavigator(_DeadReckoning):
     def target(self, t_s: float) -> TargetSight | None:
         """The radio that is followed, at a time; ``None`` before its first reading."""
         estimate = self.slam.beacons.get(self._target)
-        if estimate is None or self._heard_s is None:
+        if estimate is None or self._received_s is None:
             return None
         x_m, y_m = estimate.mean[:2].tolist()
         sigma_m = self.slam.distance(self._target)[1]
-        return TargetSight((x_m, y_m), sigma_m, t_s - self._heard_s, self.slam.moving_velocity_m_s)
+        return TargetSight((x_m, y_m), sigma_m, t_s - self._received_s, self.slam.moving_velocity_m_s)
 
     def take(self, measurements: BeaconMeasurements) -> None:
         """Predict over the wheels' intervals, then take the readings of the frame."""
@@ -272,7 +272,7 @@ class RadioNavigator(_DeadReckoning):
             self.score.refused + len(learned) - len(used),
         )
         if any(reading.beacon == self._target for reading in readings):
-            self._heard_s = t_s
+            self._received_s = t_s
 
 
 _PLACE = 2

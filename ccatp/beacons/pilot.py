@@ -36,7 +36,7 @@ class TargetSight(NamedTuple):
 
     position_m: Point
     sigma_m: float
-    unheard_s: float
+    age_s: float
     velocity_m_s: Point = (0.0, 0.0)
 
 
@@ -58,7 +58,7 @@ class Follower:
     def aim(self, pose: PlanarPose, target: TargetSight | None) -> BearingToPoint | None:
         """What is left to go, and decides what to do; None while nothing is to be approached."""
         self._sight = None
-        if target is None or target.unheard_s > self._cfg.lost_after_s:
+        if target is None or target.age_s > self._cfg.lost_after_s:
             self.state = FollowState.LOST
             return None
         self._sight = aim_at(pose, target.position_m)

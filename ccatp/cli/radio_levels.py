@@ -20,7 +20,7 @@ from ccatp.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from ccatp.beacons.slam.level_fix import HeardPlace, LevelLocator, Room
+    from ccatp.beacons.slam.level_fix import LevelLocator, MeasuredPlace, Room
     from ccatp.beacons.slam.path_loss import PathLossFit
 
     Places = dict[str, tuple[float, float]]
@@ -115,14 +115,14 @@ def fix(
     room: str | None, spacing_m: float, sheet: str | None, figure_file: Path | None, json_output: bool,
 ) -> None:  # fmt: skip
     """Find each place of PATH from one level of each beacon, and judge the errors and the 90 % regions."""
-    from ccatp.beacons.datasets.sheets import read_heard_places, read_levels
+    from ccatp.beacons.datasets.sheets import read_level_places, read_levels
     from ccatp.beacons.datasets.tables import RadioDataError
     from ccatp.beacons.slam.level_fix import LevelLocator, fingerprint_fits, judged
     from ccatp.beacons.slam.path_loss import PathLossError, fit_path_loss
 
     places_m = _beacons(beacons)
     area = _room(room, places_m, spacing_m)
-    name, places, warnings = read_heard_places(path, sheet)
+    name, places, warnings = read_level_places(path, sheet)
     if exchange is not None:
         places = _exchanged(places, exchange)
     source = fingerprints or path_loss
@@ -134,7 +134,7 @@ def fix(
             fits = dict.fromkeys(places_m, fit_path_loss(read_levels(source, sheet)[1]))
             locators = [LevelLocator(places_m, fits, area)]
         else:
-            known = read_heard_places(source, sheet)[1]
+            known = read_level_places(source, sheet)[1]
             numbers = range(len(known)) if leave_out else (None,)
             locators = [LevelLocator(places_m, fingerprint_fits(known, places_m, number), area) for number in numbers]
     except PathLossError as error:
@@ -143,12 +143,12 @@ def fix(
         warnings += _doubtful_names(locators[0], places)
         locators *= len(places)
     warn(warnings)
-    found = [locator.fix(heard.levels_dbm) for locator, heard in zip(locators, places, strict=True)]
+    found = [locator.fix(place.levels_dbm) for locator, place in zip(locators, places, strict=True)]
     result = {"data": name, "leave_one_out": leave_out, **judged(found, places, REGION), "warnings": warnings}
     if figure_file is not None:
         from ccatp.report.beacon_plots import draw_fixes
 
-        draw_fixes(found, [heard.place_m for heard in places], places_m, name, figure_file)
+        draw_fixes(found, [place.place_m for place in places], places_m, name, figure_file)
     if json_output:
         click.echo(json.dumps(result))
     else:
@@ -206,15 +206,15 @@ def _room(text: str | None, places_m: "Places", spacing_m: float) -> "Room":
     return Room((x0, y0), (x1, y1), spacing_m)
 
 
-def _exchanged(places: "tuple[HeardPlace, ...]", exchange: str) -> "tuple[HeardPlace, ...]":
+def _exchanged(places: "tuple[MeasuredPlace, ...]", exchange: str) -> "tuple[MeasuredPlace, ...]":
     pair = [name.strip() for name in exchange.split(",")]
     known = places[0].levels_dbm
     if len(pair) != 2 or any(name not in known for name in pair):
         raise click.UsageError(f"--exchange {exchange}: is not two beacons of the data, which has {', '.join(known)}")
-    return tuple(heard.renamed({pair[0]: pair[1], pair[1]: pair[0]}) for heard in places)
+    return tuple(place.renamed({pair[0]: pair[1], pair[1]: pair[0]}) for place in places)
 
 
-def _doubtful_names(locator: "LevelLocator", places: "Sequence[HeardPlace]") -> list[str]:
+def _doubtful_names(locator: "LevelLocator", places: "Sequence[MeasuredPlace]") -> list[str]:
     from ccatp.beacons.slam.level_fix import likeliest_names
 
     names, gain = likeliest_names(locator, places)

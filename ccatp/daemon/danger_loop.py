@@ -153,7 +153,7 @@ class DangerLoop(RobotLoop):
         self.peer = self._estimates = EstimateSubscriber(
             context, args.endpoints.of("main"), self.heartbeat.publish_if_due, is_taking_over=args.is_taking_over
         )
-        self._has_heard_main = False
+        self._has_estimate = False
         self._published = (EventCode.NORMAL, "", Severity.NONE)
         self._seq, self._t_s = -1, 0.0
         self._bad_lines = self._permit_seq = 0
@@ -172,8 +172,8 @@ class DangerLoop(RobotLoop):
 
     def is_peer_ready(self) -> bool:
         """Messages get through, both ways: the first ones must not be lost."""
-        self._has_heard_main = self._has_heard_main or self._estimates.has_received()
-        return self._has_heard_main and self.publisher.has_subscriber("verdict")
+        self._has_estimate = self._has_estimate or self._estimates.has_received()
+        return self._has_estimate and self.publisher.has_subscriber("verdict")
 
     async def end(self, _stop: asyncio.Event) -> None:
         self.log.info("danger_statistics", **self.monitor.counts)

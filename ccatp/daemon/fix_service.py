@@ -212,7 +212,7 @@ class FixService:
             try:
                 await self._await_commit(self._store.record_fix(request.point, fix, request.estimate), request.point)
             except AlreadyMeasuredError as error:
-                self._notify("warning", str(error))  # nothing is lost, and nobody has to be waited for
+                self._notify("warning", str(error))  # nothing is lost, and nothing has to be waited for
             except StoreError as error:
                 mission.handle(Fault(FIX_NOT_STORED.text(point=_name(request.point), why=error)))
                 return

@@ -404,7 +404,7 @@ class MainLoop(RobotLoop):
             self.link.send_drive(self._drive_seq, ack, right, left, steer)
 
     def _answer(self, seq: int, drive: DriveCommand) -> None:
-        # A robot that is driven waits for nobody.
+        # A robot that is driven does not wait.
         is_still = not (drive.right_rad_s or drive.left_rad_s)
         if is_still and self.is_lockstep and self._runner.stops_time:
             self._unanswered = seq

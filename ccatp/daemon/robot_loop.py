@@ -108,7 +108,7 @@ class RobotLoop(RobotSession):
 
     @abstractmethod
     def report_overdue(self, text: str) -> None:
-        """In lockstep a frame does not come, and the robot stands: tell those whom it concerns."""
+        """In lockstep a frame is missing, and the robot stands: report it."""
 
     def on_bad_line(self) -> None:
         """See ``RobotSession``."""

@@ -277,14 +277,14 @@ class FullStateLocalizer(LocalizerBase):
         self._relocate(z, residual, variance, is_lost=False)
         self.counts["reinitialised"] += 1
         self.notices.append(
-            f"{_CONSISTENT} fixes in a row say that the pose is {distance_mm:.1f} mm wrong: it begins anew"
+            f"{_CONSISTENT} fixes in a row say that the pose is {distance_mm:.1f} mm wrong: it starts again"
         )
 
     def inflate_covariance(self, way_m: float, turn_rad: float) -> None:
         """The pose may be wrong by this much, because what it was made of was: the pose stays, its certainty goes."""
         if self.is_frozen:
             return
-        # What the wheels may have done while nobody listened is part of the doubt.
+        # What the wheels may have done while no samples were received is part of the doubt.
         self._right.restart()
         self._left.restart()
         if self._block.dt_s > 0.0:

@@ -1,6 +1,6 @@
 """Pictures of beacon work: path loss, fixes by signal strength, the fuzzy speed, maps of motes, recorded runs.
 
-The suffix of a file tells its format (PNG, PDF, SVG); PictureError: it cannot be written.
+The suffix of a file gives its format (PNG, PDF, SVG); PictureError: it cannot be written.
 """
 
 from collections.abc import Mapping, Sequence
@@ -227,8 +227,8 @@ def draw_slam(run: RecordedRun, track: EstimatedPath, judged: TrackEvaluation, o
         "path {:.3f} m rms after one rigid alignment": judged.trajectory_rmse_m,
         "beacons {:.3f} m rms": judged.beacon_rmse_m,
     }
-    told = [text.format(rms_m) for text, rms_m in rms.items() if rms_m is not None]
-    axes.set_title("  ·  ".join(told) or "no truth to compare with", loc="left", color=QUIET)
+    parts = [text.format(rms_m) for text, rms_m in rms.items() if rms_m is not None]
+    axes.set_title("  ·  ".join(parts) or "no truth to compare with", loc="left", color=QUIET)
     _draw_paths(axes, run, track, judged, path)
     if surveyed.size:
         axes.scatter(*surveyed.T, marker="x", s=46, linewidths=1.6, color=INK, zorder=6, label="surveyed beacon")

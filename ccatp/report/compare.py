@@ -81,8 +81,8 @@ class RunPair:
         self.named = (("A", a), ("B", b))
         names = [found.record.mirror.name for found in (a, b)]
         self.is_one_mirror = names[0] == names[1]
-        told = f"The runs are of different mirrors, {' and '.join(names)}: points and panels are not compared."
-        self.warning = "" if self.is_one_mirror else told
+        differ = f"The runs are of different mirrors, {' and '.join(names)}: points and panels are not compared."
+        self.warning = "" if self.is_one_mirror else differ
         fitted = [() if found.alignment is None else found.alignment.panels for found in (a, b)]
         self.panels = [{panel.panel: panel for panel in panels} for panels in fitted]
         common = [panel for panel in self.panels[1] if panel in self.panels[0] and self.is_one_mirror]

@@ -174,11 +174,11 @@ def error_figures(series: ErrorSeries) -> dict[str, float] | None:
 
 # -- time budget ------------------------------------------------------------------------------------------------------
 
-START_ANEW = "start anew"
-KINDS = ("turn", "drive", "settle", "measure", "wait", "back off", "home", START_ANEW)
+RESTART = "restart"
+KINDS = ("turn", "drive", "settle", "measure", "wait", "back off", "home", RESTART)
 _KIND_OF = {
     "turning": "turn", "driving": "drive", "settling": "settle", "measuring": "measure", "backing off": "back off",
-    "returning": "home", START_ANEW: START_ANEW,
+    "returning": "home", RESTART: RESTART,
 }  # fmt: skip
 _OVER = "done"
 _NEVER_BEGUN = "idle"
@@ -204,7 +204,7 @@ class TimeBreakdown(NamedTuple):
     @property
     def mission_s(self) -> float:
         """Without the time in which no main loop counted it: ``mission_time_s`` of ``summary.json``."""
-        return self.total_s - self.spent_s.get(START_ANEW, 0.0)
+        return self.total_s - self.spent_s.get(RESTART, 0.0)
 
     @property
     def bound_s(self) -> float | None:
@@ -245,7 +245,7 @@ def spells_of(session: RecordedSession) -> tuple[list[TimeSpan], bool]:
         missing_s = passed_s - (later.elapsed_s - one.elapsed_s)
         part_s = missing_s if passed_s > 0.0 and missing_s > _ROUNDING_S else 0.0
         absent_s += part_s
-        spells += [(one.state, passed_s - part_s), (START_ANEW, part_s)]
+        spells += [(one.state, passed_s - part_s), (RESTART, part_s)]
     track = session.track
     is_exact = bool(session.changes and len(track.seq))
     if is_exact:
@@ -260,7 +260,7 @@ def spells_of(session: RecordedSession) -> tuple[list[TimeSpan], bool]:
             part_s = min(duration_s, absent_s)
             absent_s -= part_s
             spells[index] = state, duration_s - part_s
-            spells.append((START_ANEW, part_s))
+            spells.append((RESTART, part_s))
     return [(state, duration_s) for state, duration_s in spells if duration_s > 0.0 and state != _OVER], is_exact
 
 

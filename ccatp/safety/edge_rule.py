@@ -149,8 +149,8 @@ class EdgeRule:
             if is_rim:
                 episode.trust()
             elif seam is not None:
-                anew = self._open(i, odometry, 0.0, estimate)
-                self._place(anew, self._offsets[i], odometry, estimate, aside_m / limits.sigmas)
+                opened = self._open(i, odometry, 0.0, estimate)
+                self._place(opened, self._offsets[i], odometry, estimate, aside_m / limits.sigmas)
 
     def _place(
         self,

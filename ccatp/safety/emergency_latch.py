@@ -10,7 +10,7 @@ from ccatp.core import EmergencyKind, EventCode, Verdict
 # An observatory has a handful at a time; a peer that floods the latch must not fill the memory.
 MAX_ACTIVE = 256
 MAX_CLEARED = 1024
-# Main acts on a verdict in the frame after it at the latest; what it says of a frame later than that knows of it.
+# Main acts on a verdict in the frame after it at the latest; an estimate of a later frame takes it into account.
 INFORMED_AFTER_FRAMES = 2
 # The mission's states (``ccatp.survey.state``) in which the robot stands at base or is held.
 AT_BASE_OR_HELD = frozenset({"idle", "held", "done"})
@@ -135,7 +135,7 @@ class EmergencyRules:
 
     @property
     def at_base_or_held(self) -> bool:
-        """Whether main's newest estimate says so, and knows of the newest emergency."""
+        """Whether main's newest estimate says so, and takes the newest emergency into account."""
         return self._state_seq > self._raised_seq + INFORMED_AFTER_FRAMES and self._state in AT_BASE_OR_HELD
 
     def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:

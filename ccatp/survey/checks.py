@@ -1,4 +1,4 @@
-"""Checks of a survey beside its frames: a fault that nobody looks after, and gravity that contradicts the mirror."""
+"""Checks of a survey beside its frames: an unattended fault, and gravity that contradicts the mirror."""
 
 from collections.abc import Sequence
 from enum import StrEnum
@@ -113,7 +113,7 @@ class MirrorCheck:
         if len(self._readings) < READINGS and not is_over:
             return False
         if not self._readings:
-            self.warning = "the robot tells no gravity: nobody knows whether it stands on the configured mirror"
+            self.warning = "the robot reports no gravity: it is unknown whether it stands on the configured mirror"
             return True
         self._judge(self._mirror.gravity_in_robot(pose))
         return True

@@ -35,7 +35,7 @@ from ccatp.config.beacon_models import CricketConfig
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import aligned_rms_m, best_motion
 
-_TELLING = 12.0  # a drop of chi-squared that chance gives one offset in two thousand
+_SIGNIFICANT = 12.0  # a drop of chi-squared that chance gives one offset in two thousand
 _CHANCE = 1e-4  # that sound ranges of one pair of all disagree as much
 _SCATTER = 1.5  # factor of the sigmas that is worth a word
 _FOLDS = 5  # sets of motes that are named
@@ -102,7 +102,7 @@ def _hidden_offset(found: MoteMap, network: RangeNetwork, settings: MapFitSettin
         again = map_motes(network, settings, with_offset=True)
         shown, agreement = again.fit, again.agreement
     # Where the ranges deny the map even so, any unknown more betters it, and means nothing.
-    if without.cost - shown.cost > _TELLING and not agreement.is_denied:
+    if without.cost - shown.cost > _SIGNIFICANT and not agreement.is_denied:
         yield (
             f"all ranges look {1e3 * shown.state.offset_m:.0f} mm long in common (chi-squared {without.cost:.0f}, "
             f"{shown.cost:.0f} with an offset); --offset estimates it"
@@ -195,13 +195,14 @@ def map_measured(
     ]
     warnings += [*_disagreeing(network), *folds.warnings, *found.warnings]
     warnings += [
-        f"no {name} can be told from these ranges: the map takes it up, and its own size is free; leave --{name} out"
-        for name in freedom.untold
+        f"no {name} can be determined from these ranges: the map takes it up, and its own size is free; "
+        f"leave --{name} out"
+        for name in freedom.undetermined
     ]
     # Derivatives at a place where they vanish: what comes out is large, and means that nothing is known.
     if is_thin := _is_flat(bound_m, places) or (found.is_trusted and _is_flat(expected_m, places)):
         shape = "in a line" if network.dimension == 2 else "in a plane"
-        warnings.append(f"the motes lie {shape}, or nearly: the ranges do not tell how far each is off it")
+        warnings.append(f"the motes lie {shape}, or nearly: the ranges do not determine how far each is off it")
     is_known = found.is_trusted and bound_m is not None and not is_thin
     data = {
         "rms_m": {"p10": error_m, "p50": error_m, "p90": error_m},
@@ -215,8 +216,8 @@ def map_measured(
         "motes": len(motes),
         "frame": "aligned",
         "expected_rms_m": expected_m if is_known else None,
-        "offset_m": None if "offset" in freedom.untold else found.state.offset_m,
-        "scale": None if "scale" in freedom.untold else 1.0 + found.state.scale,
+        "offset_m": None if "offset" in freedom.undetermined else found.state.offset_m,
+        "scale": None if "scale" in freedom.undetermined else 1.0 + found.state.scale,
         "frame_directions": list(freedom.frame),
         "free_directions": freedom.lines,
         "warnings": warnings,
@@ -229,7 +230,7 @@ def _network(cfg: CricketConfig, file: MeasuredRanges, tags_m: Places | None) ->
     if tags_m is None:
         return build_network(file.readings, cfg.dimension, names)
     if not file.groups:
-        raise MappingError("--tags: these ranges are of no trolley; columns session, pos, deg, anchor, tag tell one")
+        raise MappingError("--tags: these ranges are of no trolley; columns session, pos, deg, anchor, tag make one")
     index = {name: row for row, name in enumerate(names)}
     bodies = []
     for pose, motes in file.groups.items():
@@ -315,7 +316,7 @@ def report_lines(data: dict[str, Any]) -> Iterator[str]:
     """
     yield f"{data['motes']} motes, {data['method']}, frame {data['frame']}, {data['seeds']} runs"
     yield ""
-    yield "what the ranges can tell"
+    yield "what the ranges determine"
     yield f"  free directions of the frame       {', '.join(data['frame_directions']) or 'none'}"
     yield f"  free directions beyond the frame   {data['rank_deficiency']}"
     for line in data["free_directions"]:

@@ -33,7 +33,7 @@ class Freedom(NamedTuple):
     rank: int
     frame: tuple[str, ...]  # names of rigid motions of the whole map that are free
     flexes: tuple[str, ...]
-    untold: tuple[str, ...]  # what of offset and scale cannot be separated from the map
+    undetermined: tuple[str, ...]  # what of offset and scale cannot be separated from the map
 
     @property
     def deficiency(self) -> int:
@@ -43,7 +43,7 @@ class Freedom(NamedTuple):
     @property
     def lines(self) -> list[str]:
         """Those beyond the frame's by name."""
-        return [*self.flexes, *(f"range {name}: the map takes it up" for name in self.untold)]
+        return [*self.flexes, *(f"range {name}: the map takes it up" for name in self.undetermined)]
 
 
 def generic_state(model: MapModel, rng: np.random.Generator) -> MapState:
@@ -67,11 +67,11 @@ def find_freedom(model: MapModel, state: MapState) -> Freedom:
     moves = np.asarray(model.position_jacobian(state) @ null[: model.coordinates])
     names = [name for name, on in (("offset", model.with_offset), ("scale", model.with_scale)) if on]
     shares = np.abs(null[model.coordinates :]).max(axis=1, initial=0.0)
-    untold = tuple(name for name, share in zip(names, shares, strict=True) if share > 1e-7)
+    undetermined = tuple(name for name, share in zip(names, shares, strict=True) if share > 1e-7)
     frame = _frame(moves, state.positions_m)
-    is_flexible = null.shape[1] - len(frame) > len(untold)
+    is_flexible = null.shape[1] - len(frame) > len(undetermined)
     flexes = _flexes(moves, state.positions_m, model.network) if is_flexible else ()
-    return Freedom(model.size, model.size - null.shape[1], frame, flexes, untold)
+    return Freedom(model.size, model.size - null.shape[1], frame, flexes, undetermined)
 
 
 def _largest_rigid_part(moves: FloatArray, points: FloatArray) -> list[int]:

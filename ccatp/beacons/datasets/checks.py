@@ -319,6 +319,6 @@ def _map_of(run: RecordedRun) -> Iterator[str]:
     unknown = [name for name in run.beacon_ids if name not in run.beacon_truth_m]
     if unknown and run.beacon_truth_m:
         yield f"beacons without a surveyed place: {', '.join(unknown)}"
-    unheard = [name for name in run.beacon_truth_m if name not in run.beacon_ids]
-    if unheard:
-        yield f"surveyed beacons that were never heard: {', '.join(unheard)}"
+    unread = [name for name in run.beacon_truth_m if name not in run.beacon_ids]
+    if unread:
+        yield f"surveyed beacons without any reading: {', '.join(unread)}"

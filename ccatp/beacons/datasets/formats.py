@@ -41,14 +41,14 @@ def _truth(reference: Table | None, steps: Steps, warnings: list[str]) -> Refere
 
 
 def _run(
-    name: str, kind: str, steps: Steps, heard: FloatArray, places_m: dict[str, tuple[float, float]],
+    name: str, kind: str, steps: Steps, received: FloatArray, places_m: dict[str, tuple[float, float]],
     truth: ReferencePath | None, warnings: list[str],
 ) -> RecordedRun:  # fmt: skip
-    """``heard``: time, number of the beacon, range and, if there are any, bearing, shape (m, 3 or 4)."""
-    ids, index = np.unique(heard[:, 1].astype(np.int64), return_inverse=True)
-    unknown = np.full(len(heard), np.nan)
-    bearing_rad = heard[:, 3] if heard.shape[1] > 3 else unknown
-    readings = Readings(heard[:, 0], index.astype(np.int64), heard[:, 2], bearing_rad, unknown)
+    """``received``: time, number of the beacon, range and, if there are any, bearing, shape (m, 3 or 4)."""
+    ids, index = np.unique(received[:, 1].astype(np.int64), return_inverse=True)
+    unknown = np.full(len(received), np.nan)
+    bearing_rad = received[:, 3] if received.shape[1] > 3 else unknown
+    readings = Readings(received[:, 0], index.astype(np.int64), received[:, 2], bearing_rad, unknown)
     first_pose, names = pose_of_truth(truth, steps, warnings), tuple(map(str, ids.tolist()))
     return RecordedRun(name, kind, steps, readings, names, places_m, truth, first_pose, tuple(warnings))
 
@@ -220,13 +220,13 @@ def read_mrclam(path: Path, robot: int | None) -> RecordedRun:
     rows = None if reference is None else read_table(reference, REFERENCE).in_order(warnings)
     truth = _truth(rows, steps, warnings)
     places_m = _landmarks(folder, warnings)
-    heard = np.column_stack([seen[:, 0], subjects, seen[:, 2:]])[kept]
-    return _run(f"{folder.resolve().name} robot {robot}", "mrclam", steps, heard, places_m, truth, warnings)
+    received = np.column_stack([seen[:, 0], subjects, seen[:, 2:]])[kept]
+    return _run(f"{folder.resolve().name} robot {robot}", "mrclam", steps, received, places_m, truth, warnings)
 
 
 def _subjects(folder: Path, barcodes: FloatArray, warnings: list[str]) -> FloatArray:
     """Subject of each reading, 0 where the barcode is not listed; shape (m,)."""
-    file = _needed(folder, "Barcodes.dat", "readings name barcodes, and it tells whose they are")
+    file = _needed(folder, "Barcodes.dat", "readings name barcodes, and it says whose they are")
     table = read_table(file, ("subject", "barcode"))
     subject_of = {int(barcode): int(subject) for subject, barcode in table.values.tolist()}
     subjects = np.array([subject_of.get(int(code), 0) for code in barcodes.tolist()], dtype=np.float64)
@@ -327,7 +327,7 @@ EVENTS = {
     "truth": ("time_s", "x_m", "y_m", "(heading_rad)"),
     "beacon": ("beacon", "x_m", "y_m"),
 }
-HEARD = ("range", "bearing", "rssi")
+READING_KINDS = ("range", "bearing", "rssi")
 HEADER = "event"
 
 
@@ -362,13 +362,13 @@ def read_events_csv(file: Path) -> RecordedRun:
     tables = {kind: table.in_order(warnings, needed[kind]) for kind, table in tables.items()}
     if "odom" not in tables:
         raise RadioDataError(file, f"no event odom ({', '.join(EVENTS['odom'])})")
-    if not any(kind in tables for kind in HEARD):
-        raise RadioDataError(file, f"nothing heard of beacons: no event {', '.join(HEARD)}")
+    if not any(kind in tables for kind in READING_KINDS):
+        raise RadioDataError(file, f"no readings of beacons: no event {', '.join(READING_KINDS)}")
     steps = _event_steps(tables["odom"])
     names = tuple(numbers)
-    readings, heard_ids = _merged(tables, steps, names, warnings)
-    if not heard_ids:
-        raise RadioDataError(file, "nothing was heard of beacons within the time of the odometry")
+    readings, beacon_ids = _merged(tables, steps, names, warnings)
+    if not beacon_ids:
+        raise RadioDataError(file, "no readings of beacons within the time of the odometry")
     truth = _truth(tables.get("truth"), steps, warnings)
     places_m: dict[str, tuple[float, float]] = {}
     if surveyed is not None:
@@ -377,7 +377,7 @@ def read_events_csv(file: Path) -> RecordedRun:
             if places_m.setdefault(name, (x_m, y_m)) != (x_m, y_m):
                 raise RadioDataError(file, f"beacon {name} was surveyed at another place before", line)
     first_pose, name = pose_of_truth(truth, steps, warnings), file.name.split(".")[0]
-    return RecordedRun(name, "csv", steps, readings, heard_ids, places_m, truth, first_pose, tuple(warnings))
+    return RecordedRun(name, "csv", steps, readings, beacon_ids, places_m, truth, first_pose, tuple(warnings))
 
 
 def _event_steps(odometry: Table) -> Steps:
@@ -396,18 +396,18 @@ def _merged(
     """Readings, with range, bearing and strength of the same time and beacon in one row, and the beacons' names."""
     merged: dict[tuple[float, float], list[float]] = {}
     extra: list[tuple[float, float, list[float]]] = []
-    for place, kind in enumerate(HEARD):
+    for place, kind in enumerate(READING_KINDS):
         if kind not in tables:
             continue
         values = tables[kind].values
         for t, who, value in values[within(values[:, 0], steps.times_s, kind, warnings)].tolist():
-            row = merged.setdefault((t, who), [np.nan] * len(HEARD))
+            row = merged.setdefault((t, who), [np.nan] * len(READING_KINDS))
             if np.isnan(row[place]):
                 row[place] = value
             else:  # twice at the same time
-                extra.append((t, who, [value if k == place else np.nan for k in range(len(HEARD))]))
+                extra.append((t, who, [value if k == place else np.nan for k in range(len(READING_KINDS))]))
     rows = sorted([(t, who, row) for (t, who), row in merged.items()] + extra, key=lambda item: item[:2])
-    heard, index = np.unique([int(who) for _, who, _ in rows], return_inverse=True)
-    data = np.array([row for _, _, row in rows]).reshape(-1, len(HEARD))
+    beacons, index = np.unique([int(who) for _, who, _ in rows], return_inverse=True)
+    data = np.array([row for _, _, row in rows]).reshape(-1, len(READING_KINDS))
     readings = Readings(np.array([t for t, _, _ in rows]), index.astype(np.int64), *data.T.copy())
-    return readings, tuple(names[int(who)] for who in heard)
+    return readings, tuple(names[int(who)] for who in beacons)

@@ -17,7 +17,7 @@ import tomlkit
 from ccatp.beacons.cricket.measured_map import MeasuredRanges
 from ccatp.beacons.cricket.range_network import MoteRange
 from ccatp.beacons.datasets.tables import RadioDataError, content_lines, number, read_text, split_cells
-from ccatp.beacons.slam.level_fix import HeardPlace
+from ccatp.beacons.slam.level_fix import MeasuredPlace
 from ccatp.beacons.slam.path_loss import LevelPair
 from ccatp.core import FloatArray
 
@@ -129,7 +129,7 @@ _DISTANCES = "distances, as distance_m"
 _LARGEST = 1e5  # of metres as of dBm
 
 Levels = tuple[str, tuple[LevelPair, ...], list[str]]
-LevelsByPlace = tuple[str, tuple[HeardPlace, ...], list[str]]
+LevelsByPlace = tuple[str, tuple[MeasuredPlace, ...], list[str]]
 
 
 def read_levels(path: Path, sheet: str | None = None, points: Path | None = None) -> Levels:
@@ -146,7 +146,7 @@ def read_levels(path: Path, sheet: str | None = None, points: Path | None = None
     return table.name, tuple(LevelPair(r_m, z) for (r_m, _), z in zip(numbers, levels, strict=True)), warnings
 
 
-def read_heard_places(path: Path, sheet: str | None = None) -> LevelsByPlace:
+def read_level_places(path: Path, sheet: str | None = None) -> LevelsByPlace:
     """Places and levels: columns ``x``, ``y`` (m) and ``RSSI A``, ``RSSI B``, ... (dBm); see ``read_levels``.
 
     Raises RadioDataError: it cannot be read, or has no such columns.
@@ -160,8 +160,8 @@ def read_heard_places(path: Path, sheet: str | None = None) -> LevelsByPlace:
     levels, warnings = _signed([level for row in numbers for level in row[2:]])
     rows = np.reshape(levels, (-1, len(nodes))).tolist()
     places = zip(numbers, rows, strict=True)
-    heard = tuple(HeardPlace((place[0], place[1]), dict(zip(nodes, row, strict=True))) for place, row in places)
-    return table.name, heard, warnings
+    found = tuple(MeasuredPlace((place[0], place[1]), dict(zip(nodes, row, strict=True))) for place, row in places)
+    return table.name, found, warnings
 
 
 def read_log(file: Path) -> dict[str, list[float]]:

@@ -275,9 +275,9 @@ def _widened(problem: BatchProblem, state: BatchState) -> RadioNoiseConfig:
 
 
 def _calibration(problem: BatchProblem, state: BatchState, sigmas: FloatArray) -> dict[str, Calibrated]:
-    ranged, pointed, heard = (bool(problem.there[:, k].any()) for k in range(3))
-    shown = {"range_scale": ranged, "range_offset_m": ranged, "bearing_offset_rad": pointed}
-    shown |= {"rssi_reference_db": heard, "rssi_exponent": heard}
+    has_ranges, has_bearings, has_levels = (bool(problem.there[:, k].any()) for k in range(3))
+    shown = {"range_scale": has_ranges, "range_offset_m": has_ranges, "bearing_offset_rad": has_bearings}
+    shown |= {"rssi_reference_db": has_levels, "rssi_exponent": has_levels}
     found = {}
     for k, name in enumerate(SHARED):
         if problem.free[k] and shown.get(name, True):
@@ -294,6 +294,6 @@ def _warnings(run: RecordedRun, start: Start, converged: bool) -> Iterator[str]:
         if not start.used[k]:
             yield f"beacon {name} could not be placed: too few readings of it, or all from one place"
         elif start.doubtful[k]:
-            yield f"beacon {name} may lie at its mirror image: the path tells too little of its side"
+            yield f"beacon {name} may lie at its mirror image: the path determines its side too little"
     if not converged:
         yield f"the smoother stopped after {ITERATIONS} iterations before it had converged"

@@ -55,7 +55,7 @@ class AddedPoseNoise:
         self.clear()
 
     def clear(self) -> None:
-        """Something was heard."""
+        """A reading was received."""
         self._xx = self._xy = self._xt = self._yy = self._yt = self._tt = 0.0
 
     def step(self, F: FloatArray, Q: FloatArray) -> None:

@@ -189,7 +189,7 @@ def follow(
 def _doubts(slam: BeaconSlam, nis: FloatArray, sizes: FloatArray, refused: int) -> Iterator[str]:
     for beacon in dict.fromkeys(beacon for beacon, _ in slam.moved):
         times = ", ".join(f"{time_s:.1f}" for name, time_s in slam.moved if name == beacon)
-        yield f"beacon {beacon} was placed anew at {times} s: was it moved, or exchanged for another?"
+        yield f"beacon {beacon} was placed again at {times} s: was it moved, or exchanged for another?"
     if nis.size and nis.sum() > DOUBTFUL_NIS * sizes.sum():
         yield (
             f"innovations are {float(nis.sum() / sizes.sum()):.2f} times as large, in squares, as they should be: "
@@ -210,7 +210,7 @@ def _unplaced(run: RecordedRun, slam: BeaconSlam) -> Iterator[str]:
             why = (
                 "its readings leave two places or none"
                 if name in ranged
-                else "only bearings of it were heard, no range"
+                else "only bearings of it were received, no range"
             )
             yield f"beacon {name} could not be placed: {why}"
     if slam.unplaced:

@@ -139,9 +139,9 @@ def table_lines(run: RecordedRun, data: dict[str, Any]) -> list[str]:
     """The result for people."""
     span_s = run.steps.times_s[-1] - run.steps.times_s[0]
     way_m = float(np.abs(run.steps.distance_m).sum())
-    heard = f"{len(run.readings.times_s)} readings of {len(run.beacon_ids)} beacons"
+    readings = f"{len(run.readings.times_s)} readings of {len(run.beacon_ids)} beacons"
     rows = [
-        ("data", f"{data['dataset']} ({data['format']}): {span_s:.0f} s, {way_m:.0f} m by odometry, {heard}"),
+        ("data", f"{data['dataset']} ({data['format']}): {span_s:.0f} s, {way_m:.0f} m by odometry, {readings}"),
         ("filter", f"{data['filter']}: {data['updates']} updates, {data['refused']} refused"),
         ("path", _errors(data)),
         ("beacons", _number(data["beacon_rmse_m"], "{:.3f} m rms")),

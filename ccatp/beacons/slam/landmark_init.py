@@ -196,7 +196,7 @@ class _Problem(NamedTuple):
     P: FloatArray  # of the columns of the rows
     rows: StackedRows
     reach_m: float
-    is_robust: bool  # ranges that went round a corner are left out; a bearing tells which of two places it is
+    is_robust: bool  # ranges that went round a corner are left out; a bearing decides between two places
 
     def around(self, prior_at: PriorAt, place: Sequence[float], radius_m: float) -> list[BeaconEstimate]:
         """Where to begin: the best directions on a circle about the last place, poses and calibration as they are.

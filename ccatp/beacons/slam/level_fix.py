@@ -16,15 +16,15 @@ _NEAREST_M = 0.1  # nearer than this the log-distance model is not believed
 _MOST_PERMUTED = 5  # names: 120 permutations
 
 
-class HeardPlace(NamedTuple):
+class MeasuredPlace(NamedTuple):
     """A known place, and the levels received there by beacon."""
 
     place_m: tuple[float, float]
     levels_dbm: dict[str, float]
 
-    def renamed(self, names: Mapping[str, str]) -> "HeardPlace":
+    def renamed(self, names: Mapping[str, str]) -> "MeasuredPlace":
         """With other names of beacons, from old to new."""
-        return HeardPlace(self.place_m, {names.get(name, name): level for name, level in self.levels_dbm.items()})
+        return MeasuredPlace(self.place_m, {names.get(name, name): level for name, level in self.levels_dbm.items()})
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,7 @@ class LevelLocator:
         Raises ValueError: there is no level.
         """
         if not any(name in levels_dbm for name in self.names):
-            raise ValueError(f"none of the beacons {', '.join(self.names)} was heard; a fix needs one at least")
+            raise ValueError(f"none of the beacons {', '.join(self.names)} was received; a fix needs one at least")
         log_weights = np.zeros(len(self.points_m))
         for i, name in enumerate(self.names):
             if name in levels_dbm:
@@ -115,7 +115,7 @@ class LevelLocator:
         return self._fits[beacon].predicted(np.maximum(distances, _NEAREST_M))
 
 
-def likeliest_names(locator: LevelLocator, places: Sequence[HeardPlace]) -> tuple[dict[str, str], float]:
+def likeliest_names(locator: LevelLocator, places: Sequence[MeasuredPlace]) -> tuple[dict[str, str], float]:
     """Which names the beacons of a data set with known places should have.
 
     Returns the likeliest permutation, from the name in the data to the beacon's, and how much its log-likelihood
@@ -134,36 +134,36 @@ def likeliest_names(locator: LevelLocator, places: Sequence[HeardPlace]) -> tupl
 
 
 def fingerprint_fits(
-    places: Sequence[HeardPlace], beacons_m: Mapping[str, tuple[float, float]], left_out: int | None = None
+    places: Sequence[MeasuredPlace], beacons_m: Mapping[str, tuple[float, float]], left_out: int | None = None
 ) -> dict[str, PathLossFit]:
     """Path loss of each beacon from its levels at known places, but for one of them.
 
     Raises PathLossError: no path loss follows from them.
     """
-    used = [heard for index, heard in enumerate(places) if index != left_out]
+    used = [place for index, place in enumerate(places) if index != left_out]
     found = {}
     for name, beacon_m in beacons_m.items():
         pairs = []
-        for heard in used:
-            if name in heard.levels_dbm:
-                distance_m = hypot(heard.place_m[0] - beacon_m[0], heard.place_m[1] - beacon_m[1])
-                pairs.append(LevelPair(max(distance_m, _NEAREST_M), heard.levels_dbm[name], heard.place_m))
+        for place in used:
+            if name in place.levels_dbm:
+                distance_m = hypot(place.place_m[0] - beacon_m[0], place.place_m[1] - beacon_m[1])
+                pairs.append(LevelPair(max(distance_m, _NEAREST_M), place.levels_dbm[name], place.place_m))
         found[name] = fit_path_loss(pairs)
     return found
 
 
-def judged(fixes: Sequence[LevelFix], places: Sequence[HeardPlace], probability: float) -> dict[str, Any]:
+def judged(fixes: Sequence[LevelFix], places: Sequence[MeasuredPlace], probability: float) -> dict[str, Any]:
     """Errors of fixes, and how many of the places their regions of a probability hold, for JSON."""
     points: list[dict[str, Any]] = []
-    for found, heard in zip(fixes, places, strict=True):
-        error_m = float(np.hypot(*(found.position_m - heard.place_m)))
+    for found, place in zip(fixes, places, strict=True):
+        error_m = float(np.hypot(*(found.position_m - place.place_m)))
         points.append(
             {
-                "true_m": list(heard.place_m),
+                "true_m": list(place.place_m),
                 "fix_m": [round(float(v), 4) for v in found.position_m],
                 "sigma_m": [round(float(v), 4) for v in np.sqrt(np.diag(found.covariance_m2))],
                 "error_m": round(error_m, 4),
-                "in_region": found.holds(heard.place_m, probability),
+                "in_region": found.holds(place.place_m, probability),
             }
         )
     errors = [point["error_m"] for point in points]

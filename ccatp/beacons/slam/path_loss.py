@@ -133,7 +133,7 @@ class PathLossFit:
         if self.reference_dbm > _LOUDEST_DBM:
             found.append(
                 f"reference level {self.reference_dbm:.1f} dBm is above {_LOUDEST_DBM:g} dBm, more than "
-                "a radio of 20 dBm is heard with: are the distances in metres?"
+                "a radio of 20 dBm is received with: are the distances in metres?"
             )
         if self.sigma_db < _EXACT_DB:
             found.append("levels lie on a line exactly: they were computed, not measured, and the widths mean nothing")

@@ -226,7 +226,7 @@ class SignalSlam(BeaconSlam):
 
     @property
     def moving_velocity_m_s(self) -> tuple[float, float]:
-        """Of the radio that moves; 0 before it was heard."""
+        """Of the radio that moves; 0 before it was received."""
         if self._moving.beacon not in self.engine:
             return 0.0, 0.0
         start = self.engine.block(self._moving.beacon).start + PLACE

@@ -291,13 +291,13 @@ def test_the_store_keeps_what_was_reached(cfg: RadioConfig, tmp_path: Path) -> N
     path = tmp_path / "mission.sqlite"
     store = BeaconStore(path, {"system": "zigbee"}, cfg.workspace.waypoints_m, 2)
     store.record_arrival(3.5, 5, WaypointArrival(1, 1, (2.2, 0.8), PoseBelief((2.1, 0.8, 0.0), np.eye(3))))
-    store.record_event(4.0, "warning", "held: no radio is heard")
+    store.record_event(4.0, "warning", "held: no beacon is received")
     store.close()
     with sqlite3.connect(path) as db:
         reached = db.execute("SELECT number, lap, waypoint, reached_s FROM waypoint WHERE reached_s NOTNULL").fetchall()
         assert reached == [(5, 1, 1, 3.5)]
         assert db.execute("SELECT count(*) FROM waypoint").fetchone() == (8,)
-        assert db.execute("SELECT text FROM event").fetchall() == [("held: no radio is heard",)]
+        assert db.execute("SELECT text FROM event").fetchall() == [("held: no beacon is received",)]
     db.close()
     with pytest.raises(BeaconStoreError, match="holds a mission already"):
         BeaconStore(path, {}, (), 0)
@@ -334,7 +334,7 @@ def test_silence_of_all_radios_holds_the_robot_until_they_are_heard_again() -> N
 @pytest.mark.parametrize(
     ("keys", "cause"),
     [
-        ({"sim__incidents": [{**SILENCE, "for_s": 1e4}]}, "no radio is heard for 30 s"),
+        ({"sim__incidents": [{**SILENCE, "for_s": 1e4}]}, "no beacon is received for 30 s"),
         (
             {"mission__time_limit_s": 60.0, "sim__incidents": [{**THING, "for_s": 1e4}]},
             "the mission takes longer than mission.time_limit_s",

@@ -124,7 +124,7 @@ def test_three_fixes_that_agree_are_right(filter_name: str, full: Any) -> None:
             found.fuse_fix(robot.fix(off_m=off))
     jump_m = found.fuse_fix(robot.fix(off_m=NEARLY[2]))
     assert jump_m == pytest.approx(sqrt(0.03**2 + 0.021**2), abs=3e-5)
-    assert found.notices == ["3 fixes in a row say that the pose is 36.6 mm wrong: it begins anew"]
+    assert found.notices == ["3 fixes in a row say that the pose is 36.6 mm wrong: it starts again"]
     assert (found.counts["fixes_gated"], found.counts["reinitialised"], found.counts["fixes"]) == (3, 1, 2)
     assert found.deck_pose.x_m == pytest.approx(robot.x_m + 0.03, abs=1e-9)
     assert found.deck_pose.heading_rad == pytest.approx(heading, abs=1e-12)

@@ -138,11 +138,11 @@ def test_what_passed_while_main_was_restarted_is_a_row(record: RunRecord) -> Non
     )
     changes = ((100, "idle", "driving"), (690, "idle", "settling"), (710, "settling", "done"))
     found = budget_of(record, *changes, statuses=statuses)
-    assert found.spent_s["start anew"] == pytest.approx(4.0)
+    assert found.spent_s["restart"] == pytest.approx(4.0)
     assert (found.mission_s, found.total_s) == pytest.approx((3.1, 7.1))
     sampled, _ = spells_of(replace(only(record), statuses=statuses, changes=()))
     assert [(state, round(duration_s, 6)) for state, duration_s in sampled] == [
-        ("driving", 2.0), ("driving", 0.1), ("start anew", 4.0),
+        ("driving", 2.0), ("driving", 0.1), ("restart", 4.0),
     ]  # fmt: skip
 
 

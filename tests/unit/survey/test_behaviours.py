@@ -373,7 +373,7 @@ def test_a_robot_without_the_sensor_is_waited_for_and_told() -> None:
     assert not found.update(10.0, None, pose)
     assert not found.update(10.0 + 0.99 * PATIENCE_S, None, pose)
     assert found.update(10.0 + PATIENCE_S, None, pose)
-    assert "tells no gravity" in found.warning
+    assert "reports no gravity" in found.warning
     assert not found.contradiction
 
 

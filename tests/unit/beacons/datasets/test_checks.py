@@ -104,7 +104,7 @@ WRONG: list[tuple[RecordedRun, str, str]] = [
     (replace(NEIGHBOURS, beacon_truth_m={**BEACONS, "8": (X + 0.3, Y), "9": (X, Y)}), "8 and 9 look exchanged", "feet"),
     (replace(SOUND, beacon_truth_m={**MIXED, "6": MIXED["8"], "8": MIXED["6"]}), "6 and 8 look exchanged", "feet"),
     (surveyed(_8=(9.0, 4.0)), "ranges of beacon 8 miss its surveyed place by", "exchanged"),
-    (surveyed(_8=(60.0, 60.0), _77=BEACONS["8"]), "surveyed beacons that were never heard: 77", "exchanged"),
+    (surveyed(_8=(60.0, 60.0), _77=BEACONS["8"]), "surveyed beacons without any reading: 77", "exchanged"),
     (replace(SOUND, beacon_truth_m={"6": BEACONS["6"], "7": BEACONS["7"]}), "a surveyed place: 8, 9", "exchanged"),
     (
         replace(SOUND, readings=READ.where((READ.times_s < 30.0) | (READ.times_s > 50.0))),

@@ -367,11 +367,11 @@ FAULTS: list[tuple[Make, str | None, str]] = [
     (_with("range,soon,6,2"), None, rf"mine\.csv:{LAST}: time_s is 'soon', not a number"),
     (_with("odom,3.0,7,7"), None, r"mine\.csv:\d+: two events odom at the same time say different things"),
     (_text("range,1,6,2.0"), None, r"data\.txt: no event odom \(time_s, distance_m, turn_rad"),
-    (_text("odom,0,0,0", "odom,1,0,0"), None, r"nothing heard of beacons: no event range, bearing, rssi"),
+    (_text("odom,0,0,0", "odom,1,0,0"), None, r"no readings of beacons: no event range, bearing, rssi"),
     (_text("odom,0,0,0", "odom,1,0,0", "range,0,a,1"), None, r"2 events odom: too few for a run"),
     (
         _text("odom,0,0,0", "odom,1,0,0", "odom,2,0,0", "range,9,a,1"), None,
-        r"nothing was heard of beacons within the time of the odometry",
+        r"no readings of beacons within the time of the odometry",
     ),
     (_with("range,1,,3"), None, rf"mine\.csv:{LAST}: range has no name of a beacon"),
     (_with("beacon,6,9,9"), None, rf"mine\.csv:{LAST}: beacon 6 was surveyed at another place before"),

@@ -10,7 +10,7 @@ import pytest
 from openpyxl import Workbook
 
 from ccatp.beacons.datasets.sheets import (
-    read_heard_places,
+    read_level_places,
     read_levels,
     read_log,
     read_places,
@@ -74,7 +74,7 @@ def test_levels_in_the_usual_shapes(tmp_path: Path, content: str) -> None:
 
 
 def test_places_with_levels_by_node(tmp_path: Path) -> None:
-    _, places, _ = read_heard_places(text(tmp_path, "Point,x,y,RSSI A,RSSI B\n1,0.5,1,56,60\n2,1,0,57,61\n"))
+    _, places, _ = read_level_places(text(tmp_path, "Point,x,y,RSSI A,RSSI B\n1,0.5,1,56,60\n2,1,0,57,61\n"))
     assert places[1].place_m == (1.0, 0.0)
     assert places[0].levels_dbm == {"A": -56.0, "B": -60.0}
 
@@ -116,7 +116,7 @@ REFUSALS: list[tuple[Callable[[Path], object], str, str]] = [
     (read_levels, "distance_m,rssi\n", NO_ROWS),
     (read_levels, "distance_m,rssi\n# far\n1,loud\n", r":3: column 2 is 'loud', not a number"),
     (read_levels, "distance_m,rssi\n1,-1e300\n", r":2: -1e\+300 in column 2 is no level and no place"),
-    (read_heard_places, "x,y,level\n1,2,-40\n", "has no column of levels by node"),
+    (read_level_places, "x,y,level\n1,2,-40\n", "has no column of levels by node"),
     (read_log, "Node A: -29\nNode A -30\n", r"a\.csv:2: .*is no line like"),
     (_ranges, f"{TWO}A,B,-1.0\n", ":2: range of -1 m is no distance"),
     (_ranges, f"{TWO}A,B,nan\n", ":2: range of nan m is no distance"),

@@ -125,7 +125,7 @@ def test_a_beacon_of_which_only_bearings_were_heard_is_told_so() -> None:
     run = recorded(world(3, 20.0))
     blind = run.readings._replace(range_m=np.full(len(run.readings.times_s), np.nan))
     told = track_of(replace(run, readings=blind)).warnings
-    assert "beacon 6 could not be placed: only bearings of it were heard, no range" in told
+    assert "beacon 6 could not be placed: only bearings of it were received, no range" in told
 
 
 def test_beacons_that_are_exchanged_on_the_way_are_told() -> None:
@@ -133,7 +133,7 @@ def test_beacons_that_are_exchanged_on_the_way_are_told() -> None:
     swap = np.where(run.readings.times_s > 60.0, np.array([1, 0, 2, 3])[run.readings.beacon], run.readings.beacon)
     told = track_of(replace(run, readings=run.readings._replace(beacon=swap))).warnings
     for name in ("6", "7"):
-        assert any(w.startswith(f"beacon {name} was placed anew at ") and "exchanged" in w for w in told)
+        assert any(w.startswith(f"beacon {name} was placed again at ") and "exchanged" in w for w in told)
 
 
 SCAN = ReflectorScan(ScanConfig(readings=40, bearing_sigma_rad=radians(18.0), loss_tolerance=0.5))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ccatp.beacons.slam.level_fix import HeardPlace, LevelLocator, Room, likeliest_names
+from ccatp.beacons.slam.level_fix import LevelLocator, MeasuredPlace, Room, likeliest_names
 from ccatp.beacons.slam.motion import Increment, Odometry, SlippingVehicle, Steering
 from ccatp.beacons.slam.path_loss import LevelPair, PathLoss, PathLossError, PathLossFit, fit_path_loss
 from ccatp.beacons.slam.recording import RssiReading
@@ -144,7 +144,7 @@ ROOM = Room((0.0, 0.0), (4.0, 4.0), 0.1)
 Levels = dict[str, float]
 
 
-def scene(seed: int, sigma_db: float, points: int) -> tuple[LevelLocator, list[HeardPlace]]:
+def scene(seed: int, sigma_db: float, points: int) -> tuple[LevelLocator, list[MeasuredPlace]]:
     """A locator calibrated at 40 places, and points with levels from the same model."""
     rng = np.random.default_rng(seed)
 
@@ -162,7 +162,7 @@ def scene(seed: int, sigma_db: float, points: int) -> tuple[LevelLocator, list[H
         distances = [max(float(np.hypot(p[0] - at[0], p[1] - at[1])), 0.1) for p in places]
         fits[name] = fit_path_loss(LevelPair(r, level(p, name), p) for r, p in zip(distances, places, strict=True))
     drawn = (draw() for _ in range(points))
-    heard = [HeardPlace(place, {name: level(place, name) for name in BEACONS}) for place in drawn]
+    heard = [MeasuredPlace(place, {name: level(place, name) for name in BEACONS}) for place in drawn]
     return LevelLocator(BEACONS, fits, ROOM), heard
 
 
@@ -177,7 +177,7 @@ def test_a_beacon_that_is_not_heard_is_left_out() -> None:
     levels = heard[0][1]
     fewer = locator.fix({"A": levels["A"]})
     assert fewer.region(0.9).sum() > locator.fix(levels).region(0.9).sum()
-    with pytest.raises(ValueError, match="none of the beacons A, B, C was heard"):
+    with pytest.raises(ValueError, match="none of the beacons A, B, C was received"):
         locator.fix({"D": -50.0})
 
 
