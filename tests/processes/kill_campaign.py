@@ -33,6 +33,7 @@ from ccatp.links.bus import Subscriber
 from ccatp.links.channels import format_request
 from ccatp.links.rpc import RequestFailed, request
 from ccatp.links.topics import MissionStatus, TruthMessage
+from ccatp.records.store import read_survey
 from ccatp.survey.planning.route import ORDERS
 from tests.support.runs import MODULES, NO_CALIBRATION, RecordedRun, wall_s
 from tests.support.scenario import mirror_of
@@ -45,13 +46,14 @@ LIMIT = "--set=run.restart_limit=1000"
 # A loose contact of an edge sensor: the robot backs off once in each session.
 RETREAT = '[[fault]]\nsignal = "edge_front_left"\ntype = "stuck"\nvalue = 0.0\nat_s = {:.2f}\nfor_s = 0.3\n'
 PROCESSES = ("supervisor", "dashboard", "dataloop", "etalon", "danger", "main")
-VICTIMS = {"main": 5, "danger": 5, "etalon": 2, "dashboard": 1, "dataloop": 1, "supervisor": 2}
-VICTIMS |= {"main danger": 2, "main etalon": 1, "main supervisor": 1, "danger dataloop": 1, " ".join(PROCESSES): 1}
+VICTIMS = {"main": 10, "danger": 10, "etalon": 4, "dashboard": 2, "dataloop": 2, "supervisor": 2}
+VICTIMS |= {"main danger": 4, "main etalon": 2, "main supervisor": 1, "danger dataloop": 1, " ".join(PROCESSES): 1}
 STRIKES = 16, 25  # of a mission
 STOPS = 0.25  # share of SIGSTOP; the rest are SIGKILL
-# The phase that is waited for before a strike, for so long at most, and the mean time after that.
-AIMS = {"any": 5, "leg": 2, "settling": 2, "measuring": 2, "held": 1, "retreat": 1, "dock": 0.5, "restart": 2}
-AIM_S, GAP_S = 3.0, 0.25
+# The phase that is waited for before a strike, for so long at most, and the mean time after that. What is rare is hit
+# whenever it comes; soon after a strike a process is being restarted.
+AIMS, RARE = {"any": 8, "leg": 8, "settling": 4, "measuring": 6, "held": 1}, ("retreat", "dock")
+AIM_S, ANY_S, GAP_S = 15.0, 0.5, 0.1
 PHASES = {"turning": "leg", "driving": "leg", "backing off": "retreat", "returning": "dock", "idle": "start"}
 JOINED = ("leg", "settling", "measuring", "retreat", "dock", "held")
 ENDED_S, MISSION_S = 30.0, 900.0
@@ -74,7 +76,7 @@ class Mission:
         self._panels = 1 if is_paced else 2
         self.row: dict[str, Any] = {"seed": seed, "mission": number, "world": WORLDS[number % 4]}
         self.row |= {"mirror": self._mirror, "mode": "real time" if is_paced else "lockstep"}
-        self._left, self._aborts = rng.randint(*STRIKES), rng.random() < 0.4
+        self._left, self._aborts, self._is_aborting = rng.randint(*STRIKES), rng.random() < 0.4, False
         self._last_aims = [aim for aim in ("end", "report") if rng.random() < 0.5]
         self._env = os.environ | ({} if rng.random() < 0.3 else {"MPLBACKEND": "none"})  # without a report
         self._flags = [*PORTS, *(["--realtime"] if is_paced else [])]
@@ -109,11 +111,15 @@ class Mission:
 
     def _session(self) -> int:
         """One `ccatp run`, new or resumed, to its end; its exit status."""
-        is_resumed = (self._run_dir / "mission.sqlite").exists()
+        store = self._run_dir / "mission.sqlite"
+        if is_resumed := store.exists():
+            stored = [point.status for point in read_survey(store, self._mirror).points].count("measured")
+            if stored < self._acknowledged:
+                self._problems.append(f"{self._acknowledged} measurements were acknowledged, {stored} are stored")
         self._status, self._before = None, "resume" if is_resumed else "start"
         command = [sys.executable, "-m", "ccatp", "run", "--sim", "--run-dir", str(self._run_dir), "--runtime-dir"]
         command += [str(self._runtime_dir), *self._flags, *(["--resume"] if is_resumed else self._begin)]
-        first, is_aborted = len(self._strikes), False
+        first = len(self._strikes)
         with (self._folder / "stdout").open("ab") as out, (self._folder / "stderr").open("ab") as err:
             self._supervisor = psutil.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=out, stderr=err, env=self._env, preexec_fn=die_with_parent
@@ -123,7 +129,7 @@ class Mission:
             self._strike()
         while self._is_running:
             if self._aborts and self._acknowledged > 2:
-                self._aborts, is_aborted = False, True
+                self._aborts, self._is_aborting = False, True
                 with suppress(RequestFailed):
                     request(f"ipc://{self._runtime_dir / 'control'}", format_request("abort"), timeout_s=2.0)
             elif self._left > 0:
@@ -136,8 +142,9 @@ class Mission:
         killed = {name for _, name, number, _ in self._strikes[first:] if number == "SIGKILL"}
         if "supervisor" not in killed:
             last = (self._folder / "stderr").read_text().splitlines()[-2:]
-            if not (status == 0 or (status == 3 and is_aborted) or (status == 4 and "dataloop" in killed)):
+            if not (status == 0 or (status == 3 and self._is_aborting) or (status == 4 and "dataloop" in killed)):
                 self._problems.append(f"status {status}: {last}")
+            self._is_aborting = self._is_aborting and status != 3  # one that was cut off is gone on with
             log = (self._run_dir / "log.jsonl").read_text()
             logged = [json.loads(line)["status"] for line in log.splitlines() if '"run_finished"' in line]
             if logged[-1:] != [status]:
@@ -200,8 +207,8 @@ class Mission:
 
     def _aim(self, phase: str, timeout_s: float) -> None:
         """Strike in a phase, or in another one after some time."""
-        end_s = time.monotonic() + (self._rng.expovariate(2.0) if phase == "any" else timeout_s)
-        while self._is_running and time.monotonic() < end_s and self._phase != phase:
+        end_s = time.monotonic() + (self._rng.expovariate(1.0 / ANY_S) if phase == "any" else timeout_s)
+        while self._is_running and time.monotonic() < end_s and self._phase not in (phase, *RARE):
             self._wait(0.01)
         self._wait(self._rng.expovariate(1.0 / GAP_S))
         self._strike()
