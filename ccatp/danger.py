@@ -150,7 +150,7 @@ class DangerMonitor(EmergencyRules):
         return self._map.place(pose, self._robot.edge_sensors_m[sensor])
 
     def _is_explained(self, sensor: int) -> bool:
-        """Whether the map has an edge of a panel near a sensor, as far as the estimate tells."""
+        """Whether the map has an edge of a panel near a sensor, by the estimate."""
         known, cfg = self._known, self._cfg
         if known is None:
             return True

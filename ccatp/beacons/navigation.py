@@ -283,7 +283,7 @@ class MoteNavigator(_DeadReckoning):
     """An EKF over the robot and all motes of the map.
 
     State: pose and its calibration, then the motes. The map joins with the joint covariance that its self-mapping left,
-    so that its errors, which hang together, count as such: ranges correct the robot as far as the map is known, and
+    so that its correlated errors count as such: ranges correct the robot as far as the map is known, and
     the map as far as the robot is. A range is z = |p - m| + noise.
     """
 

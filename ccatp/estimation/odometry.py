@@ -222,7 +222,7 @@ class Preintegrator:
 # Nothing but a counter gives exact zeros: this many samples in a row without another value.
 _ZEROS_OF_A_COUNTER = 8
 _COUNTER_NOISE = 1.0 / 12.0  # variance of a uniform distribution over one count
-_MIN_VARIANCE_RAD2 = 1e-10  # a third of a micrometre of travel: less would cost the filter digits and tell it nothing
+_MIN_VARIANCE_RAD2 = 1e-10  # a third of a micrometre of travel: less would cost the filter digits for nothing
 # A wheel that gave no sample for this long may have done anything meanwhile.
 _GAP_S = 0.02
 # So long a wheel without samples is taken to turn as it did lately.
@@ -318,7 +318,7 @@ class WheelAngle:
         for t, rate in zip(times_s, rates_rad_s, strict=True):
             dt = t - t0
             if dt > _LOST * period:
-                # A rate tells of its own period only; what the wheel did before it is taken from what it did lately.
+                # A rate holds for its own period only; what the wheel did before it is taken from what it did lately.
                 lost_s = dt - period
                 turned += self._mean_rate * lost_s
                 self._gap_rad += abs(self._mean_rate) * lost_s + (least if least < inf else 0.0)

@@ -94,7 +94,7 @@ class SlipPrior:
     """Carries slip and creep from leg to leg.
 
     Right and left slip are taken apart into their mean (what the distance shows) and their difference (what the
-    heading shows). Both wheels draw from one population, so both tell how much legs differ. Where legs hardly differ,
+    heading shows). Both wheels draw from one population, so both show how much legs differ. Where legs hardly differ,
     the next leg keeps the state and all its correlations; where each leg slips differently, it begins with the mean of
     all legs. How much they differ is learned (``SlipPopulation``); creep varies by a share of itself.
 

@@ -86,7 +86,7 @@ def best_motion(
 
     A, b of shape (n, d).
 
-    With ``mirrors`` R may be a reflection: ranges alone do not tell a map from its mirror image.
+    With ``mirrors`` R may be a reflection: ranges alone do not distinguish a map and its mirror image.
     """
     w = np.ones(len(source_m)) if weights is None else weights
     w = w / w.sum()

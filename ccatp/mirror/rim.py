@@ -59,7 +59,7 @@ class Outline:
         """The edges that decide the signed distance of a point within ``radius_m`` of (x, y).
 
         A distance changes by at most the way travelled: what lies further from the centre than the nearest edge by
-        more than twice the radius is nearest to no point of the disc. An upright edge tells inside from beyond, too,
+        more than twice the radius is nearest to no point of the disc. An upright edge separates inside and beyond, too,
         wherever its slab reaches into the disc.
         """
         limit_m = abs(self.signed_distance_m(x, y)) + 2.0 * radius_m + _ROUNDING_M

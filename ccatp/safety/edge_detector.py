@@ -76,7 +76,7 @@ Place = tuple[float, float]
 # The direction of a sensor's motion is taken over this length: far above what encoder noise adds up to at rest (1e-5 m
 # a minute), far below what a rule allows.
 DIRECTION_TRAVEL_M = 2e-4
-# Below this cosine the side from which a sensor came to a seam is not told by its direction any more.
+# Below this cosine the side from which a sensor came to a seam is not given by its direction any more.
 MIN_SIDE_COSINE = 0.3
 # A sensor that stays on this many times longer than it takes to clear an edge is on a panel, moving or not.
 LONG_ON = 10
@@ -262,7 +262,7 @@ class EdgeDetector:
     def _set_seam(self, axis: Axis) -> None:
         self._axis = axis
         across = self._direction[0] if axis == "x" else self._direction[1]
-        # Only where the robot's own translation brought the sensor here does its direction tell forth from back.
+        # Only where the robot's own translation brought the sensor here does its direction distinguish forth and back.
         known = not self.is_from_turn and not self._has_switched and abs(across) >= MIN_SIDE_COSINE
         self._side = (1.0 if across > 0.0 else -1.0) if known else 0.0
 

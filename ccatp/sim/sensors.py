@@ -193,7 +193,7 @@ def draw_rectangles(
     """The material of each panel as mounted: four draws per panel, in the order of ``mirror.panels``.
 
     An edge never shifts outwards by more than half the gap less half of ``MIN_GAP_M``: neighbours keep that much
-    between them, and every panel stays in its own cell, so that a cell and a rectangle tell what lies at a point.
+    between them, and every panel stays in its own cell, so that a cell and a rectangle give what lies at a point.
     """
     x_out = max(0.0, 5e-4 * (panels.pitch_x_mm - panels.size_x_mm) - 0.5 * MIN_GAP_M)
     y_out = max(0.0, 5e-4 * (panels.pitch_y_mm - panels.size_y_mm) - 0.5 * MIN_GAP_M)

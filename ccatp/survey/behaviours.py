@@ -243,7 +243,7 @@ class Retreat(msgspec.Struct, frozen=True, tag=True):
         self, tracker: LegTracker, motion: StateEstimate, is_clear: bool, verdict: Verdict, is_slow: bool
     ) -> "tuple[Retreat, Twist]":
         if not is_clear:
-            # The turn sweeps a corner off the panels. Off the rim, back; off what may be a seam, the fix tells.
+            # The turn sweeps a corner off the panels. Off the rim, back; off what may be a seam, the fix decides.
             step = RetreatStep.UNTURN if verdict.cause.startswith(RIM_AHEAD.message) else RetreatStep.OVER
             unturn = -copysign(1.0, self.away_rad)
             return replace(self, step=step, has_turned_away=True, unturn=unturn, turned_rad=0.0), STILL

@@ -263,7 +263,7 @@ Reaction = tuple[SurveyState, bool]  # the state, and whether that is all for th
 
 
 def _locate(survey: "Survey", s: SurveyState, _motion: StateEstimate, v: Verdict) -> Reaction:
-    """A sensor that stays off may be over a seam or the rim where the pose is wrong: one fix, at rest, tells."""
+    """A sensor that stays off may be over a seam or the rim where the pose is wrong: one fix, at rest, decides."""
     if s.mode is DONE or s.is_held_by_hand:
         return s, False
     if not s.has_looked:

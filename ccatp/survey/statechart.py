@@ -108,7 +108,7 @@ class Survey(HoldRules[SurveyState]):
         if s.budget.begun_s is None:
             s = replace(s, budget=s.budget._replace(begun_s=motion.t_s))
         if s.is_found:
-            # At an edge it stands until the danger loop knows where: what it met may have been a seam.
+            # At an edge it stands until the danger loop reports where: what it met may have been a seam.
             is_at_edge = verdict is not None and verdict.code is EventCode.NEAR_EDGE and s.fix is FixNeed.NONE
             until_s = motion.t_s + _NOTICED_S if is_at_edge else s.stands_until_s
             s = replace(s, is_found=False, stands_until_s=until_s)
@@ -396,7 +396,7 @@ class Survey(HoldRules[SurveyState]):
         s = replace(s, recoveries_s=(*times_s, t_s))
         if len(s.recoveries_s) > 1 + health.retries:
             return self.fault(s, cause, loses_pose=True)
-        # A filter that is frozen cannot tell when the robot stands.
+        # A filter that is frozen does not show when the robot stands.
         return replace(self.await_recovery(s, cause), resumes_after_s=t_s + health.retry_after_s)
 
     def _fixed(self, s: SurveyState, event: FixStored) -> SurveyState:

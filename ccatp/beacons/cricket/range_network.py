@@ -182,7 +182,7 @@ def _check_row(row: MoteRange, index: dict[str, int]) -> None:
 
 
 def _check_connected(network: RangeNetwork) -> None:
-    # Motes whose places are known hang together without any range.
+    # Motes whose places are known are connected without any range.
     known = np.flatnonzero(np.isfinite(network.known_m).all(axis=1))
     linked = np.concatenate([graph_pairs(network), np.column_stack([known[:-1], known[1:]])])
     labels = components(network.count, linked)

@@ -181,7 +181,7 @@ def begin_phase_two(cfg: CricketConfig, plan: MotePlan, first: FirstMap) -> Mote
     """The filter over the first motes of the stands, or over all motes where there are none, after phase 1.
 
     The printed prior, the covariance of Patil et al. eq. 25, is one variance for all coordinates. It is no prior of a
-    map by trilateration: its errors are centimetres to decimetres and hang together. Raises MappingError: phase 1 has
+    map by trilateration: its errors are centimetres to decimetres and correlated. Raises MappingError: phase 1 has
     left one of these motes without a place.
     """
     motes = list(plan.heads or plan.mapped)

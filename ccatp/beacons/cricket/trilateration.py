@@ -198,7 +198,7 @@ class Sketch:
         """Mean (n, d) and covariance (n d, n d) of the errors, by the parametric bootstrap (Efron 1979).
 
         At places close to those that were found, ranges with errors as they are expected are drawn, and the same steps
-        made of them. Derivatives give the size of the errors as well, but not how they hang together: from a small
+        made of them. Derivatives give the size of the errors as well, but not their correlations: from a small
         stand errors grow to decimetres, and along so wide an arc no line is a tangent everywhere. What a line takes to
         be known within a millimetre is known within centimetres. ``places_m``: where the motes might be, nan for those
         without a place, shape (n, d). Without draws the errors are those of the derivatives.

@@ -132,7 +132,7 @@ class Grazing(IntEnum):
 
     NONE = 0
     BESIDE = 1  # a sensor passes so near that errors may carry it over the gap
-    ALONG = 2  # a sensor runs along within the gap: an edge, as far as anybody can tell
+    ALONG = 2  # a sensor runs along within the gap: it cannot be distinguished from an edge
 
 
 _GRAZING_M = (0.0, 0.4, 4.0)  # what a way may be longer to be without

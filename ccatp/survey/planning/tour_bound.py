@@ -14,7 +14,7 @@ from ccatp.core import FloatArray, IntArray, PointId
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.search import STRAIGHT_RAD
 
-# Legs to so many nearest places, at least, are told apart: the eight around a point of the grid. All further legs of
+# Legs to so many nearest places, at least, are distinguished: the eight around a point of the grid. All further legs of
 # a place count as its shortest two of them.
 _NEAR = 8
 _NONE = -1  # in place of a near leg: a far one, or none
