@@ -163,11 +163,12 @@ async def test_long_and_slow_bodies_are_refused(rig: Rig) -> None:
     assert (await rig.ask("GET", "/status", content_length="65537")).code == 413
 
 
-async def test_an_endless_body_ends_with_its_connection(rig: Rig) -> None:
+@pytest.mark.parametrize(("request_line", "code"), [(b"POST /pause", b"401"), (b"GET /events", b"200")])
+async def test_an_endless_body_ends_with_its_connection(rig: Rig, request_line: bytes, code: bytes) -> None:
     reader, writer = await asyncio.open_connection("127.0.0.1", rig.port)
-    writer.write(b"POST /pause HTTP/1.1\r\nhost: localhost\r\ntransfer-encoding: chunked\r\n\r\n")
+    writer.write(request_line + b" HTTP/1.1\r\nhost: localhost\r\ntransfer-encoding: chunked\r\n\r\n")
     async with asyncio.timeout(DEADLINE_S):
-        assert (await reader.readuntil(b"}\n")).startswith(b"HTTP/1.1 401 ")
+        assert (await reader.readuntil(b"}\n")).startswith(b"HTTP/1.1 " + code)
         with contextlib.suppress(ConnectionError):
             while True:
                 writer.write(CHUNK)

@@ -188,13 +188,14 @@ class RequestCheckMiddleware:
         """Serve one request."""
         request = Headers(scope=scope)
         length = int(request.get("content-length", 0))
-        is_unread = length > 0 or "transfer-encoding" in request
+        is_unread, left = length > 0 or "transfer-encoding" in request, MAX_UNREAD_BYTES
 
         async def receive_body() -> Message:
-            nonlocal is_unread
+            nonlocal is_unread, left
             message = await receive()
-            is_unread = bool(message.get("more_body"))
-            return message
+            left -= len(message.get("body", b""))
+            is_unread = bool(message.get("more_body")) and left > 0
+            return message if left > 0 else {"type": "http.disconnect"}
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -205,11 +206,10 @@ class RequestCheckMiddleware:
                     headers["connection"] = "close"
             elif is_unread and not message.get("more_body"):
                 await send({**message, "more_body": True})
-                left = MAX_UNREAD_BYTES
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(self._cfg.slow_client_s):
-                        while left > 0 and is_unread:
-                            left -= len((await receive_body()).get("body", b""))
+                        while (await receive_body()).get("more_body"):
+                            pass
                 message = {"type": "http.response.body"}
             await send(message)
 
@@ -381,7 +381,7 @@ class LimitedProtocol(H11Protocol):
 
     def _find_surplus(self) -> "LimitedProtocol | None":
         """The connection that gives way to this one: this one where all others are commands."""
-        address_of = {one: one.client[0] for one in self.connections if isinstance(one, LimitedProtocol) and one.client}
+        address_of = {one: one.client and one.client[0] for one in self.connections if isinstance(one, LimitedProtocol)}
         number_at = Counter(address_of.values())
         if number_at[address_of[self]] > self.max_connections // 2:
             addresses = {address_of[self]}
