@@ -17,7 +17,7 @@ from ccatp.config.load import load_config
 from ccatp.links.topics import TOPICS
 from ccatp.records.recorder import iter_messages
 from tests.processes.conftest import Start
-from tests.support.runs import RecordedRun, Run
+from tests.support.runs import DEADLINE_S, NO_CALIBRATION, RecordedRun, Run
 
 FIRE = {"channel": "emergency", "kind": "fire", "id": "8c0e5f9e-6a1f-4b8e-9a51-0d5b2f4f2f10"}
 SOUND = {"true_edges": 0, "false_edges": 0, "falls": 0, "max_overrun_mm": 0.0}
@@ -136,6 +136,18 @@ def test_a_run_directory_and_a_runtime_directory_belong_to_one_run(start: Start,
     assert second.wait() == 1
     assert second.stderr.count("\n") == 1
     assert "another ccatp runs" in second.stderr
+
+
+def test_simulations_run_at_the_same_time_from_one_directory(tmp_path: Path, runtime_dir: Path) -> None:
+    env = os.environ | {"CCATP_RUNTIME_DIR": str(runtime_dir), "MPLBACKEND": "none"}
+    command = [sys.executable, "-m", "ccatp", "run", "--sim", "--panels", "1", "--json", *NO_CALIBRATION]
+    pipe = subprocess.PIPE
+    runs = [subprocess.Popen(command, cwd=tmp_path, env=env, stdout=pipe, stderr=pipe, text=True) for _ in range(3)]
+    for run in runs:
+        out, err = run.communicate(timeout=5.0 * DEADLINE_S)
+        assert run.returncode == 0, err
+        assert json.loads(out)["points"]["measured"] == 9
+    assert len(list((tmp_path / "runs").iterdir())) == 3
 
 
 def test_bad_peers_leave_the_survey_undisturbed_and_an_abort_leads_to_base(start: Start) -> None:

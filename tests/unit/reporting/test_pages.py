@@ -17,7 +17,7 @@ from ccatp.records.state_log import LogLine
 from ccatp.report.compare import RunPair, compare_lines, compare_page, compared_figures
 from ccatp.report.findings import findings_of, outcome_of
 from ccatp.report.html import POLICY, environment, events_of
-from ccatp.report.record import read_record
+from ccatp.report.record import changed_keys, read_record
 from ccatp.report.run_page import report_run, run_page
 from tests.support.command import answered, refused
 from tests.unit.reporting.conftest import Markup
@@ -166,6 +166,14 @@ def test_a_run_beside_itself_says_that_nothing_differs(recorded: Path) -> None:
     lines = compare_lines(RunPair(found, found))
     assert lines[0] == "no figure differs"
     assert lines[1].startswith("the surveys agree")
+
+
+def test_ports_that_a_simulation_chose_are_no_change() -> None:
+    shipped = {"robot": {"port": 7010}, "sim": {"robot": {"port": 7010}, "frame": 1}}
+    chosen = {"robot": {"port": 40001}, "sim": {"robot": {"port": 0}, "frame": 2}}
+    assert changed_keys(chosen, shipped) == {"sim.frame": (2, 1)}
+    given = {"robot": {"port": 40001}, "sim": {"robot": {"port": 40001}, "frame": 1}}
+    assert list(changed_keys(given, shipped)) == ["robot.port", "sim.robot.port"]
 
 
 def test_different_mirrors_are_not_compared_point_by_point(recorded: Path, tmp_path: Path) -> None:
