@@ -158,7 +158,8 @@ class FullStateLocalizer(LocalizerBase):
         block = self._block.take()
         self._half_s = 0.5 * block.dt_s
         self._estimate.journal.begin(t_s, block.dt_s)
-        self._estimate.move(block, self._right, self._left, (self._gyro.variance, self._accelerometer.variance))
+        variances = self._gyro.variance, self._accelerometer.variance
+        self._estimate.move(t_s, block, self._right, self._left, variances)
         mean = self._filter.mean
         self._check_speeds(float(mean[V]), float(mean[W]))
 

@@ -167,27 +167,30 @@ class Preintegrator:
     """Gathers frames into blocks, in which the path is an arc.
 
     The mean rate is that of the samples by the trapezoid rule, the difference of two mean speeds the mean acceleration
-    from middle to middle.
+    from middle to middle. Frames without a sample lengthen the trapezoid to the next one: the unit may be slower than
+    the frames.
     """
 
     def __init__(self) -> None:
         self._last: tuple[float, float] | None = None  # acceleration and rate at the end of the last frame
         self._before: float | None = None  # mean acceleration of the last block
+        self._missed = 0  # frames without a sample since the last one
         self._clear()
 
     def _clear(self) -> None:
         self.dt_s = self._turning_s = self._rates = self._accelerations = 0.0
-        self._samples = 0
+        self._samples = self._frames = 0
 
     def restart(self) -> None:
         """The robot's clock has jumped, or it has been at rest: nothing reaches across."""
         self._last = self._before = None
+        self._missed = 0
         self._clear()
 
     def stand(self, imu: Sequence[ImuSample]) -> None:
         """A frame at rest: its sample is where the trapezoid of the first moving frame begins."""
         self._last = (imu[-1][1], imu[-1][2]) if imu else None
-        self._before = None
+        self._before, self._missed = None, 0
 
     def add(self, dt_s: float, imu: Sequence[ImuSample], *, is_turning: bool) -> None:
         """Take a frame of length ``dt_s``; of the inertial unit its last sample."""
@@ -195,36 +198,44 @@ class Preintegrator:
         if is_turning:
             self._turning_s += dt_s
         if not imu:
-            self._last = None
+            self._missed += 1
+            if self._missed > _MOST_MISSED:
+                self._last = None
             return
         _, ax, wz = imu[-1]
-        last = self._last
+        last, frames, self._missed = self._last, self._missed + 1, 0
         if last is not None:
-            self._accelerations += last[0] + ax
-            self._rates += last[1] + wz
+            self._accelerations += frames * (last[0] + ax)
+            self._rates += frames * (last[1] + wz)
+            self._frames += frames
             self._samples += 1
         self._last = (ax, wz)
 
     def take(self) -> PreintegratedMotion:
         """The block so far; gathering begins again."""
-        n = self._samples
+        n = self._frames
         rate = acceleration = None
         if n:
             rate, acceleration = 0.5 * self._rates / n, 0.5 * self._accelerations / n
         before, self._before = self._before, acceleration
         if acceleration is not None and before is not None:
             acceleration = 0.5 * (before + acceleration)
-        block = PreintegratedMotion(self.dt_s, self._turning_s, rate, acceleration, n)
+        block = PreintegratedMotion(self.dt_s, self._turning_s, rate, acceleration, self._samples)
         self._clear()
         return block
 
 
+# Frames without a sample of the inertial unit over which a trapezoid still reaches: 20 Hz and frames of 100 Hz.
+_MOST_MISSED = 4
 # Nothing but a counter gives exact zeros: this many samples in a row without another value.
 _ZEROS_OF_A_COUNTER = 8
 _COUNTER_NOISE = 1.0 / 12.0  # variance of a uniform distribution over one count
 _MIN_VARIANCE_RAD2 = 1e-10  # a third of a micrometre of travel: less would cost the filter digits for nothing
 # A wheel that gave no sample for this long may have done anything meanwhile.
 _GAP_S = 0.02
+# A sample this shortly before the end of its frame is taken at its end.
+_SAME_S = 1e-4
+_WHEEL_ACCELERATION_RAD_S2 = 10.0  # limits.a_max_m_s2 and alpha_max_rad_s2 together, on wheels of 30 mm
 # So long a wheel without samples is taken to turn as it did lately.
 _BRIDGED_S = 0.1
 _LOST = 1.5  # periods between two samples of a counter beyond which one is missing
@@ -347,6 +358,13 @@ class WheelAngle:
         """What may be wrong with the angle for want of samples, rad; reset by the call."""
         gap_rad, self._gap_rad = self._gap_rad, 0.0
         return gap_rad
+
+    def angle_at(self, t_s: float) -> tuple[float, float]:
+        """The angle at the end of a frame, rad, and what its variance grows by where the last sample is older."""
+        lag_s = t_s - self._t_s
+        if not self.is_fresh or not _SAME_S < lag_s < _BRIDGED_S:
+            return self.angle_rad, 0.0
+        return self.angle_rad + self._rate * lag_s, (_WHEEL_ACCELERATION_RAD_S2 * lag_s * lag_s) ** 2
 
     def rest(self, rates_rad_s: Sequence[float]) -> None:
         """Learn from the samples of a wheel that stands."""

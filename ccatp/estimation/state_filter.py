@@ -71,9 +71,14 @@ class SurveyFilter:
     # -- motion -------------------------------------------------------------------------------------------------------
 
     def move(
-        self, block: PreintegratedMotion, right: WheelAngle, left: WheelAngle, imu_variances: tuple[float, float]
+        self,
+        t_s: float,
+        block: PreintegratedMotion,
+        right: WheelAngle,
+        left: WheelAngle,
+        imu_variances: tuple[float, float],
     ) -> None:
-        """A block of frames: predict, then update with wheel angles, angular rate and acceleration that were read."""
+        """Frames up to ``t_s``: predict, then update with wheel angles, angular rate and acceleration."""
         dt_s = block.dt_s
         slip, creep = self._legs.wander(block.turning_s) if dt_s > 0.0 else (0.0, 0.0)
         encoders = self.encoder_walk(right) * dt_s
@@ -84,7 +89,8 @@ class SurveyFilter:
         if right.is_fresh or left.is_fresh:
             gap_rad = right.take_gap() + left.take_gap()
             variance = max(right.variance_rad2(), left.variance_rad2()) + gap_rad * gap_rad
-            readings += (sm.PR, right.angle_rad, variance), (sm.PL, left.angle_rad, variance)
+            for state, (angle_rad, lag_rad2) in ((sm.PR, right.angle_at(t_s)), (sm.PL, left.angle_at(t_s))):
+                readings.append((state, angle_rad, variance + lag_rad2))
         if block.acceleration_m_s2 is not None and self._full.use.accelerometer:
             # Set points jump, and the acceleration with them, anywhere between two samples.
             jump = self._full.acceleration_jump_m_s2**2

@@ -98,6 +98,28 @@ def test_means_over_a_block() -> None:
     assert second.acceleration_m_s2 == pytest.approx(0.04, abs=1e-15)
 
 
+@pytest.mark.parametrize(("every", "samples"), [(1, 4), (2, 2), (4, 1), (5, 0), (8, 0)])
+def test_an_inertial_unit_slower_than_the_frames(every: int, samples: int) -> None:
+    builder = Preintegrator()
+    builder.stand([ImuSample(0.0, 0.0, 0.0)])
+    for frame in range(1, 5):
+        t = 0.01 * frame
+        builder.add(0.01, [] if frame % every else [ImuSample(t, t, t)], is_turning=True)
+    block = builder.take()
+    assert block.samples == samples
+    assert block.rate_rad_s == (pytest.approx(0.02, abs=1e-15) if samples else None)
+
+
+def test_a_unit_that_is_silent_for_longer_begins_a_new_sum() -> None:
+    for silent, samples in ((4, 1), (5, 0)):  # a rate of 20 Hz, and less
+        builder = Preintegrator()
+        builder.stand([ImuSample(0.0, 0.0, 0.0)])
+        for _ in range(silent):
+            builder.add(0.01, [], is_turning=True)
+        builder.add(0.01, [ImuSample(0.05, 1.0, 1.0)], is_turning=True)
+        assert builder.take().samples == samples
+
+
 def test_nothing_reaches_across_a_restart_or_a_rest() -> None:
     for forget in (Preintegrator.restart, lambda builder: builder.stand([])):
         builder = Preintegrator()
@@ -111,6 +133,18 @@ def test_nothing_reaches_across_a_restart_or_a_rest() -> None:
     builder.add(0.01, [], is_turning=True)
     builder.restart()
     assert builder.take().dt_s == 0.0
+
+
+def test_an_encoder_slower_than_its_frames_is_taken_at_their_ends() -> None:
+    wheel = WheelAngle()
+    wheel.add([0.000, 0.004, 0.008], [3.0, 3.0, 3.0], 0.01)
+    angle_rad, lag_rad2 = wheel.angle_at(0.01)
+    assert angle_rad == pytest.approx(3.0 * 0.01)
+    assert 0.0 < lag_rad2 < 1e-8  # 3 um of travel
+    wheel.add([0.012, 0.016, 0.02], [3.0, 3.0, 3.0], 0.01)
+    assert wheel.angle_at(0.02) == (wheel.angle_rad, 0.0)
+    wheel.add([], [], 0.01)  # bridged to its end already
+    assert wheel.angle_at(0.03) == (wheel.angle_rad, 0.0)
 
 
 DT_S = 1e-3
