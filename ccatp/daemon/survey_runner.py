@@ -277,7 +277,8 @@ class SurveyRunner(MissionRunner):
         if command.inflates_covariance or state.wants_calibration or state.full_fans or state.hold.is_fault:
             self._apply_requests(frame.sensors, command)
             state = mission.state
-        right, left = gate.pass_through(command.twist, verdict, motion.dt_s, motion.t_s, lag_s, state.purpose)
+        # A verdict has the robot's own time, which may have jumped.
+        right, left = gate.pass_through(command.twist, verdict, motion.dt_s, frame.sensors.t, lag_s, state.purpose)
         if gate.denial is not None:
             self._gate_log.update(motion.t_s)
         if command.at_rest or command.measure:

@@ -14,12 +14,15 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import msgspec
 import pytest
 
 import ccatp
 from ccatp.daemon.danger_loop import DangerLoop
 from ccatp.daemon.main_loop import MainLoop
 from ccatp.errors import ExitStatus
+from ccatp.links.robot_codec import decode_from_robot
+from ccatp.links.robot_messages import Sensors
 from ccatp.survey.state import FixNeed, Pause, Resume
 from tests.faults.linking import Measured
 from tests.support.daemon import Daemon, configuration, running_daemon, tell
@@ -250,6 +253,29 @@ async def test_a_robot_whose_clock_is_wrong_by_a_hundredth_is_not_late(rate: flo
             await daemon.until(lambda: daemon.robot.robot.t_s > begun_s + 8.0)
             # By then it would be late by 80 ms, and for good.
             await moving_again(daemon, asyncio.get_running_loop().time())
+            assert not daemon.main._runner.mission.state.is_faulted
+
+
+@pytest.mark.fault("S12")
+@pytest.mark.parametrize("by_s", [5.0, -3.0])
+async def test_it_drives_on_by_verdicts_of_the_new_time_after_the_robots_clock_has_jumped(by_s: float) -> None:
+    offset_s = 0.0
+
+    def decode(line: bytes) -> Any:
+        frame = decode_from_robot(line)
+        if not offset_s or not isinstance(frame, Sensors):
+            return frame
+        rows = {name: getattr(frame, name) for name in ("imu", "enc", "edge")}
+        later = {name: [row._replace(t_s=row.t_s + offset_s) for row in found] for name, found in rows.items()}
+        return msgspec.structs.replace(frame, t=frame.t + offset_s, gravity=None, **later)
+
+    clock = asyncio.get_running_loop().time
+    with patch("ccatp.links.robot_link.decode_from_robot", decode):
+        async with running_daemon(configuration()) as daemon:
+            await daemon.until(lambda: daemon.is_driving)
+            offset_s = by_s
+            await daemon.until(lambda: not daemon.is_driving)
+            await moving_again(daemon, clock() + 2.0)
             assert not daemon.main._runner.mission.state.is_faulted
 
 
