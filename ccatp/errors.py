@@ -1,7 +1,12 @@
 """The errors that end a command: each is one line for the reader and an exit status for scripts."""
 
+import re
 from collections.abc import Sequence
 from enum import IntEnum
+
+# What a terminal obeys instead of showing it, and halves of characters, which no encoding takes.
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+LONGEST_LINE = 300  # characters of one message
 
 
 class ExitStatus(IntEnum):
@@ -16,13 +21,25 @@ class ExitStatus(IntEnum):
     INTERRUPTED = 130  # wheels held, state saved
 
 
+def printable(text: str) -> str:
+    """A text with backslash escapes in place of control characters other than tabs and line feeds."""
+    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+def one_line(text: str, longest: int = LONGEST_LINE) -> str:
+    """A text as one printable line; a long one without its middle, since a message ends with what to do."""
+    line = printable(" ".join(text.split()))
+    begin, end = 2 * longest // 3, longest // 3 - 3
+    return line if len(line) <= longest else f"{line[:begin]}...{line[-end:]}"
+
+
 class CcatpError(Exception):
     """An expected end with an ``exit_status``: ``str(error)`` is one line that says what is wrong and what to do."""
 
     exit_status: int = ExitStatus.HELD
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(message.split()))
+        super().__init__(one_line(message))
 
 
 class ConfigError(CcatpError):
@@ -31,10 +48,10 @@ class ConfigError(CcatpError):
     exit_status = ExitStatus.USAGE
 
     def __init__(self, *problems: str, shows_all: bool = False) -> None:
-        self.problems: Sequence[str] = [" ".join(problem.split()) for problem in problems]
+        self.problems: Sequence[str] = [one_line(problem) for problem in problems]
         others = "; ".join(self.problems[1:]) if shows_all else "ccatp config check"
         more = f" (and {len(problems) - 1} more: {others})" if len(problems) > 1 else ""
-        super().__init__(self.problems[0] + more)
+        Exception.__init__(self, self.problems[0] + more)
 
 
 class RefusedError(CcatpError):

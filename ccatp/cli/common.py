@@ -1,10 +1,12 @@
 """What every command shares: one-line errors, exit statuses, options, talk with a running daemon."""
 
+import errno
+import io
 import math
 import os
 import sys
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,10 @@ import click
 from click.shell_completion import CompletionItem
 
 from ccatp.config.package import configs_dir
-from ccatp.errors import CcatpError, ConfigError, ExitStatus
+from ccatp.errors import CcatpError, ConfigError, ExitStatus, one_line, printable
 
 Command = Callable[..., Any]
+_NOT_WRITTEN = (errno.ENOSPC, errno.EIO, errno.EBADF)  # a full device, a closed terminal, a stream for reading
 # Former names of commands, and what they are called now.
 RENAMED_COMMANDS = {"log": "recording", "recover": "repair", "map": "plot"}
 # Longer than any answer takes; what libzmq waits for is an int of milliseconds.
@@ -106,53 +109,88 @@ class CommandGroup(click.Group):
 def run_command_line(group: click.Group, argv: Sequence[str] | None = None) -> int:
     """Run a command line (that of the process if ``None``) and return the exit status.
 
-    Expected errors become one line on standard error, never a traceback.
+    Errors become one line on standard error, never a traceback.
     """
     # Matrices are small: threads would compete for the cores, and another number of them may round differently.
     # Set before numpy is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    _prepare_streams()
+    try:
+        status = _status_of(group, argv)
+    except Exception as error:
+        from ccatp.config.files import keep_traceback
+
+        status = complain(keep_traceback(error), ExitStatus.REFUSED)
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:  # what is left in it goes nowhere
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    return status
+
+
+def _status_of(group: click.Group, argv: Sequence[str] | None) -> int:
     try:
         status = group.main(args=argv, prog_name="ccatp", standalone_mode=False)
+        sys.stdout.flush()
     except click.exceptions.NoArgsIsHelpError as error:
-        click.echo(error.format_message(), err=True)
+        with suppress(OSError):
+            click.echo(error.format_message(), err=True)
         return ExitStatus.USAGE
-    except click.UsageError as error:
-        where = f"; see {error.ctx.command_path} --help" if error.ctx else ""
-        return complain(error.format_message().rstrip(".") + where, ExitStatus.USAGE)
     except (click.ClickException, ModuleNotFoundError) as error:
         missing = f"the package {getattr(error, 'name', '')} is not installed; install ccatp with all its dependencies"
-        what = error.format_message() if isinstance(error, click.ClickException) else missing
-        return complain(what, ExitStatus.USAGE)
+        what = error.format_message().rstrip(".") if isinstance(error, click.ClickException) else missing
+        context = getattr(error, "ctx", None)
+        where = f"; see {context.command_path} --help" if context else ""
+        return complain(one_line(what + where), ExitStatus.USAGE)
     except CcatpError as error:
         return complain(str(error), error.exit_status)
     except (click.Abort, KeyboardInterrupt):
         return complain("interrupted", ExitStatus.INTERRUPTED)
-    except BrokenPipeError:  # the reader of our output has seen enough; keep the interpreter from flushing into it
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # the reader of our output has seen enough
         return ExitStatus.REFUSED
-    except OSError as error:  # too long a name, a folder that is not ours
+    except OSError as error:
+        if error.filename is None and error.errno in _NOT_WRITTEN:
+            return complain(f"output cannot be written: {error.strerror}", ExitStatus.USAGE)
         if error.filename is None:
             raise
-        return complain(f"{error.filename}: {error.strerror}; give another path, or correct this one", ExitStatus.USAGE)
+        # too long a name, a folder that is not ours
+        what = f"{error.filename}: {error.strerror}; give another path, or correct this one"
+        return complain(one_line(what), ExitStatus.USAGE)
     return int(status or 0)
+
+
+def _prepare_streams() -> None:
+    """Closed standard streams lead nowhere, not to the next file that is opened; any text can be written."""
+    for fd in range(3):
+        try:
+            os.fstat(fd)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+    sys.stdout = sys.stdout or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
+    sys.stderr = sys.stderr or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def complain(message: str, status: int) -> int:
     """One line on standard error; returns ``status``."""
-    click.echo(f"ccatp: {' '.join(message.split())}", err=True)
+    with suppress(OSError):  # nobody reads it
+        click.echo(f"ccatp: {printable(' '.join(message.split()))}", err=True)
     return int(status)
 
 
 def warn(warnings: Iterable[str]) -> None:
     """A line on standard error for each warning."""
     for warning in warnings:
-        complain(f"warning: {warning}", 0)
+        complain(f"warning: {one_line(warning)}", 0)
 
 
 def print_lines(lines: Iterable[str]) -> None:
     """Lines on standard output."""
     for line in lines:
-        click.echo(line)
+        click.echo(printable(line))
 
 
 def write_lines(option: str, path: Path, lines: Iterable[str]) -> None:
@@ -196,14 +234,18 @@ def parse_setting(text: str) -> tuple[str, object]:
 
     Raises ValueError: there is no key or no ``=``.
     """
+    from ccatp.config.messages import MOST_PARTS, parse_toml
+
     key, equals, value = text.partition("=")
-    key = key.strip()
-    if not equals or not all(key.split(".")):
+    parts = key.strip().split(".")
+    if not equals or not all(parts) or len(parts) > MOST_PARTS:
         raise ValueError(f"{text!r} is not KEY=VALUE, as in run.seed=2")
     try:
-        return key, tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        return key, value.strip()
+        found = parse_toml(f"value = {value}", "")
+    except ConfigError:
+        found = {}
+    # More than one line of TOML is a text, too.
+    return key.strip(), found["value"] if len(found) == 1 else value.strip()
 
 
 def _changes(ctx: click.Context) -> dict[str, object]:

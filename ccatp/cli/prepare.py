@@ -200,13 +200,14 @@ def _replaced(config_file: Path | None, driven: "Config") -> "Config":
 
 def _write(config_file: Path | None, table: "tuple[CalibrationRow, ...]", *, dry_run: bool) -> tuple[str | None, str]:
     """The file written, if one was, and what changes in it."""
-    from ccatp.config.load import difference, load_config, with_values, write_file
+    from ccatp.config.files import read_toml, write_file
+    from ccatp.config.load import difference, load_config, with_values
 
     values = {row.key: row.rounded for row in table}
     if config_file is None:
         return None, "".join(f"{key} = {value}\n" for key, value in values.items())
     load_config(config_file, values)  # what would be refused later is refused now
-    before = config_file.read_text(encoding="utf-8")
+    before = read_toml(config_file)
     after = with_values(before, values, config_file)
     changed = difference(before, after, config_file)
     if dry_run or not changed:

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from ccatp.config.models import (
     DashboardConfig,
+    Host,
     LinkConfig,
     Model,
     NonNegative,
@@ -85,7 +86,7 @@ class ListenerConfig(Model):
 class SimBeaconRobotConfig(Model):
     """The DataLoop: the robot's stand-in."""
 
-    host: str
+    host: Host
     port: Annotated[int, Field(ge=0, le=65535)]
     ttl_s: Positive
 

@@ -2,10 +2,9 @@
 
 import difflib
 import json
-import os
-import tempfile
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from ccatp.config.beacon_models import RadioConfig, RecordingsConfig
 from ccatp.config.checks import check_config, check_radio_config, is_file_name
+from ccatp.config.files import read_toml
 from ccatp.config.messages import (
     ConfigProblem,
     Key,
@@ -23,7 +23,6 @@ from ccatp.config.messages import (
     format_key,
     format_value,
     parse_toml,
-    read_text,
 )
 from ccatp.config.models import Config, MirrorConfig, WorldConfig
 from ccatp.config.package import configs_dir
@@ -49,6 +48,7 @@ _WHOLE: tuple[Key, ...] = (
     ("cricket", "motes"),
     ("cricket", "anchors"),
 )
+_MOST_PROBLEMS = 10  # that one error lists
 # In comments: a stand-in value, and what takes its place.
 UNVERIFIED, MEASURED = "UNVERIFIED", "measured by ccatp calibrate"
 
@@ -85,7 +85,7 @@ def read_source(path: Path, root: Key = ()) -> ConfigSource:
 
     Raises ConfigError: there is no such file, or it is not TOML.
     """
-    text = read_text(path)
+    text = read_toml(path)
     return ConfigSource(str(path), text, parse_toml(text, str(path)), root)
 
 
@@ -169,11 +169,13 @@ def validated(
         # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
         cfg = model.model_validate_json(json.dumps(tree, default=str), strict=True)
     except ValidationError as error:
-        problems = faults_of(error.errors(), model)
+        problems = list(islice(faults_of(error.errors(include_url=False), model), _MOST_PROBLEMS + 1))
     else:
-        problems = list(check(cfg))
+        problems = list(islice(check(cfg), _MOST_PROBLEMS + 1))
         if not problems:
             return cfg
+    if len(problems) > _MOST_PROBLEMS:
+        problems[-1] = problems[-1]._replace(what="is wrong as well, and maybe others; correct the first ones")
     raise ConfigError(
         *(
             f"{_place(sources, problem.key, *problem.related)}: {format_key(problem.key)} {problem.what}"
@@ -363,35 +365,3 @@ def difference(before: str, after: str, file: Path) -> str:
     """What would change, as a unified diff; empty where nothing does."""
     old, new = before.splitlines(keepends=True), after.splitlines(keepends=True)
     return "".join(difflib.unified_diff(old, new, fromfile=str(file), tofile=f"{file} (new)"))
-
-
-def write_file(path: Path, text: str, mode: int | None = None, *, is_replacing: bool = True) -> None:
-    """Write a file at once: a reader finds all of it or the old one, also after a power cut.
-
-    ``mode``: that of the old file by default. Where ``path`` is a link, what it points to is replaced. Raises
-    ConfigError: it cannot be written, or is there and not to be replaced.
-    """
-    path = path.resolve()
-    new: Path | None = None
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        new = Path(name)
-        with os.fdopen(handle, "w", encoding="utf-8") as out:
-            out.write(text)
-            out.flush()
-            os.fchmod(out.fileno(), path.stat().st_mode & 0o7777 if mode is None else mode)
-            os.fsync(out.fileno())
-        if is_replacing:
-            new.replace(path)
-        else:
-            os.link(new, path)  # unlike a rename, this fails where the file exists by now
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        if new is not None:
-            new.unlink(missing_ok=True)

@@ -7,13 +7,12 @@ import re
 import tomllib
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 from pydantic import BaseModel
 
-from ccatp.config.models import Config
-from ccatp.errors import ConfigError
+from ccatp.config.models import PATTERNS, Config
+from ccatp.errors import ConfigError, one_line
 
 Key = tuple[str | int, ...]
 
@@ -32,6 +31,11 @@ UNIT_SLIPS = (
     ("_s", 1e-3, "milliseconds", "s"),
 )
 _SHOWN = 60
+MOST_PARTS = 32  # of a key: the parser needs time and memory by the square of their number
+_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.){0,99}+"|'[^'\n]{0,99}+')"""
+_MANY_PARTS = re.compile(rf"(?<![\w-])(?:{_PART}[ \t]*\.[ \t]*){{{MOST_PARTS}}}")
+# Characters that are parsed to find the line of a key; where that is not enough, a message has none.
+_SEARCHED = 1_000_000
 
 
 class ConfigProblem(NamedTuple):
@@ -42,18 +46,11 @@ class ConfigProblem(NamedTuple):
     related: tuple[Key, ...] = ()
 
 
-def read_text(path: Path) -> str:
-    """The text of a TOML file; raises ConfigError where there is none."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; name a TOML file that exists") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
-
-
 def parse_toml(text: str, name: str) -> dict[str, Any]:
     """The content of the TOML file of that name; raises ConfigError, with the line, where it is not TOML."""
+    if deep := _MANY_PARTS.search(text):
+        line = text.count("\n", 0, deep.start()) + 1
+        raise ConfigError(f"{name}:{line}: a key has more than {MOST_PARTS} parts; no key of ccatp has half as many")
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
@@ -77,29 +74,40 @@ def depth_in(tree: Any, key: Key) -> int:
 
 
 def find_line(text: str, key: Key) -> int | None:
-    """Number (from 1) of the line of a TOML text that holds a key, or the nearest section that encloses it."""
-    depth, lines = depth_in(tomllib.loads(text), key), text.split("\n")
+    """Number (from 1) of the line of a TOML text that holds a key, or the nearest section that encloses it.
+
+    ``None`` where there is neither, or where the search would take long.
+    """
+    depth, lines, searched = depth_in(tomllib.loads(text), key), text.split("\n"), len(text)
 
     def is_there(count: int) -> bool:
+        nonlocal searched
         # A beginning of the text that ends within a value is no TOML: the value's last line decides about its first.
         for end in range(count, len(lines)):
+            beginning = "\n".join(lines[:end])
+            searched += len(beginning)
+            if searched > _SEARCHED:
+                break
             try:
-                return depth_in(tomllib.loads("\n".join(lines[:end])), key) >= depth
+                return depth_in(tomllib.loads(beginning), key) >= depth
             except ValueError:
                 pass
         return True
 
-    return bisect_left(range(1, len(lines)), True, key=is_there) + 1 if depth else None
+    line = bisect_left(range(1, len(lines)), True, key=is_there) + 1
+    return line if depth and searched <= _SEARCHED else None
 
 
 def format_key(key: Key) -> str:
     """``("robot", "edge_sensors_m", 0)`` as ``robot.edge_sensors_m[0]``."""
-    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in key).removeprefix(".")
+    name = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in key).removeprefix(".")
+    return one_line(name, _SHOWN)
 
 
 def format_value(value: object) -> str:
-    """One value as it stands in a message."""
-    return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False, default=str)
+    """One value as it stands in a message, shortened."""
+    text = repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False, default=str)
+    return one_line(text, _SHOWN)
 
 
 def nearest(name: str, names: Iterable[str]) -> str | None:
@@ -126,10 +134,10 @@ def slip_hint(key: Key, value: float, limit: float = math.inf) -> str:
     return ""
 
 
-def faults_of(errors: Iterable[Mapping[str, Any]], root: type[BaseModel] = Config) -> list[ConfigProblem]:
+def faults_of(errors: Iterable[Mapping[str, Any]], root: type[BaseModel] = Config) -> Iterator[ConfigProblem]:
     """The findings of ``ValidationError.errors()`` as problems, misspelt keys first: they also cause missing ones."""
     ordered = sorted(errors, key=lambda error: error["type"] != "extra_forbidden")
-    return [ConfigProblem(tuple(error["loc"]), _what(error, root)) for error in ordered]
+    return (ConfigProblem(tuple(error["loc"]), _what(error, root)) for error in ordered)
 
 
 def _what(error: Mapping[str, Any], root: type[BaseModel]) -> str:
@@ -147,8 +155,8 @@ def _what(error: Mapping[str, Any], root: type[BaseModel]) -> str:
     # pydantic's words: Input should be a valid number; Tuple should have at least 4 items after validation, not 3
     must = re.sub(r"^\w+ should", "must", error["msg"]).replace(" after validation", "")
     must = "must be a section" if kind in {"model_type", "dict_type"} else must
-    shown = format_value(value)
-    return f"= {shown if len(shown) <= _SHOWN else shown[:_SHOWN] + '...'} {must}{hint}"
+    must = PATTERNS.get(limits.get("pattern", ""), must)
+    return f"= {format_value(value)} {must}{hint}"
 
 
 def _unknown(key: Key, root: type[BaseModel]) -> str:

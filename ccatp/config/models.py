@@ -11,6 +11,11 @@ NonNegative = Annotated[float, Field(ge=0.0, le=1e6)]
 Freshness = Annotated[float, Field(gt=0.0, le=0.15)]
 Port = Annotated[int, Field(ge=0, le=65535)]
 Pair = tuple[float, float]
+TEXT, HOST = r"^[^\x00-\x1f\x7f-\x9f]*$", r"^([^\s./\x00-\x1f\x7f-\x9f]{1,63}(\.|$))*$"
+# What the values must be that match these.
+PATTERNS = {TEXT: "must not contain control characters", HOST: "must be the name or the address of a host"}
+Text = Annotated[str, Field(max_length=4096, pattern=TEXT)]
+Host = Annotated[str, Field(max_length=253, pattern=HOST)]
 
 
 class Model(BaseModel):
@@ -22,7 +27,7 @@ class Model(BaseModel):
 class ProcessesConfig(Model):
     """The processes of a run: where they meet, and when one hangs."""
 
-    runtime_dir: str  # empty = chosen from the environment
+    runtime_dir: Text  # empty = chosen from the environment
     realtime_priority: Annotated[int, Field(ge=0, le=99)]  # 0 = ordinary scheduling
     hang_timeout_s: Positive
     start_timeout_s: Positive
@@ -33,8 +38,8 @@ class ProcessesConfig(Model):
 class RunConfig(ProcessesConfig):
     """What to survey and how."""
 
-    mirror: str
-    world: str
+    mirror: Text
+    world: Text
     seed: Annotated[int, Field(ge=0)]
     filter: Literal["kf", "ekf", "ukf"]
     panels: Annotated[int, Field(ge=0)]  # 0 = the whole mirror
@@ -45,9 +50,9 @@ class RunConfig(ProcessesConfig):
 class LinkConfig(Model):
     """The robot link: where the robot is, and when its data are too old."""
 
-    host: str
+    host: Host
     port: Port
-    key_file: str
+    key_file: Text
     connect_timeout_s: Positive
     sensors_timeout_s: Freshness
     slip_after_s: Positive
@@ -100,7 +105,7 @@ class GainsConfig(Model):
 class ControlConfig(Model):
     """Waypoint tracking."""
 
-    gains: str
+    gains: Text
     straight_tolerance_rad: Positive
     lookahead_m: Positive
     cross_track_gain_rad_m2: NonNegative
@@ -197,7 +202,7 @@ class LocalizerConfig(Model):
 class EtalonConfig(Model):
     """Address and use of the MultiLine server."""
 
-    host: str
+    host: Host
     port: Port
     connect_timeout_s: Positive
     request_timeout_s: Positive
@@ -308,19 +313,19 @@ class HealthConfig(Model):
 class ObservatoryConfig(Model):
     """The observatory channel over TCP, beside the unix socket that is always there."""
 
-    endpoint: str  # empty = none
-    key_file: str
-    clients_file: str
+    endpoint: Text  # empty = none
+    key_file: Text
+    clients_file: Text
 
 
 class DashboardConfig(Model):
     """The operator's web page, and the commands over HTTP."""
 
     enabled: bool
-    host: str
+    host: Host
     port: Port
-    token_file: str  # empty = a token that each start makes
-    host_names: tuple[str, ...]
+    token_file: Text  # empty = a token that each start makes
+    host_names: tuple[Text, ...]
     rate_hz: Annotated[float, Field(gt=0.0, le=50.0)]
     max_connections: Annotated[int, Field(ge=8, le=512)]  # a browser opens up to six
     slow_client_s: Positive
@@ -358,7 +363,7 @@ class MissionConfig(Model):
 class SimRobotConfig(Model):
     """The DataLoop: the robot's stand-in."""
 
-    host: str
+    host: Host
     port: Port
     frame_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
     ttl_s: Positive
@@ -375,7 +380,7 @@ class SimRobotConfig(Model):
 class SimEtalonConfig(Model):
     """The Etalon stand-in."""
 
-    host: str
+    host: Host
     port: Port
     length_sigma_m: NonNegative
     length_sigma_per_m: NonNegative
@@ -405,7 +410,7 @@ class WorldConfig(Model):
     or an Ornstein-Uhlenbeck process of that sigma and correlation time.
     """
 
-    name: str
+    name: Text
     accelerometer_sigma_m_s2: NonNegative
     accelerometer_bias_sigma_m_s2: NonNegative
     accelerometer_bias_walk_m_s2_sqrt_s: NonNegative
@@ -490,10 +495,10 @@ class CollimatorsConfig(Model):
 class MirrorConfig(Model):
     """One mirror: surface, frame, panels, base, collimators."""
 
-    name: str
+    name: Text
     overhang: bool
-    provenance: tuple[str, ...]
-    unverified: tuple[str, ...]
+    provenance: tuple[Text, ...]
+    unverified: tuple[Text, ...]
     surface: SurfaceConfig
     frame: FrameConfig
     panels: PanelsConfig

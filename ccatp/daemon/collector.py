@@ -73,6 +73,7 @@ class Collector:
         self._subscriber = Subscriber(context, [endpoints.of(name) for name in names], RECEIVED)
         self._record: BeaconSummary | SurveyRecord
         self._views: Views | None = None
+        self._view: RunView | None = None
         if isinstance(cfg, RadioConfig):
             # Imported late: a survey does not need it, and its libraries are large.
             from ccatp.records import beacon_summary  # noqa: PLC0415
@@ -92,7 +93,6 @@ class Collector:
             metadata={**software, **what, "config": config},
             on_failure=self._on_recorder_failure,
         )
-        self._view: RunView | None = None
         self._truth_rows = 0
         self.status: MissionStatus | None = None
 

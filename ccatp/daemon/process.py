@@ -15,6 +15,7 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Any, TextIO, cast
 
 import structlog
@@ -22,6 +23,7 @@ import uvloop
 import zmq
 
 from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.files import keep_traceback, read_input
 from ccatp.config.load import is_radio_file, load_config, load_radio_config
 from ccatp.config.models import Config, ProcessesConfig
 from ccatp.errors import CcatpError
@@ -65,7 +67,7 @@ class Endpoints:
 def run_dir_in(runtime_dir: Path) -> Path | None:
     """The run directory of the run that goes on in a runtime directory, or of the last one."""
     try:
-        return Path((runtime_dir / RUN_DIR_FILE).read_text(encoding="utf-8").strip())
+        return Path(os.fsdecode(read_input(runtime_dir / RUN_DIR_FILE).strip()))
     except OSError:
         return None
 
@@ -120,7 +122,17 @@ def read_config(
 def start_process(argv: list[str] | None = None) -> ProcessArgs:
     """Arguments of this process, which ends with the supervisor; its sockets can be used by its own user only."""
     die_with_parent()
-    return parse_args(argv)
+    try:
+        args = parse_args(argv)
+    except CcatpError as error:
+        print(f"ccatp: {error}", file=sys.stderr, flush=True)
+        raise SystemExit(int(error.exit_status)) from None
+
+    def report(_kind: type[BaseException], error: BaseException, _trace: TracebackType | None) -> None:
+        print(f"ccatp {Path(sys.argv[0]).stem}: {keep_traceback(error, args.run_dir)}", file=sys.stderr, flush=True)
+
+    sys.excepthook = report
+    return args
 
 
 def parse_args(argv: list[str] | None = None) -> ProcessArgs:

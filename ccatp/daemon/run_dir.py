@@ -12,6 +12,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.files import read_input, read_text
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.daemon.danger_loop import FILE as EMERGENCIES
@@ -31,10 +32,10 @@ FINISHED = (ExitStatus.COMPLETE, ExitStatus.ABORTED)
 def find_resumable() -> Path | None:
     """The directory of the run that did not finish, ``None`` where there is none with a mission in it."""
     try:
-        text = FILE.read_text(encoding="utf-8").strip()
+        text = os.fsdecode(read_input(FILE).strip())
     except FileNotFoundError:
         return None
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise ConfigError(f"--recover: cannot read {FILE}: {error}; remove it to begin a new run") from error
     run_dir = Path(text)
     return run_dir if text and (run_dir / "mission.sqlite").exists() else None
@@ -43,7 +44,7 @@ def find_resumable() -> Path | None:
 def finished_summary(run_dir: Path) -> dict[str, Any] | None:
     """The summary of a mission whose points are all measured, ``None`` for any other."""
     try:
-        summary = json.loads((run_dir / "summary.json").read_text(encoding="utf-8"))
+        summary = json.loads(read_text(run_dir / "summary.json"))
         points = summary["points"]
         is_finished = points["measured"] == points["total"] > 0
     except (OSError, ValueError, KeyError, TypeError):
@@ -55,7 +56,7 @@ def mark_resumable(run_dir: Path) -> None:
     """Note that a run has begun; raises ``ConfigError`` where the note cannot be written."""
     try:
         FILE.parent.mkdir(parents=True, exist_ok=True)
-        write_durably(FILE, f"{run_dir}\n".encode())
+        write_durably(FILE, os.fsencode(run_dir) + b"\n")
     except OSError as error:
         raise ConfigError(
             f"--recover: cannot write {FILE}: {error.strerror}; start where ./runs can be made"
@@ -239,7 +240,7 @@ def with_origin(options: RunOptions) -> RunOptions:
 def _began_simulated(run_dir: Path) -> bool | None:
     """Whether a run began in simulation; ``None`` where that is not known."""
     try:
-        return bool(json.loads((run_dir / ORIGIN_FILE).read_text(encoding="utf-8"))["simulation"])
+        return bool(json.loads(read_text(run_dir / ORIGIN_FILE))["simulation"])
     except (OSError, ValueError, KeyError, TypeError):  # of an older version: the recording says so as well
         try:
             simulation = read_metadata(run_dir / TELEMETRY).get("simulation")

@@ -171,7 +171,9 @@ class SupervisedRun:
         except OSError as error:
             with suppress(OSError):
                 new.unlink()
-            text = f"{path}: cannot be written: {error.strerror or error}; what was measured is in mission.sqlite"
+            text = f"{path}: cannot be written: {error.strerror or error}"
+            if (self._run_dir / "mission.sqlite").exists():
+                text += "; what was measured is in mission.sqlite"
             self._notify_operator("error", text)
 
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
@@ -201,7 +203,8 @@ class SupervisedRun:
                 name, code, end, text = death
                 self._log.error("process_died", name=name, code=code)
                 if end is ProcessEnd.END:
-                    return ExitStatus(code)  # it has reported why
+                    # It has reported why. After a restart the robot may be anywhere.
+                    return ExitStatus.HELD if self._children.restarts else ExitStatus(code)
                 self._notify_operator("error", f"{text}; see {self._run_dir / 'log.jsonl'}")
                 return ExitStatus.HELD
             if collector.is_over:
@@ -296,7 +299,7 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
             return ExitStatus.COMPLETE
         keep_origin(run_dir, is_sim=options.sim)
         write_durably(run_dir / "config.toml", dump_config(cfg).encode())
-        (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
+        (runtime_dir / RUN_DIR_FILE).write_bytes(os.fsencode(run_dir) + b"\n")
         (runtime_dir / ADDRESSES_FILE).write_text(json.dumps(_addresses(cfg)) + "\n", encoding="utf-8")
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())

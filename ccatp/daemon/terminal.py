@@ -1,6 +1,7 @@
 """What a run shows on the terminal: progress, messages, summary, status table, and the report at its end."""
 
 import json
+import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ from ccatp.conditions import condition_of
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.core import Severity, danger_text
-from ccatp.errors import ExitStatus
+from ccatp.errors import ExitStatus, printable
 from ccatp.links.liveness import RateLimitedLog
 from ccatp.links.topics import DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
 from ccatp.records.summary import format_table
@@ -49,7 +50,7 @@ class RunView:
         self._has_pose = False
         self._shown_tenths = 0
         title, self._goals = _title_and_goals(cfg, is_sim=is_sim)
-        self._console.print(f"{title}; writing {run_dir}", soft_wrap=True, markup=False)
+        self._console.print(printable(f"{title}; writing {run_dir}"), soft_wrap=True, markup=False)
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -73,7 +74,7 @@ class RunView:
         """One line for the operator, unless too many like it were shown; ``log.jsonl`` has them all."""
         shown = self._rate_limit.take(level, text, time.monotonic())
         if shown is not None:
-            self._console.print(f"{level}: {shown}", style=STYLES[level], markup=False, soft_wrap=True)
+            self._console.print(f"{level}: {printable(shown)}", style=STYLES[level], markup=False, soft_wrap=True)
 
     def show(self, message: Message) -> None:
         """Show what an operator has to see of a message: progress, lines, the first pose, what danger says."""
@@ -115,16 +116,16 @@ class RunView:
 
     def show_summary(self, summary: dict[str, Any], *, as_json: bool) -> None:
         """Print JSON alone on standard output, or a table."""
-        if as_json:
-            json.dump(summary, sys.stdout, indent=1)
-            sys.stdout.write("\n")
-        else:
-            sys.stdout.write(format_table(summary) + "\n")
-        sys.stdout.flush()
+        try:
+            print(json.dumps(summary, indent=1) if as_json else format_table(summary), flush=True)
+        except OSError as error:
+            # The mission is over, and stays what it was; what is left for the output goes nowhere.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            self.show_message("warning", f"standard output cannot be written: {error.strerror}; see summary.json")
 
     def show_report(self, where: str) -> None:
         """Show where the report is, or why there is none; on standard error, so that JSON stays alone."""
-        self._console.print(f"report  {where}", soft_wrap=True, markup=False)
+        self._console.print(printable(f"report  {where}"), soft_wrap=True, markup=False)
 
 
 def _title_and_goals(cfg: Config | RadioConfig, *, is_sim: bool) -> tuple[str, str]:

@@ -14,7 +14,7 @@ import secrets
 import stat
 import struct
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -23,7 +23,8 @@ from pydantic import Field
 from zmq.auth import load_certificate
 from zmq.utils import z85
 
-from ccatp.config.load import read_source, validated, write_file
+from ccatp.config.files import read_input, write_file
+from ccatp.config.load import read_source, validated
 from ccatp.config.messages import ConfigProblem
 from ccatp.config.models import Model
 from ccatp.errors import ConfigError
@@ -31,8 +32,6 @@ from ccatp.errors import ConfigError
 KEY_CHARACTERS = 40
 PUBLIC_SUFFIX, SECRET_SUFFIX, LINK_SUFFIX, CLIENTS_SUFFIX = ".key", ".key_secret", "-robot.key_secret", "-clients.toml"
 LINK_KEY_BYTES = 32
-# More than a thousand clients; a list is read whole while the danger loop waits.
-MAX_FILE_BYTES = 1 << 18
 FOR_OTHERS = stat.S_IRWXG | stat.S_IRWXO
 CLIENTS_TEXT = """\
 # Who may use the observatory channel over TCP; all others are refused. Read again when it changes.
@@ -108,12 +107,12 @@ def read_clients(path: Path, what: str) -> Clients:
 
     ``ConfigError``: the file cannot be read, others may write it, it is malformed, or it lists no client.
     """
-    with reading(path, what, stat.S_IWGRP | stat.S_IWOTH):
-        try:
-            source = read_source(path)
-            listed = validated(ClientList, source.tree, [source], _check_clients).clients
-        except ConfigError as error:
-            raise ConfigError(f"{what}: {error.problems[0]}") from error
+    read_private(path, what, stat.S_IWGRP | stat.S_IWOTH)
+    try:
+        source = read_source(path)
+        listed = validated(ClientList, source.tree, [source], _check_clients).clients
+    except ConfigError as error:
+        raise ConfigError(f"{what}: {error.problems[0]}") from error
     if not listed:
         raise ConfigError(f"{what}: {path} lists no client; add a table [clients.NAME] with public_key and role")
     return {entry.public_key: AuthorizedClient(name, entry.role) for name, entry in listed.items()}
@@ -162,29 +161,25 @@ def read_public(path: Path, what: str) -> bytes:
 
 
 def _load(path: Path, what: str, forbidden: int, suffix: str) -> tuple[bytes, bytes | None]:
-    with reading(path, what, forbidden):
-        try:
-            public, secret = load_certificate(path)
-        except ValueError as error:
-            raise ConfigError(f"{what}: {path} holds no public key; name the file that ends in {suffix}") from error
+    read_private(path, what, forbidden)
+    try:
+        public, secret = load_certificate(path)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{what}: {path} holds no public key; name the file that ends in {suffix}") from error
     if why := check_key(public) or check_key(secret or public):
         raise ConfigError(f"{what}: {path} {why}")
     return public, secret
 
 
-@contextmanager
-def reading(path: Path, what: str, forbidden: int, make: str = "make keys with ccatp keys generate") -> Iterator[None]:
-    """Read a file that is not open to others, nor longer than it can be."""
+def read_private(path: Path, what: str, forbidden: int, make: str = "make keys with ccatp keys generate") -> bytes:
+    """The content of a file whose mode has none of the ``forbidden`` bits; ``ConfigError``: it cannot be used."""
     try:
-        info = path.stat()
-        if info.st_mode & forbidden:
-            mode = stat.S_IMODE(info.st_mode)
-            raise ConfigError(f"{what}: {path} is open to others (mode {mode:04o}); chmod go= {path}")
-        if info.st_size > MAX_FILE_BYTES:
-            raise ConfigError(f"{what}: {path} is longer than {MAX_FILE_BYTES} bytes; name the right file")
-        yield
+        data, mode = read_input(path), stat.S_IMODE(path.stat().st_mode)
     except OSError as error:
         raise ConfigError(f"{what}: cannot read {path}: {error.strerror}; {make}") from error
+    if mode & forbidden:
+        raise ConfigError(f"{what}: {path} is open to others (mode {mode:04o}); chmod go= {path}")
+    return data
 
 
 def read_key(key_file: str, *, must_be_private: bool = False) -> bytes | None:
@@ -195,8 +190,7 @@ def read_key(key_file: str, *, must_be_private: bool = False) -> bytes | None:
     """
     if not key_file:
         return None
-    with reading(Path(key_file), "robot.key_file", FOR_OTHERS if must_be_private else 0):
-        key = Path(key_file).read_bytes().strip()
+    key = read_private(Path(key_file), "robot.key_file", FOR_OTHERS if must_be_private else 0).strip()
     if not key:
         raise ConfigError(f"robot.key_file: {key_file} is empty")
     return key

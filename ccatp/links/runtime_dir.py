@@ -32,7 +32,10 @@ def runtime_dir_path(configured: str, environ: Mapping[str, str]) -> Path:
     else ``ccatp-<uid>`` in the temporary directory. ``ConfigError``: the path is too long for a unix socket in it.
     """
     if configured:
-        path = Path(configured).expanduser()
+        try:
+            path = Path(configured).expanduser()
+        except RuntimeError as error:
+            raise ConfigError(f"runtime directory {configured}: no such user, or no home; write it in full") from error
     elif environ.get("CCATP_RUNTIME_DIR"):
         path = Path(environ["CCATP_RUNTIME_DIR"])
     elif environ.get("XDG_RUNTIME_DIR"):

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
-from ccatp.config.load import write_file
+from ccatp.config.files import write_file
 from ccatp.core import FloatArray, PanelId
 from ccatp.mirror.panel_alignment import PanelResult, mirror_wavefront
 from ccatp.report.figures import distribution_figure, errors_figure, time_figure

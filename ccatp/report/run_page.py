@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ccatp.config.load import write_file
+from ccatp.config.files import write_file
 from ccatp.filters.metrics import consistency
 from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront
 from ccatp.report import beacon_record, figures

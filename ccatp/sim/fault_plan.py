@@ -12,7 +12,8 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
 
 from pydantic import Field, ValidationError, create_model
 
-from ccatp.config.messages import choice_hint, faults_of, find_line, format_key, format_value, parse_toml, read_text
+from ccatp.config.files import read_toml
+from ccatp.config.messages import choice_hint, faults_of, find_line, format_key, format_value, parse_toml
 from ccatp.config.models import Model, NonNegative, Positive
 from ccatp.errors import ConfigError
 
@@ -279,7 +280,7 @@ def parse_plan(text: str, name: str) -> FaultPlan:
 
 def read_plan(file: Path, *, lockstep: bool) -> FaultPlan:
     """The plan in a file; errors as of ``parse_plan`` and ``check_pacing``."""
-    plan = parse_plan(read_text(file), str(file))
+    plan = parse_plan(read_toml(file), str(file))
     check_pacing(plan, str(file), lockstep=lockstep)
     return plan
 

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from ccatp.cli import main
+from ccatp.config.files import write_file
 from ccatp.config.load import (
     available,
     dump_config,
@@ -15,7 +16,6 @@ from ccatp.config.load import (
     load_config,
     load_radio_config,
     with_values,
-    write_file,
 )
 from ccatp.config.messages import find_line
 from ccatp.config.models import Config

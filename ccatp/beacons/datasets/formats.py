@@ -1,11 +1,13 @@
 """Recorded runs: Plaza (CMU), MRCLAM (UTIAS), Labyrinth (TU Chemnitz), and a CSV of our own with an event a line."""
 
+import math
 import re
 from pathlib import Path
 
 import numpy as np
 
 from ccatp.beacons.datasets.tables import (
+    MOST_DATA_BYTES,
     RadioDataError,
     Table,
     content_lines,
@@ -22,6 +24,7 @@ from ccatp.beacons.datasets.tables import (
 )
 from ccatp.beacons.datasets.trajectory import bridged, checked_heading, pose_of_truth, steps_of_speeds, turning_factor
 from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
+from ccatp.config.files import read_input
 from ccatp.core import FloatArray
 
 NO_RANGE = "no range within the time of the odometry"
@@ -79,6 +82,7 @@ PLAZA = {
     "TL": ("beacon", "x [m]", "y [m]"),
 }
 PLAZA_NEEDED = ("DR", "TD")
+NESTED = ("cell", "struct", "object")  # classes of MATLAB that can hold any number of others
 
 
 def is_plaza(file: Path) -> bool:
@@ -121,10 +125,14 @@ def _plaza_file(folder: Path) -> Path:
 
 
 def _mat_tables(file: Path) -> dict[str, Table]:
-    from scipy.io import loadmat  # noqa: PLC0415 -- slow to import, and texts need none of it
+    from scipy.io import loadmat, whosmat  # noqa: PLC0415 -- slow to import, and texts need none of it
     from scipy.io.matlab import MatReadError  # noqa: PLC0415
 
     try:
+        read_input(file, MOST_DATA_BYTES)  # which refuses what is no file, or too long
+        for name, shape, form in whosmat(file):
+            if name in PLAZA and (form in NESTED or math.prod(shape) > MOST_DATA_BYTES // 8):
+                raise RadioDataError(file, f"variable {name} is no table of at most {MOST_DATA_BYTES} bytes")
         found = loadmat(file, variable_names=[*PLAZA])
     except FileNotFoundError as error:
         raise RadioDataError(file, "no such file") from error

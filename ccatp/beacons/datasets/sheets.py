@@ -3,7 +3,7 @@
 CSV, sheets of a workbook, and folders of XBee logs ("Node A: -56"). Maps of beacons are written as TOML.
 """
 
-import csv
+import io
 import re
 import zipfile
 import zlib
@@ -19,13 +19,15 @@ from ccatp.beacons.cricket.range_network import MoteRange
 from ccatp.beacons.datasets.tables import RadioDataError, content_lines, number, read_text, split_cells
 from ccatp.beacons.slam.level_fix import MeasuredPlace
 from ccatp.beacons.slam.path_loss import LevelPair
+from ccatp.config.files import read_input
 from ccatp.core import FloatArray
 
-_LARGEST_PART = 50_000_000  # bytes: a table that people measured is smaller, a decompression bomb is not
+# A table that people measured is smaller, a decompression bomb is not.
+_MOST_BOOK_BYTES, _MOST_CELLS = 5_000_000, 500_000
 
 # What zipfile, zlib, the XML parser and openpyxl raise on damaged files.
 _DAMAGE = (
-    OSError, EOFError, LookupError, NotImplementedError, RuntimeError, SyntaxError, TypeError, ValueError,
+    EOFError, LookupError, NotImplementedError, RuntimeError, SyntaxError, TypeError, ValueError,
     zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 
@@ -77,10 +79,7 @@ def read_sheet(path: Path, sheet: str | None = None) -> Sheet:
         name = path.name
         lines = content_lines(read_text(path, "a CSV file or an .xlsx workbook with columns of levels or ranges"))
         delimiter = next((mark for mark in ",;\t" if lines and mark in lines[0][1]), None)
-        try:
-            rows = [(line, split_cells(content, delimiter)) for line, content in lines]
-        except csv.Error as error:
-            raise RadioDataError(path, f"is no CSV text: {error}") from error
+        rows = [(line, split_cells(content, delimiter)) for line, content in lines]
     if len(rows) < 2:
         raise RadioDataError(path, "holds no rows below a head; the first row names the columns")
     head = [cell.strip() for cell in rows[0][1]]
@@ -95,25 +94,29 @@ def read_workbook(file: Path) -> dict[str, list[list[str]]]:
     """
     from openpyxl import load_workbook  # noqa: PLC0415 - the other formats do not wait for it
 
+    found: dict[str, list[list[str]]] = {}
+    cells = 0
     try:
-        with zipfile.ZipFile(file) as archive:
+        packed = io.BytesIO(read_input(file, _MOST_BOOK_BYTES))
+        with zipfile.ZipFile(packed) as archive:
+            if sum(part.file_size for part in archive.infolist()) > _MOST_BOOK_BYTES:
+                raise RadioDataError(file, f"holds more than {_MOST_BOOK_BYTES} bytes; save the sheet as CSV")
             for part in archive.infolist():
-                if part.file_size > _LARGEST_PART:
-                    raise RadioDataError(
-                        file, f"{part.filename} in it has {part.file_size} bytes; save the sheet as CSV"
-                    )
                 if part.filename.endswith(".xml") and b"<!ENTITY" in archive.read(part):
                     raise RadioDataError(file, f"{part.filename} in it defines entities, which no workbook does")
-        book = load_workbook(file, read_only=True, data_only=True)
-        try:
-            return {
-                sheet.title: [["" if cell is None else str(cell) for cell in row] for row in sheet.values]
-                for sheet in book.worksheets
-            }
-        finally:
-            book.close()
+        book = load_workbook(packed, read_only=True, data_only=True)
+        for sheet in book.worksheets:
+            rows = found.setdefault(sheet.title, [])
+            for row in sheet.values:
+                cells += 1 + len(row)
+                if cells > _MOST_CELLS:
+                    raise RadioDataError(file, f"has more than {_MOST_CELLS} cells; save the sheet as CSV")
+                rows.append(["" if cell is None else str(cell) for cell in row])
+        return found
     except FileNotFoundError as error:
         raise RadioDataError(file, "no such file") from error
+    except OSError as error:
+        raise RadioDataError(file, f"cannot be read: {error.strerror or error}") from error
     except _DAMAGE as error:
         raise RadioDataError(
             file, f"is no .xlsx workbook: {' '.join(str(error).split())}; save it again, or as CSV"

@@ -2,6 +2,7 @@
 
 import csv
 import gzip
+import io
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.beacons.slam.recording import BoolArray
+from ccatp.config.files import read_input
 from ccatp.core import FloatArray, IntArray
 from ccatp.errors import CcatpError, ExitStatus
 
@@ -23,6 +25,8 @@ class RadioDataError(CcatpError):
         super().__init__(f"{where}:{line}: {problem}" if line is not None else f"{where}: {problem}")
 
 
+MOST_DATA_BYTES = 50_000_000  # the longest known recording has 10 MB; a decompression bomb has more
+LONGEST_ROW = 20_000  # characters
 GZIP_MAGIC = b"\x1f\x8b"
 COMMENTS = ("#", "%", "//")
 GAP_S = 2.0  # pauses shorter than that are how recorders work,
@@ -42,19 +46,27 @@ def listed(names: Sequence[str], most: int = 8) -> str:
 def read_text(file: Path, wanted: str = "a data set of the formats plaza, mrclam, labyrinth or csv") -> str:
     """The text of a file, unpacked if it is gzipped, whatever its name.
 
-    Raises RadioDataError: it is missing, cannot be read, or is no text.
+    Raises RadioDataError: it is missing, cannot be read, is too long, or is no text.
     """
     try:
-        data = file.read_bytes()
+        data = read_input(file, MOST_DATA_BYTES)
         if data.startswith(GZIP_MAGIC):
-            data = gzip.decompress(data)
-        return data.decode("utf-8-sig")
+            data = gzip.GzipFile(fileobj=io.BytesIO(data)).read(MOST_DATA_BYTES + 1)
+            if len(data) > MOST_DATA_BYTES:
+                raise RadioDataError(file, f"holds more than {MOST_DATA_BYTES} bytes once unpacked")
+        text = data.decode("utf-8-sig")
     except FileNotFoundError as error:
         raise RadioDataError(file, "no such file") from error
     except (OSError, EOFError, zlib.error) as error:
         raise RadioDataError(file, f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
     except UnicodeDecodeError as error:
         raise RadioDataError(file, f"is not text; give {wanted}") from error
+    for line, content in enumerate(text.splitlines(), 1):
+        if len(content) > LONGEST_ROW:
+            raise RadioDataError(
+                file, f"has {len(content)} characters, at most {LONGEST_ROW} are taken; give {wanted}", line
+            )
+    return text
 
 
 def content_lines(text: str) -> list[tuple[int, str]]:

@@ -13,10 +13,10 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from ccatp.config.load import write_file
+from ccatp.config.files import write_file
 from ccatp.config.models import DashboardConfig
 from ccatp.errors import ConfigError
-from ccatp.links.auth import FOR_OTHERS, reading
+from ccatp.links.auth import FOR_OTHERS, read_private
 
 # 128 bits in hexadecimal digits: nothing limits the attempts.
 MIN_CHARACTERS = 32
@@ -83,8 +83,7 @@ def read_tokens(path: Path) -> dict[str, str]:
 
     No message quotes a line.
     """
-    with reading(path, "dashboard.token_file", FOR_OTHERS, _MAKE):
-        text = path.read_bytes().decode("ascii", "replace")
+    text = read_private(path, "dashboard.token_file", FOR_OTHERS, _MAKE).decode("ascii", "replace")
     tokens: dict[str, str] = {}
     for number, line in enumerate(text.splitlines(), 1):
         if line.startswith("#") or not line.strip():
