@@ -79,8 +79,8 @@ class UnscentedKalmanFilter(KalmanFilter):
             raise FilterDiverged(f"prediction is not finite: images of the points {images.tolist()}, or Q")
         mean = self._weights.dot(images)
         deviations = (images - mean) * self._roots
-        self._P_rows[:] = dsyrk(1.0, deviations.T, 1.0, Q.T, 0, 0).T
-        np.negative(mean, self._minus_x)
+        self._P_rows[:] = dgemm(1.0, deviations.T, deviations.T, 1.0, Q.T, 0, 1).T  # both halves are read
+        self._minus_x[:] = self._minus_x_row[:] = -mean
         self._mean = self._covariance = None
         self._predicted = dgemm(1.0, (self._offsets * self._roots).T, deviations.T, 0.0, None, 0, 1), L
 
