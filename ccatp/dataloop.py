@@ -40,7 +40,7 @@ class DataLoop(RobotServer):
     """The server of one simulated robot.
 
     In lockstep simulated time waits for the clients; otherwise the wall clock paces it. Each of the ``faults`` is
-    logged when it begins and ends, and with what it did.
+    logged when it begins and ends, and with what it did; a fall of the robot is logged when it falls.
     """
 
     def __init__(
@@ -58,7 +58,8 @@ class DataLoop(RobotServer):
         self._timer: asyncio.TimerHandle | None = None
         self.connections: set[Connection] = set()
         self._failure: asyncio.Future[None]
-        self.each_frame.append(self._log_faults)
+        self._is_fall_logged = False
+        self.each_frame += [self._log_faults, self._log_fall]
 
     async def start(self, listener: socket.socket) -> int:
         """Boot and serve who connects to a listening socket; return its port."""
@@ -111,6 +112,11 @@ class DataLoop(RobotServer):
         for faults in self._faults:
             for what, injected in faults.changes(self.robot.t_s):
                 self._log_fault(what, injected)
+
+    def _log_fall(self) -> None:
+        if self.robot.is_fallen and not self._is_fall_logged and self._log is not None:
+            self._is_fall_logged = True
+            self._log.info("robot_fell", **self.robot.describe_fall())
 
     def _log_fault(self, what: str, injected: Injected) -> None:
         if self._log is not None:
@@ -198,8 +204,8 @@ async def serve(
     faults: FaultPlan | None = None,
     body_file: Path | None = None,
     is_resuming: bool = False,
-) -> None:
-    """Run the simulated robot of a configuration until ``stop`` is set.
+) -> bool:
+    """Run the simulated robot of a configuration until ``stop`` is set; whether it fell.
 
     ``faults`` of a survey may be those of the robot and of its link; for the link a proxy listens in the robot's place.
     ``body_file`` keeps the true pose of the survey robot between runs. ``zmq.ZMQError``: an endpoint cannot be had.
@@ -235,3 +241,4 @@ async def serve(
             finally:
                 truth.flush()
                 answering.cancel()
+        return robot.is_fallen

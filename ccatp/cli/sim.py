@@ -56,7 +56,10 @@ def sim_robot(
     config_file: Path | None, settings: Mapping[str, object], realtime: bool, faults_file: Path | None,
     runtime_dir: Path | None,
 ) -> int:  # fmt: skip
-    """Run the simulated robot behind the robot link, for any controller."""
+    """Run the simulated robot behind the robot link, for any controller.
+
+    Standard error says if it fell, and why; then the exit status is 4.
+    """
     from ccatp.config.load import is_radio_file, load_config, load_radio_config
     from ccatp.daemon.sim_robot import run_alone
     from ccatp.sim.fault_plan import read_plan

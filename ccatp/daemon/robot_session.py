@@ -16,7 +16,7 @@ FIRST_DELAY_S, LONGEST_DELAY_S = 0.05, 1.0
 # shorter time, so that its reason is the robot's and not that no time was left.
 ATTEMPT_S, SHORTEST_ATTEMPT_S = 2.0, 0.25
 # Refusals that will be repeated.
-FINAL = ("bad mac",)
+FINAL = ("bad mac", "bad protocol")
 # The rate of the robot's clock may be wrong by a hundredth and may wander; that of the host is much better.
 MAX_DRIFT = 1.02e-2
 # Drives whose times are known: ten seconds of them at 100 Hz.

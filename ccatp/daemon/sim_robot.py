@@ -20,6 +20,7 @@ from ccatp.daemon.process import (
     start_process,
 )
 from ccatp.dataloop import serve
+from ccatp.errors import ExitStatus
 from ccatp.links.runtime_dir import TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
 from ccatp.sim.fault_plan import FaultPlan, read_plan
 from ccatp.sim.ground_truth import FILE
@@ -54,6 +55,7 @@ def run_alone(
 ) -> int:
     """The simulated robot alone, of a survey or among beacons, for other controllers; ends on SIGINT or SIGTERM.
 
+    A fall is never on the link: standard error says when and where (``robot_fell``), and the status is that of a fault.
     It listens at the address in ``sim.robot``. Its true state is at ``puck`` in the runtime directory (the configured
     one by default), for ``ccatp sim etalon --truth``.
 
@@ -68,8 +70,12 @@ def run_alone(
     with locked(folder / TRUTH_LOCK_FILE, refusal), listen("sim.robot", at.host, at.port) as listener:
 
         async def run(stop: asyncio.Event) -> int:
-            await serve(cfg, lockstep=lockstep, stop=stop, listener=listener, truth_rep=truth, log=log, faults=faults)
-            return 0
+            has_fallen = await serve(
+                cfg, lockstep=lockstep, stop=stop, listener=listener, truth_rep=truth, log=log, faults=faults
+            )
+            if has_fallen:
+                print("ccatp: the simulated robot fell; robot_fell above says why, when and where", file=sys.stderr)
+            return ExitStatus.HELD if has_fallen else ExitStatus.COMPLETE
 
         host, port = listener.getsockname()[:2]
         print(f"ccatp: simulated robot ({what}) on {host}:{port}, truth at {truth}", file=sys.stderr, flush=True)

@@ -16,7 +16,7 @@ AUTH_NONE: Literal["none"] = "none"
 AUTH_HMAC: Literal["hmac-sha256"] = "hmac-sha256"
 
 Role = Literal["controller", "monitor"]
-RefusalReason = Literal["role taken", "bad mac", "bad join", "busy"]
+RefusalReason = Literal["role taken", "bad mac", "bad join", "bad protocol", "busy"]
 Sequence53 = Annotated[int, Meta(ge=0, le=2**53 - 1)]  # what every JSON reader keeps exact
 Steer = Annotated[float, Meta(ge=-1.6, le=1.6)]
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
@@ -70,11 +70,12 @@ class Hello(RobotLinkMessage, tag="hello"):
 
 
 class Join(RobotLinkMessage, tag="join", omit_defaults=True):
-    """Answer of a client to the hello; ``mac`` only where the robot asks for it."""
+    """Answer of a client to the hello; ``mac`` only where the robot asks for it, ``protocol`` is that of the hello."""
 
     role: Role
     client: Name
     mac: Name = ""
+    protocol: Name = PROTOCOL
 
 
 class Joined(RobotLinkMessage, tag="joined"):

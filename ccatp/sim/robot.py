@@ -101,6 +101,10 @@ class Robot(SimulatedRobot):
     def is_fallen(self) -> bool:
         return self.world.is_fallen
 
+    def describe_fall(self) -> dict[str, object]:
+        x_m, y_m = self.world.plant.x_m, self.world.plant.y_m
+        return {"cause": self.world.fall, "t_s": self.t_s, "x_m": round(x_m, 4), "y_m": round(y_m, 4)}
+
     def truth_row(self) -> TruthRow:
         return self.world.truth_row(self.seq, self.t_s)
 

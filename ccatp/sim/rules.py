@@ -191,6 +191,10 @@ class SimulatedRobot(ABC):
         """Whether the robot fell; its row is published at once."""
         return False
 
+    def describe_fall(self) -> dict[str, object]:
+        """Why and where it fell, for a log."""
+        return {}
+
     def join(self, role: Role) -> None:
         """A new session has a role; fan duties of the controller before, already accepted, come into force."""
         if role == "controller":

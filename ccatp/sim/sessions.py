@@ -29,6 +29,7 @@ from ccatp.links.robot_codec import BadLine, decode_from_client, encode, is_mac_
 from ccatp.links.robot_messages import (
     AUTH_HMAC,
     AUTH_NONE,
+    PROTOCOL,
     BadLineCounter,
     Drive,
     FromClient,
@@ -202,6 +203,9 @@ class RobotServer:
         # The round of `check_time` may come later than this message: the limit holds all the same.
         if not isinstance(message, Join) or now_s - session.joined_s > JOIN_TIMEOUT_S:
             self.refuse(session, "bad join")
+            return
+        if message.protocol != PROTOCOL:
+            self.refuse(session, "bad protocol")
             return
         if self._key is not None and not is_mac_right(self._key, session.nonce, message):
             self.refuse(session, "bad mac")

@@ -32,6 +32,7 @@ class World:
         grip: share of its travel that each wheel gives to the body, right and left, besides its slip; may be set
             before a step.
         sensors: the edge sensors, for their clearance in the truth rows.
+        fall: why the robot fell, ``rim`` or ``thrust``; empty while it has not.
     """
 
     def __init__(
@@ -64,7 +65,7 @@ class World:
         self._puck_height_m = robot.puck_height_m
         self._thrust_floor, self._fall_thrust_s = sim.fan_floor, sim.fall_thrust_s
         self._weak_s = 0.0
-        self.is_fallen = False
+        self.is_fallen, self.fall = False, ""
         self.grip = (1.0, 1.0)
         self._places: deque[tuple[float, float]] = deque(maxlen=window_frames + 1)
         self._places.append((self.plant.x_m, self.plant.y_m))
@@ -98,14 +99,14 @@ class World:
             self._weak_s = self._weak_s + dt_s if thrust < self._thrust_floor else 0.0
             # Half a frame of slack: a sum of steps is not exact.
             if self._weak_s >= self._fall_thrust_s - 0.5 * dt_s:
-                self._fall()
+                self._fall("thrust")
         if plant.is_moving:
             self._has_looked = False
             self._rim_bound_m -= abs(plant.forward_m) + abs(plant.left_m)
             if self._rim_bound_m < 0.0:
                 self._measure_rim()
                 if self._rim_bound_m < 0.0:
-                    self._fall()
+                    self._fall("rim")
 
     def displace(self, dx_m: float, dy_m: float, dheading_rad: float) -> None:
         """Put the robot elsewhere: deck frame, relative to where it is. Beyond the rim it falls."""
@@ -114,10 +115,10 @@ class World:
         self._has_looked = False
         self._measure_rim()
         if self._rim_bound_m < 0.0:
-            self._fall()
+            self._fall("rim")
 
-    def _fall(self) -> None:
-        self.is_fallen = True
+    def _fall(self, why: str) -> None:
+        self.is_fallen, self.fall = True, self.fall or why
         self.plant.stop_dead()
 
     def truth_row(self, seq: int, t_s: float) -> TruthRow:

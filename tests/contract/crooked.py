@@ -48,6 +48,7 @@ class Middle(Connection):
         owner: the SurveyLoop.
         hello: what it said first.
         count: messages of the robot so far.
+        has_sent: whether the client has sent what a broken server waits for.
     """
 
     def __init__(self, owner: "CrookedLoop") -> None:
@@ -55,6 +56,7 @@ class Middle(Connection):
         self.owner, self._crooked = owner, owner.crooked
         self.hello: Message = {}
         self.count = 0
+        self.has_sent = False
 
     def write(self, data: bytes) -> None:
         message = json.loads(data)

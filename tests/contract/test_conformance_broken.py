@@ -2,7 +2,9 @@
 
 import asyncio
 import json
+import math
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +16,7 @@ from ccatp.commissioning.conformance.runner import check_ids
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.links.robot_codec import join_mac
-from ccatp.links.robot_messages import BadLineCounter, Drive, LineBuffer, Role
+from ccatp.links.robot_messages import BadLineCounter, Drive, LineBuffer, Permit, Role
 from ccatp.links.robot_messages import Fans as FansMessage
 from ccatp.sim import sessions
 from ccatp.sim.rules import MotionRules
@@ -25,15 +27,23 @@ AT_ONCE = 8  # servers
 KEY = b"secret"
 IDS = check_ids()
 HELLO = tuple(IDS[: IDS.index("join")])
-JOIN = ("join", "join-role", "join-client", "join-first", "role-taken", "refused-harmless")
+JOIN = ("join", "join-role", "join-client", "join-first", "join-protocol", "role-taken", "refused-harmless")
 MAC = tuple(name for name in IDS if name.startswith("mac"))
 FRAMES = (*(name for name in IDS if name.startswith("frames")), "echo")
 NEWEST = ("newest-drive", "newest-permit", "role-drive", "newest-fans", "role-fans")
 FANS = ("fans", "newest-fans", "role-fans", "fans-stop", "fans-fin", "fans-rst", "fan-floor")
 LINES = tuple(IDS[IDS.index("no-json") : IDS.index("lockstep-drive")])
 LOCKSTEP = tuple(name for name in IDS if name.startswith("lockstep"))
-MOVES = tuple(name for name in IDS if name.startswith("move"))
-TIMED = ("no-permit", "no-drive", "ttl-drive", "ttl-permit", "ttl-noise", *(n for n in IDS if n.startswith("lost")))
+MOVES = tuple(name for name in IDS if name.startswith("move"))  # the last is move-clamp
+TIMED = (
+    "no-permit",
+    "no-drive",
+    "ttl-drive",
+    "ttl-permit",
+    "ttl-noise",
+    "role-permit",
+    *(n for n in IDS if n.startswith("lost")),
+)
 
 
 # -- hello and join ---------------------------------------------------------------------------------------------------
@@ -105,7 +115,41 @@ def _mac_of_any_role(join: Message, middle: Middle) -> bool:
     return join.get("mac") in {join_mac(KEY, middle.hello["nonce"], role) for role in ("controller", "monitor")}
 
 
+def _of_robot(**values: Any) -> Callable[[Message, Middle], Message]:
+    return of("hello", lambda hello, _: hello["robot"].update(values))
+
+
+def _stays(loop: SurveyLoop, _: Any, session: Any, reason: str) -> None:
+    session.write(json.dumps({"type": "refused", "reason": reason}).encode() + b"\n")
+
+
+def _first_asks(message: Message, middle: Middle) -> Message | None:
+    return message if message["type"] != "sensors" or middle.has_sent else None
+
+
+def _notes_what_was_sent(data: bytes, middle: Middle) -> bytes:
+    middle.has_sent = middle.has_sent or b'"drive"' in data
+    return data
+
+
 SESSIONS = [
+    Crooked("wheel radius in mm", "hello-robot", HELLO, says=_of_robot(wheel_radius_m=30.0)),
+    Crooked("wheel base in mm", "hello-robot", HELLO, says=_of_robot(wheel_base_m=150.0)),
+    Crooked("top speed in rpm", "hello-robot", HELLO, says=_of_robot(max_wheel_rad_s=76.4)),
+    Crooked("edge sensors in mm", "hello-robot", HELLO,
+            says=_of_robot(edge_sensors_m=[[90.0, 90.0], [90.0, -90.0], [-90.0, 90.0], [-90.0, -90.0]])),
+    Crooked("puck in mm", "hello-robot", HELLO, says=_of_robot(puck_m=[0.0, 0.0, 50.0])),
+    Crooked("fan floor in per cent", "hello-robot", HELLO, says=_of_robot(fan_floor=60.0)),
+    Crooked("no puck", "hello-robot", HELLO, says=of("hello", lambda hello, _: hello["robot"].pop("puck_m"))),
+    Crooked("a time-to-live of five seconds", "hello", HELLO, says=put("hello", ttl_s=5.0)),
+    Crooked("time-to-live in ms", "hello", HELLO, says=put("hello", ttl_s=250.0)),
+    Crooked("period of the frames for their rate", "hello", HELLO, says=put("hello", frame_hz=0.01)),
+    Crooked("one session number for all", "join", JOIN, says=put("joined", session=1)),
+    Crooked("joins of another protocol", "join-protocol", JOIN, hears=swap(b"ccatp-robot/0", b"ccatp-robot/1")),
+    Crooked("refuses and stays", "join-role join-client join-first join-protocol", JOIN[1:5],
+            twist=around("refuse", _stays)),
+    Crooked("no frame without a drive", "frames-first", ("frames-first",), says=_first_asks,
+            hears=_notes_what_was_sent),
     Crooked("protocol of another version", "hello", HELLO, says=put("hello", protocol="ccatp-robot/2")),
     Crooked("boot as text", "hello", HELLO, says=put("hello", boot="417")),
     Crooked("edge sensors in another order", "hello-robot", HELLO, says=of("hello", _edges)),
@@ -167,7 +211,42 @@ def _fix(name: str, frame: Message, place: int, value: float) -> None:
         sample[place] = value
 
 
+def _shifted(name: str, back_s: float) -> Callable[[Message, Middle], Message]:
+    return _each(lambda f: [sample.__setitem__(0, sample[0] - back_s) for sample in f[name]])
+
+
+def _gravity(change: Callable[[float, float, float, float], list[float]]) -> Callable[[Message, Middle], Message]:
+    return _each(lambda f: f["gravity"] and f.update(gravity=change(*f["gravity"])))
+
+
+def _clock(change: Callable[[float], float]) -> Callable[[Message, Middle], Message]:
+    """Another clock, in the frame and its samples."""
+
+    def says(frame: Message) -> None:
+        frame["t"] = change(frame["t"])
+        for sample in (*frame["imu"], *frame["enc"], *frame["edge"], *([frame["gravity"]] if frame["gravity"] else ())):
+            sample[0] = change(sample[0])
+
+    return _each(says)
+
+
 STREAMS = [
+    Crooked("samples of three frames ago", "frames-times", FRAMES, says=_shifted("enc", 0.03)),
+    Crooked("samples of the next frame", "frames-times", FRAMES, says=_shifted("edge", -0.01)),
+    Crooked("samples with the frame's time", "frames-times", FRAMES, says=_each(
+        lambda f: _fix("enc", f, 0, f["t"]))),
+    Crooked("gravity of a second ago", "frames-times", FRAMES, says=_gravity(lambda t, *g: [t - 1.0, *g])),
+    Crooked("gravity of the time to come", "frames-times", FRAMES, says=_gravity(lambda t, *g: [t + 0.5, *g])),
+    Crooked("gravity points up", "frames-gravity", FRAMES, says=_gravity(lambda t, x, y, z: [t, -x, -y, -z])),
+    Crooked("time in ms", "frames-clock", ("frames-clock",), says=_clock(lambda t_s: 1000.0 * t_s)),
+    Crooked("time in whole seconds", "frames-clock", ("frames-clock",), says=_each(lambda f: f.update(t=f["t"] // 1))),
+    Crooked("a clock that jumps back", "frames-clock", ("frames-clock",),
+            says=_clock(lambda t_s: t_s - 0.05 * (round(100 * t_s) % 10 == 0))),
+    Crooked("ages in ms", "echo", FRAMES, says=_each(lambda f: f["cmd"].update(age=1000.0 * f["cmd"]["age"]))),
+    Crooked("fan duties in per cent", "frames-state", FRAMES, says=_each(
+        lambda f: f.update(fans=[100.0 * duty + 50.0 for duty in f["fans"]]))),
+    Crooked("a rate that is no number", "frames-lines", ("frames-lines", "frames-seq"),
+            says=_each(lambda f: _fix("imu", f, 2, math.nan))),
     Crooked("a key twice", "frames-lines", FRAMES, says=_key_twice),
     Crooked("another rate than the hello's", "frames-clock", FRAMES, says=put("hello", frame_hz=60.0)),
     Crooked("samples of two", "frames-samples", FRAMES,
@@ -203,11 +282,12 @@ def _taken(kind: str, is_taken: Callable[[int, int], bool]) -> Callable[[SurveyL
     return around("robot._take", take)
 
 
-def _obey(kind: type[Drive] | type[FansMessage]) -> Callable[[SurveyLoop], None]:
+def _obey(kind: type[Drive | FansMessage | Permit]) -> Callable[[SurveyLoop], None]:
     """Messages of one kind from whatever role."""
+    owner = "monitor" if kind is Permit else "controller"
 
     def command(_: SurveyLoop, method: Any, session: Any, role: Any, message: Any, now_s: float) -> bool:
-        return bool(method(session, "controller" if isinstance(message, kind) else role, message, now_s))
+        return bool(method(session, owner if isinstance(message, kind) else role, message, now_s))
 
     return around("command", command)
 
@@ -241,7 +321,18 @@ CORRECTED = {
     "text-for-number": swap(b'"0.0"', b"0.0"),
     "no-utf-8": swap(b"\xff", b"?"),
 }
+
+
+def _counts_none(_: SurveyLoop, command: Any, session: Any, role: Any, message: Any, now_s: float) -> bool:
+    command(session, role, message, now_s)
+    return True
+
+
 COMMANDS = [
+    Crooked("remembers the numbers of the session before", "seq-session", ("seq-session",),
+            twist=lambda loop: setattr(loop.robot, "_forget", lambda _: None)),
+    Crooked("fans exchanged", "fans", ("fans",), says=_each(lambda f: f["fans"].reverse())),
+    Crooked("does not count what is not for a role", "bad-lines-role", LINES, twist=around("command", _counts_none)),
     *(Crooked(f"obeys {what} {order}", f"newest-{what}", NEWEST, twist=_taken(what, is_taken))
       for order, is_taken in (("that are old", int.__lt__), ("twice", int.__eq__))
       for what in ("drive", "permit", "fans")),
@@ -256,7 +347,7 @@ COMMANDS = [
     Crooked("counts unknown types as bad", "unknown-type", LINES, hears=swap(b'"dance","s', b'dance",s')),
     Crooked("closes after five bad lines", "bad-lines-few", LINES,
             twist=_each_session(lambda session: setattr(session, "_bad", BadLineCounter(5)))),
-    Crooked("bears any number of bad lines", "bad-lines-many", LINES,
+    Crooked("bears any number of bad lines", "bad-lines-many bad-lines-role", LINES,
             twist=_each_session(lambda session: setattr(session, "_bad", BadLineCounter(10_000)))),
     Crooked("knows short lines only", "line-longest", LINES,
             twist=_each_session(lambda session: setattr(session, "_lines", LineBuffer(4096)))),
@@ -331,6 +422,141 @@ def _emptied(message: Message, middle: Middle) -> None:
     message["soc"] = 1.0 / middle.count
 
 
+def _scaled(name: str, place: int, factor: float) -> Callable[[Message, Middle], Message]:
+    return _each(lambda f: [sample.__setitem__(place, factor * sample[place]) for sample in f[name]])
+
+
+def _wheels(right: float, left: float) -> Callable[[Message, Middle], Message]:
+    return _each(lambda f: f.update(enc=[[t, right * a, left * b] for t, a, b in f["enc"]]))
+
+
+def _motors(change: Callable[[float, float], tuple[float, float]]) -> Callable[[SurveyLoop], None]:
+    """Wheels that turn otherwise than the robot's rules say."""
+
+    def set_points(self: MotionRules, until_s: float) -> tuple[float, float]:
+        return change(*MotionRules.set_points(self, until_s))
+
+    return rules(set_points=set_points)
+
+
+def _columns(frame: Message) -> None:
+    frame["imu"] = [[t, wz, ax] for t, ax, wz in frame["imu"]]
+
+
+def _with_gravity(frame: Message) -> None:
+    frame["imu"] = [[t, ax - 0.31 * 9.81, wz] for t, ax, wz in frame["imu"]]
+
+
+ALL_MOVES = " ".join(name for name in MOVES if name != "move-clamp")
+STRAIGHT = ("move-forward", "move-turn")
+INERTIAL = ("gyroscope", "accelerometer")
+QUANTITIES = [
+    *(Crooked(f"encoders {what}", "move-forward move-turn", STRAIGHT, says=_wheels(factor, factor))
+      for what, factor in (("in rpm", 9.55), ("in degrees", 57.3), ("in turns per second", 0.159),
+                           ("of the motor's shaft", 20.0), ("of the other sign", -1.0), ("that stand still", 0.0))),
+    Crooked("right encoder of the other sign", "move-forward move-turn", STRAIGHT, says=_wheels(-1.0, 1.0)),
+    Crooked("left encoder that is dead", "move-forward move-turn", STRAIGHT, says=_wheels(1.0, 0.0)),
+    Crooked("drives taken for rpm", "move-forward", STRAIGHT[:1], twist=_motors(lambda a, b: (a / 9.55, b / 9.55))),
+    Crooked("drives taken for degrees", "move-forward", STRAIGHT[:1],
+            twist=_motors(lambda a, b: (a / 57.3, b / 57.3))),
+    Crooked("motors exchanged", "move-turn", STRAIGHT, twist=_motors(lambda a, b: (b, a))),
+    Crooked("wheels exchanged, encoders too", "gyroscope", INERTIAL, says=_each(_sides),
+            twist=_motors(lambda a, b: (b, a))),
+    Crooked("wheels reversed, encoders too", "gyroscope accelerometer", INERTIAL, says=_wheels(-1.0, -1.0),
+            twist=_motors(lambda a, b: (-a, -b))),
+    Crooked("half the wheel base", "gyroscope", INERTIAL, says=_of_robot(wheel_base_m=0.075)),
+    Crooked("diameter for the radius", "gyroscope accelerometer", INERTIAL, says=_of_robot(wheel_radius_m=0.06)),
+    *(Crooked(f"gyroscope {what}", "gyroscope", INERTIAL, says=_scaled("imu", 2, factor))
+      for what, factor in (("in degrees", 57.3), ("of the other sign", -1.0), ("in turns per second", 0.159),
+                           ("that is dead", 0.0))),
+    *(Crooked(f"accelerometer {what}", "accelerometer", INERTIAL, says=_scaled("imu", 1, factor))
+      for what, factor in (("in g", 1.0 / 9.81), ("of the other sign", -1.0), ("in mm/s2", 1000.0),
+                           ("that is dead", 0.0))),
+    Crooked("accelerometer and gyroscope exchanged", "gyroscope accelerometer", INERTIAL, says=_each(_columns)),
+    Crooked("gravity in the acceleration", "accelerometer", INERTIAL, says=_each(_with_gravity)),
+]  # fmt: skip
+
+
+def _goes_on(self: MotionRules, seq: int, right: float, left: float, now_s: float, steer: float = 0.0) -> None:
+    """A drive of zero is taken, and changes nothing."""
+    before = self._drive
+    MotionRules.drive(self, seq, right, left, now_s, steer)
+    self._drive = before if before is not None and right == left == 0.0 else self._drive
+
+
+def _each_wheel(self: MotionRules, seq: int, right: float, left: float, now_s: float, steer: float = 0.0) -> None:
+    most = self._max_wheel_rad_s
+    MotionRules.drive(self, seq, max(-most, min(most, right)), max(-most, min(most, left)), now_s, steer)
+
+
+def _not_beyond(self: MotionRules, seq: int, right: float, left: float, now_s: float, steer: float = 0.0) -> None:
+    is_beyond = max(abs(right), abs(left)) > self._max_wheel_rad_s
+    MotionRules.drive(self, seq, *((0.0, 0.0) if is_beyond else (right, left)), now_s, steer)
+
+
+def _judging(
+    judge: Callable[[MotionRules, tuple[bool, bool, bool], float], tuple[bool, bool, bool]],
+) -> Callable[[SurveyLoop], None]:
+    """Permits that are kept otherwise than they came: (forward, reverse, turn), the robot's time."""
+
+    def permit(self: MotionRules, forward: bool, reverse: bool, turn: bool, now_s: float) -> None:
+        MotionRules.permit(self, *judge(self, (forward, reverse, turn), now_s), now_s)
+
+    return rules(permit=permit)
+
+
+def _remembered(self: MotionRules, new: tuple[bool, bool, bool], _: float) -> tuple[bool, bool, bool]:
+    forward, reverse, turn = (a or b for a, b in zip(new, self._permit or new, strict=True))
+    return forward, reverse, turn
+
+
+def _while_it_lasts(self: MotionRules, new: tuple[bool, bool, bool], now_s: float) -> tuple[bool, bool, bool]:
+    """Each direction for the time-to-live since it was allowed last."""
+    allowed_s = self.__dict__.setdefault("allowed_s", [-9.0] * 3)
+    allowed_s[:] = [now_s if is_on else before_s for is_on, before_s in zip(new, allowed_s, strict=True)]
+    forward, reverse, turn = (now_s - at_s <= self._ttl_s for at_s in allowed_s)
+    return forward, reverse, turn
+
+
+def _until_it_stands(self: MotionRules, new: tuple[bool, bool, bool], _: float) -> tuple[bool, bool, bool]:
+    is_moving = not self.is_held and self._drive is not None and self._drive != (0.0, 0.0)
+    return self._permit if is_moving and self._permit is not None else new
+
+
+def _curves(is_allowed: Callable[[bool, bool], tuple[bool, bool]]) -> Callable[[SurveyLoop], None]:
+    """Curves that are judged otherwise: whether straight on and turn are allowed, of those permitted."""
+
+    def may_move(self: MotionRules, drive: tuple[float, float], until_s: float) -> bool:
+        right, left = drive
+        if right * left <= 0.0 or right == left or self._permit is None:
+            return MotionRules._may_move(self, drive, until_s)
+        permit = forward, reverse, turn = self._permit
+        straight, turn = is_allowed(forward if right > 0.0 else reverse, turn)
+        self._permit = straight, straight, turn
+        found = MotionRules._may_move(self, drive, until_s)
+        self._permit = permit
+        return found
+
+    return rules(_may_move=may_move)
+
+
+CURVES = ("move-curve", "move-curve-back", "move-turn")
+RULES = [
+    Crooked("ignores a drive of zero", "wheels-stop", ("wheels-stop", "move-turn"), twist=rules(drive=_goes_on)),
+    Crooked("knows no top speed", "move-clamp", MOVES[-1:],
+            twist=lambda loop: setattr(loop.robot.rules, "_max_wheel_rad_s", math.inf)),
+    Crooked("clamps each wheel by itself", "move-clamp", MOVES, twist=rules(drive=_each_wheel)),
+    Crooked("stops at drives beyond the top speed", "move-clamp", MOVES[-1:], twist=rules(drive=_not_beyond)),
+    Crooked("remembers what was allowed", ALL_MOVES, MOVES, twist=_judging(_remembered)),
+    Crooked("allows each direction for its own time-to-live", ALL_MOVES, MOVES, twist=_judging(_while_it_lasts)),
+    Crooked("takes permits at rest only", ALL_MOVES, MOVES[:-1], twist=_judging(_until_it_stands)),
+    Crooked("forward and reverse exchanged", "move-forward move-reverse move-curve move-curve-back", MOVES[:-1],
+            twist=_judging(lambda _, new, __: (new[1], new[0], new[2]))),
+    Crooked("takes no notice of permits", ALL_MOVES, MOVES[:-1], twist=_judging(lambda *_: (True, True, True))),
+    Crooked("curves need no turn", "move-curve", CURVES, twist=_curves(lambda straight, _: (straight, True))),
+    Crooked("curves need turn alone", "move-curve-back", CURVES, twist=_curves(lambda _, turn: (True, turn))),
+]  # fmt: skip
+
 STEPS = [
     Crooked("does not wait for drives", "lockstep-drive", LOCKSTEP[:2], twist=_never_waits("controller")),
     Crooked("does not wait for permits", "lockstep-permit", LOCKSTEP[:2], twist=_never_waits("monitor")),
@@ -344,9 +570,9 @@ STEPS = [
     Crooked("drives forward without permit", "move-forward", MOVES, twist=_allowing(forward=True)),
     Crooked("reverses without permit", "move-reverse move-curve-back", MOVES, twist=_allowing(reverse=True)),
     Crooked("turns without permit", "move-turn move-turn-back move-curve", MOVES, twist=_allowing(turn=True)),
-    Crooked("never reverses", "move-reverse move-curve-back", MOVES, twist=_allowing(reverse=False)),
-    Crooked("says held and turns", " ".join(MOVES), MOVES, twist=rules(set_points=_lie)),
-    Crooked("encoders on the wrong side", "move-turn move-turn-back", MOVES, says=_each(_sides)),
+    Crooked("never reverses", "move-reverse move-curve-back move-clamp", MOVES, twist=_allowing(reverse=False)),
+    Crooked("says held and turns", ALL_MOVES, MOVES, twist=rules(set_points=_lie)),
+    Crooked("encoders on the wrong side", " ".join(MOVES[2:]), MOVES, says=_each(_sides)),
 ]  # fmt: skip
 
 # -- on the wall clock ------------------------------------------------------------------------------------------------
@@ -416,22 +642,73 @@ def _forgets(forgotten: Role) -> Callable[[SurveyLoop], None]:
     return around("robot.lose", lambda _, lose, role: None if role == forgotten else lose(role))
 
 
+def _twice(message: Message, _: Middle) -> Message | bytes:
+    is_again = message["type"] == "sensors" and message["seq"] % 10 == 0
+    return (json.dumps(message).encode() + b"\n") * 2 if is_again else message
+
+
+def _command(**values: Callable[[Message], object]) -> Callable[[Message, Middle], Message]:
+    return _each(lambda f: f["cmd"].update({name: of_cmd(f["cmd"]) for name, of_cmd in values.items()}))
+
+
+def _loses_late(loop: SurveyLoop, lose: Any, role: Role) -> None:
+    if role == "controller" and role not in loop._holders:
+        asyncio.get_running_loop().call_later(0.15, lose, role)
+    else:
+        lose(role)
+
+
+def _fans_off_when_joined(loop: SurveyLoop, join: Any, role: Role) -> None:
+    join(role)
+    if role == "controller":
+        loop.robot.fans.duty = (0.0, 0.0)
+
+
+def _old_frames(loop: SurveyLoop) -> None:
+    loop.robot.sensors_delay_frames = 30
+    loop.robot._frames = deque(loop.robot._frames, maxlen=31)
+
+
 LOST = {role: f"lost-{role}-fin lost-{role}-rst" for role in ("controller", "monitor")}
 REALTIME = [
     Crooked("keeps a role for bad lines", "take-over", ("take-over",), hears=_noise_keeps_the_role),
     Crooked("gives roles away too soon", "take-over", ("take-over",), twist=around("command", _soon_taken_over)),
     Crooked("ignores the age of drives", "ttl-drive ttl-noise", TIMED, twist=_ageless("drive")),
-    Crooked("ignores the age of permits", "ttl-permit", TIMED, twist=_ageless("permit")),
-    Crooked("needs one key only", f"no-permit ttl-permit {LOST['monitor']}", TIMED, twist=rules(_may_move=_one_key)),
+    Crooked("ignores the age of permits", "ttl-permit role-permit", TIMED, twist=_ageless("permit")),
+    Crooked("needs one key only", f"no-permit ttl-permit role-permit {LOST['monitor']}", TIMED,
+            twist=rules(_may_move=_one_key)),
     Crooked("is not held without a drive", f"no-drive {LOST['controller']}", TIMED,
             twist=rules(set_points=_free_without_drive)),
-    Crooked("forgets commands too soon", "ttl-drive ttl-permit ttl-noise", TIMED[:5], twist=_short_lived),
+    Crooked("forgets commands too soon", "ttl-drive ttl-permit ttl-noise role-permit", TIMED[:6], twist=_short_lived),
     Crooked("lives on bad lines", "ttl-noise", TIMED, hears=_noise_refreshes),
-    Crooked("goes on without its controller", LOST["controller"], TIMED, twist=_forgets("controller")),
-    Crooked("goes on without its monitor", LOST["monitor"], TIMED, twist=_forgets("monitor")),
+    Crooked("goes on without its controller", LOST["controller"], TIMED[6:], twist=_forgets("controller")),
+    Crooked("goes on without its monitor", LOST["monitor"], TIMED[6:], twist=_forgets("monitor")),
     Crooked("stops fans with the wheels", "fans-ttl", ("fans-ttl", "fans", "fans-stop"), twist=_fans_stop_with_wheels),
-    Crooked("frames with numbers of their own", "frames-seq", FRAMES[:2],
+    Crooked("frames with numbers of their own", "frames-seq", FRAMES[:3],
             says=_each(lambda frame: frame["seq"] % 10 or frame.update(seq=frame["seq"] - 1))),
+    Crooked("frames that are left out", "frames-seq", FRAMES[:3],
+            says=lambda message, _: None if message.get("seq", 1) % 10 == 0 else message),
+    Crooked("frames that come twice", "frames-seq", FRAMES[:3], says=_twice),
+    Crooked("frame numbers of a session", "seq-session", ("seq-session",),
+            says=of("sensors", lambda frame, middle: frame.update(seq=middle.count))),
+    Crooked("obeys permits of the controller", "role-permit", TIMED[:6], twist=_obey(Permit)),
+    Crooked("a time-to-live twice as long", "ttl-drive ttl-permit ttl-noise role-permit", TIMED[:6],
+            twist=lambda loop: setattr(loop.robot.rules, "_ttl_s", 0.5)),
+    Crooked("never says held", "no-permit no-drive", TIMED[:2], says=_command(held=lambda _: False)),
+    Crooked("the drive's age for the permit's", "ttl-permit", ("ttl-permit", "ttl-drive"),
+            says=_command(permit_age=lambda cmd: cmd["age"])),
+    Crooked("drives that do not age", "ttl-drive", ("ttl-permit", "ttl-drive"), says=_command(age=lambda _: 0.0)),
+    Crooked("ages 0.1 s too long", "ttl-drive", ("ttl-drive",), says=_command(age=lambda cmd: cmd["age"] + 0.1)),
+    Crooked("holds 0.15 s after its controller is lost", LOST["controller"], TIMED[6:],
+            twist=around("robot.lose", _loses_late)),
+    Crooked("fans to their floor at each session", "fans-fin fans-rst", ("fans", "fans-fin", "fans-rst"),
+            twist=around("robot.join", _fans_off_when_joined)),
+    Crooked("a clock 5 % slow", "clock", ("clock", "frames-clock"), says=_clock(lambda t_s: 0.95 * t_s)),
+    Crooked("a clock 5 % fast", "clock", ("clock", "frames-clock"), says=_clock(lambda t_s: 1.05 * t_s)),
+    Crooked("frames that are 0.3 s old", "frames-age", ("frames-age", "echo"), twist=_old_frames),
+    Crooked("wheels go on without permits", "wheels-ttl-permit wheels-lost-monitor",
+            ("wheels-ttl-permit", "wheels-lost-monitor"),
+            twist=lambda loop: (rules(set_points=_lie)(loop), _forgets("monitor")(loop))),
     Crooked("says held and turns", "wheels-ttl wheels-lost", ("wheels-ttl", "wheels-lost"),
             twist=lambda loop: (rules(set_points=_lie)(loop), _forgets("controller")(loop))),
 ]  # fmt: skip
@@ -453,7 +730,11 @@ async def judge(config: Config, table: list[Crooked], *, lockstep: bool, key: by
     assert not wrong, json.dumps(wrong, indent=1)
 
 
-@pytest.mark.parametrize("table", [SESSIONS, STREAMS, COMMANDS, STEPS], ids=["sessions", "frames", "commands", "steps"])
+@pytest.mark.parametrize(
+    "table",
+    [SESSIONS, STREAMS, COMMANDS, STEPS, QUANTITIES, RULES],
+    ids=["sessions", "frames", "commands", "steps", "quantities", "rules"],
+)
 async def test_in_lockstep(config: Config, table: list[Crooked], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server_checks, "FRAMES", 15)  # whatever is wrong with them is wrong with the first
     await judge(config, table, lockstep=True)
@@ -476,6 +757,6 @@ async def test_on_the_wall_clock(config: Config, monkeypatch: pytest.MonkeyPatch
 
 
 def test_every_check_has_its_broken_server() -> None:
-    tables = (SESSIONS, MACS, STREAMS, COMMANDS, FLOORS, STEPS, REALTIME)
+    tables = (SESSIONS, MACS, STREAMS, COMMANDS, FLOORS, STEPS, QUANTITIES, RULES, REALTIME)
     found = {name for table in tables for crooked in table for name in crooked.fails.split()}
     assert set(IDS) - found == {"mac"}  # a server that refuses the right mac lets no check begin

@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock
 
 import pytest
 import zmq
@@ -14,11 +15,13 @@ import zmq.asyncio
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ccatp import dataloop
 from ccatp.config.models import Config
-from ccatp.dataloop import DataLoop, serve
+from ccatp.daemon import sim_robot
+from ccatp.dataloop import DataLoop, serve, survey_robot
 from ccatp.links.robot_link import RobotLink
 from ccatp.links.robot_messages import Role, Sensors
-from tests.support.scenario import SurveyLoop, config_of
+from tests.support.scenario import SurveyLoop, any_port, config_of
 
 DEADLINE_S = 5.0  # what takes milliseconds in a good run may take this long on a loaded machine
 JOIN = b'{"type":"join","role":"controller","client":"peer"}\n'
@@ -227,6 +230,47 @@ async def test_the_same_seed_gives_the_same_bytes(world: str) -> None:
     assert [json.loads(line)["seq"] for line in first] == list(range(301))
     assert await _drive_through(cfg, 300) == first
     assert await _drive_through(config_of(run__world=world, run__seed=cfg.run.seed + 1), 300) != first
+
+
+# -- a fall -----------------------------------------------------------------------------------------------------------
+
+
+async def test_a_fall_is_reported_to_who_started_the_robot_and_not_on_the_link(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robot = survey_robot(config_of())
+    monkeypatch.setattr(dataloop, "survey_robot", lambda *_: robot)
+    stop, listener = asyncio.Event(), any_port()
+    logged: list[dict[str, object]] = []
+
+    class Log:
+        def info(self, event: str, **fields: object) -> None:
+            if event == "robot_fell":
+                logged.append(fields)
+                stop.set()
+
+    task = asyncio.create_task(serve(config_of(), lockstep=False, stop=stop, listener=listener, log=Log()))
+    peer = Peer(*await asyncio.open_connection(*listener.getsockname()))
+    peer.send(JOIN)
+    await peer.message()
+    robot.world.displace(50.0, 0.0, 0.0)
+    async with asyncio.timeout(DEADLINE_S):
+        assert await task
+    (fell,) = logged
+    assert fell["cause"] == "rim"
+    assert b"fell" not in await peer.reader.read()
+    peer.writer.close()
+
+
+def test_the_status_after_a_fall(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(sim_robot, "serve", AsyncMock(side_effect=[True, False]))
+    cfg = config_of(sim__robot__port=0)
+    tmp_path.chmod(0o700)
+    assert sim_robot.run_alone(cfg, lockstep=True, runtime_dir=tmp_path) == 4
+    assert "the simulated robot fell" in capsys.readouterr().err
+    assert sim_robot.run_alone(cfg, lockstep=True, runtime_dir=tmp_path) == 0
 
 
 # -- truth ------------------------------------------------------------------------------------------------------------

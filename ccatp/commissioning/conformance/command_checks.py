@@ -27,8 +27,8 @@ from ccatp.commissioning.conformance.harness import (
     require,
     steady,
 )
-from ccatp.links.robot_codec import format_drive
-from ccatp.links.robot_messages import MAX_LINE_BYTES
+from ccatp.links.robot_codec import encode, format_drive
+from ccatp.links.robot_messages import MAX_LINE_BYTES, Fans
 
 CHECKS = CheckList()
 check, check_steady = CHECKS.add, partial(CHECKS.add, fixture=steady)
@@ -39,7 +39,7 @@ ATTEMPTS = 6
 AHEAD = 1000
 LOST_S = 0.05
 EARLY_FRAMES, LATE_FRAMES = 2, 3  # a robot acts from frame to frame
-FAN_STEP = 0.05
+FAN_STEPS = 0.05, 0.03  # left, right
 ENDINGS: tuple[Ending, Ending] = ("FIN", "RST")
 TOLERATED = 20  # bad lines in a second
 CROWD = 150  # drives in one segment, some 8 KiB
@@ -82,16 +82,21 @@ check_steady("ttl-drive", "a drive is in force for ttl_s", "real time")(partial(
 check_steady("ttl-permit", "a permit is in force for ttl_s", "real time")(partial(_ttl, "permit"))
 
 
-@check_steady("ttl-noise", "a bad line never refreshes a time-out", "real time")
-def _noise_is_no_drive(pair: ControllerAndMonitor) -> str:
+def _noise(key: Key, line: bytes, pair: ControllerAndMonitor) -> str:
+    """The controller sends lines that renew nothing, in the place of drives or permits."""
     facts = pair.facts
-    pair.rates = None
+    _withhold(pair, key)
     first, begin_s = len(pair.frames), pair.newest.t
     while pair.newest.t < begin_s + facts.ttl_s + AFTER_TTL_S:
-        seq, ack = pair.context.next_seq(), pair.newest.seq
-        pair.controller.send(b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":"0"}\n' % (seq, ack))
+        pair.controller.send(line % (pair.context.next_seq(), pair.newest.seq))
         pair.run(NOISE_S)
-    return check_ttl(pair.frames[first:], "drive", facts.ttl_s, facts.frame_s)
+    return check_ttl(pair.frames[first:], key, facts.ttl_s, facts.frame_s)
+
+
+BAD_DRIVE = b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":"0"}\n'
+PERMIT = b'{"type":"permit","seq":%d,"ack":%d,"forward":true,"reverse":true,"turn":true}\n'
+check_steady("ttl-noise", "a bad line never refreshes a time-out", "real time")(partial(_noise, "drive", BAD_DRIVE))
+check_steady("role-permit", "permits are the monitor's", "real time")(partial(_noise, "permit", PERMIT))
 
 
 def check_ttl(frames: Sequence[Frame], key: Key, ttl_s: float, frame_s: float) -> str:
@@ -178,8 +183,8 @@ def _newest_permit(pair: ControllerAndMonitor) -> str:
     if pair.facts.lockstep:
         in_force = _answered_frame(pair)
     else:
-        pair.run(SHORT_S)
-        in_force = pair.expect(lambda frame: frame.cmd.permit_age > 0.0, "permits do not age")
+        half_s = 0.5 * pair.facts.ttl_s  # older than any that was on its way
+        in_force = pair.expect(lambda frame: frame.cmd.permit_age >= half_s, "permits do not age")
     # The age shows which permit is in force.
     latest_s = in_force.arrival_s("permit") + 0.5 * pair.facts.frame_s
     for seq in (newest - 1, newest):
@@ -290,9 +295,9 @@ check_fans = partial(CHECKS.add, fixture=_changed_fans)
 
 def other_duty(duty: Pair, lowest: float) -> Pair:
     """Duties that differ from these, and are allowed; ``NotApplicable`` where there are none."""
-    if lowest > 1.0 - FAN_STEP:
+    if lowest > 1.0 - max(FAN_STEPS):
         raise NotApplicable(f"a floor of {lowest:g} leaves no room")
-    left, right = (value + FAN_STEP if value <= 1.0 - FAN_STEP else value - FAN_STEP for value in duty)
+    left, right = (v + step if v <= 1.0 - step else v - step for v, step in zip(duty, FAN_STEPS, strict=True))
     return left, right
 
 
@@ -371,7 +376,7 @@ def _fan_floor(pair: ControllerAndMonitor) -> str:
     lowest = pair.facts.robot.fan_floor
     if lowest <= 0.0:
         raise NotApplicable("fan_floor 0")
-    below = max(0.0, lowest - FAN_STEP)
+    below = max(0.0, lowest - max(FAN_STEPS))
     pair.fans((below, below))
     for frame in [*pair.settle(), *pair.run_frames(2)]:
         require(min(frame.fans) >= lowest - DUTY_TOLERANCE, f"fans at {_shown(frame.fans)}, floor {lowest:g}")
@@ -433,12 +438,17 @@ def _few_bad_lines(pair: ControllerAndMonitor) -> str:
     return f"{TOLERATED} bad lines at once, the session goes on"
 
 
-@check("bad-lines-many", "more than 20 bad lines in a second close the session")
-def _many_bad_lines(context: CheckContext) -> str:
+def _many_bad_lines(line: bytes, context: CheckContext) -> str:
     monitor = context.join("monitor")
-    monitor.send(b"garbage\n" * (TOLERATED + 1))
+    monitor.send(line * (TOLERATED + 1))
     require(context.is_closed(monitor), f"{TOLERATED + 1} bad lines at once, and the session is not closed")
     return f"{TOLERATED + 1} bad lines at once close the session"
+
+
+check("bad-lines-many", "more than 20 bad lines in a second close the session")(partial(_many_bad_lines, b"garbage\n"))
+check("bad-lines-role", "a message that is not for the sender's role counts as a bad line")(
+    partial(_many_bad_lines, encode(Fans(seq=0, duty=STILL)))
+)
 
 
 @check_steady("line-longest", "a line holds up to 8192 bytes")

@@ -10,9 +10,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from ccatp.config.messages import format_key
 from ccatp.links.robot_codec import encode, format_drive, format_permit, join_mac
@@ -29,6 +29,7 @@ ALL: Allowed = (True, True, True)
 NOTHING: Allowed = (False, False, False)
 POLL_S = 0.05
 COMMAND_LIMIT_S = 2.0  # robot's time in which a command must have come into force
+TOP_SPEED_M_S = 1.0
 DUTY_TOLERANCE = 0.01  # a duty in eight bits
 # Numbers between two of these are free for messages that must be older or newer than others.
 SEQ_STEP = 10
@@ -107,16 +108,16 @@ def parse(model: type[PartT], message: Message, where: str = "") -> PartT:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         name = format_key(first["loc"])
-        raise CheckFailed(
-            where + (f"no {name}" if first["type"] == "missing" else f"{name} = {first['input']!r}")
-        ) from None
+        seen = f"no {name}" if first["type"] == "missing" else f"{name} = {first['input']!r}"
+        own = first.get("ctx", {}).get("error")
+        raise CheckFailed(where + (seen if own is None else f"{name}: {own}")) from None
 
 
 class Timing(Part):
     """Clock of the robot, in its hello."""
 
     lockstep: bool
-    frame_hz: Positive
+    frame_hz: Annotated[float, Field(ge=5.0, le=1000.0)]
     ttl_s: Positive
 
     @property
@@ -126,12 +127,19 @@ class Timing(Part):
 
 
 class Body(Part):
-    """Sizes of the robot that the checks need."""
+    """Sizes of the robot that the checks need; wheels do not turn on impossible ones."""
 
-    wheel_radius_m: Positive
-    wheel_base_m: Positive
+    wheel_radius_m: Annotated[float, Field(ge=0.005, le=0.2)]
+    wheel_base_m: Annotated[float, Field(ge=0.03, le=1.0)]
     max_wheel_rad_s: Positive
     fan_floor: float
+
+    @model_validator(mode="after")
+    def _check_speed(self) -> Self:
+        speed_m_s = self.wheel_radius_m * self.max_wheel_rad_s
+        if speed_m_s > TOP_SPEED_M_S:
+            raise ValueError(f"a top speed of {speed_m_s:.3g} m/s, at most {TOP_SPEED_M_S:g}")
+        return self
 
 
 class Facts(Timing):
@@ -156,12 +164,17 @@ class Echo(Part):
 
 
 class Frame(Part):
-    """What the checks need of a sensors frame; ``enc`` holds samples (t, right, left) of the wheels, s and rad/s."""
+    """What the checks need of a sensors frame.
+
+    ``enc`` holds samples (t, right, left) of the wheels, s and rad/s; ``imu`` (t, ax, wz), s, m/s^2, rad/s.
+    """
 
     seq: int
     t: float
     fans: Two
+    imu: list[Any] = []
     enc: list[Any]
+    gravity: Any = None
     cmd: Echo
 
     def age_s(self, key: Key) -> float:
@@ -365,6 +378,7 @@ class ControllerAndMonitor:
     ``rates``: (right, left) set points of the drive that answers each frame, rad/s; ``None`` sends none. ``allowed``:
     (forward, reverse, turn) of the permit that answers each frame; ``None`` sends none. ``messages``: sensors messages
     as they came, of the controller and of the monitor. ``duty``: of the fans, (left, right), where a check changed it.
+    ``received_s``: when each of the ``frames`` came; ``sent_s``: when each drive was sent, by its number; this clock.
     """
 
     def __init__(self, context: CheckContext) -> None:
@@ -374,6 +388,8 @@ class ControllerAndMonitor:
         self.allowed: Allowed | None = ALL
         self.duty: Pair = STILL
         self.frames: list[Frame] = []
+        self.received_s: list[float] = []
+        self.sent_s: dict[int, float] = {}
         self.messages: tuple[list[Message], list[Message]] = ([], [])
         self.raw: list[bytes] = []
 
@@ -401,6 +417,7 @@ class ControllerAndMonitor:
     def drive(self, seq: int | None = None, rates: Pair = STILL, ack: int | None = None, before: bytes = b"") -> int:
         """Send a drive that answers the newest frame (or another), with other bytes in front; returns its number."""
         seq = self.context.next_seq() if seq is None else seq
+        self.sent_s[seq] = time.monotonic()
         self.controller.send(before + format_drive(seq, self.newest.seq if ack is None else ack, *rates))
         if ack is None:
             self.mark_driven()
@@ -539,6 +556,7 @@ class ControllerAndMonitor:
                 frame = parse(Frame, message, "a sensors frame with ")
                 if not self.frames or frame.seq > self.newest.seq:
                     self.frames.append(frame)
+                    self.received_s.append(time.monotonic())
         return len(self.frames) > before
 
 

@@ -15,12 +15,14 @@ from ccatp.commissioning.conformance.harness import (
     ControllerAndMonitor,
     Facts,
     Frame,
+    Key,
     NotApplicable,
     Pair,
     require,
     steady,
     whole_samples,
 )
+from ccatp.links.robot_messages import Role
 
 CHECKS = CheckList()
 check_steady = partial(CHECKS.add, fixture=steady)
@@ -29,10 +31,18 @@ REPEATED_S = 1.7  # wall time in which a frame without answers comes again
 BEYOND_TTL_S = 0.2
 RATE_RAD_S = 0.5
 MOVE_S = 0.8  # longest time in which a drive must show in the encoders
+SETTLE_S, MEAN_S = 0.3, 0.2  # then of the servo; of a mean
+RAMP_S = 0.6  # from one set point to another
+ATTEMPTS = 3  # where answers of a busy machine came too late
 DENIED_S = 0.3
 STOP_S = 0.7  # a servo comes to rest in this time
 WINDOW = 5  # frames of one mean
 SHARE = 0.3  # of the set point: above it turns, below it stands
+RATE_TOLERANCE, RATIO_TOLERANCE = 0.25, 0.1  # of the set point; of the other wheel
+BEYOND: Pair = (2.0, -1.5)  # times the top speed
+IMU_SHARE = (0.6, 1.6)  # of what the wheels do: they may slip
+LEAST_IMU_HZ = 45.0
+G_M_S2, LEAST_SLOPE_M_S2 = 9.81, 1.0
 
 # -- lockstep ---------------------------------------------------------------------------------------------------------
 
@@ -110,13 +120,13 @@ def _sends_again(pair: ControllerAndMonitor) -> str:
 
 def notice(facts: Facts, checks: int) -> str:
     """The most that each of so many checks moves the robot, for its operator."""
-    rate_rad_s, time_s = _rate(facts), MOVE_S + facts.ttl_s
+    rate_rad_s, time_s = _rate(facts), MOVE_S + SETTLE_S + MEAN_S + facts.ttl_s
     speed_m_s = rate_rad_s * facts.robot.wheel_radius_m
     turn_rad = 2.0 * speed_m_s / facts.robot.wheel_base_m * time_s
     return (
         f"wheels will turn in {checks} checks, each at most {rate_rad_s:g} rad/s ({1e3 * speed_m_s:.0f} mm/s) for "
         f"{time_s:.2f} s: {1e3 * speed_m_s * time_s:.0f} mm, {math.degrees(turn_rad):.0f} degrees; "
-        "--no-motion leaves them out"
+        f"move-clamp turns a quarter and back at {facts.robot.max_wheel_rad_s:g} rad/s; --no-motion leaves them out"
     )
 
 
@@ -147,7 +157,7 @@ def _at_rest(context: CheckContext) -> Iterator[ControllerAndMonitor]:
     finally:
         pair.rates = STILL
         with suppress(CheckFailed):
-            if not pair.controller.is_ended:
+            if pair.controller.is_open and not (pair.controller.is_ended or pair.monitor.is_ended):
                 pair.steady()
 
 
@@ -155,7 +165,7 @@ check_at_rest = partial(CHECKS.add, fixture=_at_rest)
 
 
 def _direction(shares: Pair, allowed: Allowed, denied: Allowed, pair: ControllerAndMonitor) -> str:
-    """A drive that is denied, then the same allowed."""
+    """A drive that is denied, then the same allowed, then denied again."""
     rate_rad_s = _rate(pair.facts)
     rates = rate_rad_s * shares[0], rate_rad_s * shares[1]
     pair.allowed = denied
@@ -168,42 +178,167 @@ def _direction(shares: Pair, allowed: Allowed, denied: Allowed, pair: Controller
     require(_is_still(frames, rate_rad_s), f"wheels turn although only {_named(denied)} is allowed")
     pair.rates = STILL
     pair.settle()
-    seen = _move(pair, rates, allowed)
+    seen = _seen_rates(_move(pair, rates, allowed))
+    for frame in _denied_again(pair, denied):
+        require(frame.cmd.held, f"not held {frame.cmd.permit_age:.3f} s after a permit of {_named(denied)} alone")
+    pair.allowed = denied
+    pair.run(STOP_S)
+    require(_is_still(pair.frames[-WINDOW:], rate_rad_s), f"wheels go on although only {_named(denied)} is allowed")
     return f"held when denied; allowed, the wheels turn at {seen[0]:.2f}, {seen[1]:.2f} rad/s"
+
+
+def _denied_again(pair: ControllerAndMonitor, denied: Allowed) -> list[Frame]:
+    """Frames in which a permit is in force that denies what goes on, none of them after its time-to-live."""
+    if pair.facts.lockstep:
+        pair.allowed = denied
+        pair.settle()
+        return pair.run(DENIED_S)
+    first = len(pair.frames)
+    pair.allowed = None
+    pair.permit(allowed=denied)
+    pair.find(lambda frame: frame.cmd.permit_age > 0.7 * pair.facts.ttl_s)
+    # It is the last of the permits: it arrived when the age says in the end.
+    since_s = pair.newest.arrival_s("permit") - 0.5 * pair.facts.frame_s
+    in_force = [frame for frame in pair.frames[first:] if frame.arrival_s("permit") >= since_s]
+    return [frame for frame in in_force[2:] if frame.cmd.permit_age < 0.9 * pair.facts.ttl_s]
 
 
 for _check_id, _promise, _shares, _allowed, _denied in DIRECTIONS:
     check_at_rest(_check_id, _promise, "motion")(partial(_direction, _shares, _allowed, _denied))
 
 
-@check_at_rest("wheels-ttl", "wheels stop when the drive is older than ttl_s", "motion", "real time")
-def _stops_after_ttl(pair: ControllerAndMonitor) -> str:
+@check_at_rest("wheels-stop", "a drive of zero stops the wheels at once", "motion")
+def _stops_at_zero(pair: ControllerAndMonitor) -> str:
+    rate_rad_s = _rate(pair.facts)
+    seen = ""
+    for rates in ((rate_rad_s, rate_rad_s), (-rate_rad_s, rate_rad_s)):
+        _move(pair, rates, ALL)
+        pair.rates = STILL
+        pair.run(STOP_S)
+        right, left = _seen_rates(pair.frames[-WINDOW:])
+        seen = f"wheels at {right:.3f}, {left:.3f} rad/s {STOP_S:g} s after a drive of zero"
+        require(_is_still(pair.frames[-WINDOW:], rate_rad_s), seen)
+    return seen
+
+
+def _stops_without(key: Key, pair: ControllerAndMonitor) -> str:
     rate_rad_s = _rate(pair.facts)
     _move(pair, (rate_rad_s, rate_rad_s), ALL)
-    pair.rates = None
+    if key == "drive":
+        pair.rates = None
+    else:
+        pair.allowed = None
     pair.run(pair.facts.ttl_s)
-    return _stopped(pair, "of the last drive's time-to-live")
+    return _stopped(pair, f"of the last {key}'s time-to-live")
 
 
-@check_at_rest("wheels-lost", "wheels stop when the controller's session is lost", "motion", "real time")
-def _stops_when_lost(pair: ControllerAndMonitor) -> str:
+def _stops_when_lost(role: Role, pair: ControllerAndMonitor) -> str:
     rate_rad_s = _rate(pair.facts)
     _move(pair, (-rate_rad_s, -rate_rad_s), ALL)
-    pair.rates = None
-    pair.controller.end("FIN")
-    return _stopped(pair, "of the controller's session")
+    if role == "controller":
+        pair.rates = None
+        pair.controller.end("FIN")
+    else:
+        pair.allowed = None
+        pair.monitor.end("FIN")
+    return _stopped(pair, f"of the {role}'s session")
 
 
-def _move(pair: ControllerAndMonitor, rates: Pair, allowed: Allowed) -> Pair:
-    pair.rates, pair.allowed = rates, allowed
-    first = len(pair.frames)
-    pair.find(lambda _: len(pair.frames) - first > WINDOW and _is_turning(pair.frames[-WINDOW:], rates), MOVE_S)
-    frames = pair.frames[-WINDOW:]
+for _check_id, _promise, _stops in (
+    ("wheels-ttl", "wheels stop when the drive is older than ttl_s", partial(_stops_without, "drive")),
+    ("wheels-ttl-permit", "wheels stop when the permit is older than ttl_s", partial(_stops_without, "permit")),
+    ("wheels-lost", "wheels stop when the controller's session is lost", partial(_stops_when_lost, "controller")),
+    ("wheels-lost-monitor", "wheels stop when the monitor's session is lost", partial(_stops_when_lost, "monitor")),
+):
+    check_at_rest(_check_id, _promise, "motion", "real time")(_stops)
+
+
+@check_at_rest("move-clamp", "set points beyond max_wheel_rad_s are clamped, their ratio kept", "motion")
+def _clamp(pair: ControllerAndMonitor) -> str:
+    most_rad_s = pair.facts.robot.max_wheel_rad_s
+    seen = ""
+    for sign in (1.0, -1.0):
+        rates = sign * BEYOND[0] * most_rad_s, sign * BEYOND[1] * most_rad_s
+        right, left = _seen_rates(_turning(pair, rates, ALL))
+        seen = f"wheels at {right:.3g}, {left:.3g} rad/s for {rates[0]:g}, {rates[1]:g}, at most {most_rad_s:g}"
+        require(abs(abs(right) / most_rad_s - 1.0) <= RATE_TOLERANCE and right * sign > 0.0, seen)
+        require(abs(left / right - BEYOND[1] / BEYOND[0]) <= RATIO_TOLERANCE, seen)
+        pair.rates = STILL
+        pair.run(STOP_S)
+    return seen
+
+
+@check_at_rest("gyroscope", "wz is the angular rate about robot z in rad/s, left turns positive", "motion")
+def _gyroscope(pair: ControllerAndMonitor) -> str:
+    """A turn on the spot and back, of which the difference has no bias."""
+    rate_rad_s, robot = _rate(pair.facts), pair.facts.robot
+    seen = []
+    for rates in ((rate_rad_s, -rate_rad_s), (-rate_rad_s, rate_rad_s)):
+        frames = _move(pair, rates, ALL)
+        right, left = _seen_rates(frames)
+        seen.append((robot.wheel_radius_m * (right - left) / robot.wheel_base_m, _imu_mean(frames, 2)))
+        pair.rates = STILL
+        pair.run(STOP_S)
+    (wheels, gyroscope), (wheels_back, gyroscope_back) = seen
+    by_wheels, by_gyroscope = 0.5 * (wheels - wheels_back), 0.5 * (gyroscope - gyroscope_back)
+    text = f"a turn of {by_gyroscope:.3f} rad/s, {by_wheels:.3f} by the wheels"
+    require(IMU_SHARE[0] <= by_gyroscope / by_wheels <= IMU_SHARE[1], text)
+    return text
+
+
+@check_at_rest("accelerometer", "ax is the acceleration along robot x in m/s2, gravity removed", "motion")
+def _accelerometer(pair: ControllerAndMonitor) -> str:
+    """Forward and back again, of which each half begins and ends at rest: the bias has no part in the difference."""
+    rate_rad_s = _rate(pair.facts)
+    frames = pair.run(RAMP_S)
+    rest_m_s2, fall = _imu_mean(frames, 1), [f.gravity[1] for f in frames if whole_samples([f.gravity], 4)]
+    slope_m_s2 = G_M_S2 * sum(fall) / len(fall) if fall else 0.0
+    is_removed = abs(slope_m_s2) < LEAST_SLOPE_M_S2 or abs(rest_m_s2) < 0.5 * abs(slope_m_s2)
+    require(is_removed, f"ax {rest_m_s2:.2f} m/s2 at rest, where gravity has {slope_m_s2:.2f} along x: not removed")
+    by_imu, by_wheels = 0.0, 0.0
+    for _ in range(ATTEMPTS):
+        first, by_imu, by_wheels = len(pair.frames), 0.0, 0.0
+        for share, before in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)):
+            pair.rates = share * rate_rad_s, share * rate_rad_s
+            frames = pair.run(RAMP_S)
+            by_imu += 0.25 * (share - before) * _imu_mean(frames, 1) * RAMP_S
+            by_wheels += 0.5 * share * pair.facts.robot.wheel_radius_m * _seen_rates(frames[-2 * WINDOW :])[0]
+        if not _is_held(pair.frames[first:]):
+            break
+    text = f"a change of {1e3 * by_imu:.1f} mm/s, {1e3 * by_wheels:.1f} by the wheels"
+    require(by_wheels > 0.0 and IMU_SHARE[0] <= by_imu / by_wheels <= IMU_SHARE[1], text)
+    return text
+
+
+def _imu_mean(frames: Sequence[Frame], column: int) -> float:
+    """Mean of acceleration (column 1) or rate (2); ``NotApplicable`` where there are too few samples."""
+    samples = [sample for frame in frames[1:] for sample in whole_samples(frame.imu, 3)]
+    if len(samples) < LEAST_IMU_HZ * (frames[-1].t - frames[0].t):
+        raise NotApplicable(f"{len(samples)} IMU samples in {len(frames)} frames, at least {LEAST_IMU_HZ:g} Hz needed")
+    return sum(sample[column] for sample in samples) / len(samples)
+
+
+def _move(pair: ControllerAndMonitor, rates: Pair, allowed: Allowed) -> list[Frame]:
+    """Frames in which the wheels turn as the drive says, once they do so; ``CheckFailed`` where they do not."""
+    frames = _turning(pair, rates, allowed)
     right, left = _seen_rates(frames)
-    require(not pair.newest.cmd.held, f"held although {_named(allowed)} is allowed")
-    wanted = f"{rates[0]:g}, {rates[1]:g} allowed"
-    require(_is_turning(frames, rates), f"wheels at {right:.3f}, {left:.3f} rad/s, {wanted}")
-    return right, left
+    most_rad_s = RATE_TOLERANCE * max(map(abs, rates))
+    is_right = abs(right - rates[0]) <= most_rad_s and abs(left - rates[1]) <= most_rad_s
+    require(is_right, f"wheels at {right:.3f}, {left:.3f} rad/s, {rates[0]:g}, {rates[1]:g} allowed")
+    return frames
+
+
+def _turning(pair: ControllerAndMonitor, rates: Pair, allowed: Allowed) -> list[Frame]:
+    """Frames of a drive to which the servo has had time to settle, none of them held."""
+    pair.rates, pair.allowed = rates, allowed
+    for _ in range(ATTEMPTS):
+        pair.run_frames(WINDOW)
+        pair.find(lambda _: _is_turning(pair.frames[-WINDOW:], rates), MOVE_S)
+        pair.run(SETTLE_S)
+        frames = pair.run(MEAN_S)
+        if not _is_held(frames):
+            return frames
+    raise CheckFailed(f"held although {_named(allowed)} is allowed")
 
 
 def _stopped(pair: ControllerAndMonitor, end: str) -> str:
@@ -239,6 +374,10 @@ def _is_turning(frames: Sequence[Frame], rates: Pair) -> bool:
 def _is_still(frames: Sequence[Frame], rate_rad_s: float) -> bool:
     seen = mean_rates(frames)
     return seen is None or max(map(abs, seen)) < SHARE * rate_rad_s
+
+
+def _is_held(frames: Sequence[Frame]) -> bool:
+    return any(frame.cmd.held for frame in frames)
 
 
 def _named(allowed: Allowed) -> str:

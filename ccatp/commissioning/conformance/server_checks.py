@@ -26,7 +26,6 @@ from ccatp.commissioning.conformance.harness import (
     RawConnection,
     Three,
     Timing,
-    Two,
     parse,
     require,
     shorten,
@@ -49,9 +48,16 @@ FRAMES = 40  # each answered by a drive and a permit
 MOST_HZ = {"imu": 100.0, "enc": 1000.0, "edge": 1000.0}
 PERIOD_TOLERANCE = 0.2
 RATE_TOLERANCE = 1.1
+LONGEST_TTL_S = 0.5  # the limits of the fault table rest on 0.25 s
+CLOCK_S, CLOCK_TOLERANCE = 2.0, 0.03  # 1 %, and what frames that come late add to it
+ATTEMPTS = 5  # where a busy machine looks like a fault
+OLDEST_S = 0.15  # robot.sensors_timeout_s
+STALE_GRAVITY_S = 0.5
+FIRST_FRAME_S = 1.0
 NORM_TOLERANCE = 0.02  # of a unit vector in a few decimals
 TIME_TOLERANCE_S = 1e-6  # times printed with six decimals
 
+Near = Annotated[float, Field(ge=-1.0, le=1.0)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 FaultName = Literal[
     "imu", "encoder_left", "encoder_right", "edge", "fan_left", "fan_right", "battery_low", "stall"
@@ -62,6 +68,7 @@ Frames = Sequence[Message]
 
 
 class _HelloPart(Timing):
+    ttl_s: Annotated[float, Field(gt=0.0, le=LONGEST_TTL_S)]
     protocol: str
     boot: int
     nonce: Annotated[str, Field(pattern=r"^[0-9a-fA-F]{32}$")]
@@ -70,8 +77,9 @@ class _HelloPart(Timing):
 
 class _RobotPart(Body):
     fan_floor: Fraction
-    puck_m: Three
-    edge_sensors_m: Annotated[list[Two], Field(min_length=4, max_length=4)]
+    puck_m: Annotated[list[Near], Field(min_length=3, max_length=3)]
+    edge_sensors_m: Annotated[list[Annotated[list[Near], Field(min_length=2, max_length=2)]],
+                              Field(min_length=4, max_length=4)]  # fmt: skip
 
 
 class _HelloRobot(Part):
@@ -113,9 +121,11 @@ def _boots(context: CheckContext) -> str:
 # -- join -------------------------------------------------------------------------------------------------------------
 
 
-@check("join", "a join is answered by joined, with role and session")
+@check("join", "a join is answered by joined, with role and a session of its own")
 def _join_both(context: CheckContext) -> str:
-    return "; ".join(_joined(context, role) for role in ROLES)
+    seen = [_joined(context, role) for role in ROLES]
+    require(len({session for _, session in seen}) == len(ROLES), f"both sessions have the number {seen[0][1]}")
+    return "; ".join(f"{role} joined, session {session}" for role, session in seen)
 
 
 @check("join-in-time", "a client has 2 s to join")
@@ -142,12 +152,12 @@ def _join_late(context: CheckContext) -> str:
     return f"{spent_s:.2f} s after the hello: {_refused(context, connection, 'bad join')}"
 
 
-def _bad_join(check_id: str, promise: str, line: bytes) -> None:
+def _bad_join(check_id: str, promise: str, line: bytes, reason: str = "bad join") -> None:
     @check(check_id, promise)
     def _(context: CheckContext) -> str:
         connection, _ = context.greet()
         connection.send(line)
-        return _refused(context, connection, "bad join")
+        return _refused(context, connection, reason)
 
 
 _bad_join("join-role", "a role that does not exist is refused as bad join, and closed",
@@ -156,6 +166,9 @@ _bad_join("join-client", "a join without all its keys is refused as bad join, an
           b'{"type":"join","role":"controller"}\n')  # fmt: skip
 _bad_join("join-first", "the first message of a client is its join; others are refused as bad join",
           encode(Drive(seq=1, ack=0, wr=0.0, wl=0.0)))  # fmt: skip
+_bad_join("join-protocol", "a join for another protocol is refused as bad protocol, and closed",
+          b'{"type":"join","protocol":"ccatp-robot/0","role":"controller","client":"conformance","mac":""}\n',
+          "bad protocol")  # fmt: skip
 
 
 @check("role-taken", "one controller and one monitor at most")
@@ -232,7 +245,7 @@ def _send_bad_lines(pair: ControllerAndMonitor, until_s: float) -> None:
 
 @check("mac", "a join with the right mac is accepted", "hmac")
 def _mac_right(context: CheckContext) -> str:
-    return _joined(context, "monitor")
+    return f"monitor joined, session {_joined(context, 'monitor')[1]}"
 
 
 def _bad_mac(check_id: str, promise: str, line: Callable[[CheckContext, Message], bytes], *reasons: str) -> None:
@@ -258,13 +271,14 @@ _bad_mac("mac-role", "a mac belongs to one role",
          lambda context, hello: _forged(context, hello, b"", "controller"))  # fmt: skip
 
 
-def _joined(context: CheckContext, role: Role) -> str:
+def _joined(context: CheckContext, role: Role) -> tuple[Role, int]:
     _, answer = context.request(role)
     require(answer["type"] == "joined", f"{role} refused: {answer.get('reason')}")
     session = answer.get("session")
     require(answer.get("role") == role, f"joined as {answer.get('role')!r} instead of {role}")
-    require(type(session) is int, f"joined with session = {session!r}")
-    return f"{role} joined, session {session}"
+    if type(session) is not int:
+        raise CheckFailed(f"joined with session = {session!r}")
+    return role, session
 
 
 def _refused(context: CheckContext, connection: RawConnection, *reasons: str) -> str:
@@ -302,6 +316,9 @@ class _FaultsPart(Part):
 def _recorded(context: CheckContext) -> Iterator[ControllerAndMonitor]:
     pair = ControllerAndMonitor(context)
     pair.run_frames(FRAMES)
+    if pair.facts.lockstep:  # a frame comes again, unchanged, where this machine was busy
+        for messages in pair.messages:
+            messages[1:] = [after for before, after in pairwise(messages) if after != before]
     require(len(pair.messages[0]) > 2, "fewer than three frames for the controller")
     yield pair
 
@@ -349,11 +366,19 @@ def line_fault(line: bytes, limit_bytes: int) -> str | None:
     return None if isinstance(value, dict) else f"no object: {shorten(line)}"
 
 
-@check_frames("frames-seq", "seq of the frames increases")
+@check("frames-first", "the first frame comes unasked, at most 1 s after joined")
+def _first_frame(context: CheckContext) -> str:
+    controller = context.join("controller")
+    came = context.until(lambda: b'"sensors"' in b"".join(controller.lines), FIRST_FRAME_S + NOISE_S)
+    require(came, f"no frame within {FIRST_FRAME_S + NOISE_S:g} s after joined, of a controller that sends nothing")
+    return "a frame for a controller that sends nothing"
+
+
+@check_frames("frames-seq", "seq of the frames increases by one")
 def _seq(frames: Frames) -> str:
     numbers = [frame["seq"] for frame in frames]
     for before, after in pairwise(numbers):
-        require(after > before, f"seq {after} after {before}")
+        require(after == before + 1, f"seq {after} after {before}")
     return f"{numbers[0]} to {numbers[-1]} in {len(frames)} frames"
 
 
@@ -384,6 +409,10 @@ def _shapes(frames: Frames) -> str:
 
 @check_frames("frames-times", "a list holds the samples since the last frame, oldest first")
 def _times(frames: Frames) -> str:
+    for frame in frames:
+        gravity_s, *_ = frame.get("gravity") or [frame["t"]]
+        is_fresh = frame["t"] - STALE_GRAVITY_S <= gravity_s <= frame["t"] + TIME_TOLERANCE_S
+        require(is_fresh, f"gravity of {gravity_s} in the frame of {frame['t']}")
     for name in MOST_HZ:
         latest_s = -math.inf
         for before, after in pairwise(frames):
@@ -421,13 +450,19 @@ def check_edges(frames: Frames) -> str:
     return f"{len(samples)} samples of 0 and 1, the last {samples[-1][1:]}"
 
 
-@check_frames("frames-gravity", "gravity is null, or a time and a unit vector")
-def check_gravity(frames: Frames) -> str:
-    """Gravity: null, or a time and a unit vector."""
+@check_recorded("frames-gravity", "gravity is null, or a time and the unit vector along which things fall")
+def _gravity(pair: ControllerAndMonitor) -> str:
+    return check_gravity(pair.messages[0], pair.facts.robot.fan_floor)
+
+
+def check_gravity(frames: Frames, fan_floor: float = 0.0) -> str:
+    """Gravity: null, or a time and a unit vector; towards the surface unless fans hold the robot."""
     found = [gravity for frame in frames if (gravity := parse(_GravityPart, frame).gravity) is not None]
     for gravity in found:
         norm = math.hypot(*gravity[1:])
         require(abs(norm - 1.0) <= NORM_TOLERANCE, f"gravity of length {norm:.4g}: {gravity}")
+        holds = fan_floor > 0.0 or gravity[3] < 0.0
+        require(holds, f"gravity {gravity[1:]} points away from the surface, and fan_floor is 0: wrong sign of z?")
     return f"{len(found)} unit vectors in {len(frames)} frames"
 
 
@@ -484,3 +519,44 @@ def _echo(pair: ControllerAndMonitor) -> str:
     ages_s = [frame.cmd.age for frame in frames[-10:]]
     require(max(ages_s) < pair.facts.ttl_s, f"cmd.age {max(ages_s):.3f} s with a new drive for each frame")
     return f"drive {pair.newest.cmd.seq} in force, age {ages_s[-1]:.3f} s"
+
+
+@check_steady("seq-session", "a client's seq counts within its session, the robot's within its boot")
+def _seq_of_a_session(pair: ControllerAndMonitor) -> str:
+    context, last = pair.context, pair.settle()[-1].seq
+    used, context.last_seq = context.last_seq, 0
+    pair.rejoin()
+    try:
+        frame = pair.steady()
+    finally:
+        context.last_seq = used
+    new = pair.messages[0][-1]["seq"]
+    require(new > last, f"frame {new} of a new session after {last}")
+    return f"drive {frame.cmd.seq} of a new session obeyed after {used}, frame {new} after {last}"
+
+
+@check_steady("clock", "the rate of the robot's clock is wrong by up to 1 %", "real time")
+def _clock_rate(pair: ControllerAndMonitor) -> str:
+    """Between the frames that were the fastest to come, of the first and of the last quarter of the time."""
+    rate = 0.0
+    for _ in range(ATTEMPTS):
+        first = len(pair.frames)
+        pair.run(CLOCK_S)
+        times = [(s - f.t, f.t) for f, s in zip(pair.frames[first:], pair.received_s[first:], strict=True)]
+        (early_s, begin_s), (late_s, end_s) = min(times[: len(times) // 4]), min(times[-len(times) // 4 :])
+        rate = (end_s - begin_s) / (end_s - begin_s + late_s - early_s) - 1.0
+        if abs(rate) <= CLOCK_TOLERANCE:
+            break
+    require(abs(rate) <= CLOCK_TOLERANCE, f"the robot's clock goes {100.0 * rate:+.1f} % against this machine's")
+    return f"{100.0 * rate:+.1f} % against this machine's"
+
+
+@check_steady("frames-age", "a frame that answers a drive is not older than 0.15 s, there and back", "real time")
+def _age(pair: ControllerAndMonitor) -> str:
+    first = len(pair.frames)
+    pair.run(FIRST_FRAME_S)
+    seen = zip(pair.frames[first:], pair.received_s[first:], strict=True)
+    trips_s = [at_s - pair.sent_s[f.cmd.seq] - f.cmd.age for f, at_s in seen if f.cmd.seq in pair.sent_s]
+    require(bool(trips_s), "no drive is echoed")
+    require(min(trips_s) <= OLDEST_S, f"frames are {1e3 * min(trips_s):.0f} ms old, {1e3 * OLDEST_S:g} ms at most")
+    return f"{1e3 * min(trips_s):.1f} ms from drive to frame, besides its age"

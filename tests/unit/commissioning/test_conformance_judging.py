@@ -85,7 +85,7 @@ def test_judges_of_frames_without_what_they_judge() -> None:
 
 
 def test_duties_to_change_to() -> None:
-    assert other_duty((0.6, 0.98), 0.6) == pytest.approx((0.65, 0.93))
+    assert other_duty((0.6, 0.98), 0.6) == pytest.approx((0.65, 0.95))
     with pytest.raises(NotApplicable, match=r"a floor of 0\.98 leaves no room"):
         other_duty((0.99, 0.99), 0.98)
 
