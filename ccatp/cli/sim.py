@@ -115,7 +115,9 @@ def sim_etalon(
     "--key", "key_file", type=click.Path(dir_okay=False), metavar="FILE",
     help="Key of the robot link, as in robot.key_file.",
 )  # fmt: skip
+@click.option("--mirror", metavar="NAME", help="The robot stands at the base of this mirror: check its slope.")
 @click.option("--no-motion", is_flag=True, help="Leave out the checks that turn wheels.")
+@click.option("--on-stands", is_flag=True, help="Only the wheels turn: leave out the checks of the body's motion.")
 @click.option("--only", multiple=True, metavar="ID", help="Run only this check. May be repeated.")
 @click.option(
     "--timeout", "timeout_s", type=WaitingTime(), metavar="SECONDS", default=3.0, show_default=True,
@@ -123,16 +125,19 @@ def sim_etalon(
 )  # fmt: skip
 @JSON_OPTION
 def conformance(
-    server: str, key_file: str | None, no_motion: bool, only: Sequence[str], timeout_s: float, json_output: bool
-) -> int:
+    server: str, key_file: str | None, mirror: str | None, no_motion: bool, on_stands: bool, only: Sequence[str],
+    timeout_s: float, json_output: bool,
+) -> int:  # fmt: skip
     """Check a robot-link server, firmware or simulator, against the interface control document.
 
     Wheels turn slowly and for a moment, unless --no-motion. In the end the robot is held, its fans as they were.
     """
     from ccatp.commissioning.conformance.motion_checks import notice
     from ccatp.commissioning.conformance.runner import CHECKS, Conformance, as_json, check_ids, last_line, table_line
+    from ccatp.config.load import load_config
     from ccatp.config.messages import choice_hint
     from ccatp.links.auth import read_key
+    from ccatp.mirror.mirror import build_mirror
 
     host, _, port = server.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
@@ -144,12 +149,14 @@ def conformance(
         key = read_key(key_file or "")
     except ConfigError as error:
         raise ConfigError(str(error).replace("robot.key_file", "--key", 1)) from error
-    checks = Conformance((host, int(port)), key, timeout_s)
+    base = None if mirror is None else build_mirror(load_config(overrides={"run.mirror": mirror}).mirror)
+    checks = Conformance((host, int(port)), key, timeout_s, base)
     moving = [check for check in CHECKS if "motion" in check.needs and (not only or check.check_id in only)]
     if moving and not no_motion and checks.facts is not None:
         complain(notice(checks.facts, len(moving)), 0)
     results = checks.run(
         motion=not no_motion,
+        on_stands=on_stands,
         only=only,
         report=lambda result: None if json_output else click.echo(table_line(result)),
     )

@@ -13,6 +13,7 @@ from unittest.mock import patch
 from ccatp.commissioning.conformance.runner import Conformance, Result
 from ccatp.config.models import Config
 from ccatp.dataloop import Connection
+from ccatp.mirror.mirror import Mirror
 from ccatp.sim.rules import MotionRules
 from tests.support.scenario import SurveyLoop
 
@@ -131,6 +132,22 @@ def put(kind: str, **values: Any) -> Callable[[Message, Middle], Message]:
     return of(kind, lambda message, _: message.update(values))
 
 
+def each(change: Callable[[Message], object]) -> Callable[[Message, Middle], Message]:
+    """Change each frame in place."""
+    return of("sensors", lambda frame, _: change(frame))
+
+
+def clock(change: Callable[[float], float]) -> Callable[[Message, Middle], Message]:
+    """Another clock, in frames and their samples."""
+
+    def says(frame: Message) -> None:
+        frame["t"] = change(frame["t"])
+        for sample in (*frame["imu"], *frame["enc"], *frame["edge"], *([frame["gravity"]] if frame["gravity"] else ())):
+            sample[0] = change(sample[0])
+
+    return each(says)
+
+
 def swap(old: bytes, new: bytes) -> Callable[[bytes, Middle], bytes]:
     """Something else in what clients send."""
     return lambda data, _: data.replace(old, new)
@@ -185,12 +202,13 @@ async def checked(
     timeout_s: float,
     key: bytes | None = None,
     crooked: Crooked = HONEST,
+    mirror: Mirror | None = None,
 ) -> list[Result]:
     """Results of the checks on such a server."""
     async with serving(config, lockstep=lockstep, key=key, crooked=crooked) as port:
 
         def run() -> list[Result]:
-            return Conformance(("127.0.0.1", port), key, timeout_s).run(motion=True, only=tuple(only))
+            return Conformance(("127.0.0.1", port), key, timeout_s, mirror).run(motion=True, only=tuple(only))
 
         with ThreadPoolExecutor(1) as own:  # the common one has too few threads for servers side by side
             return await asyncio.get_running_loop().run_in_executor(own, run)

@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -14,7 +15,8 @@ from ccatp.cli import main
 from ccatp.commissioning.conformance.runner import CHECKS, Conformance, Result, check_ids
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from tests.contract.crooked import HONEST, Crooked, checked, serving
+from ccatp.mirror.mirror import Mirror, build_mirror
+from tests.contract.crooked import HONEST, Crooked, checked, clock, serving
 from tests.faults.table import conformance_rows, load_table
 from tests.support.scenario import SurveyLoop
 
@@ -24,10 +26,21 @@ PARTS = 4  # run side by side, each on a robot of its own
 NEEDS = {check.check_id: check.needs for check in CHECKS}
 
 
-def expected(lockstep: bool, key: bytes | None, floor: bool) -> set[str]:
+class Served(NamedTuple):
+    """A robot that keeps all promises."""
+
+    config: Config
+    key: bytes | None = None
+    mirror: Mirror | None = None
+    crooked: Crooked = HONEST
+
+
+def expected(lockstep: bool, robot: Served) -> set[str]:
     """The checks that do not apply."""
-    lacking = {"real time" if lockstep else "lockstep", *(() if key else ("hmac",))}
-    return {name for name, needs in NEEDS.items() if lacking & set(needs)} | (set() if floor else {"fan-floor"})
+    lacking = {"real time" if lockstep else "lockstep", *(() if robot.key else ("hmac",))}
+    others = {"mirror"} if robot.mirror is None else set()
+    others |= set() if robot.config.mirror.overhang else {"fan-floor"}
+    return {name for name, needs in NEEDS.items() if lacking & set(needs)} | others
 
 
 def judge(results: list[Result], not_applicable: set[str]) -> None:
@@ -35,31 +48,48 @@ def judge(results: list[Result], not_applicable: set[str]) -> None:
     assert {result.check_id for result in results if result.outcome == "not applicable"} == not_applicable
 
 
-async def both_robots(lockstep: bool) -> None:
-    """A plain robot without a key and a delayed one with fan floor and key, each part of the checks on its own."""
+# With a fan floor, a key, disturbances and delays; with old frames, a wrong clock, sensors at other rates.
+OVERHANGING = load_config(overrides={"run.mirror": "fyst-m2", "run.world": "extreme"})
+HANGING = Served(OVERHANGING, KEY, build_mirror(OVERHANGING.mirror))
+RATES = {"sim.robot.imu_hz": 50.0, "sim.robot.encoder_hz": 80.0, "sim.robot.edge_hz": 30.0}
+OLD = load_config(overrides=RATES | {"run.world": "hard", "world.sensors_delay_s": 0.12})
+LATE = [
+    Served(OLD, crooked=Crooked("slow clock", says=clock(lambda t_s: 0.99 * t_s))),
+    Served(OLD, crooked=Crooked("fast clock", says=clock(lambda t_s: 1.01 * t_s))),
+]
+
+
+async def keep_all_promises(lockstep: bool, *robots: Served) -> None:
+    """Each part of the checks on a robot of its own."""
     slow = ["take-over", "join-late"]  # the longest, by themselves
     others = [name for name in check_ids() if name not in slow]
     parts = [*([name] for name in slow), *(others[k::PARTS] for k in range(PARTS))]
-    overhanging = load_config(overrides={"run.mirror": "fyst-m2", "run.world": "extreme"})
-    robots = [(load_config(), None), (overhanging, KEY)]
-    runs = [
-        checked(cfg, part, lockstep=lockstep, timeout_s=PATIENT_S, key=key) for cfg, key in robots for part in parts
-    ]
-    found = await asyncio.gather(*runs)
-    for (config, key), of_robot in zip(robots, (found[: len(parts)], found[len(parts) :]), strict=True):
-        results = [result for part in of_robot for result in part]
+    for robot in robots:
+        runs = [
+            checked(
+                robot.config, part, lockstep=lockstep, timeout_s=PATIENT_S, key=robot.key, crooked=robot.crooked,
+                mirror=robot.mirror,
+            )
+            for part in parts
+        ]  # fmt: skip
+        results = [result for part in await asyncio.gather(*runs) for result in part]
         assert sorted(result.check_id for result in results) == sorted(check_ids())
-        judge(results, expected(lockstep, key, config is overhanging))
+        judge(results, expected(lockstep, robot))
 
 
 @pytest.mark.fault(*conformance_rows(load_table()), part="robot")
 async def test_our_robots_in_lockstep() -> None:
-    await both_robots(lockstep=True)
+    await keep_all_promises(True, Served(load_config()), HANGING)
 
 
 @pytest.mark.fault(*conformance_rows(load_table()), part="robot")
 async def test_our_robots_on_the_wall_clock() -> None:
-    await both_robots(lockstep=False)
+    await keep_all_promises(False, Served(load_config()), HANGING)
+
+
+@pytest.mark.parametrize("robot", LATE, ids=["slow clock", "fast clock"])
+async def test_old_frames_a_wrong_clock_and_other_rates_break_no_promise(robot: Served) -> None:
+    await keep_all_promises(False, robot)
 
 
 async def run_on(port: int, motion: bool, only: tuple[str, ...] = ()) -> list[Result]:

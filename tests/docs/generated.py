@@ -18,6 +18,7 @@ from ccatp.core import EventCode, Severity
 from ccatp.daemon.supervisor import PROCESSES
 from ccatp.links.topics import TOPICS
 from ccatp.survey.failsafe import ROWS
+from tests.contract.test_conformance_broken import TABLES
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -159,6 +160,19 @@ def _option(option: click.Option) -> str:
     return f"{names}: {option.help}" if option.help else names
 
 
+def seeded() -> str:
+    kinds = [(kind, rows, [row for row in rows if row.fails]) for kind, rows in TABLES.items()]
+    found, all_of_them = sum(len(seen) for *_, seen in kinds), sum(len(rows) for _, rows, _ in kinds)
+    counted = table("| kind | seeded | found |", ((kind, len(rows), len(seen)) for kind, rows, seen in kinds))
+    faults = (
+        (row.name, ", ".join(f"`{name}`" for name in row.fails.split()) or "none")
+        for _, rows, _ in kinds
+        for row in rows
+    )
+    share = f"{found} of {all_of_them} seeded faults are found ({100.0 * found / all_of_them:.0f} %)."
+    return "\n\n".join([share, counted, table("| one thing is wrong | found by |", faults)])
+
+
 MADE: dict[str, Callable[[], str]] = {
     "alarms": alarms,
     "severities": severities,
@@ -168,6 +182,7 @@ MADE: dict[str, Callable[[], str]] = {
     "codes": codes,
     "rates": rates,
     "commands": commands,
+    "seeded": seeded,
 }
 
 

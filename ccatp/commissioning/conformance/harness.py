@@ -17,8 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from ccatp.config.messages import format_key
 from ccatp.links.robot_codec import encode, format_drive, format_permit, join_mac
 from ccatp.links.robot_messages import AUTH_HMAC, Fans, Join, LineBuffer, Role
+from ccatp.mirror.mirror import Mirror
 
-Need = Literal["motion", "real time", "lockstep", "hmac"]
+Need = Literal["motion", "body", "real time", "lockstep", "hmac"]
 Key = Literal["drive", "permit"]
 Ending = Literal["FIN", "RST"]
 Message = dict[str, Any]
@@ -272,9 +273,13 @@ class RawConnection:
 
 
 class CheckContext:
-    """Clients of one check; ``clear`` before the next. ``last_seq`` is the highest sequence number used so far."""
+    """Clients of one check; ``clear`` before the next. ``last_seq`` is the highest sequence number used so far.
+
+    ``mirror`` is the one at whose base the robot stands, where that is known.
+    """
 
     facts: Facts
+    mirror: Mirror | None = None
 
     def __init__(self, address: tuple[str, int], key: bytes | None, timeout_s: float) -> None:
         self._address, self.key, self.timeout_s = address, key, timeout_s

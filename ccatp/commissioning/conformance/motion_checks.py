@@ -268,7 +268,7 @@ def _clamp(pair: ControllerAndMonitor) -> str:
     return seen
 
 
-@check_at_rest("gyroscope", "wz is the angular rate about robot z in rad/s, left turns positive", "motion")
+@check_at_rest("gyroscope", "wz is the angular rate about robot z in rad/s, left turns positive", "motion", "body")
 def _gyroscope(pair: ControllerAndMonitor) -> str:
     """A turn on the spot and back, of which the difference has no bias."""
     rate_rad_s, robot = _rate(pair.facts), pair.facts.robot
@@ -286,7 +286,7 @@ def _gyroscope(pair: ControllerAndMonitor) -> str:
     return text
 
 
-@check_at_rest("accelerometer", "ax is the acceleration along robot x in m/s2, gravity removed", "motion")
+@check_at_rest("accelerometer", "ax is the acceleration along robot x in m/s2, gravity removed", "motion", "body")
 def _accelerometer(pair: ControllerAndMonitor) -> str:
     """Forward and back again, of which each half begins and ends at rest: the bias has no part in the difference."""
     rate_rad_s = _rate(pair.facts)

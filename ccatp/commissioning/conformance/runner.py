@@ -21,6 +21,7 @@ from ccatp.commissioning.conformance.harness import (
     shorten,
 )
 from ccatp.errors import CcatpError, DaemonUnreachableError, ExitStatus
+from ccatp.mirror.mirror import Mirror
 
 CHECKS = (*server_checks.CHECKS, *command_checks.CHECKS, *motion_checks.CHECKS)
 Outcome = Literal["pass", "fail", "not applicable"]
@@ -28,6 +29,7 @@ Outcome = Literal["pass", "fail", "not applicable"]
 _HELLO_CHECKS = ("hello", "hello-robot")
 _WHY: dict[Need, str] = {
     "motion": "--no-motion",
+    "body": "--on-stands",
     "real time": "lockstep: time stands still while an answer is missing",
     "lockstep": "hello.lockstep is false",
     "hmac": "hello.auth is none",
@@ -62,11 +64,15 @@ class KeyNeeded(CcatpError):
 class Conformance:
     """The checks of one server; ``facts`` of its hello are ``None`` if it lacks what the checks need.
 
+    ``mirror``: the robot stands at its base.
     Raises NoRobot: nothing at the address says hello. Raises KeyNeeded: it asks for a key.
     """
 
-    def __init__(self, address: tuple[str, int], key: bytes | None, timeout_s: float) -> None:
+    def __init__(
+        self, address: tuple[str, int], key: bytes | None, timeout_s: float, mirror: Mirror | None = None
+    ) -> None:
         self._context = CheckContext(address, key, timeout_s)
+        self._context.mirror = mirror
         self._where = f"{address[0]}:{address[1]}"
         self._fans: Pair | None = None
         hello = self._hello()
@@ -80,9 +86,16 @@ class Conformance:
             raise KeyNeeded(f"the robot at {self._where} asks for a key: name its file with --key")
 
     def run(
-        self, *, motion: bool, only: Collection[str] = (), report: Callable[[Result], object] = lambda _: None
+        self,
+        *,
+        motion: bool,
+        on_stands: bool = False,
+        only: Collection[str] = (),
+        report: Callable[[Result], object] = lambda _: None,
     ) -> list[Result]:
         """Run the checks in their order, or only those named; ``report`` is called with each result.
+
+        On stands the wheels turn, and the body does not.
 
         Raises NoRobot: another program holds the robot.
         """
@@ -92,7 +105,7 @@ class Conformance:
         try:
             for check in CHECKS:
                 if not only or check.check_id in only:
-                    outcome, detail = self._run_one(check, motion)
+                    outcome, detail = self._run_one(check, motion, on_stands)
                     results.append(Result(check.check_id, check.promise, outcome, detail))
                     report(results[-1])
         finally:
@@ -100,7 +113,7 @@ class Conformance:
                 self._restore()
         return results
 
-    def _run_one(self, check: Check, motion: bool) -> tuple[Outcome, str]:
+    def _run_one(self, check: Check, motion: bool, on_stands: bool) -> tuple[Outcome, str]:
         try:
             if self.facts is None:
                 if check.check_id not in _HELLO_CHECKS:
@@ -109,6 +122,7 @@ class Conformance:
             is_lockstep = self.facts.lockstep
             has: dict[Need, bool] = {
                 "motion": motion,
+                "body": not on_stands,
                 "real time": not is_lockstep,
                 "lockstep": is_lockstep,
                 "hmac": self.facts.needs_mac,

@@ -20,6 +20,7 @@ from ccatp.commissioning.conformance.harness import (
     CheckFailed,
     CheckList,
     ControllerAndMonitor,
+    Frame,
     Message,
     NotApplicable,
     Part,
@@ -34,6 +35,7 @@ from ccatp.commissioning.conformance.harness import (
 )
 from ccatp.links.robot_codec import encode, join_mac
 from ccatp.links.robot_messages import MAX_LINE_BYTES, PROTOCOL, Drive, Role
+from ccatp.survey.checks import PATIENCE_S, MirrorCheck
 
 CHECKS = CheckList()
 check, check_steady = CHECKS.add, partial(CHECKS.add, fixture=steady)
@@ -464,6 +466,25 @@ def check_gravity(frames: Frames, fan_floor: float = 0.0) -> str:
         holds = fan_floor > 0.0 or gravity[3] < 0.0
         require(holds, f"gravity {gravity[1:]} points away from the surface, and fan_floor is 0: wrong sign of z?")
     return f"{len(found)} unit vectors in {len(frames)} frames"
+
+
+@check_steady("mirror", "gravity is that of the mirror's base, and the edge sensors see its panel")
+def _at_base(pair: ControllerAndMonitor) -> str:
+    mirror = pair.context.mirror
+    if mirror is None:
+        raise NotApplicable("--mirror says at whose base the robot stands")
+    check = MirrorCheck(mirror, is_heading_known=True)
+
+    def update(frame: Frame) -> bool:
+        gravity = whole_samples([frame.gravity], 4)
+        return check.update(frame.t, gravity[0] if gravity else None, mirror.base_pose)
+
+    pair.find(update, PATIENCE_S + 1.0)
+    require(not check.contradiction, check.contradiction)
+    require(not mirror.overhang or pair.facts.robot.fan_floor > 0.0, f"fan_floor 0 on {mirror.name}, which overhangs")
+    edges = [sample for message in pair.messages[0][-FRAMES:] for sample in _samples(message, "edge")]
+    require(not edges or edges[-1][1:] == [1.0] * 4, f"edge sample {edges[-1:]} at base, where all see the panel")
+    return check.warning or f"slope and edge values are those of {mirror.name} at base"
 
 
 @check_frames("frames-state", "fans and soc are within 0 and 1")
