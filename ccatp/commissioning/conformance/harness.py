@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from time import monotonic
 from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -422,7 +423,7 @@ class ControllerAndMonitor:
     def drive(self, seq: int | None = None, rates: Pair = STILL, ack: int | None = None, before: bytes = b"") -> int:
         """Send a drive that answers the newest frame (or another), with other bytes in front; returns its number."""
         seq = self.context.next_seq() if seq is None else seq
-        self.sent_s[seq] = time.monotonic()
+        self.sent_s[seq] = monotonic()
         self.controller.send(before + format_drive(seq, self.newest.seq if ack is None else ack, *rates))
         if ack is None:
             self.mark_driven()
@@ -561,7 +562,7 @@ class ControllerAndMonitor:
                 frame = parse(Frame, message, "a sensors frame with ")
                 if not self.frames or frame.seq > self.newest.seq:
                     self.frames.append(frame)
-                    self.received_s.append(time.monotonic())
+                    self.received_s.append(monotonic())
         return len(self.frames) > before
 
 
