@@ -19,6 +19,7 @@ import structlog
 import zmq
 
 from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.files import read_text
 from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon.command_handlers import ObservatoryServer
@@ -64,7 +65,7 @@ RESERVE_BYTES = 65536
 def active_ids(path: Path) -> list[str]:
     """The ids of the emergencies in a file, as far as it can be read."""
     try:
-        return [str(e["id"]) for e in json.loads(path.read_text(encoding="utf-8"))["active"]]
+        return [str(e["id"]) for e in json.loads(read_text(path))["active"]]
     except (OSError, ValueError, KeyError, TypeError):
         return []
 
@@ -82,7 +83,7 @@ class PersistentEmergencyLatch(EmergencyLatch):
         with suppress(OSError):
             self._reserve()
         try:
-            kept = json.loads(path.read_text(encoding="utf-8"))
+            kept = json.loads(read_text(path))
             self._active = {e["id"]: Emergency(EmergencyKind(e["kind"]), e["id"], e["note"]) for e in kept["active"]}
             self._cleared = dict.fromkeys(map(str, kept["cleared"]))
             self.raised = int(kept.get("raised", len(self._active) + len(self._cleared)))

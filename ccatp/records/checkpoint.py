@@ -13,6 +13,7 @@ from typing import TypeVar
 
 import msgspec
 
+from ccatp.config.files import read_input
 from ccatp.errors import CcatpError, ExitStatus
 
 FILE = "checkpoint"
@@ -95,7 +96,7 @@ def read_checkpoint(path: Path, kind: type[Record]) -> Record | None:
     ``CheckpointError``: something was written, and none of it is whole, or it is not of this ``kind``.
     """
     try:
-        data = path.read_bytes()
+        data = read_input(path)
     except FileNotFoundError:
         return None
     except OSError as error:

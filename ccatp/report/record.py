@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ccatp.config.files import read_text
 from ccatp.config.load import is_radio_file, load_config
 from ccatp.config.models import Config
 from ccatp.core import FloatArray, IntArray, PanelId, Vector3
@@ -211,7 +212,7 @@ class RunFolder:
 
     def _summary(self, path: Path) -> Mapping[str, Any] | None:
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
+            found = json.loads(read_text(path))
         except FileNotFoundError:
             self.missing.append(f"{path.name}: the run goes on, or was killed before its end")
             return None
