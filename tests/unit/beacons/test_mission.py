@@ -345,7 +345,7 @@ def test_what_lasts_needs_an_operator(keys: dict[str, Any], cause: str) -> None:
     stage = play(BeaconSilWorld(beacon_config("zigbee", mission__laps=1, **keys)))
     assert stage.mission.state.is_faulted
     assert stage.mission.state.cause.startswith(cause)
-    assert (stage.found.verdicts[-1].severity is Severity.FAULT) == ("radio" in cause)
+    assert (stage.found.verdicts[-1].severity is Severity.FAULT) == ("received" in cause)
     assert not (stage.result().summary["obstacles"] or {}).get("touched")
 
 
