@@ -211,34 +211,38 @@ class ProcessManager:
         return None
 
     def stop_all(self) -> None:
-        """Ask each to end, the last one started first; a deadline for all of them together.
+        """Ask each to end, with a deadline for all: the loops one by one, main first, then the servers together.
 
         What the survey does not need, and so has nothing to save, is asked as soon as the first has ended, and killed
         where it is still there at the end.
         """
         deadline_s = time.monotonic() + STOP_TIMEOUT_S
         running = [child for child in reversed(self._children.values()) if child.process.poll() is None]
+        needed = [child for child in running if child.spec.is_needed]
+        loops, servers = ([child for child in needed if child.spec.is_loop is is_loop] for is_loop in (True, False))
         others = [child.process for child in running if not child.spec.is_needed]
-        for child in running:
-            if not child.spec.is_needed:
-                continue
-            child.process.terminate()
-            try:
-                child.process.wait(max(deadline_s - time.monotonic(), LEAST_STOP_S))
-            except subprocess.TimeoutExpired:
-                text = f"process {child.spec.name} did not stop within {STOP_TIMEOUT_S:g} s and was killed"
-                self._notify_operator("error", text)
-                child.process.kill()
-                child.process.wait()
+        for group in (*([loop] for loop in loops), servers):
+            for child in group:
+                child.process.terminate()
+            for child in group:
+                self._await_end(child, deadline_s)
             for process in others:
                 process.terminate()
         for process in others:
-            process.terminate()
             try:
                 process.wait(LEAST_STOP_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+
+    def _await_end(self, child: _Child, deadline_s: float) -> None:
+        try:
+            child.process.wait(max(deadline_s - time.monotonic(), LEAST_STOP_S))
+        except subprocess.TimeoutExpired:
+            text = f"process {child.spec.name} did not stop within {STOP_TIMEOUT_S:g} s and was killed"
+            self._notify_operator("error", text)
+            child.process.kill()
+            child.process.wait()
 
     def kill_all(self) -> None:
         """Kill every process that is left."""

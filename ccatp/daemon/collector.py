@@ -1,6 +1,7 @@
 """Receives a run's messages from start to end: recording, progress, mission status, summary."""
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -134,8 +135,8 @@ class Collector:
         """Exit status of the run by main."""
         return ExitStatus(self.status.exit_status) if self.status is not None else ExitStatus.HELD
 
-    def collect(self, timeout_ms: int, view: RunView | None = None) -> None:
-        """Take all messages that have arrived, waiting at most ``timeout_ms`` for the first."""
+    def collect(self, timeout_ms: int, view: RunView | None = None, limit: int = sys.maxsize) -> None:
+        """Take the messages that have arrived, at most ``limit``, waiting at most ``timeout_ms`` for the first."""
         self._view = view
         received = self._subscriber.receive(timeout_ms / 1000.0)
         while received is not None:
@@ -144,7 +145,8 @@ class Collector:
                 self._on_heartbeat(message)
             elif isinstance(message, Message):
                 self._take(name, body, message)
-            received = self._subscriber.receive()
+            limit -= 1
+            received = self._subscriber.receive() if limit else None
         self._recorder.flush_if_due()
 
     def _take(self, name: str, body: bytes, message: Message) -> None:

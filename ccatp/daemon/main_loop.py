@@ -29,7 +29,7 @@ from ccatp.safety.robot_clock import MissionClock
 from ccatp.survey.state import HELD, Abort, Fault, Interrupted, Pause, Resume, StopHere
 
 # After the end the last messages must reach the supervisor, which then ends this process.
-SHUTDOWN_TIMEOUT_S = 5.0
+SHUTDOWN_TIMEOUT_S = 30.0
 # The place of a robot that moved is not known when the samples of more frames than this are missing.
 UNSEEN_S = 0.1
 # The frames that come while a path is planned for a robot that stands are late for a reason, and served within this.

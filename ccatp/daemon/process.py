@@ -6,6 +6,7 @@ Writing a log line never fails: what the disk does not take is dropped and count
 import argparse
 import asyncio
 import ctypes
+import gc
 import io
 import os
 import signal
@@ -249,7 +250,9 @@ def run_until_stopped(serve: Callable[[asyncio.Event], Coroutine[Any, Any, int]]
         return await serve(stop)
 
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-        return runner.run(run())
+        status = runner.run(run())
+    gc.freeze()  # else the interpreter visits every object of the libraries once more, which is half of a shutdown
+    return status
 
 
 def run_process(name: str, serve: Callable[["zmq.Context[zmq.Socket[bytes]]", asyncio.Event], Awaitable[int]]) -> int:

@@ -60,7 +60,7 @@ from ccatp.daemon.run_dir import (
     write_durably,
 )
 from ccatp.daemon.service import Service, is_journal, take_from
-from ccatp.daemon.terminal import RunView, write_run_report
+from ccatp.daemon.terminal import STOP_SIGNALS, RunView, write_run_report
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.auth import read_key
 from ccatp.links.topics import Heartbeat
@@ -70,8 +70,8 @@ from ccatp.report.dashboard.access import TOKEN_FILE, make_token, read_tokens
 # Between two looks at messages and processes: in lockstep a message in each of them would cost as much again.
 POLL_S = 0.02
 STDERR = 2  # its descriptor
-# In lockstep the three that answer each other keep both cores of a small machine busy: recording takes what they leave.
-LOCKSTEP_NICENESS = 10
+# So many at a time: a signal and a death are noticed in between.
+MAX_MESSAGES = 1000
 
 # In the order of starting; stopping is in the reverse order, so that main holds the wheels first.
 PROCESSES: tuple[ProcessSpec, ...] = (
@@ -132,16 +132,13 @@ class SupervisedRun:
         cfg, is_sim, view = self._cfg, self._options.sim, self._view
         what = {"system": cfg.system} if isinstance(cfg, RadioConfig) else {"mirror": cfg.mirror.name}
         self._log.info("run_started", **what, seed=cfg.run.seed, sim=is_sim)
-        niceness = os.getpriority(os.PRIO_PROCESS, 0)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         # A flag and no exception: a signal must neither be lost in a handler of exceptions nor end the shutdown.
-        previous = {n: signal.signal(n, self._interrupt) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+        previous = {n: signal.signal(n, self._interrupt) for n in STOP_SIGNALS}
         try:
             collector = Collector(context, self._endpoints, self._run_dir, cfg, self._on_heartbeat, is_sim=is_sim)
             with collector, view:
                 status = self._watch(collector)
-                with suppress(PermissionError):  # beside other work the end would take ten times as long
-                    os.setpriority(os.PRIO_PROCESS, 0, niceness)
                 self._service.stopping()
                 collector.finish()
                 self._children.stop_all()
@@ -189,11 +186,13 @@ class SupervisedRun:
             # A process that listens has a socket, if it is to run at all.
             if process.name in self._sockets or not process.listens:
                 self._children.start(process)
-        if not self._options.is_paced:
-            os.nice(LOCKSTEP_NICENESS)
+        if not self._options.is_paced and sys.platform == "linux":
+            # The three that answer each other keep both cores of a small machine busy: recording does not interrupt
+            # them. No niceness: an ordinary user cannot take it back, and beside other work the messages would pile up.
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
         while not self._is_interrupted:
             time.sleep(POLL_S)
-            collector.collect(0, self._view)
+            collector.collect(0, self._view, MAX_MESSAGES)
             # From main's first frame on the checkpoint is of this session; before, the next main begins as the first.
             self._has_begun |= collector.status is not None and collector.status.seq >= 0
             now_s = time.monotonic()

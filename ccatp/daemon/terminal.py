@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -23,6 +24,8 @@ from ccatp.links.topics import DangerEvent, LogMessage, Message, MissionStatus, 
 from ccatp.records.summary import format_table
 
 LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
+# End a run, or the writing of its report.
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 STYLES = {"info": "", "warning": "yellow", "error": "bold red"}
 
 
@@ -142,7 +145,8 @@ def _title_and_goals(cfg: Config | RadioConfig, *, is_sim: bool) -> tuple[str, s
 def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.FilteringBoundLogger) -> str:
     """Write the report of a run that has ended; returns where it is, or why there is none.
 
-    An interrupted run gets none, because the operator waits for the end.
+    An interrupted run gets none, because the operator waits for the end. A signal ends the writing alone: the run is
+    over, and its status stands.
     """
     by_hand = f"none; make it with: ccatp report {run_dir}"
     if status is ExitStatus.INTERRUPTED:
@@ -150,17 +154,23 @@ def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.Fi
     # Imported late: not needed while the robot moves.
     from ccatp.records.run_reader import RunReadError  # noqa: PLC0415
 
+    previous = {n: signal.signal(n, signal.default_int_handler) for n in STOP_SIGNALS}
     try:
         from ccatp.report.run_page import report_run  # noqa: PLC0415
 
         data, _ = report_run(run_dir)
         return str(data["report"])
+    except KeyboardInterrupt:
+        return by_hand
     except RunReadError as error:
         return f"none; {error}"
     except Exception as error:
         # The survey is done, and its record is on the disk.
         log.error("report_failed", error=f"{type(error).__name__}: {error}")
         return by_hand
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 CODES = {0: "normal", 1: "near the mirror's edge", 2: "operation aborted"}

@@ -6,10 +6,12 @@ import re
 import signal
 import socket
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import zmq
 
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
@@ -22,12 +24,30 @@ from ccatp.daemon.child_processes import (
     open_page_socket,
     page_url,
 )
-from ccatp.daemon.process import parse_args, unless_stopped
+from ccatp.daemon.collector import Collector
+from ccatp.daemon.process import Endpoints, parse_args, unless_stopped
+from ccatp.daemon.subscribers import HeartbeatPublisher
 from ccatp.errors import DaemonUnreachableError
+from ccatp.links.bus import Publisher
+from ccatp.links.topics import Heartbeat
 
 # Ends with the status in its variable, or waits for its end.
 CODE = "import os, sys, time; status = int(os.environ['STATUS']); sys.exit(status) if status else time.sleep(60.0)"
 UNENDING = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60.0)"
+# Each of two ends when both were asked to.
+TOGETHER = """
+import pathlib, signal, sys, time
+
+def end(*_):
+    pathlib.Path(sys.argv[1]).touch()
+    while not all(pathlib.Path(name).exists() for name in ("one", "two")):
+        time.sleep(0.01)
+    raise SystemExit
+
+signal.signal(signal.SIGTERM, end)
+pathlib.Path(sys.argv[1] + ".ready").touch()
+time.sleep(60.0)
+"""
 PAGE = ProcessSpec("page", "ending_child", is_needed=False, niceness=7)
 MAIN = ProcessSpec("main", "m")
 SIMULATOR = replace(MAIN, is_replaceable=False)
@@ -144,6 +164,38 @@ def test_who_does_not_stop_is_killed(
     children.stop_all()
     assert found.process.returncode == -signal.SIGKILL
     assert said == lines
+
+
+def test_servers_stop_together(
+    tmp_path: Path, config: Config, said: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr("ccatp.daemon.child_processes.STOP_TIMEOUT_S", 30.0)
+    Path("together.py").write_text(TOGETHER)
+    children = ProcessManager(config.run, lambda spec, _: ([spec.name], ()), lambda _level, text: said.append(text))
+    for name in ("one", "two"):
+        children.start(ProcessSpec(name, "together"))
+        while not Path(f"{name}.ready").exists():
+            time.sleep(0.01)
+    children.stop_all()
+    assert said == []
+
+
+def test_a_collector_takes_so_many_messages_at_a_time(tmp_path: Path, config: Config) -> None:
+    endpoints, received = Endpoints(tmp_path), list[Heartbeat]()
+    with (
+        zmq.Context() as context,
+        closing(Publisher(context, endpoints.of("main"))) as publisher,
+        Collector(context, endpoints, tmp_path, config, received.append, is_sim=False) as collector,
+    ):
+        while not publisher.has_subscriber("heartbeat.main"):
+            time.sleep(0.01)
+        for _ in range(30):
+            HeartbeatPublisher(publisher, "main").publish()
+        while (before := len(received)) < 30:
+            collector.collect(10, limit=10)
+            assert len(received) <= before + 10
 
 
 @pytest.mark.fault("P18")

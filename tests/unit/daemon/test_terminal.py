@@ -1,6 +1,7 @@
 """Progress on the terminal, its rate limit, and the report at the end of a run."""
 
 import json
+import signal
 from pathlib import Path
 
 import pytest
@@ -88,6 +89,10 @@ def test_a_run_gets_its_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     for one, text in ((run_dir, "<!DOCTYPE html>"), (record_beacons(tmp_path / "beacons"), "among ZigBee beacons")):
         assert write_run_report(one, ExitStatus.HELD, log) == str(one / "report.html")
         assert text in (one / "report.html").read_text()
+
+    monkeypatch.setattr("ccatp.report.run_page.report_run", lambda _run_dir: signal.raise_signal(signal.SIGTERM))
+    assert write_run_report(run_dir, ExitStatus.COMPLETE, log) == by_hand
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
     def fail(_run_dir: Path) -> None:
         raise ZeroDivisionError("of nothing")
