@@ -36,7 +36,9 @@ FOXGLOVE_PORT = 8765
 @key_option("--filter", "run.filter", metavar="NAME", help="State estimator: kf, ekf or ukf.")
 @click.option("--realtime", is_flag=True, help="Pace the simulation on the wall clock.")
 @click.option("--run-dir", type=PATH, help="Where to write; runs/<time>-<mirror>-s<seed> if not given.")
-@click.option("--resume", is_flag=True, help="Resume the mission in --run-dir.")
+@click.option(
+    "--resume", is_flag=True, help="Resume the mission in --run-dir, or the only one in ./runs that is not complete."
+)
 @click.option("--start-held", "held", is_flag=True, help="With --resume: nothing moves until ccatp resume.")
 @click.option(
     "--resume-last", "recover", is_flag=True, help="For services: resume, held, the run that did not finish, if any."
@@ -57,13 +59,14 @@ def run(
         raise click.UsageError("--start-held needs --resume; --resume-last always starts held")
     if recover and (resume or run_dir is not None):
         raise click.UsageError("--resume-last finds the run itself: leave out --resume and --run-dir")
+    from ccatp.daemon.run_dir import RunOptions, find_unfinished
+
     if resume and run_dir is None:
-        raise click.UsageError("--resume needs a run directory; name it with --run-dir")
+        run_dir = find_unfinished()
     if resume and config_file is None and run_dir is not None:
         config_file = run_dir / "config.toml"
     if not sim and config_file is None:
         raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
-    from ccatp.daemon.run_dir import RunOptions
     from ccatp.daemon.supervisor import run as run_to_the_end
 
     if faults_file is not None:

@@ -11,10 +11,11 @@ from ccatp.core import PointId
 from ccatp.daemon.danger_loop import FILE as EMERGENCIES
 from ccatp.daemon.danger_loop import active_ids
 from ccatp.daemon.process import ProcessArgs
+from ccatp.daemon.run_dir import read_run_id
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import build_mirror
-from ccatp.records.checkpoint import FILE, CheckpointFile, read_checkpoint
+from ccatp.records.checkpoint import AT_BASE, FILE, CheckpointError, CheckpointFile, read_checkpoint
 from ccatp.records.store import MissionStore, StoredPoint, StoreError
 from ccatp.survey.composition import Checkpoint, SurveyParts, assemble, take_over
 from ccatp.survey.planning.route import ORDERS
@@ -31,6 +32,7 @@ class CheckpointWriter:
     def __init__(self, run_dir: Path, localizer: Localizer, mission: Mission, is_patient: bool) -> None:
         self._file = CheckpointFile(run_dir / FILE, is_patient=is_patient)
         self._localizer, self._mission = localizer, mission
+        self._run_id = read_run_id(run_dir)
         self._written: SurveyState | None = None
         self._in_force = ("", "")
         self._left = 1
@@ -47,7 +49,7 @@ class CheckpointWriter:
         """Write the state of frame ``seq``; durably where abort or hold changed."""
         state = self._written = self._mission.state
         self._left = PERIOD_FRAMES
-        record = Checkpoint.of(self._localizer, state, seq, t_s, elapsed_s, self.boot)
+        record = Checkpoint.of(self._localizer, state, seq, t_s, elapsed_s, self.boot, self._run_id)
         pose = record.pose
         if not isfinite(pose.x_m + pose.y_m + pose.heading_rad + record.sigma_m + record.heading_sigma_rad):
             return  # the last good one is a better guess
@@ -75,6 +77,9 @@ def build_parts(cfg: Config, args: ProcessArgs) -> tuple[SurveyParts, MissionSto
         raise StoreUnusable(str(error)) from error
     measured = tuple(stored.point for stored in store.fixes())
     checkpoint = read_checkpoint(args.run_dir / FILE, Checkpoint) if args.is_taking_over else None
+    run_id = read_run_id(args.run_dir)
+    if run_id and checkpoint is not None and checkpoint.run_id != run_id:
+        raise CheckpointError(f"{args.run_dir / FILE}: is of another run, {AT_BASE}")
     skipped: tuple[PointId, ...] = ()
     if checkpoint is None:
         parts = assemble(cfg, measured)
@@ -103,13 +108,13 @@ def _why_held(points: Sequence[PointId], measured: Collection[PointId], skipped:
 
 
 def _open_store(cfg: Config, args: ProcessArgs, mirror: str, points: Sequence[PointId]) -> MissionStore:
-    path = args.run_dir / "mission.sqlite"
+    path, run_id = args.run_dir / "mission.sqlite", read_run_id(args.run_dir)
     if args.is_resuming or (args.is_restarted and path.exists()):
-        return MissionStore.open(path, mirror=mirror)
+        return MissionStore.open(path, mirror=mirror, run_id=run_id)
     grid = cfg.mirror.panels
     planned = []
     for point in points:
         row, column = divmod(point.point - 1, len(grid.points_x_mm))
         planned.append(StoredPoint(point, 1e-3 * grid.points_x_mm[column], 1e-3 * grid.points_y_mm[row]))
     text = (args.run_dir / "config.toml").read_text(encoding="utf-8")
-    return MissionStore.create(path, mirror=mirror, seed=cfg.run.seed, config_toml=text, points=planned)
+    return MissionStore.create(path, mirror=mirror, seed=cfg.run.seed, config_toml=text, points=planned, run_id=run_id)

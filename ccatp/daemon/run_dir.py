@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
 from typing import Any
+from uuid import uuid4
 
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.files import read_input, read_text
@@ -39,6 +40,16 @@ def find_resumable() -> Path | None:
         raise ConfigError(f"--recover: cannot read {FILE}: {error}; remove it to begin a new run") from error
     run_dir = Path(text)
     return run_dir if text and (run_dir / "mission.sqlite").exists() else None
+
+
+def find_unfinished() -> Path:
+    """The directory in ``./runs`` whose mission is not complete; ``ConfigError`` unless there is exactly one."""
+    found = [path.parent for path in sorted(Path("runs").glob("*/mission.sqlite"))]
+    found = [run_dir for run_dir in found if finished_summary(run_dir) is None]
+    if len(found) != 1:
+        names = f": {', '.join(map(str, found))}" if found else ""
+        raise ConfigError(f"--resume: {len(found)} runs in ./runs are not complete{names}; name one with --run-dir")
+    return found[0]
 
 
 def finished_summary(run_dir: Path) -> dict[str, Any] | None:
@@ -239,19 +250,32 @@ def with_origin(options: RunOptions) -> RunOptions:
 
 def _began_simulated(run_dir: Path) -> bool | None:
     """Whether a run began in simulation; ``None`` where that is not known."""
+    if (is_sim := _read_origin(run_dir).get("simulation")) is not None:
+        return bool(is_sim)
+    try:  # of an older version: the recording says so as well
+        simulation = read_metadata(run_dir / TELEMETRY).get("simulation")
+    except (OSError, CcatpError):
+        return None
+    return None if simulation is None else simulation == "true"
+
+
+def _read_origin(run_dir: Path) -> dict[str, Any]:
     try:
-        return bool(json.loads(read_text(run_dir / ORIGIN_FILE))["simulation"])
-    except (OSError, ValueError, KeyError, TypeError):  # of an older version: the recording says so as well
-        try:
-            simulation = read_metadata(run_dir / TELEMETRY).get("simulation")
-        except (OSError, CcatpError):
-            return None
-        return None if simulation is None else simulation == "true"
+        found = json.loads(read_text(run_dir / ORIGIN_FILE))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
-def keep_origin(run_dir: Path, *, is_sim: bool) -> None:
-    """Note what a run begins with, for ``with_origin``."""
-    write_durably(run_dir / ORIGIN_FILE, json.dumps({"simulation": is_sim}).encode())
+def read_run_id(run_dir: Path) -> str:
+    """What distinguishes the files of this run from those of another one; empty if an older version began it."""
+    return str(_read_origin(run_dir).get("run_id", ""))
+
+
+def keep_origin(run_dir: Path, *, is_sim: bool, is_new: bool) -> None:
+    """Note what a run begins with, for ``with_origin``, and its id; a run that is resumed keeps its own."""
+    run_id = uuid4().hex if is_new else read_run_id(run_dir)
+    write_durably(run_dir / ORIGIN_FILE, json.dumps({"simulation": is_sim, "run_id": run_id}).encode())
 
 
 def make_run_dir(options: RunOptions, cfg: Config | RadioConfig) -> Path:
@@ -283,8 +307,14 @@ def make_run_dir(options: RunOptions, cfg: Config | RadioConfig) -> Path:
                 raise ConfigError(
                     f"--resume: {key} was {was} in {run_dir} and is {wanted} now; leave it out to keep what it was"
                 )
-        if before.world != cfg.world:
-            raise ConfigError(f"--resume: section world is not that of {run_dir}; leave it out to keep what it was")
+        for section, then, now in (
+            ("mirror.surface", before.mirror.surface, cfg.mirror.surface),
+            ("mirror.panels", before.mirror.panels, cfg.mirror.panels),
+            ("world", before.world, cfg.world),
+        ):
+            if then != now:
+                text = f"section {section} is not that of {run_dir}; leave it out to keep what it was"
+                raise ConfigError(f"--resume: {text}")
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:

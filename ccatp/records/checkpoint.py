@@ -22,7 +22,7 @@ _SLOT_BYTES = 65536
 _HEAD_BYTES = 8  # length and checksum of count and record
 _COUNT_BYTES = 8
 Record = TypeVar("Record", bound=msgspec.Struct)
-_AT_BASE = "so the robot's place is not known; set it at base, remove this file and resume"
+AT_BASE = "so the robot's place is not known; set it at base, remove this file and resume"
 
 
 class CheckpointError(CcatpError):
@@ -38,11 +38,12 @@ class CheckpointFile:
     """
 
     def __init__(self, path: Path, *, is_patient: bool) -> None:
-        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        # Made with the first record: an empty file is one that has lost its content.
+        self._path, self._fd = path, -1
         self.failure = ""
         self._encode = msgspec.msgpack.Encoder().encode
         self._is_patient = is_patient
-        self._count = max((count for count, _ in _slots(path.read_bytes())), default=0)
+        self._count = max((count for count, _ in _slots(path.read_bytes())), default=0) if path.exists() else 0
         self._newest: tuple[int, msgspec.Struct] | None = None
         self._is_durable = self._is_closing = False
         self._wake = threading.Condition()
@@ -66,7 +67,8 @@ class CheckpointFile:
             self._is_closing = True
             self._wake.notify()
         self._thread.join()
-        os.close(self._fd)
+        if self._fd >= 0:
+            os.close(self._fd)
 
     def _run(self) -> None:
         while True:
@@ -82,6 +84,8 @@ class CheckpointFile:
         body = count.to_bytes(_COUNT_BYTES, "little") + self._encode(record)
         head = len(body).to_bytes(4, "little") + zlib.crc32(body).to_bytes(4, "little")
         try:
+            if self._fd < 0:
+                self._fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
             os.pwrite(self._fd, head + body, count % 2 * _SLOT_BYTES)
             if is_durable:
                 os.fdatasync(self._fd)
@@ -91,25 +95,23 @@ class CheckpointFile:
 
 
 def read_checkpoint(path: Path, kind: type[Record]) -> Record | None:
-    """The newest whole record of a file, ``None`` where nothing was written.
+    """The newest whole record of a file, ``None`` where there is no file.
 
-    ``CheckpointError``: something was written, and none of it is whole, or it is not of this ``kind``.
+    ``CheckpointError``: none in it is whole, or it is not of this ``kind``.
     """
     try:
         data = read_input(path)
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise CheckpointError(f"{path}: {error.strerror or error}; {_AT_BASE}") from error
-    if not data:
-        return None
+        raise CheckpointError(f"{path}: {error.strerror or error}; {AT_BASE}") from error
     slots = _slots(data)
     if not slots:
-        raise CheckpointError(f"{path}: damaged, {_AT_BASE}")
+        raise CheckpointError(f"{path}: {'damaged' if data else 'empty'}, {AT_BASE}")
     try:
         return msgspec.msgpack.decode(max(slots)[1], type=kind)
     except msgspec.MsgspecError as error:
-        raise CheckpointError(f"{path}: of another version of ccatp ({error}), {_AT_BASE}") from error
+        raise CheckpointError(f"{path}: of another version of ccatp ({error}), {AT_BASE}") from error
 
 
 def _slots(data: bytes) -> list[tuple[int, bytes]]:

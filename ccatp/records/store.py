@@ -62,7 +62,7 @@ CREATE TABLE ballast (filler BLOB);
 """
 _PAGE_FILLER = 3900  # bytes; one row fills a page
 _JOURNAL_PAGES = 48  # room kept in the journal; a commit of one fix touches about six pages
-_CRC_KEY = "crc"
+_CRC_KEY, _RUN_ID_KEY = "crc", "run_id"
 _INSERT_FIX = "INSERT INTO fixes VALUES (NULL,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)"
 _STATUS = "SELECT status FROM points WHERE row = ? AND col = ? AND point = ?"
 _SET_STATUS = "UPDATE points SET status = ?, t_s = ?, fix_id = ? WHERE row = ? AND col = ? AND point = ?"
@@ -150,6 +150,7 @@ class MissionStore:
         seed: int,
         config_toml: str,
         points: Iterable[StoredPoint],
+        run_id: str = "",
         reserve_bytes: int = RESERVE_BYTES,
     ) -> Self:
         """Make a new store with all points planned; the file appears complete or not at all.
@@ -164,6 +165,7 @@ class MissionStore:
             ("seed", str(seed)),
             ("config_sha256", hashlib.sha256(config_toml.encode()).hexdigest()),
             ("schema_version", str(SCHEMA_VERSION)),
+            (_RUN_ID_KEY, run_id),
         ]
         new = path.with_name(path.name + ".new")
         try:
@@ -185,14 +187,17 @@ class MissionStore:
         return cls.open(path, mirror=mirror)
 
     @classmethod
-    def open(cls, path: Path, *, mirror: str) -> Self:
-        """Open the store of an earlier run to go on with it; raises as ``read_survey``."""
+    def open(cls, path: Path, *, mirror: str, run_id: str = "") -> Self:
+        """Open the store of an earlier run to go on with it; raises as ``read_survey``, or if ``run_id`` differs."""
         if not path.is_file():
             raise StoreError(f"{path}: no such file; nothing to resume")
         db: sqlite3.Connection | None = None
         try:
             db = _connect(path)
             _check_file(db, path, mirror)
+            row = db.execute("SELECT value FROM meta WHERE key = ?", (_RUN_ID_KEY,)).fetchone()
+            if run_id and row != (run_id,):
+                raise StoreError(f"{path}: is of another run; put back that of this run, or use a new run directory")
             # Touches so many pages that the journal keeps the room which later commits need.
             db.execute("UPDATE reserve SET used = used + 1")
         except (sqlite3.Error, UnicodeDecodeError, StoreError) as error:

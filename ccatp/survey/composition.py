@@ -56,10 +56,18 @@ class Checkpoint(msgspec.Struct, frozen=True, array_like=True, tag=2, forbid_unk
     speed_m_s: float
     rate_rad_s: float
     state: SurveyState
+    run_id: str = ""  # empty in a checkpoint of an older version
 
     @classmethod
     def of(
-        cls, localizer: Localizer, state: SurveyState, seq: int, t_s: float, elapsed_s: float, boot: int = -1
+        cls,
+        localizer: Localizer,
+        state: SurveyState,
+        seq: int,
+        t_s: float,
+        elapsed_s: float,
+        boot: int = -1,
+        run_id: str = "",
     ) -> "Checkpoint":
         """That of frame ``seq``; ``boot`` is the robot's, whose clock counts from there."""
         return cls(
@@ -73,6 +81,7 @@ class Checkpoint(msgspec.Struct, frozen=True, array_like=True, tag=2, forbid_unk
             localizer.speed_m_s,
             localizer.rate_rad_s,
             replace(state, route=_NO_ROUTE, done=()),
+            run_id,
         )
 
     def sigmas(self, limits: LimitsConfig) -> tuple[float, float]:

@@ -39,7 +39,10 @@ def test_the_newest_record_is_read_back(tmp_path: Path, is_patient: bool) -> Non
 def test_nothing_there(tmp_path: Path) -> None:
     assert read_checkpoint(tmp_path / "none", Place) is None
     (tmp_path / "empty").touch()
-    assert read_checkpoint(tmp_path / "empty", Place) is None
+    with pytest.raises(CheckpointError, match="empty: empty, so the robot's place is not known; set it at base"):
+        read_checkpoint(tmp_path / "empty", Place)
+    CheckpointFile(tmp_path / "new", is_patient=True).close()
+    assert not (tmp_path / "new").exists()  # until it has a record
 
 
 @pytest.mark.fault("P16")

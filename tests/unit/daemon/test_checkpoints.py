@@ -18,11 +18,12 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, Fix, PointId, Severity, StopKind, Verdict
 from ccatp.daemon.checkpoints import CheckpointWriter, StoreUnusable, build_parts
 from ccatp.daemon.process import Endpoints, ProcessArgs
+from ccatp.daemon.run_dir import keep_origin
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello, RobotData
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import build_mirror
-from ccatp.records.checkpoint import FILE, CheckpointFile, read_checkpoint
+from ccatp.records.checkpoint import FILE, CheckpointError, CheckpointFile, read_checkpoint
 from ccatp.records.store import MissionStore
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.budget import BudgetProgress, TimeBudget
@@ -45,6 +46,7 @@ from tests.support.mission_story import ABORT, FREE, Story, from_first_leg
 
 
 def args(config: Config, folder: Path) -> ProcessArgs:
+    folder.mkdir(exist_ok=True)
     (folder / "config.toml").write_text(dump_config(config))
     return ProcessArgs(config, folder, Endpoints(folder), None, False, False)
 
@@ -304,6 +306,31 @@ def test_a_survey_goes_on_from_its_directory(tmp_path: Path) -> None:
     assert (state.mode, state.cause, state.is_faulted) == (MissionState.HELD, "a wheel is blocked", False)
     assert (state.done, state.skipped, state.failure_causes, state.budget.before_s) == ((one,), (), {}, 0.0)
     assert len({stop.point for stop in state.route.stops} - {None}) == 8
+
+
+def test_files_of_another_run_are_refused(tmp_path: Path) -> None:
+    older, one, two = (args(load_config(None, {"run.panels": 1}), tmp_path / name) for name in ("older", "one", "two"))
+    for where in (older, one, two):
+        if where is not older:
+            keep_origin(where.run_dir, is_sim=True, is_new=True)
+        built, store = build(where)
+        store.close()
+        writer = CheckpointWriter(where.run_dir, built.localizer, built.mission, is_patient=True)
+        writer.write(3, 0.03, 12.5)
+        writer.close()
+    for where in (older, one):
+        build(replace(where, is_resuming=True))[1].close()
+    for foreign in (older, two):
+        for name, why in (
+            (FILE, "is of another run, .* set it at base"),
+            ("mission.sqlite", "another run"),
+        ):
+            before = (one.run_dir / name).read_bytes()
+            (one.run_dir / name).write_bytes((foreign.run_dir / name).read_bytes())
+            with pytest.raises((CheckpointError, StoreUnusable), match=why):
+                build(replace(one, is_resuming=True))
+            (one.run_dir / name).write_bytes(before)
+    build(replace(one, is_resuming=True))[1].close()
 
 
 def test_it_is_written_ten_times_a_second_at_once_in_a_hold_or_abort_and_never_without_a_place(

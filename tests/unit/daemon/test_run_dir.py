@@ -21,12 +21,14 @@ from ccatp.daemon.run_dir import (
     clear_finished,
     default_run_dir,
     find_resumable,
+    find_unfinished,
     finished_summary,
     keep_origin,
     make_run_dir,
     mark_resumable,
     own_runtime_dir,
     owned,
+    read_run_id,
     take_over_emergencies,
     take_runtime_dir,
     with_origin,
@@ -125,6 +127,11 @@ def test_what_missions_among_beacons_do_not_have(tmp_path: Path, fields: dict[st
         (True, {**ONE_PANEL, "run.mirror": "thesis-m2"}, "run.mirror was fyst-m1 in .* and is thesis-m2 now"),
         (True, {**ONE_PANEL, "run.seed": 2}, "run.seed was 1 in .* and is 2 now; leave it out"),
         (True, {**ONE_PANEL, "run.world": "hard"}, "run.world was thesis in .* and is hard now"),
+        (
+            True,
+            {**ONE_PANEL, "mirror.panels.points_x_mm": [-200.0, 0.0, 200.0]},
+            "section mirror.panels is not that of",
+        ),
         (True, {**ONE_PANEL, "world.start_position_sigma_m": 0.5}, "section world is not that of"),
     ],
 )
@@ -158,11 +165,18 @@ def test_a_run_is_resumed_simulated_or_not_as_it_began(tmp_path: Path) -> None:
     assert with_origin(resumed) is resumed  # of an older version, and without a recording
     Recorder(tmp_path / TELEMETRY, [], is_simulation=True).close()
     assert with_origin(resumed).sim  # of an older version
-    keep_origin(tmp_path, is_sim=False)
+    assert read_run_id(tmp_path) == ""
+    keep_origin(tmp_path, is_sim=True, is_new=False)
+    assert read_run_id(tmp_path) == ""  # its files have none
+    keep_origin(tmp_path, is_sim=False, is_new=True)
+    assert (first := read_run_id(tmp_path))
     assert not with_origin(resumed).sim
     with pytest.raises(ConfigError, match=r"--sim: the run in .* is of a real robot; leave --sim out to resume it"):
         with_origin(replace(resumed, sim=True))
-    keep_origin(tmp_path, is_sim=True)
+    keep_origin(tmp_path, is_sim=True, is_new=False)
+    assert read_run_id(tmp_path) == first
+    keep_origin(tmp_path, is_sim=True, is_new=True)
+    assert read_run_id(tmp_path) != first
     assert with_origin(resumed).sim
     assert not with_origin(replace(resumed, resume=False)).sim
 
@@ -225,6 +239,21 @@ def test_a_service_goes_on_with_the_run_that_did_not_finish(monkeypatch: pytest.
     assert [run(options(recover=True)) for _ in range(3)] == [4, 0, 0]
     assert [(one.resume, one.held) for one in asked] == [(False, False), (True, True), (False, False)]
     assert asked[1].run_dir == asked[0].run_dir
+
+
+def test_the_only_run_that_is_not_complete_is_found() -> None:
+    for number, counts in enumerate(('{"measured": 9, "total": 9}', '{"measured": 8, "total": 9}'), start=1):
+        with pytest.raises(ConfigError, match=r"--resume: 0 runs in \./runs are not complete; name one"):
+            find_unfinished()
+        run_dir = Path(f"runs/{number}")
+        run_dir.mkdir(parents=True)
+        (run_dir / "mission.sqlite").touch()
+        (run_dir / "summary.json").write_text(f'{{"points": {counts}}}')
+    assert find_unfinished() == run_dir
+    Path("runs/3").mkdir()
+    Path("runs/3/mission.sqlite").touch()
+    with pytest.raises(ConfigError, match=r"--resume: 2 runs in .* are not complete: runs/2, runs/3; name one"):
+        find_unfinished()
 
 
 def begin(tmp_path: Path) -> Path:
