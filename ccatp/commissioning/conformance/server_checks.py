@@ -553,7 +553,7 @@ def _seq_of_a_session(pair: ControllerAndMonitor) -> str:
     finally:
         context.last_seq = used
     new = pair.messages[0][first]["seq"]
-    require(new > last, f"frame {new} of a new session after {last}")
+    require(new >= last, f"frame {new} of a new session after {last}")  # in lockstep the one that waits comes again
     return f"drive {frame.cmd.seq} of a new session obeyed after {used}, frame {new} after {last}"
 
 
