@@ -76,7 +76,7 @@ class SentDrives:
     ) -> Predicted:
         """The state in which the next command will find the robot; ``creep``: drift per metre in the plane of ``pose``.
 
-        ``echo_seq`` is the drive in force (-1: none) and ``echo_age_s`` its age; wheels of a robot that ``is_held`` run
+        ``echo_seq`` is the drive in force (0: none) and ``echo_age_s`` its age; wheels of a robot that ``is_held`` run
         down whatever was sent.
         """
         sent, frame_s = self._sent, self._frame_s

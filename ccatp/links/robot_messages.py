@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from ccatp.core import EdgeSample, GravitySample, ImuSample, Rate, Time, WheelSample
+from ccatp.core import EdgeSample, GravitySample, ImuSample, Time, WheelSample
 
 PROTOCOL = "ccatp-robot/1"
 AUTH_NONE: Literal["none"] = "none"
@@ -92,7 +92,7 @@ class Refused(RobotLinkMessage, tag="refused"):
 
 
 class CommandEcho(msgspec.Struct, gc=False):
-    """The newest drive in force (seq -1: none), its age, the age of the newest permit, and whether wheels are held."""
+    """The newest drive in force (seq 0: none), its age, that of the newest permit, and whether the wheels are held."""
 
     seq: Annotated[int, Meta(ge=-1, le=2**53 - 1)]
     age: Time
@@ -116,15 +116,15 @@ class Sensors(RobotLinkMessage, tag="sensors", gc=True):
 
 
 class Drive(RobotLinkMessage, tag="drive"):
-    """Wheel angular-rate set points, rad/s; ``ack`` is the newest sensors frame they were computed from.
+    """Wheel angular-rate set points, rad/s, which the robot clamps; ``ack`` is the newest sensors frame they come from.
 
     ``steer``: angle of the steered wheel, rad, left positive; for robots that have one, the others ignore it.
     """
 
     seq: Sequence53
     ack: Sequence53
-    wr: Rate
-    wl: Rate
+    wr: float
+    wl: float
     steer: Steer | None = None
 
 

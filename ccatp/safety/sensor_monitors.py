@@ -163,7 +163,7 @@ class LatencyMonitor:
         sent = self._sent
         while len(sent) > 1 and sent[1][0] <= echoed:
             sent.popleft()
-        if len(sent) > 1 and echoed >= 0:
+        if len(sent) > 1 and echoed > 0:
             # The second one is not in force yet.
             latency_s, cfg = t_s - sent[1][1], self._cfg
             if latency_s > cfg.latency_pause_s:

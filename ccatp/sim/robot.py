@@ -138,7 +138,7 @@ class Robot(SimulatedRobot):
         """No command of the boot before stays; the fans go to their floor."""
         health = self.fans.health
         self.reboots += 1
-        self._boot(self.t_s)
+        self._boot()
         self.fans.health = health
         self._frames.clear()
         injector.reboot(self.seq, self.t_s)

@@ -7,7 +7,7 @@ default: a set point reaches the wheels only through ``MotionRules.set_points``.
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
-from math import isfinite
+from math import inf, isfinite
 from typing import Any, Literal
 
 from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData, Role
@@ -31,12 +31,12 @@ class MotionRules:
         steer_rad: steering angle of the newest drive.
     """
 
-    def __init__(self, ttl_s: float, max_wheel_rad_s: float, boot_s: float = 0.0) -> None:
+    def __init__(self, ttl_s: float, max_wheel_rad_s: float) -> None:
         self._ttl_s, self._max_wheel_rad_s = ttl_s, max_wheel_rad_s
         self._drive: tuple[float, float] | None = None
         self._permit: tuple[bool, bool, bool] | None = None
-        self._drive_seq = -1
-        self._drive_s = self._permit_s = boot_s  # as old as the boot
+        self._drive_seq = 0
+        self._drive_s = self._permit_s = inf  # no age before the first of the boot
         self.steer_rad = 0.0
         self.has_monitor_joined = False
         self.is_held = True
@@ -85,8 +85,8 @@ class MotionRules:
         return (forward or speed <= 0.0) and (reverse or speed >= 0.0) and (turn or not turns)
 
     def echo(self, now_s: float) -> tuple[int, float, float, bool]:
-        """(seq, age, permit age, held) of the drive in force: seq -1 without one; ages count from the boot at most."""
-        seq = -1 if self._drive is None else self._drive_seq
+        """(seq, age, permit age, held) of the drive in force: seq 0 without one; ages are 0 before the first."""
+        seq = 0 if self._drive is None else self._drive_seq
         return seq, max(now_s - self._drive_s, 0.0), max(now_s - self._permit_s, 0.0), self.is_held
 
 
@@ -139,12 +139,12 @@ class SimulatedRobot(ABC):
         self.seq, self.t_s, self.reboots = 0, 0.0, 0
         self.delivered_seq = -1
         self.truth_requests: dict[str, Callable[[], dict[str, object]]] = {}  # replies for the true state, by request
-        self._boot(0.0)
+        self._boot()
 
-    def _boot(self, boot_s: float) -> None:
+    def _boot(self) -> None:
         """Rules without any command; the fans at their floor."""
         ttl_s, max_wheel_rad_s, fan_floor = self._limits
-        self.rules = MotionRules(ttl_s, max_wheel_rad_s, boot_s)
+        self.rules = MotionRules(ttl_s, max_wheel_rad_s)
         self.fans = FanRules(fan_floor)
         self._waiting: deque[tuple[int, str, int, Any]] = deque()  # frame in which it is due, kind, seq, values
         self._newest = {"drive": -1, "permit": -1, "fans": -1}

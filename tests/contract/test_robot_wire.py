@@ -104,7 +104,7 @@ GOLDEN_FROM_CLIENT: list[tuple[FromClient, bytes]] = [
 # Every way found so far of being no good line of a client: values of one key, whole members, and whole lines.
 DRIVE = b'{"type":"drive","seq":%b,"ack":1,"wr":%b,"wl":0%b}'
 HUGE = b"1" + b"0" * 500
-BAD_RATES = b'NaN Infinity -Infinity 1e999 1e6 null "0" true [0] 01 .5 0x1'.split()
+BAD_RATES = b'NaN Infinity -Infinity 1e999 null "0" true [0] 01 .5 0x1'.split()
 BAD_NUMBERS = b'true 1.5 -1 9007199254740992 "1"'.split()
 BAD_MEMBERS = (
     b',"seq":1 ,"wl":0 ,"w\\u006c":8 ,"type":"drive" ,"x":{"a":1,"a":1} ,"x":1e999 ,"x":NaN ,"x":"\xff" , '

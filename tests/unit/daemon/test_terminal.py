@@ -90,9 +90,10 @@ def test_a_run_gets_its_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert write_run_report(one, ExitStatus.HELD, log) == str(one / "report.html")
         assert text in (one / "report.html").read_text()
 
+    before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr("ccatp.report.run_page.report_run", lambda _run_dir: signal.raise_signal(signal.SIGTERM))
     assert write_run_report(run_dir, ExitStatus.COMPLETE, log) == by_hand
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert signal.getsignal(signal.SIGTERM) is before
 
     def fail(_run_dir: Path) -> None:
         raise ZeroDivisionError("of nothing")

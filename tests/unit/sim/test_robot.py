@@ -31,7 +31,7 @@ def test_boot_is_frame_zero(config: Config, mirror: Mirror) -> None:
     assert [sample.t_s for sample in sensors.enc] == [0.0]
     assert [sample[:] for sample in sensors.edge] == [(0.0, 1, 1, 1, 1)]
     assert sensors.gravity is not None
-    assert (sensors.cmd.seq, sensors.cmd.age, sensors.cmd.held) == (-1, 0.0, True)
+    assert (sensors.cmd.seq, sensors.cmd.age, sensors.cmd.held) == (0, 0.0, True)
 
 
 def test_a_frame_holds_the_samples_since_the_one_before(config: Config, mirror: Mirror) -> None:
@@ -43,7 +43,7 @@ def test_a_frame_holds_the_samples_since_the_one_before(config: Config, mirror: 
     assert [sample.t_s for sample in sensors.edge] == [n / 1000.0 for n in range(61, 71)]
     assert [sample.t_s for sample in sensors.imu] == [0.07]
     assert sensors.gravity is None
-    assert (sensors.cmd.seq, sensors.cmd.age, sensors.cmd.permit_age, sensors.cmd.held) == (7, 0.01, 0.07, False)
+    assert (sensors.cmd.seq, sensors.cmd.age, sensors.cmd.permit_age, sensors.cmd.held) == (7, 0.01, 0.0, False)
     # 5 sigma of the encoder's noise.
     assert sensors.enc[-1].right_rad_s == pytest.approx(robot.world.plant.right_rad_s, abs=0.005)
 

@@ -325,7 +325,7 @@ def test_a_reboot_counts_anew_forgets_and_leaves_the_body_where_it_is(config: Co
     assert (frames[0]["seq"], frames[0]["fans"]) == (1, [0.0, 0.0])
     assert frames[0]["t"] == pytest.approx(0.01)
     assert frames[0]["enc"][0][0] == pytest.approx(0.001)
-    assert frames[0]["cmd"] == {"seq": -1, "age": 0.01, "permit_age": 0.01, "held": True}
+    assert frames[0]["cmd"] == {"seq": 0, "age": 0.0, "permit_age": 0.0, "held": True}
     assert not robot.rules.has_monitor_joined
     assert (robot.reboots, robot.seq, robot.t_s) == (1, 51, 0.51)  # the truth goes on
     assert robot.world.plant.pose.x_m == pytest.approx(place.x_m, abs=1e-3)
