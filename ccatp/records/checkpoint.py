@@ -38,12 +38,13 @@ class CheckpointFile:
     """
 
     def __init__(self, path: Path, *, is_patient: bool) -> None:
-        # Made with the first record: an empty file is one that has lost its content.
-        self._path, self._fd = path, -1
+        # It gets its name with its first record: an empty file is one that has lost its content.
+        self._path, self._is_named = path, path.exists()
+        self._fd = os.open(path if self._is_named else _unnamed(path), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         self.failure = ""
         self._encode = msgspec.msgpack.Encoder().encode
         self._is_patient = is_patient
-        self._count = max((count for count, _ in _slots(path.read_bytes())), default=0) if path.exists() else 0
+        self._count = max((count for count, _ in _slots(path.read_bytes())), default=0) if self._is_named else 0
         self._newest: tuple[int, msgspec.Struct] | None = None
         self._is_durable = self._is_closing = False
         self._wake = threading.Condition()
@@ -67,8 +68,7 @@ class CheckpointFile:
             self._is_closing = True
             self._wake.notify()
         self._thread.join()
-        if self._fd >= 0:
-            os.close(self._fd)
+        os.close(self._fd)
 
     def _run(self) -> None:
         while True:
@@ -84,14 +84,19 @@ class CheckpointFile:
         body = count.to_bytes(_COUNT_BYTES, "little") + self._encode(record)
         head = len(body).to_bytes(4, "little") + zlib.crc32(body).to_bytes(4, "little")
         try:
-            if self._fd < 0:
-                self._fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
             os.pwrite(self._fd, head + body, count % 2 * _SLOT_BYTES)
+            if not self._is_named:
+                _unnamed(self._path).replace(self._path)
+                self._is_named = True
             if is_durable:
                 os.fdatasync(self._fd)
             self.failure = ""
         except OSError as error:
             self.failure = error.strerror or str(error)
+
+
+def _unnamed(path: Path) -> Path:
+    return path.with_name(f"{path.name}.new")
 
 
 def read_checkpoint(path: Path, kind: type[Record]) -> Record | None:
