@@ -21,7 +21,7 @@ from ccatp.cli.common import (
     key_option,
     print_lines,
 )
-from ccatp.errors import ConfigError, ExitStatus
+from ccatp.errors import ConfigError, ExitStatus, printable
 
 if TYPE_CHECKING:
     from ccatp.commissioning.calibration import CalibrationRow
@@ -100,7 +100,8 @@ def check(
     if json_output:
         click.echo(json.dumps(as_json(found)))
     else:
-        print_lines(map(_coloured, lines(found)))
+        for line in lines(found):
+            click.echo(_coloured(printable(line)))
     return int(ExitStatus.REFUSED if has_failed(found) else ExitStatus.COMPLETE)
 
 

@@ -111,12 +111,3 @@ def test_a_disk_that_refuses_is_told_and_does_no_harm(tmp_path: Path, monkeypatc
     file.write(Place(2))
     assert file.failure == ""
     file.close()
-
-
-def test_a_file_without_a_record_never_has_the_name(tmp_path: Path) -> None:
-    path = tmp_path / "checkpoint"
-    file = CheckpointFile(path, is_patient=True)
-    assert read_checkpoint(path, Place) is None
-    file.write(Place(7))
-    assert read_checkpoint(path, Place) == Place(7)
-    file.close()

@@ -168,7 +168,7 @@ def test_motes_in_a_line(rows: str, tmp_path: Path, capsys: pytest.CaptureFixtur
     path = tmp_path / "r.csv"
     data = measured(path, rows, capsys)
     assert (data["crlb_m"], data["expected_rms_m"]) == (None, None)
-    assert data["warnings"][-1].startswith("the motes lie in a line, or nearly: the ranges do not tell how far")
+    assert data["warnings"][-1].startswith("the motes lie in a line, or nearly: the ranges do not determine how far")
     assert "the best motes to begin with lie in a line, or nearly" in refusal(
         capsys, "--ranges", str(path), "--method", "ekf"
     )
@@ -200,7 +200,7 @@ APART = "--set cricket.layout=random --set cricket.random.count=30 --set cricket
         ("--ranges {session} --tags {places}", "tag0,0,0", "--tags: no place of tag1; there are tag0"),
         (
             "--ranges {session} --tags {places} --method ekf", "tag0,0,0\ntag1,0.2,0\ntag2,0,0.2",
-            "the filter knows no trolleys",
+            "the filter maps no trolleys",
         ),
         ("--ranges {ranges} --figure m.gifx", "", "m.gifx: no format by that name"),
         ("--ranges none.csv", "", "none.csv: no such file"),

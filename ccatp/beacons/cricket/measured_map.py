@@ -275,7 +275,7 @@ def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Mirrors) -> _Foun
 
 def _filter(cfg: CricketConfig, network: RangeNetwork) -> _Found:
     if network.bodies:
-        raise MappingError("the filter has no trolleys: leave --tags out, or take --method batch")
+        raise MappingError("the filter maps no trolleys: leave --tags out, or take --method batch")
     first = map_as_possible(network, cfg.phase1.max_dop)
     if first.unplaced:
         lost = list_names([network.names[mote] for mote in first.unplaced])
