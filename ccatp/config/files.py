@@ -49,7 +49,8 @@ def read_toml(path: Path) -> str:
     try:
         return read_text(path).replace("\r\n", "\n").replace("\r", "\n")
     except OSError as error:
-        raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; name a TOML file that exists") from error
+        what_to_do = "shorten it" if error.errno == errno.EFBIG else "name a TOML file that exists"
+        raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; {what_to_do}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
 

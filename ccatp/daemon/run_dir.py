@@ -37,7 +37,7 @@ def find_resumable() -> Path | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise ConfigError(f"--recover: cannot read {FILE}: {error}; remove it to begin a new run") from error
+        raise ConfigError(f"--resume-last: cannot read {FILE}: {error}; remove it to begin a new run") from error
     run_dir = Path(text)
     return run_dir if text and (run_dir / "mission.sqlite").exists() else None
 
@@ -48,7 +48,7 @@ def find_unfinished() -> Path:
     found = [run_dir for run_dir in found if finished_summary(run_dir) is None]
     if len(found) != 1:
         names = f": {', '.join(map(str, found))}" if found else ""
-        raise ConfigError(f"--resume: {len(found)} runs in ./runs are not complete{names}; name one with --run-dir")
+        raise ConfigError(f"--resume: {len(found)} unfinished runs in ./runs{names}; name one with --run-dir")
     return found[0]
 
 
@@ -70,7 +70,7 @@ def mark_resumable(run_dir: Path) -> None:
         write_durably(FILE, os.fsencode(run_dir) + b"\n")
     except OSError as error:
         raise ConfigError(
-            f"--recover: cannot write {FILE}: {error.strerror}; start where ./runs can be made"
+            f"--resume-last: cannot write {FILE}: {error.strerror}; start where ./runs can be made"
         ) from error
 
 
@@ -94,7 +94,7 @@ def clear_finished(status: int, run_dir: Path) -> None:
         else:
             LATCHED_FILE.unlink(missing_ok=True)
     except OSError as error:
-        raise ConfigError(f"--recover: cannot keep {LATCHED_FILE}: {error.strerror}") from error
+        raise ConfigError(f"--resume-last: cannot keep {LATCHED_FILE}: {error.strerror}") from error
     FILE.unlink(missing_ok=True)
 
 
@@ -111,7 +111,7 @@ def take_over_emergencies(run_dir: Path) -> bool:
     except FileNotFoundError:
         return False
     except OSError as error:
-        raise ConfigError(f"--recover: cannot take over {LATCHED_FILE}: {error.strerror}") from error
+        raise ConfigError(f"--resume-last: cannot take over {LATCHED_FILE}: {error.strerror}") from error
     return True
 
 

@@ -74,6 +74,7 @@ CONTENTS = {
     "long value": (f'run.mirror = "{LONG}"', "is no mirror"),
     "long host": (f'robot.host = "{LONG}"', "must"),
     "long key": (f"{LONG} = 1", "is unknown"),
+    "long file": (f"# {LONG}\n" * 2, f"is longer than {MOST_BYTES} bytes; shorten it"),
     "many keys": ("".join(f"k{i} = 1\n" for i in range(9000)), "is unknown"),
     "many parts": (".".join("a" * 20_000) + " = 1", "more than 32 parts"),
     "many quoted parts": ("x.y = 1\n[" + ".".join(["'a'"] * 20_000) + "]", ":2: a key has more than 32 parts"),

@@ -243,7 +243,7 @@ def test_a_service_goes_on_with_the_run_that_did_not_finish(monkeypatch: pytest.
 
 def test_the_only_run_that_is_not_complete_is_found() -> None:
     for number, counts in enumerate(('{"measured": 9, "total": 9}', '{"measured": 8, "total": 9}'), start=1):
-        with pytest.raises(ConfigError, match=r"--resume: 0 runs in \./runs are not complete; name one"):
+        with pytest.raises(ConfigError, match=r"--resume: 0 unfinished runs in \./runs; name one"):
             find_unfinished()
         run_dir = Path(f"runs/{number}")
         run_dir.mkdir(parents=True)
@@ -252,7 +252,7 @@ def test_the_only_run_that_is_not_complete_is_found() -> None:
     assert find_unfinished() == run_dir
     Path("runs/3").mkdir()
     Path("runs/3/mission.sqlite").touch()
-    with pytest.raises(ConfigError, match=r"--resume: 2 runs in .* are not complete: runs/2, runs/3; name one"):
+    with pytest.raises(ConfigError, match=r"--resume: 2 unfinished runs in .*: runs/2, runs/3; name one"):
         find_unfinished()
 
 
@@ -299,13 +299,13 @@ def test_notes_that_cannot_be_read_or_written(tmp_path: Path) -> None:
     latched.mkdir(parents=True)
     FILE.mkdir()
     (tmp_path / EMERGENCIES).write_text("{")
-    with pytest.raises(ConfigError, match="--recover: cannot read"):
+    with pytest.raises(ConfigError, match="--resume-last: cannot read"):
         find_resumable()
-    with pytest.raises(ConfigError, match="--recover: cannot take over"):
+    with pytest.raises(ConfigError, match="--resume-last: cannot take over"):
         take_over_emergencies(tmp_path)
-    with pytest.raises(ConfigError, match="--recover: cannot keep"):
+    with pytest.raises(ConfigError, match="--resume-last: cannot keep"):
         clear_finished(ExitStatus.COMPLETE, tmp_path)
-    with pytest.raises(ConfigError, match="--recover: cannot write"):
+    with pytest.raises(ConfigError, match="--resume-last: cannot write"):
         mark_resumable(tmp_path)
 
 
