@@ -49,6 +49,15 @@ class Action(Enum):
     INFORM = "reported"
 
 
+_ALARM_SEVERITY = {
+    Action.EARTHQUAKE: Severity.FAULT,
+    Action.RETURN: Severity.RETURN,
+    Action.WAIT: Severity.HOLD,
+    Action.RETREAT: Severity.PAUSE,
+    Action.KEEP_AWAY: Severity.INFORM,
+}
+
+
 class Group(StrEnum):
     """The chapters of the list of alarms."""
 
@@ -91,6 +100,11 @@ class Condition:
     def name(self) -> str:
         """Its constant, in lower case."""
         return _NAMES[self].lower()
+
+    @property
+    def alarm_severity(self) -> Severity:
+        """Severity in the list of alarms: that of an edge or an emergency follows from what is done about it."""
+        return self.severity or _ALARM_SEVERITY[self.action]
 
     def text(self, **varies: object) -> str:
         """The cause as it is shown."""

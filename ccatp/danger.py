@@ -115,6 +115,7 @@ class DangerMonitor(EmergencyRules):
             if known is None and estimate is not None and isfinite(estimate.t_s):
                 board.take_commands(estimate.t_s, estimate)
             found = self._look(board, sensors, t_s, wheels, samples)
+        self.found = ()
         if not found and missing is None and edges.is_idle and not origin.direction and not self.latch.is_latched:
             self.verdict = verdict = Verdict(seq, sensors.t, _NORMAL, "", "", 0.0, 0.0, True, True, True)
             if board is not None and self._escalation.is_counting:
@@ -122,7 +123,8 @@ class DangerMonitor(EmergencyRules):
         else:
             verdict = self._arbitrate(seq, sensors.t, missing)
             if board is not None:
-                verdict = self._weigh(verdict, self._escalation.climb(t_s, [*found, *self._own_findings(missing)]))
+                self.found = self._escalation.climb(t_s, [*found, *self._own_findings(missing)])
+                verdict = self._weigh(verdict, self.found)
             self.verdict = verdict = self.latch.with_emergencies(verdict)
         return verdict
 
@@ -180,7 +182,7 @@ class DangerMonitor(EmergencyRules):
             episode.is_doubted = all(others) and not is_over_rim
         return episode.is_doubted
 
-    def _weigh(self, verdict: Verdict, found: list[MonitorFinding]) -> Verdict:
+    def _weigh(self, verdict: Verdict, found: Sequence[MonitorFinding]) -> Verdict:
         top = gravest(found)
         if top is None:
             return verdict

@@ -16,7 +16,7 @@ COMMANDS = (
     *(prepare.plan, prepare.check, prepare.calibrate, config.config, config.keys),
     # during a mission
     *(run.run, operate.status, operate.pause, operate.resume, operate.abort, operate.stop),
-    *(operate.emergency, operate.clear, run.dashboard, run.stream),
+    *(operate.alarms, operate.emergency, operate.clear, run.dashboard, run.stream),
     # after a mission
     *(report.report, report.compare, report.align, report.replay, report.plot, recording.recording),
     # simulation and studies

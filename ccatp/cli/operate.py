@@ -1,5 +1,6 @@
 """The commands to a running daemon, for operators and for the observatory."""
 
+import getpass
 import json
 import os
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from ccatp.cli.common import (
     CONFIG_OPTION,
@@ -22,7 +24,7 @@ from ccatp.cli.common import (
     options,
     print_lines,
 )
-from ccatp.errors import DaemonUnreachableError
+from ccatp.errors import ConfigError, DaemonUnreachableError
 
 DAEMON_OPTIONS = options(
     CONFIG_OPTION,
@@ -35,11 +37,11 @@ EMERGENCY_KINDS = ("fire", "earthquake", "power", "weather", "operator")
 QUIET_S = 10.0
 
 
-def _ask(folder: Path | None, command: str, timeout_s: float) -> dict[str, Any]:
+def _ask(folder: Path | None, command: str, timeout_s: float, **fields: str) -> dict[str, Any]:
     """One request to the operator channel of the daemon in a runtime directory, or the usual one."""
     from ccatp.links.client import OperatorClient
 
-    return OperatorClient(folder, timeout_s).ask(command)
+    return OperatorClient(folder, timeout_s).ask(command, **fields)
 
 
 def _print_reply(reply: Mapping[str, Any], json_output: bool, page: str = "") -> None:
@@ -56,11 +58,20 @@ def _print_reply(reply: Mapping[str, Any], json_output: bool, page: str = "") ->
     print_lines([f"{name:<{width}}  {value}" for name, value in rows] or ["ok"])
 
 
+def _user() -> str:
+    """Who gives a command, for the daemon's log."""
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):  # a user without a name
+        return str(os.getuid())
+
+
 def _operator_command(name: str, help_text: str) -> click.Command:
     @click.command(name, help=help_text, epilog=example(f"ccatp {name}"))
     @DAEMON_OPTIONS
     def command(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
-        _print_reply(_ask(configured_folder(config_file, runtime_dir), name, timeout_s), json_output)
+        folder = configured_folder(config_file, runtime_dir)
+        _print_reply(_ask(folder, name, timeout_s, by=_user()), json_output)
 
     return command
 
@@ -126,6 +137,77 @@ def _ask_observatory(
     if server_key is None or key_file is None:
         raise click.UsageError("--endpoint needs --server-key and --key; make keys with ccatp keys generate")
     return ObservatoryClient.connect(endpoint, server_key, key_file, timeout_s).ask(payload)
+
+
+@click.group(
+    invoke_without_command=True,
+    epilog=example("ccatp alarms", "ccatp alarms ack wheel_blocked", "ccatp alarms history"),
+)
+@DAEMON_OPTIONS
+@click.pass_context
+def alarms(
+    context: click.Context, config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool
+) -> None:
+    """Show the alarms of the running daemon: how grave, since when, why, and what to do.
+
+    An alarm that held the robot or sent it home stays in the list until it is acknowledged.
+    """
+    if (command := context.invoked_subcommand) is not None:
+        if any(context.get_parameter_source(name) is ParameterSource.COMMANDLINE for name in context.params):
+            raise click.UsageError(f"options go behind the command, as in ccatp alarms {command} --runtime-dir DIR")
+        return
+    found = _ask(configured_folder(config_file, runtime_dir), "status", timeout_s)["status"]["alarms"]
+    if json_output:
+        click.echo(json.dumps({"alarms": found}))
+    else:
+        print_lines([line for alarm in found for line in _alarm_lines(alarm)] or ["no alarms"])
+
+
+def _alarm_lines(alarm: Mapping[str, Any]) -> list[str]:
+    times = f", {alarm['count']} times" if alarm["count"] > 1 else ""
+    ended = f", ended {alarm['ended']}" if alarm["ended"] else ""
+    seen = f", acknowledged by {alarm['acknowledged_by']} {alarm['acknowledged']}" if alarm["acknowledged"] else ""
+    return [
+        f"{alarm['severity']:<7} {alarm['name']}: {alarm['cause']}",
+        f"        since {alarm['since']}{times}{ended}{seen}",
+        *([f"        {alarm['advice']}"] if alarm["advice"] else []),
+    ]
+
+
+@alarms.command(epilog=example("ccatp alarms ack wheel_blocked"))
+@click.argument("name")
+@DAEMON_OPTIONS
+def ack(name: str, config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
+    """Acknowledge the alarm NAME: someone knows of it and sees to it. That releases no hold."""
+    folder = configured_folder(config_file, runtime_dir)
+    reply = _ask(folder, "acknowledge", timeout_s, name=name, by=_user())
+    _print_reply(reply if json_output else {"ok": True}, json_output)
+
+
+@alarms.command(epilog=example("ccatp alarms history", "ccatp alarms history runs/tonight --json"))
+@click.argument("run_dir", type=PATH, required=False)
+@CONFIG_OPTION
+@RUNTIME_DIR_OPTION
+@json_option("The events as JSON on standard output.")
+def history(run_dir: Path | None, config_file: Path | None, runtime_dir: Path | None, json_output: bool) -> None:
+    """Show what happened to the alarms of the running daemon, or of the run in RUN_DIR, oldest first."""
+    from ccatp.daemon.alarms import read_history
+    from ccatp.daemon.process import run_dir_in
+    from ccatp.links.runtime_dir import runtime_dir_path
+
+    if run_dir is None:
+        folder = configured_folder(config_file, runtime_dir)
+        run_dir = run_dir_in(runtime_dir_path(str(folder or ""), os.environ))
+    if run_dir is None or not run_dir.is_dir():
+        raise ConfigError(f"{run_dir or 'no run'}: no such run; name its directory, as in ccatp alarms history RUN_DIR")
+    events = list(read_history(run_dir))
+    if json_output:
+        import msgspec
+
+        click.echo(msgspec.json.encode({"history": events}))
+        return
+    rows = [f"{e.utc}  {e.event}{f' by {e.by}' if e.by else ''}: {e.severity} {e.name}: {e.cause}" for e in events]
+    print_lines(rows or ["no alarms"])
 
 
 @click.command(

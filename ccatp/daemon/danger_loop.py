@@ -10,7 +10,7 @@ import os
 import sys
 import time
 import uuid
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Set
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -155,7 +155,7 @@ class DangerLoop(RobotLoop):
             context, args.endpoints.of("main"), self.heartbeat.publish_if_due, is_taking_over=args.is_taking_over
         )
         self._has_estimate = False
-        self._published = (EventCode.NORMAL, "", Severity.NONE)
+        self._published: tuple[EventCode, str, Severity, Set[str]] = (EventCode.NORMAL, "", Severity.NONE, frozenset())
         self._seq, self._t_s = -1, 0.0
         self._bad_lines = self._permit_seq = 0
         self._sent: tuple[int, Verdict] | None = None  # newest permit of the session, and its frame
@@ -246,9 +246,13 @@ class DangerLoop(RobotLoop):
             self._sent = ack, verdict
             self.answer_again()
         self.publisher.send("verdict", verdict)
-        if (verdict.code, verdict.cause, verdict.severity) == self._published:
+        monitor = self.monitor
+        names = {finding.condition.name for finding in monitor.found} if monitor.found else frozenset()
+        news = verdict.code, verdict.cause, verdict.severity, names
+        if news == self._published:
             return
-        self._published = verdict.code, verdict.cause, verdict.severity
+        self._published = news
+        causes = verdict.cause, *(finding.cause for finding in monitor.found), *monitor.latch.causes
         fields: dict[str, Any] = {
             "code": int(verdict.code),
             "cause": verdict.cause,
@@ -257,7 +261,9 @@ class DangerLoop(RobotLoop):
             "limit": verdict.limit,
             "severity": int(verdict.severity),
         }
-        self.publisher.send("danger_event", DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, **fields))
+        active = [cause for cause in dict.fromkeys(causes) if cause]
+        event = DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, active=active, **fields)
+        self.publisher.send("danger_event", event)
         self.log.info("verdict_changed", seq=verdict.seq, t_s=verdict.t_s, **fields)
 
 

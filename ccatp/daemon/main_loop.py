@@ -12,7 +12,8 @@ from msgspec.structs import replace
 
 from ccatp.conditions import FRAME_LATE, FRAMES_OLD, LINK_LOST, NO_FRAME_FOR, NO_VERDICT, Condition, condition_of
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.core import Verdict
+from ccatp.core import Severity, Verdict
+from ccatp.daemon.alarms import AlarmList
 from ccatp.daemon.mission_runner import STILL, DriveCommand, MissionRunner, TimedFrame
 from ccatp.daemon.process import ProcessArgs, run_process, start_process
 from ccatp.daemon.robot_loop import WAIT_PERIOD_S, RobotLoop
@@ -20,10 +21,18 @@ from ccatp.daemon.robot_session import FrameAge
 from ccatp.daemon.subscribers import VerdictSubscriber
 from ccatp.daemon.telemetry import BATCH_WALL_S
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
-from ccatp.links.channels import BadRequest, OperatorCommand, format_error, format_ok, parse_operator
+from ccatp.links.bus import Subscriber
+from ccatp.links.channels import (
+    BadRequest,
+    OperatorCommand,
+    OperatorRequest,
+    format_error,
+    format_ok,
+    parse_operator,
+)
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.rpc import Router
-from ccatp.links.topics import ESTIMATE_FRAMES, MissionStatus
+from ccatp.links.topics import ESTIMATE_FRAMES, DangerEvent, MissionStatus
 from ccatp.safety.escalation import Since
 from ccatp.safety.robot_clock import MissionClock
 from ccatp.survey.state import HELD, Abort, Fault, Interrupted, Pause, Resume, StopHere
@@ -46,6 +55,14 @@ STANDS_REPORT_S, STANDS_REPEAT_S = 30.0, 60.0
 OWN_PAUSES = FRAME_LATE, FRAMES_OLD, NO_VERDICT
 # Of a mission among beacons; its map does not outlive a gap, so that there is no hold before a fault.
 BEACON_PAUSE_LIMITS_S = inf, 30.0
+
+
+COMMANDS: dict[OperatorCommand, Pause | Resume | Abort | StopHere] = {
+    OperatorCommand.PAUSE: Pause("operator"),
+    OperatorCommand.RESUME: Resume(),
+    OperatorCommand.ABORT: Abort("operator"),
+    OperatorCommand.STOP: StopHere(),
+}
 
 
 class StandstillReport:
@@ -106,6 +123,10 @@ class MainLoop(RobotLoop):
         self._pause_limits_s = (health.pause_limit_s, health.hold_limit_s) if health else BEACON_PAUSE_LIMITS_S
         self._own_pause, self._has_gap = Since(), False
         self.exit_status = ExitStatus.INTERRUPTED
+        self.alarms = AlarmList(args.run_dir, self.log)
+        # Apart from the verdicts, which are read with the frames: what danger finds is reported without frames, too.
+        self._danger_events = Subscriber(context, [danger], ["danger_event"], is_uncounted=True)
+        self._danger_active: list[tuple[str, Severity]] = []
         self._runner = make_runner(self)
         self._telemetry = self._runner.telemetry
 
@@ -182,6 +203,7 @@ class MainLoop(RobotLoop):
             self.log.warning("shutdown_not_acknowledged")
 
     async def close(self) -> None:
+        self._danger_events.close()
         await self._runner.close()
 
     def _save_checkpoint(self) -> None:
@@ -192,6 +214,7 @@ class MainLoop(RobotLoop):
 
     def publish_levels(self) -> None:
         self._telemetry.flush(BATCH_WALL_S)
+        self.update_alarms()
         if self.heartbeat.phase != "starting":
             self._publish_status()
         if self._runner.mission.state.is_paused and not self._runner.is_busy:
@@ -202,6 +225,19 @@ class MainLoop(RobotLoop):
         lasts_s = self._standstill.lasts_s(now_s, stands=stands)
         if lasts_s is not None:
             self._telemetry.notify_operator("warning", f"the robot stands for {lasts_s:.0f} s: {self._why_it_stands()}")
+
+    def update_alarms(self) -> None:
+        """Raise and end alarms: what danger finds, what holds the mission or sends it home, and what it waits for."""
+        own = [(cause, Severity.NONE) for cause in self._runner.causes]
+        while (received := self._danger_events.receive()) is not None:
+            event = received[2]
+            if isinstance(event, DangerEvent):
+                graver = Severity(event.severity)
+                self._danger_active = [
+                    (cause, graver if cause == event.cause else Severity.NONE) for cause in event.active
+                ]
+                self.alarms.update([*own, *self._danger_active], event.t_s)
+        self.alarms.update([*own, *self._danger_active], self.clock.t_s)
 
     def _escalate_pause(self, now_s: float) -> None:
         """A pause that persists needs a fix before the robot moves again, and then an operator."""
@@ -275,6 +311,7 @@ class MainLoop(RobotLoop):
         status.exit_status = int(self.exit_status) if self.over.is_set() else -1
         status.missed_deadlines = lateness.missed_deadlines
         status.worst_lateness_ms = round(1e3 * lateness.worst_s, 3)
+        status.alarms = self.alarms.alarms
         return status
 
     # -- commands of operators --------------------------------------------------------------------------------------
@@ -286,14 +323,17 @@ class MainLoop(RobotLoop):
     async def _answer_operator(self, frame: bytes) -> bytes:
         """A command is answered after it took effect or was refused."""
         try:
-            command = parse_operator(frame)
+            request = parse_operator(frame)
         except BadRequest as error:
             return format_error(str(error))
+        command = request.cmd
         if command is not OperatorCommand.STATUS:
-            refusal = self._apply(command)
+            refusal = self._apply(request)
             if refusal is not None:
                 return format_error(refusal)
-            self._telemetry.notify_operator("info", f"operator: {command}")
+            what = f"{command} {request.name}".strip()
+            self._telemetry.notify_operator("info", f"{request.by or 'operator'}: {what}")
+        if command in COMMANDS:
             self.release_time()
         if command in (OperatorCommand.PAUSE, OperatorCommand.STOP):
             try:
@@ -304,13 +344,11 @@ class MainLoop(RobotLoop):
                 return format_error(f"{command}: accepted, but the robot is not at rest after {EFFECT_TIMEOUT_S:.0f} s")
         return format_ok(status=self.status())
 
-    def _apply(self, command: OperatorCommand) -> str | None:
-        events: dict[OperatorCommand, Pause | Resume | Abort] = {
-            OperatorCommand.PAUSE: Pause("operator"),
-            OperatorCommand.RESUME: Resume(),
-            OperatorCommand.ABORT: Abort("operator"),
-        }
-        return self._runner.mission.handle(events.get(command, StopHere()))
+    def _apply(self, request: OperatorRequest) -> str | None:
+        if request.cmd is OperatorCommand.ACKNOWLEDGE:
+            self.update_alarms()
+            return self.alarms.acknowledge(request.name, request.by or "operator", self.clock.t_s)
+        return self._runner.mission.handle(COMMANDS[request.cmd])
 
     # -- the frame ------------------------------------------------------------------------------------------------
 

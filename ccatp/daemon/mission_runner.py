@@ -77,6 +77,12 @@ class MissionRunner(ABC):
         return False
 
     @property
+    def causes(self) -> list[str]:
+        """What holds the mission, sends it home, or makes it wait, as it is shown."""
+        state = self.mission.state
+        return [cause for cause in (state.cause, state.abort_cause) if cause]
+
+    @property
     @abstractmethod
     def is_at_rest(self) -> bool:
         """The robot is at rest."""

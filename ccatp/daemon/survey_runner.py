@@ -131,6 +131,11 @@ class SurveyRunner(MissionRunner):
         return self._fix_service.is_busy
 
     @property
+    def causes(self) -> list[str]:
+        wait_cause = self._fix_service.wait_cause
+        return [*super().causes, wait_cause] if wait_cause else super().causes
+
+    @property
     def is_at_rest(self) -> bool:
         control = self._cfg.control
         return (

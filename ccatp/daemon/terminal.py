@@ -20,7 +20,7 @@ from ccatp.config.models import Config
 from ccatp.core import Severity, danger_text
 from ccatp.errors import ExitStatus, printable
 from ccatp.links.liveness import RateLimitedLog
-from ccatp.links.topics import DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
+from ccatp.links.topics import Alarm, DangerEvent, LogMessage, Message, MissionStatus, TrackMessage
 from ccatp.records.summary import format_table
 
 LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
@@ -211,6 +211,7 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("cause", status.cause),
         ("severity", severity.name.lower() if severity else ""),
         ("since", f"{clock(status.t_s - status.since_s)} ago" if status.cause else ""),
+        ("alarms", alarms_text(status.alarms)),
         ("what to do", row.advice if row is not None else ""),
         ("outcome", status.outcome),
         ("points", f"{status.done} of {status.total} measured{skips}  [{'#' * filled}{'.' * (BAR - filled)}]"),
@@ -222,6 +223,12 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("over", f"with exit status {status.exit_status}" if status.exit_status >= 0 else ""),
     ]
     return [(name, value) for name, value in rows if value]
+
+
+def alarms_text(alarms: Sequence[Alarm]) -> str:
+    """How many, and how to see them; empty for none."""
+    active, unseen = sum(not one.ended for one in alarms), sum(not one.acknowledged_by for one in alarms)
+    return f"{active} active, {unseen} not acknowledged; see 'ccatp alarms'" if alarms else ""
 
 
 def _named(points: Sequence[str]) -> str:

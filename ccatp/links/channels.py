@@ -15,6 +15,7 @@ from ccatp.core import EmergencyKind, EventCode
 
 MAX_REQUEST_BYTES = 4096
 MAX_NOTE_CHARACTERS = 2000
+MAX_NAME_CHARACTERS = 100
 
 
 class BadRequest(ValueError):
@@ -56,6 +57,18 @@ class OperatorCommand(StrEnum):
     RESUME = "resume"
     ABORT = "abort"
     STOP = "stop"
+    ACKNOWLEDGE = "acknowledge"
+
+
+class OperatorRequest(msgspec.Struct, frozen=True):
+    """A request of the operator channel.
+
+    ``name``: the alarm to acknowledge. ``by``: who asks, for the log: a user of this machine, or a token's name.
+    """
+
+    cmd: OperatorCommand
+    name: Annotated[str, msgspec.Meta(max_length=MAX_NAME_CHARACTERS)] = ""
+    by: Annotated[str, msgspec.Meta(max_length=MAX_NAME_CHARACTERS)] = ""
 
 
 def parse_observatory(frame: bytes) -> ObservatoryRequest:
@@ -69,13 +82,16 @@ def parse_observatory(frame: bytes) -> ObservatoryRequest:
         raise BadRequest(str(error)) from error
 
 
-def parse_operator(frame: bytes) -> OperatorCommand:
-    """The command in a frame of the operator channel; errors as of ``parse_observatory``."""
-    command = str(_parse_request(frame).get("cmd"))
+def parse_operator(frame: bytes) -> OperatorRequest:
+    """The request in a frame of the operator channel; errors as of ``parse_observatory``."""
+    fields = _parse_request(frame)
+    command = str(fields.get("cmd"))
+    if command not in set(OperatorCommand):
+        raise BadRequest(f"cmd: {command!a} is none of {', '.join(OperatorCommand)}")
     try:
-        return OperatorCommand(command)
-    except ValueError as error:
-        raise BadRequest(f"cmd: {command!a} is none of {', '.join(OperatorCommand)}") from error
+        return msgspec.convert(fields, OperatorRequest)
+    except (msgspec.ValidationError, UnicodeError) as error:
+        raise BadRequest(str(error)) from error
 
 
 def format_request(cmd: str, **fields: object) -> bytes:

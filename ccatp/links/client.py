@@ -149,9 +149,13 @@ class OperatorClient:
             time.sleep(min(period_s, left_s))
         return status
 
-    def ask(self, cmd: str) -> dict[str, Any]:
+    def acknowledge(self, alarm: str, by: str = "") -> MissionStatus:
+        """Acknowledge an alarm of the status by its name; ``by``: who."""
+        return _as(MissionStatus, self.ask("acknowledge", name=alarm, by=by).get("status"))
+
+    def ask(self, cmd: str, **fields: str) -> dict[str, Any]:
         """Send a command as it is; returns the whole answer."""
-        return _exchange(self._endpoint("control"), {"cmd": cmd}, self.timeout_s)
+        return _exchange(self._endpoint("control"), {"cmd": cmd, **fields}, self.timeout_s)
 
     def _order(self, cmd: str) -> MissionStatus:
         return _as(MissionStatus, self.ask(cmd).get("status"))

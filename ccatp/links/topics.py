@@ -56,6 +56,31 @@ class EstimateMessage(Message):
         return msgspec.structs.replace(self, commanded=span)
 
 
+SeverityName = Literal["inform", "slow", "pause", "hold", "return", "fault"]
+
+
+class Alarm(msgspec.Struct, kw_only=True):
+    """One row of the list of alarms; times are UTC, empty where it has not happened.
+
+    Attributes:
+        name: of the condition, see docs/alarms.md.
+        severity: the worst so far.
+        since_s: robot time at which it began.
+        count: how often it began since it was in the list.
+    """
+
+    name: str
+    severity: SeverityName
+    cause: str
+    advice: str
+    since: str
+    since_s: float
+    count: int = 1
+    ended: str = ""
+    acknowledged: str = ""
+    acknowledged_by: str = ""
+
+
 class MissionStatus(Message):
     """Mission state for operators."""
 
@@ -77,6 +102,7 @@ class MissionStatus(Message):
     missed_deadlines: int = 0  # frames that were served late, in real time
     worst_lateness_ms: float = 0.0
     left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
+    alarms: list[Alarm] = []  # the gravest first, those that ended last
 
 
 class DisplayState(Message):
@@ -182,7 +208,10 @@ class Treatment(Message):
 
 
 class DangerEvent(Message):
-    """The verdict's code, cause or severity changed; without a cause all is well again."""
+    """The verdict's code, cause or severity changed; without a cause all is well again.
+
+    ``active``: causes of all that danger finds, that of the verdict included.
+    """
 
     code: int
     cause: str
@@ -191,6 +220,7 @@ class DangerEvent(Message):
     limit: float
     off: tuple[bool, bool, bool, bool]
     severity: int = 0
+    active: list[str] = []
 
 
 class LogMessage(Message):

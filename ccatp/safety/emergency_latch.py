@@ -1,10 +1,11 @@
 """Emergencies of the observatory: latched, one entry per id, each with its clear condition."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import msgspec
 
-from ccatp.conditions import EMERGENCY
+from ccatp.conditions import EMERGENCY, MonitorFinding
 from ccatp.core import EmergencyKind, EventCode, Verdict
 
 # An observatory has a handful at a time; a peer that floods the latch must not fill the memory.
@@ -53,6 +54,11 @@ class EmergencyLatch:
     def newest(self) -> Emergency | None:
         """The emergency raised last among the active ones."""
         return next(reversed(self._active.values())) if self._active else None
+
+    @property
+    def causes(self) -> list[str]:
+        """Of each kind that is active, as it is shown."""
+        return [EMERGENCY.text(kind=kind) for kind in dict.fromkeys(one.kind for one in self._active.values())]
 
     def verdict(self, seq: int, t_s: float) -> Verdict | None:
         """That of the newest emergency, ``None`` without one; motion is permitted: the robot shall drive home."""
@@ -119,8 +125,12 @@ class EmergencyRules:
 
     A subclass keeps the number of the newest frame and main's newest word: the state
     of the mission, empty where it is not known, and the frame of which it was said.
+
+    Attributes:
+        found: what the monitors found in that frame.
     """
 
+    found: Sequence[MonitorFinding] = ()
     _frame_seq: int
     _state: str
     _state_seq: int

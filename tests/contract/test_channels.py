@@ -187,7 +187,7 @@ def test_a_request_of_the_largest_size_is_served() -> None:
 
 def test_operator_commands() -> None:
     for command in OperatorCommand:
-        assert parse_operator(format_request(command)) is command
+        assert parse_operator(format_request(command)).cmd is command
     for frame in (b"{}", b'{"cmd":"go"}', b'{"cmd":null}', b'{"cmd":["stop"]}', b'{"cmd":"STOP"}'):
         with pytest.raises(BadRequest, match="cmd: "):
             parse_operator(frame)

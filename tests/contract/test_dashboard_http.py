@@ -122,8 +122,19 @@ async def test_a_command_goes_to_the_operator_channel(rig: Rig) -> None:
     for command in ("pause", "resume", "abort", "stop"):
         reply = await rig.ask("POST", f"/{command}")
         assert (reply.code, reply.data) == (200, {"status": "ok"})
-        assert rig.asked[-1] == {"cmd": command}
+        assert rig.asked[-1] == {"cmd": command, "by": "operator"}
         assert (rig.lines[-1]["command"], rig.lines[-1]["by"]) == (command, "operator")
+
+
+async def test_an_alarm_is_acknowledged_by_the_name_of_the_token(rig: Rig) -> None:
+    for path in ("/alarms/ack", "/api/v1/alarms/ack"):
+        reply = await rig.ask("POST", path, body=b'{"name": "fan_weak", "by": "somebody else"}')
+        assert (reply.code, rig.asked[-1]) == (200, {"cmd": "acknowledge", "name": "fan_weak", "by": "operator"})
+    rig.asked.clear()
+    reply = await rig.ask("POST", "/alarms/ack", body=b"[]")
+    assert (reply.code, reply.data["message"], rig.asked) == (400, "alarms/ack: not a JSON object", [])
+    assert (await rig.ask("GET", "/alarms/ack")).data["message"] == "method not POST"
+    assert (await rig.ask("GET", "/alarms")).data == {"status": "ok", "alarms": []}
 
 
 async def test_emergencies_go_to_the_observatory_channel(rig: Rig) -> None:

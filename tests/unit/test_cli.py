@@ -1,5 +1,6 @@
 """The command line: what reaches the rooms below, what the shell is told."""
 
+import getpass
 import importlib.metadata
 import json
 import sys
@@ -67,7 +68,7 @@ def test_every_help_shows_an_example(path: tuple[str, ...], capsys: pytest.Captu
 
 def test_the_commands_are_those_of_the_contract_the_map_and_the_conformance() -> None:
     assert {" ".join(path) for path in commands(cli) if path} - {"plot", "conformance", "dashboard"} == {
-        "run", "status", "pause", "resume", "abort", "stop", "emergency",
+        "run", "status", "alarms", "alarms ack", "alarms history", "pause", "resume", "abort", "stop", "emergency",
         "sim", "sim robot", "sim etalon", "config", "config check", "config schema", "study", "replay", "bench",
         "keys", "keys generate", "keys show-public", "clear", "align", "plan", "report", "compare",
         "recording", "recording info", "recording repair", "stream", "calibrate", "check", "completion",
@@ -209,8 +210,45 @@ def test_the_operator_commands_ask_the_daemon(
     monkeypatch.setenv("CCATP_RUNTIME_DIR", str(runtime_dir))
     with serving(runtime_dir, "control", lambda _: {"ok": True, "id": "7", "code": 2}) as asked:
         assert main([command, "--timeout", "3"]) == 0
-    assert asked == [{"cmd": command}]
+    assert asked == [{"cmd": command} | ({"by": getpass.getuser()} if command != "status" else {})]
     assert capsys.readouterr().out == "id    7\ncode  2\n"
+
+
+ALARM = {
+    "name": "fan_weak", "severity": "return", "cause": "the left fan gets weak", "advice": "Replace it.", "since": "A",
+    "since_s": 1.0, "count": 2, "ended": "B", "acknowledged": "C", "acknowledged_by": "anna",
+}  # fmt: skip
+
+
+def test_alarms_are_shown_acknowledged_and_kept(
+    runtime_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("CCATP_RUNTIME_DIR", str(runtime_dir))
+    status = {"seq": 1, "t_s": 1.0, "state": "held", "alarms": [ALARM]}
+    with serving(runtime_dir, "control", lambda _: {"ok": True, "status": status}) as asked:
+        assert main(["alarms"]) == 0
+        assert capsys.readouterr().out.splitlines() == [
+            "return  fan_weak: the left fan gets weak",
+            "        since A, 2 times, ended B, acknowledged by anna C",
+            "        Replace it.",
+        ]
+        assert main(["alarms", "--json"]) == 0
+        assert json.loads(capsys.readouterr().out) == {"alarms": [ALARM]}
+        assert main(["alarms", "ack", "fan_weak"]) == 0
+        assert capsys.readouterr().out == "ok\n"
+        assert asked[-1] == {"cmd": "acknowledge", "name": "fan_weak", "by": getpass.getuser()}
+    assert main(["alarms", "--json", "ack", "x"]) == 2
+    assert "options go behind the command, as in ccatp alarms ack" in capsys.readouterr().err
+    line = (
+        '{"utc":"A","t_s":1.0,"event":"acknowledged","name":"fan_weak","severity":"return","cause":"weak","by":"anna"}'
+    )
+    (tmp_path / "alarms.jsonl").write_text(f"{line}\n{line[:40]}")
+    assert main(["alarms", "history", str(tmp_path)]) == 0
+    assert capsys.readouterr().out == "A  acknowledged by anna: return fan_weak: weak\n"
+    assert main(["alarms", "history", str(tmp_path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"history": [json.loads(line)]}
+    assert main(["alarms", "history", str(tmp_path / "none")]) == 2
+    assert "no such run; name its directory" in capsys.readouterr().err
 
 
 def test_an_answer_may_be_shown_as_json_or_be_empty(

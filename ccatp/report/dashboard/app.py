@@ -36,7 +36,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 import ccatp
 from ccatp.config.models import DashboardConfig
-from ccatp.links.channels import BadRequest, format_request, parse_object, parse_reply
+from ccatp.links.channels import BadRequest, OperatorCommand, format_request, parse_object, parse_reply
 from ccatp.links.liveness import LogRateLimit
 from ccatp.links.rpc import MAX_REPLY_BYTES
 from ccatp.report.dashboard.access import CommandRefusal, check_command, host_refusal
@@ -97,7 +97,15 @@ class StateCollector(Collector):
         for name, text, part, value_of in GAUGES:
             if state[part] is not None:
                 yield name, text, (), [((), value_of(state[part]))]
-        yield "condition", "1 for each active condition.", ("name",), [((c["name"],), 1.0) for c in state["conditions"]]
+        active = [alarm for alarm in state["alarms"] if not alarm["ended"]]
+        rows = [((alarm["name"], alarm["severity"]), 1.0) for alarm in active]
+        yield "alarm", "1 for each active alarm.", ("name", "severity"), rows
+        yield (
+            "alarms_unacknowledged",
+            "Active, or ended and grave.",
+            (),
+            [((), sum(not alarm["acknowledged_by"] for alarm in state["alarms"]))],
+        )
         if mission is not None:
             states = [((known,), known == mission["state"]) for known in self._ground["states"]]
             yield "mission_state", "1 for the state of the mission.", ("state",), states
@@ -109,9 +117,9 @@ class StateCollector(Collector):
 
 
 STATIC = Path(__file__).resolve().parent / "static"
-# The channel of each command, and what answers there.
+# The path of each command, its channel, and what answers there.
 COMMANDS = {
-    **dict.fromkeys(("pause", "resume", "abort", "stop"), "control"),
+    **dict.fromkeys(("pause", "resume", "abort", "stop", ACKNOWLEDGE := "alarms/ack"), "control"),
     **dict.fromkeys(("emergency", "clear"), "emergency"),
 }
 ANSWERED_BY = {"control": "the main loop", "emergency": "the danger loop"}
@@ -247,6 +255,9 @@ def build_app(
     async def status(_request: Request) -> Response:
         return _json({"status": "ok", **await hub.whole_state()})
 
+    async def alarms(_request: Request) -> Response:
+        return _json({"status": "ok", "alarms": hub.state()["alarms"]})
+
     async def healthz(_request: Request) -> Response:
         trouble = hub.state()["trouble"]
         return _error(503, trouble) if trouble else _json({"status": "ok"})
@@ -255,7 +266,7 @@ def build_app(
         return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
 
     async def command(request: Request) -> Response:
-        name = request.url.path.rpartition("/")[2]
+        name = _command(request)
         line = {"command": name, "client": request.client.host if request.client is not None else "?"}
         by = check_command(request.headers, tokens)
         if isinstance(by, CommandRefusal):
@@ -263,15 +274,15 @@ def build_app(
                 log.info("page_request_refused", **line, why=by.message, left_out=left_out)
             return _error(*by, {"www-authenticate": "Bearer"} if by.http_status == 401 else {})
         request.state.is_command = True  # its connection stays
-        reply = await commands.ask(name, _frame(name, await _body(request, cfg.slow_client_s)))
+        reply = await commands.ask(name, _frame(name, await _body(request, cfg.slow_client_s), by))
         refusal = reply.message if isinstance(reply, CommandRefusal) else ""
         log.info("page_command", **line, by=by, refusal=refusal)
         if isinstance(reply, CommandRefusal):
             return _error(*reply)
         return _json({"status": "ok", **{key: reply[key] for key in ("id", "latched", "code") if key in reply}})
 
-    reads = {"/": page, "/ground": send_ground, "/events": events, "/status": status, "/healthz": healthz,
-             "/metrics": metrics}  # fmt: skip
+    reads = {"/": page, "/ground": send_ground, "/events": events, "/status": status, "/alarms": alarms,
+             "/healthz": healthz, "/metrics": metrics}  # fmt: skip
     routes = [
         *(Route(path, answer) for path, answer in reads.items()),
         *(Route(f"/{name}", command, methods=["POST"]) for name in COMMANDS),
@@ -297,19 +308,26 @@ async def _body(request: Request, slow_client_s: float) -> bytes:
     return body
 
 
-def _frame(command: str, body: bytes) -> bytes:
-    """The request of a channel; an emergency without an id gets one."""
-    if COMMANDS[command] == "control":
-        return format_request(command)
+def _command(request: Request) -> str:
+    """The path of a request as in ``COMMANDS``, where it is one of these."""
+    return request.url.path.removeprefix(PREFIX).strip("/")
+
+
+def _frame(command: str, body: bytes, by: str) -> bytes:
+    """The request of a channel, with the name of the token; an emergency without an id gets one."""
     try:
-        return format_request(**{"id": str(uuid4()), **parse_object(body), "cmd": command})
+        if COMMANDS[command] == "emergency":
+            return format_request(**{"id": str(uuid4()), **parse_object(body), "cmd": command})
+        if command == ACKNOWLEDGE:
+            return format_request(OperatorCommand.ACKNOWLEDGE, name=parse_object(body).get("name", ""), by=by)
     except ValueError as error:
         raise HTTPException(400, f"{command}: {error}") from error
+    return format_request(command, by=by)
 
 
 async def _http_error(request: Request, error: Exception) -> Response:
     code, text = (error.status_code, error.detail) if isinstance(error, HTTPException) else (500, "internal error")
-    method = "POST" if request.url.path.strip("/").rpartition("/")[2] in COMMANDS else "GET"
+    method = "POST" if _command(request) in COMMANDS else "GET"
     texts = {404: f"bad endpoint: {request.url.path}", 405: f"method not {method}"}
     return _error(code, texts.get(code, text), {"allow": method} if code == 405 else {})
 

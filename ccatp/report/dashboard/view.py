@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from ccatp.conditions import condition_of
 from ccatp.core import Verdict, danger_text
 from ccatp.links import topics
 from ccatp.links.liveness import Liveness, kind_of
@@ -387,14 +386,8 @@ class RunStateView:
             "pose": self._picture,
             "verdict": verdict,
             "robot": self._robot(),
-            "conditions": [] if self.links.is_over else self._conditions(),
+            "alarms": [] if mission is None or self.links.is_over else mission.pop("alarms"),
         }
-
-    def _conditions(self) -> list[dict[str, str]]:
-        """Those that are active: what holds the mission, or sends it home, and what the verdict says."""
-        causes = [one.cause for one in (self.status, self._verdict) if one is not None]
-        rows = {row: cause for cause in causes if (row := condition_of(cause)) is not None}
-        return [{"name": row.name, "cause": cause, "advice": row.advice} for row, cause in rows.items()]
 
     def _robot(self) -> dict[str, Any] | None:
         s = self._sensors

@@ -159,11 +159,15 @@ def test_either_may_come_first_and_frames_between_are_not_compared() -> None:
 GROUND: dict[str, Any] = {"title": "fyst-m1", "states": [str(state) for state in MissionState]}
 NOTHING: dict[str, Any] = {
     "is_sim": False, "trouble": "main has sent no heartbeat", "links": [], "restarts": {"main": 0, "danger": 2},
-    "mission": None, "verdict": None, "robot": None, "pose": None, "conditions": [],
+    "mission": None, "verdict": None, "robot": None, "pose": None, "alarms": [],
 }  # fmt: skip
 ALL: dict[str, Any] = NOTHING | {
     "trouble": "",
-    "conditions": [{"name": "no_way_on", "cause": "no way on: walled in", "advice": "carry it"}],
+    "alarms": [
+        {"name": "no_way_on", "severity": "fault", "ended": "", "acknowledged_by": ""},
+        {"name": "rim_ahead", "severity": "hold", "ended": "2026-11-26T00:13:00Z", "acknowledged_by": ""},
+        {"name": "fan_weak", "severity": "return", "ended": "", "acknowledged_by": "anna"},
+    ],
     "links": [LinkState("main loop", "joined", 0.05, True), LinkState("robot", "no frame yet", None, False)],
     "mission": {
         "state": "driving", "total": 693, "done": 12, "skipped": 1, "elapsed_s": 61.5, "eta_s": 3000.0,
@@ -214,7 +218,8 @@ def test_all_metrics() -> None:
         "ccatp_frame_lag_seconds": {(): 0.021},
         "ccatp_event_code": {(): 1.0},
         "ccatp_severity": {(): 2.0},
-        "ccatp_condition": {("no_way_on",): 1.0},
+        "ccatp_alarm": {("no_way_on", "fault"): 1.0, ("fan_weak", "return"): 1.0},
+        "ccatp_alarms_unacknowledged": {(): 2.0},
         "ccatp_battery_charge_ratio": {(): 0.93},
         "ccatp_fan_duty_ratio": {("left",): 0.8, ("right",): 0.75},
         "ccatp_wheels_held": {(): 1.0},
@@ -227,7 +232,10 @@ def test_all_metrics() -> None:
 
 def test_unknown_values_are_left_out() -> None:
     metrics = metrics_of(NOTHING)
-    assert set(metrics) == {"ccatp_info", "ccatp_up", "ccatp_process_restarts_total", "ccatp_dashboard_pages"}
+    assert set(metrics) == {
+        "ccatp_info", "ccatp_up", "ccatp_process_restarts_total", "ccatp_dashboard_pages",
+        "ccatp_alarms_unacknowledged",
+    }  # fmt: skip
     assert metrics["ccatp_up"] == {(): 0.0}
 
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.mission import MODES
-from ccatp.conditions import NO_WAY_ON, RIM_AHEAD
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_radio_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, Fix, PanelId, PanelPose, PointId, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.topics import (
+    Alarm,
     ArrivalMessage,
     BeaconArrival,
     BeaconMapMessage,
@@ -167,25 +167,19 @@ def test_the_verdict_and_its_cause(view: SurveyView) -> None:
     state = told(view, event)
     assert (state["verdict"]["code"], "forward" in state["verdict"]) == (2, False)
     assert state["log"] == [[1.25, "warning", "danger: fire", 1, 1]]
-    assert state["conditions"] == []
     line = LogMessage(seq=5, t_s=2.0, level="info", process="main", text="joined")
     assert told(view, line)["log"] == [[2.0, "info", "joined", 1, 2]]
 
 
-def test_active_conditions_and_what_to_do(view: SurveyView) -> None:
-    event = DangerEvent(
-        seq=4, t_s=1.25, code=1, cause=RIM_AHEAD.message, signal="estimate", value=1.0, limit=0.0, off=(False,) * 4,
-        severity=1,
-    )  # fmt: skip
-    held = told(
-        view,
-        mission(state="held", cause=NO_WAY_ON.text(why="rim")),
-        event,
+def test_the_alarms_are_those_of_the_status_until_the_run_is_over(view: SurveyView) -> None:
+    assert told(view)["alarms"] == []
+    alarm = Alarm(
+        name="no_way_on", severity="fault", cause="no way on: rim", advice="carry it", since="now", since_s=1.0
     )
-    assert [(one["name"], one["advice"]) for one in held["conditions"]] == [
-        (row.name, row.advice) for row in (NO_WAY_ON, RIM_AHEAD)
-    ]
-    assert told(view, mission(cause="operator", exit_status=0))["conditions"] == []
+    state = told(view, mission(state="held", alarms=[alarm]))
+    assert state["alarms"] == [msgspec.to_builtins(alarm)]
+    assert "alarms" not in state["mission"]
+    assert told(view, mission(alarms=[alarm], exit_status=0))["alarms"] == []
 
 
 def test_other_things_on_the_map(view: SurveyView) -> None:

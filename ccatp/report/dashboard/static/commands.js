@@ -82,20 +82,29 @@ export class Commands {
     this.say("");
   }
 
+  // Without a token the daemon refuses it, and says what is missing.
+  acknowledge(alarm) {
+    this.post("alarms/ack", `acknowledge ${alarm}`, JSON.stringify({ name: alarm }));
+  }
+
   async send(name) {
     this.waiting = name;
     $(name).disabled = true;
+    await this.post(name, name);
+    this.waiting = null;
+  }
+
+  async post(path, name, body) {
     this.say(`${name} …`);
     try {
       const headers = { authorization: `Bearer ${this.token}` };
-      const answer = await fetch(name, { method: "POST", headers });
+      const answer = await fetch(path, { method: "POST", headers, body });
       const { message } = await answer.json();
       this.say(answer.ok ? `${name}: done` : `refused: ${message}`, answer.ok ? "" : "bad");
       if (answer.status === 401) this.keep(""); // of an earlier start
     } catch {
       this.say(`${name}: the dashboard did not answer`, "bad");
     }
-    this.waiting = null;
   }
 
   say(words, level = "") {

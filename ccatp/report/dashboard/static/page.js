@@ -126,7 +126,7 @@ function show(state, isAll) {
   showMission(state);
   showFacts(state.facts);
   showVerdict(state.verdict);
-  text("advice", state.conditions.map(({ cause, advice }) => `${cause}: ${advice}`).join(" "));
+  showAlarms(state.alarms);
   showRobot(state.robot, state.pose);
   showLinks(state);
   showLog(state.log, isAll);
@@ -184,6 +184,35 @@ function showVerdict(verdict) {
     const is = verdict[way];
     $(`permit-${way}`).dataset.on = is === undefined ? "" : is && !verdict.is_stale ? "yes" : "no";
   }
+}
+
+// A row is made again only when it changed: a button must stay where it is while it is pressed.
+function showAlarms(alarms) {
+  const list = $("alarms");
+  $("alarms-card").hidden = alarms.length === 0;
+  alarms.forEach((alarm, k) => {
+    const key = JSON.stringify(alarm);
+    if (list.children[k]?.dataset.key === key) return;
+    const row = document.createElement("li");
+    row.dataset.key = key;
+    row.dataset.level = alarm.ended ? "" : SEVERITIES.indexOf(alarm.severity) >= SEVERITIES.indexOf("hold") ? "bad" : "warn";
+    const add = (kind, words, id = "") => {
+      const node = document.createElement(kind);
+      node.textContent = words;
+      node.className = id;
+      row.append(node);
+      return node;
+    };
+    const times = alarm.count > 1 ? `, ${alarm.count} times` : "";
+    add("strong", alarm.cause);
+    add("small", `${alarm.severity}${times}, since ${alarm.since.slice(11)}${alarm.ended ? `, ended ${alarm.ended.slice(11)}` : ""}`);
+    if (alarm.advice) add("p", alarm.advice);
+    if (alarm.acknowledged_by) add("small", `acknowledged by ${alarm.acknowledged_by}, ${alarm.acknowledged.slice(11)}`);
+    else add("button", "Acknowledge", "acknowledge").onclick = () => commands.acknowledge(alarm.name);
+    if (list.children[k]) list.children[k].replaceWith(row);
+    else list.append(row);
+  });
+  while (list.children.length > alarms.length) list.lastChild.remove();
 }
 
 function showRobot(robot, pose) {

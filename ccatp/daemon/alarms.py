@@ -1,0 +1,163 @@
+"""The list of alarms of a run: what is wrong, since when, what to do, and who has acknowledged it.
+
+An alarm is a condition of ``ccatp.conditions`` by its name; while it is active and comes again it stays one alarm. One
+that ended stays in the list until it is acknowledged where it had held the robot or sent it home. What happens to the
+list goes to ``alarms.jsonl`` in the run directory, a line each, so that a main loop that takes over has the same list.
+"""
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal, cast
+
+import msgspec
+import structlog
+
+from ccatp.conditions import OPERATOR, condition_of
+from ccatp.config.files import read_text
+from ccatp.core import Severity
+from ccatp.links.topics import Alarm, SeverityName
+
+FILE = "alarms.jsonl"
+# Bounds of the file: an alarm that flutters for hours adds no more lines; the list itself stays right.
+MAX_LINES, MOST_BYTES = 10_000, 1 << 23
+# From here on it is an alarm at once, and an operator has to know of it though it has ended.
+LASTING = Severity.HOLD
+# What is less grave must last, by the robot's clock or by ours: each run begins with frames that miss something.
+LEAST_S = 1.0
+
+
+def utc_now() -> str:
+    """The time as it stands in the list, UTC."""
+    return datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+
+
+EventName = Literal["raised", "ended", "acknowledged"]
+
+
+class AlarmEvent(msgspec.Struct, frozen=True):
+    """What happened to an alarm, UTC and robot time: ``raised`` (or graver), ``ended``, or ``acknowledged``."""
+
+    utc: str
+    t_s: float
+    event: EventName
+    name: str
+    severity: SeverityName
+    cause: str
+    by: str = ""
+
+
+_decoder = msgspec.json.Decoder(AlarmEvent)
+
+
+def read_history(run_dir: Path) -> Iterator[AlarmEvent]:
+    """What happened to the alarms of a run, oldest first; a line that was cut off by a kill is left out."""
+    try:
+        text = read_text(run_dir / FILE, MOST_BYTES)
+    except (OSError, UnicodeDecodeError):  # none yet, or not to be read
+        return
+    for line in text.splitlines():
+        with suppress(msgspec.MsgspecError):
+            yield _decoder.decode(line)
+
+
+class AlarmList:
+    """Raises, ends and acknowledges alarms; ``now`` gives the time that is shown."""
+
+    def __init__(
+        self,
+        run_dir: Path,
+        log: structlog.typing.FilteringBoundLogger,
+        now: Callable[[], str] = utc_now,
+    ) -> None:
+        self._path, self._log, self._now = run_dir / FILE, log, now
+        self._alarms: dict[str, Alarm] = {}
+        self._since: dict[str, tuple[float, float]] = {}  # robot's clock and ours, of those that are active
+        self._lines = 0
+        for event in read_history(run_dir):
+            self._lines += 1
+            self._apply(event)
+
+    @property
+    def alarms(self) -> list[Alarm]:
+        """Those that are active, the gravest first, then those that ended and are not acknowledged."""
+        return sorted(self._alarms.values(), key=lambda one: (bool(one.ended), -Severity[one.severity.upper()]))
+
+    def update(self, causes: Iterable[tuple[str, Severity]], t_s: float) -> None:
+        """Exactly these are active at robot time ``t_s``: causes as they are shown, severity of the verdict or none."""
+        active: dict[str, tuple[Severity, list[str]]] = {}
+        for cause, severity in causes:
+            row = condition_of(cause)
+            if not cause or row is OPERATOR:
+                continue
+            name = row.name if row is not None else "other"
+            known, texts = active.get(name, (Severity.INFORM, []))
+            worst = max(known, severity, row.alarm_severity if row is not None else Severity.FAULT)
+            active[name] = worst, texts if cause in texts else [*texts, cause]
+        now_s = time.monotonic()
+        self._since = {name: self._since.get(name, (t_s, now_s)) for name in active}
+        for name, (severity, texts) in active.items():
+            robot_s, our_s = self._since[name]
+            if severity < LASTING and max(t_s - robot_s, now_s - our_s) < LEAST_S:
+                continue
+            alarm, word = self._alarms.get(name), cast(SeverityName, severity.name.lower())
+            if alarm is None or alarm.ended or Severity[alarm.severity.upper()] < severity:
+                self._happened("raised", name, t_s, word, "; ".join(texts))
+        for alarm in list(self._alarms.values()):
+            if not alarm.ended and alarm.name not in active:
+                self._happened("ended", alarm.name, t_s, alarm.severity, alarm.cause)
+
+    def acknowledge(self, name: str, by: str, t_s: float) -> str | None:
+        """An operator has seen an alarm; returns why it was refused, or None. A second time has no effect."""
+        alarm = self._alarms.get(name)
+        if alarm is None:
+            known = ", ".join(one.name for one in self.alarms)
+            return f"no alarm {name!a}; " + (f"the list has {known}" if known else "the list is empty")
+        if not alarm.acknowledged_by:
+            self._happened("acknowledged", name, t_s, alarm.severity, alarm.cause, by)
+        return None
+
+    def _happened(
+        self, what: EventName, name: str, t_s: float, severity: SeverityName, cause: str, by: str = ""
+    ) -> None:
+        event = AlarmEvent(self._now(), round(t_s, 3), what, name, severity, cause, by)
+        self._apply(event)
+        self._log.info(f"alarm_{what}", name=name, severity=severity, cause=cause, by=by, t_s=t_s)
+        if self._lines >= MAX_LINES:
+            return
+        self._lines += 1
+        try:
+            with self._path.open("ab") as file:
+                file.write(msgspec.json.encode(event) + b"\n")
+        except OSError as error:  # the list in memory holds, and so does the log
+            self._log.warning("alarm_not_stored", error=str(error))
+
+    def _apply(self, event: AlarmEvent) -> None:
+        name, known = event.name, self._alarms.get(event.name)
+        if event.event == "raised":
+            row = condition_of(event.cause.partition("; ")[0])
+            alarm = Alarm(
+                name=name,
+                severity=event.severity,
+                cause=event.cause,
+                advice=row.advice if row is not None else "",
+                since=event.utc,
+                since_s=event.t_s,
+            )
+            if known is not None and known.ended:
+                alarm.count = known.count + 1
+            elif known is not None:  # it became graver
+                alarm.since, alarm.since_s, alarm.count = known.since, known.since_s, known.count
+        elif known is None:
+            return
+        elif event.event == "acknowledged":
+            alarm = msgspec.structs.replace(known, acknowledged_by=event.by, acknowledged=event.utc)
+        else:
+            alarm = msgspec.structs.replace(known, ended=event.utc)
+        is_lasting = Severity[alarm.severity.upper()] >= LASTING
+        if alarm.ended and (alarm.acknowledged_by or not is_lasting):
+            self._alarms.pop(name, None)
+        else:
+            self._alarms[name] = alarm
