@@ -326,6 +326,7 @@ CALLS = {("time", "time"), ("time", "time_ns"), ("time", "localtime"), ("time", 
 # Labels: names of run directories and the observatory's feed say when they were made. The check before a mission shows
 # the clock itself.
 LABELS = {
+    "daemon/alarms.py",  # as operators read it; what decides is the order
     "daemon/supervisor.py",
     "daemon/run_dir.py",
     "cli/prepare.py",
