@@ -10,7 +10,7 @@ import os
 import sys
 import time
 import uuid
-from collections.abc import Callable, Coroutine, Set
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -155,7 +155,12 @@ class DangerLoop(RobotLoop):
             context, args.endpoints.of("main"), self.heartbeat.publish_if_due, is_taking_over=args.is_taking_over
         )
         self._has_estimate = False
-        self._published: tuple[EventCode, str, Severity, Set[str]] = (EventCode.NORMAL, "", Severity.NONE, frozenset())
+        self._published: tuple[EventCode, str, Severity, frozenset[str]] = (
+            EventCode.NORMAL,
+            "",
+            Severity.NONE,
+            frozenset(),
+        )
         self._seq, self._t_s = -1, 0.0
         self._bad_lines = self._permit_seq = 0
         self._sent: tuple[int, Verdict] | None = None  # newest permit of the session, and its frame
@@ -246,13 +251,13 @@ class DangerLoop(RobotLoop):
             self._sent = ack, verdict
             self.answer_again()
         self.publisher.send("verdict", verdict)
-        monitor = self.monitor
-        names = {finding.condition.name for finding in monitor.found} if monitor.found else frozenset()
+        found, emergencies = self.monitor.found, self.monitor.latch.causes
+        names = frozenset((*(finding.condition.name for finding in found), *emergencies))
         news = verdict.code, verdict.cause, verdict.severity, names
         if news == self._published:
             return
         self._published = news
-        causes = verdict.cause, *(finding.cause for finding in monitor.found), *monitor.latch.causes
+        causes = verdict.cause, *(finding.cause for finding in found), *emergencies
         fields: dict[str, Any] = {
             "code": int(verdict.code),
             "cause": verdict.cause,

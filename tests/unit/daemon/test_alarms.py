@@ -1,6 +1,7 @@
 """The list of alarms."""
 
 import time
+import uuid
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from ccatp import conditions
 from ccatp.core import Severity
 from ccatp.daemon import alarms
 from ccatp.daemon.alarms import LEAST_S, AlarmList, read_history
+from tests.support.daemon import configuration, running_daemon
 
 FAN = conditions.FAN_WEAK.text(side="left")
 RIM = conditions.RIM_AHEAD.message
@@ -124,3 +126,14 @@ def test_a_folder_that_is_gone_ends_nothing(tmp_path: Path) -> None:
     known = make(tmp_path / "gone")
     known.update([(FAN, NONE)], 1.0)
     assert shown(known) == [("fan_weak", "return")]
+
+
+async def test_all_that_danger_finds_is_listed_not_only_the_gravest() -> None:
+    async with running_daemon(configuration()) as daemon:
+        await daemon.until(lambda: daemon.is_driving)
+        for kind in ("earthquake", "fire"):  # the second one does not change the verdict
+            daemon.danger.monitor.emergency(kind, str(uuid.uuid4()))
+        await daemon.until(lambda: len(daemon.main.status().alarms) == 2)
+        assert [(one.name, one.cause) for one in daemon.main.status().alarms] == [
+            ("earthquake", QUAKE), ("emergency", FIRE),
+        ]  # fmt: skip
