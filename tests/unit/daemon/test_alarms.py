@@ -131,8 +131,9 @@ def test_a_folder_that_is_gone_ends_nothing(tmp_path: Path) -> None:
 async def test_all_that_danger_finds_is_listed_not_only_the_gravest() -> None:
     async with running_daemon(configuration()) as daemon:
         await daemon.until(lambda: daemon.is_driving)
-        for kind in ("earthquake", "fire"):  # the second one does not change the verdict
-            daemon.danger.monitor.emergency(kind, str(uuid.uuid4()))
+        daemon.danger.monitor.emergency("earthquake", str(uuid.uuid4()))
+        await daemon.until(lambda: len(daemon.main.status().alarms) == 1)
+        daemon.danger.monitor.emergency("fire", str(uuid.uuid4()))  # which does not change the verdict
         await daemon.until(lambda: len(daemon.main.status().alarms) == 2)
         assert [(one.name, one.cause) for one in daemon.main.status().alarms] == [
             ("earthquake", QUAKE), ("emergency", FIRE),
