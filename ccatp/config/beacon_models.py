@@ -16,8 +16,10 @@ from ccatp.config.models import (
     ObservatoryConfig,
     Pair,
     PidConfig,
+    Port,
     Positive,
     ProcessesConfig,
+    Seed,
 )
 
 # Frames come ten times a second: what is older than two of them is stale.
@@ -87,7 +89,7 @@ class SimBeaconRobotConfig(Model):
     """The DataLoop: the robot's stand-in."""
 
     host: Host
-    port: Annotated[int, Field(ge=0, le=65535)]
+    port: Port
     ttl_s: Positive
 
 
@@ -230,7 +232,7 @@ class CricketConfig(Model):
 class RadioRunConfig(Model):
     """One run: clock, seed, end."""
 
-    seed: Annotated[int, Field(ge=0)]
+    seed: Seed
     step_s: Annotated[float, Field(gt=0.0, le=1.0)]
     steps: Count
 

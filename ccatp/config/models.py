@@ -10,8 +10,10 @@ NonNegative = Annotated[float, Field(ge=0.0, le=1e6)]
 # No decision is made on data older than 150 ms.
 Freshness = Annotated[float, Field(gt=0.0, le=0.15)]
 Port = Annotated[int, Field(ge=0, le=65535)]
+PeerPort = Annotated[int, Field(ge=1, le=65535)]  # at which somebody listens
+Seed = Annotated[int, Field(ge=0, lt=2**63)]  # an integer of TOML
 Pair = tuple[float, float]
-TEXT, HOST = r"^[^\x00-\x1f\x7f-\x9f]*$", r"^([^\s./\x00-\x1f\x7f-\x9f]{1,63}(\.|$))*$"
+TEXT, HOST = r"^[^\x00-\x1f\x7f-\x9f]*$", r"^([^\s./\x00-\x1f\x7f-\x9f]{1,63}(\.|$))+$"
 # What the values must be that match these.
 PATTERNS = {TEXT: "must not contain control characters", HOST: "must be the name or the address of a host"}
 Text = Annotated[str, Field(max_length=4096, pattern=TEXT)]
@@ -40,7 +42,7 @@ class RunConfig(ProcessesConfig):
 
     mirror: Text
     world: Text
-    seed: Annotated[int, Field(ge=0)]
+    seed: Seed
     filter: Literal["kf", "ekf", "ukf"]
     panels: Annotated[int, Field(ge=0)]  # 0 = the whole mirror
     order: Literal["thesis", "optimised", "calibration"]
@@ -51,7 +53,7 @@ class LinkConfig(Model):
     """The robot link: where the robot is, and when its data are too old."""
 
     host: Host
-    port: Port
+    port: PeerPort
     key_file: Text
     connect_timeout_s: Positive
     sensors_timeout_s: Freshness
@@ -203,7 +205,7 @@ class EtalonConfig(Model):
     """Address and use of the MultiLine server."""
 
     host: Host
-    port: Port
+    port: PeerPort
     connect_timeout_s: Positive
     request_timeout_s: Positive
     retries: Annotated[int, Field(ge=0, le=10)]

@@ -21,7 +21,7 @@ from tests.support.scenario import any_port
 
 CHANNELS = (1, 2, 3, 4)
 COLLIMATORS = np.array([[0.0, 0.0, 5.0], [3.0, 0.0, 4.0], [0.0, 4.0, 3.0], [-6.0, 0.0, 8.0]])
-QUIET = SimEtalonConfig(host="", port=0, length_sigma_m=0.0, length_sigma_per_m=0.0, motion_tolerance_m=1e-4)
+QUIET = SimEtalonConfig(host="127.0.0.1", port=0, length_sigma_m=0.0, length_sigma_per_m=0.0, motion_tolerance_m=1e-4)
 NOISY = QUIET.model_copy(update={"length_sigma_m": 1e-6})
 AIR = b"-5.0,525.0,30.0"
 CLEAN = b"400,2000," + AIR + b",0,0,0,0,0,0,0,0,0,0"
