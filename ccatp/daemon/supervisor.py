@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import signal
 import socket
 import sys
@@ -70,6 +71,8 @@ from ccatp.report.dashboard.access import TOKEN_FILE, make_token, read_tokens
 # Between two looks at messages and processes: in lockstep a message in each of them would cost as much again.
 POLL_S = 0.02
 STDERR = 2  # its descriptor
+# Of one process: a page for each of 32 clients, sockets, recording, database; most systems permit 1024.
+OPEN_FILES = 256
 # So many at a time: a signal and a death are noticed in between.
 MAX_MESSAGES = 1000
 
@@ -266,6 +269,7 @@ def run_survey(options: RunOptions) -> int:
 
 def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
     options = with_origin(options)
+    permit_open_files()
     # The processes read the files of these again; here they are refused before anything has begun.
     check_observatory(cfg.observatory)
     read_key(cfg.robot.key_file, must_be_private=not options.sim)
@@ -303,6 +307,15 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
         return SupervisedRun(options, cfg, run_dir, Endpoints(runtime_dir), sockets, locks, page, started_s).run()
+
+
+def permit_open_files() -> None:
+    """Raise the limit of open files, which the processes inherit; ConfigError: the system permits fewer than needed."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if 0 <= hard < OPEN_FILES:  # -1 is no limit
+        raise ConfigError(f"only {hard} files may be open, a run needs {OPEN_FILES}; raise the limit with ulimit -n")
+    if 0 <= soft < OPEN_FILES:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (OPEN_FILES, hard))
 
 
 def _addresses(cfg: Config | RadioConfig) -> dict[str, dict[str, object]]:
