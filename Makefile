@@ -19,7 +19,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-.PHONY: help run test test-newest newest test-slow slow-tests new-examples sweep tried-in faults docs metrics lint format
+.PHONY: help run test test-newest newest test-slow slow-tests new-examples sweep tried-in faults docs man metrics lint format
 .PHONY: kills mutants golden golden-quick lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
@@ -34,6 +34,7 @@ help:
 	@echo "make mutants          small changes of the safety code that the tests noticed before: do they still? [TARGETS=...]"
 	@echo "make faults           docs/fault_table.md from what the last test runs showed and measured"
 	@echo "make docs             build/docs/index.html, and the parts of docs/ that are made from the code"
+	@echo "make man            the manual page, build/man/ccatp.1"
 	@echo "make golden           this tree against a base commit, both run here, bit for bit; make golden-quick: a few cases"
 	@echo "make metrics          size of the code base, calls and files per frame; ARGS=--names lists them"
 	@echo "make lint             lint, types, import contract"
@@ -92,6 +93,11 @@ docs: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.docs.generated
 	$(BIN)/python -m sphinx -W -q -b html docs build/docs
 	@echo "ccatp: build/docs/index.html"
+
+man: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.docs.generated
+	$(BIN)/python -m sphinx -W -q -b man docs build/man
+	@echo "ccatp: build/man/ccatp.1"
 
 # Both run on this machine: linear algebra rounds differently on another one. ARGS=--list shows the cases.
 RADIO_DATA ?= ../shared/data/radio

@@ -18,6 +18,7 @@ myst_heading_anchors = 3
 suppress_warnings = ["myst.xref_missing", "ref.python"]
 exclude_patterns = []
 html_theme = "furo"
+man_pages = [("commands", "ccatp", "survey telescope mirrors with a laser-tracked robot", [author], 1)]
 html_title = f"ccatp {release}"
 html_copy_source = False
 html_static_path = []

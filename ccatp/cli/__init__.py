@@ -8,20 +8,22 @@ from collections.abc import Sequence
 import click
 
 import ccatp
-from ccatp.cli import config, operate, prepare, radio, recording, report, run, sim, study
+from ccatp.cli import config, operate, prepare, radio, recording, report, run, runs, sim, study
 from ccatp.cli.common import CommandGroup, example, run_command_line
 
-COMMANDS = (
-    # before a mission
-    *(prepare.plan, prepare.check, prepare.calibrate, config.config, config.keys),
-    # during a mission
-    *(run.run, operate.status, operate.pause, operate.resume, operate.abort, operate.stop),
-    *(operate.alarms, operate.emergency, operate.clear, run.dashboard, run.stream),
-    # after a mission
-    *(report.report, report.compare, report.align, report.replay, report.plot, recording.recording),
-    # simulation and studies
-    *(sim.sim, study.study, study.bench, sim.conformance, radio.radio, config.completion),
-)
+SECTIONS = {
+    "Before a mission": (prepare.plan, prepare.check, prepare.calibrate, config.config, config.keys),
+    "Operate": (
+        *(run.run, operate.status, operate.alarms, operate.pause, operate.resume, operate.abort, operate.stop),
+        *(operate.emergency, operate.clear, run.dashboard, run.stream),
+    ),
+    "Data": (
+        *(runs.runs, report.report, report.compare, report.align, report.replay, report.plot, recording.recording),
+    ),
+    "Simulation and robots": (sim.sim, sim.conformance),
+    "Studies": (study.study, study.bench, radio.radio),
+    "Shell": (config.completion,),
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,13 +33,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @click.group(
     cls=CommandGroup,
+    sections=SECTIONS,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog=example("ccatp run --sim", "ccatp run --sim --mirror fyst-m2 --seed 2", "ccatp status --json"),
 )
 @click.version_option(ccatp.__version__, message="ccatp %(version)s")
 def cli() -> None:
     """Survey telescope mirrors with a laser-tracked robot."""
-
-
-for command in COMMANDS:
-    cli.add_command(command)

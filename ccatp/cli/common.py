@@ -2,8 +2,10 @@
 
 import errno
 import io
+import json
 import math
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -93,8 +95,29 @@ class OutputFile(click.Path):
         return path
 
 
+_errors_as_json = False
+
+
 class CommandGroup(click.Group):
-    """A group of commands that refuses a former name of one with the present one."""
+    """A group of commands that refuses a former name of one with the present one.
+
+    ``sections``: titles of its help and the commands below them, in this order; without, all stand below one title.
+    """
+
+    def __init__(
+        self, *args: Any, sections: Mapping[str, Sequence[click.Command]] | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self.sections = sections or {}
+        for command in (one for commands in self.sections.values() for one in commands):
+            self.add_command(command)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The first sentence of each command's help, whole, where click cuts it off."""
+        for title, commands in (self.sections or {"Commands": [*self.commands.values()]}).items():
+            rows = [(command.name or "", _first_sentence(command.help or "")) for command in commands]
+            with formatter.section(title):
+                formatter.write_dl(rows)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -106,11 +129,17 @@ class CommandGroup(click.Group):
         return super().resolve_command(ctx, args)
 
 
+def _first_sentence(text: str) -> str:
+    return re.split(r"(?<=[.:;])\s", " ".join(text.split()), maxsplit=1)[0].rstrip(".:;")
+
+
 def run_command_line(group: click.Group, argv: Sequence[str] | None = None) -> int:
     """Run a command line (that of the process if ``None``) and return the exit status.
 
-    Errors become one line on standard error, never a traceback.
+    Errors become one line on standard error, never a traceback; with ``--json`` that is one JSON object.
     """
+    global _errors_as_json  # noqa: PLW0603 - of this process, like its standard error
+    _errors_as_json = "--json" in (sys.argv[1:] if argv is None else argv)
     # Matrices are small: threads would compete for the cores, and another number of them may round differently.
     # Set before numpy is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -175,9 +204,12 @@ def _prepare_streams() -> None:
 
 
 def complain(message: str, status: int) -> int:
-    """One line on standard error; returns ``status``."""
+    """One line on standard error, and for ``--json`` an error as an object; returns ``status``."""
+    line = printable(" ".join(message.split()))
+    if _errors_as_json and status:
+        line = json.dumps({"error": line, "status": int(status)})
     with suppress(OSError):  # nobody reads it
-        click.echo(f"ccatp: {printable(' '.join(message.split()))}", err=True)
+        click.echo(line if line.startswith("{") else f"ccatp: {line}", err=True)
     return int(status)
 
 

@@ -1,15 +1,25 @@
-"""``ccatp config check`` and ``schema``, ``ccatp keys``, ``ccatp completion``."""
+"""``ccatp config``, ``ccatp keys``, ``ccatp completion``."""
 
 import json
 import re
 import shutil
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 
-from ccatp.cli.common import CONFIG_FILE, PATH, CommandGroup, complain, example, json_option, print_lines
+from ccatp.cli.common import (
+    CONFIG_FILE,
+    PATH,
+    SETTINGS_OPTION,
+    CommandGroup,
+    complain,
+    example,
+    json_option,
+    print_lines,
+)
 from ccatp.errors import ConfigError
 
 
@@ -43,10 +53,59 @@ def config_check(file: Path) -> int:
 
 @config.command("schema", epilog=example("ccatp config schema > ccatp.schema.json"))
 def config_schema() -> None:
-    """Print the JSON schema of a configuration file."""
-    from ccatp.config.load import json_schema
+    """Print the JSON schema of a configuration file: every key with its meaning, type, limits and unit."""
+    from ccatp.config.describe import json_schema
 
     click.echo(json.dumps(json_schema(), indent=2))
+
+
+@config.command("init", epilog=example("ccatp config init telescope.toml"))
+@click.argument("file", type=PATH)
+@click.option("--force", is_flag=True, help="Replace the file that is there.")
+def config_init(file: Path, force: bool) -> None:
+    """Write a configuration to begin with: every key with its default and its meaning, commented out."""
+    from ccatp.config.describe import template
+    from ccatp.config.files import write_file
+
+    if file.exists() and not force:
+        raise ConfigError(f"{file}: exists; choose another name, or replace it with --force")
+    write_file(file, template(), 0o644, is_replacing=force)
+    click.echo(f"{file}: uncomment what differs at your telescope, then ccatp config check {file}")
+
+
+@config.command("show", epilog=example("ccatp config show telescope.toml", "ccatp config show zigbee --json"))
+@click.argument("file", type=CONFIG_FILE, required=False)
+@SETTINGS_OPTION
+@json_option("As one JSON object.")
+def config_show(file: Path | None, settings: Mapping[str, object], json_output: bool) -> None:
+    """Print the whole configuration that FILE and the defaults give, mirror and world included, as TOML."""
+    from ccatp.config.load import dump_config
+    from ccatp.daemon.process import read_config
+
+    cfg = read_config(file, settings)
+    click.echo(json.dumps(cfg.model_dump(mode="json")) if json_output else dump_config(cfg).rstrip())
+
+
+@config.command(
+    "diff", epilog=example("ccatp config diff telescope.toml", "ccatp config diff runs/a/config.toml new.toml")
+)
+@click.argument("file", type=CONFIG_FILE)
+@click.argument("other", type=CONFIG_FILE, required=False)
+@json_option("As one JSON object: key, [before, after].")
+def config_diff(file: Path, other: Path | None, json_output: bool) -> None:
+    """Show what FILE changes of the defaults for its mirror and world, or the changes from FILE to OTHER."""
+    from ccatp.config.describe import differences
+    from ccatp.config.messages import format_value
+    from ccatp.daemon.process import read_config
+
+    cfg = read_config(file)
+    found = differences(cfg) if other is None else differences(read_config(other), cfg)
+    if json_output:
+        click.echo(json.dumps({key: [before, after] for key, before, after in found}))
+        return
+    print_lines(
+        [f"{k}: {format_value(before)} -> {format_value(after)}" for k, before, after in found] or ["no difference"]
+    )
 
 
 DEFAULT_DIR = "keys"

@@ -43,6 +43,8 @@ FOXGLOVE_PORT = 8765
 @click.option(
     "--resume-last", "recover", is_flag=True, help="For services: resume, held, the run that did not finish, if any."
 )
+@click.option("-q", "--quiet", is_flag=True, help="Only warnings, errors and the summary.")
+@click.option("-v", "--verbose", is_flag=True, help="Also each change of the mission's state.")
 @renamed_flag("--held", "--start-held")
 @renamed_flag("--recover", "--resume-last")
 @json_option("Summary as JSON on standard output, nothing else there.")
@@ -51,10 +53,13 @@ FOXGLOVE_PORT = 8765
 def run(
     sim: bool, config_file: Path | None, settings: Mapping[str, object], realtime: bool, run_dir: Path | None,
     resume: bool, held: bool, recover: bool, json_output: bool, faults_file: Path | None, runtime_dir: Path | None,
+    quiet: bool, verbose: bool,
 ) -> int:  # fmt: skip
     """Survey the mirror of the configuration and end with a summary."""
     if faults_file is not None and not sim:
         raise click.UsageError("--faults needs --sim: faults are for the simulated robot, never for a real one")
+    if quiet and verbose:
+        raise click.UsageError("--quiet and --verbose contradict each other; give one of them")
     if held and not resume:
         raise click.UsageError("--start-held needs --resume; --resume-last always starts held")
     if recover and (resume or run_dir is not None):
@@ -76,6 +81,7 @@ def run(
     options = RunOptions(
         sim=sim, config_file=config_file, overrides=settings, realtime=realtime, run_dir=run_dir, resume=resume,
         held=held, recover=recover, json_output=json_output, runtime_dir=runtime_dir, faults_file=faults_file,
+        verbosity=verbose - quiet,
     )  # fmt: skip
     return int(run_to_the_end(options))
 

@@ -220,14 +220,6 @@ def dump_config(cfg: Config | RadioConfig) -> str:
     return _RUN_HEAD + tomlkit.dumps(cfg.model_dump())
 
 
-def json_schema() -> dict[str, Any]:
-    """JSON schema of a configuration file. Nothing is required: what one leaves out comes from the default file."""
-    schema = Config.model_json_schema()
-    for model in (schema, *schema["$defs"].values()):
-        model.pop("required", None)
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "ccatp configuration"}
-
-
 def available(kind: str, config_dir: Path | None = None) -> list[str]:
     """Names of the shipped ``mirror`` or ``world`` files."""
     folder = (config_dir or configs_dir()) / _SECTIONS[kind][0]

@@ -87,11 +87,11 @@ class LimitsConfig(Model):
 class PidConfig(Model):
     """One PID controller, thesis eq. 3.4, in seconds and SI units of its error and output."""
 
-    kp: NonNegative
-    ki: NonNegative
-    kd: NonNegative
-    derivative_filter_s: NonNegative
-    integral_limit: NonNegative  # largest contribution of the integral term, in the unit of the output
+    kp: NonNegative = Field(description="output per error")
+    ki: NonNegative = Field(description="output per integral of the error")
+    kd: NonNegative = Field(description="output per rate of the error")
+    derivative_filter_s: NonNegative = Field(description="time constant of the derivative's low-pass filter")
+    integral_limit: NonNegative = Field(description="largest contribution of the integral, in the unit of the output")
 
 
 class GainsConfig(Model):
@@ -123,7 +123,7 @@ class ControlConfig(Model):
     predicts_delay: bool
     compensates_creep: bool
     leg_timeout_factor: Positive
-    gain_sets: dict[str, GainsConfig]
+    gain_sets: dict[str, GainsConfig] = Field(description="gains by their name")
 
 
 class TechniquesConfig(Model):
@@ -255,7 +255,7 @@ class AlignConfig(Model):
     point_floor_m: NonNegative
     puck_height_sigma_m: NonNegative
     false_alarm: Annotated[float, Field(gt=0.0, lt=1.0)]
-    light: dict[str, LightConfig]  # by mirror name
+    light: dict[str, LightConfig] = Field(description="light at each mirror, by its name")  # by mirror name
 
 
 class HealthConfig(Model):

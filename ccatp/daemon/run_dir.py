@@ -140,6 +140,7 @@ class RunOptions:
         json_output: the summary goes to standard output as JSON, and nothing else does.
         runtime_dir: folder of the unix sockets.
         faults_file: plan of simulated faults; a copy goes into the run directory.
+        verbosity: as of ``RunView``.
     """
 
     sim: bool
@@ -154,6 +155,7 @@ class RunOptions:
     runtime_dir: Path | None = None
     faults_file: Path | None = None
     shows_summary: bool = True
+    verbosity: int = 0
 
     @property
     def is_paced(self) -> bool:

@@ -128,7 +128,7 @@ class SupervisedRun:
         self._is_interrupted = self._has_begun = False
         self._service = Service(*take_from(os.environ))
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
-        self._view = RunView(cfg, is_sim=options.sim, run_dir=run_dir)
+        self._view = RunView(cfg, is_sim=options.sim, run_dir=run_dir, verbosity=options.verbosity)
 
     def run(self) -> int:
         """Start, watch, collect, stop; returns the exit status."""

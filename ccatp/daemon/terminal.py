@@ -43,17 +43,22 @@ class _BufferedConsole(Console):
 
 
 class RunView:
-    """Progress and messages on standard error; the summary on standard output."""
+    """Progress and messages on standard error; the summary on standard output.
 
-    def __init__(self, cfg: Config | RadioConfig, *, is_sim: bool, run_dir: Path) -> None:
+    ``verbosity``: -1 leaves out progress and whatever is no warning; 1 adds each change of the state.
+    """
+
+    def __init__(self, cfg: Config | RadioConfig, *, is_sim: bool, run_dir: Path, verbosity: int = 0) -> None:
+        self._is_quiet, self._is_verbose, self._state = verbosity < 0, verbosity > 0, ""
         self._is_survey = isinstance(cfg, Config)
         self._console: Console = _BufferedConsole(stderr=True, highlight=False)
-        self._is_terminal = self._console.is_terminal
+        self._is_terminal = self._console.is_terminal and not self._is_quiet
         self._rate_limit = RateLimitedLog(LINES_OF_A_KIND, LINES_PERIOD_S)
         self._has_pose = False
         self._shown_tenths = 0
         title, self._goals = _title_and_goals(cfg, is_sim=is_sim)
-        self._console.print(printable(f"{title}; writing {run_dir}"), soft_wrap=True, markup=False)
+        if not self._is_quiet:
+            self._console.print(printable(f"{title}; writing {run_dir}"), soft_wrap=True, markup=False)
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -75,6 +80,8 @@ class RunView:
 
     def show_message(self, level: str, text: str) -> None:
         """One line for the operator, unless too many like it were shown; ``log.jsonl`` has them all."""
+        if self._is_quiet and level == "info":
+            return
         shown = self._rate_limit.take(level, text, time.monotonic())
         if shown is not None:
             self._console.print(f"{level}: {printable(shown)}", style=STYLES[level], markup=False, soft_wrap=True)
@@ -96,12 +103,15 @@ class RunView:
 
     def _show_status(self, status: MissionStatus) -> None:
         text = self.text_of(status)
+        if self._is_verbose and status.state != self._state:
+            self._state = status.state
+            self._console.print(f"debug: {text}", soft_wrap=True, markup=False)
         if self._is_terminal:
             self._progress.update(self._task, completed=status.done, total=status.total, state=text)
             self._progress.refresh()
             return
         tenths = 10 * status.done // max(status.total, 1)
-        if tenths > self._shown_tenths:
+        if tenths > self._shown_tenths and not self._is_quiet:
             self._shown_tenths = tenths
             done = f"{10 * tenths} %: {status.done} of {status.total} {self._goals}"
             self._console.print(f"{done}, {text}", soft_wrap=True)
@@ -128,7 +138,8 @@ class RunView:
 
     def show_report(self, where: str) -> None:
         """Show where the report is, or why there is none; on standard error, so that JSON stays alone."""
-        self._console.print(printable(f"report  {where}"), soft_wrap=True, markup=False)
+        if not self._is_quiet:
+            self._console.print(printable(f"report  {where}"), soft_wrap=True, markup=False)
 
 
 def _title_and_goals(cfg: Config | RadioConfig, *, is_sim: bool) -> tuple[str, str]:

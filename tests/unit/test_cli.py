@@ -69,7 +69,8 @@ def test_every_help_shows_an_example(path: tuple[str, ...], capsys: pytest.Captu
 def test_the_commands_are_those_of_the_contract_the_map_and_the_conformance() -> None:
     assert {" ".join(path) for path in commands(cli) if path} - {"plot", "conformance", "dashboard"} == {
         "run", "status", "alarms", "alarms ack", "alarms history", "pause", "resume", "abort", "stop", "emergency",
-        "sim", "sim robot", "sim etalon", "config", "config check", "config schema", "study", "replay", "bench",
+        "sim", "sim robot", "sim etalon", "config", "config check", "config diff",
+            "config init", "config schema", "config show", "runs", "runs list", "runs show", "study", "replay", "bench",
         "keys", "keys generate", "keys show-public", "clear", "align", "plan", "report", "compare",
         "recording", "recording info", "recording repair", "stream", "calibrate", "check", "completion",
         "radio", "radio slam", "radio compare", "radio calibrate", "radio fix", "radio fuzzy", "radio map",
@@ -104,6 +105,7 @@ NAMING = (["report"], ["replay"], ["map"], ["run", "--sim", "--mirror"], ["run",
         (["run", "--sim", "--set", "seed"], "'seed' is not KEY=VALUE, as in run.seed=2"),
         (["run", "--sim", "--start-held"], "--start-held needs --resume; --resume-last always starts held"),
         (["run", "--sim", "--resume-last", "--resume"], "--resume-last finds the run itself: leave out --resume"),
+        (["run", "--sim", "-q", "-v"], "--quiet and --verbose contradict each other"),
         (["run", "--sim", "--held"], "--held is now called --start-held"),
         (["run", "--sim", "--recover"], "--recover is now called --resume-last"),
         (["log", "info", "x"], "the command 'log' is now called 'recording'"),

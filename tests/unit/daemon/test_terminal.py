@@ -53,6 +53,25 @@ def test_a_run_from_its_first_line_to_its_report(tmp_path: Path, capsys: pytest.
     assert report == f"report  {tmp_path / 'report.html'}"
 
 
+@pytest.mark.parametrize(
+    ("verbosity", "lines"),
+    [
+        (-1, ["error: held"]),
+        (1, ["debug: driving", "10 %: 1 of 10 points", "error: held", "debug: held", "report  there"]),
+    ],
+)
+def test_quiet_and_verbose(
+    verbosity: int, lines: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    view = RunView(CFG, is_sim=True, run_dir=tmp_path, verbosity=verbosity)
+    for message in (STATUS, LogMessage(seq=1, t_s=0.0, level="error", process="main", text="held")):
+        view.show(message)
+    view.show(replace(STATUS, state="held"))
+    view.show_report("there")
+    told = capsys.readouterr().err.splitlines()
+    assert [line.partition(",")[0] for line in told if not line.startswith("ccatp SIM")] == lines
+
+
 def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     survey = RunView(CFG, is_sim=False, run_dir=tmp_path)
     at_point = replace(STATUS, point="1-2-3", error_mm=0.5)

@@ -1,0 +1,124 @@
+"""``ccatp runs``: which runs are here, how they ended, and what is in their directories."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ccatp.cli.common import JSON_OPTION, PATH, CommandGroup, example, print_lines
+from ccatp.errors import ConfigError, ExitStatus
+
+# Files of a run directory, and what they are.
+FILES = {
+    "summary.json": "the result",
+    "report.html": "the report, for a browser",
+    "mission.sqlite": "points and fixes",
+    "telemetry.mcap": "recording, for ccatp replay, Foxglove and PlotJuggler",
+    "log.jsonl": "log of all processes",
+    "alarms.jsonl": "what happened to the alarms",
+    "config.toml": "the exact configuration",
+    "checkpoint": "state of a mission that can be resumed",
+}
+# The line that says how a run ended is among the last ones of its log.
+_LAST_BYTES = 65_536
+
+
+@click.group(cls=CommandGroup, epilog=example("ccatp runs list", "ccatp runs show runs/tonight"))
+def runs() -> None:
+    """List the runs in a folder, and show one."""
+
+
+@runs.command("list", epilog=example("ccatp runs list", "ccatp runs list /var/lib/ccatp/runs --json"))
+@click.argument("folder", type=PATH, default="runs")
+@JSON_OPTION
+def list_runs(folder: Path, json_output: bool) -> None:
+    """List the runs in FOLDER, ./runs if not given, the oldest first."""
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: no such folder; name one that holds run directories")
+    found = sorted((_facts(path.parent) for path in folder.glob("*/config.toml")), key=lambda run: run["began"])
+    if json_output:
+        click.echo(json.dumps({"runs": found}))
+        return
+    head = {"began": "began (UTC)", "state": "state", "points": "points", "size_mb": "MB", "what": "what", "run": "run"}
+    rows = [{key: str(run[key]) for key in head} for run in (head, *found)]
+    width = {key: max(len(row[key]) for row in rows) for key in head}
+    print_lines(
+        ["  ".join(f"{row[key]:<{width[key]}}" for key in head).rstrip() for row in rows] if found else ["none"]
+    )
+
+
+@runs.command("show", epilog=example("ccatp runs show runs/tonight"))
+@click.argument("run_dir", type=PATH)
+@JSON_OPTION
+def show(run_dir: Path, json_output: bool) -> None:
+    """Show how the run in RUN_DIR ended, and which files it left."""
+    if not (run_dir / "config.toml").is_file():
+        raise ConfigError(f"{run_dir}: no run directory (it has no config.toml); ccatp runs list shows them")
+    facts = _facts(run_dir)
+    files = {path.name: path.stat().st_size for path in sorted(run_dir.iterdir()) if path.is_file()}
+    if json_output:
+        click.echo(json.dumps({**facts, "files": files}))
+        return
+    print_lines(f"{name:<15} {value}" for name, value in facts.items() if value != "")
+    click.echo()
+    print_lines(f"{name:<24} {size / 1e6:10.3f} MB  {FILES.get(name, '')}".rstrip() for name, size in files.items())
+
+
+def _facts(run_dir: Path) -> dict[str, Any]:
+    """One run; what its files do not say is an empty text."""
+    from ccatp.config.messages import parse_toml
+    from ccatp.links.runtime_dir import is_held
+    from ccatp.records.recorder import RUN_LOCK
+
+    events = list(_events(run_dir / "log.jsonl"))
+    begun = next((event for event in events if event.get("event") == "run_started"), {})
+    ended: dict[str, Any] = next((event for event in reversed(events) if event.get("event") == "run_finished"), {})
+    summary = _read_json(run_dir / "summary.json")
+    points, origin = summary.get("points", {}), _read_json(run_dir / "origin.json")
+    state = "going on" if is_held(run_dir / RUN_LOCK) else "not finished"
+    if ended and state != "going on":
+        state = ExitStatus(ended["status"]).name.lower()
+    try:
+        system = parse_toml((run_dir / "config.toml").read_text(encoding="utf-8"), "").get("system", "")
+    except (ConfigError, OSError, UnicodeDecodeError):
+        system = ""
+    where = {None: "", True: "simulated", False: "at a robot"}[origin.get("simulation")]
+    what = [summary.get("mirror", begun.get("mirror", system)), summary.get("world", ""), where]
+    return {
+        "run": str(run_dir),
+        "began": str(begun.get("timestamp", ""))[:19],
+        "ended": str(ended.get("timestamp", ""))[:19],
+        "state": state,
+        "points": f"{points['measured']}/{points['total']}" if "measured" in points else "",
+        "what": ", ".join(str(part) for part in what if part),
+        "seed": begun.get("seed", ""),
+        "size_mb": round(sum(path.stat().st_size for path in run_dir.iterdir() if path.is_file()) / 1e6, 1),
+    }
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _events(path: Path) -> Iterator[dict[str, Any]]:
+    """The first lines of a log and its last ones."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_LAST_BYTES)
+            file.seek(max(len(head), path.stat().st_size - _LAST_BYTES))
+            lines = (head + file.read()).splitlines()
+    except OSError:
+        return
+    for line in lines:
+        try:
+            event = json.loads(line)
+        except ValueError:  # cut off
+            continue
+        if isinstance(event, dict):
+            yield event
