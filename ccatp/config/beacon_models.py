@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from ccatp.config.models import (
+    AlarmsConfig,
     DashboardConfig,
     Host,
     LinkConfig,
@@ -470,6 +471,7 @@ class RadioConfig(Model):
     robot: BeaconRobotConfig
     processes: ProcessesConfig
     observatory: ObservatoryConfig
+    alarms: AlarmsConfig
     dashboard: DashboardConfig
     sim: RadioSimConfig
     cricket: CricketConfig

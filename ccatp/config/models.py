@@ -14,8 +14,13 @@ PeerPort = Annotated[int, Field(ge=1, le=65535)]  # at which somebody listens
 Seed = Annotated[int, Field(ge=0, lt=2**63)]  # an integer of TOML
 Pair = tuple[float, float]
 TEXT, HOST = r"^[^\x00-\x1f\x7f-\x9f]*$", r"^([^\s./\x00-\x1f\x7f-\x9f]{1,63}(\.|$))+$"
+URL = r"^(https?://[^\s\x00-\x20\x7f-\x9f]+)?$"
 # What the values must be that match these.
-PATTERNS = {TEXT: "must not contain control characters", HOST: "must be the name or the address of a host"}
+PATTERNS = {
+    URL: "must be empty or an address that begins with http:// or https://",
+    TEXT: "must not contain control characters",
+    HOST: "must be the name or the address of a host",
+}
 Text = Annotated[str, Field(max_length=4096, pattern=TEXT)]
 Host = Annotated[str, Field(max_length=253, pattern=HOST)]
 
@@ -320,6 +325,14 @@ class ObservatoryConfig(Model):
     clients_file: Text
 
 
+class AlarmsConfig(Model):
+    """Where alarms are reported besides page, terminal and log."""
+
+    webhook_url: Annotated[str, Field(max_length=2048, pattern=URL)]
+    webhook_timeout_s: Positive
+    webhook_give_up_s: Positive
+
+
 class DashboardConfig(Model):
     """The operator's web page, and the commands over HTTP."""
 
@@ -521,6 +534,7 @@ class Config(Model):
     align: AlignConfig
     health: HealthConfig
     observatory: ObservatoryConfig
+    alarms: AlarmsConfig
     dashboard: DashboardConfig
     mission: MissionConfig
     sim: SimConfig

@@ -62,6 +62,7 @@ from ccatp.daemon.run_dir import (
 )
 from ccatp.daemon.service import Service, is_journal, take_from
 from ccatp.daemon.terminal import STOP_SIGNALS, RunView, write_run_report
+from ccatp.daemon.webhook import AlarmWebhook
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.auth import read_key
 from ccatp.links.topics import Heartbeat
@@ -73,6 +74,8 @@ POLL_S = 0.02
 STDERR = 2  # its descriptor
 # Of one process: a page for each of 32 clients, sockets, recording, database; most systems permit 1024.
 OPEN_FILES = 256
+# For posts of alarms that are under way at the end.
+WEBHOOK_PATIENCE_S = 0.5
 # So many at a time: a signal and a death are noticed in between.
 MAX_MESSAGES = 1000
 
@@ -128,6 +131,7 @@ class SupervisedRun:
         self._is_interrupted = self._has_begun = False
         self._service = Service(*take_from(os.environ))
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
+        self._webhook = AlarmWebhook(cfg.alarms, run_dir.name, self._log)
         self._view = RunView(cfg, is_sim=options.sim, run_dir=run_dir, verbosity=options.verbosity)
 
     def run(self) -> int:
@@ -142,6 +146,7 @@ class SupervisedRun:
             collector = Collector(context, self._endpoints, self._run_dir, cfg, self._on_heartbeat, is_sim=is_sim)
             with collector, view:
                 status = self._watch(collector)
+                self._webhook.update(collector.status)
                 self._service.stopping()
                 collector.finish()
                 self._children.stop_all()
@@ -152,6 +157,7 @@ class SupervisedRun:
                 signal.signal(number, handler)
             self._children.kill_all()
             context.destroy(linger=0)
+        self._webhook.close(WEBHOOK_PATIENCE_S)
         for remark in collector.remarks:
             self._notify_operator("warning", remark)
         self._write(summary)
@@ -196,6 +202,7 @@ class SupervisedRun:
         while not self._is_interrupted:
             time.sleep(POLL_S)
             collector.collect(0, self._view, MAX_MESSAGES)
+            self._webhook.update(collector.status)
             # From main's first frame on the checkpoint is of this session; before, the next main begins as the first.
             self._has_begun |= collector.status is not None and collector.status.seq >= 0
             now_s = time.monotonic()

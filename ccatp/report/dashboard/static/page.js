@@ -127,6 +127,7 @@ function show(state, isAll) {
   showFacts(state.facts);
   showVerdict(state.verdict);
   showAlarms(state.alarms);
+  announce(state.alarms, isAll);
   showRobot(state.robot, state.pose);
   showLinks(state);
   showLog(state.log, isAll);
@@ -184,6 +185,28 @@ function showVerdict(verdict) {
     const is = verdict[way];
     $(`permit-${way}`).dataset.on = is === undefined ? "" : is && !verdict.is_stale ? "yes" : "no";
   }
+}
+
+// What an operator turned on: a tone and a notification of the browser for each grave alarm that is new.
+const known = new Set();
+let tones = null;
+$("sound").onchange = () => {
+  tones = $("sound").checked ? new AudioContext() : null;
+  if (tones && "Notification" in window) Notification.requestPermission();
+};
+
+function announce(alarms, isAll) {
+  const grave = alarms.filter((alarm) => !alarm.ended && SEVERITIES.indexOf(alarm.severity) >= SEVERITIES.indexOf("hold"));
+  const fresh = grave.filter((alarm) => !known.has(`${alarm.name} ${alarm.count} ${alarm.severity}`));
+  for (const alarm of fresh) known.add(`${alarm.name} ${alarm.count} ${alarm.severity}`);
+  if (isAll || !tones || !fresh.length) return;
+  const tone = tones.createOscillator();
+  tone.frequency.value = 880;
+  tone.connect(tones.destination);
+  tone.start();
+  tone.stop(tones.currentTime + 0.6);
+  if ("Notification" in window && Notification.permission === "granted")
+    new Notification(document.title, { body: fresh.map((alarm) => `${alarm.cause}. ${alarm.advice}`).join(" ") });
 }
 
 // A row is made again only when it changed: a button must stay where it is while it is pressed.

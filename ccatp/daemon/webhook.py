@@ -1,0 +1,129 @@
+"""Posts what happens to the alarms of a run to ``alarms.webhook_url``, from a thread that nothing waits for."""
+
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections import deque
+from contextlib import suppress
+from http import HTTPStatus
+
+import msgspec
+import structlog
+
+from ccatp.config.models import AlarmsConfig
+from ccatp.links.topics import Alarm, MissionStatus
+
+# Posts that wait; of more the oldest are left out, and the next post says how many.
+MOST_WAITING = 100
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
+# What a server refuses for good, a repetition does not change.
+_PASSING = {HTTPStatus.REQUEST_TIMEOUT, HTTPStatus.TOO_MANY_REQUESTS}
+
+
+class AlarmPost(msgspec.Struct, frozen=True):
+    """Body of a post: what happened to an alarm, in which run and state of the mission; ``left_out``: posts before."""
+
+    event: str
+    run: str
+    state: str
+    alarm: Alarm
+    left_out: int = 0
+
+
+def changes(before: dict[str, Alarm], after: dict[str, Alarm]) -> list[tuple[str, Alarm]]:
+    """``raised`` (or graver), ``acknowledged`` and ``ended`` alarms between two lists, by their names."""
+    found = []
+    for name, alarm in after.items():
+        old = before.get(name)
+        if old is None or (alarm.count, alarm.severity) != (old.count, old.severity):
+            found.append(("raised", alarm))
+        if alarm.acknowledged_by and (old is None or not old.acknowledged_by):
+            found.append(("acknowledged", alarm))
+        if alarm.ended and (old is None or not old.ended):
+            found.append(("ended", alarm))
+    return found + [("ended", old) for name, old in before.items() if name not in after and not old.ended]
+
+
+class AlarmWebhook:
+    """Posts the changes of the list of alarms; does nothing where no address is configured."""
+
+    def __init__(self, cfg: AlarmsConfig, run: str, log: structlog.typing.FilteringBoundLogger) -> None:
+        self._cfg, self._run, self._log = cfg, run, log
+        self._alarms: dict[str, Alarm] = {}
+        self._waiting: deque[AlarmPost] = deque()
+        self._left_out = 0
+        self._changed, self._is_over = threading.Condition(), False
+        self._thread = threading.Thread(target=self._work, name="webhook", daemon=True)
+        if cfg.webhook_url:
+            self._thread.start()
+
+    def update(self, status: MissionStatus | None) -> None:
+        """Take the newest status; returns at once."""
+        if not self._cfg.webhook_url or status is None:
+            return
+        alarms = {alarm.name: alarm for alarm in status.alarms}
+        if alarms == self._alarms:
+            return
+        with self._changed:
+            for event, alarm in changes(self._alarms, alarms):
+                self._waiting.append(AlarmPost(event, self._run, status.state, alarm, self._left_out))
+                self._left_out = 0
+            while len(self._waiting) > MOST_WAITING:
+                self._left_out += 1 + self._waiting[1].left_out
+                del self._waiting[1]  # the first one is under way
+            self._changed.notify()
+        self._alarms = alarms
+
+    def close(self, patience_s: float) -> None:
+        """End it; what cannot be posted within ``patience_s`` is logged as left out."""
+        if not self._thread.is_alive():
+            return
+        with self._changed:
+            self._is_over = True
+            self._changed.notify()
+        self._thread.join(patience_s)
+        if left := self._left_out + sum(1 + post.left_out for post in list(self._waiting)):
+            self._log.warning("alarm_posts_left_out", count=left)
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                while not self._waiting:
+                    if self._is_over:
+                        return
+                    self._changed.wait()
+                post = self._waiting[0]
+            if not self._deliver(post):
+                return
+            with self._changed:
+                self._waiting.popleft()
+
+    def _deliver(self, post: AlarmPost) -> bool:
+        """Post it, again and again until it is taken, refused for good, or too old; False: the run is over before."""
+        begun_s, pause_s = time.monotonic(), FIRST_PAUSE_S
+        while why := self._post(post):
+            if why.startswith("refused") or time.monotonic() - begun_s + pause_s > self._cfg.webhook_give_up_s:
+                self._log.warning("alarm_not_posted", name=post.alarm.name, what=post.event, why=why)
+                break
+            with self._changed:
+                if self._changed.wait_for(lambda: self._is_over, pause_s):
+                    return False
+            pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
+        return True
+
+    def _post(self, post: AlarmPost) -> str:
+        """Why it was not taken, empty where it was."""
+        headers = {"content-type": "application/json", "user-agent": "ccatp"}
+        url, body = self._cfg.webhook_url, msgspec.json.encode(post)
+        try:
+            request = urllib.request.Request(url, body, headers, method="POST")  # noqa: S310 - http(s) by the configuration
+            with urllib.request.urlopen(request, timeout=self._cfg.webhook_timeout_s):  # noqa: S310
+                return ""
+        except urllib.error.HTTPError as error:
+            with suppress(OSError):
+                error.close()
+            is_final = error.code < HTTPStatus.INTERNAL_SERVER_ERROR and error.code not in _PASSING
+            return f"{'refused' if is_final else 'not taken'}: status {error.code}"
+        except (OSError, ValueError) as error:
+            return f"no answer: {error}"
