@@ -1,9 +1,10 @@
-"""Value types that every package shares: sensor samples, poses, fixes, verdicts; angle arithmetic."""
+"""Value types that every package shares: samples, poses, fixes, verdicts; angles; robot time without its jumps."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from math import atan2, cos, pi, sin, tau
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -268,3 +269,110 @@ def danger_text(cause: str, signal: str, value: float, limit: float) -> str:
     shown, bound = (f"{number:.4g} {unit}".rstrip() for number in (value, limit))
     # Of what was never there the age is put at the limit.
     return f"{cause}{where}: " + (f"limit {bound}" if shown == bound else f"{shown} (limit {bound})")
+
+
+_Sample = TypeVar("_Sample", ImuSample, WheelSample, EdgeSample, GravitySample)
+
+
+class ClockJump(NamedTuple):
+    """The robot's clock jumped before frame ``seq``, by so much against what was expected; < 0 backward."""
+
+    seq: int
+    by_s: float
+
+
+class SteadyTime:
+    """Gives each frame a time that never jumps; ``jump`` is the newest jump, ``None`` before the first.
+
+    From frame to frame the robot's clock has to go on by the frames' period, times the frames that were lost in
+    between; further off than ``limit_s``, or backward, it has jumped, and counting goes on by the period. A real gap
+    without frames whose numbers go on looks the same, and is left out likewise.
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_s = limit_s
+        self._seq, self._t_s, self._period_s = -1, 0.0, 0.0
+        self.offset_s = self._before_s = 0.0
+        self.jump: ClockJump | None = None
+
+    def at(self, seq: int, t_s: float) -> float:
+        """The steady time of frame ``seq``, which is newer than all before, of robot time ``t_s``, s."""
+        if self._seq < 0:
+            self._seq, self._t_s = seq, t_s
+            return t_s
+        frames, step_s = seq - self._seq, t_s - self._t_s
+        expected_s = frames * self._period_s if self._period_s else step_s
+        if step_s <= 0.0 or step_s - expected_s > self._limit_s:
+            self._before_s = self.offset_s
+            self.offset_s += expected_s - step_s
+            self.jump = ClockJump(seq, step_s - expected_s)
+        elif frames == 1:
+            self._period_s = step_s
+        self._seq, self._t_s = seq, t_s
+        return t_s + self.offset_s
+
+    def of(self, seq: int, t_s: float) -> float:
+        """The steady time of an older frame ``seq`` of robot time ``t_s``, s; at most one jump lies in between."""
+        is_before = self.jump is not None and seq < self.jump.seq
+        return t_s + (self._before_s if is_before else self.offset_s)
+
+    def of_samples(self, samples: Sequence[_Sample], t_s: float) -> list[_Sample]:
+        """Samples of the newest frame at steady times, each in the time base in which it is near to the frame."""
+        now_s, before_s, limit_s = self.offset_s, self._before_s, self._limit_s
+        found = []
+        for sample in samples:
+            own_s, other_s = sample.t_s + now_s, sample.t_s + before_s
+            is_other = abs(own_s - t_s) > limit_s and abs(other_s - t_s) < abs(own_s - t_s)
+            found.append(sample._replace(t_s=other_s if is_other else own_s))
+        return found
+
+
+class MissionClock:
+    """Numbers and times of the frames.
+
+    Args:
+        jump_s: the robot's clock has jumped if a frame is further off.
+
+    Attributes:
+        seq: the newest frame.
+        t_s: its time, without jumps.
+        before_s: robot time of the mission before the first frame that is served here.
+    """
+
+    def __init__(self, jump_s: float) -> None:
+        self._jump_s, self.before_s = jump_s, 0.0
+        self._steady = SteadyTime(jump_s)
+        self._first_s: float | None = None
+        self.seq, self.t_s = -1, 0.0
+
+    @property
+    def has_begun(self) -> bool:
+        """A frame was served, in this boot of the robot."""
+        return self._first_s is not None
+
+    @property
+    def elapsed_s(self) -> float:
+        """Robot time of the mission, s."""
+        return self.before_s + (0.0 if self._first_s is None else self.t_s - self._first_s)
+
+    @property
+    def offset_s(self) -> float:
+        """``t_s`` less the robot's time."""
+        return self._steady.offset_s
+
+    def take(self, seq: int, t_s: float, period_s: float) -> tuple[float, float]:
+        """A frame is served now: its time, and the time since the last one (``period_s`` without one), s."""
+        # Durations are counted by a time that does not jump; everything else by the robot's own.
+        before_s, steady_s = self.t_s, self.t_s
+        if seq > self.seq:
+            self.seq, steady_s = seq, self._steady.at(seq, t_s)
+        self.t_s = steady_s
+        if self._first_s is None:
+            self._first_s = steady_s
+            return steady_s, period_s
+        return steady_s, steady_s - before_s
+
+    def reset(self) -> None:
+        """The robot's frames and clock restarted."""
+        self.before_s, self._first_s, self.seq = self.elapsed_s, None, -1
+        self._steady = SteadyTime(self._jump_s)

@@ -25,7 +25,7 @@ import msgspec
 from ccatp import conditions
 from ccatp.conditions import MonitorFinding
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
-from ccatp.core import Corner, EdgeSample, EventCode, Severity, Verdict, WheelSample
+from ccatp.core import Corner, EdgeSample, EventCode, Severity, SteadyTime, Verdict, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror
@@ -34,7 +34,6 @@ from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 from ccatp.safety.emergency_latch import EmergencyRules
 from ccatp.safety.escalation import SeverityEscalation, denies, gravest
 from ccatp.safety.monitor import HealthMonitor
-from ccatp.safety.robot_clock import SteadyTime
 
 CORNERS = tuple(Corner)
 CLOCK_JUMP_S = 0.1

@@ -13,18 +13,7 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
-from ccatp.survey.failsafe import (
-    ON_EARTHQUAKE,
-    ON_EMERGENCY,
-    ON_FAULT,
-    ON_HOLD,
-    ON_NO_VERDICT,
-    HoldRules,
-    Row,
-    is_denied,
-    pause,
-)
-from ccatp.survey.state import (
+from ccatp.survey.events import (
     DONE,
     FOLLOWING,
     HELD,
@@ -32,12 +21,12 @@ from ccatp.survey.state import (
     MAPPING,
     RETURNING,
     VISITING,
-    Hold,
-    HoldState,
     MissionState,
     SurveyInput,
     SurveyOutcome,
 )
+from ccatp.survey.failsafe import ON_EARTHQUAKE, ON_EMERGENCY, ON_FAULT, ON_HOLD, ON_NO_VERDICT, is_denied, pause
+from ccatp.survey.state import Hold, HoldRules, HoldState, Row
 
 # What such a mission is at; idle, held and done mean to the danger loop that the robot stands.
 MODES = IDLE, MAPPING, VISITING, FOLLOWING, RETURNING, HELD, DONE

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from ccatp.config.models import Config
 from ccatp.core import Fix, FloatArray
-from ccatp.estimation.odometry import WheelAngle
-from ccatp.estimation.state_model import Terrain
+from ccatp.estimation.odometry import Terrain, WheelAngle
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.records.run_reader import Marked, in_order, open_run

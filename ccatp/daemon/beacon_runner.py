@@ -20,9 +20,9 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import Verdict
 from ccatp.daemon.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionRunner, TimedFrame
 from ccatp.daemon.process import ProcessArgs
-from ccatp.daemon.telemetry import Telemetry
 from ccatp.errors import ExitStatus
 from ccatp.links.beacon_messages import NOTHING, Ellipse, decode_beacon_frame
+from ccatp.links.bus import Telemetry
 from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Hello
 from ccatp.links.topics import (
@@ -34,7 +34,7 @@ from ccatp.links.topics import (
     RobotShape,
     Scene,
 )
-from ccatp.survey.state import DONE, HELD, IDLE, RETURNING, Fault, MissionState
+from ccatp.survey.events import DONE, HELD, IDLE, RETURNING, Fault, MissionState
 
 if TYPE_CHECKING:
     from ccatp.daemon.main_loop import MainLoop
@@ -169,7 +169,7 @@ class BeaconRunner(MissionRunner):
         seq, t_s, mission, telemetry = frame.sensors.seq, frame.sensors.t, self.mission, self.telemetry
         belief = mission.navigator.belief
         if frame.is_estimate_due:
-            self.publish_estimate(frame, belief.pose, belief.sigma_m)
+            telemetry.send_estimate(seq, t_s, belief.pose, belief.sigma_m, mission.state.mode)
             self._trail.append(belief.pose[:2])
         self._collect_echoes(belief.pose)
         if t_s >= self._map_due_s:

@@ -1,8 +1,6 @@
 """Checkpoint of a main loop, and its parts and database: new, resumed, or taken over."""
 
 from collections.abc import Collection, Sequence
-from math import isfinite
-from pathlib import Path
 
 from msgspec.structs import replace
 
@@ -13,52 +11,12 @@ from ccatp.daemon.danger_loop import active_ids
 from ccatp.daemon.process import ProcessArgs
 from ccatp.daemon.run_dir import read_run_id
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import build_mirror
-from ccatp.records.checkpoint import AT_BASE, FILE, CheckpointError, CheckpointFile, read_checkpoint
+from ccatp.records.checkpoint import AT_BASE, FILE, CheckpointError, read_checkpoint
 from ccatp.records.store import MissionStore, StoredPoint, StoreError
 from ccatp.survey.composition import Checkpoint, SurveyParts, assemble, take_over
+from ccatp.survey.events import EmergencyKnown, Pause, TakenOver
 from ccatp.survey.planning.route import ORDERS
-from ccatp.survey.state import HELD, EmergencyKnown, Pause, SurveyState, TakenOver
-from ccatp.survey.statechart import Mission
-
-# Frames between two records: ten a second.
-PERIOD_FRAMES = 10
-
-
-class CheckpointWriter:
-    """Keeps the checkpoint up to date; ``boot`` is the robot's."""
-
-    def __init__(self, run_dir: Path, localizer: Localizer, mission: Mission, is_patient: bool) -> None:
-        self._file = CheckpointFile(run_dir / FILE, is_patient=is_patient)
-        self._localizer, self._mission = localizer, mission
-        self._run_id = read_run_id(run_dir)
-        self._written: SurveyState | None = None
-        self._in_force = ("", "")
-        self._left = 1
-        self.boot = -1
-
-    def is_due(self) -> bool:
-        """Asked in each frame: in every tenth, in that of an abort, and where the state changed during a hold."""
-        self._left -= 1
-        state = self._mission.state
-        is_new = state.abort_cause != self._in_force[0] or (state.mode is HELD and state is not self._written)
-        return is_new or self._left <= 0
-
-    def write(self, seq: int, t_s: float, elapsed_s: float) -> None:
-        """Write the state of frame ``seq``; durably where abort or hold changed."""
-        state = self._written = self._mission.state
-        self._left = PERIOD_FRAMES
-        record = Checkpoint.of(self._localizer, state, seq, t_s, elapsed_s, self.boot, self._run_id)
-        pose = record.pose
-        if not isfinite(pose.x_m + pose.y_m + pose.heading_rad + record.sigma_m + record.heading_sigma_rad):
-            return  # the last good one is a better guess
-        before, self._in_force = self._in_force, (state.abort_cause, state.cause if state.is_held_by_hand else "")
-        self._file.write(record, is_durable=self._in_force != before)
-
-    def close(self) -> None:
-        """Write the record that waits."""
-        self._file.close()
 
 
 class StoreUnusable(CcatpError):

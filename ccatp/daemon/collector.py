@@ -20,7 +20,6 @@ from ccatp.daemon.terminal import RunView
 from ccatp.errors import ExitStatus
 from ccatp.links.bus import Subscriber
 from ccatp.links.topics import (
-    RECORD_FORMAT,
     TOPICS,
     ArrivalMessage,
     BeaconTruth,
@@ -32,11 +31,10 @@ from ccatp.links.topics import (
     Timing,
     TrackMessage,
     TruthMessage,
-    decode_recorded,
 )
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_poses
 from ccatp.mirror.panel_alignment import fit_panels
-from ccatp.records.recorder import TELEMETRY, Recorder, iter_messages, recordings
+from ccatp.records.recorder import RECORD_FORMAT, TELEMETRY, Recorder, decode_recorded, iter_messages, recordings
 from ccatp.records.store import StoredSurvey, StoreError, read_survey
 from ccatp.records.summary import PanelFits, SummaryBuilder
 from ccatp.report.foxglove import Views, recorded_schemas

@@ -25,10 +25,10 @@ from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon.command_handlers import ObservatoryServer
 from ccatp.daemon.process import ProcessArgs, run_process, start_process
 from ccatp.daemon.robot_loop import RobotLoop
-from ccatp.daemon.subscribers import EstimateSubscriber
 from ccatp.danger import DangerMonitor
 from ccatp.errors import ExitStatus
 from ccatp.links.beacon_messages import decode_beacon_frame
+from ccatp.links.bus import EstimateSubscriber
 from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import DangerEvent, EstimateMessage

@@ -29,9 +29,8 @@ from ccatp.daemon.process import (
     run_until_stopped,
     start_process,
 )
-from ccatp.daemon.subscribers import HeartbeatPublisher
 from ccatp.errors import ConfigError, DaemonUnreachableError
-from ccatp.links.bus import Publisher
+from ccatp.links.bus import HeartbeatPublisher, Publisher
 from ccatp.links.liveness import LogRateLimit
 from ccatp.links.runtime_dir import runtime_dir_path
 from ccatp.mirror.mirror import Mirror, build_mirror

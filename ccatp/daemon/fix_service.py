@@ -10,14 +10,14 @@ from typing import Any
 from ccatp.conditions import DISK_STALLS, FIX_NOT_STORED, LASER_NOT_READY, SKIP_NOT_STORED
 from ccatp.config.models import MissionConfig
 from ccatp.core import DeckPose, Fix, PointId, Vector3
-from ccatp.daemon.telemetry import Telemetry
 from ccatp.estimation.fixes import FixRefused
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
+from ccatp.links.bus import Telemetry
 from ccatp.links.topics import FixMessage
 from ccatp.localizer import Localizer
 from ccatp.records.store import AlreadyMeasuredError, MissionStore, StoreError
+from ccatp.survey.events import Fault, FixFailed, FixStored, PointMissed
 from ccatp.survey.fix_gate import ApproachCounter, FixGate
-from ccatp.survey.state import Fault, FixFailed, FixStored, PointMissed
 from ccatp.survey.statechart import Mission
 
 # A commit takes milliseconds, on a busy disk a second. A longer one is reported, a much longer one holds the robot.

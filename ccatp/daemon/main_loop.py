@@ -12,16 +12,14 @@ from msgspec.structs import replace
 
 from ccatp.conditions import FRAME_LATE, FRAMES_OLD, LINK_LOST, NO_FRAME_FOR, NO_VERDICT, Condition, condition_of
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.core import Severity, Verdict
+from ccatp.core import MissionClock, Severity, Verdict
 from ccatp.daemon.alarms import AlarmList
 from ccatp.daemon.mission_runner import STILL, DriveCommand, MissionRunner, TimedFrame
 from ccatp.daemon.process import ProcessArgs, run_process, start_process
 from ccatp.daemon.robot_loop import WAIT_PERIOD_S, RobotLoop
 from ccatp.daemon.robot_session import FrameAge
-from ccatp.daemon.subscribers import VerdictSubscriber
-from ccatp.daemon.telemetry import BATCH_WALL_S
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
-from ccatp.links.bus import Subscriber
+from ccatp.links.bus import BATCH_WALL_S, Subscriber, VerdictSubscriber
 from ccatp.links.channels import (
     BadRequest,
     OperatorCommand,
@@ -34,8 +32,7 @@ from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.rpc import Router
 from ccatp.links.topics import ESTIMATE_FRAMES, DangerEvent, MissionStatus
 from ccatp.safety.escalation import Since
-from ccatp.safety.robot_clock import MissionClock
-from ccatp.survey.state import HELD, Abort, Fault, Interrupted, Pause, Resume, StopHere
+from ccatp.survey.events import HELD, Abort, Fault, Interrupted, Pause, Resume, StopHere
 
 # After the end the last messages must reach the supervisor, which then ends this process.
 SHUTDOWN_TIMEOUT_S = 30.0

@@ -12,11 +12,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 from ccatp.core import Verdict
-from ccatp.daemon.telemetry import Telemetry
 from ccatp.errors import ExitStatus
+from ccatp.links.bus import Telemetry
 from ccatp.links.robot_messages import Hello, Sensors
-from ccatp.links.topics import DisplayState, EstimateMessage, MissionStatus
-from ccatp.survey.state import SurveyOutcome
+from ccatp.links.topics import DisplayState, MissionStatus
+from ccatp.survey.events import SurveyOutcome
 
 if TYPE_CHECKING:  # each main loop imports its own
     from ccatp.beacons.mission import BeaconMission
@@ -152,26 +152,3 @@ class MissionRunner(ABC):
     @abstractmethod
     def publish(self, frame: TimedFrame) -> None:
         """The drive is sent: publish the estimate, keep records."""
-
-    def publish_estimate(
-        self,
-        frame: TimedFrame,
-        pose: tuple[float, float, float],
-        sigma_m: float,
-        commanded: tuple[float, float, float, float] | None = None,
-        drive_seq: int = -1,
-    ) -> None:
-        """Publish the pose, m and rad, for the danger loop; the rest as of ``EstimateMessage``."""
-        seq, t_s, (x_m, y_m, heading_rad) = frame.sensors.seq, frame.sensors.t, pose
-        estimate = EstimateMessage(
-            seq=seq,
-            t_s=t_s,
-            x_m=x_m,
-            y_m=y_m,
-            heading_rad=heading_rad,
-            sigma_m=sigma_m,
-            state=str(self.mission.state.mode),
-            commanded=commanded,
-            drive_seq=drive_seq,
-        )
-        self.telemetry.send("estimate", estimate)

@@ -31,9 +31,6 @@ from ccatp.errors import CcatpError
 
 PR_SET_PDEATHSIG = 1
 BACKLOG = 64  # of listening sockets
-LEVELS = {"info": 20, "warning": 30, "error": 40}
-# The event of a line that is also shown to the operator; the field ``text`` holds it.
-OPERATOR_MESSAGE = "operator_message"
 # The copy of the fault plan in the run directory.
 FAULTS_FILE = "faults.toml"
 # In the runtime directory: the run directory of the run that goes on there, or of the last one.

@@ -13,8 +13,7 @@ import zmq.asyncio
 from ccatp.daemon import realtime
 from ccatp.daemon.process import ProcessArgs, open_log, processes_of, unless_stopped
 from ccatp.daemon.robot_session import LatenessStatistics, RobotSession
-from ccatp.daemon.subscribers import PERIOD_S, HeartbeatPublisher, PeerSubscriber
-from ccatp.links.bus import Publisher
+from ccatp.links.bus import PERIOD_S, HeartbeatPublisher, PeerSubscriber, Publisher
 from ccatp.links.robot_messages import Role
 
 WAIT_PERIOD_S = 0.02

@@ -36,8 +36,6 @@ from ccatp.daemon.command_handlers import check_observatory
 from ccatp.daemon.process import (
     ADDRESSES_FILE,
     FAULTS_FILE,
-    LEVELS,
-    OPERATOR_MESSAGE,
     RUN_DIR_FILE,
     Endpoints,
     open_log,
@@ -65,7 +63,7 @@ from ccatp.daemon.terminal import STOP_SIGNALS, RunView, write_run_report
 from ccatp.daemon.webhook import AlarmWebhook
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.auth import read_key
-from ccatp.links.topics import Heartbeat
+from ccatp.links.topics import LEVELS, OPERATOR_MESSAGE, Heartbeat
 from ccatp.records.recorder import RUN_LOCK
 from ccatp.report.dashboard.access import TOKEN_FILE, make_token, read_tokens
 

@@ -2,21 +2,23 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from math import isfinite
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ccatp.conditions import UNATTENDED_FAULT
 from ccatp.config.models import Config
 from ccatp.control.gate import Denial, DriveGate, FanGate
-from ccatp.control.motion_checks import as_standing
-from ccatp.control.sent_drives import SentDrives
+from ccatp.control.wheel_motion import SentDrives, as_standing
 from ccatp.core import Verdict
-from ccatp.daemon.checkpoints import CheckpointWriter, build_parts
+from ccatp.daemon.checkpoints import build_parts
 from ccatp.daemon.fix_service import FixRequest, FixService
 from ccatp.daemon.mission_runner import EXIT_STATUS, STILL, DriveCommand, MissionRunner, TimedFrame
 from ccatp.daemon.process import ProcessArgs
-from ccatp.daemon.telemetry import Telemetry
+from ccatp.daemon.run_dir import read_run_id
 from ccatp.errors import DaemonUnreachableError, ExitStatus
 from ccatp.etalon_client import EtalonClient, EtalonError
+from ccatp.links.bus import Telemetry
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import (
     ArrivalMessage,
@@ -27,26 +29,60 @@ from ccatp.links.topics import (
     Treatment,
     TreatmentKind,
 )
+from ccatp.localizer import Localizer
+from ccatp.records.checkpoint import FILE, CheckpointFile
 from ccatp.records.store import MissionStore
 from ccatp.survey.behaviours import HOLD_POSITION, MissionCommand
 from ccatp.survey.budget import home_time_s
 from ccatp.survey.checks import FaultAction, MirrorCheck, UnattendedFaultTimer
-from ccatp.survey.composition import SurveyParts
+from ccatp.survey.composition import Checkpoint, SurveyParts
+from ccatp.survey.events import HELD, Abort, EstimateDiverged, Fault, MissionState, SurveyOutcome, TrackingGap
 from ccatp.survey.fix_gate import FixGate
 from ccatp.survey.route_follower import StateEstimate
-from ccatp.survey.state import (
-    Abort,
-    EstimateDiverged,
-    Fault,
-    MissionState,
-    SurveyOutcome,
-    TrackingGap,
-    by_reason,
-)
+from ccatp.survey.state import SurveyState, by_reason
 from ccatp.survey.statechart import Mission
 
 if TYPE_CHECKING:
     from ccatp.daemon.main_loop import MainLoop
+
+
+# Frames between two records: ten a second.
+PERIOD_FRAMES = 10
+
+
+class CheckpointWriter:
+    """Keeps the checkpoint up to date; ``boot`` is the robot's."""
+
+    def __init__(self, run_dir: Path, localizer: Localizer, mission: Mission, is_patient: bool) -> None:
+        self._file = CheckpointFile(run_dir / FILE, is_patient=is_patient)
+        self._localizer, self._mission = localizer, mission
+        self._run_id = read_run_id(run_dir)
+        self._written: SurveyState | None = None
+        self._in_force = ("", "")
+        self._left = 1
+        self.boot = -1
+
+    def is_due(self) -> bool:
+        """Asked in each frame: in every tenth, in that of an abort, and where the state changed during a hold."""
+        self._left -= 1
+        state = self._mission.state
+        is_new = state.abort_cause != self._in_force[0] or (state.mode is HELD and state is not self._written)
+        return is_new or self._left <= 0
+
+    def write(self, seq: int, t_s: float, elapsed_s: float) -> None:
+        """Write the state of frame ``seq``; durably where abort or hold changed."""
+        state = self._written = self._mission.state
+        self._left = PERIOD_FRAMES
+        record = Checkpoint.of(self._localizer, state, seq, t_s, elapsed_s, self.boot, self._run_id)
+        pose = record.pose
+        if not isfinite(pose.x_m + pose.y_m + pose.heading_rad + record.sigma_m + record.heading_sigma_rad):
+            return  # the last good one is a better guess
+        before, self._in_force = self._in_force, (state.abort_cause, state.cause if state.is_held_by_hand else "")
+        self._file.write(record, is_durable=self._in_force != before)
+
+    def close(self) -> None:
+        """Write the record that waits."""
+        self._file.close()
 
 
 def state_text(state: MissionState, cause: str) -> str:
@@ -370,8 +406,9 @@ class SurveyRunner(MissionRunner):
         seq, t_s, telemetry, localizer = frame.sensors.seq, frame.sensors.t, self.telemetry, self._localizer
         pose, sigma_m = localizer.pose, localizer.position_sigma_m
         if frame.is_estimate_due:
-            deck = localizer.deck_pose
-            self.publish_estimate(frame, (deck.x_m, deck.y_m, deck.heading_rad), sigma_m, *self._sent_commands)
+            deck, mode = localizer.deck_pose, self.mission.state.mode
+            place = deck.x_m, deck.y_m, deck.heading_rad
+            telemetry.send_estimate(seq, t_s, place, sigma_m, mode, *self._sent_commands)
         row = seq + telemetry.frames_before, t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, sigma_m
         telemetry.add_frame(seq, t_s, frame.raw, row)
         if self._checkpoint.is_due():

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.core import Fix, FloatArray
-from ccatp.estimation.seams import axes_on
-from ccatp.estimation.state_model import ANGLES, POSE, PSI, SPEEDS, STATES, TILT, TX, TY, Slope, V, W, X, Y
+from ccatp.estimation.odometry import Slope, axes_on
+from ccatp.estimation.state_model import ANGLES, POSE, PSI, SPEEDS, STATES, TILT, TX, TY, V, W, X, Y
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import MirrorError
 

@@ -11,6 +11,7 @@ from ccatp.estimation.localizer_base import (
     LONGEST_GAP_S,
     MAX_FRAME_STEP_S,
     Edges,
+    EdgeScanner,
     FilterWrap,
     Gravity,
     ImuReadings,
@@ -20,7 +21,6 @@ from ccatp.estimation.localizer_base import (
 )
 from ccatp.estimation.odometry import PosePredictor, Preintegrator, WheelAngle
 from ccatp.estimation.rest import NoiseFloor, ZeroVelocityDetector
-from ccatp.estimation.seams import EdgeScanner
 from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import STATES, V, W
 from ccatp.filters.base import FilterDiverged, Innovation

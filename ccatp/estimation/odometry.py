@@ -1,4 +1,4 @@
-"""Dead reckoning: the arc of one step, the path driven lately, the pose between filter steps, preintegration."""
+"""Dead reckoning: the ground, the arc of one step, the path driven lately, the pose between filter steps."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -6,7 +6,76 @@ from math import cos, hypot, inf, sin, sqrt
 from typing import NamedTuple
 
 from ccatp.core import FloatArray, ImuSample
-from ccatp.estimation.state_model import C, Slope
+from ccatp.mirror.mirror import Mirror
+
+# Third derivatives of these mirrors stay below 3e-3 1/m^2: within this distance a slope is off by less than 1e-7.
+_REACH_M = 5e-3
+
+
+# A tangent plane flatter than this has no downhill direction worth the name.
+_LEVEL = 1e-3
+
+
+class Slope(NamedTuple):
+    """Second derivatives of the surface at a deck point, 1/m, and the downhill unit tangent (gx, gy), deck frame."""
+
+    fx: float
+    fy: float
+    fxx: float
+    fxy: float
+    fyy: float
+    gx: float
+    gy: float
+
+
+class Terrain:
+    """Slopes where the robot is, at a fraction of the cost of the polynomial."""
+
+    def __init__(self, mirror: Mirror) -> None:
+        self._surface = mirror.surface
+        self._gravity = mirror.gravity_deck
+        self._x_m = self._y_m = float("inf")
+
+    def at(self, x_m: float, y_m: float) -> Slope:
+        """Slopes at a deck point."""
+        dx, dy = x_m - self._x_m, y_m - self._y_m
+        if not -_REACH_M < dx < _REACH_M or not -_REACH_M < dy < _REACH_M:
+            return self._evaluate(x_m, y_m)
+        fx, fy, fxx, fxy, fyy, gx, gy = self._slope
+        return Slope(fx + fxx * dx + fxy * dy, fy + fxy * dx + fyy * dy, fxx, fxy, fyy, gx, gy)
+
+    def height_m(self, x_m: float, y_m: float) -> float:
+        """Height of the surface over a deck point."""
+        dx, dy = x_m - self._x_m, y_m - self._y_m
+        if not -_REACH_M < dx < _REACH_M or not -_REACH_M < dy < _REACH_M:
+            self._evaluate(x_m, y_m)
+            dx = dy = 0.0
+        fx, fy, fxx, fxy, fyy, _, _ = self._slope
+        return self._f_m + fx * dx + fy * dy + 0.5 * (fxx * dx * dx + fyy * dy * dy) + fxy * dx * dy
+
+    def _evaluate(self, x_m: float, y_m: float) -> Slope:
+        self._f_m, fx, fy, fxx, fxy, fyy = self._surface.jet(x_m, y_m)
+        self._x_m, self._y_m = x_m, y_m
+        gx, gy, gz = self._gravity
+        norm = 1.0 + fx * fx + fy * fy
+        # n = (-fx, -fy, 1)/W; what is left of g without its part along n.
+        along = (gz - fx * gx - fy * gy) / norm
+        tx, ty, tz = gx + along * fx, gy + along * fy, gz - along
+        length = sqrt(tx * tx + ty * ty + tz * tz)
+        downhill = (tx / length, ty / length) if length > _LEVEL else (0.0, 0.0)
+        self._slope = Slope(fx, fy, fxx, fxy, fyy, *downhill)
+        return self._slope
+
+
+def axes_on(slope: Slope, psi: float) -> tuple[float, float, float, float]:
+    """Deck components (hx, hy, lx, ly) of the robot's x and y axes, as ``Mirror.body_axes``."""
+    fx, fy = slope[0], slope[1]
+    s2 = 1.0 + fx * fx
+    s, norm = sqrt(s2), sqrt(s2 + fy * fy)
+    ex, ey = -fx * fy / (norm * s), s / norm
+    c, d = cos(psi), sin(psi)
+    return c / s + d * ex, d * ey, c * ex - d / s, c * ey
+
 
 _STILL_M = 2e-5
 _STILL_RAD = 1e-4
@@ -99,8 +168,8 @@ class PosePredictor:
 
     def begin(self, mean: FloatArray, slope: Slope, half_s: float) -> None:
         """The filter has taken a step of which ``half_s`` is half the length; its mean speed belongs to the middle."""
-        state: list[float] = mean[: C + 1].tolist()
-        x, y, psi, v, a, w, self._bias, scale, _, s_r, s_l, k_l, c = state
+        state: list[float] = mean.tolist()
+        x, y, psi, v, a, w, self._bias, scale, _, s_r, s_l, k_l, c, *_ = state  # in the order of ``state_model``
         self.x_m, self.y_m, self.heading_rad = x, y, psi
         self._a = a
         self.v_m_s, self.omega_rad_s = v + a * half_s, w

@@ -5,7 +5,7 @@ from math import atan2, sqrt
 from typing import NamedTuple
 
 from ccatp.core import GravitySample, ImuSample
-from ccatp.estimation.state_model import Slope
+from ccatp.estimation.odometry import Slope
 
 _BLOCK = 15
 _MEMORY = 0.03  # weight of a new block: some thirty blocks are remembered

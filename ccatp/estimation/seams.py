@@ -1,15 +1,16 @@
 """Crossed seams: heading of an edge sensor pair (thesis 2.1.5), and each transition as a position measurement."""
 
 from collections.abc import Sequence
-from math import atan2, cos, hypot, inf, pi, sin, sqrt
+from math import atan2, hypot, inf, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from ccatp.config.models import LocalizerConfig, RobotConfig
 from ccatp.core import DeckPose, EdgeSample, FloatArray, PanelId, PanelPose, rotate
-from ccatp.estimation.odometry import Odometer, OdometryPose
-from ccatp.estimation.state_model import E0, E1, PSI, STATES, A, Slope, V, W, X
+from ccatp.estimation.localizer_base import EdgeScanner, SensorTransition
+from ccatp.estimation.odometry import Odometer, OdometryPose, Slope, axes_on
+from ccatp.estimation.state_model import E0, E1, PSI, STATES, A, V, W, X
 from ccatp.mirror.layout import Seam
 from ccatp.mirror.mirror import Mirror
 
@@ -18,47 +19,6 @@ _PAIRS = ((0, 1), (2, 3))  # front, rear: (left, right) in the order of EdgeSamp
 # an edge can be (the rim, the next seam) is at least ten times further.
 _REACH = 0.05
 _UNIFORM = 1.0 / 12.0  # variance of a uniform distribution over one interval
-
-
-class SensorTransition(NamedTuple):
-    """One edge sensor changed its value, between two samples whose middle is ``t_s``.
-
-    ``corner`` as in ``core.Corner``.
-    """
-
-    t_s: float
-    interval_s: float
-    corner: int
-    is_on: bool
-
-
-class EdgeScanner:
-    """Finds the transitions in the stream of edge samples. Samples that are not newer than the last are skipped."""
-
-    def __init__(self) -> None:
-        self.restart()
-
-    def restart(self) -> None:
-        """Forget the last sample: the robot's clock has jumped."""
-        self._t_s = -inf
-        self._values: tuple[int, ...] = ()
-
-    def scan(self, edges: Sequence[EdgeSample]) -> list[SensorTransition]:
-        """Transitions of a frame, oldest first; normally none."""
-        found: list[SensorTransition] = []
-        last, values = self._t_s, self._values
-        for sample in edges:
-            t = sample[0]
-            if not last < t < inf:
-                continue
-            if sample[1:] != values:
-                for corner, (old, new) in enumerate(zip(values, sample[1:], strict=bool(values))):
-                    if old != new:
-                        found.append(SensorTransition(0.5 * (last + t), t - last, corner, bool(new)))
-                values = sample[1:]
-            last = t
-        self._t_s, self._values = last, values
-        return found
 
 
 def heading_from_pair(
@@ -306,13 +266,3 @@ class SeamLines:
         place = x_m - v * late_s * hx + ox * hx + oy * lx, y_m - v * late_s * hy + ox * hy + oy * ly
         velocity = v * hx + w * turn_x, v * hy + w * turn_y
         return place, velocity, ((hx, lx, turn_x) if k == 0 else (hy, ly, turn_y))
-
-
-def axes_on(slope: Slope, psi: float) -> tuple[float, float, float, float]:
-    """Deck components (hx, hy, lx, ly) of the robot's x and y axes, as ``Mirror.body_axes``."""
-    fx, fy = slope[0], slope[1]
-    s2 = 1.0 + fx * fx
-    s, norm = sqrt(s2), sqrt(s2 + fy * fy)
-    ex, ey = -fx * fy / (norm * s), s / norm
-    c, d = cos(psi), sin(psi)
-    return c / s + d * ex, d * ey, c * ex - d / s, c * ey

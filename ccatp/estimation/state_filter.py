@@ -10,9 +10,10 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, FloatArray, PanelId, difference
 from ccatp.estimation import state_model as sm
 from ccatp.estimation.fixes import fix_row, relocated
-from ccatp.estimation.odometry import PreintegratedMotion, WheelAngle
+from ccatp.estimation.localizer_base import SensorTransition
+from ccatp.estimation.odometry import PreintegratedMotion, Slope, Terrain, WheelAngle
 from ccatp.estimation.rest import ZeroVelocityReading, heading_from_gravity
-from ccatp.estimation.seams import SeamLines, SensorTransition
+from ccatp.estimation.seams import SeamLines
 from ccatp.estimation.slip_prior import SlipPrior
 from ccatp.filters.base import Filter, Innovation
 from ccatp.mirror.mirror import Mirror
@@ -35,7 +36,7 @@ class SurveyFilter:
         self._cfg, self._full = cfg.localizer, cfg.localizer.full_state
         self.journal = ReplayBuffer(filter_, self._full.rewind_s)
         self._filter, self._counts = filter_, counts
-        self._mirror, self.terrain = mirror, sm.Terrain(mirror)
+        self._mirror, self.terrain = mirror, Terrain(mirror)
         self._motion = sm.SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m)
         self._drift = np.zeros(sm.STATES)
         self._seams = SeamLines(mirror, robot)
@@ -60,7 +61,7 @@ class SurveyFilter:
         mean[sm.SLIPS], P[_SLIP_BLOCK] = self._legs.first()
         return mean, P
 
-    def slope(self) -> sm.Slope:
+    def slope(self) -> Slope:
         """The ground under the estimated position."""
         mean = self._filter.mean
         return self.terrain.at(float(mean[sm.X]), float(mean[sm.Y]))

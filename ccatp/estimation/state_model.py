@@ -7,12 +7,11 @@ more than its rate (a rate out of counts jumps by 0.5 rad/s per 10 ms).
 
 from collections.abc import Sequence
 from math import cos, sin, sqrt
-from typing import NamedTuple
 
 import numpy as np
 
 from ccatp.core import FloatArray
-from ccatp.mirror.mirror import Mirror
+from ccatp.estimation.odometry import Slope
 
 
 class Affine:
@@ -29,63 +28,6 @@ class Affine:
         """Images of the rows (k, n)."""
         image: FloatArray = points.dot(self._F.T) + self._b
         return image
-
-
-# Third derivatives of these mirrors stay below 3e-3 1/m^2: within this distance a slope is off by less than 1e-7.
-_REACH_M = 5e-3
-# A tangent plane flatter than this has no downhill direction worth the name.
-_LEVEL = 1e-3
-
-
-class Slope(NamedTuple):
-    """Second derivatives of the surface at a deck point, 1/m, and the downhill unit tangent (gx, gy), deck frame."""
-
-    fx: float
-    fy: float
-    fxx: float
-    fxy: float
-    fyy: float
-    gx: float
-    gy: float
-
-
-class Terrain:
-    """Slopes where the robot is, at a fraction of the cost of the polynomial."""
-
-    def __init__(self, mirror: Mirror) -> None:
-        self._surface = mirror.surface
-        self._gravity = mirror.gravity_deck
-        self._x_m = self._y_m = float("inf")
-
-    def at(self, x_m: float, y_m: float) -> Slope:
-        """Slopes at a deck point."""
-        dx, dy = x_m - self._x_m, y_m - self._y_m
-        if not -_REACH_M < dx < _REACH_M or not -_REACH_M < dy < _REACH_M:
-            return self._evaluate(x_m, y_m)
-        fx, fy, fxx, fxy, fyy, gx, gy = self._slope
-        return Slope(fx + fxx * dx + fxy * dy, fy + fxy * dx + fyy * dy, fxx, fxy, fyy, gx, gy)
-
-    def height_m(self, x_m: float, y_m: float) -> float:
-        """Height of the surface over a deck point."""
-        dx, dy = x_m - self._x_m, y_m - self._y_m
-        if not -_REACH_M < dx < _REACH_M or not -_REACH_M < dy < _REACH_M:
-            self._evaluate(x_m, y_m)
-            dx = dy = 0.0
-        fx, fy, fxx, fxy, fyy, _, _ = self._slope
-        return self._f_m + fx * dx + fy * dy + 0.5 * (fxx * dx * dx + fyy * dy * dy) + fxy * dx * dy
-
-    def _evaluate(self, x_m: float, y_m: float) -> Slope:
-        self._f_m, fx, fy, fxx, fxy, fyy = self._surface.jet(x_m, y_m)
-        self._x_m, self._y_m = x_m, y_m
-        gx, gy, gz = self._gravity
-        norm = 1.0 + fx * fx + fy * fy
-        # n = (-fx, -fy, 1)/W; what is left of g without its part along n.
-        along = (gz - fx * gx - fy * gy) / norm
-        tx, ty, tz = gx + along * fx, gy + along * fy, gz - along
-        length = sqrt(tx * tx + ty * ty + tz * tz)
-        downhill = (tx / length, ty / length) if length > _LEVEL else (0.0, 0.0)
-        self._slope = Slope(fx, fy, fxx, fxy, fyy, *downhill)
-        return self._slope
 
 
 X, Y, PSI, V, A, W, BG, KG, BA, SR, SL, KL, C, PR, PL, E0, E1, TX, TY = range(19)

@@ -24,11 +24,12 @@ from ccatp.estimation.localizer_base import (
     Gravity,
     ImuReadings,
     LocalizerBase,
+    SensorTransition,
     WheelReadings,
     unwrapped,
 )
 from ccatp.estimation.odometry import Odometer, arc_step
-from ccatp.estimation.seams import CrossingDetector, HeadingFix, HeadingGate, SensorTransition
+from ccatp.estimation.seams import CrossingDetector, HeadingFix, HeadingGate
 from ccatp.filters.base import FilterDiverged, Innovation
 from ccatp.mirror.mirror import Mirror
 

@@ -1,12 +1,32 @@
-"""State shared between the processes over ZeroMQ PUB and SUB: single frames of the topic table."""
+"""What the processes share over ZeroMQ PUB and SUB: single frames of the topic table, their publishers and subscribers.
 
-from collections.abc import Iterable
+In lockstep a loop waits for the message of its frame. The main loop publishes lines, tracks and times in batches.
+"""
 
+import os
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import msgspec
+import structlog
 import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 from ccatp.core import Verdict
-from ccatp.links.topics import BY_NAME, BadMessage, Message, pack, unpack
+from ccatp.links.topics import (
+    BY_NAME,
+    LEVELS,
+    OPERATOR_MESSAGE,
+    TOPICS,
+    EstimateMessage,
+    Heartbeat,
+    LogMessage,
+    Message,
+    SensorLines,
+    Timing,
+    last_estimate_before,
+)
 
 MAX_MESSAGE_BYTES = 1 << 20
 # A lockstep run publishes some thousand frames a second; this is several seconds of them, about 100 MB at the worst.
@@ -119,3 +139,327 @@ class Subscriber:
             self.socket.disable_monitor()
             self._monitor.close()
         self.socket.close()
+
+
+_encoder = msgspec.json.Encoder()
+
+_decoders = {topic.name.encode(): (topic.name, msgspec.json.Decoder[Any](topic.message)) for topic in TOPICS}
+
+_prefixes = {topic.name: topic.name.encode() + b" " for topic in TOPICS}
+
+
+class BadMessage(Exception):
+    """A frame on the bus that is not of the topic table."""
+
+
+def pack(name: str, message: Message | Verdict) -> bytes:
+    """One frame: topic, space, JSON."""
+    return _prefixes[name] + _encoder.encode(message)
+
+
+def unpack(frame: bytes) -> tuple[str, bytes, Message | Verdict]:
+    """The topic's name, JSON text and message of a frame; raises ``BadMessage``."""
+    prefix, _, body = frame.partition(b" ")
+    known = _decoders.get(prefix)
+    if known is None:
+        raise BadMessage(f"unknown topic {prefix[:40]!r}")
+    name, decoder = known
+    try:
+        message: Message | Verdict = decoder.decode(body)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise BadMessage(f"topic {name}: {error}") from error
+    return name, body, message
+
+
+# In lockstep simulated time stands still while a loop waits; longer than this the other loop hangs.
+LOCKSTEP_WAIT_S = 10.0
+
+# Between slices the heartbeat is sent, and the connection to the other loop is checked.
+WAIT_SLICE_S = 0.02
+
+# Danger is at most a few frames ahead of main: a number far beyond the present one is of the robot's last boot.
+MAX_FRAMES_AHEAD = 100
+
+
+class PeerSubscriber:
+    """Receives what the other loop publishes for each frame, and its heartbeats.
+
+    Args:
+        topics: of the messages.
+        on_wait: called now and then while lockstep waits.
+    """
+
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        topics: tuple[str, ...],
+        on_wait: Callable[[], None],
+    ) -> None:
+        self._subscriber = Subscriber(context, [endpoint], topics, is_watching=True)
+        self._on_wait = on_wait
+        # Renews a connection that is silent for long.
+        self.maintain = self._subscriber.maintain
+        self.close = self._subscriber.close
+
+    def goes_on_waiting(self, deadline_s: float) -> bool:
+        """Nothing came for a slice: whether the other process is there, and there is time until ``deadline_s``."""
+        if self._subscriber.is_cut or time.monotonic() > deadline_s:
+            return False
+        self._on_wait()
+        return True
+
+
+class VerdictSubscriber(PeerSubscriber):
+    """Receives danger's verdicts; ``timeout_s``: an older one is not in force."""
+
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        timeout_s: float,
+        on_wait: Callable[[], None] = lambda: None,
+    ) -> None:
+        super().__init__(context, endpoint, ("verdict", "heartbeat.danger"), on_wait)
+        self._timeout_s, self._wall_s = timeout_s, 0.0
+        self.verdict: Verdict | None = None
+        self._early: Verdict | None = None
+
+    def is_danger_joined(self) -> bool:
+        """Whether danger has reported that it joined the robot; it repeats that."""
+        while (received := self._subscriber.receive()) is not None:
+            message = received[2]
+            if isinstance(message, Heartbeat) and message.phase == "joined":
+                return True
+        return False
+
+    def reset(self) -> None:
+        """The robot's frames restarted: forget the verdict."""
+        self.verdict = self._early = None
+
+    def latest(self, seq: int, frame_s: float, *, is_lockstep: bool) -> Verdict | None:
+        """The verdict in force for frame ``seq``: in lockstep that of the frame before, else the newest that is fresh.
+
+        In lockstep danger judges a frame while main serves it. Where danger did not judge the frame before, the
+        verdict on an earlier one counts as long as it is fresh.
+        """
+        if self._early is not None and self._early.seq < seq:
+            self.verdict, self._early = self._early, None
+        wait_s, deadline_s = (WAIT_SLICE_S if is_lockstep else 0.0), time.monotonic() + LOCKSTEP_WAIT_S
+        while not is_lockstep or (self._early is None and (self.verdict is None or self.verdict.seq < seq - 1)):
+            received = self._subscriber.receive(wait_s)
+            if received is None:
+                if is_lockstep and self.goes_on_waiting(deadline_s):
+                    continue
+                break
+            message = received[2]
+            if not isinstance(message, Verdict) or message.seq > seq + MAX_FRAMES_AHEAD:
+                continue
+            if is_lockstep and message.seq >= seq:
+                self._early = message
+            else:
+                self.verdict, self._wall_s = message, time.monotonic()
+        verdict = self.verdict
+        if verdict is None or (is_lockstep and verdict.seq < seq - 1 and self._early is None):
+            return None
+        age_s = max((seq - verdict.seq) * frame_s, 0.0)
+        if not is_lockstep:
+            age_s = max(age_s, time.monotonic() - self._wall_s)
+        return verdict if age_s <= self._timeout_s else None
+
+
+class EstimateSubscriber(PeerSubscriber):
+    """Receives main's estimates; ``is_taking_over``: the one for the first frame may have been missed."""
+
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        on_wait: Callable[[], None] = lambda: None,
+        *,
+        is_taking_over: bool = False,
+    ) -> None:
+        super().__init__(context, endpoint, ("estimate", "heartbeat.main"), on_wait)
+        self._is_taking_over = is_taking_over
+        self.reset()
+
+    def has_received(self) -> bool:
+        """Whether a message was received."""
+        return self._subscriber.receive() is not None
+
+    def reset(self) -> None:
+        """The robot's frames restarted: forget the estimate."""
+        self._newest: EstimateMessage | None = None
+        self._judged_frame = self._judged = self._first_seq = -1
+
+    def latest(self, seq: int, *, is_lockstep: bool) -> EstimateMessage | None:
+        """The estimate to judge frame ``seq`` with: in lockstep always the same one, else the newest.
+
+        Where several waited, after a stall, the newest counts, but the drives of each have moved the wheels:
+        ``commanded`` spans those of all that no frame was judged with.
+        """
+        if self._first_seq < 0:
+            self._first_seq = seq + self._is_taking_over
+        wanted = last_estimate_before(seq)
+        is_waiting = is_lockstep and wanted >= self._first_seq
+        wait_s, deadline_s = (WAIT_SLICE_S if is_waiting else 0.0), time.monotonic() + LOCKSTEP_WAIT_S
+        while not is_lockstep or (is_waiting and self._newest_seq < wanted):
+            received = self._subscriber.receive(wait_s)
+            if received is None:
+                if is_waiting and self.goes_on_waiting(deadline_s):
+                    continue
+                break
+            message = received[2]
+            # An estimate for a frame far ahead is of the robot's last boot.
+            if isinstance(message, EstimateMessage) and message.seq <= seq + MAX_FRAMES_AHEAD:
+                missed = self._newest if self._newest_seq > self._judged else None
+                self._newest = message if missed is None else message.following(missed)
+        if seq > self._judged_frame:  # an older one is not judged
+            self._judged_frame, self._judged = seq, self._newest_seq
+        return self._newest
+
+    @property
+    def _newest_seq(self) -> int:
+        return -1 if self._newest is None else self._newest.seq
+
+
+PERIOD_S = 0.1
+
+
+class HeartbeatPublisher:
+    """Publishes the heartbeat of one process.
+
+    Attributes:
+        phase: starting, ready, joined, rejoining (the robot is away), done.
+        frame_s: time of the monotonic clock at which the newest frame was served, ``None`` before the first.
+    """
+
+    def __init__(self, publisher: Publisher, process: str) -> None:
+        self._publisher, self._process = publisher, process
+        self.phase = "starting"
+        self.frame_s: float | None = None
+        self._count, self._published_s = 0, 0.0
+
+    @property
+    def frame_age_s(self) -> float | None:
+        """Time since the newest frame was served."""
+        return None if self.frame_s is None else time.monotonic() - self.frame_s
+
+    def publish(self) -> None:
+        """Publish now."""
+        self._published_s = now_s = time.monotonic()
+        age_s, pid = self.frame_age_s, os.getpid()
+        heartbeat = Heartbeat(
+            seq=self._count, t_s=now_s, process=self._process, pid=pid, phase=self.phase, frame_age_s=age_s
+        )
+        self._publisher.send(f"heartbeat.{self._process}", heartbeat)
+        self._count += 1
+
+    def publish_if_due(self) -> None:
+        """Publish if it is due."""
+        if time.monotonic() - self._published_s >= PERIOD_S:
+            self.publish()
+
+
+# Frames per batch: a second of them, small enough for the bus and large enough that the cost per frame vanishes.
+BATCH_FRAMES = 100
+
+# A batch is sent after this much wall time even when it is not full, so that displays stay alive in real time.
+BATCH_WALL_S = 0.25
+
+
+class Telemetry:
+    """Publishes for the main loop.
+
+    Args:
+        topic, track: topic and message of a batch of estimates.
+
+    Attributes:
+        send: publishes one message of a topic.
+        seq, t_s: the newest frame.
+        frames_before: the recorded number of a frame is its ``seq`` and this.
+        newest_line: of the newest frame with an estimate.
+        tick_us: wall times of frames for the next batch.
+    """
+
+    def __init__(
+        self,
+        publisher: Publisher,
+        log: structlog.typing.FilteringBoundLogger,
+        topic: str,
+        track: Callable[..., Message],
+    ) -> None:
+        self.send, self.log, self._topic, self._track = publisher.send, log, topic, track
+        self._lines: list[msgspec.Raw] = []
+        self._rows: list[tuple[Any, ...]] = []
+        self.tick_us: list[float] = []
+        self._flushed_wall_s = time.monotonic()
+        self.frames_before = 0
+        self.newest_line = msgspec.Raw(b"null")
+        self.seq = -1
+        self.t_s = 0.0
+
+    def continue_numbering(self) -> None:
+        """The robot's frames restarted: recorded numbers go on, as far as the number of frames is known."""
+        self.frames_before += max(self.seq, 0)
+
+    def add_frame(self, seq: int, t_s: float, raw: bytes, row: tuple[Any, ...]) -> None:
+        """Keep the line of frame ``seq`` and its row of the track, which has the recorded number."""
+        self.t_s, self.newest_line = t_s, msgspec.Raw(raw)
+        self._rows.append(row)
+        self.seq = seq
+        self._lines.append(self.newest_line)
+        if len(self._lines) >= BATCH_FRAMES:
+            self.flush()
+
+    def add_line(self, seq: int, raw: bytes) -> None:
+        """Keep the line alone, of a frame that is not newer than the last one."""
+        self.seq = seq
+        self._lines.append(msgspec.Raw(raw))
+        if len(self._lines) >= BATCH_FRAMES:
+            self.flush()
+
+    def send_estimate(
+        self,
+        seq: int,
+        t_s: float,
+        pose: tuple[float, float, float],
+        sigma_m: float,
+        state: str,
+        commanded: tuple[float, float, float, float] | None = None,
+        drive_seq: int = -1,
+    ) -> None:
+        """Publish the pose, m and rad, for the danger loop; the rest as of ``EstimateMessage``."""
+        x_m, y_m, heading_rad = pose
+        estimate = EstimateMessage(
+            seq=seq,
+            t_s=t_s,
+            x_m=x_m,
+            y_m=y_m,
+            heading_rad=heading_rad,
+            sigma_m=sigma_m,
+            state=str(state),
+            commanded=commanded,
+            drive_seq=drive_seq,
+        )
+        self.send("estimate", estimate)
+
+    def flush(self, least_age_s: float = 0.0) -> None:
+        """Publish the batches where the last time is at least so long ago."""
+        now_s = time.monotonic()
+        if now_s - self._flushed_wall_s < least_age_s:
+            return
+        self._flushed_wall_s = now_s
+        if not self._lines:
+            return
+        seq, t_s = self.seq, self.t_s
+        if self._rows:
+            self.send(self._topic, self._track(seq=seq, t_s=t_s, rows=self._rows))
+            self.send("timing", Timing(seq=seq, t_s=t_s, tick_us=self.tick_us))
+        self.send("sensors", SensorLines(seq=seq, t_s=t_s, lines=self._lines))
+        self._lines, self._rows, self.tick_us = [], [], []
+
+    def notify_operator(self, level: str, text: str) -> None:
+        """One line for the log file and for the operator's terminal."""
+        self.log.log(LEVELS[level], OPERATOR_MESSAGE, text=text, seq=self.seq, t_s=self.t_s)
+        self.send("log", LogMessage(seq=self.seq, t_s=self.t_s, level=level, process="main", text=text))

@@ -8,17 +8,24 @@ from collections.abc import Callable
 from typing import cast
 
 from ccatp.errors import DaemonUnreachableError
-from ccatp.links.robot_codec import BadLine, decode_from_robot, encode, format_drive, format_permit, join_mac
+from ccatp.links.robot_codec import (
+    BadLine,
+    BadLineCounter,
+    BadLineLimit,
+    LineBuffer,
+    decode_from_robot,
+    encode,
+    format_drive,
+    format_permit,
+    join_mac,
+)
 from ccatp.links.robot_messages import (
     AUTH_HMAC,
     PROTOCOL,
-    BadLineCounter,
-    BadLineLimit,
     FromRobot,
     Hello,
     Join,
     Joined,
-    LineBuffer,
     Refused,
     Role,
     Sensors,

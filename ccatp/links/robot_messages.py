@@ -3,7 +3,6 @@
 Lines out of a byte stream with a hard limit, and the count of bad ones.
 """
 
-from collections import deque
 from typing import Annotated, Literal
 
 import msgspec
@@ -147,74 +146,3 @@ class Fans(RobotLinkMessage, tag="fans"):
 
 FromRobot = Hello | Joined | Refused | Sensors
 FromClient = Join | Drive | Permit | Fans
-
-MAX_LINE_BYTES = 8192
-
-
-class LineTooLong(ValueError):
-    """A line over the limit; the session that sent it is of no further use."""
-
-
-class LineBuffer:
-    """Cuts a byte stream into lines, however it was chopped on its way.
-
-    ``limit``: most bytes of a line, its LF not counted. No more than this is ever kept between two calls.
-
-    Attributes:
-        error: set from the first line on, finished or not, that is over the limit.
-    """
-
-    def __init__(self, limit: int = MAX_LINE_BYTES) -> None:
-        self._limit = limit
-        self._rest = b""
-        self.error: LineTooLong | None = None
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """Whole lines, without their LF, after ``data`` was appended; none from one over the limit on."""
-        if self._rest:
-            data = self._rest + data
-        lines = data.split(b"\n")
-        self._rest = lines.pop()
-        limit = self._limit
-        if len(data) > limit:  # else no line in it can be longer
-            for k, line in enumerate((*lines, self._rest)):
-                if len(line) > limit:
-                    self._rest = b""
-                    self.error = LineTooLong(f"line of more than {limit} bytes")
-                    return lines[:k]
-        return lines
-
-
-class BadLineLimit:
-    """So many lines at once, so many a second in the long run; more is a flood."""
-
-    def __init__(self, lines: float, rate_hz: float) -> None:
-        self._lines = self._left = lines
-        self._rate_hz = rate_hz
-        self._then_s = 0.0
-
-    def take(self, lines: int, now_s: float) -> bool:
-        """Take lines at ``now_s``; false when there are not so many left."""
-        self._left = min(self._lines, self._left + self._rate_hz * (now_s - self._then_s)) - lines
-        self._then_s = now_s
-        return self._left >= 0.0
-
-
-class BadLineCounter:
-    """Counts bad lines, and whether there are too many of them in a window of time."""
-
-    def __init__(self, limit: int = 20, window_s: float = 1.0) -> None:
-        self._limit, self._window_s = limit, window_s
-        self._lines: deque[tuple[float, str]] = deque(maxlen=limit + 1)
-        self.total = 0
-
-    @property
-    def first_reason(self) -> str:
-        """Reason of the oldest line of the window."""
-        return self._lines[0][1] if self._lines else ""
-
-    def add(self, now_s: float, reason: str) -> bool:
-        """Count one bad line at ``now_s``; true when the session has to be closed."""
-        self.total += 1
-        self._lines.append((now_s, reason))
-        return len(self._lines) > self._limit and now_s - self._lines[0][0] <= self._window_s

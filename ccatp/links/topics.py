@@ -1,6 +1,6 @@
-"""THE topic table: everything the processes share over ZeroMQ, and its codec.
+"""THE topic table: everything the processes share over ZeroMQ; ``ccatp.links.bus`` is its codec.
 
-A message is one ZeroMQ frame: topic name, one space, JSON. Liveness, recording and displays are derived from the table;
+Liveness, recording and displays are derived from the table;
 a new topic is a row. Levels are repeated at the topic's rate; ``rate_hz`` 0 marks an event.
 """
 
@@ -223,6 +223,11 @@ class DangerEvent(Message):
     active: list[str] = []
 
 
+# Of log lines. The event of one that is also shown to the operator; the field ``text`` holds it.
+LEVELS = {"info": 20, "warning": 30, "error": 40}
+OPERATOR_MESSAGE = "operator_message"
+
+
 class LogMessage(Message):
     """One line for the operator's terminal."""
 
@@ -363,19 +368,9 @@ TOPICS: tuple[Topic, ...] = (
     Topic("beacon_places", BeaconPlaces, "dataloop", 0.0, 0.0, True),
     Topic("beacon_truth", BeaconTruth, "dataloop", 1.0, 0.0, True),
 )
-RECORD_FORMAT = 2
-"""Of a recording, kept in it; one more wherever an older reader would misunderstand what is recorded."""
-# In recordings of older formats: topic, text there, and the present one. A key or value, with its quotation marks.
-_OLD_TEXTS: dict[str, dict[bytes, bytes]] = {
-    "treatment": {b'"kind":"deaf"': b'"kind":"odometry_off"', b'"kind":"hearing"': b'"kind":"odometry_on"'},
-    "mission": {b'"slips":': b'"missed_deadlines":', b'"lag_ms":': b'"worst_lateness_ms":'},
-}
 BY_NAME = {topic.name: topic for topic in TOPICS}
 # Danger carries a pose on by the wheels itself: a pose in five frames is fresh enough and costs a fifth.
 ESTIMATE_FRAMES = 5
-_encoder = msgspec.json.Encoder()
-_decoders = {topic.name.encode(): (topic.name, msgspec.json.Decoder[Any](topic.message)) for topic in TOPICS}
-_prefixes = {topic.name: topic.name.encode() + b" " for topic in TOPICS}
 
 
 def is_estimate_due(seq: int) -> bool:
@@ -386,36 +381,6 @@ def is_estimate_due(seq: int) -> bool:
 def last_estimate_before(seq: int) -> int:
     """The frame of the newest estimate that the verdict on frame ``seq`` is based on, < 0 for none."""
     return (seq - 1) // ESTIMATE_FRAMES * ESTIMATE_FRAMES if seq > 0 else -1
-
-
-class BadMessage(Exception):
-    """A frame on the bus that is not of the topic table."""
-
-
-def pack(name: str, message: Message | Verdict) -> bytes:
-    """One frame: topic, space, JSON."""
-    return _prefixes[name] + _encoder.encode(message)
-
-
-def unpack(frame: bytes) -> tuple[str, bytes, Message | Verdict]:
-    """The topic's name, JSON text and message of a frame; raises ``BadMessage``."""
-    prefix, _, body = frame.partition(b" ")
-    known = _decoders.get(prefix)
-    if known is None:
-        raise BadMessage(f"unknown topic {prefix[:40]!r}")
-    name, decoder = known
-    try:
-        message: Message | Verdict = decoder.decode(body)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise BadMessage(f"topic {name}: {error}") from error
-    return name, body, message
-
-
-def decode_recorded(topic: str, payload: bytes) -> Message | Verdict:
-    """A recorded message, of this format or an older one; raises ``BadMessage``."""
-    for old, new in _OLD_TEXTS.get(topic, {}).items():
-        payload = payload.replace(old, new)
-    return unpack(topic.encode() + b" " + payload)[2]
 
 
 def schema_of(name: str) -> dict[str, Any]:

@@ -24,6 +24,9 @@ from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.writer import Writer
 from zstandard import ZstdError
 
+from ccatp.core import Verdict
+from ccatp.links import topics
+from ccatp.links.bus import unpack
 from ccatp.links.runtime_dir import is_held
 
 TELEMETRY = "telemetry.mcap"
@@ -313,3 +316,20 @@ def damage_text(path: Path, damage: str) -> str:
     if is_being_written(path):
         return f"{path.name}: still being written; what it holds so far is in this report"
     return f"{damage.replace(str(path), path.name)}; what came before it is in this report"
+
+
+RECORD_FORMAT = 2
+"""Of a recording, kept in it; one more wherever an older reader would misunderstand what is recorded."""
+
+# In recordings of older formats: topic, text there, and the present one. A key or value, with its quotation marks.
+_OLD_TEXTS: dict[str, dict[bytes, bytes]] = {
+    "treatment": {b'"kind":"deaf"': b'"kind":"odometry_off"', b'"kind":"hearing"': b'"kind":"odometry_on"'},
+    "mission": {b'"slips":': b'"missed_deadlines":', b'"lag_ms":': b'"worst_lateness_ms":'},
+}
+
+
+def decode_recorded(topic: str, payload: bytes) -> topics.Message | Verdict:
+    """A recorded message, of this format or an older one; raises ``BadMessage``."""
+    for old, new in _OLD_TEXTS.get(topic, {}).items():
+        payload = payload.replace(old, new)
+    return unpack(topic.encode() + b" " + payload)[2]

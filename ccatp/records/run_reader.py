@@ -16,12 +16,11 @@ from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import Fix, FloatArray, IntArray, PanelId, PointId, Vector3
 from ccatp.errors import CcatpError, ExitStatus
+from ccatp.links.bus import BadMessage
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import (
-    RECORD_FORMAT,
     ArrivalMessage,
-    BadMessage,
     FixMessage,
     Misalignment,
     Rest,
@@ -29,11 +28,10 @@ from ccatp.links.topics import (
     TrackMessage,
     Treatment,
     TruthMessage,
-    decode_recorded,
 )
 from ccatp.mirror.mirror import Mirror, deck_rows
 from ccatp.mirror.panel_alignment import Measured
-from ccatp.records.recorder import TELEMETRY, iter_messages, read_metadata, recordings
+from ccatp.records.recorder import RECORD_FORMAT, TELEMETRY, decode_recorded, iter_messages, read_metadata, recordings
 from ccatp.records.store import StoreError, read_survey
 
 Injected = dict[PanelId, Vector3]  # piston (m), tip and tilt (rad)

@@ -16,11 +16,12 @@ from ccatp.config.files import read_text
 from ccatp.config.load import is_radio_file, load_config
 from ccatp.config.models import Config
 from ccatp.core import FloatArray, IntArray, PanelId, Vector3
-from ccatp.links.topics import ArrivalMessage, BadMessage, FixMessage, MissionStatus, decode_recorded
+from ccatp.links.bus import BadMessage
+from ccatp.links.topics import ArrivalMessage, FixMessage, MissionStatus
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.mirror.surface import MirrorError
-from ccatp.records.recorder import TELEMETRY, damage_text, iter_messages, read_metadata, recordings
+from ccatp.records.recorder import TELEMETRY, damage_text, decode_recorded, iter_messages, read_metadata, recordings
 from ccatp.records.run_reader import CONFIG, STORE, RunReadError, Trace, check_run_dir, read_truth, trace_of_truth
 from ccatp.records.state_log import LogLine, StateChange, changes_of, read_log
 from ccatp.records.store import StoredPoint, StoreError, read_survey

@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from math import cos, hypot, inf, sin
 
 from ccatp.config.models import DangerConfig, RobotConfig
-from ccatp.control.motion_checks import largest_rate_rad_s
+from ccatp.control.wheel_motion import largest_rate_rad_s
 from ccatp.core import EdgeSample, WheelSample
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.rim import Rim

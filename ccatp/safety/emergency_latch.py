@@ -13,7 +13,7 @@ MAX_ACTIVE = 256
 MAX_CLEARED = 1024
 # Main acts on a verdict in the frame after it at the latest; an estimate of a later frame takes it into account.
 INFORMED_AFTER_FRAMES = 2
-# The mission's states (``ccatp.survey.state``) in which the robot stands at base or is held.
+# The mission's states (``ccatp.survey.events``) in which the robot stands at base or is held.
 AT_BASE_OR_HELD = frozenset({"idle", "held", "done"})
 
 

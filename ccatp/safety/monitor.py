@@ -7,7 +7,7 @@ from math import hypot, inf
 from ccatp import conditions
 from ccatp.conditions import MonitorFinding
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
-from ccatp.control.motion_checks import ImuGate, MotionSum, WheelMeans
+from ccatp.control.wheel_motion import ImuGate, MotionSum, WheelMeans
 from ccatp.core import EdgeSample, ImuSample, WheelSample
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from ccatp import conditions
 from ccatp.config.models import HealthConfig, RobotConfig
-from ccatp.control.motion_checks import MotionSum, SlidingWindow
+from ccatp.control.wheel_motion import MotionSum, SlidingWindow
 from ccatp.core import WheelSample
 from ccatp.safety.escalation import FindingLatch, Since
 

@@ -32,7 +32,7 @@ from ccatp.config.models import SimEtalonConfig
 from ccatp.core import Vector3
 from ccatp.links import multiline
 from ccatp.links.multiline import ChannelData, Command, Connected, LaserReady, Notice, Remark, Reply
-from ccatp.links.robot_messages import LineBuffer, LineTooLong
+from ccatp.links.robot_codec import LineBuffer, LineTooLong
 from ccatp.sim.laser import EtalonModel, PuckTruth
 
 _MAX_REPLY_BYTES = 4096

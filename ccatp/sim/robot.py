@@ -26,8 +26,8 @@ import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.core import DeckPose
-from ccatp.links.robot_codec import RobotFrame, encode
-from ccatp.links.robot_messages import MAX_LINE_BYTES, CommandEcho, RobotData, Sensors
+from ccatp.links.robot_codec import MAX_LINE_BYTES, RobotFrame, encode
+from ccatp.links.robot_messages import CommandEcho, RobotData, Sensors
 from ccatp.links.topics import Misalignment, TruthMessage
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_injector import Injector

@@ -25,17 +25,15 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
 
-from ccatp.links.robot_codec import BadLine, decode_from_client, encode, is_mac_right
+from ccatp.links.robot_codec import BadLine, BadLineCounter, LineBuffer, decode_from_client, encode, is_mac_right
 from ccatp.links.robot_messages import (
     AUTH_HMAC,
     AUTH_NONE,
     PROTOCOL,
-    BadLineCounter,
     Drive,
     FromClient,
     Join,
     Joined,
-    LineBuffer,
     Permit,
     RefusalReason,
     Refused,

@@ -16,6 +16,7 @@ from scipy.optimize import least_squares
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, FloatArray
 from ccatp.estimation import state_model as sm
+from ccatp.estimation.odometry import Terrain
 from ccatp.filters import FILTERS
 from ccatp.filters.ekf_slam import EkfSlam, columns_of
 from ccatp.filters.unscented import ALPHA, BETA, KURTOSIS
@@ -129,7 +130,7 @@ def survey_problem(cfg: Config) -> FilterProblem:
     sigma[sm.BA], sigma[sm.KL] = full.accelerometer_bias_sigma_m_s2, full.wheel_base_sigma
     sigma[[sm.SR, sm.SL]], sigma[sm.C], sigma[[sm.E0, sm.E1]] = full.slip_sigma, full.creep_sigma, full.edge_sigma_m
     sigma[[sm.PR, sm.PL]], sigma[[sm.TX, sm.TY]] = sqrt(_ANGLE_RAD2), robot.puck_height_m * full.panel_tilt_sigma_rad
-    slope = sm.Terrain(build_mirror(cfg.mirror)).at(float(mean[sm.X]), float(mean[sm.Y]))
+    slope = Terrain(build_mirror(cfg.mirror)).at(float(mean[sm.X]), float(mean[sm.Y]))
     motion = sm.SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m).over(DT_S, slope)
     slip = (full.slip_scatter_max * DT_S) ** 2
     impulses = np.array(

@@ -28,7 +28,7 @@ import numpy as np
 from ccatp.config.models import Config, WorldConfig
 from ccatp.core import Fix, FloatArray, PanelId, PointId
 from ccatp.estimation.fixes import deck_foot
-from ccatp.estimation.seams import EdgeScanner, SensorTransition
+from ccatp.estimation.localizer_base import EdgeScanner, SensorTransition
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.plant import LEG_PAUSE_S, LEVEL_SLOPE

@@ -36,7 +36,7 @@ from ccatp.safety.beacons import BeaconSafetyRules
 from ccatp.sim.beacon_robot import build_beacon_robot
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
 from ccatp.studies.results import LIMIT, chi_square_band, colour, plot
-from ccatp.survey.state import DONE
+from ccatp.survey.events import DONE
 
 
 @dataclass(slots=True)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ccatp.config.models import Config
-from ccatp.control.motion_checks import as_standing
+from ccatp.control.wheel_motion import as_standing
 from ccatp.core import DeckPose, FloatArray, IntArray
 from ccatp.estimation.fixes import FixRefused
 from ccatp.filters.base import Filter, FilterError, FilterModel, Innovation

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.control.motion_checks import as_standing
-from ccatp.control.sent_drives import SentDrives
-from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelPose, PointId, Verdict, difference
+from ccatp.control.wheel_motion import SentDrives, as_standing
+from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelPose, PointId, SteadyTime, Verdict, difference
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.links import multiline
@@ -26,24 +25,15 @@ from ccatp.mirror.mirror import Mirror, deck_poses
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 from ccatp.mirror.panel_alignment import Measured, fit_panels
 from ccatp.records.summary import PanelFits, SummaryBuilder
-from ccatp.safety.robot_clock import SteadyTime
 from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.sim.laser import SEED_STREAM, EtalonModel, PuckTruth
 from ccatp.sim.robot import Robot
 from ccatp.sim.world import TruthRow
 from ccatp.survey.composition import SurveyParts, assemble
+from ccatp.survey.events import DONE, EstimateDiverged, FixFailed, FixStored, MissionState, PointMissed, SurveyOutcome
 from ccatp.survey.fix_gate import ApproachCounter
 from ccatp.survey.route_follower import StateEstimate
-from ccatp.survey.state import (
-    DONE,
-    EstimateDiverged,
-    FixFailed,
-    FixStored,
-    MissionState,
-    PointMissed,
-    SurveyOutcome,
-    SurveyState,
-)
+from ccatp.survey.state import SurveyState
 
 # A mission that takes this many times its bound hangs; the robot's own deadlines should have ended it long before.
 _ENDLESS = 6.0

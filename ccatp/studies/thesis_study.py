@@ -24,7 +24,7 @@ import numpy as np
 from ccatp.config.models import Config
 from ccatp.core import EdgeSample, EventCode, Fix, FloatArray, GravitySample, ImuSample, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
-from ccatp.estimation.seams import SensorTransition
+from ccatp.estimation.localizer_base import SensorTransition
 from ccatp.estimation.thesis_localizer import THETA, FourStateLocalizer
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage

@@ -16,10 +16,11 @@ from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
 from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.survey.events import HELD, IDLE, MEASURING, SETTLING, MissionState, TakenOver
 from ccatp.survey.planning.route import ORDERS, Route, RoutePlanner
 from ccatp.survey.planning.search import leg_lengths, leg_time, path_time, stop_times
 from ccatp.survey.planning.tour_bound import tour_bound
-from ccatp.survey.state import HELD, IDLE, MEASURING, SETTLING, MissionState, SurveyState, TakenOver
+from ccatp.survey.state import SurveyState
 from ccatp.survey.statechart import Mission, Survey
 
 # The configuration may be calibrated, the robot's own figures are nominal: this much apart they describe two robots.

@@ -1,109 +1,42 @@
-"""State of a mission: one frozen value; modes, events and transitions; what may happen to it."""
+"""State of a mission, one frozen value, and the rules from one state to the next that hold for every mission."""
 
-from collections.abc import Mapping, Sequence
-from enum import Enum, StrEnum
+from collections.abc import Callable, Mapping, Sequence
+from enum import Enum
 from math import inf
-from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
+from ccatp.conditions import EARTHQUAKE, NO_VERDICT, Action
 from ccatp.control.gate import Purpose
-from ccatp.core import PointId, Severity, Stop
+from ccatp.core import EventCode, PointId, Severity, Stop, Verdict
 from ccatp.survey.behaviours import Retreat, ReturnHome, Settling
 from ccatp.survey.budget import BudgetProgress
+from ccatp.survey.events import (
+    BACKING_OFF,
+    DONE,
+    DRIVING,
+    HELD,
+    IDLE,
+    MEASURING,
+    PURPOSES,
+    SETTLING,
+    TURNING,
+    Abort,
+    Fault,
+    Interrupted,
+    MissionEvent,
+    MissionState,
+    Pause,
+    Resume,
+    StopHere,
+    SurveyInput,
+    SurveyOutcome,
+    next_state,
+)
 from ccatp.survey.planning.route import Route
 from ccatp.survey.route_follower import Leg
-
-
-class MissionState(StrEnum):
-    """What the mission is at."""
-
-    IDLE = "idle"
-    TURNING = "turning"
-    DRIVING = "driving"
-    SETTLING = "settling"
-    MEASURING = "measuring"
-    BACKING_OFF = "backing off"
-    RETURNING = "returning"
-    HELD = "held"
-    DONE = "done"
-    # Among beacons:
-    MAPPING = "mapping"  # stands while motes map themselves
-    VISITING = "visiting"  # on the way to a waypoint
-    FOLLOWING = "following"  # behind the target
-
-
-IDLE, TURNING, DRIVING, SETTLING, MEASURING, BACKING_OFF, RETURNING, HELD, DONE, *AMONG_BEACONS = MissionState
-MAPPING, VISITING, FOLLOWING = AMONG_BEACONS
-
-
-class MissionEvent(StrEnum):
-    """What can happen to it. Every event has a meaning in every state; where the table is silent it changes nothing."""
-
-    GO_ON = "go on"  # the survey starts, or goes on to the next leg
-    TURNED = "turned"  # the robot points at the stop
-    REALIGN = "realign"  # it does not any more
-    ARRIVED = "arrived"  # the stop is reached
-    SETTLED = "settled"  # the robot is at rest there
-    EDGE = "edge"  # code 1: near the mirror's edge
-    GO_HOME = "go home"  # code 2, or the operator's abort
-    FIND = "find"  # stand still for a fix: the pose is not to be trusted
-    HOLD = "hold"  # pause, fault, or no permission to move
-    FINISHED = "finished"  # all points done, at base after an abort, or stopped
-
-
-class SurveyOutcome(StrEnum):
-    """How a mission ended."""
-
-    NONE = ""
-    COMPLETE = "complete"
-    AT_BASE = "aborted, at base"
-    STOPPED = "stopped"
-
-
-_ANYWHERE = {MissionEvent.HOLD: HELD, MissionEvent.FINISHED: DONE}
-_SURVEYING = _ANYWHERE | {
-    MissionEvent.EDGE: BACKING_OFF,
-    MissionEvent.GO_HOME: RETURNING,
-    MissionEvent.GO_ON: TURNING,
-}
-
-# (state, event) -> state. An edge outranks an abort: while backing off GO_HOME changes nothing. DONE is final.
-TRANSITIONS = MappingProxyType(
-    {
-        IDLE: _SURVEYING | {MissionEvent.FIND: SETTLING},
-        TURNING: _SURVEYING | {MissionEvent.TURNED: DRIVING, MissionEvent.ARRIVED: SETTLING},
-        DRIVING: _SURVEYING | {MissionEvent.REALIGN: TURNING, MissionEvent.ARRIVED: SETTLING},
-        SETTLING: _SURVEYING | {MissionEvent.SETTLED: MEASURING},
-        MEASURING: _SURVEYING,
-        BACKING_OFF: _ANYWHERE | {MissionEvent.FIND: SETTLING},
-        RETURNING: _ANYWHERE | {MissionEvent.EDGE: BACKING_OFF},
-        HELD: _SURVEYING | {MissionEvent.FIND: SETTLING},
-        DONE: {},
-        **dict.fromkeys(AMONG_BEACONS, _ANYWHERE),
-    }
-)
-
-# What the last gate lets a state of a survey move for.
-PURPOSES = MappingProxyType(
-    {
-        IDLE: Purpose.STAND,
-        TURNING: Purpose.SURVEY,
-        DRIVING: Purpose.SURVEY,
-        SETTLING: Purpose.STAND,
-        MEASURING: Purpose.STAND,
-        BACKING_OFF: Purpose.RETREAT,
-        RETURNING: Purpose.HOMEWARD,
-        HELD: Purpose.STAND,
-        DONE: Purpose.STAND,
-    }
-)
-
-
-def next_state(state: MissionState, event: MissionEvent) -> MissionState:
-    """The state after ``event``; total over all pairs."""
-    return TRANSITIONS[state].get(event, state)
 
 
 class FixNeed(Enum):
@@ -264,95 +197,161 @@ class SurveyState(HoldState, frozen=True, kw_only=True, omit_defaults=True, forb
         return 0.0 if self.abort_cause or self.mode is DONE else self.route.remaining_s(self.stop_index)
 
 
-class Pause(NamedTuple):
-    """Hold until an operator resumes."""
-
-    cause: str
-
-
-class Resume(NamedTuple):
-    """Go on after a hold; what holds the robot must be gone."""
-
-
-class Abort(NamedTuple):
-    """Return to base and end there."""
-
-    cause: str
-
-
-class StopHere(NamedTuple):
-    """Hold the wheels and end here."""
-
-
-class Interrupted(NamedTuple):
-    """Frames or verdicts are not fresh: hold until they are."""
-
-    cause: str
-
-
-class Fault(NamedTuple):
-    """Something is wrong: hold until an operator resumes."""
-
-    cause: str
-    loses_pose: bool = False
-
-
-class EstimateDiverged(NamedTuple):
-    """The localizer is frozen until it has a fix; what comes again and again is a fault."""
-
-    cause: str
-    t_s: float
-
-
-class TrackingGap(NamedTuple):
-    """The robot may have moved while it was not observed: it does not drive on before a fix, and a sure heading."""
-
-
-class EmergencyKnown(NamedTuple):
-    """An emergency that is latched when the first verdict comes is not new."""
-
-
-class TakenOver(NamedTuple):
-    """Go on with a state that another process left; before the first frame. The robot is found before it moves.
-
-    ``measured``, in this order, and ``skipped`` as the mission's database has them; ``elapsed_s``: mission time so far.
-    ``is_new_run``: an operator goes on with what had ended: what failed is tried again, and time counts from here.
-    """
-
-    measured: tuple[PointId, ...]
-    skipped: tuple[PointId, ...] = ()
-    elapsed_s: float = 0.0
-    is_new_run: bool = False
-
-
-class FixStored(NamedTuple):
-    """The measurement that was asked for is taken, fused and stored; ``None``: it only serves to find the robot."""
-
-    point: PointId | None
-    heading_sigma_rad: float = 0.0
-
-
-class PointMissed(NamedTuple):
-    """The fix shows the robot too far from its point, which has to be approached again from where it really is."""
-
-
-class FixFailed(NamedTuple):
-    """The measurement failed for good: the point is skipped; several in a row hold the robot."""
-
-    point: PointId | None
-    cause: str
-    heading_sigma_rad: float = 0.0
-
-
-SurveyInput = (
-    Pause | Resume | Abort | StopHere | Interrupted | Fault | EstimateDiverged | TrackingGap | EmergencyKnown
-    | TakenOver | FixStored | PointMissed | FixFailed
-)  # fmt: skip
-
-
 def by_reason(causes: Mapping[PointId, str]) -> dict[str, list[str]]:
     """Points, as people name them, by why they were left out."""
     named: dict[str, list[str]] = {}
     for point, why in causes.items():
         named.setdefault(why, []).append(f"{point.row}-{point.col}-{point.point}")
     return named
+
+
+NEAR_EDGE, ABORTED = EventCode.NEAR_EDGE, EventCode.ABORTED
+NONE, HOLD, RETURN, FAULT = Severity.NONE, Severity.HOLD, Severity.RETURN, Severity.FAULT
+S = TypeVar("S", bound=HoldState)
+
+# In place of a verdict where none is fresh enough.
+NO_FRESH_VERDICT = NO_VERDICT.found("verdict", 0.0, 0.0).verdict(-1, 0.0, EventCode.NORMAL)
+
+
+class Row(NamedTuple):
+    """What a mission does about a verdict: one row.
+
+    ``applies`` to a state and the verdict in force; ``when`` says so in words. ``react`` takes the rules, a state, the
+    frame and the verdict, and returns the state, and whether that is all for this frame; otherwise the rows below count
+    as well.
+    """
+
+    when: str
+    action: Action
+    applies: Callable[[Any, Verdict], bool]
+    react: Callable[[Any, Any, Any, Verdict], tuple[Any, bool]]
+
+
+class HoldRules(Generic[S]):
+    """From one state to the next where a mission is held, goes on, or goes home.
+
+    Attributes:
+        rows: in the order of precedence.
+    """
+
+    rows: tuple[Row, ...]
+
+    # -- transitions --------------------------------------------------------------------------------------------------
+
+    def apply(self, s: S, event: MissionEvent) -> S:
+        """The mode changes as the table says."""
+        mode = next_state(s.mode, event)
+        return s if mode is s.mode else replace(s, mode=mode)
+
+    def hold(self, s: S, cause: str, *, by_hand: bool, is_fault: bool = False) -> S:
+        """Hold, until somebody resumes or until the cause is gone; what was begun begins again afterwards."""
+        return self.apply(replace(s, hold=Hold(by_hand, is_fault or s.hold.is_fault), cause=cause), MissionEvent.HOLD)
+
+    def interrupt(self, s: S, cause: str) -> S:
+        """Hold until frames and verdicts are fresh again; no effect where it stands anyway."""
+        return s if s.mode in (IDLE, HELD, DONE) else self.hold(s, cause, by_hand=False)
+
+    def fault(self, s: S, cause: str, *, loses_pose: bool = False) -> S:
+        """Hold until an operator resumes, because something is wrong; without a pose, a fix comes first then."""
+        return s if s.mode is DONE else self.hold(s, cause, by_hand=True, is_fault=True)
+
+    def await_recovery(self, s: S, cause: str, *, rejects_odometry: bool = False) -> S:
+        """Hold until the cause is gone, and then find out where the robot is before moving on."""
+        if s.mode is DONE or s.is_held_by_hand:
+            return s
+        rejects_odometry |= s.rejects_odometry
+        s = self.lose_pose(replace(self.interrupt(s, cause), cause=cause))
+        return replace(s, hold=s.hold._replace(rejects_odometry=rejects_odometry))
+
+    def abort(self, s: S, cause: str) -> S:
+        """Return to base and end there."""
+        if s.mode is DONE:
+            return s
+        is_new = not s.abort_cause
+        s = replace(s, abort_cause=s.abort_cause or cause)
+        if s.interlock:
+            return s  # home, but not before the robot may move
+        return self.proceed(s) if s.mode is HELD or (is_new and not s.is_recovering) else s
+
+    def proceed(self, s: S) -> S:
+        """To what is next."""
+        raise NotImplementedError
+
+    def lose_pose(self, s: S) -> S:
+        """The pose is not to be trusted."""
+        return s
+
+    # -- events between two frames ------------------------------------------------------------------------------------
+
+    def handle(self, s: S, event: SurveyInput) -> tuple[S, str | None]:
+        """The state after an event between two frames, and why it was refused, or ``None``."""
+        match event:
+            case Interrupted(cause):
+                return self.interrupt(s, cause), None
+            case Fault(cause, loses_pose):
+                return self.fault(s, cause, loses_pose=loses_pose), None
+            case Resume():
+                refusal = _resume_refusal(s)
+                return (self.proceed(s), None) if refusal is None else (s, refusal)
+            case Pause() | Abort() | StopHere() if s.mode is DONE:
+                return s, "the mission is over"
+            case Pause(cause):
+                return self.hold(s, cause, by_hand=True), None
+            case Abort(cause):
+                return self.abort(s, cause), None
+        return self.apply(replace(s, outcome=SurveyOutcome.STOPPED), MissionEvent.FINISHED), None
+
+    # -- verdicts -----------------------------------------------------------------------------------------------------
+
+    def react(self, s: S, frame: Any, verdict: Verdict | None) -> S:
+        """Do what the verdict in force demands (``None``: none fresh enough) in a frame at ``frame.t_s``."""
+        if verdict is None or not _is_routine(s, verdict):
+            s = s if verdict is None else _with_levels(s, verdict)
+            v = verdict or NO_FRESH_VERDICT
+            for row in self.rows:
+                if row.applies(s, v):
+                    s, is_over = row.react(self, s, frame, v)
+                    if is_over:
+                        return s
+        is_waiting = s.mode is HELD and (s.hold.by_hand or frame.t_s < s.resumes_after_s)
+        return self.proceed(s) if s.mode is IDLE or (s.mode is HELD and not is_waiting) else s
+
+
+def _resume_refusal(s: HoldState) -> str | None:
+    if s.mode is not HELD:
+        return f"the mission is not held but {s.mode}"
+    if s.interlock or s.is_shaking:
+        return f"{s.interlock or EARTHQUAKE.message}: nothing moves until that is cleared"
+    if s.is_latched and not s.abort_cause:
+        return "an emergency of before is latched: 'ccatp clear' it first"
+    if s.severity >= HOLD and s.severity is not RETURN:
+        return f"the cause persists: {s.cause}"
+    return None
+
+
+def _is_routine(s: HoldState, v: Verdict) -> bool:
+    """No row applies to such a verdict in such a state, and it says nothing that has to be remembered."""
+    is_normal = v.severity is NONE and v.code is EventCode.NORMAL and not (v.is_shaking or v.raised or v.full_fans)
+    was_normal = s.severity is NONE and not (s.is_latched or s.is_shaking or s.interlock or s.has_looked or s.is_slow)
+    is_known = s.emergency_epoch is not None and s.stuck_s is None
+    return is_normal and was_normal and is_known and v.forward and v.reverse and v.turn
+
+
+def _with_levels(s: S, v: Verdict) -> S:
+    """What the verdict says that is remembered."""
+    epoch, full_fans = s.emergency_epoch, s.full_fans or v.full_fans or v.is_shaking
+    has_looked, interlock = s.has_looked and v.severity >= HOLD, s.interlock if v.is_shaking else ""
+    levels = v.raised > 0, v.is_shaking, v.severity, full_fans, has_looked, interlock
+    known = s.is_latched, s.is_shaking, s.severity, s.full_fans, s.has_looked, s.interlock
+    if levels == known and epoch is not None:
+        return s
+    return replace(
+        s,
+        is_latched=v.raised > 0,
+        is_shaking=v.is_shaking,
+        severity=v.severity,
+        full_fans=full_fans,
+        has_looked=has_looked,
+        interlock=interlock,
+        emergency_epoch=v.raised if epoch is None else epoch,
+    )

@@ -19,12 +19,7 @@ from ccatp.survey.behaviours import (
     Settling,
 )
 from ccatp.survey.budget import BudgetProgress, TimeBudget
-from ccatp.survey.failsafe import ROWS, HoldRules
-from ccatp.survey.planning.escape import is_on_drive
-from ccatp.survey.planning.legs import PlanError
-from ccatp.survey.planning.route import Route, RoutePlanner
-from ccatp.survey.route_follower import Leg, LegFollower, StateEstimate
-from ccatp.survey.state import (
+from ccatp.survey.events import (
     BACKING_OFF,
     DONE,
     DRIVING,
@@ -37,18 +32,21 @@ from ccatp.survey.state import (
     EmergencyKnown,
     EstimateDiverged,
     FixFailed,
-    FixNeed,
     FixStored,
-    Hold,
     MissionEvent,
     PointMissed,
     SurveyInput,
     SurveyOutcome,
-    SurveyState,
     TakenOver,
     TrackingGap,
     next_state,
 )
+from ccatp.survey.failsafe import ROWS
+from ccatp.survey.planning.escape import is_on_drive
+from ccatp.survey.planning.legs import PlanError
+from ccatp.survey.planning.route import Route, RoutePlanner
+from ccatp.survey.route_follower import Leg, LegFollower, StateEstimate
+from ccatp.survey.state import FixNeed, Hold, HoldRules, SurveyState
 
 # So long after a fix found the robot the danger loop has received where it is: a pose in five frames, and a verdict.
 _NOTICED_S = 0.2

@@ -15,8 +15,8 @@ from ccatp.commissioning.conformance.command_checks import BAD_DRIVES
 from ccatp.commissioning.conformance.runner import check_ids
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.links.robot_codec import join_mac
-from ccatp.links.robot_messages import BadLineCounter, Drive, LineBuffer, Permit, Role
+from ccatp.links.robot_codec import BadLineCounter, LineBuffer, join_mac
+from ccatp.links.robot_messages import Drive, Permit, Role
 from ccatp.links.robot_messages import Fans as FansMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim import sessions

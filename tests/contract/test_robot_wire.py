@@ -11,6 +11,8 @@ from ccatp.core import EdgeSample, GravitySample, ImuSample, WheelSample
 from ccatp.links import multiline
 from ccatp.links.robot_codec import (
     BadLine,
+    BadLineCounter,
+    LineBuffer,
     RobotFrame,
     decode_from_client,
     decode_from_robot,
@@ -21,7 +23,6 @@ from ccatp.links.robot_codec import (
     set_point_on_wire,
 )
 from ccatp.links.robot_messages import (
-    BadLineCounter,
     CommandEcho,
     Drive,
     Fans,
@@ -30,7 +31,6 @@ from ccatp.links.robot_messages import (
     Hello,
     Join,
     Joined,
-    LineBuffer,
     Permit,
     Refused,
     RobotData,

@@ -23,7 +23,8 @@ from ccatp.daemon.main_loop import MainLoop
 from ccatp.errors import ExitStatus
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
-from ccatp.survey.state import FixNeed, Pause, Resume
+from ccatp.survey.events import Pause, Resume
+from ccatp.survey.state import FixNeed
 from tests.faults.linking import Measured
 from tests.support.daemon import Daemon, configuration, running_daemon, tell
 from tests.support.scenario import SurveyLoop, begin

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from ccatp.conditions import DANGER, MonitorFinding
 from ccatp.config.load import load_config
-from ccatp.control.sent_drives import SentDrives
+from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import Severity, Verdict
-from ccatp.daemon.subscribers import EstimateSubscriber
 from ccatp.danger import DangerMonitor
+from ccatp.links.bus import EstimateSubscriber
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.mirror.mirror import build_mirror
 from ccatp.safety.escalation import SeverityEscalation, denies, gravest
@@ -174,7 +174,7 @@ def test_drives_that_the_danger_loop_hears_of_late_have_moved_the_wheels(
     frames: int, dv_m_s: float, heard_until: Callable[[int], int], seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A robot that has stood for long drives on for a moment, and the estimates of that wait for the danger loop."""
-    monkeypatch.setattr("ccatp.daemon.subscribers.Subscriber", Waiting)
+    monkeypatch.setattr("ccatp.links.bus.Subscriber", Waiting)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     ear = EstimateSubscriber(context, "inproc://main")
     context.destroy()

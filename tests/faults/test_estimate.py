@@ -16,7 +16,7 @@ from ccatp.control.gate import Denial
 from ccatp.core import Twist
 from ccatp.links.robot_messages import Sensors
 from ccatp.studies.sil_run import SilRun
-from ccatp.survey.state import FixStored, MissionState
+from ccatp.survey.events import FixStored, MissionState
 from tests.faults.linking import Measured
 from tests.support.scenario import config_of, one_panel
 from tests.support.sim_survey import MeasuredSurvey, RestartedSurvey

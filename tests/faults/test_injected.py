@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ccatp.control.gate import FanGate
 from ccatp.core import Severity
-from ccatp.survey.state import MissionState, SurveyOutcome
+from ccatp.survey.events import MissionState, SurveyOutcome
 from tests.faults.linking import Measured
 from tests.support.scenario import one_panel
 from tests.support.sim_survey import Seen, Watched, watched

@@ -22,8 +22,8 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck
+from ccatp.survey.events import MissionState
 from ccatp.survey.fix_gate import SIGNED_AXES, FixGate, FrameCheck, explain
-from ccatp.survey.state import MissionState
 from tests.contract.test_etalon_client import (
     CHANNELS,
     COLLIMATORS,

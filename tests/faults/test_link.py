@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.links.robot_codec import RobotFrame, encode
+from ccatp.links.robot_codec import BadLineLimit, RobotFrame, encode
 from ccatp.links.robot_link import BACKLOG_S, FLOOD_FACTOR, RobotLink, RobotTimeout, WrongProtocol
-from ccatp.links.robot_messages import PROTOCOL, BadLineLimit, CommandEcho, Hello, RobotData, Sensors
+from ccatp.links.robot_messages import PROTOCOL, CommandEcho, Hello, RobotData, Sensors
 from ccatp.sim.fault_proxy import FaultProxy
 from tests.faults.linking import Measured
 from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S

@@ -26,9 +26,7 @@ from ccatp.safety.emergency_latch import EmergencyLatch
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.budget import home_time_s
 from ccatp.survey.checks import FaultAction, UnattendedFaultTimer
-from ccatp.survey.planning.route import RoutePlanner
-from ccatp.survey.planning.search import path_time
-from ccatp.survey.state import (
+from ccatp.survey.events import (
     BACKING_OFF,
     DONE,
     DRIVING,
@@ -42,6 +40,8 @@ from ccatp.survey.state import (
     Pause,
     Resume,
 )
+from ccatp.survey.planning.route import RoutePlanner
+from ccatp.survey.planning.search import path_time
 from tests.faults.linking import Measured
 from tests.support.mission_story import DT, FREE, FRONT_OFF, Story, from_first_leg
 from tests.support.scenario import config_of, mirror_of, one_panel

@@ -15,7 +15,9 @@ from ccatp.errors import ConfigError
 from ccatp.links import channels, multiline, topics
 from ccatp.links import robot_codec as robot
 from ccatp.links.auth import read_clients
-from ccatp.links.robot_messages import LineBuffer, LineTooLong, Sensors
+from ccatp.links.bus import BadMessage, pack, unpack
+from ccatp.links.robot_codec import LineBuffer, LineTooLong
+from ccatp.links.robot_messages import Sensors
 from ccatp.sim.fault_plan import parse_plan
 from tests.contract.test_channels import ID, Desk
 from tests.contract.test_multiline import REPLIES
@@ -69,7 +71,7 @@ def targets() -> list[Target]:
         Target("operator channel", [b'{"cmd":"status"}', b'{"cmd":"abort"}'], _operator, (channels.BadRequest,)),
         Target("replies of both channels", [b'{"ok":true,"code":0}'], _channel_reply, (channels.BadRequest,)),
         Target("observatory's clients", [CLIENTS], _clients, (ConfigError,)),
-        Target("bus", _bus(), _topic, (topics.BadMessage,)),
+        Target("bus", _bus(), _topic, (BadMessage,)),
         Target("fault plan", [PLAN], _plan, (ConfigError,)),
     ]
 
@@ -198,15 +200,15 @@ def _bus() -> list[bytes]:
     )
     track = topics.TrackMessage(seq=1, t_s=0.1, rows=[(1, 0.1, 1, 2, 0.1, 0.2, 0.3, 0.001)])
     return [
-        topics.pack("heartbeat.main", presence),
-        topics.pack("estimate", estimate),
-        topics.pack("track", track),
-        topics.pack("verdict", VERDICT),
+        pack("heartbeat.main", presence),
+        pack("estimate", estimate),
+        pack("track", track),
+        pack("verdict", VERDICT),
     ]
 
 
 def _topic(frame: bytes) -> Hashable:
-    return topics.unpack(frame)[0]
+    return unpack(frame)[0]
 
 
 def _plan(data: bytes) -> Hashable:

@@ -18,7 +18,8 @@ import tomlkit
 from ccatp.config.load import dump_config, load_config
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.errors import ConfigError
-from ccatp.links.topics import TOPICS, FixMessage, Rest, SensorLines, TrackMessage, pack, schema_of
+from ccatp.links.bus import pack
+from ccatp.links.topics import TOPICS, FixMessage, Rest, SensorLines, TrackMessage, schema_of
 from ccatp.records.recorder import Recorder, iter_messages
 from ccatp.records.run_reader import RunReadError, open_run
 from ccatp.records.store import MissionStore, StoredPoint, StoreError

@@ -22,7 +22,7 @@ from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.sim.robot import Robot
 from ccatp.studies.sil_run import SilLaser, SilRun
-from ccatp.survey.state import (
+from ccatp.survey.events import (
     BACKING_OFF,
     DONE,
     DRIVING,

@@ -12,8 +12,7 @@ from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Twist, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import MissionCommand
-from ccatp.survey.failsafe import NO_FRESH_VERDICT, ROWS
-from ccatp.survey.state import (
+from ccatp.survey.events import (
     BACKING_OFF,
     DONE,
     DRIVING,
@@ -25,17 +24,17 @@ from ccatp.survey.state import (
     EstimateDiverged,
     Fault,
     FixFailed,
-    FixNeed,
     FixStored,
     Interrupted,
     Pause,
     PointMissed,
     Resume,
     SurveyInput,
-    SurveyState,
     TakenOver,
     TrackingGap,
 )
+from ccatp.survey.failsafe import ROWS
+from ccatp.survey.state import NO_FRESH_VERDICT, FixNeed, SurveyState
 from ccatp.survey.statechart import Survey
 from tests.support.mission_story import ABORT, FREE, FRONT_OFF, Story
 

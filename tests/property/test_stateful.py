@@ -11,7 +11,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 
 from ccatp.config.load import load_config
 from ccatp.core import EmergencyKind
-from ccatp.survey.state import DONE, Resume, StopHere
+from ccatp.survey.events import DONE, Resume, StopHere
 from tests.property.stage import Stage
 
 WARM_UP_FRAMES = 90  # the fix at base; the first leg begins

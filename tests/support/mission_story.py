@@ -11,9 +11,10 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.behaviours import MissionCommand
+from ccatp.survey.events import FixStored, MissionState
 from ccatp.survey.planning.route import Route, RoutePlanner
 from ccatp.survey.route_follower import StateEstimate
-from ccatp.survey.state import FixStored, MissionState, SurveyState
+from ccatp.survey.state import SurveyState
 from ccatp.survey.statechart import Mission, Survey
 
 DT, LAG = 0.01, 0.08

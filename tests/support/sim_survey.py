@@ -15,12 +15,12 @@ import msgspec
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.control.sent_drives import SentDrives
+from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import DeckPose, Fix, PointId, Severity, Vector3, Verdict
 from ccatp.daemon.fix_service import FixRequest, FixService
-from ccatp.daemon.telemetry import Telemetry
 from ccatp.estimation.fixes import FixRefused, deck_foot
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
+from ccatp.links.bus import Telemetry
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import FixMessage
 from ccatp.localizer import Localizer
@@ -29,8 +29,8 @@ from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.composition import Checkpoint, take_over
+from ccatp.survey.events import Fault, FixFailed, FixStored, MissionState, SurveyInput, TakenOver
 from ccatp.survey.fix_gate import FixGate, nis_of
-from ccatp.survey.state import Fault, FixFailed, FixStored, MissionState, SurveyInput, TakenOver
 from ccatp.survey.statechart import Mission
 from tests.support.virtual_time import VirtualLoop
 

@@ -8,23 +8,20 @@ import pytest
 import zmq
 
 from ccatp.core import EventCode, Verdict
-from ccatp.links.bus import Publisher, Subscriber
+from ccatp.links.bus import BadMessage, Publisher, Subscriber, pack, unpack
 from ccatp.links.topics import (
     BY_NAME,
     ESTIMATE_FRAMES,
     TOPICS,
-    BadMessage,
     EstimateMessage,
     Heartbeat,
     LogMessage,
     SensorLines,
-    decode_recorded,
     is_estimate_due,
     last_estimate_before,
-    pack,
     schema_of,
-    unpack,
 )
+from ccatp.records.recorder import decode_recorded
 
 ENDPOINT = "inproc://bus"
 Context = zmq.Context[zmq.Socket[bytes]]

@@ -15,21 +15,13 @@ from ccatp.config.load import dump_config, load_config
 from ccatp.core import PanelId
 from ccatp.errors import ConfigError
 from ccatp.filters.base import FilterDiverged
+from ccatp.links.bus import pack
 from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_messages import CommandEcho, Sensors
-from ccatp.links.topics import (
-    RECORD_FORMAT,
-    ArrivalMessage,
-    Message,
-    Rest,
-    SensorLines,
-    TrackMessage,
-    TruthMessage,
-    pack,
-)
+from ccatp.links.topics import ArrivalMessage, Message, Rest, SensorLines, TrackMessage, TruthMessage
 from ccatp.mirror.mirror import build_mirror
 from ccatp.mirror.misalignment import PanelMisalignment
-from ccatp.records.recorder import Recorder
+from ccatp.records.recorder import RECORD_FORMAT, Recorder
 from ccatp.records.run_reader import RunReadError, open_run, read_run
 from ccatp.studies import replay as player
 from tests.support.command import refused

@@ -27,8 +27,8 @@ from ccatp.commissioning.conformance.harness import (
     require,
     steady,
 )
-from ccatp.links.robot_codec import encode, format_drive
-from ccatp.links.robot_messages import MAX_LINE_BYTES, Fans
+from ccatp.links.robot_codec import MAX_LINE_BYTES, encode, format_drive
+from ccatp.links.robot_messages import Fans
 
 CHECKS = CheckList()
 check, check_steady = CHECKS.add, partial(CHECKS.add, fixture=steady)

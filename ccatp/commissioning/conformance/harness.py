@@ -16,8 +16,8 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from ccatp.config.messages import format_key
-from ccatp.links.robot_codec import encode, format_drive, format_permit, join_mac
-from ccatp.links.robot_messages import AUTH_HMAC, Fans, Join, LineBuffer, Role
+from ccatp.links.robot_codec import LineBuffer, encode, format_drive, format_permit, join_mac
+from ccatp.links.robot_messages import AUTH_HMAC, Fans, Join, Role
 from ccatp.mirror.mirror import Mirror
 
 Need = Literal["motion", "body", "real time", "lockstep", "hmac"]

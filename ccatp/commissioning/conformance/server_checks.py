@@ -33,8 +33,8 @@ from ccatp.commissioning.conformance.harness import (
     steady,
     whole_samples,
 )
-from ccatp.links.robot_codec import encode, join_mac
-from ccatp.links.robot_messages import MAX_LINE_BYTES, PROTOCOL, Drive, Role
+from ccatp.links.robot_codec import MAX_LINE_BYTES, encode, join_mac
+from ccatp.links.robot_messages import PROTOCOL, Drive, Role
 from ccatp.survey.checks import PATIENCE_S, MirrorCheck
 
 CHECKS = CheckList()

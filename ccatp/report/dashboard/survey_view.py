@@ -10,8 +10,8 @@ from ccatp.mirror.mirror import Mirror, deck_poses
 from ccatp.mirror.surface import ConvergenceError
 from ccatp.records.store import StoredSurvey
 from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView, TruthCompare
+from ccatp.survey.events import PURPOSES
 from ccatp.survey.planning.route import ORDERS
-from ccatp.survey.state import PURPOSES
 
 CODES = ["normal operation", "near the mirror's edge", "operation aborted"]
 # Terms of the page, by the id of their element or for its own sentences.

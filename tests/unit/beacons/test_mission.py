@@ -34,7 +34,8 @@ from ccatp.safety.beacons import BeaconSafetyRules, ObstacleBuffer
 from ccatp.sim.beacon_robot import BeaconRobot
 from ccatp.sim.radio_world import RadioWorld
 from ccatp.studies.mote_navigation import BeaconSilResult, BeaconSilWorld
-from ccatp.survey.state import DONE, HELD, VISITING, Abort, Fault, HoldState, Pause, Resume, StopHere
+from ccatp.survey.events import DONE, HELD, VISITING, Abort, Fault, Pause, Resume, StopHere
+from ccatp.survey.state import HoldState
 
 FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
 DENIED = Verdict(0, 0.0, EventCode.NORMAL, "no radio", "radio", 8.0, 7.0, False, False, False, severity=Severity.HOLD)

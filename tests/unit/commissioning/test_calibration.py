@@ -16,10 +16,11 @@ from ccatp.commissioning.calibration import Calibration, CalibrationError, calib
 from ccatp.commissioning.calibration_drive import DriveBuilder, RecordedDrive, WheelParameters, carry
 from ccatp.config.load import dump_config, load_config
 from ccatp.core import Fix, FloatArray
+from ccatp.links.bus import pack
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import RECORD_FORMAT, TOPICS, FixMessage, SensorLines, pack, schema_of
-from ccatp.records.recorder import Recorder
+from ccatp.links.topics import TOPICS, FixMessage, SensorLines, schema_of
+from ccatp.records.recorder import RECORD_FORMAT, Recorder
 from ccatp.studies.sil_run import SilRun
 from tests.support.command import refused
 

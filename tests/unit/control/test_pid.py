@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccatp.config.models import Config, PidConfig, RobotConfig
-from ccatp.control.pid import AxisState, Pid, PidState, Profile, ProfiledAxis, lag_feed_forward
-from ccatp.control.sent_drives import SentDrives
+from ccatp.control.tracker import AxisState, Pid, PidState, Profile, ProfiledAxis, lag_feed_forward
+from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import Predicted, Twist, wheel_rates
 
 

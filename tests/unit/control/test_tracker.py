@@ -11,8 +11,8 @@ from scipy.linalg import solve_continuous_are
 
 from ccatp.config.models import Config
 from ccatp.control.gate import Purpose
-from ccatp.control.sent_drives import SentDrives
 from ccatp.control.tracker import LegLine, LegMotion, LegPhase, LegTracker, LegView, line_rate
+from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import EventCode, Twist, Verdict, difference, twist_of
 from ccatp.survey.composition import build_gate
 from ccatp.survey.planning.search import bang_bang_time

@@ -16,9 +16,10 @@ from msgspec import structs
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, Fix, PointId, Severity, StopKind, Verdict
-from ccatp.daemon.checkpoints import CheckpointWriter, StoreUnusable, build_parts
+from ccatp.daemon.checkpoints import StoreUnusable, build_parts
 from ccatp.daemon.process import Endpoints, ProcessArgs
 from ccatp.daemon.run_dir import keep_origin
+from ccatp.daemon.survey_runner import CheckpointWriter
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello, RobotData
 from ccatp.localizer import Localizer
@@ -28,20 +29,19 @@ from ccatp.records.store import MissionStore
 from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.budget import BudgetProgress, TimeBudget
 from ccatp.survey.composition import Checkpoint, SurveyParts
-from ccatp.survey.planning.route import Route
-from ccatp.survey.state import (
+from ccatp.survey.events import (
     Abort,
     Fault,
     FixFailed,
-    FixNeed,
     FixStored,
     MissionState,
     Pause,
     StopHere,
     SurveyOutcome,
-    SurveyState,
     TakenOver,
 )
+from ccatp.survey.planning.route import Route
+from ccatp.survey.state import FixNeed, SurveyState
 from tests.support.mission_story import ABORT, FREE, Story, from_first_leg
 
 

@@ -16,7 +16,7 @@ from ccatp.daemon.fix_service import FixRequest
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.links.topics import FixMessage
 from ccatp.records.store import AlreadyMeasuredError
-from ccatp.survey.state import FixStored, SurveyInput
+from ccatp.survey.events import FixStored, SurveyInput
 from tests.support.sim_survey import fix_service
 
 POINT = PointId(1, 2, 4)

@@ -26,9 +26,8 @@ from ccatp.daemon.child_processes import (
 )
 from ccatp.daemon.collector import Collector
 from ccatp.daemon.process import Endpoints, parse_args, unless_stopped
-from ccatp.daemon.subscribers import HeartbeatPublisher
 from ccatp.errors import DaemonUnreachableError
-from ccatp.links.bus import Publisher
+from ccatp.links.bus import HeartbeatPublisher, Publisher
 from ccatp.links.topics import Heartbeat
 
 # Ends with the status in its variable, or waits for its end.

@@ -8,9 +8,8 @@ import pytest
 import zmq
 
 from ccatp.core import EventCode, Verdict
-from ccatp.daemon import subscribers
-from ccatp.daemon.subscribers import VerdictSubscriber
-from ccatp.links.bus import Publisher
+from ccatp.links import bus as bus_module
+from ccatp.links.bus import Publisher, VerdictSubscriber
 
 ENDPOINT, FRAME_S, TIMEOUT_S = "inproc://verdicts", 0.01, 0.05
 
@@ -33,7 +32,7 @@ class Bus:
 
 @pytest.fixture
 def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bus]:
-    monkeypatch.setattr(subscribers, "LOCKSTEP_WAIT_S", 0.1)
+    monkeypatch.setattr(bus_module, "LOCKSTEP_WAIT_S", 0.1)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     verdicts_of_main = VerdictSubscriber(context, ENDPOINT, TIMEOUT_S)
     with closing(Publisher(context, ENDPOINT)) as publisher, closing(verdicts_of_main) as verdicts:

@@ -10,8 +10,7 @@ import structlog
 
 from ccatp.conditions import DANGER, SURVEY, condition_of
 from ccatp.daemon.main_loop import STANDS_REPEAT_S, STANDS_REPORT_S, StandstillReport
-from ccatp.daemon.telemetry import BATCH_FRAMES, Telemetry
-from ccatp.links.bus import Publisher
+from ccatp.links.bus import BATCH_FRAMES, Publisher, Telemetry
 from ccatp.links.topics import TrackMessage
 
 Received = dict[str, list[Any]]

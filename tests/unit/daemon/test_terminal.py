@@ -14,7 +14,7 @@ from ccatp.daemon.terminal import RunView, write_run_report
 from ccatp.errors import ExitStatus
 from ccatp.links.liveness import RateLimitedLog, kind_of
 from ccatp.links.topics import DangerEvent, LogMessage, MissionStatus, TrackMessage
-from ccatp.survey.state import MissionState
+from ccatp.survey.events import MissionState
 from tests.unit.aligning.conftest import load
 from tests.unit.reporting.beacon_recorded import record_beacons
 from tests.unit.run_folder import make_run

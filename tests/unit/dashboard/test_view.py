@@ -9,7 +9,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from ccatp.links.topics import DisplayState, Heartbeat
 from ccatp.report.dashboard.app import StateCollector
 from ccatp.report.dashboard.view import NO_LINE, Growing, Lines, Links, LinkState, TruthCompare
-from ccatp.survey.state import MissionState
+from ccatp.survey.events import MissionState
 
 
 def presence(process: str, t_s: float, *, pid: int = 1, phase: str = "joined", age_s: float | None = 0.01) -> Heartbeat:

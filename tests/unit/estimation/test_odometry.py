@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccatp.core import FloatArray, ImuSample
-from ccatp.estimation.odometry import PosePredictor, PreintegratedMotion, Preintegrator, WheelAngle
-from ccatp.estimation.state_model import BG, KG, PL, PR, PSI, STATES, Slope, SurveyMotion, W, X, Y
+from ccatp.estimation.odometry import PosePredictor, PreintegratedMotion, Preintegrator, Slope, WheelAngle
+from ccatp.estimation.state_model import BG, KG, PL, PR, PSI, STATES, SurveyMotion, W, X, Y
 from tests.unit.estimation.drive import config
 from tests.unit.estimation.test_state_model import LEVEL, slopes, states
 

@@ -10,8 +10,9 @@ from ccatp.core import Fix, FloatArray
 from ccatp.estimation.fixes import FixGated, FixRefused, fix_row
 from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.localizer_base import unwrapped
+from ccatp.estimation.odometry import Terrain
 from ccatp.estimation.state_filter import ReplayBuffer
-from ccatp.estimation.state_model import STATES, Terrain, V, W, X, Y
+from ccatp.estimation.state_model import STATES, V, W, X, Y
 from ccatp.filters.kalman import KalmanFilter
 from tests.unit.estimation.drive import (
     FRAME_S,

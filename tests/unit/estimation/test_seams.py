@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 
 from ccatp.config.models import FullStateConfig
 from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose
-from ccatp.estimation.seams import Edge, SeamLines, SensorTransition
+from ccatp.estimation.localizer_base import SensorTransition
+from ccatp.estimation.odometry import Slope, Terrain
+from ccatp.estimation.seams import Edge, SeamLines
 from ccatp.estimation.slip_prior import SlipPopulation, SlipPrior
-from ccatp.estimation.state_model import E0, E1, PSI, SL, SR, STATES, A, C, Slope, Terrain, V, W, X, Y
+from ccatp.estimation.state_model import E0, E1, PSI, SL, SR, STATES, A, C, V, W, X, Y
 from ccatp.mirror.mirror import Mirror
 from tests.unit.estimation.drive import Rate, Robot, build, config, errors_of, mirror, run, trapeze
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccatp.core import DeckPose, FloatArray, PanelId, difference
-from ccatp.estimation.seams import axes_on
+from ccatp.estimation.odometry import Slope, Terrain, axes_on
 from ccatp.estimation.state_model import (
     BA,
     BG,
@@ -24,9 +24,7 @@ from ccatp.estimation.state_model import (
     A,
     C,
     SensorRows,
-    Slope,
     SurveyMotion,
-    Terrain,
     V,
     W,
     X,

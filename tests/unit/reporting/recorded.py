@@ -21,7 +21,7 @@ from ccatp.links.topics import (
 )
 from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.studies.sil_run import SilRun
-from ccatp.survey.state import Abort, MissionState
+from ccatp.survey.events import Abort, MissionState
 from tests.unit.run_folder import recorder_in
 
 BATCH = 100

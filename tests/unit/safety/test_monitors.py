@@ -3,12 +3,12 @@
 import pytest
 
 from ccatp.config.load import load_config
-from ccatp.control.motion_checks import MotionSum
+from ccatp.control.wheel_motion import MotionSum
 from ccatp.core import EmergencyKind
 from ccatp.safety.emergency_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, EmergencyLatch
 from ccatp.safety.sensor_monitors import SeamMonitor
 from ccatp.safety.wheel_monitors import WheelMonitor
-from ccatp.survey.state import MissionState
+from ccatp.survey.events import MissionState
 from tests.support.scenario import mirror_of
 
 FRAME_S = 0.01

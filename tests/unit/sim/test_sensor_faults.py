@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from ccatp.config.models import Config
-from ccatp.links.robot_codec import BadLine, decode_from_robot
-from ccatp.links.robot_messages import MAX_LINE_BYTES
+from ccatp.links.robot_codec import MAX_LINE_BYTES, BadLine, decode_from_robot
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_plan import SENSOR_SIGNALS, TYPES, FaultPlan, parse_plan
 from ccatp.sim.robot import Robot

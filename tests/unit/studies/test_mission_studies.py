@@ -28,7 +28,7 @@ from ccatp.studies.results import plain
 from ccatp.studies.sil_run import SilRun, SilTrace
 from ccatp.studies.survey_studies import GROUPS, SENSITIVITY, TIME, combine_filters
 from ccatp.survey.composition import assemble
-from ccatp.survey.state import Pause
+from ccatp.survey.events import Pause
 from tests.support.sim_survey import plan_of
 
 SIGMA_M, SIGMA_RAD = 1e-3, 2e-3

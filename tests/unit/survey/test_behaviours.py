@@ -17,10 +17,10 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.behaviours import SETTLE_LIMIT_S, Retreat, RetreatStep, Settling, Standstill
 from ccatp.survey.checks import PATIENCE_S, READINGS, MirrorCheck
+from ccatp.survey.events import Pause, Resume
 from ccatp.survey.fix_gate import ApproachCounter
 from ccatp.survey.planning.escape import is_on_drive
 from ccatp.survey.route_follower import LegAim, LegFollower, StateEstimate, plan_aim
-from ccatp.survey.state import Pause, Resume
 
 DT, MEASURING_S = 0.01, 0.5
 POINT = PointId(5, 5, 1)

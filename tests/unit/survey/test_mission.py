@@ -16,10 +16,7 @@ from ccatp.core import (
     Twist,
 )
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.planning.legs import PlanError
-from ccatp.survey.planning.route import Route
-from ccatp.survey.route_follower import LegFollower
-from ccatp.survey.state import (
+from ccatp.survey.events import (
     AMONG_BEACONS,
     Abort,
     Fault,
@@ -35,6 +32,9 @@ from ccatp.survey.state import (
     SurveyOutcome,
     next_state,
 )
+from ccatp.survey.planning.legs import PlanError
+from ccatp.survey.planning.route import Route
+from ccatp.survey.route_follower import LegFollower
 from ccatp.survey.statechart import Mission, Survey
 from tests.support.mission_story import ABORT, FREE, FRONT_OFF, Story, from_first_leg
 
