@@ -1,25 +1,29 @@
-"""SurveyLoops that break the interface page in one place: messages changed on their way, or other rules inside."""
+"""SurveyLoops that break the interface page in one place: messages changed on their way, or other rules inside.
+
+Checks and server share a thread and a clock on which nothing waits: the server runs while a check waits for it.
+"""
 
 import asyncio
 import json
-import time
-from collections.abc import AsyncIterator, Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, asynccontextmanager
-from types import ModuleType, SimpleNamespace
+import select
+import selectors
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
+from ccatp.commissioning.conformance import command_checks, harness, server_checks
 from ccatp.commissioning.conformance.runner import Conformance, Result
 from ccatp.config.models import Config
 from ccatp.dataloop import Connection
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.rules import MotionRules
 from tests.support.scenario import SurveyLoop
+from tests.support.virtual_time import VirtualLoop, VirtualSelector
 
 Message = dict[str, Any]
-STOP_S = 10.0
-STEP_S, MOST_S = 0.005, 0.02  # of the clock of the servers
+TIMEOUT_S = 1.0
 
 
 class Crooked(NamedTuple):
@@ -60,14 +64,14 @@ class Middle(Connection):
         self.has_sent = False
 
     def write(self, data: bytes) -> None:
+        if self._crooked.says is None and self.hello:
+            super().write(data)
+            return
         message = json.loads(data)
         self.count += 1
         if message["type"] == "hello":
             self.hello = message
-        if self._crooked.says is None:
-            super().write(data)
-            return
-        said = self._crooked.says(message, self)
+        said = message if self._crooked.says is None else self._crooked.says(message, self)
         if said is not None:
             super().write(said if isinstance(said, bytes) else json.dumps(said).encode() + b"\n")
 
@@ -79,38 +83,55 @@ class CrookedLoop(SurveyLoop):
     """A server whose messages are changed on their way."""
 
     crooked: Crooked
+    port: int
+    clock: "OneThreadLoop"
 
     def connect(self) -> Connection:
         return Middle(self)
 
 
-@asynccontextmanager
-async def server_time(*modules: ModuleType) -> AsyncIterator[None]:
-    """Let the checks in these modules wait by the clock of the event loop that serves the robots.
+class OneThread(VirtualSelector):
+    """What this thread sent is in the other socket at once, so no wait for sockets takes time."""
 
-    What passes while that loop waits for a processor does not count: the patience of the checks is for a silent server
-    and not for a busy machine.
-    """
-    now_s = time.monotonic()
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        found = selectors.DefaultSelector.select(self, 0)
+        if not found and timeout is not None:
+            self.now_s += timeout
+        return found
 
-    async def run() -> None:
-        nonlocal now_s
-        before_s = time.monotonic()
-        while True:
-            await asyncio.sleep(STEP_S)
-            seen_s = time.monotonic()
-            now_s += min(seen_s - before_s, MOST_S)
-            before_s = seen_s
 
-    running = asyncio.create_task(run())
-    seen = SimpleNamespace(monotonic=lambda: now_s, sleep=time.sleep)
-    try:
-        with ExitStack() as stack:
-            for module in modules:
-                stack.enter_context(patch.object(module, "time", seen))
-            yield
-    finally:
-        running.cancel()
+class OneThreadLoop(VirtualLoop):
+    """The event loop of a server that runs while the checks wait."""
+
+    def __init__(self) -> None:
+        self.virtual = OneThread()
+        asyncio.SelectorEventLoop.__init__(self, self.virtual)
+
+    def select(
+        self, reading: Sequence[harness.RawConnection], _writing: object, _failed: object, wait_s: float
+    ) -> tuple[list[harness.RawConnection], list[Any], list[Any]]:
+        """`select.select` of the checks."""
+        found = select.select(reading, [], [], 0.0)
+        if not found[0]:
+            self.run_until_complete(self._readable([one.fileno() for one in reading], wait_s))
+            found = select.select(reading, [], [], 0.0)
+        return found
+
+    async def _readable(self, sockets: list[int], wait_s: float) -> None:
+        ready = asyncio.Event()
+        for one in sockets:
+            self.add_reader(one, ready.set)
+        try:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(wait_s):
+                    await ready.wait()
+        finally:
+            for one in sockets:
+                self.remove_reader(one)
+
+    def sleep(self, wait_s: float) -> None:
+        """`time.sleep` of the checks."""
+        self.run_until_complete(asyncio.sleep(wait_s))
 
 
 HONEST = Crooked("honest")
@@ -174,41 +195,43 @@ def around(path: str, new: Callable[..., Any]) -> Callable[[SurveyLoop], None]:
     return twist
 
 
-@asynccontextmanager
-async def serving(
+@contextmanager
+def serving(
     config: Config, *, lockstep: bool, key: bytes | None = None, crooked: Crooked = HONEST
-) -> AsyncIterator[int]:
-    """Run a server; its port."""
-    loop = CrookedLoop(config, lockstep=lockstep, key=key)
-    loop.crooked = crooked
-    port = await loop.start()
-    if crooked.twist is not None:
-        crooked.twist(loop)
-    stop = asyncio.Event()
-    running = asyncio.create_task(loop.run(stop))
-    try:
-        yield port
-    finally:
-        stop.set()
-        async with asyncio.timeout(STOP_S):
-            await running
+) -> Iterator[CrookedLoop]:
+    """A server whose time passes while the checks wait."""
+    with asyncio.Runner(loop_factory=OneThreadLoop) as runner, ExitStack() as stack:
+        loop = runner.get_loop()
+        assert isinstance(loop, OneThreadLoop)
+        now = SimpleNamespace(monotonic=loop.time, sleep=loop.sleep)
+        for module, name, value in (
+            (harness, "time", now), (harness, "monotonic", loop.time), (harness, "select", loop),
+            (server_checks, "time", now), (command_checks, "time", now),
+        ):  # fmt: skip
+            stack.enter_context(patch.object(module, name, value))
+        server = CrookedLoop(config, lockstep=lockstep, key=key)
+        server.crooked, server.clock, stop = crooked, loop, asyncio.Event()
+        server.port = loop.run_until_complete(server.start())
+        if crooked.twist is not None:
+            crooked.twist(server)
+        running = loop.create_task(server.run(stop))
+        try:
+            yield server
+        finally:
+            stop.set()
+            loop.run_until_complete(running)
 
 
-async def checked(
+def checked(
     config: Config,
     only: Iterable[str] = (),
     *,
     lockstep: bool,
-    timeout_s: float,
     key: bytes | None = None,
     crooked: Crooked = HONEST,
     mirror: Mirror | None = None,
+    motion: bool = True,
 ) -> list[Result]:
     """Results of the checks on such a server."""
-    async with serving(config, lockstep=lockstep, key=key, crooked=crooked) as port:
-
-        def run() -> list[Result]:
-            return Conformance(("127.0.0.1", port), key, timeout_s, mirror).run(motion=True, only=tuple(only))
-
-        with ThreadPoolExecutor(1) as own:  # the common one has too few threads for servers side by side
-            return await asyncio.get_running_loop().run_in_executor(own, run)
+    with serving(config, lockstep=lockstep, key=key, crooked=crooked) as server:
+        return Conformance(("127.0.0.1", server.port), key, TIMEOUT_S, mirror).run(motion=motion, only=tuple(only))

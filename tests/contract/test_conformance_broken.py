@@ -3,23 +3,20 @@
 import asyncio
 import json
 import math
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from ccatp.commissioning.conformance import harness, server_checks
+from ccatp.commissioning.conformance import server_checks
 from ccatp.commissioning.conformance.command_checks import BAD_DRIVES
 from ccatp.commissioning.conformance.runner import check_ids
-from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.links.robot_codec import BadLineCounter, LineBuffer, join_mac
 from ccatp.links.robot_messages import Drive, Permit, Role
 from ccatp.links.robot_messages import Fans as FansMessage
-from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.sim import sessions
+from ccatp.mirror.mirror import Mirror
 from ccatp.sim.rules import MotionRules
 from tests.contract.crooked import (
     Crooked,
@@ -32,12 +29,10 @@ from tests.contract.crooked import (
     of,
     put,
     rules,
-    server_time,
     swap,
 )
-from tests.support.scenario import SurveyLoop
+from tests.support.scenario import SurveyLoop, config_of
 
-AT_ONCE = 8  # servers
 KEY = b"secret"
 IDS = check_ids()
 HELLO = tuple(IDS[: IDS.index("join")])
@@ -387,7 +382,7 @@ def _two_steps(_: SurveyLoop, advance: Any, now_s: float) -> None:
 
 def _wall_ages(frame: Message, middle: Middle) -> None:
     """Ages that go on while time stands still."""
-    now_s = time.monotonic()
+    now_s = asyncio.get_running_loop().time()
     before_s = middle.owner.__dict__.setdefault("frame_s", {}).setdefault(frame["seq"] - 1, now_s)
     middle.owner.__dict__["frame_s"][frame["seq"]] = now_s
     frame["cmd"]["permit_age"] += now_s - before_s
@@ -575,7 +570,7 @@ STEPS = [
     Crooked("encoders on the wrong side", " ".join(MOVES[2:]), MOVES, says=each(_sides)),
 ]  # fmt: skip
 
-# -- on the wall clock ------------------------------------------------------------------------------------------------
+# -- in real time ------------------------------------------------------------------------------------------------
 
 
 def _ageless(key: str) -> Callable[[SurveyLoop], None]:
@@ -738,23 +733,16 @@ TABLES = {
 }  # fmt: skip
 
 
-async def judge(
+def judge(
     config: Config, table: list[Crooked], *, lockstep: bool, key: bytes | None = None, mirror: Mirror | None = None
 ) -> None:
     """Each server of a table fails the checks meant for it, and no others."""
-    room = asyncio.Semaphore(AT_ONCE)
-
-    async def one(crooked: Crooked) -> dict[str, str]:
-        async with room:
-            results = await checked(
-                config, crooked.runs, lockstep=lockstep, timeout_s=1.0, key=key, crooked=crooked, mirror=mirror
-            )
-            return {result.check_id: result.detail for result in results if result.outcome == "fail"}
-
-    # Where time is measured, the robot's goes by the wall clock, unless in lockstep.
-    async with server_time(harness, *((server_checks,) if lockstep else ())):
-        seen = await asyncio.gather(*map(one, table))
-    wrong = {c.name: (c.fails, s) for c, s in zip(table, seen, strict=True) if set(s) != set(c.fails.split())}
+    wrong = {}
+    for crooked in table:
+        results = checked(config, crooked.runs, lockstep=lockstep, key=key, crooked=crooked, mirror=mirror)
+        seen = {result.check_id: result.detail for result in results if result.outcome == "fail"}
+        if set(seen) != set(crooked.fails.split()):
+            wrong[crooked.name] = crooked.fails, seen
     assert not wrong, json.dumps(wrong, indent=1)
 
 
@@ -763,29 +751,25 @@ async def judge(
     [SESSIONS, STREAMS, COMMANDS, STEPS, QUANTITIES, RULES, UNSEEN],
     ids=["sessions", "frames", "commands", "steps", "quantities", "rules", "unseen"],
 )
-async def test_in_lockstep(config: Config, table: list[Crooked], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_in_lockstep(config: Config, table: list[Crooked], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server_checks, "FRAMES", 15)  # whatever is wrong with them is wrong with the first
-    await judge(config, table, lockstep=True)
+    judge(config, table, lockstep=True)
 
 
-async def test_macs(config: Config) -> None:
-    await judge(config, MACS, lockstep=True, key=KEY)
+def test_macs(config: Config) -> None:
+    judge(config, MACS, lockstep=True, key=KEY)
 
 
-async def test_at_the_base_of_a_mirror(config: Config) -> None:
-    await judge(config, MIRROR, lockstep=True, mirror=build_mirror(config.mirror))
+def test_at_the_base_of_a_mirror(config: Config, mirror: Mirror) -> None:
+    judge(config, MIRROR, lockstep=True, mirror=mirror)
 
 
-async def test_fans_over_an_overhang() -> None:
-    await judge(load_config(overrides={"run.mirror": "fyst-m2"}), FLOORS, lockstep=True)
+def test_fans_over_an_overhang() -> None:
+    judge(config_of("fyst-m2"), FLOORS, lockstep=True)
 
 
-async def test_on_the_wallclock(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Roles may be taken over after two seconds instead of five; that it is five the honest robot shows.
-    monkeypatch.setattr(sessions, "SILENCE_S", 2.0)
-    for name, value_s in (("SILENCE_S", 2.0), ("STILL_HELD_S", 0.8), ("TAKEN_S", 2.3)):
-        monkeypatch.setattr(server_checks, name, value_s)
-    await judge(config, REALTIME, lockstep=False)
+def test_in_real_time(config: Config) -> None:
+    judge(config, REALTIME, lockstep=False)
 
 
 def test_every_check_has_its_broken_server() -> None:
