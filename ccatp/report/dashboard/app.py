@@ -7,6 +7,8 @@ refusal, 405 for a wrong method, 503 for what is not available now. All files of
 import asyncio
 import contextlib
 import logging
+import os
+import platform
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -49,6 +51,7 @@ GAUGES: tuple[tuple[str, str, str, Callable[[Any], float | None]], ...] = (
     ("remaining_seconds", "Estimated time to the end of the mission.", "mission", lambda m: m["eta_s"]),
     ("frame_lag_seconds", "Lateness of the last late frame.", "mission", lambda m: 1e-3 * m["worst_lateness_ms"]),
     ("late_frames", "Frames that were served late.", "mission", lambda m: m["missed_deadlines"]),
+    ("arrival_error_meters", "Distance of the last fix from its point.", "mission", lambda m: 1e-3 * m["error_mm"]),
     ("event_code", "Event code: 0 normal, 1 near the edge, 2 aborted.", "verdict", lambda v: v["code"]),
     ("severity", "Severity of the cause, 0 none to 6 fault.", "verdict", lambda v: v["severity"]),
     ("battery_charge_ratio", "Charge of the robot's battery, 0 to 1.", "robot", lambda r: r["charge"]),
@@ -58,9 +61,27 @@ GAUGES: tuple[tuple[str, str, str, Callable[[Any], float | None]], ...] = (
     ("robot_faults", "Faults that the robot reports.", "robot", lambda r: len(r["faults"])),
     ("position_sigma_meters", "Root of the summed variances of x and y.", "pose",
      lambda p: sqrt(max(p.covariance_m2[0] + p.covariance_m2[2], 0.0))),
+    ("nis_per_dof", "Normalised innovation squared of the last update, per degree of freedom.", "pose",
+     lambda p: p.nis / p.size if p.size else None),
 )  # fmt: skip
-COUNTERS = {"late_frames", "process_restarts"}
+COUNTERS = {"late_frames", "process_restarts", "process_cpu_seconds"}
 POINT_COUNTS = {"planned": "total", "measured": "done", "skipped": "skipped"}
+
+
+PROCESS_USE = (
+    ("process_cpu_seconds", "User and system time of a loop."),
+    ("process_resident_memory_bytes", "Resident memory of a loop."),
+)
+
+
+def process_use(pid: int) -> tuple[float, float] | None:
+    """Processor time, s, and resident memory, bytes, of a process; None where it is gone, or not on Linux."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+    cpu_s = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return cpu_s, float(int(fields[21]) * os.sysconf("SC_PAGE_SIZE"))
 
 
 class StateCollector(Collector):
@@ -88,6 +109,11 @@ class StateCollector(Collector):
         what = (str(self._ground["title"]), str(state["is_sim"]).lower(), ccatp.__version__)
         yield "info", "What runs.", ("mirror", "simulation", "version"), [(what, 1.0)]
         yield "up", "1 when both loops report and the robot sends frames.", (), [((), not state["trouble"])]
+        build = (ccatp.__version__, platform.python_version())
+        yield "build_info", "The program.", ("version", "python"), [(build, 1.0)]
+        uses = {process: process_use(pid) for process, pid in state["pids"].items()}
+        for k, (name, text) in enumerate(PROCESS_USE):
+            yield name, text, ("process",), [((process,), use[k]) for process, use in uses.items() if use is not None]
         yield "dashboard_pages", "Open pages.", (), [((), self._pages())]
         yield "link_up", "1 when that end reports.", ("link",), [((link.name,), link.is_well) for link in links]
         ages = [((link.name,), link.age_s) for link in links]

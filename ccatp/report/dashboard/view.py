@@ -62,6 +62,11 @@ class Links:
             del self._cut_s[name]
         self._liveness.update(presence)
 
+    @property
+    def pids(self) -> dict[str, int]:
+        """Of each loop that has reported."""
+        return {name: beat.pid for name, beat in self._liveness.heartbeats.items() if name in LOOPS}
+
     def cut(self, name: str, now_s: float) -> None:
         """The connection to a process has ended."""
         self._cut_s.setdefault(name, now_s)
@@ -382,6 +387,7 @@ class RunStateView:
             "losses": self.links.losses(now_s),
             "links": self.links.shown(now_s),
             "restarts": self.links.restarts,
+            "pids": self.links.pids,
             "mission": mission,
             "pose": self._picture,
             "verdict": verdict,

@@ -1,11 +1,14 @@
 """Links in virtual time, what grows during a run, and the estimate against the simulated truth."""
 
+import os
+import platform
 from typing import Any
 
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
+import ccatp
 from ccatp.links.topics import DisplayState, Heartbeat
 from ccatp.report.dashboard.app import StateCollector
 from ccatp.report.dashboard.view import NO_LINE, Growing, Lines, Links, LinkState, TruthCompare
@@ -159,6 +162,7 @@ def test_either_may_come_first_and_frames_between_are_not_compared() -> None:
 GROUND: dict[str, Any] = {"title": "fyst-m1", "states": [str(state) for state in MissionState]}
 NOTHING: dict[str, Any] = {
     "is_sim": False, "trouble": "main has sent no heartbeat", "links": [], "restarts": {"main": 0, "danger": 2},
+    "pids": {},
     "mission": None, "verdict": None, "robot": None, "pose": None, "alarms": [],
 }  # fmt: skip
 ALL: dict[str, Any] = NOTHING | {
@@ -171,7 +175,7 @@ ALL: dict[str, Any] = NOTHING | {
     "links": [LinkState("main loop", "joined", 0.05, True), LinkState("robot", "no frame yet", None, False)],
     "mission": {
         "state": "driving", "total": 693, "done": 12, "skipped": 1, "elapsed_s": 61.5, "eta_s": 3000.0,
-        "missed_deadlines": 2, "worst_lateness_ms": 21.0,
+        "missed_deadlines": 2, "worst_lateness_ms": 21.0, "error_mm": 0.25,
     },
     "verdict": {"code": 1, "severity": 2},
     "robot": {
@@ -205,6 +209,7 @@ def test_all_metrics() -> None:
     assert sum(found.pop("ccatp_mission_state").values()) == 1.0
     (mirror, simulation, _) = next(iter(found.pop("ccatp_info")))
     assert (mirror, simulation) == ("fyst-m1", "false")
+    assert found.pop("ccatp_build_info") == {(platform.python_version(), ccatp.__version__): 1.0}  # sorted by label
     assert found.pop("ccatp_position_sigma_meters")[()] == pytest.approx(0.005)
     assert found == {
         "ccatp_up": {(): 1.0},
@@ -216,6 +221,8 @@ def test_all_metrics() -> None:
         "ccatp_remaining_seconds": {(): 3000.0},
         "ccatp_late_frames_total": {(): 2.0},
         "ccatp_frame_lag_seconds": {(): 0.021},
+        "ccatp_arrival_error_meters": {(): 0.00025},
+        "ccatp_nis_per_dof": {(): 1.0},
         "ccatp_event_code": {(): 1.0},
         "ccatp_severity": {(): 2.0},
         "ccatp_alarm": {("no_way_on", "fault"): 1.0, ("fan_weak", "return"): 1.0},
@@ -230,10 +237,19 @@ def test_all_metrics() -> None:
     }
 
 
+def test_what_the_loops_use_of_the_machine() -> None:
+    found = metrics_of(NOTHING | {"pids": {"main": os.getpid(), "danger": 2**22 + 1}})
+    (cpu_s,), (memory,) = (
+        found[name].values() for name in ("ccatp_process_cpu_seconds_total", "ccatp_process_resident_memory_bytes")
+    )
+    assert cpu_s == pytest.approx(sum(os.times()[:2]), abs=1.0)  # whole ticks, and what the test uses meanwhile
+    assert 1e7 < memory < 1e10
+
+
 def test_unknown_values_are_left_out() -> None:
     metrics = metrics_of(NOTHING)
     assert set(metrics) == {
-        "ccatp_info", "ccatp_up", "ccatp_process_restarts_total", "ccatp_dashboard_pages",
+        "ccatp_info", "ccatp_build_info", "ccatp_up", "ccatp_process_restarts_total", "ccatp_dashboard_pages",
         "ccatp_alarms_unacknowledged",
     }  # fmt: skip
     assert metrics["ccatp_up"] == {(): 0.0}
