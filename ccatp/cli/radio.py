@@ -52,15 +52,19 @@ def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) 
 
     from numpy.linalg import LinAlgError
 
+    from ccatp.beacons.datasets.checks import survey_doubts
     from ccatp.beacons.slam.batch_smoother import smooth
     from ccatp.beacons.slam.causal import filter_run
     from ccatp.filters.base import FilterError
 
     cfg = getattr(assumed, run.kind)
     try:
-        if filter_name == "smoother":
-            return smooth(run, cfg, assumed.filter, perf_counter)
-        return filter_run(run, cfg, assumed.filter, perf_counter)
+        find = smooth if filter_name == "smoother" else filter_run
+        track = find(run, cfg, assumed.filter, perf_counter)
+        if run.truth is not None:
+            return track
+        places_m = {name: (fix.x_m, fix.y_m) for name, fix in track.beacons.items()}
+        return track._replace(warnings=(*track.warnings, *survey_doubts(places_m, run.beacon_truth_m)))
     except (FilterError, LinAlgError) as error:
         raise SlamCommandError(
             f"{run.name}: {filter_name} finds no finite map for these data ({str(error)[:80]}); look at its warnings"

@@ -1,6 +1,7 @@
 """What looks wrong in a recorded run, a line each: units, gaps, readings and odometry against truth and survey."""
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Mapping
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
@@ -9,6 +10,7 @@ from ccatp.beacons.datasets.tables import GAP_S, long_pauses, plural
 from ccatp.beacons.datasets.trajectory import amount_at, chords, turning_factor
 from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
 from ccatp.core import FloatArray
+from ccatp.filters.metrics import aligned_rms_m
 
 MANY_SIGMA = 1.4826  # of a Gaussian, over its median absolute deviation
 SCALE_WARNING = 0.03
@@ -322,3 +324,36 @@ def _map_of(run: RecordedRun) -> Iterator[str]:
     unread = [name for name in run.beacon_truth_m if name not in run.beacon_ids]
     if unread:
         yield f"surveyed beacons without any reading: {', '.join(unread)}"
+
+
+MENDED = 0.3  # of the misfit of map and survey that is left once the right place is changed
+
+
+def survey_doubts(
+    found_m: Mapping[str, tuple[float, float]], surveyed_m: Mapping[str, tuple[float, float]]
+) -> list[str]:
+    """Two beacons that the survey has exchanged, or one that was moved: where a map fits far better without.
+
+    For runs without a reference trajectory, where nothing else says so. Places in m; each in a frame of its own.
+    """
+    names = [name for name in found_m if name in surveyed_m]
+    if len(names) < 4:  # any three places fit three others too well
+        return []
+    found, surveyed = (np.array([places[name] for name in names]) for places in (found_m, surveyed_m))
+    miss_m = aligned_rms_m(found, surveyed)
+    if miss_m < STRANGER_M:
+        return []
+    fits_m: dict[str, float] = {}
+    every = np.arange(len(names))
+    for a, b in combinations(range(len(names)), 2):
+        order = every.copy()
+        order[[a, b]] = b, a
+        line = f"beacons {names[a]} and {names[b]} look exchanged in the survey"
+        fits_m[line] = aligned_rms_m(found, surveyed[order])
+    for k, name in enumerate(names):
+        line = f"beacon {name} was moved, or surveyed wrongly"
+        fits_m[line] = aligned_rms_m(found[every != k], surveyed[every != k])
+    line, fit_m = min(fits_m.items(), key=lambda item: item[1])
+    if fit_m > MENDED * miss_m:
+        return []
+    return [f"{line}: the map misses the survey by {miss_m:.2g} m, else by {fit_m:.2g} m"]

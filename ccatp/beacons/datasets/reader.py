@@ -111,6 +111,10 @@ def _bounded(run: RecordedRun, where: Path) -> RecordedRun:
             _refuse(where, f"truth: {name}", column, FARTHEST_M, "m", truth.times_s)
     left_out: list[str] = []
     readings = run.readings
+    if (nothing := readings.range_m == 0.0).any():  # what units write that received no answer
+        first_s = readings.times_s[np.argmax(nothing)]
+        left_out.append(f"{plural(int(nothing.sum()), 'range')} of 0 m, the first at {first_s:.6g} s, left out")
+        readings = readings._replace(range_m=np.where(nothing, np.nan, readings.range_m))
     for field, what, most, unit in LIMITS:
         column = getattr(readings, field)
         beyond = ~(np.abs(column) <= most) & ~np.isnan(column)

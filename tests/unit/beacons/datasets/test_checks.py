@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.beacons.datasets.checks import suspicions
+from ccatp.beacons.datasets.checks import survey_doubts, suspicions
 from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.slam.recording import RecordedRun, ReferencePath, Steps
 from tests.unit.beacons.datasets.sets import (
@@ -167,3 +167,24 @@ def test_labyrinth_wheel_columns_by_the_true_path(tmp_path: Path, exchanged: boo
     told = " | ".join(run.warnings)
     assert what in told
     assert ("turns the other way" in told) is exchanged
+
+
+TURN = np.array([[0.8, -0.6], [0.6, 0.8]])
+MAPPED = {name: tuple((TURN @ place + 0.05 * k).tolist()) for k, (name, place) in enumerate(BEACONS.items())}
+
+
+@pytest.mark.parametrize(
+    ("survey", "what"),
+    [
+        ({}, ""),
+        ({"6": BEACONS["8"], "8": BEACONS["6"]}, "beacons 6 and 8 look exchanged in the survey: the map misses"),
+        ({"7": (9.5, 8.5)}, "beacon 7 was moved, or surveyed wrongly: the map misses the survey by 1"),
+        ({"6": (3.0, 9.0), "7": (0.0, -3.0)}, ""),  # neither makes it fit
+    ],
+)
+def test_a_map_tells_what_is_wrong_with_the_survey(survey: dict[str, tuple[float, float]], what: str) -> None:
+    """The map has a frame of its own, and errors of centimetres."""
+    lines = survey_doubts(MAPPED, {**BEACONS, **survey})
+    assert len(lines) == bool(what)
+    assert what in " ".join(lines)
+    assert survey_doubts({name: MAPPED[name] for name in "678"}, {**BEACONS, **survey}) == []

@@ -405,10 +405,16 @@ def test_a_robot_that_is_not_there(tmp_path: Path) -> None:
 
 def test_readings_that_cannot_be_are_left_out(tmp_path: Path) -> None:
     lines = ["range,1.01,6,1e200", "rssi,1.02,6,-1e9", "bearing,1.03,6,inf", "range,1.04,7,2.5", "bearing,1.04,7,1e9"]
+    lines.append("range,1.05,6,0")
     run = read_run(write_lines(tmp_path / "mine.csv", [*csv_lines(W_SHORT), *lines, "beacon,far,1e200,0"]), None, None)
     assert len(run.readings.times_s) == len(W_SHORT.read_s) + 1
     assert "far" not in run.beacon_truth_m
     told = " ".join(run.warnings)
     assert "1 range beyond 1e+06 m, the first 1e+200 m at 1.01 s" in told
-    for words in ("1 signal strength beyond", "1 bearing beyond", "surveyed place of far: is no place"):
+    for words in (
+        "1 range of 0 m, the first at 1.05 s",
+        "1 signal strength beyond",
+        "1 bearing beyond",
+        "surveyed place of far: is no place",
+    ):
         assert words in told
