@@ -34,8 +34,13 @@ class MapModel:
         self.network = network
         self.with_offset, self.with_scale = with_offset, with_scale
         d = network.dimension
+        sizes = [len(body.motes) for body in network.bodies]
+        # The motes of all bodies one after the other, the body of each, and the first mote of that.
+        self._bound = np.array([mote for body in network.bodies for mote in body.motes], dtype=np.intp)
+        self._body_of = np.repeat(np.arange(len(sizes)), sizes)
+        self._origin_of = np.repeat(np.array([body.motes[0] for body in network.bodies], dtype=np.intp), sizes)
         is_free = np.isnan(network.known_m)
-        is_free[[mote for body in network.bodies for mote in body.motes]] = False
+        is_free[self._bound] = False
         self._free_at: IndexArray = np.flatnonzero(is_free)  # flat coordinate of each unknown of a loose mote
         self._turns = np.zeros((d * (d - 1) // 2, d, d))  # the rotations in each plane, to first order
         for number, (a, b) in enumerate(combinations(range(d), 2)):
@@ -81,34 +86,29 @@ class MapModel:
         return self._jacobian_of_positions(state.positions_m)
 
     def _jacobian_of_positions(self, positions_m: FloatArray) -> csr_array:
-        d, start = self.network.dimension, len(self._free_at)
-        rows, columns, values = [self._free_at], [np.arange(start)], [np.ones(start)]
-        for body in self.network.bodies:
-            motes = list(body.motes)
-            arms = positions_m[motes] - positions_m[motes[0]]
-            block = np.concatenate([np.tile(np.eye(d), (len(motes), 1, 1)), (self._turns @ arms.T).T], 2)
-            rows.append(np.repeat(coordinates_of(motes, d), self._body_size))
-            columns.append(np.tile(start + np.arange(self._body_size), len(motes) * d))
-            values.append(block.ravel())
-            start += self._body_size
-        entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-        return coo_array(entries, shape=(positions_m.size, self.coordinates)).tocsr()
+        d, start, size = self.network.dimension, len(self._free_at), self._body_size
+        arms = positions_m[self._bound] - positions_m[self._origin_of]
+        blocks = np.concatenate([np.tile(np.eye(d), (len(arms), 1, 1)), (self._turns @ arms.T).transpose(2, 1, 0)], 2)
+        rows = np.concatenate([self._free_at, np.repeat(coordinates_of(self._bound, d), size)])
+        of_body = start + self._body_of[:, None] * size + np.arange(size)
+        columns = np.concatenate([np.arange(start), np.repeat(of_body, d, axis=0).ravel()])
+        values = np.concatenate([np.ones(start), blocks.ravel()])
+        return coo_array((values, (rows, columns)), shape=(positions_m.size, self.coordinates)).tocsr()
 
     def moved(self, state: MapState, step: FloatArray) -> MapState:
         """The state after a step of the unknowns, shape (size,)."""
         d, start = self.network.dimension, len(self._free_at)
         positions = state.positions_m.copy()
         positions.reshape(-1)[self._free_at] += step[:start]
-        for body in self.network.bodies:
-            motes = list(body.motes)
-            shift, angles = np.split(step[start : start + self._body_size], [d])
+        if self._bound.size:
+            shifts, angles = np.split(step[start : self.coordinates].reshape(-1, self._body_size), [d], axis=1)
             half = 0.5 * np.tensordot(angles, self._turns, 1)
-            rotation = np.linalg.solve(
-                np.eye(d) - half, np.eye(d) + half
-            )  # Cayley: orthogonal, and right at first order
-            origin = state.positions_m[motes[0]]
-            positions[motes] = (state.positions_m[motes] - origin) @ rotation.T + origin + shift
-            start += self._body_size
+            # Cayley: orthogonal, and right at first order
+            rotations = np.linalg.solve(np.eye(d) - half, np.eye(d) + half)
+            origins = state.positions_m[self._origin_of]
+            arms = state.positions_m[self._bound] - origins
+            turned = np.einsum("kij,kj->ki", rotations[self._body_of], arms)
+            positions[self._bound] = turned + origins + shifts[self._body_of]
         offset_m = state.offset_m + float(step[self.coordinates]) if self.with_offset else state.offset_m
         scale = state.scale + float(step[-1]) if self.with_scale else state.scale
         return MapState(positions, offset_m, scale)

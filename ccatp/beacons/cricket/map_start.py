@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import shortest_path
 
 from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
 from ccatp.beacons.cricket.range_network import MappingError, PairMeans, RangeNetwork, adjacency, every_pair
-from ccatp.beacons.cricket.trilateration import classical_scaling, map_as_possible
+from ccatp.beacons.cricket.trilateration import classical_scaling, map_as_possible, sphere_crossings
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import best_motion
 
@@ -122,13 +122,7 @@ def _crossing(
     )
     if len(drawn) > _CROSSINGS:
         drawn = drawn[rng.choice(len(drawn), _CROSSINGS, replace=False)]
-    first, radii = anchors[drawn[:, 0]], ranges_m[drawn]
-    ways = anchors[drawn[:, 1:]] - first[:, None]
-    level = 0.5 * (radii[:, :1] ** 2 - radii[:, 1:] ** 2 + (ways**2).sum(axis=2))
-    foot = np.einsum("kij,kj->ki", np.linalg.pinv(ways), level)
-    normal = np.linalg.svd(ways)[2][:, -1]
-    height = np.sqrt(np.maximum(radii[:, 0] ** 2 - (foot**2).sum(axis=1), 0.0))
-    tips = np.concatenate([first + foot + side * height[:, None] * normal for side in (1.0, -1.0)])
+    tips = sphere_crossings(anchors[drawn], ranges_m[drawn]).reshape(-1, d)
     missed = (np.linalg.norm(tips[:, None] - anchors[None], axis=2) - ranges_m) / scales_m
     # 1 for a range that meets the place, nought for one that is far off it.
     met = (1.0 / (1.0 + missed**2)).sum(axis=1)

@@ -39,6 +39,7 @@ _SIGNIFICANT = 12.0  # a drop of chi-squared that chance gives one offset in two
 _CHANCE = 1e-4  # that sound ranges of one pair of all disagree as much
 _SCATTER = 1.5  # factor of the sigmas that is worth a word
 _FOLDS = 5  # sets of motes that are named
+_SHAPES = ", or the places of --tags are wrong"
 _IN_SPACE = ", or the motes are not in a plane: --dimension 3 maps them in space"
 
 
@@ -67,7 +68,8 @@ def _doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[st
     for fold in found.folds[:_FOLDS]:
         motes = list_names([network.names[mote] for mote in fold.motes])
         yield f"{motes}: the mirror image fits almost as well (chi-squared {fold.cost_gap:.1f} more)"
-    in_space = _IN_SPACE if network.dimension == 2 else ""
+    in_space = _SHAPES if network.bodies else ""
+    in_space += _IN_SPACE if network.dimension == 2 else ""
     rows, count = found.agreement.outlying, len(network.ranges_m)
     if found.agreement.is_denied:
         yield (
@@ -276,7 +278,7 @@ def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Mirrors) -> _Foun
 def _filter(cfg: CricketConfig, network: RangeNetwork) -> _Found:
     if network.bodies:
         raise MappingError("the filter maps no trolleys: leave --tags out, or take --method batch")
-    first = map_as_possible(network, cfg.phase1.max_dop)
+    first = map_as_possible(network, cfg.phase1.max_dop, cfg.phase1.draws)
     if first.unplaced:
         lost = list_names([network.names[mote] for mote in first.unplaced])
         raise MappingError(f"trilateration cannot place {lost}; take --method batch, which needs no such start")

@@ -29,6 +29,8 @@ _SAME = 1e-6  # relative difference of costs that are the same minimum's
 _CORRECTIONS = 3  # times that the unfolding is repeated with ranges corrected by the offset found
 _FOUND = 3  # times that the best minimum is found before a search among grown maps ends
 
+_VAGUE = 0.1  # of the ranges: where they scatter by more, whatever is mirrored fits about as well
+
 Mirrors = Sequence[tuple[Sequence[int], Sequence[int]]]
 Found = TypeVar("Found")
 
@@ -85,13 +87,15 @@ def map_motes(
     else:
         fits = _fits(model, start_m, settings)
     best = _least(fits)
-    if not _is_sure(model, best) and np.isfinite(settings.robust_scale):
-        best, is_settled = searched(model, best, settings)
-        if not (is_settled and _is_sound(model, best)):
-            # To a robust loss a folded map is a good one with a few outliers: look for folds by least squares first.
-            opened, _, _ = unfold(model, fit_map(model, best.state, plain), plain, mirrors)
-            best = _least([best, fit_map(model, opened.state, settings)])
-    best, _, folds = unfold(model, best, settings, mirrors)
+    folds: tuple[Fold, ...] = ()
+    if float(np.median(model.network.sigmas_m)) < _VAGUE * float(np.median(network.ranges_m)):
+        if not _is_sure(model, best) and np.isfinite(settings.robust_scale):
+            best, is_settled = searched(model, best, settings)
+            if not (is_settled and _is_sound(model, best)):
+                # To a robust loss a folded map is a good one with a few outliers: first unfold by least squares.
+                opened, _, _ = unfold(model, fit_map(model, best.state, plain), plain, mirrors)
+                best = _least([best, fit_map(model, opened.state, settings)])
+        best, _, folds = unfold(model, best, settings, mirrors)
     covariance, free = position_covariance(model, best)
     dof, sigmas = len(network.ranges_m) - (model.size - free), model.network.sigmas_m
     steps = sum(fit.iterations for fit in fits)
@@ -296,6 +300,7 @@ def _turn_singles(model: MapModel, fit: MapFit, settings: MapFitSettings) -> tup
 
 def _turn_sets(model: MapModel, fit: MapFit, settings: MapFitSettings, mirrors: Mirrors) -> tuple[MapFit, int, _Doubts]:
     network, turned, near = model.network, 0, _Doubts()
+    sound = _SURE * max(len(network.ranges_m) - model.size, 1)
     for _, (separator, motes) in zip(range(_TRIALS), _sets(model, fit, mirrors), strict=False):
         before_m = fit.state.positions_m
         for image in _mirrored(before_m[list(motes)], before_m[list(separator)]):
@@ -303,7 +308,8 @@ def _turn_sets(model: MapModel, fit: MapFit, settings: MapFitSettings, mirrors: 
             places[list(motes)] = image
             start = model.state(places, fit.state.offset_m, fit.state.scale)
             other = fit_from_afar(model, start, settings._replace(max_iterations=_SKETCH_STEPS))
-            if not other.is_at_rest and other.cost <= _HOPELESS * (fit.cost + _CLOSE):
+            # A map that its ranges deny is left for a better one alone: others like it are without number.
+            if not other.is_at_rest and other.cost <= max(fit.cost, _HOPELESS * (min(fit.cost, sound) + _CLOSE)):
                 other = fit_map(model, other.state, settings)
             gap = other.cost - fit.cost
             if gap < -1e-6 * max(1.0, fit.cost):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ccatp.beacons.cricket.map_fit import rigidity_matrix, robust_loss
 from ccatp.beacons.cricket.mote_plan import MotePlan
-from ccatp.beacons.cricket.range_network import MappingError, PairMeans, RangeNetwork, coordinates_of, list_names
+from ccatp.beacons.cricket.range_network import MappingError, PairMeans, RangeNetwork, list_names
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import RigidMotion
 
@@ -85,28 +85,26 @@ class TrilaterationStep(NamedTuple):
 
 
 class Sketch:
-    """Places found so far, with their joint covariance.
+    """Places found so far, and the steps that found them.
 
-    Each place depends on the ranges of its step and on the places it is measured from, whose errors it inherits:
-    dx = G (dr + U da), G = (H^T W H)^-1 H^T W, U da the errors of the references along the lines of sight.
+    The errors of the places are drawn: the same steps made again on ranges with errors (``draw_errors``).
     """
 
     def __init__(self, network: RangeNetwork, max_dop: float) -> None:
         self.means = PairMeans(network)
         self._names, self._dimension, self._max_dop = network.names, network.dimension, max_dop
-        size = network.count * network.dimension
         self.positions_m = np.full((network.count, network.dimension), np.nan)
-        self.covariance_m2 = np.zeros((size, size))
-        self._seen_m = self.positions_m.copy()  # places at which derivatives are taken
+        self._seen_m = self.positions_m.copy()  # places from which the dilution of precision is judged
         self.steps: list[TrilaterationStep] = []
+        self._first_covariance_m2 = np.zeros((0, 0))  # of the motes that begin the map
 
     @property
     def is_placed(self) -> NDArray[np.bool_]:
         """Which motes have a place, shape (n,)."""
         return np.asarray(np.isfinite(self.positions_m[:, 0]))
 
-    def linearise_at(self, motes: Sequence[int], places_m: FloatArray) -> None:
-        """Take the derivatives of later steps at better places than those found, shape (k, d).
+    def judge_from(self, motes: Sequence[int], places_m: FloatArray) -> None:
+        """Judge later steps from better places than those found, shape (k, d).
 
         The error of a place from a small stand is far larger than that of a range: on a stand whose motes came out
         wider apart than they are, the next ones look better determined than they are.
@@ -116,15 +114,13 @@ class Sketch:
     def set_axes(self, origin: int, axis: int) -> None:
         """Origin and second axis: A (0, 0), B (0, d_AB); in the plane alone. Raises MappingError: A and B have none."""
         range_m, sigma_m = (values[0] for values in self._ranges(axis, [origin]))
-        variances = np.zeros((4, 4))
-        variances[3, 3] = sigma_m**2
-        self.add_together([origin, axis], np.array([[0.0, 0.0], [0.0, range_m]]), variances, "axes")
+        places_m = np.array([[0.0, 0.0], [0.0, range_m]])
+        self.add_together([origin, axis], places_m, np.diag((0.0, 0.0, 0.0, sigma_m**2)), "axes")
 
     def add_together(self, motes: Sequence[int], places_m: FloatArray, covariance_m2: FloatArray, how: str) -> None:
         """Motes that begin a map together, with their covariance, shapes (k, d) and (k d, k d)."""
-        at = coordinates_of(motes, self._dimension)
         self.positions_m[list(motes)] = self._seen_m[list(motes)] = places_m
-        self.covariance_m2[np.ix_(at, at)] = covariance_m2
+        self._first_covariance_m2 = covariance_m2
         self.steps += [TrilaterationStep(mote, (), 0.0, how) for mote in motes]
 
     def add_by_cosines(self, mote: int, origin: int, axis: int) -> None:
@@ -133,13 +129,13 @@ class Sketch:
         Raises MappingError: a range to A or B is missing. Raises DegenerateStep: the mote is on the axis, or nearly.
         """
         (a, b), c = self._ranges(mote, [origin, axis])[0], self.positions_m[axis, 1]
-        x, y = _by_cosines(a, b, c)
-        if not x > 0.0:
+        place = _by_cosines(a, b, c)
+        if not place[0] > 0.0:
             raise DegenerateStep(
                 f"{self._names[mote]}: ranges of {a:.3f} and {b:.3f} m to {self._names[origin]} and "
                 f"{self._names[axis]}, {c:.3f} m apart, meet on their line or not at all; move the anchors off it"
             )
-        self._add(mote, (origin, axis), np.array([x, y]), "cosines")
+        self._add(mote, (origin, axis), place, "cosines")
 
     def add_by_ranges(self, mote: int, references: Sequence[int]) -> None:
         """A mote by trilateration from motes that have places.
@@ -149,7 +145,7 @@ class Sketch:
         """
         ranges, sigmas = self._ranges(mote, references)
         anchors = self.positions_m[list(references)]
-        found, costs = trilaterate(_starts(anchors, ranges), anchors, ranges, sigmas)
+        found, costs = trilaterate(sphere_crossings(anchors, ranges), anchors, ranges, sigmas)
         apart_m = float(np.linalg.norm(found[1] - found[0]))
         if apart_m > _APART * float(sigmas.max()) and abs(costs[1] - costs[0]) < _ALIKE:
             raise DegenerateStep(
@@ -160,25 +156,13 @@ class Sketch:
 
     def _add(self, mote: int, references: Sequence[int], place: FloatArray, how: str) -> None:
         lines = place - self._seen_m[list(references)]
-        H = lines / np.linalg.norm(lines, axis=1)[:, None]
-        singular = np.linalg.svd(H, compute_uv=False)
+        singular = np.linalg.svd(lines / np.linalg.norm(lines, axis=1)[:, None], compute_uv=False)
         dop = float(np.sqrt((singular**-2.0).sum())) if singular[-1] > 0.0 else float("inf")
         if not dop <= self._max_dop:
             raise DegenerateStep(
                 f"{self._names[mote]} from {self._listed(references)}: dilution of precision {dop:.4g} exceeds "
                 f"{self._max_dop:.4g}; spread the motes it is measured from"
             )
-        weighted = H / self._ranges(mote, references)[1][:, None] ** 2
-        own = np.linalg.inv(H.T @ weighted)
-        d, at = self._dimension, coordinates_of([mote], self._dimension)
-        along = np.zeros((len(references), len(self.covariance_m2)))
-        for row, reference in enumerate(references):
-            along[row, reference * d : (reference + 1) * d] = H[row]
-        inherited = own @ weighted.T @ along
-        cross = inherited @ self.covariance_m2
-        self.covariance_m2[at, :] = cross
-        self.covariance_m2[:, at] = cross.T
-        self.covariance_m2[np.ix_(at, at)] = own + cross @ inherited.T
         self.positions_m[mote] = self._seen_m[mote] = place
         self.steps.append(TrilaterationStep(mote, tuple(references), dop, how))
 
@@ -198,14 +182,13 @@ class Sketch:
         """Mean (n, d) and covariance (n d, n d) of the errors, by the parametric bootstrap (Efron 1979).
 
         At places close to those that were found, ranges with errors as they are expected are drawn, and the same steps
-        made of them. Derivatives give the size of the errors as well, but not their correlations: from a small
-        stand errors grow to decimetres, and along so wide an arc no line is a tangent everywhere. What a line takes to
-        be known within a millimetre is known within centimetres. ``places_m``: where the motes might be, nan for those
-        without a place, shape (n, d). Without draws the errors are those of the derivatives.
+        made of them. Derivatives would not do: from a small stand errors grow to decimetres, and along so wide an arc
+        no line is a tangent everywhere. What a line takes to be known within a millimetre is known within centimetres.
+        ``places_m``: where the motes might be, nan for those without a place, shape (n, d). Zeros without draws.
         """
-        if draws == 0:
-            return np.zeros_like(places_m), self.covariance_m2
         count, d = places_m.shape
+        if draws == 0:
+            return np.zeros_like(places_m), np.zeros((count * d, count * d))
         rng = np.random.default_rng(0)  # the same draws for every map: the same ranges give the same one
         first, second = self.means.pairs.T
         true_m = np.linalg.norm(places_m[first] - places_m[second], axis=1)
@@ -218,15 +201,13 @@ class Sketch:
         if self.steps[0].how == "axes":
             drawn[:, first_of_all[1], 1] = lengths[first_of_all[0], first_of_all[1]]
         else:
-            at = coordinates_of(first_of_all, d)
-            covariance = self.covariance_m2[np.ix_(at, at)]
-            errors = rng.multivariate_normal(np.zeros(at.size), covariance, draws, method="eigh")
+            size = len(self._first_covariance_m2)
+            errors = rng.multivariate_normal(np.zeros(size), self._first_covariance_m2, draws, method="eigh")
             drawn[:, first_of_all] += errors.reshape(draws, -1, d)
         for step in self.steps:
             references, own = list(step.references), lengths[list(step.references), step.mote].T
             if step.how == "cosines":
-                x, y = _by_cosines(own[:, 0], own[:, 1], drawn[:, references[1], 1])
-                drawn[:, step.mote] = np.column_stack([x, y])
+                drawn[:, step.mote] = _by_cosines(own[:, 0], own[:, 1], drawn[:, references[1], 1])
             elif step.how == "trilateration":
                 starts = np.broadcast_to(places_m[step.mote], (draws, d))
                 sigmas = self.means.sigma_table_m[step.mote, references]
@@ -237,29 +218,35 @@ class Sketch:
         return bias, flat.T @ flat / (draws - 1)
 
 
-def _by_cosines(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _by_cosines(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     # y = (d_A^2 + d_AB^2 - d_B^2) / (2 d_AB), x = sqrt(d_A^2 - y^2); x is nought where the circles do not meet.
     y = (a * a + c * c - b * b) / (2.0 * c)
-    return np.sqrt(np.maximum(a * a - y * y, 0.0)), y
+    return np.stack([np.sqrt(np.maximum(a * a - y * y, 0.0)), y], axis=-1)
 
 
-def _starts(anchors: FloatArray, ranges: FloatArray) -> FloatArray:
-    """Both crossings of the spheres about anchors, on either side of the plane through them, shape (2, d)."""
-    centre = anchors.mean(axis=0)
-    offsets = anchors - centre
-    squares = ranges**2 - (offsets**2).sum(axis=1)
-    linear = np.linalg.lstsq(-2.0 * offsets, squares - squares.mean(), rcond=1e-6)[0]
-    normal = np.linalg.svd(offsets)[2][-1]
-    flat = linear - float(linear @ normal) * normal
-    height = float(np.sqrt(max(float(np.mean(squares)) - float(flat @ flat), 1e-12)))
-    return np.array([centre + flat + height * normal, centre + flat - height * normal])
+def sphere_crossings(anchors_m: FloatArray, ranges_m: FloatArray) -> FloatArray:
+    """Both crossings of the spheres about anchors, on either side of the plane through them, shape (2, ..., d).
+
+    Of more than d anchors, the places that meet the ranges best on the average. ``anchors_m``: shape (..., k, d);
+    ``ranges_m``: shape (..., k).
+    """
+    centre = anchors_m.mean(axis=-2, keepdims=True)
+    offsets = anchors_m - centre
+    squares = ranges_m**2 - (offsets**2).sum(axis=-1)
+    mean = squares.mean(axis=-1, keepdims=True)
+    linear = np.linalg.pinv(-2.0 * offsets, rcond=1e-6) @ (squares - mean)[..., None]
+    normal = np.linalg.svd(offsets)[2][..., -1, :]
+    flat = linear[..., 0] - (normal * linear[..., 0]).sum(axis=-1, keepdims=True) * normal
+    height = np.sqrt(np.maximum(mean - (flat**2).sum(axis=-1, keepdims=True), 1e-12))
+    foot = centre[..., 0, :] + flat
+    return np.stack([foot + height * normal, foot - height * normal])
 
 
 class FirstMap(NamedTuple):
     """What phase 1 gives."""
 
     positions_m: FloatArray  # nan for motes without a place, shape (n, d)
-    covariance_m2: FloatArray  # of all coordinates, zero for motes without a place, shape (n d, n d)
+    covariance_m2: FloatArray  # of all coordinates, zero for motes without a place or without draws, shape (n d, n d)
     bias_m: FloatArray  # mean error of the places, as far as it is known, shape (n, d)
     steps: tuple[TrilaterationStep, ...]
     unplaced: tuple[int, ...]
@@ -269,8 +256,8 @@ def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: in
     """Phase 1 of Patil et al., figure 8, in the field's frame.
 
     A is the origin, B on the second axis, the first stand follows by the law of cosines, every other one by
-    trilateration from all motes of the stand before it. Bias and covariance of the errors are drawn; without draws the
-    covariance is by derivatives. Raises MappingError: a step that cannot be made; the message names its motes.
+    trilateration from all motes of the stand before it. Raises MappingError: a step that cannot be made; the message
+    names its motes.
     """
     sketch = Sketch(network, max_dop)
     origin, axis = plan.anchors
@@ -278,7 +265,7 @@ def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: in
     for mote in plan.bodies[0].motes:
         sketch.add_by_cosines(mote, origin, axis)
     for before, after in pairwise(plan.bodies):
-        sketch.linearise_at(before.motes, before.placed(sketch.positions_m))
+        sketch.judge_from(before.motes, before.placed(sketch.positions_m))
         for mote in after.motes:
             sketch.add_by_ranges(mote, before.motes)
     shaped = sketch.positions_m.copy()  # with the stands as they are known to be

@@ -253,7 +253,8 @@ def test_joint_errors_of_cosines_and_trilateration() -> None:
         return sketch
 
     sample = np.cov(np.array([laid(rng).positions_m.ravel() for _ in range(300)]).T)
-    covariance = laid(None).covariance_m2
+    bias, covariance = laid(None).draw_errors(places, 2000)
+    assert bias == pytest.approx(np.zeros((6, 2)), abs=1e-3)
     spread = np.sqrt(covariance.diagonal())
     at = spread > 1e-9  # the origin and B's x are exact
     assert np.flatnonzero(~at).tolist() == [0, 1, 2]
@@ -325,12 +326,12 @@ def test_no_triangle_no_beginning() -> None:
 DRAWS = 800
 
 
-def after_phase_one(seeds: range, draws: int) -> tuple[float, int]:
+def after_phase_one(seeds: range) -> tuple[float, int]:
     """Mean NEES for each degree of freedom, and how many there were: what is known exactly does not count."""
     total, dof = 0.0, 0
     for seed in seeds:
         field = simulate_field(CRICKET, seed)
-        found, motes = first_map(CRICKET, field, draws), list(field.plan.heads)
+        found, motes = first_map(CRICKET, field, DRAWS), list(field.plan.heads)
         at = coordinates_of(motes, 2)
         known = field.plan.surveyed_m[motes].ravel()
         mean = (found.positions_m + found.bias_m)[motes].ravel()
@@ -342,12 +343,11 @@ def after_phase_one(seeds: range, draws: int) -> tuple[float, int]:
     return total / dof, dof
 
 
-def test_derivatives_are_too_sure_and_draws_are_not() -> None:
-    assert after_phase_one(range(20), 0)[0] > 1.8
-    assert after_phase_one(range(10), DRAWS)[0] < 1.4  # 90 degrees of freedom: 1.0 within 0.30
+def test_phase_one_knows_how_good_it_is() -> None:
+    assert after_phase_one(range(10))[0] < 1.4  # 90 degrees of freedom: 1.0 within 0.30
 
 
 @pytest.mark.slow
 def test_nees_of_phase_one_over_200_fields() -> None:
-    mean, dof = after_phase_one(range(200), DRAWS)
+    mean, dof = after_phase_one(range(200))
     assert chi2.ppf(0.005, dof) < mean * dof < chi2.ppf(0.995, dof)
