@@ -170,7 +170,7 @@ class PhaseOneConfig(Model):
     """Trilateration."""
 
     max_dop: Positive
-    draws: Annotated[int, Field(ge=0, le=100_000)]  # 0, or many
+    draws: Annotated[int, Field(ge=100, le=100_000)]
 
 
 class PhaseTwoConfig(Model):

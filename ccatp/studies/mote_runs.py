@@ -40,15 +40,12 @@ class SimulatedField:
     plan: MotePlan
     true_m: FloatArray  # places of all motes, shape (n, d)
     first: tuple[MoteRange, ...]  # of phase 1, repeated as configured
-    second: tuple[tuple[int, int, float, float], ...]  # in the order of phase 2: first, second, range_m, sigma_m
+    second: tuple[MoteRange, ...]  # of phase 2, in its order
 
     def network(self, *, with_second: bool = False, with_shapes: bool = False) -> RangeNetwork:
         """The graph of phase 1, with phase 2 and the shapes of the stands where asked (raises MappingError: no map)."""
-        names = self.plan.names
-        rows = list(self.first)
-        if with_second:
-            rows += [MoteRange(names[i], names[j], range_m, sigma_m) for i, j, range_m, sigma_m in self.second]
-        return build_network(rows, self.plan.dimension, names, self.plan.bodies if with_shapes else ())
+        rows = [*self.first, *(self.second if with_second else ())]
+        return build_network(rows, self.plan.dimension, self.plan.names, self.plan.bodies if with_shapes else ())
 
 
 def simulate_field(cfg: CricketConfig, seed: int) -> SimulatedField:
@@ -66,11 +63,8 @@ def simulate_field(cfg: CricketConfig, seed: int) -> SimulatedField:
     pairs = [pair for pair in plan.phase2_pairs if field.receives(*pair)]
     if not pairs:
         raise MappingError("no pair of phase 2 receives each other; enlarge cricket.transducer or turn the motes")
-    second = []
-    for pulse in field.listen(list(islice(cycle(pairs), cfg.phase2.max_updates)), 1, rng):
-        found = reading(pulse)
-        second.append((pulse.transmitter, pulse.listener, found.range_m, found.sigma_m))
-    return SimulatedField(plan, motes.positions_m, first, tuple(second))
+    pulses = field.listen(list(islice(cycle(pairs), cfg.phase2.max_updates)), 1, rng)
+    return SimulatedField(plan, motes.positions_m, first, tuple(map(reading, pulses)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +122,8 @@ def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
     plan, first = field.plan, first_map(cfg, field, cfg.phase1.draws)
     motes = list(plan.heads or plan.mapped)
     mapper = begin_phase_two(cfg, plan, first)
-    index = {mote: row for row, mote in enumerate(motes)}
-    readings = [(index[i], index[j], range_m, sigma_m) for i, j, range_m, sigma_m in field.second]
+    index = {plan.names[mote]: row for row, mote in enumerate(motes)}
+    readings = [(index[one.first], index[one.second], one.range_m, one.sigma_m) for one in field.second]
     went = run_phase_two(mapper, readings, cfg.phase2.target_rms_m)
     aligned = bool(np.isnan(plan.surveyed_m[motes]).all())
     true_m = field.true_m[motes]
@@ -224,7 +218,8 @@ def look_ahead(cfg: CricketConfig, field: SimulatedField, method: str, updates: 
         return MoteOutlook(find_freedom(model, generic_state(model, rng)), find_fold_over(network, rng), bound)
     motes = list(plan.heads or plan.mapped)
     known = plan.surveyed_m
-    second = _part(field, motes, known, updates)
+    rows, names = field.second[:updates], [plan.names[mote] for mote in motes]
+    second = build_network(rows, plan.dimension, names, (), known[motes], is_whole=False)
     model = MapModel(second, **options)
     freedom, folds = find_freedom(model, generic_state(model, rng)), find_fold_over(second, rng)
     aligned = bool(np.isnan(known).all())
@@ -233,22 +228,6 @@ def look_ahead(cfg: CricketConfig, field: SimulatedField, method: str, updates: 
     both = replace(field, second=field.second[:updates]).network(with_second=True)
     whole = MapModel(replace(both, bodies=(), known_m=known), **options)
     return MoteOutlook(freedom, folds, bound_rms_m(whole, field.true_m, motes, aligned=aligned))
-
-
-def _part(field: SimulatedField, motes: list[int], known: FloatArray, updates: int | None) -> RangeNetwork:
-    """The graph of phase 2 alone. Motes that it does not tie together are no error here: that is what is asked."""
-    index = {mote: row for row, mote in enumerate(motes)}
-    rows = field.second[:updates]
-    return RangeNetwork(
-        names=tuple(field.plan.names[mote] for mote in motes),
-        dimension=field.plan.dimension,
-        first=np.array([index[row[0]] for row in rows], dtype=np.intp),
-        second=np.array([index[row[1]] for row in rows], dtype=np.intp),
-        ranges_m=np.array([row[2] for row in rows]),
-        sigmas_m=np.array([row[3] for row in rows]),
-        bodies=(),
-        known_m=known[motes],
-    )
 
 
 def _in_field(field: SimulatedField, found: MoteMap) -> tuple[FloatArray, FloatArray]:
@@ -377,9 +356,6 @@ def _pairs(campaign: MoteCampaign, run: MoteRun) -> list[tuple[int, int]]:
     if len(run.names) > _LINED:
         return []
     row = {name: number for number, name in enumerate(run.names)}
-    names = field.plan.names
-    if campaign.method == "ekf":
-        ends = {(names[i], names[j]) for i, j, _, _ in field.second}
-    else:
-        ends = {(reading.first, reading.second) for reading in field.first}
+    readings = field.second if campaign.method == "ekf" else field.first
+    ends = {(reading.first, reading.second) for reading in readings}
     return sorted((row[a], row[b]) for a, b in ends if a in row and b in row)

@@ -96,13 +96,15 @@ def build_network(
     names: Sequence[str] | None = None,
     bodies: Sequence[RigidBody] = (),
     known_m: FloatArray | None = None,
+    *,
+    is_whole: bool = True,
 ) -> RangeNetwork:
     """The graph of some ranges, checked.
 
     ``names``: the motes in their order; those of the readings, as they come, if ``None``. ``known_m``: known
     coordinates, nan elsewhere, shape (n, d). Raises MappingError: a range names a mote that is not among ``names``, is
     from a mote to itself, negative or not finite, or has no positive sigma; there are no ranges, fewer than two motes,
-    or the motes fall apart.
+    or the motes fall apart though the graph ``is_whole``.
     """
     rows = list(readings)
     if names is None:
@@ -122,7 +124,8 @@ def build_network(
         bodies=tuple(bodies),
         known_m=np.full((len(names), dimension), np.nan) if known_m is None else known_m,
     )
-    _check_connected(network)
+    if is_whole:
+        _check_connected(network)
     return network
 
 

@@ -15,6 +15,7 @@ from ccatp.filters.metrics import RigidMotion
 
 _APART = 10.0  # sigmas between two solutions that are not the same one
 _ALIKE = 9.0  # difference of chi-squared up to which a mirror image may as well be the truth
+_NEAR = 20  # maps close by at which errors are drawn
 _DRAWN_STEPS = 15  # of each drawn trilateration; references that are decimetres off make it go slowly
 _STEPS = 100
 _REST_M = 1e-6
@@ -184,12 +185,22 @@ class Sketch:
         At places close to those that were found, ranges with errors as they are expected are drawn, and the same steps
         made of them. Derivatives would not do: from a small stand errors grow to decimetres, and along so wide an arc
         no line is a tangent everywhere. What a line takes to be known within a millimetre is known within centimetres.
-        ``places_m``: where the motes might be, nan for those without a place, shape (n, d). Zeros without draws.
+        For the same reason the errors at those places are not those at the true ones: they are drawn again at a few of
+        the maps that were drawn (iterated bootstrap: Hall 1986). ``places_m``: where the motes might be, nan for those
+        without a place, shape (n, d). Zeros without draws.
         """
         count, d = places_m.shape
         if draws == 0:
             return np.zeros_like(places_m), np.zeros((count * d, count * d))
         rng = np.random.default_rng(0)  # the same draws for every map: the same ranges give the same one
+        near = self._drawn(places_m, _NEAR, rng)
+        errors = np.concatenate([self._drawn(places, draws // _NEAR, rng) - places for places in near])
+        errors = np.nan_to_num(errors).reshape(len(errors), -1)
+        return errors.mean(axis=0).reshape(count, d), np.atleast_2d(np.cov(errors.T))
+
+    def _drawn(self, places_m: FloatArray, draws: int, rng: np.random.Generator) -> FloatArray:
+        """Maps by the same steps from ranges with errors between some places (n, d), shape (draws, n, d)."""
+        count, d = places_m.shape
         first, second = self.means.pairs.T
         true_m = np.linalg.norm(places_m[first] - places_m[second], axis=1)
         errors_of = rng.normal(0.0, 1.0, (len(true_m), draws))
@@ -212,10 +223,7 @@ class Sketch:
                 starts = np.broadcast_to(places_m[step.mote], (draws, d))
                 sigmas = self.means.sigma_table_m[step.mote, references]
                 drawn[:, step.mote] = trilaterate(starts, drawn[:, references], own, sigmas, steps=_DRAWN_STEPS)[0]
-        errors = np.nan_to_num(drawn - places_m)
-        bias = errors.mean(axis=0)
-        flat = (errors - bias).reshape(draws, -1)
-        return bias, flat.T @ flat / (draws - 1)
+        return drawn
 
 
 def _by_cosines(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:

@@ -49,7 +49,6 @@ def test_a_waypoint_that_was_reached(run_dir: Path) -> None:
     (row,) = waypoint_rows(read_beacon_record(run_dir))
     assert (row.number, row.lap, row.waypoint, row.t_s, row.place_m) == (1, 1, 1, 1.0, (0.8, 0.8))
     assert row.sigma_m == pytest.approx(SIGMA_M)
-    assert row.estimate_off_m == pytest.approx(0.2)
     assert row.true_off_m == pytest.approx((0.2**2 + OFF_M**2) ** 0.5)
     assert row.error_m == pytest.approx(OFF_M)
     assert row.sigmas == pytest.approx(OFF_M / SIGMA_M)
