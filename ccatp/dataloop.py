@@ -120,7 +120,7 @@ class DataLoop(RobotServer):
 
     def _log_fault(self, what: str, injected: Injected) -> None:
         if self._log is not None:
-            self._log.info(f"fault_{what}", **injected._asdict())
+            self._log.info(f"fault_{what}", **injected.as_fields())
 
     def fail(self, error: Exception) -> None:
         """End ``run`` with an unforeseen error."""

@@ -75,16 +75,36 @@ def write_file(path: Path, text: str, mode: int | None = None, *, is_replacing: 
             new.replace(path)
         else:
             os.link(new, path)  # unlike a rename, this fails where the file exists by now
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        sync_folder(path)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
         if new is not None:
             new.unlink(missing_ok=True)
+
+
+def write_durably(path: Path, data: bytes) -> None:
+    """The file has the old content or the new one, whatever ends this process or the machine; raises OSError."""
+    new = path.with_name(f"{path.name}.new")
+    try:
+        with new.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(path)
+    except OSError:
+        new.unlink(missing_ok=True)
+        raise
+    sync_folder(path)
+
+
+def sync_folder(path: Path) -> None:
+    """A file was made or replaced: keep its name through a power cut."""
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
 
 
 def keep_traceback(error: BaseException, folder: Path | None = None) -> str:

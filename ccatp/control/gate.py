@@ -8,7 +8,7 @@ from enum import Enum, StrEnum
 from math import isfinite
 
 from ccatp.conditions import FANS_REFUSED
-from ccatp.config.models import LimitsConfig
+from ccatp.config.models import LimitsConfig, RobotConfig
 from ccatp.core import EventCode, Twist, Verdict, wheel_rates
 
 HELD = Twist(0.0, 0.0)
@@ -49,28 +49,19 @@ class Denial(StrEnum):
 class DriveGate:
     """Turns a wanted twist into wheel rates that are finite, limited and permitted, or into zero.
 
-    ``wheel_lag_s`` is the time constant T of the wheel servo: the feed-forward may step the set point by T times the
+    The feed-forward may step the set point by ``robot.wheel_lag_s``, the time constant T of the wheel servo, times the
     acceleration limit. No decision is made on a verdict or a frame older than its timeout. ``denied`` counts each
     reason; ``denial`` is that of the last call, None where the drive was passed or nothing was wanted.
     """
 
-    def __init__(
-        self,
-        limits: LimitsConfig,
-        wheel_radius_m: float,
-        wheel_base_m: float,
-        max_wheel_rad_s: float,
-        wheel_lag_s: float,
-        verdict_timeout_s: float,
-        frame_timeout_s: float,
-    ) -> None:
+    def __init__(self, limits: LimitsConfig, robot: RobotConfig, verdict_timeout_s: float) -> None:
         self._v_max = HEADROOM * limits.v_max_m_s
         self._omega_max = HEADROOM * limits.omega_max_rad_s
-        self._v_step = 2.0 * HEADROOM * limits.a_max_m_s2 * wheel_lag_s
-        self._omega_step = 2.0 * HEADROOM * limits.alpha_max_rad_s2 * wheel_lag_s
+        self._v_step = 2.0 * HEADROOM * limits.a_max_m_s2 * robot.wheel_lag_s
+        self._omega_step = 2.0 * HEADROOM * limits.alpha_max_rad_s2 * robot.wheel_lag_s
         self._a, self._alpha = HEADROOM * limits.a_max_m_s2, HEADROOM * limits.alpha_max_rad_s2
-        self._radius, self._base, self._max_wheel = wheel_radius_m, wheel_base_m, max_wheel_rad_s
-        self._verdict_timeout_s, self._frame_timeout_s = verdict_timeout_s, frame_timeout_s
+        self._radius, self._base, self._max_wheel = robot.wheel_radius_m, robot.wheel_base_m, robot.max_wheel_rad_s
+        self._verdict_timeout_s, self._frame_timeout_s = verdict_timeout_s, robot.sensors_timeout_s
         self._last = HELD
         self.denied = dict.fromkeys(Denial, 0)
         self.denial: Denial | None = None

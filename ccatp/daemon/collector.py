@@ -78,7 +78,7 @@ class Collector:
             from ccatp.records import beacon_summary  # noqa: PLC0415
 
             what = {"system": cfg.system, "seed": str(cfg.run.seed)}
-            self._record = beacon_summary.BeaconSummary(beacon_summary.beacon_facts(cfg, is_sim=is_sim))
+            self._record = beacon_summary.BeaconSummary(cfg, is_sim)
         else:
             what = {"mirror": cfg.mirror.name, "seed": str(cfg.run.seed), "world": cfg.world.name}
             self._record = SurveyRecord(cfg, run_dir, is_sim=is_sim)

@@ -19,7 +19,7 @@ import structlog
 import zmq
 
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.files import read_text
+from ccatp.config.files import read_text, sync_folder
 from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon.command_handlers import ObservatoryServer
@@ -127,11 +127,7 @@ class PersistentEmergencyLatch(EmergencyLatch):
                 file.flush()
                 os.fsync(file.fileno())
             self._new.replace(self._path)
-            folder = os.open(self._path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+            sync_folder(self._path)
         except OSError as error:
             self._log.error("emergencies_not_saved", error=str(error))
         with suppress(OSError):
@@ -258,14 +254,8 @@ class DangerLoop(RobotLoop):
             return
         self._published = news
         causes = verdict.cause, *(finding.cause for finding in found), *emergencies
-        fields: dict[str, Any] = {
-            "code": int(verdict.code),
-            "cause": verdict.cause,
-            "signal": verdict.signal,
-            "value": verdict.value,
-            "limit": verdict.limit,
-            "severity": int(verdict.severity),
-        }
+        fields: dict[str, Any] = {name: getattr(verdict, name) for name in ("cause", "signal", "value", "limit")}
+        fields |= {"code": int(verdict.code), "severity": int(verdict.severity)}
         active = [cause for cause in dict.fromkeys(causes) if cause]
         event = DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, active=active, **fields)
         self.publisher.send("danger_event", event)

@@ -13,7 +13,7 @@ from typing import Any
 from uuid import uuid4
 
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.files import read_input, read_text
+from ccatp.config.files import read_input, read_text, write_durably
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.daemon.danger_loop import FILE as EMERGENCIES
@@ -113,16 +113,6 @@ def take_over_emergencies(run_dir: Path) -> bool:
     except OSError as error:
         raise ConfigError(f"--resume-last: cannot take over {LATCHED_FILE}: {error.strerror}") from error
     return True
-
-
-def write_durably(path: Path, data: bytes) -> None:
-    """The file has the old content or the new one, whatever ends this process or the machine."""
-    new = path.with_name(f"{path.name}.new")
-    with new.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    new.replace(path)
 
 
 @dataclass(frozen=True, slots=True)

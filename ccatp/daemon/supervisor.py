@@ -8,7 +8,7 @@ import socket
 import sys
 import time
 from collections.abc import Mapping
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any
 import zmq
 
 from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.files import write_durably
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.daemon.child_processes import (
@@ -56,7 +57,6 @@ from ccatp.daemon.run_dir import (
     take_over_emergencies,
     take_runtime_dir,
     with_origin,
-    write_durably,
 )
 from ccatp.daemon.service import Service, is_journal, take_from
 from ccatp.daemon.terminal import STOP_SIGNALS, RunView, write_run_report
@@ -168,13 +168,9 @@ class SupervisedRun:
     def _write(self, summary: dict[str, Any]) -> None:
         """Complete or not at all: the summary of an earlier session is better than half of a new one."""
         path = self._run_dir / "summary.json"
-        new = path.with_name(path.name + ".new")
         try:
-            new.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
-            new.replace(path)
+            write_durably(path, (json.dumps(summary, indent=1) + "\n").encode())
         except OSError as error:
-            with suppress(OSError):
-                new.unlink()
             text = f"{path}: cannot be written: {error.strerror or error}"
             if (self._run_dir / "mission.sqlite").exists():
                 text += "; what was measured is in mission.sqlite"

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -36,39 +36,9 @@ WITHIN_SIGMAS = 3.0
 _DISTRIBUTION = ("rmse", "mean", "p50", "p99", "max")
 
 
-class BeaconFacts(NamedTuple):
-    """Facts of a run that are known before it starts.
-
-    ``safe_distance_m``: to be kept from the target; ``None`` without one. ``settled_s``: the least distance to the
-    target counts from this time on.
-    """
-
-    system: str
-    seed: int
-    waypoints: int
-    safe_distance_m: float | None
-    target: str
-    settled_s: float
-    has_truth: bool
-
-
-def beacon_facts(cfg: RadioConfig, *, is_sim: bool) -> BeaconFacts:
-    """Facts of a configured run."""
-    is_following = cfg.follow.is_active
-    return BeaconFacts(
-        system=cfg.system,
-        seed=cfg.run.seed,
-        waypoints=0 if is_following else cfg.mission.laps * len(cfg.workspace.waypoints_m),
-        safe_distance_m=cfg.follow.safe_distance_m if is_following else None,
-        target=cfg.follow.target,
-        settled_s=cfg.observation.every_steps * cfg.run.step_s,
-        has_truth=is_sim,
-    )
-
-
 @dataclass(slots=True)
 class BeaconSummary:
-    """Collects a run.
+    """Collects a run; ``has_truth``: it is simulated.
 
     Attributes:
         track, truth: rows of the topics ``beacon_track`` and ``beacon_truth``.
@@ -82,7 +52,8 @@ class BeaconSummary:
         signal: that by which motion is denied at present.
     """
 
-    facts: BeaconFacts
+    cfg: RadioConfig
+    has_truth: bool
     track: list[Sequence[float]] = field(default_factory=list)
     truth: list[Sequence[float | None]] = field(default_factory=list)
     places: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -121,7 +92,7 @@ class BeaconSummary:
 
     def build(self, wall_s: float) -> dict[str, Any]:
         """The summary; lengths in m, angles in rad, times in s. Values that need the truth are null without it."""
-        facts = self.facts
+        cfg = self.cfg
         track = pose_track(table(self.track, TRACK_COLUMNS))
         truth = pose_truth(table(self.truth, TRUTH_COLUMNS))
         if len(track.seq):  # the last drive may have been driven, or not
@@ -132,11 +103,11 @@ class BeaconSummary:
         is_navigating = track.t_s >= self.notes.get("map_time_s", 0.0)
         if is_navigating.any():
             track, true = track.at(is_navigating), true.at(is_navigating)
-        known = facts.has_truth and len(true.seq) > 0
+        known = self.has_truth and len(true.seq) > 0
         errors = pose_errors(track, true) if known else np.empty((0, 3))
         return {
-            "system": facts.system,
-            "seed": facts.seed,
+            "system": cfg.system,
+            "seed": cfg.run.seed,
             "outcome": self.outcome,
             "cause": self.cause,
             "waypoints": self._waypoints(truth if known else None),
@@ -163,14 +134,16 @@ class BeaconSummary:
     def _waypoints(self, truth: PoseTruth | None) -> dict[str, Any]:
         """Reached by the estimate, and how often the truth was within 3 sigma of it then."""
         within: int | None = None
+        cfg = self.cfg
+        total = 0 if cfg.follow.is_active else cfg.mission.laps * len(cfg.workspace.waypoints_m)
         if truth is not None:
             places = dict(zip(truth.seq.astype(int).tolist(), truth.place_m, strict=True))
             reached = [(estimate, places[seq]) for seq, estimate in self.reached if seq in places]
             within = sum(sigmas_off(estimate, place_m) <= WITHIN_SIGMAS for estimate, place_m in reached)
-        return {"total": self.facts.waypoints, "reached": len(self.reached), "within_3_sigma": within}
+        return {"total": total, "reached": len(self.reached), "within_3_sigma": within}
 
     def _beacon_figures(self, *, known: bool) -> dict[str, Any]:
-        found = {name: place for name, place in self.beacons.items() if name != self.facts.target}
+        found = {name: place for name, place in self.beacons.items() if name != self.cfg.follow.target}
         judged = beacon_errors(found, self.places) if known else {}
         errors, squares = [error_m for error_m, _ in judged.values()], [nees for _, nees in judged.values()]
         return {
@@ -183,13 +156,14 @@ class BeaconSummary:
         }
 
     def _target_figures(self, truth: PoseTruth, *, known: bool) -> dict[str, Any] | None:
-        safe_m = self.facts.safe_distance_m
-        if safe_m is None:
+        cfg = self.cfg
+        if not cfg.follow.is_active:
             return None
-        late = truth.at((truth.t_s >= self.facts.settled_s) & np.isfinite(truth.target_m[:, 0]) & known)
+        safe_m, settled_s = cfg.follow.safe_distance_m, cfg.observation.every_steps * cfg.run.step_s
+        late = truth.at((truth.t_s >= settled_s) & np.isfinite(truth.target_m[:, 0]) & known)
         distances = np.hypot(*(late.place_m - late.target_m).T)
         error_m = None
-        place = self.beacons.get(self.facts.target)
+        place = self.beacons.get(self.cfg.follow.target)
         if known and place is not None:
             error_m = rounded(np.hypot(*(place[:2] - truth.target_m[-1])))
         return {

@@ -10,7 +10,6 @@ the file a valid database is found, and the point is measured again.
 """
 
 import hashlib
-import os
 import shutil
 import sqlite3
 import tempfile
@@ -25,6 +24,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, NamedTuple, Self
 
+from ccatp.config.files import sync_folder
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.mirror.panel_alignment import Measured
 
@@ -177,11 +177,7 @@ class MissionStore:
                 db.execute("PRAGMA journal_mode = MEMORY")
                 _fill(db, points, meta, reserve_bytes)
             new.replace(path)
-            folder = os.open(path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+            sync_folder(path)
         except (OSError, sqlite3.Error) as error:
             raise StoreError(f"{path}: cannot be made: {error}") from error
         return cls.open(path, mirror=mirror)

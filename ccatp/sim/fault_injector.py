@@ -25,7 +25,7 @@ import numpy as np
 from ccatp.links.robot_codec import BadLine, RobotFrame, decode_from_robot, encode
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
-from ccatp.sim.fault_plan import SIGNALS, FaultPlan, Injected, InjectionRecord
+from ccatp.sim.fault_plan import SIGNALS, FaultPlan, Injected
 from ccatp.sim.plant import LEVEL_SLOPE, BodyStep, Disturbance, Plant, downhill
 from ccatp.sim.rules import FanRules
 from ccatp.sim.world import World
@@ -70,7 +70,7 @@ def _act_on_side(
 class SensorFault:
     """A fault that changes readings; ``past`` holds the readings that it needs later, with their times."""
 
-    def __init__(self, record: InjectionRecord, rng: np.random.Generator) -> None:
+    def __init__(self, record: Injected, rng: np.random.Generator) -> None:
         self.record, self.fault = record, record.fault
         self._effect = EFFECTS[self.fault.type]
         self.signal, self.rng, self.count = SIGNALS[self.fault.signal], rng, 0
@@ -194,7 +194,7 @@ EFFECTS: dict[str, Callable[[SensorFault, float, Reading], Reading | None]] = {
 class LateRows:
     """Rows of a signal that arrive late, whole, under the times at which they were taken; they keep their order."""
 
-    def __init__(self, record: InjectionRecord) -> None:
+    def __init__(self, record: Injected) -> None:
         self.record, self.signal = record, SIGNALS[record.fault.signal]
         self._waiting: deque[Row] = deque()
 
@@ -215,11 +215,11 @@ class LateRows:
 
 
 class Injector:
-    """The faults of the robot in a plan at work; ``drifts`` disturb the plant."""
+    """The robot's faults of a plan at work: ``injected``, in the order of the plan; ``drifts`` disturb the plant."""
 
     def __init__(self, plan: FaultPlan, mirror: Mirror, rng: np.random.Generator) -> None:
-        self._records = records = [InjectionRecord(fault) for fault in plan.faults]
-        self._on: defaultdict[str, list[InjectionRecord]] = defaultdict(list)
+        self.injected = records = tuple(map(Injected, plan.faults))
+        self._on: defaultdict[str, list[Injected]] = defaultdict(list)
         self._sensing: list[SensorFault | LateRows] = []
         children = rng.spawn(len(records)) if records else []
         for record, child in zip(records, children, strict=True):
@@ -236,29 +236,24 @@ class Injector:
             partial(self._drift, one) for one in self._on["body"] if one.fault.type == "drift"
         ]
         self._has_weak_fan = any(one.fault.type == "weak" for one in records)
-        self._begun: set[InjectionRecord] = set()
-        self._ended: set[InjectionRecord] = set()
+        self._begun: set[Injected] = set()
+        self._ended: set[Injected] = set()
         self._withheld = b""
         self._seq_0, self._boot_s = 0, 0.0
-
-    @property
-    def injected(self) -> tuple[Injected, ...]:
-        """What became of each fault of the robot, in the order of the plan."""
-        return tuple(record.injected for record in self._records)
 
     def changes(self, t_s: float) -> Iterator[tuple[str, Injected]]:
         """Faults that began or ended since the last call: ``begins`` or ``ended``, and the record.
 
         A fault of an instant ends as it begins.
         """
-        for record in self._records:
+        for record in self.injected:
             if record not in self._begun:
                 if record.from_s is not None:
                     self._begun.add(record)
-                    yield "begins", record.injected
+                    yield "begins", record
             elif record not in self._ended and t_s >= record.fault.end_s:
                 self._ended.add(record)
-                yield "ended", record.injected
+                yield "ended", record
 
     def act(
         self, world: World, fans: FanRules, t_s: float, set_points_rad_s: tuple[float, float]
@@ -281,7 +276,7 @@ class Injector:
         world.grip = grip[0], grip[1]
         return rates[0], rates[1]
 
-    def _drift(self, record: InjectionRecord, plant: Plant, t_s: float, dt_s: float, *moved: float) -> BodyStep:
+    def _drift(self, record: Injected, plant: Plant, t_s: float, dt_s: float, *moved: float) -> BodyStep:
         """A disturbance of the plant: downhill while the wheels are held at zero."""
         forward_m, left_m, turn_rad = moved
         right_set, _, left_set, _ = plant.servo

@@ -204,29 +204,18 @@ LOCKSTEP_TYPES = ("reset", "close", "duplicate", "fragment", "garbage", "corrupt
 never do."""
 
 
-class Injected(NamedTuple):
-    """What became of one fault of the plan.
+class Injected:
+    """What has become of one fault of the plan so far.
 
     Attributes:
         at_s: when it was to begin; ``None`` for a fault of the link that waits for something else.
         from_s, until_s: the first and last sample, frame or step that it acted on, robot time; ``None``: none yet.
-        changed: how many of them came out different, or not at all.
+        changed: how many of these ``samples`` came out different, or not at all.
     """
-
-    signal: str
-    type: str
-    at_s: float | None
-    from_s: float | None
-    until_s: float | None
-    samples: int
-    changed: int
-
-
-class InjectionRecord:
-    """The record of one fault while it is written."""
 
     def __init__(self, fault: Any) -> None:
         self.fault = fault
+        self.signal, self.type, self.at_s = str(fault.signal), str(fault.type), fault.at_s
         self.from_s: float | None = None
         self.until_s: float | None = None
         self.samples = self.changed = 0
@@ -239,11 +228,9 @@ class InjectionRecord:
         self.samples += 1
         self.changed += is_changed
 
-    @property
-    def injected(self) -> Injected:
-        """The record so far."""
-        fault = self.fault
-        return Injected(fault.signal, fault.type, fault.at_s, self.from_s, self.until_s, self.samples, self.changed)
+    def as_fields(self) -> dict[str, Any]:
+        """The record for a log."""
+        return {name: value for name, value in vars(self).items() if name != "fault"}
 
 
 class FaultPlan(NamedTuple):

@@ -12,7 +12,7 @@ from collections import Counter, deque
 from math import inf
 from typing import Any, Literal, Self, cast
 
-from ccatp.sim.fault_plan import Direction, Injected, InjectionRecord, LinkFault
+from ccatp.sim.fault_plan import Direction, Injected, LinkFault
 
 OneWay = Literal["to_client", "to_robot"]
 OneWayFaults = dict[str, Any]
@@ -393,7 +393,7 @@ class LinkFaults:
 
     def __init__(self, plan: tuple[LinkFault, ...], proxy: FaultProxy) -> None:
         self._proxy = proxy
-        self._records = [InjectionRecord(fault) for fault in plan]
+        self._records = tuple(map(Injected, plan))
         self._counts_before = dict.fromkeys(self._records, 0)
         for record in self._records:
             if _is_armed(record.fault):
@@ -405,7 +405,7 @@ class LinkFaults:
         for record in self._records:
             if record.from_s is not None and record.until_s is None:
                 self._count(record)
-        return tuple(record.injected for record in self._records)
+        return self._records
 
     def changes(self, t_s: float) -> list[tuple[str, Injected]]:
         """Begin and end what is due at a robot time; what began (``begins``) and ended (``ended``)."""
@@ -420,12 +420,12 @@ class LinkFaults:
                 if fault.type in _AT_ONCE:
                     record.until_s = t_s
                 self._count(record)
-                news.append(("begins", record.injected))
+                news.append(("begins", record))
             elif record.from_s is not None and record.until_s is None and t_s >= record.from_s + (fault.for_s or inf):
                 self._count(record)
                 record.until_s = t_s
                 self._proxy.heal(fault.direction, fault.type)
-                news.append(("ended", record.injected))
+                news.append(("ended", record))
         return news
 
     def _is_due(self, fault: LinkFault, t_s: float) -> bool:
@@ -435,7 +435,7 @@ class LinkFaults:
             return self._proxy.passed_lines >= fault.after_lines
         return fault.after_bytes is not None and self._proxy.passed_bytes >= fault.after_bytes
 
-    def _count(self, record: InjectionRecord) -> None:
+    def _count(self, record: Injected) -> None:
         record.samples = record.changed = self._proxy.counts[record.fault.type] - self._counts_before[record]
 
 

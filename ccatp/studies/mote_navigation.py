@@ -30,7 +30,7 @@ from ccatp.links.beacon_messages import (
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage, is_estimate_due
-from ccatp.records.beacon_summary import BeaconSummary, beacon_facts
+from ccatp.records.beacon_summary import BeaconSummary
 from ccatp.report.plots import QUIET
 from ccatp.safety.beacons import BeaconSafetyRules
 from ccatp.sim.beacon_robot import build_beacon_robot
@@ -68,7 +68,7 @@ class BeaconSilWorld:
         self.mission, self.danger = BeaconMission(cfg), BeaconSafetyRules(cfg)
         self.found = BeaconSilResult(truth=[self.robot.truth_row()])
         self._reader = MeasurementReader(cfg)
-        self._summary = BeaconSummary(beacon_facts(cfg, is_sim=True))
+        self._summary = BeaconSummary(cfg, has_truth=True)
         self._estimate: EstimateMessage | None = None
         self._verdict: Verdict | None = None
         self._signal = ""

@@ -143,7 +143,7 @@ def assemble(cfg: Config, done: Collection[PointId] = (), checkpoint: Checkpoint
         mirror=mirror,
         localizer=localizer,
         mission=mission,
-        gate=build_gate(cfg),
+        gate=DriveGate(cfg.limits, cfg.robot, cfg.mission.verdict_timeout_s),
         route=route,
         points=tuple(points),
         lower_bound_s=path_time(route.stops, mirror.base_pose, cfg.limits, mirror, cfg.etalon.measuring_time_s),
@@ -178,20 +178,6 @@ def plan_survey(
     route = planner.route(mirror.base_pose, points, done, out_of_reach)
     # The four states have none that the drive could calibrate.
     return planner.with_calibration(route) if calibrates and cfg.run.filter not in FOUR_STATE else route
-
-
-def build_gate(cfg: Config) -> DriveGate:
-    """The last gate before the wheels."""
-    robot = cfg.robot
-    return DriveGate(
-        cfg.limits,
-        robot.wheel_radius_m,
-        robot.wheel_base_m,
-        robot.max_wheel_rad_s,
-        robot.wheel_lag_s,
-        cfg.mission.verdict_timeout_s,
-        robot.sensors_timeout_s,
-    )
 
 
 def robot_problems(cfg: Config, mirror: Mirror, hello: Hello) -> list[str]:

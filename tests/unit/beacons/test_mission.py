@@ -29,7 +29,7 @@ from ccatp.errors import ConfigError
 from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
-from ccatp.records.beacon_summary import BeaconSummary, beacon_facts
+from ccatp.records.beacon_summary import BeaconSummary
 from ccatp.safety.beacons import BeaconSafetyRules, ObstacleBuffer
 from ccatp.sim.beacon_robot import BeaconRobot
 from ccatp.sim.radio_world import RadioWorld
@@ -276,7 +276,7 @@ def test_another_robot_is_refused(system: str, keys: dict[str, Any], what: str, 
 
 
 def test_a_summary_without_truth_holds_what_needs_none(cfg: RadioConfig) -> None:
-    book = BeaconSummary(beacon_facts(cfg, is_sim=False))
+    book = BeaconSummary(cfg, has_truth=False)
     navigator = BeaconMission(cfg).navigator
     book.beacons, book.score = {"beacon1": (0.1, 0.2, 0.01, 0.0, 0.01)}, (2.0, 2, 0)
     book.notes = navigator.notes

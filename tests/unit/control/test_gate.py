@@ -13,6 +13,7 @@ from ccatp.control.gate import Denial, DriveGate, FanGate, Purpose
 from ccatp.core import EventCode, Twist, Verdict, twist_of, wheel_rates
 from ccatp.daemon.survey_runner import GateLog
 from ccatp.survey.events import AMONG_BEACONS, PURPOSES, MissionState
+from tests.support.scenario import config_of
 
 LIMITS = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=0.8, alpha_max_rad_s2=2.0)
 FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
@@ -26,7 +27,8 @@ SLOW = Twist(0.01, 0.0)
 
 
 def gate(max_wheel_rad_s: float = 8.0) -> DriveGate:
-    return DriveGate(LIMITS, R, L, max_wheel_rad_s, 0.08, VERDICT_S, FRAME_S)
+    wheels = {"wheel_radius_m": R, "wheel_base_m": L, "max_wheel_rad_s": max_wheel_rad_s, "wheel_lag_s": 0.08}
+    return DriveGate(LIMITS, config_of().robot.model_copy(update={**wheels, "sensors_timeout_s": FRAME_S}), VERDICT_S)
 
 
 def drive(

@@ -10,11 +10,10 @@ from msgspec.structs import astuple
 from scipy.linalg import solve_continuous_are
 
 from ccatp.config.models import Config
-from ccatp.control.gate import Purpose
+from ccatp.control.gate import DriveGate, Purpose
 from ccatp.control.tracker import LegLine, LegMotion, LegPhase, LegTracker, LegView, line_rate
 from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import EventCode, Twist, Verdict, difference, twist_of
-from ccatp.survey.composition import build_gate
 from ccatp.survey.planning.search import bang_bang_time
 
 DT, LAG = 0.01, 0.08
@@ -234,7 +233,7 @@ class Rig:
         self.wheels = [0.0, 0.0]
         self.slip, self.creep, self.lag_s = slip, creep, lag * robot.wheel_lag_s
         self.sent = SentDrives(robot, DT_CLOSED_LOOP)
-        self.gate = build_gate(config)
+        self.gate = DriveGate(config.limits, config.robot, config.mission.verdict_timeout_s)
         self.tracker = Leg(LegTracker(config.control, config.limits, robot.wheel_lag_s))
         self.link: deque[tuple[int, float, float]] = deque([(-1, 0.0, 0.0)] * delay)
         self.echo, self.seq = -1, 0
