@@ -29,17 +29,19 @@ COLUMNS = (
 )
 
 
-def page(table: Table, kept: Record) -> str:
+def page(table: Table, kept: Record, before: str = "") -> str:
     """The page as Markdown.
 
     Args:
         table: the rows.
         kept: the record of the tests that passed.
+        before: the page as it was; a row of which no test is in the record keeps what was measured for it.
     """
+    earlier = {cells[0]: cells[6:8] for line in before.splitlines() if len(cells := line.strip("| ").split(" | ")) == 8}
     parts = [HEAD.format(where=_where(kept))]
     for kind, title in KINDS.items():
         rows = {row_id: row for row_id, row in table.items() if row_id.startswith(kind)}
-        lines = [_line(row_id, row, kept) for row_id, row in rows.items()]
+        lines = [_line(row_id, row, kept, earlier.get(row_id, ["", ""])) for row_id, row in rows.items()]
         parts.append("\n".join([f"## {title}\n", COLUMNS, *lines]) + "\n")
     return "\n".join(parts)
 
@@ -53,11 +55,12 @@ def _where(kept: Record) -> str:
     return f" on {' and '.join(machines)}, {when}"
 
 
-def _line(row_id: str, row: Row, kept: Record) -> str:
+def _line(row_id: str, row: Row, kept: Record, earlier: list[str]) -> str:
     shown = {name: entry for name, entry in kept.items() if row_id in entry["rows"]}
     bound = row.bound if row.hardware is None else f"{row.bound}. Robot: {row.hardware} ({_listed(row.conformance)})"
-    by = _files(shown) if row.open is None else f"open: {row.open}"
-    cells = [row_id, row.fault, row.detection, row.reaction, row.severity, bound, _measured(row_id, row, shown), by]
+    measured, by = (_measured(row_id, row, shown), _files(shown)) if shown else earlier
+    by = by if row.open is None else f"open: {row.open}"
+    cells = [row_id, row.fault, row.detection, row.reaction, row.severity, bound, measured, by]
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
@@ -86,7 +89,7 @@ def _listed(names: Iterable[str]) -> str:
 def main() -> int:
     """Write the page; what is missing in it goes to standard error."""
     table, kept = load_table(), load_record(ROOT / RECORD)
-    PAGE.write_text(page(table, kept), encoding="utf-8")
+    PAGE.write_text(page(table, kept, PAGE.read_text(encoding="utf-8")), encoding="utf-8")
     shown = {row_id for entry in kept.values() for row_id in entry["rows"]}
     print(f"{PAGE.relative_to(ROOT)}: {len(table)} rows")
     if missing := [row_id for row_id in table if row_id not in shown]:

@@ -267,6 +267,9 @@ def test_bound_and_worst_case(tmp_path: Path) -> None:
     assert cells[7] == "test_a (1), test_b (1)"
     assert line_of("F6", text)[6] == "22 percent"  # of a lower limit the worst is the least
     assert line_of("S2", text)[6:] == ["", ""]
+    earlier = text.replace(line_of("S2", text)[5] + " |  |  |", line_of("S2", text)[5] + " | 60 ms | test_c (5) |")
+    assert line_of("S2", page(table, load_record(kept), earlier))[6:] == ["60 ms", "test_c (5)"]
+    assert line_of("S1", page(table, {}, text))[6:] == cells[6:]
     assert "`lost-controller-fin`" in line_of("L1", text)[5]
     assert machine_line() in text
     assert [line_of(row_id, text)[1] for row_id in table] == [row.fault for row in table.values()]
