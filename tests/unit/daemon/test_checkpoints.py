@@ -42,6 +42,7 @@ from ccatp.survey.events import (
 )
 from ccatp.survey.planning.route import Route
 from ccatp.survey.state import FixNeed, SurveyState
+from tests.faults.linking import Measured
 from tests.support.mission_story import ABORT, FREE, Story, from_first_leg
 
 
@@ -308,7 +309,8 @@ def test_a_survey_goes_on_from_its_directory(tmp_path: Path) -> None:
     assert len({stop.point for stop in state.route.stops} - {None}) == 8
 
 
-def test_files_of_another_run_are_refused(tmp_path: Path) -> None:
+@pytest.mark.fault("P24")
+def test_files_of_another_run_are_refused(tmp_path: Path, measured: Measured) -> None:
     older, one, two = (args(load_config(None, {"run.panels": 1}), tmp_path / name) for name in ("older", "one", "two"))
     for where in (older, one, two):
         if where is not older:
@@ -331,6 +333,7 @@ def test_files_of_another_run_are_refused(tmp_path: Path) -> None:
                 build(replace(one, is_resuming=True))
             (one.run_dir / name).write_bytes(before)
     build(replace(one, is_resuming=True))[1].close()
+    measured("P24", 0)
 
 
 def test_it_is_written_ten_times_a_second_at_once_in_a_hold_or_abort_and_never_without_a_place(
