@@ -1,4 +1,4 @@
-"""``ccatp recording info`` and ``ccatp recording repair``."""
+"""``ccatp recording info``, ``repair`` and ``export``."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ccatp.cli.common import PATH, CommandGroup, example, json_option
+from ccatp.cli.common import PATH, CommandGroup, example, json_option, warn, write_lines
+from ccatp.errors import ConfigError
 
 if TYPE_CHECKING:
     from ccatp.records.recording_repair import RecordingFacts
@@ -66,6 +67,36 @@ def repair(path: Path, out: Path | None, json_output: bool) -> int:
     state = "was complete" if saved.condition.is_complete else f"{lost} of {saved.condition.size_bytes} bytes are lost"
     click.echo(f"{saved.path}: {saved.messages} messages{until}; {file} {state}")
     return 0
+
+
+@recording.command(
+    epilog=example(
+        "ccatp recording export runs/tonight --tum estimate.tum --truth truth.tum", "evo_ape tum truth.tum estimate.tum"
+    )
+)
+@click.argument("run_dir", type=PATH)
+@click.option("--tum", "tum_file", type=PATH, required=True, help="File for the estimates of the run.")
+@click.option("--truth", "truth_file", type=PATH, help="File for the simulated truth.")
+def export(run_dir: Path, tum_file: Path, truth_file: Path | None) -> None:
+    """Write the path of a survey as a TUM trajectory, for evo and others: deck frame, m, the robot's clock.
+
+    Of a run that was resumed the newest recording is taken.
+    """
+    from ccatp.mirror.mirror import build_mirror
+    from ccatp.records.run_reader import format_tum, open_run
+
+    newest = open_run(run_dir)[-1]
+    for _ in newest.messages():
+        pass
+    truth = newest.truth()
+    if truth_file is not None and truth is None:
+        raise ConfigError(f"--truth: {newest.path} is of a real robot and holds no truth; leave it out")
+    warn(newest.warnings)
+    traces = [(tum_file, newest.recorded(build_mirror(newest.config({}).mirror)))]
+    traces += [(truth_file, truth)] if truth_file is not None and truth is not None else []
+    for file, trace in traces:
+        write_lines("--tum" if file == tum_file else "--truth", file, format_tum(trace).splitlines())
+        click.echo(f"{file}: {len(trace.seq)} poses")
 
 
 def _print_facts(facts: "RecordingFacts") -> None:

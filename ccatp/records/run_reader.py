@@ -120,6 +120,14 @@ class Trace(NamedTuple):
         return Trace(self.seq, self.t_s, pose, heights, covariance)
 
 
+def format_tum(trace: Trace) -> str:
+    """The trace as a trajectory of the TUM format: t_s x y z qx qy qz qw a line, deck frame, m, turned about z."""
+    half = 0.5 * trace.pose[:, 2]
+    zeros = np.zeros_like(half)
+    rows = np.column_stack([trace.t_s, trace.place, zeros, zeros, np.sin(half), np.cos(half)])
+    return "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in rows.tolist())
+
+
 class TraceBuilder:
     """Collects poses in panel frames, in little memory."""
 

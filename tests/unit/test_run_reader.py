@@ -4,6 +4,7 @@ import json
 import shutil
 import sqlite3
 from contextlib import closing
+from math import cos, hypot, sin
 from pathlib import Path
 from typing import Any
 
@@ -371,3 +372,27 @@ def test_a_recording_that_cannot_be_read_is_told(survey_dir: Path, monkeypatch: 
     assert found.warnings == (
         f"{survey_dir / 'telemetry.mcap'}: cannot be read: Permission denied; the truth is not compared",
     )
+
+
+def test_a_path_is_exported_as_a_trajectory(
+    tmp_path: Path, config_text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, estimates, truth = tmp_path / "run", tmp_path / "e.tum", tmp_path / "t.tum"
+    rows = [(0, 0.0, 1.0, 2.0, 0.5, 1.0, 2.0, 3.0, 0.1, 0, 0)]
+    messages: list[tuple[str, Message]] = [("sensors", batch(0, 1)), ("track", track(0, 1))]
+    record(run, [*messages, ("truth", TruthMessage(seq=0, t_s=0.0, rows=rows))], config=config_text, simulation="true")
+    (run / "config.toml").write_text(config_text, encoding="utf-8")
+    assert main(["recording", "export", str(run), "--tum", str(estimates), "--truth", str(truth)]) == 0
+    assert capsys.readouterr().out == f"{estimates}: 2 poses\n{truth}: 1 poses\n"
+    t_s, *place, qx, qy, qz, qw = map(float, truth.read_text().split())
+    assert (t_s, place, qx, qy) == (0.0, [1.0, 2.0, 3.0], 0.0, 0.0)
+    assert (qz, qw) == pytest.approx((sin(0.25), cos(0.25)), abs=1e-9)
+    begin, end = ([*map(float, line.split())] for line in estimates.read_text().splitlines())
+    assert end[0] - begin[0] == pytest.approx(0.01)
+    assert hypot(end[1] - begin[1], end[2] - begin[2]) == pytest.approx(0.001, abs=1e-6)  # along a panel that is tilted
+    assert "--tum: cannot write" in refused(capsys, "recording", "export", run, "--tum", tmp_path / "none" / "e.tum")
+    other = tmp_path / "robot"
+    record(other, messages, config=config_text)
+    (other / "config.toml").write_text(config_text, encoding="utf-8")
+    text = refused(capsys, "recording", "export", other, "--tum", estimates, "--truth", truth)
+    assert "of a real robot and holds no truth" in text
