@@ -55,10 +55,11 @@ class DriveGate:
     """
 
     def __init__(self, limits: LimitsConfig, robot: RobotConfig, verdict_timeout_s: float) -> None:
+        wheel_lag_s = robot.wheel_lag_s
         self._v_max = HEADROOM * limits.v_max_m_s
         self._omega_max = HEADROOM * limits.omega_max_rad_s
-        self._v_step = 2.0 * HEADROOM * limits.a_max_m_s2 * robot.wheel_lag_s
-        self._omega_step = 2.0 * HEADROOM * limits.alpha_max_rad_s2 * robot.wheel_lag_s
+        self._v_step = 2.0 * HEADROOM * limits.a_max_m_s2 * wheel_lag_s
+        self._omega_step = 2.0 * HEADROOM * limits.alpha_max_rad_s2 * wheel_lag_s
         self._a, self._alpha = HEADROOM * limits.a_max_m_s2, HEADROOM * limits.alpha_max_rad_s2
         self._radius, self._base, self._max_wheel = robot.wheel_radius_m, robot.wheel_base_m, robot.max_wheel_rad_s
         self._verdict_timeout_s, self._frame_timeout_s = verdict_timeout_s, robot.sensors_timeout_s
