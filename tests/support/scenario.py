@@ -5,11 +5,11 @@ import socket
 from collections.abc import Callable
 from functools import cache
 from math import sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.config.load import load_config
+from ccatp.config.load import available, load_config
 from ccatp.config.models import Config
 from ccatp.dataloop import DataLoop, survey_robot
 from ccatp.links.robot_codec import decode_from_robot
@@ -19,6 +19,8 @@ from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.sim.fault_proxy import FaultProxy
 from ccatp.sim.robot import Robot
 from ccatp.sim.sessions import RobotServer, RobotSession, ServerLog
+
+MIRRORS = tuple(available("mirror"))
 
 
 def config_of(mirror: str = "fyst-m1", **overrides: object) -> Config:
@@ -31,6 +33,19 @@ def config_of(mirror: str = "fyst-m1", **overrides: object) -> Config:
 def mirror_of(name: str = "fyst-m1") -> Mirror:
     """A shipped mirror; one object for all tests."""
     return build_mirror(config_of(name).mirror)
+
+
+class World(NamedTuple):
+    """A shipped configuration and its mirror."""
+
+    cfg: Config
+    mirror: Mirror
+
+
+@cache
+def world_of(name: str = "fyst-m1") -> World:
+    """The default configuration with a shipped mirror; one object for all tests."""
+    return World(config_of(name), mirror_of(name))
 
 
 def transport_rad(mirror: Mirror, x: float, y: float, dx: float, dy: float) -> float:

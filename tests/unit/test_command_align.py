@@ -16,10 +16,11 @@ from ccatp.mirror.misalignment import PanelMisalignment
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.studies.sil_run import SilLaser, SilRun, StopRow
 from tests.support.command import answered
-from tests.unit.aligning.conftest import NAMES, exact_fix, load, misaligned, survey
+from tests.support.scenario import MIRRORS, world_of
+from tests.unit.aligning.conftest import exact_fix, misaligned, survey
 from tests.unit.run_folder import make_run
 
-CFG, M1 = load("fyst-m1")
+CFG, M1 = world_of()
 PANEL = PanelId(3, 7)
 LIES = PanelMisalignment(40e-6, -90e-6, 120e-6)
 
@@ -62,7 +63,7 @@ def run_dir(tmp_path: Path) -> Path:
     return make_run(tmp_path / "run", CFG, planned, measured, truth)
 
 
-@pytest.mark.parametrize("name", [NAMES[0], *(pytest.param(name, marks=pytest.mark.slow) for name in NAMES[1:])])
+@pytest.mark.parametrize("name", [MIRRORS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in MIRRORS[1:])])
 def test_a_survey_recovers_what_was_simulated(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cfg = load_config(overrides={"run.mirror": name, "run.panels": 1, "mission.calibration_length_m": 0.0})
     found = aligned(capsys, surveyed(tmp_path / "run", cfg))

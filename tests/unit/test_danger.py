@@ -8,15 +8,15 @@ from weakref import ReferenceType, ref
 import pytest
 
 from ccatp.conditions import BEYOND_SEAM, CENTRE_NEAR_RIM, NO_SEAM, OFF_WITHOUT_WHEELS, RIM_AHEAD
-from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import Corner, EdgeSample, EventCode, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
-from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mirror.mirror import Mirror
 from ccatp.safety.edge_detector import EdgeMap
 from ccatp.safety.wheel_odometry import KNOTS_KEPT, Odometry, WheelTrack, pose_at
+from tests.support.scenario import World
 
 FL, FR, RL, RR = ("front_left",), ("front_right",), ("rear_left",), ("rear_right",)
 FRONT, ALL = FL + FR, FL + FR + RL + RR
@@ -27,14 +27,14 @@ def frame_of(seq: int, t: float, enc: list[WheelSample], edge: list[EdgeSample])
     return Sensors(seq, t, [], enc, edge, None, (0.8, 0.8), 1.0, CommandEcho(0, 0.0, 0.0, False), [])
 
 
-@pytest.fixture(scope="module")
-def cfg() -> Config:
-    return load_config(None, {"run.mirror": "thesis-m1"})
+@pytest.fixture
+def cfg(thesis: World) -> Config:
+    return thesis.cfg
 
 
-@pytest.fixture(scope="module")
-def mirror(cfg: Config) -> Mirror:
-    return build_mirror(cfg.mirror)
+@pytest.fixture
+def mirror(thesis: World) -> Mirror:
+    return thesis.mirror
 
 
 @dataclass

@@ -26,7 +26,8 @@ from ccatp.records.recorder import RECORD_FORMAT, Recorder
 from ccatp.records.run_reader import RunReadError, open_run, read_run
 from ccatp.studies import replay as player
 from tests.support.command import refused
-from tests.unit.aligning.conftest import exact_fix, load
+from tests.support.scenario import world_of
+from tests.unit.aligning.conftest import exact_fix
 from tests.unit.run_folder import make_run, record_truth, recorder_in
 
 
@@ -244,7 +245,7 @@ def test_warnings_go_to_standard_error(tmp_path: Path, config_text: str, capsys:
     assert json.loads(out)["warnings"] == [err.removeprefix("ccatp: warning: ").rstrip()]
 
 
-CFG, M1 = load("fyst-m1")
+CFG, M1 = world_of()
 PANEL = PanelId(3, 7)
 LIES = PanelMisalignment(1e-5, 2e-5, -3e-5)
 POINTS = M1.point_ids(PANEL)

@@ -1,42 +1,20 @@
 """Surveys without a robot: points of misaligned panels, measured with the laser's noise."""
 
 from collections.abc import Callable, Iterable, Mapping
-from functools import cache
 
 import numpy as np
-import pytest
 
-from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, FloatArray, PanelId, PointId
-from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.multilateration import solve_fix
 from ccatp.mirror.panel_alignment import Deviations, Measured
 from ccatp.sim.world import draw_misalignments
 
-NAMES = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
 HEIGHT_M = 0.05
 Truth = Mapping[PanelId, PanelMisalignment]
 Survey = Callable[[Truth, np.random.Generator], list[Measured]]
-
-
-@cache
-def load(name: str) -> tuple[Config, Mirror]:
-    cfg = load_config(overrides={"run.mirror": name})
-    return cfg, build_mirror(cfg.mirror)
-
-
-@pytest.fixture(params=NAMES)
-def each(request: pytest.FixtureRequest) -> tuple[Config, Mirror]:
-    """Each shipped mirror in turn, with its configuration."""
-    return load(request.param)
-
-
-@pytest.fixture
-def m1() -> Mirror:
-    """M1 of the telescope as built."""
-    return load("fyst-m1")[1]
 
 
 def misaligned(cfg: Config, panels: Iterable[PanelId], rng: np.random.Generator) -> dict[PanelId, PanelMisalignment]:

@@ -7,7 +7,7 @@ from math import sqrt
 import numpy as np
 import pytest
 
-from ccatp.config.models import AlignConfig, Config
+from ccatp.config.models import AlignConfig
 from ccatp.core import DeckPose, PanelId, PointId, Vector3
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import SurveyResult, compare, survey_result
@@ -31,7 +31,8 @@ from ccatp.mirror.panel_alignment import (
     rigid,
 )
 from ccatp.mirror.surface import UnknownPanelError
-from tests.unit.aligning.conftest import GRID_M, HEIGHT_M, Truth, exact_fix, load, misaligned, on_grid, survey
+from tests.support.scenario import World, world_of
+from tests.unit.aligning.conftest import GRID_M, HEIGHT_M, Truth, exact_fix, misaligned, on_grid, survey
 
 # -- deviations -------------------------------------------------------------------------------------------------------
 
@@ -216,8 +217,8 @@ def test_few_points_accuse_nobody(count: int) -> None:
 
 def test_light_on_m2_comes_from_m1() -> None:
     # Independent: rays along world +z, reflected at the panels of M1 by the law of reflection, and traced to M2.
-    _, m1 = load("fyst-m1")
-    cfg, m2 = load("fyst-m2")
+    _, m1 = world_of()
+    cfg, m2 = world_of("fyst-m2")
     hit = 0
     for body in m1.panels.values():
         normal = np.array(m1.rotate_world_from_deck(body.axes[2]))
@@ -250,7 +251,7 @@ def test_panels_count_with_their_area_across_the_beam() -> None:
 # -- whole mirrors -----------------------------------------------------------------------------------------------------
 
 
-CFG, M1 = load("fyst-m1")
+CFG, M1 = world_of()
 TILTED = PanelId(3, 7)
 TRUTH = PanelMisalignment(piston_m=73e-6, tip_rad=-140e-6, tilt_rad=95e-6)
 
@@ -289,8 +290,8 @@ def true_rms_m(truth: Truth, panels: tuple[PanelResult, ...], mirror: Mirror) ->
     return float(np.sqrt(total / weights))
 
 
-def test_a_whole_mirror_is_recovered_and_its_moves_align_it(each: tuple[Config, Mirror]) -> None:
-    cfg, mirror = each
+def test_a_whole_mirror_is_recovered_and_its_moves_align_it(world: World) -> None:
+    cfg, mirror = world
     rng = np.random.default_rng(21)
     truth = misaligned(cfg, mirror.panels, rng)
     result = survey_result(mirror, cfg.align, HEIGHT_M, survey(cfg, mirror, truth, rng), mirror.panels)

@@ -3,14 +3,7 @@
 import pytest
 
 from ccatp.config.models import FullStateConfig, LocalizerConfig
-from ccatp.mirror.mirror import Mirror
 from tests.unit.estimation import drive
-
-
-@pytest.fixture(scope="session")
-def mirror() -> Mirror:
-    """The default mirror."""
-    return drive.mirror()
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import (
     DeckPose,
@@ -32,7 +31,7 @@ from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.localizer_base import FilterWrap, unwrapped
 from ccatp.filters.base import Filter, FilterDiverged
 from ccatp.localizer import Localizer, build_localizer
-from ccatp.mirror.mirror import Mirror, build_mirror
+from tests.support.scenario import config_of, mirror_of
 
 Rate = Callable[[float], float]
 DT_S = 1e-3
@@ -51,14 +50,7 @@ class Frame(NamedTuple):
     gravity: GravitySample | None
 
 
-@cache
-def config() -> Config:
-    return load_config()
-
-
-@cache
-def mirror() -> Mirror:
-    return build_mirror(config().mirror)
+config, mirror = cache(config_of), mirror_of
 
 
 def build(

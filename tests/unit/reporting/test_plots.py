@@ -29,14 +29,8 @@ from ccatp.report.plots import (
     svg_of,
 )
 from ccatp.report.record import read_record
-from tests.support.scenario import mirror_of
 
 PNG = b"\x89PNG\r\n\x1a\n"
-
-
-@pytest.fixture(scope="module")
-def mirror() -> Mirror:
-    return mirror_of()
 
 
 def test_an_envelope() -> None:

@@ -13,7 +13,7 @@ from ccatp.config.models import Config
 from ccatp.control.tracker import LegTracker
 from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Verdict
 from ccatp.links.robot_messages import Sensors
-from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mirror.mirror import Mirror
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.behaviours import SETTLE_LIMIT_S, Retreat, RetreatStep, Settling, Standstill
 from ccatp.survey.checks import PATIENCE_S, READINGS, MirrorCheck
@@ -21,14 +21,10 @@ from ccatp.survey.events import Pause, Resume
 from ccatp.survey.fix_gate import ApproachCounter
 from ccatp.survey.planning.escape import is_on_drive
 from ccatp.survey.route_follower import LegAim, LegFollower, StateEstimate, plan_aim
+from tests.support.scenario import MIRRORS, mirror_of
 
 DT, MEASURING_S = 0.01, 0.5
 POINT = PointId(5, 5, 1)
-
-
-@pytest.fixture(scope="module")
-def mirror(config: Config) -> Mirror:
-    return build_mirror(config.mirror)
 
 
 class Standing:
@@ -304,13 +300,8 @@ def test_where_there_is_room_it_turns_to_the_side_that_stands(off: Four, sense: 
     assert end[2] - 0.5 * pi == pytest.approx(sense * CFG.mission.turn_away_rad, abs=0.05)
 
 
-MIRRORS = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
 SIGMA_RAD = 0.035  # of a reading, as shipped
 SEEDS = 40
-
-
-def mirror_of(name: str) -> Mirror:
-    return build_mirror(load_config(overrides={"run.mirror": name}).mirror)
 
 
 def noisy(direction: np.ndarray, rng: np.random.Generator) -> tuple[float, float, float, float]:

@@ -1,6 +1,6 @@
 """Pure. What the robot can face and where it can turn, at the rim."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import accumulate, pairwise, permutations
 from math import asin, degrees, hypot, nan, pi, radians, sqrt
 from typing import Any
@@ -32,6 +32,7 @@ from ccatp.survey.planning.search import (
     turn_time,
 )
 from ccatp.survey.planning.tour_bound import tour_bound
+from tests.support.scenario import world_of
 
 
 def body_of(world: Any) -> Body:
@@ -205,9 +206,9 @@ def test_measuring_time_counts_per_point(thesis: Any) -> None:
 
 
 @pytest.mark.parametrize("name", ["thesis-m1", "fyst-m2"])
-def test_whole_mirrors(name: str, load: Callable[[str], Any]) -> None:
+def test_whole_mirrors(name: str) -> None:
     """Planned with all stops on the way: within 6 % of what no tour can beat, and a fifth faster than the thesis's."""
-    world = load(name)
+    world = world_of(name)
     cfg, mirror = world.cfg, world.mirror
     orders = (thesis_order(mirror), optimised_order(mirror))
     thesis_s, optimised_s = (

@@ -1,6 +1,5 @@
 """Pure. Stops between the points, remaining time, refusals."""
 
-from collections.abc import Callable
 from itertools import pairwise
 from math import atan2, hypot
 from typing import Any
@@ -8,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.config.load import load_config
 from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind
-from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.legs import (
     Grazing,
     LegPlace,
@@ -32,6 +30,7 @@ from ccatp.survey.planning.route import (
     thesis_order,
 )
 from ccatp.survey.planning.search import Search, SearchNode, path_time
+from tests.support.scenario import mirror_of, world_of
 
 STEPS_OF_THESIS_M1 = ((1, 2), (2, 3), (7, 8), (8, 9))  # rows of 7, 9, 11, ..., 11, 9, 7 panels
 
@@ -163,8 +162,7 @@ def test_no_sensor_runs_along_a_seam(thesis: Any) -> None:
 @pytest.mark.parametrize(("name", "slanted"), [("thesis-m1", 11), ("fyst-m1", 28), ("fyst-m2", 28)])
 def test_no_way_off_the_route_leads_along_a_seam(name: str, slanted: int) -> None:
     """Home from anywhere, or to a point at the other end of the mirror: straight there, a slanted way would."""
-    cfg = load_config(overrides={"run.mirror": name})
-    mirror = build_mirror(cfg.mirror)
+    cfg, mirror = world_of(name)
     planner, points = RoutePlanner(mirror, cfg), thesis_order(mirror)
     rules = LegRules(mirror, build_body(cfg.robot, cfg.mission))
     rng, straight, found = np.random.default_rng(1), 0, []
@@ -261,7 +259,7 @@ def test_orders_of_table_3_1(panel: PanelId, numbers: tuple[int, ...], thesis: A
     assert tuple(order) == numbers
 
 
-def test_first_panels(load: Callable[[str], Any]) -> None:
-    mirror = load("fyst-m1").mirror
+def test_first_panels() -> None:
+    mirror = mirror_of()
     assert thesis_order(mirror, 3) == thesis_order(mirror)[:27]
     assert thesis_order(mirror, 1000) == thesis_order(mirror)
