@@ -181,22 +181,7 @@ def test_standing_over_a_gap_is_no_edge_however_long(at_seam: Story) -> None:
     assert at_seam.monitor.counts["episodes"][Corner.FRONT_LEFT] == 1
 
 
-def test_an_episode_ends_once_the_sensor_has_moved_on(at_seam: Story) -> None:
-    at_seam.run(10, v=0.1, off=FRONT)
-    at_seam.run(3, v=0.1)
-    assert not at_seam.monitor._edges.is_idle
-    at_seam.run(4, v=0.1)  # 5 mm and 20 samples on
-    assert at_seam.monitor._edges.is_idle
-
-
 # -- (c) no map -------------------------------------------------------------------------------------------------------
-
-
-def test_off_without_an_explanation_is_an_edge_after_5_mm(on_panel: Story) -> None:
-    assert on_panel.run(5, v=0.1, off=FL).code is EventCode.NORMAL
-    verdict = on_panel.frame(0.1, off=FL)
-    assert (verdict.code, verdict.cause, verdict.limit) == (EventCode.NEAR_EDGE, NO_SEAM.message, 0.005)
-    assert permits(verdict) == (False, True, False)
 
 
 def test_without_an_estimate_a_seam_is_not_believed_and_nothing_is_permitted(at_seam: Story) -> None:
@@ -241,13 +226,6 @@ def test_an_edge_that_a_fix_shows_to_be_a_seam_was_none(at_seam: Story) -> None:
     assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, BEYOND_SEAM.message)
     # Without another fix that stays so, however long it stands.
     assert at_seam.run(200, off=FRONT).code is EventCode.NEAR_EDGE
-
-
-def test_an_edge_is_one_where_a_fix_shows_no_seam_or_the_rim(on_panel: Story, at_rim: Story) -> None:
-    for story in (on_panel, at_rim):
-        declared_where_the_robot_was_not(story, aside_m=0.04)
-        story.sigma_m = 6e-6
-        assert story.run(20, off=FRONT).code is EventCode.NEAR_EDGE
 
 
 # -- (d) turns --------------------------------------------------------------------------------------------------------
@@ -386,16 +364,6 @@ def test_the_centre_needs_wheels_to_tell_its_direction(at_rim: Story) -> None:
 # -- stale data -------------------------------------------------------------------------------------------------------
 
 
-def test_a_stale_estimate_permits_nothing_and_ends_by_itself(on_panel: Story) -> None:
-    on_panel.run(2)
-    on_panel.has_estimate = False
-    verdict = on_panel.run(1)
-    assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.NORMAL, "no estimate", "estimate")
-    assert permits(verdict) == NO_PERMIT
-    on_panel.has_estimate = True
-    assert permits(on_panel.run(1)) == ANY_PERMIT
-
-
 @pytest.mark.parametrize("field_name", ["t_s", "x_m", "y_m", "heading_rad", "sigma_m"])
 @pytest.mark.parametrize("value", [nan, inf, -inf])
 def test_an_estimate_that_is_not_finite_is_none(on_panel: Story, field_name: str, value: float) -> None:
@@ -434,23 +402,6 @@ def test_every_value_is_finite_before_anything_is_heard(on_panel: Story) -> None
     verdict = on_panel.monitor.step(frame_of(1, 0.003, [], edge), None)
     assert verdict.cause == f"{OFF_WITHOUT_WHEELS.message}; encoder samples stale"
     assert verdict.value == pytest.approx(0.061, abs=1e-3)  # m: 0.15 s at 0.41 m/s
-
-
-def test_edge_samples_that_stay_away_permit_nothing(on_panel: Story) -> None:
-    on_panel.run(1)
-    for k in range(1, 18):
-        t_s = on_panel.t + 0.01 * k
-        estimate = EstimateMessage(seq=k, t_s=t_s, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-4, state="driving")
-        verdict = on_panel.monitor.step(frame_of(100 + k, t_s, [WheelSample(t_s, 0.0, 0.0)], []), estimate)
-    assert (verdict.cause, verdict.signal) == ("edge samples stale", "edge")
-    assert permits(verdict) == NO_PERMIT
-
-
-def test_no_edge_sample_ever_permits_nothing(on_panel: Story) -> None:
-    estimate = EstimateMessage(seq=0, t_s=0.0, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-4, state="driving")
-    verdict = on_panel.monitor.step(frame_of(1, 0.01, [WheelSample(0.01, 0.0, 0.0)], []), estimate)
-    assert (verdict.cause, verdict.value) == ("no edge samples", 0.15)
-    assert permits(verdict) == NO_PERMIT
 
 
 def test_no_frame_permits_nothing_whatever_the_code(at_rim: Story) -> None:

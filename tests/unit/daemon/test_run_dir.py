@@ -27,7 +27,6 @@ from ccatp.daemon.run_dir import (
     make_run_dir,
     mark_resumable,
     own_runtime_dir,
-    owned,
     read_run_id,
     take_over_emergencies,
     take_runtime_dir,
@@ -310,15 +309,6 @@ def test_notes_that_cannot_be_read_or_written(tmp_path: Path) -> None:
 
 
 # -- the runtime directory --------------------------------------------------------------------------------------------
-
-
-def test_one_daemon_in_a_runtime_directory(tmp_path: Path) -> None:
-    path = tmp_path / "lock"
-    with owned(path, "--runtime-dir"), pytest.raises(RefusedError, match="another ccatp runs in"):  # noqa: SIM117
-        with owned(path, "--runtime-dir"):
-            pass
-    with owned(path, "--runtime-dir"):
-        pass
 
 
 def test_a_daemon_waits_for_the_children_of_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

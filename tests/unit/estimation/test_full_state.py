@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.core import DeckPose, GravitySample, PanelId, PanelPose
+from ccatp.core import DeckPose, GravitySample, PanelPose
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.localizer_base import MAX_FRAME_STEP_S
@@ -389,17 +389,3 @@ def test_between_the_steps_of_the_filter_the_pose_is_carried_on() -> None:
         assert distance_m < 1e-6
         assert abs(heading_rad) < 1e-5
         assert found.t_s == robot.t_s
-
-
-def test_the_pose_is_told_in_the_frame_of_the_panel_under_the_robot() -> None:
-    start = before_a_seam(0, True)
-    robot, found = Robot(start, v=across_it()), build(start=start)
-    panels = []
-    for _ in range(420):
-        found.step(*robot.frame())
-        panels.append(found.pose.panel)
-        there = mirror().panel_pose(found.pose.panel, found.deck_pose)
-        assert (found.pose.x_m, found.pose.y_m) == pytest.approx((there.x_m, there.y_m), abs=1e-9)
-        assert found.pose.heading_rad == pytest.approx(there.heading_rad, abs=1e-6)  # the slope of up to 4 mm before
-    assert panels[0] == start.panel
-    assert panels[-1] == PanelId(start.panel.row, start.panel.col + 1)

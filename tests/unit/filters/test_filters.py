@@ -145,15 +145,6 @@ def test_covariance_stays_symmetric_positive_definite_where_the_printed_form_doe
     assert not np.array_equal(printed, printed.T) or np.linalg.eigvalsh(printed)[0] <= 0.0
 
 
-def test_a_state_known_exactly_stays_so_beside_large_ones() -> None:
-    # More rows than states, so that the square root of a singular covariance is taken.
-    kf = KalmanFilter(np.zeros(3), np.array([[1e6, 0.0, 1e3], [0.0, 0.0, 0.0], [1e3, 0.0, 1.0]]))
-    kf.update(np.ones(4), np.array([[1.0, 1, 0], [0, 1, 1], [1, 1, 1], [0, 1, 0]]), np.ones(4))
-    assert kf.mean[1] == 0.0
-    assert not kf.covariance[1].any()
-    assert not kf.covariance[:, 1].any()
-
-
 def shipped(n: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Covariance, F, Q, H and R: the thesis's four states; or as many, some of which no noise drives."""
     if n == 4:

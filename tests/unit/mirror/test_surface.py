@@ -232,18 +232,6 @@ def test_a_segment_that_is_not_finite_is_refused(m1: Mirror) -> None:
         m1.rim.segment_clearance_m(0.0, 0.0, nan, 1.0)
 
 
-def test_a_part_decides_within_its_disc_as_the_whole(mirror: Mirror) -> None:
-    rng = np.random.default_rng(5)
-    for _ in range(300):
-        x, y = rng.uniform(-4.5, 4.5, 2).tolist()
-        radius_m = float(rng.uniform(0.01, 0.8))
-        part = mirror.rim.part(x, y, radius_m)
-        for _ in range(10):
-            dx, dy = (rng.uniform(-1.0, 1.0, 2) * radius_m).tolist()
-            if hypot(dx, dy) <= radius_m:
-                assert part.signed_distance_m(x + dx, y + dy) == mirror.rim.signed_distance_m(x + dx, y + dy)
-
-
 def test_ways_along_and_over_the_rim(mirror: Mirror) -> None:
     rng = np.random.default_rng(6)
     near = NearOutline(mirror.rim)

@@ -418,13 +418,15 @@ def test_no_looking_ahead_while_on_or_without_a_place(danger: DangerConfig) -> N
     assert not lost.episode.look_ahead()
 
 
-def test_looking_ahead_waits_for_the_debounced_sample(danger: DangerConfig) -> None:
+@pytest.mark.parametrize("early", [1, 0])
+def test_looking_ahead_waits_for_the_debounced_sample(danger: DangerConfig, early: int) -> None:
     sensor = Sensor(danger, Map(seams=("x",)))
-    sensor.off(0.001)
+    for _ in range(danger.debounce_samples - early):
+        sensor.off(0.001)
     sensor.map.is_rim = True
-    assert not sensor.episode.look_ahead()
-    assert sensor.episode.phase is EdgePhase.RIM
-    assert sensor.off(0.0)
+    assert sensor.episode.look_ahead() is not bool(early)
+    assert sensor.episode.phase is (EdgePhase.RIM if early else EdgePhase.DECLARED)
+    assert sensor.off(0.0) is bool(early)  # declared once
 
 
 # -- back on ----------------------------------------------------------------------------------------------------------
@@ -450,19 +452,15 @@ def test_the_way_on_the_panel_counts_from_the_first_sample_on(danger: DangerConf
     assert ended == [False] * (danger.clear_samples - 2) + [True]
 
 
-def test_an_episode_ends_at_rest_after_a_long_time(danger: DangerConfig) -> None:
-    sensor = Sensor(danger, Map())
+@pytest.mark.parametrize("is_edge", [False, True])
+def test_at_rest_an_episode_ends_after_a_long_time_and_an_edge_once_the_sensor_is_on(
+    danger: DangerConfig, is_edge: bool
+) -> None:
+    sensor = Sensor(danger, Map(is_rim=is_edge))
     sensor.off(0.001)
+    assert sensor.off(0.001) is is_edge
     assert LONG_ON * danger.clear_samples == 200  # 0.2 s
-    assert not sensor.stay(LONG_ON * danger.clear_samples - 1)
-    assert sensor.on()
-
-
-def test_an_edge_ends_at_rest_once_the_sensor_is_on(danger: DangerConfig) -> None:
-    sensor = Sensor(danger, Map(is_rim=True))
-    sensor.off(0.001)
-    assert sensor.off(0.001)
-    assert not sensor.stay(danger.clear_samples - 1)
+    assert not sensor.stay((1 if is_edge else LONG_ON) * danger.clear_samples - 1)
     assert sensor.on()
 
 
@@ -559,14 +557,11 @@ def test_behind_a_switch_the_way_begins_anew_and_has_no_side(danger: DangerConfi
     width = GAP_M + danger.gap_tolerance_m
     limit = width + danger.seam_extra_m
     crossing = EdgeLimits(GAP_M, danger).crossing_m
-    sensor = Sensor(danger, Map(seams=("x", "y")))
-    sensor.off(0.001)
-    assert not sensor.walk(limit, 0.0, 60)
     # Along the other seam, beside the first way: its width once more, to either side.
     for side in (1.0, -1.0):
         one = Sensor(danger, Map(seams=("x", "y")))
         one.off(0.001)
-        one.walk(limit, 0.0, 60)
+        assert not one.walk(limit, 0.0, 60)
         assert not one.walk(0.0, side * (limit - 0.001), 60)
         assert hypot(limit, limit) < crossing
         assert one.walk(0.0, side * 0.002, 10)
@@ -578,14 +573,6 @@ def test_no_switch_beyond_the_crossing(danger: DangerConfig) -> None:
     sensor.off(0.001)
     assert sensor.off(0.0, crossing + 0.001)
     assert [axis for *_, axis in sensor.map.asked_seam] == [None]
-
-
-def test_a_look_ahead_declares_at_the_debounced_sample(danger: DangerConfig) -> None:
-    sensor = Sensor(danger, Map(seams=("x",)))
-    for _ in range(danger.debounce_samples):
-        sensor.off(0.001)
-    sensor.map.is_rim = True
-    assert sensor.episode.look_ahead()
 
 
 @pytest.mark.parametrize("heading", [0.5, -2.0])

@@ -307,11 +307,22 @@ def test_where_a_fix_shows_neither_it_is_to_blame(rule: Rule) -> None:
     assert episode.retreat_m > 0.007
 
 
-@pytest.mark.parametrize("sigma_m", [5e-4, 9e-4, 1e-3, 2e-3])
-def test_less_than_half_the_sigma_is_a_fix_and_nothing_else(rule: Rule, sigma_m: float) -> None:
+@pytest.mark.parametrize(
+    ("sigma_m", "v", "omega", "is_fix"),
+    [
+        *((sigma_m, 0.0, 0.0, False) for sigma_m in (5e-4, 9e-4, 1e-3, 2e-3)),  # less than half the sigma is one
+        *((1e-5, v, 0.0, False) for v in (6e-4, -6e-4)),  # a robot that moves has none
+        *((1e-5, 0.0, omega, False) for omega in (0.008, -0.008)),
+        (1e-5, 4e-4, 0.0, True),  # but for noise it stands
+        (1e-5, 0.0, -0.004, True),
+    ],
+)
+def test_what_is_a_fix(rule: Rule, sigma_m: float, v: float, omega: float, is_fix: bool) -> None:
     episode = declared(rule)
     rule.map.seam = SEAM
-    assert measured(rule, sigma_m) is episode
+    assert (measured(rule, sigma_m, v=v, omega=omega) is not episode) is is_fix
+    if v or omega:
+        assert (measured(rule, 1e-5) is not episode) is is_fix  # nor afterwards
 
 
 def test_a_fix_counts_against_the_vaguest_since_the_robot_stands(rule: Rule) -> None:
@@ -329,21 +340,6 @@ def test_each_fix_counts_once(rule: Rule) -> None:
     episode = measured(rule, 1e-5)
     assert episode.phase is EdgePhase.DECLARED
     assert measured(rule, 1e-5) is episode
-
-
-@pytest.mark.parametrize(("v", "omega"), [(6e-4, 0.0), (-6e-4, 0.0), (0.0, 0.008), (0.0, -0.008)])
-def test_a_robot_that_moves_has_no_fix(rule: Rule, v: float, omega: float) -> None:
-    episode = declared(rule)
-    rule.map.seam = SEAM
-    assert measured(rule, 1e-5, v=v, omega=omega) is episode
-    assert measured(rule, 1e-5) is episode  # nor afterwards
-
-
-@pytest.mark.parametrize(("v", "omega"), [(4e-4, 0.0), (0.0, -0.004)])
-def test_one_that_stands_but_for_noise_has(rule: Rule, v: float, omega: float) -> None:
-    episode = declared(rule)
-    rule.map.seam = SEAM
-    assert measured(rule, 1e-5, v=v, omega=omega) is not episode
 
 
 def test_what_is_no_edge_or_on_again_is_left_alone(rule: Rule) -> None:

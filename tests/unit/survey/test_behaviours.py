@@ -24,7 +24,6 @@ from ccatp.survey.route_follower import LegAim, LegFollower, StateEstimate, plan
 from tests.support.scenario import MIRRORS, mirror_of
 
 DT, MEASURING_S = 0.01, 0.5
-POINT = PointId(5, 5, 1)
 
 
 class Standing:
@@ -80,14 +79,6 @@ def test_a_measurement_during_which_the_robot_moves_is_not_wanted(settling: Stan
     again = next(k for k in range(asked + 3, asked + 400) if settling.is_due(at(mirror, k)))
     assert again > asked + 2 + round(MEASURING_S / DT)
     assert settling.requests == 2
-
-
-def test_who_never_rests_is_restless_after_the_limit(settling: Standing, mirror: Mirror) -> None:
-    frames = round(SETTLE_LIMIT_S / DT)
-    for k in range(frames):
-        assert not settling.has_settled(at(mirror, k, speed_m_s=0.01))
-    assert not settling.now.is_overdue((frames - 1) * DT)
-    assert settling.now.is_overdue((frames + 1) * DT)
 
 
 def first_rest(config: Config, mirror: Mirror, speeds: Iterable[float], rates: Iterable[float]) -> int | None:

@@ -193,17 +193,6 @@ def test_a_sensor_that_stays_off_is_looked_at_with_one_fix(story: Story) -> None
     story.until(lambda: len(story.state.done) == 3)  # it came on: the survey goes on by itself
 
 
-def test_abort_during_back_off_waits_for_the_retreat(story: Story) -> None:
-    story.drive_on()
-    story.frame(FRONT_OFF)
-    story.mission.handle(Abort("operator"))
-    assert story.state.mode is MissionState.BACKING_OFF
-    for _ in range(30):
-        assert story.frame(FRONT_OFF).twist.v_m_s <= 0.0
-    story.until_state(MissionState.DONE, ABORT)
-    assert story.state.outcome is SurveyOutcome.AT_BASE
-
-
 def test_pause_while_backing_off_holds_and_resume_finds_the_robot_first(story: Story) -> None:
     story.drive_on()
     story.frame(FRONT_OFF)
@@ -264,21 +253,6 @@ def test_a_robot_that_never_rests_is_a_fault(story: Story) -> None:
         if story.state.is_faulted:
             break
     assert "does not come to rest" in story.state.cause
-
-
-def test_abort_after_a_hold_goes_home_all_the_same(story: Story) -> None:
-    story.until_state(MissionState.DRIVING)
-    story.mission.handle(Abort("operator"))
-    story.frame()
-    story.mission.handle(Pause("operator"))
-    assert story.mission.handle(Abort("operator")) is None
-    states = [story.state.mode]
-    for _ in range(2):
-        story.mission.handle(Pause("operator"))
-        story.frame(ABORT)
-        states.append(story.state.mode)
-    # An emergency that is new outranks the pause; its level, repeated, does not.
-    assert states == [MissionState.RETURNING, MissionState.RETURNING, MissionState.HELD]
 
 
 def test_failed_measurements_are_skipped_and_three_in_a_row_hold(story: Story) -> None:
