@@ -137,18 +137,21 @@ def test_a_rim_is_an_edge_at_the_second_off_sample(at_rim: Story) -> None:
     assert at_rim.monitor.counts["edges"][Corner.FRONT_LEFT] == 1
 
 
-def test_a_rear_sensor_over_the_rim_bars_reverse(at_rim: Story) -> None:
-    at_rim.pose = (*at_rim.pose[:2], pi)
-    verdict = at_rim.run(2, v=-0.1, off=RL)
-    assert permits(verdict) == (True, False, False)
-    assert verdict.off == (False, False, True, False)
-
-
-def test_front_and_rear_over_the_rim_bar_both(at_rim: Story) -> None:
-    at_rim.pose = (at_rim.pose[0] + 0.091, at_rim.pose[1], pi / 2)
-    verdict = at_rim.run(2, v=0.05, off=FR + RR)
-    assert permits(verdict) == NO_PERMIT
-    assert verdict.off == (False, True, False, True)
+@pytest.mark.parametrize(
+    ("ahead_m", "heading", "v", "off", "permitted"),
+    [
+        (0.0, pi, -0.1, RL, (True, False, False)),
+        (0.091, pi / 2, 0.05, FR + RR, NO_PERMIT),  # front and rear bar both
+    ],
+)
+def test_a_sensor_over_the_rim_bars_its_direction(
+    at_rim: Story, ahead_m: float, heading: float, v: float, off: tuple[str, ...], permitted: tuple[bool, bool, bool]
+) -> None:
+    x, y, _ = at_rim.pose
+    at_rim.pose = (x + ahead_m, y, heading)
+    verdict = at_rim.run(2, v=v, off=off)
+    assert permits(verdict) == permitted
+    assert verdict.off == tuple(corner.value in off for corner in Corner)
 
 
 def test_a_sensor_over_a_gap_behind_does_not_keep_the_edge_alive(at_seam: Story) -> None:

@@ -160,12 +160,6 @@ async def test_foxglove_gets_channels_schemas_and_messages(foxglove: FoxgloveStr
     assert found == {7: (0, PANELS.payload), 8: (1_250_000_000, ROBOT.payload)}
 
 
-def test_foxglove_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "foxglove", None)
-    with pytest.raises(StreamError, match=r"install ccatp with its extra, ccatp\[foxglove\]"):
-        FoxgloveStream("ccatp", "127.0.0.1", 0, [])
-
-
 def test_a_network_is_served_only_when_told_to() -> None:
     check_host("127.0.0.1", is_open=False)
     check_host("localhost", is_open=False)

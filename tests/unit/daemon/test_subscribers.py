@@ -42,9 +42,27 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bus]:
     context.destroy(linger=0)
 
 
-def test_lockstep_goes_by_the_frame_before_though_later_ones_are_there(bus: Bus) -> None:
-    bus.judge(10, 11, 12, 13)
-    assert [bus.in_force(seq) for seq in (11, 12, 13)] == [10, 11, 12]
+@pytest.mark.parametrize(
+    ("judged", "is_lockstep", "in_force"),
+    [
+        pytest.param(
+            (10, 11, 12, 13), True, {11: 10, 12: 11, 13: 12}, id="lockstep goes by the frame before, not by later ones"
+        ),
+        pytest.param((10, 10, 11), True, {11: 10, 12: 11}, id="a line that danger could not read: the next frame"),
+        pytest.param(
+            (10, 12, 17), True, {11: 10, 12: 10, 13: 12, 15: 12, 16: 12, 17: 12, 18: 17},
+            id="what danger did not judge is bridged for as long as a verdict is fresh",
+        ),
+        pytest.param((30,), True, {30: None, 31: 30}, id="of this very frame: it counts in the next one"),
+        pytest.param((10,), True, {11: 10, 12: None}, id="a danger loop that hangs leaves no verdict"),
+        pytest.param((10, 11, 12), False, {12: 12, 17: 12, 18: None}, id="in real time the newest that is fresh"),
+    ],
+)  # fmt: skip
+def test_which_verdict_is_in_force(
+    bus: Bus, judged: tuple[int, ...], is_lockstep: bool, in_force: dict[int, int | None]
+) -> None:
+    bus.judge(*judged)
+    assert {seq: bus.in_force(seq, is_lockstep=is_lockstep) for seq in in_force} == in_force
 
 
 def test_lockstep_waits_for_the_frame_before(bus: Bus) -> None:
@@ -54,30 +72,3 @@ def test_lockstep_waits_for_the_frame_before(bus: Bus) -> None:
     later.start()
     assert bus.in_force(12) == 11
     later.join()
-
-
-def test_a_second_verdict_on_a_frame_comes_into_force_with_the_next(bus: Bus) -> None:
-    """As after a line that danger could not read."""
-    bus.judge(10, 10, 11)
-    assert [bus.in_force(seq) for seq in (11, 12)] == [10, 11]
-
-
-def test_what_danger_did_not_judge_is_bridged_for_as_long_as_a_verdict_is_fresh(bus: Bus) -> None:
-    bus.judge(10, 12, 17)
-    assert [bus.in_force(seq) for seq in (11, 12, 13, 15, 16, 17, 18)] == [10, 10, 12, 12, 12, 12, 17]
-    bus.judge(30)
-    assert bus.in_force(30) is None  # of this very frame: it counts in the next one
-    assert bus.in_force(31) == 30
-
-
-def test_a_danger_loop_that_hangs_leaves_no_verdict(bus: Bus) -> None:
-    bus.judge(10)
-    assert bus.in_force(11) == 10
-    assert bus.in_force(12) is None
-
-
-def test_in_real_time_the_newest_that_is_fresh_counts(bus: Bus) -> None:
-    bus.judge(10, 11, 12)
-    assert bus.in_force(12, is_lockstep=False) == 12
-    assert bus.in_force(17, is_lockstep=False) == 12
-    assert bus.in_force(18, is_lockstep=False) is None
