@@ -329,27 +329,21 @@ def test_what_is_no_run_is_refused_in_one_line(name: str, message: str, survey_d
     assert caught.value.exit_status == 2
 
 
-def test_a_real_robot_has_no_truth(survey_dir: Path) -> None:
+@pytest.mark.parametrize(
+    ("topic", "is_simulation"),
+    [("truth", True), ("misalignment", True), ("misalignments of panels", False), ("", None)],
+)
+def test_a_run_without_truth_is_read(topic: str, is_simulation: bool | None, survey_dir: Path) -> None:
+    """A recording that does not tell it, of a real robot, and none."""
     (survey_dir / "telemetry.mcap").unlink()
-    record_truth(survey_dir, {PANEL: LIES}, is_simulation=False)
+    if is_simulation is False:
+        record_truth(survey_dir, {PANEL: LIES}, is_simulation=False)
+    elif topic:
+        recorder = Recorder(survey_dir / "telemetry.mcap", [(topic, {})], is_simulation=True)
+        recorder.write(topic, 1.0, b'{"seq": 0}')
+        recorder.close()
     found = read_run(survey_dir, {})
-    assert (found.injected, found.is_simulation) == (None, False)
-
-
-def test_a_run_without_recording_is_read(survey_dir: Path) -> None:
-    (survey_dir / "telemetry.mcap").unlink()
-    found = read_run(survey_dir, {})
-    assert (found.injected, found.is_simulation, len(found.measured)) == (None, None, 5)
-
-
-@pytest.mark.parametrize("topic", ["truth", "misalignment"])
-def test_a_recording_that_does_not_tell_the_truth_is_no_hindrance(topic: str, survey_dir: Path) -> None:
-    (survey_dir / "telemetry.mcap").unlink()
-    recorder = Recorder(survey_dir / "telemetry.mcap", [(topic, {})], is_simulation=True)
-    recorder.write(topic, 1.0, b'{"seq": 0}')
-    recorder.close()
-    found = read_run(survey_dir, {})
-    assert (found.injected, found.is_simulation) == (None, True)
+    assert (found.injected, found.is_simulation, len(found.measured)) == (None, is_simulation, 5)
 
 
 def test_a_resumed_run_has_the_truth_of_its_sessions_where_it_is_one(survey_dir: Path) -> None:

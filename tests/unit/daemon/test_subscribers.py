@@ -50,10 +50,10 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bus]:
         ),
         pytest.param((10, 10, 11), True, {11: 10, 12: 11}, id="a line that danger could not read: the next frame"),
         pytest.param(
-            (10, 12, 17), True, {11: 10, 12: 10, 13: 12, 15: 12, 16: 12, 17: 12, 18: 17},
+            (10, 12, 17, 30), True,
+            {11: 10, 12: 10, 13: 12, 15: 12, 16: 12, 17: 12, 18: 17, 30: None, 31: 30},  # one counts in the next frame
             id="what danger did not judge is bridged for as long as a verdict is fresh",
         ),
-        pytest.param((30,), True, {30: None, 31: 30}, id="of this very frame: it counts in the next one"),
         pytest.param((10,), True, {11: 10, 12: None}, id="a danger loop that hangs leaves no verdict"),
         pytest.param((10, 11, 12), False, {12: 12, 17: 12, 18: None}, id="in real time the newest that is fresh"),
     ],
