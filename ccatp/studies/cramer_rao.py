@@ -82,8 +82,8 @@ class TrueRecord(NamedTuple):
 class RecordedSilRun(SilRun):
     """A mission with its record; everything random stays as it is without."""
 
-    def __init__(self, cfg: Config, *, with_track: bool = False) -> None:
-        super().__init__(cfg, with_track=with_track)
+    def __init__(self, cfg: Config) -> None:
+        super().__init__(cfg)
         self._way = array("d")
         self._scanner = EdgeScanner()
         self._transitions: list[SensorTransition] = []

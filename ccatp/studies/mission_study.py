@@ -32,20 +32,20 @@ STOP_COLUMNS = (
 COLUMN = {name: index for index, name in enumerate(STOP_COLUMNS)}
 PER_DECADE = 1000
 LEAST = 1e-9  # anything smaller falls into the first bin
+BINS = 12 * PER_DECADE + 1  # up to a kilometre; anything larger falls into the last one
 _T, _X, _Y, _HEADING, _EST_X, _EST_Y, _EST_HEADING = range(7)  # columns of a mission's track
 _PARTS = ("mean", "p50", "p99", "p99_9", "max")
 
 
 @dataclass(frozen=True, slots=True)
 class Histogram:
-    """The distribution of many values in little room: logarithmic bins, empty ones left out.
+    """The distribution of many values in little room: logarithmic bins, the same ones for all.
 
     A mission has half a million localization errors, a campaign hundreds of missions. Bins are 1/1000 of a decade
     wide, so a quantile is right to 0.12 %; count, mean, maximum and the share within the limit are exact.
     """
 
-    bins: IntArray  # indices, ascending, shape (k,); bin i ends at LEAST * 10**(i / PER_DECADE)
-    counts: IntArray  # in each of them, shape (k,)
+    counts: IntArray  # in each bin, shape (BINS,); bin i ends at LEAST * 10**(i / PER_DECADE)
     total: float
     largest: float  # 0 where there are none
     within: int  # the thesis's requirement
@@ -56,9 +56,9 @@ class Histogram:
         if values.size and not (np.isfinite(values).all() and values.min() >= 0.0):
             raise ValueError(f"values from {values.min()} to {values.max()}: must be finite and not negative")
         places = np.ceil(PER_DECADE * np.log10(np.maximum(values, LEAST) / LEAST)).astype(np.int64)
-        bins, counts = np.unique(places, return_counts=True)
+        counts = np.bincount(np.minimum(places, BINS - 1), minlength=BINS)
         largest, within = float(values.max(initial=0.0)), int(np.count_nonzero(values <= WITHIN_M))
-        return cls(bins, counts.astype(np.int64), float(values.sum()), largest, within)
+        return cls(counts, float(values.sum()), largest, within)
 
     @property
     def count(self) -> int:
@@ -74,38 +74,32 @@ class Histogram:
         """The value that this share of the values does not exceed; NaN where there are none."""
         if not self.count:
             return float("nan")
-        ends = np.cumsum(self.counts)
-        place = int(np.searchsorted(ends, share * (self.count - 1), side="right"))
-        edges, _ = self.exceedance()
-        value = edges[min(place, len(ends) - 1)] * 10.0 ** (-0.5 / PER_DECADE)  # the bin's middle
-        return min(float(value), self.largest)
+        place = int(np.searchsorted(np.cumsum(self.counts), share * (self.count - 1), side="right"))
+        return min(float(LEAST * 10.0 ** ((place - 0.5) / PER_DECADE)), self.largest)  # the bin's middle
 
     def exceedance(self) -> tuple[FloatArray, FloatArray]:
-        """Upper ends of the bins and the share of all that is larger, shapes (k,), for a figure."""
-        edges = np.asarray(LEAST * 10.0 ** (self.bins / PER_DECADE), dtype=np.float64)
-        return edges, 1.0 - np.cumsum(self.counts) / max(self.count, 1)
+        """Upper ends of the bins that hold any, and the share of all that is larger, shapes (k,), for a figure."""
+        bins = np.flatnonzero(self.counts)
+        edges = np.asarray(LEAST * 10.0 ** (bins / PER_DECADE), dtype=np.float64)
+        return edges, 1.0 - np.cumsum(self.counts[bins]) / max(self.count, 1)
 
     def to_arrays(self, name: str) -> dict[str, NDArray[np.generic]]:
         """As arrays whose names begin with ``name``."""
         figures = np.array([self.total, self.largest, float(self.within)])
-        return {f"{name}_bins": self.bins.astype(np.int32), f"{name}_counts": self.counts, f"{name}_figures": figures}
+        return {f"{name}_counts": self.counts, f"{name}_figures": figures}
 
     @classmethod
     def from_arrays(cls, arrays: Arrays, name: str) -> "Histogram":
         """The inverse of ``to_arrays``."""
         total, largest, within = arrays[f"{name}_figures"].astype(np.float64).tolist()
-        bins, counts = arrays[f"{name}_bins"].astype(np.int64), arrays[f"{name}_counts"].astype(np.int64)
-        return cls(bins, counts, total, largest, int(within))
+        return cls(arrays[f"{name}_counts"].astype(np.int64), total, largest, int(within))
 
 
 def pooled(parts: Sequence[Histogram]) -> Histogram:
     """All of them in one."""
-    none = np.empty(0, dtype=np.int64)
-    bins, where = np.unique(np.concatenate([none, *(part.bins for part in parts)]), return_inverse=True)
-    counts = np.zeros(len(bins), dtype=np.int64)
-    np.add.at(counts, where, np.concatenate([none, *(part.counts for part in parts)]))
+    counts = np.sum([np.zeros(BINS, dtype=np.int64), *(part.counts for part in parts)], axis=0)
     largest = max((part.largest for part in parts), default=0.0)
-    return Histogram(bins, counts, sum(part.total for part in parts), largest, sum(part.within for part in parts))
+    return Histogram(counts, sum(part.total for part in parts), largest, sum(part.within for part in parts))
 
 
 # -- a mission --------------------------------------------------------------------------------------------------------
@@ -113,7 +107,7 @@ def pooled(parts: Sequence[Histogram]) -> Histogram:
 
 def run_mission(job: Job) -> JobOutcome:
     """Survey the mirror of the job's configuration."""
-    return mission_outcome(job.cfg, rehearse(job.cfg, with_track=True))
+    return mission_outcome(job.cfg, rehearse(job.cfg))
 
 
 def mission_outcome(cfg: Config, found: SilResult) -> JobOutcome:

@@ -4,7 +4,9 @@ What the sockets carry is handed over directly; the order of events is that of l
 run of the daemon with the same configuration and seed go through the same states.
 """
 
-from collections import defaultdict, deque
+from array import array
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import hypot
 from typing import Any
@@ -21,9 +23,10 @@ from ccatp.links.robot_codec import set_point_on_wire
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.localizer import Localizer
-from ccatp.mirror.mirror import Mirror, deck_poses
+from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 from ccatp.mirror.panel_alignment import Measured, fit_panels
+from ccatp.records.run_reader import TraceBuilder
 from ccatp.records.summary import PanelFits, SummaryBuilder
 from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.sim.laser import SEED_STREAM, EtalonModel, PuckTruth
@@ -33,13 +36,12 @@ from ccatp.survey.composition import SurveyParts, assemble
 from ccatp.survey.events import DONE, EstimateDiverged, FixFailed, FixStored, MissionState, PointMissed, SurveyOutcome
 from ccatp.survey.fix_gate import ApproachCounter
 from ccatp.survey.route_follower import StateEstimate
-from ccatp.survey.state import SurveyState
 
 # A mission that takes this many times its bound hangs; the robot's own deadlines should have ended it long before.
 _ENDLESS = 6.0
 _LOST_FRAMES = 500  # without a frame for so long a mission is over
 _BATCH = 1000  # frames that go to the summary at a time
-_RECENT = 64  # frames of truth at hand: more than any delay of the sensors
+_TRUTH_COLUMNS = 11  # of ``TruthRow``
 
 
 @dataclass(slots=True)
@@ -60,7 +62,7 @@ class StopRow:
 class SilResult:
     """The result of a mission; ``summary`` as in ``summary.json``.
 
-    ``track``: rows of t, true x, y, heading, estimated x, y, heading (deck), shape (k, 7), k = 0 where not asked for.
+    ``track``: rows of t, true x, y, heading, estimated x, y, heading (deck), shape (k, 7).
     """
 
     summary: dict[str, Any]
@@ -79,65 +81,40 @@ class SilResult:
 
 
 class SilTrace:
-    """Truth and estimate of every frame on their way to the summary, converted a thousand at a time."""
+    """Truth and estimate of every frame; both go to the summary at the end."""
 
-    def __init__(self, parts: SurveyParts, *, with_track: bool) -> None:
+    def __init__(self, parts: SurveyParts) -> None:
         self.builder = SummaryBuilder(parts.cfg, parts.mirror, is_sim=True)
         self.builder.set_plan(parts.total_points, parts.lower_bound_s)
-        self._mirror, self._with_track = parts.mirror, with_track
-        self._truth: list[TruthRow] = []
-        self._recent: deque[TruthRow] = deque(maxlen=_RECENT)
-        self._estimates: list[tuple[int, float, PanelPose]] = []
-        self._true_rows: list[FloatArray] = []
-        self._track_rows: list[FloatArray] = []
+        self._mirror = parts.mirror
+        self._truth = array("d")
+        self._estimates = TraceBuilder()
 
     def note_truth(self, row: TruthRow) -> None:
         """The truth at the newest frame."""
-        self._truth.append(row)
-        self._recent.append(row)
+        self._truth.extend(row)
 
     def note_estimate(self, seq: int, t_s: float, pose: PanelPose) -> None:
         """The estimate after frame ``seq``."""
-        self._estimates.append((seq, t_s, pose))
-        if len(self._estimates) >= _BATCH:
-            self._flush()
+        self._estimates.add(seq, t_s, *pose.panel, (pose.x_m, pose.y_m, pose.heading_rad))
 
-    def truth_at(self, seq: int) -> TruthRow:
-        """The truth at one of the newest frames."""
-        return next(row for row in self._recent if row[0] == seq)
+    def truth_at(self, seq: int) -> Sequence[float]:
+        """The truth at a frame, as ``TruthRow``."""
+        at = _TRUTH_COLUMNS * (seq - int(self._truth[0]))
+        return self._truth[at : at + _TRUTH_COLUMNS]
 
-    def _flush(self) -> None:
-        if self._truth:
-            truth = np.array(self._truth, dtype=np.float64)
-            self._truth.clear()
-            self.builder.add_truth(truth)
-            if self._with_track:
-                self._true_rows.append(truth[:, :5])
-        if self._estimates:
-            seqs, times_s, poses = zip(*self._estimates, strict=True)
-            self._estimates.clear()
-            x, y, heading, z = deck_poses(self._mirror, poses).T
-            rows = np.column_stack([np.array(seqs, dtype=np.float64), times_s, x, y, heading, x, y, z])
-            self.builder.add_track(rows)
-            if self._with_track:
-                self._track_rows.append(rows[:, :5])
-
-    def summary(
-        self, state: SurveyState, mission_time_s: float, fits: PanelFits, injected: PanelFits
-    ) -> dict[str, Any]:
-        """The summary of the whole run; panels as fitted and as simulated."""
-        self._flush()
-        self.builder.set_mission(len(state.done), len(state.skipped), mission_time_s)
-        self.builder.set_panels(fits, injected)
-        return self.builder.build()
-
-    def track(self) -> FloatArray:
-        """Rows of t, true x, y, heading, estimated x, y, heading, shape (k, 7), after the summary; none if unasked."""
-        if not self._track_rows:
-            return np.empty((0, 7))
-        true, rows = np.concatenate(self._true_rows), np.concatenate(self._track_rows)
-        _, i, j = np.intersect1d(true[:, 0], rows[:, 0], return_indices=True)
-        return np.column_stack([true[i, 1:], rows[j, 2:]])
+    def join(self) -> FloatArray:
+        """Give everything to the summary; the rows of ``SilResult.track``."""
+        truth = np.array(self._truth).reshape(-1, _TRUTH_COLUMNS)
+        seqs, times_s, pose, heights_m, _ = self._estimates.build(self._mirror)
+        estimates = np.column_stack([seqs, times_s, pose, pose[:, :2], heights_m])
+        for first in range(0, len(truth), _BATCH):
+            batch = truth[first : first + _BATCH]
+            self.builder.add_truth(batch)
+            begin, end = np.searchsorted(seqs, (batch[0, 0], batch[-1, 0] + 1.0))
+            self.builder.add_track(estimates[begin:end])
+        _, i, j = np.intersect1d(truth[:, 0], seqs, return_indices=True)
+        return np.column_stack([truth[i, 1:5], pose[j]])
 
 
 class SilLaser:
@@ -162,7 +139,7 @@ class SilLaser:
         expected_m = self._mirror.puck_world(estimate, self._cfg.robot.puck_height_m)
         return solve_fix(self._cfg.etalon, t_s, expected_m, lengths_m, self._collimators_m)
 
-    def stop_row(self, t_s: float, point: PointId, truth: TruthRow, localizer: Localizer) -> StopRow:
+    def stop_row(self, t_s: float, point: PointId, truth: Sequence[float], localizer: Localizer) -> StopRow:
         """The state in which a point is measured, before its fix."""
         _, _, true_x_m, true_y_m, true_heading_rad, *_ = truth
         deck = localizer.deck_pose
@@ -191,9 +168,9 @@ class SilLaser:
         return fit_panels(self._mirror, self._fixes, self._cfg.robot.puck_height_m)
 
 
-def rehearse(cfg: Config, *, with_track: bool = False) -> SilResult:
+def rehearse(cfg: Config) -> SilResult:
     """Survey the mirror of a configuration in its world; ``run.seed`` seeds everything. See ``SilRun``."""
-    return SilRun(cfg, with_track=with_track).run()
+    return SilRun(cfg).run()
 
 
 class NoFrames(RuntimeError):
@@ -204,10 +181,10 @@ class SilRun:
     """The processes' parts side by side; a subclass may exchange some before ``run``, or override a frame.
 
     ``faults``: of the robot. A frame that cannot be decoded is passed over, one that is not newer is answered with
-    zeros. ``with_track``: keep true and estimated pose of every frame.
+    zeros.
     """
 
-    def __init__(self, cfg: Config, faults: FaultPlan | None = None, *, with_track: bool = False) -> None:
+    def __init__(self, cfg: Config, faults: FaultPlan | None = None) -> None:
         self.cfg = cfg
         parts: SurveyParts = assemble(cfg)
         self.parts, self.mirror = parts, parts.mirror
@@ -217,7 +194,7 @@ class SilRun:
         self.monitor = DangerMonitor(self.mirror, cfg.robot, cfg.danger, cfg.health)
         self.sent = SentDrives(cfg.robot, self.robot.frame_s)
         self.laser = SilLaser(cfg, self.mirror, self.robot)
-        self.trace = SilTrace(parts, with_track=with_track)
+        self.trace = SilTrace(parts)
         self.states_s = defaultdict(float, {MissionState.IDLE: 0.0})
         self.denied_s: list[float] = []  # when lines that were no frames took the permit away
         self.weak_frames = 0  # on an overhang, in which the fans gave less than their floor
@@ -387,13 +364,16 @@ class SilRun:
     def _result(self, mission_time_s: float) -> SilResult:
         state, misalignments = self.mission.state, self.robot.world.misalignments
         injected = {panel: (m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in misalignments.items()}
+        track, builder = self.trace.join(), self.trace.builder
+        builder.set_mission(len(state.done), len(state.skipped), mission_time_s)
+        builder.set_panels(self.laser.panel_fits(), injected)
         return SilResult(
-            summary=self.trace.summary(state, mission_time_s, self.laser.panel_fits(), injected),
+            summary=builder.build(),
             stops=self.laser.stops,
             corrections=state.corrections,
             counts=dict(self.localizer.counts),
             outcome=str(state.outcome if state.mode is DONE else SurveyOutcome.STOPPED),
             cause=state.cause,
             states_s={str(state): time_s for state, time_s in self.states_s.items()},
-            track=self.trace.track(),
+            track=track,
         )

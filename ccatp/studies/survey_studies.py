@@ -43,7 +43,7 @@ def run_filter_mission(job: Job) -> JobOutcome:
     if job.seed % _BOUND_EVERY != 1:
         values, arrays = run_mission(job)
         return JobOutcome(values, {**arrays, "bounds": np.empty((0, 5))})
-    run = RecordedSilRun(job.cfg, with_track=True)
+    run = RecordedSilRun(job.cfg)
     values, arrays = mission_outcome(job.cfg, run.run())
     record, mirror = run.record(), build_mirror(job.cfg.mirror)
     without, with_it = (bounds_of(job.cfg, mirror, record, with_accelerometer=flag) for flag in (False, True))

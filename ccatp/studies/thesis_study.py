@@ -134,7 +134,7 @@ class _Replica(SilRun):
     def __init__(self, cfg: Config, period_error: float) -> None:
         panels = cfg.run.panels
         cfg = cfg.model_copy(update={"run": cfg.run.model_copy(update={"panels": 0})})
-        super().__init__(cfg, with_track=True)
+        super().__init__(cfg)
         block = [p.panel for p in self.parts.points if p.row in _BLOCK and p.col in _BLOCK]
         kept = list(dict.fromkeys(block))[: panels or None]
         outside = [p for p in self.parts.points if p.panel not in kept]

@@ -135,7 +135,7 @@ class Leaking(SilRun):
 def test_innovations_stay_within_their_band() -> None:
     found = list[float]()
     for seed in SEEDS:
-        rehearsal = Leaking(one_panel(run__world="hard", run__seed=seed), with_track=False)
+        rehearsal = Leaking(one_panel(run__world="hard", run__seed=seed))
         found += [stop.nis for stop in rehearsal.run().stops]
         assert rehearsal.largest_m_s2 > 0.1
     low, high = (chi2.ppf(share, 2 * len(found)) / len(found) for share in (0.025, 0.975))

@@ -219,7 +219,7 @@ def test_a_port_in_use_stops_no_survey_and_the_summary_is_the_same(start: Start)
             assert run.wait() == 0, run.stderr
     assert f"warning: dashboard: port {taken} is in use, so it is at http://127.0.0.1:{page_port(run)}/" in run.stderr
     # Looking on changes nothing: as in process, without any display.
-    rehearsed = rehearse(load_config(run.run_dir / "config.toml"), with_track=False).summary
+    rehearsed = rehearse(load_config(run.run_dir / "config.toml")).summary
     assert {**run.summary, "wall": None} == {**rehearsed, "wall": None}
 
 

@@ -50,7 +50,7 @@ def test_a_rehearsal_is_the_run_without_the_sockets(
     labels = [json.loads(line)["timestamp"] for line in (run.run_dir / "log.jsonl").read_text().splitlines()]
     instants = [datetime.fromisoformat(label) for label in labels]
     assert max(abs(b - a) for a, b in pairwise(instants)) > timedelta(minutes=50)  # the clock did step
-    rehearsal = rehearse(load_config(run.run_dir / "config.toml"), with_track=True)
+    rehearsal = rehearse(load_config(run.run_dir / "config.toml"))
 
     # Every frame's true place, to the last bit: a difference anywhere upstream moves the robot sooner or later.
     messages = iter_messages(run.run_dir / "telemetry.mcap")

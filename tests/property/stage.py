@@ -75,7 +75,7 @@ class Stage(SilRun):
     """One mission; ``advance`` serves frames, the other methods are what the outside does."""
 
     def __init__(self, cfg: Config) -> None:
-        super().__init__(cfg, with_track=False)
+        super().__init__(cfg)
         self.robot: SpyRobot = SpyRobot(cfg, self.mirror, np.random.default_rng(cfg.run.seed))
         self.laser = SilLaser(cfg, self.mirror, self.robot)
         self.fans = FanGate(self.cfg.sim.robot.fan_floor if self.mirror.overhang else 0.0)

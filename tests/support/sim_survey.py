@@ -363,7 +363,7 @@ class RestartedSurvey(SilRun):
     """
 
     def __init__(self, cfg: Config, kills: set[int]) -> None:
-        super().__init__(cfg, with_track=False)
+        super().__init__(cfg)
         self._kills = kills
         self._checkpoint = b""
         self.states: list[MissionState] = []

@@ -39,7 +39,7 @@ class KeepingDesk(SilLaser):
 
 def surveyed(run_dir: Path, cfg: Config) -> Path:
     """The run directory of a survey in process."""
-    run = SilRun(cfg, with_track=False)
+    run = SilRun(cfg)
     run.laser = desk = KeepingDesk(cfg, run.mirror, run.robot)
     desk.kept = []
     assert run.run().outcome == "complete"

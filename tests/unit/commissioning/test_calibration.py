@@ -40,7 +40,7 @@ class CalibrationDrive(SilRun):
         settings = {
             "run.seed": seed, "run.world": world, "run.order": "calibration", "mission.calibration_rounds": rounds,
         }  # fmt: skip
-        super().__init__(load_config(None, {**settings, **changes}), with_track=False)
+        super().__init__(load_config(None, {**settings, **changes}))
         self.frames: list[Sensors] = []
         self.fixes: list[tuple[int, Fix]] = []
         self.run()

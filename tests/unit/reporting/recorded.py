@@ -35,7 +35,7 @@ class RecordingRun(SilRun):
     """
 
     def __init__(self, cfg: Config, run_dir: Path, *, is_simulation: bool = True, only: int | None = None) -> None:
-        super().__init__(cfg, with_track=False)
+        super().__init__(cfg)
         run_dir.mkdir(parents=True, exist_ok=True)
         self.run_dir, self.is_simulation, self.only = run_dir, is_simulation, only
         (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")

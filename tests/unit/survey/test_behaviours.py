@@ -434,7 +434,7 @@ class Paused(SilRun):
     """An operator holds the robot for a moment."""
 
     def __init__(self, cfg: Config, pause_s: float) -> None:
-        super().__init__(cfg, with_track=False)
+        super().__init__(cfg)
         self.pause_s = pause_s
 
     def _serve(self, frame: Sensors, dt_s: float) -> None:
