@@ -132,7 +132,7 @@ def bench(
     import tempfile
 
     from ccatp.config.load import dump_config, load_config
-    from ccatp.studies.bench import run_bench, terminal_lines, write_page
+    from ccatp.studies.bench import run_bench, tables, write_page
 
     cfg = load_config(config_file, settings)
     with tempfile.TemporaryDirectory(prefix="ccatp-bench-") as folder:
@@ -142,5 +142,5 @@ def bench(
         result = run_bench(cfg, quick=quick, run_args=run_args, frames=not steps_only, steps=not frames_only)
     if markdown is not None:
         write_page(markdown, result)
-    print_lines([json.dumps(result)] if json_output else terminal_lines(result))
+    print_lines([json.dumps(result)] if json_output else tables(result).splitlines())
     return 0

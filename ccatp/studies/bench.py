@@ -14,9 +14,9 @@ import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.core import FloatArray
+from ccatp.report.html import render
 from ccatp.studies.bench_cases import STEPS, Contender, races
 from ccatp.studies.bench_frame import BenchError, frame_cases
-from ccatp.studies.results import markdown_table
 
 EQUAL_WITHIN = 1e-10  # every entry of mean and covariance, SI units
 ROUNDS, QUICK_ROUNDS = 40, 4
@@ -148,91 +148,21 @@ def _version(package: str) -> str | None:
 
 BY_HAND = "<!-- by hand -->\n"
 
-_PAGE = """# Benchmarks
-
-Written by
-
-```
-OPENBLAS_NUM_THREADS=1 ccatp bench --markdown
-```
-
-on a machine that does nothing else. Ratio = ours / peer: below 1 ours is faster.
-
-Machine: {machine}
-"""
-# Key of a case, heading, format; those of a frame have a spread.
-FRAME_COLUMNS = (
-    ("name", "case", ""),
-    ("us_p50", "µs a frame", ".0f"),
-    ("us_spread", "spread", ".0f"),
-    ("peer", "peer", ""),
-    ("peer_us_p50", "peer, µs", ".0f"),
-    ("peer_us_spread", "spread", ".0f"),
-    ("ratio", "ratio", ".3f"),
-    ("times_real_time", "times real time", ".1f"),
-    ("whole_times_real_time", "with start and end", ".1f"),
-    ("wake_ups", "wake-ups a frame", ".2f"),
-)
-STEP_COLUMNS = (
-    ("name", "case", ""),
-    ("us_p50", "ours p50, µs", ".1f"),
-    ("us_p99", "ours p99, µs", ".1f"),
-    ("peer", "peer", ""),
-    ("peer_us_p50", "peer p50, µs", ".1f"),
-    ("ratio", "ratio", ".3f"),
-    ("largest_difference", "difference", ".0e"),
-)
-# What a line on the terminal says of a case, where it is known.
-_LINE = (
-    ("us_p50", "{us_p50:8.1f} us"),
-    ("us_spread", "({us_spread[0]:.0f} to {us_spread[1]:.0f})"),
-    ("us_p99", "p99 {us_p99:.0f} us"),
-    ("peer", "{peer} {peer_us_p50:.1f} us"),
-    ("ratio", "ratio {ratio:.3f}"),
-    ("largest_difference", "difference {largest_difference:.0e}"),
-    ("times_real_time", "{times_real_time:.1f} times real time"),
-    ("whole_times_real_time", "{whole_times_real_time:.1f} with start and end"),
-    ("wake_ups", "{wake_ups:.2f} wake-ups"),
-)
-
 
 def write_page(path: Path, result: Mapping[str, Any]) -> None:
     """Write the page; what follows ``BY_HAND`` in an existing one stays."""
     before = path.read_text(encoding="utf-8") if path.exists() else ""
     _, mark, by_hand = before.partition(BY_HAND)
-    path.write_text(markdown(result) + (f"\n{mark}{by_hand}" if mark else ""), encoding="utf-8")
+    path.write_text(tables(result, is_page=True) + (f"\n{mark}{by_hand}" if mark else ""), encoding="utf-8")
 
 
-def markdown(result: Mapping[str, Any]) -> str:
-    """The tables of ``docs/bench.md``."""
-    text, cases = _PAGE.format(machine=machine_line(result["machine"])), result["cases"]
-    for title, columns, is_frame in (("A frame", FRAME_COLUMNS, True), ("A step", STEP_COLUMNS, False)):
-        there = [case for case in cases if ("us_spread" in case) is is_frame]
-        if there:
-            rows = ([_cell(case.get(key), spec) for key, _, spec in columns] for case in there)
-            text += f"\n## {title}\n\n" + markdown_table([heading for _, heading, _ in columns], rows)
-    notes = [f"* {note}\n" for note in _notes(cases)]
-    return text + ("\n" + "".join(notes) if notes else "")
-
-
-def _notes(cases: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Each remark once."""
-    return [*dict.fromkeys(case["note"] for case in cases if "note" in case)]
-
-
-def _cell(value: Any, spec: str) -> str:
-    if isinstance(value, list):
-        return " to ".join(format(part, spec) for part in value)
-    return "-" if value is None else format(value, spec)
-
-
-def terminal_lines(result: Mapping[str, Any]) -> list[str]:
-    """One line for the machine, one for each case, and one for each remark."""
-    lines = [machine_line(result["machine"])]
-    for case in result["cases"]:
-        known = [text.format(**case) for key, text in _LINE if case.get(key) is not None]
-        lines.append(f"{case['name']:<62} {'   '.join(known)}")
-    return [*lines, *_notes(result["cases"])]
+def tables(result: Mapping[str, Any], *, is_page: bool = False) -> str:
+    """The machine, the cases as Markdown tables, and each remark once: on the terminal and in ``docs/bench.md``."""
+    cases = result["cases"]
+    frames, steps = ([case for case in cases if ("us_spread" in case) is is_frame] for is_frame in (True, False))
+    notes = dict.fromkeys(case["note"] for case in cases if "note" in case)
+    machine_text = machine_line(result["machine"])
+    return render("bench.md", machine=machine_text, frames=frames, steps=steps, notes=notes, is_page=is_page)
 
 
 def machine_line(machine: Mapping[str, Any]) -> str:

@@ -95,7 +95,7 @@ class RecordingRun(SilRun):
 
     def _note_truth(self) -> None:
         super()._note_truth()
-        self.truth.append(tuple(self.trace.truth_at(self.robot.seq)))
+        self.truth.append(self.robot.world.truth_row(self.robot.seq, self.robot.t_s))
 
     def _publish(self, seq: int, t_s: float, pose: PanelPose, state: MissionState) -> None:
         super()._publish(seq, t_s, pose, state)

@@ -51,9 +51,9 @@ def test_a_missing_peer_leaves_ours_and_says_how_to_install_it(monkeypatch: pyte
     assert printed["ratio"] > 0.0
     assert (filterpy["peer"], filterpy["ratio"], stonesoup["peer"]) == (None, None, None)
     assert filterpy["note"] == "filterpy is not installed: pip install 'ccatp[peers]'"
-    assert bench.markdown(result).endswith("* Stone Soup is not installed: pip install 'ccatp[peers]'\n")
-    lines = bench.terminal_lines({**result, "cases": cases * 2})
-    assert lines[-2:] == [filterpy["note"], stonesoup["note"]]
+    assert bench.tables(result).endswith("* Stone Soup is not installed: pip install 'ccatp[peers]'\n")
+    lines = bench.tables({**result, "cases": cases * 2}).splitlines()
+    assert lines[-2:] == [f"* {filterpy['note']}", f"* {stonesoup['note']}"]
     assert "\n".join(lines).count("not installed") == 2
 
 
@@ -78,8 +78,7 @@ def test_the_command_and_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     table = [line for line in page.read_text().splitlines() if line.startswith("|")]
     assert len(table) == len(result["cases"]) + 2
     assert len({line.count("|") for line in table}) == 1
-    notes = {case["note"] for case in result["cases"] if "note" in case}
-    assert len(bench.terminal_lines(result)) == 1 + len(result["cases"]) + len(notes)
+    assert page.read_text().endswith(bench.tables(result))
     written = page.read_text()
     page.write_text(f"old\n{bench.BY_HAND}kept\n")
     bench.write_page(page, result)
@@ -145,12 +144,11 @@ def test_the_rows_of_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
     assert idle["name"].endswith("2 panels, idle")
     assert (cases[-1]["us_p50"], cases[-1]["us_p99"], cases[-1]["ratio"]) == (100.0, 200.0, pytest.approx(0.01))
     result = {"machine": bench.machine(), "cases": cases}
-    table = [line for line in bench.markdown(result).splitlines() if line.startswith("|")]
+    table = [line for line in bench.tables(result).splitlines() if line.startswith("|")]
     assert len(table) == len(cases) + 2
     assert len({line.count("|") for line in table}) == 1
-    last = bench.terminal_lines(result)[-1]
-    assert "p99 200 us" in last
-    assert last.endswith("ratio 0.010")
+    assert "| 200 |" in table[-1]
+    assert "| 0.010 |" in table[-1]
 
 
 def test_a_mission_that_measured_too_little_gives_no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
