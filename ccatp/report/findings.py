@@ -138,7 +138,7 @@ def error_series(record: RunRecord) -> ErrorSeries | None:
         errors = np.full(len(track.seq), np.nan)
         if truth is not None:
             _, i, j = np.intersect1d(track.seq, truth.seq, assume_unique=True, return_indices=True)
-            errors[i] = 1e3 * np.linalg.norm(track.place_m[i] - truth.place[j], axis=1)
+            errors[i] = 1e3 * np.linalg.norm(track.place[i] - truth.place[j], axis=1)
         all_errors.append(errors)
         fixes += [(fix.t_s + offset_s, fix.jump_mm, fix.is_fused) for fix in session.fixes]
         start_s += session.span_s
@@ -146,7 +146,7 @@ def error_series(record: RunRecord) -> ErrorSeries | None:
     table = np.array(fixes, dtype=np.float64).reshape(-1, 3)
     return ErrorSeries(
         t_s=np.concatenate(times),
-        sigma3_mm=1e3 * SIGMAS * np.concatenate([session.track.sigma_m for session in sessions]),
+        sigma3_mm=1e3 * SIGMAS * np.concatenate([session.sigma_m for session in sessions]),
         error_mm=np.concatenate(all_errors),
         breaks_s=tuple(breaks[:-1]),
         fix_t_s=table[:, 0],

@@ -150,8 +150,8 @@ def driven_path_m(record: RunRecord) -> FloatArray:
     """True path where there is one, else the estimated, deck x, y; shape (k, 2), sessions set apart by NaN."""
     pieces: list[FloatArray] = [np.empty((0, 2))]
     for session in record.sessions:
-        source = session.track.place_m if session.truth is None else session.truth.place
-        pieces += [source[:, :2], np.full((1, 2), np.nan)]
+        driven = session.track if session.truth is None else session.truth
+        pieces += [driven.pose[:, :2], np.full((1, 2), np.nan)]
     return np.concatenate(pieces)
 
 

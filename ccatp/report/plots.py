@@ -182,16 +182,7 @@ def _shorten(element: ET.Element) -> None:
     element.text = (element.text or "").strip() or None
     element.tail = None
     for name in [key for key in ("d", "x", "y", "transform", "style") if key in element.attrib]:
-        value = re.sub(r"(\.\d\d)\d+", r"\1", element.attrib[name])
-        if name == "style":
-            value = re.sub(r" ?font-family:[^;]*;?", "", value)
-            value = re.sub(r"([;:]) ", r"\1", value)
-        elif name == "d":
-            value = re.sub(r"\s*([A-Za-z])\s*", r"\1", value)
-        elif name == "transform" and value.startswith("rotate(-0 "):
-            del element.attrib[name]
-            continue
-        element.set(name, value)
+        element.set(name, re.sub(r"(\.\d\d)\d+| ?font-family:[^;]*;?", r"\1", element.attrib[name]))
 
 
 def _add_titles(group: ET.Element, titles: Sequence[str]) -> None:

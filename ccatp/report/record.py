@@ -15,7 +15,7 @@ import numpy as np
 from ccatp.config.files import read_text
 from ccatp.config.load import is_radio_file, load_config
 from ccatp.config.models import Config
-from ccatp.core import FloatArray, IntArray, PanelId, Vector3
+from ccatp.core import FloatArray, PanelId, Vector3
 from ccatp.links.bus import BadMessage
 from ccatp.links.topics import ArrivalMessage, FixMessage, MissionStatus
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
@@ -32,22 +32,14 @@ SUMMARY, LOG = "summary.json", "log.jsonl"
 TOPICS_READ = frozenset(("track", "truth", "arrival", "fix", "mission"))
 
 
-class EstimatedTrack(NamedTuple):
-    """Estimates after k frames, deck frame."""
-
-    seq: IntArray  # shape (k,)
-    t_s: FloatArray  # robot time, shape (k,)
-    place_m: FloatArray  # points on the surface, shape (k, 3)
-    sigma_m: FloatArray  # standard deviation of the place along any one direction, shape (k,)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedSession:
     """One recording; a run that was resumed has several."""
 
     name: str
     version: str
-    track: EstimatedTrack
+    track: Trace  # the estimates
+    sigma_m: FloatArray  # standard deviation of the place along any one direction, shape (k,)
     truth: Trace | None  # None on a real robot
     arrivals: tuple[ArrivalMessage, ...]
     fixes: tuple[FixMessage, ...]
@@ -283,7 +275,8 @@ def _session(found: Recording, mirror: Mirror, changes: Sequence[StateChange], w
     return RecordedSession(
         name=found.name,
         version=found.version,
-        track=EstimatedTrack(track[:, 0].astype(np.int64), track[:, 1], deck[:, [0, 1, 3]], track[:, 7]),
+        track=Trace(track[:, 0].astype(np.int64), track[:, 1], deck[:, :3], deck[:, 3]),
+        sigma_m=track[:, 7],
         truth=trace_of_truth(truth) if messages["truth"] else None,
         arrivals=tuple(messages["arrival"]),
         fixes=tuple(messages["fix"]),

@@ -52,8 +52,8 @@ def test_a_whole_run_is_that_of_its_summary(record: RunRecord) -> None:
     assert record.injected is not None
     assert [line.text for line in record.log][-1] == "run finished: status 0"
     base = record.mirror.base_pose
-    assert session.track.place_m[0, :2] == pytest.approx([base.x_m, base.y_m], abs=0.01)
-    x_m, y_m, z_m = session.track.place_m[500].tolist()
+    assert session.track.place[0, :2] == pytest.approx([base.x_m, base.y_m], abs=0.01)
+    x_m, y_m, z_m = session.track.place[500].tolist()
     assert z_m == pytest.approx(record.mirror.surface.point(x_m, y_m)[2], abs=1e-9)
 
     assert record.summary is not None
