@@ -332,11 +332,11 @@ def _text(value: Any) -> str:
 def distribution(
     errors_m: FloatArray, names: Sequence[str], *, scale: float = 1.0, decimals: int = 6
 ) -> dict[str, Any]:
-    """Figures of errors, shape (k,), by name: rmse, mean, p50, p99, max; null where there are none."""
+    """Figures of errors, shape (k,), by name: rmse, mean, p50, p99, p99_9, max; null where there are none."""
     if not len(errors_m):
         return dict.fromkeys(names)
-    p50, p99 = np.percentile(errors_m, (50, 99))
-    figures = {"mean": errors_m.mean(), "p50": p50, "p99": p99, "max": errors_m.max()}
+    p50, p99, p99_9 = np.percentile(errors_m, (50.0, 99.0, 99.9))
+    figures = {"mean": errors_m.mean(), "p50": p50, "p99": p99, "p99_9": p99_9, "max": errors_m.max()}
     figures["rmse"] = np.sqrt(np.mean(errors_m**2))
     return {name: rounded(figures[name] * scale, decimals) for name in names}
 

@@ -18,7 +18,7 @@ from ccatp.config.models import Config
 from ccatp.core import FloatArray, IntArray, PointId
 from ccatp.filters.metrics import nees
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.records.summary import WITHIN_M, arrival_error_m
+from ccatp.records.summary import WITHIN_M, arrival_error_m, distribution
 from ccatp.studies.campaign import Arrays, Factors, Job, JobOutcome
 from ccatp.studies.results import chi_square_band
 from ccatp.studies.sil_run import SilResult, StopRow, rehearse
@@ -249,11 +249,8 @@ def first_arrivals(stops: FloatArray) -> FloatArray:
 
 def of_values(errors_m: FloatArray) -> dict[str, Any]:
     """Distribution of some errors, mm."""
-    if not errors_m.size:
-        return dict.fromkeys((*_PARTS, "within_10mm_fraction"))
-    figures_m = errors_m.mean(), *np.percentile(errors_m, (50.0, 99.0, 99.9)), errors_m.max()
-    named = {name: _mm(value) for name, value in zip(_PARTS, figures_m, strict=True)}
-    return {**named, "within_10mm_fraction": round(float(np.mean(errors_m <= WITHIN_M)), 6)}
+    within = round(float(np.mean(errors_m <= WITHIN_M)), 6) if errors_m.size else None
+    return {**distribution(errors_m, _PARTS, scale=1e3, decimals=4), "within_10mm_fraction": within}
 
 
 def of_histogram(errors_m: Histogram) -> dict[str, Any]:

@@ -290,11 +290,15 @@ MISSION = (
 _SHOWN = "mean (dot), 99th percentile (end of the bar)"
 
 
-def draw_sensitivity(cells: Sequence[CellResult], out: Path) -> None:
-    """One figure for each mirror, the undisturbed and the fully disturbed world as lines."""
-    for (mirror,), there in grouped(cells, "mirror").items():
-        title = f"What each disturbance costs on {mirror}: {_SHOWN}"
-        draw_ranges([_row(cell, "group") for cell in there], MISSION, title, out / f"sensitivity-{mirror}")
+def _drawing(name: str, factor: str, groups: Sequence[str], title: str) -> Callable[[Sequence[CellResult], Path], None]:
+    """Draws a figure ``<name>-<levels>`` for all levels of ``groups``, a line for each level of a factor."""
+
+    def draw(cells: Sequence[CellResult], out: Path) -> None:
+        for found, there in grouped(cells, *groups).items():
+            rows = [_row(cell, factor) for cell in there]
+            draw_ranges(rows, MISSION, f"{title.format(*found)}: {_SHOWN}", out / "-".join((name, *found)))
+
+    return draw
 
 
 def _row(cell: CellResult, factor: str) -> Row:
@@ -318,7 +322,7 @@ SENSITIVITY = Study(
         corrections mission_time_s time_ratio
         danger: false_edges
     """,
-    draw=draw_sensitivity,
+    draw=_drawing("sensitivity", "group", ("mirror",), "What each disturbance costs on {}"),
     defaults={"run.filter": "ekf"},
     runs=5,
 )
@@ -351,13 +355,6 @@ WITHOUT: Mapping[str, Mapping[str, object]] = {
 }
 
 
-def draw_ablation(cells: Sequence[CellResult], out: Path) -> None:
-    """Figures ``ablation-<mirror>-<world>``, the mission with everything as a line."""
-    for (mirror, world), there in grouped(cells, "mirror", "world").items():
-        title = f"Without a technique, world {world} on {mirror}: {_SHOWN}"
-        draw_ranges([_row(cell, "without") for cell in there], MISSION, title, out / f"ablation-{mirror}-{world}")
-
-
 ABLATION = Study(
     cells=lambda: [
         Cell({"world": world, "without": name}, {"run.world": world, **keys})
@@ -377,7 +374,7 @@ ABLATION = Study(
         danger: false_edges
         causes
     """,
-    draw=draw_ablation,
+    draw=_drawing("ablation", "without", ("mirror", "world"), "Without a technique on {}, world {}"),
     defaults={"run.filter": "ekf"},
     runs=3,
 )
