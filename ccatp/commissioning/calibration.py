@@ -16,6 +16,7 @@ from ccatp.config.models import Config, FullStateConfig, RobotConfig
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.mirror.mirror import Mirror
+from ccatp.report.html import render
 
 RIGHT, LEFT, BASE, CREEP, BIAS, SCALE = range(6)
 PARAMETERS = 6
@@ -295,20 +296,7 @@ def check_usable(table: tuple[CalibrationRow, ...]) -> None:
 
 def lines(table: tuple[CalibrationRow, ...], found: Calibration) -> list[str]:
     """For the reader."""
-    shown = [("key", "configured", "found", "sigma", "off by")]
-    for row in table:
-        off = (row.found - row.configured) / row.sigma
-        shown.append((row.key, f"{row.configured:.6g}", f"{row.found:.7g}", f"{row.sigma:.2g}", f"{off:+.1f} sigma"))
-    difference, scale, creep = found.radius_difference_m, found.gyroscope_scale, found.creep
-    slip = f", slip varies by {100.0 * found.slip_sigma:.2g} % from motion to motion"
-    return [
-        *(f"{key:<30}  {old:>12}  {new:>12}  {sigma:>8}  {off:>12}" for key, old, new, sigma, off in shown),
-        f"right wheel larger than left by {1e3 * difference.value:.4f} +- {1e3 * difference.sigma:.4f} mm; "
-        f"gyroscope reads {100.0 * scale.value:+.2f} +- {100.0 * scale.sigma:.2f} % too much; "
-        f"downhill drift {100.0 * creep.value:.2f} +- {100.0 * creep.sigma:.2f} % of the way",
-        f"{found.segments} legs, chi2 {found.chi2:.1f} at {found.degrees} degrees of freedom"
-        f"{slip if found.slip_sigma > SHOWN_SLIP else ''}",
-    ]
+    return render("calibration.txt", table=table, found=found, shown_slip=SHOWN_SLIP).splitlines()
 
 
 def as_json(table: tuple[CalibrationRow, ...], found: Calibration) -> dict[str, Any]:

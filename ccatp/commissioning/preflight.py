@@ -1,5 +1,6 @@
 """Checks before a mission: findings as a table, and the rules for the laser server and the robot at rest."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from itertools import pairwise
@@ -14,6 +15,7 @@ from ccatp.links.multiline import Environment
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import ConvergenceError
+from ccatp.report.html import render
 from ccatp.survey.checks import MirrorCheck
 from ccatp.survey.composition import robot_problems
 
@@ -68,15 +70,11 @@ def has_failed(findings: Iterable[PreflightResult]) -> bool:
 
 def lines(findings: Sequence[PreflightResult]) -> list[str]:
     """The table as plain text, and what it comes to."""
+    counts = Counter(finding.outcome for finding in findings)
+    summary = ", ".join(f"{counts[outcome]} {outcome}" for outcome in CheckOutcome if counts[outcome])
     width = max(len(finding.name) for finding in findings)
-    text = []
-    for finding in findings:
-        text.append(f"{finding.outcome:<4}  {finding.name:<{width}}  {finding.found}")
-        if finding.todo:
-            text.append(f"{'':4}  {'':{width}}  -> {finding.todo}")
-    counts = {outcome: sum(f.outcome is outcome for f in findings) for outcome in CheckOutcome}
-    summary = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count)
-    return [*text, f"{'not ready' if has_failed(findings) else 'ready'}: {summary}"]
+    values = {"findings": findings, "width": width, "has_failed": has_failed(findings), "summary": summary}
+    return render("preflight.txt", **values).splitlines()
 
 
 def as_json(findings: Sequence[PreflightResult]) -> dict[str, Any]:

@@ -21,6 +21,9 @@ from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_u
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import MirrorError
 from ccatp.records.run_reader import Event, Fixed, Marked, Trace, TraceBuilder
+from ccatp.records.summary import distribution
+from ccatp.report.html import render
+from ccatp.studies.results import value_at
 
 # Calls that may be taken back. A late fix reaches back some seconds, which are a few hundred.
 REACH = 2000
@@ -28,6 +31,7 @@ REACH = 2000
 CHAPTER = 4096
 # Wheels that turn faster than this move the robot: ten times the noise of an encoder that gives rates.
 TURNING_RAD_S = 0.01
+_FIGURES, _DECIMALS = ("mean", "p50", "p99", "max"), 9  # of errors, mm
 REPRODUCED = 1e-9
 """Largest difference, m and rad, with which a replay counts as the run again: rounding and nothing else."""
 
@@ -321,7 +325,7 @@ def figures(errors: ReplayErrors) -> dict[str, Any]:
     distance_mm = 1e3 * errors.distance_m
     known = errors.nees[np.isfinite(errors.nees)]
     return {
-        "position_error_mm": _distribution(distance_mm),
+        "position_error_mm": distribution(distance_mm, _FIGURES, decimals=_DECIMALS),
         "moving_error_mm": {"rms": rms(distance_mm[errors.is_moving])},
         "arrival_error_mm": _rms_and_max(distance_mm[errors.is_arrival]),
         "heading_error_mrad": {"rms": rms(1e3 * errors.turn_rad)},
@@ -338,13 +342,6 @@ def difference(errors: ReplayErrors) -> dict[str, Any]:
         "heading_mrad": _rms_and_max(1e3 * turn),
         "reproduced": bool(distance.size and max(distance.max(), turn.max()) <= REPRODUCED),
     }
-
-
-def _distribution(values: FloatArray) -> dict[str, float | None]:
-    if not values.size:
-        return dict.fromkeys(("mean", "p50", "p99", "max"))
-    p50, p99 = np.percentile(values, (50, 99)).tolist()
-    return {"mean": float(values.mean()), "p50": p50, "p99": p99, "max": float(values.max())}
 
 
 def _rms_and_max(values: FloatArray) -> dict[str, float | None]:
@@ -386,7 +383,7 @@ def judge(parts: Sequence[ReplayEvaluation]) -> dict[str, Any]:
             seq, x, y = part.replayed.feet.T
             places = estimate.place[np.searchsorted(estimate.seq, seq)]
             each.append(places - np.column_stack([x, y, part.mirror.surface.heights_m(x, y)]))
-        return _distribution(1e3 * np.linalg.norm(np.concatenate(each), axis=1))
+        return distribution(1e3 * np.linalg.norm(np.concatenate(each), axis=1), _FIGURES, decimals=_DECIMALS)
 
     return {
         "reference": "truth" if has_truth else "recorded",
@@ -400,44 +397,17 @@ def judge(parts: Sequence[ReplayEvaluation]) -> dict[str, Any]:
     }
 
 
-# Name of a figure for a reader, its section and key; a head without.
-_ROWS = (
-    ("error against {}", "", ""),
-    ("  position mean (mm)", "position_error_mm", "mean"),
-    ("  position p50 (mm)", "position_error_mm", "p50"),
-    ("  position p99 (mm)", "position_error_mm", "p99"),
-    ("  position max (mm)", "position_error_mm", "max"),
-    ("  in motion rms (mm)", "moving_error_mm", "rms"),
-    ("  at arrivals rms (mm)", "arrival_error_mm", "rms"),
-    ("  at arrivals max (mm)", "arrival_error_mm", "max"),
-    ("  heading rms (mrad)", "heading_error_mrad", "rms"),
-    ("  NEES mean (3 is right)", "nees_mean", ""),
-    ("distance of the fixes", "", ""),
-    ("  mean (mm)", "fix_distance_mm", "mean"),
-    ("  max (mm)", "fix_distance_mm", "max"),
-)
 _POSE = ("x_m", "y_m", "heading_rad")
 
 
-def table_lines(result: Mapping[str, Any]) -> Iterator[str]:
+def table_lines(result: Mapping[str, Any]) -> list[str]:
     """The result of ``judge`` as a table: a column for each estimate, a dash for what is not known."""
-    names = [name for name in ("recorded", "replayed", "smoothed") if result[name] is not None]
-    reference = "the truth" if result["reference"] == "truth" else "the recorded estimate"
-    for name, section, key in _ROWS:
-        found = [result[column].get(section) for column in names]
-        cells = [value.get(key) if isinstance(value, Mapping) else value for value in found]
-        yield _line(name.format(reference), [_cell(value) for value in cells] if section else names)
-    found = result["difference"]
-    yield _line("replayed less recorded", ["rms", "max"])
-    for section, name in (("position_mm", "position (mm)"), ("heading_mrad", "heading (mrad)")):
-        yield _line(f"  {name}", [_cell(found[section]["rms"]), _cell(found[section]["max"])])
+    columns = [name for name in ("recorded", "replayed", "smoothed") if result[name] is not None]
+    return render("replay.txt", result=result, columns=columns, text=_cell).splitlines()
 
 
-def _line(name: str, cells: Sequence[str]) -> str:
-    return f"{name:<34}" + "".join(f"{cell:>12}" for cell in cells)
-
-
-def _cell(value: float | None) -> str:
+def _cell(figures: Mapping[str, Any], key: str) -> str:
+    value = value_at(figures, key)
     if value is None:
         return "-"
     return f"{value:.4f}" if value == 0.0 or abs(value) >= 1e-3 else f"{value:.1e}"
@@ -448,11 +418,8 @@ def csv_lines(parts: Sequence[ReplayEvaluation]) -> Iterator[str]:
     others = [f"{name}_{key}" for name in ("smoothed", "recorded", "true") for key in _POSE]
     yield ",".join(("part", "seq", "t_s", *_POSE, *others))
     for number, part in enumerate(parts, 1):
-        trace = part.replayed.trace
-        poses_of = [
-            {} if other is None else dict(zip(other.seq.tolist(), other.pose.tolist(), strict=True))
-            for other in (part.replayed.smoothed, part.recorded, part.truth)
-        ]
+        trace, rest = part.replayed.trace, (part.replayed.smoothed, part.recorded, part.truth)
+        poses_of = [dict(zip(one.seq.tolist(), one.pose.tolist(), strict=True)) if one else {} for one in rest]
         for seq, t_s, pose in zip(trace.seq.tolist(), trace.t_s.tolist(), trace.pose.tolist(), strict=True):
             found = [cell for poses in poses_of for cell in poses.get(seq, ("", "", ""))]
-            yield ",".join(str(cell) for cell in (number, seq, t_s, *pose, *found))
+            yield ",".join(map(str, (number, seq, t_s, *pose, *found)))
