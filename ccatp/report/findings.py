@@ -11,7 +11,7 @@ import numpy as np
 
 from ccatp.core import FloatArray, PointId, StopKind
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, compare, survey_result
-from ccatp.records.summary import arrival_error_m, measured_error_m
+from ccatp.records.summary import arrival_error_m, distribution, measured_error_m
 from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, RecordedSession, RunRecord
 from ccatp.survey.composition import plan_survey
 from ccatp.survey.planning.legs import PlanError
@@ -161,12 +161,9 @@ def error_figures(series: ErrorSeries) -> dict[str, float] | None:
     errors = series.error_mm[is_known]
     if not len(errors):
         return None
-    p50, p99 = np.percentile(errors, (50, 99)).tolist()
+    shown = distribution(errors, ("mean", "p50", "p99", "max"))
     return {
-        "mean_mm": float(errors.mean()),
-        "p50_mm": p50,
-        "p99_mm": p99,
-        "max_mm": float(errors.max()),
+        **{f"{name}_mm": value for name, value in shown.items()},
         "within_sigma3": float(np.mean(errors <= series.sigma3_mm[is_known])),
         "within_limit": float(np.mean(errors <= WITHIN_MM)),
     }
