@@ -143,6 +143,7 @@ class WaypointRow(NamedTuple):
     t_s: float
     place_m: tuple[float, float]
     sigma_m: float
+    estimate_off_m: float
     true_off_m: float | None  # of the true place
     error_m: float | None  # distance of the estimated place from the true one
     sigmas: float | None  # the same in standard deviations, root(e^T P^-1 e)
@@ -160,8 +161,9 @@ def waypoint_rows(record: BeaconRecord) -> list[WaypointRow]:
             if np.isfinite(true).all():
                 true_off_m, error_m = dist(true, arrival.place), dist(true, (x, y))
                 sigmas = sigmas_off(arrival.estimate, true)
+        off_m = dist((x, y), arrival.place)
         where = (number, arrival.lap + 1, arrival.waypoint + 1, arrival.t_s, arrival.place)
-        rows.append(WaypointRow(*where, worst_sigma_m(*ellipse), true_off_m, error_m, sigmas))
+        rows.append(WaypointRow(*where, worst_sigma_m(*ellipse), off_m, true_off_m, error_m, sigmas))
     return rows
 
 
