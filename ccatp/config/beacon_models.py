@@ -512,7 +512,7 @@ class PriorsConfig(Model):
     turn_scale: NonNegative
     turn_per_m: NonNegative
     turn_bias_rad_s: NonNegative
-    delay_s: NonNegative
+    odometry_delay_s: NonNegative
     range_scale: NonNegative
     range_offset_m: NonNegative
     bearing_offset_rad: NonNegative

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ccatp.beacons.slam.batch_problem import CALIBRATION, Reckoning
+from ccatp.beacons.slam.measurement_models import range_variance
 from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun
 from ccatp.config.beacon_models import RecordingConfig
 from ccatp.core import FloatArray
@@ -196,7 +197,7 @@ class _Session:
             return float(x + r.range_m[row] * np.cos(way)), float(y + r.range_m[row] * np.sin(way))
         if len(waiting) < LEAST_READINGS:
             return None
-        found = place_by_distances(poses, r.range_m[waiting], self._variance(r.range_m[waiting]))
+        found = place_by_distances(poses, r.range_m[waiting], range_variance(self._settings.radio, r.range_m[waiting]))
         last = row >= len(r.times_s) - len(self._run.beacon_ids)
         if last or (found.margin > SURE_MARGIN and found.spread < SURE_SPREAD):
             return found.x_m, found.y_m
@@ -205,7 +206,7 @@ class _Session:
     def _factor(self, row: int) -> Any:
         gtsam, r = self._gtsam, self._run.readings
         keys = self._x(int(self._at[row])), self._l(int(r.beacon[row]))
-        sigma = float(np.sqrt(self._variance(r.range_m[row])))
+        sigma = float(np.sqrt(range_variance(self._settings.radio, r.range_m[row])))
         if np.isfinite(r.bearing_rad[row]):
             sigmas = np.array((self._settings.radio.bearing_sigma_rad, sigma))
             noise = self._robust(gtsam.noiseModel.Diagonal.Sigmas(sigmas))
@@ -216,11 +217,6 @@ class _Session:
     def _robust(self, noise: Any) -> Any:
         model = self._gtsam.noiseModel
         return model.Robust.Create(model.mEstimator.Huber.Create(HUBER), noise)
-
-    def _variance(self, range_m: FloatArray) -> FloatArray:
-        radio = self._settings.radio
-        variance: FloatArray = radio.range_sigma_m**2 + (radio.range_sigma_per_m * range_m) ** 2
-        return variance
 
     def _track(self, path: FloatArray, values: Any, update_s: FloatArray) -> EstimatedPath:
         beacons = {}

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccatp.beacons.slam.measurement_models import bearing_row, level_row, range_row
+from ccatp.beacons.slam.measurement_models import bearing_row, level_row, range_row, range_variance
 from ccatp.beacons.slam.recording import BoolArray, Readings, Steps, running_total
 from ccatp.config.beacon_models import OdometryNoiseConfig, RecordingConfig
 from ccatp.core import FloatArray, IntArray
@@ -12,8 +12,8 @@ from ccatp.filters.metrics import wrapped
 
 # What odometry is calibrated by: d = (1 + distance_scale) d_o, w = (1 + turn_scale) w_o + turn_per_m d_o - bias t.
 # Scales are what corrects, not what the odometry reads too much; ``turn_per_m`` is what wheels of unequal size do;
-# ``delay_s`` is by how much the vehicle does later what its odometry says (commands that are taken for odometry).
-CALIBRATION = ("distance_scale", "turn_scale", "turn_per_m", "turn_bias_rad_s", "delay_s")
+# ``odometry_delay_s`` is by how much the vehicle does later what its odometry says (commands taken for odometry).
+CALIBRATION = ("distance_scale", "turn_scale", "turn_per_m", "turn_bias_rad_s", "odometry_delay_s")
 STILL_M = 1e-4  # standard deviation of what happens in any interval, even at rest: keeps the covariance regular
 STILL_RAD = 1e-4
 DELAY_STEP_S = 0.05
@@ -197,7 +197,7 @@ class BatchProblem:
         settings: RecordingConfig,
         used: BoolArray,
     ) -> None:
-        self.reckoning = Reckoning(steps, times_s, delayed=settings.priors.delay_s > 0.0)
+        self.reckoning = Reckoning(steps, times_s, delayed=settings.priors.odometry_delay_s > 0.0)
         self.readings = readings
         self.at: IntArray = np.searchsorted(times_s, readings.times_s)
         self.first_pose = np.array(first_pose)
@@ -288,7 +288,7 @@ class BatchProblem:
         by_shared[:, 2, 3], by_shared[:, 2, 4] = 1.0, by_exponent
         # By the range read, not the one predicted: a variance that moves with the state would draw it outwards.
         variances = np.empty_like(errors)
-        variances[:, 0] = radio.range_sigma_m**2 + (radio.range_sigma_per_m * self._read[:, 0]) ** 2
+        variances[:, 0] = range_variance(radio, self._read[:, 0])
         variances[:, 1:] = radio.bearing_sigma_rad**2, radio.rssi_sigma_db**2
         information: FloatArray = self.there / (variances * self.repeats[:, None])
         by_rest = np.concatenate([by_shared, by_beacon], axis=2)

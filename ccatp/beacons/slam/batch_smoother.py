@@ -156,7 +156,6 @@ NOISY = 4.0  # how many times the noise may have been widened without a warning
 LITTLE = 0.1  # a reading that weighs less counts as refused
 # Unknowns s that multiply the odometry, d = (1 + s) d_o; shown is what it reads too much, e with d = d_o / (1 + e).
 CORRECTING = ("distance_scale", "turn_scale")
-SHOWN_AS = {"delay_s": "odometry_delay_s"}
 
 
 class Start(NamedTuple):
@@ -173,8 +172,7 @@ def _started(run: RecordedRun, settings: RecordingConfig, how: SlamFilterConfig,
     poses = np.column_stack([np.interp(times_s, path.times_s, column) for column in path.poses.T])
     priors, shared = settings.priors, np.zeros(len(SHARED))
     for name, (value, _) in slam.calibration.items():
-        of_filter = {shown: own for own, shown in SHOWN_AS.items()}
-        shared[SHARED.index(of_filter.get(name, name))] = 1.0 / (1.0 + value) - 1.0 if name in CORRECTING else value
+        shared[SHARED.index(name)] = 1.0 / (1.0 + value) - 1.0 if name in CORRECTING else value
     count = len(run.beacon_ids)
     beacons, used, doubtful = np.zeros((count, BEACON)), np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
     levels_db = []
@@ -235,7 +233,7 @@ def smooth(
         x_m, y_m = state.beacons[k, :2].tolist()
         beacons[run.beacon_ids[k]] = BeaconFix(x_m, y_m, covariance[place, place])
     calibration = _calibration(problem, state, np.sqrt(np.diag(covariance)))
-    priors = {SHOWN_AS.get(name, name): getattr(problem.priors, name) for name in SHARED}
+    priors = {name: getattr(problem.priors, name) for name in SHARED}
     warnings = [*_warnings(run, start, converged), *beyond_priors(calibration, priors, run.kind)]
     for what, name in (("range", "range_sigma_m"), ("bearing", "bearing_sigma_rad"), ("rssi", "rssi_sigma_db")):
         if (ratio := getattr(problem.radio, name) / getattr(first_radio, name)) > NOISY:
@@ -285,7 +283,7 @@ def _calibration(problem: BatchProblem, state: BatchState, sigmas: FloatArray) -
             if name in CORRECTING:
                 scale = 1.0 + value
                 value, sigma = 1.0 / scale - 1.0, sigma / scale**2
-            found[SHOWN_AS.get(name, name)] = Calibrated(value, sigma)
+            found[name] = Calibrated(value, sigma)
     return found
 
 

@@ -368,5 +368,5 @@ def recorded_slam(
     """The filter of recorded runs."""
     return BeaconSlam(
         DifferentialDrive(cfg.odometry, cfg.priors, how), recorded_models(cfg.radio, cfg.priors), how, pose0, P0,
-        gate=cfg.radio.gate_sigmas**2, delay_sigma_s=cfg.priors.delay_s, correlation_s=cfg.radio.correlation_s,
+        gate=cfg.radio.gate_sigmas**2, delay_sigma_s=cfg.priors.odometry_delay_s, correlation_s=cfg.radio.correlation_s,
     )  # fmt: skip

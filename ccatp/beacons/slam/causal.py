@@ -26,7 +26,6 @@ from ccatp.core import FloatArray
 
 FAR = 3.0  # standard deviations of the prior beyond which a value is reported
 UNCHANGED = 0.999  # of the prior's standard deviation: what is left of it without readings of it
-KEYS = {"odometry_delay_s": "delay_s"}  # keys under ``priors`` that are called otherwise than the quantity
 
 
 def beyond_priors(calibration: Mapping[str, Calibrated], priors: Mapping[str, float], kind: str) -> Iterator[str]:
@@ -36,7 +35,7 @@ def beyond_priors(calibration: Mapping[str, Calibrated], priors: Mapping[str, fl
         if abs(value) > FAR * sigma:
             yield (
                 f"{name} comes out as {value:+.3g}, {abs(value) / sigma:.1f} standard deviations of its prior: "
-                f"if that can be, widen {kind}.priors.{KEYS.get(name, name)} (now {sigma:g})"
+                f"if that can be, widen {kind}.priors.{name} (now {sigma:g})"
             )
 
 

@@ -40,6 +40,11 @@ def level_row(xp: ModuleType, dx: Any, dy: Any, reference: Any, exponent: Any) -
     return reference + exponent * by_exponent, slope * dx, slope * dy, by_exponent
 
 
+def range_variance(radio: RadioNoiseConfig, range_m: Any) -> Any:
+    """Of a range, m^2: sigma^2 + (sigma_per_m r)^2."""
+    return radio.range_sigma_m**2 + (radio.range_sigma_per_m * range_m) ** 2
+
+
 class MeasurementRow(NamedTuple):
     """One scalar of a reading."""
 
@@ -65,13 +70,10 @@ class MeasurementModel(ABC):
 
 
 class RangeModel(MeasurementModel):
-    """z = (1 + e) r + o, scale e and offset o shared by all, each estimated where its prior is not zero.
-
-    The variance is sigma^2 + (sigma_per_m r)^2.
-    """
+    """z = (1 + e) r + o, scale e and offset o shared by all, each estimated where its prior is not zero."""
 
     def __init__(self, radio: RadioNoiseConfig, priors: PriorsConfig) -> None:
-        self._variance, self._per_m2 = radio.range_sigma_m**2, radio.range_sigma_per_m**2
+        self._radio = radio
         self._has_scale, self._has_offset = priors.range_scale > 0.0, priors.range_offset_m > 0.0
         calibrated = {"range_scale": priors.range_scale, "range_offset_m": priors.range_offset_m}
         self.names, self.prior_sigmas = estimated(calibrated)
@@ -85,7 +87,7 @@ class RangeModel(MeasurementModel):
             offset = calibration[-1]
         expected, ux, uy, r = range_row(math, beacon[0] - pose[0], beacon[1] - pose[1], scale)
         by = (r,) * self._has_scale + (1.0,) * self._has_offset
-        return MeasurementRow(expected + offset, (-ux, -uy, 0.0), by, (ux, uy), self._variance + self._per_m2 * r * r)
+        return MeasurementRow(expected + offset, (-ux, -uy, 0.0), by, (ux, uy), range_variance(self._radio, r))
 
 
 class BearingModel(MeasurementModel):

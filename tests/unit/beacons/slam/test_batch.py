@@ -26,7 +26,7 @@ from ccatp.filters.metrics import RigidMotion, aligned_rms_m, best_motion, consi
 from tests.unit.beacons.datasets.sets import BEACONS, changed, recorded, world
 
 FloatArray = npt.NDArray[np.float64]
-DELAY = CALIBRATION.index("delay_s")
+DELAY = CALIBRATION.index("odometry_delay_s")
 ODOMETRY = OdometryNoiseConfig(
     distance_per_sqrt_m=0.02, distance_per_sqrt_rad=0.01, turn_per_sqrt_m=0.02, turn_per_sqrt_rad=0.05,
     turn_per_sqrt_s=0.01, lateral_per_sqrt_m=0.015,
@@ -37,7 +37,7 @@ RADIO = RadioNoiseConfig(
 )  # fmt: skip
 NO_PRIORS = PriorsConfig(**dict.fromkeys(PriorsConfig.model_fields, 0.0) | {"pose_m": 0.05, "heading_rad": 0.03})
 PRIORS = PriorsConfig(
-    distance_scale=0.1, turn_scale=0.1, turn_per_m=0.05, turn_bias_rad_s=0.02, delay_s=0.2, range_scale=0.1,
+    distance_scale=0.1, turn_scale=0.1, turn_per_m=0.05, turn_bias_rad_s=0.02, odometry_delay_s=0.2, range_scale=0.1,
     range_offset_m=0.3, bearing_offset_rad=0.02, rssi_reference_db=5.0, rssi_exponent=0.4, beacon_offset_m=0.1,
     beacon_reference_db=2.0, pose_m=0.05, heading_rad=0.03,
 )  # fmt: skip
@@ -295,7 +295,7 @@ def test_commands_that_the_vehicle_follows_late() -> None:
     )  # fmt: skip
     inside = lagged.readings.times_s < steps.times_s[-1]
     lagged = replace(lagged, steps=steps, readings=lagged.readings.where(inside))
-    settings = with_priors(delay_s=0.3)
+    settings = with_priors(odometry_delay_s=0.3)
     delay, sigma = smooth(lagged, settings, HOW, no_clock).calibration["odometry_delay_s"]
     assert delay == pytest.approx(0.25, abs=max(4.0 * sigma, 0.02))
 

@@ -140,7 +140,7 @@ def test_ranges_calibrate_themselves_and_the_gyroscope() -> None:
 
 
 def test_the_delay_of_a_vehicle_that_follows_its_commands_late_is_found() -> None:
-    slam = recorded_slam(*SETTINGS.but(priors__delay_s=0.2), (0.0, 0.0, 0.0), P0)
+    slam = recorded_slam(*SETTINGS.but(priors__odometry_delay_s=0.2), (0.0, 0.0, 0.0), P0)
     world = World(recorded_slam(*SETTINGS, (0.0, 0.0, 0.0), P0), both)
     turns = [0.1 if (k // 15) % 2 else -0.06 for k in range(400)]
     for k, turn_rad in enumerate(turns):
@@ -329,7 +329,7 @@ def by_both(run: RecordedRun, **priors: float) -> list[EstimatedPath]:
 def test_filter_and_smoother_mean_the_same_by_a_name() -> None:
     run = recorded(world(3, 120.0))
     more = run.steps._replace(distance_m=1.1 * run.steps.distance_m, turn_rad=0.92 * run.steps.turn_rad)
-    tracks = by_both(replace(run, steps=more), distance_scale=0.2, turn_scale=0.2, delay_s=0.2)
+    tracks = by_both(replace(run, steps=more), distance_scale=0.2, turn_scale=0.2, odometry_delay_s=0.2)
     for track in tracks:
         assert track.calibration["distance_scale"].value == pytest.approx(0.1, abs=0.03)
         assert track.calibration["turn_scale"].value == pytest.approx(-0.08, abs=0.03)
