@@ -10,13 +10,15 @@ from ccatp.config.beacon_models import OdometryNoiseConfig, RecordingConfig
 from ccatp.core import FloatArray, IntArray
 from ccatp.filters.metrics import wrapped
 
-# What odometry is calibrated by: d = (1 + distance_scale) d_o, w = (1 + turn_scale) w_o + turn_per_m d_o - bias t.
-# Scales are what corrects, not what the odometry reads too much; ``turn_per_m`` is what wheels of unequal size do;
+# What odometry is calibrated by, as in the filter: d = d_o / (1 + distance_scale),
+# w = w_o / (1 + turn_scale) + turn_per_m d_o - bias t. ``turn_per_m`` is what wheels of unequal size do;
 # ``odometry_delay_s`` is by how much the vehicle does later what its odometry says (commands taken for odometry).
 CALIBRATION = ("distance_scale", "turn_scale", "turn_per_m", "turn_bias_rad_s", "odometry_delay_s")
+BIAS = CALIBRATION.index("turn_bias_rad_s")
 STILL_M = 1e-4  # standard deviation of what happens in any interval, even at rest: keeps the covariance regular
 STILL_RAD = 1e-4
 DELAY_STEP_S = 0.05
+TINY_RAD = 1e-6  # after a second: a gyroscope is taken for no better
 # Steps shorter than that are put together: within it a vehicle turns so little that the chord is the arc.
 FINEST_S = 0.1
 
@@ -24,10 +26,14 @@ FINEST_S = 0.1
 class Reckoning:
     """Steps of odometry, cut at given instants and put together between them.
 
-    ``times_s``: the instants, shape (n + 1,), rising, within the steps.
+    ``times_s``: the instants, shape (n + 1,), rising, within the steps. ``rest``: steps slower than that, m/s and
+    rad/s, are at rest: the turn that is read is the bias of the gyroscope, and the heading stays. ``at_rest``: time and
+    turn of all such steps, s and rad.
     """
 
-    def __init__(self, steps: Steps, times_s: FloatArray, *, delayed: bool = True) -> None:
+    def __init__(
+        self, steps: Steps, times_s: FloatArray, *, delayed: bool = True, rest: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
         self._delayed = delayed
         inside = (steps.times_s > times_s[0]) & (steps.times_s < times_s[-1])
         inner_s = steps.times_s[inside]
@@ -35,18 +41,21 @@ class Reckoning:
         fine_s = np.union1d(inner_s[first], times_s)
         self._starts = np.searchsorted(fine_s, times_s)[:-1]
         self._lengths = np.diff(np.append(self._starts, fine_s.size - 1))
-        self.interval_s = np.diff(fine_s)
+        lasts_s = np.diff(steps.times_s)
+        rests = (np.abs(steps.distance_m) < rest[0] * lasts_s) & (np.abs(steps.turn_rad) < rest[1] * lasts_s)
+        self.at_rest = float(lasts_s[rests].sum()), float(steps.turn_rad[rests].sum())
 
         self._fine_s, self._steps_s = fine_s, steps.times_s
         guesses = (np.broadcast_to(guess, steps.distance_m.shape) for guess in (steps.guess_m2, steps.guess_rad2))
-        amounts = (steps.distance_m, steps.turn_rad, steps.lateral_m, *guesses)
+        # The time is that in which the bias turns the heading.
+        amounts = (steps.distance_m, steps.turn_rad * ~rests, steps.lateral_m, lasts_s * ~rests, *guesses)
         self._totals = [running_total(amount) for amount in amounts]
         self._cut(0.0)
 
     def _cut(self, delay_s: float) -> None:
         self._delay_s = delay_s
         shares = (self._shares(total, delay_s) for total in self._totals)
-        self.distance_m, self.turn_rad, self.lateral_m, self._guess_m2, self._guess_rad2 = shares
+        self.distance_m, self.turn_rad, self.lateral_m, self.interval_s, self._guess_m2, self._guess_rad2 = shares
 
     def _shares(self, total: FloatArray, delay_s: float) -> FloatArray:
         shares: FloatArray = np.diff(np.interp(self._fine_s - delay_s, self._steps_s, total))
@@ -66,10 +75,9 @@ class Reckoning:
         """
         if calibration[4] != self._delay_s:
             self._cut(float(calibration[4]))
-        way, side = (1.0 + calibration[0]) * self.distance_m, self.lateral_m
-        turn = (
-            (1.0 + calibration[1]) * self.turn_rad + calibration[2] * self.distance_m - calibration[3] * self.interval_s
-        )
+        by_scale, by_turn_scale = 1.0 / (1.0 + calibration[0]), 1.0 / (1.0 + calibration[1])
+        way, side, scaled_turn = by_scale * self.distance_m, by_scale * self.lateral_m, by_turn_scale * self.turn_rad
+        turn = scaled_turn + calibration[2] * self.distance_m - calibration[3] * self.interval_s
         before = running_total(turn)
         heading = before[:-1] + 0.5 * turn - np.repeat(before[self._starts], self._lengths)
         c, s = np.cos(heading), np.sin(heading)
@@ -82,15 +90,15 @@ class Reckoning:
         lever_y = np.repeat(end_x + start_x, self._lengths) - x
         motion = np.stack([end_x, end_y, self._sum(turn)], axis=1)
         by = np.zeros((len(motion), 3, len(CALIBRATION)))
-        by[:, 0, 0], by[:, 1, 0] = self._sum(self.distance_m * c), self._sum(self.distance_m * s)
-        for k, amount in enumerate((self.turn_rad, self.distance_m, -self.interval_s), 1):
+        by[:, :2, 0] = -by_scale * motion[:, :2]
+        for k, amount in enumerate((-by_turn_scale * scaled_turn, self.distance_m, -self.interval_s), 1):
             by[:, 0, k] = self._sum(lever_x * amount)
             by[:, 1, k] = self._sum(lever_y * amount)
             by[:, 2, k] = self._sum(amount)
         if self._delayed:
-            way_by, turn_by, side_by = (self._by_delay(total) for total in self._totals[:3])
-            turn_by = (1.0 + calibration[1]) * turn_by + calibration[2] * way_by
-            way_by = (1.0 + calibration[0]) * way_by
+            way_by, turn_by, side_by, time_by = (self._by_delay(total) for total in self._totals[:4])
+            turn_by = by_turn_scale * turn_by + calibration[2] * way_by - calibration[3] * time_by
+            way_by, side_by = by_scale * way_by, by_scale * side_by
             by[:, 0, 4] = self._sum(way_by * c - side_by * s + lever_x * turn_by)
             by[:, 1, 4] = self._sum(way_by * s + side_by * c + lever_y * turn_by)
             by[:, 2, 4] = self._sum(turn_by)
@@ -125,7 +133,7 @@ class Reckoning:
 
 
 OF_READINGS = ("range_scale", "range_offset_m", "bearing_offset_rad", "rssi_reference_db", "rssi_exponent")
-# Unknowns that are neither pose nor beacon, in the order of the state: corrections, zero where all is as it should.
+# Unknowns that are neither pose nor beacon, in the order of the state: zero where all is as it should be.
 SHARED = (*CALIBRATION, *OF_READINGS)
 RANGE_SCALE, RANGE_OFFSET, BEARING_OFFSET, RSSI_REFERENCE, RSSI_EXPONENT = (SHARED.index(name) for name in OF_READINGS)
 BEACON = 4  # x_m, y_m, the offset of its ranges, m, and of its P_ref, dB
@@ -196,12 +204,19 @@ class BatchProblem:
         first_pose: tuple[float, float, float],
         settings: RecordingConfig,
         used: BoolArray,
+        rest: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        self.reckoning = Reckoning(steps, times_s, delayed=settings.priors.odometry_delay_s > 0.0)
+        priors = settings.priors
+        self.reckoning = Reckoning(
+            steps,
+            times_s,
+            delayed=priors.odometry_delay_s > 0.0,
+            rest=rest if priors.turn_bias_rad_s > 0.0 else (0.0, 0.0),
+        )
         self.readings = readings
         self.at: IntArray = np.searchsorted(times_s, readings.times_s)
         self.first_pose = np.array(first_pose)
-        self.radio, self.odometry, self.priors = settings.radio, settings.odometry, settings.priors
+        self.radio, self.odometry, self.priors = settings.radio, settings.odometry, priors
         self.used = used
         read = np.column_stack([readings.range_m, readings.bearing_rad, readings.rssi_dbm])
         self.there = np.isfinite(read) & used[readings.beacon][:, None]
@@ -215,6 +230,12 @@ class BatchProblem:
         self.free = sigmas > 0.0
         self.prior_information = np.where(self.free, 1.0 / np.where(self.free, sigmas, 1.0) ** 2, 0.0)
         self.prior_information[np.isinf(sigmas)] = 0.0
+        rest_s, rest_rad = self.reckoning.at_rest
+        self._prior_mean = np.zeros(sigmas.size)
+        if rest_s > 0.0:  # a measurement of the bias with the angle random walk of the gyroscope
+            information = rest_s / max(self.odometry.turn_per_sqrt_s, TINY_RAD) ** 2
+            self.prior_information[BIAS] += information
+            self._prior_mean[BIAS] = rest_rad / rest_s * information / self.prior_information[BIAS]
         self._last: tuple[BatchState, Residuals] | None = None
         self.first_information = np.array((self.priors.pose_m**-2, self.priors.pose_m**-2, self.priors.heading_rad**-2))
 
@@ -226,7 +247,7 @@ class BatchProblem:
 
     def prior_cost(self, state: BatchState) -> float:
         """Half the sum of squares of the priors."""
-        shared = np.concatenate([state.shared, state.beacons.ravel()])
+        shared = np.concatenate([state.shared, state.beacons.ravel()]) - self._prior_mean
         first = state.poses[0] - self.first_pose
         return float(0.5 * (shared**2 @ self.prior_information + first**2 @ self.first_information))
 
@@ -240,7 +261,7 @@ class BatchProblem:
         )  # fmt: skip
         _add_odometry(system, state, residuals)
         self._add_readings(system, residuals, weights)
-        shared = np.concatenate([state.shared, state.beacons.ravel()])
+        shared = np.concatenate([state.shared, state.beacons.ravel()]) - self._prior_mean
         system.corner[range(size), range(size)] += self.prior_information
         system.shared_side -= self.prior_information * shared
         system.diagonal[0] += np.diag(self.first_information)

@@ -154,8 +154,6 @@ WIDENINGS = 8
 WIDER = 1.05  # noise is widened where the residuals are larger than it by that factor
 NOISY = 4.0  # how many times the noise may have been widened without a warning
 LITTLE = 0.1  # a reading that weighs less counts as refused
-# Unknowns s that multiply the odometry, d = (1 + s) d_o; shown is what it reads too much, e with d = d_o / (1 + e).
-CORRECTING = ("distance_scale", "turn_scale")
 
 
 class Start(NamedTuple):
@@ -172,7 +170,7 @@ def _started(run: RecordedRun, settings: RecordingConfig, how: SlamFilterConfig,
     poses = np.column_stack([np.interp(times_s, path.times_s, column) for column in path.poses.T])
     priors, shared = settings.priors, np.zeros(len(SHARED))
     for name, (value, _) in slam.calibration.items():
-        shared[SHARED.index(name)] = 1.0 / (1.0 + value) - 1.0 if name in CORRECTING else value
+        shared[SHARED.index(name)] = value
     count = len(run.beacon_ids)
     beacons, used, doubtful = np.zeros((count, BEACON)), np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
     levels_db = []
@@ -205,8 +203,8 @@ def smooth(
     steps_s = run.steps.times_s  # there is a pose at each reading, and at an odometry step now and then between them
     _, first = np.unique(np.floor((steps_s - steps_s[0]) / SPACING_S), return_index=True)
     times_s = np.union1d(run.readings.times_s, steps_s[first])
-    start = _started(run, settings, how, times_s)
-    problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used)
+    start, rest = _started(run, settings, how, times_s), (how.rest_speed_m_s, how.rest_turn_rad_s)
+    problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used, rest)
     counted = problem.sizes > 0
     off = problem.residuals(start.state).chi2[counted] / problem.sizes[counted]
     state, softness = start.state, float(np.median(off)) if counted.any() else 0.0
@@ -218,7 +216,7 @@ def smooth(
         if radio == problem.radio:
             break
         settings = settings.model_copy(update={"radio": radio})
-        problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used)
+        problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used, rest)
         state, converged = descend(problem, state, ITERATIONS)
     took_s = clock_s() - begin_s
     weights = t_weights(problem.residuals(state).chi2, problem.sizes, problem.radio.freedom)
@@ -279,11 +277,7 @@ def _calibration(problem: BatchProblem, state: BatchState, sigmas: FloatArray) -
     found = {}
     for k, name in enumerate(SHARED):
         if problem.free[k] and shown.get(name, True):
-            value, sigma = float(state.shared[k]), float(sigmas[k])
-            if name in CORRECTING:
-                scale = 1.0 + value
-                value, sigma = 1.0 / scale - 1.0, sigma / scale**2
-            found[name] = Calibrated(value, sigma)
+            found[name] = Calibrated(float(state.shared[k]), float(sigmas[k]))
     return found
 
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import LinAlgError
 from scipy.spatial.transform import Rotation
 
-from ccatp.beacons.slam.batch_problem import BEACON, CALIBRATION, SHARED, BatchProblem, BatchState, repeats
+from ccatp.beacons.slam.batch_problem import BEACON, CALIBRATION, SHARED, BatchProblem, BatchState, Reckoning, repeats
 from ccatp.beacons.slam.batch_smoother import Factored, smooth, t_cost, t_weights
 from ccatp.beacons.slam.evaluation import judge, truth_at
 from ccatp.beacons.slam.recording import (
@@ -65,7 +65,8 @@ def problem() -> tuple[BatchProblem, BatchState]:
         np.array([nan, -52.0, nan, nan, -50.0, -55.0]),
     )
     times = np.union1d(s.times_s[:1], t)
-    made = BatchProblem(s, readings, times, (0.1, -0.2, 0.3), OF_PROBLEM, np.ones(2, dtype=bool))
+    made = BatchProblem(s, readings, times, (0.1, -0.2, 0.3), OF_PROBLEM, np.ones(2, dtype=bool), rest=(0.3, 0.5))
+    assert made.reckoning.at_rest[0] > 0.0
     poses = np.column_stack([np.interp(times, s.times_s, c) for c in dead_reckoned(s, (0.1, -0.2, 0.3)).T])
     poses += 0.05 * rng.standard_normal(poses.shape)
     shared = 0.02 * rng.standard_normal(len(SHARED))
@@ -107,6 +108,17 @@ def dense(made: BatchProblem, state: BatchState, weights: FloatArray) -> tuple[F
     A[3 * n :, : 3 * n] = A[: 3 * n, 3 * n :].T
     A[3 * n :, 3 * n :] = system.corner
     return A, np.concatenate([system.pose_side.ravel(), system.shared_side])
+
+
+def test_at_rest_the_heading_stays_and_the_turn_is_the_bias() -> None:
+    bias_rad_s, t = 0.02, np.linspace(0.0, 10.0, 101)
+    drives = (t[:-1] >= 6.0).astype(np.float64)
+    s = Steps(t, 0.1 * drives, np.full(100, 0.1 * bias_rad_s) + 0.05 * drives, np.zeros(100))
+    reckoning = Reckoning(s, np.array([0.0, 6.0, 10.0]), rest=(0.1, 0.1))
+    assert reckoning.at_rest == pytest.approx((6.0, 6.0 * bias_rad_s))
+    for bias, turned in ((0.0, 2.0 + 4.0 * bias_rad_s), (bias_rad_s, 2.0)):
+        motion, _, _ = reckoning.increments(np.array((0.0, 0.0, 0.0, bias, 0.0)), ODOMETRY)
+        assert motion[:, 2] == pytest.approx([0.0, turned])
 
 
 def test_the_gradient_is_that_of_the_cost() -> None:
