@@ -195,8 +195,6 @@ class ProfiledAxis:
 
 # Drift per metre beyond which an estimate is nonsense: a robot carried off that fast has lost its wheels' grip.
 CREEP_LIMIT = 0.3
-
-
 Vector2 = tuple[float, float]
 Speeds = Twist | Predicted | None
 

@@ -154,6 +154,47 @@ class SampleValidator:
         return False
 
 
+class SensorTransition(NamedTuple):
+    """One edge sensor changed its value, between two samples whose middle is ``t_s``.
+
+    ``corner`` as in ``core.Corner``.
+    """
+
+    t_s: float
+    interval_s: float
+    corner: int
+    is_on: bool
+
+
+class EdgeScanner:
+    """Finds the transitions in the stream of edge samples. Samples that are not newer than the last are skipped."""
+
+    def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the last sample: the robot's clock has jumped."""
+        self._t_s = -inf
+        self._values: tuple[int, ...] = ()
+
+    def scan(self, edges: Sequence[EdgeSample]) -> list[SensorTransition]:
+        """Transitions of a frame, oldest first; normally none."""
+        found: list[SensorTransition] = []
+        last, values = self._t_s, self._values
+        for sample in edges:
+            t = sample[0]
+            if not last < t < inf:
+                continue
+            if sample[1:] != values:
+                for corner, (old, new) in enumerate(zip(values, sample[1:], strict=bool(values))):
+                    if old != new:
+                        found.append(SensorTransition(0.5 * (last + t), t - last, corner, bool(new)))
+                values = sample[1:]
+            last = t
+        self._t_s, self._values = last, values
+        return found
+
+
 FilterWrap = Callable[[Filter], Filter]
 """Makes a filter of a filter, which it may record or replace."""
 
@@ -279,44 +320,3 @@ class LocalizerBase(ABC):
         self, dt_s: float, imu: ImuReadings, right: WheelReadings, left: WheelReadings, edges: Edges, gravity: Gravity
     ) -> None:
         """Bring a filter, if not frozen, to ``t_s``, ``dt_s`` after the last frame (0 in a new base); may diverge."""
-
-
-class SensorTransition(NamedTuple):
-    """One edge sensor changed its value, between two samples whose middle is ``t_s``.
-
-    ``corner`` as in ``core.Corner``.
-    """
-
-    t_s: float
-    interval_s: float
-    corner: int
-    is_on: bool
-
-
-class EdgeScanner:
-    """Finds the transitions in the stream of edge samples. Samples that are not newer than the last are skipped."""
-
-    def __init__(self) -> None:
-        self.restart()
-
-    def restart(self) -> None:
-        """Forget the last sample: the robot's clock has jumped."""
-        self._t_s = -inf
-        self._values: tuple[int, ...] = ()
-
-    def scan(self, edges: Sequence[EdgeSample]) -> list[SensorTransition]:
-        """Transitions of a frame, oldest first; normally none."""
-        found: list[SensorTransition] = []
-        last, values = self._t_s, self._values
-        for sample in edges:
-            t = sample[0]
-            if not last < t < inf:
-                continue
-            if sample[1:] != values:
-                for corner, (old, new) in enumerate(zip(values, sample[1:], strict=bool(values))):
-                    if old != new:
-                        found.append(SensorTransition(0.5 * (last + t), t - last, corner, bool(new)))
-                values = sample[1:]
-            last = t
-        self._t_s, self._values = last, values
-        return found

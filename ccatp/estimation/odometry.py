@@ -10,8 +10,6 @@ from ccatp.mirror.mirror import Mirror
 
 # Third derivatives of these mirrors stay below 3e-3 1/m^2: within this distance a slope is off by less than 1e-7.
 _REACH_M = 5e-3
-
-
 # A tangent plane flatter than this has no downhill direction worth the name.
 _LEVEL = 1e-3
 

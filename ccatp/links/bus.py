@@ -33,6 +33,32 @@ MAX_MESSAGE_BYTES = 1 << 20
 HIGH_WATER_MARK = 50_000
 # A subscriber comes up before its publisher; it should not miss the first messages for long.
 RECONNECT_MS = 10
+_encoder = msgspec.json.Encoder()
+_decoders = {topic.name.encode(): (topic.name, msgspec.json.Decoder[Any](topic.message)) for topic in TOPICS}
+_prefixes = {topic.name: topic.name.encode() + b" " for topic in TOPICS}
+
+
+class BadMessage(Exception):
+    """A frame on the bus that is not of the topic table."""
+
+
+def pack(name: str, message: Message | Verdict) -> bytes:
+    """One frame: topic, space, JSON."""
+    return _prefixes[name] + _encoder.encode(message)
+
+
+def unpack(frame: bytes) -> tuple[str, bytes, Message | Verdict]:
+    """The topic's name, JSON text and message of a frame; raises ``BadMessage``."""
+    prefix, _, body = frame.partition(b" ")
+    known = _decoders.get(prefix)
+    if known is None:
+        raise BadMessage(f"unknown topic {prefix[:40]!r}")
+    name, decoder = known
+    try:
+        message: Message | Verdict = decoder.decode(body)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise BadMessage(f"topic {name}: {error}") from error
+    return name, body, message
 
 
 class Publisher:
@@ -141,42 +167,10 @@ class Subscriber:
         self.socket.close()
 
 
-_encoder = msgspec.json.Encoder()
-
-_decoders = {topic.name.encode(): (topic.name, msgspec.json.Decoder[Any](topic.message)) for topic in TOPICS}
-
-_prefixes = {topic.name: topic.name.encode() + b" " for topic in TOPICS}
-
-
-class BadMessage(Exception):
-    """A frame on the bus that is not of the topic table."""
-
-
-def pack(name: str, message: Message | Verdict) -> bytes:
-    """One frame: topic, space, JSON."""
-    return _prefixes[name] + _encoder.encode(message)
-
-
-def unpack(frame: bytes) -> tuple[str, bytes, Message | Verdict]:
-    """The topic's name, JSON text and message of a frame; raises ``BadMessage``."""
-    prefix, _, body = frame.partition(b" ")
-    known = _decoders.get(prefix)
-    if known is None:
-        raise BadMessage(f"unknown topic {prefix[:40]!r}")
-    name, decoder = known
-    try:
-        message: Message | Verdict = decoder.decode(body)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise BadMessage(f"topic {name}: {error}") from error
-    return name, body, message
-
-
 # In lockstep simulated time stands still while a loop waits; longer than this the other loop hangs.
 LOCKSTEP_WAIT_S = 10.0
-
 # Between slices the heartbeat is sent, and the connection to the other loop is checked.
 WAIT_SLICE_S = 0.02
-
 # Danger is at most a few frames ahead of main: a number far beyond the present one is of the robot's last boot.
 MAX_FRAMES_AHEAD = 100
 
@@ -363,7 +357,6 @@ class HeartbeatPublisher:
 
 # Frames per batch: a second of them, small enough for the bus and large enough that the cost per frame vanishes.
 BATCH_FRAMES = 100
-
 # A batch is sent after this much wall time even when it is not full, so that displays stay alive in real time.
 BATCH_WALL_S = 0.25
 

@@ -55,13 +55,11 @@ class SurveyOutcome(StrEnum):
 
 
 _ANYWHERE = {MissionEvent.HOLD: HELD, MissionEvent.FINISHED: DONE}
-
 _SURVEYING = _ANYWHERE | {
     MissionEvent.EDGE: BACKING_OFF,
     MissionEvent.GO_HOME: RETURNING,
     MissionEvent.GO_ON: TURNING,
 }
-
 # (state, event) -> state. An edge outranks an abort: while backing off GO_HOME changes nothing. DONE is final.
 TRANSITIONS = MappingProxyType(
     {
@@ -77,7 +75,6 @@ TRANSITIONS = MappingProxyType(
         **dict.fromkeys(AMONG_BEACONS, _ANYWHERE),
     }
 )
-
 # What the last gate lets a state of a survey move for.
 PURPOSES = MappingProxyType(
     {

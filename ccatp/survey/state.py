@@ -208,7 +208,6 @@ def by_reason(causes: Mapping[PointId, str]) -> dict[str, list[str]]:
 NEAR_EDGE, ABORTED = EventCode.NEAR_EDGE, EventCode.ABORTED
 NONE, HOLD, RETURN, FAULT = Severity.NONE, Severity.HOLD, Severity.RETURN, Severity.FAULT
 S = TypeVar("S", bound=HoldState)
-
 # In place of a verdict where none is fresh enough.
 NO_FRESH_VERDICT = NO_VERDICT.found("verdict", 0.0, 0.0).verdict(-1, 0.0, EventCode.NORMAL)
 
