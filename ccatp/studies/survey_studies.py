@@ -374,7 +374,7 @@ ABLATION = Study(
         danger: false_edges
         causes
     """,
-    draw=_drawing("ablation", "without", ("mirror", "world"), "Without a technique on {}, world {}"),
+    draw=_drawing("ablation", "without", ("mirror", "world"), "Without a technique, world {1} on {0}"),
     defaults={"run.filter": "ekf"},
     runs=3,
 )
