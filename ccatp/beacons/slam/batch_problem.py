@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_array, vstack
 
 from ccatp.beacons.slam.measurement_models import bearing_row, level_row, range_row, range_variance
+from ccatp.beacons.slam.motion import POSE
 from ccatp.beacons.slam.recording import BoolArray, Readings, Steps, running_total
 from ccatp.config.beacon_models import OdometryNoiseConfig, RecordingConfig
 from ccatp.core import FloatArray, IntArray
@@ -141,13 +143,15 @@ BEACON = 4  # x_m, y_m, the offset of its ranges, m, and of its P_ref, dB
 
 @dataclass(slots=True)
 class ArrowSystem:
-    """Normal equations: a matrix [[A, B], [B^T, C]], A of the chain of poses, and the right-hand side (a, c)."""
+    """Normal equations: a matrix [[A, B], [B^T, C]], A of the chain of poses, and the right-hand side (a, c).
 
-    diagonal: FloatArray  # of A, shape (n, 3, 3)
-    below: FloatArray  # blocks (k + 1, k) of A, shape (n - 1, 3, 3)
-    border: FloatArray  # B by pose, shape (n, 3, m)
+    N = 3 n for n poses.
+    """
+
+    band: FloatArray  # diagonals of A from the main one down to the fifth, each padded at its end, shape (6, N)
+    border: FloatArray  # B, shape (N, m)
     corner: FloatArray  # C, shape (m, m)
-    pose_side: FloatArray  # a, shape (n, 3)
+    pose_side: FloatArray  # a, shape (N,)
     shared_side: FloatArray  # c, shape (m,)
 
 
@@ -173,14 +177,14 @@ class Residuals:
     Readings are rows of (range, bearing, signal strength), zero where there is none.
     """
 
-    local: FloatArray  # motion by the poses, in the vehicle's frame before it, shape (n - 1, 3)
-    odometry: FloatArray  # what remains of it, shape (n - 1, 3)
+    odometry: FloatArray  # motion by the poses less that of the odometry, in the vehicle's frame, shape (n - 1, 3)
     odometry_information: FloatArray  # shape (n - 1, 3, 3)
-    by_calibration: FloatArray  # of the odometry's motion, shape (n - 1, 3, 5)
+    by_steps: (
+        FloatArray  # of the odometry by the poses before and behind and ``CALIBRATION``, shape (n - 1, 3, 3 + 3 + 5)
+    )
     readings: FloatArray  # predicted less read, shape (m, 3)
     information: FloatArray  # of each, zero where there is no reading, shape (m, 3)
-    by_pose: FloatArray  # shape (m, 3, 3)
-    by_rest: FloatArray  # by ``OF_READINGS`` and the beacon, shape (m, 3, 5 + 4)
+    by_unknowns: FloatArray  # of the readings by the pose, ``OF_READINGS`` and the beacon, shape (m, 3, 3 + 5 + 4)
 
     @property
     def chi2(self) -> FloatArray:
@@ -253,24 +257,31 @@ class BatchProblem:
 
     def normal_equations(self, state: BatchState, weights: FloatArray) -> ArrowSystem:
         """Gauss-Newton at a state with weights of the readings, shape (m,), for the free unknowns."""
-        residuals = self.residuals(state)
-        n, size = len(state.poses), self.free.size
-        system = ArrowSystem(
-            np.zeros((n, 3, 3)), np.zeros((n - 1, 3, 3)), np.zeros((n, 3, size)), np.zeros((size, size)),
-            np.zeros((n, 3)), np.zeros(size),
-        )  # fmt: skip
-        _add_odometry(system, state, residuals)
-        self._add_readings(system, residuals, weights)
+        r, n = self.residuals(state), len(state.poses)
+        split, poses, k = POSE * n, POSE * np.arange(n)[:, None], len(CALIBRATION)
+        # Rows of odometry and of readings, each divided by its standard deviation.
+        root = np.linalg.cholesky(r.odometry_information).transpose(0, 2, 1)
+        chain = np.concatenate([poses[:-1] + np.arange(2 * POSE), np.tile(split + np.arange(k), (n - 1, 1))], axis=1)
+        scale = np.sqrt(r.information * weights[:, None])[:, :, None]
+        places = split + len(SHARED) + BEACON * self.readings.beacon[:, None] + np.arange(BEACON)
+        own = np.tile(split + np.arange(k, len(SHARED)), (len(places), 1))
+        seen = np.concatenate([poses[self.at] + np.arange(POSE), own, places], axis=1)
+        width = split + self.free.size
+        J = vstack([_rows(root @ r.by_steps, chain, width), _rows(scale * r.by_unknowns, seen, width)], "csr")
+        e = np.concatenate([(root @ r.odometry[:, :, None]).ravel(), (scale[:, :, 0] * r.readings).ravel()])
+        first = state.poses[0] - self.first_pose
         shared = np.concatenate([state.shared, state.beacons.ravel()]) - self._prior_mean
-        system.corner[range(size), range(size)] += self.prior_information
-        system.shared_side -= self.prior_information * shared
-        system.diagonal[0] += np.diag(self.first_information)
-        system.pose_side[0] -= self.first_information * (state.poses[0] - self.first_pose)
-        free = np.flatnonzero(self.free)
-        system.border = system.border[:, :, free]
-        system.corner = system.corner[np.ix_(free, free)]
-        system.shared_side = system.shared_side[free]
-        return system
+        free = split + np.flatnonzero(self.free)
+        H, side = (J.T @ J).tocsc(), -(J.T @ e)
+        band = np.zeros((2 * POSE, split))
+        for down in range(2 * POSE):
+            band[down, : split - down] = H.diagonal(-down)[: split - down]
+        band[0, :POSE] += self.first_information
+        side[:POSE] -= self.first_information * first
+        side[split:] -= self.prior_information * shared
+        corner = H[:, free].toarray()
+        border, corner = corner[:split], corner[free] + np.diag(self.prior_information[self.free])
+        return ArrowSystem(band, border, corner, side[:split], side[free])
 
     def spread(self, shared: FloatArray) -> FloatArray:
         """A step of the free shared unknowns as one of all, zero for the others."""
@@ -284,8 +295,12 @@ class BatchProblem:
         c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
         dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
         local = np.column_stack([c * dx + s * dy, -s * dx + c * dy, b[:, 2] - a[:, 2]])
-        odometry = local - motion
-        odometry_information = np.asarray(np.linalg.inv(covariance))
+        by_poses = np.zeros((len(c), POSE, 2 * POSE))
+        by_poses[:, 0, 3] = by_poses[:, 1, 4] = c
+        by_poses[:, 0, 4], by_poses[:, 1, 3], by_poses[:, 2, 5] = s, -s, 1.0
+        by_poses[:, :, :POSE] = -by_poses[:, :, POSE:]
+        by_poses[:, 0, 2], by_poses[:, 1, 2] = local[:, 1], -local[:, 0]
+        by_steps = np.concatenate([by_poses, -by_calibration], axis=2)
 
         pose, beacon = state.poses[self.at], state.beacons[self.readings.beacon]
         dx, dy = beacon[:, 0] - pose[:, 0], beacon[:, 1] - pose[:, 1]
@@ -312,48 +327,17 @@ class BatchProblem:
         variances[:, 0] = range_variance(radio, self._read[:, 0])
         variances[:, 1:] = radio.bearing_sigma_rad**2, radio.rssi_sigma_db**2
         information: FloatArray = self.there / (variances * self.repeats[:, None])
-        by_rest = np.concatenate([by_shared, by_beacon], axis=2)
-        return Residuals(local, odometry, odometry_information, by_calibration, errors, information, by_pose, by_rest)
-
-    def _add_readings(self, system: ArrowSystem, residuals: Residuals, weights: FloatArray) -> None:
-        by_pose, by_rest = residuals.by_pose, residuals.by_rest
-        W = residuals.information * weights[:, None]
-        WJp, WJr, We = by_pose * W[:, :, None], by_rest * W[:, :, None], residuals.readings * W
-        own = np.arange(len(CALIBRATION), len(SHARED))
-        places = len(SHARED) + BEACON * self.readings.beacon[:, None] + np.arange(BEACON)
-        columns = np.concatenate([np.broadcast_to(own, (len(places), own.size)), places], axis=1)
-        JpT, JrT = by_pose.transpose(0, 2, 1), by_rest.transpose(0, 2, 1)
-        three = np.arange(3)
-        np.add.at(system.diagonal, self.at, JpT @ WJp)
-        np.add.at(system.border, (self.at[:, None, None], three[None, :, None], columns[:, None, :]), JpT @ WJr)
-        np.add.at(system.corner, (columns[:, :, None], columns[:, None, :]), JrT @ WJr)
-        np.add.at(system.pose_side, self.at, -np.einsum("kij,kj->ki", JpT, We))
-        np.add.at(system.shared_side, columns, -np.einsum("kij,kj->ki", JrT, We))
+        by_unknowns = np.concatenate([by_pose, by_shared, by_beacon], axis=2)
+        return Residuals(
+            local - motion, np.asarray(np.linalg.inv(covariance)), by_steps, errors, information, by_unknowns
+        )
 
 
-def _add_odometry(system: ArrowSystem, state: BatchState, residuals: Residuals) -> None:
-    local, n = residuals.local, len(residuals.local)
-    c, s = np.cos(state.poses[:-1, 2]), np.sin(state.poses[:-1, 2])
-    Ja, Jb = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
-    Jb[:, 0, 0] = Jb[:, 1, 1] = c
-    Jb[:, 0, 1], Jb[:, 1, 0], Jb[:, 2, 2] = s, -s, 1.0
-    Ja[:] = -Jb
-    Ja[:, 0, 2], Ja[:, 1, 2] = local[:, 1], -local[:, 0]
-    Jc = -residuals.by_calibration
-    W = residuals.odometry_information
-    WJa, WJb, WJc = W @ Ja, W @ Jb, W @ Jc
-    We = np.einsum("kij,kj->ki", W, residuals.odometry)
-    JaT, JbT, JcT = Ja.transpose(0, 2, 1), Jb.transpose(0, 2, 1), Jc.transpose(0, 2, 1)
-    k = len(CALIBRATION)
-    system.diagonal[:-1] += JaT @ WJa
-    system.diagonal[1:] += JbT @ WJb
-    system.below += JbT @ WJa
-    system.border[:-1, :, :k] += JaT @ WJc
-    system.border[1:, :, :k] += JbT @ WJc
-    system.corner[:k, :k] += (JcT @ WJc).sum(axis=0)
-    system.pose_side[:-1] -= np.einsum("kij,kj->ki", JaT, We)
-    system.pose_side[1:] -= np.einsum("kij,kj->ki", JbT, We)
-    system.shared_side[:k] -= np.einsum("kij,kj->i", JcT, We)
+def _rows(blocks: FloatArray, columns: IntArray, width: int) -> csr_array:
+    """A sparse matrix of blocks (k, r, c), one below the other, each in its own columns (k, c)."""
+    k, r, c = blocks.shape
+    starts = np.arange(0, blocks.size + 1, c)
+    return csr_array((blocks.ravel(), np.repeat(columns, r, axis=0).ravel(), starts), shape=(k * r, width))
 
 
 def repeats(readings: Readings, correlation_s: float) -> FloatArray:

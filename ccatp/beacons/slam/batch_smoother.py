@@ -18,12 +18,11 @@ from ccatp.beacons.slam.batch_problem import (
     BatchState,
 )
 from ccatp.beacons.slam.causal import beyond_priors, follow
+from ccatp.beacons.slam.motion import POSE
 from ccatp.beacons.slam.recording import BeaconFix, BoolArray, Calibrated, EstimatedPath, RecordedRun
 from ccatp.config.beacon_models import RadioNoiseConfig, RecordingConfig, SlamFilterConfig
 from ccatp.core import FloatArray
 
-BLOCK = 3  # x_m, y_m, heading_rad
-BAND = 2 * BLOCK - 1
 LEAST_DAMPING = 1e-9
 MOST_DAMPING = 1e9
 CONVERGED = 1e-5  # relative gain below which a cost has converged
@@ -39,23 +38,21 @@ class Factored:
 
     def __init__(self, system: ArrowSystem, damping: float = 0.0) -> None:
         self.system = system
-        n, m = len(system.diagonal), len(system.corner)
-        band = _banded(system, damping)
+        m, band = len(system.corner), system.band.copy()
+        band[0] *= 1.0 + damping
         self._factor = cholesky_banded(band, lower=True, check_finite=False)
-        right = np.concatenate([system.border.reshape(n * BLOCK, m), system.pose_side.reshape(-1, 1)], axis=1)
+        right = np.column_stack([system.border, system.pose_side])
         solved = np.asarray(cho_solve_banded((self._factor, True), right, check_finite=False))
         self._border_solved, self._pose_solved = solved[:, :m], solved[:, m]
         corner = system.corner + damping * np.diag(np.diag(system.corner))
-        S = corner - system.border.reshape(n * BLOCK, m).T @ self._border_solved
+        S = corner - system.border.T @ self._border_solved
         self._schur = cho_factor(0.5 * (S + S.T), lower=True, check_finite=False)
 
     def solution(self) -> tuple[FloatArray, FloatArray]:
         """Unknowns of the poses (n, 3) and the shared ones (m,)."""
-        system = self.system
-        n, m = len(system.diagonal), len(system.corner)
-        side = system.shared_side - system.border.reshape(n * BLOCK, m).T @ self._pose_solved
+        side = self.system.shared_side - self.system.border.T @ self._pose_solved
         shared = cho_solve(self._schur, side, check_finite=False)
-        return (self._pose_solved - self._border_solved @ shared).reshape(n, BLOCK), shared
+        return (self._pose_solved - self._border_solved @ shared).reshape(-1, POSE), shared
 
     def shared_covariance(self) -> FloatArray:
         """Inverse's block of the shared unknowns, shape (m, m)."""
@@ -63,27 +60,17 @@ class Factored:
 
     def pose_covariances(self) -> FloatArray:
         """Inverse's diagonal block of each pose, shape (n, 3, 3): (A^-1)_kk + W_k W_k^T, W = A^-1 B chol(S)^-T."""
-        n, m = len(self.system.diagonal), len(self.system.corner)
         root = np.tril(self._schur[0])
-        W = solve_triangular(root, self._border_solved.T, lower=True, check_finite=False).T.reshape(n, BLOCK, m)
-        return np.asarray(_diagonal_of_inverse(self.system) + W @ W.transpose(0, 2, 1))
+        shaped = solve_triangular(root, self._border_solved.T, lower=True, check_finite=False).T
+        W = shaped.reshape(-1, POSE, len(root))
+        return np.asarray(_diagonal_of_inverse(self.system.band) + W @ W.transpose(0, 2, 1))
 
 
-def _banded(system: ArrowSystem, damping: float) -> FloatArray:
-    n = len(system.diagonal)
-    band = np.zeros((BAND + 1, n, BLOCK))
-    for column in range(BLOCK):
-        for row in range(column, BLOCK):
-            band[row - column, :, column] = system.diagonal[:, row, column]
-        band[0, :, column] *= 1.0 + damping
-        for row in range(BLOCK):
-            band[BLOCK + row - column, :-1, column] = system.below[:, row, column]
-    return band.reshape(BAND + 1, n * BLOCK)
-
-
-def _diagonal_of_inverse(system: ArrowSystem) -> FloatArray:
-    A, below = system.diagonal, system.below
-    n = len(A)
+def _diagonal_of_inverse(band: FloatArray) -> FloatArray:
+    row, column = np.indices((POSE, POSE))
+    start = np.arange(0, band.shape[1], POSE)[:, None, None]
+    A = band[np.abs(row - column), start + np.minimum(row, column)]
+    below, n = band[POSE + row - column, start + column], len(start)  # blocks (k + 1, k)
     left, right = A.copy(), A.copy()
     for k in range(1, n):
         left[k] -= below[k - 1] @ np.linalg.solve(left[k - 1], below[k - 1].T)

@@ -97,17 +97,14 @@ def half_squares(made: BatchProblem, x: FloatArray, like: BatchState, weights: F
 def dense(made: BatchProblem, state: BatchState, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The normal equations as one full matrix and its right-hand side."""
     system = made.normal_equations(state, weights)
-    n, m = len(system.diagonal), len(system.corner)
+    n, m = len(state.poses), len(system.corner)
     A = np.zeros((3 * n + m, 3 * n + m))
-    for k in range(n):
-        A[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = system.diagonal[k]
-        A[3 * k : 3 * k + 3, 3 * n :] = system.border[k]
-        if k:
-            A[3 * k : 3 * k + 3, 3 * k - 3 : 3 * k] = system.below[k - 1]
-            A[3 * k - 3 : 3 * k, 3 * k : 3 * k + 3] = system.below[k - 1].T
-    A[3 * n :, : 3 * n] = A[: 3 * n, 3 * n :].T
+    for down, diagonal in enumerate(system.band):
+        for k in range(3 * n - down):
+            A[k + down, k] = A[k, k + down] = diagonal[k]
+    A[: 3 * n, 3 * n :], A[3 * n :, : 3 * n] = system.border, system.border.T
     A[3 * n :, 3 * n :] = system.corner
-    return A, np.concatenate([system.pose_side.ravel(), system.shared_side])
+    return A, np.concatenate([system.pose_side, system.shared_side])
 
 
 def test_at_rest_the_heading_stays_and_the_turn_is_the_bias() -> None:
@@ -152,7 +149,7 @@ def test_solution_and_covariances_are_those_of_the_full_matrix() -> None:
 def test_a_matrix_that_is_not_positive_definite_is_refused() -> None:
     made, state = problem()
     system = made.normal_equations(state, np.ones(6))
-    system.diagonal[2] *= -1.0
+    system.band[0, 7] *= -1.0
     with pytest.raises(LinAlgError, match="not positive definite"):
         Factored(system)
 
