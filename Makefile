@@ -19,7 +19,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-.PHONY: help run test test-newest newest test-slow slow-tests new-examples sweep tried-in faults docs man metrics lint format
+.PHONY: help run test tests test-newest newest test-slow slow-tests new-examples sweep tried-in faults docs man metrics lint format
 .PHONY: kills mutants golden golden-quick lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
@@ -45,7 +45,11 @@ help:
 run: $(VENV)/.installed
 	@$(BIN)/ccatp run --sim $(ARGS)
 
-test: lint tried-in
+# Side by side: what lint takes fills the time in which tests wait.
+test: $(VENV)/.installed-dev tried-in
+	@$(MAKE) --no-print-directory -j2 lint tests
+
+tests: $(VENV)/.installed-dev
 	$(PYTEST) $(PYTEST_ARGS)
 
 # The page is tried in a real browser and the completions in their shells, where there are these.
