@@ -63,23 +63,6 @@ def test_directions(drive: tuple[float, float], needs: str) -> None:
         assert robot.rules.is_held is not may
 
 
-def test_a_new_session_counts_again() -> None:
-    robot = Rig().robot
-    robot.drive(1000, 3.0, 3.0)
-    robot.lose("controller")
-    assert robot.rules.set_points(0.01) == HELD
-    robot.join("controller")
-    assert robot.rules.set_points(0.01) == HELD
-    assert robot.drive(0, 1.0, 1.0)
-    assert robot.rules.set_points(0.02) == (1.0, 1.0)
-
-
-def test_a_drive_that_is_too_fast_keeps_its_path() -> None:
-    r = MotionRules(TTL_S, FASTEST)
-    r.drive(1, 16.0, -8.0, 0.0)
-    assert r.set_points(0.01) == (8.0, -4.0)
-
-
 def test_fans_keep_their_floor_and_their_duty() -> None:
     robot = Rig(floor=0.6).robot
     fans = robot.fans
@@ -172,14 +155,6 @@ def test_the_time_to_live_covers_the_delay() -> None:
     rig = Rig(2, ttl_s=0.05)
     rig.at(0).drive(1, 3.0, 3.0)
     assert [rig.moves(frame) for frame in range(8)] == [False, False, True, True, True, False, False, False]
-
-
-@pytest.mark.parametrize("frames", [0, 2])
-def test_only_what_is_newer_is_taken(frames: int) -> None:
-    robot = Rig(frames).robot
-    assert [robot.drive(seq, 1.0, 1.0) for seq in (5, 5, 4, 6)] == [True, False, False, True]
-    assert [robot.permit(seq, True, True, True) for seq in (5, 5, 4, 6)] == [True, False, False, True]
-    assert [robot.command_fans(seq, 0.5, 0.5) for seq in (5, 5, 4, 6)] == [True, False, False, True]
 
 
 @pytest.mark.parametrize("frames", [0, 2])
