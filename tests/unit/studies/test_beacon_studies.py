@@ -15,6 +15,9 @@ from ccatp.studies.cricket_study import combine, run_job
 from ccatp.studies.mote_navigation import combine as mote_navigation_combine
 from ccatp.studies.mote_runs import run_batch, run_filter, simulate_field
 
+# One worker computes the cells that they share.
+pytestmark = pytest.mark.xdist_group("beacon studies")
+
 
 def result(config: Config, case: str, seeds: int) -> CellResult:
     factors = Cell({"case": case}).factors
