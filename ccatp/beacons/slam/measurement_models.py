@@ -41,8 +41,8 @@ def level_row(xp: ModuleType, dx: Any, dy: Any, reference: Any, exponent: Any) -
 
 
 def range_variance(radio: RadioNoiseConfig, range_m: Any) -> Any:
-    """Of a range, m^2: sigma^2 + (sigma_per_m r)^2."""
-    return radio.range_sigma_m**2 + (radio.range_sigma_per_m * range_m) ** 2
+    """Of a range, m^2: sigma^2 + sigma_per_m^2 r^2."""
+    return radio.range_sigma_m**2 + radio.range_sigma_per_m**2 * range_m * range_m
 
 
 class MeasurementRow(NamedTuple):
