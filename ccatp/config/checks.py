@@ -27,7 +27,6 @@ _TCP_ENDPOINT = re.compile(r"tcp://[^\s/@;]+:(\d{1,5})")
 _LARGEST_PORT = 65535
 _CORNERS = {"front-left": (1, 1), "front-right": (1, -1), "rear-left": (-1, 1), "rear-right": (-1, -1)}
 _ANCHORS = 2  # A is the origin, B shows the second axis
-_LEAST_DRAWS = 200
 _LEAST_NETWORK = 3  # motes of a stand that can trilaterate others in the plane
 
 Problems = Iterator[ConfigProblem]
@@ -351,6 +350,3 @@ def _check_motes(cfg: CricketConfig) -> Problems:
         yield _problem(f"{root}.reach_m", what, f"{root}.off_axis_rad")
     if angles[0] != 0.0 or any(later <= before for before, later in pairwise(angles)):
         yield _problem(f"{root}.off_axis_rad", f"= {list(angles)} must begin with 0 and rise")
-    if 0 < cfg.phase1.draws < _LEAST_DRAWS:
-        what = f"= {cfg.phase1.draws} give no covariance of dozens of coordinates; 0, or {_LEAST_DRAWS} at least"
-        yield _problem("cricket.phase1.draws", what)

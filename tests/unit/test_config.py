@@ -220,7 +220,7 @@ MOTES: list[tuple[dict[str, Any], str]] = [
     ({"networks.N1.place_m": [0.0, 0.0, 1.0]}, "cricket.networks.N1.place_m has 3 coordinates"),
     ({"transducer.reach_m": [1.0, 2.0]}, "cricket.transducer.reach_m has 2 values for 5 angles"),
     ({"transducer.off_axis_rad": [0.1, 0.2, 0.3, 0.4, 0.5]}, "must begin with 0 and rise"),
-    ({"phase1.draws": 3}, "cricket.phase1.draws = 3 give no covariance of dozens of coordinates; 0, or 200 at"),
+    ({"phase1.draws": 3}, "cricket.phase1.draws = 3 must be greater than or equal to 100"),
     ({"phase2.pairs": "few"}, "cricket.phase2.pairs = \"few\" must be 'zigzag', 'adjacent' or 'all'"),
 ]
 
