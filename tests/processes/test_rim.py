@@ -71,7 +71,7 @@ def configure(case: RimCase) -> Config:
     body = mirror.panels[panel]
     x, y = dx * (body.half_x_m - START_M), dy * (body.half_y_m - START_M)
     place = {"row": panel.row, "col": panel.col, "x_mm": 1e3 * x, "y_mm": 1e3 * y}
-    cfg = config_of(case.mirror, run__world="thesis", robot__port=0, sim__robot__port=0)
+    cfg = config_of(case.mirror, run__world="thesis", sim__robot__port=0)
     base = cfg.mirror.base.model_copy(update=place | {"heading_rad": outward + case.angle_rad})
     return cfg.model_copy(update={"mirror": cfg.mirror.model_copy(update={"base": base})})
 

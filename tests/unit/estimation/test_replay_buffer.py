@@ -218,7 +218,7 @@ def test_a_fix_older_than_the_path_or_from_the_future_is_refused() -> None:
     assert found.deck_pose == before[0]
     assert np.array_equal(found.state[0], before[1])
     found.fuse_fix(story.fixes[280])
-    there = before[0].x_m, before[0].y_m
+    there = found.deck_pose.x_m, found.deck_pose.y_m
     with pytest.raises(FixRefused, match=r"fix of 3\.110 s is outside the known path, \S+ s to 3\.100 s"):
         found.fuse_fix(fix_at(3.11, there))
     found.fuse_fix(fix_at(3.09, there))  # clocks may differ by a frame or ten
