@@ -19,7 +19,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-.PHONY: help run test tests test-newest newest test-slow slow-tests new-examples sweep tried-in faults docs man metrics lint format
+.PHONY: help run test tests test-newest newest newest-tests test-slow slow-tests new-examples sweep tried-in faults docs man metrics lint format
 .PHONY: kills mutants golden golden-quick lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
@@ -66,7 +66,10 @@ test-newest:
 		echo "ccatp: $${newest:-no python3.11 to 3.14} is the only supported Python here; nothing else to test on"; else \
 		$(MAKE) --no-print-directory VENV=$(NEWEST_VENV) PYTHON="$$newest" newest; fi
 
-newest: lint
+newest: $(VENV)/.installed-dev
+	@$(MAKE) --no-print-directory -j2 lint newest-tests
+
+newest-tests: $(VENV)/.installed-dev
 	$(PYTEST) tests/unit tests/contract $(PYTEST_ARGS)
 	rm -rf build/newest && $(BIN)/ccatp run --sim --panels 2 --run-dir build/newest
 
