@@ -324,3 +324,10 @@ def test_of_two_the_graver_wins_and_of_equal_ones_the_first_row() -> None:
         found = first.found("a", 1.0, 0.0), second.found("b", 1.0, 0.0)
         winner = found[0] if first.severity >= second.severity else found[1]
         assert gravest(found) is gravest(found[::-1]) is winner, f"{first.name} and {second.name}"
+
+
+def test_what_the_gyroscope_shows_at_rest_is_no_turn_afterwards() -> None:
+    robot = Scripted()
+    biased = always(wz_rad_s=0.25)
+    seen = robot.run(4.0, biased)[10:] + robot.run(8.0, biased, drives)  # the first frames have no estimate
+    assert {verdict.cause for verdict in seen} == {""}
