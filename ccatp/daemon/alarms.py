@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal, NamedTuple, cast
 
 import msgspec
 import structlog
@@ -32,6 +32,22 @@ LEAST_S = 1.0
 def utc_now() -> str:
     """The time as it stands in the list, UTC."""
     return datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+
+
+class ActiveCause(NamedTuple):
+    """What is wrong now: name of its condition, the cause as it is shown, and how grave it is."""
+
+    name: str
+    cause: str
+    severity: Severity
+
+
+def active_cause(cause: str) -> ActiveCause:
+    """A cause by its text alone, as grave as its row says; one that no row has is ``other``."""
+    row = condition_of(cause)
+    return (
+        ActiveCause("other", cause, Severity.FAULT) if row is None else ActiveCause(row.name, cause, row.alarm_severity)
+    )
 
 
 EventName = Literal["raised", "ended", "acknowledged"]
@@ -85,17 +101,13 @@ class AlarmList:
         """Those that are active, the gravest first, then those that ended and are not acknowledged."""
         return sorted(self._alarms.values(), key=lambda one: (bool(one.ended), -Severity[one.severity.upper()]))
 
-    def update(self, causes: Iterable[tuple[str, Severity]], t_s: float) -> None:
-        """Exactly these are active at robot time ``t_s``: causes as they are shown, severity of the verdict or none."""
+    def update(self, causes: Iterable[ActiveCause], t_s: float) -> None:
+        """Exactly these are active at robot time ``t_s``; what an operator commanded is no alarm."""
         active: dict[str, tuple[Severity, list[str]]] = {}
-        for cause, severity in causes:
-            row = condition_of(cause)
-            if not cause or row is OPERATOR:
-                continue
-            name = row.name if row is not None else "other"
-            known, texts = active.get(name, (Severity.INFORM, []))
-            worst = max(known, severity, row.alarm_severity if row is not None else Severity.FAULT)
-            active[name] = worst, texts if cause in texts else [*texts, cause]
+        for name, cause, severity in causes:
+            if name != OPERATOR.name:
+                known, texts = active.get(name, (Severity.INFORM, []))
+                active[name] = max(known, severity), texts if cause in texts else [*texts, cause]
         now_s = time.monotonic()
         self._since = {name: self._since.get(name, (t_s, now_s)) for name in active}
         for name, (severity, texts) in active.items():

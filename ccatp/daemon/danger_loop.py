@@ -22,6 +22,7 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.files import read_text, sync_folder
 from ccatp.config.models import Config
 from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
+from ccatp.daemon.alarms import ActiveCause, active_cause
 from ccatp.daemon.command_handlers import ObservatoryServer
 from ccatp.daemon.process import ProcessArgs, run_process, start_process
 from ccatp.daemon.robot_loop import RobotLoop
@@ -253,11 +254,13 @@ class DangerLoop(RobotLoop):
         if news == self._published:
             return
         self._published = news
-        causes = verdict.cause, *(finding.cause for finding in found), *emergencies
+        active = [ActiveCause(one.condition.name, one.cause, one.severity) for one in found]
+        others = dict.fromkeys((verdict.cause, *emergencies))
+        active += [active_cause(cause) for cause in others if cause and cause not in {one.cause for one in found}]
         fields: dict[str, Any] = {name: getattr(verdict, name) for name in ("cause", "signal", "value", "limit")}
         fields |= {"code": int(verdict.code), "severity": int(verdict.severity)}
-        active = [cause for cause in dict.fromkeys(causes) if cause]
-        event = DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, active=active, **fields)
+        listed = [(name, cause, int(severity)) for name, cause, severity in active]
+        event = DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, active=listed, **fields)
         self.publisher.send("danger_event", event)
         self.log.info("verdict_changed", seq=verdict.seq, t_s=verdict.t_s, **fields)
 

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from ccatp.conditions import FRAME_LATE, FRAMES_OLD, LINK_LOST, NO_FRAME_FOR, NO_VERDICT, Condition, condition_of
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import MissionClock, Severity, Verdict
-from ccatp.daemon.alarms import AlarmList
+from ccatp.daemon.alarms import ActiveCause, AlarmList, active_cause
 from ccatp.daemon.mission_runner import STILL, DriveCommand, MissionRunner, TimedFrame
 from ccatp.daemon.process import ProcessArgs, run_process, start_process
 from ccatp.daemon.robot_loop import WAIT_PERIOD_S, RobotLoop
@@ -123,7 +123,7 @@ class MainLoop(RobotLoop):
         self.alarms = AlarmList(args.run_dir, self.log)
         # Apart from the verdicts, which are read with the frames: what danger finds is reported without frames, too.
         self._danger_events = Subscriber(context, [danger], ["danger_event"], is_uncounted=True)
-        self._danger_active: list[tuple[str, Severity]] = []
+        self._danger_active: list[ActiveCause] = []
         self._runner = make_runner(self)
         self._telemetry = self._runner.telemetry
 
@@ -225,14 +225,11 @@ class MainLoop(RobotLoop):
 
     def update_alarms(self) -> None:
         """Raise and end alarms: what danger finds, what holds the mission or sends it home, and what it waits for."""
-        own = [(cause, Severity.NONE) for cause in self._runner.causes]
+        own = [active_cause(cause) for cause in self._runner.causes]
         while (received := self._danger_events.receive()) is not None:
             event = received[2]
             if isinstance(event, DangerEvent):
-                graver = Severity(event.severity)
-                self._danger_active = [
-                    (cause, graver if cause == event.cause else Severity.NONE) for cause in event.active
-                ]
+                self._danger_active = [ActiveCause(name, cause, Severity(grave)) for name, cause, grave in event.active]
                 self.alarms.update([*own, *self._danger_active], event.t_s)
         self.alarms.update([*own, *self._danger_active], self.clock.t_s)
 
@@ -267,7 +264,9 @@ class MainLoop(RobotLoop):
         if self._runner.is_busy:
             why = self._runner.status().cause or "is it ready, the line of sight free?"
             return f"waiting for a measurement of the laser system; {why}"
-        cause = state.cause or str(state.mode)
+        # A mission that has not begun waits for what danger finds without a cause of its own.
+        found = [alarm.cause for alarm in self.alarms.alarms if not alarm.ended]
+        cause = next(iter((*filter(None, (state.cause,)), *found)), str(state.mode))
         row, otherwise = condition_of(cause), "'ccatp resume' goes on" if state.is_paused else "it goes on by itself"
         return f"{state.mode}: {cause}; {row.advice if row is not None else otherwise}"
 

@@ -97,9 +97,10 @@ class RunView:
             self._show_status(message)
         elif isinstance(message, LogMessage):
             self.show_message(message.level, message.text)
-        elif isinstance(message, DangerEvent) and message.code:
+        elif isinstance(message, DangerEvent) and (message.code or message.severity >= Severity.HOLD):
             text = danger_text(message.cause, message.signal, message.value, message.limit)
-            self.show_message("warning", f"danger: code {message.code}, {text}, at {message.t_s:.2f} s")
+            what = f"code {message.code}" if message.code else Severity(message.severity).name.lower()
+            self.show_message("warning", f"danger: {what}, {text}, at {message.t_s:.2f} s")
 
     def _show_status(self, status: MissionStatus) -> None:
         text = self.text_of(status)

@@ -210,7 +210,7 @@ class Treatment(Message):
 class DangerEvent(Message):
     """The verdict's code, cause or severity changed; without a cause all is well again.
 
-    ``active``: causes of all that danger finds, that of the verdict included.
+    ``active``: all that danger finds, what the verdict says included: name of the condition, cause, severity.
     """
 
     code: int
@@ -220,7 +220,7 @@ class DangerEvent(Message):
     limit: float
     off: tuple[bool, bool, bool, bool]
     severity: int = 0
-    active: list[str] = []
+    active: list[tuple[str, str, int]] = []
 
 
 # Of log lines. The event of one that is also shown to the operator; the field ``text`` holds it.

@@ -72,6 +72,28 @@ def test_quiet_and_verbose(
     assert [line.partition(",")[0] for line in told if not line.startswith("ccatp SIM")] == lines
 
 
+def test_danger_is_shown_where_it_holds_the_robot_without_a_code(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    view = RunView(CFG, is_sim=True, run_dir=tmp_path)
+    for severity in (3, 4):
+        view.show(
+            DangerEvent(
+                seq=1,
+                t_s=2.0,
+                code=0,
+                cause="drives late",
+                signal="",
+                value=0.0,
+                limit=0.0,
+                off=(False,) * 4,
+                severity=severity,
+            )  # fmt: skip
+        )
+    _, shown = capsys.readouterr().err.splitlines()
+    assert shown.startswith("warning: danger: hold, drives late")
+
+
 def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     survey = RunView(CFG, is_sim=False, run_dir=tmp_path)
     at_point = replace(STATUS, point="1-2-3", error_mm=0.5)
