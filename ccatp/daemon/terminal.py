@@ -42,6 +42,10 @@ class _BufferedConsole(Console):
             self.quiet = True
 
 
+# Of danger's findings: what slows the robot, and what does not end by itself; a pause that lasts becomes a hold.
+SHOWN = {Severity.SLOW, Severity.HOLD, Severity.RETURN, Severity.FAULT}
+
+
 class RunView:
     """Progress and messages on standard error; the summary on standard output.
 
@@ -97,7 +101,7 @@ class RunView:
             self._show_status(message)
         elif isinstance(message, LogMessage):
             self.show_message(message.level, message.text)
-        elif isinstance(message, DangerEvent) and (message.code or message.severity >= Severity.HOLD):
+        elif isinstance(message, DangerEvent) and (message.code or message.severity in SHOWN):
             text = danger_text(message.cause, message.signal, message.value, message.limit)
             what = f"code {message.code}" if message.code else Severity(message.severity).name.lower()
             self.show_message("warning", f"danger: {what}, {text}, at {message.t_s:.2f} s")

@@ -76,22 +76,11 @@ def test_danger_is_shown_where_it_holds_the_robot_without_a_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     view = RunView(CFG, is_sim=True, run_dir=tmp_path)
-    for severity in (3, 4):
-        view.show(
-            DangerEvent(
-                seq=1,
-                t_s=2.0,
-                code=0,
-                cause="drives late",
-                signal="",
-                value=0.0,
-                limit=0.0,
-                off=(False,) * 4,
-                severity=severity,
-            )  # fmt: skip
-        )
-    _, shown = capsys.readouterr().err.splitlines()
-    assert shown.startswith("warning: danger: hold, drives late")
+    event = DangerEvent(seq=1, t_s=2.0, code=0, cause="late", signal="", value=0.0, limit=0.0, off=(False,) * 4)
+    for severity in range(7):
+        view.show(replace(event, severity=severity))
+    shown = [line.split(", late")[0] for line in capsys.readouterr().err.splitlines()[1:]]
+    assert shown == [f"warning: danger: {word}" for word in ("slow", "hold", "return", "fault")]
 
 
 def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
