@@ -18,10 +18,11 @@ from ccatp.links.beacon_messages import BeaconFrame, RadioSample, RadioScan, Ste
 from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_messages import CommandEcho, RobotData, VehicleData
 from ccatp.links.topics import BeaconPlaces, BeaconTruth
+from ccatp.onboard.rules import LinkedRobot
+from ccatp.sim.ground_truth import TruthSource
 from ccatp.sim.motes import MoteListener, TrueMotes, true_motes
 from ccatp.sim.radio import Packet, SimDriveCommand, WorldFrame
 from ccatp.sim.radio_world import RadioWorld
-from ccatp.sim.rules import SimulatedRobot
 
 _CORNER = (0.0, 0.0)  # a robot without edge sensors has them where it is
 # Streams of random numbers of a seed, apart from those of the world.
@@ -30,7 +31,7 @@ _LAYOUT, _RECEIVER = 20, 21
 BeaconTruthRow = tuple[int, float, float, float, float, float | None, float | None, float | None]
 
 
-class BeaconRobot(SimulatedRobot):
+class BeaconRobot(LinkedRobot, TruthSource):
     """The robot from its boot on; the fans have no effect."""
 
     truth_rows = 50

@@ -25,9 +25,9 @@ import numpy as np
 from ccatp.links.robot_codec import BadLine, RobotFrame, decode_from_robot, encode
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
+from ccatp.onboard.rules import FanRules
 from ccatp.sim.fault_plan import SIGNALS, FaultPlan, Injected
 from ccatp.sim.plant import LEVEL_SLOPE, BodyStep, Disturbance, Plant, downhill
-from ccatp.sim.rules import FanRules
 from ccatp.sim.world import World
 
 Reading = tuple[float, ...]

@@ -2,6 +2,8 @@
 
 import os
 import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from struct import Struct
 from typing import Any
@@ -12,10 +14,39 @@ import zmq.asyncio
 
 from ccatp.core import DeckPose
 from ccatp.links.bus import Publisher
-from ccatp.sim.robot import Robot
-from ccatp.sim.rules import SimulatedRobot
+from ccatp.links.topics import Message
+from ccatp.sim.plant import Plant
 
 MAX_REQUEST_BYTES = 4096
+
+
+class TruthSource(ABC):
+    """The true state of a simulated robot."""
+
+    truth_rows = 100  # a batch of the log of the true state
+    truth_requests: Mapping[str, Callable[[], dict[str, object]]] = {}
+    """Replies for the true state, by request."""
+
+    @abstractmethod
+    def truth_row(self) -> tuple[Any, ...]:
+        """The true state at the newest frame, as in the rows of ``truth_message``."""
+
+    @abstractmethod
+    def truth_message(self, rows: list[Any]) -> tuple[str, Message]:
+        """Rows of the true state as a topic and its message."""
+
+    @abstractmethod
+    def truth_preface(self) -> tuple[str, Message]:
+        """What a recorder needs before the first rows, likewise."""
+
+    @property
+    def is_fallen(self) -> bool:
+        """Whether the robot fell; its row is published at once."""
+        return False
+
+    def describe_fall(self) -> dict[str, object]:
+        """Why and where it fell, for a log."""
+        return {}
 
 
 class GroundTruthPublisher:
@@ -25,7 +56,7 @@ class GroundTruthPublisher:
     so far, after the pending ones; anything else: ``{"error"}``.
     """
 
-    def __init__(self, robot: SimulatedRobot, rep: str | None = None, pub: str | None = None) -> None:
+    def __init__(self, robot: TruthSource, rep: str | None = None, pub: str | None = None) -> None:
         self._robot = robot
         self._rows: list[Any] = []
         self._taken = 0
@@ -110,13 +141,12 @@ class SimPoseFile:
             return None
         return DeckPose(*_POSE.unpack(body))
 
-    def keep(self, robot: Robot) -> None:
-        """A frame has been driven."""
-        if robot.seq % PERIOD_FRAMES:
+    def keep(self, seq: int, plant: Plant) -> None:
+        """Frame ``seq`` has been driven."""
+        if seq % PERIOD_FRAMES:
             return
         if self._fd < 0:
             self._fd = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        plant = robot.world.plant
         body = _POSE.pack(plant.x_m, plant.y_m, plant.heading_rad)
         os.pwrite(self._fd, body + _CRC.pack(zlib.crc32(body)), 0)
 

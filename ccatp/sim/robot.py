@@ -30,10 +30,11 @@ from ccatp.links.robot_codec import MAX_LINE_BYTES, RobotFrame, encode
 from ccatp.links.robot_messages import CommandEcho, RobotData, Sensors
 from ccatp.links.topics import Misalignment, TruthMessage
 from ccatp.mirror.mirror import Mirror
+from ccatp.onboard.rules import LinkedRobot
 from ccatp.sim.fault_injector import Injector
 from ccatp.sim.fault_plan import FaultPlan
+from ccatp.sim.ground_truth import TruthSource
 from ccatp.sim.plant import WHOLE
-from ccatp.sim.rules import SimulatedRobot
 from ccatp.sim.sensors import SensorSuite, as_message
 from ccatp.sim.world import TruthRow, World
 
@@ -41,7 +42,7 @@ from ccatp.sim.world import TruthRow, World
 _FRAME_BYTES, _IMU_BYTES, _ENCODER_BYTES, _COUNTER_BYTES, _EDGE_BYTES = 420, 48, 44, 64, 26
 
 
-class Robot(SimulatedRobot):
+class Robot(LinkedRobot, TruthSource):
     """The robot from one boot to the next, at base where no ``start`` is given.
 
     Attributes:

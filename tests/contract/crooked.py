@@ -16,9 +16,9 @@ from unittest.mock import patch
 from ccatp.commissioning.conformance import command_checks, harness, server_checks
 from ccatp.commissioning.conformance.runner import Conformance, Result
 from ccatp.config.models import Config
-from ccatp.dataloop import Connection
 from ccatp.mirror.mirror import Mirror
-from ccatp.sim.rules import MotionRules
+from ccatp.onboard.rules import MotionRules
+from ccatp.onboard.server import Connection
 from tests.support.scenario import SurveyLoop
 from tests.support.virtual_time import VirtualLoop, VirtualSelector
 

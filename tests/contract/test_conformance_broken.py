@@ -17,7 +17,7 @@ from ccatp.links.robot_codec import BadLineCounter, LineBuffer, join_mac
 from ccatp.links.robot_messages import Drive, Permit, Role
 from ccatp.links.robot_messages import Fans as FansMessage
 from ccatp.mirror.mirror import Mirror
-from ccatp.sim.rules import MotionRules
+from ccatp.onboard.rules import MotionRules
 from tests.contract.crooked import (
     Crooked,
     Message,

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 import zmq
 
-from ccatp import dataloop
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.daemon import robot_loop
@@ -21,7 +20,7 @@ from ccatp.daemon.robot_loop import RobotLoop
 from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_link import RobotTimeout
 from ccatp.links.robot_messages import CommandEcho, Hello, Joined, Role, Sensors
-from ccatp.sim import sessions
+from ccatp.onboard import server, sessions
 from ccatp.sim.fault_proxy import FaultProxy
 from tests.faults.test_link import HELLO
 from tests.support.scenario import SurveyLoop, begin, config_of
@@ -52,7 +51,7 @@ def _short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     """A tenth of the real ones, in the same proportions."""
     monkeypatch.setattr(robot_loop, "time", CLOCK)
     for module, times_s in (
-        (dataloop, {"HOUSEKEEPING_S": 0.02}),
+        (server, {"HOUSEKEEPING_S": 0.02}),
         (sessions, {"REPEAT_S": 0.1}),
         (robot_loop, {"REPEAT_S": 0.1, "DUPLICATE_S": 0.05, "INVALID_S": 0.05, "OVERDUE_S": 0.3}),
         (robot_loop, {"WAIT_PERIOD_S": 0.005}),

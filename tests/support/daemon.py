@@ -25,10 +25,10 @@ from ccatp.daemon.process import Endpoints, ProcessArgs
 from ccatp.links.robot_link import RobotLink
 from ccatp.links.robot_messages import Sensors
 from ccatp.localizer import Localizer, build_localizer
+from ccatp.onboard.rules import MotionRules
 from ccatp.sim.etalon_server import EtalonSimulator, ZmqPuck
 from ccatp.sim.fault_proxy import FaultProxy
 from ccatp.sim.ground_truth import GroundTruthPublisher
-from ccatp.sim.rules import MotionRules
 from tests.support.scenario import SurveyLoop, any_port, config_of, mirror_of, one_panel
 
 DEADLINE_S = 60.0

@@ -15,10 +15,10 @@ from ccatp.dataloop import DataLoop, survey_robot
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.onboard.sessions import RobotServer, RobotSession, ServerLog
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.sim.fault_proxy import FaultProxy
 from ccatp.sim.robot import Robot
-from ccatp.sim.sessions import RobotServer, RobotSession, ServerLog
 
 MIRRORS = tuple(available("mirror"))
 

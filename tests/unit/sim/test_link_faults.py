@@ -9,10 +9,9 @@ from typing import Any
 
 import pytest
 
-from ccatp import dataloop
 from ccatp.config.load import load_config
 from ccatp.dataloop import serve
-from ccatp.sim import sessions
+from ccatp.onboard import server, sessions
 from ccatp.sim.fault_plan import LINK_TYPES, LOCKSTEP_TYPES, parse_plan
 from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S
 from tests.support.daemon import Driver
@@ -118,7 +117,7 @@ async def test_in_lockstep_each_fault_that_makes_sense_there(
     kind: str, trigger: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sessions, "REPEAT_S", 0.4)  # of a line that is lost
-    monkeypatch.setattr(dataloop, "HOUSEKEEPING_S", 0.02)
+    monkeypatch.setattr(server, "HOUSEKEEPING_S", 0.02)
     keys, seen = TABLE[kind]
     client, log = await drive(plan_of(kind, trigger, keys), reached(100), lockstep=True)
     assert seen(client), (client.seqs, client.lost, client.link.counts)

@@ -1,4 +1,4 @@
-"""The robot's side of the link, the same for every simulated robot; time is an argument.
+"""The rules that a robot enforces by itself, and the commands that it takes; time is an argument.
 
 It enforces by itself, whatever its clients do: drive and permit, time-to-live, directions, newest only. Deny by
 default: a set point reaches the wheels only through ``MotionRules.set_points``.
@@ -6,12 +6,10 @@ default: a set point reaches the wheels only through ``MotionRules.set_points``.
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
 from math import inf, isfinite
 from typing import Any, Literal
 
 from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData, Role
-from ccatp.links.topics import Message
 
 HELD = (0.0, 0.0)
 _EVERYTHING = (True, True, True)
@@ -115,8 +113,8 @@ class FanRules:
         return 0.5 * (self.duty[0] * self.health[0] + self.duty[1] * self.health[1])
 
 
-class SimulatedRobot(ABC):
-    """Roles, commands and the newest frame (``seq``, ``t_s`` on the robot's clock) of a simulated robot.
+class LinkedRobot(ABC):
+    """Roles, commands and the newest frame (``seq``, ``t_s`` on the robot's clock) of a robot behind its link.
 
     A command that arrives while frame n is the newest takes effect in the frame that follows n + the delay of the
     commands, in whole frames. Its age counts from its arrival, so the time-to-live covers the delay, too. Whether it is
@@ -127,7 +125,6 @@ class SimulatedRobot(ABC):
             it.
     """
 
-    truth_rows = 100  # a batch of the log of the true state
     is_steerable = False
 
     def __init__(
@@ -138,7 +135,6 @@ class SimulatedRobot(ABC):
         self.commands_delay_frames = commands_delay_frames
         self.seq, self.t_s, self.reboots = 0, 0.0, 0
         self.delivered_seq = -1
-        self.truth_requests: dict[str, Callable[[], dict[str, object]]] = {}  # replies for the true state, by request
         self._boot()
 
     def _boot(self) -> None:
@@ -173,27 +169,6 @@ class SimulatedRobot(ABC):
     @abstractmethod
     def advance(self) -> None:
         """Drive one frame and read the sensors."""
-
-    @abstractmethod
-    def truth_row(self) -> tuple[Any, ...]:
-        """The true state at the newest frame, as in the rows of ``truth_message``."""
-
-    @abstractmethod
-    def truth_message(self, rows: list[Any]) -> tuple[str, Message]:
-        """Rows of the true state as a topic and its message."""
-
-    @abstractmethod
-    def truth_preface(self) -> tuple[str, Message]:
-        """What a recorder needs before the first rows, likewise."""
-
-    @property
-    def is_fallen(self) -> bool:
-        """Whether the robot fell; its row is published at once."""
-        return False
-
-    def describe_fall(self) -> dict[str, object]:
-        """Why and where it fell, for a log."""
-        return {}
 
     def join(self, role: Role) -> None:
         """A new session has a role; fan duties of the controller before, already accepted, come into force."""

@@ -6,8 +6,8 @@ import pytest
 
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
+from ccatp.onboard.sessions import LOCKSTEP_SILENCE_S, MAX_LAG_S, MAX_SESSIONS, NO_DELIVERY_S, SILENCE_S
 from ccatp.sim.fault_plan import parse_plan
-from ccatp.sim.sessions import LOCKSTEP_SILENCE_S, MAX_LAG_S, MAX_SESSIONS, NO_DELIVERY_S, SILENCE_S
 from tests.support.scenario import ServedRobot, boot, config_of, fault_plan
 
 JOIN = b'{"type":"join","role":"controller","client":"test"}\n'

@@ -41,7 +41,7 @@ from ccatp.links.robot_messages import (
     Unknown,
 )
 from ccatp.links.robot_messages import Fans as FansMessage
-from ccatp.sim.rules import SimulatedRobot
+from ccatp.onboard.rules import LinkedRobot
 
 JOIN_TIMEOUT_S = 2.0
 SILENCE_S = 5.0
@@ -125,7 +125,7 @@ class RobotServer:
     """
 
     def __init__(
-        self, robot: SimulatedRobot, *, lockstep: bool, key: bytes | None = None, log: ServerLog | None = None
+        self, robot: LinkedRobot, *, lockstep: bool, key: bytes | None = None, log: ServerLog | None = None
     ) -> None:
         self.robot = robot
         self.counts: Counter[str] = Counter(stale=0)

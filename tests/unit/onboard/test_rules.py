@@ -6,23 +6,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.sim.rules import HELD, MotionRules, SimulatedRobot
+from ccatp.onboard.rules import HELD, LinkedRobot, MotionRules
 
 DT_S, TTL_S, FASTEST = 0.01, 0.25, 8.0
 # A robot with nothing but roles and commands.
-Bare = type("Bare", (SimulatedRobot,), dict.fromkeys(SimulatedRobot.__abstractmethods__))
+Bare = type("Bare", (LinkedRobot,), dict.fromkeys(LinkedRobot.__abstractmethods__))
 
 
 class Rig:
     def __init__(self, frames: int = 0, ttl_s: float = TTL_S, floor: float = 0.0) -> None:
-        self.robot: SimulatedRobot = Bare((ttl_s, FASTEST, floor), DT_S, 1.0 / DT_S, frames)
+        self.robot: LinkedRobot = Bare((ttl_s, FASTEST, floor), DT_S, 1.0 / DT_S, frames)
 
     def moves(self, frame: int) -> bool:
         """Whether the wheels turn in the step after ``frame``."""
         self.at(frame)._release_commands()
         return self.robot.rules.set_points((frame + 1) * DT_S) != HELD
 
-    def at(self, frame: int) -> SimulatedRobot:
+    def at(self, frame: int) -> LinkedRobot:
         self.robot.seq, self.robot.t_s = frame, frame * DT_S
         return self.robot
 
