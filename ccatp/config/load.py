@@ -25,6 +25,7 @@ from ccatp.config.messages import (
     parse_toml,
 )
 from ccatp.config.models import Config, MirrorConfig, WorldConfig
+from ccatp.config.onboard_models import OnboardConfig
 from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
 
@@ -33,6 +34,7 @@ Overrides = Mapping[str, object] | None
 M = TypeVar("M", bound=BaseModel)
 
 DEFAULT_FILE, BEACON_FILE, RECORDING_FILE = "ccatp.toml", "radio.toml", "recordings.toml"
+ONBOARD_FILE = "onboard.toml"
 SYSTEMS = ("zigbee", "follow", "cricket")
 _RUN_FILE = "config.toml"  # of a run directory
 _RUN_HEAD = "# The exact configuration of one run; ccatp run --config FILE repeats it.\n\n"
@@ -320,6 +322,13 @@ def load_recordings_config(file: Path | None = None, overrides: Overrides = None
     """
     command, user, base = sources = _layers(RECORDING_FILE, file, overrides)
     return validated(RecordingsConfig, merged(merged(base.tree, user.tree), command.tree), sources)
+
+
+def load_onboard_config(file: Path | None = None, overrides: Overrides = None) -> OnboardConfig:
+    """The configuration of the on-board program; errors as of ``load_config``."""
+    command, user, base = sources = _layers(ONBOARD_FILE, file, overrides)
+    tree = merged(merged(base.tree, user.tree), command.tree)
+    return validated(OnboardConfig, tree, sources)
 
 
 # -- changing a file --------------------------------------------------------------------------------------------------
