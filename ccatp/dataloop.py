@@ -8,6 +8,7 @@ Known limitations: the battery stays full, and nothing fails without a fault pla
 
 import asyncio
 import socket
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack
 from functools import partial
@@ -16,18 +17,58 @@ from pathlib import Path
 import numpy as np
 
 from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.load import load_onboard_config
 from ccatp.config.models import Config
+from ccatp.config.onboard_models import OnboardConfig
 from ccatp.core import DeckPose
 from ccatp.links.auth import read_key
 from ccatp.mirror.mirror import build_mirror
+from ccatp.onboard.robot import OnboardRobot
 from ccatp.onboard.server import TcpRobotServer
 from ccatp.onboard.sessions import ServerLog
 from ccatp.sim.beacon_robot import BeaconRobot, build_beacon_robot
 from ccatp.sim.fault_injector import Injector
 from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.sim.fault_proxy import FaultProxy, LinkFaults
-from ccatp.sim.ground_truth import GroundTruthPublisher, SimPoseFile
+from ccatp.sim.ground_truth import GroundTruthPublisher, SimPoseFile, SurveyTruth
+from ccatp.sim.hardware import SimulatedHardware
 from ccatp.sim.robot import Robot
+
+_SAME_STEP = 1e-6  # times of steps and frames are equal to within rounding
+
+
+class MotorRobot(OnboardRobot, SurveyTruth):
+    """A simulated survey robot with motors under the on-board core, just booted; simulated time."""
+
+    def __init__(self, cfg: Config, onboard: OnboardConfig, start: DeckPose | None = None) -> None:
+        servo, sim = onboard.servo, cfg.sim.robot
+        hardware = SimulatedHardware(
+            cfg, build_mirror(cfg.mirror), np.random.default_rng(cfg.run.seed), start,
+            loop_hz=servo.loop_hz, counts_per_rev=servo.counts_per_rev,
+        )  # fmt: skip
+        self.world = hardware.world
+        super().__init__(onboard, hardware, round(cfg.world.commands_delay_s * sim.frame_hz))
+        # The newest line last; the first is delivered once the deque is full.
+        self._lines: deque[tuple[int, bytes]] = deque(maxlen=round(cfg.world.sensors_delay_s * sim.frame_hz) + 1)
+        self._steps = 0
+        self._close_frame(self.t_s)
+
+    def advance(self) -> None:
+        self._release_commands()
+        loop_hz = self._cfg.servo.loop_hz
+        while self._steps <= self.next_t_s * loop_hz + _SAME_STEP:
+            self.control(self._steps / loop_hz)
+            self._steps += 1
+        super().advance()
+
+    def _close_frame(self, t_s: float) -> None:
+        super()._close_frame(t_s)
+        lines = self._lines
+        lines.append((self.seq, self._line))
+        self.delivered_seq, self._line = lines[0] if len(lines) == lines.maxlen else (-1, b"")
+
+
+AnyRobot = Robot | MotorRobot | BeaconRobot
 
 
 class DataLoop(TcpRobotServer):
@@ -37,11 +78,11 @@ class DataLoop(TcpRobotServer):
     it falls.
     """
 
-    robot: Robot | BeaconRobot
+    robot: AnyRobot
 
     def __init__(
         self,
-        robot: Robot | BeaconRobot,
+        robot: AnyRobot,
         *,
         lockstep: bool,
         key: bytes | None = None,
@@ -76,12 +117,31 @@ class DataLoop(TcpRobotServer):
             self._log.info(f"fault_{what}", **injected.as_fields())
 
 
+def motor_robot(cfg: Config, start: DeckPose | None = None) -> MotorRobot:
+    """The survey robot with motors, as ``survey_robot``."""
+    robot, sim = cfg.robot, cfg.sim.robot
+    onboard = load_onboard_config(
+        overrides={
+            "link.frame_hz": sim.frame_hz,
+            "link.ttl_s": sim.ttl_s,
+            "robot.wheel_radius_m": robot.wheel_radius_m,
+            "robot.wheel_base_m": robot.wheel_base_m,
+            "robot.edge_sensors_m": robot.edge_sensors_m,
+            "robot.puck_m": (0.0, 0.0, robot.puck_height_m),
+            "robot.max_wheel_rad_s": robot.max_wheel_rad_s,
+            "robot.fan_floor": sim.fan_floor if build_mirror(cfg.mirror).overhang else 0.0,
+            "servo.response_s": sim.wheel_lag_s,
+        }
+    )
+    return MotorRobot(cfg, onboard, start)
+
+
 def survey_robot(cfg: Config, faults: FaultPlan | None = None, start: DeckPose | None = None) -> Robot:
     """The survey robot of a configuration, just booted; at base where no ``start`` is given."""
     return Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(cfg.run.seed), faults, start)
 
 
-def _keep(file: SimPoseFile, robot: Robot) -> None:
+def _keep(file: SimPoseFile, robot: Robot | MotorRobot) -> None:
     file.keep(robot.seq, robot.world.plant)
 
 
@@ -103,7 +163,7 @@ async def serve(
     ``faults`` of a survey may be those of the robot and of its link; for the link a proxy listens in the robot's place.
     ``body_file`` keeps the true pose of the survey robot between runs. ``zmq.ZMQError``: an endpoint cannot be had.
     """
-    robot: Robot | BeaconRobot
+    robot: AnyRobot
     at_work: list[Injector | LinkFaults] = []
     each_frame: list[Callable[[], object]] = []
     async with AsyncExitStack() as stack:
@@ -111,12 +171,16 @@ async def serve(
             robot = build_beacon_robot(cfg)
         else:
             body = None if body_file is None else SimPoseFile(body_file)
-            robot = survey_robot(cfg, faults, body.read() if body is not None and is_resuming else None)
+            start = body.read() if body is not None and is_resuming else None
+            if cfg.sim.robot.wheels == "motors":
+                robot = motor_robot(cfg, start)
+            else:
+                robot = survey_robot(cfg, faults, start)
+                if robot.injector is not None:
+                    at_work.append(robot.injector)
             if body is not None:
                 stack.callback(body.close)
                 each_frame.append(partial(_keep, body, robot))
-            if robot.injector is not None:
-                at_work.append(robot.injector)
         if faults is not None and faults.link:
             behind = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
             proxy = FaultProxy(*behind.getsockname()[:2], seed=cfg.run.seed, listener=listener)

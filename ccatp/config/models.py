@@ -386,6 +386,7 @@ class SimRobotConfig(Model):
     encoder_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
     edge_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
     gravity_hz: Annotated[float, Field(gt=0.0, le=100.0)]
+    wheels: Literal["lag", "motors"]
     wheel_lag_s: Positive
     fan_floor: Annotated[float, Field(ge=0.0, le=1.0)]  # used on an overhanging mirror
     gravity_sigma_rad: NonNegative

@@ -36,6 +36,7 @@ class WheelServoConfig(Model):
     """The speed controller of one wheel: feed-forward and PI, in volts."""
 
     loop_hz: Annotated[float, Field(ge=100.0, le=2000.0)]
+    response_s: Positive
     counts_per_rev: Positive
     speed_window_s: Positive
     max_v: Positive

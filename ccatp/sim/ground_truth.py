@@ -14,8 +14,9 @@ import zmq.asyncio
 
 from ccatp.core import DeckPose
 from ccatp.links.bus import Publisher
-from ccatp.links.topics import Message
+from ccatp.links.topics import Message, Misalignment, TruthMessage
 from ccatp.sim.plant import Plant
+from ccatp.sim.world import TruthRow, World
 
 MAX_REQUEST_BYTES = 4096
 
@@ -24,8 +25,11 @@ class TruthSource(ABC):
     """The true state of a simulated robot."""
 
     truth_rows = 100  # a batch of the log of the true state
-    truth_requests: Mapping[str, Callable[[], dict[str, object]]] = {}
-    """Replies for the true state, by request."""
+
+    @property
+    def truth_requests(self) -> Mapping[str, Callable[[], dict[str, object]]]:
+        """Replies for the true state, by request."""
+        return {}
 
     @abstractmethod
     def truth_row(self) -> tuple[Any, ...]:
@@ -47,6 +51,44 @@ class TruthSource(ABC):
     def describe_fall(self) -> dict[str, object]:
         """Why and where it fell, for a log."""
         return {}
+
+
+class SurveyTruth(TruthSource):
+    """The true state of a robot on a mirror."""
+
+    world: World
+    seq: int
+    t_s: float
+
+    @property
+    def truth_requests(self) -> Mapping[str, Callable[[], dict[str, object]]]:
+        return {"puck": self._puck, "misalignment": self._misalignment}
+
+    def _puck(self) -> dict[str, object]:
+        return {"t": self.t_s, "puck": self.world.puck_world(), "moved_m": self.world.moved_m()}
+
+    def _misalignment(self) -> dict[str, object]:
+        return {"panels": self._panels(), "start": msgspec.structs.astuple(self.world.start_pose)}
+
+    @property
+    def is_fallen(self) -> bool:
+        return self.world.is_fallen
+
+    def describe_fall(self) -> dict[str, object]:
+        x_m, y_m = self.world.plant.x_m, self.world.plant.y_m
+        return {"cause": self.world.fall, "t_s": self.t_s, "x_m": round(x_m, 4), "y_m": round(y_m, 4)}
+
+    def truth_row(self) -> TruthRow:
+        return self.world.truth_row(self.seq, self.t_s)
+
+    def truth_message(self, rows: list[TruthRow]) -> tuple[str, TruthMessage]:
+        return "truth", TruthMessage(seq=self.seq, t_s=self.t_s, rows=rows)
+
+    def truth_preface(self) -> tuple[str, Misalignment]:
+        return "misalignment", Misalignment(seq=self.seq, t_s=self.t_s, panels=self._panels())
+
+    def _panels(self) -> list[tuple[int, int, float, float, float]]:
+        return [(*panel, m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in self.world.misalignments.items()]
 
 
 class GroundTruthPublisher:

@@ -21,28 +21,26 @@ Requests for the true state (SI; puck in the world frame, start pose in the deck
 from collections import deque
 from math import ceil
 
-import msgspec
 import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.core import DeckPose
 from ccatp.links.robot_codec import MAX_LINE_BYTES, RobotFrame, encode
 from ccatp.links.robot_messages import CommandEcho, RobotData, Sensors
-from ccatp.links.topics import Misalignment, TruthMessage
 from ccatp.mirror.mirror import Mirror
 from ccatp.onboard.rules import LinkedRobot
 from ccatp.sim.fault_injector import Injector
 from ccatp.sim.fault_plan import FaultPlan
-from ccatp.sim.ground_truth import TruthSource
+from ccatp.sim.ground_truth import SurveyTruth
 from ccatp.sim.plant import WHOLE
 from ccatp.sim.sensors import SensorSuite, as_message
-from ccatp.sim.world import TruthRow, World
+from ccatp.sim.world import World
 
 # Worst case of a frame's line: fixed part, and bytes per sample of each list. Counted rates have all their digits.
 _FRAME_BYTES, _IMU_BYTES, _ENCODER_BYTES, _COUNTER_BYTES, _EDGE_BYTES = 420, 48, 44, 64, 26
 
 
-class Robot(LinkedRobot, TruthSource):
+class Robot(LinkedRobot, SurveyTruth):
     """The robot from one boot to the next, at base where no ``start`` is given.
 
     Attributes:
@@ -73,10 +71,6 @@ class Robot(LinkedRobot, TruthSource):
         window_frames = max(1, round(cfg.etalon.measuring_time_s * sim.frame_hz))
         pushes = () if self.injector is None else self.injector.drifts
         self.world = world = World(cfg, mirror, world_rng, window_frames, pushes, start)
-        self.truth_requests = {
-            "puck": lambda: {"t": self.t_s, "puck": world.puck_world(), "moved_m": world.moved_m()},
-            "misalignment": lambda: {"panels": self._panels(), "start": msgspec.structs.astuple(world.start_pose)},
-        }
         self._sensors = SensorSuite(cfg, mirror, sensors_rng, lag_s=world.wheels.lag_s)
         self._sensors.edges.place(world.plant)
         world.sensors = self._sensors.edges
@@ -97,26 +91,6 @@ class Robot(LinkedRobot, TruthSource):
             max_wheel_rad_s=robot.max_wheel_rad_s,
             fan_floor=self._floor,
         )
-
-    @property
-    def is_fallen(self) -> bool:
-        return self.world.is_fallen
-
-    def describe_fall(self) -> dict[str, object]:
-        x_m, y_m = self.world.plant.x_m, self.world.plant.y_m
-        return {"cause": self.world.fall, "t_s": self.t_s, "x_m": round(x_m, 4), "y_m": round(y_m, 4)}
-
-    def truth_row(self) -> TruthRow:
-        return self.world.truth_row(self.seq, self.t_s)
-
-    def truth_message(self, rows: list[TruthRow]) -> tuple[str, TruthMessage]:
-        return "truth", TruthMessage(seq=self.seq, t_s=self.t_s, rows=rows)
-
-    def truth_preface(self) -> tuple[str, Misalignment]:
-        return "misalignment", Misalignment(seq=self.seq, t_s=self.t_s, panels=self._panels())
-
-    def _panels(self) -> list[tuple[int, int, float, float, float]]:
-        return [(*panel, m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in self.world.misalignments.items()]
 
     def advance(self) -> None:
         before_s = self.t_s

@@ -1,0 +1,192 @@
+"""The robot behind its link, on its own computer: commands to motor voltages, samples to frames. Time is an argument.
+
+Two rates: ``control`` runs the wheels, ``servo.loop_hz`` times a second; ``advance`` closes a frame. What the link
+demands of the robot is in ``ccatp.onboard.rules``; besides, the wheels are held while
+
+* a device that is needed to drive has failed (inertial unit, encoders, edge sensors), until it works again;
+* a wheel is stalled, until a drive of zero;
+* the control loop ran so late that the external timer may have braked, for that step.
+
+The fans are never changed by any of this.
+"""
+
+from math import pi
+from typing import TypeVar
+
+from ccatp.config.onboard_models import OnboardConfig
+from ccatp.links.robot_codec import RobotFrame, encode
+from ccatp.links.robot_messages import CommandEcho, RobotData
+from ccatp.onboard.edge_threshold import EdgeThreshold
+from ccatp.onboard.hardware import Hardware, HardwareError
+from ccatp.onboard.rules import HELD, LinkedRobot
+from ccatp.onboard.wheel_servo import WheelServo
+
+# Without these the robot does not move. A weak fan or battery is for its clients to judge.
+NEEDED = ("imu", "encoder_right", "encoder_left", "edge")
+_LINE_SAMPLES = 24  # of one sensor in a line: a burst after a gap must not exceed the line's limit
+
+WheelRates = tuple[float, float | None, float | None]
+Row = TypeVar("Row")
+
+
+class OnboardRobot(LinkedRobot):
+    """The robot; ``hardware`` has been started.
+
+    Attributes:
+        faults: what does not work now, by its name on the link, with the reason.
+        voltages_v: of the (right, left) motor.
+        late_steps: steps of the control loop that came later than the external timer waits.
+        dropped_samples: samples that were left out because a frame had too many.
+    """
+
+    def __init__(self, cfg: OnboardConfig, hardware: Hardware, commands_delay_frames: int = 0) -> None:
+        link, robot = cfg.link, cfg.robot
+        limits = link.ttl_s, robot.max_wheel_rad_s, robot.fan_floor
+        super().__init__(limits, 1.0 / link.frame_hz, link.frame_hz, commands_delay_frames)
+        self._cfg, self._hardware = cfg, hardware
+        self._servos = WheelServo(cfg.servo), WheelServo(cfg.servo)
+        self._edges = [EdgeThreshold(cfg.edges) for _ in range(4)]
+        self._rad_per_count = 2.0 * pi / cfg.servo.counts_per_rev
+        self._last_counts: tuple[float, int | None, int | None] | None = None
+        self.faults: dict[str, str] = {}
+        self.voltages_v = 0.0, 0.0
+        self.late_steps = self.dropped_samples = 0
+        self._control_s: float | None = None
+        self._commanded_duty: tuple[float, float] | None = None
+        self._soc = 1.0
+        self._line = b""
+        self._clear()
+        # The duties of before are in force; the floor comes with the first command.
+        self.fans.duty = hardware.fans()
+
+    def _clear(self) -> None:
+        self._imu: list[tuple[float, float, float]] = []
+        self._enc: list[WheelRates] = []
+        self._edge: list[tuple[float, int, int, int, int]] = []
+        self._gravity: tuple[float, float, float, float] | None = None
+
+    def describe(self) -> RobotData:
+        """See ``LinkedRobot``."""
+        robot = self._cfg.robot
+        return RobotData(
+            robot.wheel_radius_m, robot.wheel_base_m, robot.edge_sensors_m, robot.puck_m, robot.max_wheel_rad_s,
+            robot.fan_floor,
+        )  # fmt: skip
+
+    # -- the wheels ---------------------------------------------------------------------------------------------------
+
+    def control(self, now_s: float) -> None:
+        """Read the devices and give the motors their voltages, at ``now_s`` of the robot's clock."""
+        last_s, self._control_s = self._control_s, now_s
+        self._take_readings(now_s)
+        dt_s = 1.0 / self._cfg.servo.loop_hz if last_s is None else now_s - last_s
+        right_set, left_set = self.rules.set_points(now_s)
+        is_late = dt_s > self._cfg.devices.timer.timeout_s
+        self.late_steps += is_late
+        right, left = self._servos
+        stalled = "stall" if right.is_stalled or left.is_stalled else ""
+        if stalled and not (right_set or left_set):
+            right.is_stalled = left.is_stalled = False
+        failed = next((name for name in NEEDED if name in self.faults), "") or stalled
+        if failed or is_late:
+            right_set, left_set = HELD
+            self.rules.is_held = True
+        try:
+            if is_late or "encoder_right" in self.faults or "encoder_left" in self.faults:
+                # A servo that does not see its wheel would drive it at any speed.
+                self._brake()
+            else:
+                self.voltages_v = right.step(dt_s, right_set), left.step(dt_s, left_set)
+                self._hardware.drive(*self.voltages_v)
+            self.faults.pop("motors", None)
+        except HardwareError as error:
+            self.faults["motors"] = str(error)
+        self._write_fans()
+
+    def _brake(self) -> None:
+        for servo in self._servos:
+            servo.release()
+        self.voltages_v = 0.0, 0.0
+        self._hardware.brake()
+
+    def _take_readings(self, now_s: float) -> None:
+        readings = self._hardware.read(now_s)
+        self.faults = dict(readings.faults)
+        self._soc = readings.soc
+        self._imu += readings.imu
+        self._gravity = readings.gravity or self._gravity
+        for t_s, right, left in readings.counts:
+            self._count(t_s, right, left)
+        for t_s, *voltages in readings.edges:
+            front_left, front_right, rear_left, rear_right = (
+                edge.read(t_s, voltage_v) for edge, voltage_v in zip(self._edges, voltages, strict=True)
+            )
+            self._edge.append((t_s, front_left, front_right, rear_left, rear_right))
+        for right_servo, name in ((self._servos[0], "encoder_right"), (self._servos[1], "encoder_left")):
+            if right_servo.is_stalled:
+                self.faults.setdefault("stall", f"full voltage and no motion, {name.removeprefix('encoder_')} wheel")
+
+    def _count(self, t_s: float, right: int | None, left: int | None) -> None:
+        """Speeds from the counts since the reading before: their sum over time is the angle exactly."""
+        last, self._last_counts = self._last_counts, (t_s, right, left)
+        for servo, count in zip(self._servos, (right, left), strict=True):
+            if count is not None:
+                servo.count(t_s, count)
+        if last is None or t_s <= last[0]:
+            return
+        dt_s = t_s - last[0]
+        if dt_s > self._cfg.devices.daq.timeout_s:
+            return  # a gap: how fast the wheels were within it is not known
+        rates = [
+            None if now is None or before is None else (now - before) * self._rad_per_count / dt_s
+            for now, before in ((right, last[1]), (left, last[2]))
+        ]
+        if rates != [None, None]:
+            self._enc.append((t_s, rates[0], rates[1]))
+
+    def _write_fans(self) -> None:
+        duty = self.fans.duty
+        if self._commanded_duty is None or duty == self._commanded_duty:
+            self._commanded_duty = duty  # those that were read back at the start are in force already
+            return
+        try:
+            self._hardware.command_fans(*duty)
+            self._commanded_duty = duty
+        except HardwareError as error:
+            self.faults["fan_left"] = self.faults["fan_right"] = str(error)
+
+    # -- frames -------------------------------------------------------------------------------------------------------
+
+    def advance(self) -> None:
+        """Close a frame with every sample since the one before."""
+        self.seq += 1
+        self.t_s = self.seq / self.frame_hz
+        self._close_frame(self.t_s)
+
+    def advance_to(self, now_s: float) -> None:
+        """Close the frame of ``now_s``; frames that a stop of this computer left out are not made up for."""
+        self.seq = max(self.seq + 1, int(now_s * self.frame_hz + 1e-6))
+        self.t_s = now_s
+        self._close_frame(now_s)
+
+    def _close_frame(self, t_s: float) -> None:
+        drive_seq, age_s, permit_age_s, is_held = self.rules.echo(t_s)
+        # A motor that cannot be set is to the clients what a stalled one is.
+        faults = tuple(sorted({"stall" if name == "motors" else name for name in self.faults}))
+        frame = RobotFrame(
+            self.seq, round(t_s, 6), self._bounded(self._imu), self._bounded(self._enc), self._bounded(self._edge),
+            self._gravity, self.fans.duty, self._soc,
+            CommandEcho(drive_seq, round(age_s, 6), round(permit_age_s, 6), is_held), faults,
+        )  # fmt: skip
+        self._line = encode(frame)
+        self.delivered_seq = self.seq
+        self._clear()
+
+    def _bounded(self, samples: list[Row]) -> list[Row]:
+        self.dropped_samples += max(0, len(samples) - _LINE_SAMPLES)
+        return samples[-_LINE_SAMPLES:]
+
+    @property
+    def delivered_line(self) -> bytes:
+        """See ``LinkedRobot``."""
+        return self._line

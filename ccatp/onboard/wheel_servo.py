@@ -1,0 +1,90 @@
+"""The speed controller of one wheel: from a set point and encoder counts to a motor voltage.
+
+The set point passes a first-order filter (time constant ``response_s``), so that the wheel follows it as the off-board
+computer expects, however strong its motor is. The wheel follows the filtered speed by feed-forward of the motor's
+steady state, V = static sign(w) + slope w, and PI. The integral of the speed error is the difference of two angles,
+which counts give without noise. The voltage is limited in size and slope; while it is, the reference angle does not run
+ahead (anti-windup by conditional integration).
+
+A set point of zero brakes at once: the filtered speed decays, and the angle at which the wheel comes to rest is held.
+"""
+
+from collections import deque
+from math import copysign, exp, pi
+
+from ccatp.config.onboard_models import WheelServoConfig
+
+_REST_RAD_S = 0.02  # slower than this with a set point of zero, the wheel is to stay where it is
+
+
+class WheelServo:
+    """One wheel.
+
+    Attributes:
+        rate_rad_s: measured speed over ``speed_window_s``.
+        voltage_v: what the motor was given last.
+        is_stalled: full voltage without motion for ``stall_s``; until the next set point of zero.
+    """
+
+    def __init__(self, cfg: WheelServoConfig) -> None:
+        self._cfg = cfg
+        self._rad_per_count = 2.0 * pi / cfg.counts_per_rev
+        self._window: deque[tuple[float, int]] = deque()
+        self.rate_rad_s = self.voltage_v = 0.0
+        self.is_stalled = False
+        self._reference_rad_s = 0.0
+        self._ahead_rad = 0.0  # reference angle less the wheel's
+        self._last_count: int | None = None
+        self._stalled_s = 0.0
+
+    def count(self, t_s: float, count: int) -> None:
+        """Take a reading of the encoder."""
+        window = self._window
+        if window and t_s <= window[-1][0]:
+            return
+        if self._last_count is not None:
+            self._ahead_rad -= (count - self._last_count) * self._rad_per_count
+        self._last_count = count
+        window.append((t_s, count))
+        oldest_s = t_s - self._cfg.speed_window_s
+        while len(window) > 2 and window[1][0] <= oldest_s:
+            window.popleft()
+        (first_s, first), (last_s, last) = window[0], window[-1]
+        if last_s > first_s:
+            self.rate_rad_s = (last - first) * self._rad_per_count / (last_s - first_s)
+
+    def step(self, dt_s: float, set_point_rad_s: float) -> float:
+        """Voltage, V, for the next ``dt_s``."""
+        cfg = self._cfg
+        decay = exp(-dt_s / cfg.response_s)
+        before = self._reference_rad_s
+        self._reference_rad_s = reference = set_point_rad_s + (before - set_point_rad_s) * decay
+        if set_point_rad_s == 0.0 and abs(reference) < _REST_RAD_S:
+            self._reference_rad_s = reference = 0.0
+            self.is_stalled, self._stalled_s = False, 0.0
+        way_rad = set_point_rad_s * dt_s + (before - set_point_rad_s) * cfg.response_s * (1.0 - decay)
+        ahead_rad = self._ahead_rad + way_rad
+        wanted_v = cfg.volt_per_rad_s * reference + cfg.proportional_v_per_rad_s * (reference - self.rate_rad_s)
+        wanted_v += cfg.integral_v_per_rad * ahead_rad
+        direction = reference or (ahead_rad if abs(ahead_rad) > 2.0 * self._rad_per_count else 0.0)
+        if direction:
+            wanted_v += copysign(cfg.static_v, direction)
+        most_v = cfg.slew_v_s * dt_s
+        voltage_v = min(max(wanted_v, self.voltage_v - most_v), self.voltage_v + most_v)
+        voltage_v = min(max(voltage_v, -cfg.max_v), cfg.max_v)
+        if voltage_v == wanted_v or way_rad * (wanted_v - voltage_v) < 0.0:
+            self._ahead_rad = ahead_rad
+        self.voltage_v = voltage_v
+        self._watch_stall(dt_s)
+        return voltage_v
+
+    def _watch_stall(self, dt_s: float) -> None:
+        cfg = self._cfg
+        is_pushing = abs(self.voltage_v) >= cfg.max_v and abs(self.rate_rad_s) < _REST_RAD_S
+        self._stalled_s = self._stalled_s + dt_s if is_pushing else 0.0
+        self.is_stalled = self.is_stalled or self._stalled_s >= cfg.stall_s
+
+    def release(self) -> None:
+        """The motor is braked by other means: nothing of the past pushes it afterwards."""
+        self.voltage_v = self._reference_rad_s = self._ahead_rad = 0.0
+        self._stalled_s = 0.0

@@ -1,0 +1,168 @@
+"""Simulated hardware of the on-board program: geared DC motors that turn the wheels of the plant, counters, voltages.
+
+A geared DC motor at a voltage V goes to the speed of its steady state, with the time constant of its mechanics:
+
+    w_end = (V - V_friction - V_load) / ke,   T = J R / (kt ke)
+
+kt, ke: torque per ampere and voltage per rad/s at the wheel, R: resistance, J: inertia at the wheel with half of the
+robot's mass, V_friction: voltage of the Coulomb friction, V_load: that of half of gravity's part along the robot. The
+plant's first-order wheels are such a motor exactly while the voltage is constant, so the plant steps once for each step
+of the control loop. A braked motor is one at 0 V.
+"""
+
+from collections.abc import Sequence
+from math import floor, pi
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.config.models import Config
+from ccatp.core import DeckPose
+from ccatp.mirror.mirror import Mirror
+from ccatp.onboard.hardware import Readings
+from ccatp.sim.plant import downhill
+from ccatp.sim.sensors import EdgeTuple, GravityTuple, ImuTuple, SensorSuite
+from ccatp.sim.world import World
+
+_G_M_S2 = 9.771  # at latitude -22.99 deg, 5,612 m
+_MASS_KG = 1.0
+_EPSILON_S = 1e-9
+
+
+class Motor(NamedTuple):
+    """A geared DC motor, at the wheel."""
+
+    volt: float  # of the two figures that follow
+    no_load_rad_s: float
+    stall_nm: float
+    friction_nm: float
+
+    @property
+    def volt_per_rad_s(self) -> float:
+        """Slope of the steady state: what the figure without load leaves after friction."""
+        return (self.volt - self.friction_nm * self.volt_per_nm) / self.no_load_rad_s
+
+    @property
+    def volt_per_nm(self) -> float:
+        """R / kt."""
+        return self.volt / self.stall_nm
+
+    def steady_rad_s(self, voltage_v: float, load_nm: float) -> float:
+        """Speed at a constant voltage against a load (positive: against turning forwards)."""
+        net_v = voltage_v - load_nm * self.volt_per_nm
+        friction_v = self.friction_nm * self.volt_per_nm
+        if abs(net_v) <= friction_v:
+            return 0.0
+        return (net_v - friction_v if net_v > 0.0 else net_v + friction_v) / self.volt_per_rad_s
+
+    def time_constant_s(self, inertia_kg_m2: float) -> float:
+        """T for an inertia at the wheel."""
+        return inertia_kg_m2 * self.volt_per_nm / self.volt_per_rad_s
+
+
+# At a gear of 75.81 : 1 the maker gives, at 12 V, 450 rev/min without load, 1.0 kgf cm at stall, and 0.08 A of 0.75 A
+# without load, which is the friction; here all of it at 297.92 : 1. The speed that a slope gives to a braked wheel is
+# in proportion to the load over the torque at stall, so a weaker gear would not hold the robot.
+_GEAR = 297.92 / 75.81
+MOTOR_12V = Motor(volt=12.0, no_load_rad_s=47.1 / _GEAR, stall_nm=0.0981 * _GEAR, friction_nm=0.0105 * _GEAR)
+
+
+class SimulatedHardware:
+    """The devices of a simulated robot; ``read`` moves the world on to its time.
+
+    ``rng`` is the parent of the random draws. ``faults`` may be filled by a test: they are reported as they are.
+
+    Attributes:
+        world: the truth.
+        voltages_v: of the (right, left) motor in force.
+    """
+
+    def __init__(
+        self,
+        cfg: Config,
+        mirror: Mirror,
+        rng: np.random.Generator,
+        start: DeckPose | None = None,
+        *,
+        loop_hz: float,
+        counts_per_rev: float,
+        motor: Motor = MOTOR_12V,
+    ) -> None:
+        inertia_kg_m2 = 0.5 * _MASS_KG * cfg.robot.wheel_radius_m**2
+        sim_robot = cfg.sim.robot.model_copy(
+            update={"frame_hz": loop_hz, "wheel_lag_s": motor.time_constant_s(inertia_kg_m2)}
+        )
+        cfg = cfg.model_copy(update={"sim": cfg.sim.model_copy(update={"robot": sim_robot})})
+        world_rng, sensors_rng = rng.spawn(2)
+        self._motor, self._cfg, self._mirror = motor, cfg, mirror
+        window = max(1, round(cfg.etalon.measuring_time_s * loop_hz))
+        self.world = World(cfg, mirror, world_rng, window, start=start)
+        self._sensors = SensorSuite(cfg, mirror, sensors_rng, lag_s=self.world.wheels.lag_s)
+        self._sensors.edges.place(self.world.plant)
+        self.world.sensors = self._sensors.edges
+        self._loop_hz, self._per_rad = loop_hz, counts_per_rev / (2.0 * pi)
+        floor_duty = sim_robot.fan_floor if mirror.overhang else 0.0
+        self._duty = (floor_duty, floor_duty)
+        self._step = -1
+        self.voltages_v = (0.0, 0.0)
+        self.faults: dict[str, str] = {}
+        self.timer_calls = 0
+
+    def start(self) -> None:
+        """See ``Hardware``."""
+
+    def close(self) -> None:
+        """See ``Hardware``."""
+        self.brake()
+
+    def read(self, now_s: float) -> Readings:
+        """See ``Hardware``."""
+        imu: list[ImuTuple] = []
+        edges: list[EdgeTuple] = []
+        counts: list[tuple[float, int | None, int | None]] = []
+        gravity: GravityTuple | None = None
+        while (self._step + 1) / self._loop_hz <= now_s + _EPSILON_S:
+            self._step += 1
+            if self._step:
+                self._move()
+            new_edges, new_imu, _, new_gravity = self._sensors.read(self._step, self.world.plant)
+            edges += new_edges
+            imu += new_imu
+            gravity = new_gravity or gravity
+            plant = self.world.plant
+            right, left = floor(plant.right_angle_rad * self._per_rad), floor(plant.left_angle_rad * self._per_rad)
+            counts.append((self._step / self._loop_hz, right, left))
+        return Readings(imu, counts, [_voltages(row) for row in edges], gravity, 1.0, dict(self.faults))
+
+    def _move(self) -> None:
+        t_s, dt_s = (self._step - 1) / self._loop_hz, 1.0 / self._loop_hz
+        ahead, _, _ = downhill(self.world.plant, self._mirror.gravity_deck)
+        load_nm = -0.5 * _MASS_KG * _G_M_S2 * ahead * self._cfg.robot.wheel_radius_m
+        right, left = (self._motor.steady_rad_s(voltage_v, load_nm) for voltage_v in self.voltages_v)
+        self.world.step(t_s, dt_s, right, left, 0.5 * (self._duty[0] + self._duty[1]))
+
+    def drive(self, right_v: float, left_v: float) -> None:
+        """See ``Hardware``."""
+        self.voltages_v = (right_v, left_v)
+        self.timer_calls += 1
+
+    def brake(self) -> None:
+        """See ``Hardware``."""
+        self.drive(0.0, 0.0)
+
+    def fans(self) -> tuple[float, float]:
+        """See ``Hardware``."""
+        return self._duty
+
+    def command_fans(self, left: float, right: float) -> None:
+        """See ``Hardware``."""
+        self._duty = (left, right)
+
+
+_PANEL_V, _NONE_V = 2.4, 0.5
+
+
+def _voltages(row: Sequence[float]) -> tuple[float, float, float, float, float]:
+    t_s, *bits = row
+    a, b, c, d = (_PANEL_V if bit else _NONE_V for bit in bits)
+    return t_s, a, b, c, d
