@@ -34,7 +34,15 @@ from ccatp.links.topics import (
 )
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_poses
 from ccatp.mirror.panel_alignment import fit_panels
-from ccatp.records.recorder import RECORD_FORMAT, TELEMETRY, Recorder, decode_recorded, iter_messages, recordings
+from ccatp.records.recorder import (
+    RECORD_FORMAT,
+    TELEMETRY,
+    Recorder,
+    RobotClock,
+    decode_recorded,
+    iter_messages,
+    recordings,
+)
 from ccatp.records.store import StoredSurvey, StoreError, read_survey
 from ccatp.records.summary import PanelFits, SummaryBuilder
 from ccatp.report.foxglove import Views, recorded_schemas
@@ -72,6 +80,7 @@ class Collector:
         self._subscriber = Subscriber(context, [endpoints.of(name) for name in names], RECEIVED)
         self._record: BeaconSummary | SurveyRecord
         self._views: Views | None = None
+        clock = RobotClock(is_simulation=is_sim)
         self._view: RunView | None = None
         if isinstance(cfg, RadioConfig):
             # Imported late: a survey does not need it, and its libraries are large.
@@ -82,7 +91,7 @@ class Collector:
         else:
             what = {"mirror": cfg.mirror.name, "seed": str(cfg.run.seed), "world": cfg.world.name}
             self._record = SurveyRecord(cfg, run_dir, is_sim=is_sim)
-            self._views = Views(self._record.mirror, cfg.robot.puck_height_m)
+            self._views = Views(self._record.mirror, cfg.robot.puck_height_m, clock)
         software = {"format": str(RECORD_FORMAT), "ccatp": ccatp.__version__}
         config = dump_config(cfg)  # a later session in the same directory may have another
         self._recorder = Recorder(
@@ -91,6 +100,7 @@ class Collector:
             is_simulation=is_sim,
             metadata={**software, **what, "config": config},
             on_failure=self._on_recorder_failure,
+            clock=clock,
         )
         self._truth_rows = 0
         self.status: MissionStatus | None = None

@@ -21,7 +21,7 @@ from ccatp.links.bus import Subscriber
 from ccatp.links.runtime_dir import runtime_dir_path
 from ccatp.links.topics import BY_NAME, Heartbeat, Message, schema_of
 from ccatp.mirror.mirror import build_mirror
-from ccatp.records.recorder import TELEMETRY, RecordedMessage, read_metadata
+from ccatp.records.recorder import TELEMETRY, RecordedMessage, RobotClock, read_metadata
 from ccatp.report.foxglove import (
     VIEWS,
     FoxgloveStream,
@@ -76,6 +76,7 @@ class Streamer:
         self._heartbeats = Subscriber(context, [self._endpoints.of("main")], ["heartbeat.main"])
         self._run: Subscriber | None = None
         self._views: Views | None = None
+        self._clock = RobotClock(is_simulation=True)  # another for each run
         self._latched: dict[str, RecordedMessage] = {}
         self._pid = -1
 
@@ -114,7 +115,8 @@ class Streamer:
         except (OSError, ConfigError) as error:
             self._report(f"a run whose configuration cannot be read is not streamed: {error}")
             return
-        self._views = Views(build_mirror(cfg.mirror), cfg.robot.puck_height_m)
+        self._clock = RobotClock(is_simulation=is_sim)
+        self._views = Views(build_mirror(cfg.mirror), cfg.robot.puck_height_m, self._clock)
         mirror, world, run = cfg.mirror.name, cfg.world.name if is_sim else "", cfg.run
         fact = RunFact(mirror, world, is_sim, run.seed, run.filter, str(run_dir))
         self._send((RecordedMessage(RUN, 0.0, json.dumps(msgspec.to_builtins(fact)).encode()), *self._views.begin()))
@@ -130,7 +132,8 @@ class Streamer:
             self._send(self._views.of(message))
 
     def _send(self, messages: Iterable[RecordedMessage]) -> None:
-        for shown in messages:
+        for message in messages:
+            shown = message._replace(t_s=self._clock.utc_ns(message.t_s) / 1e9)
             if shown.topic in LATCHED:
                 self._latched[shown.topic] = shown
             for stream in self._streams:

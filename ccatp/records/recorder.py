@@ -57,6 +57,38 @@ _METADATA = "ccatp"
 _SIMULATION = "simulation"
 _MAX_T_S = 1e9  # thirty years of uptime: anything beyond is not a time since boot
 _NS = 1e9
+_CLOCK_BACK_S = 10.0  # batches and events are this much out of order at most
+_COMPARED_S, _UTC_OFF_NS = 10.0, 20_000_000
+
+
+class RobotClock:
+    """UTC of the robot's clock: compared at its first time, and again where it went back because the robot started.
+
+    Of a real robot they are compared every ``_COMPARED_S``, and UTC is corrected where it is off by ``_UTC_OFF_NS``. In
+    a simulation UTC advances with the robot's clock, in lockstep faster than the clock of this machine.
+    """
+
+    def __init__(self, *, is_simulation: bool, now_ns: Callable[[], int] = time.time_ns) -> None:
+        self._is_simulation, self._now_ns = is_simulation, now_ns
+        self._zero_ns = self._least_ns = 0  # UTC when the robot's clock was 0: in force, and by the promptest message
+        self._newest_s = self._compared_s = 0.0
+
+    def utc_ns(self, t_s: float) -> int:
+        """UTC of robot time ``t_s``, ns since 1970; of a message without a time (0) that of the newest one."""
+        now_ns = self._now_ns()
+        if t_s > 0.0:
+            self._compare(t_s, now_ns - round(t_s * _NS))
+        return self._zero_ns + round((t_s or self._newest_s) * _NS) if self._zero_ns else now_ns
+
+    def _compare(self, t_s: float, zero_ns: int) -> None:
+        if not self._zero_ns or t_s < self._newest_s - _CLOCK_BACK_S:
+            self._zero_ns = self._least_ns = zero_ns
+            self._newest_s = self._compared_s = t_s
+        self._newest_s, self._least_ns = max(self._newest_s, t_s), min(self._least_ns, zero_ns)
+        if not self._is_simulation and t_s - self._compared_s >= _COMPARED_S:
+            if abs(self._least_ns - self._zero_ns) >= _UTC_OFF_NS:
+                self._zero_ns = self._least_ns
+            self._least_ns, self._compared_s = zero_ns, t_s
 
 
 class RecordedMessage(NamedTuple):
@@ -94,6 +126,7 @@ class _ChunkIndexes:
 class Recorder:
     """Writes messages of a fixed set of topics to one MCAP file; never raises.
 
+    Of each message the log time is UTC by ``clock`` and the publish time that of the robot's clock, both in ns.
     An existing file at ``path`` is kept: it is renamed ``<stem>.<n><suffix>`` (see ``recordings``). ``topics``: name
     and JSON schema of each; viewers show the schema's title. ``metadata``: what distinguishes runs (mirror, seed, ...).
     ``on_failure`` is called once with the reason when recording ends early; ``is_recording`` is False from then on, and
@@ -108,8 +141,10 @@ class Recorder:
         is_simulation: bool,
         metadata: Mapping[str, str] | None = None,
         on_failure: Callable[[str], None] | None = None,
+        clock: RobotClock | None = None,
     ) -> None:
         self.path = path
+        self._utc_ns = (clock or RobotClock(is_simulation=is_simulation)).utc_ns
         self.is_recording = True
         self._on_failure = on_failure
         self._channels: dict[str, int] = {}
@@ -140,10 +175,9 @@ class Recorder:
         channel = self._channels.get(topic)
         if channel is None or not self.is_recording or not 0.0 <= t_s < _MAX_T_S:
             return
-        time_ns = round(t_s * _NS)
         self._sequence += 1
         with self._ending_at_a_failure():
-            self._writer.add_message(channel, time_ns, payload, time_ns, self._sequence)
+            self._writer.add_message(channel, self._utc_ns(t_s), payload, round(t_s * _NS), self._sequence)
             if not 0.0 <= t_s - self._flushed_s < FLUSH_AFTER_S:
                 self._flush(t_s)
             elif self._waiting_since_s is None:
@@ -279,7 +313,16 @@ def _next_chunk(data: mmap.mmap, start: int) -> int:
 
 
 def iter_messages(path: Path, on_damage: Callable[[str], None] | None = None) -> Iterator[RecordedMessage]:
+    """All messages of a file, as ``iter_logged``."""
+    return (message for _, message in iter_logged(path, on_damage))
+
+
+def iter_logged(
+    path: Path, on_damage: Callable[[str], None] | None = None
+) -> Iterator[tuple[int | None, RecordedMessage]]:
     """All messages of a file in the order of recording, up to its end or to the first damage.
+
+    Before each stands UTC minus the robot's clock, ns since 1970; None in recordings up to format 2.
 
     The file may end anywhere, as after a ``kill -9``; a damaged chunk gives none of its messages. ``on_damage`` is
     called with the reason where the file ends early or is damaged. ``OSError``: the file cannot be read.
@@ -292,7 +335,9 @@ def iter_messages(path: Path, on_damage: Callable[[str], None] | None = None) ->
         if isinstance(record, Channel):
             channels[record.id] = record.topic
         elif isinstance(record, Message) and record.channel_id in channels:
-            yield RecordedMessage(channels[record.channel_id], record.log_time / _NS, record.data)
+            # Up to format 2 both times are the robot's.
+            utc_offset_ns = record.log_time - record.publish_time or None
+            yield utc_offset_ns, RecordedMessage(channels[record.channel_id], record.publish_time / _NS, record.data)
     if on_damage is not None and not condition.is_complete:
         at = condition.lost[0][0] if condition.lost else condition.size_bytes
         on_damage(f"{path}: damaged or cut off at byte {at}")
@@ -318,7 +363,7 @@ def damage_text(path: Path, damage: str) -> str:
     return f"{damage.replace(str(path), path.name)}; what came before it is in this report"
 
 
-RECORD_FORMAT = 2
+RECORD_FORMAT = 3
 """Of a recording, kept in it; one more wherever an older reader would misunderstand what is recorded."""
 
 # In recordings of older formats: topic, text there, and the present one. A key or value, with its quotation marks.

@@ -2,6 +2,7 @@
 
 from collections.abc import Sized
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from io import SEEK_END
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -64,7 +65,10 @@ class TopicFacts:
 
 @dataclass(slots=True)
 class RecordingFacts:
-    """Content of a recording; ``faults`` are the objections of the format's own strict reader."""
+    """Content of a recording; ``faults`` are the objections of the format's own strict reader.
+
+    ``utc_ns``: of the first and the last message, ns since 1970; None where it was not recorded.
+    """
 
     path: Path
     condition: Condition
@@ -72,6 +76,16 @@ class RecordingFacts:
     topics: dict[str, TopicFacts] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
     is_being_written: bool = False
+    utc_ns: tuple[int, int] | None = None
+
+    @property
+    def utc(self) -> tuple[str | None, str | None]:
+        """UTC of the first and the last message in ISO format."""
+        first, last = (
+            f"{datetime.fromtimestamp(ns / _NS, UTC):%Y-%m-%dT%H:%M:%SZ}" if ns else None
+            for ns in self.utc_ns or (0, 0)
+        )
+        return first, last
 
     @property
     def state(self) -> str:
@@ -123,6 +137,8 @@ class RecordingFacts:
             "messages": self.messages,
             "start_s": start_s,
             "end_s": end_s,
+            "start_utc": self.utc[0],
+            "end_utc": self.utc[1],
             "bytes_per_hour": None if self.bytes_per_hour is None else round(self.bytes_per_hour),
             "metadata": known,
             "topics": {name: asdict(topic) for name, topic in sorted(self.topics.items())},
@@ -155,11 +171,14 @@ def read_facts(path: Path) -> RecordingFacts:
             elif isinstance(record, Metadata):
                 facts.metadata[record.name] = dict(record.metadata)
             elif isinstance(record, Message) and record.channel_id in channels:
-                topic, t_s = channels[record.channel_id], record.log_time / _NS
+                topic, t_s = channels[record.channel_id], record.publish_time / _NS
                 topic.messages += 1
                 topic.payload_bytes += len(record.data)
                 topic.start_s = t_s if topic.start_s is None else min(topic.start_s, t_s)
                 topic.end_s = t_s if topic.end_s is None else max(topic.end_s, t_s)
+                if record.log_time != record.publish_time:  # the same in recordings up to format 2
+                    first_ns, last_ns = facts.utc_ns or (record.log_time, record.log_time)
+                    facts.utc_ns = min(first_ns, record.log_time), max(last_ns, record.log_time)
         facts.is_being_written = is_being_written(path)
         facts.faults = strict_faults(path)
     except OSError as error:
@@ -202,7 +221,7 @@ def recover(path: Path, out: Path) -> Saved:
 
 
 def _rewrite(writer: Writer, records: list[McapRecord]) -> list[int]:
-    """Times of the messages that were written, ns."""
+    """Robot times of the messages that were written, ns."""
     library = next((record.library for record in records if isinstance(record, Header)), "")
     writer.start(library=f"ccatp recording repair ({library})" if library else "ccatp recording repair")
     # The end of a file repeats its schemas and channels: they may be all that is left of them.
@@ -222,7 +241,7 @@ def _rewrite(writer: Writer, records: list[McapRecord]) -> list[int]:
         elif isinstance(record, Message) and record.channel_id in new_channels:
             channel = new_channels[record.channel_id]
             writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
-            times_ns.append(record.log_time)
+            times_ns.append(record.publish_time)
     writer.finish()  # type: ignore[no-untyped-call]
     return times_ns
 

@@ -29,7 +29,7 @@ from ccatp.links import topics
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import FixMessage, Message, TrackMessage, TruthMessage
 from ccatp.mirror.mirror import Mirror
-from ccatp.records.recorder import RecordedMessage
+from ccatp.records.recorder import RecordedMessage, RobotClock
 
 LOOP = 1  # of LinePrimitive.type
 LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
@@ -75,11 +75,6 @@ SceneEntity = _message(
 SceneEntityDeletion = _message("SceneEntityDeletion", timestamp=Time, type=int, id=str)
 SceneUpdate = _message("SceneUpdate", deletions=[SceneEntityDeletion], entities=[SceneEntity])
 Log = _message("Log", timestamp=Time, level=int, message=str, name=str, file=(str, ""), line=(int, 0))
-
-
-def time_of(t_s: float) -> Any:
-    """Robot time, s, as a ``Time``."""
-    return Time(*divmod(round(t_s * _NS), _NS))
 
 
 DECK = "deck"
@@ -257,10 +252,10 @@ def view_schemas() -> list[tuple[str, dict[str, Any]]]:
 
 
 class Views:
-    """Derives the views of one run."""
+    """Derives the views of one run; their time stamps are UTC by ``clock``."""
 
-    def __init__(self, mirror: Mirror, puck_height_m: float) -> None:
-        self._mirror, self._puck_height_m = mirror, puck_height_m
+    def __init__(self, mirror: Mirror, puck_height_m: float, clock: RobotClock) -> None:
+        self._mirror, self._puck_height_m, self._utc_ns = mirror, puck_height_m, clock.utc_ns
         self._deviations_m: dict[PointId, float] = {}
         # Of one frame either may arrive first; at most _KEPT wait for their counterpart.
         self._estimates: dict[int, DeckPose] = {}
@@ -271,7 +266,7 @@ class Views:
     def begin(self, t_s: float = 0.0) -> Iterator[RecordedMessage]:
         """The latched views: frame of the world and map of the panels."""
         self._has_begun = True
-        mirror, now = self._mirror, time_of(t_s)
+        mirror, now = self._mirror, self._stamp(t_s)
         origin = Vector(*mirror.world_from_deck((0.0, 0.0, 0.0)))
         x, y, z = (mirror.rotate_world_from_deck(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
         yield _shown("view/frames", t_s, FrameTransform(now, WORLD, DECK, origin, quaternion((x, y, z))))
@@ -294,14 +289,17 @@ class Views:
             yield from self._of_fix(message)
         elif isinstance(message, topics.LogMessage):
             level = LEVELS.get(message.level, 0)
-            log = Log(time_of(max(message.t_s, 0.0)), level, message.text, message.process)
+            log = Log(self._stamp(max(message.t_s, 0.0)), level, message.text, message.process)
             yield _shown("view/log", message.t_s, log)
 
     def all_points(self, t_s: float) -> Iterator[RecordedMessage]:
         """All measured points so far."""
         panels = dict.fromkeys(point.panel for point in self._deviations_m)
         if panels:
-            yield _shown("view/points", t_s, point_scene(self._mirror, panels, self._deviations_m, time_of(t_s)))
+            yield _shown("view/points", t_s, point_scene(self._mirror, panels, self._deviations_m, self._stamp(t_s)))
+
+    def _stamp(self, t_s: float) -> Any:
+        return Time(*divmod(self._utc_ns(t_s), _NS))
 
     def _of_track(self, track: TrackMessage) -> Iterator[RecordedMessage]:
         for seq, t_s, row, col, x, y, heading, sigma_m in track.rows:
@@ -312,7 +310,7 @@ class Views:
     def _of_pose(self, seq: int, t_s: float, pose: DeckPose, sigma_m: float) -> Iterator[RecordedMessage]:
         if seq % EVERY_FRAMES == 0:
             yield from self._compared(seq, t_s, self._estimates, pose)
-        now, shown = time_of(t_s), self._pose_of(pose)
+        now, shown = self._stamp(t_s), self._pose_of(pose)
         yield _shown("view/pose", t_s, PoseInFrame(now, DECK, shown))
         frame = FrameTransform(now, DECK, ROBOT, shown.position, shown.orientation)
         yield _shown("view/robot_frame", t_s, frame)
@@ -323,7 +321,7 @@ class Views:
             if seq % EVERY_FRAMES:
                 continue
             pose = DeckPose(x, y, heading)
-            yield _shown("view/true_pose", t_s, PoseInFrame(time_of(t_s), DECK, self._pose_of(pose)))
+            yield _shown("view/true_pose", t_s, PoseInFrame(self._stamp(t_s), DECK, self._pose_of(pose)))
             yield from self._compared(seq, t_s, self._truths, pose)
 
     def _compared(self, seq: int, t_s: float, own: dict[int, DeckPose], pose: DeckPose) -> Iterator[RecordedMessage]:
@@ -348,7 +346,7 @@ class Views:
             self._points_sent_s = fix.t_s
             yield from self.all_points(fix.t_s)
             return
-        scene = point_scene(self._mirror, (point.panel,), self._deviations_m, time_of(fix.t_s))
+        scene = point_scene(self._mirror, (point.panel,), self._deviations_m, self._stamp(fix.t_s))
         yield _shown("view/points", fix.t_s, scene)
 
     def _pose_of(self, pose: DeckPose) -> Any:
@@ -376,7 +374,7 @@ def _shown(topic: str, t_s: float, message: object) -> RecordedMessage:
     return RecordedMessage(topic, max(t_s, 0.0), _encode(message))
 
 
-# -- live streams: PlotJuggler's framing over ZeroMQ, Foxglove's WebSocket --------------------------------------------
+# -- live streams: PlotJuggler's framing over ZeroMQ, Foxglove's WebSocket; times of their messages are UTC ------------
 
 # Some seconds of a run at full speed; a slower viewer loses the newest messages.
 HIGH_WATER_MARK = 5000

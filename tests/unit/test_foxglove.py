@@ -11,14 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from ccatp.core import PanelId, PanelPose, PointId
 from ccatp.links.topics import TOPICS, FixMessage, LogMessage, Message, SensorLines, TrackMessage, TruthMessage
+from ccatp.records.recorder import RobotClock
 from ccatp.report.foxglove import (
     POINTS_AGAIN_S,
     VIEWS,
+    Time,
     Views,
     panel_scene,
     point_scene,
     recorded_schemas,
-    time_of,
     view_schemas,
 )
 from tests.support.scenario import mirror_of
@@ -92,7 +93,7 @@ def test_fields_have_foxgloves_names() -> None:
 
 
 def test_the_sdk_takes_the_scene_as_it_is() -> None:
-    scene = builtins(panel_scene(MIRROR, time_of(1.5)))
+    scene = builtins(panel_scene(MIRROR, Time(1, 500_000_000)))
     as_sdk(sdk.SceneUpdate, scene)
     assert scene["entities"][0]["timestamp"] == {"sec": 1, "nsec": 500_000_000}
     assert len(scene["entities"]) == 78  # 77 panels and the rim
@@ -102,7 +103,7 @@ def test_the_sdk_takes_the_scene_as_it_is() -> None:
 
 def test_measured_points_carry_their_deviation() -> None:
     points = {PointId(4, 4, 5): 1e-4, PointId(4, 4, 6): -3e-4, PointId(5, 5, 1): 0.0}
-    scene = builtins(point_scene(MIRROR, [PanelId(4, 4)], points, time_of(0.0)))
+    scene = builtins(point_scene(MIRROR, [PanelId(4, 4)], points, Time(0, 0)))
     as_sdk(sdk.SceneUpdate, scene)
     (entity,) = scene["entities"]
     assert [fact["value"] for fact in entity["metadata"]] == ["100.0 um", "-300.0 um"]
@@ -114,11 +115,17 @@ def test_measured_points_carry_their_deviation() -> None:
 # -- views ------------------------------------------------------------------------------------------------------------
 
 PUCK_M = 0.05
+NOON_S = 1_800_014_400
+
+
+def clock_at_noon() -> RobotClock:
+    """A clock whose first robot time is at noon."""
+    return RobotClock(is_simulation=True, now_ns=lambda: NOON_S * 1_000_000_000)
 
 
 @pytest.fixture
 def views() -> Views:
-    made = Views(MIRROR, PUCK_M)
+    made = Views(MIRROR, PUCK_M, clock_at_noon())
     assert [shown.topic for shown in made.begin()] == ["view/frames", "view/panels"]
     return made
 
@@ -148,13 +155,15 @@ def test_every_tenth_pose_is_shown_on_the_deck(views: Views) -> None:
     assert where == pytest.approx(MIRROR.surface_point(pose.x_m, pose.y_m))
     turn = Rotation.from_quat([shown_pose["orientation"][k] for k in "xyzw"])
     assert pytest.approx(np.array(MIRROR.robot_axes(pose))) == turn.as_matrix().T
+    stamps = [[one["timestamp"] for one in found[name]] for name in ("view/pose", "view/robot_frame")]
+    assert stamps == [[{"sec": NOON_S, "nsec": 0}, {"sec": NOON_S, "nsec": 100_000_000}]] * 2  # UTC, as the log times
     frame = found["view/robot_frame"][0]
     assert (frame["parent_frame_id"], frame["child_frame_id"]) == ("deck", "robot")
     assert frame["translation"] == shown_pose["position"]
 
 
 def test_the_deck_stands_in_the_world() -> None:
-    frame = json.loads(next(iter(Views(MIRROR, PUCK_M).begin())).payload)
+    frame = json.loads(next(iter(Views(MIRROR, PUCK_M, clock_at_noon()).begin())).payload)
     turn = Rotation.from_quat([frame["rotation"][k] for k in "xyzw"])
     shift = np.array([frame["translation"][k] for k in "xyz"])
     assert turn.apply([0.3, -0.4, 0.5]) + shift == pytest.approx(MIRROR.world_from_deck((0.3, -0.4, 0.5)))
@@ -219,8 +228,8 @@ def test_a_fix_colours_its_point_and_all_points_come_again(views: Views) -> None
 
 def test_a_run_begins_with_its_first_message_and_lines_become_a_log() -> None:
     message = LogMessage(seq=1, t_s=2.25, level="warning", process="main", text="held")
-    found = shown(Views(MIRROR, PUCK_M), message)
+    found = shown(Views(MIRROR, PUCK_M, clock_at_noon()), message)
     assert list(found) == ["view/frames", "view/panels", "view/log"]
     (log,) = found["view/log"]
-    assert log["timestamp"] == {"sec": 2, "nsec": 250_000_000}
+    assert log["timestamp"] == {"sec": NOON_S, "nsec": 0}
     assert (log["level"], log["name"], log["message"]) == (3, "main", "held")

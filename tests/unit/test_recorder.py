@@ -21,7 +21,9 @@ from ccatp.records.recorder import (
     HELD_BACK_S,
     RUN_LOCK,
     Recorder,
+    RobotClock,
     damage_text,
+    iter_logged,
     iter_messages,
     read_metadata,
     recordings,
@@ -32,12 +34,22 @@ SCHEMA: dict[str, Any] = {"type": "object", "title": "x.Track", "properties": {"
 TOPICS: list[tuple[str, dict[str, Any]]] = [("track", SCHEMA), ("fix", {"type": "object"})]
 
 
+NOON_NS = 1_800_014_400_000_000_000
+
+
+def clock_at_noon() -> RobotClock:
+    """A clock by which the robot was started at noon."""
+    clock = RobotClock(is_simulation=True, now_ns=lambda: NOON_NS + 1)
+    clock.utc_ns(1e-9)
+    return clock
+
+
 def payload(n: int, size: int = 0) -> bytes:
     return json.dumps({"n": n, "x": random.Random(n).randbytes(size).hex()}).encode()
 
 
 def record(path: Path, count: int, size: int = 200, **more: Any) -> Recorder:
-    made = Recorder(path, TOPICS, is_simulation=True, **more)
+    made = Recorder(path, TOPICS, is_simulation=True, clock=clock_at_noon(), **more)
     for n in range(count):
         made.write("track", n / 100, payload(n, size))
     return made
@@ -69,8 +81,10 @@ def test_messages_come_back_and_the_formats_own_reader_agrees(path: Path) -> Non
     assert [m.payload for m in found[:500]] == [payload(n, 200) for n in range(500)]
     with path.open("rb") as file:
         reader = make_reader(file)
-        official = [(c.topic, m.log_time, m.data) for _, c, m in reader.iter_messages(log_time_order=False)]
-        assert official == [(m.topic, round(m.t_s * 1e9), m.payload) for m in found]
+        messages = [(c, m) for _, c, m in reader.iter_messages(log_time_order=False)]
+        assert [m.publish_time for _, m in messages] == [round(m.t_s * 1e9) for m in found]  # the robot's clock
+        official = [(c.topic, m.log_time, m.data) for c, m in messages]
+        assert official == [(m.topic, NOON_NS + (round(m.t_s * 1e9) or 1), m.payload) for m in found]
         summary = reader.get_summary()
         assert summary is not None
         schemas = {s.name: json.loads(s.data) for s in summary.schemas.values()}
@@ -83,11 +97,11 @@ def test_messages_come_back_and_the_formats_own_reader_agrees(path: Path) -> Non
 
 def test_a_recording_is_that_of_the_formats_own_writer_in_bounded_memory(path: Path) -> None:
     tracemalloc.start()
-    made = Recorder(path, TOPICS, is_simulation=True)
+    made = Recorder(path, TOPICS, is_simulation=True, clock=clock_at_noon())
     sizes = []
-    for n in range(1200):
+    for n in range(1, 1201):
         made.write("track", n * FLUSH_AFTER_S, b"{}")  # a chunk each
-        if n % 400 == 399:
+        if n % 400 == 0:
             sizes.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
     made.close()
@@ -100,13 +114,55 @@ def test_a_recording_is_that_of_the_formats_own_writer_in_bounded_memory(path: P
             data = json.dumps(schema, separators=(",", ":")).encode()
             number = writer.register_schema(str(schema.get("title", name)), "jsonschema", data)
             writer.register_channel(name, "json", number, {"simulation": "true"})
-        for n in range(1200):
+        for n in range(1, 1201):
             time_ns = round(n * FLUSH_AFTER_S * 1e9)
-            writer.add_message(1, time_ns, b"{}", time_ns, n + 1)
-            if n:
-                writer.flush()  # type: ignore[no-untyped-call]
+            writer.add_message(1, NOON_NS + time_ns, b"{}", time_ns, n)
+            writer.flush()  # type: ignore[no-untyped-call]
         writer.finish()  # type: ignore[no-untyped-call]
     assert path.read_bytes() == Path(own.name).read_bytes()
+
+
+def test_utc_follows_the_robots_clock_and_is_compared_again_when_the_robot_started() -> None:
+    now_ns = NOON_NS
+    clock = RobotClock(is_simulation=True, now_ns=lambda: now_ns)
+    assert clock.utc_ns(0.0) == NOON_NS  # a message without a time
+    now_ns += 5
+    assert clock.utc_ns(7000.0) == now_ns  # a robot that was on for long
+    now_ns += 1_000_000_000  # in lockstep a minute passes in a second
+    assert clock.utc_ns(7060.0) == NOON_NS + 5 + 60_000_000_000
+    assert clock.utc_ns(7059.0) == NOON_NS + 5 + 59_000_000_000  # a batch comes later than an event
+    assert clock.utc_ns(0.0) == NOON_NS + 5 + 60_000_000_000
+    now_ns += 100_000_000_000
+    assert [clock.utc_ns(t_s) for t_s in (1.5, 2.0)] == [now_ns, now_ns + 500_000_000]
+
+
+def test_utc_of_a_real_robot_is_corrected_where_its_clock_drifts() -> None:
+    now_ns = NOON_NS
+    clock = RobotClock(is_simulation=False, now_ns=lambda: now_ns)
+    off_s = []
+    for n in range(1, 60_001):  # ten minutes at 100 Hz of a clock that is fast by 1 per cent
+        now_ns = NOON_NS + n * 10_000_000
+        late_ns = 0 if n % 10 == 0 else 700_000_000  # most messages arrive as parts of batches
+        off_s.append((clock.utc_ns(0.0101 * n - late_ns / 1e9) + late_ns - now_ns) / 1e9)
+    assert max(map(abs, off_s[100:])) < 0.22  # 1 per cent of two intervals
+    steady = RobotClock(is_simulation=False, now_ns=lambda: now_ns)
+    zeros = set()
+    for n in range(1, 6001):
+        now_ns = NOON_NS + n * 10_000_000 + random.Random(n).randrange(5_000_000)
+        zeros.add(steady.utc_ns(0.01 * n) - round(0.01 * n * 1e9))
+    assert len(zeros) == 1  # what the messages take to arrive does not shift the samples
+
+
+def test_a_recording_of_an_older_format_has_no_utc(path: Path) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("track", "json", 0)
+        writer.add_message(channel, 1_250_000_000, b"{}", 1_250_000_000)
+        writer.finish()  # type: ignore[no-untyped-call]
+    assert list(iter_logged(path, pytest.fail)) == [(None, ("track", 1.25, b"{}"))]
+    facts = read_facts(path)
+    assert (facts.span_s, facts.utc) == ((1.25, 1.25), (None, None))
 
 
 @pytest.mark.parametrize(("is_simulation", "mark"), [(True, "true"), (False, "false")])
@@ -222,6 +278,7 @@ def test_facts_of_a_recording_in_order(recorded: Path) -> None:
     assert told["verified"]
     assert told["messages"] == 600
     assert (told["start_s"], told["end_s"]) == (0.0, 5.99)
+    assert (told["start_utc"], told["end_utc"]) == ("2027-01-15T12:00:00Z", "2027-01-15T12:00:05Z")
     assert told["metadata"] == {"ccatp": {"mirror": "fyst-m1", "simulation": "true"}}
     assert told["topics"]["track"]["schema"] == "x.Track"
     assert told["topics"]["fix"]["messages"] == 0
@@ -331,6 +388,7 @@ def test_commands(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert main(["recording", "info", str(recorded)]) == 0
     text = capsys.readouterr().out
     assert "complete, every checksum right" in text
+    assert "0.00 to 5.99 s of the robot's clock, 2027-01-15T12:00:00Z to 2027-01-15T12:00:05Z, " in text
     assert "x.Track" in text
     recorded.write_bytes(recorded.read_bytes()[:50_000])
     assert main(["recording", "info", str(recorded)]) == 1
