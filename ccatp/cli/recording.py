@@ -10,7 +10,10 @@ from ccatp.cli.common import PATH, CommandGroup, example, json_option, warn, wri
 from ccatp.errors import ConfigError
 
 if TYPE_CHECKING:
+    from ccatp.config.models import Config
+    from ccatp.mirror.mirror import Mirror
     from ccatp.records.recording_repair import RecordingFacts
+    from ccatp.records.run_reader import Recording
 
 
 @click.group(
@@ -71,32 +74,66 @@ def repair(path: Path, out: Path | None, json_output: bool) -> int:
 
 @recording.command(
     epilog=example(
-        "ccatp recording export runs/tonight --tum estimate.tum --truth truth.tum", "evo_ape tum truth.tum estimate.tum"
+        "ccatp recording export runs/tonight --tum estimate.tum --truth truth.tum",
+        "evo_ape tum truth.tum estimate.tum",
+        "ccatp recording export runs/tonight --ros2 tonight_bag",
     )
 )
 @click.argument("run_dir", type=PATH)
-@click.option("--tum", "tum_file", type=PATH, required=True, help="File for the estimates of the run.")
-@click.option("--truth", "truth_file", type=PATH, help="File for the simulated truth.")
-def export(run_dir: Path, tum_file: Path, truth_file: Path | None) -> None:
-    """Write the path of a survey as a TUM trajectory, for evo and others: deck frame, m, the robot's clock.
+@click.option("--tum", "tum_file", type=PATH, help="File for the estimates, a TUM trajectory.")
+@click.option("--truth", "truth_file", type=PATH, help="File for the simulated truth, a TUM trajectory.")
+@click.option("--ros2", "bag_dir", type=PATH, help="New directory for a ROS 2 bag (MCAP; extra ccatp[ros]).")
+def export(run_dir: Path, tum_file: Path | None, truth_file: Path | None, bag_dir: Path | None) -> None:
+    """Write a recorded survey for other tools.
 
-    Of a run that was resumed the newest recording is taken.
+    A TUM trajectory is the path for evo and others: deck frame, m, the robot's clock. A ROS 2 bag has every sample as a
+    message of its own, for ROS, Foxglove and PlotJuggler: frame map (the deck), SI units, UTC. Of a run that was
+    resumed the newest recording is taken.
     """
     from ccatp.mirror.mirror import build_mirror
     from ccatp.records.run_reader import format_tum, open_run
 
+    if not (tum_file or truth_file or bag_dir):
+        raise click.UsageError("nothing to write; give --tum, --truth or --ros2")
     newest = open_run(run_dir)[-1]
-    for _ in newest.messages():
-        pass
-    truth = newest.truth()
-    if truth_file is not None and truth is None:
-        raise ConfigError(f"--truth: {newest.path} is of a real robot and holds no truth; leave it out")
+    cfg = newest.config({})
+    mirror = build_mirror(cfg.mirror)
+    if bag_dir is not None:
+        counts = _write_bag(bag_dir, newest, cfg, mirror)
+        click.echo(f"{bag_dir}: {', '.join(f'{topic} {count}' for topic, count in counts.items())}")
+    if tum_file or truth_file:
+        if bag_dir is None:
+            for _ in newest.messages():
+                pass
+        truth = newest.truth()
+        if truth_file is not None and truth is None:
+            raise ConfigError(f"--truth: {newest.path} is of a real robot and holds no truth; leave it out")
+        for option, file, trace in (("--tum", tum_file, newest.recorded(mirror)), ("--truth", truth_file, truth)):
+            if file is not None and trace is not None:
+                write_lines(option, file, format_tum(trace).splitlines())
+                click.echo(f"{file}: {len(trace.seq)} poses")
     warn(newest.warnings)
-    traces = [(tum_file, newest.recorded(build_mirror(newest.config({}).mirror)))]
-    traces += [(truth_file, truth)] if truth_file is not None and truth is not None else []
-    for file, trace in traces:
-        write_lines("--tum" if file == tum_file else "--truth", file, format_tum(trace).splitlines())
-        click.echo(f"{file}: {len(trace.seq)} poses")
+
+
+def _write_bag(folder: Path, recording: "Recording", cfg: "Config", mirror: "Mirror") -> dict[str, int]:
+    from shutil import rmtree
+
+    from ccatp.filters.base import FilterError
+    from ccatp.mirror.surface import MirrorError
+
+    if folder.exists():
+        raise ConfigError(f"--ros2: {folder} exists already; name a new directory")
+    try:
+        from ccatp.studies.ros_bag import write_bag
+
+        return write_bag(folder, recording, cfg, mirror)
+    except ModuleNotFoundError as error:
+        raise ConfigError("--ros2 needs rosbags; install it with: pip install ccatp[ros]") from error
+    except (FilterError, MirrorError) as error:
+        raise ConfigError(f"--ros2: {recording.path}: the estimator gave up in the replay: {error}") from error
+    except OSError as error:
+        rmtree(folder, ignore_errors=True)
+        raise ConfigError(f"--ros2: cannot write {folder}: {error.strerror or error}") from error
 
 
 def _print_facts(facts: "RecordingFacts") -> None:

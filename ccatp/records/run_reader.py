@@ -260,17 +260,21 @@ def check_run_dir(run_dir: Path, file: str = CONFIG) -> None:
         raise RunReadError(f"{run_dir}: no {file} there; name the directory of a run")
 
 
-def open_run(run_dir: Path) -> list[Recording]:
-    """The recordings of a run directory, oldest first.
+def open_run(path: Path) -> list[Recording]:
+    """The recordings of a run directory, oldest first; or the one that is named.
 
-    ``RunReadError``: there is no such directory, it holds no recording or no configuration, or one of a newer format.
+    ``RunReadError``: there is no such path, it holds no recording or no configuration, or one of a newer format.
     """
-    check_run_dir(run_dir, TELEMETRY)
-    return [_open(path) for path in recordings(run_dir / TELEMETRY)]
+    if path.is_file():
+        return [_open(path)]
+    check_run_dir(path, TELEMETRY)
+    return [_open(part) for part in recordings(path / TELEMETRY)]
 
 
 def _open(path: Path) -> Recording:
     metadata = _readable(path, read_metadata)
+    if not metadata:
+        raise RunReadError(f"{path}: no recording of a run; name a telemetry.mcap, or the directory of a run")
     number = metadata.get("format", "0")
     if not number.isdecimal() or int(number) > RECORD_FORMAT:
         raise RunReadError(

@@ -23,7 +23,7 @@ import numpy as np
 import zmq
 
 from ccatp.config.checks import is_loopback
-from ccatp.core import DeckPose, PanelId, PanelPose, PointId, wrap_pi
+from ccatp.core import DeckPose, PanelId, PanelPose, PointId, Vector3, wrap_pi
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.links import topics
 from ccatp.links.robot_messages import Sensors
@@ -151,6 +151,12 @@ def quaternion(axes: tuple[Sequence[float], Sequence[float], Sequence[float]]) -
     return Quaternion(*(c / length for c in row))
 
 
+def deck_in_world(mirror: Mirror) -> tuple[Vector3, Any]:
+    """Origin of the deck frame in the world frame, m, and its rotation."""
+    x, y, z = (mirror.rotate_world_from_deck(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    return mirror.world_from_deck((0.0, 0.0, 0.0)), quaternion((x, y, z))
+
+
 _PLAIN = ("boolean", "string", "number", "integer")
 
 
@@ -266,11 +272,9 @@ class Views:
     def begin(self, t_s: float = 0.0) -> Iterator[RecordedMessage]:
         """The latched views: frame of the world and map of the panels."""
         self._has_begun = True
-        mirror, now = self._mirror, self._stamp(t_s)
-        origin = Vector(*mirror.world_from_deck((0.0, 0.0, 0.0)))
-        x, y, z = (mirror.rotate_world_from_deck(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
-        yield _shown("view/frames", t_s, FrameTransform(now, WORLD, DECK, origin, quaternion((x, y, z))))
-        yield _shown("view/panels", t_s, panel_scene(mirror, now))
+        now, (origin, turn) = self._stamp(t_s), deck_in_world(self._mirror)
+        yield _shown("view/frames", t_s, FrameTransform(now, WORLD, DECK, Vector(*origin), turn))
+        yield _shown("view/panels", t_s, panel_scene(self._mirror, now))
 
     def of(self, message: Message) -> Iterator[RecordedMessage]:
         """The views of one message."""

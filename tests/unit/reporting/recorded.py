@@ -10,12 +10,15 @@ import numpy as np
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PanelPose, PointId
+from ccatp.links.robot_codec import encode
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import (
     ArrivalMessage,
     FixMessage,
     Misalignment,
     MissionStatus,
+    Rest,
+    SensorLines,
     TrackMessage,
     TruthMessage,
 )
@@ -49,8 +52,11 @@ class RecordingRun(SilRun):
         self.log = (run_dir / "log.jsonl").open("a", encoding="utf-8")
         self.track: list[tuple[Any, ...]] = []
         self.truth: list[tuple[Any, ...]] = []
+        self.lines: list[msgspec.Raw] = []
         self.note_arrival = self.trace.builder.add_arrival
         self.trace.builder.add_arrival = self.arrive  # type: ignore[method-assign]
+        self.take_rest = self.localizer.rest
+        self.localizer.rest = self.rest  # type: ignore[method-assign]
         self.seq, self.t_s, self.seen = 0, 0.0, MissionState.IDLE
 
     def leave(self) -> Path:
@@ -86,6 +92,9 @@ class RecordingRun(SilRun):
         self.write("mission", message)
 
     def flush(self) -> None:
+        if self.lines:
+            self.write("sensors", SensorLines(seq=self.seq, t_s=self.t_s, lines=self.lines))
+            self.lines = []
         if self.track:
             self.write("track", TrackMessage(seq=self.seq, t_s=self.t_s, rows=self.track))
         if self.truth and self.is_simulation:
@@ -97,9 +106,17 @@ class RecordingRun(SilRun):
         super()._note_truth()
         self.truth.append(self.robot.world.truth_row(self.robot.seq, self.robot.t_s))
 
+    def _serve(self, frame: Sensors, dt_s: float) -> None:
+        self.seq, self.t_s = frame.seq, frame.t
+        self.lines.append(msgspec.Raw(encode(frame).strip()))
+        super()._serve(frame, dt_s)
+
+    def rest(self) -> None:
+        self.write("rest", Rest(seq=self.seq, t_s=self.t_s))
+        self.take_rest()
+
     def _publish(self, seq: int, t_s: float, pose: PanelPose, state: MissionState) -> None:
         super()._publish(seq, t_s, pose, state)
-        self.seq, self.t_s = seq, t_s
         row = (seq, t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, self.localizer.position_sigma_m)
         self.track.append(row)
         if state is not self.seen:

@@ -1,0 +1,243 @@
+"""A recording and its replay as a ROS 2 bag: one message for each sample, stamps in UTC, SI units.
+
+Frames are named as in REP 105, axes as in REP 103: ``map`` is the deck frame, ``base_link`` the robot (x ahead, y left,
+z along the normal, origin on the surface). The parent of ``map`` is ``world``, the frame of the laser system.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from math import nan
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.stores import ros2_jazzy as ros
+
+from ccatp.config.models import Config
+from ccatp.core import Corner, DeckPose, FloatArray, PanelId, PanelPose, Severity, Twist, twist_of
+from ccatp.links.bus import BadMessage
+from ccatp.links.robot_codec import BadLine, decode_from_robot
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import DangerEvent, FixMessage, MissionStatus, SensorLines, TrackMessage, TruthMessage
+from ccatp.mirror.mirror import Mirror
+from ccatp.records.recorder import decode_recorded, iter_logged
+from ccatp.records.run_reader import Event, Fixed, Recording, in_order
+from ccatp.report.foxglove import deck_in_world, quaternion
+from ccatp.studies.replay import replay
+
+WORLD, MAP, BASE_LINK, IMU_LINK, PUCK_LINK = "world", "map", "base_link", "imu_link", "puck_link"
+WHEELS = ["wheel_right", "wheel_left"]
+# Variance along and about axes in which nothing is measured, as drivers of wheeled robots have it.
+NOT_MEASURED = 1e6
+_NO_TIME = QosTime(0, 0)
+_LATCHED = Qos(
+    QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, _NO_TIME, _NO_TIME,
+    QosLiveliness.AUTOMATIC, _NO_TIME, False,
+)  # fmt: skip
+_UPRIGHT = ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0)
+_PLANE = np.ix_((0, 1, 5), (0, 1, 5))  # x, y and heading among the six rows of a pose's covariance
+_NS = 1_000_000_000
+_Vector = ros.geometry_msgs__msg__Vector3
+
+
+class _Motion(NamedTuple):
+    """What the wheels say in a frame, and the variances of speed and rate, slip included."""
+
+    twist: Twist
+    v_m2_s2: float
+    omega_rad2_s2: float
+
+
+_UNKNOWN = _Motion(Twist(nan, nan), NOT_MEASURED, NOT_MEASURED)
+
+
+def write_bag(folder: Path, recording: Recording, cfg: Config, mirror: Mirror) -> dict[str, int]:
+    """Write a new bag in MCAP, and return how many messages each topic has.
+
+    Poses are those that were recorded; a replay computes their covariances again. Defects are added to the warnings of
+    the recording. OSError: the folder cannot be written.
+    """
+    motions: dict[int, _Motion] = {}
+    trace = replay(cfg, mirror, _with_motions(in_order(recording.messages()), cfg, motions)).trace
+    covariances = {} if trace.covariance is None else dict(zip(trace.seq.tolist(), trace.covariance, strict=True))
+    export, types = _Export(cfg, mirror, covariances, motions), get_typestore(Stores.ROS2_JAZZY)
+    connections: dict[str, Connection] = {}
+    writer = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)  # which ROS 2 Humble and later read
+    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with writer:
+        for topic, stamp_ns, message in export.messages(recording):
+            kind = message.__msgtype__
+            if topic not in connections:
+                qos = [_LATCHED] if topic == "/tf_static" else []
+                connections[topic] = writer.add_connection(topic, kind, typestore=types, offered_qos_profiles=qos)
+            writer.write(connections[topic], stamp_ns, types.serialize_cdr(message, kind))
+    return {topic: writer.counts[one.id] for topic, one in sorted(connections.items())}
+
+
+def _with_motions(events: Iterable[Event], cfg: Config, motions: dict[int, _Motion]) -> Iterator[Event]:
+    """The same events; what the wheels say of each frame is collected on the way."""
+    robot, noise = cfg.robot, cfg.localizer
+    slip, unequal = noise.full_state.slip_sigma, noise.full_state.slip_difference_sigma
+    for event in events:
+        enc = [] if isinstance(event, Fixed) else event.sensors.enc
+        rates = [(right, left) for _, right, left in enc if right is not None and left is not None]
+        if rates and not isinstance(event, Fixed):
+            right_rad_s, left_rad_s = np.mean(rates, axis=0).tolist()
+            twist = twist_of(right_rad_s, left_rad_s, robot.wheel_radius_m, robot.wheel_base_m)
+            of_wheel = (robot.wheel_radius_m * noise.encoder_sigma_rad_s) ** 2 / len(rates)
+            along, across = (slip * twist.v_m_s) ** 2, (unequal * twist.v_m_s) ** 2
+            of_rate = (across + 2.0 * of_wheel) / robot.wheel_base_m**2
+            motions[event.sensors.seq] = _Motion(twist, along + 0.5 * of_wheel, of_rate)
+        yield event
+
+
+Stamped = tuple[str, float, Any]  # topic, robot time (s), message
+
+
+class _Export:
+    """Converts the messages of one recording."""
+
+    def __init__(
+        self, cfg: Config, mirror: Mirror, covariances: Mapping[int, FloatArray], motions: Mapping[int, _Motion]
+    ) -> None:
+        self._cfg, self._mirror, self._covariances, self._motions = cfg, mirror, covariances, motions
+        self._utc_offset_ns = 0
+
+    def messages(self, recording: Recording) -> Iterator[tuple[str, int, Any]]:
+        """Topic, stamp (ns) and message, in the order of recording."""
+        converted: dict[str, Callable[[Any], Iterator[Stamped]]] = {
+            "sensors": self._of_lines,
+            "track": self._of_track,
+            "truth": self._of_truth,
+            "fix": self._of_fix,
+            "mission": self._of_mission,
+            "danger_event": self._of_danger,
+        }
+        has_utc, has_begun = True, False
+        for utc_offset_ns, (name, begin_s, payload) in iter_logged(recording.path):
+            if name not in converted:
+                continue
+            self._utc_offset_ns, has_utc = utc_offset_ns or 0, has_utc and utc_offset_ns is not None
+            if not has_begun:
+                has_begun = True
+                fixed = ros.tf2_msgs__msg__TFMessage([*self._fixed_frames(begin_s)])
+                yield "/tf_static", self._ns(begin_s), fixed
+            with suppress(BadMessage, BadLine):  # the replay has reported it
+                for topic, t_s, message in converted[name](decode_recorded(name, payload)):
+                    yield topic, self._ns(t_s), message
+        if not has_utc:
+            recording.warnings.append(f"{recording.path}: an older format without UTC; stamps are of the robot's clock")
+
+    def _ns(self, t_s: float) -> int:
+        return round(t_s * _NS) + self._utc_offset_ns
+
+    def _header(self, t_s: float, frame: str) -> Any:
+        return ros.std_msgs__msg__Header(ros.builtin_interfaces__msg__Time(*divmod(self._ns(t_s), _NS)), frame)
+
+    def _transform(self, t_s: float, parent: str, child: str, place: Sequence[float], turn: Any = _UPRIGHT) -> Any:
+        moved = ros.geometry_msgs__msg__Transform(_Vector(*place), turn)
+        return ros.geometry_msgs__msg__TransformStamped(self._header(t_s, parent), child, moved)
+
+    def _fixed_frames(self, t_s: float) -> Iterator[Any]:
+        origin, turn = deck_in_world(self._mirror)
+        yield self._transform(t_s, WORLD, MAP, origin, _ros_quaternion(turn))
+        robot = self._cfg.robot
+        edges = {f"edge_{c}_link": (*place, 0.0) for c, place in zip(Corner, robot.edge_sensors_m, strict=True)}
+        links = {IMU_LINK: (0.0, 0.0, 0.0), PUCK_LINK: (0.0, 0.0, robot.puck_height_m), **edges}
+        for name, place in links.items():
+            yield self._transform(t_s, BASE_LINK, name, place)
+
+    def _of_lines(self, message: SensorLines) -> Iterator[Stamped]:
+        noise, none = self._cfg.localizer, np.empty(0)
+        of_rate = np.diag((NOT_MEASURED, NOT_MEASURED, noise.gyroscope_sigma_rad_s**2)).ravel()
+        ahead = np.diag((noise.accelerometer_sigma_m_s2**2, NOT_MEASURED, NOT_MEASURED)).ravel()
+        no_orientation = np.array([-1.0, *[0.0] * 8])  # as the message's definition marks it
+        for frame in [decode_from_robot(bytes(line)) for line in message.lines]:
+            if not isinstance(frame, Sensors):
+                continue
+            for t_s, ax_m_s2, wz_rad_s in frame.imu:
+                rate, acceleration = _Vector(0.0, 0.0, wz_rad_s), _Vector(ax_m_s2, 0.0, 0.0)
+                header, of_turn = self._header(t_s, IMU_LINK), (_UPRIGHT, no_orientation)
+                yield "/imu", t_s, ros.sensor_msgs__msg__Imu(header, *of_turn, rate, of_rate, acceleration, ahead)
+            for t_s, *rates_rad_s in frame.enc:
+                velocity = np.array([nan if rate is None else rate for rate in rates_rad_s])
+                wheels = ros.sensor_msgs__msg__JointState(self._header(t_s, ""), WHEELS, none, velocity, none)
+                yield "/joint_states", t_s, wheels
+
+    def _of_track(self, message: TrackMessage) -> Iterator[Stamped]:
+        unknown = np.diag([NOT_MEASURED] * 3)
+        for seq, t_s, row, col, x_m, y_m, heading_rad, _ in message.rows:
+            pose = self._mirror.deck_pose(PanelPose(PanelId(row, col), x_m, y_m, heading_rad))
+            covariance, motion = self._covariances.get(seq, unknown), self._motions.get(seq, _UNKNOWN)
+            odometry = self._odometry(t_s, pose, covariance, motion)
+            yield "/odom", t_s, odometry
+            here = odometry.pose.pose
+            place = here.position.x, here.position.y, here.position.z
+            moved = self._transform(t_s, MAP, BASE_LINK, place, here.orientation)
+            yield "/tf", t_s, ros.tf2_msgs__msg__TFMessage([moved])
+
+    def _of_truth(self, message: TruthMessage) -> Iterator[Stamped]:
+        for _, t_s, x_m, y_m, heading_rad, *_ in message.rows:
+            pose = DeckPose(x_m, y_m, heading_rad)
+            yield "/ground_truth/odom", t_s, self._odometry(t_s, pose, np.zeros((3, 3)), _UNKNOWN)
+
+    def _odometry(self, t_s: float, pose: DeckPose, covariance: FloatArray, motion: _Motion) -> Any:
+        """Height, roll and pitch follow from the surface, the wheels allow no other velocity: their variances are 0."""
+        place = ros.geometry_msgs__msg__Point(*self._mirror.surface_point(pose.x_m, pose.y_m))
+        turn = _ros_quaternion(quaternion(self._mirror.robot_axes(pose)))
+        of_pose, of_twist = np.zeros((6, 6)), np.zeros((6, 6))
+        of_pose[_PLANE] = covariance
+        of_twist[0, 0], of_twist[5, 5] = motion.v_m2_s2, motion.omega_rad2_s2
+        speeds = _Vector(motion.twist.v_m_s, 0.0, 0.0), _Vector(0.0, 0.0, motion.twist.omega_rad_s)
+        return ros.nav_msgs__msg__Odometry(
+            self._header(t_s, MAP),
+            BASE_LINK,
+            ros.geometry_msgs__msg__PoseWithCovariance(ros.geometry_msgs__msg__Pose(place, turn), of_pose.ravel()),
+            ros.geometry_msgs__msg__TwistWithCovariance(ros.geometry_msgs__msg__Twist(*speeds), of_twist.ravel()),
+        )
+
+    def _of_fix(self, message: FixMessage) -> Iterator[Stamped]:
+        covariance = np.diag([NOT_MEASURED] * 6)
+        covariance[:3, :3] = np.reshape(message.covariance_m2, (3, 3))
+        pose = ros.geometry_msgs__msg__Pose(ros.geometry_msgs__msg__Point(*message.position_m), _UPRIGHT)
+        known = ros.geometry_msgs__msg__PoseWithCovariance(pose, covariance.ravel())
+        header = self._header(message.t_s, WORLD)
+        yield "/laser/position", message.t_s, ros.geometry_msgs__msg__PoseWithCovarianceStamped(header, known)
+
+    def _of_mission(self, message: MissionStatus) -> Iterator[Stamped]:
+        yield self._diagnosis(message, "mission", message.state, {
+            f"alarm {one.name}": (Severity[one.severity.upper()], one.cause) for one in message.alarms if not one.ended
+        })  # fmt: skip
+
+    def _of_danger(self, message: DangerEvent) -> Iterator[Stamped]:
+        found = {f"danger {name}": (Severity(severity), cause) for name, cause, severity in message.active}
+        yield self._diagnosis(message, "danger", message.cause or "ok", found)
+
+    def _diagnosis(
+        self, message: MissionStatus | DangerEvent, name: str, text: str, causes: Mapping[str, tuple[Severity, str]]
+    ) -> Stamped:
+        """Of a message with its plain fields, and of each cause.
+
+        OK where it is only reported, WARN where the robot goes on by itself, else ERROR.
+        """
+        facts = {k: str(v) for k, v in msgspec.structs.asdict(message).items() if isinstance(v, str | int | float)}
+        statuses = [
+            ros.diagnostic_msgs__msg__DiagnosticStatus(
+                int(severity > Severity.INFORM) + int(severity > Severity.PAUSE), f"ccatp: {what}", cause, "",
+                [ros.diagnostic_msgs__msg__KeyValue(*fact) for fact in facts.items() if what == name],
+            )
+            for what, (severity, cause) in {name: (Severity(message.severity), text), **causes}.items()
+        ]  # fmt: skip
+        return (
+            "/diagnostics",
+            message.t_s,
+            ros.diagnostic_msgs__msg__DiagnosticArray(self._header(message.t_s, ""), statuses),
+        )
+
+
+def _ros_quaternion(turn: Any) -> Any:
+    return ros.geometry_msgs__msg__Quaternion(turn.x, turn.y, turn.z, turn.w)
