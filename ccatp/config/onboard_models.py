@@ -65,6 +65,8 @@ class Bno055Config(Model):
     axes: tuple[Axis, Axis, Axis]
     rate_hz: Positive
     timeout_s: Positive
+    noise_rad_s: Positive
+    noise_m_s2: Positive
 
 
 class DaqConfig(Model):
@@ -78,6 +80,7 @@ class DaqConfig(Model):
     battery_ratio: Positive  # battery voltage over the voltage at the converter
     battery_empty_v: Positive
     battery_full_v: Positive
+    noise_v: Positive
 
 
 class PwmChannelConfig(Model):
