@@ -1,0 +1,292 @@
+"""The inertial unit Bosch BNO055 on an I2C bus: set-up, readings, and the thread that takes them.
+
+In its mode IMU the unit fuses gyroscope and accelerometer at 100 Hz. The register UNIT_SEL is set to 0x02: 1/100 m/s^2
+and 1/900 rad/s per LSB. The unit itself turns its axes to those of the robot (x forward, y left, z away from the
+surface) by its axis registers. Its gravity vector is what an accelerometer at rest shows, so it points up: the vector
+along which things fall is the opposite one. Source: data sheet BST-BNO055-DS000-14.
+
+The unit stretches the clock of the bus; an I2C controller that does not wait for it reads wrong bits.
+"""
+
+import struct
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from math import hypot
+from typing import NamedTuple, Protocol
+
+from ccatp.config.onboard_models import Bno055Config
+from ccatp.onboard.hardware import HardwareError
+
+# Registers of page 0 and their values.
+CHIP_ID, PAGE_ID, SELF_TEST, SYS_STATUS, SYS_ERROR = 0x00, 0x07, 0x36, 0x39, 0x3A
+UNIT_SEL, OPR_MODE, PWR_MODE, SYS_TRIGGER, AXIS_MAP, AXIS_SIGN = 0x3B, 0x3D, 0x3E, 0x3F, 0x41, 0x42
+BNO055_ID = 0xA0
+UNITS_M_S2_RAD_S = 0x02
+MODE_CONFIG, MODE_IMU = 0x00, 0x08
+RESET = 0x20
+SELF_TEST_NEEDED = {0: "accelerometer", 2: "gyroscope", 3: "controller"}  # bits; the magnetometer is not used
+
+POWER_ON_S = 0.65
+TO_CONFIG_S, FROM_CONFIG_S = 0.019, 0.007
+
+# One burst from the gyroscope to OPR_MODE: rate, Euler angles, quaternion, linear acceleration, gravity (all int16),
+# temperature, calibration, self test, interrupts, clock, status, error, units, reserved, mode.
+BURST_START = 0x14
+BURST = struct.Struct("<16h10B")
+_G_M_S2 = 9.80665  # of the unit's fusion
+_NORM_TOLERANCE = 0.05  # of the quaternion and of gravity; a reading with bytes of two is off by more
+
+REOPEN_AFTER, RESET_AFTER = 3, 10  # failures in sequence
+LONGEST_WAIT_S = 1.0
+_QUEUED = 64  # samples that wait for the reader: more than half a second
+_JOIN_S = 0.2  # a transfer that hangs in the kernel ends with the process
+
+
+class Bus(Protocol):
+    """An I2C bus. Both transfers raise OSError."""
+
+    def write(self, address: int, data: bytes) -> None:
+        """Write register and values."""
+
+    def write_read(self, address: int, data: bytes, count: int) -> bytes:
+        """Write a register, repeated start, read ``count`` bytes from there on."""
+
+    def close(self) -> None:
+        """Release it."""
+
+
+class ImuSample(NamedTuple):
+    """One reading, robot frame: acceleration along x without gravity, m/s^2, rate about z, rad/s."""
+
+    t_s: float
+    ax_m_s2: float
+    wz_rad_s: float
+    gravity: tuple[float, float, float]  # unit vector along which things fall
+    calibration: int  # of the gyroscope, 0 to 3
+
+
+def axis_registers(axes: Sequence[str]) -> tuple[int, int]:
+    """AXIS_MAP_CONFIG and AXIS_MAP_SIGN for the unit's axes along robot x, y, z.
+
+    Raises HardwareError: an axis twice, or axes as of a mirror image.
+    """
+    order = tuple("xyz".index(axis[-1]) for axis in axes)
+    signs = sum((axis[0] == "-") << (2 - place) for place, axis in enumerate(axes))
+    is_cyclic = order in ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+    if len(set(order)) < 3 or is_cyclic == bool(signs.bit_count() % 2):
+        raise HardwareError(
+            f"BNO055: axes {', '.join(axes)} are not those of a turned unit; each axis once, and right-handed: "
+            "correct devices.bno055.axes"
+        )
+    return order[0] | order[1] << 2 | order[2] << 4, signs
+
+
+class Bno055:
+    """The unit. ``read`` and ``set_up`` raise OSError where the bus fails, HardwareError where the unit is not right.
+
+    Attributes:
+        doubt: why the last ``read`` gave nothing.
+        identity: what the unit says of itself.
+    """
+
+    def __init__(
+        self,
+        config: Bno055Config,
+        open_bus: Callable[[], Bus],
+        clock: Callable[[], float],
+        sleep: Callable[[float], object],
+    ) -> None:
+        self._address, self._axes = config.address, config.axes
+        self._open_bus, self._clock, self._sleep = open_bus, clock, sleep
+        self._bus: Bus | None = None
+        self._last_burst = b""
+        self.doubt = ""
+        self.identity = ""
+
+    def open(self) -> None:
+        """Open the bus, after closing it where it was open."""
+        self.close()
+        self._bus = self._open_bus()
+
+    def close(self) -> None:
+        """Release the bus."""
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            bus.close()
+
+    def set_up(self) -> None:
+        """Reset the unit and set what ``read`` relies on, each value read back; takes about 0.7 s."""
+        axis_map, axis_sign = axis_registers(self._axes)
+        self._check_id()
+        with suppress(OSError):  # it may reset before it acknowledges
+            self._write(SYS_TRIGGER, RESET)
+        self._sleep(POWER_ON_S)
+        self._check_id()
+        for name, register, value, wait_s in (
+            ("operation mode", OPR_MODE, MODE_CONFIG, TO_CONFIG_S),
+            ("power mode", PWR_MODE, 0x00, 0.0),
+            ("unit selection", UNIT_SEL, UNITS_M_S2_RAD_S, 0.0),
+            ("axis map", AXIS_MAP, axis_map, 0.0),
+            ("axis signs", AXIS_SIGN, axis_sign, 0.0),
+            ("operation mode", OPR_MODE, MODE_IMU, FROM_CONFIG_S),
+        ):
+            self._write(register, value)
+            self._sleep(wait_s)
+            if (found := self._read(register, 1)[0]) != value:
+                raise self._error(f"{name} reads back 0x{found:02x} after 0x{value:02x}; check wiring and supply")
+        passed = self._read(SELF_TEST, 1)[0]
+        if failed := [name for bit, name in SELF_TEST_NEEDED.items() if not passed >> bit & 1]:
+            raise self._error(f"self test failed: {', '.join(failed)}; replace the unit")
+        low, high, loader = self._read(CHIP_ID + 4, 3)
+        self.identity = f"BNO055 software {high:x}.{low:02x} boot loader {loader}"
+        self._last_burst = b""
+
+    def read(self) -> ImuSample | None:
+        """The newest reading; None: there is no new one, or its bytes do not fit together."""
+        t_s = self._clock()
+        burst = self._read(BURST_START, BURST.size)
+        values = BURST.unpack(burst)
+        (*_, wz), (qw, qx, qy, qz), (ax, _, _), gravity = values[0:3], values[6:10], values[10:13], values[13:16]
+        calibration, status, error, units, mode = (values[k] for k in (17, 21, 22, 23, 25))
+        self.doubt = ""
+        if burst == b"\xff" * len(burst):
+            self.doubt = "the bus reads ones only; check its wiring"
+        elif mode != MODE_IMU or units != UNITS_M_S2_RAD_S:
+            raise self._error(f"was reset (mode 0x{mode:02x}, units 0x{units:02x}); check its supply")
+        elif status == 1:
+            raise self._error(f"reports system error {error}; check its supply")
+        elif burst == self._last_burst:
+            self.doubt = "the readings do not change"
+        self._last_burst = burst
+        size = hypot(*gravity) / 100.0
+        if not self.doubt and (
+            abs(hypot(qw, qx, qy, qz) / 16384.0 - 1.0) > _NORM_TOLERANCE or abs(size / _G_M_S2 - 1.0) > _NORM_TOLERANCE
+        ):
+            self.doubt = f"a reading whose bytes do not fit together (gravity {size:.2f} m/s^2)"
+        if self.doubt:
+            return None
+        gx, gy, gz = (-g / (100.0 * size) for g in gravity)
+        return ImuSample(t_s, ax / 100.0, wz / 900.0, (gx, gy, gz), calibration >> 4 & 3)
+
+    def _check_id(self) -> None:
+        try:
+            self._write(PAGE_ID, 0)
+        except OSError:  # its supply may have come a moment ago
+            self._sleep(POWER_ON_S)
+            self._write(PAGE_ID, 0)
+        if (found := self._read(CHIP_ID, 1)[0]) != BNO055_ID:
+            raise self._error(
+                f"chip id 0x{found:02x} instead of 0xa0: another device; check devices.bno055.bus and .address"
+            )
+
+    def _write(self, register: int, value: int) -> None:
+        self._opened().write(self._address, bytes((register, value)))
+
+    def _read(self, register: int, count: int) -> bytes:
+        return self._opened().write_read(self._address, bytes((register,)), count)
+
+    def _opened(self) -> Bus:
+        if self._bus is None:
+            raise OSError("the I2C bus is closed")
+        return self._bus
+
+    def _error(self, what: str) -> HardwareError:
+        return HardwareError(f"BNO055 at 0x{self._address:02x}: {what}")
+
+
+class ImuReader:
+    """Reads the unit in a thread of its own, since a transfer takes a millisecond and may hang in the kernel.
+
+    After some failures in sequence the bus is opened again, after more the unit is reset, at growing intervals.
+
+    Attributes:
+        errors: attempts that gave no sample.
+        unit: what is read.
+    """
+
+    def __init__(self, config: Bno055Config, open_bus: Callable[[], Bus], clock: Callable[[], float]) -> None:
+        self._stop = threading.Event()
+        self._clock = clock
+        self._period_s, self._timeout_s = 1.0 / config.rate_hz, config.timeout_s
+        self._samples: deque[ImuSample] = deque(maxlen=_QUEUED)
+        self._thread = threading.Thread(target=self._run, name="bno055", daemon=True)
+        self._failures = 0
+        self._is_lost = False
+        self._reason = ""
+        self._newest_s = clock()
+        self.errors = 0
+        self.unit = Bno055(config, open_bus, clock, self._stop.wait)
+
+    def start(self) -> None:
+        """Set the unit up and begin to read. Raises HardwareError."""
+        try:
+            self.unit.open()
+            self.unit.set_up()
+        except OSError as error:
+            self.unit.close()
+            raise HardwareError(f"BNO055: {_bus_error(error)}") from None
+        except HardwareError:
+            self.unit.close()
+            raise
+        self._newest_s = self._clock()
+        self._thread.start()
+
+    def step(self) -> float:
+        """Take one reading, or try to get the unit to work again; after how long to call again, s."""
+        try:
+            if self._failures >= REOPEN_AFTER:
+                self.unit.open()
+            if self._is_lost:
+                self.unit.set_up()
+                self._is_lost = False
+            sample = self.unit.read()
+        except (OSError, HardwareError) as error:
+            sample = None
+            self._is_lost |= isinstance(error, HardwareError)
+            self._reason = _bus_error(error) if isinstance(error, OSError) else str(error)
+        else:
+            self._reason = self.unit.doubt
+        if sample is not None:
+            self._samples.append(sample)
+            self._newest_s = sample.t_s
+            self._failures = 0
+            return self._period_s
+        self.errors += 1
+        self._failures += 1
+        self._is_lost |= self._failures % RESET_AFTER == 0
+        return float(min(self._period_s * 2.0 ** max(0, self._failures - REOPEN_AFTER), LONGEST_WAIT_S))
+
+    def take(self) -> list[ImuSample]:
+        """Samples since the last call; never waits."""
+        return [self._samples.popleft() for _ in range(len(self._samples))]
+
+    def fault(self, now_s: float) -> str:
+        """Why there is no reading for too long; empty: there is one."""
+        age_s = now_s - self._newest_s
+        if age_s <= self._timeout_s:
+            return ""
+        return f"no reading for {age_s:.2f} s: {self._reason or 'a transfer hangs; check the wiring of the I2C bus'}"
+
+    def stop(self) -> None:
+        """End the thread and release the bus; one that hangs in the kernel is left to itself."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(_JOIN_S)
+
+    def _run(self) -> None:
+        due_s = self._clock()
+        try:
+            while not self._stop.wait(max(0.0, due_s - self._clock())):
+                wait_s = self.step()
+                due_s = max(due_s + wait_s, self._clock())
+        except Exception as error:
+            self._reason = f"its thread ended: {error!r}"
+            raise
+        finally:
+            self.unit.close()
+
+
+def _bus_error(error: OSError) -> str:
+    return f"{error}; check the wiring of the I2C bus"

@@ -1,0 +1,345 @@
+"""The data acquisition device on a serial line: encoder counters, edge sensors, battery. Protocol and its host side.
+
+Frames both ways, little endian, at most 264 bytes::
+
+    offset  bytes  field
+    0       2      sync: a5 5a
+    2       1      version of the protocol: 1
+    3       1      type
+    4       1      n, length of the payload
+    5       2      sequence number, counts the frames of one direction, wraps
+    7       n      payload
+    7 + n   2      CRC-16/CCITT-FALSE (polynomial 1021, start ffff, "123456789" gives 29b1) of bytes 2 to 6 + n
+
+    type  from    payload
+    01    host    identify: empty; the device answers with its identity
+    02    host    start: u16 rate, Hz; samples follow at this rate
+    03    host    stop: empty; no more samples
+    81    device  identity: u16 highest rate, Hz; name, version, serial number, each UTF-8 and closed by a zero byte
+    82    device  samples: 1 to 11 samples of 22 bytes, oldest first
+
+    offset  type    field of a sample
+    0       u32     time of the device, us, wraps
+    4       i32     count of the right encoder, up when the wheel drives the robot forwards, wraps
+    8       i32     count of the left encoder
+    12      4 u16   edge sensors front left, front right, rear left, rear right: 0 to 65535 for 0 V to full scale
+    20      u16     battery behind its divider, the same scale
+
+After power-on or a reset the device sends its identity once and then waits for a start. It sends samples at least each
+0.01 s, and ignores frames that it does not know. The host takes every identity for a fresh start of the device: it
+sends a start, and the counts go on from where they were.
+"""
+
+import binascii
+import struct
+from collections import Counter
+from collections.abc import Callable
+from math import inf
+from typing import NamedTuple, Protocol
+
+from ccatp.config.onboard_models import DaqConfig
+from ccatp.onboard.hardware import HardwareError
+
+SYNC, VERSION = b"\xa5\x5a", 1
+IDENTIFY, START, STOP, IDENTITY, SAMPLES = 0x01, 0x02, 0x03, 0x81, 0x82
+HEADER, CRC, SAMPLE = struct.Struct("<2sBBBH"), struct.Struct("<H"), struct.Struct("<Iii5H")
+MAX_SAMPLES = 11
+FULL_SCALE = 65535.0
+
+READ_BYTES = 4096
+ASK_S = 0.25  # between two requests for the identity
+ANSWER_S = 5.0  # a device that an opened port resets may start for some seconds
+RETRY_S, LONGEST_RETRY_S = 0.1, 2.0  # between two attempts to open the port
+GARBAGE_BYTES = 64  # without a valid frame
+BATTERY_S = 1.0  # time constant of the battery's voltage, over which the motors' currents average out
+
+SETTLE_S, WINDOW_S, SLEW, JUMP_S = 0.1, 0.2, 0.01, 0.1  # of DeviceClock
+
+
+class SerialPort(Protocol):
+    """A serial port that never waits. OSError: it is gone."""
+
+    def read(self, size: int, /) -> bytes:
+        """What has come, at most ``size`` bytes."""
+
+    def write(self, data: bytes, /) -> object:
+        """Send."""
+
+    def close(self) -> None:
+        """Release it."""
+
+
+class DaqSample(NamedTuple):
+    """One sample; counts unwrapped, voltages in V."""
+
+    t_s: float
+    right: int
+    left: int
+    edges_v: tuple[float, float, float, float]
+
+
+def format_frame(kind: int, seq: int, payload: bytes = b"", version: int = VERSION) -> bytes:
+    """A frame as bytes."""
+    frame = HEADER.pack(SYNC, version, kind, len(payload), seq & 0xFFFF) + payload
+    return frame + CRC.pack(binascii.crc_hqx(frame[2:], 0xFFFF))
+
+
+class Decoder:
+    """Frames out of bytes in any pieces; it keeps less than one frame.
+
+    Attributes:
+        counts: ``frames``, ``lost`` (by gaps of the sequence numbers), ``crc_errors``, ``noise`` (bytes), ``unknown``.
+        other_version: of the protocol, that the newest valid frame has; 0: it has ours.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._next_seq: int | None = None
+        self.counts: Counter[str] = Counter()
+        self.other_version = 0
+
+    def feed(self, data: bytes) -> list[tuple[int, bytes]]:
+        """Type and payload of each frame that is complete now."""
+        buffer = self._buffer
+        frames: list[tuple[int, bytes]] = []
+        buffer += data
+        while (start := buffer.find(SYNC)) >= 0:
+            self._drop_noise(start)
+            if len(buffer) < HEADER.size:
+                return frames
+            _, version, kind, size, seq = HEADER.unpack_from(buffer)
+            end = HEADER.size + size
+            if len(buffer) < end + CRC.size:
+                return frames
+            if binascii.crc_hqx(buffer[2:end], 0xFFFF) != CRC.unpack_from(buffer, end)[0]:
+                self.counts["crc_errors"] += 1
+                self._drop_noise(1)  # the next frame may begin within this one
+                continue
+            payload = bytes(buffer[HEADER.size : end])
+            del buffer[: end + CRC.size]
+            if version != VERSION:
+                self.other_version = version
+                continue
+            self.other_version = 0
+            self.counts["frames"] += 1
+            gap = 0 if self._next_seq is None else (seq - self._next_seq) & 0xFFFF
+            self.counts["lost"] += gap if gap < 0x8000 else 0
+            self._next_seq = (seq + 1) & 0xFFFF
+            frames.append((kind, payload))
+        self._drop_noise(len(buffer) - buffer.endswith(SYNC[:1]))
+        return frames
+
+    def _drop_noise(self, count: int) -> None:
+        self.counts["noise"] += count
+        del self._buffer[:count]
+
+
+class DeviceClock:
+    """Times of the device on the robot's clock: the lower envelope of the arrival times.
+
+    Arrival minus time of the device is the difference of the clocks plus a delay of transport that is never negative,
+    so its least value of ``WINDOW_S`` is followed, at most ``SLEW`` times as fast as time passes: intervals between
+    samples, and speeds with them, are right within 1 %. Times do not decrease and are not later than the arrival.
+    """
+
+    def __init__(self) -> None:
+        self._last_us: int | None = None
+        self._restart()
+
+    def _restart(self) -> None:
+        self._device_s = self._slewed_s = 0.0
+        self._offset_s = self._least_s = self._least_before_s = inf
+        self._window_end_s = SETTLE_S
+
+    def unwrap(self, device_us: int) -> float | None:
+        """Time of the device since its first sample, s; None: it went backwards."""
+        step_us = 0 if self._last_us is None else (device_us - self._last_us) & 0xFFFFFFFF
+        if step_us >= 0x80000000:
+            return None
+        self._last_us = device_us
+        self._device_s += step_us * 1e-6
+        return self._device_s
+
+    def arrive(self, now_s: float) -> bool:
+        """The newest unwrapped sample arrived at ``now_s``; False: too few have, or the times do not fit any more."""
+        difference_s = now_s - self._device_s
+        self._least_s = min(self._least_s, difference_s)
+        if self._device_s < SETTLE_S:
+            self._offset_s, self._slewed_s = self._least_s, self._device_s
+            return False
+        if self._device_s >= self._window_end_s:
+            self._least_before_s, self._least_s = self._least_s, difference_s
+            self._window_end_s = self._device_s + WINDOW_S
+        aim_s = min(self._least_s, self._least_before_s) - self._offset_s
+        if abs(aim_s) > JUMP_S:
+            self._restart()
+            return False
+        limit_s = SLEW * (self._device_s - self._slewed_s)
+        self._offset_s += min(limit_s, max(-limit_s, aim_s))
+        self._slewed_s = self._device_s
+        return True
+
+    def time_s(self, device_s: float, now_s: float) -> float:
+        """Time on the robot's clock of an unwrapped time of the device."""
+        return min(now_s, device_s + self._offset_s)
+
+
+class Daq:
+    """The device. ``poll`` never waits; it opens the port again after an unplug, and starts the device again.
+
+    Attributes:
+        identity: name, version and serial number; empty until the device has answered.
+        battery_v: voltage of the battery, smoothed; None before the first sample.
+        decoder: of the bytes that come.
+    """
+
+    def __init__(self, config: DaqConfig, open_port: Callable[[str, int], SerialPort]) -> None:
+        self._config, self._open_port = config, open_port
+        self._volt = config.full_scale_v / FULL_SCALE
+        self._port: SerialPort | None = None
+        self._reason = ""
+        self._retry_s, self._retry_wait_s = -inf, RETRY_S
+        self._ask_s = self._valid_s = self._sample_s = -inf
+        self._garbage = 0
+        self._seq = 0
+        self._is_started = False
+        self._clock = DeviceClock()
+        self._counts = [0, 0]
+        self._last_counts: tuple[int, int] | None = None
+        self.identity = ""
+        self.battery_v: float | None = None
+        self.decoder = Decoder()
+
+    def start(self, clock: Callable[[], float], sleep: Callable[[float], object]) -> None:
+        """Open the port and wait until samples come. Raises HardwareError."""
+        until_s = clock() + ANSWER_S
+        while not self.poll(clock()):
+            if self._port is None or clock() > until_s:
+                reason = self._why()
+                self.close()
+                raise HardwareError(f"data acquisition device {self._config.device}: {reason}")
+            sleep(0.005)
+
+    def poll(self, now_s: float) -> list[DaqSample]:
+        """Samples that came since the last call."""
+        samples: list[DaqSample] = []
+        try:
+            if self._port is None:
+                if now_s < self._retry_s:
+                    return []
+                self._connect(now_s)
+            data = self._opened().read(READ_BYTES)
+            self._garbage += len(data)
+            for kind, payload in self.decoder.feed(data):
+                self._garbage, self._valid_s = 0, now_s
+                if kind == IDENTITY:
+                    self._begin(payload)
+                elif kind == SAMPLES and self._is_started and payload and len(payload) % SAMPLE.size == 0:
+                    samples += self._read_samples(payload, now_s)
+                else:
+                    self.decoder.counts["unknown"] += 1
+            self._supervise(now_s)
+        except (OSError, ValueError, HardwareError) as error:
+            self._disconnect(now_s, str(error))
+        return samples
+
+    def fault(self, now_s: float) -> str:
+        """Why there is no sample for too long; empty: there is one."""
+        age_s = now_s - self._sample_s
+        return "" if age_s <= self._config.timeout_s else f"no sample for {age_s:.2f} s: {self._why()}"
+
+    def soc(self) -> float:
+        """State of charge, 0 to 1, linear in the voltage of the battery."""
+        empty_v, full_v = self._config.battery_empty_v, self._config.battery_full_v
+        battery_v = full_v if self.battery_v is None else self.battery_v
+        return min(1.0, max(0.0, (battery_v - empty_v) / (full_v - empty_v)))
+
+    def close(self) -> None:
+        """Stop the device and release the port."""
+        port, self._port = self._port, None
+        if port is None:
+            return
+        try:
+            port.write(format_frame(STOP, self._seq))
+            port.close()
+        except OSError:
+            pass  # it is gone
+
+    def _connect(self, now_s: float) -> None:
+        self._port = self._open_port(self._config.device, self._config.baud)
+        self._valid_s, self._garbage, self._is_started = now_s, 0, False
+        self._ask_s = now_s
+
+    def _disconnect(self, now_s: float, reason: str) -> None:
+        self.close()
+        self._reason = reason
+        self._retry_s = now_s + self._retry_wait_s
+        self._retry_wait_s = min(2.0 * self._retry_wait_s, LONGEST_RETRY_S)
+
+    def _supervise(self, now_s: float) -> None:
+        """Ask a device that sends no samples what it is; give up a port at which nothing valid comes."""
+        if now_s - self._valid_s > ANSWER_S:
+            raise OSError(self._why())
+        is_silent = not self._is_started or now_s - self._sample_s > ASK_S
+        if is_silent and now_s >= self._ask_s:
+            self._send(IDENTIFY)
+            self._ask_s = now_s + ASK_S
+
+    def _begin(self, payload: bytes) -> None:
+        """The device has started: its counts and its clock begin again."""
+        fastest_hz = int.from_bytes(payload[:2], "little")
+        self.identity = " ".join(payload[2:].decode("utf-8", "replace").split("\0")).strip()
+        if fastest_hz < self._config.sample_hz:
+            raise HardwareError(f"{self.identity} delivers {fastest_hz} samples/s at most; lower devices.daq.sample_hz")
+        self._clock, self._last_counts, self._is_started = DeviceClock(), None, True
+        self._send(START, struct.pack("<H", round(self._config.sample_hz)))
+
+    def _read_samples(self, payload: bytes, now_s: float) -> list[DaqSample]:
+        timed = []
+        for device_us, right, left, *edges, battery in SAMPLE.iter_unpack(payload):
+            device_s = self._clock.unwrap(device_us)
+            if device_s is None:  # it was reset, and its identity got lost
+                self._is_started = False
+                return []
+            before = self._last_counts or (right, left)
+            self._last_counts = right, left
+            self._counts = [
+                total + ((now - last + 0x80000000) & 0xFFFFFFFF) - 0x80000000
+                for total, now, last in zip(self._counts, self._last_counts, before, strict=True)
+            ]
+            timed.append((device_s, self._counts, edges))
+            battery_v = battery * self._volt * self._config.battery_ratio
+            self.battery_v = battery_v if self.battery_v is None else self.battery_v
+            self.battery_v += (battery_v - self.battery_v) * min(1.0, 1.0 / (BATTERY_S * self._config.sample_hz))
+        if not self._clock.arrive(now_s):
+            return []
+        samples = []
+        for device_s, (right, left), edges in timed:
+            t_s = self._clock.time_s(device_s, now_s)
+            if t_s > self._sample_s:
+                fl, fr, rl, rr = (self._volt * edge for edge in edges)
+                samples.append(DaqSample(t_s, right, left, (fl, fr, rl, rr)))
+                self._sample_s = t_s
+        self._retry_wait_s = RETRY_S
+        return samples
+
+    def _why(self) -> str:
+        """Why no sample comes."""
+        if self._port is None:
+            return self._reason
+        if self._garbage >= GARBAGE_BYTES:
+            return f"garbage at {self._config.baud} baud; check devices.daq.baud"
+        if version := self.decoder.other_version:
+            return f"speaks version {version} of the protocol instead of {VERSION}; install the firmware that fits"
+        if not self._is_started:
+            return "it does not answer; check its firmware, devices.daq.device and devices.daq.baud"
+        return "it is silent"
+
+    def _send(self, kind: int, payload: bytes = b"") -> None:
+        self._opened().write(format_frame(kind, self._seq, payload))
+        self._seq += 1
+
+    def _opened(self) -> SerialPort:
+        if self._port is None:
+            raise OSError("the port is closed")
+        return self._port

@@ -1,0 +1,246 @@
+"""The hardware of a robot whose computer runs Linux: device files, their packages, and all devices together.
+
+smbus2, pyserial and gpiod are in the extra ``ccatp[onboard]`` and are imported when a device is opened.
+"""
+
+import fcntl
+import importlib
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from functools import partial
+from pathlib import Path
+from statistics import pstdev
+from typing import Any
+
+from ccatp.config.onboard_models import DevicesConfig
+from ccatp.onboard.devices.bno055 import Bus, ImuReader
+from ccatp.onboard.devices.daq import Daq, SerialPort
+from ccatp.onboard.devices.outputs import (
+    PWM_ROOT,
+    ExternalTimer,
+    Fans,
+    Motors,
+    OpenLines,
+    explain,
+)
+from ccatp.onboard.hardware import DeviceCheck, HardwareError, Readings
+
+I2C_TIMEOUT = 0x0702  # ioctl of linux/i2c-dev.h, in 10 ms
+BUS_TIMEOUT_10MS = 5
+LOW_SOC = 0.15
+FAN_CHECK_S = 0.1
+RATE_TOLERANCE = 0.1
+ENCODERS_AND_EDGES = ("encoder_left", "encoder_right", "edge")
+
+_Limits = dict[str, tuple[float, tuple[int, ...]]]
+
+
+def import_package(name: str) -> Any:
+    """A package of the extra ``ccatp[onboard]``. Raises HardwareError: it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        package = {"serial": "pyserial"}.get(name, name)
+        raise HardwareError(f"{package} is not installed; pip install ccatp[onboard]") from None
+
+
+class I2cBus:
+    """A bus of the kernel, ``/dev/i2c-<number>``; a Bus."""
+
+    def __init__(self, number: int) -> None:
+        self._smbus2 = import_package("smbus2")
+        try:
+            self._bus = self._smbus2.SMBus(number)
+        except OSError as error:
+            raise explain(error, f"/dev/i2c-{number}", "i2c", "devices.bno055.bus") from None
+        with suppress(OSError):  # not every controller has it
+            fcntl.ioctl(self._bus.fd, I2C_TIMEOUT, BUS_TIMEOUT_10MS)
+
+    def write(self, address: int, data: bytes) -> None:
+        """See ``Bus``."""
+        self._bus.i2c_rdwr(self._smbus2.i2c_msg.write(address, data))
+
+    def write_read(self, address: int, data: bytes, count: int) -> bytes:
+        """See ``Bus``."""
+        answer = self._smbus2.i2c_msg.read(address, count)
+        self._bus.i2c_rdwr(self._smbus2.i2c_msg.write(address, data), answer)
+        return bytes(answer)
+
+    def close(self) -> None:
+        """See ``Bus``."""
+        self._bus.close()
+
+
+def open_serial(device: str, baud: int) -> SerialPort:
+    """A serial port that is ours alone and never waits. Raises HardwareError."""
+    serial = import_package("serial")
+    try:
+        port: SerialPort = serial.Serial(device, baud, timeout=0, write_timeout=0.002, exclusive=True)
+    except (OSError, ValueError) as error:
+        raise explain(error, device, "dialout", "devices.daq") from None
+    return port
+
+
+class GpioLines:
+    """Output lines of a GPIO chip; Lines."""
+
+    def __init__(self, chip: str, values: Mapping[int, bool]) -> None:
+        gpiod = import_package("gpiod")
+        self._levels = gpiod.line.Value.INACTIVE, gpiod.line.Value.ACTIVE
+        output = gpiod.line.Direction.OUTPUT
+        settings = {
+            line: gpiod.LineSettings(direction=output, output_value=self._levels[is_high])
+            for line, is_high in values.items()
+        }
+        try:
+            self._request = gpiod.request_lines(chip, consumer="ccatp", config=settings)
+        except (OSError, ValueError) as error:
+            raise explain(error, chip, "gpio", "the lines in devices.motors and devices.timer") from None
+
+    def set(self, values: Mapping[int, bool]) -> None:
+        """See ``Lines``."""
+        self._request.set_values({line: self._levels[is_high] for line, is_high in values.items()})
+
+    def close(self) -> None:
+        """See ``Lines``."""
+        self._request.release()
+
+
+class LinuxHardware:
+    """The devices of the configuration; a ``Hardware``. ``clock`` is the robot's, the same as ``now_s`` of ``read``."""
+
+    def __init__(
+        self,
+        config: DevicesConfig,
+        clock: Callable[[], float],
+        *,
+        open_bus: Callable[[int], Bus] = I2cBus,
+        open_port: Callable[[str, int], SerialPort] = open_serial,
+        open_lines: OpenLines = GpioLines,
+        pwm_root: Path = PWM_ROOT,
+        sleep: Callable[[float], object] = time.sleep,
+    ) -> None:
+        self._config, self._clock, self._sleep = config, clock, sleep
+        self._motors = Motors(config.motors, pwm_root, open_lines)
+        self._timer = ExternalTimer(config.timer, open_lines)
+        self._fans = Fans(config.fans, pwm_root)
+        self._daq = Daq(config.daq, open_port)
+        self._imu = ImuReader(config.bno055, partial(open_bus, config.bno055.bus), clock)
+        self._opened = ExitStack()
+        self._fan_check_s = clock()
+        # Name, how it is opened, how it is closed: the motors brake before anything else.
+        self._devices: tuple[tuple[str, Callable[[], None], Callable[[], None]], ...] = (
+            ("motors", partial(self._motors.open, sleep), self._motors.close),
+            ("external timer", self._timer.open, self._timer.close),
+            ("fans", partial(self._fans.open, sleep), self._fans.close),
+            ("data acquisition", partial(self._daq.start, clock, sleep), self._daq.close),
+            ("inertial unit", self._imu.start, self._imu.stop),
+        )
+
+    def start(self) -> None:
+        """See ``Hardware``."""
+        try:
+            for _, start, close in self._devices:
+                self._opened.callback(close)
+                start()
+        except HardwareError:
+            self.close()
+            raise
+
+    def read(self, now_s: float) -> Readings:
+        """See ``Hardware``."""
+        samples = self._daq.poll(now_s)
+        inertial = self._imu.take()
+        if now_s - self._fan_check_s >= FAN_CHECK_S:
+            self._fan_check_s = now_s
+            self._fans.check()
+        faults = dict(self._fans.faults)
+        if reason := self._imu.fault(now_s):
+            faults["imu"] = reason
+        if reason := self._daq.fault(now_s):
+            faults |= dict.fromkeys(ENCODERS_AND_EDGES, reason)
+        soc = self._daq.soc()
+        if soc < LOW_SOC:
+            faults["battery_low"] = f"battery at {self._daq.battery_v:.2f} V; charge it, or check devices.daq.battery_*"
+        return Readings(
+            [(s.t_s, s.ax_m_s2, s.wz_rad_s) for s in inertial],
+            [(s.t_s, s.right, s.left) for s in samples],
+            [(s.t_s, *s.edges_v) for s in samples],
+            (inertial[-1].t_s, *inertial[-1].gravity) if inertial else None,
+            soc,
+            faults,
+        )
+
+    def drive(self, right_v: float, left_v: float) -> None:
+        """See ``Hardware``."""
+        self._motors.drive(right_v, left_v)
+        self._timer.restart()
+
+    def brake(self) -> None:
+        """See ``Hardware``: the external timer is not restarted, so it brakes by itself where this call could not."""
+        self._motors.brake()
+
+    def fans(self) -> tuple[float, float]:
+        """See ``Hardware``."""
+        return self._fans.duties()
+
+    def command_fans(self, left: float, right: float) -> None:
+        """See ``Hardware``."""
+        self._fans.command(left, right)
+
+    def close(self) -> None:
+        """See ``Hardware``."""
+        self._opened.close()
+
+    def check(self, duration_s: float) -> list[DeviceCheck]:
+        """Open each device, read for ``duration_s`` while the robot stands still, close; nothing turns."""
+        failures: dict[str, str] = {}
+        with self._opened:
+            for name, start, close in self._devices:
+                self._opened.callback(close)
+                try:
+                    start()
+                except HardwareError as error:
+                    failures[name] = str(error)
+            end_s = self._clock() + duration_s
+            readings = []
+            while (now_s := self._clock()) < end_s:
+                readings.append(self.read(now_s))
+                self._sleep(0.005)
+        faults = readings[-1].faults if readings else {}
+        imu = [sample for reading in readings for sample in reading.imu]
+        edges = [sample for reading in readings for sample in reading.edges]
+        bno055, daq = self._config.bno055, self._config.daq
+        # Name, identity, samples, their rate, name of the fault, {unit of a noise: (limit, columns of the samples)}.
+        rows: tuple[tuple[str, str, Sequence[Sequence[float]], float, str, _Limits], ...] = (
+            ("motors", self._motors.identity, (), 0.0, "", {}),
+            ("external timer", self._timer.identity, (), 0.0, "", {}),
+            ("fans", self._fans.identity, (), 0.0, "", {}),
+            ("data acquisition", self._daq.identity, edges, daq.sample_hz, "edge", {"V": (daq.noise_v, (1, 2, 3, 4))}),
+            (
+                "inertial unit", self._imu.unit.identity, imu, bno055.rate_hz, "imu",
+                {"rad/s": (bno055.noise_rad_s, (2,)), "m/s^2": (bno055.noise_m_s2, (1,))},
+            ),
+        )  # fmt: skip
+        checks = []
+        for name, identity, samples, wanted_hz, fault, limits in rows:
+            is_sampled = len(samples) > 1
+            rate_hz = (len(samples) - 1) / (samples[-1][0] - samples[0][0]) if is_sampled else 0.0
+            noises = {unit: _noise(samples, columns) for unit, (_, columns) in limits.items() if is_sampled}
+            advice = failures.get(name) or faults.get(fault, "")
+            if not advice and abs(rate_hz - wanted_hz) > RATE_TOLERANCE * wanted_hz:
+                advice = f"{rate_hz:.0f} samples/s instead of {wanted_hz:.0f}; check the load of this computer"
+            for unit, noise in noises.items():
+                if not advice and noise > limits[unit][0]:
+                    advice = (
+                        f"noise {noise:.2g} {unit}, limit {limits[unit][0]:g}; let the robot stand, check its wiring"
+                    )
+            shown = ", ".join(f"{noise:.2g} {unit}" for unit, noise in noises.items())
+            checks.append(DeviceCheck(name, name not in failures, identity, rate_hz, shown, not advice, advice))
+        return checks
+
+
+def _noise(samples: Sequence[Sequence[float]], columns: Sequence[int]) -> float:
+    """Largest standard deviation of some columns."""
+    return max(pstdev(sample[column] for sample in samples) for column in columns)

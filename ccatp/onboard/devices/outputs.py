@@ -1,0 +1,310 @@
+"""Outputs of the robot's computer: PWM of the kernel, GPIO lines; motors, fans and external timer made of them."""
+
+import errno
+import os
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Protocol
+
+from ccatp.config.onboard_models import ExternalTimerConfig, FansConfig, MotorConfig, MotorsConfig, PwmChannelConfig
+from ccatp.onboard.hardware import HardwareError
+
+PWM_ROOT = Path("/sys/class/pwm")
+_PWM_FILES = ("period", "duty_cycle", "enable")
+# udev gives the group its access to a channel a moment after the export.
+_EXPORT_TRIES, _EXPORT_WAIT_S = 20, 0.05
+_DUTY_TOLERANCE = 0.01  # steps of the hardware
+
+Sleep = Callable[[float], object]
+
+
+def explain(error: OSError | ValueError, device: str, group: str, key: str) -> HardwareError:
+    """One line about a device file that cannot be opened or written; ``key`` is the part of the configuration."""
+    code = getattr(error, "errno", None)
+    advice = {
+        errno.ENOENT: f"is not there; check the wiring, the device tree and {key}",
+        errno.EACCES: f"permission denied; add the user of this program to the group {group}",
+        errno.EPERM: f"permission denied; add the user of this program to the group {group}",
+        errno.EBUSY: f"in use by another program or driver; stop it, or check {key}",
+        errno.EAGAIN: f"in use by another program or driver; stop it, or check {key}",
+        errno.ENODEV: f"has no such channel; check {key}",
+        errno.EINVAL: f"refuses the value; check {key}",
+    }.get(code or 0, f"{error}; check {key}")
+    return HardwareError(f"{device}: {advice}")
+
+
+class Lines(Protocol):
+    """Output lines of one GPIO chip."""
+
+    def set(self, values: Mapping[int, bool]) -> None:
+        """Set lines, all at once; OSError."""
+
+    def close(self) -> None:
+        """Release them."""
+
+
+# Chip and the first values of its lines, which are in force from the moment in which a line becomes an output.
+OpenLines = Callable[[str, Mapping[int, bool]], Lines]
+
+
+class Pwm:
+    """One channel of the kernel's PWM, its files kept open. Every method raises HardwareError.
+
+    Attributes:
+        name: what the channel drives, for messages.
+        period_ns: period in force.
+    """
+
+    def __init__(self, root: Path, channel: PwmChannelConfig, name: str, key: str) -> None:
+        self._chip = root / f"pwmchip{channel.chip}"
+        self._channel = channel.channel
+        self._folder = self._chip / f"pwm{channel.channel}"
+        self._key = key
+        self._fds: dict[str, int] = {}
+        self.name = name
+        self.period_ns = 0
+
+    @property
+    def identity(self) -> str:
+        """Chip and channel."""
+        return f"{self._chip.name}/{self._folder.name}"
+
+    def open(self, sleep: Sleep) -> None:
+        """Export the channel and open its files; changes nothing of what it puts out."""
+        try:
+            if not self._folder.is_dir():
+                fd = os.open(self._chip / "export", os.O_WRONLY)
+                try:
+                    os.pwrite(fd, b"%d\n" % self._channel, 0)
+                finally:
+                    os.close(fd)
+            self._open_files(sleep)
+        except OSError as error:
+            self.close()
+            raise explain(error, f"{self.name}, {self.identity}", "of /sys/class/pwm", self._key) from None
+        self.period_ns = self._read("period")
+
+    def _open_files(self, sleep: Sleep) -> None:
+        for tries_left in reversed(range(_EXPORT_TRIES)):
+            try:
+                for name in _PWM_FILES:
+                    if name not in self._fds:
+                        self._fds[name] = os.open(self._folder / name, os.O_RDWR)
+                return
+            except PermissionError:
+                if not tries_left:
+                    raise
+                sleep(_EXPORT_WAIT_S)
+
+    def set_up(self, period_s: float) -> None:
+        """No output, then the period, then enabled: the kernel refuses a duty without a period or longer than it."""
+        if self.period_ns:
+            self._write("duty_cycle", 0)
+        self.period_ns = round(period_s * 1e9)
+        self._write("period", self.period_ns)
+        self._write("duty_cycle", 0)
+        self._write("enable", 1)
+
+    def is_enabled(self) -> bool:
+        """Whether it puts out anything."""
+        return self._read("enable") != 0
+
+    def duty(self) -> float:
+        """Duty in force, 0 to 1, as the kernel has it."""
+        return self._read("duty_cycle") / self.period_ns if self.period_ns and self.is_enabled() else 0.0
+
+    def set_duty(self, duty: float) -> None:
+        """Set the duty, clamped to 0 to 1."""
+        self._write("duty_cycle", round(min(1.0, max(0.0, duty)) * self.period_ns))
+
+    def close(self) -> None:
+        """Close the files; what the channel puts out stays as it is."""
+        while self._fds:
+            os.close(self._fds.popitem()[1])
+
+    def _read(self, name: str) -> int:
+        try:
+            return int(os.pread(self._fds[name], 32, 0).split()[0])
+        except (OSError, LookupError, ValueError) as error:
+            raise HardwareError(f"{self.name}, {self.identity}/{name}: cannot be read: {error}") from None
+
+    def _write(self, name: str, value: int) -> None:
+        try:
+            os.pwrite(self._fds[name], b"%d\n" % value, 0)
+        except KeyError:
+            raise HardwareError(f"{self.name}, {self.identity}: is not open") from None
+        except OSError as error:
+            raise explain(error, f"{self.name}, {self.identity}/{name}", "of /sys/class/pwm", self._key) from None
+
+
+class Motors:
+    """Both motors behind their bridge: each two lines for the direction and a PWM; both lines high short-brake.
+
+    A motor goes from one direction to the other through the brake, and its duty is set while it brakes.
+    """
+
+    def __init__(self, config: MotorsConfig, root: Path, open_lines: OpenLines) -> None:
+        self._config, self._open_lines = config, open_lines
+        self._motors = [
+            (motor, Pwm(root, motor, f"{side} motor", f"devices.motors.{side}"))
+            for side, motor in (("right", config.right), ("left", config.left))
+        ]
+        self._directions = [0, 0]
+        self._lines: Lines | None = None
+
+    @property
+    def identity(self) -> str:
+        """PWM channels."""
+        return " ".join(pwm.identity for _, pwm in self._motors)
+
+    def open(self, sleep: Sleep) -> None:
+        """Brake, then make the PWM ready. Raises HardwareError."""
+        both = {line: True for motor, _ in self._motors for line in (motor.forward_line, motor.reverse_line)}
+        if len(both) < 4:
+            raise HardwareError("motors: a GPIO line is named twice; correct the lines in devices.motors")
+        self._lines = self._open_lines(self._config.gpio_chip, both)
+        for _, pwm in self._motors:
+            pwm.open(sleep)
+            pwm.set_up(self._config.period_s)
+        self.brake()
+
+    def drive(self, right_v: float, left_v: float) -> None:
+        """Voltages, V, positive drives forwards; 0 brakes. Raises HardwareError, after an attempt to brake."""
+        voltages = right_v, left_v
+        wanted = [(v > 0.0) - (v < 0.0) for v in voltages]
+        try:
+            self._direct([new if new == old else 0 for new, old in zip(wanted, self._directions, strict=True)])
+            for (_, pwm), voltage_v, direction in zip(self._motors, voltages, wanted, strict=True):
+                pwm.set_duty(abs(voltage_v) / self._config.supply_v if direction else 1.0)
+            self._direct(wanted)
+        except HardwareError:
+            with suppress(HardwareError):
+                self._direct([0, 0])
+            raise
+
+    def brake(self) -> None:
+        """Both lines of both motors high, then full duty, whatever was in force before. Raises HardwareError."""
+        self._direct([0, 0], is_forced=True)
+        for _, pwm in self._motors:
+            pwm.set_duty(1.0)
+
+    def close(self) -> None:
+        """Brake and release. What a released line does depends on its chip: the external timer brakes on."""
+        with suppress(HardwareError):
+            self.brake()
+        for _, pwm in self._motors:
+            pwm.close()
+        if self._lines is not None:
+            self._lines.close()
+            self._lines = None
+
+    def _direct(self, directions: list[int], *, is_forced: bool = False) -> None:
+        """Set the lines of both motors in one call; 1: forwards, -1: backwards, 0: brake."""
+        if directions == self._directions and not is_forced:
+            return
+        if self._lines is None:
+            raise HardwareError("motors: are not open")
+        values: dict[int, bool] = {}
+        for (motor, _), direction in zip(self._motors, directions, strict=True):
+            values |= _bridge(motor, direction)
+        try:
+            self._lines.set(values)
+        except OSError as error:
+            raise explain(error, f"motors, {self._config.gpio_chip}", "gpio", "devices.motors") from None
+        self._directions = directions
+
+
+def _bridge(motor: MotorConfig, direction: int) -> dict[int, bool]:
+    return {motor.forward_line: direction >= 0, motor.reverse_line: direction <= 0}
+
+
+class Fans:
+    """Both fans. What is in force when the program starts stays in force, period included, and stays when it ends.
+
+    Attributes:
+        faults: fans that do not work, by their names on the robot link, with the reason.
+    """
+
+    def __init__(self, config: FansConfig, root: Path) -> None:
+        self._period_s = config.period_s
+        self._fans = {
+            f"fan_{side}": Pwm(root, channel, f"{side} fan", f"devices.fans.{side}")
+            for side, channel in (("left", config.left), ("right", config.right))
+        }
+        self._commanded: dict[str, float] = {}
+        self.faults: dict[str, str] = {}
+
+    @property
+    def identity(self) -> str:
+        """PWM channels and periods."""
+        return " ".join(f"{fan.identity} {fan.period_ns / 1e3:g} us" for fan in self._fans.values())
+
+    def open(self, sleep: Sleep) -> None:
+        """Open both; one that runs is not touched, one that is off is enabled at duty 0. Raises HardwareError."""
+        for fan in self._fans.values():
+            fan.open(sleep)
+            if not fan.is_enabled():
+                fan.set_up(self._period_s)
+
+    def duties(self) -> tuple[float, float]:
+        """Duties (left, right) as read back. Raises HardwareError."""
+        left, right = (fan.duty() for fan in self._fans.values())
+        return left, right
+
+    def command(self, left: float, right: float) -> None:
+        """Set the duties; a fan that refuses does not keep the other from its duty. Raises HardwareError."""
+        self._commanded = dict(zip(self._fans, (left, right), strict=True))
+        self.check()
+        if self.faults:
+            raise HardwareError("; ".join(self.faults.values()))
+
+    def check(self) -> None:
+        """Compare what the kernel has with what was commanded, set what differs, and update ``faults``."""
+        self.faults = {}
+        for name, fan in self._fans.items():
+            try:
+                duty = fan.duty()
+                if abs(duty - self._commanded.get(name, duty)) > _DUTY_TOLERANCE:
+                    fan.set_duty(self._commanded[name])
+            except HardwareError as error:
+                self.faults[name] = str(error)
+
+    def close(self) -> None:
+        """Close the files; the duties stay in force."""
+        for fan in self._fans.values():
+            fan.close()
+
+
+class ExternalTimer:
+    """The timer outside this computer that brakes the motors when its line has not changed for a while."""
+
+    def __init__(self, config: ExternalTimerConfig, open_lines: OpenLines) -> None:
+        self._config, self._open_lines = config, open_lines
+        self._lines: Lines | None = None
+        self._level = False
+
+    @property
+    def identity(self) -> str:
+        """Chip and line."""
+        return f"{self._config.gpio_chip} line {self._config.line}"
+
+    def open(self) -> None:
+        """Make the line an output. Raises HardwareError."""
+        self._lines = self._open_lines(self._config.gpio_chip, {self._config.line: self._level})
+
+    def restart(self) -> None:
+        """Change the line. Raises HardwareError."""
+        if self._lines is None:
+            raise HardwareError("external timer: is not open")
+        self._level = not self._level
+        try:
+            self._lines.set({self._config.line: self._level})
+        except OSError as error:
+            raise explain(error, f"external timer, {self.identity}", "gpio", "devices.timer") from None
+
+    def close(self) -> None:
+        """Release the line."""
+        if self._lines is not None:
+            self._lines.close()
+            self._lines = None
