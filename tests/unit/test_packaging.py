@@ -3,11 +3,15 @@
 import json
 import os
 import re
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from markdown_it import MarkdownIt
+from markdown_it.token import Token
 
 from ccatp.cli import cli
 from ccatp.config.load import load_config
@@ -16,6 +20,29 @@ from tests.unit.dashboard.test_view import ALL, metrics_of
 PACKAGING = Path(__file__).parents[2] / "packaging"
 COMPOSE: dict[str, Any] = yaml.safe_load((PACKAGING / "compose.yaml").read_text())
 METRIC = re.compile(r"\bccatp_\w+")
+
+
+def tokens_of(tokens: list[Token]) -> Iterator[Token]:
+    for token in tokens:
+        yield token
+        yield from tokens_of(token.children or [])
+
+
+def test_links_of_the_readme_work_on_a_package_index_and_lead_to_files_that_are_there() -> None:
+    root = PACKAGING.parent
+    source = tomllib.loads((root / "pyproject.toml").read_text())["project"]["urls"]["Source"]
+    pages, files = f"{source}/blob/main/", source.replace("//github.com", "//raw.githubusercontent.com") + "/main/"
+    tokens = list(tokens_of(MarkdownIt("commonmark").parse((root / "README.md").read_text(encoding="utf-8"))))
+    links = [str(token.attrs["href"]) for token in tokens if token.type == "link_open"]
+    pictures = [str(token.attrs["src"]) for token in tokens if token.type == "image"]
+    assert len(links) > 20
+    assert pictures
+    assert [link for link in links if not link.startswith(pages)] == []
+    assert [picture for picture in pictures if not picture.startswith(files)] == []
+    places = [*(link.removeprefix(pages) for link in links), *(picture.removeprefix(files) for picture in pictures)]
+    assert [place for place in places if not (root / place).is_file()] == []
+    # a link without a definition is a text in brackets
+    assert [token.content for token in tokens if token.type == "text" and re.search(r"\[.*\]", token.content)] == []
 
 
 def exported() -> set[str]:
