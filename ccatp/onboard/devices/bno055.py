@@ -36,7 +36,7 @@ TO_CONFIG_S, FROM_CONFIG_S = 0.019, 0.007
 BURST_START = 0x14
 BURST = struct.Struct("<16h10B")
 _G_M_S2 = 9.80665  # of the unit's fusion
-_NORM_TOLERANCE = 0.05  # of the quaternion and of gravity; a reading with bytes of two is off by more
+_MISFIT = 0.05  # of the length of quaternion and gravity; with bytes of two readings it is more
 
 REOPEN_AFTER, RESET_AFTER = 3, 10  # failures in sequence
 LONGEST_WAIT_S = 1.0
@@ -148,8 +148,11 @@ class Bno055:
         t_s = self._clock()
         burst = self._read(BURST_START, BURST.size)
         values = BURST.unpack(burst)
-        (*_, wz), (qw, qx, qy, qz), (ax, _, _), gravity = values[0:3], values[6:10], values[10:13], values[13:16]
+        wz, quaternion, ax, gravity = values[2], values[6:10], values[10], values[13:16]
         calibration, status, error, units, mode = (values[k] for k in (17, 21, 22, 23, 25))
+        size = hypot(*gravity) / 100.0
+        misfit = max(abs(hypot(*quaternion) / 16384.0 - 1.0), abs(size / _G_M_S2 - 1.0))
+        is_new, self._last_burst = burst != self._last_burst, burst
         self.doubt = ""
         if burst == b"\xff" * len(burst):
             self.doubt = "the bus reads ones only; check its wiring"
@@ -157,14 +160,10 @@ class Bno055:
             raise self._error(f"was reset (mode 0x{mode:02x}, units 0x{units:02x}); check its supply")
         elif status == 1:
             raise self._error(f"reports system error {error}; check its supply")
-        elif burst == self._last_burst:
+        elif misfit > _MISFIT:
+            self.doubt = f"bytes do not fit together (gravity {size:.2f} m/s^2); check the speed of the I2C bus"
+        elif not is_new:
             self.doubt = "the readings do not change"
-        self._last_burst = burst
-        size = hypot(*gravity) / 100.0
-        if not self.doubt and (
-            abs(hypot(qw, qx, qy, qz) / 16384.0 - 1.0) > _NORM_TOLERANCE or abs(size / _G_M_S2 - 1.0) > _NORM_TOLERANCE
-        ):
-            self.doubt = f"a reading whose bytes do not fit together (gravity {size:.2f} m/s^2)"
         if self.doubt:
             return None
         gx, gy, gz = (-g / (100.0 * size) for g in gravity)
@@ -206,7 +205,13 @@ class ImuReader:
         unit: what is read.
     """
 
-    def __init__(self, config: Bno055Config, open_bus: Callable[[], Bus], clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        config: Bno055Config,
+        open_bus: Callable[[], Bus],
+        clock: Callable[[], float],
+        sleep: Callable[[float], object] | None = None,
+    ) -> None:
         self._stop = threading.Event()
         self._clock = clock
         self._period_s, self._timeout_s = 1.0 / config.rate_hz, config.timeout_s
@@ -217,7 +222,7 @@ class ImuReader:
         self._reason = ""
         self._newest_s = clock()
         self.errors = 0
-        self.unit = Bno055(config, open_bus, clock, self._stop.wait)
+        self.unit = Bno055(config, open_bus, clock, sleep or self._stop.wait)
 
     def start(self) -> None:
         """Set the unit up and begin to read. Raises HardwareError."""
