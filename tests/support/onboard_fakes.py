@@ -156,6 +156,7 @@ class FakeDaq:
         self.opened = 0
         self.latency_s: Callable[[], float] = float
         self._sent: list[tuple[float, bytes]] = []
+        self._arrived = b""
         self.boot()
 
     def open(self, _device: str, _baud: int) -> "FakeDaq":
@@ -163,6 +164,7 @@ class FakeDaq:
             raise self.open_error
         self.opened += 1
         self._sent.clear()
+        self._arrived = b""
         return self
 
     def boot(self) -> None:
@@ -190,8 +192,10 @@ class FakeDaq:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
         self._sample()
         now_s = self._time.now_s
-        due, self._sent = [d for t, d in self._sent if t <= now_s], [(t, d) for t, d in self._sent if t > now_s]
-        return b"".join(due)[:size]
+        self._arrived += b"".join(data for arrival_s, data in self._sent if arrival_s <= now_s)
+        self._sent = [(arrival_s, data) for arrival_s, data in self._sent if arrival_s > now_s]
+        data, self._arrived = self._arrived[:size], self._arrived[size:]
+        return data
 
     def close(self) -> None: ...
 

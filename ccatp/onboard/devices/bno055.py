@@ -202,7 +202,6 @@ class ImuReader:
 
     Attributes:
         errors: attempts that gave no sample.
-        unit: what is read.
     """
 
     def __init__(
@@ -210,7 +209,7 @@ class ImuReader:
         config: Bno055Config,
         open_bus: Callable[[], Bus],
         clock: Callable[[], float],
-        sleep: Callable[[float], object] | None = None,
+        sleep: Callable[[float], object],
     ) -> None:
         self._stop = threading.Event()
         self._clock = clock
@@ -222,19 +221,21 @@ class ImuReader:
         self._reason = ""
         self._newest_s = clock()
         self.errors = 0
-        self.unit = Bno055(config, open_bus, clock, sleep or self._stop.wait)
+        self._unit = Bno055(config, open_bus, clock, sleep)
 
-    def start(self) -> None:
+    @property
+    def identity(self) -> str:
+        """What the unit says of itself."""
+        return self._unit.identity
+
+    def open(self) -> None:
         """Set the unit up and begin to read. Raises HardwareError."""
         try:
-            self.unit.open()
-            self.unit.set_up()
-        except OSError as error:
-            self.unit.close()
-            raise HardwareError(f"BNO055: {_bus_error(error)}") from None
-        except HardwareError:
-            self.unit.close()
-            raise
+            self._unit.open()
+            self._unit.set_up()
+        except (OSError, HardwareError) as error:
+            self._unit.close()
+            raise HardwareError(f"BNO055: {_bus_error(error)}" if isinstance(error, OSError) else str(error)) from None
         self._newest_s = self._clock()
         self._thread.start()
 
@@ -242,17 +243,17 @@ class ImuReader:
         """Take one reading, or try to get the unit to work again; after how long to call again, s."""
         try:
             if self._failures >= REOPEN_AFTER:
-                self.unit.open()
+                self._unit.open()
             if self._is_lost:
-                self.unit.set_up()
+                self._unit.set_up()
                 self._is_lost = False
-            sample = self.unit.read()
+            sample = self._unit.read()
         except (OSError, HardwareError) as error:
             sample = None
             self._is_lost |= isinstance(error, HardwareError)
             self._reason = _bus_error(error) if isinstance(error, OSError) else str(error)
         else:
-            self._reason = self.unit.doubt
+            self._reason = self._unit.doubt
         if sample is not None:
             self._samples.append(sample)
             self._newest_s = sample.t_s
@@ -274,7 +275,7 @@ class ImuReader:
             return ""
         return f"no reading for {age_s:.2f} s: {self._reason or 'a transfer hangs; check the wiring of the I2C bus'}"
 
-    def stop(self) -> None:
+    def close(self) -> None:
         """End the thread and release the bus; one that hangs in the kernel is left to itself."""
         self._stop.set()
         if self._thread.ident is not None:
@@ -290,7 +291,7 @@ class ImuReader:
             self._reason = f"its thread ended: {error!r}"
             raise
         finally:
-            self.unit.close()
+            self._unit.close()
 
 
 def _bus_error(error: OSError) -> str:

@@ -194,8 +194,14 @@ class Daq:
         decoder: of the bytes that come.
     """
 
-    def __init__(self, config: DaqConfig, open_port: Callable[[str, int], SerialPort]) -> None:
-        self._config, self._open_port = config, open_port
+    def __init__(
+        self,
+        config: DaqConfig,
+        open_port: Callable[[str, int], SerialPort],
+        clock: Callable[[], float],
+        sleep: Callable[[float], object],
+    ) -> None:
+        self._config, self._open_port, self._now, self._sleep = config, open_port, clock, sleep
         self._volt = config.full_scale_v / FULL_SCALE
         self._port: SerialPort | None = None
         self._reason = ""
@@ -211,15 +217,15 @@ class Daq:
         self.battery_v: float | None = None
         self.decoder = Decoder()
 
-    def start(self, clock: Callable[[], float], sleep: Callable[[float], object]) -> None:
+    def open(self) -> None:
         """Open the port and wait until samples come. Raises HardwareError."""
-        until_s = clock() + ANSWER_S
-        while not self.poll(clock()):
-            if self._port is None or clock() > until_s:
+        until_s = self._now() + ANSWER_S
+        while not self.poll(self._now()):
+            if self._port is None or self._now() > until_s:
                 reason = self._why()
                 self.close()
                 raise HardwareError(f"data acquisition device: {reason}")
-            sleep(0.005)
+            self._sleep(0.005)
 
     def poll(self, now_s: float) -> list[DaqSample]:
         """Samples that came since the last call."""

@@ -11,7 +11,7 @@ from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from statistics import pstdev
-from typing import Any
+from typing import Any, Protocol
 
 from ccatp.config.onboard_models import DevicesConfig
 from ccatp.onboard.devices.bno055 import Bus, ImuReader
@@ -33,7 +33,7 @@ FAN_CHECK_S = 0.1
 RATE_TOLERANCE = 0.1
 ENCODERS_AND_EDGES = ("encoder_left", "encoder_right", "edge")
 
-_Limits = dict[str, tuple[float, tuple[int, ...]]]
+_Sampled = tuple[Sequence[Sequence[float]], float, str, dict[str, tuple[float, tuple[int, ...]]]]
 
 
 def import_package(name: str) -> Any:
@@ -107,6 +107,15 @@ class GpioLines:
         self._request.release()
 
 
+class _Device(Protocol):
+    @property
+    def identity(self) -> str: ...
+
+    def open(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
 class LinuxHardware:
     """The devices of the configuration; a ``Hardware``. ``clock`` is the robot's, the same as ``now_s`` of ``read``."""
 
@@ -119,31 +128,32 @@ class LinuxHardware:
         open_port: Callable[[str, int], SerialPort] = open_serial,
         open_lines: OpenLines = GpioLines,
         pwm_root: Path = PWM_ROOT,
+        imu_reader: type[ImuReader] = ImuReader,
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
         self._config, self._clock, self._sleep = config, clock, sleep
-        self._motors = Motors(config.motors, pwm_root, open_lines)
+        self._motors = Motors(config.motors, pwm_root, open_lines, sleep)
         self._timer = ExternalTimer(config.timer, open_lines)
-        self._fans = Fans(config.fans, pwm_root)
-        self._daq = Daq(config.daq, open_port)
-        self._imu = ImuReader(config.bno055, partial(open_bus, config.bno055.bus), clock)
+        self._fans = Fans(config.fans, pwm_root, sleep)
+        self._imu = imu_reader(config.bno055, partial(open_bus, config.bno055.bus), clock, sleep)
+        self._daq = Daq(config.daq, open_port, clock, sleep)
+        # In the order of opening: the motors brake first, and the samples that nobody takes meanwhile come last.
+        self._devices: dict[str, _Device] = {
+            "motors": self._motors,
+            "external timer": self._timer,
+            "fans": self._fans,
+            "inertial unit": self._imu,
+            "data acquisition": self._daq,
+        }
         self._opened = ExitStack()
         self._fan_check_s = clock()
-        # Name, how it is opened, how it is closed: the motors brake before anything else.
-        self._devices: tuple[tuple[str, Callable[[], None], Callable[[], None]], ...] = (
-            ("motors", partial(self._motors.open, sleep), self._motors.close),
-            ("external timer", self._timer.open, self._timer.close),
-            ("fans", partial(self._fans.open, sleep), self._fans.close),
-            ("data acquisition", partial(self._daq.start, clock, sleep), self._daq.close),
-            ("inertial unit", self._imu.start, self._imu.stop),
-        )
 
     def start(self) -> None:
         """See ``Hardware``."""
         try:
-            for _, start, close in self._devices:
-                self._opened.callback(close)
-                start()
+            for device in self._devices.values():
+                self._opened.callback(device.close)
+                device.open()
         except HardwareError:
             self.close()
             raise
@@ -196,51 +206,47 @@ class LinuxHardware:
     def check(self, duration_s: float) -> list[DeviceCheck]:
         """Open each device, read for ``duration_s`` while the robot stands still, close; nothing turns."""
         failures: dict[str, str] = {}
+        readings: list[Readings] = []
         with self._opened:
-            for name, start, close in self._devices:
-                self._opened.callback(close)
+            for name, device in self._devices.items():
+                self._opened.callback(device.close)
                 try:
-                    start()
+                    device.open()
                 except HardwareError as error:
                     failures[name] = str(error)
             end_s = self._clock() + duration_s
-            readings = []
             while (now_s := self._clock()) < end_s:
                 readings.append(self.read(now_s))
                 self._sleep(0.005)
         faults = readings[-1].faults if readings else {}
-        imu = [sample for reading in readings for sample in reading.imu]
-        edges = [sample for reading in readings for sample in reading.edges]
         bno055, daq = self._config.bno055, self._config.daq
-        # Name, identity, samples, their rate, name of the fault, {unit of a noise: (limit, columns of the samples)}.
-        rows: tuple[tuple[str, str, Sequence[Sequence[float]], float, str, _Limits], ...] = (
-            ("motors", self._motors.identity, (), 0.0, "", {}),
-            ("external timer", self._timer.identity, (), 0.0, "", {}),
-            ("fans", self._fans.identity, (), 0.0, "", {}),
-            ("data acquisition", self._daq.identity, edges, daq.sample_hz, "edge", {"V": (daq.noise_v, (1, 2, 3, 4))}),
-            (
-                "inertial unit", self._imu.unit.identity, imu, bno055.rate_hz, "imu",
+        # Samples, their rate, fault of the device, {unit of a noise: (limit, columns of the samples)}.
+        sampled: dict[str, _Sampled] = {
+            "inertial unit": (
+                [row for reading in readings for row in reading.imu], bno055.rate_hz, faults.get("imu", ""),
                 {"rad/s": (bno055.noise_rad_s, (2,)), "m/s^2": (bno055.noise_m_s2, (1,))},
             ),
-        )  # fmt: skip
+            "data acquisition": (
+                [row for reading in readings for row in reading.edges], daq.sample_hz, faults.get("edge", ""),
+                {"V": (daq.noise_v, (1, 2, 3, 4))},
+            ),
+        }  # fmt: skip
         checks = []
-        for name, identity, samples, wanted_hz, fault, limits in rows:
-            is_sampled = len(samples) > 1
-            rate_hz = (len(samples) - 1) / (samples[-1][0] - samples[0][0]) if is_sampled else 0.0
-            noises = {unit: _noise(samples, columns) for unit, (_, columns) in limits.items() if is_sampled}
-            advice = failures.get(name) or faults.get(fault, "")
-            if not advice and abs(rate_hz - wanted_hz) > RATE_TOLERANCE * wanted_hz:
-                advice = f"{rate_hz:.0f} samples/s instead of {wanted_hz:.0f}; check the load of this computer"
-            for unit, noise in noises.items():
-                if not advice and noise > limits[unit][0]:
-                    advice = (
-                        f"noise {noise:.2g} {unit}, limit {limits[unit][0]:g}; let the robot stand, check its wiring"
-                    )
-            shown = ", ".join(f"{noise:.2g} {unit}" for unit, noise in noises.items())
-            checks.append(DeviceCheck(name, name not in failures, identity, rate_hz, shown, not advice, advice))
+        for name, device in self._devices.items():
+            rows, wanted_hz, advice, limits = sampled.get(name, ([], 0.0, "", {}))
+            advice = failures.get(name, advice)
+            is_measured = len(rows) > 1
+            rate_hz = (len(rows) - 1) / (rows[-1][0] - rows[0][0]) if is_measured else 0.0
+            if abs(rate_hz - wanted_hz) > RATE_TOLERANCE * wanted_hz:
+                advice = (
+                    advice or f"{rate_hz:.0f} samples/s instead of {wanted_hz:.0f}; check the load of this computer"
+                )
+            noises = []
+            for unit, (limit, columns) in limits.items():
+                noise = max(pstdev(row[column] for row in rows) for column in columns) if is_measured else 0.0
+                noises.append(f"{noise:.2g} {unit}")
+                if noise > limit:
+                    advice = advice or f"noise {noises[-1]}, limit {limit:g}; let the robot stand, check its wiring"
+            found = name not in failures
+            checks.append(DeviceCheck(name, found, device.identity, rate_hz, ", ".join(noises), not advice, advice))
         return checks
-
-
-def _noise(samples: Sequence[Sequence[float]], columns: Sequence[int]) -> float:
-    """Largest standard deviation of some columns."""
-    return max(pstdev(sample[column] for sample in samples) for column in columns)

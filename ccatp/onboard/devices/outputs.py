@@ -56,11 +56,11 @@ class Pwm:
         period_ns: period in force.
     """
 
-    def __init__(self, root: Path, channel: PwmChannelConfig, name: str, key: str) -> None:
+    def __init__(self, root: Path, channel: PwmChannelConfig, name: str, key: str, sleep: Sleep) -> None:
         self._chip = root / f"pwmchip{channel.chip}"
         self._channel = channel.channel
         self._folder = self._chip / f"pwm{channel.channel}"
-        self._key = key
+        self._key, self._sleep = key, sleep
         self._fds: dict[str, int] = {}
         self.name = name
         self.period_ns = 0
@@ -70,7 +70,7 @@ class Pwm:
         """Chip and channel."""
         return f"{self._chip.name}/{self._folder.name}"
 
-    def open(self, sleep: Sleep) -> None:
+    def open(self) -> None:
         """Export the channel and open its files; changes nothing of what it puts out."""
         try:
             if not self._folder.is_dir():
@@ -79,13 +79,13 @@ class Pwm:
                     os.pwrite(fd, b"%d\n" % self._channel, 0)
                 finally:
                     os.close(fd)
-            self._open_files(sleep)
+            self._open_files()
         except OSError as error:
             self.close()
             raise explain(error, f"{self.name}, {self.identity}", "of /sys/class/pwm", self._key) from None
         self.period_ns = self._read("period")
 
-    def _open_files(self, sleep: Sleep) -> None:
+    def _open_files(self) -> None:
         for tries_left in reversed(range(_EXPORT_TRIES)):
             try:
                 for name in _PWM_FILES:
@@ -95,7 +95,7 @@ class Pwm:
             except PermissionError:
                 if not tries_left:
                     raise
-                sleep(_EXPORT_WAIT_S)
+                self._sleep(_EXPORT_WAIT_S)
 
     def set_up(self, period_s: float) -> None:
         """No output, then the period, then enabled: the kernel refuses a duty without a period or longer than it."""
@@ -144,10 +144,10 @@ class Motors:
     A motor goes from one direction to the other through the brake, and its duty is set while it brakes.
     """
 
-    def __init__(self, config: MotorsConfig, root: Path, open_lines: OpenLines) -> None:
+    def __init__(self, config: MotorsConfig, root: Path, open_lines: OpenLines, sleep: Sleep) -> None:
         self._config, self._open_lines = config, open_lines
         self._motors = [
-            (motor, Pwm(root, motor, f"{side} motor", f"devices.motors.{side}"))
+            (motor, Pwm(root, motor, f"{side} motor", f"devices.motors.{side}", sleep))
             for side, motor in (("right", config.right), ("left", config.left))
         ]
         self._directions = [0, 0]
@@ -158,14 +158,14 @@ class Motors:
         """PWM channels."""
         return " ".join(pwm.identity for _, pwm in self._motors)
 
-    def open(self, sleep: Sleep) -> None:
+    def open(self) -> None:
         """Brake, then make the PWM ready. Raises HardwareError."""
         both = {line: True for motor, _ in self._motors for line in (motor.forward_line, motor.reverse_line)}
         if len(both) < 4:
             raise HardwareError("motors: a GPIO line is named twice; correct the lines in devices.motors")
         self._lines = self._open_lines(self._config.gpio_chip, both)
         for _, pwm in self._motors:
-            pwm.open(sleep)
+            pwm.open()
             pwm.set_up(self._config.period_s)
         self.brake()
 
@@ -226,10 +226,10 @@ class Fans:
         faults: fans that do not work, by their names on the robot link, with the reason.
     """
 
-    def __init__(self, config: FansConfig, root: Path) -> None:
+    def __init__(self, config: FansConfig, root: Path, sleep: Sleep) -> None:
         self._period_s = config.period_s
         self._fans = {
-            f"fan_{side}": Pwm(root, channel, f"{side} fan", f"devices.fans.{side}")
+            f"fan_{side}": Pwm(root, channel, f"{side} fan", f"devices.fans.{side}", sleep)
             for side, channel in (("left", config.left), ("right", config.right))
         }
         self._commanded: dict[str, float] = {}
@@ -240,10 +240,10 @@ class Fans:
         """PWM channels and periods."""
         return " ".join(f"{fan.identity} {fan.period_ns / 1e3:g} us" for fan in self._fans.values())
 
-    def open(self, sleep: Sleep) -> None:
+    def open(self) -> None:
         """Open both; one that runs is not touched, one that is off is enabled at duty 0. Raises HardwareError."""
         for fan in self._fans.values():
-            fan.open(sleep)
+            fan.open()
             if not fan.is_enabled():
                 fan.set_up(self._period_s)
 

@@ -35,10 +35,6 @@ class Rig:
         self.time.sleep(wait_s)
         self.faults.append(self.fault())
 
-    def set_up(self) -> None:
-        self.reader.unit.open()
-        self.reader.unit.set_up()
-
     def run(self, duration_s: float) -> None:
         end_s = self.time.now_s + duration_s
         while self.time.now_s < end_s:
@@ -48,10 +44,16 @@ class Rig:
         return self.reader.fault(self.time.now_s)
 
 
+@pytest.fixture(autouse=True)
+def no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tests call the reader themselves."""
+    monkeypatch.setattr(threading.Thread, "start", lambda _thread: None)
+
+
 @pytest.fixture
 def rig() -> Rig:
     rig = Rig()
-    rig.set_up()
+    rig.reader.open()
     rig.run(0.1)
     assert not rig.fault()
     rig.reader.take()
@@ -84,9 +86,9 @@ def _fail_once(unit: FakeBno055, register: int) -> None:
 def test_set_up(before: Break) -> None:
     rig = Rig()
     before(rig.unit)
-    rig.set_up()
+    rig.reader.open()
     assert (rig.unit.mode, rig.unit.page, rig.unit.registers[0x3B]) == (0x08, 0, 0x02)
-    assert rig.reader.unit.identity == "BNO055 software 3.11 boot loader 21"
+    assert rig.reader.identity == "BNO055 software 3.11 boot loader 21"
     rig.run(0.1)
     assert len(rig.reader.take()) == 10
 
@@ -111,7 +113,7 @@ def test_a_unit_that_is_not_right_is_refused(broken: Break, message: str) -> Non
     rig = Rig()
     broken(rig.unit)
     with pytest.raises(HardwareError, match=message):
-        rig.reader.start()
+        rig.reader.open()
 
 
 @pytest.mark.parametrize(
@@ -132,7 +134,7 @@ def test_axes(axes: tuple[str, str, str], registers: tuple[int, int]) -> None:
 def test_axes_of_a_mirror_image_are_refused(axes: tuple[str, str, str]) -> None:
     rig = Rig(CONFIG.model_copy(update={"axes": axes}))
     with pytest.raises(HardwareError, match="not those of a turned unit"):
-        rig.reader.start()
+        rig.reader.open()
 
 
 # -- readings ---------------------------------------------------------------------------------------------------------
@@ -152,7 +154,7 @@ def test_gravity_is_where_things_fall_in_the_robots_frame(
 ) -> None:
     rig = Rig(CONFIG.model_copy(update={"axes": axes}))
     rig.unit.gravity_m_s2 = unit_gravity
-    rig.set_up()
+    rig.reader.open()
     rig.run(0.03)
     sample = rig.reader.take()[-1]
     assert sample.gravity == pytest.approx(falls, abs=2e-3)  # a bit is 1e-3 of g
@@ -250,7 +252,10 @@ def test_attempts_at_a_unit_that_is_gone_come_further_and_further_apart(rig: Rig
     assert "Remote I/O error" in rig.fault()
 
 
-def test_a_transfer_that_hangs_is_a_fault_and_does_not_keep_the_program_from_its_end() -> None:
+def test_a_transfer_that_hangs_is_a_fault_and_does_not_keep_the_program_from_its_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.undo()
     rig, hanging, release = Rig(), threading.Event(), threading.Event()
     config = CONFIG.model_copy(update={"rate_hz": 1000.0})
     reader = ImuReader(config, rig.unit.open, rig.time, rig.time.sleep)
@@ -261,28 +266,29 @@ def test_a_transfer_that_hangs_is_a_fault_and_does_not_keep_the_program_from_its
         return burst
 
     rig.unit.tamper = hang
-    reader.start()
+    reader.open()
     try:
         assert hanging.wait(60.0)
         rig.time.sleep(0.06)
         assert reader.fault(rig.time.now_s) == (
             "no reading for 0.06 s: a transfer hangs; check the wiring of the I2C bus"
         )
-        reader.stop()  # returns
+        reader.close()  # returns
     finally:
         release.set()
 
 
-def test_the_thread_reads_and_ends() -> None:
+def test_the_thread_reads_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
     rig = Rig()
     config = CONFIG.model_copy(update={"rate_hz": 1000.0})
     reader = ImuReader(config, rig.unit.open, rig.time, rig.time.sleep)
-    reader.start()
+    reader.open()
     until_s = time.monotonic() + 60.0
     samples = reader.take()
     while len(samples) < 5 and time.monotonic() < until_s:
         time.sleep(0.001)
         samples += reader.take()
-    reader.stop()
+    reader.close()
     assert len(samples) >= 5
     assert not any(thread.name == "bno055" for thread in threading.enumerate())

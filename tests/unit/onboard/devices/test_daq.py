@@ -33,12 +33,9 @@ class Rig:
     def __init__(self, config: DaqConfig = CONFIG, packed: int = 10) -> None:
         self.time = FakeTime()
         self.device = FakeDaq(self.time, packed)
-        self.daq = Daq(config, self.device.open)
+        self.daq = Daq(config, self.device.open, self.time, self.time.sleep)
         self.samples: list[DaqSample] = []
         self.faults: list[str] = []  # after each poll
-
-    def start(self) -> None:
-        self.daq.start(self.time, self.time.sleep)
 
     def run(self, duration_s: float, step_s: float = 0.002) -> None:
         end_s = self.time.now_s + duration_s
@@ -51,7 +48,7 @@ class Rig:
 @pytest.fixture
 def rig() -> Rig:
     rig = Rig()
-    rig.start()
+    rig.daq.open()
     rig.run(0.2)
     assert not rig.faults[-1]
     rig.samples.clear()
@@ -152,7 +149,9 @@ def test_times_of_the_device_are_those_of_the_robot(rate: float, delay: Callable
             assert times[-1] <= arrival_s
             errors.append(times[-1] - taken_s)
     assert len(times) > 985
-    assert all(0.965 < (b - a) / 0.01 < 1.035 for a, b in itertools.pairwise(times))  # its rate, and 2 %
+    # A clock that is 1 % fast gets 2 ms ahead while no packet is prompt for 0.2 s, and is then set back at once.
+    tolerance = 0.03 if abs(rate - 1.0) < 1e-3 else 0.2
+    assert all(abs((after - before) / 0.01 - 1.0) < tolerance for before, after in itertools.pairwise(times))
     # Not late by more than the least delay of a window; early by what a clock 1 % too slow gains within two windows.
     assert min(errors[50:]) > -0.005
     assert max(errors[50:]) < 0.004
@@ -175,7 +174,7 @@ def test_a_clock_that_goes_backwards_or_jumps_is_noticed() -> None:
 def test_the_device_is_started_and_read() -> None:
     rig = Rig()
     rig.device.adc = [65535, 0, 32768, 13107, 57000]
-    rig.start()
+    rig.daq.open()
     rig.run(1.0)
     assert rig.daq.identity == "ccatp-daq 1.2 SN7"
     assert len(rig.samples) == pytest.approx(1000, abs=10)  # one packet
@@ -191,7 +190,7 @@ def test_the_device_is_started_and_read() -> None:
 def test_counts_wrap_and_begin_at_zero(start: int, step: int) -> None:
     rig = Rig()
     rig.device.step, rig.device.counts = [step, -step], [start, -start]
-    rig.start()
+    rig.daq.open()
     rig.run(1.0)
     rights, lefts = ([getattr(sample, side) for sample in rig.samples] for side in ("right", "left"))
     assert {b - a for a, b in itertools.pairwise(rights)} == {step}
@@ -203,7 +202,7 @@ def test_counts_wrap_and_begin_at_zero(start: int, step: int) -> None:
 def test_state_of_charge(adc: int, soc: float) -> None:
     rig = Rig()
     rig.device.adc[4] = adc
-    rig.start()
+    rig.daq.open()
     assert rig.daq.soc() == pytest.approx(soc, abs=1e-3)
 
 
@@ -329,7 +328,7 @@ def test_a_device_that_is_not_right_is_refused(broken: Break, message: str) -> N
     rig = Rig()
     broken(rig.device)
     with pytest.raises(HardwareError, match=message):
-        rig.start()
+        rig.daq.open()
 
 
 # -- a serial port of the kernel --------------------------------------------------------------------------------------
@@ -341,7 +340,7 @@ class Terminal:
     def __init__(self, rig: Rig, link: Path) -> None:
         self._rig, self._link = rig, link
         self.master = self.slave = -1
-        self.daq = Daq(CONFIG.model_copy(update={"device": str(link)}), open_serial)
+        self.daq = Daq(CONFIG.model_copy(update={"device": str(link)}), open_serial, rig.time, rig.time.sleep)
 
     def plug(self) -> None:
         self.master, self.slave = pty.openpty()
