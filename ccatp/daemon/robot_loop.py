@@ -10,9 +10,9 @@ from typing import Any
 import zmq
 import zmq.asyncio
 
-from ccatp.daemon import realtime
 from ccatp.daemon.process import ProcessArgs, open_log, processes_of, unless_stopped
 from ccatp.daemon.robot_session import LatenessStatistics, RobotSession
+from ccatp.links import realtime
 from ccatp.links.bus import PERIOD_S, HeartbeatPublisher, PeerSubscriber, Publisher
 from ccatp.links.robot_messages import Role
 

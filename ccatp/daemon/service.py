@@ -1,59 +1,8 @@
-"""The daemon as a systemd service: readiness, watchdog and status by the datagrams of ``sd_notify(3)``."""
-
-import contextlib
-import os
-import socket
-from collections.abc import Mapping, MutableMapping
+"""The daemon as a systemd service: when it says that it is ready, that it lives, and what it does."""
 
 from ccatp.links.liveness import STALE_AFTER_S, Liveness
+from ccatp.links.service_manager import Notifier
 from ccatp.links.topics import Heartbeat, MissionStatus
-
-SOCKET, WATCHDOG_USEC, WATCHDOG_PID = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"
-
-
-class Notifier:
-    """Sends lines like ``READY=1`` to the service manager, if there is one.
-
-    ``address`` is its datagram socket: a path, or a name in the abstract namespace behind ``@``; empty for none.
-    """
-
-    def __init__(self, address: str) -> None:
-        self._address = "\0" + address[1:] if address.startswith("@") else address
-        self.has_listener = address.startswith(("@", "/"))
-
-    def send(self, *lines: str) -> None:
-        """Send one datagram, without waiting for a service manager that does not read."""
-        if not self.has_listener:
-            return
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as peer:
-            peer.setblocking(False)
-            with contextlib.suppress(OSError):
-                peer.sendto("\n".join(lines).encode(), self._address)
-
-
-def watchdog_period_s(environ: Mapping[str, str]) -> float | None:
-    """Period in which the service manager expects ``WATCHDOG=1`` from this process; ``None`` where it does not."""
-    text = environ.get(WATCHDOG_USEC, "")
-    if environ.get(WATCHDOG_PID, str(os.getpid())) != str(os.getpid()) or not text.isdecimal() or int(text) == 0:
-        return None
-    return int(text) * 1e-6
-
-
-def is_journal(descriptor: int, environ: Mapping[str, str]) -> bool:
-    """Whether what is written to a descriptor goes to the journal, which keeps it and shows it to others."""
-    with contextlib.suppress(OSError):  # closed
-        info = os.fstat(descriptor)
-        return environ.get("JOURNAL_STREAM") == f"{info.st_dev}:{info.st_ino}"
-    return False
-
-
-def take_from(environ: MutableMapping[str, str]) -> tuple[Notifier, float | None]:
-    """Notifier and watchdog period; their variables are removed, because the children must not use them."""
-    notifier, period_s = Notifier(environ.get(SOCKET, "")), watchdog_period_s(environ)
-    for name in (SOCKET, WATCHDOG_USEC, WATCHDOG_PID):
-        environ.pop(name, None)
-    return notifier, period_s
-
 
 STATUS_PERIOD_S = 1.0
 # Messages in a watchdog period, and the part of it after which silence of a loop withholds them.

@@ -58,11 +58,12 @@ from ccatp.daemon.run_dir import (
     take_runtime_dir,
     with_origin,
 )
-from ccatp.daemon.service import Service, is_journal, take_from
+from ccatp.daemon.service import Service
 from ccatp.daemon.terminal import STOP_SIGNALS, RunView, write_run_report
 from ccatp.daemon.webhook import AlarmWebhook
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.auth import read_key
+from ccatp.links.service_manager import is_journal, take_from
 from ccatp.links.topics import LEVELS, OPERATOR_MESSAGE, Heartbeat
 from ccatp.records.recorder import RUN_LOCK
 from ccatp.report.dashboard.access import TOKEN_FILE, make_token, read_tokens

@@ -17,9 +17,10 @@ import structlog
 from structlog.testing import capture_logs
 
 from ccatp.config.load import load_config
-from ccatp.daemon import realtime
-from ccatp.daemon.service import Notifier, Service, is_journal, take_from
+from ccatp.daemon.service import Service
+from ccatp.links import realtime
 from ccatp.links.liveness import Liveness
+from ccatp.links.service_manager import Notifier, is_journal, take_from
 from ccatp.links.topics import Heartbeat, MissionStatus
 
 UNIT = Path(__file__).parents[3] / "packaging" / "ccatp.service"
@@ -187,7 +188,7 @@ def test_without_permission_there_is_one_warning_that_says_what_holds(monkeypatc
 
 REALTIME = """
 import os, sys, structlog, zmq
-from ccatp.daemon import realtime
+from ccatp.links import realtime
 context = zmq.Context()
 ends = context.socket(zmq.PAIR), context.socket(zmq.PAIR)
 ends[1].connect(f"tcp://127.0.0.1:{ends[0].bind_to_random_port('tcp://127.0.0.1')}")
@@ -216,7 +217,7 @@ def test_real_time_is_taken_where_it_is_permitted() -> None:
 
 CRUMBLING = """
 import ctypes, sys
-from ccatp.daemon import realtime
+from ccatp.links import realtime
 def resident_kib():
     return next(int(line.split()[1]) for line in open("/proc/self/smaps_rollup") if line.startswith("Anonymous:"))
 reserve_bytes = int(sys.argv[1])
