@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.files import read_key
 from ccatp.config.load import load_onboard_config
 from ccatp.config.models import Config
 from ccatp.config.onboard_models import OnboardConfig
 from ccatp.core import DeckPose
-from ccatp.links.auth import read_key
 from ccatp.mirror.mirror import build_mirror
 from ccatp.onboard.robot import OnboardRobot
 from ccatp.onboard.server import TcpRobotServer

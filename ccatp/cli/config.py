@@ -145,6 +145,7 @@ def keys() -> None:
 @click.option("--force", is_flag=True, help="Replace keys that are there already; peers then need the new ones.")
 def generate(folder: Path, name: str, is_client: bool, force: bool) -> None:
     """Make a CURVE pair for the observatory channel and a key for the robot link."""
+    from ccatp.config.files import FOR_OTHERS
     from ccatp.links import auth as files
     from ccatp.links.runtime_dir import make_own_dir
 
@@ -152,7 +153,7 @@ def generate(folder: Path, name: str, is_client: bool, force: bool) -> None:
     for suffix in (files.PUBLIC_SUFFIX, files.SECRET_SUFFIX, *(() if is_client else (files.LINK_SUFFIX,))):
         if not force and (there := folder / f"{name}{suffix}").exists():
             raise ConfigError(f"--dir: {there} exists; choose another --name, or replace it with --force")
-    make_own_dir(folder, "--dir", files.FOR_OTHERS)
+    make_own_dir(folder, "--dir", FOR_OTHERS)
     public, secret = files.write_pair(folder, name, is_replacing=force)
     print_lines([f"{public}  (public, for the peers)", f"{secret}  (secret, stays here)"])
     if is_client:

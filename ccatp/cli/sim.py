@@ -134,9 +134,9 @@ def conformance(
     """
     from ccatp.commissioning.conformance.motion_checks import notice
     from ccatp.commissioning.conformance.runner import CHECKS, Conformance, as_json, check_ids, last_line, table_line
+    from ccatp.config.files import read_key
     from ccatp.config.load import load_config
     from ccatp.config.messages import choice_hint
-    from ccatp.links.auth import read_key
     from ccatp.mirror.mirror import build_mirror
 
     host, _, port = server.rpartition(":")

@@ -31,6 +31,7 @@ from ccatp.commissioning.preflight import (
     skipped,
     warned,
 )
+from ccatp.config.files import read_key
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
 from ccatp.daemon.child_processes import ProcessManager, ProcessSpec, listen, simulated_servers, with_addresses
@@ -38,7 +39,6 @@ from ccatp.daemon.command_handlers import check_observatory
 from ccatp.daemon.supervisor import PROCESSES
 from ccatp.errors import CcatpError, ConfigError
 from ccatp.etalon_client import EtalonClient, EtalonError, EtalonUnreachable
-from ccatp.links.auth import read_key
 from ccatp.links.robot_link import RobotLink, RobotLinkError
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.runtime_dir import make_runtime_dir

@@ -12,6 +12,7 @@ from ccatp.errors import ConfigError, one_line
 
 # Of a configuration, a plan, a list of clients, a key: 25 times as long as the longest that is shipped.
 MOST_BYTES = 1 << 18
+FOR_OTHERS = stat.S_IRWXG | stat.S_IRWXO
 
 
 def open_input(path: Path) -> BinaryIO:
@@ -53,6 +54,31 @@ def read_toml(path: Path) -> str:
         raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; {what_to_do}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
+
+
+def read_private(path: Path, what: str, forbidden: int, make: str = "make keys with ccatp keys generate") -> bytes:
+    """The content of a file whose mode has none of the ``forbidden`` bits; ``ConfigError``: it cannot be used."""
+    try:
+        data, mode = read_input(path), stat.S_IMODE(path.stat().st_mode)
+    except OSError as error:
+        raise ConfigError(f"{what}: cannot read {path}: {error.strerror}; {make}") from error
+    if mode & forbidden:
+        raise ConfigError(f"{what}: {path} is open to others (mode {mode:04o}); chmod go= {path}")
+    return data
+
+
+def read_key(key_file: str, *, must_be_private: bool = False, what: str = "robot.key_file") -> bytes | None:
+    """Key of the robot link: the file's bytes without white space around them; ``None`` when no file is named.
+
+    ``must_be_private``: refuse a file that others may read; the key of a simulated robot is no secret. ``ConfigError``:
+    the file cannot be read, is empty, or is not private.
+    """
+    if not key_file:
+        return None
+    key = read_private(Path(key_file), what, FOR_OTHERS if must_be_private else 0).strip()
+    if not key:
+        raise ConfigError(f"{what}: {key_file} is empty")
+    return key
 
 
 def write_file(path: Path, text: str, mode: int | None = None, *, is_replacing: bool = True) -> None:

@@ -5,9 +5,9 @@ import random
 from abc import ABC, abstractmethod
 from math import inf
 
+from ccatp.config.files import read_key
 from ccatp.config.models import LinkConfig
 from ccatp.errors import DaemonUnreachableError
-from ccatp.links.auth import read_key
 from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout
 from ccatp.links.robot_messages import CommandEcho, Hello, Role, Sensors
 

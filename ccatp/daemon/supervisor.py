@@ -18,7 +18,7 @@ from typing import Any
 import zmq
 
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.config.files import write_durably
+from ccatp.config.files import read_key, write_durably
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.daemon.child_processes import (
@@ -62,7 +62,6 @@ from ccatp.daemon.service import Service
 from ccatp.daemon.terminal import STOP_SIGNALS, RunView, write_run_report
 from ccatp.daemon.webhook import AlarmWebhook
 from ccatp.errors import ConfigError, ExitStatus
-from ccatp.links.auth import read_key
 from ccatp.links.service_manager import is_journal, take_from
 from ccatp.links.topics import LEVELS, OPERATOR_MESSAGE, Heartbeat
 from ccatp.records.recorder import RUN_LOCK

@@ -23,7 +23,7 @@ from pydantic import Field
 from zmq.auth import load_certificate
 from zmq.utils import z85
 
-from ccatp.config.files import read_input, write_file
+from ccatp.config.files import FOR_OTHERS, read_private, write_file
 from ccatp.config.load import read_source, validated
 from ccatp.config.messages import ConfigProblem
 from ccatp.config.models import Model
@@ -32,7 +32,6 @@ from ccatp.errors import ConfigError
 KEY_CHARACTERS = 40
 PUBLIC_SUFFIX, SECRET_SUFFIX, LINK_SUFFIX, CLIENTS_SUFFIX = ".key", ".key_secret", "-robot.key_secret", "-clients.toml"
 LINK_KEY_BYTES = 32
-FOR_OTHERS = stat.S_IRWXG | stat.S_IRWXO
 CLIENTS_TEXT = """\
 # Who may use the observatory channel over TCP; all others are refused. Read again when it changes.
 # role: raise = may report emergencies; clear = may also end them. Public keys: ccatp keys show-public.
@@ -169,31 +168,6 @@ def _load(path: Path, what: str, forbidden: int, suffix: str) -> tuple[bytes, by
     if why := check_key(public) or check_key(secret or public):
         raise ConfigError(f"{what}: {path} {why}")
     return public, secret
-
-
-def read_private(path: Path, what: str, forbidden: int, make: str = "make keys with ccatp keys generate") -> bytes:
-    """The content of a file whose mode has none of the ``forbidden`` bits; ``ConfigError``: it cannot be used."""
-    try:
-        data, mode = read_input(path), stat.S_IMODE(path.stat().st_mode)
-    except OSError as error:
-        raise ConfigError(f"{what}: cannot read {path}: {error.strerror}; {make}") from error
-    if mode & forbidden:
-        raise ConfigError(f"{what}: {path} is open to others (mode {mode:04o}); chmod go= {path}")
-    return data
-
-
-def read_key(key_file: str, *, must_be_private: bool = False) -> bytes | None:
-    """Key of the robot link: the file's bytes without white space around them; ``None`` when no file is named.
-
-    ``must_be_private``: refuse a file that others may read; the key of a simulated robot is no secret. ``ConfigError``:
-    the file cannot be read, is empty, or is not private.
-    """
-    if not key_file:
-        return None
-    key = read_private(Path(key_file), "robot.key_file", FOR_OTHERS if must_be_private else 0).strip()
-    if not key:
-        raise ConfigError(f"robot.key_file: {key_file} is empty")
-    return key
 
 
 def write_pair(folder: Path, name: str, *, is_replacing: bool) -> list[Path]:

@@ -32,7 +32,7 @@ class TcpRobotServer(RobotServer):
         self.begin(loop.time())
         self._listener = await loop.create_server(self.connect, sock=listener)
         if not self._is_lockstep:
-            self._timer = loop.call_at(self.next_frame_s, self._on_timer)
+            self._start_timer()
         return int(listener.getsockname()[1])
 
     def connect(self) -> "Connection":
@@ -55,8 +55,7 @@ class TcpRobotServer(RobotServer):
 
     async def close(self) -> None:
         """Stop: no timer, no listener, no session."""
-        if self._timer is not None:
-            self._timer.cancel()
+        self._stop_timer()
         if self._listener is None:
             return
         self._listener.close()
@@ -73,14 +72,20 @@ class TcpRobotServer(RobotServer):
         if not self._failure.done():
             self._failure.set_exception(error)
 
+    def _start_timer(self) -> None:
+        self._timer = asyncio.get_running_loop().call_at(self.next_frame_s, self._on_timer)
+
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+
     def _on_timer(self) -> None:
-        loop = asyncio.get_running_loop()
         try:
-            self.tick(loop.time())
+            self.tick(asyncio.get_running_loop().time())
         except Exception as error:
             self.fail(error)
             return
-        self._timer = loop.call_at(self.next_frame_s, self._on_timer)
+        self._start_timer()
 
 
 class Connection(RobotSession, asyncio.Protocol):

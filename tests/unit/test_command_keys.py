@@ -11,9 +11,10 @@ import zmq
 import zmq.auth
 
 from ccatp.cli import main
+from ccatp.config.files import read_key
 from ccatp.config.load import dump_config, load_config
 from ccatp.errors import ConfigError
-from ccatp.links.auth import ClientsFile, read_clients, read_key, read_pair, read_public
+from ccatp.links.auth import ClientsFile, read_clients, read_pair, read_public
 from tests.support.command import refused
 
 # -- ``ccatp keys``: what is written, and what is never shown ---------------------------------------------------------

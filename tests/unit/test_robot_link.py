@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import uvloop
 
+from ccatp.config.files import read_key
 from ccatp.errors import ConfigError, ExitStatus
-from ccatp.links.auth import read_key
 from ccatp.links.robot_codec import RobotFrame, encode, join_mac
 from ccatp.links.robot_link import LineWriter, RobotLink, RobotLinkError, RobotRefused, RobotTimeout, WrongProtocol
 from ccatp.links.robot_messages import CommandEcho, Sensors

@@ -13,10 +13,9 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from ccatp.config.files import write_file
+from ccatp.config.files import FOR_OTHERS, read_private, write_file
 from ccatp.config.models import DashboardConfig
 from ccatp.errors import ConfigError
-from ccatp.links.auth import FOR_OTHERS, read_private
 
 # 128 bits in hexadecimal digits: nothing limits the attempts.
 MIN_CHARACTERS = 32

@@ -1,0 +1,204 @@
+"""The process of the on-board program: the link's server and the control loop in one thread, the service manager.
+
+One event loop does everything: at ``servo.loop_hz`` it runs the wheels, and after the step that completes a frame it
+sends the frame. Only the inertial unit, whose bus may hang, is read in a thread of its own. What stops this process
+stops the external timer's signal, which brakes the motors.
+"""
+
+import asyncio
+import gc
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import structlog
+
+from ccatp.config.files import read_key
+from ccatp.config.onboard_models import OnboardConfig
+from ccatp.links import realtime
+from ccatp.links.service_manager import take_from
+from ccatp.onboard.hardware import Hardware
+from ccatp.onboard.robot import OnboardRobot
+from ccatp.onboard.server import TcpRobotServer
+from ccatp.onboard.timer import PeriodicTimer
+
+PRIORITY = 40  # of SCHED_FIFO, where permitted: below the kernel's own interrupt threads (50)
+_BIN_S, _BINS = 1e-5, 10_000
+_WATCHDOG_SHARE = 0.25  # of the watchdog's period, between two signs of life
+_REPORT_S = 10.0  # a fault that flickers is logged at most so often
+
+
+@dataclass
+class Lateness:
+    """By how much the steps of a loop came later than a period after the one before: a histogram of bounded size."""
+
+    counts: list[int] = field(default_factory=lambda: [0] * _BINS)
+    steps: int = 0
+    largest_s: float = 0.0
+
+    def add(self, late_s: float) -> None:
+        """Count a step."""
+        self.steps += 1
+        self.counts[min(max(int(late_s / _BIN_S), 0), _BINS - 1)] += 1
+        self.largest_s = max(self.largest_s, late_s)
+
+    def percentile_s(self, share: float) -> float:
+        """No more than this late was that share of the steps, to within a bin."""
+        left = share * self.steps
+        for k, count in enumerate(self.counts):
+            left -= count
+            if left <= 0.0:
+                return (k + 1) * _BIN_S
+        return self.largest_s
+
+
+class OnboardServer(TcpRobotServer):
+    """The link's server of the robot itself. Its clock is that of the computer since ``boot_s`` (of ``monotonic``).
+
+    Attributes:
+        lateness: of the control loop.
+        each_step: called with the time after each step.
+    """
+
+    robot: OnboardRobot
+
+    def __init__(
+        self,
+        robot: OnboardRobot,
+        loop_hz: float,
+        boot_s: float,
+        *,
+        key: bytes | None = None,
+        log: structlog.typing.FilteringBoundLogger,
+    ) -> None:
+        super().__init__(robot, lockstep=False, key=key, log=log)
+        self._step_s, self._device_log = 1.0 / loop_hz, log
+        self._periodic: PeriodicTimer | None = None
+        self._started_s, self._clock_s = boot_s, 0.0
+        self.lateness = Lateness()
+        self._reported: dict[str, float] = {}
+        self._faults: frozenset[str] = frozenset()
+        self.each_step: Callable[[float], None] = lambda _: None
+
+    def begin(self, now_s: float) -> None:
+        """The robot boots; samples have been taken since ``boot_s``."""
+        super().begin(self._started_s)
+        self._clock_s = now_s
+
+    def _start_timer(self) -> None:
+        self._periodic = PeriodicTimer(self._step_s, self._on_step)
+
+    def _stop_timer(self) -> None:
+        if self._periodic is not None:
+            self._periodic.close()
+
+    def _on_step(self) -> None:
+        try:
+            self.step(asyncio.get_running_loop().time())
+        except Exception as error:
+            self._stop_timer()
+            self.fail(error)
+
+    def step(self, now_s: float) -> None:
+        """Run the wheels, and send the frame that is complete."""
+        robot = self.robot
+        self.lateness.add(now_s - self._clock_s - self._step_s)
+        self._clock_s = now_s
+        robot.control(now_s - self._boot_s)
+        if robot.faults.keys() != self._faults:
+            self._report(now_s)
+        if now_s + 0.5 * self._step_s >= self.next_frame_s:
+            self.tick(now_s)
+        self.each_step(now_s)
+
+    def _skip_stop(self, now_s: float) -> float:
+        # The clock of samples and frames is one, and goes on while the process stands.
+        return now_s - self.next_frame_s
+
+    def _drive_frame(self) -> None:
+        self.robot.advance_to(self._frame_wall_s - self._boot_s)
+        for call in self.each_frame:
+            call()
+
+    def _report(self, now_s: float) -> None:
+        faults, self._faults = self.robot.faults, frozenset(self.robot.faults)
+        for name, why in faults.items():
+            if now_s - self._reported.get(name, -_REPORT_S) >= _REPORT_S:
+                self._reported[name] = now_s
+                self._device_log.warning("device_failed", device=name, why=why)
+
+
+async def serve(
+    cfg: OnboardConfig,
+    hardware: Hardware,
+    listener: socket.socket,
+    stop: asyncio.Event,
+    log: structlog.typing.FilteringBoundLogger,
+    boot_s: float,
+) -> OnboardServer:
+    """Run the robot on hardware that was started, until ``stop`` is set; the server, for its statistics."""
+    notifier, watchdog_s = take_from(os.environ)
+    robot = OnboardRobot(cfg, hardware)
+    server = OnboardServer(
+        robot,
+        cfg.servo.loop_hz,
+        boot_s,
+        key=read_key(cfg.link.key_file, must_be_private=True, what="link.key_file"),
+        log=log,
+    )
+    if watchdog_s is not None:
+        period_s, sent_s = _WATCHDOG_SHARE * watchdog_s, [0.0]
+
+        def stroke(now_s: float) -> None:
+            # Out of the control loop: a loop that hangs must not be said to live.
+            if now_s - sent_s[0] >= period_s:
+                sent_s[0] = now_s
+                notifier.send("WATCHDOG=1")
+
+        server.each_step = stroke
+    # A collection in the middle of a step would be the longest delay of all.
+    gc.collect()
+    gc.freeze()
+    port = await server.start(listener)
+    notifier.send("READY=1", f"STATUS=robot link at port {port}")
+    try:
+        await server.run(stop)
+    finally:
+        notifier.send("STOPPING=1")
+        late = server.lateness
+        log.info(
+            "control_loop",
+            steps=late.steps,
+            late_us_p50=round(1e6 * late.percentile_s(0.5)),
+            late_us_p99=round(1e6 * late.percentile_s(0.99)),
+            late_us_max=round(1e6 * late.largest_s),
+            missed_timer=robot.late_steps,
+            dropped_samples=robot.dropped_samples,
+        )
+    return server
+
+
+def run(
+    cfg: OnboardConfig,
+    make_hardware: Callable[[Callable[[], float]], Hardware],
+    listener: socket.socket,
+    log: structlog.typing.FilteringBoundLogger,
+) -> int:
+    """The program until SIGTERM or SIGINT; ``make_hardware`` gets the robot's clock. Raises ``HardwareError``."""
+    loop = asyncio.new_event_loop()
+    boot_s = time.monotonic()
+    hardware = make_hardware(lambda: time.monotonic() - boot_s)
+    try:
+        hardware.start()
+        realtime.enter(PRIORITY, log)
+        stop = asyncio.Event()
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            loop.add_signal_handler(number, stop.set)
+        loop.run_until_complete(serve(cfg, hardware, listener, stop, log, boot_s))
+    finally:
+        hardware.close()
+        loop.close()
+    return 0
