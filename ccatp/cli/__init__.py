@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import click
 
 import ccatp
-from ccatp.cli import config, operate, prepare, radio, recording, report, run, runs, sim, study
+from ccatp.cli import config, onboard, operate, prepare, radio, recording, report, run, runs, sim, study
 from ccatp.cli.common import CommandGroup, example, run_command_line
 
 SECTIONS = {
@@ -20,7 +20,7 @@ SECTIONS = {
     "Data": (
         *(runs.runs, report.report, report.compare, report.align, report.replay, report.plot, recording.recording),
     ),
-    "Simulation and robots": (sim.sim, sim.conformance),
+    "Simulation and robots": (sim.sim, onboard.onboard, sim.conformance),
     "Studies": (study.study, study.bench, radio.radio),
     "Shell": (config.completion,),
 }

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 
 import structlog
 
-from ccatp.config.files import read_key
 from ccatp.config.onboard_models import OnboardConfig
 from ccatp.links import realtime
 from ccatp.links.service_manager import take_from
@@ -136,6 +135,7 @@ async def serve(
     hardware: Hardware,
     listener: socket.socket,
     stop: asyncio.Event,
+    key: bytes | None,
     log: structlog.typing.FilteringBoundLogger,
     boot_s: float,
 ) -> OnboardServer:
@@ -146,7 +146,7 @@ async def serve(
         robot,
         cfg.servo.loop_hz,
         boot_s,
-        key=read_key(cfg.link.key_file, must_be_private=True, what="link.key_file"),
+        key=key,
         log=log,
     )
     if watchdog_s is not None:
@@ -185,6 +185,7 @@ def run(
     cfg: OnboardConfig,
     make_hardware: Callable[[Callable[[], float]], Hardware],
     listener: socket.socket,
+    key: bytes | None,
     log: structlog.typing.FilteringBoundLogger,
 ) -> int:
     """The program until SIGTERM or SIGINT; ``make_hardware`` gets the robot's clock. Raises ``HardwareError``."""
@@ -197,7 +198,7 @@ def run(
         stop = asyncio.Event()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             loop.add_signal_handler(number, stop.set)
-        loop.run_until_complete(serve(cfg, hardware, listener, stop, log, boot_s))
+        loop.run_until_complete(serve(cfg, hardware, listener, stop, key, log, boot_s))
     finally:
         hardware.close()
         loop.close()

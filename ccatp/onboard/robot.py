@@ -22,7 +22,7 @@ from ccatp.onboard.rules import HELD, LinkedRobot
 from ccatp.onboard.wheel_servo import WheelServo
 
 # Without these the robot does not move. A weak fan or battery is for its clients to judge.
-NEEDED = ("imu", "encoder_right", "encoder_left", "edge")
+NEEDED = ("imu", "encoder_right", "encoder_left", "edge", "stall")
 _LINE_SAMPLES = 24  # of one sensor in a line: a burst after a gap must not exceed the line's limit
 
 WheelRates = tuple[float, float | None, float | None]
@@ -53,7 +53,7 @@ class OnboardRobot(LinkedRobot):
         self.late_steps = self.dropped_samples = 0
         self._control_s: float | None = None
         self._commanded_duty: tuple[float, float] | None = None
-        self._soc = 1.0
+        self._soc, self._stall = 1.0, ""
         self._line = b""
         self._clear()
         # The duties of before are in force; the floor comes with the first command.
@@ -84,11 +84,14 @@ class OnboardRobot(LinkedRobot):
         is_late = dt_s > self._cfg.devices.timer.timeout_s
         self.late_steps += is_late
         right, left = self._servos
-        stalled = "stall" if right.is_stalled or left.is_stalled else ""
-        if stalled and not (right_set or left_set):
-            right.is_stalled = left.is_stalled = False
-        failed = next((name for name in NEEDED if name in self.faults), "") or stalled
-        if failed or is_late:
+        for servo, name in ((right, "right"), (left, "left")):
+            if servo.is_stalled:
+                self._stall = f"full voltage and no motion, {name} wheel"
+        if not (right_set or left_set):
+            self._stall = ""
+        if self._stall:
+            self.faults["stall"] = self._stall
+        if is_late or any(name in self.faults for name in NEEDED):
             right_set, left_set = HELD
             self.rules.is_held = True
         try:
@@ -122,9 +125,6 @@ class OnboardRobot(LinkedRobot):
                 edge.read(t_s, voltage_v) for edge, voltage_v in zip(self._edges, voltages, strict=True)
             )
             self._edge.append((t_s, front_left, front_right, rear_left, rear_right))
-        for right_servo, name in ((self._servos[0], "encoder_right"), (self._servos[1], "encoder_left")):
-            if right_servo.is_stalled:
-                self.faults.setdefault("stall", f"full voltage and no motion, {name.removeprefix('encoder_')} wheel")
 
     def _count(self, t_s: float, right: int | None, left: int | None) -> None:
         """Speeds from the counts since the reading before: their sum over time is the angle exactly."""

@@ -23,7 +23,6 @@ class WheelServo:
     Attributes:
         rate_rad_s: measured speed over ``speed_window_s``.
         voltage_v: what the motor was given last.
-        is_stalled: full voltage without motion for ``stall_s``; until the next set point of zero.
     """
 
     def __init__(self, cfg: WheelServoConfig) -> None:
@@ -31,7 +30,6 @@ class WheelServo:
         self._rad_per_count = 2.0 * pi / cfg.counts_per_rev
         self._window: deque[tuple[float, int]] = deque()
         self.rate_rad_s = self.voltage_v = 0.0
-        self.is_stalled = False
         self._reference_rad_s = 0.0
         self._ahead_rad = 0.0  # reference angle less the wheel's
         self._last_count: int | None = None
@@ -61,7 +59,6 @@ class WheelServo:
         self._reference_rad_s = reference = set_point_rad_s + (before - set_point_rad_s) * decay
         if set_point_rad_s == 0.0 and abs(reference) < _REST_RAD_S:
             self._reference_rad_s = reference = 0.0
-            self.is_stalled, self._stalled_s = False, 0.0
         way_rad = set_point_rad_s * dt_s + (before - set_point_rad_s) * cfg.response_s * (1.0 - decay)
         ahead_rad = self._ahead_rad + way_rad
         wanted_v = cfg.volt_per_rad_s * reference + cfg.proportional_v_per_rad_s * (reference - self.rate_rad_s)
@@ -75,14 +72,14 @@ class WheelServo:
         if voltage_v == wanted_v or way_rad * (wanted_v - voltage_v) < 0.0:
             self._ahead_rad = ahead_rad
         self.voltage_v = voltage_v
-        self._watch_stall(dt_s)
+        is_pushing = abs(voltage_v) >= cfg.max_v and abs(self.rate_rad_s) < _REST_RAD_S
+        self._stalled_s = self._stalled_s + dt_s if is_pushing else 0.0
         return voltage_v
 
-    def _watch_stall(self, dt_s: float) -> None:
-        cfg = self._cfg
-        is_pushing = abs(self.voltage_v) >= cfg.max_v and abs(self.rate_rad_s) < _REST_RAD_S
-        self._stalled_s = self._stalled_s + dt_s if is_pushing else 0.0
-        self.is_stalled = self.is_stalled or self._stalled_s >= cfg.stall_s
+    @property
+    def is_stalled(self) -> bool:
+        """Full voltage and no motion, for ``stall_s``."""
+        return self._stalled_s >= self._cfg.stall_s
 
     def release(self) -> None:
         """The motor is braked by other means: nothing of the past pushes it afterwards."""

@@ -70,7 +70,8 @@ MOTOR_12V = Motor(volt=12.0, no_load_rad_s=47.1 / _GEAR, stall_nm=0.0981 * _GEAR
 class SimulatedHardware:
     """The devices of a simulated robot; ``read`` moves the world on to its time.
 
-    ``rng`` is the parent of the random draws. ``faults`` may be filled by a test: they are reported as they are.
+    ``rng`` is the parent of the random draws; with ``is_lifted`` the wheels turn freely. ``faults`` may be filled by a
+    test: they are reported as they are.
 
     Attributes:
         world: the truth.
@@ -87,6 +88,7 @@ class SimulatedHardware:
         loop_hz: float,
         counts_per_rev: float,
         motor: Motor = MOTOR_12V,
+        is_lifted: bool = False,
     ) -> None:
         inertia_kg_m2 = 0.5 * _MASS_KG * cfg.robot.wheel_radius_m**2
         sim_robot = cfg.sim.robot.model_copy(
@@ -104,6 +106,9 @@ class SimulatedHardware:
         floor_duty = sim_robot.fan_floor if mirror.overhang else 0.0
         self._duty = (floor_duty, floor_duty)
         self._step = -1
+        self._is_lifted = is_lifted
+        if is_lifted:
+            self.world.grip = (0.0, 0.0)
         self.voltages_v = (0.0, 0.0)
         self.faults: dict[str, str] = {}
         self.timer_calls = 0
@@ -137,6 +142,7 @@ class SimulatedHardware:
     def _move(self) -> None:
         t_s, dt_s = (self._step - 1) / self._loop_hz, 1.0 / self._loop_hz
         ahead, _, _ = downhill(self.world.plant, self._mirror.gravity_deck)
+        ahead = 0.0 if self._is_lifted else ahead
         load_nm = -0.5 * _MASS_KG * _G_M_S2 * ahead * self._cfg.robot.wheel_radius_m
         right, left = (self._motor.steady_rad_s(voltage_v, load_nm) for voltage_v in self.voltages_v)
         self.world.step(t_s, dt_s, right, left, 0.5 * (self._duty[0] + self._duty[1]))

@@ -1,0 +1,192 @@
+"""The command ``ccatp onboard``: the program on the robot's own computer."""
+
+import json
+import socket
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ccatp.cli.common import (
+    CONFIG_OPTION,
+    JSON_OPTION,
+    PATH,
+    SETTINGS_OPTION,
+    CommandGroup,
+    address_options,
+    example,
+    print_lines,
+    run_command_line,
+    warn,
+)
+from ccatp.errors import CcatpError, ConfigError, ExitStatus
+
+if TYPE_CHECKING:
+    from ccatp.config.onboard_models import OnboardConfig
+    from ccatp.onboard.devices.linux import LinuxHardware
+    from ccatp.onboard.tuning import Tuning
+
+CHECK_S = 2.0
+_BACKLOG = 32
+
+
+class DeviceUnreachable(CcatpError):
+    """A device of the robot does not do what it must."""
+
+    exit_status = ExitStatus.UNREACHABLE
+
+
+@click.group(
+    "onboard", cls=CommandGroup, invoke_without_command=True,
+    epilog=example("ccatp onboard --config robot.toml --check", "ccatp onboard --config robot.toml"),
+)  # fmt: skip
+@CONFIG_OPTION
+@address_options("link")
+@SETTINGS_OPTION
+@click.option("--check", "is_check", is_flag=True, help="Look at each device, without driving, and end.")
+@JSON_OPTION
+@click.pass_context
+def onboard(
+    ctx: click.Context, config_file: Path | None, settings: Mapping[str, object], is_check: bool, json_output: bool
+) -> int:
+    """Run the program on the robot's own computer: link server, low-level control, devices.
+
+    The configuration is that of configs/onboard.toml. It ends on SIGTERM or Ctrl-C: the wheels brake, the fans stay.
+    """
+    ctx.obj = (config_file, settings)
+    if ctx.invoked_subcommand is not None:
+        return 0
+    from ccatp.config.load import load_onboard_config
+
+    cfg = load_onboard_config(config_file, settings)
+    return _check(cfg, json_output=json_output) if is_check else _run(cfg)
+
+
+def _hardware(cfg: "OnboardConfig", clock: Callable[[], float]) -> "LinuxHardware":
+    from ccatp.onboard.devices.linux import LinuxHardware
+
+    return LinuxHardware(cfg.devices, clock)
+
+
+def _run(cfg: "OnboardConfig") -> int:
+    import sys
+
+    import structlog
+
+    from ccatp.config.files import read_key
+    from ccatp.onboard.hardware import HardwareError
+    from ccatp.onboard.program import run
+
+    key = read_key(cfg.link.key_file, must_be_private=True, what="link.key_file")
+    if key is None and cfg.link.host not in {"127.0.0.1", "::1", "localhost"}:
+        warn([f"without link.key_file anyone who reaches {cfg.link.host}:{cfg.link.port} can drive the robot"])
+    log = structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
+    with _listen(cfg.link.host, cfg.link.port) as listener:
+        host, port = listener.getsockname()[:2]
+        click.echo(f"ccatp: robot on {host}:{port}", err=True)
+        try:
+            return run(cfg, lambda clock: _hardware(cfg, clock), listener, key, log)
+        except HardwareError as error:
+            raise DeviceUnreachable(str(error)) from error
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family, backlog=_BACKLOG)
+    except OSError as error:
+        why = (error.strerror or str(error)).partition(" (while")[0]
+        raise ConfigError(
+            f"link.port: cannot listen on {host}:{port}: {why}; stop who uses it, or set another"
+        ) from error
+
+
+def _check(cfg: "OnboardConfig", *, json_output: bool) -> int:
+    boot_s = time.monotonic()
+    checks = _hardware(cfg, lambda: time.monotonic() - boot_s).check(CHECK_S)
+    if json_output:
+        click.echo(json.dumps([check._asdict() for check in checks]))
+    else:
+        for check in checks:
+            found = f"{check.identity or 'found'}" if check.found else "not found"
+            figures = f"{check.rate_hz:.0f}/s" if check.rate_hz else "-"
+            verdict = "ok" if check.passed else "FAIL"
+            advice = "" if check.passed else f"; {check.advice}"
+            print_lines([f"{check.device:<14} {verdict:<5} {figures:>7}  {found}  {check.noise}{advice}".rstrip()])
+    return ExitStatus.COMPLETE if all(check.passed for check in checks) else ExitStatus.UNREACHABLE
+
+
+@onboard.command(epilog=example("ccatp onboard --config robot.toml tune --wheels-are-free --out tuning"))
+@click.option("--wheels-are-free", is_flag=True, help="The robot is lifted: its wheels turn at up to full speed.")
+@click.option("--out", "out_dir", type=PATH, help="Folder for the step response: CSV, and a figure with matplotlib.")
+@JSON_OPTION
+@click.pass_obj
+def tune(
+    given: tuple[Path | None, Mapping[str, object]], wheels_are_free: bool, out_dir: Path | None, json_output: bool
+) -> int:
+    """Find friction, slope and gains of the wheel servos with free wheels, in about half a minute."""
+    from ccatp.config.load import load_onboard_config
+    from ccatp.onboard.hardware import HardwareError
+    from ccatp.onboard.tuning import tune as find
+
+    if not wheels_are_free:
+        raise click.UsageError("the wheels will turn at up to full speed: lift the robot, then add --wheels-are-free")
+    cfg = load_onboard_config(*given)
+    boot_s = time.monotonic()
+
+    def clock() -> float:
+        return time.monotonic() - boot_s
+
+    hardware = _hardware(cfg, clock)
+    try:
+        hardware.start()
+        found = find(hardware, cfg.servo, clock, time.sleep, lambda text: click.echo(text, err=True))
+    except HardwareError as error:
+        raise DeviceUnreachable(str(error)) from error
+    finally:
+        hardware.close()
+    if out_dir is not None:
+        write_tuning(out_dir, found)
+    if json_output:
+        click.echo(json.dumps({**found._asdict(), "right": found.right._asdict(), "left": found.left._asdict()}))
+        return 0
+    print_lines(
+        [
+            *(
+                f"{name:<6} static {wheel.static_v:.2f} V, {wheel.volt_per_rad_s:.3f} V per rad/s, "
+                f"time constant {1e3 * wheel.time_constant_s:.0f} ms, fit to {wheel.residual_v:.2f} V"
+                for name, wheel in (("right", found.right), ("left", found.left))
+            ),
+            f"step: off its course by {found.deviation_rad_s:.3f} rad/s rms, overshoot {found.overshoot_share:.1%}",
+            "",
+            "[servo]",
+            *(f"{key} = {value}" for key, value in found.values.items()),
+        ]
+    )
+    return 0
+
+
+def write_tuning(folder: Path, found: "Tuning") -> None:
+    """``step.csv`` and, where matplotlib is installed, ``step.png``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = [f"{t_s:.4f},{rate:.4f},{wanted:.4f}" for t_s, rate, wanted in found.step]
+    (folder / "step.csv").write_text("\n".join(["t_s,speed_rad_s,wanted_rad_s", *rows]) + "\n", encoding="utf-8")
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError:
+        return
+    figure = Figure(figsize=(6.0, 3.5), layout="constrained")
+    axes = figure.add_subplot()
+    t_s, rate, wanted = zip(*found.step, strict=True)
+    axes.plot(t_s, rate, label="right wheel")
+    axes.plot(t_s, wanted, "--", label="wanted")
+    axes.set(xlabel="time, s", ylabel="wheel speed, rad/s", title="Step with the new gains")
+    axes.legend()
+    figure.savefig(folder / "step.png", dpi=150)
+
+
+def main() -> int:
+    """Entry of ``ccatp-onboard``, the small package for the robot's computer."""
+    return run_command_line(onboard)

@@ -1,0 +1,237 @@
+"""The robot's own program over simulated hardware: what reaches the motors, and what stands in its frames."""
+
+import numpy as np
+import pytest
+
+from ccatp.config.load import load_config, load_onboard_config
+from ccatp.links.robot_codec import MAX_LINE_BYTES, decode_from_robot
+from ccatp.links.robot_messages import Sensors
+from ccatp.mirror.mirror import build_mirror
+from ccatp.onboard.hardware import HardwareError, Readings
+from ccatp.onboard.robot import OnboardRobot
+from ccatp.sim.hardware import MOTOR_12V, SimulatedHardware
+
+MIRROR = load_config().mirror
+CFG = load_onboard_config()
+STEP_S = 1.0 / CFG.servo.loop_hz
+STEPS_A_FRAME = round(CFG.servo.loop_hz / CFG.link.frame_hz)
+
+
+class Bench:
+    """The robot on a level mirror with a controller; the steps of its loop, and its frames."""
+
+    def __init__(self, mirror: str = "thesis-m1", **robot: float) -> None:
+        cfg = load_config(overrides={"run.mirror": mirror})
+        self.hardware = SimulatedHardware(
+            cfg,
+            build_mirror(cfg.mirror),
+            np.random.default_rng(1),
+            loop_hz=CFG.servo.loop_hz,
+            counts_per_rev=CFG.servo.counts_per_rev,
+        )
+        onboard = CFG.model_copy(update={"robot": CFG.robot.model_copy(update=robot)})
+        self.robot = OnboardRobot(onboard, self.hardware)
+        self.robot.join("controller")
+        self.steps = self.seq = 0
+        self.frames: list[Sensors] = []
+
+    @property
+    def t_s(self) -> float:
+        return self.steps * STEP_S
+
+    def run(self, duration_s: float, right: float | None = None, left: float = 0.0) -> list[Sensors]:
+        """Frames of a time; with a (right, left) drive for each frame."""
+        first = len(self.frames)
+        for _ in range(round(duration_s / STEP_S)):
+            if right is not None and self.steps % STEPS_A_FRAME == 0:
+                self.seq += 1
+                assert self.robot.drive(self.seq, right, left, self.t_s)
+            self.robot.control(self.t_s)
+            self.steps += 1
+            if self.steps % STEPS_A_FRAME == 0:
+                self.robot.advance_to(self.t_s - STEP_S)
+                assert len(self.robot.delivered_line) <= MAX_LINE_BYTES
+                frame = decode_from_robot(self.robot.delivered_line[:-1])
+                assert isinstance(frame, Sensors)
+                self.frames.append(frame)
+        return self.frames[first:]
+
+    @property
+    def rates(self) -> list[float]:
+        plant = self.hardware.world.plant
+        return [plant.right_rad_s, plant.left_rad_s]
+
+
+def test_a_drive_turns_the_wheels_and_frames_hold_every_sample_once() -> None:
+    bench = Bench()
+    frames = bench.run(1.0, 3.0, 2.0)
+    assert bench.rates == pytest.approx([3.0, 2.0], abs=0.2)
+    times = [row.t_s for frame in frames for row in frame.enc]
+    assert np.allclose(np.diff(times), STEP_S)
+    turned = sum(row.right_rad_s or 0.0 for frame in frames for row in frame.enc) * STEP_S
+    assert turned == pytest.approx(bench.hardware.world.plant.right_angle_rad, abs=0.01)
+    assert [frame.seq for frame in frames] == list(range(frames[0].seq, frames[0].seq + len(frames)))
+    assert {frame.cmd.held for frame in frames[1:]} == {False}
+    assert all(row[1:] == (1, 1, 1, 1) for frame in frames for row in frame.edge)
+    assert any(frame.gravity for frame in frames)
+    assert all(len(frame.imu) == 1 for frame in frames[1:])
+
+
+def stops(bench: Bench) -> float:
+    """Time until the wheels get no more voltage than holds them, after what stopped them."""
+    start_s = bench.t_s
+    while bench.robot.rules.is_held is False:
+        bench.run(STEP_S)
+    return bench.t_s - start_s
+
+
+@pytest.mark.parametrize("why", ["controller", "monitor", "ttl", "zero"])
+def test_what_ends_a_drive_holds_the_wheels_within_a_step_of_the_loop(why: str) -> None:
+    bench = Bench()
+    if why == "monitor":
+        bench.robot.join("monitor")
+        assert bench.robot.permit(1, True, True, True, bench.t_s + 10.0)
+    bench.run(0.5, 3.0, 3.0)
+    assert not bench.robot.rules.is_held
+    if why in {"controller", "monitor"}:
+        bench.robot.lose(why)  # type: ignore[arg-type]
+        assert stops(bench) <= 2.0 * STEP_S
+    elif why == "ttl":
+        assert stops(bench) == pytest.approx(CFG.link.ttl_s, abs=STEPS_A_FRAME * STEP_S)
+    else:
+        bench.run(0.01, 0.0, 0.0)
+    bench.run(0.5)
+    assert bench.rates == pytest.approx([0.0, 0.0], abs=0.01)
+
+
+@pytest.mark.parametrize("name", ["imu", "edge", "encoder_right", "encoder_left"])
+def test_a_device_that_is_needed_holds_the_wheels_until_it_works(name: str) -> None:
+    bench = Bench()
+    bench.run(0.5, 3.0, 3.0)
+    bench.hardware.faults[name] = "no reading"
+    frames = bench.run(0.5, 3.0, 3.0)
+    assert frames[-1].faults == [name]
+    assert frames[-1].cmd.held
+    assert bench.rates == pytest.approx([0.0, 0.0], abs=0.2)
+    bench.hardware.faults.clear()
+    frames = bench.run(0.5, 3.0, 3.0)
+    assert not frames[-1].cmd.held
+    assert bench.rates[0] == pytest.approx(3.0, abs=0.2)
+
+
+@pytest.mark.parametrize("name", ["fan_left", "battery_low"])
+def test_other_faults_are_reported_and_hold_nothing(name: str) -> None:
+    bench = Bench()
+    bench.hardware.faults[name] = "why"
+    frames = bench.run(0.5, 3.0, 3.0)
+    assert (frames[-1].faults, frames[-1].cmd.held) == ([name], False)
+
+
+def test_a_wheel_without_its_encoder_is_braked_and_not_driven_blindly() -> None:
+    bench = Bench()
+    bench.run(0.5, 3.0, 3.0)
+    bench.hardware.faults["encoder_left"] = "no sample"
+    bench.run(STEP_S, 3.0, 3.0)
+    assert bench.hardware.voltages_v == (0.0, 0.0)
+
+
+def test_a_stalled_wheel_is_reported_and_held_until_a_drive_of_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    monkeypatch.setattr(bench.hardware, "_motor", MOTOR_12V._replace(friction_nm=1.0))
+    bench.run(1.5, 3.0, 3.0)
+    assert bench.frames[-1].faults == ["stall"]
+    assert bench.frames[-1].cmd.held
+    frames = bench.run(0.5, 3.0, 3.0)
+    assert frames[-1].cmd.held  # the controller has not seen it yet
+    monkeypatch.undo()
+    bench.run(0.6, 0.0, 0.0)
+    frames = bench.run(0.5, 3.0, 3.0)
+    assert (frames[-1].faults, frames[-1].cmd.held) == ([], False)
+
+
+def test_a_loop_that_stood_longer_than_the_external_timer_brakes_for_that_step() -> None:
+    bench = Bench()
+    bench.run(0.5, 3.0, 3.0)
+    bench.steps += 30  # 60 ms
+    bench.robot.control(bench.t_s)
+    assert bench.robot.late_steps == 1
+    assert bench.hardware.voltages_v == (0.0, 0.0)
+    bench.steps += 1
+    bench.run(0.3, 3.0, 3.0)
+    assert bench.rates[0] == pytest.approx(3.0, abs=0.3)
+
+
+def test_a_motor_that_cannot_be_set_holds_and_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+
+    def refuse(right_v: float, left_v: float) -> None:
+        raise HardwareError("pwm0: Input/output error")
+
+    monkeypatch.setattr(bench.hardware, "drive", refuse)
+    frames = bench.run(0.1, 3.0, 3.0)
+    assert frames[-1].faults == ["stall"]
+    assert bench.robot.faults["motors"] == "pwm0: Input/output error"
+
+
+def test_fans_keep_the_duty_that_was_in_force_and_change_by_command_alone() -> None:
+    bench = Bench(fan_floor=0.6)
+    bench.hardware.command_fans(0.7, 0.8)
+    robot = OnboardRobot(bench.robot._cfg, bench.hardware)
+    bench.robot = robot
+    robot.join("controller")
+    assert bench.run(0.1)[-1].fans == (0.7, 0.8)
+    robot.lose("controller")
+    bench.hardware.faults["imu"] = "no reading"
+    bench.run(0.5)
+    assert bench.hardware.fans() == (0.7, 0.8)
+    robot.join("controller")
+    assert robot.command_fans(1, 0.3, 0.9)
+    assert bench.run(0.1)[-1].fans == (0.6, 0.9)  # the floor
+    assert bench.hardware.fans() == (0.6, 0.9)
+
+
+def test_a_fan_that_cannot_be_set_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+
+    def refuse(left: float, right: float) -> None:
+        raise HardwareError("pwm1: Permission denied")
+
+    bench.run(0.02)
+    monkeypatch.setattr(bench.hardware, "command_fans", refuse)
+    assert bench.robot.command_fans(1, 0.5, 0.5)
+    assert bench.run(0.05)[-1].faults == ["fan_left", "fan_right"]
+
+
+def test_counts_after_a_gap_give_no_speed_and_a_wheel_that_was_not_read_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    bench.run(0.1)
+    rows = [(0.2, 10, 10), (0.202, 12, None), (0.204, 14, 13), (0.5, 1000, 1000), (0.502, 1002, 1003)]
+    monkeypatch.setattr(bench.hardware, "read", lambda _: Readings([], rows, [], None, 1.0, {}))
+    bench.robot.control(0.51)
+    per_step = 2.0 * np.pi / CFG.servo.counts_per_rev / STEP_S
+    assert [row[0] for row in bench.robot._enc][-3:] == [0.202, 0.204, 0.502]
+    assert [row[1] for row in bench.robot._enc][-3:] == pytest.approx([2 * per_step] * 3)
+    assert [row[2] for row in bench.robot._enc][-3:] == [None, None, pytest.approx(3 * per_step)]
+
+
+def test_a_burst_of_samples_keeps_the_newest_in_a_line_that_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    bench.run(0.1)
+    rows = [(0.2 + 0.001 * k, k, k) for k in range(400)]
+    monkeypatch.setattr(bench.hardware, "read", lambda _: Readings([], rows, [], None, 1.0, {}))
+    bench.robot.control(0.61)
+    bench.robot.advance_to(0.61)
+    frame = decode_from_robot(bench.robot.delivered_line[:-1])
+    assert isinstance(frame, Sensors)
+    assert frame.enc[-1].t_s == pytest.approx(0.599)
+    assert len(frame.enc) < 100
+    assert bench.robot.dropped_samples > 300
+
+
+def test_frames_that_a_stop_left_out_are_not_made_up_for() -> None:
+    bench = Bench()
+    bench.run(0.1)
+    before = bench.robot.seq
+    bench.robot.advance_to(0.5)
+    assert (bench.robot.seq, bench.robot.t_s) == (50, 0.5)
+    assert before == 10
