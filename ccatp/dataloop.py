@@ -124,6 +124,7 @@ def motor_robot(cfg: Config, start: DeckPose | None = None) -> MotorRobot:
         overrides={
             "link.frame_hz": sim.frame_hz,
             "link.ttl_s": sim.ttl_s,
+            "link.sample_latency_s": 0.0,
             "robot.wheel_radius_m": robot.wheel_radius_m,
             "robot.wheel_base_m": robot.wheel_base_m,
             "robot.edge_sensors_m": robot.edge_sensors_m,

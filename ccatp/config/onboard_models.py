@@ -19,6 +19,7 @@ class OnboardLinkConfig(Model):
     key_file: Text  # empty = no authentication
     frame_hz: Annotated[float, Field(ge=10.0, le=200.0)]
     ttl_s: Annotated[float, Field(gt=0.0, le=1.0)]
+    sample_latency_s: Annotated[float, Field(ge=0.0, le=0.05)]
 
 
 class OnboardRobotConfig(Model):

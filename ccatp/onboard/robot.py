@@ -11,7 +11,7 @@ The fans are never changed by any of this.
 """
 
 from math import pi
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from ccatp.config.onboard_models import OnboardConfig
 from ccatp.links.robot_codec import RobotFrame, encode
@@ -23,10 +23,11 @@ from ccatp.onboard.wheel_servo import WheelServo
 
 # Without these the robot does not move. A weak fan or battery is for its clients to judge.
 NEEDED = ("imu", "encoder_right", "encoder_left", "edge", "stall")
+_SAME_S = 1e-9
 _LINE_SAMPLES = 24  # of one sensor in a line: a burst after a gap must not exceed the line's limit
 
 WheelRates = tuple[float, float | None, float | None]
-Row = TypeVar("Row")
+Row = TypeVar("Row", bound=tuple[Any, ...])
 
 
 class OnboardRobot(LinkedRobot):
@@ -36,7 +37,7 @@ class OnboardRobot(LinkedRobot):
         faults: what does not work now, by its name on the link, with the reason.
         voltages_v: of the (right, left) motor.
         late_steps: steps of the control loop that came later than the external timer waits.
-        dropped_samples: samples that were left out because a frame had too many.
+        dropped_samples: samples that were left out: a frame had too many, or they arrived after their frame.
     """
 
     def __init__(self, cfg: OnboardConfig, hardware: Hardware, commands_delay_frames: int = 0) -> None:
@@ -55,15 +56,13 @@ class OnboardRobot(LinkedRobot):
         self._commanded_duty: tuple[float, float] | None = None
         self._soc, self._stall = 1.0, ""
         self._line = b""
-        self._clear()
-        # The duties of before are in force; the floor comes with the first command.
-        self.fans.duty = hardware.fans()
-
-    def _clear(self) -> None:
+        # Samples that no frame has held yet.
         self._imu: list[tuple[float, float, float]] = []
         self._enc: list[WheelRates] = []
         self._edge: list[tuple[float, int, int, int, int]] = []
         self._gravity: tuple[float, float, float, float] | None = None
+        # The duties of before are in force; the floor comes with the first command.
+        self.fans.duty = hardware.fans()
 
     def describe(self) -> RobotData:
         """See ``LinkedRobot``."""
@@ -160,31 +159,40 @@ class OnboardRobot(LinkedRobot):
     def advance(self) -> None:
         """Close a frame with every sample since the one before."""
         self.seq += 1
-        self.t_s = self.seq / self.frame_hz
-        self._close_frame(self.t_s)
+        self._close_frame(self.seq / self.frame_hz)
 
     def advance_to(self, now_s: float) -> None:
-        """Close the frame of ``now_s``; frames that a stop of this computer left out are not made up for."""
+        """Close the frame that is due at ``now_s``; frames that a stop of this computer left out are not made up for.
+
+        Its time is ``sample_latency_s`` ago, so that it holds every sample since the frame before.
+        """
+        t_s = max(now_s - self._cfg.link.sample_latency_s, self.t_s + 0.1 * self.frame_s)
         self.seq = max(self.seq + 1, int(now_s * self.frame_hz + 1e-6))
-        self.t_s = now_s
-        self._close_frame(now_s)
+        self._close_frame(t_s)
 
     def _close_frame(self, t_s: float) -> None:
+        since_s, self.t_s = self.t_s, t_s
         drive_seq, age_s, permit_age_s, is_held = self.rules.echo(t_s)
         # A motor that cannot be set is to the clients what a stalled one is.
         faults = tuple(sorted({"stall" if name == "motors" else name for name in self.faults}))
+        gravity = self._gravity if self._gravity is not None and self._gravity[0] <= t_s + _SAME_S else None
+        if gravity is not None:
+            self._gravity = None
         frame = RobotFrame(
-            self.seq, round(t_s, 6), self._bounded(self._imu), self._bounded(self._enc), self._bounded(self._edge),
-            self._gravity, self.fans.duty, self._soc,
+            self.seq, round(t_s, 6), self._take_samples(self._imu, since_s), self._take_samples(self._enc, since_s),
+            self._take_samples(self._edge, since_s), gravity, self.fans.duty, self._soc,
             CommandEcho(drive_seq, round(age_s, 6), round(permit_age_s, 6), is_held), faults,
         )  # fmt: skip
         self._line = encode(frame)
         self.delivered_seq = self.seq
-        self._clear()
 
-    def _bounded(self, samples: list[Row]) -> list[Row]:
-        self.dropped_samples += max(0, len(samples) - _LINE_SAMPLES)
-        return samples[-_LINE_SAMPLES:]
+    def _take_samples(self, samples: list[Row], since_s: float) -> list[Row]:
+        """The samples of the frame; later ones stay."""
+        end = next((k for k, row in enumerate(samples) if row[0] > self.t_s + _SAME_S), len(samples))
+        due, samples[:] = samples[:end], samples[end:]
+        found = [row for row in due if row[0] > since_s + _SAME_S or not since_s][-_LINE_SAMPLES:]
+        self.dropped_samples += end - len(found)
+        return found
 
     @property
     def delivered_line(self) -> bytes:

@@ -1,5 +1,7 @@
 """The robot's own program over simulated hardware: what reaches the motors, and what stands in its frames."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from ccatp.onboard.robot import OnboardRobot
 from ccatp.sim.hardware import MOTOR_12V, SimulatedHardware
 
 MIRROR = load_config().mirror
-CFG = load_onboard_config()
+CFG = load_onboard_config(overrides={"link.sample_latency_s": 0.0})
 STEP_S = 1.0 / CFG.servo.loop_hz
 STEPS_A_FRAME = round(CFG.servo.loop_hz / CFG.link.frame_hz)
 
@@ -235,3 +237,23 @@ def test_frames_that_a_stop_left_out_are_not_made_up_for() -> None:
     bench.robot.advance_to(0.5)
     assert (bench.robot.seq, bench.robot.t_s) == (50, 0.5)
     assert before == 10
+
+
+def test_a_frame_is_of_so_long_ago_that_it_holds_every_sample_since_the_one_before() -> None:
+    bench = Bench()
+    link = CFG.link.model_copy(update={"sample_latency_s": 0.015})
+    bench.robot = OnboardRobot(CFG.model_copy(update={"link": link}), bench.hardware)
+    arrived = bench.hardware.read
+
+    def read_late(now_s: float) -> Readings:
+        return arrived(now_s - 0.013)
+
+    bench.hardware.read = read_late  # type: ignore[method-assign]
+    frames = bench.run(0.5)[3:]
+    assert frames[-1].t == pytest.approx(bench.t_s - STEP_S - 0.015)
+    for before, frame in pairwise(frames):
+        times = [row.t_s for row in frame.edge]
+        assert before.t < times[0]
+        assert times[-1] <= frame.t + 1e-6
+        assert len(times) == 10  # at 1 kHz
+    assert bench.robot.dropped_samples == 0

@@ -1,0 +1,84 @@
+"""``python -m tests.support.onboard_program``: the on-board program on the wall clock, over simulated hardware."""
+
+import argparse
+import asyncio
+import signal
+import socket
+import sys
+import time
+
+import numpy as np
+import structlog
+
+from ccatp.config.load import load_config, load_onboard_config
+from ccatp.links import realtime
+from ccatp.mirror.mirror import build_mirror
+from ccatp.onboard.hardware import Hardware
+from ccatp.onboard.program import serve
+from ccatp.sim.ground_truth import GroundTruthPublisher, SurveyTruth
+from ccatp.sim.hardware import SimulatedHardware
+from ccatp.sim.world import World
+
+
+class Truth(SurveyTruth):
+    """What the laser asks for."""
+
+    seq = 0
+
+    def __init__(self, world: World, start_s: float) -> None:
+        self.world, self._start_s = world, start_s
+
+    @property
+    def t_s(self) -> float:  # type: ignore[override]
+        return time.monotonic() - self._start_s
+
+
+def main() -> int:
+    """Serve until SIGTERM; the port is the first line of standard output."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--port", type=int, default=0)
+    parser.add_argument("--mirror", default="fyst-m1")
+    parser.add_argument("--world", default="thesis")
+    parser.add_argument("--truth", help="endpoint of the true puck, for ccatp sim etalon --truth")
+    parser.add_argument("--fakes", action="store_true", help="devices at register and byte level in between")
+    options = parser.parse_args()
+    cfg = load_config(overrides={"run.mirror": options.mirror, "run.world": options.world})
+    mirror = build_mirror(cfg.mirror)
+    robot = {
+        "robot.wheel_radius_m": cfg.robot.wheel_radius_m,
+        "robot.wheel_base_m": cfg.robot.wheel_base_m,
+        "robot.edge_sensors_m": cfg.robot.edge_sensors_m,
+        "robot.puck_m": (0.0, 0.0, cfg.robot.puck_height_m),
+        "robot.fan_floor": cfg.sim.robot.fan_floor if mirror.overhang else 0.0,
+    }
+    onboard = load_onboard_config(overrides=robot)
+    simulated = SimulatedHardware(
+        cfg, mirror, np.random.default_rng(cfg.run.seed), loop_hz=onboard.servo.loop_hz,
+        counts_per_rev=onboard.servo.counts_per_rev,
+    )  # fmt: skip
+    hardware: Hardware = simulated
+    log = structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
+    listener = socket.create_server(("127.0.0.1", options.port))
+    boot_s = time.monotonic()
+
+    async def run() -> None:
+        stop = asyncio.Event()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            asyncio.get_running_loop().add_signal_handler(number, stop.set)
+        truth = GroundTruthPublisher(Truth(simulated.world, boot_s), options.truth)
+        answering = asyncio.create_task(truth.serve())
+        await serve(onboard, hardware, listener, stop, None, log, boot_s)
+        answering.cancel()
+        truth.close()
+        if simulated.world.is_fallen:
+            print("fell", file=sys.stderr)
+
+    print(listener.getsockname()[1], flush=True)
+    realtime.enter(40, log)
+    hardware.start()
+    asyncio.run(run())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
