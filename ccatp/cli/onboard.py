@@ -55,7 +55,7 @@ def onboard(
 
     The configuration is that of configs/onboard.toml. It ends on SIGTERM or Ctrl-C: the wheels brake, the fans stay.
     """
-    ctx.obj = (config_file, settings)
+    ctx.obj = config_file
     if ctx.invoked_subcommand is not None:
         return 0
     from ccatp.config.load import load_onboard_config
@@ -118,14 +118,17 @@ def _check(cfg: "OnboardConfig", *, json_output: bool) -> int:
     return ExitStatus.COMPLETE if all(check.passed for check in checks) else ExitStatus.UNREACHABLE
 
 
-@onboard.command(epilog=example("ccatp onboard --config robot.toml tune --wheels-are-free --out tuning"))
+@onboard.command(epilog=example("ccatp onboard tune --config robot.toml --wheels-are-free --out tuning"))
+@CONFIG_OPTION
+@SETTINGS_OPTION
 @click.option("--wheels-are-free", is_flag=True, help="The robot is lifted: its wheels turn at up to full speed.")
 @click.option("--out", "out_dir", type=PATH, help="Folder for the step response: CSV, and a figure with matplotlib.")
 @JSON_OPTION
 @click.pass_obj
 def tune(
-    given: tuple[Path | None, Mapping[str, object]], wheels_are_free: bool, out_dir: Path | None, json_output: bool
-) -> int:
+    group_config: Path | None, config_file: Path | None, settings: Mapping[str, object], wheels_are_free: bool,
+    out_dir: Path | None, json_output: bool,
+) -> int:  # fmt: skip
     """Find friction, slope and gains of the wheel servos with free wheels, in about half a minute."""
     from ccatp.config.load import load_onboard_config
     from ccatp.onboard.hardware import HardwareError
@@ -133,7 +136,7 @@ def tune(
 
     if not wheels_are_free:
         raise click.UsageError("the wheels will turn at up to full speed: lift the robot, then add --wheels-are-free")
-    cfg = load_onboard_config(*given)
+    cfg = load_onboard_config(config_file or group_config, settings)
     boot_s = time.monotonic()
 
     def clock() -> float:
