@@ -19,7 +19,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-.PHONY: help run test tests test-newest newest newest-tests test-slow slow-tests new-examples sweep tried-in faults docs man metrics lint format
+.PHONY: help run test tests test-newest newest newest-tests test-slow slow-tests new-examples sweep tried-in faults docs man onboard-wheel metrics lint format
 .PHONY: kills mutants golden golden-quick lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
@@ -35,6 +35,7 @@ help:
 	@echo "make faults           docs/fault_table.md from what the last test runs showed and measured"
 	@echo "make docs             build/docs/index.html, and the parts of docs/ that are made from the code"
 	@echo "make man            the manual page, build/man/ccatp.1"
+	@echo "make onboard-wheel    the small package for the robot's own computer, build/ccatp_onboard-*.whl"
 	@echo "make golden           this tree against a base commit, both run here, bit for bit; make golden-quick: a few cases"
 	@echo "make metrics          size of the code base, calls and files per frame; ARGS=--names lists them"
 	@echo "make lint             lint, types, import contract"
@@ -116,6 +117,11 @@ golden: $(VENV)/.installed-dev
 
 golden-quick: $(VENV)/.installed-dev
 	@$(BIN)/python -m tests.golden $(GOLDEN) --quick --reuse-base $(ARGS)
+
+onboard-wheel: $(VENV)/.installed-dev
+	@mkdir -p build
+	@$(PIP) wheel --no-deps --no-build-isolation --wheel-dir build packaging/onboard
+	@echo "ccatp: $$(ls -t build/ccatp_onboard-*.whl | head -n 1)"
 
 metrics: $(VENV)/.installed-dev
 	@$(BIN)/python -m tests.metrics $(ARGS)

@@ -2,12 +2,17 @@
 
 import argparse
 import asyncio
+import atexit
+import shutil
 import signal
 import socket
 import sys
+import tempfile
 import time
+from pathlib import Path
 
 import numpy as np
+import pytest
 import structlog
 
 from ccatp.config.load import load_config, load_onboard_config
@@ -18,6 +23,7 @@ from ccatp.onboard.program import serve
 from ccatp.sim.ground_truth import GroundTruthPublisher, SurveyTruth
 from ccatp.sim.hardware import SimulatedHardware
 from ccatp.sim.world import World
+from tests.support.onboard_bench import RobotBench
 
 
 class Truth(SurveyTruth):
@@ -52,14 +58,18 @@ def main() -> int:
         "robot.fan_floor": cfg.sim.robot.fan_floor if mirror.overhang else 0.0,
     }
     onboard = load_onboard_config(overrides=robot)
+    boot_s = time.monotonic()
     simulated = SimulatedHardware(
-        cfg, mirror, np.random.default_rng(cfg.run.seed), loop_hz=onboard.servo.loop_hz,
-        counts_per_rev=onboard.servo.counts_per_rev,
+        cfg, mirror, np.random.default_rng(cfg.run.seed), counts_per_rev=onboard.servo.counts_per_rev,
+        loop_hz=onboard.devices.daq.sample_hz if options.fakes else onboard.servo.loop_hz,
     )  # fmt: skip
     hardware: Hardware = simulated
+    if options.fakes:
+        folder = Path(tempfile.mkdtemp(prefix="ccatp-pwm-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        hardware = RobotBench(onboard.devices, simulated, folder, boot_s, pytest.MonkeyPatch()).hardware
     log = structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
     listener = socket.create_server(("127.0.0.1", options.port))
-    boot_s = time.monotonic()
 
     async def run() -> None:
         stop = asyncio.Event()
