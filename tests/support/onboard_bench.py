@@ -10,12 +10,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
-from tests.support.onboard_fakes import FakeBno055, FakeBridge, FakeDaq, FakePwm, FakeTime
 
 from ccatp.config.onboard_models import DevicesConfig, MotorConfig
 from ccatp.onboard.devices.daq import SAMPLE, SAMPLES
 from ccatp.onboard.devices.linux import LinuxHardware
 from ccatp.sim.hardware import SimulatedHardware
+from tests.support.onboard_fakes import FakeBno055, FakeBridge, FakeDaq, FakePwm, FakeTime
 
 
 class WallClock(FakeTime):
