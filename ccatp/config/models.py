@@ -23,6 +23,8 @@ PATTERNS = {
 }
 Text = Annotated[str, Field(max_length=4096, pattern=TEXT)]
 Host = Annotated[str, Field(max_length=253, pattern=HOST)]
+# A serial number on a command line may look like a number.
+Label = Annotated[str, Field(max_length=256, pattern=TEXT, coerce_numbers_to_str=True)]
 
 
 class Model(BaseModel):
@@ -52,6 +54,17 @@ class RunConfig(ProcessesConfig):
     panels: Annotated[int, Field(ge=0)]  # 0 = the whole mirror
     order: Literal["thesis", "optimised", "calibration"]
     budget_s: Positive
+
+
+class SurveyMetadata(Model):
+    """Who measured what with which instruments; acts on nothing. Empty = not given."""
+
+    telescope: Label
+    operator: Label
+    robot_serial_number: Label
+    laser_serial_number: Label
+    retroreflector_serial_number: Label
+    comment: Label
 
 
 class LinkConfig(Model):
@@ -526,6 +539,7 @@ class Config(Model):
     """The whole configuration of one run. ``mirror`` and ``world`` are the files that ``run`` names, read in."""
 
     run: RunConfig
+    observation: SurveyMetadata
     robot: RobotConfig
     limits: LimitsConfig
     control: ControlConfig
