@@ -39,21 +39,24 @@ _JSON = json_option("The figures of it as JSON on standard output.")
 
 
 @click.command(
-    epilog=example("ccatp report runs/tonight", "ccatp report runs/tonight --out tonight.html --figures figs")
+    epilog=example(
+        "ccatp report runs/tonight", "ccatp report runs/tonight --out tonight.html --figures figs --tables tables"
+    )
 )
 @click.argument("run_dir", type=PATH)
 @click.option("--out", type=_FILE, metavar="FILE", help="The page; report.html in the run directory if not given.")
 @_FIGURES
+@click.option("--tables", type=_FOLDER, metavar="DIR", help="Also write fixes, panels and moves there: CSV and ECSV.")
 @_JSON
-def report(run_dir: Path, out: Path | None, figures: Path | None, json_output: bool) -> int:
+def report(run_dir: Path, out: Path | None, figures: Path | None, tables: Path | None, json_output: bool) -> int:
     """Write the report of a run: one page that opens without a network.
 
-    Map, errors, how the panels lie, where the time went, events. It takes runs that are over, go on, were killed or
-    resumed, and says what is missing.
+    How the panels lie, how good the measurement was, where the time went, events. It takes runs that are over, go on,
+    were killed or resumed, and says what is missing.
     """
     from ccatp.report.run_page import report_run
 
-    data, warnings = report_run(run_dir, out, figures)
+    data, warnings = report_run(run_dir, out, figures, tables)
     warn(warnings)
     click.echo(json.dumps(data) if json_output else data["report"])
     return 0
@@ -130,7 +133,7 @@ def align(
     from ccatp.mirror.mirror import build_mirror
     from ccatp.mirror.mirror_alignment import compare, survey_result
     from ccatp.records.run_reader import read_run
-    from ccatp.report.alignment import csv_lines, result_data, table_lines
+    from ccatp.report.alignment import result_data, table_lines
 
     _check_effect(settings, ALIGN_KEYS, "the alignment")
     survey = read_run(run_dir, settings)
@@ -152,13 +155,15 @@ def align(
     warnings = [*survey.warnings, *result.warnings]
     warn(warnings)
     if csv_file is not None:
-        write_lines("--csv", csv_file, csv_lines(result))
+        from ccatp.report.tables import csv_lines, panel_table
+
+        write_lines("--csv", csv_file, csv_lines(panel_table(mirror, result)))
     if figure_file is not None:
         from ccatp.report.mirror_map import draw_alignment
 
         draw_alignment(mirror, result, figure_file, f"{mirror.name}: {len(result.panels)} panels", str(run_dir))
     if json_output:
-        print_lines([json.dumps({**facts, **result_data(result, comparison), "warnings": warnings})])
+        print_lines([json.dumps({**facts, **result_data(mirror, result, comparison), "warnings": warnings})])
     else:
         print_lines(table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m))
     return 0

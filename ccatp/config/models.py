@@ -23,8 +23,6 @@ PATTERNS = {
 }
 Text = Annotated[str, Field(max_length=4096, pattern=TEXT)]
 Host = Annotated[str, Field(max_length=253, pattern=HOST)]
-# A serial number on a command line may look like a number.
-Label = Annotated[str, Field(max_length=256, pattern=TEXT, coerce_numbers_to_str=True)]
 
 
 class Model(BaseModel):
@@ -59,12 +57,12 @@ class RunConfig(ProcessesConfig):
 class SurveyMetadata(Model):
     """Who measured what with which instruments; acts on nothing. Empty = not given."""
 
-    telescope: Label
-    operator: Label
-    robot_serial_number: Label
-    laser_serial_number: Label
-    retroreflector_serial_number: Label
-    comment: Label
+    telescope: Text
+    operator: Text
+    robot_serial_number: Text
+    laser_serial_number: Text
+    retroreflector_serial_number: Text
+    comment: Text
 
 
 class LinkConfig(Model):

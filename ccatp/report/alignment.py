@@ -1,13 +1,14 @@
-"""Alignment of the panels as data, CSV and text: um, urad; moves and deviations > 0 towards the robot."""
+"""Alignment of the panels as data and text: um, urad; moves and deviations > 0 towards the robot."""
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ccatp.core import FloatArray
+from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult
-from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront
+from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, half_size_m, mirror_wavefront, rigid
 from ccatp.report.html import MICRO, render
 
 _DECIMALS = 4
@@ -15,10 +16,27 @@ _WAVEFRONT = ("rms_before_um", "rms_before_level_um", "rms_after_um", "point_noi
 _SHOWN = 12  # panels without a result that are named
 
 
-def result_data(result: SurveyResult, comparison: Comparison | None) -> dict[str, Any]:
+class Corner(NamedTuple):
+    """Displacement of a corner along the panel's normal, and its standard deviation."""
+
+    value_m: float
+    sigma_m: float
+
+
+def worst_corner(mirror: Mirror, panel: PanelResult) -> Corner:
+    """The corner of a panel that is furthest off, by its fitted plane."""
+    signs = np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)])
+    modes = rigid(signs * half_size_m(mirror.panel(panel.panel)))
+    values = modes @ panel.fit.values
+    worst = int(np.argmax(np.abs(values)))
+    variance = modes[worst] @ panel.fit.covariance @ modes[worst]
+    return Corner(float(values[worst]), float(np.sqrt(variance)))
+
+
+def result_data(mirror: Mirror, result: SurveyResult, comparison: Comparison | None) -> dict[str, Any]:
     """What ``ccatp align --json`` prints of the panels and the mirror."""
     return {
-        "panels": [_panel(panel) for panel in result.panels],
+        "panels": [panel_data(mirror, panel) for panel in result.panels],
         "undetermined": [
             {"row": one.panel.row, "col": one.panel.col, "points": one.points, "why": one.why}
             for one in result.undetermined
@@ -38,7 +56,9 @@ def result_data(result: SurveyResult, comparison: Comparison | None) -> dict[str
     }
 
 
-def _panel(panel: PanelResult) -> dict[str, Any]:
+def panel_data(mirror: Mirror, panel: PanelResult) -> dict[str, Any]:
+    """How a panel lies, its moves and its points."""
+    corner = worst_corner(mirror, panel)
     piston, tip, tilt = _list(panel.fit.values)
     bending, shape = panel.bending, panel.shape
     own = _wavefront(mirror_wavefront([panel.rigid.wavefront]))
@@ -53,6 +73,8 @@ def _panel(panel: PanelResult) -> dict[str, Any]:
         "tip_urad": tip,
         "tilt_urad": tilt,
         "sigma": _list(panel.fit.sigma),
+        "worst_corner_um": _um(corner.value_m),
+        "sigma_worst_corner_um": _um(corner.sigma_m),
         "adjusters_um": _list(panel.rigid.moves.values_m),
         "adjusters_sigma_um": _list(panel.rigid.moves.sigma_m),
         "chi2": round(panel.fit.chi2, _DECIMALS),
@@ -95,26 +117,6 @@ def _wavefront(found: MirrorWavefront | None) -> dict[str, float | None]:
     if found is None:
         return dict.fromkeys(_WAVEFRONT)
     return {name: _um(value) for name, value in zip(_WAVEFRONT, found, strict=True)}
-
-
-def csv_lines(result: SurveyResult) -> Iterator[str]:
-    """One line a panel: how it lies, and how to turn its adjusters; a header before them."""
-    names = result.panels[0].adjusters if result.panels else ()
-    fit = ("piston_um", "tip_urad", "tilt_urad")
-    yield ",".join(
-        (
-            "row", "col", "points", *fit, *(f"sigma_{name}" for name in fit), "chi2", "dof", "outliers",
-            *(f"{name}_um" for name in names), *(f"sigma_{name}_um" for name in names), "is_bent",
-            "rms_before_um", "rms_after_um",
-        )
-    )  # fmt: skip
-    for panel in result.panels:
-        data = _panel(panel)
-        cells = [data["row"], data["col"], data["points"], *(data[name] for name in fit), *data["sigma"]]
-        cells += [data["chi2"], data["dof"], " ".join(map(str, data["outliers"]))]
-        cells += [*data["adjusters_um"], *data["adjusters_sigma_um"]]
-        cells += [int(panel.shape is not None and panel.shape.is_significant)]
-        yield ",".join(map(str, [*cells, data["rms_before_um"], data["rms_after_um"]]))
 
 
 def _list(values: FloatArray) -> list[float]:

@@ -1,19 +1,27 @@
 """What follows from a recorded survey, computed once for page, figures and data: points, errors, times, alignment."""
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import chain, pairwise
+from math import sqrt
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
-from ccatp.core import FloatArray, PointId, StopKind
+from ccatp.core import DeckPose, Fix, FloatArray, PointId, StopKind
+from ccatp.estimation.fixes import DeckFoot, FixRefused, deck_foot
+from ccatp.filters.metrics import Consistency, consistency, rms
+from ccatp.links.topics import FixMessage
+from ccatp.mirror.layout import POINTS_PER_PANEL
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, compare, survey_result
 from ccatp.records.summary import arrival_error_m, distribution, measured_error_m
 from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, RecordedSession, RunRecord
 from ccatp.survey.composition import plan_survey
+from ccatp.survey.fix_gate import nis_of
 from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import ORDERS
 from ccatp.survey.planning.search import leg_lengths, leg_time, stop_times
@@ -169,6 +177,73 @@ def error_figures(series: ErrorSeries) -> dict[str, float] | None:
     }
 
 
+# -- quality of the measurement ---------------------------------------------------------------------------------------
+
+
+class Quality(NamedTuple):
+    """How good the measurement was, against what it should be; None is not known."""
+
+    fixes: int  # in the recordings
+    refused: int  # of them: doubted, or of no use
+    residual_um: tuple[float, float] | None  # rms of the lengths' residuals in the fixes that count: mean and largest
+    plane: Consistency | None  # chi-square of the fitted planes by its degrees of freedom, with its 95 % band
+    plane_rms_um: float | None
+    repeats: int  # measurements of a point beyond its first one
+    repeat_um: float | None  # standard deviation of one deviation, from the points that were measured more than once
+    nis: Consistency | None  # of the place that each fix shows against the estimate before it
+
+
+def quality_of(record: RunRecord, alignment: SurveyResult | None) -> Quality:
+    """Residuals, repeatability and NIS.
+
+    The recorded estimate has one standard deviation, that of the worst direction: NIS is 1 or less where the filter is
+    consistent.
+    """
+    panels = () if alignment is None else alignment.panels
+    left_m = np.concatenate([panel.fit.residuals_m for panel in panels] or [np.empty(0)])
+    chi2, dof = (
+        np.array([getattr(panel.model, name) for panel in panels], dtype=np.float64) for name in ("chi2", "dof")
+    )
+    lengths_um = [1e6 * one.fix.residual_rms_m for one in record.measured]
+    feet = [(session, fix, foot) for session in record.sessions for fix, foot in _feet(record, session)]
+    nis = np.array([_nis(session, fix, foot) for session, fix, foot in feet])
+    deviations = defaultdict[PointId, list[float]](list)
+    for _, fix, foot in feet:
+        if fix.point is not None:
+            deviations[PointId(*fix.point)].append(1e6 * foot.deviation_m)
+    again = [np.array(values) for values in deviations.values() if len(values) > 1]
+    repeats = sum(len(values) - 1 for values in again)
+    squares = sum(float(((values - values.mean()) ** 2).sum()) for values in again)
+    recorded = [fix for session in record.sessions for fix in session.fixes]
+    plane_rms = rms(left_m)
+    return Quality(
+        fixes=len(recorded),
+        refused=sum(not fix.is_fused for fix in recorded),
+        residual_um=(float(np.mean(lengths_um)), max(lengths_um)) if lengths_um else None,
+        plane=consistency(chi2, dof),
+        plane_rms_um=None if plane_rms is None else 1e6 * plane_rms,
+        repeats=repeats,
+        repeat_um=sqrt(squares / repeats) if repeats else None,
+        nis=consistency(nis, np.full(len(nis), 2.0) * np.isfinite(nis)),
+    )
+
+
+def _feet(record: RunRecord, session: RecordedSession) -> Iterator[tuple[FixMessage, DeckFoot]]:
+    """The fixes that were used, and where the robot stood on the surface."""
+    for fix in session.fixes:
+        if fix.is_fused:
+            with suppress(FixRefused):
+                known = msgspec.convert(fix, Fix, from_attributes=True)
+                yield fix, deck_foot(record.mirror, known, record.cfg.robot.puck_height_m)
+
+
+def _nis(session: RecordedSession, fix: FixMessage, foot: DeckFoot) -> float:
+    at = int(np.searchsorted(session.track.seq, fix.seq, side="right")) - 1
+    if at < 0:
+        return float("nan")
+    return nis_of(foot, DeckPose(*session.track.pose[at].tolist()), session.sigma_m[at] ** 2 * np.eye(2))
+
+
 # -- time budget ------------------------------------------------------------------------------------------------------
 
 RESTART = "restart"
@@ -300,6 +375,7 @@ class Findings:
     budget: TimeBreakdown | None
     alignment: SurveyResult | None
     against: Comparison | None
+    quality: Quality
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -322,7 +398,46 @@ def findings_of(record: RunRecord) -> Findings:
         against = compare(alignment.panels, record.injected) if record.injected else None
     figures = None if errors is None else error_figures(errors)
     outcome, points, budget = outcome_of(record), point_verdicts(record), time_budget(record)
-    return Findings(record, outcome, points, errors, figures, budget, alignment, against)
+    quality = quality_of(record, alignment)
+    return Findings(record, outcome, points, errors, figures, budget, alignment, against, quality)
+
+
+def observation_of(record: RunRecord) -> dict[str, str]:
+    """When (UTC), where, by whom and with which instruments; what is not known, or was not given, is left out."""
+    date = {"date_obs": record.log[0].wall, "date_end": record.log[-1].wall} if record.log else {}
+    values = {**date, "mirror": record.mirror.name, **record.cfg.observation.model_dump()}
+    return {name: value for name, value in values.items() if value}
+
+
+def metadata_of(found: Findings) -> dict[str, object]:
+    """What each table says of its survey; what is not known is left out."""
+    record, wavefront = found.record, found.alignment and found.alignment.wavefront
+    values = {
+        "run": record.name,
+        **observation_of(record),
+        "simulation": record.is_simulation,
+        "outcome": found.outcome.text,
+        "cause": found.outcome.cause,
+        **coverage_of(found),
+        "half_wavefront_before_um": wavefront and round(1e6 * wavefront.before_m, 4),
+        "half_wavefront_after_um": wavefront and round(1e6 * wavefront.after_m, 4),
+        "puck_height_m": record.cfg.robot.puck_height_m,
+        "puck_height_sigma_um": round(1e6 * record.cfg.align.puck_height_sigma_m, 4),
+        "creator": " ".join(["ccatp", *sorted({session.version for session in record.sessions})]),
+    }
+    return {name: value for name, value in values.items() if value not in ("", None)}
+
+
+def coverage_of(found: Findings) -> dict[str, int]:
+    """How much of the mirror, and of the plan, was measured."""
+    panels = len(found.record.mirror.panels)
+    return {
+        "panels_determined": 0 if found.alignment is None else len(found.alignment.panels),
+        "panels_of_the_mirror": panels,
+        "points_measured": len(found.record.measured),
+        "points_planned": len(found.points),
+        "points_of_the_mirror": panels * POINTS_PER_PANEL,
+    }
 
 
 def outcome_of(record: RunRecord) -> PointOutcome:

@@ -20,7 +20,10 @@ DASH = "\u2013"
 MICRO = 1e6
 # Nothing is loaded, run, sent or embedded; what the page shows stands in it.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
-_FEW_LINES = 40
+_FEW_LINES = 40  # more notable lines than these are shown by their kinds
+_KINDS, _LINES_AT_AN_END = 100, 200
+_MOST_ROWS = 100  # of a list whose length a damaged run determines
+_STATISTICS = ("gate statistics", "reading statistics")
 _CALM = ("info", "debug")
 # What no reader may miss, at whatever level it was logged.
 _GRAVE = re.compile(
@@ -56,7 +59,7 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )  # fmt: skip
     found.filters.update(num=number_text, um=micro_text, clock=clock_text)
-    found.globals.update(dash=DASH, policy=POLICY)
+    found.globals.update(dash=DASH, policy=POLICY, most=_MOST_ROWS)
     return found
 
 
@@ -104,20 +107,52 @@ class Gathered(NamedTuple):
 
 
 class Events(NamedTuple):
-    """Lines of a log, and, of many lines, the kinds that matter, the gravest and then the rarest first."""
+    """What the page shows of a log.
 
-    lines: Sequence[LogLine]
-    kinds: Sequence[Gathered] | None
-    left_out: int
+    ``notable``: warnings, errors and what else no reader may miss; if there are many, their kinds instead, the gravest
+    and then the rarest first. ``first`` and ``last``: lines of the log from its ends, the ones between left out.
+    """
+
+    total: int
+    notable: Sequence[LogLine]
+    kinds: Sequence[Gathered]
+    kinds_left_out: int
+    first: Sequence[LogLine]
+    last: Sequence[LogLine]
+    ends_at: int  # index of the line with which a mission that is over begins to stop its processes; ``total``: none
+
+    @property
+    def left_out(self) -> int:
+        """Lines that the page does not show one by one."""
+        return self.total - len(self.first) - len(self.last)
 
 
 def events_of(lines: Sequence[LogLine]) -> Events:
-    """What the page shows of a log: all of few lines, of many the kinds that matter."""
-    if len(lines) <= _FEW_LINES:
-        return Events(lines, None, 0)
-    kinds = sorted((kind for kind in gathered(lines) if kind.rank < 3), key=lambda kind: (kind.rank, len(kind.lines)))
-    shown = kinds[: max(sum(kind.rank < 2 for kind in kinds), _FEW_LINES)]
-    return Events(lines, shown, len(kinds) - len(shown))
+    """What the page shows of a log: bounded, however long that is."""
+    found = [kind for kind in gathered(lines) if kind.rank < 3]
+    kinds = sorted(found, key=lambda kind: (kind.rank, len(kind.lines)))
+    notable = {id(line) for kind in kinds for line in kind.lines}
+    is_long = len(lines) > 2 * _LINES_AT_AN_END
+    shown = kinds[:_KINDS] if len(notable) > _FEW_LINES else []
+    return Events(
+        total=len(lines),
+        notable=[line for line in lines if id(line) in notable] if not shown else [],
+        kinds=shown,
+        kinds_left_out=len(kinds) - len(shown) if shown else 0,
+        first=lines[:_LINES_AT_AN_END] if is_long else lines,
+        last=lines[-_LINES_AT_AN_END:] if is_long else (),
+        ends_at=_end_of(lines),
+    )
+
+
+def _end_of(lines: Sequence[LogLine]) -> int:
+    """Where the log of a run that ended by itself turns to the end of its processes.
+
+    Main writes its statistics when its mission is over; connections that are closed after that are not lost.
+    """
+    own = [at for at, line in enumerate(lines) if line.process == "main" and line.text.startswith(_STATISTICS)]
+    is_over = bool(lines) and lines[-1].text.startswith("run finished")
+    return own[-1] if own and is_over else len(lines)
 
 
 def gathered(lines: Iterable[LogLine]) -> list[Gathered]:

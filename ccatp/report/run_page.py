@@ -13,13 +13,16 @@ import numpy as np
 from ccatp.config.files import write_file
 from ccatp.filters.metrics import consistency
 from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront
+from ccatp.records.run_reader import RunReadError
 from ccatp.report import beacon_record, figures
+from ccatp.report.alignment import worst_corner
 from ccatp.report.beacon_record import BeaconRecord
-from ccatp.report.findings import Findings, Grade, findings_of
+from ccatp.report.findings import Findings, Grade, coverage_of, findings_of, observation_of
 from ccatp.report.html import MICRO, Draw, events_of, page_figures, render, write_pictures
 from ccatp.report.mirror_map import path_figure, surface_figure
 from ccatp.report.plots import check_drawing
 from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, is_beacon_run, read_record
+from ccatp.report.tables import write_tables
 
 REPORT = "report.html"
 PAGE_MODE = 0o644
@@ -27,17 +30,19 @@ _FEW = 12  # panels of a table; more are folded
 
 
 def report_run(
-    run_dir: Path, out: Path | None = None, figures_dir: Path | None = None
+    run_dir: Path, out: Path | None = None, figures_dir: Path | None = None, tables_dir: Path | None = None
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Write the report of a run, by default into its directory, and its figures if a directory is given.
+    """Write the report of a run, by default into its directory, its figures and tables if directories are given.
 
-    Returns what ``ccatp report --json`` prints, and warnings. RunReadError: no run there; ConfigError: its
-    configuration cannot be used, or the page cannot be written; PictureError: a figure cannot be written.
+    Returns what ``ccatp report --json`` prints, and warnings. RunReadError: no run there, or no survey for the tables;
+    ConfigError: its configuration cannot be used, or the page or a table cannot be written; PictureError: a figure.
     """
     path = out or run_dir / REPORT
-    if figures_dir is not None:
-        check_drawing(figures_dir)
+    for folder in filter(None, (figures_dir, tables_dir)):
+        check_drawing(folder)
     if is_beacon_run(run_dir):
+        if tables_dir is not None:
+            raise RunReadError(f"{run_dir}: a mission among beacons has no tables; leave out --tables")
         record = beacon_record.read_beacon_record(run_dir)
         markup, data, pictures = beacon_page(record), beacon_data(record), beacon_drawings(record)
         warnings = record.warnings
@@ -45,6 +50,8 @@ def report_run(
         found = findings_of(read_record(run_dir))
         markup, data, pictures = run_page(found), run_data(found), run_drawings(found)
         warnings = found.record.warnings
+        if tables_dir is not None:
+            write_tables(found, tables_dir)
     write_file(path, markup, PAGE_MODE)
     if figures_dir is not None:
         write_pictures(pictures, figures_dir)
@@ -53,21 +60,24 @@ def report_run(
 
 def run_page(found: Findings) -> str:
     """The report as one HTML file. A section that a run holds nothing for is left out."""
-    fitted = () if found.alignment is None else found.alignment.panels
-    panels = [(panel, mirror_wavefront([panel.rigid.wavefront]), _remarks(panel)) for panel in fitted]
+    record, fitted = found.record, () if found.alignment is None else found.alignment.panels
+    panels = [
+        (panel, mirror_wavefront([panel.rigid.wavefront]), worst_corner(record.mirror, panel), _remarks(panel))
+        for panel in fitted
+    ]
     return render(
         "run.html",
         found=found,
-        record=found.record,
+        record=record,
         alignment=found.alignment,
         data=run_data(found),
         figures=page_figures(run_drawings(found)),
         within_mm=f"{WITHIN_MM:.0f}",
         never=Counter(verdict.why for verdict in found.points if verdict.grade is Grade.OPEN),
         panels=panels,
-        worst=sorted(panels, key=lambda row: row[1].before_m if row[1] else 0.0, reverse=True)[:_FEW],
+        worst=sorted(panels, key=lambda row: abs(row[2].value_m), reverse=True)[:_FEW],
         few=_FEW,
-        events=events_of(found.record.log),
+        events=events_of(record.log),
     )
 
 
@@ -105,6 +115,8 @@ def run_data(found: Findings) -> dict[str, Any]:
         "seed": record.cfg.run.seed,
         "outcome": found.outcome.text,
         "cause": found.outcome.cause,
+        "observation": observation_of(record),
+        "coverage": coverage_of(found),
         "points": {
             "total": len(found.points),
             **{str(grade).replace(" ", "_"): sum(v.grade is grade for v in found.points) for grade in Grade},

@@ -1,5 +1,6 @@
 """Pages of surveys and comparisons: sections by what a run holds, nothing from outside, text that stays text."""
 
+import html
 import json
 import re
 from collections.abc import Callable
@@ -12,18 +13,24 @@ import pytest
 from markupsafe import escape
 
 from ccatp.cli import main
+from ccatp.core import Vector3
 from ccatp.errors import ConfigError
+from ccatp.links.topics import FixMessage
 from ccatp.records.state_log import LogLine
+from ccatp.report.alignment import worst_corner
 from ccatp.report.compare import RunPair, compare_lines, compare_page, compared_figures
 from ccatp.report.findings import findings_of, outcome_of
-from ccatp.report.html import POLICY, environment, events_of
-from ccatp.report.record import changed_keys, read_record
+from ccatp.report.html import POLICY, environment, events_of, micro_text
+from ccatp.report.record import RunRecord, changed_keys, read_record
 from ccatp.report.run_page import report_run, run_page
 from tests.support.command import answered, refused
 from tests.unit.reporting.conftest import Markup
 from tests.unit.reporting.recorded import record
 
-ALL = ["map", "points", "surface", "panels", "time", "localization", "events", "configuration"]
+# The result first, then how good it is, then what else is known of the run.
+ALL = [
+    "panels", "surface", "quality", "map", "points", "localization", "time", "events", "configuration",
+]  # fmt: skip
 
 
 def test_the_page_of_a_whole_run(recorded: Path) -> None:
@@ -63,8 +70,8 @@ def test_a_real_robot_is_called_one_and_has_no_truth(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("gone", "left"),
     [
-        (("telemetry.mcap",), ["map", "points", "surface", "panels", "events", "configuration"]),
-        (("mission.sqlite", "log.jsonl", "summary.json"), ["map", "time", "localization", "configuration"]),
+        (("telemetry.mcap",), ["panels", "surface", "quality", "map", "points", "events", "configuration"]),
+        (("mission.sqlite", "log.jsonl", "summary.json"), ["quality", "map", "localization", "time", "configuration"]),
         (("telemetry.mcap", "mission.sqlite", "log.jsonl", "summary.json"), ["configuration"]),
     ],
 )
@@ -73,6 +80,31 @@ def test_sections_by_what_a_run_holds(gone: tuple[str, ...], left: list[str], wi
     assert Markup(found).anchors == left
     for name in gone:
         assert f"<li>{name}: " in found
+
+
+def plain(page: str) -> str:
+    """The words of a page, each after one space."""
+    return " ".join(html.unescape(re.sub(r"<style.*?</style>|<[^>]*>", " ", page, flags=re.DOTALL)).split())
+
+
+def test_the_outcome_comes_first_in_plain_words(recorded: Path, tmp_path: Path) -> None:
+    found = findings_of(read_record(recorded))
+    head = plain(run_page(found).partition("<nav>")[0])
+    assert found.alignment is not None
+    assert found.alignment.wavefront is not None
+    (panel,) = found.alignment.panels
+    corner, wavefront = worst_corner(found.record.mirror, panel), found.alignment.wavefront
+    assert (
+        "complete . 9 of 9 planned points measured: 1 of 77 panels (9 of 693 points) of the mirror. "
+        f"Half-wavefront error {micro_text(wavefront.before_m)} \u00b5m rms, {micro_text(wavefront.after_m)} \u00b5m "
+        "predicted after the adjuster moves. "
+        f"Furthest off: a corner of panel 1/2, {micro_text(corner.value_m)} \u00b5m."
+    ) in head
+    cut_short = findings_of(read_record(record(tmp_path / "short", only=1)))
+    head = plain(run_page(cut_short).partition("<nav>")[0])
+    assert "aborted, at base : the observatory wants the robot home. " in head
+    assert "0 of 77 panels (1 of 693 points)" in head
+    assert "How the panels lie is not determined." in head
 
 
 def test_text_stays_text(without: Callable[..., Path]) -> None:
@@ -117,6 +149,48 @@ def test_outcomes(recorded: Path, changes: dict[str, object], outcome: tuple[str
     (session,) = whole.sessions
     status = msgspec.structs.replace(session.statuses[-1], **changes)
     assert outcome_of(replace(whole, sessions=(replace(session, statuses=(status,)),))) == outcome
+
+
+# -- quality of the measurement ---------------------------------------------------------------------------------------
+
+
+def with_fixes(whole: RunRecord, fixes: tuple[FixMessage, ...]) -> RunRecord:
+    (session,) = whole.sessions
+    return replace(whole, sessions=(replace(session, fixes=fixes),))
+
+
+def moved(whole: RunRecord, fix: FixMessage, by_m: Vector3) -> FixMessage:
+    """A fix elsewhere, deck frame."""
+    offset = np.array(whole.mirror.world_from_deck(by_m)) - whole.mirror.world_from_deck((0.0, 0.0, 0.0))
+    return msgspec.structs.replace(fix, position_m=tuple((np.array(fix.position_m) + offset).tolist()))
+
+
+def test_repeatability_is_that_of_points_measured_more_than_once(recorded: Path) -> None:
+    whole = read_record(recorded)
+    fixes = [fix for fix in whole.sessions[0].fixes if fix.point is not None]
+    assert (findings_of(whole).quality.repeats, findings_of(whole).quality.repeat_um) == (0, None)
+    assert "no point was measured twice" in run_page(findings_of(whole))
+    again = [moved(whole, fix, (0.0, 0.0, up_m)) for fix in fixes[:4] for up_m in (-3e-6, 3e-6)]
+    doubted = [msgspec.structs.replace(again[0], is_fused=False, position_m=(0.0, 0.0, 9.0))]
+    quality = findings_of(with_fixes(whole, (*again, *doubted))).quality
+    assert (quality.repeats, quality.fixes, quality.refused) == (4, 9, 1)
+    # Two values d above and below their mean have the standard deviation sqrt(2) d; panels are up to 6 deg steep.
+    assert quality.repeat_um == pytest.approx(3.0 * np.sqrt(2.0), rel=0.01)
+
+
+def test_nis_is_of_the_place_of_the_fix_against_the_estimate(recorded: Path) -> None:
+    whole = read_record(recorded)
+    (session,) = whole.sessions
+    fix = session.fixes[-1]
+    at = int(np.searchsorted(session.track.seq, fix.seq))
+    height_m = whole.cfg.robot.puck_height_m
+    x_m, y_m, _ = whole.mirror.foot_of_puck(fix.position_m, height_m)
+    sigma_m = 1e-3  # a thousand times what the fix is uncertain
+    wide = replace(session, fixes=(fix,), sigma_m=np.full_like(session.sigma_m, sigma_m))
+    wide.track.pose[at, :2] = x_m + 3.0 * sigma_m, y_m
+    quality = findings_of(replace(whole, sessions=(wide,))).quality
+    assert quality.nis is not None
+    assert quality.nis.mean == pytest.approx(9.0 / 2.0, rel=1e-3)
 
 
 # -- two runs ---------------------------------------------------------------------------------------------------------
@@ -218,9 +292,61 @@ def test_a_flood_hides_nothing() -> None:
     assert "lag 0.050 to 0.349 s, limit 0.05 s" in rows[3]
     assert "12:00:00" in rows[1]  # the supervisor knows no robot time
     assert folded.count("<tr>") == 1 + 303
-    few = events_body(LATE[:3])
-    assert "<details>" not in few
+    few = events_body(LATE[:3]).split("<details>")[0]
     assert few.count("late frame") == 3
+    assert "<td>300</td>" not in few
+
+
+# What a simulated survey that went well leaves in its log.
+CLEAN = [
+    line("run started: mirror fyst-m1, seed 3, sim yes", "info", None, "supervisor"),
+    line("controller joined: main", "info", None, "dataloop"),
+    line("gate statistics: fans refused 0", "info", None, "main"),
+    line("robot session: text controller lost: wheels held", "info", None, "dataloop"),
+    line("run finished: status 0", "info", None, "supervisor"),
+]
+OVER = "The mission is over: the processes close their connections and end."
+
+
+def test_a_clean_run_says_so_in_one_line() -> None:
+    shown, folded = events_body(CLEAN).split("<details>")
+    assert plain(shown) == "No warnings, no errors, no restarts: 5 lines of information."
+    assert folded.index("joined") < folded.index(OVER) < folded.index("gate statistics") < folded.index("lost")
+    # Connections that are lost while the mission goes on, or when all is killed, are no end.
+    assert OVER not in events_body(CLEAN[:-1])
+    assert OVER not in events_body([*CLEAN[:2], *CLEAN[3:]])
+    shown = events_body([*CLEAN[:3], GRAVE[0], *CLEAN[3:]]).split("<details>")[0]
+    assert shown.count("<tr>") == 2
+    assert "was killed" in shown
+
+
+def test_the_end_of_a_long_log_is_shown_too() -> None:
+    calm = [line(f"note {k}", "info") for k in range(1000)]
+    folded = events_body([*CLEAN[:2], *calm, *CLEAN[2:]]).split("<details>")[1]
+    assert folded.index("joined") < folded.index(OVER) < folded.index("lost")
+    assert "605 lines are left out here: see log.jsonl." in folded
+
+
+def test_a_page_stays_small_however_much_went_wrong(run_dir: Path) -> None:
+    def page(lines: int) -> str:
+        with (run_dir / "log.jsonl").open("a") as log:
+            for k in range(lines):
+                name = "".join(chr(97 + k // 26**place % 26) for place in range(4))  # each of its own kind
+                fields = {"logger": "main", "event": f"odd {name}: {'x' * 900}", "level": ("error", "warning")[k % 2]}
+                log.write(json.dumps(fields) + "\n")
+        whole = read_record(run_dir)
+        problems = tuple(f"problem {k}: {'x' * 900}" for k in range(lines // 2))
+        spoilt = replace(whole, warnings=problems, missing=problems, files=dict.fromkeys(problems, 1))
+        return run_page(findings_of(spoilt))
+
+    small, large = page(1000), page(9000)
+    Markup(large)
+    assert len(large) < len(small) + 3000  # longer numbers
+    assert len(large) < 1_000_000
+    words = plain(large)
+    assert "and 4400 more." in words  # of 4500 problems
+    assert "and 8900 more kinds of such lines: see log.jsonl." in words
+    assert re.search(r"96\d\d lines are left out here: see log\.jsonl\.", words)
 
 
 # -- the commands -----------------------------------------------------------------------------------------------------
