@@ -75,9 +75,10 @@ class RunFiles:
     warnings: tuple[str, ...]
 
     @property
-    def began(self) -> str:
-        """Wall clock of the first line of the log, UTC; empty where it has none."""
-        return next((line.wall[:19].replace("T", " ") + " UTC" for line in self.log if line.wall), "")
+    def when(self) -> str:
+        """Wall clock of the first and of the last line of the log, UTC; empty where it has none."""
+        times = [line.wall[:19].replace("T", " ") + " UTC" for line in self.log if line.wall]
+        return f"{times[0]} to {times[-1]}" if times else ""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
