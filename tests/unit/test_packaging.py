@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
 import yaml
 from markdown_it import MarkdownIt
@@ -102,8 +103,16 @@ def test_what_the_containers_mount_is_there_and_their_configuration_loads() -> N
     ]
 
 
+def test_the_daemons_health_is_a_command() -> None:
+    program, *command = COMPOSE["services"]["daemon"]["healthcheck"]["test"][1:]
+    assert program == "ccatp"
+    assert cli.resolve_command(click.Context(cli), command)[1] is not None
+
+
 def test_the_image_copies_files_that_are_there() -> None:
     lines = (PACKAGING / "Containerfile").read_text().splitlines()
     copied = [name for line in lines if line.startswith("COPY") for name in line.split()[1:-1]]
     assert copied
     assert [name for name in copied if not (PACKAGING.parent / name).exists()] == []
+    kept = (PACKAGING / "Containerfile.dockerignore").read_text().splitlines()
+    assert {line[1:] for line in kept if line.startswith("!")} == set(copied)  # the builder gets nothing else
