@@ -147,7 +147,7 @@ def _print_facts(facts: "RecordingFacts") -> None:
     if span is not None:
         rate = facts.bytes_per_hour
         per_hour = "" if rate is None else f", {rate / 1e6:.1f} MB an hour"
-        utc = f" of the robot's clock, {' to '.join(map(str, facts.utc))}" if facts.utc_ns else ""
+        utc = f" of the robot's clock, {' to '.join(facts.utc)}" if facts.utc else ""
         click.echo(f"  {span[0]:.2f} to {span[1]:.2f} s{utc}, {condition.size_bytes / 1e6:.2f} MB{per_hour}")
     click.echo(f"  {facts.messages} messages in {condition.chunks} chunks")
     rows = [("topic", "schema", "messages", "per s", "kB")]

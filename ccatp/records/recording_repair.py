@@ -65,10 +65,7 @@ class TopicFacts:
 
 @dataclass(slots=True)
 class RecordingFacts:
-    """Content of a recording; ``faults`` are the objections of the format's own strict reader.
-
-    ``utc_ns``: of the first and the last message, ns since 1970; None where it was not recorded.
-    """
+    """Content of a recording; ``faults`` are the objections of the format's own strict reader."""
 
     path: Path
     condition: Condition
@@ -76,16 +73,12 @@ class RecordingFacts:
     topics: dict[str, TopicFacts] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
     is_being_written: bool = False
-    utc_ns: tuple[int, int] | None = None
+    utc_ns: tuple[int, ...] = ()  # of the first and the last message, since 1970
 
     @property
-    def utc(self) -> tuple[str | None, str | None]:
-        """UTC of the first and the last message in ISO format."""
-        first, last = (
-            f"{datetime.fromtimestamp(ns / _NS, UTC):%Y-%m-%dT%H:%M:%SZ}" if ns else None
-            for ns in self.utc_ns or (0, 0)
-        )
-        return first, last
+    def utc(self) -> list[str]:
+        """UTC of the first and the last message in ISO format; empty where it was not recorded."""
+        return [f"{datetime.fromtimestamp(ns / _NS, UTC):%Y-%m-%dT%H:%M:%SZ}" for ns in self.utc_ns]
 
     @property
     def state(self) -> str:
@@ -137,8 +130,7 @@ class RecordingFacts:
             "messages": self.messages,
             "start_s": start_s,
             "end_s": end_s,
-            "start_utc": self.utc[0],
-            "end_utc": self.utc[1],
+            "utc": self.utc,
             "bytes_per_hour": None if self.bytes_per_hour is None else round(self.bytes_per_hour),
             "metadata": known,
             "topics": {name: asdict(topic) for name, topic in sorted(self.topics.items())},
@@ -177,8 +169,8 @@ def read_facts(path: Path) -> RecordingFacts:
                 topic.start_s = t_s if topic.start_s is None else min(topic.start_s, t_s)
                 topic.end_s = t_s if topic.end_s is None else max(topic.end_s, t_s)
                 if record.log_time != record.publish_time:  # the same in recordings up to format 2
-                    first_ns, last_ns = facts.utc_ns or (record.log_time, record.log_time)
-                    facts.utc_ns = min(first_ns, record.log_time), max(last_ns, record.log_time)
+                    times_ns = *facts.utc_ns, record.log_time
+                    facts.utc_ns = min(times_ns), max(times_ns)
         facts.is_being_written = is_being_written(path)
         facts.faults = strict_faults(path)
     except OSError as error:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from math import nan
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.stores import ros2_jazzy as ros
 
 from ccatp.config.models import Config
-from ccatp.core import Corner, DeckPose, FloatArray, PanelId, PanelPose, Severity, Twist, twist_of
+from ccatp.core import Corner, DeckPose, FloatArray, PanelId, PanelPose, Severity, twist_of
 from ccatp.links.bus import BadMessage
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
@@ -44,15 +44,9 @@ _NS = 1_000_000_000
 _Vector = ros.geometry_msgs__msg__Vector3
 
 
-class _Motion(NamedTuple):
-    """What the wheels say in a frame, and the variances of speed and rate, slip included."""
-
-    twist: Twist
-    v_m2_s2: float
-    omega_rad2_s2: float
-
-
-_UNKNOWN = _Motion(Twist(nan, nan), NOT_MEASURED, NOT_MEASURED)
+# By the wheels: speed and rate (m/s, rad/s), and the variances of both, slip included.
+_Motion = tuple[float, float, float, float]
+_UNKNOWN: _Motion = nan, nan, NOT_MEASURED, NOT_MEASURED
 
 
 def write_bag(folder: Path, recording: Recording, cfg: Config, mirror: Mirror) -> dict[str, int]:
@@ -91,7 +85,7 @@ def _with_motions(events: Iterable[Event], cfg: Config, motions: dict[int, _Moti
             of_wheel = (robot.wheel_radius_m * noise.encoder_sigma_rad_s) ** 2 / len(rates)
             along, across = (slip * twist.v_m_s) ** 2, (unequal * twist.v_m_s) ** 2
             of_rate = (across + 2.0 * of_wheel) / robot.wheel_base_m**2
-            motions[event.sensors.seq] = _Motion(twist, along + 0.5 * of_wheel, of_rate)
+            motions[event.sensors.seq] = twist.v_m_s, twist.omega_rad_s, along + 0.5 * of_wheel, of_rate
         yield event
 
 
@@ -191,8 +185,8 @@ class _Export:
         turn = _ros_quaternion(quaternion(self._mirror.robot_axes(pose)))
         of_pose, of_twist = np.zeros((6, 6)), np.zeros((6, 6))
         of_pose[_PLANE] = covariance
-        of_twist[0, 0], of_twist[5, 5] = motion.v_m2_s2, motion.omega_rad2_s2
-        speeds = _Vector(motion.twist.v_m_s, 0.0, 0.0), _Vector(0.0, 0.0, motion.twist.omega_rad_s)
+        v_m_s, omega_rad_s, of_twist[0, 0], of_twist[5, 5] = motion
+        speeds = _Vector(v_m_s, 0.0, 0.0), _Vector(0.0, 0.0, omega_rad_s)
         return ros.nav_msgs__msg__Odometry(
             self._header(t_s, MAP),
             BASE_LINK,
