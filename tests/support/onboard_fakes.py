@@ -153,7 +153,7 @@ class FakeDaq:
         self.counts, self.step = [0, 0], [0, 0]
         self.adc = [60000, 60000, 60000, 60000, 57000]
         self.open_error: Exception | None = None
-        self.opened = 0
+        self.opened = self.closed = 0
         self.latency_s: Callable[[], float] = float
         self._sent: list[tuple[float, bytes]] = []
         self._arrived = b""
@@ -197,7 +197,8 @@ class FakeDaq:
         data, self._arrived = self._arrived[:size], self._arrived[size:]
         return data
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        self.closed += 1
 
     def send(self, kind: int, payload: bytes) -> None:
         """A frame, as it leaves the device."""

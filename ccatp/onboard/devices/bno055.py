@@ -20,7 +20,7 @@ from ccatp.config.onboard_models import Bno055Config
 from ccatp.onboard.hardware import HardwareError
 
 # Registers of page 0 and their values.
-CHIP_ID, PAGE_ID, SELF_TEST, SYS_STATUS, SYS_ERROR = 0x00, 0x07, 0x36, 0x39, 0x3A
+CHIP_ID, SOFTWARE, PAGE_ID, SELF_TEST = 0x00, 0x04, 0x07, 0x36
 UNIT_SEL, OPR_MODE, PWR_MODE, SYS_TRIGGER, AXIS_MAP, AXIS_SIGN = 0x3B, 0x3D, 0x3E, 0x3F, 0x41, 0x42
 BNO055_ID = 0xA0
 UNITS_M_S2_RAD_S = 0x02
@@ -57,6 +57,10 @@ class Bus(Protocol):
         """Release it."""
 
 
+class _DoubtfulReading(Exception):
+    """A transfer went well, but what came is no new reading."""
+
+
 class ImuSample(NamedTuple):
     """One reading, robot frame: acceleration along x without gravity, m/s^2, rate about z, rad/s."""
 
@@ -84,10 +88,12 @@ def axis_registers(axes: Sequence[str]) -> tuple[int, int]:
 
 
 class Bno055:
-    """The unit. ``read`` and ``set_up`` raise OSError where the bus fails, HardwareError where the unit is not right.
+    """The unit, read in a thread of its own, since a transfer takes a millisecond and may hang in the kernel.
+
+    After some failures in sequence the bus is opened again, after more the unit is reset, at growing intervals.
 
     Attributes:
-        doubt: why the last ``read`` gave nothing.
+        errors: attempts that gave no sample.
         identity: what the unit says of itself.
     """
 
@@ -98,27 +104,113 @@ class Bno055:
         clock: Callable[[], float],
         sleep: Callable[[float], object],
     ) -> None:
-        self._address, self._axes = config.address, config.axes
-        self._open_bus, self._clock, self._sleep = open_bus, clock, sleep
+        self._config, self._open_bus, self._clock, self._sleep = config, open_bus, clock, sleep
+        self._period_s = 1.0 / config.rate_hz
         self._bus: Bus | None = None
         self._last_burst = b""
-        self.doubt = ""
+        self._samples: deque[ImuSample] = deque(maxlen=_QUEUED)
+        self._newest_s = clock()
+        self._failures = 0
+        self._is_lost = False
+        self._reason = ""
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="bno055", daemon=True)
+        self.errors = 0
         self.identity = ""
 
     def open(self) -> None:
-        """Open the bus, after closing it where it was open."""
-        self.close()
-        self._bus = self._open_bus()
+        """Set the unit up and begin to read. Raises HardwareError."""
+        try:
+            self._reopen_bus()
+            self._set_up()
+        except (OSError, HardwareError) as error:
+            self._close_bus()
+            raise HardwareError(f"BNO055: {_bus_error(error)}" if isinstance(error, OSError) else str(error)) from None
+        self._newest_s = self._clock()
+        self._thread.start()
+
+    def take(self) -> list[ImuSample]:
+        """Samples since the last call; never waits."""
+        return [self._samples.popleft() for _ in range(len(self._samples))]
+
+    def fault(self, now_s: float) -> str:
+        """Why there is no reading for too long; empty: there is one."""
+        age_s = now_s - self._newest_s
+        if age_s <= self._config.timeout_s:
+            return ""
+        return f"no reading for {age_s:.2f} s: {self._reason or 'a transfer hangs; check the wiring of the I2C bus'}"
 
     def close(self) -> None:
-        """Release the bus."""
-        bus, self._bus = self._bus, None
-        if bus is not None:
-            bus.close()
+        """End the thread, which releases the bus; one that hangs in the kernel is left to itself."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(_JOIN_S)
 
-    def set_up(self) -> None:
-        """Reset the unit and set what ``read`` relies on, each value read back; takes about 0.7 s."""
-        axis_map, axis_sign = axis_registers(self._axes)
+    def step(self) -> float:
+        """Take one reading, or try to get the unit to work again; after how long to call again, s."""
+        try:
+            if self._failures >= REOPEN_AFTER:
+                self._reopen_bus()
+            if self._is_lost:
+                self._set_up()
+                self._is_lost = False
+            sample = self._read()
+        except OSError as error:
+            self._reason = _bus_error(error)
+        except _DoubtfulReading as error:
+            self._reason = str(error)
+        except HardwareError as error:
+            self._reason, self._is_lost = str(error), True
+        else:
+            self._samples.append(sample)
+            self._newest_s = sample.t_s
+            self._failures, self._reason = 0, ""
+            return self._period_s
+        self.errors += 1
+        self._failures += 1
+        self._is_lost |= self._failures % RESET_AFTER == 0
+        return float(min(self._period_s * 2.0 ** max(0, self._failures - REOPEN_AFTER), LONGEST_WAIT_S))
+
+    def _run(self) -> None:
+        due_s = self._clock()
+        try:
+            while not self._stop.wait(max(0.0, due_s - self._clock())):
+                wait_s = self.step()
+                due_s = max(due_s + wait_s, self._clock())
+        except Exception as error:
+            self._reason = f"its thread ended: {error!r}"
+            raise
+        finally:
+            self._close_bus()
+
+    def _read(self) -> ImuSample:
+        """One burst. Raises OSError, _DoubtfulReading, and HardwareError where the unit has to be set up again."""
+        t_s = self._clock()
+        burst = self._read_registers(BURST_START, BURST.size)
+        values = BURST.unpack(burst)
+        wz, quaternion, ax, gravity = values[2], values[6:10], values[10], values[13:16]
+        calibration, status, error, units, mode = (values[k] for k in (17, 21, 22, 23, 25))
+        size = hypot(*gravity) / 100.0
+        misfit = max(abs(hypot(*quaternion) / 16384.0 - 1.0), abs(size / _G_M_S2 - 1.0))
+        is_new, self._last_burst = burst != self._last_burst, burst
+        if burst == b"\xff" * len(burst):
+            raise _DoubtfulReading("the bus reads ones only; check its wiring")
+        if mode != MODE_IMU or units != UNITS_M_S2_RAD_S:
+            raise self._error(f"was reset (mode 0x{mode:02x}, units 0x{units:02x}); check its supply")
+        if status == 1:
+            raise self._error(f"reports system error {error}; check its supply")
+        if misfit > _MISFIT:
+            raise _DoubtfulReading(
+                f"bytes do not fit together (gravity {size:.2f} m/s^2); check the speed of the I2C bus"
+            )
+        if not is_new:
+            raise _DoubtfulReading("the readings do not change")
+        gx, gy, gz = (-g / (100.0 * size) for g in gravity)
+        return ImuSample(t_s, ax / 100.0, wz / 900.0, (gx, gy, gz), calibration >> 4 & 3)
+
+    def _set_up(self) -> None:
+        """Reset the unit and set what ``_read`` relies on, each value read back; takes about 0.7 s."""
+        axis_map, axis_sign = axis_registers(self._config.axes)
         self._check_id()
         with suppress(OSError):  # it may reset before it acknowledges
             self._write(SYS_TRIGGER, RESET)
@@ -134,40 +226,13 @@ class Bno055:
         ):
             self._write(register, value)
             self._sleep(wait_s)
-            if (found := self._read(register, 1)[0]) != value:
+            if (found := self._read_registers(register, 1)[0]) != value:
                 raise self._error(f"{name} reads back 0x{found:02x} after 0x{value:02x}; check wiring and supply")
-        passed = self._read(SELF_TEST, 1)[0]
+        passed = self._read_registers(SELF_TEST, 1)[0]
         if failed := [name for bit, name in SELF_TEST_NEEDED.items() if not passed >> bit & 1]:
             raise self._error(f"self test failed: {', '.join(failed)}; replace the unit")
-        low, high, loader = self._read(CHIP_ID + 4, 3)
-        self.identity = f"BNO055 software {high:x}.{low:02x} boot loader {loader}"
-        self._last_burst = b""
-
-    def read(self) -> ImuSample | None:
-        """The newest reading; None: there is no new one, or its bytes do not fit together."""
-        t_s = self._clock()
-        burst = self._read(BURST_START, BURST.size)
-        values = BURST.unpack(burst)
-        wz, quaternion, ax, gravity = values[2], values[6:10], values[10], values[13:16]
-        calibration, status, error, units, mode = (values[k] for k in (17, 21, 22, 23, 25))
-        size = hypot(*gravity) / 100.0
-        misfit = max(abs(hypot(*quaternion) / 16384.0 - 1.0), abs(size / _G_M_S2 - 1.0))
-        is_new, self._last_burst = burst != self._last_burst, burst
-        self.doubt = ""
-        if burst == b"\xff" * len(burst):
-            self.doubt = "the bus reads ones only; check its wiring"
-        elif mode != MODE_IMU or units != UNITS_M_S2_RAD_S:
-            raise self._error(f"was reset (mode 0x{mode:02x}, units 0x{units:02x}); check its supply")
-        elif status == 1:
-            raise self._error(f"reports system error {error}; check its supply")
-        elif misfit > _MISFIT:
-            self.doubt = f"bytes do not fit together (gravity {size:.2f} m/s^2); check the speed of the I2C bus"
-        elif not is_new:
-            self.doubt = "the readings do not change"
-        if self.doubt:
-            return None
-        gx, gy, gz = (-g / (100.0 * size) for g in gravity)
-        return ImuSample(t_s, ax / 100.0, wz / 900.0, (gx, gy, gz), calibration >> 4 & 3)
+        low, high, loader = self._read_registers(SOFTWARE, 3)
+        self.identity = f"BNO055 software {high:x}.{low:02x} boot loader {loader:x}"
 
     def _check_id(self) -> None:
         try:
@@ -175,123 +240,31 @@ class Bno055:
         except OSError:  # its supply may have come a moment ago
             self._sleep(POWER_ON_S)
             self._write(PAGE_ID, 0)
-        if (found := self._read(CHIP_ID, 1)[0]) != BNO055_ID:
-            raise self._error(
-                f"chip id 0x{found:02x} instead of 0xa0: another device; check devices.bno055.bus and .address"
-            )
+        if (found := self._read_registers(CHIP_ID, 1)[0]) != BNO055_ID:
+            raise self._error(f"chip id 0x{found:02x} instead of 0xa0: another device; check devices.bno055.address")
 
-    def _write(self, register: int, value: int) -> None:
-        self._opened().write(self._address, bytes((register, value)))
+    def _reopen_bus(self) -> None:
+        self._close_bus()
+        self._bus = self._open_bus()
 
-    def _read(self, register: int, count: int) -> bytes:
-        return self._opened().write_read(self._address, bytes((register,)), count)
+    def _close_bus(self) -> None:
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            bus.close()
 
     def _opened(self) -> Bus:
         if self._bus is None:
             raise OSError("the I2C bus is closed")
         return self._bus
 
+    def _write(self, register: int, value: int) -> None:
+        self._opened().write(self._config.address, bytes((register, value)))
+
+    def _read_registers(self, register: int, count: int) -> bytes:
+        return self._opened().write_read(self._config.address, bytes((register,)), count)
+
     def _error(self, what: str) -> HardwareError:
-        return HardwareError(f"BNO055 at 0x{self._address:02x}: {what}")
-
-
-class ImuReader:
-    """Reads the unit in a thread of its own, since a transfer takes a millisecond and may hang in the kernel.
-
-    After some failures in sequence the bus is opened again, after more the unit is reset, at growing intervals.
-
-    Attributes:
-        errors: attempts that gave no sample.
-    """
-
-    def __init__(
-        self,
-        config: Bno055Config,
-        open_bus: Callable[[], Bus],
-        clock: Callable[[], float],
-        sleep: Callable[[float], object],
-    ) -> None:
-        self._stop = threading.Event()
-        self._clock = clock
-        self._period_s, self._timeout_s = 1.0 / config.rate_hz, config.timeout_s
-        self._samples: deque[ImuSample] = deque(maxlen=_QUEUED)
-        self._thread = threading.Thread(target=self._run, name="bno055", daemon=True)
-        self._failures = 0
-        self._is_lost = False
-        self._reason = ""
-        self._newest_s = clock()
-        self.errors = 0
-        self._unit = Bno055(config, open_bus, clock, sleep)
-
-    @property
-    def identity(self) -> str:
-        """What the unit says of itself."""
-        return self._unit.identity
-
-    def open(self) -> None:
-        """Set the unit up and begin to read. Raises HardwareError."""
-        try:
-            self._unit.open()
-            self._unit.set_up()
-        except (OSError, HardwareError) as error:
-            self._unit.close()
-            raise HardwareError(f"BNO055: {_bus_error(error)}" if isinstance(error, OSError) else str(error)) from None
-        self._newest_s = self._clock()
-        self._thread.start()
-
-    def step(self) -> float:
-        """Take one reading, or try to get the unit to work again; after how long to call again, s."""
-        try:
-            if self._failures >= REOPEN_AFTER:
-                self._unit.open()
-            if self._is_lost:
-                self._unit.set_up()
-                self._is_lost = False
-            sample = self._unit.read()
-        except (OSError, HardwareError) as error:
-            sample = None
-            self._is_lost |= isinstance(error, HardwareError)
-            self._reason = _bus_error(error) if isinstance(error, OSError) else str(error)
-        else:
-            self._reason = self._unit.doubt
-        if sample is not None:
-            self._samples.append(sample)
-            self._newest_s = sample.t_s
-            self._failures = 0
-            return self._period_s
-        self.errors += 1
-        self._failures += 1
-        self._is_lost |= self._failures % RESET_AFTER == 0
-        return float(min(self._period_s * 2.0 ** max(0, self._failures - REOPEN_AFTER), LONGEST_WAIT_S))
-
-    def take(self) -> list[ImuSample]:
-        """Samples since the last call; never waits."""
-        return [self._samples.popleft() for _ in range(len(self._samples))]
-
-    def fault(self, now_s: float) -> str:
-        """Why there is no reading for too long; empty: there is one."""
-        age_s = now_s - self._newest_s
-        if age_s <= self._timeout_s:
-            return ""
-        return f"no reading for {age_s:.2f} s: {self._reason or 'a transfer hangs; check the wiring of the I2C bus'}"
-
-    def close(self) -> None:
-        """End the thread and release the bus; one that hangs in the kernel is left to itself."""
-        self._stop.set()
-        if self._thread.ident is not None:
-            self._thread.join(_JOIN_S)
-
-    def _run(self) -> None:
-        due_s = self._clock()
-        try:
-            while not self._stop.wait(max(0.0, due_s - self._clock())):
-                wait_s = self.step()
-                due_s = max(due_s + wait_s, self._clock())
-        except Exception as error:
-            self._reason = f"its thread ended: {error!r}"
-            raise
-        finally:
-            self._unit.close()
+        return HardwareError(f"BNO055 at 0x{self._config.address:02x}: {what}")
 
 
 def _bus_error(error: OSError) -> str:

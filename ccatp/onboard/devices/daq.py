@@ -34,6 +34,7 @@ import binascii
 import struct
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from math import inf
 from typing import NamedTuple, Protocol
 
@@ -43,7 +44,6 @@ from ccatp.onboard.hardware import HardwareError
 SYNC, VERSION = b"\xa5\x5a", 1
 IDENTIFY, START, STOP, IDENTITY, SAMPLES = 0x01, 0x02, 0x03, 0x81, 0x82
 HEADER, CRC, SAMPLE = struct.Struct("<2sBBBH"), struct.Struct("<H"), struct.Struct("<Iii5H")
-MAX_SAMPLES = 11
 FULL_SCALE = 65535.0
 
 READ_BYTES = 4096
@@ -234,7 +234,9 @@ class Daq:
             if self._port is None:
                 if now_s < self._retry_s:
                     return []
-                self._connect(now_s)
+                self._port = self._open_port(self._config.device, self._config.baud)
+                self._valid_s = self._ask_s = now_s
+                self._garbage, self._is_started = 0, False
             data = self._opened().read(READ_BYTES)
             self._garbage += len(data)
             for kind, payload in self.decoder.feed(data):
@@ -247,7 +249,9 @@ class Daq:
                     self.decoder.counts["unknown"] += 1
             self._supervise(now_s)
         except (OSError, ValueError, HardwareError) as error:
-            self._disconnect(now_s, str(error))
+            self.close()
+            self._reason, self._retry_s = str(error), now_s + self._retry_wait_s
+            self._retry_wait_s = min(2.0 * self._retry_wait_s, LONGEST_RETRY_S)
         return samples
 
     def fault(self, now_s: float) -> str:
@@ -264,24 +268,11 @@ class Daq:
     def close(self) -> None:
         """Stop the device and release the port."""
         port, self._port = self._port, None
-        if port is None:
-            return
-        try:
-            port.write(format_frame(STOP, self._seq))
-            port.close()
-        except OSError:
-            pass  # it is gone
-
-    def _connect(self, now_s: float) -> None:
-        self._port = self._open_port(self._config.device, self._config.baud)
-        self._valid_s, self._garbage, self._is_started = now_s, 0, False
-        self._ask_s = now_s
-
-    def _disconnect(self, now_s: float, reason: str) -> None:
-        self.close()
-        self._reason = reason
-        self._retry_s = now_s + self._retry_wait_s
-        self._retry_wait_s = min(2.0 * self._retry_wait_s, LONGEST_RETRY_S)
+        if port is not None:
+            with suppress(OSError):  # it may be gone
+                port.write(format_frame(STOP, self._seq))
+            with suppress(OSError):
+                port.close()
 
     def _supervise(self, now_s: float) -> None:
         """Ask a device that sends no samples what it is; give up a port at which nothing valid comes."""

@@ -14,7 +14,7 @@ from statistics import pstdev
 from typing import Any, Protocol
 
 from ccatp.config.onboard_models import DevicesConfig
-from ccatp.onboard.devices.bno055 import Bus, ImuReader
+from ccatp.onboard.devices.bno055 import Bno055, Bus
 from ccatp.onboard.devices.daq import Daq, SerialPort
 from ccatp.onboard.devices.outputs import (
     PWM_ROOT,
@@ -128,14 +128,14 @@ class LinuxHardware:
         open_port: Callable[[str, int], SerialPort] = open_serial,
         open_lines: OpenLines = GpioLines,
         pwm_root: Path = PWM_ROOT,
-        imu_reader: type[ImuReader] = ImuReader,
+        imu: type[Bno055] = Bno055,
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
         self._config, self._clock, self._sleep = config, clock, sleep
         self._motors = Motors(config.motors, pwm_root, open_lines, sleep)
         self._timer = ExternalTimer(config.timer, open_lines)
         self._fans = Fans(config.fans, pwm_root, sleep)
-        self._imu = imu_reader(config.bno055, partial(open_bus, config.bno055.bus), clock, sleep)
+        self._imu = imu(config.bno055, partial(open_bus, config.bno055.bus), clock, sleep)
         self._daq = Daq(config.daq, open_port, clock, sleep)
         # In the order of opening: the motors brake first, and the samples that nobody takes meanwhile come last.
         self._devices: dict[str, _Device] = {

@@ -12,7 +12,7 @@ import pytest
 
 from ccatp.config.load import load_onboard_config
 from ccatp.config.onboard_models import Bno055Config
-from ccatp.onboard.devices.bno055 import ImuReader, axis_registers
+from ccatp.onboard.devices.bno055 import Bno055, axis_registers
 from ccatp.onboard.hardware import HardwareError
 from tests.support.onboard_fakes import FakeBno055, FakeTime
 
@@ -29,7 +29,7 @@ class Rig:
         self.time = FakeTime()
         self.faults: list[str] = []  # at each moment that the reader waits for
         self.unit = FakeBno055(self.time)
-        self.reader = ImuReader(config, self.unit.open, self.time, self.sleep)
+        self.reader = Bno055(config, self.unit.open, self.time, self.sleep)
 
     def sleep(self, wait_s: float) -> None:
         self.time.sleep(wait_s)
@@ -88,7 +88,7 @@ def test_set_up(before: Break) -> None:
     before(rig.unit)
     rig.reader.open()
     assert (rig.unit.mode, rig.unit.page, rig.unit.registers[0x3B]) == (0x08, 0, 0x02)
-    assert rig.reader.identity == "BNO055 software 3.11 boot loader 21"
+    assert rig.reader.identity == "BNO055 software 3.11 boot loader 15"
     rig.run(0.1)
     assert len(rig.reader.take()) == 10
 
@@ -258,7 +258,7 @@ def test_a_transfer_that_hangs_is_a_fault_and_does_not_keep_the_program_from_its
     monkeypatch.undo()
     rig, hanging, release = Rig(), threading.Event(), threading.Event()
     config = CONFIG.model_copy(update={"rate_hz": 1000.0})
-    reader = ImuReader(config, rig.unit.open, rig.time, rig.time.sleep)
+    reader = Bno055(config, rig.unit.open, rig.time, rig.time.sleep)
 
     def hang(burst: bytes) -> bytes:
         hanging.set()
@@ -282,7 +282,7 @@ def test_the_thread_reads_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     rig = Rig()
     config = CONFIG.model_copy(update={"rate_hz": 1000.0})
-    reader = ImuReader(config, rig.unit.open, rig.time, rig.time.sleep)
+    reader = Bno055(config, rig.unit.open, rig.time, rig.time.sleep)
     reader.open()
     until_s = time.monotonic() + 60.0
     samples = reader.take()

@@ -299,7 +299,7 @@ def test_what_breaks(rig: Rig, broken: Break, reason: str, repair: Break | None,
     rig.run(8.0)
     assert any(re.search(reason, fault) for fault in rig.faults) if reason else not any(rig.faults)
     assert not rig.faults[-1]
-    assert rig.device.opened - opened_before == opened
+    assert rig.device.opened - opened_before == opened == rig.device.closed
     for before, after in itertools.pairwise(rig.samples):
         dt_s = after.t_s - before.t_s
         assert dt_s > 0.0

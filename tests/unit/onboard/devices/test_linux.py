@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from ccatp.config.load import load_onboard_config
-from ccatp.onboard.devices.bno055 import ImuReader, ImuSample
+from ccatp.onboard.devices.bno055 import Bno055, ImuSample
 from ccatp.onboard.devices.linux import GpioLines, I2cBus, LinuxHardware, open_serial
 from ccatp.onboard.hardware import Hardware, HardwareError
 from tests.support.onboard_fakes import FakeBno055, FakeBridge, FakeDaq, FakePwm, FakeTime
@@ -23,7 +23,7 @@ CONFIG = load_onboard_config().devices
 DEVICES = ["motors", "external timer", "fans", "inertial unit", "data acquisition"]
 
 
-class SteppedReader(ImuReader):
+class SteppedBno055(Bno055):
     """Reads when its samples are taken, at the times at which its thread would have."""
 
     due_s = 0.0
@@ -46,7 +46,7 @@ class Rig:
         self.bus_error: HardwareError | None = None
         self.linux = LinuxHardware(
             CONFIG, self.time, open_bus=self.open_bus, open_port=self.daq.open, open_lines=self.bridge.open,
-            pwm_root=root, imu_reader=SteppedReader, sleep=self.time.sleep,
+            pwm_root=root, imu=SteppedBno055, sleep=self.time.sleep,
         )  # fmt: skip
         self.hardware: Hardware = self.linux
 
