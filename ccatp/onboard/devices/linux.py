@@ -16,14 +16,7 @@ from typing import Any, Protocol
 from ccatp.config.onboard_models import DevicesConfig
 from ccatp.onboard.devices.bno055 import Bno055, Bus
 from ccatp.onboard.devices.daq import Daq, SerialPort
-from ccatp.onboard.devices.outputs import (
-    PWM_ROOT,
-    ExternalTimer,
-    Fans,
-    Motors,
-    OpenLines,
-    explain,
-)
+from ccatp.onboard.devices.outputs import PWM_ROOT, ExternalTimer, Fans, Motors, OpenLines, explain
 from ccatp.onboard.hardware import DeviceCheck, HardwareError, Readings
 
 I2C_TIMEOUT = 0x0702  # ioctl of linux/i2c-dev.h, in 10 ms
@@ -58,17 +51,14 @@ class I2cBus:
             fcntl.ioctl(self._bus.fd, I2C_TIMEOUT, BUS_TIMEOUT_10MS)
 
     def write(self, address: int, data: bytes) -> None:
-        """See ``Bus``."""
         self._bus.i2c_rdwr(self._smbus2.i2c_msg.write(address, data))
 
     def write_read(self, address: int, data: bytes, count: int) -> bytes:
-        """See ``Bus``."""
         answer = self._smbus2.i2c_msg.read(address, count)
         self._bus.i2c_rdwr(self._smbus2.i2c_msg.write(address, data), answer)
         return bytes(answer)
 
     def close(self) -> None:
-        """See ``Bus``."""
         self._bus.close()
 
 
@@ -99,11 +89,9 @@ class GpioLines:
             raise explain(error, chip, "gpio", "the lines in devices.motors and devices.timer") from None
 
     def set(self, values: Mapping[int, bool]) -> None:
-        """See ``Lines``."""
         self._request.set_values({line: self._levels[is_high] for line, is_high in values.items()})
 
     def close(self) -> None:
-        """See ``Lines``."""
         self._request.release()
 
 
@@ -149,7 +137,6 @@ class LinuxHardware:
         self._fan_check_s = clock()
 
     def start(self) -> None:
-        """See ``Hardware``."""
         try:
             for device in self._devices.values():
                 self._opened.callback(device.close)
@@ -159,7 +146,6 @@ class LinuxHardware:
             raise
 
     def read(self, now_s: float) -> Readings:
-        """See ``Hardware``."""
         samples = self._daq.poll(now_s)
         inertial = self._imu.take()
         if now_s - self._fan_check_s >= FAN_CHECK_S:
@@ -183,24 +169,19 @@ class LinuxHardware:
         )
 
     def drive(self, right_v: float, left_v: float) -> None:
-        """See ``Hardware``."""
         self._motors.drive(right_v, left_v)
         self._timer.restart()
 
     def brake(self) -> None:
-        """See ``Hardware``: the external timer is not restarted, so it brakes by itself where this call could not."""
-        self._motors.brake()
+        self._motors.brake()  # the external timer is not restarted: it brakes where this call could not
 
     def fans(self) -> tuple[float, float]:
-        """See ``Hardware``."""
         return self._fans.duties()
 
     def command_fans(self, left: float, right: float) -> None:
-        """See ``Hardware``."""
         self._fans.command(left, right)
 
     def close(self) -> None:
-        """See ``Hardware``."""
         self._opened.close()
 
     def check(self, duration_s: float) -> list[DeviceCheck]:
