@@ -11,6 +11,7 @@ import pytest
 
 from ccatp.onboard.devices.bno055 import BURST_START
 from ccatp.onboard.devices.daq import IDENTIFY, IDENTITY, SAMPLE, SAMPLES, START, STOP, Decoder, format_frame
+from ccatp.onboard.hardware import HardwareError
 
 POWER_ON_S, TO_CONFIG_S, FROM_CONFIG_S = 0.4, 0.019, 0.007
 
@@ -232,7 +233,7 @@ class FakeBridge:
     def __init__(self) -> None:
         self.levels: dict[int, bool] = {}
         self.changes: list[dict[int, bool]] = []
-        self.error: OSError | None = None
+        self.error: HardwareError | None = None
         self.closed = 0
 
     def open(self, _chip: str, values: Mapping[int, bool]) -> "FakeBridge":

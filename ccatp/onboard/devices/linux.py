@@ -24,6 +24,7 @@ BUS_TIMEOUT_10MS = 5
 LOW_SOC = 0.15
 FAN_CHECK_S = 0.1
 RATE_TOLERANCE = 0.1
+_LINES_KEY = "the lines in devices.motors and devices.timer"
 ENCODERS_AND_EDGES = ("encoder_left", "encoder_right", "edge")
 
 _Sampled = tuple[Sequence[Sequence[float]], float, str, dict[str, tuple[float, tuple[int, ...]]]]
@@ -77,6 +78,7 @@ class GpioLines:
 
     def __init__(self, chip: str, values: Mapping[int, bool]) -> None:
         gpiod = import_package("gpiod")
+        self._chip = chip
         self._levels = gpiod.line.Value.INACTIVE, gpiod.line.Value.ACTIVE
         output = gpiod.line.Direction.OUTPUT
         settings = {
@@ -86,10 +88,13 @@ class GpioLines:
         try:
             self._request = gpiod.request_lines(chip, consumer="ccatp", config=settings)
         except (OSError, ValueError) as error:
-            raise explain(error, chip, "gpio", "the lines in devices.motors and devices.timer") from None
+            raise explain(error, chip, "gpio", _LINES_KEY) from None
 
     def set(self, values: Mapping[int, bool]) -> None:
-        self._request.set_values({line: self._levels[is_high] for line, is_high in values.items()})
+        try:
+            self._request.set_values({line: self._levels[is_high] for line, is_high in values.items()})
+        except OSError as error:
+            raise explain(error, self._chip, "gpio", _LINES_KEY) from None
 
     def close(self) -> None:
         self._request.release()

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
-from ccatp.config.onboard_models import ExternalTimerConfig, FansConfig, MotorConfig, MotorsConfig, PwmChannelConfig
+from ccatp.config.onboard_models import ExternalTimerConfig, FansConfig, MotorsConfig, PwmChannelConfig
 from ccatp.onboard.hardware import HardwareError
 
 PWM_ROOT = Path("/sys/class/pwm")
@@ -38,7 +38,7 @@ class Lines(Protocol):
     """Output lines of one GPIO chip."""
 
     def set(self, values: Mapping[int, bool]) -> None:
-        """Set lines, all at once; OSError."""
+        """Set lines, all at once. Raises HardwareError."""
 
     def close(self) -> None:
         """Release them."""
@@ -52,29 +52,22 @@ class Pwm:
     """One channel of the kernel's PWM, its files kept open. Every method raises HardwareError.
 
     Attributes:
-        name: what the channel drives, for messages.
+        identity: chip and channel.
         period_ns: period in force.
     """
 
     def __init__(self, root: Path, channel: PwmChannelConfig, name: str, key: str, sleep: Sleep) -> None:
-        self._chip = root / f"pwmchip{channel.chip}"
-        self._channel = channel.channel
-        self._folder = self._chip / f"pwm{channel.channel}"
-        self._key, self._sleep = key, sleep
-        self._fds: dict[str, int] = {}
-        self.name = name
+        self.identity = f"pwmchip{channel.chip}/pwm{channel.channel}"
         self.period_ns = 0
-
-    @property
-    def identity(self) -> str:
-        """Chip and channel."""
-        return f"{self._chip.name}/{self._folder.name}"
+        self._folder, self._channel = root / self.identity, channel.channel
+        self._label, self._key, self._sleep = f"{name}, {self.identity}", key, sleep
+        self._fds: dict[str, int] = {}
 
     def open(self) -> None:
         """Export the channel and open its files; changes nothing of what it puts out."""
         try:
             if not self._folder.is_dir():
-                fd = os.open(self._chip / "export", os.O_WRONLY)
+                fd = os.open(self._folder.parent / "export", os.O_WRONLY)
                 try:
                     os.pwrite(fd, b"%d\n" % self._channel, 0)
                 finally:
@@ -82,7 +75,7 @@ class Pwm:
             self._open_files()
         except OSError as error:
             self.close()
-            raise explain(error, f"{self.name}, {self.identity}", "of /sys/class/pwm", self._key) from None
+            raise explain(error, self._label, "of /sys/class/pwm", self._key) from None
         self.period_ns = self._read("period")
 
     def _open_files(self) -> None:
@@ -112,11 +105,20 @@ class Pwm:
 
     def duty(self) -> float:
         """Duty in force, 0 to 1, as the kernel has it."""
+        self.period_ns = self._read("period")
         return self._read("duty_cycle") / self.period_ns if self.period_ns and self.is_enabled() else 0.0
 
     def set_duty(self, duty: float) -> None:
         """Set the duty, clamped to 0 to 1."""
         self._write("duty_cycle", round(min(1.0, max(0.0, duty)) * self.period_ns))
+
+    def restore(self, duty: float) -> None:
+        """Set and enable what is not ``duty``, and read it back."""
+        if abs(self.duty() - duty) > _DUTY_TOLERANCE:
+            self.set_duty(duty)
+            self._write("enable", 1)
+        if abs((found := self.duty()) - duty) > _DUTY_TOLERANCE:
+            raise HardwareError(f"{self._label}: duty {found:.2f} instead of {duty:.2f}; check its driver")
 
     def close(self) -> None:
         """Close the files; what the channel puts out stays as it is."""
@@ -127,15 +129,15 @@ class Pwm:
         try:
             return int(os.pread(self._fds[name], 32, 0).split()[0])
         except (OSError, LookupError, ValueError) as error:
-            raise HardwareError(f"{self.name}, {self.identity}/{name}: cannot be read: {error}") from None
+            raise HardwareError(f"{self._label}/{name}: cannot be read: {error}") from None
 
     def _write(self, name: str, value: int) -> None:
         try:
             os.pwrite(self._fds[name], b"%d\n" % value, 0)
         except KeyError:
-            raise HardwareError(f"{self.name}, {self.identity}: is not open") from None
+            raise HardwareError(f"{self._label}: is not open") from None
         except OSError as error:
-            raise explain(error, f"{self.name}, {self.identity}/{name}", "of /sys/class/pwm", self._key) from None
+            raise explain(error, f"{self._label}/{name}", "of /sys/class/pwm", self._key) from None
 
 
 class Motors:
@@ -207,16 +209,9 @@ class Motors:
             raise HardwareError("motors: are not open")
         values: dict[int, bool] = {}
         for (motor, _), direction in zip(self._motors, directions, strict=True):
-            values |= _bridge(motor, direction)
-        try:
-            self._lines.set(values)
-        except OSError as error:
-            raise explain(error, f"motors, {self._config.gpio_chip}", "gpio", "devices.motors") from None
+            values |= {motor.forward_line: direction >= 0, motor.reverse_line: direction <= 0}
+        self._lines.set(values)
         self._directions = directions
-
-
-def _bridge(motor: MotorConfig, direction: int) -> dict[int, bool]:
-    return {motor.forward_line: direction >= 0, motor.reverse_line: direction <= 0}
 
 
 class Fans:
@@ -254,7 +249,7 @@ class Fans:
 
     def command(self, left: float, right: float) -> None:
         """Set the duties; a fan that refuses does not keep the other from its duty. Raises HardwareError."""
-        self._commanded = dict(zip(self._fans, (left, right), strict=True))
+        self._commanded = {"fan_left": min(1.0, max(0.0, left)), "fan_right": min(1.0, max(0.0, right))}
         self.check()
         if self.faults:
             raise HardwareError("; ".join(self.faults.values()))
@@ -264,9 +259,7 @@ class Fans:
         self.faults = {}
         for name, fan in self._fans.items():
             try:
-                duty = fan.duty()
-                if abs(duty - self._commanded.get(name, duty)) > _DUTY_TOLERANCE:
-                    fan.set_duty(self._commanded[name])
+                fan.restore(self._commanded[name] if name in self._commanded else fan.duty())
             except HardwareError as error:
                 self.faults[name] = str(error)
 
@@ -298,10 +291,7 @@ class ExternalTimer:
         if self._lines is None:
             raise HardwareError("external timer: is not open")
         self._level = not self._level
-        try:
-            self._lines.set({self._config.line: self._level})
-        except OSError as error:
-            raise explain(error, f"external timer, {self.identity}", "gpio", "devices.timer") from None
+        self._lines.set({self._config.line: self._level})
 
     def close(self) -> None:
         """Release the line."""

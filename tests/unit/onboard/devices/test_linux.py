@@ -2,6 +2,7 @@
 
 import errno
 import fcntl
+import os
 import random
 import subprocess
 import sys
@@ -308,7 +309,16 @@ def test_lines_are_outputs_with_their_first_levels_and_set_in_one_call(monkeypat
     lines = GpioLines("/dev/gpiochip0", {5: True, 6: False})
     lines.set({5: False, 6: True})
     lines.close()
+    request.set_values = _refuse
+    with pytest.raises(
+        HardwareError, match=r"/dev/gpiochip0: \[Errno 5\] Input/output error; check the lines in devices"
+    ):
+        lines.set({5: True})
     assert seen == [{5: high, 6: low}, {5: low, 6: high}, "released"]
+
+
+def _refuse(_values: object) -> None:
+    raise OSError(errno.EIO, os.strerror(errno.EIO))
 
 
 def test_the_drivers_import_nothing_heavy() -> None:
