@@ -17,10 +17,11 @@ if TYPE_CHECKING:
 
 
 @click.group(
-    cls=CommandGroup, epilog=example("ccatp recording info runs/tonight", "ccatp recording repair telemetry.mcap")
+    cls=CommandGroup,
+    epilog=example("ccatp recording info runs/tonight", "ccatp recording export runs/tonight --ros2 tonight_bag"),
 )
 def recording() -> None:
-    """Show what recordings hold and repair damaged ones."""
+    """Show what recordings hold, repair damaged ones, and write them for other tools."""
 
 
 @recording.command(
@@ -79,11 +80,11 @@ def repair(path: Path, out: Path | None, json_output: bool) -> int:
         "ccatp recording export runs/tonight --ros2 tonight_bag",
     )
 )
-@click.argument("run_dir", type=PATH)
+@click.argument("path", metavar="FILE|RUN_DIR", type=PATH)
 @click.option("--tum", "tum_file", type=PATH, help="File for the estimates, a TUM trajectory.")
 @click.option("--truth", "truth_file", type=PATH, help="File for the simulated truth, a TUM trajectory.")
 @click.option("--ros2", "bag_dir", type=PATH, help="New directory for a ROS 2 bag (MCAP; extra ccatp[ros]).")
-def export(run_dir: Path, tum_file: Path | None, truth_file: Path | None, bag_dir: Path | None) -> None:
+def export(path: Path, tum_file: Path | None, truth_file: Path | None, bag_dir: Path | None) -> None:
     """Write a recorded survey for other tools.
 
     A TUM trajectory is the path for evo and others: deck frame, m, the robot's clock. A ROS 2 bag has every sample as a
@@ -91,11 +92,14 @@ def export(run_dir: Path, tum_file: Path | None, truth_file: Path | None, bag_di
     resumed the newest recording is taken.
     """
     from ccatp.mirror.mirror import build_mirror
+    from ccatp.records.recorder import iter_messages
     from ccatp.records.run_reader import format_tum, open_run
 
     if not (tum_file or truth_file or bag_dir):
         raise click.UsageError("nothing to write; give --tum, --truth or --ros2")
-    newest = open_run(run_dir)[-1]
+    newest = open_run(path)[-1]
+    if not any(message.topic == "sensors" for message in iter_messages(newest.path)):
+        raise ConfigError(f"{newest.path}: no sensors frames in it, so there is nothing to export")
     cfg = newest.config({})
     mirror = build_mirror(cfg.mirror)
     if bag_dir is not None:

@@ -233,3 +233,20 @@ def test_a_run_begins_with_its_first_message_and_lines_become_a_log() -> None:
     (log,) = found["view/log"]
     assert log["timestamp"] == {"sec": NOON_S, "nsec": 0}
     assert (log["level"], log["name"], log["message"]) == (3, "main", "held")
+
+
+def test_the_sdk_takes_every_view_of_its_types_as_it_is(views: Views) -> None:
+    pose = MIRROR.deck_pose(PanelPose(PanelId(3, 4), 0.0, 0.0, 0.0))
+    row = (100, 1.0, pose.x_m, pose.y_m, pose.heading_rad, 0.0, 0.0, 0.0, 0.1, 0, 0)
+    messages = [
+        track((100, 1.0, 3, 4, 0.0, 0.0, 0.0, 0.001)),
+        TruthMessage(seq=100, t_s=1.0, rows=[row]),
+        fix(PointId(2, 3, 5), 1.0, 1e-4),
+        LogMessage(seq=1, t_s=2.25, level="warning", process="main", text="held"),
+    ]
+    names = {view.name: view.schema_name.removeprefix("foxglove.") for view in VIEWS if "foxglove." in view.schema_name}
+    found = [*views.begin(), *(one for message in messages for one in views.of(message))]
+    of_theirs = [one for one in found if one.topic in names]
+    assert {one.topic for one in of_theirs} == set(names)
+    for one in of_theirs:
+        as_sdk(getattr(sdk, names[one.topic]), json.loads(one.payload))

@@ -208,6 +208,7 @@ def test_verdicts_alarms_and_mission_become_diagnostics(tmp_path: Path, run_dir:
         "name": "earthquake", "severity": "hold", "cause": "the mirror shakes", "advice": "", "since": "", "since_s": 0,
     }  # fmt: skip
     status["alarms"] = [alarm, {**alarm, "name": "fire", "ended": "2026-01-01T12:00:00Z"}]
+    recorder.write("sensors", 0.04, b'{"seq":4,"t_s":0.04,"lines":[]}')
     recorder.write("danger_event", 0.05, msgspec.json.encode(rim))
     recorder.write("mission", 0.06, msgspec.json.encode(msgspec.convert(status, MissionStatus)))
     recorder.close()
@@ -254,6 +255,11 @@ def test_what_cannot_be_exported_is_one_line(
     with full_beyond(100_000):
         assert f"--ros2: cannot write {new}: File too large" in refused(capsys, *export, "--ros2", new)
     assert not new.exists()
+    begun = tmp_path / "begun"  # a run that ended before the first frame
+    begun.mkdir()
+    recorder_in(begun, {"config": (run_dir / "config.toml").read_text()}).close()
+    for option in ("--tum", "--ros2"):
+        assert "no sensors frames in it" in refused(capsys, "recording", "export", begun, option, new)
     text = tmp_path / "notes.txt"
     text.write_text("no recording")
     named = "no recording of a run; name a telemetry.mcap, or the directory of a run"
