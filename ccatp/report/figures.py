@@ -18,7 +18,7 @@ from ccatp.report.plots import BAD, INK, PX_PER_IN, QUIET, SERIES, add_legend, e
 from ccatp.report.record import WITHIN_MM
 
 _LEAST_MM = 1e-3  # a micrometre: less is of no interest, and of the noise of the laser
-_PX_PER_INTERVAL = 2.0
+_PX_PER_INTERVAL = 0.5  # of series over time: there is more to see when a figure is zoomed
 _OF_THE_BUDGET = 0.4  # a few panels are no matter of an hour
 _KIND_COLOURS = dict(
     zip(KINDS, (SERIES[1], SERIES[0], SERIES[5], SERIES[2], SERIES[4], SERIES[3], "#6b5b95", QUIET), strict=True)

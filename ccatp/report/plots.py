@@ -3,6 +3,7 @@
 matplotlib takes a second to import, so that it is imported only where something is drawn.
 """
 
+import json
 import re
 from collections.abc import Sequence
 from io import StringIO
@@ -34,6 +35,7 @@ FONT = "system-ui, 'Segoe UI', 'DejaVu Sans', Helvetica, Arial, sans-serif"
 SVG = "http://www.w3.org/2000/svg"
 _XLINK = "http://www.w3.org/1999/xlink"
 _TOOLTIPS = "tooltips|"
+_PT_PER_IN = 72.0  # of SVG files
 _RASTER_DPI = 144.0  # of what an SVG holds as an image
 
 
@@ -165,11 +167,30 @@ def svg_of(figure: "Figure", *, is_file: bool = False) -> str:
         _shorten(element)
     if not is_file:
         del root.attrib["width"], root.attrib["height"]
+        root.set("data-axes", json.dumps(_axes_of(figure)))
     style = f"font-family:{FONT};stroke-linejoin:round;stroke-linecap:butt"
     root.attrib.update({"role": "img", "aria-label": title, "style": style})
     ET.register_namespace("", SVG)
     ET.register_namespace("xlink", _XLINK)
     return ET.tostring(root, encoding="unicode")
+
+
+def _axes_of(figure: "Figure") -> list[dict[str, Any]]:
+    """The x and the y axis of the first plot, with their ends in the ``svg`` element, for those who point at it."""
+    axes, width_pt, height_pt = figure.axes[0], *(_PT_PER_IN * figure.get_size_inches())
+    box = axes.get_position()
+    return [
+        {
+            "label": label,
+            "ends": [round(float(end), 2) for end in ends],
+            "values": [float(f"{value:.7g}") for value in values],
+            "log": scale == "log",
+        }
+        for label, ends, values, scale in (
+            (axes.get_xlabel(), width_pt * box.intervalx, axes.get_xlim(), axes.get_xscale()),
+            (axes.get_ylabel(), height_pt * (1.0 - box.intervaly), axes.get_ylim(), axes.get_yscale()),
+        )
+    ]
 
 
 def _shorten(element: ET.Element) -> None:

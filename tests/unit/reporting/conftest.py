@@ -21,6 +21,7 @@ class Markup(HTMLParser):
         self.open: list[str] = []
         self.outside: list[str] = []
         self.anchors: list[str] = []
+        self.scripts: list[str] = []
         self.ids: set[str | None] = set()
         self.feed(page)
         self.close()
@@ -38,7 +39,14 @@ class Markup(HTMLParser):
                 if tag == "section":
                     self.anchors.append(value or "")
             assert not name.startswith("on"), f"a script: {name}"
-        assert tag not in {"script", "iframe", "object", "embed", "img"}
+        assert tag not in {"iframe", "object", "embed", "img"}
+        if tag == "script":
+            assert attrs == []
+            self.scripts.append("")
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] == "script":
+            self.scripts[-1] += data
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         pass  # of an SVG
