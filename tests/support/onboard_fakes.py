@@ -139,10 +139,10 @@ class FakeBno055:
 class FakeDaq:
     """The device behind a serial port, and the port. Its time, its clock's rate and its counts can be set.
 
-    corrupt: changes the bytes on their way to the host. is_mute: sends nothing at all.
+    corrupt: changes the bytes on their way to the host. is_mute: takes and sends nothing.
     """
 
-    def __init__(self, time: FakeTime, packed: int = 10) -> None:
+    def __init__(self, time: FakeTime, packed: int = 5) -> None:
         self._time, self._packed = time, packed
         self.identity = b"ccatp-daq\x001.2\x00SN7\x00"
         self.fastest_hz = 2000
@@ -154,7 +154,7 @@ class FakeDaq:
         self.counts, self.step = [0, 0], [0, 0]
         self.adc = [60000, 60000, 60000, 60000, 57000]
         self.open_error: Exception | None = None
-        self.opened = self.closed = 0
+        self.opened = self.closed = self.unsent = 0
         self.latency_s: Callable[[], float] = float
         self._sent: list[tuple[float, bytes]] = []
         self._arrived = b""
@@ -179,6 +179,9 @@ class FakeDaq:
     def write(self, data: bytes, /) -> int:
         if self.is_unplugged:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
+        if self.is_mute:
+            self.unsent += len(data)
+            return len(data)
         for kind, payload in self._decoder.feed(data):
             if kind == IDENTIFY:
                 self._identify()
@@ -198,7 +201,11 @@ class FakeDaq:
         data, self._arrived = self._arrived[:size], self._arrived[size:]
         return data
 
+    def reset_output_buffer(self) -> None:
+        self.unsent = 0
+
     def close(self) -> None:
+        assert not self.unsent, "closing would wait for the device"
         self.closed += 1
 
     def send(self, kind: int, payload: bytes) -> None:

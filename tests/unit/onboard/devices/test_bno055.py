@@ -1,6 +1,8 @@
 """The inertial unit by its registers: set-up, frame, and what breaks on the bus and in the unit."""
 
+import contextlib
 import errno
+import itertools
 import math
 import os
 import re
@@ -128,6 +130,14 @@ def test_a_unit_that_is_not_right_is_refused(broken: Break, message: str) -> Non
 )
 def test_axes(axes: tuple[str, str, str], registers: tuple[int, int]) -> None:
     assert axis_registers(axes) == registers
+
+
+def test_there_are_24_ways_to_mount_a_unit() -> None:
+    registers = []
+    for axes in itertools.product(("x", "-x", "y", "-y", "z", "-z"), repeat=3):
+        with contextlib.suppress(HardwareError):
+            registers.append(axis_registers(axes))
+    assert len(registers) == len(set(registers)) == 24
 
 
 @pytest.mark.parametrize("axes", [("x", "x", "z"), ("x", "y", "-z"), ("y", "x", "z"), ("-x", "-y", "-z")])
