@@ -9,7 +9,8 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.links.beacon_messages import worst_sigma_m
 from ccatp.links.topics import BeaconArrival, BeaconMapMessage, BeaconPlaces, BeaconTrack
 from ccatp.report.beacon_record import expected_rms_m, standing_beacons, true_rms_m
-from ccatp.report.dashboard.view import MEASURED, PLANNED, RunStateView, TruthCompare
+from ccatp.report.dashboard.history import TruthCompare
+from ccatp.report.dashboard.view import MEASURED, PLANNED, RunStateView
 
 CODES = ["normal operation", "near something", "operation aborted"]
 TITLES = {"zigbee": "ZigBee beacons", "follow": "Following a radio", "cricket": "Ultrasonic motes"}

@@ -9,7 +9,8 @@ from ccatp.links.topics import ArrivalMessage, DisplayState, FixMessage, Mission
 from ccatp.mirror.mirror import Mirror, deck_poses
 from ccatp.mirror.surface import ConvergenceError
 from ccatp.records.store import StoredSurvey
-from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView, TruthCompare
+from ccatp.report.dashboard.history import TruthCompare
+from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView
 from ccatp.survey.events import PURPOSES
 from ccatp.survey.planning.route import ORDERS
 

@@ -11,7 +11,8 @@ from prometheus_client.parser import text_string_to_metric_families
 import ccatp
 from ccatp.links.topics import DisplayState, Heartbeat
 from ccatp.report.dashboard.app import StateCollector
-from ccatp.report.dashboard.view import NO_LINE, Growing, Lines, Links, LinkState, TruthCompare
+from ccatp.report.dashboard.history import Growing, Lines, TruthCompare
+from ccatp.report.dashboard.view import NO_LINE, Links, LinkState
 from ccatp.survey.events import MissionState
 
 
