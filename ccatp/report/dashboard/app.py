@@ -11,7 +11,7 @@ import os
 import platform
 import socket
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from math import sqrt
 from pathlib import Path
 from typing import Any, ClassVar
@@ -43,6 +43,7 @@ from ccatp.links.liveness import LogRateLimit
 from ccatp.links.rpc import MAX_REPLY_BYTES
 from ccatp.report.dashboard.access import CommandRefusal, check_command, host_refusal
 from ccatp.report.dashboard.hub import StateBroadcaster
+from ccatp.report.dashboard.openapi import ACKNOWLEDGE, COMMANDS, ENDPOINTS, PREFIX, description
 
 Samples = Iterable[tuple[tuple[str, ...], float | None]]
 # Name, help, part of the state, value; left out while that part is not known.
@@ -143,13 +144,7 @@ class StateCollector(Collector):
 
 
 STATIC = Path(__file__).resolve().parent / "static"
-# The path of each command, its channel, and what answers there.
-COMMANDS = {
-    **dict.fromkeys(("pause", "resume", "abort", "stop", ACKNOWLEDGE := "alarms/ack"), "control"),
-    **dict.fromkeys(("emergency", "clear"), "emergency"),
-}
 ANSWERED_BY = {"control": "the main loop", "emergency": "the danger loop"}
-PREFIX = "/api/v1"  # every path exists with it and without
 # Of all pages together; an operator has one at a time.
 MAX_COMMANDS = 8
 HEADERS = {
@@ -269,11 +264,8 @@ def build_app(
     registry = CollectorRegistry()
     registry.register(StateCollector(hub.state, lambda: hub.pages, ground))
 
-    async def page(request: Request) -> Response:
-        return await static.get_response("index.html", request.scope)
-
-    async def send_ground(_request: Request) -> Response:
-        return _json(ground)
+    async def file(request: Request) -> Response:
+        return await static.get_response(request.path_params.get("path", "index.html"), request.scope)
 
     async def events(_request: Request) -> Response:
         return StreamingResponse(hub.events(), media_type="text/event-stream", headers={"x-accel-buffering": "no"})
@@ -291,6 +283,10 @@ def build_app(
     async def metrics(_request: Request) -> Response:
         return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
 
+    async def operator(request: Request) -> Response:
+        by = check_command(request.headers, tokens)
+        return _refused(by) if isinstance(by, CommandRefusal) else _json({"status": "ok", "name": by})
+
     async def command(request: Request) -> Response:
         name = _command(request)
         line = {"command": name, "client": request.client.host if request.client is not None else "?"}
@@ -298,7 +294,7 @@ def build_app(
         if isinstance(by, CommandRefusal):
             if (left_out := refusals.take(asyncio.get_running_loop().time())) is not None:
                 log.info("page_request_refused", **line, why=by.message, left_out=left_out)
-            return _error(*by, {"www-authenticate": "Bearer"} if by.http_status == 401 else {})
+            return _refused(by)
         request.state.is_command = True  # its connection stays
         reply = await commands.ask(name, _frame(name, await _body(request, cfg.slow_client_s), by))
         refusal = reply.message if isinstance(reply, CommandRefusal) else ""
@@ -307,13 +303,10 @@ def build_app(
             return _error(*reply)
         return _json({"status": "ok", **{key: reply[key] for key in ("id", "latched", "code") if key in reply}})
 
-    reads = {"/": page, "/ground": send_ground, "/events": events, "/status": status, "/alarms": alarms,
-             "/healthz": healthz, "/metrics": metrics}  # fmt: skip
-    routes = [
-        *(Route(path, answer) for path, answer in reads.items()),
-        *(Route(f"/{name}", command, methods=["POST"]) for name in COMMANDS),
-        Mount("/static", static),
-    ]
+    reads = {"/": file, "/static/{path}": file, "/ground": _constant(ground), "/events": events, "/status": status,
+             "/alarms": alarms, "/healthz": healthz, "/metrics": metrics,
+             "/openapi.json": _constant(description()), "/operator": operator}  # fmt: skip
+    routes = [Route(row.path, reads.get(row.path, command), methods=[row.method]) for row in ENDPOINTS]
     return Starlette(
         routes=[*routes, Mount(PREFIX, routes=routes)],
         middleware=[Middleware(RequestCheckMiddleware, cfg=cfg)],
@@ -360,6 +353,17 @@ async def _http_error(request: Request, error: Exception) -> Response:
 
 def _json(data: Mapping[str, Any], code: int = 200, headers: Mapping[str, str] | None = None) -> Response:
     return Response(msgspec.json.encode(data) + b"\n", code, headers, media_type="application/json")
+
+
+def _constant(data: Mapping[str, Any]) -> Callable[[Request], Awaitable[Response]]:
+    async def answer(_request: Request) -> Response:
+        return _json(data)
+
+    return answer
+
+
+def _refused(refusal: CommandRefusal) -> Response:
+    return _error(*refusal, {"www-authenticate": "Bearer"} if refusal.http_status == 401 else {})
 
 
 def _error(code: int, message: str, headers: Mapping[str, str] | None = None) -> Response:

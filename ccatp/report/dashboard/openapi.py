@@ -1,0 +1,160 @@
+"""THE table of the HTTP interface: the application's routes and ``GET /openapi.json`` are made of it."""
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import msgspec
+
+import ccatp
+from ccatp.core import EmergencyKind, Verdict
+from ccatp.links.topics import Alarm, DisplayState, MissionStatus
+
+PREFIX = "/api/v1"  # every path exists with it and without
+ACKNOWLEDGE = "alarms/ack"
+Schema = dict[str, Any]
+
+ERRORS = {
+    400: "the body is no JSON object of the form",
+    401: "no token, or one that is not accepted",
+    403: "sent by a page of another site",
+    404: "no such path",
+    405: "another method",
+    408: "the body was not complete in time",
+    409: "refused by the daemon, with its reason",
+    413: "the body is too long",
+    421: "asked for under a foreign name",
+    502: "the daemon's answer is not of the form",
+    503: "not available now",
+    504: "no answer from the daemon in time",
+}
+JSON, HTML, TEXT, EVENTS, BYTES = (
+    "application/json",
+    "text/html",
+    "text/plain",
+    "text/event-stream",
+    "application/octet-stream",
+)
+
+
+def _ref(name: str) -> Schema:
+    return {"$ref": f"#/components/schemas/{name}"}
+
+
+def _object(*required: str, **properties: Schema) -> Schema:
+    return {"type": "object", "properties": properties, "required": list(required)}
+
+
+_TEXT: Schema = {"type": "string"}
+_OK: Schema = {"const": "ok"}
+_ID = {"type": "string", "format": "uuid"}
+_CODE = {"type": "integer", "minimum": 0, "maximum": 2}
+_KIND = {"enum": [str(kind) for kind in EmergencyKind]}
+_DONE = _object("status", status=_OK)
+
+
+class Endpoint(NamedTuple):
+    """One row: path, what it is for, and what it answers with; with a ``channel`` it commands and needs a token.
+
+    ``channel``: ``control`` is answered by the main loop, ``emergency`` by the danger loop, ``token`` by the page.
+    """
+
+    path: str
+    summary: str
+    schema: Schema
+    content: str = JSON
+    channel: str = ""
+    body: Schema | None = None
+    errors: tuple[int, ...] = ()
+
+    @property
+    def method(self) -> str:
+        """Of HTTP."""
+        return "POST" if self.channel in ("control", "emergency") else "GET"
+
+
+ENDPOINTS = (
+    Endpoint("/", "The page.", _TEXT, HTML),
+    Endpoint("/static/{path}", "A file of the page.", _TEXT, BYTES, errors=(404,)),
+    Endpoint("/ground", "What does not change in a run: map, points, limits, names.", {"type": "object"}),
+    Endpoint("/events", "Server-sent events: all once, news ten times a second, end.", _TEXT, EVENTS),
+    Endpoint("/status", "All levels of the page, and what is wrong.", _ref("Status")),
+    Endpoint(
+        "/alarms", "The list of alarms, the gravest first.",
+        _object("status", "alarms", status=_OK, alarms={"type": "array", "items": _ref("Alarm")}),
+    ),
+    Endpoint("/healthz", "Whether both loops report and the robot sends frames.", _DONE, errors=(503,)),
+    Endpoint("/metrics", "Metrics of Prometheus.", _TEXT, TEXT),
+    Endpoint("/openapi.json", "This description.", {"type": "object"}),
+    Endpoint("/operator", "The name of the token.", _object("status", "name", status=_OK, name=_TEXT), channel="token"),
+    Endpoint("/pause", "Hold the robot where it is.", _DONE, channel="control"),
+    Endpoint("/resume", "Go on.", _DONE, channel="control"),
+    Endpoint("/abort", "Give the survey up and drive home.", _DONE, channel="control"),
+    Endpoint("/stop", "Hold the wheels, save, and end the daemon.", _DONE, channel="control"),
+    Endpoint(
+        f"/{ACKNOWLEDGE}", "Acknowledge an alarm.", _DONE, channel="control", body=_object("name", name=_TEXT),
+        errors=(400,),
+    ),
+    Endpoint(
+        "/emergency", "Report an emergency; without an id it gets one.",
+        _object("status", "id", "latched", "code", status=_OK, id=_ID, latched={"type": "boolean"}, code=_CODE),
+        channel="emergency", body=_object("kind", kind=_KIND, id=_ID, note=_TEXT), errors=(400,),
+    ),
+    Endpoint(
+        "/clear", "Clear an emergency whose cause is gone.",
+        _object("status", "id", "code", status=_OK, id=_ID, code=_CODE),
+        channel="emergency", body=_object("id", id=_ID), errors=(400,),
+    ),
+)  # fmt: skip
+# The path of each command without its slash, and the channel that answers it.
+COMMANDS = {row.path[1:]: row.channel for row in ENDPOINTS if row.method == "POST"}
+# What a command may be answered with besides its success.
+_OF_TOKENS, _OF_COMMANDS = (401, 403), (408, 409, 413, 502, 503, 504)
+_LEVELS: dict[str, Schema] = {
+    "mission": {"anyOf": [_ref("MissionStatus"), {"type": "null"}]},
+    "pose": {"anyOf": [_ref("DisplayState"), {"type": "null"}]},
+    "verdict": {"anyOf": [_ref("Verdict"), {"type": "null"}]},
+    "alarms": {"type": "array", "items": _ref("Alarm")},
+    "trouble": _TEXT,
+}
+
+
+def description(endpoints: Iterable[Endpoint] = ENDPOINTS) -> Schema:
+    """The interface as OpenAPI 3.1."""
+    _, schemas = msgspec.json.schema_components(
+        (MissionStatus, DisplayState, Verdict, Alarm), ref_template="#/components/schemas/{name}"
+    )
+    schemas["Error"] = _object("status", "message", status={"const": "error"}, message=_TEXT)
+    schemas["Status"] = _object("status", *_LEVELS, status=_OK, **_LEVELS)
+    paths: Schema = {}
+    for row in endpoints:
+        paths.setdefault(row.path, {})[row.method.lower()] = _operation(row)
+    return {
+        "openapi": "3.1.0",
+        "info": {"title": "ccatp", "version": ccatp.__version__, "summary": "The dashboard of a survey over HTTP."},
+        "servers": [{"url": "/"}, {"url": PREFIX}],
+        "paths": paths,
+        "components": {"schemas": schemas, "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}}},
+    }
+
+
+def _operation(row: Endpoint) -> Schema:
+    errors = {421, *row.errors, *(_OF_TOKENS if row.channel else ()), *(_OF_COMMANDS if row.method == "POST" else ())}
+    found: Schema = {
+        "operationId": row.path.strip("/").replace("/", "_").replace("{path}", "file").replace(".", "_") or "page",
+        "summary": row.summary,
+        "responses": {
+            "200": {"description": row.summary, "content": {row.content: {"schema": row.schema}}},
+            **{str(code): _error(ERRORS[code]) for code in sorted(errors)},
+        },
+    }
+    if row.channel:
+        found["security"] = [{"token": []}]
+    if row.body is not None:
+        found["requestBody"] = {"required": True, "content": {JSON: {"schema": row.body}}}
+    if "{path}" in row.path:
+        found["parameters"] = [{"name": "path", "in": "path", "required": True, "schema": _TEXT}]
+    return found
+
+
+def _error(text: str) -> Schema:
+    return {"description": text, "content": {JSON: {"schema": _ref("Error")}}}
