@@ -34,14 +34,15 @@ from ccatp.links.bus import HeartbeatPublisher, Publisher
 from ccatp.links.liveness import LogRateLimit
 from ccatp.links.runtime_dir import runtime_dir_path
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.records.recorder import TELEMETRY, read_metadata
+from ccatp.records.recorder import TELEMETRY, read_metadata, recordings
 from ccatp.records.store import StoreError, read_survey
 from ccatp.report.dashboard.access import page_tokens
 from ccatp.report.dashboard.app import CommandEndpoint, build_app, serve
+from ccatp.report.dashboard.history import replay
 from ccatp.report.dashboard.hub import BEACONS, SURVEY, BusReader, StateBroadcaster
 from ccatp.report.dashboard.survey_view import SurveyView
 from ccatp.report.dashboard.survey_view import ground as survey_ground
-from ccatp.report.dashboard.view import RunStateView
+from ccatp.report.dashboard.view import RunStateView, run_ground
 
 Logger = structlog.typing.FilteringBoundLogger
 HEARTBEAT_PERIOD_S = 0.5
@@ -61,7 +62,7 @@ async def serve_page(
 ) -> None:
     """Serve a dashboard until ``stop`` is set and the open pages have got the last state.
 
-    Points that were measured before are read from the database in ``run_dir``.
+    What was before is read in ``run_dir``: points in the database, path and plots in the recording.
 
     Raises:
         ConfigError: the tokens cannot be read.
@@ -69,31 +70,42 @@ async def serve_page(
     settings, is_over = cfg.dashboard, asyncio.Event()
     tokens = page_tokens(settings, endpoints.runtime_dir)
     view: RunStateView
+    past: RunStateView
     if isinstance(cfg, RadioConfig):
         # Imported late: a survey does not need it, and its libraries are large.
         from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground  # noqa: PLC0415
 
-        view, wants = BeaconView(cfg, is_sim=is_sim), BEACONS
+        view, wants = BeaconView(cfg, is_sim=is_sim, run_dir=run_dir), BEACONS
+        past = BeaconView(cfg, is_sim=is_sim)
         ground = beacon_ground(cfg, is_sim=is_sim)
     else:
         mirror = build_mirror(cfg.mirror)
         view, wants = _survey_view(mirror, cfg, run_dir, is_sim=is_sim), SURVEY
+        past = SurveyView(mirror, cfg, is_sim=is_sim)
         ground = survey_ground(mirror, cfg, is_sim=is_sim)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     reader = BusReader(context, endpoints.of, view, is_sim=is_sim, wants=wants)
     hub = StateBroadcaster(reader, view, settings.rate_hz)
     commands = CommandEndpoint(context, endpoints.of, settings.command_timeout_s)
-    app = build_app(hub, commands, ground, settings, tokens, log)
+    app = build_app(hub, commands, ground | run_ground(run_dir), settings, tokens, log)
 
     async def broadcast() -> None:
         await hub.run(stop)
         is_over.set()
 
+    async def read_past() -> None:
+        topics = ("mission", *wants.main, *wants.once, wants.track, wants.truth)
+        await replay(recordings(run_dir / TELEMETRY), topics, lambda message: past.receive(message, 0.0))
+        view.prepend(past)
+        hub.send_everything()
+
     try:
         async with asyncio.TaskGroup() as tasks:
             heartbeat = tasks.create_task(_send_heartbeats(context, endpoints)) if has_heartbeat else None
             tasks.create_task(broadcast())
+            reading = tasks.create_task(read_past())
             await serve(app, listener, settings, is_over)
+            reading.cancel()
             if heartbeat is not None:
                 heartbeat.cancel()
     finally:
@@ -110,7 +122,7 @@ async def _send_heartbeats(context: zmq.Context[zmq.Socket[bytes]], endpoints: E
 
 
 def _survey_view(mirror: Mirror, cfg: Config, run_dir: Path, *, is_sim: bool) -> SurveyView:
-    view = SurveyView(mirror, cfg, is_sim=is_sim)
+    view = SurveyView(mirror, cfg, is_sim=is_sim, run_dir=run_dir)
     with suppress(StoreError):  # nothing has been measured yet
         view.begin_with(read_survey(run_dir / "mission.sqlite", mirror.name))
     return view

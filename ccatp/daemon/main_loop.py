@@ -36,6 +36,8 @@ from ccatp.survey.events import HELD, Abort, Fault, Interrupted, Pause, Resume, 
 
 # After the end the last messages must reach the supervisor, which then ends this process.
 SHUTDOWN_TIMEOUT_S = 30.0
+# Of the levels one display state goes to those who keep a history, where no page asks for all of them.
+SAMPLED_LEVELS = 10
 # The place of a robot that moved is not known when the samples of more frames than this are missing.
 UNSEEN_S = 0.1
 # The frames that come while a path is planned for a robot that stands are late for a reason, and served within this.
@@ -113,6 +115,7 @@ class MainLoop(RobotLoop):
         self._sent: tuple[int, DriveCommand] | None = None  # newest drive of the session, and its frame
         self._catches_up_until_s = -inf
         self._was_at_rest = False
+        self._levels_sent = 0
         self._unanswered: int | None = None
         self._failure: Exception | None = None
         self._standstill, self._frame_age = StandstillReport(), FrameAge()
@@ -294,7 +297,9 @@ class MainLoop(RobotLoop):
 
     def _publish_status(self) -> None:
         self._telemetry.send("mission", self.status())
-        if self._telemetry.seq >= 0 and self.publisher.has_subscriber("display_state"):
+        self._levels_sent += 1
+        is_sample = self._levels_sent % SAMPLED_LEVELS == 0
+        if self._telemetry.seq >= 0 and (is_sample or self.publisher.has_subscriber("display_state")):
             self._telemetry.send("display_state", self._runner.display_state())
 
     def status(self) -> MissionStatus:

@@ -3,14 +3,18 @@
 import asyncio
 import contextlib
 import json
+import re
 import shutil
 import socket
 import time
 import uuid
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import structlog
 from playwright.async_api import Page, async_playwright, expect
 from prometheus_client import CONTENT_TYPE_LATEST
 
@@ -18,12 +22,13 @@ from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.daemon.process import open_log
 from ccatp.links.channels import format_error, format_ok
-from ccatp.links.topics import LogMessage
+from ccatp.report.dashboard.app import build_app
 from tests.contract.page_rig import DEADLINE_S, Rig, mission, page_rig
 from tests.unit.dashboard.test_view import parse
 
 FILES = (
-    "page.js", "map.js", "plots.js", "commands.js", "page.css", "icon.svg", "uPlot.iife.min.js", "uPlot.min.css"
+    "page.js", "map.js", "plots.js", "commands.js", "alarms.js", "history.js",
+    "page.css", "icon.svg", "uPlot.iife.min.js", "uPlot.min.css"
 )  # fmt: skip
 TOKEN = "0123456789abcdef0123456789abcdef"
 
@@ -58,6 +63,50 @@ async def test_the_page_and_all_that_it_wants_come_from_here(rig: Rig) -> None:
     ground = (await rig.ask("GET", "/ground")).data
     assert (ground["title"], ground["is_sim"]) == ("fyst-m1", True)
     assert len(ground["points"]) == 9
+
+
+async def test_the_description_has_every_route_of_the_application_and_no_other(rig: Rig) -> None:
+    found = (await rig.ask("GET", "/api/v1/openapi.json")).data
+    assert found["openapi"].startswith("3.1.")
+    assert {"title", "version"} <= found["info"].keys()
+    names, described = [], set()
+    for path, operations in found["paths"].items():
+        for method, operation in operations.items():
+            names.append(operation["operationId"])
+            described.add((path, method.upper()))
+            assert operation["responses"]["200"]["content"], path
+            assert all(one["description"] for one in operation["responses"].values())
+            scopes = [name for one in operation.get("security", []) for name in one]
+            assert scopes == ["token"] * ("401" in operation["responses"])
+            in_path = {
+                one["name"] for one in operation.get("parameters", []) if one["required"] and one["in"] == "path"
+            }
+            assert in_path == set(re.findall(r"{(\w+)}", path))
+    assert len(names) == len(set(names))
+    assert found["components"]["securitySchemes"].keys() == {"token"}
+    for reference in re.findall(r'"#/([^"]+)"', json.dumps(found)):
+        part = found
+        for key in reference.split("/"):
+            part = part[key]  # a KeyError: it leads nowhere
+    hub: Any = SimpleNamespace(state=dict, pages=0)
+    starlette: Any = build_app(hub, hub, {}, load_config().dashboard, {}, structlog.get_logger())
+    *routes, mount = starlette.routes
+    for of_app in (routes, mount.routes):
+        assert {(one.path, method) for one in of_app for method in one.methods - {"HEAD"}} == described
+    assert {one["url"] for one in found["servers"]} == {"/", mount.path}
+    for path, method in described - {("/events", "GET"), ("/static/{path}", "GET")}:
+        body = b"{}" if method == "POST" else b""
+        reply = await rig.ask(method, path, body=body)
+        operation = found["paths"][path][method.lower()]
+        assert str(reply.code) in operation["responses"], (path, reply.code)
+        kind = reply.headers["content-type"].partition(";")[0]
+        assert kind in operation["responses"][str(reply.code)]["content"]
+
+
+async def test_the_name_of_a_token(rig: Rig) -> None:
+    assert (await rig.ask("GET", "/operator")).code == 401
+    reply = await rig.ask("GET", "/operator", authorization=f"Bearer {rig.token}")
+    assert (reply.code, reply.data) == (200, {"status": "ok", "name": "operator"})
 
 
 @pytest.mark.parametrize(
@@ -291,7 +340,12 @@ async def test_commands_with_configured_tokens(cfg: Config, runtime_dir: Path) -
         assert (await rig.ask("GET", "/status")).code == 200  # looking needs none
 
 
-async def test_a_page_begins_with_everything_and_goes_on_with_news(rig: Rig) -> None:
+def log_line(text: str) -> str:
+    line = {"event": "operator_message", "level": "info", "timestamp": "2026-11-26T03:32:00.5Z", "text": text}
+    return json.dumps(line) + "\n"
+
+
+async def test_a_page_begins_with_everything_and_goes_on_with_news(rig: Rig, runtime_dir: Path) -> None:
     await rig.until("/healthz", lambda reply: reply.code == 200)
     async with rig.page() as first:
         assert b"text/event-stream" in first.head
@@ -299,12 +353,12 @@ async def test_a_page_begins_with_everything_and_goes_on_with_news(rig: Rig) -> 
         name, state = await first.event()
         assert name == "all"
         assert state["is_sim"] is True
-        rig.main.send("log", LogMessage(seq=1, t_s=2.0, level="info", process="main", text="a line"))
+        (runtime_dir / "log.jsonl").write_text(log_line("a line"))
         name, state = await first.until(lambda _, state: bool(state["log"]))
-        assert (name, state["log"]) == ("news", [[2.0, "info", "a line", 1, 1]])
+        assert (name, state["log"]) == ("news", [["2026-11-26T03:32:00.5Z", "info", "a line", 1, 1]])
         async with rig.page() as second:
             name, state = await second.event()
-            assert (name, state["log"]) == ("all", [[2.0, "info", "a line", 1, 1]])
+            assert (name, [row[2] for row in state["log"]]) == ("all", ["a line"])
         rig.tell_alive()
         _, state = await first.until(lambda _, state: state["pose"] is not None)
         assert state["losses"] == []
@@ -388,22 +442,24 @@ async def test_who_sends_no_whole_request_is_dropped(rig: Rig) -> None:
         writer.close()
 
 
-async def test_who_takes_nothing_is_dropped(rig: Rig) -> None:
+async def test_who_takes_nothing_is_dropped(rig: Rig, runtime_dir: Path) -> None:
     await rig.until("/healthz", lambda reply: reply.code == 200)
     lazy = socket.socket()
     lazy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     lazy.setblocking(False)
     loop = asyncio.get_running_loop()
-    with lazy:
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(lazy)
         await loop.sock_connect(lazy, ("127.0.0.1", rig.port))
         await loop.sock_sendall(lazy, f"GET /events HTTP/1.1\r\nhost: 127.0.0.1:{rig.port}\r\n\r\n".encode())
-        long = "x" * 50_000
+        log = stack.enter_context((runtime_dir / "log.jsonl").open("a"))
         async with asyncio.timeout(DEADLINE_S):
             metrics: dict[tuple[str, ...], float] = {}
             while metrics != {(): 1.0}:
                 metrics = parse((await rig.ask("GET", "/metrics")).body.decode())["ccatp_dashboard_pages"]
             while metrics != {(): 0.0}:
-                rig.main.send("log", LogMessage(seq=1, t_s=2.0, level="info", process="main", text=long))
+                log.write(log_line("x" * 50_000))
+                log.flush()
                 metrics = parse((await rig.ask("GET", "/metrics")).body.decode())["ccatp_dashboard_pages"]
 
 
@@ -495,21 +551,19 @@ async def takes_a_token(page: Page, rig: Rig) -> None:
 
 
 async def is_laid_out(page: Page) -> None:
-    heights = await page.locator("figcaption:visible").evaluate_all("nodes => nodes.map(node => node.clientHeight)")
-    assert len(heights) == 4
-    assert max(heights) < 1.5 * min(heights)  # one line each
+    """Everything of a survey on a desktop without scrolling, nothing beside the screen of a phone."""
+    await expect(page.locator("figcaption:visible")).to_have_count(4)
     await expect(page.locator("#plot-arrival")).to_have_attribute("data-empty", "")
     await expect(page.locator("#plot-arrival .uplot")).to_be_hidden()
-    await expect(page.locator("figcaption", has_text="Position error")).to_contain_text("mm, 3\u03c3 dashed")
-    # At one instant: a banner that comes would move them.
-    places = await page.evaluate("""() => [".map", ".plots", ".side", ".log"].map(part => {
-        const box = document.querySelector(part).getBoundingClientRect();
-        return [box.top, box.bottom];
-    })""")
-    (_, map_end), (plots_top, plots_end), (_, side_end), (log_top, _) = places
-    assert map_end <= 900.0  # all of the map without scrolling
-    assert 0.0 < plots_top - map_end < 30.0
-    assert abs(plots_end - side_end) < 60.0  # no room empty on either side
-    assert log_top > plots_end
-    overflows = "nodes => nodes.filter(node => node.scrollWidth > node.clientWidth).length"
-    assert await page.locator("figcaption:visible").evaluate_all(overflows) == 0
+    await page.set_viewport_size({"width": 1440, "height": 900})
+    assert await page.evaluate("document.documentElement.scrollHeight") <= 900
+    for part in (".map", "#plot-arrival", "#plot-nis", "#log", "#controls"):
+        box = await page.locator(part).bounding_box()
+        assert box is not None
+        assert box["y"] >= 0.0, part
+        assert box["y"] + box["height"] <= 900.0, part
+    await page.set_viewport_size({"width": 390, "height": 844})
+    wide = """nodes => nodes.filter(node => node.getBoundingClientRect().right > 390.5).map(node => node.outerHTML)"""
+    assert await page.locator("body *:visible").evaluate_all(wide) == []
+    assert await page.evaluate("document.documentElement.scrollWidth") <= 390
+    await page.set_viewport_size({"width": 1440, "height": 900})

@@ -75,7 +75,7 @@ def sees_a_running_survey(page: Page) -> None:
     expect(page.locator("#pose-xy")).to_contain_text(" m")
     expect(page.locator("#map")).to_have_attribute("aria-label", re.compile(r"Map: robot at .* m, \d+ of 81 points"))
     expect(page.locator("#done")).to_have_text(re.compile("^[1-9]"))
-    expect(page.locator("#plot-arrival")).to_have_attribute("aria-label", re.compile("latest arrival error 0"))
+    expect(page.locator("#plot-arrival")).to_have_attribute("aria-label", re.compile("latest by the laser 0"))
     sees_the_map_move(page)
 
 
@@ -180,8 +180,8 @@ def sees_a_mission_among_beacons(page: Page) -> None:
         expect(page.locator(where)).to_contain_text(text)
     for where, text in {
         "#map": r"Map: robot at .* m, \d of 4 waypoints reached, \d+ other things",
-        "#plot-error": "latest true error [0-9.]+, 3\u03c3",
-        "#plot-map": "latest true error [0-9.]+, expected",
+        "#plot-error": r"latest true \(simulation\) [0-9.]+, 3\u03c3",
+        "#plot-map": r"latest true \(simulation\) [0-9.]+, expected",
     }.items():
         expect(page.locator(where)).to_have_attribute("aria-label", re.compile(text))
     expect(page.locator("#links li[data-well=yes]")).to_have_count(3)

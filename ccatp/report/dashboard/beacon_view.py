@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from math import dist
+from pathlib import Path
 from typing import Any
 
 from ccatp.beacons.mission import MODES
@@ -48,7 +49,8 @@ def beacon_ground(cfg: RadioConfig, *, is_sim: bool) -> dict[str, Any]:
         "rate_hz": cfg.dashboard.rate_hz,
         "states": [str(state) for state in MODES],
         "codes": CODES,
-        "plots": ["error", "map", "nis", *last],
+        "plots": {name: [] for name in ("error", "map", *last)} | {"nis": [[1.0, "expected"]]},
+        "limits": {"sensors_age_s": cfg.robot.sensors_timeout_s, "permit_age_s": cfg.danger.stale_after_s},
         "hides": HIDDEN,
         "words": {
             "simulation-what": "robot, radios and motes are simulated",
@@ -66,7 +68,8 @@ def beacon_ground(cfg: RadioConfig, *, is_sim: bool) -> dict[str, Any]:
 # error of the beacons and its expected standard deviation (both root mean square, mm); NIS and degrees of freedom of
 # the readings since the row before; distance to the target and the one to be kept (m); the smallest distance that a
 # distance sensor measures (m).
-SERIES = ("error", "map", "nis", "target", "clearance")
+LINES = ("error", "map", "target", "clearance")
+SERIES = (*LINES, "nis")
 # The page draws these from more frequent messages.
 _DRAWN = frozenset(("robot", "trail", "waypoint"))
 
@@ -74,8 +77,9 @@ _DRAWN = frozenset(("robot", "trail", "waypoint"))
 class BeaconView(RunStateView):
     """The state of a mission among beacons."""
 
-    def __init__(self, cfg: RadioConfig, *, is_sim: bool) -> None:
-        super().__init__(points=len(beacon_waypoints(cfg)), is_sim=is_sim, series=SERIES, has_laser=False)
+    def __init__(self, cfg: RadioConfig, *, is_sim: bool, run_dir: Path | None = None) -> None:
+        points = len(beacon_waypoints(cfg))
+        super().__init__(points=points, is_sim=is_sim, series=SERIES, lines=LINES, run_dir=run_dir, has_laser=False)
         self._cfg = cfg
         self._lap = 0
         self._map: BeaconMapMessage | None = None
@@ -100,8 +104,8 @@ class BeaconView(RunStateView):
 
     def _take_map(self, message: BeaconMapMessage, _now_s: float) -> None:
         before, self._map = self._map, message
-        t_s = round(message.t_s, 2)
-        self._trail.add(message.pose[0], message.pose[1])
+        t_s = self._mission_s(message.t_s)
+        self._trail.add(t_s, round(message.pose[0], 3), round(message.pose[1], 3))
         if before is None or message.nis_size < before.nis_size:  # the first, or of a restarted main loop
             return
         if message.nis_size > before.nis_size:

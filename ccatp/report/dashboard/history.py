@@ -1,67 +1,134 @@
 """What grows while a run lasts, bounded: series of the plots, the driven path, messages, errors against the truth."""
 
-from math import dist, hypot
-from typing import Any
+import asyncio
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from math import dist, hypot, inf
+from pathlib import Path
+from typing import Any, BinaryIO
 
+import msgspec
+
+from ccatp.core import danger_text
+from ccatp.links.bus import BadMessage
 from ccatp.links.liveness import kind_of
+from ccatp.links.topics import OPERATOR_MESSAGE, Message
+from ccatp.records.recorder import decode_recorded, iter_messages
 
 Row = tuple[Any, ...]
 
+# Batches come at least once a second: where nothing came for longer, nothing is known.
+GAP_S = 3.0
 # Not visible on a map of six metres.
 PATH_STEP_M = 0.02
 
 
-class Growing:
-    """Rows in the order of their arrival, and the new ones; beyond ``limit`` the older half is thinned."""
+def is_gap(row: Row) -> bool:
+    """Whether a row says that nothing is known from the row before to the one behind it."""
+    return all(value is None for value in row[1:])
 
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
+
+class Growing:
+    """Rows that begin with the mission's time (s), and the new ones; beyond ``limit`` the older half is thinned.
+
+    Where no row came for longer than ``gap_s`` stands a row without values: no line is drawn across it.
+    """
+
+    def __init__(self, limit: int, gap_s: float = inf) -> None:
+        self._limit, self._gap_s = limit, gap_s
+        self._seen_s = inf  # time of the last row, kept or not
         self.rows: list[Row] = []
         self._new: list[Row] = []
 
-    def add(self, *row: Any) -> None:
-        """Add a row."""
-        self.rows.append(row)
-        self._new.append(row)
-        if len(self.rows) > self._limit:
-            half = self._limit // 2
-            self.rows[:half] = self.rows[:half:2]
+    def add(self, t_s: float | None, *values: Any) -> None:
+        """Add a row, unless its time is not known; time does not go back."""
+        if t_s is None:
+            return
+        t_s = max(t_s, self.rows[-1][0]) if self.rows else t_s
+        if t_s - self._seen_s > self._gap_s:
+            self._append((t_s, *(None for _ in values)))
+        self._seen_s = t_s
+        if self._is_kept(values):
+            self._append((t_s, *values))
 
     def take_new(self) -> list[Row]:
         """The rows since the last call, at most ``limit``."""
         new, self._new = self._new[-self._limit :], []
         return new
 
+    def prepend(self, rows: Sequence[Row]) -> None:
+        """Put earlier rows before the first one."""
+        first = self.rows[:1]
+        before = [row for row in rows if not first or row[0] < first[0][0]]
+        if before and first and first[0][0] - before[-1][0] > self._gap_s:
+            before.append((first[0][0], *(None for _ in first[0][1:])))
+        self.rows[:0] = before
+        while len(self.rows) > self._limit:
+            self._thin()
+
+    def _is_kept(self, values: Row) -> bool:
+        del values
+        return True
+
+    def _append(self, row: Row) -> None:
+        self.rows.append(row)
+        self._new.append(row)
+        if len(self.rows) > self._limit:
+            self._thin()
+
+    def _thin(self) -> None:
+        """Of each two rows of the older half the one with the larger value stays; so do the first row and gaps."""
+        half, kept, is_first = len(self.rows) // 2, self.rows[:1], True
+        for row in self.rows[1:half]:
+            if is_gap(row):
+                is_first = True
+                if kept and not is_gap(kept[-1]):
+                    kept.append(row)
+            elif is_first:
+                kept.append(row)
+                is_first = False
+            else:
+                kept[-1] = max(kept[-1], row, key=_size)
+                is_first = True
+        self.rows[:half] = kept if len(kept) < half else self.rows[1:half]
+
+
+def _size(row: Row) -> float:
+    return -inf if row[1] is None else float(row[1])
+
 
 class Trail(Growing):
-    """The driven path: rows of x and y, m, in steps of at least ``PATH_STEP_M``."""
+    """The driven path: rows of time (s), x and y (m), in steps of at least ``PATH_STEP_M``."""
 
-    def add(self, *row: float) -> None:
-        """Add the position of the robot, unless it is too near to the last row."""
-        if not self.rows or dist(row, self.rows[-1]) >= PATH_STEP_M:
-            super().add(*(round(value, 3) for value in row))
+    def _is_kept(self, values: Row) -> bool:
+        return not self.rows or is_gap(self.rows[-1]) or dist(values, self.rows[-1][1:]) >= PATH_STEP_M
 
 
 class Lines:
-    """The newest message of each kind to the operator: robot time (s), level, text, count and number of its kind."""
+    """The newest message of each kind to the operator: time (UTC, ISO format), level, text, count, number of its kind.
+
+    ``left_out``: how many older messages were dropped.
+    """
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
         self._rows: dict[tuple[str, str], Row] = {}
         self._new: dict[tuple[str, str], Row] = {}
-        self._kinds = 0
+        self._kinds = self.left_out = 0
 
-    def add(self, t_s: float, level: str, text: str) -> None:
+    def add(self, utc: str, level: str, text: str) -> None:
         """Add a message."""
         key = level, kind_of(text)
         before = self._rows.pop(key, None)
         self._new.pop(key, None)
         self._kinds += before is None
         times, kind = (1, self._kinds) if before is None else (before[3] + 1, before[4])
-        self._rows[key] = self._new[key] = (t_s, level, text, times, kind)
-        for rows in (self._rows, self._new):
-            if len(rows) > self._limit:
-                del rows[next(iter(rows))]
+        self._rows[key] = self._new[key] = (utc, level, text, times, kind)
+        if len(self._rows) > self._limit:
+            self.left_out += self._rows.pop(next(iter(self._rows)))[3]
+        if len(self._new) > self._limit:
+            del self._new[next(iter(self._new))]
 
     @property
     def rows(self) -> list[Row]:
@@ -83,7 +150,7 @@ WAITING = 500
 class TruthCompare:
     """Joins estimates with the simulated truth of the same frame; either may arrive first.
 
-    The largest error of each second is a row of ``errors``: robot time (s), error and three sigma of the position (mm).
+    The largest error of each second is a row of ``errors``: time (s), error and three sigma of the position (mm).
     """
 
     def __init__(self, errors: Growing) -> None:
@@ -120,3 +187,108 @@ class TruthCompare:
         self._worst = here
         if before is not None:
             self._errors.add(round(before[0], 2), round(before[1], 3), round(before[2], 3))
+
+
+# -- what the run directory holds ----------------------------------------------------------------------------------
+
+LOG, EMERGENCIES = "log.jsonl", "emergencies.json"
+MAX_READ_BYTES = 1 << 20  # at a time: a log of a day must not delay the pages
+SHOWN_EVENTS = (OPERATOR_MESSAGE, "verdict_changed")
+_MARKS = tuple(f'"{event}"'.encode() for event in SHOWN_EVENTS)
+
+
+class LogEntry(msgspec.Struct):
+    """What the page wants of a line of the log."""
+
+    event: str = ""
+    timestamp: str = ""
+    level: str = "info"
+    text: str = ""
+    cause: str = ""
+    signal: str = ""
+    value: float = 0.0
+    limit: float = 0.0
+
+
+class Emergency(msgspec.Struct):
+    """A latched emergency, as the danger loop has written it down."""
+
+    kind: str
+    id: str
+    note: str = ""
+
+
+class Emergencies(msgspec.Struct):
+    """Contents of the file of emergencies."""
+
+    active: list[Emergency]
+
+
+_entry, _emergencies = msgspec.json.Decoder(LogEntry), msgspec.json.Decoder(Emergencies)
+
+
+class RunFiles:
+    """Follows the log of a run, whose messages go to ``lines``, and the file of its emergencies.
+
+    ``started``: when the run began, UTC in ISO format, empty while that is not known.
+    """
+
+    def __init__(self, folder: Path, lines: Lines) -> None:
+        self._log, self._latch, self._lines = folder / LOG, folder / EMERGENCIES, lines
+        self._file: BinaryIO | None = None
+        self._rest = b""
+        self._changed_ns = 0
+        self.started = ""
+        self.emergencies: list[Emergency] = []
+
+    def read(self) -> None:
+        """Take what is new; what cannot be read is left out."""
+        with suppress(OSError):
+            self._file = self._file or self._log.open("rb")
+            *lines, rest = (self._rest + self._file.read(MAX_READ_BYTES)).split(b"\n")
+            self._rest = rest[:MAX_READ_BYTES]
+            for line in lines:
+                if not self.started or any(mark in line for mark in _MARKS):
+                    self._take(line)
+        with suppress(OSError, msgspec.MsgspecError):
+            changed_ns = self._latch.stat().st_mtime_ns
+            if changed_ns != self._changed_ns:
+                self.emergencies = _emergencies.decode(self._latch.read_bytes()).active
+                self._changed_ns = changed_ns
+
+    def close(self) -> None:
+        """Close the log."""
+        if self._file is not None:
+            self._file.close()
+
+    def _take(self, line: bytes) -> None:
+        try:
+            entry = _entry.decode(line)
+        except (msgspec.MsgspecError, UnicodeDecodeError):
+            return
+        self.started = self.started or entry.timestamp
+        if entry.event == OPERATOR_MESSAGE:
+            self._lines.add(entry.timestamp, entry.level, entry.text)
+        elif entry.event in SHOWN_EVENTS and entry.cause:
+            text = danger_text(entry.cause, entry.signal, entry.value, entry.limit)
+            self._lines.add(entry.timestamp, "warning", f"danger: {text}")
+
+
+# A recording of hours takes minutes to read: pages, heartbeats and messages go on meanwhile.
+READ_S, PAUSE_S = 0.02, 0.08
+
+
+async def replay(paths: Iterable[Path], topics: Iterable[str], receive: Callable[[Message], None]) -> None:
+    """Pass on the recorded messages of these topics, oldest first; what is damaged or missing is left out."""
+    wanted, due_s = frozenset(topics), time.monotonic() + READ_S
+    for path in paths:
+        with suppress(OSError):
+            for recorded in iter_messages(path):
+                if recorded.topic in wanted:
+                    with suppress(BadMessage):
+                        message = decode_recorded(recorded.topic, recorded.payload)
+                        if isinstance(message, Message):
+                            receive(message)
+                if time.monotonic() > due_s:
+                    await asyncio.sleep(PAUSE_S)
+                    due_s = time.monotonic() + READ_S

@@ -14,7 +14,10 @@ from ccatp.report.dashboard.view import RunStateView
 
 
 class Wants(NamedTuple):
-    """The topics of one kind of mission; ``main`` are the rare ones besides those of every mission."""
+    """The topics of one kind of mission; ``main`` are the rare ones besides those of every mission.
+
+    ``track`` and ``truth`` come in batches, once a second or somewhat more often.
+    """
 
     main: tuple[str, ...]
     track: str
@@ -24,7 +27,7 @@ class Wants(NamedTuple):
 
 SURVEY = Wants(("arrival", "fix", "scene"), "track", "truth", ())
 BEACONS = Wants(("beacon_arrival", "beacon_map", "scene"), "beacon_track", "beacon_truth", ("beacon_places",))
-_OF_MAIN = ("heartbeat.main", "mission", "log")
+_OF_MAIN = ("heartbeat.main", "mission")
 _OF_DANGER = ("heartbeat.danger", "danger_event")
 # At a time: a publisher that never pauses must not delay the pages.
 MAX_MESSAGES = 2_000
@@ -48,27 +51,26 @@ class BusReader:
         newest = {"keeps_newest": True}
         # By whether they are read: publisher, topics, how.
         self._rows: dict[str, list[tuple[str, tuple[str, ...], dict[str, bool]]]] = {
-            "always": [("main", (*_OF_MAIN, *wants.main), watched), ("danger", _OF_DANGER, watched)],
+            "always": [("main", (*_OF_MAIN, *wants.main, wants.track), watched), ("danger", _OF_DANGER, watched)],
             "levels": [("main", ("display_state",), newest), ("danger", ("verdict",), newest | uncounted)],
-            "track": [("main", (wants.track,), uncounted)],
+            "samples": [("main", ("display_state",), uncounted)],
         }
         if is_sim:
-            self._rows["track"].append(("truth", (wants.truth,), uncounted))
-        if is_sim and wants.once:
-            self._rows["always"].append(("truth", wants.once, uncounted))
+            self._rows["always"].append(("truth", (wants.truth, *wants.once), uncounted))
         self._open: dict[str, dict[str, Subscriber]] = {name: {} for name in self._rows}
         self._read("always", True)
 
-    def read(self, *, levels: bool, track: bool) -> None:
-        """Subscribe, or end that: to display state and verdict, of which only the newest counts; to path and truth."""
+    def read(self, *, levels: bool) -> None:
+        """Whether display state and verdict are wanted ten times a second, or samples of the former are enough."""
         if self._open["levels"] and not levels:
             self._view.discard_picture()
-        self._view.is_tracking = track
+        self._view.is_watched = levels
         self._read("levels", levels)
-        self._read("track", track)
+        self._read("samples", not levels)
 
     def drain(self, now_s: float) -> None:
-        """Pass the received messages on to the view."""
+        """Pass the received messages on to the view, and what the run directory has got."""
+        self._view.read_files()
         for name, subscriber in self._open["always"].items():
             if subscriber.is_cut:
                 self._view.links.cut(name, now_s)
@@ -80,9 +82,11 @@ class BusReader:
                 self._view.receive(received[2], now_s)
 
     def close(self) -> None:
-        """Close the sockets."""
+        """Close sockets and files; a page that ends later opens none again."""
+        self._view.close()
         for name in self._rows:
             self._read(name, False)
+        self._rows = {name: [] for name in self._rows}
 
     def _read(self, name: str, wanted: bool) -> None:
         opened = self._open[name]
@@ -116,6 +120,10 @@ class StateBroadcaster:
     def pages(self) -> int:
         """Number of open pages."""
         return len(self._pages)
+
+    def send_everything(self) -> None:
+        """Send the whole state next, for more has become known than what is new."""
+        self._pages = dict.fromkeys(self._pages, True)
 
     async def events(self) -> AsyncIterator[bytes]:
         """The events for one page, until the end."""
@@ -182,7 +190,7 @@ class StateBroadcaster:
     def _subscribe(self) -> None:
         has_pages = bool(self._pages)
         is_asked = time.monotonic() - self._requested_s < LEVELS_S
-        self._reader.read(levels=has_pages or is_asked, track=has_pages)
+        self._reader.read(levels=has_pages or is_asked)
 
 
 def _event(name: str, data: dict[str, Any]) -> bytes:

@@ -1,6 +1,7 @@
 """The page of a survey: its points, arrival errors by the laser, errors against the simulated truth, the path."""
 
 from math import dist
+from pathlib import Path
 from typing import Any
 
 from ccatp.config.models import Config
@@ -59,7 +60,22 @@ def ground(mirror: Mirror, cfg: Config, *, is_sim: bool) -> dict[str, Any]:
         "rate_hz": cfg.dashboard.rate_hz,
         "states": [str(state) for state in PURPOSES],
         "codes": CODES,
-        "plots": ["arrival", "error", "jump", "nis"],
+        "plots": {
+            "arrival": [[1e3 * cfg.mission.arrival_tolerance_m, "limit"]],
+            "error": [[1e3 * cfg.mission.arrival_tolerance_m, "limit"]],
+            "jump": [],
+            "nis": [[1.0, "expected"], [cfg.etalon.doubt_nis / FIX_DEGREES, "doubted above"]],
+        },
+        "limits": {
+            "charge": cfg.health.battery_reserve,
+            "fan_duty": cfg.robot.fan_duty,
+            "fan_share": cfg.health.fan_share if mirror.overhang else None,
+            "sensors_age_s": cfg.robot.sensors_timeout_s,
+            "drive_age_s": cfg.health.latency_pause_s,
+            "permit_age_s": cfg.mission.verdict_timeout_s,
+            "dop": cfg.etalon.max_dop,
+            "residual_um": 1e6 * cfg.etalon.max_residual_m,
+        },
         "hides": [],
         "words": WORDS,
     }
@@ -67,15 +83,18 @@ def ground(mirror: Mirror, cfg: Config, *, is_sim: bool) -> dict[str, Any]:
 
 # Rows of robot time (s) and: arrival error by the laser (mm); how far a fix moved the estimate (mm); NIS and degrees of
 # freedom; true error and three sigma of the position (mm), without the truth only the latter.
-SERIES = ("arrival", "jump", "nis", "error")
+SERIES, LINES = ("arrival", "jump", "nis", "error"), ("error",)
+FIX_DEGREES = 2  # of freedom of a fix
 
 
 class SurveyView(RunStateView):
     """The state of a survey."""
 
-    def __init__(self, mirror: Mirror, cfg: Config, *, is_sim: bool) -> None:
+    def __init__(self, mirror: Mirror, cfg: Config, *, is_sim: bool, run_dir: Path | None = None) -> None:
         self.points = survey_points(mirror, cfg)
-        super().__init__(points=len(self.points), is_sim=is_sim, series=SERIES)
+        super().__init__(points=len(self.points), is_sim=is_sim, series=SERIES, lines=LINES, run_dir=run_dir)
+        self._laser: FixMessage | None = None
+        self._nis = (0.0, 0)  # and degrees of freedom, the last that was drawn
         self._mirror, self._puck_height_m = mirror, cfg.robot.puck_height_m
         self._index = {point: k for k, point in enumerate(self.points)}
         self._by_name = {point_name(point): k for k, point in enumerate(self.points)}
@@ -86,9 +105,9 @@ class SurveyView(RunStateView):
         }
 
     def begin_with(self, survey: StoredSurvey) -> None:
-        """Take what was measured and skipped before."""
-        for point, fix in sorted(survey.fixes, key=lambda one: one.fix.t_s):
-            self._measured(point, fix.t_s, fix.position_m)
+        """Take what was measured and skipped before; when, the recording says."""
+        for point, fix in survey.fixes:
+            self._measured(point, fix.position_m)
         for row in survey.points:
             if row.status == "skipped" and row.point in self._index:
                 self._mark(self._index[row.point], SKIPPED)
@@ -102,10 +121,10 @@ class SurveyView(RunStateView):
                     self._mark(index, SKIPPED)
 
     def _take_picture(self, picture: DisplayState, now_s: float) -> None:
-        before = self._picture
         super()._take_picture(picture, now_s)
-        if picture.size and (before is None or picture.nis != before.nis):
-            self._series["nis"].add(round(picture.t_s, 2), round(picture.nis, 3), picture.size)
+        if picture.size and (picture.nis, picture.size) != self._nis:
+            self._nis = picture.nis, picture.size
+            self._series["nis"].add(self._mission_s(picture.t_s), round(picture.nis, 3), picture.size)
 
     def _take_arrival(self, arrival: ArrivalMessage, _now_s: float) -> None:
         index = self._index.get(PointId(*arrival.point))
@@ -113,28 +132,29 @@ class SurveyView(RunStateView):
             self._mark(index, ARRIVED)
 
     def _take_fix(self, fix: FixMessage, now_s: float) -> None:
-        self.links.fix_s = now_s
+        self.links.fix_s, self._laser = now_s, fix
         if fix.is_fused:
-            self._series["jump"].add(round(fix.t_s, 2), round(fix.jump_mm, 4))
+            self._series["jump"].add(self._mission_s(fix.t_s), round(fix.jump_mm, 4))
         if fix.is_fused and fix.point is not None:
-            self._measured(PointId(*fix.point), fix.t_s, fix.position_m)
+            error_mm = self._measured(PointId(*fix.point), fix.position_m)
+            if error_mm is not None:
+                self._series["arrival"].add(self._mission_s(fix.t_s), error_mm)
 
-    def _measured(self, point: PointId, t_s: float, position_m: Vector3) -> None:
+    def _measured(self, point: PointId, position_m: Vector3) -> float | None:
+        """Mark the point, and return its arrival error, mm."""
         index = self._index.get(point)
         if index is None:
-            return
+            return None
         self._mark(index, MEASURED)
         mirror = self._mirror
         try:
             x_m, y_m, _ = mirror.foot_of_puck(position_m, self._puck_height_m)
         except ConvergenceError:
-            return  # not on this mirror
+            return None  # not on this mirror
         target = mirror.surface_point(*mirror.point_on_deck(point))
         error_mm = round(1e3 * dist(mirror.surface_point(x_m, y_m), target), 3)
         self._errors_mm[index] = error_mm
-        self._series["arrival"].add(round(t_s, 2), error_mm)
-        if not self.is_tracking:
-            self._trail.add(x_m, y_m)
+        return error_mm
 
     def _take_track(self, track: TrackMessage, _now_s: float) -> None:
         rows = [row for row in track.rows if TruthCompare.is_compared(row[0])]
@@ -142,7 +162,7 @@ class SurveyView(RunStateView):
             return
         poses = deck_poses(self._mirror, [PanelPose(PanelId(r[2], r[3]), r[4], r[5], r[6]) for r in rows])
         for row, (x_m, y_m) in zip(rows, poses[:, :2].tolist(), strict=True):
-            self._trail.add(x_m, y_m)
+            self._trail.add(self._mission_s(row[1]), round(x_m, 3), round(y_m, 3))
             self._take_estimate(row[0], row[1], x_m, y_m, row[7])
 
     def _next_point(self, status: MissionStatus) -> str:
@@ -150,3 +170,10 @@ class SurveyView(RunStateView):
         if status.point or status.outcome or PLANNED not in self._states:
             return status.point
         return point_name(self.points[self._states.index(PLANNED)])
+
+    def _levels(self, now_s: float) -> dict[str, Any]:
+        fix, laser = self._laser, None
+        if fix is not None:
+            residual_um = round(1e6 * fix.residual_rms_m, 2)
+            laser = {"dop": fix.dop, "residual_um": residual_um, "channels": fix.channels, "is_used": fix.is_fused}
+        return {**super()._levels(now_s), "laser": laser}

@@ -1,21 +1,28 @@
 """The state that every page shows, made from the messages of the bus: links, mission, verdict, pose, messages, map."""
 
+import platform
+import time
 from collections.abc import Callable, Iterable
+from math import inf
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 
-from ccatp.core import Verdict, danger_text
+import ccatp
+from ccatp.conditions import OPERATOR, condition_of
+from ccatp.core import EmergencyKind, Verdict, danger_text
 from ccatp.links import topics
 from ccatp.links.liveness import Liveness
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import BY_NAME, BeaconTruth, Heartbeat, MissionStatus, TruthMessage
-from ccatp.report.dashboard.history import Growing, Lines, Trail, TruthCompare
+from ccatp.report.dashboard.history import GAP_S, Growing, Lines, RunFiles, Trail, TruthCompare
 
 LOOPS = ("main", "danger")
 NAMES = {"main": "main loop", "danger": "danger loop"}
 PICTURE_STALE_S = BY_NAME["display_state"].stale_after_s
 STATUS_STALE_S = BY_NAME["mission"].stale_after_s
+LATE_HEARTBEAT_S = 3.0 / BY_NAME["heartbeat.main"].rate_hz
 
 
 class LinkState(msgspec.Struct, frozen=True):
@@ -70,6 +77,14 @@ class Links:
     def cut(self, name: str, now_s: float) -> None:
         """The connection to a process has ended."""
         self._cut_s.setdefault(name, now_s)
+
+    def sensors_age_s(self, now_s: float) -> float | None:
+        """Age of the newest frame when the main loop last reported, and since then where that is late."""
+        main = self._liveness.heartbeats.get("main")
+        if main is None or main.frame_age_s is None:
+            return None
+        late_s = now_s - main.t_s
+        return main.frame_age_s + (late_s if late_s > LATE_HEARTBEAT_S else 0.0)
 
     def losses(self, now_s: float) -> list[Loss]:
         """Lost links, the gravest first; none when the mission is over."""
@@ -129,27 +144,44 @@ def _age_s(since_s: float | None, now_s: float) -> float | None:
 # State of a point; arrived: the robot is at rest there.
 PLANNED, ARRIVED, MEASURED, SKIPPED = range(4)
 MAX_PATH, MAX_SAMPLES, MAX_LINES = 12_000, 4_000, 200
+# Over a shorter time the pace of the mission is not known: the finish is expected in real time.
+PACE_AFTER_S = 10.0
 NO_LINE = msgspec.Raw(b"null")
 _line = msgspec.json.Decoder(Sensors)
 
 
 class RunStateView:
-    """Keeps the state of a run up to date, and returns what is new; a subclass adds that of its kind of mission."""
+    """Keeps the state of a run up to date, and returns what is new; a subclass adds that of its kind of mission.
 
-    def __init__(self, *, points: int, is_sim: bool, series: Iterable[str], has_laser: bool = True) -> None:
+    ``lines``: series that are drawn as lines; the others are single events, between which nothing is missing.
+    """
+
+    def __init__(
+        self,
+        *,
+        points: int,
+        is_sim: bool,
+        series: Iterable[str],
+        lines: Iterable[str],
+        run_dir: Path | None = None,
+        has_laser: bool = True,
+    ) -> None:
         self._is_sim = is_sim
         self.links = Links(has_laser=has_laser)
         self.status: MissionStatus | None = None
-        self.is_tracking = False  # the path arrives as it is driven; otherwise it has only the stops
+        self.is_watched = False  # display states come ten times a second, otherwise once
+        self._offset_s: float | None = None  # from the robot's time to that of the mission
+        self._began: tuple[float, float] | None = None  # our and the mission's time when that began to pass here
         self._status_s = self._verdict_s = float("-inf")
         self._picture: topics.DisplayState | None = None
         self._sensors: Sensors | None = None
         self._verdict: Verdict | topics.DangerEvent | None = None
         self._scene: topics.Scene | None = None
         self._is_scene_new = False
-        self._trail = Trail(MAX_PATH)
-        self._series = {name: Growing(MAX_SAMPLES) for name in series}
+        self._trail = Trail(MAX_PATH, GAP_S)
+        self._series = {name: Growing(MAX_SAMPLES, GAP_S if name in set(lines) else inf) for name in series}
         self._lines = Lines(MAX_LINES)
+        self._files = None if run_dir is None else RunFiles(run_dir, self._lines)
         self._states = [PLANNED] * points
         self._errors_mm: list[float | None] = [None] * points
         self._changed: set[int] = set()
@@ -165,7 +197,6 @@ class RunStateView:
             topics.Scene: self._take_scene,
             TruthMessage: self._take_truth,
             BeaconTruth: self._take_truth,
-            topics.LogMessage: lambda log, _: self._lines.add(round(log.t_s, 2), log.level, log.text),
         }
 
     def receive(self, message: topics.Message | Verdict, now_s: float) -> None:
@@ -174,11 +205,38 @@ class RunStateView:
         if handler is not None:
             handler(message, now_s)
 
+    def read_files(self) -> None:
+        """Take what is new in the run directory."""
+        if self._files is not None:
+            self._files.read()
+
+    def close(self) -> None:
+        """Close the files."""
+        if self._files is not None:
+            self._files.close()
+
+    def prepend(self, past: "RunStateView") -> None:
+        """Put what another view has of an earlier time before what this one has."""
+        self._trail.prepend(past._trail.rows)
+        for name, series in self._series.items():
+            series.prepend(past._series[name].rows)
+
+    def _mission_s(self, t_s: float) -> float | None:
+        """The mission's time at the robot's time: it goes on when a robot boots or a run is resumed."""
+        return None if self._offset_s is None else round(t_s + self._offset_s, 2)
+
     def _take_status(self, status: MissionStatus, now_s: float) -> None:
         self.status, self._status_s = status, now_s
+        offset_s = status.elapsed_s - status.t_s
+        if self._offset_s is None or abs(offset_s - self._offset_s) > STATUS_STALE_S:
+            self._offset_s = offset_s
+        if self._began is None and status.elapsed_s > 0.0:
+            self._began = now_s, status.elapsed_s
         self.links.is_over = status.exit_status >= 0
 
     def _take_picture(self, picture: topics.DisplayState, now_s: float) -> None:
+        if not self.is_watched:
+            return
         self.links.picture_s = now_s
         self._picture = msgspec.structs.replace(picture, line=NO_LINE)
         try:
@@ -188,9 +246,6 @@ class RunStateView:
 
     def _take_verdict(self, verdict: Verdict | topics.DangerEvent, now_s: float) -> None:
         self._verdict, self._verdict_s = verdict, now_s
-        if isinstance(verdict, topics.DangerEvent) and verdict.cause:
-            text = danger_text(verdict.cause, verdict.signal, verdict.value, verdict.limit)
-            self._lines.add(round(verdict.t_s, 2), "warning", f"danger: {text}")
 
     def _take_scene(self, scene: topics.Scene, _now_s: float) -> None:
         self._scene, self._is_scene_new = scene, True
@@ -236,14 +291,24 @@ class RunStateView:
             self._truth.estimate(seq, x_m, y_m, sigma_m)
         elif int(t_s) != self._sigma_second:
             self._sigma_second = int(t_s)
-            self._series["error"].add(round(t_s, 2), None, round(3e3 * sigma_m, 3))
+            self._series["error"].add(self._mission_s(t_s), None, round(3e3 * sigma_m, 3))
 
     def _take_truth(self, truth: TruthMessage | BeaconTruth, _now_s: float) -> None:
         for seq, t_s, x_m, y_m, *_ in truth.rows:
-            self._truth.truth(seq, t_s, x_m, y_m)
+            if (mission_s := self._mission_s(t_s)) is not None:
+                self._truth.truth(seq, mission_s, x_m, y_m)
 
     def _next_point(self, status: MissionStatus) -> str:
         return status.point
+
+    def _finish_in_s(self, status: MissionStatus, now_s: float) -> float | None:
+        """Until the expected end, s: a simulation in lockstep has a pace of its own."""
+        if status.outcome or self._began is None or status.eta_s <= 0.0:
+            return None
+        began_s, elapsed_s = self._began
+        if (watched_s := now_s - began_s) < PACE_AFTER_S or status.elapsed_s <= elapsed_s:
+            return status.eta_s
+        return status.eta_s * watched_s / (status.elapsed_s - elapsed_s)
 
     def _levels(self, now_s: float) -> dict[str, Any]:
         """What is replaced as a whole; pose, mission and verdict with the fields of their messages."""
@@ -257,6 +322,8 @@ class RunStateView:
                 "is_stale": is_stale(self._status_s),
                 "next_point": self._next_point(status),
                 "not_to_be_measured": sum(map(len, status.left_out.values())),
+                "finish_in_s": self._finish_in_s(status, now_s),
+                "is_by_operator": status.cause != "" and condition_of(status.cause) is OPERATOR,
             }
         verdict: dict[str, Any] | None = None
         if (v := self._verdict) is not None:
@@ -275,6 +342,11 @@ class RunStateView:
             "pose": self._picture,
             "verdict": verdict,
             "robot": self._robot(),
+            "sensors_age_s": self.links.sensors_age_s(now_s),
+            "utc_s": time.time(),
+            "started": "" if self._files is None else self._files.started,
+            "emergencies": [] if self._files is None else self._files.emergencies,
+            "messages_left_out": self._lines.left_out,
             "alarms": [] if mission is None or self.links.is_over else mission.pop("alarms"),
         }
 
@@ -294,3 +366,14 @@ class RunStateView:
 
     def _shapes(self) -> list[Any]:
         return [] if self._scene is None else [*msgspec.to_builtins(self._scene.shapes)]
+
+
+def run_ground(folder: Path) -> dict[str, Any]:
+    """What the page says of each run."""
+    return {
+        "run": folder.name,
+        "version": ccatp.__version__,
+        "host": platform.node(),
+        "emergency_kinds": [str(kind) for kind in EmergencyKind],
+        "stale_after_s": {name: BY_NAME[f"heartbeat.{loop}"].stale_after_s for loop, name in NAMES.items()},
+    }

@@ -11,7 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families
 import ccatp
 from ccatp.links.topics import DisplayState, Heartbeat
 from ccatp.report.dashboard.app import StateCollector
-from ccatp.report.dashboard.history import Growing, Lines, TruthCompare
+from ccatp.report.dashboard.history import Growing, Lines, Trail, TruthCompare, is_gap
 from ccatp.report.dashboard.view import NO_LINE, Links, LinkState
 from ccatp.survey.events import MissionState
 
@@ -103,33 +103,74 @@ def test_a_loop_that_is_gone_shows_at_once_and_until_another_one_speaks(links: L
 def test_what_is_new_is_told_once_and_the_older_half_gets_thin() -> None:
     grown = Growing(100)
     for k in range(2):
-        grown.add(k)
-        assert (grown.take_new(), grown.take_new()) == ([(k,)], [])
+        grown.add(k, 1.0)
+        assert (grown.take_new(), grown.take_new()) == ([(k, 1.0)], [])
     for k in range(2, 1000):
-        grown.add(k)
+        grown.add(k, 2.0 if k == 300 else 1.0)
         assert len(grown.rows) <= 100
     kept = [row[0] for row in grown.rows]
     assert kept[-40:] == list(range(960, 1000))
     assert kept[0] == 0  # and it still begins where it began
     assert kept == sorted(kept)
-    assert grown.take_new() == [(k,) for k in range(900, 1000)]  # nobody took for long
+    assert 300 in kept  # the largest of its time
+    assert grown.take_new() == [(k, 1.0) for k in range(900, 1000)]  # nobody took for long
+
+
+def test_no_line_is_drawn_over_a_time_without_rows_however_often_rows_are_thinned() -> None:
+    grown = Growing(100, 3.0)
+    for t_s in (0.0, 2.0, 6.0, 7.0, 5.0):  # a clock that goes back stands still
+        grown.add(t_s, 1.0, 2.0)
+    assert grown.rows == [
+        (0.0, 1.0, 2.0),
+        (2.0, 1.0, 2.0),
+        (6.0, None, None),
+        *[(t, 1.0, 2.0) for t in (6.0, 7.0, 7.0)],
+    ]
+    grown.add(None, 1.0, 2.0)  # of an unknown time
+    for k in range(20_000):
+        grown.add(8.0 + k, 1.0, 2.0)
+    assert [row for row in grown.rows if is_gap(row)] == [(6.0, None, None)]
+    for k in range(1000):  # nothing but gaps
+        grown.add(1e5 + 4.0 * k, 1.0, 2.0)
+        assert len(grown.rows) <= 101
+
+
+def test_a_robot_that_stands_leaves_no_gap_in_its_path_and_one_that_is_not_seen_does() -> None:
+    trail = Trail(100, 3.0)
+    for k in range(20):
+        trail.add(float(k), 1.0, 2.0)
+    trail.add(20.0, 1.03, 2.0)
+    trail.add(30.0, 1.50, 2.0)
+    assert trail.rows == [(0.0, 1.0, 2.0), (20.0, 1.03, 2.0), (30.0, None, None), (30.0, 1.5, 2.0)]
+
+
+def test_what_was_before_is_put_before_what_is_known() -> None:
+    past, known = Growing(100, 3.0), Growing(100, 3.0)
+    for t_s in (1.0, 2.0, 10.0):
+        past.add(t_s, 1.0)
+    known.prepend([])
+    for t_s in (9.0, 10.0):
+        known.add(t_s, 5.0)
+    known.prepend(past.rows)
+    assert known.rows == [(1.0, 1.0), (2.0, 1.0), (9.0, None), (9.0, 5.0), (10.0, 5.0)]
 
 
 def test_a_line_that_comes_again_is_one_row_with_its_newest_text_and_old_ones_go() -> None:
     lines = Lines(3)
-    lines.add(0.5, "warning", "process main was killed")
+    lines.add("0.5", "warning", "process main was killed")
     for k in range(300):
-        lines.add(k, "warning", f"held: a frame was served {k} ms late")
-        lines.add(k, "warning", "going on: turning")
+        lines.add(str(k), "warning", f"held: a frame was served {k} ms late")
+        lines.add(str(k), "warning", "going on: turning")
         if k == 9:
             lines.take_new()
-    late = (299, "warning", "held: a frame was served 299 ms late", 300, 2)
-    going = (299, "warning", "going on: turning", 300, 3)
-    assert lines.rows == [(0.5, "warning", "process main was killed", 1, 1), late, going]
+    late = ("299", "warning", "held: a frame was served 299 ms late", 300, 2)
+    going = ("299", "warning", "going on: turning", 300, 3)
+    assert lines.rows == [("0.5", "warning", "process main was killed", 1, 1), late, going]
     assert (lines.take_new(), lines.take_new()) == ([late, going], [])
     for text in ("x", "y"):
-        lines.add(300, "info", text)
+        lines.add("300", "info", text)
     assert [row[2] for row in lines.rows] == ["going on: turning", "x", "y"]
+    assert lines.left_out == 301  # the 300 that were late, and the one that was killed
 
 
 def test_the_worst_of_each_second_is_told_when_the_next_begins() -> None:

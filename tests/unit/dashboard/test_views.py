@@ -25,17 +25,19 @@ from ccatp.links.topics import (
     BeaconTruth,
     DangerEvent,
     FixMessage,
-    LogMessage,
     RobotShape,
     Scene,
     TrackMessage,
     TruthMessage,
 )
 from ccatp.mirror.panel_alignment import Measured
+from ccatp.records.recorder import Recorder
 from ccatp.records.store import StoredPoint, StoredSurvey
 from ccatp.report.dashboard.access import CommandRefusal, check_command, host_refusal, make_token, page_tokens
 from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground
+from ccatp.report.dashboard.history import replay
 from ccatp.report.dashboard.survey_view import SurveyView
+from ccatp.report.dashboard.survey_view import ground as survey_ground
 from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView
 from tests.contract.page_rig import mission, picture
 from tests.support.scenario import config_of, mirror_of
@@ -50,6 +52,9 @@ CFG, MIRROR = config_of(run__panels=2), mirror_of()
 @pytest.fixture
 def view() -> SurveyView:
     return SurveyView(MIRROR, CFG, is_sim=True)
+
+
+BEGUN = mission(t_s=0.0)  # the mission's time is the robot's
 
 
 def fix_at(point: PointId | None, ahead_m: float, t_s: float = 2.0) -> FixMessage:
@@ -74,7 +79,9 @@ def test_levels_are_there_each_time(view: SurveyView) -> None:
     assert state["mission"] is state["pose"] is state["verdict"] is state["robot"] is None
     assert state["points"] == state["path"] == state["log"] == []
     assert state["is_sim"] is True
-    told(view, mission(), picture(15, LINE))
+    assert told(view, mission(), picture(15, LINE))["pose"] is None  # a sample for the history
+    view.is_watched = True
+    told(view, picture(15, LINE))
     for now_s in (1.1, 1.9):
         state = told(view, now_s=now_s)
         assert (state["mission"]["state"], state["pose"]["x_m"]) == ("driving", 1.0)
@@ -88,6 +95,7 @@ def test_levels_are_there_each_time(view: SurveyView) -> None:
     assert (state["robot"], state["pose"] is None) == (None, False)
     view.discard_picture()
     assert told(view)["pose"] is None
+    assert view.everything(1.0)["series"]["nis"] == [(0.5, 2.0, 2)]  # of the same update
     told(view, mission(exit_status=0))
     assert (told(view, now_s=9.0)["is_over"], told(view, now_s=9.0)["mission"]["is_stale"]) == (True, False)
 
@@ -106,7 +114,7 @@ def test_a_point_from_arrival_to_measured(view: SurveyView) -> None:
     point = view.points[0]
     arrived = ArrivalMessage(seq=8, t_s=2.0, point=(point.row, point.col, point.point), error_mm=0.3)
     assert told(view, arrived)["points"] == [[0, ARRIVED, None]]
-    state = told(view, fix_at(point, 0.004))
+    state = told(view, BEGUN, fix_at(point, 0.004))
     # The foot lies 4 mm ahead on the deck, and a little more along the slope.
     assert state["points"] == [[0, MEASURED, pytest.approx(4.0, abs=0.3)]]
     assert state["series"] == {"arrival": [[2.0, state["points"][0][2]]], "jump": [[2.0, 0.7]]}
@@ -125,7 +133,7 @@ def test_fixes_that_are_no_measurements(
     view: SurveyView, is_point: bool, changes: dict[str, Any], points: list[Any], series: set[str]
 ) -> None:
     fix = fix_at(view.points[0] if is_point else None, 0.0)
-    state = told(view, msgspec.structs.replace(fix, **changes))
+    state = told(view, BEGUN, msgspec.structs.replace(fix, **changes))
     assert (state["points"], set(state["series"])) == (points, series)
 
 
@@ -137,19 +145,20 @@ def test_points_left_out(view: SurveyView) -> None:
 
 
 def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(view: SurveyView) -> None:
-    view.is_tracking = True
     rows, truths = [], []
     for k in range(300):
         rows.append((k, 0.01 * k, 1, 2, -0.1 + 0.001 * k, 0.05, 0.0, 0.001))
         deck = MIRROR.deck_pose(PanelPose(PanelId(1, 2), rows[-1][4], 0.05, 0.0))
         truths.append((k, 0.01 * k, deck.x_m + 0.002, deck.y_m, 0.0, 0.0, 0.0, 0.0, 1.0, 0, 0))
     track = TrackMessage(seq=299, t_s=3.0, rows=rows)
-    state = told(view, track, TruthMessage(seq=299, t_s=3.0, rows=truths))
+    assert told(view, track)["path"] == []  # when in the mission is not known
+    state = told(view, BEGUN, track, TruthMessage(seq=299, t_s=3.0, rows=truths))
     path = np.array(state["path"])
-    assert hypot(*(path[-1] - path[0])) == pytest.approx(0.28, abs=0.01)
+    assert hypot(*(path[-1] - path[0])[1:]) == pytest.approx(0.28, abs=0.01)
+    assert path[-1][0] == pytest.approx(2.8, abs=0.2)
     assert [[round(value, 3) for value in row[1:]] for row in state["series"]["error"]] == [[2.0, 3.0], [2.0, 3.0]]
     blind = SurveyView(MIRROR, CFG, is_sim=False)  # without a truth sigma alone is shown
-    assert told(blind, track)["series"]["error"] == [[0.0, None, 3.0], [1.0, None, 3.0], [2.0, None, 3.0]]
+    assert told(blind, BEGUN, track)["series"]["error"] == [[0.0, None, 3.0], [1.0, None, 3.0], [2.0, None, 3.0]]
 
 
 def test_the_verdict_and_its_cause(view: SurveyView) -> None:
@@ -166,9 +175,6 @@ def test_the_verdict_and_its_cause(view: SurveyView) -> None:
     )  # fmt: skip
     state = told(view, event)
     assert (state["verdict"]["code"], "forward" in state["verdict"]) == (2, False)
-    assert state["log"] == [[1.25, "warning", "danger: fire", 1, 1]]
-    line = LogMessage(seq=5, t_s=2.0, level="info", process="main", text="joined")
-    assert told(view, line)["log"] == [[2.0, "info", "joined", 1, 2]]
 
 
 def test_the_alarms_are_those_of_the_status_until_the_run_is_over(view: SurveyView) -> None:
@@ -194,18 +200,99 @@ def test_other_things_on_the_map(view: SurveyView) -> None:
     assert len(view.everything(1.1)["shapes"]) == 2
 
 
-def test_everything_is_the_sum_of_the_news_and_stops_are_the_path_where_nobody_looked(view: SurveyView) -> None:
+def track_row(seq: int, t_s: float, x_m: float) -> Any:
+    return seq, t_s, 1, 2, x_m, 0.05, 0.0, 0.001
+
+
+def test_everything_is_the_sum_of_the_news_and_no_path_is_drawn_where_nothing_is_known(view: SurveyView) -> None:
     points, path, arrivals = dict[int, Any](), list[Any](), list[Any]()
     for k in range(6):
-        view.is_tracking = k == 5
-        news = told(view, fix_at(view.points[k], 0.001 * k, t_s=float(k)))
+        t_s = float(k) if k < 4 else 60.0 + k  # a minute without a word
+        track = TrackMessage(seq=10 * k, t_s=t_s, rows=[track_row(10 * k, t_s, 0.05 * k)])
+        news = told(view, BEGUN, fix_at(view.points[k], 0.001 * k, t_s=t_s), track)
         points |= {row[0]: row for row in news["points"]}
         path += news["path"]
         arrivals += news["series"]["arrival"]
     everything = json.loads(msgspec.json.encode(view.everything(6.0)))
     assert (everything["points"], everything["path"]) == (list(points.values()), path)
-    assert len(path) == 5
+    assert [row[0] for row in path if row[1] is None] == [64.0]
+    assert len(path) == 7
     assert everything["series"]["arrival"] == arrivals
+
+
+def test_the_time_of_the_mission_goes_on_when_the_clock_of_the_robot_begins_again(view: SurveyView) -> None:
+    told(view, mission(t_s=100.0, elapsed_s=90.0), fix_at(view.points[0], 0.001, t_s=101.0))
+    told(view, mission(t_s=1.0, elapsed_s=95.0), fix_at(view.points[1], 0.001, t_s=2.0))
+    assert [row[0] for row in view.everything(0.0)["series"]["arrival"]] == [91.0, 96.0]
+
+
+def test_when_the_mission_ends_at_its_pace(view: SurveyView) -> None:
+    def finish_in_s(now_s: float, **fields: Any) -> float | None:
+        found: float | None = told(view, mission(**fields), now_s=now_s)["mission"]["finish_in_s"]
+        return found
+
+    assert finish_in_s(0.0, elapsed_s=0.0, eta_s=100.0) is None  # it has not begun
+    assert finish_in_s(1.0, elapsed_s=20.0, eta_s=100.0) == 100.0
+    assert finish_in_s(21.0, elapsed_s=60.0, eta_s=100.0) == 50.0  # simulated twice as fast as the wall clock
+    assert finish_in_s(22.0, elapsed_s=60.0, eta_s=100.0, outcome="stopped") is None
+
+
+def test_what_an_operator_held_is_told_from_what_a_fault_held(view: SurveyView) -> None:
+    for cause, is_by_operator in (("operator", True), ("no way on: rim", False), ("", False)):
+        assert told(view, mission(state="held", cause=cause))["mission"]["is_by_operator"] is is_by_operator
+
+
+def test_messages_and_emergencies_are_those_of_the_run_directory(tmp_path: Path) -> None:
+    view = SurveyView(MIRROR, CFG, is_sim=True, run_dir=tmp_path)
+    view.read_files()  # nothing is there yet
+    begun = {"logger": "supervisor", "event": "run_started", "timestamp": "2026-11-26T03:31:20.311243Z"}
+    said = {"event": "operator_message", "level": "error", "timestamp": "2026-11-26T03:32:00.5Z", "text": "a line"}
+    edge = {"event": "verdict_changed", "level": "info", "timestamp": "2026-11-26T03:33:00Z", "cause": "edge",
+            "signal": "front_left", "value": 0.006, "limit": 0.005}  # fmt: skip
+    text = "".join(f"{json.dumps(line)}\n" for line in (begun, said, edge, edge | {"cause": ""}))
+    (tmp_path / "log.jsonl").write_text(text[:-20])
+    (tmp_path / "emergencies.json").write_text('{"active": [{"kind": "fire", "id": "7", "note": ""}], "cleared": []}')
+    view.read_files()
+    state = told(view)
+    assert (state["started"], state["emergencies"]) == (begun["timestamp"], [{"kind": "fire", "id": "7", "note": ""}])
+    assert state["log"] == [
+        ["2026-11-26T03:32:00.5Z", "error", "a line", 1, 1],
+        ["2026-11-26T03:33:00Z", "warning", "danger: edge (front left): 0.006 (limit 0.005)", 1, 2],
+    ]
+    with (tmp_path / "log.jsonl").open("a") as log:  # the rest of the line, and damage
+        log.write(text[-20:] + 'x"operator_message"\n' + json.dumps(said | {"text": "another"}) + "\n")
+    view.read_files()
+    assert [row[2] for row in told(view)["log"]] == ["another"]
+    view.close()
+
+
+async def test_plots_and_path_of_a_dashboard_that_came_late_are_read_from_the_recording(
+    view: SurveyView, tmp_path: Path
+) -> None:
+    names = ("mission", "track", "fix", "log")
+    recorder = Recorder(tmp_path / "telemetry.mcap", [(name, {}) for name in names], is_simulation=True)
+    for k in range(8):
+        track = TrackMessage(seq=10 * k, t_s=float(k), rows=[track_row(10 * k, float(k), 0.05 * k)])
+        for name, message in (("mission", BEGUN), ("track", track), ("fix", fix_at(view.points[k], 0.001, float(k)))):
+            recorder.write(name, float(k), msgspec.json.encode(message))
+    recorder.close()
+    told(view, BEGUN, fix_at(view.points[8], 0.001, 6.5))  # and from here on it listens
+    past = SurveyView(MIRROR, CFG, is_sim=True)
+    paths = [tmp_path / "missing.mcap", tmp_path / "telemetry.mcap"]
+    await replay(paths, ("mission", "track", "fix"), lambda message: past.receive(message, 0.0))
+    view.prepend(past)
+    state = view.everything(0.0)
+    assert [row[0] for row in state["series"]["arrival"]] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 6.5]
+    assert [row[0] for row in state["path"]] == [float(k) for k in range(8)]
+
+
+def test_the_last_fix_and_the_limits_that_go_with_what_is_shown(view: SurveyView) -> None:
+    state = told(view, fix_at(view.points[0], 0.001))
+    assert state["laser"] == {"dop": 1.0, "residual_um": 1.0, "channels": [1, 2, 3, 4], "is_used": True}
+    cfg = config_of(health__battery_reserve=0.31, etalon__max_dop=17.0, mission__arrival_tolerance_m=0.012)
+    ground = survey_ground(MIRROR, cfg, is_sim=True)
+    assert (ground["limits"]["charge"], ground["limits"]["dop"]) == (0.31, 17.0)
+    assert ground["plots"]["arrival"] == [[12.0, "limit"]]
 
 
 def test_what_was_measured_before_is_there(view: SurveyView) -> None:
@@ -219,7 +306,7 @@ def test_what_was_measured_before_is_there(view: SurveyView) -> None:
     view.begin_with(StoredSurvey(tuple(skipped), tuple(measured), ()))
     everything = view.everything(0.0)
     assert [row[:2] for row in everything["points"]] == [[0, MEASURED], [1, MEASURED], [2, MEASURED], [4, SKIPPED]]
-    assert [row[0] for row in everything["series"]["arrival"]] == [8.0, 9.0, 10.0]
+    assert everything["series"]["arrival"] == []  # when, only the recording says
 
 
 # -- missions among beacons -------------------------------------------------------------------------------------------
@@ -233,7 +320,9 @@ def radio(system: str = "zigbee", **keys: object) -> RadioConfig:
 
 @pytest.fixture
 def room() -> BeaconView:
-    return BeaconView(radio(), is_sim=True)
+    view = BeaconView(radio(), is_sim=True)
+    view.receive(BEGUN, 0.0)
+    return view
 
 
 def told_map(t_s: float = 1.0, **fields: Any) -> BeaconMapMessage:
@@ -278,7 +367,7 @@ def test_facts(room: BeaconView) -> None:
 def test_a_target_is_followed() -> None:
     target = (1.8, 0.8, 0.01, 0.0, 0.01)
     known: dict[str, Any] = {"target": target, "beacons": {"target": target}, "waypoints": [], "next_waypoint": -1}
-    state = told(BeaconView(radio("follow"), is_sim=True), *(told_map(t_s, **known) for t_s in (1.0, 1.5)))
+    state = told(BeaconView(radio("follow"), is_sim=True), BEGUN, *(told_map(t_s, **known) for t_s in (1.0, 1.5)))
     assert state["series"]["target"] == [[1.5, 1.0, 0.6]]
     assert "map" not in state["series"]  # the one that moves is none of the map
     assert dict(state["facts"])["distance to the target"] == "1.00 m"

@@ -2,7 +2,7 @@
 const ARMED_MS = 5000;
 // A double click is one wish, not two.
 const SETTLE_MS = 350;
-const NAMES = ["pause", "resume", "abort", "stop"];
+const NAMES = ["pause", "resume", "abort", "stop", "emergency"];
 const KEPT = "ccatp-token";
 const $ = (id) => document.getElementById(id);
 
@@ -27,9 +27,23 @@ export class Commands {
     $("token").value = token;
     $("read-only").hidden = Boolean(token);
     this.allow(this.sensible);
+    this.nameOperator();
   }
 
-  // What makes sense now; while the link is lost abort and stop may still get through.
+  async nameOperator() {
+    let name = "read-only";
+    if (this.token) {
+      try {
+        const answer = await fetch("operator", { headers: { authorization: `Bearer ${this.token}` } });
+        if (answer.ok) ({ name } = await answer.json());
+      } catch {
+        name = "not known";
+      }
+    }
+    $("operator").textContent = name;
+  }
+
+  // What makes sense now; while the link is lost abort, stop and emergency may still get through.
   receive({ mission, is_over }) {
     const state = mission?.state;
     const isOn = Boolean(mission) && !is_over;
@@ -38,6 +52,7 @@ export class Commands {
       resume: isOn && state === "held",
       abort: isOn && state !== "returning",
       stop: isOn,
+      emergency: isOn,
     });
   }
 
@@ -82,9 +97,17 @@ export class Commands {
     this.say("");
   }
 
-  // Without a token the daemon refuses it, and says what is missing.
+  // Without a token the daemon refuses these, and says what is missing.
   acknowledge(alarm) {
-    this.post("alarms/ack", `acknowledge ${alarm}`, JSON.stringify({ name: alarm }));
+    this.post("alarms/ack", `acknowledge ${alarm}`, { name: alarm });
+  }
+
+  emergency(kind, note) {
+    this.post("emergency", `emergency ${kind}`, { kind, note });
+  }
+
+  clear(id) {
+    this.post("clear", "clear", { id });
   }
 
   async send(name) {
@@ -98,7 +121,7 @@ export class Commands {
     this.say(`${name} …`);
     try {
       const headers = { authorization: `Bearer ${this.token}` };
-      const answer = await fetch(path, { method: "POST", headers, body });
+      const answer = await fetch(path, { method: "POST", headers, body: body && JSON.stringify(body) });
       const { message } = await answer.json();
       this.say(answer.ok ? `${name}: done` : `refused: ${message}`, answer.ok ? "" : "bad");
       if (answer.status === 401) this.keep(""); // of an earlier start

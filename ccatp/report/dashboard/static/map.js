@@ -1,30 +1,40 @@
 // The map: panels, points, path, robot, and whatever else the daemon has to show. Metres, x to the right, y up.
+import { Rows } from "./history.js";
+
 const PLANNED = 0, ARRIVED = 1, MEASURED = 2, SKIPPED = 3;
 const MARGIN = 0.25;
 const BEYOND = 1.5; // metres outside of the rim that are still shown
 const ZOOM = [0.5, 400];
 const NEXT = 4;
-// An ellipse of three sigma is magnified until it can be seen.
-const SEEN_PX = 12;
-const INKS = ["ink", "quiet", "card", "line", "panel", "seam", "rim", "path", "robot", "good", "warn", "bad", "accent", "todo"];
+const MAX_PATH = 12000;
+// How many times the ellipse of three sigma is magnified: the operator chooses, and the legend says it.
+const MAGNIFIED = [100, 1000, 1];
+const KEPT = "ccatp-ellipse";
+// A panel of at least this half width has room for its number between its points.
+const NUMBER_PX = 17;
+const INKS = ["ink", "quiet", "card", "line", "panel", "seam", "rim", "good", "note", "warn", "bad", "sim", "estimate", "todo"];
 
 // How things look: each gets the pen (with its colours), the place in pixels, the size of a metre, and the thing.
 const LOOKS = {
-  beacon: (pen, x, y) => polygon(pen, [[x, y - 8], [x + 7, y + 5], [x - 7, y + 5]], pen.inks.accent),
-  target: (pen, x, y) => polygon(pen, [[x, y - 7], [x + 7, y], [x, y + 7], [x - 7, y]], pen.inks.bad),
-  robot: (pen, x, y) => disc(pen, x, y, 6, pen.inks.robot),
+  beacon: (pen, x, y) => polygon(pen, [[x, y - 8], [x + 7, y + 5], [x - 7, y + 5]], pen.inks.estimate),
+  target: (pen, x, y) => polygon(pen, [[x, y - 7], [x + 7, y], [x, y + 7], [x - 7, y]], pen.inks.note),
+  robot: (pen, x, y) => disc(pen, x, y, 6, pen.inks.ink),
   obstacle: (pen, x, y, scale, shape) => {
     if (!shape.outline_m && !shape.radius_m) disc(pen, x, y, 5, pen.inks.quiet);
   },
   trail: () => {},
-  true: (pen, x, y) => cross(pen, x, y, pen.inks.quiet), // where it really is: in simulation alone
+  true: (pen, x, y) => cross(pen, x, y, pen.inks.sim), // where it really is: in simulation alone
 };
 const FILLED = { obstacle: "seam" };
 
 export class MapView {
-  constructor(canvas, legend) {
+  constructor(canvas, legend, ellipseButton) {
     this.canvas = canvas;
     this.legend = legend;
+    const kept = Number(localStorage.getItem(KEPT));
+    this.magnified = MAGNIFIED.includes(kept) ? kept : MAGNIFIED[0];
+    this.ellipseButton = ellipseButton;
+    ellipseButton.onclick = () => this.magnify();
     this.context = canvas.getContext("2d");
     this.ground = { panels: [], rim: [], points: [], base: null, edge_sensors_m: [], arrival_tolerance_mm: 10 };
     this.clear();
@@ -41,7 +51,7 @@ export class MapView {
   clear() {
     this.states = [];
     this.errors = [];
-    this.path = [];
+    this.path = new Rows(MAX_PATH);
     this.shapes = [];
     this.pose = this.mission = this.robot = null;
   }
@@ -54,6 +64,7 @@ export class MapView {
 
   begin(ground) {
     this.ground = ground;
+    this.showLegend();
     this.byName = new Map(ground.points.map(([name], k) => [name, k]));
     this.clear();
     this.draw();
@@ -65,8 +76,7 @@ export class MapView {
       this.states[k] = how;
       this.errors[k] = error;
     }
-    if (isAll) this.path = state.path;
-    else this.path.push(...state.path);
+    this.path.receive(state.path, isAll);
     if (state.shapes) this.shapes = state.shapes;
     this.pose = state.pose;
     this.mission = state.mission;
@@ -74,6 +84,34 @@ export class MapView {
     this.isLost = state.losses.length > 0;
     this.describe();
     this.draw();
+  }
+
+  magnify() {
+    this.magnified = MAGNIFIED[(MAGNIFIED.indexOf(this.magnified) + 1) % MAGNIFIED.length];
+    localStorage.setItem(KEPT, this.magnified);
+    this.showLegend();
+    this.draw();
+  }
+
+  showLegend() {
+    this.ellipseButton.textContent = `3σ ×${this.magnified}`;
+    const tolerance = `${this.ground.arrival_tolerance_mm} mm`;
+    const ofSurvey = [["○", "todo", "planned"], ["●", "good", `within ${tolerance}`], ["▲", "warn", `beyond ${tolerance}`], ["✕", "warn", "left out"]];
+    const ofRoom = [["○", "todo", "waypoint"], ["●", "good", "reached"], ["▲", "estimate", "beacon"]];
+    const items = [
+      ...(this.ground.panels.length ? ofSurvey : ofRoom),
+      ["◎", "note", "next"],
+      ["━", "estimate", "driven path"],
+      ["◯", "estimate", `3σ ellipse × ${this.magnified}`],
+    ];
+    this.legend.replaceChildren(...items.map(([sign, ink, words]) => {
+      const item = document.createElement("span");
+      const mark = document.createElement("i");
+      mark.textContent = sign;
+      mark.style.color = `var(--${ink})`;
+      item.append(mark, words);
+      return item;
+    }));
   }
 
   describe() {
@@ -90,7 +128,7 @@ export class MapView {
 
   bounds() {
     const { rim, points, base } = this.ground;
-    const all = rim.length ? [...rim, ...this.around(rim)] : [...points.map((p) => p.slice(1)), ...this.path, ...this.shapes.map((s) => [s.x_m, s.y_m]), ...this.shapes.flatMap((s) => s.outline_m ?? [])];
+    const all = rim.length ? [...rim, ...this.around(rim)] : [...points.map((p) => p.slice(1)), ...this.path.rows.filter((p) => p[1] !== null).map((p) => p.slice(1)), ...this.shapes.map((s) => [s.x_m, s.y_m]), ...this.shapes.flatMap((s) => s.outline_m ?? [])];
     if (!rim.length && this.pose) all.push([this.pose.x_m, this.pose.y_m]);
     if (!all.length) return base ? [base[0] - 1, base[1] - 1, base[0] + 1, base[1] + 1] : [-1, -1, 1, 1];
     const xs = all.map((p) => p[0]), ys = all.map((p) => p[1]);
@@ -231,13 +269,15 @@ export class MapView {
       pen.rect(left, top, 2 * hx * scale, 2 * hy * scale);
       pen.fill();
       pen.stroke();
-      if (scale * hx > 55) {
-        pen.fillStyle = this.inks.quiet;
-        pen.font = "11px system-ui";
-        pen.textAlign = "left";
-        pen.fillText(`${row}-${col}`, left + 5, top + 14);
-        pen.fillStyle = this.inks.panel;
-      }
+      if (scale * hx < NUMBER_PX) continue;
+      // Between the upper and the middle row of its points.
+      pen.fillStyle = this.inks.quiet;
+      pen.font = `${Math.min(Math.max(scale * hy * 0.3, 8), 14)}px system-ui`;
+      pen.textAlign = "center";
+      pen.textBaseline = "middle";
+      pen.fillText(`${row}-${col}`, left + hx * scale, top + 0.67 * hy * scale);
+      pen.textBaseline = "alphabetic";
+      pen.fillStyle = this.inks.panel;
     }
     if (rim.length) line(pen, rim.map(([x, y]) => at(x, y)), this.inks.rim, 1.8, true);
     if (base) {
@@ -253,30 +293,47 @@ export class MapView {
   }
 
   paintPath(pen, { at }) {
-    if (this.path.length > 1) line(pen, this.path.map(([x, y]) => at(x, y)), this.inks.path, 1.6, false);
+    pen.beginPath();
+    let isOn = false;
+    for (const [, x, y] of this.path.rows) {
+      if (x === null) isOn = false;
+      else {
+        const [px, py] = at(x, y);
+        if (isOn) pen.lineTo(px, py);
+        else pen.moveTo(px, py);
+        isOn = true;
+      }
+    }
+    pen.strokeStyle = this.inks.estimate;
+    pen.lineWidth = 1.4;
+    pen.stroke();
   }
 
   paintPoints(pen, { at, scale }) {
-    const r = Math.min(Math.max(scale * 0.016, 1.7), 7);
+    const r = Math.min(Math.max(scale * 0.02, 2), 7);
     const tolerance = this.ground.arrival_tolerance_mm;
     this.ground.points.forEach(([, x, y], k) => {
       const [px, py] = at(x, y);
       const how = this.states[k] ?? PLANNED;
       pen.beginPath();
       if (how === SKIPPED) {
-        pen.strokeStyle = this.inks.bad;
+        pen.strokeStyle = this.inks.warn;
         pen.lineWidth = 2;
         pen.moveTo(px - r, py - r); pen.lineTo(px + r, py + r);
         pen.moveTo(px - r, py + r); pen.lineTo(px + r, py - r);
         pen.stroke();
         return;
       }
+      if (how === MEASURED && (this.errors[k] ?? 0) > tolerance) {
+        polygon(pen, [[px, py - 1.6 * r], [px + 1.5 * r, py + r], [px - 1.5 * r, py + r]], this.inks.warn);
+        return;
+      }
       pen.arc(px, py, r, 0, 7);
       if (how === MEASURED) {
-        pen.fillStyle = this.errors[k] === null || this.errors[k] <= tolerance ? this.inks.good : this.inks.warn;
+        pen.fillStyle = this.inks.good;
         pen.fill();
       } else {
-        pen.strokeStyle = how === ARRIVED ? this.inks.accent : this.inks.todo;
+        pen.strokeStyle = how === ARRIVED ? this.inks.note : this.inks.todo;
         pen.lineWidth = how === ARRIVED ? 2.5 : 1.2;
         pen.stroke();
       }
@@ -292,9 +349,9 @@ export class MapView {
     for (let k = next + 1; k < this.ground.points.length && ahead.length < NEXT; k++) if ((this.states[k] ?? PLANNED) === PLANNED) ahead.push(k);
     const places = ahead.map((k) => at(this.ground.points[k][1], this.ground.points[k][2]));
     pen.setLineDash([4, 5]);
-    line(pen, this.pose ? [at(this.pose.x_m, this.pose.y_m), ...places] : places, this.inks.accent, 1.2, false);
+    line(pen, this.pose ? [at(this.pose.x_m, this.pose.y_m), ...places] : places, this.inks.note, 1.2, false);
     pen.setLineDash([]);
-    pen.strokeStyle = this.inks.accent;
+    pen.strokeStyle = this.inks.note;
     pen.lineWidth = 2.2;
     pen.beginPath();
     pen.arc(...places[0], r + 5, 0, 7);
@@ -309,7 +366,7 @@ export class MapView {
         const [first, last] = [shape.outline_m[0], shape.outline_m.at(-1)];
         const isClosed = first[0] === last[0] && first[1] === last[1];
         if (isClosed && FILLED[shape.kind]) polygon(pen, places, this.inks[FILLED[shape.kind]]);
-        line(pen, places, shape.kind === "trail" ? this.inks.path : this.inks.quiet, 1.5, isClosed);
+        line(pen, places, shape.kind === "trail" ? this.inks.estimate : this.inks.quiet, 1.5, isClosed);
       }
       if (shape.radius_m) {
         pen.beginPath();
@@ -322,8 +379,8 @@ export class MapView {
         pen.lineWidth = 1.2;
         pen.stroke();
       }
-      if (shape.covariance_m2) ellipse(pen, x, y, shape.covariance_m2, scale, this.inks.accent);
-      (LOOKS[shape.kind] ?? ((p, px, py) => disc(p, px, py, 4, p.inks.accent)))(pen, x, y, scale, shape);
+      if (shape.covariance_m2) ellipse(pen, x, y, shape.covariance_m2, scale, this.inks.estimate);
+      (LOOKS[shape.kind] ?? ((p, px, py) => disc(p, px, py, 4, p.inks.quiet)))(pen, x, y, scale, shape);
       if (shape.heading_rad != null) {
         line(pen, [[x, y], [x + 16 * Math.cos(shape.heading_rad), y - 16 * Math.sin(shape.heading_rad)]], this.inks.ink, 2, false);
       }
@@ -338,10 +395,7 @@ export class MapView {
   }
 
   paintRobot(pen, { at, scale }) {
-    if (!this.pose) {
-      this.legend.textContent = "";
-      return;
-    }
+    if (!this.pose) return;
     const { x_m: x, y_m: y, heading_rad: heading, covariance_m2 } = this.pose;
     const [c, s] = [Math.cos(heading), Math.sin(heading)];
     const sensors = this.ground.edge_sensors_m.map(([sx, sy]) => at(x + c * sx - s * sy, y + s * sx + c * sy));
@@ -350,21 +404,22 @@ export class MapView {
     if (sensors.length === 4) {
       const [fl, fr, rl, rr] = sensors;
       pen.globalAlpha *= 0.85;
-      polygon(pen, [fl, fr, rr, rl], this.inks.robot);
+      polygon(pen, [fl, fr, rr, rl], this.inks.ink);
       pen.globalAlpha = this.isLost ? 0.5 : 1;
       const at2 = (u, v) => at(x + u * c - v * s, y + u * s + v * c);
       const [nose, a, b] = [at2(0.08, 0), at2(-0.05, 0.04), at2(-0.05, -0.04)];
       polygon(pen, [nose, a, b], this.inks.card);
       const r = Math.min(Math.max(scale * 0.014, 1.8), 9);
-      sensors.forEach(([sx, sy], k) => disc(pen, sx, sy, r, this.robot?.edges ? (this.robot.edges[k] ? this.inks.good : this.inks.bad) : this.inks.quiet));
+      sensors.forEach(([sx, sy], k) => {
+        if (this.robot?.edges && !this.robot.edges[k]) square(pen, sx, sy, 1.4 * r, this.inks.warn);
+        else disc(pen, sx, sy, r, this.robot?.edges ? this.inks.good : this.inks.quiet);
+      });
     } else {
-      disc(pen, px, py, 6, this.inks.robot);
+      disc(pen, px, py, 6, this.inks.ink);
       line(pen, [[px, py], [px + 16 * c, py - 16 * s]], this.inks.ink, 2, false);
     }
     pen.globalAlpha = 1;
-    const times = ellipse(pen, px, py, covariance_m2, scale, this.inks.ink, true);
-    const words = times ? `ellipse: 3σ of the position${times > 1 ? `, ${times} times as large` : ""}` : "";
-    if (this.legend.textContent !== words) this.legend.textContent = words;
+    ellipse(pen, px, py, covariance_m2, this.magnified * scale, this.inks.estimate);
   }
 }
 
@@ -397,17 +452,18 @@ function disc(pen, x, y, radius, colour) {
   pen.fill();
 }
 
-// Three sigma; returns how many times it is magnified.
-function ellipse(pen, x, y, [xx, xy, yy], scale, colour, mayMagnify = false) {
+function square(pen, x, y, half, colour) {
+  line(pen, [[x - half, y - half], [x + half, y - half], [x + half, y + half], [x - half, y + half]], colour, 2, true);
+}
+
+// Three sigma.
+function ellipse(pen, x, y, [xx, xy, yy], scale, colour) {
   const mean = (xx + yy) / 2, apart = Math.hypot((xx - yy) / 2, xy);
   const major = 3 * Math.sqrt(Math.max(mean + apart, 0)) * scale, minor = 3 * Math.sqrt(Math.max(mean - apart, 0)) * scale;
-  if (!(major > 0)) return 0;
-  let times = 1;
-  for (let k = 0; mayMagnify && major * times < SEEN_PX && times < 1e5; k++) times *= k % 3 === 1 ? 2.5 : 2;
+  if (!(major > 0)) return;
   pen.beginPath();
-  pen.ellipse(x, y, Math.max(major * times, 1), Math.max(minor * times, 1), -0.5 * Math.atan2(2 * xy, xx - yy), 0, 7);
+  pen.ellipse(x, y, Math.max(major, 1), Math.max(minor, 1), -0.5 * Math.atan2(2 * xy, xx - yy), 0, 7);
   pen.strokeStyle = colour;
   pen.lineWidth = 1.5;
   pen.stroke();
-  return times;
 }

@@ -1,4 +1,5 @@
 // The page: receives the state, shows it, and reports when nothing arrives.
+import { Alarms, severity } from "./alarms.js";
 import { Commands } from "./commands.js";
 import { MapView } from "./map.js";
 import { Plots } from "./plots.js";
@@ -6,27 +7,30 @@ import { Plots } from "./plots.js";
 const SILENCE_MS = 800;
 const RETRY_MS = 1500;
 const MAX_LINES = 200;
-const LEVELS = { held: "bad", "backing off": "warn", returning: "warn", idle: "", done: "" };
-const SEVERITIES = ["", "inform", "slow", "pause", "hold", "return", "fault"];
+const HOLD = 4; // severity from which on an alarm holds the robot, or sends it home
 
 const $ = (id) => document.getElementById(id);
 const text = (id, value) => {
   const node = $(id);
   if (node.textContent !== value) node.textContent = value;
 };
+const two = (n) => String(n).padStart(2, "0");
 const clock = (s) => {
   if (s === null || s === undefined || !Number.isFinite(s)) return "–";
   const all = Math.max(0, Math.round(s));
-  const two = (n) => String(n).padStart(2, "0");
-  return all >= 3600
-    ? `${Math.floor(all / 3600)}:${two(Math.floor(all / 60) % 60)}:${two(all % 60)}`
-    : `${Math.floor(all / 60)}:${two(all % 60)}`;
+  const [h, m] = [Math.floor(all / 3600), Math.floor(all / 60) % 60];
+  return h ? `${h}:${two(m)}:${two(all % 60)} h` : `${m}:${two(all % 60)} min`;
 };
 const age = (s) => (s === null ? "" : s < 9.95 ? `${s.toFixed(1)} s` : s < 120 ? `${Math.round(s)} s` : `${Math.round(s / 60)} min`);
+// Of the server's clock: that of a phone may be wrong.
+const utc = (s) => new Date(1000 * s).toISOString();
+const day = (iso) => iso.slice(0, 10);
+const hour = (iso) => iso.slice(11, 19);
 
-const map = new MapView($("map"), $("legend"));
-const plots = new Plots((name) => $(`plot-${name}`));
+const map = new MapView($("map"), $("legend"), $("ellipse"));
+const plots = new Plots((name) => $(`plot-${name}`), $("plots-all"));
 const commands = new Commands();
+const alarms = new Alarms(commands);
 
 let source = null;
 let receivedAt = performance.now();
@@ -36,6 +40,8 @@ let isConnecting = false;
 let codes = [];
 let words = {};
 let hidden = [];
+let limits = {};
+let staleAfter = {};
 const rowOfKind = new Map();
 
 // -- the stream ---------------------------------------------------------------------------------------------------
@@ -66,15 +72,19 @@ async function connect() {
 function begin(ground) {
   text("title", ground.title);
   text("subtitle", ground.subtitle);
+  text("run", ground.run);
+  text("version", `${ground.version} on ${ground.host}`);
   document.title = `${ground.is_sim ? "SIM " : ""}${ground.title} – ccatp`;
   $("simulation").hidden = !ground.is_sim;
-  ({ codes, words } = ground);
+  ({ codes, words, limits } = ground);
+  staleAfter = ground.stale_after_s;
   for (const [id, word] of Object.entries(words)) if ($(id)) text(id, word);
   for (const id of hidden) $(id).hidden = false; // the mission before may have been of another kind
   for (const id of ground.hides) $(id).hidden = true;
   hidden = ground.hides;
   plots.begin(ground.plots);
   map.begin(ground);
+  alarms.begin(ground);
 }
 
 function receive(state, isAll) {
@@ -106,13 +116,13 @@ function showSilence() {
   const silent = performance.now() - receivedAt;
   if (isEnded || !(isDashboardGone || silent > SILENCE_MS)) return;
   const what = isDashboardGone ? "the dashboard has ended; the survey may go on" : "the dashboard does not answer";
-  alarm([[what, silent / 1000]]);
+  showLoss([[what, silent / 1000]]);
 }
 setInterval(showSilence, 100);
 
 // -- what is shown ------------------------------------------------------------------------------------------------
 
-function alarm(losses) {
+function showLoss(losses) {
   const node = $("alarm");
   node.hidden = losses.length === 0;
   document.body.classList.toggle("lost", losses.length > 0);
@@ -122,29 +132,49 @@ function alarm(losses) {
 }
 
 function show(state, isAll) {
-  alarm(state.losses);
+  showLoss(state.losses);
+  showTimes(state);
   showMission(state);
   showFacts(state.facts);
   showVerdict(state.verdict);
-  showAlarms(state.alarms);
-  announce(state.alarms, isAll);
-  showRobot(state.robot, state.pose);
+  alarms.receive(state, isAll);
+  showRobot(state);
+  showGauges(state);
   showLinks(state);
-  showLog(state.log, isAll);
+  showLog(state, isAll);
   map.receive(state, isAll);
   plots.receive(state.series, isAll);
   commands.receive(state);
 }
 
-function showMission({ mission, losses }) {
+function showTimes({ utc_s, started, mission, is_over }) {
+  const now = utc(utc_s);
+  text("utc", `${day(now)} ${hour(now)}`);
+  text("started", started ? `${day(started) === day(now) ? "" : `${day(started)} `}${hour(started)}` : "–");
+  const inS = is_over ? null : (mission?.finish_in_s ?? null);
+  const finish = inS === null ? null : utc(utc_s + inS);
+  text("finish", finish ? `${day(finish) === day(now) ? "" : `${day(finish)} `}${hour(finish).slice(0, 5)}` : "–");
+}
+
+// As docs/dashboard.md has it: what an operator commanded is no alarm.
+function levelOf({ mission, losses, alarms: list }) {
+  const isGrave = list.some((alarm) => !alarm.ended && ["hold", "return", "fault"].includes(alarm.severity));
+  if (losses.length || (mission.state === "done" && mission.exit_status > 0)) return "bad";
+  if (mission.state === "idle") return isGrave ? "bad" : "";
+  if (["held", "backing off", "returning"].includes(mission.state)) return isGrave ? "bad" : mission.is_by_operator ? "note" : "warn";
+  return "good";
+}
+
+function showMission(state) {
+  const { mission } = state;
   if (!mission) {
     text("state", "waiting for the main loop");
     return;
   }
-  const cause = mission.cause ? `: ${mission.cause}` : "";
+  const level = levelOf(state);
+  const cause = !mission.cause ? "" : mission.is_by_operator && level === "note" ? " by an operator" : `: ${mission.cause}`;
   text("state", mission.outcome ? `done: ${mission.outcome}` : mission.state + cause);
-  const isBad = losses.length > 0 || (mission.state === "done" && mission.exit_status > 0);
-  $("state").dataset.level = isBad ? "bad" : (LEVELS[mission.state] ?? "good");
+  $("state").dataset.level = level;
   $("state").classList.toggle("stale", mission.is_stale);
   text("done", String(mission.done));
   text("total", String(mission.total));
@@ -155,7 +185,7 @@ function showMission({ mission, losses }) {
   text("point", mission.next_point || "–");
   text("arrival", mission.done ? `${mission.error_mm.toFixed(2)} mm` : "–");
   text("skipped", String(Math.max(mission.skipped, mission.not_to_be_measured)));
-  text("slips", mission.missed_deadlines ? `${mission.missed_deadlines}, worst ${mission.worst_lateness_ms.toFixed(0)} ms` : "0");
+  text("slips", mission.missed_deadlines ? `${mission.missed_deadlines}, ≤ ${mission.worst_lateness_ms.toFixed(0)} ms` : "0");
 }
 
 // Names and values of further facts of a mission.
@@ -177,9 +207,10 @@ function showFacts(facts) {
 
 function showVerdict(verdict) {
   if (!verdict) return;
-  const grave = SEVERITIES[verdict.severity] ? `, ${SEVERITIES[verdict.severity]}` : "";
+  const level = verdict.code === 2 || verdict.severity >= HOLD ? "bad" : verdict.code || verdict.severity ? "warn" : "good";
+  const grave = verdict.severity ? `, ${severity(verdict.severity)}` : "";
   text("verdict", `${verdict.code} ${codes[verdict.code] ?? ""}${grave}${verdict.text ? `: ${verdict.text}` : ""}`);
-  $("verdict").dataset.level = verdict.code === 2 || verdict.severity >= 4 ? "bad" : verdict.code || verdict.severity ? "warn" : "";
+  $("verdict").dataset.level = level;
   $("verdict").classList.toggle("stale", Boolean(verdict.is_stale));
   for (const way of ["forward", "reverse", "turn"]) {
     const is = verdict[way];
@@ -187,74 +218,64 @@ function showVerdict(verdict) {
   }
 }
 
-// What an operator turned on: a tone and a notification of the browser for each grave alarm that is new.
-const known = new Set();
-let tones = null;
-$("sound").onchange = () => {
-  tones = $("sound").checked ? new AudioContext() : null;
-  if (tones && "Notification" in window) Notification.requestPermission();
-};
-
-function announce(alarms, isAll) {
-  const grave = alarms.filter((alarm) => !alarm.ended && SEVERITIES.indexOf(alarm.severity) >= SEVERITIES.indexOf("hold"));
-  const fresh = grave.filter((alarm) => !known.has(`${alarm.name} ${alarm.count} ${alarm.severity}`));
-  for (const alarm of fresh) known.add(`${alarm.name} ${alarm.count} ${alarm.severity}`);
-  if (isAll || !tones || !fresh.length) return;
-  const tone = tones.createOscillator();
-  tone.frequency.value = 880;
-  tone.connect(tones.destination);
-  tone.start();
-  tone.stop(tones.currentTime + 0.6);
-  if ("Notification" in window && Notification.permission === "granted")
-    new Notification(document.title, { body: fresh.map((alarm) => `${alarm.cause}. ${alarm.advice}`).join(" ") });
-}
-
-// A row is made again only when it changed: a button must stay where it is while it is pressed.
-function showAlarms(alarms) {
-  const list = $("alarms");
-  $("alarms-card").hidden = alarms.length === 0;
-  alarms.forEach((alarm, k) => {
-    const key = JSON.stringify(alarm);
-    if (list.children[k]?.dataset.key === key) return;
-    const row = document.createElement("li");
-    row.dataset.key = key;
-    row.dataset.level = alarm.ended ? "" : SEVERITIES.indexOf(alarm.severity) >= SEVERITIES.indexOf("hold") ? "bad" : "warn";
-    const add = (kind, words, id = "") => {
-      const node = document.createElement(kind);
-      node.textContent = words;
-      node.className = id;
-      row.append(node);
-      return node;
-    };
-    const times = alarm.count > 1 ? `, ${alarm.count} times` : "";
-    add("strong", alarm.cause);
-    add("small", `${alarm.severity}${times}, since ${alarm.since.slice(11)}${alarm.ended ? `, ended ${alarm.ended.slice(11)}` : ""}`);
-    if (alarm.advice) add("p", alarm.advice);
-    if (alarm.acknowledged_by) add("small", `acknowledged by ${alarm.acknowledged_by}, ${alarm.acknowledged.slice(11)}`);
-    else add("button", "Acknowledge", "acknowledge").onclick = () => commands.acknowledge(alarm.name);
-    if (list.children[k]) list.children[k].replaceWith(row);
-    else list.append(row);
-  });
-  while (list.children.length > alarms.length) list.lastChild.remove();
-}
-
-function showRobot(robot, pose) {
+function showRobot({ robot, pose, mission }) {
   const edges = robot?.edges ?? [];
   const names = ["front left", "front right", "rear left", "rear right"];
   names.forEach((name, k) => ($(`edge-${k}`).dataset.on = edges.length ? (edges[k] ? "yes" : "no") : ""));
   const off = names.filter((_, k) => edges.length && !edges[k]);
   const label = !edges.length ? "Edge sensors: not known" : off.length ? `Edge sensors off the panel: ${off.join(", ")}` : "Edge sensors: all on a panel";
-  if ($("edges").getAttribute("aria-label") !== label) $("edges").setAttribute("aria-label", label);
-  text("fans", robot ? robot.fans.map((duty) => `${Math.round(100 * duty)} %`).join(", ") : "–");
-  text("charge", robot ? `${Math.round(100 * robot.charge)} %` : "–");
-  text("held", robot ? (robot.is_held ? "held by the robot" : "free") : "–");
-  text("ages", robot ? `${Math.round(1000 * robot.drive_age_s)}, ${Math.round(1000 * robot.permit_age_s)} ms old` : "–");
+  if ($("edges").getAttribute("aria-label") !== label) {
+    $("edges").setAttribute("aria-label", label);
+    $("edges").title = label;
+  }
+  const isHeld = ["held", "idle", "done"].includes(mission?.state);
+  text("held", !robot ? "–" : robot.is_held ? "held by the robot's own rules" : isHeld ? `held, the mission is ${mission.state}` : "follow the drives");
   $("faults").hidden = !robot?.faults.length;
-  text("faults", robot?.faults.length ? `Robot reports: ${robot.faults.join(", ")}` : "");
+  text("faults", robot?.faults.length ? `■ Robot reports: ${robot.faults.join(", ")}` : "");
   text("pose-xy", pose ? `${pose.x_m.toFixed(3)}, ${pose.y_m.toFixed(3)} m` : "–");
   text("pose-heading", pose ? `${((pose.heading_rad * 180) / Math.PI).toFixed(1)}°` : "–");
   const [xx, , yy] = pose?.covariance_m2 ?? [0, 0, 0];
   text("pose-sigma", pose ? `${(3000 * Math.sqrt(Math.max(xx, yy, 0))).toFixed(2)} mm` : "–");
+}
+
+// Of each value: name, value, limit, whether it must be above it, how much the bar holds, and how it is written.
+function showGauges({ robot, laser, sensors_age_s }) {
+  const percent = (value) => `${Math.round(100 * value)} %`;
+  const ms = (value) => `${Math.round(1000 * value)} ms`;
+  const fan = (k) => [`fan ${["left", "right"][k]}`, robot?.fans[k], limits.fan_share ? limits.fan_share * limits.fan_duty[k] : null, true, 1, percent];
+  const rows = [
+    ...("charge" in limits ? [["battery", robot?.charge, limits.charge, true, 1, percent], fan(0), fan(1)] : [["battery", robot?.charge, null, true, 1, percent]]),
+    ...("dop" in limits
+      ? [
+          ["laser DOP", laser?.dop, limits.dop, false, 1.3 * limits.dop, (value) => value.toFixed(1)],
+          ["laser residual", laser?.residual_um, limits.residual_um, false, 1.3 * limits.residual_um, (value) => `${value.toFixed(value < 10 ? 1 : 0)} µm`],
+        ]
+      : []),
+    ["sensors, age", sensors_age_s, limits.sensors_age_s, false, 1.3 * limits.sensors_age_s, ms],
+    ["permit, age", robot?.permit_age_s, limits.permit_age_s, false, 1.3 * limits.permit_age_s, ms],
+    ["drive, age", robot?.drive_age_s, limits.drive_age_s, false, 1.3 * (limits.drive_age_s ?? limits.permit_age_s), ms],
+  ];
+  const list = $("gauges");
+  rows.forEach(([name, value, limit, isLeast, most, write], k) => {
+    let row = list.children[k];
+    if (!row) {
+      row = document.createElement("div");
+      row.innerHTML = "<dt></dt><span class='bar'><b></b><u></u></span><dd></dd>";
+      list.append(row);
+    }
+    const isKnown = value !== null && value !== undefined;
+    const isBad = isKnown && limit != null && (isLeast ? value < limit : value > limit);
+    const [head, bar, words] = row.children;
+    row.dataset.level = isBad ? "bad" : "";
+    head.textContent = name;
+    bar.children[0].style.width = `${isKnown ? Math.min((100 * value) / most, 100) : 0}%`;
+    bar.children[1].hidden = limit == null;
+    if (limit != null) bar.children[1].style.left = `${(100 * limit) / most}%`;
+    const bound = limit == null ? "" : ` <small>${isLeast ? "≥" : "≤"} ${write(limit)}</small>`;
+    const shown = `${isBad ? (isLeast ? "low " : "high ") : ""}${isKnown ? write(value) : "–"}${bound}`;
+    if (words.innerHTML !== shown) words.innerHTML = shown;
+  });
+  while (list.children.length > rows.length) list.lastChild.remove();
 }
 
 function showLinks({ links, restarts }) {
@@ -264,40 +285,56 @@ function showLinks({ links, restarts }) {
     row.append(document.createElement("b"), document.createElement("span"));
     list.append(row);
   }
+  while (list.children.length > links.length) list.lastChild.remove();
   links.forEach((link, k) => {
     const row = list.children[k];
     const again = link.name === "main loop" ? restarts.main : link.name === "danger loop" ? restarts.danger : 0;
-    row.dataset.well = link.is_well ? "yes" : "no";
+    const limit = staleAfter[link.name] ? ` ≤ ${staleAfter[link.name]} s` : "";
+    row.dataset.well = link.age_s === null ? "idle" : link.is_well ? "yes" : "no";
     row.children[0].textContent = link.name;
-    row.children[1].textContent = `${link.phase} ${age(link.age_s)}${again ? ` (restarted ${again}×)` : ""}`;
+    row.children[1].textContent = `${link.phase} ${age(link.age_s)}${link.age_s === null ? "" : limit}${again ? ` (restarted ${again}×)` : ""}`;
   });
 }
 
-function showLog(lines, isAll) {
+function showLog({ log, messages_left_out }, isAll) {
   const list = $("log");
   if (isAll) {
     list.replaceChildren();
     rowOfKind.clear();
   }
-  for (const [t, level, line, times, kind] of lines) {
+  for (const [at, level, line, times, kind] of log) {
     rowOfKind.get(kind)?.remove();
     const row = document.createElement("li");
     const time = document.createElement("time");
-    time.textContent = `${t.toFixed(1)} s`;
+    time.textContent = `${at.slice(5, 10)} ${hour(at)}Z`;
+    time.dateTime = at;
+    const sign = document.createElement("b");
+    sign.textContent = level;
     const body = document.createElement("span");
     body.textContent = times > 1 ? `${line} (${times}×)` : line;
     row.dataset.level = level;
-    row.append(time, body);
+    row.append(time, sign, body);
     list.prepend(row);
     rowOfKind.set(kind, row);
   }
-  while (list.children.length > MAX_LINES) list.lastChild.remove();
+  let note = list.querySelector(".left-out");
+  while (list.children.length > MAX_LINES + (note ? 1 : 0)) {
+    const oldest = note ? note.previousElementSibling : list.lastElementChild;
+    for (const [kind, row] of rowOfKind) if (row === oldest) rowOfKind.delete(kind);
+    oldest.remove();
+  }
+  if (!messages_left_out) return;
+  if (!note) {
+    note = Object.assign(document.createElement("li"), { className: "left-out" });
+    list.append(note);
+  }
+  note.textContent = `${messages_left_out.toLocaleString("en")} older messages left out: see log.jsonl`;
 }
 
 // -- keys ---------------------------------------------------------------------------------------------------------
 
 document.addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input")) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input") || document.querySelector("dialog[open]")) return;
   const act = {
     p: () => commands.press("pause"),
     r: () => commands.press("resume"),
