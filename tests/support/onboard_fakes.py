@@ -151,7 +151,7 @@ class FakeDaq:
         self.is_mute = self.is_unplugged = False
         self.rate = 1.0  # device seconds per second
         self.start_us = 0
-        self.counts, self.step = [0, 0], [0, 0]
+        self.counts, self.step = [0.0, 0.0], [0.0, 0.0]
         self.adc = [60000, 60000, 60000, 60000, 57000]
         self.open_error: Exception | None = None
         self.opened = self.closed = self.unsent = 0
@@ -173,7 +173,7 @@ class FakeDaq:
         self._decoder = Decoder()
         self._seq, self.device_us, self._waiting = 0, float(self.start_us), b""
         self._sample_hz, self._next_s, self._count = 0, math.inf, 0
-        self.counts = [0, 0]
+        self.counts = [0.0, 0.0]
         self._identify()
 
     def write(self, data: bytes, /) -> int:
@@ -224,7 +224,7 @@ class FakeDaq:
         while self._next_s <= now_s + 1e-9:
             self.device_us += 1e6 * self.rate / self._sample_hz
             self.counts = [count + step for count, step in zip(self.counts, self.step, strict=True)]
-            right, left = ((count + 0x80000000) % 0x100000000 - 0x80000000 for count in self.counts)
+            right, left = ((round(count) + 0x80000000) % 0x100000000 - 0x80000000 for count in self.counts)
             self._waiting += SAMPLE.pack(round(self.device_us) & 0xFFFFFFFF, right, left, *self.adc)
             self._next_s += 1.0 / self._sample_hz
             if len(self._waiting) == self._packed * SAMPLE.size:

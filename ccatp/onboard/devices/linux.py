@@ -130,13 +130,14 @@ class LinuxHardware:
         self._fans = Fans(config.fans, pwm_root, sleep)
         self._imu = imu(config.bno055, partial(open_bus, config.bno055.bus), clock, sleep)
         self._daq = Daq(config.daq, open_port, clock, sleep)
-        # In the order of opening: the motors brake first, and the samples that nobody takes meanwhile come last.
+        # By their sections of the configuration, in the order of opening: the motors brake first, and the samples that
+        # nobody takes meanwhile come last.
         self._devices: dict[str, _Device] = {
             "motors": self._motors,
-            "external timer": self._timer,
+            "timer": self._timer,
             "fans": self._fans,
-            "inertial unit": self._imu,
-            "data acquisition": self._daq,
+            "bno055": self._imu,
+            "daq": self._daq,
         }
         self._opened = ExitStack()
         self._fan_check_s = clock()
@@ -208,11 +209,11 @@ class LinuxHardware:
         bno055, daq = self._config.bno055, self._config.daq
         # Samples, their rate, fault of the device, {unit of a noise: (limit, columns of the samples)}.
         sampled: dict[str, _Sampled] = {
-            "inertial unit": (
+            "bno055": (
                 [row for reading in readings for row in reading.imu], bno055.rate_hz, faults.get("imu", ""),
                 {"rad/s": (bno055.noise_rad_s, (2,)), "m/s^2": (bno055.noise_m_s2, (1,))},
             ),
-            "data acquisition": (
+            "daq": (
                 [row for reading in readings for row in reading.edges], daq.sample_hz, faults.get("edge", ""),
                 {"V": (daq.noise_v, (1, 2, 3, 4))},
             ),

@@ -2,6 +2,7 @@
 
 import errno
 import fcntl
+import math
 import os
 import random
 import subprocess
@@ -18,10 +19,11 @@ from ccatp.config.load import load_onboard_config
 from ccatp.onboard.devices.bno055 import Bno055, ImuSample
 from ccatp.onboard.devices.linux import GpioLines, I2cBus, LinuxHardware, open_serial
 from ccatp.onboard.hardware import Hardware, HardwareError
+from ccatp.onboard.robot import OnboardRobot
 from tests.support.onboard_fakes import FakeBno055, FakeBridge, FakeDaq, FakePwm, FakeTime
 
 CONFIG = load_onboard_config().devices
-DEVICES = ["motors", "external timer", "fans", "inertial unit", "data acquisition"]
+DEVICES = ["motors", "timer", "fans", "bno055", "daq"]
 
 
 class SteppedBno055(Bno055):
@@ -56,6 +58,15 @@ class Rig:
         if self.bus_error is not None:
             raise self.bus_error
         return self.unit.open()
+
+    def voltages(self) -> list[float]:
+        """Of the right and the left motor, from lines and duties; 0 where it brakes."""
+        voltages = []
+        for motor in (CONFIG.motors.right, CONFIG.motors.left):
+            forward, reverse = self.bridge.levels[motor.forward_line], self.bridge.levels[motor.reverse_line]
+            duty = self.pwm.value(f"pwmchip{motor.chip}/pwm{motor.channel}/duty_cycle") / 50_000
+            voltages.append((forward - reverse) * duty * CONFIG.motors.supply_v)
+        return voltages
 
     def run(self, duration_s: float) -> set[str]:
         """Read each 2 ms; the faults after the last one."""
@@ -114,6 +125,39 @@ def test_a_motor_that_cannot_be_set_lets_the_timer_run_out(rig: Rig) -> None:
     with pytest.raises(HardwareError, match="right motor"):
         rig.hardware.drive(6.0, 6.0)
     assert rig.bridge.levels[CONFIG.timer.line] is level
+
+
+def test_the_control_loop_drives_wheels_through_the_devices_and_brakes_when_it_does_not_see_them(rig: Rig) -> None:
+    config = load_onboard_config()
+    rig.hardware.start()
+    robot = OnboardRobot(config, rig.hardware)
+    servo, rates = config.servo, [0.0, 0.0]
+    counts_per_rad = servo.counts_per_rev / math.tau
+
+    def run(duration_s: float) -> None:
+        end_s = rig.time.now_s + duration_s
+        while rig.time.now_s < end_s:
+            rig.time.sleep(0.002)
+            robot.rules.drive(1, 3.0, -2.0, rig.time.now_s)
+            robot.control(rig.time.now_s)
+            for wheel, voltage_v in enumerate(rig.voltages()):
+                steady = max(0.0, abs(voltage_v) - servo.static_v) / servo.volt_per_rad_s
+                rates[wheel] += (math.copysign(steady, voltage_v) - rates[wheel]) * 0.002 / 0.06  # of a motor
+            rig.daq.step = [rate * counts_per_rad / CONFIG.daq.sample_hz for rate in rates]
+
+    run(1.0)
+    before = rig.daq.counts
+    run(1.0)
+    moved = [(now - then) / counts_per_rad for now, then in zip(rig.daq.counts, before, strict=True)]
+    assert moved == pytest.approx([3.0, -2.0], abs=0.05)  # 2 % of the set points
+    assert not robot.faults
+    rig.daq.is_mute = True
+    run(0.1)
+    assert set(robot.faults) == {"encoder_left", "encoder_right", "edge"}
+    assert rig.voltages() == [0.0, 0.0]
+    rig.daq.is_mute = False
+    run(1.0)
+    assert rig.voltages()[0] > 0.0 > rig.voltages()[1]
 
 
 Break = Callable[[Rig], object]
@@ -202,18 +246,18 @@ CHECKS: dict[str, tuple[Break, str, bool, str]] = {
         "/dev/gpiochip0: is not there",
     ),
     "no port": (
-        lambda r: setattr(r.daq, "open_error", HardwareError("is not there")), "data acquisition", False,
+        lambda r: setattr(r.daq, "open_error", HardwareError("is not there")), "daq", False,
         "data acquisition device: is not there",
     ),
     "no unit": (
-        lambda r: setattr(r.unit, "error", OSError(errno.EREMOTEIO, "Remote I/O error")), "inertial unit", False,
+        lambda r: setattr(r.unit, "error", OSError(errno.EREMOTEIO, "Remote I/O error")), "bno055", False,
         "BNO055: [Errno 121] Remote I/O error; check the wiring of the I2C bus",
     ),
     "too few samples": (
-        lambda r: setattr(r.daq, "corrupt", _Sometimes(5)), "data acquisition", True, "800 samples/s instead of 1000; ",
+        lambda r: setattr(r.daq, "corrupt", _Sometimes(5)), "daq", True, "800 samples/s instead of 1000; ",
     ),
-    "a robot that is moved": (_shake, "inertial unit", True, "rad/s, limit 0.01; let the robot stand"),
-    "a loose edge sensor": (_flicker, "data acquisition", True, "V, limit 0.05; let the robot stand"),
+    "a robot that is moved": (_shake, "bno055", True, "rad/s, limit 0.01; let the robot stand"),
+    "a loose edge sensor": (_flicker, "daq", True, "V, limit 0.05; let the robot stand"),
 }  # fmt: skip
 
 
@@ -236,7 +280,7 @@ def test_check_says_what_is_wrong(rig: Rig, broken: Break, device: str, is_found
     found = checks.pop(device)
     assert (found.found, found.passed) == (is_found, False)
     assert advice in found.advice
-    others = set(checks) - {"external timer"} if "gpiochip" in advice else set(checks)
+    others = set(checks) - {"timer"} if "gpiochip" in advice else set(checks)
     assert all(checks[name].passed for name in others)
 
 
