@@ -140,12 +140,9 @@ class RecordingFacts:
 def recording_files(path: Path) -> list[Path]:
     """The file itself, or all recordings of a run directory, oldest first; raises ``RecordingError`` without any."""
     found = recordings(path / TELEMETRY) if path.is_dir() else [path]
-    if not found:
-        raise RecordingError(
-            f"{path}: no {TELEMETRY} there; name a recording, or the directory of a run (ccatp runs list)"
-        )
-    if not path.exists():
-        raise RecordingError(f"{path}: no such file; name a recording, or the directory of a run")
+    if not found or not path.exists():
+        what = f"no {TELEMETRY} there" if path.is_dir() else "no such file"
+        raise RecordingError(f"{path}: {what}; name a recording, or the directory of a run (ccatp runs list)")
     return found
 
 
