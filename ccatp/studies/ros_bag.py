@@ -138,7 +138,7 @@ class _Export:
 
     def _fixed_frames(self, t_s: float) -> Iterator[Any]:
         origin, turn = deck_in_world(self._mirror)
-        yield self._transform(t_s, WORLD, MAP, origin, _ros_quaternion(turn))
+        yield self._transform(t_s, WORLD, MAP, origin, turn)
         robot = self._cfg.robot
         edges = {f"edge_{c}_link": (*place, 0.0) for c, place in zip(Corner, robot.edge_sensors_m, strict=True)}
         links = {IMU_LINK: (0.0, 0.0, 0.0), PUCK_LINK: (0.0, 0.0, robot.puck_height_m), **edges}
@@ -182,7 +182,7 @@ class _Export:
     def _odometry(self, t_s: float, pose: DeckPose, covariance: FloatArray, motion: _Motion) -> Any:
         """Height, roll and pitch follow from the surface, the wheels allow no other velocity: their variances are 0."""
         place = ros.geometry_msgs__msg__Point(*self._mirror.surface_point(pose.x_m, pose.y_m))
-        turn = _ros_quaternion(quaternion(self._mirror.robot_axes(pose)))
+        turn = quaternion(self._mirror.robot_axes(pose))
         of_pose, of_twist = np.zeros((6, 6)), np.zeros((6, 6))
         of_pose[_PLANE] = covariance
         v_m_s, omega_rad_s, of_twist[0, 0], of_twist[5, 5] = motion
@@ -231,7 +231,3 @@ class _Export:
             message.t_s,
             ros.diagnostic_msgs__msg__DiagnosticArray(self._header(message.t_s, ""), statuses),
         )
-
-
-def _ros_quaternion(turn: Any) -> Any:
-    return ros.geometry_msgs__msg__Quaternion(turn.x, turn.y, turn.z, turn.w)
