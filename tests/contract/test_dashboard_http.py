@@ -153,7 +153,8 @@ async def test_status_health_and_metrics(rig: Rig) -> None:
     assert metrics["ccatp_points"]["measured",] == 3.0
 
 
-async def test_the_first_status_has_a_pose(rig: Rig) -> None:
+@pytest.mark.parametrize(("path", "of_pose"), [("/status", b'"covariance_m2"'), ("/metrics", b"position_sigma")])
+async def test_the_first_state_has_a_pose(path: str, of_pose: bytes, rig: Rig) -> None:
     async def live() -> None:
         while True:
             rig.tell_alive()
@@ -162,9 +163,9 @@ async def test_the_first_status_has_a_pose(rig: Rig) -> None:
     async with asyncio.TaskGroup() as tasks:
         living = tasks.create_task(live())
         await asyncio.sleep(0.5)  # it hears of the mission, and nobody has looked
-        status = (await rig.ask("GET", "/status")).data
+        reply = await rig.ask("GET", path)
         living.cancel()
-    assert status["pose"] is not None
+    assert of_pose in reply.body
 
 
 async def test_a_command_goes_to_the_operator_channel(rig: Rig) -> None:

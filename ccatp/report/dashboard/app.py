@@ -64,6 +64,8 @@ GAUGES: tuple[tuple[str, str, str, Callable[[Any], float | None]], ...] = (
      lambda p: sqrt(max(p.covariance_m2[0] + p.covariance_m2[2], 0.0))),
     ("nis_per_dof", "Normalised innovation squared of the last update, per degree of freedom.", "pose",
      lambda p: p.nis / p.size if p.size else None),
+    ("laser_residual_meters", "Root mean square of the last fix's residuals.", "laser",
+     lambda fix: 1e-6 * fix["residual_um"]),
 )  # fmt: skip
 COUNTERS = {"late_frames", "process_restarts", "process_cpu_seconds"}
 POINT_COUNTS = {"planned": "total", "measured": "done", "skipped": "skipped"}
@@ -122,7 +124,7 @@ class StateCollector(Collector):
         restarts = [((process,), count) for process, count in state["restarts"].items()]
         yield "process_restarts", "Restarts of a process that the dashboard has seen.", ("process",), restarts
         for name, text, part, value_of in GAUGES:
-            if state[part] is not None:
+            if state.get(part) is not None:
                 yield name, text, (), [((), value_of(state[part]))]
         active = [alarm for alarm in state["alarms"] if not alarm["ended"]]
         rows = [((alarm["name"], alarm["severity"]), 1.0) for alarm in active]
@@ -281,6 +283,7 @@ def build_app(
         return _error(503, trouble) if trouble else _json({"status": "ok"})
 
     async def metrics(_request: Request) -> Response:
+        await hub.whole_state()  # also of a run that nobody watches, however rarely it is asked
         return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
 
     async def operator(request: Request) -> Response:

@@ -228,6 +228,7 @@ ALL: dict[str, Any] = NOTHING | {
         seq=0, t_s=0.0, x_m=1.0, y_m=-2.0, heading_rad=0.5, covariance_m2=(9e-6, 0.0, 16e-6), heading_sigma_rad=0.01,
         nis=2.0, size=2, line=NO_LINE,
     ),
+    "laser": {"dop": 1.0, "residual_um": 12.0, "channels": [1, 2, 3, 4], "is_used": True},
 }  # fmt: skip
 
 
@@ -275,6 +276,7 @@ def test_all_metrics() -> None:
         "ccatp_drive_age_seconds": {(): 0.01},
         "ccatp_permit_age_seconds": {(): 0.02},
         "ccatp_robot_faults": {(): 1.0},
+        "ccatp_laser_residual_meters": {(): 12e-6},
         "ccatp_dashboard_pages": {(): 3.0},
     }
 
