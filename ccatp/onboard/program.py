@@ -59,7 +59,7 @@ class OnboardServer(TcpRobotServer):
 
     Attributes:
         lateness: of the control loop.
-        each_step: called with the time after each step.
+        each_step: called after each step, with the robot and the time.
     """
 
     robot: OnboardRobot
@@ -80,7 +80,7 @@ class OnboardServer(TcpRobotServer):
         self.lateness = Lateness()
         self._reported: dict[str, float] = {}
         self._faults: frozenset[str] = frozenset()
-        self.each_step: Callable[[float], None] = lambda _: None
+        self.each_step: list[Callable[[OnboardRobot, float], None]] = []
 
     def begin(self, now_s: float) -> None:
         """The robot boots; samples have been taken since ``boot_s``."""
@@ -111,7 +111,8 @@ class OnboardServer(TcpRobotServer):
             self._report(now_s)
         if now_s + 0.5 * self._step_s >= self.next_frame_s:
             self.tick(now_s)
-        self.each_step(now_s)
+        for call in self.each_step:
+            call(robot, now_s)
 
     def _skip_stop(self, now_s: float) -> float:
         # The clock of samples and frames is one, and goes on while the process stands.
@@ -138,8 +139,9 @@ async def serve(
     key: bytes | None,
     log: structlog.typing.FilteringBoundLogger,
     boot_s: float,
-) -> OnboardServer:
-    """Run the robot on hardware that was started, until ``stop`` is set; the server, for its statistics."""
+    *each_step: Callable[[OnboardRobot, float], None],
+) -> None:
+    """Run the robot on hardware that was started, until ``stop`` is set; each of ``each_step`` is called as often."""
     notifier, watchdog_s = take_from(os.environ)
     robot = OnboardRobot(cfg, hardware)
     server = OnboardServer(
@@ -149,16 +151,17 @@ async def serve(
         key=key,
         log=log,
     )
+    server.each_step += each_step
     if watchdog_s is not None:
         period_s, sent_s = _WATCHDOG_SHARE * watchdog_s, [0.0]
 
-        def stroke(now_s: float) -> None:
+        def stroke(_: OnboardRobot, now_s: float) -> None:
             # Out of the control loop: a loop that hangs must not be said to live.
             if now_s - sent_s[0] >= period_s:
                 sent_s[0] = now_s
                 notifier.send("WATCHDOG=1")
 
-        server.each_step = stroke
+        server.each_step.append(stroke)
     # A collection in the middle of a step would be the longest delay of all.
     gc.collect()
     gc.freeze()
@@ -178,7 +181,6 @@ async def serve(
             missed_timer=robot.late_steps,
             dropped_samples=robot.dropped_samples,
         )
-    return server
 
 
 def run(

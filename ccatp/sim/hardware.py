@@ -96,7 +96,7 @@ class SimulatedHardware:
         )
         cfg = cfg.model_copy(update={"sim": cfg.sim.model_copy(update={"robot": sim_robot})})
         world_rng, sensors_rng = rng.spawn(2)
-        self._motor, self._cfg, self._mirror = motor, cfg, mirror
+        self._motor, self._mirror = motor, mirror
         window = max(1, round(cfg.etalon.measuring_time_s * loop_hz))
         self.world = World(cfg, mirror, world_rng, window, start=start)
         self._sensors = SensorSuite(cfg, mirror, sensors_rng, lag_s=self.world.wheels.lag_s)
@@ -105,6 +105,7 @@ class SimulatedHardware:
         self._loop_hz, self._per_rad = loop_hz, counts_per_rev / (2.0 * pi)
         floor_duty = sim_robot.fan_floor if mirror.overhang else 0.0
         self._duty = (floor_duty, floor_duty)
+        self.wheel_radius_m = cfg.robot.wheel_radius_m
         self._step = -1
         self._is_lifted = is_lifted
         if is_lifted:
@@ -143,7 +144,7 @@ class SimulatedHardware:
         t_s, dt_s = (self._step - 1) / self._loop_hz, 1.0 / self._loop_hz
         ahead, _, _ = downhill(self.world.plant, self._mirror.gravity_deck)
         ahead = 0.0 if self._is_lifted else ahead
-        load_nm = -0.5 * _MASS_KG * _G_M_S2 * ahead * self._cfg.robot.wheel_radius_m
+        load_nm = -0.5 * _MASS_KG * _G_M_S2 * ahead * self.wheel_radius_m
         right, left = (self._motor.steady_rad_s(voltage_v, load_nm) for voltage_v in self.voltages_v)
         self.world.step(t_s, dt_s, right, left, 0.5 * (self._duty[0] + self._duty[1]))
 

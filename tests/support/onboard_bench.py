@@ -5,7 +5,9 @@ data acquisition device by its bytes. Each sample of the device moves the simula
 files and lines mean then, or braked where the external timer has run out.
 """
 
+import os
 import time
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -33,16 +35,33 @@ class WallClock(FakeTime):
 
 
 class _Bridge(FakeBridge):
-    """Lines whose changes are not kept, and when the line of the external timer changed last."""
+    """Lines whose changes are not kept, and when the line of the external timer changed last.
 
-    def __init__(self, clock: WallClock, timer_line: int) -> None:
+    With ``timer_fd`` each change of that line is a byte there, for an external timer in another process.
+    """
+
+    def __init__(self, clock: WallClock, timer_line: int, timer_fd: int | None) -> None:
         super().__init__()
         self._clock, self._timer_line, self.restarted_s = clock, timer_line, -1.0
+        self._timer_fd = timer_fd
 
     def set(self, values: Mapping[int, bool]) -> None:
         self.levels |= values
         if self._timer_line in values:
             self.restarted_s = self._clock.now_s
+            if self._timer_fd is not None:
+                os.write(self._timer_fd, b"x")
+
+
+class _Bno055(FakeBno055):
+    """Its bus may hang: a transfer ends after ``hang_s``."""
+
+    hang_s = 0.0
+
+    def write_read(self, address: int, data: bytes, count: int) -> bytes:
+        if self.hang_s:
+            time.sleep(self.hang_s)
+        return super().write_read(address, data, count)
 
 
 class _Daq(FakeDaq):
@@ -72,16 +91,18 @@ class RobotBench:
     def __init__(
         self, devices: DevicesConfig, simulated: SimulatedHardware, folder: Path, start_s: float,
         monkeypatch: pytest.MonkeyPatch,
+        timer_fd: int | None = None,
     ) -> None:  # fmt: skip
         self._devices, self.simulated = devices, simulated
         self.full_scale_v = devices.daq.full_scale_v
         self.clock = WallClock(start_s)
-        self.bno055 = FakeBno055(self.clock)
+        self.bno055 = _Bno055(self.clock)
         self.daq = _Daq(self.clock)
         self.daq.bench = self
-        self.bridge = _Bridge(self.clock, devices.timer.line)
+        self.bridge = _Bridge(self.clock, devices.timer.line, timer_fd)
         self.pwm = FakePwm(folder, monkeypatch, {0: 2, 1: 2})
-        self._steps = 0
+        self._steps, self._radius_m = 0, simulated.wheel_radius_m
+        self._speeds: deque[float] = deque(maxlen=1 + round(devices.daq.sample_hz / devices.bno055.rate_hz))
         self.hardware = LinuxHardware(
             devices,
             self.clock,
@@ -101,8 +122,13 @@ class RobotBench:
         )
         readings = simulated.read(self._steps / self._devices.daq.sample_hz)
         self._steps += 1
-        for _, ax, wz in readings.imu:
-            self.bno055.ax_m_s2, self.bno055.wz_rad_s = ax, wz
+        plant = simulated.world.plant
+        speeds = self._speeds
+        speeds.append(0.5 * self._radius_m * (plant.right_rad_s + plant.left_rad_s))
+        # The unit's filter takes the mean of what the motors do at 1 kHz between two of its readings.
+        self.bno055.ax_m_s2 = (speeds[-1] - speeds[0]) / (max(len(speeds) - 1, 1) / self._devices.daq.sample_hz)
+        for _, _, wz in readings.imu:
+            self.bno055.wz_rad_s = wz
         if readings.gravity is not None:
             _, gx, gy, gz = readings.gravity
             self.bno055.gravity_m_s2 = (-9.81 * gx, -9.81 * gy, -9.81 * gz)

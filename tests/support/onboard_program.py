@@ -1,4 +1,9 @@
-"""``python -m tests.support.onboard_program``: the on-board program on the wall clock, over simulated hardware."""
+"""``python -m tests.support.onboard_program``: the on-board program on the wall clock, over simulated hardware.
+
+Standard output gets the port, and a line each time that the wheels are held or let go: the word and the time of
+``monotonic``. With ``--fakes`` SIGUSR1 makes the bus of the inertial unit hang, and work again, SIGUSR2 unplugs the
+data acquisition device, and plugs it in again.
+"""
 
 import argparse
 import asyncio
@@ -9,6 +14,7 @@ import socket
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +26,7 @@ from ccatp.links import realtime
 from ccatp.mirror.mirror import build_mirror
 from ccatp.onboard.hardware import Hardware
 from ccatp.onboard.program import serve
+from ccatp.onboard.robot import OnboardRobot
 from ccatp.sim.ground_truth import GroundTruthPublisher, SurveyTruth
 from ccatp.sim.hardware import SimulatedHardware
 from ccatp.sim.world import World
@@ -39,6 +46,19 @@ class Truth(SurveyTruth):
         return time.monotonic() - self._start_s
 
 
+def tell_held() -> Callable[[OnboardRobot, float], None]:
+    """Writes when the wheels are held, and when not."""
+    was_held: list[bool] = []
+
+    def tell(robot: OnboardRobot, now_s: float) -> None:
+        is_held = robot.rules.is_held
+        if was_held != [is_held]:
+            was_held[:] = [is_held]
+            print("held" if is_held else "free", f"{now_s:.6f}", flush=True)
+
+    return tell
+
+
 def main() -> int:
     """Serve until SIGTERM; the port is the first line of standard output."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -47,6 +67,7 @@ def main() -> int:
     parser.add_argument("--world", default="thesis")
     parser.add_argument("--truth", help="endpoint of the true puck, for ccatp sim etalon --truth")
     parser.add_argument("--fakes", action="store_true", help="devices at register and byte level in between")
+    parser.add_argument("--timer-fd", type=int, help="where the line of the external timer goes")
     options = parser.parse_args()
     cfg = load_config(overrides={"run.mirror": options.mirror, "run.world": options.world})
     mirror = build_mirror(cfg.mirror)
@@ -67,7 +88,10 @@ def main() -> int:
     if options.fakes:
         folder = Path(tempfile.mkdtemp(prefix="ccatp-pwm-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        hardware = RobotBench(onboard.devices, simulated, folder, boot_s, pytest.MonkeyPatch()).hardware
+        bench = RobotBench(onboard.devices, simulated, folder, boot_s, pytest.MonkeyPatch(), options.timer_fd)
+        hardware = bench.hardware
+        signal.signal(signal.SIGUSR1, lambda *_: setattr(bench.bno055, "hang_s", 1.0 - bench.bno055.hang_s))
+        signal.signal(signal.SIGUSR2, lambda *_: setattr(bench.daq, "is_unplugged", not bench.daq.is_unplugged))
     log = structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
     listener = socket.create_server(("127.0.0.1", options.port))
 
@@ -77,7 +101,7 @@ def main() -> int:
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
         truth = GroundTruthPublisher(Truth(simulated.world, boot_s), options.truth)
         answering = asyncio.create_task(truth.serve())
-        await serve(onboard, hardware, listener, stop, None, log, boot_s)
+        await serve(onboard, hardware, listener, stop, None, log, boot_s, tell_held())
         answering.cancel()
         truth.close()
         if simulated.world.is_fallen:
