@@ -3,7 +3,7 @@
 import ipaddress
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from operator import mul
 from pathlib import PurePath
@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from ccatp.config.beacon_models import CricketConfig, FuzzyConfig, RadioConfig
 from ccatp.config.messages import ConfigProblem, Key, choice_hint, slip_hint
 from ccatp.config.models import Config, DashboardConfig, MirrorConfig
+from ccatp.config.onboard_models import OnboardConfig
 
 FUZZY_INPUTS = ("distance_m", "heading_error_rad")
 
@@ -26,6 +27,7 @@ _PITCH_AGREEMENT_MM = 0.1  # the fitted pitches of the telescope differ by up to
 _TCP_ENDPOINT = re.compile(r"tcp://[^\s/@;]+:(\d{1,5})")
 _LARGEST_PORT = 65535
 _CORNERS = {"front-left": (1, 1), "front-right": (1, -1), "rear-left": (-1, 1), "rear-right": (-1, -1)}
+_STEPS_OF_TIMER = 5  # of the control loop, in the time of the external timer: one may be late
 _ANCHORS = 2  # A is the origin, B shows the second axis
 _LEAST_NETWORK = 3  # motes of a stand that can trilaterate others in the plane
 
@@ -125,6 +127,55 @@ def _slips(value: object, key: Key) -> Problems:
         yield from _slips(item, (*key, part))
 
 
+def check_onboard_config(cfg: OnboardConfig) -> Problems:
+    """Everything wrong with a configuration of the on-board program whose values are each in range."""
+    link, robot, servo, devices = cfg.link, cfg.robot, cfg.servo, cfg.devices
+    battery = devices.daq.battery_empty_v, devices.daq.battery_full_v
+    yield from _check_corners(robot.edge_sensors_m)
+    step_s, lasting_s = 1.0 / servo.loop_hz, _STEPS_OF_TIMER / servo.loop_hz
+    for is_wrong, key, what, *related in (
+        (not 0.005 <= robot.wheel_radius_m <= 0.2, "robot.wheel_radius_m", "must be between 0.005 and 0.2 (the link)"),
+        (not 0.03 <= robot.wheel_base_m <= 1.0, "robot.wheel_base_m", "must be between 0.03 and 1 (the link)"),
+        (
+            robot.max_wheel_rad_s * robot.wheel_radius_m > 1.0,
+            "robot.max_wheel_rad_s",
+            f"= {robot.max_wheel_rad_s:g} is {robot.max_wheel_rad_s * robot.wheel_radius_m:.3g} m/s; the link allows 1",
+            "robot.wheel_radius_m",
+        ),
+        (link.frame_hz * link.ttl_s < 2.0, "link.ttl_s", "must last for two frames at least", "link.frame_hz"),
+        (servo.loop_hz < link.frame_hz, "servo.loop_hz", "must not be below link.frame_hz", "link.frame_hz"),
+        (
+            lasting_s > devices.timer.timeout_s,
+            "devices.timer.timeout_s",
+            f"= {devices.timer.timeout_s:g} brakes a loop with steps of {step_s:g} s; allow {lasting_s:g} at least",
+            "servo.loop_hz",
+        ),
+        (
+            servo.max_v > devices.motors.supply_v,
+            "servo.max_v",
+            f"= {servo.max_v:g} is more than devices.motors.supply_v = {devices.motors.supply_v:g}",
+            "devices.motors.supply_v",
+        ),
+        (servo.static_v >= servo.max_v, "servo.static_v", "must be below servo.max_v", "servo.max_v"),
+        (
+            cfg.edges.threshold_v + 0.5 * cfg.edges.hysteresis_v >= devices.daq.full_scale_v
+            or cfg.edges.threshold_v <= 0.5 * cfg.edges.hysteresis_v,
+            "edges.threshold_v",
+            f"and its band must lie between 0 and devices.daq.full_scale_v = {devices.daq.full_scale_v:g}",
+            "edges.hysteresis_v",
+            "devices.daq.full_scale_v",
+        ),
+        (
+            battery[0] >= battery[1],
+            "devices.daq.battery_empty_v",
+            "must be below devices.daq.battery_full_v",
+            "devices.daq.battery_full_v",
+        ),
+    ):
+        if is_wrong:
+            yield _problem(key, what, *related)
+
+
 def _check_wheels(cfg: Config) -> Problems:
     """The wheels must give the motion that the limits allow; edge sensors have x to the front, y to the left."""
     robot, limits = cfg.robot, cfg.limits
@@ -138,8 +189,12 @@ def _check_wheels(cfg: Config) -> Problems:
         if value > limit:
             what = f"= {value:g} is more than the wheels give: {of} = {limit:.4g}"
             yield _problem(key, what, *related, "robot.wheel_base_m")
+    yield from _check_corners(robot.edge_sensors_m)
+
+
+def _check_corners(edge_sensors_m: Sequence[tuple[float, float]]) -> Problems:
     for index, (corner, (sign_x, sign_y)) in enumerate(_CORNERS.items()):
-        x, y = robot.edge_sensors_m[index]
+        x, y = edge_sensors_m[index]
         if x * sign_x <= 0.0 or y * sign_y <= 0.0:
             where = f"x {'>' if sign_x > 0 else '<'} 0 and y {'>' if sign_y > 0 else '<'} 0"
             what = f"= [{x:g}, {y:g}] is not {corner}, where {where}; the order is {', '.join(_CORNERS)}"

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from ccatp.config.beacon_models import RadioConfig, RecordingsConfig
-from ccatp.config.checks import check_config, check_radio_config, is_file_name
+from ccatp.config.checks import check_config, check_onboard_config, check_radio_config, is_file_name
 from ccatp.config.files import read_toml
 from ccatp.config.messages import (
     ConfigProblem,
@@ -328,7 +328,7 @@ def load_onboard_config(file: Path | None = None, overrides: Overrides = None) -
     """The configuration of the on-board program; errors as of ``load_config``."""
     command, user, base = sources = _layers(ONBOARD_FILE, file, overrides)
     tree = merged(merged(base.tree, user.tree), command.tree)
-    return validated(OnboardConfig, tree, sources)
+    return validated(OnboardConfig, tree, sources, check_onboard_config)
 
 
 # -- changing a file --------------------------------------------------------------------------------------------------

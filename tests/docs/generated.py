@@ -11,6 +11,7 @@ from pathlib import Path
 
 import click
 
+import ccatp.onboard.devices.daq
 from ccatp.beacons.mission import RULES
 from ccatp.cli import cli
 from ccatp.conditions import DANGER, SAMPLE_RATES, SURVEY, Action, Condition, Group
@@ -173,6 +174,11 @@ def seeded() -> str:
     return "\n\n".join([share, counted, table("| one thing is wrong | found by |", faults)])
 
 
+def daq() -> str:
+    about = inspect.cleandoc(ccatp.onboard.devices.daq.__doc__ or "")
+    return f"```text\n{about.partition(chr(10))[2].strip()}\n```"
+
+
 MADE: dict[str, Callable[[], str]] = {
     "alarms": alarms,
     "severities": severities,
@@ -183,6 +189,7 @@ MADE: dict[str, Callable[[], str]] = {
     "rates": rates,
     "commands": commands,
     "seeded": seeded,
+    "daq": daq,
 }
 
 
