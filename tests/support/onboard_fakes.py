@@ -46,7 +46,7 @@ class FakeBno055:
         self.errors: float = math.inf
         self.tamper: Callable[[bytes], bytes] = bytes
         self.is_locked = False
-        self.opened = self.resets = self.readings = 0
+        self.opened = self.closed = self.resets = self.readings = 0
         self.power_on()
 
     def open(self) -> "FakeBno055":
@@ -55,7 +55,8 @@ class FakeBno055:
             self.error, self.is_locked = None, False
         return self
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        self.closed += 1
 
     def power_on(self, deaf_s: float = 0.0) -> None:
         """As after the supply has come."""

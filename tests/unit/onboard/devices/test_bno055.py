@@ -126,6 +126,7 @@ def test_a_unit_that_is_not_right_is_refused(broken: Break, message: str) -> Non
         (("-x", "-y", "z"), (0x24, 0x06)),
         (("y", "x", "-z"), (0x21, 0x01)),
         (("z", "x", "y"), (0x12, 0)),
+        (("y", "z", "x"), (0x09, 0)),
     ],
 )
 def test_axes(axes: tuple[str, str, str], registers: tuple[int, int]) -> None:
@@ -260,6 +261,13 @@ def test_attempts_at_a_unit_that_is_gone_come_further_and_further_apart(rig: Rig
     rig.run(60.0)
     assert rig.unit.opened < 80  # once a second
     assert "Remote I/O error" in rig.fault()
+
+
+def test_each_attempt_without_a_sample_counts_and_each_bus_is_closed_once(rig: Rig) -> None:
+    rig.unit.error, rig.unit.errors = NACK, 5
+    rig.run(1.0)
+    assert rig.reader.errors == 5
+    assert rig.unit.opened == rig.unit.closed + 1 == 4  # opened again before each attempt after the third failure
 
 
 def test_a_transfer_that_hangs_is_a_fault_and_does_not_keep_the_program_from_its_end(

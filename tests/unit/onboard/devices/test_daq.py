@@ -18,7 +18,7 @@ import pytest
 
 from ccatp.config.load import load_onboard_config
 from ccatp.config.onboard_models import DaqConfig
-from ccatp.onboard.devices.daq import SAMPLES, Daq, DaqSample, Decoder, DeviceClock, format_frame
+from ccatp.onboard.devices.daq import IDENTITY, SAMPLES, Daq, DaqSample, Decoder, DeviceClock, format_frame
 from ccatp.onboard.devices.linux import open_serial
 from ccatp.onboard.hardware import HardwareError
 from tests.support.onboard_fakes import FakeDaq, FakeTime
@@ -305,6 +305,19 @@ def test_what_breaks(rig: Rig, broken: Break, reason: str, repair: Break | None,
         assert dt_s > 0.0
         assert 0 <= after.right - before.right <= 1000.0 * dt_s * 1.05 + 1
         assert after.left - before.left == -2 * (after.right - before.right)
+
+
+def test_what_is_unknown_is_counted_and_samples_count_after_the_identity(rig: Rig) -> None:
+    rig.device.send(0x99, b"?")
+    rig.device.send(SAMPLES, bytes(23))
+    rig.run(0.1)
+    assert rig.daq.decoder.counts["unknown"] == 2
+    second = Daq(CONFIG, rig.device.open, rig.time, rig.time.sleep)
+    rig.device.corrupt = lambda frame: b"" if frame[3] == IDENTITY else frame
+    for _ in range(200):  # it still runs from before, and does not say what it is
+        rig.time.sleep(0.002)
+        assert not second.poll(rig.time.now_s)
+    assert "it does not answer" in second.fault(rig.time.now_s)
 
 
 def test_a_device_that_says_nothing_gets_its_port_opened_again_each_5_s(rig: Rig) -> None:
