@@ -19,6 +19,9 @@ from typing import NamedTuple, Protocol
 from ccatp.config.onboard_models import Bno055Config
 from ccatp.onboard.hardware import HardwareError
 
+Clock = Callable[[], float]
+Sleep = Callable[[float], object]
+
 # Registers of page 0 and their values.
 CHIP_ID, SOFTWARE, PAGE_ID, SELF_TEST = 0x00, 0x04, 0x07, 0x36
 UNIT_SEL, OPR_MODE, PWR_MODE, SYS_TRIGGER, AXIS_MAP, AXIS_SIGN = 0x3B, 0x3D, 0x3E, 0x3F, 0x41, 0x42
@@ -68,7 +71,6 @@ class ImuSample(NamedTuple):
     ax_m_s2: float
     wz_rad_s: float
     gravity: tuple[float, float, float]  # unit vector along which things fall
-    calibration: int  # of the gyroscope, 0 to 3
 
 
 def axis_registers(axes: Sequence[str]) -> tuple[int, int]:
@@ -94,16 +96,10 @@ class Bno055:
 
     Attributes:
         errors: attempts that gave no sample.
-        identity: what the unit says of itself.
+        identity: what the unit says of itself; its gyroscope calibrates itself while it stands.
     """
 
-    def __init__(
-        self,
-        config: Bno055Config,
-        open_bus: Callable[[], Bus],
-        clock: Callable[[], float],
-        sleep: Callable[[float], object],
-    ) -> None:
+    def __init__(self, config: Bno055Config, open_bus: Callable[[], Bus], clock: Clock, sleep: Sleep) -> None:
         self._config, self._open_bus, self._clock, self._sleep = config, open_bus, clock, sleep
         self._period_s = 1.0 / config.rate_hz
         self._bus: Bus | None = None
@@ -112,7 +108,7 @@ class Bno055:
         self._newest_s = clock()
         self._failures = 0
         self._is_lost = False
-        self._reason = ""
+        self._reason = self._software = ""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="bno055", daemon=True)
         self.errors = 0
@@ -206,7 +202,8 @@ class Bno055:
         if not is_new:
             raise _DoubtfulReading("the readings do not change")
         gx, gy, gz = (-g / (100.0 * size) for g in gravity)
-        return ImuSample(t_s, ax / 100.0, wz / 900.0, (gx, gy, gz), calibration >> 4 & 3)
+        self.identity = f"{self._software}, gyroscope calibrated {calibration >> 4 & 3} of 3"
+        return ImuSample(t_s, ax / 100.0, wz / 900.0, (gx, gy, gz))
 
     def _set_up(self) -> None:
         """Reset the unit and set what ``_read`` relies on, each value read back; takes about 0.7 s."""
@@ -232,7 +229,7 @@ class Bno055:
         if failed := [name for bit, name in SELF_TEST_NEEDED.items() if not passed >> bit & 1]:
             raise self._error(f"self test failed: {', '.join(failed)}; replace the unit")
         low, high, loader = self._read_registers(SOFTWARE, 3)
-        self.identity = f"BNO055 software {high:x}.{low:02x} boot loader {loader:x}"
+        self._software = f"BNO055 software {high:x}.{low:02x} boot loader {loader:x}"
 
     def _check_id(self) -> None:
         try:

@@ -74,6 +74,11 @@ class SerialPort(Protocol):
         """Release it."""
 
 
+Clock = Callable[[], float]
+Sleep = Callable[[float], object]
+OpenPort = Callable[[str, int], SerialPort]  # device file and baud rate
+
+
 class DaqSample(NamedTuple):
     """One sample; counts unwrapped, voltages in V."""
 
@@ -198,13 +203,7 @@ class Daq:
         decoder: of the bytes that come.
     """
 
-    def __init__(
-        self,
-        config: DaqConfig,
-        open_port: Callable[[str, int], SerialPort],
-        clock: Callable[[], float],
-        sleep: Callable[[float], object],
-    ) -> None:
+    def __init__(self, config: DaqConfig, open_port: OpenPort, clock: Clock, sleep: Sleep) -> None:
         self._config, self._open_port, self._now, self._sleep = config, open_port, clock, sleep
         self._volt = config.full_scale_v / FULL_SCALE
         self._port: SerialPort | None = None
@@ -319,8 +318,8 @@ class Daq:
             ]
             timed.append((device_s, self._counts, edges))
             battery_v = battery * self._volt * self._config.battery_ratio
-            self.battery_v = battery_v if self.battery_v is None else self.battery_v
-            self.battery_v += (battery_v - self.battery_v) * min(1.0, 1.0 / (BATTERY_S * self._config.sample_hz))
+            before_v = battery_v if self.battery_v is None else self.battery_v
+            self.battery_v = before_v + (battery_v - before_v) / (BATTERY_S * self._config.sample_hz)
         if not self._clock.arrive(now_s):
             return []
         samples = []

@@ -11,11 +11,11 @@ from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from statistics import pstdev
-from typing import Any, Protocol
+from typing import Any
 
 from ccatp.config.onboard_models import DevicesConfig
 from ccatp.onboard.devices.bno055 import Bno055, Bus
-from ccatp.onboard.devices.daq import Daq, SerialPort
+from ccatp.onboard.devices.daq import Daq, OpenPort, SerialPort
 from ccatp.onboard.devices.outputs import PWM_ROOT, ExternalTimer, Fans, Motors, OpenLines, explain
 from ccatp.onboard.hardware import DeviceCheck, HardwareError, Readings
 
@@ -100,15 +100,6 @@ class GpioLines:
         self._request.release()
 
 
-class _Device(Protocol):
-    @property
-    def identity(self) -> str: ...
-
-    def open(self) -> None: ...
-
-    def close(self) -> None: ...
-
-
 class LinuxHardware:
     """The devices of the configuration; a ``Hardware``. ``clock`` is the robot's, the same as ``now_s`` of ``read``."""
 
@@ -118,7 +109,7 @@ class LinuxHardware:
         clock: Callable[[], float],
         *,
         open_bus: Callable[[int], Bus] = I2cBus,
-        open_port: Callable[[str, int], SerialPort] = open_serial,
+        open_port: OpenPort = open_serial,
         open_lines: OpenLines = GpioLines,
         pwm_root: Path = PWM_ROOT,
         imu: type[Bno055] = Bno055,
@@ -132,7 +123,7 @@ class LinuxHardware:
         self._daq = Daq(config.daq, open_port, clock, sleep)
         # By their sections of the configuration, in the order of opening: the motors brake first, and the samples that
         # nobody takes meanwhile come last.
-        self._devices: dict[str, _Device] = {
+        self._devices: dict[str, Motors | ExternalTimer | Fans | Bno055 | Daq] = {
             "motors": self._motors,
             "timer": self._timer,
             "fans": self._fans,

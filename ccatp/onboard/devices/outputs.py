@@ -21,17 +21,18 @@ Sleep = Callable[[float], object]
 
 def explain(error: OSError | ValueError, device: str, group: str, key: str) -> HardwareError:
     """One line about a device file that cannot be opened or written; ``key`` is the part of the configuration."""
-    code = getattr(error, "errno", None)
+    denied = f"permission denied; add the user of this program to the group {group}"
+    in_use = f"in use by another program or driver; stop it, or check {key}"
     advice = {
         errno.ENOENT: f"is not there; check the wiring, the device tree and {key}",
-        errno.EACCES: f"permission denied; add the user of this program to the group {group}",
-        errno.EPERM: f"permission denied; add the user of this program to the group {group}",
-        errno.EBUSY: f"in use by another program or driver; stop it, or check {key}",
-        errno.EAGAIN: f"in use by another program or driver; stop it, or check {key}",
+        errno.EACCES: denied,
+        errno.EPERM: denied,
+        errno.EBUSY: in_use,
+        errno.EAGAIN: in_use,
         errno.ENODEV: f"has no such channel; check {key}",
         errno.EINVAL: f"refuses the value; check {key}",
-    }.get(code or 0, f"{error}; check {key}")
-    return HardwareError(f"{device}: {advice}")
+    }
+    return HardwareError(f"{device}: {advice.get(getattr(error, 'errno', 0), f'{error}; check {key}')}")
 
 
 class Lines(Protocol):
