@@ -64,7 +64,7 @@ class _DoubtfulReading(Exception):
     """A transfer went well, but what came is no new reading."""
 
 
-class ImuSample(NamedTuple):
+class Bno055Sample(NamedTuple):
     """One reading, robot frame: acceleration along x without gravity, m/s^2, rate about z, rad/s."""
 
     t_s: float
@@ -104,7 +104,7 @@ class Bno055:
         self._period_s = 1.0 / config.rate_hz
         self._bus: Bus | None = None
         self._last_burst = b""
-        self._samples: deque[ImuSample] = deque(maxlen=_QUEUED)
+        self._samples: deque[Bno055Sample] = deque(maxlen=_QUEUED)
         self._newest_s = clock()
         self._failures = 0
         self._is_lost = False
@@ -125,7 +125,7 @@ class Bno055:
         self._newest_s = self._clock()
         self._thread.start()
 
-    def take(self) -> list[ImuSample]:
+    def take(self) -> list[Bno055Sample]:
         """Samples since the last call; never waits."""
         return [self._samples.popleft() for _ in range(len(self._samples))]
 
@@ -179,7 +179,7 @@ class Bno055:
         finally:
             self._close_bus()
 
-    def _read(self) -> ImuSample:
+    def _read(self) -> Bno055Sample:
         """One burst. Raises OSError, _DoubtfulReading, and HardwareError where the unit has to be set up again."""
         t_s = self._clock()
         burst = self._read_registers(BURST_START, BURST.size)
@@ -203,7 +203,7 @@ class Bno055:
             raise _DoubtfulReading("the readings do not change")
         gx, gy, gz = (-g / (100.0 * size) for g in gravity)
         self.identity = f"{self._software}, gyroscope calibrated {calibration >> 4 & 3} of 3"
-        return ImuSample(t_s, ax / 100.0, wz / 900.0, (gx, gy, gz))
+        return Bno055Sample(t_s, ax / 100.0, wz / 900.0, (gx, gy, gz))
 
     def _set_up(self) -> None:
         """Reset the unit and set what ``_read`` relies on, each value read back; takes about 0.7 s."""

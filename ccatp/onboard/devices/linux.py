@@ -16,7 +16,7 @@ from typing import Any
 from ccatp.config.onboard_models import DevicesConfig
 from ccatp.onboard.devices.bno055 import Bno055, Bus
 from ccatp.onboard.devices.daq import Daq, OpenPort, SerialPort
-from ccatp.onboard.devices.outputs import PWM_ROOT, ExternalTimer, Fans, Motors, OpenLines, explain
+from ccatp.onboard.devices.outputs import PWM_ROOT, ExternalTimer, FanOutputs, Motors, OpenLines, explain
 from ccatp.onboard.hardware import DeviceCheck, HardwareError, Readings
 
 I2C_TIMEOUT = 0x0702  # ioctl of linux/i2c-dev.h, in 10 ms
@@ -74,7 +74,7 @@ def open_serial(device: str, baud: int) -> SerialPort:
 
 
 class GpioLines:
-    """Output lines of a GPIO chip; Lines."""
+    """Output lines of a GPIO chip; OutputLines."""
 
     def __init__(self, chip: str, values: Mapping[int, bool]) -> None:
         gpiod = import_package("gpiod")
@@ -118,12 +118,12 @@ class LinuxHardware:
         self._config, self._clock, self._sleep = config, clock, sleep
         self._motors = Motors(config.motors, pwm_root, open_lines, sleep)
         self._timer = ExternalTimer(config.timer, open_lines)
-        self._fans = Fans(config.fans, pwm_root, sleep)
+        self._fans = FanOutputs(config.fans, pwm_root, sleep)
         self._imu = imu(config.bno055, partial(open_bus, config.bno055.bus), clock, sleep)
         self._daq = Daq(config.daq, open_port, clock, sleep)
         # By their sections of the configuration, in the order of opening: the motors brake first, and the samples that
         # nobody takes meanwhile come last.
-        self._devices: dict[str, Motors | ExternalTimer | Fans | Bno055 | Daq] = {
+        self._devices: dict[str, Motors | ExternalTimer | FanOutputs | Bno055 | Daq] = {
             "motors": self._motors,
             "timer": self._timer,
             "fans": self._fans,

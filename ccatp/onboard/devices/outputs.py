@@ -35,7 +35,7 @@ def explain(error: OSError | ValueError, device: str, group: str, key: str) -> H
     return HardwareError(f"{device}: {advice.get(getattr(error, 'errno', 0), f'{error}; check {key}')}")
 
 
-class Lines(Protocol):
+class OutputLines(Protocol):
     """Output lines of one GPIO chip."""
 
     def set(self, values: Mapping[int, bool]) -> None:
@@ -46,7 +46,7 @@ class Lines(Protocol):
 
 
 # Chip and the first values of its lines, which are in force from the moment in which a line becomes an output.
-OpenLines = Callable[[str, Mapping[int, bool]], Lines]
+OpenLines = Callable[[str, Mapping[int, bool]], OutputLines]
 
 
 class Pwm:
@@ -154,7 +154,7 @@ class Motors:
             for side, motor in (("right", config.right), ("left", config.left))
         ]
         self._directions = [0, 0]
-        self._lines: Lines | None = None
+        self._lines: OutputLines | None = None
 
     @property
     def identity(self) -> str:
@@ -215,7 +215,7 @@ class Motors:
         self._directions = directions
 
 
-class Fans:
+class FanOutputs:
     """Both fans. What is in force when the program starts stays in force, period included, and stays when it ends.
 
     Attributes:
@@ -275,7 +275,7 @@ class ExternalTimer:
 
     def __init__(self, config: ExternalTimerConfig, open_lines: OpenLines) -> None:
         self._config, self._open_lines = config, open_lines
-        self._lines: Lines | None = None
+        self._lines: OutputLines | None = None
         self._level = False
 
     @property

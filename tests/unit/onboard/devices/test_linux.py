@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from ccatp.config.load import load_onboard_config
-from ccatp.onboard.devices.bno055 import Bno055, ImuSample
+from ccatp.onboard.devices.bno055 import Bno055, Bno055Sample
 from ccatp.onboard.devices.linux import GpioLines, I2cBus, LinuxHardware, open_serial
 from ccatp.onboard.hardware import Hardware, HardwareError
 from ccatp.onboard.robot import OnboardRobot
@@ -31,7 +31,7 @@ class SteppedBno055(Bno055):
 
     due_s = 0.0
 
-    def take(self) -> list[ImuSample]:
+    def take(self) -> list[Bno055Sample]:
         now_s = self._clock()
         while self.due_s <= now_s:
             self.due_s = max(self.due_s, now_s - 0.01) + self.step()

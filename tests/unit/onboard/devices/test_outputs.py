@@ -9,7 +9,7 @@ import pytest
 
 from ccatp.config.load import load_onboard_config
 from ccatp.config.onboard_models import MotorsConfig
-from ccatp.onboard.devices.outputs import ExternalTimer, Fans, Motors
+from ccatp.onboard.devices.outputs import ExternalTimer, FanOutputs, Motors
 from ccatp.onboard.hardware import HardwareError
 from tests.support.onboard_fakes import FakeBridge, FakePwm, FakeTime
 
@@ -25,7 +25,7 @@ class Rig:
         self.bridge = FakeBridge()
         self.time = FakeTime()
         self.motors = Motors(CONFIG.motors, root, self.bridge.open, self.time.sleep)
-        self.fans = Fans(CONFIG.fans, root, self.time.sleep)
+        self.fans = FanOutputs(CONFIG.fans, root, self.time.sleep)
         self.timer = ExternalTimer(CONFIG.timer, self.bridge.open)
 
     def right(self) -> tuple[tuple[bool, bool], float]:
