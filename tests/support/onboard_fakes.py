@@ -309,7 +309,7 @@ class FakePwm:
             is_refused = {
                 "period": value < duty or not value,
                 "duty_cycle": not period or value > period,
-                "enable": value == 1 and not period,
+                "enable": value not in (0, 1) or (value == 1 and not period),
             }[path.name]
             code = code or (errno.EINVAL if is_refused else 0)
         if code:

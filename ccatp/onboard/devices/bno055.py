@@ -125,9 +125,12 @@ class Bno055:
         self._newest_s = self._clock()
         self._thread.start()
 
-    def take(self) -> list[Bno055Sample]:
-        """Samples since the last call; never waits."""
-        return [self._samples.popleft() for _ in range(len(self._samples))]
+    def take(self, until_s: float) -> list[Bno055Sample]:
+        """Samples up to ``until_s`` that were not taken yet; never waits."""
+        taken = []
+        while self._samples and self._samples[0].t_s <= until_s:
+            taken.append(self._samples.popleft())
+        return taken
 
     def fault(self, now_s: float) -> str:
         """Why there is no reading for too long; empty: there is one."""

@@ -144,7 +144,7 @@ class LinuxHardware:
 
     def read(self, now_s: float) -> Readings:
         samples = self._daq.poll(now_s)
-        inertial = self._imu.take()
+        inertial = self._imu.take(now_s)
         if now_s - self._fan_check_s >= FAN_CHECK_S:
             self._fan_check_s = now_s
             self._fans.check()

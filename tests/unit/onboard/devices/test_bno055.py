@@ -14,7 +14,7 @@ import pytest
 
 from ccatp.config.load import load_onboard_config
 from ccatp.config.onboard_models import Bno055Config
-from ccatp.onboard.devices.bno055 import Bno055, axis_registers
+from ccatp.onboard.devices.bno055 import Bno055, Bno055Sample, axis_registers
 from ccatp.onboard.hardware import HardwareError
 from tests.support.onboard_fakes import FakeBno055, FakeTime
 
@@ -42,6 +42,9 @@ class Rig:
         while self.time.now_s < end_s:
             self.sleep(self.reader.step())
 
+    def take(self) -> list[Bno055Sample]:
+        return self.reader.take(self.time.now_s)
+
     def fault(self) -> str:
         return self.reader.fault(self.time.now_s)
 
@@ -58,7 +61,7 @@ def rig() -> Rig:
     rig.reader.open()
     rig.run(0.1)
     assert not rig.fault()
-    rig.reader.take()
+    rig.take()
     return rig
 
 
@@ -92,7 +95,7 @@ def test_set_up(before: Break) -> None:
     assert (rig.unit.mode, rig.unit.page, rig.unit.registers[0x3B]) == (0x08, 0, 0x02)
     rig.run(0.1)
     assert rig.reader.identity == "BNO055 software 3.11 boot loader 15, gyroscope calibrated 3 of 3"
-    assert len(rig.reader.take()) == 10
+    assert len(rig.take()) == 10
 
 
 REFUSED: dict[str, tuple[Break, str]] = {
@@ -167,7 +170,7 @@ def test_gravity_is_where_things_fall_in_the_robots_frame(
     rig.unit.gravity_m_s2 = unit_gravity
     rig.reader.open()
     rig.run(0.03)
-    sample = rig.reader.take()[-1]
+    sample = rig.take()[-1]
     assert sample.gravity == pytest.approx(falls, abs=2e-3)  # a bit is 1e-3 of g
     assert math.hypot(*sample.gravity) == pytest.approx(1.0)
 
@@ -175,14 +178,21 @@ def test_gravity_is_where_things_fall_in_the_robots_frame(
 def test_rate_and_acceleration(rig: Rig) -> None:
     rig.unit.ax_m_s2, rig.unit.wz_rad_s = -0.37, 1.25
     rig.run(0.02)
-    sample = rig.reader.take()[-1]
+    sample = rig.take()[-1]
     assert (sample.ax_m_s2, sample.wz_rad_s) == (-0.37, 1.25)
     assert sample.t_s == pytest.approx(rig.time.now_s - 0.01)
 
 
+def test_a_sample_that_is_newer_than_the_frame_waits_for_the_next_one(rig: Rig) -> None:
+    frame_s = rig.time.now_s
+    rig.run(0.02)
+    assert [sample.t_s for sample in rig.reader.take(frame_s)] == [frame_s]
+    assert len(rig.take()) == 1
+
+
 def test_samples_that_nobody_takes_are_bounded(rig: Rig) -> None:
     rig.run(10.0)
-    samples = rig.reader.take()
+    samples = rig.take()
     assert len(samples) == 64
     assert samples[-1].t_s == pytest.approx(rig.time.now_s - 0.01)
 
@@ -253,7 +263,7 @@ def test_what_breaks(rig: Rig, broken: Break, reason: str, repair: Break | None,
     assert any(re.search(reason, fault) for fault in rig.faults) if reason else not any(rig.faults)
     assert not rig.faults[-1]
     assert rig.unit.resets == resets
-    assert {sample.wz_rad_s for sample in rig.reader.take()} == {0.5}
+    assert {sample.wz_rad_s for sample in rig.take()} == {0.5}
 
 
 def test_attempts_at_a_unit_that_is_gone_come_further_and_further_apart(rig: Rig) -> None:
@@ -303,10 +313,10 @@ def test_the_thread_reads_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     reader = Bno055(config, rig.unit.open, rig.time, rig.time.sleep)
     reader.open()
     until_s = time.monotonic() + 60.0
-    samples = reader.take()
+    samples = reader.take(rig.time.now_s)
     while len(samples) < 5 and time.monotonic() < until_s:
         time.sleep(0.001)
-        samples += reader.take()
+        samples += reader.take(rig.time.now_s)
     reader.close()
     assert len(samples) >= 5
     assert not any(thread.name == "bno055" for thread in threading.enumerate())

@@ -31,11 +31,11 @@ class SteppedBno055(Bno055):
 
     due_s = 0.0
 
-    def take(self) -> list[Bno055Sample]:
+    def take(self, until_s: float) -> list[Bno055Sample]:
         now_s = self._clock()
         while self.due_s <= now_s:
             self.due_s = max(self.due_s, now_s - 0.01) + self.step()
-        return super().take()
+        return super().take(until_s)
 
 
 class Rig:

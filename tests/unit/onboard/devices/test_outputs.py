@@ -236,6 +236,8 @@ def test_fans_that_are_off_begin_at_zero(rig: Rig) -> None:
     assert rig.pwm.value("pwmchip1/pwm0/period") == rig.pwm.value("pwmchip1/pwm1/period") == 40_000
     rig.fans.command(2.0, -1.0)
     assert rig.fans.duties() == (1.0, 0.0)
+    rig.fans.command(-1.0, 2.0)
+    assert rig.fans.duties() == (0.0, 1.0)
 
 
 def test_a_fan_that_fails_is_named_and_the_other_one_is_set(rig: Rig) -> None:
