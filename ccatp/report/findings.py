@@ -440,15 +440,24 @@ def coverage_of(found: Findings) -> dict[str, int]:
     }
 
 
+# What the supervisor logs at the end of a complete mission.
+_FINISHED = "run finished: status 0"
+
+
 def outcome_of(record: RunRecord) -> PointOutcome:
-    """How the run ended, from the last status; a run without an end goes on or was killed."""
+    """How the run ended, from the last status, or where the recording is cut off from the log.
+
+    A run without an end goes on or was killed.
+    """
     status = record.last_status
+    if status is not None and status.outcome:
+        return PointOutcome(status.outcome, status.cause, is_good=status.outcome == COMPLETE)
+    if status is not None and status.exit_status >= 0:
+        return PointOutcome(f"ended with status {status.exit_status}, {status.state}", status.cause, is_good=False)
+    if record.log and record.log[-1].text == _FINISHED:
+        return PointOutcome(COMPLETE, "", is_good=True)
     if status is None:
         return PointOutcome("no mission", "main published no status of the mission", is_good=False)
-    if status.outcome:
-        return PointOutcome(status.outcome, status.cause, is_good=status.outcome == COMPLETE)
-    if status.exit_status >= 0:
-        return PointOutcome(f"ended with status {status.exit_status}, {status.state}", status.cause, is_good=False)
     if record.summary is None:
         return PointOutcome("no end is recorded", "the run goes on, or was killed", is_good=False)
     return PointOutcome("interrupted", status.cause or f"while {status.state}", is_good=False)

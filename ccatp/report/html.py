@@ -29,6 +29,7 @@ POLICY = (
 _FEW_LINES = 40  # more notable lines than these are shown by their kinds
 _KINDS, _LINES_AT_AN_END = 100, 200
 _MOST_ROWS = 100  # of a list whose length a damaged run determines
+_BEGIN = "run started"  # more than once: the run was resumed
 _STATISTICS = ("gate statistics", "reading statistics")
 _CALM = ("info", "debug")
 # What no reader may miss, at whatever level it was logged.
@@ -176,7 +177,8 @@ def gathered(lines: Iterable[LogLine]) -> list[Gathered]:
         parts = zip_longest(_TOKEN.split(first.text), map(_span, columns), fillvalue="")
         text = "".join(chain.from_iterable(parts))
         rank = 0 if first.level in ("error", "critical") else 3 if first.level in _CALM else 2
-        found.append(Gathered(text, tuple(alike), 1 if rank and _GRAVE.search(first.text) else rank))
+        is_grave = _GRAVE.search(first.text) or (first.text.startswith(_BEGIN) and len(alike) > 1)
+        found.append(Gathered(text, tuple(alike), 1 if rank and is_grave else rank))
     return found
 
 
