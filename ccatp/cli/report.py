@@ -39,9 +39,7 @@ _JSON = json_option("The figures of it as JSON on standard output.")
 
 
 @click.command(
-    epilog=example(
-        "ccatp report runs/tonight", "ccatp report runs/tonight --out tonight.html --figures figs --tables tables"
-    )
+    epilog=example("ccatp report runs/tonight", "ccatp report runs/tonight --figures figures --tables tables")
 )
 @click.argument("run_dir", type=PATH)
 @click.option("--out", type=_FILE, metavar="FILE", help="The page; report.html in the run directory if not given.")

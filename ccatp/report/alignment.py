@@ -1,7 +1,7 @@
 """Alignment of the panels as data and text: um, urad; moves and deviations > 0 towards the robot."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,21 +16,13 @@ _WAVEFRONT = ("rms_before_um", "rms_before_level_um", "rms_after_um", "point_noi
 _SHOWN = 12  # panels without a result that are named
 
 
-class Corner(NamedTuple):
-    """Displacement of a corner along the panel's normal, and its standard deviation."""
-
-    value_m: float
-    sigma_m: float
-
-
-def worst_corner(mirror: Mirror, panel: PanelResult) -> Corner:
-    """The corner of a panel that is furthest off, by its fitted plane."""
+def worst_corner(mirror: Mirror, panel: PanelResult) -> tuple[float, float]:
+    """Displacement of the corner of the fitted plane that is furthest off, and its standard deviation, m."""
     signs = np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)])
     modes = rigid(signs * half_size_m(mirror.panel(panel.panel)))
     values = modes @ panel.fit.values
     worst = int(np.argmax(np.abs(values)))
-    variance = modes[worst] @ panel.fit.covariance @ modes[worst]
-    return Corner(float(values[worst]), float(np.sqrt(variance)))
+    return float(values[worst]), float(np.sqrt(modes[worst] @ panel.fit.covariance @ modes[worst]))
 
 
 def result_data(mirror: Mirror, result: SurveyResult, comparison: Comparison | None) -> dict[str, Any]:
@@ -58,7 +50,7 @@ def result_data(mirror: Mirror, result: SurveyResult, comparison: Comparison | N
 
 def panel_data(mirror: Mirror, panel: PanelResult) -> dict[str, Any]:
     """How a panel lies, its moves and its points."""
-    corner = worst_corner(mirror, panel)
+    corner_m, corner_sigma_m = worst_corner(mirror, panel)
     piston, tip, tilt = _list(panel.fit.values)
     bending, shape = panel.bending, panel.shape
     own = _wavefront(mirror_wavefront([panel.rigid.wavefront]))
@@ -73,8 +65,8 @@ def panel_data(mirror: Mirror, panel: PanelResult) -> dict[str, Any]:
         "tip_urad": tip,
         "tilt_urad": tilt,
         "sigma": _list(panel.fit.sigma),
-        "worst_corner_um": _um(corner.value_m),
-        "sigma_worst_corner_um": _um(corner.sigma_m),
+        "worst_corner_um": _um(corner_m),
+        "sigma_worst_corner_um": _um(corner_sigma_m),
         "adjusters_um": _list(panel.rigid.moves.values_m),
         "adjusters_sigma_um": _list(panel.rigid.moves.sigma_m),
         "chi2": round(panel.fit.chi2, _DECIMALS),

@@ -1,7 +1,7 @@
 """What follows from a recorded survey, computed once for page, figures and data: points, errors, times, alignment."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
@@ -13,9 +13,8 @@ import msgspec
 import numpy as np
 
 from ccatp.core import DeckPose, Fix, FloatArray, PointId, StopKind
-from ccatp.estimation.fixes import DeckFoot, FixRefused, deck_foot
+from ccatp.estimation.fixes import FixRefused, deck_foot
 from ccatp.filters.metrics import Consistency, consistency, rms
-from ccatp.links.topics import FixMessage
 from ccatp.mirror.layout import POINTS_PER_PANEL
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, compare, survey_result
 from ccatp.records.summary import arrival_error_m, distribution, measured_error_m
@@ -181,67 +180,46 @@ def error_figures(series: ErrorSeries) -> dict[str, float] | None:
 
 
 class Quality(NamedTuple):
-    """How good the measurement was, against what it should be; None is not known."""
+    """How good the measurement was; None is not known."""
 
     fixes: int  # in the recordings
     refused: int  # of them: doubted, or of no use
-    residual_um: tuple[float, float] | None  # rms of the lengths' residuals in the fixes that count: mean and largest
-    plane: Consistency | None  # chi-square of the fitted planes by its degrees of freedom, with its 95 % band
-    plane_rms_um: float | None
+    lengths_um: FloatArray  # rms of the residuals of the lengths, of each fix that counts
+    plane: Consistency | None  # chi-square of the fitted panels by its degrees of freedom
+    plane_rms_um: float | None  # of the residuals of their planes
     repeats: int  # measurements of a point beyond its first one
-    repeat_um: float | None  # standard deviation of one deviation, from the points that were measured more than once
+    repeat_um: float | None  # standard deviation of one deviation, from points that were measured more than once
     nis: Consistency | None  # of the place that each fix shows against the estimate before it
 
 
 def quality_of(record: RunRecord, alignment: SurveyResult | None) -> Quality:
-    """Residuals, repeatability and NIS.
-
-    The recorded estimate has one standard deviation, that of the worst direction: NIS is 1 or less where the filter is
-    consistent.
-    """
+    """Residuals, repeatability and NIS: 1 or less of a consistent filter, as the recorded sigma is the worst one."""
     panels = () if alignment is None else alignment.panels
-    left_m = np.concatenate([panel.fit.residuals_m for panel in panels] or [np.empty(0)])
-    chi2, dof = (
-        np.array([getattr(panel.model, name) for panel in panels], dtype=np.float64) for name in ("chi2", "dof")
-    )
-    lengths_um = [1e6 * one.fix.residual_rms_m for one in record.measured]
-    feet = [(session, fix, foot) for session in record.sessions for fix, foot in _feet(record, session)]
-    nis = np.array([_nis(session, fix, foot) for session, fix, foot in feet])
-    deviations = defaultdict[PointId, list[float]](list)
-    for _, fix, foot in feet:
-        if fix.point is not None:
-            deviations[PointId(*fix.point)].append(1e6 * foot.deviation_m)
-    again = [np.array(values) for values in deviations.values() if len(values) > 1]
-    repeats = sum(len(values) - 1 for values in again)
-    squares = sum(float(((values - values.mean()) ** 2).sum()) for values in again)
-    recorded = [fix for session in record.sessions for fix in session.fixes]
-    plane_rms = rms(left_m)
+    chi2, dof = np.array([(panel.model.chi2, panel.model.dof) for panel in panels]).reshape(-1, 2).T
+    recorded = [(session, fix) for session in record.sessions for fix in session.fixes]
+    nis, deviations_um = list[float](), defaultdict[object, list[float]](list)
+    for session, fix in recorded:
+        with suppress(FixRefused):  # what lies far from the mirror was no fix
+            known = msgspec.convert(fix, Fix, from_attributes=True)
+            foot = deck_foot(record.mirror, known, record.cfg.robot.puck_height_m)
+            at = int(np.searchsorted(session.track.seq, fix.seq, side="right")) - 1
+            if fix.is_fused and at >= 0:
+                estimate = DeckPose(*session.track.pose[at].tolist())
+                nis.append(nis_of(foot, estimate, session.sigma_m[at] ** 2 * np.eye(2)))
+            if fix.is_fused and fix.point is not None:
+                deviations_um[fix.point].append(1e6 * foot.deviation_m)
+    repeats = sum(len(values) - 1 for values in deviations_um.values())
+    squares = sum(len(values) * float(np.var(values)) for values in deviations_um.values())
     return Quality(
         fixes=len(recorded),
-        refused=sum(not fix.is_fused for fix in recorded),
-        residual_um=(float(np.mean(lengths_um)), max(lengths_um)) if lengths_um else None,
+        refused=sum(not fix.is_fused for _, fix in recorded),
+        lengths_um=1e6 * np.array([one.fix.residual_rms_m for one in record.measured]),
         plane=consistency(chi2, dof),
-        plane_rms_um=None if plane_rms is None else 1e6 * plane_rms,
+        plane_rms_um=rms(1e6 * np.concatenate([panel.fit.residuals_m for panel in panels] or [np.empty(0)])),
         repeats=repeats,
         repeat_um=sqrt(squares / repeats) if repeats else None,
-        nis=consistency(nis, np.full(len(nis), 2.0) * np.isfinite(nis)),
+        nis=consistency(np.array(nis), np.full(len(nis), 2.0)),
     )
-
-
-def _feet(record: RunRecord, session: RecordedSession) -> Iterator[tuple[FixMessage, DeckFoot]]:
-    """The fixes that were used, and where the robot stood on the surface."""
-    for fix in session.fixes:
-        if fix.is_fused:
-            with suppress(FixRefused):
-                known = msgspec.convert(fix, Fix, from_attributes=True)
-                yield fix, deck_foot(record.mirror, known, record.cfg.robot.puck_height_m)
-
-
-def _nis(session: RecordedSession, fix: FixMessage, foot: DeckFoot) -> float:
-    at = int(np.searchsorted(session.track.seq, fix.seq, side="right")) - 1
-    if at < 0:
-        return float("nan")
-    return nis_of(foot, DeckPose(*session.track.pose[at].tolist()), session.sigma_m[at] ** 2 * np.eye(2))
 
 
 # -- time budget ------------------------------------------------------------------------------------------------------
@@ -272,11 +250,6 @@ class TimeBreakdown(NamedTuple):
     def total_s(self) -> float:
         """Robot time from the beginning to the end."""
         return sum(self.spent_s.values())
-
-    @property
-    def mission_s(self) -> float:
-        """Without the time in which no main loop counted it: ``mission_time_s`` of ``summary.json``."""
-        return self.total_s - self.spent_s.get(RESTART, 0.0)
 
     @property
     def bound_s(self) -> float | None:
@@ -382,11 +355,6 @@ class Findings:
         """What is damaged in the run, and doubtful in its alignment."""
         return self.record.warnings + (self.alignment.warnings if self.alignment is not None else ())
 
-    @property
-    def counts(self) -> dict[Grade, int]:
-        """How many points there are of each grade, those without any left out."""
-        return {grade: count for grade in Grade if (count := sum(one.grade is grade for one in self.points))}
-
 
 def findings_of(record: RunRecord) -> Findings:
     """Everything that follows from a recorded run."""
@@ -445,10 +413,7 @@ _FINISHED = "run finished: status 0"
 
 
 def outcome_of(record: RunRecord) -> PointOutcome:
-    """How the run ended, from the last status, or where the recording is cut off from the log.
-
-    A run without an end goes on or was killed.
-    """
+    """How the run ended, by the last status, else by the log; a run without an end goes on or was killed."""
     status = record.last_status
     if status is not None and status.outcome:
         return PointOutcome(status.outcome, status.cause, is_good=status.outcome == COMPLETE)

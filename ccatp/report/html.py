@@ -31,6 +31,7 @@ _KINDS, _LINES_AT_AN_END = 100, 200
 _MOST_ROWS = 100  # of a list whose length a damaged run determines
 _BEGIN = "run started"  # more than once: the run was resumed
 _STATISTICS = ("gate statistics", "reading statistics")
+_OVER = LogLine("", None, "info", "", "The mission is over: the processes close their connections and end.")
 _CALM = ("info", "debug")
 # What no reader may miss, at whatever level it was logged.
 _GRAVE = re.compile(
@@ -116,8 +117,8 @@ class Gathered(NamedTuple):
 class Events(NamedTuple):
     """What the page shows of a log.
 
-    ``notable``: warnings, errors and what else no reader may miss; if there are many, their kinds instead, the gravest
-    and then the rarest first. ``first`` and ``last``: lines of the log from its ends, the ones between left out.
+    ``notable``: warnings, errors and what else no reader may miss; if there are many, their ``kinds`` instead, the
+    gravest and then the rarest first. ``first`` and ``last``: the lines at both ends.
     """
 
     total: int
@@ -126,40 +127,34 @@ class Events(NamedTuple):
     kinds_left_out: int
     first: Sequence[LogLine]
     last: Sequence[LogLine]
-    ends_at: int  # index of the line with which a mission that is over begins to stop its processes; ``total``: none
-
-    @property
-    def left_out(self) -> int:
-        """Lines that the page does not show one by one."""
-        return self.total - len(self.first) - len(self.last)
+    left_out: int
 
 
 def events_of(lines: Sequence[LogLine]) -> Events:
     """What the page shows of a log: bounded, however long that is."""
     found = [kind for kind in gathered(lines) if kind.rank < 3]
-    kinds = sorted(found, key=lambda kind: (kind.rank, len(kind.lines)))
-    notable = {id(line) for kind in kinds for line in kind.lines}
-    is_long = len(lines) > 2 * _LINES_AT_AN_END
-    shown = kinds[:_KINDS] if len(notable) > _FEW_LINES else []
+    notable = {id(line) for kind in found for line in kind.lines}
+    kinds = sorted(found, key=lambda kind: (kind.rank, len(kind.lines))) if len(notable) > _FEW_LINES else []
+    all_lines = [*lines]
+    if (end := _end_of(lines)) is not None:
+        all_lines.insert(end, _OVER)
+    first, others = all_lines[:_LINES_AT_AN_END], all_lines[_LINES_AT_AN_END:]
+    last = others[-_LINES_AT_AN_END:]
     return Events(
         total=len(lines),
-        notable=[line for line in lines if id(line) in notable] if not shown else [],
-        kinds=shown,
-        kinds_left_out=len(kinds) - len(shown) if shown else 0,
-        first=lines[:_LINES_AT_AN_END] if is_long else lines,
-        last=lines[-_LINES_AT_AN_END:] if is_long else (),
-        ends_at=_end_of(lines),
+        notable=[] if kinds else [line for line in lines if id(line) in notable],
+        kinds=kinds[:_KINDS],
+        kinds_left_out=len(kinds[_KINDS:]),
+        first=first,
+        last=last,
+        left_out=len(lines) - sum(line is not _OVER for line in (*first, *last)),
     )
 
 
-def _end_of(lines: Sequence[LogLine]) -> int:
-    """Where the log of a run that ended by itself turns to the end of its processes.
-
-    Main writes its statistics when its mission is over; connections that are closed after that are not lost.
-    """
+def _end_of(lines: Sequence[LogLine]) -> int | None:
+    """Where main writes that its mission is over: connections that are closed after that are not lost."""
     own = [at for at, line in enumerate(lines) if line.process == "main" and line.text.startswith(_STATISTICS)]
-    is_over = bool(lines) and lines[-1].text.startswith("run finished")
-    return own[-1] if own and is_over else len(lines)
+    return own[-1] if own and lines[-1].text.startswith("run finished") else None
 
 
 def gathered(lines: Iterable[LogLine]) -> list[Gathered]:

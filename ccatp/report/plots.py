@@ -177,19 +177,19 @@ def svg_of(figure: "Figure", *, is_file: bool = False) -> str:
 
 def _axes_of(figure: "Figure") -> list[dict[str, Any]]:
     """The x and the y axis of the first plot, with their ends in the ``svg`` element, for those who point at it."""
-    axes, width_pt, height_pt = figure.axes[0], *(_PT_PER_IN * figure.get_size_inches())
-    box = axes.get_position()
+    axes, box = figure.axes[0], figure.axes[0].get_position()
+    places = (
+        (axes.xaxis, axes.get_xlim(), figure.get_figwidth() * box.intervalx),
+        (axes.yaxis, axes.get_ylim(), figure.get_figheight() * (1.0 - box.intervaly)),
+    )
     return [
         {
-            "label": label,
-            "ends": [round(float(end), 2) for end in ends],
+            "label": axis.get_label_text(),
+            "log": axis.get_scale() == "log",
             "values": [float(f"{value:.7g}") for value in values],
-            "log": scale == "log",
+            "ends": (_PT_PER_IN * ends_in).round(2).tolist(),
         }
-        for label, ends, values, scale in (
-            (axes.get_xlabel(), width_pt * box.intervalx, axes.get_xlim(), axes.get_xscale()),
-            (axes.get_ylabel(), height_pt * (1.0 - box.intervaly), axes.get_ylim(), axes.get_yscale()),
-        )
+        for axis, values, ends_in in places
     ]
 
 

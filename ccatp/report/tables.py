@@ -20,63 +20,55 @@ from ccatp.report.alignment import panel_data
 from ccatp.report.findings import Findings, metadata_of
 
 FILE_MODE = 0o644
-_INT, _FLOAT, _TEXT = "int64", "float64", "string"
 _UNITS = frozenset(("um", "urad", "mm", "m", "m2", "s"))
+_TYPES = {
+    **dict.fromkeys(("row", "col", "point", "points", "dof", "is_outlier", "is_bent"), "int64"),
+    **dict.fromkeys(("status", "channels", "outliers", "adjuster"), "string"),
+}  # of ECSV; all other columns are float64
 
-
-class Column(NamedTuple):
-    """A column; ``datatype`` as ECSV names it, ``description`` without double meaning."""
-
-    name: str
-    datatype: str
-    description: str
-
-    @property
-    def unit(self) -> str:
-        """The last part of the name, where that is a unit; else empty."""
-        last = self.name.rpartition("_")[2]
-        return last if last in _UNITS else ""
-
-
-class Table(NamedTuple):
-    """Rows by the names of the columns; a value that a row lacks, or that is None, is not known; others are ignored."""
-
-    columns: Sequence[Column]
-    rows: Sequence[Mapping[str, object]]
-
-
-_PLACE = (Column("row", _INT, "row of the panel"), Column("col", _INT, "column of the panel"))
+_PLACE = {"row": "row of the panel", "col": "column of the panel"}
 _COVARIANCE = {"cov_xx_m2": 0, "cov_xy_m2": 1, "cov_xz_m2": 2, "cov_yy_m2": 4, "cov_yz_m2": 5, "cov_zz_m2": 8}
-_FIXES = (
-    *_PLACE,
-    Column("point", _INT, "number of the point on its panel"),
-    Column("status", _TEXT, "planned, measured or skipped"),
-    Column("t_s", _FLOAT, "time of the fix, clock of the robot"),
-    *(Column(f"{axis}_m", _FLOAT, f"retroreflector, {axis} in the world frame") for axis in "xyz"),
-    *(Column(name, _FLOAT, "covariance of the retroreflector, world frame") for name in _COVARIANCE),
-    Column("dop", _FLOAT, "dilution of precision"),
-    Column("residual_rms_m", _FLOAT, "rms of the residuals of the lengths"),
-    Column("channels", _TEXT, "channels of the laser system that were used"),
-    Column("deviation_um", _FLOAT, "surface less the ideal one along its normal, > 0 towards the robot"),
-    Column("sigma_deviation_um", _FLOAT, "standard deviation"),
-    Column("residual_um", _FLOAT, "deviation less the fitted plane of the panel"),
-    Column("is_outlier", _INT, "1: left out of the fit of the panel"),
-    Column("first_arrival_mm", _FLOAT, "distance of the retroreflector from the point at the first arrival"),
-    Column("measured_at_mm", _FLOAT, "distance of the retroreflector from the point at the fix"),
-)
+_SIGMA = "standard deviation"
+_FIXES = {
+    **_PLACE,
+    "point": "number of the point on its panel",
+    "status": "planned, measured or skipped",
+    "t_s": "time of the fix, clock of the robot",
+    **{f"{axis}_m": f"retroreflector, {axis} in the world frame" for axis in "xyz"},
+    **dict.fromkeys(_COVARIANCE, "covariance of the retroreflector, world frame"),
+    "dop": "dilution of precision",
+    "residual_rms_m": "rms of the residuals of the lengths",
+    "channels": "channels of the laser system that were used",
+    "deviation_um": "surface less the ideal one along its normal, > 0 towards the robot",
+    "sigma_deviation_um": _SIGMA,
+    "residual_um": "deviation less the fitted plane of the panel",
+    "is_outlier": "1: left out of the fit of the panel",
+    "first_arrival_mm": "distance of the retroreflector from the point at the first arrival",
+    "measured_at_mm": "distance of the retroreflector from the point at the fix",
+}
 _FIT = {
     "piston_um": "displacement along the normal of the panel, > 0 towards the robot",
     "tip_urad": "slope along y of the panel",
     "tilt_urad": "slope along x of the panel",
 }
-_MOVES = (
-    *_PLACE,
-    Column("adjuster", _TEXT, "name of the adjuster"),
-    Column("x_m", _FLOAT, "place of the adjuster in the frame of the panel"),
-    Column("y_m", _FLOAT, "place of the adjuster in the frame of the panel"),
-    Column("move_um", _FLOAT, "move to be made, > 0 towards the robot"),
-    Column("sigma_move_um", _FLOAT, "standard deviation"),
-)
+_MOVES = {
+    **_PLACE,
+    "adjuster": "name of the adjuster",
+    "x_m": "place of the adjuster in the frame of the panel",
+    "y_m": "place of the adjuster in the frame of the panel",
+    "move_um": "move to be made, > 0 towards the robot",
+    "sigma_move_um": _SIGMA,
+}
+
+
+class Table(NamedTuple):
+    """Columns with their descriptions, and rows by the names of the columns.
+
+    A value that a row lacks, or that is None, is not known; what has no column is left out.
+    """
+
+    columns: Mapping[str, str]
+    rows: Sequence[Mapping[str, object]]
 
 
 def write_tables(found: Findings, folder: Path) -> None:
@@ -88,16 +80,15 @@ def write_tables(found: Findings, folder: Path) -> None:
         others = [{**one.panel._asdict(), "points": one.points} for one in result.undetermined]
         tables |= {"panels": Table(panels.columns, [*panels.rows, *others]), "moves": _moves_table(mirror, result)}
     for name, table in tables.items():
-        lines = [f"# {key}: {value}" for key, value in metadata.items()]
+        lines = [f"# {key}: {_yaml(value)}" for key, value in metadata.items()]
         write_file(folder / f"{name}.csv", "\n".join([*lines, *csv_lines(table), ""]), FILE_MODE)
         write_file(folder / f"{name}.ecsv", "\n".join([*_ecsv_head(table, metadata), *csv_lines(table), ""]), FILE_MODE)
 
 
 def csv_lines(table: Table) -> Iterator[str]:
     """The names of the columns, and a line a row."""
-    names = [column.name for column in table.columns]
     text = StringIO()
-    writer = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
+    writer = csv.DictWriter(text, table.columns, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows(table.rows)
     yield from text.getvalue().splitlines()
@@ -105,11 +96,10 @@ def csv_lines(table: Table) -> Iterator[str]:
 
 def _ecsv_head(table: Table, metadata: Mapping[str, object]) -> Iterator[str]:
     yield from ("# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:")
-    for column in table.columns:
-        unit = f"unit: {column.unit}, " if column.unit else ""
-        yield (
-            f"# - {{name: {column.name}, {unit}datatype: {column.datatype}, description: {_yaml(column.description)}}}"
-        )
+    for name, description in table.columns.items():
+        unit = name.rpartition("_")[2]
+        kind = (f"unit: {unit}, " if unit in _UNITS else "") + f"datatype: {_TYPES.get(name, 'float64')}"
+        yield f"# - {{name: {name}, {kind}, description: {_yaml(description)}}}"
     yield "# meta: !!omap"
     yield from (f"# - {{{key}: {_yaml(value)}}}" for key, value in metadata.items())
     yield "# schema: astropy-2.0"
@@ -123,29 +113,23 @@ def _yaml(value: object) -> str:
 
 def _fixes_table(found: Findings) -> Table:
     """Every point of the mission, measured or not."""
-    record = found.record
+    record, alignment = found.record, found.alignment
     fixes = {one.point: one.fix for one in record.measured}
-    arrivals = {one.point: one for one in found.points}
-    fitted = () if found.alignment is None else found.alignment.panels
     deviations = {
         PointId(*panel.panel, one["point"]): one
-        for panel in fitted
+        for panel in (() if alignment is None else alignment.panels)
         for one in panel_data(record.mirror, panel)["deviations"]
     }
     rows = []
-    for stored in record.points or ():
-        point = stored.point
-        arrival = arrivals[point]
-        row: dict[str, object] = {
-            **point._asdict(), "status": stored.status,
-            "first_arrival_mm": arrival.first_mm, "measured_at_mm": arrival.left_mm,
-        }  # fmt: skip
-        if (fix := fixes.get(point)) is not None:
+    for stored, arrival in zip(record.points or (), found.points, strict=True):
+        row: dict[str, object] = {**stored.point._asdict(), "status": stored.status}
+        row |= {"first_arrival_mm": arrival.first_mm, "measured_at_mm": arrival.left_mm}
+        if (fix := fixes.get(stored.point)) is not None:
             row |= {"t_s": fix.t_s, "dop": fix.dop, "residual_rms_m": fix.residual_rms_m}
-            row |= {f"{axis}_m": value for axis, value in zip("xyz", fix.position_m, strict=True)}
+            row |= zip(("x_m", "y_m", "z_m"), fix.position_m, strict=True)
             row |= {name: fix.covariance_m2[at] for name, at in _COVARIANCE.items()}
             row["channels"] = " ".join(map(str, fix.channels))
-        if (one := deviations.get(point)) is not None:
+        if (one := deviations.get(stored.point)) is not None:
             row |= {"deviation_um": one["deviation_um"], "sigma_deviation_um": one["sigma_um"]}
             row |= {"residual_um": one["residual_um"], "is_outlier": int(one["is_outlier"])}
         rows.append(row)
@@ -155,22 +139,22 @@ def _fixes_table(found: Findings) -> Table:
 def panel_table(mirror: Mirror, result: SurveyResult) -> Table:
     """How each panel that is determined lies, and how to turn its adjusters."""
     names = result.panels[0].adjusters if result.panels else ()
-    columns = [
-        *_PLACE,
-        Column("points", _INT, "measured points"),
-        *(Column(name, _FLOAT, description) for name, description in _FIT.items()),
-        *(Column(f"sigma_{name}", _FLOAT, "standard deviation") for name in _FIT),
-        Column("chi2", _FLOAT, "chi-square of the fitted plane"),
-        Column("dof", _INT, "degrees of freedom of the fitted plane"),
-        Column("outliers", _TEXT, "numbers of the points that were left out of the fit"),
-        *(Column(f"{name}_um", _FLOAT, f"move of adjuster {name}, > 0 towards the robot") for name in names),
-        *(Column(f"sigma_{name}_um", _FLOAT, "standard deviation") for name in names),
-        Column("is_bent", _INT, "1: the curvatures of the panel are significant"),
-        Column("rms_before_um", _FLOAT, "half-wavefront error before the moves"),
-        Column("rms_after_um", _FLOAT, "half-wavefront error predicted after the moves"),
-        Column("worst_corner_um", _FLOAT, "displacement of the corner that is furthest off, > 0 towards the robot"),
-        Column("sigma_worst_corner_um", _FLOAT, "standard deviation"),
-    ]
+    columns = {
+        **_PLACE,
+        "points": "measured points",
+        **_FIT,
+        **{f"sigma_{name}": _SIGMA for name in _FIT},
+        "chi2": "chi-square of the fitted plane",
+        "dof": "degrees of freedom of the fitted plane",
+        "outliers": "numbers of the points that were left out of the fit",
+        **{f"{name}_um": f"move of adjuster {name}, > 0 towards the robot" for name in names},
+        **{f"sigma_{name}_um": _SIGMA for name in names},
+        "is_bent": "1: the curvatures of the panel are significant",
+        "rms_before_um": "half-wavefront error before the moves",
+        "rms_after_um": "half-wavefront error predicted after the moves",
+        "worst_corner_um": "displacement of the corner that is furthest off, > 0 towards the robot",
+        "sigma_worst_corner_um": _SIGMA,
+    }
     rows: list[dict[str, object]] = []
     for panel in result.panels:
         data = panel_data(mirror, panel)

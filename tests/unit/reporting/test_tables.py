@@ -106,7 +106,7 @@ def test_every_table_says_what_it_is_of(survey: Path, name: str) -> None:
     assert told["points_of_the_mirror"] == 9 * told["panels_of_the_mirror"]
     lines = (survey / "tables" / f"{name}.csv").read_text(encoding="utf-8").split("\n")
     head = [line for line in lines if line.startswith("#")]
-    assert "# telescope: FYST" in head
+    assert '# telescope: "FYST"' in head
     rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
     table = read(survey, name)
     assert len(rows) == len(table)
