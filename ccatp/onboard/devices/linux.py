@@ -26,8 +26,15 @@ FAN_CHECK_S = 0.1
 RATE_TOLERANCE = 0.1
 _LINES_KEY = "the lines in devices.motors and devices.timer"
 ENCODERS_AND_EDGES = ("encoder_left", "encoder_right", "edge")
+FAULTS_OF = {
+    "motors": (),
+    "timer": (),
+    "fans": ("fan_left", "fan_right"),
+    "bno055": ("imu",),
+    "daq": ("edge", "battery_low"),
+}
 
-_Sampled = tuple[Sequence[Sequence[float]], float, str, dict[str, tuple[float, tuple[int, ...]]]]
+_Sampled = tuple[Sequence[Sequence[float]], float, dict[str, tuple[float, tuple[int, ...]]]]
 
 
 def import_package(name: str) -> Any:
@@ -198,33 +205,34 @@ class LinuxHardware:
                 self._sleep(0.005)
         faults = readings[-1].faults if readings else {}
         bno055, daq = self._config.bno055, self._config.daq
-        # Samples, their rate, fault of the device, {unit of a noise: (limit, columns of the samples)}.
+        # Samples, their rate, {unit of a noise: (limit, columns of the samples)}.
         sampled: dict[str, _Sampled] = {
             "bno055": (
-                [row for reading in readings for row in reading.imu], bno055.rate_hz, faults.get("imu", ""),
+                [row for reading in readings for row in reading.imu], bno055.rate_hz,
                 {"rad/s": (bno055.noise_rad_s, (2,)), "m/s^2": (bno055.noise_m_s2, (1,))},
             ),
             "daq": (
-                [row for reading in readings for row in reading.edges], daq.sample_hz, faults.get("edge", ""),
+                [row for reading in readings for row in reading.edges], daq.sample_hz,
                 {"V": (daq.noise_v, (1, 2, 3, 4))},
             ),
         }  # fmt: skip
         checks = []
         for name, device in self._devices.items():
-            rows, wanted_hz, advice, limits = sampled.get(name, ([], 0.0, "", {}))
-            advice = failures.get(name, advice)
-            is_measured = len(rows) > 1
-            rate_hz = (len(rows) - 1) / (rows[-1][0] - rows[0][0]) if is_measured else 0.0
-            if abs(rate_hz - wanted_hz) > RATE_TOLERANCE * wanted_hz:
-                advice = (
-                    advice or f"{rate_hz:.0f} samples/s instead of {wanted_hz:.0f}; check the load of this computer"
-                )
-            noises = []
-            for unit, (limit, columns) in limits.items():
-                noise = max(pstdev(row[column] for row in rows) for column in columns) if is_measured else 0.0
-                noises.append(f"{noise:.2g} {unit}")
-                if noise > limit:
-                    advice = advice or f"noise {noises[-1]}, limit {limit:g}; let the robot stand, check its wiring"
+            problems = [failures[name]] if name in failures else [faults[k] for k in FAULTS_OF[name] if k in faults]
+            rows, wanted_hz, limits = sampled.get(name, ([], 0.0, {}))
+            rate_hz, noises = 0.0, []
+            if len(rows) > 1:
+                rate_hz = (len(rows) - 1) / (rows[-1][0] - rows[0][0])
+                if abs(rate_hz - wanted_hz) > RATE_TOLERANCE * wanted_hz:
+                    problems.append(
+                        f"{rate_hz:.0f} samples/s instead of {wanted_hz:.0f}; check the load of this computer"
+                    )
+                for unit, (limit, columns) in limits.items():
+                    noise = max(pstdev(row[column] for row in rows) for column in columns)
+                    noises.append(f"{noise:.2g} {unit}")
+                    if noise > limit:
+                        problems.append(f"noise {noises[-1]}, limit {limit:g}; let the robot stand, check its wiring")
+            advice = problems[0] if problems else ""
             found = name not in failures
-            checks.append(DeviceCheck(name, found, device.identity, rate_hz, ", ".join(noises), not advice, advice))
+            checks.append(DeviceCheck(name, found, device.identity, rate_hz, ", ".join(noises), not problems, advice))
         return checks

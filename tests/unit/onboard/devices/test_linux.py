@@ -256,6 +256,14 @@ CHECKS: dict[str, tuple[Break, str, bool, str]] = {
     "too few samples": (
         lambda r: setattr(r.daq, "corrupt", _Sometimes(5)), "daq", True, "800 samples/s instead of 1000; ",
     ),
+    "an empty battery": (
+        lambda r: r.daq.adc.__setitem__(4, 45000), "daq", True,
+        "battery at 9.06 V; charge it, or check devices.daq.battery_*",
+    ),
+    "a unit that fails while it is read": (
+        lambda r: setattr(r.unit, "tamper", lambda burst: b"\xff" * len(burst)), "bno055", True,
+        "the bus reads ones only; check its wiring",
+    ),
     "a robot that is moved": (_shake, "bno055", True, "rad/s, limit 0.01; let the robot stand"),
     "a loose edge sensor": (_flicker, "daq", True, "V, limit 0.05; let the robot stand"),
 }  # fmt: skip
@@ -278,6 +286,7 @@ def test_check_says_what_is_wrong(rig: Rig, broken: Break, device: str, is_found
     checks = {check.device: check for check in rig.linux.check(1.0)}
     assert list(checks) == DEVICES
     found = checks.pop(device)
+    assert found.noise or not found.rate_hz
     assert (found.found, found.passed) == (is_found, False)
     assert advice in found.advice
     others = set(checks) - {"timer"} if "gpiochip" in advice else set(checks)
