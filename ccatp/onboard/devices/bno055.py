@@ -5,7 +5,8 @@ and 1/900 rad/s per LSB. The unit itself turns its axes to those of the robot (x
 surface) by its axis registers. Its gravity vector is what an accelerometer at rest shows, so it points up: the vector
 along which things fall is the opposite one. Source: data sheet BST-BNO055-DS000-14.
 
-The unit stretches the clock of the bus; an I2C controller that does not wait for it reads wrong bits.
+The unit stretches the clock of the bus. A controller that does not wait for it reads wrong bits, the highest of a byte
+most of all: on a Raspberry Pi, use the overlay i2c-gpio.
 """
 
 import struct
@@ -40,6 +41,7 @@ BURST_START = 0x14
 BURST = struct.Struct("<16h10B")
 _G_M_S2 = 9.80665  # of the unit's fusion
 _MISFIT = 0.05  # of the length of quaternion and gravity; with bytes of two readings it is more
+_MOST_RAD_S, _MOST_M_S2 = 35.0, 80.0  # ranges of the sensors: 2,000 deg/s; 4 g, and as much for gravity
 
 REOPEN_AFTER, RESET_AFTER = 3, 10  # failures in sequence
 LONGEST_WAIT_S = 1.0
@@ -191,17 +193,16 @@ class Bno055:
         calibration, status, error, units, mode = (values[k] for k in (17, 21, 22, 23, 25))
         size = hypot(*gravity) / 100.0
         misfit = max(abs(hypot(*quaternion) / 16384.0 - 1.0), abs(size / _G_M_S2 - 1.0))
+        is_possible = abs(wz) <= 900.0 * _MOST_RAD_S and abs(ax) <= 100.0 * _MOST_M_S2
         is_new, self._last_burst = burst != self._last_burst, burst
         if burst == b"\xff" * len(burst):
             raise _DoubtfulReading("the bus reads ones only; check its wiring")
-        if mode != MODE_IMU or units != UNITS_M_S2_RAD_S:
+        if mode & 0x0F != MODE_IMU or units & 0x7F != UNITS_M_S2_RAD_S:
             raise self._error(f"was reset (mode 0x{mode:02x}, units 0x{units:02x}); check its supply")
         if status == 1:
             raise self._error(f"reports system error {error}; check its supply")
-        if misfit > _MISFIT:
-            raise _DoubtfulReading(
-                f"bytes do not fit together (gravity {size:.2f} m/s^2); check the speed of the I2C bus"
-            )
+        if misfit > _MISFIT or not is_possible:
+            raise _DoubtfulReading(f"wrong bits (gravity {size:.2f} m/s^2); check the speed of the I2C bus")
         if not is_new:
             raise _DoubtfulReading("the readings do not change")
         gx, gy, gz = (-g / (100.0 * size) for g in gravity)

@@ -14,7 +14,7 @@ import pytest
 
 from ccatp.config.load import load_onboard_config
 from ccatp.config.onboard_models import Bno055Config
-from ccatp.onboard.devices.bno055 import Bno055, Bno055Sample, axis_registers
+from ccatp.onboard.devices.bno055 import BURST_START, Bno055, Bno055Sample, axis_registers
 from ccatp.onboard.hardware import HardwareError
 from tests.support.onboard_fakes import FakeBno055, FakeTime
 
@@ -62,6 +62,7 @@ def rig() -> Rig:
     rig.run(0.1)
     assert not rig.fault()
     rig.take()
+    rig.faults.clear()
     return rig
 
 
@@ -213,6 +214,15 @@ def _once(unit: FakeBno055, tamper: Callable[[bytes], bytes]) -> Callable[[bytes
     return changed
 
 
+def _high(place: int) -> Callable[[bytes], bytes]:
+    """A controller that does not wait for the stretched clock."""
+    return lambda burst: burst[:place] + bytes((burst[place] ^ 0x80,)) + burst[place + 1 :]
+
+
+def _flip_once(place: int) -> Break:
+    return lambda unit: setattr(unit, "tamper", _once(unit, _high(place)))
+
+
 def _set(**values: object) -> Break:
     return lambda unit: unit.__dict__.update(values)
 
@@ -223,6 +233,10 @@ BREAKS: dict[str, tuple[Break, str, Break | None, int]] = {
     "one transfer not acknowledged": (_set(error=NACK, errors=1), "", None, 0),
     "two transfers fail": (_set(error=EIO, errors=2), "", None, 0),
     "one reading torn": (lambda u: setattr(u, "tamper", _once(u, _torn)), "", None, 0),
+    "highest bit of the rate wrong once": (_flip_once(5), "", None, 0),
+    "highest bit of the quaternion wrong once": (_flip_once(15), "", None, 0),
+    "highest bit of the acceleration wrong once": (_flip_once(21), "", None, 0),
+    "highest bit of gravity wrong once": (_flip_once(31), "", None, 0),
     "bus locked until it is opened again": (_set(error=TIMEOUT, is_locked=True), "", None, 0),
     "no acknowledge": (
         _set(error=NACK), r"^no reading for 0\.\d\d s: \[Errno 121\] Remote I/O error; check the wiring",
@@ -233,8 +247,8 @@ BREAKS: dict[str, tuple[Break, str, Break | None, int]] = {
     "data line stuck at one": (
         _set(tamper=lambda burst: b"\xff" * len(burst)), "the bus reads ones only; check its wiring", WHOLE, 0,
     ),
-    "every reading torn": (_set(tamper=_torn), r"bytes do not fit together \(gravity 12.\d\d m/s\^2\)", WHOLE, 0),
-    "no fusion": (_set(tamper=lambda burst: bytes(32) + burst[32:]), "bytes do not fit together", WHOLE, 0),
+    "every reading torn": (_set(tamper=_torn), r"wrong bits \(gravity 12.\d\d m/s\^2\)", WHOLE, 0),
+    "no fusion": (_set(tamper=lambda burst: bytes(32) + burst[32:]), "wrong bits", WHOLE, 0),
     "readings frozen": (_set(is_frozen=True), "the readings do not change", None, 1),
     "reset while running": (lambda u: u.power_on(), r"was reset \(mode 0x00, units 0x80\); check its supply", None, 1),
     "brown-out": (lambda u: u.power_on(deaf_s=0.5), "Remote I/O error", None, 1),
@@ -253,7 +267,6 @@ BREAKS: dict[str, tuple[Break, str, Break | None, int]] = {
 def test_what_breaks(rig: Rig, broken: Break, reason: str, repair: Break | None, resets: int) -> None:
     rig.unit.resets = 0
     rig.unit.wz_rad_s = 0.5
-    rig.faults.clear()
     broken(rig.unit)
     rig.run(0.15)
     if repair is not None:
@@ -264,6 +277,14 @@ def test_what_breaks(rig: Rig, broken: Break, reason: str, repair: Break | None,
     assert not rig.faults[-1]
     assert rig.unit.resets == resets
     assert {sample.wz_rad_s for sample in rig.take()} == {0.5}
+
+
+@pytest.mark.parametrize("register", [0x3B, 0x3D])
+def test_a_wrong_bit_that_means_nothing_does_not_reset_the_unit(rig: Rig, register: int) -> None:
+    rig.unit.tamper = _high(register - BURST_START)
+    rig.run(1.0)
+    assert not any(rig.faults)
+    assert rig.unit.resets == 1  # at the start
 
 
 def test_attempts_at_a_unit_that_is_gone_come_further_and_further_apart(rig: Rig) -> None:
