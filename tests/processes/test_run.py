@@ -40,6 +40,8 @@ def check_two_panels(run: Run) -> None:
     report = (run.run_dir / "report.html").read_text()
     assert "18 pass" in report
     assert "Not in this run" not in report
+    # Its end is recognised in the log, so that closed connections are not taken for lost ones.
+    assert "The mission is over: the processes close their connections and end." in report
 
 
 def test_two_panels(recorded_run: RecordedRun) -> None:
