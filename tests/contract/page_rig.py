@@ -64,15 +64,15 @@ class Rig:
         self.asked.append(json.loads(frame))
         return format_ok() if self.answer is None else await self.answer(frame)
 
-    def tell_alive(self, phase: str = "joined") -> None:
-        """Both loops speak, and the mission drives."""
+    def tell_alive(self, phase: str = "joined", line: bytes = b"null", **status: Any) -> None:
+        """Both loops speak, and the mission drives, or is as ``status`` has it."""
         self._seq += 1
         now_s = time.monotonic()
         for publisher, name in ((self.main, "main"), (self.danger, "danger")):
             known = Heartbeat(seq=self._seq, t_s=now_s, process=name, pid=1, phase=phase, frame_age_s=0.01)
             publisher.send(f"heartbeat.{name}", known)
-        self.main.send("mission", mission(seq=self._seq))
-        self.main.send("display_state", picture(self._seq))
+        self.main.send("mission", mission(seq=self._seq, **status))
+        self.main.send("display_state", picture(self._seq, line))
 
     async def ask(self, method: str, path: str, host: str = "", body: bytes = b"", **headers: str) -> Reply:
         """One request on a connection of its own, a command with the token; header names with _ for -."""

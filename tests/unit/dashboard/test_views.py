@@ -293,6 +293,9 @@ def test_the_last_fix_and_the_limits_that_go_with_what_is_shown(view: SurveyView
     ground = survey_ground(MIRROR, cfg, is_sim=True)
     assert (ground["limits"]["charge"], ground["limits"]["dop"]) == (0.31, 17.0)
     assert ground["plots"]["arrival"] == [[12.0, "limit"]]
+    assert ground["limits"]["fan_share"] is None  # nothing depends on them on a mirror that lies flat
+    hanging = survey_ground(mirror_of("fyst-m2"), config_of("fyst-m2", health__fan_share=0.7), is_sim=True)
+    assert hanging["limits"]["fan_share"] == 0.7
 
 
 def test_what_was_measured_before_is_there(view: SurveyView) -> None:

@@ -241,7 +241,7 @@ function showRobot({ robot, pose, mission }) {
 // Of each value: name, value, limit, whether it must be above it, how much the bar holds, and how it is written.
 function showGauges({ robot, laser, sensors_age_s }) {
   const percent = (value) => `${Math.round(100 * value)} %`;
-  const ms = (value) => `${Math.round(1000 * value)} ms`;
+  const ms = (value) => (value < 0.9995 ? `${Math.round(1000 * value)} ms` : `${value.toFixed(1)} s`);
   const fan = (k) => [`fan ${["left", "right"][k]}`, robot?.fans[k], limits.fan_share ? limits.fan_share * limits.fan_duty[k] : null, true, 1, percent];
   const rows = [
     ...("charge" in limits ? [["battery", robot?.charge, limits.charge, true, 1, percent], fan(0), fan(1)] : [["battery", robot?.charge, null, true, 1, percent]]),
@@ -278,7 +278,7 @@ function showGauges({ robot, laser, sensors_age_s }) {
   while (list.children.length > rows.length) list.lastChild.remove();
 }
 
-function showLinks({ links, restarts }) {
+function showLinks({ links, restarts, is_over }) {
   const list = $("links");
   while (list.children.length < links.length) {
     const row = document.createElement("li");
@@ -290,9 +290,10 @@ function showLinks({ links, restarts }) {
     const row = list.children[k];
     const again = link.name === "main loop" ? restarts.main : link.name === "danger loop" ? restarts.danger : 0;
     const limit = staleAfter[link.name] ? ` ≤ ${staleAfter[link.name]} s` : "";
-    row.dataset.well = link.age_s === null ? "idle" : link.is_well ? "yes" : "no";
+    row.dataset.well = link.age_s === null || is_over ? "idle" : link.is_well ? "yes" : "no";
     row.children[0].textContent = link.name;
-    row.children[1].textContent = `${link.phase} ${age(link.age_s)}${link.age_s === null ? "" : limit}${again ? ` (restarted ${again}×)` : ""}`;
+    const phase = is_over ? "ended" : `${link.phase} ${age(link.age_s)}${link.age_s === null ? "" : limit}`;
+    row.children[1].textContent = `${phase}${again ? ` (restarted ${again}×)` : ""}`;
   });
 }
 

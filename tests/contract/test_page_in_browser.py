@@ -1,0 +1,272 @@
+"""The page in Chromium before a played daemon: what an operator sees, and what is sent when a button is pressed."""
+
+import json
+import re
+import shutil
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from playwright.async_api import Page, async_playwright, expect
+
+from ccatp.config.load import load_config
+from ccatp.links.topics import Alarm, FixMessage, TrackMessage
+from ccatp.report.dashboard.history import Growing
+from tests.contract.page_rig import Rig, page_rig
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the page is not tried in a browser")
+CFG = load_config(None, {"run.panels": 2, "mission.arrival_tolerance_m": 0.012, "health.battery_reserve": 0.31})
+LINE = json.dumps({
+    "type": "sensors", "seq": 5, "t": 1.5, "imu": [], "enc": [], "edge": [[1.5, 1, 0, 1, 1]], "gravity": None,
+    "fans": [0.8, 0.5], "soc": 0.3, "cmd": {"seq": 4, "age": 0.012, "permit_age": 0.008, "held": False}, "faults": [],
+}).encode()  # fmt: skip
+# Texts and circles that are drawn on the map, each with its place; the newest drawing alone.
+SPY = """
+window.drawn = {texts: [], circles: []};
+const proto = CanvasRenderingContext2D.prototype;
+const {clearRect, fillText, arc} = proto;
+const isMap = (pen) => pen.canvas.id === "map";
+proto.clearRect = function (...box) {
+  if (isMap(this)) window.drawn = {texts: [], circles: []};
+  return clearRect.apply(this, box);
+};
+proto.fillText = function (text, x, y) {
+  if (isMap(this)) window.drawn.texts.push([text, x, y, this.measureText(text).width, parseFloat(this.font)]);
+  return fillText.call(this, text, x, y);
+};
+proto.arc = function (x, y, r, ...rest) {
+  if (isMap(this)) window.drawn.circles.push([x, y, r]);
+  return arc.call(this, x, y, r, ...rest);
+};
+"""
+
+
+class Operator:
+    """A browser at the page of a played daemon, which lives as long as something is awaited here."""
+
+    def __init__(self, page: Page, rig: Rig, folder: Path) -> None:
+        self.page, self.rig, self.folder = page, rig, folder
+        self.status: dict[str, Any] = {}
+
+    async def until(self, script: str, wanted: object) -> None:
+        """Evaluate until the result is as wanted."""
+        found: object = None
+        for _ in range(400):
+            self.live()
+            found = await self.page.evaluate(script)
+            if found == wanted:
+                return
+            await self.page.wait_for_timeout(50)
+        raise AssertionError(f"{script}: {found}, not {wanted}")
+
+    def live(self) -> None:
+        """Both loops report; the mission is as in ``status``."""
+        self.rig.tell_alive(line=LINE, **{"t_s": 0.0, **self.status})
+
+    async def until_text(self, where: str, wanted: str) -> None:
+        """Wait until the text of an element is this."""
+        await self.until(f"document.querySelector({json.dumps(where)}).textContent", wanted)
+
+
+@asynccontextmanager
+async def operator_at(folder: Path, size: tuple[int, int] = (1440, 900)) -> AsyncIterator[Operator]:
+    errors: list[str] = []
+    async with async_playwright() as playwright, page_rig(CFG, folder) as rig:
+        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = await browser.new_page(viewport={"width": size[0], "height": size[1]}, color_scheme="dark")
+        page.set_default_timeout(20_000)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        await page.add_init_script(SPY)
+        await page.goto(f"http://127.0.0.1:{rig.port}/?token={rig.token}")
+        yield Operator(page, rig, folder)
+        await browser.close()
+    assert errors == []
+
+
+@pytest.fixture
+async def operator(runtime_dir: Path) -> AsyncIterator[Operator]:
+    async with operator_at(runtime_dir) as operator:
+        yield operator
+
+
+async def test_panels_have_their_numbers_where_there_is_room_and_over_no_point(operator: Operator) -> None:
+    await operator.until("window.drawn.texts.some(([text]) => text === '5-5')", True)
+    drawn = await operator.page.evaluate("window.drawn")
+    assert len(drawn["texts"]) == 77
+    assert min(size for *_, size in drawn["texts"]) >= 8.0
+    points = [(x, y, r) for x, y, r in drawn["circles"] if r < 5.0]
+    assert len(points) >= 18
+    for text, x, y, width, size in drawn["texts"]:
+        for px, py, r in points:
+            beside = max(abs(px - x) - width / 2, 0.0), max(abs(py - y) - size / 2, 0.0)
+            assert max(beside) >= r, text
+    await operator.page.set_viewport_size({"width": 390, "height": 844})
+    await operator.until("window.drawn.texts.length", 0)
+
+
+def rows_of(where: str, text: str) -> str:
+    """Script for level and text of each row of a list."""
+    return f"[...document.querySelectorAll('{where}')].map(row => [row.dataset.level, {text}])"
+
+
+def alarm(name: str, severity: Any, **fields: Any) -> Alarm:
+    known = {"cause": f"cause of {name}", "advice": "look", "since": "2026-11-26T03:00:00Z", "since_s": 1.0}
+    return Alarm(name=name, severity=severity, **{**known, **fields})
+
+
+async def test_a_pause_is_no_alarm_and_a_fault_is_one_in_colour_and_in_words(operator: Operator) -> None:
+    state = "document.querySelector('#state').dataset.level"
+    operator.status = {"state": "held", "cause": "operator"}
+    await operator.until(state, "note")
+    await operator.until_text("#state", "held by an operator")
+    await operator.until_text("#held", "held, the mission is held")
+    operator.status = {"state": "held", "cause": "a frame was served 60 ms late (limit 50 ms)"}
+    await operator.until(state, "warn")
+    alarms = [alarm(str(k), severity) for k, severity in enumerate(("fault", "slow", "inform"))]
+    ended = alarm(
+        "old", "hold", ended="2026-11-26T03:10:00Z", acknowledged_by="anna", acknowledged="2026-11-26T03:11:00Z"
+    )
+    operator.status = {"state": "held", "cause": "no way on: rim", "alarms": [*alarms, ended]}
+    await operator.until(state, "bad")
+    rows = rows_of("#alarms li", "row.querySelector('b').textContent")
+    await operator.until(rows, [["bad", "■ fault"], ["warn", "▲ slow"], ["note", "● inform"], ["", "\u2013 hold"]])
+    await operator.until("getComputedStyle(document.querySelector('#state'), '::before').content", '"■ "')
+    operator.status = {"state": "driving"}
+    await operator.until_text("#held", "follow the drives")
+    await operator.until("document.querySelector('#edge-1').dataset.on", "no")
+    await operator.until("document.querySelector('#edges').title", "Edge sensors off the panel: front right")
+
+
+async def test_times_names_and_values_with_their_limits(operator: Operator) -> None:
+    begun = {"event": "run_started", "timestamp": "2026-11-26T03:31:20.3Z"}
+    (operator.folder / "log.jsonl").write_text(json.dumps(begun) + "\n")
+    operator.status = {"elapsed_s": 5.0, "eta_s": 3600.0}
+    await operator.until_text("#operator", "operator")
+    await operator.until_text("#run", operator.folder.name)
+    await operator.until("document.querySelector('#started').textContent.endsWith('03:31:20')", True)
+    for where, form in (("#utc", r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d"), ("#finish", r"(\d{4}-\d\d-\d\d )?\d\d:\d\d")):
+        await operator.until(
+            f"new RegExp({json.dumps(f'^{form}$')}).test(document.querySelector('{where}').textContent)", True
+        )
+    fix = FixMessage(
+        seq=9, t_s=1.0, point=None, is_fused=True, position_m=(0.0, 0.0, 0.0), covariance_m2=[0.0] * 9, dop=25.0,
+        residual_rms_m=2e-6, channels=[1, 2, 3, 4], jump_mm=0.7,
+    )  # fmt: skip
+    operator.rig.main.send("fix", fix)
+    rows = rows_of("#gauges > div", r"row.innerText.replace(/\s+/g, ' ')")
+    await operator.until(rows + ".slice(0, 5)", [
+        ["bad", "battery low 30 % ≥ 31 %"], ["", "fan left 80 %"], ["", "fan right 50 %"],
+        ["bad", "laser DOP high 25.0 ≤ 20.0"], ["", "laser residual 2.0 µm ≤ 500 µm"],
+    ])  # fmt: skip
+    await operator.until(rows + ".slice(6)", [["", "permit, age 8 ms ≤ 150 ms"], ["", "drive, age 12 ms ≤ 200 ms"]])
+
+
+def track(t_s: float, x_m: float) -> TrackMessage:
+    return TrackMessage(seq=round(10 * t_s), t_s=t_s, rows=[(10 * round(t_s), t_s, 1, 2, x_m, 0.05, 0.0, 0.001)])
+
+
+async def test_plots_are_zoomed_by_dragging_and_keep_their_history_when_the_page_is_loaded_again(
+    operator: Operator,
+) -> None:
+    operator.status = {"t_s": 0.0, "elapsed_s": 0.0}
+    operator.live()
+    for k in range(100):
+        operator.rig.main.send("fix", FixMessage(
+            seq=k, t_s=float(k), point=None, is_fused=True, position_m=(0.0, 0.0, 0.0), covariance_m2=[0.0] * 9,
+            dop=1.0, residual_rms_m=1e-6, channels=[1, 2, 3, 4], jump_mm=0.1 + k,
+        ))  # fmt: skip
+        operator.rig.main.send("track", track(float(k), 0.001 * k))
+    latest = "document.querySelector('#plot-jump').getAttribute('aria-label')"
+    await operator.until(latest, "100 values, latest moved by the fix 99.100")
+    await operator.page.reload()
+    await operator.until(latest, "100 values, latest moved by the fix 99.100")
+    over = operator.page.locator("#plot-jump .u-over")
+    box = await over.bounding_box()
+    assert box is not None
+    middle = box["y"] + box["height"] / 2
+    await operator.page.mouse.move(box["x"] + 0.25 * box["width"], middle)
+    await operator.page.mouse.down()
+    await operator.page.mouse.move(box["x"] + 0.5 * box["width"], middle, steps=5)
+    await operator.page.mouse.up()
+    await operator.until("document.querySelector('#plots-all').hidden", False)
+    await operator.page.mouse.move(box["x"] + 0.5 * box["width"], middle)
+    await operator.until(
+        "/ (3[4-9]|40)\\.1 mm/.test(document.querySelector('#plot-jump').closest('figure').textContent)", True
+    )
+    operator.rig.main.send("track", track(101.0, 0.2))  # what is new does not end it
+    await operator.page.wait_for_timeout(600)
+    await operator.until("document.querySelector('#plots-all').hidden", False)
+    await over.dblclick()
+    await operator.until("document.querySelector('#plots-all').hidden", True)
+
+
+async def test_the_page_thins_its_rows_as_the_server_does(operator: Operator) -> None:
+    grown, rows = Growing(50, 3.0), list[list[float | None]]()
+    for k in range(400):
+        t_s = k + 10.0 * (k > 20) + 100.0 * (k > 300)
+        grown.add(t_s, float(k * 7 % 13), None)
+        rows += [list(row) for row in grown.take_new()]
+    script = """async (rows) => {
+        const {Rows} = await import("/static/history.js");
+        const kept = new Rows(50);
+        for (const row of rows) kept.receive([row], false);
+        return kept.rows;
+    }"""
+    assert await operator.page.evaluate(script, rows) == [list(row) for row in grown.rows]
+
+
+async def test_the_ellipse_has_one_named_scale_until_another_is_chosen(operator: Operator) -> None:
+    legend = "document.querySelector('#legend').textContent.includes('3\u03c3 ellipse \u00d7 {}')"
+    for scale in (100, 1000, 1, 100):
+        await operator.until(legend.format(scale), True)
+        for _ in range(3):
+            await operator.page.locator("#zoom-in").click()
+        await operator.page.locator("#fit").click()
+        await operator.until(legend.format(scale), True)
+        await operator.page.locator("#ellipse").click()
+
+
+async def test_messages_stand_in_the_order_of_time_and_what_is_left_out_is_said(operator: Operator) -> None:
+    word = iter(f"message {chr(97 + k // 26)}{chr(97 + k % 26)}" for k in range(250))
+    lines = [
+        {
+            "event": "operator_message",
+            "level": "info",
+            "timestamp": f"2026-11-26T03:{k // 60:02}:{k % 60:02}.5Z",
+            "text": text,
+        }
+        for k, text in enumerate(word)
+    ]
+    (operator.folder / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    await operator.until(
+        "document.querySelector('.left-out')?.textContent", "50 older messages left out: see log.jsonl"
+    )
+    times = await operator.page.evaluate("[...document.querySelectorAll('#log time')].map(time => time.textContent)")
+    assert times == [f"11-26 03:{k // 60:02}:{k % 60:02}Z" for k in range(249, 49, -1)]
+
+
+async def test_an_emergency_is_reported_and_cleared_after_a_confirmation(operator: Operator) -> None:
+    page = operator.page
+    await operator.until("document.querySelector('#emergency').disabled", False)
+    await page.locator("#emergency").click()
+    await expect(page.locator("#raise-confirm")).to_be_disabled()  # nothing is chosen beforehand
+    await page.locator("#raise button[value='']").click()
+    await page.locator("#emergency").click()
+    await page.get_by_label(re.compile("^ ?fire")).check()
+    await page.locator("#note").fill("smoke")
+    await page.locator("#raise-confirm").click()
+    await operator.until_text("#answer", "emergency fire: done")
+    assert [(one["cmd"], one["kind"], one["note"]) for one in operator.rig.asked] == [("emergency", "fire", "smoke")]
+    latched = {"active": [{"kind": "fire", "id": "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11", "note": "smoke"}]}
+    (operator.folder / "emergencies.json").write_bytes(msgspec.json.encode(latched))
+    await operator.until("document.querySelector('#emergencies strong')?.textContent", "fire: smoke")
+    await page.locator("#emergencies button").click()
+    await page.locator("#clear button[value='']").click()
+    await page.locator("#emergencies button").click()
+    await page.locator("#clear-confirm").click()
+    await operator.until_text("#answer", "clear: done")
+    assert operator.rig.asked[1:] == [{"cmd": "clear", "id": latched["active"][0]["id"]}]
