@@ -19,7 +19,15 @@ from tests.contract.page_rig import Rig, page_rig
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the page is not tried in a browser")
-CFG = load_config(None, {"run.panels": 2, "mission.arrival_tolerance_m": 0.012, "health.battery_reserve": 0.31})
+CFG = load_config(
+    None,
+    {
+        "run.panels": 2,
+        "mission.arrival_tolerance_m": 0.012,
+        "health.battery_reserve": 0.31,
+        "observation.operator": "Anna",
+    },
+)
 LINE = json.dumps({
     "type": "sensors", "seq": 5, "t": 1.5, "imu": [], "enc": [], "edge": [[1.5, 1, 0, 1, 1]], "gravity": None,
     "fans": [0.8, 0.5], "soc": 0.3, "cmd": {"seq": 4, "age": 0.012, "permit_age": 0.008, "held": False}, "faults": [],
@@ -146,6 +154,7 @@ async def test_times_names_and_values_with_their_limits(operator: Operator) -> N
     (operator.folder / "log.jsonl").write_text(json.dumps(begun) + "\n")
     operator.status = {"elapsed_s": 5.0, "eta_s": 3600.0}
     await operator.until_text("#operator", "operator")
+    await operator.until_text(".run .about", "survey byAnna")
     await operator.until_text("#run", operator.folder.name)
     await operator.until("document.querySelector('#started').textContent.endsWith('03:31:20')", True)
     for where, form in (("#utc", r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d"), ("#finish", r"(\d{4}-\d\d-\d\d )?\d\d:\d\d")):

@@ -1,7 +1,7 @@
 """What the dashboard costs: `python -m tests.processes.page_cost [SECONDS [ROUNDS]]`.
 
-A simulated run on the wall clock, with no page, one and three open ones in turns: processor time of the dashboard, and
-of main's ticks the median and the 99th percentile. Pages are plain clients, as a browser has a machine of its own.
+A simulated run on the wall clock, with none to fifty open pages in turns: processor time and memory of the dashboard,
+and of main's ticks the median and the 99th percentile. Pages are plain clients, as a browser has a machine of its own.
 """
 
 import socket
@@ -21,7 +21,8 @@ from ccatp.links.topics import Timing
 from tests.processes.test_observers import WITH_PAGE, open_page, page_port
 from tests.support.runs import NO_CALIBRATION, Run
 
-PAGES = (0, 1, 3)
+PAGES = (0, 1, 3, 50)
+ROOM = ("--set", "dashboard.max_connections=128")  # half of them for one address
 OPENING_S = 1.5
 
 
@@ -50,7 +51,7 @@ def busy_s(process: psutil.Process) -> float:
 
 
 def look(port: int, dashboard: psutil.Process, subscriber: Subscriber, pages: int, seconds: float) -> list[float]:
-    """Share of a core (%), median and 99th percentile of the ticks (us), with so many pages open."""
+    """Share of a core (%), memory (MB), median and 99th percentile of the ticks (us), with so many pages open."""
     with ExitStack() as stack:
         for _ in range(pages):
             page = stack.enter_context(open_page(port))
@@ -60,7 +61,7 @@ def look(port: int, dashboard: psutil.Process, subscriber: Subscriber, pages: in
         begun_s, before_s = time.monotonic(), busy_s(dashboard)
         ticks = ticks_us(subscriber, seconds)
         share = 100.0 * (busy_s(dashboard) - before_s) / (time.monotonic() - begun_s)
-    return [share, float(np.median(ticks)), float(np.percentile(ticks, 99))]
+    return [share, dashboard.memory_info().rss / 1e6, float(np.median(ticks)), float(np.percentile(ticks, 99))]
 
 
 def main(seconds: float, rounds: int) -> None:
@@ -68,7 +69,7 @@ def main(seconds: float, rounds: int) -> None:
     rows: dict[int, list[list[float]]] = {pages: [] for pages in PAGES}
     with tempfile.TemporaryDirectory(prefix="ccatp-") as folder, zmq.Context() as context:
         sockets = Path(folder)
-        with Run(sockets / "run", sockets, "--realtime", *WITH_PAGE, *NO_CALIBRATION) as run:
+        with Run(sockets / "run", sockets, "--realtime", *WITH_PAGE, *ROOM, *NO_CALIBRATION) as run:
             run.until_state("driving")
             subscriber = Subscriber(context, [f"ipc://{sockets / 'main'}"], ["timing"])
             for k in range(rounds):
@@ -76,8 +77,9 @@ def main(seconds: float, rounds: int) -> None:
                     rows[pages].append(look(page_port(run), run.child("dashboard"), subscriber, pages, seconds))
             subscriber.close()
     for pages, found in rows.items():
-        share, p50, p99 = np.median(np.array(found), axis=0)
-        print(f"{pages} pages: dashboard {share:.2f} % of a core, main's ticks p50 {p50:.0f} us, p99 {p99:.0f} us")
+        share, memory_mb, p50, p99 = np.median(np.array(found), axis=0)
+        of_dashboard = f"dashboard {share:.2f} % of a core, {memory_mb:.0f} MB"
+        print(f"{pages} pages: {of_dashboard}; main's ticks p50 {p50:.0f} us, p99 {p99:.0f} us")
 
 
 if __name__ == "__main__":

@@ -39,6 +39,7 @@ def beacon_ground(cfg: RadioConfig, *, is_sim: bool) -> dict[str, Any]:
         "title": TITLES[cfg.system],
         "is_sim": is_sim,
         "subtitle": f"{cfg.system}.toml, seed {cfg.run.seed}" if is_sim else f"{cfg.system}.toml",
+        "about": [],
         "panels": [],
         "rim": [[0.0, 0.0], [width_m, 0.0], [width_m, depth_m], [0.0, depth_m]],
         "points": [[waypoint_name(at), *place] for at, place in enumerate(beacon_waypoints(cfg))],

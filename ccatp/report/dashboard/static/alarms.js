@@ -79,7 +79,8 @@ export class Alarms {
       head.append(node("b", "■ emergency"), node("strong", `${emergency.kind}${emergency.note ? `: ${emergency.note}` : ""}`));
       const button = node("button", "Clear …");
       button.onclick = () => this.askToClear(emergency);
-      row.append(head, button, node("small", `latched, ${emergency.id}`));
+      row.title = emergency.id;
+      row.append(head, button);
       return row;
     });
     fill($("alarms"), alarms, (alarm) => this.row(alarm));
@@ -94,7 +95,8 @@ export class Alarms {
     const times = alarm.count > 1 ? `, ${alarm.count} times` : "";
     const by = alarm.acknowledged_by ? `, acknowledged by ${alarm.acknowledged_by}, ${time(alarm.acknowledged)}` : "";
     const ended = alarm.ended ? `, ended ${time(alarm.ended)}` : "";
-    row.append(head, node("p", alarm.advice), node("small", `since ${time(alarm.since)}${times}${ended}${by}`));
+    head.append(node("small", ` since ${time(alarm.since)}${times}${ended}${by}`));
+    row.append(head, node("p", alarm.advice));
     if (!alarm.acknowledged_by) {
       const button = node("button", "Acknowledge", "acknowledge");
       button.onclick = () => this.commands.acknowledge(alarm.name);

@@ -11,7 +11,7 @@ const MAX_PATH = 12000;
 const MAGNIFIED = [100, 1000, 1];
 const KEPT = "ccatp-ellipse";
 // A panel of at least this half width has room for its number between its points.
-const NUMBER_PX = 22;
+const NUMBER_PX = 20;
 const INKS = ["ink", "quiet", "card", "line", "panel", "seam", "rim", "good", "note", "warn", "bad", "sim", "estimate", "todo"];
 
 // How things look: each gets the pen (with its colours), the place in pixels, the size of a metre, and the thing.

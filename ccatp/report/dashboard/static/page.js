@@ -74,6 +74,12 @@ function begin(ground) {
   text("subtitle", ground.subtitle);
   text("run", ground.run);
   text("version", `${ground.version} on ${ground.host}`);
+  for (const row of document.querySelectorAll(".run .about")) row.remove();
+  for (const [name, value] of ground.about) {
+    const row = Object.assign(document.createElement("div"), { className: "about" });
+    row.append(Object.assign(document.createElement("dt"), { textContent: name }), Object.assign(document.createElement("dd"), { textContent: value }));
+    document.querySelector(".run").append(row);
+  }
   document.title = `${ground.is_sim ? "SIM " : ""}${ground.title} – ccatp`;
   $("simulation").hidden = !ground.is_sim;
   ({ codes, words, limits } = ground);
