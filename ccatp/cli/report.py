@@ -161,7 +161,7 @@ def align(
 
         draw_alignment(mirror, result, figure_file, f"{mirror.name}: {len(result.panels)} panels", str(run_dir))
     if json_output:
-        print_lines([json.dumps({**facts, **result_data(mirror, result, comparison), "warnings": warnings})])
+        print_lines([json.dumps({**facts, **result_data(result, comparison), "warnings": warnings})])
     else:
         print_lines(table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m))
     return 0

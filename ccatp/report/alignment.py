@@ -25,10 +25,10 @@ def worst_corner(mirror: Mirror, panel: PanelResult) -> tuple[float, float]:
     return float(values[worst]), float(np.sqrt(modes[worst] @ panel.fit.covariance @ modes[worst]))
 
 
-def result_data(mirror: Mirror, result: SurveyResult, comparison: Comparison | None) -> dict[str, Any]:
+def result_data(result: SurveyResult, comparison: Comparison | None) -> dict[str, Any]:
     """What ``ccatp align --json`` prints of the panels and the mirror."""
     return {
-        "panels": [panel_data(mirror, panel) for panel in result.panels],
+        "panels": [panel_data(panel) for panel in result.panels],
         "undetermined": [
             {"row": one.panel.row, "col": one.panel.col, "points": one.points, "why": one.why}
             for one in result.undetermined
@@ -48,9 +48,8 @@ def result_data(mirror: Mirror, result: SurveyResult, comparison: Comparison | N
     }
 
 
-def panel_data(mirror: Mirror, panel: PanelResult) -> dict[str, Any]:
+def panel_data(panel: PanelResult) -> dict[str, Any]:
     """How a panel lies, its moves and its points."""
-    corner_m, corner_sigma_m = worst_corner(mirror, panel)
     piston, tip, tilt = _list(panel.fit.values)
     bending, shape = panel.bending, panel.shape
     own = _wavefront(mirror_wavefront([panel.rigid.wavefront]))
@@ -65,8 +64,6 @@ def panel_data(mirror: Mirror, panel: PanelResult) -> dict[str, Any]:
         "tip_urad": tip,
         "tilt_urad": tilt,
         "sigma": _list(panel.fit.sigma),
-        "worst_corner_um": _um(corner_m),
-        "sigma_worst_corner_um": _um(corner_sigma_m),
         "adjusters_um": _list(panel.rigid.moves.values_m),
         "adjusters_sigma_um": _list(panel.rigid.moves.sigma_m),
         "chi2": round(panel.fit.chi2, _DECIMALS),

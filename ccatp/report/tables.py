@@ -16,7 +16,7 @@ from ccatp.core import PointId
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import SurveyResult
 from ccatp.mirror.panel_alignment import adjuster_places
-from ccatp.report.alignment import panel_data
+from ccatp.report.alignment import panel_data, worst_corner
 from ccatp.report.findings import Findings, metadata_of
 
 FILE_MODE = 0o644
@@ -118,7 +118,7 @@ def _fixes_table(found: Findings) -> Table:
     deviations = {
         PointId(*panel.panel, one["point"]): one
         for panel in (() if alignment is None else alignment.panels)
-        for one in panel_data(record.mirror, panel)["deviations"]
+        for one in panel_data(panel)["deviations"]
     }
     rows = []
     for stored, arrival in zip(record.points or (), found.points, strict=True):
@@ -157,12 +157,13 @@ def panel_table(mirror: Mirror, result: SurveyResult) -> Table:
     }
     rows: list[dict[str, object]] = []
     for panel in result.panels:
-        data = panel_data(mirror, panel)
+        data, corner_um = panel_data(panel), [round(1e6 * value, 4) for value in worst_corner(mirror, panel)]
         data["outliers"] = " ".join(map(str, data["outliers"]))
         data["is_bent"] = int(panel.shape is not None and panel.shape.is_significant)
         data |= zip([f"sigma_{name}" for name in _FIT], data["sigma"], strict=True)
         data |= zip([f"{name}_um" for name in names], data["adjusters_um"], strict=True)
         data |= zip([f"sigma_{name}_um" for name in names], data["adjusters_sigma_um"], strict=True)
+        data |= zip(("worst_corner_um", "sigma_worst_corner_um"), corner_um, strict=True)
         rows.append(data)
     return Table(columns, rows)
 
@@ -170,7 +171,7 @@ def panel_table(mirror: Mirror, result: SurveyResult) -> Table:
 def _moves_table(mirror: Mirror, result: SurveyResult) -> Table:
     rows = []
     for panel in result.panels:
-        data, (_, places) = panel_data(mirror, panel), adjuster_places(mirror, panel.panel)
+        data, (_, places) = panel_data(panel), adjuster_places(mirror, panel.panel)
         moves = zip(panel.adjusters, places.tolist(), data["adjusters_um"], data["adjusters_sigma_um"], strict=True)
         for name, (x_m, y_m), move, sigma in moves:
             row = {**panel.panel._asdict(), "adjuster": name, "x_m": round(x_m, 6), "y_m": round(y_m, 6)}

@@ -73,7 +73,6 @@ def test_panels_and_moves_are_those_of_the_alignment(survey: Path, capsys: pytes
         panel["piston_um"], panel["tip_urad"], panel["tilt_urad"],
     ]  # fmt: skip
     assert [row[f"sigma_{name}"] for name in ("piston_um", "tip_urad", "tilt_urad")] == panel["sigma"]
-    assert row["worst_corner_um"] == panel["worst_corner_um"]
     assert np.ma.is_masked(row["outliers"])
     moves = read(survey, "moves")
     assert moves["move_um"].unit == "um"
