@@ -1,12 +1,14 @@
 """The page in a real browser, beside a survey and a mission among beacons. One story each: starts take seconds."""
 
+import http.client
 import json
 import re
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
@@ -56,6 +58,7 @@ def test_an_operator_looks_and_aborts(start: Start) -> None:
     run.until_state("turning", "driving")
     with browser_page(page_port(run), run.runtime_dir) as page:
         sees_a_running_survey(page)
+        keeps_its_history(page, run)
         fits_a_phone(page)
         knows_keys(page)
         sees_a_dead_main_loop(page, run)
@@ -77,6 +80,34 @@ def sees_a_running_survey(page: Page) -> None:
     expect(page.locator("#done")).to_have_text(re.compile("^[1-9]"))
     expect(page.locator("#plot-arrival")).to_have_attribute("aria-label", re.compile("latest by the laser 0"))
     sees_the_map_move(page)
+
+
+def everything(port: int) -> dict[str, Any]:
+    """What a page gets that is opened now."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=1e-3 * PATIENCE_MS)
+    try:
+        connection.request("GET", "/events")
+        answer = connection.getresponse()
+        assert answer.readline() == b"event: all\n"
+        state: dict[str, Any] = json.loads(answer.readline().partition(b": ")[2])
+        return state
+    finally:
+        connection.close()
+
+
+def keeps_its_history(page: Page, run: Run) -> None:
+    """Another dashboard reads from the recording what it has not seen."""
+    killed_s = run.ask("status")["status"]["elapsed_s"]
+    run.child("dashboard").kill()
+    deadline_s = time.monotonic() + 1e-3 * PATIENCE_MS
+    begun: dict[str, float] = {}
+    while not begun or max(begun.values()) > 0.5 * killed_s:
+        assert time.monotonic() < deadline_s, f"killed at {killed_s} s, and what it shows begins at {begun}"
+        with suppress(OSError):  # it is being restarted
+            state = everything(page_port(run))
+            rows = {"path": state["path"], "error": state["series"]["error"]}
+            begun = {name: found[0][0] for name, found in rows.items() if found}
+    expect(page.locator("#alarm")).to_be_hidden()
 
 
 def sees_the_map_move(page: Page) -> None:

@@ -210,27 +210,14 @@ class LogEntry(msgspec.Struct):
     limit: float = 0.0
 
 
-class Emergency(msgspec.Struct):
-    """A latched emergency, as the danger loop has written it down."""
-
-    kind: str
-    id: str
-    note: str = ""
-
-
-class Emergencies(msgspec.Struct):
-    """Contents of the file of emergencies."""
-
-    active: list[Emergency]
-
-
-_entry, _emergencies = msgspec.json.Decoder(LogEntry), msgspec.json.Decoder(Emergencies)
+_entry = msgspec.json.Decoder(LogEntry)
 
 
 class RunFiles:
     """Follows the log of a run, whose messages go to ``lines``, and the file of its emergencies.
 
-    ``started``: when the run began, UTC in ISO format, empty while that is not known.
+    ``started``: when the run began, UTC in ISO format, empty while that is not known; ``emergencies``: those that are
+    latched, each with kind, id and note.
     """
 
     def __init__(self, folder: Path, lines: Lines) -> None:
@@ -239,7 +226,7 @@ class RunFiles:
         self._rest = b""
         self._changed_ns = 0
         self.started = ""
-        self.emergencies: list[Emergency] = []
+        self.emergencies: list[dict[str, str]] = []
 
     def read(self) -> None:
         """Take what is new; what cannot be read is left out."""
@@ -250,10 +237,10 @@ class RunFiles:
             for line in lines:
                 if not self.started or any(mark in line for mark in _MARKS):
                     self._take(line)
-        with suppress(OSError, msgspec.MsgspecError):
+        with suppress(OSError, msgspec.MsgspecError, KeyError, TypeError):
             changed_ns = self._latch.stat().st_mtime_ns
             if changed_ns != self._changed_ns:
-                self.emergencies = _emergencies.decode(self._latch.read_bytes()).active
+                self.emergencies = msgspec.json.decode(self._latch.read_bytes())["active"]
                 self._changed_ns = changed_ns
 
     def close(self) -> None:

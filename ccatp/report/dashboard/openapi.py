@@ -1,6 +1,6 @@
 """THE table of the HTTP interface: the application's routes and ``GET /openapi.json`` are made of it."""
 
-from collections.abc import Iterable
+from http import HTTPStatus
 from typing import Any, NamedTuple
 
 import msgspec
@@ -13,27 +13,7 @@ PREFIX = "/api/v1"  # every path exists with it and without
 ACKNOWLEDGE = "alarms/ack"
 Schema = dict[str, Any]
 
-ERRORS = {
-    400: "the body is no JSON object of the form",
-    401: "no token, or one that is not accepted",
-    403: "sent by a page of another site",
-    404: "no such path",
-    405: "another method",
-    408: "the body was not complete in time",
-    409: "refused by the daemon, with its reason",
-    413: "the body is too long",
-    421: "asked for under a foreign name",
-    502: "the daemon's answer is not of the form",
-    503: "not available now",
-    504: "no answer from the daemon in time",
-}
-JSON, HTML, TEXT, EVENTS, BYTES = (
-    "application/json",
-    "text/html",
-    "text/plain",
-    "text/event-stream",
-    "application/octet-stream",
-)
+JSON = "application/json"
 
 
 def _ref(name: str) -> Schema:
@@ -73,17 +53,17 @@ class Endpoint(NamedTuple):
 
 
 ENDPOINTS = (
-    Endpoint("/", "The page.", _TEXT, HTML),
-    Endpoint("/static/{path}", "A file of the page.", _TEXT, BYTES, errors=(404,)),
+    Endpoint("/", "The page.", _TEXT, "text/html"),
+    Endpoint("/static/{path}", "A file of the page.", _TEXT, "*/*", errors=(404,)),
     Endpoint("/ground", "What does not change in a run: map, points, limits, names.", {"type": "object"}),
-    Endpoint("/events", "Server-sent events: all once, news ten times a second, end.", _TEXT, EVENTS),
+    Endpoint("/events", "Server-sent events: all once, news ten times a second, end.", _TEXT, "text/event-stream"),
     Endpoint("/status", "All levels of the page, and what is wrong.", _ref("Status")),
     Endpoint(
         "/alarms", "The list of alarms, the gravest first.",
         _object("status", "alarms", status=_OK, alarms={"type": "array", "items": _ref("Alarm")}),
     ),
     Endpoint("/healthz", "Whether both loops report and the robot sends frames.", _DONE, errors=(503,)),
-    Endpoint("/metrics", "Metrics of Prometheus.", _TEXT, TEXT),
+    Endpoint("/metrics", "Metrics of Prometheus.", _TEXT, "text/plain"),
     Endpoint("/openapi.json", "This description.", {"type": "object"}),
     Endpoint("/operator", "The name of the token.", _object("status", "name", status=_OK, name=_TEXT), channel="token"),
     Endpoint("/pause", "Hold the robot where it is.", _DONE, channel="control"),
@@ -118,7 +98,7 @@ _LEVELS: dict[str, Schema] = {
 }
 
 
-def description(endpoints: Iterable[Endpoint] = ENDPOINTS) -> Schema:
+def description() -> Schema:
     """The interface as OpenAPI 3.1."""
     _, schemas = msgspec.json.schema_components(
         (MissionStatus, DisplayState, Verdict, Alarm), ref_template="#/components/schemas/{name}"
@@ -126,7 +106,7 @@ def description(endpoints: Iterable[Endpoint] = ENDPOINTS) -> Schema:
     schemas["Error"] = _object("status", "message", status={"const": "error"}, message=_TEXT)
     schemas["Status"] = _object("status", *_LEVELS, status=_OK, **_LEVELS)
     paths: Schema = {}
-    for row in endpoints:
+    for row in ENDPOINTS:
         paths.setdefault(row.path, {})[row.method.lower()] = _operation(row)
     return {
         "openapi": "3.1.0",
@@ -144,7 +124,7 @@ def _operation(row: Endpoint) -> Schema:
         "summary": row.summary,
         "responses": {
             "200": {"description": row.summary, "content": {row.content: {"schema": row.schema}}},
-            **{str(code): _error(ERRORS[code]) for code in sorted(errors)},
+            **{str(code): _error(HTTPStatus(code).phrase) for code in sorted(errors)},
         },
     }
     if row.channel:
