@@ -16,7 +16,7 @@ from ccatp.report.dashboard.view import MEASURED, PLANNED, RunStateView
 CODES = ["normal operation", "near something", "operation aborted"]
 TITLES = {"zigbee": "ZigBee beacons", "follow": "Following a radio", "cricket": "Ultrasonic motes"}
 # Elements of the page that only a survey has.
-HIDDEN = ["edges", "fans-row", "skipped-row", "eta-row"]
+HIDDEN = ["edges", "skipped-row", "eta-row", "finish-row"]
 
 
 def waypoint_name(number: int) -> str:

@@ -34,6 +34,7 @@ from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.recorder import Recorder
 from ccatp.records.store import StoredPoint, StoredSurvey
 from ccatp.report.dashboard.access import CommandRefusal, check_command, host_refusal, make_token, page_tokens
+from ccatp.report.dashboard.app import STATIC
 from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground
 from ccatp.report.dashboard.history import replay
 from ccatp.report.dashboard.survey_view import SurveyView
@@ -402,6 +403,9 @@ def test_the_ground_of_a_room(system: str) -> None:
     assert [point[0] for point in found["points"]] == names
     assert ("target" in found["plots"]) is is_following
     assert found["words"]["unit"] == ("seconds" if is_following else "waypoints")
+    page = (STATIC / "index.html").read_text()
+    parts = [*found["hides"], *(f"plot-{name}" for name in found["plots"])]
+    assert [part for part in parts if f'id="{part}"' not in page] == []
 
 
 def test_a_page_beyond_this_machine_wants_a_token() -> None:

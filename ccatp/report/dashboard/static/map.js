@@ -32,7 +32,7 @@ export class MapView {
     this.canvas = canvas;
     this.legend = legend;
     const kept = Number(localStorage.getItem(KEPT));
-    this.magnified = MAGNIFIED.includes(kept) ? kept : MAGNIFIED[0];
+    this.chosen = MAGNIFIED.includes(kept) ? kept : MAGNIFIED[0];
     this.ellipseButton = ellipseButton;
     ellipseButton.onclick = () => this.magnify();
     this.context = canvas.getContext("2d");
@@ -87,13 +87,19 @@ export class MapView {
   }
 
   magnify() {
-    this.magnified = MAGNIFIED[(MAGNIFIED.indexOf(this.magnified) + 1) % MAGNIFIED.length];
-    localStorage.setItem(KEPT, this.magnified);
+    this.chosen = MAGNIFIED[(MAGNIFIED.indexOf(this.chosen) + 1) % MAGNIFIED.length];
+    localStorage.setItem(KEPT, this.chosen);
     this.showLegend();
     this.draw();
   }
 
+  // Among beacons the ellipses are as large as the room.
+  get magnified() {
+    return this.ground.panels.length ? this.chosen : 1;
+  }
+
   showLegend() {
+    this.ellipseButton.hidden = !this.ground.panels.length;
     this.ellipseButton.textContent = `3σ ×${this.magnified}`;
     const tolerance = `${this.ground.arrival_tolerance_mm} mm`;
     const ofSurvey = [["○", "todo", "planned"], ["●", "good", `within ${tolerance}`], ["▲", "warn", `beyond ${tolerance}`], ["✕", "warn", "left out"]];

@@ -62,7 +62,8 @@ async function connect() {
       source.close(); // the next stream begins with the whole state
       setTimeout(connect, RETRY_MS);
     };
-  } catch {
+  } catch (error) {
+    console.warn(error);
     setTimeout(connect, RETRY_MS);
   } finally {
     isConnecting = false;
