@@ -16,6 +16,7 @@ KINDS = {
     "E": "Laser system",
     "O": "Operator and observatory",
     "F": "Fans, power, body",
+    "D": "Devices of the robot's computer",
 }
 HEAD = """# The fault table
 

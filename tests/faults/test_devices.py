@@ -1,0 +1,161 @@
+"""Devices of the robot's computer that break by registers and bytes: what the robot does by itself, and how fast.
+
+The on-board program drives its wheels over fake devices, in a time of its own.
+"""
+
+import errno
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from ccatp.config.load import load_onboard_config
+from ccatp.onboard.robot import OnboardRobot
+from tests.faults.linking import Measured
+from tests.unit.onboard.devices.test_bno055 import BREAKS as UNIT_BREAKS
+from tests.unit.onboard.devices.test_daq import BREAKS as DAQ_BREAKS
+from tests.unit.onboard.devices.test_linux import Rig
+
+CFG = load_onboard_config()
+STEP_S = 1.0 / CFG.servo.loop_hz
+WATCHED_S, PATIENCE_S = 1.5, 20.0
+SAMPLED = {"encoder_left", "encoder_right", "edge"}
+# Rows of the table in their order, and what breaks: of the inertial unit, of the data acquisition device, of the rest.
+UNIT = {f"D{k}": name for k, name in enumerate(UNIT_BREAKS, 1)}
+DAQ = {f"D{k}": name for k, name in enumerate(DAQ_BREAKS, 1 + len(UNIT_BREAKS))}
+
+
+class Driving:
+    """A robot that drives both wheels at 3 rad/s."""
+
+    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.rig = Rig(root, monkeypatch)
+        self.rig.hardware.start()
+        self.robot = OnboardRobot(CFG, self.rig.hardware)
+        self._rates = [0.0, 0.0]
+        self.run(1.0)
+        assert not self.robot.rules.is_held
+        assert not self.robot.faults
+
+    def step(self) -> None:
+        """One step of the control loop, and of the wheels."""
+        rig, servo = self.rig, CFG.servo
+        rig.time.sleep(STEP_S)
+        self.robot.rules.drive(1, 3.0, 3.0, rig.time.now_s)
+        self.robot.control(rig.time.now_s)
+        for wheel, voltage_v in enumerate(rig.voltages()):
+            steady = math.copysign(max(0.0, abs(voltage_v) - servo.static_v) / servo.volt_per_rad_s, voltage_v)
+            self._rates[wheel] += (steady - self._rates[wheel]) * STEP_S / 0.06
+        counts_per_rad = servo.counts_per_rev / math.tau
+        rig.daq.step = [rate * counts_per_rad / CFG.devices.daq.sample_hz for rate in self._rates]
+
+    def run(self, duration_s: float) -> None:
+        for _ in range(round(duration_s / STEP_S)):
+            self.step()
+
+    def until(self, is_there: Callable[[], bool], most_s: float = PATIENCE_S) -> float:
+        """Time until then, s."""
+        start_s = self.rig.time.now_s
+        while not is_there():
+            assert self.rig.time.now_s - start_s < most_s
+            self.step()
+        return self.rig.time.now_s - start_s
+
+    def holds(self, duration_s: float) -> int:
+        """How often the wheels are held in a time."""
+        count, was_held = 0, self.robot.rules.is_held
+        for _ in range(round(duration_s / STEP_S)):
+            self.step()
+            count += self.robot.rules.is_held and not was_held
+            was_held = self.robot.rules.is_held
+        return count
+
+
+@pytest.fixture
+def driving(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Driving:
+    return Driving(tmp_path, monkeypatch)
+
+
+def rows(names: dict[str, str]) -> list[object]:
+    return [pytest.param(row, name, marks=pytest.mark.fault(row), id=name) for row, name in names.items()]
+
+
+def breaks(
+    driving: Driving, measured: Measured, row: str, is_silent: bool, device: object, faults: set[str],
+    broken: Callable[[object], object], repair: Callable[[object], object] | None,
+) -> None:  # fmt: skip
+    robot = driving.robot
+    broken(device)
+    if is_silent:
+        measured(row, driving.holds(WATCHED_S), "holds")
+        return
+    measured(row, 1e3 * driving.until(lambda: robot.rules.is_held), "ms")
+    assert set(robot.faults) == faults
+    driving.run(0.1)
+    if repair is not None:
+        repair(device)
+    driving.until(lambda: not robot.rules.is_held and not robot.faults)
+
+
+@pytest.mark.parametrize(("row", "name"), rows(UNIT))
+def test_the_inertial_unit(row: str, name: str, driving: Driving, measured: Measured) -> None:
+    broken, reason, repair, _ = UNIT_BREAKS[name]
+    breaks(driving, measured, row, not reason, driving.rig.unit, {"imu"}, broken, repair)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("row", "name"), rows(DAQ))
+def test_the_data_acquisition_device(row: str, name: str, driving: Driving, measured: Measured) -> None:
+    broken, reason, repair, _ = DAQ_BREAKS[name]
+    breaks(driving, measured, row, not reason, driving.rig.daq, SAMPLED, broken, repair)  # type: ignore[arg-type]
+    assert driving.rig.voltages() != [0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("row", "broken"),
+    [
+        pytest.param(
+            "D36", lambda rig: rig.pwm.refusals.update({"pwmchip0/pwm0/duty_cycle": errno.EIO}),
+            marks=pytest.mark.fault("D36"), id="PWM",
+        ),
+        pytest.param(
+            "D37", lambda rig: setattr(rig.bridge, "error", OSError(errno.EIO, "Input/output error")),
+            marks=pytest.mark.fault("D37"), id="lines",
+        ),
+    ],
+)  # fmt: skip
+def test_motors_that_cannot_be_set(
+    row: str, broken: Callable[[Rig], object], driving: Driving, measured: Measured
+) -> None:
+    rig, robot = driving.rig, driving.robot
+    broken(rig)
+    line = CFG.devices.timer.line
+    level = rig.bridge.levels[line]
+    measured(row, 1e3 * driving.until(lambda: "motors" in robot.faults), "ms")
+    driving.run(0.1)
+    assert rig.bridge.levels[line] is level  # it runs out, and brakes
+
+
+@pytest.mark.parametrize(
+    ("row", "broken", "fault"),
+    [
+        pytest.param(
+            "D38", lambda rig: (rig.pwm.root / "pwmchip1/pwm0/duty_cycle").write_text("?\n"), "fan_left",
+            marks=pytest.mark.fault("D38"), id="fan that cannot be read",
+        ),
+        pytest.param(
+            "D39", lambda rig: (rig.pwm.root / "pwmchip1/pwm1/enable").write_text(""), "fan_right",
+            marks=pytest.mark.fault("D39"), id="fan that is off",
+        ),
+        pytest.param(
+            "D40", lambda rig: rig.daq.adc.__setitem__(4, 0), "battery_low",
+            marks=pytest.mark.fault("D40"), id="battery",
+        ),
+    ],
+)  # fmt: skip
+def test_what_does_not_hold_the_wheels_is_on_the_link(
+    row: str, broken: Callable[[Rig], object], fault: str, driving: Driving, measured: Measured
+) -> None:
+    broken(driving.rig)
+    measured(row, 1e3 * driving.until(lambda: fault in driving.robot.faults), "ms")
+    assert not driving.robot.rules.is_held
