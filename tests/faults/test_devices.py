@@ -11,8 +11,12 @@ from pathlib import Path
 import pytest
 
 from ccatp.config.load import load_onboard_config
+from ccatp.config.onboard_models import Bno055Config
+from ccatp.onboard.devices.bno055 import Bno055, Bno055Sample, Bus
+from ccatp.onboard.hardware import HardwareError
 from ccatp.onboard.robot import OnboardRobot
 from tests.faults.linking import Measured
+from tests.support.onboard_fakes import FakeTime
 from tests.unit.onboard.devices.test_bno055 import BREAKS as UNIT_BREAKS
 from tests.unit.onboard.devices.test_daq import BREAKS as DAQ_BREAKS
 from tests.unit.onboard.devices.test_linux import Rig
@@ -26,12 +30,52 @@ UNIT = {f"D{k}": name for k, name in enumerate(UNIT_BREAKS, 1)}
 DAQ = {f"D{k}": name for k, name in enumerate(DAQ_BREAKS, 1 + len(UNIT_BREAKS))}
 
 
+class UnitTime(FakeTime):
+    """The time of the inertial unit and of the thread that reads it: while that waits, the robot's goes on."""
+
+    def __init__(self, robot: FakeTime) -> None:
+        self._robot, self._own_s = robot, 0.0
+
+    @property
+    def now_s(self) -> float:  # type: ignore[override]
+        return max(self._own_s, self._robot.now_s)
+
+    def sleep(self, wait_s: float) -> None:
+        self._own_s = self.now_s + wait_s
+
+
+class ThreadedBno055(Bno055):
+    """Reads as its thread does; what an attempt with waits brings about is seen when they are over."""
+
+    def __init__(self, config: Bno055Config, open_bus: Callable[[], Bus], clock: FakeTime, sleep: object) -> None:
+        self.robot, self.time = clock, UnitTime(clock)
+        self._due_s = 0.0
+        self._seen = clock(), ""
+        super().__init__(config, open_bus, self.time, self.time.sleep)
+
+    def take(self, until_s: float) -> list[Bno055Sample]:
+        while max(self._due_s, self.time.now_s) <= self.robot.now_s:
+            self._seen = self._newest_s, self._reason
+            self._due_s = max(self._due_s, self.robot.now_s - 0.01) + self.step()
+        return super().take(until_s)
+
+    def fault(self, now_s: float) -> str:
+        if self.time.now_s <= now_s:
+            self._seen = self._newest_s, self._reason
+        age_s = now_s - self._seen[0]
+        return f"no reading for {age_s:.2f} s" if age_s > self._config.timeout_s else ""
+
+
 class Driving:
     """A robot that drives both wheels at 3 rad/s."""
 
     def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.rig = Rig(root, monkeypatch)
-        self.rig.hardware.start()
+        self.rig = rig = Rig(root, monkeypatch, ThreadedBno055)
+        reader = rig.linux._imu
+        assert isinstance(reader, ThreadedBno055)
+        rig.unit._time = reader.time
+        rig.hardware.start()
+        rig.time.sleep(1.0)
         self.robot = OnboardRobot(CFG, self.rig.hardware)
         self._rates = [0.0, 0.0]
         self.run(1.0)
@@ -115,12 +159,12 @@ def test_the_data_acquisition_device(row: str, name: str, driving: Driving, meas
     ("row", "broken"),
     [
         pytest.param(
-            "D36", lambda rig: rig.pwm.refusals.update({"pwmchip0/pwm0/duty_cycle": errno.EIO}),
-            marks=pytest.mark.fault("D36"), id="PWM",
+            "D40", lambda rig: rig.pwm.refusals.update({"pwmchip0/pwm0/duty_cycle": errno.EIO}),
+            marks=pytest.mark.fault("D40"), id="PWM",
         ),
         pytest.param(
-            "D37", lambda rig: setattr(rig.bridge, "error", OSError(errno.EIO, "Input/output error")),
-            marks=pytest.mark.fault("D37"), id="lines",
+            "D41", lambda rig: setattr(rig.bridge, "error", HardwareError("/dev/gpiochip0: Input/output error")),
+            marks=pytest.mark.fault("D41"), id="lines",
         ),
     ],
 )  # fmt: skip
@@ -140,16 +184,16 @@ def test_motors_that_cannot_be_set(
     ("row", "broken", "fault"),
     [
         pytest.param(
-            "D38", lambda rig: (rig.pwm.root / "pwmchip1/pwm0/duty_cycle").write_text("?\n"), "fan_left",
-            marks=pytest.mark.fault("D38"), id="fan that cannot be read",
+            "D42", lambda rig: (rig.pwm.root / "pwmchip1/pwm0/duty_cycle").write_text("?\n"), "fan_left",
+            marks=pytest.mark.fault("D42"), id="fan that cannot be read",
         ),
         pytest.param(
-            "D39", lambda rig: (rig.pwm.root / "pwmchip1/pwm1/enable").write_text(""), "fan_right",
-            marks=pytest.mark.fault("D39"), id="fan that is off",
+            "D43", lambda rig: (rig.pwm.root / "pwmchip1/pwm1/enable").write_text(""), "fan_right",
+            marks=pytest.mark.fault("D43"), id="fan that is off",
         ),
         pytest.param(
-            "D40", lambda rig: rig.daq.adc.__setitem__(4, 0), "battery_low",
-            marks=pytest.mark.fault("D40"), id="battery",
+            "D44", lambda rig: rig.daq.adc.__setitem__(4, 0), "battery_low",
+            marks=pytest.mark.fault("D44"), id="battery",
         ),
     ],
 )  # fmt: skip

@@ -41,15 +41,17 @@ class SteppedBno055(Bno055):
 class Rig:
     """A whole robot of fakes."""
 
-    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(threading.Thread, "start", lambda _thread: None)
+    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch, reader: type[Bno055] = SteppedBno055) -> None:
+        start = threading.Thread.start
+        # The thread of the inertial unit does not run: its readings are taken in the time of the test.
+        monkeypatch.setattr(threading.Thread, "start", lambda one: None if one.name == "bno055" else start(one))
         self.time = FakeTime()
         self.unit, self.daq = FakeBno055(self.time), FakeDaq(self.time)
         self.pwm, self.bridge = FakePwm(root, monkeypatch, {0: 2, 1: 2}), FakeBridge()
         self.bus_error: HardwareError | None = None
         self.linux = LinuxHardware(
             CONFIG, self.time, open_bus=self.open_bus, open_port=self.daq.open, open_lines=self.bridge.open,
-            pwm_root=root, imu=SteppedBno055, sleep=self.time.sleep,
+            pwm_root=root, imu=reader, sleep=self.time.sleep,
         )  # fmt: skip
         self.hardware: Hardware = self.linux
 
