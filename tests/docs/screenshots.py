@@ -46,7 +46,7 @@ class Camera:
         self._page.set_viewport_size({"width": size[0], "height": size[1]})
         self._page.wait_for_timeout(SETTLE_MS)
         path = self._folder / f"dashboard_{name}.png"
-        self._page.screenshot(path=path, full_page=size == PHONE)
+        self._page.screenshot(path=path)
         with Image.open(path) as image:  # this way small things keep their colours
             small = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=1)
         small.save(path, optimize=True)

@@ -20,7 +20,9 @@ import zmq
 
 from ccatp.config.load import load_config
 from ccatp.errors import RefusedError
+from ccatp.links.bus import Subscriber
 from ccatp.links.client import HttpClient, OperatorClient
+from ccatp.links.topics import DisplayState
 from ccatp.studies.sil_run import rehearse
 from tests.processes.conftest import Start
 from tests.support.runs import NO_CALIBRATION, Run
@@ -132,6 +134,15 @@ def test_the_check_does_not_disturb_a_robot_that_is_driven(beside: Beside, tmp_p
     # A machine that starts a command may serve a frame late, and the daemon holds for that, but never for the check.
     at = run.ask("status")["status"]
     assert at["state"] != "held" or "late" in at["cause"], at["cause"]
+
+
+def test_the_main_loop_samples_its_display_state_for_a_history_while_nobody_watches(beside: Beside) -> None:
+    main = f"ipc://{beside.run.runtime_dir / 'main'}"
+    with zmq.Context() as context:
+        history = Subscriber(context, [main], ["display_state"], is_uncounted=True)
+        samples = [history.receive(DEADLINE_S) for _ in range(2)]
+        history.close()
+    assert all(sample is not None and isinstance(sample[2], DisplayState) for sample in samples)
 
 
 def test_an_attached_dashboard_ends_with_a_page_open(beside: Beside) -> None:
