@@ -32,19 +32,23 @@ LINE = json.dumps({
     "type": "sensors", "seq": 5, "t": 1.5, "imu": [], "enc": [], "edge": [[1.5, 1, 0, 1, 1]], "gravity": None,
     "fans": [0.8, 0.5], "soc": 0.3, "cmd": {"seq": 4, "age": 0.012, "permit_age": 0.008, "held": False}, "faults": [],
 }).encode()  # fmt: skip
-# Texts and circles that are drawn on the map, each with its place; the newest drawing alone.
+# Texts and circles that are drawn on the map, each with its place, and where lines begin; the newest drawing alone.
 SPY = """
-window.drawn = {texts: [], circles: []};
+window.drawn = {texts: [], circles: [], begun: 0};
 const proto = CanvasRenderingContext2D.prototype;
-const {clearRect, fillText, arc} = proto;
+const {clearRect, fillText, arc, moveTo} = proto;
 const isMap = (pen) => pen.canvas.id === "map";
 proto.clearRect = function (...box) {
-  if (isMap(this)) window.drawn = {texts: [], circles: []};
+  if (isMap(this)) window.drawn = {texts: [], circles: [], begun: 0};
   return clearRect.apply(this, box);
 };
 proto.fillText = function (text, x, y) {
   if (isMap(this)) window.drawn.texts.push([text, x, y, this.measureText(text).width, parseFloat(this.font)]);
   return fillText.call(this, text, x, y);
+};
+proto.moveTo = function (x, y) {
+  if (isMap(this)) window.drawn.begun++;
+  return moveTo.call(this, x, y);
 };
 proto.arc = function (x, y, r, ...rest) {
   if (isMap(this)) window.drawn.circles.push([x, y, r]);
@@ -211,6 +215,18 @@ async def test_plots_are_zoomed_by_dragging_and_keep_their_history_when_the_page
     await operator.until("document.querySelector('#plots-all').hidden", False)
     await over.dblclick()
     await operator.until("document.querySelector('#plots-all').hidden", True)
+
+
+async def test_no_path_is_drawn_over_a_time_of_which_nothing_is_known(operator: Operator) -> None:
+    begun = "window.drawn.texts.length === 77 ? window.drawn.begun : 0"
+    await operator.until("document.querySelector('#pose-xy').textContent.endsWith(' m')", True)
+    await operator.until("window.drawn.texts.length", 77)
+    without = await operator.page.evaluate(begun)
+    for t_s in (0.0, 1.0, 2.0, 3.0, 20.0, 21.0):
+        operator.rig.main.send("track", track(t_s, 0.05 * min(t_s, 4.0) - 0.1 + 0.001 * t_s))
+    await operator.until(begun, without + 2)
+    await operator.page.reload()
+    await operator.until(begun, without + 2)
 
 
 async def test_the_page_thins_its_rows_as_the_server_does(operator: Operator) -> None:
