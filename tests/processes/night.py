@@ -39,7 +39,7 @@ signal = "edge_front_left"
 type = "stuck"
 value = 0.0
 at_s = {edge_s}
-for_s = 0.3
+for_s = 3.0
 """
 BATTERY = """
 [[fault]]
@@ -151,7 +151,7 @@ def locked(database: Path) -> Iterator[None]:
 
 def spend(night: Night) -> None:
     """The six faults, and the morning."""
-    with night.session(PLAN.format(link_s=130.0, edge_s=155.0)) as run:
+    with night.session(PLAN.format(link_s=115.0, edge_s=150.0)) as run:
         run.until_state("driving", done=2)
         laser, silent_s = run.child("etalon"), time.monotonic()
         laser.send_signal(SIGSTOP)
@@ -161,8 +161,8 @@ def spend(night: Night) -> None:
         laser.send_signal(SIGCONT)
         night.note("the laser system works again")
         night.resume(run)
-        night.acknowledge(night.await_alarm(run, "frame", "robot"))
-        night.acknowledge(night.await_alarm(run, "panel", "edge", "rim"))
+        night.acknowledge(night.await_alarm(run, "no sensors frame", "frames were lost"))
+        night.acknowledge(night.await_alarm(run, "panel", "edge sensor", "rim"))
         run.until(lambda status: status["state"] in {"driving", "turning"})
         with locked(night.run_dir / "mission.sqlite"):
             night.note("the disk does not answer")
