@@ -1,6 +1,7 @@
 """``ccatp runs``: which runs are here, how they ended, and what is in their directories."""
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,10 @@ FILES = {
     "alarms.jsonl": "what happened to the alarms",
     "config.toml": "the exact configuration",
     "checkpoint": "state of a mission that can be resumed",
+    "faults.toml": "faults that were injected",
+    "origin.json": "whether it was simulated",
+    "emergencies.json": "emergencies that are latched",
+    "robot": "where the simulated robot stands",
 }
 # The line that says how a run ended is among the last ones of its log.
 _LAST_BYTES = 65_536
@@ -63,7 +68,11 @@ def show(run_dir: Path, json_output: bool) -> None:
         return
     print_lines(f"{name:<15} {value}" for name, value in facts.items() if value != "")
     click.echo()
-    print_lines(f"{name:<24} {size / 1e6:10.3f} MB  {FILES.get(name, '')}".rstrip() for name, size in files.items())
+    print_lines(
+        f"{name:<24} {size / 1e6:10.3f} MB  {FILES.get(re.sub(r'[.]\d+[.]mcap$', '.mcap', name), '')}".rstrip()
+        for name, size in files.items()
+        if not name.startswith(".") and not name.endswith(".new")  # the program's own
+    )
 
 
 def _facts(run_dir: Path) -> dict[str, Any]:

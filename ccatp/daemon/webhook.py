@@ -52,7 +52,7 @@ class AlarmWebhook:
         self._cfg, self._run, self._log = cfg, run, log
         self._alarms: dict[str, Alarm] = {}
         self._waiting: deque[AlarmPost] = deque()
-        self._left_out = 0
+        self._left_out, self._has_begun = 0, False
         self._changed, self._is_over = threading.Condition(), False
         self._thread = threading.Thread(target=self._work, name="webhook", daemon=True)
         if cfg.webhook_url:
@@ -63,6 +63,10 @@ class AlarmWebhook:
         if not self._cfg.webhook_url or status is None:
             return
         alarms = {alarm.name: alarm for alarm in status.alarms}
+        if not self._has_begun:
+            # What is over already was posted by the session that it was in.
+            self._has_begun = True
+            self._alarms = {name: alarm for name, alarm in alarms.items() if alarm.ended}
         if alarms == self._alarms:
             return
         with self._changed:

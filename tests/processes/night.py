@@ -8,6 +8,7 @@ posts of the webhook. The folder gets the run, ``posts.jsonl``, and ``night.md``
 
 import argparse
 import json
+import re
 import shutil
 import sqlite3
 import subprocess
@@ -187,10 +188,19 @@ def spend(night: Night) -> None:
         night.note(f"the survey ended with {run.wait(400.0)}")
 
 
+HEAD = """# A night with six faults
+
+A survey of three panels on the wall clock, simulated: the laser system was silent for a minute, the link to the robot broke for 6 s, an edge sensor
+saw nothing for 3 s, the database could not be written, the observatory reported the weather, the battery got low. This is what the alarms, their
+history and the posts of the webhook say of it the next morning. `python -m tests.processes.night FOLDER` spends such a night and writes this page;
+`make test-slow` checks one.
+"""
+
+
 def morning(night: Night) -> str:
     """What the night left, as Markdown."""
     (night.folder / "posts.jsonl").write_text("".join(json.dumps(post) + "\n" for post in night.posts.bodies))
-    lines = ["# A night with six faults", "", "## What the operator did", ""]
+    lines = [HEAD, "## What happened and what the operator did (UTC)", ""]
     lines += [f"* {at} {text}" for at, text in night.diary]
     lines += ["", "## `ccatp alarms history`", "", "```", ccatp("alarms", "history", night.run_dir).rstrip(), "```"]
     lines += ["", "## Posts of the webhook", "", "| event | alarm | state | cause |", "|---|---|---|---|"]
@@ -199,7 +209,8 @@ def morning(night: Night) -> str:
         for post in night.posts.bodies
     ]
     lines += ["", "## `ccatp runs show`", "", "```", ccatp("runs", "show", night.run_dir).rstrip(), "```", ""]
-    return "\n".join(lines)
+    text = "\n".join(lines).replace(str(night.run_dir), "runs/night")
+    return re.sub(r"127\.0\.0\.1:\d+", "127.0.0.1:2001", text)
 
 
 def main() -> int:
