@@ -425,9 +425,11 @@ MISSION_TOO_LONG = fault(Group.BEACONS, "the mission takes longer than mission.t
     "The robot is held where it is.", "`ccatp abort` leads it home; or a longer time in the configuration.")
 
 FIX_NOT_STORED = fault(Group.STORAGE, "the fix of {point} cannot be stored: {why}",
-    "The database refused or the disk is full.", "Make room; `ccatp resume` measures that point again.")
+    "The disk is full or broken, or another program locks the database.",
+    "Make room, or end that program; `ccatp resume` measures the point again. Once a write has failed nothing more is "
+    "written: `ccatp stop`, then `ccatp run --resume`.")
 SKIP_NOT_STORED = fault(Group.STORAGE, "that {point} is skipped cannot be stored: {why}",
-    "The same of a point that was given up.", "Make room; `ccatp resume`.")
+    "The same of a point that was given up.", "As above.")
 DISK_STALLS = fault(Group.STORAGE, "the disk stalls: {point} is not stored after {time_s:g} s",
     "The disk does not answer.", "The disk; `ccatp resume` when it is back.")
 

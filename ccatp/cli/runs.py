@@ -26,6 +26,7 @@ FILES = {
     "emergencies.json": "emergencies that are latched",
     "robot": "where the simulated robot stands",
 }
+_PART = re.compile(r"\.\d+\.mcap$")  # of the recording: one for each session
 # The line that says how a run ended is among the last ones of its log.
 _LAST_BYTES = 65_536
 
@@ -69,7 +70,7 @@ def show(run_dir: Path, json_output: bool) -> None:
     print_lines(f"{name:<15} {value}" for name, value in facts.items() if value != "")
     click.echo()
     print_lines(
-        f"{name:<24} {size / 1e6:10.3f} MB  {FILES.get(re.sub(r'[.]\d+[.]mcap$', '.mcap', name), '')}".rstrip()
+        f"{name:<24} {size / 1e6:10.3f} MB  {FILES.get(_PART.sub('.mcap', name), '')}".rstrip()
         for name, size in files.items()
         if not name.startswith(".") and not name.endswith(".new")  # the program's own
     )

@@ -209,7 +209,7 @@ class MissionStore:
 
         Returns resolves to the number of the fix after the commit (await it with ``asyncio.wrap_future``). Fails with
         ``AlreadyMeasuredError``, ``StoreRefusal`` (not finite, a covariance not of nine values, or no point of this
-        mission) or, where nothing will be stored any more, another ``StoreError``.
+        mission) or another ``StoreError``: another program locks the file, or nothing will be stored any more.
         """
         return self._submit(lambda db: _insert_fix(db, point, fix, estimate))
 
@@ -274,7 +274,7 @@ class MissionStore:
         self._db.close()
 
     def _commit(self, job: _Job) -> Any:
-        """Raises ``StoreRefusal`` where the store can go on, another ``StoreError`` where it cannot."""
+        """Raises ``StoreRefusal``, or another ``StoreError``; the store can go on unless ``failure`` is set."""
         if self.failure is not None:
             raise self.failure
         try:
@@ -284,6 +284,9 @@ class MissionStore:
         except Exception as error:
             name = getattr(error, "sqlite_errorname", "")
             reason = f"{error} ({name})" if name else f"{type(error).__name__}: {error}"
+            if name.startswith("SQLITE_BUSY") and not self._db.in_transaction:
+                # It has not begun, so the next one may be stored.
+                raise StoreError(f"{self.path}: locked by another program: {reason}") from error
             if self._is_rolled_back():
                 if isinstance(error, StoreRefusal):
                     raise

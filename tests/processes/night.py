@@ -190,10 +190,10 @@ def spend(night: Night) -> None:
 
 HEAD = """# A night with six faults
 
-A survey of three panels on the wall clock, simulated: the laser system was silent for a minute, the link to the robot broke for 6 s, an edge sensor
-saw nothing for 3 s, the database could not be written, the observatory reported the weather, the battery got low. This is what the alarms, their
-history and the posts of the webhook say of it the next morning. `python -m tests.processes.night FOLDER` spends such a night and writes this page;
-`make test-slow` checks one.
+A survey of three panels on the wall clock, simulated: the laser system was silent for a minute, the link to the robot
+broke for 6 s, an edge sensor saw nothing for 3 s, the database could not be written, the observatory reported the
+weather, the battery got low. This is what the alarms, their history and the posts of the webhook say of it the next
+morning. `python -m tests.processes.night FOLDER` spends such a night and writes this page; `make test-slow` checks one.
 """
 
 

@@ -17,8 +17,14 @@ SIX = {
     "the weather": "emergency",
     "the battery": "battery_low",
 }
-IN_REPORT = ("no reply to laserready", "no sensors frame", "edge sensor|off the panel", "cannot be stored", "wind 25 m/s",
-             "battery has to last")  # fmt: skip
+IN_REPORT = (
+    "no reply to laserready",
+    "no sensors frame",
+    "edge sensor|off the panel",
+    "cannot be stored",
+    "wind 25 m/s",
+    "battery has to last",
+)
 
 
 @pytest.mark.slow

@@ -236,6 +236,18 @@ def test_arrivals_give_way_to_fixes_when_the_disk_is_full(path: Path) -> None:
     assert select(path, "SELECT * FROM arrivals") == []
 
 
+def test_a_lock_of_another_program_is_no_end(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "BUSY_TIMEOUT_S", 0.05)
+    make(path).close()
+    with MissionStore.open(path, mirror="fyst-m1") as db:
+        with closing(sqlite3.connect(path, isolation_level=None)) as other:
+            other.execute("BEGIN EXCLUSIVE")
+            with pytest.raises(StoreError, match=r"locked by another program: database is locked \(SQLITE_BUSY\)"):
+                db.record_fix(PANEL[0], a_fix(), POSE).result(timeout=5.0)
+        assert db.failure is None
+        assert db.record_fix(PANEL[0], a_fix(), POSE).result(timeout=5.0) == 1
+
+
 def test_a_surprise_in_the_writer_ends_the_store(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def surprise(*_: object) -> int:
         raise RuntimeError("surprise")
