@@ -37,12 +37,20 @@ from ccatp.sim.robot import Robot
 _SAME_STEP = 1e-6  # times of steps and frames are equal to within rounding
 
 
+def _hardware_class(cfg: Config) -> type[SimulatedHardware]:
+    if cfg.sim.robot.physics != "mujoco":
+        return SimulatedHardware
+    from ccatp.sim.physics import PhysicsHardware  # noqa: PLC0415 - its package is optional
+
+    return PhysicsHardware
+
+
 class MotorRobot(OnboardRobot, SurveyTruth):
     """A simulated survey robot with motors under the on-board core, just booted; simulated time."""
 
     def __init__(self, cfg: Config, onboard: OnboardConfig, start: DeckPose | None = None) -> None:
         servo, sim = onboard.servo, cfg.sim.robot
-        hardware = SimulatedHardware(
+        hardware = _hardware_class(cfg)(
             cfg, build_mirror(cfg.mirror), np.random.default_rng(cfg.run.seed), start,
             loop_hz=servo.loop_hz, counts_per_rev=servo.counts_per_rev,
         )  # fmt: skip
@@ -173,7 +181,7 @@ async def serve(
         else:
             body = None if body_file is None else SimPoseFile(body_file)
             start = body.read() if body is not None and is_resuming else None
-            if cfg.sim.robot.wheels == "motors":
+            if cfg.sim.robot.physics != "lag":
                 robot = motor_robot(cfg, start)
             else:
                 robot = survey_robot(cfg, faults, start)

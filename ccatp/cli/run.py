@@ -35,6 +35,12 @@ FOXGLOVE_PORT = 8765
 @PANELS_OPTION
 @key_option("--filter", "run.filter", metavar="NAME", help="State estimator: kf, ekf or ukf.")
 @click.option("--realtime", is_flag=True, help="Pace the simulation on the wall clock.")
+@key_option(
+    "--physics",
+    "sim.robot.physics",
+    metavar="NAME",
+    help="Simulated robot: lag, motors or mujoco (extra ccatp[physics]).",
+)
 @click.option("--run-dir", type=PATH, help="Where to write; runs/<time>-<mirror>-s<seed> if not given.")
 @click.option(
     "--resume", is_flag=True, help="Resume the mission in --run-dir, or the only one in ./runs that is not complete."

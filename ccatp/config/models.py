@@ -397,11 +397,21 @@ class SimRobotConfig(Model):
     encoder_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
     edge_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
     gravity_hz: Annotated[float, Field(gt=0.0, le=100.0)]
-    wheels: Literal["lag", "motors"]
+    physics: Literal["lag", "motors", "mujoco"]
     wheel_lag_s: Positive
     fan_floor: Annotated[float, Field(ge=0.0, le=1.0)]  # used on an overhanging mirror
     gravity_sigma_rad: NonNegative
     fall_thrust_s: Positive
+
+
+class PhysicsConfig(Model):
+    """The body of the robot with real physics (``sim.robot.physics = "mujoco"``)."""
+
+    friction: Annotated[float, Field(gt=0.0, le=2.0)]
+    tyre: Literal["round", "flat"]
+    mass_kg: Annotated[float, Field(gt=0.2, le=10.0)]
+    thrust_n: NonNegative
+    rotor_inertia_kg_m2: NonNegative
 
 
 class SimEtalonConfig(Model):
@@ -426,6 +436,7 @@ class SimConfig(Model):
 
     open_to_network: bool
     robot: SimRobotConfig
+    physics: PhysicsConfig
     etalon: SimEtalonConfig
     truth: SimTruthConfig
 

@@ -1,5 +1,6 @@
 """THE process table, and one run of it: start of the children, supervision, summary."""
 
+import importlib.util
 import json
 import os
 import resource
@@ -271,6 +272,8 @@ def run_survey(options: RunOptions) -> int:
 def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
     options = with_origin(options)
     permit_open_files()
+    if options.sim and isinstance(cfg, Config):
+        _check_physics(cfg.sim.robot.physics, has_faults=options.faults_file is not None)
     # The processes read the files of these again; here they are refused before anything has begun.
     check_observatory(cfg.observatory)
     read_key(cfg.robot.key_file, must_be_private=not options.sim)
@@ -308,6 +311,14 @@ def _run(options: RunOptions, cfg: Config | RadioConfig) -> int:
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
         return SupervisedRun(options, cfg, run_dir, Endpoints(runtime_dir), sockets, locks, page, started_s).run()
+
+
+def _check_physics(physics: str, *, has_faults: bool) -> None:
+    """ConfigError: what the simulated robot needs is not there, before a process of its own finds out."""
+    if has_faults and physics != "lag":
+        raise ConfigError(f'--faults: plans are for sim.robot.physics = "lag", not for "{physics}"')
+    if physics == "mujoco" and importlib.util.find_spec("mujoco") is None:
+        raise ConfigError(f'sim.robot.physics = "{physics}": {physics} is not installed; pip install ccatp[physics]')
 
 
 def permit_open_files() -> None:

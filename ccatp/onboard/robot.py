@@ -53,7 +53,6 @@ class OnboardRobot(LinkedRobot):
         self.voltages_v = 0.0, 0.0
         self.late_steps = self.dropped_samples = 0
         self._control_s: float | None = None
-        self._commanded_duty: tuple[float, float] | None = None
         self._soc, self._stall = 1.0, ""
         self._line = b""
         # Samples that no frame has held yet.
@@ -62,7 +61,7 @@ class OnboardRobot(LinkedRobot):
         self._edge: list[tuple[float, int, int, int, int]] = []
         self._gravity: tuple[float, float, float, float] | None = None
         # The duties of before are in force; the floor comes with the first command.
-        self.fans.duty = hardware.fans()
+        self.fans.duty = self._duty_in_force = hardware.fans()
 
     def describe(self) -> RobotData:
         """See ``LinkedRobot``."""
@@ -145,12 +144,11 @@ class OnboardRobot(LinkedRobot):
 
     def _write_fans(self) -> None:
         duty = self.fans.duty
-        if self._commanded_duty is None or duty == self._commanded_duty:
-            self._commanded_duty = duty  # those that were read back at the start are in force already
+        if duty == self._duty_in_force:
             return
         try:
             self._hardware.command_fans(*duty)
-            self._commanded_duty = duty
+            self._duty_in_force = duty
         except HardwareError as error:
             self.faults["fan_left"] = self.faults["fan_right"] = str(error)
 

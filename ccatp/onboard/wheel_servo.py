@@ -63,9 +63,8 @@ class WheelServo:
         ahead_rad = self._ahead_rad + way_rad
         wanted_v = cfg.volt_per_rad_s * reference + cfg.proportional_v_per_rad_s * (reference - self.rate_rad_s)
         wanted_v += cfg.integral_v_per_rad * ahead_rad
-        direction = reference or (ahead_rad if abs(ahead_rad) > 2.0 * self._rad_per_count else 0.0)
-        if direction:
-            wanted_v += copysign(cfg.static_v, direction)
+        if reference:  # at rest friction is on the side of the brake
+            wanted_v += copysign(cfg.static_v, reference)
         most_v = cfg.slew_v_s * dt_s
         voltage_v = min(max(wanted_v, self.voltage_v - most_v), self.voltage_v + most_v)
         voltage_v = min(max(voltage_v, -cfg.max_v), cfg.max_v)

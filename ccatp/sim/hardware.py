@@ -24,7 +24,7 @@ from ccatp.sim.plant import downhill
 from ccatp.sim.sensors import EdgeTuple, GravityTuple, ImuTuple, SensorSuite
 from ccatp.sim.world import World
 
-_G_M_S2 = 9.771  # at latitude -22.99 deg, 5,612 m
+GRAVITY_M_S2 = 9.771  # at latitude -22.99 deg, 5,612 m
 _MASS_KG = 1.0
 _EPSILON_S = 1e-9
 
@@ -97,12 +97,11 @@ class SimulatedHardware:
         cfg = cfg.model_copy(update={"sim": cfg.sim.model_copy(update={"robot": sim_robot})})
         world_rng, sensors_rng = rng.spawn(2)
         self._motor, self._mirror = motor, mirror
-        window = max(1, round(cfg.etalon.measuring_time_s * loop_hz))
-        self.world = World(cfg, mirror, world_rng, window, start=start)
+        self._loop_hz, self._per_rad = loop_hz, counts_per_rev / (2.0 * pi)
+        self.world = self._make_world(cfg, world_rng, start)
         self._sensors = SensorSuite(cfg, mirror, sensors_rng, lag_s=self.world.wheels.lag_s)
         self._sensors.edges.place(self.world.plant)
         self.world.sensors = self._sensors.edges
-        self._loop_hz, self._per_rad = loop_hz, counts_per_rev / (2.0 * pi)
         floor_duty = sim_robot.fan_floor if mirror.overhang else 0.0
         self._duty = (floor_duty, floor_duty)
         self.wheel_radius_m = cfg.robot.wheel_radius_m
@@ -113,6 +112,11 @@ class SimulatedHardware:
         self.voltages_v = (0.0, 0.0)
         self.faults: dict[str, str] = {}
         self.timer_calls = 0
+
+    def _make_world(self, cfg: Config, rng: np.random.Generator, start: DeckPose | None) -> World:
+        """The truth, stepped at the rate of the loop."""
+        window = max(1, round(cfg.etalon.measuring_time_s * self._loop_hz))
+        return World(cfg, self._mirror, rng, window, start=start)
 
     def start(self) -> None:
         """See ``Hardware``."""
@@ -144,7 +148,7 @@ class SimulatedHardware:
         t_s, dt_s = (self._step - 1) / self._loop_hz, 1.0 / self._loop_hz
         ahead, _, _ = downhill(self.world.plant, self._mirror.gravity_deck)
         ahead = 0.0 if self._is_lifted else ahead
-        load_nm = -0.5 * _MASS_KG * _G_M_S2 * ahead * self.wheel_radius_m
+        load_nm = -0.5 * _MASS_KG * GRAVITY_M_S2 * ahead * self.wheel_radius_m
         right, left = (self._motor.steady_rad_s(voltage_v, load_nm) for voltage_v in self.voltages_v)
         self.world.step(t_s, dt_s, right, left, 0.5 * (self._duty[0] + self._duty[1]))
 

@@ -32,7 +32,7 @@ class World:
         grip: share of its travel that each wheel gives to the body, right and left, besides its slip; may be set
             before a step.
         sensors: the edge sensors, for their clearance in the truth rows.
-        fall: why the robot fell, ``rim`` or ``thrust``; empty while it has not.
+        fall: why the robot fell, ``rim``, ``thrust`` or ``grip``; empty while it has not.
     """
 
     def __init__(
@@ -116,6 +116,10 @@ class World:
         self._measure_rim()
         if self._rim_bound_m < 0.0:
             self._fall("rim")
+
+    def lose_grip(self) -> None:
+        """It has left the surface."""
+        self._fall("grip")
 
     def _fall(self, why: str) -> None:
         self.is_fallen, self.fall = True, self.fall or why

@@ -192,6 +192,13 @@ def test_fans_keep_the_duty_that_was_in_force_and_change_by_command_alone() -> N
     assert bench.hardware.fans() == (0.6, 0.9)
 
 
+def test_duties_that_come_before_the_first_step_are_set() -> None:
+    bench = Bench()
+    assert bench.robot.command_fans(1, 0.8, 0.7)
+    bench.run(STEP_S)
+    assert bench.hardware.fans() == (0.8, 0.7)
+
+
 def test_a_fan_that_cannot_be_set_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench()
 

@@ -1,0 +1,225 @@
+"""The robot as a rigid body on the mirror, with tyres, motors and fans: MuJoCo, an optional package.
+
+Deck frame, SI. A body of 1 kg stands on two driven wheels and a smooth caster behind them, on a height field of the
+mirror. Contacts have Coulomb friction (elliptic cone); the tyres are round (they touch in a point) or flat. Each wheel
+has the geared DC motor of ``ccatp.sim.hardware``: torque kt (V - ke w)/R less friction. The fans press along the
+robot's own normal. Gravity is that of the mirror's inclination. Nothing is random: a run depends on its commands alone,
+besides what the sensors draw.
+
+Slip, creep, load and loss of grip come out of the contacts, so the disturbances of the kinematic worlds are not used.
+"""
+
+from math import atan2
+from typing import Any
+
+import numpy as np
+
+from ccatp.config.models import Config, PhysicsConfig
+from ccatp.core import DeckPose, FloatArray
+from ccatp.errors import ConfigError
+from ccatp.mirror.mirror import Mirror
+from ccatp.sim.hardware import GRAVITY_M_S2, Motor, SimulatedHardware
+from ccatp.sim.plant import Plant
+from ccatp.sim.world import World
+
+_CELL_M = 0.015  # of the height field: between its nodes the mirror departs from it by 3 um
+_MARGIN_M = 0.3  # beyond the rim
+_BASE_M = 0.1  # thickness of the height field
+_TYRE_M = 0.012  # width of a flat tyre
+_AVERAGED = 5  # steps: what the inertial unit takes the mean of
+
+_MODEL = """
+<mujoco model="survey robot">
+  <option timestep="{timestep}" integrator="implicitfast" cone="elliptic" noslip_iterations="4" impratio="10"
+          gravity="{gravity}"/>
+  <default><geom solref="0.004 1" solimp="0.95 0.99 0.0005" condim="4"/></default>
+  <asset><hfield name="mirror" nrow="{rows}" ncol="{columns}" size="{half_x} {half_y} {height} {base}"/></asset>
+  <worldbody>
+    <geom name="mirror" type="hfield" hfield="mirror" pos="{centre_x} {centre_y} {low}"
+          friction="{friction} 0.002 0.0001"/>
+    <body name="robot">
+      <freejoint/>
+      <geom type="box" size="0.09 0.06 0.015" pos="-0.015 0 0.035" mass="{chassis_kg}" contype="0" conaffinity="0"/>
+      <geom name="caster" type="sphere" size="0.012" pos="-0.075 0 0.012" mass="0.02" friction="0.02 0 0" priority="1"/>
+      <site name="centre"/>
+      {wheels}
+    </body>
+  </worldbody>
+  <actuator><motor joint="right"/><motor joint="left"/></actuator>
+</mujoco>
+"""
+_WHEEL = """
+      <body name="{name}" pos="0 {y} {radius}">
+        <joint name="{name}" type="hinge" axis="0 1 0" damping="{damping}" frictionloss="{friction_nm}"
+               armature="{armature}"/>
+        {tyre}
+      </body>"""
+_ROUND = (
+    '<geom type="ellipsoid" size="{radius} {radius} 0.004" euler="90 0 0" mass="0.04" '
+    'friction="{friction} 0.001 0.0001" priority="2"/>'
+)
+_FLAT = (
+    '<geom type="cylinder" size="{radius} {half}" euler="90 0 0" mass="0.04" '
+    'friction="{friction} 0.001 0.0001" priority="2"/>'
+)
+
+
+class PhysicsPlant(Plant):
+    """The body; ``step`` takes motor voltages in the place of set points.
+
+    Attributes:
+        thrust_n: of the fans, along the robot's normal, towards the surface.
+        has_left: it no longer touches the mirror.
+    """
+
+    def __init__(self, cfg: Config, mirror: Mirror, start: DeckPose, motor: Motor, step_s: float) -> None:
+        """``step_s``: of the control loop, and of the physics."""
+        robot = cfg.robot
+        super().__init__(
+            mirror.surface, start, wheel_radius_m=robot.wheel_radius_m, wheel_base_m=robot.wheel_base_m, wheel_lag_s=1.0
+        )
+        try:
+            import mujoco  # noqa: PLC0415 - an optional package, of hundreds of megabytes
+        except ImportError as error:
+            raise ConfigError(
+                'sim.robot.physics = "mujoco": the package mujoco is not installed; pip install ccatp[physics]'
+            ) from error
+        self._mujoco: Any = mujoco
+        self._motor, self._step_s = motor, step_s
+        self._mirror, self._surface = mirror, mirror.surface
+        self._model = self._build(cfg.sim.physics, robot.wheel_radius_m, robot.wheel_base_m)
+        self._data = mujoco.MjData(self._model)
+        self._body = self._model.body("robot").id
+        self.thrust_n = 0.0
+        self.has_left = False
+        self._speeds = [0.0] * (_AVERAGED + 1)
+        self._acceleration_m_s2 = self._rate_rad_s = 0.0
+        self.place(start.x_m, start.y_m, start.heading_rad)
+        self.are_wheels_still = False
+
+    def _build(self, cfg: PhysicsConfig, radius_m: float, base_m: float) -> Any:
+        low_xy, high_xy = (np.asarray(self._mirror.rim.vertices)).min(axis=0), self._mirror.rim.vertices.max(axis=0)
+        centre, half = 0.5 * (low_xy + high_xy), 0.5 * (high_xy - low_xy) + _MARGIN_M
+        columns, rows = (int(np.ceil(2.0 * one / _CELL_M)) + 1 for one in half)
+        xs, ys = (np.linspace(c - h, c + h, n) for c, h, n in zip(centre, half, (columns, rows), strict=True))
+        grid_x, grid_y = np.meshgrid(xs, ys)
+        heights_m = self._surface.heights_m(grid_x.ravel(), grid_y.ravel()).reshape(rows, columns)
+        low_m, height_m = float(heights_m.min()), float(np.ptp(heights_m)) or 1e-3
+        motor = self._motor
+        damping = motor.volt_per_rad_s / motor.volt_per_nm
+        tyre = (_FLAT if cfg.tyre == "flat" else _ROUND).format(
+            radius=radius_m, half=0.5 * _TYRE_M, friction=cfg.friction
+        )
+        wheels = "".join(
+            _WHEEL.format(
+                name=name, y=y, radius=radius_m, tyre=tyre, damping=damping, friction_nm=motor.friction_nm,
+                armature=cfg.rotor_inertia_kg_m2,
+            )
+            for name, y in (("right", -0.5 * base_m), ("left", 0.5 * base_m))
+        )  # fmt: skip
+        model = self._mujoco.MjModel.from_xml_string(
+            _MODEL.format(
+                timestep=self._step_s,
+                gravity=" ".join(f"{GRAVITY_M_S2 * one:.9g}" for one in self._mirror.gravity_deck),
+                rows=rows, columns=columns, half_x=half[0], half_y=half[1], height=height_m, base=_BASE_M,
+                centre_x=centre[0], centre_y=centre[1], low=low_m, friction=cfg.friction,
+                chassis_kg=cfg.mass_kg - 0.1, wheels=wheels,
+            )
+        )  # fmt: skip
+        model.hfield_data[:] = ((heights_m - low_m) / height_m).ravel()
+        return model
+
+    # -- motion -------------------------------------------------------------------------------------------------------
+
+    def step(self, t_s: float, dt_s: float, right_set_rad_s: float, left_set_rad_s: float) -> None:
+        """Advance by ``dt_s`` with constant voltages of the (right, left) motor, V."""
+        data, motor = self._data, self._motor
+        data.ctrl[:] = right_set_rad_s / motor.volt_per_nm, left_set_rad_s / motor.volt_per_nm
+        self._right_angle_0, self._left_angle_0 = self.right_angle_rad, self.left_angle_rad
+        x, y, heading_rad = self.x_m, self.y_m, self.heading_rad
+        data.xfrc_applied[self._body, :3] = -self.thrust_n * data.xmat[self._body].reshape(3, 3)[:, 2]
+        self._mujoco.mj_step(self._model, data)
+        self._read_state()
+        dx, dy = self.x_m - x, self.y_m - y
+        self.forward_m, self.left_m, self.turn_rad = (
+            dx * self.hx + dy * self.hy,
+            dx * self.lx + dy * self.ly,
+            (self.heading_rad - heading_rad),
+        )
+        # Rest is never exact: what is below a micrometre a step is none to the edge sensors, until it adds up.
+        self.is_moving = True
+
+    def _read_state(self) -> None:
+        data = self._data
+        rotation: FloatArray = data.xmat[self._body].reshape(3, 3)
+        x, y, z = data.xpos[self._body].tolist()
+        self.x_m, self.y_m = x, y
+        self.z_m, self.fx, self.fy, *_ = self._surface.jet(x, y)
+        self.has_left = z - self.z_m > 0.03
+        (e1x, _, e1z), (e2x, e2y, e2z), _ = self._surface.axes(x, y)
+        ax, ay, az = rotation[:, 0].tolist()
+        heading = atan2(ax * e2x + ay * e2y + az * e2z, ax * e1x + az * e1z)
+        turned = (heading - self.heading_rad + np.pi) % (2.0 * np.pi) - np.pi
+        self.heading_rad += turned
+        self._turn_axes()
+        right, left = data.qpos[7:9].tolist()
+        self.right_angle_rad, self.left_angle_rad = right, left
+        self.right_rad_s, self.left_rad_s = data.qvel[6:8].tolist()
+        speed = float(rotation[:, 0] @ data.qvel[:3])
+        self._speeds = [*self._speeds[1:], speed]
+        self._acceleration_m_s2 = (self._speeds[-1] - self._speeds[0]) / (_AVERAGED * self._step_s)
+        self._rate_rad_s = float(data.qvel[5])
+
+    @property
+    def slip_m_s(self) -> tuple[float, float]:
+        """Speed of the body along and across the robot less what the wheels give, m/s."""
+        rotation = self._data.xmat[self._body].reshape(3, 3)
+        velocity = self._data.qvel[:3]
+        rolled = 0.5 * self._radius_m * (self.right_rad_s + self.left_rad_s)
+        return float(rotation[:, 0] @ velocity) - rolled, float(rotation[:, 1] @ velocity)
+
+    def acceleration_at(self, decay: float) -> float:
+        """Acceleration along robot x over the last steps, m/s^2."""
+        return self._acceleration_m_s2
+
+    def turn_rate_at(self, decay: float) -> float:
+        """Angular rate about robot z, rad/s."""
+        return self._rate_rad_s
+
+    def place(self, x_m: float, y_m: float, heading_rad: float) -> None:
+        """Put the body, at rest, elsewhere on the surface, deck frame."""
+        pose = DeckPose(x_m, y_m, heading_rad)
+        axes = np.array(self._mirror.robot_axes(pose)).T
+        quaternion = np.zeros(4)
+        self._mujoco.mju_mat2Quat(quaternion, axes.ravel())
+        data = self._data
+        data.qpos[:3] = self._surface.point(x_m, y_m)
+        data.qpos[3:7] = quaternion
+        data.qvel[:] = 0.0
+        self._mujoco.mj_forward(self._model, data)
+        self.heading_rad = heading_rad
+        self._read_state()
+
+    def stop_dead(self) -> None:
+        """Nothing moves any more (the robot fell)."""
+        self._data.qvel[:] = 0.0
+        super().stop_dead()
+
+
+class PhysicsHardware(SimulatedHardware):
+    """The devices of a robot with real physics."""
+
+    def _make_world(self, cfg: Config, rng: np.random.Generator, start: DeckPose | None) -> World:
+        world = super()._make_world(cfg, rng, start)
+        self.plant = PhysicsPlant(cfg, self._mirror, world.start_pose, self._motor, 1.0 / self._loop_hz)
+        world.plant = self.plant
+        self._full_thrust_n = cfg.sim.physics.thrust_n
+        return world
+
+    def _move(self) -> None:
+        t_s, dt_s = (self._step - 1) / self._loop_hz, 1.0 / self._loop_hz
+        duty = 0.5 * (self._duty[0] + self._duty[1])
+        self.plant.thrust_n = duty * self._full_thrust_n
+        self.world.step(t_s, dt_s, *self.voltages_v, duty)
+        if self.plant.has_left:
+            self.world.lose_grip()
