@@ -6,6 +6,7 @@ each change of the timer's line, and brakes ``devices.timer.timeout_s`` after th
 """
 
 import argparse
+import itertools
 import os
 import select
 import signal
@@ -48,6 +49,7 @@ class Program:
         )
         os.close(timer_end)
         self.changed_s = 0.0
+        self._rates_rad_s = itertools.cycle((1.0, -1.0))
         self.events: list[tuple[str, float]] = []
         self.is_said = threading.Condition()
         assert self.process.stdout is not None
@@ -67,6 +69,10 @@ class Program:
     def _read_timer(self) -> None:
         while os.read(self.timer, 1 << 16):
             self.changed_s = time.monotonic()
+
+    def next_rate_rad_s(self) -> float:
+        """Forwards and backwards by turns, so that it stays where it is."""
+        return next(self._rates_rad_s)
 
     def after(self, word: str, since_s: float) -> float:
         """When the wheels were ``word`` for the first time after a time."""
@@ -118,7 +124,8 @@ class Program:
 class Driver:
     """A controller that sends the same drive each 10 ms until it is told to stop."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, rate_rad_s: float) -> None:
+        self._rate_rad_s = rate_rad_s
         self.socket = socket.create_connection(("127.0.0.1", port))
         self.socket.sendall(encode(Join(role="controller", client="driver")))
         self._is_stopped = threading.Event()
@@ -130,7 +137,7 @@ class Driver:
         while not self._is_stopped.wait(0.01):
             seq += 1
             with suppress(ConnectionError):  # the program is dead
-                self.socket.sendall(format_drive(seq, 0, 1.0, 1.0))
+                self.socket.sendall(format_drive(seq, 0, self._rate_rad_s, self._rate_rad_s))
                 while select.select((self.socket,), (), (), 0.0)[0] and self.socket.recv(1 << 16):
                     pass
 
@@ -143,7 +150,7 @@ class Driver:
 def driving(program: Program) -> Iterator[Driver]:
     """A controller that drives, and whose robot turns its wheels."""
     start_s = time.monotonic()
-    driver = Driver(program.port)
+    driver = Driver(program.port, program.next_rate_rad_s())
     try:
         program.after("free", start_s)
         time.sleep(0.2)
