@@ -51,6 +51,13 @@ def frames(recording: Recording) -> list[Sensors]:
 
 
 @pytest.fixture(scope="module")
+def truth(recording: Recording, frames: list[Sensors]) -> Trace:
+    found = recording.truth()  # of the messages that were read
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
 def estimates(recording: Recording, mirror: Mirror, frames: list[Sensors]) -> Trace:
     return recording.recorded(mirror)
 
@@ -82,11 +89,9 @@ def stamp_ns(message: Any) -> int:
 
 
 def test_every_sample_is_a_message_of_its_own(
-    bag: Path, recording: Recording, frames: list[Sensors], estimates: Trace
+    bag: Path, recording: Recording, frames: list[Sensors], estimates: Trace, truth: Trace
 ) -> None:
     recorded = Counter(topic for _, (topic, *_) in iter_logged(recording.path))
-    truth = recording.truth()
-    assert truth is not None
     assert Counter(topic for topic, *_ in messages(bag)) == {
         "/imu": sum(len(frame.imu) for frame in frames),
         "/joint_states": sum(len(frame.enc) for frame in frames),
@@ -141,9 +146,7 @@ def test_odometry_is_the_recorded_estimate_with_the_covariance_of_the_replay(
     np.testing.assert_allclose((ahead, left, up), last, atol=1e-12)
 
 
-def test_the_twist_is_that_of_the_path(bag: Path, recording: Recording) -> None:
-    truth = recording.truth()
-    assert truth is not None
+def test_the_twist_is_that_of_the_path(bag: Path, truth: Trace) -> None:
     speed_m_s = np.linalg.norm(np.diff(truth.place, axis=0), axis=1) / np.diff(truth.t_s)
     turn_rad_s = np.diff(np.unwrap(truth.pose[:, 2])) / np.diff(truth.t_s)
     found = [one.twist for *_, one in messages(bag, "/odom")]
