@@ -2,6 +2,7 @@
 
 import csv
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,7 @@ def test_fixes_are_those_of_the_database(survey: Path) -> None:
     for name, unit in UNITS.items():
         assert table[name].unit == unit
     assert (table["row"].dtype, table["x_m"].dtype, table["status"].dtype.kind) == (np.int64, np.float64, "U")
-    with sqlite3.connect(survey / "mission.sqlite") as db:
+    with closing(sqlite3.connect(survey / "mission.sqlite")) as db:
         points = db.execute("SELECT row, col, point, status FROM points ORDER BY row, col, point").fetchall()
         fixes = db.execute(f"SELECT row, col, point, {', '.join(FIX)} FROM fixes").fetchall()
     assert [tuple(row) for row in table["row", "col", "point", "status"]] == points
