@@ -13,7 +13,7 @@ SIX = {
     "the laser system": "measurements_failed",
     "the link": "no_frame|frames_lost",
     "the edge sensor": "edge|off_the_panel",
-    "the disk": "fix_not_stored",
+    "the disk": "fix_not_stored|disk_stalls",  # both limits are 30 s
     "the weather": "emergency",
     "the battery": "battery_low",
 }
@@ -21,7 +21,7 @@ IN_REPORT = (
     "no reply to laserready",
     "no sensors frame",
     "edge sensor|off the panel",
-    "cannot be stored",
+    "cannot be stored|disk stalls",
     "wind 25 m/s",
     "battery has to last",
 )
