@@ -12,6 +12,7 @@ import msgspec
 import structlog
 
 from ccatp.config.models import AlarmsConfig
+from ccatp.daemon.alarms import utc_now
 from ccatp.links.topics import Alarm, MissionStatus
 
 # Posts that wait; of more the oldest are left out, and the next post says how many.
@@ -45,6 +46,15 @@ def changes(before: dict[str, Alarm], after: dict[str, Alarm]) -> list[tuple[str
     return found + [("ended", old) for name, old in before.items() if name not in after and not old.ended]
 
 
+def _posted_before(alarms: dict[str, Alarm], started: str) -> dict[str, Alarm]:
+    """What an earlier session of the run has posted; an end since this one ``started`` (UTC) has not been posted."""
+    return {
+        name: alarm if alarm.ended < started else msgspec.structs.replace(alarm, ended="")
+        for name, alarm in alarms.items()
+        if alarm.since < started
+    }
+
+
 class AlarmWebhook:
     """Posts the changes of the list of alarms; does nothing where no address is configured."""
 
@@ -52,7 +62,7 @@ class AlarmWebhook:
         self._cfg, self._run, self._log = cfg, run, log
         self._alarms: dict[str, Alarm] = {}
         self._waiting: deque[AlarmPost] = deque()
-        self._left_out, self._has_begun = 0, False
+        self._left_out, self._has_begun, self._started = 0, False, utc_now()
         self._changed, self._is_over = threading.Condition(), False
         self._thread = threading.Thread(target=self._work, name="webhook", daemon=True)
         if cfg.webhook_url:
@@ -64,9 +74,8 @@ class AlarmWebhook:
             return
         alarms = {alarm.name: alarm for alarm in status.alarms}
         if not self._has_begun:
-            # What is over already was posted by the session that it was in.
             self._has_begun = True
-            self._alarms = {name: alarm for name, alarm in alarms.items() if alarm.ended}
+            self._alarms = _posted_before(alarms, self._started)
         if alarms == self._alarms:
             return
         with self._changed:

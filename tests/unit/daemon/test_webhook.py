@@ -112,6 +112,20 @@ def test_a_post_that_is_not_taken_comes_again_in_order(server: Server, monkeypat
     assert server.bodies[0]["alarm"]["cause"] == "weak"
 
 
+def test_a_resumed_run_posts_what_changed_since_it_began_again(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(webhook, "utc_now", lambda: "2026-11-26T05:00:00Z")
+    hook = hook_to(server.server_address[1])
+    before, after = "2026-11-26T04:00:00Z", "2026-11-26T05:00:01Z"
+    over, lasting = alarm("over", since=before, ended=before), alarm("lasting", since=before)
+    ended = alarm("ended", since=before, ended=after)
+    hook.update(status(over, lasting, ended, alarm("new", since=after)))
+    hook.update(status(over, alarm("lasting", since=before, ended=after), ended))
+    until(server, 4)
+    hook.close(PATIENCE_S)
+    found = [(body["event"], body["alarm"]["name"]) for body in server.bodies]
+    assert found == [("ended", "ended"), ("raised", "new"), ("ended", "lasting"), ("ended", "new")]
+
+
 def test_a_refusal_is_logged_and_the_next_one_is_posted(server: Server) -> None:
     server.answers.append(404)
     with capture_logs() as logs:
