@@ -22,6 +22,7 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.files import read_key, write_durably
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
+from ccatp.daemon.alarms import AlarmList
 from ccatp.daemon.child_processes import (
     PageSocket,
     ProcessEnd,
@@ -130,7 +131,7 @@ class SupervisedRun:
         self._is_interrupted = self._has_begun = False
         self._service = Service(*take_from(os.environ))
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
-        self._webhook = AlarmWebhook(cfg.alarms, run_dir.name, self._log)
+        self._webhook = AlarmWebhook(cfg.alarms, run_dir.name, self._log, AlarmList(run_dir, self._log).alarms)
         self._view = RunView(cfg, is_sim=options.sim, run_dir=run_dir, verbosity=options.verbosity)
 
     def run(self) -> int:

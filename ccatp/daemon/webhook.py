@@ -5,6 +5,7 @@ import time
 import urllib.error
 import urllib.request
 from collections import deque
+from collections.abc import Iterable
 from contextlib import suppress
 from http import HTTPStatus
 
@@ -12,7 +13,6 @@ import msgspec
 import structlog
 
 from ccatp.config.models import AlarmsConfig
-from ccatp.daemon.alarms import utc_now
 from ccatp.links.topics import Alarm, MissionStatus
 
 # Posts that wait; of more the oldest are left out, and the next post says how many.
@@ -46,23 +46,19 @@ def changes(before: dict[str, Alarm], after: dict[str, Alarm]) -> list[tuple[str
     return found + [("ended", old) for name, old in before.items() if name not in after and not old.ended]
 
 
-def _posted_before(alarms: dict[str, Alarm], started: str) -> dict[str, Alarm]:
-    """What an earlier session of the run has posted; an end since this one ``started`` (UTC) has not been posted."""
-    return {
-        name: alarm if alarm.ended < started else msgspec.structs.replace(alarm, ended="")
-        for name, alarm in alarms.items()
-        if alarm.since < started
-    }
-
-
 class AlarmWebhook:
-    """Posts the changes of the list of alarms; does nothing where no address is configured."""
+    """Posts the changes of the list of alarms; does nothing where no address is configured.
 
-    def __init__(self, cfg: AlarmsConfig, run: str, log: structlog.typing.FilteringBoundLogger) -> None:
+    ``known``: the list as an earlier session of the run left it, which has posted it.
+    """
+
+    def __init__(
+        self, cfg: AlarmsConfig, run: str, log: structlog.typing.FilteringBoundLogger, known: Iterable[Alarm] = ()
+    ) -> None:
         self._cfg, self._run, self._log = cfg, run, log
-        self._alarms: dict[str, Alarm] = {}
+        self._alarms = {alarm.name: alarm for alarm in known}
         self._waiting: deque[AlarmPost] = deque()
-        self._left_out, self._has_begun, self._started = 0, False, utc_now()
+        self._left_out = 0
         self._changed, self._is_over = threading.Condition(), False
         self._thread = threading.Thread(target=self._work, name="webhook", daemon=True)
         if cfg.webhook_url:
@@ -73,9 +69,6 @@ class AlarmWebhook:
         if not self._cfg.webhook_url or status is None:
             return
         alarms = {alarm.name: alarm for alarm in status.alarms}
-        if not self._has_begun:
-            self._has_begun = True
-            self._alarms = _posted_before(alarms, self._started)
         if alarms == self._alarms:
             return
         with self._changed:
