@@ -86,8 +86,16 @@ class DriveGate:
             self._last = HELD
             return 0.0, 0.0
         dt_s, last = min(dt_s, MAX_STEP_S), self._last
-        v = _slewed(last.v_m_s, v, self._v_step + self._a * dt_s, self._v_max)
-        omega = _slewed(last.omega_rad_s, omega, self._omega_step + self._alpha * dt_s, self._omega_max)
+        v_step, omega_step = self._v_step + self._a * dt_s, self._omega_step + self._alpha * dt_s
+        # Away from zero a rate may change by a step only, towards zero at once.
+        if v > 0.0:
+            v = min(v, max(last.v_m_s, 0.0) + v_step, self._v_max)
+        else:
+            v = max(v, min(last.v_m_s, 0.0) - v_step, -self._v_max)
+        if omega > 0.0:
+            omega = min(omega, max(last.omega_rad_s, 0.0) + omega_step, self._omega_max)
+        else:
+            omega = max(omega, min(last.omega_rad_s, 0.0) - omega_step, -self._omega_max)
         self._last = allowed = Twist(v, omega)
         right, left = wheel_rates(allowed, self._radius, self._base)
         if abs(right) > self._max_wheel or abs(left) > self._max_wheel:
@@ -125,15 +133,6 @@ def _judge_direction(v: float, omega: float, verdict: Verdict, purpose: Purpose)
         return Denial.EDGE
     forward, reverse, turn = v <= 0.0 or verdict.forward, v >= 0.0 or verdict.reverse, omega == 0.0 or verdict.turn
     return None if forward and reverse and turn else Denial.NOT_PERMITTED
-
-
-def _slewed(last: float, wanted: float, step: float, limit: float) -> float:
-    """``wanted`` clamped to the limit; away from zero it may change by ``step`` only, towards zero at once."""
-    if wanted > 0.0:
-        highest = last + step if last > 0.0 else step
-        return min(wanted, highest, limit)
-    lowest = last - step if last < 0.0 else -step
-    return max(wanted, lowest, -limit)
 
 
 class FanGate:
