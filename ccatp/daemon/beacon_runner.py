@@ -30,6 +30,7 @@ from ccatp.links.topics import (
     BeaconMapMessage,
     BeaconTrack,
     DisplayState,
+    EstimateMessage,
     MissionStatus,
     RobotShape,
     Scene,
@@ -169,7 +170,8 @@ class BeaconRunner(MissionRunner):
         seq, t_s, mission, telemetry = frame.sensors.seq, frame.sensors.t, self.mission, self.telemetry
         belief = mission.navigator.belief
         if frame.is_estimate_due:
-            telemetry.send_estimate(seq, t_s, belief.pose, belief.sigma_m, mission.state.mode)
+            state = mission.state.mode.value
+            telemetry.send("estimate", EstimateMessage(*belief.pose, belief.sigma_m, state, seq=seq, t_s=t_s))
             self._trail.append(belief.pose[:2])
         self._collect_echoes(belief.pose)
         if t_s >= self._map_due_s:

@@ -23,6 +23,7 @@ from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import (
     ArrivalMessage,
     DisplayState,
+    EstimateMessage,
     MissionStatus,
     Rest,
     TrackMessage,
@@ -406,9 +407,9 @@ class SurveyRunner(MissionRunner):
         seq, t_s, telemetry, localizer = frame.sensors.seq, frame.sensors.t, self.telemetry, self._localizer
         pose, sigma_m = localizer.pose, localizer.position_sigma_m
         if frame.is_estimate_due:
-            deck, mode = localizer.deck_pose, self.mission.state.mode
+            deck, state, commanded = localizer.deck_pose, self.mission.state.mode.value, self._sent_commands
             place = deck.x_m, deck.y_m, deck.heading_rad
-            telemetry.send_estimate(seq, t_s, place, sigma_m, mode, *self._sent_commands)
+            telemetry.send("estimate", EstimateMessage(*place, sigma_m, state, *commanded, seq=seq, t_s=t_s))
         row = seq + telemetry.frames_before, t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, sigma_m
         telemetry.add_frame(seq, t_s, frame.raw, row)
         if self._checkpoint.is_due():

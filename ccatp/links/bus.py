@@ -33,18 +33,13 @@ MAX_MESSAGE_BYTES = 1 << 20
 HIGH_WATER_MARK = 50_000
 # A subscriber comes up before its publisher; it should not miss the first messages for long.
 RECONNECT_MS = 10
-_encoder = msgspec.json.Encoder()
+_encode = msgspec.json.Encoder().encode
 _decoders = {topic.name.encode(): (topic.name, msgspec.json.Decoder[Any](topic.message)) for topic in TOPICS}
 _prefixes = {topic.name: topic.name.encode() + b" " for topic in TOPICS}
 
 
 class BadMessage(Exception):
     """A frame on the bus that is not of the topic table."""
-
-
-def pack(name: str, message: Message | Verdict) -> bytes:
-    """One frame: topic, space, JSON."""
-    return _prefixes[name] + _encoder.encode(message)
 
 
 def unpack(frame: bytes) -> tuple[str, bytes, Message | Verdict]:
@@ -72,8 +67,8 @@ class Publisher:
         self._subscribed: set[str] = set()
 
     def send(self, name: str, message: Message | Verdict) -> None:
-        """Publish one message."""
-        self._socket.send(pack(name, message), zmq.DONTWAIT)
+        """Publish one message: topic, space, JSON."""
+        self._socket.send(_prefixes[name] + _encode(message), zmq.DONTWAIT)
 
     def has_subscriber(self, name: str) -> bool:
         """Whether a subscription to a topic has arrived; what is published before is lost to it."""
@@ -411,31 +406,6 @@ class Telemetry:
         self._lines.append(msgspec.Raw(raw))
         if len(self._lines) >= BATCH_FRAMES:
             self.flush()
-
-    def send_estimate(
-        self,
-        seq: int,
-        t_s: float,
-        pose: tuple[float, float, float],
-        sigma_m: float,
-        state: str,
-        commanded: tuple[float, float, float, float] | None = None,
-        drive_seq: int = -1,
-    ) -> None:
-        """Publish the pose, m and rad, for the danger loop; the rest as of ``EstimateMessage``."""
-        x_m, y_m, heading_rad = pose
-        estimate = EstimateMessage(
-            seq=seq,
-            t_s=t_s,
-            x_m=x_m,
-            y_m=y_m,
-            heading_rad=heading_rad,
-            sigma_m=sigma_m,
-            state=str(state),
-            commanded=commanded,
-            drive_seq=drive_seq,
-        )
-        self.send("estimate", estimate)
 
     def flush(self, least_age_s: float = 0.0) -> None:
         """Publish the batches where the last time is at least so long ago."""

@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from ccatp.core import EventCode, Verdict
@@ -15,7 +16,7 @@ from ccatp.errors import ConfigError
 from ccatp.links import channels, multiline, topics
 from ccatp.links import robot_codec as robot
 from ccatp.links.auth import read_clients
-from ccatp.links.bus import BadMessage, pack, unpack
+from ccatp.links.bus import BadMessage, unpack
 from ccatp.links.robot_codec import LineBuffer, LineTooLong
 from ccatp.links.robot_messages import Sensors
 from ccatp.sim.fault_plan import parse_plan
@@ -200,10 +201,10 @@ def _bus() -> list[bytes]:
     )
     track = topics.TrackMessage(seq=1, t_s=0.1, rows=[(1, 0.1, 1, 2, 0.1, 0.2, 0.3, 0.001)])
     return [
-        pack("heartbeat.main", presence),
-        pack("estimate", estimate),
-        pack("track", track),
-        pack("verdict", VERDICT),
+        b"heartbeat.main " + msgspec.json.encode(presence),
+        b"estimate " + msgspec.json.encode(estimate),
+        b"track " + msgspec.json.encode(track),
+        b"verdict " + msgspec.json.encode(VERDICT),
     ]
 
 

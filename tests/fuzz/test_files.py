@@ -18,7 +18,6 @@ import tomlkit
 from ccatp.config.load import dump_config, load_config
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.errors import ConfigError
-from ccatp.links.bus import pack
 from ccatp.links.topics import TOPICS, FixMessage, Rest, SensorLines, TrackMessage, schema_of
 from ccatp.records.recorder import Recorder, iter_messages
 from ccatp.records.run_reader import RunReadError, open_run
@@ -171,7 +170,7 @@ def sound_recording(folder: Path) -> bytes:
         "track": TrackMessage(seq=12, t_s=0.12, rows=[(12, 0.12, 1, 1, 0.0, 0.0, 0.0, 0.001)]),
     }
     for name, message in messages.items():
-        recorder.write(name, 0.12, pack(name, message).split(b" ", 1)[1])
+        recorder.write(name, 0.12, msgspec.json.encode(message))
     recorder.close()
     return path.read_bytes()
 

@@ -16,7 +16,6 @@ from ccatp.config.load import dump_config, load_config
 from ccatp.core import PanelId
 from ccatp.errors import ConfigError
 from ccatp.filters.base import FilterDiverged
-from ccatp.links.bus import pack
 from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import ArrivalMessage, Message, Rest, SensorLines, TrackMessage, TruthMessage
@@ -50,7 +49,7 @@ def record(run_dir: Path, messages: list[tuple[str, Message]], **metadata: str) 
     run_dir.mkdir(exist_ok=True)
     recorder = recorder_in(run_dir, metadata)
     for name, message in messages:
-        recorder.write(name, message.t_s, pack(name, message).partition(b" ")[2])
+        recorder.write(name, message.t_s, msgspec.json.encode(message))
     recorder.close()
     return recorder.path
 

@@ -16,7 +16,6 @@ from ccatp.commissioning.calibration import Calibration, CalibrationError, calib
 from ccatp.commissioning.calibration_drive import DriveBuilder, RecordedDrive, WheelParameters, carry
 from ccatp.config.load import dump_config, load_config
 from ccatp.core import Fix, FloatArray
-from ccatp.links.bus import pack
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import TOPICS, FixMessage, SensorLines, schema_of
@@ -84,12 +83,12 @@ def record(run_dir: Path, driven: CalibrationDrive) -> Path:
             covariance_m2=list(fix.covariance_m2), dop=fix.dop, residual_rms_m=fix.residual_rms_m,
             channels=list(fix.channels), jump_mm=0.0,
         )  # fmt: skip
-        recorder.write("fix", fix.t_s, pack("fix", message).partition(b" ")[2])
+        recorder.write("fix", fix.t_s, msgspec.json.encode(message))
     for begin in range(0, len(driven.frames), 100):
         frames = driven.frames[begin : begin + 100]
         lines = [msgspec.Raw(encode(frame).strip()) for frame in frames]
         batch = SensorLines(seq=frames[-1].seq, t_s=frames[-1].t, lines=lines)
-        recorder.write("sensors", batch.t_s, pack("sensors", batch).partition(b" ")[2])
+        recorder.write("sensors", batch.t_s, msgspec.json.encode(batch))
     recorder.close()
     return run_dir
 
