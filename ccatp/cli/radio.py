@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,78 +23,17 @@ from ccatp.cli.common import (
     warn,
 )
 from ccatp.cli.radio_levels import calibrate, fix, fuzzy
-from ccatp.errors import CcatpError, ExitStatus
 
 if TYPE_CHECKING:
     from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun
-    from ccatp.config.beacon_models import CricketConfig, RecordingsConfig
+    from ccatp.config.beacon_models import CricketConfig
 
 FILTERS = ("ekf-slam", "smoother")
 FORMAT_OPTION = click.option(
-    "--format", "data_format", type=click.Choice(("plaza", "mrclam", "labyrinth", "csv")),
+    "--format", "data_format", type=click.Choice(("plaza", "mrclam", "labyrinth", "csv", "bag")),
     help="Format of the data; found out if not given.",
 )  # fmt: skip
 ASSUMED_OPTION = settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
-
-
-class SlamCommandError(CcatpError):
-    """A part that is not installed, or data of which an estimator makes nothing."""
-
-    exit_status = ExitStatus.USAGE
-
-
-def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "EstimatedPath":
-    """A run through one of ``FILTERS``.
-
-    Raises SlamCommandError: the data drove the estimator beyond finite numbers, or leave it without an answer.
-    """
-    from time import perf_counter
-
-    from numpy.linalg import LinAlgError
-
-    from ccatp.beacons.datasets.checks import survey_doubts
-    from ccatp.beacons.slam.batch_smoother import smooth
-    from ccatp.beacons.slam.causal import filter_run
-    from ccatp.filters.base import FilterError
-
-    cfg = getattr(assumed, run.kind)
-    try:
-        find = smooth if filter_name == "smoother" else filter_run
-        track = find(run, cfg, assumed.filter, perf_counter)
-        if run.truth is not None:
-            return track
-        places_m = {name: (fix.x_m, fix.y_m) for name, fix in track.beacons.items()}
-        return track._replace(warnings=(*track.warnings, *survey_doubts(places_m, run.beacon_truth_m)))
-    except (FilterError, LinAlgError) as error:
-        raise SlamCommandError(
-            f"{run.name}: {filter_name} finds no finite map for these data ({str(error)[:80]}); look at its warnings"
-        ) from error
-
-
-def compared(run: "RecordedRun", assumed: "RecordingsConfig", peers: bool) -> list[dict[str, Any]]:
-    """A row for each of our estimators, and for GTSAM's if asked for; without figures where GTSAM gave up."""
-    from time import perf_counter
-
-    from ccatp.beacons.slam.evaluation import row, row_without
-    from ccatp.studies.gtsam_peer import PeerGaveUp, import_gtsam, run_gtsam
-
-    if peers:
-        import_gtsam()  # before the work
-    rows = []
-    for name in FILTERS:
-        begin_s = perf_counter()
-        track = estimate(run, assumed, name)
-        rows.append(row(run, name, track, perf_counter() - begin_s))
-    if peers:
-        try:
-            found = run_gtsam(run, getattr(assumed, run.kind), perf_counter)
-        except PeerGaveUp as error:
-            warn([str(error)])
-            return [*rows, *(row_without(run.name, f"GTSAM {name}", gave_up=True) for name in ("iSAM2", "batch"))]
-        rows.append(row(run, "GTSAM iSAM2", found.isam2, float(found.isam2.update_s.sum()), peer=True))
-        # it starts from what iSAM2 ended with, so that its time is not a run's
-        rows.append(row(run, "GTSAM batch", found.batch, None, peer=True))
-    return rows
 
 
 @click.command(
@@ -113,77 +52,65 @@ def compared(run: "RecordedRun", assumed: "RecordingsConfig", peers: bool) -> li
 )  # fmt: skip
 @CONFIG_OPTION
 @ASSUMED_OPTION
-@figure_option("Draw map and path")
+@click.option("--topics", "topics_file", type=PATH, help="Of a ROS bag: a TOML file that names its topics.")
+@figure_option("Draw map, path and residuals")
+@click.option(
+    "--tum", "tum_file", type=OutputFile(), help="Write the path as evo reads it; the truth to NAME_truth beside it."
+)
 @click.option("--peers", is_flag=True, help="All our estimators and GTSAM's side by side; needs ccatp[peers].")
 @JSON_OPTION
 def slam(
     path: Path, data_format: str | None, robot: int | None, filter_name: str, config_file: Path | None,
-    settings: Mapping[str, object], figure_file: Path | None, peers: bool, json_output: bool,
+    settings: Mapping[str, object], topics_file: Path | None, figure_file: Path | None, tum_file: Path | None,
+    peers: bool, json_output: bool,
 ) -> None:  # fmt: skip
     """Map the beacons of a recorded run and find the vehicle's path on that map.
 
-    PATH is a file or folder of the formats Plaza, MRCLAM, Labyrinth, or a CSV of events (docs/radio_data.md).
+    PATH is a file or folder of the formats Plaza, MRCLAM, Labyrinth, a CSV of events, or a ROS bag
+    (docs/radio_data.md).
     """
     from ccatp.beacons.datasets.reader import read_run
     from ccatp.beacons.slam.evaluation import judge, markdown, result_data, table_lines
+    from ccatp.beacons.slam.track_review import review_lines, reviewed
     from ccatp.config.load import load_recordings_config
+    from ccatp.studies.recordings import compared, estimate
 
     assumed = load_recordings_config(config_file, settings)
-    run = read_run(path, data_format, robot)
+    run = read_run(path, data_format, robot, topics_file)
     warn(run.warnings)
     track = estimate(run, assumed, filter_name)
     warn(track.warnings)
     judged = judge(track, run)
-    data: dict[str, Any] = result_data(run, filter_name, track, judged)
+    data: dict[str, Any] = result_data(run, filter_name, track, judged) | reviewed(
+        run, track, getattr(assumed, run.kind).radio
+    )
+    if tum_file is not None:
+        _write_tum(tum_file, run, track)
     if figure_file is not None:
         from ccatp.report.beacon_plots import draw_slam
 
         draw_slam(run, track, judged, figure_file, f"{run.name}, {filter_name}")
     if peers:
-        data["peers"] = compared(run, assumed, peers=True)
+        data["peers"] = compared(run, assumed, warn)
     if json_output:
         click.echo(json.dumps(data, allow_nan=False))
         return
-    print_lines(table_lines(run, data))
+    print_lines((*table_lines(run, data), *review_lines(data)))
     if peers:
         print_lines(("", *markdown(data["peers"])))
 
 
-@click.command(
-    epilog=example(
-        "ccatp radio compare recordings/Plaza2_.mat recordings/MRCLAM_Dataset7",
-        "ccatp radio compare recordings/Plaza2_.mat --peers",
-    )
-)
-@click.argument("paths", nargs=-1, required=True, type=PATH)
-@FORMAT_OPTION
-@click.option("--robot", type=click.IntRange(min=1), metavar="N", help="Robot of MRCLAM sets; else all there.")
-@click.option("--peers", is_flag=True, help="GTSAM (iSAM2, batch) on the same input as well; needs ccatp[peers].")
-@CONFIG_OPTION
-@ASSUMED_OPTION
-@JSON_OPTION
-def compare(
-    paths: Sequence[Path], data_format: str | None, robot: int | None, peers: bool, config_file: Path | None,
-    settings: Mapping[str, object], json_output: bool,
-) -> None:  # fmt: skip
-    """Run all estimators over recorded runs: a table of their errors and times, side by side."""
-    from ccatp.beacons.datasets.reader import read_run, robots_of
-    from ccatp.beacons.slam.evaluation import markdown, with_means
-    from ccatp.config.load import load_recordings_config
+def _write_tum(file: Path, run: "RecordedRun", track: "EstimatedPath") -> None:
+    import numpy as np
 
-    assumed = load_recordings_config(config_file, settings)
-    rows: list[dict[str, Any]] = []
-    for path in paths:
-        found: list[dict[str, Any]] = []
-        for one in robots_of(path, data_format) if robot is None else [robot]:
-            run = read_run(path, data_format, one)
-            complain(f"{run.name} ...", 0)
-            found += compared(run, assumed, peers)
-        rows += with_means(found, f"{path.resolve().name}, mean")
-    if json_output:
-        click.echo(json.dumps({"rows": rows}, allow_nan=False))
-    else:
-        print_lines(markdown(rows))
+    from ccatp.beacons.slam.track_review import tum_lines
+
+    paths = {file: (track.times_s, track.poses)}
+    if run.truth is not None:
+        truth = np.column_stack([run.truth.x_m, run.truth.y_m, np.nan_to_num(run.truth.heading_rad)])
+        paths[file.with_stem(f"{file.stem}_truth")] = run.truth.times_s, truth
+    for one, (times_s, poses) in paths.items():
+        one.write_text("\n".join(tum_lines(times_s, poses, run.antenna_m)) + "\n", encoding="utf-8")
 
 
 @click.command(
@@ -312,5 +239,5 @@ def radio() -> None:
     """Robots among radio beacons: mapping them, finding the way by them."""
 
 
-for command in (slam, calibrate, fix, fuzzy, radio_map, compare):
+for command in (slam, calibrate, fix, fuzzy, radio_map):
     radio.add_command(command)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,8 @@ class _StudyCommand(click.Command):
 @click.option("--mirror", "mirrors", multiple=True, metavar="NAME", help="In place of the study's. May be repeated.")
 @PANELS_OPTION
 @key_option("--seed", "run.seed", type=int, metavar="N", help="Seed of the first run.")
+@key_option("--data", "run.data", metavar="DIR", help="Folder of recorded runs, for recordings and damage.")
+@click.option("--peers", is_flag=True, help="Other people's estimators, too: GTSAM, which needs ccatp[peers].")
 @CONFIG_OPTION
 @SETTINGS_OPTION
 @click.option("--no-figures", is_flag=True, help="Tables only.")
@@ -65,13 +68,13 @@ class _StudyCommand(click.Command):
 def study(
     name: str, out: Path | None, runs: int | None, workers: int | None, cluster: str | None, shard: str | None,
     others: Sequence[Path], only: Sequence[str], mirrors: Sequence[str], config_file: Path | None,
-    settings: Mapping[str, object], no_figures: bool, json_output: bool,
+    settings: Mapping[str, object], peers: bool, no_figures: bool, json_output: bool,
 ) -> int:  # fmt: skip
     """Run the study NAME: many missions or an analysis, with tables, figures and a machine-readable result."""
     from ccatp.studies import limit_threads
 
     limit_threads()  # before numpy is imported
-    from ccatp.config.load import load_config, load_radio_config
+    from ccatp.config import load as loaders
     from ccatp.studies import find_study
     from ccatp.studies.campaign import WHOLE, CampaignError, Study, parse_choice, parse_shard
     from ccatp.studies.engine import CampaignOptions, run_campaign
@@ -84,7 +87,11 @@ def study(
             others=tuple(others), mirrors=tuple(mirrors), only=dict(parse_choice(text) for text in only),
             settings=settings, with_figures=not no_figures,
         )  # fmt: skip
-        load = load_radio_config if found.is_radio else load_config
+        if peers:
+            if found.with_peers is None:
+                raise CampaignError(f"study {name} has no peers; leave --peers out")
+            found = replace(found, cells=found.with_peers)
+        load = getattr(loaders, found.loader)
         result = run_campaign(found, lambda keys: load(config_file, keys), options)
     else:
         idle = {"--cluster": cluster, "--shard": shard, "--from": others, "--only": only, "--mirror": mirrors}
@@ -92,7 +99,7 @@ def study(
             raise CampaignError(f"study {name} has no runs to hand out; leave {surplus[0]} out")
         if runs or workers:
             click.echo(f"ccatp: study {name} is one analysis: --runs and --workers change nothing", err=True)
-        result = _analysed(found, load_config(config_file, settings), out)
+        result = _analysed(found, loaders.load_config(config_file, settings), out)
     print_lines([json.dumps(result) if json_output else (out / "table.md").read_text(encoding="utf-8").rstrip()])
     return 0
 

@@ -550,9 +550,17 @@ class SlamFilterConfig(Model):
     turn_bias_walk_rad_s_sqrt_s: NonNegative
 
 
+class RecordingsRunConfig(Model):
+    """What the studies of recorded runs are made of."""
+
+    seed: Annotated[int, Field(ge=0)]
+    data: str
+
+
 class RecordingsConfig(Model):
     """All formats."""
 
+    run: RecordingsRunConfig
     plaza: RecordingConfig
     mrclam: RecordingConfig
     labyrinth: RecordingConfig

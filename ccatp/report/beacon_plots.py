@@ -15,6 +15,7 @@ from ccatp.beacons.slam.evaluation import TrackEvaluation, aligned_beacons, trut
 from ccatp.beacons.slam.level_fix import LevelFix
 from ccatp.beacons.slam.path_loss import LevelPair, PathLossFit
 from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun, dead_reckoned
+from ccatp.beacons.slam.track_review import range_residuals
 from ccatp.beacons.steering import Sugeno
 from ccatp.config.beacon_models import FuzzyConfig
 from ccatp.core import FloatArray
@@ -200,6 +201,7 @@ def _draw_traces(axes: "Axes", traces: Traces) -> None:
 WIDTH_PX, DPI = 1800, 180
 SIGMAS = 3.0  # of the ellipses
 POSE_ELLIPSES = 24  # along the path
+_BEACON_COLOURS = (_BLUE, _GOLD, _GREEN, _RED, "#b5478a", "#6b7785", "#7a3e00", "#4c9be8")
 _TRUTH, _PATH, _MAP, _RECKONED = "#8fa3b8", "#1d6fa5", "#d5703f", "#d9c9a8"
 
 
@@ -218,7 +220,10 @@ def draw_slam(run: RecordedRun, track: EstimatedPath, judged: TrackEvaluation, o
     half[0] = max(half[0], half[1] / 1.1)  # no picture is much taller than wide,
     half[1] = max(half[1], half[0] * 0.35)  # nor a stripe
     known = bool(np.isfinite(judged.errors_m).any())
+    residuals_m = range_residuals(run, track)
+    has_residuals = bool(np.isfinite(residuals_m).any())
     heights = [(WIDTH_PX / DPI - 0.8) * float(half[1] / half[0]), *([1.1] if known else [])]
+    heights += [1.6] if has_residuals else []
     figure = new_figure(WIDTH_PX / DPI, sum(heights) + 1.8, DPI)
     figure.suptitle(title, x=0.02, ha="left", fontsize=14, color=INK)
     panels = figure.subplots(len(heights), height_ratios=heights, squeeze=False)[:, 0]
@@ -247,7 +252,23 @@ def draw_slam(run: RecordedRun, track: EstimatedPath, judged: TrackEvaluation, o
         panels[1].plot(t, judged.errors_m, color=_PATH, linewidth=0.8, label="error")
         top = 1.15 * max(float(np.nanmax(judged.errors_m)), 1e-6)
         panels[1].set(xlim=(0.0, t[-1]), ylim=(0.0, top), xlabel="time, s", ylabel="error, m")
+    if has_residuals:
+        _draw_residuals(panels[-1], run, residuals_m, float(track.times_s[0]), float(track.times_s[-1]))
     save_figure(figure, out)
+
+
+def _draw_residuals(axes: "Axes", run: RecordedRun, residuals_m: FloatArray, begin_s: float, end_s: float) -> None:
+    """Range residuals by time, a colour for each beacon; those far off stand at the edge."""
+    limit = 1.2 * max(float(np.nanpercentile(np.abs(residuals_m), 99)), 1e-6)
+    for k, name in enumerate(run.beacon_ids):
+        own = (run.readings.beacon == k) & np.isfinite(residuals_m)
+        if own.any():
+            shade = _BEACON_COLOURS[k % len(_BEACON_COLOURS)]
+            shown = np.clip(residuals_m[own], -limit, limit)
+            axes.plot(run.readings.times_s[own] - begin_s, shown, ".", color=shade, markersize=2.5, label=name)
+    axes.set(xlim=(0.0, end_s - begin_s), ylim=(-1.02 * limit, 1.02 * limit), xlabel="time, s")
+    axes.set_ylabel("range residual, m")
+    axes.legend(frameon=False, fontsize=7, ncols=8, markerscale=3.0, loc="upper left", bbox_to_anchor=(0.0, -0.3))
 
 
 def _draw_paths(

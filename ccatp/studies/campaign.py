@@ -11,14 +11,14 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 import ccatp
-from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.beacon_models import RadioConfig, RecordingsConfig
 from ccatp.config.models import Config
 from ccatp.errors import CcatpError, ExitStatus
 
 Factor = str | int | float | bool
 Factors = Mapping[str, Factor]
 Arrays = Mapping[str, NDArray[Any]]
-AnyConfig = Config | RadioConfig
+AnyConfig = Config | RadioConfig | RecordingsConfig
 # Dotted keys, stronger than the configuration file, to a configuration.
 Load = Callable[[Mapping[str, object]], AnyConfig]
 
@@ -62,7 +62,7 @@ class Job:
     study: str
     factors: Factors
     seed: int
-    cfg: Any  # a Config, or a RadioConfig where the study's is_radio is set
+    cfg: Any  # what the study's loader gives
 
     @property
     def key(self) -> str:
@@ -104,9 +104,10 @@ class Study:
     defaults: Mapping[str, object] = field(default_factory=dict)
     mirrors: tuple[str, ...] = ("thesis-m1",)  # crossed with the cells; empty where these choose the mirror
     runs: int = 20  # seeds of each cell, by default
-    is_radio: bool = False  # its configurations are those of robots among radio beacons
+    loader: str = "load_config"  # of its configurations, in ``ccatp.config.load``
     # What was published of a cell: ``printed`` in its result.
     published: Callable[[Factors], Mapping[str, Any]] | None = None
+    with_peers: Callable[[], Sequence[Cell]] | None = None  # its cells with those of other people's programs
     name: str = ""  # both as in the table of studies, see ``find_study``
     title: str = ""
 

@@ -235,5 +235,5 @@ STUDY = Study(
     defaults={"system": "cricket"},
     mirrors=(),
     runs=50,
-    is_radio=True,
+    loader="load_radio_config",
 )

@@ -234,7 +234,9 @@ def _draw_errors(results: Sequence[CellResult], name: str, label: str, keys: Seq
         panels[0].set_ylabel(label)
 
 
-RadioStudy = partial(Study, run_job=run_job, combine=combine, columns=COLUMNS, mirrors=(), runs=50, is_radio=True)
+RadioStudy = partial(
+    Study, run_job=run_job, combine=combine, columns=COLUMNS, mirrors=(), runs=50, loader="load_radio_config"
+)
 
 # -- radio-signals ----------------------------------------------------------------------------------------------------
 

@@ -74,7 +74,7 @@ def test_the_commands_are_those_of_the_contract_the_map_and_the_conformance() ->
         "keys", "keys generate", "keys show-public", "clear", "align", "plan", "report", "compare",
         "recording", "recording export", "recording info", "recording repair",
         "stream", "calibrate", "check", "completion", "onboard", "onboard tune",
-        "radio", "radio slam", "radio compare", "radio calibrate", "radio fix", "radio fuzzy", "radio map",
+        "radio", "radio slam", "radio calibrate", "radio fix", "radio fuzzy", "radio map",
     }  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.beacons.slam.evaluation import judge, row_without, with_means
+from ccatp.beacons.slam.evaluation import judge
 from ccatp.cli import main
 from ccatp.config.load import load_recordings_config
 from ccatp.config.package import configs_dir
@@ -103,8 +103,10 @@ def test_the_table_names_what_was_found(tmp_path: Path, capsys: pytest.CaptureFi
     out = said(capsys, "radio", "slam", tmp_path, "--robot", "3", "--filter", "smoother")[1]
     for word in ("robot 3 (mrclam): 30 s", "smoother: ", "m rms, heading", "turn_scale", "NEES"):
         assert word in out
-    rows = [line.split() for line in out.splitlines()[-len(BEACONS) :]]
-    assert {row[0] for row in rows} == set(BEACONS)
+    places, residuals, advice = (part.splitlines() for part in out.split("\n\n")[-3:])
+    for rows in (places, residuals):
+        assert {row.split()[0] for row in rows[1:]} == set(BEACONS)
+    assert advice[0].startswith("measure next: beacon ")
 
 
 @pytest.mark.parametrize(
@@ -135,7 +137,7 @@ def test_an_estimator_that_finds_nothing(
     def diverging(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("ccatp.beacons.slam.causal.filter_run", diverging)
+    monkeypatch.setattr("ccatp.studies.recordings.filter_run", diverging)
     assert main(["radio", "slam", str(recording)]) == 2
     assert f"mine: ekf-slam finds no finite map for these data ({error})" in capsys.readouterr().err.splitlines()[-1]
 
@@ -187,8 +189,8 @@ NO_POINT = "wants a distance >= 0 m and a finite angle"
         (("fuzzy", "--set", GAP), "no rule of the fuzzy controller fires"),
         (("fuzzy", "--figure", "{tmp}/none/b.png"), "--figure: no directory"),
         *((("fuzzy", "--at", *at), NO_POINT) for at in (("nan", "0.5"), ("-3", "0.5"), ("1", "inf"), ("inf", "0"))),
-        (("compare", "{tmp}"), "name it with --format"),
-        (("compare", "{tmp}", "--format", "labyrinth"), "holds no Labyrinth text"),
+        (("slam", "{tmp}"), "name it with --format"),
+        (("slam", "{tmp}", "--format", "labyrinth"), "holds no Labyrinth text"),
         (("map", "--config", str(SURVEY)), "ccatp.toml: is the configuration of a survey of a mirror"),
     ],
 )
@@ -344,30 +346,12 @@ def test_slam_with_peers_prints_all_side_by_side(tmp_path: Path, capsys: pytest.
     assert [line.split("|")[2].strip() for line in rows] == ["ekf-slam", "smoother", "GTSAM iSAM2", "GTSAM batch"]
 
 
-def test_compare_takes_all_robots_and_gives_their_mean(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_mrclam(tmp_path, world(seed=1, seconds=20.0), robot=1)
-    write_mrclam(tmp_path, world(seed=2, seconds=20.0), robot=4)
-    assert main(["radio", "compare", str(tmp_path)]) == 0
-    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith(f"| {tmp_path.name}")]
-    assert len(rows) == 6
-    assert [cell.strip() for cell in rows[-1].split("|")[1:3]] == [f"{tmp_path.name}, mean", "smoother"]
-    assert "missing: no such file or folder" in refused(capsys, "radio", "compare", tmp_path / "missing")
-
-
-def test_a_peer_that_gives_up_on_one_run_leaves_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_peer_that_gives_up_leaves_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("gtsam", reason="the extra peers is not installed")
-    lines = csv_lines(world(seconds=20.0))
-    bearings = [line for line in lines if not line.startswith("range,")]
-    files = [write_lines(tmp_path / f"{name}.csv", text) for name, text in (("mine", lines), ("bearings", bearings))]
-    assert main(["radio", "compare", *map(str, files), "--peers"]) == 0
+    lines = [line for line in csv_lines(world(seconds=20.0)) if not line.startswith("range,")]
+    assert main(["radio", "slam", str(write_lines(tmp_path / "bearings.csv", lines)), "--peers"]) == 0
     out, err = capsys.readouterr()
-    rows = [[cell.strip() for cell in line.split("|")[1:4]] for line in out.splitlines()[2:]]
-    assert [name for name, _, path in rows if path == "gave up"] == ["bearings", "bearings"]
-    assert len(rows) == 8
+    rows = [[cell.strip() for cell in line.split("|")[2:4]] for line in out.splitlines() if line.startswith("| bear")]
+    assert [name for name, path in rows if path == "gave up"] == ["GTSAM iSAM2", "GTSAM batch"]
+    assert len(rows) == 4
     assert "warning: bearings: not all readings have a range" in err
-
-
-def test_the_mean_of_an_estimator_that_gave_up_once_is_none() -> None:
-    rows = [row_without(name, "peer", gave_up=name == "b") | {"run_s": 1.0} for name in "ab"]
-    mean = with_means(rows, "mean")[-1]
-    assert (mean["gave_up"], mean["run_s"]) == (True, None)

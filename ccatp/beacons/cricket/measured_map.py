@@ -1,6 +1,6 @@
 """A map from measured ranges: filter or batch, doubts about it, its error where the truth is known, a report."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -26,11 +26,13 @@ from ccatp.beacons.cricket.range_network import (
     RigidBody,
     build_network,
     coordinates_of,
+    every_pair,
     list_names,
 )
 from ccatp.beacons.cricket.rigidity import find_fold_over, find_freedom, generic_state
 from ccatp.beacons.cricket.self_mapping import MoteMapper, run_phase_two
 from ccatp.beacons.cricket.trilateration import map_as_possible
+from ccatp.beacons.slam.track_review import next_range
 from ccatp.config.beacon_models import CricketConfig
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import aligned_rms_m, best_motion
@@ -38,6 +40,7 @@ from ccatp.filters.metrics import aligned_rms_m, best_motion
 _SIGNIFICANT = 12.0  # a drop of chi-squared that chance gives one offset in two thousand
 _CHANCE = 1e-4  # that sound ranges of one pair of all disagree as much
 _SCATTER = 1.5  # factor of the sigmas that is worth a word
+_MOST_ADVISED = 200  # motes, between which every pair is considered
 _FOLDS = 5  # sets of motes that are named
 _SHAPES = ", or the places of --tags are wrong"
 _IN_SPACE = ", or the motes are not in a plane: --dimension 3 maps them in space"
@@ -218,6 +221,7 @@ def map_measured(
         "motes": len(motes),
         "frame": "aligned",
         "expected_rms_m": expected_m if is_known else None,
+        "measure_next": _next_pair(names, places, covariance, cfg.ranging.sigma_m) if is_known else None,
         "offset_m": None if "offset" in freedom.undetermined else found.state.offset_m,
         "scale": None if "scale" in freedom.undetermined else 1.0 + found.state.scale,
         "frame_directions": list(freedom.frame),
@@ -225,6 +229,19 @@ def map_measured(
         "warnings": warnings,
     }
     return MeasuredMap(names, places, covariance, true_m, data)
+
+
+def _next_pair(
+    names: Sequence[str], places: FloatArray, covariance: FloatArray, sigma_m: float
+) -> dict[str, Any] | None:
+    """The pair whose range would lessen the expected error most."""
+    if len(names) > _MOST_ADVISED:
+        return None
+    ends = every_pair(np.arange(len(names)))
+    found = next_range(places, covariance, ends, places[ends[:, 0]] - places[ends[:, 1]], np.full(len(ends), sigma_m))
+    if found is None:
+        return None
+    return {"pair": [names[end] for end in found.ends], "map_m": found.before_m, "after_m": found.after_m}
 
 
 def _network(cfg: CricketConfig, file: MeasuredRanges, tags_m: Places | None) -> RangeNetwork:
@@ -334,6 +351,9 @@ def report_lines(data: dict[str, Any]) -> Iterator[str]:
         yield f"  motes in doubt                     {data['motes_in_doubt']}"
         yield f"  error of the others                {_mm(data['rms_of_others_m'])}"
     yield f"  expected by the estimator          {_mm(data['expected_rms_m'])}"
+    if (advice := data.get("measure_next")) is not None:
+        pair, after_m = " to ".join(advice["pair"]), advice["after_m"]
+        yield f"  measure next                       {pair}: {_mm(advice['map_m'])} expected becomes {_mm(after_m)}"
     yield f"  updates or steps                   {data['iterations']}"
     if data["offset_m"] != 0.0:
         yield f"  common offset of the ranges        {_mm(data['offset_m'])}"

@@ -6,9 +6,10 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
+from ccatp.beacons.cricket.map_fit import map_rms_m
 from ccatp.beacons.datasets.tables import GAP_S, long_pauses, plural
 from ccatp.beacons.datasets.trajectory import amount_at, chords, turning_factor
-from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
+from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun, ReferencePath, Steps
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import aligned_rms_m
 
@@ -326,20 +327,21 @@ def _map_of(run: RecordedRun) -> Iterator[str]:
         yield f"surveyed beacons without any reading: {', '.join(unread)}"
 
 
+MISSED = 5.0  # times what a map expects to miss the survey by: then something is wrong
 MENDED = 0.3  # of the misfit of map and survey that is left once the right place is changed
 
 
-def survey_doubts(
-    found_m: Mapping[str, tuple[float, float]], surveyed_m: Mapping[str, tuple[float, float]]
-) -> list[str]:
+def survey_doubts(track: EstimatedPath, surveyed_m: Mapping[str, tuple[float, float]]) -> list[str]:
     """Two beacons that the survey has exchanged, or one that was moved: where a map fits far better without.
 
-    For runs without a reference trajectory, where nothing else says so. Places in m; each in a frame of its own.
+    Else that the map misses the survey by more than its covariance allows. For runs without a reference trajectory,
+    where nothing else says so. Map and survey are in frames of their own.
     """
-    names = [name for name in found_m if name in surveyed_m]
+    names = [name for name in track.beacons if name in surveyed_m]
     if len(names) < 4:  # any three places fit three others too well
         return []
-    found, surveyed = (np.array([places[name] for name in names]) for places in (found_m, surveyed_m))
+    found = np.array([track.beacons[name][:2] for name in names])
+    surveyed = np.array([surveyed_m[name] for name in names])
     miss_m = aligned_rms_m(found, surveyed)
     if miss_m < STRANGER_M:
         return []
@@ -355,5 +357,11 @@ def survey_doubts(
         fits_m[line] = aligned_rms_m(found[every != k], surveyed[every != k])
     line, fit_m = min(fits_m.items(), key=lambda item: item[1])
     if fit_m > MENDED * miss_m:
-        return []
+        rows, places = [list(track.beacons).index(name) for name in names], list(track.beacons.values())
+        of_all = np.array([place[:2] for place in places])
+        expected_m = map_rms_m(track.map_covariance, of_all, rows, aligned=True)
+        wrong = (
+            f"the map misses the survey by {miss_m:.2g} m, where {expected_m:.2g} m are expected: one of them is wrong"
+        )
+        return [wrong] if miss_m > MISSED * expected_m else []
     return [f"{line}: the map misses the survey by {miss_m:.2g} m, else by {fit_m:.2g} m"]

@@ -22,7 +22,14 @@ from ccatp.beacons.datasets.tables import (
     tagged_row,
     within,
 )
-from ccatp.beacons.datasets.trajectory import bridged, checked_heading, pose_of_truth, steps_of_speeds, turning_factor
+from ccatp.beacons.datasets.trajectory import (
+    at_antenna,
+    bridged,
+    checked_heading,
+    pose_of_truth,
+    steps_of_speeds,
+    turning_factor,
+)
 from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
 from ccatp.config.files import read_input
 from ccatp.core import FloatArray
@@ -333,7 +340,8 @@ EVENTS = {
     "bearing": ("time_s", "beacon", "bearing_rad"),
     "rssi": ("time_s", "beacon", "rssi_dbm"),
     "truth": ("time_s", "x_m", "y_m", "(heading_rad)"),
-    "beacon": ("beacon", "x_m", "y_m"),
+    "beacon": ("beacon", "x_m", "y_m", "(z_m)"),
+    "antenna": ("forward_m", "left_m", "(up_m)"),
 }
 READING_KINDS = ("range", "bearing", "rssi")
 HEADER = "event"
@@ -355,15 +363,22 @@ def read_events_csv(file: Path) -> RecordedRun:
     if file.is_dir():
         raise RadioDataError(file, "is a folder: name the CSV file in it")
     numbers: dict[str, float] = {}
-    warnings: list[str] = []
     rows: list[tuple[str, int, list[float]]] = []
     for line, content in content_lines(read_text(file)):
         cells = split_cells(content)
         is_head = not rows and cells[0] not in EVENTS and not any(is_number(cell) for cell in cells[1:])
         if cells[0] != HEADER and not is_head:
             rows.append(tagged_row(file, line, cells, EVENTS, numbers))
-    tables = tables_of(file, rows)
-    surveyed = tables.pop("beacon", None)
+    return run_of_events(file, tables_of(file, rows), tuple(numbers))
+
+
+def run_of_events(file: Path, tables: dict[str, Table], names: tuple[str, ...]) -> RecordedRun:
+    """A run from a table for each of ``EVENTS`` that there are; ``names``: of the beacons, which tables number.
+
+    The path is that of the antenna. Raises RadioDataError: there is no odometry or no reading of a beacon.
+    """
+    warnings: list[str] = []
+    surveyed, mounted = tables.pop("beacon", None), tables.pop("antenna", None)
     if "odom" in tables:
         tables["odom"] = tables["odom"].with_unknown_ways(warnings)
     needed = {kind: 1 if kind == "odom" else needed_of(columns) for kind, columns in EVENTS.items()}
@@ -373,19 +388,47 @@ def read_events_csv(file: Path) -> RecordedRun:
     if not any(kind in tables for kind in READING_KINDS):
         raise RadioDataError(file, f"no readings of beacons: no event {', '.join(READING_KINDS)}")
     steps = _event_steps(tables["odom"])
-    names = tuple(numbers)
     readings, beacon_ids = _merged(tables, steps, names, warnings)
     if not beacon_ids:
         raise RadioDataError(file, "no readings of beacons within the time of the odometry")
     truth = _truth(tables.get("truth"), steps, warnings)
     places_m: dict[str, tuple[float, float]] = {}
+    heights_m: dict[str, float] = {}
     if surveyed is not None:
-        for line, (index, x_m, y_m) in zip(surveyed.lines.tolist(), surveyed.values.tolist(), strict=True):
+        for line, (index, x_m, y_m, z_m) in zip(surveyed.lines.tolist(), surveyed.values.tolist(), strict=True):
             name = names[int(index)]
             if places_m.setdefault(name, (x_m, y_m)) != (x_m, y_m):
                 raise RadioDataError(file, f"beacon {name} was surveyed at another place before", line)
+            heights_m[name] = z_m
     first_pose, name = pose_of_truth(truth, steps, warnings), file.name.split(".")[0]
-    return RecordedRun(name, "csv", steps, readings, beacon_ids, places_m, truth, first_pose, tuple(warnings))
+    ahead_m, left_m, up_m = _antenna(mounted)
+    above_m = np.array([heights_m.get(beacon, np.nan) - up_m for beacon in beacon_ids])
+    readings = _in_the_plane(readings, np.nan_to_num(above_m), warnings)
+    if ahead_m or left_m:
+        steps, truth, first_pose = at_antenna(steps, truth, first_pose, (ahead_m, left_m), warnings)
+    return RecordedRun(
+        name, "csv", steps, readings, beacon_ids, places_m, truth, first_pose, tuple(warnings), (ahead_m, left_m)
+    )
+
+
+def _antenna(mounted: Table | None) -> tuple[float, float, float]:
+    if mounted is None:
+        return 0.0, 0.0, 0.0
+    if len(mounted.values) > 1 or not np.isfinite(mounted.values[0, :2]).all():
+        raise RadioDataError(mounted.file, "more than one antenna, or one at no place", int(mounted.lines[-1]))
+    ahead_m, left_m, up_m = np.nan_to_num(mounted.values[0]).tolist()
+    return ahead_m, left_m, up_m
+
+
+def _in_the_plane(readings: Readings, above_m: FloatArray, warnings: list[str]) -> Readings:
+    """Ranges without what heights add to them. ``above_m``: of each beacon over the antenna, shape (b,)."""
+    squares = readings.range_m**2 - above_m[readings.beacon] ** 2
+    if (short := (squares < 0.0) & (readings.range_m > 0.0)).any():
+        warnings.append(f"{plural(int(short.sum()), 'range')} shorter than the beacon is above the antenna, left out")
+        readings = readings.where(~short)
+        squares = squares[~short]
+    level_m = np.where(above_m[readings.beacon] == 0.0, readings.range_m, np.sqrt(np.maximum(squares, 0.0)))
+    return readings._replace(range_m=level_m)
 
 
 def _event_steps(odometry: Table) -> Steps:

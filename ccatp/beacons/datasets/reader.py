@@ -17,27 +17,35 @@ from ccatp.beacons.datasets.formats import (
     read_plaza,
     robots_in,
 )
+from ccatp.beacons.datasets.ros_bags import SUFFIXES as BAGS
+from ccatp.beacons.datasets.ros_bags import read_bag
 from ccatp.beacons.datasets.tables import RadioDataError, content_lines, plural, read_text
 from ccatp.beacons.slam.recording import RecordedRun
 from ccatp.core import FloatArray
 
 LEAST_TRUTH = 2  # rows: one fits any path
 READERS = {"plaza": read_plaza, "labyrinth": read_labyrinth, "csv": read_events_csv}
-FORMATS = ("plaza", "mrclam", "labyrinth", "csv")
+FORMATS = ("plaza", "mrclam", "labyrinth", "csv", "bag")
 
 
-def read_run(path: Path, data_format: str | None, robot: int | None) -> RecordedRun:
+def read_run(path: Path, data_format: str | None, robot: int | None, topics_file: Path | None = None) -> RecordedRun:
     """Read and check a recorded run.
 
-    ``data_format``: one of ``FORMATS``; found out from the files if ``None``. Raises RadioDataError: it cannot be read,
-    or is not what it claims to be.
+    ``data_format``: one of ``FORMATS``; found out from the files if ``None``. ``topics_file``: of a bag. Raises
+    RadioDataError: it cannot be read, or is not what it claims to be.
     """
     data_format = found_format(path, data_format)
     if robot is not None and data_format != "mrclam":
         raise RadioDataError(path, f"a {data_format} set has one vehicle: leave out --robot")
     with np.errstate(all="ignore"):  # numbers that overflow are refused below
-        run = read_mrclam(path, robot) if data_format == "mrclam" else READERS[data_format](path)
-        run = _bounded(run, path)
+        if data_format == "mrclam":
+            return checked_run(read_mrclam(path, robot), path)
+        return checked_run(read_bag(path, topics_file) if data_format == "bag" else READERS[data_format](path), path)
+
+
+def checked_run(run: RecordedRun, path: Path) -> RecordedRun:
+    """The run without what cannot be, with warnings of what looks wrong (raises RadioDataError: nothing is left)."""
+    run = _bounded(run, path)
     if run.truth is not None and len(run.truth.times_s) < LEAST_TRUTH:
         warning = (
             f"no reference trajectory: the truth has {plural(len(run.truth.times_s), 'row')}, good for the first pose "
@@ -45,15 +53,6 @@ def read_run(path: Path, data_format: str | None, robot: int | None) -> Recorded
         )
         run = replace(run, truth=None, warnings=(*run.warnings, warning))
     return replace(run, warnings=(*run.warnings, *suspicions(run)))
-
-
-def robots_of(path: Path, data_format: str | None = None) -> list[int | None]:
-    """The robots of a set: numbers if it has several, ``[None]`` for the only one.
-
-    ``data_format``: one of ``FORMATS``; found out from the files if ``None``. Raises RadioDataError: there is no such
-    set.
-    """
-    return [*robots_in(path)] if found_format(path, data_format) == "mrclam" and path.is_dir() else [None]
 
 
 def found_format(path: Path, given: str | None = None) -> str:
@@ -67,6 +66,8 @@ def found_format(path: Path, given: str | None = None) -> str:
         return given
     is_folder = path.is_dir()
     files = [file for file in sorted(path.iterdir()) if file.is_file()] if is_folder else [path]
+    if path.suffix in BAGS or any(file.name == "metadata.yaml" for file in files):
+        return "bag"
     if robots_in(path) if is_folder else ROBOT_FILE.search(path.name):
         return "mrclam"
     if any(is_plaza(file) for file in files):
@@ -85,6 +86,7 @@ def found_format(path: Path, given: str | None = None) -> str:
 
 
 LONGEST_RUN_S = 1e8  # three years
+LONGEST_PAUSE_S = 3600.0  # of the odometry; a longer one is a clock that was set
 LONGEST_STEP_M = 1e3  # between two rows of odometry
 LARGEST_TURN_RAD = 1e4  # likewise; degrees for radians stay far below it, and are reported elsewhere
 FARTHEST_M = 1e8  # of coordinates; those of maps reach 1e7
@@ -103,6 +105,10 @@ def _bounded(run: RecordedRun, where: Path) -> RecordedRun:
     """
     steps, truth = run.steps, run.truth
     _refuse(where, "time of odometry", steps.times_s - steps.times_s[0], LONGEST_RUN_S, "s after its first row")
+    _refuse(
+        where, "odometry: a pause", np.diff(steps.times_s), LONGEST_PAUSE_S, "s", steps.times_s,
+        "; was the clock set? give the part before or behind it",
+    )  # fmt: skip
     for what, column in (("forward", steps.distance_m), ("to the left", steps.lateral_m)):
         _refuse(where, f"odometry: a step {what}", column, LONGEST_STEP_M, "m", steps.times_s[1:])
     _refuse(where, "odometry: a turn", steps.turn_rad, LARGEST_TURN_RAD, "rad", steps.times_s[1:])
@@ -140,10 +146,18 @@ def _bounded(run: RecordedRun, where: Path) -> RecordedRun:
 
 
 def _refuse(
-    where: Path, what: str, values: FloatArray, most: float, unit: str, times_s: FloatArray | None = None
+    where: Path,
+    what: str,
+    values: FloatArray,
+    most: float,
+    unit: str,
+    times_s: FloatArray | None = None,
+    hint: str = "",
 ) -> None:
     beyond = np.flatnonzero(~(np.abs(values) <= most))
     if beyond.size:
         first = int(beyond[0])
         at = "" if times_s is None else f" at {times_s[first]:.6g} s"
-        raise RadioDataError(where, f"{what} of {values[first]:.3g} {unit}{at} cannot be; at most {most:g} is taken")
+        raise RadioDataError(
+            where, f"{what} of {values[first]:.3g} {unit}{at} cannot be; at most {most:g} is taken{hint}"
+        )

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.beacons.datasets.tables import long_pauses
-from ccatp.beacons.slam.recording import ReferencePath, Steps, dead_reckoned, running_total
+from ccatp.beacons.slam.recording import ReferencePath, Steps, antenna_path, dead_reckoned, running_total
 from ccatp.core import FloatArray
 
 BEFORE_S = 1.0  # over so long the speed before a gap is taken
@@ -198,3 +198,25 @@ def pose_of_truth(truth: ReferencePath | None, steps: Steps, warnings: list[str]
     p = np.interp(t, steps.times_s, path[:, 0]) + 1j * np.interp(t, steps.times_s, path[:, 1])
     q = truth.x_m[rows] + 1j * truth.y_m[rows]
     return (x, y, float(np.angle(np.vdot(p - p.mean(), q - q.mean()))))
+
+
+def at_antenna(
+    steps: Steps, truth: ReferencePath | None, first_pose: tuple[float, float, float], antenna_m: tuple[float, float],
+    warnings: list[str],
+) -> tuple[Steps, ReferencePath | None, tuple[float, float, float]]:  # fmt: skip
+    """The same run as the way of an antenna that is so far ahead and to the left of the point that odometry is of.
+
+    A turn w about that point moves the antenna across the lever by 2 sin(w / 2), seen in the middle of the turn.
+    """
+    ahead_m, left_m = antenna_m
+    swing = 2.0 * np.sin(0.5 * steps.turn_rad)
+    steps = steps._replace(distance_m=steps.distance_m - swing * left_m, lateral_m=steps.lateral_m + swing * ahead_m)
+    x_m, y_m, heading_rad = first_pose
+    (x_m, y_m), *_ = antenna_path(np.array([first_pose]), antenna_m).tolist()
+    if truth is not None and np.isfinite(truth.heading_rad).all():
+        moved = antenna_path(np.column_stack([truth.x_m, truth.y_m, truth.heading_rad]), antenna_m)
+        truth = truth._replace(x_m=moved[:, 0], y_m=moved[:, 1])
+    elif truth is not None:
+        warnings.append("the truth has no headings: its positions are taken as the antenna's")
+        x_m, y_m, _ = first_pose
+    return steps, truth, (x_m, y_m, heading_rad)

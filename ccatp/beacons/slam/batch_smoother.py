@@ -212,11 +212,12 @@ def smooth(
     covariance = np.zeros((size, size))
     covariance[np.ix_(problem.free, problem.free)] = factored.shared_covariance()
     updates = int(counted.sum())
-    beacons = {}
+    beacons, of_map = {}, list[int]()
     for k in np.flatnonzero(start.used).tolist():
         place = slice(len(SHARED) + BEACON * k, len(SHARED) + BEACON * k + 2)
         x_m, y_m = state.beacons[k, :2].tolist()
         beacons[run.beacon_ids[k]] = BeaconFix(x_m, y_m, covariance[place, place])
+        of_map += range(place.start, place.stop)
     calibration = _calibration(problem, state, np.sqrt(np.diag(covariance)))
     priors = {name: getattr(problem.priors, name) for name in SHARED}
     warnings = [*_warnings(run, start, converged), *beyond_priors(calibration, priors, run.kind)]
@@ -234,6 +235,7 @@ def smooth(
         update_s=np.array([took_s / max(updates, 1)]),
         updates=updates,
         warnings=tuple(warnings),
+        map_covariance=covariance[np.ix_(of_map, of_map)],
     )
 
 

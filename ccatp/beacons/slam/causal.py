@@ -164,7 +164,8 @@ def follow(
     calibration = {
         name: Calibrated(*found) for name, found in slam.calibration.items() if found[1] < UNCHANGED * priors[name]
     }
-    beacons = slam.beacons.items()
+    beacons, place = slam.beacons.items(), slam.engine.block
+    at = np.array([place(name).start + axis for name, _ in beacons for axis in range(2)], dtype=np.intp)
     path = EstimatedPath(
         times_s=times,
         poses=poses,
@@ -177,6 +178,7 @@ def follow(
         update_s=np.array(update_s),
         predict_s=np.array(predict_s[1:]),
         scalar_s=np.array(scalar_s),
+        map_covariance=slam.engine.covariance[np.ix_(at, at)],
         updates=len(accepted),
         warnings=(
             *_unplaced(run, slam), *beyond_priors(calibration, priors, run.kind), *_doubts(slam, nis, sizes, refused)

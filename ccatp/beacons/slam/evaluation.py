@@ -1,4 +1,4 @@
-"""A track against the truth of its recording; the results of ``ccatp radio slam`` and ``compare`` as data and text."""
+"""A track against the truth of its recording; the results of ``ccatp radio slam`` as data and text."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -200,7 +200,6 @@ COLUMNS = (
     ("update, us", "update_us_p50", "{:.0f}"),
     ("whole run, s", "run_s", "{:.1f}"),
 )
-AVERAGED = ("trajectory_rmse_m", "heading_rmse_rad", "beacon_rmse_m", "update_us_p50", "run_s")
 
 
 def row(
@@ -219,22 +218,6 @@ def row_without(dataset: str, estimator: str, *, gave_up: bool) -> dict[str, Any
     """A row without figures; ``gave_up``: the estimator has no result for these data."""
     nothing: dict[str, Any] = dict.fromkeys(key for _, key, _ in COLUMNS)
     return nothing | {"dataset": dataset, "filter": estimator, "gave_up": gave_up}
-
-
-def with_means(rows: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]:
-    """The rows, and behind them the mean of each estimator over the runs, if there are several."""
-    estimators = list(dict.fromkeys(r["filter"] for r in rows))
-    means = []
-    for estimator in estimators:
-        own = [r for r in rows if r["filter"] == estimator]
-        if len(own) < 2:
-            return list(rows)
-        mean = row_without(name, estimator, gave_up=any(r["gave_up"] for r in own))
-        for key in () if mean["gave_up"] else AVERAGED:  # a mean over the easier runs alone compares nothing
-            values = [r[key] for r in own if r[key] is not None]
-            mean[key] = float(np.mean(values)) if values else None
-        means.append(mean)
-    return [*rows, *means]
 
 
 def markdown(rows: Sequence[dict[str, Any]]) -> list[str]:

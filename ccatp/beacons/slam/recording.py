@@ -70,6 +70,7 @@ class RecordedRun:
     truth: ReferencePath | None
     first_pose: tuple[float, float, float]
     warnings: tuple[str, ...]
+    antenna_m: tuple[float, float] = (0.0, 0.0)  # ahead and left of the vehicle's origin; poses are the antenna's
 
 
 def running_total(amounts: FloatArray) -> FloatArray:
@@ -88,6 +89,17 @@ def dead_reckoned(steps: Steps, first_pose: tuple[float, float, float]) -> Float
     c, s = np.cos(middle), np.sin(middle)
     dx, dy = steps.distance_m * c - steps.lateral_m * s, steps.distance_m * s + steps.lateral_m * c
     return np.column_stack([x_m + running_total(dx), y_m + running_total(dy), headings])
+
+
+def antenna_path(poses: FloatArray, antenna_m: tuple[float, float], sign: float = 1.0) -> FloatArray:
+    """Positions of the antenna at poses of the vehicle, (n, 2); with the other sign, of the vehicle at the antenna's.
+
+    ``poses``: x_m, y_m, heading_rad, shape (n, 3).
+    """
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    ahead_m, left_m = antenna_m
+    lever = np.column_stack([c * ahead_m - s * left_m, s * ahead_m + c * left_m])
+    return np.asarray(poses[:, :2] + sign * lever)
 
 
 class BeaconFix(NamedTuple):
@@ -127,6 +139,7 @@ class EstimatedPath(NamedTuple):
     update_s: FloatArray = np.empty(0)
     predict_s: FloatArray = np.empty(0)  # wall time of each prediction, s; none from a smoother
     scalar_s: FloatArray = np.empty(0)
+    map_covariance: FloatArray = np.empty((0, 0))  # of all beacons' x_m, y_m in their order, shape (2 b, 2 b)
 
 
 BeaconId = int | str

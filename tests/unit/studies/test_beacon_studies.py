@@ -1,4 +1,4 @@
-"""The studies of self-mapping: published figures on few seeds, files, a field that receives too little, sizes."""
+"""The studies of self-mapping and of recorded runs: published figures on few seeds, files, sizes, damages."""
 
 from pathlib import Path
 from typing import Any
@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.cricket.range_network import MappingError
-from ccatp.config.load import load_radio_config
+from ccatp.config.load import load_radio_config, load_recordings_config
 from ccatp.config.models import Config
 from ccatp.studies import cricket_study
-from ccatp.studies.campaign import Cell, CellResult, Job, JobOutcome
+from ccatp.studies.campaign import CampaignError, Cell, CellResult, Job, JobOutcome
 from ccatp.studies.cricket_study import combine, run_job
 from ccatp.studies.mote_navigation import combine as mote_navigation_combine
 from ccatp.studies.mote_runs import run_batch, run_filter, simulate_field
+from ccatp.studies.recordings import DAMAGES, Damage, estimate, events_of, run_damage, run_recordings
+from tests.unit.beacons.datasets.sets import recorded, world
 
 # One worker computes the cells that they share.
 pytestmark = pytest.mark.xdist_group("beacon studies")
@@ -99,3 +101,69 @@ def test_missions_put_together() -> None:
     assert found.values["in_band"] == 1.0
     assert (found.values["complete"], found.values["waypoints"], found.values["within_3_sigma"]) == (2, 12, 10)
     assert mote_navigation_combine({}, [outcome(30.0), outcome(30.0)]).values["in_band"] == 0.0
+
+
+# -- damaged recordings -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def undamaged() -> Damage:
+    cfg, run = load_recordings_config(), recorded(world(seconds=200.0))
+    tables, truth = events_of(run, 0.0, 200.0)
+    return Damage(tables, truth, run, estimate(run, cfg, "ekf-slam"), 100.0, np.random.default_rng(1))
+
+
+def changed_share(damage: Damage, damaged: Damage, kind: str, column: int) -> float:
+    before, after = damage.tables[kind].values, damaged.tables[kind].values
+    return float(np.mean(before[:, column] != after[:, column]))
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "column", "share"),
+    [
+        ("10 % wrong identifiers", "range", 1, 0.1),
+        ("25 % of the ranges by reflection", "range", 2, 0.25),
+        ("5 % ranges of 0 m", "range", 2, 0.05),
+        ("two beacons exchange names", "range", 1, 0.25),  # two of four, half of the time
+        ("a beacon is moved by 3 m", "range", 2, 0.125),
+        ("a beacon is moved by 3 m", "bearing", 2, 0.125),
+        ("clock of the readings off by 1.5 s", "range", 0, 0.5),
+        ("clock of the readings off by 1.5 s", "odom", 0, 0.0),
+        ("two clock epochs", "odom", 0, 0.5),
+    ],
+)
+def test_a_damage_changes_what_it_says(name: str, kind: str, column: int, share: float, undamaged: Damage) -> None:
+    damaged = DAMAGES[name](undamaged)
+    assert changed_share(undamaged, damaged, kind, column) == pytest.approx(share, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "longest_s", "span_s"),
+    [
+        ("vehicle kidnapped for 30 s", "odom", 0.11, 170.0),
+        ("odometry silent for 60 s", "odom", 60.1, 200.0),
+        ("beacons silent for 60 s", "range", 60.3, 200.0),
+        ("mirror image: a straight way alone", "odom", 0.11, 5.0),
+    ],
+)
+def test_a_damage_leaves_this_time(name: str, kind: str, longest_s: float, span_s: float, undamaged: Damage) -> None:
+    times_s = DAMAGES[name](undamaged).tables[kind].values[:, 0]
+    assert np.diff(times_s).max() <= longest_s
+    assert np.ptp(times_s) == pytest.approx(span_s, abs=4.0)
+
+
+def test_the_survey_of_a_moved_or_exchanged_beacon_follows(undamaged: Damage) -> None:
+    places = undamaged.run.beacon_truth_m
+    exchanged = DAMAGES["two beacons exchanged in the survey"](undamaged)
+    assert sum(exchanged.run.beacon_truth_m[name] != places[name] for name in places) == 2
+    assert exchanged.tables is undamaged.tables
+    moved_m = DAMAGES["a beacon is moved by 3 m"](undamaged).run.beacon_truth_m
+    off_m = [float(np.hypot(*np.subtract(moved_m[name], places[name]))) for name in places]
+    assert max(off_m) == pytest.approx(3.0)
+
+
+def test_a_folder_of_recordings_is_needed() -> None:
+    with pytest.raises(CampaignError, match="give --data DIR"):
+        run_damage(Job("damage", {"damage": "two clock epochs"}, 0, load_recordings_config()))
+    with pytest.raises(CampaignError, match="started at most 80% later"):
+        run_recordings(Job("recordings", {"data": "Plaza2", "estimator": "ekf-slam"}, 9, load_recordings_config()))

@@ -1,0 +1,140 @@
+"""ROS bags as recordings: the same run by bag and by CSV; antennas off the origin, beacons at a height."""
+
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ccatp.beacons.datasets.formats import read_events_csv
+from ccatp.beacons.datasets.reader import read_run
+from ccatp.beacons.datasets.tables import RadioDataError
+from ccatp.beacons.slam.causal import filter_run
+from ccatp.beacons.slam.evaluation import judge
+from ccatp.config.load import load_recordings_config
+from tests.unit.beacons.datasets.sets import BEACONS, World, csv_lines, world, write_lines
+
+rosbags = pytest.importorskip("rosbags", reason="the extra ros is not installed")
+
+TOPICS = """
+[odometry]
+topic = "/odom"
+
+[[readings]]
+topic = "/uwb"
+beacon = "header.frame_id"
+range = "range"
+
+[truth]
+topic = "/truth"
+
+[beacons]
+6 = [0.5, 4.0]
+"""
+
+
+def write_bag(path: Path, w: World) -> Path:
+    """Odometry and truth as nav_msgs/Odometry, ranges as sensor_msgs/Range."""
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.ROS1_NOETIC if path.suffix == ".bag" else Stores.ROS2_JAZZY)
+    kinds = types.types
+
+    def header(time_s: float, frame: str) -> Any:
+        stamp = kinds["builtin_interfaces/msg/Time"](*divmod(round(time_s * 1e9), 10**9))
+        return kinds["std_msgs/msg/Header"](*([0] if path.suffix == ".bag" else []), stamp=stamp, frame_id=frame)
+
+    def odometry(time_s: float, pose: Any) -> Any:
+        x, y, heading = pose
+        vector, zeros = kinds["geometry_msgs/msg/Vector3"], np.zeros(36)
+        turn = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, np.sin(heading / 2.0), np.cos(heading / 2.0))
+        place = kinds["geometry_msgs/msg/Pose"](kinds["geometry_msgs/msg/Point"](x, y, 0.0), turn)
+        still = kinds["geometry_msgs/msg/Twist"](vector(0.0, 0.0, 0.0), vector(0.0, 0.0, 0.0))
+        return kinds["nav_msgs/msg/Odometry"](
+            header(time_s, "odom"), "base_link",
+            kinds["geometry_msgs/msg/PoseWithCovariance"](place, zeros),
+            kinds["geometry_msgs/msg/TwistWithCovariance"](still, zeros),
+        )  # fmt: skip
+
+    rows = [
+        (t, topic, odometry(t, pose))
+        for topic in ("/odom", "/truth")
+        for t, pose in zip(w.times_s, w.poses, strict=True)
+    ]
+    names = list(BEACONS)
+    fields: tuple[Any, ...] = () if path.suffix == ".bag" else (0.0,)  # ROS 2 has a variance, too
+    for t, beacon, range_m in zip(w.read_s, w.read_beacon, w.range_m, strict=True):
+        message = kinds["sensor_msgs/msg/Range"](header(t, names[beacon]), 0, 0.1, 0.0, 50.0, range_m, *fields)
+        rows.append((t, "/uwb", message))
+    plugin = {".db3": StoragePlugin.SQLITE3, ".mcap": StoragePlugin.MCAP}.get(path.suffix)
+    folder = path.with_suffix("") if plugin else path
+    with Writer1(path) if plugin is None else Writer(folder, version=9, storage_plugin=plugin) as writer:
+        at: dict[str, Any] = {}
+        for t, topic, message in sorted(rows, key=lambda row: row[0]):
+            kind = message.__msgtype__
+            at.setdefault(topic, None)
+            at[topic] = at[topic] or writer.add_connection(topic, kind, typestore=types)
+            raw = types.serialize_ros1(message, kind) if plugin is None else types.serialize_cdr(message, kind)
+            writer.write(at[topic], round(t * 1e9), raw)
+    return path if plugin is None else next(folder.glob(f"*{path.suffix}"))
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".db3", ".mcap"])
+def test_a_bag_is_the_run_that_its_csv_is(suffix: str, tmp_path: Path) -> None:
+    w = world(seconds=20.0)
+    topics = tmp_path / "topics.toml"
+    topics.write_text(TOPICS)
+    found = read_run(write_bag(tmp_path / f"run{suffix}", w), None, None, topics)
+    wanted = read_events_csv(write_lines(tmp_path / "run.csv", csv_lines(w)))
+    assert found.beacon_truth_m == {"6": BEACONS["6"]}
+    assert set(found.beacon_ids) == set(BEACONS)
+    np.testing.assert_allclose(found.steps.distance_m, wanted.steps.distance_m, atol=1e-5)
+    np.testing.assert_allclose(found.steps.turn_rad, wanted.steps.turn_rad, atol=1e-5)
+    np.testing.assert_allclose(found.first_pose, w.poses[0], atol=1e-5)
+    np.testing.assert_allclose(np.sort(found.readings.range_m), np.sort(w.range_m), atol=1e-5)  # single precision
+
+
+@pytest.mark.parametrize(
+    ("topics", "what"),
+    [
+        ("", "odometry: field required"),
+        ("[odometry", "is no TOML"),
+        (TOPICS.replace("/uwb", "/nothing"), "has no topic /nothing; there are /odom, /truth, /uwb"),
+        (TOPICS.replace('"range"', '"distance"'), "message 5 of /uwb"),
+    ],
+)
+def test_topics_that_are_not_there(topics: str, what: str, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "run.mcap", world(seconds=5.0))
+    file = tmp_path / "topics.toml"
+    file.write_text(topics)
+    with pytest.raises(RadioDataError, match=what):
+        read_run(bag, None, None, file)
+    with pytest.raises(RadioDataError, match="names its topics with --topics"):
+        read_run(bag, None, None)
+
+
+ANTENNA_M, ABOVE_M = (0.8, -0.5), 2.0
+
+
+def test_an_antenna_off_the_origin_and_beacons_at_a_height(tmp_path: Path) -> None:
+    """Ranges of the antenna to beacons 2 m above it: with both in the file, errors are those of ranges in the plane."""
+    w = world(seconds=60.0)
+    c, s = np.cos(w.poses[:, 2]), np.sin(w.poses[:, 2])
+    ahead, left = ANTENNA_M
+    antenna = w.poses[:, :2] + np.column_stack([c * ahead - s * left, s * ahead + c * left])
+    at = np.column_stack([np.interp(w.read_s, w.times_s, column) for column in antenna.T])
+    places = np.array(list(BEACONS.values()))[w.read_beacon]
+    noise = np.random.default_rng(2).normal(0.0, 0.05, len(at))
+    w = replace(w, range_m=np.hypot(np.hypot(*(places - at).T), ABOVE_M) + noise)
+    lines = [line for line in csv_lines(w) if not line.startswith("bearing")]
+    told = [f"{line},{ABOVE_M + 0.3}" if line.startswith("beacon") else line for line in lines]
+    cfg, errors_m = load_recordings_config(), []
+    for name, text in (("told", [*told, f"antenna,{ahead},{left},0.3"]), ("untold", lines)):
+        run = read_run(write_lines(tmp_path / f"{name}.csv", text), None, None)
+        errors_m.append(judge(filter_run(run, cfg.csv, cfg.filter, perf_counter), run).beacon_rmse_m or np.inf)
+    assert errors_m[0] < 0.1  # two sigmas of a range
+    assert errors_m[1] > 3.0 * errors_m[0]

@@ -1,0 +1,70 @@
+"""What else a track says: residuals by beacon, the file for evo, the range that lessens the map's error most."""
+
+import json
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+from ccatp.beacons.slam.causal import filter_run
+from ccatp.beacons.slam.track_review import next_range, range_residuals, residuals_by_beacon
+from ccatp.cli import main
+from ccatp.config.load import load_recordings_config
+from ccatp.filters.metrics import rigid_modes
+from tests.unit.beacons.datasets.sets import BEACONS, csv_lines, recorded, world, write_lines
+
+
+def test_residuals_are_the_noise_of_the_ranges() -> None:
+    cfg, run = load_recordings_config(), recorded(world(seconds=60.0, range_sigma_m=0.05))
+    track = filter_run(run, cfg.csv, cfg.filter, perf_counter)
+    found = residuals_by_beacon(run, range_residuals(run, track))
+    assert found.keys() == BEACONS.keys()
+    for one in found.values():
+        assert abs(one["median_m"]) < 0.05
+        assert 0.03 < one["sigma_m"] < 0.08
+    assert track.map_covariance.shape == (8, 8)
+
+
+def test_the_next_range_is_the_one_that_an_update_makes_best_of() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform(0.0, 10.0, (5, 2))
+    root = rng.normal(0.0, 0.1, (10, 10))
+    modes = rigid_modes(points)
+    S = np.eye(10) - modes @ modes.T
+    P = S @ root @ root.T @ S
+    ends = np.array([(i, j) for i in range(5) for j in range(i)] + [(2, 5)])  # the last from a place off the map
+    place = np.array((3.0, -2.0))
+    ways = np.array([points[i] - (points[j] if j < 5 else place) for i, j in ends.tolist()])
+    traces = []
+    for (i, j), way in zip(ends.tolist(), ways, strict=True):
+        h, u = np.zeros(10), way / np.linalg.norm(way)
+        h[2 * i : 2 * i + 2] = u
+        if j < 5:
+            h[2 * j : 2 * j + 2] = -u
+        traces.append(np.trace(P - np.outer(P @ h, P @ h) / (h @ P @ h + 0.05**2)))
+    found = next_range(points, P, ends, ways, np.full(len(ends), 0.05))
+    assert found is not None
+    assert found.ends == tuple(ends[int(np.argmin(traces))].tolist())
+    assert found.before_m == pytest.approx(np.sqrt(np.trace(P) / 5))
+    assert found.after_m == pytest.approx(np.sqrt(min(traces) / 5))
+    assert next_range(points[:2], P[:4, :4], ends[:1], ways[:1], np.ones(1)) is None
+
+
+def test_evo_finds_the_error_of_the_path(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("evo", reason="evo is not installed")
+    from evo.core import metrics, sync
+    from evo.tools import file_interface
+
+    file, out = write_lines(tmp_path / "mine.csv", csv_lines(world(seconds=30.0))), tmp_path / "path.tum"
+    assert main(["radio", "slam", str(file), "--json", "--tum", str(out)]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["measure_next"]["after_m"] < data["measure_next"]["map_m"]
+    truth, path = map(file_interface.read_tum_trajectory_file, (tmp_path / "path_truth.tum", out))
+    truth, path = sync.associate_trajectories(truth, path, max_diff=0.06)
+    path.align(truth)
+    error = metrics.APE(metrics.PoseRelation.translation_part)
+    error.process_data((truth, path))
+    rmse_m = error.get_statistic(metrics.StatisticsType.rmse)
+    # evo takes the nearest pose of the truth, up to half an interval of 0.1 s and 2.5 cm away.
+    assert rmse_m == pytest.approx(data["trajectory_rmse_m"], abs=0.02)
