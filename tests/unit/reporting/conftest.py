@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import ccatp.report.html as pictures
 from tests.unit.reporting.recorded import record
 
 FETCHED = {"src", "href", "xlink:href", "srcset", "action", "data", "poster"}
@@ -54,6 +55,19 @@ class Markup(HTMLParser):
     def handle_endtag(self, tag: str) -> None:
         if tag not in VOID:
             assert self.open.pop() == tag
+
+
+@pytest.fixture
+def drawn() -> None:
+    """For a test that looks at the pictures of a page."""
+
+
+@pytest.fixture(autouse=True)
+def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other tests make each figure, but do not draw it, which takes seconds for a page."""
+    if "drawn" not in request.fixturenames:
+        monkeypatch.setattr(pictures, "svg_of", lambda *_: "<svg></svg>")
+        monkeypatch.setattr(pictures, "save_figure", lambda _figure, path, *_: path.touch())
 
 
 @pytest.fixture(scope="session")

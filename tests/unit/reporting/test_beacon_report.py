@@ -54,6 +54,7 @@ def test_a_waypoint_that_was_reached(run_dir: Path) -> None:
     assert row.sigmas == pytest.approx(OFF_M / SIGMA_M)
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_command_and_the_page(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "page.html"
     assert main(["report", str(run_dir), "--out", str(path)]) == 0

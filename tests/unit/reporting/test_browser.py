@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
+@pytest.mark.usefixtures("drawn")
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium here: apt install chromium")
 def test_the_pages_open_by_themselves(recorded: Path, tmp_path: Path) -> None:
     # One test with one browser: its processes end with the test.

@@ -35,6 +35,7 @@ ALL = [
 ]  # fmt: skip
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_page_of_a_whole_run(recorded: Path) -> None:
     page = run_page(findings_of(read_record(recorded)))
     markup = Markup(page)
@@ -360,6 +361,7 @@ def test_a_page_stays_small_however_much_went_wrong(run_dir: Path) -> None:
 # -- the commands -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_command(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     figures = tmp_path / "figures" / "deep"
     told = answered(capsys, "report", run_dir, "--figures", figures)
