@@ -17,7 +17,8 @@ unexport PYTHONDONTWRITEBYTECODE
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
-PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
+# One more than there are cores: tests of real processes wait for most of their time.
+PYTEST := $(BIN)/python -m pytest -n $$(($(WORKERS) + 1)) --dist loadgroup --no-loadscope-reorder
 
 .PHONY: help run test tests test-newest newest newest-tests test-slow slow-tests new-examples sweep tried-in faults docs man onboard-wheel metrics lint format
 .PHONY: kills mutants golden golden-quick lock clean

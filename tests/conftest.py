@@ -38,14 +38,18 @@ GRACE_PASSES = 10
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> Iterator[None]:
-    """Tests of a group to one worker: xdist 3.8 writes the group where pytest 9.2 does not look for it any more."""
+    """Tests of a group, or of a file, to one worker, so that what a file sets up is set up once; the long groups first.
+
+    xdist 3.8 writes the group where pytest 9.2 does not look for it any more.
+    """
     yield
     if not getattr(config.option, "loadgroup", False):
         return
     for item in items:
         group = item.get_closest_marker("xdist_group")
-        if group is not None and "@" not in item.nodeid:
-            item._id = coerce_node_id(f"{item.nodeid}@{group.args[0]}")
+        if "@" not in item.nodeid:
+            item._id = coerce_node_id(f"{item.nodeid}@{group.args[0] if group else item.path.stem}")
+    items.sort(key=lambda item: item.get_closest_marker("xdist_group") is None)
 
 
 @pytest.fixture(scope="session", autouse=True)
