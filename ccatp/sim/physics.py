@@ -1,10 +1,10 @@
 """The robot as a rigid body on the mirror, with tyres, motors and fans: MuJoCo, an optional package.
 
-Deck frame, SI. A body of 1 kg stands on two driven wheels and a smooth caster behind them, on a height field of the
-mirror. Contacts have Coulomb friction (elliptic cone); the tyres are round (they touch in a point) or flat. Each wheel
-has the geared DC motor of ``ccatp.sim.hardware``: torque kt (V - ke w)/R less friction. The fans press along the
-robot's own normal. Gravity is that of the mirror's inclination. Nothing is random: a run depends on its commands alone,
-besides what the sensors draw.
+Deck frame, SI. A body of 1 kg stands on two driven wheels and a smooth caster behind them, on the tangent plane of the
+mirror, which follows it: at the wheels the mirror departs from it by 65 um. Contacts have Coulomb friction (elliptic
+cone); the tyres are round (they touch in a point) or flat. Each wheel has the geared DC motor of
+``ccatp.sim.hardware``: torque kt (V - ke w)/R less friction. The fans press along the robot's own normal. Gravity is
+that of the mirror's inclination. Nothing is random: a run depends on its commands alone, besides what the sensors draw.
 
 Slip, creep, load and loss of grip come out of the contacts, so the disturbances of the kinematic worlds are not used.
 """
@@ -22,9 +22,6 @@ from ccatp.sim.hardware import GRAVITY_M_S2, Motor, SimulatedHardware
 from ccatp.sim.plant import Plant
 from ccatp.sim.world import World
 
-_CELL_M = 0.015  # of the height field: between its nodes the mirror departs from it by 3 um
-_MARGIN_M = 0.3  # beyond the rim
-_BASE_M = 0.1  # thickness of the height field
 _TYRE_M = 0.012  # width of a flat tyre
 _AVERAGED = 5  # steps: what the inertial unit takes the mean of
 
@@ -32,11 +29,9 @@ _MODEL = """
 <mujoco model="survey robot">
   <option timestep="{timestep}" integrator="implicitfast" cone="elliptic" noslip_iterations="4" impratio="10"
           gravity="{gravity}"/>
-  <default><geom solref="0.004 1" solimp="0.95 0.99 0.0005" condim="4"/></default>
-  <asset><hfield name="mirror" nrow="{rows}" ncol="{columns}" size="{half_x} {half_y} {height} {base}"/></asset>
+  <default><geom solref="0.01 1" solimp="0.95 0.99 0.0005" condim="4"/></default>
   <worldbody>
-    <geom name="mirror" type="hfield" hfield="mirror" pos="{centre_x} {centre_y} {low}"
-          friction="{friction} 0.002 0.0001"/>
+    <geom name="mirror" type="plane" size="0 0 1" pos="0 0 -1" euler="1 1 1" friction="{friction} 0.002 0.0001"/>
     <body name="robot">
       <freejoint/>
       <geom type="box" size="0.09 0.06 0.015" pos="-0.015 0 0.035" mass="{chassis_kg}" contype="0" conaffinity="0"/>
@@ -98,13 +93,6 @@ class PhysicsPlant(Plant):
         self.are_wheels_still = False
 
     def _build(self, cfg: PhysicsConfig, radius_m: float, base_m: float) -> Any:
-        low_xy, high_xy = (np.asarray(self._mirror.rim.vertices)).min(axis=0), self._mirror.rim.vertices.max(axis=0)
-        centre, half = 0.5 * (low_xy + high_xy), 0.5 * (high_xy - low_xy) + _MARGIN_M
-        columns, rows = (int(np.ceil(2.0 * one / _CELL_M)) + 1 for one in half)
-        xs, ys = (np.linspace(c - h, c + h, n) for c, h, n in zip(centre, half, (columns, rows), strict=True))
-        grid_x, grid_y = np.meshgrid(xs, ys)
-        heights_m = self._surface.heights_m(grid_x.ravel(), grid_y.ravel()).reshape(rows, columns)
-        low_m, height_m = float(heights_m.min()), float(np.ptp(heights_m)) or 1e-3
         motor = self._motor
         damping = motor.volt_per_rad_s / motor.volt_per_nm
         tyre = (_FLAT if cfg.tyre == "flat" else _ROUND).format(
@@ -117,17 +105,13 @@ class PhysicsPlant(Plant):
             )
             for name, y in (("right", -0.5 * base_m), ("left", 0.5 * base_m))
         )  # fmt: skip
-        model = self._mujoco.MjModel.from_xml_string(
+        return self._mujoco.MjModel.from_xml_string(
             _MODEL.format(
                 timestep=self._step_s,
                 gravity=" ".join(f"{GRAVITY_M_S2 * one:.9g}" for one in self._mirror.gravity_deck),
-                rows=rows, columns=columns, half_x=half[0], half_y=half[1], height=height_m, base=_BASE_M,
-                centre_x=centre[0], centre_y=centre[1], low=low_m, friction=cfg.friction,
-                chassis_kg=cfg.mass_kg - 0.1, wheels=wheels,
+                friction=cfg.friction, chassis_kg=cfg.mass_kg - 0.1, wheels=wheels,
             )
         )  # fmt: skip
-        model.hfield_data[:] = ((heights_m - low_m) / height_m).ravel()
-        return model
 
     # -- motion -------------------------------------------------------------------------------------------------------
 
@@ -149,6 +133,12 @@ class PhysicsPlant(Plant):
         # Rest is never exact: what is below a micrometre a step is none to the edge sensors, until it adds up.
         self.is_moving = True
 
+    def _lay_ground(self) -> None:
+        """The tangent plane under the robot; a plane that the model has at its origin could not be moved."""
+        self._model.geom_pos[0] = self.x_m, self.y_m, self.z_m
+        axes = np.array(self._surface.axes(self.x_m, self.y_m)).T
+        self._mujoco.mju_mat2Quat(self._model.geom_quat[0], axes.ravel())
+
     def _read_state(self) -> None:
         data = self._data
         rotation: FloatArray = data.xmat[self._body].reshape(3, 3)
@@ -162,6 +152,7 @@ class PhysicsPlant(Plant):
         turned = (heading - self.heading_rad + np.pi) % (2.0 * np.pi) - np.pi
         self.heading_rad += turned
         self._turn_axes()
+        self._lay_ground()
         right, left = data.qpos[7:9].tolist()
         self.right_angle_rad, self.left_angle_rad = right, left
         self.right_rad_s, self.left_rad_s = data.qvel[6:8].tolist()
@@ -188,13 +179,10 @@ class PhysicsPlant(Plant):
 
     def place(self, x_m: float, y_m: float, heading_rad: float) -> None:
         """Put the body, at rest, elsewhere on the surface, deck frame."""
-        pose = DeckPose(x_m, y_m, heading_rad)
-        axes = np.array(self._mirror.robot_axes(pose)).T
-        quaternion = np.zeros(4)
-        self._mujoco.mju_mat2Quat(quaternion, axes.ravel())
+        axes = np.array(self._mirror.robot_axes(DeckPose(x_m, y_m, heading_rad))).T
         data = self._data
         data.qpos[:3] = self._surface.point(x_m, y_m)
-        data.qpos[3:7] = quaternion
+        self._mujoco.mju_mat2Quat(data.qpos[3:7], axes.ravel())
         data.qvel[:] = 0.0
         self._mujoco.mj_forward(self._model, data)
         self.heading_rad = heading_rad
