@@ -162,12 +162,12 @@ class PosePredictor:
         self._noise = (0.0, 0.0, 0.0)
         self._speed_gain = self._gyro_share = 0.0
         self.x_m = self.y_m = self.heading_rad = self.v_m_s = self.omega_rad_s = 0.0
-        self.creep_x = self.creep_y = 0.0
+        self.creep_x = self.creep_y = self._turn_creep_x = self._turn_creep_y = 0.0
 
     def begin(self, mean: FloatArray, slope: Slope, half_s: float) -> None:
         """The filter has taken a step of which ``half_s`` is half the length; its mean speed belongs to the middle."""
         state: list[float] = mean.tolist()
-        x, y, psi, v, a, w, self._bias, scale, _, s_r, s_l, k_l, c, *_ = state  # in the order of ``state_model``
+        x, y, psi, v, a, w, self._bias, scale, _, s_r, s_l, k_l, c, *_, ct = state  # as ``state_model``
         self.x_m, self.y_m, self.heading_rad = x, y, psi
         self._a = a
         self.v_m_s, self.omega_rad_s = v + a * half_s, w
@@ -181,6 +181,7 @@ class PosePredictor:
         self._along, self._ex, self._ey = 1.0 / s, -fx * fy / (norm * s), s / norm
         self._k1, self._k2 = fy * fxx / (s2 * norm), fy * fxy / (s2 * norm)
         self.creep_x, self.creep_y = c * gx, c * gy
+        self._turn_creep_x, self._turn_creep_y = ct * gx, ct * gy
 
     def trust(self, angle_variance_rad2: float, rate_variance_rad2_s2: float, dt_s: float) -> None:
         """Noise of one wheel's travel in a frame of ``dt_s``, and of a sample of the gyroscope."""
@@ -206,9 +207,9 @@ class PosePredictor:
         d, turn = 0.5 * (right + left), (right - left) * self._per_base
         middle = self.heading_rad + 0.5 * turn
         cosine, sine = cos(middle), sin(middle)
-        way = d if d >= 0.0 else -d
-        dx = d * (cosine * self._along + sine * self._ex) + way * self.creep_x
-        dy = d * sine * self._ey + way * self.creep_y
+        way, angle = d if d >= 0.0 else -d, turn if turn >= 0.0 else -turn
+        dx = d * (cosine * self._along + sine * self._ex) + way * self.creep_x + angle * self._turn_creep_x
+        dy = d * sine * self._ey + way * self.creep_y + angle * self._turn_creep_y
         self.x_m += dx
         self.y_m += dy
         self.heading_rad += turn - self._k1 * dx - self._k2 * dy

@@ -78,14 +78,15 @@ _TAUGHT = 0.9999
 # var(s_R - s_L) over var((s_R + s_L)/2), both wheels drawing from one population.
 _DIFFERENCE = 4.0
 
-# Parameters (mean slip, difference of the slips, creep) out of the states (SR, SL, C), and back.
-_PARAMETERS = np.array([[0.5, 0.5, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+# Parameters (mean slip, difference of the slips, both creeps) out of the states (SR, SL, C, CT), and back.
+_PARAMETERS = np.eye(4)
+_PARAMETERS[:2, :2] = [[0.5, 0.5], [1.0, -1.0]]
 _STATES = np.linalg.inv(_PARAMETERS)
 _SLIP_BLOCK = np.ix_(SLIPS, SLIPS)
 
 
 def _parameters_of(mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Means (3,) and variances (3,) of the parameters in a state (n,), (n, n)."""
+    """Means (4,) and variances (4,) of the parameters in a state (n,), (n, n)."""
     known = _PARAMETERS.dot(covariance[_SLIP_BLOCK]).dot(_PARAMETERS.T).diagonal()
     return _PARAMETERS.dot(mean[SLIPS]), known
 
@@ -105,17 +106,19 @@ class SlipPrior:
         # Half the difference of two draws scatters as their mean does.
         expected = (cfg.slip_mean, cfg.slip_sigma), (0.0, 0.5 * cfg.slip_difference_sigma)
         self._slip_scatter = SlipPopulation(expected, cfg.slip_scatter_max)
-        self._means = np.array((cfg.slip_mean, 0.0, 0.0))
-        self._variances = np.square((cfg.slip_sigma, cfg.slip_difference_sigma, cfg.creep_sigma))
-        self._creep_share = cfg.creep_scatter_share**2
+        self._means = np.array((cfg.slip_mean, 0.0, 0.0, 0.0))
+        sigmas = cfg.slip_sigma, cfg.slip_difference_sigma, cfg.creep_sigma, cfg.turn_creep_sigma_m_rad
+        self._variances = np.square(sigmas)
+        self._creep_shares = cfg.creep_scatter_share**2, cfg.turn_creep_scatter_share**2
         self._wander = cfg.wander_fraction**2 / cfg.wander_time_s
         self._scatters = self._learned()
         self._is_open = False
         self._wandered = 0.0  # variance of the mean slip's wander in this leg, part of the scatter
 
-    def _learned(self) -> tuple[float, float, float]:
-        slip, creep, variance = self._slip_scatter.scatter, float(self._means[2]), float(self._variances[2])
-        return slip, _DIFFERENCE * slip, self._creep_share * (creep * creep + variance)
+    def _learned(self) -> tuple[float, float, float, float]:
+        slip, squares = self._slip_scatter.scatter, np.square(self._means[2:]) + self._variances[2:]
+        creep, turn_creep = (self._creep_shares * squares).tolist()
+        return slip, _DIFFERENCE * slip, creep, turn_creep
 
     def _open(self) -> None:
         self._is_open, self._wandered = True, 0.0
@@ -127,7 +130,7 @@ class SlipPrior:
         return self._scatters[0] ** 0.5, self._scatters[2] ** 0.5
 
     def first(self) -> tuple[FloatArray, FloatArray]:
-        """Prior of (right slip, left slip, creep) before the first leg: mean (3,), covariance (3, 3)."""
+        """Prior of (right slip, left slip, creeps) before the first leg: mean (4,), covariance (4, 4)."""
         self._open()
         means, variances = self._prior
         return _STATES.dot(means), (_STATES * variances).dot(_STATES.T)
@@ -135,8 +138,8 @@ class SlipPrior:
     def begin(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """A leg begins; the state before it, mean (n,) and covariance (n, n), ends the last one.
 
-        Transition of (right slip, left slip, creep) to the next leg, s' = F s + b + e: F (3, 3), b (3,), and the
-        covariance (3, 3) of e.
+        Transition of (right slip, left slip, creeps) to the next leg, s' = F s + b + e: F (4, 4), b (4,), and the
+        covariance (4, 4) of e.
         """
         found, known = _parameters_of(mean, covariance)
         # A leg shows m by the share beta of what was not known of it; ``own`` is what is left.
@@ -148,11 +151,11 @@ class SlipPrior:
         F, Q = (_STATES * beta).dot(_PARAMETERS), (_STATES * (own + self._scatters)).dot(_STATES.T)
         return F, _STATES.dot(self._means) - F.dot(mean[SLIPS]), Q
 
-    def wander(self, dt_s: float) -> tuple[float, float]:
-        """Slip (of each wheel) and creep wander within the leg for a step of ``dt_s``: by which variance."""
+    def wander(self, dt_s: float) -> tuple[float, float, float]:
+        """Slip (of each wheel) and creeps wander within the leg for a step of ``dt_s``: by which variance."""
         per_step = self._wander * dt_s
         self._wandered += per_step
-        return 2.0 * per_step * self._scatters[0], per_step * self._scatters[2]
+        return 2.0 * per_step * self._scatters[0], per_step * self._scatters[2], per_step * self._scatters[3]
 
     def end(self, mean: FloatArray, covariance: FloatArray) -> None:
         """A fix has ended the leg: learn how much legs differ from the state after it, (n,) and (n, n)."""

@@ -81,7 +81,7 @@ class SurveyFilter:
     ) -> None:
         """Frames up to ``t_s``: predict, then update with wheel angles, angular rate and acceleration."""
         dt_s = block.dt_s
-        slip, creep = self._legs.wander(block.turning_s) if dt_s > 0.0 else (0.0, 0.0)
+        slips = self._legs.wander(block.turning_s) if dt_s > 0.0 else (0.0, 0.0, 0.0)
         encoders = self.encoder_walk(right) * dt_s
         readings = []
         # The rate before the angles: the other way round little is left of its variance, and digits go with the rest.
@@ -100,7 +100,7 @@ class SurveyFilter:
 
         def step() -> None:
             if dt_s > 0.0:
-                self._predict(dt_s, slip, creep, encoders)
+                self._predict(dt_s, slips, encoders)
             if rows is not None:
                 self._filter.update(rows.z, rows, rows.R)
 
@@ -114,15 +114,19 @@ class SurveyFilter:
         mean = self._filter.mean
         return self._mirror.nearest_panel(float(mean[sm.X]), float(mean[sm.Y]))
 
-    def _predict(self, dt_s: float, slip: float, creep: float, encoders: float) -> None:
-        full = self._full
+    def _predict(self, dt_s: float, slips: tuple[float, float, float], encoders: float) -> None:
+        full, (slip, creep, turn_creep) = self._full, slips
         motion = self._motion.over(dt_s, self.slope())
         jerk, twist = full.jerk_density_m2_s5 * dt_s, full.angular_acceleration_density_rad2_s3 * dt_s
-        impulses = np.array((jerk, twist, slip, slip, creep))
+        impulses = np.array((jerk, twist, slip, slip, creep, turn_creep))
         drift = self._drift  # work space, of which the model keeps nothing
         drift[sm.BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * dt_s
         drift[sm.BA] = full.accelerometer_bias_walk_m_s2_sqrt_s**2 * dt_s
         drift[sm.PR] = drift[sm.PL] = encoders
+        # A tyre that gives way does so downhill in the main, and as it likes besides.
+        mean: FloatArray = self._filter.mean
+        aside = full.turn_creep_aside * float(mean[sm.CT])
+        drift[sm.X] = drift[sm.Y] = aside * aside * abs(float(mean[sm.W])) * dt_s
         self._filter.predict(motion, motion.noise(self._filter.mean, impulses, drift))
 
     def encoder_walk(self, wheel: WheelAngle) -> float:
@@ -185,6 +189,7 @@ class SurveyFilter:
             return
         F, b, Q = np.eye(sm.STATES), np.zeros(sm.STATES), np.zeros((sm.STATES, sm.STATES))
         F[_SLIP_BLOCK], b[sm.SLIPS], Q[_SLIP_BLOCK] = self._legs.begin(self._filter.mean, self._filter.covariance)
+        Q[sm.KL, sm.KL] = (self._full.turn_loss_per_creep_rad_m * float(self._filter.mean[sm.CT])) ** 2
         self.journal.do(lambda: self._filter.predict(sm.Affine(F, b), Q))
 
     def end_leg(self) -> None:

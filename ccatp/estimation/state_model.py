@@ -30,23 +30,23 @@ class Affine:
         return image
 
 
-X, Y, PSI, V, A, W, BG, KG, BA, SR, SL, KL, C, PR, PL, E0, E1, TX, TY = range(19)
+X, Y, PSI, V, A, W, BG, KG, BA, SR, SL, KL, C, PR, PL, E0, E1, TX, TY, CT = range(20)
 """Order of the state.
 
 X, Y: robot origin, deck frame, m. PSI: deck heading, rad, not wrapped. V: speed that the wheels give the body over the
 last step, m/s. A: its rate of change, m/s^2. W: rate about the normal over the last step, rad/s. BG: gyroscope bias,
 rad/s. KG: gyroscope scale error. BA: accelerometer bias, m/s^2. SR, SL: slip of the right and of the left wheel, the
 part of its travel that the body does not follow (an error of the radius included). KL: relative error of the wheel
-base. C: downhill creep, part of |V|. PR, PL: angle of the right and of the left wheel since the last rest, rad. E0, E1:
-how far the two edges of the seam crossed last lie from where the map has them, m. TX, TY: by how much the puck is off
-its place over the robot because the panel under it is tilted, deck frame, m.
+base. C, CT: downhill creep, part of |V|, and of |W|, m/rad. PR, PL: angle of the right and of the left wheel since the
+last rest, rad. E0, E1: how far the two edges of the seam crossed last lie from where the map has them, m. TX, TY: by
+how much the puck is off its place over the robot because the panel under it is tilted, deck frame, m.
 """
-STATES = 19
-POSE, SPEEDS, SLIPS, ANGLES, EDGES, TILT = [X, Y, PSI], [V, A, W], [SR, SL, C], [PR, PL], [E0, E1], [TX, TY]
-_NOISY = np.array([A, W, SR, SL, C])  # whose noise enters at the beginning of a step and is carried through it
+STATES = 20
+POSE, SPEEDS, SLIPS, ANGLES, EDGES, TILT = [X, Y, PSI], [V, A, W], [SR, SL, C, CT], [PR, PL], [E0, E1], [TX, TY]
+_NOISY = np.array([A, W, SR, SL, C, CT])  # whose noise enters at the beginning of a step and is carried through it
 _MOVED = np.array([X, Y, PSI, V, PR, PL])  # by a step, in the order of `SurveyMotion.at`
 # Entries of the motion's Jacobian beside those of the identity, as `SurveyMotion.at` lists them: one call sets all.
-_COLUMNS: dict[int, tuple[int, ...]] = dict.fromkeys((X, Y, PSI), (PSI, V, A, W, C))
+_COLUMNS: dict[int, tuple[int, ...]] = dict.fromkeys((X, Y, PSI), (PSI, V, A, W, C, CT))
 _COLUMNS |= {V: (A,), PR: (V, A, W, SR, KL), PL: (V, A, W, SL, KL)}
 _ENTRIES = np.array([row * STATES + column for row, columns in _COLUMNS.items() for column in columns])
 
@@ -57,7 +57,7 @@ class SurveyMotion:
     ::
 
         v' = v + a dt,   d = v' dt,   turn = w dt
-        (x, y)' = (x, y) + d h(psi + turn/2) + c |d| g
+        (x, y)' = (x, y) + d h(psi + turn/2) + (c |d| + ct |turn|) g
         psi' = psi + turn - fy (fxx dx + fxy dy) / ((1 + fx^2) W)
         phi_R' = phi_R + (d + turn (1 + kl) L/2) / (r (1 - s_R)),   phi_L' likewise with -L/2
 
@@ -82,7 +82,7 @@ class SurveyMotion:
             return self._x, self._F
         self._of = x
         state: list[float] = x.tolist()
-        x_m, y_m, psi, v, a, w, _, _, _, s_r, s_l, kl, c, p_r, p_l, *_ = state
+        x_m, y_m, psi, v, a, w, _, _, _, s_r, s_l, kl, c, p_r, p_l, *_, ct = state
         dt, (fx, fy, fxx, fxy, _, gx, gy) = self._dt_s, self._slope
         v += a * dt
         d, turn = v * dt, w * dt
@@ -92,8 +92,9 @@ class SurveyMotion:
         middle = psi + 0.5 * turn
         cosine, sine = cos(middle), sin(middle)
         hx, hy, lx, ly = cosine / s + sine * ex, sine * ey, cosine * ex - sine / s, cosine * ey
-        way = abs(d)
-        dx, dy = d * hx + c * way * gx, d * hy + c * way * gy
+        way, angle = abs(d), abs(turn)
+        down = c * way + ct * angle
+        dx, dy = d * hx + down * gx, d * hy + down * gy
         k1, k2 = fy * fxx / (s2 * norm), fy * fxy / (s2 * norm)
         per_r, per_l = 1.0 / (self._radius_m * (1.0 - s_r)), 1.0 / (self._radius_m * (1.0 - s_l))
         half = self._half_base_m
@@ -101,15 +102,16 @@ class SurveyMotion:
         right, left = d + side, d - side
         self._x[:] = x
         self._x[_MOVED] = x_m + dx, y_m + dy, psi + turn - k1 * dx - k2 * dy, v, p_r + right * per_r, p_l + left * per_l
-        sign = c if d >= 0.0 else -c
+        sign, turn_down = c if d >= 0.0 else -c, dt * (ct if turn >= 0.0 else -ct)
         xv, yv = dt * (hx + sign * gx), dt * (hy + sign * gy)
-        x_psi, y_psi, x_c, y_c = d * lx, d * ly, way * gx, way * gy
-        psi_v, w_dt, turn_dt = -k1 * xv - k2 * yv, 0.5 * dt, dt * (1.0 + kl) * half
+        x_psi, y_psi, x_c, y_c, x_ct, y_ct = d * lx, d * ly, way * gx, way * gy, angle * gx, angle * gy
+        xw, yw = 0.5 * dt * x_psi + turn_down * gx, 0.5 * dt * y_psi + turn_down * gy
+        psi_v, turn_dt = -k1 * xv - k2 * yv, dt * (1.0 + kl) * half
         self._flat[_ENTRIES] = (
-            *(x_psi, xv, dt * xv, w_dt * x_psi, x_c),
-            *(y_psi, yv, dt * yv, w_dt * y_psi, y_c),
+            *(x_psi, xv, dt * xv, xw, x_c, x_ct),
+            *(y_psi, yv, dt * yv, yw, y_c, y_ct),
             *(1.0 - k1 * x_psi - k2 * y_psi, psi_v, dt * psi_v),
-            *(dt - w_dt * (k1 * x_psi + k2 * y_psi), -k1 * x_c - k2 * y_c, dt),
+            *(dt - k1 * xw - k2 * yw, -k1 * x_c - k2 * y_c, -k1 * x_ct - k2 * y_ct, dt),
             *(dt * per_r, dt * dt * per_r, turn_dt * per_r, right * per_r / (1.0 - s_r), turn * half * per_r),
             *(dt * per_l, dt * dt * per_l, -turn_dt * per_l, left * per_l / (1.0 - s_l), -turn * half * per_l),
         )
@@ -118,14 +120,14 @@ class SurveyMotion:
     def through(self, points: FloatArray) -> FloatArray:
         """The states (k, n) after the step, one for each row."""
         dt, (fx, fy, fxx, fxy, _, gx, gy) = self._dt_s, self._slope
-        x_m, y_m, psi, v, a, w, _, _, _, s_r, s_l, kl, c, p_r, p_l, *_ = points.T
+        x_m, y_m, psi, v, a, w, _, _, _, s_r, s_l, kl, c, p_r, p_l, *_, ct = points.T
         v = v + a * dt
         d, turn = v * dt, w * dt
         s2 = 1.0 + fx * fx
         s, norm = sqrt(s2), sqrt(s2 + fy * fy)
         middle = psi + 0.5 * turn
         cosine, sine = np.cos(middle), np.sin(middle)
-        way = c * np.abs(d)
+        way = c * np.abs(d) + ct * np.abs(turn)
         dx = d * (cosine / s - sine * (fx * fy / (norm * s))) + way * gx
         dy = d * (sine * (s / norm)) + way * gy
         side = turn * (1.0 + kl) * self._half_base_m
@@ -140,8 +142,8 @@ class SurveyMotion:
     def noise(self, x: FloatArray, impulses: FloatArray, drift: FloatArray) -> FloatArray:
         """Covariance (n, n) of a step's noise from the state x (n,) before it.
 
-        ``impulses`` (5,): variances of the impulses on A, W, SR, SL, C at its beginning; ``drift`` (n,): those at its
-        end.
+        ``impulses`` (6,): variances of the impulses on A, W, SR, SL, C, CT at its beginning; ``drift`` (n,): those
+        at its end.
         """
         G = self.at(x)[1].take(_NOISY, axis=1)
         G *= np.sqrt(impulses)

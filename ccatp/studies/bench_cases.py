@@ -129,12 +129,13 @@ def survey_problem(cfg: Config) -> FilterProblem:
     sigma[sm.BG], sigma[sm.KG] = full.gyroscope_bias_sigma_rad_s, full.gyroscope_scale_sigma
     sigma[sm.BA], sigma[sm.KL] = full.accelerometer_bias_sigma_m_s2, full.wheel_base_sigma
     sigma[[sm.SR, sm.SL]], sigma[sm.C], sigma[[sm.E0, sm.E1]] = full.slip_sigma, full.creep_sigma, full.edge_sigma_m
+    sigma[sm.CT] = full.turn_creep_sigma_m_rad
     sigma[[sm.PR, sm.PL]], sigma[[sm.TX, sm.TY]] = sqrt(_ANGLE_RAD2), robot.puck_height_m * full.panel_tilt_sigma_rad
     slope = Terrain(build_mirror(cfg.mirror)).at(float(mean[sm.X]), float(mean[sm.Y]))
     motion = sm.SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m).over(DT_S, slope)
     slip = (full.slip_scatter_max * DT_S) ** 2
     impulses = np.array(
-        (full.jerk_density_m2_s5 * DT_S, full.angular_acceleration_density_rad2_s3 * DT_S, slip, slip, slip)
+        (full.jerk_density_m2_s5 * DT_S, full.angular_acceleration_density_rad2_s3 * DT_S, *[slip] * 3, 1e-9)
     )
     drift = np.zeros(sm.STATES)
     drift[[sm.PR, sm.PL]] = cfg.localizer.encoder_sigma_rad_s**2 * full.encoder_period_s * DT_S

@@ -99,6 +99,7 @@ class Errors:
     left_slip: float = 0.0
     base: float = 0.0
     creep: float = 0.0
+    turn_creep: float = 0.0  # m/rad
     gyro_bias: float = 0.0
     gyro_scale: float = 0.0
     accelerometer_bias: float = 0.0
@@ -178,8 +179,9 @@ class Robot:
             n = self.mirror.surface.normal(x, y)
             h = along_surface(h, n)
             dx, dy = d * h[0], d * h[1]
-            if self.errors.creep:
-                g, way = along_surface(self.gravity, n), self.errors.creep * abs(d)
+            if self.errors.creep or self.errors.turn_creep:
+                way = self.errors.creep * abs(d) + self.errors.turn_creep * abs(turn)
+                g = along_surface(self.gravity, n)
                 dx, dy = dx + way * g[0], dy + way * g[1]
             x, y = self.x_m + 0.5 * dx, self.y_m + 0.5 * dy
         self.x_m, self.y_m = self.x_m + dx, self.y_m + dy

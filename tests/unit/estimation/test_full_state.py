@@ -350,7 +350,7 @@ def test_ekf_and_ukf_agree(wrong: Errors) -> None:
     """What sigma points see of the bends is small against what is not known.
 
     The gyroscope's scale error times the rate is the strongest of them: a percent of what is not known of the rate goes
-    to the bias at each turn.
+    to the bias at each turn. The size of a turn, with which the body creeps, has a bend where the turn begins.
     """
     robot = Robot(v=L_SHAPED[0], omega=L_SHAPED[1], errors=wrong)
     found = build("ekf"), build("ukf")
@@ -361,7 +361,7 @@ def test_ekf_and_ukf_agree(wrong: Errors) -> None:
             localizer.fuse_fix(robot.fix())
     (x, P), (y, S) = (localizer.state for localizer in found)
     sigma = np.sqrt(P.diagonal())
-    assert np.max(np.abs(x - y) / (sigma + 1e-9)) < 0.25
+    assert np.max(np.abs(x - y) / (sigma + 1e-9)) < 0.3
     assert np.sqrt(S.diagonal())[:13] == pytest.approx(sigma[:13], rel=0.06)
     for localizer in found:
         distance_m, heading_rad = errors_of(localizer, robot.pose)
@@ -380,6 +380,7 @@ def test_between_the_steps_of_the_filter_the_pose_is_carried_on() -> None:
         slip_scatter_max=1e-6,
         slip_difference_sigma=1e-6,
         creep_sigma=1e-6,
+        turn_creep_sigma_m_rad=1e-9,
         wheel_base_sigma=1e-6,
     )
     for _ in range(500):

@@ -189,10 +189,11 @@ def test_a_late_fix_is_as_good_as_one_in_time(filter_name: str, name: str, taken
     in_time, late = story.tell({taken: [fix]}), story.tell({told: [fix]})
     assert (in_time.counts["late_fixes"], late.counts["late_fixes"]) == (0, 1)
     mean, covariance = apart(in_time, late)
-    # The ground is looked up where the filter thought it was: slopes off by 1e-7 in some hundred steps. Sigma points
-    # lose half the digits of a covariance whose smallest variances are 1e-12 of its largest.
+    # The ground is looked up where the filter thought it was: slopes off by 1e-7 in some hundred steps, and so is the
+    # creep that sets the noise of a turn. Sigma points lose half the digits of a covariance whose smallest variances
+    # are 1e-12 of its largest.
     assert mean < 1e-5
-    assert covariance < 1e-4
+    assert covariance < 3e-4
 
 
 @pytest.mark.parametrize("inside", [1, 3])

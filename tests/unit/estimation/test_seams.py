@@ -16,7 +16,7 @@ from ccatp.estimation.localizer_base import SensorTransition
 from ccatp.estimation.odometry import Slope, Terrain
 from ccatp.estimation.seams import Edge, SeamLines
 from ccatp.estimation.slip_prior import SlipPopulation, SlipPrior
-from ccatp.estimation.state_model import E0, E1, PSI, SL, SR, STATES, A, C, V, W, X, Y
+from ccatp.estimation.state_model import CT, E0, E1, PSI, SL, SR, STATES, A, C, V, W, X, Y
 from ccatp.mirror.mirror import Mirror
 from tests.unit.estimation.drive import Rate, Robot, build, config, errors_of, mirror, run, trapeze
 
@@ -242,7 +242,7 @@ def test_an_edge_far_from_where_it_is_expected_is_gated() -> None:
     assert errors_of(found, robot.pose)[0] == pytest.approx(0.02, abs=0.006)  # 1.5 % of slip are expected on 0.35 m
 
 
-DRAWN = [SR, SL, C]
+DRAWN = [SR, SL, C, CT]
 
 
 def population() -> SlipPopulation:
@@ -279,11 +279,12 @@ def test_legs_that_differ_show_by_how_much(scatter: float) -> None:
 
 # -- the book ---------------------------------------------------------------------------------------------------------
 
-TO_PARAMETERS = np.array([[0.5, 0.5, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+TO_PARAMETERS = np.eye(4)
+TO_PARAMETERS[:2, :2] = [[0.5, 0.5], [1.0, -1.0]]
 
 
 def state(mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """A filter's state that holds this of (right slip, left slip, creep)."""
+    """A filter's state that holds this of (right slip, left slip, creep, creep of turns)."""
     x, P = np.zeros(STATES), np.eye(STATES)
     x[DRAWN], P[np.ix_(DRAWN, DRAWN)] = mean, covariance
     return x, P
@@ -292,13 +293,14 @@ def state(mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatAr
 def test_the_first_leg_is_what_was_expected(full: FullStateConfig) -> None:
     book = SlipPrior(full)
     mean, P = book.first()
-    assert mean == pytest.approx([full.slip_mean, full.slip_mean, 0.0], abs=1e-15)
+    assert mean == pytest.approx([full.slip_mean, full.slip_mean, 0.0, 0.0], abs=1e-15)
     means = TO_PARAMETERS.dot(P).dot(TO_PARAMETERS.T)
     slip, creep = book.scatter
     expected = (
         full.slip_sigma**2 + slip**2,
         full.slip_difference_sigma**2 + 4.0 * slip**2,  # of a difference against that of a mean
         full.creep_sigma**2 * (1.0 + full.creep_scatter_share**2),
+        full.turn_creep_sigma_m_rad**2 * (1.0 + full.turn_creep_scatter_share**2),
     )
     np.testing.assert_allclose(means, np.diag(expected), rtol=1e-12, atol=1e-18)
     assert creep == pytest.approx(full.creep_scatter_share * full.creep_sigma)

@@ -13,6 +13,7 @@ from ccatp.estimation.odometry import Slope, Terrain, axes_on
 from ccatp.estimation.state_model import (
     BA,
     BG,
+    CT,
     KG,
     KL,
     PL,
@@ -46,10 +47,14 @@ def near(limit: float) -> st.SearchStrategy[float]:
 
 @st.composite
 def states(draw: st.DrawFn) -> FloatArray:
-    """Any state of a robot that moves: |d| has no derivative at standstill."""
+    """Any state of a robot that drives and turns: neither way nor turn has a derivative of its size at zero."""
     x = np.array(
-        [draw(near(limit)) for limit in (3, 3, 7, 0.0, 0.5, 2, 0.05, 0.05, 1, 0.05, 0.05, 0.05, 0.1, 9, 9, 1, 1, 1, 1)]
+        [
+            draw(near(limit))
+            for limit in (3, 3, 7, 0.0, 0.5, 0.0, 0.05, 0.05, 1, 0.05, 0.05, 0.05, 0.1, 9, 9, 1, 1, 1, 1, 0.1)
+        ]
     )
+    x[W] = draw(st.sampled_from([-1.0, 1.0])) * draw(st.floats(1e-3, 2.0))
     x[V] = draw(st.sampled_from([-1.0, 1.0])) * draw(st.floats(0.06, 0.4))  # more than a dt takes away
     return x
 
@@ -87,12 +92,12 @@ def test_the_motion_of_many_is_that_of_each(points: list[FloatArray], slope: Slo
 
 
 @examples
-@given(states(), slopes(), durations, st.lists(st.floats(0.0, 1.0), min_size=5, max_size=5))
+@given(states(), slopes(), durations, st.lists(st.floats(0.0, 1.0), min_size=6, max_size=6))
 def test_noise_is_that_of_impulses_carried_through_the_step(
     x: FloatArray, slope: Slope, dt_s: float, impulses: list[float]
 ) -> None:
     motion, drift = SurveyMotion(R_M, BASE_M).over(dt_s, slope), np.linspace(0.0, 1.0, STATES)
-    columns = differences(motion, x)[:, [A, W, SR, SL, C]]
+    columns = differences(motion, x)[:, [A, W, SR, SL, C, CT]]
     expected = (columns * impulses).dot(columns.T) + np.diag(drift)
     # A product of two derivatives below 10, each off by the tolerance.
     np.testing.assert_allclose(motion.noise(x, np.array(impulses), drift), expected, atol=40.0 * TOLERANCE)
@@ -107,7 +112,7 @@ def test_creep_goes_downhill_whichever_way_the_robot_drives(sign: float) -> None
     assert after[[X, Y]] == pytest.approx([sign * 0.01 + 0.0003, 0.0004], abs=1e-15)
 
 
-ALL = Errors(right_slip=0.05, left_slip=0.02, base=0.02, creep=0.05)
+ALL = Errors(right_slip=0.05, left_slip=0.02, base=0.02, creep=0.05, turn_creep=0.003)
 CASES = {
     "perfect": Errors(),
     "all": ALL,
@@ -125,7 +130,7 @@ def test_a_robot_on_the_mirror_moves_as_modelled(
     pose, angles = robot.pose, tuple(robot.angles)
     x = np.zeros(STATES)
     x[[X, Y, PSI, V, W]] = pose.x_m, pose.y_m, pose.heading_rad, v, omega
-    x[[SR, SL, KL, C]] = wrong.right_slip, wrong.left_slip, wrong.base, wrong.creep
+    x[[SR, SL, KL, C, CT]] = wrong.right_slip, wrong.left_slip, wrong.base, wrong.creep, wrong.turn_creep
     motion, terrain = SurveyMotion(R_M, BASE_M), Terrain(mirror)
     for _ in range(50):
         x = motion.over(0.04, terrain.at(float(x[X]), float(x[Y]))).at(x)[0].copy()
