@@ -20,7 +20,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 # One more than there are cores: tests of real processes wait for most of their time.
 PYTEST := $(BIN)/python -m pytest -n $$(($(WORKERS) + 1)) --dist loadgroup --no-loadscope-reorder
 
-.PHONY: help run test tests test-newest newest newest-tests test-slow slow-tests new-examples sweep tried-in faults docs man onboard-wheel metrics lint format
+.PHONY: help run test tests test-newest newest newest-tests environment test-slow slow-tests new-examples sweep tried-in faults docs man onboard-wheel metrics lint format
 .PHONY: kills mutants golden golden-quick lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
@@ -126,6 +126,8 @@ onboard-wheel: $(VENV)/.installed-dev
 
 metrics: $(VENV)/.installed-dev
 	@$(BIN)/python -m tests.metrics $(ARGS)
+
+environment: $(VENV)/.installed-dev
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check

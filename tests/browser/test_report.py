@@ -12,6 +12,7 @@ from ccatp.core import PointId
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.compare import compare_runs
 from ccatp.report.run_page import report_run
+from tests.unit.reporting.recorded import record
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page
@@ -19,13 +20,12 @@ if TYPE_CHECKING:
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
-@pytest.mark.usefixtures("drawn")
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium here: apt install chromium")
-def test_the_pages_open_by_themselves(recorded: Path, tmp_path: Path) -> None:
+def test_the_pages_open_by_themselves(tmp_path: Path) -> None:
     # One test with one browser: its processes end with the test.
     from playwright.sync_api import sync_playwright
 
-    report = tmp_path / "report.html"
+    recorded, report = record(tmp_path / "tonight"), tmp_path / "report.html"
     report_run(recorded, report)
     compare_runs(recorded, recorded, tmp_path / "compare.html")
     with sync_playwright() as playwright:
