@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ccatp.beacons.cricket.trilateration import trilaterate
 from ccatp.beacons.slam.batch_problem import CALIBRATION, Reckoning
 from ccatp.beacons.slam.measurement_models import range_variance
 from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun
@@ -66,8 +67,7 @@ def import_gtsam() -> Any:
 
 
 STARTS = 48  # directions, around the place of a range's reading, from which a beacon is sought
-PLACING_ITERATIONS = 20
-FREEDOM = 4.0  # of Student's t by which outliers are bounded
+OUTLYING = 2.0  # sigmas beyond which a reading weighs less than half
 MOST_READINGS = 200  # of one beacon; more are thinned, since first places need no more
 APART = 0.1  # two minima are different places if they lie further apart than that part of the beacon's distance
 
@@ -88,36 +88,21 @@ def place_by_distances(poses: FloatArray, distance_m: FloatArray, variance: Floa
     3). ``distance_m``: to one beacon, shape (m,). ``variance``: of the distances, m^2, shape (m,).
     """
     thin = max(1, -(-len(distance_m) // MOST_READINGS))
-    x, y, distance, information = poses[::thin, 0], poses[::thin, 1], distance_m[::thin], 1.0 / variance[::thin]
+    anchors, distance, sigmas = poses[::thin, :2], distance_m[::thin], np.sqrt(variance[::thin])
     nearest = int(np.argmin(distance))
     angle = 2.0 * np.pi * np.arange(STARTS) / STARTS
-    bx = x[nearest] + distance[nearest] * np.cos(angle)
-    by = y[nearest] + distance[nearest] * np.sin(angle)
-    reach = float(distance.max())
-    xx = yy = xy = np.ones(STARTS)
-    for _ in range(PLACING_ITERATIONS):
-        dx, dy = bx[:, None] - x, by[:, None] - y
-        r = np.maximum(np.hypot(dx, dy), 1e-3)
-        e, ux, uy = r - distance, dx / r, dy / r
-        w = information * (FREEDOM + 1.0) / (FREEDOM + e * e * information)
-        xx, yy, xy = (w * ux * ux).sum(1), (w * uy * uy).sum(1), (w * ux * uy).sum(1)
-        little = 1e-3 * (xx + yy)  # a straight path that points at the beacon says nothing across
-        xx, yy = xx + little, yy + little
-        gx, gy = (w * ux * e).sum(1), (w * uy * e).sum(1)
-        determinant = xx * yy - xy * xy
-        sx, sy = (yy * gx - xy * gy) / determinant, (xx * gy - xy * gx) / determinant
-        size = np.hypot(sx, sy)
-        short = np.minimum(1.0, 0.3 * reach / np.maximum(size, 1e-12))
-        bx, by = bx - short * sx, by - short * sy
-    e = np.hypot(bx[:, None] - x, by[:, None] - y) - distance
-    cost = (0.5 * (FREEDOM + 1.0) * np.log1p(e * e * information / FREEDOM)).sum(1)
-    best = int(np.argmin(cost))
-    others = np.hypot(bx - bx[best], by - by[best]) > APART * reach
-    margin = float(cost[others].min() - cost[best]) if others.any() else np.inf
-    half_trace, d = 0.5 * (xx[best] + yy[best]), xx[best] * yy[best] - xy[best] ** 2
-    least = half_trace - np.sqrt(max(half_trace**2 - d, 0.0))
-    spread = float(1.0 / np.sqrt(max(least, 1e-12)) / distance[nearest])
-    return Placement(float(bx[best]), float(by[best]), margin, spread)
+    starts = anchors[nearest] + distance[nearest] * np.column_stack([np.cos(angle), np.sin(angle)])
+    found, costs = trilaterate(starts, anchors, distance, sigmas, OUTLYING)
+    best = int(np.argmin(costs))
+    others = np.hypot(*(found - found[best]).T) > APART * float(distance.max())
+    margin = 0.5 * float(costs[others].min() - costs[best]) if others.any() else np.inf
+    ways = found[best] - anchors
+    off = np.hypot(*ways.T)
+    J = ways / (np.maximum(off, 1e-3) * sigmas * np.sqrt(1.0 + ((off - distance) / (OUTLYING * sigmas)) ** 2))[:, None]
+    least = max(float(np.linalg.eigvalsh(J.T @ J)[0]), 1e-12)
+    return Placement(
+        float(found[best, 0]), float(found[best, 1]), margin, 1.0 / np.sqrt(least) / float(distance[nearest])
+    )
 
 
 class _Session:
