@@ -85,7 +85,7 @@ def run_job(job: Job) -> JobOutcome:
         outlook = look_ahead(cfg, field, case.method)
         bound_m, deficiency, is_unique = outlook.bound_rms_m, outlook.freedom.deficiency, outlook.folds.is_unique
     values = {
-        **{name: getattr(run, name) for name in ("rms_m", "phase1_rms_m", "expected_rms_m")},
+        **{name: getattr(run, name) for name in ("rms_m", "phase1_rms_m", "expected_rms_m", "nees")},
         "bound_m": bound_m,
         "rank_deficiency": deficiency,
         "is_unique": is_unique,
@@ -116,6 +116,7 @@ def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
         "coordinate_rms_at_30_m": None if shown_m is None else float(shown_m / np.sqrt(2.0)),
         "expected_rms_m": float(np.median([run["expected_rms_m"] for run in runs])),
         "bound_m": bound_m,
+        "nees": None if runs[0]["nees"] is None else float(np.mean([run["nees"] for run in runs])),
         "ratio": None if bound_m is None else total / bound_m,
         "rank_deficiency": max(run["rank_deficiency"] for run in runs),
         "is_unique": all(run["is_unique"] for run in runs),
@@ -192,7 +193,7 @@ STUDY = Study(
     columns="""
         figure phase1_rms_m
         rms_m: p10 p50 p90
-        rms_at_30_m coordinate_rms_at_30_m expected_rms_m bound_m ratio rank_deficiency is_unique spent_ms
+        rms_at_30_m coordinate_rms_at_30_m expected_rms_m bound_m ratio nees rank_deficiency is_unique spent_ms
     """,
     draw=draw,
     mirrors=(),

@@ -30,6 +30,7 @@ from ccatp.sim.motes import MoteField, MotePulse, true_motes
 
 _LAYOUT, _FIELD, _READINGS = 0, 1, 2  # streams of random numbers of one seed
 _GENERIC = 0  # seed of the random places of rank and fold-over: they must not depend on the run
+_KNOWN_M2 = 1e-14  # variance of a coordinate that is known
 _LINED = 100  # motes up to which the measured pairs are drawn
 
 
@@ -95,6 +96,16 @@ class MoteRun:
     def expected_rms_m(self) -> float:
         """The same as the map's covariance has it."""
         return float(self.expected_trace_m[-1])
+
+    @property
+    def nees(self) -> float | None:
+        """Of all places by degree of freedom, known coordinates left out; None where the frame was free."""
+        if self.is_aligned:
+            return None
+        values, vectors = np.linalg.eigh(self.covariance_m2)
+        is_open = values > _KNOWN_M2
+        across = (self.positions_m - self.true_m).ravel() @ vectors[:, is_open]
+        return float((across**2 / values[is_open]).mean())
 
 
 @dataclass(frozen=True, slots=True)
