@@ -36,7 +36,7 @@ STUDIES = {
     "radio-cases": ("radio_studies:RADIO_CASES", "cases I to III of 2017 side by side with ours"),
     "radio-follow": ("radio_studies:RADIO_FOLLOW", "a moving radio followed, beside 2018"),
     "recordings": ("recordings:RECORDINGS", "estimators on recorded runs among beacons, from several starts"),
-    "damage": ("recordings:DAMAGE", "the filter on damaged recordings: recovered, reported or wrong"),
+    "damage": ("damage:STUDY", "the filter on damaged recordings: recovered, reported or wrong"),
     "loops": ("loops:run", "Bode plots, margins and root loci of the controllers"),
 }
 

@@ -12,9 +12,10 @@ from ccatp.config.models import Config
 from ccatp.studies import cricket_study
 from ccatp.studies.campaign import CampaignError, Cell, CellResult, Job, JobOutcome
 from ccatp.studies.cricket_study import combine, run_job
+from ccatp.studies.damage import DAMAGES, Damage, run_damage
 from ccatp.studies.mote_navigation import combine as mote_navigation_combine
 from ccatp.studies.mote_runs import run_batch, run_filter, simulate_field
-from ccatp.studies.recordings import DAMAGES, Damage, estimate, events_of, run_damage, run_recordings
+from ccatp.studies.recordings import estimate, events_of, run_recordings
 from tests.unit.beacons.datasets.sets import recorded, world
 
 # One worker computes the cells that they share.

@@ -36,7 +36,9 @@ RUNS: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
     ),
     "faults": (("faults=random",), ("--mirror", "thesis-m1", *ONE_PANEL), "faults"),
     "cricket": (("case=zigzag-printed,all-printed,batch-45-once",), (), "figure_11_12 figure_14 figure_9_10_13 ways"),
-    "recordings": (("data=Plaza2", "estimator=ekf-slam"), ("--data", str(RECORDINGS)), "recordings"),
+    "recordings": (
+        ("data=Plaza2,XBee scenario 1", "estimator=ekf-slam,fingerprints"), ("--data", str(RECORDINGS)), "recordings",
+    ),
     "damage": (("damage=5 % ranges of 0 m",), ("--data", str(RECORDINGS)), ""),
     "mote-navigation": ((), ("--set", "mission.laps=1"), "mote_navigation"),
     "radio-signals": (("condition=white 2 dB",), (), "radio_signals"),
