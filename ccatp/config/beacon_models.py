@@ -509,6 +509,7 @@ class PriorsConfig(Model):
     """Standard deviations, before any reading, of what is calibrated on the way; 0: not estimated."""
 
     distance_scale: NonNegative
+    distance_per_rad: NonNegative
     turn_scale: NonNegative
     turn_per_m: NonNegative
     turn_bias_rad_s: NonNegative

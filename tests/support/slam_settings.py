@@ -10,8 +10,8 @@ _NOTHING: dict[str, object] = {
     **{f"odometry__{axis}": 0.0 for axis in ("distance_per_sqrt_rad", "turn_per_sqrt_s", "lateral_per_sqrt_m")},
     **{
         f"priors__{name}": 0.0
-        for name in ("distance_scale", "turn_scale", "turn_bias_rad_s", "odometry_delay_s", "range_scale",
-                     "range_offset_m", "rssi_reference_db", "beacon_reference_db", "rssi_exponent")
+        for name in ("distance_scale", "distance_per_rad", "turn_scale", "turn_bias_rad_s", "odometry_delay_s",
+                     "range_scale", "range_offset_m", "rssi_reference_db", "beacon_reference_db", "rssi_exponent")
     },
     "filter__turn_bias_walk_rad_s_sqrt_s": 0.0,
     "filter__rest_speed_m_s": 0.0,

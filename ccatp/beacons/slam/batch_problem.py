@@ -6,16 +6,16 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from ccatp.beacons.slam.measurement_models import bearing_row, level_row, range_row, range_variance
-from ccatp.beacons.slam.motion import POSE
+from ccatp.beacons.slam.motion import POSE, turned_way
 from ccatp.beacons.slam.recording import BoolArray, Readings, Steps, running_total
 from ccatp.config.beacon_models import OdometryNoiseConfig, RecordingConfig
 from ccatp.core import FloatArray, IntArray
 from ccatp.filters.metrics import wrapped
 
-# What odometry is calibrated by, as in the filter: d = d_o / (1 + distance_scale),
+# What odometry is calibrated by, as in the filter: d = d_o / (1 + distance_scale) - distance_per_rad |w_o| sign(d_o),
 # w = w_o / (1 + turn_scale) + turn_per_m d_o - bias t. ``turn_per_m`` is what wheels of unequal size do;
 # ``odometry_delay_s`` is by how much the vehicle does later what its odometry says (commands taken for odometry).
-CALIBRATION = ("distance_scale", "turn_scale", "turn_per_m", "turn_bias_rad_s", "odometry_delay_s")
+CALIBRATION = ("distance_scale", "turn_scale", "turn_per_m", "turn_bias_rad_s", "odometry_delay_s", "distance_per_rad")
 BIAS = CALIBRATION.index("turn_bias_rad_s")
 STILL_M = 1e-4  # standard deviation of what happens in any interval, even at rest: keeps the covariance regular
 STILL_RAD = 1e-4
@@ -50,14 +50,16 @@ class Reckoning:
         self._fine_s, self._steps_s = fine_s, steps.times_s
         guesses = (np.broadcast_to(guess, steps.distance_m.shape) for guess in (steps.guess_m2, steps.guess_rad2))
         # The time is that in which the bias turns the heading.
-        amounts = (steps.distance_m, steps.turn_rad * ~rests, steps.lateral_m, lasts_s * ~rests, *guesses)
+        lost = turned_way(steps.distance_m, steps.turn_rad)
+        amounts = (steps.distance_m, steps.turn_rad * ~rests, steps.lateral_m, lasts_s * ~rests, lost, *guesses)
         self._totals = [running_total(amount) for amount in amounts]
         self._cut(0.0)
 
     def _cut(self, delay_s: float) -> None:
         self._delay_s = delay_s
         shares = (self._shares(total, delay_s) for total in self._totals)
-        self.distance_m, self.turn_rad, self.lateral_m, self.interval_s, self._guess_m2, self._guess_rad2 = shares
+        self.distance_m, self.turn_rad, self.lateral_m, self.interval_s, self._lost, *guesses = shares
+        self._guess_m2, self._guess_rad2 = guesses
 
     def _shares(self, total: FloatArray, delay_s: float) -> FloatArray:
         shares: FloatArray = np.diff(np.interp(self._fine_s - delay_s, self._steps_s, total))
@@ -72,13 +74,14 @@ class Reckoning:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Motion x_m, y_m, heading_rad of each interval (n, 3), in the vehicle's frame at its beginning.
 
-        With its derivatives by ``calibration`` (5,), shape (n, 3, 5), and its covariance, shape (n, 3, 3). A turn error
+        With its derivatives by ``calibration`` (6,), shape (n, 3, 6), and its covariance, shape (n, 3, 3). A turn error
         e at a step swings the rest of the interval: d(x, y) = e (-(y_end - y), x_end - x).
         """
         if calibration[4] != self._delay_s:
             self._cut(float(calibration[4]))
         by_scale, by_turn_scale = 1.0 / (1.0 + calibration[0]), 1.0 / (1.0 + calibration[1])
-        way, side, scaled_turn = by_scale * self.distance_m, by_scale * self.lateral_m, by_turn_scale * self.turn_rad
+        way = by_scale * self.distance_m - calibration[5] * self._lost
+        side, scaled_turn = by_scale * self.lateral_m, by_turn_scale * self.turn_rad
         turn = scaled_turn + calibration[2] * self.distance_m - calibration[3] * self.interval_s
         before = running_total(turn)
         heading = before[:-1] + 0.5 * turn - np.repeat(before[self._starts], self._lengths)
@@ -92,15 +95,16 @@ class Reckoning:
         lever_y = np.repeat(end_x + start_x, self._lengths) - x
         motion = np.stack([end_x, end_y, self._sum(turn)], axis=1)
         by = np.zeros((len(motion), 3, len(CALIBRATION)))
-        by[:, :2, 0] = -by_scale * motion[:, :2]
+        by[:, 0, 5], by[:, 1, 5] = self._sum(-self._lost * c), self._sum(-self._lost * s)
+        by[:, :2, 0] = -by_scale * (motion[:, :2] - calibration[5] * by[:, :2, 5])
         for k, amount in enumerate((-by_turn_scale * scaled_turn, self.distance_m, -self.interval_s), 1):
             by[:, 0, k] = self._sum(lever_x * amount)
             by[:, 1, k] = self._sum(lever_y * amount)
             by[:, 2, k] = self._sum(amount)
         if self._delayed:
-            way_by, turn_by, side_by, time_by = (self._by_delay(total) for total in self._totals[:4])
+            way_by, turn_by, side_by, time_by, lost_by = (self._by_delay(total) for total in self._totals[:5])
             turn_by = by_turn_scale * turn_by + calibration[2] * way_by - calibration[3] * time_by
-            way_by, side_by = by_scale * way_by, by_scale * side_by
+            way_by, side_by = by_scale * way_by - calibration[5] * lost_by, by_scale * side_by
             by[:, 0, 4] = self._sum(way_by * c - side_by * s + lever_x * turn_by)
             by[:, 1, 4] = self._sum(way_by * s + side_by * c + lever_y * turn_by)
             by[:, 2, 4] = self._sum(turn_by)
@@ -160,11 +164,11 @@ class BatchState:
     """What is estimated."""
 
     poses: FloatArray  # x_m, y_m, heading_rad at each instant, shape (n, 3)
-    shared: FloatArray  # by ``SHARED``, shape (10,)
+    shared: FloatArray  # by ``SHARED``, shape (11,)
     beacons: FloatArray  # x_m, y_m, range_offset_m, reference_db by beacon, shape (b, 4)
 
     def moved(self, poses: FloatArray, shared: FloatArray) -> "BatchState":
-        """The state after a step, the shared part of it shape (10 + 4 b,)."""
+        """The state after a step, the shared part of it shape (11 + 4 b,)."""
         split = len(SHARED)
         beacons = self.beacons + shared[split:].reshape(-1, BEACON)
         return BatchState(self.poses + poses, self.shared + shared[:split], beacons)
@@ -180,7 +184,7 @@ class Residuals:
     odometry: FloatArray  # motion by the poses less that of the odometry, in the vehicle's frame, shape (n - 1, 3)
     odometry_information: FloatArray  # shape (n - 1, 3, 3)
     by_steps: (
-        FloatArray  # of the odometry by the poses before and behind and ``CALIBRATION``, shape (n - 1, 3, 3 + 3 + 5)
+        FloatArray  # of the odometry by the poses before and behind and ``CALIBRATION``, shape (n - 1, 3, 3 + 3 + 6)
     )
     readings: FloatArray  # predicted less read, shape (m, 3)
     information: FloatArray  # of each, zero where there is no reading, shape (m, 3)
@@ -227,7 +231,7 @@ class BatchProblem:
         self.sizes: FloatArray = self.there.sum(axis=1).astype(np.float64)
         self._read = np.where(self.there, read, 0.0)
         self.repeats = repeats(readings, settings.radio.correlation_s)
-        # Of the shared unknowns and the beacons, shape (10 + 4 b,): 0 fixes one, infinity says nothing of it.
+        # Of the shared unknowns and the beacons, shape (11 + 4 b,): 0 fixes one, infinity says nothing of it.
         beacons = np.zeros((len(used), BEACON))
         beacons[used] = (np.inf, np.inf, self.priors.beacon_offset_m, self.priors.beacon_reference_db)
         sigmas = np.concatenate([[getattr(self.priors, name) for name in SHARED], beacons.ravel()])

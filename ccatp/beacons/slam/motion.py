@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Mapping, Sequence
 from math import cos, hypot, nan, sin
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -66,6 +66,11 @@ def estimated(priors: Mapping[str, float]) -> tuple[tuple[str, ...], tuple[float
     return tuple(kept), tuple(kept.values())
 
 
+def turned_way(distance_m: Any, turn_rad: Any) -> Any:
+    """|w_o| sign(d_o), rad, of one step or of arrays (n,): what ``distance_per_rad`` is multiplied by."""
+    return abs(turn_rad) * (1.0 * (distance_m > 0.0) - (distance_m < 0.0))
+
+
 def _increment(odometry: Odometry) -> Increment:
     if not isinstance(odometry, Increment):
         raise TypeError(f"a differential drive takes increments, not {type(odometry).__name__}")
@@ -75,23 +80,24 @@ def _increment(odometry: Odometry) -> Increment:
 class DifferentialDrive:
     """Odometry by increments: the chord of a circular arc (thesis eq. 2.14 as it is meant).
 
-    With the corrected way d = d_o / (1 + e_d) and turn w = w_o / (1 + e_w) - b dt, m = heading + w / 2 and
-    c = sin(w / 2) / (w / 2):
+    With the corrected way d = d_o / (1 + e_d) - l_w |w_o| sign(d_o) and turn w = w_o / (1 + e_w) - b dt,
+    m = heading + w / 2 and c = sin(w / 2) / (w / 2):
 
         x <- x + c d cos(m) - l sin(m),  y <- y + c d sin(m) + l cos(m),  heading <- heading + w
 
     States behind the pose, each where its prior is not zero: turn_bias_rad_s (b), turn_scale (e_w), distance_scale
-    (e_d): positive where the odometry reads too much. At rest, where the odometry is slower than ``rest_speed_m_s`` and
-    ``rest_turn_rad_s``, the turn is nothing but the bias: the heading stays. All noise is a random walk, so variances
-    grow with the way and the time.
+    (e_d), distance_per_rad (l_w): positive where the odometry reads too much; l_w is the way that a vehicle loses by
+    turning while it drives, as one does that is commanded. At rest, where the odometry is slower than
+    ``rest_speed_m_s`` and ``rest_turn_rad_s``, the turn is nothing but the bias: the heading stays. All noise is a
+    random walk, so variances grow with the way and the time.
     """
 
     def __init__(self, noise: OdometryNoiseConfig, priors: PriorsConfig, how: SlamFilterConfig) -> None:
         self._noise, self._how = noise, how
-        calibrated = ("turn_bias_rad_s", "turn_scale", "distance_scale")
+        calibrated = ("turn_bias_rad_s", "turn_scale", "distance_scale", "distance_per_rad")
         self.names, self.prior_sigmas = estimated({name: getattr(priors, name) for name in calibrated})
         place = {name: POSE + i for i, name in enumerate(self.names)}
-        self._bias, self._turn_scale, self._way_scale = (place.get(name, -1) for name in calibrated)
+        self._bias, self._turn_scale, self._way_scale, self._lost = (place.get(name, -1) for name in calibrated)
         size = POSE + len(self.names)
         self._F, self._Q = np.eye(size), np.zeros((size, size))
 
@@ -100,7 +106,9 @@ class DifferentialDrive:
         odometry = _increment(odometry)
         values: list[float] = states.tolist()
         scaled = 1.0 + values[self._way_scale] if self._way_scale >= 0 else 1.0
-        way, side = odometry.distance_m / scaled, odometry.lateral_m / scaled
+        scaled_way, side = odometry.distance_m / scaled, odometry.lateral_m / scaled
+        lost = turned_way(odometry.distance_m, odometry.turn_rad) if self._lost >= 0 else 0.0
+        way = scaled_way - lost * values[self._lost]
         is_at_rest = self._bias >= 0 and self._rests(odometry)
         turn, by_bias, by_scale = (0.0, 0.0, 0.0) if is_at_rest else self._turn(values, odometry)
         half = 0.5 * turn
@@ -117,7 +125,10 @@ class DifferentialDrive:
             if place >= 0:
                 F[0, place], F[1, place], F[2, place] = x_turn * by, y_turn * by, by
         if self._way_scale >= 0:
-            F[0, self._way_scale], F[1, self._way_scale] = -dx / scaled, -dy / scaled
+            F[0, self._way_scale] = (side * s - chord * scaled_way * c) / scaled
+            F[1, self._way_scale] = -(chord * scaled_way * s + side * c) / scaled
+        if self._lost >= 0:
+            F[0, self._lost], F[1, self._lost] = -chord * lost * c, -chord * lost * s
         Q = self._spread(odometry, (c, s), (x_turn, y_turn), chord, 0.0 if is_at_rest else 1.0)
         return MotionStep(mean, F, Q)
 

@@ -37,9 +37,9 @@ RADIO = RadioNoiseConfig(
 )  # fmt: skip
 NO_PRIORS = PriorsConfig(**dict.fromkeys(PriorsConfig.model_fields, 0.0) | {"pose_m": 0.05, "heading_rad": 0.03})
 PRIORS = PriorsConfig(
-    distance_scale=0.1, turn_scale=0.1, turn_per_m=0.05, turn_bias_rad_s=0.02, odometry_delay_s=0.2, range_scale=0.1,
-    range_offset_m=0.3, bearing_offset_rad=0.02, rssi_reference_db=5.0, rssi_exponent=0.4, beacon_offset_m=0.1,
-    beacon_reference_db=2.0, pose_m=0.05, heading_rad=0.03,
+    distance_scale=0.1, distance_per_rad=0.05, turn_scale=0.1, turn_per_m=0.05, turn_bias_rad_s=0.02,
+    odometry_delay_s=0.2, range_scale=0.1, range_offset_m=0.3, bearing_offset_rad=0.02, rssi_reference_db=5.0,
+    rssi_exponent=0.4, beacon_offset_m=0.1, beacon_reference_db=2.0, pose_m=0.05, heading_rad=0.03,
 )  # fmt: skip
 OF_PROBLEM = RecordingConfig(odometry=ODOMETRY, radio=RADIO, priors=PRIORS)
 
@@ -114,7 +114,7 @@ def test_at_rest_the_heading_stays_and_the_turn_is_the_bias() -> None:
     reckoning = Reckoning(s, np.array([0.0, 6.0, 10.0]), rest=(0.1, 0.1))
     assert reckoning.at_rest == pytest.approx((6.0, 6.0 * bias_rad_s))
     for bias, turned in ((0.0, 2.0 + 4.0 * bias_rad_s), (bias_rad_s, 2.0)):
-        motion, _, _ = reckoning.increments(np.array((0.0, 0.0, 0.0, bias, 0.0)), ODOMETRY)
+        motion, _, _ = reckoning.increments(np.array((0.0, 0.0, 0.0, bias, 0.0, 0.0)), ODOMETRY)
         assert motion[:, 2] == pytest.approx([0.0, turned])
 
 

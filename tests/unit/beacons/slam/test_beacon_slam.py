@@ -328,10 +328,13 @@ def by_both(run: RecordedRun, **priors: float) -> list[EstimatedPath]:
 
 def test_filter_and_smoother_mean_the_same_by_a_name() -> None:
     run = recorded(world(3, 120.0))
-    more = run.steps._replace(distance_m=1.1 * run.steps.distance_m, turn_rad=0.92 * run.steps.turn_rad)
-    tracks = by_both(replace(run, steps=more), distance_scale=0.2, turn_scale=0.2, odometry_delay_s=0.2)
+    turn_rad = 0.92 * run.steps.turn_rad
+    more = run.steps._replace(distance_m=1.1 * (run.steps.distance_m + 0.06 * np.abs(turn_rad)), turn_rad=turn_rad)
+    priors = {"distance_scale": 0.2, "distance_per_rad": 0.2, "turn_scale": 0.2, "odometry_delay_s": 0.2}
+    tracks = by_both(replace(run, steps=more), **priors)
     for track in tracks:
         assert track.calibration["distance_scale"].value == pytest.approx(0.1, abs=0.03)
+        assert track.calibration["distance_per_rad"].value == pytest.approx(0.06, abs=0.02)
         assert track.calibration["turn_scale"].value == pytest.approx(-0.08, abs=0.03)
         assert track.calibration["odometry_delay_s"].value == pytest.approx(0.0, abs=0.05)
 

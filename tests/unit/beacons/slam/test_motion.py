@@ -22,8 +22,8 @@ from tests.unit.beacons.datasets.sets import recorded, world
 
 CALIBRATED = settings(
     **odometry(0.05, 0.03, 0.01, 0.05, 0.002, 0.02), priors__turn_bias_rad_s=0.02, priors__turn_scale=0.1,
-    priors__distance_scale=0.1, filter__turn_bias_walk_rad_s_sqrt_s=1e-4, filter__rest_speed_m_s=0.03,
-    filter__rest_turn_rad_s=0.03,
+    priors__distance_scale=0.1, priors__distance_per_rad=0.1, filter__turn_bias_walk_rad_s_sqrt_s=1e-4,
+    filter__rest_speed_m_s=0.03, filter__rest_turn_rad_s=0.03,
 )  # fmt: skip
 
 
@@ -32,10 +32,10 @@ def jacobian(of: Callable[[FloatArray], FloatArray], x: FloatArray, step: float 
 
 
 @pytest.mark.parametrize("turn_rad", [0.0, 1e-4, 0.7, -2.0])
-@pytest.mark.parametrize("lateral_m", [0.0, 0.2])
-def test_jacobian_of_the_differential_drive(turn_rad: float, lateral_m: float) -> None:
-    drive, step = CALIBRATED.drive, Increment(1.0, 0.5, 0.8, turn_rad, lateral_m)
-    x = np.array((1.0, -2.0, 2.5, 0.01, 0.05, -0.04))
+@pytest.mark.parametrize(("distance_m", "lateral_m"), [(0.8, 0.0), (0.8, 0.2), (-0.3, 0.0)])
+def test_jacobian_of_the_differential_drive(turn_rad: float, distance_m: float, lateral_m: float) -> None:
+    drive, step = CALIBRATED.drive, Increment(1.0, 0.5, distance_m, turn_rad, lateral_m)
+    x = np.array((1.0, -2.0, 2.5, 0.01, 0.05, -0.04, 0.07))
     F = drive.step(x, step).F.copy()
     assert pytest.approx(jacobian(lambda y: drive.step(y, step).mean, x), abs=1e-8) == F
 
@@ -63,7 +63,7 @@ def test_noise_of_a_way_does_not_depend_on_how_often_it_is_told() -> None:
 
 def test_a_turn_at_rest_is_the_bias_and_turns_nothing() -> None:
     drive = CALIBRATED.drive
-    x = np.array((1.0, 2.0, 0.3, 0.0, 0.0, 0.0))
+    x = np.array((1.0, 2.0, 0.3, 0.0, 0.0, 0.0, 0.0))
     still = Increment(0.1, 0.1, 0.0, -7e-4)
     assert drive.step(x, still).mean == pytest.approx(x)
     assert drive.at_rest(still) == pytest.approx((3, -7e-3, 0.002**2 / 0.1))
