@@ -70,10 +70,11 @@ def slam(
     (docs/radio_data.md).
     """
     from ccatp.beacons.datasets.reader import read_run
-    from ccatp.beacons.slam.evaluation import judge, markdown, result_data, table_lines
+    from ccatp.beacons.slam.evaluation import judge, result_data, table_lines
     from ccatp.beacons.slam.track_review import review_lines, reviewed
     from ccatp.config.load import load_recordings_config
-    from ccatp.studies.recordings import compared, estimate
+    from ccatp.studies.recordings import COMPARED, compared, estimate
+    from ccatp.studies.results import markdown_table
 
     assumed = load_recordings_config(config_file, settings)
     run = read_run(path, data_format, robot, topics_file)
@@ -97,7 +98,8 @@ def slam(
         return
     print_lines((*table_lines(run, data), *review_lines(data)))
     if peers:
-        print_lines(("", *markdown(data["peers"])))
+        rows = ([one[key] for key in COMPARED] for one in data["peers"])
+        print_lines(("", markdown_table(COMPARED, rows).rstrip()))
 
 
 def _write_tum(file: Path, run: "RecordedRun", track: "EstimatedPath") -> None:

@@ -22,7 +22,7 @@ from ccatp.beacons.datasets.tables import Table
 from ccatp.beacons.datasets.trajectory import pose_of_truth
 from ccatp.beacons.slam.batch_smoother import smooth
 from ccatp.beacons.slam.causal import filter_run
-from ccatp.beacons.slam.evaluation import judge, result_data, row, row_without
+from ccatp.beacons.slam.evaluation import judge, result_data
 from ccatp.beacons.slam.level_fix import LevelLocator, Room, fingerprint_fits, judged
 from ccatp.beacons.slam.path_loss import fit_path_loss
 from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun, ReferencePath
@@ -63,25 +63,34 @@ def estimate(run: RecordedRun, assumed: RecordingsConfig, filter_name: str) -> E
     return track._replace(warnings=(*track.warnings, *survey_doubts(track, run.beacon_truth_m)))
 
 
+COMPARED = (
+    "dataset", "filter", "trajectory_rmse_m", "heading_rmse_rad", "beacon_rmse_m", "range_scale", "nis_mean",
+    "nees_mean", "update_us_p50", "run_s", "gave_up",
+)  # fmt: skip
+
+
 def compared(run: RecordedRun, assumed: RecordingsConfig, warn: Callable[[list[str]], None]) -> list[dict[str, Any]]:
-    """A row for each of our estimators and GTSAM's; without figures where GTSAM gave up, which is a warning."""
+    """``COMPARED`` of our estimators and GTSAM's; without figures where GTSAM gave up, which is a warning."""
     import_gtsam()  # before the work
-    rows = []
+    tracks: list[tuple[str, EstimatedPath | None, float | None]] = []
     for name in FILTERS:
         begin_s = perf_counter()
-        track = estimate(run, assumed, name)
-        rows.append(row(run, name, track, perf_counter() - begin_s))
+        tracks.append((name, estimate(run, assumed, name), perf_counter() - begin_s))
     try:
-        found = run_gtsam(run, getattr(assumed, run.kind), perf_counter)
+        isam2, batch = run_gtsam(run, getattr(assumed, run.kind), perf_counter)
+        # The batch starts from what iSAM2 ended with, so its time is not a run's.
+        tracks += [(PEERS[0], isam2, float(isam2.update_s.sum())), (PEERS[1], batch, None)]
     except PeerGaveUp as error:
         warn([str(error)])
-        return [*rows, *(row_without(run.name, name, gave_up=True) for name in PEERS)]
-    # The batch starts from what iSAM2 ended with, so its time is not a run's.
-    spent_s = float(found.isam2.update_s.sum()), None
-    return [
-        *rows,
-        *(row(run, *one, peer=True) for one in zip(PEERS, found, spent_s, strict=True)),
-    ]
+        tracks += [(name, None, None) for name in PEERS]
+    rows = []
+    for name, track, run_s in tracks:
+        data = {} if track is None else result_data(run, name, track, judge(track, run))
+        if name in PEERS:
+            data["nees_mean"] = None  # they are asked for no covariances
+        known = {"dataset": run.name, "filter": name, "run_s": run_s, "gave_up": track is None}
+        rows.append({key: data.get(key) for key in COMPARED} | known)
+    return rows
 
 
 # -- the shipped sets -------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """A track against the truth of its recording; the results of ``ccatp radio slam`` as data and text."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -186,49 +186,3 @@ def _number(value: Any, shape: str) -> str:
 
 def _finite(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
-
-
-COLUMNS = (
-    ("data", "dataset", "{}"),
-    ("estimator", "filter", "{}"),
-    ("path, m", "trajectory_rmse_m", "{:.3f}"),
-    ("heading, rad", "heading_rmse_rad", "{:.4f}"),
-    ("beacons, m", "beacon_rmse_m", "{:.3f}"),
-    ("range scale", "range_scale", "{:.4f}"),
-    ("NIS", "nis_mean", "{:.2f}"),
-    ("NEES", "nees_mean", "{:.2f}"),
-    ("update, us", "update_us_p50", "{:.0f}"),
-    ("whole run, s", "run_s", "{:.1f}"),
-)
-
-
-def row(
-    run: RecordedRun, name: str, track: EstimatedPath, run_s: float | None, *, peer: bool = False
-) -> dict[str, Any]:
-    """The figures of one estimator on one run; a peer has no covariance."""
-    data = result_data(run, name, track, judge(track, run))
-    found = {key: data.get(key) for _, key, _ in COLUMNS}
-    found |= {"run_s": run_s, "gave_up": False}
-    if peer:
-        found["nees_mean"] = None
-    return found
-
-
-def row_without(dataset: str, estimator: str, *, gave_up: bool) -> dict[str, Any]:
-    """A row without figures; ``gave_up``: the estimator has no result for these data."""
-    nothing: dict[str, Any] = dict.fromkeys(key for _, key, _ in COLUMNS)
-    return nothing | {"dataset": dataset, "filter": estimator, "gave_up": gave_up}
-
-
-def markdown(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """A table."""
-    cells = [[title for title, _, _ in COLUMNS]]
-    cells += [[_number(r[key], shape) for _, key, shape in COLUMNS] for r in rows]
-    for line, r in zip(cells[1:], rows, strict=True):
-        if r["gave_up"]:
-            line[2] = "gave up"
-    widths = [max(len(line[k]) for line in cells) for k in range(len(COLUMNS))]
-    lines = [
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in cells
-    ]
-    return [lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]]
