@@ -280,11 +280,12 @@ def run_damage(job: Job) -> JobOutcome:
     pairs = ((after.trajectory_rmse_m, before.trajectory_rmse_m), (after.beacon_rmse_m, before.beacon_rmse_m))
     is_near = all(late is None or late <= _NEAR * (early or 0.0) + _NEAR_M for late, early in pairs)
     is_near &= bool(found.beacons) and track.beacons.keys() & set(again.beacon_ids) <= found.beacons.keys()
-    outcome = (
-        "recovered" if is_near else "reported" if new else "uncertain" if _covers(found, again, after) else "wrong"
-    )
+    silent = "recovered" if is_near else "uncertain" if _covers(found, again, after) else "wrong"
+    outcome = "reported" if new and not is_near else silent
+    # What a user who has surveyed no beacons is told.
+    unsurveyed = silent if all("survey" in line for line in new) else outcome
     errors = {"path_m": after.trajectory_rmse_m, "beacons_m": after.beacon_rmse_m}
-    return JobOutcome(values | errors | {"outcome": outcome, "new": new})
+    return JobOutcome(values | errors | {"outcome": outcome, "unsurveyed": unsurveyed, "new": new})
 
 
 def _unnumbered(line: str) -> str:
