@@ -18,6 +18,7 @@ Vector3 = tuple[float, float, float]
 
 # Ranges that a decoder of samples checks.
 MAX_TIME_S = 1e9  # some thirty years
+GRAVITY_M_S2 = 9.771  # at latitude -22.99 deg, 5,612 m
 MAX_RATE_RAD_S = 1e4  # wheels and body; beyond every machine, so that squares stay finite
 MAX_ACCELERATION_M_S2 = 1e4
 Time = Annotated[float, Meta(ge=0.0, le=MAX_TIME_S)]

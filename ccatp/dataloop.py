@@ -22,6 +22,8 @@ from ccatp.config.load import load_onboard_config
 from ccatp.config.models import Config
 from ccatp.config.onboard_models import OnboardConfig
 from ccatp.core import DeckPose
+from ccatp.links.robot_codec import decode_from_robot
+from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import build_mirror
 from ccatp.onboard.robot import OnboardRobot
 from ccatp.onboard.server import TcpRobotServer
@@ -48,6 +50,8 @@ def _hardware_class(cfg: Config) -> type[SimulatedHardware]:
 class MotorRobot(OnboardRobot, SurveyTruth):
     """A simulated survey robot with motors under the on-board core, just booted; simulated time."""
 
+    injector = None  # faults are those of the other robot
+
     def __init__(self, cfg: Config, onboard: OnboardConfig, start: DeckPose | None = None) -> None:
         servo, sim = onboard.servo, cfg.sim.robot
         hardware = _hardware_class(cfg)(
@@ -68,6 +72,12 @@ class MotorRobot(OnboardRobot, SurveyTruth):
             self.control(self._steps / loop_hz)
             self._steps += 1
         super().advance()
+
+    @property
+    def delivered(self) -> Sensors | None:
+        """The frame that reached the clients at this instant, ``None`` while none has."""
+        message = decode_from_robot(self.delivered_line) if self.delivered_line else None
+        return message if isinstance(message, Sensors) else None
 
     def _close_frame(self, t_s: float) -> None:
         super()._close_frame(t_s)

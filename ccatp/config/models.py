@@ -89,6 +89,12 @@ class RobotConfig(LinkConfig):
     max_wheel_rad_s: Positive
     wheel_lag_s: NonNegative
     fan_duty: tuple[Annotated[float, Field(ge=0.0, le=1.0)], Annotated[float, Field(ge=0.0, le=1.0)]]
+    mass_kg: Annotated[float, Field(gt=0.1, le=10.0)]
+    centre_of_mass_m: Pair
+    caster_m: Annotated[float, Field(gt=0.0, le=0.5)]
+    friction: Annotated[float, Field(gt=0.0, le=2.0)]
+    thrust_n: Positive
+    thrust_margin: Annotated[float, Field(ge=1.0, le=5.0)]
 
 
 class LimitsConfig(Model):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from ccatp.conditions import UNATTENDED_FAULT
 from ccatp.config.models import Config
 from ccatp.control.gate import Denial, DriveGate, FanGate
+from ccatp.control.thrust import ThrustControl
 from ccatp.control.wheel_motion import SentDrives, as_standing
 from ccatp.core import Verdict
 from ccatp.daemon.checkpoints import build_parts
@@ -139,6 +140,7 @@ class SurveyRunner(MissionRunner):
         self._clock.before_s = parts.mission.state.budget.before_s
         self._gate_log = GateLog(self._gate, self.telemetry.notify_operator)
         self._fan_gate, self._has_full_fans, self._fans_seq = FanGate(0.0), False, 0
+        self._thrust = ThrustControl(cfg.robot, parts.mirror)
         self._sent_commands: tuple[tuple[float, float, float, float] | None, int] = None, -1
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
         self._fix_service = FixService(
@@ -247,8 +249,8 @@ class SurveyRunner(MissionRunner):
         self._fan_gate = FanGate(hello.robot.fan_floor if self._mirror.overhang else 0.0)
 
     def begin_drives(self) -> None:
-        """Send the fans' duties, before the first drive."""
-        duty = FULL_FANS if self._has_full_fans else self._cfg.robot.fan_duty
+        """Send the fans' duties, before the first drive and whenever they change."""
+        duty = FULL_FANS if self._has_full_fans else self._thrust.duty
         refusal = self._fan_gate.refusal(*duty)
         if refusal is None:
             self._fans_seq += 1
@@ -327,6 +329,9 @@ class SurveyRunner(MissionRunner):
             self._execute(command, motion)
         if frame.is_estimate_due:
             self._sent_commands = self._sent.take_span(), self._sent.newest
+            turns = state.mode is not MissionState.DRIVING
+            if not self._has_full_fans and self._thrust.step(motion.t_s, self._localizer.deck_pose, turns=turns):
+                self.begin_drives()
         return DriveCommand(right, left)
 
     def hold(self, frame: TimedFrame) -> DriveCommand:

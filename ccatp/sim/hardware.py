@@ -17,14 +17,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.core import DeckPose
+from ccatp.core import GRAVITY_M_S2, DeckPose
 from ccatp.mirror.mirror import Mirror
 from ccatp.onboard.hardware import Readings
 from ccatp.sim.plant import downhill
 from ccatp.sim.sensors import EdgeTuple, GravityTuple, ImuTuple, SensorSuite
 from ccatp.sim.world import World
 
-GRAVITY_M_S2 = 9.771  # at latitude -22.99 deg, 5,612 m
 _MASS_KG = 1.0
 _EPSILON_S = 1e-9
 

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from ccatp.config.models import Config, PhysicsConfig
-from ccatp.core import DeckPose, FloatArray
+from ccatp.core import GRAVITY_M_S2, DeckPose, FloatArray
 from ccatp.errors import ConfigError
 from ccatp.mirror.mirror import Mirror
-from ccatp.sim.hardware import GRAVITY_M_S2, Motor, SimulatedHardware
+from ccatp.sim.hardware import Motor, SimulatedHardware
 from ccatp.sim.plant import Plant
 from ccatp.sim.world import World
 

@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 
 from ccatp.config.models import Config
+from ccatp.control.thrust import ThrustControl
 from ccatp.control.wheel_motion import SentDrives, as_standing
 from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelPose, PointId, SteadyTime, Verdict, difference
 from ccatp.danger import DangerMonitor
+from ccatp.dataloop import MotorRobot, motor_robot
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.links import multiline
 from ccatp.links.robot_codec import set_point_on_wire
@@ -120,7 +122,7 @@ class SilTrace:
 class SilLaser:
     """Measures the puck of a simulated robot; ``stops`` keeps the measurements whose fix was fused, in order."""
 
-    def __init__(self, cfg: Config, mirror: Mirror, robot: Robot) -> None:
+    def __init__(self, cfg: Config, mirror: Mirror, robot: Robot | MotorRobot) -> None:
         self._cfg, self._mirror, self._robot = cfg, mirror, robot
         channels, collimators_m = mirror.channels, mirror.collimators_m
         rng = np.random.default_rng([cfg.run.seed, SEED_STREAM])
@@ -190,7 +192,11 @@ class SilRun:
         self.parts, self.mirror = parts, parts.mirror
         self.localizer: Localizer = parts.localizer
         self.mission, self.gate = parts.mission, parts.gate
-        self.robot = Robot(cfg, self.mirror, np.random.default_rng(cfg.run.seed), faults)
+        self.robot: Robot | MotorRobot = (
+            Robot(cfg, self.mirror, np.random.default_rng(cfg.run.seed), faults)
+            if cfg.sim.robot.physics == "lag"
+            else motor_robot(cfg)
+        )
         self.monitor = DangerMonitor(self.mirror, cfg.robot, cfg.danger, cfg.health)
         self.sent = SentDrives(cfg.robot, self.robot.frame_s)
         self.laser = SilLaser(cfg, self.mirror, self.robot)
@@ -204,7 +210,7 @@ class SilRun:
         self._code = EventCode.NORMAL
         self._drive_seq = 0
         self._time = SteadyTime(cfg.health.clock_jump_s)
-        self._has_full_fans = False
+        self._has_full_fans, self._thrust, self._fans_seq = False, ThrustControl(cfg.robot, self.mirror), 0
 
     @property
     def injected(self) -> tuple[Injected, ...]:
@@ -218,7 +224,7 @@ class SilRun:
         robot.join("monitor")
         robot.join("controller")
         frame = self._receive()
-        robot.command_fans(1, *self.cfg.robot.fan_duty)
+        self._command_fans(self._thrust.duty)
         first_s = t_s = self._time.at(frame.seq, frame.t)
         last_s = first_s - robot.frame_s
         limit_s = _ENDLESS * self.parts.lower_bound_s + 600.0
@@ -289,7 +295,7 @@ class SilRun:
             localizer.inflate_covariance(self.cfg.health.doubt_position_m, self.cfg.health.doubt_heading_rad)
         if mission.state.full_fans and not self._has_full_fans:
             self._has_full_fans = True
-            robot.command_fans(2, 1.0, 1.0)
+            self._command_fans((1.0, 1.0))
         right, left = self.gate.pass_through(order.twist, before, dt_s, t_s, 0.0, mission.state.purpose)
         if order.at_rest:
             localizer.rest()
@@ -297,6 +303,10 @@ class SilRun:
                 self.trace.builder.add_arrival(order.arrived, seq)
         state = mission.state.mode
         self.states_s[state] += dt_s
+        turns = state is not MissionState.DRIVING
+        is_due = is_estimate_due(seq) and not self._has_full_fans
+        if is_due and self._thrust.step(motion.t_s, localizer.deck_pose, turns=turns):
+            self._command_fans(self._thrust.duty)
         self._publish(seq, t_s, motion.pose, state)
         if order.measure:
             self._measure(frame)
@@ -316,6 +326,10 @@ class SilRun:
             sigma_of=self._sigma_of,
             heading_sigma_of=self.parts.heading_sigma_rad,
         )
+
+    def _command_fans(self, duty: tuple[float, float]) -> None:
+        self._fans_seq += 1
+        self.robot.command_fans(self._fans_seq, *duty)
 
     def _note_drive(self, number: int, right: float, left: float) -> None:
         self.sent.add(number, right, left)

@@ -6,12 +6,14 @@ and what its absence saves. `ablation`: what each technique of estimation and co
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ccatp.config.load import load_config
+from ccatp.control.thrust import greatest_least_thrust
 from ccatp.core import FloatArray
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.plots import INK, QUIET
@@ -377,4 +379,50 @@ ABLATION = Study(
     draw=_drawing("ablation", "without", ("mirror", "world"), "Without a technique, world {1} on {0}"),
     defaults={"run.filter": "ekf"},
     runs=3,
+)
+
+# -- physics ----------------------------------------------------------------------------------------------------------
+
+
+def physics_cells() -> Sequence[Cell]:
+    """Mirror, tyre, friction, and the thrust at full duty over the least that holds the robot anywhere on the mirror.
+
+    The robot's configuration has the same friction and thrust: what its builder knows.
+    """
+    found = []
+    for name, tyre, friction, margin in product(
+        ("fyst-m1", "fyst-m2"), ("round", "flat"), (0.5, 0.6, 0.8, 1.0), (1.1, 1.3, 2.0, 3.0)
+    ):
+        cfg = load_config(None, {"run.mirror": name, "robot.friction": friction})
+        thrust_n = margin * greatest_least_thrust(cfg.robot, build_mirror(cfg.mirror))[0]
+        keys: dict[str, object] = {"run.mirror": name, "sim.physics.tyre": tyre}
+        for place in ("robot", "sim.physics"):
+            keys |= {f"{place}.friction": friction, f"{place}.thrust_n": round(thrust_n, 2)}
+        found.append(Cell({"mirror": name, "tyre": tyre, "friction": friction, "margin": margin}, keys))
+    return found
+
+
+def draw_physics(cells: Sequence[CellResult], out: Path) -> None:
+    """Errors and time, a figure for each mirror and thrust."""
+    for (mirror, margin), there in grouped(cells, "mirror", "margin").items():
+        rows = rows_by(there, "tyre", "friction")
+        title = f"{mirror}, {margin} times the least thrust, by friction: {_SHOWN}"
+        draw_ranges(rows, MISSION, title, out / f"physics-{mirror}-{margin}")
+
+
+PHYSICS = Study(
+    cells=physics_cells,
+    run_job=run_mission,
+    combine=combine_missions,
+    columns="""
+        complete points.measured
+        danger: falls
+        localization_error_mm: mean p99 max
+        arrival_error_mm: mean max within_10mm_fraction
+        corrections mission_time_s time_ratio
+    """,
+    draw=draw_physics,
+    defaults={"sim.robot.physics": "mujoco", "run.panels": 9},
+    mirrors=(),
+    runs=1,
 )

@@ -20,6 +20,7 @@ from ccatp.links.robot_codec import encode
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import TOPICS, FixMessage, SensorLines, schema_of
 from ccatp.records.recorder import RECORD_FORMAT, Recorder
+from ccatp.sim.robot import Robot
 from ccatp.studies.sil_run import SilRun
 from tests.support.command import refused
 
@@ -64,6 +65,7 @@ class CalibrationDrive(SilRun):
 
     def truth(self, mean_slip: float = 0.0) -> FloatArray:
         """Rolling radius (m), base (m) and gyroscope bias at boot (rad/s) of the simulated robot."""
+        assert isinstance(self.robot, Robot)
         wheels = self.robot.world.wheels
         radius_m = 0.5 * wheels.radius_m * (wheels.right_scale + wheels.left_scale) * (1.0 - mean_slip)
         return np.array((radius_m, wheels.base_m, self.robot._sensors._imu._wz_bias._value))

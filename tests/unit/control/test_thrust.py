@@ -1,0 +1,72 @@
+"""Thrust that holds the robot on its slope: against moments by hand, and the duty that follows it."""
+
+from itertools import pairwise
+from math import cos, inf, pi, radians, sin
+
+import pytest
+
+from ccatp.config.load import load_config
+from ccatp.config.models import RobotConfig
+from ccatp.control.thrust import ThrustControl, grip_margin, least_thrust_n, safe_speed_m_s
+from ccatp.core import DeckPose, Vector3
+from ccatp.mirror.mirror import build_mirror
+
+WEIGHT_N = 9.771  # of 1 kg
+OVERHANG_RAD = radians(18.435)  # of fyst-m2: 3.09 N away from the surface and 9.27 N along it
+
+
+def robot(**changed: object) -> RobotConfig:
+    return load_config(overrides={f"robot.{key}": value for key, value in changed.items()}).robot
+
+
+def gravity(to_rear: float, overhang_rad: float = OVERHANG_RAD) -> Vector3:
+    """``to_rear``: angle of downhill from straight behind, rad."""
+    along = cos(overhang_rad)
+    return -along * cos(to_rear), along * sin(to_rear), sin(overhang_rad)
+
+
+@pytest.mark.parametrize(("friction", "least_n"), [(0.5, 21.6), (0.8, 14.7), (1.0, 12.4)])
+def test_wheels_that_carry_everything(friction: float, least_n: float) -> None:
+    """Weight away from the surface and along it over the friction."""
+    on_axle = robot(friction=friction, centre_of_mass_m=[0.0, 0.0])
+    assert least_thrust_n(on_axle, gravity(1.0), turns=True) == pytest.approx(least_n, abs=0.05)
+
+
+def test_the_caster_takes_load_and_downhill_behind_takes_most() -> None:
+    cfg = robot(friction=0.6)
+    outward, along = WEIGHT_N * sin(OVERHANG_RAD), WEIGHT_N * cos(OVERHANG_RAD)
+    behind = outward + (along / 0.6 + along * 0.035 / 0.075) / 0.8
+    assert least_thrust_n(cfg, gravity(0.0), turns=False) == pytest.approx(behind)
+    for to_rear in (0.0, 1.0, pi):
+        assert least_thrust_n(cfg, gravity(to_rear), turns=True) == pytest.approx(behind)
+        assert least_thrust_n(cfg, gravity(to_rear), turns=False) <= behind
+    # Downhill ahead the nose goes down before the wheels slide.
+    assert least_thrust_n(cfg, gravity(pi), turns=False) == pytest.approx(outward + along * 0.035 / 0.015)
+
+
+def test_on_a_floor_none_is_needed() -> None:
+    assert least_thrust_n(robot(), (0.0, 0.0, -1.0), turns=True) == 0.0
+    assert grip_margin(robot(), (0.0, 0.0, -1.0), 0.0) == inf
+
+
+def test_speed_from_which_the_spare_grip_stops_it() -> None:
+    cfg = robot(friction=0.6)
+    least_n = least_thrust_n(cfg, gravity(0.0), turns=True)
+    assert safe_speed_m_s(cfg, gravity(0.0), 0.99 * least_n) == 0.0
+    # 1 N more on the fans presses the wheels with 0.8 N, of which friction takes 0.6: 0.48 m/s^2 over 30 mm.
+    assert safe_speed_m_s(cfg, gravity(0.0), least_n + 1.0) == pytest.approx((2.0 * 0.48 * 0.03) ** 0.5)
+
+
+@pytest.mark.parametrize(("mirror", "turn_duty"), [("fyst-m1", 0.8), ("fyst-m2", 0.92)])
+def test_duty_goes_to_what_a_turn_needs_with_a_ramp(mirror: str, turn_duty: float) -> None:
+    cfg = robot()
+    control = ThrustControl(cfg, build_mirror(load_config(overrides={"run.mirror": mirror}).mirror))
+    pose = DeckPose(0.0, 0.0, 0.5)
+    duties = [control.duty]
+    for k in range(10):
+        if control.step(0.05 * k, pose, turns=True):
+            duties.append(control.duty)
+    assert duties[0] == cfg.fan_duty
+    assert duties[-1] == (turn_duty, turn_duty)
+    assert all(after[0] - before[0] <= 0.05 + 1e-9 for before, after in pairwise(duties))
+    assert not control.step(0.6, pose, turns=True)  # it is there
