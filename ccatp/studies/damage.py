@@ -34,6 +34,7 @@ WRONG_SHARE, DELAYED_SHARE, ZERO_SHARE = 0.1, 0.25, 0.05
 DELAY_M = 3.0  # mean of what a reflected way is longer
 MOVED_M, APART_M = 3.0, 1.0
 _NEAR, _NEAR_M = 2.0, 0.1  # so many times the undamaged error, and so much more, is recovered
+_NO_ALARM = "before the first or after the last odometry"  # so are a few readings of most recordings
 _COVERED = 13.8  # chi-squared of two degrees of freedom, 99.9 %
 
 Tables = dict[str, Table]
@@ -275,7 +276,8 @@ def run_damage(job: Job) -> JobOutcome:
     except (RadioDataError, EstimateError) as error:
         return JobOutcome(values | {"outcome": "reported", "unsurveyed": "reported", "new": [str(error)]})
     said = {_unnumbered(line) for line in (*run.warnings, *track.warnings)}
-    new = [line for line in (*again.warnings, *found.warnings) if _unnumbered(line) not in said]
+    told = [line for line in (*again.warnings, *found.warnings) if _NO_ALARM not in line]
+    new = [line for line in told if _unnumbered(line) not in said]
     after = judge(found, again)
     pairs = ((after.trajectory_rmse_m, before.trajectory_rmse_m), (after.beacon_rmse_m, before.beacon_rmse_m))
     is_near = all(late is None or late <= _NEAR * (early or 0.0) + _NEAR_M for late, early in pairs)
