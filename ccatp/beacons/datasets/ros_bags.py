@@ -111,13 +111,13 @@ def _rows(path: Path, topics: Topics, numbers: dict[str, float]) -> Iterator[tup
             for one in topics.readings:
                 if one.topic == topic:
                     yield from _readings(one, message, time_s, line, numbers)
-        except (AttributeError, TypeError, ValueError) as error:
+        except (ArithmeticError, AttributeError, TypeError, ValueError) as error:
             raise RadioDataError(path, f"message {line} of {topic} ({message.__msgtype__}): {error}") from error
 
 
 def _messages(path: Path, wanted: set[str]) -> Iterator[tuple[str, float, Any]]:
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError  # noqa: PLC0415 - an extra
+        from rosbags.highlevel import AnyReader  # noqa: PLC0415 - an extra
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
     except ImportError as error:
         raise RadioDataError(path, "is a bag: to read it, install ccatp with its extra, ccatp[ros]") from error
@@ -129,8 +129,10 @@ def _messages(path: Path, wanted: set[str]) -> Iterator[tuple[str, float, Any]]:
             chosen = [one for one in reader.connections if one.topic in wanted]
             for connection, time_ns, raw in reader.messages(connections=chosen):
                 yield connection.topic, 1e-9 * time_ns, reader.deserialize(raw, connection.msgtype)
-    except (AnyReaderError, KeyError, OSError) as error:
-        raise RadioDataError(path, f"is no bag that can be read: {error}") from error
+    except RadioDataError:
+        raise
+    except Exception as error:  # what rosbags and its parsers raise on damaged bags is of many kinds
+        raise RadioDataError(path, f"is no bag that can be read: {' '.join(str(error).split())[:200]}") from error
 
 
 def _readings(

@@ -138,3 +138,24 @@ def test_an_antenna_off_the_origin_and_beacons_at_a_height(tmp_path: Path) -> No
         errors_m.append(judge(filter_run(run, cfg.csv, cfg.filter, perf_counter), run).beacon_rmse_m or np.inf)
     assert errors_m[0] < 0.1  # two sigmas of a range
     assert errors_m[1] > 3.0 * errors_m[0]
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".db3", ".mcap"])
+def test_a_damaged_bag_is_refused_or_read(suffix: str, tmp_path: Path) -> None:
+    whole, topics = write_bag(tmp_path / f"run{suffix}", world(seconds=3.0)), tmp_path / "topics.toml"
+    rng = np.random.default_rng(1)
+    topics.write_text(TOPICS)
+    refused = []
+    for number in range(20):
+        data = bytearray(whole.read_bytes())
+        data = data[: int(rng.integers(len(data)))] if number % 4 == 0 else data
+        for place in rng.integers(len(data), size=30).tolist():
+            data[place] = int(rng.integers(256))
+        bad = tmp_path / f"bad{number}{suffix}"
+        bad.write_bytes(bytes(data))
+        try:
+            read_run(bad, None, None, topics)
+        except RadioDataError as error:
+            refused.append(str(error))
+    assert len(refused) >= 5
+    assert not any("\n" in line for line in refused)
