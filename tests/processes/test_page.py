@@ -17,8 +17,8 @@ from playwright.sync_api import Page, expect, sync_playwright
 from ccatp.config.load import load_radio_config
 from ccatp.config.package import configs_dir
 from tests.processes.conftest import Start
-from tests.processes.test_beacon_runs import BeaconRun
 from tests.processes.test_observers import WITH_PAGE, ask, page_port
+from tests.processes.test_rehearsal import BeaconRun
 from tests.support.runs import Run
 
 CHROMIUM = shutil.which("chromium")

@@ -1,8 +1,10 @@
-"""A rehearsal goes through the states of a lockstep run with the same configuration and seed."""
+"""Runs through the real processes against the same runs in one process: surveys, and missions among beacons."""
 
 import json
 import os
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from datetime import datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
@@ -10,11 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.config.load import load_config
+from ccatp.config.load import load_config, load_radio_config
+from ccatp.config.package import configs_dir
 from ccatp.records.recorder import iter_messages
+from ccatp.studies.mote_navigation import rehearse_beacons
 from ccatp.studies.sil_run import rehearse
 from tests.faults.linking import Measured
 from tests.processes.conftest import Start
+from tests.support.runs import Run
 
 # Read by every process of the run at its start: the wall clock is an hour early or an hour late, anew at each look.
 RESTLESS_CLOCK = """
@@ -63,3 +68,62 @@ def test_a_rehearsal_is_the_run_without_the_sockets(
 
     summary = {key: value for key, value in json.loads(json.dumps(rehearsal.summary)).items() if key != "wall"}
     assert summary == {key: value for key, value in run.summary.items() if key != "wall"}
+
+
+# -- missions among beacons --------------------------------------------------------------------------------------------
+
+# A lap, a waypoint, a few seconds: what differs between daemon and rehearsal differs from the first frame on.
+SHORT = {
+    "zigbee": ("mission.laps=1",),
+    "follow": ("mission.follow_s=6",),
+    "cricket": ("cricket.ranging.repeats=4", "workspace.loops=false", "workspace.waypoints_m=[[2.5, 1.5]]"),
+}
+LONGER = {"follow": ("mission.follow_s=15",)}
+
+
+class BeaconRun(Run):
+    """`ccatp run --sim` of a mission among beacons."""
+
+    free_ports = ("--set", "sim.robot.port=0", "--set", "dashboard.enabled=false")
+
+
+Begin = Callable[..., BeaconRun]
+
+
+@pytest.fixture
+def begin(tmp_path: Path, runtime_dir: Path) -> Iterator[Begin]:
+    with ExitStack() as stack:
+
+        def start(system: str, *args: str) -> BeaconRun:
+            config = ("--config", str(configs_dir() / f"{system}.toml"))
+            return stack.enter_context(BeaconRun(tmp_path / "run", runtime_dir, *config, *args))
+
+        yield start
+
+
+@pytest.mark.parametrize(
+    ("system", "settings"),
+    [*SHORT.items(), *(pytest.param(*item, marks=pytest.mark.slow, id=f"longer {item[0]}") for item in LONGER.items())],
+)
+def test_the_daemon_does_what_the_rehearsal_does(begin: Begin, system: str, settings: tuple[str, ...]) -> None:
+    run = begin(system, *(part for setting in settings for part in ("--set", setting)), "--json")
+    assert run.wait() == 0, run.stderr
+    summary = json.loads(run.stdout)
+    assert summary == run.summary
+    expected = rehearse_beacons(load_radio_config(run.run_dir / "config.toml")).summary
+    assert {**summary, "wall": None} == {**expected, "wall": None}
+    topics = {message.topic for message in iter_messages(run.run_dir / "telemetry.mcap")}
+    assert {"beacon_track", "beacon_map", "beacon_truth", "beacon_places", "sensors", "mission"} <= topics
+    assert (run.run_dir / "log.jsonl").stat().st_size
+
+
+def test_an_operator_pauses_resumes_and_aborts(begin: Begin) -> None:
+    run = begin("zigbee", "--set", "mission.laps=50", "--set", "mission.time_limit_s=1e5")
+    run.until(lambda status: status["done"] >= 1)
+    assert run.ask("pause")["status"]["state"] == "held"
+    assert run.query("SELECT count(*) FROM waypoint WHERE reached_s NOTNULL")[0][0] >= 1
+    assert run.ask("resume")["ok"]
+    run.until_state("visiting")
+    assert run.ask("abort")["ok"]
+    assert run.wait() == 3, run.stderr
+    assert run.summary["outcome"] == "aborted, at base"

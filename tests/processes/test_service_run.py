@@ -1,9 +1,15 @@
-"""A run under a service manager: a real notification socket, a real watchdog period, a child that hangs."""
+"""Runs under a service manager, and in a shell that limits them, loses them, or cannot show what they say."""
 
+import json
 import os
+import pty
 import re
+import resource
+import shutil
 import signal
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +18,7 @@ import psutil
 import pytest
 
 from tests.processes.conftest import Start
+from tests.support.runs import NO_CALIBRATION
 
 WATCHDOG_S = 2.0
 DEADLINE_S = 60.0
@@ -82,3 +89,86 @@ def test_a_run_that_does_not_begin_is_never_ready(start: Start, manager: Manager
     assert run.stderr.startswith("ccatp: robot.key_file: cannot read")
     assert run.stderr.count("\n") == 1
     assert manager.next(timeout_s=0.01) is None
+
+
+# -- a hostile shell ---------------------------------------------------------------------------------------------------
+
+RUN = (
+    sys.executable,
+    "-m",
+    "ccatp",
+    "run",
+    "--sim",
+    "--panels",
+    "1",
+    *NO_CALIBRATION,
+    "--set",
+    "dashboard.enabled=false",
+)
+PATIENCE_S = 120.0
+
+
+def command(runtime_dir: Path, run_dir: Path, *more: str) -> list[str]:
+    return [*RUN, "--runtime-dir", str(runtime_dir), "--run-dir", str(run_dir), *more]
+
+
+def logged_status(run_dir: Path) -> int:
+    lines = [json.loads(line) for line in (run_dir / "log.jsonl").read_text().splitlines()]
+    return int(next(line["status"] for line in lines if line["event"] == "run_finished"))
+
+
+def until(path: Path) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not path.exists():
+        assert time.monotonic() < deadline_s, f"no {path}"
+        time.sleep(0.01)
+
+
+def limited(soft: int, hard: int) -> None:
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_too_few_open_files_are_refused(runtime_dir: Path, tmp_path: Path) -> None:
+    arguments = command(runtime_dir, tmp_path / "run")
+    refused = subprocess.run(
+        arguments, preexec_fn=lambda: limited(24, 24), capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    assert refused.returncode == 2
+    assert refused.stderr == ("ccatp: only 24 files may be open, a run needs 256; raise the limit with ulimit -n\n")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_full_device_as_output_and_few_open_files_at_first_do_not_matter(runtime_dir: Path, tmp_path: Path) -> None:
+    with Path("/dev/full").open("wb") as full:
+        run = subprocess.run(
+            command(runtime_dir, tmp_path / "run"), preexec_fn=lambda: limited(24, 4096), stdout=full,
+            stderr=subprocess.PIPE, timeout=PATIENCE_S, check=False,
+        )  # fmt: skip
+    assert (run.returncode, logged_status(tmp_path / "run")) == (0, 0)
+    assert b"warning: standard output cannot be written: No space left on device; see summary.json\n" in run.stderr
+
+
+def test_a_run_directory_that_is_deleted_during_the_start(runtime_dir: Path, tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    with subprocess.Popen(
+        command(runtime_dir, run_dir), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as run:
+        until(run_dir / "log.jsonl")  # the supervisor's; before it, the run is refused in one line
+        shutil.rmtree(run_dir.rename(tmp_path / "deleted"), ignore_errors=True)
+        _, said = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode in {2, 4, 5}  # by who misses it first
+    assert "Traceback" not in said
+    assert "mission.sqlite" not in said
+    assert re.search(rf"^report  none; {re.escape(str(run_dir))}: no such", said, re.MULTILINE)
+
+
+def test_a_closed_terminal_is_an_interruption(runtime_dir: Path, tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    arguments = command(runtime_dir, run_dir, "--realtime")
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execv(arguments[0], arguments)
+    until(run_dir / "mission.sqlite")
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 130
+    assert logged_status(run_dir) == 130

@@ -1,17 +1,32 @@
-"""The list of alarms."""
+"""The list of alarms, the emergency latch that survives its process, and posts to a server that behaves badly."""
 
+import json
+import socket
+import threading
 import time
 import uuid
+from collections.abc import Iterable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from io import StringIO
 from pathlib import Path
+from typing import Any
+from uuid import UUID
 
+import msgspec
 import pytest
 import structlog
+from structlog.testing import capture_logs
 
 from ccatp import conditions
+from ccatp.config.models import AlarmsConfig
 from ccatp.core import Severity
-from ccatp.daemon import alarms
+from ccatp.daemon import alarms, webhook
 from ccatp.daemon.alarms import LEAST_S, ActiveCause, AlarmList, active_cause, read_history
+from ccatp.daemon.danger_loop import FILE, RESERVE_BYTES, PersistentEmergencyLatch, active_ids
+from ccatp.daemon.webhook import AlarmWebhook, changes
+from ccatp.links.topics import Alarm, MissionStatus
 from tests.support.daemon import configuration, running_daemon
+from tests.support.scenario import config_of
 
 FAN = conditions.FAN_WEAK.text(side="left")
 RIM = conditions.RIM_AHEAD.message
@@ -151,3 +166,223 @@ async def test_all_that_danger_finds_is_listed_not_only_the_gravest() -> None:
         assert [(one.name, one.cause) for one in daemon.main.status().alarms] == [
             ("earthquake", QUAKE), ("emergency", FIRE),
         ]  # fmt: skip
+
+
+# -- the emergency latch -----------------------------------------------------------------------------------------------
+
+Log = structlog.typing.FilteringBoundLogger
+
+
+@pytest.fixture
+def told() -> StringIO:
+    return StringIO()
+
+
+@pytest.fixture
+def log(told: StringIO) -> Log:
+    logger: Log = structlog.wrap_logger(structlog.PrintLogger(told))
+    return logger
+
+
+@pytest.mark.fault("P2")
+def test_an_emergency_is_there_after_a_restart_until_it_is_cleared(tmp_path: Path, log: Log) -> None:
+    path = tmp_path / FILE
+    latch = PersistentEmergencyLatch(path, log)
+    assert not latch.is_latched
+    assert latch.raise_emergency("fire", "a", "smoke") is None
+    assert latch.raise_emergency("power", "b") is None
+    assert latch.clear("b", at_base_or_held=True) is None
+    again = PersistentEmergencyLatch(path, log)
+    assert again.newest == latch.newest
+    assert again.raised == 2
+    assert active_ids(path) == ["a"]
+    assert again.raise_emergency("power", "b") is None  # cleared is cleared
+    assert again.newest == latch.newest
+    assert again.clear("a", at_base_or_held=True) is None
+    assert not PersistentEmergencyLatch(path, log).is_latched
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"active": [{"id": "a"}], "cleared": []}', '{"active": 3}'])
+def test_a_file_that_cannot_be_read_counts_as_an_emergency(tmp_path: Path, log: Log, told: StringIO, text: str) -> None:
+    (tmp_path / FILE).write_text(text)
+    latch = PersistentEmergencyLatch(tmp_path / FILE, log)
+    assert latch.is_latched
+    newest = latch.newest
+    assert newest is not None
+    assert f"'ccatp clear {UUID(newest.id)}' ends it" in told.getvalue()
+    again = PersistentEmergencyLatch(tmp_path / FILE, log)
+    assert again.newest == newest  # the same after a restart
+    assert again.clear(newest.id, at_base_or_held=True) is None
+    assert not PersistentEmergencyLatch(tmp_path / FILE, log).is_latched
+
+
+def no_room(*_: int) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def test_a_disk_that_refuses_does_not_keep_an_emergency_from_being_latched(
+    tmp_path: Path, log: Log, told: StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    latch = PersistentEmergencyLatch(tmp_path / FILE, log)
+    monkeypatch.setattr("os.fsync", no_room)
+    assert latch.raise_emergency("fire", "a") is None
+    assert latch.is_latched
+    assert "emergencies_not_saved" in told.getvalue()
+
+
+@pytest.mark.fault("P13")
+def test_an_emergency_is_kept_on_a_full_disk(tmp_path: Path, log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The room for it was taken before; a full disk gives no more."""
+    latch = PersistentEmergencyLatch(tmp_path / FILE, log)
+    assert (tmp_path / f"{FILE}.new").stat().st_size == RESERVE_BYTES
+    monkeypatch.setattr("os.posix_fallocate", no_room)
+    assert latch.raise_emergency("earthquake", "a") is None
+    assert PersistentEmergencyLatch(tmp_path / FILE, log).is_shaking
+
+
+# -- posts of alarms ---------------------------------------------------------------------------------------------------
+
+PATIENCE_S = 30.0
+
+
+def alarm(name: str = "fan_weak", **fields: Any) -> Alarm:
+    whole = Alarm(name=name, severity="return", cause="weak", advice="", since="A", since_s=1.0)
+    return msgspec.structs.replace(whole, **fields)
+
+
+def status(*alarms: Alarm) -> MissionStatus:
+    return MissionStatus(seq=1, t_s=1.0, state="held", alarms=list(alarms))
+
+
+class Server(ThreadingHTTPServer):
+    """Answers with the next of ``answers``, then with 200."""
+
+    answers: list[int]
+    bodies: list[dict[str, Any]]
+
+
+class Handler(BaseHTTPRequestHandler):
+    server: Server
+
+    def do_POST(self) -> None:
+        body = json.loads(self.rfile.read(int(self.headers["content-length"])))
+        code = self.server.answers.pop(0) if self.server.answers else 200
+        self.send_response(code)
+        self.end_headers()
+        self.server.bodies.append(body | {"answered": code})
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    with Server(("127.0.0.1", 0), Handler) as found:
+        found.answers, found.bodies = [], []
+        thread = threading.Thread(target=found.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield found
+        found.shutdown()
+        thread.join()
+
+
+def hook_to(port: int, give_up_s: float = 600.0, known: Iterable[Alarm] = ()) -> AlarmWebhook:
+    url = f"http://127.0.0.1:{port}/hook"
+    cfg = AlarmsConfig(webhook_url=url, webhook_timeout_s=20.0, webhook_give_up_s=give_up_s)
+    return AlarmWebhook(cfg, "tonight", structlog.get_logger(), known)
+
+
+def until(server: Server, count: int) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while len(server.bodies) < count:
+        assert time.monotonic() < deadline_s, server.bodies
+        time.sleep(0.005)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "events"),
+    [
+        ([], [alarm()], ["raised"]),
+        ([alarm()], [alarm()], []),
+        ([alarm()], [alarm(severity="fault")], ["raised"]),
+        ([alarm()], [alarm(count=2)], ["raised"]),
+        ([alarm()], [alarm(acknowledged_by="anna")], ["acknowledged"]),
+        ([alarm()], [alarm(ended="B")], ["ended"]),
+        ([alarm()], [], ["ended"]),
+        ([alarm(ended="B")], [], []),
+        ([alarm("a")], [alarm("b", acknowledged_by="anna", ended="B")], ["raised", "acknowledged", "ended", "ended"]),
+    ],
+)
+def test_what_is_posted(before: list[Alarm], after: list[Alarm], events: list[str]) -> None:
+    by_name = [{one.name: one for one in alarms} for alarms in (before, after)]
+    assert [event for event, _ in changes(*by_name)] == events
+
+
+def test_a_post_that_is_not_taken_comes_again_in_order(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(webhook, "FIRST_PAUSE_S", 0.01)
+    server.answers += [500, 429]
+    hook = hook_to(server.server_port)
+    hook.update(None)
+    hook.update(status(alarm()))
+    hook.update(status(alarm()))
+    hook.update(status(alarm(ended="B")))
+    until(server, 4)
+    hook.close(PATIENCE_S)
+    assert [(body["event"], body["answered"]) for body in server.bodies] == [
+        ("raised", 500), ("raised", 429), ("raised", 200), ("ended", 200),
+    ]  # fmt: skip
+    assert (server.bodies[0]["run"], server.bodies[0]["state"]) == ("tonight", "held")
+    assert server.bodies[0]["alarm"]["cause"] == "weak"
+
+
+def test_a_resumed_run_posts_what_changed_since_the_session_before(server: Server) -> None:
+    over, lasting, gone = alarm("over", ended="B"), alarm("lasting"), alarm("gone", acknowledged_by="root")
+    hook = hook_to(server.server_port, known=(over, lasting, gone))
+    hook.update(status(over, lasting, alarm("new")))
+    until(server, 2)
+    hook.close(PATIENCE_S)
+    found = [(body["event"], body["alarm"]["name"]) for body in server.bodies]
+    assert found == [("raised", "new"), ("ended", "gone")]
+
+
+def test_a_refusal_is_logged_and_the_next_one_is_posted(server: Server) -> None:
+    server.answers.append(404)
+    with capture_logs() as logs:
+        hook = hook_to(server.server_port)
+        hook.update(status(alarm()))
+        until(server, 1)
+        hook.update(status(alarm(ended="B")))
+        until(server, 2)
+        hook.close(PATIENCE_S)
+    assert [(log["event"], log["why"]) for log in logs] == [("alarm_not_posted", "refused: status 404")]
+
+
+def test_a_server_that_never_answers_delays_nothing_and_the_queue_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(webhook, "MOST_WAITING", 3)
+    with socket.create_server(("127.0.0.1", 0)) as silent, capture_logs() as logs:
+        hook = hook_to(silent.getsockname()[1])
+        for count in range(1, 11):
+            hook.update(status(alarm(count=count)))
+        hook.close(0.05)
+    assert logs == [{"event": "alarm_posts_left_out", "log_level": "warning", "count": 10}]
+
+
+def test_an_old_post_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(webhook, "FIRST_PAUSE_S", 0.01)
+    with socket.create_server(("127.0.0.1", 0)) as gone:
+        port = gone.getsockname()[1]
+    with capture_logs() as logs:
+        hook = hook_to(port, give_up_s=0.02)
+        hook.update(status(alarm()))
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not logs and time.monotonic() < deadline_s:
+            time.sleep(0.005)
+        hook.close(PATIENCE_S)
+    assert [log["event"] for log in logs] == ["alarm_not_posted"]
+
+
+def test_without_an_address_there_is_no_thread() -> None:
+    hook = AlarmWebhook(config_of().alarms, "run", structlog.get_logger())
+    hook.update(status(alarm()))
+    hook.close(PATIENCE_S)
+    assert not [thread for thread in threading.enumerate() if thread.name == "webhook"]

@@ -16,7 +16,7 @@ from ccatp.links.liveness import RateLimitedLog, kind_of
 from ccatp.links.topics import DangerEvent, LogMessage, MissionStatus, TrackMessage
 from ccatp.survey.events import MissionState
 from tests.support.scenario import world_of
-from tests.unit.reporting.beacon_recorded import record_beacons
+from tests.unit.reporting.recorded import record_beacons
 from tests.unit.run_folder import make_run
 
 CFG, _ = world_of()

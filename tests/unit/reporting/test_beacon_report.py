@@ -17,8 +17,8 @@ from ccatp.report.beacon_record import (
 from ccatp.report.plots import NARROW, PX_PER_IN, WIDE
 from ccatp.report.run_page import beacon_data, beacon_drawings, beacon_page
 from tests.support.command import answered
-from tests.unit.reporting.beacon_recorded import FRAMES, OFF_M, SIGMA_M, beacon_config, record_beacons
 from tests.unit.reporting.conftest import Markup
+from tests.unit.reporting.recorded import FRAMES, OFF_M, SIGMA_M, beacon_config, record_beacons
 
 ALL = ["map", "waypoints", "localization", "consistency", "events", "configuration"]
 

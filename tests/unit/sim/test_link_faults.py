@@ -1,9 +1,13 @@
-"""Every fault of the proxy between the client's end of the robot link and a simulated robot, by the robot's clock."""
+"""Faults of the proxy: of connections, of lines without sockets, and each between the robot link and a robot."""
 
 import asyncio
+import contextlib
 import json
+import random
 import socket
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from itertools import pairwise
 from typing import Any
 
@@ -13,8 +17,248 @@ from ccatp.config.load import load_config
 from ccatp.dataloop import serve
 from ccatp.onboard import server, sessions
 from ccatp.sim.fault_plan import LINK_TYPES, LOCKSTEP_TYPES, parse_plan
-from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S
-from tests.support.daemon import Driver
+from ccatp.sim.fault_proxy import FaultProxy, LineStage, OneWayFaults
+from tests.support.daemon import LINK_DEADLINE_S, Driver
+from tests.support.scenario import begin
+
+DEADLINE_S = 5.0  # what never happens in a good run may take this long in a bad one
+LINES = [b"line %d of some length\n" % k for k in range(40)]
+TEXT = b"".join(LINES)
+
+
+class Server:
+    """Keeps what it gets, piece by piece, and sends what it is told."""
+
+    def __init__(self) -> None:
+        self.pieces: list[bytes] = []
+        self.ends: list[str] = []
+        self.writers: list[asyncio.StreamWriter] = []
+        self.changed = asyncio.Event()
+        self.is_echo = False
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.writers.append(writer)
+        self.changed.set()
+        try:
+            while data := await reader.read(65536):
+                self.pieces.append(data)
+                self.changed.set()
+                if self.is_echo:
+                    writer.write(data)
+            self.ends.append("FIN")
+        except ConnectionResetError:
+            self.ends.append("RST")
+        except ConnectionError:
+            self.ends.append("lost")
+        finally:
+            self.changed.set()
+            writer.close()
+
+    @property
+    def text(self) -> bytes:
+        return b"".join(self.pieces)
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(DEADLINE_S):
+            while not condition():
+                self.changed.clear()
+                await self.changed.wait()
+
+
+class Rig:
+    """A server behind a proxy."""
+
+    def __init__(self, server: Server, proxy: FaultProxy) -> None:
+        self.server, self.proxy = server, proxy
+        self.writers: list[asyncio.StreamWriter] = []
+
+    async def connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        """A client; the server has it, too."""
+        before = len(self.server.writers)
+        reader, writer = await asyncio.open_connection("127.0.0.1", self.proxy.port)
+        self.writers.append(writer)
+        await self.server.until(lambda: len(self.server.writers) > before)
+        return reader, writer
+
+
+@asynccontextmanager
+async def rig(seed: int = 1) -> AsyncIterator[Rig]:
+    server = Server()
+    listening = await asyncio.start_server(server.serve, "127.0.0.1", 0)
+    try:
+        async with FaultProxy("127.0.0.1", listening.sockets[0].getsockname()[1], seed=seed) as proxy:
+            found = Rig(server, proxy)
+            try:
+                yield found
+            finally:
+                for writer in (*found.writers, *server.writers):
+                    writer.close()
+                    with contextlib.suppress(ConnectionError):
+                        await writer.wait_closed()
+    finally:
+        listening.close()
+        await listening.wait_closed()
+
+
+async def passes(condition: Callable[[], bool]) -> None:
+    """Let the event loop turn until the condition holds."""
+    for _ in range(100_000):
+        if condition():
+            return
+        await asyncio.sleep(0)
+    pytest.fail("it never came true")
+
+
+async def read(reader: asyncio.StreamReader, count: int) -> bytes:
+    async with asyncio.timeout(DEADLINE_S):
+        return await reader.readexactly(count)
+
+
+async def rest(reader: asyncio.StreamReader) -> tuple[bytes, str]:
+    """What comes until the end, and how it ends."""
+    found = b""
+    async with asyncio.timeout(DEADLINE_S):
+        try:
+            while data := await reader.read(65536):
+                found += data
+        except ConnectionResetError:
+            return found, "RST"
+    return found, "FIN"
+
+
+async def test_without_faults_everything_passes_and_so_does_the_end() -> None:
+    async with rig() as r:
+        reader, writer = await r.connect()
+        writer.write(TEXT)
+        await r.server.until(lambda: r.server.text == TEXT)
+        r.server.writers[0].write(TEXT[::-1])
+        assert await read(reader, len(TEXT)) == TEXT[::-1]
+        assert r.proxy.passed_bytes == len(TEXT)
+        assert r.proxy.passed_lines == len(LINES)
+        writer.close()
+        await r.server.until(lambda: r.server.ends == ["FIN"])
+        assert r.proxy.counts == {"connections": 1}
+
+
+async def test_a_server_that_is_not_there_ends_the_connection(free_port: int) -> None:
+    async with FaultProxy("127.0.0.1", free_port, seed=1) as proxy:
+        reader, writer = await asyncio.open_connection("127.0.0.1", proxy.port)
+        assert (await rest(reader))[0] == b""
+        assert proxy.counts["refused"] == 1
+        writer.close()
+
+
+async def test_reset_is_felt_on_both_sides() -> None:
+    async with rig() as r:
+        reader, _ = await r.connect()
+        r.proxy.reset()
+        assert (await rest(reader))[1] == "RST"
+        await r.server.until(lambda: r.server.ends == ["RST"])
+        assert r.proxy.counts["reset"] == 1
+
+
+@pytest.mark.parametrize("count", [1, 23, 24, 100, len(TEXT) - 1])
+async def test_reset_after_exactly_so_many_bytes(count: int) -> None:
+    async with rig() as r:
+        reader, _ = await r.connect()
+        r.proxy.reset_after(count)
+        r.server.writers[0].write(TEXT)
+        assert await rest(reader) == (TEXT[:count], "RST")
+        assert r.proxy.counts["reset"] == 1
+
+
+async def test_close_ends_both_sides_in_order() -> None:
+    async with rig() as r:
+        reader, _ = await r.connect()
+        r.proxy.close()
+        assert await rest(reader) == (b"", "FIN")
+        await r.server.until(lambda: r.server.ends == ["FIN"])
+        assert r.proxy.counts["close"] == 1
+        await r.connect()  # the next one is served
+
+
+async def test_a_black_hole_one_way_swallows_data_and_the_end() -> None:
+    async with rig() as r:
+        reader, writer = await r.connect()
+        begin(r.proxy, "black_hole", "to_robot")
+        writer.write(TEXT)
+        r.server.writers[0].write(b"still here\n")
+        assert await read(reader, 11) == b"still here\n"  # the other way is open
+        await passes(lambda: r.proxy.counts["black_hole"] == len(TEXT))
+        writer.write_eof()
+        r.server.writers[0].write(b"half-open\n")
+        assert await read(reader, 10) == b"half-open\n"
+        assert r.server.pieces == []
+        assert r.server.ends == []
+        r.proxy.heal("to_robot")
+        await r.server.until(lambda: r.server.ends == ["FIN"])  # now it knows
+        assert r.server.pieces == []
+
+
+async def test_a_stall_ends_in_one_burst() -> None:
+    async with rig() as r:
+        reader, writer = await r.connect()
+        begin(r.proxy, "stall", "to_robot")
+        for line in LINES:
+            writer.write(line)
+            await writer.drain()
+            await asyncio.sleep(0)
+        r.server.writers[0].write(b"other way\n")
+        assert await read(reader, 10) == b"other way\n"
+        assert r.server.pieces == []
+        r.proxy.heal("to_robot", "stall")
+        await r.server.until(lambda: r.server.text == TEXT)
+        assert r.server.pieces == [TEXT]
+        assert r.proxy.counts["stall"] >= 1
+
+
+def stage(seed: int = 1, **faults: dict[str, Any]) -> tuple[LineStage, OneWayFaults, Counter[str]]:
+    switched: OneWayFaults = {}
+    for name, keys in faults.items():
+        switched[name] = LINK_TYPES[name].model_validate({"type": name, "direction": "both", **keys})
+    counts: Counter[str] = Counter()
+    return LineStage(switched, counts, random.Random(seed)), switched, counts
+
+
+def out(line_stage: LineStage, *lines: bytes) -> list[bytes]:
+    return [piece for line in lines for piece in line_stage.feed(line)]
+
+
+def test_lines_are_reordered_and_none_is_lost() -> None:
+    line_stage, faults, counts = stage(reorder={"every": 4})
+    assert out(line_stage, *LINES[:6]) == [*LINES[:3], LINES[4], LINES[3], LINES[5]]
+    assert out(line_stage, *LINES[6:9]) == LINES[6:8]  # the last one is withheld
+    faults.clear()
+    assert out(line_stage, LINES[9]) == [LINES[9] + LINES[8]]
+    faults.update(stage(reorder={"every": 9})[1])
+    assert out(line_stage, LINES[10]) == []
+    assert line_stage.finish() == LINES[10]
+    assert counts == {"reorder": 3}
+
+
+def test_lines_are_duplicated_and_end_in_lf_alone() -> None:
+    line_stage, _, counts = stage(duplicate={"every": 2})
+    assert out(line_stage, b"a\rb\r\nc", b"\nd\n") == [b"a\rb\r\n", b"c\n", b"c\n", b"d\n"]
+    assert counts == {"duplicate": 1}
+
+
+def test_one_byte_of_a_line_is_corrupted() -> None:
+    texts = []
+    for seed in (1, 1, 2):
+        line_stage, _, counts = stage(seed, corrupt={"every": 8})
+        found = out(line_stage, TEXT)
+        wrong = [k for k, line in enumerate(found) if line != LINES[k]]
+        assert wrong == [7, 15, 23, 31, 39]
+        assert all(sum(a != b for a, b in zip(found[k], LINES[k], strict=True)) == 1 for k in wrong)
+        assert all(line.endswith(b"\n") and line.count(b"\n") == 1 for line in found)
+        assert counts == {"corrupt": 5}
+        texts.append(found)
+    assert texts[0] == texts[1]  # of the seed
+    assert texts[0] != texts[2]
+    assert out(stage(corrupt={"every": 1})[0], b"\n\n") == [b"\n", b"\n"]  # an empty line stays
+
+
+# -- between the client's end and a simulated robot --------------------------------------------------------------------
 
 
 class Log:
@@ -40,7 +284,7 @@ async def drive(plan: str, is_over: Callable[[Driver], bool], *, lockstep: bool)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(serve(cfg, lockstep=lockstep, stop=stop, listener=listener, log=log, faults=faults))
             try:
-                await client.link.connect(DEADLINE_S)
+                await client.link.connect(LINK_DEADLINE_S)
                 await client.until(lambda: is_over(client))
             finally:
                 client.link.close()

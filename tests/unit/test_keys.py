@@ -1,4 +1,4 @@
-"""Commands that need no run: keys, the dashboard's options."""
+"""Keys and clients of the observatory channel; the dashboard's options."""
 
 import json
 import os
@@ -9,12 +9,15 @@ from pathlib import Path
 import pytest
 import zmq
 import zmq.auth
+from hypothesis import given
+from hypothesis import strategies as st
+from zmq.utils import z85
 
 from ccatp.cli import main
 from ccatp.config.files import read_key
 from ccatp.config.load import dump_config, load_config
 from ccatp.errors import ConfigError
-from ccatp.links.auth import ClientsFile, read_clients, read_pair, read_public
+from ccatp.links.auth import AuthorizedClient, ClientsFile, check_key, read_clients, read_pair, read_public
 from tests.support.command import refused
 
 # -- ``ccatp keys``: what is written, and what is never shown ---------------------------------------------------------
@@ -195,3 +198,51 @@ def test_the_list_is_read_again_when_it_changes_and_a_bad_one_names_nobody(folde
 def test_a_key_of_the_daemon_is_not_the_pages(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["dashboard", "--set", "run.seed=2"]) == 2
     assert "run.seed is no key of the page; the daemon runs with what it has" in capsys.readouterr().err
+
+
+# -- the list of clients -----------------------------------------------------------------------------------------------
+
+KEY = z85.encode(b"k" * 32).decode()
+OTHER = zmq.curve_keypair()[0].decode()
+ENTRY = f'[clients.a]\npublic_key = "{KEY}"\nrole = "raise"\n'
+NO_KEY = "is no key: a key has 40 characters of Z85"
+
+
+@given(st.binary(min_size=32, max_size=32))
+def test_keys_are_z85(key: bytes) -> None:
+    assert check_key(z85.encode(key).decode()) == ""
+
+
+@pytest.mark.parametrize("text", ["", KEY[:-1], KEY + "0", KEY[:-1] + '"', KEY[:-1] + "é"])
+def test_what_is_no_key(text: str) -> None:
+    assert check_key(text).startswith(NO_KEY)
+    assert "more than 32 bytes" in check_key("#####" + KEY[5:])
+
+
+def test_a_list_of_clients(tmp_path: Path) -> None:
+    path = tmp_path / "clients.toml"
+    path.write_text(f'{ENTRY}[clients.b]\npublic_key = "{OTHER}"\nrole = "clear"\n')
+    assert read_clients(path, "list") == {KEY: AuthorizedClient("a", "raise"), OTHER: AuthorizedClient("b", "clear")}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("# nobody\n", "lists no client; add a table"),
+        ("clients = [", "1: is not TOML"),
+        ("[client.a]", r"1: client is unknown; did you mean clients\?"),
+        ("clients = 3", "1: clients = 3 must be a section"),
+        ("[clients]\na = 3", "2: clients.a = 3 must be a section"),
+        (f'[clients.a]\npublic_key = "{KEY}"', "1: clients.a.role is missing"),
+        (f'{ENTRY}ip = "x"', "4: clients.a.ip is unknown; known here: public_key, role"),
+        (ENTRY.replace("raise", "king"), "3: clients.a.role = \"king\" must be 'raise' or 'clear'"),
+        (ENTRY.replace('"raise"', "[]"), r"3: clients.a.role = \[\] must be 'raise' or 'clear'"),
+        (ENTRY.replace(KEY, "x"), f"2: clients.a.public_key {NO_KEY}, this one 1"),
+        (ENTRY + ENTRY.replace(".a]", ".b]"), "5: clients.b.public_key is that of a, too"),
+    ],
+)
+def test_lists_that_count_for_nothing(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "clients.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=f"^list: {path}:?{message}|^list: {path} {message}"):
+        read_clients(path, "list")

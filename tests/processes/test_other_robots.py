@@ -1,13 +1,39 @@
-"""Surveys of a robot and a laser system that share no code with this project, measured by their own truth."""
+"""The on-board program in a process of its own, and a robot and a laser system that share no code with us."""
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from tests.processes.onboard_reactions import TRIALS, Program, driving, measure
 from tests.support import foreign_robot
+
+
+def test_whatever_must_stop_the_wheels_does() -> None:
+    # How fast it is depends on the load of the machine: the page of the program has the figures of an idle one.
+    assert measure(list(TRIALS), 1).keys() == TRIALS.keys()
+
+
+def test_the_line_of_the_external_timer_stands_still_once_the_program_is_stopped() -> None:
+    program = Program()
+    try:
+        with driving(program):
+            program.process.send_signal(signal.SIGSTOP)
+            program.stopped()
+            before_s = program.changed_s
+            assert not program.changes_within(0.3)
+            assert program.changed_s == before_s
+            program.process.send_signal(signal.SIGCONT)
+            assert program.changes_within(5.0)
+    finally:
+        program.close()
+    assert program.process.returncode == 0
+
+
+# -- a robot from the interface contracts alone ------------------------------------------------------------------------
 
 OTHER_CLOCK = "--clock-error 0.005 --clock-wander 0.003 --age-s 0.03 --age-jitter-s 0.01"
 SLOW_SENSORS = "--lockstep --encoder-hz 250 --edge-hz 500 --lose-samples 0.01"
