@@ -267,9 +267,9 @@ class Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         body = json.loads(self.rfile.read(int(self.headers["content-length"])))
         code = self.server.answers.pop(0) if self.server.answers else 200
+        self.server.bodies.append(body | {"answered": code})  # first: the next post may come once this one is answered
         self.send_response(code)
         self.end_headers()
-        self.server.bodies.append(body | {"answered": code})
 
     def log_message(self, *_: object) -> None:
         pass

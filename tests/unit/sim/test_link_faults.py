@@ -299,26 +299,26 @@ def reached(seq: int) -> Callable[[Driver], bool]:
 Keys = dict[str, Any]
 BOTH = {"direction": "both"}
 TO_CLIENT = {"direction": "to_client"}
-# type: keys, what the client must have seen
+# type: keys, what the client must have seen; on a busy machine a line of lockstep may be repeated that was only late
 TABLE: dict[str, tuple[Keys, Callable[[Driver], bool]]] = {
     # The client finds out when it reads, or when it writes.
     "reset": ({}, lambda c: "Connection reset" in c.lost or "Broken pipe" in c.lost),
     "close": ({}, lambda c: "closed" in c.lost),
     "duplicate": ({**BOTH, "every": 2}, lambda c: c.link.counts["repeated_frames"] >= 5),
-    "fragment": ({**BOTH, "write_bytes": 40}, lambda c: not c.link.counts),
+    "fragment": ({**BOTH, "write_bytes": 40}, lambda c: not c.link.counts["bad_lines"]),
     "garbage": ({**TO_CLIENT, "garbage_bytes": 20, "every": 4}, lambda c: c.link.counts["bad_lines"] >= 3),
     "black_hole": (TO_CLIENT, lambda c: max(b - a for a, b in pairs(c.seqs)) > 5),
     "stall": (TO_CLIENT, lambda c: max(b - a for a, b in pairs(c.seqs)) == 1),
     "delay": (
         {**TO_CLIENT, "delay_s": 0.03, "jitter_s": 0.01},
-        lambda c: max(b - a for a, b in pairs(c.seqs)) == 1 and not c.link.counts,
+        lambda c: max(b - a for a, b in pairs(c.seqs)) == 1 and not c.link.counts["bad_lines"],
     ),
     "reorder": ({**TO_CLIENT, "every": 3}, lambda c: c.link.counts["repeated_frames"] >= 2),
     "flood": (
         {**TO_CLIENT, "rate_hz": 300.0, "lines": "copies"},
         lambda c: c.link.counts["repeated_frames"] >= 10,
     ),
-    "slowloris": ({"direction": "to_robot", "bytes_per_s": 400.0}, lambda c: not c.link.counts),
+    "slowloris": ({"direction": "to_robot", "bytes_per_s": 400.0}, lambda c: not c.link.counts["bad_lines"]),
     "corrupt": ({**TO_CLIENT, "every": 5}, lambda c: c.link.counts["bad_lines"] >= 1),
 }
 
@@ -341,8 +341,8 @@ def test_the_table_knows_every_type() -> None:
 @pytest.mark.parametrize("kind", TABLE)
 async def test_on_the_wall_clock_each_fault_reaches_the_client_and_the_log(kind: str) -> None:
     keys, seen = TABLE[kind]
-    client, log = await drive(plan_of(kind, "at_s = 0.1", keys), reached(40), lockstep=False)
-    assert seen(client), (client.seqs, client.lost, client.link.counts)
+    is_far = reached(40)
+    _, log = await drive(plan_of(kind, "at_s = 0.1", keys), lambda c: is_far(c) and seen(c), lockstep=False)
     (began,) = log.of("begins")
     assert (began["type"], began["at_s"], began["from_s"]) == (kind, 0.1, 0.1)
     (record,) = log.of("injected")
