@@ -56,6 +56,12 @@ class Damage(NamedTuple):
             return self.tables
         return {**self.tables, kind: _with(self.tables[kind], change)}
 
+    def everything(self, change: Callable[[FloatArray], FloatArray]) -> "Damage":
+        """With the rows of all tables and of the truth changed."""
+        tables = {kind: _with(table, change) for kind, table in self.tables.items()}
+        truth = None if self.truth is None else ReferencePath(*change(np.column_stack(self.truth)).T)
+        return self._replace(tables={kind: table for kind, table in tables.items() if len(table.values)}, truth=truth)
+
     def readings(self, change: Callable[[FloatArray], FloatArray]) -> "Damage":
         """With the rows of all readings changed."""
         changed = {kind: _with(table, change) for kind, table in self.tables.items() if kind != "odom"}
@@ -105,11 +111,7 @@ def straight(damage: Damage) -> Damage:
         spans.append((damage.track.times_s[last] - damage.track.times_s[first], first, last))
     _, first, last = max(spans)
     begin_s, end_s = damage.track.times_s[[first, last]].tolist()
-    inside = {
-        kind: _with(t, lambda rows: rows[(rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)])
-        for kind, t in damage.tables.items()
-    }
-    return damage._replace(tables={kind: table for kind, table in inside.items() if len(table.values)})
+    return damage.everything(lambda rows: rows[(rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)])
 
 
 def swapped(damage: Damage) -> Damage:
@@ -160,14 +162,7 @@ def moved(damage: Damage) -> Damage:
 def kidnapped(damage: Damage) -> Damage:
     """Nothing is recorded while the vehicle drives on, and the clocks stand."""
     begin_s, end_s = damage.middle_s, damage.middle_s + 0.5 * SILENCE_S
-    tables = {
-        kind: _with(table, lambda rows: _later(_cut(rows, begin_s, end_s), begin_s, begin_s - end_s))
-        for kind, table in damage.tables.items()
-    }
-    truth = damage.truth
-    if truth is not None:
-        truth = ReferencePath(*_later(_cut(np.column_stack(truth), begin_s, end_s), begin_s, begin_s - end_s).T)
-    return damage._replace(tables=tables, truth=truth)
+    return damage.everything(lambda rows: _later(_cut(rows, begin_s, end_s), begin_s, begin_s - end_s))
 
 
 def wrong_names(damage: Damage) -> Damage:
@@ -198,11 +193,7 @@ def reading_gap(damage: Damage) -> Damage:
 
 def two_epochs(damage: Damage) -> Damage:
     """The recorder's clock is set half way, by days."""
-    tables = {kind: _with(t, lambda rows: _later(rows, damage.middle_s, EPOCH_S)) for kind, t in damage.tables.items()}
-    truth = damage.truth
-    if truth is not None:
-        truth = ReferencePath(*_later(np.column_stack(truth), damage.middle_s, EPOCH_S).T)
-    return damage._replace(tables=tables, truth=truth)
+    return damage.everything(lambda rows: _later(rows, damage.middle_s, EPOCH_S))
 
 
 def late_readings(damage: Damage) -> Damage:
