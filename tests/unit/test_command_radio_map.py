@@ -103,6 +103,17 @@ def test_measured_ranges(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert data["rms_m"] == {"p10": None, "p50": None, "p90": None}
     first = next(iter(tomllib.loads(out.read_text())["beacons"].values()))
     assert first["position_m"] == pytest.approx([0.0, 0.0], abs=1e-12)
+    assert data["measure_next"]["after_m"] < data["measure_next"]["map_m"] == pytest.approx(data["expected_rms_m"])
+
+
+def test_one_pair_that_was_measured_less_is_to_be_measured_next(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """M2 hangs on the others by three ranges, each once: all others have theirs sixty times."""
+    path = ranges_file(tmp_path / "r.csv", [pair for pair in ALL if 2 not in pair] * 60 + [(0, 2), (1, 2), (2, 3)])
+    assert main(["radio", "map", "--ranges", str(path)]) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if "measure next" in line)
+    assert "M2" in line.split(":")[0].split()
 
 
 def test_the_report_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
