@@ -34,8 +34,8 @@ from ccatp.links.topics import ESTIMATE_FRAMES, DangerEvent, MissionStatus
 from ccatp.safety.escalation import Since
 from ccatp.survey.events import HELD, Abort, Fault, Interrupted, Pause, Resume, StopHere
 
-# After the end the last messages must reach the supervisor, which then ends this process.
-SHUTDOWN_TIMEOUT_S = 30.0
+# After the end the last messages must reach the supervisor, which then ends this process: reported if it takes longer.
+SHUTDOWN_REPORT_S = 30.0
 # Of the levels one display state goes to those who keep a history, where no page asks for all of them.
 SAMPLED_LEVELS = 10
 # The place of a robot that moved is not known when the samples of more frames than this are missing.
@@ -194,13 +194,15 @@ class MainLoop(RobotLoop):
             raise self._failure
         if stop.is_set():
             return
-        # The end is repeated until the supervisor has received it and stops this process.
+        # The end is repeated until the supervisor has received it and stops this process, however far behind it is: it
+        # would take a process that ends by itself for one that died, and restart it.
         self.heartbeat.phase = "done"
-        try:
-            async with asyncio.timeout(SHUTDOWN_TIMEOUT_S):
-                await stop.wait()
-        except TimeoutError:
-            self.log.warning("shutdown_not_acknowledged")
+        while not stop.is_set():
+            try:
+                async with asyncio.timeout(SHUTDOWN_REPORT_S):
+                    await stop.wait()
+            except TimeoutError:
+                self.log.warning("shutdown_not_acknowledged")
 
     async def close(self) -> None:
         self._danger_events.close()

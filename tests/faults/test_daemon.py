@@ -77,6 +77,18 @@ async def test_while_a_robot_that_took_the_connection_says_nothing(measured: Mea
         measured("P10", loop.time() - begun_s)
 
 
+@pytest.mark.fault("P18")
+async def test_a_main_loop_whose_mission_is_over_waits_for_a_supervisor_that_is_behind() -> None:
+    with patch("ccatp.daemon.main_loop.SHUTDOWN_REPORT_S", 0.01):
+        async with running_daemon(configuration()) as daemon:
+            daemon.main.finish(ExitStatus.COMPLETE)
+            await daemon.until(lambda: len(daemon.events("shutdown_not_acknowledged")) >= 3)
+            assert not daemon.loops[0].done()  # the supervisor would take it for dead, and start another one
+            daemon.stop.set()
+            await asyncio.wait(daemon.loops)
+            assert daemon.main.status().exit_status == ExitStatus.COMPLETE
+
+
 @pytest.mark.slow
 @pytest.mark.fault("P10")
 async def test_many_times(measured: Measured) -> None:
