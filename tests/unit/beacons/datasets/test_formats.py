@@ -418,3 +418,37 @@ def test_readings_that_cannot_be_are_left_out(tmp_path: Path) -> None:
         "surveyed place of far: is no place",
     ):
         assert words in told
+
+
+def small(*lines: str) -> list[str]:
+    """Four steps of odometry and two ranges of a beacon."""
+    odometry = [f"odom,{t},0.1,0.2" for t in range(5)]
+    return [*odometry, "range,1.5,a,2.0", "range,2.5,a,5.0", *lines]
+
+
+@pytest.mark.parametrize(
+    ("lines", "what"),
+    [
+        (("odom,7300,0.1,0.0",), "a pause of 7.3e.03 s at 4 s cannot be; at most 3600 is taken; was the clock set"),
+        (("antenna,0.1,0.2", "antenna,0.3,0.2"), "csv:9: more than one antenna"),
+        (("antenna,nan,0.2",), "csv:8: more than one antenna, or one at no place"),
+    ],
+)
+def test_clocks_that_were_set_and_antennas_at_no_place(tmp_path: Path, lines: tuple[str, ...], what: str) -> None:
+    with pytest.raises(RadioDataError, match=what):
+        read_run(write_lines(tmp_path / "a.csv", small(*lines)), None, None)
+
+
+def test_a_range_that_is_shorter_than_the_height(tmp_path: Path) -> None:
+    run = read_run(write_lines(tmp_path / "a.csv", small("beacon,a,1,1,3.5", "antenna,0,0,0.5")), None, None)
+    assert "1 range shorter than the beacon is above the antenna, left out" in run.warnings
+    assert run.readings.range_m.tolist() == [4.0]  # of 5 m, 3 m above
+
+
+def test_an_antenna_and_a_truth_without_headings(tmp_path: Path) -> None:
+    truth = [f"truth,{t},{0.1 * t},0" for t in range(5)]
+    run = read_run(write_lines(tmp_path / "a.csv", small("antenna,0.5,0", *truth)), None, None)
+    assert "the truth has no headings: its positions are taken as the antenna's" in run.warnings
+    assert run.truth is not None
+    assert run.truth.x_m.tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert run.steps.lateral_m == pytest.approx(2.0 * np.sin(0.1) * 0.5)
