@@ -190,8 +190,10 @@ def run_recordings(job: Job) -> JobOutcome:
         if estimator in FILTERS:
             track, run_s = estimate(run, cfg, estimator), None
         else:
-            found = run_gtsam(run, getattr(cfg, run.kind), perf_counter)
-            track = found[PEERS.index(estimator)]
+            try:
+                track = run_gtsam(run, getattr(cfg, run.kind), perf_counter)[PEERS.index(estimator)]
+            except PeerGaveUp:  # a mean over the easier runs alone would compare nothing
+                return JobOutcome({"gave_up": True})
         run_s = perf_counter() - begin_s
         data = result_data(run, estimator, track, judge(track, run))
         rows.append({key: data[value] for key, value in (_ERRORS | _SHOWN).items()} | {"run_s": run_s})
@@ -249,6 +251,7 @@ def _fixed_levels(folder: Path, share: float, method: str) -> JobOutcome:
 def combine_recordings(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """The whole run, and median and 10 to 90 % of the errors over the later starts."""
     whole, later = dict(outcomes[0].values), [outcome.values for outcome in outcomes[1:]]
+    whole["gave_up"] = sum("gave_up" in outcome.values for outcome in outcomes)
     for key in _ERRORS:
         known = [one[key] for one in later if one.get(key) is not None]
         ends = np.percentile(known, (10, 50, 90)).tolist() if known else [None] * 3
@@ -279,7 +282,7 @@ RECORDINGS = Study(
     run_job=run_recordings,
     combine=combine_recordings,
     columns="""
-        path_m heading_rad beacons_m range_scale nis nees covered update_us run_s
+        path_m heading_rad beacons_m range_scale nis nees covered gave_up update_us run_s
         started_path_m: p10 p50 p90
         started_beacons_m: p10 p50 p90
     """,

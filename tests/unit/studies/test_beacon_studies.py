@@ -13,9 +13,10 @@ from ccatp.studies import cricket_study
 from ccatp.studies.campaign import CampaignError, Cell, CellResult, Job, JobOutcome
 from ccatp.studies.cricket_study import combine, run_job
 from ccatp.studies.damage import DAMAGES, Damage, run_damage
+from ccatp.studies.gtsam_peer import PeerGaveUp
 from ccatp.studies.mote_navigation import combine as mote_navigation_combine
 from ccatp.studies.mote_runs import run_batch, run_filter, simulate_field
-from ccatp.studies.recordings import estimate, events_of, run_recordings
+from ccatp.studies.recordings import combine_recordings, estimate, events_of, run_recordings
 from tests.unit.beacons.datasets.sets import recorded, world
 
 # One worker computes the cells that they share.
@@ -168,3 +169,15 @@ def test_a_folder_of_recordings_is_needed() -> None:
         run_damage(Job("damage", {"damage": "two clock epochs"}, 0, load_recordings_config()))
     with pytest.raises(CampaignError, match="started at most 80% later"):
         run_recordings(Job("recordings", {"data": "Plaza2", "estimator": "ekf-slam"}, 9, load_recordings_config()))
+
+
+def test_a_peer_that_gives_up_on_a_later_start_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def give_up(*_: object) -> None:
+        raise PeerGaveUp("no result")
+
+    monkeypatch.setattr("ccatp.studies.recordings.shipped_run", lambda *_: recorded(world(seconds=20.0)))
+    monkeypatch.setattr("ccatp.studies.recordings.run_gtsam", give_up)
+    factors = {"data": "Plaza2", "estimator": "GTSAM iSAM2"}
+    outcome = run_recordings(Job("recordings", factors, 0, load_recordings_config()))
+    found = combine_recordings(factors, [JobOutcome({"path_m": 1.0}), outcome, JobOutcome({"path_m": 2.0})]).values
+    assert (found["gave_up"], found["path_m"], found["started_path_m"]["p50"]) == (1, 1.0, 2.0)
