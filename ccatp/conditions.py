@@ -203,6 +203,9 @@ WHEEL_CREEPS_ON = fault(Group.WHEELS, "the {side} wheel turns while it is held",
     "The robot has crept for a second. Fans to their maximum.", "Hold the robot; fans, brake, slope.", full_fans=True)
 WHEEL_DOES_NOT_STOP = hold(Group.WHEELS, "the {side} wheel turns though it shall stand",
     "The servo does not come to rest.", "As for a wheel that runs away, if it comes again.")
+GRIP_LOST = hold(Group.WHEELS, "the robot loses its grip: it slides downhill over its wheels",
+    "Accelerometer and gyroscope show a slide along gravity, its wheels do not. Wheels held, fans to their maximum.",
+    "Tyres or mirror oily? Too little thrust for the slope: see `ccatp plan`.", full_fans=True)
 YAW_DISAGREES = hold(Group.SENSORS,
     "gyroscope and wheels disagree about the turn: a wheel slips, or the gyroscope is off",
     "They disagree by more than slip and errors of scale explain. A fix comes first.",

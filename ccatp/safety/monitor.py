@@ -23,7 +23,7 @@ from ccatp.safety.sensor_monitors import (
     RateMonitor,
     SeamMonitor,
 )
-from ccatp.safety.wheel_monitors import LATE_S, WheelMonitor
+from ccatp.safety.wheel_monitors import LATE_S, GripMonitor, WheelMonitor
 
 _STANDS_RAD_S = 0.02  # a wheel's mean over a frame below which it stands: 0.6 mm/s
 _LOOK_FRAMES = 2  # the monitors judge one frame in so many while nothing is wrong; sums are kept in every one
@@ -56,13 +56,14 @@ class HealthMonitor:
         cfg, robot = self._cfg, self._robot
         self._gate = ImuGate(cfg)
         self._wheels, self._rates, self._latency = WheelMonitor(cfg, robot), RateMonitor(cfg), LatencyMonitor(cfg)
+        self._grip = GripMonitor(cfg, robot)
         self._fans = FanMonitor(cfg, robot.fan_duty, self._mirror.overhang)
         self._flicker = FlickerMonitor(cfg, self._is_explained)
         self._clock, self._gap = FindingLatch(cfg.imu_quarantine_s), FindingLatch(cfg.imu_quarantine_s)
         self._garbled = FindingLatch(cfg.retry_after_s)
         self._reported: dict[str, FindingLatch] = {}
         self._latches = (
-            *(self._wheels.alarm, self._wheels.yaw, self._fans.alarm, self._latency.alarm),
+            *(self._grip.alarm, self._wheels.alarm, self._wheels.yaw, self._fans.alarm, self._latency.alarm),
             *(self._clock, self._gap, self._garbled, self._flicker.chatter, self._flicker.flash),
         )
         self._battery.reset()
@@ -124,7 +125,8 @@ class HealthMonitor:
         self._is_late = self._is_late or (frame.cmd.age > LATE_S and not frame.cmd.held)
         is_flickering = is_any_off or not self._flicker.is_quiet
         self._frames += 1
-        is_due = self._frames % _LOOK_FRAMES == 0 or is_flickering or is_gap
+        is_sliding = self._grip.step(t_s, dt_s, imu, self._means, frame.gravity, self._bias_rad_s)
+        is_due = self._frames % _LOOK_FRAMES == 0 or is_flickering or is_gap or is_sliding
         if is_due or frame.faults or self.findings or self._gate.cause:
             self._judge(t_s, frame, wheels)
             if is_flickering:

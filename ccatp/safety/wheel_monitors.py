@@ -1,4 +1,4 @@
-"""Wheels and encoders against the commanded set points, and against the gyroscope."""
+"""Wheels and encoders against the commanded set points, the gyroscope, and a body that slides."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 from ccatp import conditions
 from ccatp.config.models import HealthConfig, RobotConfig
-from ccatp.control.wheel_motion import MotionSum, SlidingWindow
-from ccatp.core import WheelSample
+from ccatp.control.wheel_motion import MotionSum, SlidingWindow, WheelMeans
+from ccatp.core import GravitySample, ImuSample, WheelSample
 from ccatp.safety.escalation import FindingLatch, Since
 
 # A servo of 0.1 s and a link of 40 ms have forgotten a command after this long, to within 2 %.
@@ -221,6 +221,68 @@ class WheelMonitor:
         limit = cfg.yaw_limit_rad + cfg.yaw_share * max(abs(by_wheels), abs(by_gyroscope))
         if not -limit <= difference <= limit:
             self.yaw.see(t_s, conditions.YAW_DISAGREES.found("imu_wz", difference, limit))
+
+
+_SLIDE_MEMORY_S = 0.06
+_GRAVITY_TIME_S = 0.2  # over which its readings, noisy ones, are averaged
+_BIAS_SAMPLES = 100  # of the accelerometer at rest, whose mean is its bias
+_LEAST_SLOPE = 0.15  # of gravity along the robot: where it drives on a level or across a slope it does not slide ahead
+_LARGEST_M_S2 = 10.0  # gravity gives no more
+_ENCODER_JUMP_M_S = 0.03  # of a wheel's speed in a frame: no wheel that carries the robot does that
+_LEAST_SHARE = 0.3  # of the limit: a turn alone is no slide
+
+
+class GripMonitor:
+    """Loss of grip: the body goes downhill faster than its wheels.
+
+    Its acceleration, less the bias at rest, against the change of the wheels' speed, and the gyroscope's rate against
+    their turn, both summed with a memory of 60 ms.
+    """
+
+    def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
+        self._slip_m_s, self._turn_rad, self._radius_m = cfg.grip_slip_m_s, cfg.grip_turn_rad, robot.wheel_radius_m
+        self._per_base = robot.wheel_radius_m / robot.wheel_base_m
+        self.alarm = FindingLatch(cfg.retry_after_s)
+        self._ahead = self._bias_m_s2 = self._slid_m_s = self._turned_rad = self._speed_m_s = 0.0
+        self._rested = 0
+
+    def step(
+        self,
+        t_s: float,
+        dt_s: float,
+        imu: Sequence[ImuSample],
+        means: WheelMeans,
+        gravity: GravitySample | None,
+        bias_rad_s: float,
+    ) -> bool:
+        """Take a frame; whether the robot slides. ``bias_rad_s``: of the gyroscope."""
+        if gravity is not None:
+            self._ahead += 0.05 / (_GRAVITY_TIME_S + 0.05) * (gravity[1] - self._ahead)
+        right, left = means.right_rad_s, means.left_rad_s
+        if not imu or right is None or left is None:
+            return False
+        _, ax, wz = imu[-1]
+        speed_m_s, before_m_s = 0.5 * self._radius_m * (right + left), self._speed_m_s
+        self._speed_m_s = speed_m_s
+        change_m_s = speed_m_s - before_m_s
+        is_sound = -_LARGEST_M_S2 < ax < _LARGEST_M_S2 and -_ENCODER_JUMP_M_S < change_m_s < _ENCODER_JUMP_M_S
+        if right == left == 0.0 and self._rested < _BIAS_SAMPLES and is_sound:
+            self._rested += 1
+            self._bias_m_s2 += (ax - self._bias_m_s2) / self._rested
+        if not is_sound or self._rested < _BIAS_SAMPLES or not 0.0 < dt_s < _SLIDE_MEMORY_S:
+            self._slid_m_s = self._turned_rad = 0.0
+            return False
+        keep = _SLIDE_MEMORY_S / (_SLIDE_MEMORY_S + dt_s)
+        self._slid_m_s = keep * (self._slid_m_s + (ax - self._bias_m_s2) * dt_s - change_m_s)
+        self._turned_rad = keep * (self._turned_rad + (wz - bias_rad_s - self._per_base * (right - left)) * dt_s)
+        if -_LEAST_SLOPE < self._ahead < _LEAST_SLOPE:
+            return False
+        downhill_m_s = self._slid_m_s if self._ahead > 0.0 else -self._slid_m_s
+        share = downhill_m_s / self._slip_m_s
+        if share < _LEAST_SHARE or share + abs(self._turned_rad) / self._turn_rad < 1.0:
+            return False
+        self.alarm.see(t_s, conditions.GRIP_LOST.found("grip", downhill_m_s, self._slip_m_s))
+        return True
 
 
 def _what_is_broken(samples: Sequence[WheelSample], side: int) -> str:

@@ -1,0 +1,64 @@
+"""A body that slides over its wheels: found within 50 ms, and nothing else is taken for it."""
+
+import numpy as np
+import pytest
+
+from ccatp.conditions import GRIP_LOST, Clear, Motion
+from ccatp.config.load import load_config
+from ccatp.control.wheel_motion import WheelMeans
+from ccatp.core import GravitySample, ImuSample, WheelSample
+from ccatp.safety.wheel_monitors import GripMonitor
+
+DT_S = 0.01
+CFG = load_config()
+REST = 150  # frames
+
+
+def found_after_s(
+    slide_m_s2: float, ahead: float, *, braking_m_s2: float = 0.0, turn_rad_s: float = 0.0, noise_m_s2: float = 0.0
+) -> float | None:
+    """Rest, 0.1 m/s, then a body that accelerates by ``slide_m_s2`` over its wheels, which brake; when it is found.
+
+    ``ahead``: gravity along the robot. The accelerometer is off by 0.3 m/s^2.
+    """
+    monitor, means, rng = GripMonitor(CFG.health, CFG.robot), WheelMeans(CFG.robot), np.random.default_rng(2)
+    speed_m_s = 0.0
+    for k in range(REST + 100):
+        t_s, sliding = DT_S * (k + 1), k >= REST + 60
+        wheels_m_s2 = 0.2 if REST <= k < REST + 50 else -braking_m_s2 if sliding and speed_m_s > 0.0 else 0.0
+        speed_m_s += wheels_m_s2 * DT_S
+        rate = speed_m_s / CFG.robot.wheel_radius_m
+        means.take([WheelSample(t_s, rate, rate)], DT_S)
+        ax = 0.3 + wheels_m_s2 + (slide_m_s2 if sliding else 0.0) + noise_m_s2 * float(rng.normal())
+        imu = [ImuSample(t_s, ax, turn_rad_s if sliding else 0.0)]
+        gravity = GravitySample(t_s, ahead, 0.0, 0.3) if k % 5 == 0 else None
+        if monitor.step(t_s, DT_S, imu, means, gravity, 0.0):
+            return t_s - DT_S * (REST + 60)
+    return None
+
+
+@pytest.mark.parametrize("ahead", [0.9, -0.9])
+@pytest.mark.parametrize("slide_m_s2", [2.5, 5.0, 9.0])
+def test_a_slide_downhill_is_found_within_50_ms(slide_m_s2: float, ahead: float) -> None:
+    after_s = found_after_s(slide_m_s2 * np.sign(ahead), ahead, noise_m_s2=0.3)
+    assert after_s is not None
+    assert after_s <= 0.05 + 1e-9
+
+
+def test_a_turn_that_the_wheels_do_not_make_counts_with_it() -> None:
+    alone, with_turn = found_after_s(1.2, 0.9), found_after_s(1.2, 0.9, turn_rad_s=0.5)
+    assert with_turn is not None
+    assert alone is None or with_turn < alone
+
+
+@pytest.mark.parametrize(
+    ("slide_m_s2", "ahead", "braking_m_s2"),
+    [(0.0, 0.9, 1.2), (-5.0, 0.9, 0.0), (5.0, 0.0, 0.0), (20.0, 0.9, 0.0)],
+    ids=["wheels that brake", "uphill", "on a level", "more than gravity: the sensor"],
+)
+def test_what_is_no_slide(slide_m_s2: float, ahead: float, braking_m_s2: float) -> None:
+    assert found_after_s(slide_m_s2, ahead, braking_m_s2=braking_m_s2, noise_m_s2=0.3) is None
+
+
+def test_its_row_holds_the_wheels_with_full_fans_until_a_fix() -> None:
+    assert (GRIP_LOST.motion, GRIP_LOST.clear, GRIP_LOST.full_fans) == (Motion.NONE, Clear.AFTER_FIX, True)
