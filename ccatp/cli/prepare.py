@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 def plan(config_file: Path | None, settings: Mapping[str, object], figure_file: Path | None, json_output: bool) -> int:
     """Show what a survey would do, without moving anything: order, way, least time, points out of reach.
 
-    The exit status is 2 where points are out of reach: a run would be refused.
+    The exit status is 2 where points are out of reach or the thrust is too little: a run would be refused.
     """
     from ccatp.config.load import load_config
     from ccatp.mirror.mirror import build_mirror
@@ -64,6 +64,8 @@ def plan(config_file: Path | None, settings: Mapping[str, object], figure_file: 
             "a run would be refused",
             ExitStatus.USAGE,
         )
+    if not found.grip.is_held:
+        return complain(f"{found.grip.text}; a run would be refused", ExitStatus.USAGE)
     return 0
 
 

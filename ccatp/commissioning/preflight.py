@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from ccatp.conditions import SAMPLE_RATES, SENSOR_TOO_SLOW
 from ccatp.config.models import Config
+from ccatp.control.thrust import forecast_grip
 from ccatp.core import Fix
 from ccatp.links.multiline import Environment
 from ccatp.links.robot_messages import Hello, Sensors
@@ -262,6 +263,11 @@ def _fans(report: RobotReport) -> PreflightResult:
     if report.mirror.overhang and min(report.cfg.robot.fan_duty) < floor:
         found = f"robot.fan_duty {min(report.cfg.robot.fan_duty):g} is below the robot's floor {floor:g}"
         return failed(found, "raise robot.fan_duty")
+    grip = forecast_grip(report.cfg.robot, report.mirror)
+    if not grip.is_held:
+        return failed(grip.text, "raise the thrust, or correct mass, thrust and friction of [robot]")
+    if grip.is_short:
+        return warned(grip.text, "nothing; for full speed raise the thrust")
     return passed(found)
 
 

@@ -10,7 +10,8 @@ hold while
 Downhill behind is the worst heading: the load goes to the caster. Downhill ahead it must not leave the ground.
 """
 
-from math import ceil, hypot, inf, sqrt
+from math import ceil, hypot, sqrt
+from typing import NamedTuple
 
 from ccatp.config.models import RobotConfig
 from ccatp.core import GRAVITY_M_S2, DeckPose, Vector3
@@ -39,17 +40,50 @@ def _load_n(robot: RobotConfig, gravity: Vector3, *, turns: bool) -> Vector3:
     return tangential, weight_n * z, tangential if turns else -weight_n * x
 
 
-def greatest_least_thrust(robot: RobotConfig, mirror: Mirror) -> tuple[float, DeckPose]:
-    """Least thrust for a turn at the panel that needs most, N, and the place."""
-    places = [DeckPose(panel.x_m, panel.y_m, 0.0) for panel in (mirror.panel(panel) for panel in mirror.panels)]
+class GripForecast(NamedTuple):
+    """Where on a mirror a turn needs most thrust: the least there, N, and what the fans make of it at full duty.
+
+    ``safe_speed_m_s``: see there; 0 where the robot cannot be held, or not stopped.
+    """
+
+    place: DeckPose
+    least_n: float
+    wanted_n: float
+    thrust_n: float
+    safe_speed_m_s: float
+
+    @property
+    def is_short(self) -> bool:
+        """Less than the configured margin over the least: slow."""
+        return self.thrust_n < 0.999 * self.wanted_n
+
+    @property
+    def is_held(self) -> bool:
+        """Enough for every stop and turn."""
+        return self.safe_speed_m_s > 0.0
+
+    @property
+    def text(self) -> str:
+        """One line."""
+        at = f"({self.place.x_m:.2f}, {self.place.y_m:.2f}) m"
+        found = f"the fans give {self.thrust_n:.1f} N; turns need {self.least_n:.1f} N at {at}"
+        if not self.is_held:
+            return f"{found}: the robot WOULD SLIDE, no speed is safe; {self.wanted_n:.1f} N are needed"
+        if self.is_short:
+            return (
+                f"{found}: little grip, half the speed; from {self.safe_speed_m_s:.2f} m/s it stops within "
+                f"{1e3 * _STOP_WAY_M:.0f} mm; {self.wanted_n:.1f} N are needed for more"
+            )
+        return found
+
+
+def forecast_grip(robot: RobotConfig, mirror: Mirror) -> GripForecast:
+    """By the configuration of the robot, at the centre of the panel that needs most."""
+    places = [DeckPose(panel.x_m, panel.y_m, 0.0) for panel in mirror.panels.values()]
     needs = [(least_thrust_n(robot, mirror.gravity_in_robot(place), turns=True), place) for place in places]
-    return max(needs, key=lambda need: need[0])
-
-
-def grip_margin(robot: RobotConfig, gravity: Vector3, thrust_n: float) -> float:
-    """Thrust over the least one for a turn; below 1 the wheels slide."""
-    least_n = least_thrust_n(robot, gravity, turns=True)
-    return thrust_n / least_n if least_n > 0.0 else inf
+    least_n, place = max(needs, key=lambda need: need[0])
+    speed_m_s = safe_speed_m_s(robot, mirror.gravity_in_robot(place), robot.thrust_n)
+    return GripForecast(place, least_n, robot.thrust_margin * least_n, robot.thrust_n, speed_m_s)
 
 
 def safe_speed_m_s(robot: RobotConfig, gravity: Vector3, thrust_n: float) -> float:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ccatp.config.load import load_config
-from ccatp.control.thrust import greatest_least_thrust
+from ccatp.control.thrust import forecast_grip
 from ccatp.core import FloatArray
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.plots import INK, QUIET
@@ -394,7 +394,7 @@ def physics_cells() -> Sequence[Cell]:
         ("fyst-m1", "fyst-m2"), ("round", "flat"), (0.5, 0.6, 0.8, 1.0), (1.1, 1.3, 2.0, 3.0)
     ):
         cfg = load_config(None, {"run.mirror": name, "robot.friction": friction})
-        thrust_n = margin * greatest_least_thrust(cfg.robot, build_mirror(cfg.mirror))[0]
+        thrust_n = margin * forecast_grip(cfg.robot, build_mirror(cfg.mirror)).least_n
         keys: dict[str, object] = {"run.mirror": name, "sim.physics.tyre": tyre}
         for place in ("robot", "sim.physics"):
             keys |= {f"{place}.friction": friction, f"{place}.thrust_n": round(thrust_n, 2)}

@@ -11,12 +11,14 @@ from msgspec.structs import replace
 
 from ccatp.config.models import Config, LimitsConfig
 from ccatp.control.gate import DriveGate
+from ccatp.control.thrust import GripForecast, forecast_grip
 from ccatp.core import DeckPose, PointId, Stop, StopKind
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
 from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.survey.events import HELD, IDLE, MEASURING, SETTLING, MissionState, TakenOver
+from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import ORDERS, Route, RoutePlanner
 from ccatp.survey.planning.search import leg_lengths, leg_time, path_time, stop_times
 from ccatp.survey.planning.tour_bound import tour_bound
@@ -128,8 +130,15 @@ class SurveyParts:
 
 
 def assemble(cfg: Config, done: Collection[PointId] = (), checkpoint: Checkpoint | None = None) -> SurveyParts:
-    """All pure parts, the robot at base or where ``checkpoint`` says; raises ``PlanError`` (unreachable point)."""
+    """All pure parts, the robot at base or where ``checkpoint`` says.
+
+    Raises ``PlanError``: unreachable point, too little thrust.
+    """
     mirror = build_mirror(cfg.mirror)
+    grip = forecast_grip(cfg.robot, mirror)
+    if not grip.is_held:
+        raise PlanError(f"thrust: {grip.text}")
+    cfg = _slowed(cfg, grip)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
     route = plan_survey(cfg, mirror, points, done, calibrates=checkpoint is None)
     survey = Survey(cfg, mirror, route, RoutePlanner(mirror, cfg))
@@ -149,6 +158,16 @@ def assemble(cfg: Config, done: Collection[PointId] = (), checkpoint: Checkpoint
         lower_bound_s=path_time(route.stops, mirror.base_pose, cfg.limits, mirror, cfg.etalon.measuring_time_s),
         start=start,
     )
+
+
+def _slowed(cfg: Config, grip: GripForecast) -> Config:
+    """With the limits of slow motion where grip is short."""
+    if not grip.is_short or not grip.is_held:
+        return cfg
+    limits, health = cfg.limits, cfg.health
+    speed_m_s = min(limits.v_max_m_s, health.slow_speed_m_s, grip.safe_speed_m_s)
+    slow = {"v_max_m_s": speed_m_s, "omega_max_rad_s": min(limits.omega_max_rad_s, health.slow_rate_rad_s)}
+    return cfg.model_copy(update={"limits": limits.model_copy(update=slow)})
 
 
 def take_over(cfg: Config, checkpoint: Checkpoint, event: TakenOver) -> SurveyParts:
@@ -224,6 +243,7 @@ class SurveyPlan:
     turning_s: float
     measuring_s: float
     any_order_s: float
+    grip: GripForecast
 
     @property
     def least_s(self) -> float:
@@ -233,6 +253,8 @@ class SurveyPlan:
 
 def make_plan(cfg: Config, mirror: Mirror) -> SurveyPlan:
     """Plan a survey as a run would; raises ``PlanError`` where base is not on the mirror or a dead end."""
+    grip = forecast_grip(cfg.robot, mirror)
+    cfg = _slowed(cfg, grip)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
     out_of_reach: list[PointId] = []
     stops = plan_survey(cfg, mirror, points, (), out_of_reach).stops
@@ -254,6 +276,7 @@ def make_plan(cfg: Config, mirror: Mirror) -> SurveyPlan:
         turning_s=sum(times_s) - driving_s,
         measuring_s=sum(rests_s),
         any_order_s=tour_bound(mirror, reached, cfg.limits, cfg.etalon.measuring_time_s),
+        grip=grip,
     )
 
 
@@ -274,6 +297,14 @@ def plan_data(cfg: Config, plan: SurveyPlan) -> dict[str, Any]:
         "any_order_bound_s": round(plan.any_order_s, 3),
         "budget_s": cfg.run.budget_s,
         "fits_budget": plan.least_s <= cfg.run.budget_s,
+        "thrust": {
+            "least_n": round(plan.grip.least_n, 2),
+            "needed_n": round(plan.grip.wanted_n, 2),
+            "available_n": plan.grip.thrust_n,
+            "safe_speed_m_s": round(plan.grip.safe_speed_m_s, 3),
+            "is_held": plan.grip.is_held,
+            "is_slow": plan.grip.is_short,
+        },
         "via_stops": kinds.count(StopKind.VIA),
         "stops": [
             {
@@ -293,7 +324,7 @@ def plan_lines(cfg: Config, plan: SurveyPlan) -> Iterator[str]:
     """The plan for a terminal."""
     vias = sum(stop.kind is StopKind.VIA for stop in plan.stops)
     panels = [panel for panel, _ in groupby(point.panel for point in plan.points)]
-    limits = cfg.limits
+    limits = _slowed(cfg, plan.grip).limits
     count = len(set(panels))
     of = f"{count} panel{'' if count == 1 else 's'}"
     yield f"{cfg.mirror.name}: {len(plan.points)} points of {of}, order {cfg.run.order}"
@@ -309,6 +340,7 @@ def plan_lines(cfg: Config, plan: SurveyPlan) -> Iterator[str]:
     yield f"any order       {_clock(plan.any_order_s)} at least, through the points that can be reached"
     word = "within" if plan.least_s <= cfg.run.budget_s else "BEYOND"
     yield f"budget          {_clock(cfg.run.budget_s)}: the least time is {word} it"
+    yield f"thrust          {plan.grip.text}"
     lost = " ".join("/".join(map(str, point)) for point in plan.out_of_reach[:_SHOWN])
     more = " ..." if len(plan.out_of_reach) > _SHOWN else ""
     yield f"out of reach    {f'{len(plan.out_of_reach)} points: {lost}{more}' if lost else 'none'}"

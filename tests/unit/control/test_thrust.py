@@ -1,15 +1,17 @@
 """Thrust that holds the robot on its slope: against moments by hand, and the duty that follows it."""
 
 from itertools import pairwise
-from math import cos, inf, pi, radians, sin
+from math import cos, pi, radians, sin
 
 import pytest
 
 from ccatp.config.load import load_config
 from ccatp.config.models import RobotConfig
-from ccatp.control.thrust import ThrustControl, grip_margin, least_thrust_n, safe_speed_m_s
+from ccatp.control.thrust import ThrustControl, forecast_grip, least_thrust_n, safe_speed_m_s
 from ccatp.core import DeckPose, Vector3
 from ccatp.mirror.mirror import build_mirror
+from ccatp.survey.composition import assemble
+from ccatp.survey.planning.legs import PlanError
 
 WEIGHT_N = 9.771  # of 1 kg
 OVERHANG_RAD = radians(18.435)  # of fyst-m2: 3.09 N away from the surface and 9.27 N along it
@@ -46,7 +48,6 @@ def test_the_caster_takes_load_and_downhill_behind_takes_most() -> None:
 
 def test_on_a_floor_none_is_needed() -> None:
     assert least_thrust_n(robot(), (0.0, 0.0, -1.0), turns=True) == 0.0
-    assert grip_margin(robot(), (0.0, 0.0, -1.0), 0.0) == inf
 
 
 def test_speed_from_which_the_spare_grip_stops_it() -> None:
@@ -70,3 +71,22 @@ def test_duty_goes_to_what_a_turn_needs_with_a_ramp(mirror: str, turn_duty: floa
     assert duties[-1] == (turn_duty, turn_duty)
     assert all(after[0] - before[0] <= 0.05 + 1e-9 for before, after in pairwise(duties))
     assert not control.step(0.6, pose, turns=True)  # it is there
+
+
+@pytest.mark.parametrize(
+    ("thrust_n", "is_held", "is_short", "text"),
+    [(40.0, True, False, "give 40.0 N"), (31.0, True, True, "half the speed"), (20.0, False, True, "WOULD SLIDE")],
+)
+def test_what_the_plan_says_of_a_slope(thrust_n: float, is_held: bool, is_short: bool, text: str) -> None:
+    cfg = load_config(overrides={"run.mirror": "fyst-m2", "robot.thrust_n": thrust_n})
+    grip = forecast_grip(cfg.robot, build_mirror(cfg.mirror))
+    assert (grip.is_held, grip.is_short) == (is_held, is_short)
+    assert text in grip.text
+
+
+def test_where_grip_is_short_a_run_is_slow_and_where_there_is_none_it_is_refused() -> None:
+    slow = assemble(load_config(overrides={"run.mirror": "fyst-m2", "run.panels": 1, "robot.thrust_n": 31.0}))
+    assert slow.cfg.limits.v_max_m_s == slow.cfg.health.slow_speed_m_s
+    assert slow.cfg.limits.omega_max_rad_s == slow.cfg.health.slow_rate_rad_s
+    with pytest.raises(PlanError, match=r"^thrust: the fans give 20.0 N; .* WOULD SLIDE"):
+        assemble(load_config(overrides={"run.mirror": "fyst-m2", "run.panels": 1, "robot.thrust_n": 20.0}))
