@@ -42,10 +42,14 @@ class CcatpError(Exception):
         super().__init__(one_line(message))
 
 
-class ConfigError(CcatpError):
-    """An unusable configuration; ``problems``: one line each, ``file:line: key: what is wrong; what to do``."""
+class UsageError(CcatpError):
+    """What a command was given cannot be used."""
 
     exit_status = ExitStatus.USAGE
+
+
+class ConfigError(UsageError):
+    """An unusable configuration; ``problems``: one line each, ``file:line: key: what is wrong; what to do``."""
 
     def __init__(self, *problems: str, shows_all: bool = False) -> None:
         self.problems: Sequence[str] = [one_line(problem) for problem in problems]

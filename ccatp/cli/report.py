@@ -24,7 +24,7 @@ from ccatp.cli.common import (
     warn,
     write_lines,
 )
-from ccatp.errors import CcatpError, ConfigError, ExitStatus
+from ccatp.errors import ConfigError, ExitStatus, UsageError
 
 if TYPE_CHECKING:
     from ccatp.config.models import Config
@@ -100,10 +100,8 @@ REPLAY_KEYS = ("localizer.", "robot.", "mirror.", "run.filter")
 PROGRESS_S = 50.0
 
 
-class ReplayError(CcatpError):
+class ReplayError(UsageError):
     """A run that cannot be replayed."""
-
-    exit_status = ExitStatus.USAGE
 
 
 def _check_effect(settings: Mapping[str, object], keys: tuple[str, ...], what: str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from ccatp.commissioning.calibration_drive import DeadReckonedSegment, RecordedDrive, Segment, WheelParameters, carry
 from ccatp.config.models import Config, FullStateConfig, RobotConfig
 from ccatp.core import FloatArray
-from ccatp.errors import CcatpError, ExitStatus
+from ccatp.errors import UsageError
 from ccatp.mirror.mirror import Mirror
 from ccatp.report.html import render
 
@@ -31,10 +31,8 @@ _LEAST_SLIP, _MOST_SLIP = 1e-6, 0.2
 _LEAST_WAY_RAD = 1e-3  # a wheel that hardly turned in a motion gives no information
 
 
-class CalibrationError(CcatpError):
+class CalibrationError(UsageError):
     """A drive from which nothing can be learned."""
-
-    exit_status = ExitStatus.USAGE
 
 
 class Estimate(NamedTuple):

@@ -107,22 +107,14 @@ _COVARIANCE = [5, 6, 8, 6, 7, 9, 8, 9, 10]  # stored as xx, xy, yy, xh, yh, hh
 
 
 class PoseTrack(NamedTuple):
-    """Estimates of k frames, in the frame of the room.
+    """Estimates of k frames, in the frame of the room."""
 
-    Attributes:
-        seq, t_s: frames and robot time, shape (k,).
-        place_m: x, y, shape (k, 2).
-        heading_rad: shape (k,).
-        covariance: of x, y, heading, shape (k, 3, 3).
-        reckoned_m: where dead reckoning alone would see the robot, shape (k, 2).
-    """
-
-    seq: FloatArray
-    t_s: FloatArray
-    place_m: FloatArray
-    heading_rad: FloatArray
-    covariance: FloatArray
-    reckoned_m: FloatArray
+    seq: FloatArray  # shape (k,)
+    t_s: FloatArray  # robot time, shape (k,)
+    place_m: FloatArray  # x, y, shape (k, 2)
+    heading_rad: FloatArray  # shape (k,)
+    covariance: FloatArray  # of x, y, heading, shape (k, 3, 3)
+    reckoned_m: FloatArray  # where dead reckoning alone would see the robot, shape (k, 2)
 
     @property
     def sigma_m(self) -> FloatArray:
@@ -135,22 +127,14 @@ class PoseTrack(NamedTuple):
 
 
 class PoseTruth(NamedTuple):
-    """The simulated truth of k frames.
+    """The simulated truth of k frames; NaN where a frame has none."""
 
-    Attributes:
-        seq, t_s: frames and robot time, shape (k,).
-        place_m: x, y, shape (k, 2); NaN where a frame has none.
-        heading_rad: shape (k,).
-        target_m: the radio that moves, shape (k, 2).
-        clearance_m: of the body to the nearest obstacle, shape (k,).
-    """
-
-    seq: FloatArray
-    t_s: FloatArray
-    place_m: FloatArray
-    heading_rad: FloatArray
-    target_m: FloatArray
-    clearance_m: FloatArray
+    seq: FloatArray  # shape (k,)
+    t_s: FloatArray  # robot time, shape (k,)
+    place_m: FloatArray  # x, y, shape (k, 2)
+    heading_rad: FloatArray  # shape (k,)
+    target_m: FloatArray  # the radio that moves, shape (k, 2)
+    clearance_m: FloatArray  # of the body to the nearest obstacle, shape (k,)
 
     def at(self, rows: Any) -> "PoseTruth":
         """Some of the frames: an index, a slice or a mask of them."""

@@ -16,7 +16,7 @@ import zmq.asyncio
 from zmq.auth.base import Authenticator
 from zmq.utils.monitor import parse_monitor_message
 
-from ccatp.errors import CcatpError, DaemonUnreachableError, ExitStatus
+from ccatp.errors import DaemonUnreachableError, UsageError
 from ccatp.links.auth import Clients, KeyPair
 from ccatp.links.channels import BadRequest, format_error, parse_reply
 
@@ -42,10 +42,8 @@ NOT_SINGLE = "a request is one frame"
 DOMAIN = "ccatp.observatory"
 
 
-class RouterError(CcatpError):
+class RouterError(UsageError):
     """The endpoint cannot be served."""
-
-    exit_status = ExitStatus.USAGE
 
 
 class RequestFailed(DaemonUnreachableError):

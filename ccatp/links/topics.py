@@ -1,7 +1,6 @@
 """THE topic table: everything the processes share over ZeroMQ; ``ccatp.links.bus`` is its codec.
 
-Liveness, recording and displays are derived from the table;
-a new topic is a row. Levels are repeated at the topic's rate; ``rate_hz`` 0 marks an event.
+Liveness, recording and displays are derived from the table; a new topic is a row. Levels are repeated at their rate.
 """
 
 from dataclasses import dataclass
@@ -60,22 +59,15 @@ SeverityName = Literal["inform", "slow", "pause", "hold", "return", "fault"]
 
 
 class Alarm(msgspec.Struct, kw_only=True):
-    """One row of the list of alarms; times are UTC, empty where it has not happened.
+    """One row of the list of alarms; times are UTC, empty where it has not happened."""
 
-    Attributes:
-        name: of the condition, see docs/alarms.md.
-        severity: the worst so far.
-        since_s: robot time at which it began.
-        count: how often it began since it was in the list.
-    """
-
-    name: str
-    severity: SeverityName
+    name: str  # of the condition, see docs/alarms.md
+    severity: SeverityName  # the worst so far
     cause: str
     advice: str
     since: str
-    since_s: float
-    count: int = 1
+    since_s: float  # robot time at which it began
+    count: int = 1  # how often it began since it was in the list
     ended: str = ""
     acknowledged: str = ""
     acknowledged_by: str = ""
@@ -106,41 +98,29 @@ class MissionStatus(Message):
 
 
 class DisplayState(Message):
-    """The newest of everything that a display shows, published only while a client has asked for it.
-
-    Attributes:
-        x_m, y_m, heading_rad: pose, deck frame.
-        nis, size: normalised innovation squared of the filter's last update, and its degrees of freedom; 0 for none.
-        line: the newest sensors line, as it came from the robot.
-    """
+    """The newest of everything that a display shows (pose: deck frame), published while a client has asked for it."""
 
     x_m: float
     y_m: float
     heading_rad: float
     covariance_m2: tuple[float, float, float]
     heading_sigma_rad: float
-    nis: float
-    size: int
-    line: msgspec.Raw
+    nis: float  # normalised innovation squared of the filter's last update
+    size: int  # its degrees of freedom; 0 for none
+    line: msgspec.Raw  # the newest of the robot, as it came
 
 
 class RobotShape(msgspec.Struct, omit_defaults=True):
-    """One thing on the map, in the plane of the pose; it has the same ``id`` in the next message.
-
-    Attributes:
-        kind: how it looks: ``beacon``, ``obstacle``, ``target``, ``robot``, ``trail``; a display draws others plainly.
-        covariance_m2: of x and y: xx, xy, yy; drawn as its ellipse.
-        outline_m: a line, closed where the first point comes again.
-    """
+    """One thing on the map, in the plane of the pose; it has the same ``id`` in the next message."""
 
     id: str
-    kind: str
+    kind: str  # its look: beacon, obstacle, target, robot, trail; a display draws others plainly
     x_m: float
     y_m: float
-    covariance_m2: tuple[float, float, float] | None = None
+    covariance_m2: tuple[float, float, float] | None = None  # of x and y: xx, xy, yy; drawn as its ellipse
     heading_rad: float | None = None
     radius_m: float | None = None
-    outline_m: list[tuple[float, float]] = []
+    outline_m: list[tuple[float, float]] = []  # a line, closed where the first point comes again
     label: str = ""
 
 
@@ -196,11 +176,9 @@ TreatmentKind = Literal["begun", "doubted", "odometry_off", "odometry_on"]
 class Treatment(Message):
     """What the localizer is treated with from frame ``seq`` on, besides samples and fixes.
 
-    Attributes:
-        kind: ``begun``: it begins again before this frame, values are x (m), y (m), heading (rad), deck frame, and the
-            standard deviations of place (m) and heading (rad); ``doubted``: after the samples of this frame its pose
-            may be wrong by so much, m and rad; ``odometry_off``: from here on wheels and inertial unit are not used,
-            the robot stands; ``odometry_on``: they are used again.
+    ``begun``: it begins again before this frame, values are x (m), y (m), heading (rad), deck frame, and the standard
+    deviations of place (m) and heading (rad); ``doubted``: after the samples of this frame its pose may be wrong by so
+    much, m and rad; ``odometry_off``: from here on wheels and inertial unit are not used, the robot stands.
     """
 
     kind: TreatmentKind
@@ -271,32 +249,21 @@ BeaconEllipse = tuple[float, float, float, float, float]
 
 
 class BeaconMapMessage(Message):
-    """The map of a robot among beacons, for displays and reports; positions in m.
-
-    Attributes:
-        pose_ellipse: x, y, and their covariance xx, xy, yy, m2.
-        beacons: of each radio or mote on the map, the same.
-        target: of the radio that is followed, the same; ``None`` before it was received.
-        obstacles: points in the room that the distance sensors saw lately.
-        waypoints: all of them, in order; ``next_waypoint`` is the number of the one driven to, -1 for none.
-        nis_sum, nis_size, refused: of all readings so far: normalised innovations squared, their degrees of freedom,
-            and how many readings the gate refused.
-        notes: what the mission has to say of the map: phases, errors expected.
-    """
+    """The map of a robot among beacons, for displays and reports; m. An ellipse is x, y, and covariance xx, xy, yy."""
 
     system: str
     pose: tuple[float, float, float]
     pose_ellipse: BeaconEllipse
-    beacons: dict[str, BeaconEllipse]
-    target: BeaconEllipse | None
-    obstacles: list[tuple[float, float]]
+    beacons: dict[str, BeaconEllipse]  # each radio or mote on the map
+    target: BeaconEllipse | None  # the radio that is followed; None before it was received
+    obstacles: list[tuple[float, float]]  # points in the room that the distance sensors saw lately
     waypoints: list[tuple[float, float]]
-    next_waypoint: int
+    next_waypoint: int  # the one driven to, -1 for none
     distances: list[float]
-    nis_sum: float
-    nis_size: int
-    refused: int
-    notes: dict[str, float]
+    nis_sum: float  # of all readings so far
+    nis_size: int  # their degrees of freedom
+    refused: int  # readings that the gate refused
+    notes: dict[str, float]  # what the mission has to say of the map: phases, errors expected
 
 
 class BeaconArrival(Message):
@@ -325,21 +292,14 @@ class BeaconPlaces(Message):
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One row of the table.
+    """One row of the table."""
 
-    Attributes:
-        name: as it stands before the JSON.
-        rate_hz: nominal rate; 0 for an event.
-        stale_after_s: a level older than this must not be used; 0 for events and batches.
-        recorded: goes to ``telemetry.mcap``.
-    """
-
-    name: str
+    name: str  # as it stands before the JSON
     message: type[Message] | type[Verdict]
     publisher: str
-    rate_hz: float
-    stale_after_s: float
-    recorded: bool
+    rate_hz: float  # nominal; 0 for an event
+    stale_after_s: float  # a level older than this must not be used; 0 for events and batches
+    recorded: bool  # goes to ``telemetry.mcap``
 
 
 TOPICS: tuple[Topic, ...] = (

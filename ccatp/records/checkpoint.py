@@ -14,7 +14,7 @@ from typing import TypeVar
 import msgspec
 
 from ccatp.config.files import read_input
-from ccatp.errors import CcatpError, ExitStatus
+from ccatp.errors import UsageError
 
 FILE = "checkpoint"
 # Of a file with a hole between the slots. A record that is longer takes the older one with it, and is whole.
@@ -25,10 +25,8 @@ Record = TypeVar("Record", bound=msgspec.Struct)
 AT_BASE = "so the robot's place is not known; set it at base, remove this file and resume"
 
 
-class CheckpointError(CcatpError):
+class CheckpointError(UsageError):
     """There is a checkpoint that cannot be read: the robot's place has to be set by hand."""
-
-    exit_status = ExitStatus.USAGE
 
 
 class CheckpointFile:

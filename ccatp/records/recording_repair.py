@@ -12,7 +12,7 @@ from mcap.records import Attachment, Channel, Header, McapRecord, Message, Metad
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from ccatp.errors import CcatpError, ExitStatus
+from ccatp.errors import UsageError
 from ccatp.records.recorder import CHUNK_BYTES, DAMAGE, MAGIC, TELEMETRY, Condition, is_being_written, recordings, scan
 
 NO_INDEX = "no index: it was not closed"
@@ -20,10 +20,8 @@ _NS = 1e9
 _HOUR_S = 3600.0
 
 
-class RecordingError(CcatpError):
+class RecordingError(UsageError):
     """A recording that cannot be used."""
-
-    exit_status = ExitStatus.USAGE
 
 
 def strict_faults(path: Path) -> list[str]:

@@ -15,7 +15,7 @@ import numpy as np
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import Fix, FloatArray, IntArray, PanelId, PointId, Vector3
-from ccatp.errors import CcatpError, ExitStatus
+from ccatp.errors import UsageError
 from ccatp.links.bus import BadMessage
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
@@ -167,10 +167,8 @@ STORE = "mission.sqlite"
 READ = frozenset(("sensors", "rest", "treatment", "fix", "track", "truth", "arrival"))
 
 
-class RunReadError(CcatpError):
+class RunReadError(UsageError):
     """A run that cannot be read."""
-
-    exit_status = ExitStatus.USAGE
 
 
 @dataclass(slots=True)

@@ -24,7 +24,7 @@ import zmq
 
 from ccatp.config.checks import is_loopback
 from ccatp.core import DeckPose, PanelId, PanelPose, PointId, Vector3, wrap_pi
-from ccatp.errors import CcatpError, ExitStatus
+from ccatp.errors import UsageError
 from ccatp.links import topics
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import FixMessage, Message, TrackMessage, TruthMessage
@@ -385,10 +385,8 @@ HIGH_WATER_MARK = 5000
 LINGER_MS = 200
 
 
-class StreamError(CcatpError):
+class StreamError(UsageError):
     """A stream cannot be served."""
-
-    exit_status = ExitStatus.USAGE
 
 
 def check_host(host: str, *, is_open: bool) -> None:

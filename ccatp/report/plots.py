@@ -15,7 +15,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from ccatp.core import FloatArray
-from ccatp.errors import CcatpError, ExitStatus
+from ccatp.errors import UsageError
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -39,10 +39,8 @@ _PT_PER_IN = 72.0  # of SVG files
 _RASTER_DPI = 144.0  # of what an SVG holds as an image
 
 
-class PictureError(CcatpError):
+class PictureError(UsageError):
     """A picture that cannot be drawn or written."""
-
-    exit_status = ExitStatus.USAGE
 
 
 def check_drawing(folder: Path) -> None:

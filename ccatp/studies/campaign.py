@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import ccatp
 from ccatp.config.beacon_models import RadioConfig, RecordingsConfig
 from ccatp.config.models import Config
-from ccatp.errors import CcatpError, ExitStatus
+from ccatp.errors import ExitStatus, UsageError
 
 Factor = str | int | float | bool
 Factors = Mapping[str, Factor]
@@ -23,10 +23,8 @@ AnyConfig = Config | RadioConfig | RecordingsConfig
 Load = Callable[[Mapping[str, object]], AnyConfig]
 
 
-class CampaignError(CcatpError):
+class CampaignError(UsageError):
     """A campaign that cannot be run as asked; what was done before is kept."""
-
-    exit_status = ExitStatus.USAGE
 
 
 class CampaignFailed(CampaignError):

@@ -20,7 +20,7 @@ from ccatp.commissioning.conformance.harness import (
     read_message,
     shorten,
 )
-from ccatp.errors import CcatpError, DaemonUnreachableError, ExitStatus
+from ccatp.errors import DaemonUnreachableError, UsageError
 from ccatp.mirror.mirror import Mirror
 
 CHECKS = (*server_checks.CHECKS, *command_checks.CHECKS, *motion_checks.CHECKS)
@@ -55,10 +55,8 @@ class NoRobot(DaemonUnreachableError):
     """No server of the robot link at the address, or another program holds the robot."""
 
 
-class KeyNeeded(CcatpError):
+class KeyNeeded(UsageError):
     """The server asks for a mac, and there is no key."""
-
-    exit_status = ExitStatus.USAGE
 
 
 class Conformance:
