@@ -76,9 +76,8 @@ def calibrate(mirror: Mirror, drive: RecordedDrive, cfg: Config) -> Calibration:
     slip = 0.0
     # The scatter of slip moves the solution, and the solution the scatter: twice is enough.
     for _ in range(2):
-        solution = problem.solve(x, slip)
-        slip = problem.fitting_slip(solution.x)
-        x = solution.x
+        x = problem.solve(x, slip).x
+        slip = problem.fitting_slip(x)
     solution = problem.solve(x, slip)
     excess = max(1.0, solution.chi2 / solution.degrees)
     x, P = solution.x[:PARAMETERS], solution.covariance * excess
@@ -110,16 +109,14 @@ def _check(drive: RecordedDrive, robot: RobotConfig) -> None:
         raise CalibrationError("the drive has no way of more than 50 mm: it does not show the wheel radius")
 
 
-@dataclass(frozen=True, slots=True)
-class _Solution:
+class _Solution(NamedTuple):
     x: FloatArray
     covariance: FloatArray
     chi2: float
     degrees: int
 
 
-@dataclass(frozen=True, slots=True)
-class _Problem:
+class _Problem(NamedTuple):
     mirror: Mirror
     drive: RecordedDrive
     priors: FullStateConfig
@@ -275,10 +272,7 @@ def rows(cfg: Config, found: Calibration) -> tuple[CalibrationRow, CalibrationRo
 
 
 def check_usable(table: tuple[CalibrationRow, ...]) -> None:
-    """Refuse what must not get into a configuration.
-
-    Raises CalibrationError: a length is too uncertain, or far from what is configured.
-    """
+    """CalibrationError: a length is too uncertain, or far from what is configured, to get into a configuration."""
     for row in table[:2]:
         if row.sigma > MOST_SIGMA * row.found:
             raise CalibrationError(

@@ -189,11 +189,7 @@ def _motions(right: FloatArray, left: FloatArray, rest_rad: float) -> tuple[tupl
 
 def _same_kind(is_turn: NDArray[np.bool_], first: int, last: int) -> list[tuple[int, int]]:
     """Parts of a motion; what lasts for a few frames only belongs to what goes before it."""
-    cuts = [first]
-    for at in range(first + 1, last):
-        if is_turn[at] != is_turn[at - 1]:
-            cuts.append(at)
-    cuts.append(last)
+    cuts = [first, *(at for at in range(first + 1, last) if is_turn[at] != is_turn[at - 1]), last]
     spans: list[tuple[int, int]] = []
     for begin, end in pairwise(cuts):
         is_same = bool(spans) and is_turn[spans[-1][0]] == is_turn[begin]
@@ -221,18 +217,13 @@ class WheelParameters(NamedTuple):
 class DeadReckonedSegment(NamedTuple):
     """Where a segment leads from one pose, and how that depends on what is not known.
 
-    Attributes:
-        end: x, y (m), heading (rad), deck frame, shape (3,).
-        of_wheels: derivatives of ``end`` by the four of ``WheelParameters``, shape (3, 4).
-        of_start: by the pose at the start, shape (3, 3).
-        of_slip: by the share of travel that right and left wheel gain in each motion, shape (3, 2 motions).
-        turn_rad: the robot's own rotation; what is left of the change of heading the surface's curvature does.
+    What is left of the change of heading beside ``turn_rad``, the robot's own rotation, the surface's curvature does.
     """
 
-    end: FloatArray
-    of_wheels: FloatArray
-    of_start: FloatArray
-    of_slip: FloatArray
+    end: FloatArray  # x, y (m), heading (rad), deck frame, shape (3,)
+    of_wheels: FloatArray  # derivatives of ``end`` by the four of ``WheelParameters``, shape (3, 4)
+    of_start: FloatArray  # by the pose at the start, shape (3, 3)
+    of_slip: FloatArray  # by the share of travel that right and left wheel gain in each motion, shape (3, 2 motions)
     turn_rad: float
 
 

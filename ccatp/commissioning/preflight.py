@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from enum import StrEnum
+from functools import partial
 from itertools import pairwise
 from math import dist
 from statistics import fmean
@@ -39,19 +40,9 @@ class PreflightResult(NamedTuple):
     todo: str = ""
 
 
-def passed(found: str) -> PreflightResult:
-    """All is well."""
-    return PreflightResult("", CheckOutcome.PASS, found)
-
-
-def warned(found: str, todo: str) -> PreflightResult:
-    """A mission is possible."""
-    return PreflightResult("", CheckOutcome.WARN, found, todo)
-
-
-def failed(found: str, todo: str) -> PreflightResult:
-    """No mission like that."""
-    return PreflightResult("", CheckOutcome.FAIL, found, todo)
+passed = partial(PreflightResult, "", CheckOutcome.PASS)
+warned = partial(PreflightResult, "", CheckOutcome.WARN)
+failed = partial(PreflightResult, "", CheckOutcome.FAIL)
 
 
 def skipped(names: Iterable[str], why: str) -> list[PreflightResult]:

@@ -190,11 +190,8 @@ def probe_machine(
     cfg: Config, runs_dir: Path, runtime_dir: Path | None, environ: Mapping[str, str]
 ) -> list[PreflightResult]:
     """Clock, disk, runtime directory, real time."""
-    return [
-        *named(machine_clock=_clock()),
-        *_disk(runs_dir),
-        *named(runtime_directory=_runtime_dir(cfg, runtime_dir, environ), real_time=_real_time(cfg)),
-    ]
+    others = named(runtime_directory=_runtime_dir(cfg, runtime_dir, environ), real_time=_real_time(cfg))
+    return [*named(machine_clock=_clock()), *_disk(runs_dir), *others]
 
 
 def probe_key(cfg: Config, *, sim: bool) -> PreflightResult:

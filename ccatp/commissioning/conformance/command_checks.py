@@ -51,7 +51,7 @@ BYTE_S = 0.002  # between single bytes
 
 def _always_held(key: Key, context: CheckContext) -> str:
     pair = ControllerAndMonitor(context)
-    _withhold(pair, key)
+    pair.withhold(key)
     facts = context.facts
     frames = pair.run(facts.ttl_s + AFTER_TTL_S)
     begin_s = frames[0].t + facts.ttl_s + LATE_FRAMES * facts.frame_s
@@ -62,16 +62,9 @@ def _always_held(key: Key, context: CheckContext) -> str:
 
 
 def _ttl(key: Key, pair: ControllerAndMonitor) -> str:
-    _withhold(pair, key)
+    pair.withhold(key)
     frames = pair.run(pair.facts.ttl_s + AFTER_TTL_S)
     return check_ttl(frames, key, pair.facts.ttl_s, pair.facts.frame_s)
-
-
-def _withhold(pair: ControllerAndMonitor, key: Key) -> None:
-    if key == "drive":
-        pair.rates = None
-    else:
-        pair.allowed = None
 
 
 check("no-permit", "once a monitor has joined, wheels are held without its permit", "real time")(
@@ -85,7 +78,7 @@ check_steady("ttl-permit", "a permit is in force for ttl_s", "real time")(partia
 def _noise(key: Key, line: bytes, pair: ControllerAndMonitor) -> str:
     """The controller sends lines that renew nothing, in the place of drives or permits."""
     facts = pair.facts
-    _withhold(pair, key)
+    pair.withhold(key)
     first, begin_s = len(pair.frames), pair.newest.t
     while pair.newest.t < begin_s + facts.ttl_s + AFTER_TTL_S:
         pair.controller.send(line % (pair.context.next_seq(), pair.newest.seq))
@@ -130,7 +123,9 @@ def _newest_drive(pair: ControllerAndMonitor) -> str:
     pair.drive(newest)
     pair.drive(old)
     _pause_and_settle(pair)
-    check_newest(pair.frames[first:], newest, old)
+    frames = pair.frames[first:]
+    require(all(frame.cmd.seq != old for frame in frames), f"drive {old} came into force after {newest}")
+    require(any(frame.cmd.seq == newest for frame in frames), f"drive {newest} never came into force")
     again, first = pair.context.next_seq(), len(pair.frames)
     pair.rates = None
     pair.drive(again)
@@ -144,7 +139,13 @@ def _newest_drive(pair: ControllerAndMonitor) -> str:
     pair.pause(SHORT_S)
     pair.answer_again()
     _pause_and_settle(pair)
-    check_once(pair.frames[first:], again, pair.facts.frame_s)
+    in_force = [frame for frame in pair.frames[first:] if frame.cmd.seq == again]
+    require(bool(in_force), f"drive {again} never came into force")
+    # The age does not start again. A robot that makes up for late frames reports 0 for what arrived after their time.
+    arrivals_s = [frame.arrival_s("drive") for frame in in_force if frame.cmd.age > 0.0]
+    spread_s = max(arrivals_s) - min(arrivals_s) if arrivals_s else 0.0
+    late = f"a second drive {again} came into force {1e3 * spread_s:.0f} ms after the first"
+    require(spread_s <= 0.5 * pair.facts.frame_s, late)
     return f"drive {old} after {newest} and a second {again} dropped"
 
 
@@ -157,22 +158,6 @@ def _pause_and_settle(pair: ControllerAndMonitor) -> None:
 
 def _answered_frame(pair: ControllerAndMonitor) -> Frame:
     return pair.next_frame("no frame after drive and permit for the one before")
-
-
-def check_newest(frames: Sequence[Frame], newest: int, old: int) -> None:
-    """The newer came into force and the older did not, in frames from when a drive and then an older one were sent."""
-    require(all(frame.cmd.seq != old for frame in frames), f"drive {old} came into force after {newest}")
-    require(any(frame.cmd.seq == newest for frame in frames), f"drive {newest} never came into force")
-
-
-def check_once(frames: Sequence[Frame], seq: int, frame_s: float) -> None:
-    """The age does not start again, in frames in which a drive was sent, and sent again under the same number."""
-    in_force = [frame for frame in frames if frame.cmd.seq == seq]
-    require(bool(in_force), f"drive {seq} never came into force")
-    # A robot that makes up for late frames reports 0 for what arrived after their time: that gives no arrival.
-    arrivals_s = [frame.arrival_s("drive") for frame in in_force if frame.cmd.age > 0.0]
-    spread_s = max(arrivals_s) - min(arrivals_s) if arrivals_s else 0.0
-    require(spread_s <= 0.5 * frame_s, f"a second drive {seq} came into force {1e3 * spread_s:.0f} ms after the first")
 
 
 @check_steady("newest-permit", "a permit with an older or equal seq is dropped")

@@ -59,17 +59,14 @@ class Check(NamedTuple):
     check_id: str
     promise: str
     run: Callable[["CheckContext"], str]
-    needs: tuple[Need, ...]
+    needs: tuple[Need, ...]  # without which it is not applicable
 
 
 class CheckList(list[Check]):
     """Checks in the order in which they run."""
 
     def add(self, check_id: str, promise: str, *needs: Need, fixture: Fixture = nullcontext) -> Callable[[Run], Run]:
-        """Decorator: append a function of what the fixture makes of the context, which is the context by default.
-
-        Without what it needs a check is not applicable.
-        """
+        """Decorator: append a function of what the fixture makes of the context, which is the context by default."""
 
         def append(run: Run) -> Run:
             def check(context: CheckContext) -> str:
@@ -217,10 +214,9 @@ def shorten(line: bytes, most: int = 60) -> str:
 
 
 class RawConnection:
-    """One connection; ``lines`` were received and not yet taken, without their LF.
+    """One connection; ``lines`` were received and not yet taken, without their LF. Raises OSError: no connection.
 
-    ``timeout_s`` is the longest wait for the connection, and for the server to take what is sent. Raises OSError: no
-    connection.
+    ``timeout_s`` is the longest wait for the connection, and for the server to take what is sent.
     """
 
     def __init__(self, address: tuple[str, int], timeout_s: float) -> None:
@@ -446,6 +442,13 @@ class ControllerAndMonitor:
     def mark_driven(self) -> None:
         """The newest frame has been answered by a drive."""
         self._driven = self.newest.seq
+
+    def withhold(self, key: Key) -> None:
+        """Answer no more frames with a drive, or none with a permit."""
+        if key == "drive":
+            self.rates = None
+        else:
+            self.allowed = None
 
     def answer_again(self) -> None:
         """Regard the newest frame as unanswered: what was sent may have been dropped."""

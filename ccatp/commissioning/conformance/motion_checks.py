@@ -221,36 +221,26 @@ def _stops_at_zero(pair: ControllerAndMonitor) -> str:
     return seen
 
 
-def _stops_without(key: Key, pair: ControllerAndMonitor) -> str:
-    rate_rad_s = _rate(pair.facts)
+def _stops(key: Key, lost: Role | None, pair: ControllerAndMonitor) -> str:
+    """Without a newer drive or permit, or when the session that sends it is lost."""
+    rate_rad_s = _rate(pair.facts) * (1.0 if lost is None else -1.0)
     _move(pair, (rate_rad_s, rate_rad_s), ALL)
-    if key == "drive":
-        pair.rates = None
-    else:
-        pair.allowed = None
-    pair.run(pair.facts.ttl_s)
-    return _stopped(pair, f"of the last {key}'s time-to-live")
+    pair.withhold(key)
+    if lost is None:
+        pair.run(pair.facts.ttl_s)
+        return _stopped(pair, f"of the last {key}'s time-to-live")
+    (pair.controller if lost == "controller" else pair.monitor).end("FIN")
+    return _stopped(pair, f"of the {lost}'s session")
 
 
-def _stops_when_lost(role: Role, pair: ControllerAndMonitor) -> str:
-    rate_rad_s = _rate(pair.facts)
-    _move(pair, (-rate_rad_s, -rate_rad_s), ALL)
-    if role == "controller":
-        pair.rates = None
-        pair.controller.end("FIN")
-    else:
-        pair.allowed = None
-        pair.monitor.end("FIN")
-    return _stopped(pair, f"of the {role}'s session")
-
-
-for _check_id, _promise, _stops in (
-    ("wheels-ttl", "wheels stop when the drive is older than ttl_s", partial(_stops_without, "drive")),
-    ("wheels-ttl-permit", "wheels stop when the permit is older than ttl_s", partial(_stops_without, "permit")),
-    ("wheels-lost", "wheels stop when the controller's session is lost", partial(_stops_when_lost, "controller")),
-    ("wheels-lost-monitor", "wheels stop when the monitor's session is lost", partial(_stops_when_lost, "monitor")),
-):
-    check_at_rest(_check_id, _promise, "motion", "real time")(_stops)
+STOPS: tuple[tuple[str, str, Key, Role | None], ...] = (
+    ("wheels-ttl", "wheels stop when the drive is older than ttl_s", "drive", None),
+    ("wheels-ttl-permit", "wheels stop when the permit is older than ttl_s", "permit", None),
+    ("wheels-lost", "wheels stop when the controller's session is lost", "drive", "controller"),
+    ("wheels-lost-monitor", "wheels stop when the monitor's session is lost", "permit", "monitor"),
+)
+for _check_id, _promise, _key, _lost in STOPS:
+    check_at_rest(_check_id, _promise, "motion", "real time")(partial(_stops, _key, _lost))
 
 
 @check_at_rest("move-clamp", "set points beyond max_wheel_rad_s are clamped, their ratio kept", "motion")
@@ -360,8 +350,7 @@ def mean_rates(frames: Sequence[Frame]) -> Pair | None:
 
 
 def _seen_rates(frames: Sequence[Frame]) -> Pair:
-    rates = mean_rates(frames)
-    if rates is None:
+    if (rates := mean_rates(frames)) is None:
         raise NotApplicable("no encoder samples")
     return rates
 

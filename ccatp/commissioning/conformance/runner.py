@@ -62,8 +62,7 @@ class KeyNeeded(UsageError):
 class Conformance:
     """The checks of one server; ``facts`` of its hello are ``None`` if it lacks what the checks need.
 
-    ``mirror``: the robot stands at its base.
-    Raises NoRobot: nothing at the address says hello. Raises KeyNeeded: it asks for a key.
+    ``mirror``: the robot stands at its base. NoRobot: nothing at the address says hello; KeyNeeded: it asks for a key.
     """
 
     def __init__(
@@ -75,7 +74,7 @@ class Conformance:
         self._fans: Pair | None = None
         hello = self._hello()
         self.facts: Facts | None = None
-        self._why_unfit = ""
+        self._why_unfit, self._lacking = "", list[Need]()
         try:
             self.facts = self._context.facts = parse(Facts, hello)
         except CheckFailed as failed:
@@ -93,41 +92,32 @@ class Conformance:
     ) -> list[Result]:
         """Run the checks in their order, or only those named; ``report`` is called with each result.
 
-        On stands the wheels turn, and the body does not.
-
-        Raises NoRobot: another program holds the robot.
+        On stands the wheels turn, and the body does not. NoRobot: another program holds the robot.
         """
         results = []
-        if self.facts is not None:
+        if (facts := self.facts) is not None:
             self._begin()
+            has: dict[Need, bool] = {
+                "motion": motion, "body": not on_stands, "real time": not facts.lockstep, "lockstep": facts.lockstep,
+                "hmac": facts.needs_mac,
+            }  # fmt: skip
+            self._lacking = [need for need, is_there in has.items() if not is_there]
         try:
             for check in CHECKS:
                 if not only or check.check_id in only:
-                    outcome, detail = self._run_one(check, motion, on_stands)
-                    results.append(Result(check.check_id, check.promise, outcome, detail))
+                    results.append(Result(check.check_id, check.promise, *self._run_one(check)))
                     report(results[-1])
         finally:
-            if self.facts is not None:
+            if facts is not None:
                 self._restore()
         return results
 
-    def _run_one(self, check: Check, motion: bool, on_stands: bool) -> tuple[Outcome, str]:
+    def _run_one(self, check: Check) -> tuple[Outcome, str]:
         try:
-            if self.facts is None:
-                if check.check_id not in _HELLO_CHECKS:
-                    return "not applicable", f"the hello is of no use: {self._why_unfit}"
-                return "pass", check.run(self._context)
-            is_lockstep = self.facts.lockstep
-            has: dict[Need, bool] = {
-                "motion": motion,
-                "body": not on_stands,
-                "real time": not is_lockstep,
-                "lockstep": is_lockstep,
-                "hmac": self.facts.needs_mac,
-            }
-            for need in check.needs:
-                if not has[need]:
-                    return "not applicable", _WHY[need]
+            if self.facts is None and check.check_id not in _HELLO_CHECKS:
+                return "not applicable", f"the hello is of no use: {self._why_unfit}"
+            if self.facts is not None and (lacking := [need for need in check.needs if need in self._lacking]):
+                return "not applicable", _WHY[lacking[0]]
             return "pass", check.run(self._context)
         except CheckFailed as failed:
             return "fail", str(failed)

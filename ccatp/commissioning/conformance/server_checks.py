@@ -336,11 +336,9 @@ check_recorded, check_frames = partial(CHECKS.add, fixture=_recorded), partial(C
 
 @check_recorded("frames-lines", "one JSON object a line, finite numbers, no key twice, at most 8192 bytes")
 def _lines(pair: ControllerAndMonitor) -> str:
-    raw = pair.raw
-    for line in raw:
-        fault = line_fault(line, MAX_LINE_BYTES)
-        require(fault is None, str(fault))
-    return f"{len(raw)} lines, the longest of {max(map(len, raw))} bytes"
+    for line in pair.raw:
+        require((fault := line_fault(line, MAX_LINE_BYTES)) is None, str(fault))
+    return f"{len(pair.raw)} lines, the longest of {max(map(len, pair.raw))} bytes"
 
 
 def line_fault(line: bytes, limit_bytes: int) -> str | None:
@@ -509,12 +507,8 @@ def _command(frames: Frames) -> str:
 
 @check_recorded("frames-all", "every frame goes to every joined session")
 def _to_both(pair: ControllerAndMonitor) -> str:
-    return check_both(*pair.messages)
-
-
-def check_both(of_controller: Frames, of_monitor: Frames) -> str:
-    """Frames of two sessions in the stretch that both received."""
-    one, other = ([frame["seq"] for frame in frames] for frames in (of_controller, of_monitor))
+    """In the stretch that both received."""
+    one, other = ([frame["seq"] for frame in frames] for frames in pair.messages)
     require(bool(other), "no frames for the monitor")
     first, last = max(one[0], other[0]), min(one[-1], other[-1])
     one, other = ([seq for seq in seqs if first <= seq <= last] for seqs in (one, other))
