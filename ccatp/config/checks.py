@@ -37,7 +37,12 @@ Problems = Iterator[ConfigProblem]
 def check_config(cfg: Config) -> Problems:
     """Everything wrong with a survey's configuration whose values are each in range."""
     yield from _check_run(cfg)
-    yield from _check_units(cfg)
+    # Lengths and angles that have no limit of their own, but that cannot be meant.
+    for name, value in cfg:
+        if name != "mirror":
+            yield from _slips(value, (name,))
+    yield from _slips(cfg.mirror.frame, ("mirror", "frame"))
+    yield from _slips(cfg.mirror.base, ("mirror", "base"))
     yield from _check_wheels(cfg)
     yield from _check_world(cfg)
     yield from _check_network(cfg)
@@ -101,15 +106,6 @@ def _check_run(cfg: Config) -> Problems:
             yield _problem(f"align.light.{name}.direction_world", "= [0, 0, 0] is no direction")
 
 
-def _check_units(cfg: Config) -> Problems:
-    """Lengths and angles that have no limit of their own, but that cannot be meant."""
-    for name, value in cfg:
-        if name != "mirror":
-            yield from _slips(value, (name,))
-    yield from _slips(cfg.mirror.frame, ("mirror", "frame"))
-    yield from _slips(cfg.mirror.base, ("mirror", "base"))
-
-
 def _slips(value: object, key: Key) -> Problems:
     items: Iterable[tuple[str | int, object]] = ()
     if isinstance(value, BaseModel):
@@ -129,49 +125,31 @@ def _slips(value: object, key: Key) -> Problems:
 
 def check_onboard_config(cfg: OnboardConfig) -> Problems:
     """Everything wrong with a configuration of the on-board program whose values are each in range."""
-    link, robot, servo, devices = cfg.link, cfg.robot, cfg.servo, cfg.devices
-    battery = devices.daq.battery_empty_v, devices.daq.battery_full_v
+    link, robot, servo, edges, devices = cfg.link, cfg.robot, cfg.servo, cfg.edges, cfg.devices
+    top_m_s, full_scale_v = robot.max_wheel_rad_s * robot.wheel_radius_m, devices.daq.full_scale_v
+    low_v, high_v = (edges.threshold_v + side * edges.hysteresis_v for side in (-0.5, 0.5))
+    supply_v = devices.motors.supply_v
     yield from _check_corners(robot.edge_sensors_m)
     step_s, lasting_s = 1.0 / servo.loop_hz, _STEPS_OF_TIMER / servo.loop_hz
     for is_wrong, key, what, *related in (
         (not 0.005 <= robot.wheel_radius_m <= 0.2, "robot.wheel_radius_m", "must be between 0.005 and 0.2 (the link)"),
         (not 0.03 <= robot.wheel_base_m <= 1.0, "robot.wheel_base_m", "must be between 0.03 and 1 (the link)"),
-        (
-            robot.max_wheel_rad_s * robot.wheel_radius_m > 1.0,
-            "robot.max_wheel_rad_s",
-            f"= {robot.max_wheel_rad_s:g} is {robot.max_wheel_rad_s * robot.wheel_radius_m:.3g} m/s; the link allows 1",
-            "robot.wheel_radius_m",
-        ),
+        (top_m_s > 1.0, "robot.max_wheel_rad_s",
+         f"= {robot.max_wheel_rad_s:g} is {top_m_s:.3g} m/s; the link allows 1", "robot.wheel_radius_m"),
         (link.frame_hz * link.ttl_s < 2.0, "link.ttl_s", "must last for two frames at least", "link.frame_hz"),
         (servo.loop_hz < link.frame_hz, "servo.loop_hz", "must not be below link.frame_hz", "link.frame_hz"),
-        (
-            lasting_s > devices.timer.timeout_s,
-            "devices.timer.timeout_s",
-            f"= {devices.timer.timeout_s:g} brakes a loop with steps of {step_s:g} s; allow {lasting_s:g} at least",
-            "servo.loop_hz",
-        ),
-        (
-            servo.max_v > devices.motors.supply_v,
-            "servo.max_v",
-            f"= {servo.max_v:g} is more than devices.motors.supply_v = {devices.motors.supply_v:g}",
-            "devices.motors.supply_v",
-        ),
+        (lasting_s > devices.timer.timeout_s, "devices.timer.timeout_s",
+         f"= {devices.timer.timeout_s:g} brakes a loop with steps of {step_s:g} s; allow {lasting_s:g} at least",
+         "servo.loop_hz"),
+        (servo.max_v > supply_v, "servo.max_v",
+         f"= {servo.max_v:g} is more than devices.motors.supply_v = {supply_v:g}", "devices.motors.supply_v"),
         (servo.static_v >= servo.max_v, "servo.static_v", "must be below servo.max_v", "servo.max_v"),
-        (
-            cfg.edges.threshold_v + 0.5 * cfg.edges.hysteresis_v >= devices.daq.full_scale_v
-            or cfg.edges.threshold_v <= 0.5 * cfg.edges.hysteresis_v,
-            "edges.threshold_v",
-            f"and its band must lie between 0 and devices.daq.full_scale_v = {devices.daq.full_scale_v:g}",
-            "edges.hysteresis_v",
-            "devices.daq.full_scale_v",
-        ),
-        (
-            battery[0] >= battery[1],
-            "devices.daq.battery_empty_v",
-            "must be below devices.daq.battery_full_v",
-            "devices.daq.battery_full_v",
-        ),
-    ):
+        (low_v <= 0.0 or high_v >= full_scale_v, "edges.threshold_v",
+         f"and its band must lie between 0 and devices.daq.full_scale_v = {full_scale_v:g}",
+         "edges.hysteresis_v", "devices.daq.full_scale_v"),
+        (devices.daq.battery_empty_v >= devices.daq.battery_full_v, "devices.daq.battery_empty_v",
+         "must be below devices.daq.battery_full_v", "devices.daq.battery_full_v"),
+    ):  # fmt: skip
         if is_wrong:
             yield _problem(key, what, *related)
 

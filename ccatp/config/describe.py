@@ -85,17 +85,15 @@ def differences(
 
     Without ``other`` the shipped configuration: of the same mirror and world, where these are shipped, or system.
     """
-    if other is None:
-        other = load_radio_config(None, {"system": cfg.system}) if isinstance(cfg, RadioConfig) else _default(cfg)
+    if isinstance(cfg, RadioConfig):
+        other = other or load_radio_config(None, {"system": cfg.system})
+    elif other is None:
+        names = {"mirror": cfg.mirror.name, "world": cfg.world.name}
+        shipped = {f"run.{kind}": name for kind, name in names.items() if name in available(kind)}
+        other = load_config(None, shipped).model_copy(update={"run": load_config().run})
     before, after = dict(_leaves(other.model_dump(mode="json"))), dict(_leaves(cfg.model_dump(mode="json")))
     keys = dict.fromkeys((*before, *after))
     return [(key, before.get(key), after.get(key)) for key in keys if before.get(key) != after.get(key)]
-
-
-def _default(cfg: Config) -> Config:
-    names = {"mirror": cfg.mirror.name, "world": cfg.world.name}
-    shipped = {f"run.{kind}": name for kind, name in names.items() if name in available(kind)}
-    return load_config(None, shipped).model_copy(update={"run": load_config().run})
 
 
 def _leaves(tree: Mapping[str, Any], at: str = "") -> Iterator[tuple[str, object]]:

@@ -32,6 +32,7 @@ from ccatp.errors import ConfigError
 Tree = dict[str, Any]
 Overrides = Mapping[str, object] | None
 M = TypeVar("M", bound=BaseModel)
+Check = Callable[[M], Iterable[ConfigProblem]]
 
 DEFAULT_FILE, BEACON_FILE, RECORDING_FILE = "ccatp.toml", "radio.toml", "recordings.toml"
 ONBOARD_FILE = "onboard.toml"
@@ -83,19 +84,13 @@ class ConfigSource:
 
 
 def read_source(path: Path, root: Key = ()) -> ConfigSource:
-    """The content of a TOML file, as the section ``root`` of a configuration.
-
-    Raises ConfigError: there is no such file, or it is not TOML.
-    """
+    """A TOML file as the section ``root`` of a configuration; ConfigError: there is no such file, or it is not TOML."""
     text = read_toml(path)
     return ConfigSource(str(path), text, parse_toml(text, str(path)), root)
 
 
 def nested(dotted: Mapping[str, object]) -> Tree:
-    """``{"run.seed": 2}`` as ``{"run": {"seed": 2}}``; ``None`` values are left out.
-
-    Raises ConfigError: a key is given both as a value and as a section.
-    """
+    """``{"run.seed": 2}`` as ``{"run": {"seed": 2}}``, without ``None``; ConfigError: a key is value and section."""
     tree: Tree = {}
     for key, value in dotted.items():
         if value is None:
@@ -122,13 +117,11 @@ def merged(
     return tree
 
 
-def _layers(
-    base: str, file: Path | None, overrides: Overrides, config_dir: Path | None = None, *, any_ports: bool = False
-) -> list[ConfigSource]:
+def _layers(base: str, file: Path | None, overrides: Overrides, *, any_ports: bool = False) -> list[ConfigSource]:
     """Command line, the user's file, base: the strongest first."""
     user = read_source(file) if file else ConfigSource("", "", {})
     command = ConfigSource("command line", "", nested(overrides or {}))
-    below = read_source((config_dir or configs_dir()) / base)
+    below = read_source(configs_dir() / base)
     for server in below.tree["sim"].values() if any_ports else ():
         if isinstance(server, dict) and "port" in server:
             server["port"] = 0
@@ -157,16 +150,8 @@ def _value(tree: object, *key: str) -> Any:
     return tree
 
 
-def validated(
-    model: type[M],
-    tree: Tree,
-    sources: list[ConfigSource],
-    check: Callable[[M], Iterable[ConfigProblem]] = lambda _: (),
-) -> M:
-    """The values of a tree as a model.
-
-    Raises ConfigError: one line with file, line, key, what is wrong and what to do.
-    """
+def validated(model: type[M], tree: Tree, sources: list[ConfigSource], check: Check[M] = lambda _: ()) -> M:
+    """The values of a tree as a model; ConfigError: one line with file, line, key, what is wrong and what to do."""
     try:
         # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
         cfg = model.model_validate_json(json.dumps(tree, default=str), strict=True)
@@ -178,32 +163,23 @@ def validated(
             return cfg
     if len(problems) > _MOST_PROBLEMS:
         problems[-1] = problems[-1]._replace(what="is wrong as well, and maybe others; correct the first ones")
-    raise ConfigError(
-        *(
-            f"{_place(sources, problem.key, *problem.related)}: {format_key(problem.key)} {problem.what}"
-            for problem in problems
-        )
-    )
+    raise ConfigError(*(f"{_place(sources, key, *others)}: {format_key(key)} {what}" for key, what, others in problems))
 
 
 # -- surveys of mirrors -----------------------------------------------------------------------------------------------
 
 
-def load_config(
-    file: Path | None = None, overrides: Overrides = None, config_dir: Path | None = None, *, any_ports: bool = False
-) -> Config:
+def load_config(file: Path | None = None, overrides: Overrides = None, *, any_ports: bool = False) -> Config:
     """The whole configuration of a run.
 
     The user's file needs only the keys that differ from the default file. ``mirror`` and ``world`` come from the files
     that ``run.mirror`` and ``run.world`` name, a name or the path of a ``.toml`` file; a file with complete sections
     ``[mirror]`` and ``[world]``, as a run directory holds, is taken as it is, and single keys of these sections are
     laid over the named file. Dotted keys in ``overrides`` are stronger than the file; ``None`` values are left out.
-    ``config_dir`` (the shipped one by default) has ``ccatp.toml``, ``mirrors/`` and ``worlds/``. ``any_ports``: the
-    simulated servers take any free port unless file or overrides name one. Raises ConfigError:
-    one line with file, line, key, what is wrong and what to do. Raises NotASurvey: the file is of a mission among
-    beacons.
+    ``any_ports``: the simulated servers take any free port unless file or overrides name one. ConfigError: one line
+    with file, line, key, what is wrong and what to do; NotASurvey: the file is of a mission among beacons.
     """
-    command, user, base = sources = _layers(DEFAULT_FILE, file, overrides, config_dir, any_ports=any_ports)
+    command, user, base = sources = _layers(DEFAULT_FILE, file, overrides, any_ports=any_ports)
     system = user.tree.get("system")
     if file is not None and system is not None:
         use = f"ccatp report {file.parent}" if file.name == _RUN_FILE else "ccatp run or ccatp study with it"
@@ -211,7 +187,7 @@ def load_config(
         raise NotASurvey(f"{what}, and this is for surveys of mirrors alone; use {use}")
     tree = merged(merged(base.tree, user.tree), command.tree)
     for section in _SECTIONS:
-        tree[section] = _section(section, tree, sources, config_dir or configs_dir())
+        tree[section] = _section(section, tree, sources)
     return validated(Config, tree, sources, check_config)
 
 
@@ -222,13 +198,12 @@ def dump_config(cfg: Config | RadioConfig) -> str:
     return _RUN_HEAD + tomlkit.dumps(cfg.model_dump())
 
 
-def available(kind: str, config_dir: Path | None = None) -> list[str]:
+def available(kind: str) -> list[str]:
     """Names of the shipped ``mirror`` or ``world`` files."""
-    folder = (config_dir or configs_dir()) / _SECTIONS[kind][0]
-    return sorted(path.stem for path in folder.glob("*.toml"))
+    return sorted(path.stem for path in (configs_dir() / _SECTIONS[kind][0]).glob("*.toml"))
 
 
-def _section(section: str, tree: Tree, sources: list[ConfigSource], config_dir: Path) -> Tree:
+def _section(section: str, tree: Tree, sources: list[ConfigSource]) -> Tree:
     """Mirror or world: the file that ``run`` names, which joins the sources, under what file and command line say.
 
     Where the user's file holds all of it, this is taken, unless the command line names another one.
@@ -243,12 +218,12 @@ def _section(section: str, tree: Tree, sources: list[ConfigSource], config_dir: 
         raise ConfigError(f"{place}: {section}: must be a section; name a {section} with run.{section}")
     if is_complete and not is_replaced:
         return dict(overlay)
-    named = _read_named(section, tree["run"], sources, config_dir)
+    named = _read_named(section, tree["run"], sources)
     sources.append(named)
     return merged(named.tree, overlay)
 
 
-def _read_named(section: str, run: object, sources: list[ConfigSource], config_dir: Path) -> ConfigSource:
+def _read_named(section: str, run: object, sources: list[ConfigSource]) -> ConfigSource:
     """The file that ``run.mirror`` or ``run.world`` names."""
     source, key = _strongest(sources, ("run", section))
     if not isinstance(run, Mapping):
@@ -262,8 +237,8 @@ def _read_named(section: str, run: object, sources: list[ConfigSource], config_d
         raise refusal(f" must be the name of a {section}")
     if is_file_name(name):
         path = Path(source.name).parent / name
-    elif name in (names := available(section, config_dir)):
-        path = config_dir / _SECTIONS[section][0] / f"{name}.toml"
+    elif name in (names := available(section)):
+        path = configs_dir() / _SECTIONS[section][0] / f"{name}.toml"
     else:
         raise refusal(f" is no {section}; {choice_hint(name, names)}")
     try:
@@ -276,16 +251,15 @@ def _read_named(section: str, run: object, sources: list[ConfigSource], config_d
 
 
 def load_radio_config(
-    file: Path | None = None, overrides: Overrides = None, config_dir: Path | None = None, *, simulates: bool = True,
-    any_ports: bool = False,
-) -> RadioConfig:  # fmt: skip
+    file: Path | None = None, overrides: Overrides = None, *, simulates: bool = True, any_ports: bool = False
+) -> RadioConfig:
     """The whole configuration of a robot among radio beacons; arguments as in ``load_config``.
 
     ``system`` of the user's file, else of the base file ``radio.toml``, says which of ``zigbee.toml``, ``follow.toml``
     and ``cricket.toml`` lies between the two. ``simulates`` says whether a field of motes is simulated, or its ranges
-    were measured. Raises ConfigError: one line with file, line, key, what is wrong and what to do.
+    were measured.
     """
-    command, user, base = sources = _layers(BEACON_FILE, file, overrides, config_dir, any_ports=any_ports)
+    command, user, base = sources = _layers(BEACON_FILE, file, overrides, any_ports=any_ports)
     run = user.tree.get("run")
     named = set(user.tree) | (set(run) if isinstance(run, Mapping) else set())
     if "system" not in user.tree and {"mirror", "world"} & named:  # which only surveys have
@@ -299,7 +273,7 @@ def load_radio_config(
     if name not in SYSTEMS:
         hint = choice_hint(str(name), SYSTEMS)
         raise ConfigError(f"{source.place(key)}: system = {format_value(name)} is no system; {hint}")
-    system = read_source((config_dir or configs_dir()) / f"{name}.toml")
+    system = read_source(configs_dir() / f"{name}.toml")
     tree = merged(merged(base.tree, system.tree, _WHOLE), user.tree, _WHOLE)
     sources = [command, user, system, base]
     return validated(
@@ -308,18 +282,12 @@ def load_radio_config(
 
 
 def is_radio_file(file: Path) -> bool:
-    """Whether a configuration file is one of a robot among radio beacons: it names its ``system``.
-
-    Raises ConfigError: it cannot be read.
-    """
+    """Whether a configuration file is one of a robot among beacons: it names its ``system``; errors as of loading."""
     return "system" in read_source(file).tree
 
 
 def load_recordings_config(file: Path | None = None, overrides: Overrides = None) -> RecordingsConfig:
-    """What is assumed of recorded radio data, by format, as in ``plaza.priors.range_scale``.
-
-    Raises ConfigError: one line with file, line, key, what is wrong and what to do.
-    """
+    """What is assumed of recorded radio data, by format, as in ``plaza.priors.range_scale``; errors as above."""
     command, user, base = sources = _layers(RECORDING_FILE, file, overrides)
     return validated(RecordingsConfig, merged(merged(base.tree, user.tree), command.tree), sources)
 

@@ -163,7 +163,7 @@ def _unknown(key: Key, root: type[BaseModel]) -> str:
     """A key that no model has: the nearest one beside it, else one of the same name in another section."""
     *section, name = key
     paths = list(_paths(root))
-    beside = [path for path in paths if len(path) == len(key) and _fits(path[:-1], section)]
+    beside = [path for path in paths if len(path) == len(key) and all(map(_fits, path, section))]
     siblings = {path[-1]: (*section, path[-1]) for path in beside}
     everywhere = {path[-1]: path for path in paths}
     for known in siblings, everywhere:
@@ -172,8 +172,8 @@ def _unknown(key: Key, root: type[BaseModel]) -> str:
     return f"is unknown; known here: {', '.join(siblings)}"
 
 
-def _fits(path: Iterable[str], section: Iterable[str | int]) -> bool:
-    return all(part in ("*", given) for part, given in zip(path, section, strict=True))
+def _fits(part: str, given: str | int) -> bool:
+    return part in ("*", given)
 
 
 def _paths(model: type[BaseModel], prefix: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:

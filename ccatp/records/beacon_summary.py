@@ -38,35 +38,23 @@ _DISTRIBUTION = ("rmse", "mean", "p50", "p99", "max")
 
 @dataclass(slots=True)
 class BeaconSummary:
-    """Collects a run; ``has_truth``: it is simulated.
-
-    Attributes:
-        track, truth: rows of the topics ``beacon_track`` and ``beacon_truth``.
-        places: true places of radios and motes.
-        reached: frame of each waypoint that was reached, and x, y, xx, xy, yy by the estimate.
-        beacons: ellipses of the newest map, by name.
-        score: of the newest map: sum of NIS, its degrees of freedom, readings refused.
-        events: how often the danger loop began to deny motion, by the signal.
-        mission_time_s: by the robot's clock.
-        ticks_us: wall times of main-loop ticks.
-        signal: that by which motion is denied at present.
-    """
+    """Collects a run; ``has_truth``: it is simulated."""
 
     cfg: RadioConfig
     has_truth: bool
-    track: list[Sequence[float]] = field(default_factory=list)
-    truth: list[Sequence[float | None]] = field(default_factory=list)
-    places: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    beacons: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    score: tuple[float, int, int] = (0.0, 0, 0)
+    track: list[Sequence[float]] = field(default_factory=list)  # rows of the topic ``beacon_track``
+    truth: list[Sequence[float | None]] = field(default_factory=list)  # rows of the topic ``beacon_truth``
+    places: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # true, of radios and motes
+    beacons: Mapping[str, Sequence[float]] = field(default_factory=dict)  # ellipses of the newest map, by name
+    score: tuple[float, int, int] = (0.0, 0, 0)  # of that map: sum of NIS, its degrees of freedom, readings refused
     notes: Mapping[str, float] = field(default_factory=dict)
-    reached: list[tuple[int, Sequence[float]]] = field(default_factory=list)
-    events: Counter[str] = field(default_factory=Counter)
-    mission_time_s: float = 0.0
+    reached: list[tuple[int, Sequence[float]]] = field(default_factory=list)  # frame; x, y, xx, xy, yy by the estimate
+    events: Counter[str] = field(default_factory=Counter)  # how often motion began to be denied, by the signal
+    mission_time_s: float = 0.0  # by the robot's clock
     outcome: str = ""
     cause: str = ""
     ticks_us: list[float] = field(default_factory=list)
-    signal: str = ""
+    signal: str = ""  # by which motion is denied at present
 
     def take(self, message: Message) -> None:
         """Take one message of the run."""
@@ -162,16 +150,13 @@ class BeaconSummary:
         safe_m, settled_s = cfg.follow.safe_distance_m, cfg.observation.every_steps * cfg.run.step_s
         late = truth.at((truth.t_s >= settled_s) & np.isfinite(truth.target_m[:, 0]) & known)
         distances = np.hypot(*(late.place_m - late.target_m).T)
-        error_m = None
-        place = self.beacons.get(self.cfg.follow.target)
-        if known and place is not None:
-            error_m = rounded(np.hypot(*(place[:2] - truth.target_m[-1])))
+        place = self.beacons.get(cfg.follow.target) if known else None
         return {
             "safe_distance_m": safe_m,
             "distance_mean_m": rounded(distances.mean()) if len(distances) else None,
             "distance_min_m": rounded(distances.min()) if len(distances) else None,
             "distance_rms_off_m": rounded(np.sqrt(np.mean((distances - safe_m) ** 2))) if len(distances) else None,
-            "final_error_m": error_m,
+            "final_error_m": None if place is None else rounded(np.hypot(*(place[:2] - truth.target_m[-1]))),
         }
 
 

@@ -114,11 +114,6 @@ class Trace(NamedTuple):
         """Points on the surface, deck frame, m, shape (k, 3)."""
         return np.column_stack([self.pose[:, :2], self.height_m])
 
-    def moved_to(self, mirror: Mirror, pose: FloatArray, covariance: FloatArray) -> "Trace":
-        """The same frames with other poses (k, 3) and covariances (k, 3, 3)."""
-        heights = mirror.surface.heights_m(pose[:, 0], pose[:, 1])
-        return Trace(self.seq, self.t_s, pose, heights, covariance)
-
 
 def format_tum(trace: Trace) -> str:
     """The trace as a trajectory of the TUM format: t_s x y z qx qy qz qw a line, deck frame, m, turned about z."""
@@ -259,10 +254,7 @@ def check_run_dir(run_dir: Path, file: str = CONFIG) -> None:
 
 
 def open_run(path: Path) -> list[Recording]:
-    """The recordings of a run directory, oldest first; or the one that is named.
-
-    ``RunReadError``: there is no such path, it holds no recording or no configuration, or one of a newer format.
-    """
+    """The recordings of a run directory, oldest first, or the one that is named; ``RunReadError``: none can be read."""
     if path.is_file():
         return [_open(path)]
     check_run_dir(path, TELEMETRY)

@@ -279,7 +279,9 @@ class _Player:
             means, covariances = self._recording.smooth()
             steps = np.array(self._steps, dtype=np.int64)
             corrections = means[steps] - np.array(self._states).reshape(-1, 3)
-            smoothed = trace.moved_to(self._mirror, trace.pose + corrections, covariances[steps])
+            pose = trace.pose + corrections
+            heights_m = self._mirror.surface.heights_m(pose[:, 0], pose[:, 1])
+            smoothed = trace._replace(pose=pose, height_m=heights_m, covariance=covariances[steps])
         return Replayed(
             trace=trace,
             moving=np.array(self._moving, dtype=np.int64),
