@@ -26,10 +26,9 @@ import msgspec
 import numpy as np
 import zmq
 import zmq.asyncio
-from numpy.typing import NDArray
 
 from ccatp.config.models import SimEtalonConfig
-from ccatp.core import Vector3
+from ccatp.core import FloatArray, Vector3
 from ccatp.links import multiline
 from ccatp.links.multiline import ChannelData, Command, Connected, LaserReady, Notice, Remark, Reply
 from ccatp.links.robot_codec import LineBuffer, LineTooLong
@@ -69,8 +68,7 @@ class ZmqPuck:
     """From the simulated robot: request ``b"puck"``, reply ``{"t", "puck": [x, y, z], "moved_m"}``, SI, world."""
 
     def __init__(self, endpoint: str, timeout_s: float = 1.0) -> None:
-        self._endpoint = endpoint
-        self._timeout_s = timeout_s
+        self._endpoint, self._timeout_s = endpoint, timeout_s
         self._context = zmq.asyncio.Context()
 
     async def puck(self) -> PuckTruth:
@@ -103,24 +101,17 @@ _BUSY = Remark("error", "busy")
 class EtalonSimulator:
     """The server of k channels with collimators in the world frame, shape (k, 3).
 
-    ``moved_m`` of ``truth`` is meant over the time in which a length is averaged.
-
-    Attributes:
-        model: lengths and flags; ``blocked``, ``flags`` and ``laser_ready`` may be changed at any time.
-        connected: answer to ``isconnected``.
-        counts: requests, bad_requests, oversized_lines, truth_failures, refused_clients, lost_clients.
+    ``moved_m`` of ``truth`` is meant over the time in which a length is averaged. ``blocked``, ``flags`` and
+    ``laser_ready`` of ``model`` may be changed at any time. ``counts``: requests, bad_requests, oversized_lines,
+    truth_failures, refused_clients, lost_clients.
     """
 
     def __init__(
-        self,
-        cfg: SimEtalonConfig,
-        mirror_channels: Sequence[int],
-        collimators_m: NDArray[np.float64],
-        truth: PuckSource,
+        self, cfg: SimEtalonConfig, channels: Sequence[int], collimators_m: FloatArray, truth: PuckSource,
         rng: np.random.Generator,
-    ) -> None:
-        self.model = EtalonModel(cfg, mirror_channels, collimators_m, rng)
-        self.connected = True
+    ) -> None:  # fmt: skip
+        self.model = EtalonModel(cfg, channels, collimators_m, rng)
+        self.connected = True  # answer to ``isconnected``
         self.push_hz = 5.0
         self.counts: Counter[str] = Counter()
         self._truth = truth

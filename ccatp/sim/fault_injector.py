@@ -318,18 +318,13 @@ class Injector:
         for name in ("imu", "enc", "edge", "gravity"):
             rows[name] = [(self._stamp(t_s, row[0] - self._boot_s, is_frame=False), *row[1:]) for row in rows[name]]
         _, left, right = rows["fans"][-1]
-        return RobotFrame(
-            frame.seq - self._seq_0,
+        stamp, gravity = (
             self._stamp(t_s, t_s - self._boot_s, is_frame=True),
-            rows["imu"],
-            rows["enc"],
-            rows["edge"],
             rows["gravity"][-1] if rows["gravity"] else None,
-            (left, right),
-            rows["soc"][-1][1],
-            frame.cmd,
-            self._raised(t_s),
         )
+        lists, charge = (rows["imu"], rows["enc"], rows["edge"]), rows["soc"][-1][1]
+        names = self._raised(t_s)
+        return RobotFrame(frame.seq - self._seq_0, stamp, *lists, gravity, (left, right), charge, frame.cmd, names)
 
     def _stamp(self, t_s: float, at_s: float, *, is_frame: bool) -> float:
         """The time that is written for ``at_s``, counted from the boot, at the time ``t_s`` of the plan."""

@@ -205,20 +205,15 @@ never do."""
 
 
 class Injected:
-    """What has become of one fault of the plan so far.
-
-    Attributes:
-        at_s: when it was to begin; ``None`` for a fault of the link that waits for something else.
-        from_s, until_s: the first and last sample, frame or step that it acted on, robot time; ``None``: none yet.
-        changed: how many of these ``samples`` came out different, or not at all.
-    """
+    """What has become of one fault of the plan so far; robot times."""
 
     def __init__(self, fault: Any) -> None:
         self.fault = fault
-        self.signal, self.type, self.at_s = str(fault.signal), str(fault.type), fault.at_s
-        self.from_s: float | None = None
-        self.until_s: float | None = None
-        self.samples = self.changed = 0
+        self.signal, self.type = str(fault.signal), str(fault.type)
+        self.at_s: float | None = fault.at_s  # when it was to begin; None: it waits for something else
+        self.from_s: float | None = None  # the first sample, frame or step that it acted on
+        self.until_s: float | None = None  # the last one
+        self.samples = self.changed = 0  # how many, and how many of them came out different, or not at all
 
     def add(self, t_s: float, *, is_changed: bool = True) -> None:
         """Count one sample, frame or step."""

@@ -53,9 +53,8 @@ class LineStage:
 
     def flood_line(self) -> bytes:
         """One further line."""
-        if self._faults["flood"].lines == "copies" and self._last:
-            return self._last
-        return self._garbage(_GARBAGE_LINE_BYTES)
+        is_copy = self._faults["flood"].lines == "copies" and self._last
+        return self._last if is_copy else self._garbage(_GARBAGE_LINE_BYTES)
 
     def _treat(self, line: bytes) -> list[bytes]:
         self._last = line
@@ -157,11 +156,9 @@ class Pipe(asyncio.Protocol):
         if not data or self._is_shut or self._waiting_bytes + len(data) > 2 * MAX_WAITING_BYTES:
             return
         late_s = 0.0
-        delay = self._faults.get("delay")
-        if delay is not None:
+        if (delay := self._faults.get("delay")) is not None:
             late_s = delay.delay_s + (delay.jitter_s * self._rng.random() if delay.jitter_s else 0.0)
-        if late_s:
-            self._counts["delay"] += 1
+            self._counts["delay"] += late_s > 0.0
         self._due_s = max(self._due_s, self._loop.time() + late_s)
         self._waiting.append((self._due_s, data))
         self._waiting_bytes += len(data)
@@ -267,20 +264,16 @@ class FaultProxy:
     """A proxy for one server; an asynchronous context manager.
 
     A fault that lasts acts on the connections that are and on those to come, from ``switch_on`` to ``heal``; ``reset``
-    and ``close`` act at once. ``listener`` is a bound socket; any free port of 127.0.0.1 if not given.
-
-    Attributes:
-        counts: what was really done, by the types of the faults: lines hit, writes, bytes swallowed, connections
-            ended; ``connections`` taken, ``refused`` because the server could not be reached.
-        faults: those that are switched on.
-        connections: both ends of each that there is now.
+    and ``close`` act at once. ``listener`` is a bound socket; any free port of 127.0.0.1 if not given. ``counts``: what
+    was really done, by the types of the faults: lines hit, writes, bytes swallowed, connections ended; ``connections``
+    taken, ``refused`` because the server could not be reached.
     """
 
     def __init__(self, host: str, port: int, *, seed: int, listener: socket.socket | None = None) -> None:
         self._address, self._listener = (host, port), listener
         self.rng = random.Random(seed)
-        self.faults: dict[OneWay, OneWayFaults] = {way: {} for way in _BOTH}
-        self.connections: list[tuple[Pipe, Pipe]] = []
+        self.faults: dict[OneWay, OneWayFaults] = {way: {} for way in _BOTH}  # that are switched on
+        self.connections: list[tuple[Pipe, Pipe]] = []  # both ends of each that there is now
         self._tasks: set[asyncio.Task[None]] = set()
         self._reset_after_bytes: int | None = None
         self.port = 0

@@ -62,13 +62,11 @@ class SurveyTruth(TruthSource):
 
     @property
     def truth_requests(self) -> Mapping[str, Callable[[], dict[str, object]]]:
-        return {"puck": self._puck, "misalignment": self._misalignment}
-
-    def _puck(self) -> dict[str, object]:
-        return {"t": self.t_s, "puck": self.world.puck_world(), "moved_m": self.world.moved_m()}
-
-    def _misalignment(self) -> dict[str, object]:
-        return {"panels": self._panels(), "start": msgspec.structs.astuple(self.world.start_pose)}
+        world = self.world
+        return {
+            "puck": lambda: {"t": self.t_s, "puck": world.puck_world(), "moved_m": world.moved_m()},
+            "misalignment": lambda: {"panels": self._panels(), "start": msgspec.structs.astuple(world.start_pose)},
+        }
 
     @property
     def is_fallen(self) -> bool:

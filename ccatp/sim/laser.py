@@ -9,10 +9,9 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.config.models import SimEtalonConfig
-from ccatp.core import Vector3
+from ccatp.core import FloatArray, Vector3
 from ccatp.links.multiline import FLAGS, ChannelRecord, Environment
 
 # Air on a high site. Lengths are already corrected for refraction, so it takes no part in them.
@@ -36,31 +35,21 @@ class PuckTruth(msgspec.Struct, frozen=True, rename={"t_s": "t", "position_m": "
 class EtalonModel:
     """Channels that look at the puck from known collimators, world frame, shape (k, 3); ``rng`` is drawn from once.
 
-    Attributes:
-        flags: further error flags to raise, names out of ``ccatp.links.multiline.FLAGS`` by channel.
-        laser_ready: while false, each record carries ``laser_temp_error``.
-
     ``ValueError``: channels and collimators do not fit.
     """
 
     def __init__(
-        self,
-        cfg: SimEtalonConfig,
-        channels: Sequence[int],
-        collimators_m: NDArray[np.float64],
-        rng: np.random.Generator,
+        self, cfg: SimEtalonConfig, channels: Sequence[int], collimators_m: FloatArray, rng: np.random.Generator
     ) -> None:
         if np.shape(collimators_m) != (len(channels), 3):
             raise ValueError(f"{len(channels)} channels, collimators of shape {np.shape(collimators_m)}")
-        self._sigma_m = cfg.length_sigma_m
-        self._sigma_per_m = cfg.length_sigma_per_m
-        self._motion_tolerance_m = cfg.motion_tolerance_m
+        self._cfg = cfg
         rows: list[list[float]] = np.asarray(collimators_m, dtype=np.float64).tolist()
         self._collimators = dict(zip(channels, rows, strict=True))
         self._key = int(rng.integers(2**63))
         self.blocked: set[int] = set()
-        self.flags: dict[int, set[str]] = {}
-        self.laser_ready = True
+        self.flags: dict[int, set[str]] = {}  # further error flags to raise, out of FLAGS, by channel
+        self.laser_ready = True  # while false, each record carries ``laser_temp_error``
         self.environment = AIR
 
     @property
@@ -83,14 +72,14 @@ class EtalonModel:
         if puck is None or collimator is None:
             return self._format(channel, 0.0, {"daq_error"})
         flags = set(self.flags.get(channel, ()))
-        if not puck.moved_m <= self._motion_tolerance_m:
+        if not puck.moved_m <= self._cfg.motion_tolerance_m:
             flags.add("motion_tolerance_error")
         if not self.laser_ready:
             flags.add("laser_temp_error")
         if channel in self.blocked:
             return self._format(channel, 0.0, flags | {"beam_break"})
         length_m = math.dist(collimator, puck.position_m)
-        sigma_m = self._sigma_m + self._sigma_per_m * length_m
+        sigma_m = self._cfg.length_sigma_m + self._cfg.length_sigma_per_m * length_m
         return self._format(channel, length_m + sigma_m * self._noise(puck.t_s, channel), flags)
 
     def _noise(self, t_s: float, channel: int) -> float:
@@ -101,15 +90,7 @@ class EtalonModel:
         return float(np.random.Generator(np.random.Philox(counter=counter, key=key)).standard_normal())
 
     def _format(self, channel: int, length_m: float, flags: set[str]) -> ChannelRecord:
-        air = self.environment
+        air = self.environment.temperature_c, self.environment.pressure_hpa, self.environment.humidity_pct
         low, high = _INTENSITY if length_m and "intensity_error" not in flags else (0, 0)
-        return ChannelRecord(
-            channel,
-            round(length_m * 1e3, _LENGTH_DECIMALS),
-            low,
-            high,
-            air.temperature_c,
-            air.pressure_hpa,
-            air.humidity_pct,
-            *(int(name in flags) for name in FLAGS),
-        )
+        length_mm, raised = round(length_m * 1e3, _LENGTH_DECIMALS), (int(name in flags) for name in FLAGS)
+        return ChannelRecord(channel, length_mm, low, high, *air, *raised)

@@ -54,26 +54,15 @@ before this disturbance, it gives the displacement after it."""
 class Plant:
     """State of the robot's body and wheels.
 
-    Attributes:
-        x_m, y_m, z_m: robot origin on the surface, deck frame.
-        heading_rad: deck heading (see ``DeckPose``), not wrapped.
-        forward_m, left_m, turn_rad, is_moving, are_wheels_still: of the last step.
-        hx, hy, lx, ly: deck-plane components of the robot's x and y axes, as ``Mirror.body_axes``.
-        right_angle_rad, left_angle_rad: wheel angles at the end of the last step, since boot.
-        right_scale, left_scale: travel of the body over travel of the nominal wheel; may be set before a step.
-        shake_rate_rad_s, shake_acceleration_m_s2: what vibration adds to the readings of the inertial unit.
+    ``x_m``, ``y_m``, ``z_m``: robot origin on the surface, deck frame; ``heading_rad``: as in ``DeckPose``, not
+    wrapped; ``hx``, ``hy``, ``lx``, ``ly``: deck-plane components of the robot's x and y axes, as
+    ``Mirror.body_axes``. ``right_scale`` and ``left_scale`` may be set before a step.
     """
 
     def __init__(
-        self,
-        surface: Surface,
-        start: DeckPose,
-        *,
-        wheel_radius_m: float,
-        wheel_base_m: float,
-        wheel_lag_s: float,
+        self, surface: Surface, start: DeckPose, *, wheel_radius_m: float, wheel_base_m: float, wheel_lag_s: float,
         disturbances: Sequence[Disturbance] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._jet = SurfacePatch(surface, _REACH_M).jet
         self._radius_m, self._half_base_m = wheel_radius_m, wheel_base_m / 2.0
         self.lag_s = wheel_lag_s
@@ -82,10 +71,10 @@ class Plant:
         self.z_m, self.fx, self.fy, *_ = surface.jet(start.x_m, start.y_m)
         self.right_rad_s = self.left_rad_s = 0.0
         self._right_set = self._left_set = self._right_0 = self._left_0 = 0.0
-        self.right_angle_rad = self.left_angle_rad = self._right_angle_0 = self._left_angle_0 = 0.0
-        self.right_scale = self.left_scale = 1.0
-        self.shake_rate_rad_s = self.shake_acceleration_m_s2 = 0.0
-        self.forward_m = self.left_m = self.turn_rad = 0.0
+        self.right_angle_rad = self.left_angle_rad = self._right_angle_0 = self._left_angle_0 = 0.0  # since boot
+        self.right_scale = self.left_scale = 1.0  # travel of the body over travel of the nominal wheel
+        self.shake_rate_rad_s = self.shake_acceleration_m_s2 = 0.0  # added to the readings of the inertial unit
+        self.forward_m = self.left_m = self.turn_rad = 0.0  # of the last step
         self.is_moving, self.are_wheels_still = False, True
         self._decay_dt_s = self._decay = 0.0
         self._turn_axes()
@@ -292,11 +281,7 @@ def draw_wheels(robot: RobotConfig, lag_s: float, world: WorldConfig, rng: np.ra
 
 
 class WheelSlip:
-    """Slip of both wheels; ``rng`` is the parent of the generators of legs and walks.
-
-    Attributes:
-        right, left: share of each wheel's travel that is lost now.
-    """
+    """Slip of both wheels; ``rng`` is the parent of the generators of legs and walks."""
 
     def __init__(self, world: WorldConfig, rng: np.random.Generator) -> None:
         self._leg_rng, right, left = rng.spawn(3)
@@ -305,7 +290,7 @@ class WheelSlip:
         self._walks = OrnsteinUhlenbeck(sigma, time_s, right), OrnsteinUhlenbeck(sigma, time_s, left)
         self._base = (self._least, self._least)
         self._ordered_s = -inf
-        self.right = self.left = 0.0
+        self.right = self.left = 0.0  # share of each wheel's travel that is lost now
 
     def step(self, t_s: float, dt_s: float, is_ordered: bool) -> None:
         """Go on to a frame in which the wheels turn or should; frames at rest may be left out.
@@ -353,11 +338,7 @@ class Creep:
 
 
 class Vibration:
-    """Jitter of the body while the fans thrust; ``rng`` is the parent of the generators.
-
-    Attributes:
-        is_thrusting: the fans thrust in the next frame; to be set before it.
-    """
+    """Jitter of the body while the fans thrust; ``rng`` is the parent of the generators."""
 
     def __init__(self, world: WorldConfig, frame_s: float, rng: np.random.Generator) -> None:
         self._heading, self._place, self._acceleration = (noise_stream(one) for one in rng.spawn(3))
@@ -366,7 +347,7 @@ class Vibration:
         self._sigma_m = world.vibration_speed_m_s * frame_s / sqrt(2.0)
         self._sigma_m_s2 = world.vibration_acceleration_m_s2 / sqrt(2.0)
         self._angle = self._ahead = self._push = 0.0
-        self.is_thrusting = False
+        self.is_thrusting = False  # the fans thrust in the next frame; to be set before it
 
     def displace(
         self, plant: Plant, t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float

@@ -53,19 +53,13 @@ class TargetBearing(NamedTuple):
 
 
 class WorldFrame(NamedTuple):
-    """All readings of one step.
-
-    Attributes:
-        packets: answers received at its end while the reflector turned once; empty in steps without a scan.
-        sightings: the same of worlds that draw the result of a scan.
-        distances_m: of the distance sensors, in the order of the configuration; their range without an obstacle.
-    """
+    """All readings of one step."""
 
     time_s: float
     wheels: WheelReading
-    packets: tuple[Packet, ...]
-    sightings: tuple[TargetBearing, ...]
-    distances_m: tuple[float, ...]
+    packets: tuple[Packet, ...]  # received at its end while the reflector turned once; empty without a scan
+    sightings: tuple[TargetBearing, ...]  # the same of worlds that draw the result of a scan
+    distances_m: tuple[float, ...]  # in the order of the configuration; the range of the sensor without an obstacle
 
 
 Point = tuple[float, float]
@@ -164,13 +158,8 @@ class TrueRadio:
         self, name: str, reference_dbm: float, cfg: SimRadioConfig, size_m: Point,
         obstacles: Sequence[SimObstacleConfig], readings: int, places: np.random.Generator, noise: np.random.Generator,
     ) -> None:  # fmt: skip
-        self._name = name
-        self._reference_dbm = reference_dbm
-        self._cfg = cfg
-        self._obstacles = obstacles
-        self._step_rad = tau / readings
-        self._readings = readings
-        self._noise = noise
+        self._name, self._reference_dbm, self._cfg, self._obstacles = name, reference_dbm, cfg, obstacles
+        self._step_rad, self._readings, self._noise = tau / readings, readings, noise
         self._shadowing = ShadowingField(cfg.shadowing_sigma_db, cfg.shadowing_length_m, places)
         self._reflections = [_drawn_reflection(size_m, cfg, places) for _ in range(cfg.multipath_paths)]
 
@@ -217,8 +206,7 @@ class TrueRadio:
     def _received(self, level_dbm: float) -> float | None:
         """Reading of a level by the receiver; None if the packet is lost."""
         noisy_dbm = level_dbm + self._cfg.white_sigma_db * self._noise.standard_normal()
-        is_lost = self._noise.random() < self._cfg.loss_probability or noisy_dbm < self._cfg.sensitivity_dbm
-        if is_lost:
+        if self._noise.random() < self._cfg.loss_probability or noisy_dbm < self._cfg.sensitivity_dbm:
             return None
         resolution_db = self._cfg.resolution_db
         return round(noisy_dbm / resolution_db) * resolution_db if resolution_db else noisy_dbm
@@ -247,10 +235,7 @@ class MovingTarget:
     def __init__(
         self, cfg: SimTargetConfig, size_m: Point, obstacles: Sequence[SimObstacleConfig], rng: np.random.Generator
     ) -> None:
-        self._cfg = cfg
-        self._obstacles = obstacles
-        self._size_m = size_m
-        self._rng = rng
+        self._cfg, self._obstacles, self._size_m, self._rng = cfg, obstacles, size_m, rng
         self._course_rad = rng.uniform(-pi, pi)
         self._next = 0
         self.position_m: Point = (cfg.x_m, cfg.y_m)

@@ -42,10 +42,7 @@ class TrueVehicle:
     def __init__(
         self, geometry: VehicleConfig, truth: SimVehicleConfig, pose: TruePose, rng: np.random.Generator
     ) -> None:
-        self._geometry = geometry
-        self._truth = truth
-        self._rng = rng
-        self.pose = pose
+        self._geometry, self._truth, self._rng, self.pose = geometry, truth, rng, pose
 
     def step(self, command: SimDriveCommand, interval_s: float) -> WheelReading:
         """Drive for an interval (s); its odometry."""
@@ -94,7 +91,11 @@ class RadioWorld:
         seed = cfg.run.seed if seed is None else seed
         self._cfg = cfg
         self.obstacles = list(cfg.sim.obstacles)
-        self._vehicle = TrueVehicle(cfg.vehicle, cfg.sim.vehicle, _true_start(cfg, seed), _stream(seed, _WHEELS))
+        x, y, turn = _stream(seed, _START).standard_normal(3).tolist()
+        start, offset_m = cfg.start, cfg.sim.vehicle.start_position_offset_m
+        heading_rad = start.heading_rad + cfg.sim.vehicle.start_heading_offset_rad * turn
+        pose = TruePose(start.x_m + offset_m * x, start.y_m + offset_m * y, heading_rad)
+        self._vehicle = TrueVehicle(cfg.vehicle, cfg.sim.vehicle, pose, _stream(seed, _WHEELS))
         self._target = MovingTarget(cfg.sim.target, cfg.workspace.size_m, cfg.sim.obstacles, _stream(seed, _TARGET))
         self._distances = _stream(seed, _DISTANCES)
         references = {name: beacon.reference_dbm for name, beacon in cfg.sim.beacons.items()}
@@ -175,13 +176,3 @@ class RadioWorld:
 
 def _stream(seed: int, *name: int) -> np.random.Generator:
     return np.random.default_rng([seed, *name])
-
-
-def _true_start(cfg: RadioConfig, seed: int) -> TruePose:
-    x, y, turn = _stream(seed, _START).standard_normal(3).tolist()
-    offset_m = cfg.sim.vehicle.start_position_offset_m
-    return TruePose(
-        cfg.start.x_m + offset_m * x,
-        cfg.start.y_m + offset_m * y,
-        cfg.start.heading_rad + cfg.sim.vehicle.start_heading_offset_rad * turn,
-    )

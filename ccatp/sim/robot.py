@@ -43,22 +43,15 @@ _FRAME_BYTES, _IMU_BYTES, _ENCODER_BYTES, _COUNTER_BYTES, _EDGE_BYTES = 420, 48,
 class Robot(LinkedRobot, SurveyTruth):
     """The robot from one boot to the next, at base where no ``start`` is given.
 
-    Attributes:
-        delivered_rows: ``delivered`` with plain tuples for samples, before the faults of its delivery; leave it as it
-            is.
-
-    ``rng`` is the parent of every random draw. ``ValueError``: the rates put more samples in a frame than a line may
+    ``rng`` is the parent of every random draw. ``delivered_rows``: ``delivered`` with plain tuples for samples, before
+    the faults of its delivery; leave it as it is. ``ValueError``: the rates put more samples in a frame than a line may
     hold, or a frame outlasts the TTL.
     """
 
     def __init__(
-        self,
-        cfg: Config,
-        mirror: Mirror,
-        rng: np.random.Generator,
-        faults: FaultPlan | None = None,
+        self, cfg: Config, mirror: Mirror, rng: np.random.Generator, faults: FaultPlan | None = None,
         start: DeckPose | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         sim = cfg.sim.robot
         _check_rates(cfg)
         world_rng, sensors_rng = rng.spawn(2)

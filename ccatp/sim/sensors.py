@@ -44,16 +44,11 @@ _Row = TypeVar("_Row", ImuSample, WheelSample, EdgeSample)
 
 
 class SampleTimes(NamedTuple):
-    """Instants of a sensor in one frame.
-
-    Attributes:
-        fractions: the instants as fractions of the frame, in (0, 1].
-        decays: ``exp(-tau/lag_s)`` of the wheel servo at the instants, tau counted from the start of the frame.
-    """
+    """Instants of a sensor in one frame."""
 
     times_s: list[float]
-    fractions: list[float]
-    decays: list[float]
+    fractions: list[float]  # of the frame, in (0, 1]
+    decays: list[float]  # ``exp(-tau/lag_s)`` of the wheel servo, tau counted from the start of the frame
 
 
 def sample_times(hz: float, frame_hz: float, lag_s: float, frame: int, count: int) -> list[SampleTimes]:

@@ -27,23 +27,13 @@ class World:
 
     ``rng`` is the parent of the generators; the draws of one kind do not depend on the others. ``pushes`` move the body
     besides the disturbances of the configuration. The robot stands at ``start``; at base, with an error, by default.
-
-    Attributes:
-        grip: share of its travel that each wheel gives to the body, right and left, besides its slip; may be set
-            before a step.
-        sensors: the edge sensors, for their clearance in the truth rows.
-        fall: why the robot fell, ``rim``, ``thrust`` or ``grip``; empty while it has not.
+    ``grip`` and ``sensors`` may be set before a step.
     """
 
     def __init__(
-        self,
-        cfg: Config,
-        mirror: Mirror,
-        rng: np.random.Generator,
-        window_frames: int,
-        pushes: Iterable[Disturbance] = (),
-        start: DeckPose | None = None,
-    ) -> None:
+        self, cfg: Config, mirror: Mirror, rng: np.random.Generator, window_frames: int,
+        pushes: Iterable[Disturbance] = (), start: DeckPose | None = None,
+    ) -> None:  # fmt: skip
         start_rng, truth_rng = rng.spawn(2)
         wheels_rng, slip_rng, creep_rng, vibration_rng = rng.spawn(4)
         self.mirror = mirror
@@ -65,14 +55,14 @@ class World:
         self._puck_height_m = robot.puck_height_m
         self._thrust_floor, self._fall_thrust_s = sim.fan_floor, sim.fall_thrust_s
         self._weak_s = 0.0
-        self.is_fallen, self.fall = False, ""
-        self.grip = (1.0, 1.0)
+        self.is_fallen, self.fall = False, ""  # why it fell: ``rim``, ``thrust`` or ``grip``
+        self.grip = (1.0, 1.0)  # share of its travel that each wheel, right and left, gives besides its slip
         self._places: deque[tuple[float, float]] = deque(maxlen=window_frames + 1)
         self._places.append((self.plant.x_m, self.plant.y_m))
         self._overhang, self._rim = mirror.overhang, NearOutline(mirror.rim)
         # The origin's distance to the rim is known to be at least this; it shrinks with the distance driven.
         self._rim_bound_m = -inf
-        self.sensors: EdgeSensors | None = None
+        self.sensors: EdgeSensors | None = None  # for their clearance in the truth rows
         self._has_looked = False
         self._clearance_m, self._off_mask = FAR_CLEARANCE_M, 0
 
