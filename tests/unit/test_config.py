@@ -251,9 +251,10 @@ def test_a_mistake_among_beacons_is_one_line(keys: dict[str, Any], message: str)
 
 def test_files_without_a_system_or_with_one_stand_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path / "radio.toml", "[run]\nseed = 1\n")
-    with monkeypatch.context() as elsewhere, pytest.raises(ConfigError, match="system is missing"):
+    with monkeypatch.context() as elsewhere:
         elsewhere.setattr("ccatp.config.load.configs_dir", lambda: tmp_path)
-        load_radio_config()
+        with pytest.raises(ConfigError, match="system is missing"):
+            load_radio_config()
     stand = "[cricket.networks]\nP = { place_m = [0.0, 0.0], facing = [1.0, 0.0] }\n"
     with pytest.raises(ConfigError, match="networks has 1; phase 1 goes from one network to the next"):
         load_radio_config(write(tmp_path / "one.toml", f'system = "cricket"\n{stand}'))
