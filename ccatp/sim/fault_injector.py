@@ -318,12 +318,9 @@ class Injector:
         for name in ("imu", "enc", "edge", "gravity"):
             rows[name] = [(self._stamp(t_s, row[0] - self._boot_s, is_frame=False), *row[1:]) for row in rows[name]]
         _, left, right = rows["fans"][-1]
-        stamp, gravity = (
-            self._stamp(t_s, t_s - self._boot_s, is_frame=True),
-            rows["gravity"][-1] if rows["gravity"] else None,
-        )
+        stamp, names = self._stamp(t_s, t_s - self._boot_s, is_frame=True), self._raised(t_s)
         lists, charge = (rows["imu"], rows["enc"], rows["edge"]), rows["soc"][-1][1]
-        names = self._raised(t_s)
+        gravity = rows["gravity"][-1] if rows["gravity"] else None
         return RobotFrame(frame.seq - self._seq_0, stamp, *lists, gravity, (left, right), charge, frame.cmd, names)
 
     def _stamp(self, t_s: float, at_s: float, *, is_frame: bool) -> float:
