@@ -51,10 +51,7 @@ class Changes(NamedTuple):
 
 
 def panel_changes(pairs: Sequence[tuple[PanelResult, PanelResult]]) -> Changes | None:
-    """Compare the panels of two surveys of one mirror; None without any.
-
-    The error of the puck's height, which all pistons share, is in no covariance: with another puck all seem to move.
-    """
+    """Compare the panels of two surveys of one mirror; None without any. With another puck all seem to move."""
     if not pairs:
         return None
     changes = []
@@ -239,10 +236,10 @@ def compare_data(pair: RunPair) -> dict[str, Any]:
         "b": run_data(pair.b),
         "one_mirror": pair.is_one_mirror,
         "half_wavefront_common_um": {"a": a, "b": b},
-        "panels": None if changes is None else [_panel(panel) for panel in changes.panels],
-        "chi2": None if changes is None else round(changes.chi2, 4),
-        "dof": None if changes is None else changes.dof,
-        "agree": None if changes is None else changes.agree,
+        "panels": changes and [_panel(panel) for panel in changes.panels],
+        "chi2": changes and round(changes.chi2, 4),
+        "dof": changes and changes.dof,
+        "agree": changes and changes.agree,
     }
 
 

@@ -116,20 +116,14 @@ def point_scene(mirror: Mirror, panels: Iterable[PanelId], deviations_m: dict[Po
         for point in mirror.point_ids(panel):
             if point in deviations_m:
                 pose = Pose(_on_surface(mirror, *mirror.point_on_deck(point)), UPRIGHT)
-                colour = Color(*colour_of(deviations_m[point]), 1.0)
+                share = max(-1.0, min(1.0, deviations_m[point] / FULL_SCALE_M))
+                ends = zip(EVEN, HIGH if share > 0.0 else LOW, strict=True)  # from blue (low) by way of white to red
+                colour = Color(*(even + abs(share) * (most - even) for even, most in ends), 1.0)
                 spheres.append(SpherePrimitive(pose, Vector(POINT_M, POINT_M, POINT_M), colour))
                 facts.append(KeyValuePair(f"point {point.point}", f"{1e6 * deviations_m[point]:.1f} um"))
         name = f"points {panel.row}-{panel.col}"
         entities.append(SceneEntity(timestamp, DECK, name, False, metadata=facts, spheres=spheres))
     return SceneUpdate((), entities)
-
-
-def colour_of(deviation_m: float) -> tuple[float, float, float]:
-    """Red, green and blue, 0 to 1, from blue (low) by way of white to red (high)."""
-    share = max(-1.0, min(1.0, deviation_m / FULL_SCALE_M))
-    end = HIGH if share > 0.0 else LOW
-    r, g, b = (even + abs(share) * (most - even) for even, most in zip(EVEN, end, strict=True))
-    return r, g, b
 
 
 def _on_surface(mirror: Mirror, x_m: float, y_m: float) -> Any:
@@ -196,8 +190,6 @@ EVERY_FRAMES = 10
 # All points are published again at this period, for viewers that start in the middle of a recording.
 POINTS_AGAIN_S = 60.0
 _KEPT = 1000
-
-
 _NUMBER, _INT = (float | msgspec.UnsetType, msgspec.UNSET), (int | msgspec.UnsetType, msgspec.UNSET)
 RobotView = _message(
     "Robot",
@@ -240,8 +232,6 @@ VIEWS = (
     TopicView("view/error", ErrorView, "ccatp.Error"),
 )
 _encode = msgspec.json.Encoder().encode
-
-
 _sensors = msgspec.json.Decoder(Sensors)
 
 
@@ -398,10 +388,7 @@ def check_host(host: str, *, is_open: bool) -> None:
 
 
 class PlotJugglerStream:
-    """Messages of three frames: topic, JSON, time as ASCII seconds.
-
-    Port 0 takes any free one; ``StreamError`` if the port is in use.
-    """
+    """Messages of three frames: topic, JSON, time as ASCII seconds; port 0 is any free one, StreamError: in use."""
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], host: str, port: int) -> None:
         self._socket = context.socket(zmq.XPUB)
@@ -413,9 +400,8 @@ class PlotJugglerStream:
             self._socket.bind(f"tcp://{host}:{port or '*'}")
         except (zmq.ZMQError, UnicodeError) as error:
             self._socket.close()
-            reason = error.strerror if isinstance(error, zmq.ZMQError) else "is no host name"
-            why = f"cannot listen on {host}:{port}: {reason}; choose another port"
-            raise StreamError(f"PlotJuggler: {why}") from error
+            why = error.strerror if isinstance(error, zmq.ZMQError) else "is no host name"
+            raise StreamError(f"PlotJuggler: cannot listen on {host}:{port}: {why}; choose another port") from error
         self.where = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
     def send(self, shown: RecordedMessage) -> None:

@@ -206,17 +206,14 @@ class RunFolder:
 
     def _summary(self, path: Path) -> Mapping[str, Any] | None:
         try:
-            found = json.loads(read_text(path))
+            if isinstance(found := json.loads(read_text(path)), dict):
+                return found
+            self.warnings.append(f"{path.name}: is no summary")
         except FileNotFoundError:
             self.missing.append(f"{path.name}: the run goes on, or was killed before its end")
-            return None
         except (OSError, ValueError) as error:
             self.warnings.append(f"{path.name}: cannot be read: {error}")
-            return None
-        if not isinstance(found, dict):
-            self.warnings.append(f"{path.name}: is no summary")
-            return None
-        return found
+        return None
 
     def recordings(self, topics: Iterable[str], columns: Mapping[str, int], holds: str) -> list[Recording | None]:
         """All recordings, each up to its end or its first damage; None in place of one that cannot be read at all.

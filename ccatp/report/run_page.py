@@ -126,7 +126,7 @@ def run_data(found: Findings) -> dict[str, Any]:
         "time_budget_s": budget
         and {
             "spent": _rounded(budget.spent_s),
-            "least": None if budget.least_s is None else _rounded(budget.least_s),
+            "least": budget.least_s and _rounded(budget.least_s),
             "total": round(budget.total_s, 3),
             "bound": None if budget.bound_s is None else round(budget.bound_s, 3),
             "is_exact": budget.is_exact,
@@ -207,12 +207,8 @@ def beacon_data(record: BeaconRecord) -> dict[str, Any]:
         "pose_nees_mean": None if pose_nees is None else round(pose_nees, 4),
         "nis_mean": nis and round(nis.mean, 4),
         "beacons": {
-            row.name: {
-                "x_m": round(row.place_m[0], 4),
-                "y_m": round(row.place_m[1], 4),
-                "sigma_m": round(row.sigma_m, 6),
-            }
-            for row in found["beacons"]
+            name: {"x_m": round(x_m, 4), "y_m": round(y_m, 4), "sigma_m": round(sigma_m, 6)}
+            for name, (x_m, y_m), sigma_m, *_ in found["beacons"]
         },
         "missing": list(record.missing),
         "warnings": list(record.warnings),
@@ -221,11 +217,8 @@ def beacon_data(record: BeaconRecord) -> dict[str, Any]:
 
 def _beacon_findings(record: BeaconRecord) -> dict[str, Any]:
     """How it ended; beacons and waypoints; of the frames that count and have a truth: errors and NEES; mean NIS."""
-    errors, nees, readings = (
-        beacon_record.pose_errors_m(record),
-        beacon_record.pose_nees(record),
-        beacon_record.readings_of(record),
-    )
+    errors, nees = beacon_record.pose_errors_m(record), beacon_record.pose_nees(record)
+    readings = beacon_record.readings_of(record)
     found: dict[str, Any] = {
         "outcome": outcome_of(record),
         "beacons": beacon_record.beacon_rows(record),

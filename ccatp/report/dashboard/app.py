@@ -71,10 +71,10 @@ COUNTERS = {"late_frames", "process_restarts", "process_cpu_seconds"}
 POINT_COUNTS = {"planned": "total", "measured": "done", "skipped": "skipped"}
 
 
-PROCESS_USE = (
-    ("process_cpu_seconds", "User and system time of a loop."),
-    ("process_resident_memory_bytes", "Resident memory of a loop."),
-)
+PROCESS_USE = {
+    "process_cpu_seconds": "User and system time of a loop.",
+    "process_resident_memory_bytes": "Resident memory of a loop.",
+}
 
 
 def process_use(pid: int) -> tuple[float, float] | None:
@@ -115,7 +115,7 @@ class StateCollector(Collector):
         build = (ccatp.__version__, platform.python_version())
         yield "build_info", "The program.", ("version", "python"), [(build, 1.0)]
         uses = {process: process_use(pid) for process, pid in state["pids"].items()}
-        for k, (name, text) in enumerate(PROCESS_USE):
+        for k, (name, text) in enumerate(PROCESS_USE.items()):
             yield name, text, ("process",), [((process,), use[k]) for process, use in uses.items() if use is not None]
         yield "dashboard_pages", "Open pages.", (), [((), self._pages())]
         yield "link_up", "1 when that end reports.", ("link",), [((link.name,), link.is_well) for link in links]
@@ -129,12 +129,8 @@ class StateCollector(Collector):
         active = [alarm for alarm in state["alarms"] if not alarm["ended"]]
         rows = [((alarm["name"], alarm["severity"]), 1.0) for alarm in active]
         yield "alarm", "1 for each active alarm.", ("name", "severity"), rows
-        yield (
-            "alarms_unacknowledged",
-            "Active, or ended and grave.",
-            (),
-            [((), sum(not alarm["acknowledged_by"] for alarm in state["alarms"]))],
-        )
+        unseen = sum(not alarm["acknowledged_by"] for alarm in state["alarms"])
+        yield "alarms_unacknowledged", "Active, or ended and grave.", (), [((), unseen)]
         if mission is not None:
             states = [((known,), known == mission["state"]) for known in self._ground["states"]]
             yield "mission_state", "1 for the state of the mission.", ("state",), states
@@ -253,13 +249,9 @@ class RequestCheckMiddleware:
 
 
 def build_app(
-    hub: StateBroadcaster,
-    commands: CommandEndpoint,
-    ground: Mapping[str, Any],
-    cfg: DashboardConfig,
-    tokens: Mapping[str, str],
-    log: structlog.typing.FilteringBoundLogger,
-) -> ASGIApp:
+    hub: StateBroadcaster, commands: CommandEndpoint, ground: Mapping[str, Any], cfg: DashboardConfig,
+    tokens: Mapping[str, str], log: structlog.typing.FilteringBoundLogger,
+) -> ASGIApp:  # fmt: skip
     """The application; ``ground``: see ``survey_view.ground``; commands need one of ``tokens``, by name."""
     refusals = LogRateLimit(REFUSAL_LINES, REFUSAL_PERIOD_S)
     static = StaticFiles(directory=STATIC)
@@ -426,10 +418,6 @@ class LimitedProtocol(H11Protocol):
     def _is_serving(self) -> bool:
         return bool(self.headers) and not self.cycle.response_complete
 
-    @property
-    def _is_command(self) -> bool:
-        return self._is_serving and "is_command" in self.scope["state"]
-
     def _find_surplus(self) -> "LimitedProtocol | None":
         """The connection that gives way to this one: this one where all others are commands."""
         address_of = {one: one.client and one.client[0] for one in self.connections if isinstance(one, LimitedProtocol)}
@@ -443,7 +431,7 @@ class LimitedProtocol(H11Protocol):
             return None
         others = [one for one, address in address_of.items() if address in addresses and one is not self]
         return min(
-            (one for one in others if not one._is_command),
+            (one for one in others if not (one._is_serving and "is_command" in one.scope["state"])),
             key=lambda one: (one._is_serving and not one.flow.write_paused, one._opened_s),
             default=self,
         )
@@ -470,19 +458,10 @@ async def serve(app: ASGIApp, listener: socket.socket, cfg: DashboardConfig, sto
 
     logging.getLogger("uvicorn.access").disabled = True
     config = uvicorn.Config(
-        app,
-        http=Protocol,
-        ws="none",
-        loop="none",
-        lifespan="off",
-        log_config=None,
-        access_log=False,
-        proxy_headers=False,
-        server_header=False,
-        timeout_keep_alive=KEEP_ALIVE_S,
-        timeout_graceful_shutdown=GRACE_S,
+        app, http=Protocol, ws="none", loop="none", lifespan="off", log_config=None, access_log=False,
+        proxy_headers=False, server_header=False, timeout_keep_alive=KEEP_ALIVE_S, timeout_graceful_shutdown=GRACE_S,
         h11_max_incomplete_event_size=MAX_HEADER_BYTES,
-    )
+    )  # fmt: skip
     server = _Server(config)
 
     async def end() -> None:

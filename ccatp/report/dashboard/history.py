@@ -1,6 +1,7 @@
 """What grows while a run lasts, bounded: series of the plots, the driven path, messages, errors against the truth."""
 
 import asyncio
+import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -220,7 +221,8 @@ class RunFiles:
     latched, each with kind, id and note.
     """
 
-    def __init__(self, folder: Path, lines: Lines) -> None:
+    def __init__(self, folder: Path | None, lines: Lines) -> None:
+        folder = folder or Path(os.devnull)  # in which there is nothing
         self._log, self._latch, self._lines = folder / LOG, folder / EMERGENCIES, lines
         self._file: BinaryIO | None = None
         self._rest = b""

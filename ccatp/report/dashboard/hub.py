@@ -14,14 +14,11 @@ from ccatp.report.dashboard.view import RunStateView
 
 
 class Wants(NamedTuple):
-    """The topics of one kind of mission; ``main`` are the rare ones besides those of every mission.
+    """The topics of one kind of mission."""
 
-    ``track`` and ``truth`` come in batches, once a second or somewhat more often.
-    """
-
-    main: tuple[str, ...]
-    track: str
-    truth: str
+    main: tuple[str, ...]  # the rare ones besides those of every mission
+    track: str  # in batches, once a second or somewhat more often
+    truth: str  # likewise
     once: tuple[str, ...]
 
 
@@ -37,14 +34,9 @@ class BusReader:
     """Subscriptions of the dashboard: rare topics always, the others on request; no publisher waits for them."""
 
     def __init__(
-        self,
-        context: zmq.Context[zmq.Socket[bytes]],
-        endpoint_of: Callable[[str], str],
-        view: RunStateView,
-        *,
-        is_sim: bool,
-        wants: Wants = SURVEY,
-    ) -> None:
+        self, context: zmq.Context[zmq.Socket[bytes]], endpoint_of: Callable[[str], str], view: RunStateView,
+        *, is_sim: bool, wants: Wants = SURVEY,
+    ) -> None:  # fmt: skip
         self._context, self._endpoint_of, self._view = context, endpoint_of, view
         # The main loop makes a display state only for counted subscribers; a run counts those of the verdict.
         uncounted, watched = {"is_uncounted": True}, {"is_uncounted": True, "is_watching": True}

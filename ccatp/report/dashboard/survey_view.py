@@ -4,7 +4,7 @@ from math import dist
 from pathlib import Path
 from typing import Any
 
-from ccatp.config.models import Config, SurveyMetadata
+from ccatp.config.models import Config
 from ccatp.core import PanelId, PanelPose, PointId, Vector3
 from ccatp.links.topics import ArrivalMessage, DisplayState, FixMessage, MissionStatus, TrackMessage
 from ccatp.mirror.mirror import Mirror, deck_poses
@@ -40,12 +40,17 @@ def survey_points(mirror: Mirror, cfg: Config) -> list[PointId]:
 
 def ground(mirror: Mirror, cfg: Config, *, is_sim: bool) -> dict[str, Any]:
     """What does not change during a run: map and settings of the page; lengths in m, deck frame."""
-    base = mirror.base_pose
+    base, observation = mirror.base_pose, cfg.observation
+    about = {
+        "telescope": observation.telescope,
+        "survey by": observation.operator,
+        "robot": observation.robot_serial_number,
+    }
     return {
         "title": mirror.name,
         "is_sim": is_sim,
         "subtitle": f"world {cfg.world.name}, seed {cfg.run.seed}" if is_sim else f"filter {cfg.run.filter}",
-        "about": [[name, text] for name, text in _about(cfg.observation) if text],
+        "about": [[name, text] for name, text in about.items() if text],
         "panels": [
             [p.id.row, p.id.col, *(round(v, 4) for v in (p.x_m, p.y_m, p.half_x_m, p.half_y_m))]
             for p in mirror.panels.values()
@@ -80,14 +85,6 @@ def ground(mirror: Mirror, cfg: Config, *, is_sim: bool) -> dict[str, Any]:
         "hides": [],
         "words": WORDS,
     }
-
-
-def _about(observation: SurveyMetadata) -> list[tuple[str, str]]:
-    return [
-        ("telescope", observation.telescope),
-        ("survey by", observation.operator),
-        ("robot", observation.robot_serial_number),
-    ]
 
 
 # Rows of robot time (s) and: arrival error by the laser (mm); how far a fix moved the estimate (mm); NIS and degrees of

@@ -157,15 +157,9 @@ class RunStateView:
     """
 
     def __init__(
-        self,
-        *,
-        points: int,
-        is_sim: bool,
-        series: Iterable[str],
-        lines: Iterable[str],
-        run_dir: Path | None = None,
+        self, *, points: int, is_sim: bool, series: Iterable[str], lines: Iterable[str], run_dir: Path | None = None,
         has_laser: bool = True,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._is_sim = is_sim
         self.links = Links(has_laser=has_laser)
         self.status: MissionStatus | None = None
@@ -181,7 +175,8 @@ class RunStateView:
         self._trail = Trail(MAX_PATH, GAP_S)
         self._series = {name: Growing(MAX_SAMPLES, GAP_S if name in set(lines) else inf) for name in series}
         self._lines = Lines(MAX_LINES)
-        self._files = None if run_dir is None else RunFiles(run_dir, self._lines)
+        self._files = RunFiles(run_dir, self._lines)
+        self.read_files, self.close = self._files.read, self._files.close
         self._states = [PLANNED] * points
         self._errors_mm: list[float | None] = [None] * points
         self._changed: set[int] = set()
@@ -204,16 +199,6 @@ class RunStateView:
         handler = self._handlers.get(type(message))
         if handler is not None:
             handler(message, now_s)
-
-    def read_files(self) -> None:
-        """Take what is new in the run directory."""
-        if self._files is not None:
-            self._files.read()
-
-    def close(self) -> None:
-        """Close the files."""
-        if self._files is not None:
-            self._files.close()
 
     def prepend(self, past: "RunStateView") -> None:
         """Put what another view has of an earlier time before what this one has."""
@@ -344,8 +329,8 @@ class RunStateView:
             "robot": self._robot(),
             "sensors_age_s": self.links.sensors_age_s(now_s),
             "utc_s": time.time(),
-            "started": "" if self._files is None else self._files.started,
-            "emergencies": [] if self._files is None else self._files.emergencies,
+            "started": self._files.started,
+            "emergencies": self._files.emergencies,
             "messages_left_out": self._lines.left_out,
             "alarms": [] if mission is None or self.links.is_over else mission.pop("alarms"),
         }
