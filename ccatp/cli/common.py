@@ -9,6 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -69,10 +70,7 @@ class ConfigFile(click.Path):
 
 
 class OutputFile(click.Path):
-    """A file to be written: what cannot be is refused before the work, not after it.
-
-    Its name must end in one of ``formats``; however it likes, if none is given.
-    """
+    """A file to be written, with one of the suffixes ``formats``, if any: what cannot be is refused before the work."""
 
     def __init__(self, *formats: str) -> None:
         super().__init__(dir_okay=False, path_type=Path)
@@ -115,9 +113,10 @@ class CommandGroup(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The first sentence of each command's help, whole, where click cuts it off."""
         for title, commands in (self.sections or {"Commands": [*self.commands.values()]}).items():
-            rows = [(command.name or "", _first_sentence(command.help or "")) for command in commands]
+            texts = [" ".join((command.help or "").split()) for command in commands]
+            firsts = [re.split(r"(?<=[.:;])\s", text, maxsplit=1)[0].rstrip(".:;") for text in texts]
             with formatter.section(title):
-                formatter.write_dl(rows)
+                formatter.write_dl([(one.name or "", text) for one, text in zip(commands, firsts, strict=True)])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -127,10 +126,6 @@ class CommandGroup(click.Group):
         if name not in self.commands and new_name in self.commands:
             raise click.UsageError(f"the command {name!r} is now called {new_name!r}", ctx)
         return super().resolve_command(ctx, args)
-
-
-def _first_sentence(text: str) -> str:
-    return re.split(r"(?<=[.:;])\s", " ".join(text.split()), maxsplit=1)[0].rstrip(".:;")
 
 
 def run_command_line(group: click.Group, argv: Sequence[str] | None = None) -> int:
@@ -225,6 +220,13 @@ def print_lines(lines: Iterable[str]) -> None:
         click.echo(printable(line))
 
 
+def columns(rows: Sequence[Sequence[str]], *, left: int = 99) -> list[str]:
+    """Rows as lines, their first ``left`` columns aligned to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    formats = [f"{'<' if k < left else '>'}{width}" for k, width in enumerate(widths)]
+    return ["  ".join(map(format, row, formats)).rstrip() for row in rows]
+
+
 def write_lines(option: str, path: Path, lines: Iterable[str]) -> None:
     """Write the text file that an option names. Raises ConfigError: it cannot be written."""
     try:
@@ -241,13 +243,7 @@ def example(*lines: str) -> str:
 
 def options(*decorators: Callable[[Command], Command]) -> Callable[[Command], Command]:
     """Several options as one decorator, shown in the order given."""
-
-    def decorate(command: Command) -> Command:
-        for decorator in reversed(decorators):
-            command = decorator(command)
-        return command
-
-    return decorate
+    return lambda command: reduce(lambda changed, decorator: decorator(changed), reversed(decorators), command)
 
 
 def renamed_flag(old: str, new: str) -> Callable[[Command], Command]:
@@ -262,10 +258,7 @@ def renamed_flag(old: str, new: str) -> Callable[[Command], Command]:
 
 
 def parse_setting(text: str) -> tuple[str, object]:
-    """``run.seed=2`` as ``("run.seed", 2)``. The value is TOML, or else text.
-
-    Raises ValueError: there is no key or no ``=``.
-    """
+    """``run.seed=2`` as ``("run.seed", 2)``, the value TOML or else text; ValueError: there is no key or no ``=``."""
     from ccatp.config.messages import MOST_PARTS, parse_toml
 
     key, equals, value = text.partition("=")
@@ -280,14 +273,13 @@ def parse_setting(text: str) -> tuple[str, object]:
     return key.strip(), found["value"] if len(found) == 1 else value.strip()
 
 
-def _changes(ctx: click.Context) -> dict[str, object]:
+def _changes(ctx: click.Context) -> Any:
     """What this command line sets of the configuration, by dotted key."""
-    changes: dict[str, object] = ctx.meta.setdefault("ccatp.changes", {})
-    return changes
+    return ctx.meta.setdefault("ccatp.changes", {})
 
 
 def _take_settings(ctx: click.Context, _param: click.Parameter, values: Iterable[str]) -> dict[str, object]:
-    changes = _changes(ctx)
+    changes: dict[str, object] = _changes(ctx)
     try:
         changes.update(parse_setting(value) for value in values)
     except ValueError as error:
@@ -307,11 +299,7 @@ def key_option(flag: str, key: str, **attributes: Any) -> Callable[[Command], Co
 
 def names_of(folder: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
     """Completes the names of shipped configurations in a folder; a path of a file is the shell's own business."""
-
-    def complete(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
-        return [name for name in shipped_names(folder) if name.startswith(incomplete)]
-
-    return complete
+    return lambda _ctx, _param, incomplete: [name for name in shipped_names(folder) if name.startswith(incomplete)]
 
 
 def shipped_names(folder: str) -> list[str]:
@@ -380,10 +368,7 @@ def overrides(settings: Mapping[str, object], named: Mapping[str, object]) -> di
 
 
 def configured_folder(config_file: Path | None, runtime_dir: Path | None) -> Path | None:
-    """The runtime directory that command line or configuration names, else that of the only daemon that runs.
-
-    ``None``: none runs. Raises ConfigError: several run.
-    """
+    """The named runtime directory, else that of the only daemon that runs; None: none runs, ConfigError: several."""
     if runtime_dir is None and config_file is not None:
         from ccatp.daemon.process import processes_of, read_config
 

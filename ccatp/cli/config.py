@@ -15,6 +15,7 @@ from ccatp.cli.common import (
     PATH,
     SETTINGS_OPTION,
     CommandGroup,
+    columns,
     complain,
     example,
     json_option,
@@ -186,8 +187,7 @@ def show_public(folder: Path, name: str | None, json_output: bool) -> None:
     if json_output:
         click.echo(json.dumps(shown))
         return
-    width = max(map(len, shown))
-    print_lines(f"{key:<{width}}  {value}" for key, value in shown.items())
+    print_lines(columns([*shown.items()]))
 
 
 SHELLS = ("bash", "zsh", "fish")

@@ -156,18 +156,13 @@ def tune(
         click.echo(json.dumps({**found._asdict(), "right": found.right._asdict(), "left": found.left._asdict()}))
         return 0
     print_lines(
-        [
-            *(
-                f"{name:<6} static {wheel.static_v:.2f} V, {wheel.volt_per_rad_s:.3f} V per rad/s, "
-                f"time constant {1e3 * wheel.time_constant_s:.0f} ms, fit to {wheel.residual_v:.2f} V"
-                for name, wheel in (("right", found.right), ("left", found.left))
-            ),
-            f"step: off its course by {found.deviation_rad_s:.3f} rad/s rms, overshoot {found.overshoot_share:.1%}",
-            "",
-            "[servo]",
-            *(f"{key} = {value}" for key, value in found.values.items()),
-        ]
+        f"{name:<6} static {wheel.static_v:.2f} V, {wheel.volt_per_rad_s:.3f} V per rad/s, "
+        f"time constant {1e3 * wheel.time_constant_s:.0f} ms, fit to {wheel.residual_v:.2f} V"
+        for name, wheel in (("right", found.right), ("left", found.left))
     )
+    course = f"{found.deviation_rad_s:.3f} rad/s rms, overshoot {found.overshoot_share:.1%}"
+    values = [f"{key} = {value}" for key, value in found.values.items()]
+    print_lines([f"step: off its course by {course}", "", "[servo]", *values])
     return 0
 
 

@@ -18,6 +18,7 @@ from ccatp.cli.common import (
     PATH,
     RUNTIME_DIR_OPTION,
     TIMEOUT_OPTION,
+    columns,
     configured_folder,
     example,
     json_option,
@@ -26,12 +27,8 @@ from ccatp.cli.common import (
 )
 from ccatp.errors import ConfigError, DaemonUnreachableError
 
-DAEMON_OPTIONS = options(
-    CONFIG_OPTION,
-    RUNTIME_DIR_OPTION,
-    TIMEOUT_OPTION,
-    json_option("The daemon's answer as JSON on standard output."),
-)
+_JSON = json_option("The daemon's answer as JSON on standard output.")
+DAEMON_OPTIONS = options(CONFIG_OPTION, RUNTIME_DIR_OPTION, TIMEOUT_OPTION, _JSON)
 EMERGENCY_KINDS = ("fire", "earthquake", "power", "weather", "operator")
 # Without a terminal a line is shown at a change, and at least this often.
 QUIET_S = 10.0
@@ -51,11 +48,10 @@ def _print_reply(reply: Mapping[str, Any], json_output: bool, page: str = "") ->
         return
     from ccatp.daemon.terminal import status_rows
 
-    facts, status = [(name, value) for name, value in reply.items() if name != "ok"], reply.get("status")
+    facts, status = [(name, str(value)) for name, value in reply.items() if name != "ok"], reply.get("status")
     rows = list(status_rows(status)) if isinstance(status, Mapping) else facts
     rows += [("page", page)] if page else []
-    width = max((len(name) for name, _ in rows), default=0)
-    print_lines([f"{name:<{width}}  {value}" for name, value in rows] or ["ok"])
+    print_lines(columns(rows) or ["ok"])
 
 
 def _user() -> str:
@@ -263,8 +259,7 @@ def _answers(folder: Path | None, timeout_s: float, period_s: float) -> Iterator
 def _watch_lines(answers: Iterator[dict[str, Any]]) -> None:
     from ccatp.daemon.terminal import status_line
 
-    shown: tuple[object, ...] = ()
-    shown_s = 0.0
+    shown, shown_s = tuple[object, ...](), 0.0
     for answer in answers:
         found = answer.get("status", {})
         newest = (found.get("state"), found.get("done"), found.get("cause"))

@@ -102,15 +102,10 @@ def check(
     if json_output:
         click.echo(json.dumps(as_json(found)))
     else:
-        for line in lines(found):
-            click.echo(_coloured(printable(line)))
+        for line in map(printable, lines(found)):
+            outcome = line[:4]  # a terminal shows it in colour
+            click.echo(click.style(outcome, COLOURS[outcome]) + line[4:] if outcome in COLOURS else line)
     return int(ExitStatus.REFUSED if has_failed(found) else ExitStatus.COMPLETE)
-
-
-def _coloured(line: str) -> str:
-    """A line of the result; a terminal shows its outcome in colour."""
-    outcome, rest = line[:4], line[4:]
-    return click.style(outcome, COLOURS[outcome]) + rest if outcome in COLOURS else line
 
 
 @click.command(

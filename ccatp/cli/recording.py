@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ccatp.cli.common import PATH, CommandGroup, example, json_option, warn, write_lines
+from ccatp.cli.common import PATH, CommandGroup, columns, example, json_option, print_lines, warn, write_lines
 from ccatp.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -63,8 +63,7 @@ def repair(path: Path, out: Path | None, json_output: bool) -> int:
     saved = recover(file, out or file.with_name(f"{file.stem}.recovered{file.suffix}"))
     lost = saved.condition.lost_bytes
     if json_output:
-        end_s = saved.end_s
-        facts = {"file": str(saved.path), "messages": saved.messages, "end_s": end_s, "lost_bytes": lost}
+        facts = {"file": str(saved.path), "messages": saved.messages, "end_s": saved.end_s, "lost_bytes": lost}
         click.echo(json.dumps({**facts, "was_complete": saved.condition.is_complete}))
         return 0
     until = "" if saved.end_s is None else f" up to {saved.end_s:.2f} s"
@@ -159,11 +158,7 @@ def _print_facts(facts: "RecordingFacts") -> None:
         length_s = (topic.end_s or 0.0) - (topic.start_s or 0.0)
         per_s = f"{(topic.messages - 1) / length_s:.2f}" if topic.messages > 1 and length_s > 0.0 else "-"
         rows.append((name, topic.schema, str(topic.messages), per_s, f"{topic.payload_bytes / 1e3:.1f}"))
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    for row in rows:
-        left = "  ".join(text.ljust(width) for text, width in zip(row[:2], widths[:2], strict=True))
-        right = "  ".join(text.rjust(width) for text, width in zip(row[2:], widths[2:], strict=True))
-        click.echo(f"  {left}  {right}")
+    print_lines(f"  {line}" for line in columns(rows, left=2))
     if empty := sum(not topic.messages for topic in facts.topics.values()):
         click.echo(f"  {empty} topic{'s' if empty > 1 else ''} without messages")
     if facts.is_in_order:

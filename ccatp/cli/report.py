@@ -105,7 +105,6 @@ class ReplayError(UsageError):
 
 
 def _check_effect(settings: Mapping[str, object], keys: tuple[str, ...], what: str) -> None:
-    """ConfigError: a key has no effect on ``what``."""
     if idle := [key for key in settings if not key.startswith(keys)]:
         raise ConfigError(f"command line: {idle[0]}: has no effect on {what}; what has: {', '.join(keys)}")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ccatp.cli.common import JSON_OPTION, PATH, CommandGroup, example, print_lines
+from ccatp.cli.common import JSON_OPTION, PATH, CommandGroup, columns, example, print_lines
 from ccatp.errors import ConfigError, ExitStatus
 
 # Files of a run directory, and what they are.
@@ -48,11 +48,7 @@ def list_runs(folder: Path, json_output: bool) -> None:
         click.echo(json.dumps({"runs": found}))
         return
     head = {"began": "began (UTC)", "state": "state", "points": "points", "size_mb": "MB", "what": "what", "run": "run"}
-    rows = [{key: str(run[key]) for key in head} for run in (head, *found)]
-    width = {key: max(len(row[key]) for row in rows) for key in head}
-    print_lines(
-        ["  ".join(f"{row[key]:<{width[key]}}" for key in head).rstrip() for row in rows] if found else ["none"]
-    )
+    print_lines(columns([[str(run[key]) for key in head] for run in (head, *found)]) if found else ["none"])
 
 
 @runs.command("show", epilog=example("ccatp runs show runs/tonight"))
