@@ -30,8 +30,7 @@ def run_bench(
 ) -> dict[str, Any]:
     """Run every benchmark, ``quick`` with a tenth of the repeats and missions of one panel.
 
-    ``run_args``: what else ``ccatp run`` needs to work on the same configuration. BenchError: a peer's result differs,
-    or a mission failed.
+    ``run_args``: what else ``ccatp run`` needs for this configuration. BenchError: results differ, a mission failed.
     """
     # Missions first: they start in a process that has allocated little.
     of_frames = frame_cases(cfg, run_args, quick=quick) if frames else []
@@ -118,32 +117,18 @@ def largest_difference(ours: Contender, peer: Contender) -> float:
 
 def machine() -> dict[str, object]:
     """Processor, usable cores, Python, build and versions of what takes part, threads of the linear algebra."""
-    try:
+    cpu, cores = platform.processor() or platform.machine(), os.cpu_count() or 1
+    with suppress(OSError):  # the model as the kernel names it
+        lines = [line.partition(":") for line in CPU_INFO.read_text(encoding="utf-8").splitlines()]
+        cpu = next((model.strip() for name, _, model in lines if name.strip() == "model name"), cpu)
+    with suppress(AttributeError):  # not on every system
         cores = len(os.sched_getaffinity(0))
-    except AttributeError:  # not on every system
-        cores = os.cpu_count() or 1
-    return {
-        "cpu": _cpu_model(),
-        "cores": cores,
-        "python": platform.python_version(),
-        **{name: _version(name) for name in PACKAGES},
-        "blas_threads": os.environ.get("OPENBLAS_NUM_THREADS"),
-    }
-
-
-def _cpu_model() -> str:
-    """The model as the kernel names it, or what the platform knows."""
-    with suppress(OSError):
-        for line in CPU_INFO.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
-
-
-def _version(package: str) -> str | None:
-    with suppress(PackageNotFoundError):
-        return version(package)
-    return None
+    versions: dict[str, str | None] = dict.fromkeys(PACKAGES)
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
+    blas_threads = os.environ.get("OPENBLAS_NUM_THREADS")
+    return {"cpu": cpu, "cores": cores, "python": platform.python_version(), **versions, "blas_threads": blas_threads}
 
 
 BY_HAND = "<!-- by hand -->\n"

@@ -212,14 +212,8 @@ def _pool(count: int) -> Iterator[Executor]:
 def prepare_worker() -> None:
     """Leave Ctrl-C to the parent, and end with it however it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
-
-
-def _end_with(sentinel: int) -> None:
-    connection.wait([sentinel])
-    os._exit(1)
+    if (parent := multiprocessing.parent_process()) is not None:
+        Thread(target=lambda: (connection.wait([parent.sentinel]), os._exit(1)), daemon=True).start()
 
 
 @contextmanager
@@ -297,10 +291,8 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
         _print(console, study, f"{len(todo)} jobs to do" + (f", {len(done)} done before" if done else ""))
         failures = _run_jobs(study, todo, store, console, options) if todo else []
         found = [[one for job in group if (one := store.find(job)) is not None] for group in plan]
-    results = [
-        cell_result(study, group[0].factors, [one.outcome for one in there])
-        for group, there in zip(plan, found, strict=True)
-    ]
+    parts = zip(cells, found, strict=True)
+    results = [cell_result(study, cell.factors, [one.outcome for one in there]) for cell, there in parts]
     missing = len(jobs) - sum(map(len, found))
     about: dict[str, Any] = {
         "wall_s": round(time.perf_counter() - started_s, 3),
@@ -314,13 +306,9 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
             f"{len(failures)} of {len(todo)} jobs failed, the first: {failures[0]}; see {options.out / FAILURES}; "
             "the results are those of the others: the same command tries again"
         )
-    text = f"all {len(jobs)} jobs are done; results are in {options.out}"
-    if missing:
-        text = (
-            f"{len(jobs) - missing} of {len(jobs)} jobs are done; the other shards, "
-            f"or the same command without --shard, do the {missing} that are missing"
-        )
-    _print(console, study, text)
+    others = f"the other shards, or the same command without --shard, do the {missing} that are missing"
+    text = f"{len(jobs) - missing} of {len(jobs)} jobs are done; {others}"
+    _print(console, study, text if missing else f"all {len(jobs)} jobs are done; results are in {options.out}")
     return result
 
 

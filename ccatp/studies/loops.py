@@ -8,7 +8,7 @@ with the delay of the link. Needs the extra ``tune`` (python-control), imported 
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, product
 from math import degrees, inf, isfinite, pi, sqrt, tau
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -39,14 +39,11 @@ PADE_ORDER = 4
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """One open loop L(s) = C(s) P(s) exp(-s tau).
-
-    Plant ``printed`` is 1/(T s + 1), ``true`` 1/(s (T s + 1)).
-    """
+    """One open loop L(s) = C(s) P(s) exp(-s tau)."""
 
     gains: str
     axis: str  # forward (distance, m), angular (turn in place, rad) or steering (heading on a leg, rad)
-    plant: str
+    plant: str  # ``printed`` is 1/(T s + 1), ``true`` 1/(s (T s + 1))
     lag_s: float
     delay_frames: int
     delay_s: float  # tau
@@ -117,11 +114,10 @@ def loops_of(cfg: Config) -> Iterator[Loop]:
         axes = {"forward": gains.forward, "angular": gains.angular}
         if gains.shaped:
             axes["steering"] = steering(cfg.limits, cfg.control)
-        for axis, pid in axes.items():
-            for plant in ("true",) if gains.shaped else ("printed", "true"):
-                for frames in DELAYS_FRAMES:
-                    is_filtered = plant == "true" and not gains.shaped  # printed: as eq. 3.4; else as it is built
-                    yield open_loop(name, axis, pid, plant, lag_s, frames, frame_s, is_filtered=is_filtered)
+        plants = ("true",) if gains.shaped else ("printed", "true")
+        for (axis, pid), plant, frames in product(axes.items(), plants, DELAYS_FRAMES):
+            is_filtered = plant == "true" and not gains.shaped  # printed: as eq. 3.4; else as it is built
+            yield open_loop(name, axis, pid, plant, lag_s, frames, frame_s, is_filtered=is_filtered)
 
 
 def limit_of(cfg: Config) -> Iterator[Loop]:

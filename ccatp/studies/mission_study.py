@@ -16,9 +16,9 @@ from scipy.special import chdtri
 
 from ccatp.config.models import Config
 from ccatp.core import FloatArray, IntArray, PointId
-from ccatp.filters.metrics import nees
+from ccatp.filters.metrics import nees, rms
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.records.summary import WITHIN_M, arrival_error_m, distribution
+from ccatp.records.summary import WITHIN_M, arrival_error_m, distribution, rounded
 from ccatp.studies.campaign import Arrays, Factors, Job, JobOutcome
 from ccatp.studies.results import chi_square_band
 from ccatp.studies.sil_run import SilResult, StopRow, rehearse
@@ -215,7 +215,7 @@ def combine_missions(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
         "arrival_error_after_first_leg_mm": of_values(later[:, COLUMN["arrival_m"]]),
         "localization_error_mm": of_histogram(everywhere),
         "localization_error_after_first_leg_mm": of_histogram(afterwards),
-        "heading_error_mrad": {"rms": None if turn_square is None else round(float(np.sqrt(turn_square)), 3)},
+        "heading_error_mrad": {"rms": None if turn_square is None else rounded(np.sqrt(turn_square), 3)},
         "stop_error_mm": {**_stop_errors(arrivals), "after_first_leg": _stop_errors(later)},
         "nees": {"pose": _nees_figures(arrivals, 3), "position": _nees_figures(arrivals, 2)},
         "nis": chi_square_figures(stops[:, COLUMN["nis"]], 2),
@@ -228,7 +228,7 @@ def combine_missions(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
         **times(values),
         "danger": dangers(values),
         "panels": {
-            name: _root_mean_square([v["panels"][name] for v in values if v["panels"][name] is not None])
+            name: rounded(rms(np.array([v["panels"][name] for v in values if v["panels"][name] is not None])), 3)
             for name in ("piston_rms_um", "tilt_rms_urad")
         },
         "counts": {name: sum(v["counts"].get(name, 0) for v in values) for name in values[0]["counts"]},
@@ -310,10 +310,6 @@ def _last_of_each(stops: FloatArray) -> FloatArray:
     names = stops[:, [COLUMN["row"], COLUMN["col"], COLUMN["point"]]]
     _, backwards = np.unique(names[::-1], axis=0, return_index=True)
     return stops[::-1][np.sort(backwards)]
-
-
-def _root_mean_square(values: Sequence[float]) -> float | None:
-    return round(float(np.sqrt(np.mean(np.square(values)))), 3) if values else None
 
 
 def _mm(value_m: Any) -> float:

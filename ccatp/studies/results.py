@@ -98,11 +98,8 @@ def write_results(
     there = [cell for cell in cells if cell.values["runs"]]
     arrays = {f"{k}/{name}": array for k, cell in enumerate(cells) for name, array in cell.arrays.items()}
     np.savez_compressed(out / "result.npz", allow_pickle=False, **arrays)
-    _write_whole(
-        out / "table.md",
-        f"# {study.name}: {study.title}\n\n" + table([row for row in rows if row["runs"]], study.columns),
-    )
-    _write_whole(out / "result.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
+    shown = table([row for row in rows if row["runs"]], study.columns)
+    _write(out, result, f"# {study.name}: {study.title}\n\n{shown}")
     if with_figures and there:
         study.draw(there, out)
     return result
@@ -113,16 +110,17 @@ def write_analysis(
 ) -> dict[str, Any]:
     """Write ``result.json`` and ``table.md`` of a study without runs, begun at ``started_s`` of ``perf_counter``."""
     result = {"study": name, "cells": list(cells), "wall_s": time.perf_counter() - started_s}
-    _write_whole(out / "table.md", table(cells, columns))
-    _write_whole(out / "result.json", json.dumps(result, indent=1) + "\n")
+    _write(out, result, table(cells, columns))
     return result
 
 
-def _write_whole(path: Path, text: str) -> None:
-    """A reader sees the old file or the new one, never a part."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    draft.write_text(text, encoding="utf-8")
-    draft.replace(path)
+def _write(out: Path, result: Mapping[str, Any], markdown: str) -> None:
+    """A reader sees the old files or the new ones, never a part of one."""
+    texts = {"table.md": markdown, "result.json": json.dumps(result, indent=1, allow_nan=False) + "\n"}
+    for name, text in texts.items():
+        draft = out / f".{name}.{os.getpid()}"
+        draft.write_text(text, encoding="utf-8")
+        draft.replace(out / name)
 
 
 # -- figures ----------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ run of the daemon with the same configuration and seed go through the same state
 
 from array import array
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import hypot
 from typing import Any
@@ -90,11 +90,8 @@ class SilTrace:
         self.builder.set_plan(parts.total_points, parts.lower_bound_s)
         self._mirror = parts.mirror
         self._truth = array("d")
+        self.note_truth: Callable[[TruthRow], None] = self._truth.extend  # at the newest frame
         self._estimates = TraceBuilder()
-
-    def note_truth(self, row: TruthRow) -> None:
-        """The truth at the newest frame."""
-        self._truth.extend(row)
 
     def note_estimate(self, seq: int, t_s: float, pose: PanelPose) -> None:
         """The estimate after frame ``seq``."""
@@ -262,8 +259,7 @@ class SilRun:
             self.robot.permit(self._drive_seq, verdict.forward, verdict.reverse, verdict.turn)
 
     def _note_truth(self) -> None:
-        robot = self.robot
-        self.trace.note_truth(robot.world.truth_row(robot.seq, robot.t_s))
+        self.trace.note_truth(self.robot.truth_row())
 
     # -- a frame, as in daemon.frame_service and daemon.danger_loop ---------------------------------------------------
 
