@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.blas import daxpy, dscal, dtrsm, dtrsv
+from scipy.linalg.blas import daxpy, dger, dscal, dtrsm, dtrsv
 from scipy.linalg.lapack import dposv, dpotrf
 
 from ccatp.core import FloatArray
@@ -89,7 +89,7 @@ class EkfSlam:
         v = self.vehicle_size
         self.mean, self.covariance = mean, covariance
         self._rows, self._columns, self._vehicle = covariance[:v], covariance[:, :v], mean[:v]
-        self._product = np.empty_like(covariance)
+        self._transposed = covariance.T  # BLAS writes in place into columns that lie together
 
     def __deepcopy__(self, memo: dict[int, object]) -> "EkfSlam":
         """A filter of its own, its views upon its own state."""
@@ -172,9 +172,7 @@ class EkfSlam:
         root = sqrt(s)
         dscal(1.0 / root, cross)
         if s < STRONG * r:
-            # P stays symmetric exactly; BLAS's rank-one update fuses some products with the sum and rounds others.
-            np.multiply(cross[:, None], cross, self._product)
-            np.subtract(self.covariance, self._product, self.covariance)
+            dger(-1.0, cross, cross, a=self._transposed, overwrite_a=1)
         else:
             self._joseph(columns, h[None, :], cross[:, None] / root, np.array(((r,),)))
         daxpy(cross, self.mean, a=residual / root)
