@@ -284,7 +284,8 @@ class BatchProblem:
         side[:POSE] -= self.first_information * first
         side[split:] -= self.prior_information * shared
         corner = H[:, free].toarray()
-        border, corner = corner[:split], corner[free] + np.diag(self.prior_information[self.free])
+        # NumPy multiplies by part of a sparse matrix's columns twenty times as slowly as by an array of its own.
+        border, corner = np.asfortranarray(corner[:split]), corner[free] + np.diag(self.prior_information[self.free])
         return ArrowSystem(band, border, corner, side[:split], side[free])
 
     def spread(self, shared: FloatArray) -> FloatArray:
