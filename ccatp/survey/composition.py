@@ -18,7 +18,6 @@ from ccatp.links.robot_messages import Hello
 from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.survey.events import HELD, IDLE, MEASURING, SETTLING, MissionState, TakenOver
-from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import ORDERS, Route, RoutePlanner
 from ccatp.survey.planning.search import leg_lengths, leg_time, path_time, stop_times
 from ccatp.survey.planning.tour_bound import tour_bound
@@ -132,12 +131,12 @@ class SurveyParts:
 def assemble(cfg: Config, done: Collection[PointId] = (), checkpoint: Checkpoint | None = None) -> SurveyParts:
     """All pure parts, the robot at base or where ``checkpoint`` says.
 
-    Raises ``PlanError``: unreachable point, too little thrust.
+    Raises ``PlanError``: unreachable point; ``ConfigError``: too little thrust.
     """
     mirror = build_mirror(cfg.mirror)
     grip = forecast_grip(cfg.robot, mirror)
     if not grip.is_held:
-        raise PlanError(f"thrust: {grip.text}")
+        raise ConfigError(f"robot.thrust_n: {grip.text}")
     cfg = _slowed(cfg, grip)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
     route = plan_survey(cfg, mirror, points, done, calibrates=checkpoint is None)

@@ -9,9 +9,9 @@ from ccatp.config.load import load_config
 from ccatp.config.models import RobotConfig
 from ccatp.control.thrust import ThrustControl, forecast_grip, least_thrust_n, safe_speed_m_s
 from ccatp.core import DeckPose, Vector3
+from ccatp.errors import ConfigError
 from ccatp.mirror.mirror import build_mirror
 from ccatp.survey.composition import assemble
-from ccatp.survey.planning.legs import PlanError
 
 WEIGHT_N = 9.771  # of 1 kg
 OVERHANG_RAD = radians(18.435)  # of fyst-m2: 3.09 N away from the surface and 9.27 N along it
@@ -88,5 +88,5 @@ def test_where_grip_is_short_a_run_is_slow_and_where_there_is_none_it_is_refused
     slow = assemble(load_config(overrides={"run.mirror": "fyst-m2", "run.panels": 1, "robot.thrust_n": 31.0}))
     assert slow.cfg.limits.v_max_m_s == slow.cfg.health.slow_speed_m_s
     assert slow.cfg.limits.omega_max_rad_s == slow.cfg.health.slow_rate_rad_s
-    with pytest.raises(PlanError, match=r"^thrust: the fans give 20.0 N; .* WOULD SLIDE"):
+    with pytest.raises(ConfigError, match=r"^robot.thrust_n: the fans give 20.0 N; .* WOULD SLIDE"):
         assemble(load_config(overrides={"run.mirror": "fyst-m2", "run.panels": 1, "robot.thrust_n": 20.0}))
