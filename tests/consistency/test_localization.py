@@ -20,7 +20,7 @@ from ccatp.core import FloatArray, PanelId, PanelPose, wrap_pi
 from ccatp.estimation.odometry import PreintegratedMotion, WheelAngle
 from ccatp.estimation.slip_prior import SlipPrior
 from ccatp.estimation.state_filter import SurveyFilter
-from ccatp.estimation.state_model import BA, BG, KG, KL, PL, PR, PSI, SL, SR, STATES, A, C, V, W, X, Y
+from ccatp.estimation.state_model import BA, BG, CT, KG, KL, PL, PR, PSI, SL, SR, STATES, A, C, V, W, X, Y
 from ccatp.filters import FILTERS
 from ccatp.filters.base import Filter
 from ccatp.mirror.mirror import Mirror
@@ -28,14 +28,14 @@ from tests.support.scenario import transport_rad
 from tests.support.slam_settings import odometry, settings, trust
 from tests.unit.estimation.drive import config, mirror
 
-SEEDS, STEPS, DT_S = 50, 50, 0.04
+SEEDS, STEPS, DT_S = 200, 50, 0.04
 FIX_STEPS, FIX_SIGMA_M = (20, 35, 50), 2e-5
 LOOKS = (10, 20, 21, 35, 50)  # steps after which the errors are looked at, after the fix where there is one
 QUANTUM_RAD = 2.0 * np.pi / 1200.0
 SAMPLES = 4  # of the inertial unit in a block
 START = PanelPose(PanelId(3, 7), 0.0, 0.0, 0.4)
 POSE = [X, Y, PSI]
-KNOWN = [X, Y, PSI, V, A, W, BG, KG, BA, SR, SL, KL, C]  # nothing but an offset to the encoders in the others
+KNOWN = [X, Y, PSI, V, A, W, BG, KG, BA, SR, SL, KL, C, CT]  # nothing but an offset to the encoders in the others
 # 5 looks at two sets of states and two sums of innovations: the band of each is that of 95 % for all twelve together.
 ALPHA = 0.05 / 12.0
 
@@ -60,8 +60,9 @@ def moved(m: Mirror, x: FloatArray) -> FloatArray:
     g = np.array(m.rotate_deck_from_world((0.0, 0.0, 1.0)))
     g = g - (g @ np.array(n)) * np.array(n)
     g /= sqrt(g @ g)
-    dx = d * (cos(middle) * e1x + sin(middle) * e2x) + x[C] * abs(d) * g[0]
-    dy = d * sin(middle) * e2y + x[C] * abs(d) * g[1]
+    down = x[C] * abs(d) + x[CT] * abs(turn)
+    dx = d * (cos(middle) * e1x + sin(middle) * e2x) + down * g[0]
+    dy = d * sin(middle) * e2y + down * g[1]
     out[X], out[Y] = x[X] + dx, x[Y] + dy
     out[PSI] = x[PSI] + turn + transport_rad(m, float(x[X]), float(x[Y]), float(dx), float(dy))
     side = turn * (1.0 + x[KL]) * 0.5 * robot.wheel_base_m
@@ -95,15 +96,24 @@ def run(name: str, seed: int) -> Run:
     right, left = WheelAngle(), WheelAngle()
     for wheel in (right, left):
         wheel.is_counter, wheel.quantum_rad, wheel.is_fresh, wheel.noise_rad2_s2 = True, QUANTUM_RAD, True, 0.0
-    slip, creep = (full.wander_fraction**2 / full.wander_time_s * DT_S * v for v in scatters())
+    slip, creep, turn_creep = (full.wander_fraction**2 / full.wander_time_s * DT_S * v for v in scatters())
     impulses = np.array(
-        [full.jerk_density_m2_s5 * DT_S, full.angular_acceleration_density_rad2_s3 * DT_S, slip, slip, creep]
+        (
+            full.jerk_density_m2_s5 * DT_S,
+            full.angular_acceleration_density_rad2_s3 * DT_S,
+            slip,
+            slip,
+            creep,
+            turn_creep,
+        )
     )
     gyro, accelerometer = cfg().gyroscope_sigma_rad_s ** 2, cfg().accelerometer_sigma_m_s2 ** 2
     result = Run([], [], [])
     for k in range(1, STEPS + 1):
-        x[[A, W, SR, SL, C]] += np.sqrt(impulses) * rng.normal(size=5)
+        x[[A, W, SR, SL, C, CT]] += np.sqrt(impulses) * rng.normal(size=6)
         x = moved(m, x)
+        aside_m_rad = full.turn_creep_aside * float(inner.mean[CT])
+        x[:2] += aside_m_rad * sqrt(abs(float(inner.mean[W])) * DT_S) * rng.normal(size=2)
         x[BG] += full.gyroscope_bias_walk_rad_s_sqrt_s * sqrt(DT_S) * rng.normal()
         x[BA] += full.accelerometer_bias_walk_m_s2_sqrt_s * sqrt(DT_S) * rng.normal()
         right.angle_rad, left.angle_rad = (x[[PR, PL]] + QUANTUM_RAD / sqrt(12.0) * rng.normal(size=2)).tolist()
@@ -122,10 +132,11 @@ def run(name: str, seed: int) -> Run:
     return result
 
 
-def scatters() -> tuple[float, float]:
-    """Variances from leg to leg of a wheel's slip, twice that of the mean of two, and of the creep; not yet learned."""
-    slip, creep = SlipPrior(cfg().full_state).scatter
-    return 2.0 * slip * slip, creep * creep
+def scatters() -> tuple[float, float, float]:
+    """Variances from leg to leg of a wheel's slip, twice that of the mean of two, and of the creeps, before any leg."""
+    full = cfg().full_state
+    slip, creep = SlipPrior(full).scatter
+    return 2.0 * slip * slip, creep * creep, (full.turn_creep_scatter_share * full.turn_creep_sigma_m_rad) ** 2
 
 
 def band(freedom: int) -> tuple[float, float]:
@@ -135,7 +146,7 @@ def band(freedom: int) -> tuple[float, float]:
 
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
 def test_errors_are_as_large_as_the_covariance_says(name: str) -> None:
-    """At each look the robots are independent: the sum over the seeds is chi-squared with 50 times the states."""
+    """At each look the robots are independent: the sum over the seeds is chi-squared, with its degrees of freedom."""
     runs = [run(name, seed) for seed in range(SEEDS)]
     for states, values in ((POSE, [r.pose for r in runs]), (KNOWN, [r.state for r in runs])):
         low, high = band(SEEDS * len(states))
@@ -152,8 +163,8 @@ def test_fixes_are_as_far_off_as_expected(name: str) -> None:
 
 
 def test_a_filter_that_trusts_itself_too_much_would_be_found() -> None:
-    """The band is narrow enough: sigmas that are 15 % (pose) or 10 % (state) too small leave it."""
-    for states, share in ((POSE, 0.15), (KNOWN, 0.1)):
+    """The band is narrow enough: sigmas that are 8 % (pose) or 5 % (state) too small leave it."""
+    for states, share in ((POSE, 0.08), (KNOWN, 0.05)):
         assert band(SEEDS * len(states))[1] < 1.0 / (1.0 - share) ** 2
 
 
