@@ -35,6 +35,7 @@ RUNS: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
         "danger_false_edges_thesis-m1 danger_overrun_thesis-m1",
     ),
     "faults": (("faults=random",), ("--mirror", "thesis-m1", *ONE_PANEL), "faults"),
+    "physics": (("mirror=fyst-m1", "tyre=round", "friction=1.0", "margin=3.0"), ONE_PANEL, "physics-fyst-m1-3"),
     "cricket": (("case=zigzag-printed,all-printed,batch-45-once",), (), "figure_11_12 figure_14 figure_9_10_13 ways"),
     "recordings": (
         ("data=Plaza2,XBee scenario 1", "estimator=ekf-slam,fingerprints"), ("--data", str(RECORDINGS)), "recordings",
