@@ -1,6 +1,7 @@
 """``MUJOCO_GL=egl python -m tests.docs.physics_picture``: docs/physics.png, the robot on M2 with the forces on it.
 
-Up in the picture is against gravity. White: weight; orange: thrust; green: what each contact gives. 10 N are 60 mm.
+Up in the picture is against gravity. White: weight; orange: thrust; green: what each contact gives. 10 N are 40 mm. The
+lines on the mirror are 100 mm apart.
 """
 
 from pathlib import Path
@@ -15,8 +16,10 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.hardware import MOTOR_12V
 from ccatp.sim.physics import PhysicsPlant
 
-M_PER_N = 0.006
-WHITE, ORANGE, GREEN = (0.9, 0.9, 0.95, 1.0), (1.0, 0.55, 0.1, 1.0), (0.2, 0.8, 0.35, 1.0)
+M_PER_N = 0.004
+GRID_M = 0.1
+WHITE, ORANGE, GREEN = (0.95, 0.95, 1.0, 1.0), (1.0, 0.55, 0.1, 1.0), (0.2, 0.8, 0.35, 1.0)
+DARK = 0.2, 0.25, 0.35, 1.0
 SIZE = 480, 640  # the framebuffer of a model that does not ask for more
 
 
@@ -26,6 +29,15 @@ def arrow(scene: mujoco.MjvScene, start: FloatArray, force_n: FloatArray, colour
     kind = mujoco.mjtGeom.mjGEOM_ARROW
     mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), np.array(colour, dtype=np.float32))
     mujoco.mjv_connector(geom, kind, 0.004, start, start + M_PER_N * force_n)
+    scene.ngeom += 1
+
+
+def line(scene: mujoco.MjvScene, start: FloatArray, end: FloatArray) -> None:
+    """On the mirror."""
+    geom = scene.geoms[scene.ngeom]
+    kind = mujoco.mjtGeom.mjGEOM_CAPSULE
+    mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), np.array(DARK, dtype=np.float32))
+    mujoco.mjv_connector(geom, kind, 0.001, start, end)
     scene.ngeom += 1
 
 
@@ -52,10 +64,15 @@ def main() -> None:
             force = np.zeros(6)
             mujoco.mj_contactForce(model, data, k, force)
             arrow(scene, contact.pos, contact.frame.reshape(3, 3).T @ force[:3], GREEN)
-        ahead = data.xmat[1].reshape(3, 3)[:, 0]
+        ahead, left = data.xmat[1].reshape(3, 3)[:, 0], data.xmat[1].reshape(3, 3)[:, 1]
+        foot = data.xpos[1].copy()
+        for k in range(-6, 7):
+            for along, across in ((ahead, left), (left, ahead)):
+                middle = foot + k * GRID_M * across
+                line(scene, middle - 6.0 * GRID_M * along, middle + 6.0 * GRID_M * along)
         side = np.cross(gravity, normal)
-        eye = centre + 0.3 * normal + 0.3 * side / np.linalg.norm(side) + 0.1 * ahead
-        forward = (centre + 0.05 * normal - eye) / np.linalg.norm(centre + 0.05 * normal - eye)
+        eye = centre + 0.22 * normal + 0.42 * side / np.linalg.norm(side) - 0.1 * gravity
+        forward = (centre + 0.06 * normal - eye) / np.linalg.norm(centre + 0.06 * normal - eye)
         up = -gravity + (gravity @ forward) * forward
         for camera in scene.camera:
             camera.pos, camera.forward, camera.up = eye, forward, up / np.linalg.norm(up)
