@@ -164,9 +164,13 @@ def test_the_exact_steps_of_value_and_rate(sign: float) -> None:
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_exact_steps_of_turning(sign: float) -> None:
     under_test = gate()
-    turned = [drive(under_test, Twist(0.0, sign * 9.0)).omega_rad_s for _ in range(12)]
-    assert turned[:2] == pytest.approx([sign * STEP_RAD_S, sign * 2.0 * STEP_RAD_S])
+    turned = [drive(under_test, Twist(0.0, sign * 0.9)).omega_rad_s for _ in range(2)]
+    assert turned == pytest.approx([sign * STEP_RAD_S, sign * 2.0 * STEP_RAD_S])
+    turned = [drive(under_test, Twist(0.0, sign * 9.0)).omega_rad_s for _ in range(10)]
     assert turned[-1] == pytest.approx(sign * 1.25 * LIMITS.omega_max_rad_s)
+    # Slower at once, and through zero one step only.
+    assert drive(under_test, Twist(0.0, sign * 0.1)).omega_rad_s == pytest.approx(sign * 0.1)
+    assert drive(under_test, Twist(0.0, -sign * 9.0)).omega_rad_s == pytest.approx(-sign * STEP_RAD_S)
 
 
 def test_a_long_silence_allows_no_larger_step() -> None:
