@@ -252,14 +252,14 @@ class SurveyRecord:
     def build(self, wall_s: float) -> dict[str, Any]:
         """The summary, when main has closed the mission's database."""
         survey = self._stored()
+        standings = [] if survey is None else [point.status for point in survey.points]
         if not self._session.has_status:
             if survey is None and (before := _read(self._run_dir / "summary.json")):
                 return before  # nothing is known, and that must not replace an earlier summary
-            # Main ended before its first status: the mission's database holds the counts.
-            standings = [] if survey is None else [point.status for point in survey.points]
-            done, skipped = standings.count("measured"), standings.count("skipped")
-            self.take(MissionStatus(seq=-1, t_s=0.0, state="", total=len(standings), done=done, skipped=skipped))
+            self.take(MissionStatus(seq=-1, t_s=0.0, state="", total=len(standings)))
         builder = self._session.builder
+        if survey is not None:  # the last status of a main that was told to end may be lost
+            builder.set_counts(standings.count("measured"), standings.count("skipped"))
         builder.set_panels({} if survey is None else self._fits(survey), self._injected)
         for path in reversed(recordings(self._run_dir / TELEMETRY)[:-1]):
             earlier = _SurveySession(self._cfg, self.mirror, is_sim=self._is_sim)

@@ -195,6 +195,10 @@ class SummaryBuilder:
         """All points of the mission, measured or not, and the rest-to-rest time of its path with the measuring."""
         self._points, self._lower_bound_s = total_points, lower_bound_s
 
+    def set_counts(self, measured: int, skipped: int) -> None:
+        """Points measured and skipped."""
+        self._measured, self._skipped = measured, skipped
+
     def set_mission(
         self,
         measured: int,
@@ -203,8 +207,8 @@ class SummaryBuilder:
         left_out: Mapping[str, Sequence[str]] = MappingProxyType({}),
     ) -> None:
         """Points measured and skipped, the robot's time from start to end, and points left out, by the reason."""
-        self._measured, self._skipped, self._mission_time_s = measured, skipped, mission_time_s
-        self._left_out = left_out
+        self.set_counts(measured, skipped)
+        self._mission_time_s, self._left_out = mission_time_s, left_out
 
     def set_panels(self, fits: PanelFits, injected: PanelFits | None) -> None:
         """Misalignment of panels as fitted, and as simulated (None on a real robot)."""

@@ -15,6 +15,7 @@ import zmq
 
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
+from ccatp.core import DeckPose, Fix, PointId
 from ccatp.daemon.child_processes import (
     ProcessEnd,
     ProcessManager,
@@ -24,11 +25,12 @@ from ccatp.daemon.child_processes import (
     open_page_socket,
     page_url,
 )
-from ccatp.daemon.collector import Collector
+from ccatp.daemon.collector import Collector, SurveyRecord
 from ccatp.daemon.process import Endpoints, parse_args, unless_stopped
 from ccatp.errors import DaemonUnreachableError
 from ccatp.links.bus import HeartbeatPublisher, Publisher
-from ccatp.links.topics import Heartbeat
+from ccatp.links.topics import Heartbeat, MissionStatus
+from ccatp.records.store import MissionStore, StoredPoint
 
 # Ends with the status in its variable, or waits for its end.
 CODE = "import os, sys, time; status = int(os.environ['STATUS']); sys.exit(status) if status else time.sleep(60.0)"
@@ -195,6 +197,25 @@ def test_a_collector_takes_so_many_messages_at_a_time(tmp_path: Path, config: Co
         while (before := len(received)) < 30:
             collector.collect(10, limit=10)
             assert len(received) <= before + 10
+
+
+def test_a_summary_counts_the_points_of_the_database_where_the_last_status_was_lost(
+    tmp_path: Path, config: Config
+) -> None:
+    plan = [StoredPoint(PointId(1, 2, n), 0.0, 0.0) for n in range(1, 10)]
+    with MissionStore.create(
+        tmp_path / "mission.sqlite", mirror="fyst-m1", seed=1, config_toml="[run]\n", points=plan, reserve_bytes=0
+    ) as store:
+        for n, (point, *_) in enumerate(plan[:3]):
+            fix = Fix(
+                1.0 + n, (0.0, 0.0, 3.6), (1e-12, 0.0, 0.0, 0.0, 1e-12, 0.0, 0.0, 0.0, 1e-12), 1.0, (1, 2, 3), 0.0
+            )
+            store.record_fix(point, fix, DeckPose(0.0, 0.0, 0.0)).result()
+        store.record_skipped(plan[3].point, 9.0).result()
+    survey = SurveyRecord(config, tmp_path, is_sim=False)
+    survey.take(MissionStatus(seq=1, t_s=1.0, state="driving", total=9, done=2, elapsed_s=5.0))
+    points, time_s = (survey.build(1.0)[key] for key in ("points", "mission_time_s"))
+    assert (points["total"], points["measured"], points["skipped"], time_s) == (9, 3, 1, 5.0)
 
 
 @pytest.mark.fault("P18")
