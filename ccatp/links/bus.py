@@ -5,7 +5,7 @@ In lockstep a loop waits for the message of its frame. The main loop publishes l
 
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import msgspec
@@ -173,11 +173,17 @@ MAX_FRAMES_AHEAD = 100
 class PeerSubscriber:
     """Receives what the other loop publishes for each frame, and its heartbeats.
 
-    ``on_wait`` is called now and then while lockstep waits.
+    Args:
+        topics: of the messages.
+        on_wait: called now and then while lockstep waits.
     """
 
     def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, topics: Iterable[str], on_wait: Callable[[], None]
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        topics: tuple[str, ...],
+        on_wait: Callable[[], None],
     ) -> None:
         self._subscriber = Subscriber(context, [endpoint], topics, is_watching=True)
         self._on_wait = on_wait
@@ -185,25 +191,24 @@ class PeerSubscriber:
         self.maintain = self._subscriber.maintain
         self.close = self._subscriber.close
 
-    def _messages(self, is_awaited: Callable[[], bool] | None) -> Iterator[Message | Verdict]:
-        """What is there; in lockstep (``is_awaited``) no more than is awaited, and that for a while if need be."""
-        wait_s, deadline_s = (0.0 if is_awaited is None else WAIT_SLICE_S), time.monotonic() + LOCKSTEP_WAIT_S
-        while is_awaited is None or is_awaited():
-            if (received := self._subscriber.receive(wait_s)) is not None:
-                yield received[2]
-                continue
-            if is_awaited is None or self._subscriber.is_cut or time.monotonic() > deadline_s:
-                return
-            self._on_wait()
+    def goes_on_waiting(self, deadline_s: float) -> bool:
+        """Nothing came for a slice: whether the other process is there, and there is time until ``deadline_s``."""
+        if self._subscriber.is_cut or time.monotonic() > deadline_s:
+            return False
+        self._on_wait()
+        return True
 
 
 class VerdictSubscriber(PeerSubscriber):
     """Receives danger's verdicts; ``timeout_s``: an older one is not in force."""
 
     def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, timeout_s: float,
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        timeout_s: float,
         on_wait: Callable[[], None] = lambda: None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(context, endpoint, ("verdict", "heartbeat.danger"), on_wait)
         self._timeout_s, self._wall_s = timeout_s, 0.0
         self.verdict: Verdict | None = None
@@ -211,7 +216,11 @@ class VerdictSubscriber(PeerSubscriber):
 
     def is_danger_joined(self) -> bool:
         """Whether danger has reported that it joined the robot; it repeats that."""
-        return any(isinstance(one, Heartbeat) and one.phase == "joined" for one in self._messages(None))
+        while (received := self._subscriber.receive()) is not None:
+            message = received[2]
+            if isinstance(message, Heartbeat) and message.phase == "joined":
+                return True
+        return False
 
     def reset(self) -> None:
         """The robot's frames restarted: forget the verdict."""
@@ -225,11 +234,14 @@ class VerdictSubscriber(PeerSubscriber):
         """
         if self._early is not None and self._early.seq < seq:
             self.verdict, self._early = self._early, None
-
-        def is_awaited() -> bool:
-            return self._early is None and (self.verdict is None or self.verdict.seq < seq - 1)
-
-        for message in self._messages(is_awaited if is_lockstep else None):
+        wait_s, deadline_s = (WAIT_SLICE_S if is_lockstep else 0.0), time.monotonic() + LOCKSTEP_WAIT_S
+        while not is_lockstep or (self._early is None and (self.verdict is None or self.verdict.seq < seq - 1)):
+            received = self._subscriber.receive(wait_s)
+            if received is None:
+                if is_lockstep and self.goes_on_waiting(deadline_s):
+                    continue
+                break
+            message = received[2]
             if not isinstance(message, Verdict) or message.seq > seq + MAX_FRAMES_AHEAD:
                 continue
             if is_lockstep and message.seq >= seq:
@@ -249,9 +261,13 @@ class EstimateSubscriber(PeerSubscriber):
     """Receives main's estimates; ``is_taking_over``: the one for the first frame may have been missed."""
 
     def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, on_wait: Callable[[], None] = lambda: None,
-        *, is_taking_over: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        on_wait: Callable[[], None] = lambda: None,
+        *,
+        is_taking_over: bool = False,
+    ) -> None:
         super().__init__(context, endpoint, ("estimate", "heartbeat.main"), on_wait)
         self._is_taking_over = is_taking_over
         self.reset()
@@ -274,11 +290,15 @@ class EstimateSubscriber(PeerSubscriber):
         if self._first_seq < 0:
             self._first_seq = seq + self._is_taking_over
         wanted = last_estimate_before(seq)
-
-        def is_awaited() -> bool:
-            return self._newest_seq < wanted and wanted >= self._first_seq
-
-        for message in self._messages(is_awaited if is_lockstep else None):
+        is_waiting = is_lockstep and wanted >= self._first_seq
+        wait_s, deadline_s = (WAIT_SLICE_S if is_waiting else 0.0), time.monotonic() + LOCKSTEP_WAIT_S
+        while not is_lockstep or (is_waiting and self._newest_seq < wanted):
+            received = self._subscriber.receive(wait_s)
+            if received is None:
+                if is_waiting and self.goes_on_waiting(deadline_s):
+                    continue
+                break
+            message = received[2]
             # An estimate for a frame far ahead is of the robot's last boot.
             if isinstance(message, EstimateMessage) and message.seq <= seq + MAX_FRAMES_AHEAD:
                 missed = self._newest if self._newest_seq > self._judged else None
@@ -298,8 +318,9 @@ PERIOD_S = 0.1
 class HeartbeatPublisher:
     """Publishes the heartbeat of one process.
 
-    ``phase``: starting, ready, joined, rejoining (the robot is away), done. ``frame_s``: monotonic time at which the
-    newest frame was served, ``None`` before the first.
+    Attributes:
+        phase: starting, ready, joined, rejoining (the robot is away), done.
+        frame_s: time of the monotonic clock at which the newest frame was served, ``None`` before the first.
     """
 
     def __init__(self, publisher: Publisher, process: str) -> None:
@@ -316,10 +337,11 @@ class HeartbeatPublisher:
     def publish(self) -> None:
         """Publish now."""
         self._published_s = now_s = time.monotonic()
-        self._publisher.send(f"heartbeat.{self._process}", Heartbeat(
-            seq=self._count, t_s=now_s, process=self._process, pid=os.getpid(), phase=self.phase,
-            frame_age_s=self.frame_age_s,
-        ))  # fmt: skip
+        age_s, pid = self.frame_age_s, os.getpid()
+        heartbeat = Heartbeat(
+            seq=self._count, t_s=now_s, process=self._process, pid=pid, phase=self.phase, frame_age_s=age_s
+        )
+        self._publisher.send(f"heartbeat.{self._process}", heartbeat)
         self._count += 1
 
     def publish_if_due(self) -> None:
@@ -335,16 +357,26 @@ BATCH_WALL_S = 0.25
 
 
 class Telemetry:
-    """Publishes for the main loop; ``topic`` and ``track`` are those of a batch of estimates.
+    """Publishes for the main loop.
 
-    ``seq``, ``t_s``: the newest frame. ``frames_before``: the recorded number of a frame is its ``seq`` and this.
-    ``newest_line``: of the newest frame with an estimate. ``tick_us``: wall times of frames for the next batch.
+    Args:
+        topic, track: topic and message of a batch of estimates.
+
+    Attributes:
+        send: publishes one message of a topic.
+        seq, t_s: the newest frame.
+        frames_before: the recorded number of a frame is its ``seq`` and this.
+        newest_line: of the newest frame with an estimate.
+        tick_us: wall times of frames for the next batch.
     """
 
     def __init__(
-        self, publisher: Publisher, log: structlog.typing.FilteringBoundLogger, topic: str,
+        self,
+        publisher: Publisher,
+        log: structlog.typing.FilteringBoundLogger,
+        topic: str,
         track: Callable[..., Message],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.send, self.log, self._topic, self._track = publisher.send, log, topic, track
         self._lines: list[msgspec.Raw] = []
         self._rows: list[tuple[Any, ...]] = []
@@ -361,17 +393,19 @@ class Telemetry:
 
     def add_frame(self, seq: int, t_s: float, raw: bytes, row: tuple[Any, ...]) -> None:
         """Keep the line of frame ``seq`` and its row of the track, which has the recorded number."""
-        self.t_s = t_s
+        self.t_s, self.newest_line = t_s, msgspec.Raw(raw)
         self._rows.append(row)
-        self.newest_line = self.add_line(seq, raw)
-
-    def add_line(self, seq: int, raw: bytes) -> msgspec.Raw:
-        """Keep the line alone, of a frame that is not newer than the last one; returns it."""
-        self.seq, line = seq, msgspec.Raw(raw)
-        self._lines.append(line)
+        self.seq = seq
+        self._lines.append(self.newest_line)
         if len(self._lines) >= BATCH_FRAMES:
             self.flush()
-        return line
+
+    def add_line(self, seq: int, raw: bytes) -> None:
+        """Keep the line alone, of a frame that is not newer than the last one."""
+        self.seq = seq
+        self._lines.append(msgspec.Raw(raw))
+        if len(self._lines) >= BATCH_FRAMES:
+            self.flush()
 
     def flush(self, least_age_s: float = 0.0) -> None:
         """Publish the batches where the last time is at least so long ago."""
