@@ -173,6 +173,7 @@ def apart(one: FullStateLocalizer, other: FullStateLocalizer) -> tuple[float, fl
     return float(np.max(np.abs(x - y) / sigma)), float(np.max(np.abs(P - S) / np.outer(sigma, sigma)))
 
 
+@pytest.mark.parametrize(("turn_creep_sigma_m_rad", "limit"), [(1e-6, 1e-4), (0.002, 3e-4)])
 @pytest.mark.parametrize(
     ("name", "taken_s", "told_s"),
     [
@@ -181,19 +182,23 @@ def apart(one: FullStateLocalizer, other: FullStateLocalizer) -> tuple[float, fl
         ("a rest in between", 3.6, 4.5),
     ],
 )
-def test_a_late_fix_is_as_good_as_one_in_time(filter_name: str, name: str, taken_s: float, told_s: float) -> None:
+def test_a_late_fix_is_as_good_as_one_in_time(
+    filter_name: str, name: str, taken_s: float, told_s: float, turn_creep_sigma_m_rad: float, limit: float
+) -> None:
     """Without what a leg passes on to the next, which was passed on before the fix was known."""
-    story = Story(name, filter_name, use={"slip_per_leg": False}, rewind_s=3.0)
+    story = Story(
+        name, filter_name, use={"slip_per_leg": False}, rewind_s=3.0, turn_creep_sigma_m_rad=turn_creep_sigma_m_rad
+    )
     taken, told = story.end_after(taken_s), story.end_after(told_s)
     fix = story.fixes[taken]
     in_time, late = story.tell({taken: [fix]}), story.tell({told: [fix]})
     assert (in_time.counts["late_fixes"], late.counts["late_fixes"]) == (0, 1)
     mean, covariance = apart(in_time, late)
-    # The ground is looked up where the filter thought it was: slopes off by 1e-7 in some hundred steps, and so is the
-    # creep that sets the noise of a turn. Sigma points lose half the digits of a covariance whose smallest variances
-    # are 1e-12 of its largest.
+    # The ground is looked up where the filter thought it was: slopes off by 1e-7 in some hundred steps. Sigma points
+    # lose half the digits of a covariance whose smallest variances are 1e-12 of its largest. With the creep of turns
+    # the covariance of place and creep is off by 1.6e-4 after a corner.
     assert mean < 1e-5
-    assert covariance < 3e-4
+    assert covariance < limit
 
 
 @pytest.mark.parametrize("inside", [1, 3])
