@@ -41,7 +41,7 @@ Tables = dict[str, Table]
 
 
 class Damage(NamedTuple):
-    """What a damage is given: all that it changes is returned anew."""
+    """What a damage is given; it returns changed copies."""
 
     tables: Tables
     truth: ReferencePath | None
@@ -267,15 +267,15 @@ def run_damage(job: Job) -> JobOutcome:
     except (RadioDataError, EstimateError) as error:
         return JobOutcome(values | {"outcome": "reported", "unsurveyed": "reported", "new": [str(error)]})
     said = {_unnumbered(line) for line in (*run.warnings, *track.warnings)}
-    told = [line for line in (*again.warnings, *found.warnings) if _NO_ALARM not in line]
-    new = [line for line in told if _unnumbered(line) not in said]
+    warned = [line for line in (*again.warnings, *found.warnings) if _NO_ALARM not in line]
+    new = [line for line in warned if _unnumbered(line) not in said]
     after = judge(found, again)
     pairs = ((after.trajectory_rmse_m, before.trajectory_rmse_m), (after.beacon_rmse_m, before.beacon_rmse_m))
     is_near = all(late is None or late <= _NEAR * (early or 0.0) + _NEAR_M for late, early in pairs)
     is_near &= bool(found.beacons) and track.beacons.keys() & set(again.beacon_ids) <= found.beacons.keys()
     silent = "recovered" if is_near else "uncertain" if _covers(found, again, after) else "wrong"
     outcome = "reported" if new and not is_near else silent
-    # What a user who has surveyed no beacons is told.
+    # The warnings that a user gets who has surveyed no beacons.
     unsurveyed = silent if all("survey" in line for line in new) else outcome
     errors = {"path_m": after.trajectory_rmse_m, "beacons_m": after.beacon_rmse_m}
     return JobOutcome(values | errors | {"outcome": outcome, "unsurveyed": unsurveyed, "new": new})
