@@ -7,6 +7,7 @@ import io
 import json
 import multiprocessing
 import os
+import pickle
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -162,8 +163,26 @@ def timed(run_job: Callable[[Job], JobOutcome], job: Job) -> tuple[JobOutcome, f
     """Do a job; its outcome and working time, s."""
     settle()
     started_s = time.perf_counter()
-    outcome = run_job(job)
+    try:
+        outcome = run_job(job)
+    except Exception as error:
+        if _is_portable(error):
+            raise
+        if not isinstance(error, CcatpError):
+            raise RuntimeError(f"{type(error).__name__}: {error}") from error
+        plain = CcatpError(str(error))
+        plain.exit_status = error.exit_status
+        raise plain from error
     return outcome, time.perf_counter() - started_s
+
+
+def _is_portable(error: Exception) -> bool:
+    """Whether a worker can hand it over; one whose arguments are not its message would end the pool as it arrives."""
+    try:
+        pickle.loads(pickle.dumps(error))  # noqa: S301 - its own
+    except Exception:
+        return False
+    return True
 
 
 Ended = Iterator[tuple[Job, "Future[tuple[JobOutcome, float]]"]]

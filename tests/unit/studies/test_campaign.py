@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ccatp.cli import main
+from ccatp.errors import CcatpError
 from ccatp.studies import STUDIES
 from ccatp.studies.campaign import (
     CampaignError,
@@ -214,6 +215,20 @@ def test_what_ends_a_campaign(
     assert ended.value.exit_status == (130 if error is CampaignInterrupted else 4)
     assert len(jobs_done(tmp_path)) in done
     assert not (tmp_path / "result.json").exists()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_errors_with_arguments_of_their_own_end_no_pool(
+    workers: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(FAULTS, f"{KEYS[0]}:block")
+    with pytest.raises(CampaignFailed, match=r"1 of 6 jobs failed, the first: .*block 'b' is not in the state"):
+        campaign(tmp_path, workers=workers)
+    assert len(jobs_done(tmp_path)) == 5
+    monkeypatch.setenv(FAULTS, f"{KEYS[0]}:data")  # data that cannot be used end the campaign: no job can use them
+    with pytest.raises(CcatpError, match=r"^a\.csv:3: is empty$") as ended:
+        campaign(tmp_path, workers=workers)
+    assert ended.value.exit_status == 2
 
 
 def test_a_cluster_that_does_not_answer_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

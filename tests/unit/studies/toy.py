@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ccatp.beacons.datasets.tables import RadioDataError
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.filters.ekf_slam import BlockError
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
 
 SPEEDS_M_S = (0.05, 0.1)
@@ -28,6 +30,10 @@ def _go_wrong(job: Job) -> None:
             continue
         if what == "raise":
             raise ArithmeticError("the wheel came off")
+        if what == "data":
+            raise RadioDataError(Path("a.csv"), "is empty", 3)
+        if what == "block":
+            raise BlockError("b", "is not in the state")
         if what == "interrupt":
             raise KeyboardInterrupt
         if what == "die":
