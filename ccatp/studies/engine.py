@@ -7,7 +7,6 @@ import io
 import json
 import multiprocessing
 import os
-import pickle
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -165,24 +164,17 @@ def timed(run_job: Callable[[Job], JobOutcome], job: Job) -> tuple[JobOutcome, f
     started_s = time.perf_counter()
     try:
         outcome = run_job(job)
-    except Exception as error:
-        if _is_portable(error):
-            raise
-        if not isinstance(error, CcatpError):
-            raise RuntimeError(f"{type(error).__name__}: {error}") from error
+    except CcatpError as error:
         plain = CcatpError(str(error))
         plain.exit_status = error.exit_status
         raise plain from error
+    except Exception as error:
+        raise JobError(f"{type(error).__name__}: {error}") from error
     return outcome, time.perf_counter() - started_s
 
 
-def _is_portable(error: Exception) -> bool:
-    """Whether a worker can hand it over; one whose arguments are not its message would end the pool as it arrives."""
-    try:
-        pickle.loads(pickle.dumps(error))  # noqa: S301 - its own
-    except Exception:
-        return False
-    return True
+class JobError(Exception):
+    """What a job died of, by its message: an error with arguments of its own would end the pool as it arrives."""
 
 
 Ended = Iterator[tuple[Job, "Future[tuple[JobOutcome, float]]"]]
@@ -365,7 +357,8 @@ def _run_jobs(
             except CcatpError:
                 raise
             except Exception as error:  # whatever a mission dies of, the others go on
-                failures.append(f"{job.key}: {type(error).__name__}: {error}")
+                what = str(error) if isinstance(error, JobError) else f"{type(error).__name__}: {error}"
+                failures.append(f"{job.key}: {what}")
                 with (options.out / FAILURES).open("a", encoding="utf-8") as file:
                     file.write(f"{job.key}\n{''.join(format_exception(error))}\n")
                 if len(failures) == _MOST_FAILURES:
