@@ -251,7 +251,6 @@ class FullStateLocalizer(LocalizerBase):
         self._refused.clear()
         self._fixed_m, self._is_relocated = z, False
         self.counts["late_fixes"] += self._estimate.fix(t_s, z, variance) > 0
-        self._estimate.end_leg()
 
     def _relocate(self, z: FloatArray, residual: FloatArray, variance: FloatArray, *, is_lost: bool) -> None:
         turn_rad = 0.0

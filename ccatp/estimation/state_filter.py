@@ -20,6 +20,7 @@ from ccatp.mirror.mirror import Mirror
 
 _STOP_ROWS = np.eye(sm.STATES)[sm.SPEEDS]
 _SLIP_BLOCK = np.ix_(sm.SLIPS, sm.SLIPS)
+_CALIBRATION_BLOCK = np.ix_(sm.CALIBRATION, sm.CALIBRATION)
 
 Step = Callable[[], object]
 LateStep = Callable[[float], None]
@@ -44,6 +45,8 @@ class SurveyFilter:
         self._tilt_sigma_m = robot.puck_height_m * self._full.panel_tilt_sigma_rad
         self._gravity_deck = mirror.gravity_deck
         filter_.reset(*self._first(start))
+        self._keep_calibration()
+        self._is_trusted = True  # what odometry did since the last fix
         self._panel = self._panel_below()
 
     def _first(self, pose: DeckPose) -> tuple[FloatArray, FloatArray]:
@@ -185,16 +188,24 @@ class SurveyFilter:
 
     def begin_leg(self) -> None:
         """Slip and creep of the coming leg, from the legs so far."""
-        if not self._full.use.slip_per_leg:
-            return
-        F, b, Q = np.eye(sm.STATES), np.zeros(sm.STATES), np.zeros((sm.STATES, sm.STATES))
-        F[_SLIP_BLOCK], b[sm.SLIPS], Q[_SLIP_BLOCK] = self._legs.begin(self._filter.mean, self._filter.covariance)
-        Q[sm.KL, sm.KL] = (self._full.turn_loss_per_creep_rad_m * float(self._filter.mean[sm.CT])) ** 2
-        self.journal.do(lambda: self._filter.predict(sm.Affine(F, b), Q))
+        if self._full.use.slip_per_leg:
+            F, b, Q = np.eye(sm.STATES), np.zeros(sm.STATES), np.zeros((sm.STATES, sm.STATES))
+            F[_SLIP_BLOCK], b[sm.SLIPS], Q[_SLIP_BLOCK] = self._legs.begin(self._filter.mean, self._filter.covariance)
+            Q[sm.KL, sm.KL] = (self._full.turn_loss_per_creep_rad_m * float(self._filter.mean[sm.CT])) ** 2
+            self.journal.do(lambda: self._filter.predict(sm.Affine(F, b), Q))
+        self.journal.do(self._keep_calibration)
 
-    def end_leg(self) -> None:
-        """A fix has been fused at the leg's end."""
-        self._legs.end(self._filter.mean, self._filter.covariance)
+    def _keep_calibration(self) -> None:
+        """What is known of it where a leg begins or ends: should the leg turn out wrong, it has taught nothing."""
+        mean, P = self._filter.mean, self._filter.covariance
+        self._calibration = mean[sm.CALIBRATION], P[_CALIBRATION_BLOCK]
+
+    def _restored(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The state with the calibration as kept, not correlated with the rest: a fix then corrects the pose alone."""
+        x, P = mean.copy(), covariance.copy()
+        P[sm.CALIBRATION, :] = P[:, sm.CALIBRATION] = 0.0
+        x[sm.CALIBRATION], P[_CALIBRATION_BLOCK] = self._calibration
+        return x, P
 
     # -- seams --------------------------------------------------------------------------------------------------------
 
@@ -230,17 +241,25 @@ class SurveyFilter:
     def fix(self, t_s: float, z: FloatArray, variance: FloatArray) -> int:
         """The robot's origin at ``t_s``, deck, m (2,), and its covariance (2, 2).
 
-        Returns how many steps were repeated after it.
+        It ends the leg. Returns how many steps were repeated after it.
         """
+        is_trusted, self._is_trusted = self._is_trusted, True
+        if not is_trusted:
+            self._legs.forget_leg()
 
         def step(late_s: float) -> None:
+            if not is_trusted:
+                self._filter.reset(*self._restored(self._filter.mean, self._filter.covariance))
             mean = self._filter.mean
             residual, H = fix_row(z, mean, self.slope(), late_s)
             innovation = self._filter.update(H.dot(mean) + residual, H, variance)
             if not self.journal.is_replaying:
                 self.innovation = innovation
+            self._keep_calibration()
 
-        return self.journal.take(t_s, step)
+        repeated = self.journal.take(t_s, step)
+        self._legs.end(self._filter.mean, self._filter.covariance)
+        return repeated
 
     def expect(self, t_s: float, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         """How far a position (2,) lies from what the filter held for true at ``t_s``, and the covariance of that."""
@@ -257,7 +276,8 @@ class SurveyFilter:
         sensors and of slip since the last time was misleading, and is forgotten, too. Raises ``FilterDiverged``: not
         finite.
         """
-        mean, P = self._filter.mean, self._filter.covariance
+        mean, P = self._restored(self._filter.mean, self._filter.covariance)
+        self._is_trusted = True
         heading_rad2 = max(self._full.relocated_heading_sigma_rad, turn_rad) ** 2
         x, P = relocated(mean, P, residual, variance, self._tilt_sigma_m**2, heading_rad2, is_lost=is_lost)
         self.journal.restart()
@@ -271,10 +291,15 @@ class SurveyFilter:
             P_first[sm.TILT, :2], P_first[:2, sm.TILT] = P[sm.TILT, :2], P[:2, sm.TILT]
             x, P = first, P_first
         self._filter.reset(x, P)
+        self._keep_calibration()
         self._panel = self._panel_below()
 
     def inflate_covariance(self, way_m: float, turn_rad: float) -> None:
-        """The robot may have gone this far, and turned, without anyone looking."""
+        """The robot may have gone this far, and turned, without anyone looking: the next fix corrects the pose alone.
+
+        What odometry did since the leg began, and does until the fix, teaches nothing of slip, creep and the sensors.
+        """
+        self._is_trusted = False
         Q = np.zeros((sm.STATES, sm.STATES))
         Q[sm.X, sm.X] = Q[sm.Y, sm.Y] = way_m * way_m
         Q[sm.PSI, sm.PSI] = turn_rad * turn_rad

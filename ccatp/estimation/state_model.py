@@ -43,6 +43,7 @@ how much the puck is off its place over the robot because the panel under it is 
 """
 STATES = 20
 POSE, SPEEDS, SLIPS, ANGLES, EDGES, TILT = [X, Y, PSI], [V, A, W], [SR, SL, C, CT], [PR, PL], [E0, E1], [TX, TY]
+CALIBRATION = [BG, KG, BA, SR, SL, KL, C, CT]
 _NOISY = np.array([A, W, SR, SL, C, CT])  # whose noise enters at the beginning of a step and is carried through it
 _MOVED = np.array([X, Y, PSI, V, PR, PL])  # by a step, in the order of `SurveyMotion.at`
 # Entries of the motion's Jacobian beside those of the identity, as `SurveyMotion.at` lists them: one call sets all.

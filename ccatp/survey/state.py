@@ -259,7 +259,7 @@ class HoldRules(Generic[S]):
         if s.mode is DONE or s.is_held_by_hand:
             return s
         rejects_odometry |= s.rejects_odometry
-        s = self.lose_pose(replace(self.interrupt(s, cause), cause=cause))
+        s = self.lose_pose(replace(self.interrupt(s, cause), cause=cause), doubts_odometry=False)
         return replace(s, hold=s.hold._replace(rejects_odometry=rejects_odometry))
 
     def abort(self, s: S, cause: str) -> S:
@@ -276,8 +276,8 @@ class HoldRules(Generic[S]):
         """To what is next."""
         raise NotImplementedError
 
-    def lose_pose(self, s: S) -> S:
-        """The pose is not to be trusted."""
+    def lose_pose(self, s: S, *, doubts_odometry: bool = True) -> S:
+        """The pose is not to be trusted, nor what odometry has made of it where that is doubted."""
         return s
 
     # -- events between two frames ------------------------------------------------------------------------------------

@@ -139,9 +139,9 @@ class Survey(HoldRules[SurveyState]):
             s = self.lose_pose(s)
         return super().fault(s, cause)
 
-    def lose_pose(self, s: SurveyState) -> SurveyState:
+    def lose_pose(self, s: SurveyState, *, doubts_odometry: bool = True) -> SurveyState:
         """A fix comes before the next move."""
-        return replace(s, fix=FixNeed.RELOCALIZE)
+        return replace(s, fix=FixNeed.RELOCALIZE, inflates_covariance=s.inflates_covariance or doubts_odometry)
 
     def proceed(self, s: SurveyState) -> SurveyState:
         """To what is next: finding the robot, home, the next stop, or the end."""

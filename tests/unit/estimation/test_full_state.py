@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.core import DeckPose, GravitySample, PanelPose
+from ccatp.core import DeckPose, FloatArray, GravitySample, PanelPose, WheelSample
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.localizer_base import MAX_FRAME_STEP_S
-from ccatp.estimation.state_model import BG, PSI, SL, SR, STATES, TX, A, V, W, X, Y
+from ccatp.estimation.state_model import BG, CALIBRATION, PSI, SL, SR, STATES, TX, A, V, W, X, Y
 from ccatp.filters import FILTERS
 from tests.unit.estimation.drive import (
     STEEP,
@@ -151,11 +151,41 @@ def test_a_leg_that_ended_elsewhere_puts_the_heading_in_doubt() -> None:
     assert doubt_rad == pytest.approx(hypot(0.03, 0.03) / leg_m, rel=0.02)  # the estimate is some 0.1 mm off
 
 
+def begin_leg(found: FullStateLocalizer, robot: Robot) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance of the state where the robot drives off."""
+    while found.is_resting:
+        run(found, robot.frames(0.01))
+    return found.state
+
+
+@pytest.mark.parametrize("slip_per_leg", [True, False])
+def test_what_odometry_did_before_it_was_doubted_teaches_the_pose_alone(filter_name: str, slip_per_leg: bool) -> None:
+    """An encoder is stuck for a part of the leg; the doubt comes when the robot stands, or while it drives."""
+    for doubted_after_s in (1.0, 1.9):
+        found = build(filter_name, use={"slip_per_leg": slip_per_leg})
+        robot = rested(found)
+        x, P = begin_leg(found, robot)
+        frames = robot.frames(1.9)
+        for k, frame in enumerate(frames):
+            stuck = [WheelSample(t_s, 0.0, left) for t_s, _, left in frame.encoders]
+            found.step(*(frame._replace(encoders=stuck) if 50 <= k < 80 else frame))
+            if k + 1 == round(100 * doubted_after_s):
+                found.inflate_covariance(0.05, 0.15)
+        taught = np.abs(found.state[0] - x)[CALIBRATION] / np.sqrt(P.diagonal())[CALIBRATION]
+        assert taught.max() > 3.0 or doubted_after_s < 1.9
+        found.fuse_fix(robot.fix())
+        assert errors_of(found, robot.pose)[0] < 2e-5
+        y, S = found.state
+        block = np.ix_(CALIBRATION, CALIBRATION)
+        np.testing.assert_allclose(y[CALIBRATION], x[CALIBRATION], atol=1e-9)
+        np.testing.assert_allclose(S[block], P[block], rtol=1e-6, atol=1e-12)
+
+
 def test_who_begins_anew_twice_in_a_row_forgets_what_was_learned() -> None:
     found = build()
     robot = rested(found)
-    run(found, robot.frames(2.9))
-    learned = found.state[1][BG, BG]
+    learned = begin_leg(found, robot)[1][BG, BG]
+    run(found, robot.frames(1.9))
     begin_anew(found, robot, (0.0, 0.03))
     assert found.state[1][BG, BG] == pytest.approx(learned)
     begin_anew(found, robot, (0.0, 0.06))

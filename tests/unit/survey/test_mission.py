@@ -19,6 +19,7 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.survey.events import (
     AMONG_BEACONS,
     Abort,
+    EstimateDiverged,
     Fault,
     FixFailed,
     FixStored,
@@ -243,6 +244,16 @@ def test_a_robot_that_stands_to_be_found_needs_no_permission(story: Story) -> No
     story.frame(denied)
     assert story.state.mode is MissionState.HELD  # found, and waits for the permission to move
     story.finish()
+
+
+@pytest.mark.parametrize("doubts_odometry", [True, False])
+def test_what_odometry_did_before_a_fault_that_loses_the_pose_is_doubted(story: Story, doubts_odometry: bool) -> None:
+    """Once, as what the localizer gets from it is added; a filter that has diverged begins again by itself."""
+    story.until_state(MissionState.DRIVING)
+    event = Fault("blocked", loses_pose=True) if doubts_odometry else EstimateDiverged("filter", story.motion().t_s)
+    story.mission.handle(event)
+    orders = [story.frame() for _ in range(20)]
+    assert [order.inflates_covariance for order in orders] == [doubts_odometry, *[False] * 19]
 
 
 def test_a_robot_that_never_rests_is_a_fault(story: Story) -> None:
