@@ -241,6 +241,11 @@ def example(*lines: str) -> str:
     return "\b\nExample:\n" + "\n".join(f"  {line}" for line in lines)
 
 
+def command(*examples: str, **attributes: Any) -> Callable[[Command], click.Command]:
+    """``click.command`` with these examples at the end of its help."""
+    return click.command(epilog=example(*examples), **attributes)
+
+
 def options(*decorators: Callable[[Command], Command]) -> Callable[[Command], Command]:
     """Several options as one decorator, shown in the order given."""
     return lambda command: reduce(lambda changed, decorator: decorator(changed), reversed(decorators), command)

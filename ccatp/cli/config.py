@@ -10,29 +10,20 @@ from typing import Any
 
 import click
 
-from ccatp.cli.common import (
-    CONFIG_FILE,
-    PATH,
-    SETTINGS_OPTION,
-    CommandGroup,
-    columns,
-    complain,
-    example,
-    json_option,
-    print_lines,
-)
+from ccatp.cli import common
 from ccatp.errors import ConfigError
 
 
 @click.group(
-    cls=CommandGroup, epilog=example("ccatp config check telescope.toml", "ccatp config schema > ccatp.schema.json")
+    cls=common.CommandGroup,
+    epilog=common.example("ccatp config check telescope.toml", "ccatp config schema > ccatp.schema.json"),
 )
 def config() -> None:
     """Check and describe configurations."""
 
 
-@config.command("check", epilog=example("ccatp config check telescope.toml"))
-@click.argument("file", type=CONFIG_FILE)
+@config.command("check", epilog=common.example("ccatp config check telescope.toml"))
+@click.argument("file", type=common.CONFIG_FILE)
 def config_check(file: Path) -> int:
     """Check a configuration; each problem is one line with file, line and key."""
     from ccatp.config.models import Config
@@ -42,7 +33,7 @@ def config_check(file: Path) -> int:
         cfg = read_config(file)
     except ConfigError as error:
         for problem in error.problems:
-            complain(problem, error.exit_status)
+            common.complain(problem, error.exit_status)
         return error.exit_status
     if isinstance(cfg, Config):
         shown = f"mirror {cfg.mirror.name}, {cfg.mirror.panels.count} panels, world {cfg.world.name}"
@@ -52,7 +43,7 @@ def config_check(file: Path) -> int:
     return 0
 
 
-@config.command("schema", epilog=example("ccatp config schema > ccatp.schema.json"))
+@config.command("schema", epilog=common.example("ccatp config schema > ccatp.schema.json"))
 def config_schema() -> None:
     """Print the JSON schema of a configuration file: every key with its meaning, type, limits and unit."""
     from ccatp.config.describe import json_schema
@@ -60,8 +51,8 @@ def config_schema() -> None:
     click.echo(json.dumps(json_schema(), indent=2))
 
 
-@config.command("init", epilog=example("ccatp config init telescope.toml"))
-@click.argument("file", type=PATH)
+@config.command("init", epilog=common.example("ccatp config init telescope.toml"))
+@click.argument("file", type=common.PATH)
 @click.option("--force", is_flag=True, help="Replace the file that is there.")
 def config_init(file: Path, force: bool) -> None:
     """Write a configuration to begin with: every key with its default and its meaning, commented out."""
@@ -74,10 +65,10 @@ def config_init(file: Path, force: bool) -> None:
     click.echo(f"{file}: uncomment what differs at your telescope, then ccatp config check {file}")
 
 
-@config.command("show", epilog=example("ccatp config show telescope.toml", "ccatp config show zigbee --json"))
-@click.argument("file", type=CONFIG_FILE, required=False)
-@SETTINGS_OPTION
-@json_option("As one JSON object.")
+@config.command("show", epilog=common.example("ccatp config show telescope.toml", "ccatp config show zigbee --json"))
+@click.argument("file", type=common.CONFIG_FILE, required=False)
+@common.SETTINGS_OPTION
+@common.json_option("As one JSON object.")
 def config_show(file: Path | None, settings: Mapping[str, object], json_output: bool) -> None:
     """Print the whole configuration that FILE and the defaults give, mirror and world included, as TOML."""
     from ccatp.config.load import dump_config
@@ -88,11 +79,11 @@ def config_show(file: Path | None, settings: Mapping[str, object], json_output: 
 
 
 @config.command(
-    "diff", epilog=example("ccatp config diff telescope.toml", "ccatp config diff runs/a/config.toml new.toml")
+    "diff", epilog=common.example("ccatp config diff telescope.toml", "ccatp config diff runs/a/config.toml new.toml")
 )
-@click.argument("file", type=CONFIG_FILE)
-@click.argument("other", type=CONFIG_FILE, required=False)
-@json_option("As one JSON object: key, [before, after].")
+@click.argument("file", type=common.CONFIG_FILE)
+@click.argument("other", type=common.CONFIG_FILE, required=False)
+@common.json_option("As one JSON object: key, [before, after].")
 def config_diff(file: Path, other: Path | None, json_output: bool) -> None:
     """Show what FILE changes of the defaults for its mirror and world, or the changes from FILE to OTHER."""
     from ccatp.config.describe import differences
@@ -104,7 +95,7 @@ def config_diff(file: Path, other: Path | None, json_output: bool) -> None:
     if json_output:
         click.echo(json.dumps({key: [before, after] for key, before, after in found}))
         return
-    print_lines(
+    common.print_lines(
         [f"{k}: {format_value(before)} -> {format_value(after)}" for k, before, after in found] or ["no difference"]
     )
 
@@ -122,18 +113,18 @@ def _name(_ctx: click.Context, _param: click.Parameter, name: str | None) -> str
 
 
 DIR_OPTION = click.option(
-    "--dir", "folder", type=PATH, default=DEFAULT_DIR, show_default=True,
+    "--dir", "folder", type=common.PATH, default=DEFAULT_DIR, show_default=True,
     help="Folder of the keys, for its owner alone.",
 )  # fmt: skip
 
 
-@click.group(cls=CommandGroup, epilog=example("ccatp keys generate --dir /etc/ccatp/keys"))
+@click.group(cls=common.CommandGroup, epilog=common.example("ccatp keys generate --dir /etc/ccatp/keys"))
 def keys() -> None:
     """Make keys and show the public ones."""
 
 
 @keys.command(
-    epilog=example(
+    epilog=common.example(
         "ccatp keys generate --dir /etc/ccatp/keys",
         "ccatp keys generate --client --name observatory --dir ~/ccatp-keys",
     )
@@ -156,7 +147,7 @@ def generate(folder: Path, name: str, is_client: bool, force: bool) -> None:
             raise ConfigError(f"--dir: {there} exists; choose another --name, or replace it with --force")
     make_own_dir(folder, "--dir", FOR_OTHERS)
     public, secret = files.write_pair(folder, name, is_replacing=force)
-    print_lines([f"{public}  (public, for the peers)", f"{secret}  (secret, stays here)"])
+    common.print_lines([f"{public}  (public, for the peers)", f"{secret}  (secret, stays here)"])
     if is_client:
         key = files.read_public(public, "--dir").decode()
         click.echo(f'\nAdd to the list of clients at the daemon (or role = "clear"):\n\n[clients.{name}]')
@@ -165,16 +156,18 @@ def generate(folder: Path, name: str, is_client: bool, force: bool) -> None:
         return
     link = files.write_link_key(folder, name, is_replacing=force)
     clients = files.write_clients(folder, name)
-    print_lines([f"{link}  (secret, the same file at the robot)", f"{clients}  (clients that get in, none so far)"])
+    common.print_lines(
+        [f"{link}  (secret, the same file at the robot)", f"{clients}  (clients that get in, none so far)"]
+    )
     click.echo("\nAdd to the configuration, and clients to the list (ccatp keys generate --client, at theirs):\n")
     click.echo(f'[robot]\nkey_file = "{link}"\n\n[observatory]\nendpoint = "tcp://ADDRESS:7020"')
     click.echo(f'key_file = "{secret}"\nclients_file = "{clients}"')
 
 
-@keys.command("show-public", epilog=example("ccatp keys show-public --dir /etc/ccatp/keys"))
+@keys.command("show-public", epilog=common.example("ccatp keys show-public --dir /etc/ccatp/keys"))
 @DIR_OPTION
 @click.option("--name", callback=_name, default=None, help="One of them; all if not given.")
-@json_option("As JSON: names and keys.")
+@common.json_option("As JSON: names and keys.")
 def show_public(folder: Path, name: str | None, json_output: bool) -> None:
     """Show the public keys in a folder."""
     from ccatp.links import auth as files
@@ -187,19 +180,17 @@ def show_public(folder: Path, name: str | None, json_output: bool) -> None:
     if json_output:
         click.echo(json.dumps(shown))
         return
-    print_lines(columns([*shown.items()]))
+    common.print_lines(common.columns([*shown.items()]))
 
 
 SHELLS = ("bash", "zsh", "fish")
 VARIABLE = "_CCATP_COMPLETE"
 
 
-@click.command(
-    epilog=example(
-        'eval "$(ccatp completion bash)"',
-        "ccatp completion zsh > ~/.zfunc/_ccatp",
-        "ccatp completion fish > ~/.config/fish/completions/ccatp.fish",
-    )
+@common.command(
+    'eval "$(ccatp completion bash)"',
+    "ccatp completion zsh > ~/.zfunc/_ccatp",
+    "ccatp completion fish > ~/.config/fish/completions/ccatp.fish",
 )
 @click.argument("shell", type=click.Choice(SHELLS), metavar="SHELL")
 @click.pass_context

@@ -9,18 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ccatp.cli.common import (
-    CONFIG_OPTION,
-    JSON_OPTION,
-    PATH,
-    SETTINGS_OPTION,
-    CommandGroup,
-    address_options,
-    example,
-    print_lines,
-    run_command_line,
-    warn,
-)
+from ccatp.cli import common
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 
 if TYPE_CHECKING:
@@ -39,14 +28,14 @@ class DeviceUnreachable(CcatpError):
 
 
 @click.group(
-    "onboard", cls=CommandGroup, invoke_without_command=True,
-    epilog=example("ccatp onboard --config robot.toml --check", "ccatp onboard --config robot.toml"),
+    "onboard", cls=common.CommandGroup, invoke_without_command=True,
+    epilog=common.example("ccatp onboard --config robot.toml --check", "ccatp onboard --config robot.toml"),
 )  # fmt: skip
-@CONFIG_OPTION
-@address_options("link")
-@SETTINGS_OPTION
+@common.CONFIG_OPTION
+@common.address_options("link")
+@common.SETTINGS_OPTION
 @click.option("--check", "is_check", is_flag=True, help="Look at each device, without driving, and end.")
-@JSON_OPTION
+@common.JSON_OPTION
 @click.pass_context
 def onboard(
     ctx: click.Context, config_file: Path | None, settings: Mapping[str, object], is_check: bool, json_output: bool
@@ -81,7 +70,7 @@ def _run(cfg: "OnboardConfig") -> int:
 
     key = read_key(cfg.link.key_file, must_be_private=True, what="link.key_file")
     if key is None and cfg.link.host not in {"127.0.0.1", "::1", "localhost"}:
-        warn([f"without link.key_file anyone who reaches {cfg.link.host}:{cfg.link.port} can drive the robot"])
+        common.warn([f"without link.key_file anyone who reaches {cfg.link.host}:{cfg.link.port} can drive the robot"])
     log = structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
     with _listen(cfg.link.host, cfg.link.port) as listener:
         host, port = listener.getsockname()[:2]
@@ -114,16 +103,20 @@ def _check(cfg: "OnboardConfig", *, json_output: bool) -> int:
             figures = f"{check.rate_hz:.0f}/s" if check.rate_hz else "-"
             verdict = "ok" if check.passed else "FAIL"
             advice = "" if check.passed else f"; {check.advice}"
-            print_lines([f"{check.device:<14} {verdict:<5} {figures:>7}  {found}  {check.noise}{advice}".rstrip()])
+            common.print_lines(
+                [f"{check.device:<14} {verdict:<5} {figures:>7}  {found}  {check.noise}{advice}".rstrip()]
+            )
     return ExitStatus.COMPLETE if all(check.passed for check in checks) else ExitStatus.UNREACHABLE
 
 
-@onboard.command(epilog=example("ccatp onboard tune --config robot.toml --wheels-are-free --out tuning"))
-@CONFIG_OPTION
-@SETTINGS_OPTION
+@onboard.command(epilog=common.example("ccatp onboard tune --config robot.toml --wheels-are-free --out tuning"))
+@common.CONFIG_OPTION
+@common.SETTINGS_OPTION
 @click.option("--wheels-are-free", is_flag=True, help="The robot is lifted: its wheels turn at up to full speed.")
-@click.option("--out", "out_dir", type=PATH, help="Folder for the step response: CSV, and a figure with matplotlib.")
-@JSON_OPTION
+@click.option(
+    "--out", "out_dir", type=common.PATH, help="Folder for the step response: CSV, and a figure with matplotlib."
+)
+@common.JSON_OPTION
 @click.pass_obj
 def tune(
     group_config: Path | None, config_file: Path | None, settings: Mapping[str, object], wheels_are_free: bool,
@@ -155,14 +148,14 @@ def tune(
     if json_output:
         click.echo(json.dumps({**found._asdict(), "right": found.right._asdict(), "left": found.left._asdict()}))
         return 0
-    print_lines(
+    common.print_lines(
         f"{name:<6} static {wheel.static_v:.2f} V, {wheel.volt_per_rad_s:.3f} V per rad/s, "
         f"time constant {1e3 * wheel.time_constant_s:.0f} ms, fit to {wheel.residual_v:.2f} V"
         for name, wheel in (("right", found.right), ("left", found.left))
     )
     course = f"{found.deviation_rad_s:.3f} rad/s rms, overshoot {found.overshoot_share:.1%}"
     values = [f"{key} = {value}" for key, value in found.values.items()]
-    print_lines([f"step: off its course by {course}", "", "[servo]", *values])
+    common.print_lines([f"step: off its course by {course}", "", "[servo]", *values])
     return 0
 
 
@@ -187,4 +180,4 @@ def write_tuning(folder: Path, found: "Tuning") -> None:
 
 def main() -> int:
     """Entry of ``ccatp-onboard``, the small package for the robot's computer."""
-    return run_command_line(onboard)
+    return common.run_command_line(onboard)

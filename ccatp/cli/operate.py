@@ -13,22 +13,11 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from ccatp.cli.common import (
-    CONFIG_OPTION,
-    PATH,
-    RUNTIME_DIR_OPTION,
-    TIMEOUT_OPTION,
-    columns,
-    configured_folder,
-    example,
-    json_option,
-    options,
-    print_lines,
-)
+from ccatp.cli import common
 from ccatp.errors import ConfigError, DaemonUnreachableError
 
-_JSON = json_option("The daemon's answer as JSON on standard output.")
-DAEMON_OPTIONS = options(CONFIG_OPTION, RUNTIME_DIR_OPTION, TIMEOUT_OPTION, _JSON)
+_JSON = common.json_option("The daemon's answer as JSON on standard output.")
+DAEMON_OPTIONS = common.options(common.CONFIG_OPTION, common.RUNTIME_DIR_OPTION, common.TIMEOUT_OPTION, _JSON)
 EMERGENCY_KINDS = ("fire", "earthquake", "power", "weather", "operator")
 # Without a terminal a line is shown at a change, and at least this often.
 QUIET_S = 10.0
@@ -51,7 +40,7 @@ def _print_reply(reply: Mapping[str, Any], json_output: bool, page: str = "") ->
     facts, status = [(name, str(value)) for name, value in reply.items() if name != "ok"], reply.get("status")
     rows = list(status_rows(status)) if isinstance(status, Mapping) else facts
     rows += [("page", page)] if page else []
-    print_lines(columns(rows) or ["ok"])
+    common.print_lines(common.columns(rows) or ["ok"])
 
 
 def _user() -> str:
@@ -63,10 +52,10 @@ def _user() -> str:
 
 
 def _operator_command(name: str, help_text: str) -> click.Command:
-    @click.command(name, help=help_text, epilog=example(f"ccatp {name}"))
+    @click.command(name, help=help_text, epilog=common.example(f"ccatp {name}"))
     @DAEMON_OPTIONS
     def command(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
-        folder = configured_folder(config_file, runtime_dir)
+        folder = common.configured_folder(config_file, runtime_dir)
         _print_reply(_ask(folder, name, timeout_s, by=_user()), json_output)
 
     return command
@@ -77,19 +66,17 @@ resume = _operator_command("resume", "Carry on after pause.")
 abort = _operator_command("abort", "Give up the survey and drive the robot to its base.")
 stop = _operator_command("stop", "Hold the wheels where the robot is, save, and end the daemon.")
 
-OBSERVATORY_OPTIONS = options(
+OBSERVATORY_OPTIONS = common.options(
     click.option("--endpoint", metavar="tcp://HOST:PORT", help="A daemon on another machine, by its TCP endpoint."),
-    click.option("--server-key", type=PATH, help="With --endpoint: the daemon's NAME.key."),
-    click.option("--key", "key_file", type=PATH, help="With --endpoint: our NAME.key_secret."),
+    click.option("--server-key", type=common.PATH, help="With --endpoint: the daemon's NAME.key."),
+    click.option("--key", "key_file", type=common.PATH, help="With --endpoint: our NAME.key_secret."),
     DAEMON_OPTIONS,
 )
 
 
-@click.command(
-    epilog=example(
-        "ccatp emergency fire --note 'smoke in the receiver cabin'",
-        "ccatp emergency fire --endpoint tcp://m1:7020 --server-key ccatp.key --key observatory.key_secret",
-    )
+@common.command(
+    "ccatp emergency fire --note 'smoke in the receiver cabin'",
+    "ccatp emergency fire --endpoint tcp://m1:7020 --server-key ccatp.key --key observatory.key_secret",
 )
 @click.argument("kind", type=click.Choice(EMERGENCY_KINDS), metavar="KIND")
 @click.option("--note", default="", help="What happened, for the log.")
@@ -106,7 +93,7 @@ def emergency(kind: str, note: str, emergency_id: uuid.UUID | None, json_output:
     _print_reply(_ask_observatory(payload, **where), json_output)
 
 
-@click.command(epilog=example("ccatp clear 6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"))
+@common.command("ccatp clear 6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11")
 @click.argument("emergency_id", type=click.UUID, metavar="ID")
 @OBSERVATORY_OPTIONS
 def clear(emergency_id: uuid.UUID, json_output: bool, **where: Any) -> None:
@@ -127,7 +114,7 @@ def _ask_observatory(
     if endpoint is None:
         if server_key is not None or key_file is not None:
             raise click.UsageError("--server-key and --key go with --endpoint tcp://HOST:PORT")
-        return OperatorClient(configured_folder(config_file, runtime_dir), timeout_s).observatory.ask(payload)
+        return OperatorClient(common.configured_folder(config_file, runtime_dir), timeout_s).observatory.ask(payload)
     if not endpoint.startswith("tcp://"):
         raise click.UsageError(f"--endpoint {endpoint!r} is not tcp://HOST:PORT; a daemon here has --runtime-dir")
     if server_key is None or key_file is None:
@@ -137,7 +124,7 @@ def _ask_observatory(
 
 @click.group(
     invoke_without_command=True,
-    epilog=example("ccatp alarms", "ccatp alarms ack wheel_blocked", "ccatp alarms history"),
+    epilog=common.example("ccatp alarms", "ccatp alarms ack wheel_blocked", "ccatp alarms history"),
 )
 @DAEMON_OPTIONS
 @click.pass_context
@@ -152,11 +139,11 @@ def alarms(
         if any(context.get_parameter_source(name) is ParameterSource.COMMANDLINE for name in context.params):
             raise click.UsageError(f"options go behind the command, as in ccatp alarms {command} --runtime-dir DIR")
         return
-    found = _ask(configured_folder(config_file, runtime_dir), "status", timeout_s)["status"]["alarms"]
+    found = _ask(common.configured_folder(config_file, runtime_dir), "status", timeout_s)["status"]["alarms"]
     if json_output:
         click.echo(json.dumps({"alarms": found}))
     else:
-        print_lines([line for alarm in found for line in _alarm_lines(alarm)] or ["no alarms"])
+        common.print_lines([line for alarm in found for line in _alarm_lines(alarm)] or ["no alarms"])
 
 
 def _alarm_lines(alarm: Mapping[str, Any]) -> list[str]:
@@ -170,21 +157,21 @@ def _alarm_lines(alarm: Mapping[str, Any]) -> list[str]:
     ]
 
 
-@alarms.command(epilog=example("ccatp alarms ack wheel_blocked"))
+@alarms.command(epilog=common.example("ccatp alarms ack wheel_blocked"))
 @click.argument("name")
 @DAEMON_OPTIONS
 def ack(name: str, config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
     """Acknowledge the alarm NAME: someone knows of it and sees to it. That releases no hold."""
-    folder = configured_folder(config_file, runtime_dir)
+    folder = common.configured_folder(config_file, runtime_dir)
     reply = _ask(folder, "acknowledge", timeout_s, name=name, by=_user())
     _print_reply(reply if json_output else {"ok": True}, json_output)
 
 
-@alarms.command(epilog=example("ccatp alarms history", "ccatp alarms history runs/tonight --json"))
-@click.argument("run_dir", type=PATH, required=False)
-@CONFIG_OPTION
-@RUNTIME_DIR_OPTION
-@json_option("The events as JSON on standard output.")
+@alarms.command(epilog=common.example("ccatp alarms history", "ccatp alarms history runs/tonight --json"))
+@click.argument("run_dir", type=common.PATH, required=False)
+@common.CONFIG_OPTION
+@common.RUNTIME_DIR_OPTION
+@common.json_option("The events as JSON on standard output.")
 def history(run_dir: Path | None, config_file: Path | None, runtime_dir: Path | None, json_output: bool) -> None:
     """Show what happened to the alarms of the running daemon, or of the run in RUN_DIR, oldest first."""
     from ccatp.daemon.alarms import read_history
@@ -192,7 +179,7 @@ def history(run_dir: Path | None, config_file: Path | None, runtime_dir: Path | 
     from ccatp.links.runtime_dir import runtime_dir_path
 
     if run_dir is None:
-        folder = configured_folder(config_file, runtime_dir)
+        folder = common.configured_folder(config_file, runtime_dir)
         run_dir = run_dir_in(runtime_dir_path(str(folder or ""), os.environ))
     if run_dir is None or not run_dir.is_dir():
         raise ConfigError(f"{run_dir or 'no run'}: no such run; name its directory, as in ccatp alarms history RUN_DIR")
@@ -203,12 +190,10 @@ def history(run_dir: Path | None, config_file: Path | None, runtime_dir: Path | 
         click.echo(msgspec.json.encode({"history": events}))
         return
     rows = [f"{e.utc}  {e.event}{f' by {e.by}' if e.by else ''}: {e.severity} {e.name}: {e.cause}" for e in events]
-    print_lines(rows or ["no alarms"])
+    common.print_lines(rows or ["no alarms"])
 
 
-@click.command(
-    epilog=example("ccatp status", "ccatp status --watch", "ccatp status --watch --json | jq -c .status.done")
-)
+@common.command("ccatp status", "ccatp status --watch", "ccatp status --watch --json | jq -c .status.done")
 @DAEMON_OPTIONS
 @click.option("--watch", is_flag=True, help="Go on until the run is over; with --json one answer a line.")
 @click.option(
@@ -220,7 +205,7 @@ def status(
     json_output: bool,
 ) -> None:  # fmt: skip
     """Show what the running daemon is doing."""
-    folder = configured_folder(config_file, runtime_dir)
+    folder = common.configured_folder(config_file, runtime_dir)
     if not watch:
         from ccatp.daemon.child_processes import page_address
         from ccatp.links.runtime_dir import runtime_dir_path

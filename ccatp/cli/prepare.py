@@ -8,19 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ccatp.cli.common import (
-    JSON_OPTION,
-    PANELS_OPTION,
-    PATH,
-    RUNTIME_DIR_OPTION,
-    WORLD_OPTIONS,
-    complain,
-    example,
-    figure_option,
-    json_option,
-    key_option,
-    print_lines,
-)
+from ccatp.cli import common
 from ccatp.errors import ConfigError, ExitStatus, printable
 
 if TYPE_CHECKING:
@@ -28,18 +16,16 @@ if TYPE_CHECKING:
     from ccatp.config.models import Config
 
 
-@click.command(
-    epilog=example(
-        "ccatp plan --mirror fyst-m2",
-        "ccatp plan --config telescope.toml --figure plan.png",
-        "ccatp plan --set run.order=optimised --set mission.leg_clearance_m=0.12 --json",
-    )
+@common.command(
+    "ccatp plan --mirror fyst-m2",
+    "ccatp plan --config telescope.toml --figure plan.png",
+    "ccatp plan --set run.order=optimised --set mission.leg_clearance_m=0.12 --json",
 )
-@WORLD_OPTIONS
-@PANELS_OPTION
-@key_option("--filter", "run.filter", metavar="NAME", help="State estimator: some drive a calibration first.")
-@figure_option("Draw the way")
-@JSON_OPTION
+@common.WORLD_OPTIONS
+@common.PANELS_OPTION
+@common.key_option("--filter", "run.filter", metavar="NAME", help="State estimator: some drive a calibration first.")
+@common.figure_option("Draw the way")
+@common.JSON_OPTION
 def plan(config_file: Path | None, settings: Mapping[str, object], figure_file: Path | None, json_output: bool) -> int:
     """Show what a survey would do, without moving anything: order, way, least time, points out of reach.
 
@@ -56,28 +42,28 @@ def plan(config_file: Path | None, settings: Mapping[str, object], figure_file: 
         from ccatp.report.mirror_map import draw_plan
 
         draw_plan(geometry, found, figure_file)
-    print_lines([json.dumps(plan_data(cfg, found))] if json_output else plan_lines(cfg, found))
+    common.print_lines([json.dumps(plan_data(cfg, found))] if json_output else plan_lines(cfg, found))
     if found.out_of_reach:
-        return complain(
+        return common.complain(
             f"{len(found.out_of_reach)} points are out of reach with mission.leg_clearance_m = "
             f"{cfg.mission.leg_clearance_m:g} and turn_clearance_m = {cfg.mission.turn_clearance_m:g}; "
             "a run would be refused",
             ExitStatus.USAGE,
         )
     if not found.grip.is_held:
-        return complain(f"{found.grip.text}; a run would be refused", ExitStatus.USAGE)
+        return common.complain(f"{found.grip.text}; a run would be refused", ExitStatus.USAGE)
     return 0
 
 
 COLOURS = {"pass": "green", "warn": "yellow", "fail": "bright_red", "skip": "bright_black"}
 
 
-@click.command(epilog=example("ccatp check --config telescope.toml", "ccatp check --sim", "ccatp check --sim --json"))
+@common.command("ccatp check --config telescope.toml", "ccatp check --sim", "ccatp check --sim --json")
 @click.option("--sim", is_flag=True, help="Start the stand-ins of robot and laser system, and check those.")
-@WORLD_OPTIONS
-@click.option("--runs-dir", type=PATH, default="runs", show_default=True, help="Of the recordings.")
-@json_option("As JSON on standard output, nothing else there.")
-@RUNTIME_DIR_OPTION
+@common.WORLD_OPTIONS
+@click.option("--runs-dir", type=common.PATH, default="runs", show_default=True, help="Of the recordings.")
+@common.json_option("As JSON on standard output, nothing else there.")
+@common.RUNTIME_DIR_OPTION
 def check(
     sim: bool, config_file: Path | None, settings: Mapping[str, object], runs_dir: Path, json_output: bool,
     runtime_dir: Path | None,
@@ -108,25 +94,23 @@ def check(
     return int(ExitStatus.REFUSED if has_failed(found) else ExitStatus.COMPLETE)
 
 
-@click.command(
-    epilog=example(
-        "ccatp calibrate --config telescope.toml --dry-run",
-        "ccatp calibrate --config telescope.toml --rounds 5",
-        "ccatp calibrate --sim --world hard",
-        "ccatp calibrate --from runs/tonight --config telescope.toml",
-    )
+@common.command(
+    "ccatp calibrate --config telescope.toml --dry-run",
+    "ccatp calibrate --config telescope.toml --rounds 5",
+    "ccatp calibrate --sim --world hard",
+    "ccatp calibrate --from runs/tonight --config telescope.toml",
 )
 @click.option("--sim", is_flag=True, help="Simulate robot and laser system on this machine.")
-@WORLD_OPTIONS
+@common.WORLD_OPTIONS
 @click.option("--rounds", type=click.IntRange(2, 5), default=3, show_default=True, help="Rounds of four legs.")
 @click.option(
     "--length", "length_m", type=click.FloatRange(0.08, 0.5), default=0.2, show_default=True, help="Of a leg, m."
 )
-@click.option("--from", "from_dir", type=PATH, help="Do not drive: take the drive of this run.")
-@click.option("--run-dir", type=PATH, help="Where to record the drive.")
+@click.option("--from", "from_dir", type=common.PATH, help="Do not drive: take the drive of this run.")
+@click.option("--run-dir", type=common.PATH, help="Where to record the drive.")
 @click.option("--dry-run", is_flag=True, help="Drive and report, but write nothing into the configuration.")
-@JSON_OPTION
-@RUNTIME_DIR_OPTION
+@common.JSON_OPTION
+@common.RUNTIME_DIR_OPTION
 def calibrate(
     sim: bool, config_file: Path | None, settings: Mapping[str, object], rounds: int, length_m: float,
     from_dir: Path | None, run_dir: Path | None, dry_run: bool, json_output: bool, runtime_dir: Path | None,
@@ -156,7 +140,7 @@ def calibrate(
         )  # fmt: skip
         if status := run_survey(options):
             log = from_dir / "log.jsonl"
-            return complain(f"the drive did not come to its end, so nothing is calibrated; see {log}", status)
+            return common.complain(f"the drive did not come to its end, so nothing is calibrated; see {log}", status)
     from ccatp.commissioning.calibration import as_json, check_usable, lines, rows
     from ccatp.commissioning.calibration import calibrate as estimate
     from ccatp.commissioning.calibration_drive import read_drive
@@ -165,7 +149,7 @@ def calibrate(
     found = estimate(on_mirror, drive, cfg)
     table = rows(_replaced(config_file, cfg), found)
     if not json_output:
-        print_lines(lines(table, found))
+        common.print_lines(lines(table, found))
     check_usable(table)
     written, difference = _write(config_file, table, dry_run=dry_run)
     if json_output:
@@ -174,9 +158,9 @@ def calibrate(
     else:
         click.echo(difference or "nothing to change", nl=not difference)
         if config_file is None:
-            complain("nothing written: name the configuration with --config FILE", 0)
+            common.complain("nothing written: name the configuration with --config FILE", 0)
         elif written is None:
-            complain(f"nothing written into {config_file} (--dry-run)", 0)
+            common.complain(f"nothing written into {config_file} (--dry-run)", 0)
     return 0
 
 
@@ -188,7 +172,7 @@ def _replaced(config_file: Path | None, driven: "Config") -> "Config":
 
     cfg = load_config(config_file)
     if cfg.mirror.name != driven.mirror.name:
-        complain(
+        common.complain(
             f"warning: the drive was on {driven.mirror.name}, {config_file} is for {cfg.mirror.name}: "
             "the same robot must drive on both",
             0,

@@ -8,20 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.cli.common import (
-    CONFIG_OPTION,
-    JSON_OPTION,
-    PATH,
-    CommandGroup,
-    OutputFile,
-    complain,
-    example,
-    figure_option,
-    overrides,
-    print_lines,
-    settings_option,
-    warn,
-)
+from ccatp.cli import common
 from ccatp.cli.radio_levels import calibrate, fix, fuzzy
 
 if TYPE_CHECKING:
@@ -33,32 +20,33 @@ FORMAT_OPTION = click.option(
     "--format", "data_format", type=click.Choice(("plaza", "mrclam", "labyrinth", "csv", "bag")),
     help="Format of the data; found out if not given.",
 )  # fmt: skip
-ASSUMED_OPTION = settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
+ASSUMED_OPTION = common.settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
 
 
-@click.command(
-    epilog=example(
-        "ccatp radio slam recordings/Plaza2_.mat",
-        "ccatp radio slam recordings/MRCLAM_Dataset7 --robot 2 --filter smoother --json",
-        "ccatp radio slam mine.csv --set csv.radio.range_sigma_m=0.3 --figure map.png",
-    )
+@common.command(
+    "ccatp radio slam recordings/Plaza2_.mat",
+    "ccatp radio slam recordings/MRCLAM_Dataset7 --robot 2 --filter smoother --json",
+    "ccatp radio slam mine.csv --set csv.radio.range_sigma_m=0.3 --figure map.png",
 )
-@click.argument("path", type=PATH)
+@click.argument("path", type=common.PATH)
 @FORMAT_OPTION
 @click.option("--robot", type=click.IntRange(min=1), metavar="N", help="Robot of an MRCLAM set; else the first there.")
 @click.option(
     "--filter", "filter_name", type=click.Choice(FILTERS), default=FILTERS[0], show_default=True,
     help="ekf-slam: at each instant from readings up to it; smoother: from all of them.",
 )  # fmt: skip
-@CONFIG_OPTION
+@common.CONFIG_OPTION
 @ASSUMED_OPTION
-@click.option("--topics", "topics_file", type=PATH, help="Of a ROS bag: a TOML file that names its topics.")
-@figure_option("Draw map, path and residuals")
+@click.option("--topics", "topics_file", type=common.PATH, help="Of a ROS bag: a TOML file that names its topics.")
+@common.figure_option("Draw map, path and residuals")
 @click.option(
-    "--tum", "tum_file", type=OutputFile(), help="Write the path as evo reads it; the truth to NAME_truth beside it."
+    "--tum",
+    "tum_file",
+    type=common.OutputFile(),
+    help="Write the path as evo reads it; the truth to NAME_truth beside it.",
 )
 @click.option("--peers", is_flag=True, help="All our estimators and GTSAM's side by side; needs ccatp[peers].")
-@JSON_OPTION
+@common.JSON_OPTION
 def slam(
     path: Path, data_format: str | None, robot: int | None, filter_name: str, config_file: Path | None,
     settings: Mapping[str, object], topics_file: Path | None, figure_file: Path | None, tum_file: Path | None,
@@ -78,9 +66,9 @@ def slam(
 
     assumed = load_recordings_config(config_file, settings)
     run = read_run(path, data_format, robot, topics_file)
-    warn(run.warnings)
+    common.warn(run.warnings)
     track = estimate(run, assumed, filter_name)
-    warn(track.warnings)
+    common.warn(track.warnings)
     judged = judge(track, run)
     data: dict[str, Any] = result_data(run, filter_name, track, judged) | reviewed(
         run, track, getattr(assumed, run.kind).radio
@@ -92,14 +80,14 @@ def slam(
 
         draw_slam(run, track, judged, figure_file, f"{run.name}, {filter_name}")
     if peers:
-        data["peers"] = compared(run, assumed, warn)
+        data["peers"] = compared(run, assumed, common.warn)
     if json_output:
         click.echo(json.dumps(data, allow_nan=False))
         return
-    print_lines((*table_lines(run, data), *review_lines(data)))
+    common.print_lines((*table_lines(run, data), *review_lines(data)))
     if peers:
         rows = ([one[key] for key in COMPARED] for one in data["peers"])
-        print_lines(("", markdown_table(COMPARED, rows).rstrip()))
+        common.print_lines(("", markdown_table(COMPARED, rows).rstrip()))
 
 
 def _write_tum(file: Path, run: "RecordedRun", track: "EstimatedPath") -> None:
@@ -117,16 +105,16 @@ def _write_tum(file: Path, run: "RecordedRun", track: "EstimatedPath") -> None:
 
 @click.command(
     "map",
-    epilog=example(
+    epilog=common.example(
         "ccatp radio map --config cricket --seeds 20",
         "ccatp radio map --method ekf --set cricket.phase2.pairs=zigzag --figure map.png",
         "ccatp radio map --ranges ranges.csv --offset --out beacons.toml --json",
     ),
 )
-@CONFIG_OPTION
-@click.option("--ranges", "ranges_file", type=PATH, help="Measured ranges (CSV) in place of simulated ones.")
-@click.option("--tags", "tags_file", type=PATH, help="Places of tags on their trolley (CSV).")
-@click.option("--truth", "truth_file", type=PATH, help="True places (CSV) to compare with.")
+@common.CONFIG_OPTION
+@click.option("--ranges", "ranges_file", type=common.PATH, help="Measured ranges (CSV) in place of simulated ones.")
+@click.option("--tags", "tags_file", type=common.PATH, help="Places of tags on their trolley (CSV).")
+@click.option("--truth", "truth_file", type=common.PATH, help="True places (CSV) to compare with.")
 @click.option(
     "--method",
     type=click.Choice(("ekf", "batch")),
@@ -141,10 +129,10 @@ def _write_tum(file: Path, run: "RecordedRun", track: "EstimatedPath") -> None:
 @click.option(
     "--dimension", type=click.IntRange(2, 3), metavar="D", help="2 for motes in a plane, 3 for motes in space."
 )
-@settings_option("A key of cricket, as in cricket.phase2.pairs=zigzag.")
-@click.option("--out", "out_file", type=OutputFile(), help="Write a beacon file (TOML).")
-@figure_option("Draw map and errors")
-@JSON_OPTION
+@common.settings_option("A key of cricket, as in cricket.phase2.pairs=zigzag.")
+@click.option("--out", "out_file", type=common.OutputFile(), help="Write a beacon file (TOML).")
+@common.figure_option("Draw map and errors")
+@common.JSON_OPTION
 def radio_map(
     config_file: Path | None, ranges_file: Path | None, tags_file: Path | None, truth_file: Path | None,
     method: str, seeds: int, seed: int | None, offset: bool, scale: bool, dimension: int | None,
@@ -165,13 +153,13 @@ def radio_map(
         "cricket.batch.estimates_scale": scale or None,
         "system": "cricket" if config_file is None else None,
     }
-    cfg = load_radio_config(config_file, overrides(settings, named), simulates=ranges_file is None)
+    cfg = load_radio_config(config_file, common.overrides(settings, named), simulates=ranges_file is None)
     if ranges_file is None:
         data = _simulated(cfg.cricket, method, range(cfg.run.seed, cfg.run.seed + seeds), out_file, figure_file)
     else:
         data = _measured(cfg.cricket, method, (ranges_file, tags_file, truth_file), out_file, figure_file)
-    warn(data["warnings"])
-    print_lines([json.dumps(data)] if json_output else report_lines(data))
+    common.warn(data["warnings"])
+    common.print_lines([json.dumps(data)] if json_output else report_lines(data))
 
 
 def _simulated(
@@ -231,12 +219,12 @@ def _progress(total: int) -> Callable[[int], None]:
         if is_live:
             click.echo(f"\rccatp: {done} of {total} runs", nl=done == total, err=True)
         elif 10 * done // total > 10 * (done - 1) // total:
-            complain(f"{done} of {total} runs", 0)
+            common.complain(f"{done} of {total} runs", 0)
 
     return show
 
 
-@click.group(cls=CommandGroup, epilog=example("ccatp radio slam recordings/Plaza2_.mat"))
+@click.group(cls=common.CommandGroup, epilog=common.example("ccatp radio slam recordings/Plaza2_.mat"))
 def radio() -> None:
     """Robots among radio beacons: mapping them, finding the way by them."""
 

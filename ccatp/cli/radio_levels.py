@@ -8,16 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.cli.common import (
-    CONFIG_OPTION,
-    JSON_OPTION,
-    PATH,
-    SETTINGS_OPTION,
-    example,
-    figure_option,
-    print_lines,
-    warn,
-)
+from ccatp.cli import common
 
 if TYPE_CHECKING:
     from ccatp.beacons.slam.level_fix import LevelLocator, MeasuredPlace, Room
@@ -30,18 +21,16 @@ _LEAST_DB = 0.3  # readings come in whole decibels: 1 / sqrt(12)
 SHEET_OPTION = click.option("--sheet", metavar="NAME", help="Sheet of the workbooks; the first if not given.")
 
 
-@click.command(
-    epilog=example(
-        "ccatp radio calibrate pairs.csv --figure path_loss.png",
-        "ccatp radio calibrate Pathloss_Scenario1.xlsx --sheet Zigbee --json",
-        "ccatp radio calibrate Pathloss/Zigbee --points Pathloss_Scenario1.xlsx",
-    )
+@common.command(
+    "ccatp radio calibrate pairs.csv --figure path_loss.png",
+    "ccatp radio calibrate Pathloss_Scenario1.xlsx --sheet Zigbee --json",
+    "ccatp radio calibrate Pathloss/Zigbee --points Pathloss_Scenario1.xlsx",
 )
-@click.argument("path", type=PATH)
+@click.argument("path", type=common.PATH)
 @SHEET_OPTION
-@click.option("--points", type=PATH, help="Table of the distances of a folder of logs.")
-@figure_option("Draw it")
-@JSON_OPTION
+@click.option("--points", type=common.PATH, help="Table of the distances of a folder of logs.")
+@common.figure_option("Draw it")
+@common.JSON_OPTION
 def calibrate(path: Path, sheet: str | None, points: Path | None, figure_file: Path | None, json_output: bool) -> None:
     """Find reference level, exponent and spread of a radio from pairs of distance and level."""
     from ccatp.beacons.datasets.sheets import read_levels
@@ -54,7 +43,7 @@ def calibrate(path: Path, sheet: str | None, points: Path | None, figure_file: P
     except PathLossError as error:
         raise RadioDataError(path, str(error)) from error
     warnings += fit.doubts()
-    warn(warnings)
+    common.warn(warnings)
     if figure_file is not None:
         from ccatp.report.beacon_plots import draw_path_loss
 
@@ -62,7 +51,7 @@ def calibrate(path: Path, sheet: str | None, points: Path | None, figure_file: P
     if json_output:
         click.echo(json.dumps({"data": name, **fit.data(CONFIDENCE), "warnings": warnings}))
     else:
-        print_lines(_fit_lines(name, fit))
+        common.print_lines(_fit_lines(name, fit))
 
 
 def _fit_lines(name: str, fit: "PathLossFit") -> Iterator[str]:
@@ -92,24 +81,22 @@ _LARGEST_M = 1e4  # of coordinates: levels reach no further than that
 _MOST_POINTS = 250_000  # of the grid: a few megabytes for each beacon
 
 
-@click.command(
-    epilog=example(
-        "ccatp radio fix Tests_Scenario1.xlsx --fingerprints Database_Scenario1.xlsx "
-        "--beacon A=0,0 --beacon B=0,4 --beacon C=4,0",
-        "ccatp radio fix Database_Scenario1.xlsx --fingerprints Database_Scenario1.xlsx "
-        "--beacon A=0,0 --beacon B=0,4 --beacon C=4,0   # each point by the others",
-    )
+@common.command(
+    "ccatp radio fix Tests_Scenario1.xlsx --fingerprints Database_Scenario1.xlsx "
+    "--beacon A=0,0 --beacon B=0,4 --beacon C=4,0",
+    "ccatp radio fix Database_Scenario1.xlsx --fingerprints Database_Scenario1.xlsx "
+    "--beacon A=0,0 --beacon B=0,4 --beacon C=4,0   # each point by the others",
 )
-@click.argument("path", type=PATH)
-@click.option("--fingerprints", type=PATH, help="Places and levels that calibrate each beacon.")
-@click.option("--path-loss", type=PATH, help="Distances and levels that calibrate all instead.")
+@click.argument("path", type=common.PATH)
+@click.option("--fingerprints", type=common.PATH, help="Places and levels that calibrate each beacon.")
+@click.option("--path-loss", type=common.PATH, help="Distances and levels that calibrate all instead.")
 @click.option("--beacon", "beacons", multiple=True, metavar="NAME=X,Y", help="Place of a beacon, m. Repeat for each.")
 @click.option("--exchange", metavar="NAME,NAME", help="Two beacons that PATH has exchanged.")
 @click.option("--room", metavar="X0,Y0,X1,Y1", help="Where the receiver may be, m; round the beacons if not given.")
 @click.option("--spacing", "spacing_m", type=float, default=0.1, show_default=True, help="Of the grid, m.")
 @SHEET_OPTION
-@figure_option("Draw it")
-@JSON_OPTION
+@common.figure_option("Draw it")
+@common.JSON_OPTION
 def fix(
     path: Path, fingerprints: Path | None, path_loss: Path | None, beacons: Sequence[str], exchange: str | None,
     room: str | None, spacing_m: float, sheet: str | None, figure_file: Path | None, json_output: bool,
@@ -142,7 +129,7 @@ def fix(
     if not leave_out:
         warnings += _doubtful_names(locators[0], places)
         locators *= len(places)
-    warn(warnings)
+    common.warn(warnings)
     found = [locator.fix(place.levels_dbm) for locator, place in zip(locators, places, strict=True)]
     result = {"data": name, "leave_one_out": leave_out, **judged(found, places, REGION), "warnings": warnings}
     if figure_file is not None:
@@ -152,7 +139,7 @@ def fix(
     if json_output:
         click.echo(json.dumps(result))
     else:
-        print_lines(_fix_lines(result))
+        common.print_lines(_fix_lines(result))
 
 
 def _coordinates(option: str, text: str, wanted: str) -> list[float]:
@@ -241,14 +228,14 @@ def _fix_lines(result: dict[str, Any]) -> Iterator[str]:
     )
 
 
-@click.command(epilog=example("ccatp radio fuzzy --figure speed.png", "ccatp radio fuzzy --at 0.3 0.5"))
-@CONFIG_OPTION
-@SETTINGS_OPTION
+@common.command("ccatp radio fuzzy --figure speed.png", "ccatp radio fuzzy --at 0.3 0.5")
+@common.CONFIG_OPTION
+@common.SETTINGS_OPTION
 @click.option(
     "--at", nargs=2, type=float, multiple=True, metavar="M RAD", help="Speed at a distance and a heading error."
 )
-@figure_option("Draw it")
-@JSON_OPTION
+@common.figure_option("Draw it")
+@common.JSON_OPTION
 def fuzzy(
     config_file: Path | None, settings: dict[str, object], at: Sequence[tuple[float, float]], figure_file: Path | None,
     json_output: bool,
@@ -281,4 +268,4 @@ def fuzzy(
         click.echo(json.dumps({"rules": len(cfg.rules), "points": values}))
         return
     click.echo("distance, m   heading error, rad   speed, m/s")
-    print_lines(f"{v['distance_m']:11.2f} {v['heading_error_rad']:20.2f} {v['speed_m_s']:12.3f}" for v in values)
+    common.print_lines(f"{v['distance_m']:11.2f} {v['heading_error_rad']:20.2f} {v['speed_m_s']:12.3f}" for v in values)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ccatp.cli.common import PATH, CommandGroup, columns, example, json_option, print_lines, warn, write_lines
+from ccatp.cli import common
 from ccatp.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -17,18 +17,22 @@ if TYPE_CHECKING:
 
 
 @click.group(
-    cls=CommandGroup,
-    epilog=example("ccatp recording info runs/tonight", "ccatp recording export runs/tonight --ros2 tonight_bag"),
+    cls=common.CommandGroup,
+    epilog=common.example(
+        "ccatp recording info runs/tonight", "ccatp recording export runs/tonight --ros2 tonight_bag"
+    ),
 )
 def recording() -> None:
     """Show what recordings hold, repair damaged ones, and write them for other tools."""
 
 
 @recording.command(
-    epilog=example("ccatp recording info runs/tonight", "ccatp recording info runs/tonight/telemetry.mcap --json")
+    epilog=common.example(
+        "ccatp recording info runs/tonight", "ccatp recording info runs/tonight/telemetry.mcap --json"
+    )
 )
-@click.argument("path", metavar="FILE|RUN_DIR", type=PATH)
-@json_option("As JSON on standard output, nothing else there.")
+@click.argument("path", metavar="FILE|RUN_DIR", type=common.PATH)
+@common.json_option("As JSON on standard output, nothing else there.")
 def info(path: Path, json_output: bool) -> int:
     """Show what a recording holds, and whether every checksum in it is right.
 
@@ -47,11 +51,13 @@ def info(path: Path, json_output: bool) -> int:
 
 
 @recording.command(
-    epilog=example("ccatp recording repair runs/tonight", "ccatp recording repair telemetry.mcap --out saved.mcap")
+    epilog=common.example(
+        "ccatp recording repair runs/tonight", "ccatp recording repair telemetry.mcap --out saved.mcap"
+    )
 )
-@click.argument("path", metavar="FILE|RUN_DIR", type=PATH)
-@click.option("--out", type=PATH, help="The new file; FILE.recovered.mcap if not given.")
-@json_option("As JSON on standard output, nothing else there.")
+@click.argument("path", metavar="FILE|RUN_DIR", type=common.PATH)
+@click.option("--out", type=common.PATH, help="The new file; FILE.recovered.mcap if not given.")
+@common.json_option("As JSON on standard output, nothing else there.")
 def repair(path: Path, out: Path | None, json_output: bool) -> int:
     """Save what is intact of a recording that was cut off or damaged, as a new file with an index.
 
@@ -73,16 +79,16 @@ def repair(path: Path, out: Path | None, json_output: bool) -> int:
 
 
 @recording.command(
-    epilog=example(
+    epilog=common.example(
         "ccatp recording export runs/tonight --tum estimate.tum --truth truth.tum",
         "evo_ape tum truth.tum estimate.tum",
         "ccatp recording export runs/tonight --ros2 tonight_bag",
     )
 )
-@click.argument("path", metavar="FILE|RUN_DIR", type=PATH)
-@click.option("--tum", "tum_file", type=PATH, help="File for the estimates, a TUM trajectory.")
-@click.option("--truth", "truth_file", type=PATH, help="File for the simulated truth, a TUM trajectory.")
-@click.option("--ros2", "bag_dir", type=PATH, help="New directory for a ROS 2 bag (MCAP; extra ccatp[ros]).")
+@click.argument("path", metavar="FILE|RUN_DIR", type=common.PATH)
+@click.option("--tum", "tum_file", type=common.PATH, help="File for the estimates, a TUM trajectory.")
+@click.option("--truth", "truth_file", type=common.PATH, help="File for the simulated truth, a TUM trajectory.")
+@click.option("--ros2", "bag_dir", type=common.PATH, help="New directory for a ROS 2 bag (MCAP; extra ccatp[ros]).")
 def export(path: Path, tum_file: Path | None, truth_file: Path | None, bag_dir: Path | None) -> None:
     """Write a recorded survey for other tools.
 
@@ -113,9 +119,9 @@ def export(path: Path, tum_file: Path | None, truth_file: Path | None, bag_dir: 
             raise ConfigError(f"--truth: {newest.path} is of a real robot and holds no truth; leave it out")
         for option, file, trace in (("--tum", tum_file, newest.recorded(mirror)), ("--truth", truth_file, truth)):
             if file is not None and trace is not None:
-                write_lines(option, file, format_tum(trace).splitlines())
+                common.write_lines(option, file, format_tum(trace).splitlines())
                 click.echo(f"{file}: {len(trace.seq)} poses")
-    warn(newest.warnings)
+    common.warn(newest.warnings)
 
 
 def _write_bag(folder: Path, recording: "Recording", cfg: "Config", mirror: "Mirror") -> dict[str, int]:
@@ -158,7 +164,7 @@ def _print_facts(facts: "RecordingFacts") -> None:
         length_s = (topic.end_s or 0.0) - (topic.start_s or 0.0)
         per_s = f"{(topic.messages - 1) / length_s:.2f}" if topic.messages > 1 and length_s > 0.0 else "-"
         rows.append((name, topic.schema, str(topic.messages), per_s, f"{topic.payload_bytes / 1e3:.1f}"))
-    print_lines(f"  {line}" for line in columns(rows, left=2))
+    common.print_lines(f"  {line}" for line in common.columns(rows, left=2))
     if empty := sum(not topic.messages for topic in facts.topics.values()):
         click.echo(f"  {empty} topic{'s' if empty > 1 else ''} without messages")
     if facts.is_in_order:

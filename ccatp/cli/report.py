@@ -10,20 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.cli.common import (
-    JSON_OPTION,
-    PATH,
-    OutputFile,
-    complain,
-    example,
-    figure_option,
-    json_option,
-    key_option,
-    print_lines,
-    settings_option,
-    warn,
-    write_lines,
-)
+from ccatp.cli import common
 from ccatp.errors import ConfigError, ExitStatus, UsageError
 
 if TYPE_CHECKING:
@@ -35,13 +22,11 @@ if TYPE_CHECKING:
 _FILE = click.Path(path_type=Path, dir_okay=False)
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 _FIGURES = click.option("--figures", type=_FOLDER, metavar="DIR", help="Also write the figures there: SVG, PNG, PDF.")
-_JSON = json_option("The figures of it as JSON on standard output.")
+_JSON = common.json_option("The figures of it as JSON on standard output.")
 
 
-@click.command(
-    epilog=example("ccatp report runs/tonight", "ccatp report runs/tonight --figures figures --tables tables")
-)
-@click.argument("run_dir", type=PATH)
+@common.command("ccatp report runs/tonight", "ccatp report runs/tonight --figures figures --tables tables")
+@click.argument("run_dir", type=common.PATH)
 @click.option("--out", type=_FILE, metavar="FILE", help="The page; report.html in the run directory if not given.")
 @_FIGURES
 @click.option("--tables", type=_FOLDER, metavar="DIR", help="Also write fixes, panels and moves there: CSV and ECSV.")
@@ -55,14 +40,14 @@ def report(run_dir: Path, out: Path | None, figures: Path | None, tables: Path |
     from ccatp.report.run_page import report_run
 
     data, warnings = report_run(run_dir, out, figures, tables)
-    warn(warnings)
+    common.warn(warnings)
     click.echo(json.dumps(data) if json_output else data["report"])
     return 0
 
 
-@click.command(epilog=example("ccatp compare runs/before runs/after", "ccatp compare runs/a runs/b --json"))
-@click.argument("run_a", type=PATH)
-@click.argument("run_b", type=PATH)
+@common.command("ccatp compare runs/before runs/after", "ccatp compare runs/a runs/b --json")
+@click.argument("run_a", type=common.PATH)
+@click.argument("run_b", type=common.PATH)
 @click.option("--out", type=_FILE, metavar="FILE", help="The page; compare.html in RUN_B if not given.")
 @_FIGURES
 @_JSON
@@ -73,16 +58,18 @@ def compare(run_a: Path, run_b: Path, out: Path | None, figures: Path | None, js
     path = out or run_b / COMPARISON
     pair = compare_runs(run_a, run_b, path, figures)
     for found in (pair.a, pair.b):
-        warn(f"{found.record.name}: {warning}" for warning in found.record.warnings)
+        common.warn(f"{found.record.name}: {warning}" for warning in found.record.warnings)
     data = {"report": str(path), **compare_data(pair)}
-    print_lines([json.dumps(data)] if json_output else [*compare_lines(pair), str(path)])
+    common.print_lines([json.dumps(data)] if json_output else [*compare_lines(pair), str(path)])
     return 0
 
 
-@click.command(epilog=example("ccatp plot runs/20260101T000000Z-fyst-m1-s1 --out map.png"))
-@click.argument("run_dir", type=PATH)
+@common.command("ccatp plot runs/20260101T000000Z-fyst-m1-s1 --out map.png")
+@click.argument("run_dir", type=common.PATH)
 @click.option(
-    "--out", type=OutputFile(".png", ".pdf", ".svg"), help="The picture; map.png in the run directory if not given."
+    "--out",
+    type=common.OutputFile(".png", ".pdf", ".svg"),
+    help="The picture; map.png in the run directory if not given.",
 )
 def plot(run_dir: Path, out: Path | None) -> int:
     """Draw the map of a run: panels, path, and each point coloured by its arrival error."""
@@ -109,18 +96,16 @@ def _check_effect(settings: Mapping[str, object], keys: tuple[str, ...], what: s
         raise ConfigError(f"command line: {idle[0]}: has no effect on {what}; what has: {', '.join(keys)}")
 
 
-@click.command(
-    epilog=example(
-        "ccatp align runs/tonight",
-        "ccatp align runs/tonight --csv moves.csv --figure panels.png",
-        "ccatp align runs/tonight --json --set align.point_floor_m=2e-6",
-    )
+@common.command(
+    "ccatp align runs/tonight",
+    "ccatp align runs/tonight --csv moves.csv --figure panels.png",
+    "ccatp align runs/tonight --json --set align.point_floor_m=2e-6",
 )
-@click.argument("run_dir", type=PATH)
-@settings_option("A key of align or mirror, or robot.puck_height_m, as in align.point_floor_m=2e-6.")
-@click.option("--csv", "csv_file", type=OutputFile(), help="Write a line a panel (CSV).")
-@figure_option("Draw deviations and moves")
-@JSON_OPTION
+@click.argument("run_dir", type=common.PATH)
+@common.settings_option("A key of align or mirror, or robot.puck_height_m, as in align.point_floor_m=2e-6.")
+@click.option("--csv", "csv_file", type=common.OutputFile(), help="Write a line a panel (CSV).")
+@common.figure_option("Draw deviations and moves")
+@common.JSON_OPTION
 def align(
     run_dir: Path, settings: Mapping[str, object], csv_file: Path | None, figure_file: Path | None, json_output: bool
 ) -> int:
@@ -148,35 +133,35 @@ def align(
         "puck_height_sigma_um": round(cfg.align.puck_height_sigma_m * 1e6, 4),
     }
     warnings = [*survey.warnings, *result.warnings]
-    warn(warnings)
+    common.warn(warnings)
     if csv_file is not None:
         from ccatp.report.tables import csv_lines, panel_table
 
-        write_lines("--csv", csv_file, csv_lines(panel_table(mirror, result)))
+        common.write_lines("--csv", csv_file, csv_lines(panel_table(mirror, result)))
     if figure_file is not None:
         from ccatp.report.mirror_map import draw_alignment
 
         draw_alignment(mirror, result, figure_file, f"{mirror.name}: {len(result.panels)} panels", str(run_dir))
     if json_output:
-        print_lines([json.dumps({**facts, **result_data(result, comparison), "warnings": warnings})])
+        common.print_lines([json.dumps({**facts, **result_data(result, comparison), "warnings": warnings})])
     else:
-        print_lines(table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m))
+        common.print_lines(table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m))
     return 0
 
 
-@click.command(
-    epilog=example(
-        "ccatp replay runs/tonight",
-        "ccatp replay runs/tonight --filter ukf --smooth",
-        "ccatp replay runs/tonight --set localizer.full_state.fix_gate_nis=20 --out track.csv",
-    )
+@common.command(
+    "ccatp replay runs/tonight",
+    "ccatp replay runs/tonight --filter ukf --smooth",
+    "ccatp replay runs/tonight --set localizer.full_state.fix_gate_nis=20 --out track.csv",
 )
-@click.argument("run_dir", type=PATH)
-@key_option("--filter", "run.filter", metavar="NAME", help="State estimator, if not that of the run: kf, ekf, ukf.")
-@settings_option("A key of localizer, robot or mirror, as in localizer.full_state.fix_gate_nis=20.")
+@click.argument("run_dir", type=common.PATH)
+@common.key_option(
+    "--filter", "run.filter", metavar="NAME", help="State estimator, if not that of the run: kf, ekf, ukf."
+)
+@common.settings_option("A key of localizer, robot or mirror, as in localizer.full_state.fix_gate_nis=20.")
 @click.option("--smooth", is_flag=True, help="Go back over the run with the smoother, too (not with kf).")
-@click.option("--out", type=OutputFile(), help="Write the estimates of all frames (CSV).")
-@JSON_OPTION
+@click.option("--out", type=common.OutputFile(), help="Write the estimates of all frames (CSV).")
+@common.JSON_OPTION
 def replay(run_dir: Path, settings: Mapping[str, object], smooth: bool, out: Path | None, json_output: bool) -> int:
     """Run an estimator again over the recorded samples of a run, as it was or with other settings."""
     from ccatp.records.run_reader import open_run
@@ -198,19 +183,21 @@ def replay(run_dir: Path, settings: Mapping[str, object], smooth: bool, out: Pat
         "warnings": [warning for recording in recordings for warning in recording.warnings],
         "wall": {"time_s": round(time.monotonic() - started, 3)},
     }
-    warn(result["warnings"])
+    common.warn(result["warnings"])
     if out is not None:
-        write_lines("--out", out, csv_lines(parts))
+        common.write_lines("--out", out, csv_lines(parts))
     is_as_it_was = result["difference"]["reproduced"]
     may_differ = bool(settings or result["warnings"])
     lines = [*_head(result), *table_lines(result)]
     if is_as_it_was or may_differ:
         lines.append(f"the replay {'reproduces' if is_as_it_was else 'differs from'} the recorded estimates")
-    print_lines([json.dumps(result)] if json_output else lines)
+    common.print_lines([json.dumps(result)] if json_output else lines)
     if is_as_it_was or may_differ:
         return ExitStatus.COMPLETE
     why = "was the run made by another version, or on another CPU?"
-    return complain(f"{run_dir}: the replay does not reproduce the recorded estimates: {why}", ExitStatus.REFUSED)
+    return common.complain(
+        f"{run_dir}: the replay does not reproduce the recorded estimates: {why}", ExitStatus.REFUSED
+    )
 
 
 def _replayed(recording: "Recording", cfg: "Config", smooth: bool) -> "ReplayEvaluation":

@@ -5,43 +5,27 @@ from pathlib import Path
 
 import click
 
-from ccatp.cli.common import (
-    CONFIG_OPTION,
-    FAULTS_OPTION,
-    PANELS_OPTION,
-    PATH,
-    RUNTIME_DIR_OPTION,
-    WORLD_OPTIONS,
-    address_options,
-    configured_folder,
-    example,
-    json_option,
-    key_option,
-    renamed_flag,
-    settings_option,
-)
+from ccatp.cli import common
 
 PLOTJUGGLER_PORT = 9872
 FOXGLOVE_PORT = 8765
 
 
-@click.command(
-    epilog=example(
-        "ccatp run --sim --mirror fyst-m2 --panels 4", "ccatp run --config telescope.toml --run-dir runs/tonight"
-    )
+@common.command(
+    "ccatp run --sim --mirror fyst-m2 --panels 4", "ccatp run --config telescope.toml --run-dir runs/tonight"
 )
 @click.option("--sim", is_flag=True, help="Simulate robot and laser system on this machine.")
-@WORLD_OPTIONS
-@PANELS_OPTION
-@key_option("--filter", "run.filter", metavar="NAME", help="State estimator: kf, ekf or ukf.")
+@common.WORLD_OPTIONS
+@common.PANELS_OPTION
+@common.key_option("--filter", "run.filter", metavar="NAME", help="State estimator: kf, ekf or ukf.")
 @click.option("--realtime", is_flag=True, help="Pace the simulation on the wall clock.")
-@key_option(
+@common.key_option(
     "--physics",
     "sim.robot.physics",
     metavar="NAME",
     help="Simulated robot: lag, motors or mujoco (extra ccatp[physics]).",
 )
-@click.option("--run-dir", type=PATH, help="Where to write; runs/<time>-<mirror>-s<seed> if not given.")
+@click.option("--run-dir", type=common.PATH, help="Where to write; runs/<time>-<mirror>-s<seed> if not given.")
 @click.option(
     "--resume", is_flag=True, help="Resume the mission in --run-dir, or the only one in ./runs that is not complete."
 )
@@ -51,11 +35,11 @@ FOXGLOVE_PORT = 8765
 )
 @click.option("-q", "--quiet", is_flag=True, help="Only warnings, errors and the summary.")
 @click.option("-v", "--verbose", is_flag=True, help="Also each change of the mission's state.")
-@renamed_flag("--held", "--start-held")
-@renamed_flag("--recover", "--resume-last")
-@json_option("Summary as JSON on standard output, nothing else there.")
-@FAULTS_OPTION
-@RUNTIME_DIR_OPTION
+@common.renamed_flag("--held", "--start-held")
+@common.renamed_flag("--recover", "--resume-last")
+@common.json_option("Summary as JSON on standard output, nothing else there.")
+@common.FAULTS_OPTION
+@common.RUNTIME_DIR_OPTION
 def run(
     sim: bool, config_file: Path | None, settings: Mapping[str, object], realtime: bool, run_dir: Path | None,
     resume: bool, held: bool, recover: bool, json_output: bool, faults_file: Path | None, runtime_dir: Path | None,
@@ -92,15 +76,13 @@ def run(
     return int(run_to_the_end(options))
 
 
-@click.command(
-    epilog=example(
-        "ccatp dashboard", "ccatp dashboard --port 8080", "ccatp dashboard --host 0.0.0.0 --token-file page.token"
-    )
+@common.command(
+    "ccatp dashboard", "ccatp dashboard --port 8080", "ccatp dashboard --host 0.0.0.0 --token-file page.token"
 )
-@address_options("dashboard")
-@key_option("--token-file", "dashboard.token_file", type=click.Path(), help="File with the tokens of commands.")
-@RUNTIME_DIR_OPTION
-@settings_option("A key of dashboard, as in dashboard.rate_hz=5.")
+@common.address_options("dashboard")
+@common.key_option("--token-file", "dashboard.token_file", type=click.Path(), help="File with the tokens of commands.")
+@common.RUNTIME_DIR_OPTION
+@common.settings_option("A key of dashboard, as in dashboard.rate_hz=5.")
 def dashboard(runtime_dir: Path | None, settings: Mapping[str, object]) -> int:
     """Show a running daemon on a web page, and command it from there; Ctrl-C ends the page and nothing else.
 
@@ -108,14 +90,12 @@ def dashboard(runtime_dir: Path | None, settings: Mapping[str, object]) -> int:
     """
     from ccatp.daemon.dashboard import attach
 
-    return attach(configured_folder(None, runtime_dir), settings, click.echo)
+    return attach(common.configured_folder(None, runtime_dir), settings, click.echo)
 
 
-@click.command(
-    epilog=example("ccatp stream", "ccatp stream --foxglove", "ccatp stream --no-plotjuggler --foxglove-port 8800")
-)
-@CONFIG_OPTION
-@RUNTIME_DIR_OPTION
+@common.command("ccatp stream", "ccatp stream --foxglove", "ccatp stream --no-plotjuggler --foxglove-port 8800")
+@common.CONFIG_OPTION
+@common.RUNTIME_DIR_OPTION
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option("--plotjuggler/--no-plotjuggler", default=True, show_default=True, help="Serve PlotJuggler's ZMQ plugin.")
 @click.option("--port", type=click.IntRange(0, 65535), default=PLOTJUGGLER_PORT, show_default=True, help="Its port.")
@@ -138,7 +118,7 @@ def stream(
     if not plotjuggler and foxglove_port is None:
         raise click.UsageError("nothing to serve: leave out --no-plotjuggler, or add --foxglove")
     return serve(
-        configured_folder(config_file, runtime_dir),
+        common.configured_folder(config_file, runtime_dir),
         host,
         port if plotjuggler else None,
         foxglove_port,

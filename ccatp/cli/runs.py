@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ccatp.cli.common import JSON_OPTION, PATH, CommandGroup, columns, example, print_lines
+from ccatp.cli import common
 from ccatp.errors import ConfigError, ExitStatus
 
 # Files of a run directory, and what they are.
@@ -31,14 +31,14 @@ _PART = re.compile(r"\.\d+\.mcap$")  # of the recording: one for each session
 _LAST_BYTES = 65_536
 
 
-@click.group(cls=CommandGroup, epilog=example("ccatp runs list", "ccatp runs show runs/tonight"))
+@click.group(cls=common.CommandGroup, epilog=common.example("ccatp runs list", "ccatp runs show runs/tonight"))
 def runs() -> None:
     """List the runs in a folder, and show one."""
 
 
-@runs.command("list", epilog=example("ccatp runs list", "ccatp runs list /var/lib/ccatp/runs --json"))
-@click.argument("folder", type=PATH, default="runs")
-@JSON_OPTION
+@runs.command("list", epilog=common.example("ccatp runs list", "ccatp runs list /var/lib/ccatp/runs --json"))
+@click.argument("folder", type=common.PATH, default="runs")
+@common.JSON_OPTION
 def list_runs(folder: Path, json_output: bool) -> None:
     """List the runs in FOLDER, ./runs if not given, the oldest first."""
     if not folder.is_dir():
@@ -48,12 +48,14 @@ def list_runs(folder: Path, json_output: bool) -> None:
         click.echo(json.dumps({"runs": found}))
         return
     head = {"began": "began (UTC)", "state": "state", "points": "points", "size_mb": "MB", "what": "what", "run": "run"}
-    print_lines(columns([[str(run[key]) for key in head] for run in (head, *found)]) if found else ["none"])
+    common.print_lines(
+        common.columns([[str(run[key]) for key in head] for run in (head, *found)]) if found else ["none"]
+    )
 
 
-@runs.command("show", epilog=example("ccatp runs show runs/tonight"))
-@click.argument("run_dir", type=PATH)
-@JSON_OPTION
+@runs.command("show", epilog=common.example("ccatp runs show runs/tonight"))
+@click.argument("run_dir", type=common.PATH)
+@common.JSON_OPTION
 def show(run_dir: Path, json_output: bool) -> None:
     """Show how the run in RUN_DIR ended, and which files it left."""
     if not (run_dir / "config.toml").is_file():
@@ -63,9 +65,9 @@ def show(run_dir: Path, json_output: bool) -> None:
     if json_output:
         click.echo(json.dumps({**facts, "files": files}))
         return
-    print_lines(f"{name:<15} {value}" for name, value in facts.items() if value != "")
+    common.print_lines(f"{name:<15} {value}" for name, value in facts.items() if value != "")
     click.echo()
-    print_lines(
+    common.print_lines(
         f"{name:<24} {size / 1e6:10.3f} MB  {FILES.get(_PART.sub('.mcap', name), '')}".rstrip()
         for name, size in files.items()
         if not name.startswith(".") and not name.endswith(".new")  # the program's own

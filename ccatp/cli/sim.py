@@ -7,18 +7,7 @@ from pathlib import Path
 
 import click
 
-from ccatp.cli.common import (
-    FAULTS_OPTION,
-    JSON_OPTION,
-    PATH,
-    RUNTIME_DIR_OPTION,
-    WORLD_OPTIONS,
-    CommandGroup,
-    WaitingTime,
-    address_options,
-    complain,
-    example,
-)
+from ccatp.cli import common
 from ccatp.errors import ConfigError
 
 # No laser reaches farther.
@@ -39,19 +28,20 @@ def _endpoint(_ctx: click.Context, _param: click.Parameter, endpoint: str | None
     return endpoint
 
 
-@click.group(cls=CommandGroup, epilog=example("ccatp sim robot --port 7010"))
+@click.group(cls=common.CommandGroup, epilog=common.example("ccatp sim robot --port 7010"))
 def sim() -> None:
     """Stand-ins of robot and laser system, alone."""
 
 
 @sim.command(
-    "robot", epilog=example("ccatp sim robot --port 7010 --mirror fyst-m2", "ccatp sim robot --lockstep --seed 3")
+    "robot",
+    epilog=common.example("ccatp sim robot --port 7010 --mirror fyst-m2", "ccatp sim robot --lockstep --seed 3"),
 )
-@address_options("sim.robot")
-@WORLD_OPTIONS
+@common.address_options("sim.robot")
+@common.WORLD_OPTIONS
 @click.option("--realtime/--lockstep", default=True, show_default=True, help="Wall clock, or wait for each command.")
-@FAULTS_OPTION
-@RUNTIME_DIR_OPTION
+@common.FAULTS_OPTION
+@common.RUNTIME_DIR_OPTION
 def sim_robot(
     config_file: Path | None, settings: Mapping[str, object], realtime: bool, faults_file: Path | None,
     runtime_dir: Path | None,
@@ -72,9 +62,9 @@ def sim_robot(
     return int(run_alone(cfg, lockstep=not realtime, faults=plan, runtime_dir=runtime_dir))
 
 
-@sim.command("etalon", epilog=example("ccatp sim etalon --port 2001 --puck 0.1 -0.5 3.4"))
-@address_options("sim.etalon")
-@WORLD_OPTIONS
+@sim.command("etalon", epilog=common.example("ccatp sim etalon --port 2001 --puck 0.1 -0.5 3.4"))
+@common.address_options("sim.etalon")
+@common.WORLD_OPTIONS
 @click.option(
     "--puck", "puck_world_m", type=(float, float, float), callback=_finite, metavar="X Y Z",
     help="Where the puck stands: world frame, metres.",
@@ -83,7 +73,9 @@ def sim_robot(
     "--truth", callback=_endpoint, metavar="ENDPOINT",
     help="Follow the true puck that a simulated robot publishes there.",
 )  # fmt: skip
-@click.option("--runtime-dir", type=PATH, help="Follow the true puck of the simulated robot that has this folder.")
+@click.option(
+    "--runtime-dir", type=common.PATH, help="Follow the true puck of the simulated robot that has this folder."
+)
 def sim_etalon(
     config_file: Path | None, settings: Mapping[str, object], puck_world_m: Place | None, truth: str | None,
     runtime_dir: Path | None,
@@ -103,12 +95,10 @@ def sim_etalon(
     return int(run_alone(load_config(config_file, settings), puck_world_m, truth))
 
 
-@click.command(
-    epilog=example(
-        "ccatp conformance 192.168.1.20:7010 --no-motion",
-        "ccatp conformance 127.0.0.1:7010 --key robot.key --json",
-        "ccatp conformance 127.0.0.1:7010 --only ttl-drive --only ttl-permit",
-    )
+@common.command(
+    "ccatp conformance 192.168.1.20:7010 --no-motion",
+    "ccatp conformance 127.0.0.1:7010 --key robot.key --json",
+    "ccatp conformance 127.0.0.1:7010 --only ttl-drive --only ttl-permit",
 )
 @click.argument("server", metavar="HOST:PORT")
 @click.option(
@@ -120,10 +110,10 @@ def sim_etalon(
 @click.option("--on-stands", is_flag=True, help="Only the wheels turn: leave out the checks of the body's motion.")
 @click.option("--only", multiple=True, metavar="ID", help="Run only this check. May be repeated.")
 @click.option(
-    "--timeout", "timeout_s", type=WaitingTime(), metavar="SECONDS", default=3.0, show_default=True,
+    "--timeout", "timeout_s", type=common.WaitingTime(), metavar="SECONDS", default=3.0, show_default=True,
     help="Seconds to wait for an answer.",
 )  # fmt: skip
-@JSON_OPTION
+@common.JSON_OPTION
 def conformance(
     server: str, key_file: str | None, mirror: str | None, no_motion: bool, on_stands: bool, only: Sequence[str],
     timeout_s: float, json_output: bool,
@@ -153,7 +143,7 @@ def conformance(
     checks = Conformance((host, int(port)), key, timeout_s, base)
     moving = [check for check in CHECKS if "motion" in check.needs and (not only or check.check_id in only)]
     if moving and not no_motion and checks.facts is not None:
-        complain(notice(checks.facts, len(moving)), 0)
+        common.complain(notice(checks.facts, len(moving)), 0)
     results = checks.run(
         motion=not no_motion,
         on_stands=on_stands,

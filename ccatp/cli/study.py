@@ -8,17 +8,7 @@ from typing import Any
 
 import click
 
-from ccatp.cli.common import (
-    CONFIG_OPTION,
-    JSON_OPTION,
-    PANELS_OPTION,
-    PATH,
-    SETTINGS_OPTION,
-    WORLD_OPTIONS,
-    example,
-    key_option,
-    print_lines,
-)
+from ccatp.cli import common
 
 
 class _StudyCommand(click.Command):
@@ -32,13 +22,11 @@ class _StudyCommand(click.Command):
         super().format_epilog(ctx, formatter)
 
 
-@click.command(
+@common.command(
+    "ccatp study filters --runs 20 --out studies/filters",
+    "ccatp study filters --only world=hard,extreme --only filter=ekf --out studies/ekf",
+    "ccatp study time --mirror fyst-m1 --mirror fyst-m2 --out studies/time",
     cls=_StudyCommand,
-    epilog=example(
-        "ccatp study filters --runs 20 --out studies/filters",
-        "ccatp study filters --only world=hard,extreme --only filter=ekf --out studies/ekf",
-        "ccatp study time --mirror fyst-m1 --mirror fyst-m2 --out studies/time",
-    ),
 )
 @click.argument("name", metavar="NAME")
 @click.option(
@@ -52,19 +40,19 @@ class _StudyCommand(click.Command):
 @click.option("--cluster", metavar="ADDRESS", help="Scheduler of dask.distributed that does the jobs instead.")
 @click.option("--shard", metavar="I/N", help="Only every N-th job, from the I-th on; without it all are put together.")
 @click.option(
-    "--from", "others", multiple=True, type=PATH, metavar="DIR",
+    "--from", "others", multiple=True, type=common.PATH, metavar="DIR",
     help="Take over the jobs that are done there. May be repeated.",
 )  # fmt: skip
 @click.option("--only", multiple=True, metavar="FACTOR=LEVEL[,LEVEL]", help="Only these cells. May be repeated.")
 @click.option("--mirror", "mirrors", multiple=True, metavar="NAME", help="In place of the study's. May be repeated.")
-@PANELS_OPTION
-@key_option("--seed", "run.seed", type=int, metavar="N", help="Seed of the first run.")
-@key_option("--data", "run.data", metavar="DIR", help="Folder of recorded runs, for recordings and damage.")
+@common.PANELS_OPTION
+@common.key_option("--seed", "run.seed", type=int, metavar="N", help="Seed of the first run.")
+@common.key_option("--data", "run.data", metavar="DIR", help="Folder of recorded runs, for recordings and damage.")
 @click.option("--peers", is_flag=True, help="Other people's estimators, too: GTSAM, which needs ccatp[peers].")
-@CONFIG_OPTION
-@SETTINGS_OPTION
+@common.CONFIG_OPTION
+@common.SETTINGS_OPTION
 @click.option("--no-figures", is_flag=True, help="Tables only.")
-@JSON_OPTION
+@common.JSON_OPTION
 def study(
     name: str, out: Path | None, runs: int | None, workers: int | None, cluster: str | None, shard: str | None,
     others: Sequence[Path], only: Sequence[str], mirrors: Sequence[str], config_file: Path | None,
@@ -100,7 +88,7 @@ def study(
         if runs or workers:
             click.echo(f"ccatp: study {name} is one analysis: --runs and --workers change nothing", err=True)
         result = _analysed(found, loaders.load_config(config_file, settings), out)
-    print_lines([json.dumps(result) if json_output else (out / "table.md").read_text(encoding="utf-8").rstrip()])
+    common.print_lines([json.dumps(result) if json_output else (out / "table.md").read_text(encoding="utf-8").rstrip()])
     return 0
 
 
@@ -121,8 +109,8 @@ def _analysed(analysis: Callable[[Any, Path], dict[str, Any]], cfg: Any, out: Pa
 PAGE = "docs/bench.md"
 
 
-@click.command(epilog=example("ccatp bench --quick", "ccatp bench --json", "ccatp bench --markdown"))
-@WORLD_OPTIONS
+@common.command("ccatp bench --quick", "ccatp bench --json", "ccatp bench --markdown")
+@common.WORLD_OPTIONS
 @click.option("--quick", is_flag=True, help="A tenth of the repeats, missions of one panel.")
 @click.option("--steps-only", is_flag=True, help="No missions.")
 @click.option("--frames-only", is_flag=True, help="Missions only.")
@@ -130,7 +118,7 @@ PAGE = "docs/bench.md"
     "--markdown", type=click.Path(path_type=Path, dir_okay=False), is_flag=False, flag_value=PAGE, metavar="[FILE]",
     help=f"Write the tables to FILE, below them what stood there by hand; {PAGE} if not named.",
 )  # fmt: skip
-@JSON_OPTION
+@common.JSON_OPTION
 def bench(
     config_file: Path | None, settings: Mapping[str, object], quick: bool, steps_only: bool, frames_only: bool,
     markdown: Path | None, json_output: bool,
@@ -149,5 +137,5 @@ def bench(
         result = run_bench(cfg, quick=quick, run_args=run_args, frames=not steps_only, steps=not frames_only)
     if markdown is not None:
         write_page(markdown, result)
-    print_lines([json.dumps(result)] if json_output else tables(result).splitlines())
+    common.print_lines([json.dumps(result)] if json_output else tables(result).splitlines())
     return 0
