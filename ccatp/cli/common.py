@@ -367,11 +367,6 @@ def address_options(section: str) -> Callable[[Command], Command]:
     )
 
 
-def overrides(settings: Mapping[str, object], named: Mapping[str, object]) -> dict[str, object]:
-    """Values by dotted key: those that are given, and ``--set`` on top."""
-    return {**{key: value for key, value in named.items() if value is not None}, **settings}
-
-
 def configured_folder(config_file: Path | None, runtime_dir: Path | None) -> Path | None:
     """The named runtime directory, else that of the only daemon that runs; None: none runs, ConfigError: several."""
     if runtime_dir is None and config_file is not None:

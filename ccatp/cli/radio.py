@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -103,40 +104,39 @@ def _write_tum(file: Path, run: "RecordedRun", track: "EstimatedPath") -> None:
         one.write_text("\n".join(tum_lines(times_s, poses, run.antenna_m)) + "\n", encoding="utf-8")
 
 
-@click.command(
-    "map",
-    epilog=common.example(
-        "ccatp radio map --config cricket --seeds 20",
-        "ccatp radio map --method ekf --set cricket.phase2.pairs=zigzag --figure map.png",
-        "ccatp radio map --ranges ranges.csv --offset --out beacons.toml --json",
-    ),
+_flag = partial(common.key_option, is_flag=True, flag_value=True, default=None)
+
+
+@common.command(
+    "ccatp radio map --config cricket --seeds 20",
+    "ccatp radio map --method ekf --set cricket.phase2.pairs=zigzag --figure map.png",
+    "ccatp radio map --ranges ranges.csv --offset --out beacons.toml --json",
+    name="map",
 )
 @common.CONFIG_OPTION
 @click.option("--ranges", "ranges_file", type=common.PATH, help="Measured ranges (CSV) in place of simulated ones.")
 @click.option("--tags", "tags_file", type=common.PATH, help="Places of tags on their trolley (CSV).")
 @click.option("--truth", "truth_file", type=common.PATH, help="True places (CSV) to compare with.")
 @click.option(
-    "--method",
-    type=click.Choice(("ekf", "batch")),
-    default="batch",
-    show_default=True,
+    "--method", type=click.Choice(("ekf", "batch")), default="batch", show_default=True,
     help="Filter, or all ranges at once.",
-)
+)  # fmt: skip
 @click.option("--seeds", type=click.IntRange(min=1), default=1, show_default=True, metavar="N", help="Simulated runs.")
-@click.option("--seed", type=click.IntRange(min=0), metavar="N", help="Seed of the first run.")
-@click.option("--offset", is_flag=True, help="Estimate a common offset of the ranges.")
-@click.option("--scale", is_flag=True, help="Estimate a common scale of the ranges.")
-@click.option(
-    "--dimension", type=click.IntRange(2, 3), metavar="D", help="2 for motes in a plane, 3 for motes in space."
-)
+@common.key_option("--seed", "run.seed", type=click.IntRange(min=0), metavar="N", help="Seed of the first run.")
+@_flag("--offset", "cricket.batch.estimates_offset", help="Estimate a common offset of the ranges.")
+@_flag("--scale", "cricket.batch.estimates_scale", help="Estimate a common scale of the ranges.")
+@common.key_option(
+    "--dimension", "cricket.dimension", type=click.IntRange(2, 3), metavar="D",
+    help="2 for motes in a plane, 3 for motes in space.",
+)  # fmt: skip
 @common.settings_option("A key of cricket, as in cricket.phase2.pairs=zigzag.")
 @click.option("--out", "out_file", type=common.OutputFile(), help="Write a beacon file (TOML).")
 @common.figure_option("Draw map and errors")
 @common.JSON_OPTION
 def radio_map(
     config_file: Path | None, ranges_file: Path | None, tags_file: Path | None, truth_file: Path | None,
-    method: str, seeds: int, seed: int | None, offset: bool, scale: bool, dimension: int | None,
-    settings: Mapping[str, object], out_file: Path | None, figure_file: Path | None, json_output: bool,
+    method: str, seeds: int, settings: Mapping[str, object], out_file: Path | None, figure_file: Path | None,
+    json_output: bool,
 ) -> None:  # fmt: skip
     """Map beacons from the ranges between them."""
     if ranges_file is None and (tags_file is not None or truth_file is not None):
@@ -146,14 +146,8 @@ def radio_map(
     from ccatp.beacons.cricket.measured_map import report_lines
     from ccatp.config.load import load_radio_config
 
-    named: dict[str, object] = {
-        "run.seed": seed,
-        "cricket.dimension": dimension,
-        "cricket.batch.estimates_offset": offset or None,
-        "cricket.batch.estimates_scale": scale or None,
-        "system": "cricket" if config_file is None else None,
-    }
-    cfg = load_radio_config(config_file, common.overrides(settings, named), simulates=ranges_file is None)
+    system = {"system": "cricket"} if config_file is None else {}
+    cfg = load_radio_config(config_file, {**system, **settings}, simulates=ranges_file is None)
     if ranges_file is None:
         data = _simulated(cfg.cricket, method, range(cfg.run.seed, cfg.run.seed + seeds), out_file, figure_file)
     else:
