@@ -39,27 +39,17 @@ RECOVERY_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class ProcessSpec:
-    """One row of the process table.
-
-    Attributes:
-        module: run with ``python -m``.
-        is_simulator: runs with ``--sim`` only.
-        listens: the configuration section with the host and port of its listening socket, bound by the supervisor.
-        is_replaceable: can be restarted when it dies; the simulated robot cannot.
-        is_loop: publishes a heartbeat, and hangs when it does not.
-        is_needed: the survey does not go on without it.
-        hang_timeout_s: where it is not ``run.hang_timeout_s``.
-    """
+    """One row of the process table."""
 
     name: str
-    module: str
-    is_simulator: bool = False
-    listens: str = ""
-    is_replaceable: bool = True
-    is_loop: bool = False
-    is_needed: bool = True
+    module: str  # run with ``python -m``
+    is_simulator: bool = False  # runs with ``--sim`` only
+    listens: str = ""  # section with host and port of its listening socket, which the supervisor binds
+    is_replaceable: bool = True  # can be restarted when it dies; the simulated robot cannot
+    is_loop: bool = False  # publishes a heartbeat, and hangs when it does not
+    is_needed: bool = True  # the survey does not go on without it
     niceness: int = 0
-    hang_timeout_s: float | None = None
+    hang_timeout_s: float | None = None  # where it is not ``run.hang_timeout_s``
 
 
 class ProcessEnd(Enum):
@@ -136,10 +126,8 @@ class _Child:
 class ProcessManager:
     """The processes of one run.
 
-    Args:
-        cfg: time-outs and restart limits.
-        command_of: command line of a process (restarted or not), and the file descriptors that it inherits.
-        notify_operator: called with level and text.
+    ``cfg``: time-outs and restart limits. ``command_of``: command line of a process (restarted or not), and the file
+    descriptors that it inherits. ``notify_operator``: called with level and text.
     """
 
     def __init__(
@@ -187,8 +175,7 @@ class ProcessManager:
     def poll(self, now_s: float) -> tuple[str, int, ProcessEnd, str] | None:
         """Collect dead processes, kill hung ones, and restart.
 
-        Returns:
-            The process that ends the run, with its exit code, how, and a line for the operator; or ``None``.
+        Returns the process that ends the run, with its exit code, how, and a line for the operator; or ``None``.
         """
         for name, child in tuple(self._children.items()):
             spec, code = child.spec, child.process.poll()
@@ -253,11 +240,7 @@ class ProcessManager:
 
 
 def listen(section: str, host: str, port: int) -> socket.socket:
-    """A listening socket for a process that inherits it; port 0 takes any free one.
-
-    Raises:
-        ConfigError: the port is taken.
-    """
+    """A listening socket for a process that inherits it; port 0 takes any free one. ConfigError: it is taken."""
     try:
         return listen_at(host, port)
     except OSError as error:

@@ -30,11 +30,8 @@ LOGGED_LINES, LOGGED_PERIOD_S = 10, 60.0
 class ObservatoryServer:
     """Answers the observatory, and logs its requests.
 
-    Args:
-        age_s: returns the age of the last frame, ``None`` before the first.
-
-    Raises:
-        ConfigError: the keys or the list of clients cannot be used.
+    ``age_s``: returns the age of the last frame, ``None`` before the first. ConfigError: the keys or the list of
+    clients cannot be used.
     """
 
     def __init__(
@@ -101,8 +98,7 @@ class ObservatoryServer:
 def check_observatory(cfg: ObservatoryConfig) -> KeyPair | None:
     """The server's keys, ``None`` where TCP is not configured.
 
-    Raises:
-        ConfigError: the keys or the list of clients cannot be used.
+    ConfigError: the keys or the list of clients cannot be used.
     """
     if not cfg.endpoint:
         return None

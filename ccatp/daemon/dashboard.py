@@ -62,10 +62,8 @@ async def serve_page(
 ) -> None:
     """Serve a dashboard until ``stop`` is set and the open pages have got the last state.
 
-    What was before is read in ``run_dir``: points in the database, path and plots in the recording.
-
-    Raises:
-        ConfigError: the tokens cannot be read.
+    What was before is read in ``run_dir``: points in the database, path and plots in the recording. ConfigError: the
+    tokens cannot be read.
     """
     settings, is_over = cfg.dashboard, asyncio.Event()
     tokens = page_tokens(settings, endpoints.runtime_dir)
@@ -169,9 +167,8 @@ def main() -> int:
 def attach(runtime_dir: Path | None, settings: Mapping[str, object], report: Callable[[str], None]) -> int:
     """Serve a dashboard beside a running daemon until SIGINT or SIGTERM; ``settings`` replace keys of ``dashboard``.
 
-    Raises:
-        DaemonUnreachableError: no daemon runs in the runtime directory.
-        ConfigError: a key outside ``dashboard``, a token that cannot be read, or no address to listen on.
+    DaemonUnreachableError: no daemon runs in the runtime directory; ConfigError: a key outside ``dashboard``, a token
+    that cannot be read, or no address to listen on.
     """
     for key in settings:
         if not key.startswith(ROOT):

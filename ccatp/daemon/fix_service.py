@@ -47,15 +47,8 @@ class FixRequest:
 class FixService:
     """Takes the measurements that the mission requests; a point counts only when its fix is committed.
 
-    Args:
-        on_finished: called after each measurement, successful or not.
-        between_s: wait for new lengths before measuring again at the same place.
-        heading_sigma_of: returns the standard deviation of the heading, rad.
-
-    Attributes:
-        is_busy: from ``begin`` to the end of the measurement.
-        arrival_error_m: distance of the last fix from its point.
-        wait_cause: what the measurement waits for, or empty.
+    ``on_finished``: called after each measurement, successful or not. ``between_s``: wait for new lengths before
+    measuring again at the same place. ``heading_sigma_of``: returns the standard deviation of the heading, rad.
     """
 
     def __init__(
@@ -79,9 +72,9 @@ class FixService:
         self._timeout_s = cfg.measure_timeout_s
         self._wanted: FixRequest | None = None
         self._wakes = asyncio.Event()
-        self.is_busy = False
-        self.arrival_error_m = 0.0
-        self.wait_cause = ""
+        self.is_busy = False  # from ``begin`` to the end of the measurement
+        self.arrival_error_m = 0.0  # distance of the last fix from its point
+        self.wait_cause = ""  # what the measurement waits for, or empty
 
     def begin(self, request: FixRequest) -> None:
         """Take a measurement; one in progress is finished first, and dropped."""
@@ -221,8 +214,7 @@ class FixService:
     async def _await_commit(self, commit: "Future[Any]", point: PointId) -> None:
         """Wait for a commit. On a disk that stalls the robot stands here, and after a while is held for an operator.
 
-        Raises:
-            StoreError: it will not be committed.
+        StoreError: it will not be committed.
         """
         waiting = asyncio.wrap_future(commit)
         try:

@@ -47,14 +47,10 @@ FEED_FIELDS = {
 
 @dataclass(slots=True)
 class SurveyTask:
-    """Starts, follows and ends surveys; a session is one of OCS, with ``status`` and ``data``.
-
-    Attributes:
-        command: of a survey, ``ccatp run ...``.
-    """
+    """Starts, follows and ends surveys; a session is one of OCS, with ``status`` and ``data``."""
 
     client: OperatorClient
-    command: Sequence[str]
+    command: Sequence[str]  # of a survey, ``ccatp run ...``
     environment: Mapping[str, str]
     log: Callable[[str], None]
 

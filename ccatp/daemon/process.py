@@ -72,27 +72,18 @@ def run_dir_in(runtime_dir: Path) -> Path | None:
 
 @dataclass(frozen=True, slots=True)
 class ProcessArgs:
-    """Arguments of a process.
+    """Arguments of a process."""
 
-    Attributes:
-        config: the run's exact configuration, from its run directory.
-        listen_fd: an inherited listening socket, or ``None``.
-        is_resuming: go on with the mission in the run directory.
-        has_faults: a fault plan is in the run directory; simulators only.
-        is_restarted: takes the place of a process of this run that died; of a resumed run, after its first frame.
-        is_sim: robot and laser system are simulated.
-    """
-
-    config: Config | RadioConfig
+    config: Config | RadioConfig  # exactly that of the run, from its run directory
     run_dir: Path
     endpoints: Endpoints
-    listen_fd: int | None
+    listen_fd: int | None  # an inherited listening socket
     is_realtime: bool
-    is_resuming: bool
-    has_faults: bool = False
-    is_restarted: bool = False
+    is_resuming: bool  # go on with the mission in the run directory
+    has_faults: bool = False  # a fault plan is in the run directory; simulators only
+    is_restarted: bool = False  # takes the place of one of this run that died; of a resumed run, after its first frame
     is_held: bool = False
-    is_sim: bool = False
+    is_sim: bool = False  # robot and laser system are simulated
 
     @property
     def is_taking_over(self) -> bool:
@@ -175,10 +166,7 @@ class LogStream(io.TextIOBase):
     """Appends whole lines; several processes may share the file.
 
     When the first line is dropped, ``process`` reports it on standard error. Raises ``OSError`` where the file cannot
-    be made.
-
-    Attributes:
-        dropped: lines that are not in the file, or only in part.
+    be made. ``dropped``: lines that are not in the file, or only in part.
     """
 
     def __init__(self, path: Path, process: str) -> None:

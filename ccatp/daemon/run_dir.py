@@ -75,11 +75,7 @@ def mark_resumable(run_dir: Path) -> None:
 
 
 def clear_finished(status: int, run_dir: Path) -> None:
-    """Remove the note where the run has finished; keep emergencies that are in force for the next one.
-
-    Raises:
-        ConfigError: they cannot be kept.
-    """
+    """Remove the note of a run that has finished; keep emergencies in force for the next. ConfigError: it cannot."""
     if status not in FINISHED:
         return
     emergencies = run_dir / EMERGENCIES
@@ -99,11 +95,7 @@ def clear_finished(status: int, run_dir: Path) -> None:
 
 
 def take_over_emergencies(run_dir: Path) -> bool:
-    """Copy the emergencies that were in force when the last run finished; returns whether there are any.
-
-    Raises:
-        ConfigError: they cannot be read or written.
-    """
+    """Whether emergencies were in force when the last run finished, which are copied. ConfigError: they cannot be."""
     try:
         kept = LATCHED_FILE.read_bytes()
         run_dir.mkdir(parents=True, exist_ok=True)
@@ -117,35 +109,22 @@ def take_over_emergencies(run_dir: Path) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """The command line of ``ccatp run``.
+    """The command line of ``ccatp run``."""
 
-    Attributes:
-        sim: simulate robot and laser system.
-        overrides: dotted keys given on the command line (``{"run.seed": 2}``), stronger than the file.
-        realtime: pace the simulation on the wall clock instead of in lockstep.
-        run_dir: ``None`` for ``default_run_dir``.
-        resume: continue the mission in ``run_dir``.
-        held: begin held.
-        recover: continue, held, the run that did not finish, or begin one that can be recovered.
-        json_output: the summary goes to standard output as JSON, and nothing else does.
-        runtime_dir: folder of the unix sockets.
-        faults_file: plan of simulated faults; a copy goes into the run directory.
-        verbosity: as of ``RunView``.
-    """
-
-    sim: bool
+    sim: bool  # simulate robot and laser system
     config_file: Path | None = None
+    # Dotted keys given on the command line (``{"run.seed": 2}``), stronger than the file.
     overrides: Mapping[str, object] = field(default_factory=dict)
-    realtime: bool = False
-    run_dir: Path | None = None
-    resume: bool = False
-    held: bool = False
-    recover: bool = False
-    json_output: bool = False
-    runtime_dir: Path | None = None
-    faults_file: Path | None = None
+    realtime: bool = False  # pace the simulation on the wall clock instead of in lockstep
+    run_dir: Path | None = None  # None for ``default_run_dir``
+    resume: bool = False  # continue the mission in ``run_dir``
+    held: bool = False  # begin held
+    recover: bool = False  # continue, held, the run that did not finish, or begin one that can be recovered
+    json_output: bool = False  # the summary goes to standard output as JSON, and nothing else does
+    runtime_dir: Path | None = None  # folder of the unix sockets
+    faults_file: Path | None = None  # plan of simulated faults; a copy goes into the run directory
     shows_summary: bool = True
-    verbosity: int = 0
+    verbosity: int = 0  # as of ``RunView``
 
     @property
     def is_paced(self) -> bool:
@@ -177,10 +156,8 @@ def await_predecessors(stack: ExitStack, *folders: Path) -> tuple[int, ...]:
     """Locks of the folders for the children to inherit, until the stack is closed.
 
     Children of a supervisor that was killed end by themselves, after it; meanwhile they write their last records, and
-    remove sockets as they close them. So these locks are had when the last of them has ended.
-
-    Raises:
-        RefusedError: some are still there after ``PREDECESSORS_S``.
+    remove sockets as they close them. So these locks are had when the last of them has ended. RefusedError: some are
+    still there after ``PREDECESSORS_S``.
     """
     locks = []
     for folder in folders:
@@ -193,11 +170,8 @@ def await_predecessors(stack: ExitStack, *folders: Path) -> tuple[int, ...]:
 def take_runtime_dir(stack: ExitStack, configured: str, *, is_sim: bool) -> Path:
     """Make a runtime directory and own it until the stack is closed: the configured one, else the usual one.
 
-    A simulation for which none is configured takes another one beside the usual one while that is in use.
-
-    Raises:
-        ConfigError: it cannot be made.
-        RefusedError: it is in use.
+    A simulation for which none is configured takes another one beside the usual one while that is in use. ConfigError:
+    it cannot be made; RefusedError: it is in use.
     """
     usual = folder = make_runtime_dir(configured, os.environ)
     for number in itertools.count(2):
@@ -218,8 +192,7 @@ def take_runtime_dir(stack: ExitStack, configured: str, *, is_sim: bool) -> Path
 def own_runtime_dir(stack: ExitStack, runtime_dir: Path, *, is_sim: bool) -> None:
     """Lock a runtime directory until the stack is closed, and remove the sockets then.
 
-    Raises:
-        RefusedError: another daemon has it, or a simulated robot that runs alone.
+    RefusedError: another daemon has it, or a simulated robot that runs alone.
     """
     stack.enter_context(owned(runtime_dir / LOCK_FILE, "--runtime-dir"))
     if is_sim:
@@ -273,8 +246,7 @@ def keep_origin(run_dir: Path, *, is_sim: bool, is_new: bool) -> None:
 def make_run_dir(options: RunOptions, cfg: Config | RadioConfig) -> Path:
     """The directory of a run that is new, or of a survey that is resumed with the points that it was planned with.
 
-    Raises:
-        ConfigError: options or configuration contradict its content, or it cannot be made.
+    ConfigError: options or configuration contradict its content, or it cannot be made.
     """
     is_survey = isinstance(cfg, Config)
     name = cfg.run.mirror if isinstance(cfg, Config) else cfg.system

@@ -57,11 +57,8 @@ def run_alone(
 
     A fall is never on the link: standard error says when and where (``robot_fell``), and the status is that of a fault.
     It listens at the address in ``sim.robot``. Its true state is at ``puck`` in the runtime directory (the configured
-    one by default), for ``ccatp sim etalon --truth``.
-
-    Raises:
-        ConfigError: it cannot listen there.
-        RefusedError: another simulated robot uses that directory.
+    one by default), for ``ccatp sim etalon --truth``. ConfigError: it cannot listen there; RefusedError: another
+    simulated robot uses that directory.
     """
     folder = make_runtime_dir(str(runtime_dir or processes_of(cfg).runtime_dir), os.environ)
     truth, what = Endpoints(folder).of("puck"), cfg.system if isinstance(cfg, RadioConfig) else cfg.mirror.name

@@ -156,12 +156,8 @@ def serve(
 ) -> int:
     """Stream until SIGINT or SIGTERM.
 
-    Args:
-        plotjuggler_port, foxglove_port: 0 takes any free one, ``None`` serves none.
-        is_open: the host may be an address of the network.
-
-    Raises:
-        StreamError: a stream cannot be served.
+    ``plotjuggler_port, foxglove_port``: 0 takes any free one, ``None`` serves none. ``is_open``: the host may be an
+    address of the network. StreamError: a stream cannot be served.
     """
     check_host(host, is_open=is_open)
     folder = runtime_dir_path(str(runtime_dir or ""), os.environ)

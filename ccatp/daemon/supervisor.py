@@ -108,10 +108,8 @@ BEACON_PROCESSES = tuple(
 class SupervisedRun:
     """The children of one run and the messages collected from them.
 
-    Args:
-        sockets: listening sockets of simulators and dashboard, by the name of the process.
-        locks: descriptors that every child inherits.
-        started_s: of the monotonic clock, for the wall time of the run.
+    ``sockets``: listening sockets of simulators and dashboard, by the name of the process. ``locks``: descriptors that
+    every child inherits. ``started_s``: of the monotonic clock, for the wall time of the run.
     """
 
     def __init__(
@@ -246,11 +244,7 @@ class SupervisedRun:
 def run(options: RunOptions) -> int:
     """Run what the configuration is of, a survey or a mission among beacons, to its end.
 
-    Returns:
-        The exit status of ``cli.md``.
-
-    Raises:
-        CcatpError: the run could not begin.
+    Returns the exit status of ``cli.md``. CcatpError: the run could not begin.
     """
     cfg = read_config(options.config_file, dict(options.overrides), any_ports=options.sim)
     if isinstance(cfg, Config):
