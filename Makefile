@@ -96,7 +96,7 @@ mutants: $(VENV)/.installed-dev
 	nice -n 19 $(BIN)/python -m tests.mutation $(TARGETS)
 
 faults: $(VENV)/.installed-dev
-	$(BIN)/python -m tests.faults.page
+	$(BIN)/python -m tests.faults.table
 
 docs: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.docs.generated

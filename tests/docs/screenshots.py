@@ -1,19 +1,23 @@
-"""Makes the pictures of the page in docs: `python -m tests.docs.screenshots [FOLDER]`.
+"""Makes pictures of the documentation in Chromium: ``python -m tests.docs.screenshots``.
 
-Simulated runs of their own, looked at in Chromium: waiting for the laser system, driving, the same on a phone, held
-with three alarms, and done. A picture that is larger than ``MAX_BYTES`` is an error.
+``dashboard [FOLDER]``: the page of simulated runs of their own: waiting for the laser system, driving, the same on a
+phone, held with three alarms, and done. A picture that is larger than ``MAX_BYTES`` is an error.
+``report RUN_DIR``: parts of a report.
 """
 
+import shutil
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from signal import SIGSTOP
 
 from PIL import Image
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, expect, sync_playwright
 
+from ccatp.report.run_page import report_run
 from tests.docs.generated import DOCS
 from tests.processes.test_observers import WITH_PAGE, page_port
 from tests.processes.test_page import browser_page
@@ -96,12 +100,47 @@ def drives_and_is_held(run: Run, page: Page, camera: Camera) -> None:
     camera.take("held")
 
 
-def main(folder: Path) -> None:
-    """Make all pictures."""
+def picture_dashboard(folder: Path) -> None:
+    """Make those of the dashboard."""
     look(folder, ("--panels", "1", "--realtime"), waits)
     look(folder, ("--panels", "9"), ends)
     look(folder, ("--panels", "40"), drives_and_is_held)
 
 
+# -- a report ----------------------------------------------------------------------------------------------------------
+
+# Name of each file, and the sections that it shows: from the top of the first to the bottom of the last.
+REPORT_PICTURES = {"report_result": ("body > header", "#panels"), "report_quality": ("#surface", "#quality")}
+WIDTH_PX, MARGIN_PX, COLOURS = 1000, 12, 256
+
+
+def picture_report(run_dir: Path) -> None:
+    """Write those of a report into the folder of the documentation."""
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        page_file = Path(folder) / "report.html"
+        report_run(run_dir, page_file)
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": WIDTH_PX, "height": 800})
+        page.goto(page_file.as_uri())
+        for name, sections in REPORT_PICTURES.items():
+            first, last = (page.locator(section).bounding_box() for section in sections)
+            assert first is not None
+            assert last is not None
+            top = max(first["y"] - MARGIN_PX, 0.0)
+            clip = {"x": 0.0, "y": top, "width": WIDTH_PX, "height": last["y"] + last["height"] + MARGIN_PX - top}
+            picture = Image.open(BytesIO(page.screenshot(full_page=True, clip=clip)))  # type: ignore[arg-type]
+            picture.convert("RGB").quantize(COLOURS).save(DOCS / f"{name}.png", optimize=True)
+        browser.close()
+
+
+def main(kind: str, *names: str) -> None:
+    """Make the pictures of a kind."""
+    places = [Path(name) for name in names]
+    if kind == "report":
+        picture_report(*places)
+    else:
+        picture_dashboard(*places or [DOCS])
+
+
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else DOCS)
+    main(*sys.argv[1:])

@@ -9,8 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from tests.faults.linking import judge
-from tests.faults.page import page
-from tests.faults.table import PATH, ROWS, Row, Seen, keep_record, load_record, load_table, machine_line
+from tests.faults.table import PATH, ROWS, Row, Seen, keep_record, load_record, load_table, machine_line, page
 
 ROOT = PATH.parents[2]
 TABLE = """

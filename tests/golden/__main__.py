@@ -19,10 +19,8 @@ import time
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
-from tests.golden.cases import CASES, Case
-from tests.golden.comparison import Difference, Renames, compare
-from tests.golden.observation import observe
-from tests.golden.runs import HERE, RESULTS, ROOT, GoldenError, Runner, Side, base_side, locked, this_side
+from tests.golden.comparison import Difference, Renames, compare, observe
+from tests.golden.runs import CASES, HERE, RESULTS, ROOT, Case, GoldenError, Runner, Side, base_side, locked, this_side
 
 _DATA = ROOT.parent / "shared" / "data" / "radio"
 

@@ -9,10 +9,8 @@ from typing import Any
 import pytest
 from mcap.writer import Writer
 
-from tests.golden.cases import CASES
-from tests.golden.comparison import Renames, compare
-from tests.golden.observation import Observation, observe
-from tests.golden.runs import HERE
+from tests.golden.comparison import Observation, Renames, compare, observe
+from tests.golden.runs import CASES, HERE
 
 SENSORS = '>{"type":"sensors","seq":%d,"t":%s,"fans":[0.8,0.8]}'
 WIRE = [

@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from tests.metrics.frame_calls import MAIN_LOOP, MeasurementError, measure
+from tests.metrics.frame_profile import MAIN_LOOP, MeasurementError, measure
 from tests.metrics.sizes import SMALL_FILE_LINES, duplicate_classes, read_sources, single_importer_modules
 
 _HERE = Path(__file__).resolve().parents[2]

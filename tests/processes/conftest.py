@@ -10,7 +10,7 @@ from tests.support.runs import NO_CALIBRATION, Run
 
 Start = Callable[..., Run]
 # Two queues of about the same length, for two of the workers: within a queue one run after the other.
-SECOND = {"test_restarts", "test_replay", "test_study", "test_rehearsal"}
+SECOND = {"test_restarts", "test_replay", "test_study"}
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -10,6 +10,7 @@ import json
 import math
 import multiprocessing
 import random
+import shutil
 import socket
 import sys
 import tempfile
@@ -32,8 +33,12 @@ from ccatp.links.bus import Publisher
 from ccatp.links.topics import FixMessage, Heartbeat, TrackMessage, TruthMessage
 from ccatp.report.dashboard.access import make_token
 from tests.contract.page_rig import mission, picture
-from tests.processes.test_page import CHROMIUM, FLAGS
 
+CHROMIUM = shutil.which("chromium")
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update",
+    "--disable-sync", "--no-first-run", "--disable-dev-shm-usage", "--disable-extensions",
+)  # fmt: skip
 CFG = load_config(None, {"dashboard.max_connections": 256})
 FRAMES, SPEED_M_S, RADIUS_M = 100, 0.1, 0.15  # frames a second; the robot drives in circles on a panel
 MESSAGE_EVERY_S, FIX_EVERY_S, MOMENTS = 2, 4, 10

@@ -3,10 +3,10 @@
 import http.client
 import json
 import re
-import shutil
+import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -16,16 +16,13 @@ from playwright.sync_api import Page, expect, sync_playwright
 
 from ccatp.config.load import load_radio_config
 from ccatp.config.package import configs_dir
+from ccatp.report.dashboard.view import MAX_LINES, MAX_SAMPLES
 from tests.processes.conftest import Start
-from tests.processes.test_observers import WITH_PAGE, ask, page_port
-from tests.processes.test_rehearsal import BeaconRun
+from tests.processes.page_load import CHROMIUM, FLAGS, MESSAGE_EVERY_S, load
+from tests.processes.test_observers import WITH_PAGE, ask, open_page, page_port
+from tests.processes.test_replay import BeaconRun
 from tests.support.runs import Run
 
-CHROMIUM = shutil.which("chromium")
-FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update",
-    "--disable-sync", "--no-first-run", "--disable-dev-shm-usage", "--disable-extensions",
-)  # fmt: skip
 PATIENCE_MS = 30_000
 expect.set_options(timeout=PATIENCE_MS)  # on two busy cores a robot may be held for want of frames, and go on
 PHONE = {"width": 360, "height": 740}
@@ -219,3 +216,31 @@ def sees_a_mission_among_beacons(page: Page) -> None:
     expect(page.locator("#edges")).to_be_hidden()
     expect(page.locator("#plot-arrival")).to_be_hidden()
     sees_the_map_move(page)
+
+
+# -- a long mission, and fifty pages at once, as `page_load` measures: bounded memory, and all are served --------------
+
+PLAYED_S, PER_S, PAGES = 7200, 600.0, 50
+# Measured for 24 hours: 6 MB and 66 MB.
+MOST_PAGE_MB, MOST_GROWTH_MB = 30.0, 150.0
+
+
+@pytest.mark.slow  # a minute; the rules by which rows are left out are tried in tests/unit/dashboard
+def test_two_hours_within_seconds_are_held_in_bounded_memory_and_fifty_pages_are_served() -> None:
+    with load() as loaded:
+        before = loaded.held()
+        loaded.play(PLAYED_S, PER_S)
+        left_out = PLAYED_S // MESSAGE_EVERY_S - MAX_LINES
+        assert loaded.page.locator(".left-out").inner_text() == f"{left_out:,} older messages left out: see log.jsonl"
+        assert loaded.page.locator("#log li").count() == MAX_LINES + 1
+        values = loaded.page.locator("#plot-error").get_attribute("aria-label")
+        assert values is not None
+        assert MAX_SAMPLES // 2 < int(values.split()[0]) <= MAX_SAMPLES  # of 7,200 seconds
+        with ExitStack() as stack:
+            pages = [stack.enter_context(open_page(loaded.port)) for _ in range(PAGES)]  # each has received news
+            loaded.play(MESSAGE_EVERY_S, PER_S)
+            for page in pages:
+                page.shutdown(socket.SHUT_RDWR)
+        held = loaded.held()
+        assert held.page_mb < MOST_PAGE_MB
+        assert held.server_mb - before.server_mb < MOST_GROWTH_MB

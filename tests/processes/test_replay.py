@@ -1,14 +1,26 @@
-"""What the daemon recorded, through `ccatp replay` and `ccatp align`."""
+"""What the daemon recorded, through `ccatp replay` and `ccatp align`; and its runs against those in one process."""
 
 import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from datetime import datetime, timedelta
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ccatp.cli import main
-from ccatp.config.load import load_config
+from ccatp.config.load import load_config, load_radio_config
+from ccatp.config.package import configs_dir
+from ccatp.records.recorder import iter_messages
 from ccatp.records.run_reader import open_run
+from ccatp.studies.mote_navigation import rehearse_beacons
+from ccatp.studies.sil_run import rehearse
+from tests.faults.linking import Measured
 from tests.processes.conftest import Start
 from tests.support.runs import RecordedRun, Run
 
@@ -105,3 +117,113 @@ def test_the_smoother_is_clearly_better_between_the_stops(
     # Measured: a fifth to a quarter. Between two fixes of micrometres only what happens between them is left.
     assert moving["smoothed"] < 0.5 * moving["replayed"]
     assert result["smoothed"]["heading_error_mrad"]["rms"] < result["replayed"]["heading_error_mrad"]["rms"]
+
+
+# -- runs through the real processes against the same runs in one process: surveys, and missions among beacons ---------
+
+# Read by every process of the run at its start: the wall clock is an hour early or an hour late, anew at each look.
+RESTLESS_CLOCK = """
+import datetime, itertools, time
+
+step = itertools.cycle((3600, -3600)).__next__
+time_s, time_ns = time.time, time.time_ns
+time.time = lambda: time_s() + step()
+time.time_ns = lambda: time_ns() + step() * 10**9
+
+
+class Restless(datetime.datetime):
+    @classmethod
+    def now(cls, tz=None):
+        return super().now(tz) + datetime.timedelta(seconds=step())
+
+
+datetime.datetime = Restless
+"""
+
+
+@pytest.mark.fault("S13")
+@pytest.mark.parametrize("calibrates", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_rehearsal_is_the_run_without_the_sockets(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, measured: Measured, calibrates: bool
+) -> None:
+    (tmp_path / "clock").mkdir()
+    (tmp_path / "clock" / "sitecustomize.py").write_text(RESTLESS_CLOCK)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "clock"), *sys.path]))
+    args = "--panels 1 --mirror thesis-m1 --filter ekf --world hard --seed 3"
+    run = start(*args.split(), calibrates=calibrates)
+    assert run.wait() == 0, run.stderr
+    labels = [json.loads(line)["timestamp"] for line in (run.run_dir / "log.jsonl").read_text().splitlines()]
+    instants = [datetime.fromisoformat(label) for label in labels]
+    assert max(abs(b - a) for a, b in pairwise(instants)) > timedelta(minutes=50)  # the clock did step
+    rehearsal = rehearse(load_config(run.run_dir / "config.toml"))
+
+    # Every frame's true place, to the last bit: a difference anywhere upstream moves the robot sooner or later.
+    messages = iter_messages(run.run_dir / "telemetry.mcap")
+    batches = [json.loads(message.payload)["rows"] for message in messages if message.topic == "truth"]
+    driven = np.array([row[1:5] for rows in batches for row in rows])
+    rehearsed = rehearsal.track[:, :4]
+    differs = np.flatnonzero((driven[: len(rehearsed)] != rehearsed).any(axis=1))
+    measured("S13", differs.size)
+    assert differs.size == 0, f"first in frame {differs[0]}: {driven[differs[0]]} is not {rehearsed[differs[0]]}"
+
+    summary = {key: value for key, value in json.loads(json.dumps(rehearsal.summary)).items() if key != "wall"}
+    assert summary == {key: value for key, value in run.summary.items() if key != "wall"}
+
+
+# -- missions among beacons --------------------------------------------------------------------------------------------
+
+# A lap, a waypoint, a few seconds: what differs between daemon and rehearsal differs from the first frame on.
+SHORT = {
+    "zigbee": ("mission.laps=1",),
+    "follow": ("mission.follow_s=6",),
+    "cricket": ("cricket.ranging.repeats=4", "workspace.loops=false", "workspace.waypoints_m=[[2.5, 1.5]]"),
+}
+LONGER = {"follow": ("mission.follow_s=15",)}
+
+
+class BeaconRun(Run):
+    """`ccatp run --sim` of a mission among beacons."""
+
+    free_ports = ("--set", "sim.robot.port=0", "--set", "dashboard.enabled=false")
+
+
+Begin = Callable[..., BeaconRun]
+
+
+@pytest.fixture
+def begin(tmp_path: Path, runtime_dir: Path) -> Iterator[Begin]:
+    with ExitStack() as stack:
+
+        def start(system: str, *args: str) -> BeaconRun:
+            config = ("--config", str(configs_dir() / f"{system}.toml"))
+            return stack.enter_context(BeaconRun(tmp_path / "run", runtime_dir, *config, *args))
+
+        yield start
+
+
+@pytest.mark.parametrize(
+    ("system", "settings"),
+    [*SHORT.items(), *(pytest.param(*item, marks=pytest.mark.slow, id=f"longer {item[0]}") for item in LONGER.items())],
+)
+def test_the_daemon_does_what_the_rehearsal_does(begin: Begin, system: str, settings: tuple[str, ...]) -> None:
+    run = begin(system, *(part for setting in settings for part in ("--set", setting)), "--json")
+    assert run.wait() == 0, run.stderr
+    summary = json.loads(run.stdout)
+    assert summary == run.summary
+    expected = rehearse_beacons(load_radio_config(run.run_dir / "config.toml")).summary
+    assert {**summary, "wall": None} == {**expected, "wall": None}
+    topics = {message.topic for message in iter_messages(run.run_dir / "telemetry.mcap")}
+    assert {"beacon_track", "beacon_map", "beacon_truth", "beacon_places", "sensors", "mission"} <= topics
+    assert (run.run_dir / "log.jsonl").stat().st_size
+
+
+def test_an_operator_pauses_resumes_and_aborts(begin: Begin) -> None:
+    run = begin("zigbee", "--set", "mission.laps=50", "--set", "mission.time_limit_s=1e5")
+    run.until(lambda status: status["done"] >= 1)
+    assert run.ask("pause")["status"]["state"] == "held"
+    assert run.query("SELECT count(*) FROM waypoint WHERE reached_s NOTNULL")[0][0] >= 1
+    assert run.ask("resume")["ok"]
+    run.until_state("visiting")
+    assert run.ask("abort")["ok"]
+    assert run.wait() == 3, run.stderr
+    assert run.summary["outcome"] == "aborted, at base"

@@ -21,7 +21,7 @@ from ccatp.daemon.run_dir import RunOptions
 from ccatp.errors import ConfigError, DaemonUnreachableError, RefusedError
 from ccatp.links.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked
 from tests.support.command import refused
-from tests.unit.test_client import serving
+from tests.unit.test_keys import serving
 
 EMERGENCY_ID = "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"
 

@@ -22,7 +22,7 @@ from ccatp.links.topics import MissionStatus
 from ccatp.survey.composition import assemble
 from ccatp.survey.planning.search import leg_lengths
 from tests.support.command import answered, refused
-from tests.unit.test_client import serving
+from tests.unit.test_keys import serving
 
 BASH = shutil.which("bash")
 

@@ -26,8 +26,8 @@ from ccatp.records.run_reader import RunReadError, open_run, read_run
 from ccatp.studies import replay as player
 from tests.support.command import refused
 from tests.support.scenario import world_of
-from tests.unit.aligning.conftest import exact_fix
-from tests.unit.run_folder import make_run, record_truth, recorder_in
+from tests.unit.aligning.test_panel_alignment import exact_fix
+from tests.unit.reporting.recorded import make_run, record_truth, recorder_in
 
 
 def line_of(seq: int) -> bytes:

@@ -16,8 +16,7 @@ from ccatp.links.liveness import RateLimitedLog, kind_of
 from ccatp.links.topics import DangerEvent, LogMessage, MissionStatus, TrackMessage
 from ccatp.survey.events import MissionState
 from tests.support.scenario import world_of
-from tests.unit.reporting.recorded import record_beacons
-from tests.unit.run_folder import make_run
+from tests.unit.reporting.recorded import make_run, record_beacons
 
 CFG, _ = world_of()
 STATUS = MissionStatus(seq=-1, t_s=0.0, state="driving", elapsed_s=61.0, eta_s=9.0, done=1, total=10)

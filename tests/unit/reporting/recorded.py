@@ -1,6 +1,7 @@
 """Run directories as the daemon writes them, made in process: of surveys, and of missions among beacons."""
 
 import json
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,11 @@ import numpy as np
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import dump_config, load_config, load_radio_config
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, Fix, PanelPose, PointId
+from ccatp.core import DeckPose, Fix, PanelId, PanelPose, PointId
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import (
+    TOPICS,
     ArrivalMessage,
     BeaconArrival,
     BeaconMapMessage,
@@ -30,11 +32,51 @@ from ccatp.links.topics import (
     TruthMessage,
     schema_of,
 )
+from ccatp.mirror.misalignment import PanelMisalignment
+from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.recorder import Recorder
 from ccatp.records.store import MissionStore, StoredPoint
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.events import Abort, MissionState
-from tests.unit.run_folder import recorder_in
+
+HERE = DeckPose(0.0, 0.0, 0.0)
+
+
+def recorder_in(run_dir: Path, metadata: Mapping[str, str] | None = None, *, is_simulation: bool = True) -> Recorder:
+    """A recorder of all topics."""
+    topics = [(topic.name, schema_of(topic.name)) for topic in TOPICS if topic.recorded]
+    return Recorder(run_dir / "telemetry.mcap", topics, is_simulation=is_simulation, metadata=metadata)
+
+
+def make_run(
+    run_dir: Path,
+    cfg: Config,
+    planned: Iterable[PointId],
+    measured: Iterable[Measured],
+    truth: Mapping[PanelId, PanelMisalignment] | None,
+) -> Path:
+    """A run directory: configuration, database, and a recording where the truth is known."""
+    run_dir.mkdir(exist_ok=True)
+    (run_dir / "config.toml").write_text(dump_config(cfg))
+    points = [StoredPoint(point, 0.0, 0.0) for point in planned]
+    with MissionStore.create(
+        run_dir / "mission.sqlite", mirror=cfg.mirror.name, seed=cfg.run.seed, config_toml="", points=points
+    ) as store:
+        for done in [store.record_fix(one.point, one.fix, HERE) for one in measured]:
+            done.result()
+    if truth is not None:
+        record_truth(run_dir, truth)
+    return run_dir
+
+
+def record_truth(run_dir: Path, truth: Mapping[PanelId, PanelMisalignment], *, is_simulation: bool = True) -> None:
+    """One more recording in a run directory that holds how the panels lie, and a batch of truth after it."""
+    recorder = recorder_in(run_dir, is_simulation=is_simulation)
+    panels = [(*panel, m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in truth.items()]
+    recorder.write("misalignment", 0.0, msgspec.json.encode(Misalignment(seq=0, t_s=0.0, panels=panels)))
+    recorder.write("truth", 1.0, b'{"seq":0,"t_s":0.0,"rows":[]}')
+    recorder.close()
+
 
 BATCH = 100
 
@@ -182,7 +224,7 @@ FRAMES, PERIOD_S = 61, 0.1
 SIGMA_M, OFF_M = 0.02, 0.03  # of the estimate; the truth lies so far to the right of it
 ELLIPSE = (SIGMA_M**2, 0.0, SIGMA_M**2)
 PLACES = {"beacon1": (0.0, 0.0), "beacon2": (3.0, 3.0)}
-TOPICS = (
+BEACON_TOPICS = (
     "beacon_track", "beacon_truth", "beacon_map", "beacon_arrival", "beacon_places", "mission"
 )  # fmt: skip
 
@@ -236,7 +278,7 @@ def record_beacons(run_dir: Path, cfg: RadioConfig | None = None, *, is_sim: boo
     (run_dir / "config.toml").write_text(dump_config(cfg))
     recorder = Recorder(
         run_dir / "telemetry.mcap",
-        [(name, schema_of(name)) for name in TOPICS],
+        [(name, schema_of(name)) for name in BEACON_TOPICS],
         is_simulation=is_sim,
         metadata={"system": cfg.system, "ccatp": "9.9"},
     )
