@@ -220,6 +220,11 @@ def print_lines(lines: Iterable[str]) -> None:
         click.echo(printable(line))
 
 
+def print_result(result: object, lines: Iterable[str], as_json: bool) -> None:
+    """A result on standard output, as JSON or as lines for a reader."""
+    print_lines([json.dumps(result)] if as_json else lines)
+
+
 def columns(rows: Sequence[Sequence[str]], *, left: int = 99) -> list[str]:
     """Rows as lines, their first ``left`` columns aligned to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

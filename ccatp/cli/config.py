@@ -92,12 +92,9 @@ def config_diff(file: Path, other: Path | None, json_output: bool) -> None:
 
     cfg = read_config(file)
     found = differences(cfg) if other is None else differences(read_config(other), cfg)
-    if json_output:
-        click.echo(json.dumps({key: [before, after] for key, before, after in found}))
-        return
-    common.print_lines(
-        [f"{k}: {format_value(before)} -> {format_value(after)}" for k, before, after in found] or ["no difference"]
-    )
+    lines = [f"{k}: {format_value(before)} -> {format_value(after)}" for k, before, after in found]
+    changes = {key: [before, after] for key, before, after in found}
+    common.print_result(changes, lines or ["no difference"], json_output)
 
 
 DEFAULT_DIR = "keys"
@@ -177,10 +174,7 @@ def show_public(folder: Path, name: str | None, json_output: bool) -> None:
     if not found:
         raise ConfigError(f"--dir: no {pattern} in {folder}; make one with ccatp keys generate")
     shown: dict[str, Any] = {key: files.read_public(path, "--dir").decode() for key, path in found.items()}
-    if json_output:
-        click.echo(json.dumps(shown))
-        return
-    common.print_lines(common.columns([*shown.items()]))
+    common.print_result(shown, common.columns([*shown.items()]), json_output)
 
 
 SHELLS = ("bash", "zsh", "fish")

@@ -1,6 +1,5 @@
 """The command ``ccatp onboard``: the program on the robot's own computer."""
 
-import json
 import socket
 import time
 from collections.abc import Callable, Mapping
@@ -95,17 +94,14 @@ def _listen(host: str, port: int) -> socket.socket:
 def _check(cfg: "OnboardConfig", *, json_output: bool) -> int:
     boot_s = time.monotonic()
     checks = _hardware(cfg, lambda: time.monotonic() - boot_s).check(CHECK_S)
-    if json_output:
-        click.echo(json.dumps([check._asdict() for check in checks]))
-    else:
-        for check in checks:
-            found = f"{check.identity or 'found'}" if check.found else "not found"
-            figures = f"{check.rate_hz:.0f}/s" if check.rate_hz else "-"
-            verdict = "ok" if check.passed else "FAIL"
-            advice = "" if check.passed else f"; {check.advice}"
-            common.print_lines(
-                [f"{check.device:<14} {verdict:<5} {figures:>7}  {found}  {check.noise}{advice}".rstrip()]
-            )
+    lines = []
+    for check in checks:
+        found = f"{check.identity or 'found'}" if check.found else "not found"
+        figures = f"{check.rate_hz:.0f}/s" if check.rate_hz else "-"
+        verdict = "ok" if check.passed else "FAIL"
+        advice = "" if check.passed else f"; {check.advice}"
+        lines.append(f"{check.device:<14} {verdict:<5} {figures:>7}  {found}  {check.noise}{advice}".rstrip())
+    common.print_result([check._asdict() for check in checks], lines, json_output)
     return ExitStatus.COMPLETE if all(check.passed for check in checks) else ExitStatus.UNREACHABLE
 
 
@@ -145,17 +141,17 @@ def tune(
         hardware.close()
     if out_dir is not None:
         write_tuning(out_dir, found)
-    if json_output:
-        click.echo(json.dumps({**found._asdict(), "right": found.right._asdict(), "left": found.left._asdict()}))
-        return 0
-    common.print_lines(
+    wheels = {"right": found.right, "left": found.left}
+    lines = [
         f"{name:<6} static {wheel.static_v:.2f} V, {wheel.volt_per_rad_s:.3f} V per rad/s, "
         f"time constant {1e3 * wheel.time_constant_s:.0f} ms, fit to {wheel.residual_v:.2f} V"
-        for name, wheel in (("right", found.right), ("left", found.left))
-    )
+        for name, wheel in wheels.items()
+    ]
     course = f"{found.deviation_rad_s:.3f} rad/s rms, overshoot {found.overshoot_share:.1%}"
-    values = [f"{key} = {value}" for key, value in found.values.items()]
-    common.print_lines([f"step: off its course by {course}", "", "[servo]", *values])
+    lines += [f"step: off its course by {course}", "", "[servo]"]
+    lines += [f"{key} = {value}" for key, value in found.values.items()]
+    result = {**found._asdict(), **{name: wheel._asdict() for name, wheel in wheels.items()}}
+    common.print_result(result, lines, json_output)
     return 0
 
 

@@ -140,10 +140,8 @@ def alarms(
             raise click.UsageError(f"options go behind the command, as in ccatp alarms {command} --runtime-dir DIR")
         return
     found = _ask(common.configured_folder(config_file, runtime_dir), "status", timeout_s)["status"]["alarms"]
-    if json_output:
-        click.echo(json.dumps({"alarms": found}))
-    else:
-        common.print_lines([line for alarm in found for line in _alarm_lines(alarm)] or ["no alarms"])
+    lines = [line for alarm in found for line in _alarm_lines(alarm)]
+    common.print_result({"alarms": found}, lines or ["no alarms"], json_output)
 
 
 def _alarm_lines(alarm: Mapping[str, Any]) -> list[str]:

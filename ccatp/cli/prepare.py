@@ -42,7 +42,7 @@ def plan(config_file: Path | None, settings: Mapping[str, object], figure_file: 
         from ccatp.report.mirror_map import draw_plan
 
         draw_plan(geometry, found, figure_file)
-    common.print_lines([json.dumps(plan_data(cfg, found))] if json_output else plan_lines(cfg, found))
+    common.print_result(plan_data(cfg, found), plan_lines(cfg, found), json_output)
     if found.out_of_reach:
         return common.complain(
             f"{len(found.out_of_reach)} points are out of reach with mission.leg_clearance_m = "

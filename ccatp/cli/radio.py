@@ -153,7 +153,7 @@ def radio_map(
     else:
         data = _measured(cfg.cricket, method, (ranges_file, tags_file, truth_file), out_file, figure_file)
     common.warn(data["warnings"])
-    common.print_lines([json.dumps(data)] if json_output else report_lines(data))
+    common.print_result(data, report_lines(data), json_output)
 
 
 def _simulated(

@@ -1,6 +1,5 @@
 """The commands ``ccatp radio calibrate``, ``fix`` and ``fuzzy``: path loss, positions from levels, the speed rules."""
 
-import json
 from collections.abc import Iterator, Sequence
 from math import isfinite
 from pathlib import Path
@@ -48,10 +47,8 @@ def calibrate(path: Path, sheet: str | None, points: Path | None, figure_file: P
         from ccatp.report.beacon_plots import draw_path_loss
 
         draw_path_loss(fit, pairs, name, figure_file)
-    if json_output:
-        click.echo(json.dumps({"data": name, **fit.data(CONFIDENCE), "warnings": warnings}))
-    else:
-        common.print_lines(_fit_lines(name, fit))
+    result = {"data": name, **fit.data(CONFIDENCE), "warnings": warnings}
+    common.print_result(result, _fit_lines(name, fit), json_output)
 
 
 def _fit_lines(name: str, fit: "PathLossFit") -> Iterator[str]:
@@ -136,10 +133,7 @@ def fix(
         from ccatp.report.beacon_plots import draw_fixes
 
         draw_fixes(found, [place.place_m for place in places], places_m, name, figure_file)
-    if json_output:
-        click.echo(json.dumps(result))
-    else:
-        common.print_lines(_fix_lines(result))
+    common.print_result(result, _fix_lines(result), json_output)
 
 
 def _coordinates(option: str, text: str, wanted: str) -> list[float]:
@@ -264,8 +258,6 @@ def fuzzy(
         from ccatp.report.beacon_plots import draw_fuzzy
 
         draw_fuzzy(cfg, figure_file)
-    if json_output:
-        click.echo(json.dumps({"rules": len(cfg.rules), "points": values}))
-        return
-    click.echo("distance, m   heading error, rad   speed, m/s")
-    common.print_lines(f"{v['distance_m']:11.2f} {v['heading_error_rad']:20.2f} {v['speed_m_s']:12.3f}" for v in values)
+    lines = [f"{v['distance_m']:11.2f} {v['heading_error_rad']:20.2f} {v['speed_m_s']:12.3f}" for v in values]
+    head = "distance, m   heading error, rad   speed, m/s"
+    common.print_result({"rules": len(cfg.rules), "points": values}, [head, *lines], json_output)

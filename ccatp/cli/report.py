@@ -60,7 +60,7 @@ def compare(run_a: Path, run_b: Path, out: Path | None, figures: Path | None, js
     for found in (pair.a, pair.b):
         common.warn(f"{found.record.name}: {warning}" for warning in found.record.warnings)
     data = {"report": str(path), **compare_data(pair)}
-    common.print_lines([json.dumps(data)] if json_output else [*compare_lines(pair), str(path)])
+    common.print_result(data, [*compare_lines(pair), str(path)], json_output)
     return 0
 
 
@@ -142,10 +142,8 @@ def align(
         from ccatp.report.mirror_map import draw_alignment
 
         draw_alignment(mirror, result, figure_file, f"{mirror.name}: {len(result.panels)} panels", str(run_dir))
-    if json_output:
-        common.print_lines([json.dumps({**facts, **result_data(result, comparison), "warnings": warnings})])
-    else:
-        common.print_lines(table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m))
+    lines = table_lines(facts, result, comparison, cfg.align.puck_height_sigma_m)
+    common.print_result({**facts, **result_data(result, comparison), "warnings": warnings}, lines, json_output)
     return 0
 
 
@@ -191,7 +189,7 @@ def replay(run_dir: Path, settings: Mapping[str, object], smooth: bool, out: Pat
     lines = [*_head(result), *table_lines(result)]
     if is_as_it_was or may_differ:
         lines.append(f"the replay {'reproduces' if is_as_it_was else 'differs from'} the recorded estimates")
-    common.print_lines([json.dumps(result)] if json_output else lines)
+    common.print_result(result, lines, json_output)
     if is_as_it_was or may_differ:
         return ExitStatus.COMPLETE
     why = "was the run made by another version, or on another CPU?"

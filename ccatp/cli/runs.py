@@ -44,13 +44,9 @@ def list_runs(folder: Path, json_output: bool) -> None:
     if not folder.is_dir():
         raise ConfigError(f"{folder}: no such folder; name one that holds run directories")
     found = sorted((_facts(path.parent) for path in folder.glob("*/config.toml")), key=lambda run: run["began"])
-    if json_output:
-        click.echo(json.dumps({"runs": found}))
-        return
     head = {"began": "began (UTC)", "state": "state", "points": "points", "size_mb": "MB", "what": "what", "run": "run"}
-    common.print_lines(
-        common.columns([[str(run[key]) for key in head] for run in (head, *found)]) if found else ["none"]
-    )
+    lines = common.columns([[str(run[key]) for key in head] for run in (head, *found)])
+    common.print_result({"runs": found}, lines if found else ["none"], json_output)
 
 
 @runs.command("show", epilog=common.example("ccatp runs show runs/tonight"))
@@ -62,16 +58,13 @@ def show(run_dir: Path, json_output: bool) -> None:
         raise ConfigError(f"{run_dir}: no run directory (it has no config.toml); ccatp runs list shows them")
     facts = _facts(run_dir)
     files = {path.name: path.stat().st_size for path in sorted(run_dir.iterdir()) if path.is_file()}
-    if json_output:
-        click.echo(json.dumps({**facts, "files": files}))
-        return
-    common.print_lines(f"{name:<15} {value}" for name, value in facts.items() if value != "")
-    click.echo()
-    common.print_lines(
+    sizes = [
         f"{name:<24} {size / 1e6:10.3f} MB  {FILES.get(_PART.sub('.mcap', name), '')}".rstrip()
         for name, size in files.items()
         if not name.startswith(".") and not name.endswith(".new")  # the program's own
-    )
+    ]
+    lines = [f"{name:<15} {value}" for name, value in facts.items() if value != ""]
+    common.print_result({**facts, "files": files}, [*lines, "", *sizes], json_output)
 
 
 def _facts(run_dir: Path) -> dict[str, Any]:

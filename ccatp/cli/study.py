@@ -137,5 +137,5 @@ def bench(
         result = run_bench(cfg, quick=quick, run_args=run_args, frames=not steps_only, steps=not frames_only)
     if markdown is not None:
         write_page(markdown, result)
-    common.print_lines([json.dumps(result)] if json_output else tables(result).splitlines())
+    common.print_result(result, tables(result).splitlines(), json_output)
     return 0
