@@ -4,7 +4,7 @@ import itertools
 import json
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -135,6 +135,21 @@ class RunOptions:
 def default_run_dir(mirror: str, seed: int, now_utc: datetime, parent: Path = Path("runs")) -> Path:
     """``runs/<UTC time>-<mirror>-s<seed>``; the mirror is a name or the path of a file."""
     return parent / f"{now_utc:%Y%m%dT%H%M%SZ}-{PurePath(mirror).stem}-s{seed}"
+
+
+def recover(options: RunOptions, cfg: Config, run: Callable[[RunOptions, Config], int]) -> int:
+    """Go on, held, with the run that did not finish; else begin a new one that may be recovered."""
+    run_dir = find_resumable()
+    if run_dir is not None:
+        options = replace(options, run_dir=run_dir, resume=True, held=True)
+    else:
+        run_dir = default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC)).absolute()
+        # An emergency latched when the last run ended stays latched: the robot waits at its base until it is cleared.
+        options = replace(options, run_dir=run_dir, held=take_over_emergencies(run_dir))
+        mark_resumable(run_dir)
+    status = run(options, cfg)
+    clear_finished(status, run_dir)
+    return status
 
 
 # In run directory and runtime directory: held by every child of the supervisor.

@@ -11,7 +11,6 @@ import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -48,24 +47,20 @@ from ccatp.daemon.process import (
 from ccatp.daemon.run_dir import (
     RunOptions,
     await_predecessors,
-    clear_finished,
-    default_run_dir,
-    find_resumable,
     finished_summary,
     keep_origin,
     make_run_dir,
-    mark_resumable,
     owned,
-    take_over_emergencies,
+    recover,
     take_runtime_dir,
     with_origin,
 )
-from ccatp.daemon.service import Service
 from ccatp.daemon.terminal import STOP_SIGNALS, RunView, write_run_report
 from ccatp.daemon.webhook import AlarmWebhook
 from ccatp.errors import ConfigError, ExitStatus
-from ccatp.links.service_manager import is_journal, take_from
-from ccatp.links.topics import LEVELS, OPERATOR_MESSAGE, Heartbeat
+from ccatp.links.liveness import STALE_AFTER_S, Liveness
+from ccatp.links.service_manager import Notifier, is_journal, take_from
+from ccatp.links.topics import LEVELS, OPERATOR_MESSAGE, Heartbeat, MissionStatus
 from ccatp.records.recorder import RUN_LOCK
 from ccatp.report.dashboard.access import TOKEN_FILE, make_token, read_tokens
 
@@ -78,6 +73,9 @@ OPEN_FILES = 256
 WEBHOOK_PATIENCE_S = 0.5
 # So many at a time: a signal and a death are noticed in between.
 MAX_MESSAGES = 1000
+STATUS_PERIOD_S = 1.0  # of what a service reports of its mission
+# Messages of a service in a watchdog period, and the part of it after which silence of a loop withholds them.
+STROKES, STALE_SHARE = 4.0, 0.5
 
 # In the order of starting; stopping is in the reverse order, so that main holds the wheels first.
 PROCESSES: tuple[ProcessSpec, ...] = (
@@ -103,6 +101,52 @@ BEACON_PROCESSES = tuple(
     for spec in PROCESSES
     if spec.name != "etalon"
 )
+
+
+class Service:
+    """Reports the state of the run to the service manager; ``watchdog_s`` is None without a watchdog."""
+
+    def __init__(self, notifier: Notifier, watchdog_s: float | None) -> None:
+        self._notifier, self._watchdog_s = notifier, watchdog_s
+        self._liveness = Liveness(min(STALE_AFTER_S, STALE_SHARE * (watchdog_s or STALE_AFTER_S / STALE_SHARE)))
+        self._is_ready = self._is_troubled = False
+        self._stroked_s = self._sent_s = float("-inf")
+        self._text = ""
+
+    def on_heartbeat(self, heartbeat: Heartbeat) -> None:
+        """A heartbeat was received."""
+        self._liveness.update(heartbeat)
+
+    def update(self, now_s: float, status: MissionStatus | None, *, is_recovering: bool = False) -> None:
+        """Send due messages; while ``is_recovering`` from a restart the watchdog is served in any case."""
+        if not self._notifier.has_listener:
+            return
+        if not self._is_ready:
+            if self._liveness.has_joined:
+                self._is_ready = True
+                self._notifier.send("READY=1")
+            return
+        trouble = self._liveness.trouble(now_s)
+        may_stroke = is_recovering or not trouble
+        if self._watchdog_s is not None and may_stroke and now_s - self._stroked_s >= self._watchdog_s / STROKES:
+            self._stroked_s = now_s
+            self._notifier.send("WATCHDOG=1")
+        has_turned, self._is_troubled = bool(trouble) != self._is_troubled, bool(trouble)
+        text = f"trouble: {trouble}" if trouble else _status_text(status)
+        if text != self._text and (has_turned or now_s - self._sent_s >= STATUS_PERIOD_S):
+            self._text, self._sent_s = text, now_s
+            self._notifier.send(f"STATUS={text}")
+
+    def stopping(self) -> None:
+        """The run ends."""
+        self._notifier.send("STOPPING=1", "STATUS=holding the wheels and saving")
+
+
+def _status_text(status: MissionStatus | None) -> str:
+    if status is None:
+        return "joined the robot"
+    cause = f" ({status.cause})" if status.cause else ""
+    return f"{status.state}{cause}, {status.done} of {status.total} points"
 
 
 class SupervisedRun:
@@ -248,7 +292,7 @@ def run(options: RunOptions) -> int:
     """
     cfg = read_config(options.config_file, dict(options.overrides), any_ports=options.sim)
     if isinstance(cfg, Config):
-        return _recover(options, cfg) if options.recover else _run(options, cfg)
+        return recover(options, cfg, _run) if options.recover else _run(options, cfg)
     if options.resume or options.recover:
         flag = "--resume" if options.resume else "--resume-last"
         raise ConfigError(
@@ -330,18 +374,3 @@ def _addresses(cfg: Config | RadioConfig) -> dict[str, dict[str, object]]:
     sections = {"robot": cfg.robot, "etalon": getattr(cfg, "etalon", None)}
     sections["dashboard"] = cfg.dashboard if cfg.dashboard.enabled else None
     return {name: {"host": at.host, "port": at.port} for name, at in sections.items() if at is not None}
-
-
-def _recover(options: RunOptions, cfg: Config) -> int:
-    """Go on, held, with the run that did not finish; else begin a new one that may be recovered."""
-    run_dir = find_resumable()
-    if run_dir is not None:
-        options = replace(options, run_dir=run_dir, resume=True, held=True)
-    else:
-        run_dir = default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC)).absolute()
-        # An emergency latched when the last run ended stays latched: the robot waits at its base until it is cleared.
-        options = replace(options, run_dir=run_dir, held=take_over_emergencies(run_dir))
-        mark_resumable(run_dir)
-    status = _run(options, cfg)
-    clear_finished(status, run_dir)
-    return status

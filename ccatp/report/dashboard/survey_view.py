@@ -1,6 +1,5 @@
 """The page of a survey: its points, arrival errors by the laser, errors against the simulated truth, the path."""
 
-from math import dist
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ from ccatp.links.topics import ArrivalMessage, DisplayState, FixMessage, Mission
 from ccatp.mirror.mirror import Mirror, deck_poses
 from ccatp.mirror.surface import ConvergenceError
 from ccatp.records.store import StoredSurvey
+from ccatp.records.summary import measured_error_m
 from ccatp.report.dashboard.history import TruthCompare
 from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView
 from ccatp.survey.events import PURPOSES
@@ -152,14 +152,11 @@ class SurveyView(RunStateView):
         if index is None:
             return None
         self._mark(index, MEASURED)
-        mirror = self._mirror
         try:
-            x_m, y_m, _ = mirror.foot_of_puck(position_m, self._puck_height_m)
+            error_m = measured_error_m(self._mirror, point, position_m, self._puck_height_m)
         except ConvergenceError:
             return None  # not on this mirror
-        target = mirror.surface_point(*mirror.point_on_deck(point))
-        error_mm = round(1e3 * dist(mirror.surface_point(x_m, y_m), target), 3)
-        self._errors_mm[index] = error_mm
+        self._errors_mm[index] = error_mm = round(1e3 * error_m, 3)
         return error_mm
 
     def _take_track(self, track: TrackMessage, _now_s: float) -> None:
