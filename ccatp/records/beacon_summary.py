@@ -10,6 +10,7 @@ import numpy as np
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import aligned_rms_m, nees, rms_m
+from ccatp.links import topics
 from ccatp.links.beacon_messages import (
     TRACK_COLUMNS,
     TRUTH_COLUMNS,
@@ -18,17 +19,6 @@ from ccatp.links.beacon_messages import (
     pose_track,
     pose_truth,
     table,
-)
-from ccatp.links.topics import (
-    BeaconArrival,
-    BeaconMapMessage,
-    BeaconPlaces,
-    BeaconTrack,
-    BeaconTruth,
-    DangerEvent,
-    Message,
-    MissionStatus,
-    Timing,
 )
 from ccatp.records.summary import distribution, rounded, wall_figures
 
@@ -56,26 +46,26 @@ class BeaconSummary:
     ticks_us: list[float] = field(default_factory=list)
     signal: str = ""  # by which motion is denied at present
 
-    def take(self, message: Message) -> None:
+    def take(self, message: topics.Message) -> None:
         """Take one message of the run."""
-        if isinstance(message, BeaconTrack):
+        if isinstance(message, topics.BeaconTrack):
             self.track += message.rows
-        elif isinstance(message, BeaconTruth):
+        elif isinstance(message, topics.BeaconTruth):
             self.truth += message.rows
-        elif isinstance(message, BeaconPlaces):
+        elif isinstance(message, topics.BeaconPlaces):
             self.places = message.places
-        elif isinstance(message, BeaconMapMessage):
+        elif isinstance(message, topics.BeaconMapMessage):
             self.beacons, self.notes = message.beacons, message.notes
             self.score = message.nis_sum, message.nis_size, message.refused
-        elif isinstance(message, BeaconArrival):
+        elif isinstance(message, topics.BeaconArrival):
             self.reached.append((message.seq, message.estimate))
-        elif isinstance(message, Timing):
+        elif isinstance(message, topics.Timing):
             self.ticks_us += message.tick_us
-        elif isinstance(message, DangerEvent):
+        elif isinstance(message, topics.DangerEvent):
             if message.signal and message.signal != self.signal:
                 self.events[message.signal] += 1
             self.signal = message.signal
-        elif isinstance(message, MissionStatus):
+        elif isinstance(message, topics.MissionStatus):
             self.mission_time_s, self.outcome, self.cause = message.elapsed_s, message.outcome, message.cause
 
     def build(self, wall_s: float) -> dict[str, Any]:

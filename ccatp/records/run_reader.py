@@ -16,19 +16,10 @@ from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import Fix, FloatArray, IntArray, PanelId, PointId, Vector3
 from ccatp.errors import UsageError
+from ccatp.links import topics
 from ccatp.links.bus import BadMessage
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import (
-    ArrivalMessage,
-    FixMessage,
-    Misalignment,
-    Rest,
-    SensorLines,
-    TrackMessage,
-    Treatment,
-    TruthMessage,
-)
 from ccatp.mirror.mirror import Mirror, deck_rows
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.recorder import RECORD_FORMAT, TELEMETRY, decode_recorded, iter_messages, read_metadata, recordings
@@ -61,10 +52,10 @@ class Fixed(NamedTuple):
 
 
 Event = Marked | Fixed
-Message = Sensors | Rest | FixMessage | Treatment
+Message = Sensors | topics.Rest | topics.FixMessage | topics.Treatment
 
 
-def _fixed(message: FixMessage) -> Fixed:
+def _fixed(message: topics.FixMessage) -> Fixed:
     return Fixed(msgspec.convert(message, Fix, from_attributes=True), message.is_fused, message.is_set_aside)
 
 
@@ -78,14 +69,14 @@ def in_order(messages: Iterable[Message]) -> Iterator[Event]:
     rests: set[int] = set()
     treatments: dict[tuple[int, str], tuple[float, ...]] = {}
     is_odometry_off = False
-    fixes: deque[FixMessage] = deque()
+    fixes: deque[topics.FixMessage] = deque()
     last = -1
     for message in messages:
-        if isinstance(message, Rest):
+        if isinstance(message, topics.Rest):
             rests.add(message.seq)
-        elif isinstance(message, FixMessage):
+        elif isinstance(message, topics.FixMessage):
             fixes.append(message)
-        elif isinstance(message, Treatment):
+        elif isinstance(message, topics.Treatment):
             treatments[message.seq, message.kind] = message.values
         else:
             while fixes and fixes[0].seq < message.seq:
@@ -222,17 +213,17 @@ class Recording:
             self.warnings.append(f"{self.path}: {missing} frames are missing in between")
 
     def _take(self, message: object) -> list[Message]:
-        if isinstance(message, SensorLines):
+        if isinstance(message, topics.SensorLines):
             frames = [decode_from_robot(bytes(line)) for line in message.lines]
             return [frame for frame in frames if isinstance(frame, Sensors)]
-        if isinstance(message, Rest | Treatment | FixMessage):
+        if isinstance(message, topics.Rest | topics.Treatment | topics.FixMessage):
             return [message]
-        if isinstance(message, TrackMessage):
+        if isinstance(message, topics.TrackMessage):
             for seq, t_s, row, col, x_m, y_m, heading_rad, _ in message.rows:
                 self._track.add(seq, t_s, row, col, (x_m, y_m, heading_rad))
-        elif isinstance(message, TruthMessage):
+        elif isinstance(message, topics.TruthMessage):
             self._truth += message.rows
-        elif isinstance(message, ArrivalMessage):
+        elif isinstance(message, topics.ArrivalMessage):
             self.arrivals.append(message.seq)
         return []
 
@@ -339,7 +330,7 @@ def _injected(path: Path) -> Injected | None:
         if topic == "misalignment":
             with suppress(BadMessage):
                 message = decode_recorded(topic, payload)
-                if isinstance(message, Misalignment):
+                if isinstance(message, topics.Misalignment):
                     return {PanelId(row, col): (piston, tip, tilt) for row, col, piston, tip, tilt in message.panels}
             break
     return None

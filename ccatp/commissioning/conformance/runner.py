@@ -5,21 +5,7 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from typing import Any, Literal, NamedTuple
 
-from ccatp.commissioning.conformance import command_checks, motion_checks, server_checks
-from ccatp.commissioning.conformance.harness import (
-    Check,
-    CheckContext,
-    CheckFailed,
-    ControllerAndMonitor,
-    Facts,
-    Message,
-    Need,
-    NotApplicable,
-    Pair,
-    parse,
-    read_message,
-    shorten,
-)
+from ccatp.commissioning.conformance import command_checks, harness, motion_checks, server_checks
 from ccatp.errors import DaemonUnreachableError, UsageError
 from ccatp.mirror.mirror import Mirror
 
@@ -27,7 +13,7 @@ CHECKS = (*server_checks.CHECKS, *command_checks.CHECKS, *motion_checks.CHECKS)
 Outcome = Literal["pass", "fail", "not applicable"]
 # With a hello that lacks what the other checks need, these two are all that can run.
 _HELLO_CHECKS = ("hello", "hello-robot")
-_WHY: dict[Need, str] = {
+_WHY: dict[harness.Need, str] = {
     "motion": "--no-motion",
     "body": "--on-stands",
     "real time": "lockstep: time stands still while an answer is missing",
@@ -68,16 +54,16 @@ class Conformance:
     def __init__(
         self, address: tuple[str, int], key: bytes | None, timeout_s: float, mirror: Mirror | None = None
     ) -> None:
-        self._context = CheckContext(address, key, timeout_s)
+        self._context = harness.CheckContext(address, key, timeout_s)
         self._context.mirror = mirror
         self._where = f"{address[0]}:{address[1]}"
-        self._fans: Pair | None = None
+        self._fans: harness.Pair | None = None
         hello = self._hello()
-        self.facts: Facts | None = None
-        self._why_unfit, self._lacking = "", list[Need]()
+        self.facts: harness.Facts | None = None
+        self._why_unfit, self._lacking = "", list[harness.Need]()
         try:
-            self.facts = self._context.facts = parse(Facts, hello)
-        except CheckFailed as failed:
+            self.facts = self._context.facts = harness.parse(harness.Facts, hello)
+        except harness.CheckFailed as failed:
             self._why_unfit = str(failed)
         if self.facts is not None and self.facts.needs_mac and key is None:
             raise KeyNeeded(f"the robot at {self._where} asks for a key: name its file with --key")
@@ -97,7 +83,7 @@ class Conformance:
         results = []
         if (facts := self.facts) is not None:
             self._begin()
-            has: dict[Need, bool] = {
+            has: dict[harness.Need, bool] = {
                 "motion": motion, "body": not on_stands, "real time": not facts.lockstep, "lockstep": facts.lockstep,
                 "hmac": facts.needs_mac,
             }  # fmt: skip
@@ -112,21 +98,21 @@ class Conformance:
                 self._restore()
         return results
 
-    def _run_one(self, check: Check) -> tuple[Outcome, str]:
+    def _run_one(self, check: harness.Check) -> tuple[Outcome, str]:
         try:
             if self.facts is None and check.check_id not in _HELLO_CHECKS:
                 return "not applicable", f"the hello is of no use: {self._why_unfit}"
             if self.facts is not None and (lacking := [need for need in check.needs if need in self._lacking]):
                 return "not applicable", _WHY[lacking[0]]
             return "pass", check.run(self._context)
-        except CheckFailed as failed:
+        except harness.CheckFailed as failed:
             return "fail", str(failed)
-        except NotApplicable as reason:
+        except harness.NotApplicable as reason:
             return "not applicable", str(reason)
         finally:
             self._context.clear()
 
-    def _hello(self) -> Message:
+    def _hello(self) -> harness.Message:
         try:
             connection = self._context.connect()
         except OSError as error:
@@ -134,17 +120,17 @@ class Conformance:
         self._context.until(lambda: bool(connection.lines) or connection.is_ended)
         self._context.clear()
         line = connection.lines[0] if connection.lines else b""
-        message = read_message(line)
+        message = harness.read_message(line)
         if message is None or message.get("type") != "hello":
-            seen = f"says {shorten(line)!r}" if line else "says nothing"
+            seen = f"says {harness.shorten(line)!r}" if line else "says nothing"
             raise NoRobot(f"no robot link at {self._where}: it {seen} where a hello should be")
         return message
 
     def _begin(self) -> None:
         """Check that no other program holds the robot; note its fans and the highest number in use."""
         try:
-            frame = ControllerAndMonitor(self._context).expect(lambda _: True, "no frame")
-        except CheckFailed as failed:
+            frame = harness.ControllerAndMonitor(self._context).expect(lambda _: True, "no frame")
+        except harness.CheckFailed as failed:
             if "role taken" in str(failed):
                 raise NoRobot(f"another program drives the robot at {self._where}; end it first") from None
         else:
@@ -156,8 +142,8 @@ class Conformance:
     def _restore(self) -> None:
         """Fans as they were found; then no session, so that the wheels are held."""
         self._context.clear()
-        with suppress(CheckFailed, NotApplicable):
-            pair = ControllerAndMonitor(self._context)
+        with suppress(harness.CheckFailed, harness.NotApplicable):
+            pair = harness.ControllerAndMonitor(self._context)
             if self._fans is not None and not pair.steady().has_fans(self._fans):
                 pair.fans(self._fans)
                 pair.settle()
