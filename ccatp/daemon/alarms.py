@@ -83,10 +83,7 @@ class AlarmList:
     """Raises, ends and acknowledges alarms; ``now`` gives the time that is shown."""
 
     def __init__(
-        self,
-        run_dir: Path,
-        log: structlog.typing.FilteringBoundLogger,
-        now: Callable[[], str] = utc_now,
+        self, run_dir: Path, log: structlog.typing.FilteringBoundLogger, now: Callable[[], str] = utc_now
     ) -> None:
         self._path, self._log, self._now = run_dir / FILE, log, now
         self._alarms: dict[str, Alarm] = {}

@@ -6,12 +6,7 @@ from contextlib import contextmanager
 from math import cos, sin
 from typing import TYPE_CHECKING
 
-from ccatp.beacons.mission import (
-    BeaconMission,
-    check_beacon_robot,
-    track_row,
-    wheel_rates,
-)
+from ccatp.beacons.mission import BeaconMission, check_beacon_robot, track_row, wheel_rates
 from ccatp.beacons.navigation import BeaconMeasurements, MeasurementReader
 from ccatp.beacons.steering import HALT
 from ccatp.beacons.store import BeaconStore

@@ -21,14 +21,7 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.daemon.child_processes import open_page_socket, token_query
 from ccatp.daemon.command_handlers import LOGGED_LINES, LOGGED_PERIOD_S
-from ccatp.daemon.process import (
-    Endpoints,
-    open_log,
-    read_config,
-    run_dir_in,
-    run_until_stopped,
-    start_process,
-)
+from ccatp.daemon.process import Endpoints, open_log, read_config, run_dir_in, run_until_stopped, start_process
 from ccatp.errors import ConfigError, DaemonUnreachableError
 from ccatp.links.bus import HeartbeatPublisher, Publisher
 from ccatp.links.liveness import LogRateLimit

@@ -11,14 +11,7 @@ import structlog
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
 from ccatp.daemon.child_processes import listen
-from ccatp.daemon.process import (
-    FAULTS_FILE,
-    Endpoints,
-    open_log,
-    processes_of,
-    run_until_stopped,
-    start_process,
-)
+from ccatp.daemon.process import FAULTS_FILE, Endpoints, open_log, processes_of, run_until_stopped, start_process
 from ccatp.dataloop import serve
 from ccatp.errors import ExitStatus
 from ccatp.links.runtime_dir import TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets

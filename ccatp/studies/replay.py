@@ -327,10 +327,7 @@ def figures(errors: ReplayErrors) -> dict[str, Any]:
     distance_mm = 1e3 * errors.distance_m
     known = errors.nees[np.isfinite(errors.nees)]
     return {
-        "position_error_mm": {
-            **distribution(distance_mm, _FIGURES, decimals=_DECIMALS),
-            "rms": rms(distance_mm),
-        },
+        "position_error_mm": {**distribution(distance_mm, _FIGURES, decimals=_DECIMALS), "rms": rms(distance_mm)},
         "moving_error_mm": {"rms": rms(distance_mm[errors.is_moving])},
         "arrival_error_mm": _rms_and_max(distance_mm[errors.is_arrival]),
         "heading_error_mrad": {"rms": rms(1e3 * errors.turn_rad)},
