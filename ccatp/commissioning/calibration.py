@@ -44,21 +44,17 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What a drive shows: radius and base in m, bias in rad/s, the difference of the radii (right less left) in m.
-
-    ``covariance``: of radius, base and bias, shape (3, 3). ``slip_sigma``: how much slip varies from motion to motion;
-    0 where nothing shows that it does. ``chi2``, ``degrees``: of all residuals, with ``slip_sigma`` as it is.
-    """
+    """What a drive shows: radius and base in m, bias in rad/s, the difference of the radii (right less left) in m."""
 
     radius: Estimate
     base: Estimate
     bias: Estimate
-    covariance: FloatArray
+    covariance: FloatArray  # of radius, base and bias, shape (3, 3)
     radius_difference_m: Estimate
     gyroscope_scale: Estimate
     creep: Estimate
-    slip_sigma: float
-    chi2: float
+    slip_sigma: float  # how much slip varies from motion to motion; 0 where nothing shows that it does
+    chi2: float  # of all residuals, with ``slip_sigma`` as it is
     degrees: int
     segments: int
 

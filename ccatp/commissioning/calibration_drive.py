@@ -39,14 +39,11 @@ class FixedPlace:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """From one fix to the next: what each wheel turned, frame by frame, shape (n,), and the gyroscope summed up.
-
-    ``motions`` are the first and last (exclusive) frame of each motion; together all frames.
-    """
+    """From one fix to the next: what each wheel turned, frame by frame, shape (n,), and the gyroscope summed up."""
 
     right_rad: FloatArray
     left_rad: FloatArray
-    motions: tuple[tuple[int, int], ...]
+    motions: tuple[tuple[int, int], ...]  # first and last (exclusive) frame of each; together all frames
     gyro_rad: float
     gyro_s: float
     gyro_samples: int
@@ -55,16 +52,13 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class RecordedDrive:
-    """A whole drive: k + 1 places and the k segments between them.
-
-    The noise of a rate sample is 0 of a counter; the quantum of a counter is 0 where the rate itself is read.
-    """
+    """A whole drive: k + 1 places and the k segments between them."""
 
     places: tuple[FixedPlace, ...]
     segments: tuple[Segment, ...]
-    encoder_sigma_rad_s: float
+    encoder_sigma_rad_s: float  # of a rate sample; 0 of a counter
     encoder_period_s: float
-    quantum_rad: float
+    quantum_rad: float  # of a counter; 0 where the rate itself is read
     gyro_sigma_rad_s: float
 
 
@@ -215,16 +209,13 @@ class WheelParameters(NamedTuple):
 
 
 class DeadReckonedSegment(NamedTuple):
-    """Where a segment leads from one pose, and how that depends on what is not known.
-
-    What is left of the change of heading beside ``turn_rad``, the robot's own rotation, the surface's curvature does.
-    """
+    """Where a segment leads from one pose, and how that depends on what is not known."""
 
     end: FloatArray  # x, y (m), heading (rad), deck frame, shape (3,)
     of_wheels: FloatArray  # derivatives of ``end`` by the four of ``WheelParameters``, shape (3, 4)
     of_start: FloatArray  # by the pose at the start, shape (3, 3)
     of_slip: FloatArray  # by the share of travel that right and left wheel gain in each motion, shape (3, 2 motions)
-    turn_rad: float
+    turn_rad: float  # the robot's own rotation; what is left of the change of heading the surface's curvature does
 
 
 _STEPS = np.array((1e-5, 1e-5, 1e-5, 1e-3))  # relative, but for the creep

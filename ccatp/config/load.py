@@ -62,14 +62,11 @@ class NotASurvey(ConfigError):
 
 @dataclass(frozen=True, slots=True)
 class ConfigSource:
-    """One place that values come from: a file, or the command line, which has no text.
+    """One place that values come from: a file, or the command line, which has no text."""
 
-    ``name`` is the file's as the user knows it; ``tree`` is the section ``root`` of the configuration.
-    """
-
-    name: str
+    name: str  # of the file, as the user knows it
     text: str
-    tree: Tree
+    tree: Tree  # the section ``root`` of the configuration
     root: Key = ()
 
     def depth(self, key: Key) -> int:

@@ -29,18 +29,13 @@ Injected = dict[PanelId, Vector3]  # piston (m), tip and tilt (rad)
 
 
 class Marked(NamedTuple):
-    """A frame, and the treatment of the localizer in it.
-
-    ``begun``: before the frame the localizer was reset, with these values of ``Treatment``. ``is_odometry_off``:
-    whatever wheels and inertial unit report, the robot stands. ``doubted``: after the samples its uncertainty was
-    increased by this much, m and rad.
-    """
+    """A frame, and the treatment of the localizer in it."""
 
     sensors: Sensors
     at_rest: bool
-    begun: tuple[float, ...] | None = None
-    is_odometry_off: bool = False
-    doubted: tuple[float, ...] | None = None
+    begun: tuple[float, ...] | None = None  # before the frame it was reset, with these values of ``Treatment``
+    is_odometry_off: bool = False  # whatever wheels and inertial unit report, the robot stands
+    doubted: tuple[float, ...] | None = None  # after the samples its uncertainty was increased by this, m and rad
 
 
 class Fixed(NamedTuple):
@@ -159,16 +154,13 @@ class RunReadError(UsageError):
 
 @dataclass(slots=True)
 class Recording:
-    """One recording of a run; a run that was resumed has several, each from the robot's start at base.
-
-    ``warnings``: defects; complete when ``messages`` has come to its end. ``arrivals``: frames at which the robot stood
-    at a point for the first time; complete likewise.
-    """
+    """One recording of a run; a run that was resumed has several, each from the robot's start at base."""
 
     path: Path
     metadata: Mapping[str, str]
+    # Both are complete when ``messages`` has come to its end.
     warnings: list[str] = field(default_factory=list)
-    arrivals: list[int] = field(default_factory=list)
+    arrivals: list[int] = field(default_factory=list)  # frames at which the robot stood at a point for the first time
     _track: TraceBuilder = field(default_factory=TraceBuilder)
     _truth: list[tuple[float, ...]] = field(default_factory=list)
 

@@ -85,16 +85,13 @@ class AlreadyMeasuredError(StoreRefusal):
 
 
 class StoredPoint(NamedTuple):
-    """A point and its target in the tangent plane of its panel, panel frame; a row of ``points``.
-
-    ``status`` is planned, measured or skipped, ``t_s`` the time of the latter two.
-    """
+    """A point and its target in the tangent plane of its panel, panel frame; a row of ``points``."""
 
     point: PointId
     x_m: float
     y_m: float
-    status: str = "planned"
-    t_s: float | None = None
+    status: str = "planned"  # or measured, or skipped
+    t_s: float | None = None  # when that happened
     fix_id: int | None = None
 
 

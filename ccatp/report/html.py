@@ -115,17 +115,13 @@ class Gathered(NamedTuple):
 
 
 class Events(NamedTuple):
-    """What the page shows of a log.
-
-    ``notable``: warnings, errors and what else no reader may miss; if there are many, their ``kinds`` instead, the
-    gravest and then the rarest first. ``first`` and ``last``: the lines at both ends.
-    """
+    """What the page shows of a log."""
 
     total: int
-    notable: Sequence[LogLine]
-    kinds: Sequence[Gathered]
+    notable: Sequence[LogLine]  # warnings, errors and what else no reader may miss
+    kinds: Sequence[Gathered]  # in place of many notable lines, the gravest and then the rarest first
     kinds_left_out: int
-    first: Sequence[LogLine]
+    first: Sequence[LogLine]  # at both ends
     last: Sequence[LogLine]
     left_out: int
 

@@ -52,15 +52,11 @@ class Loop:
 
 
 class Margins(NamedTuple):
-    """What separates a loop from instability; ``inf`` where nothing does.
+    """What separates a loop from instability; ``inf`` where nothing does."""
 
-    The gain may grow by ``gain_db`` before the loop becomes unstable, negative if it has to shrink; ``phase_rad`` is
-    the least over all gain crossovers, ``modulus`` the least distance of L(j w) from -1.
-    """
-
-    gain_db: float
-    phase_rad: float
-    modulus: float
+    gain_db: float  # by which the gain may grow before the loop becomes unstable, negative if it has to shrink
+    phase_rad: float  # the least over all gain crossovers
+    modulus: float  # the least distance of L(j w) from -1
     gain_crossover_rad_s: float
     phase_crossover_rad_s: float
     delay_s: float

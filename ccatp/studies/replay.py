@@ -167,14 +167,11 @@ def transition_of_reset(before: FloatArray, after: FloatArray) -> tuple[FloatArr
 
 @dataclass(slots=True)
 class Replayed:
-    """The estimates of a localizer for a run, each before the fix that was taken there; the same poses smoothed.
-
-    ``feet`` of the fixes taken in the run: frame before them, deck x, y of the origin as they show it, shape (f, 3).
-    """
+    """The estimates of a localizer for a run, each before the fix that was taken there; the same poses smoothed."""
 
     trace: Trace
     moving: IntArray
-    feet: FloatArray
+    feet: FloatArray  # of fixes taken in the run: frame before, deck x, y of the origin as they show it, shape (f, 3)
     smoothed: Trace | None = None
     fixes: int = 0
     refused: int = 0  # by this localizer

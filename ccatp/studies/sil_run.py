@@ -62,19 +62,16 @@ class StopRow:
 
 @dataclass(slots=True)
 class SilResult:
-    """The result of a mission; ``summary`` as in ``summary.json``.
+    """The result of a mission."""
 
-    ``track``: rows of t, true x, y, heading, estimated x, y, heading (deck), shape (k, 7).
-    """
-
-    summary: dict[str, Any]
+    summary: dict[str, Any]  # as in ``summary.json``
     stops: list[StopRow]
     corrections: int  # moves after a fix that showed the robot too far from its point
     counts: dict[str, int]
     outcome: str
     cause: str
     states_s: dict[str, float]
-    track: FloatArray
+    track: FloatArray  # rows of t, true x, y, heading, estimated x, y, heading (deck), shape (k, 7)
 
     @property
     def mission_time_s(self) -> float:

@@ -33,16 +33,13 @@ _DONE = _object("status", status=_OK)
 
 
 class Endpoint(NamedTuple):
-    """One row: path, what it is for, and what it answers with; with a ``channel`` it commands and needs a token.
-
-    ``channel``: ``control`` is answered by the main loop, ``emergency`` by the danger loop, ``token`` by the page.
-    """
+    """One row: path, what it is for, and what it answers with; with a ``channel`` it commands and needs a token."""
 
     path: str
     summary: str
     schema: Schema
     content: str = JSON
-    channel: str = ""
+    channel: str = ""  # ``control`` is answered by the main loop, ``emergency`` by the danger loop, ``token`` here
     body: Schema | None = None
     errors: tuple[int, ...] = ()
 
