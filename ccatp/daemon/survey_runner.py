@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from ccatp.daemon.main_loop import MainLoop
 
 
-# Frames between two records: ten a second.
+# A record in the first of so many frames, ten a second: in that of an estimate.
 PERIOD_FRAMES = 10
 
 
@@ -61,20 +61,20 @@ class CheckpointWriter:
         self._run_id = read_run_id(run_dir)
         self._written: SurveyState | None = None
         self._in_force = ("", "")
-        self._left = 1
+        self._period = -1
         self.boot = -1
 
-    def is_due(self) -> bool:
-        """Asked in each frame: in every tenth, in that of an abort, and where the state changed during a hold."""
-        self._left -= 1
+    def is_due(self, seq: int) -> bool:
+        """Asked in each frame: in the first of ten, in that of an abort, and where the state changed during a hold."""
+        if seq // PERIOD_FRAMES != self._period:
+            return True
         state = self._mission.state
-        is_new = state.abort_cause != self._in_force[0] or (state.mode is HELD and state is not self._written)
-        return is_new or self._left <= 0
+        return state.abort_cause != self._in_force[0] or (state.mode is HELD and state is not self._written)
 
     def write(self, seq: int, t_s: float, elapsed_s: float) -> None:
         """Write the state of frame ``seq``; durably where abort or hold changed."""
         state = self._written = self._mission.state
-        self._left = PERIOD_FRAMES
+        self._period = seq // PERIOD_FRAMES
         record = Checkpoint.of(self._localizer, state, seq, t_s, elapsed_s, self.boot, self._run_id)
         pose = record.pose
         if not isfinite(pose.x_m + pose.y_m + pose.heading_rad + record.sigma_m + record.heading_sigma_rad):
@@ -417,7 +417,7 @@ class SurveyRunner(MissionRunner):
             telemetry.send("estimate", EstimateMessage(*place, sigma_m, state, *commanded, seq=seq, t_s=t_s))
         row = seq + telemetry.frames_before, t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, sigma_m
         telemetry.add_frame(seq, t_s, frame.raw, row)
-        if self._checkpoint.is_due():
+        if self._checkpoint.is_due(seq):
             self._checkpoint.write(seq, t_s, self._clock.elapsed_s)
         if self.mission.state.mode is not self._state:
             self.publish_state()
