@@ -114,9 +114,9 @@ class ThrustControl:
         wanted = _STEP * ceil(robot.thrust_margin * least_n / robot.thrust_n / _STEP)
         ramp = _RAMP_PER_S * min(max(elapsed_s, 0.0), 0.1)
         before = self.duty
-        left, right = (
+        left, right = [
             round(min(max(wanted, lowest, now - ramp), now + ramp, 1.0), 3)
             for lowest, now in zip(robot.fan_duty, before, strict=True)
-        )
+        ]
         self.duty = left, right
         return self.duty != before

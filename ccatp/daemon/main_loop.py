@@ -447,10 +447,15 @@ class MainLoop(RobotLoop):
     def _answer(self, seq: int, drive: DriveCommand) -> None:
         # A robot that is driven does not wait.
         is_still = not (drive.right_rad_s or drive.left_rad_s)
-        if is_still and self.is_lockstep and self._runner.stops_time:
+        if is_still and self.is_lockstep and self._stops_time():
             self._unanswered = seq
         else:
             self.send_drive(seq, drive)
+
+    def _stops_time(self) -> bool:
+        """In lockstep simulated time stands still while a peer is awaited, and all but still in a pause."""
+        runner = self._runner
+        return runner.is_busy or (runner.mission.state.is_paused and runner.is_at_rest)
 
     def _answer_held_frame(self) -> None:
         """Answer the frame that waits, standing."""
@@ -460,7 +465,7 @@ class MainLoop(RobotLoop):
 
     def release_time(self) -> None:
         """Something changed between two frames, as after a measurement or a pause: lockstep time may go on."""
-        if not (self.is_lockstep and self._runner.stops_time):
+        if not (self.is_lockstep and self._stops_time()):
             self._answer_held_frame()
         self._save_checkpoint()
         self._runner.publish_state()

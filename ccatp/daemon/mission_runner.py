@@ -87,11 +87,6 @@ class MissionRunner(ABC):
     def is_at_rest(self) -> bool:
         """The robot is at rest."""
 
-    @property
-    def stops_time(self) -> bool:
-        """In lockstep simulated time stands still while a peer is awaited, and all but still in a pause."""
-        return self.is_busy or (self.mission.state.is_paused and self.is_at_rest)
-
     @abstractmethod
     def status(self) -> MissionStatus:
         """Progress of the mission; the process adds times, verdict code, lateness and exit status."""

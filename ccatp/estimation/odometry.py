@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Sequence
 from math import cos, hypot, inf, sin, sqrt
+from operator import mul
 from typing import NamedTuple
 
 from ccatp.core import FloatArray, ImuSample
@@ -438,7 +439,7 @@ class WheelAngle:
         """Learn from the samples of a wheel that stands."""
         if self.is_counter or not rates_rad_s:
             return
-        squares = sum(rate * rate for rate in rates_rad_s) / len(rates_rad_s)
+        squares = sum(map(mul, rates_rad_s, rates_rad_s)) / len(rates_rad_s)
         # Some hundred samples are plenty; a slow mean forgets the residue of the last motion.
         old = self.noise_rad2_s2
         self.noise_rad2_s2 = squares if old is None else old + 0.02 * (squares - old)
