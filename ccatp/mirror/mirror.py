@@ -190,9 +190,9 @@ class Mirror:
 
     def gravity_in_robot(self, p: DeckPose) -> Vector3:
         """Unit vector along which things fall, in the frame of a robot at ``p``."""
-        g = self.gravity_deck
-        h, left, n = self.robot_axes(p)
-        return _dot(h, g), _dot(left, g), _dot(n, g)
+        gx, gy, gz = self.gravity_deck
+        (hx, hy, hz), (lx, ly, lz), (nx, ny, nz) = self.robot_axes(p)
+        return hx * gx + hy * gy + hz * gz, lx * gx + ly * gy + lz * gz, nx * gx + ny * gy + nz * gz
 
     def _dropped(self, panel: Panel, x: float, y: float) -> tuple[float, float]:
         deck_x, deck_y, _ = self.surface.drop(panel.to_deck((x, y, 0.0)), panel.axes[2])

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from ccatp.config.models import Config, PanelsConfig, WorldConfig
-from ccatp.core import DeckPose, EdgeSample, GravitySample, ImuSample, PanelId, Vector3, WheelSample
+from ccatp.core import DeckPose, EdgeSample, GravitySample, ImuSample, PanelId, WheelSample
 from ccatp.links.robot_codec import RobotFrame
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
@@ -276,9 +276,8 @@ class SensorSuite:
         sim, world = cfg.sim.robot, cfg.world
         imu, encoders, gravity = rng.spawn(3)
         biases, counts, panel_edges = rng.spawn(3)
-        self._mirror = mirror
         self._gravity_noise = noise_stream(gravity)
-        self._gravity_on_deck = mirror.gravity_deck
+        self._gravity_in_robot = mirror.gravity_in_robot
         self._gravity_pose: DeckPose | None = None
         self._gravity = (0.0, 0.0, 0.0)
         self._gravity_sigma = sim.gravity_sigma_rad
@@ -324,18 +323,13 @@ class SensorSuite:
     def _read_gravity(self, plant: Plant, t_s: float) -> GravityTuple:
         pose = plant.pose
         if pose != self._gravity_pose:
-            self._gravity_pose, self._gravity = pose, self._gravity_at(pose)
+            self._gravity_pose, self._gravity = pose, self._gravity_in_robot(pose)
         sigma, noise, unit, whole = self._gravity_sigma, self._gravity_noise, _PER_UNIT, WHOLE
         x, y, z = self._gravity
         x, y, z = x + sigma * noise(), y + sigma * noise(), z + sigma * noise()
         scale = unit / hypot(x, y, z)
         gx, gy, gz = ((component * scale + whole - whole) / unit for component in (x, y, z))
         return t_s, gx, gy, gz
-
-    def _gravity_at(self, pose: DeckPose) -> Vector3:
-        gx, gy, gz = self._gravity_on_deck
-        (hx, hy, hz), (lx, ly, lz), (nx, ny, nz) = self._mirror.robot_axes(pose)
-        return hx * gx + hy * gy + hz * gz, lx * gx + ly * gy + lz * gz, nx * gx + ny * gy + nz * gz
 
 
 def as_message(frame: RobotFrame) -> Sensors:
