@@ -40,7 +40,7 @@ Rectangle = tuple[float, float, float, float]
 """Low x, high x, low y, high y, m, deck plane."""
 EdgeTuple = tuple[float, int, int, int, int]
 _Body = tuple[float, float, float, float, float, float]
-_Row = TypeVar("_Row", ImuSample, WheelSample, EdgeSample)
+_Row = TypeVar("_Row", bound=tuple[object, ...])
 
 
 class SampleTimes(NamedTuple):
@@ -49,6 +49,9 @@ class SampleTimes(NamedTuple):
     times_s: list[float]
     fractions: list[float]  # of the frame, in (0, 1]
     decays: list[float]  # ``exp(-tau/lag_s)`` of the wheel servo, tau counted from the start of the frame
+
+
+_NO_TIMES = SampleTimes([], [], [])
 
 
 def sample_times(hz: float, frame_hz: float, lag_s: float, frame: int, count: int) -> list[SampleTimes]:
@@ -69,10 +72,13 @@ def sample_times(hz: float, frame_hz: float, lag_s: float, frame: int, count: in
     if abs(ratio - per_frame) < _SAME_RATIO * ratio:  # always at the same fractions of a frame
         fractions = [(j + 1) / per_frame for j in range(per_frame)]
         decays = decays_at(fractions)
-        return [SampleTimes(row, fractions, decays) for row in times_s.reshape(-1, per_frame).tolist()]
+        return named(SampleTimes, zip(times_s.reshape(-1, per_frame).tolist(), repeat(fractions), repeat(decays)))
     found: list[SampleTimes] = []
     times, starts = times_s.tolist(), (lasts - lasts[0]).tolist()
     for before, (start, end) in enumerate(pairwise(starts), frame - 1):
+        if start == end:
+            found.append(_NO_TIMES)
+            continue
         row = times[start:end]
         fractions = [t * frame_hz - before for t in row]
         found.append(SampleTimes(row, fractions, decays_at(fractions)))
