@@ -3,7 +3,6 @@
 from collections import deque
 from collections.abc import Sequence
 from math import cos, exp, inf, sin
-from typing import NamedTuple
 
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.core import ImuSample, Predicted, WheelSample
@@ -111,13 +110,8 @@ def _servo(lag_s: float, dt_s: float) -> tuple[float, float]:
     return keep, lag_s * (1.0 - keep) / dt_s
 
 
-class MotionSum(NamedTuple):
-    """Running sums since the start; ``turned_rad`` is the turn by the gyroscope, where it was plausible."""
-
-    t_s: float
-    right_m: float
-    left_m: float
-    turned_rad: float
+MotionSum = tuple[float, float, float, float]
+"""Time, s; running sums since the start: way of right and left wheel, m, turn by the gyroscope where plausible, rad."""
 
 
 class SlidingWindow:
@@ -134,7 +128,7 @@ class SlidingWindow:
         self._kept.clear()
 
     def push(self, now: MotionSum) -> MotionSum | None:
-        """Take the newest sums; the change over the span (``t_s`` is its length), ``None`` while it is shorter."""
+        """Take the newest sums; the change over the span (its time is the length), ``None`` while it is shorter."""
         kept, since_s = self._kept, now[0] - self._span_s
         kept.append(now)
         while len(kept) > 1 and kept[1][0] <= since_s:
@@ -142,7 +136,7 @@ class SlidingWindow:
         t_s, right_m, left_m, turned_rad = kept[0]
         if t_s > since_s:
             return None
-        return MotionSum(now[0] - t_s, now[1] - right_m, now[2] - left_m, now[3] - turned_rad)
+        return now[0] - t_s, now[1] - right_m, now[2] - left_m, now[3] - turned_rad
 
 
 class WheelMeans:

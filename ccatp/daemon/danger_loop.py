@@ -248,6 +248,8 @@ class DangerLoop(RobotLoop):
             self._sent = ack, verdict
             self.answer_again()
         self.publisher.send("verdict", verdict)
+        if not (verdict.cause or self._published[1]):  # all is well, as before: whatever is found gives a cause
+            return
         found, emergencies = self.monitor.found, self.monitor.latch.causes
         names = frozenset((*(finding.condition.name for finding in found), *emergencies))
         news = verdict.code, verdict.cause, verdict.severity, names

@@ -69,7 +69,7 @@ class HealthMonitor:
         self._battery.reset()
         self._seams.reset()
         self._t_s: float | None = None
-        self._sums = MotionSum(0.0, 0.0, 0.0, 0.0)
+        self._sums: MotionSum = (0.0, 0.0, 0.0, 0.0)
         self._estimate_seq = self._commands_seq = -1
         self._opened = (0, 0, 0, 0)
         self._home_m = 0.0
@@ -156,13 +156,13 @@ class HealthMonitor:
 
     def _added(self, imu: Sequence[ImuSample], dt_s: float) -> MotionSum:
         """The sums with this frame's motion. What is not known of it is taken to be none, of all."""
-        means, sums = self._means, self._sums
+        means, (_, right_m, left_m, turned_rad) = self._means, self._sums
         right, left = means.right_rad_s, means.left_rad_s
         usable = self._gate.admit(imu, means.yaw_rad_s) if imu else imu
         t_s = self._t_s or 0.0
         if right is None or left is None:
             # Without one of them none is counted, so that they do not disagree about what is not known.
-            return MotionSum(t_s, *sums[1:])
+            return t_s, right_m, left_m, turned_rad
         rolled_m = self._robot.wheel_radius_m * dt_s
         if usable:
             wz = usable[-1][2]
@@ -174,7 +174,7 @@ class HealthMonitor:
                 turned = (wz - self._bias_rad_s) * dt_s
         else:
             turned = means.yaw_rad_s * dt_s
-        return MotionSum(t_s, sums[1] + right * rolled_m, sums[2] + left * rolled_m, sums[3] + turned)
+        return t_s, right_m + right * rolled_m, left_m + left * rolled_m, turned_rad + turned
 
     def take_commands(self, t_s: float, estimate: EstimateMessage) -> None:
         """Take the set points from an estimate, too old or not; a repeated one changes nothing."""

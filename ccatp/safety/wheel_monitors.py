@@ -106,9 +106,9 @@ class WheelMonitor:
         Since the last look, ``is_free``: the robot executed its commands, and was permitted to go anywhere;
         ``is_late``: it executed an old command; ``is_sparse``: the encoders gave fewer samples than usual.
         """
-        t_s = now.t_s
+        t_s = now[0]
         shortly, stalling, turning = self._shortly.push(now), self._stalling.push(now), self._turning.push(now)
-        self.speed_m_s = 0.0 if shortly is None else max(abs(shortly.right_m), abs(shortly.left_m)) / shortly.t_s
+        self.speed_m_s = 0.0 if shortly is None else max(abs(shortly[1]), abs(shortly[2])) / shortly[0]
         if not is_free:
             self._held_s = t_s
         if not is_held:
@@ -145,7 +145,9 @@ class WheelMonitor:
     def _find_runaway(
         self, t_s: float, moved: MotionSum, commanded: Span, samples: Sequence[WheelSample], limit: float
     ) -> None:
-        above = [_excess(moved[1 + k] / moved.t_s, *commanded.of(k)) for k in range(2)]
+        over_s, right_m, left_m, _ = moved
+        _, right_low, right_high, left_low, left_high = commanded
+        above = _excess(right_m / over_s, right_low, right_high), _excess(left_m / over_s, left_low, left_high)
         worst = max(above)
         if worst <= limit:
             return
@@ -164,11 +166,12 @@ class WheelMonitor:
         commanded, cfg = self._stall, self._cfg
         if commanded is None or (self._held_s is not None and t_s - self._held_s < cfg.stall_time_s + _LATENCY_S):
             return
-        speeds, limit = [abs(moved[1 + k]) / moved.t_s for k in range(2)], cfg.stall_speed_m_s
+        over_s, right_m, left_m, turned_rad = moved
+        speeds, limit = (abs(right_m) / over_s, abs(left_m) / over_s), cfg.stall_speed_m_s
         still = [k for k in range(2) if speeds[k] < limit and self._is_commanded(*commanded.of(k))]
         if not still:
             return
-        disagreement = abs((moved.right_m - moved.left_m) / self._base_m - moved.turned_rad)
+        disagreement = abs((right_m - left_m) / self._base_m - turned_rad)
         speed, side = min(speeds[k] for k in still), _SIDES[still[0]]
         if len(still) == len(_SIDES):
             finding = conditions.WHEELS_STAND.found("encoders", speed, limit)
@@ -185,7 +188,7 @@ class WheelMonitor:
     def _find_creep(self, now: MotionSum, moved: MotionSum, commanded: Span, samples: Sequence[WheelSample]) -> None:
         """Motion against a set point of zero. While the link stalls the robot keeps its last command, then stops."""
         runs_down_s = _MEMORY_S + self._cfg.stall_time_s
-        is_running_down = self._late_s is not None and now.t_s - self._late_s < runs_down_s
+        is_running_down = self._late_s is not None and now[0] - self._late_s < runs_down_s
         if is_running_down or commanded[1:] != (0.0, 0.0, 0.0, 0.0):
             self._stood = None
             return
@@ -193,9 +196,9 @@ class WheelMonitor:
             self._stood = now
             self._creeping = Since(), Since()
             return
-        cfg, stood, t_s = self._cfg, self._stood, now.t_s
+        cfg, stood, t_s = self._cfg, self._stood, now[0]
         for k, side in enumerate(_SIDES):
-            speed_m_s, crept_m = abs(moved[1 + k]) / moved.t_s, abs(now[1 + k] - stood[1 + k])
+            speed_m_s, crept_m = abs(moved[1 + k]) / moved[0], abs(now[1 + k] - stood[1 + k])
             creeps = crept_m > cfg.creep_m and speed_m_s > _STILL_M_S
             is_moving = creeps or speed_m_s > cfg.stop_speed_m_s
             broken = _what_is_broken(samples, k) if is_moving else ""
@@ -215,8 +218,8 @@ class WheelMonitor:
 
     def _compare_turns(self, t_s: float, moved: MotionSum) -> None:
         """The turn of the gyroscope, while it was believed, with that of the wheels."""
-        cfg, by_gyroscope = self._cfg, moved.turned_rad
-        by_wheels = (moved.right_m - moved.left_m) / self._base_m
+        cfg, (_, right_m, left_m, by_gyroscope) = self._cfg, moved
+        by_wheels = (right_m - left_m) / self._base_m
         difference = by_gyroscope - by_wheels
         limit = cfg.yaw_limit_rad + cfg.yaw_share * max(abs(by_wheels), abs(by_gyroscope))
         if not -limit <= difference <= limit:

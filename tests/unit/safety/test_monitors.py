@@ -3,7 +3,6 @@
 import pytest
 
 from ccatp.config.load import load_config
-from ccatp.control.wheel_motion import MotionSum
 from ccatp.core import EmergencyKind
 from ccatp.safety.emergency_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, EmergencyLatch
 from ccatp.safety.sensor_monitors import SeamMonitor
@@ -44,7 +43,7 @@ def test_a_wheel_that_rolls_though_it_shall_stand_is_found(
             monitor.learn(t_s)
         rolled_m += ROLLS_M_S * FRAME_S * (t_s > rolls_from_s)
         flags = {"is_free": not is_silent, "is_held": is_held and is_silent, "is_late": t_s <= late_until_s}
-        monitor.step(MotionSum(t_s, rolled_m, 0.0, 0.0), (), **flags, is_sparse=False)
+        monitor.step((t_s, rolled_m, 0.0, 0.0), (), **flags, is_sparse=False)
     assert (monitor.alarm.finding is None) is (expected_s is None)
     assert expected_s is None or expected_s[0] < t_s < expected_s[1]
 
