@@ -431,18 +431,18 @@ class MainLoop(RobotLoop):
     def send_drive(self, ack: int, drive: DriveCommand) -> None:
         """Send the drive that was computed from frame ``ack``."""
         self._drive_seq += 1
-        ack, (right, left, steer) = max(ack, 0), drive
+        ack, right, left = max(ack, 0), drive.right_rad_s, drive.left_rad_s
         self._runner.on_drive(self._drive_seq, right, left)
         self._sent = ack, drive
         if not self.is_lockstep:
             self._frame_age.add_drive(self._drive_seq, time.monotonic())
-        self.link.send_drive(self._drive_seq, ack, right, left, steer)
+        self.link.send_drive(self._drive_seq, ack, right, left, drive.steer_rad)
 
     def answer_again(self) -> None:
         if self._sent is not None:
             self._drive_seq += 1
-            ack, (right, left, steer) = self._sent
-            self.link.send_drive(self._drive_seq, ack, right, left, steer)
+            ack, drive = self._sent
+            self.link.send_drive(self._drive_seq, ack, drive.right_rad_s, drive.left_rad_s, drive.steer_rad)
 
     def _answer(self, seq: int, drive: DriveCommand) -> None:
         # A robot that is driven does not wait.

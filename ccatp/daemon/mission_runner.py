@@ -9,7 +9,9 @@ mission is a subclass of ``MissionRunner`` and a row in ``main_loop.open_runner`
 import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
+
+import msgspec
 
 from ccatp.core import Verdict
 from ccatp.errors import ExitStatus
@@ -30,7 +32,7 @@ EXIT_STATUS = {
 }
 
 
-class TimedFrame(NamedTuple):
+class TimedFrame(msgspec.Struct, frozen=True):
     """A frame as it is served.
 
     Attributes:
@@ -48,7 +50,7 @@ class TimedFrame(NamedTuple):
     is_estimate_due: bool
 
 
-class DriveCommand(NamedTuple):
+class DriveCommand(msgspec.Struct, frozen=True):
     """Set points of the wheels, rad/s, and of the steering, rad, where the robot has one."""
 
     right_rad_s: float

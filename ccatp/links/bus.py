@@ -119,7 +119,7 @@ class Subscriber:
             self.socket.setsockopt(zmq.SUBSCRIBE, BY_NAME[name].name.encode() + (b" {" if is_uncounted else b" "))
         for endpoint in endpoints:
             self.socket.connect(endpoint)
-        self._timeout_ms = -1
+        self._timeout_s = -1.0
         self.bad_messages = 0
 
     def receive(self, timeout_s: float = 0.0) -> tuple[str, bytes, Message | Verdict] | None:
@@ -127,10 +127,9 @@ class Subscriber:
 
         Bad ones are counted and dropped.
         """
-        timeout_ms = round(1000 * timeout_s)
-        if timeout_ms != self._timeout_ms:
-            self.socket.setsockopt(zmq.RCVTIMEO, timeout_ms)
-            self._timeout_ms = timeout_ms
+        if timeout_s != self._timeout_s:
+            self.socket.setsockopt(zmq.RCVTIMEO, round(1000 * timeout_s))
+            self._timeout_s = timeout_s
         while True:
             try:
                 return unpack(self.socket.recv())
