@@ -110,7 +110,7 @@ class DataLoop(TcpRobotServer):
         super().__init__(robot, lockstep=lockstep, key=key, log=log)
         self._faults = faults
         self._is_fall_logged = False
-        self.each_frame += [self._log_faults, self._log_fall]
+        self.each_frame += [self._log_faults, self._log_fall] if faults else [self._log_fall]
 
     async def close(self) -> None:
         if self._listener is not None:
