@@ -206,6 +206,13 @@ WHEEL_DOES_NOT_STOP = hold(Group.WHEELS, "the {side} wheel turns though it shall
 GRIP_LOST = hold(Group.WHEELS, "the robot loses its grip: it slides downhill over its wheels",
     "Accelerometer and gyroscope show a slide along gravity, its wheels do not. Wheels held, fans to their maximum.",
     "Tyres or mirror oily? Too little thrust for the slope: see `ccatp plan`.", full_fans=True)
+GRIP_TOO_LITTLE = fault(Group.WHEELS, "too little grip by the creep of turns: the fans do not hold it everywhere",
+    "The friction that turns show, at the start and at each fix after a turn, is less than full thrust can do with.",
+    "Tyres or mirror oily? Clean them, or raise the thrust; `ccatp status` shows the friction. Wrong `robot.tyre_m`?",
+    full_fans=True)
+GRIP_LITTLE = slow(Group.WHEELS, "little grip by the creep of turns: less than `robot.thrust_margin`",
+    "The same, and full thrust still holds the robot. More thrust, half the speed.",
+    "As above; it is over when turns creep less.")
 YAW_DISAGREES = hold(Group.SENSORS,
     "gyroscope and wheels disagree about the turn: a wheel slips, or the gyroscope is off",
     "They disagree by more than slip and errors of scale explain. A fix comes first.",

@@ -95,6 +95,7 @@ class RobotConfig(LinkConfig):
     friction: Annotated[float, Field(gt=0.0, le=2.0)]
     thrust_n: Positive
     thrust_margin: Annotated[float, Field(ge=1.0, le=5.0)]
+    tyre_m: Annotated[float, Field(ge=0.0, le=0.05)]
 
 
 class LimitsConfig(Model):

@@ -10,16 +10,24 @@ hold while
 Downhill behind is the worst heading: the load goes to the caster. Downhill ahead it must not leave the ground.
 """
 
-from math import ceil, hypot, sqrt
+from math import ceil, cos, hypot, pi, sqrt
 from typing import NamedTuple
 
+from scipy.optimize import brentq
+
 from ccatp.config.models import RobotConfig
-from ccatp.core import GRAVITY_M_S2, DeckPose, Vector3
+from ccatp.core import GRAVITY_M_S2, DeckPose, Vector3, difference
 from ccatp.mirror.mirror import Mirror
 
 _RAMP_PER_S = 1.0  # of the duty
 _STEP = 0.02  # of the duty: smaller changes are not worth a command
 _STOP_WAY_M = 0.03  # an overrun at the rim that leaves two edge sensors on the mirror
+_HEADINGS_RAD = tuple(k * pi / 4.0 for k in range(8))
+_LEAST_TURN_RAD = 1.0  # between two fixes: a shorter turn shows no creep
+_LEAST_USE = 0.1  # of tangential load by load of the wheels: a tyre that carries less shows no creep either
+_MOST_FRICTION = 2.0
+_TURNS = 4  # that the mean creep is taken over
+_TOLERANCE = 2.0  # of the creep: by slope and heading it varies by so much with the friction that is promised
 
 
 def least_thrust_n(robot: RobotConfig, gravity: Vector3, *, turns: bool) -> float:
@@ -89,27 +97,72 @@ def forecast_grip(robot: RobotConfig, mirror: Mirror) -> GripForecast:
 def safe_speed_m_s(robot: RobotConfig, gravity: Vector3, thrust_n: float) -> float:
     """Speed from which the grip that the slope leaves stops the robot within an overrun of 30 mm; 0: it cannot stop."""
     tangential, outward, to_rear = _load_n(robot, gravity, turns=True)
-    x_m, height_m = robot.centre_of_mass_m
-    wheels_n = (thrust_n - outward) * (1.0 + x_m / robot.caster_m) - to_rear * height_m / robot.caster_m
-    spare_n = robot.friction * wheels_n - tangential
+    spare_n = robot.friction * _wheels_n(robot, thrust_n - outward, to_rear) - tangential
     return sqrt(2.0 * max(spare_n, 0.0) / robot.mass_kg * _STOP_WAY_M)
+
+
+def _wheels_n(robot: RobotConfig, pressed_n: float, to_rear_n: float) -> float:
+    """Load of both wheels, N."""
+    x_m, height_m = robot.centre_of_mass_m
+    return pressed_n * (1.0 + x_m / robot.caster_m) - to_rear_n * height_m / robot.caster_m
+
+
+def friction_by_creep(robot: RobotConfig, gravity: Vector3, thrust_n: float, creep_m_rad: float) -> float | None:
+    """Friction of tyres that creep so far downhill for each radian turned on the spot; None on too little slope.
+
+    The forces that a pivoting contact can take lie in an ellipsoid, and it slides along the normal of that (Howe and
+    Cutkosky 1996): with the share u of its friction in use it creeps by tyre_m u / sqrt(1 - u^2) for each radian. Mean
+    over all headings.
+    """
+    tangential, outward, _ = _load_n(robot, gravity, turns=True)
+    loads_n = [_wheels_n(robot, thrust_n - outward, tangential * cos(to_rear)) for to_rear in _HEADINGS_RAD]
+    if min(loads_n) <= 0.0:
+        return None
+    used = [tangential / load_n for load_n in loads_n]
+
+    def excess_m_rad(friction: float) -> float:
+        creeps = (robot.tyre_m * use / sqrt(friction * friction - use * use) for use in used)
+        return sum(creeps) / len(used) - creep_m_rad
+
+    least = 1.001 * max(used)  # it holds
+    if not _LEAST_USE < least < _MOST_FRICTION or robot.tyre_m == 0.0:
+        return None
+    if excess_m_rad(_MOST_FRICTION) > 0.0:
+        return _MOST_FRICTION
+    return float(brentq(excess_m_rad, least, _MOST_FRICTION)) if excess_m_rad(least) > 0.0 else least
 
 
 class ThrustControl:
     """The duty of both fans, never below the configured one: by the slope and the manoeuvre, with a ramp.
 
     ``duty``: (left, right) as last commanded. While the robot stands it has the thrust for a turn already.
+    ``friction``: of the tyres by the creep of turns, 0 before the first. ``margin``: full thrust over the least that
+    holds the robot on all of the mirror, 0 likewise: with the configured friction, as long as twice the creep that it
+    explains is not exceeded, and with less beyond that.
     """
 
     def __init__(self, robot: RobotConfig, mirror: Mirror) -> None:
-        self._robot, self._mirror = robot, mirror
+        self._robot, self._promised, self._mirror = robot, robot.friction, mirror
         self.duty = robot.fan_duty
+        self.friction = self.margin = 0.0
         self._t_s: float | None = None
+        self._is_full = False
+        self._fixes = self._turns = 0
+        self._heading_rad, self._turned_rad, self._creep_m_rad = mirror.base_pose.heading_rad, 0.0, 0.0
+
+    def give_all(self) -> bool:
+        """Full duty from now on; whether that is new."""
+        is_new, self._is_full, self.duty = not self._is_full, True, (1.0, 1.0)
+        return is_new
 
     def step(self, t_s: float, pose: DeckPose, *, turns: bool) -> bool:
         """Set the duty for now; ``turns``: the robot turns, or may at any time. Whether it has changed."""
         elapsed_s = 0.0 if self._t_s is None else t_s - self._t_s
         robot, self._t_s = self._robot, t_s
+        self._turned_rad += abs(difference(pose.heading_rad, self._heading_rad))
+        self._heading_rad = pose.heading_rad
+        if self._is_full:
+            return False
         least_n = least_thrust_n(robot, self._mirror.gravity_in_robot(pose), turns=turns)
         wanted = _STEP * ceil(robot.thrust_margin * least_n / robot.thrust_n / _STEP)
         ramp = _RAMP_PER_S * min(max(elapsed_s, 0.0), 0.1)
@@ -120,3 +173,26 @@ class ThrustControl:
         ]
         self.duty = left, right
         return self.duty != before
+
+    def measure_grip(self, fixes: int, pose: DeckPose, creep_m_rad: float) -> bool:
+        """After each fix, the number of which is ``fixes``: what the turn before it shows; whether it was a new one.
+
+        ``creep_m_rad``: downhill, as estimated for each radian of a turn.
+        """
+        if fixes == self._fixes:
+            return False
+        turned_rad, self._fixes, self._turned_rad = self._turned_rad, fixes, 0.0
+        if turned_rad < _LEAST_TURN_RAD:
+            return False
+        self._turns = min(self._turns + 1, _TURNS)
+        self._creep_m_rad += (creep_m_rad - self._creep_m_rad) / self._turns
+        thrust_n, gravity = 0.5 * sum(self.duty) * self._robot.thrust_n, self._mirror.gravity_in_robot(pose)
+        found = friction_by_creep(self._robot, gravity, thrust_n, self._creep_m_rad)
+        at_most = friction_by_creep(self._robot, gravity, thrust_n, self._creep_m_rad / _TOLERANCE)
+        if found is None or at_most is None:
+            return False
+        self.friction, friction = found, min(at_most, self._promised)
+        if friction != self._robot.friction or not self.margin:
+            self._robot = self._robot.model_copy(update={"friction": friction})
+            self.margin = self._robot.thrust_n / forecast_grip(self._robot, self._mirror).least_n
+        return True

@@ -225,6 +225,7 @@ class _SurveySession:
                 self.has_status = True
                 builder.set_plan(message.total, message.lower_bound_s)
             builder.set_mission(message.done, message.skipped, message.elapsed_s, message.left_out)
+            builder.add_grip(message.friction, message.grip)
 
     def _on_deck(self, track: TrackMessage) -> FloatArray:
         """Rows of seq, t_s, x, y, heading (deck), X, Y, Z of the surface point, as the truth has them."""

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from ccatp.conditions import UNATTENDED_FAULT
 from ccatp.config.models import Config
 from ccatp.control.gate import Denial, DriveGate, FanGate
-from ccatp.control.thrust import ThrustControl
 from ccatp.control.wheel_motion import SentDrives, as_standing
 from ccatp.core import Verdict
 from ccatp.daemon.checkpoints import build_parts
@@ -96,7 +95,6 @@ def state_text(state: MissionState, cause: str) -> str:
 
 
 GIVEN_UP = "the calibration drive is left out, as the robot was held elsewhere: slip and heading are learned on the way"
-FULL_FANS = (1.0, 1.0)
 DENIAL_REPEAT_S = 1.0
 
 
@@ -139,8 +137,8 @@ class SurveyRunner(MissionRunner):
         self._mirror, self._localizer, self._gate = parts.mirror, parts.localizer, parts.gate
         self._clock.before_s = parts.mission.state.budget.before_s
         self._gate_log = GateLog(self._gate, self.telemetry.notify_operator)
-        self._fan_gate, self._has_full_fans, self._fans_seq = FanGate(0.0), False, 0
-        self._thrust = ThrustControl(cfg.robot, parts.mirror)
+        self._fan_gate, self._fans_seq = FanGate(0.0), 0
+        self._thrust = parts.thrust
         self._sent_commands: tuple[tuple[float, float, float, float] | None, int] = None, -1
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
         self._fix_service = FixService(
@@ -201,6 +199,8 @@ class SurveyRunner(MissionRunner):
             outcome=str(state.outcome),
             lower_bound_s=self._parts.lower_bound_s,
             left_out=by_reason(survey.left_out(state)),
+            friction=round(self._thrust.friction, 3),
+            grip=round(self._thrust.margin, 3),
         )
 
     def display_state(self) -> DisplayState:
@@ -250,7 +250,7 @@ class SurveyRunner(MissionRunner):
 
     def begin_drives(self) -> None:
         """Send the fans' duties, before the first drive and whenever they change."""
-        duty = FULL_FANS if self._has_full_fans else self._thrust.duty
+        duty = self._thrust.duty
         refusal = self._fan_gate.refusal(*duty)
         if refusal is None:
             self._fans_seq += 1
@@ -330,9 +330,18 @@ class SurveyRunner(MissionRunner):
         if frame.is_estimate_due:
             self._sent_commands = self._sent.take_span(), self._sent.newest
             turns = state.mode is not MissionState.DRIVING
-            if not self._has_full_fans and self._thrust.step(motion.t_s, self._localizer.deck_pose, turns=turns):
+            self._measure_grip()
+            if self._thrust.step(motion.t_s, self._localizer.deck_pose, turns=turns):
                 self.begin_drives()
         return DriveCommand(right, left)
+
+    def _measure_grip(self) -> None:
+        """The first turns, those of the calibration drive, are the test of grip; it is reported once."""
+        thrust = self._thrust
+        is_test = not thrust.friction
+        if self._parts.measure_grip() and is_test:
+            text = f"grip: friction {thrust.friction:.2f}, {thrust.margin:.2f} times the thrust that turns need"
+            self.telemetry.notify_operator("info", text)
 
     def hold(self, frame: TimedFrame) -> DriveCommand:
         if frame.is_estimate_due:
@@ -368,8 +377,7 @@ class SurveyRunner(MissionRunner):
         if state.wants_calibration and not self._has_reported_calibration:
             self._has_reported_calibration = True
             self.telemetry.notify_operator("warning", GIVEN_UP)
-        if state.full_fans and not self._has_full_fans:  # pressed on first, held then
-            self._has_full_fans = True
+        if state.full_fans and self._thrust.give_all():  # pressed on first, held then
             self.begin_drives()
         if state.is_faulted:
             self._check_unattended_fault(sensors)
@@ -414,7 +422,9 @@ class SurveyRunner(MissionRunner):
         if frame.is_estimate_due:
             deck, state, commanded = localizer.deck_pose, self.mission.state.mode.value, self._sent_commands
             place = deck.x_m, deck.y_m, deck.heading_rad
-            telemetry.send("estimate", EstimateMessage(*place, sigma_m, state, *commanded, seq=seq, t_s=t_s))
+            telemetry.send(
+                "estimate", EstimateMessage(*place, sigma_m, state, *commanded, self._thrust.margin, seq=seq, t_s=t_s)
+            )
         row = seq + telemetry.frames_before, t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, sigma_m
         telemetry.add_frame(seq, t_s, frame.raw, row)
         if self._checkpoint.is_due(seq):

@@ -233,6 +233,7 @@ def status_rows(answered: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("points", f"{status.done} of {status.total} measured{skips}  [{'#' * filled}{'.' * (BAR - filled)}]"),
         ("time", f"{clock(status.elapsed_s)} elapsed, {clock(status.eta_s)} to go, {bound}"),
         ("arrival", arrival),
+        ("grip", f"friction {status.friction:.2f}, {status.grip:.2f} times the least thrust" if status.grip else ""),
         ("danger", f"{status.code} {CODES.get(status.code, '')}".strip()),
         ("late frames", late if status.missed_deadlines else ""),
         *((f"left out: {why}", _named(points)) for why, points in status.left_out.items()),

@@ -35,7 +35,8 @@ class EstimateMessage(Message):
     """The localizer's pose after frame ``seq``, deck frame, and what main had the wheels do.
 
     ``commanded``: lowest and highest set point of the right wheel, then of the left one, rad/s, over the drives sent
-    since the last estimate. ``drive_seq``: number of the newest of them.
+    since the last estimate. ``drive_seq``: number of the newest of them. ``grip``: full thrust over the least that
+    holds the robot on all of the mirror, by the creep of turns; 0 where that is not measured.
     """
 
     x_m: float
@@ -45,6 +46,7 @@ class EstimateMessage(Message):
     state: str
     commanded: tuple[float, float, float, float] | None = None
     drive_seq: int = -1
+    grip: float = 0.0
 
     def following(self, missed: "EstimateMessage") -> "EstimateMessage":
         """This estimate for one who has not looked at the one before: ``commanded`` spans the drives of both."""
@@ -94,6 +96,8 @@ class MissionStatus(Message):
     missed_deadlines: int = 0  # frames that were served late, in real time
     worst_lateness_ms: float = 0.0
     left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
+    friction: float = 0.0  # of the tyres, by the creep of turns; 0: not measured
+    grip: float = 0.0  # full thrust over the least that holds the robot on all of the mirror with it
     alarms: list[Alarm] = []  # the gravest first, those that ended last
 
 

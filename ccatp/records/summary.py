@@ -136,6 +136,7 @@ class SummaryBuilder:
         self._true_edges = self._false_edges = self._falls = 0
         self._is_fallen = False
         self._overrun_m = 0.0
+        self._friction = self._grip = self._least_grip = nan
         self._fits: PanelFits = {}
         self._injected: PanelFits | None = None
 
@@ -210,6 +211,12 @@ class SummaryBuilder:
         self.set_counts(measured, skipped)
         self._mission_time_s, self._left_out = mission_time_s, left_out
 
+    def add_grip(self, friction: float, margin: float) -> None:
+        """Friction and margin of thrust as measured last; 0: not measured."""
+        if margin:
+            self._friction, self._grip = friction, margin
+            self._least_grip = np.fmin(self._least_grip, margin)
+
     def set_panels(self, fits: PanelFits, injected: PanelFits | None) -> None:
         """Misalignment of panels as fitted, and as simulated (None on a real robot)."""
         self._fits, self._injected = fits, injected
@@ -231,6 +238,7 @@ class SummaryBuilder:
         self._false_edges += earlier._false_edges
         self._falls += earlier._falls
         self._overrun_m = max(self._overrun_m, earlier._overrun_m)
+        self._least_grip = np.fmin(self._least_grip, earlier._least_grip)
 
     def build(self, wall_s: float | None = None) -> dict[str, Any]:
         """The summary, keys in the order of the command line contract; ``wall_s`` is the wall time of the run."""
@@ -266,6 +274,11 @@ class SummaryBuilder:
                 "false_edges": self._false_edges if is_sim else None,
                 "falls": self._falls if is_sim else None,
                 "max_overrun_mm": rounded(self._overrun_m * 1e3, 3) if is_sim else None,
+            },
+            "grip": {
+                "friction": rounded(self._friction, 3),
+                "margin": rounded(self._grip, 3),
+                "least_margin": rounded(self._least_grip, 3),
             },
             "panels": self._panels(),
             "wall": wall_figures(self._mission_time_s, wall_s, self._ticks_us.sample),

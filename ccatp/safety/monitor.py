@@ -191,6 +191,7 @@ class HealthMonitor:
         self._estimate_seq = estimate.seq
         self.take_commands(t_s, estimate)
         self._wheels.learn(t_s)
+        self._grip.take_margin(estimate.grip)
         if estimate.drive_seq >= 0:
             self._latency.sent(estimate.drive_seq, t_s)
         for i, count in enumerate(opened):
@@ -207,7 +208,7 @@ class HealthMonitor:
         for latch in self._latches:
             if latch.finding is not None and (finding := latch.settle(t_s)) is not None:
                 found.append(finding)
-        for other in (self._rates.finding, self._battery.finding, self._seams.finding):
+        for other in (self._grip.finding, self._rates.finding, self._battery.finding, self._seams.finding):
             if other is not None:
                 found.append(other)
         gate = self._gate

@@ -232,22 +232,32 @@ _BIAS_SAMPLES = 100  # of the accelerometer at rest, whose mean is its bias
 _LEAST_SLOPE = 0.15  # of gravity along the robot: where it drives on a level or across a slope it does not slide ahead
 _LARGEST_M_S2 = 10.0  # gravity gives no more
 _ENCODER_JUMP_M_S = 0.03  # of a wheel's speed in a frame: no wheel that carries the robot does that
+_HOLDS = 1.05  # full thrust over the least: with less it may slide anywhere
 _LEAST_SHARE = 0.3  # of the limit: a turn alone is no slide
 
 
 class GripMonitor:
-    """Loss of grip: the body goes downhill faster than its wheels.
+    """Loss of grip: the body goes downhill faster than its wheels. And too little of it, by the creep of turns.
 
     Its acceleration, less the bias at rest, against the change of the wheels' speed, and the gyroscope's rate against
-    their turn, both summed with a memory of 60 ms.
+    their turn, both summed with a memory of 60 ms. ``finding``: of the margin that main measures, or None.
     """
 
     def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
         self._slip_m_s, self._turn_rad, self._radius_m = cfg.grip_slip_m_s, cfg.grip_turn_rad, robot.wheel_radius_m
         self._per_base = robot.wheel_radius_m / robot.wheel_base_m
         self.alarm = FindingLatch(cfg.retry_after_s)
+        self._least_margin = robot.thrust_margin
+        self.finding: conditions.MonitorFinding | None = None
         self._ahead = self._bias_m_s2 = self._slid_m_s = self._turned_rad = self._speed_m_s = 0.0
         self._rested = 0
+
+    def take_margin(self, margin: float) -> None:
+        """Full thrust over the least that holds the robot everywhere; 0: not measured."""
+        is_short, is_held = 0.0 < margin < 0.999 * self._least_margin, margin >= _HOLDS
+        condition = conditions.GRIP_LITTLE if is_held else conditions.GRIP_TOO_LITTLE
+        least = self._least_margin if is_held else _HOLDS
+        self.finding = condition.found("grip", margin, least) if is_short else None
 
     def step(
         self,

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.control.thrust import ThrustControl
 from ccatp.control.wheel_motion import SentDrives, as_standing
 from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelPose, PointId, SteadyTime, Verdict, difference
 from ccatp.danger import DangerMonitor
@@ -204,7 +203,7 @@ class SilRun:
         self._code = EventCode.NORMAL
         self._drive_seq = 0
         self._time = SteadyTime(cfg.health.clock_jump_s)
-        self._has_full_fans, self._thrust, self._fans_seq = False, ThrustControl(cfg.robot, self.mirror), 0
+        self._thrust, self._fans_seq = parts.thrust, 0
 
     @property
     def injected(self) -> tuple[Injected, ...]:
@@ -286,9 +285,8 @@ class SilRun:
         order = mission.step(motion, before)  # the decision in a frame goes by the verdict on the one before
         if order.inflates_covariance:
             localizer.inflate_covariance(self.cfg.health.doubt_position_m, self.cfg.health.doubt_heading_rad)
-        if mission.state.full_fans and not self._has_full_fans:
-            self._has_full_fans = True
-            self._command_fans((1.0, 1.0))
+        if mission.state.full_fans and self._thrust.give_all():
+            self._command_fans(self._thrust.duty)
         right, left = self.gate.pass_through(order.twist, before, dt_s, t_s, 0.0, mission.state.purpose)
         if order.at_rest:
             localizer.rest()
@@ -297,9 +295,10 @@ class SilRun:
         state = mission.state.mode
         self.states_s[state] += dt_s
         turns = state is not MissionState.DRIVING
-        is_due = is_estimate_due(seq) and not self._has_full_fans
-        if is_due and self._thrust.step(motion.t_s, localizer.deck_pose, turns=turns):
-            self._command_fans(self._thrust.duty)
+        if is_estimate_due(seq):
+            self.parts.measure_grip()
+            if self._thrust.step(motion.t_s, localizer.deck_pose, turns=turns):
+                self._command_fans(self._thrust.duty)
         self._publish(seq, t_s, motion.pose, state)
         if order.measure:
             self._measure(frame)
@@ -334,7 +333,7 @@ class SilRun:
             self._published = EstimateMessage(
                 seq=seq, t_s=t_s, x_m=deck.x_m, y_m=deck.y_m, heading_rad=deck.heading_rad,
                 sigma_m=self.localizer.position_sigma_m, state=state, commanded=self.sent.take_span(),
-                drive_seq=self._drive_seq,
+                drive_seq=self._drive_seq, grip=self._thrust.margin,
             )  # fmt: skip
 
     # -- a measurement, as in daemon.fix_service ----------------------------------------------------------------------
@@ -373,6 +372,7 @@ class SilRun:
         injected = {panel: (m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in misalignments.items()}
         track, builder = self.trace.join(), self.trace.builder
         builder.set_mission(len(state.done), len(state.skipped), mission_time_s)
+        builder.add_grip(self._thrust.friction, self._thrust.margin)
         builder.set_panels(self.laser.panel_fits(), injected)
         return SilResult(
             summary=builder.build(),

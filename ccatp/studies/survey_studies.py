@@ -384,6 +384,9 @@ ABLATION = Study(
 # -- physics ----------------------------------------------------------------------------------------------------------
 
 
+TYRES_M = {"round": 0.002, "flat": 0.0075}  # levers at which they rub: the creep of turns at a known friction
+
+
 def physics_cells() -> Sequence[Cell]:
     """Mirror, tyre, friction, and the thrust at full duty over the least that holds the robot anywhere on the mirror.
 
@@ -391,11 +394,11 @@ def physics_cells() -> Sequence[Cell]:
     """
     found = []
     for name, tyre, friction, margin in product(
-        ("fyst-m1", "fyst-m2"), ("round", "flat"), (0.5, 0.6, 0.8, 1.0), (1.1, 1.3, 2.0, 3.0)
+        ("fyst-m1", "fyst-m2"), TYRES_M, (0.5, 0.6, 0.8, 1.0), (1.1, 1.3, 2.0, 3.0)
     ):
         cfg = load_config(None, {"run.mirror": name, "robot.friction": friction})
         thrust_n = margin * forecast_grip(cfg.robot, build_mirror(cfg.mirror)).least_n
-        keys: dict[str, object] = {"run.mirror": name, "sim.physics.tyre": tyre}
+        keys: dict[str, object] = {"run.mirror": name, "sim.physics.tyre": tyre, "robot.tyre_m": TYRES_M[tyre]}
         for place in ("robot", "sim.physics"):
             keys |= {f"{place}.friction": friction, f"{place}.thrust_n": round(thrust_n, 2)}
         found.append(Cell({"mirror": name, "tyre": tyre, "friction": friction, "margin": margin}, keys))

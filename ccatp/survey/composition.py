@@ -11,9 +11,11 @@ from msgspec.structs import replace
 
 from ccatp.config.models import Config, LimitsConfig
 from ccatp.control.gate import DriveGate
-from ccatp.control.thrust import GripForecast, forecast_grip
+from ccatp.control.thrust import GripForecast, ThrustControl, forecast_grip
 from ccatp.core import DeckPose, PointId, Stop, StopKind
 from ccatp.errors import ConfigError
+from ccatp.estimation.full_state import FullStateLocalizer
+from ccatp.estimation.state_model import CT
 from ccatp.links.robot_messages import Hello
 from ccatp.localizer import FOUR_STATE, Localizer, build_localizer, build_with_uncertainty
 from ccatp.mirror.mirror import Mirror, build_mirror
@@ -108,6 +110,7 @@ class SurveyParts:
     localizer: Localizer
     mission: Mission
     gate: DriveGate
+    thrust: ThrustControl
     route: Route
     points: tuple[PointId, ...]
     lower_bound_s: float
@@ -116,6 +119,13 @@ class SurveyParts:
     def heading_sigma_rad(self) -> float:
         """How well the heading is known. No drive shows the four states theirs: the fix does not reach it."""
         return 0.0 if self.cfg.run.filter in FOUR_STATE else self.localizer.heading_sigma_rad
+
+    def measure_grip(self) -> bool:
+        """After a fix, by the creep of the turn before it; whether that showed it. The four states have no creep."""
+        localizer = self.localizer
+        if not isinstance(localizer, FullStateLocalizer):
+            return False
+        return self.thrust.measure_grip(localizer.counts["fixes"], localizer.deck_pose, float(localizer.state[0][CT]))
 
     @property
     def total_points(self) -> int:
@@ -152,6 +162,7 @@ def assemble(cfg: Config, done: Collection[PointId] = (), checkpoint: Checkpoint
         localizer=localizer,
         mission=mission,
         gate=DriveGate(cfg.limits, cfg.robot, cfg.mission.verdict_timeout_s),
+        thrust=ThrustControl(cfg.robot, mirror),
         route=route,
         points=tuple(points),
         lower_bound_s=path_time(route.stops, mirror.base_pose, cfg.limits, mirror, cfg.etalon.measuring_time_s),

@@ -187,7 +187,7 @@ def test_a_whole_summary_has_the_keys_of_the_contract_in_their_order(builder: Su
     built = builder.build(60.0)
     assert list(built) == [
         *("mirror", "world", "filter", "seed", "reference", "points", "arrival_error_mm", "localization_error_mm"),
-        *("heading_error_mrad", "mission_time_s", "lower_bound_s", "within_budget", "danger", "panels", "wall"),
+        *("heading_error_mrad", "mission_time_s", "lower_bound_s", "within_budget", "danger", "grip", "panels", "wall"),
     ]
     assert list(built["points"]) == ["total", "measured", "first_arrival_within_10mm", "skipped"]
     assert list(built["arrival_error_mm"]) == ["mean", "p50", "p99", "max"]
@@ -241,7 +241,7 @@ def test_a_diverged_estimate_gives_a_file_that_json_can_hold(builder: SummaryBui
 
 def test_the_table_has_every_figure_and_counts_points_left_out_by_reason(builder: SummaryBuilder) -> None:
     text = format_table(builder.build())
-    assert len(text.splitlines()) == 8
+    assert len(text.splitlines()) == 9
     for part in ("points                 total 693  measured 0", "mean -", "within_budget yes"):
         assert part in text
     builder.set_mission(1, 2, 3.0, {"operator": ["1-2-3", "1-2-4"], "no fix": ["1-2-5"]})

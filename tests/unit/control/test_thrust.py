@@ -7,7 +7,7 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.config.models import RobotConfig
-from ccatp.control.thrust import ThrustControl, forecast_grip, least_thrust_n, safe_speed_m_s
+from ccatp.control.thrust import ThrustControl, forecast_grip, friction_by_creep, least_thrust_n, safe_speed_m_s
 from ccatp.core import DeckPose, Vector3
 from ccatp.errors import ConfigError
 from ccatp.mirror.mirror import build_mirror
@@ -90,3 +90,44 @@ def test_where_grip_is_short_a_run_is_slow_and_where_there_is_none_it_is_refused
     assert slow.cfg.limits.omega_max_rad_s == slow.cfg.health.slow_rate_rad_s
     with pytest.raises(ConfigError, match=r"^robot.thrust_n: the fans give 20.0 N; .* WOULD SLIDE"):
         assemble(load_config(overrides={"run.mirror": "fyst-m2", "run.panels": 1, "robot.thrust_n": 20.0}))
+
+
+@pytest.mark.parametrize("friction", [0.45, 0.6, 0.8])
+def test_creep_of_turns_shows_the_friction(friction: float) -> None:
+    """Mean over a whole turn of the creep of a tyre with that friction, downhill all round; 36 N on 18 degrees."""
+    cfg, found = robot(), []
+    for to_rear in (k * pi / 180.0 for k in range(360)):
+        along = WEIGHT_N * cos(OVERHANG_RAD)
+        load_n = (36.0 - WEIGHT_N * sin(OVERHANG_RAD)) * 0.8 - along * cos(to_rear) * 0.035 / 0.075
+        use = along / load_n / friction
+        found.append(0.002 * use / (1.0 - use * use) ** 0.5)
+    creep_m_rad = sum(found) / len(found)
+    assert friction_by_creep(cfg, gravity(0.0), 36.0, creep_m_rad) == pytest.approx(friction, rel=0.03)
+    # No creep is no bound, and no slope or no known tyre says nothing.
+    assert friction_by_creep(cfg, gravity(0.0), 36.0, 0.0) == pytest.approx(2.0)
+    assert friction_by_creep(cfg, gravity(0.0, radians(89.0)), 36.0, creep_m_rad) is None
+    assert friction_by_creep(robot(tyre_m=0.0), gravity(0.0), 36.0, creep_m_rad) is None
+
+
+@pytest.mark.parametrize(
+    ("creep_m_rad", "margin", "duty"), [(0.0014, 1.44, 0.9), (0.004, 1.21, 1.0), (0.03, 1.03, 1.0)]
+)
+def test_little_grip_in_the_first_turns_raises_the_thrust(creep_m_rad: float, margin: float, duty: float) -> None:
+    cfg, mirror = robot(), build_mirror(load_config(overrides={"run.mirror": "fyst-m2"}).mirror)
+    control = ThrustControl(cfg, mirror)
+    base = mirror.base_pose
+
+    def turn(fixes: int, turn_rad: float) -> bool:
+        for k in range(40):
+            control.step(0.05 * k, DeckPose(base.x_m, base.y_m, base.heading_rad + turn_rad * k / 39.0), turns=True)
+        return control.measure_grip(fixes, base, creep_m_rad)
+
+    assert not control.measure_grip(1, base, 0.0)  # where it starts
+    assert not turn(2, 0.5)  # too short a turn
+    assert control.margin == 0.0
+    assert turn(3, pi)
+    assert not turn(3, pi)  # no fix since
+    assert turn(4, pi)  # with more thrust, where there is little grip
+    assert control.margin == pytest.approx(margin, abs=0.05)
+    turn(4, pi)
+    assert control.duty == (duty, duty)

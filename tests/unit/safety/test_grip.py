@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ccatp.conditions import GRIP_LOST, Clear, Motion
+from ccatp.conditions import GRIP_LITTLE, GRIP_LOST, GRIP_TOO_LITTLE, Clear, Condition, Motion
 from ccatp.config.load import load_config
 from ccatp.control.wheel_motion import WheelMeans
 from ccatp.core import GravitySample, ImuSample, WheelSample
@@ -62,3 +62,14 @@ def test_what_is_no_slide(slide_m_s2: float, ahead: float, braking_m_s2: float) 
 
 def test_its_row_holds_the_wheels_with_full_fans_until_a_fix() -> None:
     assert (GRIP_LOST.motion, GRIP_LOST.clear, GRIP_LOST.full_fans) == (Motion.NONE, Clear.AFTER_FIX, True)
+
+
+@pytest.mark.parametrize(
+    ("margin", "row"), [(0.0, None), (1.3, None), (1.2, GRIP_LITTLE), (1.04, GRIP_TOO_LITTLE), (0.5, GRIP_TOO_LITTLE)]
+)
+def test_what_the_measured_margin_leads_to(margin: float, row: Condition | None) -> None:
+    monitor = GripMonitor(CFG.health, CFG.robot)
+    monitor.take_margin(margin)
+    assert (monitor.finding and monitor.finding.condition) is row
+    monitor.take_margin(1.4)
+    assert monitor.finding is None
