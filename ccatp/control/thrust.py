@@ -27,7 +27,7 @@ _LEAST_TURN_RAD = 1.0  # between two fixes: a shorter turn shows no creep
 _LEAST_USE = 0.1  # of tangential load by load of the wheels: a tyre that carries less shows no creep either
 _MOST_FRICTION = 2.0
 _TURNS = 4  # that the mean creep is taken over
-_TOLERANCE = 2.0  # of the creep: by slope and heading it varies by so much with the friction that is promised
+_TOLERANCE = 1.8  # of the creep: by slope and heading it varies by so much with the friction that is promised
 
 
 def least_thrust_n(robot: RobotConfig, gravity: Vector3, *, turns: bool) -> float:
@@ -137,8 +137,8 @@ class ThrustControl:
 
     ``duty``: (left, right) as last commanded. While the robot stands it has the thrust for a turn already.
     ``friction``: of the tyres by the creep of turns, 0 before the first. ``margin``: full thrust over the least that
-    holds the robot on all of the mirror, 0 likewise: with the configured friction, as long as twice the creep that it
-    explains is not exceeded, and with less beyond that.
+    holds the robot on all of the mirror, 0 likewise: with the configured friction, as long as 1.8 times the creep that
+    it explains is not exceeded, and with less beyond that.
     """
 
     def __init__(self, robot: RobotConfig, mirror: Mirror) -> None:
