@@ -26,7 +26,7 @@ STUDIES = {
     "time": ("survey_studies:TIME", "order, speed and measuring time against the hour"),
     "sensitivity": ("survey_studies:SENSITIVITY", "what each disturbance of a hard world costs"),
     "ablation": ("survey_studies:ABLATION", "what each technique gives, one off at a time"),
-    "physics": ("survey_studies:PHYSICS", "a rigid body on both mirrors: tyre, friction, thrust"),
+    "physics": ("physics_study:PHYSICS", "a rigid body on both mirrors: tyre, friction, thrust"),
     "danger": ("danger_study:STUDY", "false edges and overrun of two edge rules"),
     "faults": ("faults_study:STUDY", "whole missions with random faults: falls, completion"),
     "cricket": ("cricket_study:STUDY", "self-mapping of motes: the published figures, better ways"),

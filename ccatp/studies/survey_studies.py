@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from ccatp.config.load import load_config
-from ccatp.control.thrust import forecast_grip
 from ccatp.core import FloatArray
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.plots import INK, QUIET
@@ -289,7 +288,7 @@ MISSION = (
     ),
     Measure("time / bound of the path", ("time_ratio", "time_ratio"), "time_ratio", is_log=False),
 )
-_SHOWN = "mean (dot), 99th percentile (end of the bar)"
+SHOWN = "mean (dot), 99th percentile (end of the bar)"
 
 
 def _drawing(name: str, factor: str, groups: Sequence[str], title: str) -> Callable[[Sequence[CellResult], Path], None]:
@@ -298,7 +297,7 @@ def _drawing(name: str, factor: str, groups: Sequence[str], title: str) -> Calla
     def draw(cells: Sequence[CellResult], out: Path) -> None:
         for found, there in grouped(cells, *groups).items():
             rows = [_row(cell, factor) for cell in there]
-            draw_ranges(rows, MISSION, f"{title.format(*found)}: {_SHOWN}", out / "-".join((name, *found)))
+            draw_ranges(rows, MISSION, f"{title.format(*found)}: {SHOWN}", out / "-".join((name, *found)))
 
     return draw
 
@@ -379,53 +378,4 @@ ABLATION = Study(
     draw=_drawing("ablation", "without", ("mirror", "world"), "Without a technique, world {1} on {0}"),
     defaults={"run.filter": "ekf"},
     runs=3,
-)
-
-# -- physics ----------------------------------------------------------------------------------------------------------
-
-
-TYRES_M = {"round": 0.002, "flat": 0.0075}  # levers at which they rub: the creep of turns at a known friction
-
-
-def physics_cells() -> Sequence[Cell]:
-    """Mirror, tyre, friction, and the thrust at full duty over the least that holds the robot anywhere on the mirror.
-
-    The robot's configuration has the same friction and thrust: what its builder knows.
-    """
-    found = []
-    for name, tyre, friction, margin in product(
-        ("fyst-m1", "fyst-m2"), TYRES_M, (0.5, 0.6, 0.8, 1.0), (1.1, 1.3, 2.0, 3.0)
-    ):
-        cfg = load_config(None, {"run.mirror": name, "robot.friction": friction})
-        thrust_n = margin * forecast_grip(cfg.robot, build_mirror(cfg.mirror)).least_n
-        keys: dict[str, object] = {"run.mirror": name, "sim.physics.tyre": tyre, "robot.tyre_m": TYRES_M[tyre]}
-        for place in ("robot", "sim.physics"):
-            keys |= {f"{place}.friction": friction, f"{place}.thrust_n": round(thrust_n, 2)}
-        found.append(Cell({"mirror": name, "tyre": tyre, "friction": friction, "margin": margin}, keys))
-    return found
-
-
-def draw_physics(cells: Sequence[CellResult], out: Path) -> None:
-    """Errors and time, a figure for each mirror and thrust."""
-    for (mirror, margin), there in grouped(cells, "mirror", "margin").items():
-        rows = rows_by(there, "tyre", "friction")
-        title = f"{mirror}, {margin} times the least thrust, by friction: {_SHOWN}"
-        draw_ranges(rows, MISSION, title, out / f"physics-{mirror}-{margin}")
-
-
-PHYSICS = Study(
-    cells=physics_cells,
-    run_job=run_mission,
-    combine=combine_missions,
-    columns="""
-        complete points.measured
-        danger: falls
-        localization_error_mm: mean p99 max
-        arrival_error_mm: mean max within_10mm_fraction
-        corrections mission_time_s time_ratio
-    """,
-    draw=draw_physics,
-    defaults={"sim.robot.physics": "mujoco", "run.panels": 9},
-    mirrors=(),
-    runs=1,
 )
