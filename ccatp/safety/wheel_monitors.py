@@ -228,7 +228,8 @@ class WheelMonitor:
 
 _SLIDE_MEMORY_S = 0.06
 _GRAVITY_TIME_S = 0.2  # over which its readings, noisy ones, are averaged
-_BIAS_SAMPLES = 100  # of the accelerometer at rest, whose mean is its bias
+_BIAS_SAMPLES = 50  # of the accelerometer at rest, whose mean is its bias
+_STILL_RAD_S = 0.05  # a wheel that is held gives way so slowly on a slope
 _LEAST_SLOPE = 0.15  # of gravity along the robot: where it drives on a level or across a slope it does not slide ahead
 _LARGEST_M_S2 = 10.0  # gravity gives no more
 _ENCODER_JUMP_M_S = 0.03  # of a wheel's speed in a frame: no wheel that carries the robot does that
@@ -279,7 +280,8 @@ class GripMonitor:
         self._speed_m_s = speed_m_s
         change_m_s = speed_m_s - before_m_s
         is_sound = -_LARGEST_M_S2 < ax < _LARGEST_M_S2 and -_ENCODER_JUMP_M_S < change_m_s < _ENCODER_JUMP_M_S
-        if right == left == 0.0 and self._rested < _BIAS_SAMPLES and is_sound:
+        is_still = -_STILL_RAD_S < right < _STILL_RAD_S and -_STILL_RAD_S < left < _STILL_RAD_S
+        if is_still and self._rested < _BIAS_SAMPLES and is_sound:
             self._rested += 1
             self._bias_m_s2 += (ax - self._bias_m_s2) / self._rested
         if not is_sound or self._rested < _BIAS_SAMPLES or not 0.0 < dt_s < _SLIDE_MEMORY_S:

@@ -23,6 +23,7 @@ from ccatp.sim.plant import Plant
 from ccatp.sim.world import World
 
 _TYRE_M = 0.012  # width of a flat tyre
+_TYRE_PRIORITY = 2  # of contacts: the tyre's friction counts, not the mirror's
 _AVERAGED = 5  # steps: what the inertial unit takes the mean of
 
 _MODEL = """
@@ -51,11 +52,11 @@ _WHEEL = """
       </body>"""
 _ROUND = (
     '<geom type="ellipsoid" size="{radius} {radius} 0.004" euler="90 0 0" mass="0.04" '
-    'friction="{friction} 0.001 0.0001" priority="2"/>'
+    'friction="{friction} 0.001 0.0001" priority="{priority}"/>'
 )
 _FLAT = (
     '<geom type="cylinder" size="{radius} {half}" euler="90 0 0" mass="0.04" '
-    'friction="{friction} 0.001 0.0001" priority="2"/>'
+    'friction="{friction} 0.001 0.0001" priority="{priority}"/>'
 )
 
 
@@ -96,7 +97,7 @@ class PhysicsPlant(Plant):
         motor = self._motor
         damping = motor.volt_per_rad_s / motor.volt_per_nm
         tyre = (_FLAT if cfg.tyre == "flat" else _ROUND).format(
-            radius=radius_m, half=0.5 * _TYRE_M, friction=cfg.friction
+            radius=radius_m, half=0.5 * _TYRE_M, friction=cfg.friction, priority=_TYRE_PRIORITY
         )
         wheels = "".join(
             _WHEEL.format(
@@ -187,6 +188,12 @@ class PhysicsPlant(Plant):
         self._mujoco.mj_forward(self._model, data)
         self.heading_rad = heading_rad
         self._read_state()
+
+    def set_friction(self, friction: float) -> None:
+        """Of both tyres, from now on."""
+        for geom in range(self._model.ngeom):
+            if self._model.geom_priority[geom] == _TYRE_PRIORITY:
+                self._model.geom_friction[geom, 0] = friction
 
     def stop_dead(self) -> None:
         """Nothing moves any more (the robot fell)."""

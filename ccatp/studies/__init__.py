@@ -27,6 +27,8 @@ STUDIES = {
     "sensitivity": ("survey_studies:SENSITIVITY", "what each disturbance of a hard world costs"),
     "ablation": ("survey_studies:ABLATION", "what each technique gives, one off at a time"),
     "physics": ("physics_study:PHYSICS", "a rigid body on both mirrors: tyre, friction, thrust"),
+    "stops": ("physics_study:STOPS", "a rigid body at the rim and on command: overrun by speed"),
+    "slides": ("physics_study:SLIDES", "a rigid body whose friction falls: when that is found"),
     "danger": ("danger_study:STUDY", "false edges and overrun of two edge rules"),
     "faults": ("faults_study:STUDY", "whole missions with random faults: falls, completion"),
     "cricket": ("cricket_study:STUDY", "self-mapping of motes: the published figures, better ways"),

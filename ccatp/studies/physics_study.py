@@ -1,19 +1,27 @@
 """The studies with real physics.
 
 `physics`: whole missions by tyre, friction and thrust. `stops`: drives over the rim, and stops by command. `slides`:
-friction that falls while the robot drives.
+friction that falls while the robot drives or turns.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
+from math import cos, hypot, pi, sin
 from pathlib import Path
+from typing import NamedTuple
 
 from ccatp.config.load import load_config
-from ccatp.control.thrust import forecast_grip
-from ccatp.mirror.mirror import build_mirror
-from ccatp.studies.campaign import Cell, CellResult, Study
+from ccatp.config.models import Config
+from ccatp.control.thrust import ThrustControl, forecast_grip
+from ccatp.core import DeckPose, EventCode, PanelId, Twist, Verdict, wheel_rates
+from ccatp.danger import DangerMonitor
+from ccatp.dataloop import motor_robot
+from ccatp.links.topics import EstimateMessage, is_estimate_due
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.sim.physics import PhysicsPlant
+from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
 from ccatp.studies.mission_study import combine_missions, run_mission
-from ccatp.studies.results import draw_ranges, grouped, rows_by
+from ccatp.studies.results import Measure, draw_ranges, grouped, rows_by
 from ccatp.studies.survey_studies import MISSION, SHOWN
 
 # -- whole missions ---------------------------------------------------------------------------------------------------
@@ -67,6 +75,226 @@ PHYSICS = Study(
     """,
     draw=draw_physics,
     defaults={"sim.robot.physics": "mujoco", "run.panels": 9},
+    mirrors=(),
+    runs=1,
+)
+
+# -- single drives ----------------------------------------------------------------------------------------------------
+
+_REST_FRAMES = 120  # before it drives: the fans run up, the accelerometer's bias is learned
+_STOP_FRAMES = 60
+_INSIDE_M = 0.25  # of the rim, where a drive begins
+_SIDES_RAD = tuple(k * pi / 2.0 for k in range(4))
+
+
+class Truth(NamedTuple):
+    """``clearance_m``: of the edge sensor that is furthest out, < 0 beyond the rim."""
+
+    pose: DeckPose
+    clearance_m: float
+    has_fallen: bool
+
+
+class Drive:
+    """A robot with real physics on set points; the danger loop's monitors get its true pose. ``verdict``: the last."""
+
+    def __init__(self, cfg: Config, mirror: Mirror, start: DeckPose) -> None:
+        self._cfg, self._robot = cfg, motor_robot(cfg, start)
+        self._monitor = DangerMonitor(mirror, cfg.robot, cfg.danger, cfg.health)
+        self._thrust = ThrustControl(cfg.robot, mirror)
+        self._estimate: EstimateMessage | None = None
+        self._number, self._speed_m_s = 0, 0.0
+        self.verdict: Verdict | None = None
+        self._robot.join("monitor")
+        self._robot.join("controller")
+        self._command_fans()
+        for _ in range(_REST_FRAMES):
+            self.step(Twist(0.0, 0.0))
+
+    @property
+    def truth(self) -> Truth:
+        """How it stands on the mirror."""
+        _, _, x_m, y_m, heading_rad, *_, clearance_m, has_fallen, _ = self._robot.truth_row()
+        return Truth(DeckPose(x_m, y_m, heading_rad), clearance_m, has_fallen > 0.0)
+
+    def _command_fans(self) -> None:
+        self._robot.command_fans(self._number + 1, *self._thrust.duty)
+
+    def step(self, wanted: Twist) -> None:
+        """One frame towards a twist, with the limit of acceleration; a stop is at once."""
+        robot, cfg = self._robot, self._cfg
+        most_m_s = cfg.limits.a_max_m_s2 * robot.frame_s
+        ahead_m_s = min(max(wanted.v_m_s - self._speed_m_s, -most_m_s), most_m_s) + self._speed_m_s
+        self._speed_m_s = ahead_m_s if wanted.v_m_s else 0.0
+        robot.advance()
+        frame, pose = robot.delivered, self.truth.pose
+        if frame is None:
+            return
+        self.verdict = verdict = self._monitor.step(frame, self._estimate)
+        self._number += 1
+        if verdict.full_fans and self._thrust.give_all():
+            self._command_fans()
+        if is_estimate_due(frame.seq):
+            place = pose.x_m, pose.y_m, pose.heading_rad
+            self._estimate = EstimateMessage(*place, 0.001, "driving", seq=frame.seq, t_s=frame.t)
+            if self._thrust.step(frame.t, pose, turns=wanted.omega_rad_s != 0.0 or wanted.v_m_s == 0.0):
+                self._command_fans()
+        twist = Twist(self._speed_m_s, wanted.omega_rad_s)
+        right, left = wheel_rates(twist, cfg.robot.wheel_radius_m, cfg.robot.wheel_base_m)
+        robot.permit(self._number, verdict.forward, verdict.reverse, verdict.turn)
+        robot.drive(self._number, right, left)
+
+    def set_friction(self, friction: float) -> None:
+        """Of both tyres, from now on."""
+        plant = self._robot.world.plant
+        if isinstance(plant, PhysicsPlant):
+            plant.set_friction(friction)
+
+    def stop(self) -> float:
+        """Zeros until it stands: how far the body goes, m."""
+        before = self.truth.pose
+        for _ in range(_STOP_FRAMES):
+            self.step(Twist(0.0, 0.0))
+        after = self.truth.pose
+        return hypot(after.x_m - before.x_m, after.y_m - before.y_m)
+
+
+def drives_to_rim(mirror: Mirror) -> Iterator[tuple[DeckPose, bool]]:
+    """Places in front of the middle of each side, straight and at 45 degrees to it, ahead and in reverse."""
+    row, col = (mirror.rows + 1) // 2, (mirror.cols + 1) // 2
+    for outward in _SIDES_RAD:
+        dx, dy = round(cos(outward)), round(sin(outward))
+        on_side = [p for p in mirror.panels if PanelId(p.row + dy, p.col + dx) not in mirror.panels]
+        panel = mirror.panels[
+            min(on_side, key=lambda p: (abs(p.row - row) if dx else abs(p.col - col), -dx * p.col - dy * p.row))
+        ]
+        x_m = panel.x_m + dx * (panel.half_x_m - _INSIDE_M)
+        y_m = panel.y_m + dy * (panel.half_y_m - _INSIDE_M)
+        for angle, reverse in product((-pi / 4.0, 0.0, pi / 4.0), (False, True)):
+            yield DeckPose(x_m, y_m, outward + angle + pi * reverse), reverse
+
+
+def run_stops(job: Job) -> JobOutcome:
+    """Drives over the rim; and stops by command, in eight directions."""
+    cfg, mirror = job.cfg, build_mirror(job.cfg.mirror)
+    speed_m_s = cfg.limits.v_max_m_s
+    if job.factors["speed"] == "safe":
+        speed_m_s = min(
+            forecast_grip(cfg.robot, mirror).safe_speed_m_s, cfg.robot.max_wheel_rad_s * cfg.robot.wheel_radius_m
+        )
+    further_m, overruns_m, falls, missed = [], [], 0, 0
+    for start, reverse in drives_to_rim(mirror):
+        drive, twist = Drive(cfg, mirror, start), Twist(-speed_m_s if reverse else speed_m_s, 0.0)
+        frames = round((2.0 * _INSIDE_M / speed_m_s + 1.0) / 0.01)
+        while frames and (drive.verdict is None or drive.verdict.code is not EventCode.NEAR_EDGE):
+            drive.step(twist)
+            frames -= 1
+        at_m = max(-drive.truth.clearance_m, 0.0)
+        drive.stop()
+        missed += not frames
+        falls += drive.truth.has_fallen
+        overruns_m.append(max(-drive.truth.clearance_m, 0.0))
+        further_m.append(overruns_m[-1] - at_m)
+    stops_m = []
+    for k in range(8):
+        drive = Drive(cfg, mirror, DeckPose(0.0, 0.0, k * pi / 4.0))  # the rim is far
+        for _ in range(round(speed_m_s / cfg.limits.a_max_m_s2 / 0.01) + 20):
+            drive.step(Twist(speed_m_s, 0.0))
+        stops_m.append(drive.stop())
+        falls += drive.truth.has_fallen
+    values = {"speed_m_s": round(speed_m_s, 3), "drives": len(overruns_m), "missed": missed, "falls": falls}
+    for name, found_m in (("overrun", overruns_m), ("further", further_m), ("stop", stops_m)):
+        values |= {f"{name}_mm": {"mean": 1e3 * sum(found_m) / len(found_m), "max": 1e3 * max(found_m)}}
+    return JobOutcome(values, {})
+
+
+def first_outcome(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
+    """Nothing is random: one run is all."""
+    return outcomes[0]
+
+
+def draw_stops(cells: Sequence[CellResult], out: Path) -> None:
+    """Mean and largest overrun."""
+    labels = {"overrun_mm": "beyond the rim, mm", "further_mm": "since the verdict", "stop_mm": "on command"}
+    measures = [
+        Measure(label, (f"{key}.mean", f"{key}.max"), f"{key}.max", is_log=False) for key, label in labels.items()
+    ]
+    for (mirror,), there in grouped(cells, "mirror").items():
+        rows = rows_by(there, "tyre", "thrust", "speed")
+        draw_ranges(rows, measures, f"Stops on {mirror}: mean, largest", out / f"stops-{mirror}")
+
+
+STOPS = Study(
+    cells=lambda: [
+        Cell(
+            {"mirror": mirror, "tyre": tyre, "thrust": thrust, "speed": speed},
+            robot_keys(mirror, tyre, 0.6, None if thrust == "shipped" else 1.3),
+        )
+        for mirror, tyre, thrust, speed in product(MIRRORS, TYRES_M, ("1.3 x least", "shipped"), ("survey", "safe"))
+    ],
+    run_job=run_stops,
+    combine=first_outcome,
+    columns="""
+        speed_m_s drives missed falls
+        overrun_mm: mean max
+        further_mm: mean max
+        stop_mm: mean max
+    """,
+    draw=draw_stops,
+    defaults={"sim.robot.physics": "mujoco"},
+    mirrors=(),
+    runs=1,
+)
+
+_HEADINGS_RAD = tuple(k * pi / 4.0 + 0.2 for k in range(8))
+_SLIDE_FRAMES = 60
+_SOON_FRAMES = 5
+
+
+def run_slides(job: Job) -> JobOutcome:
+    """The friction falls while the robot drives, or turns, in eight directions: when it is found, how far it slides."""
+    cfg, mirror, factors = job.cfg, build_mirror(job.cfg.mirror), job.factors
+    twist = Twist(cfg.limits.v_max_m_s, 0.0) if factors["way"] == "drive" else Twist(0.0, 0.5)
+    found: list[int] = []
+    ways_m, falls = [], 0
+    for heading_rad in _HEADINGS_RAD:
+        drive = Drive(cfg, mirror, DeckPose(0.0, 0.0, heading_rad))
+        for _ in range(_REST_FRAMES):
+            drive.step(twist)
+        drive.set_friction(float(factors["friction"]))
+        frames = 0
+        while frames < _SLIDE_FRAMES and (drive.verdict is None or drive.verdict.signal != "grip"):
+            drive.step(twist)
+            frames += 1
+        if frames < _SLIDE_FRAMES:
+            found.append(frames)
+        ways_m.append(drive.stop())
+        falls += drive.truth.has_fallen
+    values = {
+        "trials": len(ways_m), "found": len(found), "within_50ms": sum(frames <= _SOON_FRAMES for frames in found),
+        "latest_ms": 10 * max(found, default=0), "falls": falls,
+        "way_mm": {"mean": 1e3 * sum(ways_m) / len(ways_m), "max": 1e3 * max(ways_m)},
+    }  # fmt: skip
+    return JobOutcome(values, {})
+
+
+def draw_slides(cells: Sequence[CellResult], out: Path) -> None:
+    """How far it slides after it was found."""
+    measures = [Measure("way after that, mm", ("way_mm.mean", "way_mm.max"), "way_mm.max")]
+    draw_ranges(rows_by(cells, "mirror", "friction", "way"), measures, "Slides: mean, largest", out / "slides")
+
+
+SLIDES = Study(
+    cells=lambda: [
+        Cell({"mirror": mirror, "friction": friction, "way": way}, robot_keys(mirror, "round", 0.6, margin))
+        for mirror, margin in (("fyst-m1", 1.3), ("fyst-m2", None))
+        for friction, way in product((0.1, 0.2, 0.3), ("drive", "turn"))
+    ],
+    run_job=run_slides,
+    combine=first_outcome,
+    columns="trials found within_50ms latest_ms falls\nway_mm: mean max",
+    draw=draw_slides,
+    defaults={"sim.robot.physics": "mujoco"},
     mirrors=(),
     runs=1,
 )

@@ -6,7 +6,6 @@ and what its absence saves. `ablation`: what each technique of estimation and co
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import product
 from pathlib import Path
 from typing import Any
 
