@@ -108,6 +108,7 @@ class Drive:
         self._robot.join("monitor")
         self._robot.join("controller")
         self._command_fans()
+        self.set_friction(cfg.robot.friction)
         for _ in range(_REST_FRAMES):
             self.step(Twist(0.0, 0.0))
 
@@ -178,10 +179,6 @@ def run_stops(job: Job) -> JobOutcome:
     """Drives over the rim; and stops by command, in eight directions."""
     cfg, mirror = job.cfg, build_mirror(job.cfg.mirror)
     speed_m_s = cfg.limits.v_max_m_s
-    if job.factors["speed"] == "safe":
-        speed_m_s = min(
-            forecast_grip(cfg.robot, mirror).safe_speed_m_s, cfg.robot.max_wheel_rad_s * cfg.robot.wheel_radius_m
-        )
     further_m, overruns_m, falls, missed = [], [], 0, 0
     for start, reverse in drives_to_rim(mirror):
         drive, twist = Drive(cfg, mirror, start), Twist(-speed_m_s if reverse else speed_m_s, 0.0)
@@ -224,14 +221,21 @@ def draw_stops(cells: Sequence[CellResult], out: Path) -> None:
         draw_ranges(rows, measures, f"Stops on {mirror}: mean, largest", out / f"stops-{mirror}")
 
 
+def stop_cells() -> Sequence[Cell]:
+    """The speed of a survey, and the one that the plan calls safe, as far as the wheels turn so fast."""
+    found = []
+    for mirror, tyre, thrust, speed in product(MIRRORS, TYRES_M, ("1.3 x least", "shipped"), ("survey", "safe")):
+        keys = robot_keys(mirror, tyre, 0.6, None if thrust == "shipped" else 1.3)
+        if speed == "safe":
+            cfg = load_config(None, keys)
+            safe_m_s = forecast_grip(cfg.robot, build_mirror(cfg.mirror)).safe_speed_m_s
+            keys["limits.v_max_m_s"] = min(safe_m_s, cfg.robot.max_wheel_rad_s * cfg.robot.wheel_radius_m)
+        found.append(Cell({"mirror": mirror, "tyre": tyre, "thrust": thrust, "speed": speed}, keys))
+    return found
+
+
 STOPS = Study(
-    cells=lambda: [
-        Cell(
-            {"mirror": mirror, "tyre": tyre, "thrust": thrust, "speed": speed},
-            robot_keys(mirror, tyre, 0.6, None if thrust == "shipped" else 1.3),
-        )
-        for mirror, tyre, thrust, speed in product(MIRRORS, TYRES_M, ("1.3 x least", "shipped"), ("survey", "safe"))
-    ],
+    cells=stop_cells,
     run_job=run_stops,
     combine=first_outcome,
     columns="""
@@ -252,47 +256,56 @@ _SOON_FRAMES = 5
 
 
 def run_slides(job: Job) -> JobOutcome:
-    """The friction falls while the robot drives, or turns, in eight directions: when it is found, how far it slides."""
-    cfg, mirror, factors = job.cfg, build_mirror(job.cfg.mirror), job.factors
-    twist = Twist(cfg.limits.v_max_m_s, 0.0) if factors["way"] == "drive" else Twist(0.0, 0.5)
-    found: list[int] = []
+    """The friction falls from the robot's to that of the physics, in eight directions: when that is found."""
+    cfg, mirror = job.cfg, build_mirror(job.cfg.mirror)
+    values: dict[str, object] = {}
     ways_m, falls = [], 0
-    for heading_rad in _HEADINGS_RAD:
-        drive = Drive(cfg, mirror, DeckPose(0.0, 0.0, heading_rad))
-        for _ in range(_REST_FRAMES):
-            drive.step(twist)
-        drive.set_friction(float(factors["friction"]))
-        frames = 0
-        while frames < _SLIDE_FRAMES and (drive.verdict is None or drive.verdict.signal != "grip"):
-            drive.step(twist)
-            frames += 1
-        if frames < _SLIDE_FRAMES:
-            found.append(frames)
-        ways_m.append(drive.stop())
-        falls += drive.truth.has_fallen
-    values = {
-        "trials": len(ways_m), "found": len(found), "within_50ms": sum(frames <= _SOON_FRAMES for frames in found),
-        "latest_ms": 10 * max(found, default=0), "falls": falls,
-        "way_mm": {"mean": 1e3 * sum(ways_m) / len(ways_m), "max": 1e3 * max(ways_m)},
-    }  # fmt: skip
-    return JobOutcome(values, {})
+    for way, twist in (("drive", Twist(cfg.limits.v_max_m_s, 0.0)), ("turn", Twist(0.0, 0.5))):
+        found: list[int] = []
+        for heading_rad in _HEADINGS_RAD:
+            drive = Drive(cfg, mirror, DeckPose(0.0, 0.0, heading_rad))
+            for _ in range(_REST_FRAMES):
+                drive.step(twist)
+            drive.set_friction(cfg.sim.physics.friction)
+            frames = 0
+            while frames < _SLIDE_FRAMES and (drive.verdict is None or drive.verdict.signal != "grip"):
+                drive.step(twist)
+                frames += 1
+            if frames < _SLIDE_FRAMES:
+                found.append(frames)
+            ways_m.append(drive.stop())
+            falls += drive.truth.has_fallen
+        soon = sum(frames <= _SOON_FRAMES for frames in found)
+        values[way] = {"found": len(found), "within_50ms": soon, "latest_ms": 10 * max(found, default=0)}
+    way_mm = {"mean": 1e3 * sum(ways_m) / len(ways_m), "max": 1e3 * max(ways_m)}
+    return JobOutcome({"trials": len(ways_m), **values, "falls": falls, "way_mm": way_mm}, {})
+
+
+def slide_cells() -> Sequence[Cell]:
+    """Where thrust is as little as the margin allows."""
+    found = []
+    for mirror, friction in product(MIRRORS, (0.1, 0.2, 0.3)):
+        keys = robot_keys(mirror, "round", 0.6, 1.3)
+        found.append(Cell({"mirror": mirror, "friction": friction}, {**keys, "sim.physics.friction": friction}))
+    return found
 
 
 def draw_slides(cells: Sequence[CellResult], out: Path) -> None:
     """How far it slides after it was found."""
     measures = [Measure("way after that, mm", ("way_mm.mean", "way_mm.max"), "way_mm.max")]
-    draw_ranges(rows_by(cells, "mirror", "friction", "way"), measures, "Slides: mean, largest", out / "slides")
+    draw_ranges(rows_by(cells, "mirror", "friction"), measures, "Slides: mean, largest", out / "slides")
 
 
 SLIDES = Study(
-    cells=lambda: [
-        Cell({"mirror": mirror, "friction": friction, "way": way}, robot_keys(mirror, "round", 0.6, margin))
-        for mirror, margin in (("fyst-m1", 1.3), ("fyst-m2", None))
-        for friction, way in product((0.1, 0.2, 0.3), ("drive", "turn"))
-    ],
+    cells=slide_cells,
     run_job=run_slides,
     combine=first_outcome,
-    columns="trials found within_50ms latest_ms falls\nway_mm: mean max",
+    columns="""
+        trials falls
+        drive: found within_50ms latest_ms
+        turn: found within_50ms latest_ms
+        way_mm: mean max
+    """,
     draw=draw_slides,
     defaults={"sim.robot.physics": "mujoco"},
     mirrors=(),

@@ -361,7 +361,7 @@ RUNS: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
     "faults": (("faults=random",), ("--mirror", "thesis-m1", *ONE_PANEL_ARGS), "faults"),
     "physics": (("mirror=fyst-m1", "tyre=round", "friction=1.0", "margin=3.0"), ONE_PANEL_ARGS, "physics-fyst-m1-3"),
     "stops": (("mirror=fyst-m1", "tyre=round", "thrust=shipped", "speed=safe"), (), "stops-fyst-m1"),
-    "slides": (("mirror=fyst-m1", "friction=0.1", "way=turn"), (), "slides"),
+    "slides": (("mirror=fyst-m1", "friction=0.1"), (), "slides"),
     "cricket": (("case=zigzag-printed,all-printed,batch-45-once",), (), "figure_11_12 figure_14 figure_9_10_13 ways"),
     "recordings": (
         ("data=Plaza2,XBee scenario 1", "estimator=ekf-slam,fingerprints"), ("--data", str(RECORDINGS)), "recordings",
