@@ -118,10 +118,8 @@ class OnboardServer(TcpRobotServer):
         # The clock of samples and frames is one, and goes on while the process stands.
         return now_s - self.next_frame_s
 
-    def _drive_frame(self) -> None:
+    def _advance_robot(self) -> None:
         self.robot.advance_to(self._frame_wall_s - self._boot_s)
-        for call in self.each_frame:
-            call()
 
     def _report(self, now_s: float) -> None:
         faults, self._faults = self.robot.faults, frozenset(self.robot.faults)

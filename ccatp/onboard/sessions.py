@@ -121,7 +121,7 @@ class RobotServer:
         counts: bad_lines, unknown_types, oversized_lines, refused, stale (drives, permits and fans not newer),
             slips (frames more than a period late), repeats (frames that were sent again in lockstep).
         oldest_ack_frames: how many frames a drive that moves the robot was behind at most (not in lockstep).
-        each_frame: called after each frame that was driven.
+        each_frame: called after each frame that was driven and sent.
     """
 
     def __init__(
@@ -225,8 +225,8 @@ class RobotServer:
         if not self._is_lockstep:
             return
         if message.role == "controller":
-            self._run_to_delivery()
             self._send_frame()
+            self._run_to_delivery()
         elif "controller" in self._holders:
             session.write(self.robot.delivered_line)
 
@@ -237,7 +237,6 @@ class RobotServer:
             if robot.t_s - since_s > NO_DELIVERY_S:
                 self._drop_all(f"no frame could be delivered for {NO_DELIVERY_S:g} s")
                 return
-            self._send_frame()
             self._drive_frame()
 
     def command(self, session: RobotSession, role: Role, message: FromClient, now_s: float) -> bool:
@@ -294,12 +293,16 @@ class RobotServer:
         self._drive_frame()
         if self._is_lockstep:
             self._run_to_delivery()
-        self._send_frame()
 
     def _drive_frame(self) -> None:
-        self.robot.advance()
+        """Drive a frame and send it; what is kept of it is kept while the clients work on it."""
+        self._advance_robot()
+        self._send_frame()
         for call in self.each_frame:
             call()
+
+    def _advance_robot(self) -> None:
+        self.robot.advance()
         if self.robot.reboots != self._reboots:
             self._reboots = self.robot.reboots
             self._drop_all("the robot rebooted")
