@@ -205,10 +205,10 @@ class Plant:
         self.shake_rate_rad_s = self.shake_acceleration_m_s2 = 0.0
 
 
-def noise_stream(rng: np.random.Generator) -> Callable[[], float]:
-    """Standard normal numbers of one kind, one by one: a function of the seed only."""
-    blocks: Iterator[list[float]] = iter(lambda: rng.standard_normal(BLOCK).tolist(), None)
-    return chain.from_iterable(blocks).__next__
+def noise_stream(rng: np.random.Generator, sigma: float = 1.0) -> Iterator[float]:
+    """Normal numbers of one kind without end, of standard deviation ``sigma``: a function of the seed only."""
+    blocks: Iterator[list[float]] = iter(lambda: rng.normal(0.0, sigma, BLOCK).tolist(), None)
+    return chain.from_iterable(blocks)
 
 
 class OrnsteinUhlenbeck:
@@ -219,7 +219,7 @@ class OrnsteinUhlenbeck:
     """
 
     def __init__(self, sigma: float, time_s: float, rng: np.random.Generator) -> None:
-        self._draw = noise_stream(rng)
+        self._draw = noise_stream(rng).__next__
         self._sigma, self._time_s = sigma, time_s
         self._value = sigma * self._draw()
         self._t_s = 0.0
@@ -328,7 +328,7 @@ class Creep:
         self, plant: Plant, t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
     ) -> BodyStep:
         """Add ``creep_fraction |v| (1 + walk) dt`` along the unit vector downhill."""
-        if forward_m == 0.0:
+        if forward_m == 0.0 or self._fraction == 0.0:
             return forward_m, left_m, turn_rad
         ahead, aside, slope = downhill(plant, self._gravity)
         if slope < LEVEL_SLOPE:
@@ -341,11 +341,11 @@ class Vibration:
     """Jitter of the body while the fans thrust; ``rng`` is the parent of the generators."""
 
     def __init__(self, world: WorldConfig, frame_s: float, rng: np.random.Generator) -> None:
-        self._heading, self._place, self._acceleration = (noise_stream(one) for one in rng.spawn(3))
+        heading, place, acceleration = rng.spawn(3)
         # A difference of two independent numbers has twice their variance.
-        self._sigma_rad = world.vibration_rate_rad_s * frame_s / sqrt(2.0)
-        self._sigma_m = world.vibration_speed_m_s * frame_s / sqrt(2.0)
-        self._sigma_m_s2 = world.vibration_acceleration_m_s2 / sqrt(2.0)
+        self._angles_rad = noise_stream(heading, world.vibration_rate_rad_s * frame_s / sqrt(2.0))
+        self._ways_m = noise_stream(place, world.vibration_speed_m_s * frame_s / sqrt(2.0))
+        self._pushes_m_s2 = noise_stream(acceleration, world.vibration_acceleration_m_s2 / sqrt(2.0))
         self._angle = self._ahead = self._push = 0.0
         self.is_thrusting = False  # the fans thrust in the next frame; to be set before it
 
@@ -355,9 +355,8 @@ class Vibration:
         """Replace the jitter of the frame before by this frame's; without thrust it goes back to nothing."""
         angle, ahead, push = self._angle, self._ahead, self._push
         if self.is_thrusting:
-            self._angle = self._sigma_rad * self._heading()
-            self._ahead = self._sigma_m * self._place()
-            self._push = self._sigma_m_s2 * self._acceleration()
+            self._angle, self._ahead = next(self._angles_rad), next(self._ways_m)
+            self._push = next(self._pushes_m_s2)
         else:
             self._angle = self._ahead = self._push = 0.0
         turned = self._angle - angle

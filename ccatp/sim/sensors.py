@@ -8,7 +8,7 @@ sensors alone. The rim over which the robot falls stays the ideal one.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import chain, pairwise, repeat
+from itertools import chain, islice, pairwise, repeat
 from math import exp, hypot, pi
 from typing import NamedTuple, TypeVar
 
@@ -89,14 +89,12 @@ class RateEncoders:
     """Wheel rates with white noise, right and left independent."""
 
     def __init__(self, sigma_rad_s: float, rng: np.random.Generator) -> None:
-        self._noise = noise_stream(rng)
-        self._sigma = sigma_rad_s * _PER_UNIT
+        self._noise = noise_stream(rng, sigma_rad_s * _PER_UNIT)
 
     def read(self, plant: Plant, times: SampleTimes) -> list[WheelTuple]:
         """(t, right, left) wheel rates of the frame."""
-        sigma, noise, unit, whole = self._sigma, self._noise, _PER_UNIT, WHOLE
-        right_noise = [sigma * noise() for _ in times.times_s]
-        left_noise = [sigma * noise() for _ in times.times_s]
+        noise, count, unit, whole = self._noise, len(times.times_s), _PER_UNIT, WHOLE
+        right_noise, left_noise = list(islice(noise, count)), list(islice(noise, count))
         right, right_lag, left, left_lag = (unit * rate_rad_s for rate_rad_s in plant.servo)
         found: list[WheelTuple] = []
         for t, e, a, b in zip(times.times_s, times.decays, right_noise, left_noise):  # noqa: B905 - of one length; bare it compiles to a plain loop
@@ -282,11 +280,10 @@ class SensorSuite:
         sim, world = cfg.sim.robot, cfg.world
         imu, encoders, gravity = rng.spawn(3)
         biases, counts, panel_edges = rng.spawn(3)
-        self._gravity_noise = noise_stream(gravity)
+        self._gravity_noise = noise_stream(gravity, sim.gravity_sigma_rad)
         self._gravity_in_robot = mirror.gravity_in_robot
         self._gravity_pose: DeckPose | None = None
         self._gravity = (0.0, 0.0, 0.0)
-        self._gravity_sigma = sim.gravity_sigma_rad
         self._rates_hz = sim.edge_hz, sim.imu_hz, sim.encoder_hz, sim.gravity_hz
         self._frame_hz, self._lag_s = sim.frame_hz, lag_s
         self._ahead: list[tuple[SampleTimes, ...]] = []  # of the sensors in the order of their rates, frame by frame
@@ -330,9 +327,9 @@ class SensorSuite:
         pose = plant.pose
         if pose != self._gravity_pose:
             self._gravity_pose, self._gravity = pose, self._gravity_in_robot(pose)
-        sigma, noise, unit, whole = self._gravity_sigma, self._gravity_noise, _PER_UNIT, WHOLE
+        noise, unit, whole = self._gravity_noise, _PER_UNIT, WHOLE
         x, y, z = self._gravity
-        x, y, z = x + sigma * noise(), y + sigma * noise(), z + sigma * noise()
+        x, y, z = x + next(noise), y + next(noise), z + next(noise)
         scale = unit / hypot(x, y, z)
         gx, gy, gz = ((component * scale + whole - whole) / unit for component in (x, y, z))
         return t_s, gx, gy, gz
