@@ -33,6 +33,7 @@ from ccatp.report.plots import INK
 from ccatp.sim.radio import SimDriveCommand, TruePose, TrueRadio
 from ccatp.sim.radio_world import RadioWorld
 from ccatp.studies.campaign import Cell, CellResult, Factors, Job, JobOutcome, Study
+from ccatp.studies.radio_bound import RadioBound, TrueStep, radio_bound
 from ccatp.studies.results import LIMIT, Measure, Row, band, chi_square_band, colour, draw_ranges, grouped, plot
 
 # -- a run with the truth beside the estimates -------------------------------------------------------------------------
@@ -56,6 +57,7 @@ class RadioRun:
     believed: list[Place] = field(default_factory=list)
     places: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)  # at the end: mean and truth
     joint_nees: tuple[float, int] = (0.0, 0)  # at the end, of pose and static radios on the map; degrees of freedom
+    bound: RadioBound | None = None
     nearest_m: float = inf  # to the target
     clearance_m: float = inf  # least, from what stands in the room
 
@@ -65,6 +67,7 @@ def run_radio(cfg: RadioConfig) -> RadioRun:
     world, navigator, pilot, run = RadioWorld(cfg), RadioNavigator(cfg), BeaconPilot(cfg), RadioRun()
     drive, observation, slam = HALT, cfg.observation, navigator.slam
     truths: dict[str, Place] = {}
+    driven: list[TrueStep] = []
     for step in range(1, cfg.run.steps + 1):
         static, target = step % observation.every_steps == 0, step % observation.target_every_steps == 0
         frame = world.step(SimDriveCommand(*drive), cfg.run.step_s, static=static, target=target)
@@ -72,12 +75,14 @@ def run_radio(cfg: RadioConfig) -> RadioRun:
         wheels = (odometry_of(cfg, t_s, *frame.wheels),)
         navigator.take(BeaconMeasurements(t_s, wheels, frame.packets, frame.sightings, distances_m))
         drive = pilot.drive(t_s, frame.wheels.interval_s, slam.pose, navigator.target(t_s), distances_m)
+        driven.append(TrueStep(world.pose, wheels[0], world.target_m))
         truths = dict(world.beacons_m)
         if world.target_m is not None:
             truths[cfg.follow.target] = world.target_m
         _note(run, world, navigator, truths, cfg.follow.target)
     for name, estimate in slam.beacons.items():
         run.places[str(name)] = (estimate.mean, np.array(truths[str(name)]))
+    run.bound = radio_bound(cfg, driven, list(world.beacons_m.values()), SETTLED_SHARE)
     # Radios whose readings still wait are not on the map.
     placed = [name for name in world.beacons_m if name in slam.engine]
     mean, covariance = slam.joint(placed)
@@ -118,7 +123,7 @@ _HIT = float(chdtri(2, 0.1))
 COLUMNS = """
     beacons_m: mean median
     beacons_aligned_m: mean
-    beacons_covered pose_m reckoned_m pose_ratio heading_rad nis nis_band nees nees_band
+    beacons_rms_m beacons_bound_m beacons_covered pose_m reckoned_m pose_ratio heading_rad nis nis_band nees nees_band
 """
 _MEANS = ("pose_m", "reckoned_m", "pose_aligned_m", "reckoned_aligned_m", "heading_rad", "target_covered")
 
@@ -145,7 +150,10 @@ def run_job(job: Job) -> JobOutcome:
         "nis": [sum(nis for nis, _ in run.nis), sum(size for _, size in run.nis)],
         "nees": list(run.joint_nees),
         "collided": run.clearance_m < 0.0,
+        "beacons_rms_m": rms(np.array([np.hypot(*(mean - true)) for mean, true in finals.values()])),
     }
+    if run.bound is not None:
+        values |= {"beacons_bound_m": run.bound.beacons_m, "target_bound_m": run.bound.target_m}
     arrays = {"beacons_m": _curve([run.beacon_errors_m[name] for name in finals], len(truth))}
     if run.targets:
         first = round(SETTLED_SHARE * len(run.targets))
@@ -184,6 +192,9 @@ def combine(_: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     for name in ("nis", "nees"):
         total, freedom = (float(sum(run[name][k] for run in runs)) for k in (0, 1))
         values[name], values[f"{name}_band"] = total / max(freedom, 1.0), _band(freedom)
+    for name in ("beacons_rms_m", "beacons_bound_m", "target_bound_m"):
+        if squares := [run[name] ** 2 for run in runs if run.get(name) is not None]:
+            values[name] = float(np.sqrt(np.mean(squares)))
     if "target_m" in runs[0]:
         values |= {name: _spread([run[name] for run in runs]) for name in ("target_m", "target_aligned_m")}
         values["nearest_m"] = min(run["nearest_m"] for run in runs)
@@ -451,7 +462,7 @@ RADIO_FOLLOW = RadioStudy(
         printed: target_m beacons_m
         target_m: mean median
         target_aligned_m: mean
-        target_covered nearest_m collisions
+        target_bound_m target_covered nearest_m collisions
         {COLUMNS.strip()}
     """,
     draw=draw_follow,

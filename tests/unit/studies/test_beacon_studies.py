@@ -1,5 +1,6 @@
 """The studies of self-mapping and of recorded runs: published figures on few seeds, files, sizes, damages."""
 
+from math import hypot, log, sqrt, tau
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.cricket.range_network import MappingError
+from ccatp.beacons.slam.motion import Steering
 from ccatp.config.load import load_radio_config, load_recordings_config
 from ccatp.config.models import Config
 from ccatp.studies import cricket_study
@@ -16,6 +18,7 @@ from ccatp.studies.damage import DAMAGES, Damage, run_damage
 from ccatp.studies.gtsam_peer import PeerGaveUp
 from ccatp.studies.mote_navigation import combine as mote_navigation_combine
 from ccatp.studies.mote_runs import run_batch, run_filter, simulate_field
+from ccatp.studies.radio_bound import TrueStep, radio_bound
 from ccatp.studies.recordings import combine_recordings, estimate, events_of, run_recordings
 from tests.unit.beacons.datasets.sets import recorded, world
 
@@ -181,3 +184,31 @@ def test_a_peer_that_gives_up_on_a_later_start_is_counted(monkeypatch: pytest.Mo
     outcome = run_recordings(Job("recordings", factors, 0, load_recordings_config()))
     found = combine_recordings(factors, [JobOutcome({"path_m": 1.0}), outcome, JobOutcome({"path_m": 2.0})]).values
     assert (found["gave_up"], found["path_m"], found["started_path_m"]["p50"]) == (1, 1.0, 2.0)
+
+
+def test_the_bound_of_a_radio_seen_from_one_place_in_closed_form() -> None:
+    """Of n scans at a distance r: sigma_z r ln(10) / (10 eta) along, sigma_beta r across, over root(n) each."""
+    keys = {"start.position_sigma_m": 1e-9, "start.heading_sigma_rad": 1e-9, "observation.every_steps": 1}
+    cfg = load_radio_config(None, {"system": "zigbee", **keys})
+    pose, count, range_m = (cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad), 12, 2.5
+    stands = [TrueStep(pose, Steering(0.1 * k, 0.1, 0.0, 0.0), None) for k in range(1, count + 1)]
+    found = radio_bound(cfg, stands, [(pose[0] + 0.6 * range_m, pose[1] + 0.8 * range_m)], 0.3)
+    radio, step_rad = cfg.sim.radio, tau / cfg.scan.readings
+    along = radio.white_sigma_db * log(10.0) / (10.0 * cfg.path_loss.exponent)
+    across = hypot(radio.bearing_sigma_rad, step_rad / sqrt(12.0))
+    assert found is not None
+    assert found.beacons_m == pytest.approx(range_m * hypot(along, across) / sqrt(count), rel=1e-3)  # weak prior
+    assert found.target_m is None
+
+
+def test_shadowing_that_stays_with_the_place_is_not_averaged() -> None:
+    keys = {"sim.radio.shadowing_sigma_db": 5.0, "observation.every_steps": 1}
+    cfg = load_radio_config(None, {"system": "zigbee", **keys})
+    pose = (cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad)
+    stands = [TrueStep(pose, Steering(0.1 * k, 0.1, 0.0, 0.0), None) for k in range(1, 102)]
+    few, many, too_many = (radio_bound(cfg, stands[:count], [(2.8, 0.8)], 0.3) for count in (10, 100, 101))
+    assert few is not None
+    assert many is not None
+    assert few.beacons_m > many.beacons_m
+    assert many.beacons_m > 2.0 * 5.0 * log(10.0) / (10.0 * cfg.path_loss.exponent)  # 2 m times the spread of ln r
+    assert too_many is None
