@@ -1,7 +1,5 @@
 """Places for a fit to begin with: unfolded in more dimensions, trilaterated, drawn, or grown mote by mote."""
 
-from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
 
@@ -9,8 +7,8 @@ import numpy as np
 from scipy.sparse.csgraph import shortest_path
 
 from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
-from ccatp.beacons.cricket.range_network import MappingError, PairMeans, RangeNetwork, adjacency, every_pair
-from ccatp.beacons.cricket.trilateration import classical_scaling, map_as_possible, sphere_crossings
+from ccatp.beacons.cricket.range_network import PairMeans, RangeNetwork, adjacency, every_pair
+from ccatp.beacons.cricket.trilateration import classical_scaling, sphere_crossings
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import best_motion
 
@@ -130,38 +128,8 @@ def _crossing(
     return float(met[best]), tips[best]
 
 
-FEW = 60  # motes up to which unfolding from drawn places costs little
-_DRAWS = 16
-_FEW_DRAWS = 2  # where there are more, and each takes seconds
-_MAX_DOP = 60.0  # of a trilateration that is but a start
-
-
-def map_starts(network: RangeNetwork, given_m: FloatArray | None) -> Iterator[list[FloatArray]]:
-    """Places to begin, the most promising first; each with its mirror image, where bodies distinguish them.
-
-    ``given_m``: what the caller has, shape (n, d), nan where nothing is known.
-    """
-    whole = _with_bodies(network)
-    yield _images(network, unfolded(whole))
-    if given_m is not None:
-        yield [_filled(given_m, network)]
-    with suppress(MappingError):  # no triangle to begin with, or none that is good: the other starts need none
-        yield _images(network, _filled(map_as_possible(network, _MAX_DOP).positions_m, network))
-    if network.count <= FEW:
-        for draw in range(_DRAWS):  # the same ranges give the same map
-            yield _images(network, unfolded(whole, np.random.default_rng(draw)))
-
-
-def grown_starts(network: RangeNetwork, robust_scale: float) -> Iterator[list[FloatArray]]:
-    """Maps grown from drawn triangles, which a few wrong ranges do not bend; with their mirror images as before."""
-    whole = _with_bodies(network)
-    for draw in range(_DRAWS if network.count <= FEW else _FEW_DRAWS):
-        places = grown(whole, robust_scale, np.random.default_rng(draw))
-        if places is not None:
-            yield _images(network, _filled(places, network))
-
-
-def _images(network: RangeNetwork, places_m: FloatArray) -> list[FloatArray]:
+def images(network: RangeNetwork, places_m: FloatArray) -> list[FloatArray]:
+    """Places (n, d) moved to those that are known; with the mirror image, where known places or bodies tell them."""
     known = np.isfinite(network.known_m).all(axis=1)
     if known.sum() > network.dimension:
         return [best_motion(places_m[known], network.known_m[known], mirrors=True).moved(places_m)]
@@ -170,7 +138,8 @@ def _images(network: RangeNetwork, places_m: FloatArray) -> list[FloatArray]:
     return [places_m, places_m * np.where(np.arange(network.dimension) == 0, -1.0, 1.0)]
 
 
-def _filled(places_m: FloatArray, network: RangeNetwork) -> FloatArray:
+def filled(places_m: FloatArray, network: RangeNetwork) -> FloatArray:
+    """Places (n, d) with those that are not known, nan, beside the motes that they have ranges to."""
     places, pairs = places_m.copy(), network.pairs
     for _ in range(len(places)):
         is_known = np.isfinite(places[:, 0])
@@ -184,7 +153,7 @@ def _filled(places_m: FloatArray, network: RangeNetwork) -> FloatArray:
     return np.nan_to_num(places)
 
 
-def _with_bodies(network: RangeNetwork) -> RangeNetwork:
+def with_bodies(network: RangeNetwork) -> RangeNetwork:
     """One range for each pair, those of the bodies' shapes among them; nothing else is known."""
     means = PairMeans(network)
     pairs, ranges, sigmas = [means.pairs], [means.ranges_m], [means.sigmas_m]

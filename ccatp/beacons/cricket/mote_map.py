@@ -1,8 +1,8 @@
 """The batch map from ranges alone: starts, the robust fit, a look for folds, the scale of the sigmas, covariance."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
@@ -18,7 +18,7 @@ from ccatp.beacons.cricket.map_fit import (
     fit_map,
     position_covariance,
 )
-from ccatp.beacons.cricket.map_start import FEW, grown_starts, map_starts
+from ccatp.beacons.cricket.map_start import filled, grown, images, unfolded, with_bodies
 from ccatp.beacons.cricket.range_network import RangeNetwork, graph_pairs, sides
 from ccatp.beacons.cricket.trilateration import trilaterate
 from ccatp.core import FloatArray
@@ -26,13 +26,14 @@ from ccatp.filters.metrics import RigidMotion, best_motion, rigid_modes
 
 _SURE = 2.0  # a map whose cost per degree of freedom is less needs no other start, and is folded nowhere
 _SAME = 1e-6  # relative difference of costs that are the same minimum's
-_CORRECTIONS = 3  # times that the unfolding is repeated with ranges corrected by the offset found
-_FOUND = 3  # times that the best minimum is found before a search among grown maps ends
+_FOUND = 3  # times that the best minimum is found before the search ends
+_FEW = 60  # motes up to which unfolding from drawn places costs little
+_DRAWS = 16
+_MANY_DRAWS = 2  # where there are more, and each takes seconds
 
 _VAGUE = 0.1  # of the ranges: where they scatter by more, whatever is mirrored fits about as well
 
 Mirrors = Sequence[tuple[Sequence[int], Sequence[int]]]
-Found = TypeVar("Found")
 
 
 class Fold(NamedTuple):
@@ -76,79 +77,24 @@ def map_motes(
     the other side are tried there (``unfold``). ``start_m``: one more place to begin, shape (n, d), nan where unknown.
     ``finds_sigma``: the sigmas are right up to a factor, which follows from the residuals (``scaled``).
     """
-    model = MapModel(network, with_offset=with_offset, with_scale=with_scale)
-    plain = settings._replace(robust_scale=float("inf"))
-    if finds_sigma:
-        first = _least(_fits(model, start_m, plain))
-        model, fit = scaled(model, first, settings)
-        fits = [fit]
-        if not _is_sure(model, fit) and not _is_sound(model, fit):
-            fits += _fits(model, fit.state.positions_m, settings)
-    else:
-        fits = _fits(model, start_m, settings)
-    best = _least(fits)
+    search = _Search(MapModel(network, with_offset=with_offset, with_scale=with_scale), settings, finds_sigma)
+    (_, model, best), is_found = search.best_of(start_m)
     folds: tuple[Fold, ...] = ()
     if float(np.median(model.network.sigmas_m)) < _VAGUE * float(np.median(network.ranges_m)):
-        if not _is_sure(model, best) and np.isfinite(settings.robust_scale):
-            best, is_settled = searched(model, best, settings)
-            if not (is_settled and _is_sound(model, best)):
-                # To a robust loss a folded map is a good one with a few outliers: first unfold by least squares.
-                opened, _, _ = unfold(model, fit_map(model, best.state, plain), plain, mirrors)
-                best = _least([best, fit_map(model, opened.state, settings)])
+        if not is_found and np.isfinite(settings.robust_scale):
+            # To a robust loss a folded map is a good one with a few outliers: first unfold by least squares.
+            plain = settings._replace(robust_scale=float("inf"))
+            opened, _, _ = unfold(model, fit_map(model, best.state, plain), plain, mirrors)
+            best = min(best, fit_map(model, opened.state, settings), key=_cost)
         best, _, folds = unfold(model, best, settings, mirrors)
     covariance, free = position_covariance(model, best)
     dof, sigmas = len(network.ranges_m) - (model.size - free), model.network.sigmas_m
-    steps = sum(fit.iterations for fit in fits)
     agreement = agreement_of(best, sigmas, dof)
-    return MoteMap(best, covariance, dof, float(np.median(sigmas)), steps, agreement, free, folds)
+    return MoteMap(best, covariance, dof, float(np.median(sigmas)), search.iterations, agreement, free, folds)
 
 
-def _fits(model: MapModel, start_m: FloatArray | None, settings: MapFitSettings) -> list[MapFit]:
-    fits = _started_fits(model, start_m, settings)
-    for _ in range(_CORRECTIONS if model.with_offset or model.with_scale else 0):
-        best = _least(fits)
-        if _is_sure(model, best):
-            break
-        # An offset bends the map that the unfolding begins with: once more, with what is known of it by now.
-        fits += _started_fits(model, None, settings, best.state)
-        if _least(fits).cost >= best.cost * (1.0 - _SAME):
-            break
-    return fits
-
-
-def _started_fits(
-    model: MapModel, start_m: FloatArray | None, settings: MapFitSettings, at: MapState | None = None
-) -> list[MapFit]:
-    fits: list[MapFit] = []
-    network = _corrected(model, at)
-    offset_m, scale = (at.offset_m, at.scale) if at is not None else (0.0, 0.0)
-    is_few = network.count <= FEW
-    for images in map_starts(network, start_m):
-        ends = [fit_from_afar(model, model.state(image, offset_m, scale), settings) for image in images]
-        found, is_first = _least(ends), not fits
-        is_repeated = not is_few and not is_first and abs(found.cost - _least(fits).cost) <= _SAME * _least(fits).cost
-        fits += ends
-        if _is_sure(model, found) or is_repeated:
-            break
-        # Growing is quick for a few motes, and the shapes of bodies say more.
-        if is_first and is_few and not network.bodies and np.isfinite(settings.robust_scale):
-            # Wrong ranges would lead all starts by least squares astray, one after the other.
-            found, is_settled = searched(model, found, settings)
-            fits.append(found)
-            if _is_sure(model, found) or (is_settled and _is_sound(model, found)):
-                break
-    return fits
-
-
-def _corrected(model: MapModel, at: MapState | None) -> RangeNetwork:
-    """The network with its ranges freed of offset and scale."""
-    if at is None:
-        return model.network
-    return replace(model.network, ranges_m=np.maximum((model.network.ranges_m - at.offset_m) / (1.0 + at.scale), 0.0))
-
-
-def _least(fits: Sequence[MapFit]) -> MapFit:
-    return min(fits, key=lambda fit: fit.cost)
+def _cost(fit: MapFit) -> float:
+    return fit.cost
 
 
 def _is_sure(model: MapModel, fit: MapFit) -> bool:
@@ -160,7 +106,7 @@ def _is_sound(model: MapModel, fit: MapFit) -> bool:
     return not agreement_of(fit, network.sigmas_m, len(network.ranges_m) - model.size).is_denied
 
 
-# -- maps that wrong ranges do not bend -------------------------------------------------------------------------------
+# -- the search -------------------------------------------------------------------------------------------------------
 
 _WIDER = 8.0  # times the robust scale of the first steps from a grown map, whose places are off by several sigmas
 _FIRST_STEPS = 30
@@ -169,42 +115,111 @@ _SETTLED = 0.01  # relative change of a scale that ends the rounds
 _LEAST_FACTOR = 1e-9  # of sigmas, that is not nought where the ranges are exact
 
 
-def searched(model: MapModel, best: MapFit, settings: MapFitSettings) -> tuple[MapFit, bool]:
-    """The fit of least robust cost that grown maps lead to, or the one given; whether several of them led there.
+class _Judged(NamedTuple):
+    badness: float  # cost, or scale of the residuals where the sigmas are sought
+    model: MapModel
+    fit: MapFit
 
-    Least squares is drawn towards wrong ranges, and a robust fit from there stays among them.
+
+class _Search:
+    """Fits from one start after the other, until one is sure, or the best was found several times and is sound.
+
+    The best is that of least cost. Where the sigmas are sought it is that of least scale of its residuals, fitted with
+    sigmas of that scale (``scaled``).
     """
-    return _found_again(best, _grown_fits(model, best, settings), lambda fit: fit.cost, _SAME)
+
+    def __init__(self, model: MapModel, settings: MapFitSettings, finds_sigma: bool) -> None:
+        self._model, self._settings, self._finds_sigma = model, settings, finds_sigma
+        self._best: _Judged | None = None
+        self.iterations = 0
+
+    def best_of(self, start_m: FloatArray | None) -> tuple[_Judged, bool]:
+        """The best, and whether it is sure or was found often enough. ``start_m``: as of ``map_motes``."""
+        same = _SETTLED if self._finds_sigma else _SAME
+        enough = _FOUND if self._model.network.count <= _FEW else _FOUND - 1
+        best, times = self._judge(self._unfolded_fit()), 0
+        self._best = best
+        for fit in () if self._is_sure(best) else self._other_fits(start_m):
+            found = self._judge(fit)
+            if found.badness < best.badness * (1.0 - same):
+                self._best = best = found
+                times = 0
+            times += found.badness <= best.badness * (1.0 + same)
+            if self._is_sure(best) or (times >= enough and _is_sound(best.model, best.fit)):
+                return best, True
+        return best, self._is_sure(best)
+
+    def _other_fits(self, start_m: FloatArray | None) -> Iterator[MapFit]:
+        network = self._model.network
+        if self._model.with_offset or self._model.with_scale:
+            # An offset bends the map that the unfolding begins with: again, with what is known of it by now.
+            yield self._unfolded_fit()
+        if start_m is not None:
+            yield self._fit(filled(start_m, network))
+        is_few = network.count <= _FEW
+        if not network.bodies and np.isfinite(self._settings.robust_scale):
+            yield from self._grown_fits(_DRAWS if is_few else _MANY_DRAWS)
+        for draw in range(_DRAWS if is_few else 0):
+            yield self._unfolded_fit(np.random.default_rng(draw))
+
+    def _grown_fits(self, draws: int) -> Iterator[MapFit]:
+        """Least squares is drawn towards wrong ranges, and a robust fit from there stays among them; growing is not."""
+        robust_scale = self._settings.robust_scale
+        wide = self._settings._replace(robust_scale=_WIDER * robust_scale, max_iterations=_FIRST_STEPS)
+        for draw in range(draws):  # the same for the same ranges
+            network = self._corrected()
+            places = grown(network, robust_scale, np.random.default_rng(draw))
+            if places is not None:
+                near = [fit_map(self._model, start, wide) for start in self._states(filled(places, network))]
+                yield self._least([fit_map(self._model, fit.state, self._settings) for fit in near])
+
+    def _unfolded_fit(self, rng: np.random.Generator | None = None) -> MapFit:
+        return self._fit(unfolded(with_bodies(self._corrected()), rng))
+
+    def _fit(self, start_m: FloatArray) -> MapFit:
+        # Sigmas that are sought may be far off: they say nothing yet of what is wrong.
+        how = self._settings._replace(robust_scale=float("inf")) if self._finds_sigma else self._settings
+        return self._least([fit_from_afar(self._model, start, how) for start in self._states(start_m)])
+
+    def _least(self, fits: list[MapFit]) -> MapFit:
+        self.iterations += sum(fit.iterations for fit in fits)
+        return min(fits, key=_cost)
+
+    def _states(self, start_m: FloatArray) -> list[MapState]:
+        offset_m, scale = (0.0, 0.0) if self._best is None else self._best.fit.state[1:]
+        return [self._model.state(image, offset_m, scale) for image in images(self._model.network, start_m)]
+
+    def _judge(self, fit: MapFit) -> _Judged:
+        if self._finds_sigma:
+            return _Judged(*scaled(self._model, fit, self._settings))
+        return _Judged(fit.cost, self._model, fit)
+
+    def _is_sure(self, found: _Judged) -> bool:
+        return found.badness <= 1.0 if self._finds_sigma else _is_sure(found.model, found.fit)
+
+    def _corrected(self) -> RangeNetwork:
+        """The network with its ranges freed of the offset and the scale that were found."""
+        network = self._model.network
+        if self._best is None:
+            return network
+        _, offset_m, scale = self._best.fit.state
+        return replace(network, ranges_m=np.maximum((network.ranges_m - offset_m) / (1.0 + scale), 0.0))
 
 
-def scaled(model: MapModel, first: MapFit, settings: MapFitSettings) -> tuple[MapModel, MapFit]:
-    """The map with the least scale of its residuals, fitted robustly with the sigmas of that scale, which it has.
+def scaled(model: MapModel, fit: MapFit, settings: MapFitSettings) -> tuple[float, MapModel, MapFit]:
+    """The scale of a map's residuals in sigmas; the model with sigmas of that scale, and the map fitted with them.
 
     Residuals of a fit that wrong ranges have bent are all too large, those of a robust fit are not: the scale follows
-    from the fit and the fit from the scale, in turn (S-estimate: Rousseeuw and Yohai 1984). Where it comes out larger
-    than the sigmas were taken for, grown maps are tried too. ``model``: network with sigmas that are right up to a
-    factor.
+    from the fit and the fit from the scale, in turn (S-estimate: Rousseeuw and Yohai 1984).
     """
-    best = _settled(model, first, settings)
-    # Shapes of bodies hold a map together by themselves.
-    if best[0] > 1.0 and not model.network.bodies and np.isfinite(settings.robust_scale):
-        others = (_settled(model, fit, settings) for fit in _grown_fits(model, first, settings))
-        best, _ = _found_again(best, others, lambda found: found[0], _SETTLED)
-    return best[1:]
-
-
-def _found_again(
-    best: Found, others: Iterator[Found], cost: Callable[[Found], float], same: float
-) -> tuple[Found, bool]:
-    """The least of some maps, up to the one that finds it for the third time; whether one did."""
-    times = 0
-    for found in others:
-        if cost(found) < cost(best) * (1.0 - same):
-            best, times = found, 0
-        times += cost(found) <= cost(best) * (1.0 + same)
-        if times >= _FOUND:
-            return best, True
-    return best, False
+    factor, at = float("inf"), model
+    for _ in range(_SCALE_ROUNDS):
+        before, factor = factor, max(residual_scale(model, fit), _LEAST_FACTOR)
+        at = model.with_sigmas(factor)
+        fit = fit_map(at, fit.state, settings)
+        if factor < 1.0 or abs(factor - before) <= _SETTLED * factor:
+            break
+    return factor, at, fit
 
 
 def residual_scale(model: MapModel, fit: MapFit) -> float:
@@ -217,25 +232,6 @@ def residual_scale(model: MapModel, fit: MapFit) -> float:
     quantile = float(np.sort(np.abs(fit.residuals_m) / model.network.sigmas_m)[place - 1])
     normal = float(ndtri(0.5 + 0.5 * (place - 0.5) / count)) * np.sqrt(1.0 - size / count)
     return quantile / float(normal)
-
-
-def _settled(model: MapModel, fit: MapFit, settings: MapFitSettings) -> tuple[float, MapModel, MapFit]:
-    factor, at = float("inf"), model
-    for _ in range(_SCALE_ROUNDS):
-        before, factor = factor, max(residual_scale(model, fit), _LEAST_FACTOR)
-        at = model.with_sigmas(factor)
-        fit = fit_map(at, fit.state, settings)
-        if factor < 1.0 or abs(factor - before) <= _SETTLED * factor:
-            break
-    return factor, at, fit
-
-
-def _grown_fits(model: MapModel, best: MapFit, settings: MapFitSettings) -> Iterator[MapFit]:
-    offset_m, scale = best.state.offset_m, best.state.scale
-    wide = settings._replace(robust_scale=_WIDER * settings.robust_scale, max_iterations=_FIRST_STEPS)
-    for images in grown_starts(_corrected(model, best.state), settings.robust_scale):
-        near = [fit_map(model, model.state(image, offset_m, scale), wide) for image in images]
-        yield _least([fit_map(model, fit.state, settings) for fit in near])
 
 
 # -- folds ------------------------------------------------------------------------------------------------------------
