@@ -5,6 +5,7 @@ import http.client
 import json
 import os
 import re
+import shlex
 import signal
 import socket
 import subprocess
@@ -12,7 +13,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
@@ -21,6 +23,7 @@ import psutil
 import pytest
 import zmq
 
+from ccatp.cli import main
 from ccatp.config.load import load_config
 from ccatp.daemon.streaming import streamed_schemas
 from ccatp.errors import RefusedError
@@ -74,110 +77,6 @@ def open_page(port: int) -> Iterator[socket.socket]:
         while b"event: news" not in received:
             received += page.recv(65_536)
         yield page
-
-
-# -- beside one run ---------------------------------------------------------------------------------------------------
-
-
-class Beside(NamedTuple):
-    """A run that lasts longer than these tests, and `ccatp stream` beside it."""
-
-    run: Run
-    stream: "subprocess.Popen[str]"
-
-
-@pytest.fixture(scope="module")
-def beside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beside]:
-    with tempfile.TemporaryDirectory(prefix="ccatp-") as sockets:
-        command = [sys.executable, "-m", "ccatp", "stream", "--runtime-dir", sockets, "--port", "0"]
-        args = ("--realtime", "--panels", "9", "--mirror", "thesis-m1", *NO_CALIBRATION)
-        # The stream begins before the run, which must not mistake it for its recorder.
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as stream:
-            try:
-                with Run(tmp_path_factory.mktemp("beside") / "run", Path(sockets), *args) as run:
-                    run.until_state("driving")
-                    yield Beside(run, stream)
-            finally:
-                stream.kill()
-
-
-def test_a_late_viewer_sees_the_run(beside: Beside) -> None:
-    assert beside.stream.stderr is not None
-    where = beside.stream.stderr.readline().rpartition(" ")[2].strip()
-    with zmq.Context() as context, context.socket(zmq.SUB) as viewer:
-        viewer.setsockopt(zmq.LINGER, 0)
-        viewer.setsockopt(zmq.RCVTIMEO, 20_000)
-        viewer.setsockopt(zmq.SUBSCRIBE, b"")
-        viewer.connect(where)
-        found: dict[str, dict[str, object]] = {}
-        wanted = {"run", "view/panels", "view/frames", "view/robot", "view/sensors", "view/error", "mission"}
-        while wanted - found.keys():
-            topic, payload, t_s = viewer.recv_multipart()
-            found[topic.decode()] = json.loads(payload)
-            float(t_s)
-    assert found["run"] | {"run_dir": ""} == {
-        "mirror": "thesis-m1", "world": "thesis", "simulation": True, "seed": 1, "filter": "ekf", "run_dir": "",
-    }  # fmt: skip
-    assert abs(float(str(found["view/error"]["position_mm"]))) < 50.0
-    beside.stream.send_signal(signal.SIGTERM)
-    assert beside.stream.wait(10.0) == 0
-
-
-def check(*args: object) -> tuple[int, dict[str, dict[str, Any]]]:
-    """Exit status and findings of `ccatp check`."""
-    command = [sys.executable, "-m", "ccatp", "check", "--json", *map(str, args)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=False)
-    assert "Traceback" not in done.stderr
-    return done.returncode, {one["name"]: one for one in json.loads(done.stdout)["checks"]}
-
-
-def test_the_check_does_not_disturb_a_robot_that_is_driven(beside: Beside, tmp_path: Path) -> None:
-    run = beside.run
-    config = run.run_dir / "config.toml"
-    status, found = check("--config", config, "--runtime-dir", run.runtime_dir, "--runs-dir", tmp_path)
-    assert status == 1
-    assert "role taken" in found["robot link"]["found"]
-    assert "a daemon runs in" in found["runtime directory"]["found"]
-    # A machine that starts a command may serve a frame late, and the daemon holds for that, but never for the check.
-    at = run.ask("status")["status"]
-    assert at["state"] != "held" or "late" in at["cause"], at["cause"]
-
-
-def test_the_main_loop_samples_its_display_state_for_a_history_while_nobody_watches(beside: Beside) -> None:
-    main = f"ipc://{beside.run.runtime_dir / 'main'}"
-    with zmq.Context() as context:
-        history = Subscriber(context, [main], ["display_state"], is_uncounted=True)
-        samples = [history.receive(DEADLINE_S) for _ in range(2)]
-        history.close()
-    assert all(sample is not None and isinstance(sample[2], DisplayState) for sample in samples)
-
-
-def test_an_attached_dashboard_ends_with_a_page_open(beside: Beside) -> None:
-    with attached(beside.run) as (process, port):
-        assert ask(port, "GET", "/ground")[1]["is_sim"] is True
-        assert mission_of(port)["total"] == 81
-        with open_page(port) as page:
-            process.send_signal(signal.SIGTERM)
-            assert process.wait(DEADLINE_S) == 0
-            received = b"".join(iter(lambda: page.recv(65_536), b""))
-    assert b"event: end" in received
-    assert received.endswith(b"0\r\n\r\n")
-    assert beside.run.ask("status")["ok"]  # the daemon does not mind
-
-
-@contextmanager
-def attached(run: Run) -> Iterator[tuple["subprocess.Popen[str]", int]]:
-    """`ccatp dashboard` beside a run."""
-    command = [sys.executable, "-m", "ccatp", "dashboard", "--port", "0", "--runtime-dir", str(run.runtime_dir)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            found = URL.search(process.stdout.readline())
-            assert found is not None
-            yield process, int(found[1])
-        finally:
-            if process.poll() is None:
-                process.kill()
 
 
 # -- runs of their own ------------------------------------------------------------------------------------------------
@@ -285,16 +184,27 @@ def test_decimals_may_be_those_of_another_processor_and_nothing_else_may() -> No
 def looked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     """The directory in which the commands ran, and what they printed otherwise than the page shows."""
     folder = tmp_path_factory.mktemp("first_look")
-    path = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
-    env = {**os.environ, "PATH": path, "HOME": str(folder)}
     unlike = []
-    for command, shown in EXAMPLE.findall("".join(blocks(DOCS / "first_look.md", "console"))):
-        done = subprocess.run(
-            command, shell=True, cwd=folder, env=env, capture_output=True, text=True, timeout=300, check=False
-        )
-        if done.returncode or not is_like(shown, done.stdout):
-            unlike.append(f"$ {command}\n{done.stdout}{done.stderr}")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("HOME", str(folder))
+        patch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
+        for command, shown in EXAMPLE.findall("".join(blocks(DOCS / "first_look.md", "console"))):
+            status, printed = run_example(command)
+            if status or not is_like(shown, printed):
+                unlike.append(f"$ {command}\n{printed}")
     return folder, unlike
+
+
+def run_example(command: str) -> tuple[int, str]:
+    """Exit status and standard output; a command of ``ccatp`` that starts no processes, in this one."""
+    name, *words = shlex.split(command)
+    if name == "ccatp" and words[0] != "run":
+        with redirect_stdout(StringIO()) as printed:
+            return main(words), printed.getvalue()
+    env = os.environ | ({"MPLBACKEND": "none"} if name == "ccatp" else {})  # of its report nothing is shown
+    done = subprocess.run(command, shell=True, env=env, capture_output=True, text=True, timeout=300, check=False)
+    return done.returncode, done.stdout
 
 
 def test_the_commands_print_what_the_page_shows(looked: tuple[Path, list[str]]) -> None:
@@ -352,3 +262,107 @@ def test_what_plotjugglers_layout_plots_is_recorded_and_streamed(recorded: dict[
     assert [topic + field for topic, _, field in series if not is_there(topic, field, recorded)] == []
     for splitter in root.iter("DockSplitter"):
         assert splitter.get("count") == str(len(splitter)) == str(len(str(splitter.get("sizes")).split(";")))
+
+
+# -- beside one run, last in the file, so that it ends with them -------------------------------------------------------
+
+
+class Beside(NamedTuple):
+    """A run that lasts longer than these tests, and `ccatp stream` beside it."""
+
+    run: Run
+    stream: "subprocess.Popen[str]"
+
+
+@pytest.fixture(scope="module")
+def beside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Beside]:
+    with tempfile.TemporaryDirectory(prefix="ccatp-") as sockets:
+        command = [sys.executable, "-m", "ccatp", "stream", "--runtime-dir", sockets, "--port", "0"]
+        args = ("--realtime", "--panels", "9", "--mirror", "thesis-m1", *NO_CALIBRATION)
+        # The stream begins before the run, which must not mistake it for its recorder.
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as stream:
+            try:
+                with Run(tmp_path_factory.mktemp("beside") / "run", Path(sockets), *args) as run:
+                    run.until_state("driving")
+                    yield Beside(run, stream)
+            finally:
+                stream.kill()
+
+
+def test_a_late_viewer_sees_the_run(beside: Beside) -> None:
+    assert beside.stream.stderr is not None
+    where = beside.stream.stderr.readline().rpartition(" ")[2].strip()
+    with zmq.Context() as context, context.socket(zmq.SUB) as viewer:
+        viewer.setsockopt(zmq.LINGER, 0)
+        viewer.setsockopt(zmq.RCVTIMEO, 20_000)
+        viewer.setsockopt(zmq.SUBSCRIBE, b"")
+        viewer.connect(where)
+        found: dict[str, dict[str, object]] = {}
+        wanted = {"run", "view/panels", "view/frames", "view/robot", "view/sensors", "view/error", "mission"}
+        while wanted - found.keys():
+            topic, payload, t_s = viewer.recv_multipart()
+            found[topic.decode()] = json.loads(payload)
+            float(t_s)
+    assert found["run"] | {"run_dir": ""} == {
+        "mirror": "thesis-m1", "world": "thesis", "simulation": True, "seed": 1, "filter": "ekf", "run_dir": "",
+    }  # fmt: skip
+    assert abs(float(str(found["view/error"]["position_mm"]))) < 50.0
+    beside.stream.send_signal(signal.SIGTERM)
+    assert beside.stream.wait(10.0) == 0
+
+
+def check(*args: object) -> tuple[int, dict[str, dict[str, Any]]]:
+    """Exit status and findings of `ccatp check`."""
+    command = [sys.executable, "-m", "ccatp", "check", "--json", *map(str, args)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=False)
+    assert "Traceback" not in done.stderr
+    return done.returncode, {one["name"]: one for one in json.loads(done.stdout)["checks"]}
+
+
+def test_the_check_does_not_disturb_a_robot_that_is_driven(beside: Beside, tmp_path: Path) -> None:
+    run = beside.run
+    config = run.run_dir / "config.toml"
+    status, found = check("--config", config, "--runtime-dir", run.runtime_dir, "--runs-dir", tmp_path)
+    assert status == 1
+    assert "role taken" in found["robot link"]["found"]
+    assert "a daemon runs in" in found["runtime directory"]["found"]
+    # A machine that starts a command may serve a frame late, and the daemon holds for that, but never for the check.
+    at = run.ask("status")["status"]
+    assert at["state"] != "held" or "late" in at["cause"], at["cause"]
+
+
+def test_the_main_loop_samples_its_display_state_for_a_history_while_nobody_watches(beside: Beside) -> None:
+    main = f"ipc://{beside.run.runtime_dir / 'main'}"
+    with zmq.Context() as context:
+        history = Subscriber(context, [main], ["display_state"], is_uncounted=True)
+        samples = [history.receive(DEADLINE_S) for _ in range(2)]
+        history.close()
+    assert all(sample is not None and isinstance(sample[2], DisplayState) for sample in samples)
+
+
+def test_an_attached_dashboard_ends_with_a_page_open(beside: Beside) -> None:
+    with attached(beside.run) as (process, port):
+        assert ask(port, "GET", "/ground")[1]["is_sim"] is True
+        assert mission_of(port)["total"] == 81
+        with open_page(port) as page:
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(DEADLINE_S) == 0
+            received = b"".join(iter(lambda: page.recv(65_536), b""))
+    assert b"event: end" in received
+    assert received.endswith(b"0\r\n\r\n")
+    assert beside.run.ask("status")["ok"]  # the daemon does not mind
+
+
+@contextmanager
+def attached(run: Run) -> Iterator[tuple["subprocess.Popen[str]", int]]:
+    """`ccatp dashboard` beside a run."""
+    command = [sys.executable, "-m", "ccatp", "dashboard", "--port", "0", "--runtime-dir", str(run.runtime_dir)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            found = URL.search(process.stdout.readline())
+            assert found is not None
+            yield process, int(found[1])
+        finally:
+            if process.poll() is None:
+                process.kill()
