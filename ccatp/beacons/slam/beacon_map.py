@@ -18,11 +18,11 @@ class NoiseLevel:
     An innovation of variance S, of which the share a = f r / S is this noise, has the log-likelihood -(ln S + nu^2 / S)
     / 2: its derivative by ln f is a (nis - 1) / 2, its Fisher information a^2 / 2. So J <- J + a^2, ln f <- ln f + a
     (nis - 1) / J. ``prior``: J at the start, the innovations that the starting value counts for. ``memory``: largest J:
-    older innovations fade; 0: the factor stays one.
+    older innovations fade; 0: the factor stays one. ``least``: smallest factor.
     """
 
-    def __init__(self, prior: float, memory: float) -> None:
-        self.factor = 1.0
+    def __init__(self, prior: float, memory: float, least: float) -> None:
+        self.factor, self._least = 1.0, least
         self._information, self._memory = prior, memory
 
     def learn(self, nis: float, share: float) -> None:
@@ -34,10 +34,7 @@ class NoiseLevel:
         change = share * (nis - 1.0) / information
         if not -LARGEST < change < LARGEST:
             change = LARGEST if change > 0.0 else -LARGEST
-        factor = self.factor * exp(change)
-        if not 1.0 / FURTHEST < factor < FURTHEST:
-            factor = FURTHEST if factor > 1.0 else 1.0 / FURTHEST
-        self.factor = factor
+        self.factor = min(max(self.factor * exp(change), self._least), FURTHEST)
 
 
 LARGEST = 0.3  # most that one innovation may change the logarithm of the factor

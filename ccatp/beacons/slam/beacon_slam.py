@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.beacons.slam.beacon_map import (
+    FURTHEST,
     HEADING,
     AddedPoseNoise,
     BeaconMap,
@@ -114,7 +115,12 @@ class BeaconSlam:
         self._clock = DeadReckoning(is_delayed=bool(delay_names))
         self._map = BeaconMap(self.engine, self._shared)
         self._transport = HeadingTransport(self.engine) if how.transports else None
-        self.levels = {kind: NoiseLevel(how.learn_prior, how.learn_memory) for kind in (*models.by_kind, "motion")}
+        # Innovations show only what is new of an error that lasts: they teach no less noise than is set.
+        least = dict.fromkeys(models.by_kind, 1.0) if correlation_s > 0.0 else {}
+        self.levels = {
+            kind: NoiseLevel(how.learn_prior, how.learn_memory, least.get(kind, 1.0 / FURTHEST))
+            for kind in (*models.by_kind, "motion")
+        }
         self._learns = how.learn_memory > 0.0
         self._fresh = AddedPoseNoise()
         self._gate, self._knee, self._iterations = gate, how.knee_sigmas, iterations

@@ -245,6 +245,18 @@ def test_errors_that_stay_while_the_vehicle_does_are_not_averaged_away() -> None
     assert sigmas[1] > 3.0 * sigmas[0]
 
 
+@pytest.mark.parametrize(("correlation_s", "lasts"), [(0.0, False), (3.0, True)])
+def test_innovations_of_errors_that_last_teach_no_less_noise_than_is_set(correlation_s: float, *, lasts: bool) -> None:
+    def constant(time_s: float, world: World, beacon: BeaconId) -> Reading:
+        return RangeReading(time_s, beacon, world.range_m(beacon) + 0.05, world.bearing_rad(beacon) + 0.02)
+
+    world = start(SETTINGS.but(radio__correlation_s=correlation_s), constant)
+    world.drive(100)
+    factors = [world.slam.levels[kind].factor for kind in ("range", "bearing")]
+    assert (min(factors) >= 1.0) == lasts
+    assert lasts or min(factors) < 0.5
+
+
 def test_beacons_join_though_the_settings_promise_less_noise_than_there_is() -> None:
     world = start(SETTINGS.but(radio__range_sigma_m=0.025), ranges)
     world.drive(250)
