@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun
     from ccatp.config.beacon_models import CricketConfig
 
-FILTERS = ("ekf-slam", "smoother")
+FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 FORMAT_OPTION = click.option(
     "--format", "data_format", type=click.Choice(("plaza", "mrclam", "labyrinth", "csv", "bag")),
     help="Format of the data; found out if not given.",
@@ -34,7 +34,8 @@ ASSUMED_OPTION = common.settings_option("A key of recordings.toml, as in plaza.p
 @click.option("--robot", type=click.IntRange(min=1), metavar="N", help="Robot of an MRCLAM set; else the first there.")
 @click.option(
     "--filter", "filter_name", type=click.Choice(FILTERS), default=FILTERS[0], show_default=True,
-    help="ekf-slam: at each instant from readings up to it; smoother: from all of them.",
+    help="ekf-slam: at each instant from readings up to it; fixed-lag: that, and again some seconds later; "
+    "smoother: from all of them.",
 )  # fmt: skip
 @common.CONFIG_OPTION
 @ASSUMED_OPTION

@@ -551,6 +551,13 @@ class SlamFilterConfig(Model):
     turn_bias_walk_rad_s_sqrt_s: NonNegative
 
 
+class FixedLagConfig(Model):
+    """The window of the fixed-lag smoother."""
+
+    lag_s: Positive
+    poses: Annotated[int, Field(ge=1)]
+
+
 class RecordingsRunConfig(Model):
     """What the studies of recorded runs are made of."""
 
@@ -567,3 +574,4 @@ class RecordingsConfig(Model):
     labyrinth: RecordingConfig
     csv: RecordingConfig
     filter: SlamFilterConfig
+    fixed_lag: FixedLagConfig

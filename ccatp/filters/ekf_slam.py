@@ -139,6 +139,14 @@ class EkfSlam:
         self._columns[:] = rows.T
         self._vehicle[:] = vehicle_mean
 
+    def copy_states(self, block: BlockId, start: int) -> None:
+        """A block takes the value of the states from ``start`` on, as many as it has, and all their correlations."""
+        to = self.block(block)
+        source, P = slice(start, start + to.stop - to.start), self.covariance
+        self.mean[to] = self.mean[source]
+        P[to] = P[source]
+        P[:, to] = P[:, source]
+
     def relax(self, index: int, factor: float, variance: float) -> None:
         """One state forgets: x <- factor x + noise, a Gauss-Markov process; ``factor`` 0 to 1."""
         P = self.covariance

@@ -35,7 +35,7 @@ from ccatp.studies.campaign import CampaignError, Cell, CellResult, Factors, Job
 from ccatp.studies.gtsam_peer import PeerGaveUp, import_gtsam, run_gtsam
 from ccatp.studies.results import Measure, draw_ranges, rows_by
 
-FILTERS = ("ekf-slam", "smoother")
+FILTERS = ("ekf-slam", "fixed-lag", "smoother")
 PEERS = ("GTSAM iSAM2", "GTSAM batch")
 
 
@@ -52,8 +52,11 @@ def estimate(run: RecordedRun, assumed: RecordingsConfig, filter_name: str) -> E
     """
     cfg = getattr(assumed, run.kind)
     try:
-        find = smooth if filter_name == "smoother" else filter_run
-        track = find(run, cfg, assumed.filter, perf_counter)
+        if filter_name == "smoother":
+            track = smooth(run, cfg, assumed.filter, perf_counter)
+        else:
+            lag = assumed.fixed_lag if filter_name == "fixed-lag" else None
+            track = filter_run(run, cfg, assumed.filter, perf_counter, lag)
     except (FilterError, np.linalg.LinAlgError) as error:
         raise EstimateError(
             f"{run.name}: {filter_name} finds no finite map for these data ({str(error)[:80]}); look at its warnings"
@@ -167,6 +170,7 @@ def read_again(run: RecordedRun, tables: Mapping[str, Table], truth: ReferencePa
 
 START_SHARE, MOST_SHARE = 0.1, 0.8  # of the run, later for each seed; seed 0 has all of it
 _ERRORS = {"path_m": "trajectory_rmse_m", "heading_rad": "heading_rmse_rad", "beacons_m": "beacon_rmse_m"}
+_DELAYED = {"delayed_path_m": "trajectory_rmse_m", "delayed_nees": "nees_mean"}
 _SHOWN = {"range_scale": "range_scale", "nis": "nis_mean", "nees": "nees_mean", "update_us": "update_us_p50"}
 
 
@@ -196,7 +200,9 @@ def run_recordings(job: Job) -> JobOutcome:
                 return JobOutcome({"gave_up": True})
         run_s = perf_counter() - begin_s
         data = result_data(run, estimator, track, judge(track, run))
-        rows.append({key: data[value] for key, value in (_ERRORS | _SHOWN).items()} | {"run_s": run_s})
+        row = {key: data[value] for key, value in (_ERRORS | _SHOWN).items()}
+        late = data["delayed"] or dict.fromkeys(_DELAYED.values())
+        rows.append(row | {key: late[value] for key, value in _DELAYED.items()} | {"run_s": run_s})
     values = {key: [one[key] for one in rows] for key in rows[0]}
     if estimator not in FILTERS:
         values["nees"] = [None]  # it is asked for no covariances
@@ -282,7 +288,7 @@ RECORDINGS = Study(
     run_job=run_recordings,
     combine=combine_recordings,
     columns="""
-        path_m heading_rad beacons_m range_scale nis nees covered gave_up update_us run_s
+        path_m heading_rad beacons_m range_scale nis nees delayed_path_m delayed_nees covered gave_up update_us run_s
         started_path_m: p10 p50 p90
         started_beacons_m: p10 p50 p90
     """,

@@ -513,6 +513,19 @@ def test_a_state_that_forgets() -> None:
     assert ours.covariance == pytest.approx(np.array(((1.0, 0.25), (0.25, 0.5 + 0.75))))
 
 
+def test_a_copy_of_a_state_is_corrected_as_the_state_was() -> None:
+    """x1 = x0 + w: with a copy of x0, a reading of x1 is the textbook's smoother of two steps."""
+    ours = EkfSlam(np.zeros(1), np.eye(1))
+    ours.augment("copy", np.full(1, 9.0), np.arange(0), np.zeros((1, 0)), np.eye(1), np.eye(1))
+    ours.copy_states("copy", 0)
+    ours.predict(np.zeros(1), np.eye(1), np.eye(1))
+    ours.update_row(np.arange(1), np.ones(1), 1.0, 1.0)
+    exact = ExactFilter(np.zeros(2), np.array(((2.0, 1.0), (1.0, 1.0))))
+    exact.update(np.ones(1), np.array(((1.0, 0.0),)), np.eye(1))
+    assert ours.mean == pytest.approx(exact.mean)
+    assert ours.covariance == pytest.approx(exact.covariance)
+
+
 def test_refusals() -> None:
     ours = EkfSlam(np.zeros(3), np.eye(3))
     with pytest.raises(FilterShapeError, match=r"F has shape \(2, 2\)"):

@@ -52,7 +52,7 @@ def told(capsys: pytest.CaptureFixture[str], *argv: object) -> Any:
     return answered(capsys, "radio", *argv)
 
 
-@pytest.mark.parametrize("filter_name", ["ekf-slam", "smoother"])
+@pytest.mark.parametrize("filter_name", ["ekf-slam", "fixed-lag", "smoother"])
 def test_json_is_the_contracts(
     recording: Path, tmp_path: Path, filter_name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -75,6 +75,7 @@ def test_json_is_the_contracts(
     assert data["update_us_p50"] > 0.0
     assert (data["nis_mean"] is None) == (filter_name == "smoother")
     assert data["nees_mean"] > 0.0
+    assert (data["delayed"] is None) == (filter_name != "fixed-lag")
     assert all(warning in err for warning in data["warnings"])
 
 
@@ -343,7 +344,8 @@ def test_slam_with_peers_prints_all_side_by_side(tmp_path: Path, capsys: pytest.
     file = write_lines(tmp_path / "mine.csv", csv_lines(world(seconds=20.0)))
     assert main(["radio", "slam", str(file), "--peers"]) == 0
     rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| mine")]
-    assert [line.split("|")[2].strip() for line in rows] == ["ekf-slam", "smoother", "GTSAM iSAM2", "GTSAM batch"]
+    names = [line.split("|")[2].strip() for line in rows]
+    assert names == ["ekf-slam", "fixed-lag", "smoother", "GTSAM iSAM2", "GTSAM batch"]
 
 
 def test_a_peer_that_gives_up_leaves_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -353,5 +355,5 @@ def test_a_peer_that_gives_up_leaves_the_table(tmp_path: Path, capsys: pytest.Ca
     out, err = capsys.readouterr()
     rows = [[cell.strip() for cell in line.split("|")[2:-1]] for line in out.splitlines() if line.startswith("| bear")]
     assert [row[0] for row in rows if row[-1] == "True"] == ["GTSAM iSAM2", "GTSAM batch"]
-    assert len(rows) == 4
+    assert len(rows) == 5
     assert "warning: bearings: not all readings have a range" in err

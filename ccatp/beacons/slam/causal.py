@@ -10,10 +10,11 @@ import numpy as np
 
 from ccatp.beacons.slam.beacon_map import HEADING
 from ccatp.beacons.slam.beacon_slam import BeaconInnovation, BeaconSlam, recorded_slam
-from ccatp.beacons.slam.motion import Increment
+from ccatp.beacons.slam.motion import POSE, Increment
 from ccatp.beacons.slam.recording import (
     BeaconFix,
     Calibrated,
+    DelayedPath,
     EstimatedPath,
     RangeReading,
     Reading,
@@ -21,7 +22,7 @@ from ccatp.beacons.slam.recording import (
     RssiReading,
     Steps,
 )
-from ccatp.config.beacon_models import RecordingConfig, SlamFilterConfig
+from ccatp.config.beacon_models import FixedLagConfig, RecordingConfig, SlamFilterConfig
 from ccatp.core import FloatArray
 
 FAR = 3.0  # standard deviations of the prior beyond which a value is reported
@@ -59,9 +60,14 @@ class HeadingRelocalizer:
         self._scores = [0.0]
         self._taken, self._is_guessed = 0, False
 
+    @property
+    def all(self) -> list[BeaconSlam]:
+        """All of them, the best one first."""
+        return [self.best, *self._others]
+
     def predict(self, odometry: Increment) -> None:
         """Carry all of them on; behind a gap the heading is split."""
-        for slam in (self.best, *self._others):
+        for slam in self.all:
             slam.predict(odometry)
         was_guessed, self._is_guessed = self._is_guessed, odometry.guess_rad2 > 0.0
         if was_guessed and not self._is_guessed and self.best.pose_covariance[HEADING, HEADING] > LOST_RAD**2:
@@ -93,7 +99,7 @@ class HeadingRelocalizer:
             each.sort(key=lambda one: str(one.beacon))
         if len({tuple(one.beacon for one in each) for each in learned}) > 1:
             return
-        slams = [self.best, *self._others]
+        slams = self.all
         self._scores = [
             score + sum(one.surprise - max(one.nis - OUTLIER, 0.0) for one in each)
             for score, each in zip(self._scores, learned, strict=True)
@@ -105,6 +111,41 @@ class HeadingRelocalizer:
         self.best, *self._others = (slams[k] for _, k in kept)
 
 
+class FixedLag:
+    """Copies of the poses of the last seconds in the filter's state: each reading corrects them with it.
+
+    A fixed-lag smoother by state augmentation (Moore 1973). The copies are a ring, so nothing else in the state moves.
+    """
+
+    def __init__(self, how: FixedLagConfig, slam: BeaconSlam) -> None:
+        self._lag_s, self._count, self._spacing_s = how.lag_s, how.poses, how.lag_s / how.poses
+        self._kept, self._times_s = list[tuple[FloatArray, FloatArray]](), list[float]()
+        for k in range(how.poses):
+            slam.engine.augment((KEPT, k), slam.engine.mean[:POSE].copy(), np.arange(POSE), np.eye(POSE))
+
+    def keep(self, time_s: float, search: HeadingRelocalizer) -> None:
+        """Keep the pose of now where it is due, in place of the oldest one, which is what is known of it then."""
+        if self._times_s and time_s < self._times_s[-1] + self._spacing_s:
+            return
+        if len(self._times_s) >= self._count:
+            self._hand_over(search.best)
+        for slam in search.all:
+            slam.engine.copy_states((KEPT, len(self._times_s) % self._count), 0)
+        self._times_s.append(time_s)
+
+    def path(self, slam: BeaconSlam) -> DelayedPath:
+        """All of it, at the end."""
+        while len(self._kept) < len(self._times_s):
+            self._hand_over(slam)
+        poses, covariances = zip(*self._kept, strict=True)
+        return DelayedPath(self._lag_s, np.array(self._times_s), np.array(poses), np.array(covariances))
+
+    def _hand_over(self, slam: BeaconSlam) -> None:
+        at = slam.engine.block((KEPT, len(self._kept) % self._count))
+        self._kept.append((slam.engine.mean[at].copy(), slam.engine.covariance[at, at].copy()))
+
+
+KEPT = "kept"  # first part of the name of a block that holds the copy of a pose
 FINEST_S = 0.1
 # Mean square of normalised innovations, per degree of freedom, that is reported: of learned noise it is one.
 DOUBTFUL_NIS = 1.3
@@ -113,10 +154,11 @@ DOUBTFUL_SHARE = 0.3  # share of refused readings that is reported
 
 
 def filter_run(
-    run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float]
-) -> EstimatedPath:
-    """Run the filter over a recording; nothing of the truth is used but the first pose."""
-    return follow(run, cfg, how, clock_s)[0]
+    run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float],
+    lag: FixedLagConfig | None = None,
+) -> EstimatedPath:  # fmt: skip
+    """Run the filter over a recording, or the fixed-lag smoother; of the truth the first pose alone is used."""
+    return follow(run, cfg, how, clock_s, lag=lag)[0]
 
 
 def follow(
@@ -125,6 +167,7 @@ def follow(
     how: SlamFilterConfig,
     clock_s: Callable[[], float],
     finest_s: float = FINEST_S,
+    lag: FixedLagConfig | None = None,
 ) -> tuple[EstimatedPath, BeaconSlam]:
     """The path by the filter, and the filter as it is at the end.
 
@@ -133,6 +176,7 @@ def follow(
     position, heading = cfg.priors.pose_m, cfg.priors.heading_rad
     first = np.diag((position**2, position**2, heading**2))
     search = HeadingRelocalizer(recorded_slam(cfg, how, run.first_pose, first))
+    window = None if lag is None else FixedLag(lag, search.best)
     times = np.union1d(_spaced(run.steps.times_s, finest_s), run.readings.times_s)
     increments, readings = _increments(run.steps, times), list(_readings(run))
     ends = np.searchsorted([reading.time_s for reading in readings], times, side="right").tolist()
@@ -146,6 +190,8 @@ def follow(
             search.predict(increments[k - 1])
         predicted_s = clock_s()
         predict_s.append(predicted_s - begin_s)
+        if window is not None:
+            window.keep(float(times[k]), search)
         if now := readings[begin:end]:
             taken = search.observe(now)
             end_s = clock_s()
@@ -178,6 +224,7 @@ def follow(
         update_s=np.array(update_s),
         predict_s=np.array(predict_s[1:]),
         scalar_s=np.array(scalar_s),
+        delayed=None if window is None else window.path(slam),
         map_covariance=slam.engine.covariance[np.ix_(at, at)],
         updates=len(accepted),
         warnings=(

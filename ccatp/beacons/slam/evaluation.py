@@ -126,12 +126,26 @@ def result_data(run: RecordedRun, filter_name: str, track: EstimatedPath, judged
         "nis_mean": None if nis is None else nis.mean,
         "nis_band": None if nis is None else [nis.low, nis.high],
         "nees_mean": None if nees is None else nees.mean,
+        "delayed": _delayed(run, track),
         "updates": track.updates,
         "refused": track.refused,
         "update_us_p50": _median_us(track.update_s),
         "predict_us_p50": _median_us(track.predict_s),
         "scalar_us_p50": _median_us(track.scalar_s),
         "warnings": [*run.warnings, *track.warnings],
+    }
+
+
+def _delayed(run: RecordedRun, track: EstimatedPath) -> dict[str, float | None] | None:
+    if track.delayed is None:
+        return None
+    lag_s, times_s, poses, covariances = track.delayed
+    judged = judge(track._replace(times_s=times_s, poses=poses, covariances=covariances), run)
+    return {
+        "lag_s": lag_s,
+        "trajectory_rmse_m": _finite(judged.trajectory_rmse_m),
+        "heading_rmse_rad": _finite(judged.heading_rmse_rad),
+        "nees_mean": None if judged.nees is None else judged.nees.mean,
     }
 
 
@@ -146,6 +160,8 @@ def table_lines(run: RecordedRun, data: dict[str, Any]) -> list[str]:
         ("path", _errors(data)),
         ("beacons", _number(data["beacon_rmse_m"], "{:.3f} m rms")),
     ]
+    if (late := data["delayed"]) is not None:
+        rows.insert(3, ("delayed", f"by {late['lag_s']:g} s: {_errors(late)}"))
     rows += [("calibration", f"{name} {c['value']:.5g} +- {c['sigma']:.2g}") for name, c in data["calibration"].items()]
     if data["nis_mean"] is not None:
         low, high = data["nis_band"]

@@ -117,6 +117,15 @@ class Calibrated(NamedTuple):
     sigma: float
 
 
+class DelayedPath(NamedTuple):
+    """Where the vehicle was, from readings up to ``lag_s`` later; the last poses from those that there were."""
+
+    lag_s: float
+    times_s: FloatArray  # shape (n,), rising
+    poses: FloatArray  # x_m, y_m, heading_rad, shape (n, 3)
+    covariances: FloatArray  # shape (n, 3, 3)
+
+
 class EstimatedPath(NamedTuple):
     """An estimate of a run.
 
@@ -139,6 +148,7 @@ class EstimatedPath(NamedTuple):
     update_s: FloatArray = np.empty(0)
     predict_s: FloatArray = np.empty(0)  # wall time of each prediction, s; none from a smoother
     scalar_s: FloatArray = np.empty(0)
+    delayed: DelayedPath | None = None
     map_covariance: FloatArray = np.empty((0, 0))  # of all beacons' x_m, y_m in their order, shape (2 b, 2 b)
 
 

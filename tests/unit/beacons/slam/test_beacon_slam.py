@@ -32,6 +32,7 @@ from ccatp.beacons.slam.recording import (
     RssiReading,
     Steps,
 )
+from ccatp.config.beacon_models import FixedLagConfig
 from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.ekf_slam import BlockError
@@ -349,6 +350,31 @@ def test_filter_and_smoother_mean_the_same_by_a_name() -> None:
         assert track.calibration["distance_per_rad"].value == pytest.approx(0.06, abs=0.02)
         assert track.calibration["turn_scale"].value == pytest.approx(-0.08, abs=0.03)
         assert track.calibration["odometry_delay_s"].value == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_fixed_lag_gives_what_the_smoother_of_all_readings_up_to_its_end_gives(seed: int) -> None:
+    """With noise as it is set and no outliers both are least squares; they differ by where they are linearised."""
+    run, lag = recorded(world(seed)), FixedLagConfig(lag_s=10.0, poses=10)
+    given = SETTINGS.but(
+        **trust(100.0, 100.0, 0.0, 5.0, 3, 20), radio__bearing_sigma_rad=0.02, radio__freedom=1e6,
+        priors__turn_per_m=0.0,
+    )  # fmt: skip
+    track = filter_run(run, *given, no_clock, lag)
+    causal = filter_run(run, *given, no_clock)
+    np.testing.assert_allclose(track.poses, causal.poses, atol=1e-9)
+    assert track.delayed is not None
+    _, times_s, poses, covariances = track.delayed
+    for k in (20, 35, 45, -1):
+        end_s = times_s[k] + lag.lag_s
+        upto = replace(run, readings=run.readings.where(run.readings.times_s <= end_s))
+        smoothed = smooth(upto, *given, no_clock)
+        at = int(np.argmin(np.abs(smoothed.times_s - times_s[k])))
+        assert smoothed.times_s[at] == pytest.approx(times_s[k], abs=0.05)
+        expected = [np.interp(times_s[k], smoothed.times_s, column) for column in smoothed.poses.T]
+        sigmas = np.sqrt(np.diag(covariances[k]))
+        assert np.all(np.abs(poses[k] - expected) < 0.3 * sigmas)
+        assert sigmas == pytest.approx(np.sqrt(np.diag(smoothed.covariances[at])), rel=0.15)
 
 
 def test_a_calibration_that_no_reading_told_is_not_told() -> None:
