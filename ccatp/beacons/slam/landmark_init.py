@@ -25,6 +25,9 @@ STARTS = 24  # directions about the vehicle in which a beacon is looked for
 TIGHT = 0.1  # largest standard deviation, across the line of sight, of a beacon that joins, relative to its distance
 # How many times that is borne at last, in proportion to the readings: the vehicle strays while beacons wait.
 LOOSEST = 2.5
+# Largest second-order change of a waiting reading, in its sigmas, over the spread of the place across its line of
+# sight: seen from near by, the arc on which a far beacon may lie is no Gaussian.
+BEND = 1.0
 DEEP = 0.3  # the same along it, where ranges are all but linear: a scale that all share may be that uncertain
 APART = 0.05  # places nearer to each other than that, relative to the distance, are one
 # Residuals beyond that many sigmas first weigh no more than those at it (Huber), at last nothing: readings round a
@@ -60,6 +63,9 @@ class Candidate(NamedTuple):
     covariance: FloatArray  # shape (b, b)
     cost: float
     variances: FloatArray  # of the readings' noise, larger where they look too far off, shape (m,)
+    bend: (
+        float  # most that a reading changes in second order over a standard deviation across its line of sight, sigmas
+    )
 
 
 class StackedRows:
@@ -179,7 +185,10 @@ class PendingLandmark:
         distance = hypot(*sight.tolist())
         along, across = sight / distance, np.array((-sight[1], sight[0])) / distance
         C = best.covariance[:2, :2]
-        tight = TIGHT * min(max(self.count / MOST, 1.0), LOOSEST)
+        loose = min(max(self.count / MOST, 1.0), LOOSEST)
+        tight = TIGHT * loose
+        if best.bend > BEND * loose:
+            return None
         if across.dot(C).dot(across) > (tight * distance) ** 2 or along.dot(C).dot(along) > (DEEP * distance) ** 2:
             return None
         m = len(self.records)
@@ -230,7 +239,15 @@ class _Problem(NamedTuple):
             if size < 1e-3 * stride and (k > ROBUST or not self.is_robust):
                 break
             b = b + step * min(1.0, stride / max(size, 1e-12))
-        return Candidate(b, np.linalg.inv(A), cost, variances)
+        return Candidate(
+            b, np.linalg.inv(A), cost, variances, self._bend(b, np.linalg.inv(A)) if self.is_robust else 0.0
+        )
+
+    def _bend(self, b: FloatArray, C: FloatArray) -> float:
+        _, G, _, R = self.rows.at(self.x, b.tolist())
+        x, y = (b[:2] - np.array([self.x[block][:2] for block in self.rows.blocks])).T
+        across = (C[0, 0] * y * y - 2.0 * C[0, 1] * x * y + C[1, 1] * x * x) / (x * x + y * y)
+        return float((0.5 * np.hypot(G[:, 0], G[:, 1]) * across / (np.hypot(x, y) * np.sqrt(R))).max())
 
 
 def _mirrored(places: FloatArray, point: FloatArray) -> tuple[float, float]:
