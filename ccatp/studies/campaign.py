@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from hashlib import sha256
 from json import dumps
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
@@ -74,11 +73,14 @@ class Job:
         return sha256(dumps(whole, sort_keys=True).encode()).hexdigest()[:16]
 
 
+NO_ARRAYS: Arrays = {}  # not to be written to; a read-only view could not cross to another process
+
+
 class JobOutcome(NamedTuple):
     """The outcome of a job, or of all jobs of a cell; numbers in ``values`` that are not finite become null."""
 
     values: Mapping[str, Any]
-    arrays: Arrays = MappingProxyType({})
+    arrays: Arrays = NO_ARRAYS
 
 
 class CellResult(NamedTuple):

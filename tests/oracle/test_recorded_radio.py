@@ -7,10 +7,12 @@ import pytest
 
 from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.slam.batch_smoother import smooth
-from ccatp.beacons.slam.evaluation import TrackEvaluation, judge
+from ccatp.beacons.slam.evaluation import TrackEvaluation, judge, result_data
 from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun
 from ccatp.config.load import load_recordings_config
+from ccatp.studies.recordings import estimate, shipped_window
 
+PLAZA2_S = 409.523  # how long it takes
 DATA = Path(__file__).parents[3] / "shared" / "data" / "radio"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"the recorded radio data are not at {DATA}")
 
@@ -35,6 +37,19 @@ def test_plaza2_smoothed() -> None:
     told = " | ".join(run.warnings)
     for warning in ("turned by pi", "odometry distance equals the truth", "ranges read +7.0 per cent"):
         assert warning in told
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4])
+def test_plaza2_started_later(share: float) -> None:
+    """The filter, and the fixed-lag smoother; of four tenths a beacon joined 16 m off and its path was 3.2 m off."""
+    run = shipped_window(str(DATA), "Plaza2", None, share * PLAZA2_S, PLAZA2_S)
+    track = estimate(run, load_recordings_config(), "fixed-lag")
+    found, late = judge(track, run), result_data(run, "fixed-lag", track, judge(track, run))["delayed"]
+    assert found.trajectory_rmse_m is not None
+    assert found.nees is not None
+    assert found.trajectory_rmse_m < 0.8
+    assert found.nees.mean < 2.0
+    assert late["trajectory_rmse_m"] < found.trajectory_rmse_m
 
 
 def test_mrclam7_smoothed() -> None:

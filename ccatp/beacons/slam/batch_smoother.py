@@ -25,6 +25,8 @@ from ccatp.core import FloatArray
 
 LEAST_DAMPING = 1e-9
 MOST_DAMPING = 1e9
+SLOW = 0.5  # ratio of a step to the one before from which on both are taken for terms of a geometric series
+FURTHEST = 10.0  # steps that are taken at once
 CONVERGED = 1e-5  # relative gain below which a cost has converged
 WELL_CONVERGED = 1e-6  # the same before noise is widened: what has not converged looks like noise
 
@@ -109,28 +111,35 @@ def descend(
         steps = np.einsum("ki,kij,kj->k", r.odometry, r.odometry_information, r.odometry)
         return problem.prior_cost(tried) + 0.5 * float(steps.sum()) + readings
 
-    residuals, cost = problem.residuals(state), cost_of(state)
+    cost, before = cost_of(state), None
     for _ in range(most):
-        weights = t_weights(residuals.chi2, problem.sizes, problem.radio.freedom, softness)
+        weights = t_weights(problem.residuals(state).chi2, problem.sizes, problem.radio.freedom, softness)
         system = problem.normal_equations(state, weights)
-        while (tried := _step(problem, state, system, damping)) is None or cost_of(tried) > cost:
+        while (step := _step(problem, system, damping)) is None or cost_of(tried := state.moved(*step)) > cost:
             damping = max(damping, LEAST_DAMPING) * 10.0
             if damping > MOST_DAMPING:
                 return state, True
-        gain, state = cost - cost_of(tried), tried
-        residuals, cost = problem.residuals(state), cost - gain
         damping = max(damping * 0.1, LEAST_DAMPING)
+        gain, state = cost - cost_of(tried), tried
+        cost -= gain
         if gain <= enough * max(abs(cost), 1.0):
             return state, True
+        rate = 0.0 if before is None else float(np.vdot(before[0], step[0]) / np.vdot(before[0], before[0]))
+        before = step
+        if SLOW < rate < 1.0:  # as steps of weights do that follow the residuals: the sum of all that would come
+            further = min(rate / (1.0 - rate), FURTHEST)
+            tried = state.moved(further * step[0], further * step[1])
+            if (shorter := cost_of(tried)) < cost:
+                state, cost, before = tried, shorter, None
     return state, False
 
 
-def _step(problem: BatchProblem, state: BatchState, system: ArrowSystem, damping: float) -> BatchState | None:
+def _step(problem: BatchProblem, system: ArrowSystem, damping: float) -> tuple[FloatArray, FloatArray] | None:
     try:
         poses, shared = Factored(system, damping).solution()
     except LinAlgError:
         return None  # not positive definite
-    return state.moved(poses, problem.spread(shared))
+    return poses, problem.spread(shared)
 
 
 SPACING_S = 0.5  # there is a pose at least that often, with a reading or without
