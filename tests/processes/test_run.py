@@ -4,9 +4,11 @@ import json
 import os
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -155,11 +157,29 @@ def test_simulations_run_at_the_same_time_from_one_directory(tmp_path: Path, run
     command = [sys.executable, "-m", "ccatp", "run", "--sim", "--panels", "1", "--json", *NO_CALIBRATION]
     pipe = subprocess.PIPE
     runs = [subprocess.Popen(command, cwd=tmp_path, env=env, stdout=pipe, stderr=pipe, text=True) for _ in range(2)]
+    deadline_s, folders = time.monotonic() + 5.0 * DEADLINE_S, tmp_path / "runs"
+    while len(databases := list(folders.glob("*/mission.sqlite"))) < 2 or min(map(measured_in, databases)) < 2:
+        assert time.monotonic() < deadline_s
+        assert [run.poll() for run in runs] == [None, None]
+        time.sleep(0.05)
     for run in runs:
-        out, err = run.communicate(timeout=5.0 * DEADLINE_S)
-        assert run.returncode == 0, err
-        assert json.loads(out)["points"]["measured"] == 9
-    assert len(list((tmp_path / "runs").iterdir())) == 2
+        run.send_signal(signal.SIGINT)
+    for run in runs:
+        _, err = run.communicate(timeout=DEADLINE_S)
+        assert run.returncode == 130, err
+    for path in folders.iterdir():
+        summary = json.loads((path / "summary.json").read_text())
+        assert summary["points"]["measured"] == measured_in(path / "mission.sqlite") >= 2
+    assert len(list(folders.iterdir())) == 2
+
+
+def measured_in(database: Path) -> int:
+    """Points measured, as a mission database has it."""
+    with closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as db:
+        try:
+            return int(db.execute("SELECT count(*) FROM points WHERE status = 'measured'").fetchone()[0])
+        except sqlite3.OperationalError:  # it is just being made
+            return 0
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import socket
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import pytest
@@ -360,10 +360,15 @@ async def test_on_the_wall_clock_each_fault_reaches_the_client_and_the_log(kind:
         assert ended["until_s"] == pytest.approx(0.3, abs=0.011)
 
 
-@pytest.mark.parametrize("kind", LOCKSTEP_TYPES)
-@pytest.mark.parametrize("trigger", ["at_s = 0.2", "after_lines = 20", "after_bytes = 20000"])
+@pytest.mark.parametrize(
+    ("trigger", "kind"),
+    [
+        *(("at_s = 0.2", kind) for kind in LOCKSTEP_TYPES),
+        *product(("after_lines = 20", "after_bytes = 20000"), ("reset", "fragment")),  # an instant, and what lasts
+    ],
+)
 async def test_in_lockstep_each_fault_that_makes_sense_there(
-    kind: str, trigger: str, monkeypatch: pytest.MonkeyPatch
+    trigger: str, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sessions, "REPEAT_S", 0.4)  # of a line that is lost
     monkeypatch.setattr(server, "HOUSEKEEPING_S", 0.02)
