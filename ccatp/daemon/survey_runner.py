@@ -299,10 +299,9 @@ class SurveyRunner(MissionRunner):
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         place = pose.x_m, pose.y_m, pose.heading_rad
         ahead = self._sent.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
+        sigma_of, heading_sigma_of = self._position_sigma_m, self._parts.heading_sigma_rad
         self._motion = StateEstimate(
-            *(frame.t_s, frame.dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead),
-            sigma_of=self._position_sigma_m,
-            heading_sigma_of=self._parts.heading_sigma_rad,
+            frame.t_s, frame.dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, sigma_of, heading_sigma_of
         )
 
     def _position_sigma_m(self) -> float:

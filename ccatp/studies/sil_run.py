@@ -313,11 +313,8 @@ class SilRun:
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         here = pose.x_m, pose.y_m, pose.heading_rad
         ahead = self.sent.ahead(here, v, omega, echo.seq, echo.age, echo.held, creep)
-        return StateEstimate(
-            *(frame.t + self._time.offset_s, dt_s, pose, self.mirror.deck_pose, v, omega, creep, ahead),
-            sigma_of=self._sigma_of,
-            heading_sigma_of=self.parts.heading_sigma_rad,
-        )
+        t_s, sigma_of, heading_sigma_of = frame.t + self._time.offset_s, self._sigma_of, self.parts.heading_sigma_rad
+        return StateEstimate(t_s, dt_s, pose, self.mirror.deck_pose, v, omega, creep, ahead, sigma_of, heading_sigma_of)
 
     def _command_fans(self, duty: tuple[float, float]) -> None:
         self._fans_seq += 1
