@@ -37,7 +37,7 @@ class Surface:
     methods in the plural take arrays.
     """
 
-    __slots__ = ("_coefficients", "_rows")
+    __slots__ = ("_coefficients", "_rows", "_slopes")
 
     def __init__(self, coefficients: FloatArray) -> None:
         """``coefficients``: c_ij in m^(1-i-j), shape (powers of x, powers of y).
@@ -46,9 +46,10 @@ class Surface:
         """
         if coefficients.ndim != 2:
             raise ValueError(f"surface coefficients need shape (i, j), got {coefficients.shape}")
-        self._coefficients = coefficients.astype(np.float64)
+        self._coefficients = c = coefficients.astype(np.float64)
+        self._slopes = polyder(c, axis=0), polyder(c, axis=1)
         # Highest power first, as Horner's scheme consumes them; trailing zeros of each row are not stored.
-        self._rows = tuple(tuple(np.trim_zeros(row, "b")[::-1].tolist()) for row in self._coefficients[::-1])
+        self._rows = tuple(tuple(np.trim_zeros(row, "b")[::-1].tolist()) for row in c[::-1])
 
     def height_m(self, x: float, y: float) -> float:
         """Height f(x, y) above the deck plane, m."""
@@ -174,10 +175,8 @@ class Surface:
 
     def gradients(self, xs: FloatArray, ys: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Slopes (fx, fy) of many points, each of the shape of ``xs``."""
-        return (
-            np.asarray(polyval2d(xs, ys, polyder(self._coefficients, axis=0)), dtype=np.float64),
-            np.asarray(polyval2d(xs, ys, polyder(self._coefficients, axis=1)), dtype=np.float64),
-        )
+        fx, fy = (np.asarray(polyval2d(xs, ys, slope), dtype=np.float64) for slope in self._slopes)
+        return fx, fy
 
 
 def build_surface(cfg: SurfaceConfig, drive_side: int) -> Surface:
