@@ -11,8 +11,7 @@ from ccatp.config.load import load_config
 from ccatp.core import PointId
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.compare import compare_runs
-from ccatp.report.run_page import report_run
-from tests.unit.reporting.recorded import record
+from tests.support.runs import RecordedRun
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page
@@ -21,12 +20,12 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium here: apt install chromium")
-def test_the_pages_open_by_themselves(tmp_path: Path) -> None:
+def test_the_pages_open_by_themselves(recorded_run: RecordedRun, tmp_path: Path) -> None:
     # One test with one browser: its processes end with the test.
     from playwright.sync_api import sync_playwright
 
-    recorded, report = record(tmp_path / "tonight"), tmp_path / "report.html"
-    report_run(recorded, report)
+    recorded = recorded_run.run_dir
+    report = recorded / "report.html"
     compare_runs(recorded, recorded, tmp_path / "compare.html")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
