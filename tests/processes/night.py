@@ -26,7 +26,6 @@ from tests.support.runs import NO_CALIBRATION, Run
 
 PANELS = 3
 SILENT_S = 60.0  # of the laser system
-LOCKED_S = 15.0  # of the disk; mission.storage_limit_s is shorter
 # Robot time from its boot; the legs between them take a few seconds each.
 PLAN = """
 [[link]]
