@@ -6,7 +6,7 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from ccatp.beacons.slam.measurement_models import bearing_row, level_row, range_row, range_variance
-from ccatp.beacons.slam.motion import POSE, turned_way
+from ccatp.beacons.slam.motion import POSE, step_variances, turned_way
 from ccatp.beacons.slam.recording import BoolArray, Readings, Steps, running_total
 from ccatp.config.beacon_models import OdometryNoiseConfig, RecordingConfig
 from ccatp.core import FloatArray, IntArray
@@ -114,15 +114,8 @@ class Reckoning:
         self, noise: OdometryNoiseConfig, direction: tuple[FloatArray, FloatArray], lever: tuple[FloatArray, FloatArray]
     ) -> FloatArray:
         way, turned = np.hypot(self.distance_m, self.lateral_m), np.abs(self.turn_rad)
-        var_way = noise.distance_per_sqrt_m**2 * way + noise.distance_per_sqrt_rad**2 * turned
-        var_turn = (
-            noise.turn_per_sqrt_m**2 * way
-            + noise.turn_per_sqrt_rad**2 * turned
-            + noise.turn_per_sqrt_s**2 * self.interval_s
-            + self._guess_rad2
-        )
-        var_way = var_way + self._guess_m2
-        var_side = noise.lateral_per_sqrt_m**2 * way + self._guess_m2
+        variances = step_variances(noise, way, turned, self.interval_s)
+        var_way, var_turn, var_side = map(np.add, variances, (self._guess_m2, self._guess_rad2, self._guess_m2))
         (c, s), (lx, ly) = direction, lever
         Q = np.empty((self._starts.size, 3, 3))
         Q[:, 0, 0] = self._sum(lx * lx * var_turn + c * c * var_way + s * s * var_side) + STILL_M**2

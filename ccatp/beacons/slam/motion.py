@@ -71,6 +71,16 @@ def turned_way(distance_m: Any, turn_rad: Any) -> Any:
     return abs(turn_rad) * (1.0 * (distance_m > 0.0) - (distance_m < 0.0))
 
 
+def step_variances(noise: OdometryNoiseConfig, way_m: Any, turned_rad: Any, interval_s: Any) -> tuple[Any, Any, Any]:
+    """Of way, turn and way to the left, by how much was driven and turned; of one step or of arrays (n,)."""
+    var_turn = noise.turn_per_sqrt_m**2 * way_m + noise.turn_per_sqrt_rad**2 * turned_rad
+    return (
+        noise.distance_per_sqrt_m**2 * way_m + noise.distance_per_sqrt_rad**2 * turned_rad,
+        var_turn + noise.turn_per_sqrt_s**2 * interval_s,
+        noise.lateral_per_sqrt_m**2 * way_m,
+    )
+
+
 def _increment(odometry: Odometry) -> Increment:
     if not isinstance(odometry, Increment):
         raise TypeError(f"a differential drive takes increments, not {type(odometry).__name__}")
@@ -160,11 +170,8 @@ class DifferentialDrive:
         chord: float,
         turning: float,
     ) -> FloatArray:
-        noise, dt = self._noise, odometry.interval_s
-        way, turned = hypot(odometry.distance_m, odometry.lateral_m), abs(odometry.turn_rad)
-        var_way = noise.distance_per_sqrt_m**2 * way + noise.distance_per_sqrt_rad**2 * turned
-        var_turn = noise.turn_per_sqrt_m**2 * way + noise.turn_per_sqrt_rad**2 * turned + noise.turn_per_sqrt_s**2 * dt
-        var_side = noise.lateral_per_sqrt_m**2 * way
+        way, dt = hypot(odometry.distance_m, odometry.lateral_m), odometry.interval_s
+        var_way, var_turn, var_side = step_variances(self._noise, way, abs(odometry.turn_rad), dt)
         var_turn *= turning
         (c, s), (tx, ty) = direction, by_turn
         ax, ay = chord * c, chord * s
