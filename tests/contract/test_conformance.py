@@ -58,6 +58,9 @@ def expected(lockstep: bool, robot: Served) -> set[str]:
 # With a fan floor, a key, disturbances and delays; with old frames, a wrong clock, sensors at other rates.
 OVERHANGING = config_of("fyst-m2", run__world="extreme")
 HANGING = Served(OVERHANGING, KEY, mirror_of("fyst-m2"))
+# The on-board core with motors, under a rigid body; against the slope these motors do not reach 8 rad/s.
+HEAVY_CONFIG = config_of("fyst-m2", sim__robot__physics="mujoco", robot__max_wheel_rad_s=6.0)
+HEAVY = Served(HEAVY_CONFIG, mirror=mirror_of("fyst-m2"))
 RATES = {"sim__robot__imu_hz": 50.0, "sim__robot__encoder_hz": 80.0, "sim__robot__edge_hz": 30.0}
 OLD = config_of(**RATES, run__world="hard", world__sensors_delay_s=0.12)  # type: ignore[arg-type]
 
@@ -72,7 +75,7 @@ def keep_all_promises(lockstep: bool, robot: Served) -> None:
 
 @pytest.mark.fault(*conformance_rows(load_table()), part="robot")
 @pytest.mark.parametrize("lockstep", [True, False])
-@pytest.mark.parametrize("robot", [Served(config_of()), HANGING], ids=["plain", "over an overhang"])
+@pytest.mark.parametrize("robot", [Served(config_of()), HANGING, HEAVY], ids=["plain", "over an overhang", "physics"])
 def test_our_robots(robot: Served, lockstep: bool) -> None:
     keep_all_promises(lockstep, robot)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ccatp.config.load import available, load_config
 from ccatp.config.models import Config
-from ccatp.dataloop import DataLoop, survey_robot
+from ccatp.dataloop import DataLoop, motor_robot, survey_robot
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror, build_mirror
@@ -113,7 +113,8 @@ class SurveyLoop(DataLoop):
     def __init__(
         self, config: Config, *, lockstep: bool, key: bytes | None = None, log: ServerLog | None = None
     ) -> None:
-        super().__init__(survey_robot(config), lockstep=lockstep, key=key, log=log)
+        robot = survey_robot(config) if config.sim.robot.physics == "lag" else motor_robot(config)
+        super().__init__(robot, lockstep=lockstep, key=key, log=log)
 
     async def start(self, listener: socket.socket | None = None) -> int:
         return await super().start(listener or any_port())
