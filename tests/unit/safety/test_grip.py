@@ -38,7 +38,7 @@ def found_after_s(
 
 
 @pytest.mark.parametrize("ahead", [0.9, -0.9])
-@pytest.mark.parametrize("slide_m_s2", [1.8, 2.5, 5.0, 9.0])
+@pytest.mark.parametrize("slide_m_s2", [2.0, 2.5, 5.0, 9.0])
 def test_a_slide_downhill_is_found_within_50_ms(slide_m_s2: float, ahead: float) -> None:
     after_s = found_after_s(slide_m_s2 * np.sign(ahead), ahead, noise_m_s2=0.3)
     assert after_s is not None
