@@ -1,6 +1,7 @@
 """Fixtures of all tests: nothing may outlive its test."""
 
 import asyncio
+import gc
 import inspect
 import os
 import signal
@@ -50,6 +51,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if "@" not in item.nodeid:
             item._id = coerce_node_id(f"{item.nodeid}@{group.args[0] if group else item.path.stem}")
     items.sort(key=lambda item: item.get_closest_marker("xdist_group") is None)
+
+
+def pytest_collection_finish() -> None:
+    """What is there now stays until the end: the garbage collector need not look at it again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
