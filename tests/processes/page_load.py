@@ -15,6 +15,7 @@ import socket
 import sys
 import tempfile
 import time
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -142,8 +143,20 @@ class Load(NamedTuple):
             if k % max(round(per_s / 10.0), 1) == 0:
                 self.daemon.live()
                 self.page.wait_for_timeout(1e3 * max(due_s - time.monotonic(), 0.0) + 1.0)
+                self.until_received()
             due_s += 1.0 / per_s
         self.until_shown()
+
+    def until_received(self) -> None:
+        """Wait until the dashboard has what was published: truth that is late against its estimate is not shown."""
+        for _ in range(6000):
+            with urllib.request.urlopen(f"http://127.0.0.1:{self.port}/status") as answer:
+                state = json.load(answer)["mission"]
+            if state is not None and state["elapsed_s"] >= self.daemon.second:
+                return
+            self.daemon.live()
+            self.page.wait_for_timeout(10)
+        raise AssertionError("the dashboard does not receive the state of the mission")
 
     def until_shown(self) -> None:
         """Wait until the page shows the last message."""
