@@ -183,7 +183,7 @@ class FullStateConfig(Model):
     turn_creep_sigma_m_rad: Positive
     turn_creep_scatter_share: NonNegative
     turn_creep_aside: NonNegative
-    turn_loss_per_creep_rad_m: NonNegative
+    turn_loss_per_creep: NonNegative
     wander_fraction: NonNegative  # of the scatter from leg to leg: how much slip and creep wander within one
     wander_time_s: Positive
     edge_sigma_m: Positive

@@ -126,10 +126,12 @@ class SurveyFilter:
         drift[sm.BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * dt_s
         drift[sm.BA] = full.accelerometer_bias_walk_m_s2_sqrt_s**2 * dt_s
         drift[sm.PR] = drift[sm.PL] = encoders
-        # A tyre that gives way does so downhill in the main, and as it likes besides.
+        # A tyre that gives way does so downhill in the main, and as it likes besides; what it loses of a turn varies.
         mean: FloatArray = self._filter.mean
-        aside = full.turn_creep_aside * float(mean[sm.CT])
-        drift[sm.X] = drift[sm.Y] = aside * aside * abs(float(mean[sm.W])) * dt_s
+        creep, turned_rad = float(mean[sm.CT]), abs(float(mean[sm.W])) * dt_s
+        drift[sm.X] = drift[sm.Y] = (full.turn_creep_aside * creep) ** 2 * turned_rad
+        creep2 = creep * creep + float(self._filter.covariance[sm.CT, sm.CT])
+        drift[sm.KL] = full.turn_loss_per_creep**2 * creep2 * turned_rad
         self._filter.predict(motion, motion.noise(self._filter.mean, impulses, drift))
 
     def encoder_walk(self, wheel: WheelAngle) -> float:
@@ -191,7 +193,6 @@ class SurveyFilter:
         if self._full.use.slip_per_leg:
             F, b, Q = np.eye(sm.STATES), np.zeros(sm.STATES), np.zeros((sm.STATES, sm.STATES))
             F[_SLIP_BLOCK], b[sm.SLIPS], Q[_SLIP_BLOCK] = self._legs.begin(self._filter.mean, self._filter.covariance)
-            Q[sm.KL, sm.KL] = (self._full.turn_loss_per_creep_rad_m * float(self._filter.mean[sm.CT])) ** 2
             self.journal.do(lambda: self._filter.predict(sm.Affine(F, b), Q))
         self.journal.do(self._keep_calibration)
 

@@ -63,6 +63,8 @@ _KEPT = (
     *("corrections", "request", "failures", "was_reverse", "backoffs"),
 )
 
+_SURE_SIGMAS = 3.0
+
 Step = tuple[SurveyState, MissionCommand]
 
 
@@ -78,6 +80,7 @@ class Survey(HoldRules[SurveyState]):
         self._budget: TimeBudget | None = None
         if cfg.mission.holds_to_budget:
             self._budget = TimeBudget(cfg.run.budget_s, mirror, cfg.limits, cfg.etalon.measuring_time_s)
+        self._vague_m = cfg.mission.arrival_tolerance_m / _SURE_SIGMAS
         self._is_steered_bare = not (cfg.control.predicts_delay and cfg.control.compensates_creep)
 
     def begin(self) -> SurveyState:
@@ -208,9 +211,16 @@ class Survey(HoldRules[SurveyState]):
         if leg.motion is None or leg.motion.phase is LegPhase.DONE:
             return s, None
         is_driving, mode = leg.motion.phase is LegPhase.DRIVE, s.mode
+        if is_driving and mode is TURNING and self._is_vague(stop, motion):
+            return self._arrive(replace(s, fix=FixNeed.CONFIRM), motion)
         if is_driving is not (mode is DRIVING):
             mode = next_state(mode, MissionEvent.TURNED if is_driving else MissionEvent.REALIGN)
         return replace(s, behaviour=leg, mode=mode), MissionCommand(twist)
+
+    def _is_vague(self, stop: Stop, motion: StateEstimate) -> bool:
+        """A turn has made the place uncertain, by creep: the leg to a point, unless short, is aimed again from a fix."""
+        is_worth = stop.point is not None and motion.sigma_of() > self._vague_m
+        return is_worth and self.follower.distance_m(stop, motion.pose) > self.cfg.mission.correction_reach_m
 
     def _overdue(self, s: SurveyState, stop: Stop) -> SurveyState:
         return self.fault(s, conditions.LEG_OVERDUE.text(x_m=stop.x_m, y_m=stop.y_m))

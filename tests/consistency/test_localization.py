@@ -112,8 +112,9 @@ def run(name: str, seed: int) -> Run:
     for k in range(1, STEPS + 1):
         x[[A, W, SR, SL, C, CT]] += np.sqrt(impulses) * rng.normal(size=6)
         x = moved(m, x)
-        aside_m_rad = full.turn_creep_aside * float(inner.mean[CT])
-        x[:2] += aside_m_rad * sqrt(abs(float(inner.mean[W])) * DT_S) * rng.normal(size=2)
+        creep, root_turned = float(inner.mean[CT]), sqrt(abs(float(inner.mean[W])) * DT_S)
+        x[:2] += full.turn_creep_aside * creep * root_turned * rng.normal(size=2)
+        x[KL] += full.turn_loss_per_creep * hypot(creep, sqrt(inner.covariance[CT, CT])) * root_turned * rng.normal()
         x[BG] += full.gyroscope_bias_walk_rad_s_sqrt_s * sqrt(DT_S) * rng.normal()
         x[BA] += full.accelerometer_bias_walk_m_s2_sqrt_s * sqrt(DT_S) * rng.normal()
         right.angle_rad, left.angle_rad = (x[[PR, PL]] + QUANTUM_RAD / sqrt(12.0) * rng.normal(size=2)).tolist()
