@@ -39,6 +39,7 @@ class SurveyFilter:
         self._filter, self._counts = filter_, counts
         self._mirror, self.terrain = mirror, Terrain(mirror)
         self._motion = sm.SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m)
+        self._base_per_radius = 0.5 * robot.wheel_base_m / robot.wheel_radius_m
         self._drift = np.zeros(sm.STATES)
         self._seams = SeamLines(mirror, robot)
         self._legs = SlipPrior(self._full)
@@ -125,13 +126,12 @@ class SurveyFilter:
         drift = self._drift  # work space, of which the model keeps nothing
         drift[sm.BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * dt_s
         drift[sm.BA] = full.accelerometer_bias_walk_m_s2_sqrt_s**2 * dt_s
-        drift[sm.PR] = drift[sm.PL] = encoders
         # A tyre that gives way does so downhill in the main, and as it likes besides; what it loses of a turn varies.
         mean: FloatArray = self._filter.mean
         creep, turned_rad = float(mean[sm.CT]), abs(float(mean[sm.W])) * dt_s
         drift[sm.X] = drift[sm.Y] = (full.turn_creep_aside * creep) ** 2 * turned_rad
-        creep2 = creep * creep + float(self._filter.covariance[sm.CT, sm.CT])
-        drift[sm.KL] = full.turn_loss_per_creep**2 * creep2 * turned_rad
+        lost = (self._base_per_radius * full.turn_loss_per_creep) ** 2 * turned_rad
+        drift[sm.PR] = drift[sm.PL] = encoders + lost * (creep * creep + float(self._filter.covariance[sm.CT, sm.CT]))
         self._filter.predict(motion, motion.noise(self._filter.mean, impulses, drift))
 
     def encoder_walk(self, wheel: WheelAngle) -> float:

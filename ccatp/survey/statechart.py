@@ -218,7 +218,7 @@ class Survey(HoldRules[SurveyState]):
         return replace(s, behaviour=leg, mode=mode), MissionCommand(twist)
 
     def _is_vague(self, stop: Stop, motion: StateEstimate) -> bool:
-        """A turn has made the place uncertain, by creep: the leg to a point, unless short, is aimed again from a fix."""
+        """A turn has made the place uncertain, by creep: a leg to a point, unless short, is aimed again from a fix."""
         is_worth = stop.point is not None and motion.sigma_of() > self._vague_m
         return is_worth and self.follower.distance_m(stop, motion.pose) > self.cfg.mission.correction_reach_m
 

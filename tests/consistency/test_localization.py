@@ -114,7 +114,8 @@ def run(name: str, seed: int) -> Run:
         x = moved(m, x)
         creep, root_turned = float(inner.mean[CT]), sqrt(abs(float(inner.mean[W])) * DT_S)
         x[:2] += full.turn_creep_aside * creep * root_turned * rng.normal(size=2)
-        x[KL] += full.turn_loss_per_creep * hypot(creep, sqrt(inner.covariance[CT, CT])) * root_turned * rng.normal()
+        lost_rad = full.turn_loss_per_creep * hypot(creep, sqrt(inner.covariance[CT, CT])) * root_turned
+        x[[PR, PL]] += 0.5 * config().robot.wheel_base_m / config().robot.wheel_radius_m * lost_rad * rng.normal(size=2)
         x[BG] += full.gyroscope_bias_walk_rad_s_sqrt_s * sqrt(DT_S) * rng.normal()
         x[BA] += full.accelerometer_bias_walk_m_s2_sqrt_s * sqrt(DT_S) * rng.normal()
         right.angle_rad, left.angle_rad = (x[[PR, PL]] + QUANTUM_RAD / sqrt(12.0) * rng.normal(size=2)).tolist()
