@@ -64,6 +64,7 @@ _KEPT = (
 )
 
 _SURE_SIGMAS = 3.0
+_LONG_TURN_S = 1.0  # 0.7 rad; the turn after a fix, to where the robot crept from, is shorter
 
 Step = tuple[SurveyState, MissionCommand]
 
@@ -211,16 +212,18 @@ class Survey(HoldRules[SurveyState]):
         if leg.motion is None or leg.motion.phase is LegPhase.DONE:
             return s, None
         is_driving, mode = leg.motion.phase is LegPhase.DRIVE, s.mode
-        if is_driving and mode is TURNING and self._is_vague(stop, motion):
+        if is_driving and mode is TURNING and self._is_vague(s.behaviour, motion):
             return self._arrive(replace(s, fix=FixNeed.CONFIRM), motion)
         if is_driving is not (mode is DRIVING):
             mode = next_state(mode, MissionEvent.TURNED if is_driving else MissionEvent.REALIGN)
         return replace(s, behaviour=leg, mode=mode), MissionCommand(twist)
 
-    def _is_vague(self, stop: Stop, motion: StateEstimate) -> bool:
-        """A turn has made the place uncertain, by creep: a leg to a point, unless short, is aimed again from a fix."""
-        is_worth = stop.point is not None and motion.sigma_of() > self._vague_m
-        return is_worth and self.follower.distance_m(stop, motion.pose) > self.cfg.mission.correction_reach_m
+    def _is_vague(self, leg: object, motion: StateEstimate) -> bool:
+        """A long turn has made the place uncertain, by creep: a leg to a point, unless short, needs a fix first."""
+        if not isinstance(leg, Leg) or leg.stop.point is None or motion.sigma_of() <= self._vague_m:
+            return False
+        is_long = leg.motion is not None and leg.motion.planned_s > _LONG_TURN_S
+        return is_long and self.follower.distance_m(leg.stop, motion.pose) > self.cfg.mission.correction_reach_m
 
     def _overdue(self, s: SurveyState, stop: Stop) -> SurveyState:
         return self.fault(s, conditions.LEG_OVERDUE.text(x_m=stop.x_m, y_m=stop.y_m))

@@ -88,7 +88,7 @@ def nees(x: FloatArray, filter_: Filter, which: list[int]) -> float:
 def run(name: str, seed: int) -> Run:
     rng, m, full = np.random.default_rng(seed), mirror(), cfg().full_state
     inner = FILTERS[name](np.zeros(STATES), np.eye(STATES))
-    found = SurveyFilter(inner, m, config(), {}, m.deck_pose(START))
+    found = SurveyFilter(inner, m, config().model_copy(update={"localizer": cfg()}), {}, m.deck_pose(START))
     mean, P = inner.mean.copy(), inner.covariance.copy()
     mean[V] = 0.1
     inner.reset(mean, P)

@@ -35,7 +35,7 @@ from ccatp.survey.events import (
 )
 from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import Route
-from ccatp.survey.route_follower import LegFollower
+from ccatp.survey.route_follower import LegFollower, StateEstimate
 from ccatp.survey.statechart import Mission, Survey
 from tests.support.mission_story import ABORT, FREE, FRONT_OFF, Story, from_first_leg
 
@@ -244,6 +244,26 @@ def test_a_robot_that_stands_to_be_found_needs_no_permission(story: Story) -> No
     story.frame(denied)
     assert story.state.mode is MissionState.HELD  # found, and waits for the permission to move
     story.finish()
+
+
+class Creeping(Story):
+    """Turns leave the place uncertain."""
+
+    def motion(self) -> StateEstimate:
+        return replace(super().motion(), sigma_of=lambda: self.sigma_m)
+
+    sigma_m = 0.0
+
+
+@pytest.mark.parametrize("sigma_m", [0.003, 0.004])
+def test_a_turn_that_leaves_the_place_uncertain_ends_with_a_fix(config: Config, mirror: Mirror, sigma_m: float) -> None:
+    """The leg then begins again, once, however little the fix says."""
+    story = Creeping(config, mirror)
+    story.sigma_m = sigma_m
+    story.finish()
+    extra = sum(order.measure for order in story.orders) - 3
+    assert (extra > 0) is (sigma_m > 0.0033)
+    assert extra <= 3
 
 
 @pytest.mark.parametrize("doubts_odometry", [True, False])
