@@ -150,7 +150,7 @@ FINEST_S = 0.1
 # Mean square of normalised innovations, per degree of freedom, that is reported: of learned noise it is one.
 DOUBTFUL_NIS = 1.3
 DOUBTFUL_JUMPS = 0.003  # how often the pose has to be doubted, for each reading, that it is reported
-DOUBTFUL_SHARE = 0.3  # share of refused readings that is reported
+DOUBTFUL_SHARE = 0.05  # share of refused readings that is reported: twice that of ranges indoors
 
 
 def filter_run(
