@@ -352,6 +352,15 @@ def test_filter_and_smoother_mean_the_same_by_a_name() -> None:
         assert track.calibration["odometry_delay_s"].value == pytest.approx(0.0, abs=0.05)
 
 
+def test_a_twentieth_of_the_readings_refused_is_told() -> None:
+    run = recorded(world(3, 120.0))
+    for every, is_told in ((200, False), (12, True)):
+        far = np.arange(run.readings.range_m.size) % every == every - 1
+        longer = run.readings._replace(range_m=run.readings.range_m + 20.0 * far)
+        track = filter_run(replace(run, readings=longer), CONFIG.csv, CONFIG.filter, no_clock)
+        assert any("readings were refused" in line for line in track.warnings) == is_told
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_fixed_lag_gives_what_the_smoother_of_all_readings_up_to_its_end_gives(seed: int) -> None:
     """With noise as it is set and no outliers both are least squares; they differ by where they are linearised."""
