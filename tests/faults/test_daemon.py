@@ -340,7 +340,6 @@ CALLS = {("time", "time"), ("time", "time_ns"), ("time", "localtime"), ("time", 
 # the clock itself.
 LABELS = {
     "daemon/alarms.py",  # as operators read it; what decides is the order
-    "daemon/supervisor.py",
     "daemon/run_dir.py",
     "cli/prepare.py",
     "daemon/ocs_agent.py",

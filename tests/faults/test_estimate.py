@@ -135,11 +135,13 @@ class Leaking(SilRun):
 def test_innovations_stay_within_their_band() -> None:
     found = list[float]()
     for seed in SEEDS:
-        rehearsal = Leaking(one_panel(run__world="hard", run__seed=seed))
-        found += [stop.nis for stop in rehearsal.run().stops]
+        # With its calibration drive: before it, creep and slip may be anything, and no fix is a surprise.
+        rehearsal = Leaking(config_of(run__panels=1, run__world="hard", run__seed=seed))
+        result = rehearsal.run()
+        assert result.summary["points"]["measured"] == 9
+        found += [stop.nis for stop in result.stops]
         assert rehearsal.largest_m_s2 > 0.1
     low, high = (chi2.ppf(share, 2 * len(found)) / len(found) for share in (0.025, 0.975))
-    assert len(found) == 9 * len(SEEDS)
     assert low < np.mean(found) < high
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from itertools import pairwise
 from math import hypot, inf
+from statistics import mean
 from typing import Any
 
 import pytest
@@ -150,11 +151,15 @@ def test_it_stops_in_time(case: Stop, measured: Measured) -> None:
 
 @pytest.mark.parametrize("rate", [8.0, -8.0])
 def test_a_wheel_that_runs_away_while_its_encoder_is_slow(rate: float) -> None:
-    slow_ones = each(ENCODERS[::-1], f"slow at_s={DRIVING_S - 1.0} every=3")
-    fault = f"left_wheel runaway at_s={DRIVING_S} for_s=0.4 rate_rad_s={rate}"
-    run = watched(HARD, after(DRIVING_S + 0.61), *slow_ones, fault)
-    assert run.time_to_zero_s(DRIVING_S) <= 0.15  # two faults at once: not the 0.1 s of one
-    assert run.first(DRIVING_S, held(HOLD)).verdict.signal in RUNAWAYS
+    times_s = []
+    for at_s in (DRIVING_S + 0.01 * k for k in range(0, 20, 4)):  # between samples that are 0.03 s apart, or at one
+        slow_ones = each(ENCODERS[::-1], f"slow at_s={at_s - 1.0} every=3")
+        fault = f"left_wheel runaway at_s={at_s} for_s=0.4 rate_rad_s={rate}"
+        run = watched(HARD, after(at_s + 0.61), *slow_ones, fault)
+        times_s.append(run.time_to_zero_s(at_s))
+        assert run.first(at_s, held(HOLD)).verdict.signal in RUNAWAYS
+    assert mean(times_s) <= 0.15  # two faults at once: not the 0.1 s of one
+    assert max(times_s) <= 0.15 + 0.03
 
 
 @pytest.mark.fault("S19")
@@ -367,8 +372,10 @@ def test_two_lines_that_are_no_frames_cost_nothing() -> None:
 @pytest.mark.parametrize("kind", ["wrong offset=400.0", "garbage beyond=0.0"])
 def test_no_reading_of_an_encoder_makes_the_pose_jump(kind: str, at_s: float, measured: Measured) -> None:
     run = watched(HARD, after(at_s + 0.6), f"encoder_left {kind} at_s={at_s} for_s=0.05")
-    steps = steps_m(run.since(1.0))
+    # Away from the robot: a step towards it is the correction, by readings that are right again.
+    steps = [error_m(b) - error_m(a) for a, b in pairwise(run.since(1.0))]
     assert max(steps) <= 0.005
+    assert error_m(run.seen[-1]) <= 0.010
     measured("S5", 1e3 * max(steps))
 
 

@@ -132,7 +132,7 @@ ESTIMATE = EstimateMessage(seq=5, t_s=0.05, x_m=1.0, y_m=-2.0, heading_rad=0.5, 
 def test_golden_frame_and_round_trip() -> None:
     body = (
         b'{"x_m":1.0,"y_m":-2.0,"heading_rad":0.5,"sigma_m":0.001,"state":"driving","commanded":null,'
-        b'"drive_seq":-1,"seq":5,"t_s":0.05}'
+        b'"drive_seq":-1,"grip":0.0,"seq":5,"t_s":0.05}'
     )
     assert msgspec.json.encode(ESTIMATE) == body
     assert unpack(b"estimate " + body) == ("estimate", body, ESTIMATE)

@@ -106,7 +106,10 @@ def test_the_worst_corner_is_that_of_the_plane(survey: Path) -> None:
     # A panel of fyst-m1 is 0.67 m by 0.75 m, a little more along its slopes.
     reach = abs(row["tilt_urad"]) * 0.67 / 2.0 + abs(row["tip_urad"]) * 0.75 / 2.0
     assert abs(row["worst_corner_um"]) == pytest.approx(abs(row["piston_um"]) + reach, rel=0.03)
-    assert row["sigma_worst_corner_um"] > row["sigma_piston_um"]
+    # Four points lie to one side, so its parts are correlated; standard deviations obey the triangle all the same.
+    parts_um = [row["sigma_piston_um"], row["sigma_tilt_urad"] * 0.67 / 2.0, row["sigma_tip_urad"] * 0.75 / 2.0]
+    assert 2.0 * max(parts_um) - sum(parts_um) < 1.03 * row["sigma_worst_corner_um"] < 1.06 * sum(parts_um)
+    assert row["sigma_worst_corner_um"] > 0.0
 
 
 @pytest.mark.parametrize("name", ["fixes", "panels", "moves"])
