@@ -118,7 +118,7 @@ def linear_problem(
 
 
 def survey_problem(cfg: Config) -> FilterProblem:
-    """The full-state localizer's problem with its own models: n = 19, both wheels' angles, rate and acceleration."""
+    """The full-state localizer's problem with its own models: n = 20, both wheels' angles, rate and acceleration."""
     rng = np.random.default_rng((SEED, sm.STATES))
     robot, full = cfg.robot, cfg.localizer.full_state
     mean, sigma = np.zeros(sm.STATES), np.zeros(sm.STATES)
