@@ -13,9 +13,9 @@ from ccatp.cli import main
 from ccatp.config import load as loaders
 from ccatp.config.load import load_config
 from ccatp.mirror.mirror import build_mirror
-from ccatp.records import summary
+from ccatp.records import run_reader, summary
 from ccatp.sim.world import TruthRow
-from ccatp.studies import STUDIES, faults_study, find_study
+from ccatp.studies import STUDIES, faults_study, find_study, sil_run
 from ccatp.studies.campaign import Job, JobOutcome, Study, cells_of, jobs_of
 from ccatp.studies.faults_study import FIRST_S, LONGEST_S, is_recoverable, random_plan
 from ccatp.studies.mission_study import (
@@ -290,6 +290,8 @@ MOST_IN_A_DAY_BYTES = 5 << 20
 WARM_UP_FRAMES, COMPARED_FRAMES = 12_500, 40_000
 # A point that was measured is kept with its fix.
 POINT_BYTES = 4096
+# A run in one process keeps its whole track for the study of it; a daemon records it.
+TRACK = [tracemalloc.Filter(inclusive=False, filename_pattern=str(one.__file__)) for one in (sil_run, run_reader)]
 
 
 class Enough(Exception):
@@ -312,7 +314,8 @@ class MeasuredRun(SilRun):
             self.mission.handle(Pause("operator"))
         if self._frames in (WARM_UP_FRAMES, WARM_UP_FRAMES + COMPARED_FRAMES):
             gc.collect()
-            self.bytes.append(tracemalloc.get_traced_memory()[0])
+            left = tracemalloc.take_snapshot().filter_traces(TRACK)
+            self.bytes.append(sum(trace.size for trace in left.traces))
             self.points.append(len(self.mission.state.done))
             if len(self.bytes) == 2:
                 raise Enough
