@@ -418,8 +418,9 @@ def test_a_panel_of_the_overhanging_mirror_with_little_friction(tyre: str, tyre_
 
 @pytest.mark.slow
 def test_less_friction_than_promised_is_found_by_the_creep_of_turns() -> None:
-    """The robot counts on 0.6: what it finds near the base lowers the margin, so it goes on slowly, and holds."""
-    found = panel_with(sim__physics__friction=0.45)
+    """The robot counts on 0.6: what it finds near the base lowers the margin, so it goes on at half the speed."""
+    found = panel_with(sim__physics__friction=0.43)
+    assert found.outcome == "complete"
     assert found.summary["danger"]["falls"] == 0
     assert 0.35 < found.summary["grip"]["friction"] < 0.5
-    assert found.summary["grip"]["margin"] < 1.3
+    assert found.summary["grip"]["margin"] < 1.25
