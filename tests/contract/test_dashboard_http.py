@@ -109,21 +109,6 @@ async def test_the_name_of_a_token(rig: Rig) -> None:
     assert (reply.code, reply.data) == (200, {"status": "ok", "name": "operator"})
 
 
-@pytest.mark.parametrize(
-    ("method", "path"),
-    [
-        *(("GET", path) for path in ("/", "/ground", "/status", "/healthz", "/metrics", "/static/page.js")),
-        *(("POST", f"/{command}") for command in ("pause", "resume", "abort", "stop", "clear")),
-        ("GET", "/abort"), ("POST", "/status"),
-    ],
-)  # fmt: skip
-async def test_every_path_has_a_prefix_too(rig: Rig, method: str, path: str) -> None:
-    rig.main.send("mission", mission())
-    short, long = [await rig.ask(method, f"{prefix}{path}", body=b"{}") for prefix in ("", "/api/v1")]
-    assert short.code == long.code
-    assert short.headers.keys() == long.headers.keys()
-
-
 async def test_what_there_is_not_is_told_as_the_telescope_does(rig: Rig) -> None:
     for method, path, code, message in (
         ("GET", "/nothing", 404, "bad endpoint: /nothing"),
@@ -501,15 +486,6 @@ async def test_many_connections_of_one_client_block_nobody(
         measured("O11", 0)
         for _, writer in crowd:
             writer.close()
-
-
-async def test_garbage_is_answered_and_noted_sparingly(rig: Rig) -> None:
-    for _ in range(30):
-        reader, writer = await asyncio.open_connection("127.0.0.1", rig.port)
-        writer.write(b"\x00\x01\x02\r\n\r\n")
-        assert (await closed(reader)).startswith(b"HTTP/1.1 400 ")
-        writer.close()
-    assert (await rig.ask("GET", "/ground")).code == 200
 
 
 # -- in a real browser ------------------------------------------------------------------------------------------------

@@ -19,8 +19,8 @@ from ccatp import dataloop
 from ccatp.config.models import Config
 from ccatp.daemon import sim_robot
 from ccatp.dataloop import DataLoop, serve, survey_robot
-from ccatp.links.robot_link import RobotLink
-from ccatp.links.robot_messages import Role, Sensors
+from ccatp.links.robot_messages import Sensors
+from tests.support.daemon import link_to
 from tests.support.scenario import SurveyLoop, any_port, config_of
 
 DEADLINE_S = 5.0  # what takes milliseconds in a good run may take this long on a loaded machine
@@ -183,24 +183,12 @@ async def test_a_session_is_lost_with_its_fin_however_much_its_client_has_not_re
 # -- determinism ------------------------------------------------------------------------------------------------------
 
 
-def _link(port: int, role: Role) -> RobotLink:
-    return RobotLink(
-        host="127.0.0.1",
-        port=port,
-        role=role,
-        client=role,
-        key=None,
-        on_sensors=lambda _sensors, _line: None,
-        on_lost=lambda _reason: None,
-    )
-
-
 async def _drive_through(config: Config, frames: int) -> list[bytes]:
     """Our own two clients, driving until frame ``frames``; every line of the controller."""
     lines: list[bytes] = []
     over = asyncio.Event()
     async with running(config) as rig:
-        controller, monitor = _link(rig.port, "controller"), _link(rig.port, "monitor")
+        controller, monitor = link_to(rig.port), link_to(rig.port, "monitor")
 
         def on_frame(sensors: Sensors, line: bytes) -> None:
             lines.append(line)

@@ -9,7 +9,6 @@ import time
 import tracemalloc
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,8 +19,9 @@ from ccatp.links.robot_messages import PROTOCOL, CommandEcho, Hello, RobotData, 
 from ccatp.sim.fault_proxy import FaultProxy
 from tests.faults.linking import Measured
 from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S
-from tests.support.daemon import Driver, robot_behind_proxy
+from tests.support.daemon import Driver, link_to, robot_behind_proxy
 from tests.support.scenario import ServedRobot, SurveyLoop, begin, config_of, mirror_of
+from tests.unit.test_robot_link import robot
 
 FRAMES = 60
 KEY = b"secret"
@@ -50,11 +50,6 @@ async def driving(*, lockstep: bool) -> AsyncIterator[tuple[SurveyLoop, FaultPro
         await driver.link.connect(DEADLINE_S)
         yield loop, proxy, driver
         driver.link.close()
-
-
-def link_to(port: int, kind: type[RobotLink] = RobotLink, **hears: Any) -> RobotLink:
-    hears = {"on_sensors": lambda *_: None, "on_lost": lambda _: None} | hears
-    return kind(host="127.0.0.1", port=port, role="controller", client="test", key=None, **hears)
 
 
 # -- what TCP or a proxy may do to whole messages ---------------------------------------------------------------------
@@ -147,7 +142,7 @@ async def flooded(kind: type[RobotLink]) -> tuple[RobotLink, list[int], str]:
     seqs: list[int] = []
     over: asyncio.Future[str] = asyncio.get_running_loop().create_future()
     with flooding_robot() as port:
-        link = link_to(port, kind, on_sensors=lambda sensors, _: seqs.append(sensors.seq), on_lost=over.set_result)
+        link = link_to(port, kind=kind, on_sensors=lambda sensors, _: seqs.append(sensors.seq), on_lost=over.set_result)
         if isinstance(link, Timed):
             link.passes_s = []
         await link.connect(DEADLINE_S)
@@ -213,27 +208,16 @@ def test_a_client_that_trickles_is_closed_in_time_and_nobody_else_notices(measur
 
 @pytest.mark.fault("L6")
 async def test_a_robot_that_trickles_is_given_up() -> None:
-    over = asyncio.Event()
-
     async def trickle(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        for k in range(len(encode(HELLO))):
-            writer.write(encode(HELLO)[k : k + 1])
-            if reader.at_eof() or over.is_set():
+        for byte in encode(HELLO):
+            writer.write(bytes([byte]))
+            if reader.at_eof():
                 break
             await asyncio.sleep(0.02)
-        writer.close()
-        over.set()
 
-    listening = await asyncio.start_server(trickle, "127.0.0.1", 0)
-    link = link_to(listening.sockets[0].getsockname()[1])
-    try:
+    async with robot(trickle) as (link, _):
         with pytest.raises(RobotTimeout, match="no answer from the robot"):
             await link.connect(0.2)
-    finally:
-        listening.close()
-        async with asyncio.timeout(DEADLINE_S):
-            await over.wait()
-        await listening.wait_closed()
 
 
 # -- who is not who they should be ------------------------------------------------------------------------------------
@@ -316,25 +300,17 @@ async def test_commands_that_come_again_are_dropped() -> None:
      "", " ccatp-robot/1", "ccatp-robot/1\u200b"],
 )  # fmt: skip
 async def test_no_other_version_is_joined(protocol: str, measured: Measured) -> None:
-    heard: list[bytes] = []
+    heard: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
 
     async def speak(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        hello = encode(HELLO).replace(PROTOCOL.encode(), protocol.encode())
-        writer.write(hello)
-        heard.append(await reader.read())
-        writer.close()
+        writer.write(encode(HELLO).replace(PROTOCOL.encode(), protocol.encode()))
+        heard.set_result(await reader.read())
 
-    listening = await asyncio.start_server(speak, "127.0.0.1", 0)
-    link = link_to(listening.sockets[0].getsockname()[1])
-    with pytest.raises(WrongProtocol, match="this program ccatp-robot/1"):
-        await link.connect(DEADLINE_S)
-    async with asyncio.timeout(DEADLINE_S):
-        while not heard:  # noqa: ASYNC110 - the server's task has no event
-            await asyncio.sleep(0)
-    listening.close()
-    await listening.wait_closed()
-    assert heard == [b""]  # no join, no command
-    measured("L12", 100.0 if heard == [b""] else 0.0)
+    async with robot(speak) as (link, _):
+        with pytest.raises(WrongProtocol, match="this program ccatp-robot/1"):
+            await link.connect(DEADLINE_S)
+        async with asyncio.timeout(DEADLINE_S):
+            measured("L12", 100.0 if await heard == b"" else 0.0)  # no join, no command
 
 
 # -- small messages ---------------------------------------------------------------------------------------------------

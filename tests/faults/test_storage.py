@@ -2,12 +2,8 @@
 
 import asyncio
 import gc
-import resource
-import signal
 import sqlite3
-import threading
 import time
-from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import closing
 from pathlib import Path
@@ -22,6 +18,8 @@ from ccatp.daemon.process import LogStream, open_log
 from ccatp.records.store import MissionStore, StoredPoint, StoreError
 from tests.faults.linking import Measured
 from tests.support.sim_survey import Desk, serving
+from tests.unit.test_recorder import full_beyond
+from tests.unit.test_store import hold
 
 POINTS = [PointId(row, col, n) for row in range(1, 10) for col in range(1, 9) for n in range(1, 10)][: 77 * 9]
 FIX = Fix(1.5, (1.0, 2.0, 3.0), (1e-12,) * 9, 1.7, (1, 2, 5, 8), 2e-6)
@@ -33,30 +31,13 @@ def make(path: Path, points: list[PointId] = POINTS) -> MissionStore:
     return MissionStore.create(path, mirror="fyst-m1", seed=1, config_toml="", points=plan)
 
 
-@pytest.fixture
-def nothing_may_grow() -> Iterator[Callable[[int], None]]:
-    """Lets no file of this process grow beyond a size: the kernel refuses, as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-
-    def limit(size: int) -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-
-    yield limit
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    signal.signal(signal.SIGXFSZ, handler)
-
-
 # -- P13: a disk that is full -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.fault("P13")
-def test_a_whole_mirror_is_measured_on_a_disk_that_gives_nothing_more(
-    tmp_path: Path, nothing_may_grow: Callable[[int], None], measured: Measured
-) -> None:
+def test_a_whole_mirror_is_measured_on_a_disk_that_gives_nothing_more(tmp_path: Path, measured: Measured) -> None:
     path = tmp_path / "mission.sqlite"
-    with make(path) as store:
-        nothing_may_grow(path.stat().st_size)
+    with make(path) as store, full_beyond(path.stat().st_size):
         with pytest.raises(OSError, match="File too large"):  # the limit is real
             (tmp_path / "probe").write_bytes(bytes(2 * path.stat().st_size))
         for first in range(0, len(POINTS), 9):
@@ -74,26 +55,23 @@ def test_a_whole_mirror_is_measured_on_a_disk_that_gives_nothing_more(
 
 
 @pytest.mark.fault("P13")
-def test_a_log_on_a_full_disk_drops_lines_and_says_so_once(
-    tmp_path: Path, nothing_may_grow: Callable[[int], None], capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_log_on_a_full_disk_drops_lines_and_says_so_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     log = open_log(tmp_path / "log.jsonl", "main")
-    nothing_may_grow(4096)
-    for k in range(500):
-        log.warning("held", cause="no fresh verdict", seq=k)
+    with full_beyond(4096):
+        for k in range(500):
+            log.warning("held", cause="no fresh verdict", seq=k)
     complaint = capfd.readouterr().err
     assert complaint.count("\n") == 1
     assert "ccatp main" in complaint
     assert "lines are dropped" in complaint
 
 
-def test_a_log_goes_on_where_there_is_room_again(tmp_path: Path, nothing_may_grow: Callable[[int], None]) -> None:
+def test_a_log_goes_on_where_there_is_room_again(tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
     with LogStream(path, "main") as stream:
-        nothing_may_grow(100)
-        for k in range(20):
-            stream.write(f'{{"line": {k}}}\n')
-        nothing_may_grow(1_000_000)
+        with full_beyond(100):
+            for k in range(20):
+                stream.write(f'{{"line": {k}}}\n')
         stream.write('{"line": "last"}\n')
         assert stream.dropped > 5
     lines = path.read_text().splitlines()
@@ -104,23 +82,10 @@ def test_a_log_goes_on_where_there_is_room_again(tmp_path: Path, nothing_may_gro
 # -- P14: a disk that is slow -----------------------------------------------------------------------------------------
 
 
-def stall(store: MissionStore) -> threading.Event:
-    """Keep the writer thread where an fsync would keep it, until the event is set."""
-    release, began = threading.Event(), threading.Event()
-
-    def wait(_: sqlite3.Connection) -> None:
-        began.set()
-        release.wait(30.0)
-
-    _held: Future[None] = store._submit(wait)
-    assert began.wait(10.0)
-    return release
-
-
 @pytest.mark.fault("P14")
 def test_nobody_waits_for_a_stalled_disk(tmp_path: Path, measured: Measured) -> None:
     with make(tmp_path / "mission.sqlite", POINTS[:9]) as store:
-        release = stall(store)
+        release = hold(store)
         gc.collect()  # or it comes due in between, and visits all that other tests have left
         futures, longest_s = list[Future[int]](), 0.0
         for point in POINTS[:9]:  # what a pass of the control loop does at a stop, and more
@@ -150,7 +115,7 @@ async def test_the_robot_is_held_where_the_disk_stalls_and_the_point_counts_once
     with make(tmp_path / "mission.sqlite", POINTS[:9]) as store:
         desk = Desk(config, a_fix, store)
         async with serving(desk.service), asyncio.timeout(20.0):
-            release = stall(store)
+            release = hold(store)
             desk.begin(POINTS[0])
             await desk.faulted.wait()
             assert any("the disk is slow: point 1-1-1" in text for text in desk.said)

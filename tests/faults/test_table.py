@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from pydantic import ValidationError
 
 from tests.faults.linking import judge
-from tests.faults.table import PATH, ROWS, Row, Seen, keep_record, load_record, load_table, machine_line, page
+from tests.faults.table import PATH, ROWS, Seen, keep_record, load_record, load_table, machine_line, page
 
 ROOT = PATH.parents[2]
 TABLE = """
@@ -215,34 +214,6 @@ UNSHOWN = seen("L1", "", of_robot=("L1",))
 def test_what_shows_a_row(row: str, kind: str, tests: dict[str, Seen], problem: str) -> None:
     table = {row: load_table()[row].model_copy(update={"open": None})}
     assert judge(table, tests, kind) == ([f"{row} ({table[row].fault}): {problem}"] if problem else [], [])
-
-
-ROW = {"fault": "what", "detection": "how", "reaction": "then", "bound": "when", "severity": "hold"}
-
-
-@pytest.mark.parametrize(
-    ("keys", "why"),
-    [
-        ({"severity": "bad"}, "severity"),
-        ({"bund": "x"}, "bund"),
-        ({"bound": ""}, "bound"),
-        ({"open": ""}, "open"),
-        ({"hardware": "the robot"}, "hardware and conformance belong together"),
-        ({"conformance": ["mac"]}, "hardware and conformance belong together"),
-        ({"hardware": "the robot", "conformance": ["mac", "mc"]}, "no check \\['mc'\\]"),
-        ({"at_most": {"ms": 1}, "at_least": {"ms": 1}}, "at_most and in at_least"),
-        ({"without_realtime": {"ms": 1}}, "without_realtime has \\['ms'\\], at_most has not"),
-    ],
-)
-def test_rows_that_are_none(keys: dict[str, object], why: str) -> None:
-    Row.model_validate(ROW)
-    with pytest.raises(ValidationError, match=why):
-        Row.model_validate(ROW | keys)
-
-
-def test_the_table_is_read_from_any_file(tmp_path: Path) -> None:
-    (tmp_path / "table.toml").write_text(TABLE)
-    assert list(load_table(tmp_path / "table.toml")) == ["A1", "A2"]
 
 
 # -- the page ----------------------------------------------------------------------------------------------------------

@@ -13,15 +13,14 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from signal import SIGCONT, SIGSTOP
 from typing import Any
 
+from tests.support.http_server import taking_posts
 from tests.support.runs import NO_CALIBRATION, Run
 
 PANELS = 3
@@ -50,33 +49,6 @@ at_s = {battery_s}
 """
 
 
-class Posts:
-    """A server on loopback that keeps what is posted to it."""
-
-    def __init__(self) -> None:
-        self.bodies: list[dict[str, Any]] = []
-        posts = self.bodies
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_POST(self) -> None:
-                posts.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
-                self.send_response(204)
-                self.end_headers()
-
-            def log_message(self, *_: object) -> None:
-                """Not to standard error."""
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self._server.server_address[1]}/alarms"
-        self._thread = threading.Thread(target=self._server.serve_forever)
-        self._thread.start()
-
-    def close(self) -> None:
-        self._server.shutdown()
-        self._thread.join()
-        self._server.server_close()
-
-
 def ccatp(*arguments: object) -> str:
     """Standard output of a command that must succeed."""
     command = [sys.executable, "-m", "ccatp", *map(str, arguments)]
@@ -89,11 +61,12 @@ class Night:
     def __init__(self, folder: Path) -> None:
         self.folder, self.run_dir, self.sockets = folder, folder / "run", folder / "sockets"
         self.sockets.mkdir()
-        self.posts = Posts()
+        self._server = ExitStack()
+        self.posts = self._server.enter_context(taking_posts())
         self.diary: list[tuple[str, str]] = []
 
     def close(self) -> None:
-        self.posts.close()
+        self._server.close()
 
     def note(self, text: str) -> None:
         """What the operator did."""

@@ -23,7 +23,7 @@ from ccatp.daemon.danger_loop import DangerLoop
 from ccatp.daemon.main_loop import MainLoop, open_runner
 from ccatp.daemon.process import Endpoints, ProcessArgs
 from ccatp.links.robot_link import RobotLink
-from ccatp.links.robot_messages import Sensors
+from ccatp.links.robot_messages import Role, Sensors
 from ccatp.localizer import Localizer, build_localizer
 from ccatp.onboard.rules import MotionRules
 from ccatp.sim.etalon_server import EtalonSimulator, ZmqPuck
@@ -221,6 +221,12 @@ def tell(daemon: Daemon) -> str:
 # -- the robot link alone ---------------------------------------------------------------------------------------------
 
 
+def link_to(port: int, role: Role = "controller", kind: type[RobotLink] = RobotLink, **more: Any) -> RobotLink:
+    """A client's end; ``more``: its key, and what it calls."""
+    given = {"key": None, "on_sensors": lambda *_: None, "on_lost": lambda _: None} | more
+    return kind(host="127.0.0.1", port=port, role=role, client="test", **given)
+
+
 class Driver:
     """Joins as the controller, localizes, and answers each frame, and one that comes again, by the same drive.
 
@@ -238,8 +244,7 @@ class Driver:
         self.seqs: list[int] = []
         self.lost = ""
         self.changed = asyncio.Event()
-        self.link = RobotLink(host="127.0.0.1", port=port, role="controller", client="test", key=key,
-                              on_sensors=self._on_sensors, on_lost=self._on_lost, on_repeated=self._answer)  # fmt: skip
+        self.link = link_to(port, key=key, on_sensors=self._on_sensors, on_lost=self._on_lost, on_repeated=self._answer)
         self._answers = 0
 
     def _on_sensors(self, frame: Sensors, _line: bytes) -> None:

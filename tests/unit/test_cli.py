@@ -104,6 +104,7 @@ NAMING = (["report"], ["replay"], ["map"], ["run", "--sim", "--mirror"], ["run",
         (["sim", "etalon", "--truth", "ipc://x", "--runtime-dir", "x"], "leave out --puck and --truth"),
         (["run", "--sim", "--miror", "x"], "Did you mean one of: '--mirror'"),
         (["run", "--sim", "--set", "seed"], "'seed' is not KEY=VALUE, as in run.seed=2"),
+        (["run", "--sim", "--set", ".".join("a" * 99) + "=1"], "is not KEY=VALUE"),
         (["run", "--sim", "--start-held"], "--start-held needs --resume; --resume-last always starts held"),
         (["run", "--sim", "--resume-last", "--resume"], "--resume-last finds the run itself: leave out --resume"),
         (["run", "--sim", "-q", "-v"], "--quiet and --verbose contradict each other"),
@@ -380,6 +381,9 @@ def test_config_check_lists_every_problem(tmp_path: Path, capsys: pytest.Capture
         ('run.mirror="fyst-m2"', ("run.mirror", "fyst-m2")),
         ("robot.fan_duty=[0.7, 0.7]", ("robot.fan_duty", [0.7, 0.7])),
         ("robot.key_file=", ("robot.key_file", "")),
+        ("x=" + "[" * 50_000, ("x", "[" * 50_000)),
+        ("x=1\ny = 2", ("x", "1\ny = 2")),
+        ("x=" + "9" * 9000, ("x", "9" * 9000)),
     ],
 )
 def test_settings_are_toml_or_text(text: str, setting: tuple[str, object]) -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from ccatp.beacons.datasets.tables import LONGEST_ROW, MOST_DATA_BYTES
-from ccatp.cli.common import parse_setting
 from ccatp.config.files import MOST_BYTES, keep_traceback, read_text
 from ccatp.config.load import load_config
 from ccatp.config.package import child_environment
@@ -109,21 +108,6 @@ def test_a_byte_order_mark_is_no_part_of_a_text(tmp_path: Path, capsys: pytest.C
     assert read_text(file).startswith("[run]")
     file.write_bytes(b"\xef\xbb\xbfseed = 3")
     assert f"{file}:1: seed is unknown" in refused(capsys, "config", "check", file)
-
-
-@pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        ("x=[1, 2]", [1, 2]),
-        ("x=" + "[" * 50_000, "[" * 50_000),
-        ("x=1\ny = 2", "1\ny = 2"),
-        ("x=" + "9" * 9000, "9" * 9000),
-    ],
-)
-def test_a_setting_is_one_value(text: str, found: object) -> None:
-    assert parse_setting(text) == ("x", found)
-    with pytest.raises(ValueError, match="is not KEY=VALUE"):
-        parse_setting(".".join("a" * 99) + "=1")
 
 
 def test_data_are_bounded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,6 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +30,7 @@ from ccatp.links.client import HttpClient, Latched, OperatorClient, Pong, StillW
 from ccatp.links.rpc import Router
 from ccatp.links.topics import MissionStatus
 from tests.support.command import refused
+from tests.support.http_server import answering
 
 # -- ``ccatp keys``: what is written, and what is never shown ---------------------------------------------------------
 
@@ -359,68 +359,19 @@ def test_observatory(runtime_dir: Path) -> None:
     assert kinds[0] == ("fire", "smoke")
 
 
-# -- tests of the client over HTTP, against a server that answers as a dashboard does, or does not --------------------
-
-
-Answer = Callable[[str, str, str | None], tuple[int, bytes]]
-
-
-@contextmanager
-def page(answer: Answer) -> Iterator[str]:
-    """A server on a free port; yields its URL."""
-
-    class Handler(BaseHTTPRequestHandler):
-        def _serve(self) -> None:
-            code, body = answer(self.command, self.path, self.headers.get("authorization"))
-            self.send_response(code)
-            self.send_header("content-length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-        do_GET = do_POST = _serve
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    with HTTPServer(("127.0.0.1", 0), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_port}/"
-        finally:
-            server.shutdown()
-            thread.join()
-
-
-def test_orders_and_answers() -> None:
-    asked = []
-
-    def answer(method: str, path: str, token: str | None) -> tuple[int, bytes]:
-        asked.append((method, path, token))
-        return 200, json.dumps({"status": "ok", "path": path}).encode()
-
-    with page(answer) as url:
-        client = HttpClient(url, token="secret")
-        assert client.status()["path"] == "/status"
-        assert client.is_healthy()
-        for order in (client.pause, client.resume, client.abort, client.stop):
-            order()
-    assert [(method, path) for method, path, _ in asked] == [
-        ("GET", "/status"), ("GET", "/healthz"), ("POST", "/pause"), ("POST", "/resume"), ("POST", "/abort"),
-        ("POST", "/stop"),
-    ]  # fmt: skip
-    assert {token for *_, token in asked} == {"Bearer secret"}
+# -- the client over HTTP, against a server that answers otherwise than a dashboard -----------------------------------
 
 
 @pytest.mark.parametrize(
     ("body", "told"), [(b'{"status": "error", "message": "nothing is paused"}', "nothing is paused"), (b"no", "no")]
 )
 def test_a_refusal_of_the_page_says_why(body: bytes, told: str) -> None:
-    with page(lambda *_: (409, body)) as url:
+    with answering(lambda method, *_: (409 if method == "POST" else 503, body)) as url:
         client = HttpClient(url)
         assert not client.is_healthy()
-        with pytest.raises(RefusedError, match=rf"resume refused \(409\): {told}"):
-            client.resume()
+        for order in (client.pause, client.resume, client.abort, client.stop):
+            with pytest.raises(RefusedError, match=rf"{order.__name__} refused \(409\): {told}"):
+                order()
 
 
 def test_no_page_there(free_port: int) -> None:
@@ -430,7 +381,7 @@ def test_no_page_there(free_port: int) -> None:
 
 @pytest.mark.parametrize(("body", "told"), [(b"<html>", "is no JSON"), (b"[]", "is no object")])
 def test_another_server_is_told(body: bytes, told: str) -> None:
-    with page(lambda *_: (200, body)) as url, pytest.raises(DaemonUnreachableError, match=told):
+    with answering(lambda *_: (200, body)) as url, pytest.raises(DaemonUnreachableError, match=told):
         HttpClient(url).status()
 
 

@@ -14,6 +14,7 @@ from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.robot_codec import RobotFrame, encode, join_mac
 from ccatp.links.robot_link import LineWriter, RobotLink, RobotLinkError, RobotRefused, RobotTimeout, WrongProtocol
 from ccatp.links.robot_messages import CommandEcho, Sensors
+from tests.support.daemon import link_to
 
 NONCE = "ab" * 16
 HELLO = (
@@ -81,17 +82,8 @@ async def robot(script: Script, *, key: bytes | None = None) -> AsyncIterator[tu
 
     server = await asyncio.start_server(serve, "127.0.0.1", 0)
     seen = Seen()
-    link = RobotLink(
-        host="127.0.0.1",
-        port=server.sockets[0].getsockname()[1],
-        role="controller",
-        client="test",
-        key=key,
-        on_sensors=seen.on_sensors,
-        on_lost=seen.on_lost,
-        on_bad_line=seen.on_bad_line,
-        on_repeated=seen.on_repeated,
-    )
+    hears = {name: getattr(seen, name) for name in ("on_sensors", "on_lost", "on_bad_line", "on_repeated")}
+    link = link_to(server.sockets[0].getsockname()[1], key=key, **hears)
     try:
         yield link, seen
     finally:
@@ -210,15 +202,7 @@ async def test_an_error_in_the_callback_ends_the_session_aloud() -> None:
 
 async def test_nobody_listens(free_port: int) -> None:
     seen = Seen()
-    link = RobotLink(
-        host="127.0.0.1",
-        port=free_port,
-        role="monitor",
-        client="test",
-        key=None,
-        on_sensors=seen.on_sensors,
-        on_lost=seen.on_lost,
-    )
+    link = link_to(free_port, "monitor", on_lost=seen.on_lost)
     with pytest.raises(
         RobotLinkError, match=f"cannot reach the robot at 127.0.0.1:{free_port}.*is it running"
     ) as caught:

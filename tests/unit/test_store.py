@@ -303,7 +303,7 @@ def hold(db: MissionStore) -> threading.Event:
 
     def wait(_: sqlite3.Connection) -> None:
         began.set()
-        gate.wait(10.0)
+        gate.wait(30.0)
 
     db._submit(wait)
     assert began.wait(10.0)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.onboard.rules import HELD, LinkedRobot, MotionRules
+from ccatp.onboard.rules import HELD, LinkedRobot
 
 DT_S, TTL_S, FASTEST = 0.01, 0.25, 8.0
 # A robot with nothing but roles and commands.
@@ -25,18 +25,6 @@ class Rig:
     def at(self, frame: int) -> LinkedRobot:
         self.robot.seq, self.robot.t_s = frame, frame * DT_S
         return self.robot
-
-
-def test_a_drive_dies_with_its_time_to_live() -> None:
-    r = MotionRules(TTL_S, FASTEST)
-    r.drive(1, 3.0, 3.0, 1.0)
-    assert r.set_points(1.25) == (3.0, 3.0)
-    assert r.set_points(1.2501) == HELD
-    seq, age_s, permit_age_s, is_held = r.echo(1.26)
-    assert (seq, is_held) == (1, True)
-    assert (age_s, permit_age_s) == pytest.approx((0.26, 0.0))
-    r.drive(2, 3.0, 3.0, 1.26)
-    assert r.set_points(1.27) == (3.0, 3.0)
 
 
 @pytest.mark.parametrize(

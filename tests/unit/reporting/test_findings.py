@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 
 from ccatp.core import PointId
-from ccatp.errors import ConfigError
 from ccatp.links.topics import BY_NAME, MissionStatus
 from ccatp.records.recorder import Recorder, iter_messages
-from ccatp.records.run_reader import RunReadError
 from ccatp.records.state_log import StateChange, changes_of, read_log
 from ccatp.records.store import StoredPoint
 from ccatp.report.findings import (
@@ -237,23 +235,6 @@ def test_a_resumed_run_has_its_sessions_one_after_the_other(run_dir: Path) -> No
     assert (*errors.breaks_s, errors.t_s[-1]) == pytest.approx((span_s, 2.0 * span_s))
     assert budget.is_exact
     assert budget.total_s == pytest.approx(2.0 * span_s)
-
-
-@pytest.mark.parametrize(
-    ("config", "error", "why"),
-    [
-        (None, RunReadError, r"no config\.toml there; name the directory of a run"),
-        ('system = "cricket"\n', RunReadError, "a mission among beacons; this is for surveys"),
-        ("[run]\nspeed = 1\n", ConfigError, r"run\.speed is unknown"),
-    ],
-)
-def test_no_run_is_refused(tmp_path: Path, config: str | None, error: type[Exception], why: str) -> None:
-    if config is not None:
-        (tmp_path / "config.toml").write_text(config)
-    with pytest.raises(error, match=why):
-        read_record(tmp_path)
-    with pytest.raises(RunReadError, match="nothing: no such directory; name the directory of a run"):
-        read_record(tmp_path / "nothing")
 
 
 def test_every_topic_that_is_read_is_recorded(recorded: Path) -> None:
