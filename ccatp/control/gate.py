@@ -67,11 +67,6 @@ class DriveGate:
         self.denied = dict.fromkeys(Denial, 0)
         self.denial: Denial | None = None
 
-    @property
-    def denials(self) -> int:
-        """How many drives were denied."""
-        return sum(self.denied.values())
-
     def pass_through(
         self, wanted: Twist, verdict: Verdict | None, dt_s: float, t_s: float, age_s: float, purpose: Purpose
     ) -> tuple[float, float]:

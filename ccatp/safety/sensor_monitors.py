@@ -80,8 +80,6 @@ class FlickerMonitor:
 
 
 _SOURCES = ("imu", "enc", "edge")
-# Sensors are taken to be sound while the robot stands for its first fix; that time shows their usual rates.
-_LEARN_S = 0.5
 
 
 class RateMonitor:

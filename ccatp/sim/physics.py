@@ -162,14 +162,6 @@ class PhysicsPlant(Plant):
         self._acceleration_m_s2 = (self._speeds[-1] - self._speeds[0]) / (_AVERAGED * self._step_s)
         self._rate_rad_s = float(data.qvel[5])
 
-    @property
-    def slip_m_s(self) -> tuple[float, float]:
-        """Speed of the body along and across the robot less what the wheels give, m/s."""
-        rotation = self._data.xmat[self._body].reshape(3, 3)
-        velocity = self._data.qvel[:3]
-        rolled = 0.5 * self._radius_m * (self.right_rad_s + self.left_rad_s)
-        return float(rotation[:, 0] @ velocity) - rolled, float(rotation[:, 1] @ velocity)
-
     def acceleration_at(self, decay: float) -> float:
         """Acceleration along robot x over the last steps, m/s^2."""
         return self._acceleration_m_s2
