@@ -32,6 +32,7 @@ from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
 from tests.contract.crooked import HONEST, TIMEOUT_S, Crooked, checked, clock, serving
 from tests.faults.table import conformance_rows, load_table
+from tests.support.command import refused
 from tests.support.scenario import config_of, mirror_of
 
 KEY = b"secret"
@@ -173,10 +174,8 @@ def test_the_table(robot: str, capsys: pytest.CaptureFixture[str]) -> None:
 
 @locked
 def test_a_key(robot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["conformance", robot, "--no-motion"]) == 2
-    assert "asks for a key: name its file with --key" in capsys.readouterr().err
-    assert main(["conformance", robot, "--key", str(tmp_path / "none")]) == 2
-    assert "--key: cannot read" in capsys.readouterr().err
+    assert "asks for a key: name its file with --key" in refused(capsys, "conformance", robot, "--no-motion")
+    assert "--key: cannot read" in refused(capsys, "conformance", robot, "--key", tmp_path / "none")
     key_file = tmp_path / "key"
     key_file.write_bytes(KEY + b"\n")
     assert main(["conformance", robot, "--key", str(key_file), "--only", "mac", "--only", "mac-wrong"]) == 0
@@ -188,14 +187,14 @@ def test_another_program_drives(robot: str, capsys: pytest.CaptureFixture[str]) 
     connection, hello = other.greet()
     connection.send(other.join_line(hello, "controller", mac=""))
     assert other.answer(connection)["type"] == "joined"
-    assert main(["conformance", robot, "--no-motion", "--timeout", "0.3"]) == 5
-    assert "another program drives the robot" in capsys.readouterr().err
+    said = refused(capsys, "conformance", robot, "--no-motion", "--timeout", "0.3", status=5)
+    assert "another program drives the robot" in said
     other.clear()
 
 
 def test_nobody_there(free_port: int, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["conformance", f"127.0.0.1:{free_port}"]) == 5
-    assert f"no server at 127.0.0.1:{free_port}: Connection refused" in capsys.readouterr().err
+    said = refused(capsys, "conformance", f"127.0.0.1:{free_port}", status=5)
+    assert f"no server at 127.0.0.1:{free_port}: Connection refused" in said
 
 
 @pytest.mark.parametrize(("first", "said"), [(b"SSH-2.0-OpenSSH\n", "says 'SSH-2.0-OpenSSH'"), (b"", "says nothing")])

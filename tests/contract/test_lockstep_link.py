@@ -22,7 +22,7 @@ from ccatp.links.robot_link import RobotTimeout
 from ccatp.links.robot_messages import CommandEcho, Hello, Joined, Role, Sensors
 from ccatp.onboard import server, sessions
 from ccatp.sim.fault_proxy import FaultProxy
-from tests.faults.test_link import HELLO
+from tests.support.daemon import HELLO
 from tests.support.scenario import SurveyLoop, begin, config_of
 
 DEADLINE_S = 30.0  # what never happens in a good run may take this long in a bad one

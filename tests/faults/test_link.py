@@ -15,22 +15,16 @@ import pytest
 
 from ccatp.links.robot_codec import BadLineLimit, RobotFrame, encode
 from ccatp.links.robot_link import BACKLOG_S, FLOOD_FACTOR, RobotLink, RobotTimeout, WrongProtocol
-from ccatp.links.robot_messages import PROTOCOL, CommandEcho, Hello, RobotData, Sensors
+from ccatp.links.robot_messages import PROTOCOL, CommandEcho, Sensors
 from ccatp.sim.fault_proxy import FaultProxy
 from tests.faults.linking import Measured
+from tests.support.daemon import HELLO, Driver, link_to, robot_behind_proxy
 from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S
-from tests.support.daemon import Driver, link_to, robot_behind_proxy
 from tests.support.scenario import ServedRobot, SurveyLoop, begin, config_of, mirror_of
 from tests.unit.test_robot_link import robot
 
 FRAMES = 60
 KEY = b"secret"
-HELLO = Hello(
-    protocol=PROTOCOL, boot=1, nonce="ab" * 16, auth="none", lockstep=False, frame_hz=100.0, ttl_s=0.25,
-    robot=RobotData(wheel_radius_m=0.03, wheel_base_m=0.15,
-                    edge_sensors_m=((0.09, 0.09), (0.09, -0.09), (-0.09, 0.09), (-0.09, -0.09)),
-                    puck_m=(0.0, 0.0, 0.05), max_wheel_rad_s=8.0, fan_floor=0.0),
-)  # fmt: skip
 JOIN = b'{"type":"join","role":"controller","client":"test"}\n'
 JOINED = b'{"type":"joined","role":"controller","session":1}\n'
 

@@ -14,6 +14,12 @@ def answered(capsys: pytest.CaptureFixture[str], *argv: object, status: int = 0)
     return json.loads(capsys.readouterr().out)
 
 
+def printed(capsys: pytest.CaptureFixture[str], *argv: object, status: int = 0) -> str:
+    """What a command prints on standard output."""
+    assert main([*map(str, argv)]) == status
+    return capsys.readouterr().out
+
+
 def refused(capsys: pytest.CaptureFixture[str], *argv: object, status: int = 2) -> str:
     """The one line that a command prints in place of an answer."""
     assert main([*map(str, argv)]) == status

@@ -23,7 +23,7 @@ from ccatp.daemon.danger_loop import DangerLoop
 from ccatp.daemon.main_loop import MainLoop, open_runner
 from ccatp.daemon.process import Endpoints, ProcessArgs
 from ccatp.links.robot_link import RobotLink
-from ccatp.links.robot_messages import Role, Sensors
+from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData, Role, Sensors
 from ccatp.localizer import Localizer, build_localizer
 from ccatp.onboard.rules import MotionRules
 from ccatp.sim.etalon_server import EtalonSimulator, ZmqPuck
@@ -35,6 +35,12 @@ DEADLINE_S = 60.0
 LINK_DEADLINE_S = 30.0  # what never happens in a good run may take this long in a bad one
 SEED = 3
 SEND_DRIVE, SEND_PERMIT, SET_POINTS = RobotLink.send_drive, RobotLink.send_permit, MotionRules.set_points
+HELLO = Hello(
+    protocol=PROTOCOL, boot=1, nonce="ab" * 16, auth="none", lockstep=False, frame_hz=100.0, ttl_s=0.25,
+    robot=RobotData(wheel_radius_m=0.03, wheel_base_m=0.15,
+                    edge_sensors_m=((0.09, 0.09), (0.09, -0.09), (-0.09, 0.09), (-0.09, -0.09)),
+                    puck_m=(0.0, 0.0, 0.05), max_wheel_rad_s=8.0, fan_floor=0.0),
+)  # fmt: skip
 LATE_FRAMES = 16  # of 10 ms: data are too old after 150 ms
 
 

@@ -20,7 +20,7 @@ from ccatp.config.package import configs_dir
 from ccatp.daemon.run_dir import RunOptions
 from ccatp.errors import ConfigError, DaemonUnreachableError, RefusedError
 from ccatp.links.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked
-from tests.support.command import refused
+from tests.support.command import answered, printed, refused
 from tests.unit.test_keys import serving
 
 EMERGENCY_ID = "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"
@@ -60,8 +60,7 @@ def commands(group: click.Group, path: tuple[str, ...] = ()) -> Iterator[tuple[s
 
 @pytest.mark.parametrize("path", list(commands(cli)), ids=lambda path: " ".join(path) or "ccatp")
 def test_every_help_shows_an_example(path: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*path, "--help"]) == 0
-    text = capsys.readouterr().out
+    text = printed(capsys, *path, "--help")
     assert "Example:" in text
     assert f"    {' '.join(('ccatp', *path))}" in text
 
@@ -79,8 +78,7 @@ def test_the_commands_are_those_of_the_contract_the_map_and_the_conformance() ->
 
 
 def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--version"]) == 0
-    assert capsys.readouterr().out == f"ccatp {ccatp.__version__}\n"
+    assert printed(capsys, "--version") == f"ccatp {ccatp.__version__}\n"
     assert importlib.metadata.version("click")  # the only package that help and version need
 
 
@@ -141,11 +139,9 @@ def test_a_shipped_configuration_is_taken_by_its_name(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "zigbee").mkdir()
-    assert main(["config", "check", "zigbee"]) == 0
-    assert capsys.readouterr().out.endswith("zigbee.toml: ok: system zigbee, seed 1\n")
+    assert printed(capsys, "config", "check", "zigbee").endswith("zigbee.toml: ok: system zigbee, seed 1\n")
     (tmp_path / "cricket").write_text("[run]\nseed = 7\n")  # a file of the user comes first
-    assert main(["config", "check", "cricket"]) == 0
-    assert capsys.readouterr().out.startswith("cricket: ok: mirror fyst-m1")
+    assert printed(capsys, "config", "check", "cricket").startswith("cricket: ok: mirror fyst-m1")
 
 
 @pytest.mark.parametrize(
@@ -230,16 +226,13 @@ def test_alarms_are_shown_acknowledged_and_kept(
     monkeypatch.setenv("CCATP_RUNTIME_DIR", str(runtime_dir))
     status = {"seq": 1, "t_s": 1.0, "state": "held", "alarms": [ALARM]}
     with serving(runtime_dir, "control", lambda _: {"ok": True, "status": status}) as asked:
-        assert main(["alarms"]) == 0
-        assert capsys.readouterr().out.splitlines() == [
+        assert printed(capsys, "alarms").splitlines() == [
             "return  fan_weak: the left fan gets weak",
             "        since A, 2 times, ended B, acknowledged by anna C",
             "        Replace it.",
         ]
-        assert main(["alarms", "--json"]) == 0
-        assert json.loads(capsys.readouterr().out) == {"alarms": [ALARM]}
-        assert main(["alarms", "ack", "fan_weak"]) == 0
-        assert capsys.readouterr().out == "ok\n"
+        assert answered(capsys, "alarms") == {"alarms": [ALARM]}
+        assert printed(capsys, "alarms", "ack", "fan_weak") == "ok\n"
         assert asked[-1] == {"cmd": "acknowledge", "name": "fan_weak", "by": getpass.getuser()}
     assert main(["alarms", "--json", "ack", "x"]) == 2
     assert "options go behind the command, as in ccatp alarms ack" in capsys.readouterr().err
@@ -247,12 +240,9 @@ def test_alarms_are_shown_acknowledged_and_kept(
         '{"utc":"A","t_s":1.0,"event":"acknowledged","name":"fan_weak","severity":"return","cause":"weak","by":"anna"}'
     )
     (tmp_path / "alarms.jsonl").write_text(f"{line}\n{line[:40]}")
-    assert main(["alarms", "history", str(tmp_path)]) == 0
-    assert capsys.readouterr().out == "A  acknowledged by anna: return fan_weak: weak\n"
-    assert main(["alarms", "history", str(tmp_path), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"history": [json.loads(line)]}
-    assert main(["alarms", "history", str(tmp_path / "none")]) == 2
-    assert "no such run; name its directory" in capsys.readouterr().err
+    assert printed(capsys, "alarms", "history", tmp_path) == "A  acknowledged by anna: return fan_weak: weak\n"
+    assert answered(capsys, "alarms", "history", tmp_path) == {"history": [json.loads(line)]}
+    assert "no such run; name its directory" in refused(capsys, "alarms", "history", tmp_path / "none")
 
 
 def test_an_answer_may_be_shown_as_json_or_be_empty(
@@ -263,8 +253,7 @@ def test_an_answer_may_be_shown_as_json_or_be_empty(
     here = ["--runtime-dir", str(runtime_dir)]
     with serving(runtime_dir, "control", lambda asked: reply if asked["cmd"] == "status" else {"ok": True}):
         for where in (here, ["--config", str(tmp_path / "mine.toml")]):
-            assert main(["status", "--json", *where]) == 0
-            assert json.loads(capsys.readouterr().out) == reply
+            assert answered(capsys, "status", *where) == reply
         assert main(["pause", *here]) == 0
     assert capsys.readouterr().out == "ok\n"
 
@@ -360,8 +349,7 @@ def test_the_laser_system_alone_gets_its_puck(stub: Stub, tmp_path: Path) -> Non
 def test_config_check_lists_every_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "mine.toml"
     file.write_text("[run]\nseed = 3\n")
-    assert main(["config", "check", str(file)]) == 0
-    assert capsys.readouterr().out == f"{file}: ok: mirror fyst-m1, 77 panels, world thesis, seed 3\n"
+    assert printed(capsys, "config", "check", file) == f"{file}: ok: mirror fyst-m1, 77 panels, world thesis, seed 3\n"
     file.write_text("[run]\nseed = -3\nsed = 2\n")
     assert main(["config", "check", str(file)]) == 2
     out, err = capsys.readouterr()

@@ -21,7 +21,7 @@ from ccatp.daemon.terminal import clock, status_line, status_rows
 from ccatp.links.topics import MissionStatus
 from ccatp.survey.composition import assemble
 from ccatp.survey.planning.search import leg_lengths
-from tests.support.command import answered, refused
+from tests.support.command import answered, printed, refused
 from tests.unit.test_keys import serving
 
 BASH = shutil.which("bash")
@@ -32,8 +32,7 @@ BASH = shutil.which("bash")
     [("bash", "complete -o nosort -F"), ("zsh", "#compdef ccatp"), ("fish", "complete --no-files --command ccatp")],
 )
 def test_each_shell_gets_its_script(shell: str, sign: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["completion", shell]) == 0
-    text = capsys.readouterr().out
+    text = printed(capsys, "completion", shell)
     assert sign in text
     assert "_CCATP_COMPLETE" in text
     (tmp_path / "script").write_text(text)
@@ -78,8 +77,7 @@ def planned(capsys: pytest.CaptureFixture[str], *args: str, status: int = 0) -> 
 
 
 def test_every_shipped_world_is_named_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["plan", "--help"]) == 0
-    told = " ".join(capsys.readouterr().out.split())
+    told = " ".join(printed(capsys, "plan", "--help").split())
     assert set(available("world")) <= set(re.split(r"[ ,]+", told))
 
 
@@ -142,14 +140,13 @@ def test_points_out_of_reach_are_reported_and_drawn(tmp_path: Path, capsys: pyte
 
 def test_the_text_tells_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     found = planned(capsys, "--panels", "10", "--mirror", "fyst-m2")
-    assert main(["plan", "--panels", "10", "--mirror", "fyst-m2"]) == 0
-    out = capsys.readouterr().out
+    out = printed(capsys, "plan", "--panels", "10", "--mirror", "fyst-m2")
     assert "fyst-m2: 90 points of 10 panels, order thesis\n" in out
     assert f"way             {found['length_m']:.1f} m, {len(found['stops'])} stops" in out
     assert out.endswith("out of reach    none\n")
     assert out.splitlines()[1].endswith(" ...")
-    assert main(["plan", "--mirror", "fyst-m2", "--panels", "1"]) == 0
-    assert "fyst-m2: 9 points of 1 panel, order thesis\n" in capsys.readouterr().out
+    said = printed(capsys, "plan", "--mirror", "fyst-m2", "--panels", "1")
+    assert "fyst-m2: 9 points of 1 panel, order thesis\n" in said
 
 
 @pytest.mark.parametrize(

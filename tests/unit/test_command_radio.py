@@ -18,7 +18,7 @@ from ccatp.filters.base import FilterDiverged
 from ccatp.links.topics import schema_of
 from ccatp.records.recorder import Recorder
 from ccatp.studies.gtsam_peer import PeerError, PeerGaveUp, run_gtsam
-from tests.support.command import answered, refused
+from tests.support.command import answered, printed, refused
 from tests.unit.beacons.datasets.sets import (
     BEACONS,
     csv_lines,
@@ -342,8 +342,9 @@ def test_what_cannot_be_solved_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
 def test_slam_with_peers_prints_all_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("gtsam", reason="the extra peers is not installed")
     file = write_lines(tmp_path / "mine.csv", csv_lines(world(seconds=20.0)))
-    assert main(["radio", "slam", str(file), "--peers"]) == 0
-    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| mine")]
+    rows = [
+        line for line in printed(capsys, "radio", "slam", file, "--peers").splitlines() if line.startswith("| mine")
+    ]
     names = [line.split("|")[2].strip() for line in rows]
     assert names == ["ekf-slam", "fixed-lag", "smoother", "GTSAM iSAM2", "GTSAM batch"]
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ccatp.cli import main
-from tests.support.command import answered, refused
+from tests.support.command import answered, printed, refused
 from tests.unit.beacons.cricket.fields import ALL, HEADS, FloatArray
 
 SESSION = Path(__file__).parents[2].parent / "shared" / "data" / "radio" / "uwb_planar"
@@ -45,8 +45,7 @@ def truth_file(path: Path) -> Path:
 
 
 def test_the_directions_of_the_frame_stand_apart(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["radio", "map"]) == 0
-    out = capsys.readouterr().out
+    out = printed(capsys, "radio", "map")
     assert "of the frame       translation along x, translation along y, rotation\n" in out
     assert "beyond the frame   0\n  other maps" in out
 
@@ -111,8 +110,8 @@ def test_one_pair_that_was_measured_less_is_to_be_measured_next(
 ) -> None:
     """M2 hangs on the others by three ranges, each once: all others have theirs sixty times."""
     path = ranges_file(tmp_path / "r.csv", [pair for pair in ALL if 2 not in pair] * 60 + [(0, 2), (1, 2), (2, 3)])
-    assert main(["radio", "map", "--ranges", str(path)]) == 0
-    line = next(line for line in capsys.readouterr().out.splitlines() if "measure next" in line)
+    rows = printed(capsys, "radio", "map", "--ranges", path).splitlines()
+    line = next(row for row in rows if "measure next" in row)
     assert "M2" in line.split(":")[0].split()
 
 

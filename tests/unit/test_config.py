@@ -25,7 +25,7 @@ from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
 from ccatp.links.runtime_dir import locked
 from ccatp.records.recorder import RUN_LOCK
-from tests.support.command import refused
+from tests.support.command import answered, printed, refused
 
 
 def write(path: Path, text: str) -> Path:
@@ -169,7 +169,7 @@ def test_a_contradiction_points_to_what_the_user_wrote(tmp_path: Path) -> None:
     [
         ("none.toml", None, r"none.toml: no such file or directory; name a TOML file that exists"),
         ("", None, "is a directory; name a TOML file"),
-        ("latin.toml", '[run]\nmirror = "Mirör"'.encode("latin-1"), r"is not UTF-8 text \(byte 19\)"),
+        ("latin.toml", '[run]\nmirror = "Mirör"'.encode("latin-1"), r"is not UTF-8 text \(byte 19\); save it as UTF-8"),
         ("mine.toml", b"[run]\nseed =", r"mine.toml:2: is not TOML: "),
         ("mine.toml", b'[run]\nmirror = "bad.toml"\n', r"mine.toml:2: run.mirror.*is not TOML"),
     ],
@@ -183,8 +183,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, name: str, content:
 
 
 def test_the_schema_allows_what_the_loader_allows(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["config", "schema"]) == 0
-    text = capsys.readouterr().out
+    text = printed(capsys, "config", "schema")
     schema = json.loads(text)
     assert schema["title"] == "ccatp configuration"
     assert schema["additionalProperties"] is False
@@ -435,17 +434,13 @@ def test_the_template_changes_nothing_and_has_every_key(tmp_path: Path, capsys: 
 def test_show_and_diff(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, other = tmp_path / "mine.toml", tmp_path / "other.toml"
     file.write_text('[run]\nmirror = "fyst-m2"\n[robot]\nwheel_radius_m = 0.031\n', encoding="utf-8")
-    assert main(["config", "show", str(file), "--set", "run.seed=7"]) == 0
-    other.write_text(capsys.readouterr().out, encoding="utf-8")
+    other.write_text(printed(capsys, "config", "show", file, "--set", "run.seed=7"), encoding="utf-8")
     assert load_config(other) == load_config(file, {"run.seed": 7})
-    assert main(["config", "diff", str(file)]) == 0
-    assert capsys.readouterr().out.splitlines() == [
+    assert printed(capsys, "config", "diff", file).splitlines() == [
         'run.mirror: "fyst-m1" -> "fyst-m2"', "robot.wheel_radius_m: 0.03 -> 0.031",
     ]  # fmt: skip
-    assert main(["config", "diff", str(file), str(other), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"run.seed": [1, 7]}
-    assert main(["config", "diff", "follow"]) == 0
-    assert capsys.readouterr().out == "no difference\n"
+    assert answered(capsys, "config", "diff", file, other) == {"run.seed": [1, 7]}
+    assert printed(capsys, "config", "diff", "follow") == "no difference\n"
     assert differences(load_radio_config(None, {"run.seed": 9})) == [("run.seed", 1, 9)]
 
 
@@ -481,16 +476,13 @@ def test_runs_with_how_they_ended(tmp_path: Path, capsys: pytest.CaptureFixture[
         ("a", "held", "2/9", "fyst-m1, hard, simulated"), ("c", "not finished", "", "fyst-m1"),
         ("d", "going on", "", "fyst-m1"), ("b", "complete", "9/9", "fyst-m1, hard, simulated"),
     ]  # fmt: skip
-    assert main(["runs", "list", str(tmp_path)]) == 0
-    assert capsys.readouterr().out.splitlines()[1].split() == [
+    assert printed(capsys, "runs", "list", tmp_path).splitlines()[1].split() == [
         "2026-01-02T00:00:00", "held", "2/9", "0.3", "fyst-m1,", "hard,", "simulated", str(tmp_path / "a"),
     ]  # fmt: skip
-    assert main(["runs", "show", str(killed)]) == 0
-    shown = capsys.readouterr().out
+    shown = printed(capsys, "runs", "show", killed)
     assert "state           not finished\n" in shown
     assert "config.toml                   0.000 MB  the exact configuration\n" in shown
-    assert main(["runs", "show", str(killed), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["files"]["config.toml"] == 0
+    assert answered(capsys, "runs", "show", killed)["files"]["config.toml"] == 0
     assert "no such folder" in refused(capsys, "runs", "list", str(tmp_path / "none"))
     assert "no run directory (it has no config.toml)" in refused(capsys, "runs", "show", str(tmp_path))
 

@@ -22,7 +22,7 @@ from ccatp.cli import cli
 from ccatp.config import package
 from ccatp.config.load import load_config
 from ccatp.core import danger_text
-from ccatp.errors import CcatpError, ConfigError, DaemonUnreachableError, ExitStatus, RefusedError
+from ccatp.errors import CcatpError, ConfigError, ExitStatus
 from tests.unit.dashboard.test_view import ALL, metrics_of
 
 
@@ -49,22 +49,9 @@ def test_the_paths_of_the_parent_are_kept(monkeypatch: pytest.MonkeyPatch) -> No
     assert found["HOME"] == "/home"
 
 
-@pytest.mark.parametrize(
-    ("error", "status"),
-    [
-        (CcatpError("x"), ExitStatus.HELD),
-        (ConfigError("x"), ExitStatus.USAGE),
-        (RefusedError("x"), ExitStatus.REFUSED),
-        (DaemonUnreachableError("x"), ExitStatus.UNREACHABLE),
-    ],
-)
-def test_each_error_has_its_exit_status(error: CcatpError, status: ExitStatus) -> None:
-    assert error.exit_status == status
-    assert str(error) == "x"
-
-
 def test_a_message_is_one_line_and_that_of_the_first_problem() -> None:
     assert str(CcatpError("two\n lines ")) == "two lines"
+    assert CcatpError("x").exit_status is ExitStatus.HELD
     error = ConfigError("a: b", "c:\nd")
     assert str(error) == "a: b (and 1 more: ccatp config check)"
     assert error.problems == ["a: b", "c: d"]

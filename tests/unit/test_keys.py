@@ -29,7 +29,7 @@ from ccatp.links.auth import AuthorizedClient, ClientsFile, check_key, read_clie
 from ccatp.links.client import HttpClient, Latched, OperatorClient, Pong, StillWaiting
 from ccatp.links.rpc import Router
 from ccatp.links.topics import MissionStatus
-from tests.support.command import refused
+from tests.support.command import answered, printed, refused
 from tests.support.http_server import answering
 
 # -- ``ccatp keys``: what is written, and what is never shown ---------------------------------------------------------
@@ -150,12 +150,9 @@ def test_show_public_shows_public_keys(folder: Path, capsys: pytest.CaptureFixtu
     assert generate(folder, "--name", "a") == generate(folder, "--name", "bcd") == 0
     capsys.readouterr()
     keys = {name: read_public(folder / f"{name}.key", "x").decode() for name in ("a", "bcd")}
-    assert main(["keys", "show-public", "--dir", str(folder)]) == 0
-    assert capsys.readouterr().out == f"a    {keys['a']}\nbcd  {keys['bcd']}\n"
-    assert main(["keys", "show-public", "--dir", str(folder), "--name", "a", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"a": keys["a"]}
-    assert main(["keys", "show-public", "--dir", str(folder), "--name", "c"]) == 2
-    assert "no c.key in" in capsys.readouterr().err
+    assert printed(capsys, "keys", "show-public", "--dir", folder) == f"a    {keys['a']}\nbcd  {keys['bcd']}\n"
+    assert answered(capsys, "keys", "show-public", "--dir", folder, "--name", "a") == {"a": keys["a"]}
+    assert "no c.key in" in refused(capsys, "keys", "show-public", "--dir", folder, "--name", "c")
 
 
 def test_secret_files_that_are_refused(folder: Path) -> None:
@@ -208,8 +205,8 @@ def test_the_list_is_read_again_when_it_changes_and_a_bad_one_names_nobody(folde
 
 
 def test_a_key_of_the_daemon_is_not_the_pages(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["dashboard", "--set", "run.seed=2"]) == 2
-    assert "run.seed is no key of the page; the daemon runs with what it has" in capsys.readouterr().err
+    said = refused(capsys, "dashboard", "--set", "run.seed=2")
+    assert "run.seed is no key of the page; the daemon runs with what it has" in said
 
 
 # -- the list of clients -----------------------------------------------------------------------------------------------

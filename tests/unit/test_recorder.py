@@ -29,6 +29,7 @@ from ccatp.records.recorder import (
     recordings,
 )
 from ccatp.records.recording_repair import RecordingError, read_facts, recording_files, recover, strict_faults
+from tests.support.command import answered, printed, refused
 
 SCHEMA: dict[str, Any] = {"type": "object", "title": "x.Track", "properties": {"n": {"type": "integer"}}}
 TOPICS: list[tuple[str, dict[str, Any]]] = [("track", SCHEMA), ("fix", {"type": "object"})]
@@ -382,23 +383,18 @@ def test_a_disk_that_garbles_is_noticed(recorded: Path, tmp_path: Path, monkeypa
 
 
 def test_commands(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["recording", "info", str(tmp_path), "--json"]) == 0
-    (told,) = json.loads(capsys.readouterr().out)["recordings"]
+    (told,) = answered(capsys, "recording", "info", tmp_path)["recordings"]
     assert told["complete"]
-    assert main(["recording", "info", str(recorded)]) == 0
-    text = capsys.readouterr().out
+    text = printed(capsys, "recording", "info", recorded)
     assert "complete, every checksum right" in text
     assert "0.00 to 5.99 s of the robot's clock, 2027-01-15T12:00:00Z to 2027-01-15T12:00:05Z, " in text
     assert "x.Track" in text
     recorded.write_bytes(recorded.read_bytes()[:50_000])
-    assert main(["recording", "info", str(recorded)]) == 1
-    assert "save what is intact with: ccatp recording repair" in capsys.readouterr().out
-    assert main(["recording", "repair", str(tmp_path)]) == 0
-    assert "telemetry.recovered.mcap: " in capsys.readouterr().out
-    assert main(["recording", "repair", str(recorded), "--out", str(tmp_path / "b.mcap"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["was_complete"] is False
-    assert main(["recording", "repair", str(recorded)]) == 2
-    assert "exists already" in capsys.readouterr().err
+    said = printed(capsys, "recording", "info", recorded, status=1)
+    assert "save what is intact with: ccatp recording repair" in said
+    assert "telemetry.recovered.mcap: " in printed(capsys, "recording", "repair", tmp_path)
+    assert answered(capsys, "recording", "repair", recorded, "--out", tmp_path / "b.mcap")["was_complete"] is False
+    assert "exists already" in refused(capsys, "recording", "repair", recorded)
 
 
 def test_nothing_waits_longer_than_a_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -425,16 +421,14 @@ def test_a_recording_that_is_being_written_is_not_damaged(tmp_path: Path, capsys
     for n in range(600):
         made.write("track", n / 100, payload(n))
     with locked(run_dir / RUN_LOCK, "taken"):
-        assert main(["recording", "info", str(run_dir)]) == 0
-        told = capsys.readouterr().out
+        told = printed(capsys, "recording", "info", run_dir)
         assert "telemetry.mcap: still being written, so without an index\n" in told
         assert "recording repair" not in told
         assert "beacon_map" not in told
         assert "  1 topic without messages\n" in told
         assert damage_text(run_dir / "telemetry.mcap", "x").startswith("telemetry.mcap: still being written")
     # Nobody writes it any more, and it has no end.
-    assert main(["recording", "info", str(run_dir)]) == 1
-    told = capsys.readouterr().out
+    told = printed(capsys, "recording", "info", run_dir, status=1)
     assert "telemetry.mcap: cut off or damaged\n" in told
     assert "  no index: it was not closed\n" in told
     assert "RecordLengthLimitExceeded" not in told

@@ -8,21 +8,17 @@ from pathlib import Path
 
 import pytest
 import uvloop
+from msgspec.structs import replace
 
 from ccatp.config.files import read_key
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.robot_codec import RobotFrame, encode, join_mac
 from ccatp.links.robot_link import LineWriter, RobotLink, RobotLinkError, RobotRefused, RobotTimeout, WrongProtocol
 from ccatp.links.robot_messages import CommandEcho, Sensors
+from tests.support.daemon import HELLO as OF_ROBOT
 from tests.support.daemon import link_to
 
-NONCE = "ab" * 16
-HELLO = (
-    b'{"type":"hello","protocol":"ccatp-robot/1","boot":1,"nonce":"%b","auth":"none","lockstep":true,'
-    b'"frame_hz":100.0,"ttl_s":0.25,"robot":{"wheel_radius_m":0.03,"wheel_base_m":0.15,'
-    b'"edge_sensors_m":[[0.09,0.09],[0.09,-0.09],[-0.09,0.09],[-0.09,-0.09]],"puck_m":[0,0,0.05],'
-    b'"max_wheel_rad_s":8.0,"fan_floor":0.0}}\n' % NONCE.encode()
-)
+HELLO = encode(replace(OF_ROBOT, lockstep=True))
 HELLO_HMAC = HELLO.replace(b'"none"', b'"hmac-sha256"')
 JOINED = b'{"type":"joined","role":"controller","session":1}\n'
 DEADLINE_S = 2.0  # what never happens in a good run may take this long in a bad one
@@ -295,7 +291,7 @@ async def test_the_key_is_used_where_the_robot_asks_for_it() -> None:
 
     async with robot(script, key=b"secret") as (link, _):
         await link.connect(DEADLINE_S)
-    mac = join_mac(b"secret", NONCE, "controller")
+    mac = join_mac(b"secret", OF_ROBOT.nonce, "controller")
     assert joins == [b'{"type":"join","role":"controller","client":"test","mac":"%b"}\n' % mac.encode()]
 
 

@@ -24,7 +24,7 @@ from ccatp.mirror.misalignment import PanelMisalignment
 from ccatp.records.recorder import RECORD_FORMAT, Recorder
 from ccatp.records.run_reader import RunReadError, open_run, read_run
 from ccatp.studies import replay as player
-from tests.support.command import refused
+from tests.support.command import printed, refused
 from tests.support.scenario import world_of
 from tests.unit.aligning.test_panel_alignment import exact_fix
 from tests.unit.reporting.recorded import make_run, record_truth, recorder_in
@@ -376,8 +376,8 @@ def test_a_path_is_exported_as_a_trajectory(
     messages: list[tuple[str, Message]] = [("sensors", batch(0, 1)), ("track", track(0, 1))]
     record(run, [*messages, ("truth", TruthMessage(seq=0, t_s=0.0, rows=rows))], config=config_text, simulation="true")
     (run / "config.toml").write_text(config_text, encoding="utf-8")
-    assert main(["recording", "export", str(run), "--tum", str(estimates), "--truth", str(truth)]) == 0
-    assert capsys.readouterr().out == f"{estimates}: 2 poses\n{truth}: 1 poses\n"
+    told = printed(capsys, "recording", "export", run, "--tum", estimates, "--truth", truth)
+    assert told == f"{estimates}: 2 poses\n{truth}: 1 poses\n"
     t_s, *place, qx, qy, qz, qw = map(float, truth.read_text().split())
     assert (t_s, place, qx, qy) == (0.0, [1.0, 2.0, 3.0], 0.0, 0.0)
     assert (qz, qw) == pytest.approx((sin(0.25), cos(0.25)), abs=1e-9)

@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 
 from ccatp.cli import main
-from ccatp.config.load import load_config
 from ccatp.config.models import AlignConfig, Config
 from ccatp.core import DeckPose, Fix, FloatArray, PanelId, PointId, Vector3
-from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import SurveyResult, compare, survey_result
 from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
@@ -41,10 +39,9 @@ from ccatp.mirror.panel_alignment import (
 )
 from ccatp.mirror.surface import UnknownPanelError
 from ccatp.sim.world import draw_misalignments
-from ccatp.studies.sil_run import SilLaser, SilRun, StopRow
-from tests.support.command import answered
+from tests.support.command import answered, printed, refused
 from tests.support.scenario import MIRRORS, World, world_of
-from tests.unit.reporting.recorded import make_run
+from tests.unit.reporting.recorded import make_run, record
 
 HEIGHT_M = 0.05
 Truth = Mapping[PanelId, PanelMisalignment]
@@ -459,27 +456,6 @@ ALIGNED = PanelId(3, 7)
 LIES = PanelMisalignment(40e-6, -90e-6, 120e-6)
 
 
-class KeepingDesk(SilLaser):
-    """Keeps the fix that counts for each point, as the daemon's database does."""
-
-    def is_too_far(self, row: StopRow, point: PointId, fix: Fix, distance_m: float, localizer: Localizer) -> bool:
-        is_too_far = super().is_too_far(row, point, fix, distance_m, localizer)
-        if not is_too_far:
-            self.kept.append(Measured(point, fix))
-        return is_too_far
-
-    kept: list[Measured]
-
-
-def surveyed(run_dir: Path, cfg: Config) -> Path:
-    """The run directory of a survey in process."""
-    run = SilRun(cfg)
-    run.laser = desk = KeepingDesk(cfg, run.mirror, run.robot)
-    desk.kept = []
-    assert run.run().outcome == "complete"
-    return make_run(run_dir, cfg, run.parts.points, desk.kept, run.robot.world.misalignments)
-
-
 def aligned(capsys: pytest.CaptureFixture[str], run_dir: Path, *args: str) -> Any:
     return answered(capsys, "align", run_dir, *args)
 
@@ -499,8 +475,7 @@ def run_dir(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("name", [MIRRORS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in MIRRORS[1:])])
 def test_a_survey_recovers_what_was_simulated(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cfg = load_config(overrides={"run.mirror": name, "run.panels": 1, "mission.calibration_length_m": 0.0})
-    found = aligned(capsys, surveyed(tmp_path / "run", cfg))
+    found = aligned(capsys, record(tmp_path / "run", run__mirror=name, run__world="thesis"))
     assert (found["mirror"], found["world"], found["warnings"]) == (name, "thesis", [])
     assert found["points"] == {"total": 9, "measured": 9, "outliers": 0}
     truth = found["truth"]
@@ -545,8 +520,7 @@ def test_a_survey_without_a_panel_is_told(tmp_path: Path, capsys: pytest.Capture
     found = aligned(capsys, run_dir)
     assert (found["panels"], found["rms_before_um"], found["rms_after_um"]) == ([], None, None)
     assert (found["truth"], found["world"]) == (None, None)
-    assert main(["align", str(run_dir)]) == 0
-    assert "1 panel not measured" in capsys.readouterr().out
+    assert "1 panel not measured" in printed(capsys, "align", run_dir)
 
 
 def test_the_csv_has_a_line_a_panel_and_the_figure_is_drawn(
@@ -598,8 +572,7 @@ def test_what_cannot_be_is_refused_in_one_line(
 
 def test_a_csv_that_cannot_be_written_and_no_run_are_errors(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run_dir / "dir.csv").symlink_to("/dev/full")
-    assert main(["align", str(run_dir), "--csv", str(run_dir / "dir.csv")]) == 2
-    assert "--csv: cannot write" in capsys.readouterr().err
+    assert "--csv: cannot write" in refused(capsys, "align", run_dir, "--csv", run_dir / "dir.csv")
     (run_dir / "config.toml").unlink()
     assert main(["align", str(run_dir)]) == 2
     assert capsys.readouterr().err == f"ccatp: {run_dir}: no config.toml there; name the directory of a run\n"

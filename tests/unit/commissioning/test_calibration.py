@@ -1,6 +1,5 @@
 """Tests of the calibration: the true robot is found within the uncertainty that is stated."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -18,11 +17,12 @@ from ccatp.config.load import dump_config, load_config
 from ccatp.core import Fix, FloatArray
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import TOPICS, FixMessage, SensorLines, schema_of
-from ccatp.records.recorder import RECORD_FORMAT, Recorder
+from ccatp.links.topics import FixMessage, SensorLines
+from ccatp.records.recorder import RECORD_FORMAT
 from ccatp.sim.robot import Robot
 from ccatp.studies.sil_run import SilRun
-from tests.support.command import refused
+from tests.support.command import answered, printed, refused
+from tests.unit.reporting.recorded import recorder_in
 
 # A robot that is not what the configuration says, in a world without slip: thesis with these.
 OTHER_ROBOT = {
@@ -76,9 +76,7 @@ def record(run_dir: Path, driven: CalibrationDrive) -> Path:
     run_dir.mkdir(exist_ok=True)
     text = dump_config(driven.cfg)
     (run_dir / "config.toml").write_text(text)
-    topics = [(topic.name, schema_of(topic.name)) for topic in TOPICS if topic.recorded]
-    metadata = {"config": text, "format": str(RECORD_FORMAT)}
-    recorder = Recorder(run_dir / "telemetry.mcap", topics, is_simulation=True, metadata=metadata)
+    recorder = recorder_in(run_dir, {"config": text, "format": str(RECORD_FORMAT)})
     for seq, fix in driven.fixes:
         message = FixMessage(
             seq=seq, t_s=fix.t_s, point=None, is_fused=True, position_m=fix.position_m,
@@ -206,8 +204,7 @@ def test_the_command_writes_what_it_found(
     assert "-wheel_radius_m = 0.03  # by a tape" in shown.out
     assert "nothing written" in shown.err
     assert config.read_text() == text
-    assert main([*command, "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    result = answered(capsys, *command)
     told = result["parameters"]["robot.wheel_radius_m"]
     assert told["found"] == pytest.approx(found.radius.value, abs=1e-9)  # of a few decimals of the recorded samples
     assert result["written"] == str(config)
@@ -218,8 +215,7 @@ def test_the_command_writes_what_it_found(
     assert "[localizer]\ngyroscope_bias_rad_s = " in written
     assert config.stat().st_mode & 0o777 == 0o640
     assert set(tmp_path.iterdir()) == {run_dir, config}
-    assert main([*command]) == 0
-    assert "nothing to change" in capsys.readouterr().out
+    assert "nothing to change" in printed(capsys, *command)
 
 
 def test_what_is_replaced_is_shown_and_nothing_without_a_configuration(
@@ -232,8 +228,7 @@ def test_what_is_replaced_is_shown_and_nothing_without_a_configuration(
     (row,) = (line for line in shown.out.splitlines() if line.startswith("robot.wheel_radius_m "))
     assert row.split()[1] == "0.0301"
     assert f"the drive was on fyst-m1, {config} is for fyst-m2" in shown.err
-    assert main(["calibrate", "--from", str(run_dir)]) == 0
-    assert "robot.wheel_radius_m = " in capsys.readouterr().out
+    assert "robot.wheel_radius_m = " in printed(capsys, "calibrate", "--from", run_dir)
 
 
 def test_misuse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,7 +17,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from ccatp.cli import main
 from ccatp.commissioning.preflight import (
     ROBOT_CHECKS,
     CheckOutcome,
@@ -43,6 +42,7 @@ from ccatp.links.multiline import Environment
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.robot import Robot
+from tests.support.command import printed, refused
 
 FRAMES = 300
 PASS, WARN, FAIL, SKIP = CheckOutcome
@@ -334,17 +334,12 @@ def test_the_command_fails_where_one_fails(tmp_path: Path, free_port: int, capsy
     config = tmp_path / "a.toml"
     config.write_text(f"[robot]\nport = {free_port}\n[etalon]\nport = {free_port}\nretries = 0\n")
     command = ["check", "--config", str(config), "--runtime-dir", str(tmp_path / "rt"), "--runs-dir", str(tmp_path)]
-    assert main(command) == 1
-    out = capsys.readouterr().out
+    out = printed(capsys, *command, status=1)
     assert "fail  robot link" in out
     assert "not ready: " in out
-    assert main([*command, "--json"]) == 1
-    assert json.loads(capsys.readouterr().out)["ready"] is False
+    assert json.loads(printed(capsys, *command, "--json", status=1))["ready"] is False
     config.write_text("[robot]\nport = 'x'\n")
-    assert main(command) == 1
-    assert "fail  configuration" in capsys.readouterr().out
-    assert main(["check"]) == 2
-    assert "--config FILE, or add --sim" in capsys.readouterr().err
+    assert "fail  configuration" in printed(capsys, *command, status=1)
+    assert "--config FILE, or add --sim" in refused(capsys, "check")
     config.write_text("[observatory]\nendpoint = 'tcp://127.0.0.1:7020'\nkey_file = 'a'\nclients_file = 'b'\n")
-    assert main(command) == 1
-    assert "fail  observatory keys" in capsys.readouterr().out
+    assert "fail  observatory keys" in printed(capsys, *command, status=1)

@@ -30,7 +30,7 @@ from ccatp.links.robot_messages import CommandEcho, Hello, Joined, Sensors
 from ccatp.links.topics import FixMessage
 from ccatp.records.store import AlreadyMeasuredError
 from ccatp.survey.events import FixStored, SurveyInput
-from tests.faults.test_link import HELLO
+from tests.support.daemon import HELLO
 from tests.support.scenario import SurveyLoop
 from tests.support.sim_survey import fix_service
 

@@ -16,7 +16,7 @@ from ccatp.report.beacon_record import (
 )
 from ccatp.report.plots import NARROW, PX_PER_IN, WIDE
 from ccatp.report.run_page import beacon_data, beacon_drawings, beacon_page
-from tests.support.command import answered
+from tests.support.command import answered, printed
 from tests.unit.reporting.conftest import Markup
 from tests.unit.reporting.recorded import FRAMES, OFF_M, SIGMA_M, beacon_config, record_beacons
 
@@ -57,8 +57,7 @@ def test_a_waypoint_that_was_reached(run_dir: Path) -> None:
 @pytest.mark.usefixtures("drawn")
 def test_the_command_and_the_page(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "page.html"
-    assert main(["report", str(run_dir), "--out", str(path)]) == 0
-    assert capsys.readouterr().out == f"{path}\n"
+    assert printed(capsys, "report", run_dir, "--out", path) == f"{path}\n"
     told = answered(capsys, "report", run_dir, "--out", path)
     assert told["report"] == str(path)
     assert (told["system"], told["seed"], told["outcome"]) == ("zigbee", 5, "complete")

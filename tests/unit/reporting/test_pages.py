@@ -25,7 +25,7 @@ from ccatp.report.findings import findings_of, outcome_of
 from ccatp.report.html import POLICY, environment, events_of, micro_text
 from ccatp.report.record import RunRecord, changed_keys, read_record
 from ccatp.report.run_page import report_run, run_page
-from tests.support.command import answered, refused
+from tests.support.command import answered, printed, refused
 from tests.unit.reporting.conftest import Markup
 from tests.unit.reporting.recorded import record
 
@@ -209,8 +209,7 @@ def test_two_surveys_of_one_mirror_agree(
     config = run_dir / "config.toml"
     config.write_text(config.read_text().replace('filter = "ekf"', 'filter = "ukf"'))
     out, figures = tmp_path / "cmp.html", tmp_path / "figures"
-    assert main(["compare", str(recorded), str(run_dir), "--out", str(out), "--figures", str(figures), "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
+    data = answered(capsys, "compare", recorded, run_dir, "--out", out, "--figures", figures)
     assert (data["one_mirror"], data["agree"], data["dof"], data["report"]) == (True, True, 3, str(out))
     (panel,) = data["panels"]
     assert panel["piston_um"] == 0.0 < panel["sigma"][0]
@@ -232,8 +231,7 @@ def test_two_surveys_of_one_mirror_agree(
 
 def test_panels_that_moved_are_found(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     elsewhere = record(tmp_path / "moved", run__seed=2)  # its panels lie otherwise
-    assert main(["compare", str(recorded), str(elsewhere), "--out", str(tmp_path / "c.html")]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = printed(capsys, "compare", recorded, elsewhere, "--out", tmp_path / "c.html").splitlines()
     assert lines[-3].startswith("the surveys differ: chi2 of no change ")
     assert lines[-2].startswith("panel 1/2 has moved: piston ")
     assert lines[-1] == str(tmp_path / "c.html")

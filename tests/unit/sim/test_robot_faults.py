@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.cli import main
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
 from ccatp.errors import ConfigError
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_plan import LINK_TYPES, TYPES, FaultPlan, Injected, check_pacing, parse_plan, read_plan
 from ccatp.sim.robot import Robot
+from tests.support.command import refused
 from tests.support.scenario import config_of, fault_plan, mirror_of
 
 FAULT = '[[fault]]\nsignal = "imu_wz"\nat_s = 1.0\n'
@@ -119,8 +119,7 @@ def test_the_commands_refuse_it_before_anything_starts(
 ) -> None:
     file = tmp_path / "plan.toml"
     file.write_text(LINK + 'type = "stall"\ndirection = "both"')
-    assert main([*command, "--faults", str(file)]) == 2
-    error = capsys.readouterr().err
+    error = refused(capsys, *command, "--faults", file)
     assert 'link[0].type = "stall" makes no sense in lockstep' in error
     assert error.count("\n") == 1
 

@@ -163,25 +163,6 @@ def test_the_control_loop_drives_wheels_through_the_devices_and_brakes_when_it_d
 
 
 Break = Callable[[Rig], object]
-# What breaks, faults on the robot link.
-BREAKS: dict[str, tuple[Break, set[str]]] = {
-    "nothing": (lambda r: None, set()),
-    "inertial unit": (lambda r: setattr(r.unit, "error", OSError(errno.EREMOTEIO, "Remote I/O error")), {"imu"}),
-    "data acquisition": (lambda r: setattr(r.daq, "is_mute", True), {"encoder_left", "encoder_right", "edge"}),
-    "battery": (lambda r: r.daq.adc.__setitem__(4, 45000), {"battery_low"}),
-    "battery's wire": (lambda r: r.daq.adc.__setitem__(4, 0), {"battery_low"}),
-    "left fan": (lambda r: (r.pwm.root / "pwmchip1/pwm0/duty_cycle").write_text("?\n"), {"fan_left"}),
-    "right fan": (lambda r: (r.pwm.root / "pwmchip1/pwm1/enable").write_text(""), {"fan_right"}),
-}
-
-
-@pytest.mark.parametrize(("broken", "faults"), BREAKS.values(), ids=BREAKS)
-def test_faults_have_their_names_on_the_link(rig: Rig, broken: Break, faults: set[str]) -> None:
-    rig.hardware.start()
-    assert rig.run(0.2) == set()
-    broken(rig)
-    assert rig.run(1.5) == faults
-    rig.hardware.close()
 
 
 @pytest.mark.parametrize(
