@@ -27,6 +27,7 @@ _LEAST_TURN_RAD = 1.0  # between two fixes: a shorter turn shows no creep
 _LEAST_USE = 0.1  # of tangential load by load of the wheels: a tyre that carries less shows no creep either
 _MOST_FRICTION = 2.0
 _TURNS = 4  # that the mean creep is taken over
+_MOST_USE = 0.8  # of its friction by a wheel in a turn: beyond that it slides for moments, and the creep grows steeply
 _TOLERANCE = 1.8  # of the creep: by slope and heading it varies by so much with the friction that is promised
 
 
@@ -38,6 +39,20 @@ def least_thrust_n(robot: RobotConfig, gravity: Vector3, *, turns: bool) -> floa
     grips = outward + (tangential / robot.friction + ahead * height_m / robot.caster_m) / share
     lifts = outward + (tangential if turns else -ahead) * height_m / -x_m if x_m < 0.0 else 0.0
     return max(grips, lifts, 0.0)
+
+
+def turn_thrust_n(robot: RobotConfig, gravity: Vector3) -> float:
+    """Thrust with which each wheel uses at most 0.8 of its friction at any heading there, N.
+
+    The slope takes load from the wheel that is higher, and a centre of mass behind the axle pulls at that wheel:
+    downhill behind and a little beside is the worst heading.
+    """
+    tangential, outward, _ = _load_n(robot, gravity, turns=True)
+    x_m, height_m = robot.centre_of_mass_m
+    per_friction = 1.0 / (_MOST_USE * robot.friction)
+    along = per_friction + height_m / robot.caster_m
+    across = 2.0 * (abs(x_m) * per_friction + height_m) / robot.wheel_base_m
+    return outward + tangential * hypot(along, across) / (1.0 + x_m / robot.caster_m)
 
 
 def _load_n(robot: RobotConfig, gravity: Vector3, *, turns: bool) -> Vector3:
@@ -163,8 +178,11 @@ class ThrustControl:
         self._heading_rad = pose.heading_rad
         if self._is_full:
             return False
-        least_n = least_thrust_n(robot, self._mirror.gravity_in_robot(pose), turns=turns)
-        wanted = _STEP * ceil(robot.thrust_margin * least_n / robot.thrust_n / _STEP)
+        gravity = self._mirror.gravity_in_robot(pose)
+        wanted_n = robot.thrust_margin * least_thrust_n(robot, gravity, turns=turns)
+        if turns:
+            wanted_n = max(wanted_n, turn_thrust_n(robot, gravity))
+        wanted = _STEP * ceil(wanted_n / robot.thrust_n / _STEP)
         ramp = _RAMP_PER_S * min(max(elapsed_s, 0.0), 0.1)
         before = self.duty
         left, right = [

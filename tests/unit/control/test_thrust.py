@@ -7,7 +7,14 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.config.models import RobotConfig
-from ccatp.control.thrust import ThrustControl, forecast_grip, friction_by_creep, least_thrust_n, safe_speed_m_s
+from ccatp.control.thrust import (
+    ThrustControl,
+    forecast_grip,
+    friction_by_creep,
+    least_thrust_n,
+    safe_speed_m_s,
+    turn_thrust_n,
+)
 from ccatp.core import DeckPose, Vector3
 from ccatp.errors import ConfigError
 from ccatp.mirror.mirror import build_mirror
@@ -50,6 +57,19 @@ def test_on_a_floor_none_is_needed() -> None:
     assert least_thrust_n(robot(), (0.0, 0.0, -1.0), turns=True) == 0.0
 
 
+def test_a_turn_leaves_a_fifth_of_its_friction_to_the_lighter_wheel() -> None:
+    """Loads of each wheel by moments about the axle and along it, at every heading."""
+    cfg, used = robot(), []
+    thrust_n = turn_thrust_n(cfg, gravity(0.0))
+    for degrees in range(360):
+        ahead, left, away = (WEIGHT_N * part for part in gravity(radians(degrees)))
+        both_n = (thrust_n - away) * 0.8 + ahead * 0.035 / 0.075
+        for side in (1.0, -1.0):
+            load_n, pull_n = 0.5 * both_n + side * left * 0.035 / 0.15, 0.5 * ahead + side * left * 0.015 / 0.15
+            used.append(abs(pull_n) / load_n / cfg.friction)
+    assert max(used) == pytest.approx(0.8, abs=1e-3)
+
+
 def test_speed_from_which_the_spare_grip_stops_it() -> None:
     cfg = robot(friction=0.6)
     least_n = least_thrust_n(cfg, gravity(0.0), turns=True)
@@ -58,9 +78,11 @@ def test_speed_from_which_the_spare_grip_stops_it() -> None:
     assert safe_speed_m_s(cfg, gravity(0.0), least_n + 1.0) == pytest.approx((2.0 * 0.48 * 0.03) ** 0.5)
 
 
-@pytest.mark.parametrize(("mirror", "turn_duty"), [("fyst-m1", 0.8), ("fyst-m2", 0.92)])
-def test_duty_goes_to_what_a_turn_needs_with_a_ramp(mirror: str, turn_duty: float) -> None:
-    cfg = robot()
+@pytest.mark.parametrize(
+    ("mirror", "thrust_n", "turn_duty"), [("fyst-m1", 40.0, 0.8), ("fyst-m1", 6.5, 0.94), ("fyst-m2", 40.0, 0.92)]
+)
+def test_duty_goes_to_what_a_turn_needs_with_a_ramp(mirror: str, thrust_n: float, turn_duty: float) -> None:
+    cfg = robot(thrust_n=thrust_n)
     control = ThrustControl(cfg, build_mirror(load_config(overrides={"run.mirror": mirror}).mirror))
     pose = DeckPose(0.0, 0.0, 0.5)
     duties = [control.duty]
