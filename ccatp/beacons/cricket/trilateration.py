@@ -179,22 +179,24 @@ class Sketch:
     def _listed(self, motes: Sequence[int]) -> str:
         return list_names([self._names[mote] for mote in motes])
 
-    def draw_errors(self, places_m: FloatArray, draws: int) -> tuple[FloatArray, FloatArray]:
+    def draw_errors(self, places_m: FloatArray, draws: int, maps: int = _NEAR) -> tuple[FloatArray, FloatArray]:
         """Mean (n, d) and covariance (n d, n d) of the errors, by the parametric bootstrap (Efron 1979).
 
         At places close to those that were found, ranges with errors as they are expected are drawn, and the same steps
         made of them. Derivatives would not do: from a small stand errors grow to decimetres, and along so wide an arc
         no line is a tangent everywhere. What a line takes to be known within a millimetre is known within centimetres.
         For the same reason the errors at those places are not those at the true ones: they are drawn again at a few of
-        the maps that were drawn (iterated bootstrap: Hall 1986). ``places_m``: where the motes might be, nan for those
-        without a place, shape (n, d). Zeros without draws.
+        the ``maps`` that were drawn (iterated bootstrap: Hall 1986; 0: at the places alone). These are turned one way
+        and the other, so across the arcs the covariance is wider than that of the errors there are (NEES 0.8); phase 2
+        is less sure than the errors at the places alone would make it (docs/cricket.md). ``places_m``: where the motes
+        might be, nan for those without a place, shape (n, d). Zeros without draws.
         """
         count, d = places_m.shape
         if draws == 0:
             return np.zeros_like(places_m), np.zeros((count * d, count * d))
         rng = np.random.default_rng(0)  # the same draws for every map: the same ranges give the same one
-        near = self._drawn(places_m, _NEAR, rng)
-        errors = np.concatenate([self._drawn(places, draws // _NEAR, rng) - places for places in near])
+        near = self._drawn(places_m, maps, rng) if maps else places_m[None]
+        errors = np.concatenate([self._drawn(places, draws // len(near), rng) - places for places in near])
         errors = np.nan_to_num(errors).reshape(len(errors), -1)
         return errors.mean(axis=0).reshape(count, d), np.atleast_2d(np.cov(errors.T))
 
@@ -260,12 +262,12 @@ class FirstMap(NamedTuple):
     unplaced: tuple[int, ...]
 
 
-def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: int = 0) -> FirstMap:
+def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: int = 0, maps: int = _NEAR) -> FirstMap:
     """Phase 1 of Patil et al., figure 8, in the field's frame.
 
     A is the origin, B on the second axis, the first stand follows by the law of cosines, every other one by
-    trilateration from all motes of the stand before it. Raises MappingError: a step that cannot be made; the message
-    names its motes.
+    trilateration from all motes of the stand before it. ``draws``, ``maps``: as of ``Sketch.draw_errors``. Raises
+    MappingError: a step that cannot be made; the message names its motes.
     """
     sketch = Sketch(network, max_dop)
     origin, axis = plan.anchors
@@ -279,7 +281,7 @@ def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: in
     shaped = sketch.positions_m.copy()  # with the stands as they are known to be
     for stand in plan.bodies:
         shaped[list(stand.motes)] = stand.placed(sketch.positions_m)
-    bias, covariance = sketch.draw_errors(shaped, draws)
+    bias, covariance = sketch.draw_errors(shaped, draws, maps)
     up = plan.axes_m[1] / np.linalg.norm(plan.axes_m[1])
     motion = RigidMotion(np.column_stack([(up[1], -up[0]), up]), plan.axes_m[0])
     positions, covariance = motion.moved(sketch.positions_m), motion.turned_map(covariance)

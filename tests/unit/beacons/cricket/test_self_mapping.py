@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
 from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
 from ccatp.beacons.cricket.mote_plan import network_plan
@@ -326,28 +325,48 @@ def test_no_triangle_no_beginning() -> None:
 DRAWS = 800
 
 
-def after_phase_one(seeds: range) -> tuple[float, int]:
-    """Mean NEES for each degree of freedom, and how many there were: what is known exactly does not count."""
-    total, dof = 0.0, 0
+def after_phase_one(seeds: range, *, with_expected: bool = False) -> tuple[FloatArray, FloatArray]:
+    """NEES of each field by degree of freedom, and what errors drawn at the found map alone make it on the average.
+
+    What is known exactly does not count. With the covariance P that is reported, and errors of covariance C about a
+    mean that is d off, the expectation is (tr(P^-1 C) + d^T P^-1 d) / dof, whatever their distribution.
+    """
+    squares, expected = [], []
     for seed in seeds:
         field = simulate_field(CRICKET, seed)
-        found, motes = first_map(CRICKET, field, DRAWS), list(field.plan.heads)
-        at = coordinates_of(motes, 2)
-        known = field.plan.surveyed_m[motes].ravel()
-        mean = (found.positions_m + found.bias_m)[motes].ravel()
-        mean, covariance = conditioned(mean, found.covariance_m2[np.ix_(at, at)], known)
+        motes = list(field.plan.heads)
+        at, known = coordinates_of(motes, 2), field.plan.surveyed_m[motes].ravel()
+
+        def prior(found: FirstMap) -> tuple[FloatArray, FloatArray]:
+            mean = (found.positions_m + found.bias_m)[motes].ravel()  # noqa: B023
+            return conditioned(mean, found.covariance_m2[np.ix_(at, at)], known)  # noqa: B023
+
+        mean, covariance = prior(first_map(CRICKET, field, DRAWS))
         variances, axes = np.linalg.eigh(covariance)
         free = variances > 1e-14
-        errors = axes[:, free].T @ (mean - field.true_m[motes].ravel())
-        total, dof = total + float((errors**2 / variances[free]).sum()), dof + int(free.sum())
-    return total / dof, dof
+        whitening = axes[:, free] / np.sqrt(variances[free])
+        squares.append(float((((mean - field.true_m[motes].ravel()) @ whitening) ** 2).mean()))
+        if with_expected:
+            alone = map_by_plan(field.plan, field.network(), CRICKET.phase1.max_dop, DRAWS, maps=0)
+            likely, spread = prior(alone)
+            seen = np.einsum("ij,ik,kj->j", whitening, spread, whitening) + ((likely - mean) @ whitening) ** 2
+            expected.append(float(seen.mean()))
+    return np.array(squares), np.array(expected)
 
 
 def test_phase_one_knows_how_good_it_is() -> None:
-    assert after_phase_one(range(10))[0] < 1.4  # 90 degrees of freedom: 1.0 within 0.30
+    assert after_phase_one(range(10))[0].mean() < 1.4  # 90 degrees of freedom: 1.0 within 0.30
 
 
 @pytest.mark.slow
-def test_nees_of_phase_one_over_200_fields() -> None:
-    mean, dof = after_phase_one(range(200))
-    assert chi2.ppf(0.005, dof) < mean * dof < chi2.ppf(0.995, dof)
+def test_nees_of_phase_one_over_100_fields() -> None:
+    """The covariance is that of errors at maps near the found one, which are turned one way and the other.
+
+    Across the arcs along which the errors lie it is wider than that of the errors there are, so NEES is less than 1:
+    by as much as the errors at the found map alone make expected. The nine coordinates of a field are bent and not
+    Gaussian, so the band is that of the mean of 100 fields by their own spread, 99 %, and not chi-squared of 900.
+    """
+    squares, expected = after_phase_one(range(100), with_expected=True)
+    off = squares - expected
+    assert abs(off.mean()) < 2.58 * off.std(ddof=1) / np.sqrt(len(off))
+    assert expected.mean() < 1.0  # it never promises more than there is
