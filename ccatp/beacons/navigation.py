@@ -13,7 +13,7 @@ from ccatp.beacons.cricket.self_mapping import MoteMapper, begin_phase_two
 from ccatp.beacons.cricket.trilateration import map_by_plan
 from ccatp.beacons.pilot import TargetSight
 from ccatp.beacons.slam.motion import POSE, Increment, Odometry, SlippingVehicle, Steering
-from ccatp.beacons.slam.recording import RssiReading
+from ccatp.beacons.slam.recording import Reading
 from ccatp.beacons.slam.signal_slam import ReflectorScan, SignalSlam
 from ccatp.config.beacon_models import CricketConfig, RadioConfig
 from ccatp.core import FloatArray, WheelSample
@@ -261,9 +261,11 @@ class RadioNavigator(_DeadReckoning):
             self.slam.predict(odometry)
             self._reckoned = self._motion.step(self._reckoned, odometry).mean
         t_s = measurements.t_s
-        results = self._scan.results(measurements.packets)
-        readings = [RssiReading(t_s, one.beacon, one.rssi_dbm, one.bearing_rad) for one in results]
-        readings += [RssiReading(t_s, *sighting) for sighting in measurements.sightings]
+        readings = self._scan.results(t_s, measurements.packets)
+        readings += [
+            Reading(t_s, beacon, bearing_rad=bearing_rad, rssi_dbm=level_dbm)
+            for beacon, level_dbm, bearing_rad in measurements.sightings
+        ]
         learned = self.slam.observe(readings)
         used = [one for one in learned if one.accepted]
         self.score = Score(

@@ -10,8 +10,9 @@ import click
 from ccatp.cli import common
 
 if TYPE_CHECKING:
-    from ccatp.beacons.slam.level_fix import LevelLocator, MeasuredPlace, Room
+    from ccatp.beacons.slam.level_fix import LevelLocator, MeasuredPlace
     from ccatp.beacons.slam.path_loss import PathLossFit
+    from ccatp.core import FloatArray
 
     Places = dict[str, tuple[float, float]]
 
@@ -163,8 +164,9 @@ def _beacons(texts: Sequence[str]) -> "Places":
     return places_m
 
 
-def _room(text: str | None, places_m: "Places", spacing_m: float) -> "Room":
-    from ccatp.beacons.slam.level_fix import Room
+def _room(text: str | None, places_m: "Places", spacing_m: float) -> "FloatArray":
+    """Points of a grid over the room, shape (n, 2)."""
+    from ccatp.beacons.slam.level_fix import grid_points
 
     if text is not None:
         x0, y0, x1, y1 = _coordinates(f"--room {text}", text, "X0,Y0,X1,Y1")
@@ -184,7 +186,7 @@ def _room(text: str | None, places_m: "Places", spacing_m: float) -> "Room":
             f"{option}: makes more than {most} points in a room of {x1 - x0:g} by {y1 - y0:g} m; "
             f"give {longest_m / (most**0.5 - 1.0):.2g} m or more, or a smaller --room"
         )
-    return Room((x0, y0), (x1, y1), spacing_m)
+    return grid_points((x0, y0), (x1, y1), spacing_m)
 
 
 def _exchanged(places: "tuple[MeasuredPlace, ...]", exchange: str) -> "tuple[MeasuredPlace, ...]":

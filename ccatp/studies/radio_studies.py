@@ -24,7 +24,8 @@ from scipy.special import chdtri
 from ccatp.beacons.navigation import BeaconMeasurements, RadioNavigator, odometry_of
 from ccatp.beacons.pilot import BeaconPilot
 from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.signal_slam import ReflectorScan, ScanResult
+from ccatp.beacons.slam.recording import Reading
+from ccatp.beacons.slam.signal_slam import ReflectorScan
 from ccatp.beacons.steering import HALT
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import FloatArray, wrap_pi
@@ -343,7 +344,7 @@ def draw_signals(results: Sequence[CellResult], out: Path) -> None:
             axes.legend(frameon=False, fontsize=7)
 
 
-def _turns(cfg: RadioConfig, sender_m: tuple[float, float]) -> list[ScanResult]:
+def _turns(cfg: RadioConfig, sender_m: tuple[float, float]) -> list[Reading]:
     places, noise = (np.random.default_rng([cfg.run.seed, stream]) for stream in (0, 1))
     radio = TrueRadio(
         "radio", cfg.path_loss.reference_dbm, cfg.sim.radio, cfg.workspace.size_m, (), cfg.scan.readings, places, noise
@@ -352,7 +353,7 @@ def _turns(cfg: RadioConfig, sender_m: tuple[float, float]) -> list[ScanResult]:
     headings = np.random.default_rng([cfg.run.seed, 2]).uniform(-pi, pi, TURNS) / cfg.scan.readings
     found = []
     for offset_rad in headings.tolist():  # the robot never stands quite straight: steps and beacon are not in line
-        for result in scan.results(radio.scan(ROBOT._replace(heading_rad=offset_rad), sender_m)):
+        for result in scan.results(0.0, radio.scan(ROBOT._replace(heading_rad=offset_rad), sender_m)):
             straight = None if result.bearing_rad is None else result.bearing_rad + offset_rad
             found.append(result._replace(bearing_rad=straight))
     return found

@@ -23,7 +23,7 @@ from ccatp.beacons.datasets.trajectory import pose_of_truth
 from ccatp.beacons.slam.batch_smoother import smooth
 from ccatp.beacons.slam.causal import filter_run
 from ccatp.beacons.slam.evaluation import judge, result_data
-from ccatp.beacons.slam.level_fix import LevelLocator, Room, fingerprint_fits, judged
+from ccatp.beacons.slam.level_fix import LevelLocator, fingerprint_fits, grid_points, judged
 from ccatp.beacons.slam.path_loss import fit_path_loss
 from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun, ReferencePath
 from ccatp.config.beacon_models import RecordingsConfig
@@ -117,7 +117,7 @@ ANCHOR_METHODS = {"batch": False, "batch, offset": True}
 LEVELS = "XBee scenario 1"
 LEVEL_METHODS = ("fingerprints", "fingerprints, each by the others", "path-loss sheet")
 XBEE_M = {"A": (0.0, 0.0), "B": (0.0, 4.0), "C": (4.0, 0.0)}  # a square of 4 m, as text and levels agree with
-XBEE_ROOM = Room((-1.0, -1.0), (5.0, 5.0), 0.1)
+XBEE_ROOM = grid_points((-1.0, -1.0), (5.0, 5.0), 0.1)
 
 
 @cache

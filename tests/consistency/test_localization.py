@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from ccatp.beacons.slam.beacon_slam import BeaconSlam, recorded_slam
 from ccatp.beacons.slam.motion import Increment
-from ccatp.beacons.slam.recording import RangeReading, Reading
+from ccatp.beacons.slam.recording import Reading
 from ccatp.config.models import LocalizerConfig
 from ccatp.core import FloatArray, PanelId, PanelPose, wrap_pi
 from ccatp.estimation.odometry import PreintegratedMotion, WheelAngle
@@ -201,9 +201,9 @@ def drive(slam: BeaconSlam, seed: int, steps: int, *, bearings: bool) -> tuple[f
             range_m = hypot(bx - x, by - y) + SIGMA_M * rng.normal()
             if bearings:
                 bearing = wrap_pi(atan2(by - y, bx - x) - heading + SIGMA_RAD * rng.normal())
-                readings.append(RangeReading(time_s, beacon, range_m, bearing))
+                readings.append(Reading(time_s, beacon, range_m, bearing))
             else:
-                readings.append(RangeReading(time_s, beacon, range_m))
+                readings.append(Reading(time_s, beacon, range_m))
         for learned in slam.observe(readings):
             nis, size = nis + learned.nis, size + learned.size
     error = np.array((slam.pose.x_m - x, slam.pose.y_m - y, wrap_pi(slam.pose.heading_rad - heading)))

@@ -16,10 +16,8 @@ from ccatp.beacons.slam.recording import (
     Calibrated,
     DelayedPath,
     EstimatedPath,
-    RangeReading,
     Reading,
     RecordedRun,
-    RssiReading,
     Steps,
 )
 from ccatp.config.beacon_models import FixedLagConfig, RecordingConfig, SlamFilterConfig
@@ -288,8 +286,8 @@ def _readings(run: RecordedRun) -> Iterator[Reading]:
         name = run.beacon_ids[beacon]
         bearing = None if math.isnan(bearing_rad) else bearing_rad
         if not math.isnan(range_m):
-            yield RangeReading(time_s, name, range_m, bearing)
+            yield Reading(time_s, name, range_m, bearing)
         elif not math.isnan(rssi_dbm):
-            yield RssiReading(time_s, name, rssi_dbm, bearing)
+            yield Reading(time_s, name, bearing_rad=bearing, rssi_dbm=rssi_dbm)
         elif bearing is not None:
-            yield RangeReading(time_s, name, math.nan, bearing)
+            yield Reading(time_s, name, bearing_rad=bearing)

@@ -27,21 +27,13 @@ class MeasuredPlace(NamedTuple):
         return MeasuredPlace(self.place_m, {names.get(name, name): level for name, level in self.levels_dbm.items()})
 
 
-@dataclass(frozen=True, slots=True)
-class Room:
-    """A rectangle in which the receiver is, searched on a grid."""
-
-    low_m: tuple[float, float]
-    high_m: tuple[float, float]
-    spacing_m: float
-
-    def points(self) -> FloatArray:
-        """Grid points, shape (n, 2)."""
-        axes = [
-            np.linspace(low, high, max(2, round((high - low) / self.spacing_m) + 1))
-            for low, high in zip(self.low_m, self.high_m, strict=True)
-        ]
-        return np.column_stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
+def grid_points(low_m: tuple[float, float], high_m: tuple[float, float], spacing_m: float) -> FloatArray:
+    """Points of a grid over a rectangle, the outermost on its sides, shape (n, 2)."""
+    axes = [
+        np.linspace(low, high, max(2, round((high - low) / spacing_m) + 1))
+        for low, high in zip(low_m, high_m, strict=True)
+    ]
+    return np.column_stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,15 +63,15 @@ class LevelLocator:
     """Positions from levels of beacons whose places and path losses are known.
 
     The level of a beacon at a place has Student's t about its path loss: the spread of its calibration, and the
-    uncertainty of the two parameters. Over the room all places are as likely; the posterior is summed on a grid, so
-    that nothing is linearised. Its mean is the position of least expected squared error.
+    uncertainty of the two parameters. Over the room all places are as likely; the posterior is summed on the points of
+    a grid, shape (n, 2), so that nothing is linearised. Its mean is the position of least expected squared error.
     """
 
     def __init__(
-        self, beacons_m: Mapping[str, tuple[float, float]], fits: Mapping[str, PathLossFit], room: Room
+        self, beacons_m: Mapping[str, tuple[float, float]], fits: Mapping[str, PathLossFit], points_m: FloatArray
     ) -> None:
         self.names = tuple(beacons_m)
-        self.points_m = room.points()
+        self.points_m = points_m
         self._beacons_m = np.array(list(beacons_m.values()))
         self._fits = [fits[name] for name in self.names]
         self._predicted = [self._predict(self.points_m, i) for i in range(len(self.names))]

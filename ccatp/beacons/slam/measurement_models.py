@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ccatp.beacons.slam.level_fix import grid_points
 from ccatp.beacons.slam.motion import estimated
 from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.recording import BeaconId, RangeReading, Reading, RssiReading
+from ccatp.beacons.slam.recording import BeaconId, Reading
 from ccatp.config.beacon_models import PriorsConfig, RadioNoiseConfig
 from ccatp.core import FloatArray
 
@@ -154,8 +155,7 @@ class ShadowingMap:
     """
 
     def __init__(self, size_m: tuple[float, float], spacing_m: float, sigma_db: float, length_m: float) -> None:
-        axes = [np.linspace(0.0, size, max(2, round(size / spacing_m) + 1)) for size in size_m]
-        self._points = np.column_stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
+        self._points = grid_points((0.0, 0.0), size_m, spacing_m)
         self._variance, self._length_m = sigma_db**2, length_m
         offsets = self._points[:, None] - self._points[None, :]
         root = np.linalg.cholesky(self._covariance(np.hypot(offsets[..., 0], offsets[..., 1])))
@@ -200,14 +200,11 @@ def recorded_models(radio: RadioNoiseConfig, priors: PriorsConfig) -> Measuremen
 
 def is_direction(reading: Reading) -> bool:
     """Whether it has a bearing and nothing else."""
-    return isinstance(reading, RangeReading) and math.isnan(reading.range_m)
+    return math.isnan(reading.range_m) and math.isnan(reading.rssi_dbm)
 
 
 def scalars_of(reading: Reading) -> list[tuple[str, float]]:
     """The numbers of a reading, each with its kind: the bearing, then the range or the signal strength."""
     found = [] if reading.bearing_rad is None else [("bearing", reading.bearing_rad)]
-    if isinstance(reading, RssiReading):
-        found.append(("rssi", reading.rssi_dbm))
-    elif not math.isnan(reading.range_m):
-        found.append(("range", reading.range_m))
-    return found
+    others = ("range", reading.range_m), ("rssi", reading.rssi_dbm)
+    return found + [(kind, value) for kind, value in others if not math.isnan(value)]

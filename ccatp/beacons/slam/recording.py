@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import nan
 from typing import NamedTuple
 
 import numpy as np
@@ -155,30 +156,14 @@ class EstimatedPath(NamedTuple):
 BeaconId = int | str
 
 
-@dataclass(frozen=True, slots=True)
-class RangeReading:
-    """A range to a beacon as it was measured, scale error, offset and all, with a direction where that is known."""
+class Reading(NamedTuple):
+    """What was measured of a beacon at once: a range or a signal strength, a direction alone, or both."""
 
     time_s: float
     beacon: BeaconId
-    range_m: float  # NaN where the direction alone was read
-    bearing_rad: float | None = None  # from the vehicle's heading, counter-clockwise
-
-
-@dataclass(frozen=True, slots=True)
-class RssiReading:
-    """A received signal strength, with the direction where it was strongest if an antenna turns.
-
-    ``bearing_rad``: from the vehicle's heading, counter-clockwise; None without a directional antenna.
-    """
-
-    time_s: float
-    beacon: BeaconId
-    rssi_dbm: float
-    bearing_rad: float | None = None
-
-
-Reading = RangeReading | RssiReading
+    range_m: float = nan  # as it was measured, scale error, offset and all
+    bearing_rad: float | None = None  # from the vehicle's heading, counter-clockwise; None without a direction
+    rssi_dbm: float = nan
 
 
 class BeaconEstimate(NamedTuple):

@@ -4,7 +4,6 @@ from collections.abc import Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from math import atan2, cos, exp, hypot, log, pi, sin, sqrt, tau
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -14,7 +13,7 @@ from ccatp.beacons.slam.landmark_init import PendingLandmark
 from ccatp.beacons.slam.measurement_models import BearingModel, LevelModel, MeasurementModels, ShadowingMap
 from ccatp.beacons.slam.motion import POSE, Odometry, SlippingVehicle, VehiclePose
 from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, RssiReading
+from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
 from ccatp.config.beacon_models import RadioConfig, ScanConfig, SlamFilterConfig
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.ekf_slam import Columns, EkfSlam, Update, columns_of
@@ -28,14 +27,6 @@ _PLAIN = SlamFilterConfig(
     turn_bias_walk_rad_s_sqrt_s=0.0,
 )  # fmt: skip
 _APART_RAD = pi / 2.0  # strongest readings further apart than this are two directions, not one
-
-
-class ScanResult(NamedTuple):
-    """Level and bearing of one radio after a turn of the reflector."""
-
-    beacon: str
-    rssi_dbm: float
-    bearing_rad: float | None  # left of the heading; None where the scan has none
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,24 +45,26 @@ class ReflectorScan:
         """Of a bearing: noise, and a direction that may lie anywhere within a step (variance step^2 / 12)."""
         return hypot(self.cfg.bearing_sigma_rad, self.step_rad / 12.0**0.5)
 
-    def results(self, packets: Iterable[tuple[str, float, float]]) -> list[ScanResult]:
-        """One result for each radio, in the order of their first packets.
+    def results(self, time_s: float, packets: Iterable[tuple[str, float, float]]) -> list[Reading]:
+        """Level and bearing of each radio after a turn of the reflector, in the order of their first packets.
 
         ``packets``: radio, direction of the reflector left of the heading (rad), level (dBm).
         """
         by_beacon: dict[str, list[tuple[float, float]]] = {}
         for beacon, direction_rad, level_dbm in packets:
             by_beacon.setdefault(beacon, []).append((direction_rad, level_dbm))
-        return [self._result(beacon, readings) for beacon, readings in by_beacon.items()]
+        found = {beacon: self._result(readings) for beacon, readings in by_beacon.items()}
+        return [Reading(time_s, beacon, bearing_rad=bearing, rssi_dbm=z) for beacon, (bearing, z) in found.items()]
 
-    def _result(self, beacon: str, readings: Sequence[tuple[float, float]]) -> ScanResult:
+    def _result(self, readings: Sequence[tuple[float, float]]) -> tuple[float | None, float]:
+        """Bearing, where there is one, and level."""
         bearing_rad = self._bearing(readings)
         strongest_dbm = max(level_dbm for _, level_dbm in readings)
         if bearing_rad is None or len(readings) / self.cfg.readings < 1.0 - self.cfg.loss_tolerance:
-            return ScanResult(beacon, strongest_dbm, None)
+            return None, strongest_dbm
         levels = [z for direction, z in readings if abs(wrap_pi(direction - bearing_rad)) <= 1.01 * self.step_rad]
         levels = levels or [strongest_dbm]
-        return ScanResult(beacon, sum(levels) / len(levels), bearing_rad)
+        return bearing_rad, sum(levels) / len(levels)
 
     def _bearing(self, readings: Sequence[tuple[float, float]]) -> float | None:
         """Direction of the strongest reading, 2017 eq. 5; the middle of equals that lie together, else None."""
@@ -163,9 +156,9 @@ class SignalSlam(BeaconSlam):
         if self._ahead is not None:
             self._ahead.predict(odometry)
 
-    def observe(self, readings: Sequence[RssiReading]) -> list[BeaconInnovation]:  # type: ignore[override]
+    def observe(self, readings: Iterable[Reading]) -> list[BeaconInnovation]:
         """Take readings of any radios, one after the other; new ones are placed when their readings suffice."""
-        moving, of_others, learned = self._moving, list[RssiReading](), list[BeaconInnovation]()
+        readings, moving, of_others, learned = list(readings), self._moving, list[Reading](), list[BeaconInnovation]()
         if self._ahead is not None:
             self._ahead.observe([reading for reading in readings if reading.beacon not in self.waiting])
         for reading in readings:
@@ -250,7 +243,7 @@ class SignalSlam(BeaconSlam):
         engine = self._likely.engine
         return engine.mean.take(columns), engine.covariance[np.ix_(columns, columns)]
 
-    def _update_moving(self, reading: RssiReading) -> Update:
+    def _update_moving(self, reading: Reading) -> Update:
         loss = self.path_loss_of(reading.beacon)
         return self._moving.update(self.engine, reading, loss, self._moving_variances, self._gates)
 
@@ -296,7 +289,7 @@ class MovingRadio:
         self._to_plane(engine)
 
     def update(
-        self, engine: EkfSlam, reading: RssiReading, path_loss: PathLoss, variances: tuple[float, float],
+        self, engine: EkfSlam, reading: Reading, path_loss: PathLoss, variances: tuple[float, float],
         gates: Sequence[float],
     ) -> Update:  # fmt: skip
         """Condition on a reading, in polar coordinates about the vehicle.

@@ -26,10 +26,8 @@ from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.recording import (
     BeaconId,
     EstimatedPath,
-    RangeReading,
     Reading,
     RecordedRun,
-    RssiReading,
     Steps,
 )
 from ccatp.config.beacon_models import FixedLagConfig
@@ -85,13 +83,13 @@ class World:
 
 
 def ranges(time_s: float, world: World, beacon: BeaconId) -> Reading:
-    return RangeReading(time_s, beacon, world.range_m(beacon) + 0.05 * world.rng.normal())
+    return Reading(time_s, beacon, world.range_m(beacon) + 0.05 * world.rng.normal())
 
 
 def both(time_s: float, world: World, beacon: BeaconId) -> Reading:
     range_m = world.range_m(beacon) + 0.05 * world.rng.normal()
     bearing_rad = wrap_pi(world.bearing_rad(beacon) + 0.03 * world.rng.normal())
-    return RangeReading(time_s, beacon, range_m, bearing_rad)
+    return Reading(time_s, beacon, range_m, bearing_rad)
 
 
 def start(settings: Settings = SETTINGS, sense: Sense = both) -> World:
@@ -128,7 +126,7 @@ def test_ranges_calibrate_themselves_and_the_gyroscope() -> None:
         priors__turn_bias_rad_s=0.02, filter__rest_speed_m_s=0.03, filter__rest_turn_rad_s=0.03,
         priors__range_scale=0.1, priors__range_offset_m=0.2,
     )  # fmt: skip
-    world = start(changed, lambda t, w, b: RangeReading(t, b, 1.07 * w.range_m(b) + 0.15 + 0.05 * w.rng.normal()))
+    world = start(changed, lambda t, w, b: Reading(t, b, 1.07 * w.range_m(b) + 0.15 + 0.05 * w.rng.normal()))
     world.bias_rad_s = 0.01
     for turn_rad in (0.05, -0.04, 0.05, -0.04):
         world.drive(150, turn_rad)
@@ -160,7 +158,7 @@ def test_signal_strengths_with_levels_of_their_own() -> None:
 
     def heard(time_s: float, world: World, beacon: BeaconId) -> Reading:
         rssi = levels[str(beacon)] - 20.0 * log10(world.range_m(beacon)) + 0.5 * world.rng.normal()
-        return RssiReading(time_s, beacon, rssi, world.bearing_rad(beacon))
+        return Reading(time_s, beacon, bearing_rad=world.bearing_rad(beacon), rssi_dbm=rssi)
 
     rssi = {"radio__rssi_sigma_db": 0.5, "radio__rssi_reference_dbm": -38.0, "radio__rssi_exponent": 2.0}
     world = start(SETTINGS.but(**rssi, priors__rssi_reference_db=5.0), heard)
@@ -179,7 +177,7 @@ def test_an_outlier_is_refused() -> None:
     world.drive(100)
     before = world.slam.pose
     bearing = world.bearing_rad("a")
-    learned = world.slam.observe([RangeReading(world.time_s, "a", world.range_m("a") + 3.0, bearing)])
+    learned = world.slam.observe([Reading(world.time_s, "a", world.range_m("a") + 3.0, bearing)])
     assert not learned[0].accepted
     assert learned[0].nis > 36.0
     assert hypot(world.slam.pose.x_m - before.x_m, world.slam.pose.y_m - before.y_m) < 0.01
@@ -249,7 +247,7 @@ def test_errors_that_stay_while_the_vehicle_does_are_not_averaged_away() -> None
 @pytest.mark.parametrize(("correlation_s", "lasts"), [(0.0, False), (3.0, True)])
 def test_innovations_of_errors_that_last_teach_no_less_noise_than_is_set(correlation_s: float, *, lasts: bool) -> None:
     def constant(time_s: float, world: World, beacon: BeaconId) -> Reading:
-        return RangeReading(time_s, beacon, world.range_m(beacon) + 0.05, world.bearing_rad(beacon) + 0.02)
+        return Reading(time_s, beacon, world.range_m(beacon) + 0.05, world.bearing_rad(beacon) + 0.02)
 
     world = start(SETTINGS.but(radio__correlation_s=correlation_s), constant)
     world.drive(100)

@@ -160,7 +160,7 @@ def turn(levels: dict[int, float], lost: set[int] | None = None, floor_dbm: floa
     ],
 )
 def test_bearing_and_level_of_a_scan(packets: list[Packet], bearing_steps: float | None, level_dbm: float) -> None:
-    (found,) = SCAN.results(packets)
+    (found,) = SCAN.results(0.0, packets)
     assert (found.bearing_rad is None) == (bearing_steps is None)
     assert wrap_pi((found.bearing_rad or 0.0) - STEP * (bearing_steps or 0.0)) == pytest.approx(0.0, abs=1e-9)
     assert found.rssi_dbm == pytest.approx(level_dbm)
@@ -169,5 +169,5 @@ def test_bearing_and_level_of_a_scan(packets: list[Packet], bearing_steps: float
 
 def test_radios_are_kept_apart_by_their_identifier() -> None:
     both = [*turn({3: -40.0}), *(p._replace(beacon="c") for p in turn({9: -50.0}))]
-    assert [(r.beacon, r.rssi_dbm > -65.0) for r in SCAN.results(both)] == [("b", True), ("c", True)]
-    assert SCAN.results([]) == []
+    assert [(r.beacon, r.rssi_dbm > -65.0) for r in SCAN.results(0.0, both)] == [("b", True), ("c", True)]
+    assert SCAN.results(0.0, []) == []

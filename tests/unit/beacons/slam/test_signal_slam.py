@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ccatp.beacons.slam.level_fix import LevelLocator, MeasuredPlace, Room, likeliest_names
+from ccatp.beacons.slam.level_fix import LevelLocator, MeasuredPlace, grid_points, likeliest_names
 from ccatp.beacons.slam.motion import Increment, Odometry, SlippingVehicle, Steering
 from ccatp.beacons.slam.path_loss import LevelPair, PathLoss, PathLossError, PathLossFit, fit_path_loss
-from ccatp.beacons.slam.recording import RssiReading
+from ccatp.beacons.slam.recording import Reading
 from ccatp.beacons.slam.signal_slam import MovingRadio, SignalSlam
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_radio_config
@@ -83,7 +83,7 @@ def test_many_levels_with_one_unknown_offset_do_not_tell_the_range() -> None:
     rng = np.random.default_rng(4)
     for _ in range(300):
         level_dbm = loss.level_dbm(1.5) - 6.0 + 2.0 * rng.standard_normal()
-        reading = RssiReading(0.0, "t", level_dbm, 0.2 + 0.3 * rng.standard_normal())
+        reading = Reading(0.0, "t", bearing_rad=0.2 + 0.3 * rng.standard_normal(), rssi_dbm=level_dbm)
         radio.update(engine, reading, loss, (4.0, 0.32**2), (9e9, 9e9))
     place = engine.block("t")
     offset = engine.mean[place][:2] - engine.mean[:2]
@@ -102,7 +102,8 @@ def heard(slam_cfg: RadioConfig, scans: int) -> tuple[SignalSlam, float]:
             slam.predict(Steering(0.0, 0.1, 0.15, 0.0))
         pose = slam.engine.mean[:3].tolist()
         level = loss.level_dbm(hypot(2.0 - pose[0], 2.0 - pose[1]))
-        slam.observe([RssiReading(k, "b", level, np.arctan2(2.0 - pose[1], 2.0 - pose[0]) - pose[2])])
+        bearing_rad = np.arctan2(2.0 - pose[1], 2.0 - pose[0]) - pose[2]
+        slam.observe([Reading(k, "b", bearing_rad=bearing_rad, rssi_dbm=level)])
     estimate = slam.beacons["b"]
     return slam, float(np.hypot(*(estimate.mean - 2.0)))
 
@@ -140,7 +141,7 @@ def test_ignored_shadowing_is_overconfident_and_mapped_shadowing_is_not() -> Non
 
 
 BEACONS = {"A": (0.0, 0.0), "B": (0.0, 4.0), "C": (4.0, 0.0)}
-ROOM = Room((0.0, 0.0), (4.0, 4.0), 0.1)
+ROOM = grid_points((0.0, 0.0), (4.0, 4.0), 0.1)
 Levels = dict[str, float]
 
 
