@@ -101,14 +101,6 @@ class _Obstacle(NamedTuple):
     y_m: float
 
 
-class FreeHeading(NamedTuple):
-    """What the obstacles leave of an aim."""
-
-    aim: BearingToPoint
-    speed_factor: float  # 1 far from everything, 0 where nothing but standing is safe
-    is_blocked: bool
-
-
 class ObstacleAvoider:
     """Chooses the free heading nearest to the aim, after Borenstein and Koren's vector field histogram (1991).
 
@@ -133,15 +125,15 @@ class ObstacleAvoider:
                     _Obstacle(time_s, pose[0] + distance_m * cos(course_rad), pose[1] + distance_m * sin(course_rad))
                 )
 
-    def way(self, pose: PlanarPose, aim: BearingToPoint) -> FreeHeading:
-        """What is left of an aim at a pose."""
+    def way(self, pose: PlanarPose, aim: BearingToPoint) -> tuple[BearingToPoint, float]:
+        """What is left of an aim at a pose, and of the speed: 1 far from everything, 0 where only standing is safe."""
         # What stands behind the aim is not in the way to it.
         near = [echo for echo in self._near(pose) if echo[0] - self._reach_m < aim.distance_m]
         blocked = [(wrap_pi(angle_rad), asin(min(1.0, self._reach_m / max(d, 1e-6)))) for d, angle_rad in near]
         error_rad = self._free_heading(aim.error_rad, blocked)
         if error_rad is None:
-            return FreeHeading(aim, 0.0, True)
-        return FreeHeading(BearingToPoint(aim.distance_m, error_rad), self._speed_factor(near), False)
+            return aim, 0.0
+        return BearingToPoint(aim.distance_m, error_rad), self._speed_factor(near)
 
     def clear_m(self, pose: PlanarPose, direction_rad: float) -> float:
         """Distance to the nearest remembered obstacle in the way of a body that moves in a direction, m.
@@ -311,14 +303,14 @@ class BeaconPilot:
             return self._held(pose, self._escape())
         if aim is None:
             return self._held(pose, self._without_obstacles(aim, interval_s))
-        way = self._avoider.way(pose, aim)
-        if way.is_blocked or way.speed_factor <= 0.0:
+        free, speed_factor = self._avoider.way(pose, aim)
+        if speed_factor <= 0.0:
             self._escapes_until_s = time_s + self._cfg.avoidance.back_time_s
             return self._held(pose, self._escape())
-        if way.aim.error_rad != aim.error_rad:
+        if free.error_rad != aim.error_rad:
             self.state = PilotState.AVOIDING
-        found = self._driver.drive(way.aim, interval_s)
-        return found._replace(speed_m_s=found.speed_m_s * way.speed_factor)
+        found = self._driver.drive(free, interval_s)
+        return found._replace(speed_m_s=found.speed_m_s * speed_factor)
 
     def _aim(self, pose: PlanarPose, target: TargetSight | None) -> BearingToPoint | None:
         if self._is_following:
