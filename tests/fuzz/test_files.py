@@ -15,6 +15,7 @@ import msgspec
 import pytest
 import tomlkit
 
+from ccatp.config.files import read_toml
 from ccatp.config.load import dump_config, load_config
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.errors import ConfigError
@@ -73,7 +74,7 @@ def config_target(folder: Path) -> Target:
                 assert problem.startswith(f"{file}"), problem
                 assert "\n" not in problem, problem
             raise
-        assert_in_force(tomllib.loads(data.decode()), cfg.model_dump(), "")
+        assert_in_force(tomllib.loads(read_toml(file)), cfg.model_dump(), "")
         return cfg.run.panels == 0
 
     return Target("configuration", [USER_FILE, b"", b"[run]\nseed = 1\n"], run, (ConfigError,))
