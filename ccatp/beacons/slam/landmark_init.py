@@ -148,7 +148,9 @@ class PendingLandmark:
         )
         places = [engine.mean[block].tolist() for block in rows.blocks]
         if pointed is not None:
-            likely = problem.refine(prior_at(*pointed), self.candidates[0].mean if self.candidates else None)
+            prior = prior_at(*pointed)
+            start = self.candidates[0].mean if self.candidates else np.array([*pointed, *prior.mean[2:]])
+            likely = problem.refine(prior, start)
             self.candidates = [] if likely is None else [likely]
             return
         starts = [BeaconEstimate(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]

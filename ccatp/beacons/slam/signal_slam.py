@@ -87,12 +87,11 @@ class SignalSlam(BeaconSlam):
     shadowing where there is any. Updates are iterated, because an error of 18 degrees is too large for one
     linearisation. A level of unknown shadowing gives the range up to a factor; an update that is linearised there is
     wrong later, when bearings from elsewhere have given the range. So the readings of a new radio wait until they
-    place it. A radio of which no bearing is known is not used: a level alone is a circle.
+    place it. A radio of which no bearing is known is not used: a level alone is a circle. A static radio is in the
+    room: before its readings the mean of each coordinate is the middle of the room, and the walls are 0.7 sigma away.
 
     The vehicle begins at the believed start of the configuration, which defines the frame of the map.
     """
-
-    flat = 10.0
 
     def __init__(self, cfg: RadioConfig) -> None:
         start, loss, estimator, room_m = cfg.start, cfg.path_loss, cfg.estimator, cfg.workspace.size_m
@@ -109,6 +108,7 @@ class SignalSlam(BeaconSlam):
             {"bearing": BearingModel(bearing_sigma_rad, 0), "rssi": LevelModel(self.path_loss_of, shadowing=shadowing)}
         )
         P0 = np.diag(np.square((start.position_sigma_m, start.position_sigma_m, start.heading_sigma_rad)))
+        self._middle_m, self._room_variances_m2 = 0.5 * np.array(room_m), 0.5 * np.square(room_m)
         super().__init__(
             SlippingVehicle(cfg.vehicle, cfg.odometry), models, _PLAIN, (start.x_m, start.y_m, start.heading_rad), P0,
             gate=float(chdtri(1, 1.0 - estimator.gate_probability)), iterations=_ITERATIONS,
@@ -194,6 +194,11 @@ class SignalSlam(BeaconSlam):
             self._look(waiting)
             for likely in waiting.candidates[:1]:
                 self._join(waiting, likely)
+
+    def _prior_at(self, waiting: PendingLandmark, x_m: float, y_m: float) -> BeaconEstimate:
+        prior = super()._prior_at(waiting, *self._middle_m.tolist())
+        prior.covariance[range(PLACE), range(PLACE)] = self._room_variances_m2
+        return prior
 
     def _place_new(self, waiting: PendingLandmark) -> None:
         """Not before all readings have been taken."""

@@ -95,17 +95,18 @@ def test_many_levels_with_one_unknown_offset_do_not_tell_the_range() -> None:
 
 
 def heard(slam_cfg: RadioConfig, scans: int) -> tuple[SignalSlam, float]:
+    """Of a radio in the middle of the room, where its prior pulls nowhere; and the error of its place."""
     slam = SignalSlam(slam_cfg)
     loss = slam.path_loss_of("b")
     for k in range(scans):
         for _ in range(10):
             slam.predict(Steering(0.0, 0.1, 0.15, 0.0))
         pose = slam.engine.mean[:3].tolist()
-        level = loss.level_dbm(hypot(2.0 - pose[0], 2.0 - pose[1]))
-        bearing_rad = np.arctan2(2.0 - pose[1], 2.0 - pose[0]) - pose[2]
+        level = loss.level_dbm(hypot(1.5 - pose[0], 1.5 - pose[1]))
+        bearing_rad = np.arctan2(1.5 - pose[1], 1.5 - pose[0]) - pose[2]
         slam.observe([Reading(k, "b", bearing_rad=bearing_rad, rssi_dbm=level)])
     estimate = slam.beacons["b"]
-    return slam, float(np.hypot(*(estimate.mean - 2.0)))
+    return slam, float(np.hypot(*(estimate.mean - 1.5)))
 
 
 def test_a_new_radio_waits_and_is_on_the_map_all_the_same() -> None:
@@ -116,6 +117,16 @@ def test_a_new_radio_waits_and_is_on_the_map_all_the_same() -> None:
     assert "b" in slam.engine
     assert error_m < 0.02
     assert not [b for b in slam.engine.blocks if not isinstance(b, str)]
+
+
+def test_a_radio_in_the_shadow_is_looked_for_in_the_room() -> None:
+    slam = SignalSlam(config(path_loss__shadowing_sigma_db=5.0, estimator__shadowing="map"))
+    level = slam.path_loss_of("b").level_dbm(12.0)
+    x_m, y_m, heading_rad = slam.pose
+    slam.observe([Reading(0.0, "b", bearing_rad=np.pi / 4.0 - heading_rad, rssi_dbm=level)])
+    estimate = slam.beacons["b"]
+    assert hypot(estimate.mean[0] - x_m, estimate.mean[1] - y_m) < 6.0  # of 12 by the level alone
+    assert np.linalg.eigvalsh(estimate.covariance).max() < 0.5 * 3.0**2
 
 
 SHADOW = {"sim.radio.shadowing_sigma_db": 5.0, "path_loss.shadowing_sigma_db": 5.0, "estimator.shadowing": "map"}
