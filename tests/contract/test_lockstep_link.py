@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 import zmq
 
-from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.daemon import robot_loop
 from ccatp.daemon.process import Endpoints, ProcessArgs
@@ -151,10 +150,6 @@ class Rig:
         return plant.x_m, plant.y_m, plant.heading_rad, plant.right_rad_s, plant.left_rad_s
 
 
-def at_port(cfg: Config, port: int) -> Config:
-    return cfg.model_copy(update={"robot": cfg.robot.model_copy(update={"port": port})})
-
-
 @asynccontextmanager
 async def running(folder: Path) -> AsyncIterator[Rig]:
     rig, cfg, stop = Rig(), config_of(run__seed=SEED), asyncio.Event()
@@ -169,7 +164,7 @@ async def running(folder: Path) -> AsyncIterator[Rig]:
         roles: tuple[Role, ...] = ("monitor", "controller")
         for role in roles:
             proxy = await stack.enter_async_context(FaultProxy("127.0.0.1", port, seed=1))
-            client = Answering(role, at_port(cfg, proxy.port), folder, context)
+            client = Answering(role, config_of(run__seed=SEED, robot__port=proxy.port), folder, context)
             rig.proxies[role], rig.clients[role] = proxy, client
             await client.join(is_patient=False)
             tasks += [asyncio.create_task(service) for service in client.services()]
@@ -356,7 +351,7 @@ async def test_a_robot_without_a_valid_first_frame_is_reported_and_given_up(
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     async with await asyncio.start_server(talk, "127.0.0.1", 0) as server:
         port = server.sockets[0].getsockname()[1]
-        cfg = load_config(overrides={"robot.port": port, "robot.reconnect_timeout_s": 1.0})
+        cfg = config_of(robot__port=port, robot__reconnect_timeout_s=1.0)
         client = Answering(role, cfg, tmp_path, context)
         await client.join(is_patient=False)
         watching = asyncio.create_task(client.watch())

@@ -57,8 +57,9 @@ async def ended(seed: int) -> float:
 
 
 @pytest.mark.fault("P10")
-async def test_whenever_they_are_told_to_end(measured: Measured) -> None:
-    for seed in range(TIMES):
+@pytest.mark.parametrize(("first", "count"), [(0, TIMES), pytest.param(TIMES, SLOW_TIMES, marks=pytest.mark.slow)])
+async def test_whenever_they_are_told_to_end(first: int, count: int, measured: Measured) -> None:
+    for seed in range(first, first + count):
         measured("P10", await ended(seed))
 
 
@@ -87,13 +88,6 @@ async def test_a_main_loop_whose_mission_is_over_waits_for_a_supervisor_that_is_
             daemon.stop.set()
             await asyncio.wait(daemon.loops)
             assert daemon.main.status().exit_status == ExitStatus.COMPLETE
-
-
-@pytest.mark.slow
-@pytest.mark.fault("P10")
-async def test_many_times(measured: Measured) -> None:
-    for seed in range(TIMES, TIMES + SLOW_TIMES):
-        measured("P10", await ended(seed))
 
 
 # -- a task that breaks ------------------------------------------------------------------------------------------------

@@ -6,8 +6,7 @@ import shutil
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import pytest
 
 from ccatp.config.package import child_environment
+from tests.support.runs import until
 
 # Crossbar is no dependency of ours: name one with this variable, or have it in the path.
 CROSSBAR = os.environ.get("CCATP_CROSSBAR") or shutil.which("crossbar")
@@ -81,15 +81,6 @@ def network(crossbar: str, folder: Path, port: int, *arguments: str) -> Iterator
         until(listens)
         with started(folder / "agent.log", agent, child_environment(os.environ)):
             yield options
-
-
-def until(look: Callable[[], Any], timeout_s: float = 90.0) -> Any:
-    deadline_s, found = time.monotonic() + timeout_s, None
-    while time.monotonic() < deadline_s:
-        if found := look():
-            return found
-        time.sleep(0.2)
-    raise AssertionError(f"not within {timeout_s} s; last seen {found}")
 
 
 def connect(options: list[str]) -> Any:

@@ -18,7 +18,7 @@ import psutil
 import pytest
 
 from tests.processes.conftest import Start
-from tests.support.runs import NO_CALIBRATION
+from tests.support.runs import NO_CALIBRATION, until
 
 WATCHDOG_S = 2.0
 DEADLINE_S = 60.0
@@ -117,13 +117,6 @@ def logged_status(run_dir: Path) -> int:
     return int(next(line["status"] for line in lines if line["event"] == "run_finished"))
 
 
-def until(path: Path) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not path.exists():
-        assert time.monotonic() < deadline_s, f"no {path}"
-        time.sleep(0.01)
-
-
 def limited(soft: int, hard: int) -> None:
     resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
@@ -153,7 +146,7 @@ def test_a_run_directory_that_is_deleted_during_the_start(runtime_dir: Path, tmp
     with subprocess.Popen(
         command(runtime_dir, run_dir), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     ) as run:
-        until(run_dir / "log.jsonl")  # the supervisor's; before it, the run is refused in one line
+        until((run_dir / "log.jsonl").exists)  # the supervisor's; before it, the run is refused in one line
         shutil.rmtree(run_dir.rename(tmp_path / "deleted"), ignore_errors=True)
         _, said = run.communicate(timeout=PATIENCE_S)
     assert run.returncode in {2, 4, 5}  # by who misses it first
@@ -168,7 +161,7 @@ def test_a_closed_terminal_is_an_interruption(runtime_dir: Path, tmp_path: Path)
     pid, terminal = pty.fork()
     if pid == 0:
         os.execv(arguments[0], arguments)
-    until(run_dir / "mission.sqlite")
+    until((run_dir / "mission.sqlite").exists)
     os.close(terminal)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 130
     assert logged_status(run_dir) == 130

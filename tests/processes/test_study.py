@@ -6,13 +6,14 @@ import resource
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
+
+from tests.support.runs import until
 
 # Half a second of work a job, and no mission behind it.
 STUDY = ("danger", "--mirror", "thesis-m1", "--only", "crossing=0", "--no-figures")
@@ -45,13 +46,6 @@ def started() -> Iterator[Callable[..., subprocess.Popen[str]]]:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
-
-
-def until(is_there: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not is_there():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def lines_of(out: Path) -> list[bytes]:

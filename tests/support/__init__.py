@@ -6,7 +6,8 @@
 * `mission_story`: the mission with an ideal robot on one panel and scripted verdicts (`FREE`, `FRONT_OFF`, `ABORT`).
 * `virtual_time`: `run_virtual(coroutine)` runs asyncio code, sockets included, on a clock on which nothing waits.
 * `command`: the command line in process: `answered` (its JSON), `printed` (its text), `refused` (its one line).
-* `runs`: real processes (`Run`), and `recorded_run()`: one two-panel run, recorded once per test session, to read from.
+* `runs`: real processes (`Run`), `until` (something is seen of them), and `recorded_run()`: one two-panel run, recorded
+  once per test session, to read from.
 * `sim_survey`: surveys in process: watched frame by frame with faults, measured by the daemon's own fix service with a
   scripted laser (`MeasuredSurvey`, `fix_service`), restarted after a kill.
 * `http_server`: `answering` (a server on loopback), `taking_posts` (what is posted to it).

@@ -233,7 +233,19 @@ def link_to(port: int, role: Role = "controller", kind: type[RobotLink] = RobotL
     return kind(host="127.0.0.1", port=port, role=role, client="test", **given)
 
 
-class Driver:
+class Waiting:
+    """Something that sets an event at each change, so that a test can wait for a condition."""
+
+    changed: asyncio.Event
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(LINK_DEADLINE_S):
+            while not condition():
+                self.changed.clear()
+                await self.changed.wait()
+
+
+class Driver(Waiting):
     """Joins as the controller, localizes, and answers each frame, and one that comes again, by the same drive.
 
     Args:
@@ -270,12 +282,6 @@ class Driver:
     @property
     def pose(self) -> PanelPose:
         return self.localizer.pose
-
-    async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(LINK_DEADLINE_S):
-            while not condition():
-                self.changed.clear()
-                await self.changed.wait()
 
     async def drive(self, frames: int) -> None:
         """Until frame number ``frames`` came, or the session ended."""

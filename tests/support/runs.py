@@ -174,6 +174,15 @@ class Run:
         raise AssertionError(f"{process} has not logged {event!r}")
 
 
+def until(look: Callable[[], Any], timeout_s: float = 120.0) -> Any:
+    """What a look finds, once that is something."""
+    deadline_s = time.monotonic() + timeout_s
+    while not (found := look()):
+        assert time.monotonic() < deadline_s, f"not within {timeout_s} s"
+        time.sleep(0.01)
+    return found
+
+
 def wall_s(entry: dict[str, Any]) -> float:
     """Wall time of a line of the log."""
     return datetime.fromisoformat(entry["timestamp"]).timestamp()

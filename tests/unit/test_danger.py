@@ -16,7 +16,7 @@ from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror
 from ccatp.safety.edge_detector import EdgeMap
 from ccatp.safety.wheel_odometry import KNOTS_KEPT, Odometry, WheelTrack, pose_at
-from tests.support.scenario import World
+from tests.support.scenario import World, config_of
 
 FL, FR, RL, RR = ("front_left",), ("front_right",), ("rear_left",), ("rear_right",)
 FRONT, ALL = FL + FR, FL + FR + RL + RR
@@ -274,17 +274,13 @@ def test_a_turn_across_a_seam_allows_its_width(cfg: Config, mirror: Mirror) -> N
     assert verdict.limit == pytest.approx(0.014, abs=1e-9)  # m; 10 + 1 + 3 mm
 
 
-def test_a_turn_has_a_limit_even_along_a_seam(cfg: Config, mirror: Mirror) -> None:
-    short = with_danger(cfg, turn_travel_limit_m=0.05)
+def test_a_turn_has_a_limit_even_along_a_seam(mirror: Mirror) -> None:
+    short = config_of("thesis-m1", danger__turn_travel_limit_m=0.05)
     panel = list(mirror.panels.values())[40]
     story = Story(short, mirror, (panel.x_m, panel.y_m + panel.half_y_m - 0.122, 1.281 - pi / 4))
     assert story.run(39, omega=1.0, off=FL).code is EventCode.NORMAL  # 49.6 mm of arc
     verdict = story.run(2, omega=1.0, off=FL)
     assert (verdict.code, verdict.limit) == (EventCode.NEAR_EDGE, 0.05)
-
-
-def with_danger(cfg: Config, **values: float) -> Config:
-    return cfg.model_copy(update={"danger": cfg.danger.model_copy(update=values)})
 
 
 # -- (g) wheels -------------------------------------------------------------------------------------------------------

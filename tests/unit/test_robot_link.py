@@ -16,7 +16,7 @@ from ccatp.links.robot_codec import RobotFrame, encode, join_mac
 from ccatp.links.robot_link import LineWriter, RobotLink, RobotLinkError, RobotRefused, RobotTimeout, WrongProtocol
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from tests.support.daemon import HELLO as OF_ROBOT
-from tests.support.daemon import link_to
+from tests.support.daemon import Waiting, link_to
 
 HELLO = encode(replace(OF_ROBOT, lockstep=True))
 HELLO_HMAC = HELLO.replace(b'"none"', b'"hmac-sha256"')
@@ -30,7 +30,7 @@ def frame(seq: int) -> bytes:
     return encode(RobotFrame(seq, seq / 100.0, (), (), (), None, (0.0, 0.0), 1.0, CommandEcho(-1, 0.0, 0.0, True), ()))
 
 
-class Seen:
+class Seen(Waiting):
     """What a link told."""
 
     def __init__(self) -> None:
@@ -54,12 +54,6 @@ class Seen:
     def on_lost(self, reason: str) -> None:
         self.lost.append(reason)
         self.changed.set()
-
-    async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(DEADLINE_S):
-            while not condition():
-                self.changed.clear()
-                await self.changed.wait()
 
 
 @asynccontextmanager

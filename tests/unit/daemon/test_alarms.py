@@ -25,6 +25,7 @@ from ccatp.daemon.webhook import AlarmWebhook, changes
 from ccatp.links.topics import Alarm, MissionStatus
 from tests.support.daemon import configuration, running_daemon
 from tests.support.http_server import Posts, taking_posts
+from tests.support.runs import until
 from tests.support.scenario import config_of
 
 FAN = conditions.FAN_WEAK.text(side="left")
@@ -264,13 +265,6 @@ def hook_to(url: str, give_up_s: float = 600.0, known: Iterable[Alarm] = ()) -> 
     return AlarmWebhook(cfg, "tonight", structlog.get_logger(), known)
 
 
-def until(posts: Posts, count: int) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while len(posts.bodies) < count:
-        assert time.monotonic() < deadline_s, posts.bodies
-        time.sleep(0.005)
-
-
 @pytest.mark.parametrize(
     ("before", "after", "events"),
     [
@@ -298,7 +292,7 @@ def test_a_post_that_is_not_taken_comes_again_in_order(posts: Posts, monkeypatch
     hook.update(status(alarm()))
     hook.update(status(alarm()))
     hook.update(status(alarm(ended="B")))
-    until(posts, 4)
+    until(lambda: len(posts.bodies) == 4)
     hook.close(PATIENCE_S)
     assert [(body["event"], body["answered"]) for body in posts.bodies] == [
         ("raised", 500), ("raised", 429), ("raised", 200), ("ended", 200),
@@ -311,7 +305,7 @@ def test_a_resumed_run_posts_what_changed_since_the_session_before(posts: Posts)
     over, lasting, gone = alarm("over", ended="B"), alarm("lasting"), alarm("gone", acknowledged_by="root")
     hook = hook_to(posts.url, known=(over, lasting, gone))
     hook.update(status(over, lasting, alarm("new")))
-    until(posts, 2)
+    until(lambda: len(posts.bodies) == 2)
     hook.close(PATIENCE_S)
     found = [(body["event"], body["alarm"]["name"]) for body in posts.bodies]
     assert found == [("raised", "new"), ("ended", "gone")]
@@ -322,9 +316,9 @@ def test_a_refusal_is_logged_and_the_next_one_is_posted(posts: Posts) -> None:
     with capture_logs() as logs:
         hook = hook_to(posts.url)
         hook.update(status(alarm()))
-        until(posts, 1)
+        until(lambda: len(posts.bodies) == 1)
         hook.update(status(alarm(ended="B")))
-        until(posts, 2)
+        until(lambda: len(posts.bodies) == 2)
         hook.close(PATIENCE_S)
     assert [(log["event"], log["why"]) for log in logs] == [("alarm_not_posted", "refused: status 404")]
 
@@ -346,9 +340,7 @@ def test_an_old_post_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     with capture_logs() as logs:
         hook = hook_to(f"http://127.0.0.1:{port}/", give_up_s=0.02)
         hook.update(status(alarm()))
-        deadline_s = time.monotonic() + PATIENCE_S
-        while not logs and time.monotonic() < deadline_s:
-            time.sleep(0.005)
+        until(lambda: logs)
         hook.close(PATIENCE_S)
     assert [log["event"] for log in logs] == ["alarm_not_posted"]
 

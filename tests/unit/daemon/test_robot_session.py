@@ -30,7 +30,7 @@ from ccatp.links.robot_messages import CommandEcho, Hello, Joined, Sensors
 from ccatp.links.topics import FixMessage
 from ccatp.records.store import AlreadyMeasuredError
 from ccatp.survey.events import FixStored, SurveyInput
-from tests.support.daemon import HELLO
+from tests.support.daemon import HELLO, Waiting
 from tests.support.scenario import SurveyLoop
 from tests.support.sim_survey import fix_service
 
@@ -42,7 +42,7 @@ def test_the_delay_grows_and_is_spread() -> None:
     assert delay_s(0, 0.0) == FIRST_DELAY_S
 
 
-class Client(RobotSession):
+class Client(RobotSession, Waiting):
     """A controller that answers every frame with zeros."""
 
     def __init__(self, cfg: Config) -> None:
@@ -61,12 +61,6 @@ class Client(RobotSession):
     def on_sensors(self, sensors: Sensors, _line: bytes) -> None:
         self.frames.append(sensors.seq)
         self.changed.set()
-
-    async def until(self, is_there: Callable[[], bool]) -> None:
-        async with asyncio.timeout(20.0):
-            while not is_there():
-                self.changed.clear()
-                await self.changed.wait()
 
 
 async def with_robot(story: Callable[[Config, SurveyLoop], Coroutine[Any, Any, None]]) -> None:

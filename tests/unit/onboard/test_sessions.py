@@ -186,15 +186,12 @@ def test_after_a_long_stop_the_clock_goes_on_where_it_stood(rig: Rig) -> None:
 
 # -- delays -----------------------------------------------------------------------------------------------------------
 
-
-def delayed(config: Config, sensors: int, commands: int) -> Config:
-    delays = {"sensors_delay_s": 0.01 * sensors, "commands_delay_s": 0.01 * commands}
-    return config.model_copy(update={"world": config.world.model_copy(update=delays)})
+LATE = config_of(world__sensors_delay_s=0.02, world__commands_delay_s=0.01)
 
 
 @pytest.mark.parametrize(("sensors", "commands"), [(1, 0), (0, 1), (1, 1), (2, 2)])
-def test_lockstep_with_delays(config: Config, mirror: Mirror, sensors: int, commands: int) -> None:
-    r = ServedRobot(delayed(config, sensors, commands), mirror)
+def test_lockstep_with_delays(mirror: Mirror, sensors: int, commands: int) -> None:
+    r = ServedRobot(config_of(world__sensors_delay_s=0.01 * sensors, world__commands_delay_s=0.01 * commands), mirror)
     monitor = r.client(JOIN_MONITOR)
     assert (monitor.kinds, r.robot.seq) == (["hello", "joined"], 0)
     controller = r.client(JOIN)
@@ -216,8 +213,8 @@ def test_lockstep_with_delays(config: Config, mirror: Mirror, sensors: int, comm
             assert frame["cmd"]["permit_age"] == frame["cmd"]["age"]
 
 
-def test_in_lockstep_the_newest_frame_delivered_is_to_be_acknowledged(config: Config, mirror: Mirror) -> None:
-    r = ServedRobot(delayed(config, 2, 1), mirror)
+def test_in_lockstep_the_newest_frame_delivered_is_to_be_acknowledged(mirror: Mirror) -> None:
+    r = ServedRobot(LATE, mirror)
     controller = r.client(JOIN)
     controller.drive(0, 2)  # the robot's own newest, which nobody can know
     assert r.robot.seq == 2
@@ -229,8 +226,8 @@ def test_in_lockstep_the_newest_frame_delivered_is_to_be_acknowledged(config: Co
     assert r.robot.seq == 3
 
 
-def test_delays_on_the_wall_clock(config: Config, mirror: Mirror) -> None:
-    r = ServedRobot(delayed(config, 2, 1), mirror, lockstep=False)
+def test_delays_on_the_wall_clock(mirror: Mirror) -> None:
+    r = ServedRobot(LATE, mirror, lockstep=False)
     controller = r.client(JOIN)
     r.run(0.0101)
     assert controller.kinds == ["hello", "joined"]  # frame 1 exists, frame 0 is on its way

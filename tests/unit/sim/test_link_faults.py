@@ -18,7 +18,7 @@ from ccatp.dataloop import serve
 from ccatp.onboard import server, sessions
 from ccatp.sim.fault_plan import LINK_TYPES, LOCKSTEP_TYPES, parse_plan
 from ccatp.sim.fault_proxy import FaultProxy, LineStage, OneWayFaults
-from tests.support.daemon import LINK_DEADLINE_S, Driver
+from tests.support.daemon import LINK_DEADLINE_S, Driver, Waiting
 from tests.support.scenario import begin
 
 DEADLINE_S = 5.0  # what never happens in a good run may take this long in a bad one
@@ -26,7 +26,7 @@ LINES = [b"line %d of some length\n" % k for k in range(40)]
 TEXT = b"".join(LINES)
 
 
-class Server:
+class Server(Waiting):
     """Keeps what it gets, piece by piece, and sends what it is told."""
 
     def __init__(self) -> None:
@@ -57,12 +57,6 @@ class Server:
     @property
     def text(self) -> bytes:
         return b"".join(self.pieces)
-
-    async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(DEADLINE_S):
-            while not condition():
-                self.changed.clear()
-                await self.changed.wait()
 
 
 class Rig:

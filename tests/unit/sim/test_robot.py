@@ -248,10 +248,6 @@ def hard() -> Config:
     return config_of(run__world="hard")
 
 
-def with_world(config: Config, **values: float) -> Config:
-    return config.model_copy(update={"world": config.world.model_copy(update=values)})
-
-
 Row = tuple[object, ...]
 
 
@@ -297,7 +293,7 @@ def test_a_frame_is_delivered_when_the_clock_shows_its_time_and_the_delay(
     config: Config, mirror: Mirror, frames: int
 ) -> None:
     at_once = survey(config, mirror)
-    late = survey(with_world(config, sensors_delay_s=0.01 * frames), mirror)
+    late = survey(config_of(world__sensors_delay_s=0.01 * frames), mirror)
     assert [row for row, _ in late] == [row for row, _ in at_once]  # only the news is late
     for k in range(frames + 1, 300):
         assert late[k][1] == at_once[k - frames][1]
@@ -322,7 +318,7 @@ BODY = {"slip", "creep", "vibration", "wheels"}
 @pytest.mark.parametrize("kind", KINDS)
 def test_each_kind_alone_changes_what_is_its_own(config: Config, hard: Config, mirror: Mirror, kind: str) -> None:
     """In an otherwise quiet world: a body that is pushed moves elsewhere, a sensor that errs does not move it."""
-    alone = with_world(config, **{key: getattr(hard.world, key) for key in KINDS[kind]})
+    alone = config_of(**{f"world__{key}": getattr(hard.world, key) for key in KINDS[kind]})
     quiet, found = survey(config, mirror), survey(alone, mirror)
     assert ([row for row, _ in found] != [row for row, _ in quiet]) is (kind in BODY)
 

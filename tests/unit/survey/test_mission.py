@@ -286,16 +286,6 @@ def test_a_robot_that_never_rests_is_a_fault(story: Story) -> None:
     assert "does not come to rest" in story.state.cause
 
 
-def test_failed_measurements_are_skipped_and_three_in_a_row_hold(story: Story) -> None:
-    story.auto_fix = False
-    for _ in range(3):
-        story.until(lambda: story.state.is_awaiting_fix)
-        story.mission.handle(FixFailed(story.state.measuring_point, "no answer"))
-    assert story.state.is_faulted
-    assert "3 measurements in a row failed: no answer" in story.state.cause
-    assert len(story.state.skipped) == 3
-
-
 def test_a_fix_committed_after_the_way_was_planned_anew_counts_once(story: Story) -> None:
     # A slow disk: the robot was paused meanwhile, and went on by a way whose next stop is not the point.
     via = Stop(*story.mirror.point_on_deck(PointId(5, 5, 5)), StopKind.VIA)
