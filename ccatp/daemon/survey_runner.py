@@ -1,5 +1,6 @@
 """The survey of a mirror in the main-loop process: localizer, mission, gate, laser system, fans, store."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import isfinite
@@ -33,7 +34,7 @@ from ccatp.links.topics import (
 from ccatp.localizer import Localizer
 from ccatp.records.checkpoint import FILE, CheckpointFile
 from ccatp.records.store import MissionStore
-from ccatp.survey.behaviours import HOLD_POSITION, MissionCommand
+from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.budget import home_time_s
 from ccatp.survey.checks import FaultAction, MirrorCheck, UnattendedFaultTimer
 from ccatp.survey.composition import Checkpoint, SurveyParts
@@ -123,7 +124,110 @@ class GateLog:
         return {denial.name.lower(): count for denial, count in self._gate.denied.items() if count}
 
 
-class SurveyRunner(MissionRunner):
+class SurveyFrames(ABC):
+    """A survey's frames from samples to set points: in the main-loop process, and in a run in one process.
+
+    What is sent besides, reported and kept is up to who derives from it. ``motion``: the estimate of the newest frame,
+    None where that is stale.
+    """
+
+    def __init__(self, cfg: Config, parts: SurveyParts, frame_s: float) -> None:
+        self.cfg, self.parts, self.mirror, self.thrust = cfg, parts, parts.mirror, parts.thrust
+        self.localizer, self.mission, self.gate = parts.localizer, parts.mission, parts.gate
+        self.sent = SentDrives(cfg.robot, frame_s)
+        self.motion: StateEstimate | None = None
+        self._sent_commands: tuple[tuple[float, float, float, float] | None, int] = None, -1
+        self._start, self._is_odometry_off = parts.start, False
+
+    @abstractmethod
+    def begin_drives(self) -> None:
+        """Send the fans' duties, before the first drive and whenever they change."""
+
+    def _publish_treatment(self, sensors: Sensors, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:
+        """Called where the samples of a frame are taken otherwise than they came; for a replay."""
+        del sensors, kind, values
+
+    @abstractmethod
+    def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
+        """The robot is at rest, or is to be measured."""
+
+    def estimate(self, frame: TimedFrame) -> None:
+        """Give the frame's samples to the localizer, as far as they can be trusted."""
+        sensors, mission, localizer = frame.sensors, self.mission, self.localizer
+        start, self._start = self._start, None
+        if start is not None:  # a replay has to know where the localizer of a loop that takes over begins
+            begun, sigmas = start
+            self._publish_treatment(sensors, "begun", (begun.x_m, begun.y_m, begun.heading_rad, *sigmas))
+        state = mission.state
+        is_odometry_off = state.mode is HELD and state.rejects_odometry
+        if is_odometry_off is not self._is_odometry_off:
+            self._is_odometry_off = is_odometry_off
+            self._publish_treatment(sensors, "odometry_off" if is_odometry_off else "odometry_on")
+        imu, enc = ((), as_standing(sensors.enc)) if is_odometry_off else (sensors.imu, sensors.enc)
+        localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
+        if localizer.hold_cause:
+            # A filter that diverged is frozen until it has a fix.
+            mission.handle(EstimateDiverged(localizer.hold_cause, frame.t_s))
+            localizer.clear_hold()
+        if frame.dt_s <= 0.0:
+            self.motion = None
+            return
+        echo = sensors.cmd
+        pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
+        place = pose.x_m, pose.y_m, pose.heading_rad
+        ahead = self.sent.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
+        sigma_of, heading_sigma_of = self._position_sigma_m, self.parts.heading_sigma_rad
+        self.motion = StateEstimate(
+            frame.t_s, frame.dt_s, pose, self.mirror.deck_pose, v, omega, creep, ahead, sigma_of, heading_sigma_of
+        )
+
+    def _position_sigma_m(self) -> float:
+        return self.localizer.position_sigma_m
+
+    def plan(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
+        """The mission's velocity, as far as the gate permits it."""
+        mission, motion, sensors = self.mission, self.motion, frame.sensors
+        if motion is None:
+            raise RuntimeError("plan comes after estimate, and not for a stale frame")
+        mission.state, command = mission.survey.step(mission.state, motion, verdict)
+        state = mission.state
+        if command.inflates_covariance or state.wants_calibration or state.full_fans or state.hold.is_fault:
+            self._apply_requests(sensors, command)
+            state = mission.state
+        # A verdict has the robot's own time, which may have jumped.
+        right, left = self.gate.pass_through(command.twist, verdict, motion.dt_s, sensors.t, lag_s, state.purpose)
+        if command.at_rest or command.measure:
+            self._execute(command, motion)
+        if frame.is_estimate_due:
+            self._sent_commands = self.sent.take_span(), self.sent.newest
+            turns = state.mode is not MissionState.DRIVING
+            self._measure_grip()
+            if self.thrust.step(motion.t_s, self.localizer.deck_pose, turns=turns):
+                self.begin_drives()
+        return DriveCommand(right, left)
+
+    def _measure_grip(self) -> None:
+        self.parts.measure_grip()
+
+    def _apply_requests(self, sensors: Sensors, command: MissionCommand) -> None:
+        """Requests of the mission besides the drive, before that is sent."""
+        health = self.cfg.health
+        if command.inflates_covariance:
+            doubt = health.doubt_position_m, health.doubt_heading_rad
+            self.localizer.inflate_covariance(*doubt)
+            self._publish_treatment(sensors, "doubted", doubt)
+        if self.mission.state.full_fans and self.thrust.give_all():  # pressed on first, held then
+            self.begin_drives()
+
+    def _estimate_message(self, frame: TimedFrame) -> EstimateMessage:
+        """The estimate for the danger loop, in a frame in which it is due."""
+        deck, sensors = self.localizer.deck_pose, frame.sensors
+        place = deck.x_m, deck.y_m, deck.heading_rad, self.localizer.position_sigma_m
+        mode, grip = self.mission.state.mode.value, self.thrust.margin
+        return EstimateMessage(*place, mode, *self._sent_commands, grip, seq=sensors.seq, t_s=sensors.t)
+
+
+class SurveyRunner(SurveyFrames, MissionRunner):
     """A survey in the main-loop process."""
 
     mission: Mission
@@ -131,15 +235,13 @@ class SurveyRunner(MissionRunner):
     def __init__(
         self, cfg: Config, args: ProcessArgs, loop: "MainLoop", parts: SurveyParts, store: MissionStore
     ) -> None:
-        self._sent = SentDrives(cfg.robot, 1.0 / cfg.sim.robot.frame_hz)
-        super().__init__(parts.mission, Telemetry(loop.publisher, loop.log, "track", TrackMessage), self._sent.add)
-        self._cfg, self._loop, self._clock, self._parts, self._store = cfg, loop, loop.clock, parts, store
-        self._mirror, self._localizer, self._gate = parts.mirror, parts.localizer, parts.gate
+        SurveyFrames.__init__(self, cfg, parts, 1.0 / cfg.sim.robot.frame_hz)
+        telemetry = Telemetry(loop.publisher, loop.log, "track", TrackMessage)
+        MissionRunner.__init__(self, parts.mission, telemetry, self.sent.add)
+        self._loop, self._clock, self._store = loop, loop.clock, store
         self._clock.before_s = parts.mission.state.budget.before_s
-        self._gate_log = GateLog(self._gate, self.telemetry.notify_operator)
+        self._gate_log = GateLog(self.gate, self.telemetry.notify_operator)
         self._fan_gate, self._fans_seq = FanGate(0.0), 0
-        self._thrust = parts.thrust
-        self._sent_commands: tuple[tuple[float, float, float, float] | None, int] = None, -1
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
         self._fix_service = FixService(
             cfg.mission,
@@ -157,10 +259,7 @@ class SurveyRunner(MissionRunner):
         self._checkpoint = CheckpointWriter(args.run_dir, parts.localizer, self.mission, not args.is_realtime)
         self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
-        self._start = parts.start
-        self._is_odometry_off = False
         self._state = MissionState.IDLE
-        self._motion: StateEstimate | None = None
         self._has_reported_calibration = False
 
     @property
@@ -174,10 +273,10 @@ class SurveyRunner(MissionRunner):
 
     @property
     def is_at_rest(self) -> bool:
-        control = self._cfg.control
+        control = self.cfg.control
         return (
-            abs(self._localizer.speed_m_s) <= control.settle_speed_m_s
-            and abs(self._localizer.rate_rad_s) <= control.settle_rate_rad_s
+            abs(self.localizer.speed_m_s) <= control.settle_speed_m_s
+            and abs(self.localizer.rate_rad_s) <= control.settle_rate_rad_s
         )
 
     def status(self) -> MissionStatus:
@@ -192,20 +291,20 @@ class SurveyRunner(MissionRunner):
             cause=state.cause or self._fix_service.wait_cause,
             done=len(state.done),
             skipped=len(state.skipped),
-            total=self._parts.total_points,
+            total=self.parts.total_points,
             point=f"{point.row}-{point.col}-{point.point}" if point is not None else "",
             eta_s=round(state.eta_s, 3),
             error_mm=1e3 * self._fix_service.arrival_error_m,
             outcome=str(state.outcome),
-            lower_bound_s=self._parts.lower_bound_s,
+            lower_bound_s=self.parts.lower_bound_s,
             left_out=by_reason(survey.left_out(state)),
-            friction=round(self._thrust.friction, 3),
-            grip=round(self._thrust.margin, 3),
+            friction=round(self.thrust.friction, 3),
+            grip=round(self.thrust.margin, 3),
         )
 
     def display_state(self) -> DisplayState:
         """Pose on the deck, and the filter's last update."""
-        localizer, telemetry = self._localizer, self.telemetry
+        localizer, telemetry = self.localizer, self.telemetry
         pose, covariance, innovation = localizer.deck_pose, localizer.pose_covariance, localizer.innovation
         return DisplayState(
             seq=telemetry.seq,
@@ -240,17 +339,16 @@ class SurveyRunner(MissionRunner):
         await self._etalon.close()
 
     def check_robot(self, hello: Hello) -> None:
-        self._parts.check_robot(hello)
+        self.parts.check_robot(hello)
 
     def begin_session(self, hello: Hello) -> None:
-        self._sent.begin_session(1.0 / hello.frame_hz)
+        self.sent.begin_session(1.0 / hello.frame_hz)
         self._checkpoint.boot = hello.boot
         # The robot's own floor counts where the mirror overhangs.
-        self._fan_gate = FanGate(hello.robot.fan_floor if self._mirror.overhang else 0.0)
+        self._fan_gate = FanGate(hello.robot.fan_floor if self.mirror.overhang else 0.0)
 
     def begin_drives(self) -> None:
-        """Send the fans' duties, before the first drive and whenever they change."""
-        duty = self._thrust.duty
+        duty = self.thrust.duty
         refusal = self._fan_gate.refusal(*duty)
         if refusal is None:
             self._fans_seq += 1
@@ -274,89 +372,34 @@ class SurveyRunner(MissionRunner):
     def _publish_treatment(self, sensors: Sensors, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:
         self.telemetry.send("treatment", Treatment(seq=sensors.seq, t_s=sensors.t, kind=kind, values=values))
 
-    def estimate(self, frame: TimedFrame) -> None:
-        """Give the frame's samples to the localizer, as far as they can be trusted."""
-        sensors, mission, localizer = frame.sensors, self.mission, self._localizer
-        start, self._start = self._start, None
-        if start is not None:  # a replay has to know where the localizer of a loop that takes over begins
-            begun, sigmas = start
-            self._publish_treatment(sensors, "begun", (begun.x_m, begun.y_m, begun.heading_rad, *sigmas))
-        state = mission.state
-        is_odometry_off = state.mode is MissionState.HELD and state.rejects_odometry
-        if is_odometry_off is not self._is_odometry_off:
-            self._is_odometry_off = is_odometry_off
-            self._publish_treatment(sensors, "odometry_off" if is_odometry_off else "odometry_on")
-        imu, enc = ((), as_standing(sensors.enc)) if is_odometry_off else (sensors.imu, sensors.enc)
-        localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
-        if localizer.hold_cause:
-            # A filter that diverged is frozen until it has a fix.
-            mission.handle(EstimateDiverged(localizer.hold_cause, frame.t_s))
-            localizer.clear_hold()
-        if frame.dt_s <= 0.0:
-            self._motion = None
-            return
-        echo = sensors.cmd
-        pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
-        place = pose.x_m, pose.y_m, pose.heading_rad
-        ahead = self._sent.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
-        sigma_of, heading_sigma_of = self._position_sigma_m, self._parts.heading_sigma_rad
-        self._motion = StateEstimate(
-            frame.t_s, frame.dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, sigma_of, heading_sigma_of
-        )
-
-    def _position_sigma_m(self) -> float:
-        return self._localizer.position_sigma_m
-
     def plan(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
-        """The mission's velocity, as far as the gate permits it."""
-        mission, motion = self.mission, self._motion
-        if motion is None:
-            raise RuntimeError("plan comes after estimate, and not for a stale frame")
-        is_placed = self._mirror_check is None or self._is_on_mirror(frame.sensors)
-        command = HOLD_POSITION
-        if is_placed:
-            mission.state, command = mission.survey.step(mission.state, motion, verdict)
-        state, gate = mission.state, self._gate
-        if command.inflates_covariance or state.wants_calibration or state.full_fans or state.hold.is_fault:
-            self._apply_requests(frame.sensors, command)
-            state = mission.state
-        # A verdict has the robot's own time, which may have jumped.
-        right, left = gate.pass_through(command.twist, verdict, motion.dt_s, frame.sensors.t, lag_s, state.purpose)
-        if gate.denial is not None:
-            self._gate_log.update(motion.t_s)
-        if command.at_rest or command.measure:
-            self._execute(command, motion)
-        if frame.is_estimate_due:
-            self._sent_commands = self._sent.take_span(), self._sent.newest
-            turns = state.mode is not MissionState.DRIVING
-            self._measure_grip()
-            if self._thrust.step(motion.t_s, self._localizer.deck_pose, turns=turns):
-                self.begin_drives()
-        return DriveCommand(right, left)
+        if self._mirror_check is not None and not self._is_on_mirror(self._mirror_check, frame.sensors):
+            return self.hold(frame)
+        drive = super().plan(frame, verdict, lag_s)
+        if self.gate.denial is not None:
+            self._gate_log.update(frame.t_s)
+        return drive
 
     def _measure_grip(self) -> None:
         """The first turns, those of the calibration drive, are the test of grip; it is reported once."""
-        thrust = self._thrust
+        thrust = self.thrust
         is_test = not thrust.friction
-        if self._parts.measure_grip() and is_test:
+        if self.parts.measure_grip() and is_test:
             text = f"grip: friction {thrust.friction:.2f}, {thrust.margin:.2f} times the thrust that turns need"
             self.telemetry.notify_operator("info", text)
 
     def hold(self, frame: TimedFrame) -> DriveCommand:
         if frame.is_estimate_due:
-            self._sent_commands = self._sent.take_span(), self._sent.newest
+            self._sent_commands = self.sent.take_span(), self.sent.newest
         return STILL
 
-    def _is_on_mirror(self, sensors: Sensors) -> bool:
+    def _is_on_mirror(self, check: MirrorCheck, sensors: Sensors) -> bool:
         """Whether gravity permits motion: the robot stands on the mirror of the configuration.
 
         In lockstep the mission begins at once, and ends when gravity contradicts: nothing real can be harmed, and a run
         stays the same function of its seed.
         """
-        check = self._mirror_check
-        if check is None:
-            return True
-        if check.update(sensors.t, sensors.gravity, self._localizer.deck_pose):
+        if check.update(sensors.t, sensors.gravity, self.localizer.deck_pose):
             self._mirror_check = None
             if check.warning:
                 self.telemetry.notify_operator("warning", check.warning)
@@ -367,25 +410,19 @@ class SurveyRunner(MissionRunner):
         return self._mirror_check is None or self._loop.is_lockstep
 
     def _apply_requests(self, sensors: Sensors, command: MissionCommand) -> None:
-        """Requests of the mission besides the drive, before that is sent."""
-        state, health = self.mission.state, self._cfg.health
-        if command.inflates_covariance:
-            doubt = health.doubt_position_m, health.doubt_heading_rad
-            self._localizer.inflate_covariance(*doubt)
-            self._publish_treatment(sensors, "doubted", doubt)
+        super()._apply_requests(sensors, command)
+        state = self.mission.state
         if state.wants_calibration and not self._has_reported_calibration:
             self._has_reported_calibration = True
             self.telemetry.notify_operator("warning", GIVEN_UP)
-        if state.full_fans and self._thrust.give_all():  # pressed on first, held then
-            self.begin_drives()
         if state.is_faulted:
             self._check_unattended_fault(sensors)
 
     def _check_unattended_fault(self, sensors: Sensors) -> None:
         """An alarm now and then, and the return to base before the battery is too low for it."""
-        mission, timer, pose = self.mission, self._fault_timer, self._localizer.deck_pose
-        is_localized = not (mission.state.is_lost or self._localizer.is_frozen)
-        home_s = home_time_s(self._mirror.base_pose, self._cfg.limits, pose.x_m, pose.y_m) if is_localized else None
+        mission, timer, pose = self.mission, self._fault_timer, self.localizer.deck_pose
+        is_localized = not (mission.state.is_lost or self.localizer.is_frozen)
+        home_s = home_time_s(self.mirror.base_pose, self.cfg.limits, pose.x_m, pose.y_m) if is_localized else None
         action = timer.watch(sensors.t, sensors.soc, home_s)
         if action is FaultAction.REMIND:
             held_s = timer.held_s(sensors.t)
@@ -398,7 +435,7 @@ class SurveyRunner(MissionRunner):
     def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
         mission, seq = self.mission, self._clock.seq
         if command.at_rest:
-            self._localizer.rest()
+            self.localizer.rest()
             self.telemetry.send("rest", Rest(seq=seq, t_s=motion.t_s))
         if command.arrived is not None:
             error_m = mission.survey.follower.distance_m(mission.state.stop, motion.pose)
@@ -407,8 +444,8 @@ class SurveyRunner(MissionRunner):
             self.telemetry.send("arrival", arrival)
             self._store.record_arrival(command.arrived, motion.t_s, error_m)
         if command.measure:
-            pose = self._localizer.deck_pose
-            expected = self._mirror.puck_world(pose, self._cfg.robot.puck_height_m)
+            pose = self.localizer.deck_pose
+            expected = self.mirror.puck_world(pose, self.cfg.robot.puck_height_m)
             # The localizer dates a fix by the robot's own clock.
             t_s = motion.t_s - self._clock.offset_s
             self._fix_service.begin(
@@ -416,14 +453,10 @@ class SurveyRunner(MissionRunner):
             )
 
     def publish(self, frame: TimedFrame) -> None:
-        seq, t_s, telemetry, localizer = frame.sensors.seq, frame.sensors.t, self.telemetry, self._localizer
+        seq, t_s, telemetry, localizer = frame.sensors.seq, frame.sensors.t, self.telemetry, self.localizer
         pose, sigma_m = localizer.pose, localizer.position_sigma_m
         if frame.is_estimate_due:
-            deck, state, commanded = localizer.deck_pose, self.mission.state.mode.value, self._sent_commands
-            place = deck.x_m, deck.y_m, deck.heading_rad
-            telemetry.send(
-                "estimate", EstimateMessage(*place, sigma_m, state, *commanded, self._thrust.margin, seq=seq, t_s=t_s)
-            )
+            telemetry.send("estimate", self._estimate_message(frame))
         row = seq + telemetry.frames_before, t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, sigma_m
         telemetry.add_frame(seq, t_s, frame.raw, row)
         if self._checkpoint.is_due(seq):

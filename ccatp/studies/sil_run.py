@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.control.wheel_motion import SentDrives, as_standing
 from ccatp.core import DeckPose, EventCode, Fix, FloatArray, PanelPose, PointId, SteadyTime, Verdict, difference
+from ccatp.daemon.mission_runner import STILL, DriveCommand, TimedFrame
+from ccatp.daemon.survey_runner import SurveyFrames
 from ccatp.danger import DangerMonitor
 from ccatp.dataloop import MotorRobot, motor_robot
 from ccatp.estimation.fixes import FixGated, FixRefused
@@ -33,8 +34,9 @@ from ccatp.sim.fault_plan import FaultPlan, Injected
 from ccatp.sim.laser import SEED_STREAM, EtalonModel, PuckTruth
 from ccatp.sim.robot import Robot
 from ccatp.sim.world import TruthRow
+from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.composition import SurveyParts, assemble
-from ccatp.survey.events import DONE, EstimateDiverged, FixFailed, FixStored, MissionState, PointMissed, SurveyOutcome
+from ccatp.survey.events import DONE, FixFailed, FixStored, MissionState, PointMissed, SurveyOutcome
 from ccatp.survey.fix_gate import ApproachCounter
 from ccatp.survey.route_follower import StateEstimate
 
@@ -172,7 +174,7 @@ class NoFrames(RuntimeError):
     """The robot sends no frame any more, which no plan of passing faults causes."""
 
 
-class SilRun:
+class SilRun(SurveyFrames):
     """The processes' parts side by side; a subclass may exchange some before ``run``, or override a frame.
 
     ``faults``: of the robot. A frame that cannot be decoded is passed over, one that is not newer is answered with
@@ -180,18 +182,14 @@ class SilRun:
     """
 
     def __init__(self, cfg: Config, faults: FaultPlan | None = None) -> None:
-        self.cfg = cfg
-        parts: SurveyParts = assemble(cfg)
-        self.parts, self.mirror = parts, parts.mirror
-        self.localizer: Localizer = parts.localizer
-        self.mission, self.gate = parts.mission, parts.gate
+        parts = assemble(cfg)
+        super().__init__(cfg, parts, 1.0 / cfg.sim.robot.frame_hz)
         self.robot: Robot | MotorRobot = (
             Robot(cfg, self.mirror, np.random.default_rng(cfg.run.seed), faults)
             if cfg.sim.robot.physics == "lag"
             else motor_robot(cfg)
         )
         self.monitor = DangerMonitor(self.mirror, cfg.robot, cfg.danger, cfg.health)
-        self.sent = SentDrives(cfg.robot, self.robot.frame_s)
         self.laser = SilLaser(cfg, self.mirror, self.robot)
         self.trace = SilTrace(parts)
         self.states_s = defaultdict(float, {MissionState.IDLE: 0.0})
@@ -199,11 +197,11 @@ class SilRun:
         self.weak_frames = 0  # on an overhang, in which the fans gave less than their floor
         self._published: EstimateMessage | None = None
         self._verdict: Verdict | None = None
-        self._sigma_of = lambda: self.localizer.position_sigma_m
         self._code = EventCode.NORMAL
         self._drive_seq = 0
         self._time = SteadyTime(cfg.health.clock_jump_s)
-        self._thrust, self._fans_seq = parts.thrust, 0
+        self._fans_seq = 0
+        self._is_measuring = False
 
     @property
     def injected(self) -> tuple[Injected, ...]:
@@ -217,7 +215,7 @@ class SilRun:
         robot.join("monitor")
         robot.join("controller")
         frame = self._receive()
-        self._command_fans(self._thrust.duty)
+        self.begin_drives()
         first_s = t_s = self._time.at(frame.seq, frame.t)
         last_s = first_s - robot.frame_s
         limit_s = _ENDLESS * self.parts.lower_bound_s + 600.0
@@ -257,81 +255,57 @@ class SilRun:
     def _note_truth(self) -> None:
         self.trace.note_truth(self.robot.truth_row())
 
-    # -- a frame, as in daemon.frame_service and daemon.danger_loop ---------------------------------------------------
+    # -- a frame, as in daemon.main_loop and daemon.danger_loop -------------------------------------------------------
 
-    def _serve(self, frame: Sensors, dt_s: float) -> None:
-        localizer, mission, robot = self.localizer, self.mission, self.robot
-        seq, t_s = frame.seq, frame.t
+    def _serve(self, sensors: Sensors, dt_s: float) -> None:
+        robot, t_s = self.robot, sensors.t + self._time.offset_s
+        frame = TimedFrame(sensors, b"", t_s, dt_s, False, is_estimate_due(sensors.seq))
         if self.mirror.overhang and robot.fans.thrust < self.cfg.sim.robot.fan_floor:
             self.weak_frames += 1
         if dt_s <= 0.0:
-            localizer.step(t_s, frame.imu, frame.enc, frame.edge, frame.gravity)
-            self._drive_seq += 1
-            self._note_drive(self._drive_seq, 0.0, 0.0)
-            robot.drive(self._drive_seq, 0.0, 0.0)
+            self.estimate(frame)
+            self._drive(STILL)
             return
         # Main publishes a pose in five frames; the verdict on a frame waits for the newest that is due before it.
-        before, verdict = self._verdict, self.monitor.step(frame, self._published)
+        before, verdict = self._verdict, self.monitor.step(sensors, self._published)
         self._verdict = verdict
         if verdict.code is not self._code:
             self._code = verdict.code
-            self.trace.builder.add_verdict_event(seq, verdict.code)
-        imu, enc = ((), as_standing(frame.enc)) if mission.state.rejects_odometry else (frame.imu, frame.enc)
-        localizer.step(t_s, imu, enc, frame.edge, frame.gravity)
-        if localizer.hold_cause:
-            mission.handle(EstimateDiverged(localizer.hold_cause, t_s + self._time.offset_s))
-            localizer.clear_hold()
-        motion = self._motion(frame, dt_s)
-        order = mission.step(motion, before)  # the decision in a frame goes by the verdict on the one before
-        if order.inflates_covariance:
-            localizer.inflate_covariance(self.cfg.health.doubt_position_m, self.cfg.health.doubt_heading_rad)
-        if mission.state.full_fans and self._thrust.give_all():
-            self._command_fans(self._thrust.duty)
-        right, left = self.gate.pass_through(order.twist, before, dt_s, t_s, 0.0, mission.state.purpose)
-        if order.at_rest:
-            localizer.rest()
-            if order.arrived is not None:
-                self.trace.builder.add_arrival(order.arrived, seq)
-        state = mission.state.mode
-        self.states_s[state] += dt_s
-        turns = state is not MissionState.DRIVING
-        if is_estimate_due(seq):
-            self.parts.measure_grip()
-            if self._thrust.step(motion.t_s, localizer.deck_pose, turns=turns):
-                self._command_fans(self._thrust.duty)
-        self._publish(seq, t_s, motion.pose, state)
-        if order.measure:
-            self._measure(frame)
-            right = left = 0.0  # the held frame is answered by zeros
-        self._drive_seq = number = self._drive_seq + 1
-        self._note_drive(number, right, left)
-        robot.permit(number, verdict.forward, verdict.reverse, verdict.turn)
-        robot.drive(number, set_point_on_wire(right), set_point_on_wire(left))
+            self.trace.builder.add_verdict_event(sensors.seq, verdict.code)
+        self.estimate(frame)
+        drive = self.plan(frame, before, 0.0)  # the decision in a frame goes by the verdict on the one before
+        self.states_s[self.mission.state.mode] += dt_s
+        self._publish(frame)
+        if self._is_measuring:
+            self._is_measuring = False
+            self._measure(sensors)
+            drive = STILL  # the held frame is answered by zeros
+        robot.permit(self._drive_seq + 1, verdict.forward, verdict.reverse, verdict.turn)
+        self._drive(drive)
 
-    def _motion(self, frame: Sensors, dt_s: float) -> StateEstimate:
-        localizer, echo = self.localizer, frame.cmd
-        pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
-        here = pose.x_m, pose.y_m, pose.heading_rad
-        ahead = self.sent.ahead(here, v, omega, echo.seq, echo.age, echo.held, creep)
-        t_s, sigma_of, heading_sigma_of = frame.t + self._time.offset_s, self._sigma_of, self.parts.heading_sigma_rad
-        return StateEstimate(t_s, dt_s, pose, self.mirror.deck_pose, v, omega, creep, ahead, sigma_of, heading_sigma_of)
+    def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
+        self._is_measuring = command.measure
+        if command.at_rest:
+            self.localizer.rest()
+        if command.arrived is not None:
+            self.trace.builder.add_arrival(command.arrived, self.robot.delivered_seq)
 
-    def _command_fans(self, duty: tuple[float, float]) -> None:
+    def begin_drives(self) -> None:
+        """Command the duties of the thrust control."""
         self._fans_seq += 1
-        self.robot.command_fans(self._fans_seq, *duty)
+        self.robot.command_fans(self._fans_seq, *self.thrust.duty)
 
-    def _note_drive(self, number: int, right: float, left: float) -> None:
+    def _drive(self, drive: DriveCommand) -> None:
+        self._drive_seq = number = self._drive_seq + 1
+        right, left = drive.right_rad_s, drive.left_rad_s
         self.sent.add(number, right, left)
+        self.robot.drive(number, set_point_on_wire(right), set_point_on_wire(left))
 
-    def _publish(self, seq: int, t_s: float, pose: PanelPose, state: MissionState) -> None:
-        self.trace.note_estimate(seq, t_s, pose)
-        if is_estimate_due(seq):
-            deck = self.localizer.deck_pose
-            self._published = EstimateMessage(
-                seq=seq, t_s=t_s, x_m=deck.x_m, y_m=deck.y_m, heading_rad=deck.heading_rad,
-                sigma_m=self.localizer.position_sigma_m, state=state, commanded=self.sent.take_span(),
-                drive_seq=self._drive_seq, grip=self._thrust.margin,
-            )  # fmt: skip
+    def _publish(self, frame: TimedFrame) -> None:
+        sensors = frame.sensors
+        self.trace.note_estimate(sensors.seq, sensors.t, self.localizer.pose)
+        if frame.is_estimate_due:
+            self._published = self._estimate_message(frame)
 
     # -- a measurement, as in daemon.fix_service ----------------------------------------------------------------------
 
@@ -369,7 +343,7 @@ class SilRun:
         injected = {panel: (m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in misalignments.items()}
         track, builder = self.trace.join(), self.trace.builder
         builder.set_mission(len(state.done), len(state.skipped), mission_time_s)
-        builder.add_grip(self._thrust.friction, self._thrust.margin)
+        builder.add_grip(self.thrust.friction, self.thrust.margin)
         builder.set_panels(self.laser.panel_fits(), injected)
         return SilResult(
             summary=builder.build(),

@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from ccatp.config.models import Config
 from ccatp.control.gate import Denial
 from ccatp.core import Twist
+from ccatp.daemon.mission_runner import DriveCommand
 from ccatp.links.robot_messages import Sensors
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.events import FixStored, MissionState
@@ -64,9 +65,9 @@ class Broken(MeasuredSurvey):
     held_at_s: float | None = None
     drive = (0.0, 0.0)
 
-    def _note_drive(self, number: int, right: float, left: float) -> None:
-        super()._note_drive(number, right, left)
-        self.drive = right, left
+    def _drive(self, drive: DriveCommand) -> None:
+        super()._drive(drive)
+        self.drive = drive.right_rad_s, drive.left_rad_s
 
     def look(self, frame: Sensors) -> None:
         if self.broken_at_s is None and self.mission.state.done and self.mission.state.mode is MissionState.DRIVING:

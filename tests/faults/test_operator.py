@@ -18,6 +18,7 @@ from msgspec.structs import replace
 
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EmergencyKind, EventCode, Severity, Verdict
+from ccatp.daemon.mission_runner import STILL, DriveCommand
 from ccatp.links.channels import format_ok
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.rpc import REPEAT_S, RequestFailed, request
@@ -78,17 +79,17 @@ class Aborted(MeasuredSurvey):
             self.cleared_s = frame.t
             assert self.monitor.clear("e", at_base_or_held=self.mission.state.mode is HELD) is None
 
-    def _note_drive(self, number: int, right: float, left: float) -> None:
-        super()._note_drive(number, right, left)
+    def _drive(self, drive: DriveCommand) -> None:
+        super()._drive(drive)
         frame = self.robot.delivered
         assert frame is not None
-        if self.raised_s <= frame.t and right == left == 0.0:
+        if self.raised_s <= frame.t and drive == STILL:
             self.zero_s = min(self.zero_s, frame.t)
         if self.raised_s <= frame.t < self.cleared_s:
             verdict = self.monitor.verdict
             self.was_permitted |= verdict.forward or verdict.reverse or verdict.turn
         if self.zero_s < frame.t < self.cleared_s:
-            self.moved_while_held |= not right == left == 0.0
+            self.moved_while_held |= drive != STILL
 
 
 # -- O1: aborts -------------------------------------------------------------------------------------------------------

@@ -15,10 +15,11 @@ from msgspec.structs import replace
 from ccatp.config.models import Config
 from ccatp.control.gate import FanGate, Purpose
 from ccatp.core import EdgeSample, EventCode, PointId, Stop, Twist, Verdict, WheelSample, twist_of
+from ccatp.daemon.mission_runner import STILL, TimedFrame
 from ccatp.danger import DangerMonitor
 from ccatp.estimation.fixes import FixRefused
-from ccatp.links.robot_codec import set_point_on_wire
 from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import is_estimate_due
 from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.sim.robot import Robot
 from ccatp.studies.sil_run import SilLaser, SilRun
@@ -31,7 +32,6 @@ from ccatp.survey.events import (
     RETURNING,
     TURNING,
     Abort,
-    Fault,
     FixFailed,
     FixStored,
     Pause,
@@ -166,6 +166,7 @@ class Stage(SilRun):
 
     def _serve(self, frame: Sensors, dt_s: float) -> None:
         t_s, trouble, mission = frame.t, self.trouble, self.mission
+        timed = TimedFrame(frame, b"", t_s, dt_s, is_first=False, is_estimate_due=is_estimate_due(frame.seq))
         verdict = None
         if trouble.no_danger > 0:
             trouble.no_danger -= 1
@@ -173,32 +174,24 @@ class Stage(SilRun):
             self._verdict = verdict = self.monitor.step(frame, self._published)
             self._permit_seq += 1
             self.robot.permit(self._permit_seq, verdict.forward, verdict.reverse, verdict.turn)
-        self.localizer.step(t_s, frame.imu, frame.enc, frame.edge, frame.gravity)
-        if self.localizer.hold_cause:
-            mission.handle(Fault(self.localizer.hold_cause, loses_pose=self.localizer.is_frozen))
-            self.localizer.clear_hold()
+        self.estimate(timed)
         if dt_s <= 0.0:
-            self._send(0.0, 0.0)
+            self._drive(STILL)
             return
         verdict = self._verdict
         if verdict is not None and not abs(t_s - verdict.t_s) <= FRESH_S:
             verdict = None
-        motion = self._motion(frame, dt_s)
-        order = mission.step(motion, verdict)
-        right, left = self.gate.pass_through(order.twist, verdict, dt_s, t_s, 0.0, mission.state.purpose)
-        if order.at_rest:
-            self.localizer.rest()
-        self._publish(frame.seq, t_s, motion.pose, mission.state.mode)
-        if order.measure:
+        drive = self.plan(timed, verdict, 0.0)
+        self._publish(timed)
+        if self._is_measuring:
+            self._is_measuring = False
             self._pending = mission.state.request, trouble.fix_frames, frame
-            right = left = 0.0
-        self._send(right, left)
+            drive = STILL
+        self._drive(drive)
         self._collect()
 
-    def _send(self, right: float, left: float) -> None:
-        self._drive_seq += 1
-        self._note_drive(self._drive_seq, right, left)
-        self.robot.drive(self._drive_seq, set_point_on_wire(right), set_point_on_wire(left))
+    def begin_drives(self) -> None:
+        self.command_fans(*self.thrust.duty)
 
     def _collect(self) -> None:
         """A fix comes when it is ready; one that is not wanted any more is thrown away."""

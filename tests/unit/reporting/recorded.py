@@ -11,7 +11,8 @@ import numpy as np
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import dump_config, load_config, load_radio_config
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, Fix, PanelId, PanelPose, PointId
+from ccatp.core import DeckPose, Fix, PanelId, PointId
+from ccatp.daemon.mission_runner import TimedFrame
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import (
@@ -166,9 +167,10 @@ class RecordingRun(SilRun):
         self.write("rest", Rest(seq=self.seq, t_s=self.t_s))
         self.take_rest()
 
-    def _publish(self, seq: int, t_s: float, pose: PanelPose, state: MissionState) -> None:
-        super()._publish(seq, t_s, pose, state)
-        row = (seq, t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, self.localizer.position_sigma_m)
+    def _publish(self, frame: TimedFrame) -> None:
+        super()._publish(frame)
+        seq, pose, state = self.seq, self.localizer.pose, self.mission.state.mode
+        row = (seq, self.t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, self.localizer.position_sigma_m)
         self.track.append(row)
         if state is not self.seen:
             self.say("main", "state_changed", "debug", seq=seq, before=str(self.seen), after=str(state))
