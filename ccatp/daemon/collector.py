@@ -14,7 +14,7 @@ import ccatp
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
-from ccatp.core import FloatArray, PanelId, PanelPose, PointId
+from ccatp.core import FloatArray, PanelId, PointId
 from ccatp.daemon.process import Endpoints
 from ccatp.daemon.terminal import RunView
 from ccatp.errors import ExitStatus
@@ -32,7 +32,7 @@ from ccatp.links.topics import (
     TrackMessage,
     TruthMessage,
 )
-from ccatp.mirror.mirror import Mirror, build_mirror, deck_poses
+from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
 from ccatp.mirror.panel_alignment import fit_panels
 from ccatp.records.recorder import (
     RECORD_FORMAT,
@@ -229,10 +229,9 @@ class _SurveySession:
 
     def _on_deck(self, track: TrackMessage) -> FloatArray:
         """Rows of seq, t_s, x, y, heading (deck), X, Y, Z of the surface point, as the truth has them."""
-        poses = [PanelPose(PanelId(row, col), x, y, heading) for _, _, row, col, x, y, heading, _ in track.rows]
-        x, y, heading, z = deck_poses(self._mirror, poses).T
-        seq, t_s = np.array([row[:2] for row in track.rows]).T
-        return np.column_stack([seq, t_s, x, y, heading, x, y, z])
+        rows = np.array(track.rows)
+        deck = deck_rows(self._mirror, [row[2:4] for row in track.rows], rows[:, 4:7])
+        return np.column_stack([rows[:, :2], deck[:, :3], deck[:, :2], deck[:, 3]])
 
 
 class SurveyRecord:

@@ -213,14 +213,11 @@ def build_mirror(cfg: MirrorConfig) -> Mirror:
 _DROP_STEPS = 2
 
 
-def deck_poses(mirror: Mirror, poses: Sequence[PanelPose]) -> FloatArray:
-    """``Mirror.deck_pose`` of many; see ``deck_rows``."""
-    places = np.array([[p.x_m for p in poses], [p.y_m for p in poses], [p.heading_rad for p in poses]]).T
-    return deck_rows(mirror, [p.panel for p in poses], places)
-
-
 def deck_rows(mirror: Mirror, panels: Sequence[tuple[int, int]], places: FloatArray) -> FloatArray:
-    """Deck x, y (m), heading (rad) and height there (m), shape (k, 4), of ``places`` (k, 3) in frames of panels."""
+    """``Mirror.deck_pose`` of many: deck x, y (m), heading (rad) and height there (m), shape (k, 4).
+
+    ``places`` (k, 3) are x, y (m) and heading (rad) in the frames of the panels (row, column).
+    """
     rows = np.empty((len(panels), 4))
     start = 0
     for panel, run in groupby(panels):

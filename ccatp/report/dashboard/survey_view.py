@@ -3,10 +3,12 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ccatp.config.models import Config
-from ccatp.core import PanelId, PanelPose, PointId, Vector3
+from ccatp.core import PointId, Vector3
 from ccatp.links.topics import ArrivalMessage, DisplayState, FixMessage, MissionStatus, TrackMessage
-from ccatp.mirror.mirror import Mirror, deck_poses
+from ccatp.mirror.mirror import Mirror, deck_rows
 from ccatp.mirror.surface import ConvergenceError
 from ccatp.records.store import StoredSurvey
 from ccatp.records.summary import measured_error_m
@@ -163,8 +165,8 @@ class SurveyView(RunStateView):
         rows = [row for row in track.rows if TruthCompare.is_compared(row[0])]
         if not rows:
             return
-        poses = deck_poses(self._mirror, [PanelPose(PanelId(r[2], r[3]), r[4], r[5], r[6]) for r in rows])
-        for row, (x_m, y_m) in zip(rows, poses[:, :2].tolist(), strict=True):
+        deck = deck_rows(self._mirror, [row[2:4] for row in rows], np.array([row[4:7] for row in rows]))
+        for row, (x_m, y_m) in zip(rows, deck[:, :2].tolist(), strict=True):
             self._trail.add(self._mission_s(row[1]), round(x_m, 3), round(y_m, 3))
             self._take_estimate(row[0], row[1], x_m, y_m, row[7])
 

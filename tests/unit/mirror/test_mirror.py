@@ -10,7 +10,7 @@ import pytest
 from ccatp.config.models import PanelsConfig
 from ccatp.core import DeckPose, PanelId, PanelPose, PointId, bearing, difference
 from ccatp.mirror.layout import PanelGrid
-from ccatp.mirror.mirror import Mirror, deck_poses
+from ccatp.mirror.mirror import Mirror, deck_rows
 from ccatp.mirror.surface import ConvergenceError, UnknownPanelError
 
 POSE = DeckPose(1.1, -1.7, 0.6)
@@ -110,7 +110,8 @@ def test_many_poses_are_as_one_by_one(mirror: Mirror) -> None:
         for panel in mirror.panels
         for _ in range(3)
     ]
-    rows = deck_poses(mirror, poses)
+    places = np.array([(pose.x_m, pose.y_m, pose.heading_rad) for pose in poses])
+    rows = deck_rows(mirror, [pose.panel for pose in poses], places)
     for row, pose in zip(rows, poses, strict=True):
         one = mirror.deck_pose(pose)
         expected = (one.x_m, one.y_m, one.heading_rad, mirror.surface.height_m(one.x_m, one.y_m))
