@@ -1,7 +1,7 @@
 """The edge rule's own part: which samples count, what an episode is opened with, lifted and put back."""
 
 from dataclasses import dataclass, field
-from math import cos, hypot, sin
+from math import cos, hypot, pi, sin
 from typing import Any, cast
 
 import pytest
@@ -10,8 +10,9 @@ from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import EdgeSample, WheelSample
 from ccatp.links.topics import EstimateMessage
+from ccatp.mirror.rim import Rim
 from ccatp.safety.edge_detector import EdgeDetector, EdgeMap, EdgePhase, SeamNear
-from ccatp.safety.edge_rule import EdgeRule
+from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 
 MS = 1e-3
 OFF_FL = (0, 1, 1, 1)
@@ -216,6 +217,12 @@ def test_put_back_the_episodes_begin_anew(rule: Rule) -> None:
     assert rule.rule.episodes == [None] * 4
 
 
+def test_a_robot_that_stands_with_all_sensors_on_was_not_put_back(rule: Rule) -> None:
+    rule.feed([OFF_FL] * 10, v=0.1)
+    rule.feed([ON] * 2 * rule.cfg.danger.clear_samples)
+    assert rule.rule.episodes[0] is not None
+
+
 def test_an_edge_seen_ahead_is_counted_once(rule: Rule) -> None:
     rule.feed([ON] * 10, v=0.05)
     rule.feed([OFF_FL] * 20, v=0.05, estimate=rule.estimate())
@@ -366,3 +373,44 @@ def test_a_reset_forgets_how_vague_the_pose_was(rule: Rule) -> None:
     episode = rule.rule.episodes[0]
     rule.map.seam = SEAM
     assert measured(rule, 1e-5) is episode
+
+
+# -- the centre -------------------------------------------------------------------------------------------------------
+
+
+class Wall:
+    """A rim at x = 0 that counts how often it was asked."""
+
+    asked = 0
+
+    def signed_distance_m(self, x: float, _y: float) -> float:
+        self.asked += 1
+        return x
+
+
+def centre_at(x_m: float) -> EstimateMessage:
+    """Towards the wall."""
+    return EstimateMessage(seq=0, t_s=0.0, x_m=x_m, y_m=0.0, heading_rad=pi, sigma_m=0.0, state="driving")
+
+
+def test_the_clearance_is_looked_up_when_it_may_be_short_and_ten_times_a_second(cfg: Config) -> None:
+    wall = Wall()
+    check = CentreClearanceCheck(cast(Rim, wall), cfg.robot, cfg.danger)
+    check.step(0.0, centre_at(1.0), ())
+    limit_m, fastest_m_s = check.limit_m, cfg.robot.wheel_radius_m * cfg.robot.max_wheel_rad_s
+    looks = {0.0999: 1, 0.1001: 2}
+    for t_s, count in looks.items():
+        check.step(t_s, centre_at(limit_m + 0.04 * fastest_m_s), ())
+        assert wall.asked == count
+    for t_s, count in {0.1400: 2, 0.1402: 3}.items():
+        check.step(t_s, centre_at(1.0), ())
+        assert wall.asked == count
+
+
+@pytest.mark.parametrize(("sum_rad_s", "direction"), [(0.0199, 0), (0.0201, 1), (-0.0201, 0)])
+def test_the_centre_at_the_rim_bars_the_way_that_it_takes_outwards(
+    cfg: Config, sum_rad_s: float, direction: int
+) -> None:
+    check = CentreClearanceCheck(cast(Rim, Wall()), cfg.robot, cfg.danger)
+    check.step(0.0, centre_at(0.001), [WheelSample(0.0, 0.5 * sum_rad_s, 0.5 * sum_rad_s)])
+    assert check.direction == direction
