@@ -67,14 +67,10 @@ def permitted(drive: SteeringCommand, verdict: Verdict, back_speed_m_s: float) -
 
 
 class WaypointArrival(NamedTuple):
-    """A waypoint is reached.
+    """A waypoint is reached."""
 
-    Attributes:
-        waypoint, lap: its number in the loop and the lap, both from 0.
-    """
-
-    waypoint: int
-    lap: int
+    waypoint: int  # its number in the loop, from 0
+    lap: int  # from 0
     place_m: tuple[float, float]
     belief: PoseBelief
 
@@ -130,8 +126,7 @@ class BeaconMission:
     def step(self, measurements: BeaconMeasurements, interval_s: float, verdict: Verdict | None) -> SteeringCommand:
         """One frame: take its readings, react to the verdict, drive on as far as it permits.
 
-        Args:
-            verdict: the danger loop's, in force; ``None`` where there is none fresh enough.
+        ``verdict``: the danger loop's, in force; ``None`` where there is none fresh enough.
         """
         self.navigator.take(measurements)
         t_s = measurements.t_s

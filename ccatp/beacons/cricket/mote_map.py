@@ -364,13 +364,8 @@ def pinned_map(
     C' = S C S^T, S = I - G (K G)^-1 K, G the rigid motions of the map, K the rows of the known coordinates
     (S-transform, Baarda 1973).
 
-    Args:
-        positions_m: shape (n, 2).
-        covariance_m2: of the free map, shape (2 n, 2 n).
-        known_m: both coordinates of one mote and one of another, nan elsewhere, shape (n, 2).
-
-    Raises:
-        ValueError: other coordinates are known than these.
+    Positions (n, 2), covariance of the free map (2 n, 2 n); ``known_m``: both coordinates of one mote and one of
+    another, nan elsewhere, shape (n, 2). Raises ValueError: other coordinates are known than these.
     """
     is_known = np.isfinite(known_m)
     counts = is_known.sum(axis=1).tolist()

@@ -33,16 +33,9 @@ class MoteMapper:
 
     z = (1 + s) |p_i - p_j| + o;  H has the unit vector from j to i at i, its negative at j, distance and 1 at s and o.
     What is known has neither variance nor covariance; the prior of all else is the caller's, and is conditioned on what
-    is known.
-
-    Args:
-        positions_m: of the motes, shape (n, d).
-        covariance_m2: shape (n d, n d).
-        known_m: coordinates that are known, nan elsewhere, shape (n, d).
-        batch: what it estimates of offset and scale, the filter estimates, too.
-
-    Raises:
-        MappingError: shapes that do not fit, or a place that is missing.
+    is known. Positions (n, d), covariance (n d, n d); ``known_m``: coordinates that are known, nan elsewhere, shape
+    (n, d). ``batch``: what it estimates of offset and scale, the filter estimates, too. Raises MappingError: shapes
+    that do not fit, or a place that is missing.
     """
 
     def __init__(

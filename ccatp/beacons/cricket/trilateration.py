@@ -28,12 +28,8 @@ def trilaterate(
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Places from ranges to anchors, and their costs: damped Gauss-Newton steps of many problems at once.
 
-    Args:
-        starts_m: shape (b, d).
-        anchors_m: shape (b, k, d), or (k, d) where they are the same for all.
-        ranges_m: shape (b, k) or (k,).
-        sigmas_m: shape (k,).
-        robust_scale: as of ``MapFitSettings``.
+    Starts (b, d); anchors (b, k, d) and ranges (b, k), or (k, d) and (k,) where they are the same for all; sigmas (k,).
+    ``robust_scale``: as of ``MapFitSettings``.
     """
     d = starts_m.shape[1]
 
