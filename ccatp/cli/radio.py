@@ -17,11 +17,6 @@ if TYPE_CHECKING:
     from ccatp.config.beacon_models import CricketConfig
 
 FILTERS = ("ekf-slam", "fixed-lag", "smoother")
-FORMAT_OPTION = click.option(
-    "--format", "data_format", type=click.Choice(("plaza", "mrclam", "labyrinth", "csv", "bag")),
-    help="Format of the data; found out if not given.",
-)  # fmt: skip
-ASSUMED_OPTION = common.settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
 
 
 @common.command(
@@ -30,7 +25,10 @@ ASSUMED_OPTION = common.settings_option("A key of recordings.toml, as in plaza.p
     "ccatp radio slam mine.csv --set csv.radio.range_sigma_m=0.3 --figure map.png",
 )
 @click.argument("path", type=common.PATH)
-@FORMAT_OPTION
+@click.option(
+    "--format", "data_format", type=click.Choice(("plaza", "mrclam", "labyrinth", "csv", "bag")),
+    help="Format of the data; found out if not given.",
+)  # fmt: skip
 @click.option("--robot", type=click.IntRange(min=1), metavar="N", help="Robot of an MRCLAM set; else the first there.")
 @click.option(
     "--filter", "filter_name", type=click.Choice(FILTERS), default=FILTERS[0], show_default=True,
@@ -38,7 +36,7 @@ ASSUMED_OPTION = common.settings_option("A key of recordings.toml, as in plaza.p
     "smoother: from all of them.",
 )  # fmt: skip
 @common.CONFIG_OPTION
-@ASSUMED_OPTION
+@common.settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
 @click.option("--topics", "topics_file", type=common.PATH, help="Of a ROS bag: a TOML file that names its topics.")
 @common.figure_option("Draw map, path and residuals")
 @click.option(
