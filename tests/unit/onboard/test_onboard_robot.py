@@ -132,14 +132,6 @@ def test_a_device_that_is_needed_holds_the_wheels_until_it_works(name: str) -> N
     assert bench.rates[0] == pytest.approx(3.0, abs=0.2)
 
 
-@pytest.mark.parametrize("name", ["fan_left", "battery_low"])
-def test_other_faults_are_reported_and_hold_nothing(name: str) -> None:
-    bench = Bench()
-    bench.hardware.faults[name] = "why"
-    frames = bench.run(0.5, 3.0, 3.0)
-    assert (frames[-1].faults, frames[-1].cmd.held) == ([name], False)
-
-
 def test_a_wheel_without_its_encoder_is_braked_and_not_driven_blindly() -> None:
     bench = Bench()
     bench.run(0.5, 3.0, 3.0)

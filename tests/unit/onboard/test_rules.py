@@ -51,20 +51,6 @@ def test_directions(drive: tuple[float, float], needs: str) -> None:
         assert robot.rules.is_held is not may
 
 
-def test_fans_keep_their_floor_and_their_duty() -> None:
-    robot = Rig(floor=0.6).robot
-    fans = robot.fans
-    assert fans.duty == (0.6, 0.6)
-    assert robot.command_fans(1, 0.0, 0.9)
-    assert fans.duty == (0.6, 0.9)
-    robot.join("controller")
-    assert fans.duty == (0.6, 0.9)
-    assert robot.command_fans(0, 2.0, 0.7)
-    assert fans.duty == (1.0, 0.7)
-    fans.health = (1.0, 0.0)
-    assert fans.thrust == 0.5
-
-
 EVENTS = st.one_of(
     st.tuples(st.just("drive"), st.integers(0, 20), st.floats(-20, 20), st.floats(-20, 20)),
     st.tuples(st.just("permit"), st.integers(0, 20), st.booleans(), st.booleans(), st.booleans()),

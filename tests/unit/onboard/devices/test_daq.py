@@ -64,15 +64,6 @@ def test_a_frame_is_the_documented_bytes() -> None:
     assert format_frame(0x02, 0x0102, struct.pack("<H", 1000)) == bytes.fromhex("a55a 01 02 02 0201 e803 4cf5")
 
 
-@pytest.mark.parametrize("piece", [1, 2, 7, 31, 264, 4000])
-def test_frames_come_in_any_pieces(piece: int) -> None:
-    data, decoder, frames = b"".join(FRAMES), Decoder(), []
-    for start in range(0, len(data), piece):
-        frames += decoder.feed(data[start : start + piece])
-    assert frames == [(SAMPLES, bytes(range(22)))] * 40
-    assert +decoder.counts == {"frames": 40}
-
-
 def _flipped(data: bytes, place: int) -> bytes:
     return data[:place] + bytes((data[place] ^ 0x40,)) + data[place + 1 :]
 
@@ -155,17 +146,6 @@ def test_times_of_the_device_are_those_of_the_robot(rate: float, delay: Callable
     # Not late by more than the least delay of a window; early by what a clock 1 % too slow gains within two windows.
     assert min(errors[50:]) > -0.005
     assert max(errors[50:]) < 0.004
-
-
-def test_a_clock_that_goes_backwards_or_jumps_is_noticed() -> None:
-    clock = DeviceClock()
-    assert clock.unwrap(5_000_000) == 0.0
-    assert clock.unwrap(4_000_000) is None
-    for k in range(100):
-        clock.unwrap(5_000_000 + 11_000 * k)
-        assert clock.arrive(10.0 + 0.011 * k) == (k >= 10)
-    clock.unwrap(7_000_000)
-    assert not clock.arrive(11.0)
 
 
 # -- samples ----------------------------------------------------------------------------------------------------------
