@@ -324,6 +324,8 @@ async def test_commands_do_not_pile_up() -> None:
 
     async with robot(after_join(then=stall)) as (link, _):
         await link.connect(DEADLINE_S)
+        assert link._transport is not None
+        link._transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)  # soon full
         await asyncio.sleep(0)  # let the robot stop reading
         async with asyncio.timeout(60.0):
             seq = 0
@@ -333,7 +335,6 @@ async def test_commands_do_not_pile_up() -> None:
                 seq += 1
                 if seq % 1000 == 0:
                     await asyncio.sleep(0)
-        assert link._transport is not None
         assert link._transport.get_write_buffer_size() < 3 * 4096
         resume.set()
 

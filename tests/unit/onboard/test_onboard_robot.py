@@ -24,7 +24,6 @@ from ccatp.onboard.hardware import HardwareError, Readings
 from ccatp.onboard.robot import OnboardRobot
 from ccatp.sim.hardware import MOTOR_12V, SimulatedHardware
 
-MIRROR = load_config().mirror
 CFG = load_onboard_config(overrides={"link.sample_latency_s": 0.0})
 STEP_S = 1.0 / CFG.servo.loop_hz
 STEPS_A_FRAME = round(CFG.servo.loop_hz / CFG.link.frame_hz)
