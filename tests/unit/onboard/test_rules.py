@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.onboard.rules import HELD, LinkedRobot
+from ccatp.onboard.rules import HELD, LinkedRobot, MotionRules
 
 DT_S, TTL_S, FASTEST = 0.01, 0.25, 8.0
 # A robot with nothing but roles and commands.
@@ -25,6 +25,18 @@ class Rig:
     def at(self, frame: int) -> LinkedRobot:
         self.robot.seq, self.robot.t_s = frame, frame * DT_S
         return self.robot
+
+
+def test_a_drive_dies_with_its_time_to_live() -> None:
+    r = MotionRules(TTL_S, FASTEST)
+    r.drive(1, 3.0, 3.0, 1.0)
+    assert r.set_points(1.25) == (3.0, 3.0)
+    assert r.set_points(1.2501) == HELD
+    seq, age_s, permit_age_s, is_held = r.echo(1.26)
+    assert (seq, is_held) == (1, True)
+    assert (age_s, permit_age_s) == pytest.approx((0.26, 0.0))
+    r.drive(2, 3.0, 3.0, 1.26)
+    assert r.set_points(1.27) == (3.0, 3.0)
 
 
 @pytest.mark.parametrize(
@@ -49,6 +61,20 @@ def test_directions(drive: tuple[float, float], needs: str) -> None:
         may = set(needs.split()) <= allowed
         assert robot.rules.set_points(0.01) == (drive if may else HELD)
         assert robot.rules.is_held is not may
+
+
+def test_fans_keep_their_floor_and_their_duty() -> None:
+    robot = Rig(floor=0.6).robot
+    fans = robot.fans
+    assert fans.duty == (0.6, 0.6)
+    assert robot.command_fans(1, 0.0, 0.9)
+    assert fans.duty == (0.6, 0.9)
+    robot.join("controller")
+    assert fans.duty == (0.6, 0.9)
+    assert robot.command_fans(0, 2.0, 0.7)
+    assert fans.duty == (1.0, 0.7)
+    fans.health = (1.0, 0.0)
+    assert fans.thrust == 0.5
 
 
 EVENTS = st.one_of(

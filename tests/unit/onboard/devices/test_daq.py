@@ -148,6 +148,17 @@ def test_times_of_the_device_are_those_of_the_robot(rate: float, delay: Callable
     assert max(errors[50:]) < 0.004
 
 
+def test_a_clock_that_goes_backwards_or_jumps_is_noticed() -> None:
+    clock = DeviceClock()
+    assert clock.unwrap(5_000_000) == 0.0
+    assert clock.unwrap(4_000_000) is None
+    for k in range(100):
+        clock.unwrap(5_000_000 + 11_000 * k)
+        assert clock.arrive(10.0 + 0.011 * k) == (k >= 10)
+    clock.unwrap(7_000_000)
+    assert not clock.arrive(11.0)
+
+
 # -- samples ----------------------------------------------------------------------------------------------------------
 
 
