@@ -64,6 +64,16 @@ class BeaconInnovation(NamedTuple):
     surprise: float = 0.0  # minus twice its log-likelihood, up to a constant: sum of nis + ln S
 
 
+class _Scalar(NamedTuple):
+    """One number of a reading of a beacon on the map."""
+
+    reading: Reading
+    entry: MapEntry
+    wander: GaussMarkovBias | None  # of the error that lasts, where it is taken into account
+    kind: str
+    z: float
+
+
 class BeaconSlam:
     """EKF-SLAM of a vehicle among beacons, by ``EkfSlam``; docs/slam.md has the models.
 
@@ -299,23 +309,23 @@ class BeaconSlam:
         nis, spread, size, accepted = 0.0, 1.0, 0, True
         for kind, z in scalars_of(reading):
             if accepted:
-                found = self._take(reading, entry, kind, z, model)
+                found = self._take(_Scalar(reading, entry, model, kind, z))
                 nis, spread, size, accepted = nis + found.nis, spread * found.spread, size + 1, found.accepted
         if self._learns:
             self._fresh.clear()
         self._judge(reading, entry, accepted=accepted)
         return BeaconInnovation(reading.beacon, nis, size, accepted, nis + log(spread))
 
-    def _take(self, reading: Reading, entry: MapEntry, kind: str, z: float, model: GaussMarkovBias | None) -> RowUpdate:
-        engine, level, columns = self.engine, self.levels[kind], entry.columns
+    def _take(self, one: _Scalar) -> RowUpdate:
+        engine, level, columns = self.engine, self.levels[one.kind], one.entry.columns
         prior = engine.mean.take(columns)
-        h, residual, r, own = self._linearised(reading, entry, kind, z, model, prior.tolist())
+        h, residual, r, own = self._linearised(one, prior.tolist())
         if self._iterations > 1:
             P = engine.covariance[np.ix_(columns, columns)]
             for _ in range(self._iterations - 1):
                 Ph = P.dot(h)
                 x = prior + Ph * (residual / (float(h.dot(Ph)) + r))
-                h, residual, r, own = self._linearised(reading, entry, kind, z, model, x.tolist())
+                h, residual, r, own = self._linearised(one, x.tolist())
                 residual += float(h.dot(x - prior))
         found = engine.update_row(columns, h, residual, r, self._gate, self._knee)
         if found.accepted and self._learns:
@@ -323,11 +333,10 @@ class BeaconSlam:
             self.levels["motion"].learn(found.nis, self._fresh.seen(*h[:POSE].tolist()) / found.spread)
         return found
 
-    def _linearised(
-        self, reading: Reading, entry: MapEntry, kind: str, z: float, model: GaussMarkovBias | None, x: list[float]
-    ) -> tuple[FloatArray, float, float, float]:
+    def _linearised(self, one: _Scalar, x: list[float]) -> tuple[FloatArray, float, float, float]:
         """Derivatives by the columns of a beacon, residual, noise variance, and that with the wandering error."""
         is_delayed, shown = self._delay >= 0, self._shown
+        reading, entry, wander, kind, z = one
         at = self._clock.at(x, reading.time_s, x[shown - 1] if is_delayed else 0.0)
         calibration, beacon = x[POSE : POSE + self._ranges], x[shown : shown + entry.size]
         row = self._models.by_kind[kind].row(at.pose, calibration, beacon, reading.beacon)
@@ -336,7 +345,7 @@ class BeaconSlam:
         expected = row.expected
         r = own = row.variance * self.levels[kind].factor
         if entry.wander >= 0:
-            share = 0.0 if model is None or kind == "bearing" else model.share
+            share = 0.0 if wander is None or kind == "bearing" else wander.share
             by_wander = sqrt(share * r)
             h.append(by_wander)
             expected += by_wander * x[-1]

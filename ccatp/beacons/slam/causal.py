@@ -22,6 +22,7 @@ from ccatp.beacons.slam.recording import (
 )
 from ccatp.config.beacon_models import FixedLagConfig, RecordingConfig, SlamFilterConfig
 from ccatp.core import FloatArray
+from ccatp.filters.ekf_slam import columns_of
 
 FAR = 3.0  # standard deviations of the prior beyond which a value is reported
 UNCHANGED = 0.999  # of the prior's standard deviation: what is left of it without readings of it
@@ -53,10 +54,8 @@ class HeadingRelocalizer:
     """
 
     def __init__(self, slam: BeaconSlam) -> None:
-        self.best = slam
-        self._others: list[BeaconSlam] = []
-        self._scores = [0.0]
-        self._taken, self._is_guessed = 0, False
+        self.best, self._others = slam, list[BeaconSlam]()
+        self._scores, self._taken, self._is_guessed = [0.0], 0, False
 
     @property
     def all(self) -> list[BeaconSlam]:
@@ -136,7 +135,7 @@ class FixedLag:
         while len(self._kept) < len(self._times_s):
             self._hand_over(slam)
         poses, covariances = zip(*self._kept, strict=True)
-        return DelayedPath(self._lag_s, np.array(self._times_s), np.array(poses), np.array(covariances))
+        return DelayedPath(self._lag_s, *map(np.array, (self._times_s, poses, covariances)))
 
     def _hand_over(self, slam: BeaconSlam) -> None:
         at = slam.engine.block((KEPT, len(self._kept) % self._count))
@@ -160,76 +159,81 @@ def filter_run(
 
 
 def follow(
-    run: RecordedRun,
-    cfg: RecordingConfig,
-    how: SlamFilterConfig,
-    clock_s: Callable[[], float],
-    finest_s: float = FINEST_S,
-    lag: FixedLagConfig | None = None,
-) -> tuple[EstimatedPath, BeaconSlam]:
+    run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float],
+    finest_s: float = FINEST_S, lag: FixedLagConfig | None = None,
+) -> tuple[EstimatedPath, BeaconSlam]:  # fmt: skip
     """The path by the filter, and the filter as it is at the end.
 
     ``finest_s``: steps of odometry shorter than that are put together.
     """
-    position, heading = cfg.priors.pose_m, cfg.priors.heading_rad
-    first = np.diag((position**2, position**2, heading**2))
-    search = HeadingRelocalizer(recorded_slam(cfg, how, run.first_pose, first))
+    sigmas = cfg.priors.pose_m, cfg.priors.pose_m, cfg.priors.heading_rad
+    search = HeadingRelocalizer(recorded_slam(cfg, how, run.first_pose, np.diag(np.square(sigmas))))
     window = None if lag is None else FixedLag(lag, search.best)
     times = np.union1d(_spaced(run.steps.times_s, finest_s), run.readings.times_s)
     increments, readings = _increments(run.steps, times), list(_readings(run))
     ends = np.searchsorted([reading.time_s for reading in readings], times, side="right").tolist()
     poses, covariances = np.empty((len(times), 3)), np.empty((len(times), 3, 3))
-    predict_s, update_s, scalar_s = list[float](), list[float](), list[float]()
-    accepted: list[BeaconInnovation] = []
-    refused = 0
+    log = _Log()
     for k, (begin, end) in enumerate(pairwise((0, *ends))):
         begin_s = clock_s()
         if k:
             search.predict(increments[k - 1])
         predicted_s = clock_s()
-        predict_s.append(predicted_s - begin_s)
+        log.predict_s.append(predicted_s - begin_s)
         if window is not None:
             window.keep(float(times[k]), search)
         if now := readings[begin:end]:
-            taken = search.observe(now)
-            end_s = clock_s()
-            update_s += [(end_s - begin_s) / len(now)] * len(now)
-            if len(taken) == len(now):  # nothing that waits or joins: updates alone
-                scalars = sum(one.size for one in taken)
-                scalar_s += [(end_s - predicted_s) / scalars] * scalars
-            used = [one for one in taken if one.accepted]
-            refused += len(taken) - len(used)
-            accepted += used
+            log.take(search.observe(now), len(now), clock_s() - predicted_s)
         poses[k], covariances[k] = search.best.pose, search.best.pose_covariance
-    slam = search.best
-    nis, sizes = np.array([one.nis for one in accepted]), np.array([float(one.size) for one in accepted])
+    delayed = None if window is None else window.path(search.best)
+    path = _result(run, search.best, log)
+    return path._replace(times_s=times, poses=poses, covariances=covariances, delayed=delayed), search.best
+
+
+class _Log:
+    """What the readings did, and how long it took: ``predict_s`` of each instant, the others of each reading, s."""
+
+    def __init__(self) -> None:
+        self.learned, self.predict_s = list[BeaconInnovation](), list[float]()
+        self.update_s, self.scalar_s = list[float](), list[float]()
+
+    def take(self, learned: Sequence[BeaconInnovation], count: int, lasted_s: float) -> None:
+        """Take what ``count`` readings of the instant did."""
+        self.learned += learned
+        self.update_s += [(self.predict_s[-1] + lasted_s) / count] * count
+        if len(learned) == count:  # nothing that waits or joins: updates alone
+            scalars = sum(one.size for one in learned)
+            self.scalar_s += [lasted_s / scalars] * scalars
+
+
+def _result(run: RecordedRun, slam: BeaconSlam, log: _Log) -> EstimatedPath:
+    """All but the path, which is empty."""
+    used = [one for one in log.learned if one.accepted]
+    refused = len(log.learned) - len(used)
+    nis, sizes = np.array([(one.nis, float(one.size)) for one in used]).reshape(-1, 2).T
     priors = dict(zip(slam.calibration, slam.prior_sigmas, strict=True))
     # Those that the readings have determined in part; a prior is no result.
     calibration = {
         name: Calibrated(*found) for name, found in slam.calibration.items() if found[1] < UNCHANGED * priors[name]
     }
-    beacons, place = slam.beacons.items(), slam.engine.block
-    at = np.array([place(name).start + axis for name, _ in beacons for axis in range(2)], dtype=np.intp)
-    path = EstimatedPath(
-        times_s=times,
-        poses=poses,
-        covariances=covariances,
+    beacons, none = slam.beacons.items(), np.empty(0)
+    at = columns_of(*((first := slam.engine.block(name).start, first + 1) for name, _ in beacons))
+    return EstimatedPath(
+        none, none, none,
         beacons={str(b): BeaconFix(float(e.mean[0]), float(e.mean[1]), e.covariance[:2, :2]) for b, e in beacons},
         calibration=calibration,
-        nis=nis,
-        nis_sizes=sizes,
         refused=refused,
-        update_s=np.array(update_s),
-        predict_s=np.array(predict_s[1:]),
-        scalar_s=np.array(scalar_s),
-        delayed=None if window is None else window.path(slam),
-        map_covariance=slam.engine.covariance[np.ix_(at, at)],
-        updates=len(accepted),
+        updates=nis.size,
         warnings=(
             *_unplaced(run, slam), *beyond_priors(calibration, priors, run.kind), *_doubts(slam, nis, sizes, refused)
         ),
+        nis=nis,
+        nis_sizes=sizes,
+        update_s=np.array(log.update_s),
+        predict_s=np.array(log.predict_s[1:]),
+        scalar_s=np.array(log.scalar_s),
+        map_covariance=slam.engine.covariance[np.ix_(at, at)],
     )  # fmt: skip
-    return path, slam
 
 
 def _doubts(slam: BeaconSlam, nis: FloatArray, sizes: FloatArray, refused: int) -> Iterator[str]:
@@ -241,27 +245,24 @@ def _doubts(slam: BeaconSlam, nis: FloatArray, sizes: FloatArray, refused: int) 
             f"innovations are {float(nis.sum() / sizes.sum()):.2f} times as large, in squares, as they should be: "
             "clocks apart, scales beyond what the configuration allows, or beacons exchanged on the way?"
         )
-    if slam.jumps > DOUBTFUL_JUMPS * (nis.size + refused):
-        times = f"{slam.jumps} times"
-        yield f"the pose had to be doubted {times}: pushed, beacons misread, or odometry that misses something?"
-    if refused > DOUBTFUL_SHARE * (nis.size + refused):
-        yield f"{refused} of {nis.size + refused} readings were refused: do they belong to this odometry?"
+    readings = nis.size + refused
+    if slam.jumps > DOUBTFUL_JUMPS * readings:
+        why = "pushed, beacons misread, or odometry that misses something?"
+        yield f"the pose had to be doubted {slam.jumps} times: {why}"
+    if refused > DOUBTFUL_SHARE * readings:
+        yield f"{refused} of {readings} readings were refused: do they belong to this odometry?"
 
 
 def _unplaced(run: RecordedRun, slam: BeaconSlam) -> Iterator[str]:
     r = run.readings
     ranged = {run.beacon_ids[k] for k in np.unique(r.beacon[np.isfinite(r.range_m) | np.isfinite(r.rssi_dbm)])}
+    whys = ("only bearings of it were received, no range", "its readings leave two places or none")
     for name in run.beacon_ids:
         if name not in slam.beacons:
-            why = (
-                "its readings leave two places or none"
-                if name in ranged
-                else "only bearings of it were received, no range"
-            )
-            yield f"beacon {name} could not be placed: {why}"
+            yield f"beacon {name} could not be placed: {whys[name in ranged]}"
     if slam.unplaced:
-        early = f"{slam.unplaced} bearings"
-        yield f"{early} had no range or strength of the same time and came before their beacon was placed"
+        early = f"{slam.unplaced} bearings had no range or strength of the same time"
+        yield f"{early} and came before their beacon was placed"
 
 
 def _spaced(times_s: FloatArray, finest_s: float) -> FloatArray:
@@ -275,19 +276,14 @@ def _increments(steps: Steps, times_s: FloatArray) -> list[Increment]:
         shared: list[float] = np.diff(np.interp(times_s, steps.times_s, total)).tolist()
         return shared
 
-    columns = (times_s[1:].tolist(), np.diff(times_s).tolist())
     amounts = map(shares, steps[1:])
-    return [Increment(*row) for row in zip(*columns, *amounts, strict=True)]
+    return [Increment(*row) for row in zip(times_s[1:].tolist(), np.diff(times_s).tolist(), *amounts, strict=True)]
 
 
 def _readings(run: RecordedRun) -> Iterator[Reading]:
     r = run.readings
     for time_s, beacon, range_m, bearing_rad, rssi_dbm in zip(*(column.tolist() for column in r), strict=True):
-        name = run.beacon_ids[beacon]
         bearing = None if math.isnan(bearing_rad) else bearing_rad
-        if not math.isnan(range_m):
-            yield Reading(time_s, name, range_m, bearing)
-        elif not math.isnan(rssi_dbm):
-            yield Reading(time_s, name, bearing_rad=bearing, rssi_dbm=rssi_dbm)
-        elif bearing is not None:
-            yield Reading(time_s, name, bearing_rad=bearing)
+        level_dbm = rssi_dbm if math.isnan(range_m) else math.nan
+        if not (bearing is None and math.isnan(range_m) and math.isnan(level_dbm)):
+            yield Reading(time_s, run.beacon_ids[beacon], range_m, bearing, level_dbm)
