@@ -10,7 +10,8 @@ hold while
 Downhill behind is the worst heading: the load goes to the caster. Downhill ahead it must not leave the ground.
 """
 
-from math import ceil, cos, hypot, pi, sqrt
+from collections.abc import Sequence
+from math import atan2, ceil, cos, hypot, pi, sqrt
 from typing import NamedTuple
 
 from scipy.optimize import brentq
@@ -28,6 +29,7 @@ _LEAST_USE = 0.1  # of tangential load by load of the wheels: a tyre that carrie
 _MOST_FRICTION = 2.0
 _TURNS = 4  # that the mean creep is taken over
 _MOST_USE = 0.8  # of its friction by a wheel in a turn: beyond that it slides for moments, and the creep grows steeply
+_MOST_SHARE = 0.95  # of the friction: closer to 1 the law has no bound
 _TOLERANCE = 1.8  # of the creep: by slope and heading it varies by so much with the friction that is promised
 
 
@@ -42,7 +44,7 @@ def least_thrust_n(robot: RobotConfig, gravity: Vector3, *, turns: bool) -> floa
 
 
 def turn_thrust_n(robot: RobotConfig, gravity: Vector3) -> float:
-    """Thrust with which each wheel uses at most 0.8 of its friction at any heading there, N.
+    """Thrust for a turn, N: the margin over the least, and each wheel uses at most 0.8 of its friction at any heading.
 
     The slope takes load from the wheel that is higher, and a centre of mass behind the axle pulls at that wheel:
     downhill behind and a little beside is the worst heading.
@@ -52,7 +54,8 @@ def turn_thrust_n(robot: RobotConfig, gravity: Vector3) -> float:
     per_friction = 1.0 / (_MOST_USE * robot.friction)
     along = per_friction + height_m / robot.caster_m
     across = 2.0 * (abs(x_m) * per_friction + height_m) / robot.wheel_base_m
-    return outward + tangential * hypot(along, across) / (1.0 + x_m / robot.caster_m)
+    higher_n = outward + tangential * hypot(along, across) / (1.0 + x_m / robot.caster_m)
+    return max(robot.thrust_margin * least_thrust_n(robot, gravity, turns=True), higher_n)
 
 
 def _load_n(robot: RobotConfig, gravity: Vector3, *, turns: bool) -> Vector3:
@@ -122,6 +125,29 @@ def _wheels_n(robot: RobotConfig, pressed_n: float, to_rear_n: float) -> float:
     return pressed_n * (1.0 + x_m / robot.caster_m) - to_rear_n * height_m / robot.caster_m
 
 
+def creep_share(robot: RobotConfig, gravity: Vector3) -> float:
+    """Creep of a turn at this heading over its mean of all headings, by the law of ``friction_by_creep``.
+
+    With the thrust that a turn gets; tyres creep as if they had 0.8 of their friction.
+    """
+    x, y, _ = gravity
+    thrust_n = min(max(turn_thrust_n(robot, gravity), 0.5 * sum(robot.fan_duty) * robot.thrust_n), robot.thrust_n)
+    used = _used(robot, gravity, thrust_n, (atan2(y, -x), *_HEADINGS_RAD))
+    if min(used) < 0.0:
+        return 1.0
+    shares = [min(use / (_MOST_USE * robot.friction), _MOST_SHARE) for use in used]
+    here, *others = [share / sqrt(1.0 - share * share) for share in shares]
+    mean = sum(others) / len(others)
+    return here / mean if mean else 1.0
+
+
+def _used(robot: RobotConfig, gravity: Vector3, thrust_n: float, headings_rad: Sequence[float]) -> list[float]:
+    """Load along the surface by load of the wheels, with downhill so far from straight behind; < 0: they lift."""
+    tangential, outward, _ = _load_n(robot, gravity, turns=True)
+    loads_n = [_wheels_n(robot, thrust_n - outward, tangential * cos(to_rear)) for to_rear in headings_rad]
+    return [tangential / load_n if load_n > 0.0 else -1.0 for load_n in loads_n]
+
+
 def friction_by_creep(robot: RobotConfig, gravity: Vector3, thrust_n: float, creep_m_rad: float) -> float | None:
     """Friction of tyres that creep so far downhill for each radian turned on the spot; None on too little slope.
 
@@ -129,11 +155,9 @@ def friction_by_creep(robot: RobotConfig, gravity: Vector3, thrust_n: float, cre
     Cutkosky 1996): with the share u of its friction in use it creeps by tyre_m u / sqrt(1 - u^2) for each radian. Mean
     over all headings.
     """
-    tangential, outward, _ = _load_n(robot, gravity, turns=True)
-    loads_n = [_wheels_n(robot, thrust_n - outward, tangential * cos(to_rear)) for to_rear in _HEADINGS_RAD]
-    if min(loads_n) <= 0.0:
+    used = _used(robot, gravity, thrust_n, _HEADINGS_RAD)
+    if min(used) < 0.0:
         return None
-    used = [tangential / load_n for load_n in loads_n]
 
     def excess_m_rad(friction: float) -> float:
         creeps = (robot.tyre_m * use / sqrt(friction * friction - use * use) for use in used)
@@ -179,9 +203,8 @@ class ThrustControl:
         if self._is_full:
             return False
         gravity = self._mirror.gravity_in_robot(pose)
-        wanted_n = robot.thrust_margin * least_thrust_n(robot, gravity, turns=turns)
-        if turns:
-            wanted_n = max(wanted_n, turn_thrust_n(robot, gravity))
+        straight_n = robot.thrust_margin * least_thrust_n(robot, gravity, turns=False)
+        wanted_n = turn_thrust_n(robot, gravity) if turns else straight_n
         wanted = _STEP * ceil(wanted_n / robot.thrust_n / _STEP)
         ramp = _RAMP_PER_S * min(max(elapsed_s, 0.0), 0.1)
         before = self.duty

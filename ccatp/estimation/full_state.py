@@ -199,7 +199,7 @@ class FullStateLocalizer(LocalizerBase):
     def _predict_pose(self, half_s: float) -> None:
         self.position_sigma_m, self._creep_on = self._worst_sigma_m(), None
         self._slope = self._estimate.slope()
-        self._running.begin(self._filter.mean, self._slope, half_s)
+        self._running.begin(self._filter.mean, self._slope, half_s, self._estimate.turn_creep_share)
         if self._rest.is_resting:
             self._running.stand()
             return

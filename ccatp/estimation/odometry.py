@@ -165,7 +165,7 @@ class PosePredictor:
         self.x_m = self.y_m = self.heading_rad = self.v_m_s = self.omega_rad_s = 0.0
         self.creep_x = self.creep_y = self._turn_creep_x = self._turn_creep_y = 0.0
 
-    def begin(self, mean: FloatArray, slope: Slope, half_s: float) -> None:
+    def begin(self, mean: FloatArray, slope: Slope, half_s: float, turn_creep_share: float = 1.0) -> None:
         """The filter has taken a step of which ``half_s`` is half the length; its mean speed belongs to the middle."""
         state: list[float] = mean.tolist()
         x, y, psi, v, a, w, self._bias, scale, _, s_r, s_l, k_l, c, *_, ct = state  # as ``state_model``
@@ -182,6 +182,7 @@ class PosePredictor:
         self._along, self._ex, self._ey = 1.0 / s, -fx * fy / (norm * s), s / norm
         self._k1, self._k2 = fy * fxx / (s2 * norm), fy * fxy / (s2 * norm)
         self.creep_x, self.creep_y = c * gx, c * gy
+        ct *= turn_creep_share
         self._turn_creep_x, self._turn_creep_y = ct * gx, ct * gy
 
     def trust(self, angle_variance_rad2: float, rate_variance_rad2_s2: float, dt_s: float) -> None:

@@ -7,6 +7,7 @@ from math import sqrt
 import numpy as np
 
 from ccatp.config.models import Config
+from ccatp.control.thrust import creep_share
 from ccatp.core import DeckPose, FloatArray, PanelId, difference
 from ccatp.estimation import state_model as sm
 from ccatp.estimation.fixes import fix_row, relocated
@@ -32,8 +33,9 @@ class SurveyFilter:
     """The filter of ``STATES`` states with its models; the ``journal`` does each step, and does it again."""
 
     def __init__(self, filter_: Filter, mirror: Mirror, cfg: Config, counts: dict[str, int], start: DeckPose) -> None:
-        robot = cfg.robot
+        self._robot = robot = cfg.robot
         self.innovation: Innovation | None = None
+        self.turn_creep_share = 1.0  # in the last step; see ``creep_share``
         self._cfg, self._full = cfg.localizer, cfg.localizer.full_state
         self.journal = ReplayBuffer(filter_, self._full.rewind_s)
         self._filter, self._counts = filter_, counts
@@ -120,18 +122,21 @@ class SurveyFilter:
 
     def _predict(self, dt_s: float, slips: tuple[float, float, float], encoders: float) -> None:
         full, (slip, creep, turn_creep) = self._full, slips
-        motion = self._motion.over(dt_s, self.slope())
+        mean: FloatArray = self._filter.mean
+        gravity = self._mirror.gravity_in_robot(DeckPose(*mean[sm.POSE].tolist()))
+        self.turn_creep_share = share = creep_share(self._robot, gravity)
+        motion = self._motion.over(dt_s, self.slope(), share)
         jerk, twist = full.jerk_density_m2_s5 * dt_s, full.angular_acceleration_density_rad2_s3 * dt_s
         impulses = np.array((jerk, twist, slip, slip, creep, turn_creep))
         drift = self._drift  # work space, of which the model keeps nothing
         drift[sm.BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * dt_s
         drift[sm.BA] = full.accelerometer_bias_walk_m_s2_sqrt_s**2 * dt_s
         # A tyre that gives way does so downhill in the main, and as it likes besides; what it loses of a turn varies.
-        mean: FloatArray = self._filter.mean
-        creep, turned_rad = float(mean[sm.CT]), abs(float(mean[sm.W])) * dt_s
+        creep, turned_rad = share * float(mean[sm.CT]), abs(float(mean[sm.W])) * dt_s
         drift[sm.X] = drift[sm.Y] = (full.turn_creep_aside * creep) ** 2 * turned_rad
         lost = (self._base_per_radius * full.turn_loss_per_creep) ** 2 * turned_rad
-        drift[sm.PR] = drift[sm.PL] = encoders + lost * (creep * creep + float(self._filter.covariance[sm.CT, sm.CT]))
+        variance = share * share * float(self._filter.covariance[sm.CT, sm.CT])
+        drift[sm.PR] = drift[sm.PL] = encoders + lost * (creep * creep + variance)
         self._filter.predict(motion, motion.noise(self._filter.mean, impulses, drift))
 
     def encoder_walk(self, wheel: WheelAngle) -> float:

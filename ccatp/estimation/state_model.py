@@ -37,9 +37,10 @@ X, Y: robot origin, deck frame, m. PSI: deck heading, rad, not wrapped. V: speed
 last step, m/s. A: its rate of change, m/s^2. W: rate about the normal over the last step, rad/s. BG: gyroscope bias,
 rad/s. KG: gyroscope scale error. BA: accelerometer bias, m/s^2. SR, SL: slip of the right and of the left wheel, the
 part of its travel that the body does not follow (an error of the radius included). KL: relative error of the wheel
-base. C, CT: downhill creep, part of |V|, and of |W|, m/rad. PR, PL: angle of the right and of the left wheel since the
-last rest, rad. E0, E1: how far the two edges of the seam crossed last lie from where the map has them, m. TX, TY: by
-how much the puck is off its place over the robot because the panel under it is tilted, deck frame, m.
+base. C, CT: downhill creep, part of |V|, and of |W|, m/rad, the mean of all headings. PR, PL: angle of the right and of
+the left wheel since the last rest, rad. E0, E1: how far the two edges of the seam crossed last lie from where the map
+has them, m. TX, TY: by how much the puck is off its place over the robot because the panel under it is tilted, deck
+frame, m.
 """
 STATES = 20
 POSE, SPEEDS, SLIPS, ANGLES, EDGES, TILT = [X, Y, PSI], [V, A, W], [SR, SL, C, CT], [PR, PL], [E0, E1], [TX, TY]
@@ -58,12 +59,13 @@ class SurveyMotion:
     ::
 
         v' = v + a dt,   d = v' dt,   turn = w dt
-        (x, y)' = (x, y) + d h(psi + turn/2) + (c |d| + ct |turn|) g
+        (x, y)' = (x, y) + d h(psi + turn/2) + (c |d| + share ct |turn|) g
         psi' = psi + turn - fy (fxx dx + fxy dy) / ((1 + fx^2) W)
         phi_R' = phi_R + (d + turn (1 + kl) L/2) / (r (1 - s_R)),   phi_L' likewise with -L/2
 
-    h and g are the deck components of the heading and of the downhill direction in the tangent plane. The noise of a
-    step is an impulse at its beginning (see ``ConstantAcceleration``), so v', a and w hold for the whole of it.
+    h and g are the deck components of the heading and of the downhill direction in the tangent plane; share is the
+    creep of a turn at this heading over its mean. The noise of a step is an impulse at its beginning (see
+    ``ConstantAcceleration``), so v', a and w hold for the whole of it.
     """
 
     def __init__(self, wheel_radius_m: float, wheel_base_m: float) -> None:
@@ -71,9 +73,9 @@ class SurveyMotion:
         self._x, self._F = np.zeros(STATES), np.eye(STATES)
         self._flat = self._F.reshape(-1)
 
-    def over(self, dt_s: float, slope: Slope) -> "SurveyMotion":
-        """Set the step's duration and the ground under it."""
-        self._dt_s, self._slope = dt_s, slope
+    def over(self, dt_s: float, slope: Slope, creep_share: float = 1.0) -> "SurveyMotion":
+        """Set the step's duration, the ground under it, and ``share``."""
+        self._dt_s, self._slope, self._share = dt_s, slope, creep_share
         self._of: FloatArray | None = None
         return self
 
@@ -86,14 +88,14 @@ class SurveyMotion:
         x_m, y_m, psi, v, a, w, _, _, _, s_r, s_l, kl, c, p_r, p_l, *_, ct = state
         dt, (fx, fy, fxx, fxy, _, gx, gy) = self._dt_s, self._slope
         v += a * dt
-        d, turn = v * dt, w * dt
+        d, turn, share = v * dt, w * dt, self._share
         s2 = 1.0 + fx * fx
         s, norm = sqrt(s2), sqrt(s2 + fy * fy)
         ex, ey = -fx * fy / (norm * s), s / norm
         middle = psi + 0.5 * turn
         cosine, sine = cos(middle), sin(middle)
         hx, hy, lx, ly = cosine / s + sine * ex, sine * ey, cosine * ex - sine / s, cosine * ey
-        way, angle = abs(d), abs(turn)
+        way, angle = abs(d), share * abs(turn)
         down = c * way + ct * angle
         dx, dy = d * hx + down * gx, d * hy + down * gy
         k1, k2 = fy * fxx / (s2 * norm), fy * fxy / (s2 * norm)
@@ -103,7 +105,7 @@ class SurveyMotion:
         right, left = d + side, d - side
         self._x[:] = x
         self._x[_MOVED] = x_m + dx, y_m + dy, psi + turn - k1 * dx - k2 * dy, v, p_r + right * per_r, p_l + left * per_l
-        sign, turn_down = c if d >= 0.0 else -c, dt * (ct if turn >= 0.0 else -ct)
+        sign, turn_down = c if d >= 0.0 else -c, dt * share * (ct if turn >= 0.0 else -ct)
         xv, yv = dt * (hx + sign * gx), dt * (hy + sign * gy)
         x_psi, y_psi, x_c, y_c, x_ct, y_ct = d * lx, d * ly, way * gx, way * gy, angle * gx, angle * gy
         xw, yw = 0.5 * dt * x_psi + turn_down * gx, 0.5 * dt * y_psi + turn_down * gy
@@ -128,7 +130,7 @@ class SurveyMotion:
         s, norm = sqrt(s2), sqrt(s2 + fy * fy)
         middle = psi + 0.5 * turn
         cosine, sine = np.cos(middle), np.sin(middle)
-        way = c * np.abs(d) + ct * np.abs(turn)
+        way = c * np.abs(d) + self._share * ct * np.abs(turn)
         dx = d * (cosine / s - sine * (fx * fy / (norm * s))) + way * gx
         dy = d * (sine * (s / norm)) + way * gy
         side = turn * (1.0 + kl) * self._half_base_m

@@ -9,6 +9,7 @@ from ccatp.config.load import load_config
 from ccatp.config.models import RobotConfig
 from ccatp.control.thrust import (
     ThrustControl,
+    creep_share,
     forecast_grip,
     friction_by_creep,
     least_thrust_n,
@@ -59,7 +60,7 @@ def test_on_a_floor_none_is_needed() -> None:
 
 def test_a_turn_leaves_a_fifth_of_its_friction_to_the_lighter_wheel() -> None:
     """Loads of each wheel by moments about the axle and along it, at every heading."""
-    cfg, used = robot(), []
+    cfg, used = robot(thrust_margin=1.0), []
     thrust_n = turn_thrust_n(cfg, gravity(0.0))
     for degrees in range(360):
         ahead, left, away = (WEIGHT_N * part for part in gravity(radians(degrees)))
@@ -129,6 +130,16 @@ def test_creep_of_turns_shows_the_friction(friction: float) -> None:
     assert friction_by_creep(cfg, gravity(0.0), 36.0, 0.0) == pytest.approx(2.0)
     assert friction_by_creep(cfg, gravity(0.0, radians(89.0)), 36.0, creep_m_rad) is None
     assert friction_by_creep(robot(tyre_m=0.0), gravity(0.0), 36.0, creep_m_rad) is None
+
+
+def test_a_turn_creeps_most_with_downhill_behind() -> None:
+    """On 18 degrees with 36 N: the shares of all headings have the mean 1; on a floor a turn creeps by none more."""
+    cfg = robot()
+    shares = [creep_share(cfg, gravity(radians(degrees))) for degrees in range(0, 360, 45)]
+    assert shares == pytest.approx([1.54, 1.25, 0.91, 0.73, 0.68, 0.73, 0.91, 1.25], abs=0.05)
+    assert sum(shares) / len(shares) == pytest.approx(1.0)
+    assert creep_share(cfg, (0.0, 0.0, -1.0)) == 1.0
+    assert creep_share(robot(thrust_n=2.0), gravity(0.0)) == 1.0  # it is lifted off
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from ccatp.core import FloatArray, ImuSample
 from ccatp.estimation.odometry import PosePredictor, PreintegratedMotion, Preintegrator, Slope, WheelAngle
 from ccatp.estimation.state_model import BG, KG, PL, PR, PSI, STATES, SurveyMotion, W, X, Y
 from tests.unit.estimation.drive import config
-from tests.unit.estimation.test_state_model import LEVEL, slopes, states
+from tests.unit.estimation.test_state_model import LEVEL, shares, slopes, states
 
 R_M, BASE_M = config().robot.wheel_radius_m, config().robot.wheel_base_m
 
@@ -22,14 +22,14 @@ def running() -> PosePredictor:
 
 
 @settings(max_examples=60, deadline=None)
-@given(states(), slopes(), st.floats(1e-3, 0.1), st.integers(1, 5))
-def test_it_drives_the_filters_arc(x: FloatArray, slope: Slope, dt_s: float, steps: int) -> None:
+@given(states(), slopes(), st.floats(1e-3, 0.1), shares, st.integers(1, 5))
+def test_it_drives_the_filters_arc(x: FloatArray, slope: Slope, dt_s: float, share: float, steps: int) -> None:
     """Given the wheel angles that the filter's motion predicts, the pose is the filter's."""
-    motion, pose = SurveyMotion(R_M, BASE_M).over(dt_s, slope), running()
-    pose.begin(x, slope, 0.0)
+    motion, pose = SurveyMotion(R_M, BASE_M).over(dt_s, slope, share), running()
+    pose.begin(x, slope, 0.0, share)
     for _ in range(steps):
         after = motion.at(x)[0].copy()
-        motion.over(dt_s, slope)
+        motion.over(dt_s, slope, share)
         pose.advance(dt_s, float(after[PR] - x[PR]), float(after[PL] - x[PL]), None)
         x = after
         expected = x[[X, Y, PSI]].tolist()

@@ -68,6 +68,7 @@ def slopes(draw: st.DrawFn) -> Slope:
 
 
 durations = st.floats(1e-3, 0.1)
+shares = st.floats(0.3, 3.0)  # of the creep of turns
 examples = settings(max_examples=60, deadline=None)
 
 
@@ -77,16 +78,16 @@ def differences(model: SurveyMotion | SensorRows, x: FloatArray) -> FloatArray:
 
 
 @examples
-@given(states(), slopes(), durations)
-def test_the_motions_jacobian_is_its_derivative(x: FloatArray, slope: Slope, dt_s: float) -> None:
-    motion = SurveyMotion(R_M, BASE_M).over(dt_s, slope)
+@given(states(), slopes(), durations, shares)
+def test_the_motions_jacobian_is_its_derivative(x: FloatArray, slope: Slope, dt_s: float, share: float) -> None:
+    motion = SurveyMotion(R_M, BASE_M).over(dt_s, slope, share)
     np.testing.assert_allclose(motion.at(x)[1], differences(motion, x), atol=TOLERANCE)
 
 
 @examples
-@given(st.lists(states(), min_size=2, max_size=4), slopes(), durations)
-def test_the_motion_of_many_is_that_of_each(points: list[FloatArray], slope: Slope, dt_s: float) -> None:
-    motion = SurveyMotion(R_M, BASE_M).over(dt_s, slope)
+@given(st.lists(states(), min_size=2, max_size=4), slopes(), durations, shares)
+def test_the_motion_of_many_is_that_of_each(points: list[FloatArray], slope: Slope, dt_s: float, share: float) -> None:
+    motion = SurveyMotion(R_M, BASE_M).over(dt_s, slope, share)
     for x, after in zip(points, motion.through(np.array(points)), strict=True):
         np.testing.assert_allclose(motion.at(x)[0], after, rtol=0.0, atol=1e-13)  # rounding of numbers up to 20
 
@@ -110,6 +111,14 @@ def test_creep_goes_downhill_whichever_way_the_robot_drives(sign: float) -> None
     slope = LEVEL._replace(gx=0.6, gy=0.8)
     after = SurveyMotion(R_M, BASE_M).over(0.1, slope).at(x)[0]
     assert after[[X, Y]] == pytest.approx([sign * 0.01 + 0.0003, 0.0004], abs=1e-15)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_turn_creeps_by_its_share_of_the_mean(sign: float) -> None:
+    x = np.zeros(STATES)
+    x[[W, CT]] = sign, 0.005
+    after = SurveyMotion(R_M, BASE_M).over(0.1, LEVEL._replace(gx=0.6, gy=0.8), 2.0).at(x)[0]
+    assert after[[X, Y]] == pytest.approx([0.0006, 0.0008], abs=1e-15)
 
 
 ALL = Errors(right_slip=0.05, left_slip=0.02, base=0.02, creep=0.05, turn_creep=0.003)
