@@ -19,7 +19,7 @@ LATE_S = 0.1
 # Wheels and gyroscope that differ by more than this within a stall's time do not show the same motion.
 _SAME_TURN_RAD = 0.05
 # A few samples of an encoder that counts steps are hardly a speed: with fewer than usual a wheel has to be
-# faster than it may be by so many times, or for longer.
+# faster than it may be by so many times, or for longer, and to differ so many times more from the gyroscope.
 _VAGUE = 2.5
 # A wheel that goes on creeping for this long while it is held will not stop by itself.
 _CREEP_FAULT_S = 1.0
@@ -120,9 +120,9 @@ class WheelMonitor:
         if is_sparse:
             self._sparse_s = t_s
         lately = self._commanded(t_s)
+        is_vague = self._sparse_s is not None and t_s - self._sparse_s < self._cfg.stall_time_s
         if lately is not None:
             limit = self._cfg.runaway_m_s
-            is_vague = self._sparse_s is not None and t_s - self._sparse_s < self._cfg.stall_time_s
             if shortly is not None:
                 self._find_runaway(t_s, shortly, lately, samples, _VAGUE * limit if is_vague else limit)
             if is_vague and stalling is not None:
@@ -131,7 +131,7 @@ class WheelMonitor:
                 self._find_stall(t_s, stalling)
                 self._find_creep(now, stalling, lately, samples)
         if turning is not None:
-            self._compare_turns(t_s, turning)
+            self._compare_turns(t_s, turning, _VAGUE if is_vague else 1.0)
 
     def _commanded(self, t_s: float) -> Span | None:
         """Recent set points of the wheels; ``None`` where they are not known."""
@@ -216,12 +216,12 @@ class WheelMonitor:
                 finding = conditions.WHEEL_DOES_NOT_STOP.found(wheel, speed_m_s, limit_m_s, side=side)
             self.alarm.see(t_s, finding)
 
-    def _compare_turns(self, t_s: float, moved: MotionSum) -> None:
-        """The turn of the gyroscope, while it was believed, with that of the wheels."""
+    def _compare_turns(self, t_s: float, moved: MotionSum, vagueness: float) -> None:
+        """The turn of the gyroscope, while it was believed, with that of the wheels; ``vagueness`` widens the limit."""
         cfg, (_, right_m, left_m, by_gyroscope) = self._cfg, moved
         by_wheels = (right_m - left_m) / self._base_m
         difference = by_gyroscope - by_wheels
-        limit = cfg.yaw_limit_rad + cfg.yaw_share * max(abs(by_wheels), abs(by_gyroscope))
+        limit = vagueness * (cfg.yaw_limit_rad + cfg.yaw_share * max(abs(by_wheels), abs(by_gyroscope)))
         if not -limit <= difference <= limit:
             self.yaw.see(t_s, conditions.YAW_DISAGREES.found("imu_wz", difference, limit))
 
