@@ -6,7 +6,7 @@ friction that falls while the robot drives or turns.
 
 from collections.abc import Iterator, Sequence
 from itertools import product
-from math import cos, hypot, pi, sin
+from math import ceil, cos, hypot, pi, sin
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,7 +36,8 @@ def robot_keys(mirror: str, tyre: str, friction: float, margin: float | None) ->
     cfg = load_config(None, {"run.mirror": mirror, "robot.friction": friction})
     thrust_n = cfg.robot.thrust_n
     if margin is not None:
-        thrust_n = round(margin * forecast_grip(cfg.robot, build_mirror(cfg.mirror)).least_n, 2)
+        # Rounded up: with less than the margin that is asked for, a survey is slow.
+        thrust_n = ceil(100.0 * margin * forecast_grip(cfg.robot, build_mirror(cfg.mirror)).least_n) / 100.0
     for place in ("robot", "sim.physics"):
         keys |= {f"{place}.friction": friction, f"{place}.thrust_n": thrust_n}
     return keys
