@@ -109,6 +109,7 @@ FEEDBACK_SHARE = 0.25
 class AxisState(msgspec.Struct, frozen=True):
     """Progress of a motion: position and speed ``planned`` for now, its bang-bang time ``duration_s``.
 
+    ``profile`` ends at ``duration_s``: the last of a motion that was planned more than once.
     ``slip``: the share by which the wheels travel further than the body.
     """
 
@@ -173,16 +174,18 @@ class ProfiledAxis:
         coast = 0.0 if speed is None else speed * self._lag_s
         return abs(remaining - coast) <= tolerance
 
-    def renewed_if_far(self, motion: AxisState, remaining: float) -> AxisState:
-        """Another motion where the last one ended further off than feedback can bring it in time."""
-        if motion.t_s >= motion.duration_s and abs(remaining) > 0.5 * self._feedback_limit * self._stop_time_s:
-            return self.begin(remaining)
-        return motion
+    def _renewed_if_far(self, motion: AxisState, remaining: float) -> AxisState:
+        """Planned again where the plan ended further off than feedback can bring it in time."""
+        if motion.t_s < motion.duration_s or abs(remaining) <= 0.5 * self._feedback_limit * self._stop_time_s:
+            return motion
+        profile = Profile.rest_to_rest(remaining, self._v_max, self._a_max)
+        return AxisState(motion.t_s + profile.duration_s, profile, motion.t_s)
 
     def step(self, motion: AxisState, remaining: float, dt_s: float, speed: float | None) -> tuple[AxisState, float]:
         """The motion ``dt_s`` later, and its set point until then, in the unit of the quantity per s."""
+        motion = self._renewed_if_far(motion, remaining)
         profile, (position, now), t_s = motion.profile, motion.planned, motion.t_s + dt_s
-        planned = profile.at(t_s)
+        planned = profile.at(t_s - (motion.duration_s - profile.duration_s))
         error = remaining - (profile.distance - position)
         bound, slip_bound = self._feedback_limit, self._slip_limit
         feedback = min(max(self._kp * error, -bound), bound)
@@ -443,7 +446,6 @@ class LegTracker:
         ahead_m, gain = view.ahead_m, view.gain
         speed = None if speeds is None else sign * speeds.v_m_s * gain
         if axis.t_s >= axis.duration_s:
-            axis = pace.along.renewed_if_far(axis, ahead_m)
             is_late = axis.t_s - axis.duration_s >= control.stop_time_s
             if pace.along.is_over(axis, ahead_m, control.stop_tolerance_m, speed) or is_late:
                 return replace(motion, phase=DONE), STILL

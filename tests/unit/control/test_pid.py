@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccatp.config.models import Config, PidConfig, RobotConfig
-from ccatp.control.tracker import AxisState, Pid, PidState, Profile, ProfiledAxis, lag_feed_forward
+from ccatp.control.tracker import Pid, PidState, Profile, ProfiledAxis, lag_feed_forward
 from ccatp.control.wheel_motion import SentDrives
 from ccatp.core import Predicted, Twist, wheel_rates
 
@@ -69,10 +69,6 @@ class KeptAxis:
     def is_over(self, remaining: float, tolerance: float, speed: float | None) -> bool:
         return self._axis.is_over(self.motion, remaining, tolerance, speed)
 
-    def renew_if_far(self, remaining: float) -> AxisState:
-        self.motion = self._axis.renewed_if_far(self.motion, remaining)
-        return self.motion
-
 
 @pytest.fixture
 def axis(config: Config) -> KeptAxis:
@@ -122,10 +118,12 @@ def test_the_end_counts_what_the_wheels_still_run(axis: KeptAxis) -> None:
 
 def test_an_end_far_off_is_followed_by_another_motion(axis: KeptAxis) -> None:
     axis.begin(0.0)
-    assert axis.renew_if_far(0.001).duration_s == 0.0
-    assert axis.renew_if_far(-0.02).duration_s == pytest.approx(2.0 * (0.02 / A_MAX) ** 0.5)
-    # Not while one is under way.
-    assert axis.renew_if_far(0.05).duration_s == pytest.approx(2.0 * (0.02 / A_MAX) ** 0.5)
+    durations_s = []
+    for remaining in (0.001, -0.02, 0.05):  # the last while one is under way
+        axis.step(remaining, DT, 0.0)
+        durations_s.append(axis.motion.duration_s)
+    further_s = DT + 2.0 * (0.02 / A_MAX) ** 0.5
+    assert durations_s == pytest.approx([0.0, further_s, further_s])
 
 
 def test_trapezoid_takes_the_bang_bang_time() -> None:

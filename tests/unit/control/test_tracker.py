@@ -134,6 +134,17 @@ def test_turn_in_place_ends_within_tolerance(tracker: Leg) -> None:
     assert robot.heading == pytest.approx(-1.2, abs=0.01)  # heading tolerance
 
 
+def test_a_turn_whose_bearing_runs_on_is_planned_again(tracker: Leg) -> None:
+    # The robot creeps by as much as it turns: half of what it turns by is left again.
+    robot, t = Robot((0.0, 0.0, 0.0)), 0.0
+    tracker.begin_turn(1.0)
+    while tracker.phase is not LegPhase.DONE:
+        robot.drive(tracker.step_turn(1.0 - 0.5 * robot.heading, DT))
+        t += DT
+        assert t < 3.0  # 2 rad take 2.5 s at once; feedback at a quarter of the rate brings the rest in 3.8 s
+    assert robot.heading == pytest.approx(2.0, abs=0.02)  # twice the heading tolerance
+
+
 # Carried to the right of +x by what 0.25 rad to the left make up for.
 DRIFT = (0.0, -sin(0.25))
 
