@@ -88,6 +88,17 @@ def test_retreats_allow_turning_and_are_straight_moves_the_place_allows(world: A
             assert spot.can_face(course) or spot.can_face(course + pi)
 
 
+def test_on_tyres_that_creep_a_retreat_is_longer(thesis: Any) -> None:
+    shortest_m = []
+    for tyre_m in (0.002, 0.0075):
+        robot = thesis.cfg.robot.model_copy(update={"tyre_m": tyre_m})
+        mirror, body = thesis.mirror, build_body(robot, thesis.cfg.mission)
+        spot = at(mirror, body, PointId(5, 11, 6))
+        moves = find_retreats(mirror, body, [spot])[0]
+        shortest_m.append(min(hypot(r.x_m - spot.x_m, r.y_m - spot.y_m) for r in moves))
+    assert shortest_m == pytest.approx([0.02, 0.06], abs=1e-9)  # eight times the lever at which they rub
+
+
 def test_retreat_in_a_corner_is_slanted(thesis: Any) -> None:
     mirror, body = thesis.mirror, body_of(thesis)
     assert PanelId(1, 3) in mirror.panels
