@@ -176,9 +176,10 @@ class SurveyFrames(ABC):
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         place = pose.x_m, pose.y_m, pose.heading_rad
         ahead = self.sent.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
-        sigma_of, heading_sigma_of = self._position_sigma_m, self.parts.heading_sigma_rad
+        sigmas_of = self._position_sigma_m, self.parts.heading_sigma_rad
+        deck_of, turn_creep_of = self.mirror.deck_pose, self.parts.turn_creep_m_rad
         self.motion = StateEstimate(
-            frame.t_s, frame.dt_s, pose, self.mirror.deck_pose, v, omega, creep, ahead, sigma_of, heading_sigma_of
+            frame.t_s, frame.dt_s, pose, deck_of, v, omega, creep, ahead, *sigmas_of, turn_creep_of
         )
 
     def _position_sigma_m(self) -> float:

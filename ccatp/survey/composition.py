@@ -125,7 +125,12 @@ class SurveyParts:
         localizer = self.localizer
         if not isinstance(localizer, FullStateLocalizer):
             return False
-        return self.thrust.measure_grip(localizer.counts["fixes"], localizer.deck_pose, float(localizer.state[0][CT]))
+        return self.thrust.measure_grip(localizer.counts["fixes"], localizer.deck_pose, self.turn_creep_m_rad())
+
+    def turn_creep_m_rad(self) -> float:
+        """Downhill, for each radian of a turn, mean of all headings; 0 of the four states."""
+        localizer = self.localizer
+        return float(localizer.state[0][CT]) if isinstance(localizer, FullStateLocalizer) else 0.0
 
     @property
     def total_points(self) -> int:

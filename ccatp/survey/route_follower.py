@@ -1,5 +1,6 @@
 """The leg being driven (thesis 3.2), at the usual or the reduced speed; corrections, and legs that show the heading."""
 
+import dataclasses
 from collections.abc import Callable
 from math import atan2, ceil, cos, hypot, pi, sin
 from operator import itemgetter
@@ -10,8 +11,9 @@ import numpy as np
 from msgspec.structs import replace
 
 from ccatp.config.models import Config
+from ccatp.control.thrust import creep_share
 from ccatp.control.tracker import DONE, LegMotion, LegTracker
-from ccatp.core import DeckPose, PanelId, PanelPose, Predicted, Stop, StopKind, Twist, difference
+from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose, Predicted, Stop, StopKind, Twist, difference
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.legs import build_body, course_of_heading, room_m, sensor_depths
 
@@ -23,6 +25,8 @@ _STEP_M = 0.01
 _SHORTEST_M = 0.04
 _SIGMAS = 2.0
 _LEAVING = 0.5
+_CREEP_STEP_RAD = 0.2  # in which the creep of a turn is summed
+_SLANT = 0.1  # of a leg's length: so far beside its line it may end
 
 
 class LegAim(NamedTuple):
@@ -60,7 +64,7 @@ class StateEstimate(msgspec.Struct, frozen=True):
     ``creep`` is the drift (dx, dy) per metre of travel in the plane of ``pose``. ``ahead`` is where the robot will be,
     in the same plane, when the twist decided now takes effect; ``None`` where that is at once. Whether it has arrived
     and stands still is judged by ``pose``; it is steered by ``ahead``. ``sigma_of`` says how well the position is
-    known, in its worst direction, m.
+    known, in its worst direction, m. ``turn_creep_of``: downhill, for each radian of a turn, mean of all headings, m.
     """
 
     t_s: float
@@ -73,6 +77,7 @@ class StateEstimate(msgspec.Struct, frozen=True):
     ahead: Predicted | None = None
     sigma_of: Callable[[], float] = float  # hardly ever asked for either
     heading_sigma_of: Callable[[], float] = float
+    turn_creep_of: Callable[[], float] = float
 
     @property
     def steered(self) -> Predicted:
@@ -103,11 +108,16 @@ class Leg(msgspec.Struct, frozen=True, tag=True):
     target: tuple[PanelId, tuple[float, float]] | None = None  # the stop in the frame of a panel, m
 
 
+def _course(start: DeckPose | Stop, stop: Stop) -> float:
+    return atan2(stop.y_m - start.y_m, stop.x_m - start.x_m)
+
+
 class LegFollower:
     """Drives legs, and says which short ones are safe."""
 
     def __init__(self, mirror: Mirror, cfg: Config) -> None:
         self._mirror, self._mission, self._timeout_factor = mirror, cfg.mission, cfg.control.leg_timeout_factor
+        self._robot = cfg.robot
         self._body = build_body(cfg.robot, cfg.mission)
         limits, health = cfg.limits, cfg.health
         slow = limits.model_copy(
@@ -137,6 +147,39 @@ class LegFollower:
             deadline_s = self.deadline_s(motion.t_s, tracked)
         return Leg(stop, tracked, deadline_s, aim, cached), twist
 
+    def begin(self, motion: StateEstimate, stop: Stop, after: Stop | None = None) -> Leg:
+        """The leg to a stop; one to a via point ends uphill of it by what the turn there, to the next stop, will creep.
+
+        Along its line, and beside it by a part of its length. Not by so little that the clearance of turns allows for
+        it, and not where a sensor would come too near to the rim.
+        """
+        here, body = motion.deck, self._body
+        length_m, course = hypot(stop.x_m - here.x_m, stop.y_m - here.y_m), _course(here, stop)
+        if after is None or stop.kind is not StopKind.VIA:
+            return Leg(stop)
+        arrival = course + (pi if stop.reverse else 0.0)
+        turn_rad = difference(_course(stop, after) + (pi if after.reverse else 0.0), arrival)
+        courses = np.linspace(arrival, arrival + turn_rad, 2 + int(abs(turn_rad) / _CREEP_STEP_RAD))
+        way_m, downhill = self._creep(stop, courses, motion.turn_creep_of() * abs(turn_rad))
+        if not body.turn_clearance_m < way_m < length_m:
+            return Leg(stop)
+        ahead_m = max(-way_m * cos(downhill - course), -0.5 * length_m)
+        most_m = _SLANT * length_m
+        beside_m = min(max(-way_m * sin(downhill - course), -most_m), most_m)
+        dx_m = ahead_m * cos(course) - beside_m * sin(course)
+        dy_m = ahead_m * sin(course) + beside_m * cos(course)
+        left = np.linspace(1.0, 0.0, len(courses))
+        depths = sensor_depths(self._mirror, body, stop.x_m + left * dx_m, stop.y_m + left * dy_m, courses)
+        if depths.min() < body.turn_clearance_m:
+            return Leg(stop)
+        return Leg(dataclasses.replace(stop, x_m=stop.x_m + dx_m, y_m=stop.y_m + dy_m))
+
+    def _creep(self, stop: Stop, courses: FloatArray, mean_m: float) -> tuple[float, float]:
+        """How far a turn through courses creeps, ``mean_m`` at the mean of all headings, m; its direction, rad."""
+        gravities = [self._mirror.gravity_in_robot(DeckPose(stop.x_m, stop.y_m, c)) for c in courses.tolist()]
+        share = sum(creep_share(self._robot, gravity) for gravity in gravities) / len(gravities)
+        return share * mean_m, float(courses[0]) + atan2(gravities[0][1], gravities[0][0])
+
     def begin_turn(self, leg: Leg, motion: StateEstimate, heading_rad: float, *, is_slow: bool) -> Leg:
         """Begin the turn to a heading on the deck, at the end of a leg."""
         tracked = self.tracker.begin_turn(difference(heading_rad, motion.deck.heading_rad), is_slow=is_slow)
@@ -158,6 +201,10 @@ class LegFollower:
             return 0.0
         x, y = self.target_in(pose.panel, stop)
         return hypot(x - pose.x_m, y - pose.y_m)
+
+    def is_at_rim(self, stop: Stop) -> bool:
+        """Whether the robot cannot turn as it likes there."""
+        return self._mirror.rim.signed_distance_m(stop.x_m, stop.y_m) < self._body.turning_depth_m
 
     def target_in(self, panel: PanelId, stop: Stop) -> tuple[float, float]:
         """The stop in the frame of a panel, (x, y), m."""

@@ -205,7 +205,10 @@ class Survey(HoldRules[SurveyState]):
 
     def _follow(self, s: SurveyState, motion: StateEstimate, stop: Stop) -> tuple[SurveyState, MissionCommand | None]:
         """One frame of the leg to a stop; no command where it is reached."""
-        leg = s.behaviour if isinstance(s.behaviour, Leg) else Leg(stop)
+        leg = s.behaviour
+        if not isinstance(leg, Leg):
+            after = s.route.stops[s.stop_index + 1 : s.stop_index + 2] if stop is s.stop else ()
+            leg = self.follower.begin(motion, stop, *after)
         leg, twist = self.follower.follow(leg, motion, is_slow=s.is_slow)
         if motion.t_s > leg.deadline_s:
             return self._overdue(s, stop), HOLD_POSITION
@@ -219,11 +222,12 @@ class Survey(HoldRules[SurveyState]):
         return replace(s, behaviour=leg, mode=mode), MissionCommand(twist)
 
     def _is_vague(self, leg: object, motion: StateEstimate) -> bool:
-        """A long turn has made the place uncertain, by creep: a leg to a point, unless short, needs a fix first."""
+        """A long turn makes the place uncertain, by creep: a long leg to a point, or one at the rim, needs a fix."""
         if not isinstance(leg, Leg) or leg.stop.point is None or motion.sigma_of() <= self._vague_m:
             return False
         is_long = leg.motion is not None and leg.motion.planned_s > _LONG_TURN_S
-        return is_long and self.follower.distance_m(leg.stop, motion.pose) > self.cfg.mission.correction_reach_m
+        follower, reach_m = self.follower, self.cfg.mission.correction_reach_m
+        return is_long and (follower.is_at_rim(leg.stop) or follower.distance_m(leg.stop, motion.pose) > reach_m)
 
     def _overdue(self, s: SurveyState, stop: Stop) -> SurveyState:
         return self.fault(s, conditions.LEG_OVERDUE.text(x_m=stop.x_m, y_m=stop.y_m))

@@ -1,7 +1,8 @@
 """From the end of a leg to the request for a measurement."""
 
 from collections.abc import Callable, Iterable
-from math import cos, hypot, pi, sin
+from math import atan2, cos, hypot, pi, sin
+from operator import itemgetter
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from ccatp.conditions import BEYOND_SEAM, NO_SEAM, RIM_AHEAD
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegTracker
-from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Verdict
+from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Verdict, difference
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.studies.sil_run import SilRun
@@ -176,6 +177,35 @@ def test_after_a_correction_a_turn_at_the_rim_is_looked_at(follower: LegFollower
         assert follower.can_proceed(pose, Stop(pose.x_m, pose.y_m + 0.2, StopKind.MEASURE))
         assert follower.can_proceed(pose, Stop(pose.x_m - 0.2, pose.y_m, StopKind.MEASURE)) is is_safe
         assert follower.can_proceed(pose, Stop(pose.x_m, pose.y_m - 0.2, StopKind.MEASURE, reverse=True))
+
+
+@pytest.mark.parametrize(("creep_m_rad", "is_early"), [(0.01, True), (0.002, False)])
+def test_a_leg_ends_uphill_of_where_the_next_turn_begins(
+    config: Config, mirror: Mirror, follower: LegFollower, creep_m_rad: float, *, is_early: bool
+) -> None:
+    gx, gy, _ = mirror.gravity_in_robot(DeckPose(0.5, 0.5, 0.0))
+    downhill = atan2(gy, gx)
+    start = mirror.panel_pose(PanelId(5, 5), DeckPose(0.5 - 0.3 * cos(downhill), 0.5 - 0.3 * sin(downhill), downhill))
+    via = Stop(0.5, 0.5, StopKind.VIA)
+    after = Stop(0.5 - 0.2 * sin(downhill), 0.5 + 0.2 * cos(downhill), StopKind.MEASURE)  # a quarter turn to the left
+    motion = StateEstimate(0.0, DT, start, mirror.deck_pose, 0.0, 0.0, turn_creep_of=lambda: creep_m_rad)
+    stop = follower.begin(motion, via, after).stop
+    early_m = hypot(stop.x_m - via.x_m, stop.y_m - via.y_m)
+    assert (early_m > config.mission.turn_clearance_m) is is_early
+    if is_early:
+        assert early_m == pytest.approx(0.5 * pi * creep_m_rad, rel=0.5)  # by heading it creeps more or less
+        assert difference(atan2(via.y_m - stop.y_m, via.x_m - stop.x_m), downhill) == pytest.approx(0.0, abs=0.02)
+    assert follower.begin(motion, via).stop is via
+    assert follower.begin(motion, after, via).stop is after  # where it is measured, it stands
+
+
+def test_beside_the_rim_it_does_not_end_where_a_sensor_would_pass_it(mirror: Mirror, follower: LegFollower) -> None:
+    x, y = max(((float(x), float(y)) for x, y in mirror.rim.vertices), key=itemgetter(1))
+    via = Stop(x - 0.14, y - 0.15, StopKind.VIA)  # uphill of it is the rim
+    after = Stop(via.x_m - 0.3, via.y_m, StopKind.MEASURE)
+    start = mirror.panel_pose(mirror.nearest_panel(via.x_m, via.y_m - 0.3), DeckPose(via.x_m, via.y_m - 0.3, 0.0))
+    motion = StateEstimate(0.0, DT, start, mirror.deck_pose, 0.0, 0.0, turn_creep_of=lambda: 0.03)
+    assert follower.begin(motion, via, after).stop is via
 
 
 HERE, THERE = PointId(1, 2, 3), PointId(1, 2, 4)
