@@ -60,7 +60,7 @@ def draw_physics(cells: Sequence[CellResult], out: Path) -> None:
     for (mirror, margin), there in grouped(cells, "mirror", "margin").items():
         rows = rows_by(there, "tyre", "friction")
         title = f"{mirror}, {margin} times the least thrust, by friction: {SHOWN}"
-        draw_ranges(rows, MISSION, title, out / f"physics-{mirror}-{margin}")
+        draw_ranges(rows, MISSION, title, out / f"physics-{mirror}-{100.0 * margin:.0f}")
 
 
 PHYSICS = Study(

@@ -362,7 +362,7 @@ RUNS: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
         "danger_false_edges_thesis-m1 danger_overrun_thesis-m1",
     ),
     "faults": (("faults=random",), ("--mirror", "thesis-m1", *ONE_PANEL_ARGS), "faults"),
-    "physics": (("mirror=fyst-m1", "tyre=round", "friction=1.0", "margin=3.0"), ONE_PANEL_ARGS, "physics-fyst-m1-3"),
+    "physics": (("mirror=fyst-m1", "tyre=flat", "friction=0.8", "margin=1.3"), ONE_PANEL_ARGS, "physics-fyst-m1-130"),
     "stops": (("mirror=fyst-m1", "tyre=round", "thrust=shipped", "speed=safe"), (), "stops-fyst-m1"),
     "slides": (("mirror=fyst-m1", "friction=0.1"), (), "slides"),
     "cricket": (("case=zigzag-printed,all-printed,batch-45-once",), (), "figure_11_12 figure_14 figure_9_10_13 ways"),
