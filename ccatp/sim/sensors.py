@@ -9,7 +9,7 @@ sensors alone. The rim over which the robot falls stays the ideal one.
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain, islice, pairwise, repeat
-from math import exp, hypot, pi
+from math import exp, hypot, inf, pi
 from typing import NamedTuple, TypeVar
 
 import msgspec
@@ -246,6 +246,15 @@ class EdgeSensors:
             return -1.0
         x0, x1, y0, y1 = self._material[panel]
         return min(x - x0, x1 - x, y - y0, y1 - y)
+
+    def outer_edge_m(self, x: float, y: float) -> float:
+        """Distance from where the panel under a point, as mounted, ends at the rim; inf where none does."""
+        panel = self._panel_at(x, y)
+        if panel is None:
+            return inf
+        (row, col), (x0, x1, y0, y1) = panel, self._material[panel]
+        sides = ((row, col - 1), x - x0), ((row, col + 1), x1 - x), ((row - 1, col), y - y0), ((row + 1, col), y1 - y)
+        return min((distance_m for beside, distance_m in sides if PanelId(*beside) not in self._material), default=inf)
 
     def _look(self) -> None:
         inside_m = [self._inside_m(x, y) for x, y in self.places]

@@ -130,8 +130,9 @@ class World:
         if self._rim_bound_m < NEAR_RIM_M:
             self._measure_rim()
         if self._rim_bound_m < NEAR_RIM_M and self.sensors is not None:
-            distance_m = self._rim.signed_distance_m
-            clearances_m = [distance_m(x, y) for x, y in self.sensors.places]
+            # A panel may end short of the rim as it is drawn: there the robot's edge sensors see it.
+            distance_m, outer_edge_m = self._rim.signed_distance_m, self.sensors.outer_edge_m
+            clearances_m = [min(distance_m(x, y), outer_edge_m(x, y)) for x, y in self.sensors.places]
             self._clearance_m = min(FAR_CLEARANCE_M, *clearances_m)
             if self._clearance_m < 0.0:
                 self._off_mask = sum((clearance_m < 0.0) << k for k, clearance_m in enumerate(clearances_m))
