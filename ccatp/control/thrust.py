@@ -11,7 +11,7 @@ Downhill behind is the worst heading: the load goes to the caster. Downhill ahea
 """
 
 from collections.abc import Sequence
-from math import atan2, ceil, cos, hypot, pi, sqrt
+from math import ceil, cos, hypot, pi, sqrt
 from typing import NamedTuple
 
 from scipy.optimize import brentq
@@ -29,6 +29,7 @@ _LEAST_USE = 0.1  # of tangential load by load of the wheels: a tyre that carrie
 _MOST_FRICTION = 2.0
 _TURNS = 4  # that the mean creep is taken over
 _MOST_USE = 0.8  # of its friction by a wheel in a turn: beyond that it slides for moments, and the creep grows steeply
+_TILT_STEP = 1e-3  # sine of the slope's angle: creep differs by less than 1 % within it
 _MOST_SHARE = 0.95  # of the friction: closer to 1 the law has no bound
 _TOLERANCE = 1.8  # of the creep: by slope and heading it varies by so much with the friction that is promised
 
@@ -125,20 +126,47 @@ def _wheels_n(robot: RobotConfig, pressed_n: float, to_rear_n: float) -> float:
     return pressed_n * (1.0 + x_m / robot.caster_m) - to_rear_n * height_m / robot.caster_m
 
 
-def creep_share(robot: RobotConfig, gravity: Vector3) -> float:
-    """Creep of a turn at this heading over its mean of all headings, by the law of ``friction_by_creep``.
+class TurnCreep:
+    """Creep of a turn at one heading over its mean of all headings, by the law of ``friction_by_creep``.
 
     With the thrust that a turn gets; tyres creep as if they had 0.8 of their friction.
     """
-    x, y, _ = gravity
-    thrust_n = min(max(turn_thrust_n(robot, gravity), 0.5 * sum(robot.fan_duty) * robot.thrust_n), robot.thrust_n)
-    used = _used(robot, gravity, thrust_n, (atan2(y, -x), *_HEADINGS_RAD))
-    if min(used) < 0.0:
-        return 1.0
-    shares = [min(use / (_MOST_USE * robot.friction), _MOST_SHARE) for use in used]
-    here, *others = [share / sqrt(1.0 - share * share) for share in shares]
-    mean = sum(others) / len(others)
-    return here / mean if mean else 1.0
+
+    def __init__(self, robot: RobotConfig) -> None:
+        self._robot = robot
+        self._slopes: dict[tuple[int, bool], tuple[float, float, float]] = {}
+
+    def share(self, gravity: Vector3) -> float:
+        """At the heading that has gravity (unit vector, robot frame) in this direction; 1 where wheels lift."""
+        x, y, z = gravity
+        tilt = hypot(x, y)
+        key = round(tilt / _TILT_STEP), z > 0.0
+        law = self._slopes.get(key)
+        if law is None:
+            law = self._slopes[key] = self._law(key[0] * _TILT_STEP, overhangs=key[1])
+        level, swing, mean = law
+        return _creep(level + swing * x / tilt) / mean if mean else 1.0
+
+    def _law(self, tilt: float, *, overhangs: bool) -> tuple[float, float, float]:
+        """Friction over its use with downhill aside, how that grows until it is ahead, mean creep; 0: none, or lifts.
+
+        ``tilt``: sine of the angle between the surface and the horizontal.
+        """
+        robot, height = self._robot, sqrt(max(1.0 - tilt * tilt, 0.0))
+        gravity = tilt, 0.0, height if overhangs else -height
+        thrust_n = min(max(turn_thrust_n(robot, gravity), 0.5 * sum(robot.fan_duty) * robot.thrust_n), robot.thrust_n)
+        aside, ahead = _used(robot, gravity, thrust_n, (0.5 * pi, pi))
+        if min(_used(robot, gravity, thrust_n, _HEADINGS_RAD)) <= 0.0:
+            return 0.0, 0.0, 0.0
+        level, swing = _MOST_USE * robot.friction / aside, _MOST_USE * robot.friction * (1.0 / ahead - 1.0 / aside)
+        creeps = [_creep(level - swing * cos(to_rear)) for to_rear in _HEADINGS_RAD]
+        return level, swing, sum(creeps) / len(creeps)
+
+
+def _creep(per_use: float) -> float:
+    """U / sqrt(1 - u^2) of a share u = 1 / ``per_use`` of the friction."""
+    share = min(1.0 / per_use, _MOST_SHARE) if per_use > 0.0 else _MOST_SHARE
+    return share / sqrt(1.0 - share * share)
 
 
 def _used(robot: RobotConfig, gravity: Vector3, thrust_n: float, headings_rad: Sequence[float]) -> list[float]:

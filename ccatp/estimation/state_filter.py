@@ -7,7 +7,7 @@ from math import sqrt
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.control.thrust import creep_share
+from ccatp.control.thrust import TurnCreep
 from ccatp.core import DeckPose, FloatArray, PanelId, difference
 from ccatp.estimation import state_model as sm
 from ccatp.estimation.fixes import fix_row, relocated
@@ -33,16 +33,16 @@ class SurveyFilter:
     """The filter of ``STATES`` states with its models; the ``journal`` does each step, and does it again."""
 
     def __init__(self, filter_: Filter, mirror: Mirror, cfg: Config, counts: dict[str, int], start: DeckPose) -> None:
-        self._robot = robot = cfg.robot
+        robot = cfg.robot
         self.innovation: Innovation | None = None
-        self.turn_creep_share = 1.0  # in the last step; see ``creep_share``
+        self._turn_creep, self.turn_creep_share = TurnCreep(robot), 1.0  # in the last step
         self._cfg, self._full = cfg.localizer, cfg.localizer.full_state
         self.journal = ReplayBuffer(filter_, self._full.rewind_s)
         self._filter, self._counts = filter_, counts
         self._mirror, self.terrain = mirror, Terrain(mirror)
         self._motion = sm.SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m)
         self._base_per_radius = 0.5 * robot.wheel_base_m / robot.wheel_radius_m
-        self._drift = np.zeros(sm.STATES)
+        self._impulses, self._drift = np.zeros(sm.STATES), np.zeros(sm.STATES)
         self._seams = SeamLines(mirror, robot)
         self._legs = SlipPrior(self._full)
         self._tilt_sigma_m = robot.puck_height_m * self._full.panel_tilt_sigma_rad
@@ -123,12 +123,13 @@ class SurveyFilter:
     def _predict(self, dt_s: float, slips: tuple[float, float, float], encoders: float) -> None:
         full, (slip, creep, turn_creep) = self._full, slips
         mean: FloatArray = self._filter.mean
-        gravity = self._mirror.gravity_in_robot(DeckPose(*mean[sm.POSE].tolist()))
-        self.turn_creep_share = share = creep_share(self._robot, gravity)
+        self.turn_creep_share = share = self._turn_creep.share(
+            self._mirror.gravity_in_robot(DeckPose(*mean[:3].tolist()))
+        )
         motion = self._motion.over(dt_s, self.slope(), share)
         jerk, twist = full.jerk_density_m2_s5 * dt_s, full.angular_acceleration_density_rad2_s3 * dt_s
-        impulses = np.array((jerk, twist, slip, slip, creep, turn_creep))
-        drift = self._drift  # work space, of which the model keeps nothing
+        impulses, drift = self._impulses, self._drift  # work space, of which the filter keeps nothing
+        impulses[sm.IMPULSES] = jerk, twist, slip, slip, creep, turn_creep
         drift[sm.BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * dt_s
         drift[sm.BA] = full.accelerometer_bias_walk_m_s2_sqrt_s**2 * dt_s
         # A tyre that gives way does so downhill in the main, and as it likes besides; what it loses of a turn varies.
@@ -137,7 +138,7 @@ class SurveyFilter:
         lost = (self._base_per_radius * full.turn_loss_per_creep) ** 2 * turned_rad
         variance = share * share * float(self._filter.covariance[sm.CT, sm.CT])
         drift[sm.PR] = drift[sm.PL] = encoders + lost * (creep * creep + variance)
-        self._filter.predict(motion, motion.noise(self._filter.mean, impulses, drift))
+        self._filter.predict(motion, drift, impulses)
 
     def encoder_walk(self, wheel: WheelAngle) -> float:
         """Growth of the summed angle's error per second: white rate noise, none where a counter counts."""

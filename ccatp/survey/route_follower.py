@@ -11,7 +11,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ccatp.config.models import Config
-from ccatp.control.thrust import creep_share
+from ccatp.control.thrust import TurnCreep
 from ccatp.control.tracker import DONE, LegMotion, LegTracker
 from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose, Predicted, Stop, StopKind, Twist, difference
 from ccatp.mirror.mirror import Mirror
@@ -117,7 +117,7 @@ class LegFollower:
 
     def __init__(self, mirror: Mirror, cfg: Config) -> None:
         self._mirror, self._mission, self._timeout_factor = mirror, cfg.mission, cfg.control.leg_timeout_factor
-        self._robot = cfg.robot
+        self._turn_creep = TurnCreep(cfg.robot)
         self._body = build_body(cfg.robot, cfg.mission)
         limits, health = cfg.limits, cfg.health
         slow = limits.model_copy(
@@ -177,7 +177,7 @@ class LegFollower:
     def _creep(self, stop: Stop, courses: FloatArray, mean_m: float) -> tuple[float, float]:
         """How far a turn through courses creeps, ``mean_m`` at the mean of all headings, m; its direction, rad."""
         gravities = [self._mirror.gravity_in_robot(DeckPose(stop.x_m, stop.y_m, c)) for c in courses.tolist()]
-        share = sum(creep_share(self._robot, gravity) for gravity in gravities) / len(gravities)
+        share = sum(map(self._turn_creep.share, gravities)) / len(gravities)
         return share * mean_m, float(courses[0]) + atan2(gravities[0][1], gravities[0][0])
 
     def begin_turn(self, leg: Leg, motion: StateEstimate, heading_rad: float, *, is_slow: bool) -> Leg:

@@ -9,7 +9,7 @@ from ccatp.config.load import load_config
 from ccatp.config.models import RobotConfig
 from ccatp.control.thrust import (
     ThrustControl,
-    creep_share,
+    TurnCreep,
     forecast_grip,
     friction_by_creep,
     least_thrust_n,
@@ -135,11 +135,12 @@ def test_creep_of_turns_shows_the_friction(friction: float) -> None:
 def test_a_turn_creeps_most_with_downhill_behind() -> None:
     """On 18 degrees with 36 N: the shares of all headings have the mean 1; on a floor a turn creeps by none more."""
     cfg = robot()
-    shares = [creep_share(cfg, gravity(radians(degrees))) for degrees in range(0, 360, 45)]
+    creep = TurnCreep(cfg)
+    shares = [creep.share(gravity(radians(degrees))) for degrees in range(0, 360, 45)]
     assert shares == pytest.approx([1.54, 1.25, 0.91, 0.73, 0.68, 0.73, 0.91, 1.25], abs=0.05)
     assert sum(shares) / len(shares) == pytest.approx(1.0)
-    assert creep_share(cfg, (0.0, 0.0, -1.0)) == 1.0
-    assert creep_share(robot(thrust_n=2.0), gravity(0.0)) == 1.0  # it is lifted off
+    assert creep.share((0.0, 0.0, -1.0)) == 1.0
+    assert TurnCreep(robot(thrust_n=2.0)).share(gravity(0.0)) == 1.0  # it is lifted off
 
 
 @pytest.mark.parametrize(
