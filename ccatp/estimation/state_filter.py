@@ -42,7 +42,7 @@ class SurveyFilter:
         self._mirror, self.terrain = mirror, Terrain(mirror)
         self._motion = sm.SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m)
         self._base_per_radius = 0.5 * robot.wheel_base_m / robot.wheel_radius_m
-        self._impulses, self._drift = np.zeros(sm.STATES), np.zeros(sm.STATES)
+        self._drift = np.zeros(sm.STATES)
         self._seams = SeamLines(mirror, robot)
         self._legs = SlipPrior(self._full)
         self._tilt_sigma_m = robot.puck_height_m * self._full.panel_tilt_sigma_rad
@@ -128,8 +128,8 @@ class SurveyFilter:
         )
         motion = self._motion.over(dt_s, self.slope(), share)
         jerk, twist = full.jerk_density_m2_s5 * dt_s, full.angular_acceleration_density_rad2_s3 * dt_s
-        impulses, drift = self._impulses, self._drift  # work space, of which the filter keeps nothing
-        impulses[sm.IMPULSES] = jerk, twist, slip, slip, creep, turn_creep
+        impulses = np.array((jerk, twist, slip, slip, creep, turn_creep))
+        drift = self._drift  # work space, of which the model keeps nothing
         drift[sm.BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * dt_s
         drift[sm.BA] = full.accelerometer_bias_walk_m_s2_sqrt_s**2 * dt_s
         # A tyre that gives way does so downhill in the main, and as it likes besides; what it loses of a turn varies.
@@ -138,7 +138,7 @@ class SurveyFilter:
         lost = (self._base_per_radius * full.turn_loss_per_creep) ** 2 * turned_rad
         variance = share * share * float(self._filter.covariance[sm.CT, sm.CT])
         drift[sm.PR] = drift[sm.PL] = encoders + lost * (creep * creep + variance)
-        self._filter.predict(motion, drift, impulses)
+        self._filter.predict(motion, motion.noise(self._filter.mean, impulses, drift))
 
     def encoder_walk(self, wheel: WheelAngle) -> float:
         """Growth of the summed angle's error per second: white rate noise, none where a counter counts."""

@@ -45,7 +45,7 @@ frame, m.
 STATES = 20
 POSE, SPEEDS, SLIPS, ANGLES, EDGES, TILT = [X, Y, PSI], [V, A, W], [SR, SL, C, CT], [PR, PL], [E0, E1], [TX, TY]
 CALIBRATION = [BG, KG, BA, SR, SL, KL, C, CT]
-IMPULSES = np.array([A, W, SR, SL, C, CT])  # whose noise enters at the beginning of a step and is carried through it
+_NOISY = np.array([A, W, SR, SL, C, CT])  # whose noise enters at the beginning of a step and is carried through it
 _MOVED = np.array([X, Y, PSI, V, PR, PL])  # by a step, in the order of `SurveyMotion.at`
 # Entries of the motion's Jacobian beside those of the identity, as `SurveyMotion.at` lists them: one call sets all.
 _COLUMNS: dict[int, tuple[int, ...]] = dict.fromkeys((X, Y, PSI), (PSI, V, A, W, C, CT))
@@ -76,10 +76,14 @@ class SurveyMotion:
     def over(self, dt_s: float, slope: Slope, creep_share: float = 1.0) -> "SurveyMotion":
         """Set the step's duration, the ground under it, and ``share``."""
         self._dt_s, self._slope, self._share = dt_s, slope, creep_share
+        self._of: FloatArray | None = None
         return self
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The state after the step (n,) and the Jacobian (n, n); work space that holds until the next call."""
+        if x is self._of:  # the same arrays again: the filter asks for what the noise has asked for already
+            return self._x, self._F
+        self._of = x
         state: list[float] = x.tolist()
         x_m, y_m, psi, v, a, w, _, _, _, s_r, s_l, kl, c, p_r, p_l, *_, ct = state
         dt, (fx, fy, fxx, fxy, _, gx, gy) = self._dt_s, self._slope
@@ -137,6 +141,18 @@ class SurveyMotion:
         after[:, PR] = p_r + (d + side) / (self._radius_m * (1.0 - s_r))
         after[:, PL] = p_l + (d - side) / (self._radius_m * (1.0 - s_l))
         return after
+
+    def noise(self, x: FloatArray, impulses: FloatArray, drift: FloatArray) -> FloatArray:
+        """Covariance (n, n) of a step's noise from the state x (n,) before it.
+
+        ``impulses`` (6,): variances of the impulses on A, W, SR, SL, C, CT at its beginning; ``drift`` (n,): those
+        at its end.
+        """
+        G = self.at(x)[1].take(_NOISY, axis=1)
+        G *= np.sqrt(impulses)
+        Q: FloatArray = G.dot(G.T)
+        Q.reshape(-1)[:: STATES + 1] += drift
+        return Q
 
 
 _SENSORS = np.eye(STATES)  # Jacobian of a reading of each state; that by the scale error is set where it is used

@@ -81,12 +81,10 @@ class Filter(Protocol):
         At first the identity.
         """
 
-    def predict(self, F: FloatArray | FilterModel, Q: FloatArray, impulses: FloatArray | None = None) -> None:
+    def predict(self, F: FloatArray | FilterModel, Q: FloatArray) -> None:
         """Advance the state: x <- F x, P <- F P F^T + Q (thesis eqs 2.5, 2.6), or the same with a nonlinear f.
 
-        F (n, n) or a model; Q variances (n,) or covariance (n, n); ``impulses``: variances (n,) of noise that enters
-        before the step and is carried through it, P <- F (P + diag) F^T + Q. Raises ``FilterShapeError`` and
-        ``FilterDiverged`` (not finite).
+        F and Q have shape (n, n). Raises ``FilterShapeError`` and ``FilterDiverged`` (not finite).
         """
 
     def update(self, z: FloatArray, H: FloatArray | FilterModel, R: FloatArray) -> Innovation:

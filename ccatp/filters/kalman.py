@@ -88,7 +88,6 @@ class KalmanFilter:
         self._propagate = 1.0, self._F.T, product, 1.0, predicted, 1, 0, 1  # predicted = F product + Q
         self._load = noise.ravel(order="K"), predicted.ravel(order="K")
         self._accept = predicted.ravel(order="K"), self._flat
-        self._variances, self._Q_variances = self._flat[: -1 : n + 2], self._load[0][: -1 : n + 2]
         self._squares = self._accept[0], self._accept[0], (n + 1) ** 2 - 1  # without the corner
         self._U_column, self._U_row, self._unit = self._U[:, n], self._U[n, :n], np.eye(n + 1)[n]
         self._rows: dict[tuple[int, ...], _Rows] = {}
@@ -123,28 +122,19 @@ class KalmanFilter:
         """Re-initialise with copies of ``mean`` (n,) and ``covariance`` (n, n); see ``Filter.reset``."""
         self._start(*checked_gaussian(mean, covariance, self._shape))
 
-    def predict(self, F: FloatArray | FilterModel, Q: FloatArray, impulses: FloatArray | None = None) -> None:
-        """Advance by F and Q, thesis eqs 2.5 and 2.6; see ``Filter.predict``."""
-        x = kept = None
+    def predict(self, F: FloatArray | FilterModel, Q: FloatArray) -> None:
+        """Advance by F (n, n) and Q (n, n), thesis eqs 2.5 and 2.6; see ``Filter.predict``."""
+        x = None
         if F is not self._checked_F or Q is not self._checked_Q:
             F, x = self._check_transition(F, Q)
         self._F_rows[...] = F
-        if Q.ndim == 1:
-            self._Q_rows.fill(0.0)
-            self._Q_variances[:] = Q
-        else:
-            self._Q_rows[...] = Q
-        if impulses is not None:
-            kept = self._variances.copy()
-            self._variances += self._checked_impulses(impulses)
+        self._Q_rows[...] = Q
         dcopy(*self._load)
         dsymm(*self._multiply)
         dgemm(*self._propagate)
         # BLAS does not warn where it overflows.
         if not ddot(*self._squares) < HUGE:
             self._F_rows[...] = np.eye(self._n)
-            if kept is not None:
-                self._variances[:] = kept
             raise FilterDiverged(f"prediction is not finite: mean {(-self._predicted_minus_x[:-1]).tolist()}")
         dcopy(*self._accept)
         if x is not None:
@@ -164,15 +154,10 @@ class KalmanFilter:
                 raise FilterDiverged(f"prediction is not finite: mean {x.tolist()}")
         if F.shape != self._shape:
             raise FilterShapeError(name, F.shape, str(self._shape))
-        if Q.shape not in (self._shape, self._shape[:1]):
-            raise FilterShapeError("Q", Q.shape, f"({self._n},) or {self._shape}")
+        if Q.shape != self._shape:
+            raise FilterShapeError("Q", Q.shape, str(self._shape))
         self._checked_F, self._checked_Q = F, Q
         return F, x
-
-    def _checked_impulses(self, impulses: FloatArray) -> FloatArray:
-        if impulses.shape != self._shape[:1]:
-            raise FilterShapeError("impulses", impulses.shape, f"({self._n},)")
-        return impulses
 
     def update(self, z: FloatArray, H: FloatArray | FilterModel, R: FloatArray) -> Innovation:
         """Condition on z (m,) = H x + noise, thesis eqs 2.7 to 2.10; see ``Filter.update``."""

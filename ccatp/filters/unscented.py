@@ -62,24 +62,24 @@ class UnscentedKalmanFilter(KalmanFilter):
         super().reset(mean, covariance)
         self._predicted = None
 
-    def predict(self, F: FloatArray | FilterModel, Q: FloatArray, impulses: FloatArray | None = None) -> None:
-        """Advance by F, a matrix (n, n) or a model, and Q; see ``Filter.predict``."""
+    def predict(self, F: FloatArray | FilterModel, Q: FloatArray) -> None:
+        """Advance by F, a matrix (n, n) or a model, and Q (n, n); see ``Filter.predict``."""
         self._predicted = None
         if isinstance(F, np.ndarray):
-            super().predict(F, Q, impulses)
+            super().predict(F, Q)
             return
-        n, P = self._n, self.covariance
-        L = self._draw(P if impulses is None else P + np.diag(self._checked_impulses(impulses)))
+        n = self._n
+        L = self._draw()
         images = F.through(self.mean + self._offsets)
         if images.shape != (2 * n + 1, n):
             raise FilterShapeError("f(X)", images.shape, f"({2 * n + 1}, {n})")
-        if Q.shape not in ((n,), (n, n)):
-            raise FilterShapeError("Q", Q.shape, f"({n},) or ({n}, {n})")
+        if Q.shape != (n, n):
+            raise FilterShapeError("Q", Q.shape, str((n, n)))
         if not np.vdot(images, images) + np.vdot(Q, Q) < HUGE:
             raise FilterDiverged(f"prediction is not finite: images of the points {images.tolist()}, or Q")
-        mean, noise = self._weights.dot(images), Q if Q.ndim == 2 else np.diag(Q)
+        mean = self._weights.dot(images)
         deviations = (images - mean) * self._roots
-        self._P_rows[:] = dgemm(1.0, deviations.T, deviations.T, 1.0, noise.T, 0, 1).T  # both halves are read
+        self._P_rows[:] = dgemm(1.0, deviations.T, deviations.T, 1.0, Q.T, 0, 1).T  # both halves are read
         self._minus_x[:] = self._minus_x_row[:] = -mean
         self._mean = self._covariance = None
         self._predicted = dgemm(1.0, (self._offsets * self._roots).T, deviations.T, 0.0, None, 0, 1), L
@@ -89,7 +89,7 @@ class UnscentedKalmanFilter(KalmanFilter):
         if isinstance(H, np.ndarray):
             return super().update(z, H, R)
         m = z.size
-        self._draw(self.covariance)
+        self._draw()
         images = H.through(self.mean + self._offsets)
         if z.ndim != 1 or images.shape != (len(self._offsets), m):
             raise FilterShapeError("h(X)", images.shape, f"({len(self._offsets)}, m) with z of shape {z.shape}")
@@ -115,9 +115,9 @@ class UnscentedKalmanFilter(KalmanFilter):
             raise FilterDiverged("update is not finite, or the covariance of the measurement is not positive definite")
         return self._subtract(rows, rows.residual.tolist())
 
-    def _draw(self, P: FloatArray) -> FloatArray:
+    def _draw(self) -> FloatArray:
         n = self._n
-        L = square_root(P)
+        L = square_root(self.covariance)
         np.multiply(L.T, self._spread, self._offsets[1 : n + 1])
         np.negative(self._offsets[1 : n + 1], self._offsets[n + 1 :])
         return L

@@ -134,11 +134,12 @@ def survey_problem(cfg: Config) -> FilterProblem:
     slope = Terrain(build_mirror(cfg.mirror)).at(float(mean[sm.X]), float(mean[sm.Y]))
     motion = sm.SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m).over(DT_S, slope)
     slip = (full.slip_scatter_max * DT_S) ** 2
-    impulses = full.jerk_density_m2_s5 * DT_S, full.angular_acceleration_density_rad2_s3 * DT_S, *[slip] * 3, 1e-9
+    impulses = np.array(
+        (full.jerk_density_m2_s5 * DT_S, full.angular_acceleration_density_rad2_s3 * DT_S, *[slip] * 3, 1e-9)
+    )
     drift = np.zeros(sm.STATES)
     drift[[sm.PR, sm.PL]] = cfg.localizer.encoder_sigma_rad_s**2 * full.encoder_period_s * DT_S
-    G = motion.at(mean)[1].take(sm.IMPULSES, axis=1)
-    Q = (G * impulses).dot(G.T) + np.diag(drift)
+    Q = motion.noise(mean, impulses, drift)
     gyroscope, accelerometer = cfg.localizer.gyroscope_sigma_rad_s**2, cfg.localizer.accelerometer_sigma_m_s2**2
     variances = {sm.W: gyroscope, sm.PR: _ANGLE_RAD2, sm.PL: _ANGLE_RAD2, sm.A: accelerometer}
     sight = sm.SensorRows([(state, 0.0, variance) for state, variance in variances.items()])

@@ -72,15 +72,11 @@ class RecordingFilter:
         filter_ = self._filter
         self.mean, self.covariance, self.transition = filter_.mean, filter_.covariance, filter_.transition
 
-    def predict(self, F: FloatArray | FilterModel, Q: FloatArray, impulses: FloatArray | None = None) -> None:
+    def predict(self, F: FloatArray | FilterModel, Q: FloatArray) -> None:
         """As ``Filter.predict``."""
         mean, covariance = self.mean, self.covariance
-        self._filter.predict(F, Q, impulses)
+        self._filter.predict(F, Q)
         self._look()
-        if Q.ndim == 1:
-            Q = np.diag(Q)
-        if impulses is not None:
-            Q = Q + (self.transition * impulses).dot(self.transition.T)
         noise = added_noise(covariance, self.transition, self.covariance, Q)
         self._past.append(_Past(mean, covariance, (self.transition, self.mean, noise)))
         self.count += 1

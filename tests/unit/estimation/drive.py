@@ -257,10 +257,10 @@ class Fragile:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._filter, name)
 
-    def predict(self, F: Any, Q: FloatArray, impulses: FloatArray | None = None) -> None:
+    def predict(self, F: Any, Q: FloatArray) -> None:
         if self.is_broken:
             raise FilterDiverged("for the sake of the test")
-        self._filter.predict(F, Q, impulses)
+        self._filter.predict(F, Q)
 
 
 def fix_at(t_s: float, xy_m: tuple[float, float], sigma_m: float = 1e-5) -> Fix:

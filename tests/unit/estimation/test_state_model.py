@@ -92,6 +92,18 @@ def test_the_motion_of_many_is_that_of_each(points: list[FloatArray], slope: Slo
         np.testing.assert_allclose(motion.at(x)[0], after, rtol=0.0, atol=1e-13)  # rounding of numbers up to 20
 
 
+@examples
+@given(states(), slopes(), durations, st.lists(st.floats(0.0, 1.0), min_size=6, max_size=6))
+def test_noise_is_that_of_impulses_carried_through_the_step(
+    x: FloatArray, slope: Slope, dt_s: float, impulses: list[float]
+) -> None:
+    motion, drift = SurveyMotion(R_M, BASE_M).over(dt_s, slope), np.linspace(0.0, 1.0, STATES)
+    columns = differences(motion, x)[:, [A, W, SR, SL, C, CT]]
+    expected = (columns * impulses).dot(columns.T) + np.diag(drift)
+    # A product of two derivatives below 10, each off by the tolerance.
+    np.testing.assert_allclose(motion.noise(x, np.array(impulses), drift), expected, atol=40.0 * TOLERANCE)
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_creep_goes_downhill_whichever_way_the_robot_drives(sign: float) -> None:
     x = np.zeros(STATES)

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccatp.core import FloatArray
-from ccatp.estimation.state_model import Affine
 from ccatp.filters import FILTERS
 from ccatp.filters.base import Filter, FilterDiverged, FilterShapeError
 from ccatp.filters.kalman import KalmanFilter
@@ -69,10 +68,8 @@ def test_predict_and_update_refuse_shapes() -> None:
     kf = make()
     with pytest.raises(FilterShapeError, match=r"F has shape \(3, 3\)"):
         kf.predict(np.eye(3), EYE)
-    with pytest.raises(FilterShapeError, match=r"Q has shape \(3,\), wanted \(2,\) or \(2, 2\)"):
-        kf.predict(EYE, np.ones(3))
-    with pytest.raises(FilterShapeError, match=r"impulses has shape \(3,\), wanted \(2,\)"):
-        kf.predict(EYE, EYE, np.ones(3))
+    with pytest.raises(FilterShapeError, match=r"Q has shape \(2,\)"):
+        kf.predict(EYE, np.ones(2))
     with pytest.raises(FilterShapeError, match=r"z has shape \(1, 1\)"):
         kf.update(np.ones((1, 1)), np.ones((1, 2)), np.ones(1))
     with pytest.raises(FilterShapeError, match=r"H has shape \(2, 1\), wanted \(1, 2\)"):
@@ -89,8 +86,6 @@ def test_what_is_not_finite_is_refused_and_leaves_the_state(bad: float) -> None:
         kf.update(np.array([bad]), np.ones((1, 2)), np.ones(1))
     with pytest.raises(FilterDiverged, match="prediction is not finite"):
         kf.predict(np.diag([bad, bad]), EYE)
-    with pytest.raises(FilterDiverged, match="prediction is not finite"):
-        kf.predict(EYE, EYE, np.array([1.0, bad]))
     np.testing.assert_array_equal(kf.mean, before[0])
     np.testing.assert_array_equal(kf.covariance, before[1])
 
@@ -318,20 +313,6 @@ def test_shapes_of_jacobians() -> None:
         build("ekf").predict(Bent(2, 3), EYE)
     with pytest.raises(FilterShapeError, match=r"H has shape \(1, 3\), wanted \(1, 2\)"):
         build("ekf").update(np.zeros(1), Bent(1, 3), np.ones(1))
-
-
-@BOTH
-@pytest.mark.parametrize("is_model", [False, True])
-def test_impulses_are_carried_through_the_step_and_variances_are_a_diagonal(name: str, is_model: bool) -> None:
-    filter_, F, impulses = build(name), np.array([[1.0, 0.5], [0.0, 2.0]]), np.array([0.3, 0.7])
-    expected = F.dot(filter_.covariance + np.diag(impulses)).dot(F.T) + np.diag([0.1, 0.2])
-    filter_.predict(Affine(F, np.zeros(2)) if is_model else F, np.array([0.1, 0.2]), impulses)
-    np.testing.assert_allclose(filter_.covariance, expected, rtol=1e-14)
-    np.testing.assert_allclose(filter_.mean, F.dot([1.0, 2.0]), rtol=1e-14)
-    # Noise that is a matrix again finds nothing of the diagonal.
-    full = np.array([[0.4, 0.1], [0.1, 0.5]])
-    filter_.predict(EYE, full)
-    np.testing.assert_allclose(filter_.covariance, expected + full, rtol=1e-14)
 
 
 @BOTH
