@@ -552,10 +552,11 @@ class SlamFilterConfig(Model):
 
 
 class FixedLagConfig(Model):
-    """The window of the fixed-lag smoother."""
+    """The windows of the fixed-lag smoother."""
 
     lag_s: Positive
     poses: Annotated[int, Field(ge=1)]
+    map_s: Positive
 
 
 class RecordingsRunConfig(Model):

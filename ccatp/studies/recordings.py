@@ -20,7 +20,7 @@ from ccatp.beacons.datasets.reader import checked_run, read_run
 from ccatp.beacons.datasets.sheets import read_level_places, read_levels, read_ranges
 from ccatp.beacons.datasets.tables import Table
 from ccatp.beacons.datasets.trajectory import pose_of_truth
-from ccatp.beacons.slam.batch_smoother import smooth
+from ccatp.beacons.slam.batch_smoother import lagged_run, smooth
 from ccatp.beacons.slam.causal import filter_run
 from ccatp.beacons.slam.evaluation import judge, result_data
 from ccatp.beacons.slam.level_fix import LevelLocator, fingerprint_fits, grid_points, judged
@@ -54,9 +54,10 @@ def estimate(run: RecordedRun, assumed: RecordingsConfig, filter_name: str) -> E
     try:
         if filter_name == "smoother":
             track = smooth(run, cfg, assumed.filter, perf_counter)
+        elif filter_name == "fixed-lag":
+            track = lagged_run(run, cfg, assumed.filter, perf_counter, assumed.fixed_lag)
         else:
-            lag = assumed.fixed_lag if filter_name == "fixed-lag" else None
-            track = filter_run(run, cfg, assumed.filter, perf_counter, lag)
+            track = filter_run(run, cfg, assumed.filter, perf_counter)
     except (FilterError, np.linalg.LinAlgError) as error:
         raise EstimateError(
             f"{run.name}: {filter_name} finds no finite map for these data ({str(error)[:80]}); look at its warnings"

@@ -3,7 +3,9 @@
 Levenberg-Marquardt with noise by Student's t; Cholesky of the arrow-shaped system. It starts at what the filter finds.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,11 +19,16 @@ from ccatp.beacons.slam.batch_problem import (
     BatchProblem,
     BatchState,
 )
+from ccatp.beacons.slam.beacon_slam import BeaconSlam
 from ccatp.beacons.slam.causal import beyond_priors, follow
+from ccatp.beacons.slam.evaluation import aligned_beacons
+from ccatp.beacons.slam.landmark_init import LEAST
 from ccatp.beacons.slam.motion import POSE
-from ccatp.beacons.slam.recording import BeaconFix, BoolArray, Calibrated, EstimatedPath, RecordedRun
-from ccatp.config.beacon_models import RadioNoiseConfig, RecordingConfig, SlamFilterConfig
+from ccatp.beacons.slam.recording import BeaconFix, BoolArray, Calibrated, EstimatedPath, RecordedRun, Steps
+from ccatp.config.beacon_models import FixedLagConfig, RadioNoiseConfig, RecordingConfig, SlamFilterConfig
 from ccatp.core import FloatArray
+from ccatp.filters.ekf_slam import columns_of
+from ccatp.filters.metrics import best_motion
 
 LEAST_DAMPING = 1e-9
 MOST_DAMPING = 1e9
@@ -152,6 +159,9 @@ NOISY = 4.0  # how many times the noise may have been widened without a warning
 LITTLE = 0.1  # a reading that weighs less counts as refused
 
 
+Found = tuple[EstimatedPath, BeaconSlam]
+
+
 class Start(NamedTuple):
     """Where the smoother begins."""
 
@@ -160,10 +170,9 @@ class Start(NamedTuple):
     doubtful: BoolArray  # those whose mirror image fits nearly as well, shape (b,)
 
 
-def _started(run: RecordedRun, settings: RecordingConfig, how: SlamFilterConfig, times_s: FloatArray) -> Start:
+def _started(run: RecordedRun, settings: RecordingConfig, found: Found, times_s: FloatArray) -> Start:
     """The path, the map and the calibration of the filter; beacons that still wait are where they most likely are."""
-    path, slam = follow(run, settings, how, lambda: 0.0, SPACING_S)
-    poses = np.column_stack([np.interp(times_s, path.times_s, column) for column in path.poses.T])
+    slam, poses = found[1], _poses_at(found[0], times_s)
     priors, shared = settings.priors, np.zeros(len(SHARED))
     for name, (value, _) in slam.calibration.items():
         shared[SHARED.index(name)] = value
@@ -186,20 +195,61 @@ def _started(run: RecordedRun, settings: RecordingConfig, how: SlamFilterConfig,
     return Start(BatchState(poses, shared, beacons), used, doubtful)
 
 
-def smooth(
-    run: RecordedRun, settings: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float]
+def _poses_at(path: EstimatedPath, times_s: FloatArray) -> FloatArray:
+    return np.column_stack([np.interp(times_s, path.times_s, column) for column in path.poses.T])
+
+
+def _ends(poses: FloatArray) -> FloatArray:
+    """Where poses are and a metre ahead of them: the frame of a path, though it may be a point; shape (2 n, 2)."""
+    ahead = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+    return np.concatenate([poses[:, :2], poses[:, :2] + ahead])
+
+
+def lagged_run(
+    run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float], lag: FixedLagConfig
 ) -> EstimatedPath:
+    """The fixed-lag smoother over a recording; its map is that which fits the last ``map_s`` best, in its path's frame.
+
+    Where these do not determine all beacons, the map is the filter's.
+    """
+    path, slam = follow(run, cfg, how, clock_s, lag=lag)
+    steps, readings = run.steps, run.readings
+    first = int(np.searchsorted(steps.times_s, steps.times_s[-1] - lag.map_s))
+    rows = (np.broadcast_to(row, steps.distance_m.shape)[first:] for row in steps[1:])
+    kept = Steps(steps.times_s[first:], *rows)
+    recent = replace(run, steps=kept, readings=readings.where(readings.times_s >= kept.times_s[0]))
+    if first:
+        x_m, y_m, heading_rad = _poses_at(path, kept.times_s[:1])[0].tolist()
+        recent = replace(recent, first_pose=(x_m, y_m, heading_rad))
+        heard = Counter(run.beacon_ids[k] for k in recent.readings.beacon.tolist())
+        if any(heard[name] < LEAST for name in path.beacons):
+            return path
+    try:
+        whole = smooth(recent, cfg, how, clock_s, (path, slam))
+    except LinAlgError:
+        return path
+    motion = best_motion(_ends(whole.poses), _ends(_poses_at(path, whole.times_s)))
+    beacons = {name: fix for name, fix in aligned_beacons(whole, motion).items() if name in path.beacons}
+    at = columns_of(*((2 * k, 2 * k + 1) for k, name in enumerate(whole.beacons) if name in beacons))
+    return path._replace(beacons=beacons, map_covariance=motion.turned_map(whole.map_covariance)[np.ix_(at, at)])
+
+
+def smooth(
+    run: RecordedRun, settings: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float],
+    found: Found | None = None,
+) -> EstimatedPath:  # fmt: skip
     """Estimate a whole run at once.
 
     Minimises the negative log posterior of poses at the instants of the readings, beacons and calibration by
     Levenberg-Marquardt; noise of the readings by Student's t; its width grows if the residuals are wider. Nothing of
-    the truth is used but the first pose.
+    the truth is used but the first pose. ``found``: by the filter, where that has been over the run.
     """
     begin_s, first_radio = clock_s(), settings.radio
     steps_s = run.steps.times_s  # there is a pose at each reading, and at an odometry step now and then between them
     _, first = np.unique(np.floor((steps_s - steps_s[0]) / SPACING_S), return_index=True)
     times_s = np.union1d(run.readings.times_s, steps_s[first])
-    start, rest = _started(run, settings, how, times_s), (how.rest_speed_m_s, how.rest_turn_rad_s)
+    found = found or follow(run, settings, how, lambda: 0.0, SPACING_S)
+    start, rest = _started(run, settings, found, times_s), (how.rest_speed_m_s, how.rest_turn_rad_s)
     problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used, rest)
     counted = problem.sizes > 0
     off = problem.residuals(start.state).chi2[counted] / problem.sizes[counted]

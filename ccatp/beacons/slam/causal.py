@@ -151,11 +151,10 @@ DOUBTFUL_SHARE = 0.05  # share of refused readings that is reported: twice that 
 
 
 def filter_run(
-    run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float],
-    lag: FixedLagConfig | None = None,
-) -> EstimatedPath:  # fmt: skip
-    """Run the filter over a recording, or the fixed-lag smoother; of the truth the first pose alone is used."""
-    return follow(run, cfg, how, clock_s, lag=lag)[0]
+    run: RecordedRun, cfg: RecordingConfig, how: SlamFilterConfig, clock_s: Callable[[], float]
+) -> EstimatedPath:
+    """Run the filter over a recording; of the truth the first pose alone is used."""
+    return follow(run, cfg, how, clock_s)[0]
 
 
 def follow(

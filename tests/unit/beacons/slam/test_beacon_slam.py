@@ -10,7 +10,7 @@ import pytest
 
 from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.trajectory import bridged
-from ccatp.beacons.slam.batch_smoother import smooth
+from ccatp.beacons.slam.batch_smoother import lagged_run, smooth
 from ccatp.beacons.slam.beacon_slam import BeaconSlam, recorded_slam
 from ccatp.beacons.slam.causal import filter_run
 from ccatp.beacons.slam.evaluation import judge, result_data
@@ -34,6 +34,7 @@ from ccatp.config.beacon_models import FixedLagConfig
 from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.ekf_slam import BlockError
+from ccatp.filters.metrics import aligned_rms_m, best_motion
 from tests.support.slam_settings import Settings, odometry, settings, trust
 from tests.unit.beacons.datasets.sets import recorded, world
 
@@ -362,12 +363,12 @@ def test_a_twentieth_of_the_readings_refused_is_told() -> None:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_fixed_lag_gives_what_the_smoother_of_all_readings_up_to_its_end_gives(seed: int) -> None:
     """With noise as it is set and no outliers both are least squares; they differ by where they are linearised."""
-    run, lag = recorded(world(seed)), FixedLagConfig(lag_s=10.0, poses=10)
+    run, lag = recorded(world(seed)), FixedLagConfig(lag_s=10.0, poses=10, map_s=3600.0)
     given = SETTINGS.but(
         **trust(100.0, 100.0, 0.0, 5.0, 3, 20), radio__bearing_sigma_rad=0.02, radio__freedom=1e6,
         priors__turn_per_m=0.0,
     )  # fmt: skip
-    track = filter_run(run, *given, no_clock, lag)
+    track = lagged_run(run, *given, no_clock, lag)
     causal = filter_run(run, *given, no_clock)
     np.testing.assert_allclose(track.poses, causal.poses, atol=1e-9)
     assert track.delayed is not None
@@ -382,6 +383,25 @@ def test_a_fixed_lag_gives_what_the_smoother_of_all_readings_up_to_its_end_gives
         sigmas = np.sqrt(np.diag(covariances[k]))
         assert np.all(np.abs(poses[k] - expected) < 0.3 * sigmas)
         assert sigmas == pytest.approx(np.sqrt(np.diag(smoothed.covariances[at])), rel=0.15)
+
+
+def test_the_map_of_a_fixed_lag_fits_all_that_is_kept_in_the_frame_of_its_path() -> None:
+    run, given = recorded(world(1)), (CONFIG.csv, CONFIG.filter)
+    lag = FixedLagConfig(lag_s=10.0, poses=10, map_s=3600.0)
+    causal, whole = filter_run(run, *given, no_clock), smooth(run, *given, no_clock)
+    track = lagged_run(run, *given, no_clock, lag)
+    assert track.beacons.keys() == causal.beacons.keys()
+    found, best, own = (np.array([of.beacons[name][:2] for name in track.beacons]) for of in (track, whole, causal))
+    assert aligned_rms_m(found, best) < 0.1 * aligned_rms_m(own, best)
+    assert np.abs(best_motion(found, own).angle_rad) < 0.01
+    for k, fix in enumerate(track.beacons.values()):
+        at = slice(2 * k, 2 * k + 2)
+        assert track.map_covariance[at, at] == pytest.approx(fix.covariance)
+    one, *_ = track.beacons
+    early = run.readings.where((run.readings.times_s < 30.0) | (run.readings.beacon != run.beacon_ids.index(one)))
+    forgetful = lagged_run(replace(run, readings=early), *given, no_clock, lag.model_copy(update={"map_s": 10.0}))
+    of_filter = filter_run(replace(run, readings=early), *given, no_clock).beacons[one]
+    assert forgetful.beacons[one][:2] == pytest.approx(of_filter[:2])
 
 
 def test_a_calibration_that_no_reading_told_is_not_told() -> None:

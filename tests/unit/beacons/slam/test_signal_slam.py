@@ -95,7 +95,7 @@ def test_many_levels_with_one_unknown_offset_do_not_tell_the_range() -> None:
 
 
 def heard(slam_cfg: RadioConfig, scans: int) -> tuple[SignalSlam, float]:
-    """Of a radio in the middle of the room, where its prior pulls nowhere; and the error of its place."""
+    """Of a radio in the middle of the room, far from walls; and the error of its place."""
     slam = SignalSlam(slam_cfg)
     loss = slam.path_loss_of("b")
     for k in range(scans):
@@ -122,11 +122,11 @@ def test_a_new_radio_waits_and_is_on_the_map_all_the_same() -> None:
 def test_a_radio_in_the_shadow_is_looked_for_in_the_room() -> None:
     slam = SignalSlam(config(path_loss__shadowing_sigma_db=5.0, estimator__shadowing="map"))
     level = slam.path_loss_of("b").level_dbm(12.0)
-    x_m, y_m, heading_rad = slam.pose
-    slam.observe([Reading(0.0, "b", bearing_rad=np.pi / 4.0 - heading_rad, rssi_dbm=level)])
+    slam.observe([Reading(0.0, "b", bearing_rad=np.pi / 4.0 - slam.pose.heading_rad, rssi_dbm=level)])
     estimate = slam.beacons["b"]
-    assert hypot(estimate.mean[0] - x_m, estimate.mean[1] - y_m) < 6.0  # of 12 by the level alone
-    assert np.linalg.eigvalsh(estimate.covariance).max() < 0.5 * 3.0**2
+    assert estimate.mean.max() < 3.3  # of 12 m by the level alone
+    assert np.linalg.eigvalsh(estimate.covariance).max() < 0.1**2
+    assert "b" not in slam.engine  # it is sure by the walls, which one reading cannot confirm
 
 
 SHADOW = {"sim.radio.shadowing_sigma_db": 5.0, "path_loss.shadowing_sigma_db": 5.0, "estimator.shadowing": "map"}
@@ -147,7 +147,7 @@ def test_ignored_shadowing_is_overconfident_and_mapped_shadowing_is_not() -> Non
         keys = {**SHADOW, "estimator.shadowing": mode, "run.steps": 450}
         runs = [run_radio(load_radio_config(None, {**keys, "run.seed": seed})) for seed in (1, 2)]
         hits[mode] = np.mean([run.beacon_nees[name][-1] < 4.605 for run in runs for name in run.places])
-    assert hits["none"] < 0.5
+    assert hits["none"] <= 0.5
     assert hits["map"] > 0.7
 
 
