@@ -24,7 +24,7 @@ from ccatp.beacons.cricket.self_mapping import begin_phase_two, complete_stands,
 from ccatp.beacons.cricket.trilateration import FirstMap, map_as_possible, map_by_plan
 from ccatp.config.beacon_models import CricketConfig
 from ccatp.core import FloatArray
-from ccatp.filters.metrics import aligned_rms_m, best_motion, rms_m
+from ccatp.filters.metrics import RigidMotion, aligned_rms_m, best_motion, rms_m
 from ccatp.report.beacon_plots import MapPicture, Traces
 from ccatp.sim.motes import MoteField, MotePulse, true_motes
 
@@ -179,7 +179,7 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
     phase1_m = None
     if first is not None and not set(motes) & set(first.unplaced):
         phase1_m = aligned_rms_m(first.positions_m[motes], true_m, mirrors=not plan.anchors)
-    positions, covariance = _in_field(field, found)
+    positions, covariance = _in_field(field, found, has_shapes=bool(network.bodies))
     positions, covariance = positions[motes], _block(covariance, motes, plan.dimension)
     error_m = aligned_rms_m(positions, true_m, mirrors=not plan.bodies)
     lost = {mote for fold in found.folds for mote in fold.motes} | {mote for _, moved in mirrors for mote in moved}
@@ -241,18 +241,25 @@ def look_ahead(cfg: CricketConfig, field: SimulatedField, method: str, updates: 
     return MoteOutlook(freedom, folds, bound_rms_m(whole, field.true_m, motes, aligned=aligned))
 
 
-def _in_field(field: SimulatedField, found: MoteMap) -> tuple[FloatArray, FloatArray]:
-    """The map in the field's frame, as far as the operator knows it."""
-    plan = field.plan
+def _in_field(field: SimulatedField, found: MoteMap, *, has_shapes: bool) -> tuple[FloatArray, FloatArray]:
+    """The map in the field's frame, as far as the operator knows it.
+
+    Without shapes, ranges do not tell a map from its mirror image: the first stand is on the right of the axis from A
+    to B, as in phase 1.
+    """
+    plan, places_m, covariance_m2 = field.plan, found.positions_m, found.covariance_m2
     if not plan.anchors:
-        motion = plain_frame(found.positions_m)
-        return motion.moved(found.positions_m), motion.turned_map(found.covariance_m2)
+        motion = plain_frame(places_m)
+        return motion.moved(places_m), motion.turned_map(covariance_m2)
     up = plan.axes_m[1] / np.linalg.norm(plan.axes_m[1])
     origin, axis = plan.anchors
-    way = found.positions_m[axis] - found.positions_m[origin]
+    way, head = places_m[[axis, plan.heads[0]]] - places_m[origin]
+    if not has_shapes and way[0] * head[1] > way[1] * head[0]:
+        mirror = RigidMotion(np.diag((-1.0, 1.0)), np.zeros(2))
+        places_m, covariance_m2 = mirror.moved(places_m), mirror.turned_map(covariance_m2)
     wanted = np.array([plan.axes_m[0], plan.axes_m[0] + up * np.linalg.norm(way)])
-    motion = best_motion(found.positions_m[[origin, axis]], wanted)
-    positions, covariance = motion.moved(found.positions_m), motion.turned_map(found.covariance_m2)
+    motion = best_motion(places_m[[origin, axis]], wanted)
+    positions, covariance = motion.moved(places_m), motion.turned_map(covariance_m2)
     if np.isfinite(plan.surveyed_m).sum() == 3:
         return pinned_map(positions, covariance, plan.surveyed_m)
     return positions, covariance

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccatp.beacons.cricket.mote_map import MoteMap, map_motes
 from ccatp.beacons.cricket.range_network import MappingError
 from ccatp.beacons.slam.motion import Steering
 from ccatp.config.load import load_radio_config, load_recordings_config
 from ccatp.config.models import Config
-from ccatp.studies import cricket_study
+from ccatp.studies import cricket_study, mote_runs
 from ccatp.studies.campaign import CampaignError, Cell, CellResult, Job, JobOutcome
 from ccatp.studies.cricket_study import combine, run_job
 from ccatp.studies.damage import DAMAGES, Damage, run_damage
@@ -80,6 +81,22 @@ def test_a_field_whose_motes_cannot_be_laid_out() -> None:
     with pytest.raises(MappingError, match=r"phase 1 cannot place M\d+ \(and \d+ more\); the batch"):
         run_filter(cfg, field)
     assert np.median(np.linalg.norm(run_batch(cfg, field).positions_m, axis=1)) > 0.0
+
+
+def test_a_map_without_shapes_is_on_the_side_of_phase_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whichever of the two images the fit began with."""
+    cfg = load_radio_config(None, {"system": "cricket", "cricket.batch.uses_shapes": False}).cricket
+    field = simulate_field(cfg, 3)
+    found = run_batch(cfg, field)
+
+    def mirrored(*args: Any, **options: Any) -> MoteMap:
+        best = map_motes(*args, **options)
+        state = best.fit.state._replace(positions_m=best.positions_m * (-1.0, 1.0))
+        return best._replace(fit=best.fit._replace(state=state))
+
+    monkeypatch.setattr(mote_runs, "map_motes", mirrored)
+    assert run_batch(cfg, field).positions_m == pytest.approx(found.positions_m)
+    assert found.rms_m < 0.2
 
 
 def test_sizes(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
