@@ -27,8 +27,8 @@ SELECTIONS = ("keyword", "lf", "deselect", "ignore", "ignore_glob", "collectonly
 Measured = Callable[..., None]
 
 
-def judge(table: Table, tests: dict[str, Seen], kind: str | None) -> tuple[list[str], list[str]]:
-    """What is wrong between table and tests, and the rows that are open.
+def judge(table: Table, tests: dict[str, Seen], kind: str | None) -> list[str]:
+    """What is wrong between table and tests.
 
     Args:
         table: the rows.
@@ -42,14 +42,10 @@ def judge(table: Table, tests: dict[str, Seen], kind: str | None) -> tuple[list[
         if row not in table
     ]
     problems += [f"{name} is marked, but for no row" for name, test in tests.items() if not test.rows]
-    open_rows = []
     for row_id, row in table.items() if kind is not None else ():
-        problem = _missing(row_id, row, tests, kind or "")
-        if row.open is not None:
-            open_rows.append(f"{row_id} ({row.open}){'' if problem else '; tests show it by now'}")
-        elif problem:
+        if problem := _missing(row_id, row, tests, kind or ""):
             problems.append(f"{row_id} ({row.fault}): {problem}")
-    return problems, open_rows
+    return problems
 
 
 def _missing(row_id: str, row: Row, tests: dict[str, Seen], kind: str) -> str:
@@ -100,7 +96,7 @@ class Linking:
         path = config.getoption("--fault-table")
         self.table, self._is_ours = load_table(path), path == PATH
         self._tests: dict[str, Seen] = {}
-        self._problems, self._open_rows = list[str](), list[str]()
+        self._problems = list[str]()
         self._is_worker = hasattr(config, "workeroutput")
 
     # -- where tests are collected and run ------------------------------------------------------------------------
@@ -146,7 +142,7 @@ class Linking:
         if self._is_worker or exitstatus not in {pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED}:
             return
         kind = None if session.shouldstop or session.shouldfail else self._kind()
-        self._problems, self._open_rows = judge(self.table, self._tests, kind)
+        self._problems = judge(self.table, self._tests, kind)
         path = self._config.getoption("--fault-record")
         if path is not None or self._is_ours:
             keep_record(path or self._config.rootpath / RECORD, self._tests, is_full=kind is not None)
@@ -162,9 +158,6 @@ class Linking:
 
     def pytest_terminal_summary(self, terminalreporter: Any) -> None:
         """Say what is missing."""
-        if rows := self._open_rows:
-            terminalreporter.write_sep("=", f"fault table: {len(rows)} rows open")
-            terminalreporter.write_line(f"{len(rows)} rows open: " + ", ".join(rows))
         if self._problems:
             terminalreporter.write_sep("=", "fault table", red=True)
             for problem in self._problems:

@@ -41,7 +41,6 @@ class Row(BaseModel):
     slow: bool = False
     hardware: Text | None = None
     conformance: tuple[str, ...] = Field(default=(), strict=False)
-    open: Text | None = None
 
     @model_validator(mode="after")
     def _fits(self) -> "Row":
@@ -208,7 +207,6 @@ def _line(row_id: str, row: Row, kept: Record, earlier: list[str]) -> str:
     shown = {name: entry for name, entry in kept.items() if row_id in entry["rows"]}
     bound = row.bound if row.hardware is None else f"{row.bound}. Robot: {row.hardware} ({_listed(row.conformance)})"
     measured, by = (_measured(row_id, row, shown), _files(shown)) if shown else earlier
-    by = by if row.open is None else f"open: {row.open}"
     cells = [row_id, row.fault, row.detection, row.reaction, row.severity, bound, measured, by]
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 

@@ -162,13 +162,6 @@ def test_slow_rows_are_shown_by_slow_runs(pytester: pytest.Pytester) -> None:
     assert "A2 (another): test_it.py::test_two[a@b] failed" in said
 
 
-def test_open_rows_are_told_and_do_no_harm(pytester: pytest.Pytester) -> None:
-    open_rows = TABLE.replace("[A1]", '[A1]\nopen = "not built"').replace("[A2]", '[A2]\nopen = "nor this"')
-    status, said = Project(pytester, SHOWN.replace('fault("A2")', "slow"), open_rows).run()
-    assert status == 0
-    assert "2 rows open: A1 (not built); tests show it by now, A2 (nor this)" in said
-
-
 def test_a_run_that_was_stopped_is_not_judged(pytester: pytest.Pytester) -> None:
     status, said = Project(pytester, SHOWN.replace("measured(", "assert 0, (", 1)).run("-x")
     assert status == 1
@@ -212,8 +205,8 @@ UNSHOWN = seen("L1", "", of_robot=("L1",))
     ],
 )
 def test_what_shows_a_row(row: str, kind: str, tests: dict[str, Seen], problem: str) -> None:
-    table = {row: load_table()[row].model_copy(update={"open": None})}
-    assert judge(table, tests, kind) == ([f"{row} ({table[row].fault}): {problem}"] if problem else [], [])
+    table = {row: load_table()[row]}
+    assert judge(table, tests, kind) == ([f"{row} ({table[row].fault}): {problem}"] if problem else [])
 
 
 # -- the page ----------------------------------------------------------------------------------------------------------
@@ -225,7 +218,7 @@ def line_of(row_id: str, text: str) -> list[str]:
 
 
 def test_bound_and_worst_case(tmp_path: Path) -> None:
-    table = {row_id: row.model_copy(update={"open": None}) for row_id, row in load_table().items()}
+    table = load_table()
     kept = tmp_path / "record.json"
     first = Seen(("S1", "F6"), is_slow=False, passed=True, values={"S1:ms": 120.0, "F6:percent": 31.0})
     keep_record(kept, {"tests/a/test_a.py::test_one": first}, is_full=True)
@@ -258,4 +251,4 @@ def test_the_record_forgets_what_fails_and_what_is_gone(tmp_path: Path) -> None:
 def test_without_a_record_the_rows_are_there(tmp_path: Path) -> None:
     text = page(load_table(), load_record(tmp_path / "none.json"))
     assert "none of which has run here" in text
-    assert "open: " in line_of("S1", text)[7] or not line_of("S1", text)[7]
+    assert not line_of("S1", text)[7]
