@@ -357,19 +357,6 @@ def test_the_accelerometer_is_a_switch() -> None:
     assert with_.state[1][A, A] < 0.9 * without.state[1][A, A]  # 0.1 m/s^2 of jumps against some counts in 40 ms
 
 
-def test_a_robot_at_rest_does_not_crawl() -> None:
-    """The noise of the rates at rest adds up to nothing."""
-    found, robot = build(), Robot(errors=NOISY)
-    run(found, robot.frames(0.5))
-    before = found.pose
-    run(found, robot.frames(20.0))
-    now = found.pose
-    assert (now.x_m, now.y_m) == pytest.approx((before.x_m, before.y_m), abs=1e-9)  # rounding
-    # What is learned of the gyroscope's bias moves the heading with it, by next to nothing of its 10 mrad.
-    assert now.heading_rad == pytest.approx(before.heading_rad, abs=1e-6)
-    assert found.speed_m_s == found.rate_rad_s == 0.0
-
-
 # -- the whole drive --------------------------------------------------------------------------------------------------
 
 L_SHAPED = (lambda t: STRAIGHT(t) + STRAIGHT(t - 3.1), trapeze(2.05, 1.3, 0.8, 2.0))

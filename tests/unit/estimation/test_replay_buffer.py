@@ -74,18 +74,6 @@ def test_late_measurements_in_any_order_are_as_good_as_in_time(order: tuple[int,
     same(late, in_time)
 
 
-def test_a_look_back_changes_nothing() -> None:
-    found, means = Recorded(), []
-    for k in range(1, 5):
-        found.step(k)
-        means.append(found.filter.mean)
-    for t_s, index, late_s in ((0.1, 0, 0.0), (0.15, 1, 0.05), (0.2, 1, 0.0), (0.4, 3, 0.0), (9.0, 3, 0.0)):
-        mean, _, late = found.journal.look(t_s)
-        assert mean is means[index]
-        assert late == pytest.approx(late_s, abs=1e-12)
-    assert found.filter.mean is means[-1]
-
-
 @pytest.mark.parametrize("late_s", [0.01, 0.03])
 def test_the_row_of_a_late_fix_is_its_derivative(late_s: float) -> None:
     x, terrain, step = build().state[0].copy(), Terrain(mirror()), 1e-6
@@ -284,22 +272,6 @@ def test_a_filter_that_diverges_at_a_fix_begins_anew_with_it() -> None:
     assert found.hold_cause == "filter: for the sake of the test"
     assert not found.is_frozen
     assert errors_of(found, robot.pose)[0] < 1e-9
-
-
-@pytest.mark.parametrize("jump_s", [-500.0, 1e4])
-@pytest.mark.parametrize("before_s", [1.81, 1.83])
-def test_after_a_jump_of_the_clock_it_measures_the_same_speed(jump_s: float, before_s: float) -> None:
-    """What the wheels did in the frame that begins the new time base belongs to the gap."""
-    found, robot = build(), Robot(v=trapeze(0.5, 9.0, 0.1, 0.2), errors=NOISY)
-    run(found, robot.frames(before_s))
-    for _ in range(2):
-        found.step(*shifted(robot.frame(), jump_s))
-    before, true = found.deck_pose, robot.pose
-    for frame in robot.frames(0.5):
-        found.step(*shifted(frame, jump_s))
-    assert found.speed_m_s == pytest.approx(0.1, abs=2e-3)  # 2 % of slip
-    after, now = found.deck_pose, robot.pose
-    assert after.x_m - before.x_m == pytest.approx(now.x_m - true.x_m, abs=2e-3)
 
 
 @pytest.mark.parametrize("before_s", [2.01, 2.03])

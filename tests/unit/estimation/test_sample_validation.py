@@ -101,17 +101,6 @@ def test_rest_begins_after_its_time_and_only_once() -> None:
     assert found.is_resting
 
 
-def test_means_over_a_rest() -> None:
-    found = watch()
-    for k in range(4):
-        found.add([ImuSample(0.0, 1.0 + k, 10.0 * k)], GravitySample(0.0, 3.0, 4.0, 9.0) if k else None)
-    assert found.count == 4
-    reading = found.take()
-    assert reading[:4] == (4, 15.0, 2.5, 3)
-    assert reading.bearing_rad == pytest.approx(np.arctan2(4.0, 3.0))
-    assert found.take()[:4] == (0, 0.0, 0.0, 0)
-
-
 # -- the noise that counts --------------------------------------------------------------------------------------------
 
 

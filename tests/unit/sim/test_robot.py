@@ -34,20 +34,6 @@ def test_boot_is_frame_zero(config: Config, mirror: Mirror) -> None:
     assert (sensors.cmd.seq, sensors.cmd.age, sensors.cmd.held) == (0, 0.0, True)
 
 
-def test_a_frame_holds_the_samples_since_the_one_before(config: Config, mirror: Mirror) -> None:
-    robot = boot(config, mirror)
-    drive(robot, 3.0, 2.0, 7)
-    sensors = sensors_of(robot)
-    assert (sensors.seq, sensors.t) == (7, 0.07)
-    assert [sample.t_s for sample in sensors.enc] == [n / 1000.0 for n in range(61, 71)]
-    assert [sample.t_s for sample in sensors.edge] == [n / 1000.0 for n in range(61, 71)]
-    assert [sample.t_s for sample in sensors.imu] == [0.07]
-    assert sensors.gravity is None
-    assert (sensors.cmd.seq, sensors.cmd.age, sensors.cmd.permit_age, sensors.cmd.held) == (7, 0.01, 0.0, False)
-    # 5 sigma of the encoder's noise.
-    assert sensors.enc[-1].right_rad_s == pytest.approx(robot.world.plant.right_rad_s, abs=0.005)
-
-
 def test_misalignment_and_start_have_the_configured_spread(config: Config, mirror: Mirror) -> None:
     starts, pistons, tips, tilts = [], [], [], []
     base = mirror.base_panel_pose

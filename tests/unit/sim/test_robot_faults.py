@@ -285,21 +285,6 @@ def test_a_jump_of_the_clock_shifts_every_time(config: Config, mirror: Mirror, b
     assert acted(robot) == (0.5, 0.79, 30, 30)
 
 
-def test_a_clock_that_wraps(config: Config, mirror: Mirror) -> None:
-    robot = boot(config, mirror, signal="clock", type="wrap", modulo_s=0.75, at_s=0.0)
-    times = [frame["t"] for frame in drive(robot, 1.0, 1.0, 1.0)]
-    assert max(times) < 0.75
-    assert times[-1] == pytest.approx(0.25)
-    assert record(robot).changed == 26
-
-
-def test_frames_that_are_lost(config: Config, mirror: Mirror) -> None:
-    robot = boot(config, mirror, signal="frames", type="drop", every=3, for_s=0.3)
-    numbers = [frame["seq"] for frame in drive(robot, 1.0, 1.0, 1.0)]
-    assert numbers == [k for k in range(1, 101) if not (50 <= k < 80 and (k - 49) % 3 == 0)]
-    assert acted(robot) == (0.5, 0.79, 30, 10)
-
-
 def test_names_that_the_robot_raises(config: Config, mirror: Mirror) -> None:
     robot = boot(config, mirror, signal="faults", type="raise", names=["stall", "edge", "stall"], for_s=0.2)
     found = [frame["faults"] for frame in drive(robot, 1.0, 1.0, 1.0)]

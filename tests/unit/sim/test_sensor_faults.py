@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ccatp.config.models import Config
-from ccatp.links.robot_codec import MAX_LINE_BYTES, BadLine, decode_from_robot
+from ccatp.links.robot_codec import MAX_LINE_BYTES
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_plan import SENSOR_SIGNALS, TYPES, FaultPlan, parse_plan
 from ccatp.sim.robot import Robot
@@ -191,35 +191,11 @@ def test_a_fault_acts_and_says_so(config: Config, mirror: Mirror, sound: Drive, 
     assert all(len(line) <= MAX_LINE_BYTES for line in drive.lines)
 
 
-@pytest.mark.parametrize(
-    ("signal", "token"), [*((signal, "NaN") for signal in SENSOR_SIGNALS), ("imu_wz", "Infinity"), ("imu_wz", "1e999")]
-)
-def test_what_is_no_number_stands_in_the_line_and_no_client_takes_it(
-    config: Config, mirror: Mirror, signal: str, token: str
-) -> None:
-    drive = Drive(config, mirror, plan_of(signal, "non_finite", token=token))
-    lines = [line for line in drive.lines if token.encode() in line]
-    assert lines
-    for line in lines:
-        with pytest.raises(BadLine):
-            decode_from_robot(line[:-1])
-    for line, is_delivered in zip(drive.lines, drive.delivered, strict=True):
-        assert is_delivered is (line not in lines)
-
-
 def test_stuck_without_a_value_repeats_the_last_reading(config: Config, mirror: Mirror, sound: Drive) -> None:
     drive = Drive(config, mirror, plan_of("imu_wz", "stuck"))
     last = [reading for t, reading in sound.readings("imu_wz", 1, FROM) if t < 0.2][-1]
     assert {reading for _, reading in drive.readings("imu_wz", FROM, UNTIL - 1)} == {last}
     assert last != 0.0
-
-
-def test_an_intermittent_edge_sensor_reads_a_value(config: Config, mirror: Mirror) -> None:
-    drive = Drive(config, mirror, plan_of("edge_rear_left", "intermittent", period_s=0.02, duty=0.5, value=0.0))
-    found = drive.readings("edge_rear_left")
-    assert len(found) == 10 * (UNTIL - FROM - 1)
-    assert {reading for t, reading in found if (t - 0.2) % 0.02 < 0.0099} == {1}
-    assert {reading for t, reading in found if 0.0101 < (t - 0.2) % 0.02 < 0.0199} == {0}
 
 
 @pytest.mark.parametrize("signal", [*PLACES, "gravity"])
@@ -255,14 +231,6 @@ def test_both_encoders_off_leave_no_row(config: Config, mirror: Mirror) -> None:
     drive = Drive(config, mirror, FaultPlan(plans[0].faults + plans[1].faults))
     assert json.loads(drive.lines[FROM + 5])["enc"] == []
     assert json.loads(Drive(config, mirror, plans[0]).lines[FROM + 5])["enc"][0][1] is None
-
-
-def test_garbage_within_the_range_is_taken_and_beyond_it_is_dropped_whole(config: Config, mirror: Mirror) -> None:
-    within = Drive(config, mirror, plan_of("encoder_left", "garbage", beyond=0.0))
-    assert all(within.delivered)
-    beyond = Drive(config, mirror, plan_of("encoder_left", "garbage", beyond=1.0))
-    assert sum(not taken for taken in beyond.delivered) == pytest.approx(UNTIL - FROM, abs=2)
-    assert within.lines == Drive(config, mirror, plan_of("encoder_left", "garbage", beyond=0.0)).lines  # of the seed
 
 
 def test_a_run_with_an_empty_plan_is_the_run_without() -> None:

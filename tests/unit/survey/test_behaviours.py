@@ -52,13 +52,6 @@ def at(mirror: Mirror, frame: int, speed_m_s: float = 0.0) -> StateEstimate:
     return StateEstimate(frame * DT, DT, PanelPose(PanelId(5, 5), 0.0, 0.0, 0.0), mirror.deck_pose, speed_m_s, 0.0)
 
 
-def test_asks_once_and_only_after_the_measuring_time_at_rest(settling: Standing, mirror: Mirror) -> None:
-    settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))
-    asked = [k for k in range(settled, settled + 200) if settling.is_due(at(mirror, k))]
-    assert asked == [settled + round(MEASURING_S / DT)]
-    assert (settling.requests, settling.now.is_requested) == (1, True)
-
-
 @pytest.mark.fault("E9")
 def test_who_moves_for_ever_is_never_measured_and_restless(settling: Standing, mirror: Mirror) -> None:
     settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))
@@ -122,28 +115,6 @@ def seen(ahead_m: float, left_m: float) -> tuple[float, float]:
 def test_what_lies_nearly_along_the_heading_is_driven_to_without_a_turn(ahead_m: float, left_m: float) -> None:
     aim = plan_aim(POSE, seen(ahead_m, left_m), 0.010, 0.7)
     assert aim == pytest.approx(LegAim(*seen(ahead_m, 0.0), ahead_m < 0.0, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("ahead_m", "left_m", "reverse", "turn_rad"),
-    [
-        (0.01, 0.01, False, pi / 4),
-        (0.01, -0.01, False, -pi / 4),
-        (-0.01, 0.01, True, -pi / 4),
-        (-0.01, -0.01, True, pi / 4),
-    ],
-)
-def test_else_the_robot_turns_by_the_smaller_angle(
-    ahead_m: float, left_m: float, reverse: bool, turn_rad: float
-) -> None:
-    target = seen(ahead_m, left_m)
-    aim = plan_aim(POSE, target, 0.010, 0.7)
-    assert aim == pytest.approx(LegAim(*target, reverse, turn_rad))
-    sign = -1.0 if aim.reverse else 1.0
-    heading, distance = POSE[2] + aim.turn_rad, hypot(ahead_m, left_m)
-    # Driven that far that way the robot is there.
-    assert POSE[0] + sign * distance * cos(heading) == pytest.approx(target[0])
-    assert POSE[1] + sign * distance * sin(heading) == pytest.approx(target[1])
 
 
 def test_beyond_its_reach_there_is_no_correction(follower: LegFollower, config: Config) -> None:

@@ -1,7 +1,7 @@
 """The mission as stories in virtual time: an ideal robot on one panel, verdicts as told."""
 
 from itertools import product
-from math import cos, hypot, sin
+from math import copysign, cos, hypot, sin
 
 import pytest
 from msgspec.structs import replace
@@ -63,14 +63,6 @@ def test_the_table_is_total_and_hold_is_one_event_away() -> None:
     )  # an edge outranks an abort
 
 
-def test_measures_every_point_once_and_is_complete(story: Story) -> None:
-    story.until_state(MissionState.DONE)
-    assert story.state.outcome is SurveyOutcome.COMPLETE
-    assert [p.point for p in story.state.done] == [1, 2, 3]
-    arrived = [order.arrived for order in story.orders if order.arrived is not None]
-    assert [p.point for p in arrived] == [1, 2, 3]
-
-
 def test_a_fix_at_the_start_comes_before_the_first_leg_and_costs_no_route(config: Config, mirror: Mirror) -> None:
     first = config.mission.model_copy(update={"fix_at_start": True})
     story = Story(config.model_copy(update={"mission": first}), mirror)
@@ -113,13 +105,6 @@ def test_abort_goes_home_from_every_state(story: Story, state: MissionState) -> 
     x, y = story.motion().deck.x_m, story.motion().deck.y_m
     assert hypot(x - story.base[0], y - story.base[1]) < 2e-3  # twice the arrival tolerance
     assert story.motion().deck.heading_rad == pytest.approx(1.0, abs=0.011)  # heading tolerance and 1e-3 of frames
-
-
-def test_no_verdict_holds_and_comes_back_by_itself(story: Story) -> None:
-    story.until_state(MissionState.DRIVING)
-    assert story.frame(None).twist == Twist(0.0, 0.0)
-    assert story.state.mode is MissionState.HELD
-    story.finish()
 
 
 def test_edge_backs_off_at_most_60_mm_turns_away_fixes_and_resumes(story: Story, config: Config) -> None:
@@ -204,15 +189,6 @@ def test_pause_while_backing_off_holds_and_resume_finds_the_robot_first(story: S
     story.until(lambda: story.orders[-1].measure)  # nothing but a fix comes first
     assert all(order.twist == Twist(0.0, 0.0) for order in story.orders[-30:])
     story.finish()
-
-
-def test_missing_data_during_a_back_off_only_pause_it(story: Story) -> None:
-    story.drive_on()
-    story.frame(FRONT_OFF)
-    for _ in range(20):
-        assert story.frame(replace(FRONT_OFF, reverse=False)).twist == Twist(0.0, 0.0)
-    assert story.state.mode is MissionState.BACKING_OFF
-    assert story.frame(FRONT_OFF).twist.v_m_s < 0.0
 
 
 def test_a_robot_that_cannot_be_found_does_not_drive(story: Story) -> None:
@@ -369,14 +345,16 @@ def test_a_point_missed_along_the_heading_is_approached_straight(story: Story, a
     assert (story.plans, story.state.corrections) == ([], 1)
 
 
-@pytest.mark.parametrize(("ahead_m", "sign"), [(0.01, 1.0), (-0.01, -1.0)])
+@pytest.mark.parametrize("ahead_m", [0.01, -0.01])
+@pytest.mark.parametrize("left_m", [0.015, -0.015])
 def test_a_point_missed_beside_the_heading_is_turned_to_by_the_smaller_angle(
-    story: Story, ahead_m: float, sign: float
+    story: Story, ahead_m: float, left_m: float
 ) -> None:
-    miss(story, ahead_m, 0.015)
+    miss(story, ahead_m, left_m)
     heading = story.heading
-    assert all(speed * sign > -5e-4 for speed in speeds_until_rest(story))  # forward, or in reverse, all the way
-    assert story.heading - heading == pytest.approx(sign * 0.983, abs=0.02)  # atan(15/10), twice the heading tolerance
+    assert all(speed * ahead_m > -5e-6 for speed in speeds_until_rest(story))  # forward, or in reverse, all the way
+    turned_rad = copysign(0.983, ahead_m * left_m)  # atan(15/10)
+    assert story.heading - heading == pytest.approx(turned_rad, abs=0.02)  # twice the heading tolerance
     assert distance_m(story) < 5e-4  # stop tolerance, and the heading tolerance over 18 mm
     assert (story.plans, story.state.corrections) == ([], 1)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ccatp.config.models import LimitsConfig
-from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind, bearing, difference
+from ccatp.core import DeckPose, PointId, Stop, StopKind, bearing, difference
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.escape import find_retreats
 from ccatp.survey.planning.legs import (
@@ -97,15 +97,6 @@ def test_on_tyres_that_creep_a_retreat_is_longer(thesis: Any) -> None:
         moves = find_retreats(mirror, body, [spot])[0]
         shortest_m.append(min(hypot(r.x_m - spot.x_m, r.y_m - spot.y_m) for r in moves))
     assert shortest_m == pytest.approx([0.02, 0.06], abs=1e-9)  # eight times the lever at which they rub
-
-
-def test_retreat_in_a_corner_is_slanted(thesis: Any) -> None:
-    mirror, body = thesis.mirror, body_of(thesis)
-    assert PanelId(1, 3) in mirror.panels
-    spot = at(mirror, body, PointId(1, 3, 1))
-    moves = [(r.x_m - spot.x_m, r.y_m - spot.y_m) for r in find_retreats(mirror, body, [spot])[0]]
-    assert moves
-    assert all(dx > 0.015 and dy > 0.01 for dx, dy in moves)  # 133 mm are needed, 115 and 122 there
 
 
 STOP = Stop(0.7, 0.0, StopKind.MEASURE, PointId(1, 2, 3), True)
@@ -239,31 +230,6 @@ def test_whole_mirrors(name: str) -> None:
 
 def go(world: Any, start: DeckPose, base: DeckPose | None = None) -> tuple[Stop, ...]:
     return RoutePlanner(world.mirror, world.cfg).home(start, base)
-
-
-def test_ends_at_base_with_its_heading(world: Any) -> None:
-    base = world.mirror.base_pose
-    stops = go(world, DeckPose(0.3, 0.4, 1.0))
-    assert (stops[-1].x_m, stops[-1].y_m, stops[-1].heading_rad) == (base.x_m, base.y_m, base.heading_rad)
-    assert [stop.kind for stop in stops] == [StopKind.VIA] * (len(stops) - 1) + [StopKind.BASE]
-
-
-def test_goes_around_stepped_corners(thesis: Any) -> None:
-    start = DeckPose(-3.5, -1.7, 0.0)  # row 3, left of the rows below
-    ends = [(start.x_m, start.y_m), *((stop.x_m, stop.y_m) for stop in go(thesis, start))]
-    base = thesis.mirror.base_pose
-    assert thesis.mirror.rim.segment_clearance_m(start.x_m, start.y_m, base.x_m, base.y_m) < 0.1
-    assert all(thesis.mirror.rim.segment_clearance_m(*a, *b) >= 0.1 for a, b in pairwise(ends))
-
-
-@pytest.mark.parametrize("heading", [0.0, pi / 2.0, pi, -pi / 2.0])
-def test_leaves_the_rim_without_sweeping_it(heading: float, thesis: Any) -> None:
-    first = go(thesis, DeckPose(3.625, 0.0, heading))[0]  # 110 mm from the right rim
-    assert first.x_m < 3.625
-    assert thesis.mirror.rim.signed_distance_m(first.x_m, first.y_m) > 0.1323
-    if heading in {0.0, pi}:  # straight back, or straight ahead
-        assert first.y_m == pytest.approx(0.0, abs=0.002)  # the surface turns headings by some mrad
-        assert first.reverse == (heading == 0.0)
 
 
 def test_base_near_the_rim_is_entered_the_way_that_allows_its_heading(thesis: Any) -> None:
