@@ -72,15 +72,6 @@ def test_a_drive_with_a_turn_from_a_known_start(noise: float, limit_m: float, li
         assert np.mean(nis[15:265]) == pytest.approx(1.0 - 1.0 / 22.0, abs=0.12)
 
 
-def test_sigmas_cover_the_error_and_grow_with_the_way() -> None:
-    localizer = make()
-    assert localizer.position_sigma_m == pytest.approx(config().localizer.start_position_sigma_m)
-    assert localizer.heading_sigma_rad == pytest.approx(config().localizer.start_heading_sigma_rad)
-    run(localizer, truth(v=lambda _: 0.1).frames(2.0))
-    # 0.2 m at 0.01 rad and 0.2 % beside 2 mm
-    assert localizer.position_sigma_m == pytest.approx(hypot(0.002, 0.2 * 0.01, 0.2 * 0.002), rel=0.02)
-
-
 # --- measurement model -----------------------------------------------------------------------------------------------
 
 
@@ -245,16 +236,6 @@ def test_rest_leaves_a_consistent_covariance() -> None:
     assert filter_.mean.tolist() == [0.0, 0.0, heading, 0.0]
     sigmas = [1e-4, 1e-3, np.sqrt(variance), 1e-4]
     np.testing.assert_allclose(filter_.covariance, np.diag(np.square(sigmas)), rtol=1e-12)  # no correlation is left
-
-
-def test_a_fix_at_standstill() -> None:
-    world = truth()
-    localizer = make(PanelPose(CENTRE.panel, 0.003, -0.004, CENTRE.heading_rad))
-    run(localizer, world.frames(0.3))
-    assert localizer.fuse_fix(world.fix()) == pytest.approx(0.005, abs=1e-6)  # weight 1 - (10 um / 2 mm)^2
-    assert errors(localizer, world.pose)[0] < 1e-6
-    assert localizer.position_sigma_m == pytest.approx(1e-5, rel=1e-3)
-    assert localizer.counts["fixes"] == 1
 
 
 def test_a_late_fix_belongs_to_its_own_time() -> None:

@@ -166,13 +166,6 @@ def test_a_recording_of_an_older_format_has_no_utc(path: Path) -> None:
     assert (facts.span_s, facts.utc) == ((1.25, 1.25), [])
 
 
-@pytest.mark.parametrize(("is_simulation", "mark"), [(True, "true"), (False, "false")])
-def test_simulation_is_marked(path: Path, is_simulation: bool, mark: str) -> None:
-    Recorder(path, TOPICS, is_simulation=is_simulation, metadata={"seed": "1"}).close()
-    assert read_metadata(path) == {"seed": "1", "simulation": mark}
-    assert list(iter_messages(path, on_damage=pytest.fail)) == []
-
-
 def test_a_flipped_bit_never_alters_a_message(path: Path) -> None:
     record(path, 200).close()
     whole = path.read_bytes()

@@ -11,10 +11,7 @@ from hypothesis import strategies as st
 from ccatp.core import DeckPose, FloatArray, PanelId, difference
 from ccatp.estimation.odometry import Slope, Terrain, axes_on
 from ccatp.estimation.state_model import (
-    BA,
-    BG,
     CT,
-    KG,
     KL,
     PL,
     PR,
@@ -175,20 +172,6 @@ def taken(has_counts: bool, has_rate: bool, has_acceleration: bool) -> SensorRow
     return SensorRows(has_rate * rate + has_counts * counts + has_acceleration * acceleration)
 
 
-def test_rows_say_what_each_sensor_reads() -> None:
-    rows = taken(True, True, True)
-    assert sorted(zip(rows.z.tolist(), rows.R.tolist(), strict=True)) == [
-        (1.0, 0.1),
-        (2.0, 0.1),
-        (3.0, 0.2),
-        (4.0, 0.3),
-    ]
-    x = np.zeros(STATES)
-    x[[PR, PL, W, KG, BG, A, BA]] = 5.0, 6.0, 0.5, 0.1, 0.01, 0.2, 0.03
-    expected = dict(zip(rows.z.tolist(), rows.at(x)[0].tolist(), strict=True))
-    assert expected == pytest.approx({1.0: 5.0, 2.0: 6.0, 3.0: 0.56, 4.0: 0.23}, abs=1e-15)
-
-
 REACH_M = 5e-3
 
 
@@ -244,15 +227,6 @@ def test_the_robots_axes_are_the_mirrors(mirror: Mirror) -> None:
 
 
 # -- the panel's frame ------------------------------------------------------------------------------------------------
-
-
-def test_a_pose_in_a_panels_frame_is_the_mirrors(mirror: Mirror) -> None:
-    for k, (x, y) in enumerate(places(mirror, 50, 6)):
-        found = build(start=mirror.panel_pose(mirror.nearest_panel(x, y), DeckPose(x, y, 0.37 * k - 9.0)))
-        expected = mirror.panel_pose(mirror.nearest_panel(x, y), found.deck_pose)
-        assert found.pose.panel == expected.panel
-        assert (found.pose.x_m, found.pose.y_m) == pytest.approx((expected.x_m, expected.y_m), abs=1e-14)  # rounding
-        assert abs(difference(found.pose.heading_rad, expected.heading_rad)) < 1e-14
 
 
 @pytest.mark.parametrize(

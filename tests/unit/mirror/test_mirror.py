@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from math import cos, hypot, inf, nan, pi, sin, sqrt
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,14 +37,6 @@ def test_shipped_base_stands_beside_the_first_point_and_looks_at_it(mirror: Mirr
     assert hypot(dx, dy) == pytest.approx(0.10, abs=0.002)  # sqrt(2) times 70 mm is 99 mm
     assert difference(bearing(dx, dy), base.heading_rad) == pytest.approx(0.0, abs=1e-9)
     assert mirror.rim.signed_distance_m(mirror.base_pose.x_m, mirror.base_pose.y_m) > 0.15
-
-
-def test_body_offset_is_the_projection_of_the_robot_frame(mirror: Mirror) -> None:
-    x, y, _ = mirror.deck_from_robot(POSE, (0.09, -0.04, 0.0))
-    assert mirror.body_offset(POSE, 0.09, -0.04) == pytest.approx((x, y), abs=1e-15)
-    hx, hy, lx, ly = mirror.body_axes(POSE)
-    h, left, _ = mirror.robot_axes(POSE)
-    assert (hx, hy, lx, ly) == pytest.approx((*h[:2], *left[:2]), abs=1e-15)
 
 
 def test_panel_heading_is_the_projection_on_the_panel_plane(mirror: Mirror) -> None:
@@ -118,7 +109,6 @@ def test_many_poses_are_as_one_by_one(mirror: Mirror) -> None:
         assert row.tolist() == pytest.approx(expected, abs=1e-12)  # two orders of the same sums
 
 
-Raw = dict[str, Any]
 PANELS = {"fyst-m1": 77, "fyst-m2": 69, "thesis-m1": 87, "thesis-m2": 78}
 POINTS = {"fyst-m1": 693, "fyst-m2": 621, "thesis-m1": 783, "thesis-m2": 702}
 MAX_DOP = 3.0
@@ -162,17 +152,6 @@ def test_outline_of_the_telescope_as_built(m1: Mirror, m2: Mirror) -> None:
         assert corner[1] == pytest.approx((-x * 1e-3 + half_gap, low * 1e-3 + half_gap), abs=2e-5)
 
 
-def test_cell_and_material_at_the_corners_of_every_panel(mirror: Mirror) -> None:
-    for pid, panel in mirror.panels.items():
-        for sx in (-1, 1):
-            for sy in (-1, 1):
-                x, y = panel.x_m + sx * panel.half_x_m, panel.y_m + sy * panel.half_y_m
-                assert mirror.is_on_panel(x - sx * 1e-6, y - sy * 1e-6)
-                assert not mirror.is_on_panel(x + sx * 1e-6, y - sy * 1e-6)
-                assert not mirror.is_on_panel(x - sx * 1e-6, y + sy * 1e-6)
-                assert mirror.panel_at(x + sx * 1e-6, y + sy * 1e-6) == pid  # the half gap belongs to the cell
-
-
 @pytest.mark.parametrize(("x", "y"), [(nan, 0.0), (0.0, nan), (inf, 0.0), (0.0, -inf)])
 def test_a_place_that_is_no_number_is_off_the_mirror(m1: Mirror, x: float, y: float) -> None:
     assert m1.panel_at(x, y) is None
@@ -190,18 +169,6 @@ def test_nearest_panel_against_a_search_over_all_cells(mirror: Mirror) -> None:
                 for pid, p in mirror.panels.items()
             }
             assert distances[mirror.nearest_panel(x, y)] == pytest.approx(min(distances.values()), abs=1e-12)
-
-
-def test_nearest_seam_left_and_right_of_it(m1: Mirror) -> None:
-    half = 0.6712022 / 2
-    seam = m1.nearest_seam(half - 0.02, 0.1)
-    assert seam is not None
-    assert seam.axis == "x"
-    assert seam.position_m == pytest.approx(half, abs=1e-12)
-    assert seam.distance_m == pytest.approx(-0.02, abs=1e-12)
-    seam = m1.nearest_seam(half + 0.01, 0.1)
-    assert seam is not None
-    assert seam.distance_m == pytest.approx(0.01, abs=1e-12)
 
 
 def test_seams_of_every_panel_have_a_panel_on_both_sides(mirror: Mirror) -> None:
@@ -231,15 +198,6 @@ def test_points_are_numbered_row_by_row_from_the_lower_left(m1: Mirror) -> None:
         p = panel.from_deck(m1.surface_point(x, y))
         assert p[:2] == pytest.approx((dx, dy), abs=1e-12)
         assert (x - panel.x_m, y - panel.y_m) == pytest.approx((dx, dy), abs=1e-3)  # the projection shortens < 1 mm
-
-
-def test_every_measurement_point_lies_on_its_panel_well_inside_the_rim(mirror: Mirror) -> None:
-    for panel in mirror.panels:
-        for pid in mirror.point_ids(panel):
-            x, y = mirror.point_on_deck(pid)
-            assert mirror.panel_at(x, y) == panel
-            assert mirror.is_on_panel(x, y)
-            assert mirror.rim.signed_distance_m(x, y) > 0.1
 
 
 @pytest.mark.parametrize("number", [0, 10, -1])

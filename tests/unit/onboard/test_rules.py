@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.onboard.rules import HELD, LinkedRobot, MotionRules
+from ccatp.onboard.rules import HELD, LinkedRobot
 
 DT_S, TTL_S, FASTEST = 0.01, 0.25, 8.0
 # A robot with nothing but roles and commands.
@@ -25,18 +25,6 @@ class Rig:
     def at(self, frame: int) -> LinkedRobot:
         self.robot.seq, self.robot.t_s = frame, frame * DT_S
         return self.robot
-
-
-def test_a_drive_dies_with_its_time_to_live() -> None:
-    r = MotionRules(TTL_S, FASTEST)
-    r.drive(1, 3.0, 3.0, 1.0)
-    assert r.set_points(1.25) == (3.0, 3.0)
-    assert r.set_points(1.2501) == HELD
-    seq, age_s, permit_age_s, is_held = r.echo(1.26)
-    assert (seq, is_held) == (1, True)
-    assert (age_s, permit_age_s) == pytest.approx((0.26, 0.0))
-    r.drive(2, 3.0, 3.0, 1.26)
-    assert r.set_points(1.27) == (3.0, 3.0)
 
 
 @pytest.mark.parametrize(
@@ -124,31 +112,6 @@ def test_wheels_turn_only_with_both_keys(events: list[tuple[object, ...]]) -> No
                 assert permit[1] or right + left <= 0
                 assert permit[2] or right + left >= 0
                 assert permit[3] or right == left
-
-
-@pytest.mark.parametrize("frames", [0, 1, 2, 5])
-def test_a_drive_takes_effect_to_the_frame(frames: int) -> None:
-    rig = Rig(frames)
-    for frame in range(10):
-        if frame == 3:
-            assert rig.at(frame).drive(7, 3.0, 3.0)
-        assert rig.moves(frame) is (frame >= 3 + frames)
-        # What is in force is echoed, and its age counts from its arrival.
-        seq, age_s, _, _ = rig.robot.rules.echo((frame + 1) * DT_S)
-        assert seq == (7 if frame >= 3 + frames else 0)
-        if seq == 7:
-            assert age_s == pytest.approx((frame - 2) * DT_S, abs=1e-12)
-
-
-@pytest.mark.parametrize("frames", [0, 2])
-def test_a_permit_takes_effect_to_the_frame(frames: int) -> None:
-    rig = Rig(frames)
-    rig.robot.join("monitor")
-    for frame in range(8):
-        rig.at(frame).drive(frame, 3.0, 3.0)
-        if frame in {2, 5}:
-            assert rig.robot.permit(frame, frame == 2, False, False)
-        assert rig.moves(frame) is (2 + frames <= frame < 5 + frames)
 
 
 def test_the_time_to_live_covers_the_delay() -> None:

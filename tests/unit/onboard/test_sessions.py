@@ -79,20 +79,6 @@ def test_a_lost_monitor_stops_simulated_time_until_another_joins(rig: Rig) -> No
     assert not r.robot.rules.is_held
 
 
-def test_a_lost_controller_and_the_next_one(rig: Rig) -> None:
-    r = rig()
-    controller, monitor = r.client(JOIN), r.client(JOIN_MONITOR)
-    controller.drive(0, 0)
-    r.server.lost(controller)
-    monitor.permit(0, 0)
-    assert r.robot.seq == 0  # the answer went with the one who gave it
-    assert monitor.kinds == ["hello", "joined", "0"]
-    again = r.client(JOIN)
-    assert (again.kinds, monitor.kinds) == (["hello", "joined", "0"], ["0"])
-    again.drive(0, 0)
-    assert r.robot.seq == 1  # the monitor's answer to frame 0 still stands
-
-
 def test_a_stall_is_noted_once_per_frame_and_waited_for(rig: Rig) -> None:
     r = rig()
     monitor = r.client(JOIN_MONITOR)
