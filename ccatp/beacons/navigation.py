@@ -152,14 +152,9 @@ class MeasurementReader:
                 for index, level in enumerate(levels)
                 if level is not None
             )
-        return BeaconMeasurements(
-            sensors.t,
-            tuple(one for one in wheels if one is not None),
-            packets,
-            tuple((one.beacon, one.rssi_dbm, one.bearing_rad) for one in extras.radio),
-            tuple(extras.distances),
-            tuple(extras.motes),
-        )
+        known = tuple(one for one in wheels if one is not None)
+        sightings = tuple((one.beacon, one.rssi_dbm, one.bearing_rad) for one in extras.radio)
+        return BeaconMeasurements(sensors.t, known, packets, sightings, tuple(extras.distances), tuple(extras.motes))
 
     def _interval(self, sample: WheelSample, steering: dict[float, float]) -> Odometry | None:
         self._steer_rad = steering.get(sample.t_s, self._steer_rad)
@@ -214,6 +209,12 @@ class _DeadReckoning:
         self._reckoned[:POSE] = cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad
         self.score = Score(0.0, 0, 0)
 
+    def _count(self, nis: float, size: int, *, accepted: bool) -> None:
+        nis_sum, nis_size, refused = self.score
+        self.score = (
+            Score(nis_sum + nis, nis_size + size, refused) if accepted else Score(nis_sum, nis_size, refused + 1)
+        )
+
     @property
     def reckoned_m(self) -> tuple[float, float]:
         """Where dead reckoning alone would see it."""
@@ -266,13 +267,8 @@ class RadioNavigator(_DeadReckoning):
             Reading(t_s, beacon, bearing_rad=bearing_rad, rssi_dbm=level_dbm)
             for beacon, level_dbm, bearing_rad in measurements.sightings
         ]
-        learned = self.slam.observe(readings)
-        used = [one for one in learned if one.accepted]
-        self.score = Score(
-            self.score.nis_sum + sum(one.nis for one in used),
-            self.score.nis_size + sum(one.size for one in used),
-            self.score.refused + len(learned) - len(used),
-        )
+        for one in self.slam.observe(readings):
+            self._count(one.nis, one.size, accepted=one.accepted)
         if any(reading.beacon == self._target for reading in readings):
             self._received_s = t_s
 
@@ -367,11 +363,7 @@ class MoteNavigator(_DeadReckoning):
         ux, uy = (x - mx) / r, (y - my) / r
         h = np.array((ux, uy, -ux, -uy))
         found = self._filter.update_row(columns, h, reading.range_m - r, reading.sigma_m**2, self._gate)
-        nis_sum, nis_size, refused = self.score
-        if found.accepted:
-            self.score = Score(nis_sum + found.nis, nis_size + 1, refused)
-        else:
-            self.score = Score(nis_sum, nis_size, refused + 1)
+        self._count(found.nis, 1, accepted=found.accepted)
 
 
 Navigator = RadioNavigator | MoteNavigator

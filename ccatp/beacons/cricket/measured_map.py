@@ -274,13 +274,9 @@ def _check_enough(model: MapModel, network: RangeNetwork) -> None:
 def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Mirrors) -> _Found:
     settings = MapFitSettings(cfg.batch.robust_scale, cfg.batch.max_iterations)
     found = map_motes(
-        network,
-        settings,
-        with_offset=cfg.batch.estimates_offset,
-        with_scale=cfg.batch.estimates_scale,
-        mirrors=mirrors,
-        finds_sigma=len(network.ranges_m) > 2 * network.count * network.dimension,
-    )
+        network, settings, with_offset=cfg.batch.estimates_offset, with_scale=cfg.batch.estimates_scale,
+        mirrors=mirrors, finds_sigma=len(network.ranges_m) > 2 * network.count * network.dimension,
+    )  # fmt: skip
     factor = found.sigma_m / float(np.median(network.sigmas_m))
     scaled = replace(network, sigmas_m=network.sigmas_m * factor)
     warnings = [*_hidden_offset(found, scaled, settings)] if not cfg.batch.estimates_offset else []

@@ -146,14 +146,9 @@ def _bounded(run: RecordedRun, where: Path) -> RecordedRun:
 
 
 def _refuse(
-    where: Path,
-    what: str,
-    values: FloatArray,
-    most: float,
-    unit: str,
-    times_s: FloatArray | None = None,
+    where: Path, what: str, values: FloatArray, most: float, unit: str, times_s: FloatArray | None = None,
     hint: str = "",
-) -> None:
+) -> None:  # fmt: skip
     beyond = np.flatnonzero(~(np.abs(values) <= most))
     if beyond.size:
         first = int(beyond[0])

@@ -176,9 +176,7 @@ class Residuals:
 
     odometry: FloatArray  # motion by the poses less that of the odometry, in the vehicle's frame, shape (n - 1, 3)
     odometry_information: FloatArray  # shape (n - 1, 3, 3)
-    by_steps: (
-        FloatArray  # of the odometry by the poses before and behind and ``CALIBRATION``, shape (n - 1, 3, 3 + 3 + 6)
-    )
+    by_steps: FloatArray  # of the odometry by poses before, behind and ``CALIBRATION``, shape (n - 1, 3, 3 + 3 + 6)
     readings: FloatArray  # predicted less read, shape (m, 3)
     information: FloatArray  # of each, zero where there is no reading, shape (m, 3)
     by_unknowns: FloatArray  # of the readings by the pose, ``OF_READINGS`` and the beacon, shape (m, 3, 3 + 5 + 4)
@@ -198,22 +196,12 @@ class BatchProblem:
     """
 
     def __init__(
-        self,
-        steps: Steps,
-        readings: Readings,
-        times_s: FloatArray,
-        first_pose: tuple[float, float, float],
-        settings: RecordingConfig,
-        used: BoolArray,
-        rest: tuple[float, float] = (0.0, 0.0),
-    ) -> None:
+        self, steps: Steps, readings: Readings, times_s: FloatArray, first_pose: tuple[float, float, float],
+        settings: RecordingConfig, used: BoolArray, rest: tuple[float, float] = (0.0, 0.0),
+    ) -> None:  # fmt: skip
         priors = settings.priors
-        self.reckoning = Reckoning(
-            steps,
-            times_s,
-            delayed=priors.odometry_delay_s > 0.0,
-            rest=rest if priors.turn_bias_rad_s > 0.0 else (0.0, 0.0),
-        )
+        rest = rest if priors.turn_bias_rad_s > 0.0 else (0.0, 0.0)
+        self.reckoning = Reckoning(steps, times_s, delayed=priors.odometry_delay_s > 0.0, rest=rest)
         self.readings = readings
         self.at: IntArray = np.searchsorted(times_s, readings.times_s)
         self.first_pose = np.array(first_pose)

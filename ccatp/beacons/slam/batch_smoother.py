@@ -11,14 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular
 
-from ccatp.beacons.slam.batch_problem import (
-    BEACON,
-    RSSI_REFERENCE,
-    SHARED,
-    ArrowSystem,
-    BatchProblem,
-    BatchState,
-)
+from ccatp.beacons.slam.batch_problem import BEACON, RSSI_REFERENCE, SHARED, ArrowSystem, BatchProblem, BatchState
 from ccatp.beacons.slam.beacon_slam import BeaconSlam
 from ccatp.beacons.slam.causal import beyond_priors, follow
 from ccatp.beacons.slam.evaluation import aligned_beacons
@@ -103,11 +96,7 @@ def t_cost(chi2: FloatArray, sizes: FloatArray, freedom: float, softness: float 
 
 
 def descend(
-    problem: BatchProblem,
-    state: BatchState,
-    most: int,
-    softness: float = 1.0,
-    enough: float = CONVERGED,
+    problem: BatchProblem, state: BatchState, most: int, softness: float = 1.0, enough: float = CONVERGED
 ) -> tuple[BatchState, bool]:
     """Minimise the negative log posterior, with the softness of the readings' law; whether that converged."""
     damping = 1e-6
@@ -285,17 +274,10 @@ def smooth(
             much = f"{ratio:.1f} times as noisy as assumed"
             warnings.append(f"{what} readings are {much}: beacons exchanged or moved on the way?")
     return EstimatedPath(
-        times_s=times_s,
-        poses=state.poses,
-        covariances=factored.pose_covariances(),
-        beacons=beacons,
-        calibration=calibration,
-        refused=int((weights[counted] < LITTLE).sum()),
-        update_s=np.array([took_s / max(updates, 1)]),
-        updates=updates,
-        warnings=tuple(warnings),
-        map_covariance=covariance[np.ix_(of_map, of_map)],
-    )
+        times_s, state.poses, factored.pose_covariances(), beacons, calibration, updates=updates,
+        refused=int((weights[counted] < LITTLE).sum()), update_s=np.array([took_s / max(updates, 1)]),
+        warnings=tuple(warnings), map_covariance=covariance[np.ix_(of_map, of_map)],
+    )  # fmt: skip
 
 
 def _widened(problem: BatchProblem, state: BatchState) -> RadioNoiseConfig:

@@ -11,15 +11,7 @@ import numpy as np
 from ccatp.beacons.slam.beacon_map import HEADING
 from ccatp.beacons.slam.beacon_slam import BeaconInnovation, BeaconSlam, recorded_slam
 from ccatp.beacons.slam.motion import POSE, Increment
-from ccatp.beacons.slam.recording import (
-    BeaconFix,
-    Calibrated,
-    DelayedPath,
-    EstimatedPath,
-    Reading,
-    RecordedRun,
-    Steps,
-)
+from ccatp.beacons.slam.recording import BeaconFix, Calibrated, DelayedPath, EstimatedPath, Reading, RecordedRun, Steps
 from ccatp.config.beacon_models import FixedLagConfig, RecordingConfig, SlamFilterConfig
 from ccatp.core import FloatArray
 from ccatp.filters.ekf_slam import columns_of

@@ -50,9 +50,7 @@ class ReadingRecord(NamedTuple):
     """A reading that waits."""
 
     reading: Reading
-    place: (
-        BlockId  # block of the state with the place (x_m, y_m), or the pose if there is a bearing, where it was taken
-    )
+    place: BlockId  # of the state: the place (x_m, y_m) where it was taken, or the pose if there is a bearing
     distance_m: float
 
 
@@ -63,9 +61,7 @@ class Candidate(NamedTuple):
     covariance: FloatArray  # shape (b, b)
     cost: float
     variances: FloatArray  # of the readings' noise, larger where they look too far off, shape (m,)
-    bend: (
-        float  # most that a reading changes in second order over a standard deviation across its line of sight, sigmas
-    )
+    bend: float  # most that a reading changes in second order over a sigma across its line of sight, in sigmas
 
 
 class StackedRows:
@@ -241,9 +237,8 @@ class _Problem(NamedTuple):
             if size < 1e-3 * stride and (k > ROBUST or not self.is_robust):
                 break
             b = b + step * min(1.0, stride / max(size, 1e-12))
-        return Candidate(
-            b, np.linalg.inv(A), cost, variances, self._bend(b, np.linalg.inv(A)) if self.is_robust else 0.0
-        )
+        C = np.linalg.inv(A)
+        return Candidate(b, C, cost, variances, self._bend(b, C) if self.is_robust else 0.0)
 
     def _bend(self, b: FloatArray, C: FloatArray) -> float:
         _, G, _, R = self.rows.at(self.x, b.tolist())

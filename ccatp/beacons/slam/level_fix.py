@@ -148,16 +148,10 @@ def judged(fixes: Sequence[LevelFix], places: Sequence[MeasuredPlace], probabili
     """Errors of fixes, and how many of the places their regions of a probability hold, for JSON."""
     points: list[dict[str, Any]] = []
     for found, place in zip(fixes, places, strict=True):
-        error_m = float(np.hypot(*(found.position_m - place.place_m)))
-        points.append(
-            {
-                "true_m": list(place.place_m),
-                "fix_m": [round(float(v), 4) for v in found.position_m],
-                "sigma_m": [round(float(v), 4) for v in np.sqrt(np.diag(found.covariance_m2))],
-                "error_m": round(error_m, 4),
-                "in_region": found.holds(place.place_m, probability),
-            }
-        )
+        error_m, sigmas_m = float(np.hypot(*(found.position_m - place.place_m))), np.sqrt(np.diag(found.covariance_m2))
+        fix_m, sigma_m = ([round(value, 4) for value in values.tolist()] for values in (found.position_m, sigmas_m))
+        point = {"true_m": list(place.place_m), "fix_m": fix_m, "sigma_m": sigma_m, "error_m": round(error_m, 4)}
+        points.append(point | {"in_region": found.holds(place.place_m, probability)})
     errors = [point["error_m"] for point in points]
     return {
         "points": points,

@@ -163,13 +163,9 @@ class DifferentialDrive:
         return turn - bias * dt, -dt, -turn / scaled
 
     def _spread(
-        self,
-        odometry: Increment,
-        direction: tuple[float, float],
-        by_turn: tuple[float, float],
-        chord: float,
+        self, odometry: Increment, direction: tuple[float, float], by_turn: tuple[float, float], chord: float,
         turning: float,
-    ) -> FloatArray:
+    ) -> FloatArray:  # fmt: skip
         way, dt = hypot(odometry.distance_m, odometry.lateral_m), odometry.interval_s
         var_way, var_turn, var_side = step_variances(self._noise, way, abs(odometry.turn_rad), dt)
         var_turn *= turning

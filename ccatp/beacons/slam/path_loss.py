@@ -177,17 +177,10 @@ def fit_path_loss(pairs: Iterable[LevelPair]) -> PathLossFit:
     variance = float(residuals @ residuals) / (distances.size - 2)
     white, shadowing = _parts(list(by_place.values()), variance)
     return PathLossFit(
-        reference_dbm=float(found[0]),
-        exponent=float(found[1]),
-        covariance=variance * normal,
-        sigma_db=sqrt(variance),
-        white_sigma_db=white,
-        shadowing_sigma_db=shadowing,
-        places=distances.size,
-        readings=sum(map(len, by_place.values())),
-        residuals_db=residuals,
-        distances_m=distances,
-    )
+        reference_dbm=float(found[0]), exponent=float(found[1]), covariance=variance * normal, sigma_db=sqrt(variance),
+        white_sigma_db=white, shadowing_sigma_db=shadowing, places=distances.size,
+        readings=sum(map(len, by_place.values())), residuals_db=residuals, distances_m=distances,
+    )  # fmt: skip
 
 
 def _parts(groups: list[list[float]], variance_db2: float) -> tuple[float, float]:

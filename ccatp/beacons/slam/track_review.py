@@ -83,7 +83,7 @@ def next_range(
     return NextRange((int(ends[best, 0]), int(ends[best, 1])), float(np.sqrt(max(total, 0.0) / count)), after_m)
 
 
-def next_reading(track: EstimatedPath, noise: RadioNoiseConfig) -> tuple[str, tuple[float, float], NextRange] | None:
+def next_reading(track: EstimatedPath, noise: RadioNoiseConfig) -> dict[str, Any] | None:
     """The beacon to range to, the place on the path where, and what that gives; None with fewer than three beacons."""
     names, count = list(track.beacons), len(track.beacons)
     points = np.array([track.beacons[name][:2] for name in names]).reshape(-1, 2)
@@ -94,24 +94,15 @@ def next_reading(track: EstimatedPath, noise: RadioNoiseConfig) -> tuple[str, tu
     found = next_range(points, track.map_covariance, np.column_stack([which, count + where]), ways, sigmas)
     if found is None:
         return None
-    x_m, y_m = places[found.ends[1] - count].tolist()
-    return names[found.ends[0]], (x_m, y_m), found
+    beacon, place = found.ends
+    from_m: list[float] = places[place - count].tolist()
+    return {"beacon": names[beacon], "from_m": from_m, "map_m": found.before_m, "after_m": found.after_m}
 
 
 def reviewed(run: RecordedRun, track: EstimatedPath, noise: RadioNoiseConfig) -> dict[str, Any]:
     """What ``ccatp radio slam`` says besides errors, as JSON has it."""
-    advice = next_reading(track, noise)
-    return {
-        "residuals": residuals_by_beacon(run, range_residuals(run, track)),
-        "measure_next": None
-        if advice is None
-        else {
-            "beacon": advice[0],
-            "from_m": list(advice[1]),
-            "map_m": advice[2].before_m,
-            "after_m": advice[2].after_m,
-        },
-    }
+    residuals = residuals_by_beacon(run, range_residuals(run, track))
+    return {"residuals": residuals, "measure_next": next_reading(track, noise)}
 
 
 def review_lines(data: Mapping[str, Any]) -> Iterator[str]:
