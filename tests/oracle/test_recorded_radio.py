@@ -67,6 +67,14 @@ def test_mrclam7_smoothed_mean_of_all_robots() -> None:
 
 
 @pytest.mark.slow
+def test_mrclam7_landmarks_by_the_fixed_lag_mean_of_all_robots() -> None:
+    """Its map rests on what was received up to the end, its alignment on the path of each instant."""
+    runs = [read_run(DATA / "mrclam/set7", None, robot) for robot in range(1, 6)]
+    errors = [judge(estimate(run, load_recordings_config(), "fixed-lag"), run).beacon_rmse_m or 9.0 for run in runs]
+    assert sum(errors) / len(errors) < 0.10
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", [3, 5])
 def test_mrclam3_maps_the_landmarks_without_truth_of_the_path(robot: int) -> None:
     _, _, found = smoothed("mrclam/set3", robot)
