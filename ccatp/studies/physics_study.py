@@ -128,7 +128,7 @@ class Drive:
         most_m_s = cfg.limits.a_max_m_s2 * robot.frame_s
         ahead_m_s = min(max(wanted.v_m_s - self._speed_m_s, -most_m_s), most_m_s) + self._speed_m_s
         self._speed_m_s = ahead_m_s if wanted.v_m_s else 0.0
-        robot.advance()
+        self._advance()
         frame, pose = robot.delivered, self.truth.pose
         if frame is None:
             return
@@ -151,6 +151,19 @@ class Drive:
         plant = self._robot.world.plant
         if isinstance(plant, PhysicsPlant):
             plant.set_friction(friction)
+        self._slide_m = 0j
+
+    @property
+    def slid_m(self) -> float:
+        """How far the body has gone over its wheels since the friction was set, m."""
+        return abs(self._slide_m)
+
+    def _advance(self) -> None:
+        plant = self._robot.world.plant
+        before_m, before_rad = complex(plant.x_m, plant.y_m), plant.right_angle_rad + plant.left_angle_rad
+        self._robot.advance()
+        rolled_m = 0.5 * self._cfg.robot.wheel_radius_m * (plant.right_angle_rad + plant.left_angle_rad - before_rad)
+        self._slide_m += complex(plant.x_m, plant.y_m) - before_m - rolled_m * complex(plant.hx, plant.hy)
 
     def stop(self) -> float:
         """Zeros until it stands: how far the body goes, m."""
@@ -260,7 +273,7 @@ def run_slides(job: Job) -> JobOutcome:
     """The friction falls from the robot's to that of the physics, in eight directions: when that is found."""
     cfg, mirror = job.cfg, build_mirror(job.cfg.mirror)
     values: dict[str, object] = {}
-    ways_m, falls = [], 0
+    ways_m, slides_m, falls = [], [], 0
     for way, twist in (("drive", Twist(cfg.limits.v_max_m_s, 0.0)), ("turn", Twist(0.0, 0.5))):
         found: list[int] = []
         for heading_rad in _HEADINGS_RAD:
@@ -274,12 +287,14 @@ def run_slides(job: Job) -> JobOutcome:
                 frames += 1
             if frames < _SLIDE_FRAMES:
                 found.append(frames)
+                slides_m.append(drive.slid_m)
             ways_m.append(drive.stop())
             falls += drive.truth.has_fallen
         soon = sum(frames <= _SOON_FRAMES for frames in found)
         values[way] = {"found": len(found), "within_50ms": soon, "latest_ms": 10 * max(found, default=0)}
-    way_mm = {"mean": 1e3 * sum(ways_m) / len(ways_m), "max": 1e3 * max(ways_m)}
-    return JobOutcome({"trials": len(ways_m), **values, "falls": falls, "way_mm": way_mm}, {})
+    for name, each_m in (("slid", slides_m), ("way", ways_m)):
+        values[f"{name}_mm"] = {"mean": 1e3 * sum(each_m) / max(len(each_m), 1), "max": 1e3 * max(each_m, default=0.0)}
+    return JobOutcome({"trials": len(ways_m), **values, "falls": falls}, {})
 
 
 def slide_cells() -> Sequence[Cell]:
@@ -305,6 +320,7 @@ SLIDES = Study(
         trials falls
         drive: found within_50ms latest_ms
         turn: found within_50ms latest_ms
+        slid_mm: mean max
         way_mm: mean max
     """,
     draw=draw_slides,
