@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 
 # Ranges that a decoder of samples checks.
@@ -249,6 +250,46 @@ def twist_of(right_rad_s: float, left_rad_s: float, wheel_radius_m: float, wheel
     return Twist(
         0.5 * wheel_radius_m * (right_rad_s + left_rad_s), wheel_radius_m * (right_rad_s - left_rad_s) / wheel_base_m
     )
+
+
+_SLIDE_MEMORY_S = 0.06
+_LEAST_SHARE = 0.3  # of the limit: a turn alone is no slide
+
+
+class SlideRule:
+    """Loss of grip: the body goes downhill faster than its wheels, and less so where it turns with them neither.
+
+    What it gains on its wheels in speed, and in angle, is summed with a memory of 60 ms. Limits ``slip_m_s`` and
+    ``turn_rad``.
+    """
+
+    MEMORY_S = _SLIDE_MEMORY_S
+    LEAST_SLOPE = 0.15  # of gravity along the surface: with less it does not slide
+    LARGEST_M_S2 = 10.0  # gravity gives no more
+    WHEEL_JUMP_M_S = 0.03  # of the wheels' speed in 10 ms: no wheel that carries the robot does that
+    BIAS_SAMPLES = 50  # of the accelerometer at rest, whose mean is its bias
+
+    def __init__(self, slip_m_s: float, turn_rad: float) -> None:
+        self.slip_m_s, self._turn_rad = slip_m_s, turn_rad
+        self._ahead_m_s = self._left_m_s = self._turned_rad = 0.0
+
+    def reset(self) -> None:
+        """Nothing is known of the last 60 ms."""
+        self._ahead_m_s = self._left_m_s = self._turned_rad = 0.0
+
+    def step(self, dt_s: float, ahead_m_s: float, left_m_s: float, turned_rad: float, downhill: Vector2) -> float:
+        """Take what was gained within ``dt_s``; how fast it slides downhill, m/s; 0: it does not.
+
+        ``downhill``: unit vector, robot frame; zeros where there is no slope.
+        """
+        keep = _SLIDE_MEMORY_S / (_SLIDE_MEMORY_S + dt_s)
+        self._ahead_m_s = keep * (self._ahead_m_s + ahead_m_s)
+        self._left_m_s = keep * (self._left_m_s + left_m_s)
+        self._turned_rad = keep * (self._turned_rad + turned_rad)
+        downhill_m_s = self._ahead_m_s * downhill[0] + self._left_m_s * downhill[1]
+        share = downhill_m_s / self.slip_m_s
+        slides = share >= _LEAST_SHARE and share + abs(self._turned_rad) / self._turn_rad >= 1.0
+        return downhill_m_s if slides else 0.0
 
 
 # By the signal; whatever is stale or missing has an age. A signal that stands for several quantities has none.

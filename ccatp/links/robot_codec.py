@@ -87,7 +87,7 @@ def decode_from_client(line: bytes) -> FromClient | Unknown:
     return message
 
 
-class RobotFrame(RobotLinkMessage, tag="sensors"):
+class RobotFrame(RobotLinkMessage, tag="sensors", omit_defaults=True):
     """A frame as it is encoded: the fields of ``Sensors`` in the same places, samples as plain tuples (finite, SI).
 
     Making named tuples of twenty samples takes as long as reading them, so it waits until names are needed.
@@ -103,6 +103,7 @@ class RobotFrame(RobotLinkMessage, tag="sensors"):
     soc: float
     cmd: CommandEcho
     faults: Sequence[str]
+    sliding: bool = False
 
 
 def encode(message: FromRobot | FromClient | RobotFrame) -> bytes:

@@ -99,8 +99,11 @@ class CommandEcho(msgspec.Struct, gc=False):
     held: bool
 
 
-class Sensors(RobotLinkMessage, tag="sensors", gc=True):
-    """One frame of the robot: every sample taken since the one before, oldest first. Times are the robot's clock, s."""
+class Sensors(RobotLinkMessage, tag="sensors", gc=True, omit_defaults=True):
+    """One frame of the robot: every sample taken since the one before, oldest first. Times are the robot's clock, s.
+
+    ``sliding``: it has found a loss of grip itself, holds its wheels, and gives full fans.
+    """
 
     seq: Sequence53
     t: Time
@@ -112,6 +115,7 @@ class Sensors(RobotLinkMessage, tag="sensors", gc=True):
     soc: Fraction
     cmd: CommandEcho
     faults: list[Name]
+    sliding: bool = False
 
 
 class Drive(RobotLinkMessage, tag="drive"):

@@ -26,7 +26,7 @@ class DeviceCheck(NamedTuple):
 class Readings(NamedTuple):
     """Samples that came since the last call, each list oldest first.
 
-    imu: (t, acceleration along robot x without gravity, m/s^2, rate about robot z, rad/s).
+    imu: (t, acceleration along robot x, rate about robot z, acceleration along robot y), m/s^2 without gravity, rad/s.
     counts: (t, right, left) encoder counts since the start, unwrapped; ``None`` is a wheel that was not read.
     edges: (t, front left, front right, rear left, rear right) of the analogue edge sensors, V.
     gravity: (t, gx, gy, gz), unit vector along which things fall, robot frame; the newest one, or none.
@@ -34,7 +34,7 @@ class Readings(NamedTuple):
     faults: what does not work now, by its name on the robot link, with the reason.
     """
 
-    imu: Sequence[tuple[float, float, float]]
+    imu: Sequence[tuple[float, float, float, float]]
     counts: Sequence[tuple[float, int | None, int | None]]
     edges: Sequence[tuple[float, float, float, float, float]]
     gravity: tuple[float, float, float, float] | None

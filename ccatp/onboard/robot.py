@@ -5,9 +5,11 @@ demands of the robot is in ``ccatp.onboard.rules``; besides, the wheels are held
 
 * a device that is needed to drive has failed (inertial unit, encoders, edge sensors), until it works again;
 * a wheel is stalled, until a drive of zero;
-* the control loop ran so late that the external timer may have braked, for that step.
+* the control loop ran so late that the external timer may have braked, for that step;
+* the robot slides over its wheels, and for half a second after: then the fans give all they can, until they are
+  commanded again.
 
-The fans are never changed by any of this.
+Nothing else changes the fans.
 """
 
 from math import pi
@@ -18,12 +20,13 @@ from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_messages import CommandEcho, RobotData
 from ccatp.onboard.edge_threshold import EdgeThreshold
 from ccatp.onboard.hardware import Hardware, HardwareError
-from ccatp.onboard.rules import HELD, LinkedRobot
+from ccatp.onboard.rules import HELD, LinkedRobot, SlideMonitor
 from ccatp.onboard.wheel_servo import WheelServo
 
 # Without these the robot does not move. A weak fan or battery is for its clients to judge.
 NEEDED = ("imu", "encoder_right", "encoder_left", "edge", "stall")
 _SAME_S = 1e-9
+_SLIDE_HOLD_S = 0.5
 _LINE_SAMPLES = 24  # of one sensor in a line: a burst after a gap must not exceed the line's limit
 
 WheelRates = tuple[float, float | None, float | None]
@@ -49,6 +52,10 @@ class OnboardRobot(LinkedRobot):
         self._edges = [EdgeThreshold(cfg.edges) for _ in range(4)]
         self._rad_per_count = 2.0 * pi / cfg.servo.counts_per_rev
         self._last_counts: tuple[float, int | None, int | None] | None = None
+        self._slides = SlideMonitor(
+            (robot.grip_slip_m_s, robot.grip_turn_rad), robot.wheel_radius_m, robot.wheel_base_m
+        )
+        self._slides_until_s = 0.0
         self.faults: dict[str, str] = {}
         self.voltages_v = 0.0, 0.0
         self.late_steps = self.dropped_samples = 0
@@ -59,7 +66,8 @@ class OnboardRobot(LinkedRobot):
         self._imu: list[tuple[float, float, float]] = []
         self._enc: list[WheelRates] = []
         self._edge: list[tuple[float, int, int, int, int]] = []
-        self._gravity: tuple[float, float, float, float] | None = None
+        self._gravity: tuple[float, float, float, float] | None = None  # of no frame yet
+        self._downhill: tuple[float, float, float, float] | None = None
         # The duties of before are in force; the floor comes with the first command.
         self.fans.duty = self._duty_in_force = hardware.fans()
 
@@ -89,7 +97,7 @@ class OnboardRobot(LinkedRobot):
             self._stall = ""
         if self._stall:
             self.faults["stall"] = self._stall
-        if is_late or any(name in self.faults for name in NEEDED):
+        if is_late or now_s < self._slides_until_s or any(name in self.faults for name in NEEDED):
             right_set, left_set = HELD
             self.rules.is_held = True
         try:
@@ -114,8 +122,9 @@ class OnboardRobot(LinkedRobot):
         readings = self._hardware.read(now_s)
         self.faults = dict(readings.faults)
         self._soc = readings.soc
-        self._imu += readings.imu
+        self._imu += [row[:3] for row in readings.imu]
         self._gravity = readings.gravity or self._gravity
+        self._downhill = readings.gravity or self._downhill
         for t_s, right, left in readings.counts:
             self._count(t_s, right, left)
         for t_s, *voltages in readings.edges:
@@ -123,6 +132,11 @@ class OnboardRobot(LinkedRobot):
                 edge.read(t_s, voltage_v) for edge, voltage_v in zip(self._edges, voltages, strict=True)
             )
             self._edge.append((t_s, front_left, front_right, rear_left, rear_right))
+        if readings.imu and self._last_counts is not None:
+            right_rad, left_rad = [None if n is None else n * self._rad_per_count for n in self._last_counts[1:]]
+            if self._slides.step(readings.imu[-1], (right_rad, left_rad), self._downhill):
+                self._slides_until_s = now_s + _SLIDE_HOLD_S
+                self.fans.command(1.0, 1.0)
 
     def _count(self, t_s: float, right: int | None, left: int | None) -> None:
         """Speeds from the counts since the reading before: their sum over time is the angle exactly."""
@@ -180,6 +194,7 @@ class OnboardRobot(LinkedRobot):
             self.seq, round(t_s, 6), self._take_samples(self._imu, since_s), self._take_samples(self._enc, since_s),
             self._take_samples(self._edge, since_s), gravity, self.fans.duty, self._soc,
             CommandEcho(drive_seq, round(age_s, 6), round(permit_age_s, 6), is_held), faults,
+            t_s < self._slides_until_s,
         )  # fmt: skip
         self._line = encode(frame)
         self.delivered_seq = self.seq

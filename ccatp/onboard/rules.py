@@ -6,13 +6,15 @@ default: a set point reaches the wheels only through ``MotionRules.set_points``.
 
 from abc import ABC, abstractmethod
 from collections import deque
-from math import inf, isfinite
+from math import hypot, inf, isfinite
 from typing import Any, Literal
 
+from ccatp.core import SlideRule, twist_of
 from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData, Role
 
 HELD = (0.0, 0.0)
 _EVERYTHING = (True, True, True)
+_BIAS_TIME_S = 1.0
 _MOTION: dict[Role, str] = {"controller": "drive", "monitor": "permit"}  # command of a role that moves the robot
 
 
@@ -111,6 +113,56 @@ class FanRules:
     def thrust(self) -> float:
         """Mean thrust, 0 to 1."""
         return 0.5 * (self.duty[0] * self.health[0] + self.duty[1] * self.health[1])
+
+
+class SlideMonitor:
+    """Loss of grip by the robot's own sensors: accelerations ahead and to the left, gyroscope, gravity, wheels.
+
+    Their mean of 1 s is no slide: errors of the sensors and of the gravity that was taken out of the accelerations.
+    """
+
+    def __init__(self, limits: tuple[float, float], wheel_radius_m: float, wheel_base_m: float) -> None:
+        self._rule, self._radius_m, self._base_m = SlideRule(*limits), wheel_radius_m, wheel_base_m
+        self._last: tuple[float, float, float] | None = None
+        self._speed_m_s = 0.0
+        self._biases = [0.0, 0.0, 0.0]
+        self._count = 0
+
+    def step(
+        self,
+        sample: tuple[float, float, float, float],
+        angles_rad: tuple[float | None, float | None],
+        gravity: tuple[float, float, float, float] | None,
+    ) -> bool:
+        """Take a sample of the inertial unit and the (right, left) angles of the wheels; whether the robot slides."""
+        rule, last, (t_s, ax, wz, ay), (right, left) = self._rule, self._last, sample, angles_rad
+        self._last = None if right is None or left is None else (t_s, right, left)
+        if (
+            last is None
+            or right is None
+            or left is None
+            or gravity is None
+            or not last[0] < t_s < last[0] + rule.MEMORY_S
+        ):
+            rule.reset()
+            return False
+        dt_s = t_s - last[0]
+        wheels = twist_of((right - last[1]) / dt_s, (left - last[2]) / dt_s, self._radius_m, self._base_m)
+        change_m_s, self._speed_m_s = wheels.v_m_s - self._speed_m_s, wheels.v_m_s
+        self._count += 1
+        if max(abs(ax), abs(ay)) > rule.LARGEST_M_S2 or abs(change_m_s) > rule.WHEEL_JUMP_M_S:
+            rule.reset()
+            return False
+        excess = ax - change_m_s / dt_s, ay - wz * wheels.v_m_s, wz - wheels.omega_rad_s
+        share = max(dt_s / (_BIAS_TIME_S + dt_s), 1.0 / self._count)
+        biases = self._biases
+        for k, value in enumerate(excess):
+            biases[k] += share * (value - biases[k])
+        ahead, left_m_s2, turn = (dt_s * (value - bias) for value, bias in zip(excess, biases, strict=True))
+        _, gx, gy, _ = gravity
+        slope = hypot(gx, gy)
+        downhill = (gx / slope, gy / slope) if slope >= rule.LEAST_SLOPE else HELD
+        return rule.step(dt_s, ahead, left_m_s2, turn, downhill) > 0.0 and self._count > rule.BIAS_SAMPLES
 
 
 class LinkedRobot(ABC):

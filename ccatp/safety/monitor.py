@@ -126,6 +126,8 @@ class HealthMonitor:
         is_flickering = is_any_off or not self._flicker.is_quiet
         self._frames += 1
         is_sliding = self._grip.step(t_s, dt_s, imu, self._means, frame.gravity, self._bias_rad_s)
+        if frame.sliding:
+            is_sliding = self._grip.report(t_s, self._cfg.grip_slip_m_s)
         is_due = self._frames % _LOOK_FRAMES == 0 or is_flickering or is_gap or is_sliding
         if is_due or frame.faults or self.findings or self._gate.cause:
             self._judge(t_s, frame, wheels)

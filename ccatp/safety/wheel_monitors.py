@@ -7,7 +7,7 @@ from typing import NamedTuple
 from ccatp import conditions
 from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.control.wheel_motion import MotionSum, SlidingWindow, WheelMeans
-from ccatp.core import GravitySample, ImuSample, WheelSample
+from ccatp.core import GravitySample, ImuSample, SlideRule, WheelSample
 from ccatp.safety.escalation import FindingLatch, Since
 
 # A servo of 0.1 s and a link of 40 ms have forgotten a command after this long, to within 2 %.
@@ -226,31 +226,25 @@ class WheelMonitor:
             self.yaw.see(t_s, conditions.YAW_DISAGREES.found("imu_wz", difference, limit))
 
 
-_SLIDE_MEMORY_S = 0.06
 _GRAVITY_TIME_S = 0.2  # over which its readings, noisy ones, are averaged
-_BIAS_SAMPLES = 50  # of the accelerometer at rest, whose mean is its bias
 _STILL_RAD_S = 0.05  # a wheel that is held gives way so slowly on a slope
-_LEAST_SLOPE = 0.15  # of gravity along the robot: where it drives on a level or across a slope it does not slide ahead
-_LARGEST_M_S2 = 10.0  # gravity gives no more
-_ENCODER_JUMP_M_S = 0.03  # of a wheel's speed in a frame: no wheel that carries the robot does that
 _HOLDS = 1.05  # full thrust over the least: with less it may slide anywhere
-_LEAST_SHARE = 0.3  # of the limit: a turn alone is no slide
 
 
 class GripMonitor:
     """Loss of grip: the body goes downhill faster than its wheels. And too little of it, by the creep of turns.
 
-    Its acceleration, less the bias at rest, against the change of the wheels' speed, and the gyroscope's rate against
-    their turn, both summed with a memory of 60 ms. ``finding``: of the margin that main measures, or None.
+    Its acceleration ahead, less the bias at rest, against the change of the wheels' speed, and the gyroscope's rate
+    against their turn; or the robot says so itself. ``finding``: of the margin that main measures, or None.
     """
 
     def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
-        self._slip_m_s, self._turn_rad, self._radius_m = cfg.grip_slip_m_s, cfg.grip_turn_rad, robot.wheel_radius_m
+        self._rule, self._radius_m = SlideRule(cfg.grip_slip_m_s, cfg.grip_turn_rad), robot.wheel_radius_m
         self._per_base = robot.wheel_radius_m / robot.wheel_base_m
         self.alarm = FindingLatch(cfg.retry_after_s)
         self._least_margin = robot.thrust_margin
         self.finding: conditions.MonitorFinding | None = None
-        self._ahead = self._bias_m_s2 = self._slid_m_s = self._turned_rad = self._speed_m_s = 0.0
+        self._ahead = self._bias_m_s2 = self._speed_m_s = 0.0
         self._rested = 0
 
     def take_margin(self, margin: float) -> None:
@@ -270,6 +264,7 @@ class GripMonitor:
         bias_rad_s: float,
     ) -> bool:
         """Take a frame; whether the robot slides. ``bias_rad_s``: of the gyroscope."""
+        rule = self._rule
         if gravity is not None:
             self._ahead += 0.05 / (_GRAVITY_TIME_S + 0.05) * (gravity[1] - self._ahead)
         right, left = means.right_rad_s, means.left_rad_s
@@ -279,24 +274,23 @@ class GripMonitor:
         speed_m_s, before_m_s = 0.5 * self._radius_m * (right + left), self._speed_m_s
         self._speed_m_s = speed_m_s
         change_m_s = speed_m_s - before_m_s
-        is_sound = -_LARGEST_M_S2 < ax < _LARGEST_M_S2 and -_ENCODER_JUMP_M_S < change_m_s < _ENCODER_JUMP_M_S
+        is_sound = abs(ax) < rule.LARGEST_M_S2 and abs(change_m_s) < rule.WHEEL_JUMP_M_S
         is_still = -_STILL_RAD_S < right < _STILL_RAD_S and -_STILL_RAD_S < left < _STILL_RAD_S
-        if is_still and self._rested < _BIAS_SAMPLES and is_sound:
+        if is_still and self._rested < rule.BIAS_SAMPLES and is_sound:
             self._rested += 1
             self._bias_m_s2 += (ax - self._bias_m_s2) / self._rested
-        if not is_sound or self._rested < _BIAS_SAMPLES or not 0.0 < dt_s < _SLIDE_MEMORY_S:
-            self._slid_m_s = self._turned_rad = 0.0
+        if not is_sound or self._rested < rule.BIAS_SAMPLES or not 0.0 < dt_s < rule.MEMORY_S:
+            rule.reset()
             return False
-        keep = _SLIDE_MEMORY_S / (_SLIDE_MEMORY_S + dt_s)
-        self._slid_m_s = keep * (self._slid_m_s + (ax - self._bias_m_s2) * dt_s - change_m_s)
-        self._turned_rad = keep * (self._turned_rad + (wz - bias_rad_s - self._per_base * (right - left)) * dt_s)
-        if -_LEAST_SLOPE < self._ahead < _LEAST_SLOPE:
-            return False
-        downhill_m_s = self._slid_m_s if self._ahead > 0.0 else -self._slid_m_s
-        share = downhill_m_s / self._slip_m_s
-        if share < _LEAST_SHARE or share + abs(self._turned_rad) / self._turn_rad < 1.0:
-            return False
-        self.alarm.see(t_s, conditions.GRIP_LOST.found("grip", downhill_m_s, self._slip_m_s))
+        # Of the acceleration the link has the part ahead alone.
+        side = 1.0 if self._ahead >= rule.LEAST_SLOPE else -1.0 if self._ahead <= -rule.LEAST_SLOPE else 0.0
+        turned_rad = (wz - bias_rad_s - self._per_base * (right - left)) * dt_s
+        slid_m_s = rule.step(dt_s, (ax - self._bias_m_s2) * dt_s - change_m_s, 0.0, turned_rad, (side, 0.0))
+        return slid_m_s > 0.0 and self.report(t_s, slid_m_s)
+
+    def report(self, t_s: float, slid_m_s: float) -> bool:
+        """It slides downhill so fast, by this rule or by the robot's own."""
+        self.alarm.see(t_s, conditions.GRIP_LOST.found("grip", slid_m_s, self._rule.slip_m_s))
         return True
 
 

@@ -21,7 +21,7 @@ from ccatp.core import GRAVITY_M_S2, DeckPose
 from ccatp.mirror.mirror import Mirror
 from ccatp.onboard.hardware import Readings
 from ccatp.sim.plant import downhill
-from ccatp.sim.sensors import EdgeTuple, GravityTuple, ImuTuple, SensorSuite
+from ccatp.sim.sensors import EdgeTuple, GravityTuple, SensorSuite
 from ccatp.sim.world import World
 
 _MASS_KG = 1.0
@@ -126,7 +126,7 @@ class SimulatedHardware:
 
     def read(self, now_s: float) -> Readings:
         """See ``Hardware``."""
-        imu: list[ImuTuple] = []
+        imu: list[tuple[float, float, float, float]] = []
         edges: list[EdgeTuple] = []
         counts: list[tuple[float, int | None, int | None]] = []
         gravity: GravityTuple | None = None
@@ -136,7 +136,7 @@ class SimulatedHardware:
                 self._move()
             new_edges, new_imu, _, new_gravity = self._sensors.read(self._step, self.world.plant)
             edges += new_edges
-            imu += new_imu
+            imu += [(*row, self._sensors.read_lateral(self.world.plant, 0.0)) for row in new_imu]
             gravity = new_gravity or gravity
             plant = self.world.plant
             right, left = floor(plant.right_angle_rad * self._per_rad), floor(plant.left_angle_rad * self._per_rad)

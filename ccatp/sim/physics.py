@@ -88,8 +88,8 @@ class PhysicsPlant(Plant):
         self._body = self._model.body("robot").id
         self.thrust_n = 0.0
         self.has_left = False
-        self._speeds = [0.0] * (_AVERAGED + 1)
-        self._acceleration_m_s2 = self._rate_rad_s = 0.0
+        self._speeds = [(0.0, 0.0)] * (_AVERAGED + 1)
+        self._rate_rad_s = 0.0
         self.place(start.x_m, start.y_m, start.heading_rad)
         self.are_wheels_still = False
 
@@ -157,14 +157,18 @@ class PhysicsPlant(Plant):
         right, left = data.qpos[7:9].tolist()
         self.right_angle_rad, self.left_angle_rad = right, left
         self.right_rad_s, self.left_rad_s = data.qvel[6:8].tolist()
-        speed = float(rotation[:, 0] @ data.qvel[:3])
-        self._speeds = [*self._speeds[1:], speed]
-        self._acceleration_m_s2 = (self._speeds[-1] - self._speeds[0]) / (_AVERAGED * self._step_s)
+        ahead, left = (rotation[:, :2].T @ data.qvel[:3]).tolist()
+        self._speeds = [*self._speeds[1:], (ahead, left)]
         self._rate_rad_s = float(data.qvel[5])
 
     def acceleration_at(self, decay: float) -> float:
         """Acceleration along robot x over the last steps, m/s^2."""
-        return self._acceleration_m_s2
+        return (self._speeds[-1][0] - self._speeds[0][0]) / (_AVERAGED * self._step_s)
+
+    def lateral_acceleration_at(self, decay: float) -> float:
+        """The same along robot y."""
+        (_, before), (ahead, now) = self._speeds[0], self._speeds[-1]
+        return (now - before) / (_AVERAGED * self._step_s) + self._rate_rad_s * ahead
 
     def turn_rate_at(self, decay: float) -> float:
         """Angular rate about robot z, rad/s."""

@@ -184,6 +184,11 @@ class Plant:
         difference = right_set - left_set + (r * self._right_0 - right_set - q * self._left_0 + left_set) * decay
         return 0.5 * self._radius_m * difference / self._half_base_m + self.shake_rate_rad_s
 
+    def lateral_acceleration_at(self, decay: float) -> float:
+        """Acceleration along robot y within the last step, m/s^2: the body rolls as its wheels turn."""
+        speed_m_s = 0.5 * self._radius_m * (self.right_rad_s + self.left_rad_s)
+        return self.turn_rate_at(decay) * speed_m_s
+
     def place(self, x_m: float, y_m: float, heading_rad: float) -> None:
         """Put the body elsewhere on the surface, deck frame; the wheels do not turn."""
         self.x_m, self.y_m, self.heading_rad = x_m, y_m, heading_rad

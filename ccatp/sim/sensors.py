@@ -298,6 +298,10 @@ class SensorSuite:
         self._ahead: list[tuple[SampleTimes, ...]] = []  # of the sensors in the order of their rates, frame by frame
         self._ahead_from = 0
         self._imu = InertialUnit(world, sim.imu_hz, imu, biases)
+        (lateral,) = rng.spawn(1)
+        self._lateral_bias_m_s2 = world.accelerometer_bias_sigma_m_s2 * float(lateral.standard_normal())
+        sigma_m_s2 = hypot(world.accelerometer_sigma_m_s2, world.vibration_acceleration_m_s2)
+        self._lateral_noise = noise_stream(lateral, sigma_m_s2)
         self._encoders: CountingEncoders | RateEncoders
         if world.encoder_counts_per_rev:
             self._encoders = CountingEncoders(world, sim.encoder_hz, 1.0 / sim.frame_hz, counts)
@@ -325,6 +329,10 @@ class SensorSuite:
             self._read_gravity(plant, gravity_times.times_s[-1]) if gravity_times.times_s else None,
         )
 
+    def read_lateral(self, plant: Plant, decay: float) -> float:
+        """Acceleration along robot y without gravity, which the link does not have, m/s^2; vibration as white noise."""
+        return plant.lateral_acceleration_at(decay) + self._lateral_bias_m_s2 + next(self._lateral_noise)
+
     def _look_ahead(self, frame: int) -> None:
         rates_hz = self._rates_hz
         # Sensors of the same rate are read at the same instants.
@@ -346,9 +354,11 @@ class SensorSuite:
 
 def as_message(frame: RobotFrame) -> Sensors:
     """The message that a client decodes from the frame's line."""
-    seq, t_s, imu, encoders, edges, gravity, fans, soc, cmd, faults = msgspec.structs.astuple(frame)
+    seq, t_s, imu, encoders, edges, gravity, fans, soc, cmd, faults, sliding = msgspec.structs.astuple(frame)
     read = named(ImuSample, imu), named(WheelSample, encoders), named(EdgeSample, edges)
-    return Sensors(seq, t_s, *read, None if gravity is None else GravitySample(*gravity), fans, soc, cmd, list(faults))
+    return Sensors(
+        seq, t_s, *read, None if gravity is None else GravitySample(*gravity), fans, soc, cmd, list(faults), sliding
+    )
 
 
 def named(kind: type[_Row], rows: Iterable[tuple[object, ...]]) -> list[_Row]:

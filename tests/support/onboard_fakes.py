@@ -40,7 +40,7 @@ class FakeBno055:
     def __init__(self, time: FakeTime, address: int = 0x28) -> None:
         self._time, self._address = time, address
         self.chip_id, self.self_test = 0xA0, 0x0F
-        self.gravity_m_s2, self.ax_m_s2, self.wz_rad_s = (0.0, 0.0, 9.81), 0.0, 0.0
+        self.gravity_m_s2, self.ax_m_s2, self.ay_m_s2, self.wz_rad_s = (0.0, 0.0, 9.81), 0.0, 0.0, 0.0
         self.stuck: dict[int, int] = {}
         self.error: OSError | None = None
         self.errors: float = math.inf
@@ -117,7 +117,7 @@ class FakeBno055:
 
         rate = turned((0.0, 0.0, self.wz_rad_s), per_rad_s)
         rate[0] += self.readings % 2
-        acceleration = turned((self.ax_m_s2, 0.0, 0.0), per_m_s2)
+        acceleration = turned((self.ax_m_s2, self.ay_m_s2, 0.0), per_m_s2)
         gravity = turned(self.gravity_m_s2, per_m_s2)
         data = struct.pack("<16h2B", *rate, 0, 0, 0, 16384, 0, 0, 0, *acceleration, *gravity, 21, 0x30)
         self.registers[BURST_START : BURST_START + len(data)] = data

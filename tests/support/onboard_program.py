@@ -149,8 +149,8 @@ class RobotBench:
         speeds.append(0.5 * self._radius_m * (plant.right_rad_s + plant.left_rad_s))
         # The unit's filter takes the mean of what the motors do at 1 kHz between two of its readings.
         self.bno055.ax_m_s2 = (speeds[-1] - speeds[0]) / (max(len(speeds) - 1, 1) / self._devices.daq.sample_hz)
-        for _, _, wz in readings.imu:
-            self.bno055.wz_rad_s = wz
+        for _, _, wz, ay in readings.imu:
+            self.bno055.wz_rad_s, self.bno055.ay_m_s2 = wz, ay
         if readings.gravity is not None:
             _, gx, gy, gz = readings.gravity
             self.bno055.gravity_m_s2 = (-9.81 * gx, -9.81 * gy, -9.81 * gz)

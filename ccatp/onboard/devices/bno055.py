@@ -67,12 +67,13 @@ class _DoubtfulReading(Exception):
 
 
 class Bno055Sample(NamedTuple):
-    """One reading, robot frame: acceleration along x without gravity, m/s^2, rate about z, rad/s."""
+    """One reading, robot frame: acceleration along x and y without gravity, m/s^2, rate about z, rad/s."""
 
     t_s: float
     ax_m_s2: float
     wz_rad_s: float
     gravity: tuple[float, float, float]  # unit vector along which things fall
+    ay_m_s2: float = 0.0
 
 
 def axis_registers(axes: Sequence[str]) -> tuple[int, int]:
@@ -189,11 +190,11 @@ class Bno055:
         t_s = self._clock()
         burst = self._read_registers(BURST_START, BURST.size)
         values = BURST.unpack(burst)
-        wz, quaternion, ax, gravity = values[2], values[6:10], values[10], values[13:16]
+        wz, quaternion, (ax, ay), gravity = values[2], values[6:10], values[10:12], values[13:16]
         calibration, status, error, units, mode = (values[k] for k in (17, 21, 22, 23, 25))
         size = hypot(*gravity) / 100.0
         misfit = max(abs(hypot(*quaternion) / 16384.0 - 1.0), abs(size / _G_M_S2 - 1.0))
-        is_possible = abs(wz) <= 900.0 * _MOST_RAD_S and abs(ax) <= 100.0 * _MOST_M_S2
+        is_possible = abs(wz) <= 900.0 * _MOST_RAD_S and max(abs(ax), abs(ay)) <= 100.0 * _MOST_M_S2
         is_new, self._last_burst = burst != self._last_burst, burst
         if burst == b"\xff" * len(burst):
             raise _DoubtfulReading("the bus reads ones only; check its wiring")
@@ -207,7 +208,7 @@ class Bno055:
             raise _DoubtfulReading("the readings do not change")
         gx, gy, gz = (-g / (100.0 * size) for g in gravity)
         self.identity = f"{self._software}, gyroscope calibrated {calibration >> 4 & 3} of 3"
-        return Bno055Sample(t_s, ax / 100.0, wz / 900.0, (gx, gy, gz))
+        return Bno055Sample(t_s, ax / 100.0, wz / 900.0, (gx, gy, gz), ay / 100.0)
 
     def _set_up(self) -> None:
         """Reset the unit and set what ``_read`` relies on, each value read back; takes about 0.7 s."""

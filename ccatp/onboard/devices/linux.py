@@ -164,7 +164,7 @@ class LinuxHardware:
         if soc < LOW_SOC:
             faults["battery_low"] = f"battery at {self._daq.battery_v:.2f} V; charge it, or check devices.daq.battery_*"
         return Readings(
-            [(s.t_s, s.ax_m_s2, s.wz_rad_s) for s in inertial],
+            [(s.t_s, s.ax_m_s2, s.wz_rad_s, s.ay_m_s2) for s in inertial],
             [(s.t_s, s.right, s.left) for s in samples],
             [(s.t_s, *s.edges_v) for s in samples],
             (inertial[-1].t_s, *inertial[-1].gravity) if inertial else None,
@@ -209,7 +209,7 @@ class LinuxHardware:
         sampled: dict[str, _Sampled] = {
             "bno055": (
                 [row for reading in readings for row in reading.imu], bno055.rate_hz,
-                {"rad/s": (bno055.noise_rad_s, (2,)), "m/s^2": (bno055.noise_m_s2, (1,))},
+                {"rad/s": (bno055.noise_rad_s, (2,)), "m/s^2": (bno055.noise_m_s2, (1, 3))},
             ),
             "daq": (
                 [row for reading in readings for row in reading.edges], daq.sample_hz,

@@ -239,6 +239,34 @@ def test_a_burst_of_samples_keeps_the_newest_in_a_line_that_fits(monkeypatch: py
     assert bench.robot.dropped_samples > 300
 
 
+def test_a_robot_that_slides_holds_itself_with_full_fans_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench("fyst-m1")
+    read, slide = bench.hardware.read, 0.0
+
+    def sliding(now_s: float) -> Readings:
+        readings = read(now_s)
+        gx, gy = readings.gravity[1:3] if readings.gravity else (0.0, 0.0)
+        downhill[:] = (gx, gy) if readings.gravity else downhill
+        rows = [(t, ax + slide * downhill[0], wz, ay + slide * downhill[1]) for t, ax, wz, ay in readings.imu]
+        return readings._replace(imu=rows)
+
+    downhill = [0.0, 0.0]
+    monkeypatch.setattr(bench.hardware, "read", sliding)
+    assert bench.robot.command_fans(1, 0.2, 0.2)
+    sound = bench.run(1.5, 2.0, 2.0)
+    assert b"sliding" not in bench.robot.delivered_line
+    assert not any(frame.sliding for frame in sound)
+    slide = 9.0
+    frames = bench.run(0.1, 2.0, 2.0)
+    assert any(frame.sliding for frame in frames[:6])
+    assert (frames[-1].sliding, frames[-1].cmd.held, frames[-1].fans) == (True, True, (1.0, 1.0))
+    slide = 0.0
+    assert bench.run(0.4, 2.0, 2.0)[-1].cmd.held
+    assert bench.robot.command_fans(2, 0.5, 0.5)
+    later = bench.run(0.4, 2.0, 2.0)[-1]
+    assert (later.sliding, later.cmd.held, later.fans) == (False, False, (0.5, 0.5))
+
+
 def test_frames_that_a_stop_left_out_are_not_made_up_for() -> None:
     bench = Bench()
     bench.run(0.1)

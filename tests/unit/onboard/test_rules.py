@@ -1,12 +1,13 @@
 """The robot's own rules, and commands that wait on their way, in virtual time. Every test starts from "held"."""
 
 import math
+import random
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.onboard.rules import HELD, LinkedRobot
+from ccatp.onboard.rules import HELD, LinkedRobot, SlideMonitor
 
 DT_S, TTL_S, FASTEST = 0.01, 0.25, 8.0
 # A robot with nothing but roles and commands.
@@ -25,6 +26,50 @@ class Rig:
     def at(self, frame: int) -> LinkedRobot:
         self.robot.seq, self.robot.t_s = frame, frame * DT_S
         return self.robot
+
+
+def slid_after_s(
+    slide: tuple[float, float], gravity: tuple[float, float], *, noise_m_s2: float = 0.2, is_read: bool = True
+) -> float | None:
+    """A drive round a bend, then a body that is accelerated by (ahead, left) m/s^2 over its wheels: when it is found.
+
+    Both accelerations are off by 0.3 m/s^2. ``is_read``: the left wheel.
+    """
+    monitor, rng = SlideMonitor((0.055, 0.04), 0.03, 0.15), random.Random(3)
+    right_rad = left_rad = 0.0
+    for k in range(200):
+        t_s, is_sliding = DT_S * k, k > 100
+        right_rad, left_rad = right_rad + 4.0 * DT_S, left_rad + 2.0 * DT_S  # 0.09 m/s, 0.4 rad/s: 0.036 m/s^2
+        noise = [0.3 + noise_m_s2 * rng.gauss(0.0, 1.0) for _ in range(2)]
+        ahead, left = slide if is_sliding else (0.0, 0.0)
+        sample = t_s, noise[0] + ahead, 0.4, noise[1] + 0.036 + left
+        if monitor.step(sample, (right_rad, left_rad if is_read else None), (t_s, *gravity, 0.3)):
+            return t_s - 100 * DT_S
+    return None
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 1.0, 1.57, 2.5, -1.57])
+@pytest.mark.parametrize("slide_m_s2", [2.2, 4.0])
+def test_a_slide_downhill_is_found_in_any_direction(slide_m_s2: float, angle_rad: float) -> None:
+    way = math.cos(angle_rad), math.sin(angle_rad)
+    after_s = slid_after_s((slide_m_s2 * way[0], slide_m_s2 * way[1]), (0.9 * way[0], 0.9 * way[1]))
+    assert after_s is not None
+    assert 0.0 < after_s <= 0.05 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("slide", "gravity", "is_read"),
+    [
+        ((0.0, 0.0), (0.0, 0.9), True),
+        ((0.0, -4.0), (0.0, 0.9), True),
+        ((0.0, 4.0), (0.0, 0.1), True),
+        ((0.0, 20.0), (0.0, 0.9), True),
+        ((0.0, 4.0), (0.0, 0.9), False),
+    ],
+    ids=["a bend", "uphill", "on a level", "more than gravity: the sensor", "a wheel that is not read"],
+)
+def test_what_is_no_slide(slide: tuple[float, float], gravity: tuple[float, float], *, is_read: bool) -> None:
+    assert slid_after_s(slide, gravity, is_read=is_read) is None
 
 
 @pytest.mark.parametrize(

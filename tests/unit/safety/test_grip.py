@@ -5,8 +5,12 @@ import pytest
 
 from ccatp.conditions import GRIP_LITTLE, GRIP_LOST, GRIP_TOO_LITTLE, Clear, Condition, Motion
 from ccatp.config.load import load_config
+from ccatp.config.models import Config
 from ccatp.control.wheel_motion import WheelMeans
 from ccatp.core import GravitySample, ImuSample, WheelSample
+from ccatp.danger import DangerMonitor
+from ccatp.dataloop import motor_robot
+from ccatp.mirror.mirror import Mirror
 from ccatp.safety.wheel_monitors import GripMonitor
 
 DT_S = 0.01
@@ -58,6 +62,20 @@ def test_a_turn_that_the_wheels_do_not_make_counts_with_it() -> None:
 )
 def test_what_is_no_slide(slide_m_s2: float, ahead: float, braking_m_s2: float) -> None:
     assert found_after_s(slide_m_s2, ahead, braking_m_s2=braking_m_s2, noise_m_s2=0.3) is None
+
+
+def test_what_the_robot_says_of_itself_counts(config: Config, mirror: Mirror) -> None:
+    monitor = DangerMonitor(mirror, config.robot, config.danger, config.health)
+    robot = motor_robot(config)
+    frame = robot.delivered
+    assert frame is not None
+    assert monitor.step(frame, None).signal != "grip"
+    robot.advance()
+    frame = robot.delivered
+    assert frame is not None
+    frame.sliding = True
+    verdict = monitor.step(frame, None)
+    assert (verdict.signal, verdict.full_fans, verdict.forward, verdict.turn) == ("grip", True, False, False)
 
 
 def test_its_row_holds_the_wheels_with_full_fans_until_a_fix() -> None:

@@ -351,7 +351,7 @@ def test_the_inertial_unit_sees_the_turn_and_gravity_is_that_of_the_slope() -> N
     for k in range(300):
         hardware.drive(3.0, -3.0)
         readings = hardware.read(t_s + (k + 1) * STEP_S)
-        rates += [wz for _, _, wz in readings.imu]
+        rates += [wz for _, _, wz, _ in readings.imu]
         gravity = readings.gravity or (0.0, 0.0, 0.0, -1.0)
     assert np.mean(rates) * 0.6 == pytest.approx(hardware.plant.heading_rad - heading, rel=0.1)
     assert gravity[3] < -0.8

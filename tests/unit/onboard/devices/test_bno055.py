@@ -177,10 +177,10 @@ def test_gravity_is_where_things_fall_in_the_robots_frame(
 
 
 def test_rate_and_acceleration(rig: Rig) -> None:
-    rig.unit.ax_m_s2, rig.unit.wz_rad_s = -0.37, 1.25
+    rig.unit.ax_m_s2, rig.unit.ay_m_s2, rig.unit.wz_rad_s = -0.37, 0.21, 1.25
     rig.run(0.02)
     sample = rig.take()[-1]
-    assert (sample.ax_m_s2, sample.wz_rad_s) == (-0.37, 1.25)
+    assert (sample.ax_m_s2, sample.ay_m_s2, sample.wz_rad_s) == (-0.37, 0.21, 1.25)
     assert sample.t_s == pytest.approx(rig.time.now_s - 0.01)
 
 

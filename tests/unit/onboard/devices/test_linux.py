@@ -89,13 +89,13 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
 
 
 def test_start_read_drive_close(rig: Rig) -> None:
-    rig.daq.step, rig.unit.wz_rad_s, rig.unit.ax_m_s2 = [2, -3], 0.5, 0.25
+    rig.daq.step, rig.unit.wz_rad_s, rig.unit.ax_m_s2, rig.unit.ay_m_s2 = [2, -3], 0.5, 0.25, -0.5
     rig.hardware.start()
     assert all(rig.bridge.levels[line] for line in (5, 6, 13, 19))
     assert rig.run(0.3) == set()
     rig.time.sleep(0.02)
     readings = rig.hardware.read(rig.time.now_s)
-    assert readings.imu[-1][1:] == (0.25, 0.5)
+    assert readings.imu[-1][1:] == (0.25, 0.5, -0.5)
     assert readings.gravity is not None
     assert readings.gravity[1:] == pytest.approx((0.0, 0.0, -1.0))
     (t_s, right, left), edge = readings.counts[-1], readings.edges[-1]
@@ -104,7 +104,7 @@ def test_start_read_drive_close(rig: Rig) -> None:
     assert (t_s, 3 * right) == (edge[0], -2 * left)
     assert edge[1:] == pytest.approx([60000 / 65535 * 3.3] * 4)
     assert 0.0 < readings.soc < 1.0
-    assert all(sample[0] <= rig.time.now_s for sample in (*readings.imu, *readings.counts))
+    assert all(row[0] <= rig.time.now_s for rows in (readings.imu, readings.counts) for row in rows)
 
     level = rig.bridge.levels[CONFIG.timer.line]
     rig.hardware.drive(6.0, -6.0)
