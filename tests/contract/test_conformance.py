@@ -12,22 +12,10 @@ import pytest
 
 from ccatp.cli import main
 from ccatp.commissioning.conformance.command_checks import check_lost, other_duty
-from ccatp.commissioning.conformance.harness import (
-    CheckContext,
-    CheckFailed,
-    Facts,
-    Frame,
-    NotApplicable,
-    parse,
-)
+from ccatp.commissioning.conformance.harness import CheckContext, CheckFailed, Facts, Frame, NotApplicable, parse
 from ccatp.commissioning.conformance.motion_checks import mean_rates
 from ccatp.commissioning.conformance.runner import CHECKS, Conformance, check_ids
-from ccatp.commissioning.conformance.server_checks import (
-    check_clock,
-    check_edges,
-    check_gravity,
-    line_fault,
-)
+from ccatp.commissioning.conformance.server_checks import check_clock, check_edges, check_gravity, line_fault
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
 from tests.contract.crooked import HONEST, TIMEOUT_S, Crooked, checked, clock, serving

@@ -225,9 +225,7 @@ async def test_the_same_seed_gives_the_same_bytes(world: str) -> None:
 # -- a fall -----------------------------------------------------------------------------------------------------------
 
 
-async def test_a_fall_is_reported_to_who_started_the_robot_and_not_on_the_link(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_a_fall_is_reported_to_who_started_the_robot_and_not_on_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = survey_robot(config_of())
     monkeypatch.setattr(dataloop, "survey_robot", lambda *_: robot)
     stop, listener = asyncio.Event(), any_port()

@@ -24,16 +24,7 @@ from ccatp.sim.robot import Robot
 from ccatp.studies.faults_study import random_plan
 from ccatp.studies.sil_run import SilResult, SilRun
 from tests.faults import edge_sweep
-from tests.faults.edge_sweep import (
-    Tally,
-    rim_case,
-    rim_cases,
-    seam_case,
-    speed_of,
-    sweep,
-    turn_case,
-    turn_cases,
-)
+from tests.faults.edge_sweep import Tally, rim_case, rim_cases, seam_case, speed_of, sweep, turn_case, turn_cases
 from tests.faults.linking import Measured
 from tests.support.scenario import config_of, one_panel
 from tests.support.sim_survey import plan_of

@@ -195,12 +195,7 @@ UNSHOWN = seen("L1", "", of_robot=("L1",))
         ("L1", "default", {"ours": seen("L1"), "robots": seen("L1", of_robot=("L1",))}, ""),
         ("L1", "default", {"ours": seen("L1")}, "of the robot's part no test is marked for it"),
         ("L1", "default", {"robots": seen("L1", of_robot=("L1",))}, "no test is marked for it"),
-        (
-            "L1",
-            "default",
-            {"o": seen("L1"), "r": UNSHOWN},
-            "of the robot's part r did not pass",
-        ),
+        ("L1", "default", {"o": seen("L1"), "r": UNSHOWN}, "of the robot's part r did not pass"),
         ("L1", "slow", {"o": seen("L1"), "r": UNSHOWN}, ""),
     ],
 )

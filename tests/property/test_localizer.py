@@ -17,18 +17,7 @@ from ccatp.estimation.fixes import FixRefused
 from ccatp.estimation.odometry import arc_step
 from ccatp.estimation.thesis_localizer import FourStateLocalizer
 from tests.faults.linking import Measured
-from tests.unit.estimation.drive import (
-    STEEP,
-    Errors,
-    Frame,
-    Robot,
-    build,
-    changed,
-    fix_at,
-    mirror,
-    run,
-    trapeze,
-)
+from tests.unit.estimation.drive import STEEP, Errors, Frame, Robot, build, changed, fix_at, mirror, run, trapeze
 
 FRAMES = 40
 WRONG = Errors(right_slip=0.02, left_slip=0.01, creep=0.02, gyro_bias=0.01, noise=1.0)

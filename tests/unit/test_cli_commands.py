@@ -44,10 +44,7 @@ def test_each_shell_gets_its_script(shell: str, sign: str, tmp_path: Path, capsy
 @pytest.mark.skipif(BASH is None, reason="no bash here")
 @pytest.mark.parametrize(
     ("words", "offered"),
-    [
-        (("ccatp", "re"), {"replay", "resume"}),
-        (("ccatp", "run", "--mirror", "fyst"), {"fyst-m1", "fyst-m2"}),
-    ],
+    [(("ccatp", "re"), {"replay", "resume"}), (("ccatp", "run", "--mirror", "fyst"), {"fyst-m1", "fyst-m2"})],
     ids=("command", "mirror"),
 )
 def test_bash_completes(words: tuple[str, ...], offered: set[str], tmp_path: Path) -> None:

@@ -11,14 +11,7 @@ import pytest
 from ccatp.cli import main
 from ccatp.config.describe import comments, differences, json_schema, template
 from ccatp.config.files import write_file
-from ccatp.config.load import (
-    available,
-    dump_config,
-    is_radio_file,
-    load_config,
-    load_radio_config,
-    with_values,
-)
+from ccatp.config.load import available, dump_config, is_radio_file, load_config, load_radio_config, with_values
 from ccatp.config.messages import find_line
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir

@@ -18,13 +18,7 @@ import pytest
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.records import store
 from ccatp.records.checkpoint import CheckpointError, CheckpointFile, read_checkpoint
-from ccatp.records.store import (
-    AlreadyMeasuredError,
-    MissionStore,
-    StoredPoint,
-    StoreError,
-    StoreRefusal,
-)
+from ccatp.records.store import AlreadyMeasuredError, MissionStore, StoredPoint, StoreError, StoreRefusal
 
 PANEL = [PointId(1, 2, n) for n in range(1, 10)]
 POSE = DeckPose(0.1, 0.2, 0.3)
@@ -58,10 +52,7 @@ def test_a_fix_comes_back_as_it_was(path: Path) -> None:
     with MissionStore.open(path, mirror="fyst-m1") as db:
         assert db.fixes() == [(PANEL[4], a_fix())]
         rows = {row.point: row[1:5] for row in db.points()}
-        assert (rows[PANEL[4]], rows[PANEL[0]]) == (
-            (0.22, -0.25, "measured", 1.5),
-            (0.22, -0.25, "planned", None),
-        )
+        assert (rows[PANEL[4]], rows[PANEL[0]]) == ((0.22, -0.25, "measured", 1.5), (0.22, -0.25, "planned", None))
         assert db.damaged == ()
     assert select(path, "SELECT row, col, point, t_s, estimated_error_m FROM arrivals") == [(*PANEL[1], 3.5, 0.0004)]
     assert select(path, "SELECT estimate_x_m, estimate_y_m, estimate_heading_rad FROM fixes") == [

@@ -8,12 +8,7 @@ from numpy.random import default_rng
 from scipy.stats import chi2
 
 from ccatp.beacons.pilot import BackOff, BeaconPilot, FollowState, PilotState, TargetSight
-from ccatp.beacons.steering import (
-    HALT,
-    FuzzyGapError,
-    Point,
-    Sugeno,
-)
+from ccatp.beacons.steering import HALT, FuzzyGapError, Point, Sugeno
 from ccatp.config.beacon_models import FuzzyConfig, RadioConfig
 from ccatp.config.load import load_radio_config
 from ccatp.sim.radio import SimDriveCommand, TruePose, clearance_m, seen_m

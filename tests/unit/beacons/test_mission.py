@@ -9,14 +9,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from ccatp.beacons.mission import (
-    RULES,
-    BeaconMission,
-    WaypointArrival,
-    check_beacon_robot,
-    permitted,
-    wheel_rates,
-)
+from ccatp.beacons.mission import RULES, BeaconMission, WaypointArrival, check_beacon_robot, permitted, wheel_rates
 from ccatp.beacons.navigation import BeaconMeasurements, MeasurementReader, PoseBelief, SelfMap
 from ccatp.beacons.slam.motion import Steering
 from ccatp.beacons.steering import HALT, SteeringCommand

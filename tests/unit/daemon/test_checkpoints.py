@@ -316,10 +316,7 @@ def test_files_of_another_run_are_refused(tmp_path: Path, measured: Measured) ->
     for where in (older, one):
         build(replace(where, is_resuming=True))[1].close()
     for foreign in (older, two):
-        for name, why in (
-            (FILE, "is of another run, .* set it at base"),
-            ("mission.sqlite", "another run"),
-        ):
+        for name, why in ((FILE, "is of another run, .* set it at base"), ("mission.sqlite", "another run")):
             before = (one.run_dir / name).read_bytes()
             (one.run_dir / name).write_bytes((foreign.run_dir / name).read_bytes())
             with pytest.raises((CheckpointError, StoreUnusable), match=why):

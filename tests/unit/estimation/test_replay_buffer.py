@@ -164,11 +164,7 @@ def apart(one: FullStateLocalizer, other: FullStateLocalizer) -> tuple[float, fl
 @pytest.mark.parametrize(("turn_creep_sigma_m_rad", "limit"), [(1e-6, 1e-4), (0.002, 3e-4)])
 @pytest.mark.parametrize(
     ("name", "taken_s", "told_s"),
-    [
-        ("straight on", 1.5, 1.6),
-        ("round a corner", 1.8, 3.7),
-        ("a rest in between", 3.6, 4.5),
-    ],
+    [("straight on", 1.5, 1.6), ("round a corner", 1.8, 3.7), ("a rest in between", 3.6, 4.5)],
 )
 def test_a_late_fix_is_as_good_as_one_in_time(
     filter_name: str, name: str, taken_s: float, told_s: float, turn_creep_sigma_m_rad: float, limit: float

@@ -34,10 +34,7 @@ def edges_of(k: int) -> tuple[float, float]:
     return (
         (here.x_m + here.half_x_m, there.x_m - there.half_x_m)
         if k == 0
-        else (
-            here.y_m + here.half_y_m,
-            there.y_m - there.half_y_m,
-        )
+        else (here.y_m + here.half_y_m, there.y_m - there.half_y_m)
     )
 
 

@@ -10,24 +10,7 @@ from hypothesis import strategies as st
 
 from ccatp.core import DeckPose, FloatArray, PanelId, difference
 from ccatp.estimation.odometry import Slope, Terrain, axes_on
-from ccatp.estimation.state_model import (
-    CT,
-    KL,
-    PL,
-    PR,
-    PSI,
-    SL,
-    SR,
-    STATES,
-    A,
-    C,
-    SensorRows,
-    SurveyMotion,
-    V,
-    W,
-    X,
-    Y,
-)
+from ccatp.estimation.state_model import CT, KL, PL, PR, PSI, SL, SR, STATES, A, C, SensorRows, SurveyMotion, V, W, X, Y
 from ccatp.mirror.mirror import Mirror
 from tests.unit.estimation.drive import STEEP, Errors, Robot, build, config
 
@@ -119,10 +102,7 @@ def test_a_turn_creeps_by_its_share_of_the_mean(sign: float) -> None:
 
 
 ALL = Errors(right_slip=0.05, left_slip=0.02, base=0.02, creep=0.05, turn_creep=0.003)
-CASES = {
-    "perfect": Errors(),
-    "all": ALL,
-}
+CASES = {"perfect": Errors(), "all": ALL}
 
 
 @pytest.mark.parametrize(("v", "omega", "limit_m"), [(0.1, 0.0, 2e-6), (-0.1, 0.7, 7e-6)])

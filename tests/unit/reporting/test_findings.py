@@ -15,15 +15,7 @@ from ccatp.links.topics import BY_NAME, MissionStatus
 from ccatp.records.recorder import Recorder, iter_messages
 from ccatp.records.state_log import StateChange, changes_of, read_log
 from ccatp.records.store import StoredPoint
-from ccatp.report.findings import (
-    Grade,
-    TimeBreakdown,
-    findings_of,
-    outcome_of,
-    point_verdicts,
-    spells_of,
-    time_budget,
-)
+from ccatp.report.findings import Grade, TimeBreakdown, findings_of, outcome_of, point_verdicts, spells_of, time_budget
 from ccatp.report.record import TOPICS_READ, RecordedSession, RunRecord, read_record
 from ccatp.survey.composition import assemble
 

@@ -143,10 +143,7 @@ def test_a_run_given_up_before_its_first_point_says_why(recorded: Path) -> None:
             {"outcome": "", "exit_status": 4, "state": "held", "cause": "stuck"},
             ("ended with status 4, held", "stuck", False),
         ),
-        (
-            {"outcome": "", "exit_status": -1, "state": "driving", "cause": ""},
-            ("interrupted", "while driving", False),
-        ),
+        ({"outcome": "", "exit_status": -1, "state": "driving", "cause": ""}, ("interrupted", "while driving", False)),
     ],
 )
 def test_outcomes(recorded: Path, changes: dict[str, object], outcome: tuple[str, str, bool]) -> None:

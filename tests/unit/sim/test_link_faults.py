@@ -280,10 +280,7 @@ TABLE: dict[str, tuple[Keys, Callable[[Driver], bool]]] = {
         lambda c: max(b - a for a, b in pairs(c.seqs)) == 1 and only_repeats(c),
     ),
     "reorder": ({**TO_CLIENT, "every": 3}, lambda c: c.link.counts["repeated_frames"] >= 2),
-    "flood": (
-        {**TO_CLIENT, "rate_hz": 300.0, "lines": "copies"},
-        lambda c: c.link.counts["repeated_frames"] >= 10,
-    ),
+    "flood": ({**TO_CLIENT, "rate_hz": 300.0, "lines": "copies"}, lambda c: c.link.counts["repeated_frames"] >= 10),
     "slowloris": ({"direction": "to_robot", "bytes_per_s": 400.0}, only_repeats),
     "corrupt": ({**TO_CLIENT, "every": 5}, lambda c: c.link.counts["bad_lines"] >= 1),
 }

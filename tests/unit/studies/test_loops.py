@@ -17,15 +17,7 @@ from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.studies import loops
 from ccatp.studies.campaign import CampaignError, JobOutcome
-from ccatp.studies.danger_study import (
-    OFF_S,
-    RULES,
-    combine,
-    drive_frame,
-    drive_to_rim,
-    off_time_rule,
-    transit,
-)
+from ccatp.studies.danger_study import OFF_S, RULES, combine, drive_frame, drive_to_rim, off_time_rule, transit
 from ccatp.studies.loops import Loop, margins, open_loop
 
 LAG_S, FRAME_S = 0.08, 0.01

@@ -7,14 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from ccatp.config.models import Config
-from ccatp.core import (
-    PointId,
-    Predicted,
-    Severity,
-    Stop,
-    StopKind,
-    Twist,
-)
+from ccatp.core import PointId, Predicted, Severity, Stop, StopKind, Twist
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.events import (
     AMONG_BEACONS,
@@ -89,10 +82,7 @@ def test_resume_is_refused_where_nothing_is_held(story: Story) -> None:
     assert story.mission.handle(Resume()) == "the mission is not held but driving"
 
 
-@pytest.mark.parametrize(
-    "state",
-    [MissionState.TURNING, MissionState.MEASURING, MissionState.HELD],
-)
+@pytest.mark.parametrize("state", [MissionState.TURNING, MissionState.MEASURING, MissionState.HELD])
 def test_abort_goes_home_from_every_state(story: Story, state: MissionState) -> None:
     if state is MissionState.HELD:
         story.until_state(MissionState.DRIVING)

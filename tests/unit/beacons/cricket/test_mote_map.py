@@ -14,14 +14,7 @@ from ccatp.beacons.cricket.map_fit import (
     position_covariance,
 )
 from ccatp.beacons.cricket.map_start import completed, grown, unfolded
-from ccatp.beacons.cricket.mote_map import (
-    map_motes,
-    pinned_map,
-    plain_frame,
-    residual_scale,
-    scaled,
-    unfold,
-)
+from ccatp.beacons.cricket.mote_map import map_motes, pinned_map, plain_frame, residual_scale, scaled, unfold
 from ccatp.beacons.cricket.range_network import RangeNetwork, RigidBody, components
 from ccatp.beacons.cricket.rigidity import find_fold_over
 from ccatp.beacons.cricket.trilateration import classical_scaling

@@ -23,13 +23,7 @@ from ccatp.beacons.slam.measurement_models import (
 )
 from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.recording import (
-    BeaconId,
-    EstimatedPath,
-    Reading,
-    RecordedRun,
-    Steps,
-)
+from ccatp.beacons.slam.recording import BeaconId, EstimatedPath, Reading, RecordedRun, Steps
 from ccatp.config.beacon_models import FixedLagConfig
 from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
