@@ -352,18 +352,6 @@ def test_the_crab_angle_keeps_a_drifting_robot_on_its_line(config: Config) -> No
     assert rig.heading == pytest.approx(-0.05, abs=2e-3)  # asin(0.05), and what steering moved it
 
 
-def test_a_stop_moved_by_an_update_is_reached_all_the_same(config: Config) -> None:
-    rig = Rig(config)
-    rig.tracker.begin(rig.pose, (0.3, 0.0), False)
-    while rig.tracker.phase is not LegPhase.DONE:
-        rig.drive(rig.tracker.step(rig.pose, (0.3, 0.0), DT_CLOSED_LOOP, rig.twist))
-        if rig.t == pytest.approx(1.0):
-            rig.x, rig.y = rig.x + 0.004, rig.y - 0.003
-        assert rig.t < 5.0
-    assert rig.x == pytest.approx(0.3, abs=3e-4)  # stop tolerance and what the wheels still run
-    assert rig.y == pytest.approx(0.0, abs=3e-4)
-
-
 def test_a_drive_that_cannot_end_stops_in_time_near_the_stop_and_goes_on_far_from_it(config: Config) -> None:
     budget_s = bang_bang_time(0.3, 0.1, 0.2) + config.control.stop_time_s
     for left_over_m, is_ended in ((0.002, True), (0.05, False)):

@@ -85,22 +85,6 @@ def test_pose_after_ten_seconds(mirror: Mirror, right: float, left: float) -> No
     assert plant.z_m == pytest.approx(mirror.surface.height_m(plant.x_m, plant.y_m), abs=1e-9)
 
 
-def test_acceleration_is_the_derivative_of_the_speed_and_turn_rate_that_of_the_wheels(mirror: Mirror) -> None:
-    plant = plant_on(mirror)
-    drive(plant, 2.0, -1.0, 3)
-    plant.step(0.03, DT_S, 4.0, 3.0)
-    tau, h = 0.006, 1e-6
-    speeds = []
-    for t in (tau - h, tau + h):
-        ((right, left),) = rates_at(plant, [exp(-t / LAG_S)])
-        speeds.append(RADIUS_M * (right + left) / 2.0)
-    decay = exp(-tau / LAG_S)
-    # A central difference over 2 us of a function with a 80 ms time constant.
-    assert plant.acceleration_at(decay) == pytest.approx((speeds[1] - speeds[0]) / (2.0 * h), rel=1e-7)
-    ((right, left),) = rates_at(plant, [decay])
-    assert plant.turn_rate_at(decay) == pytest.approx(RADIUS_M * (right - left) / BASE_M, abs=1e-14)
-
-
 def test_disturbances_act_on_the_body_one_after_the_other(mirror: Mirror) -> None:
     def creep(_p: Plant, _t: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float) -> BodyStep:
         return forward_m, left_m + 0.01 * dt_s, turn_rad
