@@ -311,6 +311,7 @@ class EstimatorConfig(Model):
     shadowing_grid_m: Positive
     placed_share: Annotated[float, Field(gt=0.0, le=1.0)]
     waiting_scans: Annotated[int, Field(ge=1, le=200)]
+    radios_beyond_m: NonNegative
     gate_probability: Annotated[float, Field(gt=0.5, lt=1.0)]
     target_speed_sigma_m_s: Positive
     target_course_time_s: Positive

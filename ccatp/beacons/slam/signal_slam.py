@@ -88,7 +88,7 @@ class SignalSlam(BeaconSlam):
     linearisation. A level of unknown shadowing gives the range up to a factor; an update that is linearised there is
     wrong later, when bearings from elsewhere have given the range. So the readings of a new radio wait until they
     place it. A radio of which no bearing is known is not used: a level alone is a circle. A static radio is in the
-    room: while its readings wait, no place beyond a wall is likelier than the error of the wall's place allows.
+    room, or as near to it as is set: while its readings wait, a place beyond costs what that error of the wall's does.
 
     The vehicle begins at the believed start of the configuration, which defines the frame of the map.
     """
@@ -108,7 +108,9 @@ class SignalSlam(BeaconSlam):
             {"bearing": BearingModel(bearing_sigma_rad, 0), "rssi": LevelModel(self.path_loss_of, shadowing=shadowing)}
         )
         P0 = np.diag(np.square((start.position_sigma_m, start.position_sigma_m, start.heading_sigma_rad)))
-        self._room_m = room_m  # its walls are known in the room, the map has the frame of the believed start
+        beyond_m = estimator.radios_beyond_m
+        self._within_m = np.array([(-beyond_m, wall_m + beyond_m) for wall_m in room_m]).T
+        # The walls are known in the room, the map has the frame of the believed start.
         self._wall_variance_m2 = start.position_sigma_m**2 + (0.5 * start.heading_sigma_rad * hypot(*room_m)) ** 2
         super().__init__(
             SlippingVehicle(cfg.vehicle, cfg.odometry), models, _PLAIN, (start.x_m, start.y_m, start.heading_rad), P0,
@@ -197,7 +199,7 @@ class SignalSlam(BeaconSlam):
                 self._join(waiting, likely)
 
     def _stacked(self, waiting: PendingLandmark) -> StackedRows:
-        return _RowsInRoom(super()._stacked(waiting), self._room_m, self._wall_variance_m2)
+        return _RowsInRoom(super()._stacked(waiting), self._within_m, self._wall_variance_m2)
 
     def _place_new(self, waiting: PendingLandmark) -> None:
         """Not before all readings have been taken."""
@@ -209,7 +211,7 @@ class SignalSlam(BeaconSlam):
             return True
         mean, covariance = self.joint((waiting.beacon,))
         x, y, _, bx, by = mean.tolist()
-        if not all(0.0 < at_m < wall_m for at_m, wall_m in zip((bx, by), self._room_m, strict=True)):
+        if (np.clip((bx, by), *self._within_m) != (bx, by)).any():
             return False  # sure by the walls, not by readings
         largest = float(np.linalg.eigvalsh(covariance[POSE:, POSE:])[-1])
         return largest < (self._placed_share * hypot(bx - x, by - y)) ** 2
@@ -257,15 +259,15 @@ class SignalSlam(BeaconSlam):
 class _RowsInRoom(StackedRows):
     """The rows of a radio and of the walls: as far as a coordinate is beyond one, the wall's place is in error."""
 
-    def __init__(self, rows: StackedRows, room_m: tuple[float, float], variance_m2: float) -> None:
-        self._rows, self._room_m, self._variances_m2 = rows, room_m, np.full(PLACE, variance_m2)
+    def __init__(self, rows: StackedRows, within_m: FloatArray, variance_m2: float) -> None:
+        self._rows, self._within_m, self._variances_m2 = rows, within_m, np.full(PLACE, variance_m2)
         self.blocks, self.columns = rows.blocks, rows.columns
 
     def at(self, x: FloatArray, beacon: list[float]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """As those of the readings, with a row for each coordinate of the place behind them."""
         H, G, e, R = self._rows.at(x, beacon)
         place = np.array(beacon[:PLACE])
-        inwards = np.clip(place, 0.0, self._room_m) - place
+        inwards = np.clip(place, *self._within_m) - place
         walls = np.eye(PLACE, len(beacon)) * (inwards != 0.0)[:, None]
         H = np.pad(H, ((0, PLACE), (0, 0)))
         return H, np.vstack([G, walls]), np.append(e, inwards), np.append(R, self._variances_m2)

@@ -119,12 +119,14 @@ def test_a_new_radio_waits_and_is_on_the_map_all_the_same() -> None:
     assert not [b for b in slam.engine.blocks if not isinstance(b, str)]
 
 
-def test_a_radio_in_the_shadow_is_looked_for_in_the_room() -> None:
-    slam = SignalSlam(config(path_loss__shadowing_sigma_db=5.0, estimator__shadowing="map"))
+@pytest.mark.parametrize("beyond_m", [0.0, 1.0])
+def test_a_radio_in_the_shadow_is_looked_for_in_the_room(beyond_m: float) -> None:
+    keys: dict[str, object] = {"path_loss__shadowing_sigma_db": 5.0, "estimator__shadowing": "map"}
+    slam = SignalSlam(config(**keys, estimator__radios_beyond_m=beyond_m))
     level = slam.path_loss_of("b").level_dbm(12.0)
     slam.observe([Reading(0.0, "b", bearing_rad=np.pi / 4.0 - slam.pose.heading_rad, rssi_dbm=level)])
     estimate = slam.beacons["b"]
-    assert estimate.mean.max() < 3.3  # of 12 m by the level alone
+    assert estimate.mean.max() == pytest.approx(3.0 + beyond_m, abs=0.3)  # 12 m away by the level alone
     assert np.linalg.eigvalsh(estimate.covariance).max() < 0.1**2
     assert "b" not in slam.engine  # it is sure by the walls, which one reading cannot confirm
 
