@@ -52,6 +52,13 @@ def at(mirror: Mirror, frame: int, speed_m_s: float = 0.0) -> StateEstimate:
     return StateEstimate(frame * DT, DT, PanelPose(PanelId(5, 5), 0.0, 0.0, 0.0), mirror.deck_pose, speed_m_s, 0.0)
 
 
+def test_asks_once_and_only_after_the_measuring_time_at_rest(settling: Standing, mirror: Mirror) -> None:
+    settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))
+    asked = [k for k in range(settled, settled + 200) if settling.is_due(at(mirror, k))]
+    assert asked == [settled + round(MEASURING_S / DT)]
+    assert (settling.requests, settling.now.is_requested) == (1, True)
+
+
 @pytest.mark.fault("E9")
 def test_who_moves_for_ever_is_never_measured_and_restless(settling: Standing, mirror: Mirror) -> None:
     settled = next(k for k in range(100) if settling.has_settled(at(mirror, k)))

@@ -181,6 +181,15 @@ def test_pause_while_backing_off_holds_and_resume_finds_the_robot_first(story: S
     story.finish()
 
 
+def test_missing_data_during_a_back_off_only_pause_it(story: Story) -> None:
+    story.drive_on()
+    story.frame(FRONT_OFF)
+    for _ in range(20):
+        assert story.frame(replace(FRONT_OFF, reverse=False)).twist == Twist(0.0, 0.0)
+    assert story.state.mode is MissionState.BACKING_OFF
+    assert story.frame(FRONT_OFF).twist.v_m_s < 0.0
+
+
 def test_a_robot_that_cannot_be_found_does_not_drive(story: Story) -> None:
     story.auto_fix = False
     story.drive_on()

@@ -88,6 +88,19 @@ def test_points_too_near_the_rim(clearances: dict[str, float], thesis: Any) -> N
         assert f"{name} = {value}" in str(e.value)
 
 
+def test_way_around_several_corners(thesis: Any) -> None:
+    mirror, body = thesis.mirror, build_body(thesis.cfg.robot, thesis.cfg.mission)
+    rules = LegRules(mirror, body)
+    xs, ys = np.array([3.4, 2.2, -3.4, 0.0]), np.array([1.6, 3.2, -1.6, 0.0])
+    upper, top, lower, middle = build_places(mirror, body, xs, ys)
+    chain = [upper, *rules.way_around(upper, top), top]
+    assert len(chain) == 3  # by the elbow, along rows and columns
+    assert all(rules.is_clear(a, b) for a, b in pairwise(chain))
+    slanted = [lower, *rules.way_around(lower, middle), middle]
+    assert len(slanted) == 3  # clear, but at 25 degrees it would lead a sensor along the seams between rows
+    assert rules.is_clear(lower, middle)
+
+
 def test_no_leg_whose_sensors_clip_a_re_entrant_corner(thesis: Any) -> None:
     """Slanting past the corner at 0.1002 m: all sensors are clear at both ends, the right front one is not between."""
     mirror, body = thesis.mirror, build_body(thesis.cfg.robot, thesis.cfg.mission)
