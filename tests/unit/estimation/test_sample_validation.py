@@ -10,7 +10,7 @@ from ccatp.config.models import FullStateConfig
 from ccatp.core import DeckPose, GravitySample, ImuSample, PanelPose, WheelSample, difference, wrap_pi
 from ccatp.estimation.localizer_base import SampleValidator
 from ccatp.estimation.odometry import Terrain
-from ccatp.estimation.rest import NoiseFloor, heading_from_gravity
+from ccatp.estimation.rest import NoiseFloor, ZeroVelocityDetector, heading_from_gravity
 from ccatp.estimation.state_model import BA, BG, PSI, W
 from ccatp.mirror.mirror import Mirror
 from tests.unit.estimation.drive import FRAME_S, STEEP, Errors, Frame, Robot, build, run, trapeze
@@ -85,6 +85,13 @@ def test_a_jump_of_the_clock_forgets_all_times() -> None:
     found = intake()
     found.restart()
     assert found.wheels(0.01, [WheelSample(0.005, 1.0, 2.0)]) == (((0.005,), (1.0,)), ((0.005,), (2.0,)))
+
+
+def test_rest_begins_after_its_time_and_only_once() -> None:
+    found = ZeroVelocityDetector(0.25, NoiseFloor(1e-4), NoiseFloor(1e-4))
+    begun = [found.stood(0.05) for _ in range(8)]
+    assert begun == [False] * 4 + [True] + [False] * 3
+    assert found.is_resting
 
 
 WINDOW = 15  # samples in a mean of the noise floor

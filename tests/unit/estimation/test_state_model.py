@@ -209,6 +209,15 @@ def test_the_robots_axes_are_the_mirrors(mirror: Mirror) -> None:
 # -- the panel's frame ------------------------------------------------------------------------------------------------
 
 
+def test_a_pose_in_a_panels_frame_is_the_mirrors(mirror: Mirror) -> None:
+    for k, (x, y) in enumerate(places(mirror, 50, 6)):
+        found = build(start=mirror.panel_pose(mirror.nearest_panel(x, y), DeckPose(x, y, 0.37 * k - 9.0)))
+        expected = mirror.panel_pose(mirror.nearest_panel(x, y), found.deck_pose)
+        assert found.pose.panel == expected.panel
+        assert (found.pose.x_m, found.pose.y_m) == pytest.approx((expected.x_m, expected.y_m), abs=1e-14)  # rounding
+        assert abs(difference(found.pose.heading_rad, expected.heading_rad)) < 1e-14
+
+
 @pytest.mark.parametrize(
     ("panel", "off_m", "under"),  # in the frame of the first
     [((4, 4), -1e-6, (4, 4)), ((4, 4), 1e-6, (4, 5)), ((4, 5), -1e-6, (4, 4)), ((5, 1), -1.0, (5, 1))],
