@@ -204,8 +204,9 @@ WHEEL_CREEPS_ON = fault(Group.WHEELS, "the {side} wheel turns while it is held",
 WHEEL_DOES_NOT_STOP = hold(Group.WHEELS, "the {side} wheel turns though it shall stand",
     "The servo does not come to rest.", "As for a wheel that runs away, if it comes again.")
 GRIP_LOST = hold(Group.WHEELS, "the robot loses its grip: it slides downhill over its wheels",
-    "Accelerometer and gyroscope show a slide along gravity, its wheels do not. Wheels held, fans to their maximum.",
-    "Tyres or mirror oily? Too little thrust for the slope: see `ccatp plan`.", full_fans=True)
+    "Accelerometer and gyroscope show a slide along gravity, its wheels do not. Wheels held, fans to their maximum; "
+    "a fault if it slides again within `health.retry_window_s`.",
+    "Tyres or mirror oily? Too little thrust for the slope: see `ccatp plan`.", full_fans=True, retries=0)
 GRIP_TOO_LITTLE = fault(Group.WHEELS, "too little grip by the creep of turns: the fans do not hold it everywhere",
     "The friction that turns show, at the start and at each fix after a turn, is less than full thrust can do with.",
     "Tyres or mirror oily? Clean them, or raise the thrust; `ccatp status` shows the friction. Wrong `robot.tyre_m`?",

@@ -7,10 +7,11 @@ from ccatp.conditions import GRIP_LITTLE, GRIP_LOST, GRIP_TOO_LITTLE, Clear, Con
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.control.wheel_motion import WheelMeans
-from ccatp.core import GravitySample, ImuSample, WheelSample
+from ccatp.core import GravitySample, ImuSample, Severity, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.dataloop import motor_robot
 from ccatp.mirror.mirror import Mirror
+from ccatp.safety.escalation import SeverityEscalation
 from ccatp.safety.wheel_monitors import GripMonitor
 
 DT_S = 0.01
@@ -78,8 +79,11 @@ def test_what_the_robot_says_of_itself_counts(config: Config, mirror: Mirror) ->
     assert (verdict.signal, verdict.full_fans, verdict.forward, verdict.turn) == ("grip", True, False, False)
 
 
-def test_its_row_holds_the_wheels_with_full_fans_until_a_fix() -> None:
+def test_its_row_holds_the_wheels_with_full_fans_until_a_fix_and_another_slide_is_a_fault() -> None:
     assert (GRIP_LOST.motion, GRIP_LOST.clear, GRIP_LOST.full_fans) == (Motion.NONE, Clear.AFTER_FIX, True)
+    escalation, slide = SeverityEscalation(CFG.health), GRIP_LOST.found("grip", 0.06, 0.055)
+    found = [escalation.climb(t_s, [slide] if is_sliding else []) for t_s, is_sliding in enumerate((1, 0, 1))]
+    assert [[one.severity for one in findings] for findings in found] == [[Severity.HOLD], [], [Severity.FAULT]]
 
 
 @pytest.mark.parametrize(
