@@ -7,7 +7,7 @@ from weakref import ReferenceType, ref
 
 import pytest
 
-from ccatp.conditions import BEYOND_SEAM, CENTRE_NEAR_RIM, NO_SEAM, OFF_WITHOUT_WHEELS, RIM_AHEAD
+from ccatp.conditions import BEYOND_SEAM, CENTRE_NEAR_RIM, EDGE_SENSOR_CHATTERS, NO_SEAM, OFF_WITHOUT_WHEELS, RIM_AHEAD
 from ccatp.config.models import Config
 from ccatp.core import Corner, EdgeSample, EventCode, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
@@ -615,3 +615,10 @@ def test_odometry_survives_the_tracks_forgetting() -> None:
         track.update(k * 1e-3)
         odometry.advance_to(k * 1e-3)
     assert odometry.x_m == pytest.approx(0.03 * 1e-3 * (5 * KNOTS_KEPT - 1), abs=1e-9)  # sums of 2,559 steps
+
+
+def test_a_sensor_that_chatters_is_found_while_its_episode_is_open(on_panel: Story) -> None:
+    cfg = on_panel.cfg
+    on_panel.monitor = DangerMonitor(on_panel.mirror, cfg.robot, cfg.danger, cfg.health)
+    found = [on_panel.frame(off=FL, flags="1010101010") for _ in range(20)]
+    assert EDGE_SENSOR_CHATTERS.message in {verdict.cause for verdict in found}
