@@ -252,7 +252,6 @@ def twist_of(right_rad_s: float, left_rad_s: float, wheel_radius_m: float, wheel
     )
 
 
-_SLIDE_MEMORY_S = 0.06
 _LEAST_SHARE = 0.3  # of the limit: a turn alone is no slide
 
 
@@ -263,7 +262,7 @@ class SlideRule:
     ``turn_rad``.
     """
 
-    MEMORY_S = _SLIDE_MEMORY_S
+    MEMORY_S = 0.06
     LEAST_SLOPE = 0.15  # of gravity along the surface: with less it does not slide
     LARGEST_M_S2 = 10.0  # gravity gives no more
     WHEEL_JUMP_M_S = 0.03  # of the wheels' speed in 10 ms: no wheel that carries the robot does that
@@ -282,7 +281,7 @@ class SlideRule:
 
         ``downhill``: unit vector, robot frame; zeros where there is no slope.
         """
-        keep = _SLIDE_MEMORY_S / (_SLIDE_MEMORY_S + dt_s)
+        keep = self.MEMORY_S / (self.MEMORY_S + dt_s)
         self._ahead_m_s = keep * (self._ahead_m_s + ahead_m_s)
         self._left_m_s = keep * (self._left_m_s + left_m_s)
         self._turned_rad = keep * (self._turned_rad + turned_rad)
