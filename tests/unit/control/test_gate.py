@@ -146,30 +146,19 @@ def test_a_denial_stops_and_the_next_drive_begins_at_rest() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_exact_steps_of_value_and_rate(sign: float) -> None:
+@pytest.mark.parametrize(("axis", "step", "limit"), [(0, STEP_M_S, 0.1), (1, STEP_RAD_S, 0.8)])
+def test_the_exact_steps_of_value_and_rate(axis: int, step: float, limit: float, sign: float) -> None:
     under_test = gate()
-    first = drive(under_test, Twist(sign * 0.3, 0.0))
-    assert first.v_m_s == pytest.approx(sign * STEP_M_S)
-    second = drive(under_test, Twist(sign * 0.3, 0.0))
-    assert second.v_m_s == pytest.approx(sign * 2.0 * STEP_M_S)
-    for _ in range(10):
-        last = drive(under_test, Twist(sign * 0.3, 0.0))
-    assert last.v_m_s == pytest.approx(sign * 1.25 * LIMITS.v_max_m_s)
-    # Slower at once, and through zero one step only.
-    assert drive(under_test, Twist(sign * 0.01, 0.0)).v_m_s == pytest.approx(sign * 0.01)
-    assert drive(under_test, Twist(-sign * 0.3, 0.0)).v_m_s == pytest.approx(-sign * STEP_M_S)
 
+    def passed(wanted: float) -> float:
+        twist = drive(under_test, Twist(*(sign * wanted if each == axis else 0.0 for each in range(2))))
+        return sign * (twist.v_m_s, twist.omega_rad_s)[axis]
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_exact_steps_of_turning(sign: float) -> None:
-    under_test = gate()
-    turned = [drive(under_test, Twist(0.0, sign * 0.9)).omega_rad_s for _ in range(2)]
-    assert turned == pytest.approx([sign * STEP_RAD_S, sign * 2.0 * STEP_RAD_S])
-    turned = [drive(under_test, Twist(0.0, sign * 9.0)).omega_rad_s for _ in range(10)]
-    assert turned[-1] == pytest.approx(sign * 1.25 * LIMITS.omega_max_rad_s)
+    assert [passed(9.0), passed(9.0)] == pytest.approx([step, 2.0 * step])
+    assert [passed(9.0) for _ in range(10)][-1] == pytest.approx(1.25 * limit)
     # Slower at once, and through zero one step only.
-    assert drive(under_test, Twist(0.0, sign * 0.1)).omega_rad_s == pytest.approx(sign * 0.1)
-    assert drive(under_test, Twist(0.0, -sign * 9.0)).omega_rad_s == pytest.approx(-sign * STEP_RAD_S)
+    assert passed(0.01) == pytest.approx(0.01)
+    assert passed(-9.0) == pytest.approx(-step)
 
 
 def test_a_long_silence_allows_no_larger_step() -> None:
