@@ -24,6 +24,7 @@ from tests.unit.onboard.devices.test_linux import Rig
 CFG = load_onboard_config()
 STEP_S = 1.0 / CFG.servo.loop_hz
 WATCHED_S, PATIENCE_S = 1.5, 20.0
+RATES = 3.0, -2.0  # right, left, rad/s
 SAMPLED = {"encoder_left", "encoder_right", "edge"}
 # Rows of the table in their order, and what breaks: of the inertial unit, of the data acquisition device, of the rest.
 UNIT = {f"D{k}": name for k, name in enumerate(UNIT_BREAKS, 1)}
@@ -67,7 +68,7 @@ class ThreadedBno055(Bno055):
 
 
 class Driving:
-    """A robot that drives both wheels at 3 rad/s."""
+    """A robot that drives its wheels, each at its own rate."""
 
     def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.rig = rig = Rig(root, monkeypatch, ThreadedBno055)
@@ -78,7 +79,8 @@ class Driving:
         rig.time.sleep(1.0)
         self.robot = OnboardRobot(CFG, self.rig.hardware)
         self._rates = [0.0, 0.0]
-        self.run(1.0)
+        self.run(2.0)
+        assert self._rates == pytest.approx(RATES, abs=0.05)  # 2 % of the set points
         assert not self.robot.rules.is_held
         assert not self.robot.faults
 
@@ -86,7 +88,7 @@ class Driving:
         """One step of the control loop, and of the wheels."""
         rig, servo = self.rig, CFG.servo
         rig.time.sleep(STEP_S)
-        self.robot.rules.drive(1, 3.0, 3.0, rig.time.now_s)
+        self.robot.rules.drive(1, *RATES, rig.time.now_s)
         self.robot.control(rig.time.now_s)
         for wheel, voltage_v in enumerate(rig.voltages()):
             steady = math.copysign(max(0.0, abs(voltage_v) - servo.static_v) / servo.volt_per_rad_s, voltage_v)
@@ -136,6 +138,8 @@ def breaks(
         return
     measured(row, 1e3 * driving.until(lambda: robot.rules.is_held), "ms")
     assert set(robot.faults) == faults
+    if faults == SAMPLED:  # it does not see its wheels
+        assert driving.rig.voltages() == [0.0, 0.0]
     driving.run(0.1)
     if repair is not None:
         repair(device)
@@ -152,7 +156,9 @@ def test_the_inertial_unit(row: str, name: str, driving: Driving, measured: Meas
 def test_the_data_acquisition_device(row: str, name: str, driving: Driving, measured: Measured) -> None:
     broken, reason, repair, _ = DAQ_BREAKS[name]
     breaks(driving, measured, row, not reason, driving.rig.daq, SAMPLED, broken, repair)  # type: ignore[arg-type]
-    assert driving.rig.voltages() != [0.0, 0.0]
+    driving.run(0.5)
+    right_v, left_v = driving.rig.voltages()
+    assert right_v > 0.0 > left_v
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from ccatp.config.onboard_models import MotorConfig
 from ccatp.onboard.devices.bno055 import BURST_START
 from ccatp.onboard.devices.daq import IDENTIFY, IDENTITY, SAMPLE, SAMPLES, START, STOP, Decoder, format_frame
 from ccatp.onboard.hardware import HardwareError
@@ -279,6 +280,13 @@ class FakePwm:
     def value(self, name: str) -> int:
         return int((self.root / name).read_text().split()[0])
 
+    def duty(self, chip: int, channel: int) -> float:
+        """Of a channel, 0 to 1; 0 where it is off."""
+        folder = f"pwmchip{chip}/pwm{channel}"
+        if not self.value(f"{folder}/enable"):
+            return 0.0
+        return self.value(f"{folder}/duty_cycle") / self.value(f"{folder}/period")
+
     def export(self, chip: int, channel: int, period: int = 0, duty: int = 0, enable: int = 0) -> None:
         folder = self.root / f"pwmchip{chip}" / f"pwm{channel}"
         folder.mkdir()
@@ -316,3 +324,9 @@ class FakePwm:
             raise OSError(code, os.strerror(code))
         self.writes.append((name, value))
         return self._pwrite(fd, data, offset)
+
+
+def voltage_of(motor: MotorConfig, supply_v: float, bridge: FakeBridge, pwm: FakePwm) -> float:
+    """Of a motor, from its lines and its duty; 0 where it brakes."""
+    forward, reverse = bridge.levels[motor.forward_line], bridge.levels[motor.reverse_line]
+    return (forward - reverse) * supply_v * pwm.duty(motor.chip, motor.channel)

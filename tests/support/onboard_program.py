@@ -28,7 +28,7 @@ import pytest
 import structlog
 
 from ccatp.config.load import load_config, load_onboard_config
-from ccatp.config.onboard_models import DevicesConfig, MotorConfig
+from ccatp.config.onboard_models import DevicesConfig
 from ccatp.links import realtime
 from ccatp.mirror.mirror import build_mirror
 from ccatp.onboard.devices.daq import SAMPLE, SAMPLES
@@ -39,7 +39,7 @@ from ccatp.onboard.robot import OnboardRobot
 from ccatp.sim.ground_truth import GroundTruthPublisher, SurveyTruth
 from ccatp.sim.hardware import SimulatedHardware
 from ccatp.sim.world import World
-from tests.support.onboard_fakes import FakeBno055, FakeBridge, FakeDaq, FakePwm, FakeTime
+from tests.support.onboard_fakes import FakeBno055, FakeBridge, FakeDaq, FakePwm, FakeTime, voltage_of
 
 
 class WallClock(FakeTime):
@@ -136,12 +136,11 @@ class RobotBench:
 
     def step(self) -> tuple[int, int, list[float]]:
         """Move the robot on by one sample: counts, and voltages of the edge sensors."""
-        simulated, motors = self.simulated, self._devices.motors
+        simulated, motors, fans, pwm = self.simulated, self._devices.motors, self._devices.fans, self.pwm
         is_running = self.clock.now_s - self.bridge.restarted_s <= self._devices.timer.timeout_s
-        simulated.drive(*(self._voltage(motor) if is_running else 0.0 for motor in (motors.right, motors.left)))
-        simulated.command_fans(
-            *(self._duty(f"pwmchip1/pwm{fan.channel}") for fan in (self._devices.fans.left, self._devices.fans.right))
-        )
+        right_v, left_v = (voltage_of(m, motors.supply_v, self.bridge, pwm) for m in (motors.right, motors.left))
+        simulated.drive(*((right_v, left_v) if is_running else (0.0, 0.0)))
+        simulated.command_fans(*(pwm.duty(fan.chip, fan.channel) for fan in (fans.left, fans.right)))
         readings = simulated.read(self._steps / self._devices.daq.sample_hz)
         self._steps += 1
         plant = simulated.world.plant
@@ -156,18 +155,6 @@ class RobotBench:
             self.bno055.gravity_m_s2 = (-9.81 * gx, -9.81 * gy, -9.81 * gz)
         _, right, left = readings.counts[-1]
         return right or 0, left or 0, list(readings.edges[-1][1:])
-
-    def _voltage(self, motor: MotorConfig) -> float:
-        forward, reverse = self.bridge.levels[motor.forward_line], self.bridge.levels[motor.reverse_line]
-        if forward == reverse:
-            return 0.0
-        volts = self._devices.motors.supply_v * self._duty(f"pwmchip{motor.chip}/pwm{motor.channel}")
-        return volts if forward else -volts
-
-    def _duty(self, channel: str) -> float:
-        if not self.pwm.value(f"{channel}/enable"):
-            return 0.0
-        return self.pwm.value(f"{channel}/duty_cycle") / self.pwm.value(f"{channel}/period")
 
 
 class Truth(SurveyTruth):

@@ -2,7 +2,6 @@
 
 import errno
 import fcntl
-import math
 import os
 import random
 import subprocess
@@ -19,8 +18,7 @@ from ccatp.config.load import load_onboard_config
 from ccatp.onboard.devices.bno055 import Bno055, Bno055Sample
 from ccatp.onboard.devices.linux import GpioLines, I2cBus, LinuxHardware, open_serial
 from ccatp.onboard.hardware import Hardware, HardwareError
-from ccatp.onboard.robot import OnboardRobot
-from tests.support.onboard_fakes import FakeBno055, FakeBridge, FakeDaq, FakePwm, FakeTime
+from tests.support.onboard_fakes import FakeBno055, FakeBridge, FakeDaq, FakePwm, FakeTime, voltage_of
 
 CONFIG = load_onboard_config().devices
 DEVICES = ["motors", "timer", "fans", "bno055", "daq"]
@@ -63,12 +61,8 @@ class Rig:
 
     def voltages(self) -> list[float]:
         """Of the right and the left motor, from lines and duties; 0 where it brakes."""
-        voltages = []
-        for motor in (CONFIG.motors.right, CONFIG.motors.left):
-            forward, reverse = self.bridge.levels[motor.forward_line], self.bridge.levels[motor.reverse_line]
-            duty = self.pwm.value(f"pwmchip{motor.chip}/pwm{motor.channel}/duty_cycle") / 50_000
-            voltages.append((forward - reverse) * duty * CONFIG.motors.supply_v)
-        return voltages
+        motors = CONFIG.motors
+        return [voltage_of(m, motors.supply_v, self.bridge, self.pwm) for m in (motors.right, motors.left)]
 
     def run(self, duration_s: float) -> set[str]:
         """Read each 2 ms; the faults after the last one."""
@@ -118,48 +112,6 @@ def test_start_read_drive_close(rig: Rig) -> None:
     assert all(rig.bridge.levels[line] for line in (5, 6, 13, 19))
     assert rig.pwm.value("pwmchip1/pwm0/duty_cycle") == 20_000
     rig.hardware.close()
-
-
-def test_a_motor_that_cannot_be_set_lets_the_timer_run_out(rig: Rig) -> None:
-    rig.hardware.start()
-    level = rig.bridge.levels[CONFIG.timer.line]
-    rig.pwm.refusals["pwmchip0/pwm0/duty_cycle"] = errno.EIO
-    with pytest.raises(HardwareError, match="right motor"):
-        rig.hardware.drive(6.0, 6.0)
-    assert rig.bridge.levels[CONFIG.timer.line] is level
-
-
-def test_the_control_loop_drives_wheels_through_the_devices_and_brakes_when_it_does_not_see_them(rig: Rig) -> None:
-    config = load_onboard_config()
-    rig.hardware.start()
-    robot = OnboardRobot(config, rig.hardware)
-    servo, rates = config.servo, [0.0, 0.0]
-    counts_per_rad = servo.counts_per_rev / math.tau
-
-    def run(duration_s: float) -> None:
-        end_s = rig.time.now_s + duration_s
-        while rig.time.now_s < end_s:
-            rig.time.sleep(0.002)
-            robot.rules.drive(1, 3.0, -2.0, rig.time.now_s)
-            robot.control(rig.time.now_s)
-            for wheel, voltage_v in enumerate(rig.voltages()):
-                steady = max(0.0, abs(voltage_v) - servo.static_v) / servo.volt_per_rad_s
-                rates[wheel] += (math.copysign(steady, voltage_v) - rates[wheel]) * 0.002 / 0.06  # of a motor
-            rig.daq.step = [rate * counts_per_rad / CONFIG.daq.sample_hz for rate in rates]
-
-    run(1.0)
-    before = rig.daq.counts
-    run(1.0)
-    moved = [(now - then) / counts_per_rad for now, then in zip(rig.daq.counts, before, strict=True)]
-    assert moved == pytest.approx([3.0, -2.0], abs=0.05)  # 2 % of the set points
-    assert not robot.faults
-    rig.daq.is_mute = True
-    run(0.1)
-    assert set(robot.faults) == {"encoder_left", "encoder_right", "edge"}
-    assert rig.voltages() == [0.0, 0.0]
-    rig.daq.is_mute = False
-    run(1.0)
-    assert rig.voltages()[0] > 0.0 > rig.voltages()[1]
 
 
 Break = Callable[[Rig], object]

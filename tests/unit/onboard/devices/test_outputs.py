@@ -31,11 +31,7 @@ class Rig:
     def right(self) -> tuple[tuple[bool, bool], float]:
         """Lines and duty of the right motor."""
         levels, right = self.bridge.levels, CONFIG.motors.right
-        return (levels[right.forward_line], levels[right.reverse_line]), self.duty(0, 0)
-
-    def duty(self, chip: int, channel: int) -> float:
-        folder = f"pwmchip{chip}/pwm{channel}"
-        return self.pwm.value(f"{folder}/duty_cycle") / self.pwm.value(f"{folder}/period")
+        return (levels[right.forward_line], levels[right.reverse_line]), self.pwm.duty(0, 0)
 
 
 @pytest.fixture
@@ -86,7 +82,7 @@ def test_a_voltage_is_direction_and_duty(
 ) -> None:
     motors.drive(voltage_v, 0.0)
     assert rig.right() == expected
-    assert rig.duty(0, 1) == 1.0
+    assert rig.pwm.duty(0, 1) == 1.0
     motors.drive(0.0, voltage_v)
     assert rig.right() == (BRAKE, 1.0)
 
@@ -225,7 +221,7 @@ def test_a_restarted_program_finds_the_fans_running_and_changes_nothing(rig: Rig
     assert rig.pwm.value("pwmchip1/pwm1/duty_cycle") == 15_000
     assert rig.pwm.value("pwmchip1/pwm1/period") == 50_000
     rig.fans.close()
-    assert (rig.duty(1, 0), rig.duty(1, 1)) == (0.7, 0.3)
+    assert (rig.pwm.duty(1, 0), rig.pwm.duty(1, 1)) == (0.7, 0.3)
 
 
 def test_fans_that_are_off_begin_at_zero(rig: Rig) -> None:
