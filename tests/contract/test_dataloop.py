@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -10,8 +9,6 @@ from typing import Any
 from unittest.mock import AsyncMock
 
 import pytest
-import zmq
-import zmq.asyncio
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -20,30 +17,16 @@ from ccatp.config.models import Config
 from ccatp.daemon import sim_robot
 from ccatp.dataloop import DataLoop, serve, survey_robot
 from ccatp.links.robot_messages import Sensors
-from tests.support.daemon import link_to
+from tests.support.daemon import at_work, link_to
 from tests.support.scenario import SurveyLoop, any_port, config_of
+from tests.support.sockets import DEADLINE_S, Peer
 
-DEADLINE_S = 5.0  # what takes milliseconds in a good run may take this long on a loaded machine
 JOIN = b'{"type":"join","role":"controller","client":"peer"}\n'
 JOIN_MONITOR = b'{"type":"join","role":"monitor","client":"peer"}\n'
 
 
-class Peer:
-    """A plain socket that talks lines."""
-
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self.reader, self.writer = reader, writer
-
-    def send(self, data: bytes) -> None:
-        self.writer.write(data)
-
-    async def line(self) -> bytes:
-        """The next line; empty at the end."""
-        async with asyncio.timeout(DEADLINE_S):
-            try:
-                return await self.reader.readline()
-            except ConnectionError:
-                return b""
+class RobotPeer(Peer):
+    """A plain socket that talks to a robot."""
 
     async def message(self) -> dict[str, Any]:
         found: dict[str, Any] = json.loads(await self.line())
@@ -55,14 +38,8 @@ class Peer:
         assert message["type"] == kind, message
         return message
 
-    async def is_closed(self) -> bool:
-        """Whether the robot closes, whatever it says before."""
-        while await self.line():
-            pass
-        return True
-
     def drive(self, seq: int, ack: int, right: float = 3.0, left: float = 3.0) -> None:
-        self.send(b'{"type":"drive","seq":%d,"ack":%d,"wr":%r,"wl":%r}\n' % (seq, ack, right, left))
+        self.writer.write(b'{"type":"drive","seq":%d,"ack":%d,"wr":%r,"wl":%r}\n' % (seq, ack, right, left))
 
 
 class Notes:
@@ -90,14 +67,14 @@ class Rig:
 
     def __init__(self, loop: DataLoop, port: int, notes: Notes) -> None:
         self.loop, self.port, self.notes = loop, port, notes
-        self._peers: list[Peer] = []
+        self._peers: list[RobotPeer] = []
 
-    async def peer(self, first: bytes = b"") -> Peer:
-        peer = Peer(*await asyncio.open_connection("127.0.0.1", self.port))
+    async def peer(self, first: bytes = b"") -> RobotPeer:
+        peer = RobotPeer(*await asyncio.open_connection("127.0.0.1", self.port))
         self._peers.append(peer)
         if first:
             await peer.expect("hello")
-            peer.send(first)
+            peer.writer.write(first)
         return peer
 
     async def close(self) -> None:
@@ -114,16 +91,10 @@ class Rig:
 async def running(config: Config, *, lockstep: bool = True) -> AsyncIterator[Rig]:
     notes = Notes()
     loop = SurveyLoop(config, lockstep=lockstep, log=notes)
-    stop = asyncio.Event()
-    rig = Rig(loop, await loop.start(), notes)
-    serving = asyncio.create_task(loop.run(stop))
-    try:
+    async with at_work(loop) as port:
+        rig = Rig(loop, port, notes)
         yield rig
-    finally:
         await rig.close()
-        stop.set()
-        async with asyncio.timeout(DEADLINE_S):
-            await serving
 
 
 # -- malformed lines --------------------------------------------------------------------------------------------------
@@ -136,7 +107,7 @@ async def test_a_line_of_a_megabyte(config: Config) -> None:
         await holder.expect("joined")
         for first in (b"", JOIN_MONITOR):
             rogue = await rig.peer(first)
-            rogue.send(b"x" * 1_000_000)
+            rogue.writer.write(b"x" * 1_000_000)
             assert await rogue.is_closed()
         assert rig.loop.counts["oversized_lines"] == 2
         assert (await holder.expect("sensors"))["seq"] > 0
@@ -155,7 +126,7 @@ def test_fuzz(config: Config, noise: list[bytes]) -> None:
             for k, junk in enumerate(noise):
                 if peer.reader.at_eof():
                     break
-                peer.send(junk.replace(b"\n", b"") + b"\n")
+                peer.writer.write(junk.replace(b"\n", b"") + b"\n")
                 peer.drive(k, k)
                 line = await peer.line()
                 while line and json.loads(line)["seq"] == k:  # repeated, because the answer took long
@@ -238,8 +209,8 @@ async def test_a_fall_is_reported_to_who_started_the_robot_and_not_on_the_link(m
                 stop.set()
 
     task = asyncio.create_task(serve(config_of(), lockstep=False, stop=stop, listener=listener, log=Log()))
-    peer = Peer(*await asyncio.open_connection(*listener.getsockname()))
-    peer.send(JOIN)
+    peer = RobotPeer(*await asyncio.open_connection(*listener.getsockname()))
+    peer.writer.write(JOIN)
     await peer.message()
     robot.world.displace(50.0, 0.0, 0.0)
     async with asyncio.timeout(DEADLINE_S):
@@ -259,63 +230,6 @@ def test_the_status_after_a_fall(
     assert sim_robot.run_alone(cfg, lockstep=True, runtime_dir=tmp_path) == 4
     assert "the simulated robot fell" in capsys.readouterr().err
     assert sim_robot.run_alone(cfg, lockstep=True, runtime_dir=tmp_path) == 0
-
-
-# -- truth ------------------------------------------------------------------------------------------------------------
-
-
-async def test_truth_leaves_by_its_own_sockets(config: Config, tmp_path: Path) -> None:
-    rep, pub = f"ipc://{tmp_path}/rep", f"ipc://{tmp_path}/pub"
-    listening = socket.create_server(("127.0.0.1", 0))
-    stop = asyncio.Event()
-    task = asyncio.create_task(
-        serve(config, lockstep=True, stop=stop, listener=listening, truth_rep=rep, truth_pub=pub)
-    )
-    context = zmq.asyncio.Context()
-    asking, listener = context.socket(zmq.REQ), context.socket(zmq.SUB)
-    asking.linger = 0
-    try:
-        async with asyncio.timeout(2 * DEADLINE_S):
-            listener.subscribe(b"truth ")
-            listener.connect(pub)
-            asking.connect(rep)
-
-            async def ask(request: bytes) -> dict[str, Any]:
-                await asking.send(request)
-                found: dict[str, Any] = json.loads(await asking.recv())
-                return found
-
-            at_start = await ask(b"puck")
-            assert (at_start["t"], at_start["moved_m"]) == (0.0, 0.0)
-            # A subscription takes effect some time after the connection: publish until something arrives.
-            while not await listener.poll(20):
-                await ask(b"flush")
-                peer = Peer(*await asyncio.open_connection("127.0.0.1", listening.getsockname()[1]))
-                await peer.expect("hello")
-                peer.send(JOIN)
-                await peer.expect("joined")
-                seq = (await peer.expect("sensors"))["seq"]
-                for k in range(seq, seq + 5):
-                    peer.drive(k, k)
-                    await peer.expect("sensors")
-                peer.writer.close()
-                await peer.writer.wait_closed()
-                await ask(b"flush")
-            topic, _, body = (await listener.recv()).partition(b" ")
-            assert topic == b"truth"
-            assert all(len(row) == 11 and row[9] == 0 for row in json.loads(body)["rows"])
-            told = await ask(b"misalignment")
-            assert len(told["panels"]) == 77
-            assert (await ask(b"nonsense"))["error"].startswith("unknown request")
-            last = await ask(b"puck")
-            assert last["t"] > 0.0
-            assert last["moved_m"] > 0.0
-    finally:
-        asking.close()
-        listener.close()
-        context.term()
-        stop.set()
-        await task
 
 
 async def test_an_unforeseen_error_ends_the_loop_aloud(config: Config) -> None:

@@ -3,7 +3,7 @@
 import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 
 import numpy as np
 import pytest
@@ -23,6 +23,7 @@ from ccatp.etalon_client import (
 )
 from ccatp.links.multiline import ChannelData, ChannelRecord, Connected, Environment, LaserReady, Remark, format_reply
 from tests.support.scenario import config_of
+from tests.support.sockets import scripted
 
 CHANNELS = (1, 2, 3, 4, 5, 6, 7, 8)
 COLLIMATORS = np.array([[x, y, z] for x in (-4.0, 5.0) for y in (-5.0, 4.0) for z in (-3.0, 6.0)])
@@ -53,43 +54,26 @@ class ScriptedServer:
         self.connections = 0
         self.greeting: deque[bytes] = deque()
         self.port = 0
-        self._server: asyncio.Server | None = None
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._serving = AsyncExitStack()
 
     async def start(self) -> None:
-        self._server = await asyncio.start_server(self._serve, "127.0.0.1", self.port, reuse_address=True)
-        self.port = self._server.sockets[0].getsockname()[1]
+        self.port = await self._serving.enter_async_context(scripted(self._serve, self.port))
 
     async def stop(self) -> None:
-        assert self._server is not None
-        self._server.close()
-        tasks = tuple(self._tasks)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        await self._server.wait_closed()
+        await self._serving.aclose()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        self._tasks.add(task)
         self.connections += 1
-        try:
-            if self.greeting:
-                writer.write(self.greeting.popleft())
-            while line := await reader.readline():
-                self.asked.append(line)
-                action = self.script.popleft() if self.script else lengths()
-                if isinstance(action, bytes):
-                    writer.write(action)
-                else:
-                    await action(writer)
-                await writer.drain()
-        except (ConnectionError, asyncio.CancelledError):
-            pass  # the latter by stop()
-        finally:
-            self._tasks.discard(task)
-            writer.transport.abort()
+        if self.greeting:
+            writer.write(self.greeting.popleft())
+        while line := await reader.readline():
+            self.asked.append(line)
+            action = self.script.popleft() if self.script else lengths()
+            if isinstance(action, bytes):
+                writer.write(action)
+            else:
+                await action(writer)
+            await writer.drain()
 
 
 async def silence(_: asyncio.StreamWriter) -> None:

@@ -5,7 +5,6 @@ import logging
 import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from ccatp.sim import etalon_server as etalon_standin
 from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck, PuckSource, TruthUnavailable, ZmqPuck
 from ccatp.sim.laser import PuckTruth
 from tests.support.scenario import any_port
+from tests.support.sockets import peer_of
 
 CHANNELS = (1, 2, 3, 4)
 COLLIMATORS = np.array([[0.0, 0.0, 5.0], [3.0, 0.0, 4.0], [0.0, 4.0, 3.0], [-6.0, 0.0, 8.0]])
@@ -42,37 +42,6 @@ async def running(server: EtalonSimulator) -> AsyncIterator[int]:
         await server.close()
 
 
-class Peer(NamedTuple):
-    reader: asyncio.StreamReader
-    writer: asyncio.StreamWriter
-
-    async def line(self) -> bytes:
-        async with asyncio.timeout(2.0):
-            return await self.reader.readline()
-
-    async def ask(self, line: bytes) -> bytes:
-        self.writer.write(line)
-        return await self.line()
-
-    async def is_closed(self) -> bool:
-        try:
-            async with asyncio.timeout(2.0):
-                while await self.reader.read(65536):
-                    pass
-        except ConnectionError:
-            pass
-        return True
-
-
-@asynccontextmanager
-async def peer(port: int) -> AsyncIterator[Peer]:
-    reader, writer = await asyncio.open_connection("127.0.0.1", port)
-    try:
-        yield Peer(reader, writer)
-    finally:
-        writer.transport.abort()
-
-
 GOLDEN = [
     (b"isconnected\r\n", b"isconnected_1\r\n"),
     (b"laserready\r\n", b"laserready_1\r\n"),
@@ -86,7 +55,7 @@ GOLDEN = [
 
 @pytest.mark.parametrize(("request_", "reply"), GOLDEN)
 async def test_replies_to_the_byte(request_: bytes, reply: bytes) -> None:
-    async with running(standin()) as port, peer(port) as client:
+    async with running(standin()) as port, peer_of(port) as client:
         assert await client.ask(request_) == reply
 
 
@@ -101,7 +70,7 @@ async def test_replies_to_the_byte(request_: bytes, reply: bytes) -> None:
 )
 async def test_a_bad_line_is_answered_counted_and_nothing_else(line: bytes, reason: bytes) -> None:
     server = standin()
-    async with running(server) as port, peer(port) as client:
+    async with running(server) as port, peer_of(port) as client:
         assert await client.ask(line) == b"error_" + reason + b"\r\n"
         assert server.counts == {"bad_requests": 1}
         assert await client.ask(b"isconnected\r\n") == b"isconnected_1\r\n"
@@ -113,7 +82,7 @@ async def test_flags_blocked_beams_and_cold_lasers_reach_the_wire() -> None:
     server.model.flags = {3: {"usb_error"}}
     server.model.laser_ready = False
     server.connected = False
-    async with running(server) as port, peer(port) as client:
+    async with running(server) as port, peer_of(port) as client:
         data = parse_reply((await client.ask(b"latestlengthvalid,1,2,3\r\n")).rstrip())
         assert isinstance(data, ChannelData)
         common = {"motion_tolerance_error", "laser_temp_error"}
@@ -146,7 +115,7 @@ async def test_a_slow_client_that_ends_its_side_still_gets_every_reply() -> None
 
 async def test_a_line_of_one_megabyte_closes_its_connection_and_no_other() -> None:
     server = standin()
-    async with running(server) as port, peer(port) as client, peer(port) as flooder:
+    async with running(server) as port, peer_of(port) as client, peer_of(port) as flooder:
         flooder.writer.write(b"x" * 1_000_000)
         assert await flooder.is_closed()
         assert server.counts == {"oversized_lines": 1}
@@ -159,9 +128,9 @@ async def test_a_connection_reset_in_the_middle_of_a_line_is_counted() -> None:
         with closing(socket.create_connection(("127.0.0.1", port))) as rude:
             rude.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\x01\x00\x00\x00\x00\x00\x00\x00")
             rude.send(b"isconn")
-            async with peer(port) as client:
+            async with peer_of(port) as client:
                 assert await client.ask(b"isconnected\r\n") == b"isconnected_1\r\n"
-        async with peer(port) as client, asyncio.timeout(2.0):
+        async with peer_of(port) as client, asyncio.timeout(2.0):
             while not server.counts["lost_clients"]:
                 assert await client.ask(b"isconnected\r\n") == b"isconnected_1\r\n"
 
@@ -169,7 +138,7 @@ async def test_a_connection_reset_in_the_middle_of_a_line_is_counted() -> None:
 async def test_a_client_that_never_reads_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(etalon_standin, "_SEND_TIMEOUT_S", 0.05)
     server = standin()
-    async with running(server) as port, peer(port) as client, peer(port) as deaf:
+    async with running(server) as port, peer_of(port) as client, peer_of(port) as deaf:
         deaf.writer.transport.pause_reading()  # type: ignore[attr-defined]
         request = b"latestlengthvalid," + b",".join(b"%d" % n for n in range(1, 33)) + b"\r\n"
         async with asyncio.timeout(60.0):
@@ -182,9 +151,9 @@ async def test_a_client_that_never_reads_is_dropped(monkeypatch: pytest.MonkeyPa
 async def test_more_clients_than_allowed_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(etalon_standin, "_MAX_CLIENTS", 2)
     server = standin()
-    async with running(server) as port, peer(port) as first, peer(port) as second:
+    async with running(server) as port, peer_of(port) as first, peer_of(port) as second:
         assert await first.ask(b"isconnected\r\n") == await second.ask(b"isconnected\r\n")
-        async with peer(port) as third:
+        async with peer_of(port) as third:
             assert await third.is_closed()
         assert server.counts["refused_clients"] == 1
         assert await first.ask(b"isconnected\r\n") == b"isconnected_1\r\n"
@@ -193,7 +162,7 @@ async def test_more_clients_than_allowed_are_refused(monkeypatch: pytest.MonkeyP
 async def test_the_stream_pushes_every_channel_until_it_is_stopped() -> None:
     server = standin(FixedPuck((0.0, 0.0, 0.0), step_s=0.2), NOISY)
     server.push_hz = 10_000.0
-    async with running(server) as port, peer(port) as client, peer(port) as other:
+    async with running(server) as port, peer_of(port) as client, peer_of(port) as other:
         assert await client.ask(b"startmeasnogui\r\n") == b"measstarted\r\n"
         pushed = [await client.line() for _ in range(3)]
         assert len(set(pushed)) == 3  # time passes, so does the noise
@@ -225,7 +194,7 @@ class NoPuck:
 
 async def test_without_the_puck_the_server_error_is_one() -> None:
     server = standin(NoPuck())
-    async with running(server) as port, peer(port) as client:
+    async with running(server) as port, peer_of(port) as client:
         reply = await client.ask(b"latestlengthvalid,1,2\r\n")
         assert reply == b"channeldata_1,0.0," + DEAD + b"_2,0.0," + DEAD + b"_1\r\n"
         assert server.counts["truth_failures"] == 1
@@ -238,7 +207,7 @@ class BrokenPuck:
 
 async def test_an_error_nobody_foresaw_ends_serve() -> None:
     server = standin(BrokenPuck())
-    async with running(server) as port, peer(port) as client:
+    async with running(server) as port, peer_of(port) as client:
         client.writer.write(b"latestlengthvalid,1\r\n")
         with pytest.raises(ExceptionGroup) as caught:
             async with asyncio.timeout(2.0):
@@ -262,7 +231,7 @@ async def test_serve_lasts_until_closed_and_wants_a_start() -> None:
 async def test_closing_with_clients_connected_is_quiet(caplog: pytest.LogCaptureFixture) -> None:
     server = standin()
     port = await server.start(any_port())
-    async with peer(port) as client, peer(port) as streaming:
+    async with peer_of(port) as client, peer_of(port) as streaming:
         assert await client.ask(b"isconnected\r\n") == b"isconnected_1\r\n"
         assert await streaming.ask(b"startmeasnogui\r\n") == b"measstarted\r\n"
         with caplog.at_level(logging.WARNING):

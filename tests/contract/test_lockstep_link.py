@@ -21,8 +21,9 @@ from ccatp.links.robot_link import RobotTimeout
 from ccatp.links.robot_messages import CommandEcho, Hello, Joined, Role, Sensors
 from ccatp.onboard import server, sessions
 from ccatp.sim.fault_proxy import FaultProxy
-from tests.support.daemon import HELLO
+from tests.support.daemon import HELLO, at_work
 from tests.support.scenario import SurveyLoop, begin, config_of
+from tests.support.sockets import scripted
 
 DEADLINE_S = 30.0  # what never happens in a good run may take this long in a bad one
 FRAMES = 40
@@ -152,15 +153,15 @@ class Rig:
 
 @asynccontextmanager
 async def running(folder: Path) -> AsyncIterator[Rig]:
-    rig, cfg, stop = Rig(), config_of(run__seed=SEED), asyncio.Event()
+    rig = Rig()
     rig.notes, rig.proxies, rig.clients = [], {}, {}
     log: Any = SimpleNamespace(info=lambda _event, **fields: rig.notes.append(str(fields.get("text", ""))))
-    rig.robot = SurveyLoop(cfg, lockstep=True, log=log)
+    rig.robot = SurveyLoop(config_of(run__seed=SEED), lockstep=True, log=log)
     async with AsyncExitStack() as stack:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         stack.callback(context.destroy, linger=0)
-        port = await rig.robot.start()
-        tasks = [asyncio.create_task(rig.robot.run(stop))]
+        port = await stack.enter_async_context(at_work(rig.robot))
+        tasks: list[asyncio.Task[None]] = []
         roles: tuple[Role, ...] = ("monitor", "controller")
         for role in roles:
             proxy = await stack.enter_async_context(FaultProxy("127.0.0.1", port, seed=1))
@@ -171,13 +172,11 @@ async def running(folder: Path) -> AsyncIterator[Rig]:
         try:
             yield rig
         finally:
-            stop.set()
             for client in rig.clients.values():
                 client.leave()
-            await tasks[0]
-            for task in tasks[1:]:
+            for task in tasks:
                 task.cancel()
-            await asyncio.gather(*tasks[1:], return_exceptions=True)
+            await asyncio.gather(*tasks, return_exceptions=True)
 
 
 async def end_of(
@@ -346,11 +345,9 @@ async def test_a_robot_without_a_valid_first_frame_is_reported_and_given_up(
                     await reader.readline()
             except TimeoutError:
                 continue
-        writer.close()
 
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    async with await asyncio.start_server(talk, "127.0.0.1", 0) as server:
-        port = server.sockets[0].getsockname()[1]
+    async with scripted(talk) as port:
         cfg = config_of(robot__port=port, robot__reconnect_timeout_s=1.0)
         client = Answering(role, cfg, tmp_path, context)
         await client.join(is_patient=False)

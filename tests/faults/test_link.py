@@ -18,7 +18,7 @@ from ccatp.links.robot_link import BACKLOG_S, FLOOD_FACTOR, RobotLink, RobotTime
 from ccatp.links.robot_messages import PROTOCOL, CommandEcho, Sensors
 from ccatp.sim.fault_proxy import FaultProxy
 from tests.faults.linking import Measured
-from tests.support.daemon import HELLO, Driver, link_to, robot_behind_proxy
+from tests.support.daemon import HELLO, Driver, at_work, link_to, robot_behind_proxy
 from tests.support.daemon import LINK_DEADLINE_S as DEADLINE_S
 from tests.support.scenario import ServedRobot, SurveyLoop, begin, config_of, mirror_of
 from tests.unit.test_robot_link import robot
@@ -313,24 +313,20 @@ async def test_no_other_version_is_joined(protocol: str, measured: Measured) -> 
 async def round_trips(count: int) -> list[float]:
     """Times from a frame to the next one in lockstep: our answer's way, the robot's step, the frame's way."""
     times_s: list[float] = []
-    robot, stop = SurveyLoop(config_of(), lockstep=True), asyncio.Event()
-    port = await robot.start()
-    async with asyncio.TaskGroup() as tasks:
-        tasks.create_task(robot.run(stop))
-        done = asyncio.Event()
+    done = asyncio.Event()
 
-        def on_sensors(frame: Sensors, _: bytes) -> None:
-            times_s.append(time.perf_counter())
-            link.send_drive(frame.seq + 1, frame.seq, 0.0, 0.0)
-            if len(times_s) > count:
-                done.set()
+    def on_sensors(frame: Sensors, _: bytes) -> None:
+        times_s.append(time.perf_counter())
+        link.send_drive(frame.seq + 1, frame.seq, 0.0, 0.0)
+        if len(times_s) > count:
+            done.set()
 
+    async with at_work(SurveyLoop(config_of(), lockstep=True)) as port:
         link = link_to(port, on_sensors=on_sensors, on_lost=lambda _: done.set())
         await link.connect(DEADLINE_S)
         async with asyncio.timeout(DEADLINE_S):
             await done.wait()
         link.close()
-        stop.set()
     return list(np.diff(times_s))
 
 

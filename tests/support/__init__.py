@@ -10,6 +10,7 @@
   once per test session, to read from.
 * `sim_survey`: surveys in process: watched frame by frame with faults, measured by the daemon's own fix service with a
   scripted laser (`MeasuredSurvey`, `fix_service`), restarted after a kill.
+* `sockets`: `scripted` (a server that follows a script), `peer_of` (a client that talks lines).
 * `http_server`: `answering` (a server on loopback), `taking_posts` (what is posted to it).
 * `daemon`: both loops of the daemon and their peers in one event loop; or the robot link alone, behind a proxy.
 """

@@ -289,17 +289,22 @@ class Driver(Waiting):
 
 
 @asynccontextmanager
+async def at_work(robot: SurveyLoop) -> AsyncIterator[int]:
+    """A simulated robot behind its link; its port."""
+    port, stop = await robot.start(), asyncio.Event()
+    async with asyncio.TaskGroup() as tasks:
+        tasks.create_task(robot.run(stop))
+        try:
+            yield port
+        finally:
+            stop.set()
+
+
+@asynccontextmanager
 async def robot_behind_proxy(
     *, lockstep: bool, key: bytes | None = None
 ) -> AsyncIterator[tuple[SurveyLoop, FaultProxy]]:
     """A running DataLoop with a proxy before it."""
     loop = SurveyLoop(config_of(run__seed=SEED), lockstep=lockstep, key=key)
-    port = await loop.start()
-    stop = asyncio.Event()
-    async with asyncio.TaskGroup() as tasks:
-        tasks.create_task(loop.run(stop))
-        try:
-            async with FaultProxy("127.0.0.1", port, seed=1) as proxy:
-                yield loop, proxy
-        finally:
-            stop.set()
+    async with at_work(loop) as port, FaultProxy("127.0.0.1", port, seed=1) as proxy:
+        yield loop, proxy

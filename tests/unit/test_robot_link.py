@@ -2,7 +2,7 @@
 
 import asyncio
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -17,13 +17,12 @@ from ccatp.links.robot_link import LineWriter, RobotLink, RobotLinkError, RobotR
 from ccatp.links.robot_messages import CommandEcho, Sensors
 from tests.support.daemon import HELLO as OF_ROBOT
 from tests.support.daemon import Waiting, link_to
+from tests.support.sockets import Script, scripted
 
 HELLO = encode(replace(OF_ROBOT, lockstep=True))
 HELLO_HMAC = HELLO.replace(b'"none"', b'"hmac-sha256"')
 JOINED = b'{"type":"joined","role":"controller","session":1}\n'
 DEADLINE_S = 2.0  # what never happens in a good run may take this long in a bad one
-
-Script = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
 
 def frame(seq: int) -> bytes:
@@ -58,31 +57,13 @@ class Seen(Waiting):
 
 @asynccontextmanager
 async def robot(script: Script, *, key: bytes | None = None) -> AsyncIterator[tuple[RobotLink, Seen]]:
-    """A robot that runs ``script`` for the one client it gets, and a link to it."""
-    done: list[asyncio.Task[None]] = []
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        done.append(task)
-        try:
-            await script(reader, writer)
-        finally:
-            writer.close()
-
-    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    """A robot that runs ``script`` for the client it gets, and a link to it."""
     seen = Seen()
     hears = {name: getattr(seen, name) for name in ("on_sensors", "on_lost", "on_bad_line", "on_repeated")}
-    link = link_to(server.sockets[0].getsockname()[1], key=key, **hears)
-    try:
+    async with scripted(script) as port:
+        link = link_to(port, key=key, **hears)
         yield link, seen
-    finally:
         link.close()
-        server.close()
-        await server.wait_closed()
-        for task in done:
-            task.cancel()
-        await asyncio.gather(*done, return_exceptions=True)
 
 
 def after_join(*pieces: bytes, then: Script | None = None, hello: bytes = HELLO, joined: bytes = JOINED) -> Script:

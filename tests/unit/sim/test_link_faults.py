@@ -20,6 +20,7 @@ from ccatp.sim.fault_plan import LINK_TYPES, LOCKSTEP_TYPES, parse_plan
 from ccatp.sim.fault_proxy import FaultProxy, LineStage, OneWayFaults
 from tests.support.daemon import LINK_DEADLINE_S, Driver, Waiting
 from tests.support.scenario import begin
+from tests.support.sockets import scripted
 
 DEADLINE_S = 5.0  # what never happens in a good run may take this long in a bad one
 LINES = [b"line %d of some length\n" % k for k in range(40)]
@@ -52,7 +53,6 @@ class Server(Waiting):
             self.ends.append("lost")
         finally:
             self.changed.set()
-            writer.close()
 
     @property
     def text(self) -> bytes:
@@ -78,20 +78,13 @@ class Rig:
 @asynccontextmanager
 async def rig(seed: int = 1) -> AsyncIterator[Rig]:
     server = Server()
-    listening = await asyncio.start_server(server.serve, "127.0.0.1", 0)
-    try:
-        async with FaultProxy("127.0.0.1", listening.sockets[0].getsockname()[1], seed=seed) as proxy:
-            found = Rig(server, proxy)
-            try:
-                yield found
-            finally:
-                for writer in (*found.writers, *server.writers):
-                    writer.close()
-                    with contextlib.suppress(ConnectionError):
-                        await writer.wait_closed()
-    finally:
-        listening.close()
-        await listening.wait_closed()
+    async with scripted(server.serve) as port, FaultProxy("127.0.0.1", port, seed=seed) as proxy:
+        found = Rig(server, proxy)
+        yield found
+        for writer in found.writers:
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
 
 
 async def passes(condition: Callable[[], bool]) -> None:
