@@ -37,7 +37,6 @@ from ccatp.mirror.panel_alignment import (
     quadratic,
     rigid,
 )
-from ccatp.mirror.surface import UnknownPanelError
 from ccatp.sim.world import draw_misalignments
 from tests.support.command import answered, printed
 from tests.support.scenario import MIRRORS, World, world_of
@@ -102,11 +101,6 @@ def test_the_surface_counts_where_the_puck_stood(m1: Mirror) -> None:
     # The mirror's slope against the panel's there is 3 mrad: the height of the point itself is off by some 20 um.
     assert found.deck_m[0] == pytest.approx([x + 8e-3, y - 6e-3], abs=1e-6)
     assert found.values_m[0] == pytest.approx(30e-6 * found.lever[0], rel=1e-6)
-
-
-def test_a_panel_that_does_not_exist_is_refused(m1: Mirror) -> None:
-    with pytest.raises(UnknownPanelError, match="no panel in row 1, column 9"):
-        deviations_of(m1, PanelId(1, 9), [exact_fix(m1, PointId(1, 2, 1), SHIFTED)], HEIGHT_M, 0.0)
 
 
 # -- least squares ----------------------------------------------------------------------------------------------------

@@ -10,9 +10,13 @@ from ccatp.config.models import PanelsConfig
 from ccatp.core import DeckPose, PanelId, PanelPose, PointId, bearing, difference
 from ccatp.mirror.layout import PanelGrid
 from ccatp.mirror.mirror import Mirror, deck_rows
+from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
+from ccatp.mirror.panel_alignment import deviations_of
 from ccatp.mirror.surface import ConvergenceError, UnknownPanelError
+from tests.unit.aligning.test_panel_alignment import exact_fix
 
 POSE = DeckPose(1.1, -1.7, 0.6)
+LEVEL = PanelMisalignment(0.0, 0.0, 0.0)
 
 
 def test_world_places_the_mirrors_as_in_the_optical_design(m1: Mirror, m2: Mirror) -> None:
@@ -87,6 +91,8 @@ def test_gravity_at_the_apex(m1: Mirror, m2: Mirror) -> None:
         lambda m, nowhere: m.deck_pose(PanelPose(nowhere, 0.0, 0.0, 0.0)),
         lambda m, nowhere: m.seam_normal_angle(nowhere, "x", 0.0, 0.0),
         lambda m, nowhere: m.adjusters_on_deck(nowhere),
+        lambda m, nowhere: misaligned_puck_world(m, nowhere, LEVEL, POSE, 0.05),
+        lambda m, nowhere: deviations_of(m, nowhere, [exact_fix(m, PointId(1, 2, 1), LEVEL)], 0.05, 0.0),
     ],
 )
 def test_panels_that_do_not_exist_are_refused(m1: Mirror, call: Callable[[Mirror, PanelId], object]) -> None:
