@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import dump_config, load_config, load_radio_config
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, Fix, PanelId, PointId
+from ccatp.core import DeckPose, PanelId, PointId
 from ccatp.daemon.mission_runner import TimedFrame
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_messages import Sensors
@@ -37,8 +36,10 @@ from ccatp.mirror.misalignment import PanelMisalignment
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.recorder import Recorder
 from ccatp.records.store import MissionStore, StoredPoint
-from ccatp.studies.sil_run import SilRun
+from ccatp.survey.behaviours import MissionCommand
 from ccatp.survey.events import Abort, MissionState
+from ccatp.survey.route_follower import StateEstimate
+from tests.support.sim_survey import MeasuredSurvey
 
 HERE = DeckPose(0.0, 0.0, 0.0)
 
@@ -82,7 +83,7 @@ def record_truth(run_dir: Path, truth: Mapping[PanelId, PanelMisalignment], *, i
 BATCH = 100
 
 
-class RecordingRun(SilRun):
+class RecordingRun(MeasuredSurvey):
     """A mission in process that leaves a run directory behind.
 
     ``is_simulation``: what the recording says of itself; without a simulation no truth is recorded. ``only``: points
@@ -90,25 +91,17 @@ class RecordingRun(SilRun):
     """
 
     def __init__(self, cfg: Config, run_dir: Path, *, is_simulation: bool = True, only: int | None = None) -> None:
-        super().__init__(cfg)
+        super().__init__(cfg, run_dir)
         run_dir.mkdir(parents=True, exist_ok=True)
         self.run_dir, self.is_simulation, self.only = run_dir, is_simulation, only
         (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
         self.recorder = recorder_in(
             run_dir, {"ccatp": "0.0.test", "config": dump_config(cfg)}, is_simulation=is_simulation
         )
-        points = [StoredPoint(point, 0.0, 0.0) for point in self.parts.points]
-        self.store = MissionStore.create(
-            run_dir / "mission.sqlite", mirror=cfg.mirror.name, seed=cfg.run.seed, config_toml="", points=points
-        )
         self.log = (run_dir / "log.jsonl").open("a", encoding="utf-8")
         self.track: list[tuple[Any, ...]] = []
         self.truth: list[tuple[Any, ...]] = []
         self.lines: list[msgspec.Raw] = []
-        self.note_arrival = self.trace.builder.add_arrival
-        self.trace.builder.add_arrival = self.arrive  # type: ignore[method-assign]
-        self.take_rest = self.localizer.rest
-        self.localizer.rest = self.rest  # type: ignore[method-assign]
         self.seq, self.t_s, self.seen = 0, 0.0, MissionState.IDLE
 
     def leave(self) -> Path:
@@ -122,7 +115,6 @@ class RecordingRun(SilRun):
         self.flush()
         self.status(outcome=result.outcome, exit_status=0 if result.outcome == "complete" else 3)
         self.recorder.close()
-        self.store.close()
         self.say("supervisor", "run_finished", status=0)
         self.log.close()
         (self.run_dir / "summary.json").write_text(json.dumps(result.summary), encoding="utf-8")
@@ -163,9 +155,14 @@ class RecordingRun(SilRun):
         self.lines.append(msgspec.Raw(encode(frame).strip()))
         super()._serve(frame, dt_s)
 
-    def rest(self) -> None:
-        self.write("rest", Rest(seq=self.seq, t_s=self.t_s))
-        self.take_rest()
+    def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
+        super()._execute(command, motion)
+        if command.at_rest:
+            self.write("rest", Rest(seq=self.seq, t_s=self.t_s))
+        if command.arrived is not None:
+            error_mm = 1e3 * self.mission.survey.follower.distance_m(self.mission.state.stop, self.localizer.pose)
+            point = (*command.arrived,)
+            self.write("arrival", ArrivalMessage(seq=self.seq, t_s=self.t_s, point=point, error_mm=error_mm))
 
     def _publish(self, frame: TimedFrame) -> None:
         super()._publish(frame)
@@ -181,36 +178,9 @@ class RecordingRun(SilRun):
             self.only = None
             self.mission.handle(Abort("the observatory wants the robot home"))
 
-    def _measure(self, frame: Sensors) -> None:
-        point = self.mission.state.measuring_point
-        before = self.localizer.deck_pose
-        self.newest: Fix | None = None
-        super()._measure(frame)
-        if self.newest is not None:
-            self.keep(point, self.newest, before)
-
-    def arrive(self, point: PointId, seq: int) -> None:
-        self.note_arrival(point, seq)
-        error_mm = 1e3 * self.mission.survey.follower.distance_m(self.mission.state.stop, self.localizer.pose)
-        self.write("arrival", ArrivalMessage(seq=seq, t_s=self.t_s, point=(*point,), error_mm=error_mm))
-
-    def _fuse(self, fix: Fix) -> None:
-        self.newest = fix
-        super()._fuse(fix)
-
-    def keep(self, point: PointId | None, fix: Fix, before: DeckPose) -> None:
-        after = self.localizer.deck_pose
-        jump_mm = 1e3 * float(np.hypot(after.x_m - before.x_m, after.y_m - before.y_m))
-        self.write(
-            "fix",
-            FixMessage(
-                seq=self.seq, t_s=fix.t_s, point=None if point is None else (*point,), is_fused=True,
-                position_m=fix.position_m, covariance_m2=list(fix.covariance_m2), dop=fix.dop,
-                residual_rms_m=fix.residual_rms_m, channels=list(fix.channels), jump_mm=jump_mm,
-            ),
-        )  # fmt: skip
-        if point is not None and point in self.mission.state.done:
-            self.store.record_fix(point, fix, before).result()
+    def _note_fix(self, topic: str, message: FixMessage) -> None:
+        super()._note_fix(topic, message)
+        self.write(topic, msgspec.structs.replace(message, seq=self.seq))
 
 
 def record(run_dir: Path, *, is_simulation: bool = True, only: int | None = None, **changes: object) -> Path:
