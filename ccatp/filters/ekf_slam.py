@@ -5,9 +5,10 @@ from copy import copy
 from math import inf, sqrt
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.blas import daxpy, dger, dscal, dtrsm, dtrsv
+from scipy.linalg.blas import daxpy, ddot, dger, dscal, dtrsm, dtrsv
 from scipy.linalg.lapack import dposv, dpotrf
 
 from ccatp.core import FloatArray
@@ -43,7 +44,7 @@ class Update(NamedTuple):
     spread: FloatArray
 
 
-class RowUpdate(NamedTuple):
+class RowUpdate(msgspec.Struct, frozen=True, gc=False):
     """An ``Update`` of one row as numbers, because arrays of one take longer than the algebra."""
 
     residual: float
@@ -76,6 +77,9 @@ class EkfSlam:
     ) -> None:
         x, P = checked_gaussian(vehicle_mean, vehicle_covariance, np.shape(vehicle_covariance))
         self.vehicle_size = v = x.size
+        row, column = np.ogrid[:v, :v]
+        # Flat places of the upper triangle of (v, v), mirrored: what is taken from them is exactly symmetric.
+        self._mirrored = v * np.minimum(row, column) + np.maximum(row, column)
         c = 0 if calibration_mean is None else int(np.size(calibration_mean))
         self._blocks: dict[BlockId, slice] = {}
         mean, covariance = np.zeros(v + c), np.zeros((v + c, v + c))
@@ -130,11 +134,9 @@ class EkfSlam:
         corner = rows[:, :v].dot(F.T)
         corner += Q
         flat = corner.ravel()
-        if not flat.dot(flat) + vehicle_mean.dot(vehicle_mean) < HUGE:
+        if not ddot(flat, flat) + ddot(vehicle_mean, vehicle_mean) < HUGE:
             raise FilterDiverged(f"prediction is not finite: vehicle {vehicle_mean.tolist()}")
-        symmetric = corner + corner.T
-        symmetric *= 0.5
-        rows[:, :v] = symmetric
+        rows[:, :v] = flat.take(self._mirrored)
         self._rows[:] = rows
         self._columns[:] = rows.T
         self._vehicle[:] = vehicle_mean
@@ -149,11 +151,17 @@ class EkfSlam:
 
     def relax(self, index: int, factor: float, variance: float) -> None:
         """One state forgets: x <- factor x + noise, a Gauss-Markov process; ``factor`` 0 to 1."""
-        P = self.covariance
+        n = self.size
+        flat = self.covariance.ravel()
         self.mean[index] *= factor
-        P[index] *= factor
-        P[:, index] *= factor
-        P[index, index] += variance
+        dscal(factor, flat, n, index * n)  # the row
+        dscal(factor, flat, n, index, n)  # the column
+        flat[index * (n + 1)] += variance
+
+    def add_square(self, factor: float, vector: FloatArray) -> None:
+        """P <- P + factor vector vector^T, vector (n,): exactly symmetric where ``factor`` is a power of two."""
+        # All arguments by position: by name they take as long as the algebra. P^T, because BLAS has columns.
+        dger(factor, vector, vector, 1, 1, self._transposed, 1, 1, 1)
 
     def update_row(
         self, columns: Columns, h: FloatArray, residual: float, r: float, gate: float = inf, knee: float = inf
@@ -167,7 +175,7 @@ class EkfSlam:
         with that noise.
         """
         cross = h.dot(self.covariance.take(columns, axis=0))
-        s = given = float(h.dot(cross.take(columns))) + r
+        s = given = ddot(h, cross[columns]) + r
         if not (r > 0.0 and r <= s * (1.0 + 1e-9) and s < HUGE and residual * residual < HUGE):
             raise FilterDiverged(f"update is not finite: residual {residual:.6g}, noise {r:.3g}, variance {s:.3g}")
         nis = residual * residual / s
@@ -180,10 +188,10 @@ class EkfSlam:
         root = sqrt(s)
         dscal(1.0 / root, cross)
         if s < STRONG * r:
-            dger(-1.0, cross, cross, a=self._transposed, overwrite_a=1)
+            self.add_square(-1.0, cross)
         else:
             self._joseph(columns, h[None, :], cross[:, None] / root, np.array(((r,),)))
-        daxpy(cross, self.mean, a=residual / root)
+        daxpy(cross, self.mean, cross.size, residual / root)
         return RowUpdate(residual, nis, True, given)
 
     def update(self, columns: Columns, H: FloatArray, residual: FloatArray, R: FloatArray, gate: float = inf) -> Update:

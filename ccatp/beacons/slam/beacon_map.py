@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from math import exp
 
 import numpy as np
-from scipy.linalg.blas import daxpy, dger
+from scipy.linalg.blas import daxpy
 
 from ccatp.beacons.slam.motion import POSE
 from ccatp.beacons.slam.recording import BeaconId
@@ -34,7 +34,10 @@ class NoiseLevel:
         change = share * (nis - 1.0) / information
         if not -LARGEST < change < LARGEST:
             change = LARGEST if change > 0.0 else -LARGEST
-        self.factor = min(max(self.factor * exp(change), self._least), FURTHEST)
+        factor = self.factor * exp(change)
+        if not self._least <= factor <= FURTHEST:
+            factor = self._least if factor < self._least else FURTHEST
+        self.factor = factor
 
 
 LARGEST = 0.3  # most that one innovation may change the logarithm of the factor
@@ -175,24 +178,23 @@ class HeadingTransport:
         something left the state since, nothing is done.
         """
         engine = self._engine
-        P = engine.covariance
+        mean, P, heading = engine.mean, engine.covariance, engine.covariance[HEADING]
         if P is not self._seen:
             self._look(P)
-        if before.size > engine.size:
+        if before.size > mean.size:
             return
-        if before.size < engine.size:
-            before = np.concatenate((before, engine.mean[before.size :]))
-        daxpy(engine.mean, before, a=-1.0)
-        d = before.take(self._partner)
+        if before.size < mean.size:
+            before = np.concatenate((before, mean[before.size :]))
+        daxpy(mean, before, mean.size, -1.0)
+        d = before[self._partner]
         d *= self._sign
-        more = P[HEADING] + d
-        less = P[HEADING] - d
-        half = 0.5 * P.item(HEADING, HEADING)  # w = P e + d e^T P e / 2
-        daxpy(d, more, a=half)
-        daxpy(d, less, a=half)
-        # d w^T + w d^T as a difference of squares: P stays symmetric exactly
-        dger(0.5, more, more, a=P.T, overwrite_a=1)
-        dger(-0.5, less, less, a=P.T, overwrite_a=1)
+        # With w = P e + d e^T P e / 2, d w^T + w d^T as a difference of squares: P stays symmetric exactly.
+        half = 0.5 * heading.item(HEADING)
+        more, less = heading.copy(), heading.copy()
+        daxpy(d, more, d.size, half + 1.0)
+        daxpy(d, less, d.size, half - 1.0)
+        engine.add_square(0.5, more)
+        engine.add_square(-0.5, less)
 
     def _look(self, P: FloatArray) -> None:
         engine = self._engine
