@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Sequence
 from functools import partial
 from math import log, sqrt
-from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from ccatp.beacons.slam.beacon_map import (
@@ -54,7 +54,7 @@ PLACE = 2  # x_m, y_m
 UNITS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-class BeaconInnovation(NamedTuple):
+class BeaconInnovation(msgspec.Struct, frozen=True, gc=False):
     """What one reading did."""
 
     beacon: BeaconId
@@ -62,16 +62,6 @@ class BeaconInnovation(NamedTuple):
     size: int  # scalars that were taken: bearing, range or strength; where the bearing is refused, it alone
     accepted: bool  # False where it was refused; the state is then as before, or has taken the bearing alone
     surprise: float = 0.0  # minus twice its log-likelihood, up to a constant: sum of nis + ln S
-
-
-class _Scalar(NamedTuple):
-    """One number of a reading of a beacon on the map."""
-
-    reading: Reading
-    entry: MapEntry
-    wander: GaussMarkovBias | None  # of the error that lasts, where it is taken into account
-    kind: str
-    z: float
 
 
 class BeaconSlam:
@@ -173,10 +163,10 @@ class BeaconSlam:
         before = engine.mean[: engine.vehicle_size].copy()
         mean, F, Q = motion.step(before, odometry)
         if self._learns:
-            Q = Q * self.levels["motion"].factor
+            Q *= self.levels["motion"].factor
             self._fresh.step(F, Q)
         if isinstance(odometry, Increment) and odometry.guess_m2 > 0.0:
-            Q = Q.copy()  # a guessed way says nothing of the noise of odometry
+            # a guessed way says nothing of the noise of odometry
             Q[range(POSE), range(POSE)] += odometry.guess_m2, odometry.guess_m2, odometry.guess_rad2
         engine.predict(mean, F, Q)
         self._way_m += self._clock.took(odometry, before, mean)
@@ -189,15 +179,15 @@ class BeaconSlam:
         self.learned = []
         for reading in readings:
             entry, before = self._map.get(reading.beacon), self.engine.mean.copy()
-            if entry is None and is_direction(reading):
-                self.unplaced += 1  # it may lie anywhere along it
-            elif entry is None:
-                self._begin(reading)
-            else:
+            if entry is not None:
                 self.learned.append(self._update(reading, entry))
                 if entry.on_trial and reading.beacon not in self._map and not is_direction(reading):
                     before = self.engine.mean.copy()
                     self._begin(reading)
+            elif is_direction(reading):
+                self.unplaced += 1  # it may lie anywhere along it
+            else:
+                self._begin(reading)
             self._follow(before)
         return self.learned
 
@@ -273,7 +263,8 @@ class BeaconSlam:
     def _stacked(self, waiting: PendingLandmark) -> StackedRows:
         def row_of(kind: str, pose: list[float], calibration: list[float], beacon: list[float]) -> MeasurementRow:
             row = self._models.by_kind[kind].row(pose, calibration[: self._ranges], beacon, waiting.beacon)
-            return row._replace(variance=row.variance * self.levels[kind].factor)
+            row.variance *= self.levels[kind].factor
+            return row
 
         return StackedRows(self.engine, waiting.records, self._shared, row_of)
 
@@ -303,40 +294,40 @@ class BeaconSlam:
 
     def _update(self, reading: Reading, entry: MapEntry) -> BeaconInnovation:
         """The bearing is taken first: if it is refused, so is the rest."""
-        model = None if is_direction(reading) else self._wander
-        if model is not None:
-            self._map.wander_to(reading.beacon, model, self._way_m, reading.time_s)
+        if self._wander is not None and not is_direction(reading):
+            self._map.wander_to(reading.beacon, self._wander, self._way_m, reading.time_s)
         nis, spread, size, accepted = 0.0, 1.0, 0, True
         for kind, z in scalars_of(reading):
             if accepted:
-                found = self._take(_Scalar(reading, entry, model, kind, z))
+                found = self._take(reading, entry, kind, z)
                 nis, spread, size, accepted = nis + found.nis, spread * found.spread, size + 1, found.accepted
         if self._learns:
             self._fresh.clear()
         self._judge(reading, entry, accepted=accepted)
         return BeaconInnovation(reading.beacon, nis, size, accepted, nis + log(spread))
 
-    def _take(self, one: _Scalar) -> RowUpdate:
-        engine, level, columns = self.engine, self.levels[one.kind], one.entry.columns
-        prior = engine.mean.take(columns)
-        h, residual, r, own = self._linearised(one, prior.tolist())
+    def _take(self, reading: Reading, entry: MapEntry, kind: str, z: float) -> RowUpdate:
+        engine, columns = self.engine, entry.columns
+        prior = engine.mean[columns]
+        h, residual, r, own = self._linearised(reading, entry, kind, z, prior.tolist())
         if self._iterations > 1:
             P = engine.covariance[np.ix_(columns, columns)]
             for _ in range(self._iterations - 1):
                 Ph = P.dot(h)
                 x = prior + Ph * (residual / (float(h.dot(Ph)) + r))
-                h, residual, r, own = self._linearised(one, x.tolist())
+                h, residual, r, own = self._linearised(reading, entry, kind, z, x.tolist())
                 residual += float(h.dot(x - prior))
         found = engine.update_row(columns, h, residual, r, self._gate, self._knee)
         if found.accepted and self._learns:
-            level.learn(found.nis, own / found.spread)
-            self.levels["motion"].learn(found.nis, self._fresh.seen(*h[:POSE].tolist()) / found.spread)
+            self.levels[kind].learn(found.nis, own / found.spread)
+            self.levels["motion"].learn(found.nis, self._fresh.seen(h.item(0), h.item(1), h.item(2)) / found.spread)
         return found
 
-    def _linearised(self, one: _Scalar, x: list[float]) -> tuple[FloatArray, float, float, float]:
+    def _linearised(
+        self, reading: Reading, entry: MapEntry, kind: str, z: float, x: list[float]
+    ) -> tuple[FloatArray, float, float, float]:
         """Derivatives by the columns of a beacon, residual, noise variance, and that with the wandering error."""
         is_delayed, shown = self._delay >= 0, self._shown
-        reading, entry, wander, kind, z = one
         at = self._clock.at(x, reading.time_s, x[shown - 1] if is_delayed else 0.0)
         calibration, beacon = x[POSE : POSE + self._ranges], x[shown : shown + entry.size]
         row = self._models.by_kind[kind].row(at.pose, calibration, beacon, reading.beacon)
@@ -345,7 +336,7 @@ class BeaconSlam:
         expected = row.expected
         r = own = row.variance * self.levels[kind].factor
         if entry.wander >= 0:
-            share = 0.0 if wander is None or kind == "bearing" else wander.share
+            share = 0.0 if self._wander is None or kind == "bearing" else self._wander.share
             by_wander = sqrt(share * r)
             h.append(by_wander)
             expected += by_wander * x[-1]

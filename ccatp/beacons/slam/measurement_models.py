@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from types import ModuleType
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from ccatp.beacons.slam.level_fix import grid_points
@@ -46,7 +47,7 @@ def range_variance(radio: RadioNoiseConfig, range_m: Any) -> Any:
     return radio.range_sigma_m**2 + radio.range_sigma_per_m**2 * range_m * range_m
 
 
-class MeasurementRow(NamedTuple):
+class MeasurementRow(msgspec.Struct, gc=False):
     """One scalar of a reading."""
 
     expected: float  # h(x), in the reading's unit
@@ -206,5 +207,8 @@ def is_direction(reading: Reading) -> bool:
 def scalars_of(reading: Reading) -> list[tuple[str, float]]:
     """The numbers of a reading, each with its kind: the bearing, then the range or the signal strength."""
     found = [] if reading.bearing_rad is None else [("bearing", reading.bearing_rad)]
-    others = ("range", reading.range_m), ("rssi", reading.rssi_dbm)
-    return found + [(kind, value) for kind, value in others if not math.isnan(value)]
+    if not math.isnan(reading.range_m):
+        found.append(("range", reading.range_m))
+    if not math.isnan(reading.rssi_dbm):
+        found.append(("rssi", reading.rssi_dbm))
+    return found

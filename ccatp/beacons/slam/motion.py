@@ -2,9 +2,10 @@
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from math import cos, hypot, nan, sin
+from math import copysign, cos, hypot, nan, sin
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from ccatp.config.beacon_models import (
@@ -262,7 +263,7 @@ class SlippingVehicle:
 SLIVER = 0.2  # part of an interval that is not worth a step of its own: the pose is carried over it
 
 
-class CarriedOdometry(NamedTuple):
+class CarriedOdometry(msgspec.Struct, frozen=True, gc=False):
     """The pose at a reading's time: pose(t) = pose - back_s (vx, vy, turn)."""
 
     pose: list[float]
@@ -326,9 +327,9 @@ class DeadReckoning:
 
     def at(self, pose: list[float], time_s: float, delay_s: float) -> CarriedOdometry:
         """The pose, the first of some states, at a reading's time, carried no further than an interval."""
-        limit_s = self._interval_s
         back_s = self._until_s + delay_s - time_s
-        back_s = max(-limit_s, min(limit_s, back_s)) if limit_s > 0.0 else 0.0
+        if not abs(back_s) <= self._interval_s:  # not a number: there was no odometry yet
+            back_s = copysign(self._interval_s, back_s)
         if back_s == 0.0 and not self._is_delayed:
             return CarriedOdometry(pose[:POSE], (0.0, 0.0, 0.0), 0.0)  # its speed does not matter
         ahead, side, turn = self._rates
@@ -339,4 +340,4 @@ class DeadReckoning:
 
 
 def _part(step: Increment, part: float, end_s: float) -> Increment:
-    return Increment(end_s, part * step.interval_s, *(part * amount for amount in step[2:]))
+    return Increment(end_s, *[part * amount for amount in step[1:]])
