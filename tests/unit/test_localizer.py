@@ -1,11 +1,12 @@
 """Pure but for reading the shipped configuration. The four-state localizer against the robot of ``drive``."""
 
+from dataclasses import replace
 from math import atan, cos, hypot, inf, nan, pi, sin
 
 import numpy as np
 import pytest
 
-from ccatp.core import EdgeSample, Fix, ImuSample, PanelId, PanelPose, WheelSample
+from ccatp.core import EdgeSample, ImuSample, PanelId, PanelPose, WheelSample
 from ccatp.estimation.localizer_base import FilterWrap, unwrapped
 from ccatp.estimation.odometry import Odometer, OdometryPose, arc_step
 from ccatp.estimation.seams import HeadingFix, HeadingGate, heading_from_pair
@@ -343,7 +344,7 @@ def test_a_jump_of_the_clock_does_not_move_the_pose(shift: float) -> None:
     assert localizer.innovation.size == 22  # the samples of the new time base count
     assert localizer.position_sigma_m > 0.05 * 0.1  # what may have happened meanwhile
     fix = world.fix()
-    assert localizer.fuse_fix(Fix(fix.t_s + shift, *(getattr(fix, f) for f in list(Fix.__slots__)[1:]))) < 0.002
+    assert localizer.fuse_fix(replace(fix, t_s=fix.t_s + shift)) < 0.002
 
 
 @pytest.mark.fault("S11")

@@ -11,12 +11,10 @@ from ccatp.core import DeckPose, FloatArray, GravitySample, PanelPose, WheelSamp
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.estimation.full_state import FullStateLocalizer
 from ccatp.estimation.localizer_base import MAX_FRAME_STEP_S
-from ccatp.estimation.state_model import BG, CALIBRATION, PSI, SL, SR, STATES, TX, A, V, W, X, Y
-from ccatp.filters import FILTERS
+from ccatp.estimation.state_model import BG, CALIBRATION, PSI, SL, SR, TX, A, V, W, X, Y
 from tests.unit.estimation.drive import (
     STEEP,
     Errors,
-    Fragile,
     Frame,
     Robot,
     build,
@@ -243,11 +241,6 @@ def test_only_three_in_a_row_that_agree_are_right(offs: list[tuple[float, float]
 # -- divergence -------------------------------------------------------------------------------------------------------
 
 
-def fragile() -> tuple[FullStateLocalizer, Fragile]:
-    filter_ = Fragile(FILTERS["ekf"](np.zeros(STATES), np.eye(STATES)))
-    return build(wrap=lambda _: filter_), filter_
-
-
 def test_a_speed_that_no_wheel_can_give_is_a_divergence() -> None:
     found, robot = build(), Robot(v=STRAIGHT, errors=NOISY)
     run(found, robot.frames(1.2))
@@ -262,12 +255,6 @@ def test_a_speed_that_no_wheel_can_give_is_a_divergence() -> None:
 # -- time stamps ------------------------------------------------------------------------------------------------------
 
 
-def driven(found: FullStateLocalizer) -> Robot:
-    robot = Robot(v=trapeze(0.5, 9.0, 0.1, 0.2), errors=NOISY)
-    run(found, robot.frames(1.81))
-    return robot
-
-
 def at_constant_speed(before: DeckPose, after: DeckPose, way_m: float) -> bool:
     """Within a millimetre; the slip that is not known makes 2 % of the way."""
     hx, hy, _, _ = mirror().body_axes(before)
@@ -276,8 +263,8 @@ def at_constant_speed(before: DeckPose, after: DeckPose, way_m: float) -> bool:
 
 @pytest.mark.parametrize("jump_s", [-1.0, 1e4])
 def test_when_the_clock_jumps_the_pose_does_not_step(jump_s: float) -> None:
-    found = build()
-    robot = driven(found)
+    found, robot = build(), Robot(v=trapeze(0.5, 9.0, 0.1, 0.2), errors=NOISY)
+    run(found, robot.frames(1.81))
     before, variance, t_s = found.deck_pose, float(found.state[1][X, X]), found.t_s
     found.step(*shifted(robot.frame(), jump_s))
     assert (found.deck_pose, found.t_s) == (before, t_s)  # a frame from elsewhere changes nothing

@@ -1,5 +1,6 @@
 """Pure. A measurement that comes late is taken at its own time, and what followed is done again."""
 
+from dataclasses import replace
 from functools import cache, partial
 from math import cos
 
@@ -13,11 +14,12 @@ from ccatp.estimation.localizer_base import unwrapped
 from ccatp.estimation.odometry import Terrain
 from ccatp.estimation.state_filter import ReplayBuffer
 from ccatp.estimation.state_model import STATES, V, W, X, Y
+from ccatp.filters import FILTERS
 from ccatp.filters.kalman import KalmanFilter
 from tests.unit.estimation.drive import (
     FRAME_S,
     STEEP,
-    Errors,
+    Fragile,
     Frame,
     Rate,
     Robot,
@@ -29,8 +31,7 @@ from tests.unit.estimation.drive import (
     shifted,
     trapeze,
 )
-from tests.unit.estimation.test_full_state import NOISY, fragile
-from tests.unit.estimation.test_full_state import STRAIGHT as RecoveriesSTRAIGHT
+from tests.unit.estimation.test_full_state import NOISY, STRAIGHT
 from tests.unit.estimation.test_seams import across_it, before_a_seam
 
 F, Q = np.array([[1.0, 0.1], [0.0, 1.0]]), np.diag([1e-3, 2e-3])
@@ -93,14 +94,11 @@ def test_the_row_of_a_late_fix_is_its_derivative(late_s: float) -> None:
 
 # -- in the localizer -------------------------------------------------------------------------------------------------
 
-WRONG = Errors(right_slip=0.02, left_slip=0.01, creep=0.02, gyro_bias=0.01, noise=1.0)
-
 
 def twice(*rates: Rate) -> Rate:
     return lambda t: sum(rate(t) for rate in rates)
 
 
-STRAIGHT = trapeze(0.5, 1.5, 0.1, 0.2)
 CORNER = trapeze(2.05, 1.3, 0.8, 2.0)
 DRIVES = {
     "straight on": (trapeze(0.5, 9.0, 0.1, 0.2), lambda _: 0.0, 3.0),
@@ -113,7 +111,7 @@ DRIVES = {
 def driven(name: str) -> tuple[list[Frame], list[Fix]]:
     """The frames of a drive, and a fix at the end of each."""
     v, omega, duration_s = DRIVES[name]
-    robot, frames, fixes = Robot(v=v, omega=omega, errors=WRONG), [], []
+    robot, frames, fixes = Robot(v=v, omega=omega, errors=NOISY), [], []
     for _ in range(round(duration_s / FRAME_S)):
         frames.append(robot.frame())
         fixes.append(robot.fix())
@@ -237,14 +235,15 @@ def test_a_standstill_however_long_does_not_grow_and_takes_a_measurement_of_its_
         same(recorded, today)
 
 
-def at(fix: Fix, t_s: float) -> Fix:
-    return Fix(t_s, fix.position_m, fix.covariance_m2, fix.dop, fix.channels, fix.residual_rms_m)
+def fragile() -> tuple[FullStateLocalizer, Fragile]:
+    filter_ = Fragile(FILTERS["ekf"](np.zeros(STATES), np.eye(STATES)))
+    return build(wrap=lambda _: filter_), filter_
 
 
 def test_a_revived_filter_stays_alive() -> None:
     """The wheels went on while the filter stood; that way is not taken for one of the first block."""
     found, filter_ = fragile()
-    robot = Robot(v=RecoveriesSTRAIGHT, errors=NOISY)
+    robot = Robot(v=STRAIGHT, errors=NOISY)
     run(found, robot.frames(1.0))
     filter_.is_broken = True
     run(found, robot.frames(1.5))
@@ -260,7 +259,7 @@ def test_a_revived_filter_stays_alive() -> None:
 
 def test_a_filter_that_diverges_at_a_fix_begins_anew_with_it() -> None:
     found, filter_ = fragile()
-    robot = Robot(v=RecoveriesSTRAIGHT, errors=NOISY)
+    robot = Robot(v=STRAIGHT, errors=NOISY)
     run(found, robot.frames(1.03))
     filter_.is_broken = True
     found.fuse_fix(robot.fix())
@@ -279,7 +278,7 @@ def test_after_a_reboot_fixes_are_taken(before_s: float) -> None:
     base_s = robot.t_s
     for frame in robot.frames(0.5):
         found.step(*shifted(frame, -base_s))
-    found.fuse_fix(at(robot.fix(), robot.t_s - base_s))
+    found.fuse_fix(replace(robot.fix(), t_s=robot.t_s - base_s))
     assert errors_of(found, robot.pose)[0] < 3e-5
 
 
