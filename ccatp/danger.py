@@ -75,7 +75,7 @@ class DangerMonitor(EmergencyRules):
         """The event code now."""
         if self._edges.is_lifted or self._origin.direction or self._declared() is not None:
             return EventCode.NEAR_EDGE
-        return EventCode.ABORTED if self.latch.is_latched else EventCode.NORMAL
+        return super().code
 
     @property
     def counts(self) -> dict[str, dict[Corner, int]]:

@@ -12,9 +12,10 @@ import zmq.asyncio
 
 from ccatp.config.models import ObservatoryConfig
 from ccatp.links.auth import AuthorizedClient, ClientsFile, KeyPair, read_clients, read_pair
-from ccatp.links.channels import answer_observatory, format_error, parse_reply
+from ccatp.links.channels import format_error, parse_reply
 from ccatp.links.liveness import LogRateLimit
 from ccatp.links.rpc import Router, ZapHandler
+from ccatp.safety.emergency_latch import answer_observatory
 
 if TYPE_CHECKING:
     from ccatp.danger import DangerMonitor

@@ -6,12 +6,12 @@ request that is not of the form gets ``{"ok": false, "error": why}`` and changes
 
 import json
 from enum import StrEnum
-from typing import Annotated, Any, NoReturn, Protocol
+from typing import Annotated, Any, NoReturn
 from uuid import UUID
 
 import msgspec
 
-from ccatp.core import EmergencyKind, EventCode
+from ccatp.core import EmergencyKind
 
 MAX_REQUEST_BYTES = 4096
 MAX_NOTE_CHARACTERS = 2000
@@ -30,7 +30,7 @@ class EmergencyRequest(msgspec.Struct, frozen=True, tag_field="cmd", tag="emerge
     note: Annotated[str, msgspec.Meta(max_length=MAX_NOTE_CHARACTERS)] = ""
 
     def __post_init__(self) -> None:
-        _uuid_of(self.id)
+        uuid_of(self.id)
 
 
 class ClearRequest(msgspec.Struct, frozen=True, tag_field="cmd", tag="clear"):
@@ -39,7 +39,7 @@ class ClearRequest(msgspec.Struct, frozen=True, tag_field="cmd", tag="clear"):
     id: str
 
     def __post_init__(self) -> None:
-        _uuid_of(self.id)
+        uuid_of(self.id)
 
 
 class PingRequest(msgspec.Struct, frozen=True, tag_field="cmd", tag="ping"):
@@ -117,49 +117,7 @@ def parse_reply(frame: bytes) -> dict[str, Any]:
     return reply
 
 
-class EmergencyHandler(Protocol):
-    """What answers the observatory; ``ccatp.danger.DangerMonitor`` is one."""
-
-    @property
-    def code(self) -> EventCode:
-        """The event code now."""
-
-    def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
-        """Latch; returns why it was refused, or None."""
-
-    def holds(self, emergency_id: str) -> bool:
-        """Whether the emergency with that id is latched."""
-
-    def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
-        """Clear; returns why it was refused, or None."""
-
-
-def answer_observatory(
-    frame: bytes, handler: EmergencyHandler, *, at_base_or_held: bool, age_s: float | None, may_clear: bool = True
-) -> bytes:
-    """The reply to one request of the observatory channel; ``age_s`` of the last verdict, ``None`` before the first."""
-    try:
-        request = parse_observatory(frame)
-    except BadRequest as error:
-        return format_error(str(error))
-    if isinstance(request, PingRequest):
-        return format_ok(code=int(handler.code), age_s=age_s)
-    key = _uuid_of(request.id)
-    if isinstance(request, EmergencyRequest):
-        refusal = handler.emergency(request.kind.value, key, request.note)
-        # An edge may hide the abort's code until the robot is off it; the answer is about the latch. What was cleared
-        # before is not latched again: whoever means another emergency has to know.
-        is_held = handler.holds(key)
-        accepted = format_ok(id=request.id, latched=is_held, code=int(EventCode.ABORTED if is_held else handler.code))
-    elif not may_clear:
-        refusal, accepted = "this client may raise emergencies, not clear them", b""
-    else:
-        refusal = handler.clear(key, at_base_or_held)
-        accepted = format_ok(id=request.id, code=int(handler.code))
-    return accepted if refusal is None else format_error(refusal, id=request.id)
-
-
-def _uuid_of(text: str) -> str:
+def uuid_of(text: str) -> str:
     """The one form of an id that may be written in many; the id itself is answered as it was sent."""
     return str(UUID(text))
 

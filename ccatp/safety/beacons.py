@@ -86,6 +86,8 @@ _NORMAL, _NEAR, _ABORTED = EventCode
 class BeaconSafetyRules(EmergencyRules):
     """Judges frames. Call ``step`` once per frame, ``stale`` when no frame came in time."""
 
+    code: EventCode = _NORMAL
+
     def __init__(self, cfg: RadioConfig) -> None:
         self._danger, self._follow, self._loss = cfg.danger, cfg.follow, cfg.path_loss
         self._avoidance, self._vehicle, self._radius_m = cfg.avoidance, cfg.vehicle, cfg.robot.wheel_radius_m

@@ -1,4 +1,4 @@
-"""Emergencies of the observatory: latched, one entry per id, each with its clear condition."""
+"""Emergencies of the observatory: latched, one entry per id, each with its clear condition; answers to requests."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,6 +7,15 @@ import msgspec
 
 from ccatp.conditions import EMERGENCY, MonitorFinding
 from ccatp.core import EmergencyKind, EventCode, Verdict
+from ccatp.links.channels import (
+    BadRequest,
+    EmergencyRequest,
+    PingRequest,
+    format_error,
+    format_ok,
+    parse_observatory,
+    uuid_of,
+)
 
 # An observatory has a handful at a time; a peer that floods the latch must not fill the memory.
 MAX_ACTIVE = 256
@@ -144,6 +153,11 @@ class EmergencyRules:
         self._raised_seq = -INFORMED_AFTER_FRAMES - 1  # the frame in which the newest emergency was raised
 
     @property
+    def code(self) -> EventCode:
+        """The event code now, of emergencies alone."""
+        return EventCode.ABORTED if self.latch.is_latched else EventCode.NORMAL
+
+    @property
     def at_base_or_held(self) -> bool:
         """Whether main's newest estimate says so, and takes the newest emergency into account."""
         return self._state_seq > self._raised_seq + INFORMED_AFTER_FRAMES and self._state in AT_BASE_OR_HELD
@@ -160,6 +174,27 @@ class EmergencyRules:
         """End an emergency; returns why it was refused, or None."""
         return self.latch.clear(emergency_id, at_base_or_held)
 
-    def holds(self, emergency_id: str) -> bool:
-        """Whether the emergency with that id is active."""
-        return self.latch.holds(emergency_id)
+
+def answer_observatory(
+    frame: bytes, handler: EmergencyRules, *, at_base_or_held: bool, age_s: float | None, may_clear: bool = True
+) -> bytes:
+    """The reply to one request of the observatory channel; ``age_s`` of the last verdict, ``None`` before the first."""
+    try:
+        request = parse_observatory(frame)
+    except BadRequest as error:
+        return format_error(str(error))
+    if isinstance(request, PingRequest):
+        return format_ok(code=int(handler.code), age_s=age_s)
+    key = uuid_of(request.id)
+    if isinstance(request, EmergencyRequest):
+        refusal = handler.emergency(request.kind.value, key, request.note)
+        # An edge may hide the abort's code until the robot is off it; the answer is about the latch. What was cleared
+        # before is not latched again: whoever means another emergency has to know.
+        is_held = handler.latch.holds(key)
+        accepted = format_ok(id=request.id, latched=is_held, code=int(EventCode.ABORTED if is_held else handler.code))
+    elif not may_clear:
+        refusal, accepted = "this client may raise emergencies, not clear them", b""
+    else:
+        refusal = handler.clear(key, at_base_or_held)
+        accepted = format_ok(id=request.id, code=int(handler.code))
+    return accepted if refusal is None else format_error(refusal, id=request.id)

@@ -11,7 +11,7 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from ccatp.core import EmergencyKind, EventCode
+from ccatp.core import EmergencyKind
 from ccatp.links.auth import KeyPair
 from ccatp.links.channels import (
     MAX_REQUEST_BYTES,
@@ -20,7 +20,6 @@ from ccatp.links.channels import (
     EmergencyRequest,
     OperatorCommand,
     PingRequest,
-    answer_observatory,
     format_error,
     format_ok,
     format_request,
@@ -41,31 +40,17 @@ from ccatp.links.rpc import (
     request,
     split_envelope,
 )
-from ccatp.safety.emergency_latch import EmergencyLatch
+from ccatp.safety.emergency_latch import EmergencyRules, answer_observatory
 
 ID = "3b241101-e2bb-4255-8caf-4136c566a962"
 DEADLINE_S = 5.0  # only a broken test waits so long
 
 
-class Desk:
-    """A latch with the code that the danger monitor would show, and a robot that is held."""
+class Desk(EmergencyRules):
+    """Rules that know of emergencies alone, of a robot that is held."""
 
-    def __init__(self) -> None:
-        self.latch = EmergencyLatch()
-        self.at_base_or_held = True
-
-    @property
-    def code(self) -> EventCode:
-        return EventCode.ABORTED if self.latch.is_latched else EventCode.NORMAL
-
-    def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
-        return self.latch.raise_emergency(kind, emergency_id, note)
-
-    def holds(self, emergency_id: str) -> bool:
-        return self.latch.holds(emergency_id)
-
-    def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
-        return self.latch.clear(emergency_id, at_base_or_held)
+    at_base_or_held = True
+    _frame_seq = -1
 
 
 def ask(desk: Desk, text: str | bytes, *, at_base_or_held: bool = False) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from ccatp.links.auth import read_clients
 from ccatp.links.bus import BadMessage, unpack
 from ccatp.links.robot_codec import LineBuffer, LineTooLong
 from ccatp.links.robot_messages import Sensors
+from ccatp.safety.emergency_latch import answer_observatory
 from ccatp.sim.fault_plan import parse_plan
 from tests.contract.test_channels import ID, Desk
 from tests.contract.test_multiline import REPLIES
@@ -170,7 +171,7 @@ def _observatory() -> list[bytes]:
 
 def _emergency(frame: bytes) -> Hashable:
     # Whatever comes is answered, with an answer that can be read.
-    answer = channels.answer_observatory(frame, Desk(), at_base_or_held=True, age_s=0.1)
+    answer = answer_observatory(frame, Desk(), at_base_or_held=True, age_s=0.1)
     assert channels.parse_reply(answer)["ok"] in (True, False)
     return type(channels.parse_observatory(frame)).__name__
 
