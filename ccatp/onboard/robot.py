@@ -12,13 +12,12 @@ demands of the robot is in ``ccatp.onboard.rules``; besides, the wheels are held
 Nothing else changes the fans.
 """
 
-from math import pi
+from math import inf, pi
 from typing import Any, TypeVar
 
-from ccatp.config.onboard_models import OnboardConfig
+from ccatp.config.onboard_models import EdgeThresholdConfig, OnboardConfig
 from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_messages import CommandEcho, RobotData
-from ccatp.onboard.edge_threshold import EdgeThreshold
 from ccatp.onboard.hardware import Hardware, HardwareError
 from ccatp.onboard.rules import HELD, LinkedRobot, SlideMonitor
 from ccatp.onboard.wheel_servo import WheelServo
@@ -31,6 +30,37 @@ _LINE_SAMPLES = 24  # of one sensor in a line: a burst after a gap must not exce
 
 WheelRates = tuple[float, float | None, float | None]
 Row = TypeVar("Row", bound=tuple[Any, ...])
+
+
+class EdgeThreshold:
+    """From the voltage of one analogue edge sensor to a bit: threshold, hysteresis, debouncing.
+
+    A sensor that changes to *no panel* counts from the first sample: a late report of the rim costs way. The change
+    back must last for ``debounce_s``. Before the first sample, which decides at once, there is no panel.
+    """
+
+    def __init__(self, cfg: EdgeThresholdConfig) -> None:
+        sign = 1.0 if cfg.is_panel_above else -1.0
+        self._sign, self._debounce_s = sign, cfg.debounce_s
+        half_v = 0.5 * cfg.hysteresis_v
+        self._on_v, self._off_v = sign * cfg.threshold_v + half_v, sign * cfg.threshold_v - half_v
+        self._is_on = False
+        # A sensor that is first read above has been there for ever.
+        self._above_since_s: float | None = -inf
+
+    def read(self, t_s: float, voltage_v: float) -> int:
+        """1 = panel under the sensor, 0 = none; what is not a number is no panel."""
+        level_v = self._sign * voltage_v
+        if self._is_on:
+            self._is_on = level_v >= self._off_v
+            self._above_since_s = None
+        elif level_v >= self._on_v:
+            if self._above_since_s is None:
+                self._above_since_s = t_s
+            self._is_on = t_s - self._above_since_s >= self._debounce_s
+        else:
+            self._above_since_s = None
+        return int(self._is_on)
 
 
 class OnboardRobot(LinkedRobot):
@@ -72,7 +102,6 @@ class OnboardRobot(LinkedRobot):
         self.fans.duty = self._duty_in_force = hardware.fans()
 
     def describe(self) -> RobotData:
-        """See ``LinkedRobot``."""
         robot = self._cfg.robot
         return RobotData(
             robot.wheel_radius_m, robot.wheel_base_m, robot.edge_sensors_m, robot.puck_m, robot.max_wheel_rad_s,
@@ -209,5 +238,4 @@ class OnboardRobot(LinkedRobot):
 
     @property
     def delivered_line(self) -> bytes:
-        """See ``LinkedRobot``."""
         return self._line

@@ -118,14 +118,12 @@ class SimulatedHardware:
         return World(cfg, self._mirror, rng, window, start=start)
 
     def start(self) -> None:
-        """See ``Hardware``."""
+        pass
 
     def close(self) -> None:
-        """See ``Hardware``."""
         self.brake()
 
     def read(self, now_s: float) -> Readings:
-        """See ``Hardware``."""
         imu: list[tuple[float, float, float, float]] = []
         edges: list[EdgeTuple] = []
         counts: list[tuple[float, int | None, int | None]] = []
@@ -152,20 +150,16 @@ class SimulatedHardware:
         self.world.step(t_s, dt_s, right, left, 0.5 * (self._duty[0] + self._duty[1]))
 
     def drive(self, right_v: float, left_v: float) -> None:
-        """See ``Hardware``."""
         self.voltages_v = (right_v, left_v)
         self.timer_calls += 1
 
     def brake(self) -> None:
-        """See ``Hardware``."""
         self.drive(0.0, 0.0)
 
     def fans(self) -> tuple[float, float]:
-        """See ``Hardware``."""
         return self._duty
 
     def command_fans(self, left: float, right: float) -> None:
-        """See ``Hardware``."""
         self._duty = (left, right)
 
 

@@ -19,9 +19,8 @@ from ccatp.errors import ConfigError
 from ccatp.links.robot_codec import MAX_LINE_BYTES, decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import build_mirror
-from ccatp.onboard.edge_threshold import EdgeThreshold
 from ccatp.onboard.hardware import HardwareError, Readings
-from ccatp.onboard.robot import OnboardRobot
+from ccatp.onboard.robot import EdgeThreshold, OnboardRobot
 from ccatp.sim.hardware import MOTOR_12V, SimulatedHardware
 
 CFG = load_onboard_config(overrides={"link.sample_latency_s": 0.0})
