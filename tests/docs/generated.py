@@ -26,30 +26,27 @@ DOCS = ROOT / "docs"
 MARKED = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- made -->)", re.DOTALL)
 ABOUT = {
     Group.EDGES: (
-        "The robot stops, backs off along the way it came, has itself measured, and goes on: no operator is "
-        "needed unless it comes again at the same place. Code 1."
+        "The robot stops, backs off along its path, takes a fix, and continues. No operator is "
+        "needed unless the edge occurs again at the same place. Code 1."
     ),
     Group.DATA: (
-        "Nothing moves on data older than 0.15 s. The wheels are held; the survey goes on by itself as soon "
-        "as data are fresh. What lasts for more than `health.pause_limit_s` is followed by a fix, for more "
-        "than `health.hold_limit_s` it is a fault."
+        "Nothing moves on data older than 0.15 s. The wheels are held, and the survey continues as soon "
+        "as the data are fresh. If the condition lasts longer than `health.pause_limit_s`, a fix follows; if it lasts "
+        "longer than `health.hold_limit_s`, it is a fault."
     ),
-    Group.SENSORS: (
-        "A sensor that is not to be believed is left out where the others suffice, and holds the robot where "
-        "they do not."
-    ),
+    Group.SENSORS: ("A faulty sensor is not used if the other sensors are sufficient. Otherwise the robot is held."),
     Group.WHEELS: (
-        "The wheels are held. What passes by itself is followed by a fix; what comes back more than "
+        "The wheels are held. A fix follows a temporary condition. A condition that recurs more than "
         "`health.retries` times is a fault."
     ),
     Group.FANS: (
-        "On an overhanging mirror the fans carry the robot: these lead home or hold, with all that the fans "
-        "can give. Elsewhere they are only reported."
+        "On an overhanging mirror the fans carry the robot: these conditions send it home or hold it, with the fans "
+        "at full duty. On other mirrors they are only reported."
     ),
-    Group.SURVEY: "Held until an operator decides: resume, abort, or stop.",
+    Group.SURVEY: "The robot is held until an operator decides: resume, abort, or stop.",
     Group.BEACONS: "Missions of robots among radio beacons (`system` in the configuration).",
-    Group.STORAGE: "A fix counts once it is on the disk; the survey does not go on without.",
-    Group.OBSERVATORY: "Code 2, latched: it stays until it is cleared by its id (`ccatp clear ID`), across restarts.",
+    Group.STORAGE: "A fix counts once it is on the disk; the survey does not continue without it.",
+    Group.OBSERVATORY: "Code 2, latched until it is cleared by its id (`ccatp clear ID`), across restarts.",
 }
 
 
@@ -61,7 +58,7 @@ def table(head: str, rows: Iterable[Iterable[object]]) -> str:
 
 def alarms() -> str:
     """Every condition: what happens, and what to do."""
-    what = "| it says | what happens | it may still move | ends | limit | what it means | what to do |"
+    what = "| message | reaction | permitted motion | ends | limit | meaning | what to do |"
     parts = []
     for group in Group:
         rows = [_alarm(row) for row in (*DANGER, *SURVEY) if row.group is group]
@@ -89,14 +86,14 @@ def _alarm(row: Condition) -> tuple[str, ...]:
 
 
 def reactions() -> str:
-    """What missions do about verdicts, in the order of precedence."""
+    """Reactions of missions to verdicts, in the order of precedence."""
     rows = [(str(k), row.when, row.action.value, "yes" if row in RULES.rows else "") for k, row in enumerate(ROWS, 1)]
     rows += [("", row.when, row.action.value, "yes") for row in RULES.rows if row not in ROWS]
     return table("| | when | what happens | also among beacons |", rows)
 
 
 def severities() -> str:
-    """The severities, least first."""
+    """The severities, lowest first."""
     rows = [(int(one), f"`{one.name.lower()}`", Action[one.name].value if one else "nothing") for one in Severity]
     return table("| | severity | what happens |", rows)
 
