@@ -151,7 +151,7 @@ class BeaconMission:
             return HALT
         t_s, avoidance = measurements.t_s, self._cfg.avoidance
         # Sensors without a reading in this frame count as seeing nothing: what they saw before is remembered.
-        distances_m = measurements.distances_m or (avoidance.range_max_m,) * len(avoidance.sensors_rad)
+        distances_m = measurements.extras.distances or [avoidance.range_max_m] * len(avoidance.sensors_rad)
         if self.state.abort_cause:
             return self._return(t_s, interval_s, distances_m)
         pose, target = self.navigator.belief.pose, self.navigator.target(t_s)
@@ -174,7 +174,7 @@ class BeaconMission:
         if len(self.arrivals) >= self.total:
             self._finish(SurveyOutcome.COMPLETE)
 
-    def _return(self, t_s: float, interval_s: float, distances_m: tuple[float, ...]) -> SteeringCommand:
+    def _return(self, t_s: float, interval_s: float, distances_m: list[float]) -> SteeringCommand:
         self._enter(RETURNING)
         if self._homing is None:
             self._homing = BeaconPilot(self._cfg, (self._cfg.start.x_m, self._cfg.start.y_m))

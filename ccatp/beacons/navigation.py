@@ -1,6 +1,6 @@
 """Where a robot among beacons is: radios mapped on the way, or ultrasonic motes that map themselves first."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import hypot
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from ccatp.beacons.slam.signal_slam import ReflectorScan, SignalSlam
 from ccatp.config.beacon_models import CricketConfig, RadioConfig
 from ccatp.core import FloatArray, WheelSample
 from ccatp.filters.ekf_slam import EkfSlam, columns_of
-from ccatp.links.beacon_messages import BeaconFrame, Ellipse, MoteBurst, worst_sigma_m
+from ccatp.links.beacon_messages import BeaconFrame, Ellipse, MoteBurst, RadioScan, worst_sigma_m
 from ccatp.links.robot_messages import Sensors
 
 
@@ -103,18 +103,17 @@ _EPSILON_S = 1e-9  # an interval shorter than this is none
 
 
 class BeaconMeasurements(NamedTuple):
-    """A frame as a mission takes it.
-
-    ``packets``: answers of radios: name, direction of the reflector left of the heading (rad), level (dBm).
-    ``sightings``: results of scans: radio, level (dBm), bearing left of the heading (rad; None where not known).
-    """
+    """A frame as a mission takes it."""
 
     t_s: float
     wheels: tuple[Odometry, ...]  # odometry since the last frame, without gaps; empty where nothing is known of it
-    packets: tuple[tuple[str, float, float], ...]
-    sightings: tuple[tuple[str, float, float | None], ...]
-    distances_m: tuple[float, ...]
-    motes: tuple[MoteBurst, ...] = ()
+    extras: BeaconFrame
+
+
+def packets_of(scan: RadioScan) -> Iterator[tuple[str, float, float]]:
+    """Answers of radios: name, direction of the reflector left of the heading (rad), level (dBm)."""
+    for beacon, levels in scan.levels.items():
+        yield from ((beacon, k * scan.step, level) for k, level in enumerate(levels) if level is not None)
 
 
 def odometry_of(
@@ -144,17 +143,7 @@ class MeasurementReader:
             self._read_to_s = sensors.t
         steering = {sample.t_s: sample.steer_rad for sample in extras.steer}
         wheels = [self._interval(sample, steering) for sample in sensors.enc]
-        packets: tuple[tuple[str, float, float], ...] = ()
-        if (scan := extras.scan) is not None:
-            packets = tuple(
-                (beacon, index * scan.step, level)
-                for beacon, levels in scan.levels.items()
-                for index, level in enumerate(levels)
-                if level is not None
-            )
-        known = tuple(one for one in wheels if one is not None)
-        sightings = tuple((one.beacon, one.rssi_dbm, one.bearing_rad) for one in extras.radio)
-        return BeaconMeasurements(sensors.t, known, packets, sightings, tuple(extras.distances), tuple(extras.motes))
+        return BeaconMeasurements(sensors.t, tuple(one for one in wheels if one is not None), extras)
 
     def _interval(self, sample: WheelSample, steering: dict[float, float]) -> Odometry | None:
         self._steer_rad = steering.get(sample.t_s, self._steer_rad)
@@ -261,11 +250,10 @@ class RadioNavigator(_DeadReckoning):
         for odometry in measurements.wheels:
             self.slam.predict(odometry)
             self._reckoned = self._motion.step(self._reckoned, odometry).mean
-        t_s = measurements.t_s
-        readings = self._scan.results(t_s, measurements.packets)
+        t_s, extras = measurements.t_s, measurements.extras
+        readings = [] if extras.scan is None else self._scan.results(t_s, packets_of(extras.scan))
         readings += [
-            Reading(t_s, beacon, bearing_rad=bearing_rad, rssi_dbm=level_dbm)
-            for beacon, level_dbm, bearing_rad in measurements.sightings
+            Reading(t_s, one.beacon, bearing_rad=one.bearing_rad, rssi_dbm=one.rssi_dbm) for one in extras.radio
         ]
         for one in self.slam.observe(readings):
             self._count(one.nis, one.size, accepted=one.accepted)
@@ -339,7 +327,7 @@ class MoteNavigator(_DeadReckoning):
             step = self._motion.step(state.mean[: state.vehicle_size], odometry)
             state.predict(step.mean, step.F, step.Q)
             self._reckoned = self._motion.step(self._reckoned, odometry).mean
-        for burst in measurements.motes:
+        for burst in measurements.extras.motes:
             if burst.listener == self._cfg.listener.name:
                 self._range(burst)
             elif self.is_mapping:

@@ -190,7 +190,7 @@ class BeaconRunner(MissionRunner):
         self.publish_state()
 
     def _collect_echoes(self, pose: tuple[float, float, float]) -> None:
-        distances_m = () if self._measurements is None else self._measurements.distances_m
+        distances_m = [] if self._measurements is None else self._measurements.extras.distances
         self._distances = list(distances_m)
         avoidance = self._cfg.avoidance
         if not avoidance.is_active:

@@ -9,19 +9,20 @@ Choices the interface leaves open:
   the wheels.
 """
 
-from math import inf, tau
+from math import inf
 
 import numpy as np
+from msgspec.structs import replace
 
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.links.beacon_messages import BeaconFrame, RadioSample, RadioScan, SteerSample, with_extras
+from ccatp.links.beacon_messages import BeaconFrame, SteerSample, with_extras
 from ccatp.links.robot_codec import RobotFrame, encode
 from ccatp.links.robot_messages import CommandEcho, RobotData, VehicleData
 from ccatp.links.topics import BeaconPlaces, BeaconTruth
 from ccatp.onboard.rules import LinkedRobot
 from ccatp.sim.ground_truth import TruthSource
 from ccatp.sim.motes import MoteListener, TrueMotes, true_motes
-from ccatp.sim.radio import Packet, SimDriveCommand, WorldFrame
+from ccatp.sim.radio import SimDriveCommand, WorldFrame
 from ccatp.sim.radio_world import RadioWorld
 
 _CORNER = (0.0, 0.0)  # a robot without edge sensors has them where it is
@@ -120,26 +121,11 @@ class BeaconRobot(LinkedRobot, TruthSource):
             half_m_s = 0.5 * vehicle.track_m * frame.wheels.turn_rate_rad_s
             speed_m_s = frame.wheels.speed_m_s
             wheels = [(t_s, (speed_m_s + half_m_s) / radius_m, (speed_m_s - half_m_s) / radius_m)]
-            extras = BeaconFrame(
-                steer=[SteerSample(t_s, frame.wheels.steer_rad)] if self.is_steerable else [],
-                radio=[RadioSample(t_s, one.beacon, one.rssi_dbm, one.bearing_rad) for one in frame.sightings],
-                scan=_scan(t_s, frame.packets, self._cfg.scan.readings),
-                distances=list(frame.distances_m),
-                motes=[] if self._listener is None else self._listener.receive(t_s, self.world.pose),
-            )
+            steer = [SteerSample(t_s, frame.wheels.steer_rad)] if self.is_steerable else []
+            motes = [] if self._listener is None else self._listener.receive(t_s, self.world.pose)
+            extras = replace(frame.extras, steer=steer, motes=motes)
         line = RobotFrame(self.seq, t_s, (), wheels, (), None, (0.0, 0.0), 1.0, cmd, ())
         self._line = with_extras(encode(line), extras)
-
-
-def _scan(t_s: float, packets: tuple[Packet, ...], readings: int) -> RadioScan | None:
-    if not packets:
-        return None
-    step_rad = tau / readings
-    levels: dict[str, list[float | None]] = {}
-    for packet in packets:
-        row = levels.setdefault(packet.beacon, [None] * readings)
-        row[round(packet.direction_rad / step_rad) % readings] = packet.rssi_dbm
-    return RadioScan(t_s, step_rad, levels)
 
 
 def build_beacon_robot(cfg: RadioConfig) -> BeaconRobot:

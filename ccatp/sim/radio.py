@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ccatp.config.beacon_models import SimObstacleConfig, SimRadioConfig, SimTargetConfig
 from ccatp.core import bearing, wrap_pi
+from ccatp.links.beacon_messages import BeaconFrame
 
 
 class SimDriveCommand(NamedTuple):
@@ -36,30 +37,12 @@ class WheelReading(NamedTuple):
     turn_rate_rad_s: float
 
 
-class Packet(NamedTuple):
-    """One answer of a radio: which, where the reflector pointed (left of the heading), how strong."""
-
-    beacon: str
-    direction_rad: float
-    rssi_dbm: float
-
-
-class TargetBearing(NamedTuple):
-    """A scan that comes as its result: one signal strength and one bearing, left of the heading."""
-
-    beacon: str
-    rssi_dbm: float
-    bearing_rad: float
-
-
 class WorldFrame(NamedTuple):
-    """All readings of one step."""
+    """All readings of one step; ``extras`` as the link has them, received at its end."""
 
     time_s: float
     wheels: WheelReading
-    packets: tuple[Packet, ...]  # received at its end while the reflector turned once; empty without a scan
-    sightings: tuple[TargetBearing, ...]  # the same of worlds that draw the result of a scan
-    distances_m: tuple[float, ...]  # in the order of the configuration; the range of the sensor without an obstacle
+    extras: BeaconFrame
 
 
 Point = tuple[float, float]
@@ -155,10 +138,10 @@ class TrueRadio:
     """
 
     def __init__(
-        self, name: str, reference_dbm: float, cfg: SimRadioConfig, size_m: Point,
-        obstacles: Sequence[SimObstacleConfig], readings: int, places: np.random.Generator, noise: np.random.Generator,
+        self, reference_dbm: float, cfg: SimRadioConfig, size_m: Point, obstacles: Sequence[SimObstacleConfig],
+        readings: int, places: np.random.Generator, noise: np.random.Generator,
     ) -> None:  # fmt: skip
-        self._name, self._reference_dbm, self._cfg, self._obstacles = name, reference_dbm, cfg, obstacles
+        self._reference_dbm, self._cfg, self._obstacles = reference_dbm, cfg, obstacles
         self._step_rad, self._readings, self._noise = tau / readings, readings, noise
         self._shadowing = ShadowingField(cfg.shadowing_sigma_db, cfg.shadowing_length_m, places)
         self._reflections = [_drawn_reflection(size_m, cfg, places) for _ in range(cfg.multipath_paths)]
@@ -174,26 +157,26 @@ class TrueRadio:
             found.append(Ray(_seen_from(pose, place_m), self._path_dbm(way_m) - loss_db))
         return found
 
-    def sight(self, pose: TruePose, sender_m: Point) -> TargetBearing | None:
-        """The result of a scan, drawn: direction of the strongest ray with noise, to the nearest step; None if lost."""
+    def sight(self, pose: TruePose, sender_m: Point) -> tuple[float, float] | None:
+        """The result of a scan, drawn; None if lost.
+
+        Level, dBm, and direction of the strongest ray with noise, to the nearest step, rad left of the heading.
+        """
         strongest = max(self.rays(pose, sender_m), key=lambda ray: ray.level_dbm)
         level_dbm = self._received(strongest.level_dbm)
         noisy_rad = strongest.direction_rad + self._cfg.bearing_sigma_rad * self._noise.standard_normal()
         if level_dbm is None:
             return None
-        return TargetBearing(self._name, level_dbm, wrap_pi(round(noisy_rad / self._step_rad) * self._step_rad))
+        return level_dbm, wrap_pi(round(noisy_rad / self._step_rad) * self._step_rad)
 
-    def scan(self, pose: TruePose, sender_m: Point) -> list[Packet]:
-        """The packets of one turn of the reflector, in the order of its steps; lost ones are missing."""
-        rays = self.rays(pose, sender_m)
-        packets = []
+    def scan(self, pose: TruePose, sender_m: Point) -> list[float | None]:
+        """Levels of one turn of the reflector, dBm, in the order of its steps; None for lost packets."""
+        rays, levels_dbm = self.rays(pose, sender_m), list[float | None]()
         for index in range(self._readings):
             direction_rad = wrap_pi(index * self._step_rad)
             milliwatt = sum(10.0 ** (0.1 * (ray.level_dbm + self._gain_db(ray, direction_rad))) for ray in rays)
-            level_dbm = self._received(10.0 * log10(milliwatt))
-            if level_dbm is not None:
-                packets.append(Packet(self._name, direction_rad, level_dbm))
-        return packets
+            levels_dbm.append(self._received(10.0 * log10(milliwatt)))
+        return levels_dbm
 
     def _path_dbm(self, distance_m: float) -> float:
         return self._reference_dbm - 10.0 * self._cfg.exponent * log10(distance_m)

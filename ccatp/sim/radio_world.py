@@ -3,7 +3,7 @@
 The vehicle has Ackermann or differential drive, wheels that slip, a heading that drifts, and noisy odometry.
 """
 
-from math import cos, sin
+from math import cos, sin, tau
 from typing import TypeVar
 
 import numpy as np
@@ -17,11 +17,10 @@ from ccatp.config.beacon_models import (
     TargetApproachConfig,
     VehicleConfig,
 )
+from ccatp.links.beacon_messages import BeaconFrame, RadioSample, RadioScan
 from ccatp.sim.radio import (
     MovingTarget,
-    Packet,
     SimDriveCommand,
-    TargetBearing,
     TruePose,
     TrueRadio,
     WheelReading,
@@ -103,7 +102,7 @@ class RadioWorld:
             references[cfg.follow.target] = cfg.sim.target.reference_dbm
         self._radios = {
             name: TrueRadio(
-                name, reference_dbm, cfg.sim.radio, cfg.workspace.size_m, self.obstacles, cfg.scan.readings,
+                reference_dbm, cfg.sim.radio, cfg.workspace.size_m, self.obstacles, cfg.scan.readings,
                 _stream(seed, _PLACES, index), _stream(seed, _NOISE, index),
             )
             for index, (name, reference_dbm) in enumerate(references.items())
@@ -141,16 +140,17 @@ class RadioWorld:
             self._target.approach(self.pose[:2], approaches[0].speed_m_s * interval_s)
         else:
             self._target.step(interval_s)
-        self.time_s += interval_s
-        packets, sightings = self._receive(static=static, target=target)
-        return WorldFrame(self.time_s, wheels, packets, sightings, self._distances_m())
+        self.time_s = round(self.time_s + interval_s, 9)
+        radio, scan = self._receive(static=static, target=target)
+        return WorldFrame(self.time_s, wheels, BeaconFrame(radio=radio, scan=scan, distances=self._distances_m()))
 
     def _lasting(self, kind: type[_Incident]) -> list[_Incident]:
         """The incidents of a kind that last now."""
         incidents = [one for one in self._cfg.sim.incidents if isinstance(one, kind)]
         return [one for one in incidents if one.at_s <= self.time_s < one.at_s + one.for_s]
 
-    def _receive(self, *, static: bool, target: bool) -> tuple[tuple[Packet, ...], tuple[TargetBearing, ...]]:
+    def _receive(self, *, static: bool, target: bool) -> tuple[list[RadioSample], RadioScan | None]:
+        """Drawn results of scans, or the levels of one turn of the reflector."""
         places = dict(self.beacons_m) if static else {}
         if target and self.target_m is not None:
             places[self._cfg.follow.target] = self.target_m
@@ -159,19 +159,20 @@ class RadioWorld:
             if any(not one.beacons or name in one.beacons for one in losses):
                 del places[name]
         if self._cfg.sim.radio.scan == "drawn":
-            found = (self._radios[name].sight(self.pose, place_m) for name, place_m in places.items())
-            return (), tuple(sighting for sighting in found if sighting is not None)
-        scans = (self._radios[name].scan(self.pose, place_m) for name, place_m in places.items())
-        return tuple(packet for packets in scans for packet in packets), ()
+            found = {name: self._radios[name].sight(self.pose, place_m) for name, place_m in places.items()}
+            return [RadioSample(self.time_s, name, *result) for name, result in found.items() if result], None
+        levels = {name: self._radios[name].scan(self.pose, place_m) for name, place_m in places.items()}
+        levels = {name: row for name, row in levels.items() if any(level_dbm is not None for level_dbm in row)}
+        return [], RadioScan(self.time_s, tau / self._cfg.scan.readings, levels) if levels else None
 
-    def _distances_m(self) -> tuple[float, ...]:
+    def _distances_m(self) -> list[float]:
         cfg = self._cfg
         distances = []
         for direction_rad in cfg.avoidance.sensors_rad:
             true_m = seen_m(self.pose, direction_rad, self.obstacles)
             read_m = true_m + cfg.sim.range_sigma_m * self._distances.standard_normal()
             distances.append(max(0.0, min(read_m, cfg.avoidance.range_max_m)))
-        return tuple(distances)
+        return distances
 
 
 def _stream(seed: int, *name: int) -> np.random.Generator:

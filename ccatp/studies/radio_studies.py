@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from ccatp.beacons.navigation import BeaconMeasurements, RadioNavigator, odometry_of
+from ccatp.beacons.navigation import BeaconMeasurements, RadioNavigator, odometry_of, packets_of
 from ccatp.beacons.pilot import BeaconPilot
 from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.recording import Reading
@@ -30,6 +30,7 @@ from ccatp.beacons.steering import HALT
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.metrics import best_motion, rms, rms_m
+from ccatp.links.beacon_messages import RadioScan
 from ccatp.report.plots import INK
 from ccatp.sim.radio import SimDriveCommand, TruePose, TrueRadio
 from ccatp.sim.radio_world import RadioWorld
@@ -72,10 +73,11 @@ def run_radio(cfg: RadioConfig) -> RadioRun:
     for step in range(1, cfg.run.steps + 1):
         static, target = step % observation.every_steps == 0, step % observation.target_every_steps == 0
         frame = world.step(SimDriveCommand(*drive), cfg.run.step_s, static=static, target=target)
-        t_s, distances_m = frame.time_s, frame.distances_m
+        t_s = frame.time_s
         wheels = (odometry_of(cfg, t_s, *frame.wheels),)
-        navigator.take(BeaconMeasurements(t_s, wheels, frame.packets, frame.sightings, distances_m))
-        drive = pilot.drive(t_s, frame.wheels.interval_s, slam.pose, navigator.target(t_s), distances_m)
+        navigator.take(BeaconMeasurements(t_s, wheels, frame.extras))
+        target_sight, distances_m = navigator.target(t_s), frame.extras.distances
+        drive = pilot.drive(t_s, frame.wheels.interval_s, slam.pose, target_sight, distances_m)
         driven.append(TrueStep(world.pose, wheels[0], world.target_m))
         truths = dict(world.beacons_m)
         if world.target_m is not None:
@@ -347,13 +349,14 @@ def draw_signals(results: Sequence[CellResult], out: Path) -> None:
 def _turns(cfg: RadioConfig, sender_m: tuple[float, float]) -> list[Reading]:
     places, noise = (np.random.default_rng([cfg.run.seed, stream]) for stream in (0, 1))
     radio = TrueRadio(
-        "radio", cfg.path_loss.reference_dbm, cfg.sim.radio, cfg.workspace.size_m, (), cfg.scan.readings, places, noise
+        cfg.path_loss.reference_dbm, cfg.sim.radio, cfg.workspace.size_m, (), cfg.scan.readings, places, noise
     )
     scan = ReflectorScan(cfg.scan)
     headings = np.random.default_rng([cfg.run.seed, 2]).uniform(-pi, pi, TURNS) / cfg.scan.readings
     found = []
     for offset_rad in headings.tolist():  # the robot never stands quite straight: steps and beacon are not in line
-        for result in scan.results(0.0, radio.scan(ROBOT._replace(heading_rad=offset_rad), sender_m)):
+        levels_dbm = radio.scan(ROBOT._replace(heading_rad=offset_rad), sender_m)
+        for result in scan.results(0.0, packets_of(RadioScan(0.0, scan.step_rad, {"radio": levels_dbm}))):
             straight = None if result.bearing_rad is None else result.bearing_rad + offset_rad
             found.append(result._replace(bearing_rad=straight))
     return found

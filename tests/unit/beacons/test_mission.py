@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from ccatp.beacons.mission import RULES, BeaconMission, WaypointArrival, check_beacon_robot, permitted, wheel_rates
-from ccatp.beacons.navigation import BeaconMeasurements, MeasurementReader, PoseBelief, SelfMap
+from ccatp.beacons.navigation import BeaconMeasurements, MeasurementReader, PoseBelief, SelfMap, packets_of
 from ccatp.beacons.slam.motion import Steering
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.beacons.store import BeaconStore, BeaconStoreError
@@ -90,7 +90,7 @@ def test_stop_ends_it_where_it_is_and_then_it_takes_no_commands(stage: BeaconSil
 
 
 def test_what_holds_the_robot_says_when_it_goes_on() -> None:
-    frame = BeaconMeasurements(0.0, (), (), (), ())
+    frame = BeaconMeasurements(0.0, (), BeaconFrame())
 
     def after(state: HoldState, verdict: Verdict | None, *, goes_on: bool) -> HoldState:
         state = RULES.react(state, frame, verdict)
@@ -194,10 +194,11 @@ def test_a_scan_on_the_link_keeps_its_directions() -> None:
     world = RadioWorld(cfg)
     robot = BeaconRobot(cfg, world)
     robot.advance()
-    packets = MeasurementReader(cfg).read(*frame_of(robot)).packets
-    assert len(packets) == 4 * cfg.scan.readings
+    scan = MeasurementReader(cfg).read(*frame_of(robot)).extras.scan
+    assert scan is not None
     step = 2 * pi / cfg.scan.readings
-    assert {round(direction_rad / step, 6) % cfg.scan.readings for _, direction_rad, _ in packets} == set(range(40))
+    directions = [round(direction_rad / step, 6) for _, direction_rad, _ in packets_of(scan)]
+    assert directions == 4 * list(range(cfg.scan.readings))
     assert len(robot.delivered_line) < 8192
 
 

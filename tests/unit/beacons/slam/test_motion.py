@@ -1,6 +1,6 @@
 """Motion models: Jacobians against differences, noise that adds up, calibration, rest."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import replace
 from math import pi, radians
 from time import perf_counter
@@ -16,7 +16,6 @@ from ccatp.beacons.slam.signal_slam import ReflectorScan
 from ccatp.config.beacon_models import ScanConfig
 from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
-from ccatp.sim.radio import Packet
 from tests.support.slam_settings import odometry, settings
 from tests.unit.beacons.datasets.sets import recorded, world
 
@@ -140,10 +139,11 @@ SCAN = ReflectorScan(ScanConfig(readings=40, bearing_sigma_rad=radians(18.0), lo
 STEP = radians(9.0)
 
 
-def turn(levels: dict[int, float], lost: set[int] | None = None, floor_dbm: float = -70.0) -> list[Packet]:
-    return [
-        Packet("b", wrap_pi(k * STEP), levels.get(k, floor_dbm)) for k in range(40) if lost is None or k not in lost
-    ]
+Packet = tuple[str, float, float]
+
+
+def turn(levels: dict[int, float], lost: Container[int] = (), name: str = "b") -> list[Packet]:
+    return [(name, wrap_pi(k * STEP), levels.get(k, -70.0)) for k in range(40) if k not in lost]
 
 
 @pytest.mark.parametrize(
@@ -168,6 +168,6 @@ def test_bearing_and_level_of_a_scan(packets: list[Packet], bearing_steps: float
 
 
 def test_radios_are_kept_apart_by_their_identifier() -> None:
-    both = [*turn({3: -40.0}), *(p._replace(beacon="c") for p in turn({9: -50.0}))]
+    both = [*turn({3: -40.0}), *turn({9: -50.0}, name="c")]
     assert [(r.beacon, r.rssi_dbm > -65.0) for r in SCAN.results(0.0, both)] == [("b", True), ("c", True)]
     assert SCAN.results(0.0, []) == []
